@@ -1,0 +1,269 @@
+"""The solver as one layer: normalise, guess, refine, undo; and its weights on disk."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from kornia.core.check import KORNIA_CHECK_SHAPE
+from kornia.core.exceptions import DeviceError, ShapeError, TypeCheckError, ValueCheckError
+from torch import Tensor, nn
+
+from kornia_pnpnet.init import MLPInit
+from kornia_pnpnet.lm import RobustWeightedLM
+from kornia_pnpnet.normalize import Normalize
+from kornia_pnpnet.types import Guess, PnPResult, Pose
+
+__all__ = ["PnPNet", "shipped_weights"]
+
+WEIGHTS_FOLDER = Path(__file__).parent / "weights"
+CONFIG_NAME, WEIGHTS_NAME = "config.json", "model.safetensors"
+_INITIALISERS: dict[str, type[nn.Module]] = {"MLPInit": MLPInit}
+
+
+def shipped_weights() -> list[str]:
+    """Names of the weights that come with the package."""
+    return sorted(path.parent.name for path in WEIGHTS_FOLDER.glob(f"*/{CONFIG_NAME}"))
+
+
+def check_inputs(
+    world_points: Tensor, img_points: Tensor, intrinsics: Tensor, weights: Tensor | None, mask: Tensor | None
+) -> None:
+    """Check shapes, dtypes and devices; never values, which would stall a GPU and let one problem fail a batch."""
+    KORNIA_CHECK_SHAPE(world_points, ["B", "N", "3"])
+    KORNIA_CHECK_SHAPE(img_points, ["B", "N", "2"])
+    batch, count = world_points.shape[:2]
+    shapes = {"img_points": (img_points, (batch, count, 2)), "weights": (weights, (batch, count))}
+    shapes["mask"] = (mask, (batch, count))
+    if intrinsics.shape != (3, 3):
+        shapes["intrinsics"] = (intrinsics, (batch, 3, 3))
+    for name, (tensor, expected) in shapes.items():
+        if tensor is not None and tensor.shape != expected:
+            raise ShapeError(
+                f"{name} must have the shape {expected} to go with world_points of {tuple(world_points.shape)}, "
+                f"got {tuple(tensor.shape)}.",
+                actual_shape=tuple(tensor.shape),
+                expected_shape=expected,
+            )
+    if count < 3:
+        raise ShapeError(f"A pose needs at least 3 pairs, got N = {count}.", actual_shape=tuple(world_points.shape))
+    for name, tensor in {"img_points": img_points, "intrinsics": intrinsics, "weights": weights}.items():
+        if tensor is not None and tensor.dtype != world_points.dtype:
+            raise TypeCheckError(f"{name} is {tensor.dtype} but world_points is {world_points.dtype}.")
+    if world_points.dtype not in (torch.float32, torch.float64):
+        raise TypeCheckError(f"world_points must be float32 or float64, got {world_points.dtype}.")
+    if mask is not None and mask.dtype != torch.bool:
+        raise TypeCheckError(f"mask must be bool, got {mask.dtype}.")
+    tensors = {"img_points": img_points, "intrinsics": intrinsics, "weights": weights, "mask": mask}
+    for name, tensor in tensors.items():
+        if tensor is not None and tensor.device != world_points.device:
+            raise DeviceError(f"{name} is on {tensor.device} but world_points is on {world_points.device}.")
+
+
+class PnPNet(nn.Module):
+    r"""Find the pose of a calibrated camera from 2D-3D pairs of which some are wrong.
+
+    The layer normalises the pairs, lets ``init`` guess a pose, refines it, and expresses it in the frame that came
+    in. All of it is batched and differentiable. One bad problem (non-finite input, fewer than three pairs, points on
+    a line, nothing in front of the camera) has ``ok=False``, finite outputs and zero gradients, and changes no other.
+
+    Convention: ``x_cam = R x_world + t``, +z forward, pixels ``u = fx x/z + cx``; skew must be 0.
+
+    Args:
+        init: maps :class:`~kornia_pnpnet.types.Correspondences` to a :class:`~kornia_pnpnet.types.Guess`; ``None``
+            starts from the identity or from the pose given with the call.
+        refine: the refiner; classical :class:`~kornia_pnpnet.lm.RobustWeightedLM` when ``None``.
+        normalize: the normalisation; the default centres and scales the world and orders the pairs.
+
+    Example:
+        >>> from kornia_pnpnet.data import SyntheticProblems
+        >>> problems = SyntheticProblems(n=9, batch_size=4, seed=0).batch(0)
+        >>> solver = PnPNet(MLPInit(n=9), RobustWeightedLM(m=5))
+        >>> result = solver(problems.world_points, problems.img_points, problems.intrinsics)
+        >>> result.matrix.shape, result.ok.shape
+        (torch.Size([4, 4, 4]), torch.Size([4]))
+    """
+
+    def __init__(
+        self,
+        init: nn.Module | None = None,
+        refine: RobustWeightedLM | None = None,
+        normalize: Normalize | None = None,
+    ) -> None:
+        super().__init__()
+        self.init = init
+        self.refine = RobustWeightedLM(learnable=False) if refine is None else refine
+        self.normalize = Normalize() if normalize is None else normalize
+
+    def forward(
+        self,
+        world_points: Tensor,
+        img_points: Tensor,
+        intrinsics: Tensor,
+        weights: Tensor | None = None,
+        mask: Tensor | None = None,
+        init: Pose | None = None,
+    ) -> PnPResult:
+        r"""Solve a batch of problems.
+
+        Args:
+            world_points: shape :math:`(B, N, 3)`, float32 or float64, any unit.
+            img_points: pixels, shape :math:`(B, N, 2)`.
+            intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`.
+            weights: how much each pair counts, at least 0, shape :math:`(B, N)`; 1 when ``None``.
+            mask: False where a pair is padding, bool, shape :math:`(B, N)`. What padding holds does not matter.
+            init: world-to-camera pose to start from instead of the initialiser's, :math:`(B, 3, 3)` and
+                :math:`(B, 3)`.
+
+        Returns:
+            The :class:`~kornia_pnpnet.types.PnPResult`. Gradients flow through rotation, translation, weights, cost
+            and the first guess of the problems that are ``ok``.
+
+        Raises:
+            ShapeError: for shapes that do not fit each other, fewer than 3 pairs, or another N than the initialiser
+                was built for.
+            TypeCheckError: for dtypes that differ or are not float32 or float64.
+            DeviceError: for tensors on different devices.
+        """
+        check_inputs(world_points, img_points, intrinsics, weights, mask)
+        if intrinsics.ndim == 2:
+            intrinsics = intrinsics.expand(world_points.shape[0], 3, 3)
+        with torch.autocast(world_points.device.type, enabled=False):
+            corr, frame = self.normalize(world_points, img_points, intrinsics, weights, mask)
+            if init is not None or self.init is None:
+                guess = self._given(init, corr.weights, world_points, frame)
+            else:
+                guess = self.init(corr)
+            refined = self.refine(corr, guess)
+            pose = self.normalize.undo(refined.pose, frame)
+            first = self.normalize.undo(guess.pose, frame)
+        pair_weights = refined.weights
+        if self.normalize.order:
+            pair_weights = torch.zeros_like(pair_weights).scatter(1, frame.order, pair_weights)
+        finite = pose.rotation.isfinite().flatten(1).all(-1) & pose.translation.isfinite().all(-1)
+        finite = finite & refined.cost.isfinite() & pair_weights.isfinite().all(-1)
+        ok = frame.valid & refined.ok & finite
+        first_ok = frame.valid & first.rotation.isfinite().flatten(1).all(-1) & first.translation.isfinite().all(-1)
+        return PnPResult(
+            *_gate_pose(pose, ok, finite & frame.valid),
+            _gate(pair_weights, ok, finite & frame.valid, 0.0),
+            _gate(refined.cost, ok, finite & frame.valid, torch.finfo(refined.cost.dtype).max),
+            ok,
+            _gate_pose(first, first_ok, first_ok),
+        )
+
+    def _given(self, init: Pose | None, weights: Tensor, world_points: Tensor, frame: Any) -> Guess:
+        """Bring a pose given by hand (or the identity) to the normalised frame."""
+        batch = world_points.shape[0]
+        if init is None:
+            eye = torch.eye(3, dtype=world_points.dtype, device=world_points.device).expand(batch, 3, 3)
+            init = Pose(eye, world_points.new_zeros(batch, 3))
+        KORNIA_CHECK_SHAPE(init[0], [str(batch), "3", "3"])
+        KORNIA_CHECK_SHAPE(init[1], [str(batch), "3"])
+        usable = frame.valid & init[0].isfinite().flatten(1).all(-1) & init[1].isfinite().all(-1)
+        given = _gate_pose(Pose(*init), usable, usable)
+        return Guess(self.normalize.apply_to_pose(given, frame), torch.ones_like(weights))
+
+    # -- weights on disk ---------------------------------------------------------------------------------------------
+
+    def config(self) -> dict[str, Any]:
+        """The constructor arguments of all parts, as plain data."""
+        init = None if self.init is None else {"name": type(self.init).__name__, **self.init.config}  # type: ignore[dict-item]
+        return {"init": init, "refine": self.refine.config, "normalize": self.normalize.config}
+
+    @classmethod
+    def from_config(cls, config: dict[str, Any]) -> PnPNet:
+        """Build an untrained solver from what :meth:`config` returned.
+
+        Raises:
+            ValueCheckError: when a part or an argument is unknown.
+        """
+        try:
+            init_config = config["init"]
+            init = None
+            if init_config is not None:
+                arguments = {key: value for key, value in init_config.items() if key != "name"}
+                init = _INITIALISERS[init_config["name"]](**arguments)
+            return cls(init, RobustWeightedLM(**config["refine"]), Normalize(**config["normalize"]))
+        except (KeyError, TypeError, AttributeError) as error:
+            raise ValueCheckError(f"Not a configuration of PnPNet: {error!r}.") from error
+
+    def save_pretrained(self, folder: str | Path) -> None:
+        """Write ``config.json`` and ``model.safetensors``.
+
+        Args:
+            folder: where to; made when missing.
+        """
+        from safetensors.torch import save_file
+
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        state = {name: value.detach().cpu().contiguous() for name, value in self.state_dict().items()}
+        save_file(state, folder / WEIGHTS_NAME)
+        (folder / CONFIG_NAME).write_text(json.dumps(self.config(), indent=2) + "\n")
+
+    @classmethod
+    def from_pretrained(cls, name_or_folder: str | Path) -> PnPNet:
+        """Load a trained solver, in evaluation mode.
+
+        Args:
+            name_or_folder: the name of shipped weights (see :func:`shipped_weights`), which needs no network; a local
+                folder; or a Hugging Face Hub repository id. The first that exists is taken. Nothing is unpickled.
+
+        Returns:
+            The solver in float32 on the CPU.
+
+        Raises:
+            FileNotFoundError: when there is no such name, folder or repository.
+            ValueCheckError: when the files are damaged or of another model.
+        """
+        folder = _find_weights(name_or_folder)
+        from safetensors import SafetensorError
+        from safetensors.torch import load_file
+
+        try:
+            config = json.loads((folder / CONFIG_NAME).read_text())
+            state = load_file(folder / WEIGHTS_NAME)
+        except (OSError, ValueError, SafetensorError) as error:
+            raise ValueCheckError(f"Cannot read the weights in {folder}: {error}") from error
+        model = cls.from_config(config)
+        try:
+            model.load_state_dict(state)
+        except RuntimeError as error:
+            raise ValueCheckError(f"The weights in {folder} are of another model: {error}") from error
+        return model.eval()
+
+
+def _find_weights(name_or_folder: str | Path) -> Path:
+    """Find the folder of some weights: shipped, local, or on the Hub."""
+    name = str(name_or_folder)
+    for folder in (WEIGHTS_FOLDER / name, Path(name)):
+        if (folder / CONFIG_NAME).is_file():
+            return folder
+    message = f"No weights {name!r}: shipped are {shipped_weights()}; a folder needs {CONFIG_NAME} and {WEIGHTS_NAME}"
+    if name.count("/") != 1 or Path(name).exists():
+        raise FileNotFoundError(f"{message}.")
+    from huggingface_hub import hf_hub_download
+    from huggingface_hub.errors import HfHubHTTPError
+
+    try:
+        config = hf_hub_download(name, CONFIG_NAME)
+        hf_hub_download(name, WEIGHTS_NAME)
+    except (HfHubHTTPError, OSError, ValueError) as error:
+        raise FileNotFoundError(f"{message}; the Hub said: {error}") from error
+    return Path(config).parent
+
+
+def _gate(value: Tensor, ok: Tensor, finite: Tensor, fill: float | Tensor) -> Tensor:
+    """Keep the gradient of problems that are ok, the value of those that are finite, and fill the others."""
+    shape = (-1,) + (1,) * (value.ndim - 1)
+    value = torch.where(ok.view(shape), value, value.detach())
+    return torch.where(finite.view(shape), value, fill)
+
+
+def _gate_pose(pose: Pose, ok: Tensor, finite: Tensor) -> Pose:
+    """:func:`_gate` for a pose; the identity fills."""
+    eye = torch.eye(3, dtype=pose.rotation.dtype, device=pose.rotation.device)
+    return Pose(_gate(pose.rotation, ok, finite, eye), _gate(pose.translation, ok, finite, 0.0))

@@ -1,0 +1,108 @@
+r"""Robust kernels: how much a pair counts, as a function of its squared residual.
+
+A kernel is a loss :math:`\rho(s)` of the squared residual :math:`s = \|r\|^2` in square pixels with one *shape*
+parameter, and its derivative :math:`w(s) = \rho'(s)`: iterating weighted least squares with the weight :math:`w`
+minimises :math:`\sum \rho`. The scale of ``huber``, ``cauchy``, ``geman_mcclure`` and ``truncated`` is in pixels of
+the normalised camera; the shape of ``power`` is the exponent :math:`\alpha` of the paper's
+:math:`w = 1/\|r\|^\alpha`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+__all__ = ["KERNELS", "POWER_FLOOR", "RobustKernel"]
+
+#: Residuals below this many pixels count as this many in ``power``, whose weight would be infinite at 0.
+POWER_FLOOR = 0.1
+
+
+class RobustKernel(NamedTuple):
+    """A robust loss of the squared residual, its derivative, and the range of its one shape parameter.
+
+    Attributes:
+        loss: ``loss(sq_residual, shape)``, 0 at 0 and never decreasing.
+        weight: ``weight(sq_residual, shape)``, the derivative of ``loss`` by ``sq_residual``.
+        default: the classical value of the shape.
+        lower: the smallest shape that may be learned.
+        upper: the largest shape that may be learned.
+        logarithmic: whether the shape is a scale, learned in log space.
+    """
+
+    loss: Callable[[Tensor, Tensor], Tensor]
+    weight: Callable[[Tensor, Tensor], Tensor]
+    default: float
+    lower: float
+    upper: float
+    logarithmic: bool
+
+
+def _power_weight(sq_residual: Tensor, alpha: Tensor) -> Tensor:
+    return (sq_residual + POWER_FLOOR**2) ** (-0.5 * alpha)
+
+
+def _power_loss(sq_residual: Tensor, alpha: Tensor) -> Tensor:
+    # The integral of (s + c)^(-alpha/2) from 0. With e = 1 - alpha/2 and L = log(1 + s/c) it is
+    # c^e L (exp(e L) - 1) / (e L), which stays smooth through alpha = 2 when the last factor does.
+    floor = POWER_FLOOR**2
+    exponent = 1.0 - 0.5 * alpha
+    log_ratio = torch.log1p(sq_residual / floor)
+    x = exponent * log_ratio
+    small = x.abs() < 1e-2
+    safe = torch.where(small, 1.0, x)
+    series = 1.0 + x * (1.0 / 2 + x * (1.0 / 6 + x * (1.0 / 24 + x * (1.0 / 120 + x / 720))))
+    relative = torch.where(small, torch.where(small, series, 1.0), torch.expm1(safe) / safe)
+    return floor**exponent * log_ratio * relative
+
+
+def _huber_weight(sq_residual: Tensor, scale: Tensor) -> Tensor:
+    outside = sq_residual > scale * scale
+    safe = torch.where(outside, sq_residual, 1.0)
+    return torch.where(outside, scale * safe.rsqrt(), 1.0)
+
+
+def _huber_loss(sq_residual: Tensor, scale: Tensor) -> Tensor:
+    outside = sq_residual > scale * scale
+    safe = torch.where(outside, sq_residual, 1.0)
+    return torch.where(outside, 2.0 * scale * safe.sqrt() - scale * scale, sq_residual)
+
+
+def _cauchy_weight(sq_residual: Tensor, scale: Tensor) -> Tensor:
+    return 1.0 / (1.0 + sq_residual / (scale * scale))
+
+
+def _cauchy_loss(sq_residual: Tensor, scale: Tensor) -> Tensor:
+    return scale * scale * torch.log1p(sq_residual / (scale * scale))
+
+
+def _geman_mcclure_weight(sq_residual: Tensor, scale: Tensor) -> Tensor:
+    return (1.0 + sq_residual / (scale * scale)) ** -2
+
+
+def _geman_mcclure_loss(sq_residual: Tensor, scale: Tensor) -> Tensor:
+    return sq_residual / (1.0 + sq_residual / (scale * scale))
+
+
+def _truncated_weight(sq_residual: Tensor, scale: Tensor) -> Tensor:
+    # The zero term keeps the scale in the graph, as training on several processes expects of every parameter.
+    return (sq_residual < scale * scale).to(sq_residual.dtype) + 0.0 * scale
+
+
+def _truncated_loss(sq_residual: Tensor, scale: Tensor) -> Tensor:
+    return torch.minimum(sq_residual, scale * scale)
+
+
+#: The kernels by name. ``power`` is the paper's; the others are the usual M-estimators (Z. Zhang, "Parameter
+#: estimation techniques", Image and Vision Computing 15(1), 1997, table 1), with ``truncated`` the least squares
+#: behind MSAC.
+KERNELS: dict[str, RobustKernel] = {
+    "power": RobustKernel(_power_loss, _power_weight, 1.0, 0.0, 3.0, logarithmic=False),
+    "huber": RobustKernel(_huber_loss, _huber_weight, 5.0, 0.1, 1e4, logarithmic=True),
+    "cauchy": RobustKernel(_cauchy_loss, _cauchy_weight, 10.0, 0.1, 1e4, logarithmic=True),
+    "geman_mcclure": RobustKernel(_geman_mcclure_loss, _geman_mcclure_weight, 20.0, 0.1, 1e4, logarithmic=True),
+    "truncated": RobustKernel(_truncated_loss, _truncated_weight, 30.0, 0.1, 1e4, logarithmic=True),
+}

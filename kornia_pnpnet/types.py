@@ -1,0 +1,126 @@
+"""The tensors that travel between the parts of a solver, each a ``NamedTuple`` with its shape contract.
+
+``NamedTuple`` is a pytree, so ``torch.compile``, ``torch.export``, ``torch.func`` and data loaders take these as they
+are. The letters are the same everywhere: ``B`` problems in the batch, ``N`` pairs in each.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from kornia.geometry.conversions import Rt_to_matrix4x4
+from torch import Tensor
+
+__all__ = ["Correspondences", "Guess", "PnPResult", "Pose", "Problems", "Refinement"]
+
+
+class Pose(NamedTuple):
+    r"""A world-to-camera rigid motion, ``x_cam = R x_world + t``.
+
+    Attributes:
+        rotation: :math:`R`, shape :math:`(B, 3, 3)`.
+        translation: :math:`t` in the unit of the world points, shape :math:`(B, 3)`.
+    """
+
+    rotation: Tensor
+    translation: Tensor
+
+    @property
+    def matrix(self) -> Tensor:
+        """The homogeneous world-to-camera matrix, shape :math:`(B, 4, 4)`."""
+        return Rt_to_matrix4x4(self.rotation, self.translation[..., None])
+
+
+class Correspondences(NamedTuple):
+    r"""Normalised 2D-3D pairs: what an initialiser and a refiner see.
+
+    Attributes:
+        world_points: points in the (possibly centred and scaled) world frame, shape :math:`(B, N, 3)`.
+        img_points: pixels of a camera with the focal length ``focal`` and the principal point 0,
+            shape :math:`(B, N, 2)`.
+        weights: how much each pair counts, at least 0; 0 means that the pair is not there, shape :math:`(B, N)`.
+        focal: the focal length in pixels that all pairs share, a scalar.
+    """
+
+    world_points: Tensor
+    img_points: Tensor
+    weights: Tensor
+    focal: Tensor
+
+
+class Guess(NamedTuple):
+    r"""What an initialiser returns.
+
+    Attributes:
+        pose: a coarse pose in the frame of the :class:`Correspondences`.
+        weights: a factor for the weight of each pair, at least 0, shape :math:`(B, N)`.
+    """
+
+    pose: Pose
+    weights: Tensor
+
+
+class Refinement(NamedTuple):
+    r"""What a refiner returns.
+
+    Attributes:
+        pose: the refined pose in the frame of the :class:`Correspondences`.
+        weights: the weight of each pair at that pose, shape :math:`(B, N)`.
+        cost: mean robust loss of the pairs at that pose, shape :math:`(B,)`.
+        ok: whether the pose explains the pairs, bool, shape :math:`(B,)`.
+    """
+
+    pose: Pose
+    weights: Tensor
+    cost: Tensor
+    ok: Tensor
+
+
+class PnPResult(NamedTuple):
+    r"""What every solver returns.
+
+    Attributes:
+        rotation: world-to-camera rotation, shape :math:`(B, 3, 3)`.
+        translation: world-to-camera translation in the unit of the world points, shape :math:`(B, 3)`.
+        weights: final weight of each pair, in the order in which the pairs were given, shape :math:`(B, N)`.
+        cost: mean robust loss of the pairs, in the kernel's unit (see :mod:`kornia_pnpnet.robust`), shape
+            :math:`(B,)`. Comparable between problems solved by the same solver.
+        ok: whether the pose can be used, bool, shape :math:`(B,)`. Where it is false the other fields are finite and
+            carry no gradient.
+        init: the first guess that was refined.
+    """
+
+    rotation: Tensor
+    translation: Tensor
+    weights: Tensor
+    cost: Tensor
+    ok: Tensor
+    init: Pose
+
+    @property
+    def pose(self) -> Pose:
+        """Rotation and translation as a :class:`Pose`."""
+        return Pose(self.rotation, self.translation)
+
+    @property
+    def matrix(self) -> Tensor:
+        """The homogeneous world-to-camera matrix, shape :math:`(B, 4, 4)`."""
+        return self.pose.matrix
+
+
+class Problems(NamedTuple):
+    r"""A batch of problems with their answers: what every data source yields.
+
+    Attributes:
+        world_points: shape :math:`(B, N, 3)`.
+        img_points: pixels, shape :math:`(B, N, 2)`.
+        intrinsics: camera matrices, shape :math:`(B, 3, 3)`.
+        pose: the true world-to-camera pose.
+        inliers: whether the pixel of a pair belongs to its point, bool, shape :math:`(B, N)`.
+    """
+
+    world_points: Tensor
+    img_points: Tensor
+    intrinsics: Tensor
+    pose: Pose
+    inliers: Tensor
