@@ -1,0 +1,20 @@
+"""Sources of problems: synthetic ones, and real scenes."""
+
+from kornia_pnpnet.data.colmap import Scene, View, load_colmap, load_matches, load_scene
+from kornia_pnpnet.data.outliers import OutlierMix
+from kornia_pnpnet.data.scenes import SceneProblems
+from kornia_pnpnet.data.synthetic import BoxPoints, MixedPoints, SlabPoints, SyntheticProblems
+
+__all__ = [
+    "BoxPoints",
+    "MixedPoints",
+    "OutlierMix",
+    "Scene",
+    "SceneProblems",
+    "SlabPoints",
+    "SyntheticProblems",
+    "View",
+    "load_colmap",
+    "load_matches",
+    "load_scene",
+]

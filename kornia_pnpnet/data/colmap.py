@@ -1,0 +1,313 @@
+"""Real scenes: COLMAP and ETH3D models and files of raw matches.
+
+Convention: ``x_cam = R x_world + t``. Pixels and camera matrices are COLMAP's: the centre of the top-left pixel is
+(0.5, 0.5). Everything is kept in float64 on the CPU.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+__all__ = ["Scene", "View", "load_colmap", "load_matches", "load_scene"]
+
+# Where a model lies below the folder a user names: right there, in ETH3D's layout, in COLMAP's.
+_MODEL_FOLDERS = (".", "dslr_calibration_undistorted", "sparse/0", "sparse")
+_MODEL_FILES = ("cameras", "images", "points3D")
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    r"""One image of a scene: what it observes and where it was taken from.
+
+    Attributes:
+        name: the image's name, with its sub-folders if it has any.
+        world_points: the observed points in the unit of the scene, shape :math:`(M, 3)`, float64.
+        img_points: their pixels, freed from lens distortion, shape :math:`(M, 2)`, float64.
+        intrinsics: pinhole camera matrix in pixels, shape :math:`(3, 3)`.
+        rotation: world-to-camera rotation, shape :math:`(3, 3)`.
+        translation: world-to-camera translation, shape :math:`(3,)`.
+        width: image width in pixels.
+        height: image height in pixels.
+        inliers: whether the pixel belongs to the point, bool, shape :math:`(M,)`.
+
+    Raises:
+        ValueError: if a shape is wrong, a value is not finite, or ``rotation`` is not a rotation.
+    """
+
+    name: str
+    world_points: Tensor
+    img_points: Tensor
+    intrinsics: Tensor
+    rotation: Tensor
+    translation: Tensor
+    width: int
+    height: int
+    inliers: Tensor
+
+    def __post_init__(self) -> None:
+        count = len(self.world_points)
+        expected = {
+            "world_points": (count, 3),
+            "img_points": (count, 2),
+            "intrinsics": (3, 3),
+            "rotation": (3, 3),
+            "translation": (3,),
+            "inliers": (count,),
+        }
+        for field, shape in expected.items():
+            value: Tensor = getattr(self, field)
+            if value.shape != shape:
+                raise ValueError(f"image '{self.name}': {field} has shape {tuple(value.shape)}, expected {shape}")
+            if not value.isfinite().all():
+                raise ValueError(f"image '{self.name}': {field} has values that are not finite")
+        deviation = (self.rotation @ self.rotation.mT - torch.eye(3, dtype=self.rotation.dtype)).abs().max()
+        if deviation > 1e-3 or self.rotation.det() < 0:
+            raise ValueError(f"image '{self.name}': rotation is not a rotation matrix")
+
+    @property
+    def cam_points(self) -> Tensor:
+        """The observed points in the camera's frame, shape :math:`(M, 3)`."""
+        return self.world_points @ self.rotation.mT + self.translation
+
+    @property
+    def median_depth(self) -> float:
+        """Median depth of the observed points in the unit of the scene."""
+        return self.cam_points[:, 2].median().item()
+
+    @property
+    def reprojection_error_px(self) -> Tensor:
+        """Distance of each pixel to its point's projection, infinite behind the camera, shape :math:`(M,)`."""
+        cam_points = self.cam_points  # (M, 3)
+        in_front = cam_points[:, 2] > 0
+        projected = cam_points @ self.intrinsics.mT  # (M, 3)
+        error = (projected[:, :2] / projected[:, 2:] - self.img_points).norm(dim=1)
+        return torch.where(in_front, error, torch.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """The images of one scene.
+
+    Attributes:
+        name: the scene's name.
+        views: the images that observe enough points, sorted by name.
+        skipped: names of the images left out because they observe too few points.
+        metric: whether the unit is the metre; otherwise it is arbitrary.
+    """
+
+    name: str
+    views: tuple[View, ...]
+    skipped: tuple[str, ...] = ()
+    metric: bool = True
+
+    @property
+    def median_depth(self) -> float:
+        """Median depth of all observations in the unit of the scene."""
+        return torch.cat([view.cam_points[:, 2] for view in self.views]).median().item()
+
+
+def load_scene(path: str | Path, *, metric: bool = True, min_points: int = 10, max_error_px: float = 10.0) -> Scene:
+    """Load a scene: an ``.npz`` file holds raw matches, a folder a COLMAP model.
+
+    Args:
+        path: the file (see :func:`load_matches`) or the folder (see :func:`load_colmap`).
+        metric: whether the unit of the scene is the metre.
+        min_points: images with fewer points are skipped.
+        max_error_px: matches with a larger reprojection error under the true pose are mismatches; of no effect on
+            COLMAP models.
+
+    Returns:
+        The scene.
+
+    Raises:
+        FileNotFoundError: if there is nothing at ``path`` or no model in the folder.
+        ValueError: if what is there cannot be used; the message says why.
+    """
+    path = Path(path)
+    if path.suffix == ".npz" and not path.is_dir():
+        return load_matches(path, metric=metric, min_points=min_points, max_error_px=max_error_px)
+    return load_colmap(path, metric=metric, min_points=min_points)
+
+
+def load_colmap(folder: str | Path, *, metric: bool = True, min_points: int = 10) -> Scene:
+    """Load a COLMAP model, text or binary, through ``pycolmap``.
+
+    Distorted cameras are undone: pixels become those of the pinhole camera with the same focal length and principal
+    point. A point that an image observes twice is taken once, and points behind the camera are dropped, which only a
+    fisheye lens can see.
+
+    Args:
+        folder: the folder of the model or a scene above it: ETH3D's, with the model in
+            ``dslr_calibration_undistorted``, or COLMAP's, with ``sparse/0`` or ``sparse``.
+        metric: whether the unit of the model is the metre.
+        min_points: images that observe fewer points are skipped.
+
+    Returns:
+        The scene. All its pairs count as inliers.
+
+    Raises:
+        ImportError: if ``pycolmap`` is missing.
+        FileNotFoundError: if the folder or the model in it is missing.
+        ValueError: if the model cannot be read, has no images, or all of them are skipped.
+    """
+    folder = Path(folder)
+    model_folder = _find_model(folder)
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise ImportError("reading COLMAP models needs pycolmap: pip install 'kornia_pnpnet[eval]'") from error
+    try:
+        model = pycolmap.Reconstruction(str(model_folder))
+    except Exception as error:  # whatever its C++ code threw at a bad file, std::bad_alloc included
+        reason = " ".join(str(error).split())
+        raise ValueError(f"pycolmap cannot read the model in '{model_folder}': {reason}") from error
+    if not model.images:
+        raise ValueError(f"the COLMAP model in '{model_folder}' has no images")
+
+    world_points = {point_id: point.xyz for point_id, point in model.points3D.items()}
+    try:
+        views = [_colmap_view(image, world_points) for image in model.images.values()]
+    except ValueError as error:
+        raise ValueError(f"the COLMAP model in '{model_folder}' cannot be used: {error}") from error
+    return _scene(folder, _scene_name(folder), views, min_points, metric)
+
+
+def load_matches(path: str | Path, *, metric: bool = True, min_points: int = 10, max_error_px: float = 10.0) -> Scene:
+    """Load a file of raw, unfiltered 2D-3D matches with the true poses.
+
+    The file holds ``names`` (V,), ``K`` (V, 3, 3), ``R`` (V, 3, 3), ``t`` (V, 3) and ``size`` (V, 2) as width and
+    height; for image ``iii`` (three digits) ``iii_img_points`` (M, 2), ``iii_world_points`` (M, 3) and
+    ``iii_error_px`` (M,), the reprojection error under the true pose. Nothing in it is unpickled.
+
+    Args:
+        path: the ``.npz`` file.
+        metric: whether the unit of the world is the metre.
+        min_points: images with fewer matches are skipped.
+        max_error_px: matches with a larger error are mismatches.
+
+    Returns:
+        The scene.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is not such a file, an array is missing or has a wrong shape, or all images are skipped.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"no file of matches at '{path}'")
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+            arrays = {key: np.asarray(file[key]) for key in file.files}
+    except Exception as error:  # numpy, zipfile and zlib have a dozen ways to say that a file is broken
+        raise ValueError(f"'{path}' is not a readable .npz file of plain arrays: {error}") from error
+    try:
+        views = _match_views(arrays, max_error_px)
+    except ValueError as error:
+        raise ValueError(f"the matches in '{path}' cannot be used: {error}") from error
+    if not views:
+        raise ValueError(f"the file of matches '{path}' has no images")
+    return _scene(path, path.stem, views, min_points, metric)
+
+
+def _scene(path: Path, name: str, views: list[View], min_points: int, metric: bool) -> Scene:
+    """Sort the views by name and set those with too few points apart."""
+    views = sorted(views, key=lambda view: view.name)
+    kept = tuple(view for view in views if len(view.world_points) >= min_points)
+    if not kept:
+        most = max(len(view.world_points) for view in views)
+        raise ValueError(f"no image of '{path}' has {min_points} points: the best of {len(views)} images has {most}")
+    return Scene(name, kept, tuple(view.name for view in views if len(view.world_points) < min_points), metric)
+
+
+def _find_model(folder: Path) -> Path:
+    """The folder at or below ``folder`` that has the three files of a model, all binary or all text."""
+    if not folder.is_dir():
+        raise FileNotFoundError(f"no folder at '{folder}'")
+    for below in _MODEL_FOLDERS:
+        for ending in (".bin", ".txt"):
+            if all((folder / below / (stem + ending)).is_file() for stem in _MODEL_FILES):
+                return folder / below
+    raise FileNotFoundError(
+        f"no COLMAP model in '{folder}': looked for cameras, images and points3D (.bin or .txt) in "
+        + ", ".join(_MODEL_FOLDERS)
+    )
+
+
+def _scene_name(folder: Path) -> str:
+    """The folder's name, or that of the scene above it if it is one of the usual folders of a model."""
+    parts = list(folder.resolve().parts)
+    while len(parts) > 2 and parts[-1] in {"0", "sparse", "dslr_calibration_undistorted"}:
+        parts.pop()
+    return parts[-1]
+
+
+def _colmap_view(image: Any, world_points: Mapping[int, np.ndarray]) -> View:
+    """What one ``pycolmap.Image`` observes."""
+    camera = image.camera
+    observed = image.get_observation_points2D()
+    ids, first = np.unique(np.array([point.point3D_id for point in observed], dtype=np.uint64), return_index=True)
+    distorted = np.array([observed[i].xy for i in first], dtype=np.float64).reshape(-1, 2)
+    points = np.array([world_points[int(i)] for i in ids], dtype=np.float64).reshape(-1, 3)
+    world_to_cam = image.cam_from_world().matrix()  # (3, 4)
+    intrinsics = camera.calibration_matrix()
+
+    plane = camera.cam_from_img(distorted)  # (M, 2), nan where the lens model has no inverse
+    pixels = plane @ intrinsics[:2, :2].T + intrinsics[:2, 2]
+    depth = points @ world_to_cam[2, :3] + world_to_cam[2, 3]
+    # A pose that is not finite must reach the check in View, not be read as "no point in front".
+    seen = np.isfinite(pixels).all(axis=1) & ~(depth <= 0)
+    return View(
+        name=image.name,
+        world_points=torch.tensor(points[seen]),
+        img_points=torch.tensor(pixels[seen]),
+        intrinsics=torch.tensor(intrinsics),
+        rotation=torch.tensor(world_to_cam[:, :3]),
+        translation=torch.tensor(world_to_cam[:, 3]),
+        width=int(camera.width),
+        height=int(camera.height),
+        inliers=torch.ones(int(seen.sum()), dtype=torch.bool),
+    )
+
+
+def _match_views(arrays: Mapping[str, np.ndarray], max_error_px: float) -> list[View]:
+    """The views of a file of matches."""
+
+    def read(key: str, *shape: int | None) -> Tensor:
+        if key not in arrays:
+            raise ValueError(f"there is no array '{key}'")
+        array = arrays[key]
+        fits = len(shape) == array.ndim and all(s in (None, a) for s, a in zip(shape, array.shape, strict=True))
+        if not fits or array.dtype.kind not in "fiu":
+            wanted = ", ".join("any" if s is None else str(s) for s in shape)
+            raise ValueError(f"'{key}' has shape {array.shape} of {array.dtype}, expected numbers of ({wanted})")
+        return torch.tensor(array.astype(np.float64))
+
+    if "names" not in arrays:
+        raise ValueError("there is no array 'names'")
+    names = [str(name) for name in np.atleast_1d(arrays["names"])]
+    intrinsics, rotation = read("K", len(names), 3, 3), read("R", len(names), 3, 3)
+    translation, size = read("t", len(names), 3), read("size", len(names), 2)
+    views = []
+    for i, name in enumerate(names):
+        img_points = read(f"{i:03d}_img_points", None, 2)
+        views.append(
+            View(
+                name=name,
+                world_points=read(f"{i:03d}_world_points", len(img_points), 3),
+                img_points=img_points,
+                intrinsics=intrinsics[i],
+                rotation=rotation[i],
+                translation=translation[i],
+                width=int(size[i, 0]),
+                height=int(size[i, 1]),
+                inliers=read(f"{i:03d}_error_px", len(img_points)) <= max_error_px,
+            )
+        )
+    return views

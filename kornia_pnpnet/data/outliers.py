@@ -1,0 +1,94 @@
+"""How many pairs are wrong, which, and in what way."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from kornia.core.check import KORNIA_CHECK
+from torch import Tensor
+
+__all__ = ["OutlierDraw", "OutlierMix"]
+
+
+class OutlierDraw(NamedTuple):
+    r"""Which pairs of a batch are wrong.
+
+    Attributes:
+        mismatch: the pixel belongs to another point, bool, shape :math:`(B, N)`.
+        sensing: the pixel is anywhere in the image, bool, shape :math:`(B, N)`.
+    """
+
+    mismatch: Tensor
+    sensing: Tensor
+
+    @property
+    def inliers(self) -> Tensor:
+        """Pairs that are neither, bool, shape :math:`(B, N)`."""
+        return ~(self.mismatch | self.sensing)
+
+
+class OutlierMix:
+    r"""The number of wrong pairs, uniform over the integers from ``min_count`` to a maximum, at random positions.
+
+    Args:
+        max_ratio: the maximum as a share of the pairs, rounded down. A twentieth of a pair is forgiven, so that a
+            third written as 0.33 means :math:`\lfloor n/3 \rfloor` for every n up to 15.
+        count: exactly this many instead.
+        min_count: the fewest.
+        mismatch_share: probability that a wrong pair is a *mismatch* (the projection of another point) rather than
+            *sensing* (a pixel anywhere in the image).
+
+    Raises:
+        BaseError: for shares outside [0, 1] or negative counts.
+
+    Example:
+        >>> OutlierMix().max_count(9), OutlierMix(max_ratio=0.33).max_count(9), OutlierMix(count=2).max_count(9)
+        (3, 3, 2)
+    """
+
+    def __init__(
+        self,
+        *,
+        max_ratio: float = 1.0 / 3.0,
+        count: int | None = None,
+        min_count: int = 0,
+        mismatch_share: float = 0.5,
+    ) -> None:
+        KORNIA_CHECK(0.0 <= max_ratio <= 1.0, f"max_ratio must lie in [0, 1], got {max_ratio}.")
+        KORNIA_CHECK(0.0 <= mismatch_share <= 1.0, f"mismatch_share must lie in [0, 1], got {mismatch_share}.")
+        KORNIA_CHECK(min_count >= 0, f"min_count must be at least 0, got {min_count}.")
+        KORNIA_CHECK(count is None or count >= 0, f"count must be at least 0, got {count}.")
+        self.max_ratio = max_ratio
+        self.count = count
+        self.min_count = min_count
+        self.mismatch_share = mismatch_share
+
+    def max_count(self, n: int) -> int:
+        """The most wrong pairs among ``n``."""
+        return math.floor(n * self.max_ratio + 0.05) if self.count is None else self.count
+
+    def draw(self, batch_size: int, n: int, generator: torch.Generator) -> OutlierDraw:
+        r"""Draw the wrong pairs of a batch.
+
+        Args:
+            batch_size: number of problems.
+            n: pairs in each.
+            generator: source of randomness; the result is on its device.
+
+        Returns:
+            Two masks of shape ``(batch_size, n)``.
+
+        Raises:
+            BaseError: when more wrong pairs are asked for than there are pairs.
+        """
+        most = self.max_count(n)
+        least = min(self.min_count, most) if self.count is None else self.count
+        KORNIA_CHECK(most <= n, f"{most} outliers do not fit into n = {n} pairs.")
+        device = generator.device
+        count = torch.randint(least, most + 1, (batch_size, 1), generator=generator, device=device)
+        rank = torch.rand(batch_size, n, generator=generator, device=device).argsort(-1).argsort(-1)
+        outlier = rank < count
+        mismatch = torch.rand(batch_size, n, generator=generator, device=device) < self.mismatch_share
+        return OutlierDraw(outlier & mismatch, outlier & ~mismatch)

@@ -1,0 +1,189 @@
+"""Random problems drawn from real scenes."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+
+import torch
+from kornia.core.check import KORNIA_CHECK
+from torch import Tensor
+
+from kornia_pnpnet.data.colmap import Scene
+from kornia_pnpnet.data.outliers import OutlierMix
+from kornia_pnpnet.data.synthetic import batch_generator, random_poses, uniform
+from kornia_pnpnet.types import Pose, Problems
+
+__all__ = ["SceneProblems"]
+
+
+class SceneProblems:
+    r"""Random problems of a scene, endless and reproducible: batch ``i`` depends on ``seed`` and ``i`` alone.
+
+    Each problem is a random image, ``n`` random points that it observes and their pixels, of which some are spoilt:
+    a *mismatch* gets the pixel of a spare point of the same image, a *sensing* outlier a uniform pixel of the image.
+    ``outliers=OutlierMix(count=2)`` is the protocol's real data with outliers: 10 points are drawn, and 2 of the
+    first 9 get the 10th point's pixel or a uniform one. Points and poses do not depend on ``outliers``, so that
+    numbers of outliers are compared on the same problems.
+
+    As in the paper the world is centred on a coarse pose: a pose :math:`(R^*, t^*)` is drawn from the training prior
+    and the world is moved so that it is the true one, :math:`x' = R^{*\top}(R x + t - t^*)`.
+
+    Args:
+        scene: where the problems are drawn from. Only its images with at least ``n + num_spares`` points are used.
+        n: pairs per problem.
+        batch_size: problems per batch.
+        seed: of the stream, at least 0.
+        outliers: how many pairs are spoilt and how; none when ``None``. Raw matches bring their own mismatches.
+        num_spares: extra points drawn per problem, given to its mismatches in turn. The protocol draws one, which
+            all mismatches share; as many as there are mismatches give each its own.
+        recentre: whether to move the world.
+        translation_box: side of the box centred at 0 in which :math:`t^*` is uniform.
+        max_angle: the angle of :math:`R^*` is uniform from 0 to this many radians, its axis uniform in direction.
+        dtype: of the batches; everything is drawn in float64 first.
+        device: of the batches; everything is drawn on the CPU first.
+
+    Raises:
+        BaseError: for an argument out of range.
+        ValueError: if no image has enough points.
+
+    Example:
+        >>> from kornia_pnpnet.data.colmap import View
+        >>> world_points = torch.rand(20, 3, dtype=torch.float64) + torch.tensor([0.0, 0.0, 4.0])
+        >>> view = View(
+        ...     name="a.jpg",
+        ...     world_points=world_points,
+        ...     img_points=500 * world_points[:, :2] / world_points[:, 2:],
+        ...     intrinsics=torch.diag(torch.tensor([500.0, 500.0, 1.0], dtype=torch.float64)),
+        ...     rotation=torch.eye(3, dtype=torch.float64),
+        ...     translation=torch.zeros(3, dtype=torch.float64),
+        ...     width=640,
+        ...     height=480,
+        ...     inliers=torch.ones(20, dtype=torch.bool),
+        ... )
+        >>> problems = SceneProblems(Scene("box", (view,)), batch_size=2, outliers=OutlierMix(count=3)).batch(0)
+        >>> problems.world_points.shape, problems.inliers.sum(-1)
+        (torch.Size([2, 9, 3]), tensor([6, 6]))
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        n: int = 9,
+        batch_size: int = 1000,
+        seed: int = 0,
+        outliers: OutlierMix | None = None,
+        num_spares: int = 1,
+        recentre: bool = True,
+        translation_box: float = 25.0,
+        max_angle: float = math.pi / 2,
+        dtype: torch.dtype = torch.float64,
+        device: str | torch.device = "cpu",
+    ) -> None:
+        KORNIA_CHECK(n >= 1 and batch_size >= 1, f"n and batch_size must be at least 1, got {n} and {batch_size}.")
+        KORNIA_CHECK(num_spares >= 1, f"num_spares must be at least 1, got {num_spares}.")
+        self.scene = scene
+        self.n = n
+        self.batch_size = batch_size
+        self.seed = seed
+        self.outliers = OutlierMix(count=0) if outliers is None else outliers
+        self.num_spares = num_spares
+        self.recentre = recentre
+        self.translation_box = translation_box
+        self.max_angle = max_angle
+        self.dtype = dtype
+        self.device = torch.device(device)
+        need = n + num_spares
+        self.views = tuple(view for view in scene.views if len(view.world_points) >= need)
+        if not self.views:
+            raise ValueError(
+                f"no image of '{scene.name}' has the {need} points for n = {n} and num_spares = {num_spares}"
+            )
+
+        # The points of all views one after the other, so that a batch is one gather.
+        self._counts = torch.tensor([len(view.world_points) for view in self.views])
+        self._starts = self._counts.cumsum(0) - self._counts
+        self._world_points = torch.cat([view.world_points for view in self.views])
+        self._cam_points = torch.cat([view.cam_points for view in self.views])
+        self._img_points = torch.cat([view.img_points for view in self.views])
+        self._inliers = torch.cat([view.inliers for view in self.views])
+        self._intrinsics = torch.stack([view.intrinsics for view in self.views])
+        self._rotation = torch.stack([view.rotation for view in self.views])
+        self._translation = torch.stack([view.translation for view in self.views])
+        self._size = torch.tensor([[view.width, view.height] for view in self.views], dtype=torch.float64)
+
+    @property
+    def max_translation(self) -> float:
+        """Translation error below which a pose is a success: 0.2 in metres, else 0.5 % of the median depth."""
+        return 0.2 if self.scene.metric else 0.005 * self.scene.median_depth
+
+    def __iter__(self) -> Iterator[Problems]:
+        """Yield batch 0, 1, 2, … without end."""
+        return map(self.batch, itertools.count())
+
+    def batch(self, index: int) -> Problems:
+        """Draw batch ``index``.
+
+        Args:
+            index: at least 0.
+
+        Returns:
+            The problems; points, pixels, intrinsics and pose in ``dtype`` on ``device``. A pair is an inlier if it
+            is one in the scene and was not spoilt.
+        """
+        generator = batch_generator(self.seed, index)
+        # What depends on the outlier options is drawn last.
+        view = torch.randint(len(self.views), (self.batch_size,), generator=generator)
+        rows = _choose(self._counts[view], self.n + self.num_spares, generator) + self._starts[view, None]
+        rows, spare_rows = rows[:, : self.n], rows[:, self.n :]  # (B, N), (B, num_spares)
+        prior = random_poses(
+            self.batch_size, generator, translation_box=self.translation_box, max_angle=self.max_angle
+        )
+        anywhere = uniform((self.batch_size, self.n, 2), 0.0, 1.0, generator) * self._size[view, None]
+        draw = self.outliers.draw(self.batch_size, self.n, generator)
+
+        if self.recentre:
+            pose = prior
+            world_points = (self._cam_points[rows] - pose.translation[:, None]) @ pose.rotation  # (B, N, 3)
+        else:
+            pose = Pose(self._rotation[view], self._translation[view])
+            world_points = self._world_points[rows]
+        turn = (draw.mismatch.cumsum(1) - 1) % self.num_spares  # (B, N), read only at mismatches
+        seen = torch.where(draw.mismatch, spare_rows.gather(1, turn), rows)
+        img_points = torch.where(draw.sensing[..., None], anywhere, self._img_points[seen])
+        return Problems(
+            self._cast(world_points),
+            self._cast(img_points),
+            self._cast(self._intrinsics[view]),
+            Pose(self._cast(pose.rotation), self._cast(pose.translation)),
+            (self._inliers[rows] & draw.inliers).to(self.device),
+        )
+
+    def _cast(self, values: Tensor) -> Tensor:
+        return values.to(device=self.device, dtype=self.dtype)
+
+
+def _choose(counts: Tensor, k: int, generator: torch.Generator) -> Tensor:
+    """For each count c, k different integers of 0 ... c - 1, every ordered choice equally likely.
+
+    Floyd's algorithm on the whole batch at once: its cost does not grow with the number of points in an image.
+
+    Args:
+        counts: at least k each, shape :math:`(B,)`.
+        k: how many to choose.
+        generator: source of randomness.
+
+    Returns:
+        The choices, shape :math:`(B, k)`.
+    """
+    draws = uniform((len(counts), k), 0.0, 1.0, generator)
+    chosen = torch.empty((len(counts), k), dtype=torch.int64)
+    for i in range(k):
+        last = counts - k + i  # the range grows by one each time, so its last element is never taken yet
+        candidate = (draws[:, i] * (last + 1)).long().minimum(last)
+        taken = (chosen[:, :i] == candidate[:, None]).any(1)
+        chosen[:, i] = torch.where(taken, last, candidate)
+    # Uniform as a set so far, but late elements sit late: shuffle each row.
+    return chosen.gather(1, uniform((len(counts), k), 0.0, 1.0, generator).argsort(1))
