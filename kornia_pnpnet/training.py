@@ -1,0 +1,424 @@
+"""The training loop: data, model, loss, schedule, checkpoint, resume, on one process or many.
+
+Lightning Fabric carries devices and processes; what is here is what is ours: the ramp of the loss, steps that are
+skipped when they are not finite, and a run that can be stopped at any moment and continued to the same numbers.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+import resource
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from kornia.core.check import KORNIA_CHECK
+from lightning_fabric import Fabric
+from torch import nn
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet.init import MLPInit
+from kornia_pnpnet.lm import RobustWeightedLM
+from kornia_pnpnet.losses import LossTerms, PoseLoss
+from kornia_pnpnet.metrics import pose_errors, success, success_rate
+from kornia_pnpnet.model import PnPNet
+from kornia_pnpnet.types import Pose, Problems
+
+__all__ = ["FitReport", "ProblemSource", "TrainSettings", "TrainingError", "fit", "train_briefly", "validate"]
+
+CHECKPOINT_NAME, HISTORY_NAME = "last.ckpt", "history.csv"
+
+
+class TrainingError(RuntimeError):
+    """The training cannot go on, or cannot be continued as asked; the message says why and what to do."""
+
+
+class ProblemSource(Protocol):
+    """What the loop needs of a data source: batch ``i``, always the same."""
+
+    batch_size: int
+
+    def batch(self, index: int) -> Problems:
+        """Draw batch ``index``."""
+        ...
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    """Numbers of a training run.
+
+    Attributes:
+        updates: how many updates in all.
+        lr: Adam's learning rate of the network.
+        lr_refine: that of the refiner's few hyperparameters, which have far to go.
+        warmup: updates over which the learning rate rises linearly.
+        final_lr: share of the learning rate that is left at the end of the cosine; 1 keeps it constant.
+        clip: largest norm of the gradient.
+        ramp: shares of the run at which the refined terms of the loss begin to count and count in full.
+        max_skipped: the run stops when more steps than this had to be skipped.
+        log_every: updates between rows of the history.
+        validate_every: updates between validations.
+        checkpoint_every: updates between checkpoints.
+    """
+
+    updates: int
+    lr: float = 1e-3
+    lr_refine: float = 3e-3
+    warmup: int = 200
+    final_lr: float = 0.02
+    clip: float = 1.0
+    ramp: tuple[float, float] = (0.1, 0.2)
+    max_skipped: int = 100
+    log_every: int = 100
+    validate_every: int = 1000
+    checkpoint_every: int = 1000
+
+    def lr_factor(self, update: int) -> float:
+        """Warm-up, then a cosine from 1 to ``final_lr``."""
+        cosine = 0.5 * (1.0 + math.cos(math.pi * min(1.0, update / max(1, self.updates))))
+        return min(1.0, (update + 1) / max(1, self.warmup)) * (self.final_lr + (1.0 - self.final_lr) * cosine)
+
+    def ramp_factor(self, update: int) -> float:
+        """Weight of the refined terms at an update, from 0 to 1."""
+        start, end = (share * self.updates for share in self.ramp)
+        return 1.0 if update >= end else max(0.0, (update - start) / (end - start))
+
+
+@dataclass(frozen=True)
+class FitReport:
+    """What a call of :func:`fit` did.
+
+    Attributes:
+        update: updates done in all, earlier calls counted in.
+        skipped: steps skipped because the loss or the gradient was not finite.
+        interrupted: whether a signal ended the call early; the checkpoint is saved.
+        seconds: wall-clock time of this call.
+        updates_per_second: of this call.
+        peak_memory_mib: largest resident memory of this process (of the GPU where one is used).
+    """
+
+    update: int
+    skipped: int
+    interrupted: bool
+    seconds: float
+    updates_per_second: float
+    peak_memory_mib: float
+
+
+@contextmanager
+def _stop_on_signal() -> Iterator[threading.Event]:
+    """Turn SIGTERM and Ctrl-C into an event, so that the loop can save before it ends."""
+    event = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield event
+        return
+    signals = (signal.SIGTERM, signal.SIGINT)
+    before = [signal.signal(number, lambda *_: event.set()) for number in signals]
+    try:
+        yield event
+    finally:
+        for number, handler in zip(signals, before, strict=True):
+            signal.signal(number, handler)
+
+
+def _peak_memory_mib(device: torch.device) -> float:
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / 2**20
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (2**20 if sys.platform == "darwin" else 2**10)  # bytes there, KiB here
+
+
+def _share(problems: Problems, fabric: Fabric) -> Problems:
+    """Every ``world_size``-th problem: the batches of all processes together are the batch of one."""
+    part = slice(fabric.global_rank, None, fabric.world_size)
+    world, img, intrinsics, pose, inliers = problems
+    pick = [x[part].to(fabric.device) for x in (world, img, intrinsics, *pose, inliers)]
+    return Problems(pick[0], pick[1], pick[2], Pose(pick[3], pick[4]), pick[5])
+
+
+@torch.no_grad()
+def validate(model: nn.Module, validation: Mapping[str, Problems]) -> dict[str, float]:
+    """Success rates and median errors on fixed problems.
+
+    Args:
+        model: a solver.
+        validation: problems by name.
+
+    Returns:
+        ``val/<name>/success`` and the median errors of the refined pose and of the first guess.
+    """
+    report = {}
+    for name, problems in validation.items():
+        result = model(problems.world_points, problems.img_points, problems.intrinsics)
+        errors = pose_errors(result.pose, problems.pose)
+        first = pose_errors(result.init, problems.pose)
+        report[f"val/{name}/success"] = success_rate(success(errors)).rate
+        report[f"val/{name}/rotation_error_deg"] = errors.rotation_error_deg.median().item()
+        report[f"val/{name}/translation_error"] = errors.translation_error.median().item()
+        report[f"val/{name}/init_rotation_error_deg"] = first.rotation_error_deg.median().item()
+        report[f"val/{name}/init_translation_error"] = first.translation_error.median().item()
+    return report
+
+
+class _History:
+    """Learning curves in one CSV file and TensorBoard; rows after the resumed update are dropped."""
+
+    def __init__(self, folder: Path, columns: list[str], start: int) -> None:
+        self._path = folder / HISTORY_NAME
+        self._columns = columns
+        rows: list[dict[str, Any]] = []
+        if start and self._path.is_file():
+            with self._path.open(newline="") as file:
+                rows = [row for row in csv.DictReader(file) if int(row["update"]) <= start]
+        temporary = self._path.with_suffix(".tmp")
+        with temporary.open("w", newline="") as file:
+            writer = csv.DictWriter(file, columns, restval="", extrasaction="ignore")
+            writer.writeheader()
+            writer.writerows(rows)
+        os.replace(temporary, self._path)
+        self._board = SummaryWriter(folder / "tensorboard", purge_step=start or None)
+
+    def write(self, row: dict[str, float]) -> None:
+        with self._path.open("a", newline="") as file:
+            csv.DictWriter(file, self._columns, restval="").writerow(
+                {key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()}
+            )
+        for key, value in row.items():
+            if key != "update":
+                self._board.add_scalar(key, value, int(row["update"]))
+
+    def close(self) -> None:
+        self._board.close()
+
+
+def _save_checkpoint(path: Path, state: dict[str, Any]) -> None:
+    """Write a checkpoint in one piece: a run killed at any moment leaves the old one or the new one."""
+    temporary = path.with_suffix(".tmp")
+    with temporary.open("wb") as file:
+        torch.save(state, file)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(temporary, path)
+
+
+def _load_checkpoint(path: Path, identity: dict[str, Any]) -> dict[str, Any]:
+    try:
+        state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+        saved = state["identity"]
+    except Exception as error:  # torch.load raises many types on a damaged file
+        raise TrainingError(f"Cannot read the checkpoint {path}: {error}") from error
+    differing = sorted(key for key in identity if saved.get(key) != identity[key])
+    if differing:
+        details = "; ".join(f"{key}: {saved.get(key)!r} there, {identity[key]!r} now" for key in differing)
+        raise TrainingError(f"The checkpoint {path} is of another run: {details}.")
+    return state
+
+
+def fit(
+    model: PnPNet,
+    data: ProblemSource,
+    validation: Mapping[str, Problems],
+    loss: PoseLoss,
+    settings: TrainSettings,
+    folder: str | Path,
+    *,
+    fabric: Fabric | None = None,
+    resume: bool = False,
+    progress: bool = True,
+) -> FitReport:
+    r"""Train a solver.
+
+    Writes ``last.ckpt``, ``history.csv`` and ``tensorboard/`` into ``folder``. SIGTERM and Ctrl-C save and return. A
+    step whose loss or gradient is not finite is skipped, counted and reported.
+
+    Args:
+        model: the solver, trained in place.
+        data: its batch ``i`` is used for update ``i``.
+        validation: fixed problems by name.
+        loss: compares results with true poses.
+        settings: the numbers of the run.
+        folder: where the run lives.
+        fabric: the launched engine; one process on the CPU when ``None``.
+        resume: continue from ``folder``'s checkpoint when there is one.
+        progress: show a progress bar.
+
+    Returns:
+        What was done.
+
+    Raises:
+        TrainingError: when ``folder`` holds a checkpoint and ``resume`` is false, when the checkpoint is damaged or of
+            other settings, or when more than ``settings.max_skipped`` steps were not finite.
+        BaseError: when the batch cannot be shared equally among the processes.
+    """
+    if fabric is None:
+        fabric = Fabric(accelerator="cpu", devices=1)
+    KORNIA_CHECK(
+        data.batch_size % fabric.world_size == 0,
+        f"A batch of {data.batch_size} cannot be shared equally among {fabric.world_size} processes.",
+    )
+    folder = Path(folder)
+    checkpoint = folder / CHECKPOINT_NAME
+    identity = {"settings": _plain(asdict(settings)), "model": model.config()}
+    start, skipped = 0, 0
+    state = None
+    if checkpoint.exists():
+        if not resume:
+            raise TrainingError(f"{checkpoint} exists: pass resume=true to continue it, or choose another folder.")
+        state = _load_checkpoint(checkpoint, identity)
+        start, skipped = state["update"], state["skipped"]
+        model.load_state_dict(state["model"])
+
+    groups = [
+        {"params": [p for p in part.parameters() if p.requires_grad], "initial_lr": lr}
+        for part, lr in ((model.init, settings.lr), (model.refine, settings.lr_refine))
+        if part is not None
+    ]
+    optimizer = torch.optim.Adam([{**group, "lr": group["initial_lr"]} for group in groups if group["params"]])
+    if state is not None:
+        optimizer.load_state_dict(state["optimizer"])
+    solver, fabric_optimizer = fabric.setup(model, optimizer)
+    validation = {name: _to_device(problems, fabric.device) for name, problems in validation.items()}
+    best_names = ["success", "rotation_error_deg", "translation_error"]
+    best_names += ["init_rotation_error_deg", "init_translation_error"]
+    columns = ["update", *LossTerms._fields, "ramp", "lr", "grad_norm", "skipped", "updates_per_second"]
+    columns += ["peak_memory_mib", *(f"val/{name}/{metric}" for name in validation for metric in best_names)]
+    history = None
+    if fabric.is_global_zero:
+        folder.mkdir(parents=True, exist_ok=True)
+        history = _History(folder, columns, start)
+
+    def save(update: int) -> None:
+        if fabric.is_global_zero:
+            content = {"update": update, "skipped": skipped, "identity": identity}
+            _save_checkpoint(
+                checkpoint, {**content, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
+            )
+        fabric.barrier()
+
+    model.train()
+    began = logged = time.perf_counter()
+    logged_update = update = start
+    interrupted = False
+    bar = tqdm(total=settings.updates, initial=start, disable=not (progress and fabric.is_global_zero), unit="update")
+    with _stop_on_signal() as stop, bar:
+        while update < settings.updates and not interrupted:
+            factor = settings.lr_factor(update)
+            for group in optimizer.param_groups:
+                group["lr"] = group["initial_lr"] * factor
+            ramp = settings.ramp_factor(update)
+            problems = _share(data.batch(update), fabric)
+            result = solver(problems.world_points, problems.img_points, problems.intrinsics)
+            terms = loss(result, problems, ramp)
+            optimizer.zero_grad()
+            fabric.backward(terms.total)
+            norm = nn.utils.clip_grad_norm_(model.parameters(), settings.clip)
+            # All processes must take the same branch, whoever saw the bad number or the signal.
+            bad, interrupted = _agree(fabric, not bool(torch.isfinite(terms.total + norm)), stop.is_set())
+            if bad:
+                skipped += 1
+                if fabric.is_global_zero:
+                    tqdm.write(f"update {update}: loss or gradient not finite, step skipped ({skipped} so far)")
+            else:
+                fabric_optimizer.step()
+            update += 1
+            bar.update()
+
+            if skipped > settings.max_skipped:
+                raise TrainingError(
+                    f"{skipped} steps had a loss or a gradient that is not finite, more than max_skipped = "
+                    f"{settings.max_skipped}, up to update {update}. Lower the learning rate or look at the data."
+                )
+            last = update == settings.updates or interrupted
+            if history is not None and (update % settings.log_every == 0 or last):
+                now = time.perf_counter()
+                rate = (update - logged_update) / max(now - logged, 1e-9)
+                row = {"update": update, **{name: term.item() for name, term in terms._asdict().items()}}
+                row |= {"ramp": ramp, "lr": settings.lr * factor, "grad_norm": norm.item(), "skipped": skipped}
+                row |= {"updates_per_second": rate, "peak_memory_mib": _peak_memory_mib(fabric.device)}
+                if update % settings.validate_every == 0 or update == settings.updates:
+                    model.eval()
+                    report = validate(model, validation)
+                    model.train()
+                    row |= report
+                    bar.set_postfix({name: f"{100 * report[f'val/{name}/success']:.1f}%" for name in validation})
+                history.write(row)
+                logged, logged_update = time.perf_counter(), update
+            if update % settings.checkpoint_every == 0 or last:
+                save(update)
+    if history is not None:
+        history.close()
+    model.eval()
+    seconds = time.perf_counter() - began
+    rate = (update - start) / max(seconds, 1e-9)
+    return FitReport(update, skipped, interrupted, seconds, rate, _peak_memory_mib(fabric.device))
+
+
+def _plain(value: Any) -> Any:
+    """Tuples as lists: what a checkpoint gives back."""
+    if isinstance(value, dict):
+        return {key: _plain(entry) for key, entry in value.items()}
+    return [_plain(entry) for entry in value] if isinstance(value, (list, tuple)) else value
+
+
+def _to_device(problems: Problems, device: torch.device) -> Problems:
+    pose = Pose(*(x.to(device) for x in problems.pose))
+    return problems._replace(
+        world_points=problems.world_points.to(device),
+        img_points=problems.img_points.to(device),
+        intrinsics=problems.intrinsics.to(device),
+        pose=pose,
+        inliers=problems.inliers.to(device),
+    )
+
+
+def _agree(fabric: Fabric, *flags: bool) -> list[bool]:
+    """Whether each flag is set on any process."""
+    if fabric.world_size == 1:
+        return list(flags)
+    counts = fabric.all_reduce(torch.tensor(flags, dtype=torch.float32, device=fabric.device), reduce_op="sum")
+    return (torch.as_tensor(counts) > 0).tolist()
+
+
+def train_briefly(seconds: float, folder: str | Path, *, progress: bool = True) -> Path:
+    """Train a new PnP-Net for n = 9 for about so many seconds, to show that training works here.
+
+    Args:
+        seconds: how long, roughly; the speed of this machine is measured first.
+        folder: where the run is kept; a run that is already there is replaced.
+        progress: show a progress bar.
+
+    Returns:
+        The path of the learning curves, a CSV file.
+    """
+    folder = Path(folder)
+    (folder / CHECKPOINT_NAME).unlink(missing_ok=True)
+    torch.manual_seed(0)
+    model = PnPNet(MLPInit(9), RobustWeightedLM(5))
+    data = SyntheticProblems(n=9, batch_size=250, seed=0, outliers=OutlierMix())
+    validation = {
+        "none": SyntheticProblems(n=9, batch_size=500, seed=900_001).batch(0),
+        "uniform": SyntheticProblems(n=9, batch_size=500, seed=900_002, outliers=OutlierMix()).batch(0),
+    }
+    loss = PoseLoss(saturation=0.02)
+    began = time.perf_counter()
+    for index in range(10):
+        problems = data.batch(index)
+        result = model(problems.world_points, problems.img_points, problems.intrinsics)
+        loss(result, problems).total.backward()
+    updates = max(100, round(seconds * 10 / (time.perf_counter() - began)) // 100 * 100)
+    settings = TrainSettings(
+        updates, warmup=100, log_every=updates // 20, validate_every=updates // 20, checkpoint_every=updates
+    )
+    fit(model, data, validation, loss, settings, folder, progress=progress)
+    return folder / HISTORY_NAME

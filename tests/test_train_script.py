@@ -1,0 +1,114 @@
+"""``train.py`` and ``conf``: every configuration composes and trains; sweeps and resuming work from the shell."""
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+
+from kornia_pnpnet import PnPNet
+from kornia_pnpnet.training import fit
+
+REPO = Path(__file__).resolve().parents[1]
+EXPERIMENTS = sorted(path.stem for path in (REPO / "conf" / "experiment").glob("*.yaml"))
+DATA = sorted(path.stem for path in (REPO / "conf" / "data").glob("*.yaml"))
+
+
+def composed(*overrides):
+    with initialize_config_dir(str(REPO / "conf"), version_base="1.3"):
+        return compose("train", overrides=list(overrides))
+
+
+def train_two_updates(config, folder):
+    return fit(
+        instantiate(config.model.solver),
+        instantiate(config.data.train),
+        {name: instantiate(source).batch(0) for name, source in config.data.validation.items()},
+        instantiate(config.loss),
+        instantiate(config.train, _convert_="all"),
+        folder,
+        fabric=instantiate(config.engine),
+        progress=False,
+    )
+
+
+def run(*arguments, check=True):
+    command = [sys.executable, str(REPO / "train.py"), *arguments, "debug=two_updates", "threads=1"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
+    assert not check or done.returncode == 0, done.stderr
+    return done
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_every_experiment_trains(experiment, tmp_path):
+    config = composed(f"experiment={experiment}", "debug=two_updates")
+    assert train_two_updates(config, tmp_path).update == 2
+
+
+@pytest.mark.parametrize("data", DATA)
+def test_every_data_config_trains(data, tmp_path):
+    config = composed(f"data={data}", "debug=two_updates")
+    assert train_two_updates(config, tmp_path).update == 2
+
+
+def test_model_net_has_no_refinement(tmp_path):
+    config = composed("model=net", "debug=two_updates")
+    assert instantiate(config.model.solver).refine.m == 0
+    assert train_two_updates(config, tmp_path).update == 2
+
+
+def test_overrides_reach_the_parts():
+    config = composed("model.n=12", "model.m=3", "data.outliers.max_ratio=0.2", "batch_size=7", "seed=5")
+    solver = instantiate(config.model.solver)
+    data = instantiate(config.data.train)
+    assert (solver.init.n, solver.refine.m) == (12, 3)
+    assert (data.n, data.batch_size, data.seed, data.outliers.max_count(12)) == (12, 7, 5, 2)
+    assert all(instantiate(source).n == 12 for source in config.data.validation.values())
+
+
+def test_protocol_is_the_papers():
+    config = composed("experiment=protocol")
+    settings = instantiate(config.train, _convert_="all")
+    assert (settings.updates, settings.lr, config.batch_size, config.model.n, config.model.m) == (200_000, 1e-4, 1000, 9, 5)
+    assert settings.lr_factor(100_000) == 1.0
+    assert instantiate(config.data.train).outliers.max_count(9) == 3
+
+
+def test_a_typing_error_in_a_config_raises():
+    with pytest.raises(Exception, match="kernal"):
+        instantiate(composed("+model.solver.refine.kernal=huber").model.solver)
+
+
+def test_run_writes_results_and_resumes(tmp_path):
+    run(f"hydra.run.dir={tmp_path}", "train.updates=1")
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert results["run"]["update"] == 1
+    assert set(results["validation"]) == {"none", "uniform", "slab"}
+    assert "train.updates=1" in results["overrides"]
+    model = PnPNet.from_pretrained(tmp_path / "weights")
+    checkpoint = torch.load(tmp_path / "last.ckpt", weights_only=True)["model"]
+    assert all(torch.equal(value, checkpoint[name]) for name, value in model.state_dict().items())
+    assert "model.n=" not in (tmp_path / "weights" / "README.md").read_text()
+
+    again = run(f"hydra.run.dir={tmp_path}", "train.updates=1", check=False)
+    assert again.returncode == 1
+    assert "resume=true" in again.stdout + again.stderr
+    assert "Traceback" not in again.stdout + again.stderr
+    done = run(f"hydra.run.dir={tmp_path}", "train.updates=1", "resume=true")
+    assert "1 updates" in done.stdout + done.stderr
+
+
+def test_sweep_leaves_results_and_a_summary(tmp_path):
+    run("-m", "model.n=6,9", "model.m=0,2", "data.outliers.max_ratio=0.33", f"hydra.sweep.dir={tmp_path}")
+    assert len(list(tmp_path.glob("*/results.json"))) == 4
+    with (tmp_path / "summary.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert {(row["model.n"], row["model.m"]) for row in rows} == {("6", "0"), ("6", "2"), ("9", "0"), ("9", "2")}
+    for row in rows:
+        results = json.loads((tmp_path / row["run"] / "results.json").read_text())
+        assert float(row["uniform/rate"]) == pytest.approx(results["validation"]["uniform"]["success"]["rate"], abs=1e-4)

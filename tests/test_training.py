@@ -1,0 +1,285 @@
+"""The training loop: resuming equals not stopping, bad steps are skipped, two processes equal one."""
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+from kornia_pnpnet import MLPInit, PnPNet, PoseLoss, RobustWeightedLM
+from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet.training import (
+    CHECKPOINT_NAME,
+    HISTORY_NAME,
+    TrainingError,
+    TrainSettings,
+    _save_checkpoint,
+    fit,
+    train_briefly,
+)
+
+REPO = Path(__file__).resolve().parents[1]
+
+
+def make_parts(updates=6, **changes):
+    torch.manual_seed(0)
+    settings = {"warmup": 1, "log_every": 1, "validate_every": 3, "checkpoint_every": 2, "ramp": (0.2, 0.5), **changes}
+    return {
+        "model": PnPNet(MLPInit(6), RobustWeightedLM(2)),
+        "data": SyntheticProblems(n=6, batch_size=16, seed=3, outliers=OutlierMix()),
+        "validation": {"none": SyntheticProblems(n=6, batch_size=32, seed=4).batch(0)},
+        "loss": PoseLoss(saturation=0.02),
+        "settings": TrainSettings(updates, **settings),
+        "progress": False,
+    }
+
+
+def read_history(folder):
+    with (folder / HISTORY_NAME).open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def comparable(rows):
+    """History rows without what depends on the clock or the memory."""
+    return [{k: v for k, v in row.items() if k not in ("updates_per_second", "peak_memory_mib")} for row in rows]
+
+
+class StoppingLoss(PoseLoss):
+    """Sends a signal to this process while the given update is computed."""
+
+    def __init__(self, at, number):
+        super().__init__(saturation=0.02)
+        self.calls, self.at, self.number = 0, at, number
+
+    def forward(self, *args, **kwargs):
+        self.calls += 1
+        if self.calls == self.at:
+            os.kill(os.getpid(), self.number)
+        return super().forward(*args, **kwargs)
+
+
+class BrokenLoss(PoseLoss):
+    """Returns a loss that is not finite at some updates."""
+
+    def __init__(self, at, value):
+        super().__init__(saturation=0.02)
+        self.calls, self.at, self.value = 0, at, value
+
+    def forward(self, *args, **kwargs):
+        terms = super().forward(*args, **kwargs)
+        self.calls += 1
+        return terms._replace(total=terms.total * self.value) if self.calls in self.at else terms
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_resuming_after_a_signal_equals_not_stopping(tmp_path, number):
+    whole = make_parts()
+    fit(folder=tmp_path / "whole", **whole)
+
+    stopped = make_parts()
+    handler = signal.getsignal(number)
+    report = fit(folder=tmp_path / "parts", **{**stopped, "loss": StoppingLoss(3, number)})
+    assert report.interrupted
+    assert report.update == 3
+    assert signal.getsignal(number) is handler
+    assert len(read_history(tmp_path / "parts")) == 3
+
+    torch.manual_seed(77)  # a fresh process: other weights at first
+    again = make_parts()
+    again["model"] = PnPNet(MLPInit(6), RobustWeightedLM(2))
+    report = fit(folder=tmp_path / "parts", resume=True, **again)
+    assert not report.interrupted
+    assert report.update == 6
+    for name, value in whole["model"].state_dict().items():
+        assert torch.equal(value, again["model"].state_dict()[name]), name
+    assert comparable(read_history(tmp_path / "parts")) == comparable(read_history(tmp_path / "whole"))
+
+
+def test_history_after_the_checkpoint_is_written_again(tmp_path):
+    """A killed run has rows beyond its last checkpoint; resuming replaces them."""
+    fit(folder=tmp_path / "whole", **make_parts())
+    parts = make_parts(checkpoint_every=4)
+    loss = BrokenLoss(at=(6,), value=1.0)
+    loss.forward = lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt) if loss.calls == 5 else _count(loss, *a, **k)
+    with pytest.raises(KeyboardInterrupt):
+        fit(folder=tmp_path / "killed", **{**parts, "loss": loss})
+    assert [row["update"] for row in read_history(tmp_path / "killed")] == ["1", "2", "3", "4", "5"]
+    resumed = make_parts(checkpoint_every=4)
+    fit(folder=tmp_path / "killed", resume=True, **resumed)
+    assert comparable(read_history(tmp_path / "killed")) == comparable(read_history(tmp_path / "whole"))
+
+
+def _count(loss, *args, **kwargs):
+    loss.calls += 1
+    return PoseLoss.forward(loss, *args, **kwargs)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_steps_that_are_not_finite_are_skipped_and_counted(tmp_path, value):
+    parts = make_parts(updates=1)
+    before = {name: p.clone() for name, p in parts["model"].state_dict().items()}
+    report = fit(folder=tmp_path / "one", **{**parts, "loss": BrokenLoss((1,), value)})
+    assert report.skipped == 1
+    for name, p in parts["model"].state_dict().items():
+        assert torch.equal(p, before[name]), name
+
+    parts = make_parts(updates=5)
+    report = fit(folder=tmp_path / "some", **{**parts, "loss": BrokenLoss((2, 4), value)})
+    assert report.skipped == 2
+    assert all(p.isfinite().all() for p in parts["model"].parameters())
+    assert [row["skipped"] for row in read_history(tmp_path / "some")] == ["0", "1", "1", "2", "2"]
+
+
+def test_too_many_bad_steps_stop_the_run(tmp_path):
+    parts = make_parts(updates=9, max_skipped=2)
+    with pytest.raises(TrainingError, match=r"3 steps .* max_skipped = 2"):
+        fit(folder=tmp_path, **{**parts, "loss": BrokenLoss(range(1, 10), float("nan"))})
+
+
+def test_a_run_is_not_overwritten_by_accident(tmp_path):
+    fit(folder=tmp_path, **make_parts())
+    content = (tmp_path / CHECKPOINT_NAME).read_bytes()
+    with pytest.raises(TrainingError, match="resume=true"):
+        fit(folder=tmp_path, **make_parts())
+    assert (tmp_path / CHECKPOINT_NAME).read_bytes() == content
+
+
+def test_a_checkpoint_of_other_settings_is_refused(tmp_path):
+    fit(folder=tmp_path, **make_parts())
+    with pytest.raises(TrainingError, match="of another run: settings"):
+        fit(folder=tmp_path, resume=True, **make_parts(lr=1.0))
+
+
+@pytest.mark.parametrize("content", [b"", b"not a checkpoint", None])
+def test_a_damaged_checkpoint_is_refused(tmp_path, content):
+    fit(folder=tmp_path, **make_parts())
+    path = tmp_path / CHECKPOINT_NAME
+    path.write_bytes(path.read_bytes()[:-100] if content is None else content)
+    with pytest.raises(TrainingError, match="Cannot read the checkpoint"):
+        fit(folder=tmp_path, resume=True, **make_parts())
+
+
+def test_no_partial_checkpoint_is_left_when_writing_fails(tmp_path, monkeypatch):
+    path = tmp_path / CHECKPOINT_NAME
+    fit(folder=tmp_path, **make_parts(updates=2))
+    content = path.read_bytes()
+
+    def full_disk(state, file):
+        file.write(b"half of it")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(torch, "save", full_disk)
+    with pytest.raises(OSError, match="No space left"):
+        _save_checkpoint(path, {})
+    assert path.read_bytes() == content
+
+
+def test_schedules():
+    settings = TrainSettings(1000, warmup=10, final_lr=0.1, ramp=(0.2, 0.4))
+    assert settings.lr_factor(0) == pytest.approx(0.1, rel=1e-5)
+    assert settings.lr_factor(9) == pytest.approx(1.0, abs=1e-3)
+    assert settings.lr_factor(1000) == pytest.approx(0.1)
+    assert [settings.ramp_factor(u) for u in (0, 200, 300, 400, 999)] == [0.0, 0.0, 0.5, 1.0, 1.0]
+    assert TrainSettings(10, ramp=(0.0, 0.0)).ramp_factor(0) == 1.0
+
+
+def test_learning_lowers_the_loss(tmp_path):
+    parts = make_parts(updates=400, log_every=50, validate_every=50, checkpoint_every=400)
+    parts["data"] = SyntheticProblems(n=6, batch_size=128, seed=3)
+    fit(folder=tmp_path, **parts)
+    rows = read_history(tmp_path)
+    first, last = rows[0], rows[-1]
+    for name in ("init_rotation", "init_translation", "refined_rotation"):
+        assert float(last[name]) < 0.95 * float(first[name]), name
+
+
+def test_validation_does_not_change_the_training(tmp_path):
+    with_it, without = make_parts(validate_every=1), make_parts(validate_every=100)
+    fit(folder=tmp_path / "a", **with_it)
+    fit(folder=tmp_path / "b", **without)
+    for name, value in with_it["model"].state_dict().items():
+        assert torch.equal(value, without["model"].state_dict()[name]), name
+
+
+def test_training_outside_the_main_thread(tmp_path):
+    """Signals cannot be caught there; training works all the same."""
+    result = []
+    thread = threading.Thread(target=lambda: result.append(fit(folder=tmp_path, **make_parts())))
+    thread.start()
+    thread.join()
+    assert result[0].update == 6
+
+
+def test_train_briefly(tmp_path):
+    curves = train_briefly(1.0, tmp_path, progress=False)
+    assert curves == tmp_path / HISTORY_NAME
+    rows = read_history(tmp_path)
+    assert len(rows) >= 10
+    assert float(rows[-1]["val/none/success"]) > float(rows[0]["val/none/success"])
+
+
+DDP_SCRIPT = """
+import sys, torch
+sys.path.insert(0, {tests!r})
+from lightning_fabric import Fabric
+from test_training import make_parts
+from kornia_pnpnet.training import fit
+torch.set_num_threads(1)
+fabric = Fabric(accelerator="cpu", devices={devices}, strategy={strategy!r})
+fabric.launch()
+parts = make_parts()
+parts["model"].double()
+parts["data"].dtype = torch.float64
+parts["validation"] = {{}}
+fit(folder={folder!r}, fabric=fabric, **parts)
+if fabric.is_global_zero:
+    torch.save(parts["model"].state_dict(), {out!r})
+"""
+
+
+def test_two_processes_equal_one(tmp_path):
+    """Two CPU processes with gloo share the batch of one and arrive at the same weights."""
+    states = []
+    for devices, strategy in ((1, "auto"), (2, "ddp")):
+        script, out = tmp_path / f"run{devices}.py", tmp_path / f"{devices}.pt"
+        script.write_text(
+            DDP_SCRIPT.format(
+                tests=str(REPO / "tests"),
+                devices=devices,
+                strategy=strategy,
+                folder=str(tmp_path / str(devices)),
+                out=str(out),
+            )
+        )
+        done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=240, check=False)
+        assert done.returncode == 0, done.stderr
+        states.append(torch.load(out, weights_only=True))
+    assert "distributed_backend=gloo" in done.stderr
+    for name, value in states[0].items():
+        torch.testing.assert_close(states[1][name], value, rtol=0, atol=1e-9)
+    start = make_parts()["model"].double().state_dict()
+    assert any(not torch.equal(states[0][name], start[name]) for name in start)
+
+
+def test_a_batch_that_cannot_be_shared_is_refused(tmp_path):
+    class ThreeProcesses:
+        world_size, global_rank, is_global_zero, device = 3, 0, True, torch.device("cpu")
+
+    with pytest.raises(Exception, match="batch of 16 cannot be shared equally among 3"):
+        fit(folder=tmp_path, fabric=ThreeProcesses(), **make_parts())
+
+
+def test_first_stage_only_trains(tmp_path):
+    """m = 0 leaves no hyperparameters to learn."""
+    parts = make_parts()
+    parts["model"] = PnPNet(MLPInit(6), RobustWeightedLM(0))
+    before = [p.clone() for p in parts["model"].init.parameters()]
+    fit(folder=tmp_path, **parts)
+    assert any(not torch.equal(a, b) for a, b in zip(before, parts["model"].init.parameters(), strict=True))
+    assert isinstance(parts["model"].init, nn.Module)

@@ -1,0 +1,82 @@
+"""Train a solver: ``python train.py``. See ``conf/train.yaml`` for what can be overridden."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from pathlib import Path
+
+import hydra
+import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from kornia_pnpnet.reports import RESULTS_NAME, run_results, summarize_runs, write_json, write_model_card
+from kornia_pnpnet.training import TrainingError, fit
+
+log = logging.getLogger("train")
+
+
+@hydra.main(version_base="1.3", config_path="conf", config_name="train")
+def main(config: DictConfig) -> float | None:
+    """Train, write results and weights; returns the success rate that a sweeper may maximise."""
+    runtime = HydraConfig.get()
+    folder = Path(runtime.runtime.output_dir)
+    if config.threads is not None:
+        torch.set_num_threads(config.threads)
+    fabric = instantiate(config.engine)
+    fabric.launch()
+    torch.manual_seed(config.seed)
+    model = instantiate(config.model.solver)
+    validation = {name: instantiate(source).batch(0) for name, source in config.data.validation.items()}
+    settings = instantiate(config.train, _convert_="all")
+    if fabric.is_global_zero:
+        parameters = sum(p.numel() for p in model.parameters() if p.requires_grad)
+        shape = f"n = {config.model.n}, m = {config.model.m}"
+        log.info("%s, %s parameters, %s processes", shape, parameters, fabric.world_size)
+    try:
+        report = fit(
+            model,
+            instantiate(config.data.train),
+            validation,
+            instantiate(config.loss),
+            settings,
+            folder,
+            fabric=fabric,
+            resume=config.resume,
+            progress=config.progress,
+        )
+    except TrainingError as error:
+        log.error("%s", error)
+        sys.exit(1)
+    if not fabric.is_global_zero:
+        return None
+    log.info(
+        "%s updates, %.1f per second, peak memory %.0f MiB, %s skipped",
+        report.update,
+        report.updates_per_second,
+        report.peak_memory_mib,
+        report.skipped,
+    )
+    if report.interrupted:
+        log.warning("Stopped at update %s of %s; continue with resume=true.", report.update, settings.updates)
+        sys.exit(130)
+    results = run_results(
+        model.cpu(), validation, report, OmegaConf.to_container(config, resolve=True), list(runtime.overrides.task)
+    )
+    write_json(folder / RESULTS_NAME, results)
+    model.save_pretrained(folder / "weights")
+    write_model_card(folder / "weights", results)
+    for name, entry in results["validation"].items():
+        rate = entry["success"]
+        log.info("%s: success %.1f %% [%.1f, %.1f]", name, *(100 * rate[key] for key in ("rate", "low", "high")))
+    log.info("Weights, model card and results are in %s", folder)
+    if runtime.mode == RunMode.MULTIRUN:
+        log.info("Sweep summary: %s", summarize_runs(runtime.sweep.dir))
+    return float(next(reversed(results["validation"].values()))["success"]["rate"])
+
+
+if __name__ == "__main__":
+    main()
