@@ -280,12 +280,13 @@ class RobustWeightedLM(nn.Module):
         robust = self.kernel.weight(projection.residual.square().sum(-1), shape)
         return torch.where(projection.in_front, prior * robust, 0.0)
 
-    def forward(self, corr: Correspondences, guess: Guess) -> Refinement:
+    def forward(self, corr: Correspondences, guess: Guess, *, m: int | None = None) -> Refinement:
         r"""Refine a guess.
 
         Args:
             corr: normalised correspondences of :math:`B` problems with :math:`N` pairs each.
             guess: poses in the frame of ``corr`` and a factor for the weight of each pair.
+            m: stop after this many iterations; all of them when ``None``.
 
         Returns:
             The refined poses; the weights and the cost at them, with the shape of the last iteration; and ``ok``,
@@ -298,7 +299,7 @@ class RobustWeightedLM(nn.Module):
         projection = project(pose, corr)
         solved = torch.ones_like(projection.in_front[:, 0])
         factor = torch.ones_like(corr.weights[:, 0])  # of the damping, per problem
-        for i in range(self.m):
+        for i in range(self.m if m is None else min(m, self.m)):
             weights = self._pair_weights(projection, prior, shape[i])
             candidate, solved = lm_step(
                 corr, pose, projection, weights, step[i], damping[i] * factor, additive=self.additive

@@ -87,7 +87,7 @@ class PoseLoss(nn.Module):
         *,
         rotation: float = 1.0,
         translation: float = 0.1,
-        init_translation: float = 0.05,
+        init_translation: float = 0.02,
         refined: float = 1.0,
         saturation: float | None = None,
     ) -> None:

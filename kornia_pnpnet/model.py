@@ -105,6 +105,8 @@ class PnPNet(nn.Module):
         weights: Tensor | None = None,
         mask: Tensor | None = None,
         init: Pose | None = None,
+        *,
+        first_stage_only: bool = False,
     ) -> PnPResult:
         r"""Solve a batch of problems.
 
@@ -116,6 +118,7 @@ class PnPNet(nn.Module):
             mask: False where a pair is padding, bool, shape :math:`(B, N)`. What padding holds does not matter.
             init: world-to-camera pose to start from instead of the initialiser's, :math:`(B, 3, 3)` and
                 :math:`(B, 3)`.
+            first_stage_only: return the first guess unrefined, the paper's "Net"; as with ``m=0``, at that cost.
 
         Returns:
             The :class:`~kornia_pnpnet.types.PnPResult`. Gradients flow through rotation, translation, weights, cost
@@ -136,7 +139,7 @@ class PnPNet(nn.Module):
                 guess = self._given(init, corr.weights, world_points, frame)
             else:
                 guess = self.init(corr)
-            refined = self.refine(corr, guess)
+            refined = self.refine(corr, guess, m=0 if first_stage_only else None)
             pose = self.normalize.undo(refined.pose, frame)
             first = self.normalize.undo(guess.pose, frame)
         pair_weights = refined.weights

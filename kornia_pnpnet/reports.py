@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 
+from kornia_pnpnet.environment import environment
 from kornia_pnpnet.metrics import pose_errors, success, success_rate
 from kornia_pnpnet.model import PnPNet
 from kornia_pnpnet.training import FitReport
@@ -46,8 +47,6 @@ def run_results(
     Returns:
         Plain data, ready for :func:`write_json`.
     """
-    from kornia_pnpnet.evaluation import environment
-
     sets = {}
     for name, problems in validation.items():
         result = model(problems.world_points, problems.img_points, problems.intrinsics)

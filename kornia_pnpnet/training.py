@@ -73,12 +73,12 @@ class TrainSettings:
     """
 
     updates: int
-    lr: float = 1e-3
-    lr_refine: float = 3e-3
+    lr: float = 3e-3
+    lr_refine: float = 1e-2
     warmup: int = 200
     final_lr: float = 0.02
     clip: float = 1.0
-    ramp: tuple[float, float] = (0.1, 0.2)
+    ramp: tuple[float, float] = (0.6, 0.62)
     max_skipped: int = 100
     log_every: int = 100
     validate_every: int = 1000
@@ -318,10 +318,12 @@ def fit(
                 group["lr"] = group["initial_lr"] * factor
             ramp = settings.ramp_factor(update)
             problems = _share(data.batch(update), fabric)
-            result = solver(problems.world_points, problems.img_points, problems.intrinsics)
-            terms = loss(result, problems, ramp)
+            inputs = (problems.world_points, problems.img_points, problems.intrinsics)
+            terms = loss(solver(*inputs, first_stage_only=ramp == 0.0), problems, ramp)
+            # The zero keeps the refiner in the graph before the ramp: processes expect gradients of every parameter.
+            unused = sum(p.sum() for p in model.refine.parameters() if p.requires_grad) if ramp == 0.0 else 0.0
             optimizer.zero_grad()
-            fabric.backward(terms.total)
+            fabric.backward(terms.total + 0.0 * unused)
             norm = nn.utils.clip_grad_norm_(model.parameters(), settings.clip)
             # All processes must take the same branch, whoever saw the bad number or the signal.
             bad, interrupted = _agree(fabric, not bool(torch.isfinite(terms.total + norm)), stop.is_set())

@@ -125,9 +125,9 @@ class SlabPoints:
         *,
         window: tuple[float, float] = (0.15, 0.8),
         field_of_view: float = 0.9,
-        distance: tuple[float, float] = (10.0, 80.0),
+        distance: tuple[float, float] = (10.0, 40.0),
         tilt: float = 0.5,
-        thickness: tuple[float, float] = (0.02, 8.0),
+        thickness: tuple[float, float] = (0.02, 4.0),
     ) -> None:
         self.window = window
         self.field_of_view = field_of_view
