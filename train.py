@@ -14,7 +14,8 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from kornia_pnpnet.reports import RESULTS_NAME, run_results, summarize_runs, write_json, write_model_card
-from kornia_pnpnet.training import TrainingError, fit
+from kornia_pnpnet.runstate import TrainingError
+from kornia_pnpnet.training import fit
 
 log = logging.getLogger("train")
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
-from kornia.core.exceptions import DeviceError, ShapeError, TypeCheckError, ValueCheckError
+from kornia.core.exceptions import BaseError, DeviceError, ShapeError, TypeCheckError, ValueCheckError
 from torch import Tensor, nn
 
 from kornia_pnpnet.init import MLPInit
@@ -184,13 +184,15 @@ class PnPNet(nn.Module):
             ValueCheckError: when a part or an argument is unknown.
         """
         try:
+            if set(config) != {"init", "refine", "normalize"}:
+                raise KeyError(f"parts {sorted(config)}")
             init_config = config["init"]
             init = None
             if init_config is not None:
                 arguments = {key: value for key, value in init_config.items() if key != "name"}
                 init = _INITIALISERS[init_config["name"]](**arguments)
             return cls(init, RobustWeightedLM(**config["refine"]), Normalize(**config["normalize"]))
-        except (KeyError, TypeError, AttributeError) as error:
+        except (BaseError, KeyError, TypeError, AttributeError) as error:
             raise ValueCheckError(f"Not a configuration of PnPNet: {error!r}.") from error
 
     def save_pretrained(self, folder: str | Path) -> None:

@@ -40,8 +40,8 @@ class Frame(NamedTuple):
 class Normalize(nn.Module):
     r"""Normalise cameras, order and world frame.
 
-    A problem is *valid* when what its pairs hold is finite, its weights are not negative, at least three pairs have
-    a weight, its camera has positive focal lengths and no skew, and its points do not lie on one line or point. The
+    A problem is *valid* when what its pairs hold is finite (and small enough to be squared twice), its weights are not
+    negative, at least three pairs have a weight, its camera has positive focal lengths and no skew, and its points do not lie on one line or point. The
     inputs of invalid problems are replaced by zeros, which keeps values and gradients finite everywhere behind.
 
     Args:
@@ -97,14 +97,19 @@ class Normalize(nn.Module):
         """
         weights = torch.ones_like(world_points[..., 0]) if weights is None else weights
         there = torch.ones_like(weights, dtype=torch.bool) if mask is None else mask
+        # Beyond this, squares of squares overflow; NaN compares false. Pixels are bounded as the normalised camera's.
+        limit = torch.finfo(world_points.dtype).max ** 0.25
+        with torch.no_grad():
+            raw_pixels = self.f_const * normalize_points_with_intrinsics(img_points, intrinsics)
         finite = (
-            world_points.isfinite().all(-1)
-            & img_points.isfinite().all(-1)
-            & weights.isfinite()
+            (world_points.abs() < limit).all(-1)
+            & (raw_pixels.abs() < limit).all(-1)
+            & (weights < limit)
             & (weights >= 0)
         )
         focal_lengths = intrinsics.diagonal(dim1=-2, dim2=-1)[:, :2]
-        camera_ok = intrinsics.isfinite().flatten(1).all(-1) & (focal_lengths > 0).all(-1) & (intrinsics[:, 0, 1] == 0)
+        camera_ok = (intrinsics.abs() < limit).flatten(1).all(-1)
+        camera_ok = camera_ok & (focal_lengths > 0).all(-1) & (intrinsics[:, 0, 1] == 0)
         valid = camera_ok & (finite | ~there).all(-1)
 
         # Inputs are made safe before anything is computed from them.
@@ -112,10 +117,11 @@ class Normalize(nn.Module):
         eye = torch.eye(3, dtype=intrinsics.dtype, device=intrinsics.device)
         intrinsics = torch.where(valid[:, None, None], intrinsics, eye)
         world_points = torch.where(there[..., None], world_points, 0.0)
+        img_points = torch.where(there[..., None], img_points, 0.0)
         weights = torch.where(there, weights, 0.0)
         there = weights > 0
         pixels = self.f_const * normalize_points_with_intrinsics(img_points, intrinsics)
-        pixels = torch.where(there[..., None], torch.where(there[..., None], pixels, 0.0), 0.0)
+        pixels = torch.where(there[..., None], pixels, 0.0)
         valid = valid & (there.sum(-1) >= 3)
 
         centroid, scale, spread_out = self._world_frame(world_points, there)

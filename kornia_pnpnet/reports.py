@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 import torch
 
 from kornia_pnpnet.environment import environment
+from kornia_pnpnet.files import atomic_open
 from kornia_pnpnet.metrics import pose_errors, success, success_rate
 from kornia_pnpnet.model import PnPNet
 from kornia_pnpnet.training import FitReport
@@ -24,11 +24,9 @@ RESULTS_NAME = "results.json"
 
 
 def write_json(path: str | Path, content: Any) -> None:
-    """Write a JSON file in one piece."""
-    path = Path(path)
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
-    os.replace(temporary, path)
+    """Write a JSON file that people can read, in one piece."""
+    with atomic_open(path) as file:
+        file.write(json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
 @torch.no_grad()
@@ -95,12 +93,10 @@ def summarize_runs(folder: str | Path) -> Path | None:
     if not rows:
         return None
     columns = list(dict.fromkeys(key for row in rows for key in row))
-    temporary = folder / f"summary.{os.getpid()}.tmp"  # runs of a parallel launcher may end together
-    with temporary.open("w", newline="") as file:
+    with atomic_open(folder / "summary.csv", newline="") as file:  # runs of a parallel launcher may end together
         writer = csv.DictWriter(file, columns, restval="")
         writer.writeheader()
         writer.writerows(rows)
-    os.replace(temporary, folder / "summary.csv")
     return folder / "summary.csv"
 
 

@@ -6,16 +6,11 @@ skipped when they are not finite, and a run that can be stopped at any moment an
 
 from __future__ import annotations
 
-import csv
 import math
-import os
 import resource
-import signal
 import sys
-import threading
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -24,7 +19,6 @@ import torch
 from kornia.core.check import KORNIA_CHECK
 from lightning_fabric import Fabric
 from torch import nn
-from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
@@ -33,15 +27,18 @@ from kornia_pnpnet.lm import RobustWeightedLM
 from kornia_pnpnet.losses import LossTerms, PoseLoss
 from kornia_pnpnet.metrics import pose_errors, success, success_rate
 from kornia_pnpnet.model import PnPNet
+from kornia_pnpnet.runstate import (
+    CHECKPOINT_NAME,
+    HISTORY_NAME,
+    History,
+    TrainingError,
+    load_checkpoint,
+    save_checkpoint,
+    stop_on_signal,
+)
 from kornia_pnpnet.types import Pose, Problems
 
-__all__ = ["FitReport", "ProblemSource", "TrainSettings", "TrainingError", "fit", "train_briefly", "validate"]
-
-CHECKPOINT_NAME, HISTORY_NAME = "last.ckpt", "history.csv"
-
-
-class TrainingError(RuntimeError):
-    """The training cannot go on, or cannot be continued as asked; the message says why and what to do."""
+__all__ = ["FitReport", "ProblemSource", "TrainSettings", "fit", "train_briefly", "validate"]
 
 
 class ProblemSource(Protocol):
@@ -116,22 +113,6 @@ class FitReport:
     peak_memory_mib: float
 
 
-@contextmanager
-def _stop_on_signal() -> Iterator[threading.Event]:
-    """Turn SIGTERM and Ctrl-C into an event, so that the loop can save before it ends."""
-    event = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield event
-        return
-    signals = (signal.SIGTERM, signal.SIGINT)
-    before = [signal.signal(number, lambda *_: event.set()) for number in signals]
-    try:
-        yield event
-    finally:
-        for number, handler in zip(signals, before, strict=True):
-            signal.signal(number, handler)
-
-
 def _peak_memory_mib(device: torch.device) -> float:
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device) / 2**20
@@ -169,60 +150,6 @@ def validate(model: nn.Module, validation: Mapping[str, Problems]) -> dict[str, 
         report[f"val/{name}/init_rotation_error_deg"] = first.rotation_error_deg.median().item()
         report[f"val/{name}/init_translation_error"] = first.translation_error.median().item()
     return report
-
-
-class _History:
-    """Learning curves in one CSV file and TensorBoard; rows after the resumed update are dropped."""
-
-    def __init__(self, folder: Path, columns: list[str], start: int) -> None:
-        self._path = folder / HISTORY_NAME
-        self._columns = columns
-        rows: list[dict[str, Any]] = []
-        if start and self._path.is_file():
-            with self._path.open(newline="") as file:
-                rows = [row for row in csv.DictReader(file) if int(row["update"]) <= start]
-        temporary = self._path.with_suffix(".tmp")
-        with temporary.open("w", newline="") as file:
-            writer = csv.DictWriter(file, columns, restval="", extrasaction="ignore")
-            writer.writeheader()
-            writer.writerows(rows)
-        os.replace(temporary, self._path)
-        self._board = SummaryWriter(folder / "tensorboard", purge_step=start or None)
-
-    def write(self, row: dict[str, float]) -> None:
-        with self._path.open("a", newline="") as file:
-            csv.DictWriter(file, self._columns, restval="").writerow(
-                {key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()}
-            )
-        for key, value in row.items():
-            if key != "update":
-                self._board.add_scalar(key, value, int(row["update"]))
-
-    def close(self) -> None:
-        self._board.close()
-
-
-def _save_checkpoint(path: Path, state: dict[str, Any]) -> None:
-    """Write a checkpoint in one piece: a run killed at any moment leaves the old one or the new one."""
-    temporary = path.with_suffix(".tmp")
-    with temporary.open("wb") as file:
-        torch.save(state, file)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
-
-
-def _load_checkpoint(path: Path, identity: dict[str, Any]) -> dict[str, Any]:
-    try:
-        state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
-        saved = state["identity"]
-    except Exception as error:  # torch.load raises many types on a damaged file
-        raise TrainingError(f"Cannot read the checkpoint {path}: {error}") from error
-    differing = sorted(key for key in identity if saved.get(key) != identity[key])
-    if differing:
-        details = "; ".join(f"{key}: {saved.get(key)!r} there, {identity[key]!r} now" for key in differing)
-        raise TrainingError(f"The checkpoint {path} is of another run: {details}.")
-    return state
 
 
 def fit(
@@ -275,7 +202,7 @@ def fit(
     if checkpoint.exists():
         if not resume:
             raise TrainingError(f"{checkpoint} exists: pass resume=true to continue it, or choose another folder.")
-        state = _load_checkpoint(checkpoint, identity)
+        state = load_checkpoint(checkpoint, identity)
         start, skipped = state["update"], state["skipped"]
         model.load_state_dict(state["model"])
 
@@ -296,14 +223,12 @@ def fit(
     history = None
     if fabric.is_global_zero:
         folder.mkdir(parents=True, exist_ok=True)
-        history = _History(folder, columns, start)
+        history = History(folder, columns, start)
 
     def save(update: int) -> None:
         if fabric.is_global_zero:
             content = {"update": update, "skipped": skipped, "identity": identity}
-            _save_checkpoint(
-                checkpoint, {**content, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
-            )
+            save_checkpoint(checkpoint, {**content, "model": model.state_dict(), "optimizer": optimizer.state_dict()})
         fabric.barrier()
 
     model.train()
@@ -311,7 +236,7 @@ def fit(
     logged_update = update = start
     interrupted = False
     bar = tqdm(total=settings.updates, initial=start, disable=not (progress and fabric.is_global_zero), unit="update")
-    with _stop_on_signal() as stop, bar:
+    with stop_on_signal() as stop, bar:
         while update < settings.updates and not interrupted:
             factor = settings.lr_factor(update)
             for group in optimizer.param_groups:

@@ -85,9 +85,10 @@ class PnPResult(NamedTuple):
         weights: final weight of each pair, in the order in which the pairs were given, shape :math:`(B, N)`.
         cost: mean robust loss of the pairs, in the kernel's unit (see :mod:`kornia_pnpnet.robust`), shape
             :math:`(B,)`. Comparable between problems solved by the same solver.
-        ok: whether the pose can be used, bool, shape :math:`(B,)`. Where it is false the other fields are finite and
+        ok: whether the pose can be used, bool, shape :math:`(B,)`. Where it is false the fields above are finite and
             carry no gradient.
-        init: the first guess that was refined.
+        init: the first guess that was refined. It carries a gradient whenever the problem itself is sound, so that it
+            can be trained from guesses that refinement cannot save.
     """
 
     rotation: Tensor

@@ -74,7 +74,13 @@ def test_overrides_reach_the_parts():
 def test_protocol_is_the_papers():
     config = composed("experiment=protocol")
     settings = instantiate(config.train, _convert_="all")
-    assert (settings.updates, settings.lr, config.batch_size, config.model.n, config.model.m) == (200_000, 1e-4, 1000, 9, 5)
+    assert (settings.updates, settings.lr, config.batch_size, config.model.n, config.model.m) == (
+        200_000,
+        1e-4,
+        1000,
+        9,
+        5,
+    )
     assert settings.lr_factor(100_000) == 1.0
     assert instantiate(config.data.train).outliers.max_count(9) == 3
 
@@ -111,4 +117,6 @@ def test_sweep_leaves_results_and_a_summary(tmp_path):
     assert {(row["model.n"], row["model.m"]) for row in rows} == {("6", "0"), ("6", "2"), ("9", "0"), ("9", "2")}
     for row in rows:
         results = json.loads((tmp_path / row["run"] / "results.json").read_text())
-        assert float(row["uniform/rate"]) == pytest.approx(results["validation"]["uniform"]["success"]["rate"], abs=1e-4)
+        assert float(row["uniform/rate"]) == pytest.approx(
+            results["validation"]["uniform"]["success"]["rate"], abs=1e-4
+        )

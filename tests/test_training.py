@@ -14,15 +14,8 @@ from torch import nn
 
 from kornia_pnpnet import MLPInit, PnPNet, PoseLoss, RobustWeightedLM
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
-from kornia_pnpnet.training import (
-    CHECKPOINT_NAME,
-    HISTORY_NAME,
-    TrainingError,
-    TrainSettings,
-    _save_checkpoint,
-    fit,
-    train_briefly,
-)
+from kornia_pnpnet.runstate import CHECKPOINT_NAME, HISTORY_NAME, TrainingError, save_checkpoint
+from kornia_pnpnet.training import TrainSettings, fit, train_briefly
 
 REPO = Path(__file__).resolve().parents[1]
 
@@ -106,7 +99,9 @@ def test_history_after_the_checkpoint_is_written_again(tmp_path):
     fit(folder=tmp_path / "whole", **make_parts())
     parts = make_parts(checkpoint_every=4)
     loss = BrokenLoss(at=(6,), value=1.0)
-    loss.forward = lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt) if loss.calls == 5 else _count(loss, *a, **k)
+    loss.forward = lambda *a, **k: (
+        (_ for _ in ()).throw(KeyboardInterrupt) if loss.calls == 5 else _count(loss, *a, **k)
+    )
     with pytest.raises(KeyboardInterrupt):
         fit(folder=tmp_path / "killed", **{**parts, "loss": loss})
     assert [row["update"] for row in read_history(tmp_path / "killed")] == ["1", "2", "3", "4", "5"]
@@ -176,7 +171,8 @@ def test_no_partial_checkpoint_is_left_when_writing_fails(tmp_path, monkeypatch)
 
     monkeypatch.setattr(torch, "save", full_disk)
     with pytest.raises(OSError, match="No space left"):
-        _save_checkpoint(path, {})
+        save_checkpoint(path, {})
+    assert list(tmp_path.glob("*.tmp")) == []
     assert path.read_bytes() == content
 
 

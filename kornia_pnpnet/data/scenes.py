@@ -138,9 +138,7 @@ class SceneProblems:
         view = torch.randint(len(self.views), (self.batch_size,), generator=generator)
         rows = _choose(self._counts[view], self.n + self.num_spares, generator) + self._starts[view, None]
         rows, spare_rows = rows[:, : self.n], rows[:, self.n :]  # (B, N), (B, num_spares)
-        prior = random_poses(
-            self.batch_size, generator, translation_box=self.translation_box, max_angle=self.max_angle
-        )
+        prior = random_poses(self.batch_size, generator, translation_box=self.translation_box, max_angle=self.max_angle)
         anywhere = uniform((self.batch_size, self.n, 2), 0.0, 1.0, generator) * self._size[view, None]
         draw = self.outliers.draw(self.batch_size, self.n, generator)
 

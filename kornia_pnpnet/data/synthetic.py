@@ -32,7 +32,7 @@ def batch_generator(seed: int, index: int, device: str | torch.device = "cpu") -
 
     The two numbers are hashed because CPU generators only use 32 bits of their seed.
     """
-    state = int(np.random.SeedSequence((seed, index)).generate_state(1, np.uint64)[0])
+    state = int(np.random.SeedSequence(seed, spawn_key=(index,)).generate_state(1, np.uint64)[0])
     return torch.Generator(device).manual_seed(state >> 1)
 
 
@@ -268,8 +268,8 @@ class SyntheticProblems:
             translation_sigma=self.translation_sigma,
             max_angle=self.max_angle,
         )
-        cam_points = self.points(self.batch_size, self.n, generator)
-        other_points = self.points(self.batch_size, self.n, generator)
+        # Mismatches show other points of the same scene, so both are drawn at once.
+        cam_points, other_points = self.points(self.batch_size, 2 * self.n, generator).chunk(2, 1)
         draw = self.outliers.draw(self.batch_size, self.n, generator)
         anywhere = uniform((self.batch_size, self.n, 2), -self.half_image, self.half_image, generator)
 

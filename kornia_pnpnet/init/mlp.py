@@ -26,6 +26,16 @@ def _relu_layers(sizes: list[int]) -> list[nn.Module]:
     return layers
 
 
+def _run(layers: nn.Sequential, hidden: Tensor) -> Tensor:
+    """The layers in the dtype of their input, whatever that of their weights."""
+    for layer in layers:
+        if isinstance(layer, nn.Linear):
+            hidden = nn.functional.linear(hidden, layer.weight.to(hidden.dtype), layer.bias.to(hidden.dtype))
+        else:
+            hidden = layer(hidden)
+    return hidden
+
+
 class MLPInit(nn.Module):
     r"""Stage 1 of PnP-Net: a small multilayer perceptron for exactly ``n`` ordered pairs.
 
@@ -35,7 +45,7 @@ class MLPInit(nn.Module):
     numbers. All pairs weigh the same.
 
     Source: Sheffer and Wiesel 2020, figure 2. The scales of the input are ours: they bring both kinds of coordinates
-    to the order of 1. The network computes in its own dtype, whatever that of the correspondences.
+    to the order of 1. The network computes in the wider of its own dtype and that of the correspondences.
 
     Args:
         n: number of pairs.
@@ -89,13 +99,13 @@ class MLPInit(nn.Module):
                 expected_shape=["B", str(self.n), "3"],
             )
         features = torch.cat((corr.world_points / self.world_scale, corr.img_points / self.img_scale), -1)
-        dtype = next(self.parameters()).dtype
-        hidden = self.shared(features.flatten(1).to(dtype))  # (B, 3n)
-        axis_and_angle = self.rotation(hidden)
+        dtype = torch.promote_types(features.dtype, next(self.parameters()).dtype)
+        hidden = _run(self.shared, features.flatten(1).to(dtype))  # (B, 3n)
+        axis_and_angle = _run(self.rotation, hidden)
         axis, angle = axis_and_angle[:, :3], axis_and_angle[:, 3:]
         # |s| with a floor under the root: the gradient stays finite where the branch returns zeros.
         length = (axis.square().sum(-1, keepdim=True) + torch.finfo(dtype).eps).sqrt()
         rotation_vector = (axis / length * angle).to(corr.world_points.dtype)
-        translation = self.translation(hidden).to(corr.world_points.dtype)
+        translation = _run(self.translation, hidden).to(corr.world_points.dtype)
         pose = Pose(axis_angle_to_rotation_matrix(rotation_vector), translation)
         return Guess(pose, torch.ones_like(corr.weights))

@@ -1,0 +1,96 @@
+"""Helpers that the tests share: problems, correspondences and poses, all seeded, all in float64 unless asked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+from torch import Tensor
+
+from kornia_pnpnet import Correspondences, Normalize, Pose, Problems
+from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet.geometry import retract
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _one_thread() -> None:
+    """The tensors are small: threads only get into each other's way, above all under pytest-xdist."""
+    torch.set_num_threads(1)
+
+
+@pytest.fixture(autouse=True)
+def _seed() -> None:
+    """Networks draw their weights from the global generator: the same ones whatever ran before."""
+    torch.manual_seed(0)
+
+
+@pytest.fixture
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(0)
+
+
+@pytest.fixture
+def make_problems() -> Callable[..., Problems]:
+    def make(
+        n: int = 9,
+        batch: int = 7,
+        *,
+        outliers: int = 0,
+        noise: bool = True,
+        seed: int = 0,
+        dtype: torch.dtype = torch.float64,
+    ) -> Problems:
+        source = SyntheticProblems(
+            n=n,
+            batch_size=batch,
+            seed=seed,
+            outliers=OutlierMix(count=outliers),
+            img_sigma=1.0 if noise else 0.0,
+            world_sigma=0.05 if noise else 0.0,
+            dtype=dtype,
+        )
+        return source.batch(0)
+
+    return make
+
+
+@pytest.fixture
+def correspond() -> Callable[[Problems], tuple[Correspondences, Pose]]:
+    """Normalised correspondences (centred, scaled, unordered) of some problems, and the true pose in their frame."""
+
+    def make(problems: Problems) -> tuple[Correspondences, Pose]:
+        normalize = Normalize(order=False)
+        corr, frame = normalize(problems.world_points, problems.img_points, problems.intrinsics)
+        return corr, normalize.apply_to_pose(problems.pose, frame)
+
+    return make
+
+
+@pytest.fixture
+def random_rotations() -> Callable[..., Tensor]:
+    """Rotations about random axes, by random angles or by given ones."""
+
+    def make(batch: int, *, angle: float | Tensor | None = None, seed: int = 0) -> Tensor:
+        generator = torch.Generator().manual_seed(seed)
+        axis = torch.randn(batch, 3, generator=generator, dtype=torch.float64)
+        axis = axis / axis.norm(dim=-1, keepdim=True)
+        if angle is None:
+            angle = 3.0 * torch.rand(batch, 1, generator=generator, dtype=torch.float64)
+        return axis_angle_to_rotation_matrix(axis * angle)
+
+    return make
+
+
+@pytest.fixture
+def perturb() -> Callable[..., Pose]:
+    """A pose turned by ``angle`` radians about a random axis and shifted by ``shift`` in a random direction."""
+
+    def make(pose: Pose, *, angle: float = 0.05, shift: float = 0.05, seed: int = 1) -> Pose:
+        generator = torch.Generator().manual_seed(seed)
+        delta = torch.randn(pose.translation.shape[0], 2, 3, generator=generator, dtype=torch.float64)
+        delta = delta / delta.norm(dim=-1, keepdim=True) * torch.tensor([angle, shift], dtype=torch.float64)[:, None]
+        return retract(pose, delta.flatten(1).to(pose.translation))
+
+    return make

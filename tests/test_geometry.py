@@ -1,0 +1,277 @@
+"""Laws of projection, Jacobian, retraction and rotation angle."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from kornia.geometry.camera import PinholeCamera
+from kornia.geometry.camera.perspective import project_points
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+
+from kornia_pnpnet import Correspondences, Pose
+from kornia_pnpnet.geometry import (
+    MIN_DEPTH_RATIO,
+    additive_tangent_map,
+    linearize,
+    project,
+    retract,
+    retract_additive,
+    rotation_angle,
+    transform,
+)
+from kornia_pnpnet.lm import lm_step
+
+FOCAL = torch.tensor(3400.0, dtype=torch.float64)
+
+
+def random_scene(n, rotation, *, batch=7, shift=0.0, seed=0):
+    """Points in front of cameras whose world lies ``shift`` away, and pixels 50 px off."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(*shape):
+        return 2 * torch.rand(*shape, generator=generator, dtype=torch.float64) - 1
+
+    cam_points = uniform(batch, n, 3) * torch.tensor([10.0, 10, 40]) + torch.tensor([0.0, 0, 50])
+    pose = Pose(rotation, 12.5 * uniform(batch, 3) + shift)
+    world_points = (cam_points - pose.translation[:, None]) @ pose.rotation
+    pixels = FOCAL * cam_points[..., :2] / cam_points[..., 2:] + 50 * uniform(batch, n, 2)
+    return Correspondences(world_points, pixels, torch.ones(batch, n, dtype=torch.float64), FOCAL), pose
+
+
+def per_problem_jacobian(function, at):
+    """Derivative (B, M, D) of a map (B, D) -> (B, M) whose rows do not meet."""
+    total = torch.autograd.functional.jacobian(lambda x: function(x).sum(0), at)  # (M, B, D)
+    return total.movedim(0, 1)
+
+
+# --- projection ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n", [3, 9, 50])
+def test_projection_is_kornias(n, random_rotations):
+    corr, pose = random_scene(n, random_rotations(7))
+    pixels = project(pose, corr).residual + corr.img_points
+
+    K = torch.diag(torch.stack((FOCAL, FOCAL, torch.ones_like(FOCAL)))).expand(7, 3, 3)
+    functional = project_points(transform(pose, corr.world_points), K[:, None].expand(7, n, 3, 3))
+    torch.testing.assert_close(pixels, functional, rtol=1e-12, atol=1e-8)
+
+    intrinsics = torch.eye(4, dtype=torch.float64).repeat(7, 1, 1)
+    intrinsics[:, :3, :3] = K
+    size = torch.full((7,), 6800.0, dtype=torch.float64)
+    camera = PinholeCamera(intrinsics, pose.matrix, size, size)
+    torch.testing.assert_close(pixels, camera.project(corr.world_points), rtol=1e-10, atol=1e-7)
+
+
+def test_transform_is_the_matrix_of_the_pose(random_rotations):
+    corr, pose = random_scene(5, random_rotations(7))
+    homogeneous = torch.cat((corr.world_points, torch.ones(7, 5, 1, dtype=torch.float64)), -1) @ pose.matrix.mT
+    torch.testing.assert_close(transform(pose, corr.world_points), homogeneous[..., :3])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_projection_keeps_dtype_and_shapes(dtype, random_rotations):
+    corr, pose = random_scene(4, random_rotations(7))
+    corr, pose = Correspondences(*(x.to(dtype) for x in corr)), Pose(*(x.to(dtype) for x in pose))
+    projection = project(pose, corr)
+    linear = linearize(projection, corr.focal)
+    assert projection.residual.shape == (7, 4, 2)
+    assert linear.residual.shape == (7, 8)
+    assert linear.jacobian.shape == (7, 6, 8)
+    assert {projection.residual.dtype, linear.residual.dtype, linear.jacobian.dtype} == {dtype}
+    assert projection.in_front.all()
+
+
+# --- Jacobian ------------------------------------------------------------------------------------------------------
+
+ROTATIONS = {"any": None, "identity": 0.0, "near_identity": 1e-5, "taylor_switch": 1e-3, "small": 0.1, "large": 3.0}
+RETRACTIONS = {"retraction": (retract, lambda pose: None), "additive": (retract_additive, additive_tangent_map)}
+
+
+@pytest.mark.parametrize("shift", [0.0, 1e4])
+@pytest.mark.parametrize("angle", ROTATIONS.values(), ids=ROTATIONS.keys())
+@pytest.mark.parametrize("n", [3, 4, 6, 9, 50])
+@pytest.mark.parametrize("update", RETRACTIONS)
+def test_jacobian_is_the_derivative_through_the_retraction(update, n, angle, shift, random_rotations):
+    move, tangent_map = RETRACTIONS[update]
+    corr, pose = random_scene(n, random_rotations(7, angle=angle), shift=shift)
+
+    def residual(delta):
+        moved = move(pose, delta)
+        return project(moved, corr).residual.mT.flatten(1) / corr.focal  # (B, 2N)
+
+    analytic = linearize(project(pose, corr), corr.focal, tangent_map(pose)).jacobian.mT  # (B, 2N, 6)
+    zero = torch.zeros(7, 6, dtype=torch.float64)
+    automatic = per_problem_jacobian(residual, zero)
+    # A turn moves points by their distance from the origin: steps that move them by about 1e-4 either way.
+    size = torch.tensor([1e-4 / (50.0 + shift)] * 3 + [1e-4] * 3, dtype=torch.float64)
+    steps = torch.diag(size)[:, None].expand(6, 7, 6)
+    central = torch.stack([residual(h) - residual(-h) for h in steps], -1) / (2 * size)
+
+    torch.testing.assert_close(residual(zero), linearize(project(pose, corr), corr.focal).residual, rtol=0, atol=1e-6)
+    # kornia's conversions near the identity are accurate to 2e-10 (see their docstrings).
+    scale = analytic.abs().amax(1, keepdim=True)
+    assert ((analytic - automatic) / scale).abs().max() < (1e-10 if update == "retraction" else 1e-6)
+    assert ((analytic - central) / scale).abs().max() < 1e-5
+
+
+@settings(max_examples=50, deadline=None, derandomize=True)
+@given(
+    omega=st.lists(st.floats(-1.5, 1.5), min_size=3, max_size=3),
+    translation=st.lists(st.floats(-100, 100), min_size=3, max_size=3),
+    update=st.sampled_from(sorted(RETRACTIONS)),
+)
+def test_jacobian_of_any_pose(omega, translation, update):
+    move, tangent_map = RETRACTIONS[update]
+    pose = Pose(
+        axis_angle_to_rotation_matrix(torch.tensor([omega], dtype=torch.float64)),
+        torch.tensor([translation], dtype=torch.float64),
+    )
+    cam_points = torch.tensor([[[1.0, 2, 10], [-4, 3, 20], [5, -6, 30], [0, 0, 5]]], dtype=torch.float64)
+    world_points = (cam_points - pose.translation[:, None]) @ pose.rotation
+    corr = Correspondences(world_points, torch.zeros(1, 4, 2).double(), torch.ones(1, 4).double(), FOCAL)
+
+    def residual(delta):
+        return project(move(pose, delta), corr).residual.mT.flatten(1) / corr.focal
+
+    automatic = per_problem_jacobian(residual, torch.zeros(1, 6, dtype=torch.float64))
+    analytic = linearize(project(pose, corr), corr.focal, tangent_map(pose)).jacobian.mT
+    # What kornia's series near the identity leaves.
+    assert (analytic - automatic).abs().max() <= 1e-6 * analytic.abs().max()
+
+
+# --- retraction -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("angle", ROTATIONS.values(), ids=ROTATIONS.keys())
+def test_retraction_by_zero_is_the_identity(angle, random_rotations):
+    pose = Pose(random_rotations(7, angle=angle), torch.arange(21, dtype=torch.float64).view(7, 3))
+    moved = retract(pose, torch.zeros(7, 6, dtype=torch.float64))
+    assert torch.equal(moved.rotation, pose.rotation)
+    assert torch.equal(moved.translation, pose.translation)
+    moved = retract_additive(pose, torch.zeros(7, 6, dtype=torch.float64))
+    # The round trip through the rotation vector, accurate to 2e-10 in kornia's low-angle branch.
+    torch.testing.assert_close(moved.rotation, pose.rotation, rtol=0, atol=1e-9)
+    assert torch.equal(moved.translation, pose.translation)
+
+
+@pytest.mark.parametrize("move", [retract, retract_additive])
+@pytest.mark.parametrize("length", [1e-12, 1e-6, 1e-3, 1.1e-3, 0.3, 2.0, 30.0])
+def test_retraction_stays_on_the_group(move, length, random_rotations, generator):
+    delta = torch.randn(50, 6, generator=generator, dtype=torch.float64)
+    delta = length * delta / delta.norm(dim=-1, keepdim=True)
+    rotation = move(Pose(random_rotations(50), torch.zeros(50, 3).double()), delta).rotation
+    eye = torch.eye(3, dtype=torch.float64).expand(50, 3, 3)
+    torch.testing.assert_close(rotation @ rotation.mT, eye, rtol=0, atol=1e-12)
+    assert (torch.linalg.det(rotation) > 0.5).all()
+
+
+def test_retraction_turns_by_its_length(random_rotations, generator):
+    delta = torch.randn(50, 6, generator=generator, dtype=torch.float64)
+    delta = delta / delta[:, :3].norm(dim=-1, keepdim=True)
+    pose = Pose(random_rotations(50), torch.zeros(50, 3).double())
+    moved = retract(pose, delta)
+    torch.testing.assert_close(rotation_angle(moved.rotation, pose.rotation), torch.ones(50).double())
+    torch.testing.assert_close(moved.translation, delta[:, 3:])
+
+
+def test_additive_update_adds_rotation_vectors():
+    vector = torch.tensor([[0.3, -0.2, 0.5]], dtype=torch.float64)
+    change = torch.tensor([[0.1, 0.4, -0.2]], dtype=torch.float64)
+    pose = Pose(axis_angle_to_rotation_matrix(vector), torch.zeros(1, 3).double())
+    moved = retract_additive(pose, torch.cat((change, torch.ones(1, 3).double()), 1))
+    torch.testing.assert_close(moved.rotation, axis_angle_to_rotation_matrix(vector + change))
+    torch.testing.assert_close(moved.translation, torch.ones(1, 3).double())
+
+
+# --- rotation angle -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "angle", [0.0, 1e-12, 1e-9, 1e-6, 9e-4, 1.1e-3, 0.1, 1.0, math.pi / 2, 3.0, math.pi - 1e-7, math.pi]
+)
+def test_rotation_angle_of_a_known_turn(angle, random_rotations):
+    base = random_rotations(200, seed=1)
+    turned = random_rotations(200, angle=angle, seed=2) @ base
+    expected = torch.full((200,), angle, dtype=torch.float64)
+    torch.testing.assert_close(rotation_angle(turned, base), expected, rtol=0, atol=2e-15)
+    torch.testing.assert_close(rotation_angle(base, turned), expected, rtol=0, atol=2e-15)
+
+
+def test_rotation_angle_in_float32_keeps_small_angles(random_rotations):
+    turned = random_rotations(200, angle=1e-5, seed=2).float()
+    angle = rotation_angle(turned, torch.eye(3).expand(200, 3, 3))
+    torch.testing.assert_close(angle, torch.full((200,), 1e-5), rtol=1e-2, atol=0)
+
+
+# --- behind the camera ----------------------------------------------------------------------------------------------
+
+BEHIND = {
+    "behind": (1.0, 2.0, -5.0),
+    "in_the_plane": (1.0, 2.0, 0.0),
+    "at_the_centre": (0.0, 0.0, 0.0),
+    "nearly_in_the_plane": (1.0, 1.0, 0.5 * MIN_DEPTH_RATIO),
+    "far_behind": (1e12, -1e12, -1e12),
+    "tiny": (1e-30, 0.0, -1e-30),
+}
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("point", BEHIND.values(), ids=BEHIND.keys())
+def test_points_behind_the_camera_do_not_count(point, dtype):
+    front = torch.tensor([[1.0, 2, 10], [-4, 3, 20], [5, -6, 30], [3, 3, 7]], dtype=dtype)
+    world = torch.cat((front, torch.tensor([point], dtype=dtype)))[None].requires_grad_()
+    pixels = torch.full((1, 5, 2), 100.0, dtype=dtype, requires_grad=True)
+    corr = Correspondences(world, pixels, torch.ones(1, 5, dtype=dtype), FOCAL.to(dtype))
+    translation = torch.zeros(1, 3, dtype=dtype, requires_grad=True)
+    pose = Pose(torch.eye(3, dtype=dtype)[None].requires_grad_(), translation)
+
+    projection = project(pose, corr)
+    assert projection.in_front.tolist() == [[True] * 4 + [False]]
+    assert torch.equal(projection.residual[0, 4], torch.zeros(2, dtype=dtype))
+    assert all(x.isfinite().all() for x in projection)
+
+    one = torch.tensor(1.0, dtype=dtype)
+    step = lm_step(corr, pose, projection, corr.weights, one, 1e-3 * one)
+    (step.pose.rotation.square().sum() + step.pose.translation.square().sum()).backward()
+    for tensor in (world, pixels, pose.rotation, translation):
+        assert tensor.grad.isfinite().all()
+    assert torch.equal(world.grad[0, 4], torch.zeros(3, dtype=dtype))
+    assert torch.equal(pixels.grad[0, 4], torch.zeros(2, dtype=dtype))
+
+    # Exactly the step that the points in front would have taken alone.
+    alone = Correspondences(world[:, :4], pixels[:, :4], corr.weights[:, :4], corr.focal)
+    without = lm_step(alone, pose, project(pose, alone), alone.weights, one, 1e-3 * one)
+    torch.testing.assert_close(
+        step.pose.matrix, without.pose.matrix, rtol=1e-5 if dtype == torch.float32 else 1e-13, atol=0
+    )
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_in_front_does_not_depend_on_the_unit(dtype):
+    point = torch.tensor([[[1.0, 1.0, 1e-3], [1.0, 1.0, 2e-3], [0.3, 0.1, 1.0], [0.0, 0.0, -1.0]]], dtype=dtype)
+    pose = Pose(torch.eye(3, dtype=dtype)[None], torch.zeros(1, 3, dtype=dtype))
+    for unit in (1e-6, 1.0, 1e6):
+        corr = Correspondences(
+            point * unit, torch.zeros(1, 4, 2).to(dtype), torch.ones(1, 4).to(dtype), FOCAL.to(dtype)
+        )
+        assert project(pose, corr).in_front.tolist() == [[False, True, True, False]]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_all_zeros_is_finite(dtype):
+    zeros = torch.zeros(1, 4, 3, dtype=dtype, requires_grad=True)
+    translation = torch.zeros(1, 3, dtype=dtype, requires_grad=True)
+    pose = Pose(torch.eye(3, dtype=dtype)[None], translation)
+    corr = Correspondences(zeros, torch.zeros(1, 4, 2).to(dtype), torch.zeros(1, 4).to(dtype), FOCAL.to(dtype))
+    projection = project(pose, corr)
+    linear = linearize(projection, corr.focal)
+    assert not projection.in_front.any()
+    assert linear.jacobian.isfinite().all()
+    (linear.jacobian.sum() + linear.residual.sum()).backward()
+    assert zeros.grad.isfinite().all()
+    assert translation.grad.isfinite().all()

@@ -1,0 +1,124 @@
+"""What this package relies on in kornia. A failure here is a change of kornia's, not ours."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from kornia.core.check import KORNIA_CHECK, KORNIA_CHECK_SHAPE
+from kornia.core.exceptions import BaseError, DeviceError, ShapeError, TypeCheckError, ValueCheckError
+from kornia.geometry.conversions import (
+    Rt_to_matrix4x4,
+    axis_angle_to_rotation_matrix,
+    convert_points_from_homogeneous,
+    normalize_points_with_intrinsics,
+    rotation_matrix_to_axis_angle,
+)
+from kornia.geometry.liegroup import So3
+
+ANGLES = (0.0, 1e-12, 1e-6, 9.9e-4, 1.1e-3, 0.1, 1.0, 3.0, math.pi)
+
+
+def vectors(angle, dtype=torch.float64):
+    axis = torch.randn(50, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return (angle * axis / axis.norm(dim=-1, keepdim=True)).to(dtype)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("angle", ANGLES)
+def test_axis_angle_gives_rotations(angle, dtype):
+    rotation = axis_angle_to_rotation_matrix(vectors(angle, dtype))
+    eye = torch.eye(3, dtype=dtype).expand(50, 3, 3)
+    torch.testing.assert_close(rotation @ rotation.mT, eye, rtol=0, atol=20 * torch.finfo(dtype).eps)
+    torch.testing.assert_close(torch.linalg.det(rotation), torch.ones(50, dtype=dtype))
+    cosine = 0.5 * (rotation.diagonal(dim1=-2, dim2=-1).sum(-1) - 1)
+    torch.testing.assert_close(cosine, torch.full((50,), math.cos(angle), dtype=dtype))
+
+
+def test_axis_angle_is_the_matrix_exponential_and_its_derivative_at_the_identity():
+    for angle in ANGLES:
+        exponential = torch.linalg.matrix_exp(So3.hat(vectors(angle)))
+        torch.testing.assert_close(axis_angle_to_rotation_matrix(vectors(angle)), exponential, rtol=0, atol=1e-13)
+    jacobian = torch.func.jacrev(axis_angle_to_rotation_matrix)(torch.zeros(3, dtype=torch.float64))
+    generators = So3.hat(torch.eye(3, dtype=torch.float64))
+    torch.testing.assert_close(jacobian.movedim(-1, 0), generators)
+
+
+def test_zero_rotation_vector_gives_exactly_the_identity():
+    assert torch.equal(axis_angle_to_rotation_matrix(torch.zeros(2, 3)), torch.eye(3).expand(2, 3, 3))
+
+
+@pytest.mark.parametrize("angle", ANGLES[:-1])
+def test_rotation_vector_round_trip(angle):
+    back = rotation_matrix_to_axis_angle(axis_angle_to_rotation_matrix(vectors(angle)))
+    torch.testing.assert_close(back, vectors(angle), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("angle", ANGLES)
+def test_gradients_of_the_rotation_vector_are_finite(angle, dtype):
+    rotation = axis_angle_to_rotation_matrix(vectors(angle, dtype)).requires_grad_()
+    rotation_matrix_to_axis_angle(rotation).sum().backward()
+    assert rotation.grad.isfinite().all()
+    vector = vectors(angle, dtype).requires_grad_()
+    axis_angle_to_rotation_matrix(vector).sum().backward()
+    assert vector.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("angle", [1e-4, 0.1, 0.3, 2.0])
+def test_left_jacobian_is_the_derivative_of_the_exponential(angle):
+    vector = vectors(angle)
+
+    def turn(change):
+        moved = axis_angle_to_rotation_matrix(vector + change)
+        relative = moved @ axis_angle_to_rotation_matrix(vector).mT
+        return 0.5 * So3.vee(relative - relative.mT)
+
+    derivative = torch.autograd.functional.jacobian(turn, torch.zeros(3, dtype=torch.float64))
+    torch.testing.assert_close(So3.left_jacobian(vector), derivative, rtol=0, atol=1e-7)
+
+
+def test_left_jacobian_at_the_identity():
+    zero = torch.zeros(2, 3, dtype=torch.float64, requires_grad=True)
+    jacobian = So3.left_jacobian(zero)
+    assert torch.equal(jacobian.detach(), torch.eye(3, dtype=torch.float64).expand(2, 3, 3))
+    jacobian.sum().backward()
+    assert zero.grad.isfinite().all()
+
+
+def test_vee_undoes_hat():
+    torch.testing.assert_close(So3.vee(So3.hat(vectors(1.0))), vectors(1.0))
+
+
+def test_dehomogenising_with_zero_eps_divides_whatever_is_not_zero():
+    points = torch.tensor([[2.0, 4.0, 2.0], [2e-20, 4e-20, 2e-20], [2.0, 4.0, -2.0], [2.0, 4.0, 0.0]])
+    expected = torch.tensor([[1.0, 2.0], [1.0, 2.0], [-1.0, -2.0], [2.0, 4.0]])
+    torch.testing.assert_close(convert_points_from_homogeneous(points, eps=0.0), expected)
+
+
+def test_intrinsics_broadcast_over_the_points_of_their_problem():
+    K = torch.eye(3).repeat(2, 1, 1)
+    K[0, 0, 0], K[1, 0, 0], K[0, 1, 1], K[1, 1, 1] = 2.0, 4.0, 8.0, 16.0
+    K[0, 0, 2], K[1, 1, 2] = 10.0, 20.0
+    points = torch.tensor([[[12.0, 8.0]] * 5, [[4.0, 36.0]] * 5])  # (B, N, 2)
+    expected = torch.tensor([[[1.0, 1.0]] * 5, [[1.0, 1.0]] * 5])
+    torch.testing.assert_close(normalize_points_with_intrinsics(points, K), expected)
+    # As many points as problems: the letters must not be mixed up.
+    square = torch.tensor([[[12.0, 8.0]] * 2, [[4.0, 36.0]] * 2])
+    torch.testing.assert_close(normalize_points_with_intrinsics(square, K), expected[:, :2])
+
+
+def test_matrix_of_rotation_and_translation():
+    matrix = Rt_to_matrix4x4(torch.eye(3)[None], torch.tensor([[[1.0], [2.0], [3.0]]]))
+    assert matrix[0].tolist() == [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
+
+
+def test_checks_raise_typed_errors():
+    with pytest.raises(ShapeError):
+        KORNIA_CHECK_SHAPE(torch.zeros(2, 3), ["B", "N", "3"])
+    with pytest.raises(BaseError, match="no such thing"):
+        KORNIA_CHECK(False, "no such thing")
+    for error in (ShapeError, TypeCheckError, ValueCheckError, DeviceError):
+        assert issubclass(error, BaseError)
+    assert "came" in str(ShapeError("what came", actual_shape=[1], expected_shape=[2]))

@@ -1,0 +1,116 @@
+"""Arrows go one way: which module of the package may import which (ARCHITECTURE.md)."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import kornia_pnpnet
+
+ROOT = Path(kornia_pnpnet.__file__).parent
+
+#: From the bottom up. A module imports from its own layer and those below. The longest prefix counts.
+LAYERS = (
+    ("types", "environment", "files"),
+    ("geometry", "robust", "metrics", "pairs", "data.colmap"),
+    ("normalize", "lm", "init", "data"),
+    ("model", "losses"),
+    ("registry", "peers", "__init__"),
+    ("evaluation", "runstate", "training", "choices", "reports"),
+    ("figures", "cli", "demo", "__main__"),
+)
+
+#: What importing the package must not import: the extras, which a user of the layer need not have.
+EXTRAS = ("cv2", "hydra", "lightning_fabric", "matplotlib", "omegaconf", "poselib", "pycolmap", "tensorboard")
+
+#: Optional packages and the only modules that may import them.
+OWNERS = {"matplotlib": {"figures"}, "hydra": set(), "cv2": {"peers"}, "pycolmap": {"data.colmap"}}
+
+
+def modules():
+    names = {}
+    for path in sorted(ROOT.rglob("*.py")):
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        name = ".".join(parts[:-1] if parts[-1] == "__init__" and len(parts) > 1 else parts)
+        names[name] = path
+    return names
+
+
+MODULES = modules()
+
+
+def imports(path):
+    """Full names of all that a file imports, at its top or inside functions."""
+    found = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found += [(alias.name, None) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}:{node.lineno}: a relative import"
+            found += [(node.module, alias.name) for alias in node.names]
+    return found
+
+
+def own_imports(path):
+    """Names, below the package, of the modules that a file imports."""
+    for module, name in imports(path):
+        if module.split(".")[0] != "kornia_pnpnet":
+            continue
+        below = module.removeprefix("kornia_pnpnet").removeprefix(".")
+        inner = f"{below}.{name}".removeprefix(".")
+        yield inner if name is not None and inner in MODULES else below or "__init__"
+
+
+def layer(name):
+    for length in range(name.count(".") + 1, 0, -1):
+        prefix = ".".join(name.split(".")[:length])
+        for level, members in enumerate(LAYERS):
+            if prefix in members:
+                return level
+    pytest.fail(f"{name} is in no layer: say in LAYERS (and in ARCHITECTURE.md) where it belongs.")
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_imports_come_from_the_same_layer_or_below(name):
+    wrong = {other for other in own_imports(MODULES[name]) if layer(other) > layer(name)}
+    assert not wrong, f"{name} (layer {layer(name)}) imports {sorted(wrong)} from above."
+
+
+def test_no_circles():
+    graph = {name: set(own_imports(path)) - {name} for name, path in MODULES.items()}
+    while graph:
+        leaves = {name for name, others in graph.items() if not others & graph.keys()}
+        assert leaves, f"Imports go in a circle among {sorted(graph)}."
+        graph = {name: others for name, others in graph.items() if name not in leaves}
+
+
+@pytest.mark.parametrize(("package", "owners"), OWNERS.items())
+def test_optional_packages_have_one_door(package, owners):
+    users = {name for name, path in MODULES.items() for module, _ in imports(path) if module.split(".")[0] == package}
+    assert users <= owners
+
+
+def test_the_layers_name_what_exists():
+    listed = {name for members in LAYERS for name in members} - {"__main__"}
+    assert listed <= MODULES.keys(), "LAYERS names modules that are gone."
+
+
+def test_importing_the_package_imports_no_extras():
+    code = f"import sys, kornia_pnpnet; print([name for name in {EXTRAS!r} if name in sys.modules])"
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert output.stdout.strip() == "[]"
+
+
+def test_importing_the_package_leaves_no_trace():
+    """No global state at import: neither the seed, the threads nor the default type change."""
+    code = (
+        "import torch; torch.manual_seed(5); before = (torch.get_rng_state(), torch.get_num_threads());"
+        "import kornia_pnpnet; after = (torch.get_rng_state(), torch.get_num_threads());"
+        "assert torch.equal(before[0], after[0]) and before[1] == after[1];"
+        "assert torch.get_default_dtype() == torch.float32"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

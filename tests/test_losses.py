@@ -1,0 +1,109 @@
+"""The distances and the loss over both stages."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from kornia_pnpnet import PnPResult, Pose, PoseLoss
+from kornia_pnpnet.losses import pose_distances
+
+EPS = 1e-6
+
+
+def solved(problems, init, refined):
+    batch, n = problems.world_points.shape[:2]
+    ones = torch.ones(batch, n, dtype=torch.float64)
+    return PnPResult(*refined, ones, ones[:, 0], torch.ones(batch, dtype=torch.bool), init)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-6, 0.1, 1.0, math.pi])
+def test_distances_have_their_closed_forms(angle, random_rotations):
+    base = random_rotations(20, seed=1)
+    turned = random_rotations(20, angle=angle, seed=2) @ base
+    zeros = torch.zeros(20, 3, dtype=torch.float64)
+    moved = zeros + torch.tensor([2.0, 3.0, 6.0])
+    rotation, translation = pose_distances(Pose(turned, moved), Pose(base, zeros))
+    expected = torch.full((20,), 2 * math.sqrt(2) * math.sin(angle / 2), dtype=torch.float64)
+    torch.testing.assert_close(rotation, expected, rtol=1e-9, atol=1e-14)
+    torch.testing.assert_close(translation, torch.full((20,), 7.0, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_gradients_at_zero_are_zero(dtype):
+    truth = Pose(torch.eye(3, dtype=dtype)[None], torch.zeros(1, 3, dtype=dtype))
+    estimate = Pose(*(x.clone().requires_grad_() for x in truth))
+    sum(x.sum() for x in pose_distances(estimate, truth)).backward()
+    assert not estimate.rotation.grad.any()
+    assert not estimate.translation.grad.any()
+
+
+@pytest.mark.parametrize("distance", [1e-30, 1e-12, 1e-3, 1.0, 1e6])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_gradients_are_bounded_by_one(distance, dtype):
+    truth = Pose(torch.eye(3, dtype=dtype)[None], torch.zeros(1, 3, dtype=dtype))
+    translation = torch.tensor([[distance, 0.0, 0.0]], dtype=dtype, requires_grad=True)
+    pose_distances(Pose(truth.rotation, translation), truth)[1].sum().backward()
+    assert translation.grad.norm() <= 1 + EPS
+
+
+def test_a_perfect_result_costs_nothing(make_problems):
+    p = make_problems()
+    terms = PoseLoss()(solved(p, p.pose, p.pose), p)
+    assert all(term.ndim == 0 and term < EPS for term in terms)
+
+
+def test_the_total_is_the_weighted_sum_with_the_ramp(make_problems, perturb):
+    p = make_problems()
+    init, refined = perturb(p.pose, angle=0.3, shift=2.0), perturb(p.pose, angle=0.1, shift=0.5, seed=2)
+    loss = PoseLoss(rotation=2.0, translation=0.3, init_translation=0.07, refined=5.0)
+    for ramp in (0.0, 0.25, 1.0):
+        terms = loss(solved(p, init, refined), p, ramp)
+        expected = 2.0 * terms.init_rotation + 0.07 * terms.init_translation
+        expected = expected + ramp * 5.0 * (2.0 * terms.refined_rotation + 0.3 * terms.refined_translation)
+        torch.testing.assert_close(terms.total, expected)
+        torch.testing.assert_close(terms.refined_rotation, torch.tensor(2 * math.sqrt(2) * math.sin(0.05)).double())
+        torch.testing.assert_close(terms.refined_translation, torch.tensor(0.5).double())
+
+
+def test_without_ramp_the_refinement_takes_no_gradient(make_problems, perturb):
+    p = make_problems()
+    init, refined = (Pose(*(x.clone().requires_grad_() for x in perturb(p.pose, seed=seed))) for seed in (1, 2))
+    PoseLoss()(solved(p, init, refined), p, 0.0).total.backward()
+    assert init.rotation.grad.any()
+    assert not refined.rotation.grad.any()
+    assert not refined.translation.grad.any()
+
+
+def test_the_first_translation_is_compared_at_the_centroid(make_problems, random_rotations):
+    """A first guess that turns the world about its centroid has no translation error."""
+    p = make_problems()
+    centroid = p.world_points.mean(1)
+    turned = random_rotations(7, angle=0.5) @ p.pose.rotation
+    kept = p.pose.translation + ((p.pose.rotation - turned) @ centroid[..., None])[..., 0]
+    terms = PoseLoss()(solved(p, Pose(turned, kept), p.pose), p)
+    assert terms.init_translation < EPS
+    assert terms.init_rotation > 0.1
+    shifted = Pose(p.pose.rotation, p.pose.translation + 2.0 * torch.eye(3).double()[0])
+    torch.testing.assert_close(PoseLoss()(solved(p, shifted, p.pose), p).init_translation, torch.tensor(2.0).double())
+
+
+def test_saturation_bounds_each_problem(make_problems):
+    p = make_problems()
+    for distance in (1e-3, 1.0, 1e3, 1e12):
+        far = Pose(p.pose.rotation, p.pose.translation + distance * torch.eye(3).double()[0])
+        total = PoseLoss(translation=1.0, saturation=0.5)(solved(p, p.pose, far), p).total
+        torch.testing.assert_close(total, torch.tensor(distance / (1 + distance / 0.5)).double(), rtol=1e-6, atol=0)
+        assert total <= 0.5
+    translation = far.translation.clone().requires_grad_()
+    PoseLoss(saturation=0.5)(solved(p, p.pose, far._replace(translation=translation)), p).total.backward()
+    assert translation.grad.norm() < EPS
+
+
+def test_the_first_stage_is_not_saturated(make_problems):
+    p = make_problems()
+    far = Pose(p.pose.rotation, p.pose.translation + 1e3 * torch.eye(3).double()[0])
+    total = PoseLoss(init_translation=1.0, saturation=0.5)(solved(p, far, p.pose), p).total
+    torch.testing.assert_close(total, torch.tensor(1e3).double())
