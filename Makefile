@@ -27,7 +27,7 @@ help: ## Show this list
 
 install: $(STAMP) ## Make .venv with every extra
 
-demo: $(STAMP) ## Solve problems with the shipped weights, beside OpenCV; DATA=folder adds a COLMAP scene
+demo: $(STAMP) ## Solve problems with the shipped weights, beside OpenCV; DATA=folder solves that COLMAP scene
 	@mkdir -p outputs/demo
 	$(VENV)/bin/pnpnet demo $(if $(DATA),--data '$(DATA)')
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 from pathlib import Path
+from typing import Any
 
 import hydra
 import torch
@@ -64,9 +65,8 @@ def main(config: DictConfig) -> float | None:
     if report.interrupted:
         log.warning("Stopped at update %s of %s; continue with resume=true.", report.update, settings.updates)
         sys.exit(130)
-    results = run_results(
-        model.cpu(), validation, report, OmegaConf.to_container(config, resolve=True), list(runtime.overrides.task)
-    )
+    resolved: Any = OmegaConf.to_container(config, resolve=True)
+    results = run_results(model.cpu(), validation, report, resolved, list(runtime.overrides.task))
     write_json(folder / RESULTS_NAME, results)
     model.save_pretrained(folder / "weights")
     write_model_card(folder / "weights", results)

@@ -96,4 +96,5 @@ def success_rate(successes: Tensor) -> SuccessRate:
     z = 1.959963984540054  # the 97.5 % point of the normal distribution
     centre = (rate + z * z / (2 * count)) / (1 + z * z / count)
     half = z / (1 + z * z / count) * math.sqrt(rate * (1 - rate) / count + z * z / (4 * count * count))
-    return SuccessRate(rate, max(0.0, centre - half), min(1.0, centre + half), count)
+    # The bounds hold the rate; at 0 and 1 rounding could put them past it.
+    return SuccessRate(rate, max(0.0, min(rate, centre - half)), min(1.0, max(rate, centre + half)), count)

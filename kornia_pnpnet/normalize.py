@@ -40,9 +40,10 @@ class Frame(NamedTuple):
 class Normalize(nn.Module):
     r"""Normalise cameras, order and world frame.
 
-    A problem is *valid* when what its pairs hold is finite (and small enough to be squared twice), its weights are not
-    negative, at least three pairs have a weight, its camera has positive focal lengths and no skew, and its points do not lie on one line or point. The
-    inputs of invalid problems are replaced by zeros, which keeps values and gradients finite everywhere behind.
+    A problem is *valid* when what its pairs hold is finite (and small enough to be squared twice), its weights are
+    not negative, at least three pairs have a weight, its camera has positive focal lengths and no skew, and its points
+    do not lie on one line or point. The inputs of invalid problems are replaced by zeros, which keeps values and
+    gradients finite everywhere behind.
 
     Args:
         f_const: focal length of the normalised camera in pixels.

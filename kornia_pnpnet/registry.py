@@ -65,7 +65,7 @@ def create_solver(name: str, **options: Any) -> nn.Module:
         The solver as a module in evaluation mode.
 
     Raises:
-        ValueCheckError: for an unknown name.
+        ValueCheckError: for an unknown name or option.
         ImportError: when the solver needs a package that is not installed.
 
     Example:
@@ -75,4 +75,7 @@ def create_solver(name: str, **options: Any) -> nn.Module:
     builders = _builders()
     if name not in builders:
         raise ValueCheckError(f"No solver {name!r}. There are: {', '.join(sorted(builders))}.")
-    return builders[name](**options).eval()
+    try:
+        return builders[name](**options).eval()
+    except TypeError as error:
+        raise ValueCheckError(f"Solver {name!r} does not take these options: {error}.") from error

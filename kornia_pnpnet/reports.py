@@ -133,8 +133,8 @@ def write_model_card(folder: str | Path, results: Mapping[str, Any]) -> None:
         "## Success on the validation sets",
         "",
         "Rotation error below 1° and translation error below 0.2, with 95 % intervals. `none`: the protocol without",
-        "outliers; `uniform`: up to a third of the pairs wrong; `slab`: tilted slabs of any thickness, as in photographs,",
-        "also with up to a third wrong.",
+        "outliers; `uniform`: up to a third of the pairs wrong; `slab`: tilted slabs of any thickness, as in",
+        "photographs, also with up to a third wrong.",
         "",
         "| Set | PnP-Net | Net alone | median rotation error | median translation error |",
         "|---|---|---|---|---|",
@@ -158,8 +158,8 @@ def write_model_card(folder: str | Path, results: Mapping[str, Any]) -> None:
         "",
         "## Limits",
         "",
-        f"Exactly {n} pairs, at most about a third of them wrong. Rotations within about a quarter turn of the identity",
-        "(the world's axes roughly the camera's): the training prior. World unit and origin do not matter.",
+        f"Exactly {n} pairs, at most about a third of them wrong. Rotations within about a quarter turn of the",
+        "identity (the world's axes roughly the camera's): the training prior. World unit and origin do not matter.",
         "",
     ]
     (Path(folder) / "README.md").write_text("\n".join(lines))

@@ -11,8 +11,8 @@ from kornia.core.exceptions import BaseError
 from torch.testing import assert_close
 
 from kornia_pnpnet.data.colmap import Scene, View, load_colmap, load_matches, load_scene
-from kornia_pnpnet.data.scenes import SceneProblems, _choose
 from kornia_pnpnet.data.outliers import OutlierMix
+from kornia_pnpnet.data.scenes import SceneProblems, _choose
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason=f"needs the real data in {SHARED}")

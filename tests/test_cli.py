@@ -1,0 +1,528 @@
+"""The command line says what the library says, and bad input is one line and the exit code 2."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import subprocess
+import sys
+from types import ModuleType
+
+import numpy as np
+import pytest
+import torch
+from kornia.geometry.conversions import quaternion_to_rotation_matrix
+
+import kornia_pnpnet.model
+from kornia_pnpnet import MLPInit, PnPNet, RobustWeightedLM, create_solver
+from kornia_pnpnet.cli import main
+from kornia_pnpnet.evaluation import load_results
+from kornia_pnpnet.pairs import rejection_limit, reprojections
+from kornia_pnpnet.types import Pose
+
+CAMERA = "800,810,320,240"
+K = torch.tensor([[800.0, 0, 320], [0, 810, 240], [0, 0, 1]], dtype=torch.float64)
+
+
+@pytest.fixture
+def problem():
+    """World points and the pixels of a camera at the identity that looks at them, two of nine wrong."""
+    generator = np.random.default_rng(0)
+    world = generator.uniform((-2, -2, 4), (2, 2, 9), (9, 3))
+    img = world[:, :2] / world[:, 2:] * (800, 810) + (320, 240) + generator.normal(0, 0.3, (9, 2))
+    img[[1, 6]] += ((180.0, -90.0), (-150.0, 200.0))
+    return world, img
+
+
+@pytest.fixture
+def csv_file(tmp_path, problem):
+    path = tmp_path / "pairs.csv"
+    rows = [",".join(repr(float(value)) for value in row) for row in np.concatenate(problem, axis=1)]
+    path.write_text("\n".join(["X,Y,Z,u,v", *rows]) + "\n")
+    return path
+
+
+@pytest.fixture
+def weights_folder(tmp_path):
+    """An untrained network whose refinement gets from anywhere near to the pose."""
+    torch.manual_seed(1)
+    PnPNet(MLPInit(n=9), RobustWeightedLM(m=5)).save_pretrained(tmp_path / "weights")
+    return tmp_path / "weights"
+
+
+@pytest.fixture
+def shipped(tmp_path, monkeypatch):
+    """Pretend that untrained weights pnpnet-n9 come with the package."""
+    PnPNet(MLPInit(n=9), RobustWeightedLM(m=5)).save_pretrained(tmp_path / "shipped" / "pnpnet-n9")
+    monkeypatch.setattr(kornia_pnpnet.model, "WEIGHTS_FOLDER", tmp_path / "shipped")
+
+
+def run(capsys, *arguments) -> tuple[int, str, str]:
+    capsys.readouterr()
+    code = main([str(argument) for argument in arguments])
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+def answer(capsys, *arguments) -> dict:
+    code, out, _ = run(capsys, "solve", *arguments)
+
+    def refuse(word):
+        raise AssertionError(f"{word} is not JSON")
+
+    parsed = json.loads(out, parse_constant=refuse)
+    assert code == (0 if parsed["ok"] else 1)
+    return parsed
+
+
+# -- solve -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("solver", ["identity-lm", "weights"])
+def test_solve_prints_what_the_library_returns(capsys, csv_file, problem, weights_folder, solver):
+    name = solver if solver == "identity-lm" else str(weights_folder)
+    got = answer(capsys, csv_file, "--intrinsics", CAMERA, "--solver", name)
+    module = create_solver(name) if solver == "identity-lm" else PnPNet.from_pretrained(weights_folder)
+    world, img = (torch.from_numpy(part)[None] for part in problem)
+    with torch.no_grad():
+        result = module(world, img, K)
+    assert got["solver"] == name
+    assert got["n"] == 9
+    assert got["ok"] == result.ok.item()
+    assert got["rotation"] == result.rotation[0].tolist()
+    assert got["translation"] == result.translation[0].tolist()
+    assert got["cost"] == result.cost.item()
+    assert [pair["weight"] for pair in got["pairs"]] == result.weights[0].tolist()
+    torch.testing.assert_close(
+        quaternion_to_rotation_matrix(torch.tensor(got["quaternion_wxyz"], dtype=torch.float64)), result.rotation[0]
+    )
+    cam = world @ result.rotation.mT + result.translation[:, None]
+    pixels = cam[0, :, :2] / cam[0, :, 2:] * K.diagonal()[:2] + K[:2, 2]
+    for pair, point, error in zip(got["pairs"], cam[0], (pixels - img[0]).norm(dim=-1), strict=True):
+        if point[2] > 0:
+            assert pair["reprojection_error_px"] == pytest.approx(error.item())
+            assert pair["rejected"] == (error.item() > got["rejected_above_px"])
+        else:
+            assert pair == {"weight": 0.0, "reprojection_error_px": None, "rejected": True}
+
+
+def test_solve_finds_the_wrong_pairs(capsys, csv_file):
+    got = answer(capsys, csv_file, "--intrinsics", CAMERA, "--solver", "identity-lm")
+    assert got["ok"]
+    assert [pair["rejected"] for pair in got["pairs"]] == [i in (1, 6) for i in range(9)]
+    np.testing.assert_allclose(got["rotation"], np.eye(3), atol=5e-3)
+    errors = sorted(pair["reprojection_error_px"] for pair in got["pairs"])
+    assert got["rejected_above_px"] == max(3.0, 3 * 1.4826 * errors[4])
+
+
+def test_pairs_behind_the_camera_are_rejected(capsys, csv_file, tmp_path):
+    lines = csv_file.read_text().splitlines()
+    path = tmp_path / "behind.csv"
+    path.write_text("\n".join([*lines, "0.1,0.2,-5,300,200"]))
+    got = answer(capsys, path, "--intrinsics", CAMERA, "--solver", "identity-lm", "--threshold", "1e6")
+    assert got["ok"]
+    assert got["pairs"][-1] == {"weight": 0.0, "reprojection_error_px": None, "rejected": True}
+    assert not any(pair["rejected"] for pair in got["pairs"][:-1])
+
+
+def test_threshold_is_taken_as_given(capsys, csv_file):
+    common = (csv_file, "--intrinsics", CAMERA, "--solver", "identity-lm", "--threshold")
+    assert not any(pair["rejected"] for pair in answer(capsys, *common, "5000")["pairs"])
+    assert sum(pair["rejected"] for pair in answer(capsys, *common, "1e-9")["pairs"]) == 9
+
+
+def test_csv_in_any_column_order_and_npz_give_the_same(capsys, tmp_path, problem, csv_file):
+    world, img = problem
+    weights = np.linspace(0.5, 1.5, 9)
+    shuffled = tmp_path / "shuffled.csv"
+    with shuffled.open("w", newline="", encoding="utf-8-sig") as file:
+        writer = csv.writer(file)
+        writer.writerow(["v", " weight", "name", "Z", "X ", "u", "Y"])
+        for (x, y, z), (u, v), weight in zip(world.tolist(), img.tolist(), weights.tolist(), strict=True):
+            writer.writerow([v, weight, "a, b", z, x, u, y])
+        file.write("\n  \n")
+    archive = tmp_path / "pairs.npz"
+    np.savez(archive, world_points=world, img_points=img, weights=weights, intrinsics=K.numpy(), other=np.zeros(2))
+    from_csv = answer(capsys, shuffled, "--intrinsics", CAMERA, "--solver", "identity-lm")
+    from_npz = answer(capsys, archive, "--solver", "identity-lm")
+    assert from_csv == from_npz
+    assert from_csv != answer(capsys, csv_file, "--intrinsics", CAMERA, "--solver", "identity-lm")
+    renamed = tmp_path / "pairs.dat"
+    archive.rename(renamed)
+    assert answer(capsys, renamed, "--solver", "identity-lm") == from_npz
+    other_camera = answer(capsys, renamed, "--intrinsics", "900,900,320,240", "--solver", "identity-lm")
+    assert other_camera["rotation"] != from_npz["rotation"]
+
+
+def test_weights_keep_their_order_and_zero_means_absent(capsys, csv_file, tmp_path):
+    lines = csv_file.read_text().splitlines()
+    weighted = tmp_path / "weighted.csv"
+    factors = [0.0 if i in (1, 6) else 1.0 for i in range(9)]
+    body = [f"{line},{factor}" for line, factor in zip(lines[1:], factors, strict=True)]
+    weighted.write_text("\n".join([f"{lines[0]},weight", *body]))
+    got = answer(capsys, weighted, "--intrinsics", CAMERA, "--solver", "identity-lm")
+    assert [pair["weight"] == 0 for pair in got["pairs"]] == [factor == 0 for factor in factors]
+    assert [pair["rejected"] for pair in got["pairs"]] == [factor == 0 for factor in factors]
+
+
+def test_default_solver_is_the_shipped_one_for_that_n(capsys, csv_file, shipped):
+    assert answer(capsys, csv_file, "--intrinsics", CAMERA)["solver"] == "pnpnet-n9"
+
+
+def test_default_solver_without_weights_says_so(capsys, csv_file, tmp_path, monkeypatch):
+    monkeypatch.setattr(kornia_pnpnet.model, "WEIGHTS_FOLDER", tmp_path / "none")
+    code, out, err = run(capsys, "solve", csv_file, "--intrinsics", CAMERA)
+    assert code == 0
+    assert json.loads(out)["solver"] == "identity-lm"
+    assert err == "pnpnet: no weights pnpnet-n9 are shipped, using identity-lm\n"
+
+
+def test_no_pose_is_exit_code_one(capsys, tmp_path):
+    path = tmp_path / "line.csv"
+    path.write_text("X,Y,Z,u,v\n" + "\n".join(f"{i},{2 * i},{5 + i},{10 * i},{7 * i}" for i in range(9)))
+    for solver in ("identity-lm", "opencv-ransac"):
+        got = answer(capsys, path, "--intrinsics", CAMERA, "--solver", solver)
+        assert not got["ok"]
+        assert got["rotation"] == torch.eye(3).tolist()
+
+
+def test_plot_draws_the_pairs(capsys, csv_file, tmp_path):
+    pytest.importorskip("matplotlib")
+    picture = tmp_path / "sub" / "pose.png"
+    answer(capsys, csv_file, "--intrinsics", CAMERA, "--solver", "identity-lm", "--plot", picture)
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert picture.stat().st_size > 10_000
+
+
+# -- bad input -------------------------------------------------------------------------------------------------------
+
+GOOD = "1,2,3,4,5\n"
+HEADER = "X,Y,Z,u,v\n"
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        ("", "1: the file is empty, expected the header X,Y,Z,u,v"),
+        ("\n \n", "1: the file is empty, expected the header X,Y,Z,u,v"),
+        ("X,Y,Z,u\n1,2,3,4\n", "1: no column v: expected X,Y,Z,u,v, found 'X,Y,Z,u'"),
+        ("\nX,Z,v\n1,2,3\n", "2: no column Y, u: expected X,Y,Z,u,v, found 'X,Z,v'"),
+        (GOOD * 3, "1: no header: expected X,Y,Z,u,v, found '1,2,3,4,5'"),
+        (f"X,{HEADER}{GOOD}", "1: the column X is there 2 times"),
+        (HEADER + GOOD + "1,2,3,4\n" + GOOD, "3: 4 values, but the header has 5 columns"),
+        (HEADER + GOOD + "1,2,3,4,5,6\n" + GOOD, "3: 6 values, but the header has 5 columns"),
+        (HEADER + GOOD + GOOD + "1,2,x,4,5\n", "4: Z is not a number: 'x'"),
+        (HEADER + "\n" + GOOD + "1,2,,4,5\n", "4: Z is not a number: ''"),
+        (HEADER + "1,2,3,nan,5\n" + GOOD, "2: u is not finite: nan"),
+        (HEADER + "1,2,3,4,-inf\n" + GOOD, "2: v is not finite: -inf"),
+        ("X,Y,Z,u,v,weight\n1,2,3,4,5,-1\n", "2: weight is negative: -1"),
+        ("X,Y,Z,u,v,weight\n1,2,3,4,5,\n", "2: weight is not a number: ''"),
+        (HEADER, "1: a pose needs at least 3 pairs, got 0"),
+        (HEADER + GOOD * 2, "3: a pose needs at least 3 pairs, got 2"),
+        (HEADER + '1,2,3,4,"5\n' + GOOD, "3: not a CSV file: unexpected end of data"),
+        (HEADER + GOOD + "\0\0", "3: not a text file"),
+        (HEADER.encode() + b"\xff\xfe\n", "2: not a text file in UTF-8"),
+        (bytes(range(1, 256)) * 20, "2: not a text file in UTF-8"),
+        (b"\xff\xfeX\0,\0", "1: not a text file in UTF-8"),
+    ],
+)
+def test_bad_csv_files(capsys, tmp_path, content, expected):
+    path = tmp_path / "bad.csv"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    assert run(capsys, "solve", path, "--intrinsics", CAMERA) == (2, "", f"pnpnet: {path}:{expected}\n")
+
+
+@pytest.mark.parametrize(
+    ("arrays", "expected"),
+    [
+        ({"img_points": np.zeros((4, 2))}, "no array world_points"),
+        ({"world_points": np.zeros((4, 3))}, "no array img_points"),
+        (
+            {"world_points": np.zeros((4, 3)), "img_points": np.zeros((5, 2))},
+            "img_points must hold numbers of the shape (4, 2), got float64 of (5, 2)",
+        ),
+        (
+            {"world_points": np.zeros(()), "img_points": np.zeros((0, 2))},
+            "world_points must hold numbers of the shape (0, 3), got float64 of ()",
+        ),
+        (
+            {"world_points": np.zeros((3, 3), dtype="U1"), "img_points": np.zeros((3, 2))},
+            "world_points must hold numbers of the shape (3, 3), got <U1 of (3, 3)",
+        ),
+        ({"world_points": np.zeros((0, 3)), "img_points": np.zeros((0, 2))}, "a pose needs at least 3 pairs, got 0"),
+        (
+            {"world_points": np.zeros((4, 3)), "img_points": np.array([[0, 0], [1, 1], [0, math.nan], [2, 2]])},
+            "img_points[2] is not finite",
+        ),
+        (
+            {"world_points": np.ones((3, 3)), "img_points": np.ones((3, 2)), "weights": np.array([1, 1, -2.0])},
+            "weights[2] is negative",
+        ),
+        (
+            {"world_points": np.ones((3, 3)), "img_points": np.ones((3, 2)), "intrinsics": -np.eye(3)},
+            "the focal lengths must be positive, got -1 and -1",
+        ),
+        (
+            {"world_points": np.ones((3, 3)), "img_points": np.ones((3, 2)), "intrinsics": np.eye(3) + np.eye(3, k=1)},
+            "the camera must have no skew, got 1",
+        ),
+        (
+            {"world_points": np.ones((3, 3)), "img_points": np.ones((3, 2)), "intrinsics": 2 * np.eye(3)},
+            "the intrinsics must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]",
+        ),
+    ],
+)
+def test_bad_npz_files(capsys, tmp_path, arrays, expected):
+    path = tmp_path / "bad.npz"
+    np.savez(path, **arrays)
+    assert run(capsys, "solve", path, "--intrinsics", CAMERA) == (2, "", f"pnpnet: {path}: {expected}\n")
+
+
+def test_npz_files_that_are_none(capsys, tmp_path):
+    path = tmp_path / "bad.npz"
+    np.savez(path, world_points=np.array([{}], dtype=object), img_points=np.zeros((3, 2)))
+    good = tmp_path / "good.npz"
+    np.savez(good, world_points=np.ones((3, 3)), img_points=np.ones((3, 2)))
+    contents = [path.read_bytes(), b"", b"garbage\n", good.read_bytes()[:-40]]
+    for content in contents:
+        path.write_bytes(content)
+        code, out, err = run(capsys, "solve", path, "--intrinsics", CAMERA)
+        assert (code, out, err.count("\n")) == (2, "", 1)
+        assert err.startswith(f"pnpnet: {path}: not an NPZ file of plain arrays: ")
+    assert run(capsys, "solve", good) == (
+        2,
+        "",
+        f"pnpnet: {good}: the camera is not in the file: pass --intrinsics fx,fy,cx,cy\n",
+    )
+
+
+def test_missing_files_and_folders(capsys, tmp_path):
+    missing = tmp_path / "missing.csv"
+    for path, reason in ((missing, "No such file or directory"), (tmp_path, "Is a directory")):
+        assert run(capsys, "solve", path, "--intrinsics", CAMERA) == (2, "", f"pnpnet: {path}: {reason}\n")
+
+
+@pytest.mark.parametrize(
+    ("camera", "expected"),
+    [
+        ("1,2,3", "expected four numbers fx,fy,cx,cy, got '1,2,3'"),
+        ("1,2,3,x", "expected four numbers fx,fy,cx,cy, got '1,2,3,x'"),
+        ("1,2,3,4,5", "expected four numbers fx,fy,cx,cy, got '1,2,3,4,5'"),
+        ("0,800,320,240", "the focal lengths must be positive, got 0 and 800"),
+        ("800,-1,320,240", "the focal lengths must be positive, got 800 and -1"),
+        ("800,800,nan,240", "the intrinsics are not finite"),
+    ],
+)
+def test_bad_intrinsics(capsys, csv_file, camera, expected):
+    assert run(capsys, "solve", csv_file, f"--intrinsics={camera}") == (2, "", f"pnpnet: --intrinsics: {expected}\n")
+
+
+def test_wrong_n_and_wrong_solvers_are_one_line(capsys, csv_file, tmp_path, weights_folder):
+    eight = tmp_path / "eight.csv"
+    eight.write_text("\n".join(csv_file.read_text().splitlines()[:-1]))
+    common = ("--intrinsics", CAMERA, "--solver")
+    code, out, err = run(capsys, "solve", eight, *common, weights_folder)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "n = 9" in err
+    assert "N = 8" in err
+    bad = {
+        "nobody": "No solver 'nobody'",
+        str(tmp_path): "No weights",
+        "opencv-ransac:speed=9": "unexpected keyword argument 'speed'",
+        "opencv-ransac:threshold=-1": "threshold must be positive",
+    }
+    for name, expected in bad.items():
+        code, out, err = run(capsys, "solve", csv_file, *common, name)
+        assert (code, out, err.count("\n")) == (2, "", 1)
+        assert err.startswith("pnpnet: ")
+        assert expected in err
+    (weights_folder / "config.json").write_text("{}")
+    code, out, err = run(capsys, "solve", csv_file, *common, weights_folder)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        (),
+        ("solve",),
+        ("fly",),
+        ("solve", "x.csv", "--threshold", "0"),
+        ("solve", "x.csv", "--plot", "x.doc"),
+        ("evaluate", "--problems", "0"),
+        ("evaluate", "--seed", "-1"),
+        ("demo", "--train-seconds", "nan"),
+    ],
+)
+def test_wrong_usage_is_one_line(capsys, arguments):
+    with pytest.raises(SystemExit) as stopped:
+        main(list(arguments))
+    _, err = capsys.readouterr()
+    assert stopped.value.code == 2
+    assert err.startswith("pnpnet: ")
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize("command", ["solve", "evaluate", "list", "demo"])
+def test_help_has_an_example(capsys, command):
+    with pytest.raises(SystemExit) as stopped:
+        main([command, "--help"])
+    assert stopped.value.code == 0
+    assert f"\n  pnpnet {command}" in capsys.readouterr().out
+
+
+# -- evaluate, list, demo --------------------------------------------------------------------------------------------
+
+
+def test_evaluate_writes_what_it_prints(capsys, tmp_path, shipped):
+    out_file, pictures = tmp_path / "results.json", tmp_path / "pictures"
+    code, out, err = run(
+        capsys, "evaluate", "--outliers", "none,uniform,2", "--problems", 20, "--out", out_file, "--plot", pictures
+    )
+    assert (code, err) == (0, "")
+    results = load_results(out_file)
+    assert list(results["solvers"]) == ["pnpnet-n9", "net-n9", "identity-lm", "opencv-ransac"]
+    assert list(results["data"]) == [f"synthetic, {label}" for label in ("0 outliers", "0-3 outliers", "2 outliers")]
+    assert [entry["mean_outliers"] for entry in results["data"].values()][::2] == [0.0, 2.0]
+    assert out.count("| synthetic, 2 outliers") == 4
+    assert sorted(path.name for path in pictures.iterdir()) == ["errors.png", "success.png"]
+    again = tmp_path / "again.json"
+    run(capsys, "evaluate", "--problems", 20, "--solver", "identity-lm", "--out", again)
+    assert load_results(again)["rows"][0]["per_problem"] == results["rows"][2]["per_problem"]
+
+
+def test_evaluate_takes_scenes_options_and_folders(capsys, tmp_path, weights_folder):
+    generator = np.random.default_rng(0)
+    world = generator.uniform((-2, -2, 4), (2, 2, 9), (30, 3))
+    matches = tmp_path / "scene.npz"
+    np.savez(
+        matches,
+        names=np.array(["a.jpg"]),
+        K=K.numpy()[None],
+        R=np.eye(3)[None],
+        t=np.zeros((1, 3)),
+        size=np.array([[640, 480]]),
+        **{
+            "000_world_points": world,
+            "000_img_points": world[:, :2] / world[:, 2:] * (800, 810) + (320, 240),
+            "000_error_px": np.zeros(30),
+        },
+    )
+    out_file = tmp_path / "results.json"
+    solvers = ("opencv-ransac:threshold=5,refine=false", str(weights_folder))
+    common = ("evaluate", "--data", matches, "--outliers", "none,1", "--problems", 5, "--out", out_file)
+    assert run(capsys, *common, "--solver", *solvers)[0] == 0
+    results = load_results(out_file)
+    assert list(results["data"]) == ["scene, +0 outliers", "scene, +1 outlier"]
+    assert results["solvers"][solvers[0]]["config"]["refine"] is False
+    assert results["rows"][0]["success"]["rate"] == 1.0
+    entry = results["data"]["scene, +0 outliers"]
+    assert (entry["unit"], entry["max_translation"]) == ("m", 0.2)
+    assert run(capsys, *common, "--solver", solvers[0], "--arbitrary-unit")[0] == 0
+    entry = load_results(out_file)["data"]["scene, +0 outliers"]
+    assert entry["unit"] == ""
+    assert entry["max_translation"] == pytest.approx(0.005 * np.median(world[:, 2]), rel=0.1)
+    code, _, err = run(capsys, *common, "--solver", solvers[0], "--n", 40)
+    assert (code, err.count("\n")) == (2, 1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("--data", "nowhere"), "nowhere"),
+        (("--outliers", "none,some"), "expected none, uniform or numbers with commas"),
+        (("--outliers", "10"), "10 outliers do not fit into n = 9 pairs"),
+        (("--n", "2"), "at least 3 pairs"),
+        (("--solver", "nobody"), "No solver 'nobody'"),
+    ],
+)
+def test_evaluate_refuses_in_one_line(capsys, arguments, expected):
+    code, out, err = run(capsys, "evaluate", "--problems", 5, *arguments)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith("pnpnet: ")
+    assert expected in err
+
+
+def test_evaluate_on_another_n_than_the_weights(capsys, weights_folder):
+    code, _, err = run(capsys, "evaluate", "--problems", 5, "--n", 6, "--solver", weights_folder)
+    assert (code, err.count("\n")) == (2, 1)
+    assert "n = 9" in err
+
+
+def test_list_names_solvers_and_missing_packages(capsys, shipped, monkeypatch):
+    code, out, _ = run(capsys, "list")
+    assert code == 0
+    lines = dict(line.split(None, 1) for line in out.splitlines()[:4])
+    assert lines == dict.fromkeys(("identity-lm", "net-n9", "opencv-ransac", "pnpnet-n9"), "installed")
+    assert out.splitlines()[-1] == "Shipped weights: pnpnet-n9"
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert "needs OpenCV: pip install 'kornia_pnpnet[eval]'" in run(capsys, "list")[1]
+
+
+def test_demo_compares_trains_and_draws(capsys, tmp_path, shipped, monkeypatch):
+    pytest.importorskip("matplotlib")
+    asked = []
+
+    def train_briefly(seconds, folder):
+        asked.append((seconds, folder))
+        folder.mkdir(parents=True)
+        columns = "update,total,init_rotation,init_translation,refined_rotation,refined_translation,val/none/success"
+        (folder / "history.csv").write_text(f"{columns}\n1,1,1,1,1,1,0.25\n2,1,1,1,1,1,\n3,1,1,1,1,1,0.5\n")
+        return folder / "history.csv"
+
+    training = ModuleType("kornia_pnpnet.training")
+    training.train_briefly = train_briefly
+    monkeypatch.setitem(sys.modules, "kornia_pnpnet.training", training)
+    folder = tmp_path / "demo"
+    code, out, err = run(capsys, "demo", "--out", folder, "--problems", 20, "--train-seconds", 3)
+    assert (code, err) == (0, "")
+    assert asked == [(3.0, folder / "training")]
+    assert "success, outliers none: 25.0 % at update 1 -> 50.0 % at update 3" in out
+    results = load_results(folder / "results.json")
+    assert list(results["solvers"]) == ["pnpnet-n9", "net-n9", "identity-lm", "opencv-ransac"]
+    assert {entry["dtype"] for entry in results["data"].values()} == {"float32"}
+    assert out.count("| synthetic, 0-3 outliers") == 4
+    for name in ("success", "errors", "problem", "training"):
+        assert (folder / f"{name}.png").stat().st_size > 10_000
+        assert str(folder / f"{name}.png") in out
+
+
+def test_interrupting_is_one_line(capsys, monkeypatch):
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("kornia_pnpnet.cli.list_solvers", interrupt)
+    assert run(capsys, "list") == (130, "", "pnpnet: interrupted\n")
+
+
+def test_version(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(["--version"])
+    assert stopped.value.code == 0
+    assert capsys.readouterr().out == f"pnpnet {kornia_pnpnet.__version__}\n"
+
+
+def test_the_command_as_a_process(csv_file):
+    code = "import sys; from kornia_pnpnet.cli import main; sys.exit(main())"
+    arguments = ["solve", str(csv_file), "--intrinsics", CAMERA, "--solver", "identity-lm"]
+    command = [sys.executable, "-W", "error", "-c", code, *arguments]
+    solved = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
+    assert json.loads(solved.stdout)["ok"]
+    assert solved.stderr == ""
+
+
+# -- the measures behind it ------------------------------------------------------------------------------------------
+
+
+def test_points_behind_the_camera_have_no_reprojection():
+    world = torch.tensor([[[0.0, 0, 2], [1, 1, -2], [0, 0, 0]]])
+    pixels = reprojections(world, Pose(torch.eye(3)[None], torch.zeros(1, 3)), K.float()[None])
+    assert pixels[0, 0].tolist() == [320.0, 240.0]
+    assert pixels[0, 1:].isnan().all()
+
+
+def test_rejection_limit_ignores_what_is_not_finite():
+    errors = torch.tensor([10.0, 20.0, 30.0, math.inf, math.nan])
+    assert rejection_limit(errors) == pytest.approx(3 * 1.4826 * 20)
+    assert rejection_limit(errors[3:]) == 3.0

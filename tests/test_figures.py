@@ -1,0 +1,167 @@
+"""Pictures exist, show the data, and leave nothing behind in matplotlib."""
+
+from __future__ import annotations
+
+import importlib
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("matplotlib")
+
+from matplotlib.image import imread
+
+from kornia_pnpnet.figures import plot_errors, plot_pose, plot_success, plot_training
+
+
+def fake_results(solvers: int = 3, sets: int = 2, shift: float = 0.0) -> dict:
+    """What `evaluate` returns, as far as a picture reads it."""
+    generator = np.random.default_rng(0)
+    names, data = [f"solver-{i}" for i in range(solvers)], [f"set, {i}" for i in range(sets)]
+    entry = {"max_rotation_deg": 1.0, "max_translation": 0.2, "unit": "m"}
+    rows = []
+    for set_name in data:
+        for index, name in enumerate(names):
+            rate = max(0.0, 0.9 - 0.2 * index - shift)
+            rotation = np.exp(generator.normal(index + shift, 1.0, 50)).tolist()
+            per_problem = {"rotation_error_deg": rotation, "translation_error": rotation, "ok": [1] * 50}
+            success = {"rate": rate, "low": max(0.0, rate - 0.05), "high": min(1.0, rate + 0.05), "count": 50}
+            rows.append({"data": set_name, "solver": name, "success": success, "per_problem": per_problem})
+    return {"solvers": dict.fromkeys(names), "data": {name: dict(entry) for name in data}, "rows": rows}
+
+
+def pixels(path) -> np.ndarray:
+    image = imread(path)
+    assert image.shape[0] > 300
+    assert image.shape[1] > 500
+    # An opaque white background; colour, dark ink, and most of the page empty.
+    assert (image[0, 0] == 1).all()
+    assert 0.005 < (image[..., :3].min(-1) < 0.9).mean() < 0.6
+    return image
+
+
+def differ(a: np.ndarray, b: np.ndarray) -> bool:
+    return a.shape != b.shape or not np.array_equal(a, b)
+
+
+def has_colour(image: np.ndarray, colour: tuple[int, int, int]) -> bool:
+    return bool((np.abs(image[..., :3] - np.array(colour) / 255).max(-1) < 0.02).sum() > 20)
+
+
+BLUE, RED = (0, 0x72, 0xB2), (0xCC, 0x33, 0x11)
+
+
+@pytest.fixture
+def problem():
+    generator = np.random.default_rng(1)
+    img = generator.uniform((0, 0), (640, 480), (9, 2))
+    projected = img + generator.normal(0, 2, img.shape)
+    projected[2] = img[2] + 150
+    return img, projected, np.arange(9) == 2
+
+
+@pytest.mark.parametrize("plot", [plot_success, plot_errors])
+def test_results_pictures_show_the_data(tmp_path, plot):
+    results = fake_results(sets=1)
+    first = pixels(plot(tmp_path / "new" / "a.png", results))
+    assert results == fake_results(sets=1)
+    again = pixels(plot(tmp_path / "b.png", results))
+    other = pixels(plot(tmp_path / "c.png", fake_results(sets=1, shift=0.2)))
+    assert np.array_equal(first, again)
+    assert differ(first, other)
+    assert has_colour(first, BLUE)
+
+
+def test_bars_are_as_high_as_the_rates(tmp_path):
+    def blue(shift: float) -> float:
+        results = fake_results(solvers=1, sets=1, shift=shift)
+        image = pixels(plot_success(tmp_path / "a.png", results))
+        column = image[:, image.shape[1] // 2 - 80, :3]
+        return (np.abs(column - np.array(BLUE) / 255).max(-1) < 0.02).sum() / image.shape[0]
+
+    assert blue(0.0) / blue(0.45) == pytest.approx(2.0, rel=0.02)
+
+
+@pytest.mark.parametrize("plot", [plot_success, plot_errors])
+@pytest.mark.parametrize(("solvers", "sets"), [(1, 1), (14, 1)])
+def test_any_number_of_solvers_and_sets(tmp_path, plot, solvers, sets):
+    pixels(plot(tmp_path / "a.png", fake_results(solvers, sets)))
+
+
+def test_incomplete_and_extreme_rows(tmp_path):
+    results = fake_results()
+    del results["rows"][1]
+    results["rows"][0]["success"] = {"rate": 0.0, "low": 1e-18, "high": 0.0, "count": 50}
+    results["rows"][0]["per_problem"]["rotation_error_deg"] = [0.0] * 50
+    results["data"]["set, 1"]["max_translation"] = 1.0
+    pixels(plot_success(tmp_path / "a.png", results))
+    pixels(plot_errors(tmp_path / "b.png", results))
+
+
+def test_pose_picture_marks_rejected_pairs(tmp_path, problem):
+    img, projected, rejected = problem
+    kept = pixels(plot_pose(tmp_path / "a.png", img, projected, np.zeros(9, dtype=bool), title="all kept"))
+    marked = pixels(plot_pose(tmp_path / "b.png", img, projected, rejected, title="one rejected"))
+    # The legend has a cross in any case; the pair's own cross and line come on top.
+    red = [(np.abs(image[..., :3] - np.array(RED) / 255).max(-1) < 0.1).sum() for image in (kept, marked)]
+    assert red[1] > 1.5 * red[0] > 0
+    assert has_colour(marked, BLUE)
+
+
+def test_pose_picture_takes_tensors_sizes_and_points_behind(tmp_path, problem):
+    img, projected, rejected = map(torch.from_numpy, problem)
+    whole = pixels(plot_pose(tmp_path / "a.png", img, projected, rejected, (640, 480)))
+    projected[4] = torch.nan
+    projected[5] = 1e12
+    behind = pixels(plot_pose(tmp_path / "b.png", img, projected, rejected, (640, 480)))
+    assert differ(whole, behind)
+    pixels(plot_pose(tmp_path / "c.png", img, torch.full_like(img, torch.nan), rejected))
+    pixels(plot_pose(tmp_path / "d.png", img[:, :1] * torch.tensor([0.0, 1.0]), projected, rejected))
+
+
+HEADER = "update,total,init_rotation,init_translation,refined_rotation,refined_translation"
+
+
+def write_history(path, *, factor: float = 1.0):
+    rows = [f"{i},{factor / i},{1 / i},{9 / i},{0.5 / i},{4 / i},1.0,{'' if i % 2 else 0.1 * i}" for i in range(1, 9)]
+    path.write_text("\n".join([f"{HEADER},lr,val/none/success", *rows]) + "\n")
+    return path
+
+
+def test_training_picture_reads_the_history(tmp_path):
+    first = pixels(plot_training(tmp_path / "a.png", write_history(tmp_path / "a.csv")))
+    other = pixels(plot_training(tmp_path / "b.png", write_history(tmp_path / "b.csv", factor=2.0)))
+    assert differ(first, other)
+    bare = tmp_path / "bare.csv"
+    bare.write_text(f"{HEADER}\n1,1,1,1,1,1\n2,nan,1,1,1,1\n")
+    pixels(plot_training(tmp_path / "c.png", bare))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"), [("", "no rows"), (HEADER, "no rows"), ("update\n1", "no column 'total'")]
+)
+def test_histories_that_cannot_be_drawn(tmp_path, text, message):
+    path = tmp_path / "bad.csv"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        plot_training(tmp_path / "a.png", path)
+
+
+def test_no_pyplot_and_no_matplotlib_without_figures():
+    code = (
+        "import sys, kornia_pnpnet, kornia_pnpnet.cli\n"
+        "assert not {'matplotlib', 'cv2', 'pycolmap', 'hydra', 'lightning_fabric'} & set(sys.modules)\n"
+        "import kornia_pnpnet.figures\n"
+        "assert 'matplotlib.pyplot' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+def test_without_matplotlib_the_error_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.axes", None)
+    monkeypatch.delitem(sys.modules, "kornia_pnpnet.figures")
+    with pytest.raises(ImportError, match=r"pip install 'kornia_pnpnet\[eval\]'"):
+        importlib.import_module("kornia_pnpnet.figures")
