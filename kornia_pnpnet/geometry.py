@@ -24,6 +24,7 @@ __all__ = [
     "MIN_DEPTH_RATIO",
     "Linearization",
     "Projection",
+    "additive_tangent_map",
     "linearize",
     "project",
     "retract",

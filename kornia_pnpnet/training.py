@@ -6,6 +6,7 @@ skipped when they are not finite, and a run that can be stopped at any moment an
 
 from __future__ import annotations
 
+import logging
 import math
 import resource
 import sys
@@ -20,6 +21,7 @@ from kornia.core.check import KORNIA_CHECK
 from lightning_fabric import Fabric
 from torch import nn
 from tqdm import tqdm
+from tqdm.contrib.logging import logging_redirect_tqdm
 
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.init import MLPInit
@@ -39,6 +41,8 @@ from kornia_pnpnet.runstate import (
 from kornia_pnpnet.types import Pose, Problems
 
 __all__ = ["FitReport", "ProblemSource", "TrainSettings", "fit", "train_briefly", "validate"]
+
+_log = logging.getLogger(__name__)
 
 
 class ProblemSource(Protocol):
@@ -236,7 +240,7 @@ def fit(
     logged_update = update = start
     interrupted = False
     bar = tqdm(total=settings.updates, initial=start, disable=not (progress and fabric.is_global_zero), unit="update")
-    with stop_on_signal() as stop, bar:
+    with stop_on_signal() as stop, bar, logging_redirect_tqdm():
         while update < settings.updates and not interrupted:
             factor = settings.lr_factor(update)
             for group in optimizer.param_groups:
@@ -255,7 +259,7 @@ def fit(
             if bad:
                 skipped += 1
                 if fabric.is_global_zero:
-                    tqdm.write(f"update {update}: loss or gradient not finite, step skipped ({skipped} so far)")
+                    _log.warning("update %s: loss or gradient not finite, step skipped (%s so far)", update, skipped)
             else:
                 fabric_optimizer.step()
             update += 1
@@ -278,7 +282,11 @@ def fit(
                     report = validate(model, validation)
                     model.train()
                     row |= report
-                    bar.set_postfix({name: f"{100 * report[f'val/{name}/success']:.1f}%" for name in validation})
+                    rates = {name: f"{100 * report[f'val/{name}/success']:.1f} %" for name in validation}
+                    memory = row["peak_memory_mib"]
+                    found = ", ".join(f"{name} {share}" for name, share in rates.items())
+                    _log.info("update %s: success %s; %.1f updates/s, %.0f MiB", update, found, rate, memory)
+                    bar.set_postfix(rates)
                 history.write(row)
                 logged, logged_update = time.perf_counter(), update
             if update % settings.checkpoint_every == 0 or last:
