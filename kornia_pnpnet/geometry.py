@@ -104,8 +104,8 @@ def project(pose: Pose, corr: Correspondences) -> Projection:
     sq_ratio = MIN_DEPTH_RATIO * MIN_DEPTH_RATIO
     depth = cam_points[..., 2]
     in_front = (depth > 0) & (depth.square() > sq_ratio * cam_points.detach().square().sum(-1))
-    unit = cam_points.new_tensor((0.0, 0.0, 1.0))
-    safe = torch.where(in_front[..., None], cam_points, unit)
+    axis = torch.eye(3, dtype=cam_points.dtype, device=cam_points.device)[2]
+    safe = torch.where(in_front[..., None], cam_points, axis)
     plane_points = convert_points_from_homogeneous(safe, eps=0.0)  # (B, N, 2)
     residual = torch.where(in_front[..., None], corr.focal * plane_points - corr.img_points, 0.0)
     return Projection(residual, in_front, rotated, safe, plane_points)

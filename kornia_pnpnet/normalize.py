@@ -135,7 +135,7 @@ class Normalize(nn.Module):
             world_points = world_points.gather(1, order[..., None].expand(-1, -1, 3))
             pixels = pixels.gather(1, order[..., None].expand(-1, -1, 2))
             weights = weights.gather(1, order)
-        focal = torch.as_tensor(self.f_const, dtype=pixels.dtype, device=pixels.device)
+        focal = pixels.new_full((), self.f_const)  # made on the device: nothing here waits for the CPU
         return Correspondences(world_points, pixels, weights, focal), Frame(centroid, scale, order, valid)
 
     def _world_frame(self, world_points: Tensor, there: Tensor) -> tuple[Tensor, Tensor, Tensor]:
