@@ -628,5 +628,5 @@ def test_solvers_by_name(make_problems):
     assert solver(*make_problems()[:3]).matrix.shape == (7, 4, 4)
     with pytest.raises(ValueCheckError, match=r"pnpnet-nine.*identity-lm"):
         create_solver("pnpnet-nine")
-    with pytest.raises(TypeError):
+    with pytest.raises(ValueCheckError, match="iterations"):
         create_solver("identity-lm", iterations=3)
