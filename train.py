@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import logging
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -23,7 +25,7 @@ log = logging.getLogger("train")
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="train")
 def main(config: DictConfig) -> float | None:
-    """Train, write results and weights; returns the success rate that a sweeper may maximise."""
+    """Train, write results and weights; returns the success rate with outliers, which a sweeper may maximise."""
     runtime = HydraConfig.get()
     folder = Path(runtime.runtime.output_dir)
     if config.threads is not None:
@@ -34,10 +36,14 @@ def main(config: DictConfig) -> float | None:
     model = instantiate(config.model.solver)
     validation = {name: instantiate(source).batch(0) for name, source in config.data.validation.items()}
     settings = instantiate(config.train, _convert_="all")
+    processes = int(os.environ.get("WORLD_SIZE", fabric.world_size))
+    if processes != fabric.world_size:
+        sys.exit(f"torchrun started {processes} processes: pass engine.devices=... engine.strategy=ddp to match.")
     if fabric.is_global_zero:
         parameters = sum(p.numel() for p in model.parameters() if p.requires_grad)
         shape = f"n = {config.model.n}, m = {config.model.m}"
         log.info("%s, %s parameters, %s processes", shape, parameters, fabric.world_size)
+    resolved: Any = OmegaConf.to_container(config, resolve=True)
     try:
         report = fit(
             model,
@@ -47,10 +53,13 @@ def main(config: DictConfig) -> float | None:
             settings,
             folder,
             fabric=fabric,
+            identity={"data": resolved["data"]["train"], "loss": resolved["loss"], "model_config": resolved["model"]},
             resume=config.resume,
             progress=config.progress,
         )
     except TrainingError as error:
+        if runtime.mode == RunMode.MULTIRUN:
+            raise  # the sweep goes on with its other runs
         log.error("%s", error)
         sys.exit(1)
     if not fabric.is_global_zero:
@@ -65,18 +74,21 @@ def main(config: DictConfig) -> float | None:
     if report.interrupted:
         log.warning("Stopped at update %s of %s; continue with resume=true.", report.update, settings.updates)
         sys.exit(130)
-    resolved: Any = OmegaConf.to_container(config, resolve=True)
-    results = run_results(model.cpu(), validation, report, resolved, list(runtime.overrides.task))
-    write_json(folder / RESULTS_NAME, results)
-    model.save_pretrained(folder / "weights")
-    write_model_card(folder / "weights", results)
+    if report.start == report.update and (folder / RESULTS_NAME).exists():
+        log.info("Nothing is left to train; the results stay as they are.")
+        results = json.loads((folder / RESULTS_NAME).read_text())
+    else:
+        results = run_results(model.cpu(), validation, report, resolved, list(runtime.overrides.task))
+        write_json(folder / RESULTS_NAME, results)
+        model.save_pretrained(folder / "weights")
+        write_model_card(folder / "weights", results)
     for name, entry in results["validation"].items():
         rate = entry["success"]
         log.info("%s: success %.1f %% [%.1f, %.1f]", name, *(100 * rate[key] for key in ("rate", "low", "high")))
     log.info("Weights, model card and results are in %s", folder)
     if runtime.mode == RunMode.MULTIRUN:
         log.info("Sweep summary: %s", summarize_runs(runtime.sweep.dir))
-    return float(next(reversed(results["validation"].values()))["success"]["rate"])
+    return float(results["validation"]["uniform"]["success"]["rate"])
 
 
 if __name__ == "__main__":

@@ -109,6 +109,7 @@ def _parser() -> _Parser:
         "--solver",
         metavar="NAME",
         nargs="+",
+        action="extend",
         help="see `pnpnet list`, options after a colon (opencv-ransac:threshold=12,iterations=100), or folders of "
         "weights; default: those for n that are installed",
     )
@@ -116,7 +117,7 @@ def _parser() -> _Parser:
         "--data",
         metavar="DATA",
         nargs="+",
-        default=["synthetic"],
+        action="extend",
         help="synthetic, a folder with a COLMAP model, or an .npz file of matches; default: synthetic",
     )
     evaluate.add_argument("--n", type=_positive_int, default=9, help="pairs per problem; default: 9")
@@ -171,7 +172,7 @@ def main(argv: list[str] | None = None) -> int:
     arguments = _parser().parse_args(argv)
     try:
         return int(arguments.run(arguments))
-    except (BaseError, PairsError, OSError, ImportError) as error:
+    except (BaseError, PairsError, OSError, ImportError, ValueError) as error:
         print(f"pnpnet: {_one_line(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
@@ -237,7 +238,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     names = arguments.solver or default_solvers(arguments.n)
     solvers = {name: load_solver(name) for name in names}
     sets = evaluation_sets(
-        arguments.data,
+        arguments.data or ["synthetic"],
         arguments.outliers,
         n=arguments.n,
         count=arguments.problems,

@@ -22,7 +22,6 @@ from kornia_pnpnet.types import PnPResult, Pose, Problems
 __all__ = [
     "EvaluationData",
     "draw_problems",
-    "environment",
     "evaluate",
     "format_table",
     "load_results",
@@ -81,23 +80,14 @@ def draw_problems(source: _Source, count: int) -> Problems:
     batches = [source.batch(0)]
     size = len(batches[0].world_points)
     batches += [source.batch(index) for index in range(1, math.ceil(count / size))]
-    return _problems(*(torch.cat(parts)[:count] for parts in zip(*map(_flat, batches), strict=True)))
-
-
-def _flat(problems: Problems) -> tuple[Tensor, ...]:
-    world_points, img_points, intrinsics, pose, inliers = problems
-    return world_points, img_points, intrinsics, *pose, inliers
-
-
-def _problems(
-    world: Tensor, img: Tensor, intrinsics: Tensor, rotation: Tensor, translation: Tensor, inliers: Tensor
-) -> Problems:
-    return Problems(world, img, intrinsics, Pose(rotation, translation), inliers)
+    fields = zip(*((*batch[:3], *batch.pose, batch.inliers) for batch in batches), strict=True)
+    joined = iter([torch.cat(field)[:count] for field in fields])
+    return batches[0].map(lambda _: next(joined))
 
 
 def _chunks(problems: Problems, size: int) -> Iterator[Problems]:
     for start in range(0, len(problems.world_points), size):
-        yield _problems(*(part[start : start + size] for part in _flat(problems)))
+        yield problems.map(lambda part, start=start: part[start : start + size])  # type: ignore[misc]
 
 
 def evaluate(

@@ -139,7 +139,7 @@ def plot_success(path: str | Path, results: Mapping[str, Any]) -> Path:
         bars = axes.bar(
             places, rate, 0.92 * width, color=colour, hatch=_HATCHES[turn], edgecolor="white", linewidth=0, label=solver
         )
-        reach = np.stack((rate - low, high - rate))
+        reach = np.stack((rate - low, high - rate)).clip(min=0)  # rounded in the file, a bound may lie a hair inside
         axes.errorbar(places, rate, reach, fmt="none", ecolor="#222222", capsize=3, linewidth=1.2)
         for bar, value, top in zip(bars, rate, high, strict=True):
             place = bar.get_x() + bar.get_width() / 2

@@ -128,6 +128,9 @@ def lm_step(
     """
     linear = linearize(projection, corr.focal, additive_tangent_map(pose) if additive else None)
     used = torch.where(projection.in_front, weights, 0.0)
+    # The step does not depend on a common factor of the weights; tiny weights must not vanish when multiplied.
+    largest = used.detach().amax(-1, keepdim=True)
+    used = used / torch.where(largest > 0, largest, 1.0)
     weighted = linear.jacobian * torch.cat((used, used), 1)[:, None]  # (B, 6, 2N)
     hessian = weighted @ linear.jacobian.mT
     gradient = (weighted @ linear.residual[..., None])[..., 0]

@@ -11,6 +11,7 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from kornia.core.exceptions import BaseError, DeviceError, ShapeError, TypeCheckError, ValueCheckError
 from torch import Tensor, nn
 
+from kornia_pnpnet.files import atomic_open
 from kornia_pnpnet.init import MLPInit
 from kornia_pnpnet.lm import RobustWeightedLM
 from kornia_pnpnet.normalize import Normalize
@@ -29,7 +30,12 @@ def shipped_weights() -> list[str]:
 
 
 def check_inputs(
-    world_points: Tensor, img_points: Tensor, intrinsics: Tensor, weights: Tensor | None, mask: Tensor | None
+    world_points: Tensor,
+    img_points: Tensor,
+    intrinsics: Tensor,
+    weights: Tensor | None,
+    mask: Tensor | None,
+    init: Pose | None = None,
 ) -> None:
     """Check shapes, dtypes and devices; never values, which would stall a GPU and let one problem fail a batch."""
     KORNIA_CHECK_SHAPE(world_points, ["B", "N", "3"])
@@ -37,8 +43,10 @@ def check_inputs(
     batch, count = world_points.shape[:2]
     shapes = {"img_points": (img_points, (batch, count, 2)), "weights": (weights, (batch, count))}
     shapes["mask"] = (mask, (batch, count))
-    if intrinsics.shape != (3, 3):
-        shapes["intrinsics"] = (intrinsics, (batch, 3, 3))
+    shapes["intrinsics"] = (intrinsics, (3, 3) if intrinsics.ndim == 2 else (batch, 3, 3))
+    rotation, translation = (None, None) if init is None else init
+    shapes["init rotation"] = (rotation, (batch, 3, 3))
+    shapes["init translation"] = (translation, (batch, 3))
     for name, (tensor, expected) in shapes.items():
         if tensor is not None and tensor.shape != expected:
             raise ShapeError(
@@ -49,15 +57,16 @@ def check_inputs(
             )
     if count < 3:
         raise ShapeError(f"A pose needs at least 3 pairs, got N = {count}.", actual_shape=tuple(world_points.shape))
-    for name, tensor in {"img_points": img_points, "intrinsics": intrinsics, "weights": weights}.items():
+    floats = {"img_points": img_points, "intrinsics": intrinsics, "weights": weights}
+    floats |= {"init rotation": rotation, "init translation": translation}
+    for name, tensor in floats.items():
         if tensor is not None and tensor.dtype != world_points.dtype:
             raise TypeCheckError(f"{name} is {tensor.dtype} but world_points is {world_points.dtype}.")
     if world_points.dtype not in (torch.float32, torch.float64):
         raise TypeCheckError(f"world_points must be float32 or float64, got {world_points.dtype}.")
     if mask is not None and mask.dtype != torch.bool:
         raise TypeCheckError(f"mask must be bool, got {mask.dtype}.")
-    tensors = {"img_points": img_points, "intrinsics": intrinsics, "weights": weights, "mask": mask}
-    for name, tensor in tensors.items():
+    for name, tensor in {**floats, "mask": mask}.items():
         if tensor is not None and tensor.device != world_points.device:
             raise DeviceError(f"{name} is on {tensor.device} but world_points is on {world_points.device}.")
 
@@ -67,7 +76,7 @@ class PnPNet(nn.Module):
 
     The layer normalises the pairs, lets ``init`` guess a pose, refines it, and expresses it in the frame that came
     in. All of it is batched and differentiable. One bad problem (non-finite input, fewer than three pairs, points on
-    a line, nothing in front of the camera) has ``ok=False``, finite outputs and zero gradients, and changes no other.
+    a line, a pose that explains nothing) has ``ok=False``, a finite pose without gradient, and changes no other.
 
     Convention: ``x_cam = R x_world + t``, +z forward, pixels ``u = fx x/z + cx``; skew must be 0.
 
@@ -121,8 +130,9 @@ class PnPNet(nn.Module):
             first_stage_only: return the first guess unrefined, the paper's "Net"; as with ``m=0``, at that cost.
 
         Returns:
-            The :class:`~kornia_pnpnet.types.PnPResult`. Gradients flow through rotation, translation, weights, cost
-            and the first guess of the problems that are ``ok``.
+            The :class:`~kornia_pnpnet.types.PnPResult`. Gradients flow through rotation, translation, weights and cost
+            of the problems that are ``ok``, and through the first guess of every sound one. A problem that cannot be
+            solved has the identity as its pose and a cost of the square root of the dtype's largest number.
 
         Raises:
             ShapeError: for shapes that do not fit each other, fewer than 3 pairs, or another N than the initialiser
@@ -130,7 +140,7 @@ class PnPNet(nn.Module):
             TypeCheckError: for dtypes that differ or are not float32 or float64.
             DeviceError: for tensors on different devices.
         """
-        check_inputs(world_points, img_points, intrinsics, weights, mask)
+        check_inputs(world_points, img_points, intrinsics, weights, mask, init)
         if intrinsics.ndim == 2:
             intrinsics = intrinsics.expand(world_points.shape[0], 3, 3)
         with torch.autocast(world_points.device.type, enabled=False):
@@ -152,7 +162,7 @@ class PnPNet(nn.Module):
         return PnPResult(
             *_gate_pose(pose, ok, finite & frame.valid),
             _gate(pair_weights, ok, finite & frame.valid, 0.0),
-            _gate(refined.cost, ok, finite & frame.valid, torch.finfo(refined.cost.dtype).max),
+            _gate(refined.cost, ok, finite & frame.valid, torch.finfo(refined.cost.dtype).max ** 0.5),
             ok,
             _gate_pose(first, first_ok, first_ok),
         )
@@ -163,9 +173,8 @@ class PnPNet(nn.Module):
         if init is None:
             eye = torch.eye(3, dtype=world_points.dtype, device=world_points.device).expand(batch, 3, 3)
             init = Pose(eye, world_points.new_zeros(batch, 3))
-        KORNIA_CHECK_SHAPE(init[0], [str(batch), "3", "3"])
-        KORNIA_CHECK_SHAPE(init[1], [str(batch), "3"])
-        usable = frame.valid & init[0].isfinite().flatten(1).all(-1) & init[1].isfinite().all(-1)
+        limit = torch.finfo(world_points.dtype).max ** 0.25  # as for points: it can be squared twice
+        usable = frame.valid & (init[0].abs() < limit).flatten(1).all(-1) & (init[1].abs() < limit).all(-1)
         given = _gate_pose(Pose(*init), usable, usable)
         return Guess(self.normalize.apply_to_pose(given, frame), torch.ones_like(weights))
 
@@ -173,7 +182,8 @@ class PnPNet(nn.Module):
 
     def config(self) -> dict[str, Any]:
         """The constructor arguments of all parts, as plain data."""
-        init = None if self.init is None else {"name": type(self.init).__name__, **self.init.config}  # type: ignore[dict-item]
+        arguments = getattr(self.init, "config", {})
+        init = None if self.init is None else {"name": type(self.init).__name__, **arguments}
         return {"init": init, "refine": self.refine.config, "normalize": self.normalize.config}
 
     @classmethod
@@ -200,14 +210,20 @@ class PnPNet(nn.Module):
 
         Args:
             folder: where to; made when missing.
-        """
-        from safetensors.torch import save_file
 
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
+        Raises:
+            ValueCheckError: when the initialiser is not one of the package's.
+        """
+        from safetensors.torch import save
+
+        config = self.config()
+        if self.init is not None and config["init"]["name"] not in _INITIALISERS:
+            raise ValueCheckError(f"{config['init']['name']} cannot be saved, only {sorted(_INITIALISERS)} can.")
         state = {name: value.detach().cpu().contiguous() for name, value in self.state_dict().items()}
-        save_file(state, folder / WEIGHTS_NAME)
-        (folder / CONFIG_NAME).write_text(json.dumps(self.config(), indent=2) + "\n")
+        with atomic_open(Path(folder) / WEIGHTS_NAME, "wb") as file:
+            file.write(save(state))
+        with atomic_open(Path(folder) / CONFIG_NAME) as file:
+            file.write(json.dumps(config, indent=2) + "\n")
 
     @classmethod
     def from_pretrained(cls, name_or_folder: str | Path) -> PnPNet:
@@ -248,7 +264,7 @@ def _find_weights(name_or_folder: str | Path) -> Path:
         if (folder / CONFIG_NAME).is_file():
             return folder
     message = f"No weights {name!r}: shipped are {shipped_weights()}; a folder needs {CONFIG_NAME} and {WEIGHTS_NAME}"
-    if name.count("/") != 1 or Path(name).exists():
+    if isinstance(name_or_folder, Path) or name.count("/") != 1 or Path(name).exists():
         raise FileNotFoundError(f"{message}.")
     from huggingface_hub import hf_hub_download
     from huggingface_hub.errors import HfHubHTTPError

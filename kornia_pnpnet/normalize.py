@@ -13,6 +13,7 @@ import torch
 from kornia.geometry.conversions import normalize_points_with_intrinsics
 from torch import Tensor, nn
 
+from kornia_pnpnet.geometry import MIN_DEPTH_RATIO
 from kornia_pnpnet.types import Correspondences, Pose
 
 __all__ = ["F_CONST", "Frame", "Normalize"]
@@ -41,7 +42,7 @@ class Normalize(nn.Module):
     r"""Normalise cameras, order and world frame.
 
     A problem is *valid* when what its pairs hold is finite (and small enough to be squared twice), its weights are
-    not negative, at least three pairs have a weight, its camera has positive focal lengths and no skew, and its points
+    not negative, at least three pairs have a weight, its camera is a pinhole without skew, and its points
     do not lie on one line or point. The inputs of invalid problems are replaced by zeros, which keeps values and
     gradients finite everywhere behind.
 
@@ -98,19 +99,23 @@ class Normalize(nn.Module):
         """
         weights = torch.ones_like(world_points[..., 0]) if weights is None else weights
         there = torch.ones_like(weights, dtype=torch.bool) if mask is None else mask
-        # Beyond this, squares of squares overflow; NaN compares false. Pixels are bounded as the normalised camera's.
+        # Beyond this, squares of squares overflow; NaN compares false. No point in front of the camera has a pixel
+        # beyond the other limit.
         limit = torch.finfo(world_points.dtype).max ** 0.25
         with torch.no_grad():
             raw_pixels = self.f_const * normalize_points_with_intrinsics(img_points, intrinsics)
         finite = (
             (world_points.abs() < limit).all(-1)
-            & (raw_pixels.abs() < limit).all(-1)
+            & (raw_pixels.abs() <= self.f_const / MIN_DEPTH_RATIO).all(-1)
             & (weights < limit)
             & (weights >= 0)
         )
         focal_lengths = intrinsics.diagonal(dim1=-2, dim2=-1)[:, :2]
         camera_ok = (intrinsics.abs() < limit).flatten(1).all(-1)
-        camera_ok = camera_ok & (focal_lengths > 0).all(-1) & (intrinsics[:, 0, 1] == 0)
+        last_row = intrinsics.new_zeros(3)
+        last_row[2] = 1.0
+        camera_ok = camera_ok & (focal_lengths > 0).all(-1) & (intrinsics[:, 2] == last_row).all(-1)
+        camera_ok = camera_ok & (intrinsics[:, 0, 1] == 0) & (intrinsics[:, 1, 0] == 0)
         valid = camera_ok & (finite | ~there).all(-1)
 
         # Inputs are made safe before anything is computed from them.
@@ -121,6 +126,7 @@ class Normalize(nn.Module):
         img_points = torch.where(there[..., None], img_points, 0.0)
         weights = torch.where(there, weights, 0.0)
         there = weights > 0
+        weights = torch.where(there, weights, 0.0)  # a pair that is not there has no gradient either
         pixels = self.f_const * normalize_points_with_intrinsics(img_points, intrinsics)
         pixels = torch.where(there[..., None], pixels, 0.0)
         valid = valid & (there.sum(-1) >= 3)
@@ -150,12 +156,15 @@ class Normalize(nn.Module):
         with torch.no_grad():
             size = world_points.abs().flatten(1).amax(-1) if world_points.shape[1] else mean.new_zeros(mean.shape[0])
             safe_size = torch.where(size > 0, size, 1.0)
+            large = size > torch.finfo(world_points.dtype).tiny ** 0.25  # smaller squares vanish
             unit = centred / safe_size[:, None, None]
             covariance = (share[..., None] * unit).mT @ unit  # (B, 3, 3)
             trace = covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
             minors = 0.5 * (trace.square() - covariance.square().sum((-2, -1)))
             tolerance = (64.0 * torch.finfo(world_points.dtype).eps) ** 2
-            spread_out = minors > tolerance * trace + torch.finfo(world_points.dtype).eps * 8.0 * trace.square()
+            spread_out = large & (
+                minors > tolerance * trace + torch.finfo(world_points.dtype).eps * 8.0 * trace.square()
+            )
 
         centroid = mean if self.center else torch.zeros_like(mean)
         moved = centred if self.center else world_points

@@ -13,6 +13,7 @@ import torch
 from kornia.geometry.conversions import convert_points_from_homogeneous, denormalize_points_with_intrinsics
 from torch import Tensor
 
+from kornia_pnpnet.geometry import transform
 from kornia_pnpnet.types import Pose
 
 __all__ = ["Pairs", "PairsError", "camera_matrix", "read_pairs", "rejection_limit", "reprojections"]
@@ -211,7 +212,7 @@ def reprojections(world_points: Tensor, pose: Pose, intrinsics: Tensor) -> Tenso
     Returns:
         Pixels of shape :math:`(B, N, 2)`, NaN for points that are not in front of the camera.
     """
-    cam_points = world_points @ pose.rotation.mT + pose.translation[:, None]
+    cam_points = transform(pose, world_points)
     in_front = cam_points[..., 2:] > 0
     plane_points = convert_points_from_homogeneous(torch.where(in_front, cam_points, 1.0), eps=0.0)
     pixels = denormalize_points_with_intrinsics(plane_points, intrinsics)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from types import ModuleType
 from typing import NamedTuple
 
@@ -52,7 +53,7 @@ class PeerSolver(nn.Module):
 
     def __init__(self, *, threshold: float) -> None:
         super().__init__()
-        KORNIA_CHECK(threshold > 0, f"threshold must be positive, got {threshold}.")
+        KORNIA_CHECK(0 < threshold < math.inf, f"threshold must be positive and finite, got {threshold}.")
         self.threshold = threshold
 
     def config(self) -> dict[str, float | int | str | bool]:
@@ -114,7 +115,7 @@ class PeerSolver(nn.Module):
         rotation, translation = np.tile(np.eye(3), (batch, 1, 1)), np.zeros((batch, 3))
         init_rotation, init_translation = rotation.copy(), translation.copy()
         pair_weights, ok = np.zeros((batch, count)), np.zeros(batch, dtype=bool)
-        cost = np.full(batch, np.finfo(np.float64).max)
+        cost = np.full(batch, torch.finfo(world_points.dtype).max ** 0.5)
         for i in range(batch):
             if not _solvable(world[i], img[i], cameras[i], shares[i], present[i]):
                 continue
@@ -149,7 +150,8 @@ def _solvable(world: np.ndarray, img: np.ndarray, camera: np.ndarray, weights: n
     finite = all(np.isfinite(x).all() for x in (world[present], img[present], weights[present], camera))
     if not finite or (weights[present] < 0).any() or (present & (weights > 0)).sum() < 3:
         return False
-    return bool(camera[0, 0] > 0 and camera[1, 1] > 0 and camera[0, 1] == 0)
+    pinhole = camera[0, 1] == 0 and camera[1, 0] == 0 and (camera[2] == (0.0, 0.0, 1.0)).all()
+    return bool(camera[0, 0] > 0 and camera[1, 1] > 0 and pinhole)
 
 
 def _squared_errors(
@@ -215,7 +217,9 @@ class OpenCVRansac(PeerSolver):
     ) -> None:
         super().__init__(threshold=threshold)
         cv2 = _import_opencv()
-        KORNIA_CHECK(iterations >= 1, f"iterations must be at least 1, got {iterations}.")
+        KORNIA_CHECK(type(iterations) is int and iterations >= 1, f"iterations must be at least 1, got {iterations!r}.")
+        KORNIA_CHECK(type(refine) is bool, f"refine must be true or false, got {refine!r}.")
+        KORNIA_CHECK(type(seed) is int, f"seed must be an integer, got {seed!r}.")
         KORNIA_CHECK(0.0 < confidence < 1.0, f"confidence must lie in (0, 1), got {confidence}.")
         KORNIA_CHECK(hasattr(cv2, f"SOLVEPNP_{method}"), f"OpenCV {cv2.__version__} has no SOLVEPNP_{method}.")
         self.iterations = iterations

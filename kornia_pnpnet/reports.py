@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from kornia_pnpnet.data import OutlierMix
 from kornia_pnpnet.environment import environment
 from kornia_pnpnet.files import atomic_open
 from kornia_pnpnet.metrics import pose_errors, success, success_rate
@@ -104,6 +105,17 @@ def _rate(entry: Mapping[str, float]) -> str:
     return f"{100 * entry['rate']:.1f} % [{100 * entry['low']:.1f}, {100 * entry['high']:.1f}]"
 
 
+def _mix(source: Mapping[str, Any], n: int) -> str:
+    """What a data source's configuration says of its wrong pairs and its points."""
+    mix = source.get("outliers")
+    most = 0 if mix is None else OutlierMix(**{k: v for k, v in mix.items() if k != "_target_"}).max_count(n)
+    least = most if mix is not None and mix.get("count") is not None else 0
+    wrong = f"{least} to {most} of {n} pairs wrong" if most > least else f"{most} of {n} pairs wrong"
+    prior = source.get("points") or {"_target_": "BoxPoints"}
+    names = [entry["_target_"].rpartition(".")[2] for entry in prior.get("priors", [prior])]
+    return f"{wrong}, points from {' and '.join(names)}"
+
+
 def write_model_card(folder: str | Path, results: Mapping[str, Any]) -> None:
     """Write ``README.md`` beside some weights, all of it from the run's results.
 
@@ -111,30 +123,30 @@ def write_model_card(folder: str | Path, results: Mapping[str, Any]) -> None:
         folder: where the weights are.
         results: what :func:`run_results` returned.
     """
-    model, run, config = results["model"], results["run"], results["config"]
+    model, run, config, learned = results["model"], results["run"], results["config"], results["learned"]
     n, m = model["init"]["n"], model["refine"]["m"]
+    overrides = [entry for entry in results["overrides"] if not entry.startswith(("resume=", "progress=", "threads="))]
+    sources = {"training": config["data"]["train"], **config["data"]["validation"]}
     lines = [
         f"# {config['name']}",
         "",
-        f"The paper's network for exactly n = {n} pairs and m = {m} iterations of robust weighted LM with learned",
-        "hyperparameters (Sheffer and Wiesel, PnP-Net, 2020). Apache-2.0.",
+        f"The paper's network for exactly n = {n} pairs and m = {m} iterations of robust weighted LM (Sheffer and",
+        "Wiesel, PnP-Net, 2020). Apache-2.0. Written from `results.json`, which has the full configuration.",
         "",
-        f"    solver = kornia_pnpnet.create_solver({config['name']!r})",
+        "    solver = kornia_pnpnet.PnPNet.from_pretrained(FOLDER)  # this one, or its name when it is shipped",
         "",
         "## Training",
         "",
-        f"- {run['update']} updates of {config['batch_size']} synthetic problems, {run['skipped']} skipped;",
-        f"  the last call of the loop made {run['updates_per_second']:.1f} updates per second with a peak memory of",
-        f"  {run['peak_memory_mib']:.0f} MiB on {results['environment']['cpu']}.",
-        f"- Command: `python train.py {' '.join(results['overrides'])}`".rstrip(" `") + "`",
+        f"- `{' '.join(['python train.py', *overrides])}`",
+        f"- {run['update']} updates of {config['batch_size']} synthetic problems, {run['skipped']} of them skipped;",
+        f"  {run['updates_per_second']:.1f} updates per second, peak memory {run['peak_memory_mib']:.0f} MiB,",
+        f"  {results['environment']['threads']} thread(s) of {results['environment']['cpu']}.",
         f"- Commit {results['environment']['commit']}, torch {results['environment']['versions']['torch']}.",
-        "- The full configuration and every number below are in `results.json`; `history.csv` has the curves.",
+        *(f"- Data, {name}: {_mix(source, n)}." for name, source in sources.items()),
         "",
         "## Success on the validation sets",
         "",
-        "Rotation error below 1° and translation error below 0.2, with 95 % intervals. `none`: the protocol without",
-        "outliers; `uniform`: up to a third of the pairs wrong; `slab`: tilted slabs of any thickness, as in",
-        "photographs, also with up to a third wrong.",
+        "Rotation error below 1° and translation error below 0.2, with 95 % intervals.",
         "",
         "| Set | PnP-Net | Net alone | median rotation error | median translation error |",
         "|---|---|---|---|---|",
@@ -144,22 +156,20 @@ def write_model_card(folder: str | Path, results: Mapping[str, Any]) -> None:
             f"| {name} | {_rate(entry['success'])} | {_rate(entry['first_stage_success'])} "
             f"| {entry['median_rotation_error_deg']:.3f}° | {entry['median_translation_error']:.3f} |"
         )
-    lines += [
-        "",
-        "## Learned hyperparameters",
-        "",
-        "| Iteration | step γ | damping λ | robustness α |",
-        "|---|---|---|---|",
-    ]
-    learned = results["learned"]
-    for i, (step, damping, alpha) in enumerate(zip(*(learned[k] for k in learned), strict=True), 1):
-        lines.append(f"| {i} | {step:.3f} | {damping:.2e} | {alpha:.3f} |")
+    if m > 0:
+        lines += ["", "## Learned hyperparameters", ""]
+        lines += ["| Iteration | step γ | damping λ | robustness |", "|---|---|---|---|"]
+        for i, (step, damping, shape) in enumerate(zip(*learned.values(), strict=True), 1):
+            lines.append(f"| {i} | {step:.3f} | {damping:.2e} | {shape:.3f} |")
+    centred = model["normalize"]["center"] and model["normalize"]["scale"]
     lines += [
         "",
         "## Limits",
         "",
-        f"Exactly {n} pairs, at most about a third of them wrong. Rotations within about a quarter turn of the",
-        "identity (the world's axes roughly the camera's): the training prior. World unit and origin do not matter.",
+        f"Exactly {n} pairs, with wrong ones as in the training. Rotations within about a quarter turn of the identity",
+        "(the world's axes roughly the camera's), which is the training's prior. The world's unit and origin "
+        + ("do not matter." if centred else "must be the training's."),
         "",
     ]
-    (Path(folder) / "README.md").write_text("\n".join(lines))
+    with atomic_open(Path(folder) / "README.md") as file:
+        file.write("\n".join(lines))

@@ -39,13 +39,22 @@ def stop_on_signal() -> Iterator[threading.Event]:
     if threading.current_thread() is not threading.main_thread():
         yield event
         return
-    signals = (signal.SIGTERM, signal.SIGINT)
-    before = [signal.signal(number, lambda *_: event.set()) for number in signals]
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+
+    def restore() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+    def stop(*_: object) -> None:
+        event.set()
+        restore()  # a second signal ends the process as usual
+
+    for number in before:
+        signal.signal(number, stop)
     try:
         yield event
     finally:
-        for number, handler in zip(signals, before, strict=True):
-            signal.signal(number, handler)
+        restore()
 
 
 class History:
@@ -109,8 +118,22 @@ def load_checkpoint(path: Path, identity: dict[str, Any]) -> dict[str, Any]:
         saved = state["identity"]
     except Exception as error:  # torch.load raises many types on a damaged file
         raise TrainingError(f"Cannot read the checkpoint {path}: {error}") from error
-    differing = sorted(key for key in identity if saved.get(key) != identity[key])
+    there, now = _leaves(saved), _leaves(identity)
+    differing = [key for key in {**there, **now} if there.get(key) != now.get(key)]
     if differing:
-        details = "; ".join(f"{key}: {saved.get(key)!r} there, {identity[key]!r} now" for key in differing)
+        details = "; ".join(f"{key} was {there.get(key)!r} and is {now.get(key)!r}" for key in differing)
         raise TrainingError(f"The checkpoint {path} is of another run: {details}.")
     return state
+
+
+def _leaves(value: Any, prefix: str = "") -> dict[str, Any]:
+    """Nested plain data as ``{"a.b.0": leaf}``."""
+    if isinstance(value, dict):
+        entries = list(value.items())
+    elif isinstance(value, (list, tuple)):
+        entries = list(enumerate(value))
+    else:
+        return {prefix: value}
+    return {
+        k: v for key, entry in entries for k, v in _leaves(entry, f"{prefix}.{key}" if prefix else str(key)).items()
+    }

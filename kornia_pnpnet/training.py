@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import math
 import resource
+import shutil
 import sys
 import time
 from collections.abc import Mapping
@@ -19,7 +20,7 @@ from typing import Any, Protocol
 import torch
 from kornia.core.check import KORNIA_CHECK
 from lightning_fabric import Fabric
-from torch import nn
+from torch import Tensor, nn
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
@@ -38,7 +39,7 @@ from kornia_pnpnet.runstate import (
     save_checkpoint,
     stop_on_signal,
 )
-from kornia_pnpnet.types import Pose, Problems
+from kornia_pnpnet.types import Problems
 
 __all__ = ["FitReport", "ProblemSource", "TrainSettings", "fit", "train_briefly", "validate"]
 
@@ -83,7 +84,19 @@ class TrainSettings:
     max_skipped: int = 100
     log_every: int = 100
     validate_every: int = 1000
-    checkpoint_every: int = 1000
+    checkpoint_every: int = 500
+
+    def __post_init__(self) -> None:
+        """Check the numbers.
+
+        Raises:
+            BaseError: for intervals below 1, negative numbers of updates, or a ramp that does not rise.
+        """
+        for name in ("log_every", "validate_every", "checkpoint_every"):
+            KORNIA_CHECK(getattr(self, name) >= 1, f"{name} must be at least 1, got {getattr(self, name)}.")
+        KORNIA_CHECK(self.updates >= 0, f"updates must be at least 0, got {self.updates}.")
+        rises = len(self.ramp) == 2 and 0.0 <= self.ramp[0] <= self.ramp[1]
+        KORNIA_CHECK(rises, f"ramp must be two shares that do not fall, got {self.ramp}.")
 
     def lr_factor(self, update: int) -> float:
         """Warm-up, then a cosine from 1 to ``final_lr``."""
@@ -93,7 +106,7 @@ class TrainSettings:
     def ramp_factor(self, update: int) -> float:
         """Weight of the refined terms at an update, from 0 to 1."""
         start, end = (share * self.updates for share in self.ramp)
-        return 1.0 if update >= end else max(0.0, (update - start) / (end - start))
+        return 0.0 if update < start else 1.0 if update >= end else (update - start) / (end - start)
 
 
 @dataclass(frozen=True)
@@ -101,7 +114,8 @@ class FitReport:
     """What a call of :func:`fit` did.
 
     Attributes:
-        update: updates done in all, earlier calls counted in.
+        start: updates done by earlier calls.
+        update: updates done in all.
         skipped: steps skipped because the loss or the gradient was not finite.
         interrupted: whether a signal ended the call early; the checkpoint is saved.
         seconds: wall-clock time of this call.
@@ -109,6 +123,7 @@ class FitReport:
         peak_memory_mib: largest resident memory of this process (of the GPU where one is used).
     """
 
+    start: int
     update: int
     skipped: int
     interrupted: bool
@@ -127,9 +142,7 @@ def _peak_memory_mib(device: torch.device) -> float:
 def _share(problems: Problems, fabric: Fabric) -> Problems:
     """Every ``world_size``-th problem: the batches of all processes together are the batch of one."""
     part = slice(fabric.global_rank, None, fabric.world_size)
-    world, img, intrinsics, pose, inliers = problems
-    pick = [x[part].to(fabric.device) for x in (world, img, intrinsics, *pose, inliers)]
-    return Problems(pick[0], pick[1], pick[2], Pose(pick[3], pick[4]), pick[5])
+    return problems.map(lambda x: x[part].to(fabric.device))
 
 
 @torch.no_grad()
@@ -165,6 +178,7 @@ def fit(
     folder: str | Path,
     *,
     fabric: Fabric | None = None,
+    identity: Mapping[str, Any] | None = None,
     resume: bool = False,
     progress: bool = True,
 ) -> FitReport:
@@ -181,6 +195,8 @@ def fit(
         settings: the numbers of the run.
         folder: where the run lives.
         fabric: the launched engine; one process on the CPU when ``None``.
+        identity: what else must be the same when the run is continued, such as the configuration of data and loss, as
+            plain data.
         resume: continue from ``folder``'s checkpoint when there is one.
         progress: show a progress bar.
 
@@ -200,13 +216,13 @@ def fit(
     )
     folder = Path(folder)
     checkpoint = folder / CHECKPOINT_NAME
-    identity = {"settings": _plain(asdict(settings)), "model": model.config()}
+    own = _plain({"settings": asdict(settings), "model": model.config(), **(identity or {})})
     start, skipped = 0, 0
     state = None
     if checkpoint.exists():
         if not resume:
             raise TrainingError(f"{checkpoint} exists: pass resume=true to continue it, or choose another folder.")
-        state = load_checkpoint(checkpoint, identity)
+        state = load_checkpoint(checkpoint, own)
         start, skipped = state["update"], state["skipped"]
         model.load_state_dict(state["model"])
 
@@ -216,10 +232,10 @@ def fit(
         if part is not None
     ]
     optimizer = torch.optim.Adam([{**group, "lr": group["initial_lr"]} for group in groups if group["params"]])
-    if state is not None:
-        optimizer.load_state_dict(state["optimizer"])
     solver, fabric_optimizer = fabric.setup(model, optimizer)
-    validation = {name: _to_device(problems, fabric.device) for name, problems in validation.items()}
+    if state is not None:  # now that the parameters are on their device, so that Adam's state follows them
+        optimizer.load_state_dict(state["optimizer"])
+    validation = {name: problems.map(lambda x: x.to(fabric.device)) for name, problems in validation.items()}
     best_names = ["success", "rotation_error_deg", "translation_error"]
     best_names += ["init_rotation_error_deg", "init_translation_error"]
     columns = ["update", *LossTerms._fields, "ramp", "lr", "grad_norm", "skipped", "updates_per_second"]
@@ -231,7 +247,7 @@ def fit(
 
     def save(update: int) -> None:
         if fabric.is_global_zero:
-            content = {"update": update, "skipped": skipped, "identity": identity}
+            content = {"update": update, "skipped": skipped, "identity": own}
             save_checkpoint(checkpoint, {**content, "model": model.state_dict(), "optimizer": optimizer.state_dict()})
         fabric.barrier()
 
@@ -264,39 +280,45 @@ def fit(
                 fabric_optimizer.step()
             update += 1
             bar.update()
+            finished = update == settings.updates
+            interrupted = interrupted and not finished
 
             if skipped > settings.max_skipped:
                 raise TrainingError(
                     f"{skipped} steps had a loss or a gradient that is not finite, more than max_skipped = "
                     f"{settings.max_skipped}, up to update {update}. Lower the learning rate or look at the data."
                 )
-            last = update == settings.updates or interrupted
-            if history is not None and (update % settings.log_every == 0 or last):
-                now = time.perf_counter()
-                rate = (update - logged_update) / max(now - logged, 1e-9)
-                row = {"update": update, **{name: term.item() for name, term in terms._asdict().items()}}
-                row |= {"ramp": ramp, "lr": settings.lr * factor, "grad_norm": norm.item(), "skipped": skipped}
-                row |= {"updates_per_second": rate, "peak_memory_mib": _peak_memory_mib(fabric.device)}
-                if update % settings.validate_every == 0 or update == settings.updates:
-                    model.eval()
-                    report = validate(model, validation)
-                    model.train()
-                    row |= report
-                    rates = {name: f"{100 * report[f'val/{name}/success']:.1f} %" for name in validation}
-                    memory = row["peak_memory_mib"]
-                    found = ", ".join(f"{name} {share}" for name, share in rates.items())
-                    _log.info("update %s: success %s; %.1f updates/s, %.0f MiB", update, found, rate, memory)
-                    bar.set_postfix(rates)
-                history.write(row)
-                logged, logged_update = time.perf_counter(), update
-            if update % settings.checkpoint_every == 0 or last:
+            validates = finished or update % settings.validate_every == 0
+            if finished or update % settings.log_every == 0 or validates:
+                means = _mean(fabric, torch.stack([term.detach() for term in terms]))
+                if history is not None:
+                    now = time.perf_counter()
+                    rate = (update - logged_update) / max(now - logged, 1e-9)
+                    row: dict[str, float] = {"update": update, **dict(zip(terms._fields, means, strict=True))}
+                    if ramp == 0.0:  # nothing was refined yet
+                        row = {name: value for name, value in row.items() if not name.startswith("refined")}
+                    row |= {"ramp": ramp, "lr": settings.lr * factor, "grad_norm": norm.item(), "skipped": skipped}
+                    row |= {"updates_per_second": rate, "peak_memory_mib": _peak_memory_mib(fabric.device)}
+                    if validates:
+                        model.eval()
+                        report = validate(model, validation)
+                        model.train()
+                        row |= report
+                        rates = {name: f"{100 * report[f'val/{name}/success']:.1f} %" for name in validation}
+                        found = ", ".join(f"{name} {share}" for name, share in rates.items())
+                        memory = row["peak_memory_mib"]
+                        _log.info("update %s: success %s; %.1f updates/s, %.0f MiB", update, found, rate, memory)
+                        bar.set_postfix(rates)
+                    history.write(row)
+                    logged, logged_update = time.perf_counter(), update
+            if finished or interrupted or update % settings.checkpoint_every == 0:
                 save(update)
     if history is not None:
         history.close()
     model.eval()
     seconds = time.perf_counter() - began
     rate = (update - start) / max(seconds, 1e-9)
-    return FitReport(update, skipped, interrupted, seconds, rate, _peak_memory_mib(fabric.device))
+    return FitReport(start, update, skipped, interrupted, seconds, rate, _peak_memory_mib(fabric.device))
 
 
 def _plain(value: Any) -> Any:
@@ -306,15 +328,11 @@ def _plain(value: Any) -> Any:
     return [_plain(entry) for entry in value] if isinstance(value, (list, tuple)) else value
 
 
-def _to_device(problems: Problems, device: torch.device) -> Problems:
-    pose = Pose(*(x.to(device) for x in problems.pose))
-    return problems._replace(
-        world_points=problems.world_points.to(device),
-        img_points=problems.img_points.to(device),
-        intrinsics=problems.intrinsics.to(device),
-        pose=pose,
-        inliers=problems.inliers.to(device),
-    )
+def _mean(fabric: Fabric, values: Tensor) -> list[float]:
+    """The mean of each value over all processes."""
+    if fabric.world_size > 1:
+        values = torch.as_tensor(fabric.all_reduce(values, reduce_op="mean"))
+    return values.tolist()
 
 
 def _agree(fabric: Fabric, *flags: bool) -> list[bool]:
@@ -337,21 +355,30 @@ def train_briefly(seconds: float, folder: str | Path, *, progress: bool = True) 
         The path of the learning curves, a CSV file.
     """
     folder = Path(folder)
-    (folder / CHECKPOINT_NAME).unlink(missing_ok=True)
-    torch.manual_seed(0)
-    model = PnPNet(MLPInit(9), RobustWeightedLM(5))
+    for name in (CHECKPOINT_NAME, HISTORY_NAME):
+        (folder / name).unlink(missing_ok=True)
+    shutil.rmtree(folder / "tensorboard", ignore_errors=True)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        model = PnPNet(MLPInit(9), RobustWeightedLM(5))
     data = SyntheticProblems(n=9, batch_size=250, seed=0, outliers=OutlierMix())
     validation = {
         "none": SyntheticProblems(n=9, batch_size=500, seed=900_001).batch(0),
         "uniform": SyntheticProblems(n=9, batch_size=500, seed=900_002, outliers=OutlierMix()).batch(0),
     }
     loss = PoseLoss(saturation=0.02)
-    began = time.perf_counter()
-    for index in range(10):
-        problems = data.batch(index)
-        result = model(problems.world_points, problems.img_points, problems.intrinsics)
-        loss(result, problems).total.backward()
-    updates = max(100, round(seconds * 10 / (time.perf_counter() - began)) // 100 * 100)
+
+    def seconds_per_update(ramp: float) -> float:
+        began = time.perf_counter()
+        for index in range(10):
+            problems = data.batch(index)
+            result = model(*problems[:3], first_stage_only=ramp == 0.0)
+            loss(result, problems, ramp).total.backward()
+        return (time.perf_counter() - began) / 10
+
+    alone = TrainSettings(0).ramp[0]  # the share of the run in which the network learns alone
+    expected = alone * seconds_per_update(0.0) + (1.0 - alone) * seconds_per_update(1.0)
+    updates = max(100, round(seconds / expected) // 100 * 100)
     settings = TrainSettings(
         updates, warmup=100, log_every=updates // 20, validate_every=updates // 20, checkpoint_every=updates
     )

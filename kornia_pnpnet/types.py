@@ -6,6 +6,7 @@ are. The letters are the same everywhere: ``B`` problems in the batch, ``N`` pai
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 from kornia.geometry.conversions import Rt_to_matrix4x4
@@ -125,3 +126,8 @@ class Problems(NamedTuple):
     intrinsics: Tensor
     pose: Pose
     inliers: Tensor
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Problems:
+        """Apply a function to every tensor, for example to slice the batch or to move it to another device."""
+        world, img, intrinsics, rotation, translation, inliers = map(function, (*self[:3], *self.pose, self.inliers))
+        return Problems(world, img, intrinsics, Pose(rotation, translation), inliers)

@@ -526,3 +526,19 @@ def test_rejection_limit_ignores_what_is_not_finite():
     errors = torch.tensor([10.0, 20.0, 30.0, math.inf, math.nan])
     assert rejection_limit(errors) == pytest.approx(3 * 1.4826 * 20)
     assert rejection_limit(errors[3:]) == 3.0
+
+
+def test_solvers_may_be_named_in_several_places(tmp_path, capsys):
+    arguments = ["--problems", "5", "--outliers", "none", "--out", str(tmp_path / "r.json")]
+    assert main(["evaluate", "--solver", "identity-lm", "--solver", "opencv-ransac", *arguments]) == 0
+    out = capsys.readouterr().out
+    assert "identity-lm" in out
+    assert "opencv-ransac" in out
+
+
+@pytest.mark.parametrize("option", ["refine=no", "refine=False", "iterations=10.5", "seed=abc", "threshold=Infinity"])
+def test_wrong_solver_options_end_with_one_line(option, capsys):
+    assert main(["evaluate", "--solver", f"opencv-ransac:{option}", "--problems", "5"]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("pnpnet: ")
+    assert err.count("\n") == 1

@@ -94,7 +94,7 @@ def test_any_number_of_solvers_and_sets(tmp_path, plot, solvers, sets):
 def test_incomplete_and_extreme_rows(tmp_path):
     results = fake_results()
     del results["rows"][1]
-    results["rows"][0]["success"] = {"rate": 0.0, "low": 1e-18, "high": 0.0, "count": 50}
+    results["rows"][0]["success"] = {"rate": 0.0, "low": 1e-18, "high": 0.0, "total": 50}
     results["rows"][0]["per_problem"]["rotation_error_deg"] = [0.0] * 50
     results["data"]["set, 1"]["max_translation"] = 1.0
     pixels(plot_success(tmp_path / "a.png", results))

@@ -13,6 +13,7 @@ from kornia.core.exceptions import BaseError, DeviceError, ShapeError, TypeCheck
 from torch.utils import _pytree as pytree
 
 from kornia_pnpnet import (
+    Guess,
     MLPInit,
     Normalize,
     PnPNet,
@@ -630,3 +631,89 @@ def test_solvers_by_name(make_problems):
         create_solver("pnpnet-nine")
     with pytest.raises(ValueCheckError, match="iterations"):
         create_solver("identity-lm", iterations=3)
+
+
+# --- corners that once were wrong -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [1e7, 1e9, 1e20, 1e36])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_large_pixels_leave_finite_gradients(size, dtype, make_problems):
+    p = make_problems(dtype=dtype)
+    pixels = p.img_points.clone()
+    pixels[2, 4, 1] = size
+    pixels.requires_grad_()
+    solver = net(9, 5).to(dtype)
+    result = solver(p.world_points, pixels, p.intrinsics)
+    assert not result.ok[2]
+    (result.rotation.sum() + result.translation.sum() + result.weights.sum() + result.init.translation.sum()).backward()
+    assert pixels.grad.isfinite().all()
+    assert all(x.grad.isfinite().all() for x in solver.parameters() if x.grad is not None)
+
+
+def test_a_weight_of_zero_has_no_gradient(make_problems, perturb):
+    p = make_problems()
+    weights = torch.ones(7, 9, dtype=torch.float64)
+    weights[:, 3] = 0.0
+    weights.requires_grad_()
+    result = PnPNet(None, RobustWeightedLM(m=3))(*p[:3], weights, init=perturb(p.pose))
+    result.translation.sum().backward()
+    assert (weights.grad[:, 3] == 0).all()
+    assert (weights.grad[result.ok][:, :3] != 0).any()
+
+
+def test_a_common_factor_of_tiny_weights_does_not_matter(make_problems, perturb):
+    p = make_problems(dtype=torch.float32)
+    solver, init = PnPNet(None, RobustWeightedLM(m=5)), perturb(p.pose)
+    one = solver(*p[:3], torch.ones(7, 9), init=init)
+    two = solver(*p[:3], torch.full((7, 9), 2.0**-100), init=init)
+    torch.testing.assert_close(two.matrix, one.matrix, rtol=1e-5, atol=1e-5)
+
+
+def test_costs_of_failed_problems_can_be_summed(make_problems):
+    for dtype in DTYPES:
+        p = make_problems(dtype=dtype)
+        cost = net(9, 2).to(dtype)(torch.full_like(p.world_points, torch.nan), *p[1:3]).cost
+        assert cost.sum().isfinite()
+
+
+def test_cameras_that_are_no_pinholes_are_refused(make_problems):
+    p = make_problems()
+    K = p.intrinsics.clone()
+    K[1, 2, 2], K[2, 1, 0], K[3, 0, 1] = 2.0, 50.0, 1.0
+    ok = PnPNet(None)(*p[:2], K, init=p.pose).ok
+    assert ok.tolist() == [True, False, False, False, True, True, True]
+
+
+@pytest.mark.parametrize("with_net", [True, False])
+def test_export_and_compile_with_any_batch(with_net, make_problems):
+    solver = net(9, 2).double() if with_net else PnPNet(None, RobustWeightedLM(m=2))
+    p, q = make_problems(batch=4), make_problems(batch=6, seed=1)
+    batch = torch.export.Dim("B")
+    program = torch.export.export(solver.eval(), tuple(p[:3]), dynamic_shapes=({0: batch},) * 3)
+    torch.testing.assert_close(program.module()(*q[:3]).rotation, solver(*q[:3]).rotation, rtol=1e-9, atol=1e-9)
+    compiled = torch.compile(solver, backend="eager", fullgraph=True, dynamic=True)
+    torch.testing.assert_close(compiled(*q[:3]).rotation, solver(*q[:3]).rotation, rtol=1e-9, atol=1e-9)
+
+
+def test_an_initialiser_of_ones_own(make_problems, tmp_path):
+    class Identity(torch.nn.Module):
+        def forward(self, corr):
+            batch = corr.weights.shape[0]
+            eye = torch.eye(3).to(corr.weights).expand(batch, 3, 3)
+            return Guess(Pose(eye, corr.weights.new_zeros(batch, 3)), torch.ones_like(corr.weights))
+
+    solver = PnPNet(Identity(), RobustWeightedLM(m=2))
+    assert solver(*make_problems()[:3]).matrix.shape == (7, 4, 4)
+    assert solver.config()["init"] == {"name": "Identity"}
+    with pytest.raises(ValueCheckError, match="Identity cannot be saved"):
+        solver.save_pretrained(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_init_pose_of_another_shape_or_dtype_is_refused(make_problems):
+    p = make_problems()
+    with pytest.raises(ShapeError, match="init translation"):
+        PnPNet(None)(*p[:3], init=Pose(p.pose.rotation, p.pose.translation[:3]))
+    with pytest.raises(TypeCheckError, match="init rotation"):
+        PnPNet(None)(*p[:3], init=Pose(p.pose.rotation.float(), p.pose.translation))

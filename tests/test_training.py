@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from kornia.core.exceptions import BaseError
 from torch import nn
 
 from kornia_pnpnet import MLPInit, PnPNet, PoseLoss, RobustWeightedLM
@@ -191,7 +192,8 @@ def test_learning_lowers_the_loss(tmp_path):
     fit(folder=tmp_path, **parts)
     rows = read_history(tmp_path)
     first, last = rows[0], rows[-1]
-    for name in ("init_rotation", "init_translation", "refined_rotation"):
+    assert first["refined_rotation"] == ""  # the network learns alone at first
+    for name in ("init_rotation", "init_translation", "val/none/rotation_error_deg"):
         assert float(last[name]) < 0.95 * float(first[name]), name
 
 
@@ -279,3 +281,35 @@ def test_first_stage_only_trains(tmp_path):
     fit(folder=tmp_path, **parts)
     assert any(not torch.equal(a, b) for a, b in zip(before, parts["model"].init.parameters(), strict=True))
     assert isinstance(parts["model"].init, nn.Module)
+
+
+def test_another_run_is_not_continued(tmp_path):
+    """Whatever the caller names as the run's identity must be the same, and the message names what is not."""
+    fit(folder=tmp_path, identity={"data": {"seed": 3, "sigma": [1.0, 2.0]}}, **make_parts())
+    with pytest.raises(TrainingError, match=r"of another run: data\.sigma\.1 was 2\.0 and is 5\.0\.$"):
+        fit(folder=tmp_path, identity={"data": {"seed": 3, "sigma": [1.0, 5.0]}}, resume=True, **make_parts())
+    report = fit(folder=tmp_path, identity={"data": {"seed": 3, "sigma": (1.0, 2.0)}}, resume=True, **make_parts())
+    assert (report.start, report.update) == (6, 6)
+
+
+def test_validation_has_its_own_interval(tmp_path):
+    fit(folder=tmp_path, **make_parts(updates=9, log_every=4, validate_every=3))
+    rows = read_history(tmp_path)
+    assert [row["update"] for row in rows] == ["3", "4", "6", "8", "9"]
+    assert [row["update"] for row in rows if row["val/none/success"]] == ["3", "6", "9"]
+
+
+def test_a_signal_in_the_last_update_is_no_interruption(tmp_path):
+    report = fit(folder=tmp_path, **{**make_parts(), "loss": StoppingLoss(6, signal.SIGTERM)})
+    assert (report.update, report.interrupted) == (6, False)
+
+
+@pytest.mark.parametrize("wrong", [{"log_every": 0}, {"updates": -1}, {"ramp": (0.5, 0.2)}, {"checkpoint_every": 0}])
+def test_settings_out_of_range_are_refused(wrong):
+    with pytest.raises(BaseError, match=next(iter(wrong))):
+        TrainSettings(**{"updates": 10, **wrong})
+
+
+def test_a_ramp_may_be_a_step():
+    assert [TrainSettings(10, ramp=(0.5, 0.5)).ramp_factor(update) for update in (0, 4, 5, 9)] == [0.0, 0.0, 1.0, 1.0]
+    assert TrainSettings(10, ramp=(1.0, 1.0)).ramp_factor(9) == 0.0
