@@ -29,6 +29,7 @@ _COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#000000")
 _HATCHES, _DASHES = ("", "///", "..."), ("-", "--", ":")
 _RED, _GREY = "#CC3311", "#5f5f5f"
 _DPI = 150
+_SETS_PER_ROW = 4
 
 
 def _figure(width: float, height: float) -> Figure:
@@ -129,27 +130,32 @@ def plot_success(path: str | Path, results: Mapping[str, Any]) -> Path:
     solvers, sets = list(results["solvers"]), list(results["data"])
     rates = {(row["data"], row["solver"]): row["success"] for row in results["rows"]}
     width = 0.84 / len(solvers)
-    figure = _figure(max(6.0, 1.2 + 0.55 * len(solvers) * len(sets) + 0.5 * len(sets)), 4.4)
-    axes = figure.subplots()
-    for index, solver in enumerate(solvers):
-        colour, turn = _style(index)
-        there = [(place, rates[name, solver]) for place, name in enumerate(sets) if (name, solver) in rates]
-        places = np.array([place - 0.42 + width * (index + 0.5) for place, _ in there])
-        rate, low, high = (100 * np.array([entry[key] for _, entry in there]) for key in ("rate", "low", "high"))
-        bars = axes.bar(
-            places, rate, 0.92 * width, color=colour, hatch=_HATCHES[turn], edgecolor="white", linewidth=0, label=solver
-        )
-        reach = np.stack((rate - low, high - rate)).clip(min=0)  # rounded in the file, a bound may lie a hair inside
-        axes.errorbar(places, rate, reach, fmt="none", ecolor="#222222", capsize=3, linewidth=1.2)
-        for bar, value, top in zip(bars, rate, high, strict=True):
-            place = bar.get_x() + bar.get_width() / 2
-            axes.annotate(f"{value:.1f}", (place, top), (0, 3), textcoords="offset points", ha="center", fontsize=8)
-    axes.set_xticks(range(len(sets)), [_wrapped(name) for name in sets])
-    axes.tick_params(axis="x", length=0)
-    axes.set(ylim=(0, 108), yticks=range(0, 101, 20), ylabel="problems solved (%)", xlim=(-0.55, len(sets) - 0.45))
-    _tidy(axes, grid="y")
-    axes.set_title(f"Success with 95 % intervals: {_limits(results, sets)}", fontsize=11, loc="left")
-    figure.legend(loc="outside lower center", ncols=min(4, len(solvers)), frameon=False)
+    per_row = min(len(sets), _SETS_PER_ROW)
+    parts = [sets[start : start + per_row] for start in range(0, len(sets), per_row)]
+    figure = _figure(max(6.0, 1.2 + (0.55 * len(solvers) + 0.5) * per_row), 1.2 + 3.2 * len(parts))
+    for part, axes in zip(parts, figure.subplots(len(parts), squeeze=False)[:, 0], strict=True):
+        for index, solver in enumerate(solvers):
+            colour, turn = _style(index)
+            there = [(place, rates[name, solver]) for place, name in enumerate(part) if (name, solver) in rates]
+            places = np.array([place - 0.42 + width * (index + 0.5) for place, _ in there])
+            rate, low, high = (100 * np.array([entry[key] for _, entry in there]) for key in ("rate", "low", "high"))
+            style = {"color": colour, "hatch": _HATCHES[turn], "edgecolor": "white", "linewidth": 0}
+            bars = axes.bar(places, rate, 0.92 * width, label=solver, **style)
+            reach = np.stack((rate - low, high - rate)).clip(
+                min=0
+            )  # rounded in the file, a bound may lie a hair inside
+            axes.errorbar(places, rate, reach, fmt="none", ecolor="#222222", capsize=3, linewidth=1.2)
+            for bar, value, top in zip(bars, rate, high, strict=True):
+                place = bar.get_x() + bar.get_width() / 2
+                axes.annotate(f"{value:.1f}", (place, top), (0, 3), textcoords="offset points", ha="center", fontsize=8)
+        axes.set_xticks(range(len(part)), [_wrapped(name) for name in part])
+        axes.tick_params(axis="x", length=0)
+        axes.set(ylim=(0, 108), yticks=range(0, 101, 20), ylabel="problems solved (%)", xlim=(-0.55, per_row - 0.45))
+        _tidy(axes, grid="y")
+    first = figure.axes[0]
+    first.set_title(f"Success with 95 % intervals: {_limits(results, sets)}", fontsize=11, loc="left")
+    handles, labels = first.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(5, len(solvers)), frameon=False)
     return _save(figure, path)
 
 
