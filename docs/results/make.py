@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import argparse
 import csv
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from kornia_pnpnet import create_solver
+from kornia_pnpnet import PnPNet, RobustWeightedLM, create_solver
 from kornia_pnpnet.data import OutlierMix, SceneProblems, SyntheticProblems, load_scene
 from kornia_pnpnet.evaluation import EvaluationData, draw_problems, evaluate, format_table, load_results, save_results
 from kornia_pnpnet.figures import plot_errors, plot_success, plot_training
@@ -74,6 +74,24 @@ def tuned(options: Mapping[str, Any], data: Mapping[str, EvaluationData]) -> tup
     return create_solver(PEER, threshold=float(best), **options), reached
 
 
+def deeper(solver: PnPNet, order: Sequence[int]) -> PnPNet:
+    """The same weights with some iterations of the refinement done again: ``order`` names them, from 0."""
+    refine = RobustWeightedLM(len(order))
+    for name in ("step", "damping", "robustness"):
+        getattr(refine, name).raw.data = getattr(solver.refine, name).raw.data[list(order)]
+    return PnPNet(solver.init, refine, solver.normalize)
+
+
+def measure_depth(scenes: Path, count: int) -> None:
+    """What more iterations of the shipped weights do, without training them."""
+    shipped = PnPNet.from_pretrained(OURS)
+    orders = {5: (0, 1, 2, 3, 4), 7: (0, 1, 1, 2, 2, 3, 4), 10: (0, 1, 1, 1, 2, 2, 2, 3, 4, 4)}
+    solvers = {f"m = {depth}": deeper(shipped, order) for depth, order in orders.items()}
+    data = {name: entry for name, entry in real_data(scenes, SEED_REPORT, count).items() if "2 wrong" in name}
+    data["protocol, k uniform"] = synthetic_data(SEED_REPORT, count)["k uniform"]
+    save_results(evaluate(solvers, data), HERE / "depth.json")
+
+
 def measure(scenes: Path, synthetic_count: int, real_count: int) -> None:
     """Solve everything and write the two results files."""
     torch.set_num_threads(1)
@@ -88,6 +106,7 @@ def measure(scenes: Path, synthetic_count: int, real_count: int) -> None:
         results["peer_threshold_tuning"] = {"seed": SEED_TUNE, "mean_success": reached}
         save_results(results, HERE / f"{name}.json")
         print(format_table(results))
+    measure_depth(scenes, real_count)
 
 
 def comparison(results: Mapping[str, Any]) -> list[str]:
@@ -109,8 +128,9 @@ def comparison(results: Mapping[str, Any]) -> list[str]:
 PAGE = """\
 # Results
 
-Written by `docs/results/make.py` from [synthetic.json](synthetic.json) and [real.json](real.json), which hold the
-errors of every problem, and [ablation.csv](ablation.csv); no number here is typed. Success: rotation error below 1° and
+Written by `docs/results/make.py` from [synthetic.json](synthetic.json), [real.json](real.json) and
+[depth.json](depth.json), which hold the errors of every problem, and [ablation.csv](ablation.csv); no number here is
+typed. Success: rotation error below 1° and
 translation error below 0.2 m, or 0.5 % of the median depth where a scene has no unit. Brackets: 95 % intervals. Every
 solver has the same problems, n = 9, of seeds used for nothing else. Time: calls of 1000 problems, one thread, {cpu}.
 
@@ -145,6 +165,15 @@ lund_door and sceaux_castle: COLMAP models of arbitrary unit.
 
 {real_comparison}
 
+## Why real scenes with wrong pairs are behind
+
+The first guess is coarser there than on the protocol's data (`net-n9` above), and five iterations do not always bring
+it home. The table has the same weights with the middle iterations done again, untrained for it: success on the scenes
+rises, success on the protocol, for whose noise the last iterations were tuned, falls. Training deeper unrolls is the
+next thing to try; the scale of the scene is not the cause, since the world is centred and scaled.
+
+{depth_table}
+
 ## Ablation
 
 Short runs of the shipped recipe with one thing changed; success on the training's validation sets.
@@ -172,7 +201,7 @@ def ablation_table(path: Path) -> str:
     return "\n".join(lines)
 
 
-def page(synthetic: Mapping[str, Any], real: Mapping[str, Any], ablation: Path) -> str:
+def page(synthetic: Mapping[str, Any], real: Mapping[str, Any], depth: Mapping[str, Any], ablation: Path) -> str:
     """The results page as Markdown."""
     return PAGE.format(
         ours=OURS,
@@ -189,18 +218,19 @@ def page(synthetic: Mapping[str, Any], real: Mapping[str, Any], ablation: Path) 
         real_table=format_table(real),
         synthetic_comparison="\n".join(comparison(synthetic)),
         real_comparison="\n".join(comparison(real)),
+        depth_table=format_table(depth),
         ablation_table=ablation_table(ablation),
     )
 
 
 def render() -> None:
     """Write the page and its pictures from the results files."""
-    synthetic, real = (load_results(HERE / f"{name}.json") for name in ("synthetic", "real"))
+    synthetic, real, depth = (load_results(HERE / f"{name}.json") for name in ("synthetic", "real", "depth"))
     plot_success(HERE / "synthetic_success.png", synthetic)
     plot_errors(HERE / "synthetic_errors.png", synthetic)
     plot_success(HERE / "real_success.png", real)
     plot_training(HERE / "training.png", WEIGHTS_FOLDER / OURS / "history.csv")
-    (HERE / "README.md").write_text(page(synthetic, real, HERE / "ablation.csv"), encoding="utf-8")
+    (HERE / "README.md").write_text(page(synthetic, real, depth, HERE / "ablation.csv"), encoding="utf-8")
 
 
 def main() -> None:
