@@ -235,10 +235,10 @@ def _solve(arguments: argparse.Namespace) -> int:
 def _evaluate(arguments: argparse.Namespace) -> int:
     from kornia_pnpnet.evaluation import evaluate, format_table, save_results
 
-    names = arguments.solver or default_solvers(arguments.n)
-    solvers = {name: load_solver(name) for name in names}
+    sources = arguments.data or ["synthetic"]
+    solvers = {name: load_solver(name) for name in arguments.solver or default_solvers(arguments.n, sources)}
     sets = evaluation_sets(
-        arguments.data or ["synthetic"],
+        sources,
         arguments.outliers,
         n=arguments.n,
         count=arguments.problems,

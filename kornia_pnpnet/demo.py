@@ -17,9 +17,6 @@ from kornia_pnpnet.pairs import rejection_limit, reprojections
 __all__ = ["run_demo"]
 
 _N = 9
-# On real scenes the points are sharp and OpenCV does best with a lower threshold than on the protocol's data: the
-# best of 3 to 60 px over three scenes, on problems of another seed.
-_ON_SCENES = {"opencv-ransac": "opencv-ransac:threshold=12"}
 
 
 def run_demo(
@@ -34,11 +31,9 @@ def run_demo(
         count: problems per set.
         train_seconds: how long to train, roughly; 0 leaves it out.
     """
-    names = default_solvers(_N)
+    names = default_solvers(_N, [data or "synthetic"])
     if f"pnpnet-n{_N}" not in names:
         print(f"pnpnet: no weights pnpnet-n{_N} are shipped, going on without", file=sys.stderr)
-    if data is not None:
-        names = [_ON_SCENES.get(name, name) for name in names]
     sets = evaluation_sets(
         [data or "synthetic"], "none,2" if data else "none,uniform", n=_N, count=count, metric=metric
     )

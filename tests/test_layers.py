@@ -21,7 +21,7 @@ LAYERS = (
     ("model", "losses"),
     ("registry", "peers", "__init__"),
     ("evaluation", "runstate", "training", "choices", "reports"),
-    ("figures", "cli", "demo", "__main__"),
+    ("figures", "cli", "demo"),
 )
 
 #: What importing the package must not import: the extras, which a user of the layer need not have.
