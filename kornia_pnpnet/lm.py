@@ -145,14 +145,14 @@ class BoundedParameter(nn.Module):
     The parameter passes a sigmoid onto ``[lower, upper]``, in log space when ``logarithmic``.
 
     Args:
-        initial: the first value of each entry, strictly between the bounds.
+        initial: the first value of each entry, between the bounds. A value at a bound stays there.
         size: how many entries.
         lower: lower bound.
         upper: upper bound.
         logarithmic: interpolate the logarithm; the bounds must be positive.
 
     Raises:
-        BaseError: when ``initial`` is not strictly between the bounds.
+        BaseError: when ``initial`` is not between the bounds.
 
     Example:
         >>> BoundedParameter(1e-3, size=2, lower=1e-6, upper=1.0, logarithmic=True)()
@@ -161,11 +161,11 @@ class BoundedParameter(nn.Module):
 
     def __init__(self, initial: float, *, size: int, lower: float, upper: float, logarithmic: bool = False) -> None:
         super().__init__()
-        KORNIA_CHECK(lower < initial < upper, f"The initial value {initial} must lie between {lower} and {upper}.")
+        KORNIA_CHECK(lower <= initial <= upper, f"The initial value {initial} must lie between {lower} and {upper}.")
         self._logarithmic = logarithmic
         self._lower, self._upper = (math.log(lower), math.log(upper)) if logarithmic else (lower, upper)
         share = ((math.log(initial) if logarithmic else initial) - self._lower) / (self._upper - self._lower)
-        self.raw = nn.Parameter(torch.full((size,), math.log(share / (1.0 - share))))
+        self.raw = nn.Parameter(torch.full((size,), share).logit())
 
     def forward(self) -> Tensor:
         """Return the bounded values, shape ``(size,)``."""
@@ -187,9 +187,9 @@ class RobustWeightedLM(nn.Module):
     Args:
         m: number of iterations; 0 leaves the guess as it is and only judges it.
         kernel: name of the robust kernel, a key of :data:`~kornia_pnpnet.robust.KERNELS`.
-        step: initial :math:`\gamma`, in (0, 2).
-        damping: initial :math:`\lambda`, in (1e-8, 100).
-        robustness: initial shape of the kernel, its classical value when ``None``.
+        step: initial :math:`\gamma`, in [0, 2].
+        damping: initial :math:`\lambda`, in [1e-8, 100].
+        robustness: initial shape of the kernel, its classical value when ``None``. With 0, ``power`` is least squares.
         shared: learn one set for all iterations instead of one each.
         update: ``"retraction"`` on the rotation group, or the paper's ``"additive"`` on the rotation vector.
         reject_worse: refuse, per problem, a step that raises the cost, and raise the damping after it tenfold.

@@ -443,10 +443,10 @@ def test_the_bounds_themselves_are_finite(kernel, raw, make_problems, correspond
 
 @pytest.mark.parametrize("logarithmic", [False, True])
 def test_a_bounded_parameter_is_what_it_was_set_to(logarithmic):
-    for initial in (0.011, 0.3, 4.9):
+    for initial in (0.01, 0.011, 0.3, 4.9, 5.0):
         parameter = BoundedParameter(initial, size=3, lower=0.01, upper=5.0, logarithmic=logarithmic)
         torch.testing.assert_close(parameter(), torch.full((3,), initial), rtol=1e-4, atol=0)
-    for initial in (0.01, 5.0, -1.0, 9.0, math.nan):
+    for initial in (0.0099, 5.01, -1.0, 9.0, math.nan):
         with pytest.raises(BaseError, match="between"):
             BoundedParameter(initial, size=1, lower=0.01, upper=5.0, logarithmic=logarithmic)
 
@@ -458,7 +458,7 @@ def test_a_bounded_parameter_is_what_it_was_set_to(logarithmic):
         ({"update": "se3"}, "retraction.*se3"),
         ({"m": -1}, "-1"),
         ({"m": 2.5}, "2.5"),
-        ({"step": 2.0}, "2.0"),
+        ({"step": 2.1}, "2.1"),
         ({"damping": 0.0}, "0.0"),
         ({"robustness": 3.5}, "3.5"),
     ],
@@ -474,3 +474,14 @@ def test_the_config_rebuilds_the_module():
     assert again.config == lm.config
     assert "cauchy" in repr(lm)
     again.load_state_dict(lm.state_dict())
+
+
+def test_power_with_shape_zero_is_least_squares(make_problems, correspond, perturb):
+    p = make_problems(6, 20)
+    corr, _ = correspond(p)
+    lm = RobustWeightedLM(m=3, robustness=0.0)
+    guess = Guess(correspond(p._replace(pose=perturb(p.pose)))[1], torch.ones_like(corr.weights))
+    refined = lm(corr, guess)
+    assert torch.equal(refined.weights, torch.ones_like(refined.weights))
+    refined.cost.sum().backward()
+    assert lm.robustness.raw.grad.isfinite().all()
