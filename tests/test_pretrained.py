@@ -67,5 +67,5 @@ def test_results_page_is_generated_from_its_files():
     namespace = {"__name__": "make", "__file__": str(make)}
     exec(compile(make.read_text(), make, "exec"), namespace)
     folder = make.parent
-    results = [namespace["load_results"](folder / f"{name}.json") for name in ("synthetic", "real", "depth")]
-    assert namespace["page"](*results, folder / "ablation.csv") == (folder / "README.md").read_text()
+    results = {name: namespace["load_results"](folder / f"{name}.json") for name in namespace["RESULTS"]}
+    assert namespace["page"](results, folder / "ablation.csv") == (folder / "README.md").read_text()
