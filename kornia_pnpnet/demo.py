@@ -39,7 +39,9 @@ def run_demo(
     )
     solvers = {name: load_solver(name) for name in names}
 
-    print(f"{count} problems of {_N} pairs in each set, all solvers on the same ones:\n", flush=True)
+    # Tensors are small: more threads are no faster, and crawl when another process computes beside them.
+    torch.set_num_threads(1)
+    print(f"{count} problems of {_N} pairs in each set, all solvers on the same ones, one thread:\n", flush=True)
     results = evaluate(solvers, sets)
     print(format_table(results), flush=True)
     save_results(results, folder / "results.json")
