@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from kornia.core.exceptions import BaseError, ValueCheckError
+from kornia.core.exceptions import ValueCheckError
 from torch import nn
 
 from kornia_pnpnet.data import OutlierMix, SceneProblems, SyntheticProblems, load_scene
@@ -53,12 +53,7 @@ def load_solver(spec: str) -> nn.Module:
             options[key] = json.loads(value)
         except ValueError:
             options[key] = value
-    try:
-        return create_solver(name, **options)
-    except (TypeError, ValueError) as error:
-        if isinstance(error, BaseError):
-            raise
-        raise ValueCheckError(f"{spec}: {error}") from error
+    return create_solver(name, **options)
 
 
 def _outlier_mixes(text: str, n: int) -> dict[str, OutlierMix]:

@@ -8,6 +8,7 @@ damping by the diagonal is Marquardt's (1963).
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import torch
@@ -315,15 +316,17 @@ class RobustWeightedLM(nn.Module):
                     projection, corr, prior, shape[i]
                 )
                 factor = torch.where(better, factor * _DAMPING_DOWN, factor * _DAMPING_UP)
-                candidate = Pose(
-                    torch.where(better[:, None, None], candidate.rotation, pose.rotation),
-                    torch.where(better[:, None], candidate.translation, pose.translation),
-                )
-                candidate_projection = project(candidate, corr)
+                candidate = Pose(*_chosen(better, candidate, pose))
+                candidate_projection = Projection(*_chosen(better, candidate_projection, projection))
             pose, projection = candidate, candidate_projection
         weights = self._pair_weights(projection, prior, shape[-1])
         cost = self._cost(projection, corr, prior, shape[-1])
         return Refinement(pose, weights, cost, solved & explains(projection, corr, prior))
+
+
+def _chosen(first: Tensor, a: Iterable[Tensor], b: Iterable[Tensor]) -> Iterator[Tensor]:
+    """For each pair of tensors, ``a`` for the problems where ``first`` holds, else ``b``."""
+    return (torch.where(first.view(-1, *(1,) * (x.ndim - 1)), x, y) for x, y in zip(a, b, strict=True))
 
 
 def explains(projection: Projection, corr: Correspondences, prior: Tensor) -> Tensor:

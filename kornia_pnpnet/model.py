@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from kornia_pnpnet.files import atomic_open
 from kornia_pnpnet.init import MLPInit
 from kornia_pnpnet.lm import RobustWeightedLM
-from kornia_pnpnet.normalize import Normalize
+from kornia_pnpnet.normalize import Frame, Normalize
 from kornia_pnpnet.types import Guess, PnPResult, Pose
 
 __all__ = ["PnPNet", "shipped_weights"]
@@ -167,7 +167,7 @@ class PnPNet(nn.Module):
             _gate_pose(first, first_ok, first_ok),
         )
 
-    def _given(self, init: Pose | None, weights: Tensor, world_points: Tensor, frame: Any) -> Guess:
+    def _given(self, init: Pose | None, weights: Tensor, world_points: Tensor, frame: Frame) -> Guess:
         """Bring a pose given by hand (or the identity) to the normalised frame."""
         batch = world_points.shape[0]
         if init is None:
