@@ -7,13 +7,14 @@ from kornia_pnpnet.metrics import pose_errors, success, success_rate
 from kornia_pnpnet.model import PnPNet, shipped_weights
 from kornia_pnpnet.normalize import Normalize
 from kornia_pnpnet.registry import create_solver, list_solvers
-from kornia_pnpnet.types import Correspondences, Guess, PnPResult, Pose, Problems, Refinement
+from kornia_pnpnet.types import Correspondences, Guess, Hypotheses, PnPResult, Pose, Problems, Refinement
 
 __version__ = "0.1.0"
 
 __all__ = [
     "Correspondences",
     "Guess",
+    "Hypotheses",
     "MLPInit",
     "Normalize",
     "PnPNet",

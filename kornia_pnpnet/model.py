@@ -158,6 +158,7 @@ class PnPNet(nn.Module):
         finite = pose.rotation.isfinite().flatten(1).all(-1) & pose.translation.isfinite().all(-1)
         finite = finite & refined.cost.isfinite() & pair_weights.isfinite().all(-1)
         ok = frame.valid & refined.ok & finite
+        ok = ok if guess.ok is None else ok & guess.ok
         first_ok = frame.valid & first.rotation.isfinite().flatten(1).all(-1) & first.translation.isfinite().all(-1)
         return PnPResult(
             *_gate_pose(pose, ok, finite & frame.valid),

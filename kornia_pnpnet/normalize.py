@@ -142,7 +142,9 @@ class Normalize(nn.Module):
             pixels = pixels.gather(1, order[..., None].expand(-1, -1, 2))
             weights = weights.gather(1, order)
         focal = pixels.new_full((), self.f_const)  # made on the device: nothing here waits for the CPU
-        return Correspondences(world_points, pixels, weights, focal), Frame(centroid, scale, order, valid)
+        img_scale = self.f_const * intrinsics[:, 0, 0].rsqrt() * intrinsics[:, 1, 1].rsqrt()
+        corr = Correspondences(world_points, pixels, weights, focal, img_scale, scale)
+        return corr, Frame(centroid, scale, order, valid)
 
     def _world_frame(self, world_points: Tensor, there: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Centroid (B, 3) and scale (B,) of the world, and whether it is more than a line (B,)."""

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from kornia.geometry.conversions import Rt_to_matrix4x4
 from torch import Tensor
 
-__all__ = ["Correspondences", "Guess", "PnPResult", "Pose", "Problems", "Refinement"]
+__all__ = ["Correspondences", "Guess", "Hypotheses", "PnPResult", "Pose", "Problems", "Refinement"]
 
 
 class Pose(NamedTuple):
@@ -41,12 +41,18 @@ class Correspondences(NamedTuple):
             shape :math:`(B, N, 2)`.
         weights: how much each pair counts, at least 0; 0 means that the pair is not there, shape :math:`(B, N)`.
         focal: the focal length in pixels that all pairs share, a scalar.
+        img_scale: pixels of ``img_points`` per pixel of the camera that was given, shape :math:`(B,)`; ``None`` is 1.
+            What a user says in pixels, a threshold for example, is multiplied by it.
+        world_scale: lengths of ``world_points`` per unit of the world that was given, shape :math:`(B,)`; ``None`` is
+            1.
     """
 
     world_points: Tensor
     img_points: Tensor
     weights: Tensor
     focal: Tensor
+    img_scale: Tensor | None = None
+    world_scale: Tensor | None = None
 
 
 class Guess(NamedTuple):
@@ -55,10 +61,25 @@ class Guess(NamedTuple):
     Attributes:
         pose: a coarse pose in the frame of the :class:`Correspondences`.
         weights: a factor for the weight of each pair, at least 0, shape :math:`(B, N)`.
+        ok: whether there is a guess at all (degenerate pairs may have none), bool, shape :math:`(B,)`; ``None``:
+            always.
     """
 
     pose: Pose
     weights: Tensor
+    ok: Tensor | None = None
+
+
+class Hypotheses(NamedTuple):
+    r"""What a solver of minimal or small samples returns: up to :math:`S` poses for each sample.
+
+    Attributes:
+        pose: rotations :math:`(B, S, 3, 3)` and translations :math:`(B, S, 3)` in the frame of the sample.
+        valid: which of them are solutions, bool, shape :math:`(B, S)`. The others are finite.
+    """
+
+    pose: Pose
+    valid: Tensor
 
 
 class Refinement(NamedTuple):
