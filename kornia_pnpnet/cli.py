@@ -1,4 +1,4 @@
-"""The command ``pnpnet``: solve a file of pairs, compare solvers, list them, and a demo."""
+"""The command ``pnpnet``: solve a file of pairs, compare solvers, draw the figures, list solvers, and a demo."""
 
 from __future__ import annotations
 
@@ -6,158 +6,24 @@ import argparse
 import json
 import math
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NoReturn
 
 import torch
 from kornia.core.exceptions import BaseError
 
-from kornia_pnpnet import __version__, list_solvers, shipped_weights
-from kornia_pnpnet.choices import DEFAULT_SEED, default_solvers, evaluation_sets, load_solver, missing_package
+from kornia_pnpnet import list_solvers, shipped_weights
+from kornia_pnpnet.arguments import make_parser
+from kornia_pnpnet.choices import (
+    BOUNDS,
+    default_solvers,
+    evaluation_sets,
+    load_solver,
+    missing_package,
+)
 from kornia_pnpnet.pairs import PairsError, camera_matrix, read_pairs, rejection_limit, reprojections
 
 __all__ = ["main"]
-
-_PICTURES = (".pdf", ".png", ".svg")
-
-
-class _Parser(argparse.ArgumentParser):
-    """Errors on one line, like all others."""
-
-    def error(self, message: str) -> NoReturn:
-        self.exit(2, f"pnpnet: {message} (see {self.prog} --help)\n")
-
-
-def _positive_int(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"expected an integer of at least 1, got {text!r}")
-    return int(text)
-
-
-def _seed(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"expected an integer of at least 0, got {text!r}")
-    return int(text)
-
-
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"expected a positive number, got {text!r}")
-    return value
-
-
-def _not_negative(text: str) -> float:
-    return 0.0 if text in ("0", "0.0") else _positive(text)
-
-
-def _picture(text: str) -> Path:
-    if Path(text).suffix.lower() not in _PICTURES:
-        raise argparse.ArgumentTypeError(f"expected a file ending in {', '.join(_PICTURES)}, got {text!r}")
-    return Path(text)
-
-
-def _parser() -> _Parser:
-    parser = _Parser(prog="pnpnet", description="Camera poses from 2D-3D pairs of which some are wrong.")
-    parser.add_argument("--version", action="version", version=f"pnpnet {__version__}")
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-
-    def command(name: str, run: Any, help_text: str, details: str) -> argparse.ArgumentParser:
-        added = commands.add_parser(
-            name, help=help_text, description=details, formatter_class=argparse.RawDescriptionHelpFormatter
-        )
-        added.set_defaults(run=run)
-        return added
-
-    solve = command(
-        "solve",
-        _solve,
-        "find the pose of one image",
-        "Find the pose of one image and print it as JSON: x_cam = R x_world + t.\n\n"
-        "  pnpnet solve pairs.csv --intrinsics 3400,3400,3024,2016 --plot pose.png\n\n"
-        "Exit code: 0 when solved, 1 when the solver found no pose that explains the pairs, 2 for bad input.",
-    )
-    solve.add_argument(
-        "file",
-        metavar="FILE",
-        help="CSV with the header X,Y,Z,u,v and optionally weight, or NPZ with world_points (N, 3), img_points (N, 2) "
-        "and optionally weights (N,) and intrinsics (3, 3)",
-    )
-    solve.add_argument("--intrinsics", metavar="fx,fy,cx,cy", help="the camera in pixels; goes before an NPZ's own")
-    solve.add_argument(
-        "--solver", metavar="NAME", help="see `pnpnet list`, or a folder of weights; default: pnpnet-nN for N pairs"
-    )
-    solve.add_argument("--plot", metavar="PNG", type=_picture, help="draw pixels, reprojections and rejected pairs")
-    solve.add_argument(
-        "--threshold",
-        metavar="PX",
-        type=_positive,
-        help="pairs with a larger reprojection error are rejected; default: a robust three sigma, at least 3 px",
-    )
-
-    evaluate = command(
-        "evaluate",
-        _evaluate,
-        "compare solvers on the same problems",
-        "Compare solvers on the same problems, in float32; print a table and write a results file.\n\n"
-        "  pnpnet evaluate --solver pnpnet-n9 opencv-ransac:threshold=12 --data path/to/colmap --outliers none,2",
-    )
-    evaluate.add_argument(
-        "--solver",
-        metavar="NAME",
-        nargs="+",
-        action="extend",
-        help="see `pnpnet list`, options after a colon (opencv-ransac:threshold=12,iterations=100), or folders of "
-        "weights; default: those for n that are installed",
-    )
-    evaluate.add_argument(
-        "--data",
-        metavar="DATA",
-        nargs="+",
-        action="extend",
-        help="synthetic, a folder with a COLMAP model, or an .npz file of matches; default: synthetic",
-    )
-    evaluate.add_argument("--n", type=_positive_int, default=9, help="pairs per problem; default: 9")
-    evaluate.add_argument(
-        "--outliers",
-        metavar="LIST",
-        default="none,uniform",
-        help="none, uniform (0 to n/3 of the pairs) or numbers, with commas; default: none,uniform",
-    )
-    evaluate.add_argument("--problems", type=_positive_int, default=1000, help="per set; default: 1000")
-    evaluate.add_argument("--seed", type=_seed, default=DEFAULT_SEED, help=f"of the problems; default: {DEFAULT_SEED}")
-    _add_unit(evaluate)
-    evaluate.add_argument("--out", metavar="JSON", default="outputs/results.json", help="default: outputs/results.json")
-    evaluate.add_argument("--plot", metavar="FOLDER", help="draw success rates and error curves into this folder")
-
-    command("list", _list, "list solvers and weights", "List the solvers that --solver takes.\n\n  pnpnet list")
-
-    demo = command(
-        "demo",
-        _demo,
-        "solve problems beside OpenCV, then train for a minute",
-        "Solve random problems without and with outliers beside OpenCV's RANSAC, train a small model, draw pictures.\n"
-        "\n  pnpnet demo --data path/to/colmap --out outputs/demo",
-    )
-    demo.add_argument("--data", metavar="FOLDER", help="a COLMAP model or an .npz file of matches, not synthetic data")
-    _add_unit(demo)
-    demo.add_argument("--out", metavar="FOLDER", default="outputs/demo", help="default: outputs/demo")
-    demo.add_argument("--problems", type=_positive_int, default=1000, help="per set; default: 1000")
-    demo.add_argument(
-        "--train-seconds", type=_not_negative, default=60.0, help="0 leaves the training out; default: 60"
-    )
-    return parser
-
-
-def _add_unit(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--arbitrary-unit",
-        action="store_true",
-        help="the scene is not in metres: a success has a translation error below 0.5 %% of the median depth",
-    )
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -169,9 +35,9 @@ def main(argv: list[str] | None = None) -> int:
     Returns:
         The exit code: 0, 1 when ``solve`` found no pose, 2 for bad input, 130 when interrupted.
     """
-    arguments = _parser().parse_args(argv)
+    arguments = make_parser().parse_args(argv)
     try:
-        return int(arguments.run(arguments))
+        return _COMMANDS[arguments.command](arguments)
     except (BaseError, PairsError, OSError, ImportError, ValueError) as error:
         print(f"pnpnet: {_one_line(error)}", file=sys.stderr)
         return 2
@@ -183,7 +49,8 @@ def main(argv: list[str] | None = None) -> int:
 def _one_line(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename and error.strerror:
         return f"{error.filename}: {error.strerror}"
-    return " ".join(str(error).split()) or type(error).__name__
+    notes = (f"({note})" for note in getattr(error, "__notes__", ()))
+    return " ".join(" ".join([str(error) or type(error).__name__, *notes]).split())
 
 
 def _solve(arguments: argparse.Namespace) -> int:
@@ -201,6 +68,8 @@ def _solve(arguments: argparse.Namespace) -> int:
         if name not in shipped_weights():
             print(f"pnpnet: no weights {name} are shipped, using identity-lm", file=sys.stderr)
             name = "identity-lm"
+    if name.partition(":")[0] in BOUNDS:
+        raise ValueError(f"--solver: {name} is a bound, which has to see the true pose: it can only be evaluated")
     solver = load_solver(name)
     weights = None if pairs.weights is None else pairs.weights[None]
     with torch.no_grad():
@@ -233,8 +102,10 @@ def _solve(arguments: argparse.Namespace) -> int:
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
-    from kornia_pnpnet.evaluation import evaluate, format_table, save_results
+    from kornia_pnpnet.evaluation import evaluate, format_table, load_results
 
+    out = Path(arguments.out)
+    kept = len(load_results(out)["rows"]) if out.exists() and not arguments.overwrite else 0
     sources = arguments.data or ["synthetic"]
     solvers = {name: load_solver(name) for name in arguments.solver or default_solvers(arguments.n, sources)}
     sets = evaluation_sets(
@@ -244,11 +115,24 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         count=arguments.problems,
         seed=arguments.seed,
         metric=not arguments.arbitrary_unit,
+        mismatches_only=arguments.mismatches_only,
+        dtype=getattr(torch, arguments.dtype),
     )
-    results = evaluate(solvers, sets)
-    save_results(results, arguments.out)
+    torch.set_num_threads(1)  # as in the demo, and as the peers have it
+    try:
+        results = evaluate(solvers, sets, path=out, overwrite=arguments.overwrite)
+    except KeyboardInterrupt:
+        print(f"pnpnet: interrupted; the same command continues {out}", file=sys.stderr)
+        return 130
+    reasons: dict[str, list[str]] = {}
+    for entry in results["left_out"]:
+        reasons.setdefault(entry["solver"], []).append(entry["reason"])
+    if not results["rows"]:
+        raise ValueError(f"no solver takes these problems: {results['left_out'][0]['reason']}")
+    for solver, given in reasons.items():
+        print(f"pnpnet: {solver} is left out on {len(given)} of {len(sets)} sets: {given[0]}", file=sys.stderr)
     print(format_table(results))
-    print(f"\nResults: {arguments.out}")
+    print(f"\nResults: {out}" + (f" ({kept} of {len(results['rows'])} rows were there)" if kept else ""))
     if arguments.plot:
         from kornia_pnpnet.figures import plot_errors, plot_success
 
@@ -258,12 +142,23 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _figures(arguments: argparse.Namespace) -> int:
+    from kornia_pnpnet.evaluation import load_results
+    from kornia_pnpnet.figures import paper_figures
+
+    pictures = paper_figures([load_results(path, complexity=True) for path in arguments.files], arguments.out)
+    print(*pictures, sep="\n")
+    return 0
+
+
 def _list(_: argparse.Namespace) -> int:
-    names = list_solvers()
-    for name in names:
+    states = {}
+    for name in list_solvers():
         package = missing_package(name)
-        state = f"needs {package}: pip install 'kornia_pnpnet[eval]'" if package else "installed"
-        print(f"{name:<{max(map(len, names))}}  {state}")
+        states[name] = f"needs {package}: pip install 'kornia_pnpnet[eval]'" if package else "installed"
+    states |= dict.fromkeys(BOUNDS, "bound: sees the true pose, for `pnpnet evaluate` only")
+    for name, state in states.items():
+        print(f"{name:<{max(map(len, states))}}  {state}")
     print(f"\nShipped weights: {', '.join(shipped_weights()) or 'none'}")
     return 0
 
@@ -279,3 +174,12 @@ def _demo(arguments: argparse.Namespace) -> int:
         train_seconds=arguments.train_seconds,
     )
     return 0
+
+
+_COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
+    "solve": _solve,
+    "evaluate": _evaluate,
+    "figures": _figures,
+    "list": _list,
+    "demo": _demo,
+}

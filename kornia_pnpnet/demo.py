@@ -17,6 +17,7 @@ from kornia_pnpnet.pairs import rejection_limit, reprojections
 __all__ = ["run_demo"]
 
 _N = 9
+_SOLVERS = (f"pnpnet-n{_N}", f"net-n{_N}", "epnp-lm", "p3p-ransac", "opencv-ransac")  # enough to see at a glance
 
 
 def run_demo(
@@ -31,7 +32,7 @@ def run_demo(
         count: problems per set.
         train_seconds: how long to train, roughly; 0 leaves it out.
     """
-    names = default_solvers(_N, [data or "synthetic"])
+    names = [name for name in default_solvers(_N, [data or "synthetic"]) if name.partition(":")[0] in _SOLVERS]
     if f"pnpnet-n{_N}" not in names:
         print(f"pnpnet: no weights pnpnet-n{_N} are shipped, going on without", file=sys.stderr)
     sets = evaluation_sets(

@@ -2,25 +2,35 @@
 
 from __future__ import annotations
 
-import json
+import hashlib
 import math
 import statistics
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
+from kornia.core.exceptions import ShapeError
 from torch import Tensor, nn
 
 from kornia_pnpnet.environment import environment
-from kornia_pnpnet.files import atomic_open
-from kornia_pnpnet.metrics import PoseErrors, SuccessRate, pose_errors, success, success_rate
+from kornia_pnpnet.metrics import PoseErrors, pose_errors, success, success_rate
+from kornia_pnpnet.results import (
+    FORMAT,
+    format_table,
+    load_results,
+    resume,
+    row_errors,
+    save_results,
+    source_digest,
+)
 from kornia_pnpnet.types import PnPResult, Pose, Problems
 
 __all__ = [
     "EvaluationData",
+    "SeesTruth",
     "draw_problems",
     "evaluate",
     "format_table",
@@ -29,8 +39,9 @@ __all__ = [
     "save_results",
 ]
 
-FORMAT = 1
 _QUARTILES = {"q25": 0.25, "median": 0.5, "q75": 0.75}
+# What a row was made on and may differ from that of other rows; what it was made with may not.
+_MACHINE = ("python", "platform", "cpu", "threads", "gpu", "commit")
 
 
 class EvaluationData(NamedTuple):
@@ -56,6 +67,15 @@ class _Source(Protocol):
 
     def batch(self, index: int) -> Problems:
         """Draw batch ``index``."""
+        ...
+
+
+@runtime_checkable
+class SeesTruth(Protocol):
+    """A bound: a module that :func:`evaluate` gives the answers along with the problems."""
+
+    def solve_with_truth(self, problems: Problems) -> PnPResult:
+        """Solve problems whose answers are known."""
         ...
 
 
@@ -94,6 +114,8 @@ def evaluate(
     solvers: Mapping[str, nn.Module],
     data: Mapping[str, EvaluationData],
     *,
+    path: str | Path | None = None,
+    overwrite: bool = False,
     chunk: int = 1000,
     repeats: int = 3,
     progress: bool | None = None,
@@ -103,42 +125,100 @@ def evaluate(
     A non-finite pose counts as the identity with ``ok=False``. All summaries are computed from the per-problem errors
     as they are stored, rounded to six digits, so that whoever reads the file finds the same numbers.
 
+    With a ``path`` the results are on disk after every row, and calling again with the same arguments continues where
+    the file ends: an evaluation that was killed loses the row it was at. More solvers and data sets may be added that
+    way. A file with rows of other code, versions, weights, configurations or problems is refused.
+
     Args:
         solvers: by name, each called as ``solver(world_points, img_points, intrinsics)`` in evaluation mode, without
-            gradients.
+            gradients. One that has ``solve_with_truth`` (see :class:`SeesTruth`) is given the answers as well.
         data: problems by name, on the device and in the dtype to solve them in.
+        path: the results file to write and to continue; none when ``None``.
+        overwrite: start anew, whatever is at ``path``.
         chunk: problems per call, which bounds the memory.
         repeats: calls to time at least. The first chunk is solved once before, untimed.
         progress: show a progress bar; when ``None``, if standard error is a terminal.
 
     Returns:
-        Plain data: ``format``, ``environment`` (see :func:`environment`), ``solvers`` with each one's configuration,
-        ``data`` with each set's description and limits, and ``rows``, one for each set and solver: ``success``
-        (rate, low, high, total), quartiles of ``rotation_error_deg`` and ``translation_error``, the share ``ok``,
-        ``us_per_problem`` (median over the timed calls) and the ``per_problem`` errors and ok.
+        Plain data: ``format``, ``environment`` (see :func:`environment`), ``code`` (a digest of the package),
+        ``solvers`` with each one's configuration and a digest of its weights, ``data`` with each set's description,
+        limits and a digest of its problems, and ``rows``, one for each set and solver: ``success`` (rate, low, high,
+        total), quartiles of ``rotation_error_deg`` and ``translation_error``, the share ``ok``, ``us_per_problem``
+        (median over the timed calls), the ``per_problem`` errors and ok, and what differs from ``environment`` if
+        another machine continued. A solver that refuses the shape of a set (another n than its own) has an entry in
+        ``left_out`` instead: ``data``, ``solver`` and ``reason``.
+
+    Raises:
+        ValueError: when ``path`` is not a results file, or one that this evaluation cannot continue.
+        OSError: when ``path`` cannot be written.
     """
     from tqdm import tqdm
 
-    hidden = not (sys.stderr.isatty() if progress is None else progress)
-    rows = []
-    with tqdm(total=len(solvers) * len(data), disable=hidden, unit="run") as bar:
-        for data_name, entry in data.items():
-            for solver_name, solver in solvers.items():
-                bar.set_postfix_str(f"{solver_name} on {data_name}")
-                rows.append({"data": data_name, "solver": solver_name, **_row(solver, entry, chunk, repeats)})
-                bar.update()
-    return {
+    results: dict[str, Any] = {
         "format": FORMAT,
         "environment": environment(),
-        "solvers": {name: _config(solver) for name, solver in solvers.items()},
+        "code": source_digest(),
+        "solvers": {name: _describe_solver(solver) for name, solver in solvers.items()},
         "data": {name: {**_describe(entry), "chunk": chunk} for name, entry in data.items()},
-        "rows": rows,
+        "rows": [],
     }
+    machine = {key: results["environment"][key] for key in _MACHINE}
+    if path is not None and not overwrite:
+        results = resume(results, path)
+    results["left_out"] = []
+    elsewhere = {key: value for key, value in machine.items() if results["environment"].get(key) != value}
+
+    plan = [(data_name, solver_name) for data_name in data for solver_name in solvers]
+    done = {(row["data"], row["solver"]): row for row in results["rows"]}
+    if path is not None:
+        save_results(results, path)  # before the work: a file that cannot be written is found out now
+    hidden = not (sys.stderr.isatty() if progress is None else progress)
+    with tqdm(total=len(plan), initial=len(done), disable=hidden, unit="run") as bar:
+        for names in plan:
+            if names in done:
+                continue
+            row = dict(zip(("data", "solver"), names, strict=True))
+            bar.set_postfix_str("{solver} on {data}".format(**row))
+            try:
+                solved = _row(solvers[row["solver"]], data[row["data"]], chunk, repeats)
+            except ShapeError as error:
+                results["left_out"].append({**row, "reason": str(error).splitlines()[0]})
+            except Exception as error:
+                error.add_note("{solver} on {data}".format(**row))
+                raise
+            else:
+                done[names] = {**row, **solved, **({"environment": elsewhere} if elsewhere else {})}
+                results["rows"] = [done[key] for key in plan if key in done]
+            if path is not None:
+                save_results(results, path)
+            bar.update()
+    return results
 
 
-def _config(solver: nn.Module) -> dict[str, Any]:
+def _digest(tensors: Iterable[Tensor]) -> str:
+    """A digest of shapes and values."""
+    digest = hashlib.sha256()
+    for tensor in tensors:
+        digest.update(repr(tuple(tensor.shape)).encode())
+        digest.update(tensor.detach().cpu().flatten().view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()
+
+
+def _problems_digest(problems: Problems) -> str:
+    # In float32: on another machine the last bits of a float64 may differ.
+    tensors = (*problems[:3], *problems.pose)
+    return _digest((*(tensor.float() for tensor in tensors), problems.inliers))
+
+
+def _describe_solver(solver: nn.Module) -> dict[str, Any]:
     config = getattr(solver, "config", None)
-    return {"class": type(solver).__name__, "config": config() if callable(config) else None}
+    config = config() if callable(config) else config
+    state = {name: value for name, value in solver.state_dict().items() if isinstance(value, Tensor)}
+    return {
+        "class": type(solver).__name__,
+        "config": config if isinstance(config, dict) else None,
+        "weights": _digest(state.values()) if state else None,
+    }
 
 
 def _describe(entry: EvaluationData) -> dict[str, Any]:
@@ -153,6 +233,7 @@ def _describe(entry: EvaluationData) -> dict[str, Any]:
         "unit": entry.unit,
         "dtype": str(problems.world_points.dtype).removeprefix("torch."),
         "device": problems.world_points.device.type,
+        "digest": _problems_digest(problems),
     }
 
 
@@ -200,7 +281,10 @@ def _timed(solver: nn.Module, problems: Problems) -> tuple[PnPResult, float]:
     if on_gpu:
         torch.cuda.synchronize()
     start = time.perf_counter()
-    result = solver(problems.world_points, problems.img_points, problems.intrinsics)
+    if isinstance(solver, SeesTruth):
+        result = solver.solve_with_truth(problems)
+    else:
+        result = solver(problems.world_points, problems.img_points, problems.intrinsics)
     if on_gpu:
         torch.cuda.synchronize()
     return result, time.perf_counter() - start
@@ -222,95 +306,3 @@ def _rounded(value: float) -> float:
 
 def _quartiles(values: Tensor) -> dict[str, float]:
     return {name: _rounded(values.quantile(share).item()) for name, share in _QUARTILES.items()}
-
-
-def row_errors(row: Mapping[str, Any]) -> tuple[PoseErrors, Tensor]:
-    """The per-problem errors of a row of the results.
-
-    Args:
-        row: one of ``results["rows"]``.
-
-    Returns:
-        The errors in float64 and ok as bool, each of shape :math:`(B,)`.
-    """
-    errors = row["per_problem"]
-    parts = (torch.tensor(errors[name], dtype=torch.float64) for name in PoseErrors._fields)
-    return PoseErrors(*parts), torch.tensor(errors["ok"], dtype=torch.bool)
-
-
-def save_results(results: Mapping[str, Any], path: str | Path) -> None:
-    """Write results as one JSON file, in one piece: a reader finds the old file or the new one.
-
-    Args:
-        results: what :func:`evaluate` returned.
-        path: where to; folders are made when missing.
-
-    Raises:
-        ValueError: when a number is not finite, which JSON does not know.
-    """
-    text = json.dumps(results, separators=(",", ":"), allow_nan=False) + "\n"
-    with atomic_open(path, encoding="utf-8") as file:
-        file.write(text)
-
-
-def load_results(path: str | Path) -> dict[str, Any]:
-    """Read a results file.
-
-    Args:
-        path: what :func:`save_results` wrote.
-
-    Returns:
-        The results.
-
-    Raises:
-        FileNotFoundError: when there is no such file.
-        ValueError: when it is not a results file of this format.
-    """
-    try:
-        results = json.loads(Path(path).read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"'{path}' is not a results file: {error}") from error
-    if not isinstance(results, dict) or results.get("format") != FORMAT:
-        raise ValueError(f"'{path}' is not a results file of format {FORMAT}.")
-    return results
-
-
-def _three_digits(value: float) -> str:
-    """Three significant digits, zeros at the end kept: 0.160."""
-    return f"{value:#.3g}".rstrip(".")
-
-
-def format_table(results: Mapping[str, Any]) -> str:
-    """The results as a Markdown table that also reads well as plain text.
-
-    Args:
-        results: what :func:`evaluate` returned.
-
-    Returns:
-        One line for each set and solver: success with its 95 % interval, median errors, time and share of ok.
-    """
-    head = ("data", "solver", "success [95 %]", "median rotation error", "median translation error", "µs/problem", "ok")
-    cells = [head]
-    for row in results["rows"]:
-        unit = results["data"][row["data"]]["unit"]
-        cells.append(
-            (
-                row["data"],
-                row["solver"],
-                str(SuccessRate(**row["success"])),
-                f"{_three_digits(row['rotation_error_deg']['median'])}°",
-                f"{_three_digits(row['translation_error']['median'])} {unit}".rstrip(),
-                f"{row['us_per_problem']:.0f}",
-                f"{100 * row['ok']:.1f} %",
-            )
-        )
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    left = 2  # the names; numbers are aligned to the right
-    lines = [
-        "| "
-        + " | ".join(c.ljust(w) if i < left else c.rjust(w) for i, (c, w) in enumerate(zip(line, widths, strict=True)))
-        + " |"
-        for line in cells
-    ]
-    rule = "|" + "|".join("-" * (w + 2) if i < left else "-" * (w + 1) + ":" for i, w in enumerate(widths)) + "|"
-    return "\n".join([lines[0], rule, *lines[1:]])

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from kornia.core.check import KORNIA_CHECK
@@ -228,7 +228,7 @@ class RobustWeightedLM(nn.Module):
         KORNIA_CHECK(isinstance(m, int) and m >= 0, f"m must be an integer of at least 0, got {m!r}.")
         KORNIA_CHECK(kernel in KERNELS, f"kernel must be one of {sorted(KERNELS)}, got {kernel!r}.")
         KORNIA_CHECK(update in ("retraction", "additive"), f"update must be retraction or additive, got {update!r}.")
-        self.config = {
+        self.config: dict[str, Any] = {
             "m": m,
             "kernel": kernel,
             "step": step,

@@ -6,46 +6,93 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+from kornia.core.check import KORNIA_CHECK
 from kornia.core.exceptions import ValueCheckError
 from torch import nn
 
+from kornia_pnpnet.init import P3P, RANSAC, EPnP, REPPnP, SubsetSolver
 from kornia_pnpnet.lm import RobustWeightedLM
 from kornia_pnpnet.model import PnPNet, shipped_weights
 
 __all__ = ["create_solver", "list_solvers"]
 
+# Iterations of the classical robust LM: from a pose that is nearly right, and from the identity.
+_FEW, _MANY = 10, 30
+# The paper's RANSAC: EPnP-LM on samples of 7 of the pairs.
+_PAPERS_SAMPLE = 7
 
-def _first_stage(weights: str) -> PnPNet:
-    """The network of some weights alone, the paper's "Net"."""
+
+def _trained(weights: str, m: int | None = None) -> PnPNet:
+    """Shipped weights; with ``m``, only their first iterations (0: the network alone, the paper's "Net")."""
     solver = PnPNet.from_pretrained(weights)
-    solver.refine = RobustWeightedLM(m=0)
+    if m is not None:
+        whole = solver.refine
+        KORNIA_CHECK(type(m) is int and 0 <= m <= whole.m, f"m must be an integer from 0 to {whole.m}, got {m!r}.")
+        solver.refine = RobustWeightedLM(**{**whole.config, "m": m})
+        for name, parameter in solver.refine.named_parameters():
+            parameter.data.copy_(whole.get_parameter(name)[: len(parameter)])
     return solver
 
 
-def _opencv_ransac(**options: Any) -> nn.Module:
-    from kornia_pnpnet.peers import OpenCVRansac  # imports OpenCV, an extra
+def _judged(init: nn.Module) -> PnPNet:
+    """An initialiser by itself: its pose is only judged, and its weights are those of the result."""
+    return PnPNet(init, RobustWeightedLM(0, robustness=0.0, learnable=False))
 
-    return OpenCVRansac(**options)
+
+def _refined(init: Callable[..., nn.Module], m: int = _FEW, **options: Any) -> PnPNet:
+    """The paper's "-LM": the classical robust LM, alpha = 1, started from a method."""
+    return PnPNet(init(**options), RobustWeightedLM(m, learnable=False))
 
 
-def _identity_lm(m: int = 30) -> PnPNet:
-    """The classical robust LM from the identity pose, the paper's LM without a network."""
-    return PnPNet(None, RobustWeightedLM(m=m, learnable=False))
+def _identity_lm(m: int = _MANY) -> PnPNet:
+    return PnPNet(None, RobustWeightedLM(m, learnable=False))
+
+
+def _p3p_ransac(**options: Any) -> PnPNet:
+    return _judged(RANSAC(P3P(), **options))
+
+
+def _ransac_epnp_lm(m: int = 5, **options: Any) -> PnPNet:
+    samples = SubsetSolver(EPnP(), RobustWeightedLM(m, learnable=False), size=_PAPERS_SAMPLE)
+    return _judged(RANSAC(samples, **options))
+
+
+def _peer(name: str, **options: Any) -> nn.Module:
+    from kornia_pnpnet import peers  # needs the extras
+
+    solver: nn.Module = getattr(peers, name)(**options)
+    return solver
 
 
 def _builders() -> dict[str, Callable[..., nn.Module]]:
-    builders: dict[str, Callable[..., nn.Module]] = {"identity-lm": _identity_lm, "opencv-ransac": _opencv_ransac}
+    builders: dict[str, Callable[..., nn.Module]] = {
+        "epnp": lambda **options: _judged(EPnP(**options)),
+        "epnp-lm": partial(_refined, EPnP),
+        "reppnp": lambda **options: _judged(REPPnP(**options)),
+        "reppnp-lm": partial(_refined, REPPnP),
+        "p3p-ransac": _p3p_ransac,
+        "ransac-epnp-lm": _ransac_epnp_lm,
+        "identity-lm": _identity_lm,
+    }
+    peers = {
+        "opencv-epnp": partial(_peer, "OpenCVPnP", method="EPNP"),
+        "opencv-sqpnp": partial(_peer, "OpenCVPnP", method="SQPNP"),
+        "opencv-ransac": partial(_peer, "OpenCVRansac"),
+        "opencv-usac": partial(_peer, "OpenCVUsac"),
+        "poselib": partial(_peer, "PoseLib"),
+        "pycolmap": partial(_peer, "PyColmap"),
+    }
     for name in shipped_weights():
-        builders[name] = partial(PnPNet.from_pretrained, name)
-        builders[name.replace("pnpnet-", "net-")] = partial(_first_stage, name)
-    return builders
+        builders[name] = partial(_trained, name)
+        builders[name.replace("pnpnet-", "net-")] = partial(_trained, name, m=0)
+    return builders | peers
 
 
 def list_solvers() -> list[str]:
     """Names that :func:`create_solver` takes.
 
     Example:
-        >>> "identity-lm" in list_solvers()
+        >>> "p3p-ransac" in list_solvers()
         True
     """
     return sorted(_builders())
@@ -59,18 +106,23 @@ def create_solver(name: str, **options: Any) -> nn.Module:
 
     Args:
         name: one of :func:`list_solvers`.
-        options: of that solver, for example ``m`` of ``identity-lm`` or ``threshold`` of ``opencv-ransac``.
+        options: of that solver: ``m``, the number of iterations, of ``identity-lm``, every ``-lm`` and trained weights
+            (at most their own); the arguments of :class:`~kornia_pnpnet.init.EPnP` of ``epnp`` and ``epnp-lm``, of
+            :class:`~kornia_pnpnet.init.REPPnP` of ``reppnp`` and ``reppnp-lm``, of
+            :class:`~kornia_pnpnet.init.RANSAC` of ``p3p-ransac`` and ``ransac-epnp-lm``, and of the classes of
+            :mod:`kornia_pnpnet.peers`.
 
     Returns:
         The solver as a module in evaluation mode.
 
     Raises:
         ValueCheckError: for an unknown name or option.
+        BaseError: for an option that is out of its range.
         ImportError: when the solver needs a package that is not installed.
 
     Example:
-        >>> create_solver("identity-lm", m=10).refine.m
-        10
+        >>> create_solver("epnp-lm", m=5).refine.m
+        5
     """
     builders = _builders()
     if name not in builders:

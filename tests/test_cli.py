@@ -13,11 +13,13 @@ import numpy as np
 import pytest
 import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
+from torch import nn
 
 import kornia_pnpnet.model
-from kornia_pnpnet import MLPInit, PnPNet, RobustWeightedLM, create_solver
+from kornia_pnpnet import MLPInit, PnPNet, RobustWeightedLM, create_solver, list_solvers
+from kornia_pnpnet.choices import BOUNDS, default_solvers
 from kornia_pnpnet.cli import main
-from kornia_pnpnet.evaluation import load_results
+from kornia_pnpnet.evaluation import load_results, save_results
 from kornia_pnpnet.pairs import rejection_limit, reprojections
 from kornia_pnpnet.types import Pose
 
@@ -352,6 +354,10 @@ def test_wrong_n_and_wrong_solvers_are_one_line(capsys, csv_file, tmp_path, weig
         ("solve", "x.csv", "--plot", "x.doc"),
         ("evaluate", "--problems", "0"),
         ("evaluate", "--seed", "-1"),
+        ("evaluate", "--n", "9,"),
+        ("evaluate", "--n", "six"),
+        ("evaluate", "--dtype", "float16"),
+        ("figures",),
         ("demo", "--train-seconds", "nan"),
     ],
 )
@@ -364,7 +370,7 @@ def test_wrong_usage_is_one_line(capsys, arguments):
     assert err.count("\n") == 1
 
 
-@pytest.mark.parametrize("command", ["solve", "evaluate", "list", "demo"])
+@pytest.mark.parametrize("command", ["solve", "evaluate", "figures", "list", "demo"])
 def test_help_has_an_example(capsys, command):
     with pytest.raises(SystemExit) as stopped:
         main([command, "--help"])
@@ -376,20 +382,94 @@ def test_help_has_an_example(capsys, command):
 
 
 def test_evaluate_writes_what_it_prints(capsys, tmp_path, shipped):
+    pytest.importorskip("matplotlib")
     out_file, pictures = tmp_path / "results.json", tmp_path / "pictures"
     code, out, err = run(
         capsys, "evaluate", "--outliers", "none,uniform,2", "--problems", 20, "--out", out_file, "--plot", pictures
     )
     assert (code, err) == (0, "")
     results = load_results(out_file)
-    assert list(results["solvers"]) == ["pnpnet-n9", "net-n9", "identity-lm", "opencv-ransac"]
-    assert list(results["data"]) == [f"synthetic, {label}" for label in ("0 outliers", "0-3 outliers", "2 outliers")]
+    assert list(results["solvers"]) == default_solvers(9)
+    labels = ("0 outliers", "0-3 outliers", "2 outliers")
+    assert list(results["data"]) == [f"synthetic, n = 9, {label}" for label in labels]
     assert [entry["mean_outliers"] for entry in results["data"].values()][::2] == [0.0, 2.0]
-    assert out.count("| synthetic, 2 outliers") == 4
+    assert out.count("| synthetic, n = 9, 2 outliers") == len(results["solvers"])
     assert sorted(path.name for path in pictures.iterdir()) == ["errors.png", "success.png"]
     again = tmp_path / "again.json"
     run(capsys, "evaluate", "--problems", 20, "--solver", "identity-lm", "--out", again)
-    assert load_results(again)["rows"][0]["per_problem"] == results["rows"][2]["per_problem"]
+    (same,) = (
+        row
+        for row in results["rows"]
+        if (row["data"], row["solver"]) == ("synthetic, n = 9, 0 outliers", "identity-lm")
+    )
+    assert load_results(again)["rows"][0]["per_problem"] == same["per_problem"]
+
+
+def test_the_same_command_continues_and_another_is_refused(capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr("kornia_pnpnet.evaluation.source_digest", lambda: "edited by nobody meanwhile")
+    out_file = tmp_path / "results.json"
+    common = ("evaluate", "--problems", 5, "--out", out_file, "--outliers", "none")
+    assert run(capsys, *common, "--solver", "identity-lm", "--n", "6")[0] == 0
+    before = load_results(out_file)["rows"]
+    code, out, err = run(capsys, *common, "--solver", "identity-lm", "known-inliers", "--n", "6,9")
+    assert (code, err) == (0, "")
+    assert out.splitlines()[-1] == f"Results: {out_file} (1 of 4 rows were there)"
+    rows = load_results(out_file)["rows"]
+    assert rows[0] == before[0]
+    assert [(row["data"], row["solver"]) for row in rows] == [
+        (f"synthetic, n = {n}, 0 outliers", solver) for n in (6, 9) for solver in ("identity-lm", "known-inliers")
+    ]
+    content = out_file.read_bytes()
+    other = (*common, "--solver", "identity-lm", "known-inliers", "--n", "6,9", "--seed", 7)
+    code, out, err = run(capsys, *other)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "holds another evaluation" in err
+    assert out_file.read_bytes() == content
+    assert run(capsys, *other, "--overwrite")[0] == 0
+    assert load_results(out_file)["data"]["synthetic, n = 6, 0 outliers"]["description"]["seed"] == 7
+
+
+def test_a_damaged_results_file_is_one_line_and_stays(capsys, tmp_path):
+    out_file = tmp_path / "results.json"
+    out_file.write_text('{"format": 1, "rows": [{"data"')
+    code, out, err = run(capsys, "evaluate", "--problems", 5, "--out", out_file)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith(f"pnpnet: '{out_file}' is not a results file: ")
+    assert out_file.read_text() == '{"format": 1, "rows": [{"data"'
+
+
+def test_interrupting_an_evaluation_says_how_to_go_on(capsys, tmp_path, monkeypatch):
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("kornia_pnpnet.evaluation.evaluate", interrupt)
+    out_file = tmp_path / "results.json"
+    code, out, err = run(capsys, "evaluate", "--problems", 5, "--solver", "identity-lm", "--out", out_file)
+    assert (code, out, err) == (130, "", f"pnpnet: interrupted; the same command continues {out_file}\n")
+
+
+def test_solvers_for_another_n_are_left_out_with_one_line(capsys, tmp_path, weights_folder):
+    common = (
+        "evaluate",
+        "--problems",
+        5,
+        "--out",
+        tmp_path / "results.json",
+        "--outliers",
+        "none,1",
+        "--dtype",
+        "float64",
+    )
+    code, out, err = run(capsys, *common, "--n", "6,9", "--solver", weights_folder, "identity-lm")
+    assert code == 0
+    assert err.startswith(f"pnpnet: {weights_folder} is left out on 2 of 4 sets: This network was built for n = 9")
+    assert err.count("\n") == 1
+    results = load_results(tmp_path / "results.json")
+    assert len(results["rows"]) == 6
+    assert {entry["dtype"] for entry in results["data"].values()} == {"float64"}
+    code, out, err = run(capsys, *common, "--overwrite", "--n", 6, "--solver", weights_folder)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "no solver takes these problems: This network was built for n = 9" in err
 
 
 def test_evaluate_takes_scenes_options_and_folders(capsys, tmp_path, weights_folder):
@@ -414,13 +494,13 @@ def test_evaluate_takes_scenes_options_and_folders(capsys, tmp_path, weights_fol
     common = ("evaluate", "--data", matches, "--outliers", "none,1", "--problems", 5, "--out", out_file)
     assert run(capsys, *common, "--solver", *solvers)[0] == 0
     results = load_results(out_file)
-    assert list(results["data"]) == ["scene, +0 outliers", "scene, +1 outlier"]
+    assert list(results["data"]) == ["scene, n = 9, +0 outliers", "scene, n = 9, +1 outlier"]
     assert results["solvers"][solvers[0]]["config"]["refine"] is False
     assert results["rows"][0]["success"]["rate"] == 1.0
-    entry = results["data"]["scene, +0 outliers"]
+    entry = results["data"]["scene, n = 9, +0 outliers"]
     assert (entry["unit"], entry["max_translation"]) == ("m", 0.2)
-    assert run(capsys, *common, "--solver", solvers[0], "--arbitrary-unit")[0] == 0
-    entry = load_results(out_file)["data"]["scene, +0 outliers"]
+    assert run(capsys, *common, "--solver", solvers[0], "--arbitrary-unit", "--overwrite")[0] == 0
+    entry = load_results(out_file)["data"]["scene, n = 9, +0 outliers"]
     assert entry["unit"] == ""
     assert entry["max_translation"] == pytest.approx(0.005 * np.median(world[:, 2]), rel=0.1)
     code, _, err = run(capsys, *common, "--solver", solvers[0], "--n", 40)
@@ -431,30 +511,82 @@ def test_evaluate_takes_scenes_options_and_folders(capsys, tmp_path, weights_fol
     ("arguments", "expected"),
     [
         (("--data", "nowhere"), "nowhere"),
-        (("--outliers", "none,some"), "expected none, uniform or numbers with commas"),
+        (("--outliers", "none,some"), "expected none, uniform, numbers or shares like 50%, with commas, got 'some'"),
+        (("--outliers", "none,"), "expected none, uniform, numbers or shares like 50%, with commas, got ''"),
+        (("--outliers", "120%"), "got '120%'"),
+        (("--outliers", "x%"), "got 'x%'"),
+        (("--n", "9,2"), "at least 3 pairs, got 2"),
+        (("--n", "20,6", "--outliers", "7"), "7 outliers do not fit into n = 6 pairs"),
+        (("--solver", "known-inliers:threshold=3"), "Bound 'known-inliers' does not take these options"),
         (("--outliers", "10"), "10 outliers do not fit into n = 9 pairs"),
         (("--n", "2"), "at least 3 pairs"),
         (("--solver", "nobody"), "No solver 'nobody'"),
     ],
 )
-def test_evaluate_refuses_in_one_line(capsys, arguments, expected):
-    code, out, err = run(capsys, "evaluate", "--problems", 5, *arguments)
+def test_evaluate_refuses_in_one_line(capsys, tmp_path, arguments, expected):
+    out_file = tmp_path / "results.json"
+    code, out, err = run(capsys, "evaluate", "--problems", 5, "--out", out_file, *arguments)
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert err.startswith("pnpnet: ")
     assert expected in err
+    assert not out_file.exists()
 
 
-def test_evaluate_on_another_n_than_the_weights(capsys, weights_folder):
-    code, _, err = run(capsys, "evaluate", "--problems", 5, "--n", 6, "--solver", weights_folder)
-    assert (code, err.count("\n")) == (2, 1)
-    assert "n = 9" in err
+def test_an_error_in_a_solver_says_where(capsys, tmp_path, monkeypatch):
+    class Broken(nn.Module):
+        def forward(self, *_):
+            raise ValueError("a bad\nday")
+
+    monkeypatch.setattr("kornia_pnpnet.cli.load_solver", lambda name: Broken())
+    arguments = ("--problems", 5, "--outliers", "none", "--solver", "broken", "--out", tmp_path / "results.json")
+    code, _, err = run(capsys, "evaluate", *arguments)
+    assert (code, err) == (2, "pnpnet: a bad day (broken on synthetic, n = 9, 0 outliers)\n")
+
+
+def test_bounds_cannot_solve(capsys, csv_file):
+    code, out, err = run(capsys, "solve", csv_file, "--intrinsics", CAMERA, "--solver", "known-inliers")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "known-inliers is a bound" in err
+
+
+def test_figures_prints_what_it_draws(capsys, tmp_path):
+    pytest.importorskip("matplotlib")
+    out_file, folder = tmp_path / "results.json", tmp_path / "figures"
+    solvers = ("identity-lm", "known-inliers")
+    run(capsys, "evaluate", "--problems", 5, "--n", "6,9", "--solver", *solvers, "--out", out_file)
+    code, out, err = run(capsys, "figures", out_file, "--out", folder)
+    assert (code, err) == (0, "")
+    drawn = out.splitlines()
+    assert drawn
+    assert sorted(drawn) == sorted(str(path) for path in folder.iterdir())
+    counts = tmp_path / "counts.json"
+    save_results({"kind": "complexity", "format": 1, "n": [6, 9], "counts": {"epnp": [1e3, 2e3]}, "ransac": []}, counts)
+    assert run(capsys, "figures", counts, "--out", folder)[::2] == (0, "")
+    assert len(list(folder.iterdir())) == len(drawn) + 1
+
+
+def test_figures_refuses_in_one_line(capsys, tmp_path):
+    pytest.importorskip("matplotlib")
+    no_results, nothing = tmp_path / "other.json", tmp_path / "nothing.json"
+    no_results.write_text('{"success": 1}')
+    save_results({"format": 1, "environment": {}, "solvers": {}, "data": {}, "rows": []}, nothing)
+    for path, expected in (
+        (no_results, "is not a results file"),
+        (tmp_path / "missing.json", "No such file"),
+        (nothing, "no data"),
+    ):
+        code, out, err = run(capsys, "figures", path, "--out", tmp_path / "figures")
+        assert (code, out, err.count("\n")) == (2, "", 1)
+        assert expected in err
+    assert not (tmp_path / "figures").exists()
 
 
 def test_list_names_solvers_and_missing_packages(capsys, shipped, monkeypatch):
     code, out, _ = run(capsys, "list")
     assert code == 0
-    lines = dict(line.split(None, 1) for line in out.splitlines()[:4])
-    assert lines == dict.fromkeys(("identity-lm", "net-n9", "opencv-ransac", "pnpnet-n9"), "installed")
+    lines = dict(line.split(None, 1) for line in out.splitlines()[:-2])
+    assert {name for name, state in lines.items() if state == "installed"} == set(list_solvers())
+    assert {name for name, state in lines.items() if state.startswith("bound: ")} == set(BOUNDS)
     assert out.splitlines()[-1] == "Shipped weights: pnpnet-n9"
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert "needs OpenCV: pip install 'kornia_pnpnet[eval]'" in run(capsys, "list")[1]
@@ -480,9 +612,9 @@ def test_demo_compares_trains_and_draws(capsys, tmp_path, shipped, monkeypatch):
     assert asked == [(3.0, folder / "training")]
     assert "success, outliers none: 25.0 % at update 1 -> 50.0 % at update 3" in out
     results = load_results(folder / "results.json")
-    assert list(results["solvers"]) == ["pnpnet-n9", "net-n9", "identity-lm", "opencv-ransac"]
+    assert {"pnpnet-n9", "opencv-ransac"} <= set(results["solvers"])
     assert {entry["dtype"] for entry in results["data"].values()} == {"float32"}
-    assert out.count("| synthetic, 0-3 outliers") == 4
+    assert out.count("| synthetic, n = 9, 0-3 outliers") == len(results["solvers"])
     for name in ("success", "errors", "problem", "training"):
         assert (folder / f"{name}.png").stat().st_size > 10_000
         assert str(folder / f"{name}.png") in out
@@ -537,8 +669,9 @@ def test_solvers_may_be_named_in_several_places(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("option", ["refine=no", "refine=False", "iterations=10.5", "seed=abc", "threshold=Infinity"])
-def test_wrong_solver_options_end_with_one_line(option, capsys):
-    assert main(["evaluate", "--solver", f"opencv-ransac:{option}", "--problems", "5"]) == 2
+def test_wrong_solver_options_end_with_one_line(option, capsys, tmp_path):
+    out_file = str(tmp_path / "results.json")
+    assert main(["evaluate", "--solver", f"opencv-ransac:{option}", "--problems", "5", "--out", out_file]) == 2
     err = capsys.readouterr().err
     assert err.startswith("pnpnet: ")
     assert err.count("\n") == 1

@@ -12,6 +12,7 @@ import torch
 
 pytest.importorskip("matplotlib")
 
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from kornia_pnpnet.figures import plot_errors, plot_pose, plot_success, plot_training
@@ -20,7 +21,7 @@ from kornia_pnpnet.figures import plot_errors, plot_pose, plot_success, plot_tra
 def fake_results(solvers: int = 3, sets: int = 2, shift: float = 0.0) -> dict:
     """What `evaluate` returns, as far as a picture reads it."""
     generator = np.random.default_rng(0)
-    names, data = [f"solver-{i}" for i in range(solvers)], [f"set, {i}" for i in range(sets)]
+    names, data = ["pnpnet-n9", *(f"solver-{i}" for i in range(1, solvers))], [f"set, {i}" for i in range(sets)]
     entry = {"max_rotation_deg": 1.0, "max_translation": 0.2, "unit": "m"}
     rows = []
     for set_name in data:
@@ -28,7 +29,7 @@ def fake_results(solvers: int = 3, sets: int = 2, shift: float = 0.0) -> dict:
             rate = max(0.0, 0.9 - 0.2 * index - shift)
             rotation = np.exp(generator.normal(index + shift, 1.0, 50)).tolist()
             per_problem = {"rotation_error_deg": rotation, "translation_error": rotation, "ok": [1] * 50}
-            success = {"rate": rate, "low": max(0.0, rate - 0.05), "high": min(1.0, rate + 0.05), "count": 50}
+            success = {"rate": rate, "low": max(0.0, rate - 0.05), "high": min(1.0, rate + 0.05), "total": 50}
             rows.append({"data": set_name, "solver": name, "success": success, "per_problem": per_problem})
     return {"solvers": dict.fromkeys(names), "data": {name: dict(entry) for name in data}, "rows": rows}
 
@@ -36,7 +37,7 @@ def fake_results(solvers: int = 3, sets: int = 2, shift: float = 0.0) -> dict:
 def pixels(path) -> np.ndarray:
     image = imread(path)
     assert image.shape[0] > 300
-    assert image.shape[1] > 500
+    assert image.shape[1] > 1400
     # An opaque white background; colour, dark ink, and most of the page empty.
     assert (image[0, 0] == 1).all()
     assert 0.005 < (image[..., :3].min(-1) < 0.9).mean() < 0.6
@@ -75,14 +76,36 @@ def test_results_pictures_show_the_data(tmp_path, plot):
     assert has_colour(first, BLUE)
 
 
-def test_bars_are_as_high_as_the_rates(tmp_path):
-    def blue(shift: float) -> float:
-        results = fake_results(solvers=1, sets=1, shift=shift)
-        image = pixels(plot_success(tmp_path / "a.png", results))
-        column = image[:, image.shape[1] // 2 - 80, :3]
-        return (np.abs(column - np.array(BLUE) / 255).max(-1) < 0.02).sum() / image.shape[0]
+def test_every_set_has_a_panel_with_a_dot_for_each_of_its_solvers(tmp_path, monkeypatch):
+    figures = []
+    monkeypatch.setattr(Figure, "savefig", lambda self, *_, **__: figures.append(self))
+    results = fake_results(solvers=3, sets=5)
+    del results["rows"][-1]
+    plot_success(tmp_path / "a.png", results)
+    panels = figures[0].axes
+    assert [axes.get_title() for axes in panels] == list(results["data"])
+    for axes in panels:
+        dots = {dot.get_label(): dot.lines[0].get_xdata()[0] for dot in axes.containers}
+        rows = [row for row in results["rows"] if row["data"] == axes.get_title()]
+        assert dots == pytest.approx({row["solver"]: 100 * row["success"]["rate"] for row in rows})
 
-    assert blue(0.0) / blue(0.45) == pytest.approx(2.0, rel=0.02)
+
+def test_error_curves_are_the_shares_of_the_errors(tmp_path, monkeypatch):
+    figures = []
+    monkeypatch.setattr(Figure, "savefig", lambda self, *_, **__: figures.append(self))
+    results = fake_results(solvers=2, sets=1)
+    plot_errors(tmp_path / "a.png", results)
+    (curve,) = (line for line in figures[0].axes[0].lines if line.get_label() == "solver-1")
+    errors = np.array(results["rows"][1]["per_problem"]["rotation_error_deg"])
+    at, share = (np.asarray(values, dtype=float) for values in curve.get_data())
+    for limit in (0.5, 1.0, 5.0):
+        assert share[at <= limit].max(initial=0.0) == pytest.approx(100 * (errors <= limit).mean())
+
+
+@pytest.mark.parametrize("plot", [plot_success, plot_errors])
+def test_results_without_rows_cannot_be_drawn(tmp_path, plot):
+    with pytest.raises(ValueError, match="no rows"):
+        plot(tmp_path / "a.png", {**fake_results(), "rows": []})
 
 
 @pytest.mark.parametrize("plot", [plot_success, plot_errors])
@@ -161,7 +184,7 @@ def test_no_pyplot_and_no_matplotlib_without_figures():
 
 
 def test_without_matplotlib_the_error_names_the_extra(monkeypatch):
-    monkeypatch.setitem(sys.modules, "matplotlib.axes", None)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
     monkeypatch.delitem(sys.modules, "kornia_pnpnet.figures")
     with pytest.raises(ImportError, match=r"pip install 'kornia_pnpnet\[eval\]'"):
         importlib.import_module("kornia_pnpnet.figures")

@@ -633,6 +633,45 @@ def test_solvers_by_name(make_problems):
         create_solver("identity-lm", iterations=3)
 
 
+@pytest.mark.parametrize("m", [0, 2, 5])
+def test_the_first_iterations_of_trained_weights(m, make_problems):
+    p = make_problems()
+    whole = create_solver("pnpnet-n9")
+    solver = create_solver("pnpnet-n9", m=m)
+    assert solver.refine.m == m
+    corr, _ = whole.normalize(*p[:3])
+    guess = whole.init(corr)
+    for mine, others in zip(solver.refine(corr, guess).pose, whole.refine(corr, guess, m=m).pose, strict=True):
+        assert torch.equal(mine, others)
+    with pytest.raises(BaseError, match="from 0 to 5, got 6"):
+        create_solver("pnpnet-n9", m=6)
+
+
+@pytest.mark.parametrize("name", [name for name in list_solvers() if not name.startswith(("opencv", "poselib", "pyc"))])
+def test_every_solver_of_ours_keeps_the_contract(name, make_problems):
+    """Shapes, dtype, permutation of the pairs, and a bad problem that changes no other by a bit."""
+    p = make_problems(dtype=torch.float64)
+    solver = create_solver(name)
+    with torch.no_grad():
+        result = solver(*p[:3])
+        broken = p.world_points.clone()
+        broken[3] = torch.nan
+        beside = solver(broken, *p[1:3])
+        order = torch.randperm(9, generator=torch.Generator().manual_seed(0))
+        shuffled = solver(p.world_points[:, order], p.img_points[:, order], p.intrinsics)
+    assert result.matrix.shape == (7, 4, 4) and result.weights.shape == (7, 9)
+    assert result.matrix.dtype == result.cost.dtype == torch.float64
+    others = torch.arange(7) != 3
+    assert not beside.ok[3] and beside.matrix[3].isfinite().all()
+    for mine, theirs in zip(beside[:5], result[:5], strict=True):
+        assert torch.equal(mine[others], theirs[others])
+    # The order does not matter, save that enumerated samples are tried in it.
+    if "ransac" not in name:
+        ok = result.ok & shuffled.ok
+        torch.testing.assert_close(shuffled.matrix[ok], result.matrix[ok], rtol=1e-6, atol=1e-6)
+        assert torch.equal(shuffled.ok, result.ok)
+
+
 # --- corners that once were wrong -----------------------------------------------------------------------------------
 
 
@@ -709,6 +748,23 @@ def test_an_initialiser_of_ones_own(make_problems, tmp_path):
     with pytest.raises(ValueCheckError, match="Identity cannot be saved"):
         solver.save_pretrained(tmp_path)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_initialiser_without_a_guess_fails_its_problem_alone(make_problems):
+    class Truth(torch.nn.Module):
+        def forward(self, corr):
+            ok = torch.arange(len(corr.weights)) != 2
+            return Guess(pose, torch.ones_like(corr.weights), ok)
+
+    p = make_problems()
+    normalize = Normalize()
+    pose = normalize.apply_to_pose(p.pose, normalize(*p[:3])[1])
+    world_points = p.world_points.clone().requires_grad_()
+    result = PnPNet(Truth(), RobustWeightedLM(m=2), normalize)(world_points, *p[1:3])
+    assert result.ok.tolist() == [True, True, False, True, True, True, True]
+    result.translation.sum().backward()
+    gradient = world_points.grad.abs().sum((1, 2))
+    assert gradient[2] == 0 and (gradient[result.ok] > 0).all()
 
 
 def test_an_init_pose_of_another_shape_or_dtype_is_refused(make_problems):

@@ -396,3 +396,21 @@ def test_gradcheck(make_problems):
     assert torch.autograd.gradcheck(run, [x.detach().requires_grad_() for x in inputs])
     corr = normalize(p.world_points, p.img_points, p.intrinsics)[0]
     assert isinstance(corr, Correspondences)
+
+
+def test_units_of_the_user_are_brought_along(make_problems):
+    """A pixel and a unit of the world that were given become ``img_scale`` pixels and ``world_scale`` units."""
+    p = make_problems(n=9)
+    K = p.intrinsics.clone()
+    K[:, 0, 0], K[:, 1, 1] = 500.0, 2000.0
+    moved = p.world_points.clone()
+    moved[:, 4, 0] += 1.0
+    for scale in (True, False):
+        normalize = Normalize(order=False, scale=scale, center=False)
+        corr, frame = normalize(p.world_points, p.img_points, K)
+        assert torch.equal(corr.world_scale, frame.scale)
+        shifted = corr.world_points * 1.0
+        shifted[:, 4, 0] += corr.world_scale
+        torch.testing.assert_close(shifted / corr.world_scale[:, None, None], moved)
+        # One pixel to the right is 3400 / 500 normalised ones, one down 3400 / 2000: the geometric mean of both.
+        torch.testing.assert_close(corr.img_scale, torch.full_like(corr.img_scale, 3400.0 / 1000.0))

@@ -1,5 +1,9 @@
 """Initialisers: from normalised correspondences to a first guess of the pose."""
 
+from kornia_pnpnet.init.epnp import EPnP
 from kornia_pnpnet.init.mlp import MLPInit
+from kornia_pnpnet.init.p3p import P3P, p3p
+from kornia_pnpnet.init.ransac import RANSAC, SubsetSolver
+from kornia_pnpnet.init.reppnp import REPPnP
 
-__all__ = ["MLPInit"]
+__all__ = ["P3P", "RANSAC", "EPnP", "MLPInit", "REPPnP", "SubsetSolver", "p3p"]

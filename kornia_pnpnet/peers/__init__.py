@@ -1,0 +1,11 @@
+"""Solvers of other libraries behind the signature of ours, so that they can be compared on the same problems.
+
+Nothing here imports a library before one of its solvers is made.
+"""
+
+from kornia_pnpnet.peers.base import PeerPose, PeerSolver
+from kornia_pnpnet.peers.opencv import OpenCVPnP, OpenCVRansac, OpenCVUsac
+from kornia_pnpnet.peers.poselib import PoseLib
+from kornia_pnpnet.peers.pycolmap import PyColmap
+
+__all__ = ["OpenCVPnP", "OpenCVRansac", "OpenCVUsac", "PeerPose", "PeerSolver", "PoseLib", "PyColmap"]

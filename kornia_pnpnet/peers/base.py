@@ -1,0 +1,193 @@
+"""What every peer shares: a loop over problems, which of them it may be shown, and its answers as a result of ours."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from kornia.core.check import KORNIA_CHECK
+from torch import Tensor, nn
+
+from kornia_pnpnet.model import check_inputs
+from kornia_pnpnet.types import PnPResult, Pose
+
+__all__ = ["PeerPose", "PeerSolver"]
+
+
+class PeerPose(NamedTuple):
+    r"""What a peer finds for one problem, in float64.
+
+    Attributes:
+        rotation: world-to-camera rotation, shape :math:`(3, 3)`.
+        translation: world-to-camera translation, shape :math:`(3,)`.
+        inliers: which of the pairs it was given the peer kept, bool, shape :math:`(N,)`.
+        init_rotation: rotation before the last refinement, shape :math:`(3, 3)`; ``None``: the peer does not say, and
+            the result stands in for it.
+        init_translation: translation before the last refinement, shape :math:`(3,)`, or ``None`` likewise.
+    """
+
+    rotation: np.ndarray
+    translation: np.ndarray
+    inliers: np.ndarray
+    init_rotation: np.ndarray | None = None
+    init_translation: np.ndarray | None = None
+
+
+class PeerSolver(nn.Module):
+    r"""A solver that takes one problem at a time, as a batched layer without gradients.
+
+    A subclass implements :meth:`solve_one` and keeps its constructor's arguments as attributes of the same names.
+    Pairs with the weight 0 and padding are never shown to it; other weights do not matter. A problem that is not
+    finite, has a negative weight, fewer than three pairs or a camera with skew or without a positive focal length, and
+    one that the peer gives up, has ``ok=False`` and the identity as its pose.
+
+    Convention: ``x_cam = R x_world + t``, +z forward, pixels ``u = fx x/z + cx``.
+
+    Args:
+        threshold: largest reprojection error of an inlier, in the pixels that the solver is given. Infinite for a
+            peer that keeps all pairs.
+
+    Raises:
+        BaseError: when ``threshold`` is not positive.
+    """
+
+    def __init__(self, *, threshold: float) -> None:
+        super().__init__()
+        KORNIA_CHECK(threshold > 0, f"threshold must be positive, got {threshold}.")
+        self.threshold = threshold
+
+    def config(self) -> dict[str, float | int | str | bool]:
+        """The constructor arguments, as plain data."""
+        return {name: getattr(self, name) for name in inspect.signature(type(self)).parameters}
+
+    def extra_repr(self) -> str:
+        """Show the constructor's arguments."""
+        return ", ".join(f"{key}={value!r}" for key, value in self.config().items())
+
+    def solve_one(self, world_points: np.ndarray, img_points: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:
+        r"""Solve one problem.
+
+        Args:
+            world_points: shape :math:`(N, 3)`, float64, finite.
+            img_points: pixels, shape :math:`(N, 2)`.
+            intrinsics: shape :math:`(3, 3)`.
+
+        Returns:
+            What was found, or ``None`` when nothing was.
+        """
+        raise NotImplementedError
+
+    @torch.no_grad()
+    def forward(
+        self,
+        world_points: Tensor,
+        img_points: Tensor,
+        intrinsics: Tensor,
+        weights: Tensor | None = None,
+        mask: Tensor | None = None,
+    ) -> PnPResult:
+        r"""Solve a batch of problems, one after the other, on the CPU in float64.
+
+        Args:
+            world_points: shape :math:`(B, N, 3)`, float32 or float64, any unit.
+            img_points: pixels, shape :math:`(B, N, 2)`.
+            intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`.
+            weights: pairs with 0 are left out, shape :math:`(B, N)`; 1 when ``None``.
+            mask: False where a pair is padding, bool, shape :math:`(B, N)`.
+
+        Returns:
+            The :class:`~kornia_pnpnet.types.PnPResult` in the dtype and on the device of the input, without
+            gradients. Its weights are 1 for the inliers that the peer reports, else 0; its cost is the mean over the
+            pairs of the squared reprojection error in px², truncated at the squared threshold.
+
+        Raises:
+            ShapeError: for shapes that do not fit each other, or fewer than 3 pairs.
+            TypeCheckError: for dtypes that differ or are not float32 or float64.
+            DeviceError: for tensors on different devices.
+        """
+        check_inputs(world_points, img_points, intrinsics, weights, mask)
+        batch, count = world_points.shape[:2]
+        world, img, cameras = (x.detach().cpu().double().numpy() for x in (world_points, img_points, intrinsics))
+        cameras = np.broadcast_to(cameras, (batch, 3, 3))
+        shares = np.ones((batch, count)) if weights is None else weights.detach().cpu().double().numpy()
+        present = np.ones((batch, count), dtype=bool) if mask is None else mask.detach().cpu().numpy()
+        used = present & (shares > 0)
+
+        rotation, translation = np.tile(np.eye(3), (batch, 1, 1)), np.zeros((batch, 3))
+        first_rotation, first_translation = rotation.copy(), translation.copy()
+        pair_weights, ok = np.zeros((batch, count)), np.zeros(batch, dtype=bool)
+        for i in np.flatnonzero(_solvable(world, img, cameras, shares, present)):
+            found = self.solve_one(world[i, used[i]], img[i, used[i]], cameras[i])
+            if found is None:
+                continue
+            first = found[:2] if found.init_rotation is None else found[3:]
+            if not all(np.isfinite(part).all() for part in (*found[:2], *first)):
+                continue
+            rotation[i], translation[i], pair_weights[i, used[i]] = found[:3]
+            first_rotation[i], first_translation[i] = first
+            ok[i] = True
+
+        largest = torch.finfo(world_points.dtype).max
+        errors = _squared_errors(rotation, translation, world, img, cameras, used & ok[:, None])
+        truncated = np.minimum(errors, min(self.threshold, largest**0.25) ** 2)
+        cost = np.where(ok, truncated.sum(-1) / np.maximum(used.sum(-1), 1), largest**0.5)
+
+        def back(values: np.ndarray) -> Tensor:
+            return torch.from_numpy(values).clamp(-largest, largest).to(world_points)
+
+        return PnPResult(
+            back(rotation),
+            back(translation),
+            back(pair_weights),
+            back(cost),
+            torch.from_numpy(ok).to(world_points.device),
+            Pose(back(first_rotation), back(first_translation)),
+        )
+
+
+def _solvable(
+    world: np.ndarray, img: np.ndarray, cameras: np.ndarray, weights: np.ndarray, present: np.ndarray
+) -> np.ndarray:
+    """Which problems may be shown to a peer, (B,); the rules of :class:`~kornia_pnpnet.normalize.Normalize`."""
+    sound = np.isfinite(world).all(-1) & np.isfinite(img).all(-1) & np.isfinite(weights) & (weights >= 0)  # (B, N)
+    enough = (present & (weights > 0)).sum(-1) >= 3
+    pinhole = (cameras[:, 0, 1] == 0) & (cameras[:, 1, 0] == 0) & (cameras[:, 2] == (0.0, 0.0, 1.0)).all(-1)
+    pinhole &= np.isfinite(cameras).all((-1, -2)) & (cameras[:, 0, 0] > 0) & (cameras[:, 1, 1] > 0)
+    return (sound | ~present).all(-1) & enough & pinhole
+
+
+def _squared_errors(
+    rotation: np.ndarray,
+    translation: np.ndarray,
+    world: np.ndarray,
+    img: np.ndarray,
+    cameras: np.ndarray,
+    used: np.ndarray,
+) -> np.ndarray:
+    """Squared reprojection errors in px², infinite behind the camera and 0 for pairs that are not used, (B, N)."""
+    cameras = np.where(used.any(-1)[:, None, None], cameras, np.eye(3))
+    world, img = (np.where(used[..., None], x, 0.0) for x in (world, img))
+    with np.errstate(over="ignore", invalid="ignore"):
+        cam_points = world @ rotation.swapaxes(-1, -2) + translation[:, None]  # (B, N, 3)
+        depth = cam_points[..., 2:]
+        focal, centre = cameras[:, None, (0, 1), (0, 1)], cameras[:, None, :2, 2]  # (B, 1, 2)
+        projected = cam_points[..., :2] / np.where(depth > 0, depth, 1.0) * focal + centre
+        errors = np.where(depth[..., 0] > 0, np.square(projected - img).sum(-1), math.inf)
+    return np.where(used, np.nan_to_num(errors, nan=math.inf, posinf=math.inf), 0.0)
+
+
+def missing(library: str) -> ImportError:
+    """What to raise where a library that a solver needs is not installed."""
+    return ImportError(f"This solver needs {library}: pip install 'kornia_pnpnet[eval]'")
+
+
+def check_robust_options(*, threshold: float, confidence: float, seed: int, **counts: int) -> None:
+    """Check what the robust peers share; ``counts`` are whole numbers of at least 1, by name (``True`` is none)."""
+    KORNIA_CHECK(0 < threshold < math.inf, f"threshold must be positive and finite, got {threshold}.")
+    KORNIA_CHECK(0 < confidence < 1, f"confidence must lie in (0, 1), got {confidence}.")
+    KORNIA_CHECK(type(seed) is int and seed >= 0, f"seed must be a whole number of at least 0, got {seed!r}.")
+    for name, count in counts.items():
+        KORNIA_CHECK(type(count) is int and count >= 1, f"{name} must be a whole number of at least 1, got {count!r}.")

@@ -1,0 +1,93 @@
+"""PoseLib's LO-RANSAC."""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from kornia.core.check import KORNIA_CHECK
+
+from kornia_pnpnet.peers.base import PeerPose, PeerSolver, check_robust_options, missing
+
+__all__ = ["PoseLib"]
+
+
+def _import_poselib() -> ModuleType:
+    try:
+        import poselib
+    except ImportError as error:
+        raise missing("PoseLib") from error
+    return poselib
+
+
+class PoseLib(PeerSolver):
+    r"""PoseLib's ``estimate_absolute_pose``, problem by problem: P3P, LO-RANSAC and a robust refinement of the inliers.
+
+    The default threshold is the best of a grid on the protocol's data, see
+    :class:`~kornia_pnpnet.peers.OpenCVRansac`. PoseLib itself asks for 1000 iterations at least, ten times as many as
+    here, which with nine pairs finds nothing more.
+
+    Args:
+        threshold: largest reprojection error of an inlier, in the pixels that the solver is given.
+        min_iterations: smallest number of iterations.
+        max_iterations: largest number of iterations, which a problem without a pose takes.
+        confidence: it ends when it has seen an outlier-free sample with this probability, in (0, 1).
+        seed: of the samples, the same for each problem.
+
+    Raises:
+        ImportError: when PoseLib is not installed.
+        BaseError: for an argument out of range, or when the installed PoseLib has other options: it would ignore
+            those that it does not know.
+
+    Example:
+        >>> from kornia_pnpnet.data import SyntheticProblems
+        >>> problems = SyntheticProblems(n=9, batch_size=4, seed=0).batch(0)
+        >>> PoseLib()(problems.world_points, problems.img_points, problems.intrinsics).ok
+        tensor([True, True, True, True])
+    """
+
+    def __init__(
+        self,
+        *,
+        threshold: float = 50.0,
+        min_iterations: int = 100,
+        max_iterations: int = 10_000,
+        confidence: float = 0.9999,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(threshold=threshold)
+        check_robust_options(
+            threshold=threshold,
+            confidence=confidence,
+            seed=seed,
+            min_iterations=min_iterations,
+            max_iterations=max_iterations,
+        )
+        self.min_iterations = min_iterations
+        self.max_iterations = max_iterations
+        self.confidence = confidence
+        self.seed = seed
+        poselib = _import_poselib()
+        unknown = self._options().keys() - poselib.RansacOptions().keys()
+        KORNIA_CHECK(not unknown, f"PoseLib {poselib.__version__} has no options {sorted(unknown)}.")
+
+    def _options(self) -> dict[str, Any]:
+        """Our options by PoseLib's names."""
+        return {
+            "max_reproj_error": self.threshold,
+            "min_iterations": self.min_iterations,
+            "max_iterations": self.max_iterations,
+            "success_prob": self.confidence,
+            "seed": self.seed,
+        }
+
+    def solve_one(self, world_points: np.ndarray, img_points: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:
+        """Solve one problem, see :meth:`PeerSolver.solve_one`."""
+        poselib = _import_poselib()
+        focal_and_centre = [intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]]
+        camera = {"model": "PINHOLE", "width": -1, "height": -1, "params": focal_and_centre}
+        pose, report = poselib.estimate_absolute_pose(img_points, world_points, camera, self._options(), {})
+        if report["num_inliers"] == 0:  # PoseLib's way to say that it found nothing
+            return None
+        return PeerPose(pose.R, pose.t, np.array(report["inliers"]))

@@ -1,0 +1,168 @@
+"""The instrument: what single operations cost, that nothing is lost, and to which part it belongs."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from kornia_pnpnet.geometry import retract
+from kornia_pnpnet.lm import solve_damped
+from kornia_pnpnet.opcount import (
+    OPERATION_COSTS,
+    OperationCounter,
+    Operations,
+    cholesky,
+    count_per_problem,
+    eigh,
+    lu,
+    matmul,
+    qr,
+    solve,
+    solve_triangular,
+    sort,
+    svd,
+)
+from kornia_pnpnet.types import Pose
+
+
+def count(function, *shapes):
+    """Operations of a function of random tensors of these shapes, made beforehand."""
+    tensors = [torch.rand(shape, dtype=torch.float64) + 0.5 for shape in shapes]
+    with OperationCounter() as counter:
+        function(*tensors)
+    return counter.counts.get("", Operations())
+
+
+def test_every_kind_has_a_cost():
+    assert Operations(*range(1, 9)).flops == sum(i * cost for i, cost in enumerate(OPERATION_COSTS.values(), 1))
+    assert list(OPERATION_COSTS) == list(Operations.__dataclass_fields__)
+
+
+@pytest.mark.parametrize(
+    ("function", "expected"),
+    [
+        (lambda x: x + 1, Operations(add=12)),
+        (lambda x: 3 - x, Operations(add=12)),
+        (lambda x: x * x, Operations(multiply=12)),
+        (lambda x: x[:, None] * x[None], Operations(multiply=3 * 3 * 4)),
+        (lambda x: x / 3, Operations(divide=12)),
+        (lambda x: x.rsqrt(), Operations(sqrt=12, divide=12)),
+        (lambda x: x.exp_(), Operations(exp=12)),
+        (lambda x: x.sin() + x.log(), Operations(log=24, add=12)),
+        (lambda x: x.abs() > 1, Operations(compare=36)),
+        (lambda x: x.clamp(min=0), Operations(compare=12)),
+        (lambda x: x.clamp(min=0, max=1), Operations(compare=24)),
+        (lambda x: torch.where(x > 1, x, 0.0), Operations(compare=12, logic=12)),
+        (lambda x: torch.addcmul(x, x, x), Operations(add=12, multiply=12)),
+        (lambda x: x.square(), Operations(multiply=12)),
+        (lambda x: x**5, Operations(multiply=36)),  # x² twice, times x
+        (lambda x: x**8, Operations(multiply=36)),
+        (lambda x: x**-2, Operations(multiply=12, divide=12)),
+        (lambda x: x**0.5, Operations(sqrt=12)),
+        (lambda x: x**1.5, Operations(sqrt=12, multiply=12)),
+        (lambda x: x**0.3, Operations(exp=12, log=12, multiply=12)),
+        (lambda x: x**x, Operations(exp=12, log=12, multiply=12)),
+        (lambda x: x.sum(-1), Operations(add=9)),
+        (lambda x: x.sum(), Operations(add=11)),
+        (lambda x: x.mean(0), Operations(add=8, divide=4)),
+        (lambda x: x.cumsum(-1), Operations(add=9)),
+        (lambda x: x.amax(-1), Operations(compare=9)),
+        (lambda x: x.argmin(-1), Operations(compare=9)),
+        (lambda x: x.min(-1), Operations(compare=9)),
+        (lambda x: torch.minimum(x, x), Operations(compare=12)),
+        (lambda x: (x > 0).all(-1), Operations(compare=12, logic=9)),
+        (lambda x: x.norm(dim=-1), Operations(multiply=12, add=9, sqrt=3)),
+        (lambda x: x.sort(-1), Operations(compare=3 * 4 * 2)),
+        (lambda x: x.argsort(dim=-1, stable=True), Operations(compare=3 * 4 * 2)),
+        (lambda x: x.sort(0), Operations(compare=4 * 3 * math.log2(3))),
+        (lambda x: (-x).T.reshape(2, 6).flip(0).clone()[:, [0, 1]], Operations()),
+    ],
+)
+def test_cost_of_an_operation(function, expected):
+    assert count(function, (3, 4)) == expected
+
+
+@pytest.mark.parametrize(
+    ("function", "shapes", "expected"),
+    [
+        (lambda a, b: a @ b, [(5, 2, 3), (5, 3, 4)], 5 * matmul(2, 3, 4)),
+        (lambda a, b: a @ b, [(5, 2, 3), (3, 4)], 5 * matmul(2, 3, 4)),
+        (torch.nn.functional.linear, [(5, 3), (4, 3), (4,)], 5 * Operations(multiply=12, add=12)),
+        (torch.linalg.solve_ex, [(5, 4, 4), (5, 4, 2)], 5 * solve(4, 2)),
+        (torch.linalg.solve_ex, [(5, 4, 4), (5, 4)], 5 * solve(4, 1)),
+        (torch.linalg.inv_ex, [(5, 4, 4)], 5 * solve(4, 4)),
+        (torch.linalg.det, [(5, 4, 4)], 5 * (lu(4) + Operations(multiply=3))),
+        (lambda a: torch.linalg.cholesky_ex(a @ a.mT), [(5, 4, 4)], 5 * (matmul(4, 4, 4) + cholesky(4))),
+        (torch.linalg.qr, [(5, 6, 4)], 5 * qr(6, 4)),
+        (torch.linalg.eigh, [(5, 4, 4)], 5 * eigh(4)),
+        (torch.linalg.svd, [(5, 4, 4)], 5 * svd(4, 4)),
+        (lambda a: torch.linalg.svd(a, full_matrices=False), [(5, 3, 6)], 5 * svd(6, 3)),
+        (torch.linalg.svd, [(5, 3, 6)], 5 * svd(6, 3, full=True)),
+        (torch.linalg.cross, [(5, 3), (5, 3)], 5 * Operations(multiply=6, add=3)),
+    ],
+)
+def test_cost_of_linear_algebra(function, shapes, expected):
+    measured = count(function, *shapes)
+    assert measured.flops == pytest.approx(expected.flops, rel=1e-12)
+
+
+@pytest.mark.parametrize(("left", "columns"), [(True, 2), (False, 3)])
+def test_cost_of_triangular_systems(left, columns):
+    measured = count(
+        lambda a, b: torch.linalg.solve_triangular(a, b, upper=True, left=left),
+        (4, 4),
+        (columns, 4)[::-1] if left else (columns, 4),
+    )
+    assert measured == solve_triangular(4, columns)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 6])
+def test_formulas_agree_with_the_algorithms_written_out(n):
+    """The loops of the textbook, counted one by one."""
+    add = divide = 0
+    for k in range(n):  # Gaussian elimination
+        for _ in range(k + 1, n):
+            divide += 1
+            add += n - k - 1
+    assert (lu(n).add, lu(n).multiply, lu(n).divide) == (pytest.approx(add), pytest.approx(add), divide)
+    add = divide = 0
+    for j in range(n):  # Cholesky by columns
+        for i in range(j, n):
+            add += j
+            divide += i > j
+    assert (cholesky(n).add, cholesky(n).multiply) == (pytest.approx(add), pytest.approx(add))
+    assert (cholesky(n).divide, cholesky(n).sqrt) == (divide, n)
+    assert solve_triangular(n, 1).add == sum(range(n))
+    assert matmul(n, n, 1).add == n * (n - 1)
+
+
+def test_an_unknown_operation_is_not_lost():
+    with pytest.raises(NotImplementedError, match=r"aten\.erf"):
+        count(lambda x: x.erf(), (3,))
+
+
+def test_what_the_batch_shares_is_not_counted():
+    table = torch.rand(5, 5)
+    counts = count_per_problem(lambda batch: torch.rand(batch, 5) @ (table @ table).exp() + table.sum())
+    assert counts == {"": Operations(add=5 * 4 + 5, multiply=5 * 5)}
+
+
+def test_an_operation_belongs_to_the_innermost_part():
+    def run(batch):
+        hessian = torch.eye(6).expand(batch, 6, 6)
+        delta, _ = solve_damped(hessian, hessian[:, 0], torch.tensor(1.0))
+        return retract(Pose(hessian[:, :3, :3], delta[:, :3]), 2 * delta)
+
+    alone = count_per_problem(run)
+    apart = count_per_problem(run, ["lm.solve_damped", "geometry.retract"])
+    assert set(apart) == {"", "lm.solve_damped", "geometry.retract"}
+    assert apart[""] == Operations(multiply=6)
+    assert sum(apart.values(), Operations()) == alone[""]
+    assert count_per_problem(run, ["lm.solve"]) == alone
+
+
+def test_sorting_nothing_costs_nothing():
+    assert sort(0) == sort(1) == Operations()
+    assert sort(8) == Operations(compare=24)
