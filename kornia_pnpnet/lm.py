@@ -134,7 +134,8 @@ def lm_step(
     used = used / torch.where(largest > 0, largest, 1.0)
     weighted = linear.jacobian * torch.cat((used, used), 1)[:, None]  # (B, 6, 2N)
     hessian = weighted @ linear.jacobian.mT
-    gradient = (weighted @ linear.residual[..., None])[..., 0]
+    # Not a product of matrices: for a batch of one that takes another kernel, which rounds differently.
+    gradient = (weighted * linear.residual[:, None]).sum(-1)
     delta, solved = solve_damped(hessian, gradient, damping)
     update = retract_additive if additive else retract
     return LMStep(update(pose, -step * delta), solved)

@@ -12,7 +12,7 @@ from kornia.core.exceptions import BaseError, DeviceError, ShapeError, TypeCheck
 from torch import Tensor, nn
 
 from kornia_pnpnet.files import atomic_open
-from kornia_pnpnet.init import MLPInit
+from kornia_pnpnet.init import EPnP, MLPInit, REPPnP
 from kornia_pnpnet.lm import RobustWeightedLM
 from kornia_pnpnet.normalize import Frame, Normalize
 from kornia_pnpnet.types import Guess, PnPResult, Pose
@@ -21,7 +21,7 @@ __all__ = ["PnPNet", "shipped_weights"]
 
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 CONFIG_NAME, WEIGHTS_NAME = "config.json", "model.safetensors"
-_INITIALISERS: dict[str, type[nn.Module]] = {"MLPInit": MLPInit}
+_INITIALISERS: dict[str, type[nn.Module]] = {"EPnP": EPnP, "MLPInit": MLPInit, "REPPnP": REPPnP}
 
 
 def shipped_weights() -> list[str]:
@@ -81,8 +81,8 @@ class PnPNet(nn.Module):
     Convention: ``x_cam = R x_world + t``, +z forward, pixels ``u = fx x/z + cx``; skew must be 0.
 
     Args:
-        init: maps :class:`~kornia_pnpnet.types.Correspondences` to a :class:`~kornia_pnpnet.types.Guess`; ``None``
-            starts from the identity or from the pose given with the call.
+        init: maps :class:`~kornia_pnpnet.types.Correspondences` to a :class:`~kornia_pnpnet.types.Guess`, see
+            :mod:`kornia_pnpnet.init`; ``None`` starts from the identity or from the pose given with the call.
         refine: the refiner; classical :class:`~kornia_pnpnet.lm.RobustWeightedLM` when ``None``.
         normalize: the normalisation; the default centres and scales the world and orders the pairs.
 

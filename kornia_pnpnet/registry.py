@@ -52,7 +52,7 @@ def _p3p_ransac(**options: Any) -> PnPNet:
     return _judged(RANSAC(P3P(), **options))
 
 
-def _ransac_epnp_lm(m: int = 5, **options: Any) -> PnPNet:
+def _ransac_epnp_lm(m: int = _FEW, **options: Any) -> PnPNet:
     samples = SubsetSolver(EPnP(), RobustWeightedLM(m, learnable=False), size=_PAPERS_SAMPLE)
     return _judged(RANSAC(samples, **options))
 

@@ -76,7 +76,7 @@ def test_transform_is_the_matrix_of_the_pose(random_rotations):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_projection_keeps_dtype_and_shapes(dtype, random_rotations):
     corr, pose = random_scene(4, random_rotations(7))
-    corr, pose = Correspondences(*(x.to(dtype) for x in corr)), Pose(*(x.to(dtype) for x in pose))
+    corr, pose = Correspondences(*(x.to(dtype) for x in corr[:4])), Pose(*(x.to(dtype) for x in pose))
     projection = project(pose, corr)
     linear = linearize(projection, corr.focal)
     assert projection.residual.shape == (7, 4, 2)
@@ -243,11 +243,11 @@ def test_points_behind_the_camera_do_not_count(point, dtype):
     assert torch.equal(world.grad[0, 4], torch.zeros(3, dtype=dtype))
     assert torch.equal(pixels.grad[0, 4], torch.zeros(2, dtype=dtype))
 
-    # Exactly the step that the points in front would have taken alone.
+    # The step that the points in front would have taken alone, but for the order in which sums are rounded.
     alone = Correspondences(world[:, :4], pixels[:, :4], corr.weights[:, :4], corr.focal)
     without = lm_step(alone, pose, project(pose, alone), alone.weights, one, 1e-3 * one)
     torch.testing.assert_close(
-        step.pose.matrix, without.pose.matrix, rtol=1e-5 if dtype == torch.float32 else 1e-13, atol=0
+        step.pose.matrix, without.pose.matrix, rtol=1e-4 if dtype == torch.float32 else 1e-12, atol=0
     )
 
 

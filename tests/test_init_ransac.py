@@ -181,7 +181,10 @@ def test_a_problem_is_itself_in_every_batch(n, outliers, dtype, make_problems, c
     tolerance = 1e-9 if dtype == torch.float64 else 1e-5
     for at in (torch.tensor([0]), torch.tensor([59, 3]), torch.arange(59, -1, -1)):
         for a, b in zip(outputs(ransac(part(corr, at))), together, strict=True):
-            torch.testing.assert_close(a, b[at], rtol=tolerance, atol=tolerance)
+            if n == 9:
+                assert torch.equal(a, b[at])
+            else:  # the kernels for a single problem, or for four samples, may round the last bit otherwise
+                torch.testing.assert_close(a, b[at], rtol=tolerance, atol=tolerance)
 
 
 @pytest.mark.parametrize("size", [1, 50, 10**6])
@@ -219,6 +222,7 @@ def test_how_many_samples_are_drawn(found, make_problems, correspond):
     assert (few <= many).all()
     assert few.sum() < many.sum()
     assert samples(min_samples=400).min() >= 400
+    assert samples(min_samples=400, chunk_size=150).min() >= 400
     assert samples(max_samples=77, threshold=1e-6).max() <= 77  # no inliers, no early end
 
 

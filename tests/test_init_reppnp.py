@@ -81,10 +81,29 @@ def test_gross_outliers_are_found_and_do_not_move_the_pose(n, outliers, make_pro
     assert success(pose_errors(every.pose, truth))[gross].double().mean() < 0.03
 
 
+@pytest.mark.parametrize("thickness", [0.0, 0.05, 1.0])
+@pytest.mark.parametrize(("dtype", "max_error_deg"), [(torch.float64, 1e-6), (torch.float32, 0.5)])
+def test_a_view_through_a_telephoto_lens(dtype, max_error_deg, thickness, random_rotations, generator):
+    """Seen from 100 radii there is hardly any depth, and off the axis the pixels are nearly all the same."""
+    world = torch.randn(100, 20, 3, generator=generator, dtype=torch.float64)
+    world[..., 2] *= thickness
+    truth = Pose(random_rotations(100), torch.tensor([50.0, -30.0, 100.0], dtype=torch.float64).expand(100, 3))
+    cam_points = transform(truth, world)
+    pixels = 3400.0 * cam_points[..., :2] / cam_points[..., 2:]
+    pixels[:, [2, 5, 11], 0] += 40.0  # more than a radius
+    focal = torch.tensor(3400.0, dtype=dtype)
+    guess = REPPnP()(Correspondences(world.to(dtype), pixels.to(dtype), torch.ones(100, 20, dtype=dtype), focal))
+    errors = pose_errors(Pose(*(x.double() for x in guess.pose)), truth)
+    right = guess.ok & (errors.rotation_error_deg < max_error_deg)
+    assert right.double().mean() > 0.95
+    assert (guess.weights[right].sum(-1) == 17).all()
+
+
 # --- the floors that the method has to hold ---------------------------------------------------------------------------
 
-# Share of success of 1000 problems of the protocol, a few standard deviations (1.5 %) below what is measured.
-FLOORS = {(9, None): 0.87, (9, 3): 0.69, (20, 6): 0.95, (50, 16): 0.98}
+# Share of success of 1000 problems of the protocol, about three standard deviations below what is measured on 5000
+# (90.5, 75.6, 98.8 and 100 %). (Pairs, most outliers.)
+FLOORS = {(9, None): 0.88, (9, 3): 0.715, (20, 6): 0.975, (50, 16): 0.995}
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -214,6 +233,13 @@ def test_everything_stays_finite(kind, dtype, reject_outliers, make_problems, co
     torch.testing.assert_close(guess.pose.rotation @ guess.pose.rotation.mT, eye, rtol=0, atol=1e-4)
     (guess.pose.rotation.sum() + guess.pose.translation.sum()).backward()
     assert all(x.grad is not None and x.grad.isfinite().all() for x in inputs)
+
+
+def test_an_empty_batch_has_no_guesses():
+    empty = Correspondences(torch.zeros(0, 9, 3), torch.zeros(0, 9, 2), torch.zeros(0, 9), torch.tensor(3400.0))
+    guess = REPPnP()(empty)
+    assert guess.pose.matrix.shape == (0, 4, 4)
+    assert guess.ok.shape == (0,)
 
 
 def test_three_pairs_have_no_guess(correspond, make_problems):

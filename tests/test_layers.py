@@ -20,7 +20,7 @@ LAYERS = (
     ("normalize", "lm", "init", "data"),
     ("model", "losses"),
     ("registry", "peers", "bounds", "__init__"),
-    ("results", "evaluation", "opcount", "complexity", "runstate", "training", "choices", "reports"),
+    ("results", "evaluation", "complexity", "runstate", "training", "choices", "reports"),
     ("figures", "arguments", "cli", "demo"),
 )
 

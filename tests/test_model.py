@@ -773,3 +773,13 @@ def test_an_init_pose_of_another_shape_or_dtype_is_refused(make_problems):
         PnPNet(None)(*p[:3], init=Pose(p.pose.rotation, p.pose.translation[:3]))
     with pytest.raises(TypeCheckError, match="init rotation"):
         PnPNet(None)(*p[:3], init=Pose(p.pose.rotation.float(), p.pose.translation))
+
+
+@pytest.mark.parametrize("name", ["epnp-lm", "reppnp-lm"])
+def test_solvers_without_a_network_are_saved_too(name, make_problems, tmp_path):
+    solver = create_solver(name, m=2)
+    solver.save_pretrained(tmp_path)
+    p = make_problems()
+    again = PnPNet.from_pretrained(tmp_path)
+    assert again.config() == solver.config()
+    assert torch.equal(again(*p[:3]).matrix, solver(*p[:3]).matrix)

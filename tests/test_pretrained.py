@@ -68,4 +68,6 @@ def test_results_page_is_generated_from_its_files():
     exec(compile(make.read_text(), make, "exec"), namespace)
     folder = make.parent
     results = {name: namespace["load_results"](folder / f"{name}.json") for name in namespace["RESULTS"]}
-    assert namespace["page"](results, folder / "ablation.csv") == (folder / "README.md").read_text()
+    complexity = json.loads((folder / "complexity.json").read_text())
+    assert namespace["page"](results, complexity, folder / "ablation.csv") == (folder / "README.md").read_text()
+

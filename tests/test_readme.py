@@ -13,7 +13,7 @@ PAGES = [REPO / "README.md", *sorted((REPO / "docs").rglob("*.md"))]
 def test_python_blocks_run():
     text = (REPO / "README.md").read_text()
     blocks = re.findall(r"```python\n(.*?)```", text, flags=re.S)
-    assert len(blocks) == 2
+    assert len(blocks) == 3
     namespace = {}
     for block in blocks:
         exec(block, namespace)
@@ -21,6 +21,8 @@ def test_python_blocks_run():
     assert namespace["result"].ok.float().mean() > 0.5
     assert namespace["img_points"].grad.isfinite().all()
     assert torch.isfinite(namespace["refined"].matrix).all()
+    assert namespace["robust"].ok.float().mean() > 0.9
+    assert ((namespace["robust"].weights > 0) == namespace["problems"].inliers).float().mean() > 0.9
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPO)))

@@ -40,7 +40,8 @@ def plot_mismatches(path: str | Path, results: Sequence[Mapping[str, Any]]) -> P
         path: where the picture goes; the ending gives the format.
         results: what :func:`~kornia_pnpnet.evaluation.evaluate` returned, any number of times. Taken together are the
             scenes that have all numbers of mismatches that any scene has, at n = 9 or the smallest n there is; a
-            solver has a point where it was given all of them. Without mismatches alone, the protocol's mix is drawn.
+            solver that was given all of them at three numbers or more has a curve. Without mismatches alone, the
+            protocol's mix is drawn.
 
     Returns:
         The path.
@@ -64,6 +65,7 @@ def plot_mismatches(path: str | Path, results: Sequence[Mapping[str, Any]]) -> P
     for number in outliers_in_order(here):
         for solver, rate in pooled([r for r in here if r.outliers == number], scenes).items():
             rates.setdefault(solver, {})[float(number)] = rate
+    rates = {solver: points for solver, points in rates.items() if len(points) >= _FEWEST_MISMATCHES}
     if len(most) < _FEWEST_MISMATCHES or not rates:
         raise NothingToDrawError(f"The results hold no scenes with {_FEWEST_MISMATCHES} numbers of mismatches.")
 
@@ -84,7 +86,7 @@ def plot_against_n(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Pa
     Args:
         path: where the picture goes; the ending gives the format.
         results: what :func:`~kornia_pnpnet.evaluation.evaluate` returned, any number of times. Solvers for one n
-            each, such as ``pnpnet-n9`` and ``pnpnet-n20``, make one curve.
+            each, such as ``pnpnet-n9`` and ``pnpnet-n20``, make one curve. Others need two numbers of pairs.
 
     Returns:
         The path.
@@ -107,6 +109,7 @@ def plot_against_n(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Pa
         for record in here:
             if record.outliers == setting:
                 rates.setdefault(names[record.solver, record.n], {})[record.n] = record.success
+        rates = {name: points for name, points in rates.items() if len(points) > 1 or looks[name].group == 0}
         panels[axes] = _curves(rates, looks)
         draw_rates(axes, panels[axes])
         axes.set(xscale="log", xlabel="pairs n")

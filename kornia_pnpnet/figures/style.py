@@ -114,6 +114,7 @@ _KNOWN = {
     "reppnp-lm": SolverStyle(1, GREEN, "^", True, _SOLID),
     "ransac-epnp-lm": SolverStyle(1, PURPLE, "s", True, _SOLID),
     "p3p-ransac": SolverStyle(2, ORANGE, "P", True, _SOLID),
+    "p3p-ransac-noise": SolverStyle(2, ORANGE, "D", False, _DASHED),
     "identity-lm": SolverStyle(2, "#7A5C2E", "X", True, _DASH_DOTTED),
     "opencv-epnp": SolverStyle(3, _BLACK, "<", False, _DOTTED),
     "opencv-sqpnp": SolverStyle(3, _BLACK, "<", True, _DASHED),

@@ -78,7 +78,7 @@ class RANSAC(nn.Module):
     by least squares on its inliers (LO-RANSAC), and the problem is done when a sample without an outlier has been seen
     with the ``confidence``. When there are at most ``max_samples`` subsets each is tried once instead. Problems only
     share the random numbers, which are the same in every call: a problem has the same result alone, in any batch and
-    at any place in it.
+    at any place in it, up to a last bit that torch's kernels for a single problem may round otherwise.
 
     A pair is an inlier when :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`, with the ``threshold`` :math:`\tau` for
     errors of the pixels and the ``world_threshold`` :math:`\omega` for errors of the points, which move the pixel by

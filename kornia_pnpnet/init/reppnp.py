@@ -23,6 +23,9 @@ __all__ = ["REPPnP"]
 # to the fewest that determine them come one and two more, without which no error could show.
 _NULL_FLOOR, _RIGID_FLOOR = 7, 5
 _MIN_PAIRS = 4
+# Weight of the squared depths of the control points, relative to the centroid's, while outliers are looked for and at
+# last. Anything from 1e-3 to 3e-2 does for the first; the second must stay below what a narrow view sees of depth.
+_DEPTH_PRIOR, _FINAL_DEPTH_PRIOR = 5e-3, 1e-5
 
 
 class REPPnP(nn.Module):
@@ -34,11 +37,14 @@ class REPPnP(nn.Module):
     With ``reject_outliers=False`` this is EPPnP.
 
     Source: L. Ferraz, X. Binefa and F. Moreno-Noguer, "Very Fast Solution to the PnP Problem with Algebraic Outlier
-    Rejection", CVPR 2014. We depart from it where that raised the success on the protocol's problems:
+    Rejection", CVPR 2014. We depart from it for success on the protocol's problems and for batches:
 
     - The null vector is the one of least error among those with the centroid at depth 1, not among those of length
       1. It solves a linear system instead of an eigenproblem, its sign is right, and it does not depend on the
       choice of the control points, on the frame of the world or on its unit.
+    - While outliers are looked for, the depths of the control points are kept close to the centroid's by a small
+      ridge. That takes away ways to bend to outliers, and where a view is too narrow to show depth it leaves the
+      weak perspective that it does show.
     - The error that is compared is that of leaving the pair out (of letting it in, for one that is out),
       :math:`e^\top (1 \mp w H)^{-1} e` with the leverage :math:`H` of the pair. One outlier among few pairs bends the
       fit to itself, and its plain error is small.
@@ -128,10 +134,10 @@ class REPPnP(nn.Module):
         pairs, radius = _own_frame(corr, control)
         with torch.no_grad():
             kept, pose = self._select(pairs)
+        ok = control.ok & (pairs.there.sum(-1) >= _MIN_PAIRS)
+        for i in range(self.refine_iterations):
             normal = _normal_matrix(_linearize(pairs, pose), pairs.weights, kept)
-            ok = control.ok & (pairs.there.sum(-1) >= _MIN_PAIRS) & _determined(normal)
-        for _ in range(self.refine_iterations):
-            normal = _normal_matrix(_linearize(pairs, pose), pairs.weights, kept)
+            ok = ok & _determined(normal) if i == 0 else ok
             pose = _step(pose, torch.where(ok[:, None, None], normal, 0.0))
         ok = ok & (pose.translation[:, 2] > 0)
         offset = (pose.rotation @ control.points[:, 0, :, None])[..., 0]
@@ -144,9 +150,9 @@ class REPPnP(nn.Module):
         features = _features(pairs)
         if self.reject_outliers:
             for _ in range(self.null_iterations):
-                null = _null_vector(pairs, features, kept)
+                null = _null_vector(pairs, features, kept, _DEPTH_PRIOR)
                 kept = self._keep(pairs, _null_error(pairs, features, null, kept), _NULL_FLOOR)
-        pose = _aligned(pairs, _null_vector(pairs, features, kept), kept)
+        pose = _aligned(pairs, _null_vector(pairs, features, kept, _FINAL_DEPTH_PRIOR), kept)
         pose = _step(pose, _normal_matrix(_linearize(pairs, pose), pairs.weights, kept))
         if self.reject_outliers:
             for _ in range(self.rigid_iterations):
@@ -171,6 +177,8 @@ class _Pairs(NamedTuple):
     world: Tensor  # (B, 3, N)
     u: Tensor  # pixel over focal length, (B, N)
     v: Tensor
+    mean_u: Tensor  # (B, 1)
+    mean_v: Tensor
     weights: Tensor  # with the sum 1, (B, N)
     there: Tensor  # bool, (B, N)
 
@@ -178,10 +186,10 @@ class _Pairs(NamedTuple):
 class _Null(NamedTuple):
     """The null vector, and what the leverage of a pair is made of."""
 
-    solution: Tensor  # T, with x = T_x z and y = T_y z for the depths z of the control points: (B, 4, 8)
-    depths: Tensor  # z, (B, 4, 1); the first is 1
+    control: Tensor  # control points in the camera frame, sheared by (x - mean_u z, y - mean_v z, z), (B, 4, 3)
+    solution: Tensor  # T, with T_x z and T_y z the best x and y for the depths z, (B, 4, 8)
     inverse_gram: Tensor  # (B, 4, 4)
-    inverse_depths: Tensor  # inverse of the normal matrix of the three depths once x and y are eliminated, (B, 3, 3)
+    inverse_depths: Tensor  # inverse of the normal matrix of the depths but the centroid's, (B, 3, 3)
 
 
 def _own_frame(corr: Correspondences, control: ControlPoints) -> tuple[_Pairs, Tensor]:
@@ -193,28 +201,32 @@ def _own_frame(corr: Correspondences, control: ControlPoints) -> tuple[_Pairs, T
     # The frame is not differentiated: the pose does not depend on it, nor on a common factor of the weights.
     total = corr.weights.detach().sum(-1, keepdim=True)
     weights = corr.weights / torch.where(total > 0, total, 1.0)
-    return _Pairs(control.coordinates.mT.contiguous(), world, u, v, weights, corr.weights > 0), radius
+    mean_u, mean_v = ((control.weights * x).sum(-1, keepdim=True) for x in (u, v))
+    coordinates = control.coordinates.mT.contiguous()
+    return _Pairs(coordinates, world, u, v, mean_u, mean_v, weights, corr.weights > 0), radius
 
 
 def _features(pairs: _Pairs) -> Tensor:
     """The right factors a, u a, v a, (u² + v²) a of the products that the normal matrix sums, (B, 16, N)."""
-    a, u, v = pairs.coordinates, pairs.u[:, None], pairs.v[:, None]
+    a = pairs.coordinates
+    u, v = (pairs.u - pairs.mean_u)[:, None], (pairs.v - pairs.mean_v)[:, None]
     return torch.cat((a, u * a, v * a, (u * u + v * v) * a), 1)
 
 
-def _inverse(matrix: Tensor) -> Tensor:
-    """Inverse of positive semi-definite matrices, of what is not determined the one of least length."""
-    ridge = 32.0 * torch.finfo(matrix.dtype).eps
+def _inverse(matrix: Tensor, ridge: float = 0.0) -> Tensor:
+    """Inverse of positive semi-definite matrices; what they do not determine is small instead of infinite."""
+    ridge = ridge + 32.0 * torch.finfo(matrix.dtype).eps
     eye = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
     return torch.linalg.inv_ex(matrix + ridge * eye).inverse
 
 
-def _null_vector(pairs: _Pairs, features: Tensor, kept: Tensor) -> _Null:
+def _null_vector(pairs: _Pairs, features: Tensor, kept: Tensor, depth_prior: float) -> _Null:
     r"""Control points in the camera frame with the centroid at depth 1 and the least algebraic error.
 
-    The normal matrix is :math:`[[A, 0, -U], [0, A, -V], [-U, -V, Q]]` with the sums A of :math:`a a^\top`, U of
-    :math:`u a a^\top`, V likewise, Q of :math:`(u^2 + v^2) a a^\top`: x and y are eliminated as
-    :math:`A^{-1} U z` and :math:`A^{-1} V z`, and the depths z have :math:`Q - U A^{-1} U - V A^{-1} V`.
+    With the pixels relative to their mean, a shear of the camera frame that changes no error but keeps the digits of
+    a narrow view, the normal matrix is :math:`[[A, 0, -U], [0, A, -V], [-U, -V, Q]]`: sums of :math:`a a^\top`,
+    :math:`u a a^\top`, :math:`v a a^\top` and :math:`(u^2 + v^2) a a^\top`. Eliminating x and y as :math:`A^{-1} U z`
+    and :math:`A^{-1} V z` leaves :math:`Q - U A^{-1} U - V A^{-1} V` for the depths z.
     """
     weighted = pairs.coordinates * torch.where(kept, pairs.weights, 0.0)[:, None]
     sums = weighted @ features.mT  # (B, 4, 16)
@@ -222,35 +234,35 @@ def _null_vector(pairs: _Pairs, features: Tensor, kept: Tensor) -> _Null:
     cross = sums[..., 4:12]
     solution = inverse_gram @ cross  # (B, 4, 8)
     schur = sums[..., 12:] - torch.cat(cross.chunk(2, -1), 1).mT @ torch.cat(solution.chunk(2, -1), 1)
-    inverse_depths = _inverse(schur[:, 1:, 1:])
+    inverse_depths = _inverse(schur[:, 1:, 1:], depth_prior)
     depths = torch.cat((torch.ones_like(schur[:, :1, :1]), -(inverse_depths @ schur[:, 1:, :1])), 1)
-    return _Null(solution, depths, inverse_gram, inverse_depths)
+    control = torch.cat((*(part @ depths for part in solution.chunk(2, -1)), depths), -1)
+    return _Null(control, solution, inverse_gram, inverse_depths)
 
 
 def _null_error(pairs: _Pairs, features: Tensor, null: _Null, kept: Tensor) -> Tensor:
     """Squared errors of leaving pairs out, relative to the size of the null vector, (B, N)."""
     a = pairs.coordinates
     moved = torch.cat((null.solution, null.inverse_gram), -1).mT @ a  # (B, 12, N)
-    from_xy = (moved[:, 8:] * a).sum(1)  # leverage of x alone and of y alone
-    first = torch.cat((moved[:, 0] - features[:, 4], moved[:, 4] - features[:, 8]), -1)  # of the centroid, (B, 2N)
+    from_xy = (moved[:, 8:] * a).sum(1)  # the leverage that x alone and y alone give
+    # The equations once x and y are eliminated, in the depth of the centroid and in the other depths.
+    first = torch.cat((moved[:, 0] - features[:, 4], moved[:, 4] - features[:, 8]), -1)  # (B, 2N)
     rows = torch.cat((moved[:, 1:4] - features[:, 5:8], moved[:, 5:8] - features[:, 9:12]), -1)  # (B, 3, 2N)
-    residual = first + (null.depths[:, 1:].mT @ rows)[:, 0]
+    residual = first + (null.control[:, None, 1:, 2] @ rows)[:, 0]
     uu, uv, vv = _leverage(rows, null.inverse_depths @ rows)
-    error = _leave_one_out(residual, from_xy + uu, uv, from_xy + vv, pairs, kept)
-    vectors = torch.cat((*(x @ null.depths for x in null.solution.chunk(2, -1)), null.depths), -1)[:, 1:]
-    size = vectors.square().sum((1, 2))[:, None]
-    return error / size.clamp(min=torch.finfo(size.dtype).eps)
+    sq_error = _leave_one_out(residual, from_xy + uu, uv, from_xy + vv, pairs, kept)
+    sq_size = null.control[:, 1:].square().sum((1, 2))[:, None]
+    return sq_error / sq_size.clamp(min=torch.finfo(sq_size.dtype).eps ** 2)
 
 
 def _aligned(pairs: _Pairs, null: _Null, kept: Tensor) -> Pose:
-    """The rigid motion that fits the control points of the null vector best."""
-    x, y = (part @ null.depths for part in null.solution.chunk(2, -1))
-    control = torch.cat((x, y, null.depths), -1)  # (B, 4, 3)
-    points = pairs.coordinates.mT @ control
-    pose, scale = align(pairs.world.mT, points, torch.where(kept, pairs.weights, 0.0))
+    """The rigid motion that fits the null vector best."""
+    x, y, z = null.control.unbind(-1)
+    control = torch.stack((x + pairs.mean_u * z, y + pairs.mean_v * z, z), -1)  # (B, 4, 3)
+    cam_points = pairs.coordinates.mT @ control
+    pose, scale = align(pairs.world.mT, cam_points, torch.where(kept, pairs.weights, 0.0))
     large = scale > torch.finfo(scale.dtype).eps ** 0.5
-    scale = torch.where(large, scale, 1.0)
-    return Pose(pose.rotation, control[:, 0] / scale[:, None])
+    return Pose(pose.rotation, control[:, 0] / torch.where(large, scale, 1.0)[:, None])
 
 
 def _linearize(pairs: _Pairs, pose: Pose) -> Tensor:
@@ -272,7 +284,7 @@ def _linearize(pairs: _Pairs, pose: Pose) -> Tensor:
         x + tx - u * depth, y + ty - v * depth,
     )
     # fmt: on
-    return torch.stack(rows, 1).view(u.shape[0], 7, -1)
+    return torch.stack(rows, 1).view(u.shape[0], 7, 2 * u.shape[1])
 
 
 def _normal_matrix(rows: Tensor, weights: Tensor, kept: Tensor) -> Tensor:

@@ -73,6 +73,15 @@ def judge(projection: Projection, corr: Correspondences, thresholds: Thresholds)
 
     Returns:
         Weights and errors of the pairs.
+
+    Example:
+        >>> from kornia_pnpnet.geometry import project
+        >>> from kornia_pnpnet.types import Pose
+        >>> points = torch.tensor([[[0.0, 0.0, 4.0], [1.0, 0.0, 4.0]]])
+        >>> corr = Correspondences(points, torch.zeros(1, 2, 2), torch.ones(1, 2), torch.tensor(100.0))
+        >>> projection = project(Pose(torch.eye(3)[None], torch.zeros(1, 3)), corr)
+        >>> judge(projection, corr, Thresholds(torch.tensor([10.0]), torch.tensor([0.0])))
+        Judged(weights=tensor([[1., 0.]]), errors=tensor([[0.0000, 6.2500]]))
     """
     sq_img = thresholds.img.square()[:, None]
     depth = projection.cam_points[..., 2]  # 1 for points behind the camera
@@ -97,6 +106,13 @@ def chance_of_inlier(corr: Correspondences, thresholds: Thresholds, judged: Judg
 
     Returns:
         At most 1, shape :math:`(B,)`.
+
+    Example:
+        >>> pixels = torch.tensor([[[0.0, 0.0], [400.0, 0.0], [0.0, 200.0]]])
+        >>> corr = Correspondences(torch.zeros(1, 3, 3), pixels, torch.ones(1, 3), torch.tensor(100.0))
+        >>> judged = Judged(torch.ones(1, 3), torch.tensor([[0.0, 0.1, 0.25]]))  # the worst is 5 px off
+        >>> chance_of_inlier(corr, Thresholds(torch.tensor([10.0]), torch.tensor([0.0])), judged) * 400 * 200
+        tensor([78.5398])
     """
     there, inlier = corr.weights[..., None] > 0, judged.weights > 0
     high = torch.where(there, corr.img_points, -torch.inf).amax(1)
@@ -200,6 +216,13 @@ def standardised_errors(scene: Scene, packed: Tensor) -> Tensor:
 
     Returns:
         At most :data:`MAX_ERROR`, shape :math:`(P, N, H)`.
+
+    Example:
+        >>> points = torch.tensor([[[0.0, 0.0, 4.0], [1.0, 0.0, 4.0]]])
+        >>> corr = Correspondences(points, torch.zeros(1, 2, 2), torch.ones(1, 2), torch.tensor(100.0))
+        >>> scene = Scene.make(corr, Thresholds(torch.tensor([10.0]), torch.tensor([0.0])), torch.float64)
+        >>> standardised_errors(scene, scene.pack(torch.eye(3).view(1, 1, 1, 3, 3), torch.zeros(1, 1, 1, 3)))[0, :, 0]
+        tensor([0.0000, 6.2500], dtype=torch.float64)
     """
     count = packed.shape[-1]
     x, y, z = (scene.points @ packed.flatten(2)).split(count, -1)  # (P, N, H) each

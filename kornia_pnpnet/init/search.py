@@ -77,6 +77,18 @@ class Search:
         plan: how to search.
         corr: normalised correspondences whose world is centred: the search has few digits.
         thresholds: what counts as an inlier.
+
+    Example:
+        >>> from kornia_pnpnet.init.p3p import P3P
+        >>> from kornia_pnpnet.init.scoring import SCORERS
+        >>> points = torch.rand(1, 6, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        >>> cam_points = points + torch.tensor([0.0, 0.0, 5.0], dtype=torch.float64)
+        >>> pixels = 100.0 * cam_points[..., :2] / cam_points[..., 2:]
+        >>> corr = Correspondences(points, pixels, torch.ones_like(pixels[..., 0]), pixels.new_tensor(100.0))
+        >>> plan = Plan(P3P(), SCORERS["msac"], 100, 32, 0.999, 2, 2, 0, 4096)
+        >>> found = Search(plan, corr, Thresholds(pixels.new_tensor([1.0]), pixels.new_tensor([0.0]))).run()
+        >>> round(found.pose.translation[0, 2].item(), 3), found.samples
+        (5.0, tensor([20]))
     """
 
     def __init__(self, plan: Plan, corr: Correspondences, thresholds: Thresholds) -> None:
@@ -117,7 +129,7 @@ class Search:
                 judged = judge(project(_pose(matrix[at]), corr), corr, thresholds)
                 inliers[at] = (judged.weights > 0).sum(-1)
             needed = samples_needed(inliers[active], samples.counts[active], samples.size, plan.confidence)
-            active = active[needed > stop]
+            active = active[needed.clamp(min=plan.min_samples) > stop]
         return Found(_orthonormal(_pose(matrix.to(self.corr.weights))), loss, poses, drawn)
 
     def _round(self, done: int) -> int:

@@ -123,11 +123,12 @@ class PeerSolver(nn.Module):
             found = self.solve_one(world[i, used[i]], img[i, used[i]], cameras[i])
             if found is None:
                 continue
-            first = found[:2] if found.init_rotation is None else found[3:]
-            if not all(np.isfinite(part).all() for part in (*found[:2], *first)):
+            start = found.rotation if found.init_rotation is None else found.init_rotation
+            origin = found.translation if found.init_translation is None else found.init_translation
+            if not all(np.isfinite(part).all() for part in (found.rotation, found.translation, start, origin)):
                 continue
             rotation[i], translation[i], pair_weights[i, used[i]] = found[:3]
-            first_rotation[i], first_translation[i] = first
+            first_rotation[i], first_translation[i] = start, origin
             ok[i] = True
 
         largest = torch.finfo(world_points.dtype).max
@@ -168,7 +169,7 @@ def _squared_errors(
     used: np.ndarray,
 ) -> np.ndarray:
     """Squared reprojection errors in px², infinite behind the camera and 0 for pairs that are not used, (B, N)."""
-    cameras = np.where(used.any(-1)[:, None, None], cameras, np.eye(3))
+    cameras = np.where(used.sum(-1)[:, None, None] > 0, cameras, np.eye(3))
     world, img = (np.where(used[..., None], x, 0.0) for x in (world, img))
     with np.errstate(over="ignore", invalid="ignore"):
         cam_points = world @ rotation.swapaxes(-1, -2) + translation[:, None]  # (B, N, 3)

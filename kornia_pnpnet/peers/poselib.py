@@ -50,7 +50,7 @@ class PoseLib(PeerSolver):
     def __init__(
         self,
         *,
-        threshold: float = 50.0,
+        threshold: float = 40.0,
         min_iterations: int = 100,
         max_iterations: int = 10_000,
         confidence: float = 0.9999,

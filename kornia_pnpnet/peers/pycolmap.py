@@ -51,7 +51,7 @@ class PyColmap(PeerSolver):
         self,
         *,
         threshold: float = 50.0,
-        loss_scale: float = 30.0,
+        loss_scale: float = 15.0,
         min_iterations: int = 100,
         max_iterations: int = 10_000,
         confidence: float = 0.9999,

@@ -1,0 +1,164 @@
+"""Which parts a solver runs, how often, and on how many pairs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import torch
+from kornia.core.exceptions import ValueCheckError
+from torch import nn
+
+from kornia_pnpnet.complexity.parts import PARTS
+from kornia_pnpnet.init import P3P, RANSAC, EPnP, MLPInit, REPPnP, SubsetSolver
+from kornia_pnpnet.init.sampling import samples_needed
+from kornia_pnpnet.init.scoring import SCORERS
+from kornia_pnpnet.lm import RobustWeightedLM
+from kornia_pnpnet.model import PnPNet
+
+__all__ = ["part_calls"]
+
+#: A part, how often it is called for each problem, and its sizes.
+Call = tuple[str, float, tuple[int, ...]]
+
+
+def _step_calls(n: int, times: float, *, own_damping: bool) -> Iterator[Call]:
+    """One step of Levenberg-Marquardt."""
+    yield "geometry.linearize", times, (n,)
+    yield "lm.lm_step", times, (n,)
+    yield "lm.solve_damped", times, (own_damping,)
+    yield "geometry.retract", times, ()
+
+
+def _lm_calls(lm: RobustWeightedLM, n: int, times: float = 1) -> Iterator[Call]:
+    weight, loss = (f"robust.{function.__name__}" for function in (lm.kernel.weight, lm.kernel.loss))
+    if lm.additive or lm.reject_worse or weight not in PARTS:
+        raise ValueCheckError(f"There is no formula for {lm}: it needs the retraction, no rejection, the power kernel.")
+    yield "lm.RobustWeightedLM.forward", times, (n, lm.m)
+    yield from _step_calls(n, lm.m * times, own_damping=True)
+    for part in ("geometry.project", "lm.RobustWeightedLM._pair_weights", weight):
+        yield part, (lm.m + 1) * times, (n,)
+    for part in ("lm.RobustWeightedLM._cost", loss, "lm.explains"):
+        yield part, times, (n,)
+
+
+def _epnp_calls(epnp: EPnP, n: int, times: float) -> Iterator[Call]:
+    for part in ("epnp.EPnP.forward", "control_points.control_points", "depths.depth_system", "epnp._best_case"):
+        yield part, times, (n,)
+    yield "depths.four_cases", times, ()
+    yield "depths.minimize", times, (4, 2)  # two iterations in all cases
+    yield "depths.minimize", times, (1, epnp.iterations - 2)  # the others in the best one
+    yield "control_points.nearest_rotation", times, ()
+
+
+def _reppnp_calls(reppnp: REPPnP, n: int, times: float) -> Iterator[Call]:
+    null, rigid = (reppnp.null_iterations, reppnp.rigid_iterations) if reppnp.reject_outliers else (0, 0)
+    steps = 1 + rigid + reppnp.refine_iterations
+    yield "reppnp.REPPnP.forward", times, (n, reppnp.refine_iterations)
+    yield "control_points.control_points", times, (n,)
+    yield "reppnp._aligned", times, (n,)
+    yield "reppnp._null_vector", (null + 1) * times, (n,)
+    yield "reppnp._null_error", null * times, (n,)
+    yield "reppnp._rigid_error", rigid * times, (n,)
+    yield "reppnp.REPPnP._keep", (null + rigid) * times, (n,)
+    yield "reppnp._linearize", steps * times, (n,)
+    yield "reppnp._normal_matrix", (steps + rigid) * times, (n,)
+    yield "control_points.nearest_rotation", times, ()
+    yield "reppnp._step", steps * times, ()
+    yield "geometry.retract", steps * times, ()
+
+
+def _ransac_calls(ransac: RANSAC, n: int, outliers: int | None, better: int | None) -> Iterator[Call]:
+    plan, minimal = ransac.plan, ransac.minimal
+    size, slots = minimal.sample_size, 4 if isinstance(minimal, P3P) else 1
+    if plan.scorer not in SCORERS.values():
+        raise ValueCheckError(f"There is no formula for the scorer {ransac.config['scorer']}.")
+    rounds = _rounds(ransac, n, outliers)
+    better = len(rounds) if better is None else better
+    for samples in rounds:
+        kept = min(plan.local_candidates, samples * slots)
+        drawn = math.comb(n, size) > plan.max_samples
+        yield "search.Search._best_of_samples", 1, (samples, size, slots, kept, drawn)
+        yield "search.Search._rank", 1, (n, samples * slots, kept)
+    match minimal:
+        case P3P():
+            yield "p3p.P3P.hypotheses", sum(rounds), ()
+        case SubsetSolver(init=init, refine=refine):
+            yield from _init_calls(init, size, sum(rounds))
+            yield from _lm_calls(refine, size, sum(rounds)) if refine is not None else ()
+            yield "ransac.SubsetSolver.hypotheses", sum(rounds), (_says_ok(init),)
+        case _:
+            raise ValueCheckError(f"There is no formula for samples solved by {type(minimal).__name__}.")
+    # The best poses of a round take one step, the best of them the others; then 2 steps end all.
+    poses = min(plan.local_candidates, rounds[0] * slots)
+    steps = poses + plan.local_iterations - 1
+    yield "search.Search._improve", better, (poses,)
+    yield "search.Search._descend", better * steps, (n,)
+    yield from _step_calls(n, better * steps + 2, own_damping=False)
+    yield "geometry.project", better * (steps + 1) + 2 + 1, (n,)
+    yield "search.Search.run", 1, (n, size, len(rounds), better)
+    yield "ransac.RANSAC.forward", 1, (n,)
+
+
+def _rounds(ransac: RANSAC, n: int, outliers: int | None) -> list[int]:
+    """Samples in each round: at least as many as the rule asks for, each round half of what came before it or more."""
+    plan, size = ransac.plan, ransac.minimal.sample_size
+    total = min(math.comb(n, size), plan.max_samples)
+    if total == 0:
+        raise ValueCheckError(f"Samples of {size} pairs need at least as many, got n = {n}.")
+    needed = float(total)
+    if outliers is not None:
+        inliers, count = torch.tensor(n - outliers), torch.tensor(n)
+        needed = max(plan.min_samples, samples_needed(inliers, count, size, plan.confidence).item())
+    rounds: list[int] = []
+    while (done := sum(rounds)) < total and (done < needed or not rounds):
+        rounds.append(min(max(plan.min_samples, done // 2), plan.chunk_size, total - done))
+    return rounds
+
+
+def _says_ok(init: nn.Module | None) -> bool:
+    """Whether an initialiser may say that it has no guess."""
+    return not isinstance(init, MLPInit | None)
+
+
+def _init_calls(init: nn.Module | None, n: int, times: float = 1) -> Iterator[Call]:
+    match init:
+        case None:
+            yield "model.PnPNet._given", times, ()
+            yield "normalize.Normalize.apply_to_pose", times, ()
+        case MLPInit():
+            yield "mlp.MLPInit.forward", times, (n,)
+        case EPnP():
+            yield from _epnp_calls(init, n, times)
+        case REPPnP():
+            yield from _reppnp_calls(init, n, times)
+        case _:
+            raise ValueCheckError(f"There is no formula for {type(init).__name__}.")
+
+
+def part_calls(solver: PnPNet, n: int, *, outliers: int | None = None, better: int | None = None) -> Iterator[Call]:
+    """What a solver runs for one problem of n pairs.
+
+    Args:
+        solver: the solver. A network counts as one that is built for n pairs.
+        n: number of pairs.
+        outliers: how many pairs are wrong, for the rule by which RANSAC stops; it draws all its samples when ``None``.
+        better: how many rounds of RANSAC find a better pose; every one when ``None``.
+
+    Returns:
+        Names of :data:`PARTS`, how often each is called, and with which sizes.
+
+    Raises:
+        ValueCheckError: when there is no formula for the solver, or RANSAC's samples have more than n pairs.
+    """
+    normalize = solver.normalize
+    if not (normalize.order and normalize.center and normalize.scale):
+        raise ValueCheckError(f"There is no formula for {normalize}: it needs all that Normalize does by default.")
+    yield "normalize.Normalize.forward", 1, (n,)
+    if isinstance(solver.init, RANSAC):
+        yield from _ransac_calls(solver.init, n, outliers, better)
+    else:
+        yield from _init_calls(solver.init, n)
+    yield from _lm_calls(solver.refine, n)
+    yield "normalize.Normalize.undo", 2, ()
+    yield "model.PnPNet.forward", 1, (n, _says_ok(solver.init))

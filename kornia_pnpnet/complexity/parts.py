@@ -1,0 +1,187 @@
+"""How many operations one call of each part of a solver takes, as formulas in its sizes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+
+from kornia_pnpnet.complexity.operations import Operations, cholesky, matmul, smallest, solve, sort
+
+__all__ = ["PARTS"]
+
+#: Rodrigues' formula as kornia computes it: the general branch and the one for small angles.
+_RODRIGUES = Operations(add=26, multiply=46, divide=5, sqrt=1, log=2, compare=1, logic=10)
+
+
+def _mlp(n: int) -> Operations:
+    """One product and one sum for each weight of the network of the paper's figure 2, a comparison for each ReLU."""
+    shared, branch = [5 * n, 20 * n, 5 * n, 3 * n], [3 * n] + 5 * [2 * n]
+    hidden = [*pairwise(shared), *pairwise(branch), *pairwise(branch)]
+    weights = sum(size_in * size_out for size_in, size_out in hidden) + 2 * n * (4 + 3)
+    units = sum(size_out for _, size_out in hidden)
+    layers = Operations(add=weights, multiply=weights, compare=units)
+    scale_inputs = Operations(divide=5 * n)
+    rotation_vector = Operations(add=3, multiply=6, divide=3, sqrt=1)
+    return scale_inputs + layers + rotation_vector + _RODRIGUES
+
+
+def _inverse(n: int) -> Operations:
+    """REPPnP's inverse of a matrix with a ridge."""
+    return solve(n, n) + Operations(add=n * n)
+
+
+def _rank(n: int, poses: int, kept: int) -> Operations:
+    """The best poses of a round: of 32 pairs or more, 16 are scored first and four times as many for the best quarter.
+
+    A pose and a pair take 9 sums and 12 products to project; residual, threshold and loss are the rest.
+    """
+    total, pairs = Operations(), 16
+    while 2 * pairs <= n:
+        best = max(poses // 4, kept)
+        total += _scores(pairs, poses) + smallest(poses, best) + Operations(multiply=pairs, divide=pairs)
+        poses, pairs = best, 4 * pairs
+    return total + _scores(n, poses) + smallest(poses, kept) + sort(kept)
+
+
+def _scores(n: int, poses: int) -> Operations:
+    return poses * Operations(add=15 * n - 1, multiply=19 * n, divide=n, compare=3 * n, logic=2)
+
+
+def _best_of_samples(samples: int, size: int, slots: int, kept: int, drawn: bool) -> Operations:
+    """Gathering samples of some size, with some poses each, and drawing them unless all subsets are enumerated."""
+    gather = Operations(
+        add=samples * (size + slots) - 1,
+        multiply=4 * slots * samples + 1,
+        divide=4 * kept,
+        compare=samples * size,
+        logic=samples * (size - 1 + slots),
+    )
+    earlier = size * (size - 1) // 2
+    draw = samples * Operations(add=earlier, multiply=size, compare=size + 3 * earlier)
+    return gather + draw + Operations(add=2 * size, compare=size) if drawn else gather
+
+
+#: Operations of one call of a part as a function of its sizes, first of all the number of pairs n. Data that are only
+#: moved cost nothing; what is computed once for the whole batch is not counted.
+PARTS: dict[str, Callable[..., Operations]] = {
+    # Checks of all inputs; two changes of pixels; mean, covariance and scale of the world; two sorts.
+    "normalize.Normalize.forward": lambda n: (
+        Operations(add=27 * n - 3, multiply=28 * n + 16, divide=8 * n + 3, sqrt=3, compare=27 * n + 39)
+        + Operations(logic=27 * n + 31)
+        + 2 * sort(n)
+    ),
+    "normalize.Normalize.apply_to_pose": lambda: matmul(3, 3, 1) + Operations(add=3, multiply=3),
+    "normalize.Normalize.undo": lambda: matmul(3, 3, 1) + Operations(add=3, divide=3),
+    # Checks of everything that is returned, of the initialiser's word, and of a pose that was given.
+    "model.PnPNet.forward": lambda n, init_ok: Operations(
+        multiply=n + 25, compare=4 * n + 100, logic=3 * n + 79 + init_ok
+    ),
+    "model.PnPNet._given": lambda: Operations(compare=36, logic=36),
+    "mlp.MLPInit.forward": _mlp,
+    # R x + t (9 products, 9 sums), in front (5, 2), x/z and y/z (3), times the focal length minus the pixel (2, 2).
+    "geometry.project": lambda n: n * Operations(add=13, multiply=19, divide=1, compare=5, logic=8),
+    # Of the two rows of a pair 8 entries are computed.
+    "geometry.linearize": lambda n: n * Operations(add=2, multiply=16, divide=3),
+    "geometry.retract": lambda: _RODRIGUES + matmul(3, 3, 3) + Operations(add=3),
+    # Prior weights, and the damping of each iteration.
+    "lm.RobustWeightedLM.forward": lambda n, m: Operations(multiply=n + m, logic=1),
+    "lm.RobustWeightedLM._pair_weights": lambda n: n * Operations(add=1, multiply=3, logic=1),
+    "lm.RobustWeightedLM._cost": lambda n: Operations(
+        add=3 * n - 2, multiply=3 * n, divide=1, compare=2 * n + 1, logic=n
+    ),
+    # The kernel 1 / |r|^alpha with any alpha: a power; its loss with a series near alpha = 2.
+    "robust._power_weight": lambda n: n * Operations(add=1, multiply=1, exp=1, log=1),
+    "robust._power_loss": lambda n: n * Operations(add=5, multiply=7, divide=3, exp=1, log=1, compare=3, logic=3),
+    # The weights divided by the largest, times the Jacobian, and the normal equations of 6 unknowns in 2n equations.
+    "lm.lm_step": lambda n: (
+        Operations(multiply=12 * n + 6, divide=n, compare=n, logic=n + 1) + matmul(6, 2 * n, 6) + matmul(6, 2 * n, 1)
+    ),
+    # LDL' of a full 6 x 6 matrix scaled to a unit diagonal; the damping may differ between problems.
+    "lm.solve_damped": lambda own_damping: Operations(
+        add=121 + own_damping, multiply=211, divide=27, sqrt=6, compare=12, logic=30
+    ),
+    # Two quantiles by sorting.
+    "lm.explains": lambda n: (
+        Operations(add=12 * n - 8, multiply=6 * n + 1, divide=n, compare=3 * n + 5, logic=2 * n + 1) + 2 * sort(n)
+    ),
+    # Gram-Schmidt on the coordinates of the points.
+    "control_points.control_points": lambda n: Operations(
+        add=34 * n - 22, multiply=45 * n + 3, divide=n + 3, sqrt=3, compare=13, logic=11
+    ),
+    # Newton's iteration on the quaternion.
+    "control_points.nearest_rotation": lambda: Operations(
+        add=198, multiply=281, divide=27, sqrt=4, log=2, compare=32, logic=12
+    ),
+    # The last alignment, and which points are in front of the camera.
+    "epnp.EPnP.forward": lambda n: Operations(
+        add=5 * n + 83, multiply=3 * n + 117, divide=2 * n + 10, compare=2 * n + 16, logic=n + 17
+    ),
+    # Moments of the pixels with the 4 coordinates, and of what they leave.
+    "depths.depth_system": lambda n: Operations(add=72 * n - 10, multiply=81 * n + 27, divide=9, sqrt=1, logic=1),
+    # Eigenvectors of 3 x 3, distances of the control points, and the linear systems of the four cases.
+    "depths.four_cases": lambda: Operations(add=750, multiply=1160, divide=25, sqrt=20, compare=56, logic=25),
+    # Normal equations of 4 depths in 6 distances, and their solution.
+    "depths.minimize": lambda cases, iterations: (
+        Operations(multiply=16) + cases * iterations * Operations(add=282, multiply=370, divide=4, compare=4)
+    ),
+    # A rotation and the reprojection error for each of the four cases.
+    "epnp._best_case": lambda n: Operations(
+        add=52 * n + 252, multiply=56 * n + 399, divide=4 * n + 10, sqrt=10, compare=8 * n + 11, logic=4 * n
+    ),
+    # The pairs in their own frame, features of the null space, and whether the last equations have full rank.
+    "reppnp.REPPnP.forward": lambda n, refine_iterations: (
+        Operations(add=10 * n + 13, multiply=16 * n + 33, divide=6 * n, sqrt=1, compare=n + 10)
+        + Operations(logic=42 * refine_iterations + 11)
+        + cholesky(6)
+    ),
+    # Sums over the pairs, then 12 unknowns in blocks of 4: inverses of 4 x 4 and 3 x 3.
+    "reppnp._null_vector": lambda n: (
+        matmul(4, n, 16)
+        + _inverse(4)
+        + matmul(4, 4, 8)
+        + matmul(4, 8, 4)
+        + _inverse(3)
+        + matmul(3, 3, 1)
+        + 2 * matmul(4, 4, 1)
+        + Operations(add=16, multiply=4 * n, logic=n)
+    ),
+    # Leverage of each pair: the inverses times its rows. Then the 2 x 2 systems of leaving it out.
+    "reppnp._null_error": lambda n: (
+        matmul(12, 4, n)
+        + matmul(4, 3, 2 * n)
+        + Operations(add=26 * n + 8, multiply=25 * n + 9, divide=2 * n, compare=n + 1, logic=n)
+    ),
+    "reppnp._rigid_error": lambda n: (
+        _inverse(6) + matmul(6, 6, 2 * n) + Operations(add=20 * n, multiply=30 * n, divide=n, compare=n, logic=n)
+    ),
+    "reppnp.REPPnP._keep": lambda n: Operations(add=n, multiply=1, compare=n + 4, logic=2 * n) + sort(n),
+    # Points to control points, then Procrustes.
+    "reppnp._aligned": lambda n: Operations(add=34 * n + 8, multiply=36 * n + 26, divide=n + 4, compare=3, logic=n + 3),
+    "reppnp._linearize": lambda n: n * Operations(add=13, multiply=15),
+    "reppnp._normal_matrix": lambda n: matmul(6, 2 * n, 7) + Operations(multiply=12 * n, logic=n),
+    "reppnp._step": lambda: _inverse(6) + matmul(6, 6, 1),
+    # A root of a cubic, four candidates, their Newton steps and their rotations: nothing depends on n.
+    "p3p.P3P.hypotheses": lambda: Operations(
+        add=612, multiply=724, divide=42, sqrt=21, exp=1, log=1, compare=122, logic=17
+    ),
+    # Whether the 12 numbers of a pose are finite.
+    "ransac.SubsetSolver.hypotheses": lambda init_ok: Operations(multiply=12, compare=48, logic=23 + init_ok),
+    "search.Search._best_of_samples": _best_of_samples,
+    "search.Search._rank": _rank,
+    # Inliers of a pose, and its score after the step on them.
+    "search.Search._descend": lambda n: Operations(
+        add=17 * n - 1, multiply=23 * n + 9, divide=4 * n, compare=5 * n + 5, logic=3 * n + 14
+    ),
+    "search.Search._improve": lambda poses: Operations(compare=poses - 1),
+    # Two steps to the nearest rotation; then each round: how many samples are needed; and inliers of a better pose.
+    "search.Search.run": lambda n, size, rounds, better: (
+        2 * (2 * matmul(3, 3, 3) + Operations(add=9, multiply=18))
+        + Operations(compare=1)
+        + rounds * Operations(add=2 * size + 1, multiply=size + 1, divide=size + 1, log=1, compare=2 * size + 4)
+        + better * Operations(add=3 * n - 1, multiply=3 * n + 2, divide=3 * n, compare=3 * n, logic=3 * n)
+    ),
+    # Centring, thresholds, the inliers twice, and whether so many could be chance.
+    "ransac.RANSAC.forward": lambda n: Operations(
+        add=20 * n + 12, multiply=14 * n + 21, divide=12 * n + 2, sqrt=n, log=5, compare=18 * n + 13, logic=15 * n + 3
+    ),
+}

@@ -1,0 +1,221 @@
+r"""The distances of three points from a camera that sees the directions to them, for whole batches.
+
+The unknowns are the distances :math:`\lambda_k` of the points along their unit rays. The law of cosines for the edge
+:math:`k`, the one opposite to point :math:`k` with the ends :math:`i` and :math:`j`, is
+
+.. math:: (\lambda_i - \lambda_j)^2 + b_k \lambda_i \lambda_j = a_k,
+
+with the squared length :math:`a_k` of the edge and :math:`b_k` that of the difference of the two rays, which keeps the
+digits that :math:`2 - 2\cos` loses between rays close to each other. Weights :math:`u` of the three equations with
+:math:`a \cdot u = 0` give conics in the ratios of the distances. Those that are pairs of lines solve a cubic,
+
+.. math:: (u_1 u_2 + u_2 u_3 + u_3 u_1)\,(s \cdot u) = g\, u_1 u_2 u_3,
+
+:math:`s_k` being the squared sine of the angle of two rays and :math:`g` the squared determinant of all three. One
+root gives two lines, each of which meets the other conics in two points. A Newton step then refines the ratios.
+
+Sources: M. Persson and K. Nordberg, "Lambda Twist", ECCV 2018, for the route by one degenerate conic; Y. Ding, J. Yang,
+V. Larsson, C. Olsson and K. Åström, "Revisiting the P3P Problem", CVPR 2023, for what the roots of the cubic say about
+the solutions and for the lines from the adjugate matrix. The short form of the cubic, the choice of its root and the
+lines in differences of distances are ours.
+
+Everything is computed by components, (C,) numbers at a time, one plain operation after the other. A choice between two
+finite values is a ``lerp`` with a weight of exactly 0 or 1, which returns exactly one of them: with a mask that nobody
+can predict, ``where`` takes a CPU ten times as long.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+__all__ = ["Triple", "Turn", "distances", "greater", "turn_to_largest", "turned"]
+
+# Newton steps for the root of the cubic, which start within a tenth of it.
+_CUBIC_STEPS = 4
+# The Newton step fades out where its squared determinant is less than this power of the machine epsilon of the squares
+# of the edges. Two solutions meet there: the step would be noise, and the lines have found them as well as can be.
+_DAMPING_POWER = 1.25
+
+Triple = tuple[Tensor, Tensor, Tensor]
+Turn = tuple[Tensor, Tensor]
+
+
+def greater(first: Tensor, second: Tensor) -> Tensor:
+    """1.0 where the first is greater, else 0.0."""
+    return torch.gt(first, second, out=torch.empty_like(first))
+
+
+def turn_to_largest(first: Tensor, second: Tensor, third: Tensor) -> Turn:
+    """Whether one place, and whether two places, bring the largest of three (C,) to the front: weights 0 or 1."""
+    return greater(second, first), greater(third, torch.maximum(first, second))
+
+
+def turned(ring: Tensor, turn: Turn) -> Tensor:
+    """The triples (*, 3, C) after the turn of each problem; ``ring`` (*, 5, C) repeats their first two after them."""
+    return ring[..., 0:3, :].lerp(ring[..., 1:4, :], turn[0]).lerp_(ring[..., 2:5, :], turn[1])
+
+
+def _turned_back(triple: Triple, turn: Turn) -> Triple:
+    x, y, z = triple
+    by1, by2 = turn
+    return x.lerp(z, by1).lerp_(y, by2), y.lerp(x, by1).lerp_(z, by2), z.lerp(y, by1).lerp_(x, by2)
+
+
+def _sqrt(square: Tensor) -> Tensor:
+    """The root of a positive number, in less time than `torch.sqrt`."""
+    return square.rsqrt().mul_(square)
+
+
+def _isolated_root(k3: Tensor, k2: Tensor, k1: Tensor, k0: Tensor) -> tuple[Tensor, Tensor]:
+    """The real root, as a ratio ``u : v``, of a cubic form (C,) that is farthest from the other two.
+
+    Where two solutions are close to each other so are two roots, and it is the third: it puts these two on one line.
+    """
+    tiny = torch.finfo(k3.dtype).tiny
+    k = torch.stack((k3, k2, k1, k0))
+    sizes = k.abs()
+    k3, k2, k1, k0 = k.mul_(sizes.amax(0).clamp_(min=tiny).reciprocal_())
+    # Two roots must not be at infinity.
+    swap = greater(sizes[2], sizes[1])
+    k3, k0 = k3.lerp(k0, swap), k0.lerp(k3, swap)
+    k2, k1 = k2.lerp(k1, swap), k1.lerp(k2, swap)
+    # x = k3 u / v + k2 / 3 solves x³ = 3 p x + 2 q. The root is the outermost one, of the sign of q.
+    third = k2 * (1 / 3)
+    k31, sq_third = k3 * k1, third * third
+    p = torch.add(sq_third, k31, alpha=-1 / 3)
+    q = torch.sub(k31, sq_third, alpha=2).mul_(third).addcmul_(k3 * k3, k0, value=-1.0).mul_(0.5)
+    size = q.abs()
+    pure = (2.0 * size).pow_(2 / 3).clamp_(min=tiny)  # x² if p were 0
+    up = p.clamp(min=0.0)
+    x = _sqrt(torch.add(pure, up, alpha=3)).mul_(pure).div_(pure.add_(up.sub_(p), alpha=2.2))  # within a tenth
+    for _ in range(_CUBIC_STEPS):
+        sq_x = x * x
+        x = torch.addcmul(size, sq_x, x).mul_(2 / 3).div_(sq_x.sub_(p).clamp_(min=tiny))
+    u, v = x.copysign_(q).sub_(third), k3
+    inv = torch.maximum(u.abs(), v.abs()).clamp_(min=tiny).reciprocal_()
+    u, v = u.mul_(inv), v * inv
+    return u.lerp(v, swap), v.lerp(u, swap)
+
+
+def _lines(u: Tensor, h: Tensor, pairs: Tensor) -> tuple[Tensor, Tensor]:
+    r"""The two lines (2, C) that are the conic with the weights ``u`` (3, C), of which ``u[1] + u[2]`` is not small.
+
+    ``h`` (3, C) is 1 - cos, ``pairs`` (C,) the first factor of the cubic. The lines are
+    :math:`\lambda_1 - \lambda_3 = \text{slope}\,(\lambda_2 - \lambda_3) + \text{offset}\,\lambda_3`.
+    """
+    tiny = torch.finfo(u.dtype).tiny
+    # The matrix D of the conic has u_2 + u_3 and the like on its diagonal and -u_1 cos_1 and the like beside it. The
+    # lines cross in m with m mᵀ = -adj D, and D + [m]ₓ and D - [m]ₓ have rank one: their first rows are the lines.
+    uh = u * h
+    e1, e2, e3 = u - uh
+    d11 = u[1] + u[2]
+    inv = d11 / (d11 * d11).add_(tiny)
+    us = (u[1:] * u[1:]).mul_(torch.addcmul(2.0 * h[1:], h[1:], h[1:], value=-1.0))
+    sq_m2, sq_m3 = (us + pairs).neg_().clamp_(min=tiny)
+    large = _sqrt(torch.maximum(sq_m2, sq_m3))
+    # Where the lines are not real nothing else would bound what comes of them.
+    least = -large
+    small = (e1 * d11).addcmul_(e2, e3).neg_().div_(large).clamp_(least, large)
+    third = greater(sq_m3, sq_m2)
+    m2, m3 = large.lerp(small, third), small.lerp(large, third)
+    # m_3 - m_2 by the difference of the squares, unless the signs differ.
+    same_sign = greater(small, torch.zeros_like(small))
+    apart = (us[0] - us[1]).div_((m2 + m3).abs_().clamp_(min=tiny**0.5)).clamp_(least, large)
+    apart = (m3 - m2).lerp_(apart, same_sign)
+    bend = (uh[1] + uh[2]).neg_()
+    slope = torch.stack((e3 + m3, e3 - m3)).mul_(inv)
+    return slope, torch.stack((bend + apart, bend - apart)).mul_(inv)
+
+
+def _meet(slope: Tensor, offset: Tensor, v: Tensor, h: Tensor) -> Triple:
+    """Where lines (2, C) meet the conic with the weights ``v`` (3, C): distances (2, 2, C) up to scale.
+
+    A line that misses the conic is taken to touch it. Of a line that touches it the second point is 0.
+    """
+    v1, v2, v3 = v
+    _, h2, h3 = h
+    vh1, vh2, vh3 = v * h
+    # Coefficients of y², 2 y and 1 in y = (λ_2 - λ_3) / λ_3.
+    v2_slope, less = slope * v2, slope - 1.0
+    c2 = (less * less).addcmul_(slope, h3, value=2.0).mul_(v3).addcmul_(v2_slope, slope).add_(v1)
+    c1 = (slope + offset).mul_(h3).add_(h3).addcmul_(less, offset).mul_(v3)
+    c1.addcmul_(v2_slope, offset + h2).add_(vh1)
+    vh23 = (vh2 + vh3).mul_(2.0)
+    c0 = (offset * offset).mul_(v2 + v3).addcmul_(offset, vh23).add_(torch.add(vh23, vh1, alpha=2))
+    disc = (c1 * c1).addcmul_(c2, c0, value=-1.0)
+    two = greater(disc, torch.zeros_like(disc))
+    z = _sqrt(disc.clamp_(min=torch.finfo(disc.dtype).tiny)).copysign_(c1).add_(c1).neg_()
+    y, dist3 = torch.stack((z, c0.mul_(two))), torch.stack((c2, z * two))
+    dist1 = torch.addcmul(dist3, slope, y).addcmul_(offset, dist3)
+    return dist1, y.add_(dist3), dist3
+
+
+def _candidates(p: Tensor, q: Tensor, r: Tensor, b: Tensor, g: Tensor) -> Triple:
+    """Where all the equations of :func:`distances` meet, but for rounding."""
+    h = 0.5 * b
+    s = torch.addcmul(b, h, h, value=-1.0)
+    s1, s2, s3 = s
+    # With u_1 = -(p u_3 + q u_2) the cubic is one in u_3 : u_2, and s · u = t_3 u_3 + t_2 u_2.
+    t3, t2 = torch.addcmul(s3, p, s1, value=-1.0), torch.addcmul(s2, q, s1, value=-1.0)
+    k2, k1 = (r * t3).addcmul_(p, g - t2), (r * t2).addcmul_(q, g - t3)
+    u3, u2 = _isolated_root((p * t3).neg_(), k2, k1, (q * t2).neg_())
+    u1 = (p * u3).addcmul_(q, u2).neg_()
+    pairs = (u2 * u3).addcmul_(u1, u2 + u3)
+    turn = turn_to_largest((u2 + u3).abs_(), (u3 + u1).abs_(), (u1 + u2).abs_())
+    # As other conic the one at right angles: the weights (p u_2 - q u_3, u_3, -u_2).
+    v1, v3 = (p * u2).addcmul_(q, u3, value=-1.0), -u2
+    h1, h2, h3 = h
+    ring = torch.stack((u1, u2, u3, u1, u2, v1, u3, v3, v1, u3, h1, h2, h3, h1, h2)).view(3, 5, -1)
+    u, v, h = turned(ring, turn)
+    slope, offset = _lines(u, h, pairs)
+    return _turned_back(_meet(slope, offset, v, h), turn)
+
+
+def _refined(candidates: Triple, p: Tensor, q: Tensor, b: Tensor) -> Triple:
+    """One Newton step on the ratios of the distances."""
+    dist1, dist2, dist3 = candidates
+    h1, h2, h3 = 0.5 * b
+    d1, d2, d3 = dist2 - dist3, dist3 - dist1, dist1 - dist2
+    # The squared edges e, which should fulfil e2 = q e1 and e3 = p e1.
+    e1 = (d1 * d1).addcmul_(b[0], dist2 * dist3)
+    e2 = (d2 * d2).addcmul_(b[1], dist3 * dist1)
+    e3 = (d3 * d3).addcmul_(b[2], dist1 * dist2)
+    r2, r3 = torch.addcmul(e2, q, e1, value=-1.0), torch.addcmul(e3, p, e1, value=-1.0)
+    # Half the derivatives of e1 by 2, minus e1 by 3, e2 by 3, minus e3 by 2; then of minus r by 2 and r by 3.
+    e12, e13 = torch.addcmul(d1, h1, dist3), d1.addcmul_(h1, dist2, value=-1.0)
+    e23, e32 = d2.addcmul_(h2, dist1), d3.addcmul_(h3, dist1, value=-1.0)
+    r22, r23 = q * e12, e23.addcmul_(q, e13)
+    r32, r33 = e32.addcmul_(p, e12), e13.mul_(p)
+    det = (r23 * r32).addcmul_(r22, r33, value=-1.0)
+    finfo = torch.finfo(det.dtype)
+    inv = det.div_((det * det).addcmul_(e2, e3, value=finfo.eps**_DAMPING_POWER).add_(finfo.tiny))
+    step2 = (r2 * r33).addcmul_(r3, r23, value=-1.0)
+    step3 = r2.mul_(r32).addcmul_(r3, r22, value=-1.0)
+    return dist1, torch.addcmul(dist2, step2, inv, value=-0.5), torch.addcmul(dist3, step3, inv, value=-0.5)
+
+
+def distances(p: Tensor, q: Tensor, r: Tensor, b: Tensor, g: Tensor) -> Triple:
+    r"""Solve the law of cosines for the three edges of a triangle of which the edge 1 is the longest and has length 1.
+
+    Args:
+        p: squared edge 3, shape :math:`(C,)`.
+        q: squared edge 2, shape :math:`(C,)`.
+        r: :math:`1 - p - q`, which may be known with more digits, shape :math:`(C,)`.
+        b: squared difference of the two rays to the ends of each edge, shape :math:`(3, C)`.
+        g: squared determinant of the three rays, shape :math:`(C,)`.
+
+    Returns:
+        Four candidates for the distances, :math:`(2, 2, C)` for each point, the first not negative. A candidate that is
+        no solution for positive distances is finite.
+
+    Example:
+        >>> one = torch.ones(1, dtype=torch.float64)  # the camera at the corner of a cube, points at its neighbours
+        >>> first, second, third = distances(one, one, -one, 2.0 * one.expand(3, 1), one)
+        >>> torch.stack((first, second, third)).amax((1, 2)).round(decimals=6).flatten()
+        tensor([0.7071, 0.7071, 0.7071], dtype=torch.float64)
+    """
+    dist1, dist2, dist3 = _refined(_candidates(p, q, r, b, g), p, q, b)
+    sq_edge = (dist2 - dist3).square_().addcmul_(b[0], dist2 * dist3)
+    scale = sq_edge.clamp_(min=torch.finfo(b.dtype).tiny ** 0.5).rsqrt_().copysign_(dist1)
+    return dist1 * scale, dist2.mul_(scale), dist3.mul_(scale)

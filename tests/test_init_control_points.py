@@ -1,0 +1,236 @@
+"""Control points and orthogonal Procrustes: laws that hold for any points."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from kornia_pnpnet import Correspondences
+from kornia_pnpnet.geometry import rotation_angle
+from kornia_pnpnet.init.control_points import align, control_points, nearest_rotation, small_product
+
+FLAT = torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
+
+
+def correspondences(world, weights=None):
+    weights = torch.ones_like(world[..., 0]) if weights is None else weights
+    return Correspondences(world, torch.zeros_like(world[..., :2]), weights, torch.ones((), dtype=world.dtype))
+
+
+@pytest.fixture
+def world(generator):
+    """Points of very different extents along random axes, far from the origin."""
+    axes = torch.linalg.qr(torch.randn(7, 3, 3, generator=generator, dtype=torch.float64)).Q
+    extents = torch.tensor([5.0, 1.0, 0.1], dtype=torch.float64)
+    return (torch.randn(7, 9, 3, generator=generator, dtype=torch.float64) * extents) @ axes + 20.0
+
+
+@pytest.fixture
+def weights(generator):
+    return torch.rand(7, 9, generator=generator, dtype=torch.float64) + 0.1
+
+
+def svd_rotation(matrix):
+    """Kabsch's solution of matrices (B, 3, 3)."""
+    U, _, Vh = torch.linalg.svd(matrix)
+    sign = torch.ones_like(U[:, 0])
+    sign[:, 2] = torch.linalg.det(U @ Vh)
+    return (U * sign[:, None]) @ Vh
+
+
+# --- control points -------------------------------------------------------------------------------------------------
+
+
+def test_coordinates_are_orthonormal_and_give_the_points_back(world, weights):
+    control = control_points(correspondences(world, weights))
+    torch.testing.assert_close(control.coordinates @ control.points, world, rtol=0, atol=1e-12)
+    moments = control.coordinates.mT @ (control.coordinates * control.weights[..., None])
+    torch.testing.assert_close(moments, torch.eye(4, dtype=torch.float64).expand(7, 4, 4), rtol=0, atol=1e-11)
+    torch.testing.assert_close(control.weights, weights / weights.sum(-1, keepdim=True))
+    assert control.ok.all()
+    assert not control.planar.any()
+
+
+def test_coordinates_differ_by_an_orthogonal_transform_when_the_world_moves(world, weights, random_rotations):
+    moved = 3.0 * world @ random_rotations(7).mT + 7.0
+    one, other = (control_points(correspondences(x, weights)).coordinates for x in (world, moved))
+    torch.testing.assert_close(one @ one.mT, other @ other.mT, rtol=0, atol=1e-9)
+
+
+def test_pairs_without_weight_do_not_matter(world, weights):
+    weights[:, 3] = 0.0
+    changed = world.clone()
+    changed[:, 3] = -1000.0
+    one, other = (control_points(correspondences(x, weights)) for x in (world, changed))
+    assert torch.equal(one.points, other.points)
+    keep = torch.arange(9) != 3
+    assert torch.equal(one.coordinates[:, keep], other.coordinates[:, keep])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
+def test_planes_lines_and_points_are_told_apart(unit, dtype, world, random_rotations):
+    centred = world - world.mean(1, keepdim=True)
+    line, point = torch.tensor([1.0, 0.0, 0.0]), torch.zeros(3)
+    thin = torch.tensor([1.0, 1.0, 3e-2])
+    for spread, ok, planar in ((FLAT, True, True), (line, False, True), (point, False, True), (thin, True, False)):
+        shape = (centred @ random_rotations(7) * spread) @ random_rotations(7, seed=1)
+        control = control_points(correspondences((unit * shape).to(dtype)))
+        assert (control.ok == ok).all()
+        assert (control.planar == planar).all()
+        assert control.points.isfinite().all()
+        assert control.coordinates.isfinite().all()
+        if planar:
+            assert not control.points[:, 3].any()
+            assert not control.coordinates[..., 3].any()
+
+
+def test_no_pair_at_all_is_not_ok(world):
+    control = control_points(correspondences(world, torch.zeros(7, 9, dtype=torch.float64)))
+    assert not control.ok.any()
+    assert all(x.isfinite().all() for x in control[:3])
+
+
+def test_gradcheck_of_the_control_points(world, weights):
+    def run(world, weights):
+        control = control_points(correspondences(world, weights))
+        return control.coordinates, control.points
+
+    assert torch.autograd.gradcheck(run, (world[:2].requires_grad_(), weights[:2].requires_grad_()))
+
+
+@pytest.mark.parametrize("spread", [1.0, 0.0])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_gradients_are_finite_on_a_line_and_a_point(dtype, spread, world):
+    line = (spread * (world - 20.0) * torch.tensor([1.0, 0.0, 0.0])).to(dtype).requires_grad_()
+    control = control_points(correspondences(line))
+    (control.coordinates.sum() + control.points.sum()).backward()
+    assert line.grad.isfinite().all()
+
+
+def test_small_product_is_the_matrix_product(generator):
+    a = torch.randn(2, 3, 5, generator=generator, dtype=torch.float64)
+    b = torch.randn(3, 4, 5, generator=generator, dtype=torch.float64)
+    expected = a.permute(2, 0, 1) @ b.permute(2, 0, 1)
+    torch.testing.assert_close(small_product(a, b).permute(2, 0, 1), expected)
+
+
+# --- the nearest rotation -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("values", [(1, 1, 1), (3, 2, 1), (3, 2, 0), (3, 2, -1), (1, 1e-3, 1e-6), (1, 1e-5, -1e-7)])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 3e-6), (torch.float64, 5e-15)])
+def test_nearest_rotation_is_known_from_its_singular_vectors(dtype, tolerance, values, random_rotations):
+    if dtype == torch.float32 and values[1] < 1e-4:
+        pytest.skip("float32 does not resolve these singular values.")
+    left, right = random_rotations(50), random_rotations(50, seed=1)
+    matrix = (left * torch.tensor(values, dtype=torch.float64)) @ right.mT
+    rotation, unique = nearest_rotation(matrix.to(dtype).permute(1, 2, 0))
+    assert unique.all()
+    rotation = rotation.permute(2, 0, 1).double()
+    eye = torch.eye(3, dtype=torch.float64).expand(50, 3, 3)
+    torch.testing.assert_close(rotation @ rotation.mT, eye, rtol=0, atol=tolerance)
+    # Rounding of the matrix alone turns the rotation by about its relative error over the smallest gap.
+    gap = (values[1] + values[2]) / values[0]
+    assert (rotation_angle(rotation, left @ right.mT) < tolerance / gap).all()
+
+
+def test_nearest_rotation_agrees_with_the_singular_value_decomposition(generator):
+    matrix = torch.randn(1000, 3, 3, generator=generator, dtype=torch.float64)
+    rotation, unique = nearest_rotation(matrix.permute(1, 2, 0))
+    assert unique.all()
+    assert (torch.linalg.det(matrix) < 0).any()
+    torch.testing.assert_close(rotation.permute(2, 0, 1), svd_rotation(matrix), rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize(("dtype", "factors"), [(torch.float32, (1e-8, 1e15)), (torch.float64, (1e-70, 1e100))])
+def test_nearest_rotation_does_not_depend_on_the_unit(dtype, factors, generator):
+    matrix = torch.randn(3, 3, 20, generator=generator, dtype=torch.float64).to(dtype)
+    rotation, _ = nearest_rotation(matrix)
+    for factor in factors:
+        scaled, unique = nearest_rotation(factor * matrix)
+        assert unique.all()
+        torch.testing.assert_close(scaled, rotation)
+
+
+def test_where_there_is_no_nearest_rotation_it_is_the_identity_without_gradient(random_rotations):
+    left, right = random_rotations(5), random_rotations(5, seed=1)
+    values = torch.tensor([[0, 0, 0], [1, 0, 0], [3, 1, -1], [3, 0, 0], [2, 1, 1]], dtype=torch.float64)
+    matrix = ((left * values[:, None]) @ right.mT).permute(1, 2, 0).requires_grad_()
+    rotation, unique = nearest_rotation(matrix)
+    assert unique.tolist() == [False, False, False, False, True]
+    eye = torch.eye(3, dtype=torch.float64)[..., None].expand(3, 3, 4)
+    assert torch.equal(rotation[..., :4], eye)
+    (rotation * torch.arange(9.0).view(3, 3, 1)).sum().backward()
+    assert not matrix.grad[..., :4].any()
+    assert matrix.grad[..., 4].any()
+    assert matrix.grad.isfinite().all()
+
+
+def test_gradcheck_of_the_nearest_rotation(generator):
+    matrix = torch.randn(3, 3, 4, generator=generator, dtype=torch.float64)
+    flat = matrix * FLAT[:, None]
+    for x in (matrix, flat):
+        inputs = (x.clone().requires_grad_(),)
+        assert torch.autograd.gradcheck(lambda m: nearest_rotation(m)[0], inputs)
+        assert torch.autograd.gradgradcheck(lambda m: nearest_rotation(m)[0], inputs)
+
+
+# --- alignment ------------------------------------------------------------------------------------------------------
+
+
+def test_align_recovers_a_similarity(world, weights, random_rotations):
+    rotation = random_rotations(7)
+    shift = torch.randn(7, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    target = 0.5 * world @ rotation.mT + shift[:, None]
+    pose, scale = align(world, target, weights)
+    torch.testing.assert_close(pose.rotation, rotation, rtol=0, atol=1e-9)
+    torch.testing.assert_close(scale, torch.full_like(scale, 0.5))
+    pose, _ = align(world, 2.0 * target, weights)
+    torch.testing.assert_close(pose.translation, 2.0 * shift, rtol=0, atol=1e-7)
+
+
+def test_align_counts_points_by_their_weights(world, generator):
+    target = torch.randn(7, 9, 3, generator=generator, dtype=torch.float64)
+    times = torch.tensor([1, 3, 0, 2, 1, 1, 0, 1, 1])
+    one = align(world, target, times.double().expand(7, 9))
+    other = align(*(x.repeat_interleave(times, 1) for x in (world, target)), torch.ones(7, 10, dtype=torch.float64))
+    torch.testing.assert_close(one, other)
+
+
+def test_align_minimises_the_squares(world, weights, generator, random_rotations):
+    target = world @ random_rotations(7).mT + torch.randn(7, 9, 3, generator=generator, dtype=torch.float64)
+    pose, scale = align(world, target, weights)
+
+    def cost(rotation, translation):
+        return (weights[..., None] * (world @ rotation.mT + translation[:, None] - target).square()).sum((1, 2))
+
+    for seed in range(20):
+        turn = random_rotations(7, angle=0.01, seed=seed)
+        turned = turn @ pose.rotation
+        mean = (weights[..., None] * world).sum(1) / weights.sum(-1, keepdim=True)
+        centre = (pose.rotation @ mean[..., None])[..., 0] + pose.translation
+        other = centre - (turned @ mean[..., None])[..., 0]
+        assert (cost(turned, other) > cost(pose.rotation, pose.translation)).all()
+    assert (scale > 0).all()
+
+
+def test_gradcheck_of_align(world, generator):
+    target = torch.randn(2, 9, 3, generator=generator, dtype=torch.float64)
+    weights = torch.rand(2, 9, generator=generator, dtype=torch.float64) + 0.1
+
+    def run(source, target, weights):
+        pose, scale = align(source, target, weights)
+        return (*pose, scale)
+
+    inputs = [x.clone().requires_grad_() for x in (world[:2] - 20.0, target, weights)]
+    assert torch.autograd.gradcheck(run, inputs)
+
+
+@pytest.mark.parametrize("weight", [0.0, 1.0])
+def test_align_of_nothing_is_finite(weight):
+    source = torch.zeros(3, 4, 3, dtype=torch.float64, requires_grad=True)
+    weights = torch.full((3, 4), weight, dtype=torch.float64, requires_grad=True)
+    pose, scale = align(source, source + 1.0, weights)
+    (pose.rotation.sum() + pose.translation.sum() + scale.sum()).backward()
+    assert all(x.isfinite().all() for x in (*pose, scale, source.grad, weights.grad))

@@ -1,0 +1,401 @@
+"""EPnP: laws, the minimum it looks for, gradients, and OpenCV's beside it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from kornia.core.exceptions import BaseError
+
+from kornia_pnpnet import Correspondences, Normalize, PnPNet, Pose, RobustWeightedLM
+from kornia_pnpnet.data import SyntheticProblems
+from kornia_pnpnet.geometry import transform
+from kornia_pnpnet.init.control_points import control_points
+from kornia_pnpnet.init.depths import attach_gradient, depth_system, four_cases, minimize
+from kornia_pnpnet.init.epnp import EPnP
+from kornia_pnpnet.metrics import pose_errors, success
+
+DTYPES = (torch.float32, torch.float64)
+
+
+class Plane:
+    """Points of a square in a random plane in front of the camera."""
+
+    def __call__(self, batch_size, n, generator):
+        normal, corner, shift = (
+            torch.rand(batch_size, n, 3, generator=generator, dtype=torch.float64) - 0.5 for _ in range(3)
+        )
+        axes = torch.linalg.qr(normal[:, :3] if n >= 3 else normal).Q
+        points = (20.0 * corner[..., :2]) @ axes[:, :, :2].mT
+        return points + 10.0 * shift[:, :1] + torch.tensor([0.0, 0.0, 40.0], dtype=torch.float64)
+
+
+def problems(n, batch=50, *, planar=False, noise=True, seed=2001, dtype=torch.float64):
+    noises = {} if noise else {"img_sigma": 0.0, "world_sigma": 0.0}
+    if noise and planar:
+        noises = {"world_sigma": 0.0}
+    points = Plane() if planar else None
+    return SyntheticProblems(n=n, batch_size=batch, seed=seed, points=points, dtype=dtype, **noises).batch(0)
+
+
+def solver(**arguments):
+    return PnPNet(EPnP(**arguments), RobustWeightedLM(m=0, robustness=0))
+
+
+def correspondences(p, **normalization):
+    normalize = Normalize(order=False, **normalization)
+    return normalize(p.world_points, p.img_points, p.intrinsics)[0]
+
+
+# --- exact data -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 0.02), (torch.float64, 1e-9)])
+@pytest.mark.parametrize("planar", [False, True])
+@pytest.mark.parametrize("n", [6, 9, 50])
+def test_exact_data_give_the_exact_pose(n, planar, dtype, tolerance):
+    p = problems(n, 500, planar=planar, noise=False).map(lambda x: x.to(dtype) if x.is_floating_point() else x)
+    result = solver()(*p[:3])
+    errors = pose_errors(result.pose, p.pose)
+    assert result.ok.all()
+    assert (errors.rotation_error_deg < tolerance).all()
+    assert (errors.translation_error < tolerance).all()
+
+
+def test_four_and_five_exact_pairs_work_through_the_null_space():
+    for n, planar, share in ((5, False, 1.0), (5, True, 1.0), (4, True, 1.0), (4, False, 0.85)):
+        p = problems(n, 500, planar=planar, noise=False)
+        result = solver()(*p[:3])
+        assert (pose_errors(result.pose, p.pose).rotation_error_deg < 1e-4).double().mean() >= share
+
+
+@pytest.mark.parametrize("thickness", [1e-2, 1e-3, 1e-5, 1e-8, 0.0])
+def test_nearly_planar_points_are_solved_on_either_side_of_the_threshold(thickness):
+    p = problems(9, 200, planar=True, noise=False)
+    bump = torch.randn(p.world_points.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    world = p.world_points + 10.0 * thickness * bump
+    cam = transform(p.pose, world)
+    img = p.intrinsics[:, :1, 0, None] * cam[..., :2] / cam[..., 2:]
+    result = solver()(world, img, p.intrinsics)
+    # Below the threshold the thickness is dropped and acts as noise of that size.
+    tolerance = 1e-6 if thickness in (1e-2, 0.0) else 1.0
+    assert (pose_errors(result.pose, p.pose).rotation_error_deg < tolerance).double().mean() >= 0.98
+
+
+# --- weights, order, frames -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("planar", [False, True])
+def test_weight_zero_equals_absence(planar):
+    p = problems(9, planar=planar)
+    weights = torch.ones(50, 9, dtype=torch.float64)
+    weights[:, [2, 5]] = 0.0
+    keep = [0, 1, 3, 4, 6, 7, 8]
+    junk = p.img_points.clone()
+    junk[:, [2, 5]] = 1e4
+    without = solver()(p.world_points[:, keep], p.img_points[:, keep], p.intrinsics)
+    with_zero = solver()(p.world_points, junk, p.intrinsics, weights)
+    masked = solver()(p.world_points, junk, p.intrinsics, mask=weights > 0)
+    torch.testing.assert_close(with_zero.matrix, without.matrix, rtol=0, atol=1e-9)
+    torch.testing.assert_close(masked.matrix, without.matrix, rtol=0, atol=1e-9)
+
+
+def test_integer_weights_equal_repeating():
+    p = problems(6)
+    times = torch.tensor([1, 3, 1, 2, 1, 1])
+    corr = correspondences(p)
+    weighted = EPnP()(corr._replace(weights=times.double().expand(50, 6)))
+    repeated = EPnP()(Correspondences(*(x.repeat_interleave(times, 1) for x in corr[:3]), corr.focal))
+    torch.testing.assert_close(weighted.pose.matrix, repeated.pose.matrix, rtol=0, atol=1e-9)
+
+
+def test_a_common_factor_of_the_weights_does_not_matter():
+    corr = correspondences(problems(9))
+    one, other = (EPnP()(corr._replace(weights=factor * corr.weights)).pose.matrix for factor in (1.0, 1e-6))
+    torch.testing.assert_close(one, other, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("n", "planar"), [(4, False), (5, False), (9, False), (9, True)])
+def test_order_does_not_matter(n, planar):
+    p = problems(n, planar=planar)
+    order = torch.randperm(n, generator=torch.Generator().manual_seed(1))
+    corr = correspondences(p)
+    guess, shuffled = EPnP()(corr), EPnP()(Correspondences(*(x[:, order] for x in corr[:3]), corr.focal))
+    same = (guess.pose.matrix - shuffled.pose.matrix).abs().flatten(1).amax(-1) < 1e-6
+    # With four pairs two cases may reach the same error, or rounding decides where Gauss-Newton ends.
+    assert same.double().mean() >= (1.0 if n > 4 else 0.9)
+
+
+@pytest.mark.parametrize("normalization", [{}, {"scale": False}, {"center": False, "scale": False}])
+@pytest.mark.parametrize(("n", "planar"), [(5, False), (9, False), (9, True)])
+def test_the_pose_moves_with_the_world(n, planar, normalization, random_rotations):
+    """A similarity of the world, which normalisation does not take away when told not to."""
+    p = problems(n, planar=planar)
+    factor, shift = 30.0, torch.tensor([3.0, -200.0, 50.0], dtype=torch.float64)
+    rotation = random_rotations(50)
+    moved = factor * p.world_points @ rotation.mT + shift
+    net = PnPNet(EPnP(), RobustWeightedLM(m=0, robustness=0), Normalize(**normalization))
+    result, other = net(*p[:3]), net(moved, p.img_points, p.intrinsics)
+    torch.testing.assert_close(other.rotation @ rotation, result.rotation, rtol=0, atol=1e-7)
+    expected = factor * result.translation - other.rotation @ shift
+    torch.testing.assert_close(other.translation, expected, rtol=0, atol=1e-4)
+
+
+def test_every_problem_is_alone():
+    """Whatever the other problems of the batch are, not a bit changes."""
+    p = problems(6, 40)
+    corr = correspondences(p)
+    guess = EPnP()(corr)
+    odd = torch.arange(40) % 2 == 1
+    for bad in (torch.nan, torch.inf, 0.0, 1e30):
+        world = torch.where(odd[:, None, None], bad, corr.world_points)
+        img = torch.where(odd[:, None, None], bad, corr.img_points)
+        spoilt = EPnP()(corr._replace(world_points=world, img_points=img))
+        assert torch.equal(spoilt.pose.matrix[~odd], guess.pose.matrix[~odd])
+        assert spoilt.ok[~odd].all()
+        assert not spoilt.ok[odd].any()
+    alone = EPnP()(Correspondences(*(x[7:8] for x in corr[:3]), corr.focal))
+    torch.testing.assert_close(alone.pose.matrix, guess.pose.matrix[7:8], rtol=0, atol=1e-10)
+
+
+# --- the minimum ----------------------------------------------------------------------------------------------------
+
+
+def reference_equations(corr):
+    """The same objective from the 12 by 12 matrix of the paper: residuals of depths (4,), and K."""
+    control = control_points(corr)
+    a, w = control.coordinates, control.weights[..., None]
+    u, v = ((corr.img_points / corr.focal).unbind(-1)[i][..., None] for i in range(2))
+    zero = torch.zeros_like(a)
+    rows = torch.cat((torch.cat((a, zero, -u * a), -1), torch.cat((zero, a, -v * a), -1)), 1)  # (B, 2N, 12)
+    M = rows.mT @ (torch.cat((w, w), 1) * rows)
+    camera = torch.cat((-torch.linalg.solve(M[:, :8, :8], M[:, :8, 8:]), torch.eye(4).double().expand(len(a), 4, 4)), 1)
+    K = camera.mT @ M @ camera
+    L = control.points[:, 1:].mT
+    unit = L.square().sum((1, 2)).sqrt()[:, None, None]
+    return camera.unflatten(1, (3, 4)), K, L / unit
+
+
+def reference_minimum(corr, weight):
+    """The least value of the objective that Gauss-Newton with step control finds from eigenvectors of K."""
+    camera, K, L = reference_equations(corr)
+    gram = L.mT @ L
+    root = torch.linalg.cholesky(K + 1e-15 * torch.eye(4)).mT
+
+    def residual(camera, root, gram, z):
+        D = (camera @ z)[:, 1:]
+        return torch.cat(((D.mT @ D - gram).flatten(), weight**0.5 * root @ z))
+
+    values = torch.func.vmap(residual)
+    slopes = torch.func.vmap(torch.func.jacrev(residual, argnums=3))
+    best = torch.full((len(K),), torch.inf, dtype=torch.float64)
+    vectors = torch.linalg.eigh(K).eigenvectors
+    for z in (vectors[..., 0], vectors[..., 0] + vectors[..., 1], vectors[..., 0] - vectors[..., 1]):
+        z = z / z[:, :1] * 2.0
+        damping = torch.full_like(z[:, :1], 1e-3)
+        for _ in range(60):
+            r, J = values(camera, root, gram, z), slopes(camera, root, gram, z)
+            normal = J.mT @ J
+            step = torch.linalg.solve(normal + torch.diag_embed(damping * torch.ones_like(z)), J.mT @ r[..., None])
+            moved = z - step[..., 0]
+            better = values(camera, root, gram, moved).square().sum(-1) < r.square().sum(-1)
+            z = torch.where(better[:, None], moved, z)
+            damping = torch.where(better[:, None], 0.1 * damping, 10.0 * damping).clamp(1e-15, 1e6)
+        best = torch.minimum(best, values(camera, root, gram, z).square().sum(-1))
+    return best
+
+
+@pytest.mark.parametrize(("n", "weight"), [(6, 0.3), (9, 0.3), (9, 0.0), (20, 0.3)])
+def test_the_minimum_is_that_of_the_twelve_unknowns(n, weight):
+    corr = correspondences(problems(n, 200))
+    control = control_points(corr)
+    system = depth_system(control, (corr.img_points / corr.focal).permute(2, 1, 0))
+    camera, K, L = reference_equations(corr)
+    torch.testing.assert_close(system.error.permute(2, 0, 1), K, rtol=0, atol=1e-12)
+    torch.testing.assert_close(system.first.permute(2, 0, 1), camera[:, 0], rtol=0, atol=1e-12)
+    torch.testing.assert_close(system.gram.permute(2, 0, 1), L.mT @ L, rtol=0, atol=1e-12)
+    cases = minimize(system, four_cases(system, control.planar), weight, 8)  # (4, 4, B)
+    values = []
+    for z in cases.permute(1, 2, 0):
+        D = (camera @ z[:, None, :, None])[:, :, 1:, 0]
+        algebraic = (z[:, None] @ K @ z[..., None])[:, 0, 0]
+        values.append((D.mT @ D - L.mT @ L).square().sum((1, 2)) + weight * algebraic)
+    reached = torch.stack(values).amin(0) <= reference_minimum(corr, weight) * (1 + 1e-6) + 1e-14
+    assert reached.double().mean() >= 0.995
+
+
+def test_the_algebraic_weight_pays():
+    p = problems(9, 1000)
+    shares = [success(pose_errors(solver(algebraic_weight=w)(*p[:3]).pose, p.pose)).double().mean() for w in (0.0, 0.3)]
+    assert shares[1] > shares[0] + 0.01
+
+
+# --- degenerate problems --------------------------------------------------------------------------------------------
+
+
+def degenerate(dtype):
+    """Correspondences without a pose, by name."""
+    corr = Correspondences(*(x.to(dtype) for x in correspondences(problems(6, 8))[:4]))
+    weights = corr.weights.clone()
+    weights[:, 3:] = 0.0
+    axis = torch.tensor([1.0, 0.0, 0.0], dtype=dtype)
+    return {
+        "three pairs": corr._replace(weights=weights),
+        "no pairs": corr._replace(weights=torch.zeros_like(weights)),
+        "a line": corr._replace(world_points=corr.world_points * axis),
+        "a point": corr._replace(world_points=torch.zeros_like(corr.world_points)),
+        "one pixel on a line": corr._replace(world_points=corr.world_points * axis, img_points=0.0 * corr.img_points),
+    }
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("name", degenerate(torch.float64))
+def test_degenerate_problems_are_not_ok_and_finite(name, dtype):
+    corr = degenerate(dtype)[name]
+    inputs = [x.clone().requires_grad_() for x in corr[:3]]
+    guess = EPnP()(Correspondences(*inputs, corr.focal))
+    assert not guess.ok.any()
+    assert guess.pose.matrix.isfinite().all()
+    guess.pose.matrix.sum().backward()
+    assert all(x.grad.isfinite().all() for x in inputs)
+
+
+def test_fewer_than_three_pairs_in_front_are_not_ok():
+    generator = torch.Generator().manual_seed(0)
+    world = torch.randn(5000, 4, 3, generator=generator, dtype=torch.float64)
+    img = 3400.0 * torch.randn(5000, 4, 2, generator=generator, dtype=torch.float64)
+    focal = torch.tensor(3400.0, dtype=torch.float64)
+    guess = EPnP()(Correspondences(world, img, torch.ones(5000, 4, dtype=torch.float64), focal))
+    in_front = (transform(guess.pose, world)[..., 2] > 0).sum(-1)
+    assert (in_front < 3).any()
+    assert not guess.ok[in_front < 3].any()
+    assert guess.ok[in_front >= 3].double().mean() > 0.95
+
+
+# --- gradients ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("n", "planar"), [(4, True), (5, False), (6, False), (9, False), (9, True)])
+def test_gradcheck_through_the_solver(n, planar):
+    p = problems(n, 2, planar=planar, seed=2005)
+    net = solver(iterations=8)
+    assert net(*p[:3]).ok.all()
+
+    # Everything near 1, so that one difference step suits all; only the four free entries of the intrinsics.
+    def run(world, pixels, entries, weights):
+        (fx, fy, cx, cy), zero = entries.unbind(-1), torch.zeros_like(entries[:, 0])
+        rows = torch.stack((fx, zero, cx, zero, fy, cy, zero, zero, zero + 1e-3), -1)
+        result = net(world, 1000.0 * pixels, 1000.0 * rows.unflatten(-1, (3, 3)), weights)
+        return result.rotation, result.translation
+
+    entries = torch.tensor([3.4, 3.4, 0.1, -0.1], dtype=torch.float64).repeat(2, 1)
+    shift = torch.tensor([0.1, -0.1], dtype=torch.float64)
+    weights = 0.5 + torch.rand(2, n, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    inputs = [x.clone().requires_grad_() for x in (p.world_points, p.img_points / 1000.0 + shift, entries, weights)]
+    assert torch.autograd.gradcheck(run, inputs, eps=1e-6, atol=1e-5, rtol=1e-4)
+
+
+def test_the_gradient_does_not_depend_on_how_the_minimum_was_found():
+    corr = correspondences(problems(9))
+    gradients = []
+    for iterations in (8, 20):
+        world = corr.world_points.clone().requires_grad_()
+        guess = EPnP(iterations=iterations)(corr._replace(world_points=world))
+        guess.pose.matrix.square().sum().backward()
+        gradients.append(world.grad)
+    torch.testing.assert_close(*gradients, rtol=1e-7, atol=1e-9)
+
+
+def test_values_are_the_same_with_and_without_gradients():
+    corr = correspondences(problems(9))
+    with_gradient = EPnP()(corr._replace(world_points=corr.world_points.clone().requires_grad_()))
+    with torch.no_grad():
+        without = EPnP()(corr)
+    assert torch.equal(with_gradient.pose.matrix, without.pose.matrix)
+    assert with_gradient.pose.rotation.requires_grad
+    assert not without.pose.rotation.requires_grad
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(("n", "planar"), [(4, False), (4, True), (5, False), (6, False), (6, True)])
+def test_gradients_are_finite_on_exact_data(n, planar, dtype):
+    p = problems(n, 200, planar=planar, noise=False).map(lambda x: x.to(dtype) if x.is_floating_point() else x)
+    weights = torch.ones(200, n, dtype=dtype)
+    inputs = [x.clone().requires_grad_() for x in (*p[:3], weights)]
+    result = solver()(*inputs)
+    (result.matrix.sum() + result.init.matrix.sum()).backward()
+    assert result.matrix.isfinite().all()
+    assert all(x.grad.isfinite().all() for x in inputs)
+
+
+def test_a_plane_parallel_to_the_image_has_a_gradient():
+    """There the third control vector is free in the equations, but not in the problem."""
+    generator = torch.Generator().manual_seed(0)
+    plane = torch.rand(1, 6, 2, generator=generator, dtype=torch.float64) - 0.5
+    world = torch.cat((plane, torch.zeros_like(plane[..., :1])), -1)
+    pixels = (plane / 4.0).requires_grad_()
+    one = torch.ones((), dtype=torch.float64)
+    run = EPnP(iterations=8)
+    guess = run(Correspondences(world, pixels, torch.ones_like(world[..., 0]), one))
+    torch.testing.assert_close(guess.pose.translation, torch.tensor([[0.0, 0.0, 4.0]]).double(), rtol=0, atol=1e-9)
+    guess.pose.translation[0, 2].backward()
+    # Pixels that grow together come from a camera that is closer: d(1/z) = dz / z.
+    growth = (pixels.grad * pixels.detach()).sum()
+    torch.testing.assert_close(growth, torch.tensor(-4.0).double(), rtol=1e-6, atol=0)
+
+
+def test_an_indefinite_curvature_takes_no_step():
+    corr = correspondences(problems(9, 5))
+    control = control_points(corr._replace(world_points=corr.world_points.clone().requires_grad_()))
+    system = depth_system(control, (corr.img_points / corr.focal).permute(2, 1, 0))
+    depths = attach_gradient(system, torch.zeros(4, 5, dtype=torch.float64), control.planar, 0.0)
+    assert not depths.any()
+    (gradient,) = torch.autograd.grad(depths.sum(), system.first)
+    assert not gradient.any()
+
+
+# --- beside OpenCV --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("n", "planar"), [(4, False), (5, False), (6, False), (9, False), (20, False), (50, False)])
+def test_success_is_at_least_opencvs(n, planar):
+    compare_with_opencv(problems(n, 2000, planar=planar, seed=2002))
+
+
+@pytest.mark.parametrize("n", [4, 6, 9, 50])
+def test_success_on_planes_is_at_least_opencvs(n):
+    compare_with_opencv(problems(n, 1000, planar=True, seed=2002))
+
+
+def compare_with_opencv(p):
+    cv2 = pytest.importorskip("cv2")
+    rotation, translation = np.tile(np.eye(3), (len(p.world_points), 1, 1)), np.zeros((len(p.world_points), 3))
+    for i, (world, img, camera) in enumerate(zip(*(x.numpy() for x in p[:3]), strict=True)):
+        found, turn, shift = cv2.solvePnP(world, img, camera, None, flags=cv2.SOLVEPNP_EPNP)
+        if found:
+            rotation[i], translation[i] = cv2.Rodrigues(turn)[0], shift[:, 0]
+    theirs = success(pose_errors(Pose(torch.from_numpy(rotation), torch.from_numpy(translation)), p.pose))
+    ours = success(pose_errors(solver()(*p[:3]).pose, p.pose))
+    assert ours.double().mean() >= theirs.double().mean() - 0.01
+
+
+# --- the module -----------------------------------------------------------------------------------------------------
+
+
+def test_the_config_rebuilds_the_module():
+    module = EPnP(iterations=7, algebraic_weight=0.1)
+    again = EPnP(**module.config)
+    assert again.config == module.config
+    assert "iterations=7" in repr(module)
+    corr = correspondences(problems(6, 5))
+    assert torch.equal(again(corr).pose.matrix, module(corr).pose.matrix)
+    assert torch.equal(module(corr).weights, torch.ones_like(corr.weights))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [({"iterations": 1}, "1"), ({"iterations": 2.5}, "2.5"), ({"algebraic_weight": -0.1}, "-0.1")],
+)
+def test_wrong_arguments_raise_and_say_what_came(arguments, message):
+    with pytest.raises(BaseError, match=message):
+        EPnP(**arguments)
