@@ -1,4 +1,4 @@
-"""Control points and orthogonal Procrustes: laws that hold for any points."""
+"""Control points and alignment: laws that hold for any points."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from kornia_pnpnet import Correspondences
-from kornia_pnpnet.geometry import rotation_angle
-from kornia_pnpnet.init.control_points import align, control_points, nearest_rotation, small_product
+from kornia_pnpnet.init.control_points import align, control_points
 
 FLAT = torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
 
@@ -28,14 +27,6 @@ def world(generator):
 @pytest.fixture
 def weights(generator):
     return torch.rand(7, 9, generator=generator, dtype=torch.float64) + 0.1
-
-
-def svd_rotation(matrix):
-    """Kabsch's solution of matrices (B, 3, 3)."""
-    U, _, Vh = torch.linalg.svd(matrix)
-    sign = torch.ones_like(U[:, 0])
-    sign[:, 2] = torch.linalg.det(U @ Vh)
-    return (U * sign[:, None]) @ Vh
 
 
 # --- control points -------------------------------------------------------------------------------------------------
@@ -106,74 +97,6 @@ def test_gradients_are_finite_on_a_line_and_a_point(dtype, spread, world):
     control = control_points(correspondences(line))
     (control.coordinates.sum() + control.points.sum()).backward()
     assert line.grad.isfinite().all()
-
-
-def test_small_product_is_the_matrix_product(generator):
-    a = torch.randn(2, 3, 5, generator=generator, dtype=torch.float64)
-    b = torch.randn(3, 4, 5, generator=generator, dtype=torch.float64)
-    expected = a.permute(2, 0, 1) @ b.permute(2, 0, 1)
-    torch.testing.assert_close(small_product(a, b).permute(2, 0, 1), expected)
-
-
-# --- the nearest rotation -------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("values", [(1, 1, 1), (3, 2, 1), (3, 2, 0), (3, 2, -1), (1, 1e-3, 1e-6), (1, 1e-5, -1e-7)])
-@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 3e-6), (torch.float64, 5e-15)])
-def test_nearest_rotation_is_known_from_its_singular_vectors(dtype, tolerance, values, random_rotations):
-    if dtype == torch.float32 and values[1] < 1e-4:
-        pytest.skip("float32 does not resolve these singular values.")
-    left, right = random_rotations(50), random_rotations(50, seed=1)
-    matrix = (left * torch.tensor(values, dtype=torch.float64)) @ right.mT
-    rotation, unique = nearest_rotation(matrix.to(dtype).permute(1, 2, 0))
-    assert unique.all()
-    rotation = rotation.permute(2, 0, 1).double()
-    eye = torch.eye(3, dtype=torch.float64).expand(50, 3, 3)
-    torch.testing.assert_close(rotation @ rotation.mT, eye, rtol=0, atol=tolerance)
-    # Rounding of the matrix alone turns the rotation by about its relative error over the smallest gap.
-    gap = (values[1] + values[2]) / values[0]
-    assert (rotation_angle(rotation, left @ right.mT) < tolerance / gap).all()
-
-
-def test_nearest_rotation_agrees_with_the_singular_value_decomposition(generator):
-    matrix = torch.randn(1000, 3, 3, generator=generator, dtype=torch.float64)
-    rotation, unique = nearest_rotation(matrix.permute(1, 2, 0))
-    assert unique.all()
-    assert (torch.linalg.det(matrix) < 0).any()
-    torch.testing.assert_close(rotation.permute(2, 0, 1), svd_rotation(matrix), rtol=0, atol=1e-11)
-
-
-@pytest.mark.parametrize(("dtype", "factors"), [(torch.float32, (1e-8, 1e15)), (torch.float64, (1e-70, 1e100))])
-def test_nearest_rotation_does_not_depend_on_the_unit(dtype, factors, generator):
-    matrix = torch.randn(3, 3, 20, generator=generator, dtype=torch.float64).to(dtype)
-    rotation, _ = nearest_rotation(matrix)
-    for factor in factors:
-        scaled, unique = nearest_rotation(factor * matrix)
-        assert unique.all()
-        torch.testing.assert_close(scaled, rotation)
-
-
-def test_where_there_is_no_nearest_rotation_it_is_the_identity_without_gradient(random_rotations):
-    left, right = random_rotations(5), random_rotations(5, seed=1)
-    values = torch.tensor([[0, 0, 0], [1, 0, 0], [3, 1, -1], [3, 0, 0], [2, 1, 1]], dtype=torch.float64)
-    matrix = ((left * values[:, None]) @ right.mT).permute(1, 2, 0).requires_grad_()
-    rotation, unique = nearest_rotation(matrix)
-    assert unique.tolist() == [False, False, False, False, True]
-    eye = torch.eye(3, dtype=torch.float64)[..., None].expand(3, 3, 4)
-    assert torch.equal(rotation[..., :4], eye)
-    (rotation * torch.arange(9.0).view(3, 3, 1)).sum().backward()
-    assert not matrix.grad[..., :4].any()
-    assert matrix.grad[..., 4].any()
-    assert matrix.grad.isfinite().all()
-
-
-def test_gradcheck_of_the_nearest_rotation(generator):
-    matrix = torch.randn(3, 3, 4, generator=generator, dtype=torch.float64)
-    flat = matrix * FLAT[:, None]
-    for x in (matrix, flat):
-        inputs = (x.clone().requires_grad_(),)
-        assert torch.autograd.gradcheck(lambda m: nearest_rotation(m)[0], inputs)
-        assert torch.autograd.gradgradcheck(lambda m: nearest_rotation(m)[0], inputs)
 
 
 # --- alignment ------------------------------------------------------------------------------------------------------

@@ -11,8 +11,14 @@ from kornia_pnpnet import Correspondences, Normalize, PnPNet, Pose, RobustWeight
 from kornia_pnpnet.data import SyntheticProblems
 from kornia_pnpnet.geometry import transform
 from kornia_pnpnet.init.control_points import control_points
-from kornia_pnpnet.init.depths import attach_gradient, depth_system, four_cases, minimize
-from kornia_pnpnet.init.epnp import EPnP
+from kornia_pnpnet.init.depths import (
+    attach_gradient,
+    control_points_in_camera,
+    depth_system,
+    four_cases,
+    minimize,
+)
+from kornia_pnpnet.init.epnp import EPnP, best_case
 from kornia_pnpnet.metrics import pose_errors, success
 
 DTYPES = (torch.float32, torch.float64)
@@ -22,12 +28,12 @@ class Plane:
     """Points of a square in a random plane in front of the camera."""
 
     def __call__(self, batch_size, n, generator):
-        normal, corner, shift = (
-            torch.rand(batch_size, n, 3, generator=generator, dtype=torch.float64) - 0.5 for _ in range(3)
-        )
-        axes = torch.linalg.qr(normal[:, :3] if n >= 3 else normal).Q
-        points = (20.0 * corner[..., :2]) @ axes[:, :, :2].mT
-        return points + 10.0 * shift[:, :1] + torch.tensor([0.0, 0.0, 40.0], dtype=torch.float64)
+        def uniform(*shape):
+            return torch.rand(batch_size, *shape, generator=generator, dtype=torch.float64) - 0.5
+
+        axes = torch.linalg.qr(uniform(3, 2)).Q
+        centre = torch.tensor([0.0, 0.0, 40.0], dtype=torch.float64)
+        return 20.0 * uniform(n, 2) @ axes.mT + 10.0 * uniform(1, 3) + centre
 
 
 def problems(n, batch=50, *, planar=False, noise=True, seed=2001, dtype=torch.float64):
@@ -214,7 +220,7 @@ def test_the_minimum_is_that_of_the_twelve_unknowns(n, weight):
     torch.testing.assert_close(system.error.permute(2, 0, 1), K, rtol=0, atol=1e-12)
     torch.testing.assert_close(system.first.permute(2, 0, 1), camera[:, 0], rtol=0, atol=1e-12)
     torch.testing.assert_close(system.gram.permute(2, 0, 1), L.mT @ L, rtol=0, atol=1e-12)
-    cases = minimize(system, four_cases(system, control.planar), weight, 8)  # (4, 4, B)
+    cases = minimize(system, four_cases(system), weight, 8)  # (4, 4, B)
     values = []
     for z in cases.permute(1, 2, 0):
         D = (camera @ z[:, None, :, None])[:, :, 1:, 0]
@@ -224,10 +230,70 @@ def test_the_minimum_is_that_of_the_twelve_unknowns(n, weight):
     assert reached.double().mean() >= 0.995
 
 
+def test_the_size_of_the_world_is_known():
+    """The centroid is as far as the control points say when they are scaled to those of the world."""
+    corr = correspondences(problems(6))
+    control = control_points(corr)
+    system = depth_system(control, (corr.img_points / corr.focal).permute(2, 1, 0))
+    module = EPnP(iterations=20, algebraic_weight=30.0)
+    pose = module(corr).pose
+    depths = minimize(system, four_cases(system), 30.0, 20)[:, 0]
+    camera = torch.stack(control_points_in_camera(system, depths)).permute(2, 1, 0)  # (B, 4, 3)
+    turned = control.points[:, 1:] @ pose.rotation.mT
+    scale = (turned * camera[:, 1:]).sum((1, 2)) / camera[:, 1:].square().sum((1, 2))
+    expected = scale[:, None] * camera[:, 0]
+    reached = transform(pose, control.points[:, :1])[:, 0]
+    torch.testing.assert_close(reached, expected, rtol=0, atol=1e-8)
+    assert (scale / system.unit - 1.0).abs().median() > 1e-4
+
+
 def test_the_algebraic_weight_pays():
     p = problems(9, 1000)
     shares = [success(pose_errors(solver(algebraic_weight=w)(*p[:3]).pose, p.pose)).double().mean() for w in (0.0, 0.3)]
     assert shares[1] > shares[0] + 0.01
+
+
+# --- the choice of the case -----------------------------------------------------------------------------------------
+
+
+def choose(p, *, img_points=None):
+    """Whether the true depths are chosen, rather than those of a flat scene far away, (B,)."""
+    normalize = Normalize(order=False)
+    corr, frame = normalize(*p[:3])
+    truth = normalize.apply_to_pose(p.pose, frame)
+    control = control_points(corr)
+    system = depth_system(control, (corr.img_points / corr.focal).permute(2, 1, 0))
+    points = control.points @ truth.rotation[:, 2, :, None]  # (B, 4, 1)
+    depths = points[..., 0].mT.clone()
+    depths[0] += truth.translation[:, 2]
+    flat = torch.zeros_like(depths)
+    flat[0] = 10.0
+    cases = torch.stack((depths / system.unit, flat), 1)
+    seen = corr.img_points if img_points is None else img_points
+    vectors = control.points[:, 1:].permute(2, 1, 0) / system.unit
+    return best_case(system, cases, control, (seen / corr.focal).permute(2, 1, 0), vectors) == 0
+
+
+def test_the_true_case_is_chosen():
+    assert choose(problems(9, 200, noise=False)).all()
+
+
+def test_a_point_behind_the_camera_counts_as_a_large_error():
+    """The point is moved through the camera: its pixel stays."""
+    p = problems(9, 200, noise=False)
+    cam = transform(p.pose, p.world_points)
+    world = p.world_points.clone()
+    world[:, 0] = ((-cam[:, 0] - p.pose.translation)[:, None] @ p.pose.rotation)[:, 0]
+    moved = p._replace(world_points=world)
+    assert (~choose(moved)).double().mean() > 0.8
+
+
+def test_a_large_error_is_bounded():
+    """Else where the one wrong pixel falls would decide."""
+    p = problems(9, 200, noise=False)
+    img = p.img_points.clone()
+    img[:, 0, 0] = 1e5
+    assert choose(p, img_points=img).all()
 
 
 # --- degenerate problems --------------------------------------------------------------------------------------------
@@ -244,7 +310,7 @@ def degenerate(dtype):
         "no pairs": corr._replace(weights=torch.zeros_like(weights)),
         "a line": corr._replace(world_points=corr.world_points * axis),
         "a point": corr._replace(world_points=torch.zeros_like(corr.world_points)),
-        "one pixel on a line": corr._replace(world_points=corr.world_points * axis, img_points=0.0 * corr.img_points),
+        "one pixel": corr._replace(img_points=torch.full_like(corr.img_points, 100.0)),
     }
 
 
@@ -328,20 +394,40 @@ def test_gradients_are_finite_on_exact_data(n, planar, dtype):
     assert all(x.grad.isfinite().all() for x in inputs)
 
 
-def test_a_plane_parallel_to_the_image_has_a_gradient():
-    """There the third control vector is free in the equations, but not in the problem."""
-    generator = torch.Generator().manual_seed(0)
-    plane = torch.rand(1, 6, 2, generator=generator, dtype=torch.float64) - 0.5
+SQUARE = torch.tensor([[[-1, -1], [1, -1], [-1, 1], [1, 1], [2, 0], [-2, 0]]], dtype=torch.float64)
+
+
+def parallel_plane(plane):
+    """Correspondences of a plane parallel to the image at the distance 4, with a gradient in the pixels."""
     world = torch.cat((plane, torch.zeros_like(plane[..., :1])), -1)
     pixels = (plane / 4.0).requires_grad_()
-    one = torch.ones((), dtype=torch.float64)
-    run = EPnP(iterations=8)
-    guess = run(Correspondences(world, pixels, torch.ones_like(world[..., 0]), one))
+    return Correspondences(world, pixels, torch.ones_like(world[..., 0]), torch.ones((), dtype=plane.dtype))
+
+
+@pytest.mark.parametrize("plane", [SQUARE, SQUARE[:, :4], SQUARE + 0.1 * SQUARE.square()], ids=["six", "four", "odd"])
+def test_a_plane_parallel_to_the_image_has_a_gradient(plane):
+    """There the depth of the third control vector is free in the equations, but not in the problem."""
+    corr = parallel_plane(plane)
+    guess = EPnP(iterations=8)(corr)
+    assert guess.ok.all()
     torch.testing.assert_close(guess.pose.translation, torch.tensor([[0.0, 0.0, 4.0]]).double(), rtol=0, atol=1e-9)
     guess.pose.translation[0, 2].backward()
     # Pixels that grow together come from a camera that is closer: d(1/z) = dz / z.
-    growth = (pixels.grad * pixels.detach()).sum()
+    growth = (corr.img_points.grad * corr.img_points.detach()).sum()
     torch.testing.assert_close(growth, torch.tensor(-4.0).double(), rtol=1e-6, atol=0)
+
+
+def test_exact_zeros_of_a_plane_stay_zero_and_keep_the_gradient():
+    corr = parallel_plane(SQUARE)
+    control = control_points(corr)
+    system = depth_system(control, corr.img_points.permute(2, 1, 0))
+    depths = torch.tensor([4.0, 0.0, 0.0, 0.0], dtype=torch.float64)[:, None] / system.unit.detach()
+    torch.testing.assert_close(minimize(system, depths, 0.3, 1), depths)
+    attached = attach_gradient(system, depths, control.planar, 0.3)
+    assert torch.equal(attached, depths)
+    attached[0].backward()
+    growth = (corr.img_points.grad * corr.img_points.detach()).sum()
+    torch.testing.assert_close(growth, -depths[0, 0])
 
 
 def test_an_indefinite_curvature_takes_no_step():

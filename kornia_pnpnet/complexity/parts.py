@@ -162,7 +162,7 @@ PARTS: dict[str, Callable[..., Operations]] = {
     "reppnp._step": lambda: _inverse(6) + matmul(6, 6, 1),
     # A root of a cubic, four candidates, their Newton steps and their rotations: nothing depends on n.
     "p3p.P3P.hypotheses": lambda: Operations(
-        add=612, multiply=724, divide=42, sqrt=21, exp=1, log=1, compare=122, logic=17
+        add=618, multiply=731, divide=42, sqrt=21, exp=1, log=1, compare=135, logic=18
     ),
     # Whether the 12 numbers of a pose are finite.
     "ransac.SubsetSolver.hypotheses": lambda init_ok: Operations(multiply=12, compare=48, logic=23 + init_ok),

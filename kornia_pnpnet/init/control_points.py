@@ -9,14 +9,15 @@ that both describe are the same; but with vectors the coordinates can be made or
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from kornia_pnpnet.init.small import nearest_rotation
 from kornia_pnpnet.types import Correspondences, Pose
 
-__all__ = ["ControlPoints", "align", "control_points", "nearest_rotation", "small_product"]
+__all__ = ["ControlPoints", "align", "control_points"]
 
 # Points are planar when their extent across the plane is below this share of that along it, a thousandth.
 _PLANAR_RATIO = 1e-3
@@ -96,118 +97,6 @@ def control_points(corr: Correspondences) -> ControlPoints:
         ~found[2],
         found[1],
     )
-
-
-def small_product(a: Tensor, b: Tensor) -> Tensor:
-    r"""Product of small matrices with the problems last, written out: several times faster than a batched ``matmul``.
-
-    Args:
-        a: shape :math:`(R, K, *)`.
-        b: shape :math:`(K, C, *)`.
-
-    Returns:
-        Shape :math:`(R, C, *)`.
-    """
-    (first, *others), (row, *rows) = a.unbind(1), b.unbind(0)
-    total = first[:, None] * row
-    for column, row in zip(others, rows, strict=True):
-        total = torch.addcmul(total, column[:, None], row)
-    return total
-
-
-def _cofactors(matrix: Tensor) -> Tensor:
-    """Cofactors of matrices (3, 3, *): their rows are the cross products of the rows."""
-    m = [row.unbind(0) for row in matrix.unbind(0)]
-    turns = ((1, 2), (2, 0), (0, 1))
-    entries = [torch.addcmul(m[i][k] * m[j][n], m[i][n], m[j][k], value=-1) for i, j in turns for k, n in turns]
-    return torch.stack(entries).unflatten(0, (3, 3))
-
-
-def _turn(a: Tensor, b: Tensor) -> Tensor:
-    r"""The vector :math:`v` with :math:`[v]_\times = a^\top b - b^\top a`, (3, *), of matrices (3, 3, *)."""
-    product = small_product(a.transpose(0, 1), b)
-    return torch.stack([product[j, i] - product[i, j] for i, j in ((1, 2), (2, 0), (0, 1))])
-
-
-class _NearestRotation(torch.autograd.Function):
-    @staticmethod
-    def forward(matrix: Tensor) -> tuple[Tensor, Tensor]:
-        eps = torch.finfo(matrix.dtype).eps
-        size = matrix.abs().amax((0, 1))
-        there = size > torch.finfo(matrix.dtype).tiny ** 0.25
-        scaled = matrix / torch.where(there, size, 1.0)
-        # The largest singular value: the squares of all three are the roots of x³ - 3 mean x² + minors x - det².
-        cofactors = _cofactors(scaled)
-        determinant = (scaled[0] * cofactors[0]).sum(0)
-        mean = scaled.square().sum((0, 1)) / 3.0
-        minors = cofactors.square().sum((0, 1))
-        radius = (mean * mean - minors / 3.0).clamp(min=eps * eps).sqrt()
-        cosine = (mean * (mean * mean - 0.5 * minors) + 0.5 * determinant * determinant) / radius**3
-        largest = (mean + 2.0 * radius * (cosine.clamp(-1.0, 1.0).acos() / 3.0).cos()).sqrt().clamp(min=eps)
-        # With singular values s₁ ≥ s₂ ≥ |s₃|, the last with the sign of the determinant, the matrix plus its cofactors
-        # over s₁ has the same singular vectors and the values first = s₁ + s₂s₃/s₁ and, twice, second = s₂ + s₃, all
-        # positive. Of two distinct values the inverse square root is a polynomial of degree 1.
-        upright = scaled + cofactors / largest
-        first = largest + determinant / (largest * largest)
-        square, minors = first * first, _cofactors(upright).square().sum((0, 1))  # of the two: 2 first² second² + second⁴
-        second = (minors / (square + torch.addcmul(minors, square, square).sqrt())).sqrt()
-        unique = there & (second > eps**0.75 * first)  # what Newton-Schulz below can repair
-        second = torch.where(unique, second, 1.0)
-        constant = second.reciprocal() + second / (first * (first + second))
-        linear = -(first * second * (first + second)).reciprocal()
-        eye = torch.eye(3, dtype=matrix.dtype, device=matrix.device).view(3, 3, *(1,) * (matrix.ndim - 2))
-        gram = small_product(upright.transpose(0, 1), upright)
-        rotation = small_product(upright, torch.addcmul(constant * eye, linear, gram))
-        for _ in range(2):  # Newton-Schulz: what rounding left of the deviation from orthogonality
-            gram = small_product(rotation.transpose(0, 1), rotation)
-            rotation = small_product(rotation, 1.5 * eye - 0.5 * gram)
-        return torch.where(unique, rotation, eye), unique
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor], output: tuple[Tensor, Tensor]) -> None:
-        ctx.mark_non_differentiable(output[1])
-        ctx.save_for_backward(inputs[0], *output)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
-        # M = R S turns by dR = R [w], with (tr S - S) w the vector of Rᵀ dM - dMᵀ R.
-        matrix, rotation, unique = ctx.saved_tensors
-        inner = small_product(rotation.transpose(0, 1), matrix)
-        inner = 0.5 * (inner + inner.transpose(0, 1))
-        size = inner.abs().amax((0, 1))
-        inner = inner / torch.where(unique, size, 1.0)
-        eye = torch.eye(3, dtype=matrix.dtype, device=matrix.device).view(3, 3, *(1,) * (matrix.ndim - 2))
-        normal = (inner[0, 0] + inner[1, 1] + inner[2, 2]) * eye - inner
-        normal = torch.where(unique, normal, eye)
-        cofactors = _cofactors(normal)
-        determinant = (normal[0] * cofactors[0]).sum(0)
-        usable = unique & (determinant > torch.finfo(matrix.dtype).tiny)
-        turn = (cofactors * _turn(rotation, gradients[0])).sum(1) / torch.where(usable, determinant * size, 1.0)
-        x, y, z = torch.where(usable, turn, 0.0).unbind(0)
-        zero = torch.zeros_like(x)
-        cross = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero)).unflatten(0, (3, 3))
-        return small_product(rotation, cross)
-
-
-def nearest_rotation(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    r"""The rotations :math:`R` that maximise :math:`\mathrm{tr}(R^\top M)`: orthogonal Procrustes in closed form.
-
-    No LAPACK: a singular value decomposition of a thousand 3 by 3 matrices takes six times as long.
-
-    Args:
-        matrix: :math:`M` with the problems last, shape :math:`(3, 3, *)`.
-
-    Returns:
-        The rotations, :math:`(3, 3, *)`, and whether they are unique, bool, :math:`(*)`: where they are not (the
-        second singular value is 0 or that of a reflection) the identity without gradient.
-
-    Example:
-        >>> rotation, unique = nearest_rotation(torch.diag(torch.tensor([3.0, 2.0, 0.0])))
-        >>> torch.allclose(rotation, torch.eye(3), atol=1e-6), unique
-        (True, tensor(True))
-    """
-    rotation, unique = _NearestRotation.apply(matrix)
-    return rotation, unique
 
 
 def align(source: Tensor, target: Tensor, weights: Tensor) -> tuple[Pose, Tensor]:

@@ -10,21 +10,27 @@ matrix :math:`D(z)`, and they are those of the world turned when :math:`D^\top D
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from kornia_pnpnet.init.control_points import ControlPoints, small_product
+from kornia_pnpnet.init.control_points import ControlPoints
+from kornia_pnpnet.init.small import dot, eigenvectors, small_product, solve_leading
 from kornia_pnpnet.lm import solve_damped
 
-__all__ = ["DepthSystem", "attach_gradient", "control_points_in_camera", "depth_system", "dot", "four_cases", "minimize"]
+__all__ = [
+    "DepthSystem",
+    "attach_gradient",
+    "control_points_in_camera",
+    "depth_system",
+    "four_cases",
+    "minimize",
+]
 
 # In a tie the control points lie at equal depths, or else tilt along the world's longest extents. Relative to the
 # spread of the pixels: a hundredth of it, squared. It decides where an iteration starts, not where it ends.
 _TIE = 1e-4
-_SWEEPS = 2  # of Jacobi rotations: the directions only start an iteration
 _UPPER = [(i, j) for i in range(4) for j in range(i, 4)]
 _EDGES = [(i, j) for i in range(3) for j in range(i, 3)]  # of the Gram matrix of the control vectors
 
@@ -49,7 +55,7 @@ class DepthSystem(NamedTuple):
 
 
 class _Objective(NamedTuple):
-    """The system laid out for :func:`_normal_equations`: rows of shape (4, *, B), without their first entry (3, *, B)."""
+    """The system as :func:`_normal_equations` reads it: rows (4, *, B), and without their first entries (3, *, B)."""
 
     first: tuple[Tensor, ...]
     second: tuple[Tensor, ...]
@@ -58,16 +64,6 @@ class _Objective(NamedTuple):
     prior: Tensor  # half the weighted algebraic error, (4, 4, *, B)
     target: list[tuple[Tensor, ...]]  # minus the Gram matrix
     axes: tuple[Tensor, ...]
-
-
-def dot(a: Iterable[Tensor], b: Iterable[Tensor]) -> Tensor:
-    """Sum of the products of two equally long rows of tensors."""
-    pairs = zip(a, b, strict=True)
-    x, y = next(pairs)
-    total = x * y
-    for x, y in pairs:
-        total.addcmul_(x, y)
-    return total
 
 
 def _symmetric(upper: dict[tuple[int, int], Tensor]) -> Tensor:
@@ -125,64 +121,7 @@ def control_points_in_camera(system: DepthSystem, depths: Tensor) -> tuple[Tenso
     return x, y, depths
 
 
-def _solve(matrix: Iterable[Sequence[Tensor]], rhs: Iterable[Tensor], sizes: Sequence[int]) -> list[list[Tensor]]:
-    """Solve the leading blocks of some sizes of symmetric systems by one LDLᵀ factorisation, entry by entry.
-
-    A vanishing pivot is replaced by rounding, so that values are finite where the right side is in the range.
-    """
-    rows, rest = [list(row) for row in matrix], list(rhs)
-    count = len(rest)
-    floor, ridge = torch.finfo(rest[0].dtype).tiny, 16.0 * torch.finfo(rest[0].dtype).eps
-    diagonal = [rows[k][k] for k in range(count)]
-    lower, inverse = {}, []
-    for k in range(count):
-        inverse.append(torch.add(rows[k][k], diagonal[k], alpha=ridge).clamp(min=floor).reciprocal())
-        for i in range(k + 1, count):
-            factor = lower[i, k] = rows[i][k] * inverse[k]
-            for j in range(k + 1, i + 1):
-                rows[i][j] = torch.addcmul(rows[i][j], factor, rows[j][k], value=-1)
-            rest[i] = torch.addcmul(rest[i], factor, rest[k], value=-1)
-    scaled = [x * y for x, y in zip(rest, inverse, strict=True)]
-    solutions = []
-    for size in sizes:
-        solution = scaled[:size]
-        for i in range(size - 1, 0, -1):
-            for k in range(i):
-                solution[k] = torch.addcmul(solution[k], lower[i, k], solution[i], value=-1)
-        solutions.append(solution)
-    return solutions
-
-
-def _eigenvectors(matrix: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """Eigenvalues (B,) and vectors (3, B) of symmetric matrices (3, 3, B), ascending, by Jacobi's rotations."""
-    a = [list(row.unbind(0)) for row in matrix.unbind(0)]
-    one, zero = torch.ones_like(a[0][0]), torch.zeros_like(a[0][0])
-    vectors = [torch.stack([one if i == j else zero for i in range(3)]) for j in range(3)]
-    tiny = torch.finfo(matrix.dtype).tiny
-    for _ in range(_SWEEPS):
-        for p, q, r in ((0, 1, 2), (0, 2, 1), (1, 2, 0)):
-            twice, difference = a[p][q] + a[p][q], a[q][q] - a[p][p]
-            root = torch.addcmul(difference * difference, twice, twice).sqrt() + tiny
-            tangent = twice / (difference + root.copysign(difference))
-            cosine = torch.addcmul(one, tangent, tangent).rsqrt()
-            sine = tangent * cosine
-            shift = tangent * a[p][q]
-            a[p][p], a[q][q] = a[p][p] - shift, a[q][q] + shift
-            a[p][q] = a[q][p] = zero
-            old_p, old_q = a[r][p], a[r][q]
-            a[r][p] = a[p][r] = torch.addcmul(cosine * old_p, sine, old_q, value=-1)
-            a[r][q] = a[q][r] = torch.addcmul(cosine * old_q, sine, old_p)
-            old_p, old_q = vectors[p], vectors[q]
-            vectors[p] = torch.addcmul(cosine * old_p, sine, old_q, value=-1)
-            vectors[q] = torch.addcmul(cosine * old_q, sine, old_p)
-    pairs = [torch.cat((a[i][i][None], vectors[i])) for i in range(3)]
-    for i, j in ((0, 1), (1, 2), (0, 1)):
-        swap = pairs[i][0] > pairs[j][0]
-        pairs[i], pairs[j] = torch.where(swap, pairs[j], pairs[i]), torch.where(swap, pairs[i], pairs[j])
-    return [(pair[0], pair[1:]) for pair in pairs]
-
-
-def _null_space(system: DepthSystem, planar: Tensor) -> Tensor:
+def _null_space(system: DepthSystem) -> Tensor:
     """Depths in the order of their algebraic error, (4, 4 vectors, B): z = β₁v₁ + β₂v₂ + β₃v₃ + β₄v₄.
 
     The first has the least error of those with the centroid at depth 1; the others have the centroid at 0 and are the
@@ -192,14 +131,10 @@ def _null_space(system: DepthSystem, planar: Tensor) -> Tensor:
     spread = error[0, 0] + (first[0, 1:].square() + second[0, 1:].square()).sum(0)
     eye = torch.eye(3, dtype=gram.dtype, device=gram.device)[..., None]
     inner = torch.addcmul(error[1:, 1:], _TIE * spread, 1.1 * eye - gram)
-    across = torch.zeros_like(eye)
-    across[2, 2] = 1.0  # the third vector of planar points is 0 and must stay last
-    inner = torch.addcmul(inner, across, torch.where(planar, spread, 0.0))
-    floor = torch.finfo(spread.dtype).eps * spread
     usual = torch.zeros_like(first[0, 1:])  # (3, B)
     directions = []
-    for value, direction in _eigenvectors(inner):
-        along = dot(error[0, 1:].unbind(0), direction.unbind(0)) / value.maximum(floor)
+    for value, direction in eigenvectors(inner):
+        along = dot(error[0, 1:].unbind(0), direction.unbind(0)) / value
         usual = torch.addcmul(usual, along, direction, value=-1)
         directions.append(direction)
     top = eye.new_zeros(4, 1)
@@ -207,7 +142,7 @@ def _null_space(system: DepthSystem, planar: Tensor) -> Tensor:
     return torch.cat((top.expand(1, 4, *spread.shape), torch.stack((usual, *directions), 1)))
 
 
-def four_cases(system: DepthSystem, planar: Tensor) -> Tensor:
+def four_cases(system: DepthSystem) -> Tensor:
     r"""The depths that the paper's four cases give for the number of null vectors.
 
     For :math:`N = 1, 2, 3` the products of the betas are solved for by least squares, for N = 3 without
@@ -216,12 +151,11 @@ def four_cases(system: DepthSystem, planar: Tensor) -> Tensor:
 
     Args:
         system: the equations.
-        planar: whether the points of a problem are planar, bool, shape :math:`(B,)`.
 
     Returns:
         Depths, shape :math:`(4, 4, B)`, the cases in the second dimension.
     """
-    basis = _null_space(system, planar)  # (4, 4 vectors, B)
+    basis = _null_space(system)  # (4, 4 vectors, B)
     camera = control_points_in_camera(system, basis)
     vectors = [axis.unbind(0)[1:] for axis in camera]  # (4 vectors, B) of every axis and control vector
     single = [[control.unbind(0) for control in axis] for axis in vectors]
@@ -240,11 +174,13 @@ def four_cases(system: DepthSystem, planar: Tensor) -> Tensor:
         rhs.addcmul_(target, row, value=weight)
     nested = (0, 1, 4, 2, 5, 3)
     rows, right = [row.unbind(0) for row in normal.unbind(0)], rhs.unbind(0)
-    one, two, three, four = _solve([[rows[i][j] for j in nested] for i in nested], [right[i] for i in nested], (1, 3, 5, 6))
+    one, two, three, four = solve_leading(
+        [[rows[i][j] for j in nested] for i in nested], [right[i] for i in nested], (1, 3, 5, 6)
+    )
     zero = torch.zeros_like(one[0])
     square = torch.stack((one[0], two[0], three[0], four[0]))
     sign = square.sign()
-    first = (2.0 * square.abs()).clamp(min=torch.finfo(zero.dtype).eps).sqrt()
+    first = (2.0 * square.abs()).sqrt()
     inverse = sign / first
     mixed = torch.stack((zero, two[1], three[1], four[1])) * sign
     square = torch.stack((zero, two[2], three[2], four[2])) * sign
@@ -254,8 +190,8 @@ def four_cases(system: DepthSystem, planar: Tensor) -> Tensor:
     return dot(basis[:, :, None].unbind(1), (first, second, third, fourth))
 
 
-def _objective(system: DepthSystem, weight: float, cases: int) -> _Objective:
-    """Lay the system out for ``cases`` candidates per problem, or for one without a dimension of its own (0)."""
+def _objective(system: DepthSystem, weight: float, cases: bool) -> _Objective:
+    """Lay the system out for one candidate per problem, or for several in a dimension of their own."""
     shape = (4, 1, -1) if cases else (4, -1)
     first, second = (tuple(row.view(shape) for row in matrix.unbind(0)) for matrix in system[:2])
     eye = torch.eye(4, dtype=system.error.dtype, device=system.error.device)
@@ -271,7 +207,7 @@ def _objective(system: DepthSystem, weight: float, cases: int) -> _Objective:
 
 
 def _normal_equations(objective: _Objective, depths: Tensor) -> tuple[Tensor, Tensor, dict[tuple[int, int], Tensor]]:
-    r"""Gauss-Newton's :math:`\tfrac12 J^\top J` (4, 4, *, B) and :math:`\tfrac12 J^\top r` (4, *, B), and the misfits."""
+    r"""Half of :math:`J^\top J` (4, 4, *, B) and of :math:`J^\top r` (4, *, B), and the misfits of the edges (*, B)."""
     first, second, first_inner, second_inner, prior, target, axes = objective
     z = depths.unbind(0)
     normal, gradient, misfits = prior.expand(4, *depths.shape).clone(), dot(prior.unbind(0), z), {}
@@ -302,10 +238,10 @@ def minimize(system: DepthSystem, depths: Tensor, weight: float, iterations: int
     Returns:
         The depths, in the shape that came.
     """
-    objective = _objective(system, weight, depths.ndim - 2)
+    objective = _objective(system, weight, depths.ndim > 2)
     for _ in range(iterations):
         normal, gradient, _ = _normal_equations(objective, depths)
-        (step,) = _solve((row.unbind(0) for row in normal.unbind(0)), gradient.unbind(0), (4,))
+        (step,) = solve_leading((row.unbind(0) for row in normal.unbind(0)), gradient.unbind(0), (4,))
         depths = depths - torch.stack(step)
     return depths
 
@@ -325,7 +261,7 @@ def attach_gradient(system: DepthSystem, depths: Tensor, planar: Tensor, weight:
     Returns:
         The same depths, with a gradient. It is 0 where the minimum is not isolated.
     """
-    normal, gradient, misfits = _normal_equations(_objective(system, weight, 0), depths)
+    normal, gradient, misfits = _normal_equations(_objective(system, weight, False), depths)
     with torch.no_grad():
         entries = [misfits[min(i, j), max(i, j)] for i in range(3) for j in range(3)]
         misfit = torch.stack(entries).unflatten(0, (3, 3))

@@ -8,19 +8,19 @@ import torch
 from kornia.core.check import KORNIA_CHECK
 from torch import Tensor, nn
 
-from kornia_pnpnet.init.control_points import ControlPoints, control_points, nearest_rotation, small_product
+from kornia_pnpnet.init.control_points import ControlPoints, control_points
 from kornia_pnpnet.init.depths import (
     DepthSystem,
     attach_gradient,
     control_points_in_camera,
     depth_system,
-    dot,
     four_cases,
     minimize,
 )
+from kornia_pnpnet.init.small import dot, nearest_rotation, small_product
 from kornia_pnpnet.types import Correspondences, Guess, Pose
 
-__all__ = ["EPnP"]
+__all__ = ["EPnP", "best_case"]
 
 _MIN_PAIRS, _MIN_IN_FRONT = 4, 3
 # Gauss-Newton steps of every case before one of them is chosen.
@@ -34,9 +34,9 @@ class EPnP(nn.Module):
 
     The control points of the world are expressed in the camera frame as a combination of the null vectors of the
     projection equations; the coefficients make the control points as far from each other as they are in the world.
-    Four cases, N = 1 … 4 null vectors, start Gauss-Newton; the case with the least reprojection error is taken (weighted,
-    in pixels; a point behind the camera counts as an error of two focal lengths). The pose moves the control points
-    of the world to those in the camera (orthogonal Procrustes).
+    Four cases, N = 1 … 4 null vectors, start Gauss-Newton; the case with the least weighted reprojection error is taken
+    (a point behind the camera counts as an error of two focal lengths). The pose moves the control points of the
+    world to those in the camera (orthogonal Procrustes).
 
     Source: V. Lepetit, F. Moreno-Noguer and P. Fua, "EPnP: An Accurate O(n) Solution to the PnP Problem", IJCV 2009.
     We depart from it for accuracy, for speed and to do without eigenvectors of equal eigenvalues:
@@ -69,7 +69,9 @@ class EPnP(nn.Module):
         >>> from kornia_pnpnet import Normalize
         >>> from kornia_pnpnet.data import SyntheticProblems
         >>> from kornia_pnpnet.metrics import pose_errors
-        >>> problems = SyntheticProblems(n=6, batch_size=2, world_sigma=0.0, img_sigma=0.0, dtype=torch.float64).batch(0)
+        >>> problems = SyntheticProblems(n=6, batch_size=2, world_sigma=0.0, img_sigma=0.0, dtype=torch.float64).batch(
+        ...     0
+        ... )
         >>> normalize = Normalize()
         >>> corr, frame = normalize(problems.world_points, problems.img_points, problems.intrinsics)
         >>> guess = EPnP()(corr)
@@ -109,13 +111,13 @@ class EPnP(nn.Module):
         vectors = control.points[:, 1:].permute(2, 1, 0) / system.unit  # (3 axes, 3 vectors, B)
         with torch.no_grad():
             depths, solved = self._depths(system, control, plane_points, vectors)
-        if torch.is_grad_enabled():
+        if system.error.requires_grad:
             depths = attach_gradient(system, depths, control.planar, self.algebraic_weight)
 
         camera = torch.stack(control_points_in_camera(system, depths))  # (3, 4, B)
         affine = camera[:, 1:]
         rotation, unique = nearest_rotation(small_product(affine, vectors.transpose(0, 1)))
-        # The algebraic error shrinks the control points a little; their size is known.
+        # The control points miss their distances a little. Their size is known.
         size = affine.square().sum((0, 1))
         scale = (small_product(rotation, vectors) * affine).sum((0, 1)) / torch.where(size > 0, size, 1.0)
         offset = dot(rotation.unbind(1), control.points[:, 0].mT.unbind(0))
@@ -123,7 +125,7 @@ class EPnP(nn.Module):
 
         there = corr.weights.mT > 0
         depth = dot(rotation[2].unbind(0), corr.world_points.permute(2, 1, 0).unbind(0)) + translation[2]  # (N, B)
-        ok = control.ok & solved & unique & (there.sum(0) >= _MIN_PAIRS)
+        ok = solved & unique & (there.sum(0) >= _MIN_PAIRS)
         ok = ok & ((there & (depth > 0)).sum(0) >= _MIN_IN_FRONT)
         pose = Pose(rotation.permute(2, 0, 1).contiguous(), translation.mT.contiguous())
         return Guess(pose, torch.ones_like(corr.weights), ok)
@@ -131,14 +133,13 @@ class EPnP(nn.Module):
     def _depths(
         self, system: DepthSystem, control: ControlPoints, plane_points: Tensor, vectors: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """The depths (4, B) of the best case and whether they could be found (B,); else the centroid's alone is not 0."""
-        cases = minimize(system, four_cases(system, control.planar), self.algebraic_weight, _CASE_ITERATIONS)
-        best = _best_case(system, cases, control, plane_points, vectors)
+        """The depths (4, B) of the best case, and whether they could be found (B,); else those of equal depth."""
+        cases = minimize(system, four_cases(system), self.algebraic_weight, _CASE_ITERATIONS)
+        best = best_case(system, cases, control, plane_points, vectors)
         depths = cases.gather(1, best.expand(4, 1, -1))[:, 0]
         depths = minimize(system, depths, self.algebraic_weight, self.iterations - _CASE_ITERATIONS)
-        depths = torch.where(depths[0] < 0, -depths, depths)
         # Greater ratios than rounding resolves are a failure; NaN compares false.
-        solved = control.ok & (depths.abs() < 1.0 / torch.finfo(depths.dtype).eps).all(0)
+        solved = (depths.abs() < 1.0 / torch.finfo(depths.dtype).eps).all(0)
         flat = torch.zeros_like(depths)
         flat[0] = 1.0
         return torch.where(solved, depths, flat), solved
@@ -146,24 +147,33 @@ class EPnP(nn.Module):
 
 def _frame(one: Sequence[Tensor], two: Sequence[Tensor]) -> list[tuple[Tensor, ...]]:
     """Orthonormal axes of two vectors; a vector is a triple."""
-    tiny = torch.finfo(one[0].dtype).tiny
-    length = (dot(one, one) + tiny).rsqrt()
+    length = dot(one, one).rsqrt()
     a, b, c = (entry * length for entry in one)
     along = dot((a, b, c), two)
     two = [torch.addcmul(entry, along, axis, value=-1) for entry, axis in zip(two, (a, b, c), strict=True)]
-    length = (dot(two, two) + tiny).rsqrt()
+    length = dot(two, two).rsqrt()
     d, e, f = (entry * length for entry in two)
     return [(a, b, c), (d, e, f), (b * f - c * e, c * d - a * f, a * e - b * d)]
 
 
-def _best_case(
+def best_case(
     system: DepthSystem, cases: Tensor, control: ControlPoints, plane_points: Tensor, vectors: Tensor
 ) -> Tensor:
-    """Which case (4, C, B) of a problem has the least reprojection error, (B,).
+    r"""Choose among the cases of every problem by the weighted mean of their squared reprojection errors.
 
     The control vectors of a case are nearly those of the world turned: frames of two of them stand in for Procrustes.
+
+    Args:
+        system: the equations.
+        cases: depths, shape :math:`(4, C, B)`.
+        control: the control points in the world.
+        plane_points: pixels over the focal length, shape :math:`(2, N, B)`.
+        vectors: the control vectors of the world in units of ``system.unit``, shape :math:`(3, 3, B)`.
+
+    Returns:
+        The number of the best case, shape :math:`(B,)`.
     """
-    camera = zip(*(axis.unbind(0) for axis in control_points_in_camera(system, cases * cases[0].sign())), strict=True)
+    camera = zip(*(axis.unbind(0) for axis in control_points_in_camera(system, cases)), strict=True)
     centroid, *affine = camera  # triples of (C, B)
     world = [vector.unbind(0) for vector in vectors.unbind(1)]  # triples of (B,)
     axes, world_axes = _frame(*affine[:2]), _frame(*world[:2])
@@ -184,6 +194,6 @@ def _best_case(
         inverse = z.reciprocal()
         x, y = torch.addcmul(minus_u, x, inverse), torch.addcmul(minus_v, y, inverse)
         error = (x * x).addcmul_(y, y).clamp_(max=_MAX_SQ_RESIDUAL)
-        error = torch.where(z > 0, error, _MAX_SQ_RESIDUAL)
+        error = torch.where(z > 0, error, _MAX_SQ_RESIDUAL)  # also where a case has failed: NaN compares false
         errors.append((error * weights).sum(0))
     return torch.stack(errors).argmin(0)

@@ -216,6 +216,7 @@ def distances(p: Tensor, q: Tensor, r: Tensor, b: Tensor, g: Tensor) -> Triple:
         tensor([0.7071, 0.7071, 0.7071], dtype=torch.float64)
     """
     dist1, dist2, dist3 = _refined(_candidates(p, q, r, b, g), p, q, b)
-    sq_edge = (dist2 - dist3).square_().addcmul_(b[0], dist2 * dist3)
+    edge = dist2 - dist3
+    sq_edge = edge.mul_(edge).addcmul_(b[0], dist2 * dist3)
     scale = sq_edge.clamp_(min=torch.finfo(b.dtype).tiny ** 0.5).rsqrt_().copysign_(dist1)
     return dist1 * scale, dist2.mul_(scale), dist3.mul_(scale)

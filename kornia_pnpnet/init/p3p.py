@@ -10,8 +10,8 @@ from kornia.core.exceptions import DeviceError, ShapeError, TypeCheckError
 from torch import Tensor, nn
 
 from kornia_pnpnet.geometry import MIN_DEPTH_RATIO
-from kornia_pnpnet.init.depths import dot
 from kornia_pnpnet.init.law_of_cosines import Triple, distances, turn_to_largest, turned
+from kornia_pnpnet.init.small import dot
 from kornia_pnpnet.types import Correspondences, Hypotheses, Pose
 
 __all__ = ["P3P", "p3p"]
@@ -24,8 +24,8 @@ _ERROR_POWER = 2 / 3
 _LARGEST_ERROR = 0.01
 # A triangle is a line when it is less high than this many machine epsilons of its coordinates and its longest edge.
 _LINE = 32.0
-# A solution is at no point but this many longest edges, times that power, away from it: from closer by the point's
-# direction would be rounding.
+# A camera is this many longest edges, times the same power, away from each point: from closer by, rounding would decide
+# in which direction it sees the point.
 _CLOSE = 64.0
 
 
@@ -48,56 +48,67 @@ def _axes(base: list[Tensor], side: list[Tensor]) -> tuple[list[Tensor], list[Te
     return axis1, [x.mul_(inv_height) for x in axis2], (inv_base, along, sq_height)
 
 
-def _solve_chunk(world_points: Tensor, plane_points: Tensor, out: Tensor) -> Tensor:
-    """Write rotations and translations into ``out`` (12, 2, 2, C); return which are solutions (2, 2, C)."""
-    finfo = torch.finfo(world_points.dtype)
+def _load(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Tensor]:
+    """Points as components (5, 3, C), in an order in which the longest edge is opposite to the first.
+
+    Returned after them: whether they are numbers with which one can calculate (C,). The others are 0.
+    """
     ring = world_points.new_empty(5, 5, world_points.shape[0])
     given = ring[:, :3]
     given[:3], given[3:] = world_points.permute(2, 1, 0), plane_points.permute(2, 1, 0)
-    sound = given.abs().sum((0, 1)) <= finfo.max**0.2  # what is larger could overflow
+    sound = given.abs().sum((0, 1)) <= torch.finfo(ring.dtype).max ** 0.2  # what is larger could overflow
     torch.where(sound, given, given.new_zeros(()), out=given)
     ring[:, 3:] = ring[:, :2]
-    # The points in an order in which the longest edge is opposite to the first.
     edges = ring[:3, 2:] - ring[:3, 1:4]
-    given = turned(ring, turn_to_largest(*dot(edges, edges)))
+    return turned(ring, turn_to_largest(*dot(edges, edges))), sound
+
+
+def _look(plane: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Unit rays (3, 3, C), squared differences (3, C) and squared determinant (C,) of them, and whether all see."""
+    ring = plane.new_empty(3, 5, plane.shape[-1])
+    rays = ring[:, :3]
+    depth = torch.mul(plane[0], plane[0], out=rays[2]).addcmul_(plane[1], plane[1]).add_(1.0).rsqrt_()
+    torch.mul(plane, depth, out=rays[:2])
+    ring[:, 3:] = ring[:, :2]
+    gaps = ring[:, 2:] - ring[:, 1:4]
+    det = dot(_cross(gaps[:, 1], gaps[:, 2]), rays[:, 0])
+    return rays, dot(gaps, gaps), det.mul_(det), depth.amin(0) > MIN_DEPTH_RATIO
+
+
+def _solve_chunk(world_points: Tensor, plane_points: Tensor, out: Tensor) -> Tensor:
+    """Write rotations and translations into ``out`` (12, 2, 2, C); return which are solutions (2, 2, C)."""
+    finfo = torch.finfo(world_points.dtype)
+    given, sound = _load(world_points, plane_points)
     x1, x2, x3 = given[:3].unbind(1)
     axis1, axis2, (inv_base, along, sq_height) = _axes([*(x3 - x2)], [*(x1 - x2)])
     axis3 = _cross(axis1, axis2)
     inv_sq_base = inv_base * inv_base
     along, sq_height = along.mul_(inv_base), sq_height.mul_(inv_sq_base)
     line = dot(x1, x1).mul_(inv_sq_base).add_(1.0).mul_((_LINE * finfo.eps) ** 2)
-    sound = sound & (sq_height > line) & (inv_sq_base < finfo.tiny**-0.5)
+    sound = sound.bitwise_and_(sq_height > line).bitwise_and_(inv_sq_base < finfo.tiny**-0.5)
     rest = 1.0 - along
     p, q = (along * along).add_(sq_height), (rest * rest).add_(sq_height)
     r = rest.mul_(along).sub_(sq_height).mul_(2.0)
-
-    ring = ring.new_empty(3, 5, ring.shape[-1])
-    rays, plane = ring[:, :3], given[3:]
-    inv = torch.mul(plane[0], plane[0], out=rays[2]).addcmul_(plane[1], plane[1]).add_(1.0).rsqrt_()
-    sound = sound & (inv.amin(0) > MIN_DEPTH_RATIO)
-    torch.mul(plane, inv, out=rays[:2])
-    ring[:, 3:] = ring[:, :2]
-    gaps = ring[:, 2:] - ring[:, 1:4]
-    b = dot(gaps, gaps)
-    g = dot(_cross(gaps[:, 1], gaps[:, 2]), rays[:, 0]).square_()
+    rays, b, g, sees = _look(given[3:])
     dist = distances(p, q, r, b, g)
 
     # Up to here the longest edge was 1 long.
-    unit = inv_base.reciprocal()
-    rays.mul_(unit)
+    base_length = inv_base.reciprocal()
+    rays.mul_(base_length)
     y1, y2, y3 = ([d * x for x in ray] for d, ray in zip(dist, rays.unbind(1), strict=True))
     base = [y.sub_(x) for y, x in zip(y3, y2, strict=True)]
     side = [torch.sub(y, x, out=x) for y, x in zip(y1, y2, strict=True)]
     cam1, cam2, (cam_inv_base, cam_along, cam_sq_height) = _axes(base, side)
     # The two triangles differ in the base, the side along it and the squared height, relative to the base.
-    base_error = (cam_inv_base * unit).sub_(1.0)
+    base_error = (cam_inv_base * base_length).sub_(1.0)
     along_error = torch.addcmul(-along, cam_along, inv_base)
     height_error = torch.addcmul(-sq_height, cam_sq_height, inv_sq_base)
-    sq_error = base_error.square_().addcmul_(along_error, along_error).addcmul_(height_error, height_error)
+    sq_error = base_error.mul_(base_error).addcmul_(along_error, along_error).addcmul_(height_error, height_error)
     least = torch.minimum(torch.minimum(dist[0], dist[1]), dist[2])
-    room = least.addcmul_(least, dist[0]).sub_(_CLOSE * finfo.eps**_ERROR_POWER)  # no distance is more than dist[0] + 1
-    room.mul_(sound.to(room.dtype).mul_(finfo.eps ** (2 * _ERROR_POWER))).clamp_(max=_LARGEST_ERROR**2)
-    valid = sq_error < room
+    bound = sound.bitwise_and_(sees) * least.new_full((), finfo.eps ** (2 * _ERROR_POWER))
+    # No distance is more than dist[0] + 1.
+    room = least.addcmul_(least, dist[0]).sub_(_CLOSE * finfo.eps**_ERROR_POWER).mul_(bound)
+    valid = sq_error < room.clamp_(max=_LARGEST_ERROR**2)
 
     # R = Σ camera axis · world axisᵀ, the last row from the first two; t = y1 - R x1.
     (a0, a1, a2), (b0, b1, b2) = cam1, cam2
@@ -128,8 +139,9 @@ def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
 
     Returns:
         Four slots for each problem. A slot is valid when its pose is a solution with all three points in front of the
-        camera. A double solution fills one slot. The other slots hold finite numbers. Points on a line, of which there
-        are either no poses or too many, NaN and infinity have no valid slot.
+        camera. A double solution fills one slot. The other slots hold finite numbers. No slot is valid for points on a
+        line (they have no pose or too many), for NaN and infinity, and where a point is seen further out than
+        :data:`~kornia_pnpnet.geometry.MIN_DEPTH_RATIO` allows.
 
     Raises:
         ShapeError: when the shapes are not these.

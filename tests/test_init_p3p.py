@@ -1,0 +1,352 @@
+"""Laws of P3P: all solutions and nothing else, whatever the order, the unit and the company of the points."""
+
+from __future__ import annotations
+
+import math
+import sys
+
+import numpy as np
+import pytest
+import torch
+from kornia.core.exceptions import DeviceError, ShapeError, TypeCheckError
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+
+from kornia_pnpnet import Correspondences, Pose
+from kornia_pnpnet.data import SyntheticProblems
+from kornia_pnpnet.init.law_of_cosines import distances
+from kornia_pnpnet.init.p3p import P3P, p3p
+from kornia_pnpnet.types import Hypotheses
+
+DTYPES = (torch.float64, torch.float32)
+NEAR = 1e-6
+
+
+def rotations(batch, generator):
+    """Uniform over all rotations: unit quaternions uniform on their sphere."""
+    w, *v = torch.nn.functional.normalize(
+        torch.randn(batch, 4, generator=generator, dtype=torch.float64), dim=-1
+    ).unbind(-1)
+    axis = torch.stack(v, -1)
+    return axis_angle_to_rotation_matrix(
+        2.0 * torch.atan2(axis.norm(dim=-1), w)[:, None] * axis / axis.norm(dim=-1)[:, None]
+    )
+
+
+def seen(cam_points, generator):
+    """World points and plane points of points in the camera frame, and the pose, which is anywhere."""
+    rotation = rotations(len(cam_points), generator)
+    translation = torch.randn(len(cam_points), 3, generator=generator, dtype=torch.float64)
+    world_points = (cam_points - translation[:, None]) @ rotation
+    return world_points, cam_points[..., :2] / cam_points[..., 2:], Pose(rotation, translation)
+
+
+def wide(batch, seed=0):
+    """A right angle wide field of view, depths from 0.1 to 10."""
+    generator = torch.Generator().manual_seed(seed)
+    xy, z = torch.rand(batch, 3, 3, generator=generator, dtype=torch.float64).split((2, 1), -1)
+    return seen(torch.cat((2.0 * xy - 1.0, torch.ones_like(z)), -1) * (0.1 + 9.9 * z), generator)
+
+
+def protocol(batch, seed=0):
+    """The package's own problems without noise."""
+    source = SyntheticProblems(n=3, batch_size=batch, seed=seed, img_sigma=0.0, world_sigma=0.0, dtype=torch.float64)
+    problems = source.batch(0)
+    return problems.world_points, problems.img_points / source.focal, problems.pose
+
+
+def tele(batch, seed=0):
+    """Points around one that is a hundred times as far away."""
+    generator = torch.Generator().manual_seed(seed)
+    centre = torch.tensor([20.0, -10.0, 100.0], dtype=torch.float64)
+    return seen(centre + torch.randn(batch, 3, 3, generator=generator, dtype=torch.float64), generator)
+
+
+SCENES = {"wide": wide, "protocol": protocol, "tele": tele}
+
+
+def errors(found, pose):
+    """Largest error of an entry of the rotation plus relative error of the translation, (B, S), infinite if invalid."""
+    rotation = (found.pose.rotation - pose.rotation[:, None]).abs().amax((-1, -2))
+    translation = (found.pose.translation - pose.translation[:, None]).norm(dim=-1)
+    error = rotation + translation / pose.translation.norm(dim=-1)[:, None]
+    return torch.where(found.valid, error, torch.inf)
+
+
+def in_camera(found, world_points):
+    """The points in the camera frame of each solution, (B, S, 3, 3)."""
+    return torch.einsum("bsij,bnj->bsni", found.pose.rotation, world_points) + found.pose.translation[:, :, None]
+
+
+def reprojection_errors(found, world_points, plane_points):
+    """The largest of each valid solution; infinite behind the camera."""
+    cam_points = in_camera(found, world_points)
+    error = (cam_points[..., :2] / cam_points[..., 2:] - plane_points[:, None]).norm(dim=-1).amax(-1)
+    return torch.where((cam_points[..., 2] > 0).all(-1), error, torch.inf)[found.valid]
+
+
+def assert_same_solutions(found, expected, tolerance=NEAR):
+    """Each solution of one is a solution of the other."""
+    assert torch.equal(found.valid.sum(-1), expected.valid.sum(-1))
+    matrix, other = (torch.cat((h.pose.rotation, h.pose.translation[..., None]), -1) for h in (found, expected))
+    apart = (matrix[:, :, None] - other[:, None]).abs().amax((-1, -2))  # (B, S, S)
+    apart = torch.where(expected.valid[:, None], apart, torch.inf)
+    assert (apart.amin(-1)[found.valid] < tolerance).all()
+
+
+def assert_finite(found):
+    assert all(x.isfinite().all() for x in found.pose)
+
+
+@pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
+def test_the_true_pose_is_among_the_solutions_and_all_of_them_are_solutions(scene):
+    world_points, plane_points, pose = scene(20_000)
+    found = p3p(world_points, plane_points)
+    assert found.pose.rotation.shape == (20_000, 4, 3, 3)
+    assert (errors(found, pose).amin(-1) < NEAR).all()
+    assert (reprojection_errors(found, world_points, plane_points) < 1e-9).all()
+    rotation = found.pose.rotation[found.valid]
+    assert (rotation @ rotation.mT - torch.eye(3)).abs().max() < 1e-11
+    assert (torch.linalg.det(rotation) > 0).all()
+
+
+def test_there_are_one_to_four_solutions_and_no_two_are_the_same():
+    found = p3p(*wide(20_000)[:2])
+    counts = torch.bincount(found.valid.sum(-1))
+    assert counts[0] == 0
+    assert (counts[1:] > 100).all()
+    apart = (found.pose.rotation[:, :, None] - found.pose.rotation[:, None]).abs().amax((-1, -2))
+    apart = torch.where(found.valid[:, :, None] & found.valid[:, None] & ~torch.eye(4, dtype=torch.bool), apart, 1.0)
+    assert apart.min() > NEAR
+
+
+def test_rays_of_no_pose_have_few_solutions_and_these_are_true(generator):
+    world_points = torch.randn(20_000, 3, 3, generator=generator, dtype=torch.float64)
+    plane_points = torch.randn(20_000, 3, 2, generator=generator, dtype=torch.float64)
+    found = p3p(world_points, plane_points)
+    assert_finite(found)
+    assert (~found.valid).all(-1).float().mean() > 0.4
+    assert (reprojection_errors(found, world_points, plane_points) < 1e-8).all()
+
+
+@pytest.mark.parametrize("order", [(1, 2, 0), (1, 0, 2), (2, 1, 0)])
+def test_the_order_of_the_points_does_not_matter(order):
+    world_points, plane_points, _ = wide(5000)
+    assert_same_solutions(p3p(world_points[:, order], plane_points[:, order]), p3p(world_points, plane_points))
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1e12])
+def test_the_frame_and_the_unit_of_the_world_do_not_matter(scale, generator):
+    world_points, plane_points, _ = wide(5000)
+    turn, shift = rotations(5000, generator), torch.randn(5000, 3, generator=generator, dtype=torch.float64)
+    found = p3p(scale * (world_points @ turn.mT + shift[:, None]), plane_points)
+    # x_cam = R' s (Q x + c) + t' is s times R' Q x + R' c + t' / s
+    rotation = found.pose.rotation @ turn[:, None]
+    moved = (found.pose.rotation @ shift[:, None, :, None])[..., 0] + found.pose.translation / scale
+    assert_same_solutions(Hypotheses(Pose(rotation, moved), found.valid), p3p(world_points, plane_points))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_a_symmetric_scene_whose_cubic_has_its_roots_at_zero_and_infinity(dtype):
+    # An equilateral triangle seen from its axis: the pose upright and three that look at it from aside.
+    angle = torch.tensor([0.0, 2.0, 4.0], dtype=dtype) * math.pi / 3.0
+    world_points = torch.stack((angle.cos(), angle.sin(), torch.zeros_like(angle)), -1)[None]
+    cam_points = world_points + torch.tensor([0.0, 0.0, 4.0], dtype=dtype)
+    found = p3p(world_points, cam_points[..., :2] / cam_points[..., 2:])
+    assert found.valid.all()
+    upright = Pose(torch.eye(3, dtype=dtype)[None], torch.tensor([[0.0, 0.0, 4.0]], dtype=dtype))
+    assert errors(found, upright).min() < 100.0 * torch.finfo(dtype).eps
+    assert (found.pose.rotation[..., 2, 2] < 0.99).sum() == 3
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e-15, 1e-12, 1e-9, 1e-6])
+def test_two_solutions_that_meet_are_not_lost(offset, generator):
+    # They meet where the camera is on the cylinder upright on the circle through the points.
+    angles = 2.0 * math.pi * torch.rand(5000, 4, generator=generator, dtype=torch.float64)
+    circle = torch.stack((angles.cos(), angles.sin(), torch.zeros_like(angles)), -1)
+    centre = circle[:, 3] + torch.tensor([offset, 0.0, 2.0])
+    axis3 = torch.nn.functional.normalize(-centre, dim=-1)
+    axis1 = torch.nn.functional.normalize(torch.linalg.cross(circle[:, 0].roll(1, -1) + 0.1, axis3), dim=-1)
+    rotation = torch.stack((axis1, torch.linalg.cross(axis3, axis1), axis3), -2)
+    cam_points = (circle[:, :3] - centre[:, None]) @ rotation.mT
+    edges = (circle[:, :3] - circle[:, :3].roll(1, 1)).norm(dim=-1).amin(-1)
+    cam_points = cam_points[edges > 0.2]  # whose rounding is not the problem
+    world_points, plane_points, pose = seen(cam_points, generator)
+    found = p3p(world_points, plane_points)
+    assert found.valid.any(-1).all()
+    assert (errors(found, pose).amin(-1) < 1e-5).all()
+    assert (errors(found, pose).amin(-1) < NEAR).double().mean() > 0.98
+    assert (reprojection_errors(found, world_points, plane_points) < 1e-9).all()
+
+
+def spoiled(points, how):
+    """What is wrong with some points (3, 3) or (3, 2)."""
+    points = points.clone()
+    if how in ("nan", "inf"):
+        points[1, 0] = float(how)
+    elif how == "zeros":
+        points[:] = 0.0
+    elif how == "huge":
+        points *= torch.finfo(points.dtype).max ** 0.9
+    elif how == "tiny":
+        points *= torch.finfo(points.dtype).tiny ** 0.9
+    elif how == "coincident":
+        points[2] = points[0]
+    elif how == "line":
+        points[2] = 0.3 * points[0] + 0.7 * points[1]
+    return points
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("which", ["world", "plane"])
+@pytest.mark.parametrize("how", ["nan", "inf", "zeros", "huge", "tiny", "coincident", "line"])
+def test_a_bad_problem_has_no_solution_and_changes_no_other(how, which, dtype):
+    world_points, plane_points = (x.to(dtype) for x in wide(50)[:2])
+    good = p3p(world_points, plane_points)
+    points = world_points if which == "world" else plane_points
+    points[7] = spoiled(points[7], how)
+    found = p3p(world_points, plane_points)
+    assert_finite(found)
+    others = torch.arange(50) != 7
+    for mine, before in zip((*found.pose, found.valid), (*good.pose, good.valid), strict=True):
+        assert torch.equal(mine[others], before[others])
+    if which == "plane" and how in ("coincident", "line"):  # which may happen to be right
+        assert (reprojection_errors(found, world_points, plane_points) < 1e-3).all()
+    else:
+        assert not found.valid[7].any()
+
+
+def test_points_beside_the_camera_are_not_seen():
+    world_points, plane_points, _ = wide(50)
+    assert not p3p(world_points, 1e4 * plane_points).valid.any()
+
+
+@pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
+def test_single_precision_solves_what_it_can(scene):
+    world_points, plane_points, pose = scene(20_000)
+    found = p3p(world_points.float(), plane_points.float())
+    assert found.pose.rotation.dtype == torch.float32
+    assert_finite(found)
+    error = (found.pose.rotation - pose.rotation[:, None]).abs().amax((-1, -2))
+    error = torch.where(found.valid, error, torch.inf).amin(-1)
+    assert error.quantile(0.5) < 1e-5
+    assert error.quantile(0.99) < 1e-3
+    assert (error < 0.01).double().mean() > 0.999
+    exact = p3p(world_points, plane_points)
+    assert (found.valid.sum(-1) == exact.valid.sum(-1)).double().mean() > 0.99
+
+
+def test_chunks_do_not_matter(monkeypatch):
+    world_points, plane_points, _ = wide(500)
+    whole = p3p(world_points, plane_points)
+    monkeypatch.setattr(sys.modules[p3p.__module__], "_CHUNK_BYTES", 512)
+    assert_same_solutions(p3p(world_points, plane_points), whole)
+    none = p3p(world_points[:0], plane_points[:0])
+    assert none.pose.rotation.shape == (0, 4, 3, 3)
+    assert none.valid.shape == (0, 4)
+
+
+def test_the_poses_carry_no_gradient_and_can_be_used_where_gradients_flow():
+    world_points, plane_points, _ = wide(5)
+    found = p3p(world_points.requires_grad_(), plane_points.requires_grad_())
+    assert not any(x.requires_grad for x in found.pose)
+    in_camera(found, world_points).sum().backward()
+    assert world_points.grad.isfinite().all()
+
+
+def test_the_module_reads_normalised_correspondences():
+    world_points, plane_points, _ = wide(50)
+    focal = torch.tensor(3400.0, dtype=torch.float64)
+    solver = P3P()
+    corr = Correspondences(world_points, focal * plane_points, torch.zeros(50, 3, dtype=torch.float64), focal)
+    assert_same_solutions(solver.hypotheses(corr), p3p(world_points, plane_points))
+    assert solver.sample_size == 3
+    assert P3P(**solver.config).config == solver.config
+    with pytest.raises(ShapeError, match="3 pairs, got N = 4"):
+        solver.hypotheses(Correspondences(torch.zeros(2, 4, 3), torch.zeros(2, 4, 2), torch.ones(2, 4), focal))
+
+
+@pytest.mark.parametrize(
+    ("plane_points", "error"),
+    [
+        (torch.zeros(2, 3, 3), ShapeError),
+        (torch.zeros(2, 4, 2), ShapeError),
+        (torch.zeros(3, 3, 2), ShapeError),
+        (torch.zeros(2, 3, 2, dtype=torch.float64), TypeCheckError),
+        (torch.zeros(2, 3, 2, device="meta"), DeviceError),
+    ],
+)
+def test_wrong_arguments_say_so(plane_points, error):
+    with pytest.raises(error):
+        p3p(torch.zeros(2, 3, 3), plane_points)
+
+
+def test_half_precision_is_refused():
+    with pytest.raises(TypeCheckError, match="float16"):
+        p3p(torch.zeros(2, 3, 3, dtype=torch.float16), torch.zeros(2, 3, 2, dtype=torch.float16))
+
+
+def test_distances_fulfil_the_law_of_cosines(generator):
+    rays = torch.randn(3, 3, 1000, generator=generator, dtype=torch.float64)
+    rays = rays / rays.norm(dim=0)  # (xyz, point, C)
+    truth = 0.5 + torch.rand(3, 1000, generator=generator, dtype=torch.float64)
+    points = rays * truth
+    edges = (points.roll(1, 1) - points.roll(-1, 1)).square().sum(0)
+    longest_first = edges[0] >= edges.amax(0)
+    unit = edges[0].sqrt()
+    p, q = edges[2] / edges[0], edges[1] / edges[0]
+    b = (rays.roll(1, 1) - rays.roll(-1, 1)).square().sum(0)
+    g = torch.linalg.det(rays.permute(2, 0, 1)).square()
+    found = torch.stack(distances(p, q, 1.0 - p - q, b, g))  # (3, 2, 2, C)
+    assert found.isfinite().all()
+    apart = (found - (truth / unit)[:, None, None]).abs().amax(0).flatten(0, 1).amin(0)
+    assert (apart[longest_first] < NEAR).all()
+
+
+# --- beside the peers -------------------------------------------------------------------------------------------------
+
+
+def of_peer(solutions, batch):
+    """What a peer found, problem by problem, as ours."""
+    rotation, translation = np.zeros((batch, 4, 3, 3)), np.zeros((batch, 4, 3))
+    valid = np.zeros((batch, 4), bool)
+    for i, poses in enumerate(solutions):
+        for j, pose in enumerate(poses):
+            rotation[i, j], translation[i, j] = pose
+            valid[i, j] = np.isfinite(pose[0]).all()
+    return Hypotheses(Pose(torch.from_numpy(rotation), torch.from_numpy(translation)), torch.from_numpy(valid))
+
+
+def misses(found, pose):
+    return int((errors(found, pose).amin(-1) > NEAR).sum())
+
+
+@pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
+def test_it_misses_no_more_than_poselib(scene):
+    poselib = pytest.importorskip("poselib")
+    world_points, plane_points, pose = scene(100_000, seed=1)
+    rays = torch.cat((plane_points, torch.ones_like(plane_points[..., :1])), -1)
+    rays = torch.nn.functional.normalize(rays, dim=-1).numpy()
+    pairs = zip(rays, world_points.numpy(), strict=True)
+    theirs = of_peer(([(s.R, s.t) for s in poselib.p3p(*pair)] for pair in pairs), len(rays))
+    ours = p3p(world_points, plane_points)
+    assert misses(ours, pose) <= misses(theirs, pose)
+    assert misses(ours, pose) == 0
+    assert (ours.valid.sum(-1) != theirs.valid.sum(-1)).sum() <= 2
+    assert torch.median(errors(ours, pose).amin(-1)) < torch.median(errors(theirs, pose).amin(-1))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["P3P", "AP3P"])
+@pytest.mark.parametrize("scene", [wide, protocol])
+def test_it_misses_no_more_than_opencv(scene, method):
+    cv2 = pytest.importorskip("cv2")
+    world_points, plane_points, pose = scene(100_000, seed=1)
+    flags, camera = getattr(cv2, f"SOLVEPNP_{method}"), np.eye(3)
+
+    def solved(world, plane):
+        _, turns, shifts = cv2.solveP3P(world, plane, camera, None, flags=flags)
+        return [(cv2.Rodrigues(turn)[0], shift[:, 0]) for turn, shift in zip(turns, shifts, strict=True)]
+
+    pairs = zip(world_points.numpy(), plane_points.numpy(), strict=True)
+    theirs = of_peer((solved(*pair) for pair in pairs), len(world_points))
+    assert misses(p3p(world_points, plane_points), pose) <= misses(theirs, pose)
