@@ -222,13 +222,16 @@ def test_default_solvers_suit_scenes():
     assert set(BOUNDS) <= set(synthetic)
     assert set(real) & set(BOUNDS) == {"known-inliers"}
     assert [name.partition(":")[0] for name in real] == [
-        name for name in synthetic if name != "known-inliers-and-noise"
+        name.partition(":")[0] for name in synthetic if name != "known-inliers-and-noise"
     ]
     assert "opencv-ransac:threshold=12" in real
+    assert "opencv-ransac" in synthetic  # its default is for the protocol's data
+    assert "p3p-ransac:threshold=12" in real
+    assert any(name.startswith("p3p-ransac:") and "world_threshold" in name for name in synthetic)
 
 
 def test_default_solvers_are_all_but_the_networks_for_another_n():
-    left = set(list_solvers()) - set(default_solvers(9))
+    left = set(list_solvers()) - {name.partition(":")[0] for name in default_solvers(9)}
     assert all(name.startswith(("pnpnet-", "net-")) and not name.endswith("-n9") for name in left)
 
 

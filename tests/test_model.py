@@ -659,10 +659,12 @@ def test_every_solver_of_ours_keeps_the_contract(name, make_problems):
         beside = solver(broken, *p[1:3])
         order = torch.randperm(9, generator=torch.Generator().manual_seed(0))
         shuffled = solver(p.world_points[:, order], p.img_points[:, order], p.intrinsics)
-    assert result.matrix.shape == (7, 4, 4) and result.weights.shape == (7, 9)
+    assert result.matrix.shape == (7, 4, 4)
+    assert result.weights.shape == (7, 9)
     assert result.matrix.dtype == result.cost.dtype == torch.float64
     others = torch.arange(7) != 3
-    assert not beside.ok[3] and beside.matrix[3].isfinite().all()
+    assert not beside.ok[3]
+    assert beside.matrix[3].isfinite().all()
     for mine, theirs in zip(beside[:5], result[:5], strict=True):
         assert torch.equal(mine[others], theirs[others])
     # The order does not matter, save that enumerated samples are tried in it.
@@ -764,7 +766,8 @@ def test_an_initialiser_without_a_guess_fails_its_problem_alone(make_problems):
     assert result.ok.tolist() == [True, True, False, True, True, True, True]
     result.translation.sum().backward()
     gradient = world_points.grad.abs().sum((1, 2))
-    assert gradient[2] == 0 and (gradient[result.ok] > 0).all()
+    assert gradient[2] == 0
+    assert (gradient[result.ok] > 0).all()
 
 
 def test_an_init_pose_of_another_shape_or_dtype_is_refused(make_problems):

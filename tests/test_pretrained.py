@@ -70,4 +70,3 @@ def test_results_page_is_generated_from_its_files():
     results = {name: namespace["load_results"](folder / f"{name}.json") for name in namespace["RESULTS"]}
     complexity = json.loads((folder / "complexity.json").read_text())
     assert namespace["page"](results, complexity, folder / "ablation.csv") == (folder / "README.md").read_text()
-

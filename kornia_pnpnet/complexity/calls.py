@@ -43,12 +43,12 @@ def _lm_calls(lm: RobustWeightedLM, n: int, times: float = 1) -> Iterator[Call]:
 
 
 def _epnp_calls(epnp: EPnP, n: int, times: float) -> Iterator[Call]:
-    for part in ("epnp.EPnP.forward", "control_points.control_points", "depths.depth_system", "epnp._best_case"):
+    for part in ("epnp.EPnP.forward", "control_points.control_points", "depths.depth_system", "epnp.best_case"):
         yield part, times, (n,)
     yield "depths.four_cases", times, ()
     yield "depths.minimize", times, (4, 2)  # two iterations in all cases
     yield "depths.minimize", times, (1, epnp.iterations - 2)  # the others in the best one
-    yield "control_points.nearest_rotation", times, ()
+    yield "small.nearest_rotation", times, ()
 
 
 def _reppnp_calls(reppnp: REPPnP, n: int, times: float) -> Iterator[Call]:
@@ -63,7 +63,7 @@ def _reppnp_calls(reppnp: REPPnP, n: int, times: float) -> Iterator[Call]:
     yield "reppnp.REPPnP._keep", (null + rigid) * times, (n,)
     yield "reppnp._linearize", steps * times, (n,)
     yield "reppnp._normal_matrix", (steps + rigid) * times, (n,)
-    yield "control_points.nearest_rotation", times, ()
+    yield "small.nearest_rotation", times, ()
     yield "reppnp._step", steps * times, ()
     yield "geometry.retract", steps * times, ()
 

@@ -109,24 +109,22 @@ PARTS: dict[str, Callable[..., Operations]] = {
         add=34 * n - 22, multiply=45 * n + 3, divide=n + 3, sqrt=3, compare=13, logic=11
     ),
     # Newton's iteration on the quaternion.
-    "control_points.nearest_rotation": lambda: Operations(
-        add=198, multiply=281, divide=27, sqrt=4, log=2, compare=32, logic=12
-    ),
+    "small.nearest_rotation": lambda: Operations(add=198, multiply=281, divide=27, sqrt=4, log=2, compare=31, logic=20),
     # The last alignment, and which points are in front of the camera.
     "epnp.EPnP.forward": lambda n: Operations(
-        add=5 * n + 83, multiply=3 * n + 117, divide=2 * n + 10, compare=2 * n + 16, logic=n + 17
+        add=5 * n + 83, multiply=3 * n + 117, divide=2 * n + 10, compare=2 * n + 15, logic=n + 11
     ),
     # Moments of the pixels with the 4 coordinates, and of what they leave.
     "depths.depth_system": lambda n: Operations(add=72 * n - 10, multiply=81 * n + 27, divide=9, sqrt=1, logic=1),
     # Eigenvectors of 3 x 3, distances of the control points, and the linear systems of the four cases.
-    "depths.four_cases": lambda: Operations(add=750, multiply=1160, divide=25, sqrt=20, compare=56, logic=25),
+    "depths.four_cases": lambda: Operations(add=741, multiply=1150, divide=25, sqrt=20, compare=49, logic=24),
     # Normal equations of 4 depths in 6 distances, and their solution.
     "depths.minimize": lambda cases, iterations: (
         Operations(multiply=16) + cases * iterations * Operations(add=282, multiply=370, divide=4, compare=4)
     ),
     # A rotation and the reprojection error for each of the four cases.
-    "epnp._best_case": lambda n: Operations(
-        add=52 * n + 252, multiply=56 * n + 399, divide=4 * n + 10, sqrt=10, compare=8 * n + 11, logic=4 * n
+    "epnp.best_case": lambda n: Operations(
+        add=52 * n + 242, multiply=56 * n + 383, divide=4 * n + 10, sqrt=10, compare=8 * n + 3, logic=4 * n
     ),
     # The pairs in their own frame, features of the null space, and whether the last equations have full rank.
     "reppnp.REPPnP.forward": lambda n, refine_iterations: (
