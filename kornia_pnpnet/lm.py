@@ -226,7 +226,7 @@ class RobustWeightedLM(nn.Module):
         learnable: bool = True,
     ) -> None:
         super().__init__()
-        KORNIA_CHECK(isinstance(m, int) and m >= 0, f"m must be an integer of at least 0, got {m!r}.")
+        KORNIA_CHECK(type(m) is int and m >= 0, f"m must be an integer of at least 0, got {m!r}.")
         KORNIA_CHECK(kernel in KERNELS, f"kernel must be one of {sorted(KERNELS)}, got {kernel!r}.")
         KORNIA_CHECK(update in ("retraction", "additive"), f"update must be retraction or additive, got {update!r}.")
         self.config: dict[str, Any] = {

@@ -38,6 +38,9 @@ def check_inputs(
     init: Pose | None = None,
 ) -> None:
     """Check shapes, dtypes and devices; never values, which would stall a GPU and let one problem fail a batch."""
+    for name, value in (("world_points", world_points), ("img_points", img_points), ("intrinsics", intrinsics)):
+        if not isinstance(value, Tensor):
+            raise TypeCheckError(f"{name} must be a tensor, got {type(value).__name__}.")
     KORNIA_CHECK_SHAPE(world_points, ["B", "N", "3"])
     KORNIA_CHECK_SHAPE(img_points, ["B", "N", "2"])
     batch, count = world_points.shape[:2]

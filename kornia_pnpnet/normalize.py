@@ -128,13 +128,15 @@ class Normalize(nn.Module):
         there = weights > 0
         weights = torch.where(there, weights, 0.0)  # a pair that is not there has no gradient either
         pixels = self.f_const * normalize_points_with_intrinsics(img_points, intrinsics)
-        pixels = torch.where(there[..., None], pixels, 0.0)
-        valid = valid & (there.sum(-1) >= 3)
-
         centroid, scale, spread_out = self._world_frame(world_points, there)
         world_points = (world_points - centroid[:, None]) * scale[:, None, None]
+
+        # Too few pairs and degenerate worlds become zeros as well: behind this nothing of them has a gradient.
+        valid = valid & (there.sum(-1) >= 3) & spread_out
+        there = there & valid[:, None]
         world_points = torch.where(there[..., None], world_points, 0.0)
-        valid = valid & spread_out
+        pixels = torch.where(there[..., None], pixels, 0.0)
+        weights = torch.where(there, weights, 0.0)
 
         order = self._order(pixels, there)
         if self.order:

@@ -125,7 +125,7 @@ def create_solver(name: str, **options: Any) -> nn.Module:
         5
     """
     builders = _builders()
-    if name not in builders:
+    if not isinstance(name, str) or name not in builders:
         raise ValueCheckError(f"No solver {name!r}. There are: {', '.join(sorted(builders))}.")
     try:
         return builders[name](**options).eval()

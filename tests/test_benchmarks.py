@@ -46,6 +46,11 @@ def row(solver, rounds, name="n = 9, 3 outliers"):
     return {"solver": solver, "set": name, "success": success, **times}
 
 
+def test_the_page_is_generated_from_its_file():
+    results = json.loads(PATH.with_suffix(".json").read_text())
+    assert benchmark.page(results) == PATH.with_suffix(".md").read_text()
+
+
 def test_the_file_says_what_was_measured_with_what(written):
     assert written["environment"]["threads"] == 1
     assert written["environment"]["versions"]["torch"]

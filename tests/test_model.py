@@ -786,3 +786,57 @@ def test_solvers_without_a_network_are_saved_too(name, make_problems, tmp_path):
     again = PnPNet.from_pretrained(tmp_path)
     assert again.config() == solver.config()
     assert torch.equal(again(*p[:3]).matrix, solver(*p[:3]).matrix)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("name", ["epnp-lm", "reppnp-lm", "p3p-ransac", "ransac-epnp-lm"])
+def test_degenerate_worlds_leave_no_gradient_anywhere(name, dtype, make_problems):
+    """Not even in what all problems share: a parameter, or a factor before the layer."""
+    p = make_problems(n=9, dtype=dtype)
+    world = p.world_points.clone()
+    world[1], world[2], world[3] = 0.0, 1.0, world[3] * torch.finfo(dtype).tiny ** 0.5
+    world[4] = world[4, :1] + torch.arange(9, dtype=dtype)[:, None] * torch.ones(3, dtype=dtype)
+    factor = torch.ones((), dtype=dtype, requires_grad=True)
+    leaf = world.requires_grad_()
+    result = create_solver(name)(leaf * factor, p.img_points * factor, p.intrinsics)
+    assert not result.ok[1:5].any()
+    (result.cost.sum() + result.translation.sum() + result.init.translation.sum()).backward()
+    assert factor.grad.isfinite()
+    assert torch.equal(leaf.grad[1:5], torch.zeros(4, 9, 3, dtype=dtype))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_samples_round_the_same_wherever_they_stand(dtype, make_problems):
+    problems = make_problems(n=7, batch=40, dtype=dtype)
+    solver = create_solver("ransac-epnp-lm", max_samples=50)
+    whole = solver(*problems[:3])
+    for first_bad in (3, 27, 38):
+        world = problems.world_points.clone()
+        world[first_bad:] = torch.nan
+        beside = solver(world, *problems[1:3])
+        assert torch.equal(beside.matrix[:first_bad], whole.matrix[:first_bad])
+
+
+@pytest.mark.parametrize("name", ["epnp-lm", "reppnp", "p3p-ransac", "ransac-epnp-lm"])
+def test_solvers_are_pickled(name, make_problems):
+    p = make_problems()
+    solver = create_solver(name)
+    assert torch.equal(pickle.loads(pickle.dumps(solver))(*p[:3]).matrix, solver(*p[:3]).matrix)
+
+
+@pytest.mark.parametrize("unit", [1e-46, 1.0, 1e39])
+def test_any_unit_of_the_weights(unit, make_problems):
+    p = make_problems(n=10, noise=False)
+    result = create_solver("p3p-ransac")(*p[:3], torch.full((7, 10), unit, dtype=torch.float64))
+    assert result.ok.all()
+
+
+def test_what_is_no_tensor_or_no_name_is_a_typed_error(make_problems):
+    p = make_problems()
+    with pytest.raises(TypeCheckError, match="world_points must be a tensor, got list"):
+        PnPNet(None)(p.world_points.tolist(), *p[1:3])
+    with pytest.raises(ValueCheckError, match="No solver"):
+        create_solver(["epnp"])
+    for options in ({"seed": 1.5}, {"seed": -1}, {"threshold": -1.0}):
+        with pytest.raises(BaseError):
+            create_solver("p3p-ransac", **options)

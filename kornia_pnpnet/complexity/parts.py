@@ -67,7 +67,7 @@ PARTS: dict[str, Callable[..., Operations]] = {
     # Checks of all inputs; two changes of pixels; mean, covariance and scale of the world; two sorts.
     "normalize.Normalize.forward": lambda n: (
         Operations(add=27 * n - 3, multiply=28 * n + 16, divide=8 * n + 3, sqrt=3, compare=27 * n + 39)
-        + Operations(logic=27 * n + 31)
+        + Operations(logic=29 * n + 31)
         + 2 * sort(n)
     ),
     "normalize.Normalize.apply_to_pose": lambda: matmul(3, 3, 1) + Operations(add=3, multiply=3),
@@ -180,6 +180,6 @@ PARTS: dict[str, Callable[..., Operations]] = {
     ),
     # Centring, thresholds, the inliers twice, and whether so many could be chance.
     "ransac.RANSAC.forward": lambda n: Operations(
-        add=20 * n + 12, multiply=14 * n + 21, divide=12 * n + 2, sqrt=n, log=5, compare=18 * n + 13, logic=15 * n + 3
+        add=20 * n + 12, multiply=14 * n + 21, divide=13 * n + 2, sqrt=n, log=5, compare=19 * n + 13, logic=15 * n + 4
     ),
 }

@@ -155,6 +155,7 @@ class RANSAC(nn.Module):
         KORNIA_CHECK(0 < threshold < math.inf, f"threshold must be positive and finite, got {threshold}.")
         KORNIA_CHECK(0 <= world_threshold < math.inf, f"world_threshold must be at least 0, got {world_threshold}.")
         KORNIA_CHECK(0 < confidence < 1, f"confidence must lie in (0, 1), got {confidence}.")
+        KORNIA_CHECK(type(seed) is int and 0 <= seed < 2**63, f"seed must be an integer of at least 0, got {seed!r}.")
         KORNIA_CHECK(callable(scorer) or scorer in SCORERS, f"scorer must be one of {sorted(SCORERS)}, got {scorer!r}.")
         self.config: dict[str, Any] = {
             "minimal": _named(minimal),
@@ -207,7 +208,10 @@ class RANSAC(nn.Module):
         corr = corr._replace(world_points=corr.world_points - centre[:, None])
         with torch.no_grad():
             thresholds = self._thresholds(corr)
-            found = Search(self.plan, corr, thresholds).run()
+            # The search has single precision: the weights relative to the largest, since any unit of them is allowed.
+            largest = corr.weights.amax(-1, keepdim=True)
+            relative = corr.weights / torch.where(largest > 0, largest, 1.0)
+            found = Search(self.plan, corr._replace(weights=relative), thresholds).run()
         pose, judged = self._refine(corr, found.pose, thresholds)
         with torch.no_grad():
             ok = self._is_no_chance(found, corr, thresholds, judged)

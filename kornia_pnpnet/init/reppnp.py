@@ -7,6 +7,7 @@ algebraic error, the pixel error times the depth over the focal length: a length
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -93,7 +94,8 @@ class REPPnP(nn.Module):
     ) -> None:
         super().__init__()
         KORNIA_CHECK(0.0 < quantile <= 1.0, f"quantile must lie in (0, 1], got {quantile}.")
-        KORNIA_CHECK(max_error >= 0.0, f"max_error must be at least 0, got {max_error}.")
+        KORNIA_CHECK(0.0 <= max_error < math.inf, f"max_error must be finite and at least 0, got {max_error}.")
+        KORNIA_CHECK(type(reject_outliers) is bool, f"reject_outliers must be true or false, got {reject_outliers!r}.")
         self.config = {
             "reject_outliers": reject_outliers,
             "max_error": max_error,
@@ -104,9 +106,7 @@ class REPPnP(nn.Module):
         }
         for name, least in (("null_iterations", 0), ("rigid_iterations", 0), ("refine_iterations", 1)):
             count = self.config[name]
-            KORNIA_CHECK(
-                isinstance(count, int) and count >= least, f"{name} must be an integer >= {least}, got {count!r}."
-            )
+            KORNIA_CHECK(type(count) is int and count >= least, f"{name} must be an integer >= {least}, got {count!r}.")
         self.reject_outliers = reject_outliers
         self.max_error = max_error
         self.quantile = quantile

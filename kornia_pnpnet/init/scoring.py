@@ -29,12 +29,18 @@ MAX_ERROR = 1e6
 # Times a negative depth it is larger than any residual.
 _BEHIND = 1e15
 
+
+def _truncated(error: Tensor) -> Tensor:
+    return error.clamp(max=1.0)
+
+
+def _outlier(error: Tensor) -> Tensor:
+    return (error >= 1.0).to(error.dtype)
+
+
 #: Losses of a pair by its standardised squared residual :math:`e`, 1 at the threshold: the truncated squares of MSAC
 #: (P. Torr and A. Zisserman, "MLESAC", CVIU 78(1), 2000, section 3), and RANSAC's count of outliers.
-SCORERS: dict[str, Scorer] = {
-    "msac": lambda error: error.clamp(max=1.0),
-    "inliers": lambda error: (error >= 1.0).to(error.dtype),
-}
+SCORERS: dict[str, Scorer] = {"msac": _truncated, "inliers": _outlier}
 
 
 class Thresholds(NamedTuple):

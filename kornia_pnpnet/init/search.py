@@ -21,6 +21,8 @@ _DTYPE = torch.float32
 _FIRST_PAIRS, _KEPT = 16, 4
 # Each round has at least this share of the samples before it: fewer rounds against fewer samples too many.
 _GROWTH = 0.5
+# Samples are solved in multiples of this, twice the numbers in the longest vector of a processor.
+_VECTOR = 64
 # Damping of the least squares: next to none, they start close to their minimum.
 DAMPING = 1e-6
 # The first least squares take inliers up to this many times the threshold: the pose of a noisy sample misses some.
@@ -145,17 +147,22 @@ class Search:
         scene = self.scene.of(problems)
         positions = self.samples.positions(problems, start, stop)  # (P, H, s)
         batch, count, size = positions.shape
-        rows = positions + problems[:, None, None] * self.corr.weights.shape[1]
-        values = self.pairs.index_select(0, rows.flatten()).view(batch * count, size, 6)
+        rows = (positions + problems[:, None, None] * self.corr.weights.shape[1]).flatten(0, 1)  # (P H, s)
+        # Some arithmetic rounds differently in what is left over from a processor's vectors: nothing is left over, so
+        # that a sample has the same poses wherever it stands.
+        left_over = -len(rows) % _VECTOR
+        rows = torch.cat((rows, rows[:1].expand(left_over, -1))) if left_over else rows
+        values = self.pairs.index_select(0, rows.flatten()).view(-1, size, 6)
         world, img, weights = values.split((3, 2, 1), -1)
+        owners = torch.cat((problems.repeat_interleave(count), problems[:1].expand(left_over)))
         img_scale, world_scale = (
-            None if x is None else x[problems].repeat_interleave(count)
-            for x in (self.corr.img_scale, self.corr.world_scale)
+            None if x is None else x[owners] for x in (self.corr.img_scale, self.corr.world_scale)
         )
         sample = Correspondences(world, img, weights[..., 0], self.corr.focal, img_scale, world_scale)
         solved = self.plan.minimal.hypotheses(sample)
         valid = solved.valid & (weights[..., 0] > 0).all(-1, keepdim=True)
-        rotation, translation, valid = (x.unflatten(0, (batch, count)) for x in (*solved.pose, valid))
+        parts = (x[: batch * count].unflatten(0, (batch, count)) for x in (*solved.pose, valid))
+        rotation, translation, valid = parts
         losses, packed = self._rank(problems, scene, scene.pack(rotation, translation), valid.mT.flatten(1))
         return losses, scene.unpack(packed), valid.sum((1, 2))
 
