@@ -262,8 +262,9 @@ PAGE = """\
 Written by `docs/results/make.py` from the results files beside it; no number here is typed. Success: rotation error
 below 1° and translation error below 0.2 m, or 0.5 % of the median depth where a scene has no unit. Brackets: 95 %
 intervals. Every solver has the same problems of seeds that nothing was trained or tuned on, in float64. Time: calls of
-1000 problems, one thread, {cpu}, commit {commit}. The thresholds of all threshold methods were tuned by success on
-another seed:
+1000 problems, one thread, {cpu}, commit {commit:.9}; the machine was shared, so compare
+within a column, and see [benchmarks](../../benchmarks/solvers.md) for times taken in turns. The thresholds of all
+threshold methods were tuned by success on another seed:
 
 {tuned}
 
