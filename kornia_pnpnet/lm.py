@@ -354,10 +354,8 @@ def explains(projection: Projection, corr: Correspondences, prior: Tensor) -> Te
     spread = (pixels - (share[..., None] * pixels).sum(1, keepdim=True)).square().sum(-1)
     residual = torch.where(projection.in_front, projection.residual.detach().square().sum(-1), torch.inf)
 
-    def most(values: Tensor) -> Tensor:
-        ascending, order = values.sort(-1)
-        position = (share.gather(-1, order).cumsum(-1) < _EXPLAINED_SHARE).sum(-1, keepdim=True)
-        return ascending.gather(-1, position.clamp(max=values.shape[-1] - 1))[..., 0]
-
+    ascending, order = torch.stack((residual, spread)).sort(-1)  # (2, B, N)
+    position = (share.expand_as(ascending).gather(-1, order).cumsum(-1) < _EXPLAINED_SHARE).sum(-1, keepdim=True)
+    residual, spread = ascending.gather(-1, position.clamp(max=ascending.shape[-1] - 1))[..., 0]  # what most are below
     in_front = (projection.in_front & there).sum(-1)
-    return (in_front >= 3) & (most(residual) <= _EXPLAINED_RESIDUAL**2 * most(spread))
+    return (in_front >= 3) & (residual <= _EXPLAINED_RESIDUAL**2 * spread)

@@ -13,6 +13,7 @@ from torch import nn
 from kornia_pnpnet.init import P3P, RANSAC, EPnP, REPPnP, SubsetSolver
 from kornia_pnpnet.lm import RobustWeightedLM
 from kornia_pnpnet.model import PnPNet, shipped_weights
+from kornia_pnpnet.normalize import Normalize
 
 __all__ = ["create_solver", "list_solvers"]
 
@@ -34,14 +35,19 @@ def _trained(weights: str, m: int | None = None) -> PnPNet:
     return solver
 
 
-def _judged(init: nn.Module) -> PnPNet:
+def _judged(init: nn.Module, *, order: bool = True) -> PnPNet:
     """An initialiser by itself: its pose is only judged, and its weights are those of the result."""
-    return PnPNet(init, RobustWeightedLM(0, robustness=0.0, learnable=False))
+    return PnPNet(init, RobustWeightedLM(0, robustness=0.0, learnable=False), Normalize(order=order))
+
+
+def _alone(init: Callable[..., nn.Module], **options: Any) -> PnPNet:
+    """A method to which the order of the pairs does not matter, unrefined."""
+    return _judged(init(**options), order=False)
 
 
 def _refined(init: Callable[..., nn.Module], m: int = _FEW, **options: Any) -> PnPNet:
     """The paper's "-LM": the classical robust LM, alpha = 1, started from a method."""
-    return PnPNet(init(**options), RobustWeightedLM(m, learnable=False))
+    return PnPNet(init(**options), RobustWeightedLM(m, learnable=False), Normalize(order=False))
 
 
 def _identity_lm(m: int = _MANY) -> PnPNet:
@@ -66,9 +72,9 @@ def _peer(name: str, **options: Any) -> nn.Module:
 
 def _builders() -> dict[str, Callable[..., nn.Module]]:
     builders: dict[str, Callable[..., nn.Module]] = {
-        "epnp": lambda **options: _judged(EPnP(**options)),
+        "epnp": partial(_alone, EPnP),
         "epnp-lm": partial(_refined, EPnP),
-        "reppnp": lambda **options: _judged(REPPnP(**options)),
+        "reppnp": partial(_alone, REPPnP),
         "reppnp-lm": partial(_refined, REPPnP),
         "p3p-ransac": _p3p_ransac,
         "ransac-epnp-lm": _ransac_epnp_lm,

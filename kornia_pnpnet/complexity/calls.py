@@ -152,9 +152,9 @@ def part_calls(solver: PnPNet, n: int, *, outliers: int | None = None, better: i
         ValueCheckError: when there is no formula for the solver, or RANSAC's samples have more than n pairs.
     """
     normalize = solver.normalize
-    if not (normalize.order and normalize.center and normalize.scale):
-        raise ValueCheckError(f"There is no formula for {normalize}: it needs all that Normalize does by default.")
-    yield "normalize.Normalize.forward", 1, (n,)
+    if not (normalize.center and normalize.scale):
+        raise ValueCheckError(f"There is no formula for {normalize}: the world has to be centred and scaled.")
+    yield "normalize.Normalize.forward", 1, (n, normalize.order)
     if isinstance(solver.init, RANSAC):
         yield from _ransac_calls(solver.init, n, outliers, better)
     else:

@@ -65,10 +65,10 @@ def _best_of_samples(samples: int, size: int, slots: int, kept: int, drawn: bool
 #: moved cost nothing; what is computed once for the whole batch is not counted.
 PARTS: dict[str, Callable[..., Operations]] = {
     # Checks of all inputs; two changes of pixels; mean, covariance and scale of the world; two sorts.
-    "normalize.Normalize.forward": lambda n: (
+    "normalize.Normalize.forward": lambda n, order: (
         Operations(add=27 * n - 3, multiply=28 * n + 16, divide=8 * n + 3, sqrt=3, compare=27 * n + 39)
-        + Operations(logic=29 * n + 31)
-        + 2 * sort(n)
+        + Operations(logic=27 * n + 31)
+        + order * (Operations(logic=2 * n) + 2 * sort(n))
     ),
     "normalize.Normalize.apply_to_pose": lambda: matmul(3, 3, 1) + Operations(add=3, multiply=3),
     "normalize.Normalize.undo": lambda: matmul(3, 3, 1) + Operations(add=3, divide=3),
