@@ -75,8 +75,8 @@ def operation_count(solver: str | PnPNet, n: int, *, outliers: int | None = None
         ValueCheckError: when there is no such solver, or no formula for it.
 
     Example:
-        >>> round(operation_count("identity-lm", 9))
-        127090
+        >>> round(operation_count("identity-lm", 9), -4)
+        130000.0
     """
     solver = _solver(solver) if isinstance(solver, str) else solver
     return sum(operations.flops for operations in operations_by_part(solver, n, outliers=outliers).values())
