@@ -11,8 +11,11 @@ from torch import nn
 
 from kornia_pnpnet.complexity.parts import PARTS
 from kornia_pnpnet.init import P3P, RANSAC, EPnP, MLPInit, REPPnP, SubsetSolver
+from kornia_pnpnet.init.epnp import CASE_ITERATIONS
+from kornia_pnpnet.init.ransac import FINAL_STEPS
 from kornia_pnpnet.init.sampling import samples_needed
 from kornia_pnpnet.init.scoring import SCORERS
+from kornia_pnpnet.init.search import GROWTH
 from kornia_pnpnet.lm import RobustWeightedLM
 from kornia_pnpnet.model import PnPNet
 
@@ -46,8 +49,8 @@ def _epnp_calls(epnp: EPnP, n: int, times: float) -> Iterator[Call]:
     for part in ("epnp.EPnP.forward", "control_points.control_points", "depths.depth_system", "epnp.best_case"):
         yield part, times, (n,)
     yield "depths.four_cases", times, ()
-    yield "depths.minimize", times, (4, 2)  # two iterations in all cases
-    yield "depths.minimize", times, (1, epnp.iterations - 2)  # the others in the best one
+    yield "depths.minimize", times, (4, CASE_ITERATIONS)
+    yield "depths.minimize", times, (1, epnp.iterations - CASE_ITERATIONS)  # in the best case
     yield "small.nearest_rotation", times, ()
 
 
@@ -89,19 +92,19 @@ def _ransac_calls(ransac: RANSAC, n: int, outliers: int | None, better: int | No
             yield "ransac.SubsetSolver.hypotheses", sum(rounds), (_says_ok(init),)
         case _:
             raise ValueCheckError(f"There is no formula for samples solved by {type(minimal).__name__}.")
-    # The best poses of a round take one step, the best of them the others; then 2 steps end all.
+    # The best poses of a round take one step, the best of them the others; then the final ones.
     poses = min(plan.local_candidates, rounds[0] * slots)
     steps = poses + plan.local_iterations - 1
     yield "search.Search._improve", better, (poses,)
     yield "search.Search._descend", better * steps, (n,)
-    yield from _step_calls(n, better * steps + 2, own_damping=False)
-    yield "geometry.project", better * (steps + 1) + 2 + 1, (n,)
+    yield from _step_calls(n, better * steps + FINAL_STEPS, own_damping=False)
+    yield "geometry.project", better * (steps + 1) + FINAL_STEPS + 1, (n,)
     yield "search.Search.run", 1, (n, size, len(rounds), better)
     yield "ransac.RANSAC.forward", 1, (n,)
 
 
 def _rounds(ransac: RANSAC, n: int, outliers: int | None) -> list[int]:
-    """Samples in each round: at least as many as the rule asks for, each round half of what came before it or more."""
+    """Samples in each round: at least as many as the rule asks for, each a share of what came before it or more."""
     plan, size = ransac.plan, ransac.minimal.sample_size
     total = min(math.comb(n, size), plan.max_samples)
     if total == 0:
@@ -112,7 +115,7 @@ def _rounds(ransac: RANSAC, n: int, outliers: int | None) -> list[int]:
         needed = max(plan.min_samples, samples_needed(inliers, count, size, plan.confidence).item())
     rounds: list[int] = []
     while (done := sum(rounds)) < total and (done < needed or not rounds):
-        rounds.append(min(max(plan.min_samples, done // 2), plan.chunk_size, total - done))
+        rounds.append(min(max(plan.min_samples, int(GROWTH * done)), plan.chunk_size, total - done))
     return rounds
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from itertools import pairwise
 
 from kornia_pnpnet.complexity.operations import Operations, cholesky, matmul, smallest, solve, sort
+from kornia_pnpnet.init.search import FIRST_PAIRS, KEPT_ONE_IN
 
 __all__ = ["PARTS"]
 
@@ -35,11 +36,11 @@ def _rank(n: int, poses: int, kept: int) -> Operations:
 
     A pose and a pair take 9 sums and 12 products to project; residual, threshold and loss are the rest.
     """
-    total, pairs = Operations(), 16
+    total, pairs = Operations(), FIRST_PAIRS
     while 2 * pairs <= n:
-        best = max(poses // 4, kept)
+        best = max(poses // KEPT_ONE_IN, kept)
         total += _scores(pairs, poses) + smallest(poses, best) + Operations(multiply=pairs, divide=pairs)
-        poses, pairs = best, 4 * pairs
+        poses, pairs = best, KEPT_ONE_IN * pairs
     return total + _scores(n, poses) + smallest(poses, kept) + sort(kept)
 
 

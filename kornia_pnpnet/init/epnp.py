@@ -24,7 +24,7 @@ __all__ = ["EPnP", "best_case"]
 
 _MIN_PAIRS, _MIN_IN_FRONT = 4, 3
 # Gauss-Newton steps of every case before one of them is chosen.
-_CASE_ITERATIONS = 2
+CASE_ITERATIONS = 2
 # A reprojection error counts up to this many squared focal lengths, and a point behind the camera counts as much.
 _MAX_SQ_RESIDUAL = 4.0
 
@@ -82,8 +82,8 @@ class EPnP(nn.Module):
     def __init__(self, *, iterations: int = 5, algebraic_weight: float = 0.3) -> None:
         super().__init__()
         KORNIA_CHECK(
-            isinstance(iterations, int) and iterations >= _CASE_ITERATIONS,
-            f"iterations must be an integer of at least {_CASE_ITERATIONS}, got {iterations!r}.",
+            isinstance(iterations, int) and iterations >= CASE_ITERATIONS,
+            f"iterations must be an integer of at least {CASE_ITERATIONS}, got {iterations!r}.",
         )
         KORNIA_CHECK(
             0.0 <= algebraic_weight < float("inf"), f"algebraic_weight must be at least 0, got {algebraic_weight!r}."
@@ -134,10 +134,10 @@ class EPnP(nn.Module):
         self, system: DepthSystem, control: ControlPoints, plane_points: Tensor, vectors: Tensor
     ) -> tuple[Tensor, Tensor]:
         """The depths (4, B) of the best case, and whether they could be found (B,); else those of equal depth."""
-        cases = minimize(system, four_cases(system), self.algebraic_weight, _CASE_ITERATIONS)
+        cases = minimize(system, four_cases(system), self.algebraic_weight, CASE_ITERATIONS)
         best = best_case(system, cases, control, plane_points, vectors)
         depths = cases.gather(1, best.expand(4, 1, -1))[:, 0]
-        depths = minimize(system, depths, self.algebraic_weight, self.iterations - _CASE_ITERATIONS)
+        depths = minimize(system, depths, self.algebraic_weight, self.iterations - CASE_ITERATIONS)
         # Greater ratios than rounding resolves are a failure; NaN compares false.
         solved = (depths.abs() < 1.0 / torch.finfo(depths.dtype).eps).all(0)
         flat = torch.zeros_like(depths)

@@ -20,7 +20,7 @@ from kornia_pnpnet.types import Correspondences, Guess, Hypotheses, Pose
 __all__ = ["RANSAC", "SubsetSolver"]
 
 # Steps of least squares from the best pose: it is near the minimum already.
-_FINAL_STEPS = 2
+FINAL_STEPS = 2
 # A pose is chance when so many with as many inliers are expected from pairs without a pose.
 _MAX_FALSE_ALARMS = 1e-2
 
@@ -236,7 +236,7 @@ class RANSAC(nn.Module):
             projection = project(pose, part)
             with torch.no_grad():
                 inliers = judge(projection, part, limits).weights
-            for _ in range(_FINAL_STEPS):
+            for _ in range(FINAL_STEPS):
                 pose = lm_step(part, pose, projection, part.weights * inliers, one, damping).pose
                 projection = project(pose, part)
             with torch.no_grad():

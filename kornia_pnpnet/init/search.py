@@ -18,9 +18,9 @@ __all__ = ["Found", "MinimalSolver", "Plan", "Search", "take"]
 # Poses are compared and improved in this precision: a ten thousandth of a pixel at the protocol's focal length.
 _DTYPE = torch.float32
 # Of many pairs, this many are scored first, four times as many for the best quarter, and so on.
-_FIRST_PAIRS, _KEPT = 16, 4
+FIRST_PAIRS, KEPT_ONE_IN = 16, 4
 # Each round has at least this share of the samples before it: fewer rounds against fewer samples too many.
-_GROWTH = 0.5
+GROWTH = 0.5
 # Samples are solved in multiples of this, twice the numbers in the longest vector of a processor.
 _VECTOR = 64
 # Damping of the least squares: next to none, they start close to their minimum.
@@ -136,7 +136,7 @@ class Search:
 
     def _round(self, done: int) -> int:
         """How many samples come after the first ``done``."""
-        return min(max(self.plan.min_samples, int(_GROWTH * done)), self.plan.chunk_size)
+        return min(max(self.plan.min_samples, int(GROWTH * done)), self.plan.chunk_size)
 
     def _of(self, problems: Tensor) -> tuple[Correspondences, Thresholds]:
         """Correspondences and thresholds of some problems."""
@@ -168,12 +168,12 @@ class Search:
 
     def _rank(self, problems: Tensor, scene: Scene, packed: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
         """The best poses and their losses; of many pairs some are scored first, then more for the better poses."""
-        pairs, width = _FIRST_PAIRS, packed.shape[-1]
+        pairs, width = FIRST_PAIRS, packed.shape[-1]
         while 2 * pairs <= scene.points.shape[1]:
             some = scene.pairs(self.samples.spread(problems, pairs))
-            width = max(width // _KEPT, self.plan.local_candidates)
+            width = max(width // KEPT_ONE_IN, self.plan.local_candidates)
             _, packed, valid = self._keep(some, packed, valid, width, ordered=False)
-            pairs *= _KEPT
+            pairs *= KEPT_ONE_IN
         losses, packed, _ = self._keep(scene, packed, valid, self.plan.local_candidates)
         return losses, packed
 

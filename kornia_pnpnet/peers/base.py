@@ -149,6 +149,32 @@ class PeerSolver(nn.Module):
         )
 
 
+class RobustPeer(PeerSolver):
+    """What the peers that draw samples share: their options, checked and kept.
+
+    Args:
+        threshold: as for :class:`PeerSolver`, finite.
+        confidence: probability to have seen an outlier-free sample, in (0, 1).
+        seed: of the samples.
+        counts: whole numbers of at least 1 (``True`` is none), kept under their names.
+
+    Raises:
+        BaseError: for an argument out of range.
+    """
+
+    def __init__(self, *, threshold: float, confidence: float, seed: int, **counts: int) -> None:
+        super().__init__(threshold=threshold)
+        KORNIA_CHECK(threshold < math.inf, f"threshold must be positive and finite, got {threshold}.")
+        KORNIA_CHECK(0 < confidence < 1, f"confidence must lie in (0, 1), got {confidence}.")
+        KORNIA_CHECK(type(seed) is int and seed >= 0, f"seed must be a whole number of at least 0, got {seed!r}.")
+        self.confidence = confidence
+        self.seed = seed
+        for name, count in counts.items():
+            whole = type(count) is int and count >= 1
+            KORNIA_CHECK(whole, f"{name} must be a whole number of at least 1, got {count!r}.")
+            setattr(self, name, count)
+
+
 def _solvable(
     world: np.ndarray, img: np.ndarray, cameras: np.ndarray, weights: np.ndarray, present: np.ndarray
 ) -> np.ndarray:
@@ -183,12 +209,3 @@ def _squared_errors(
 def missing(library: str) -> ImportError:
     """What to raise where a library that a solver needs is not installed."""
     return ImportError(f"This solver needs {library}: pip install 'kornia_pnpnet[eval]'")
-
-
-def check_robust_options(*, threshold: float, confidence: float, seed: int, **counts: int) -> None:
-    """Check what the robust peers share; ``counts`` are whole numbers of at least 1, by name (``True`` is none)."""
-    KORNIA_CHECK(0 < threshold < math.inf, f"threshold must be positive and finite, got {threshold}.")
-    KORNIA_CHECK(0 < confidence < 1, f"confidence must lie in (0, 1), got {confidence}.")
-    KORNIA_CHECK(type(seed) is int and seed >= 0, f"seed must be a whole number of at least 0, got {seed!r}.")
-    for name, count in counts.items():
-        KORNIA_CHECK(type(count) is int and count >= 1, f"{name} must be a whole number of at least 1, got {count!r}.")

@@ -8,7 +8,7 @@ from types import ModuleType
 import numpy as np
 from kornia.core.check import KORNIA_CHECK
 
-from kornia_pnpnet.peers.base import PeerPose, PeerSolver, check_robust_options, missing
+from kornia_pnpnet.peers.base import PeerPose, PeerSolver, RobustPeer, missing
 
 __all__ = ["OpenCVPnP", "OpenCVRansac", "OpenCVUsac"]
 
@@ -64,15 +64,10 @@ class OpenCVPnP(PeerSolver):
         return PeerPose(rotation, translation.ravel(), np.ones(len(world_points), dtype=bool))
 
 
-class _Robust(PeerSolver):
+class _Robust(RobustPeer):
     """What the families of ``solvePnPRansac`` share."""
 
-    def __init__(self, *, threshold: float, iterations: int, confidence: float, seed: int) -> None:
-        super().__init__(threshold=threshold)
-        check_robust_options(threshold=threshold, confidence=confidence, seed=seed, iterations=iterations)
-        self.iterations = iterations
-        self.confidence = confidence
-        self.seed = seed
+    iterations: int
 
     def _search(
         self, world_points: np.ndarray, img_points: np.ndarray, intrinsics: np.ndarray, flag: int

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from kornia.core.check import KORNIA_CHECK
 
-from kornia_pnpnet.peers.base import PeerPose, PeerSolver, check_robust_options, missing
+from kornia_pnpnet.peers.base import PeerPose, RobustPeer, missing
 
 __all__ = ["PoseLib"]
 
@@ -21,7 +21,7 @@ def _import_poselib() -> ModuleType:
     return poselib
 
 
-class PoseLib(PeerSolver):
+class PoseLib(RobustPeer):
     r"""PoseLib's ``estimate_absolute_pose``, problem by problem: P3P, LO-RANSAC and a robust refinement of the inliers.
 
     The default threshold is the best of a grid on the protocol's data, see
@@ -47,6 +47,9 @@ class PoseLib(PeerSolver):
         tensor([True, True, True, True])
     """
 
+    min_iterations: int
+    max_iterations: int
+
     def __init__(
         self,
         *,
@@ -56,18 +59,13 @@ class PoseLib(PeerSolver):
         confidence: float = 0.9999,
         seed: int = 0,
     ) -> None:
-        super().__init__(threshold=threshold)
-        check_robust_options(
+        super().__init__(
             threshold=threshold,
             confidence=confidence,
             seed=seed,
             min_iterations=min_iterations,
             max_iterations=max_iterations,
         )
-        self.min_iterations = min_iterations
-        self.max_iterations = max_iterations
-        self.confidence = confidence
-        self.seed = seed
         poselib = _import_poselib()
         unknown = self._options().keys() - poselib.RansacOptions().keys()
         KORNIA_CHECK(not unknown, f"PoseLib {poselib.__version__} has no options {sorted(unknown)}.")
@@ -83,7 +81,7 @@ class PoseLib(PeerSolver):
         }
 
     def solve_one(self, world_points: np.ndarray, img_points: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:
-        """Solve one problem, see :meth:`PeerSolver.solve_one`."""
+        """Solve one problem, see :meth:`~kornia_pnpnet.peers.PeerSolver.solve_one`."""
         poselib = _import_poselib()
         focal_and_centre = [intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]]
         camera = {"model": "PINHOLE", "width": -1, "height": -1, "params": focal_and_centre}

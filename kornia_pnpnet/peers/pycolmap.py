@@ -8,7 +8,7 @@ from types import ModuleType
 import numpy as np
 from kornia.core.check import KORNIA_CHECK
 
-from kornia_pnpnet.peers.base import PeerPose, PeerSolver, check_robust_options, missing
+from kornia_pnpnet.peers.base import PeerPose, RobustPeer, missing
 
 __all__ = ["PyColmap"]
 
@@ -21,7 +21,7 @@ def _import_pycolmap() -> ModuleType:
     return pycolmap
 
 
-class PyColmap(PeerSolver):
+class PyColmap(RobustPeer):
     r"""COLMAP's absolute pose estimation, problem by problem: LO-RANSAC, then robust least squares of the inliers.
 
     The default threshold and loss scale are the best of a grid on the protocol's data, see
@@ -47,6 +47,9 @@ class PyColmap(PeerSolver):
         tensor([True, True, True, True])
     """
 
+    min_iterations: int
+    max_iterations: int
+
     def __init__(
         self,
         *,
@@ -57,8 +60,7 @@ class PyColmap(PeerSolver):
         confidence: float = 0.9999,
         seed: int = 0,
     ) -> None:
-        super().__init__(threshold=threshold)
-        check_robust_options(
+        super().__init__(
             threshold=threshold,
             confidence=confidence,
             seed=seed,
@@ -69,14 +71,10 @@ class PyColmap(PeerSolver):
         counts = f"min_iterations {min_iterations} must not exceed max_iterations {max_iterations}."
         KORNIA_CHECK(min_iterations <= max_iterations, counts)
         self.loss_scale = loss_scale
-        self.min_iterations = min_iterations
-        self.max_iterations = max_iterations
-        self.confidence = confidence
-        self.seed = seed
         _import_pycolmap()
 
     def solve_one(self, world_points: np.ndarray, img_points: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:
-        """Solve one problem, see :meth:`PeerSolver.solve_one`."""
+        """Solve one problem, see :meth:`~kornia_pnpnet.peers.PeerSolver.solve_one`."""
         pycolmap = _import_pycolmap()
         focal_and_centre = [intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]]
         camera = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=focal_and_centre)
