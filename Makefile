@@ -1,4 +1,4 @@
-# demo, test, test-all and lint make .venv when it is missing, with every extra, and bring it up to date when
+# demo, bench, test, test-all and lint make .venv when it is missing, with every extra, and bring it up to date when
 # pyproject.toml or constraints.txt changed. Linux wheels of torch on PyPI bring CUDA along; to leave it out:
 #   PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu make demo
 
@@ -19,7 +19,7 @@ $(STAMP): FORCE
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-all lint clean FORCE
+.PHONY: help install demo bench test test-all lint clean FORCE
 
 help: ## Show this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' Makefile | while IFS='|' read -r name text; do \
@@ -30,6 +30,12 @@ install: $(STAMP) ## Make .venv with every extra
 demo: $(STAMP) ## Solve problems with the shipped weights, beside OpenCV; DATA=folder solves that COLMAP scene
 	@mkdir -p outputs/demo
 	$(VENV)/bin/pnpnet demo $(if $(DATA),--data '$(DATA)')
+
+# A quarter of an hour on two quiet cores.
+bench: $(STAMP) ## Time and memory beside other libraries; writes benchmarks/*.json and docs/performance.md
+	$(PY) benchmarks/solvers.py --repeats 5 --out benchmarks/solvers.json
+	$(PY) benchmarks/performance.py measure
+	$(PY) benchmarks/performance.py render
 
 # One thread per worker: two workers on two cores would otherwise fight over them.
 test: lint ## Lint, types and the quick tests

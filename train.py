@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from kornia_pnpnet.reports import RESULTS_NAME, run_results, summarize_runs, write_json, write_model_card
 from kornia_pnpnet.runstate import TrainingError
-from kornia_pnpnet.training import fit
+from kornia_pnpnet.training import describe_shares, fit
 
 log = logging.getLogger("train")
 
@@ -34,6 +34,8 @@ def main(config: DictConfig) -> float | None:
     fabric.launch()
     torch.manual_seed(config.seed)
     model = instantiate(config.model.solver)
+    if config.compile:
+        model.compile()
     validation = {name: instantiate(source).batch(0) for name, source in config.data.validation.items()}
     settings = instantiate(config.train, _convert_="all")
     processes = int(os.environ.get("WORLD_SIZE", fabric.world_size))
@@ -54,6 +56,7 @@ def main(config: DictConfig) -> float | None:
             folder,
             fabric=fabric,
             identity={"data": resolved["data"]["train"], "loss": resolved["loss"], "model_config": resolved["model"]},
+            data_workers=config.data_workers,
             resume=config.resume,
             progress=config.progress,
         )
@@ -65,9 +68,10 @@ def main(config: DictConfig) -> float | None:
     if not fabric.is_global_zero:
         return None
     log.info(
-        "%s updates, %.1f per second, peak memory %.0f MiB, %s skipped",
+        "%s updates, %.1f per second (%s), peak memory %.0f MiB, %s skipped",
         report.update,
         report.updates_per_second,
+        describe_shares(report.time_shares),
         report.peak_memory_mib,
         report.skipped,
     )

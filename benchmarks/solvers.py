@@ -9,17 +9,14 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
-import os
-import statistics
-import subprocess
-import sys
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from contenders import bare_call
+from harness import in_turns, load, peak_bytes, ratio, run_child, say, seconds, summary, threads
 from kornia.core.exceptions import BaseError
 from torch import nn
 
@@ -28,7 +25,6 @@ from kornia_pnpnet.choices import load_solver
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.environment import environment
 from kornia_pnpnet.evaluation import draw_problems
-from kornia_pnpnet.peers import PeerSolver
 from kornia_pnpnet.results import save_results
 from kornia_pnpnet.types import Problems
 
@@ -72,22 +68,6 @@ class Speedup(NamedTuple):
 SPEEDUPS = (Speedup("epnp", "opencv-epnp", 3.0), Speedup("p3p-ransac", "poselib", 1.0))
 
 
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """PyTorch and OpenCV on one thread, and as they were afterwards; both are settings of the whole process."""
-    cv2 = sys.modules.get("cv2")  # imported by its solvers, if there are any
-    threads = torch.get_num_threads(), None if cv2 is None else cv2.getNumThreads()
-    torch.set_num_threads(1)
-    if cv2 is not None:
-        cv2.setNumThreads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads[0])
-        if cv2 is not None:
-            cv2.setNumThreads(threads[1])
-
-
 def draw(name: str, count: int, seed: int) -> Problems:
     """Problems of one of ``SETS``, in float64; another seed for each set."""
     n, outliers = SETS[name]
@@ -106,75 +86,42 @@ def runs_on(spec: str, name: str) -> bool:
     return SETS[name][0] == SMALL or base_name(spec) in ROBUST
 
 
-def call_of(solver: nn.Module, problems: Problems) -> Callable[[], object]:
-    """What is timed: one call with the whole batch for ours, the bare calls of the library for a peer's."""
-    if isinstance(solver, PeerSolver):
-        single = list(zip(*(x.numpy() for x in problems[:3]), strict=True))
-        return lambda: [solver.solve_one(*one) for one in single]
-    return lambda: solver(*problems[:3])
-
-
 @torch.no_grad()
 def measure_set(
     solvers: Mapping[str, nn.Module], name: str, count: int, repeats: int, seed: int
 ) -> list[dict[str, Any]]:
     """Time the solvers on one set in rounds, each solver once in a round, and count what they solve."""
     problems = draw(name, count, seed)
-    calls = {spec: call_of(solver, problems) for spec, solver in solvers.items()}
-    rates, rounds = {}, {}
+    rates, timers = {}, {}
     for spec, solver in solvers.items():
         result = solver(*problems[:3])  # not timed: first calls are slower
         rates[spec] = success_rate(success(pose_errors(result.pose, problems.pose)))
-        rounds[spec] = list[float]()
-    for _ in range(repeats):
-        for spec, call in calls.items():
-            start = time.perf_counter()
-            call()
-            rounds[spec].append(1e6 * (time.perf_counter() - start) / count)
+        timers[spec] = partial(seconds, bare_call(solver, problems))
+    rounds = in_turns(timers, repeats)
     return [
-        {
-            "solver": spec,
-            "set": name,
-            "success": rates[spec]._asdict(),
-            "median_us": statistics.median(times),
-            "min_us": min(times),
-            "rounds_us": times,
-        }
+        {"solver": spec, "set": name, "success": rates[spec]._asdict(), **summary([1e6 * s / count for s in times])}
         for spec, times in rounds.items()
     ]
 
 
 def speedups(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Every target of speed on every small set on which both sides were measured.
-
-    The ratio is the median over the rounds of the peer's time by ours in the same round.
-    """
+    """Every target of speed on every small set on which both sides were measured."""
     found = []
     for wanted in SPEEDUPS:
         for mine, theirs in itertools.product(rows, rows):
             names = base_name(mine["solver"]), base_name(theirs["solver"])
             if names != wanted[:2] or mine["set"] != theirs["set"] or SETS[mine["set"]][0] != SMALL:
                 continue
-            rounds = zip(theirs["rounds_us"], mine["rounds_us"], strict=True)
-            ratio = statistics.median(peer / ours for peer, ours in rounds)
-            entry = {"solver": mine["solver"], "peer": theirs["solver"], "set": mine["set"], "ratio": ratio}
-            found.append({**entry, "target": wanted.target, "met": ratio >= wanted.target})
+            times = ratio(mine, theirs)
+            entry = {"solver": mine["solver"], "peer": theirs["solver"], "set": mine["set"], "ratio": times}
+            found.append({**entry, "target": wanted.target, "met": times >= wanted.target})
     return found
-
-
-def peak_bytes() -> int:
-    """The most memory that this process has held so far.
-
-    Not ``getrusage``: what it says of a new process can include the one that started it.
-    """
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:"))
 
 
 def memory_here(spec: str, count: int, seed: int) -> dict[str, int]:
     """Solve one large batch in this process; its peak before there were problems, and in the end."""
     before = peak_bytes()
-    with one_thread(), torch.no_grad():
+    with threads(), torch.no_grad():
         load_solver(spec)(*draw(MEMORY_SET, count, seed)[:3])
     return {"imports_bytes": before, "peak_bytes": peak_bytes()}
 
@@ -184,13 +131,8 @@ def measure_memory(spec: str, count: int, seed: int) -> dict[str, Any]:
 
     Peaks of the same run differ: it is chance what the allocator has given back when the next tensor comes.
     """
-    command = [sys.executable, __file__, "--memory-of", spec, "--memory-count", str(count), "--seed", str(seed)]
-    runs = []
-    for _ in range(MEMORY_RUNS):
-        output = subprocess.run(command, capture_output=True, text=True, check=False)
-        if output.returncode:
-            raise RuntimeError(f"{' '.join(command)} failed:\n{output.stderr}")
-        runs.append(json.loads(output.stdout))
+    arguments = ("--memory-of", spec, "--memory-count", str(count), "--seed", str(seed))
+    runs = [run_child(Path(__file__), *arguments) for _ in range(MEMORY_RUNS)]
     peak = max(run["peak_bytes"] for run in runs)
     return {
         "solver": spec,
@@ -219,30 +161,30 @@ def measure(specs: Sequence[str], *, count: int, repeats: int, memory_count: int
         ``environment``, ``settings``, ``load_average`` (of the last minute, before and after), ``skipped`` (why, by
         solver), ``rows`` (one for each solver and set), ``speedups`` and ``memory``.
     """
-    load = os.getloadavg()[0]
+    before = load()
     solvers, skipped = {}, {}
     for spec in specs:
         try:
             solvers[spec] = load_solver(spec).double()
         except ImportError as error:
             skipped[spec] = str(error)
-            print(f"skipped: {spec}: {error}", file=sys.stderr)
+            say(f"skipped: {spec}: {error}")
     memory = []
     for spec in solvers if memory_count else ():
         if base_name(spec) == MEMORY_SOLVER:
-            print(f"memory of {spec}", file=sys.stderr)
+            say(f"memory of {spec}")
             memory.append(measure_memory(spec, memory_count, seed))
     rows = []
-    with one_thread():
+    with threads():
         for name in SETS:
-            print(name, file=sys.stderr)
+            say(name)
             chosen = {spec: solver for spec, solver in solvers.items() if runs_on(spec, name)}
             rows += measure_set(chosen, name, count, repeats, seed)
         settings = {"solvers": list(specs), "count": count, "repeats": repeats, "seed": seed, "dtype": "float64"}
         return {
             "environment": environment(),
             "settings": settings,
-            "load_average": [load, os.getloadavg()[0]],
+            "load_average": [before, load()],
             "skipped": skipped,
             "rows": rows,
             "speedups": speedups(rows),

@@ -7,14 +7,11 @@ and the principal point 0 (see :mod:`kornia_pnpnet.normalize`). A point is *in f
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from kornia.geometry.conversions import (
-    axis_angle_to_rotation_matrix,
-    convert_points_from_homogeneous,
-    rotation_matrix_to_axis_angle,
-)
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix, rotation_matrix_to_axis_angle
 from kornia.geometry.liegroup import So3
 from torch import Tensor
 
@@ -22,10 +19,13 @@ from kornia_pnpnet.types import Correspondences, Pose
 
 __all__ = [
     "MIN_DEPTH_RATIO",
-    "Linearization",
+    "NormalEquations",
     "Projection",
     "additive_tangent_map",
-    "linearize",
+    "change_tangent",
+    "move",
+    "normal_equations",
+    "problems_last",
     "project",
     "retract",
     "retract_additive",
@@ -38,33 +38,42 @@ MIN_DEPTH_RATIO = 1e-3
 
 
 class Projection(NamedTuple):
-    r"""Where the points fall, and what the Jacobian needs of it.
+    r"""Where the points fall, coordinate by coordinate: every tensor is of shape :math:`(B, N)`.
 
     Attributes:
-        residual: projection minus measurement in pixels, 0 for points behind the camera, shape :math:`(B, N, 2)`.
-        in_front: whether the point is in front of the camera, bool, shape :math:`(B, N)`.
-        rotated: the points in the camera's axes before translation, :math:`R x`, shape :math:`(B, N, 3)`.
-        cam_points: the points in the camera frame, (0, 0, 1) for those behind, shape :math:`(B, N, 3)`.
-        plane_points: :math:`(x/z, y/z)`, shape :math:`(B, N, 2)`.
+        residual: projection minus measurement in pixels, horizontal and vertical. It says nothing where ``in_front``
+            is false, but is finite there.
+        in_front: whether the point is in front of the camera, bool.
+        rotated: the points in the camera's axes before translation, :math:`y = R x`, three coordinates.
+        plane_points: :math:`(x/z, y/z)`, 0 for points behind the camera.
+        inv_depth: :math:`1/z`, 0 for points behind the camera.
+        scaled_residual: the residual times the depth.
     """
 
-    residual: Tensor
+    residual: tuple[Tensor, Tensor]
     in_front: Tensor
-    rotated: Tensor
-    cam_points: Tensor
-    plane_points: Tensor
+    rotated: tuple[Tensor, Tensor, Tensor]
+    plane_points: tuple[Tensor, Tensor]
+    inv_depth: Tensor
+    scaled_residual: tuple[Tensor, Tensor]
+
+    @property
+    def sq_residual(self) -> Tensor:
+        """Squared length of the residual in square pixels, shape :math:`(B, N)`."""
+        u, v = self.residual
+        return torch.addcmul(u * u, v, v)
 
 
-class Linearization(NamedTuple):
-    r"""Residual and Jacobian of every pixel coordinate, both divided by the focal length.
+class NormalEquations(NamedTuple):
+    r"""The damped Gauss-Newton system before damping, entry by entry: every tensor is of shape :math:`(B,)`.
 
     Attributes:
-        residual: first all horizontal, then all vertical coordinates, shape :math:`(B, 2N)`.
-        jacobian: its derivative by the tangent :math:`(\omega, v)`, transposed, shape :math:`(B, 6, 2N)`.
+        hessian: the rows of :math:`J^\top W J` up to the diagonal, the 21 entries :math:`H_{ij}` with :math:`i \ge j`.
+        gradient: :math:`J^\top W r`, 6 entries.
     """
 
-    residual: Tensor
-    jacobian: Tensor
+    hessian: Sequence[Sequence[Tensor]]
+    gradient: Sequence[Tensor]
 
 
 def transform(pose: Pose, world_points: Tensor) -> Tensor:
@@ -80,10 +89,21 @@ def transform(pose: Pose, world_points: Tensor) -> Tensor:
     return world_points @ pose.rotation.mT + pose.translation[:, None]
 
 
+def problems_last(corr: Correspondences) -> Correspondences:
+    """The same correspondences with the problems side by side in memory, which is where the arithmetic is fastest.
+
+    Shapes and values stay. One coordinate of all problems is then one row of memory, so that elementwise operations
+    run at full width however few pairs a problem has, and a compiler can keep a problem in registers.
+    """
+    world_points, img_points = (x.permute(2, 1, 0).contiguous().permute(2, 1, 0) for x in corr[:2])
+    return corr._replace(world_points=world_points, img_points=img_points, weights=corr.weights.mT.contiguous().mT)
+
+
 def project(pose: Pose, corr: Correspondences) -> Projection:
     r"""Project the points of normalised correspondences and compare them with their pixels.
 
-    Points behind the camera are replaced *before* the division, so that neither values nor gradients can overflow.
+    The depth of points behind the camera is replaced *before* the division, so that neither values nor gradients can
+    overflow.
 
     Args:
         pose: world-to-camera pose in the frame of ``corr``.
@@ -96,56 +116,91 @@ def project(pose: Pose, corr: Correspondences) -> Projection:
         >>> points = torch.tensor([[[1.0, 2.0, 4.0]]])
         >>> corr = Correspondences(points, torch.zeros(1, 1, 2), torch.ones(1, 1), torch.tensor(100.0))
         >>> project(Pose(torch.eye(3)[None], torch.zeros(1, 3)), corr).residual
-        tensor([[[25., 50.]]])
+        (tensor([[25.]]), tensor([[50.]]))
     """
-    rotated = corr.world_points @ pose.rotation.mT  # (B, N, 3)
-    cam_points = rotated + pose.translation[:, None]
-    # Compared without a square root, whose gradient is infinite at 0.
-    sq_ratio = MIN_DEPTH_RATIO * MIN_DEPTH_RATIO
-    depth = cam_points[..., 2]
-    in_front = (depth > 0) & (depth.square() > sq_ratio * cam_points.detach().square().sum(-1))
-    axis = torch.eye(3, dtype=cam_points.dtype, device=cam_points.device)[2]
-    safe = torch.where(in_front[..., None], cam_points, axis)
-    plane_points = convert_points_from_homogeneous(safe, eps=0.0)  # (B, N, 2)
-    residual = torch.where(in_front[..., None], corr.focal * plane_points - corr.img_points, 0.0)
-    return Projection(residual, in_front, rotated, safe, plane_points)
+    a, b, c = corr.world_points.unbind(-1)  # (B, N) each, and the pose (B, 1) each
+    matrix = [row.unbind(1) for row in pose.rotation[..., None].unbind(1)]
+    y0, y1, y2 = (torch.addcmul(torch.addcmul(i * a, j, b), k, c) for i, j, k in matrix)
+    x, y, z = (r + t for r, t in zip((y0, y1, y2), pose.translation[..., None].unbind(1), strict=True))
+    # z |z| > ratio² |x|²: one comparison for both conditions, and no square root, whose gradient is infinite at 0.
+    margin = z * z.abs()
+    for coordinate in (x, y, z):
+        margin = torch.addcmul(margin, coordinate, coordinate, value=-MIN_DEPTH_RATIO * MIN_DEPTH_RATIO)
+    in_front = margin > 0
+    inv_depth = torch.where(in_front, z, torch.inf).reciprocal()
+    u, v = corr.img_points.unbind(-1)
+    scaled = torch.addcmul(corr.focal * x, u, z, value=-1), torch.addcmul(corr.focal * y, v, z, value=-1)
+    residual = scaled[0] * inv_depth, scaled[1] * inv_depth
+    return Projection(residual, in_front, (y0, y1, y2), (x * inv_depth, y * inv_depth), inv_depth, scaled)
 
 
-def linearize(projection: Projection, focal: Tensor, tangent_map: Tensor | None = None) -> Linearization:
-    r"""Analytic Jacobian of the residual by the six pose parameters.
+def normal_equations(projection: Projection, weights: Tensor) -> NormalEquations:
+    r"""The normal equations of the residuals by the six pose parameters.
 
     With :math:`y = R x`, :math:`p = x/z`, :math:`q = y/z` of the camera point, and the tangent
-    :math:`(\omega, v)` of :func:`retract`, the rows divided by the focal length are
+    :math:`(\omega, v)` of :func:`retract`, the rows of the Jacobian divided by the focal length are
     :math:`\tfrac1z [-p y_y,\; y_z + p y_x,\; -y_y,\; 1,\; 0,\; -p]` and
-    :math:`\tfrac1z [-y_z - q y_y,\; q y_x,\; y_x,\; 0,\; 1,\; -q]`.
+    :math:`\tfrac1z [-y_z - q y_y,\; q y_x,\; y_x,\; 0,\; 1,\; -q]`. The factor :math:`1/z` goes into the weights,
+    and what is known of the rows (a one, a zero, columns that both rows share) is not multiplied.
 
     Args:
         projection: what :func:`project` returned at the pose.
-        focal: the focal length in pixels, a scalar.
-        tangent_map: :math:`(B, 3, 3)`, the derivative of :math:`\omega` by other rotation parameters, for
-            :func:`retract_additive` the left Jacobian of SO(3).
+        weights: weight of each pair, :math:`(B, N)`; points behind the camera do not count whatever it is.
 
     Returns:
-        Residual and transposed Jacobian, in units of the focal length.
+        :math:`J^\top W J` and :math:`J^\top W r` with :math:`J` divided by the focal length and :math:`r` in pixels.
     """
-    y0, y1, y2 = projection.rotated.unbind(-1)  # (B, N) each
-    p, q = projection.plane_points.unbind(-1)
-    inv_z = projection.cam_points[..., 2].reciprocal()
-    zero = torch.zeros_like(inv_z)
-    row_u = torch.stack((-p * y1, y2 + p * y0, -y1, torch.ones_like(p), zero, -p), 1) * inv_z[:, None]  # (B, 6, N)
-    row_v = torch.stack((-y2 - q * y1, q * y0, y0, zero, torch.ones_like(q), -q), 1) * inv_z[:, None]
-    jacobian = torch.cat((row_u, row_v), 2)
-    if tangent_map is not None:
-        jacobian = torch.cat((tangent_map.mT @ jacobian[:, :3], jacobian[:, 3:]), 1)
-    residual = projection.residual.mT.flatten(1) / focal
-    return Linearization(residual, jacobian)
+    y0, y1, y2 = projection.rotated
+    p, q = (-i for i in projection.plane_points)
+    e, f = projection.scaled_residual
+    w = weights * projection.inv_depth * projection.inv_depth
+    # The two rows of a pair by the rotation; by the translation they are (1, 0, p) and (0, 1, q).
+    left, up, back = -y0, -y1, -y2
+    u = p * y1, torch.addcmul(y2, p, left), up
+    v = torch.addcmul(back, q, y1), q * left, y0
+    wu, wv, wp, wq = [w * i for i in u], [w * i for i in v], w * p, w * q
+
+    def total(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
+        return torch.addcmul(a * b, c, d).sum(1)
+
+    one = w.sum(1)
+    rows = [[total(wu[i], u[j], wv[i], v[j]) for j in range(i + 1)] for i in range(3)]
+    rows.append([*(x.sum(1) for x in wu), one])
+    rows.append([*(x.sum(1) for x in wv), torch.zeros_like(one), one])
+    rows.append([*(total(x, p, y, q) for x, y in zip(wu, wv, strict=True)), wp.sum(1), wq.sum(1), total(wp, p, wq, q)])
+    gradient = [total(x, e, y, f) for x, y in zip(wu, wv, strict=True)]
+    return NormalEquations(rows, [*gradient, (w * e).sum(1), (w * f).sum(1), total(wp, e, wq, f)])
+
+
+def change_tangent(equations: NormalEquations, tangent_map: Tensor) -> NormalEquations:
+    r"""Express normal equations by other rotation parameters.
+
+    Args:
+        equations: by the tangent :math:`(\omega, v)`.
+        tangent_map: derivative :math:`M` of :math:`\omega` by the other parameters, :math:`(B, 3, 3)`, for
+            :func:`retract_additive` the :func:`additive_tangent_map`.
+
+    Returns:
+        The system with :math:`M^\top` and :math:`M` around the blocks of the rotation.
+    """
+    h, g = equations
+    turn = torch.stack([torch.stack([h[max(i, j)][min(i, j)] for j in range(3)], -1) for i in range(3)], -1)
+    cross = torch.stack([torch.stack(list(row[:3]), -1) for row in h[3:]], -2)  # (B, 3, 3), of v by omega
+    turn, cross = tangent_map.mT @ turn @ tangent_map, cross @ tangent_map
+    rotation = (torch.stack(list(g[:3]), -1)[:, None] @ tangent_map)[:, 0]
+    rows = [list(row.unbind(-1)[: i + 1]) for i, row in enumerate(turn.unbind(1))]
+    rows += [[*row.unbind(-1), *old[3:]] for row, old in zip(cross.unbind(1), h[3:], strict=True)]
+    return NormalEquations(rows, [*rotation.unbind(-1), *g[3:]])
 
 
 def retract(pose: Pose, delta: Tensor) -> Pose:
-    r"""Move a pose along a tangent vector, :math:`(\exp([\omega]_\times) R,\; t + v)`.
+    r"""Move a pose along a tangent vector, :math:`(\mathrm{cay}(\omega) R,\; t + v)`.
 
     Rotation and translation move apart, so that with a centred world a turn leaves the centroid where it is: the
-    two stay well separated in the normal equations however far the points are.
+    two stay well separated in the normal equations however far the points are. The rotation is Cayley's,
+    :math:`\mathrm{cay}(\omega) = (I - \tfrac12[\omega]_\times)^{-1}(I + \tfrac12[\omega]_\times)`, which agrees with
+    the exponential to second order, turns by :math:`2 \arctan(|\omega|/2)` and so never by more than a half turn, and
+    needs neither trigonometry nor a branch at 0.
 
     Args:
         pose: rotation :math:`(B, 3, 3)`, translation :math:`(B, 3)`.
@@ -159,10 +214,24 @@ def retract(pose: Pose, delta: Tensor) -> Pose:
         >>> retract(pose, torch.tensor([[0.0, 0.0, 0.0, 1.0, 2.0, 3.0]])).translation
         tensor([[1., 2., 3.]])
     """
-    return Pose(
-        axis_angle_to_rotation_matrix(delta[:, :3]) @ pose.rotation,
-        pose.translation + delta[:, 3:],
-    )
+    return move(pose, delta.unbind(-1))
+
+
+def move(pose: Pose, delta: Sequence[Tensor]) -> Pose:
+    """:func:`retract` by the six entries of the tangent vector, each of shape :math:`(B,)`."""
+    a, b, c = (0.5 * i for i in delta[:3])
+    r = pose.rotation.permute(1, 2, 0).unbind(0)  # rows of the matrix, (3, B) each
+
+    def cross(m: Sequence[Tensor], plus: Sequence[Tensor] | None = None) -> list[Tensor]:
+        """The cross product of (a, b, c) with each column, plus something."""
+        pairs = ((b, m[2], c, m[1]), (c, m[0], a, m[2]), (a, m[1], b, m[0]))
+        first = [i * j if plus is None else torch.addcmul(plus[n], i, j) for n, (i, j, _, _) in enumerate(pairs)]
+        return [torch.addcmul(x, k, m, value=-1) for x, (_, _, k, m) in zip(first, pairs, strict=True)]
+
+    once = cross(r)
+    factor = 2.0 / torch.addcmul(torch.addcmul(torch.addcmul(torch.ones_like(a), a, a), b, b), c, c)
+    rows = [torch.addcmul(i, factor, j) for i, j in zip(r, cross(once, once), strict=True)]
+    return Pose(torch.stack(rows).permute(2, 0, 1), pose.translation + torch.stack(tuple(delta[3:])).mT)
 
 
 def retract_additive(pose: Pose, delta: Tensor) -> Pose:

@@ -8,31 +8,51 @@ damping by the diagonal is Marquardt's (1963).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial, reduce
+from operator import and_
 from typing import Any, NamedTuple
 
 import torch
 from kornia.core.check import KORNIA_CHECK
 from torch import Tensor, nn
 
+from kornia_pnpnet.compilation import Compiled
 from kornia_pnpnet.geometry import (
+    NormalEquations,
     Projection,
     additive_tangent_map,
-    linearize,
+    change_tangent,
+    move,
+    normal_equations,
+    problems_last,
     project,
-    retract,
     retract_additive,
 )
 from kornia_pnpnet.robust import KERNELS, RobustKernel
+from kornia_pnpnet.small import factorise, substitute
 from kornia_pnpnet.types import Correspondences, Guess, Pose, Refinement
 
-__all__ = ["BoundedParameter", "LMStep", "RobustWeightedLM", "explains", "lm_step", "solve_damped"]
+__all__ = [
+    "BACKWARDS",
+    "BoundedParameter",
+    "LMStart",
+    "LMStep",
+    "RobustWeightedLM",
+    "explains",
+    "lm_step",
+    "solve_damped",
+]
+
+#: How gradients pass through a refinement, see :class:`RobustWeightedLM`.
+BACKWARDS = ("unroll", "truncated", "implicit")
 
 # Residuals count up to this many focal lengths in the cost, and a point behind the camera counts as much: it can
 # never be cheaper than a point in front of it.
 _MAX_RESIDUAL = 2.0
 # A pose explains the pixels when this share of the pairs has residuals below this share of the pixels' spread.
-_EXPLAINED_SHARE, _EXPLAINED_RESIDUAL = 0.6, 0.2
+# Just below the share, so that a sum of shares that is it but for rounding is enough.
+_EXPLAINED_SHARE, _EXPLAINED_RESIDUAL = 0.6 - 1e-5, 0.2
 # Factors of the damping after a refused and after an accepted step (only with `reject_worse`).
 _DAMPING_UP, _DAMPING_DOWN = 10.0, 0.3
 
@@ -49,55 +69,60 @@ class LMStep(NamedTuple):
     solved: Tensor
 
 
-def solve_damped(hessian: Tensor, gradient: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
+class LMStart(NamedTuple):
+    r"""What the iterations of a refinement start from.
+
+    Attributes:
+        corr: the correspondences, problems last in memory.
+        prior: weight of each pair before its residual was looked at, :math:`(B, N)`.
+        pairs: the correspondences with these weights relative to the largest, what an iteration sees.
+        pose: the first pose.
+        step: :math:`\gamma` of each iteration, scalars.
+        damping: :math:`\lambda` of each.
+        shape: the kernel's shape of each.
+    """
+
+    corr: Correspondences
+    prior: Tensor
+    pairs: Correspondences
+    pose: Pose
+    step: tuple[Tensor, ...]
+    damping: tuple[Tensor, ...]
+    shape: tuple[Tensor, ...]
+
+
+def solve_damped(equations: NormalEquations, damping: Tensor) -> tuple[list[Tensor], Tensor]:
     r"""Solve :math:`(H + \lambda\,\mathrm{diag}(H))\,\delta = g` for a batch of positive semi-definite :math:`H`.
 
-    An LDLᵀ factorisation written out in plain operations, so that it compiles, exports and differentiates like the
-    rest. :math:`H` is first scaled to a unit diagonal, which makes the test on the pivots independent of units.
+    An LDLᵀ factorisation written out entry by entry, so that it compiles, exports and differentiates like the rest.
+    Its test on the pivots does not depend on units.
 
     Args:
-        hessian: :math:`(B, D, D)`.
-        gradient: :math:`(B, D)`.
+        equations: :math:`H` and :math:`g` of any size, entry by entry.
         damping: :math:`\lambda \ge 0`, a scalar or :math:`(B,)`.
 
     Returns:
-        The solution :math:`(B, D)` and whether there is one, bool :math:`(B,)`. Where a pivot vanishes the solution
-        is zero with zero gradients.
+        The entries of the solution, each :math:`(B,)`, and whether there is one, bool :math:`(B,)`. Where a pivot
+        vanishes values and gradients are finite but mean nothing.
 
     Example:
-        >>> solve_damped(torch.eye(2)[None] * 4.0, torch.tensor([[8.0, 4.0]]), torch.tensor(1.0))
-        (tensor([[1.0000, 0.5000]]), tensor([True]))
+        >>> four, eight = torch.tensor([4.0]), torch.tensor([8.0])
+        >>> solve_damped(NormalEquations(((four,), (0 * four, four)), (eight, four)), torch.tensor(1.0))
+        ([tensor([1.]), tensor([0.5000])], tensor([True]))
     """
-    diagonal = hessian.diagonal(dim1=-2, dim2=-1)  # (B, D)
-    dim = diagonal.shape[-1]
-    used = diagonal > torch.finfo(hessian.dtype).tiny
-    scale = torch.where(used, torch.where(used, diagonal, 1.0).rsqrt(), 0.0)
-    damped_diagonal = (1.0 + damping)[..., None] if damping.ndim else 1.0 + damping
-    eye = torch.eye(dim, dtype=hessian.dtype, device=hessian.device)
-    schur = hessian * scale[:, :, None] * scale[:, None, :]
-    schur = schur * (1.0 - eye) + torch.diag_embed(used.to(schur.dtype) * damped_diagonal)  # (B, D, D)
-    rest = gradient * scale
-    tolerance = 10.0 * torch.finfo(hessian.dtype).eps
+    factor = 1.0 + damping
+    rows = [[*row[:-1], row[-1] * factor] for row in equations.hessian]
+    diagonal = [row[-1] for row in rows]
+    limits = torch.finfo(diagonal[0].dtype)
+    smallest, infinite = torch.full_like(damping, limits.tiny), torch.full_like(damping, torch.inf)
+    good: list[Tensor] = []
 
-    solved = torch.ones_like(used[:, 0])
-    pivots, columns, partial = [], [], []
-    for k in range(dim):
-        pivot = schur[:, 0, 0]
-        good = pivot > tolerance
-        solved = solved & good
-        pivot = torch.where(good, pivot, 1.0)
-        pivots.append(pivot)
-        partial.append(rest[:, 0])
-        if k < dim - 1:
-            column = schur[:, 1:, 0] / pivot[:, None]  # (B, D - k - 1)
-            columns.append(column)
-            rest = rest[:, 1:] - column * rest[:, :1]
-            schur = schur[:, 1:, 1:] - column[:, :, None] * schur[:, None, 0, 1:]
-    solution = (partial[-1] / pivots[-1])[:, None]
-    for k in range(dim - 2, -1, -1):
-        entry = partial[k] / pivots[k] - (columns[k] * solution).sum(-1)
-        solution = torch.cat((entry[:, None], solution), 1)
-    return torch.where(solved[:, None], solution * scale, 0.0), solved
+    def inverse(k: int, pivot: Tensor) -> Tensor:
+        good.append(torch.add(pivot, diagonal[k], alpha=-10.0 * limits.eps) > smallest)
+        return torch.where(good[-1], pivot, infinite).reciprocal()
+
+    lower, scaled = factorise(rows, list(equations.gradient), inverse)
+    return substitute(lower, scaled), reduce(and_, good)
 
 
 def lm_step(
@@ -119,7 +144,8 @@ def lm_step(
         corr: normalised correspondences.
         pose: the pose to improve.
         projection: :func:`~kornia_pnpnet.geometry.project` of ``pose``.
-        weights: weight of each pair, :math:`(B, N)`; points behind the camera do not count whatever it is.
+        weights: weight of each pair, :math:`(B, N)`; points behind the camera do not count whatever it is. The step
+            does not depend on a common factor.
         step: :math:`\gamma`, a scalar.
         damping: :math:`\lambda`, a scalar or :math:`(B,)`.
         additive: update the rotation vector additively as in the paper, instead of by the retraction.
@@ -127,18 +153,34 @@ def lm_step(
     Returns:
         The moved pose and whether the equations could be solved.
     """
-    linear = linearize(projection, corr.focal, additive_tangent_map(pose) if additive else None)
-    used = torch.where(projection.in_front, weights, 0.0)
-    # The step does not depend on a common factor of the weights; tiny weights must not vanish when multiplied.
-    largest = used.detach().amax(-1, keepdim=True)
-    used = used / torch.where(largest > 0, largest, 1.0)
-    weighted = linear.jacobian * torch.cat((used, used), 1)[:, None]  # (B, 6, 2N)
-    hessian = weighted @ linear.jacobian.mT
-    # Not a product of matrices: for a batch of one that takes another kernel, which rounds differently.
-    gradient = (weighted * linear.residual[:, None]).sum(-1)
-    delta, solved = solve_damped(hessian, gradient, damping)
-    update = retract_additive if additive else retract
-    return LMStep(update(pose, -step * delta), solved)
+    equations = normal_equations(projection, _relative(weights, projection))
+    if additive:
+        equations = change_tangent(equations, additive_tangent_map(pose))
+    delta, solved = solve_damped(equations, damping)
+    factor = torch.where(solved, -step / corr.focal, torch.zeros_like(step))
+    delta = [factor * x for x in delta]
+    return LMStep(retract_additive(pose, torch.stack(delta).mT) if additive else move(pose, delta), solved)
+
+
+def _relative(weights: Tensor, projection: Projection) -> Tensor:
+    """Weights relative to the heaviest row of the Jacobian, so that products of tiny ones do not vanish."""
+    largest = (weights * projection.inv_depth * projection.inv_depth).detach().amax(1, keepdim=True)
+    return weights / torch.where(largest > 0, largest, 1.0)
+
+
+def _iterate(
+    corr: Correspondences,
+    pose: Pose,
+    step: Tensor,
+    damping: Tensor,
+    shape: Tensor,
+    kernel_weight: Callable[[Tensor, Tensor], Tensor],
+    additive: bool,
+) -> LMStep:
+    """Weigh the pairs by their residuals and take one step."""
+    projection = project(pose, corr)
+    weights = corr.weights * kernel_weight(projection.sq_residual, shape)
+    return lm_step(corr, pose, projection, weights, step, damping, additive=additive)
 
 
 class BoundedParameter(nn.Module):
@@ -196,6 +238,11 @@ class RobustWeightedLM(nn.Module):
         update: ``"retraction"`` on the rotation group, or the paper's ``"additive"`` on the rotation vector.
         reject_worse: refuse, per problem, a step that raises the cost, and raise the damping after it tenfold.
         learnable: whether the hyperparameters are trained.
+        backward: how gradients pass. ``"unroll"``: through all iterations. ``"truncated"``: through the ``last`` ones,
+            the pose before them counts as constant. ``"implicit"``: by the implicit function theorem, as through a
+            minimum, at a memory that does not grow with ``m``; exact once the iterations have converged, and then step
+            and damping have no gradient, nor has the first guess.
+        last: how many iterations ``"truncated"`` passes through.
 
     Raises:
         BaseError: for an unknown kernel or update, a negative ``m``, or an initial value out of its bounds.
@@ -224,11 +271,15 @@ class RobustWeightedLM(nn.Module):
         update: str = "retraction",
         reject_worse: bool = False,
         learnable: bool = True,
+        backward: str = "unroll",
+        last: int = 1,
     ) -> None:
         super().__init__()
         KORNIA_CHECK(type(m) is int and m >= 0, f"m must be an integer of at least 0, got {m!r}.")
         KORNIA_CHECK(kernel in KERNELS, f"kernel must be one of {sorted(KERNELS)}, got {kernel!r}.")
         KORNIA_CHECK(update in ("retraction", "additive"), f"update must be retraction or additive, got {update!r}.")
+        KORNIA_CHECK(backward in BACKWARDS, f"backward must be one of {BACKWARDS}, got {backward!r}.")
+        KORNIA_CHECK(type(last) is int and last >= 1, f"last must be an integer of at least 1, got {last!r}.")
         self.config: dict[str, Any] = {
             "m": m,
             "kernel": kernel,
@@ -239,8 +290,12 @@ class RobustWeightedLM(nn.Module):
             "update": update,
             "reject_worse": reject_worse,
             "learnable": learnable,
+            "backward": backward,
+            "last": last,
         }
         self.m = m
+        self.backward = backward
+        self.last = last
         self.kernel: RobustKernel = KERNELS[kernel]
         self.additive = update == "additive"
         self.reject_worse = reject_worse
@@ -256,6 +311,11 @@ class RobustWeightedLM(nn.Module):
             logarithmic=self.kernel.logarithmic,
         )
         self.requires_grad_(learnable and m > 0)
+        self._iteration = partial(_iterate, kernel_weight=self.kernel.weight, additive=self.additive)
+        # What runs: these, or what `compile` made of them.
+        self._begin: Callable[..., LMStart] = self.begin
+        self._iterate: Callable[..., LMStep] = self._iteration
+        self._finish: Callable[..., Refinement] = self.finish
 
     def extra_repr(self) -> str:
         """Show the constructor's arguments."""
@@ -274,18 +334,85 @@ class RobustWeightedLM(nn.Module):
         step, damping, shape = (p().to(like).expand(count) for p in (self.step, self.damping, self.robustness))
         return step, damping, shape
 
-    def _cost(self, projection: Projection, corr: Correspondences, weights: Tensor, shape: Tensor) -> Tensor:
+    def _cost(self, projection: Projection, start: LMStart, shape: Tensor) -> Tensor:
         """Mean robust loss over the pairs that are there, shape (B,)."""
-        most = (_MAX_RESIDUAL * corr.focal).square()
-        sq_residual = projection.residual.square().sum(-1).minimum(most)
-        sq_residual = torch.where(projection.in_front, sq_residual, most)  # (B, N)
-        count = (corr.weights > 0).sum(-1).clamp(min=1)
-        return (weights * self.kernel.loss(sq_residual, shape)).sum(-1) / count
+        most = (_MAX_RESIDUAL * start.corr.focal).square()
+        sq_residual = torch.where(projection.in_front, projection.sq_residual.minimum(most), most)  # (B, N)
+        count = (start.corr.weights > 0).sum(-1).clamp(min=1)
+        return (start.prior * self.kernel.loss(sq_residual, shape)).sum(-1) / count
 
-    def _pair_weights(self, projection: Projection, prior: Tensor, shape: Tensor) -> Tensor:
-        """Robust weight times prior weight, 0 behind the camera, shape (B, N)."""
-        robust = self.kernel.weight(projection.residual.square().sum(-1), shape)
-        return torch.where(projection.in_front, prior * robust, 0.0)
+    def begin(self, corr: Correspondences, guess: Guess) -> LMStart:
+        """Prepare a refinement: everything before the first iteration.
+
+        Args:
+            corr: normalised correspondences of :math:`B` problems with :math:`N` pairs each.
+            guess: poses in the frame of ``corr`` and a factor for the weight of each pair.
+
+        Returns:
+            What the iterations need.
+        """
+        hyperparameters = (x.unbind() for x in self.hyperparameters(corr.world_points))
+        corr = problems_last(corr)
+        pose = Pose(*(x.movedim(0, -1).contiguous().movedim(-1, 0) for x in guess.pose))
+        prior = corr.weights * guess.weights.mT.contiguous().mT
+        # The steps do not depend on a common factor of the weights; tiny ones must not vanish when multiplied.
+        largest = prior.detach().amax(1, keepdim=True)
+        pairs = Correspondences(*corr[:2], prior / torch.where(largest > 0, largest, 1.0), corr.focal)
+        return LMStart(corr, prior, pairs, pose, *hyperparameters)
+
+    def iterate(self, start: LMStart, m: int | None = None) -> LMStep:
+        """Run the iterations.
+
+        Args:
+            start: what :meth:`begin` returned.
+            m: stop after this many; all of them when ``None``.
+
+        Returns:
+            The last pose, and whether the last equations could be solved.
+        """
+        m = self.m if m is None else min(m, self.m)
+        unrolled = {"unroll": m, "truncated": min(self.last, m), "implicit": 0}[self.backward]
+        with torch.set_grad_enabled(torch.is_grad_enabled() and unrolled == m):
+            pose, solved, factor = self._run(start, start.pose, None, range(m - unrolled))
+        if unrolled:
+            pose, solved, factor = self._run(start, pose, factor, range(m - unrolled, m))
+        elif m and torch.is_grad_enabled():
+            pose = self._attach_gradient(start, pose, start.shape[m - 1])
+        return LMStep(pose, solved)
+
+    def _run(
+        self, start: LMStart, pose: Pose, factor: Tensor | None, iterations: range
+    ) -> tuple[Pose, Tensor, Tensor | None]:
+        """Some iterations: pose, whether the last was solved, and with rejection the factor of the damping, (B,)."""
+        solved = torch.ones_like(start.prior[:, 0], dtype=torch.bool)
+        for i in iterations:
+            before, damping = pose, start.damping[i]
+            if self.reject_worse:
+                factor = torch.ones_like(start.prior[:, 0]) if factor is None else factor
+                damping = damping * factor
+            pose, solved = self._iterate(start.pairs, pose, start.step[i], damping, start.shape[i])
+            if factor is not None:
+                new, old = (self._cost(project(at, start.pairs), start, start.shape[i]) for at in (pose, before))
+                better = new <= old
+                factor = torch.where(better, factor * _DAMPING_DOWN, factor * _DAMPING_UP)
+                pose = Pose(*_chosen(better, pose, before))
+        return pose, solved, factor
+
+    def finish(self, start: LMStart, end: LMStep) -> Refinement:
+        """Judge where the iterations ended: everything after the last of them.
+
+        Args:
+            start: what :meth:`begin` returned.
+            end: what :meth:`iterate` returned.
+
+        Returns:
+            See :meth:`forward`.
+        """
+        projection, shape = project(end.pose, start.corr), start.shape[-1]
+        weights = start.prior * self.kernel.weight(projection.sq_residual, shape)
+        weights = torch.where(projection.in_front, weights, 0.0)
+        cost = self._cost(projection, start, shape)
+        return Refinement(end.pose, weights, cost, end.solved & explains(projection, start.corr, start.prior))
 
     def forward(self, corr: Correspondences, guess: Guess, *, m: int | None = None) -> Refinement:
         r"""Refine a guess.
@@ -300,29 +427,47 @@ class RobustWeightedLM(nn.Module):
             which is true when the last iteration's equations could be solved and the pose explains the pixels better
             than a single point would (see :func:`explains`).
         """
-        step, damping, shape = self.hyperparameters(corr.world_points)
-        prior = corr.weights * guess.weights
-        pose = guess.pose
-        projection = project(pose, corr)
-        solved = torch.ones_like(projection.in_front[:, 0])
-        factor = torch.ones_like(corr.weights[:, 0])  # of the damping, per problem
-        for i in range(self.m if m is None else min(m, self.m)):
-            weights = self._pair_weights(projection, prior, shape[i])
-            candidate, solved = lm_step(
-                corr, pose, projection, weights, step[i], damping[i] * factor, additive=self.additive
-            )
-            candidate_projection = project(candidate, corr)
-            if self.reject_worse:
-                better = self._cost(candidate_projection, corr, prior, shape[i]) <= self._cost(
-                    projection, corr, prior, shape[i]
-                )
-                factor = torch.where(better, factor * _DAMPING_DOWN, factor * _DAMPING_UP)
-                candidate = Pose(*_chosen(better, candidate, pose))
-                candidate_projection = Projection(*_chosen(better, candidate_projection, projection))
-            pose, projection = candidate, candidate_projection
-        weights = self._pair_weights(projection, prior, shape[-1])
-        cost = self._cost(projection, corr, prior, shape[-1])
-        return Refinement(pose, weights, cost, solved & explains(projection, corr, prior))
+        start = self._begin(corr, guess)
+        return self._finish(start, self.iterate(start, m))
+
+    def compile(self, mode: str | None = None) -> None:
+        """Compile with ``torch.compile``, in place: what is before, in, and after an iteration, each once.
+
+        The first call takes seconds, then each takes a fraction of the time. The batch may change its size.
+
+        Args:
+            mode: of ``torch.compile``.
+        """
+        self._begin = Compiled(self.begin, mode)
+        self._iterate = Compiled(self._iteration, mode)
+        self._finish = Compiled(self.finish, mode)
+
+    def _attach_gradient(self, start: LMStart, pose: Pose, shape: Tensor) -> Pose:
+        r"""Give a converged pose the gradient of a minimum, by the implicit function theorem.
+
+        With :math:`g(\delta) = J^\top W r` at the pose moved by :math:`\delta`, which is 0 at the minimum,
+        :math:`d\delta = -(\partial g / \partial \delta)^{-1} dg`: one Newton step, which is left out of the value. Where
+        the matrix is not positive definite the pose is no minimum yet, and the Gauss-Newton matrix takes its place.
+        """
+
+        def equations(corr: Correspondences, at: Pose, shape: Tensor) -> NormalEquations:
+            projection = project(at, corr)
+            weights = corr.weights * self.kernel.weight(projection.sq_residual, shape)
+            return normal_equations(projection, _relative(weights, projection))
+
+        fixed = Correspondences(*(x.detach() for x in start.pairs[:4]))
+        zero = [torch.zeros_like(start.prior[:, 0]).requires_grad_() for _ in range(6)]
+        with torch.enable_grad():
+            around, gradient = equations(fixed, move(pose, zero), shape.detach())
+            hessian = [
+                torch.autograd.grad(entry.sum(), zero[: i + 1], retain_graph=True) for i, entry in enumerate(gradient)
+            ]
+        gradient = equations(start.pairs, pose, shape).gradient
+        none = torch.zeros_like(shape)
+        newton, convex = solve_damped(NormalEquations(hessian, gradient), none)
+        gauss_newton, solved = solve_damped(NormalEquations([[x.detach() for x in y] for y in around], gradient), none)
+        steps = (torch.where(convex, x, torch.where(solved, y, 0.0)) for x, y in zip(newton, gauss_newton, strict=True))
+        return move(pose, [step.detach() - step for step in steps])
 
 
 def _chosen(first: Tensor, a: Iterable[Tensor], b: Iterable[Tensor]) -> Iterator[Tensor]:
@@ -348,14 +493,12 @@ def explains(projection: Projection, corr: Correspondences, prior: Tensor) -> Te
         bool of shape :math:`(B,)`.
     """
     prior = prior.detach()
-    there = prior > 0
     share = prior / prior.sum(-1, keepdim=True).clamp(min=torch.finfo(prior.dtype).tiny)  # (B, N)
     pixels = corr.img_points.detach()
     spread = (pixels - (share[..., None] * pixels).sum(1, keepdim=True)).square().sum(-1)
-    residual = torch.where(projection.in_front, projection.residual.detach().square().sum(-1), torch.inf)
-
-    ascending, order = torch.stack((residual, spread)).sort(-1)  # (2, B, N)
-    position = (share.expand_as(ascending).gather(-1, order).cumsum(-1) < _EXPLAINED_SHARE).sum(-1, keepdim=True)
-    residual, spread = ascending.gather(-1, position.clamp(max=ascending.shape[-1] - 1))[..., 0]  # what most are below
-    in_front = (projection.in_front & there).sum(-1)
-    return (in_front >= 3) & (residual <= _EXPLAINED_RESIDUAL**2 * spread)
+    ascending, order = spread.sort(-1)
+    position = (share.gather(-1, order).cumsum(-1) < _EXPLAINED_SHARE).sum(-1, keepdim=True)
+    limit = _EXPLAINED_RESIDUAL**2 * ascending.gather(-1, position.clamp(max=ascending.shape[-1] - 1))
+    explained = projection.in_front & (projection.sq_residual.detach() <= limit)
+    enough = torch.where(explained, share, 0.0).sum(-1) >= _EXPLAINED_SHARE
+    return enough & ((projection.in_front & (prior > 0)).sum(-1) >= 3)

@@ -46,15 +46,26 @@ def pose_distances(estimate: Pose, truth: Pose) -> tuple[Tensor, Tensor]:
         >>> pose_distances(turned, eye)
         (tensor([2.]), tensor([5.]))
     """
-    tiny = torch.finfo(estimate.rotation.dtype).tiny
-    rotation = ((estimate.rotation - truth.rotation).square().sum((-2, -1)) + tiny).sqrt()
-    translation = ((estimate.translation - truth.translation).square().sum(-1) + tiny).sqrt()
+    return _lengths(_difference(estimate, truth))
+
+
+def _difference(estimate: Pose, truth: Pose) -> Pose:
+    """The estimate minus the truth, entry by entry."""
+    return Pose(estimate.rotation - truth.rotation, estimate.translation - truth.translation)
+
+
+def _lengths(difference: Pose) -> tuple[Tensor, Tensor]:
+    """Frobenius and Euclidean norm of the parts, each (B,)."""
+    tiny = torch.finfo(difference.rotation.dtype).tiny
+    rotation = (difference.rotation.square().sum((-2, -1)) + tiny).sqrt()
+    translation = (difference.translation.square().sum(-1) + tiny).sqrt()
     return rotation, translation
 
 
-def _at(points: Tensor, pose: Pose) -> Pose:
-    """The pose of a world whose origin is at ``points``, (B, 3)."""
-    return Pose(pose.rotation, pose.translation + (pose.rotation @ points[..., None])[..., 0])
+def _at(points: Tensor, difference: Pose) -> Pose:
+    """The difference of the same poses for a world whose origin is at ``points``, (B, 3)."""
+    turned = (difference.rotation * points[:, None]).sum(-1)
+    return Pose(difference.rotation, difference.translation + turned)
 
 
 class PoseLoss(nn.Module):
@@ -104,14 +115,15 @@ class PoseLoss(nn.Module):
         Args:
             result: of :math:`B` problems.
             problems: what was solved, with the true poses.
-            ramp: factor of the refined terms, 0 at the start of the training.
+            ramp: factor of the refined terms, 0 at the start of the training. Then no gradient goes through them.
 
         Returns:
             The loss and its terms, means over the batch.
         """
         centroid = problems.world_points.mean(1)
-        init_rotation, init_translation = pose_distances(_at(centroid, result.init), _at(centroid, problems.pose))
-        rotation, translation = pose_distances(result.pose, problems.pose)
+        init_rotation, init_translation = _lengths(_at(centroid, _difference(result.init, problems.pose)))
+        with torch.set_grad_enabled(torch.is_grad_enabled() and ramp > 0.0):
+            rotation, translation = pose_distances(result.pose, problems.pose)
         init = self.rotation * init_rotation + self.init_translation * init_translation
         refined = self.rotation * rotation + self.translation * translation
         if self.saturation is not None:

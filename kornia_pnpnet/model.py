@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from kornia.core.exceptions import BaseError, DeviceError, ShapeError, TypeCheckError, ValueCheckError
 from torch import Tensor, nn
 
+from kornia_pnpnet.compilation import Compiled
 from kornia_pnpnet.files import atomic_open
 from kornia_pnpnet.init import EPnP, MLPInit, REPPnP
-from kornia_pnpnet.lm import RobustWeightedLM
+from kornia_pnpnet.lm import LMStart, LMStep, RobustWeightedLM
 from kornia_pnpnet.normalize import Frame, Normalize
 from kornia_pnpnet.types import Guess, PnPResult, Pose
 
@@ -66,12 +68,22 @@ def check_inputs(
         if tensor is not None and tensor.dtype != world_points.dtype:
             raise TypeCheckError(f"{name} is {tensor.dtype} but world_points is {world_points.dtype}.")
     if world_points.dtype not in (torch.float32, torch.float64):
-        raise TypeCheckError(f"world_points must be float32 or float64, got {world_points.dtype}.")
+        raise TypeCheckError(
+            f"world_points must be float32 or float64, got {world_points.dtype}: cast the inputs with .float()."
+        )
     if mask is not None and mask.dtype != torch.bool:
         raise TypeCheckError(f"mask must be bool, got {mask.dtype}.")
     for name, tensor in {**floats, "mask": mask}.items():
         if tensor is not None and tensor.device != world_points.device:
             raise DeviceError(f"{name} is on {tensor.device} but world_points is on {world_points.device}.")
+
+
+class _Stage(NamedTuple):
+    """What is known before the first iteration."""
+
+    start: LMStart
+    frame: Frame
+    guess: Guess
 
 
 class PnPNet(nn.Module):
@@ -82,6 +94,10 @@ class PnPNet(nn.Module):
     a line, a pose that explains nothing) has ``ok=False``, a finite pose without gradient, and changes no other.
 
     Convention: ``x_cam = R x_world + t``, +z forward, pixels ``u = fx x/z + cx``; skew must be 0.
+
+    Precision: the layer computes in the dtype of its inputs, float32 or float64, also inside :class:`torch.autocast`,
+    which changes no bit of its results. Half precision has too few digits for a pixel: inputs of float16 or bfloat16
+    have to be cast with ``.float()``.
 
     Args:
         init: maps :class:`~kornia_pnpnet.types.Correspondences` to a :class:`~kornia_pnpnet.types.Guess`, see
@@ -108,6 +124,9 @@ class PnPNet(nn.Module):
         self.init = init
         self.refine = RobustWeightedLM(learnable=False) if refine is None else refine
         self.normalize = Normalize() if normalize is None else normalize
+        # What runs: these, or what `compile` made of them.
+        self._begin: Callable[..., _Stage] = self._guess
+        self._finish: Callable[..., PnPResult] = self._result
 
     def forward(
         self,
@@ -147,26 +166,61 @@ class PnPNet(nn.Module):
         if intrinsics.ndim == 2:
             intrinsics = intrinsics.expand(world_points.shape[0], 3, 3)
         with torch.autocast(world_points.device.type, enabled=False):
-            corr, frame = self.normalize(world_points, img_points, intrinsics, weights, mask)
-            if init is not None or self.init is None:
-                guess = self._given(init, corr.weights, world_points, frame)
-            else:
-                guess = self.init(corr)
-            refined = self.refine(corr, guess, m=0 if first_stage_only else None)
-            pose = self.normalize.undo(refined.pose, frame)
-            first = self.normalize.undo(guess.pose, frame)
+            stage = self._begin(world_points, img_points, intrinsics, weights, mask, init)
+            end = self.refine.iterate(stage.start, 0 if first_stage_only else None)
+            return self._finish(stage, end)
+
+    def compile(self, mode: str | None = None) -> None:
+        """Compile with ``torch.compile``, in place: what is before, in, and after an iteration, each once.
+
+        The first call then takes some seconds, less where a cache of ``torch.compile`` is on disk, and each further one
+        a fraction of the time. The batch may change its size; a batch of one, another number of pairs, another dtype
+        and calls that record gradients are compiled for themselves when they first come. Where a part cannot be
+        compiled, for want of a C++ compiler or because it is a RANSAC, that part runs as it is, with one warning.
+        Copies and saved weights of the solver are not compiled.
+
+        Args:
+            mode: of ``torch.compile``; ``"reduce-overhead"`` captures CUDA graphs.
+        """
+        self._begin = Compiled(self._guess, mode)
+        self._finish = Compiled(self._result, mode)
+        self.refine.compile(mode)
+
+    def _guess(
+        self,
+        world_points: Tensor,
+        img_points: Tensor,
+        intrinsics: Tensor,
+        weights: Tensor | None,
+        mask: Tensor | None,
+        init: Pose | None,
+    ) -> _Stage:
+        """Everything before the first iteration."""
+        corr, frame = self.normalize(world_points, img_points, intrinsics, weights, mask)
+        if init is not None or self.init is None:
+            guess = self._given(init, corr.weights, world_points, frame)
+        else:
+            guess = self.init(corr)
+        return _Stage(self.refine.begin(corr, guess), frame, guess)
+
+    def _result(self, stage: _Stage, end: LMStep) -> PnPResult:
+        """Everything after the last iteration."""
+        start, frame, guess = stage
+        refined = self.refine.finish(start, end)
+        pose = self.normalize.undo(refined.pose, frame)
+        first = self.normalize.undo(guess.pose, frame)
+        # A sum is finite when all its terms are, and no rotation that is not leaves its translation finite: every entry
+        # was multiplied by a coordinate of the centroid.
+        finite = frame.valid & (pose.translation.sum(-1) + refined.weights.sum(-1) + refined.cost).isfinite()
+        ok = finite & refined.ok if guess.ok is None else finite & refined.ok & guess.ok
+        first_ok = frame.valid & first.translation.sum(-1).isfinite()
         pair_weights = refined.weights
         if self.normalize.order:
             pair_weights = torch.zeros_like(pair_weights).scatter(1, frame.order, pair_weights)
-        finite = pose.rotation.isfinite().flatten(1).all(-1) & pose.translation.isfinite().all(-1)
-        finite = finite & refined.cost.isfinite() & pair_weights.isfinite().all(-1)
-        ok = frame.valid & refined.ok & finite
-        ok = ok if guess.ok is None else ok & guess.ok
-        first_ok = frame.valid & first.rotation.isfinite().flatten(1).all(-1) & first.translation.isfinite().all(-1)
         return PnPResult(
-            *_gate_pose(pose, ok, finite & frame.valid),
-            _gate(pair_weights, ok, finite & frame.valid, 0.0),
-            _gate(refined.cost, ok, finite & frame.valid, torch.finfo(refined.cost.dtype).max ** 0.5),
+            *_gate_pose(pose, ok, finite),
+            _gate(pair_weights, ok, finite, 0.0),
+            _gate(refined.cost, ok, finite, torch.finfo(refined.cost.dtype).max ** 0.5),
             ok,
             _gate_pose(first, first_ok, first_ok),
         )
@@ -178,7 +232,7 @@ class PnPNet(nn.Module):
             eye = torch.eye(3, dtype=world_points.dtype, device=world_points.device).expand(batch, 3, 3)
             init = Pose(eye, world_points.new_zeros(batch, 3))
         limit = torch.finfo(world_points.dtype).max ** 0.25  # as for points: it can be squared twice
-        usable = frame.valid & (init[0].abs() < limit).flatten(1).all(-1) & (init[1].abs() < limit).all(-1)
+        usable = frame.valid & (torch.cat((init[0].flatten(1), init[1]), 1).abs().amax(-1) < limit)
         given = _gate_pose(Pose(*init), usable, usable)
         return Guess(self.normalize.apply_to_pose(given, frame), torch.ones_like(weights))
 
@@ -284,8 +338,9 @@ def _find_weights(name_or_folder: str | Path) -> Path:
 def _gate(value: Tensor, ok: Tensor, finite: Tensor, fill: float | Tensor) -> Tensor:
     """Keep the gradient of problems that are ok, the value of those that are finite, and fill the others."""
     shape = (-1,) + (1,) * (value.ndim - 1)
-    value = torch.where(ok.view(shape), value, value.detach())
-    return torch.where(finite.view(shape), value, fill)
+    if value.requires_grad:
+        value = torch.where(ok.view(shape), value, value.detach())
+    return torch.where(finite.view(shape), value, fill).contiguous()
 
 
 def _gate_pose(pose: Pose, ok: Tensor, finite: Tensor) -> Pose:

@@ -10,7 +10,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from kornia.geometry.conversions import normalize_points_with_intrinsics
 from torch import Tensor, nn
 
 from kornia_pnpnet.geometry import MIN_DEPTH_RATIO
@@ -41,10 +40,10 @@ class Frame(NamedTuple):
 class Normalize(nn.Module):
     r"""Normalise cameras, order and world frame.
 
-    A problem is *valid* when what its pairs hold is finite (and small enough to be squared twice), its weights are
-    not negative, at least three pairs have a weight, its camera is a pinhole without skew, and its points
-    do not lie on one line or point. The inputs of invalid problems are replaced by zeros, which keeps values and
-    gradients finite everywhere behind.
+    A problem is *valid* when what its pairs hold is finite (and can be squared twice), its weights are not negative, at
+    least three pairs have a weight, its camera is a pinhole without skew, and its points do not lie on one line or
+    point. The inputs of invalid problems are replaced by zeros, which keeps values and gradients finite everywhere
+    behind. A pair without weight is padding: what it holds does not matter.
 
     Args:
         f_const: focal length of the normalised camera in pixels.
@@ -95,95 +94,64 @@ class Normalize(nn.Module):
             mask: False where a pair is padding, bool, shape :math:`(B, N)`.
 
         Returns:
-            The normalised correspondences and the :class:`Frame` that undoes it.
+            The normalised correspondences, in memory as :func:`~kornia_pnpnet.geometry.problems_last` would have them,
+            and the :class:`Frame` that undoes it.
         """
-        weights = torch.ones_like(world_points[..., 0]) if weights is None else weights
-        there = torch.ones_like(weights, dtype=torch.bool) if mask is None else mask
-        # Beyond this, squares of squares overflow; NaN compares false. No point in front of the camera has a pixel
-        # beyond the other limit.
-        limit = torch.finfo(world_points.dtype).max ** 0.25
-        with torch.no_grad():
-            raw_pixels = self.f_const * normalize_points_with_intrinsics(img_points, intrinsics)
-        finite = (
-            (world_points.abs() < limit).all(-1)
-            & (raw_pixels.abs() <= self.f_const / MIN_DEPTH_RATIO).all(-1)
-            & (weights < limit)
-            & (weights >= 0)
-        )
-        focal_lengths = intrinsics.diagonal(dim1=-2, dim2=-1)[:, :2]
-        camera_ok = (intrinsics.abs() < limit).flatten(1).all(-1)
-        last_row = intrinsics.new_zeros(3)
-        last_row[2] = 1.0
-        camera_ok = camera_ok & (focal_lengths > 0).all(-1) & (intrinsics[:, 2] == last_row).all(-1)
-        camera_ok = camera_ok & (intrinsics[:, 0, 1] == 0) & (intrinsics[:, 1, 0] == 0)
-        valid = camera_ok & (finite | ~there).all(-1)
+        batch, count = world_points.shape[:2]
+        usable = _is_pinhole(intrinsics)
+        if weights is None:
+            weights = world_points.new_ones(batch, count) if mask is None else mask.to(world_points.dtype)
+        else:
+            weights = weights if mask is None else torch.where(mask, weights, 0.0)
+            usable = usable & (weights >= 0).all(-1)
+        # From here on the problems are side by side in memory: coordinates and weight of each pair, (6, N, B), and the
+        # entries of each camera, (9, B), of which fx, fy = [:5:4] and cx, cy = [2:6:3].
+        rows = torch.cat((world_points.permute(2, 1, 0), img_points.permute(2, 1, 0), weights.mT[None]))
+        camera = intrinsics.flatten(1).mT
+        there = rows[5] != 0
 
-        # Inputs are made safe before anything is computed from them.
-        there = there & valid[:, None]
-        eye = torch.eye(3, dtype=intrinsics.dtype, device=intrinsics.device)
-        intrinsics = torch.where(valid[:, None, None], intrinsics, eye)
-        world_points = torch.where(there[..., None], world_points, 0.0)
-        img_points = torch.where(there[..., None], img_points, 0.0)
-        weights = torch.where(there, weights, 0.0)
-        there = weights > 0
-        weights = torch.where(there, weights, 0.0)  # a pair that is not there has no gradient either
-        pixels = self.f_const * normalize_points_with_intrinsics(img_points, intrinsics)
-        centroid, scale, spread_out = self._world_frame(world_points, there)
-        world_points = (world_points - centroid[:, None]) * scale[:, None, None]
+        # Inputs are made safe before anything is computed from them: between this limit and its inverse, squares of
+        # squares neither overflow nor vanish. NaN compares false, and is what the root of a negative number is.
+        limit = torch.finfo(rows.dtype).max ** 0.25
+        zero, one = rows.new_zeros(1, batch), rows.new_ones(1, batch)
+        sizes = torch.where(there, rows.detach().abs(), zero).amax(1)
+        size = sizes[:3].amax(0)  # of the world
+        entries = camera.detach()
+        largest = torch.maximum(sizes.amax(0), size.reciprocal())
+        largest_entry = torch.maximum(entries.abs().amax(0), entries[:5:4].rsqrt().amax(0))
+        usable = usable & (torch.maximum(largest, largest_entry) < limit)
+        there = there & usable
+        rows = torch.where(there, rows, zero)
+        camera = torch.where(usable, camera, one)
+        present = there.to(rows.dtype)
 
-        # Too few pairs and degenerate worlds become zeros as well: behind this nothing of them has a gradient.
-        valid = valid & (there.sum(-1) >= 3) & spread_out
-        there = there & valid[:, None]
-        world_points = torch.where(there[..., None], world_points, 0.0)
-        pixels = torch.where(there[..., None], pixels, 0.0)
-        weights = torch.where(there, weights, 0.0)
+        focal = rows.new_full((), self.f_const)  # made on the device: nothing here waits for the CPU
+        share = present.sum(0).clamp(min=1.0).reciprocal()
+        mean = rows[:3].sum(1) * share
+        centroid = mean if self.center else zero.expand(3, batch)
+        moved = torch.addcmul(rows, torch.cat((centroid, camera[2:6:3], zero))[:, None], present, value=-1)
+        centred = moved[:3] if self.center else torch.addcmul(rows[:3], mean[:, None], present, value=-1)
+        spread_out = _is_spread_out(centred.detach(), share, size)
+        mean_square = moved[:3].square().sum((0, 1)) * share
+        scale = torch.where(spread_out, mean_square, one[0]).rsqrt() if self.scale else one[0]
+        img_scales = focal / camera[:5:4]  # (2, B)
 
-        order = self._order(pixels, there)
+        # No point in front of the camera has a pixel beyond a limit. A problem that is not valid becomes zeros: behind
+        # this nothing of it has a gradient.
+        img_sizes = moved[3:5].detach().abs().amax(1) * img_scales.detach()
+        valid = spread_out & (img_sizes.amax(0) <= self.f_const / MIN_DEPTH_RATIO)
+        factors = torch.where(valid, torch.cat((scale.expand(3, batch), img_scales, one)), zero)
+        rows = moved * factors[:, None]
+
         if self.order:
-            world_points = world_points.gather(1, order[..., None].expand(-1, -1, 3))
-            pixels = pixels.gather(1, order[..., None].expand(-1, -1, 2))
-            weights = weights.gather(1, order)
-        focal = pixels.new_full((), self.f_const)  # made on the device: nothing here waits for the CPU
-        img_scale = self.f_const * intrinsics[:, 0, 0].rsqrt() * intrinsics[:, 1, 1].rsqrt()
-        corr = Correspondences(world_points, pixels, weights, focal, img_scale, scale)
-        return corr, Frame(centroid, scale, order, valid)
-
-    def _world_frame(self, world_points: Tensor, there: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Centroid (B, 3) and scale (B,) of the world, and whether it is more than a line (B,)."""
-        share = there.to(world_points.dtype)
-        share = share / share.sum(-1, keepdim=True).clamp(min=1.0)  # (B, N)
-        mean = (share[..., None] * world_points).sum(1)
-        centred = torch.where(there[..., None], world_points - mean[:, None], 0.0)
-
-        # The second largest variance from the invariants of the covariance: it is about the sum of the principal
-        # minors over the trace. On a line or a point only rounding is left of it.
-        with torch.no_grad():
-            size = world_points.abs().flatten(1).amax(-1) if world_points.shape[1] else mean.new_zeros(mean.shape[0])
-            safe_size = torch.where(size > 0, size, 1.0)
-            large = size > torch.finfo(world_points.dtype).tiny ** 0.25  # smaller squares vanish
-            unit = centred / safe_size[:, None, None]
-            covariance = (share[..., None] * unit).mT @ unit  # (B, 3, 3)
-            trace = covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
-            minors = 0.5 * (trace.square() - covariance.square().sum((-2, -1)))
-            tolerance = (64.0 * torch.finfo(world_points.dtype).eps) ** 2
-            spread_out = large & (
-                minors > tolerance * trace + torch.finfo(world_points.dtype).eps * 8.0 * trace.square()
-            )
-
-        centroid = mean if self.center else torch.zeros_like(mean)
-        moved = centred if self.center else world_points
-        mean_square = (share[..., None] * moved.square()).sum((1, 2))
-        usable = spread_out & (mean_square > 0)
-        scale = torch.where(usable, torch.where(usable, mean_square, 1.0).rsqrt(), 1.0)
-        return centroid, scale if self.scale else torch.ones_like(scale), spread_out
-
-    def _order(self, pixels: Tensor, there: Tensor) -> Tensor:
-        """Positions of the pairs in the order of their pixels, (B, N)."""
-        if not self.order:
-            return torch.arange(pixels.shape[1], device=pixels.device).expand(pixels.shape[:2])
-        keys = torch.where(there[..., None], pixels.detach(), torch.inf)
-        by_v = keys[..., 1].argsort(stable=True, dim=-1)
-        return by_v.gather(1, keys[..., 0].gather(1, by_v).argsort(stable=True, dim=-1))
+            order = _order(torch.where(there, rows[3:5].detach(), torch.inf))
+            rows = rows.gather(1, order.mT.expand(6, -1, -1))
+        else:
+            order = torch.arange(count, device=rows.device).expand(batch, count)
+        world_points, img_points, weights = rows.permute(2, 1, 0).split((3, 2, 1), -1)
+        horizontal, vertical = img_scales.sqrt()
+        corr = Correspondences(world_points, img_points, weights[..., 0], focal, horizontal * vertical, scale)
+        return corr, Frame(centroid.mT, scale, order, valid)
 
     def undo(self, pose: Pose, frame: Frame) -> Pose:
         r"""Express a pose of the normalised world in the original one.
@@ -196,7 +164,7 @@ class Normalize(nn.Module):
             The pose of the original world: :math:`(R,\; t / s - R c)`.
         """
         rotation, translation = pose
-        offset = (rotation @ frame.centroid[..., None])[..., 0]
+        offset = (rotation * frame.centroid[:, None]).sum(-1)
         return Pose(rotation, translation / frame.scale[:, None] - offset)
 
     def apply_to_pose(self, pose: Pose, frame: Frame) -> Pose:
@@ -210,5 +178,37 @@ class Normalize(nn.Module):
             The pose of the centred and scaled world: :math:`(R,\; s (t + R c))`.
         """
         rotation, translation = pose
-        offset = (rotation @ frame.centroid[..., None])[..., 0]
+        offset = (rotation * frame.centroid[:, None]).sum(-1)
         return Pose(rotation, (translation + offset) * frame.scale[:, None])
+
+
+def _is_pinhole(intrinsics: Tensor) -> Tensor:
+    """Whether cameras with positive focal lengths have no skew and the last row 0, 0, 1, bool (B,)."""
+    # Where both focal lengths are there, no other entry of the first two columns may be.
+    return ((intrinsics[..., :2] != 0).sum((1, 2)) == 2) & (intrinsics[:, 2, 2] == 1)
+
+
+def _is_spread_out(centred: Tensor, share: Tensor, size: Tensor) -> Tensor:
+    """Whether points are more than a line or a point, so that there are at least three.
+
+    Args:
+        centred: the points about their mean, 0 where there is none, (3, N, B).
+        share: one over the number of points, (B,).
+        size: the largest coordinate before the points were centred, (B,). Where it is 0 or NaN the answer is no.
+
+    Returns:
+        bool of shape (B,).
+    """
+    # The second largest variance from the invariants of the covariance: it is about the sum of the principal minors,
+    # half of trace² - sum of squares, over the trace. On a line or a point only rounding is left of it.
+    eps = torch.finfo(centred.dtype).eps
+    covariance = (centred[:, None] * centred).sum(2) * (share / (size * size))  # (3, 3, B) in the unit of the size
+    trace = covariance.diagonal().sum(-1)
+    return ((1.0 - 16.0 * eps) * trace - 2.0 * (64.0 * eps) ** 2) * trace > (covariance * covariance).sum((0, 1))
+
+
+def _order(keys: Tensor) -> Tensor:
+    """Positions in ascending order of the first of two keys (2, N, B), ties by the second, (B, N)."""
+    first, second = keys.mT.contiguous()  # sorting is twice as fast along the last dimension
+    by_second = second.argsort(stable=True, dim=-1)
+    return by_second.gather(1, first.gather(1, by_second).argsort(stable=True, dim=-1))

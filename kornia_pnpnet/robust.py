@@ -42,7 +42,7 @@ class RobustKernel(NamedTuple):
 
 
 def _power_weight(sq_residual: Tensor, alpha: Tensor) -> Tensor:
-    return (sq_residual + POWER_FLOOR**2) ** (-0.5 * alpha)
+    return torch.exp(-0.5 * alpha * torch.log(sq_residual + POWER_FLOOR**2))
 
 
 def _power_loss(sq_residual: Tensor, alpha: Tensor) -> Tensor:

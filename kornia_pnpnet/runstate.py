@@ -1,11 +1,12 @@
-"""What lets a training run be stopped at any moment and continued: signals, checkpoints, learning curves."""
+"""What lets a training run be stopped at any moment, continued and followed: signals, checkpoints, curves, times."""
 
 from __future__ import annotations
 
 import csv
 import signal
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ __all__ = [
     "CHECKPOINT_NAME",
     "HISTORY_NAME",
     "History",
+    "StageClock",
     "TrainingError",
     "load_checkpoint",
     "save_checkpoint",
@@ -55,6 +57,42 @@ def stop_on_signal() -> Iterator[threading.Event]:
         yield event
     finally:
         restore()
+
+
+class StageClock:
+    """Wall-clock time of a loop by stage. Nothing is lost between stages: their times add up to that of the loop.
+
+    Work that a GPU does later counts where the loop waits for it.
+
+    Args:
+        stages: their names.
+
+    Attributes:
+        seconds: time of each stage so far.
+
+    Example:
+        >>> clock = StageClock("data", "rest")
+        >>> clock.lap("data")
+        >>> clock.lap("rest")
+        >>> sum(clock.shares().values())
+        1.0
+    """
+
+    def __init__(self, *stages: str) -> None:
+        self.seconds = dict.fromkeys(stages, 0.0)
+        self._last = time.perf_counter()
+
+    def lap(self, stage: str) -> None:
+        """Count the time since the last lap as that of a stage."""
+        now = time.perf_counter()
+        self.seconds[stage] += now - self._last
+        self._last = now
+
+    def shares(self, before: Mapping[str, float] | None = None) -> dict[str, float]:
+        """Share of each stage of the time since ``before``, an earlier copy of ``seconds``; of all when ``None``."""
+        spent = {stage: seconds - (before or {}).get(stage, 0.0) for stage, seconds in self.seconds.items()}
+        whole = sum(spent.values())
+        return {stage: seconds / whole if whole > 0.0 else 0.0 for stage, seconds in spent.items()}
 
 
 class History:

@@ -13,9 +13,10 @@ import shutil
 import sys
 import time
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from kornia.core.check import KORNIA_CHECK
@@ -25,6 +26,7 @@ from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet.data.stream import ProblemSource, stream_batches
 from kornia_pnpnet.init import MLPInit
 from kornia_pnpnet.lm import RobustWeightedLM
 from kornia_pnpnet.losses import LossTerms, PoseLoss
@@ -34,6 +36,7 @@ from kornia_pnpnet.runstate import (
     CHECKPOINT_NAME,
     HISTORY_NAME,
     History,
+    StageClock,
     TrainingError,
     load_checkpoint,
     save_checkpoint,
@@ -41,19 +44,12 @@ from kornia_pnpnet.runstate import (
 )
 from kornia_pnpnet.types import Problems
 
-__all__ = ["FitReport", "ProblemSource", "TrainSettings", "fit", "train_briefly", "validate"]
+__all__ = ["FitReport", "TrainSettings", "describe_shares", "fit", "train_briefly", "validate"]
 
 _log = logging.getLogger(__name__)
 
-
-class ProblemSource(Protocol):
-    """What the loop needs of a data source: batch ``i``, always the same."""
-
-    batch_size: int
-
-    def batch(self, index: int) -> Problems:
-        """Draw batch ``index``."""
-        ...
+# Parts of an update, and what is between updates: rows of the history, validations, checkpoints.
+_STAGES = ("data", "forward", "backward", "optimizer", "rest")
 
 
 @dataclass(frozen=True)
@@ -120,6 +116,7 @@ class FitReport:
         interrupted: whether a signal ended the call early; the checkpoint is saved.
         seconds: wall-clock time of this call.
         updates_per_second: of this call.
+        time_shares: how ``seconds`` divides among waiting for data, forward, backward, optimizer, and the rest.
         peak_memory_mib: largest resident memory of this process (of the GPU where one is used).
     """
 
@@ -129,6 +126,7 @@ class FitReport:
     interrupted: bool
     seconds: float
     updates_per_second: float
+    time_shares: dict[str, float]
     peak_memory_mib: float
 
 
@@ -179,6 +177,7 @@ def fit(
     *,
     fabric: Fabric | None = None,
     identity: Mapping[str, Any] | None = None,
+    data_workers: int = 0,
     resume: bool = False,
     progress: bool = True,
 ) -> FitReport:
@@ -197,6 +196,8 @@ def fit(
         fabric: the launched engine; one process on the CPU when ``None``.
         identity: what else must be the same when the run is continued, such as the configuration of data and loss, as
             plain data.
+        data_workers: processes, for each process that trains, that draw the next batches meanwhile. The numbers are
+            the same for any; see :func:`~kornia_pnpnet.data.stream.stream_batches`.
         resume: continue from ``folder``'s checkpoint when there is one.
         progress: show a progress bar.
 
@@ -226,19 +227,21 @@ def fit(
         start, skipped = state["update"], state["skipped"]
         model.load_state_dict(state["model"])
 
-    groups = [
-        {"params": [p for p in part.parameters() if p.requires_grad], "initial_lr": lr}
-        for part, lr in ((model.init, settings.lr), (model.refine, settings.lr_refine))
-        if part is not None
-    ]
-    optimizer = torch.optim.Adam([{**group, "lr": group["initial_lr"]} for group in groups if group["params"]])
+    parts = ((model.init, settings.lr), (model.refine, settings.lr_refine))
+    trained = [([p for p in part.parameters() if p.requires_grad], lr) for part, lr in parts if part is not None]
+    groups = [{"params": params, "lr": lr, "initial_lr": lr} for params, lr in trained if params]
+    optimizer = torch.optim.Adam(groups, fused=True)
+    parameters = [p for params, _ in trained for p in params]
     solver, fabric_optimizer = fabric.setup(model, optimizer)
     if state is not None:  # now that the parameters are on their device, so that Adam's state follows them
+        for group in state["optimizer"]["param_groups"]:
+            group["fused"] = True  # how a step is computed is this code's choice, not the checkpoint's
         optimizer.load_state_dict(state["optimizer"])
     validation = {name: problems.map(lambda x: x.to(fabric.device)) for name, problems in validation.items()}
     best_names = ["success", "rotation_error_deg", "translation_error"]
     best_names += ["init_rotation_error_deg", "init_translation_error"]
     columns = ["update", *LossTerms._fields, "ramp", "lr", "grad_norm", "skipped", "updates_per_second"]
+    columns += [f"{stage}_share" for stage in _STAGES]
     columns += ["peak_memory_mib", *(f"val/{name}/{metric}" for name in validation for metric in best_names)]
     history = None
     if fabric.is_global_zero:
@@ -252,24 +255,30 @@ def fit(
         fabric.barrier()
 
     model.train()
-    began = logged = time.perf_counter()
-    logged_update = update = start
+    clock = StageClock(*_STAGES)
+    logged_update, logged_seconds = start, dict(clock.seconds)
+    update = start
     interrupted = False
     bar = tqdm(total=settings.updates, initial=start, disable=not (progress and fabric.is_global_zero), unit="update")
-    with stop_on_signal() as stop, bar, logging_redirect_tqdm():
+    batches = stream_batches(data, start, settings.updates, data_workers)
+    with stop_on_signal() as stop, closing(batches), bar, logging_redirect_tqdm():
         while update < settings.updates and not interrupted:
             factor = settings.lr_factor(update)
             for group in optimizer.param_groups:
                 group["lr"] = group["initial_lr"] * factor
             ramp = settings.ramp_factor(update)
-            problems = _share(data.batch(update), fabric)
+            clock.lap("rest")
+            problems = _share(next(batches), fabric)
+            clock.lap("data")
             inputs = (problems.world_points, problems.img_points, problems.intrinsics)
             terms = loss(solver(*inputs, first_stage_only=ramp == 0.0), problems, ramp)
             # The zero keeps the refiner in the graph before the ramp: processes expect gradients of every parameter.
             unused = sum(p.sum() for p in model.refine.parameters() if p.requires_grad) if ramp == 0.0 else 0.0
+            clock.lap("forward")
             optimizer.zero_grad()
             fabric.backward(terms.total + 0.0 * unused)
-            norm = nn.utils.clip_grad_norm_(model.parameters(), settings.clip)
+            clock.lap("backward")
+            norm = nn.utils.clip_grad_norm_(parameters, settings.clip)
             # All processes must take the same branch, whoever saw the bad number or the signal.
             bad, interrupted = _agree(fabric, not bool(torch.isfinite(terms.total + norm)), stop.is_set())
             if bad:
@@ -278,6 +287,7 @@ def fit(
                     _log.warning("update %s: loss or gradient not finite, step skipped (%s so far)", update, skipped)
             else:
                 fabric_optimizer.step()
+            clock.lap("optimizer")
             update += 1
             bar.update()
             finished = update == settings.updates
@@ -292,13 +302,16 @@ def fit(
             if finished or update % settings.log_every == 0 or validates:
                 means = _mean(fabric, torch.stack([term.detach() for term in terms]))
                 if history is not None:
-                    now = time.perf_counter()
-                    rate = (update - logged_update) / max(now - logged, 1e-9)
+                    clock.lap("rest")
+                    shares = clock.shares(logged_seconds)
+                    elapsed = sum(clock.seconds.values()) - sum(logged_seconds.values())
+                    rate = (update - logged_update) / max(elapsed, 1e-9)
                     row: dict[str, float] = {"update": update, **dict(zip(terms._fields, means, strict=True))}
                     if ramp == 0.0:  # nothing was refined yet
                         row = {name: value for name, value in row.items() if not name.startswith("refined")}
                     row |= {"ramp": ramp, "lr": settings.lr * factor, "grad_norm": norm.item(), "skipped": skipped}
-                    row |= {"updates_per_second": rate, "peak_memory_mib": _peak_memory_mib(fabric.device)}
+                    row |= {"updates_per_second": rate, **{f"{stage}_share": shares[stage] for stage in _STAGES}}
+                    row["peak_memory_mib"] = _peak_memory_mib(fabric.device)
                     if validates:
                         model.eval()
                         report = validate(model, validation)
@@ -306,19 +319,27 @@ def fit(
                         row |= report
                         rates = {name: f"{100 * report[f'val/{name}/success']:.1f} %" for name in validation}
                         found = ", ".join(f"{name} {share}" for name, share in rates.items())
-                        memory = row["peak_memory_mib"]
-                        _log.info("update %s: success %s; %.1f updates/s, %.0f MiB", update, found, rate, memory)
+                        speed = f"{rate:.1f} updates/s ({describe_shares(shares)})"
+                        _log.info("update %s: success %s; %s; %.0f MiB", update, found, speed, row["peak_memory_mib"])
                         bar.set_postfix(rates)
                     history.write(row)
-                    logged, logged_update = time.perf_counter(), update
+                    clock.lap("rest")
+                    logged_update, logged_seconds = update, dict(clock.seconds)
             if finished or interrupted or update % settings.checkpoint_every == 0:
                 save(update)
     if history is not None:
         history.close()
     model.eval()
-    seconds = time.perf_counter() - began
+    clock.lap("rest")
+    seconds = sum(clock.seconds.values())
     rate = (update - start) / max(seconds, 1e-9)
-    return FitReport(start, update, skipped, interrupted, seconds, rate, _peak_memory_mib(fabric.device))
+    memory = _peak_memory_mib(fabric.device)
+    return FitReport(start, update, skipped, interrupted, seconds, rate, clock.shares(), memory)
+
+
+def describe_shares(shares: Mapping[str, float]) -> str:
+    """Shares of the time as a line of a log, for example ``"data 1 %, forward 40 %"``."""
+    return ", ".join(f"{stage} {100 * share:.0f} %" for stage, share in shares.items())
 
 
 def _plain(value: Any) -> Any:

@@ -130,11 +130,11 @@ def test_ransac_stops_where_the_formula_says(measure):
 
 
 def test_the_check_can_fail(measure, monkeypatch):
-    monkeypatch.setitem(PARTS, "geometry.project", lambda n: n * Operations(13, 20, 1, compare=5, logic=8))
+    monkeypatch.setitem(PARTS, "geometry.project", lambda n: n * Operations(14, 25, 1, compare=3, logic=1))
     wrong = differences(create_solver("identity-lm", m=1), measure, sizes=(6, 9)).splitlines()
     assert wrong == [
         "geometry.project, each of its calls, multiply: "
-        "n = 6: runs 114, formula says 120; n = 9: runs 171, formula says 180"
+        "n = 6: runs 144, formula says 150; n = 9: runs 216, formula says 225"
     ]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import importlib
 import subprocess
 import sys
@@ -15,7 +16,7 @@ pytest.importorskip("matplotlib")
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from kornia_pnpnet.figures import plot_errors, plot_pose, plot_success, plot_training
+from kornia_pnpnet.figures import plot_errors, plot_pose, plot_success, plot_sweep, plot_training
 
 
 def fake_results(solvers: int = 3, sets: int = 2, shift: float = 0.0) -> dict:
@@ -171,6 +172,70 @@ def test_histories_that_cannot_be_drawn(tmp_path, text, message):
     path.write_text(text)
     with pytest.raises(ValueError, match=message):
         plot_training(tmp_path / "a.png", path)
+
+
+def sweep_rows() -> list[dict[str, str]]:
+    """A sweep's summary: the rate says which run it is."""
+    rows = []
+    for mix in ("0.33", "0"):
+        for n, m in ((9, 10), (9, 2), (6, 2), (6, 10)):
+            rate = n / 100 + m / 1000 + float(mix)
+            rows.append({"model.n": f"{n}", "model.m": f"{m}", "data.outliers.max_ratio": mix})
+            rows[-1] |= {"uniform/rate": f"{rate}", "uniform/low": f"{rate - 0.01}", "uniform/high": f"{rate + 0.01}"}
+            rows[-1]["us_per_problem"] = f"{n * m + 10 * float(mix)}"
+    return rows
+
+
+def write_summary(path, rows):
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    return path
+
+
+@pytest.mark.parametrize(("against", "places", "panels"), [("m", [2, 10], [6, 9]), ("n", [6, 9], [2, 10])])
+def test_sweep_picture_shows_success_and_time(tmp_path, monkeypatch, against, places, panels):
+    figures = []
+    monkeypatch.setattr(Figure, "savefig", lambda self, *_, **__: figures.append(self))
+    plot_sweep(tmp_path / "a.png", write_summary(tmp_path / "a.csv", sweep_rows()), against=against)
+    left, right = figures[0].axes[:2], figures[0].axes[2:]
+    other = "n" if against == "m" else "m"
+    assert [axes.get_title(loc="left") for axes in left] == [f"{other} = {value}" for value in panels]
+    for axes, twin, value in zip(left, right, panels, strict=True):
+        pairs = [(place, value) if against == "n" else (value, place) for place in places]
+        drawn = {bars.get_label(): bars.lines[0].get_data() for bars in axes.containers}
+        assert list(drawn) == ["no wrong pairs", "0 to ⌊n/3⌋ pairs wrong"]
+        for (x, y), share in zip(drawn.values(), (0, 33), strict=True):
+            assert list(x) == places
+            assert list(y) == pytest.approx([n + m / 10 + share for n, m in pairs])
+        (time,) = twin.lines
+        # The least over the mixes; the zeros of both axes lie side by side.
+        assert list(time.get_ydata()) == pytest.approx([n * m for n, m in pairs])
+        zeros = [a.transData.transform((0, 0))[1] for a in (axes, twin)]
+        assert zeros[0] == pytest.approx(zeros[1])
+
+
+def test_an_unfinished_sweep_is_drawn(tmp_path):
+    whole = pixels(plot_sweep(tmp_path / "a.png", write_summary(tmp_path / "a.csv", sweep_rows()), against="n"))
+    part = pixels(plot_sweep(tmp_path / "b.png", write_summary(tmp_path / "b.csv", sweep_rows()[:5]), against="n"))
+    assert differ(whole, part)
+    assert has_colour(whole, BLUE)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda rows: [{**row, "model.m": "2"} for row in rows], "several runs with the same n, m and mix"),
+        (lambda rows: [{key: row[key] for key in row if key != "us_per_problem"} for row in rows], "'us_per_problem'"),
+    ],
+)
+def test_sweeps_that_cannot_be_drawn(tmp_path, change, message):
+    with pytest.raises(ValueError, match=message):
+        plot_sweep(tmp_path / "a.png", write_summary(tmp_path / "a.csv", change(sweep_rows())), against="m")
+    (tmp_path / "empty.csv").write_text("model.n,model.m")
+    with pytest.raises(ValueError, match="no rows"):
+        plot_sweep(tmp_path / "a.png", tmp_path / "empty.csv", against="m")
 
 
 def test_no_pyplot_and_no_matplotlib_without_figures():

@@ -9,6 +9,7 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import nn
 
 from kornia_pnpnet import Correspondences, MLPInit
+from kornia_pnpnet.init.mlp import _rotation
 
 
 def correspondences(n, batch=5, dtype=torch.float32, seed=0):
@@ -85,6 +86,32 @@ def test_gradients_are_finite_where_the_branch_returns_zeros(dtype):
     (pose.rotation.sum() + pose.translation.sum()).backward()
     assert world.grad.isfinite().all()
     assert all(p.grad.isfinite().all() for p in net.parameters())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_axis_and_angle_turn_as_kornias_rotation_vectors(dtype):
+    """Large and tiny angles, long and short axes; values and gradients."""
+    generator = torch.Generator().manual_seed(0)
+    axis = torch.randn(3, 400, generator=generator, dtype=torch.float64)
+    axis *= 10.0 ** torch.linspace(-1, 3, 20, dtype=torch.float64).repeat(20)
+    angle = 10.0 * torch.randn(400, generator=generator, dtype=torch.float64)
+    angle[:200] *= 10.0 ** torch.linspace(-12, 0, 200, dtype=torch.float64)
+    upstream = torch.randn(400, 3, 3, generator=generator, dtype=torch.float64).to(dtype)
+    outcomes = []
+    for at in (dtype, torch.float64):
+        leaves = [x.to(dtype).to(at).requires_grad_() for x in (axis, angle)]
+        if at == dtype:
+            rotation = _rotation(*leaves)
+        else:
+            floor = torch.finfo(dtype).eps
+            length = (leaves[0].square().sum(0) + floor).sqrt()
+            rotation = axis_angle_to_rotation_matrix((leaves[0] / length * leaves[1]).mT)
+        by_axis, by_angle = torch.autograd.grad(rotation, leaves, upstream.to(at))
+        size = leaves[0].detach().norm(dim=0)  # the gradient by the axis is inverse to it
+        outcomes.append([x.to(torch.float64) for x in (rotation, by_axis * size, by_angle)])
+    tolerance = 2e-5 if dtype == torch.float32 else 1e-12
+    for mine, kornias in zip(*outcomes, strict=True):
+        torch.testing.assert_close(mine, kornias, rtol=tolerance, atol=20 * tolerance)
 
 
 def test_scales_divide_the_input():

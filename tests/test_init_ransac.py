@@ -333,7 +333,8 @@ def test_the_gradient_is_that_of_the_result(make_problems, correspond):
     probe = torch.randn(4, 3, generator=generator, dtype=torch.float64)
     guess = ransac(corr._replace(img_points=img))
     (guess.pose.translation * probe).sum().backward()
-    step = 1e-3
+    # The weights are those at the start, which is found in single precision: smaller steps would show its rounding.
+    step = 1e-2
     ends = [ransac(corr._replace(img_points=corr.img_points + s * direction)).pose.translation for s in (step, -step)]
     numeric = ((ends[0] - ends[1]) * probe).sum(-1) / (2 * step)
     analytic = (img.grad * direction).sum((1, 2))

@@ -128,9 +128,9 @@ def test_inliers_weigh_by_the_inverse_of_their_threshold(scene):
     corr = corr._replace(weights=torch.ones_like(corr.weights).index_fill(1, torch.tensor([3]), 0.0))
     projection = project(truth, corr)
     judged = judge(projection, corr, thresholds)
-    depth = projection.cam_points[..., 2]
+    depth = transform(truth, corr.world_points)[..., 2]
     sq_limit = thresholds.img[:, None] ** 2 + (corr.focal * thresholds.world[:, None] / depth) ** 2
-    inlier = (projection.residual.square().sum(-1) < sq_limit) & (corr.weights > 0)
+    inlier = projection.in_front & (projection.sq_residual < sq_limit) & (corr.weights > 0)
     assert inlier.any()
     assert not inlier.all()
     assert torch.equal(judged.weights > 0, inlier)

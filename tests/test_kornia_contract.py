@@ -12,7 +12,7 @@ from kornia.geometry.conversions import (
     Rt_to_matrix4x4,
     axis_angle_to_rotation_matrix,
     convert_points_from_homogeneous,
-    normalize_points_with_intrinsics,
+    denormalize_points_with_intrinsics,
     rotation_matrix_to_axis_angle,
 )
 from kornia.geometry.liegroup import So3
@@ -101,12 +101,11 @@ def test_intrinsics_broadcast_over_the_points_of_their_problem():
     K = torch.eye(3).repeat(2, 1, 1)
     K[0, 0, 0], K[1, 0, 0], K[0, 1, 1], K[1, 1, 1] = 2.0, 4.0, 8.0, 16.0
     K[0, 0, 2], K[1, 1, 2] = 10.0, 20.0
-    points = torch.tensor([[[12.0, 8.0]] * 5, [[4.0, 36.0]] * 5])  # (B, N, 2)
-    expected = torch.tensor([[[1.0, 1.0]] * 5, [[1.0, 1.0]] * 5])
-    torch.testing.assert_close(normalize_points_with_intrinsics(points, K), expected)
+    pixels = torch.tensor([[[12.0, 8.0]] * 5, [[4.0, 36.0]] * 5])  # (B, N, 2)
+    plane_points = torch.ones(2, 5, 2)
+    torch.testing.assert_close(denormalize_points_with_intrinsics(plane_points, K), pixels)
     # As many points as problems: the letters must not be mixed up.
-    square = torch.tensor([[[12.0, 8.0]] * 2, [[4.0, 36.0]] * 2])
-    torch.testing.assert_close(normalize_points_with_intrinsics(square, K), expected[:, :2])
+    torch.testing.assert_close(denormalize_points_with_intrinsics(plane_points[:, :2], K), pixels[:, :2])
 
 
 def test_matrix_of_rotation_and_translation():

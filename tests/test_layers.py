@@ -15,8 +15,8 @@ ROOT = Path(kornia_pnpnet.__file__).parent
 
 #: From the bottom up. A module imports from its own layer and those below. The longest prefix counts.
 LAYERS = (
-    ("types", "environment", "files"),
-    ("geometry", "robust", "metrics", "pairs", "data.colmap"),
+    ("types", "environment", "files", "compilation"),
+    ("geometry", "small", "robust", "metrics", "pairs", "data.colmap"),
     ("normalize", "lm", "init", "data"),
     ("model", "losses"),
     ("registry", "peers", "bounds", "__init__"),

@@ -162,7 +162,8 @@ def bad_calls(p):
         "float32_pixels": ((world, pixels.float(), K), {}, TypeCheckError, r"img_points.*float32.*float64"),
         "float32_K": ((world, pixels, K.float()), {}, TypeCheckError, r"intrinsics.*float32.*float64"),
         "float32_weights": ((world, pixels, K), {"weights": ones.float()}, TypeCheckError, r"weights.*float32"),
-        "half": ((world.half(), pixels.half(), K.half()), {}, TypeCheckError, r"float16"),
+        "half": ((world.half(), pixels.half(), K.half()), {}, TypeCheckError, r"float16.*\.float\(\)"),
+        "bfloat16": ((world.bfloat16(), pixels.bfloat16(), K.bfloat16()), {}, TypeCheckError, r"bfloat16.*\.float\(\)"),
         "integers": ((world.long(), pixels.long(), K.long()), {}, TypeCheckError, r"int64"),
         "float_mask": ((world, pixels, K), {"mask": ones}, TypeCheckError, r"mask.*bool.*float64"),
         "meta_pixels": ((world, pixels.to("meta"), K), {}, DeviceError, r"img_points.*meta.*cpu"),
@@ -438,13 +439,24 @@ def test_the_whole_layer_trains(make_problems):
 # --- compile, export, autocast, copies --------------------------------------------------------------------------------
 
 
-def test_autocast_around_the_layer_changes_nothing(make_problems):
-    p = make_problems(dtype=torch.float32)
-    solver = net()
-    plain = solver(*p[:3])
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        cast = solver(*p[:3])
-    assert_same(cast, plain)
+@pytest.mark.parametrize("cast_dtype", [torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("name", ["net", "additive", "identity"])
+def test_autocast_around_the_layer_changes_no_bit(name, dtype, cast_dtype, make_problems):
+    """Neither of the results nor of the gradients."""
+    outcomes = []
+    for enabled in (False, True):
+        world, pixels, K = (x.requires_grad_() for x in make_problems(dtype=dtype)[:3])
+        torch.manual_seed(0)
+        solver = SOLVERS[name]()
+        with torch.autocast("cpu", dtype=cast_dtype, enabled=enabled):
+            result = solver(world, pixels, K)
+            loss = result.init.translation.sum() + result.translation.sum() + result.cost.sum()
+        loss.backward()
+        gradients = [x.grad for x in (world, pixels, K, *solver.parameters())]
+        outcomes.append((*pytree.tree_leaves(result), *gradients))
+    for plain, cast in zip(*outcomes, strict=True):
+        assert plain is cast is None or torch.equal(plain, cast)
 
 
 @pytest.mark.parametrize("options", [{}, {"update": "additive", "reject_worse": True, "kernel": "huber"}], ids=str)

@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+from kornia.geometry.conversions import normalize_points_with_intrinsics
 
 from kornia_pnpnet import Correspondences, MLPInit, Normalize, PnPNet, Pose, RobustWeightedLM
 from kornia_pnpnet.geometry import project, transform
@@ -76,7 +77,7 @@ def test_residuals_scale_with_the_focal_length(f, options, make_problems):
 
     normalize = Normalize(**options)
     corr, frame = normalize(p.world_points, pixels, K)
-    residual = project(normalize.apply_to_pose(p.pose, frame), corr).residual
+    residual = torch.stack(project(normalize.apply_to_pose(p.pose, frame), corr).residual, -1)
     expected = expected.gather(1, frame.order[..., None].expand(-1, -1, 2))
     torch.testing.assert_close(residual, expected * (F_CONST / f), rtol=1e-9, atol=1e-7)
     assert corr.focal == F_CONST
@@ -88,9 +89,17 @@ def test_true_poses_project_exactly_for_any_camera(fx, fy, cx, cy, make_problems
     K = camera(fx, fy, cx, cy, 7)
     normalize = Normalize()
     corr, frame = normalize(p.world_points, see(p, K), K)
-    residual = project(normalize.apply_to_pose(p.pose, frame), corr).residual
+    residual = torch.stack(project(normalize.apply_to_pose(p.pose, frame), corr).residual, -1)
     assert residual.abs().max() < 1e-8
     assert frame.valid.all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_pixels_are_kornias_times_the_focal_length(dtype, make_problems):
+    p = make_problems(dtype=dtype)
+    K = camera(3000, 2000, 2016.5, -7.25, 7).to(dtype)
+    corr, _ = Normalize(order=False)(p.world_points, p.img_points, K)
+    torch.testing.assert_close(corr.img_points, F_CONST * normalize_points_with_intrinsics(p.img_points, K))
 
 
 def test_the_camera_of_the_normalised_pixels_is_a_constructor_argument(make_problems):
@@ -244,14 +253,19 @@ def test_what_padding_holds_does_not_change_a_bit(make_problems):
         assert torch.equal(other.ok, results[0].ok)
 
 
-def test_a_pair_without_weight_has_no_place(make_problems):
+@pytest.mark.parametrize("content", PADDING.values(), ids=PADDING.keys())
+def test_a_pair_without_weight_has_no_place(content, make_problems):
+    """It is padding, whatever it holds."""
     p = make_problems(9)
     weights = torch.ones(7, 9, dtype=torch.float64)
     weights[:, 2] = 0.0
     mask = torch.ones(7, 9, dtype=torch.bool)
     mask[:, 2] = False
-    by_weight, _ = Normalize()(p.world_points, p.img_points, p.intrinsics, weights)
+    world, pixels = p.world_points.clone(), p.img_points.clone()
+    world[:, 2], pixels[:, 2] = content, content
+    by_weight, frame = Normalize()(world, pixels, p.intrinsics, weights)
     by_mask, _ = Normalize()(p.world_points, p.img_points, p.intrinsics, None, mask)
+    assert frame.valid.all()
     for one, two in zip(by_weight, by_mask, strict=True):
         assert torch.equal(one, two)
 
@@ -365,6 +379,28 @@ def test_points_off_a_line_are_valid(n, dtype, random_rotations):
             for unit in (1e-3, 1.0, 1e3):
                 _, frame = Normalize()((unit * points).to(dtype), pixels, K)
                 assert frame.valid.all(), (shape, offset, unit)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("size", [1e-7, 1e-3, 1.0, 1e4, 1e8])
+@pytest.mark.parametrize("offset", [0.0, 1.0, 1e4])
+def test_two_pairs_are_invalid_wherever_they_are(offset, size, dtype):
+    generator = torch.Generator().manual_seed(0)
+    world = size * (offset + torch.randn(500, 9, 3, generator=generator, dtype=torch.float64))
+    pixels = torch.randn(500, 9, 2, generator=generator, dtype=torch.float64)
+    mask = torch.arange(9) < 2
+    K = camera(1, 1, 0, 0, 500).to(dtype)
+    _, frame = Normalize()(world.to(dtype), pixels.to(dtype), K, None, mask.expand(500, 9))
+    assert not frame.valid.any()
+
+
+@pytest.mark.parametrize("options", OPTIONS, ids=str)
+def test_problems_are_side_by_side_in_memory(options, make_problems):
+    """One coordinate of one pair of all problems is a row: see ``problems_last``."""
+    corr, _ = Normalize(**options)(*make_problems()[:3])
+    assert corr.world_points.permute(2, 1, 0).is_contiguous()
+    assert corr.img_points.permute(2, 1, 0).is_contiguous()
+    assert corr.weights.mT.is_contiguous()
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -271,6 +271,24 @@ def test_drawing_leaves_the_global_generator_alone():
     assert torch.equal(torch.rand(3), expected)
 
 
+def test_the_stream_is_the_same_in_every_version():
+    """Checkpoints are continued, and results compared, on the batches that they began with."""
+    source = SyntheticProblems(
+        n=4,
+        batch_size=2,
+        seed=1,
+        outliers=OutlierMix(count=2),
+        points=MixedPoints([BoxPoints(), SlabPoints()]),
+        dtype=torch.float64,
+    )
+    p = source.batch(5)
+    expected = [28.632700473229, 21.940176818086, 12.999538879636, 664.160198577891, -2333.270799434770]
+    expected += [-11.830719013041, 1.755626411493, -12.466575925139]
+    found = torch.cat((p.world_points[1, 3], p.img_points[1, 3], p.pose.translation[1]))
+    torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float64), rtol=1e-9, atol=0)
+    assert p.inliers.tolist() == [[False, False, True, True], [True, False, False, True]]
+
+
 def test_seeds_beyond_32_bits_count():
     # Of the state itself PyTorch's CPU generator uses 32 bits.
     seeds = (0, 1, 2**32, 2**40)

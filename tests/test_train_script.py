@@ -94,6 +94,7 @@ def test_run_writes_results_and_resumes(tmp_path):
     run(f"hydra.run.dir={tmp_path}", "train.updates=1")
     results = json.loads((tmp_path / "results.json").read_text())
     assert results["run"]["update"] == 1
+    assert sum(results["run"]["time_shares"].values()) == pytest.approx(1.0)
     assert set(results["validation"]) == {"none", "uniform", "slab"}
     assert "train.updates=1" in results["overrides"]
     model = PnPNet.from_pretrained(tmp_path / "weights")
@@ -107,6 +108,17 @@ def test_run_writes_results_and_resumes(tmp_path):
     assert "Traceback" not in again.stdout + again.stderr
     done = run(f"hydra.run.dir={tmp_path}", "train.updates=1", "resume=true")
     assert "1 updates" in done.stdout + done.stderr
+
+
+@pytest.mark.slow
+def test_compilation_changes_neither_the_numbers_nor_what_is_saved(tmp_path):
+    for compiled in ("false", "true"):
+        run(f"hydra.run.dir={tmp_path / compiled}", f"compile={compiled}", "train.ramp=[0,0]")
+    plain, compiled = (torch.load(tmp_path / name / "last.ckpt", weights_only=True) for name in ("false", "true"))
+    assert compiled["identity"] == plain["identity"]
+    torch.testing.assert_close(compiled["model"], plain["model"], rtol=0, atol=1e-4)
+    PnPNet.from_pretrained(tmp_path / "true" / "weights")
+    assert "compile=" not in (tmp_path / "true" / "weights" / "README.md").read_text()
 
 
 def test_sweep_leaves_results_and_a_summary(tmp_path):

@@ -1,11 +1,13 @@
 """The training loop: resuming equals not stopping, bad steps are skipped, two processes equal one."""
 
 import csv
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -19,6 +21,10 @@ from kornia_pnpnet.runstate import CHECKPOINT_NAME, HISTORY_NAME, TrainingError,
 from kornia_pnpnet.training import TrainSettings, fit, train_briefly
 
 REPO = Path(__file__).resolve().parents[1]
+SHARES = [f"{stage}_share" for stage in ("data", "forward", "backward", "optimizer", "rest")]
+
+# Python 3.12 warns of every fork of a process with threads, which pytest-xdist's are.
+forks = pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
 
 
 def make_parts(updates=6, **changes):
@@ -41,11 +47,18 @@ def read_history(folder):
 
 def comparable(rows):
     """History rows without what depends on the clock or the memory."""
-    return [{k: v for k, v in row.items() if k not in ("updates_per_second", "peak_memory_mib")} for row in rows]
+    timed = ("updates_per_second", "peak_memory_mib", *SHARES)
+    return [{k: v for k, v in row.items() if k not in timed} for row in rows]
+
+
+def assert_same_weights(model, other):
+    state = other.state_dict()
+    for name, value in model.state_dict().items():
+        assert torch.equal(value, state[name]), name
 
 
 class StoppingLoss(PoseLoss):
-    """Sends a signal to this process while the given update is computed."""
+    """Sends a signal to this process and its workers while the given update is computed, as a terminal does."""
 
     def __init__(self, at, number):
         super().__init__(saturation=0.02)
@@ -54,7 +67,8 @@ class StoppingLoss(PoseLoss):
     def forward(self, *args, **kwargs):
         self.calls += 1
         if self.calls == self.at:
-            os.kill(os.getpid(), self.number)
+            for pid in (os.getpid(), *(child.pid for child in multiprocessing.active_children())):
+                os.kill(pid, self.number)
         return super().forward(*args, **kwargs)
 
 
@@ -71,14 +85,18 @@ class BrokenLoss(PoseLoss):
         return terms._replace(total=terms.total * self.value) if self.calls in self.at else terms
 
 
+@forks
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_resuming_after_a_signal_equals_not_stopping(tmp_path, number):
+@pytest.mark.parametrize(("workers", "workers_later"), [(0, 0), (1, 0), (0, 1), (1, 1)])
+def test_resuming_after_a_signal_equals_not_stopping(tmp_path, number, workers, workers_later):
     whole = make_parts()
     fit(folder=tmp_path / "whole", **whole)
 
     stopped = make_parts()
     handler = signal.getsignal(number)
-    report = fit(folder=tmp_path / "parts", **{**stopped, "loss": StoppingLoss(3, number)})
+    stopped["loss"] = StoppingLoss(3, number)
+    report = fit(folder=tmp_path / "parts", data_workers=workers, **stopped)
+    assert not multiprocessing.active_children()
     assert report.interrupted
     assert report.update == 3
     assert signal.getsignal(number) is handler
@@ -87,11 +105,10 @@ def test_resuming_after_a_signal_equals_not_stopping(tmp_path, number):
     torch.manual_seed(77)  # a fresh process: other weights at first
     again = make_parts()
     again["model"] = PnPNet(MLPInit(6), RobustWeightedLM(2))
-    report = fit(folder=tmp_path / "parts", resume=True, **again)
+    report = fit(folder=tmp_path / "parts", resume=True, data_workers=workers_later, **again)
     assert not report.interrupted
     assert report.update == 6
-    for name, value in whole["model"].state_dict().items():
-        assert torch.equal(value, again["model"].state_dict()[name]), name
+    assert_same_weights(whole["model"], again["model"])
     assert comparable(read_history(tmp_path / "parts")) == comparable(read_history(tmp_path / "whole"))
 
 
@@ -201,8 +218,7 @@ def test_validation_does_not_change_the_training(tmp_path):
     with_it, without = make_parts(validate_every=1), make_parts(validate_every=100)
     fit(folder=tmp_path / "a", **with_it)
     fit(folder=tmp_path / "b", **without)
-    for name, value in with_it["model"].state_dict().items():
-        assert torch.equal(value, without["model"].state_dict()[name]), name
+    assert_same_weights(with_it["model"], without["model"])
 
 
 def test_training_outside_the_main_thread(tmp_path):
@@ -313,3 +329,66 @@ def test_settings_out_of_range_are_refused(wrong):
 def test_a_ramp_may_be_a_step():
     assert [TrainSettings(10, ramp=(0.5, 0.5)).ramp_factor(update) for update in (0, 4, 5, 9)] == [0.0, 0.0, 1.0, 1.0]
     assert TrainSettings(10, ramp=(1.0, 1.0)).ramp_factor(9) == 0.0
+
+
+@forks
+def test_data_drawn_meanwhile_changes_nothing(tmp_path):
+    plain, overlapped = make_parts(updates=30), make_parts(updates=30)
+    fit(folder=tmp_path / "plain", **plain)
+    fit(folder=tmp_path / "overlapped", data_workers=1, **overlapped)
+    assert_same_weights(plain["model"], overlapped["model"])
+    assert comparable(read_history(tmp_path / "overlapped")) == comparable(read_history(tmp_path / "plain"))
+
+
+class BrokenSource(SyntheticProblems):
+    def batch(self, index):
+        if index == 4:
+            raise ArithmeticError("batch 4 cannot be drawn")
+        return super().batch(index)
+
+
+@forks
+@pytest.mark.parametrize("workers", [0, 1])
+def test_an_error_in_the_data_ends_the_run_with_its_message(tmp_path, workers):
+    parts = {**make_parts(), "data": BrokenSource(n=6, batch_size=16)}
+    with pytest.raises(ArithmeticError, match="batch 4 cannot be drawn"):
+        fit(folder=tmp_path, data_workers=workers, **parts)
+    assert not multiprocessing.active_children()
+    assert torch.load(tmp_path / CHECKPOINT_NAME, weights_only=True)["update"] == 4
+
+
+def test_a_checkpoint_of_an_optimizer_that_was_not_fused_is_continued(tmp_path):
+    """How a step is computed may change between two calls: the numbers that it continues from may not."""
+    whole = make_parts()
+    fit(folder=tmp_path / "whole", **whole)
+    fit(folder=tmp_path / "parts", **{**make_parts(), "loss": StoppingLoss(4, signal.SIGTERM)})
+    path = tmp_path / "parts" / CHECKPOINT_NAME
+    state = torch.load(path, weights_only=True)
+    for group in state["optimizer"]["param_groups"]:
+        assert group["fused"]
+        group["fused"] = None
+    torch.save(state, path)
+    again = make_parts()
+    fit(folder=tmp_path / "parts", resume=True, **again)
+    assert_same_weights(whole["model"], again["model"])
+
+
+def test_the_shares_of_the_time_add_up(tmp_path):
+    report = fit(folder=tmp_path, **make_parts())
+    assert [f"{stage}_share" for stage in report.time_shares] == SHARES
+    for shares in (report.time_shares.values(), *([float(row[s]) for s in SHARES] for row in read_history(tmp_path))):
+        assert all(share > 0.0 for share in shares)
+        assert sum(shares) == pytest.approx(1.0, abs=1e-4)  # six digits are written
+
+
+class SlowSource(SyntheticProblems):
+    def batch(self, index):
+        time.sleep(0.2)
+        return super().batch(index)
+
+
+def test_waiting_for_data_is_counted_as_that(tmp_path):
+    quick, slow = ({**make_parts(), "data": kind(n=6, batch_size=16)} for kind in (SyntheticProblems, SlowSource))
+    shares = [fit(folder=tmp_path / name, **parts).time_shares for name, parts in (("quick", quick), ("slow", slow))]
+    assert shares[1]["data"] > shares[0]["data"]
+    assert shares[1]["data"] == max(shares[1].values())

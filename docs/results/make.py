@@ -3,8 +3,15 @@
 ``measure`` solves fresh problems with every solver and writes the results files here, without the errors of single
 problems; with them they are in ``outputs/results``, from where a run that was stopped continues. It needs the scenes
 (``--scenes``, default ``../shared/data``). ``compare`` (two folders of ``train.py`` with ``--runs``) writes
-``distribution.json`` in the same way. ``render`` reads the files and ``ablation.csv``, the summary of short runs, and
-writes ``README.md`` and the pictures; every number of the page comes from the files.
+``distribution.json`` in the same way. ``render`` reads the files and writes ``README.md`` and the pictures; every
+number of the page comes from the files. ``ablation.csv`` and ``sweep.csv`` are copies of ``summary.csv`` in the folders
+of these, which take less than an hour on one core and go on where they were stopped::
+
+    SHORT="train.updates=4000 validation_size=5000 threads=1 hydra.sweep.dir=outputs/ablation resume=true"
+    python train.py -m experiment=recipe $SHORT
+    python train.py -m experiment=net_loss_only,identity_start,shared,additive,uncentred $SHORT
+    python train.py -m experiment=kernels $SHORT
+    python train.py -m experiment=sweep threads=1 hydra.sweep.dir=outputs/sweep resume=true
 """
 
 from __future__ import annotations
@@ -13,7 +20,7 @@ import argparse
 import csv
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import product
+from itertools import pairwise, product, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +31,15 @@ from kornia_pnpnet import PnPNet, RobustWeightedLM
 from kornia_pnpnet.choices import evaluation_sets, load_solver
 from kornia_pnpnet.complexity import complexity_results
 from kornia_pnpnet.evaluation import EvaluationData, evaluate
-from kornia_pnpnet.figures import paper_figures, plot_training
+from kornia_pnpnet.figures import paper_figures, plot_sweep, plot_training
+from kornia_pnpnet.figures.sweep import mix_in_words
 from kornia_pnpnet.model import WEIGHTS_FOLDER
 from kornia_pnpnet.reports import write_json
 from kornia_pnpnet.results import format_table, load_results, save_results
 
 HERE = Path(__file__).resolve().parent
 OUTPUTS = HERE.parents[1] / "outputs" / "results"
+EXPERIMENTS = HERE.parents[1] / "conf" / "experiment"
 OURS = "pnpnet-n9"
 METRIC_SCENES = ("strecha/fountain-P11", "strecha/Herz-Jesus-P25", "eth3d/courtyard")
 OTHER_SCENES = ("colmap/lund_door", "colmap/sceaux_castle")
@@ -353,11 +362,13 @@ next thing to try; the scale of the scene is not the cause, since the world is c
 
 {depth}
 
-## Ablation
-
-Short runs of the shipped recipe with one thing changed; success on the training's validation sets.
+## Ablations
 
 {ablation}
+
+## Sweep over n, m and the mix of wrong pairs
+
+{sweep}
 
 ## Training of {ours}
 
@@ -429,21 +440,138 @@ def beside_peers(rates: Rates, solvers: Iterable[str]) -> str:
     return "\n".join(lines)
 
 
-def ablation_table(path: Path) -> str:
-    """The summary of the short runs as a Markdown table of success rates."""
+ABLATION = """\
+Short runs ({updates} updates) of the shipped recipe with one thing changed, each by the file of its name in
+[conf/experiment](../../conf/experiment), which opens with its command; success on the training's validation sets, and
+µs per problem (the shortest call of 1000 problems at the end of the run, one thread). `recipe` changes nothing: its
+{seeds} seeds differ by up to {spread:.1f} points, which the intervals do not cover, since they are about the problems
+alone. So a run counts as above or below only if its interval is above or below those of all seeds of `recipe`; the
+difference is from their mean.
+
+{table}
+
+{findings}"""
+
+SWEEP = """\
+`python train.py -m experiment=sweep`: {updates} updates for each n, m and mix of wrong pairs, which is also the mix
+that is tested. So short, the runs compare with each other, not with the shipped weights, and another seed changes them
+too (see the ablations). µs as above, the least over the mixes, on which it does not depend.
+
+{table}
+
+{findings}
+
+![Success against m](sweep_against_m.png)
+
+![Success against n](sweep_against_n.png)"""
+
+Row = Mapping[str, str]
+KERNEL = "model.solver.refine.kernel"
+
+
+def read_summary(path: Path) -> list[Row]:
+    """The rows of the summary of a multirun."""
     with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    names = [key.removesuffix("/rate") for key in rows[0] if key.endswith("/rate")]
-    lines = ["| Run | Updates | " + " | ".join(names) + " |", "|---" * (2 + len(names)) + "|"]
-    for row in rows:
-        shares = [[100 * float(row[f"{name}/{key}"]) for key in ("rate", "low", "high")] for name in names]
-        cells = [f"{rate:.1f} % [{low:.1f}, {high:.1f}]" for rate, low, high in shares]
-        lines.append(f"| {row['run']} | {row['update']} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        return list(csv.DictReader(file))
 
 
-def page(results: Mapping[str, Mapping[str, Any]], complexity: Mapping[str, Any], ablation: Path) -> str:
-    """The results page as Markdown, from the results by their names in ``RESULTS`` and the ablation's table."""
+def percent(row: Row, data: str) -> tuple[float, float, float]:
+    """Success of a run on a validation set and its interval."""
+    rate, low, high = (100 * float(row[f"{data}/{key}"]) for key in ("rate", "low", "high"))
+    return rate, low, high
+
+
+def compared(runs: Sequence[Row], others: Sequence[Row], data: str) -> str:
+    """How far the mean of some runs is from that of others, in points, and whether all intervals are apart."""
+    (rates, lows, highs), (other_rates, other_lows, other_highs) = (
+        zip(*(percent(row, data) for row in rows), strict=True) for rows in (runs, others)
+    )
+    difference = sum(rates) / len(rates) - sum(other_rates) / len(other_rates)
+    above, below = min(lows) > max(other_highs), max(highs) < min(other_lows)
+    return f"{difference:+.1f} points ({'above' if above else 'below' if below else 'not told apart'})"
+
+
+def updates_of(rows: Sequence[Row]) -> str:
+    """How long runs were, which is the same for all or said as it is."""
+    return " or ".join(dict.fromkeys(row["update"] for row in rows))
+
+
+def claim(experiment: str) -> str:
+    """What an experiment's file says that it tests."""
+    lines = (EXPERIMENTS / f"{experiment}.yaml").read_text(encoding="utf-8").splitlines()
+    comment = " ".join(line.removeprefix("# ") for line in takewhile(lambda line: line.startswith("#"), lines))
+    return comment.partition("Claim: ")[2]
+
+
+def ablation_text(rows: Sequence[Row]) -> str:
+    """Short runs beside the recipe's: a table, and for each experiment its claim and what the intervals say of it."""
+    sets = [key.removesuffix("/rate") for key in rows[0] if key.endswith("/rate")]
+    recipe = [row for row in rows if row["experiment"] == "recipe"]
+    lines = [
+        "| Run | " + " | ".join(f"{data} (%)" for data in sets) + " | µs |",
+        "|---" + "|---:" * (len(sets) + 1) + "|",
+    ]
+    for row in [*recipe, *(row for row in rows if row not in recipe)]:
+        seed = f"seed={row['seed']}" if row.get("seed") else ""
+        name = " ".join(filter(None, (row["experiment"], row.get(KERNEL), seed)))
+        cells = ["{:.1f} [{:.1f}, {:.1f}]".format(*percent(row, data)) for data in sets]
+        lines.append(f"| `{name}` | " + " | ".join(cells) + f" | {float(row['us_per_problem']):.0f} |")
+    findings = []
+    for experiment in dict.fromkeys(row["experiment"] for row in rows if row not in recipe):
+        findings.append(f"- `{experiment}`. *Claim:* {claim(experiment)}")
+        by_kind: dict[str, list[Row]] = {}
+        for row in rows:
+            if row["experiment"] == experiment:
+                by_kind.setdefault(row.get(KERNEL, ""), []).append(row)
+        for kind, runs in by_kind.items():
+            found = ", ".join(f"{data} {compared(runs, recipe, data)}" for data in sets)
+            findings.append(f"    - *Found{f', {kind}' if kind else ''}:* {found}.")
+    rates = {data: [percent(row, data)[0] for row in recipe] for data in sets}
+    return ABLATION.format(
+        updates=updates_of(rows),
+        seeds=len(recipe),
+        spread=max(max(values) - min(values) for values in rates.values()),
+        table="\n".join(lines),
+        findings="\n".join(findings),
+    )
+
+
+def sweep_text(rows: Sequence[Row]) -> str:
+    """The sweep as a table of n and mix against m, and what its steps in m and in n give at the middle of the other."""
+    runs = {(int(row["model.n"]), int(row["model.m"]), float(row["data.outliers.max_ratio"])): row for row in rows}
+    all_n, all_m, mixes = (sorted(set(values)) for values in zip(*runs, strict=True))
+    lines = ["| n | trained and tested on | " + " | ".join(f"m = {m} (%)" for m in all_m) + " |"]
+    lines.append("|---:|---" + "|---:" * len(all_m) + "|")
+    for n in all_n:
+        for mix in mixes:
+            cells = ["{:.1f} [{:.1f}, {:.1f}]".format(*percent(runs[n, m, mix], "uniform")) for m in all_m]
+            lines.append(f"| {n} | {mix_in_words(mix)} | " + " | ".join(cells) + " |")
+        times = [min(float(runs[n, m, mix]["us_per_problem"]) for mix in mixes) for m in all_m]
+        lines.append(f"| {n} | µs | " + " | ".join(f"{time:.0f}" for time in times) + " |")
+    findings = []
+    middle_n, middle_m = all_n[len(all_n) // 2], all_m[len(all_m) // 2]
+    for mix in mixes:
+        deeper_steps = ", ".join(
+            f"{low} → {high} {compared([runs[middle_n, high, mix]], [runs[middle_n, low, mix]], 'uniform')}"
+            for low, high in pairwise(all_m)
+        )
+        wider_steps = ", ".join(
+            f"{low} → {high} {compared([runs[high, middle_m, mix]], [runs[low, middle_m, mix]], 'uniform')}"
+            for low, high in pairwise(all_n)
+        )
+        findings.append(
+            f"- {mix_in_words(mix)}: m at n = {middle_n}, {deeper_steps}; n at m = {middle_m}, {wider_steps}."
+        )
+    return SWEEP.format(updates=updates_of(rows), table="\n".join(lines), findings="\n".join(findings))
+
+
+def page(
+    results: Mapping[str, Mapping[str, Any]],
+    complexity: Mapping[str, Any],
+    ablation: Sequence[Row],
+    sweep: Sequence[Row],
+) -> str:
+    """The results page as Markdown, from the results by their names in ``RESULTS`` and the summaries of short runs."""
     rates = {name: Rates(entry) for name, entry in results.items()}
     environment = results["paper"]["environment"]
     tuned = [
@@ -470,7 +598,8 @@ def page(results: Mapping[str, Mapping[str, Any]], complexity: Mapping[str, Any]
         depth=format_table(results["depth"]),
         distribution_runs=", ".join(f"{name}: {n} updates" for name, n in runs),
         distribution=format_table(results["distribution"]),
-        ablation=ablation_table(ablation),
+        ablation=ablation_text(ablation),
+        sweep=sweep_text(sweep),
     )
 
 
@@ -480,7 +609,10 @@ def render() -> None:
     complexity = json.loads((HERE / "complexity.json").read_text())
     paper_figures([*(results[name] for name in RESULTS[:-2]), complexity], HERE)
     plot_training(HERE / "training.png", WEIGHTS_FOLDER / OURS / "history.csv")
-    (HERE / "README.md").write_text(page(results, complexity, HERE / "ablation.csv"), encoding="utf-8")
+    for against in ("n", "m"):
+        plot_sweep(HERE / f"sweep_against_{against}.png", HERE / "sweep.csv", against=against)
+    short_runs = [read_summary(HERE / f"{name}.csv") for name in ("ablation", "sweep")]
+    (HERE / "README.md").write_text(page(results, complexity, *short_runs), encoding="utf-8")
 
 
 def compare(scenes: Path, count: int, runs: Sequence[Path]) -> None:

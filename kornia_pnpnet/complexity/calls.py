@@ -25,23 +25,25 @@ __all__ = ["part_calls"]
 Call = tuple[str, float, tuple[int, ...]]
 
 
-def _step_calls(n: int, times: float, *, own_damping: bool) -> Iterator[Call]:
+def _step_calls(n: int, times: float) -> Iterator[Call]:
     """One step of Levenberg-Marquardt."""
-    yield "geometry.linearize", times, (n,)
-    yield "lm.lm_step", times, (n,)
-    yield "lm.solve_damped", times, (own_damping,)
-    yield "geometry.retract", times, ()
+    yield "lm._relative", times, (n,)
+    yield "geometry.normal_equations", times, (n,)
+    yield "lm.lm_step", times, ()
+    yield "lm.solve_damped", times, ()
+    yield "geometry.move", times, ()
 
 
 def _lm_calls(lm: RobustWeightedLM, n: int, times: float = 1) -> Iterator[Call]:
     weight, loss = (f"robust.{function.__name__}" for function in (lm.kernel.weight, lm.kernel.loss))
     if lm.additive or lm.reject_worse or weight not in PARTS:
         raise ValueCheckError(f"There is no formula for {lm}: it needs the retraction, no rejection, the power kernel.")
-    yield "lm.RobustWeightedLM.forward", times, (n, lm.m)
-    yield from _step_calls(n, lm.m * times, own_damping=True)
-    for part in ("geometry.project", "lm.RobustWeightedLM._pair_weights", weight):
+    yield "lm._iterate", lm.m * times, (n,)
+    yield from _step_calls(n, lm.m * times)
+    for part in ("geometry.project", weight):
         yield part, (lm.m + 1) * times, (n,)
-    for part in ("lm.RobustWeightedLM._cost", loss, "lm.explains"):
+    ends = "lm.RobustWeightedLM.begin", "lm.RobustWeightedLM.finish"
+    for part in (*ends, "lm.RobustWeightedLM._cost", loss, "lm.explains"):
         yield part, times, (n,)
 
 
@@ -68,7 +70,7 @@ def _reppnp_calls(reppnp: REPPnP, n: int, times: float) -> Iterator[Call]:
     yield "reppnp._normal_matrix", (steps + rigid) * times, (n,)
     yield "small.nearest_rotation", times, ()
     yield "reppnp._step", steps * times, ()
-    yield "geometry.retract", steps * times, ()
+    yield "geometry.move", steps * times, ()
 
 
 def _ransac_calls(ransac: RANSAC, n: int, outliers: int | None, better: int | None) -> Iterator[Call]:
@@ -97,7 +99,7 @@ def _ransac_calls(ransac: RANSAC, n: int, outliers: int | None, better: int | No
     steps = poses + plan.local_iterations - 1
     yield "search.Search._improve", better, (poses,)
     yield "search.Search._descend", better * steps, (n,)
-    yield from _step_calls(n, better * steps + FINAL_STEPS, own_damping=False)
+    yield from _step_calls(n, better * steps + FINAL_STEPS)
     yield "geometry.project", better * (steps + 1) + FINAL_STEPS + 1, (n,)
     yield "search.Search.run", 1, (n, size, len(rounds), better)
     yield "ransac.RANSAC.forward", 1, (n,)
@@ -164,4 +166,4 @@ def part_calls(solver: PnPNet, n: int, *, outliers: int | None = None, better: i
         yield from _init_calls(solver.init, n)
     yield from _lm_calls(solver.refine, n)
     yield "normalize.Normalize.undo", 2, ()
-    yield "model.PnPNet.forward", 1, (n, _says_ok(solver.init))
+    yield "model.PnPNet._result", 1, (n, _says_ok(solver.init))

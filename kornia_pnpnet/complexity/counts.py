@@ -76,7 +76,7 @@ def operation_count(solver: str | PnPNet, n: int, *, outliers: int | None = None
 
     Example:
         >>> round(operation_count("identity-lm", 9), -4)
-        130000.0
+        70000.0
     """
     solver = _solver(solver) if isinstance(solver, str) else solver
     return sum(operations.flops for operations in operations_by_part(solver, n, outliers=outliers).values())

@@ -10,10 +10,6 @@ from kornia_pnpnet.init.search import FIRST_PAIRS, KEPT_ONE_IN
 
 __all__ = ["PARTS"]
 
-#: Rodrigues' formula as kornia computes it: the general branch and the one for small angles.
-_RODRIGUES = Operations(add=26, multiply=46, divide=5, sqrt=1, log=2, compare=1, logic=10)
-
-
 def _mlp(n: int) -> Operations:
     """One product and one sum for each weight of the network of the paper's figure 2, a comparison for each ReLU."""
     shared, branch = [5 * n, 20 * n, 5 * n, 3 * n], [3 * n] + 5 * [2 * n]
@@ -22,8 +18,8 @@ def _mlp(n: int) -> Operations:
     units = sum(size_out for _, size_out in hidden)
     layers = Operations(add=weights, multiply=weights, compare=units)
     scale_inputs = Operations(divide=5 * n)
-    rotation_vector = Operations(add=3, multiply=6, divide=3, sqrt=1)
-    return scale_inputs + layers + rotation_vector + _RODRIGUES
+    rotation = Operations(add=15, multiply=26, divide=2, sqrt=2, log=2, compare=1)  # by way of the unit quaternion
+    return scale_inputs + layers + rotation
 
 
 def _inverse(n: int) -> Operations:
@@ -65,45 +61,41 @@ def _best_of_samples(samples: int, size: int, slots: int, kept: int, drawn: bool
 #: Operations of one call of a part as a function of its sizes, first of all the number of pairs n. Data that are only
 #: moved cost nothing; what is computed once for the whole batch is not counted.
 PARTS: dict[str, Callable[..., Operations]] = {
-    # Checks of all inputs; two changes of pixels; mean, covariance and scale of the world; two sorts.
+    # Checks of all inputs; a change of pixels; mean, covariance and scale of the world; two sorts.
     "normalize.Normalize.forward": lambda n, order: (
-        Operations(add=27 * n - 3, multiply=28 * n + 16, divide=8 * n + 3, sqrt=3, compare=27 * n + 39)
-        + Operations(logic=27 * n + 31)
+        Operations(add=22 * n + 2, multiply=24 * n + 28, divide=8, sqrt=5, compare=25 * n + 42, logic=13 * n + 19)
         + order * (Operations(logic=2 * n) + 2 * sort(n))
     ),
     "normalize.Normalize.apply_to_pose": lambda: matmul(3, 3, 1) + Operations(add=3, multiply=3),
     "normalize.Normalize.undo": lambda: matmul(3, 3, 1) + Operations(add=3, divide=3),
     # Checks of everything that is returned, of the initialiser's word, and of a pose that was given.
-    "model.PnPNet.forward": lambda n, init_ok: Operations(
-        multiply=n + 25, compare=4 * n + 100, logic=3 * n + 79 + init_ok
-    ),
-    "model.PnPNet._given": lambda: Operations(compare=36, logic=36),
+    "model.PnPNet._result": lambda n, init_ok: Operations(add=n + 5, multiply=2, compare=8, logic=n + 28 + init_ok),
+    "model.PnPNet._given": lambda: Operations(compare=36, logic=13),
     "mlp.MLPInit.forward": _mlp,
-    # R x + t (9 products, 9 sums), in front (5, 2), x/z and y/z (3), times the focal length minus the pixel (2, 2).
-    "geometry.project": lambda n: n * Operations(add=13, multiply=19, divide=1, compare=5, logic=8),
-    # Of the two rows of a pair 8 entries are computed.
-    "geometry.linearize": lambda n: n * Operations(add=2, multiply=16, divide=3),
-    "geometry.retract": lambda: _RODRIGUES + matmul(3, 3, 3) + Operations(add=3),
-    # Prior weights, and the damping of each iteration.
-    "lm.RobustWeightedLM.forward": lambda n, m: Operations(multiply=n + m, logic=1),
-    "lm.RobustWeightedLM._pair_weights": lambda n: n * Operations(add=1, multiply=3, logic=1),
+    # R x + t (9 products, 9 sums), in front (3, 8), x/z and y/z (3), times the focal length minus the pixel (2, 4).
+    "geometry.project": lambda n: n * Operations(add=14, multiply=24, divide=1, compare=3, logic=1),
+    # Of the 21 entries of the matrix and the 6 of the gradient what is not known beforehand.
+    "geometry.normal_equations": lambda n: Operations(add=41 * n - 25, multiply=44 * n),
+    # Cayley's map: two cross products with the rows of the rotation.
+    "geometry.move": lambda: Operations(add=42, multiply=52, divide=1),
+    # Prior weights, relative to the largest; those of an iteration likewise, by the rows of the Jacobian.
+    "lm.RobustWeightedLM.begin": lambda n: Operations(multiply=n, divide=n, compare=n, logic=1),
+    "lm.RobustWeightedLM.finish": lambda n: Operations(add=n, multiply=3 * n, logic=n + 1),
+    "lm._iterate": lambda n: n * Operations(add=1, multiply=3),
+    "lm._relative": lambda n: Operations(multiply=2 * n, divide=n, compare=n, logic=1),
     "lm.RobustWeightedLM._cost": lambda n: Operations(
         add=3 * n - 2, multiply=3 * n, divide=1, compare=2 * n + 1, logic=n
     ),
     # The kernel 1 / |r|^alpha with any alpha: a power; its loss with a series near alpha = 2.
     "robust._power_weight": lambda n: n * Operations(add=1, multiply=1, exp=1, log=1),
     "robust._power_loss": lambda n: n * Operations(add=5, multiply=7, divide=3, exp=1, log=1, compare=3, logic=3),
-    # The weights divided by the largest, times the Jacobian, and the normal equations of 6 unknowns in 2n equations.
-    "lm.lm_step": lambda n: (
-        Operations(multiply=12 * n + 6, divide=n, compare=n, logic=n + 1) + matmul(6, 2 * n, 6) + matmul(6, 2 * n, 1)
-    ),
-    # LDL' of a full 6 x 6 matrix scaled to a unit diagonal; the damping may differ between problems.
-    "lm.solve_damped": lambda own_damping: Operations(
-        add=121 + own_damping, multiply=211, divide=27, sqrt=6, compare=12, logic=30
-    ),
-    # Two quantiles by sorting.
+    # The step times the solution, where there is one.
+    "lm.lm_step": lambda: Operations(multiply=6, logic=1),
+    # LDL' of 6 x 6, entry by entry.
+    "lm.solve_damped": lambda: Operations(add=71, multiply=98, divide=6, compare=6, logic=11),
+    # One quantile by sorting.
     "lm.explains": lambda n: (
-        Operations(add=12 * n - 8, multiply=6 * n + 1, divide=n, compare=3 * n + 5, logic=2 * n + 1) + 2 * sort(n)
+        Operations(add=11 * n - 7, multiply=6 * n + 1, divide=n, compare=3 * n + 4, logic=3 * n + 1) + sort(n)
     ),
     # Gram-Schmidt on the coordinates of the points.
     "control_points.control_points": lambda n: Operations(
@@ -169,7 +161,7 @@ PARTS: dict[str, Callable[..., Operations]] = {
     "search.Search._rank": _rank,
     # Inliers of a pose, and its score after the step on them.
     "search.Search._descend": lambda n: Operations(
-        add=17 * n - 1, multiply=23 * n + 9, divide=4 * n, compare=5 * n + 5, logic=3 * n + 14
+        add=17 * n - 1, multiply=24 * n + 9, divide=3 * n, compare=5 * n + 5, logic=3 * n + 14
     ),
     "search.Search._improve": lambda poses: Operations(compare=poses - 1),
     # Two steps to the nearest rotation; then each round: how many samples are needed; and inliers of a better pose.
@@ -177,10 +169,10 @@ PARTS: dict[str, Callable[..., Operations]] = {
         2 * (2 * matmul(3, 3, 3) + Operations(add=9, multiply=18))
         + Operations(compare=1)
         + rounds * Operations(add=2 * size + 1, multiply=size + 1, divide=size + 1, log=1, compare=2 * size + 4)
-        + better * Operations(add=3 * n - 1, multiply=3 * n + 2, divide=3 * n, compare=3 * n, logic=3 * n)
+        + better * Operations(add=3 * n - 1, multiply=4 * n + 2, divide=2 * n, compare=3 * n, logic=3 * n)
     ),
     # Centring, thresholds, the inliers twice, and whether so many could be chance.
     "ransac.RANSAC.forward": lambda n: Operations(
-        add=20 * n + 12, multiply=14 * n + 21, divide=13 * n + 2, sqrt=n, log=5, compare=19 * n + 13, logic=15 * n + 4
+        add=20 * n + 12, multiply=16 * n + 21, divide=11 * n + 2, sqrt=n, log=5, compare=19 * n + 13, logic=15 * n + 4
     ),
 }

@@ -88,7 +88,8 @@ class OutlierMix:
         KORNIA_CHECK(most <= n, f"{most} outliers do not fit into n = {n} pairs.")
         device = generator.device
         count = torch.randint(least, most + 1, (batch_size, 1), generator=generator, device=device)
-        rank = torch.rand(batch_size, n, generator=generator, device=device).argsort(-1).argsort(-1)
+        order = torch.rand(batch_size, n, generator=generator, device=device).argsort(-1)
+        rank = torch.empty_like(order).scatter_(1, order, torch.arange(n, device=device).expand(batch_size, n))
         outlier = rank < count
         mismatch = torch.rand(batch_size, n, generator=generator, device=device) < self.mismatch_share
         return OutlierDraw(outlier & mismatch, outlier & ~mismatch)

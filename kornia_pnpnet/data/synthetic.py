@@ -39,7 +39,7 @@ def batch_generator(seed: int, index: int, device: str | torch.device = "cpu") -
 def uniform(shape: Sequence[int], low: float, high: float, generator: torch.Generator) -> Tensor:
     """Uniform float64 numbers in ``[low, high)`` of a shape, on the generator's device."""
     values = torch.rand(tuple(shape), generator=generator, device=generator.device, dtype=torch.float64)
-    return low + (high - low) * values
+    return values.mul_(high - low).add_(low)
 
 
 def _normal(shape: Sequence[int], generator: torch.Generator) -> Tensor:
@@ -145,10 +145,11 @@ class SlabPoints:
             return uniform((batch_size, 1), math.log(low), math.log(high), generator).exp()
 
         slope = self.tilt * _normal((batch_size, 1, 2), generator)
-        surface = (1.0 + (slope * (direction - centre)).sum(-1)).clamp(min=0.3)
+        rise = slope * (direction - centre)  # (B, n, 2)
+        surface = (1.0 + (rise[..., 0] + rise[..., 1])).clamp(min=0.3)
         thickness = 1.0 + log_uniform(*self.thickness) * uniform((batch_size, n), 0.0, 1.0, generator)
         z = log_uniform(*self.distance) * surface * thickness  # (B, n)
-        return torch.cat((direction, torch.ones_like(z)[..., None]), -1) * z[..., None]
+        return torch.cat((direction * z[..., None], z[..., None]), -1)
 
 
 class MixedPoints:
@@ -173,11 +174,13 @@ class MixedPoints:
 
     def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
         """Draw points of shape ``(batch_size, n, 3)``."""
-        draws = torch.stack([prior(batch_size, n, generator) for prior in self.priors])  # (P, B, n, 3)
+        draws = [prior(batch_size, n, generator) for prior in self.priors]
         bounds = torch.tensor(self.shares, dtype=torch.float64, device=generator.device).cumsum(0)
         position = bounds[-1] * uniform((batch_size,), 0.0, 1.0, generator)
-        choice = torch.bucketize(position, bounds[:-1], right=True)  # (B,)
-        return draws[choice, torch.arange(batch_size, device=generator.device)]
+        points = draws[0]
+        for draw, bound in zip(draws[1:], bounds[:-1], strict=True):  # the last prior whose share begins below
+            points = torch.where((position >= bound)[:, None, None], draw, points)
+        return points
 
 
 class SyntheticProblems:
@@ -274,11 +277,11 @@ class SyntheticProblems:
         anywhere = uniform((self.batch_size, self.n, 2), -self.half_image, self.half_image, generator)
 
         world_points = (cam_points - pose.translation[:, None]) @ pose.rotation
-        world_points = world_points + self.world_sigma * _normal(world_points.shape, generator)
+        world_points += _normal(world_points.shape, generator).mul_(self.world_sigma)
         seen = torch.where(draw.mismatch[..., None], other_points, cam_points)
         img_points = self.focal * seen[..., :2] / seen[..., 2:]
         img_points = torch.where(draw.sensing[..., None], anywhere, img_points)
-        img_points = img_points + self.img_sigma * _normal(img_points.shape, generator)
+        img_points += _normal(img_points.shape, generator).mul_(self.img_sigma)
         intrinsics = torch.diag(img_points.new_tensor((self.focal, self.focal, 1.0))).expand(self.batch_size, 3, 3)
         return Problems(
             world_points.to(self.dtype),

@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from kornia_pnpnet.figures import style
-from kornia_pnpnet.figures.lines import Curve, draw_rates, few_ticks, list_curves, name_curves
+from kornia_pnpnet.figures.lines import Curve, draw_rates, few_ticks, list_curves, make_panels, name_curves
 from kornia_pnpnet.figures.records import (
     NothingToDrawError,
     Record,
@@ -30,7 +29,6 @@ from kornia_pnpnet.metrics import SuccessRate
 __all__ = ["plot_against_m", "plot_against_n", "plot_mismatches"]
 
 _FEWEST_MISMATCHES = 3  # different numbers of mismatches that make a curve
-_MOST_COLUMNS, _HEIGHT = 3, 2.9  # of panels side by side; inches of each
 
 
 def plot_mismatches(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Path:
@@ -102,7 +100,7 @@ def plot_against_n(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Pa
     here = [record for record in here if record.outliers in settings]
     names = _names_over_n(here)
     looks = style.solver_styles([*names.values(), *(record.solver for record in everything)])
-    figure, grid = _panels(len(settings))
+    figure, grid = make_panels(len(settings))
     panels = {}
     for axes, setting in zip(grid, settings, strict=True):
         rates: dict[str, dict[float, SuccessRate]] = {}
@@ -162,7 +160,7 @@ def plot_against_m(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Pa
         raise NothingToDrawError("The results hold no success on 'paper' of a solver with several m.")
 
     looks = style.solver_styles(without_m(record.solver) for record in everything)
-    figure, grid = _panels(len(settings) + 1)
+    figure, grid = make_panels(len(settings) + 1)
     panels = {}
     for axes, setting in zip(grid, settings, strict=False):
         rates: dict[str, dict[float, SuccessRate]] = {}
@@ -207,14 +205,3 @@ def _draw_times(
 
 def _curves(rates: Mapping[str, Mapping[float, SuccessRate]], looks: Mapping[str, SolverStyle]) -> list[Curve]:
     return [Curve.of_rates(name, look, rates[name]) for name, look in looks.items() if name in rates]
-
-
-def _panels(count: int) -> tuple[Figure, list[Axes]]:
-    """A figure with so many panels, three side by side or two."""
-    columns = count if count <= _MOST_COLUMNS else 2
-    lines = -(-count // columns)
-    figure = style.make_figure(WIDTH, 1.1 + _HEIGHT * lines)
-    grid = list(figure.subplots(lines, columns, squeeze=False).flat)
-    for axes in grid[count:]:
-        axes.remove()
-    return figure, grid[:count]

@@ -11,13 +11,14 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.text import Annotation
 
-from kornia_pnpnet.figures.style import GREY, LETTERS, SMALL, SolverStyle, shortened, tidy
+from kornia_pnpnet.figures.style import GREY, LETTERS, SMALL, WIDTH, SolverStyle, make_figure, shortened, tidy
 from kornia_pnpnet.metrics import SuccessRate
 
-__all__ = ["Curve", "draw_rates", "few_ticks", "list_curves", "name_curves"]
+__all__ = ["Curve", "draw_rates", "few_ticks", "list_curves", "make_panels", "name_curves"]
 
 _LINE_PT, _TICK_PT = 9.6, 13.5  # from one name to the next, and from one tick to the next, in points
 _BESIDE = 1.06  # where names begin, in widths of the axes
+_MOST_COLUMNS, _HEIGHT = 3, 2.9  # of panels side by side; inches of each
 _LEGEND_COLUMNS, _HANDLE = 4, 11  # at most; what a piece of line takes beside its name, in letters
 
 
@@ -46,6 +47,17 @@ class Curve(NamedTuple):
         x = sorted(rates)
         y, low, high = ([100 * getattr(rates[place], key) for place in x] for key in ("rate", "low", "high"))
         return cls(name, look, x, y, low, high)
+
+
+def make_panels(count: int) -> tuple[Figure, list[Axes]]:
+    """A figure with so many panels, three side by side or two."""
+    columns = count if count <= _MOST_COLUMNS else 2
+    lines = -(-count // columns)
+    figure = make_figure(WIDTH, 1.1 + _HEIGHT * lines)
+    grid = list(figure.subplots(lines, columns, squeeze=False).flat)
+    for axes in grid[count:]:
+        axes.remove()
+    return figure, grid[:count]
 
 
 def draw_rates(axes: Axes, curves: Sequence[Curve]) -> None:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_pnpnet.init.small import nearest_rotation
+from kornia_pnpnet.small import nearest_rotation
 from kornia_pnpnet.types import Correspondences, Pose
 
 __all__ = ["ControlPoints", "align", "control_points"]

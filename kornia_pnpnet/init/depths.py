@@ -15,9 +15,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kornia_pnpnet.geometry import NormalEquations
 from kornia_pnpnet.init.control_points import ControlPoints
-from kornia_pnpnet.init.small import dot, eigenvectors, small_product, solve_leading
 from kornia_pnpnet.lm import solve_damped
+from kornia_pnpnet.small import dot, eigenvectors, small_product, solve_leading
 
 __all__ = [
     "DepthSystem",
@@ -272,6 +273,8 @@ def attach_gradient(system: DepthSystem, depths: Tensor, planar: Tensor, weight:
         last = torch.zeros_like(normal[:, :, :1])
         last[3, 3] = 1.0
         normal = normal + last * planar
+    rows = [row[: i + 1].unbind(0) for i, row in enumerate(normal.unbind(0))]
     zero = torch.zeros((), dtype=depths.dtype, device=depths.device)
-    step = solve_damped(normal.permute(2, 0, 1), gradient.mT, zero)[0].mT
+    solution, solved = solve_damped(NormalEquations(rows, gradient.unbind(0)), zero)
+    step = torch.where(solved, torch.stack(solution), 0.0)
     return depths - step + step.detach()

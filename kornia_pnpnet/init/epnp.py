@@ -17,7 +17,7 @@ from kornia_pnpnet.init.depths import (
     four_cases,
     minimize,
 )
-from kornia_pnpnet.init.small import dot, nearest_rotation, small_product
+from kornia_pnpnet.small import dot, nearest_rotation, small_product
 from kornia_pnpnet.types import Correspondences, Guess, Pose
 
 __all__ = ["EPnP", "best_case"]

@@ -7,7 +7,6 @@ from itertools import pairwise
 import torch
 from kornia.core.check import KORNIA_CHECK
 from kornia.core.exceptions import ShapeError
-from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor, nn
 
 from kornia_pnpnet.types import Correspondences, Guess, Pose
@@ -27,13 +26,43 @@ def _relu_layers(sizes: list[int]) -> list[nn.Module]:
 
 
 def _run(layers: nn.Sequential, hidden: Tensor) -> Tensor:
-    """The layers in the dtype of their input, whatever that of their weights."""
+    """The layers on columns, (units, B), in the wider of the dtypes of their input and their weights."""
     for layer in layers:
         if isinstance(layer, nn.Linear):
-            hidden = nn.functional.linear(hidden, layer.weight.to(hidden.dtype), layer.bias.to(hidden.dtype))
+            weight: Tensor = layer.weight
+            bias: Tensor = layer.bias
+            if weight.dtype != hidden.dtype:
+                wider = torch.promote_types(weight.dtype, hidden.dtype)
+                weight, bias, hidden = weight.to(wider), bias.to(wider), hidden.to(wider)
+            hidden = torch.addmm(bias[:, None], weight, hidden)
         else:
-            hidden = layer(hidden)
+            hidden = hidden.relu_()  # of a sum that nothing else needs
     return hidden
+
+
+def _rotation(axis: Tensor, angle: Tensor) -> Tensor:
+    r"""Rotations by some angles about unnormalised axes.
+
+    Args:
+        axis: :math:`s` as columns, shape :math:`(3, B)`.
+        angle: :math:`\theta` in radians, shape :math:`(B)`.
+
+    Returns:
+        :math:`\exp(\theta [s / \|s\|]_\times)`, shape :math:`(B, 3, 3)`.
+    """
+    limits = torch.finfo(axis.dtype)
+    # |s| with a floor under the root: the gradient stays finite where the branch returns zeros.
+    vector = axis * (angle * ((axis * axis).sum(0) + limits.eps).rsqrt())
+    length = (vector * vector).sum(0).clamp(min=limits.tiny).sqrt()
+    # The unit quaternion, times the root of 2.
+    half, root = 0.5 * length, 2.0**0.5
+    w, xyz = root * half.cos(), vector * (root * half.sin() / length)
+    (x, y, z), (wx, wy, wz) = xyz.unbind(), (w * xyz).unbind()
+    xy, yz, zx, cosine = x * y, y * z, z * x, w * w - 1.0
+    first = torch.addcmul(cosine, x, x), xy - wz, zx + wy
+    second = xy + wz, torch.addcmul(cosine, y, y), yz - wx
+    third = zx - wy, yz + wx, torch.addcmul(cosine, z, z)
+    return torch.stack((*first, *second, *third)).unflatten(0, (3, 3)).permute(2, 0, 1)
 
 
 class MLPInit(nn.Module):
@@ -98,14 +127,12 @@ class MLPInit(nn.Module):
                 actual_shape=tuple(corr.world_points.shape),
                 expected_shape=["B", str(self.n), "3"],
             )
-        features = torch.cat((corr.world_points / self.world_scale, corr.img_points / self.img_scale), -1)
-        dtype = torch.promote_types(features.dtype, next(self.parameters()).dtype)
-        hidden = _run(self.shared, features.flatten(1).to(dtype))  # (B, 3n)
-        axis_and_angle = _run(self.rotation, hidden)
-        axis, angle = axis_and_angle[:, :3], axis_and_angle[:, 3:]
-        # |s| with a floor under the root: the gradient stays finite where the branch returns zeros.
-        length = (axis.square().sum(-1, keepdim=True) + torch.finfo(dtype).eps).sqrt()
-        rotation_vector = (axis / length * angle).to(corr.world_points.dtype)
-        translation = _run(self.translation, hidden).to(corr.world_points.dtype)
-        pose = Pose(axis_angle_to_rotation_matrix(rotation_vector), translation)
+        # The pairs one after the other, x, y, z, u, v of each, as columns: that is how they lie in memory.
+        world_points, img_points = corr.world_points / self.world_scale, corr.img_points / self.img_scale
+        features = torch.cat((world_points.permute(1, 2, 0), img_points.permute(1, 2, 0)), 1).flatten(0, 1)  # (5n, B)
+        hidden = _run(self.shared, features)  # (3n, B)
+        axis, angle = _run(self.rotation, hidden).split((3, 1))
+        rotation = _rotation(axis, angle[0])
+        translation = _run(self.translation, hidden).mT
+        pose = Pose(rotation.to(features.dtype), translation.to(features.dtype))
         return Guess(pose, torch.ones_like(corr.weights))

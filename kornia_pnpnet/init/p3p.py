@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from kornia_pnpnet.geometry import MIN_DEPTH_RATIO
 from kornia_pnpnet.init.law_of_cosines import Triple, distances, turn_to_largest, turned
-from kornia_pnpnet.init.small import dot
+from kornia_pnpnet.small import dot
 from kornia_pnpnet.types import Correspondences, Hypotheses, Pose
 
 __all__ = ["P3P", "p3p"]

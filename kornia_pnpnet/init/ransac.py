@@ -10,10 +10,10 @@ from kornia.core.check import KORNIA_CHECK
 from kornia.core.exceptions import ShapeError
 from torch import Tensor, nn
 
-from kornia_pnpnet.geometry import project
+from kornia_pnpnet.geometry import problems_last, project
 from kornia_pnpnet.init.sampling import MIN_PAIRS, log_false_alarms
 from kornia_pnpnet.init.scoring import SCORERS, Judged, Scorer, Thresholds, chance_of_inlier, judge
-from kornia_pnpnet.init.search import DAMPING, PAIRS_PER_SAMPLE, Found, MinimalSolver, Plan, Search, take
+from kornia_pnpnet.init.search import DAMPING, PAIRS_PER_SAMPLE, Found, MinimalSolver, Plan, Search, full_vectors, take
 from kornia_pnpnet.lm import RobustWeightedLM, lm_step
 from kornia_pnpnet.types import Correspondences, Guess, Hypotheses, Pose
 
@@ -201,17 +201,20 @@ class RANSAC(nn.Module):
                 actual_shape=tuple(corr.world_points.shape),
                 expected_shape=["B", f"{size} or more", "3"],
             )
+        # Pair by pair in memory: a sum over pairs then rounds alike wherever a problem stands in the batch.
+        corr = corr._replace(**{name: getattr(corr, name).contiguous() for name in ("world_points", "img_points")})
+        weights = corr.weights.contiguous()
         with torch.no_grad():
-            share = (corr.weights > 0).to(corr.weights)
+            share = (weights > 0).to(weights)
             share = share / share.sum(-1, keepdim=True).clamp(min=1.0)
             centre = (share[..., None] * corr.world_points).sum(1)  # (B, 3), a constant
-        corr = corr._replace(world_points=corr.world_points - centre[:, None])
+        # Any unit of the weights is allowed: from here on they are relative to the largest.
+        largest = weights.detach().amax(-1, keepdim=True)
+        weights = weights / torch.where(largest > 0, largest, 1.0)
+        corr = corr._replace(world_points=corr.world_points - centre[:, None], weights=weights)
         with torch.no_grad():
             thresholds = self._thresholds(corr)
-            # The search has single precision: the weights relative to the largest, since any unit of them is allowed.
-            largest = corr.weights.amax(-1, keepdim=True)
-            relative = corr.weights / torch.where(largest > 0, largest, 1.0)
-            found = Search(self.plan, corr._replace(weights=relative), thresholds).run()
+            found = Search(self.plan, corr, thresholds).run()
         pose, judged = self._refine(corr, found.pose, thresholds)
         with torch.no_grad():
             ok = self._is_no_chance(found, corr, thresholds, judged)
@@ -230,8 +233,9 @@ class RANSAC(nn.Module):
         size = max(1, PAIRS_PER_SAMPLE * self.chunk_size // corr.weights.shape[1])
         results = []
         for first in range(0, max(1, len(corr.weights)), size):
-            at = slice(first, first + size)
-            part, limits = take(corr, at), Thresholds(*(x[at] for x in thresholds))
+            last = min(first + size, len(corr.weights))
+            at = full_vectors(torch.arange(first, last, device=corr.weights.device))
+            part, limits = problems_last(take(corr, at)), Thresholds(*(x[at] for x in thresholds))
             pose = Pose(*(x[at] for x in start))
             projection = project(pose, part)
             with torch.no_grad():
@@ -240,9 +244,10 @@ class RANSAC(nn.Module):
                 pose = lm_step(part, pose, projection, part.weights * inliers, one, damping).pose
                 projection = project(pose, part)
             with torch.no_grad():
-                results.append((*pose, *judge(projection, part, limits)))
+                judged = judge(projection, part, limits)
+            results.append([x[: last - first] for x in (*pose, *judged)])
         rotation, translation, weights, errors = (torch.cat(parts) for parts in zip(*results, strict=True))
-        return Pose(rotation, translation), Judged(weights, errors)
+        return Pose(rotation.contiguous(), translation.contiguous()), Judged(weights, errors)
 
     def _is_no_chance(self, found: Found, corr: Correspondences, thresholds: Thresholds, judged: Judged) -> Tensor:
         """Whether pairs without a pose would hardly have as many inliers, as close; (B,)."""

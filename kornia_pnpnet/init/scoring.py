@@ -90,9 +90,8 @@ def judge(projection: Projection, corr: Correspondences, thresholds: Thresholds)
         Judged(weights=tensor([[1., 0.]]), errors=tensor([[0.0000, 6.2500]]))
     """
     sq_img = thresholds.img.square()[:, None]
-    depth = projection.cam_points[..., 2]  # 1 for points behind the camera
-    sq_limit = sq_img + (corr.focal * thresholds.world[:, None] / depth).square()
-    errors = projection.residual.square().sum(-1) / sq_limit
+    sq_limit = sq_img + (corr.focal * thresholds.world[:, None] * projection.inv_depth).square()
+    errors = projection.sq_residual / sq_limit
     errors = torch.where(projection.in_front, errors, MAX_ERROR)
     inlier = (errors < 1.0) & (corr.weights > 0)
     return Judged(torch.where(inlier, sq_img / sq_limit, 0.0), errors)

@@ -7,13 +7,13 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from kornia_pnpnet.geometry import project
+from kornia_pnpnet.geometry import problems_last, project
 from kornia_pnpnet.init.sampling import Samples, samples_needed
 from kornia_pnpnet.init.scoring import Scene, Scorer, Thresholds, judge
 from kornia_pnpnet.lm import lm_step
 from kornia_pnpnet.types import Correspondences, Hypotheses, Pose
 
-__all__ = ["Found", "MinimalSolver", "Plan", "Search", "take"]
+__all__ = ["Found", "MinimalSolver", "Plan", "Search", "full_vectors", "take"]
 
 # Poses are compared and improved in this precision: a ten thousandth of a pixel at the protocol's focal length.
 _DTYPE = torch.float32
@@ -150,11 +150,10 @@ class Search:
         rows = (positions + problems[:, None, None] * self.corr.weights.shape[1]).flatten(0, 1)  # (P H, s)
         # Some arithmetic rounds differently in what is left over from a processor's vectors: nothing is left over, so
         # that a sample has the same poses wherever it stands.
-        left_over = -len(rows) % _VECTOR
-        rows = torch.cat((rows, rows[:1].expand(left_over, -1))) if left_over else rows
+        rows = full_vectors(rows)
         values = self.pairs.index_select(0, rows.flatten()).view(-1, size, 6)
         world, img, weights = values.split((3, 2, 1), -1)
-        owners = torch.cat((problems.repeat_interleave(count), problems[:1].expand(left_over)))
+        owners = full_vectors(problems.repeat_interleave(count))
         img_scale, world_scale = (
             None if x is None else x[owners] for x in (self.corr.img_scale, self.corr.world_scale)
         )
@@ -199,12 +198,14 @@ class Search:
 
     def _descend(self, problems: Tensor, loss: Tensor, matrix: Tensor, limit: float) -> tuple[Tensor, Tensor]:
         """One step of least squares on the pairs within so many thresholds, where it lowers the loss."""
-        corr, thresholds = self._of(problems)
+        corr, thresholds = self._of(full_vectors(problems))
+        corr, start = problems_last(corr), _pose(full_vectors(matrix))
         scene = self.scene.of(problems)
         one, damping = loss.new_tensor((1.0, DAMPING))
-        projection = project(_pose(matrix), corr)
+        projection = project(start, corr)
         judged = judge(projection, corr, Thresholds(*(limit * x for x in thresholds)))
-        pose = lm_step(corr, _pose(matrix), projection, corr.weights * judged.weights, one, damping).pose
+        moved = lm_step(corr, start, projection, corr.weights * judged.weights, one, damping).pose
+        pose = Pose(*(x[: len(problems)] for x in moved))
         new_loss = scene.losses(scene.pack(*(x[:, None, None] for x in pose)), self.plan.scorer)[:, 0]
         better = (new_loss < loss) & loss.isfinite()  # what is no pose stays none
         new_matrix = torch.cat((pose.rotation, pose.translation[..., None]), -1)
@@ -217,6 +218,12 @@ def take(corr: Correspondences, at: Tensor | slice) -> Correspondences:
     return Correspondences(
         corr.world_points[at], corr.img_points[at], corr.weights[at], corr.focal, img_scale, world_scale
     )
+
+
+def full_vectors(rows: Tensor) -> Tensor:
+    """The rows, and the first of them again until their number fills a processor's vectors."""
+    left_over = -len(rows) % _VECTOR
+    return torch.cat((rows, rows[:1].expand(left_over, *rows.shape[1:]))) if left_over else rows
 
 
 def _pose(matrix: Tensor) -> Pose:

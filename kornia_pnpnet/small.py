@@ -6,13 +6,21 @@ the cache; LAPACK, called a thousand times, takes a millisecond.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-__all__ = ["dot", "eigenvectors", "nearest_rotation", "small_product", "solve_leading"]
+__all__ = [
+    "dot",
+    "eigenvectors",
+    "factorise",
+    "nearest_rotation",
+    "small_product",
+    "solve_leading",
+    "substitute",
+]
 
 _SWEEPS = 2
 
@@ -163,26 +171,48 @@ def solve_leading(
         [[1.5], [1.0, 1.0]]
     """
     rows, rest = [list(row) for row in matrix], list(rhs)
-    count = len(rest)
+    diagonal = [row[k] for k, row in enumerate(rows)]
     floor, ridge = torch.finfo(rest[0].dtype).tiny, 16.0 * torch.finfo(rest[0].dtype).eps
-    diagonal = [rows[k][k] for k in range(count)]
-    lower, inverse = {}, []
+
+    def inverse(k: int, pivot: Tensor) -> Tensor:
+        return torch.add(pivot, diagonal[k], alpha=ridge).clamp(min=floor).reciprocal()
+
+    lower, scaled = factorise(rows, rest, inverse)
+    return [substitute(lower, scaled[:size]) for size in sizes]
+
+
+def factorise(
+    rows: list[list[Tensor]], rest: list[Tensor], inverse: Callable[[int, Tensor], Tensor]
+) -> tuple[dict[tuple[int, int], Tensor], list[Tensor]]:
+    r"""Factorise symmetric matrices into LDLᵀ, entry by entry, and take the right side along.
+
+    Args:
+        rows: rows of entries up to the diagonal, :math:`(*)` each; overwritten.
+        rest: entries of the right side; overwritten.
+        inverse: gives the inverse of pivot number k, and so says what becomes of one that vanishes.
+
+    Returns:
+        The entries of :math:`L` below its diagonal of ones, and :math:`D^{-1} L^{-1}` times the right side.
+    """
+    count = len(rest)
+    lower, inverses = {}, []
     for k in range(count):
-        inverse.append(torch.add(rows[k][k], diagonal[k], alpha=ridge).clamp(min=floor).reciprocal())
+        inverses.append(inverse(k, rows[k][k]))
         for i in range(k + 1, count):
-            factor = lower[i, k] = rows[i][k] * inverse[k]
+            factor = lower[i, k] = rows[i][k] * inverses[k]
             for j in range(k + 1, i + 1):
                 rows[i][j] = torch.addcmul(rows[i][j], factor, rows[j][k], value=-1)
             rest[i] = torch.addcmul(rest[i], factor, rest[k], value=-1)
-    scaled = [x * y for x, y in zip(rest, inverse, strict=True)]
-    solutions = []
-    for size in sizes:
-        solution = scaled[:size]
-        for i in range(size - 1, 0, -1):
-            for k in range(i):
-                solution[k] = torch.addcmul(solution[k], lower[i, k], solution[i], value=-1)
-        solutions.append(solution)
-    return solutions
+    return lower, [x * y for x, y in zip(rest, inverses, strict=True)]
+
+
+def substitute(lower: Mapping[tuple[int, int], Tensor], scaled: Iterable[Tensor]) -> list[Tensor]:
+    r"""Solve :math:`L^\top x = b` with the leading rows of what :func:`factorise` returned."""
+    solution = list(scaled)
+    for i in range(len(solution) - 1, 0, -1):
+        for k in range(i):
+            solution[k] = torch.addcmul(solution[k], lower[i, k], solution[i], value=-1)
+    return solution
 
 
 def eigenvectors(matrix: Tensor) -> list[tuple[Tensor, Tensor]]:

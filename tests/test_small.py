@@ -6,7 +6,15 @@ import pytest
 import torch
 
 from kornia_pnpnet.geometry import rotation_angle
-from kornia_pnpnet.init.small import dot, eigenvectors, nearest_rotation, small_product, solve_leading
+from kornia_pnpnet.small import (
+    dot,
+    eigenvectors,
+    factorise,
+    nearest_rotation,
+    small_product,
+    solve_leading,
+    substitute,
+)
 
 
 def svd_rotation(matrix):
@@ -101,14 +109,63 @@ def test_dot_is_the_sum_of_products(generator):
     torch.testing.assert_close(dot(a.unbind(0), b.unbind(0)), (a * b).sum(0))
 
 
-def test_leading_blocks_are_solved(generator):
-    root = torch.randn(20, 6, 6, generator=generator, dtype=torch.float64)
+@pytest.fixture
+def systems(generator):
+    """Positive definite matrices (20, 6, 6), right sides (20, 6), and the rows of the lower triangles."""
+    root = torch.randn(20, 6, 8, generator=generator, dtype=torch.float64)
     matrix, rhs = root @ root.mT, torch.randn(20, 6, generator=generator, dtype=torch.float64)
-    rows = [row.unbind(0) for row in matrix.permute(1, 2, 0).unbind(0)]
+    rows = [list(row[: i + 1].unbind(0)) for i, row in enumerate(matrix.permute(1, 2, 0).unbind(0))]
+    return matrix, rhs, rows
+
+
+def test_the_factors_are_those_of_cholesky(systems):
+    """With the square roots of the pivots in them; and the right side comes along."""
+    matrix, rhs, rows = systems
+    pivots = []
+
+    def inverse(k, pivot):
+        assert k == len(pivots)
+        pivots.append(pivot)
+        return pivot.reciprocal()
+
+    lower, scaled = factorise(rows, list(rhs.unbind(-1)), inverse)
+    assert sorted(lower) == [(i, k) for i in range(6) for k in range(i)]
+    unit = torch.eye(6, dtype=torch.float64).repeat(20, 1, 1)
+    for (i, k), entry in lower.items():
+        unit[:, i, k] = entry
+    pivots = torch.stack(pivots, -1)
+    torch.testing.assert_close(unit * pivots.sqrt()[:, None], torch.linalg.cholesky(matrix), rtol=1e-9, atol=1e-9)
+    forward = torch.linalg.solve_triangular(unit, rhs[..., None], upper=False, unitriangular=True)[..., 0]
+    torch.testing.assert_close(torch.stack(scaled, -1), forward / pivots, rtol=1e-9, atol=1e-9)
+    for size in (1, 4, 6):
+        expected = torch.linalg.solve(matrix[:, :size, :size], rhs[:, :size])
+        solution = torch.stack(substitute(lower, scaled[:size]), -1)
+        torch.testing.assert_close(solution, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_an_unknown_whose_pivot_has_no_inverse_is_left_out(systems):
+    """The others have the solution of the system without its row and column."""
+    matrix, rhs, rows = systems
+    lower, scaled = factorise(
+        rows, list(rhs.unbind(-1)), lambda k, pivot: torch.zeros_like(pivot) if k == 2 else pivot.reciprocal()
+    )
+    solution = torch.stack(substitute(lower, scaled), -1)
+    kept = [0, 1, 3, 4, 5]
+    expected = torch.linalg.solve(matrix[:, kept][..., kept], rhs[:, kept])
+    torch.testing.assert_close(solution[:, kept], expected, rtol=1e-9, atol=1e-9)
+
+
+def test_leading_blocks_are_solved(systems):
+    matrix, rhs, rows = systems
     sizes = (1, 3, 6)
     for size, solution in zip(sizes, solve_leading(rows, rhs.mT.unbind(0), sizes), strict=True):
         expected = torch.linalg.solve(matrix[:, :size, :size], rhs[:, :size])
-        torch.testing.assert_close(torch.stack(solution, -1), expected, rtol=1e-6, atol=1e-6)
+        # The ridge is 16 roundings of the diagonal.
+        torch.testing.assert_close(torch.stack(solution, -1), expected, rtol=1e-10, atol=1e-10)
+    nan = torch.full_like(rhs[:, 0], torch.nan)
+    padded = [[*row, *[nan] * (5 - i)] for i, row in enumerate(rows)]  # above the diagonal nothing is read
+    again = solve_leading(padded, rhs.mT.unbind(0), (6,))[0]
+    assert torch.equal(torch.stack(again), torch.stack(solution))
 
 
 def test_a_singular_system_in_its_range_has_a_finite_solution():

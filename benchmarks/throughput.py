@@ -1,0 +1,152 @@
+"""Time per problem against the batch and the number of pairs, forward and with gradients."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import torch
+from contenders import CannotBeTimedError, Contender, Task, first
+from harness import in_turns, ratio, say, summary, target, threads
+from settings import N, Settings, draw, make_contenders
+
+from kornia_pnpnet.types import Problems
+
+__all__ = ["BACKWARD", "FORWARD", "measure_throughput", "targets"]
+
+FORWARD, BACKWARD = "forward", "forward+backward"
+# A loop is tried on so many problems first; calls shorter than this are repeated within a round.
+_PROBE, _SHORTEST_S = 10, 0.005
+_FEWEST_ROUNDS = 3
+
+
+def grid(settings: Settings, count: int) -> Iterator[tuple[int, list[tuple[int, str]]]]:
+    """For each number of pairs the batches and modes that are measured.
+
+    With more than one thread only what shows the difference.
+    """
+    sizes = [size for size in settings.batches if count == 1 or size >= settings.problems]
+    backward = [size for size in sizes if size <= settings.most_backward]
+    if count > 1:
+        backward = backward[:1]
+    for n in settings.pairs:
+        if n == N:
+            yield n, [*((size, FORWARD) for size in sizes), *((size, BACKWARD) for size in backward)]
+        elif count == 1:
+            yield n, [(settings.problems, FORWARD)]
+
+
+def ready(
+    contender: Contender, problems: Problems, settings: Settings, *, backward: bool, known: float | None
+) -> tuple[Task, int, float]:
+    """A warm task, how many problems it solves, and the seconds that it takes.
+
+    Args:
+        contender: what is timed.
+        problems: the batch. A loop gets as many of them as take a given time.
+        settings: the limits.
+        backward: with gradients.
+        known: seconds per problem in a smaller batch.
+
+    Raises:
+        CannotBeTimedError: when it would take too long, or cannot compile.
+    """
+    count = len(problems.world_points)
+    if contender.loops:
+        probe = min(count, _PROBE)
+        task = contender.task(first(problems, probe), backward=backward)
+        task.seconds()
+        count = min(count, max(probe, int(settings.loop_s * probe / task.seconds())))
+    elif known is not None and known * count > settings.call_s:
+        raise CannotBeTimedError(f"a call would take about {known * count:.0f} s")
+    task = contender.task(first(problems, count), backward=backward)
+    return task, count, task.warm()
+
+
+def measure_throughput(settings: Settings, *, count: int) -> dict[str, list[dict[str, Any]]]:
+    """Times on ``count`` threads.
+
+    Returns:
+        ``rows``, one for each contender and point: ``contender``, ``threads``, ``mode``, ``n``, ``batch``, ``count``
+        (of problems that were solved, fewer than the batch for a loop), ``success``, times; and ``skipped``.
+    """
+    rows: list[dict[str, Any]] = []
+    skipped: list[dict[str, Any]] = []
+    with threads(count):
+        for n, points in grid(settings, count):
+            torch.compiler.reset()  # who has one number of pairs does not compile for others
+            contenders, missing = make_contenders(settings, versions=n == N)
+            skipped += [{**entry, "threads": count, "n": n} for entry in missing]
+            problems = draw(n, max(settings.problems, *(batch for batch, _ in points)))
+            rates: dict[str, dict[str, Any]] = {}
+            known: dict[tuple[str, str], float] = {}
+            for batch, mode in points:
+                say(f"throughput: {count} thread(s), n = {n}, B = {batch}, {mode}")
+                tasks, sizes, once = {}, {}, {}
+                for name, contender in contenders.items():
+                    backward = mode == BACKWARD
+                    if not contender.takes(n) or (backward and not contender.differentiable):
+                        continue
+                    options: dict[str, Any] = {"backward": backward, "known": known.get((name, mode))}
+                    try:
+                        found = ready(contender, first(problems, batch), settings, **options)
+                    except CannotBeTimedError as error:
+                        place = {"contender": name, "threads": count, "n": n, "batch": batch, "mode": mode}
+                        skipped.append({**place, "why": str(error)})
+                        continue
+                    if name not in rates:  # after the first call, which tells whether it compiles
+                        rates[name] = rate(contender, first(problems, settings.problems), settings)
+                    tasks[name], sizes[name], once[name] = found
+                    known[name, mode] = once[name] / sizes[name]
+                for name, times in timed(tasks, sizes, once, settings).items():
+                    place = {"contender": name, "threads": count, "mode": mode, "n": n, "batch": batch}
+                    rows.append({**place, "count": sizes[name], "success": rates[name], **summary(times)})
+            for contender in contenders.values():
+                contender.close()
+    return {"rows": rows, "skipped": skipped}
+
+
+def rate(contender: Contender, problems: Problems, settings: Settings) -> dict[str, Any]:
+    """Success on as many problems as a loop solves in a few of its turns."""
+    if contender.loops:
+        _, _, once = ready(contender, first(problems, _PROBE), settings, backward=False, known=None)
+        most = int(_PROBE * settings.point_s / 10 / once)
+        problems = first(problems, max(_PROBE, most))
+    return contender.task(problems).success()._asdict()
+
+
+def timed(
+    tasks: Mapping[str, Task], sizes: Mapping[str, int], once: Mapping[str, float], settings: Settings
+) -> dict[str, list[float]]:
+    """Microseconds per problem of each round."""
+    times = {name: max(1, math.ceil(_SHORTEST_S / seconds)) for name, seconds in once.items()}
+    a_round = sum(times[name] * seconds for name, seconds in once.items())
+    rounds = min(settings.rounds, max(_FEWEST_ROUNDS, int(settings.point_s / a_round))) if tasks else 0
+
+    def timer(name: str) -> Any:
+        return lambda: 1e6 * tasks[name].seconds(times[name]) / sizes[name]
+
+    return in_turns({name: timer(name) for name in tasks}, rounds)
+
+
+def targets(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """What is wanted of 1000 problems of 9 pairs with 3 mismatches on one thread, as far as it was measured."""
+    here = [row for row in rows if (row["threads"], row["n"], row["batch"]) == (1, N, 1000)]
+    forward, backward = ({row["contender"]: row for row in here if row["mode"] == mode} for mode in (FORWARD, BACKWARD))
+    found = []
+    for name, most in (("refinement compiled", 3.0), ("pnpnet-n9 compiled", 8.0)):
+        if name in forward:
+            what = f"`{name}`, per problem"
+            found.append(target(what, forward[name]["median_us"], most, unit="µs", at_most=True))
+    ratios = [(forward, "pnpnet-n9 compiled", "opencv-ransac", 20.0), (forward, "pnpnet-n9 compiled", "poselib", 10.0)]
+    ratios += [(backward, "refinement compiled", name, 10.0) for name in ("pypose-lm", "pypose-parts")]
+    firsts = [name for name in backward if "@" in name]
+    for base in ("refinement", "pnpnet-n9"):
+        first_version = next((name for name in firsts if name.startswith(base)), None)
+        ratios += [(backward, f"{base} compiled", first_version, 10.0)] if first_version else []
+    for times, mine, theirs, least in ratios:
+        if mine in times and theirs in times:
+            what = f"`{mine}` against `{theirs}`, {times[mine]['mode']}"
+            found.append(target(what, ratio(times[mine], times[theirs]), least, unit="times as fast", at_most=False))
+    return found

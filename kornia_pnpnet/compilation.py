@@ -1,0 +1,77 @@
+"""Compiling parts of a solver with ``torch.compile``, and going on without where that is not possible."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator
+from typing import Any, Generic, ParamSpec, TypeVar
+
+import torch
+from torch import Tensor
+
+__all__ = ["Compiled"]
+
+# A solver of its own counts how often it was compiled: for other numbers of pairs, dtypes, with and without gradients.
+_LIMITS: dict[str, Any] = {"recompile_limit": 64, "isolate_recompiles": True}
+
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
+
+
+class Compiled(Generic[_P, _T]):
+    r"""A function of batches that is compiled when it is first called.
+
+    The first dimension of its tensors, the batch, may change without a new compilation (a batch of one is compiled for
+    itself); other sizes, dtypes, and whether gradients are recorded may not. Where it cannot be compiled, for want of
+    a C++ compiler or because the function does something a compiler cannot follow, it runs as it is, with one warning.
+
+    Args:
+        function: of tensors and nested tuples of them, whose first dimension is the batch in all that have one.
+        mode: of ``torch.compile``.
+
+    Example:
+        >>> double = Compiled(lambda x: 2 * x)
+        >>> double.function(torch.ones(2))
+        tensor([2., 2.])
+    """
+
+    def __init__(self, function: Callable[_P, _T], mode: str | None = None) -> None:
+        self.function = function
+        self.mode = mode
+        # Else half of the first compilation would go into asking the C++ compiler which instructions it knows, for each
+        # set of them that the processor has.
+        options: dict[str, Any] | None = {"cpp.vec_isa_ok": True} if mode is None else None
+        self._compiled = torch.compile(function, fullgraph=True, mode=mode, options=options, **_LIMITS)
+        self._failed = False
+        self._seen: set[tuple[torch.Size, torch.dtype]] = set()
+
+    def __reduce__(self) -> tuple[type[Compiled[_P, _T]], tuple[Callable[_P, _T], str | None]]:
+        """What was compiled stays behind when a solver is copied or sent to another process."""
+        return type(self), (self.function, self.mode)
+
+    def __call__(self, *args: _P.args, **kwargs: _P.kwargs) -> _T:
+        """Call the function."""
+        if self._failed or torch.compiler.is_compiling():
+            return self.function(*args, **kwargs)
+        first = next(_tensors(args))
+        if (kind := (first.shape, first.dtype)) not in self._seen:
+            for tensor in _tensors(args):
+                if tensor.ndim and tensor.shape[0] > 1:
+                    torch._dynamo.maybe_mark_dynamic(tensor, 0)
+            self._seen.add(kind)
+        try:
+            return self._compiled(*args, **kwargs)
+        except (torch._dynamo.exc.TorchDynamoException, torch._inductor.exc.InductorError) as error:
+            self._failed = True
+            reason = f"{type(error).__name__}: {str(error).strip().splitlines()[0]}"
+            warnings.warn(f"Not compiled, running as it is: {reason}", RuntimeWarning, stacklevel=3)
+            return self.function(*args, **kwargs)
+
+
+def _tensors(value: Any) -> Iterator[Tensor]:
+    """All tensors in nested tuples."""
+    if isinstance(value, Tensor):
+        yield value
+    elif isinstance(value, (tuple, list)):
+        for entry in value:
+            yield from _tensors(entry)

@@ -1,0 +1,192 @@
+"""A compiled solver is the same solver; where it cannot be compiled it runs as it is, and says so once."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+import warnings
+from functools import partial
+
+import pytest
+import torch
+from torch._dynamo.testing import CompileCounter
+from torch._subclasses.fake_tensor import FakeTensorMode
+
+from kornia_pnpnet import MLPInit, PnPNet, RobustWeightedLM, create_solver
+from kornia_pnpnet.compilation import Compiled
+from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet.types import PnPResult
+
+
+# torch.compile makes an instance of an autograd function while it looks into it.
+pytestmark = pytest.mark.filterwarnings("ignore:.*should not be instantiated:DeprecationWarning")
+
+
+@pytest.fixture
+def backend(monkeypatch):
+    """Dynamo captures and guards, its graphs run as they are: what needs no C++ compiler. Counts the graphs."""
+    torch.compiler.reset()
+    counter = CompileCounter()
+    compile_ = torch.compile
+
+    def capture(function, **options):
+        return compile_(function, **{**options, "options": None, "backend": counter})
+
+    monkeypatch.setattr(torch, "compile", capture)
+    yield counter
+    torch.compiler.reset()
+
+
+def problems(count, n=9, dtype=torch.float64):
+    return SyntheticProblems(n=n, batch_size=count, seed=5, outliers=OutlierMix(), dtype=dtype).batch(0)
+
+
+def tensors(result):
+    return (*result[:5], *result.init)
+
+
+def assert_same(result, expected, **tolerance):
+    assert type(result) is PnPResult
+    for a, b in zip(tensors(result), tensors(expected), strict=True):
+        torch.testing.assert_close(a, b, **tolerance)
+
+
+@pytest.mark.parametrize("name", ["pnpnet-n9", "epnp-lm", "reppnp-lm", "identity-lm"])
+def test_each_part_is_one_graph_and_the_batch_may_change(name, backend):
+    eager, compiled = create_solver(name), create_solver(name)
+    compiled.compile()
+    with torch.no_grad(), warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        for count in (7, 5, 64):
+            inputs = problems(count)[:3]
+            assert_same(compiled(*inputs), eager(*inputs), rtol=0, atol=0)
+    assert backend.frame_count == 3  # before, in and after an iteration
+
+
+def test_gradients_are_those_of_the_eager_solver(backend):
+    solver = PnPNet(MLPInit(6), RobustWeightedLM(2)).double()
+    compiled = copy.deepcopy(solver)
+    compiled.compile()
+    leaves = []
+    for net in (solver, compiled):
+        world, img, intrinsics = (x.clone().requires_grad_() for x in problems(4, n=6)[:3])
+        result = net(world, img, intrinsics)
+        (result.rotation.sum() + result.translation.sum() + result.weights.sum() + result.cost.sum()).backward()
+        leaves.append([world, img, intrinsics, *net.parameters()])
+    assert leaves[0][0].grad.any()
+    for a, b in zip(*leaves, strict=True):
+        torch.testing.assert_close(a.grad, b.grad)
+
+
+def test_the_first_stage_alone_and_other_arguments(backend):
+    eager, compiled = create_solver("pnpnet-n9"), create_solver("pnpnet-n9")
+    compiled.compile()
+    inputs = problems(3)[:3]
+    weights = torch.ones(3, 9, dtype=torch.float64)
+    weights[:, 2] = 0.0
+    mask = torch.arange(9).expand(3, 9) < 8
+    with torch.no_grad():
+        assert_same(compiled(*inputs, first_stage_only=True), eager(*inputs, first_stage_only=True))
+        assert_same(compiled(*inputs, weights=weights, mask=mask), eager(*inputs, weights=weights, mask=mask))
+        pose = eager(*inputs).pose
+        assert_same(compiled(*inputs, init=pose), eager(*inputs, init=pose))
+        assert_same(compiled(inputs[0], inputs[1], inputs[2][0]), eager(inputs[0], inputs[1], inputs[2][0]))
+
+
+def test_what_cannot_be_captured_runs_as_it_is_with_one_warning(backend):
+    eager, compiled = create_solver("p3p-ransac", seed=1), create_solver("p3p-ransac", seed=1)
+    compiled.compile()
+    inputs = problems(3)[:3]
+    with torch.no_grad():
+        with pytest.warns(RuntimeWarning, match="Not compiled, running as it is") as caught:
+            first = compiled(*inputs)
+        assert len(caught) == 1
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", RuntimeWarning)
+            second = compiled(*inputs)
+        for result in (first, second):
+            assert_same(result, eager(*inputs), rtol=0, atol=0)
+
+
+def test_without_a_compiler_it_runs_as_it_is(monkeypatch):
+    torch.compiler.reset()
+
+    def broken(graph, inputs):
+        raise RuntimeError("no compiler here")
+
+    monkeypatch.setattr(torch, "compile", lambda f, **options: compile_(f, fullgraph=True, backend=broken))
+    twice = Compiled(lambda x: 2 * x)
+    with pytest.warns(RuntimeWarning, match="no compiler here") as caught:
+        assert torch.equal(twice(torch.ones(3)), 2 * torch.ones(3))
+    assert len(caught) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        assert torch.equal(twice(torch.ones(3)), 2 * torch.ones(3))
+
+
+compile_ = torch.compile
+
+
+def test_errors_of_the_caller_are_the_callers(backend):
+    solver = create_solver("pnpnet-n9")
+    solver.compile()
+    world, img, intrinsics = problems(3)[:3]
+    with pytest.raises(Exception, match=r"img_points must have the shape"):
+        solver(world, img[:, :8], intrinsics)
+    with pytest.raises(Exception, match=r"built for n = 9"):
+        solver(world[:, :8], img[:, :8], intrinsics)
+    with torch.no_grad():
+        assert solver(world, img, intrinsics).ok.any()
+
+
+def test_compiling_changes_no_weights_and_copies_are_not_compiled():
+    solver = create_solver("pnpnet-n9")
+    names = list(solver.state_dict())
+    solver.compile()
+    assert list(solver.state_dict()) == names
+    for other in (copy.deepcopy(solver), pickle.loads(pickle.dumps(solver))):
+        for a, b in zip(solver.parameters(), other.parameters(), strict=True):
+            assert torch.equal(a, b)
+            assert a is not b
+        assert other._begin.function.__self__ is other
+
+
+@pytest.mark.parametrize("name", ["pnpnet-n9", "epnp-lm", "reppnp-lm"])
+def test_nothing_reads_a_value_back(name):
+    """So a solve can be captured as one CUDA graph: fake tensors have no values to branch on."""
+    solver = create_solver(name)
+    inputs = problems(3)[:3]
+    solver.double()
+    with FakeTensorMode(allow_non_fake_inputs=True) as mode, torch.no_grad():
+        result = solver(*(mode.from_tensor(x) for x in inputs))
+    assert result.rotation.shape == (3, 3, 3)
+
+
+@pytest.mark.slow
+def test_inductor_computes_the_same():
+    torch.compiler.reset()
+    solver = PnPNet(MLPInit(6), RobustWeightedLM(3)).double()
+    compiled = copy.deepcopy(solver)
+    compiled.compile()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        for count in (50, 31, 1):
+            inputs = problems(count, n=6)[:3]
+            with torch.no_grad():
+                assert_same(compiled(*inputs), solver(*inputs), rtol=1e-6, atol=1e-8)
+        grads = []
+        for net in (solver, compiled):
+            result = net(*problems(50, n=6)[:3])
+            (result.rotation.sum() + result.init.translation.sum()).backward()
+            grads.append([p.grad for p in net.parameters()])
+    for a, b in zip(*grads, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_without_a_real_compiler(monkeypatch):
+    torch.compiler.reset()
+    with torch._inductor.config.patch({"cpp.cxx": ("/no/such/compiler",), "force_disable_caches": True}):
+        three = Compiled(partial(torch.mul, 3.0))
+        with pytest.warns(RuntimeWarning, match="Not compiled"):
+            assert torch.equal(three(torch.ones(2000)), 3 * torch.ones(2000))

@@ -1,0 +1,125 @@
+"""``conf/experiment``: every file composes and trains, and changes what it says that it changes."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+from kornia_pnpnet.robust import KERNELS
+from kornia_pnpnet.training import fit
+
+CONF = Path(__file__).resolve().parents[1] / "conf"
+FILES = {path.stem: path for path in sorted((CONF / "experiment").glob("*.yaml"))}
+# Two updates of the network alone and one through the refinement, where the recipe's ramp is not changed.
+SHORT = ("debug=two_updates", "train.updates=3")
+
+
+def swept(experiment):
+    """What an experiment runs over: its own sweeper's overrides, one at a time."""
+    params = OmegaConf.select(OmegaConf.load(FILES[experiment]), "hydra.sweeper.params") or {}
+    return {key: str(values).split(",") for key, values in params.items()}
+
+
+CASES = [(name, ()) for name in FILES]
+CASES += [(name, (f"{key}={value}",)) for name in FILES for key, values in swept(name).items() for value in values]
+
+
+def composed(*overrides):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose("train", overrides=list(overrides))
+
+
+def trained(folder, *overrides):
+    """The configuration, the solver before and after the training, and the report."""
+    config = composed(*overrides, *SHORT)
+    torch.manual_seed(config.seed)
+    solver = instantiate(config.model.solver)
+    before = deepcopy(solver.state_dict())
+    report = fit(
+        solver,
+        instantiate(config.data.train),
+        {name: instantiate(source).batch(0) for name, source in config.data.validation.items()},
+        instantiate(config.loss),
+        instantiate(config.train, _convert_="all"),
+        folder,
+        fabric=instantiate(config.engine),
+        progress=False,
+    )
+    return config, before, solver, report
+
+
+def moved(before, solver):
+    return {name for name, value in solver.state_dict().items() if not torch.equal(value, before[name])}
+
+
+@pytest.mark.parametrize(("experiment", "overrides"), CASES)
+def test_every_experiment_trains(experiment, overrides, tmp_path):
+    *_, report = trained(tmp_path, f"experiment={experiment}", *overrides)
+    assert (report.update, report.skipped) == (3, 0)
+
+
+@pytest.mark.parametrize(("name", "path"), FILES.items())
+def test_every_experiment_opens_with_its_command(name, path):
+    package, command, *_ = path.read_text().splitlines()
+    assert package == "# @package _global_"
+    multirun = "-m " if swept(name) else ""
+    assert command == f"# python train.py {multirun}experiment={name}"
+
+
+def test_recipe_changes_nothing():
+    recipe, shipped = (OmegaConf.to_container(composed(*arguments)) for arguments in (("experiment=recipe",), ()))
+    assert recipe.pop("name") != shipped.pop("name")
+    assert recipe == shipped
+
+
+def test_net_loss_only_leaves_the_refiner_as_it_was(tmp_path):
+    _, before, solver, _ = trained(tmp_path, "experiment=net_loss_only")
+    parameters = {name for name, _ in solver.named_parameters()}
+    assert moved(before, solver) == {name for name in parameters if name.startswith("init.")}
+
+
+def test_identity_start_learns_the_refiner_alone_from_the_first_update(tmp_path):
+    config, before, solver, _ = trained(tmp_path, "experiment=identity_start")
+    assert solver.init is None
+    assert moved(before, solver) == {f"refine.{name}.raw" for name in ("step", "damping", "robustness")}
+    problems = instantiate(config.data.train).batch(0)
+    first = solver(*problems[:3]).init
+    assert torch.allclose(first.rotation, torch.eye(3), atol=1e-6)
+    assert torch.allclose(first.translation, torch.zeros(3), atol=1e-4)
+    settings = instantiate(config.train, _convert_="all")
+    assert [settings.ramp_factor(update) for update in range(3)] == [1.0, 1.0, 1.0]
+
+
+def test_shared_learns_one_set_of_hyperparameters(tmp_path):
+    _, before, solver, _ = trained(tmp_path, "experiment=shared")
+    names = {f"refine.{name}.raw" for name in ("step", "damping", "robustness")}
+    assert {name: tuple(solver.state_dict()[name].shape) for name in names} == dict.fromkeys(names, (1,))
+    assert names <= moved(before, solver)
+
+
+def test_kernels_start_from_their_classical_scales():
+    kernels = swept("kernels")["model.solver.refine.kernel"]
+    assert {"power", *kernels} == set(KERNELS)
+    for kernel in kernels:
+        config = composed("experiment=kernels", f"model.solver.refine.kernel={kernel}")
+        refine = instantiate(config.model.solver).refine
+        assert refine.kernel is KERNELS[kernel]
+        assert refine.robustness().tolist() == pytest.approx([KERNELS[kernel].default] * 5)
+        assert config.name == f"{kernel}-n9"
+
+
+@pytest.mark.parametrize("max_ratio", swept("sweep")["data.outliers.max_ratio"])
+def test_sweep_tests_on_the_mix_it_trains_on(max_ratio):
+    config = composed("experiment=sweep", f"data.outliers.max_ratio={max_ratio}", "model.n=12", "model.m=2")
+    solver = instantiate(config.model.solver)
+    assert (solver.init.n, solver.refine.m) == (12, 2)
+    sources = [config.data.train, config.data.validation.uniform]
+    most = {instantiate(source).outliers.max_count(12) for source in sources}
+    assert most == {round(12 * float(max_ratio))}
+    assert len({source.seed for source in sources}) == 2

@@ -1,0 +1,118 @@
+"""Batches drawn by other processes: the same numbers in the same order, and processes that end."""
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+from itertools import islice
+
+import pytest
+import torch
+
+from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet.data.stream import stream_batches
+
+# Python 3.12 warns of every fork of a process with threads, which pytest-xdist's are.
+pytestmark = pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
+
+
+def make_source(**options):
+    return SyntheticProblems(n=6, batch_size=5, seed=3, outliers=OutlierMix(), **options)
+
+
+def tensors(problems):
+    return (*problems[:3], *problems.pose, problems.inliers)
+
+
+def assert_equal(problems, expected):
+    for value, wanted in zip(tensors(problems), tensors(expected), strict=True):
+        assert value.dtype == wanted.dtype
+        assert torch.equal(value, wanted)
+
+
+class BrokenSource(SyntheticProblems):
+    def batch(self, index):
+        if index == 7:
+            raise ArithmeticError("batch 7 cannot be drawn")
+        return super().batch(index)
+
+
+@pytest.mark.parametrize("workers", [0, 1, 2])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_batches_are_those_of_the_source_in_order(workers, dtype):
+    source = make_source(dtype=dtype)
+    count = 0
+    for index, problems in enumerate(stream_batches(source, 4, 25, workers), 4):
+        assert_equal(problems, source.batch(index))  # after others were drawn meanwhile
+        count += 1
+    assert count == 21
+    assert not multiprocessing.active_children()
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_nothing_to_draw(workers):
+    assert list(stream_batches(make_source(), 3, 3, workers)) == []
+
+
+def test_a_stream_that_is_closed_leaves_no_process():
+    stream = stream_batches(make_source(), 0, 10**9, 2)
+    for index, problems in enumerate(islice(stream, 3)):
+        assert_equal(problems, make_source().batch(index))
+    assert len(multiprocessing.active_children()) == 2
+    stream.close()
+    assert not multiprocessing.active_children()
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_an_error_of_the_source_arrives_with_its_message(workers):
+    source = BrokenSource(n=6, batch_size=5)
+    stream = stream_batches(source, 5, 100, workers)
+    assert_equal(next(stream), source.batch(5))
+    assert_equal(next(stream), source.batch(6))
+    with pytest.raises(ArithmeticError, match="batch 7 cannot be drawn"):
+        next(stream)
+    assert not multiprocessing.active_children()
+
+
+def test_the_global_generator_is_left_alone():
+    torch.manual_seed(5)
+    expected = torch.rand(3)
+    torch.manual_seed(5)
+    list(stream_batches(make_source(), 0, 3, 1))
+    assert torch.equal(torch.rand(3), expected)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_to_the_group_does_not_end_the_workers(number):
+    source = make_source()
+    stream = stream_batches(source, 0, 30, 1)
+    assert_equal(next(stream), source.batch(0))
+    (worker,) = multiprocessing.active_children()
+    os.kill(worker.pid, number)
+    for index, problems in enumerate(stream, 1):
+        assert_equal(problems, source.batch(index))
+    assert index == 29
+
+
+SPAWNED = """
+import multiprocessing, torch
+from kornia_pnpnet.data import SyntheticProblems
+from kornia_pnpnet.data.stream import stream_batches
+
+if __name__ == "__main__":
+    multiprocessing.set_start_method("spawn")
+    source = SyntheticProblems(n=6, batch_size=5)
+    for index, problems in enumerate(stream_batches(source, 0, 12, 1)):
+        assert torch.equal(problems.img_points, source.batch(index).img_points), index
+    print("batches", index + 1)
+"""
+
+
+@pytest.mark.slow
+def test_spawned_processes_draw_the_same(tmp_path):
+    """As on systems that cannot fork."""
+    script = tmp_path / "spawned.py"
+    script.write_text(SPAWNED)
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=240, check=False)
+    assert (done.returncode, done.stdout) == (0, "batches 12\n"), done.stderr
