@@ -43,7 +43,7 @@ class Compiled(Generic[_P, _T]):
         options: dict[str, Any] | None = {"cpp.vec_isa_ok": True} if mode is None else None
         self._compiled = torch.compile(function, fullgraph=True, mode=mode, options=options, **_LIMITS)
         self._failed = False
-        self._seen: set[tuple[torch.Size, torch.dtype]] = set()
+        self._seen: set[tuple[torch.Size, torch.dtype, bool]] = set()
 
     def __reduce__(self) -> tuple[type[Compiled[_P, _T]], tuple[Callable[_P, _T], str | None]]:
         """What was compiled stays behind when a solver is copied or sent to another process."""
@@ -54,18 +54,24 @@ class Compiled(Generic[_P, _T]):
         if self._failed or torch.compiler.is_compiling():
             return self.function(*args, **kwargs)
         first = next(_tensors(args))
-        if (kind := (first.shape, first.dtype)) not in self._seen:
+        kind = first.shape, first.dtype, torch.is_grad_enabled()
+        try:
+            if kind in self._seen:
+                return self._compiled(*args, **kwargs)
             for tensor in _tensors(args):
                 if tensor.ndim and tensor.shape[0] > 1:
                     torch._dynamo.maybe_mark_dynamic(tensor, 0)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # what a compiler says of its own parts
+                result = self._compiled(*args, **kwargs)
             self._seen.add(kind)
-        try:
-            return self._compiled(*args, **kwargs)
+            return result
         except (torch._dynamo.exc.TorchDynamoException, torch._inductor.exc.InductorError) as error:
+            result = self.function(*args, **kwargs)  # a mistake of the caller raises here as it would anywhere
             self._failed = True
-            reason = f"{type(error).__name__}: {str(error).strip().splitlines()[0]}"
-            warnings.warn(f"Not compiled, running as it is: {reason}", RuntimeWarning, stacklevel=3)
-            return self.function(*args, **kwargs)
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            warnings.warn(f"Not compiled, running as it is. {reason[:300]}", RuntimeWarning, stacklevel=3)
+            return result
 
 
 def _tensors(value: Any) -> Iterator[Tensor]:

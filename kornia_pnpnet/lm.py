@@ -446,8 +446,8 @@ class RobustWeightedLM(nn.Module):
         r"""Give a converged pose the gradient of a minimum, by the implicit function theorem.
 
         With :math:`g(\delta) = J^\top W r` at the pose moved by :math:`\delta`, which is 0 at the minimum,
-        :math:`d\delta = -(\partial g / \partial \delta)^{-1} dg`: one Newton step, which is left out of the value. Where
-        the matrix is not positive definite the pose is no minimum yet, and the Gauss-Newton matrix takes its place.
+        :math:`d\delta = -(\partial g / \partial \delta)^{-1} dg`: one Newton step, which is left out of the value.
+        Where the matrix is not positive definite the pose is no minimum yet: the Gauss-Newton matrix takes its place.
         """
 
         def equations(corr: Correspondences, at: Pose, shape: Tensor) -> NormalEquations:

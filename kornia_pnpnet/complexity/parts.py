@@ -10,6 +10,7 @@ from kornia_pnpnet.init.search import FIRST_PAIRS, KEPT_ONE_IN
 
 __all__ = ["PARTS"]
 
+
 def _mlp(n: int) -> Operations:
     """One product and one sum for each weight of the network of the paper's figure 2, a comparison for each ReLU."""
     shared, branch = [5 * n, 20 * n, 5 * n, 3 * n], [3 * n] + 5 * [2 * n]
