@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import pytest
 import torch
@@ -12,6 +14,9 @@ from torch import Tensor
 from kornia_pnpnet import Correspondences, Normalize, Pose, Problems
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.geometry import retract
+
+if TYPE_CHECKING:
+    from kornia_pnpnet.training import FitReport
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -94,3 +99,25 @@ def perturb() -> Callable[..., Pose]:
         return retract(pose, delta.flatten(1).to(pose.translation))
 
     return make
+
+
+@pytest.fixture
+def fit_config(tmp_path: Path) -> Callable[..., FitReport]:
+    """Train what a composed configuration describes, as ``train.py`` does, or another solver in its place."""
+    from hydra.utils import instantiate
+
+    from kornia_pnpnet.training import fit
+
+    def run(config: Any, solver: torch.nn.Module | None = None) -> FitReport:
+        return fit(
+            instantiate(config.model.solver) if solver is None else solver,
+            instantiate(config.data.train),
+            {name: instantiate(source).batch(0) for name, source in config.data.validation.items()},
+            instantiate(config.loss),
+            instantiate(config.train, _convert_="all"),
+            tmp_path,
+            fabric=instantiate(config.engine),
+            progress=False,
+        )
+
+    return run

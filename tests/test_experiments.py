@@ -12,7 +12,6 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from kornia_pnpnet.robust import KERNELS
-from kornia_pnpnet.training import fit
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 FILES = {path.stem: path for path in sorted((CONF / "experiment").glob("*.yaml"))}
@@ -35,23 +34,18 @@ def composed(*overrides):
         return compose("train", overrides=list(overrides))
 
 
-def trained(folder, *overrides):
-    """The configuration, the solver before and after the training, and the report."""
-    config = composed(*overrides, *SHORT)
-    torch.manual_seed(config.seed)
-    solver = instantiate(config.model.solver)
-    before = deepcopy(solver.state_dict())
-    report = fit(
-        solver,
-        instantiate(config.data.train),
-        {name: instantiate(source).batch(0) for name, source in config.data.validation.items()},
-        instantiate(config.loss),
-        instantiate(config.train, _convert_="all"),
-        folder,
-        fabric=instantiate(config.engine),
-        progress=False,
-    )
-    return config, before, solver, report
+@pytest.fixture
+def trained(fit_config):
+    """Trains an experiment: the configuration, the solver's state before, the solver after, and the report."""
+
+    def run(*overrides):
+        config = composed(*overrides, *SHORT)
+        torch.manual_seed(config.seed)
+        solver = instantiate(config.model.solver)
+        before = deepcopy(solver.state_dict())
+        return config, before, solver, fit_config(config, solver)
+
+    return run
 
 
 def moved(before, solver):
@@ -59,8 +53,8 @@ def moved(before, solver):
 
 
 @pytest.mark.parametrize(("experiment", "overrides"), CASES)
-def test_every_experiment_trains(experiment, overrides, tmp_path):
-    *_, report = trained(tmp_path, f"experiment={experiment}", *overrides)
+def test_every_experiment_trains(experiment, overrides, trained):
+    *_, report = trained(f"experiment={experiment}", *overrides)
     assert (report.update, report.skipped) == (3, 0)
 
 
@@ -78,14 +72,14 @@ def test_recipe_changes_nothing():
     assert recipe == shipped
 
 
-def test_net_loss_only_leaves_the_refiner_as_it_was(tmp_path):
-    _, before, solver, _ = trained(tmp_path, "experiment=net_loss_only")
+def test_net_loss_only_leaves_the_refiner_as_it_was(trained):
+    _, before, solver, _ = trained("experiment=net_loss_only")
     parameters = {name for name, _ in solver.named_parameters()}
     assert moved(before, solver) == {name for name in parameters if name.startswith("init.")}
 
 
-def test_identity_start_learns_the_refiner_alone_from_the_first_update(tmp_path):
-    config, before, solver, _ = trained(tmp_path, "experiment=identity_start")
+def test_identity_start_learns_the_refiner_alone_from_the_first_update(trained):
+    config, before, solver, _ = trained("experiment=identity_start")
     assert solver.init is None
     assert moved(before, solver) == {f"refine.{name}.raw" for name in ("step", "damping", "robustness")}
     problems = instantiate(config.data.train).batch(0)
@@ -96,8 +90,8 @@ def test_identity_start_learns_the_refiner_alone_from_the_first_update(tmp_path)
     assert [settings.ramp_factor(update) for update in range(3)] == [1.0, 1.0, 1.0]
 
 
-def test_shared_learns_one_set_of_hyperparameters(tmp_path):
-    _, before, solver, _ = trained(tmp_path, "experiment=shared")
+def test_shared_learns_one_set_of_hyperparameters(trained):
+    _, before, solver, _ = trained("experiment=shared")
     names = {f"refine.{name}.raw" for name in ("step", "damping", "robustness")}
     assert {name: tuple(solver.state_dict()[name].shape) for name in names} == dict.fromkeys(names, (1,))
     assert names <= moved(before, solver)

@@ -12,7 +12,6 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
 from kornia_pnpnet import PnPNet
-from kornia_pnpnet.training import fit
 
 REPO = Path(__file__).resolve().parents[1]
 DATA = sorted(path.stem for path in (REPO / "conf" / "data").glob("*.yaml"))
@@ -23,19 +22,6 @@ def composed(*overrides):
         return compose("train", overrides=list(overrides))
 
 
-def train_two_updates(config, folder):
-    return fit(
-        instantiate(config.model.solver),
-        instantiate(config.data.train),
-        {name: instantiate(source).batch(0) for name, source in config.data.validation.items()},
-        instantiate(config.loss),
-        instantiate(config.train, _convert_="all"),
-        folder,
-        fabric=instantiate(config.engine),
-        progress=False,
-    )
-
-
 def run(*arguments, check=True):
     command = [sys.executable, str(REPO / "train.py"), *arguments, "debug=two_updates", "threads=1"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
@@ -44,15 +30,15 @@ def run(*arguments, check=True):
 
 
 @pytest.mark.parametrize("data", DATA)
-def test_every_data_config_trains(data, tmp_path):
+def test_every_data_config_trains(data, fit_config):
     config = composed(f"data={data}", "debug=two_updates")
-    assert train_two_updates(config, tmp_path).update == 2
+    assert fit_config(config).update == 2
 
 
-def test_model_net_has_no_refinement(tmp_path):
+def test_model_net_has_no_refinement(fit_config):
     config = composed("model=net", "debug=two_updates")
     assert instantiate(config.model.solver).refine.m == 0
-    assert train_two_updates(config, tmp_path).update == 2
+    assert fit_config(config).update == 2
 
 
 def test_overrides_reach_the_parts():
