@@ -48,13 +48,13 @@ class Settings(NamedTuple):
     batches: tuple[int, ...] = (1, 10, 100, 1000, 10_000, 100_000)
     pairs: tuple[int, ...] = (6, 9, 20, 100, 1000)
     most_backward: int = 10_000
-    rounds: int = 7
+    rounds: int = 5
     loop_s: float = 0.2
     call_s: float = 2.0
-    point_s: float = 6.0
+    point_s: float = 3.0
     latency_calls: int = 1000
-    latency_s: float = 4.0
-    startup_runs: int = 2
+    latency_s: float = 2.5
+    startup_runs: int = 1
     memory_batch: int = 10_000
 
     @classmethod
