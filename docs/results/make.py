@@ -470,7 +470,9 @@ KERNEL = "model.solver.refine.kernel"
 
 
 def read_summary(path: Path) -> list[Row]:
-    """The rows of the summary of a multirun."""
+    """The rows of the summary of a multirun, none when it was not run."""
+    if not path.exists():
+        return []
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
 
@@ -538,6 +540,8 @@ def ablation_text(rows: Sequence[Row]) -> str:
 
 def sweep_text(rows: Sequence[Row]) -> str:
     """The sweep as a table of n and mix against m, and what its steps in m and in n give at the middle of the other."""
+    if not rows:
+        return "Not run yet: `python train.py -m experiment=sweep`."
     runs = {(int(row["model.n"]), int(row["model.m"]), float(row["data.outliers.max_ratio"])): row for row in rows}
     all_n, all_m, mixes = (sorted(set(values)) for values in zip(*runs, strict=True))
     lines = ["| n | trained and tested on | " + " | ".join(f"m = {m} (%)" for m in all_m) + " |"]
@@ -609,9 +613,10 @@ def render() -> None:
     complexity = json.loads((HERE / "complexity.json").read_text())
     paper_figures([*(results[name] for name in RESULTS[:-2]), complexity], HERE)
     plot_training(HERE / "training.png", WEIGHTS_FOLDER / OURS / "history.csv")
-    for against in ("n", "m"):
-        plot_sweep(HERE / f"sweep_against_{against}.png", HERE / "sweep.csv", against=against)
     short_runs = [read_summary(HERE / f"{name}.csv") for name in ("ablation", "sweep")]
+    if short_runs[1]:
+        for against in ("n", "m"):
+            plot_sweep(HERE / f"sweep_against_{against}.png", HERE / "sweep.csv", against=against)
     (HERE / "README.md").write_text(page(results, complexity, *short_runs), encoding="utf-8")
 
 
