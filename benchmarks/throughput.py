@@ -19,6 +19,7 @@ FORWARD, BACKWARD = "forward", "forward+backward"
 # A loop is tried on so many problems first; calls shorter than this are repeated within a round.
 _PROBE, _SHORTEST_S = 10, 0.005
 _FEWEST_ROUNDS = 3
+_MOST_PAIRS = 100_000
 
 
 def grid(settings: Settings, count: int) -> Iterator[tuple[int, list[tuple[int, str]]]]:
@@ -34,7 +35,8 @@ def grid(settings: Settings, count: int) -> Iterator[tuple[int, list[tuple[int, 
         if n == N:
             yield n, [*((size, FORWARD) for size in sizes), *((size, BACKWARD) for size in backward)]
         elif count == 1:
-            yield n, [(settings.problems, FORWARD)]
+            # The same number of pairs in all at most: some of the others need memory with the square of n.
+            yield n, [(max(1, min(settings.problems, _MOST_PAIRS // n)), FORWARD)]
 
 
 def ready(
