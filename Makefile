@@ -31,7 +31,6 @@ demo: $(STAMP) ## Solve problems with the shipped weights, beside OpenCV; DATA=f
 	@mkdir -p outputs/demo
 	$(VENV)/bin/pnpnet demo $(if $(DATA),--data '$(DATA)')
 
-# A quarter of an hour on two quiet cores.
 bench: $(STAMP) ## Time and memory beside other libraries; writes benchmarks/*.json and docs/performance.md
 	$(PY) benchmarks/solvers.py --repeats 5 --out benchmarks/solvers.json
 	$(PY) benchmarks/performance.py measure
