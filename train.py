@@ -14,8 +14,10 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from hydra.utils import instantiate
+from kornia.core.exceptions import ValueCheckError
 from omegaconf import DictConfig, OmegaConf
 
+from kornia_pnpnet.model import PnPNet
 from kornia_pnpnet.reports import RESULTS_NAME, run_results, summarize_runs, write_json, write_model_card
 from kornia_pnpnet.runstate import TrainingError
 from kornia_pnpnet.training import describe_shares, fit
@@ -34,6 +36,11 @@ def main(config: DictConfig) -> float | None:
     fabric.launch()
     torch.manual_seed(config.seed)
     model = instantiate(config.model.solver)
+    if config.weights is not None:
+        try:
+            model.load_state_dict(PnPNet.from_pretrained(config.weights).state_dict())
+        except (FileNotFoundError, RuntimeError, ValueCheckError) as error:
+            sys.exit(f"Cannot start n = {config.model.n}, m = {config.model.m} from weights={config.weights}: {error}")
     if config.compile:
         model.compile()
     validation = {name: instantiate(source).batch(0) for name, source in config.data.validation.items()}

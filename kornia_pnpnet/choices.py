@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,7 @@ from torch import nn
 
 from kornia_pnpnet.bounds import KnownInliers, KnownInliersAndNoise
 from kornia_pnpnet.data import (
-    BoxPoints,
-    MixedPoints,
+    MixedProblems,
     OutlierMix,
     Scene,
     SceneProblems,
@@ -38,12 +38,13 @@ BOUNDS: dict[str, type[nn.Module]] = {
     "known-inliers-and-noise": KnownInliersAndNoise,
 }
 
-#: Synthetic data by the name of a source: what it is called in results (the names of conf/data), and its options.
-PRIORS: dict[str, tuple[str, Mapping[str, Any]]] = {
-    "synthetic": ("paper", {}),
-    "gaussian_pose": ("gaussian_pose", {"translation_sigma": 25.0}),
-    "slab": ("slab", {"points": SlabPoints()}),
-    "mixed": ("mixed", {"points": MixedPoints([BoxPoints(), SlabPoints()])}),
+_slab = partial(SyntheticProblems, points=SlabPoints())
+#: Synthetic data by the name of a source: what it is called in results (the names of conf/data), and what makes it.
+PRIORS: dict[str, tuple[str, Callable[..., SyntheticProblems | MixedProblems]]] = {
+    "synthetic": ("paper", SyntheticProblems),
+    "gaussian_pose": ("gaussian_pose", partial(SyntheticProblems, translation_sigma=25.0)),
+    "slab": ("slab", _slab),
+    "mixed": ("mixed", partial(MixedProblems, [SyntheticProblems, _slab])),
 }
 
 # Every competitor of the protocol, in the order of its figures.
@@ -212,10 +213,8 @@ def _evaluation_data(
 ) -> EvaluationData:
     """Draw the problems of one set; its description says where they are from."""
     if scene is None:
-        prior, options = PRIORS[source]
-        return EvaluationData(
-            draw_problems(SyntheticProblems(**options, **common), count), description={"source": prior}
-        )
+        prior, make = PRIORS[source]
+        return EvaluationData(draw_problems(make(**common), count), description={"source": prior})
     drawn = SceneProblems(scene, num_spares=num_spares, **common)
     return EvaluationData(
         draw_problems(drawn, count),

@@ -80,6 +80,8 @@ class LMStart(NamedTuple):
         step: :math:`\gamma` of each iteration, scalars.
         damping: :math:`\lambda` of each.
         shape: the kernel's shape of each.
+        starts: where a guess has :math:`S` other poses, ``pose`` holds :math:`(S + 1) B`, first the first ones of all
+            problems, and this is ``pairs`` as often; else ``None``.
     """
 
     corr: Correspondences
@@ -89,6 +91,15 @@ class LMStart(NamedTuple):
     step: tuple[Tensor, ...]
     damping: tuple[Tensor, ...]
     shape: tuple[Tensor, ...]
+    starts: Correspondences | None = None
+
+
+class _State(NamedTuple):
+    """Where the iterations are: poses, whether the last equations were solved, factor of the damping if it changes."""
+
+    pose: Pose
+    solved: Tensor
+    factor: Tensor | None
 
 
 def solve_damped(equations: NormalEquations, damping: Tensor) -> tuple[list[Tensor], Tensor]:
@@ -225,6 +236,9 @@ class RobustWeightedLM(nn.Module):
     damping :math:`\lambda` and robustness (the shape of the kernel, :math:`\alpha` for ``power``) are learned, by
     default one set per iteration; at their initial values this is the classical method.
 
+    Where a guess has other poses, all of them are refined by the first half of the iterations, :math:`m / 2` rounded
+    down. Then, per problem, the one of the lowest cost by the kernel of the next iteration goes on alone.
+
     All operations are per problem: a problem that cannot be solved keeps its pose, reports ``ok=False`` and changes
     no other.
 
@@ -315,6 +329,7 @@ class RobustWeightedLM(nn.Module):
         # What runs: these, or what `compile` made of them.
         self._begin: Callable[..., LMStart] = self.begin
         self._iterate: Callable[..., LMStep] = self._iteration
+        self._choose: Callable[..., _State] = self.choose
         self._finish: Callable[..., Refinement] = self.finish
 
     def extra_repr(self) -> str:
@@ -334,12 +349,12 @@ class RobustWeightedLM(nn.Module):
         step, damping, shape = (p().to(like).expand(count) for p in (self.step, self.damping, self.robustness))
         return step, damping, shape
 
-    def _cost(self, projection: Projection, start: LMStart, shape: Tensor) -> Tensor:
+    def _cost(self, projection: Projection, corr: Correspondences, prior: Tensor, shape: Tensor) -> Tensor:
         """Mean robust loss over the pairs that are there, shape (B,)."""
-        most = (_MAX_RESIDUAL * start.corr.focal).square()
+        most = (_MAX_RESIDUAL * corr.focal).square()
         sq_residual = torch.where(projection.in_front, projection.sq_residual.minimum(most), most)  # (B, N)
-        count = (start.corr.weights > 0).sum(-1).clamp(min=1)
-        return (start.prior * self.kernel.loss(sq_residual, shape)).sum(-1) / count
+        count = (corr.weights > 0).sum(-1).clamp(min=1)
+        return (prior * self.kernel.loss(sq_residual, shape)).sum(-1) / count
 
     def begin(self, corr: Correspondences, guess: Guess) -> LMStart:
         """Prepare a refinement: everything before the first iteration.
@@ -351,14 +366,19 @@ class RobustWeightedLM(nn.Module):
         Returns:
             What the iterations need.
         """
-        hyperparameters = (x.unbind() for x in self.hyperparameters(corr.world_points))
+        step, damping, shape = (x.unbind() for x in self.hyperparameters(corr.world_points))
         corr = problems_last(corr)
-        pose = Pose(*(x.movedim(0, -1).contiguous().movedim(-1, 0) for x in guess.pose))
+        poses: Iterable[Tensor] = guess.pose
+        if guess.others is not None:
+            every = (torch.cat((x[:, None], y), 1) for x, y in zip(guess.pose, guess.others, strict=True))
+            poses = (x.transpose(0, 1).flatten(0, 1) for x in every)
+        pose = Pose(*(x.movedim(0, -1).contiguous().movedim(-1, 0) for x in poses))
         prior = corr.weights * guess.weights.mT.contiguous().mT
         # The steps do not depend on a common factor of the weights; tiny ones must not vanish when multiplied.
         largest = prior.detach().amax(1, keepdim=True)
         pairs = Correspondences(*corr[:2], prior / torch.where(largest > 0, largest, 1.0), corr.focal)
-        return LMStart(corr, prior, pairs, pose, *hyperparameters)
+        starts = None if guess.others is None else _repeated(pairs, 1 + guess.others.rotation.shape[1])
+        return LMStart(corr, prior, pairs, pose, step, damping, shape, starts)
 
     def iterate(self, start: LMStart, m: int | None = None) -> LMStep:
         """Run the iterations.
@@ -372,31 +392,52 @@ class RobustWeightedLM(nn.Module):
         """
         m = self.m if m is None else min(m, self.m)
         unrolled = {"unroll": m, "truncated": min(self.last, m), "implicit": 0}[self.backward]
+        ones = torch.ones_like(start.pose.translation[:, 0])
+        state = _State(start.pose, ones.bool(), ones if self.reject_worse else None)
         with torch.set_grad_enabled(torch.is_grad_enabled() and unrolled == m):
-            pose, solved, factor = self._run(start, start.pose, None, range(m - unrolled))
-        if unrolled:
-            pose, solved, factor = self._run(start, pose, factor, range(m - unrolled, m))
-        elif m and torch.is_grad_enabled():
-            pose = self._attach_gradient(start, pose, start.shape[m - 1])
-        return LMStep(pose, solved)
+            state = self._run(start, state, range(m - unrolled))
+        state = self._run(start, state, range(m - unrolled, m))
+        if start.starts is not None and m <= self.m // 2:
+            state = self._choose(start, state, start.shape[self.m // 2 if self.m else 0])
+        if unrolled == 0 and m and torch.is_grad_enabled():
+            return LMStep(self._attach_gradient(start, state.pose, start.shape[m - 1]), state.solved)
+        return LMStep(state.pose, state.solved)
 
-    def _run(
-        self, start: LMStart, pose: Pose, factor: Tensor | None, iterations: range
-    ) -> tuple[Pose, Tensor, Tensor | None]:
-        """Some iterations: pose, whether the last was solved, and with rejection the factor of the damping, (B,)."""
-        solved = torch.ones_like(start.prior[:, 0], dtype=torch.bool)
+    def _run(self, start: LMStart, state: _State, iterations: range) -> _State:
+        """Some iterations."""
         for i in iterations:
-            before, damping = pose, start.damping[i]
-            if self.reject_worse:
-                factor = torch.ones_like(start.prior[:, 0]) if factor is None else factor
-                damping = damping * factor
-            pose, solved = self._iterate(start.pairs, pose, start.step[i], damping, start.shape[i])
+            pairs = start.pairs
+            if start.starts is not None and i < self.m // 2:
+                pairs = start.starts
+            elif start.starts is not None and i == self.m // 2:
+                state = self._choose(start, state, start.shape[i])
+            pose, factor = state.pose, state.factor
+            damping = start.damping[i] if factor is None else start.damping[i] * factor
+            pose, solved = self._iterate(pairs, pose, start.step[i], damping, start.shape[i])
             if factor is not None:
-                new, old = (self._cost(project(at, start.pairs), start, start.shape[i]) for at in (pose, before))
+                at = project(pose, pairs), project(state.pose, pairs)
+                new, old = (self._cost(x, pairs, pairs.weights, start.shape[i]) for x in at)
                 better = new <= old
                 factor = torch.where(better, factor * _DAMPING_DOWN, factor * _DAMPING_UP)
-                pose = Pose(*_chosen(better, pose, before))
-        return pose, solved, factor
+                pose = Pose(*_chosen(better, pose, state.pose))
+            state = _State(pose, solved, factor)
+        return state
+
+    def choose(self, start: LMStart, state: _State, shape: Tensor) -> _State:
+        """Of each problem's poses, keep the one of the lowest cost."""
+        starts = start.starts
+        assert starts is not None
+        pose = Pose(*(x.detach() for x in state.pose))
+        batch = start.prior.shape[0]
+        cost = self._cost(project(pose, starts), starts, starts.weights, shape.detach())
+        best = cost.view(-1, batch).argmin(0)  # (B,), the first of equals
+        index = torch.add(torch.arange(batch, device=best.device), best, alpha=batch)
+
+        def kept(x: Tensor) -> Tensor:
+            return x.movedim(0, -1).index_select(-1, index).movedim(-1, 0)
+
+        factor = None if state.factor is None else kept(state.factor)
+        return _State(Pose(*map(kept, state.pose)), kept(state.solved), factor)
 
     def finish(self, start: LMStart, end: LMStep) -> Refinement:
         """Judge where the iterations ended: everything after the last of them.
@@ -411,7 +452,7 @@ class RobustWeightedLM(nn.Module):
         projection, shape = project(end.pose, start.corr), start.shape[-1]
         weights = start.prior * self.kernel.weight(projection.sq_residual, shape)
         weights = torch.where(projection.in_front, weights, 0.0)
-        cost = self._cost(projection, start, shape)
+        cost = self._cost(projection, start.corr, start.prior, shape)
         return Refinement(end.pose, weights, cost, end.solved & explains(projection, start.corr, start.prior))
 
     def forward(self, corr: Correspondences, guess: Guess, *, m: int | None = None) -> Refinement:
@@ -440,6 +481,7 @@ class RobustWeightedLM(nn.Module):
         """
         self._begin = Compiled(self.begin, mode)
         self._iterate = Compiled(self._iteration, mode)
+        self._choose = Compiled(self.choose, mode)
         self._finish = Compiled(self.finish, mode)
 
     def _attach_gradient(self, start: LMStart, pose: Pose, shape: Tensor) -> Pose:
@@ -468,6 +510,14 @@ class RobustWeightedLM(nn.Module):
         gauss_newton, solved = solve_damped(NormalEquations([[x.detach() for x in y] for y in around], gradient), none)
         steps = (torch.where(convex, x, torch.where(solved, y, 0.0)) for x, y in zip(newton, gauss_newton, strict=True))
         return move(pose, [step.detach() - step for step in steps])
+
+
+def _repeated(pairs: Correspondences, count: int) -> Correspondences:
+    """The pairs of all problems several times over, problems last in memory."""
+    world_points, img_points = (x.permute(2, 1, 0).repeat(1, 1, count).permute(2, 1, 0) for x in pairs[:2])
+    return pairs._replace(
+        world_points=world_points, img_points=img_points, weights=pairs.weights.mT.repeat(1, count).mT
+    )
 
 
 def _chosen(first: Tensor, a: Iterable[Tensor], b: Iterable[Tensor]) -> Iterator[Tensor]:

@@ -15,10 +15,21 @@ from torch import Tensor, nn
 from kornia_pnpnet.geometry import MIN_DEPTH_RATIO
 from kornia_pnpnet.types import Correspondences, Pose
 
-__all__ = ["F_CONST", "Frame", "Normalize"]
+__all__ = ["F_CONST", "VIEWS", "Frame", "Normalize"]
 
 #: Focal length of the normalised camera in pixels (PROTOCOL.md: an ETH3D DSLR has 3400-3430).
 F_CONST = 3400.0
+#: The mirrors that leave a square image a square image: are x and y exchanged, then x reversed, then y?
+VIEWS = (
+    (False, False, False),
+    (True, False, False),
+    (False, True, True),
+    (True, True, True),
+    (False, True, False),
+    (False, False, True),
+    (True, True, False),
+    (True, False, True),
+)
 
 
 class Frame(NamedTuple):
@@ -153,6 +164,47 @@ class Normalize(nn.Module):
         corr = Correspondences(world_points, img_points, weights[..., 0], focal, horizontal * vertical, scale)
         return corr, Frame(centroid.mT, scale, order, valid)
 
+    def views(self, corr: Correspondences, count: int) -> Correspondences:
+        """The same problems seen in mirrors: the axes of image and world exchanged or reversed, both alike.
+
+        The distribution of random problems does not change, but what a network makes of one does.
+
+        Args:
+            corr: normalised correspondences of :math:`B` problems.
+            count: of the views of each, the problem itself first, at most 8.
+
+        Returns:
+            The correspondences of all problems in the first view, then in the second, and so on.
+        """
+        rows = torch.cat((corr.world_points.permute(2, 1, 0), corr.img_points.permute(2, 1, 0), corr.weights.mT[None]))
+        x, y, z, u, v, weights = rows  # (N, B) each
+        seen = [torch.stack((*_exchanged(x, y, *view), z, *_exchanged(u, v, *view), weights)) for view in VIEWS[:count]]
+        if self.order:
+            keys = torch.cat([torch.where(view[5] != 0, view[3:5].detach(), torch.inf) for view in seen[1:]], -1)
+            order = _order(keys).mT.expand(6, -1, -1)
+            seen = [seen[0], torch.cat(seen[1:], -1).gather(1, order)]
+        world_points, img_points, weights = torch.cat(seen, -1).permute(2, 1, 0).split((3, 2, 1), -1)
+        return Correspondences(world_points, img_points, weights[..., 0], corr.focal)
+
+    def undo_views(self, pose: Pose, count: int) -> tuple[Pose, Pose]:
+        """Poses of :meth:`views`, expressed for the problems themselves.
+
+        Args:
+            pose: of all views.
+            count: of the views.
+
+        Returns:
+            The poses from the first view, and those from the others, :math:`(B, S, 3, 3)` and :math:`(B, S, 3)`.
+        """
+        seen = []
+        matrices, vectors = (x.movedim(0, -1).unflatten(-1, (count, -1)).unbind(-2) for x in pose)
+        for view, matrix, vector in zip(VIEWS, matrices, vectors, strict=False):  # (3, 3, B), (3, B)
+            for axis in (0, 1):
+                matrix = _axes_back(matrix, axis, view)
+            seen.append((matrix.movedim(-1, 0), _axes_back(vector, 0, view).movedim(-1, 0)))
+        (first, *others) = (Pose(*view) for view in seen)
+        return first, Pose(*(torch.stack(entries, 1) for entries in zip(*others, strict=True)))
+
     def undo(self, pose: Pose, frame: Frame) -> Pose:
         r"""Express a pose of the normalised world in the original one.
 
@@ -205,6 +257,20 @@ def _is_spread_out(centred: Tensor, share: Tensor, size: Tensor) -> Tensor:
     covariance = (centred[:, None] * centred).sum(2) * (share / (size * size))  # (3, 3, B) in the unit of the size
     trace = covariance.diagonal().sum(-1)
     return ((1.0 - 16.0 * eps) * trace - 2.0 * (64.0 * eps) ** 2) * trace > (covariance * covariance).sum((0, 1))
+
+
+def _exchanged(x: Tensor, y: Tensor, swap: bool, reverse_x: bool, reverse_y: bool) -> tuple[Tensor, Tensor]:
+    """Two coordinates in a mirror."""
+    x, y = (y, x) if swap else (x, y)
+    return -x if reverse_x else x, -y if reverse_y else y
+
+
+def _axes_back(entries: Tensor, axis: int, view: tuple[bool, bool, bool]) -> Tensor:
+    """Undo a mirror in one dimension, of three coordinates."""
+    swap, reverse_x, reverse_y = view
+    x, y, z = entries.unbind(axis)
+    x, y = -x if reverse_x else x, -y if reverse_y else y
+    return torch.stack((y, x, z) if swap else (x, y, z), axis)
 
 
 def _order(keys: Tensor) -> Tensor:

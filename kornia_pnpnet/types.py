@@ -63,11 +63,14 @@ class Guess(NamedTuple):
         weights: a factor for the weight of each pair, at least 0, shape :math:`(B, N)`.
         ok: whether there is a guess at all (degenerate pairs may have none), bool, shape :math:`(B,)`; ``None``:
             always.
+        others: more poses to start from, rotations :math:`(B, S, 3, 3)` and translations :math:`(B, S, 3)`; ``None``:
+            no others.
     """
 
     pose: Pose
     weights: Tensor
     ok: Tensor | None = None
+    others: Pose | None = None
 
 
 class Hypotheses(NamedTuple):

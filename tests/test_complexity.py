@@ -76,10 +76,10 @@ def differences(solver, measure, sizes=SIZES, outliers=None):
     )
 
 
-@pytest.mark.parametrize("m", [0, 1, 5])
-def test_networks_cost_what_the_formulas_say(m, measure):
+@pytest.mark.parametrize(("m", "views"), [(0, 1), (1, 1), (5, 1), (0, 3), (1, 2), (4, 2), (5, 8)])
+def test_networks_cost_what_the_formulas_say(m, views, measure):
     for n in SIZES:
-        wrong = differences(PnPNet(MLPInit(n), RobustWeightedLM(m)), measure, sizes=[n])
+        wrong = differences(PnPNet(MLPInit(n), RobustWeightedLM(m), views=views), measure, sizes=[n])
         assert not wrong, wrong
 
 

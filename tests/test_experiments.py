@@ -63,7 +63,7 @@ def test_every_experiment_opens_with_its_command(name, path):
     package, command, *_ = path.read_text().splitlines()
     assert package == "# @package _global_"
     multirun = "-m " if swept(name) else ""
-    assert command == f"# python train.py {multirun}experiment={name}"
+    assert command.startswith(f"# python train.py {multirun}experiment={name}")
 
 
 def test_recipe_changes_nothing():
@@ -113,7 +113,16 @@ def test_sweep_tests_on_the_mix_it_trains_on(max_ratio):
     config = composed("experiment=sweep", f"data.outliers.max_ratio={max_ratio}", "model.n=12", "model.m=2")
     solver = instantiate(config.model.solver)
     assert (solver.init.n, solver.refine.m) == (12, 2)
-    sources = [config.data.train, config.data.validation.uniform]
-    most = {instantiate(source).outliers.max_count(12) for source in sources}
+    train, validation = (instantiate(source) for source in (config.data.train, config.data.validation.uniform))
+    sources = [*train.sources, validation]
+    most = {source.outliers.max_count(12) for source in sources}
     assert most == {round(12 * float(max_ratio))}
     assert len({source.seed for source in sources}) == 2
+
+
+def test_finetune_goes_on_with_weights_on_sharper_slabs_and_two_views():
+    config = composed("experiment=finetune", "weights=pnpnet-n9")
+    _, slabs = instantiate(config.data.train).sources
+    assert list(slabs.world_sigma) == [0.002, 0.05]
+    assert instantiate(config.model.solver).views == 2
+    assert config.train.ramp == [0.0, 0.0]

@@ -861,3 +861,89 @@ def test_power_with_shape_zero_is_least_squares(make_problems, correspond, pertu
     assert torch.equal(refined.weights, torch.ones_like(refined.weights))
     refined.cost.sum().backward()
     assert lm.robustness.raw.grad.isfinite().all()
+
+
+# --- several starts -------------------------------------------------------------------------------------------------
+
+
+def several(corr, *poses):
+    """A guess of some poses for each problem."""
+    first, *others = poses
+    return guess(first, corr)._replace(others=Pose(*(torch.stack(entries, 1) for entries in zip(*others, strict=True))))
+
+
+@pytest.mark.parametrize("options", [{}, {"reject_worse": True}, {"update": "additive"}], ids=str)
+@pytest.mark.parametrize("m", [1, 2, 5, 6])
+def test_the_best_of_several_starts_goes_on(m, options, make_problems, correspond, perturb):
+    """From far and near starts in turns: what comes out is what the near one alone gives."""
+    p = make_problems(noise=False)
+    corr, pose = correspond(p)
+    near, far = perturb(pose, angle=0.02), perturb(pose, angle=2.5, shift=2.0)
+    second = torch.arange(7) % 3 == 1
+    third = torch.arange(7) % 3 == 2
+    starts = [
+        Pose(*(torch.where(x.view(-1, *(1,) * (a.ndim - 1)), a, b) for a, b in zip(near, far, strict=True)))
+        for x in (~second & ~third, second, third)
+    ]
+    lm = RobustWeightedLM(m, **options)
+    alone = lm(corr, guess(near, corr))
+    best = lm(corr, several(corr, *starts))
+    for found, expected in zip((*best.pose, *best[1:]), (*alone.pose, *alone[1:]), strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("m", [0, 1, 2, 3, 6])
+def test_stopped_early_the_best_of_several_starts_is_returned(m, make_problems, correspond, perturb):
+    corr, pose = correspond(make_problems(noise=False))
+    near, far = perturb(pose, angle=0.02), perturb(pose, angle=2.5, shift=2.0)
+    lm = RobustWeightedLM(6)
+    best, alone = lm(corr, several(corr, far, near), m=m), lm(corr, guess(near, corr), m=m)
+    torch.testing.assert_close(best.pose, alone.pose, rtol=1e-9, atol=1e-12)
+    assert torch.equal(best.ok, alone.ok)
+
+
+def test_of_equal_starts_the_first_goes_on_and_the_result_is_the_same(make_problems, correspond, perturb):
+    corr, pose = correspond(make_problems(outliers=2))
+    start = perturb(pose)
+    lm = RobustWeightedLM(4)
+    alone, best = lm(corr, guess(start, corr)), lm(corr, several(corr, start, start, start))
+    torch.testing.assert_close(best.pose, alone.pose, rtol=1e-12, atol=1e-14)
+
+
+def test_only_the_best_start_has_a_gradient(make_problems, correspond, perturb):
+    corr, pose = correspond(make_problems())
+    near, far = ([x.requires_grad_() for x in perturb(pose, angle=angle)] for angle in (0.02, 2.5))
+    lm = RobustWeightedLM(4)
+    lm(corr, several(corr, Pose(*far), Pose(*near))).pose.translation.sum().backward()
+    assert all(x.grad.count_nonzero() == 0 for x in far)
+    assert all(x.grad.isfinite().all() and x.grad.abs().flatten(1).sum(1).gt(0).all() for x in near)
+    alone = [x.detach().requires_grad_() for x in near]
+    lm(corr, guess(Pose(*alone), corr)).pose.translation.sum().backward()
+    for x, y in zip(near, alone, strict=True):
+        torch.testing.assert_close(x.grad, y.grad, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("backward", ["implicit", "truncated"])
+def test_shorter_gradients_are_those_of_the_best_start(backward, make_problems, correspond, perturb):
+    corr, pose = correspond(make_problems())
+    near, far = perturb(pose, angle=0.02), perturb(pose, angle=2.5)
+    gradients = []
+    for starts in ((near,), (far, near)):
+        points = corr.world_points.detach().clone().requires_grad_()
+        moved = corr._replace(world_points=points)
+        start = guess(*starts, moved) if len(starts) == 1 else several(moved, *starts)
+        lm = RobustWeightedLM(20, robustness=0.0, backward=backward, last=12)
+        lm(moved, start).pose.translation.sum().backward()
+        gradients.append(points.grad)
+    torch.testing.assert_close(*gradients, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("spoilt", [torch.nan, torch.inf, 1e30])
+def test_a_spoilt_start_is_never_the_best(spoilt, make_problems, correspond, perturb):
+    corr, pose = correspond(make_problems())
+    start = perturb(pose)
+    bad = Pose(start.rotation, torch.full_like(start.translation, spoilt))
+    lm = RobustWeightedLM(4)
+    best = lm(corr, several(corr, bad, start))
+    torch.testing.assert_close(best.pose, lm(corr, guess(start, corr)).pose, rtol=1e-9, atol=1e-12)
+    assert best.ok.all()

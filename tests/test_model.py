@@ -23,7 +23,10 @@ from kornia_pnpnet import (
     RobustWeightedLM,
     create_solver,
     list_solvers,
+    pose_errors,
 )
+from kornia_pnpnet.init import EPnP
+from kornia_pnpnet.metrics import success
 
 DTYPES = (torch.float32, torch.float64)
 
@@ -852,3 +855,82 @@ def test_what_is_no_tensor_or_no_name_is_a_typed_error(make_problems):
     for options in ({"seed": 1.5}, {"seed": -1}, {"threshold": -1.0}):
         with pytest.raises(BaseError):
             create_solver("p3p-ransac", **options)
+
+
+# --- views ----------------------------------------------------------------------------------------------------------
+
+
+def untrained(views=1, m=6, n=9):
+    torch.manual_seed(3)
+    return PnPNet(MLPInit(n), RobustWeightedLM(m), views=views).double().eval()
+
+
+@pytest.mark.parametrize("views", [0, 9, 2.0, True, "2"])
+def test_a_number_of_views_that_there_is_not_is_refused(views):
+    with pytest.raises(BaseError, match="views must be 1 to 8"):
+        PnPNet(MLPInit(9), views=views)
+
+
+def test_more_views_solve_more(make_problems):
+    """Also for a network that has learned little: the poses it starts from are simply more."""
+    p = make_problems(batch=400)
+    rates = [success(pose_errors(untrained(views, m=10)(*p[:3]).pose, p.pose)).double().mean() for views in (1, 2, 8)]
+    assert rates[0] + 0.03 < rates[1]
+    assert rates[1] + 0.1 < rates[2]
+
+
+@pytest.mark.parametrize("views", [2, 8])
+def test_with_views_the_first_guess_is_still_that_of_the_problem_itself(views, make_problems):
+    p = make_problems()
+    torch.testing.assert_close(untrained(views)(*p[:3]).init, untrained()(*p[:3]).init)
+    alone, several = (untrained(k)(*p[:3], first_stage_only=True) for k in (1, views))
+    torch.testing.assert_close(several.pose, alone.pose)
+    torch.testing.assert_close(untrained(views, m=0)(*p[:3]).pose, untrained(m=0)(*p[:3]).pose)
+
+
+def test_views_do_not_matter_for_a_pose_that_is_given(make_problems, perturb):
+    p = make_problems()
+    start = perturb(p.pose)
+    torch.testing.assert_close(untrained(4)(*p[:3], init=start).pose, untrained()(*p[:3], init=start).pose)
+
+
+def test_views_of_a_method_that_mirrors_do_not_change(make_problems):
+    p = make_problems(outliers=1)
+    one, four = (PnPNet(EPnP(), RobustWeightedLM(4), views=views)(*p[:3]) for views in (1, 4))
+    assert one.ok.any()
+    torch.testing.assert_close(four.pose, one.pose, rtol=1e-6, atol=1e-8)
+    torch.testing.assert_close(four.weights, one.weights, rtol=1e-6, atol=1e-8)
+
+
+def test_views_of_one_problem_do_not_touch_another(make_problems):
+    p = make_problems(batch=5, outliers=1)
+    solver = untrained(3)
+    together = solver(*p[:3])
+    for i in range(5):
+        torch.testing.assert_close(solver(*(x[i : i + 1] for x in p[:3])).matrix, together.matrix[i : i + 1])
+    spoilt = p.world_points.clone()
+    spoilt[2, 4] = torch.nan
+    result = solver(spoilt, *p[1:3])
+    others = torch.arange(5) != 2
+    assert not result.ok[2]
+    assert result.matrix.isfinite().all()
+    torch.testing.assert_close(result.matrix[others], together.matrix[others])
+
+
+def test_gradients_with_views_are_finite_and_reach_the_network(make_problems):
+    p = make_problems(batch=5)
+    solver = untrained(3)
+    p.world_points[1] = 0.0
+    result = solver(*p[:3])
+    (result.translation.sum() + result.weights.sum() + result.init.translation.sum()).backward()
+    assert all(x.grad.isfinite().all() for x in solver.parameters())
+    assert all(x.grad.abs().sum() > 0 for x in solver.init.parameters())
+
+
+def test_views_are_saved(make_problems, tmp_path):
+    solver = untrained(5)
+    solver.save_pretrained(tmp_path)
+    again = PnPNet.from_pretrained(tmp_path).double()
+    assert again.views == 5
+    p = make_problems()
+    torch.testing.assert_close(again(*p[:3]).matrix, solver.float().double()(*p[:3]).matrix)

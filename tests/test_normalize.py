@@ -10,7 +10,7 @@ from kornia.geometry.conversions import normalize_points_with_intrinsics
 
 from kornia_pnpnet import Correspondences, MLPInit, Normalize, PnPNet, Pose, RobustWeightedLM
 from kornia_pnpnet.geometry import project, transform
-from kornia_pnpnet.normalize import F_CONST
+from kornia_pnpnet.normalize import F_CONST, VIEWS
 
 OPTIONS = [
     {"order": order, "center": center, "scale": scale}
@@ -450,3 +450,51 @@ def test_units_of_the_user_are_brought_along(make_problems):
         torch.testing.assert_close(shifted / corr.world_scale[:, None, None], moved)
         # One pixel to the right is 3400 / 500 normalised ones, one down 3400 / 2000: the geometric mean of both.
         torch.testing.assert_close(corr.img_scale, torch.full_like(corr.img_scale, 3400.0 / 1000.0))
+
+
+# --- views ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("order", [True, False])
+def test_mirrors_show_the_same_problems_and_are_undone(order, make_problems):
+    """Every view has a pose that explains its pixels exactly, and undoing the view gives the true one."""
+    p = make_problems(noise=False)
+    normalize = Normalize(order=order)
+    corr, frame = normalize(*p[:3])
+    count = len(VIEWS)
+    seen = normalize.views(corr, count)
+    assert seen.world_points.shape == (7 * count, 9, 3)
+    true = normalize.apply_to_pose(p.pose, frame)
+    poses = []
+    for swap, reverse_x, reverse_y in VIEWS:
+        mirror = torch.diag(torch.tensor([1.0 - 2 * reverse_x, 1.0 - 2 * reverse_y, 1.0], dtype=torch.float64))
+        mirror = mirror[:, [1, 0, 2]] if swap else mirror
+        poses.append((mirror @ true.rotation @ mirror.mT, true.translation @ mirror.mT))
+    stacked = Pose(*(torch.cat(entries) for entries in zip(*poses, strict=True)))
+    assert project(stacked, seen).sq_residual.max() < 1e-12
+    first, others = normalize.undo_views(stacked, count)
+    torch.testing.assert_close(first, true)
+    for i in range(count - 1):
+        torch.testing.assert_close(Pose(*(x[:, i] for x in others)), true)
+
+
+def test_the_first_view_is_the_problem_and_no_two_are_alike(make_problems):
+    corr, _ = Normalize()(*make_problems()[:3])
+    seen = Normalize().views(corr, len(VIEWS))
+    assert torch.equal(seen.world_points[:7], corr.world_points)
+    assert torch.equal(seen.img_points[:7], corr.img_points)
+    points = seen.world_points.unflatten(0, (len(VIEWS), 7))
+    assert all(not torch.equal(points[i], points[j]) for i in range(len(VIEWS)) for j in range(i))
+
+
+def test_views_are_ordered_by_their_own_pixels_with_padding_last(make_problems):
+    p = make_problems()
+    mask = torch.ones(7, 9, dtype=torch.bool)
+    mask[2:5, 3] = False
+    corr, _ = Normalize()(*p[:3], mask=mask)
+    seen = Normalize().views(corr, len(VIEWS))
+    there = seen.weights > 0
+    count = there.sum(1)
+    assert torch.equal(there, torch.arange(9) < count[:, None])
+    u = torch.where(there, seen.img_points[..., 0], torch.inf)
+    assert (u.diff() >= 0)[there[:, 1:]].all()

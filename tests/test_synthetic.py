@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -11,7 +12,7 @@ from kornia.core.exceptions import BaseError
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
 from kornia_pnpnet import Pose, Problems
-from kornia_pnpnet.data import BoxPoints, MixedPoints, OutlierMix, SlabPoints, SyntheticProblems
+from kornia_pnpnet.data import BoxPoints, MixedProblems, OutlierMix, SlabPoints, SyntheticProblems
 from kornia_pnpnet.data.synthetic import batch_generator, random_poses
 from kornia_pnpnet.geometry import transform
 
@@ -278,15 +279,15 @@ def test_the_stream_is_the_same_in_every_version():
         batch_size=2,
         seed=1,
         outliers=OutlierMix(count=2),
-        points=MixedPoints([BoxPoints(), SlabPoints()]),
+        points=SlabPoints(),
         dtype=torch.float64,
     )
     p = source.batch(5)
-    expected = [28.632700473229, 21.940176818086, 12.999538879636, 664.160198577891, -2333.270799434770]
+    expected = [22.701997641412, 32.510782258771, 7.399977915547, -537.263534025228, 241.439302635276]
     expected += [-11.830719013041, 1.755626411493, -12.466575925139]
     found = torch.cat((p.world_points[1, 3], p.img_points[1, 3], p.pose.translation[1]))
     torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float64), rtol=1e-9, atol=0)
-    assert p.inliers.tolist() == [[False, False, True, True], [True, False, False, True]]
+    assert p.inliers.tolist() == [[True, False, False, True], [True, True, False, False]]
 
 
 def test_seeds_beyond_32_bits_count():
@@ -358,23 +359,52 @@ class Plane:
         return BoxPoints(z_near=self.depth, depth=0.0)(batch_size, n, generator)
 
 
+def mixed(count=3, shares=None, batch=60, **options):
+    planes = [partial(SyntheticProblems, points=Plane(float(depth + 1))) for depth in range(count)]
+    return MixedProblems(planes, shares=shares, batch_size=batch, seed=7, n=4, dtype=torch.float64, **options)
+
+
+def depths(p):
+    depth = transform(p.pose, p.world_points)[..., 2]
+    assert (depth.amax(1) - depth.amin(1)).max() < 1e-9  # a problem's points come from one source
+    return depth[:, 0].round().long()
+
+
 @pytest.mark.parametrize("shares", [None, (1.0, 1.0, 2.0), (3.0, 1.0, 1.0)])
-def test_mixed_priors_are_chosen_per_problem_by_their_shares(shares, generator):
-    points = MixedPoints([Plane(1.0), Plane(2.0), Plane(3.0)], shares=shares)(COUNT, 4, generator)
-    depth = points[..., 2]
-    assert (depth == depth[:, :1]).all()  # a problem's points come from one prior
+def test_mixed_sources_have_their_shares_in_every_part_of_a_batch(shares):
+    p = mixed(shares=shares, world_sigma=0.0).batch(0)
     shares = (1.0, 1.0, 1.0) if shares is None else shares
-    assert_counts(depth[:, 0].long().bincount()[1:], [share / sum(shares) for share in shares])
-    assert_uniform(points[..., 0], -10, 10)
+    for part in (slice(60), slice(20), slice(20, 40)):
+        found = depths(p)[part].bincount(minlength=4)[1:]
+        expected = torch.tensor(shares) / sum(shares) * len(depths(p)[part])
+        assert (found - expected).abs().max() <= 1
+
+
+def test_mixed_sources_do_not_see_the_same_random_numbers():
+    source = mixed(world_sigma=0.0)
+    translations = torch.cat([source.batch(i).pose.translation for i in range(3)])
+    assert len(translations.unique(dim=0)) == 180
+
+
+def test_answers_of_mixed_problems_stay_with_their_problems():
+    p = mixed(world_sigma=0.0, img_sigma=0.0, outliers=OutlierMix(count=1)).batch(1)
+    wrong = reprojection(p).norm(dim=-1) > 1e-6
+    assert (wrong <= ~p.inliers).all()
+    assert wrong.double().mean() > 0.2
+
+
+@pytest.mark.parametrize("batch", [1, 2, 7])
+def test_mixed_batches_have_the_size_that_was_asked_for(batch):
+    assert len(mixed(batch=batch).batch(0).inliers) == batch
 
 
 @pytest.mark.parametrize(("count", "shares"), [(0, None), (2, (1.0,)), (2, (1.0, 0.0)), (2, (1.0, -1.0))])
 def test_shares_that_do_not_fit_raise(count, shares):
-    with pytest.raises(BaseError, match=f"{count} priors"):
-        MixedPoints([BoxPoints()] * count, shares=shares)
+    with pytest.raises(BaseError, match=f"{count} sources"):
+        MixedProblems([SyntheticProblems] * count, shares=shares)
 
 
-@pytest.mark.parametrize("points", [SlabPoints(), MixedPoints([BoxPoints(), SlabPoints()])], ids=["slab", "mixed"])
+@pytest.mark.parametrize("points", [BoxPoints(), SlabPoints()], ids=["box", "slab"])
 def test_a_mismatch_shows_another_point_of_the_same_scene(points):
     """A wrong pixel lies where the right ones lie: else it is known by its place alone, which real ones are not."""
     p = draw(20, 4000, points=points, outliers=OutlierMix(count=1, mismatch_share=1.0), img_sigma=0.0, world_sigma=0.0)
@@ -384,3 +414,31 @@ def test_a_mismatch_shows_another_point_of_the_same_scene(points):
     # One more uniform point falls outside the range of 19 with probability 2/20 on each axis.
     outside = ((wrong < low) | (wrong > high)).double().mean()
     assert 0.08 < outside < 0.12
+
+
+# --- ranges of noise --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["img_sigma", "world_sigma"])
+def test_noise_from_a_range_is_log_uniform_over_the_problems(name):
+    other = {"img_sigma": "world_sigma", "world_sigma": "img_sigma"}[name]
+    clean, noisy = (draw(50, 4000, **{other: 0.0, name: sigma}) for sigma in (0.0, (0.01, 1.0)))
+    noise = reprojection(noisy) if name == "img_sigma" else noisy.world_points - clean.world_points
+    sigma = noise.flatten(1).square().mean(1).sqrt()  # of each problem, known to a tenth
+    quarter = torch.tensor([0.25, 0.5, 0.75], dtype=torch.float64)
+    found = sigma.log10().quantile(quarter)
+    torch.testing.assert_close(found, 2 * quarter - 2, rtol=0, atol=0.05)
+    assert sigma.min() > 0.007
+    assert sigma.max() < 1.4
+
+
+def test_a_range_of_one_value_is_that_noise():
+    one, same = (draw(9, 100, world_sigma=sigma, img_sigma=0.0) for sigma in (0.05, (0.05, 0.05)))
+    torch.testing.assert_close(one.world_points, same.world_points)
+
+
+@pytest.mark.parametrize("sigma", [-1.0, (0.0, 1.0), (2.0, 1.0), (1.0,), (1.0, 2.0, 3.0)])
+@pytest.mark.parametrize("name", ["img_sigma", "world_sigma"])
+def test_noise_that_cannot_be_drawn_is_refused(name, sigma):
+    with pytest.raises(BaseError, match=name):
+        SyntheticProblems(**{name: sigma})

@@ -46,7 +46,8 @@ def test_overrides_reach_the_parts():
     solver = instantiate(config.model.solver)
     data = instantiate(config.data.train)
     assert (solver.init.n, solver.refine.m) == (12, 3)
-    assert (data.n, data.batch_size, data.seed, data.outliers.max_count(12)) == (12, 7, 5, 2)
+    assert data.batch_size == 7
+    assert {(source.n, source.seed, source.outliers.max_count(12)) for source in data.sources} == {(12, 5, 2)}
     assert all(instantiate(source).n == 12 for source in config.data.validation.values())
 
 
@@ -87,6 +88,21 @@ def test_run_writes_results_and_resumes(tmp_path):
     assert "Traceback" not in again.stdout + again.stderr
     done = run(f"hydra.run.dir={tmp_path}", "train.updates=1", "resume=true")
     assert "1 updates" in done.stdout + done.stderr
+
+
+def test_run_starts_from_weights(tmp_path):
+    """With learning rates of 0 they are what comes out."""
+    learn_nothing = ("train.lr=0", "train.lr_refine=0", "train.ramp=[0,0]")
+    weights = PnPNet.from_pretrained("pnpnet-n9")
+    options = (f"model.m={weights.refine.m}", "weights=pnpnet-n9")
+    run(f"hydra.run.dir={tmp_path / 'run'}", *options, *learn_nothing)
+    trained = PnPNet.from_pretrained(tmp_path / "run" / "weights").state_dict()
+    assert all(torch.equal(trained[name], value) for name, value in weights.state_dict().items())
+    for wrong in (f"model.m={weights.refine.m + 1}", "model.n=6", "weights=nowhere"):
+        done = run(f"hydra.run.dir={tmp_path}/wrong", *options, wrong, check=False)
+        assert done.returncode == 1
+        assert "Cannot start" in done.stderr
+        assert "Traceback" not in done.stderr
 
 
 @pytest.mark.slow

@@ -34,17 +34,23 @@ def _step_calls(n: int, times: float) -> Iterator[Call]:
     yield "geometry.move", times, ()
 
 
-def _lm_calls(lm: RobustWeightedLM, n: int, times: float = 1) -> Iterator[Call]:
+def _lm_calls(lm: RobustWeightedLM, n: int, times: float = 1, starts: int = 1) -> Iterator[Call]:
+    """A refinement, of several starts in the first half of its iterations."""
     weight, loss = (f"robust.{function.__name__}" for function in (lm.kernel.weight, lm.kernel.loss))
     if lm.additive or lm.reject_worse or weight not in PARTS:
         raise ValueCheckError(f"There is no formula for {lm}: it needs the retraction, no rejection, the power kernel.")
-    yield "lm._iterate", lm.m * times, (n,)
-    yield from _step_calls(n, lm.m * times)
-    for part in ("geometry.project", weight):
-        yield part, (lm.m + 1) * times, (n,)
-    ends = "lm.RobustWeightedLM.begin", "lm.RobustWeightedLM.finish"
-    for part in (*ends, "lm.RobustWeightedLM._cost", loss, "lm.explains"):
+    iterations = lm.m + (starts - 1) * (lm.m // 2)
+    compared = starts if starts > 1 else 0
+    yield "lm._iterate", iterations * times, (n,)
+    yield from _step_calls(n, iterations * times)
+    yield "geometry.project", (iterations + compared + 1) * times, (n,)
+    yield weight, (iterations + 1) * times, (n,)
+    for part in ("lm.RobustWeightedLM._cost", loss):
+        yield part, (compared + 1) * times, (n,)
+    for part in ("lm.RobustWeightedLM.begin", "lm.RobustWeightedLM.finish", "lm.explains"):
         yield part, times, (n,)
+    if compared:
+        yield "lm.RobustWeightedLM.choose", times, (starts,)
 
 
 def _epnp_calls(epnp: EPnP, n: int, times: float) -> Iterator[Call]:
@@ -160,10 +166,16 @@ def part_calls(solver: PnPNet, n: int, *, outliers: int | None = None, better: i
     if not (normalize.center and normalize.scale):
         raise ValueCheckError(f"There is no formula for {normalize}: the world has to be centred and scaled.")
     yield "normalize.Normalize.forward", 1, (n, normalize.order)
+    views = solver.views if solver.refine.m and solver.init is not None else 1
+    if views > 1:
+        yield "normalize.Normalize.views", 1, (n, views, normalize.order)
+        yield "normalize.Normalize.undo_views", 1, (views,)
+        if not isinstance(solver.init, MLPInit):
+            raise ValueCheckError(f"There is no formula for views of {type(solver.init).__name__}.")
     if isinstance(solver.init, RANSAC):
         yield from _ransac_calls(solver.init, n, outliers, better)
     else:
-        yield from _init_calls(solver.init, n)
-    yield from _lm_calls(solver.refine, n)
+        yield from _init_calls(solver.init, n, views)
+    yield from _lm_calls(solver.refine, n, starts=views)
     yield "normalize.Normalize.undo", 2, ()
     yield "model.PnPNet._result", 1, (n, _says_ok(solver.init))

@@ -67,6 +67,11 @@ PARTS: dict[str, Callable[..., Operations]] = {
         Operations(add=22 * n + 2, multiply=24 * n + 28, divide=8, sqrt=5, compare=25 * n + 42, logic=13 * n + 19)
         + order * (Operations(logic=2 * n) + 2 * sort(n))
     ),
+    # Two sorts of each mirrored problem.
+    "normalize.Normalize.views": lambda n, views, order: (
+        order * (views - 1) * (Operations(compare=n, logic=2 * n) + 2 * sort(n))
+    ),
+    "normalize.Normalize.undo_views": lambda views: Operations(),
     "normalize.Normalize.apply_to_pose": lambda: matmul(3, 3, 1) + Operations(add=3, multiply=3),
     "normalize.Normalize.undo": lambda: matmul(3, 3, 1) + Operations(add=3, divide=3),
     # Checks of everything that is returned, of the initialiser's word, and of a pose that was given.
@@ -82,6 +87,7 @@ PARTS: dict[str, Callable[..., Operations]] = {
     # Prior weights, relative to the largest; those of an iteration likewise, by the rows of the Jacobian.
     "lm.RobustWeightedLM.begin": lambda n: Operations(multiply=n, divide=n, compare=n, logic=1),
     "lm.RobustWeightedLM.finish": lambda n: Operations(add=n, multiply=3 * n, logic=n + 1),
+    "lm.RobustWeightedLM.choose": lambda starts: Operations(add=1, multiply=1, compare=starts - 1),
     "lm._iterate": lambda n: n * Operations(add=1, multiply=3),
     "lm._relative": lambda n: Operations(multiply=2 * n, divide=n, compare=n, logic=1),
     "lm.RobustWeightedLM._cost": lambda n: Operations(

@@ -3,11 +3,11 @@
 from kornia_pnpnet.data.colmap import Scene, View, load_colmap, load_matches, load_scene
 from kornia_pnpnet.data.outliers import OutlierMix
 from kornia_pnpnet.data.scenes import SceneProblems
-from kornia_pnpnet.data.synthetic import BoxPoints, MixedPoints, SlabPoints, SyntheticProblems
+from kornia_pnpnet.data.synthetic import BoxPoints, MixedProblems, SlabPoints, SyntheticProblems
 
 __all__ = [
     "BoxPoints",
-    "MixedPoints",
+    "MixedProblems",
     "OutlierMix",
     "Scene",
     "SceneProblems",

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from typing import Protocol
+from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from kornia_pnpnet.types import Pose, Problems
 
 __all__ = [
     "BoxPoints",
-    "MixedPoints",
+    "MixedProblems",
     "PointPrior",
     "SlabPoints",
     "SyntheticProblems",
@@ -44,6 +45,19 @@ def uniform(shape: Sequence[int], low: float, high: float, generator: torch.Gene
 
 def _normal(shape: Sequence[int], generator: torch.Generator) -> Tensor:
     return torch.randn(tuple(shape), generator=generator, device=generator.device, dtype=torch.float64)
+
+
+def _log_uniform(shape: Sequence[int], low: float, high: float, generator: torch.Generator) -> Tensor:
+    return uniform(shape, math.log(low), math.log(high), generator).exp_()
+
+
+def _noise(shape: Sequence[int], sigma: float | Sequence[float], generator: torch.Generator) -> Tensor:
+    """Normal noise of one standard deviation, or for each problem of one from a range, log-uniform."""
+    noise = _normal(shape, generator)
+    if isinstance(sigma, int | float):
+        return noise.mul_(sigma)
+    low, high = sigma
+    return noise.mul_(_log_uniform((shape[0], *(1,) * (len(shape) - 1)), low, high, generator))
 
 
 def random_poses(
@@ -140,47 +154,13 @@ class SlabPoints:
         half = uniform((batch_size, 1, 2), *self.window, generator)
         centre = (self.field_of_view - half) * uniform((batch_size, 1, 2), -1.0, 1.0, generator)
         direction = centre + half * uniform((batch_size, n, 2), -1.0, 1.0, generator)
-
-        def log_uniform(low: float, high: float) -> Tensor:
-            return uniform((batch_size, 1), math.log(low), math.log(high), generator).exp()
-
         slope = self.tilt * _normal((batch_size, 1, 2), generator)
         rise = slope * (direction - centre)  # (B, n, 2)
         surface = (1.0 + (rise[..., 0] + rise[..., 1])).clamp(min=0.3)
-        thickness = 1.0 + log_uniform(*self.thickness) * uniform((batch_size, n), 0.0, 1.0, generator)
-        z = log_uniform(*self.distance) * surface * thickness  # (B, n)
+        thickness = _log_uniform((batch_size, 1), *self.thickness, generator)
+        layer = 1.0 + thickness * uniform((batch_size, n), 0.0, 1.0, generator)
+        z = _log_uniform((batch_size, 1), *self.distance, generator) * surface * layer  # (B, n)
         return torch.cat((direction * z[..., None], z[..., None]), -1)
-
-
-class MixedPoints:
-    """Each problem's points from one of several priors, chosen at random.
-
-    Args:
-        priors: what to choose from.
-        shares: how often each is chosen, relative to the others; equally when ``None``.
-
-    Raises:
-        BaseError: when the shares do not fit the priors or are not positive.
-    """
-
-    def __init__(self, priors: Sequence[PointPrior], *, shares: Sequence[float] | None = None) -> None:
-        shares = [1.0] * len(priors) if shares is None else list(shares)
-        KORNIA_CHECK(
-            len(shares) == len(priors) > 0 and min(shares) > 0,
-            f"MixedPoints needs one positive share for each prior, got {shares} for {len(priors)} priors.",
-        )
-        self.priors = list(priors)
-        self.shares = shares
-
-    def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
-        """Draw points of shape ``(batch_size, n, 3)``."""
-        draws = [prior(batch_size, n, generator) for prior in self.priors]
-        bounds = torch.tensor(self.shares, dtype=torch.float64, device=generator.device).cumsum(0)
-        position = bounds[-1] * uniform((batch_size,), 0.0, 1.0, generator)
-        points = draws[0]
-        for draw, bound in zip(draws[1:], bounds[:-1], strict=True):  # the last prior whose share begins below
-            points = torch.where((position >= bound)[:, None, None], draw, points)
-        return points
 
 
 class SyntheticProblems:
@@ -202,10 +182,14 @@ class SyntheticProblems:
         max_angle: largest rotation angle in radians.
         focal: focal length in pixels; the principal point is 0.
         half_image: pixels of *sensing* outliers are uniform in ``[-half_image, half_image]`` on both axes.
-        img_sigma: standard deviation of the noise on each pixel coordinate.
-        world_sigma: standard deviation of the noise on each world coordinate.
+        img_sigma: standard deviation of the noise on each pixel coordinate; or the smallest and the largest, for each
+            problem another, log-uniform.
+        world_sigma: likewise of the noise on each world coordinate.
         dtype: of the batches; everything is drawn in float64 first.
         device: of the batches.
+
+    Raises:
+        BaseError: for a size below 1, or a range of noise that is not of two positive, rising numbers.
 
     Example:
         >>> problems = SyntheticProblems(n=9, batch_size=2, seed=1, outliers=OutlierMix(count=3)).batch(0)
@@ -226,12 +210,15 @@ class SyntheticProblems:
         max_angle: float = math.pi / 2,
         focal: float = 3400.0,
         half_image: float = 3400.0,
-        img_sigma: float = 1.0,
-        world_sigma: float = 0.05,
+        img_sigma: float | Sequence[float] = 1.0,
+        world_sigma: float | Sequence[float] = 0.05,
         dtype: torch.dtype = torch.float32,
         device: str | torch.device = "cpu",
     ) -> None:
         KORNIA_CHECK(n >= 1 and batch_size >= 1, f"n and batch_size must be at least 1, got {n} and {batch_size}.")
+        for name, sigma in (("img_sigma", img_sigma), ("world_sigma", world_sigma)):
+            right = sigma >= 0 if isinstance(sigma, int | float) else len(sigma) == 2 and 0 < sigma[0] <= sigma[1]
+            KORNIA_CHECK(right, f"{name} must be at least 0, or a range of two positive numbers, got {sigma}.")
         self.n = n
         self.batch_size = batch_size
         self.seed = seed
@@ -277,11 +264,11 @@ class SyntheticProblems:
         anywhere = uniform((self.batch_size, self.n, 2), -self.half_image, self.half_image, generator)
 
         world_points = (cam_points - pose.translation[:, None]) @ pose.rotation
-        world_points += _normal(world_points.shape, generator).mul_(self.world_sigma)
+        world_points += _noise(world_points.shape, self.world_sigma, generator)
         seen = torch.where(draw.mismatch[..., None], other_points, cam_points)
         img_points = self.focal * seen[..., :2] / seen[..., 2:]
         img_points = torch.where(draw.sensing[..., None], anywhere, img_points)
-        img_points += _normal(img_points.shape, generator).mul_(self.img_sigma)
+        img_points += _noise(img_points.shape, self.img_sigma, generator)
         intrinsics = torch.diag(img_points.new_tensor((self.focal, self.focal, 1.0))).expand(self.batch_size, 3, 3)
         return Problems(
             world_points.to(self.dtype),
@@ -290,3 +277,71 @@ class SyntheticProblems:
             Pose(pose.rotation.to(self.dtype), pose.translation.to(self.dtype)),
             draw.inliers,
         )
+
+
+class MixedProblems:
+    """Batches of problems from several sources, in turns.
+
+    Args:
+        sources: each makes a :class:`SyntheticProblems` from ``batch_size``, ``seed`` and ``options``, such as the
+            class itself or a :func:`functools.partial` of it.
+        shares: how much of a batch each fills, relative to the others; equal parts when ``None``.
+        batch_size: problems per batch.
+        seed: of the stream.
+        options: of all sources.
+
+    Raises:
+        BaseError: when the shares do not fit the sources or are not positive.
+
+    Example:
+        >>> from functools import partial
+        >>> source = MixedProblems(
+        ...     [SyntheticProblems, partial(SyntheticProblems, points=SlabPoints())], batch_size=5, n=4
+        ... )
+        >>> source.batch(0).world_points.shape
+        torch.Size([5, 4, 3])
+    """
+
+    def __init__(
+        self,
+        sources: Sequence[Callable[..., SyntheticProblems]],
+        *,
+        shares: Sequence[float] | None = None,
+        batch_size: int = 1000,
+        seed: int = 0,
+        **options: Any,
+    ) -> None:
+        shares = [1.0] * len(sources) if shares is None else list(shares)
+        KORNIA_CHECK(
+            len(shares) == len(sources) > 0 and min(shares) > 0,
+            f"MixedProblems needs one positive share for each source, got {shares} for {len(sources)} sources.",
+        )
+        self.batch_size = batch_size
+        bounds = [round(batch_size * sum(shares[:i]) / sum(shares)) for i in range(len(shares) + 1)]
+        sizes = [end - start for start, end in pairwise(bounds)]
+        made = [
+            source(batch_size=size, seed=seed, **options) for source, size in zip(sources, sizes, strict=True) if size
+        ]
+        self.sources = made
+        # A source of more problems has more turns; the first problems of a batch are as mixed as all of them.
+        turns = [(turn + 0.5) / size for size in sizes for turn in range(size)]
+        self._order = torch.tensor(sorted(range(batch_size), key=turns.__getitem__))
+
+    def batch(self, index: int) -> Problems:
+        """Draw batch ``index``.
+
+        Args:
+            index: at least 0.
+
+        Returns:
+            The problems.
+        """
+        count = len(self.sources)  # no two sources see the same random numbers
+        parts = [source.batch(count * index + i) for i, source in enumerate(self.sources)]
+        world_points, img_points, intrinsics, poses, inliers = zip(*parts, strict=True)
+        pose = Pose(*(torch.cat(entries) for entries in zip(*poses, strict=True)))
+        problems = Problems(
+            torch.cat(world_points), torch.cat(img_points), torch.cat(intrinsics), pose, torch.cat(inliers)
+        )
+        order = self._order.to(problems.inliers.device)
+        return problems.map(lambda x: x[order])
