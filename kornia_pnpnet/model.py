@@ -136,6 +136,7 @@ class PnPNet(nn.Module):
         self.refine = RobustWeightedLM(learnable=False) if refine is None else refine
         self.normalize = Normalize() if normalize is None else normalize
         # What runs: these, or what `compile` made of them.
+        self._solve: Callable[..., PnPResult] = self._in_parts
         self._begin: Callable[..., _Stage] = self._guess
         self._finish: Callable[..., PnPResult] = self._result
 
@@ -177,12 +178,25 @@ class PnPNet(nn.Module):
         if intrinsics.ndim == 2:
             intrinsics = intrinsics.expand(world_points.shape[0], 3, 3)
         with torch.autocast(world_points.device.type, enabled=False):
-            views = 1 if first_stage_only or self.refine.m == 0 else self.views
-            stage = self._begin(world_points, img_points, intrinsics, weights, mask, init, views)
-            end = self.refine.iterate(stage.start, 0 if first_stage_only else None)
-            return self._finish(stage, end)
+            return self._solve(world_points, img_points, intrinsics, weights, mask, init, first_stage_only)
 
-    def compile(self, mode: str | None = None) -> None:
+    def _in_parts(
+        self,
+        world_points: Tensor,
+        img_points: Tensor,
+        intrinsics: Tensor,
+        weights: Tensor | None,
+        mask: Tensor | None,
+        init: Pose | None,
+        first_stage_only: bool,
+    ) -> PnPResult:
+        """What is before the iterations, they themselves, and what is after them."""
+        views = 1 if first_stage_only or self.refine.m == 0 else self.views
+        stage = self._begin(world_points, img_points, intrinsics, weights, mask, init, views)
+        end = self.refine.iterate(stage.start, 0 if first_stage_only else None)
+        return self._finish(stage, end)
+
+    def compile(self, mode: str | None = None, *, whole: bool = False) -> None:
         """Compile with ``torch.compile``, in place: what is before, in, and after an iteration, each once.
 
         The first call then takes some seconds, less where a cache of ``torch.compile`` is on disk, and each further one
@@ -193,10 +207,14 @@ class PnPNet(nn.Module):
 
         Args:
             mode: of ``torch.compile``; ``"reduce-overhead"`` captures CUDA graphs.
+            whole: compile the solver as one, with its iterations one after the other. The first call takes several
+                times as long; calls of a few problems, which mostly wait for Python, take half the time.
         """
-        self._begin = Compiled(self._guess, mode)
-        self._finish = Compiled(self._result, mode)
-        self.refine.compile(mode)
+        self._solve = Compiled(self._in_parts, mode) if whole else self._in_parts
+        self._begin = self._guess if whole else Compiled(self._guess, mode)
+        self._finish = self._result if whole else Compiled(self._result, mode)
+        if not whole:
+            self.refine.compile(mode)
 
     def _guess(
         self,

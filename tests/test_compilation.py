@@ -50,22 +50,33 @@ def assert_same(result, expected, **tolerance):
         torch.testing.assert_close(a, b, **tolerance)
 
 
-@pytest.mark.parametrize("name", ["pnpnet-n9", "epnp-lm", "reppnp-lm", "identity-lm"])
-def test_each_part_is_one_graph_and_the_batch_may_change(name, backend):
-    eager, compiled = create_solver(name), create_solver(name)
-    compiled.compile()
+@pytest.mark.parametrize(
+    ("name", "views", "whole", "graphs"),
+    [
+        *((name, 1, False, 3) for name in ("pnpnet-n9", "epnp-lm", "reppnp-lm", "identity-lm")),
+        ("pnpnet-n9", 3, False, 4),  # and the choice among the starts
+        ("pnpnet-n9", 1, True, 1),
+        ("pnpnet-n9", 3, True, 1),
+    ],
+)
+def test_each_part_is_one_graph_and_the_batch_may_change(name, views, whole, graphs, backend):
+    eager, compiled = create_solver(name, m=2), create_solver(name, m=2)
+    eager.views = compiled.views = views
+    compiled.compile(whole=whole)
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
         for count in (7, 5, 64):
             inputs = problems(count)[:3]
             assert_same(compiled(*inputs), eager(*inputs), rtol=1e-6, atol=1e-6)
-    assert backend.frame_count == 3  # before, in and after an iteration
+    assert backend.frame_count == graphs  # before, in and after an iteration
 
 
-def test_gradients_are_those_of_the_eager_solver(backend):
+@pytest.mark.parametrize(("views", "whole"), [(1, False), (2, False), (2, True)])
+def test_gradients_are_those_of_the_eager_solver(views, whole, backend):
     solver = create_solver("pnpnet-n9", m=2).double()
+    solver.views = views
     compiled = copy.deepcopy(solver)
-    compiled.compile()
+    compiled.compile(whole=whole)
     leaves = []
     for net in (solver, compiled):
         world, img, intrinsics = (x.clone().requires_grad_() for x in problems(4)[:3])
@@ -138,16 +149,27 @@ def test_errors_of_the_caller_are_the_callers(backend):
         assert solver(world, img, intrinsics).ok.any()
 
 
-def test_compiling_changes_no_weights_and_copies_are_not_compiled():
+@pytest.mark.parametrize("whole", [False, True])
+def test_compiling_changes_no_weights_and_copies_are_not_compiled(whole):
     solver = create_solver("pnpnet-n9")
     names = list(solver.state_dict())
-    solver.compile()
+    solver.compile(whole=whole)
     assert list(solver.state_dict()) == names
     for other in (copy.deepcopy(solver), pickle.loads(pickle.dumps(solver))):
         for a, b in zip(solver.parameters(), other.parameters(), strict=True):
             assert torch.equal(a, b)
             assert a is not b
-        assert other._begin.function.__self__ is other
+        assert (other._solve if whole else other._begin).function.__self__ is other
+
+
+def test_compiling_again_takes_the_place_of_what_was_compiled(backend):
+    solver, eager = create_solver("pnpnet-n9", m=1), create_solver("pnpnet-n9", m=1)
+    inputs = problems(3)[:3]
+    for whole, graphs in ((True, 1), (False, 4)):
+        solver.compile(whole=whole)
+        with torch.no_grad():
+            assert_same(solver(*inputs), eager(*inputs), rtol=1e-6, atol=1e-6)
+        assert backend.frame_count == graphs
 
 
 @pytest.mark.parametrize("name", ["pnpnet-n9", "epnp-lm", "reppnp-lm"])
@@ -162,11 +184,12 @@ def test_nothing_reads_a_value_back(name):
 
 
 @pytest.mark.slow
-def test_inductor_computes_the_same():
+@pytest.mark.parametrize("whole", [False, True])
+def test_inductor_computes_the_same(whole):
     torch.compiler.reset()
-    solver = PnPNet(MLPInit(6), RobustWeightedLM(3)).double()
+    solver = PnPNet(MLPInit(6), RobustWeightedLM(3), views=2).double()
     compiled = copy.deepcopy(solver)
-    compiled.compile()
+    compiled.compile(whole=whole)
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
         for count in (50, 31, 1):
