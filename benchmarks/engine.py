@@ -8,13 +8,14 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
-from contenders import ITERATIONS, normalized
+from contenders import TRAINED
 from settings import N, draw
+from tasks import ITERATIONS, normalized
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from kornia_pnpnet import PnPNet, RobustWeightedLM
+from kornia_pnpnet import PnPNet, RobustWeightedLM, create_solver
 from kornia_pnpnet.complexity import Operations, operations_by_part
 
 __all__ = ["GPU", "measure_engine"]
@@ -99,17 +100,20 @@ def measure_engine() -> dict[str, Any]:
     """Count; nothing is timed.
 
     Returns:
-        ``n``, ``m``; ``operations`` of one iteration by kind; ``iteration_flops`` and ``solve_flops``, weighted as
-        figure 1 of the results; ``iteration_kernels`` and ``iteration_bytes`` of eager mode; ``floor_bytes`` of a
-        whole call and of an iteration; ``gpu``: what the floor allows on one.
+        ``n``, ``m``; ``shipped``: iterations and views of the shipped solver; ``operations`` of one iteration by kind;
+        ``iteration_flops`` and ``solve_flops``, weighted as figure 1 of the results; ``iteration_kernels`` and
+        ``iteration_bytes`` of eager mode; ``floor_bytes`` of a whole call and of an iteration; ``gpu``: what the floor
+        allows on one.
     """
     whole, without_last = (refinement_operations(m) for m in (ITERATIONS, ITERATIONS - 1))
     one = {kind: count - asdict(without_last)[kind] for kind, count in asdict(whole).items()}
     more, fewer = (traffic(m) for m in (ITERATIONS, ITERATIONS - 1))
     floor = floor_bytes()
+    shipped: Any = create_solver(TRAINED)
     return {
         "n": N,
         "m": ITERATIONS,
+        "shipped": {"m": shipped.refine.m, "views": shipped.views},
         "batch": _BATCH,
         "operations": one,
         "iteration_flops": Operations(**one).flops,

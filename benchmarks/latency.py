@@ -7,9 +7,10 @@ import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from contenders import CannotBeTimedError, Contender, Task, first
+from contenders import PLAIN, TRAINED, WHOLE
 from harness import quantiles, say, target, threads
 from settings import N, Settings, draw, make_contenders
+from tasks import CannotBeTimedError, Contender, Task, first
 
 from kornia_pnpnet.data import OutlierMix
 from kornia_pnpnet.types import Problems
@@ -96,7 +97,8 @@ def latencies(tasks: Mapping[str, Sequence[Task]]) -> dict[str, list[float]]:
 def targets(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """What is wanted of one problem on one thread."""
     found = []
-    for name, most_ms in (("pnpnet-n9 compiled", 0.4), ("pnpnet-n9", 3.0)):
+    compiled = WHOLE, f"{PLAIN} compiled", f"{TRAINED} compiled"
+    for name, most_ms in (*((name, 0.4) for name in compiled), (PLAIN, 3.0), (TRAINED, 3.0)):
         for row in rows:
             if (row["contender"], row["threads"]) == (name, 1):
                 median = f"`{name}`, one problem, median"

@@ -20,6 +20,7 @@ from engine import measure_engine
 from harness import HERE, load, run_child, say
 from settings import FULL, QUICK, Settings
 from startup import measure_startup
+from tables import PARTS
 
 from kornia_pnpnet.environment import environment
 from kornia_pnpnet.results import save_results
@@ -65,7 +66,7 @@ def make_parser() -> argparse.ArgumentParser:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("step", nargs="?", choices=("measure", "render"), default="measure")
-    parser.add_argument("--parts", nargs="+", choices=page.PARTS, default=page.PARTS, help="for measure: only these")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help="for measure: only these")
     parser.add_argument("--contenders", nargs="+", help="for measure: only these")
     parser.add_argument("--device", default="cpu", help="of the solvers of ours: cpu, cuda")
     parser.add_argument("--quick", action="store_true", help="a few small problems, to see that everything runs")

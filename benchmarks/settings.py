@@ -6,8 +6,9 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
-from contenders import CONTENDERS, OURS, CannotBeTimedError, Contender
+from contenders import CONTENDERS, OURS
 from harness import say
+from tasks import CannotBeTimedError, Contender
 from versions import version_contenders
 
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems

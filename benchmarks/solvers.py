@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from contenders import bare_call
 from harness import in_turns, load, peak_bytes, ratio, run_child, say, seconds, summary, threads
 from kornia.core.exceptions import BaseError
+from others import bare_call
 from torch import nn
 
 from kornia_pnpnet import pose_errors, success, success_rate

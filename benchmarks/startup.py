@@ -8,6 +8,7 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from contenders import PLAIN, TRAINED, WHOLE
 from harness import HERE, run_child, say, target
 from settings import Settings, make_contenders
 
@@ -15,7 +16,7 @@ __all__ = ["measure_startup", "targets"]
 
 # The first is the compiler's warm-up; the others show that another batch size does not compile everything anew.
 _BATCHES = (1000, 999, 100, 10, 1)
-COMPILED = "pnpnet-n9 compiled"
+COMPILED = f"{TRAINED} compiled"
 COLD, CACHED, EAGER = "cold", "cached", "eager"
 
 
@@ -30,7 +31,9 @@ def measure_startup(settings: Settings) -> dict[str, Any]:
     made = make_contenders(settings)
     starts = []
     for name, contender in made.contenders.items():
-        for backward in (False, True) if contender.differentiable else (False,):
+        if name.startswith(PLAIN) and name != WHOLE:
+            continue  # as TRAINED
+        for backward in (False, True) if contender.differentiable and name != WHOLE else (False,):
             say(f"cold start: {name}{', backward' if backward else ''}")
             request: dict[str, Any] = {"contender": name, "backward": backward, "device": settings.device}
             # A loop needs the memory of one problem, and PyPose's takes minutes for so many.

@@ -7,9 +7,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
-from contenders import CannotBeTimedError, Contender, Task, first
+from contenders import PLAIN, TRAINED
 from harness import in_turns, ratio, say, summary, target, threads
 from settings import N, Settings, draw, make_contenders
+from tasks import CannotBeTimedError, Contender, Task, first
 
 from kornia_pnpnet.types import Problems
 
@@ -137,14 +138,15 @@ def targets(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     here = [row for row in rows if (row["threads"], row["n"], row["batch"]) == (1, N, 1000)]
     forward, backward = ({row["contender"]: row for row in here if row["mode"] == mode} for mode in (FORWARD, BACKWARD))
     found = []
-    for name, most in (("refinement compiled", 3.0), ("pnpnet-n9 compiled", 8.0)):
+    solvers = f"{PLAIN} compiled", f"{TRAINED} compiled"
+    for name, most in (("refinement compiled", 3.0), *((name, 8.0) for name in solvers)):
         if name in forward:
             what = f"`{name}`, per problem"
             found.append(target(what, forward[name]["median_us"], most, unit="µs", at_most=True))
-    ratios = [(forward, "pnpnet-n9 compiled", "opencv-ransac", 20.0), (forward, "pnpnet-n9 compiled", "poselib", 10.0)]
+    ratios = [(forward, name, *least) for least in (("opencv-ransac", 20.0), ("poselib", 10.0)) for name in solvers]
     ratios += [(backward, "refinement compiled", name, 10.0) for name in ("pypose-lm", "pypose-parts")]
     firsts = [name for name in backward if "@" in name]
-    for base in ("refinement", "pnpnet-n9"):
+    for base in ("refinement", PLAIN):
         first_version = next((name for name in firsts if name.startswith(base)), None)
         ratios += [(backward, f"{base} compiled", first_version, 10.0)] if first_version else []
     for times, mine, theirs, least in ratios:

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from contenders import Contender, Task
+from contenders import PLAIN
+from tasks import Contender, Task
 
 from kornia_pnpnet.metrics import SuccessRate
 from kornia_pnpnet.types import Problems
@@ -27,9 +28,9 @@ VERSIONS_FILE = HERE / "versions.json"
 def load_versions() -> list[dict[str, Any]]:
     """The versions of the engine, oldest first.
 
-    Each has a ``version`` (its name), ``commit`` (``null``: the code as it is), ``compiled``, ``text`` (what was
-    changed) and ``predicted``: what was expected before it was written, in µs per problem by a key of
-    ``page.OUTCOMES``.
+    Each has a ``version`` (its name), ``commit`` (``null``: the code as it is), ``compiled`` (how: the end of a
+    contender's name, or empty), ``text`` (what was changed) and ``predicted``: what was expected before it was written,
+    in µs per problem by a key of ``tables.OUTCOMES``.
     """
     versions: list[dict[str, Any]] = json.loads(VERSIONS_FILE.read_text(encoding="utf-8"))
     return versions
@@ -37,7 +38,7 @@ def load_versions() -> list[dict[str, Any]]:
 
 def contender_name(base: str, version: dict[str, Any]) -> str:
     """What a version's contender is called: ``refinement compiled`` or ``refinement @1576bce``."""
-    name = f"{base} compiled" if version["compiled"] else base
+    name = f"{base} {version['compiled']}" if version["compiled"] else base
     return f"{name} @{version['commit']}" if version["commit"] else name
 
 
@@ -159,5 +160,5 @@ def version_contenders() -> dict[str, Callable[[], Contender]]:
         contender_name(base, version): maker(contender_name(base, {**version, "commit": None}), version["commit"])
         for version in load_versions()
         if version["commit"]
-        for base in ("pnpnet-n9", "refinement")
+        for base in (PLAIN, "refinement")
     }

@@ -11,7 +11,8 @@ import sys
 from typing import Any
 
 import torch
-from contenders import CONTENDERS, Contender, Task
+from contenders import CONTENDERS
+from tasks import Contender, Task
 
 from kornia_pnpnet.types import Pose, Problems
 

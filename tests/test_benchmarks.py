@@ -25,8 +25,19 @@ PATH = FOLDER / "solvers.py"
 SOLVERS = ("epnp", "p3p-ransac:max_samples=50", "opencv-epnp", "poselib")
 
 sys.path.insert(0, str(FOLDER))  # they are scripts and import each other
-NAMES = ("contenders", "engine", "harness", "latency", "page", "performance", "process", "settings", "startup")
-modules = {name: importlib.import_module(name) for name in (*NAMES, "throughput", "versions")}
+NAMES = (
+    "contenders",
+    "engine",
+    "harness",
+    "latency",
+    "others",
+    "page",
+    "performance",
+    "process",
+    "settings",
+    "startup",
+)
+modules = {name: importlib.import_module(name) for name in (*NAMES, "tables", "tasks", "throughput", "versions")}
 benchmark = importlib.import_module("solvers")
 
 
@@ -138,7 +149,7 @@ def test_peers_are_timed_without_our_adapter(make_problems):
     pytest.importorskip("cv2")
     solver, seen = create_solver("opencv-epnp"), []
     solver.solve_one = lambda *arrays: seen.append([array.shape for array in arrays])
-    call = modules["contenders"].bare_call(solver, make_problems(n=9, batch=4))
+    call = modules["others"].bare_call(solver, make_problems(n=9, batch=4))
     assert seen == []
     call()
     assert seen == 4 * [[(9, 3), (9, 2), (3, 3)]]
@@ -232,15 +243,15 @@ def test_a_target_is_met_at_its_limit(measured, at_most, met):
 
 
 def test_the_coarse_pose_is_as_far_off_as_it_says(make_problems):
-    contenders, problems = modules["contenders"], make_problems(n=9, batch=50)
-    coarse = contenders.coarse_pose(problems)
+    tasks, problems = modules["tasks"], make_problems(n=9, batch=50)
+    coarse = tasks.coarse_pose(problems)
     errors = pose_errors(coarse, problems.pose)
-    expected = torch.full((50,), contenders.COARSE_ANGLE_DEG, dtype=torch.float64)
+    expected = torch.full((50,), tasks.COARSE_ANGLE_DEG, dtype=torch.float64)
     torch.testing.assert_close(errors.rotation_error_deg, expected, atol=1e-4, rtol=0)
     centre = problems.world_points.mean(1)[..., None]
     true, moved = (rotation @ centre + translation[..., None] for rotation, translation in (problems.pose, coarse))
     share = ((moved - true).norm(dim=1) / true.norm(dim=1))[:, 0]
-    torch.testing.assert_close(share, torch.full_like(share, contenders.COARSE_SHIFT))
+    torch.testing.assert_close(share, torch.full_like(share, tasks.COARSE_SHIFT))
 
 
 EAGER = [name for name in modules["contenders"].CONTENDERS if "compiled" not in name]
@@ -285,11 +296,11 @@ class Uncompiled(nn.Linear):
 
 
 def test_what_does_not_compile_is_not_timed_as_compiled(make_problems):
-    contenders = modules["contenders"]
-    with pytest.raises(contenders.CannotBeTimedError, match="no compiler"):
-        contenders._compile(Uncompiled(1, 1))
-    task = contenders.Task(lambda: Uncompiled(1, 1).compile(), lambda: None, make_problems())
-    with pytest.raises(contenders.CannotBeTimedError, match="no compiler"):
+    tasks = modules["tasks"]
+    with pytest.raises(tasks.CannotBeTimedError, match="no compiler"):
+        tasks.compile_or_raise(Uncompiled(1, 1))
+    task = tasks.Task(lambda: Uncompiled(1, 1).compile(), lambda: None, make_problems())
+    with pytest.raises(tasks.CannotBeTimedError, match="no compiler"):
         task.warm()
 
 
@@ -350,9 +361,9 @@ def test_loops_are_cut_and_long_calls_left_out():
     problems = settings.draw(9, 40)
 
     def fake(loops, each):
-        class Fake(modules["contenders"].Contender):
+        class Fake(modules["tasks"].Contender):
             def task(self, problems, *, backward=False):
-                task = modules["contenders"].Task(lambda: None, lambda: problems.pose, problems)
+                task = modules["tasks"].Task(lambda: None, lambda: problems.pose, problems)
                 task.seconds = lambda times=1: each * len(problems.world_points)
                 return task
 
@@ -365,7 +376,7 @@ def test_loops_are_cut_and_long_calls_left_out():
     assert (count, len(task.problems.world_points)) == (30, 30)
     assert once == pytest.approx(0.3)
     assert throughput.ready(fake(False, 0.01), problems, few, **options)[1] == 40
-    with pytest.raises(modules["contenders"].CannotBeTimedError, match="about 4 s"):
+    with pytest.raises(modules["tasks"].CannotBeTimedError, match="about 4 s"):
         throughput.ready(fake(False, 0.1), problems, few, backward=False, known=0.1)
 
 
@@ -380,11 +391,15 @@ def test_targets_of_throughput():
     rows += [a_time("opencv-ransac", [180.0, 170.0, 162.0]), a_time("poselib", [60.0, 60.0, 60.0])]
     rows += [a_time("poselib", [1.0], threads=2), a_time("opencv-ransac", [1.0], batch=10)]
     rows += [a_time("refinement compiled", [10.0], both), a_time("pypose-parts", [99.0], both)]
-    rows += [a_time("refinement @1576bce", [100.0], both), a_time("pnpnet-n9 @1576bce", [100.0], both)]
+    rows += [a_time("refinement @1576bce", [100.0], both), a_time("pnpnet-n9:m=5 @1576bce", [100.0], both)]
+    rows += [a_time("pnpnet-n9:m=5 compiled", [5.0, 5.0, 5.0])]
     found = {entry["what"]: (entry["measured"], entry["met"]) for entry in modules["throughput"].targets(rows)}
     assert found == {
         "`refinement compiled`, per problem": (3.0, True),
+        "`pnpnet-n9:m=5 compiled`, per problem": (5.0, True),
         "`pnpnet-n9 compiled`, per problem": (8.5, False),
+        "`pnpnet-n9:m=5 compiled` against `opencv-ransac`, forward": (34.0, True),
+        "`pnpnet-n9:m=5 compiled` against `poselib`, forward": (12.0, True),
         "`pnpnet-n9 compiled` against `opencv-ransac`, forward": (20.0, True),
         "`pnpnet-n9 compiled` against `poselib`, forward": (pytest.approx(60 / 8.5), False),
         "`refinement compiled` against `pypose-parts`, forward+backward": (pytest.approx(9.9), False),
@@ -513,8 +528,8 @@ def test_a_version_is_measured_from_a_copy_of_its_commit(make_problems):
 
 def test_a_version_that_is_not_here_is_skipped_with_a_reason(monkeypatch, tmp_path):
     versions, settings = modules["versions"], modules["settings"]
-    entry = {"version": "lost", "commit": "0000000", "compiled": False, "text": "", "predicted": {}}
-    (tmp_path / "versions.json").write_text(json.dumps([entry, {**entry, "commit": None, "compiled": True}]))
+    entry = {"version": "lost", "commit": "0000000", "compiled": "", "text": "", "predicted": {}}
+    (tmp_path / "versions.json").write_text(json.dumps([entry, {**entry, "commit": None, "compiled": "compiled"}]))
     monkeypatch.setattr(versions, "VERSIONS_FILE", tmp_path / "versions.json")
     only = settings.QUICK._replace(contenders=("refinement @0000000", "epnp"))
     made = settings.make_contenders(only, versions=True)
@@ -527,7 +542,7 @@ def test_a_version_that_is_not_here_is_skipped_with_a_reason(monkeypatch, tmp_pa
 def test_versions_say_what_was_expected_of_them():
     for version in modules["versions"].load_versions():
         assert version.keys() == {"version", "commit", "compiled", "text", "predicted"}
-        assert version["predicted"].keys() <= modules["page"].OUTCOMES.keys()
+        assert version["predicted"].keys() <= modules["tables"].OUTCOMES.keys()
         assert all(value > 0 for value in version["predicted"].values())
 
 
@@ -548,7 +563,7 @@ def test_a_page_is_rendered_of_a_small_run(measured, tmp_path):
     modules["performance"].main(["render", "--results", str(folder), "--page", str(tmp_path / "a.md")])
     text = (tmp_path / "a.md").read_text(encoding="utf-8")
     assert sorted(path.name for path in (tmp_path / "a").iterdir()) == ["batch.png", "latency.png", "pairs.png"]
-    three = modules["page"].three_digits
+    three = modules["tables"].three_digits
     for row in results["throughput"]["rows"]:
         if row["n"] == 9 and row["batch"] == modules["settings"].QUICK.problems:
             assert three(row["median_us"]) in text
@@ -574,6 +589,6 @@ def test_the_page_shows_every_verdict_and_what_a_gpu_reached(measured):
 
 
 def test_numbers_have_three_digits():
-    three = modules["page"].three_digits
+    three = modules["tables"].three_digits
     assert [three(x) for x in (0.01234, 1.0, 99.96, 123.4, 1234.5)] == ["0.0123", "1.00", "100", "123", "1,234"]
     assert math.isclose(float(three(0.5)), 0.5)
