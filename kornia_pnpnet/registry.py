@@ -23,16 +23,16 @@ _FEW, _MANY = 10, 30
 _PAPERS_SAMPLE = 7
 
 
-def _trained(weights: str, m: int | None = None) -> PnPNet:
+def _trained(weights: str, m: int | None = None, views: int | None = None) -> PnPNet:
     """Shipped weights; with ``m``, only their first iterations (0: the network alone, the paper's "Net")."""
     solver = PnPNet.from_pretrained(weights)
+    refine = whole = solver.refine
     if m is not None:
-        whole = solver.refine
         KORNIA_CHECK(type(m) is int and 0 <= m <= whole.m, f"m must be an integer from 0 to {whole.m}, got {m!r}.")
-        solver.refine = RobustWeightedLM(**{**whole.config, "m": m})
-        for name, parameter in solver.refine.named_parameters():
+        refine = RobustWeightedLM(**{**whole.config, "m": m})
+        for name, parameter in refine.named_parameters():
             parameter.data.copy_(whole.get_parameter(name)[: len(parameter)])
-    return solver
+    return PnPNet(solver.init, refine, solver.normalize, views=solver.views if views is None else views)
 
 
 def _judged(init: nn.Module, *, order: bool = True) -> PnPNet:
@@ -113,7 +113,8 @@ def create_solver(name: str, **options: Any) -> nn.Module:
     Args:
         name: one of :func:`list_solvers`.
         options: of that solver: ``m``, the number of iterations, of ``identity-lm``, every ``-lm`` and trained weights
-            (at most their own); the arguments of :class:`~kornia_pnpnet.init.EPnP` of ``epnp`` and ``epnp-lm``, of
+            (at most their own); ``views``, the guesses for each problem, of trained weights (see
+            :class:`~kornia_pnpnet.model.PnPNet`); the arguments of :class:`~kornia_pnpnet.init.EPnP` of ``epnp`` and ``epnp-lm``, of
             :class:`~kornia_pnpnet.init.REPPnP` of ``reppnp`` and ``reppnp-lm``, of
             :class:`~kornia_pnpnet.init.RANSAC` of ``p3p-ransac`` and ``ransac-epnp-lm``, and of the classes of
             :mod:`kornia_pnpnet.peers`.

@@ -934,3 +934,15 @@ def test_views_are_saved(make_problems, tmp_path):
     assert again.views == 5
     p = make_problems()
     torch.testing.assert_close(again(*p[:3]).matrix, solver.float().double()(*p[:3]).matrix)
+
+
+def test_trained_weights_take_views_and_m(make_problems):
+    p = make_problems(batch=50, outliers=2)
+    assert create_solver("pnpnet-n9", views=3).views == 3
+    shallow = create_solver("pnpnet-n9", m=2, views=8)
+    assert (shallow.refine.m, shallow.views) == (2, 8)
+    one, eight = (create_solver("pnpnet-n9", views=views)(*p[:3]) for views in (1, 8))
+    errors = [pose_errors(result.pose, p.pose).rotation_error_deg.median() for result in (one, eight)]
+    assert errors[1] < errors[0]
+    with pytest.raises(BaseError, match="views must be 1 to 8"):
+        create_solver("pnpnet-n9", views=0)
