@@ -114,8 +114,8 @@ def create_solver(name: str, **options: Any) -> nn.Module:
         name: one of :func:`list_solvers`.
         options: of that solver: ``m``, the number of iterations, of ``identity-lm``, every ``-lm`` and trained weights
             (at most their own); ``views``, the guesses for each problem, of trained weights (see
-            :class:`~kornia_pnpnet.model.PnPNet`); the arguments of :class:`~kornia_pnpnet.init.EPnP` of ``epnp`` and ``epnp-lm``, of
-            :class:`~kornia_pnpnet.init.REPPnP` of ``reppnp`` and ``reppnp-lm``, of
+            :class:`~kornia_pnpnet.model.PnPNet`); the arguments of :class:`~kornia_pnpnet.init.EPnP` of ``epnp`` and
+            ``epnp-lm``, of :class:`~kornia_pnpnet.init.REPPnP` of ``reppnp`` and ``reppnp-lm``, of
             :class:`~kornia_pnpnet.init.RANSAC` of ``p3p-ransac`` and ``ransac-epnp-lm``, and of the classes of
             :mod:`kornia_pnpnet.peers`.
 
