@@ -30,7 +30,7 @@ from kornia_pnpnet.geometry import (
     retract_additive,
 )
 from kornia_pnpnet.robust import KERNELS, RobustKernel
-from kornia_pnpnet.small import factorise, substitute
+from kornia_pnpnet.small import factorise, relative, substitute
 from kornia_pnpnet.types import Correspondences, Guess, Pose, Refinement
 
 __all__ = [
@@ -175,8 +175,15 @@ def lm_step(
 
 def _relative(weights: Tensor, projection: Projection) -> Tensor:
     """Weights relative to the heaviest row of the Jacobian, so that products of tiny ones do not vanish."""
-    largest = (weights * projection.inv_depth * projection.inv_depth).detach().amax(1, keepdim=True)
-    return weights / torch.where(largest > 0, largest, 1.0)
+    return relative(weights, weights * projection.inv_depth * projection.inv_depth)
+
+
+def _weighted(
+    corr: Correspondences, pose: Pose, shape: Tensor, kernel_weight: Callable[[Tensor, Tensor], Tensor]
+) -> tuple[Projection, Tensor]:
+    """The projection, and the weights of the pairs by their residuals there."""
+    projection = project(pose, corr)
+    return projection, corr.weights * kernel_weight(projection.sq_residual, shape)
 
 
 def _iterate(
@@ -189,8 +196,7 @@ def _iterate(
     additive: bool,
 ) -> LMStep:
     """Weigh the pairs by their residuals and take one step."""
-    projection = project(pose, corr)
-    weights = corr.weights * kernel_weight(projection.sq_residual, shape)
+    projection, weights = _weighted(corr, pose, shape, kernel_weight)
     return lm_step(corr, pose, projection, weights, step, damping, additive=additive)
 
 
@@ -375,8 +381,7 @@ class RobustWeightedLM(nn.Module):
         pose = Pose(*(x.movedim(0, -1).contiguous().movedim(-1, 0) for x in poses))
         prior = corr.weights * guess.weights.mT.contiguous().mT
         # The steps do not depend on a common factor of the weights; tiny ones must not vanish when multiplied.
-        largest = prior.detach().amax(1, keepdim=True)
-        pairs = Correspondences(*corr[:2], prior / torch.where(largest > 0, largest, 1.0), corr.focal)
+        pairs = Correspondences(*corr[:2], relative(prior, prior), corr.focal)
         starts = None if guess.others is None else _repeated(pairs, 1 + guess.others.rotation.shape[1])
         return LMStart(corr, prior, pairs, pose, step, damping, shape, starts)
 
@@ -493,8 +498,7 @@ class RobustWeightedLM(nn.Module):
         """
 
         def equations(corr: Correspondences, at: Pose, shape: Tensor) -> NormalEquations:
-            projection = project(at, corr)
-            weights = corr.weights * self.kernel.weight(projection.sq_residual, shape)
+            projection, weights = _weighted(corr, at, shape, self.kernel.weight)
             return normal_equations(projection, _relative(weights, projection))
 
         fixed = Correspondences(*(x.detach() for x in start.pairs[:4]))

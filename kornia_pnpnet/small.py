@@ -17,6 +17,7 @@ __all__ = [
     "eigenvectors",
     "factorise",
     "nearest_rotation",
+    "relative",
     "small_product",
     "solve_leading",
     "substitute",
@@ -33,6 +34,20 @@ def dot(a: Iterable[Tensor], b: Iterable[Tensor]) -> Tensor:
     for x, y in pairs:
         total.addcmul_(x, y)
     return total
+
+
+def relative(values: Tensor, size: Tensor) -> Tensor:
+    """Values over the largest size of their problem, which counts as constant, or as they are where that is 0.
+
+    Args:
+        values: at least 0, shape :math:`(B, N)`.
+        size: shape :math:`(B, N)`.
+
+    Returns:
+        Shape :math:`(B, N)`.
+    """
+    largest = size.detach().amax(1, keepdim=True)
+    return values / torch.where(largest > 0, largest, 1.0)
 
 
 def small_product(a: Tensor, b: Tensor) -> Tensor:

@@ -15,6 +15,7 @@ from kornia_pnpnet.init.sampling import MIN_PAIRS, log_false_alarms
 from kornia_pnpnet.init.scoring import SCORERS, Judged, Scorer, Thresholds, chance_of_inlier, judge
 from kornia_pnpnet.init.search import DAMPING, PAIRS_PER_SAMPLE, Found, MinimalSolver, Plan, Search, full_vectors, take
 from kornia_pnpnet.lm import RobustWeightedLM, lm_step
+from kornia_pnpnet.small import relative
 from kornia_pnpnet.types import Correspondences, Guess, Hypotheses, Pose
 
 __all__ = ["RANSAC", "SubsetSolver"]
@@ -209,8 +210,7 @@ class RANSAC(nn.Module):
             share = share / share.sum(-1, keepdim=True).clamp(min=1.0)
             centre = (share[..., None] * corr.world_points).sum(1)  # (B, 3), a constant
         # Any unit of the weights is allowed: from here on they are relative to the largest.
-        largest = weights.detach().amax(-1, keepdim=True)
-        weights = weights / torch.where(largest > 0, largest, 1.0)
+        weights = relative(weights, weights)
         corr = corr._replace(world_points=corr.world_points - centre[:, None], weights=weights)
         with torch.no_grad():
             thresholds = self._thresholds(corr)
