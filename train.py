@@ -18,7 +18,7 @@ from kornia.core.exceptions import ValueCheckError
 from omegaconf import DictConfig, OmegaConf
 
 from kornia_pnpnet.model import PnPNet
-from kornia_pnpnet.reports import RESULTS_NAME, run_results, summarize_runs, write_json, write_model_card
+from kornia_pnpnet.reports import RESULTS_NAME, find_results, run_results, summarize_runs, write_json, write_model_card
 from kornia_pnpnet.runstate import TrainingError
 from kornia_pnpnet.training import describe_shares, fit
 
@@ -89,7 +89,8 @@ def main(config: DictConfig) -> float | None:
         log.info("Nothing is left to train; the results stay as they are.")
         results = json.loads((folder / RESULTS_NAME).read_text())
     else:
-        results = run_results(model.cpu(), validation, report, resolved, list(runtime.overrides.task))
+        origin = None if config.weights is None else find_results(config.weights)
+        results = run_results(model.cpu(), validation, report, resolved, list(runtime.overrides.task), origin)
         write_json(folder / RESULTS_NAME, results)
         model.save_pretrained(folder / "weights")
         write_model_card(folder / "weights", results)

@@ -19,7 +19,7 @@ from kornia_pnpnet.lm import LMStart, LMStep, RobustWeightedLM
 from kornia_pnpnet.normalize import VIEWS, Frame, Normalize
 from kornia_pnpnet.types import Guess, PnPResult, Pose
 
-__all__ = ["PnPNet", "shipped_weights"]
+__all__ = ["PnPNet", "find_weights", "shipped_weights"]
 
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 CONFIG_NAME, WEIGHTS_NAME = "config.json", "model.safetensors"
@@ -336,7 +336,7 @@ class PnPNet(nn.Module):
             FileNotFoundError: when there is no such name, folder or repository.
             ValueCheckError: when the files are damaged or of another model.
         """
-        folder = _find_weights(name_or_folder)
+        folder = find_weights(name_or_folder)
         from safetensors import SafetensorError
         from safetensors.torch import load_file
 
@@ -353,8 +353,18 @@ class PnPNet(nn.Module):
         return model.eval()
 
 
-def _find_weights(name_or_folder: str | Path) -> Path:
-    """Find the folder of some weights: shipped, local, or on the Hub."""
+def find_weights(name_or_folder: str | Path) -> Path:
+    """Find the folder of some weights: shipped, local, or on the Hub.
+
+    Args:
+        name_or_folder: see :meth:`PnPNet.from_pretrained`.
+
+    Returns:
+        The folder.
+
+    Raises:
+        FileNotFoundError: when there is none.
+    """
     name = str(name_or_folder)
     for folder in (WEIGHTS_FOLDER / name, Path(name)):
         if (folder / CONFIG_NAME).is_file():

@@ -16,11 +16,11 @@ from kornia_pnpnet.data import OutlierMix
 from kornia_pnpnet.environment import environment
 from kornia_pnpnet.files import atomic_open
 from kornia_pnpnet.metrics import pose_errors, success, success_rate
-from kornia_pnpnet.model import PnPNet
+from kornia_pnpnet.model import PnPNet, find_weights
 from kornia_pnpnet.training import FitReport
 from kornia_pnpnet.types import Problems
 
-__all__ = ["run_results", "summarize_runs", "write_json", "write_model_card"]
+__all__ = ["find_results", "run_results", "summarize_runs", "write_json", "write_model_card"]
 
 RESULTS_NAME = "results.json"
 # Overrides that say how a run was done, not what it found.
@@ -35,7 +35,12 @@ def write_json(path: str | Path, content: Any) -> None:
 
 @torch.no_grad()
 def run_results(
-    model: PnPNet, validation: Mapping[str, Problems], report: FitReport, config: dict[str, Any], overrides: list[str]
+    model: PnPNet,
+    validation: Mapping[str, Problems],
+    report: FitReport,
+    config: dict[str, Any],
+    overrides: list[str],
+    origin: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Gather what a run found: success on each validation set, learned hyperparameters, speed, and how to repeat it.
 
@@ -45,6 +50,7 @@ def run_results(
         report: what :func:`~kornia_pnpnet.training.fit` returned.
         config: the resolved configuration.
         overrides: the command line's overrides, ``key=value``.
+        origin: the results of the run with whose weights this one began.
 
     Returns:
         Plain data, ready for :func:`write_json`.
@@ -73,7 +79,28 @@ def run_results(
         "model": model.config(),
         "config": config,
         "environment": environment(),
+        "origin": origin,
     }
+
+
+def find_results(weights: str | Path) -> dict[str, Any] | None:
+    """The results of the run that some weights are from.
+
+    Args:
+        weights: what :meth:`~kornia_pnpnet.model.PnPNet.from_pretrained` takes.
+
+    Returns:
+        What :func:`run_results` returned then, or ``None`` where the file is neither beside nor above the weights.
+
+    Raises:
+        FileNotFoundError: when there are no such weights.
+    """
+    folder = find_weights(weights)
+    for path in (folder / RESULTS_NAME, folder.parent / RESULTS_NAME):
+        if path.is_file():
+            found: dict[str, Any] = json.loads(path.read_text())
+            return found
+    return None
 
 
 def _us_per_problem(model: PnPNet, problems: Problems) -> float:
@@ -127,9 +154,31 @@ def _mix(source: Mapping[str, Any], n: int) -> str:
     most = 0 if mix is None else OutlierMix(**{k: v for k, v in mix.items() if k != "_target_"}).max_count(n)
     least = most if mix is not None and mix.get("count") is not None else 0
     wrong = f"{least} to {most} of {n} pairs wrong" if most > least else f"{most} of {n} pairs wrong"
-    prior = source.get("points") or {"_target_": "BoxPoints"}
-    names = [entry["_target_"].rpartition(".")[2] for entry in prior.get("priors", [prior])]
+    names = [name for part in source.get("sources", [source]) for name in _points({**source, **part})]
     return f"{wrong}, points from {' and '.join(names)}"
+
+
+def _points(source: Mapping[str, Any]) -> list[str]:
+    """The priors of the points of a source, and their noise where it is from a range."""
+    prior = source.get("points") or {"_target_": "BoxPoints"}
+    noise = source.get("world_sigma")
+    known = f" (world_sigma {noise[0]:g} to {noise[1]:g})" if isinstance(noise, list) else ""
+    return [entry["_target_"].rpartition(".")[2] + known for entry in prior.get("priors", [prior])]
+
+
+def _run_lines(results: Mapping[str, Any]) -> list[str]:
+    """How a run was done; before it the one whose weights it began with."""
+    run, config, made = results["run"], results["config"], results["environment"]
+    overrides = [entry for entry in results["overrides"] if entry.split("=")[0] not in _HOW_IT_RAN]
+    return [
+        *(_run_lines(results["origin"]) if results.get("origin") else []),
+        f"- `{' '.join(['python train.py', *overrides])}`:",
+        f"  {run['update']} updates of {config['batch_size']} synthetic problems, {run['skipped']} of them skipped;",
+        f"  {run['updates_per_second']:.1f} updates per second, peak memory {run['peak_memory_mib']:.0f} MiB,",
+        f"  {made['threads']} thread(s) of {made['cpu']};",
+        f"  {_mix(config['data']['train'], config['model']['n'])}.",
+        f"  Commit {made['commit']}, torch {made['versions']['torch']}.",
+    ]
 
 
 def write_model_card(folder: str | Path, results: Mapping[str, Any]) -> None:
@@ -139,27 +188,23 @@ def write_model_card(folder: str | Path, results: Mapping[str, Any]) -> None:
         folder: where the weights are.
         results: what :func:`run_results` returned.
     """
-    model, run, config, learned = results["model"], results["run"], results["config"], results["learned"]
+    model, config, learned = results["model"], results["config"], results["learned"]
     n, m = config["model"]["n"], model["refine"]["m"]
     start, scope = ("The paper's network", "Exactly") if model["init"] else ("A start from the identity", "Trained on")
-    overrides = [entry for entry in results["overrides"] if entry.split("=")[0] not in _HOW_IT_RAN]
-    sources = {"training": config["data"]["train"], **config["data"]["validation"]}
+    views = model.get("views", 1)
+    guesses = f" from {views} guesses for each problem" if views > 1 else ""
     lines = [
         f"# {config['name']}",
         "",
-        f"{start} for n = {n} pairs and m = {m} iterations of robust weighted LM (Sheffer and",
+        f"{start} for n = {n} pairs and m = {m} iterations of robust weighted LM{guesses} (Sheffer and",
         "Wiesel, PnP-Net, 2020). Apache-2.0. Written from `results.json`, which has the full configuration.",
         "",
         "    solver = kornia_pnpnet.PnPNet.from_pretrained(FOLDER)  # this one, or its name when it is shipped",
         "",
         "## Training",
         "",
-        f"- `{' '.join(['python train.py', *overrides])}`",
-        f"- {run['update']} updates of {config['batch_size']} synthetic problems, {run['skipped']} of them skipped;",
-        f"  {run['updates_per_second']:.1f} updates per second, peak memory {run['peak_memory_mib']:.0f} MiB,",
-        f"  {results['environment']['threads']} thread(s) of {results['environment']['cpu']}.",
-        f"- Commit {results['environment']['commit']}, torch {results['environment']['versions']['torch']}.",
-        *(f"- Data, {name}: {_mix(source, n)}." for name, source in sources.items()),
+        *_run_lines(results),
+        *(f"- Validation, {name}: {_mix(source, n)}." for name, source in config["data"]["validation"].items()),
         "",
         "## Success on the validation sets",
         "",

@@ -98,6 +98,11 @@ def test_run_starts_from_weights(tmp_path):
     run(f"hydra.run.dir={tmp_path / 'run'}", *options, *learn_nothing)
     trained = PnPNet.from_pretrained(tmp_path / "run" / "weights").state_dict()
     assert all(torch.equal(trained[name], value) for name, value in weights.state_dict().items())
+    results = json.loads((tmp_path / "run" / "results.json").read_text())
+    assert results["origin"]["run"]["update"] == 50_000
+    card = (tmp_path / "run" / "weights" / "README.md").read_text()
+    assert card.index("50000 updates of 1000") < card.index("weights=pnpnet-n9") < card.index("2 updates of 8")
+    assert "points from BoxPoints and SlabPoints" in card.split("weights=pnpnet-n9")[1]
     for wrong in (f"model.m={weights.refine.m + 1}", "model.n=6", "weights=nowhere"):
         done = run(f"hydra.run.dir={tmp_path}/wrong", *options, wrong, check=False)
         assert done.returncode == 1
