@@ -42,7 +42,7 @@ def test_runs_are_told_apart_by_all_their_intervals(make, rates, others, verdict
 
 def test_every_experiment_has_a_claim(make):
     for path in make.EXPERIMENTS.glob("*.yaml"):
-        assert path.stem == "protocol" or make.claim(path.stem).endswith("."), path
+        assert path.stem in ("protocol", "finetune") or make.claim(path.stem).endswith("."), path
 
 
 def test_the_ablations_are_said_beside_the_recipe(make):
