@@ -403,7 +403,8 @@ class RobustWeightedLM(nn.Module):
             state = self._run(start, state, range(m - unrolled))
         state = self._run(start, state, range(m - unrolled, m))
         if start.starts is not None and m <= self.m // 2:
-            state = self._choose(start, state, start.shape[self.m // 2 if self.m else 0])
+            shape = start.shape[self.m // 2 if self.m else 0]
+            state = self._choose(start.pairs, start.starts, state, shape)
         if unrolled == 0 and m and torch.is_grad_enabled():
             return LMStep(self._attach_gradient(start, state.pose, start.shape[m - 1]), state.solved)
         return LMStep(state.pose, state.solved)
@@ -415,7 +416,7 @@ class RobustWeightedLM(nn.Module):
             if start.starts is not None and i < self.m // 2:
                 pairs = start.starts
             elif start.starts is not None and i == self.m // 2:
-                state = self._choose(start, state, start.shape[i])
+                state = self._choose(start.pairs, start.starts, state, start.shape[i])
             pose, factor = state.pose, state.factor
             damping = start.damping[i] if factor is None else start.damping[i] * factor
             pose, solved = self._iterate(pairs, pose, start.step[i], damping, start.shape[i])
@@ -428,12 +429,10 @@ class RobustWeightedLM(nn.Module):
             state = _State(pose, solved, factor)
         return state
 
-    def choose(self, start: LMStart, state: _State, shape: Tensor) -> _State:
-        """Of each problem's poses, keep the one of the lowest cost."""
-        starts = start.starts
-        assert starts is not None
+    def choose(self, pairs: Correspondences, starts: Correspondences, state: _State, shape: Tensor) -> _State:
+        """Of each problem's poses keep the one of the lowest cost: several of ``starts`` to one of ``pairs``."""
         pose = Pose(*(x.detach() for x in state.pose))
-        batch = start.prior.shape[0]
+        batch = pairs.weights.shape[0]
         cost = self._cost(project(pose, starts), starts, starts.weights, shape.detach())
         best = cost.view(-1, batch).argmin(0)  # (B,), the first of equals
         index = torch.add(torch.arange(batch, device=best.device), best, alpha=batch)
