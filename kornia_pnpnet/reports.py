@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -16,11 +17,12 @@ from kornia_pnpnet.data import OutlierMix
 from kornia_pnpnet.environment import environment
 from kornia_pnpnet.files import atomic_open
 from kornia_pnpnet.metrics import pose_errors, success, success_rate
-from kornia_pnpnet.model import PnPNet, find_weights
+from kornia_pnpnet.model import CONFIG_NAME, WEIGHTS_NAME, PnPNet, find_weights
+from kornia_pnpnet.runstate import HISTORY_NAME
 from kornia_pnpnet.training import FitReport
 from kornia_pnpnet.types import Problems
 
-__all__ = ["find_results", "run_results", "summarize_runs", "write_json", "write_model_card"]
+__all__ = ["collect_weights", "find_results", "run_results", "summarize_runs", "write_json", "write_model_card"]
 
 RESULTS_NAME = "results.json"
 # Overrides that say how a run was done, not what it found.
@@ -103,6 +105,37 @@ def find_results(weights: str | Path) -> dict[str, Any] | None:
     return None
 
 
+def collect_weights(runs: Sequence[str | Path], folder: str | Path, *, most_rows: int = 100) -> None:
+    """Gather what a solver came from into one folder: weights, results, model card and learning curves.
+
+    Args:
+        runs: folders of ``train.py``, each of which but the first began with the weights of the one before.
+        folder: where the files go; its name is that of the weights.
+        most_rows: of the curves of each run that are kept, all of them with a validation.
+    """
+    folder = Path(folder)
+    rows: list[dict[str, str]] = []
+    done = 0
+    for run in map(Path, runs):
+        with (run / HISTORY_NAME).open(newline="") as file:
+            validated = [row for row in csv.DictReader(file) if any(row[key] for key in row if key.startswith("val/"))]
+        step = -(-len(validated) // most_rows)
+        kept = [*reversed(validated[::-1][::step])]  # the last one always
+        rows += [{**row, "update": str(done + int(row["update"]))} for row in kept]
+        done = int(rows[-1]["update"])
+    last = Path(runs[-1])
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in (CONFIG_NAME, WEIGHTS_NAME):
+        shutil.copyfile(last / "weights" / name, folder / name)
+    results = json.loads((last / RESULTS_NAME).read_text())
+    write_json(folder / RESULTS_NAME, results)
+    write_model_card(folder, results, name=folder.name)
+    with atomic_open(folder / HISTORY_NAME, newline="") as file:
+        writer = csv.DictWriter(file, list(dict.fromkeys(key for row in rows for key in row)), restval="")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
 def _us_per_problem(model: PnPNet, problems: Problems) -> float:
     """Microseconds per problem in calls of 1000: the shortest call, since other work on the machine only adds."""
     inputs = [part[:1000] for part in problems[:3]]
@@ -181,12 +214,13 @@ def _run_lines(results: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def write_model_card(folder: str | Path, results: Mapping[str, Any]) -> None:
+def write_model_card(folder: str | Path, results: Mapping[str, Any], *, name: str | None = None) -> None:
     """Write ``README.md`` beside some weights, all of it from the run's results.
 
     Args:
         folder: where the weights are.
         results: what :func:`run_results` returned.
+        name: of the weights, that of the run when ``None``.
     """
     model, config, learned = results["model"], results["config"], results["learned"]
     n, m = config["model"]["n"], model["refine"]["m"]
@@ -194,7 +228,7 @@ def write_model_card(folder: str | Path, results: Mapping[str, Any]) -> None:
     views = model.get("views", 1)
     guesses = f" from {views} guesses for each problem" if views > 1 else ""
     lines = [
-        f"# {config['name']}",
+        f"# {name or config['name']}",
         "",
         f"{start} for n = {n} pairs and m = {m} iterations of robust weighted LM{guesses} (Sheffer and",
         "Wiesel, PnP-Net, 2020). Apache-2.0. Written from `results.json`, which has the full configuration.",
@@ -204,7 +238,7 @@ def write_model_card(folder: str | Path, results: Mapping[str, Any]) -> None:
         "## Training",
         "",
         *_run_lines(results),
-        *(f"- Validation, {name}: {_mix(source, n)}." for name, source in config["data"]["validation"].items()),
+        *(f"- Validation, {key}: {_mix(source, n)}." for key, source in config["data"]["validation"].items()),
         "",
         "## Success on the validation sets",
         "",
@@ -213,9 +247,9 @@ def write_model_card(folder: str | Path, results: Mapping[str, Any]) -> None:
         "| Set | PnP-Net | Net alone | median rotation error | median translation error |",
         "|---|---|---|---|---|",
     ]
-    for name, entry in results["validation"].items():
+    for validation, entry in results["validation"].items():
         lines.append(
-            f"| {name} | {_rate(entry['success'])} | {_rate(entry['first_stage_success'])} "
+            f"| {validation} | {_rate(entry['success'])} | {_rate(entry['first_stage_success'])} "
             f"| {entry['median_rotation_error_deg']:.3f}° | {entry['median_translation_error']:.3f} |"
         )
     if m > 0:

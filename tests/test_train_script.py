@@ -12,6 +12,7 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
 from kornia_pnpnet import PnPNet
+from kornia_pnpnet.reports import collect_weights
 
 REPO = Path(__file__).resolve().parents[1]
 DATA = sorted(path.stem for path in (REPO / "conf" / "data").glob("*.yaml"))
@@ -103,6 +104,14 @@ def test_run_starts_from_weights(tmp_path):
     card = (tmp_path / "run" / "weights" / "README.md").read_text()
     assert card.index("50000 updates of 1000") < card.index("weights=pnpnet-n9") < card.index("2 updates of 8")
     assert "points from BoxPoints and SlabPoints" in card.split("weights=pnpnet-n9")[1]
+    run(f"hydra.run.dir={tmp_path / 'again'}", *options, f"weights={tmp_path / 'run' / 'weights'}", "train.updates=3")
+    collect_weights([tmp_path / "run", tmp_path / "again"], tmp_path / "mine")
+    with (tmp_path / "mine" / "history.csv").open(newline="") as file:
+        assert [row["update"] for row in csv.DictReader(file)] == ["1", "2", "3", "4", "5"]
+    card = (tmp_path / "mine" / "README.md").read_text()
+    assert card.startswith("# mine\n")
+    assert card.count("`python train.py") == 3
+    assert PnPNet.from_pretrained(tmp_path / "mine").config() == weights.config()
     for wrong in (f"model.m={weights.refine.m + 1}", "model.n=6", "weights=nowhere"):
         done = run(f"hydra.run.dir={tmp_path}/wrong", *options, wrong, check=False)
         assert done.returncode == 1

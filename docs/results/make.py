@@ -3,7 +3,8 @@
 ``measure`` solves fresh problems with every solver and writes the results files here, without the errors of single
 problems; with them they are in ``outputs/results``, from where a run that was stopped continues. It needs the scenes
 (``--scenes``, default ``../shared/data``). ``compare`` (two folders of ``train.py`` with ``--runs``) writes
-``distribution.json`` in the same way. ``render`` reads the files and writes ``README.md`` and the pictures; every
+``distribution.json`` in the same way, and ``ship`` (with ``--runs`` the folders of one solver's runs, one after the
+other) puts its weights into the package. ``render`` reads the files and writes ``README.md`` and the pictures; every
 number of the page comes from the files. ``ablation.csv`` and ``sweep.csv`` are copies of ``summary.csv`` in the folders
 of these, which take less than an hour on one core and go on where they were stopped::
 
@@ -34,7 +35,7 @@ from kornia_pnpnet.evaluation import EvaluationData, evaluate
 from kornia_pnpnet.figures import paper_figures, plot_sweep, plot_training
 from kornia_pnpnet.figures.sweep import mix_in_words
 from kornia_pnpnet.model import WEIGHTS_FOLDER
-from kornia_pnpnet.reports import write_json
+from kornia_pnpnet.reports import collect_weights, write_json
 from kornia_pnpnet.results import format_table, load_results, save_results
 from kornia_pnpnet.types import PnPResult, Problems
 
@@ -651,22 +652,35 @@ def compare(scenes: Path, count: int, runs: Sequence[Path]) -> None:
     run("distribution", solvers, sets, updates=updates)
 
 
+def ship(runs: Sequence[Path]) -> None:
+    """Put the weights of the last run into the package, with the curves of all."""
+    n = json.loads((runs[-1] / "results.json").read_text())["config"]["model"]["n"]
+    collect_weights(runs, WEIGHTS_FOLDER / f"pnpnet-n{n}")
+
+
 def main() -> None:
     """Run one of the steps."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("step", choices=("measure", "compare", "render"))
+    parser.add_argument("step", choices=("measure", "compare", "ship", "render"))
     parser.add_argument(
         "--only", nargs="+", default=(), choices=(*RESULTS, "complexity"), help="for measure: these files"
     )
     parser.add_argument("--scenes", type=Path, default=HERE.parents[2] / "shared" / "data")
     parser.add_argument("--synthetic-count", type=int, default=5000)
     parser.add_argument("--real-count", type=int, default=1000)
-    parser.add_argument("--runs", type=Path, nargs="+", help="for compare: folders of two runs, `mixed` and `paper`")
+    parser.add_argument(
+        "--runs",
+        type=Path,
+        nargs="+",
+        help="for compare: folders of two runs, `mixed` and `paper`; for ship: one or more",
+    )
     arguments = parser.parse_args()
     if arguments.step == "measure":
         measure(arguments.scenes, arguments.synthetic_count, arguments.real_count, arguments.only)
     elif arguments.step == "compare":
         compare(arguments.scenes, arguments.real_count, arguments.runs)
+    elif arguments.step == "ship":
+        ship(arguments.runs)
     else:
         render()
 
