@@ -57,7 +57,8 @@ def test_model_card_is_generated_from_the_run(name, tmp_path):
     results = json.loads((folder / "results.json").read_text())
     write_model_card(tmp_path, results, name=name)
     assert (tmp_path / "README.md").read_text() == (folder / "README.md").read_text()
-    assert PnPNet.from_config(results["model"]).config() == PnPNet.from_pretrained(name).config()
+    model = {"views": 1, **results["model"]}  # the results of pnpnet-n9 are older than views
+    assert PnPNet.from_config(model).config() == PnPNet.from_pretrained(name).config()
     updates, run = 0, results
     while run:
         updates, run = updates + run["run"]["update"], run.get("origin")
