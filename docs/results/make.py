@@ -34,7 +34,7 @@ from kornia_pnpnet.complexity import complexity_results
 from kornia_pnpnet.evaluation import EvaluationData, evaluate
 from kornia_pnpnet.figures import paper_figures, plot_sweep, plot_training
 from kornia_pnpnet.figures.sweep import mix_in_words
-from kornia_pnpnet.model import WEIGHTS_FOLDER
+from kornia_pnpnet.model import WEIGHTS_FOLDER, shipped_weights
 from kornia_pnpnet.reports import collect_weights, write_json
 from kornia_pnpnet.results import format_table, load_results, save_results
 from kornia_pnpnet.types import PnPResult, Problems
@@ -171,7 +171,7 @@ def measure(scenes: Path, synthetic_count: int, real_count: int, only: Sequence[
             )
         if wanted("against_n"):
             sets = evaluation_sets(["synthetic"], "none,uniform", **{**synthetic, "n": [6, 9, 12, 20, 50]})
-            run("against_n", named(fast, found), sets, tuned=found)
+            run("against_n", named(dict.fromkeys((*shipped_weights(), *fast)), found), sets, tuned=found)
     if wanted("crowd"):
         found = tune(evaluation_sets(["synthetic"], **{**tuning, **crowd, "count": real_count // 5}), "crowd", ROBUST)
         sets = evaluation_sets(["synthetic"], **{**synthetic, **crowd, "count": real_count})
@@ -389,11 +389,9 @@ beyond it are weights by more than the residual.
 
 {sweep}
 
-## Training of {ours}
+## Training
 
-![Learning curves](training.png)
-
-[Model card](../../kornia_pnpnet/weights/{ours}/README.md)
+{trainings}
 """
 RESULTS = ("paper", "gaussian_pose", "real", "mismatches", "crowd", "against_n", "against_m", "views", "distribution")
 
@@ -625,6 +623,11 @@ def page(
         distribution=format_table(results["distribution"]),
         ablation=ablation_text(ablation),
         sweep=sweep_text(sweep),
+        trainings="\n\n".join(
+            f"`{name}`: [model card](../../kornia_pnpnet/weights/{name}/README.md).\n\n"
+            f"![Learning curves of {name}](training-{name}.png)"
+            for name in shipped_weights()
+        ),
     )
 
 
@@ -633,7 +636,8 @@ def render() -> None:
     results = {name: load_results(HERE / f"{name}.json") for name in RESULTS}
     complexity = json.loads((HERE / "complexity.json").read_text())
     paper_figures([*(results[name] for name in RESULTS[:-2]), complexity], HERE)
-    plot_training(HERE / "training.png", WEIGHTS_FOLDER / OURS / "history.csv")
+    for name in shipped_weights():
+        plot_training(HERE / f"training-{name}.png", WEIGHTS_FOLDER / name / "history.csv")
     short_runs = [read_summary(HERE / f"{name}.csv") for name in ("ablation", "sweep")]
     if short_runs[1]:
         for against in ("n", "m"):
