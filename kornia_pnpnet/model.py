@@ -178,21 +178,12 @@ class PnPNet(nn.Module):
         if intrinsics.ndim == 2:
             intrinsics = intrinsics.expand(world_points.shape[0], 3, 3)
         with torch.autocast(world_points.device.type, enabled=False):
-            return self._solve(world_points, img_points, intrinsics, weights, mask, init, first_stage_only)
+            return self._solve(first_stage_only, world_points, img_points, intrinsics, weights, mask, init)
 
-    def _in_parts(
-        self,
-        world_points: Tensor,
-        img_points: Tensor,
-        intrinsics: Tensor,
-        weights: Tensor | None,
-        mask: Tensor | None,
-        init: Pose | None,
-        first_stage_only: bool,
-    ) -> PnPResult:
-        """What is before the iterations, they themselves, and what is after them."""
+    def _in_parts(self, first_stage_only: bool, *inputs: Any) -> PnPResult:
+        """What is before the iterations, they themselves, and what is after them; inputs as of :meth:`_guess`."""
         views = 1 if first_stage_only or self.refine.m == 0 else self.views
-        stage = self._begin(world_points, img_points, intrinsics, weights, mask, init, views)
+        stage = self._begin(views, *inputs)
         end = self.refine.iterate(stage.start, 0 if first_stage_only else None)
         return self._finish(stage, end)
 
@@ -218,13 +209,13 @@ class PnPNet(nn.Module):
 
     def _guess(
         self,
+        views: int,
         world_points: Tensor,
         img_points: Tensor,
         intrinsics: Tensor,
         weights: Tensor | None,
         mask: Tensor | None,
         init: Pose | None,
-        views: int,
     ) -> _Stage:
         """Everything before the first iteration."""
         corr, frame = self.normalize(world_points, img_points, intrinsics, weights, mask)
