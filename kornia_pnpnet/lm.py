@@ -242,8 +242,8 @@ class RobustWeightedLM(nn.Module):
     damping :math:`\lambda` and robustness (the shape of the kernel, :math:`\alpha` for ``power``) are learned, by
     default one set per iteration; at their initial values this is the classical method.
 
-    Where a guess has other poses, all of them are refined by the first half of the iterations, :math:`m / 2` rounded
-    down. Then, per problem, the one of the lowest cost by the kernel of the next iteration goes on alone.
+    Where a guess has other poses, all of them are refined by the first seven tenths of the iterations, rounded down.
+    Then, per problem, the one of the lowest cost by the kernel of the next iteration goes on alone.
 
     All operations are per problem: a problem that cannot be solved keeps its pose, reports ``ok=False`` and changes
     no other.
@@ -314,6 +314,7 @@ class RobustWeightedLM(nn.Module):
             "last": last,
         }
         self.m = m
+        self.compared_at = 7 * m // 10  # the iteration before which the best of several starts is chosen
         self.backward = backward
         self.last = last
         self.kernel: RobustKernel = KERNELS[kernel]
@@ -402,8 +403,8 @@ class RobustWeightedLM(nn.Module):
         with torch.set_grad_enabled(torch.is_grad_enabled() and unrolled == m):
             state = self._run(start, state, range(m - unrolled))
         state = self._run(start, state, range(m - unrolled, m))
-        if start.starts is not None and m <= self.m // 2:
-            shape = start.shape[self.m // 2 if self.m else 0]
+        if start.starts is not None and m <= self.compared_at:
+            shape = start.shape[self.compared_at]
             state = self._choose(start.pairs, start.starts, state, shape)
         if unrolled == 0 and m and torch.is_grad_enabled():
             return LMStep(self._attach_gradient(start, state.pose, start.shape[m - 1]), state.solved)
@@ -413,9 +414,9 @@ class RobustWeightedLM(nn.Module):
         """Some iterations."""
         for i in iterations:
             pairs = start.pairs
-            if start.starts is not None and i < self.m // 2:
+            if start.starts is not None and i < self.compared_at:
                 pairs = start.starts
-            elif start.starts is not None and i == self.m // 2:
+            elif start.starts is not None and i == self.compared_at:
                 state = self._choose(start.pairs, start.starts, state, start.shape[i])
             pose, factor = state.pose, state.factor
             damping = start.damping[i] if factor is None else start.damping[i] * factor

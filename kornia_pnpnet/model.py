@@ -106,7 +106,8 @@ class PnPNet(nn.Module):
         normalize: the normalisation; the default centres and scales the world and orders the pairs.
         views: guesses for each problem, 1 to 8: of the problem itself and of what mirrors make of it (see
             :meth:`~kornia_pnpnet.normalize.Normalize.views`), which to a network are other problems. All are refined,
-            and after half of the iterations the best goes on. Costs more and solves more, whatever it was trained with.
+            and after seven tenths of the iterations the best goes on. Costs more and solves more, whatever the number
+            was in training.
 
     Raises:
         BaseError: when ``views`` is not an integer from 1 to 8.

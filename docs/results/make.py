@@ -372,12 +372,12 @@ longer along the optical axis than across, which no façade is: what the network
 
 ## More guesses for each problem, and a perfect one
 
-With `views=4` the network guesses from four mirror images of each problem, half of the iterations refine all four, and
-the best goes on: most of what `{ours}` loses on scenes with wrong pairs, it loses to a first guess that is too far off.
-On the protocol's data that is a smaller part. `{ours} from the truth` starts its few iterations at the true pose and
-has not gone far; `alpha = ... from the truth` are 30 classical iterations from there, which is where the minima are:
-wrong pairs and noise move them. No first guess gets past the best of them, and RANSAC (first table) is about there;
-beyond it are weights by more than the residual.
+With `views=4` the network guesses from four mirror images of each problem, seven tenths of the iterations refine all
+four, and the best goes on: most of what `{ours}` loses on scenes with wrong pairs, it loses to a first guess that is
+too far off. On the protocol's data that is a smaller part. `{ours} from the truth` starts its few iterations at the
+true pose and has not gone far; `alpha = ... from the truth` are 30 classical iterations from there, which is where the
+minima are: wrong pairs and noise move them. No first guess gets past the best of them, and RANSAC (first table) is
+about there; beyond it are weights by more than the residual.
 
 {views}
 

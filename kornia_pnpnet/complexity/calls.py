@@ -35,11 +35,11 @@ def _step_calls(n: int, times: float) -> Iterator[Call]:
 
 
 def _lm_calls(lm: RobustWeightedLM, n: int, times: float = 1, starts: int = 1) -> Iterator[Call]:
-    """A refinement, of several starts in the first half of its iterations."""
+    """A refinement, of several starts until they are compared."""
     weight, loss = (f"robust.{function.__name__}" for function in (lm.kernel.weight, lm.kernel.loss))
     if lm.additive or lm.reject_worse or weight not in PARTS:
         raise ValueCheckError(f"There is no formula for {lm}: it needs the retraction, no rejection, the power kernel.")
-    iterations = lm.m + (starts - 1) * (lm.m // 2)
+    iterations = lm.m + (starts - 1) * lm.compared_at
     compared = starts if starts > 1 else 0
     yield "lm._iterate", iterations * times, (n,)
     yield from _step_calls(n, iterations * times)
