@@ -243,7 +243,7 @@ class RobustWeightedLM(nn.Module):
     default one set per iteration; at their initial values this is the classical method.
 
     Where a guess has other poses, all of them are refined by the first seven tenths of the iterations, rounded down.
-    Then, per problem, the one of the lowest cost by the kernel of the next iteration goes on alone.
+    Then, per problem, the one of the lowest cost by the kernel of the last of these goes on alone.
 
     All operations are per problem: a problem that cannot be solved keeps its pose, reports ``ok=False`` and changes
     no other.
@@ -404,8 +404,7 @@ class RobustWeightedLM(nn.Module):
             state = self._run(start, state, range(m - unrolled))
         state = self._run(start, state, range(m - unrolled, m))
         if start.starts is not None and m <= self.compared_at:
-            shape = start.shape[self.compared_at]
-            state = self._choose(start.pairs, start.starts, state, shape)
+            state = self._choose(start.pairs, start.starts, state, start.shape[max(self.compared_at - 1, 0)])
         if unrolled == 0 and m and torch.is_grad_enabled():
             return LMStep(self._attach_gradient(start, state.pose, start.shape[m - 1]), state.solved)
         return LMStep(state.pose, state.solved)
@@ -417,7 +416,7 @@ class RobustWeightedLM(nn.Module):
             if start.starts is not None and i < self.compared_at:
                 pairs = start.starts
             elif start.starts is not None and i == self.compared_at:
-                state = self._choose(start.pairs, start.starts, state, start.shape[i])
+                state = self._choose(start.pairs, start.starts, state, start.shape[max(i - 1, 0)])
             pose, factor = state.pose, state.factor
             damping = start.damping[i] if factor is None else start.damping[i] * factor
             pose, solved = self._iterate(pairs, pose, start.step[i], damping, start.shape[i])
