@@ -199,8 +199,8 @@ class PnPNet(nn.Module):
 
         Args:
             mode: of ``torch.compile``; ``"reduce-overhead"`` captures CUDA graphs.
-            whole: compile the solver as one, with its iterations one after the other. The first call takes several
-                times as long; calls of a few problems, which mostly wait for Python, take half the time.
+            whole: compile the solver as one, with its iterations one after the other. The first call takes longer;
+                calls of a few problems, which mostly wait for Python, take half the time.
         """
         self._solve = Compiled(self._in_parts, mode) if whole else self._in_parts
         self._begin = self._guess if whole else Compiled(self._guess, mode)
