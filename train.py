@@ -38,9 +38,9 @@ def main(config: DictConfig) -> float | None:
     model = instantiate(config.model.solver)
     if config.weights is not None:
         try:
-            model.load_state_dict(PnPNet.from_pretrained(config.weights).state_dict())
+            start_from(model, PnPNet.from_pretrained(config.weights))
         except (FileNotFoundError, RuntimeError, ValueCheckError) as error:
-            sys.exit(f"Cannot start n = {config.model.n}, m = {config.model.m} from weights={config.weights}: {error}")
+            sys.exit(f"Cannot start n = {config.model.n} from weights={config.weights}: {error}")
     if config.compile:
         model.compile()
     validation = {name: instantiate(source).batch(0) for name, source in config.data.validation.items()}
@@ -101,6 +101,16 @@ def main(config: DictConfig) -> float | None:
     if runtime.mode == RunMode.MULTIRUN:
         log.info("Sweep summary: %s", summarize_runs(runtime.sweep.dir))
     return float(results["validation"]["uniform"]["success"]["rate"])
+
+
+def start_from(model: PnPNet, trained: PnPNet) -> None:
+    """Give a solver the weights of another one; where that has other iterations, its own start anew."""
+    state = trained.state_dict()
+    if trained.refine.m != model.refine.m:
+        log.info("The weights have m = %s: only the network starts from them.", trained.refine.m)
+        state = {name: value for name, value in state.items() if not name.startswith("refine.")}
+        state |= {f"refine.{name}": value for name, value in model.refine.state_dict().items()}
+    model.load_state_dict(state)
 
 
 if __name__ == "__main__":

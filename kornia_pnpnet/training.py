@@ -76,7 +76,7 @@ class TrainSettings:
     warmup: int = 200
     final_lr: float = 0.02
     clip: float = 1.0
-    ramp: tuple[float, float] = (0.6, 0.62)
+    ramp: tuple[float, float] = (0.8, 0.81)
     max_skipped: int = 100
     log_every: int = 100
     validate_every: int = 1000

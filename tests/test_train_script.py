@@ -100,9 +100,11 @@ def test_run_starts_from_weights(tmp_path):
     trained = PnPNet.from_pretrained(tmp_path / "run" / "weights").state_dict()
     assert all(torch.equal(trained[name], value) for name, value in weights.state_dict().items())
     results = json.loads((tmp_path / "run" / "results.json").read_text())
-    assert results["origin"]["run"]["update"] == 50_000
+    assert results["origin"]["origin"]["run"]["update"] == 200_000
     card = (tmp_path / "run" / "weights" / "README.md").read_text()
-    assert card.index("50000 updates of 1000") < card.index("weights=pnpnet-n9") < card.index("2 updates of 8")
+    assert card.count("`python train.py") == 3
+    lineage = ("200000 updates of 1000", "10000 updates of 1000", "weights=pnpnet-n9", "2 updates of 8")
+    assert [*map(card.index, lineage)] == sorted(map(card.index, lineage))
     assert "points from BoxPoints and SlabPoints" in card.split("weights=pnpnet-n9")[1]
     run(f"hydra.run.dir={tmp_path / 'again'}", *options, f"weights={tmp_path / 'run' / 'weights'}", "train.updates=3")
     collect_weights([tmp_path / "run", tmp_path / "again"], tmp_path / "mine")
@@ -110,9 +112,15 @@ def test_run_starts_from_weights(tmp_path):
         assert [row["update"] for row in csv.DictReader(file)] == ["1", "2", "3", "4", "5"]
     card = (tmp_path / "mine" / "README.md").read_text()
     assert card.startswith("# mine\n")
-    assert card.count("`python train.py") == 3
+    assert card.count("`python train.py") == 4
+    done = run(f"hydra.run.dir={tmp_path / 'deeper'}", *options, *learn_nothing, f"model.m={weights.refine.m + 1}")
+    assert "only the network" in done.stdout + done.stderr
+    deeper = PnPNet.from_pretrained(tmp_path / "deeper" / "weights")
+    assert deeper.refine.step().tolist() == pytest.approx([1.0] * (weights.refine.m + 1))
+    for a, b in zip(deeper.init.parameters(), weights.init.parameters(), strict=True):
+        assert torch.equal(a, b)
     assert PnPNet.from_pretrained(tmp_path / "mine").config() == weights.config()
-    for wrong in (f"model.m={weights.refine.m + 1}", "model.n=6", "weights=nowhere"):
+    for wrong in ("model.solver.refine.shared=true", "model.n=6", "weights=nowhere"):
         done = run(f"hydra.run.dir={tmp_path}/wrong", *options, wrong, check=False)
         assert done.returncode == 1
         assert "Cannot start" in done.stderr
