@@ -21,15 +21,18 @@ from tasks import (
 )
 from torch import nn
 
-from kornia_pnpnet import create_solver
+from kornia_pnpnet import PnPNet, RobustWeightedLM
 from kornia_pnpnet.choices import load_solver
 from kornia_pnpnet.types import Pose, Problems
 
-__all__ = ["CONTENDERS", "OURS", "PLAIN", "TRAINED", "WHOLE"]
+__all__ = ["CONTENDERS", "ONE", "OURS", "PLAIN", "TRAINED", "WHOLE"]
 
 TRAINED = "pnpnet-n9"
-#: As the paper has it: one guess, and the iterations that the targets are set for.
-PLAIN = f"{TRAINED}:m={ITERATIONS}"
+#: As the paper has it: its network, one guess, and the iterations that the targets are set for. The trained ones are
+#: more and belong together, so these are classical.
+PLAIN = "net-n9+lm"
+#: All of its iterations, from one guess.
+ONE = f"{TRAINED}:views=1"
 WHOLE = f"{PLAIN} compiled whole"
 
 
@@ -43,11 +46,15 @@ class Ours(Contender):
         compiled: bool = False,
         whole: bool = False,
         views: int | None = None,
+        classical: int | None = None,
         device: str = "cpu",
     ) -> None:
-        solver: Any = load_solver(spec).float().to(device)
+        solver: Any = load_solver(spec)
         if views is not None:
             solver.views = views
+        if classical is not None:
+            solver = PnPNet(solver.init, RobustWeightedLM(classical), solver.normalize).eval()
+        solver = solver.float().to(device)
         self.solver: nn.Module = solver
         self.device = device
         self.only_n = int(spec.partition(":")[0].removeprefix("pnpnet-n")) if spec.startswith("pnpnet-n") else None
@@ -74,11 +81,10 @@ class Ours(Contender):
 
 
 class Refinement(Contender):
-    """The first iterations of the trained refinement alone, on normalised pairs and from the coarse pose."""
+    """A refinement alone, on normalised pairs and from the coarse pose."""
 
     def __init__(self, *, compiled: bool = False, device: str = "cpu") -> None:
-        solver: Any = create_solver(TRAINED, m=ITERATIONS)
-        self.refine: nn.Module = solver.refine.to(device)
+        self.refine: nn.Module = RobustWeightedLM(ITERATIONS).to(device)
         self.device = device
         if compiled:
             compile_or_raise(self.refine)
@@ -100,9 +106,11 @@ class Refinement(Contender):
 OURS: dict[str, Callable[..., Contender]] = {
     TRAINED: functools.partial(Ours, TRAINED),
     f"{TRAINED} compiled": functools.partial(Ours, TRAINED, compiled=True),
-    PLAIN: functools.partial(Ours, PLAIN, views=1),
-    f"{PLAIN} compiled": functools.partial(Ours, PLAIN, views=1, compiled=True),
-    WHOLE: functools.partial(Ours, PLAIN, views=1, compiled=True, whole=True),
+    ONE: functools.partial(Ours, TRAINED, views=1),
+    f"{ONE} compiled": functools.partial(Ours, TRAINED, views=1, compiled=True),
+    PLAIN: functools.partial(Ours, TRAINED, classical=ITERATIONS),
+    f"{PLAIN} compiled": functools.partial(Ours, TRAINED, classical=ITERATIONS, compiled=True),
+    WHOLE: functools.partial(Ours, TRAINED, classical=ITERATIONS, compiled=True, whole=True),
     "refinement": Refinement,
     "refinement compiled": functools.partial(Refinement, compiled=True),
     "epnp": functools.partial(Ours, "epnp"),

@@ -7,7 +7,7 @@ import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from contenders import PLAIN, TRAINED, WHOLE
+from contenders import ONE, PLAIN, TRAINED, WHOLE
 from harness import quantiles, say, target, threads
 from settings import N, Settings, draw, make_contenders
 from tasks import CannotBeTimedError, Contender, Task, first
@@ -97,8 +97,8 @@ def latencies(tasks: Mapping[str, Sequence[Task]]) -> dict[str, list[float]]:
 def targets(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """What is wanted of one problem on one thread."""
     found = []
-    compiled = WHOLE, f"{PLAIN} compiled", f"{TRAINED} compiled"
-    for name, most_ms in (*((name, 0.4) for name in compiled), (PLAIN, 3.0), (TRAINED, 3.0)):
+    compiled = WHOLE, *(f"{name} compiled" for name in (PLAIN, ONE, TRAINED))
+    for name, most_ms in (*((name, 0.4) for name in compiled), *((name, 3.0) for name in (PLAIN, ONE, TRAINED))):
         for row in rows:
             if (row["contender"], row["threads"]) == (name, 1):
                 median = f"`{name}`, one problem, median"

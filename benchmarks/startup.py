@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from contenders import PLAIN, TRAINED, WHOLE
+from contenders import ONE, PLAIN, TRAINED, WHOLE
 from harness import HERE, run_child, say, target
 from settings import Settings, make_contenders
 
@@ -31,7 +31,7 @@ def measure_startup(settings: Settings) -> dict[str, Any]:
     made = make_contenders(settings)
     starts = []
     for name, contender in made.contenders.items():
-        if name.startswith(PLAIN) and name != WHOLE:
+        if name.startswith((PLAIN, ONE)) and name != WHOLE:
             continue  # as TRAINED
         for backward in (False, True) if contender.differentiable and name != WHOLE else (False,):
             say(f"cold start: {name}{', backward' if backward else ''}")

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
-from contenders import PLAIN, TRAINED
+from contenders import ONE, PLAIN, TRAINED
 from harness import in_turns, ratio, say, summary, target, threads
 from settings import N, Settings, draw, make_contenders
 from tasks import CannotBeTimedError, Contender, Task, first
@@ -138,7 +138,7 @@ def targets(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     here = [row for row in rows if (row["threads"], row["n"], row["batch"]) == (1, N, 1000)]
     forward, backward = ({row["contender"]: row for row in here if row["mode"] == mode} for mode in (FORWARD, BACKWARD))
     found = []
-    solvers = f"{PLAIN} compiled", f"{TRAINED} compiled"
+    solvers = f"{PLAIN} compiled", f"{ONE} compiled", f"{TRAINED} compiled"
     for name, most in (("refinement compiled", 3.0), *((name, 8.0) for name in solvers)):
         if name in forward:
             what = f"`{name}`, per problem"

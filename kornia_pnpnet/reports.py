@@ -22,7 +22,15 @@ from kornia_pnpnet.runstate import HISTORY_NAME
 from kornia_pnpnet.training import FitReport
 from kornia_pnpnet.types import Problems
 
-__all__ = ["collect_weights", "find_results", "run_results", "summarize_runs", "write_json", "write_model_card"]
+__all__ = [
+    "collect_weights",
+    "find_results",
+    "run_results",
+    "solver_results",
+    "summarize_runs",
+    "write_json",
+    "write_model_card",
+]
 
 RESULTS_NAME = "results.json"
 # Overrides that say how a run was done, not what it found.
@@ -35,7 +43,6 @@ def write_json(path: str | Path, content: Any) -> None:
         file.write(json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
-@torch.no_grad()
 def run_results(
     model: PnPNet,
     validation: Mapping[str, Problems],
@@ -57,6 +64,30 @@ def run_results(
     Returns:
         Plain data, ready for :func:`write_json`.
     """
+    step, damping, robustness = model.refine.hyperparameters(torch.zeros((), dtype=torch.float64))
+    learned = {"step": step.tolist(), "damping": damping.tolist(), "robustness": robustness.tolist()}
+    return {
+        "overrides": overrides,
+        "run": asdict(report),
+        "learned": learned,
+        "config": config,
+        "environment": environment(),
+        "origin": origin,
+        **solver_results(model, validation),
+    }
+
+
+@torch.no_grad()
+def solver_results(model: PnPNet, validation: Mapping[str, Problems]) -> dict[str, Any]:
+    """What of :func:`run_results` is not about the training: the entries ``model``, ``validation``, ``us_per_problem``.
+
+    Args:
+        model: the solver.
+        validation: problems by name.
+
+    Returns:
+        Plain data.
+    """
     sets = {}
     for name, problems in validation.items():
         result = model(problems.world_points, problems.img_points, problems.intrinsics)
@@ -70,19 +101,7 @@ def run_results(
             "first_stage_median_rotation_error_deg": first.rotation_error_deg.median().item(),
             "first_stage_median_translation_error": first.translation_error.median().item(),
         }
-    step, damping, robustness = model.refine.hyperparameters(torch.zeros((), dtype=torch.float64))
-    learned = {"step": step.tolist(), "damping": damping.tolist(), "robustness": robustness.tolist()}
-    return {
-        "overrides": overrides,
-        "run": asdict(report),
-        "us_per_problem": _us_per_problem(model, problems),
-        "validation": sets,
-        "learned": learned,
-        "model": model.config(),
-        "config": config,
-        "environment": environment(),
-        "origin": origin,
-    }
+    return {"model": model.config(), "validation": sets, "us_per_problem": _us_per_problem(model, problems)}
 
 
 def find_results(weights: str | Path) -> dict[str, Any] | None:
@@ -225,13 +244,15 @@ def write_model_card(folder: str | Path, results: Mapping[str, Any], *, name: st
     model, config, learned = results["model"], results["config"], results["learned"]
     n, m = config["model"]["n"], model["refine"]["m"]
     start, scope = ("The paper's network", "Exactly") if model["init"] else ("A start from the identity", "Trained on")
-    views = model.get("views", 1)
+    views = model["views"]
+    trained = config["model"].get("views", 1)
     guesses = f" from {views} guesses for each problem" if views > 1 else ""
+    guesses += f", {trained} in training" if trained != views else ""
     lines = [
         f"# {name or config['name']}",
         "",
-        f"{start} for n = {n} pairs and m = {m} iterations of robust weighted LM{guesses} (Sheffer and",
-        "Wiesel, PnP-Net, 2020). Apache-2.0. Written from `results.json`, which has the full configuration.",
+        f"{start} for n = {n} pairs and m = {m} iterations of robust weighted LM{guesses}",
+        "(Sheffer and Wiesel, PnP-Net, 2020). Apache-2.0. Written from `results.json`, which has the configuration.",
         "",
         "    solver = kornia_pnpnet.PnPNet.from_pretrained(FOLDER)  # this one, or its name when it is shipped",
         "",

@@ -391,15 +391,15 @@ def test_targets_of_throughput():
     rows += [a_time("opencv-ransac", [180.0, 170.0, 162.0]), a_time("poselib", [60.0, 60.0, 60.0])]
     rows += [a_time("poselib", [1.0], threads=2), a_time("opencv-ransac", [1.0], batch=10)]
     rows += [a_time("refinement compiled", [10.0], both), a_time("pypose-parts", [99.0], both)]
-    rows += [a_time("refinement @1576bce", [100.0], both), a_time("pnpnet-n9:m=5 @1576bce", [100.0], both)]
-    rows += [a_time("pnpnet-n9:m=5 compiled", [5.0, 5.0, 5.0])]
+    rows += [a_time("refinement @1576bce", [100.0], both), a_time("net-n9+lm @1576bce", [100.0], both)]
+    rows += [a_time("net-n9+lm compiled", [5.0, 5.0, 5.0])]
     found = {entry["what"]: (entry["measured"], entry["met"]) for entry in modules["throughput"].targets(rows)}
     assert found == {
         "`refinement compiled`, per problem": (3.0, True),
-        "`pnpnet-n9:m=5 compiled`, per problem": (5.0, True),
+        "`net-n9+lm compiled`, per problem": (5.0, True),
         "`pnpnet-n9 compiled`, per problem": (8.5, False),
-        "`pnpnet-n9:m=5 compiled` against `opencv-ransac`, forward": (34.0, True),
-        "`pnpnet-n9:m=5 compiled` against `poselib`, forward": (12.0, True),
+        "`net-n9+lm compiled` against `opencv-ransac`, forward": (34.0, True),
+        "`net-n9+lm compiled` against `poselib`, forward": (12.0, True),
         "`pnpnet-n9 compiled` against `opencv-ransac`, forward": (20.0, True),
         "`pnpnet-n9 compiled` against `poselib`, forward": (pytest.approx(60 / 8.5), False),
         "`refinement compiled` against `pypose-parts`, forward+backward": (pytest.approx(9.9), False),

@@ -163,7 +163,7 @@ def test_compiling_changes_no_weights_and_copies_are_not_compiled(whole):
 
 
 def test_compiling_again_takes_the_place_of_what_was_compiled(backend):
-    solver, eager = create_solver("pnpnet-n9", m=1), create_solver("pnpnet-n9", m=1)
+    solver, eager = (create_solver("pnpnet-n9", m=1, views=1) for _ in range(2))
     inputs = problems(3)[:3]
     for whole, graphs in ((True, 1), (False, 4)):
         solver.compile(whole=whole)

@@ -18,21 +18,30 @@ def rate(solver, problems):
     return success_rate(success(pose_errors(result.pose, problems.pose))).rate
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_success_on_the_protocols_data(dtype):
-    """10 000 problems that nothing else uses: at least 80 % without outliers, 62 % with k uniform."""
-    solver = create_solver("pnpnet-n9")
-    none = SyntheticProblems(n=9, batch_size=10_000, seed=555_001, dtype=dtype).batch(0)
-    uniform = SyntheticProblems(n=9, batch_size=10_000, seed=555_002, outliers=OutlierMix(), dtype=dtype).batch(0)
-    assert rate(solver, none) >= 0.80
-    assert rate(solver, uniform) >= 0.62
-    first_stage = create_solver("net-n9")
-    assert rate(first_stage, none) < rate(solver, none)
+# Success without wrong pairs and with k uniform that each must keep: about two points below what its run found.
+FLOORS = {6: (0.58, 0.45), 9: (0.81, 0.71), 12: (0.90, 0.83), 20: (0.97, 0.94)}
 
 
-def test_sound_problems_are_ok_and_garbage_is_not():
-    solver = create_solver("pnpnet-n9")
-    problems = SyntheticProblems(n=9, batch_size=2000, seed=555_003).batch(0)
+@pytest.mark.parametrize(("n", "dtype"), [(9, torch.float32), *((n, torch.float64) for n in FLOORS)])
+def test_success_on_the_protocols_data(n, dtype):
+    """10 000 problems that nothing else uses."""
+    solver, first_stage = create_solver(f"pnpnet-n{n}"), create_solver(f"net-n{n}")
+    common = {"n": n, "batch_size": 10_000, "dtype": dtype}
+    none = SyntheticProblems(seed=555_001, **common).batch(0)
+    uniform = SyntheticProblems(seed=555_002, outliers=OutlierMix(), **common).batch(0)
+    assert rate(solver, none) >= FLOORS[n][0]
+    assert rate(solver, uniform) >= FLOORS[n][1]
+    assert rate(first_stage, none) < rate(solver, none) / 2
+
+
+def test_these_are_shipped():
+    assert set(shipped_weights()) == {f"pnpnet-n{n}" for n in FLOORS}
+
+
+@pytest.mark.parametrize("n", FLOORS)
+def test_sound_problems_are_ok_and_garbage_is_not(n):
+    solver = create_solver(f"pnpnet-n{n}")
+    problems = SyntheticProblems(n=n, batch_size=2000, seed=555_003).batch(0)
     with torch.no_grad():
         ok = solver(problems.world_points, problems.img_points, problems.intrinsics).ok
         shuffled = problems.img_points.roll(1, 0)  # every pixel belongs to another problem
@@ -57,12 +66,11 @@ def test_model_card_is_generated_from_the_run(name, tmp_path):
     results = json.loads((folder / "results.json").read_text())
     write_model_card(tmp_path, results, name=name)
     assert (tmp_path / "README.md").read_text() == (folder / "README.md").read_text()
-    model = {"views": 1, **results["model"]}  # the results of pnpnet-n9 are older than views
-    assert PnPNet.from_config(model).config() == PnPNet.from_pretrained(name).config()
+    assert PnPNet.from_config(results["model"]).config() == PnPNet.from_pretrained(name).config()
     updates, run = 0, results
     while run:
         updates, run = updates + run["run"]["update"], run.get("origin")
-    assert updates >= 50_000
+    assert updates >= 200_000
     assert sum(path.stat().st_size for path in folder.iterdir()) < 2_000_000
 
 

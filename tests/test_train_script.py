@@ -60,7 +60,7 @@ def test_protocol_is_the_papers():
         1e-4,
         1000,
         9,
-        5,
+        10,
     )
     assert settings.lr_factor(100_000) == 1.0
     assert instantiate(config.data.train).outliers.max_count(9) == 3

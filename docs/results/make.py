@@ -4,9 +4,10 @@
 problems; with them they are in ``outputs/results``, from where a run that was stopped continues. It needs the scenes
 (``--scenes``, default ``../shared/data``). ``compare`` (two folders of ``train.py`` with ``--runs``) writes
 ``distribution.json`` in the same way, and ``ship`` (with ``--runs`` the folders of one solver's runs, one after the
-other) puts its weights into the package. ``render`` reads the files and writes ``README.md`` and the pictures; every
-number of the page comes from the files. ``ablation.csv`` and ``sweep.csv`` are copies of ``summary.csv`` in the folders
-of these, which take less than an hour on one core and go on where they were stopped::
+other) puts its weights into the package, with ``--views`` guesses for each problem. ``render`` reads the files and
+writes ``README.md`` and the pictures; every number of the page comes from the files. ``ablation.csv`` and ``sweep.csv``
+are copies of ``summary.csv`` in the folders of these, which take less than an hour on one core and go on where they
+were stopped::
 
     SHORT="train.updates=4000 validation_size=5000 threads=1 hydra.sweep.dir=outputs/ablation resume=true"
     python train.py -m experiment=recipe $SHORT
@@ -26,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from hydra.utils import instantiate
 from torch import nn
 
 from kornia_pnpnet import PnPNet, RobustWeightedLM
@@ -35,7 +37,7 @@ from kornia_pnpnet.evaluation import EvaluationData, evaluate
 from kornia_pnpnet.figures import paper_figures, plot_sweep, plot_training
 from kornia_pnpnet.figures.sweep import mix_in_words
 from kornia_pnpnet.model import WEIGHTS_FOLDER, shipped_weights
-from kornia_pnpnet.reports import collect_weights, write_json
+from kornia_pnpnet.reports import RESULTS_NAME, collect_weights, solver_results, write_json, write_model_card
 from kornia_pnpnet.results import format_table, load_results, save_results
 from kornia_pnpnet.types import PnPResult, Problems
 
@@ -69,7 +71,7 @@ TUNED: dict[str, tuple[str, dict[str, Sequence[float]]]] = {
 PEERS = ("opencv-ransac", "opencv-ransac-sqpnp", "opencv-usac", "poselib", "pycolmap")
 ROBUST = ("p3p-ransac", "p3p-ransac-noise", *PEERS)
 BOUNDS = ("known-inliers", "known-inliers-and-noise")
-VIEWS = (1, 2, 4, 8)
+VIEWS = (1, 2, 3, 4, 8)
 
 
 # -- measuring -------------------------------------------------------------------------------------------------------
@@ -372,12 +374,12 @@ longer along the optical axis than across, which no façade is: what the network
 
 ## More guesses for each problem, and a perfect one
 
-With `views=4` the network guesses from four mirror images of each problem, seven tenths of the iterations refine all
-four, and the best goes on: most of what `{ours}` loses on scenes with wrong pairs, it loses to a first guess that is
-too far off. On the protocol's data that is a smaller part. `{ours} from the truth` starts its few iterations at the
-true pose and has not gone far; `alpha = ... from the truth` are 30 classical iterations from there, which is where the
-minima are: wrong pairs and noise move them. No first guess gets past the best of them, and RANSAC (first table) is
-about there; beyond it are weights by more than the residual.
+The network guesses from `views` mirror images of each problem ({shipped_views} as `{ours}` is shipped), seven tenths of
+the iterations refine all of them, and the best goes on: most of what it loses on scenes with wrong pairs, it loses to a
+first guess that is too far off. On the protocol's data that is a smaller part. `{ours} from the truth` starts its
+few iterations at the true pose and has not gone far; `alpha = ... from the truth` are 30 classical iterations from
+there, which is where the minima are: wrong pairs and noise move them. No first guess gets past the best of them, and
+RANSAC (first table) is about there; beyond it are weights by more than the residual.
 
 {views}
 
@@ -616,6 +618,7 @@ def page(
         real_peers=beside_peers(rates["real"], ("p3p-ransac", "reppnp", OURS)),
         crowd=rates["crowd"].table(),
         against_n="\n\n".join(rates["against_n"].table(rates["against_n"].sets[i::2]) for i in (0, 1)),
+        shipped_views=PnPNet.from_pretrained(OURS).views,
         views="\n\n".join(
             rates["views"].table(sets, times=False) for sets in (rates["views"].sets[:5], rates["views"].sets[5:])
         ),
@@ -656,10 +659,24 @@ def compare(scenes: Path, count: int, runs: Sequence[Path]) -> None:
     run("distribution", solvers, sets, updates=updates)
 
 
-def ship(runs: Sequence[Path]) -> None:
+def ship(runs: Sequence[Path], views: int) -> None:
     """Put the weights of the last run into the package, with the curves of all."""
-    n = json.loads((runs[-1] / "results.json").read_text())["config"]["model"]["n"]
-    collect_weights(runs, WEIGHTS_FOLDER / f"pnpnet-n{n}")
+    n = json.loads((runs[-1] / RESULTS_NAME).read_text())["config"]["model"]["n"]
+    folder = WEIGHTS_FOLDER / f"pnpnet-n{n}"
+    collect_weights(runs, folder)
+    set_views(folder, views)
+
+
+def set_views(folder: Path, views: int) -> None:
+    """Give shipped weights so many guesses for each problem, and validate them again."""
+    trained = PnPNet.from_pretrained(folder)
+    solver = PnPNet(trained.init, trained.refine, trained.normalize, views=views)
+    results = json.loads((folder / RESULTS_NAME).read_text())
+    sources = results["config"]["data"]["validation"]
+    results |= solver_results(solver, {name: instantiate(source).batch(0) for name, source in sources.items()})
+    solver.save_pretrained(folder)
+    write_json(folder / RESULTS_NAME, results)
+    write_model_card(folder, results, name=folder.name)
 
 
 def main() -> None:
@@ -678,13 +695,14 @@ def main() -> None:
         nargs="+",
         help="for compare: folders of two runs, `mixed` and `paper`; for ship: one or more",
     )
+    parser.add_argument("--views", type=int, default=3, help="for ship: guesses for each problem")
     arguments = parser.parse_args()
     if arguments.step == "measure":
         measure(arguments.scenes, arguments.synthetic_count, arguments.real_count, arguments.only)
     elif arguments.step == "compare":
         compare(arguments.scenes, arguments.real_count, arguments.runs)
     elif arguments.step == "ship":
-        ship(arguments.runs)
+        ship(arguments.runs, arguments.views)
     else:
         render()
 
