@@ -15,7 +15,7 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix, rotation_
 from kornia.geometry.liegroup import So3
 from torch import Tensor
 
-from kornia_pnpnet.types import Correspondences, Pose
+from kornia_pnpnet.types import Correspondences, Noise, Pose
 
 __all__ = [
     "MIN_DEPTH_RATIO",
@@ -24,6 +24,7 @@ __all__ = [
     "additive_tangent_map",
     "change_tangent",
     "move",
+    "pixel_variance",
     "normal_equations",
     "problems_last",
     "project",
@@ -132,6 +133,35 @@ def project(pose: Pose, corr: Correspondences) -> Projection:
     scaled = torch.addcmul(corr.focal * x, u, z, value=-1), torch.addcmul(corr.focal * y, v, z, value=-1)
     residual = scaled[0] * inv_depth, scaled[1] * inv_depth
     return Projection(residual, in_front, (y0, y1, y2), (x * inv_depth, y * inv_depth), inv_depth, scaled)
+
+
+def pixel_variance(projection: Projection, noise: Noise, focal: Tensor) -> Tensor:
+    r"""Variance of a pixel coordinate that noise of the pixel and of the world point make together.
+
+    A move of the point by :math:`d` moves its pixel by :math:`J d` with :math:`J = \tfrac fz [I_2 \mid -(p, q)^\top]`,
+    :math:`p = x/z`, :math:`q = y/z`. The mean over both coordinates is returned:
+    :math:`\sigma_\mathrm{img}^2 + \sigma_\mathrm{world}^2 \, \mathrm{tr}(J J^\top) / 2`, where the trace is
+    :math:`(f/z)^2 (2 + p^2 + q^2)`.
+
+    Args:
+        projection: what :func:`project` returned.
+        noise: standard deviations, :math:`(B, N)`.
+        focal: the focal length in pixels, a scalar.
+
+    Returns:
+        Shape :math:`(B, N)`. Behind the camera it is that of the pixel alone.
+
+    Example:
+        >>> points = torch.tensor([[[0.0, 0.0, 4.0]]])
+        >>> corr = Correspondences(points, torch.zeros(1, 1, 2), torch.ones(1, 1), torch.tensor(100.0))
+        >>> projection = project(Pose(torch.eye(3)[None], torch.zeros(1, 3)), corr)
+        >>> pixel_variance(projection, Noise(torch.tensor([[3.0]]), torch.tensor([[0.04]])), corr.focal)
+        tensor([[10.]])
+    """
+    p, q = projection.plane_points
+    moved = focal * noise.world * projection.inv_depth
+    sides = torch.addcmul(torch.addcmul(torch.ones_like(p), p, p, value=0.5), q, q, value=0.5)
+    return torch.addcmul(noise.img * noise.img, moved * moved, sides)
 
 
 def normal_equations(projection: Projection, weights: Tensor) -> NormalEquations:

@@ -25,13 +25,14 @@ from kornia_pnpnet.geometry import (
     change_tangent,
     move,
     normal_equations,
+    pixel_variance,
     problems_last,
     project,
     retract_additive,
 )
 from kornia_pnpnet.robust import KERNELS, RobustKernel
 from kornia_pnpnet.small import factorise, relative, substitute
-from kornia_pnpnet.types import Correspondences, Guess, Pose, Refinement
+from kornia_pnpnet.types import Correspondences, Guess, Noise, Pose, Refinement
 
 __all__ = [
     "BACKWARDS",
@@ -181,9 +182,12 @@ def _relative(weights: Tensor, projection: Projection) -> Tensor:
 def _weighted(
     corr: Correspondences, pose: Pose, shape: Tensor, kernel_weight: Callable[[Tensor, Tensor], Tensor]
 ) -> tuple[Projection, Tensor]:
-    """The projection, and the weights of the pairs by their residuals there."""
+    """The projection, and the weights of the pairs by their residuals there and by their noise."""
     projection = project(pose, corr)
-    return projection, corr.weights * kernel_weight(projection.sq_residual, shape)
+    if corr.noise is None:
+        return projection, corr.weights * kernel_weight(projection.sq_residual, shape)
+    precision = pixel_variance(projection, corr.noise, corr.focal).reciprocal()
+    return projection, corr.weights * precision * kernel_weight(projection.sq_residual * precision, shape)
 
 
 def _iterate(
@@ -241,6 +245,11 @@ class RobustWeightedLM(nn.Module):
     came with the correspondences, times the initialiser's, and takes one :func:`lm_step`. Step :math:`\gamma`,
     damping :math:`\lambda` and robustness (the shape of the kernel, :math:`\alpha` for ``power``) are learned, by
     default one set per iteration; at their initial values this is the classical method.
+
+    Where a guess says how large the noise of each pair is, residuals count in standard deviations: a pair weighs
+    :math:`1 / \sigma^2` times the robust weight of :math:`\|r\|^2 / \sigma^2`, with the
+    :func:`~kornia_pnpnet.geometry.pixel_variance` :math:`\sigma^2` at the previous estimate, and scales of kernels and
+    the cost count in standard deviations too.
 
     Where a guess has other poses, all of them are refined by the first seven tenths of the iterations, rounded down.
     Then, per problem, the one of the lowest cost by the kernel of the last of these goes on alone.
@@ -360,6 +369,8 @@ class RobustWeightedLM(nn.Module):
         """Mean robust loss over the pairs that are there, shape (B,)."""
         most = (_MAX_RESIDUAL * corr.focal).square()
         sq_residual = torch.where(projection.in_front, projection.sq_residual.minimum(most), most)  # (B, N)
+        if corr.noise is not None:
+            sq_residual = sq_residual / pixel_variance(projection, corr.noise, corr.focal)
         count = (corr.weights > 0).sum(-1).clamp(min=1)
         return (prior * self.kernel.loss(sq_residual, shape)).sum(-1) / count
 
@@ -382,7 +393,8 @@ class RobustWeightedLM(nn.Module):
         pose = Pose(*(x.movedim(0, -1).contiguous().movedim(-1, 0) for x in poses))
         prior = corr.weights * guess.weights.mT.contiguous().mT
         # The steps do not depend on a common factor of the weights; tiny ones must not vanish when multiplied.
-        pairs = Correspondences(*corr[:2], relative(prior, prior), corr.focal)
+        noise = None if guess.noise is None else Noise(*(x.mT.contiguous().mT for x in guess.noise))
+        pairs = Correspondences(*corr[:2], relative(prior, prior), corr.focal, noise=noise)
         starts = None if guess.others is None else _repeated(pairs, 1 + guess.others.rotation.shape[1])
         return LMStart(corr, prior, pairs, pose, step, damping, shape, starts)
 
@@ -453,11 +465,17 @@ class RobustWeightedLM(nn.Module):
         Returns:
             See :meth:`forward`.
         """
-        projection, shape = project(end.pose, start.corr), start.shape[-1]
-        weights = start.prior * self.kernel.weight(projection.sq_residual, shape)
+        corr = start.corr._replace(noise=start.pairs.noise)
+        projection, shape = project(end.pose, corr), start.shape[-1]
+        sq_residual = projection.sq_residual
+        if corr.noise is not None:
+            sq_residual = sq_residual / pixel_variance(projection, corr.noise, corr.focal)
+        weights = start.prior * self.kernel.weight(sq_residual, shape)
         weights = torch.where(projection.in_front, weights, 0.0)
-        cost = self._cost(projection, start.corr, start.prior, shape)
-        return Refinement(end.pose, weights, cost, end.solved & explains(projection, start.corr, start.prior))
+        cost = self._cost(projection, corr, start.prior, shape)
+        # With the noise known what explains the pixels is a question of evidence, which the solver answers.
+        seen = explains(projection, corr, start.prior) if corr.noise is None else _enough(projection, start.prior)
+        return Refinement(end.pose, weights, cost, end.solved & seen)
 
     def forward(self, corr: Correspondences, guess: Guess, *, m: int | None = None) -> Refinement:
         r"""Refine a guess.
@@ -500,7 +518,7 @@ class RobustWeightedLM(nn.Module):
             projection, weights = _weighted(corr, at, shape, self.kernel.weight)
             return normal_equations(projection, _relative(weights, projection))
 
-        fixed = Correspondences(*(x.detach() for x in start.pairs[:4]))
+        fixed = start.pairs.map(torch.Tensor.detach)
         zero = [torch.zeros_like(start.prior[:, 0]).requires_grad_() for _ in range(6)]
         with torch.enable_grad():
             around, gradient = equations(fixed, move(pose, zero), shape.detach())
@@ -518,9 +536,9 @@ class RobustWeightedLM(nn.Module):
 def _repeated(pairs: Correspondences, count: int) -> Correspondences:
     """The pairs of all problems several times over, problems last in memory."""
     world_points, img_points = (x.permute(2, 1, 0).repeat(1, 1, count).permute(2, 1, 0) for x in pairs[:2])
-    return pairs._replace(
-        world_points=world_points, img_points=img_points, weights=pairs.weights.mT.repeat(1, count).mT
-    )
+    weights = pairs.weights.mT.repeat(1, count).mT
+    noise = None if pairs.noise is None else Noise(*(x.mT.repeat(1, count).mT for x in pairs.noise))
+    return pairs._replace(world_points=world_points, img_points=img_points, weights=weights, noise=noise)
 
 
 def _chosen(first: Tensor, a: Iterable[Tensor], b: Iterable[Tensor]) -> Iterator[Tensor]:
@@ -554,4 +572,9 @@ def explains(projection: Projection, corr: Correspondences, prior: Tensor) -> Te
     limit = _EXPLAINED_RESIDUAL**2 * ascending.gather(-1, position.clamp(max=ascending.shape[-1] - 1))
     explained = projection.in_front & (projection.sq_residual.detach() <= limit)
     enough = torch.where(explained, share, 0.0).sum(-1) >= _EXPLAINED_SHARE
-    return enough & ((projection.in_front & (prior > 0)).sum(-1) >= 3)
+    return enough & _enough(projection, prior)
+
+
+def _enough(projection: Projection, prior: Tensor) -> Tensor:
+    """Whether three pairs or more are in front of the camera, bool (B,)."""
+    return (projection.in_front & (prior > 0)).sum(-1) >= 3

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from kornia_pnpnet.types import PnPResult, Pose, Problems
+from kornia_pnpnet.geometry import transform
+from kornia_pnpnet.types import Noise, PnPResult, Pose, Problems
 
-__all__ = ["LossTerms", "PoseLoss", "pose_distances"]
+__all__ = ["LossTerms", "PoseLoss", "SetLoss", "pose_distances"]
+
+# Probabilities this close to 0 and 1 are no surer: a pair that is wrong about them costs no more than it teaches.
+_LEAST_CHANCE = 1e-3
+# Squared residuals beyond this many variances are no noise.
+_MOST_VARIANCES = 20.0
 
 
 class LossTerms(NamedTuple):
-    """The loss and the four mean distances that it weighs, each a scalar.
+    """The loss and what it weighs, each a scalar and a mean over the batch.
 
     Attributes:
         total: the weighted sum, saturated per problem.
@@ -21,6 +28,8 @@ class LossTerms(NamedTuple):
         init_translation: translation distance of the first guess at the centroid of the points.
         refined_rotation: chordal rotation distance after refinement.
         refined_translation: translation distance after refinement.
+        weights: cross entropy of the weights as probabilities of being right; 0 where no loss looks at it.
+        noise: likelihood of the right pairs under the estimated noise; likewise.
     """
 
     total: Tensor
@@ -28,6 +37,8 @@ class LossTerms(NamedTuple):
     init_translation: Tensor
     refined_rotation: Tensor
     refined_translation: Tensor
+    weights: Tensor
+    noise: Tensor
 
 
 def pose_distances(estimate: Pose, truth: Pose) -> tuple[Tensor, Tensor]:
@@ -129,5 +140,111 @@ class PoseLoss(nn.Module):
         if self.saturation is not None:
             refined = refined / (1.0 + refined / self.saturation)
         total = init + ramp * self.refined * refined
-        terms = (total, init_rotation, init_translation, rotation, translation)
+        none = torch.zeros_like(total)
+        terms = (total, init_rotation, init_translation, rotation, translation, none, none)
         return LossTerms(*(term.mean() for term in terms))
+
+
+class SetLoss(nn.Module):
+    r"""What a set network learns from: the pose before and after the refinement, right and wrong pairs, and noise.
+
+    Nothing in it has a unit: translations are compared at the centroid of the points, as a share of its distance.
+
+    - Of the hypotheses of a first guess the best one counts, and a little all of them, so that they may differ.
+    - After the refinement, both errors in units of what counts as success, saturated as in :class:`PoseLoss`.
+    - Binary cross entropy of the weights: of the network's alone, then of those after the refinement.
+    - The negative log-likelihood of the right pairs' residuals at the true pose under the estimated noise.
+
+    Args:
+        every: weight of the mean over the hypotheses against the best of them.
+        refined: weight of the terms after the refinement, before the ramp.
+        saturation: of these, in units of success.
+        weights: weight of the cross entropy.
+        noise: weight of the likelihood.
+        rotation_unit: what counts as success, in degrees.
+        translation_unit: likewise, as a share of the distance.
+    """
+
+    def __init__(
+        self,
+        *,
+        every: float = 0.15,
+        refined: float = 1.0,
+        saturation: float = 2.0,
+        weights: float = 0.5,
+        noise: float = 0.02,
+        rotation_unit: float = 1.0,
+        translation_unit: float = 0.005,
+    ) -> None:
+        super().__init__()
+        self.every = every
+        self.refined = refined
+        self.saturation = saturation
+        self.weights = weights
+        self.noise = noise
+        self.rotation_unit = 2.0**0.5 * math.radians(rotation_unit)  # as a chordal distance
+        self.translation_unit = translation_unit
+
+    def forward(self, result: PnPResult, problems: Problems, ramp: float = 1.0) -> LossTerms:
+        """Compare a solver's result with the truth.
+
+        Args:
+            result: of a solver in training mode.
+            problems: what was solved, with the true poses.
+            ramp: factor of the refined terms, 0 at the start of the training. Then no gradient goes through them.
+
+        Returns:
+            The loss and its terms, means over the batch.
+        """
+        guess = result.guess
+        assert guess is not None
+        hypotheses = [x[:, None] for x in guess.pose]
+        if guess.others is not None:
+            hypotheses = [torch.cat(x, 1) for x in zip(hypotheses, guess.others, strict=True)]
+        starts = hypotheses[0].shape[1]
+        centre = problems.world_points.mean(1)
+        away = (problems.pose.rotation @ centre[..., None])[..., 0] + problems.pose.translation
+        distance = away.norm(dim=-1)
+
+        truth = Pose(*(x.repeat_interleave(starts, 0) for x in problems.pose))
+        flat = Pose(*(x.flatten(0, 1) for x in hypotheses))
+        lengths = _lengths(_at(centre.repeat_interleave(starts, 0), _difference(flat, truth)))
+        rotations, translations = (x.view(-1, starts) for x in lengths)
+        translations = translations / distance[:, None]
+        each = rotations + translations
+        best = each.argmin(1, keepdim=True)
+        first = (1.0 - self.every) * each.gather(1, best)[:, 0] + self.every * each.mean(1)
+
+        with torch.set_grad_enabled(torch.is_grad_enabled() and ramp > 0.0):
+            rotation, translation = _lengths(_at(centre, _difference(result.pose, problems.pose)))
+            translation = translation / distance
+            refined = rotation / self.rotation_unit + translation / self.translation_unit
+            refined = refined / (1.0 + refined / self.saturation)
+            # What cannot be refined at all says nothing about its weights.
+            after = torch.where(result.ok, _cross_entropy(result.weights, problems.inliers), 0.0)
+        entropy = (1.0 - 0.5 * min(ramp, 1.0)) * _cross_entropy(guess.weights, problems.inliers) + 0.5 * ramp * after
+        likelihood = torch.zeros_like(first) if guess.noise is None else _surprise(guess.noise, problems)
+        total = first + ramp * self.refined * refined + self.weights * entropy + self.noise * likelihood
+        init = (x.gather(1, best)[:, 0] for x in (rotations, translations))
+        terms = (total, *init, rotation, translation, entropy, likelihood)
+        return LossTerms(*(term.mean() for term in terms))
+
+
+def _cross_entropy(weights: Tensor, inliers: Tensor) -> Tensor:
+    """Mean binary cross entropy of each problem, (B,)."""
+    right = torch.where(inliers, weights, 1.0 - weights)
+    return -right.clamp(min=_LEAST_CHANCE).log().mean(-1)
+
+
+def _surprise(noise: Noise, problems: Problems) -> Tensor:
+    """Negative log-likelihood of the right pairs' residuals at the true pose, up to a constant, mean of each, (B,)."""
+    cam = transform(problems.pose, problems.world_points)
+    z = torch.where(problems.inliers, cam[..., 2], 1.0)
+    focal = problems.intrinsics.diagonal(dim1=1, dim2=2)[:, None, :2]
+    centre = problems.intrinsics[:, None, :2, 2]
+    plane = cam[..., :2] / z[..., None]
+    sq_residual = (focal * plane + centre - problems.img_points).square().sum(-1)
+    moved = focal.mean(-1) * noise.world / z
+    variance = noise.img.square() + moved.square() * (1.0 + 0.5 * plane.square().sum(-1))
+    surprise = variance.log() + 0.5 * (sq_residual / variance).clamp(max=_MOST_VARIANCES)
+    return torch.where(problems.inliers, surprise, 0.0).sum(-1) / problems.inliers.sum(-1).clamp(min=1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,16 +15,28 @@ from torch import Tensor, nn
 
 from kornia_pnpnet.compilation import Compiled
 from kornia_pnpnet.files import atomic_open
-from kornia_pnpnet.init import EPnP, MLPInit, REPPnP
+from kornia_pnpnet.geometry import project
+from kornia_pnpnet.init import EPnP, MLPInit, REPPnP, SetInit
+from kornia_pnpnet.init.sampling import log_false_alarms
+from kornia_pnpnet.init.scoring import Thresholds, chance_of_inlier, judge
 from kornia_pnpnet.lm import LMStart, LMStep, RobustWeightedLM
 from kornia_pnpnet.normalize import VIEWS, Frame, Normalize
-from kornia_pnpnet.types import Guess, PnPResult, Pose
+from kornia_pnpnet.types import Correspondences, Guess, Noise, PnPResult, Pose, Refinement
 
 __all__ = ["PnPNet", "find_weights", "shipped_weights"]
 
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 CONFIG_NAME, WEIGHTS_NAME = "config.json", "model.safetensors"
-_INITIALISERS: dict[str, type[nn.Module]] = {"EPnP": EPnP, "MLPInit": MLPInit, "REPPnP": REPPnP}
+_INITIALISERS: dict[str, type[nn.Module]] = {
+    "EPnP": EPnP,
+    "MLPInit": MLPInit,
+    "REPPnP": REPPnP,
+    "SetInit": SetInit,
+}
+# Pixels are never known better than to this share of the focal length: weights stay finite.
+_LEAST_NOISE = 1e-6
+# Pairs that are this many standard deviations off are no evidence for a pose; and how often chance may look like one.
+_EVIDENT, _MAX_FALSE_ALARMS = 3.5, 0.01
 
 
 def shipped_weights() -> list[str]:
@@ -150,6 +163,8 @@ class PnPNet(nn.Module):
         mask: Tensor | None = None,
         init: Pose | None = None,
         *,
+        img_sigma: Tensor | float | None = None,
+        world_sigma: Tensor | float | None = None,
         first_stage_only: bool = False,
     ) -> PnPResult:
         r"""Solve a batch of problems.
@@ -161,7 +176,11 @@ class PnPNet(nn.Module):
             weights: how much each pair counts, at least 0, shape :math:`(B, N)`; 1 when ``None``.
             mask: False where a pair is padding, bool, shape :math:`(B, N)`. What padding holds does not matter.
             init: world-to-camera pose to start from instead of the initialiser's, :math:`(B, 3, 3)` and
-                :math:`(B, 3)`.
+                :math:`(B, 3)`. Where the initialiser weighs pairs, it still does.
+            img_sigma: standard deviation of the noise on each pixel coordinate, a number, :math:`(B,)` or
+                :math:`(B, N)`, at least 0; NaN where it is not known. With this or ``world_sigma`` the refinement
+                counts residuals in standard deviations, and so do the scales of its kernel.
+            world_sigma: likewise on each world coordinate, in the unit of ``world_points``.
             first_stage_only: return the first guess unrefined, the paper's "Net"; as with ``m=0``, at that cost.
 
         Returns:
@@ -176,10 +195,14 @@ class PnPNet(nn.Module):
             DeviceError: for tensors on different devices.
         """
         check_inputs(world_points, img_points, intrinsics, weights, mask, init)
+        noise = None
+        if img_sigma is not None or world_sigma is not None:
+            sigmas = ("img_sigma", img_sigma), ("world_sigma", world_sigma)
+            noise = Noise(*(_sigmas(name, sigma, world_points) for name, sigma in sigmas))
         if intrinsics.ndim == 2:
             intrinsics = intrinsics.expand(world_points.shape[0], 3, 3)
         with torch.autocast(world_points.device.type, enabled=False):
-            return self._solve(first_stage_only, world_points, img_points, intrinsics, weights, mask, init)
+            return self._solve(first_stage_only, world_points, img_points, intrinsics, weights, mask, init, noise)
 
     def _in_parts(self, first_stage_only: bool, *inputs: Any) -> PnPResult:
         """What is before the iterations, they themselves, and what is after them; inputs as of :meth:`_guess`."""
@@ -217,11 +240,17 @@ class PnPNet(nn.Module):
         weights: Tensor | None,
         mask: Tensor | None,
         init: Pose | None,
+        noise: Noise | None,
     ) -> _Stage:
         """Everything before the first iteration."""
         corr, frame = self.normalize(world_points, img_points, intrinsics, weights, mask)
-        if init is not None or self.init is None:
+        if noise is not None:
+            corr, frame = self._with_noise(corr, frame, noise)
+        if self.init is None or (init is not None and not isinstance(self.init, SetInit)):
             guess = self._given(init, corr.weights, world_points, frame)
+        elif init is not None:
+            given = self._given(init, corr.weights, world_points, frame).pose
+            guess = self.init(corr)._replace(pose=given, others=None)
         elif views == 1:
             guess = self.init(corr)
         else:
@@ -229,11 +258,26 @@ class PnPNet(nn.Module):
             pose, others = self.normalize.undo_views(guess.pose, views)
             batch = world_points.shape[0]  # of the first view, whose pairs have the order that they came in
             guess = Guess(pose, guess.weights[:batch], None if guess.ok is None else guess.ok[:batch], others)
-        return _Stage(self.refine.begin(corr, guess), frame, guess._replace(others=None))
+        if guess.noise is None and corr.noise is not None:  # what is not known does not count
+            guess = guess._replace(noise=Noise(*(x.nan_to_num(0.0) for x in corr.noise)))
+        if guess.noise is not None:
+            least = _LEAST_NOISE * corr.focal
+            guess = guess._replace(noise=guess.noise._replace(img=guess.noise.img.maximum(least)))
+        return _Stage(self.refine.begin(corr, guess), frame, guess)
+
+    def _with_noise(self, corr: Correspondences, frame: Frame, noise: Noise) -> tuple[Correspondences, Frame]:
+        """Noise in the units and the order of the correspondences; where it makes no sense, no problem is valid."""
+        usable = torch.stack([((x >= 0) | x.isnan()).all(-1) & ~x.isinf().any(-1) for x in noise]).all(0)
+        scales = corr.img_scale, corr.world_scale
+        parts = [x if scale is None else x * scale[:, None] for x, scale in zip(noise, scales, strict=True)]
+        if self.normalize.order:
+            parts = [x.gather(1, frame.order) for x in parts]
+        return corr._replace(noise=Noise(*parts)), frame._replace(valid=frame.valid & usable)
 
     def _result(self, stage: _Stage, end: LMStep) -> PnPResult:
         """Everything after the last iteration."""
         start, frame, guess = stage
+        training = self.training and isinstance(self.init, SetInit)
         refined = self.refine.finish(start, end)
         pose = self.normalize.undo(refined.pose, frame)
         first = self.normalize.undo(guess.pose, frame)
@@ -241,6 +285,8 @@ class PnPNet(nn.Module):
         # was multiplied by a coordinate of the centroid.
         finite = frame.valid & (pose.translation.sum(-1) + refined.weights.sum(-1) + refined.cost).isfinite()
         ok = finite & refined.ok if guess.ok is None else finite & refined.ok & guess.ok
+        if start.pairs.noise is not None:
+            ok = ok & _is_no_chance(start, refined)
         first_ok = frame.valid & first.translation.sum(-1).isfinite()
         pair_weights = refined.weights
         if self.normalize.order:
@@ -251,7 +297,25 @@ class PnPNet(nn.Module):
             _gate(refined.cost, ok, finite, torch.finfo(refined.cost.dtype).max ** 0.5),
             ok,
             _gate_pose(first, first_ok, first_ok),
+            self._whole_guess(start, guess, first, frame) if training else None,
         )
+
+    def _whole_guess(self, start: LMStart, guess: Guess, first: Pose, frame: Frame) -> Guess:
+        """A first guess in the frame, the order and the units of the inputs."""
+        others = guess.others
+        if others is not None:
+            count = others.rotation.shape[1]
+            many = Frame(*(x.repeat_interleave(count, 0) for x in frame))
+            flat = self.normalize.undo(Pose(*(x.flatten(0, 1) for x in others)), many)
+            others = Pose(*(x.unflatten(0, (-1, count)) for x in flat))
+        weights = guess.weights
+        if self.normalize.order:
+            weights = torch.zeros_like(weights).scatter(1, frame.order, weights)
+        noise = guess.noise
+        if noise is not None:
+            scales = start.corr.img_scale, start.corr.world_scale
+            noise = Noise(*(x if s is None else x / s[:, None] for x, s in zip(noise, scales, strict=True)))
+        return Guess(first, weights, frame.valid, others, noise)
 
     def _given(self, init: Pose | None, weights: Tensor, world_points: Tensor, frame: Frame) -> Guess:
         """Bring a pose given by hand (or the identity) to the normalised frame."""
@@ -387,3 +451,34 @@ def _gate_pose(pose: Pose, ok: Tensor, finite: Tensor) -> Pose:
     """:func:`_gate` for a pose; the identity fills."""
     eye = torch.eye(3, dtype=pose.rotation.dtype, device=pose.rotation.device)
     return Pose(_gate(pose.rotation, ok, finite, eye), _gate(pose.translation, ok, finite, 0.0))
+
+
+def _sigmas(name: str, sigma: Tensor | float | None, like: Tensor) -> Tensor:
+    """Standard deviations of each pair, (B, N), NaN where they are not known, like the (B, N, 3) world points."""
+    batch, count = like.shape[:2]
+    if sigma is None or isinstance(sigma, int | float):
+        return like.new_full((batch, count), torch.nan if sigma is None else sigma)
+    if not isinstance(sigma, Tensor):
+        raise TypeCheckError(f"{name} must be a number or a tensor, got {type(sigma).__name__}.")
+    if sigma.dtype != like.dtype:
+        raise TypeCheckError(f"{name} is {sigma.dtype} but world_points is {like.dtype}.")
+    if sigma.device != like.device:
+        raise DeviceError(f"{name} is on {sigma.device} but world_points is on {like.device}.")
+    if sigma.shape not in ((), (batch,), (batch, count)):
+        raise ShapeError(
+            f"{name} must be a number or have the shape {(batch,)} or {(batch, count)}, got {tuple(sigma.shape)}.",
+            actual_shape=tuple(sigma.shape),
+            expected_shape=["B", "N"],
+        )
+    return (sigma[:, None] if sigma.ndim == 1 else sigma).expand(batch, count)
+
+
+def _is_no_chance(start: LMStart, refined: Refinement) -> Tensor:
+    """Whether pairs without a pose would hardly fit any so well and so often, bool (B,). It needs to know the noise."""
+    pose, fixed = Pose(*(x.detach() for x in refined.pose)), start.pairs.map(torch.Tensor.detach)
+    assert fixed.noise is not None
+    thresholds = Thresholds(*(_EVIDENT * x for x in fixed.noise))
+    judged = judge(project(pose, fixed), fixed, thresholds)
+    inliers, counts = (judged.weights > 0).sum(-1), (fixed.weights > 0).sum(-1)
+    chance = chance_of_inlier(fixed, thresholds, judged)
+    return log_false_alarms(counts, inliers, counts, chance) < math.log(_MAX_FALSE_ALARMS)

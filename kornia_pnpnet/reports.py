@@ -90,7 +90,7 @@ def solver_results(model: PnPNet, validation: Mapping[str, Problems]) -> dict[st
     """
     sets = {}
     for name, problems in validation.items():
-        result = model(problems.world_points, problems.img_points, problems.intrinsics)
+        result = model(*problems[:3], **problems.told)
         errors = pose_errors(result.pose, problems.pose)
         first = pose_errors(result.init, problems.pose)
         sets[name] = {

@@ -29,7 +29,7 @@ from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.data.stream import ProblemSource, stream_batches
 from kornia_pnpnet.init import MLPInit
 from kornia_pnpnet.lm import RobustWeightedLM
-from kornia_pnpnet.losses import LossTerms, PoseLoss
+from kornia_pnpnet.losses import LossTerms, PoseLoss, SetLoss
 from kornia_pnpnet.metrics import pose_errors, success, success_rate
 from kornia_pnpnet.model import PnPNet
 from kornia_pnpnet.runstate import (
@@ -156,7 +156,7 @@ def validate(model: nn.Module, validation: Mapping[str, Problems]) -> dict[str, 
     """
     report = {}
     for name, problems in validation.items():
-        result = model(problems.world_points, problems.img_points, problems.intrinsics)
+        result = model(*problems[:3], **problems.told)
         errors = pose_errors(result.pose, problems.pose)
         first = pose_errors(result.init, problems.pose)
         report[f"val/{name}/success"] = success_rate(success(errors)).rate
@@ -171,7 +171,7 @@ def fit(
     model: PnPNet,
     data: ProblemSource,
     validation: Mapping[str, Problems],
-    loss: PoseLoss,
+    loss: PoseLoss | SetLoss,
     settings: TrainSettings,
     folder: str | Path,
     *,
@@ -270,8 +270,7 @@ def fit(
             clock.lap("rest")
             problems = _share(next(batches), fabric)
             clock.lap("data")
-            inputs = (problems.world_points, problems.img_points, problems.intrinsics)
-            terms = loss(solver(*inputs, first_stage_only=ramp == 0.0), problems, ramp)
+            terms = loss(solver(*problems[:3], **problems.told, first_stage_only=ramp == 0.0), problems, ramp)
             # The zero keeps the refiner in the graph before the ramp: processes expect gradients of every parameter.
             unused = sum(p.sum() for p in model.refine.parameters() if p.requires_grad) if ramp == 0.0 else 0.0
             clock.lap("forward")
@@ -393,7 +392,7 @@ def train_briefly(seconds: float, folder: str | Path, *, progress: bool = True) 
         began = time.perf_counter()
         for index in range(10):
             problems = data.batch(index)
-            result = model(*problems[:3], first_stage_only=ramp == 0.0)
+            result = model(*problems[:3], **problems.told, first_stage_only=ramp == 0.0)
             loss(result, problems, ramp).total.backward()
         return (time.perf_counter() - began) / 10
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from kornia.geometry.conversions import Rt_to_matrix4x4
 from torch import Tensor
 
-__all__ = ["Correspondences", "Guess", "Hypotheses", "PnPResult", "Pose", "Problems", "Refinement"]
+__all__ = ["Correspondences", "Guess", "Hypotheses", "Noise", "PnPResult", "Pose", "Problems", "Refinement"]
 
 
 class Pose(NamedTuple):
@@ -32,6 +32,18 @@ class Pose(NamedTuple):
         return Rt_to_matrix4x4(self.rotation, self.translation[..., None])
 
 
+class Noise(NamedTuple):
+    r"""Standard deviations of the noise of each pair, on each coordinate alike.
+
+    Attributes:
+        img: of its pixel, shape :math:`(B, N)`.
+        world: of its world point, shape :math:`(B, N)`.
+    """
+
+    img: Tensor
+    world: Tensor
+
+
 class Correspondences(NamedTuple):
     r"""Normalised 2D-3D pairs: what an initialiser and a refiner see.
 
@@ -45,6 +57,7 @@ class Correspondences(NamedTuple):
             What a user says in pixels, a threshold for example, is multiplied by it.
         world_scale: lengths of ``world_points`` per unit of the world that was given, shape :math:`(B,)`; ``None`` is
             1.
+        noise: in the units of ``img_points`` and ``world_points``; NaN where it is not known, ``None`` where none is.
     """
 
     world_points: Tensor
@@ -53,6 +66,15 @@ class Correspondences(NamedTuple):
     focal: Tensor
     img_scale: Tensor | None = None
     world_scale: Tensor | None = None
+    noise: Noise | None = None
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Correspondences:
+        """Apply a function to points, pixels, weights, focal length and noise; the scales stay."""
+        noise = None if self.noise is None else Noise(function(self.noise.img), function(self.noise.world))
+        world_points, img_points, weights, focal = map(function, self[:4])
+        return self._replace(
+            world_points=world_points, img_points=img_points, weights=weights, focal=focal, noise=noise
+        )
 
 
 class Guess(NamedTuple):
@@ -65,12 +87,15 @@ class Guess(NamedTuple):
             always.
         others: more poses to start from, rotations :math:`(B, S, 3, 3)` and translations :math:`(B, S, 3)`; ``None``:
             no others.
+        noise: of each pair, in the units of the correspondences and known everywhere; residuals then count in
+            standard deviations. ``None``: they count in pixels.
     """
 
     pose: Pose
     weights: Tensor
     ok: Tensor | None = None
     others: Pose | None = None
+    noise: Noise | None = None
 
 
 class Hypotheses(NamedTuple):
@@ -114,6 +139,8 @@ class PnPResult(NamedTuple):
             carry no gradient.
         init: the first guess that was refined. It carries a gradient whenever the problem itself is sound, so that it
             can be trained from guesses that refinement cannot save.
+        guess: all of the first guess, in the frame, the order and the units of the inputs, to train from; ``None`` but
+            from a solver in training mode.
     """
 
     rotation: Tensor
@@ -122,6 +149,7 @@ class PnPResult(NamedTuple):
     cost: Tensor
     ok: Tensor
     init: Pose
+    guess: Guess | None = None
 
     @property
     def pose(self) -> Pose:
@@ -143,6 +171,9 @@ class Problems(NamedTuple):
         intrinsics: camera matrices, shape :math:`(B, 3, 3)`.
         pose: the true world-to-camera pose.
         inliers: whether the pixel of a pair belongs to its point, bool, shape :math:`(B, N)`.
+        img_sigma: standard deviation of the noise on each pixel coordinate, NaN where a solver is not told, shape
+            :math:`(B,)`; ``None``: no solver is told.
+        world_sigma: likewise of each world coordinate.
     """
 
     world_points: Tensor
@@ -150,8 +181,17 @@ class Problems(NamedTuple):
     intrinsics: Tensor
     pose: Pose
     inliers: Tensor
+    img_sigma: Tensor | None = None
+    world_sigma: Tensor | None = None
+
+    @property
+    def told(self) -> dict[str, Tensor]:
+        """What a solver is told of the noise, as arguments of its call."""
+        sigmas = {"img_sigma": self.img_sigma, "world_sigma": self.world_sigma}
+        return {name: sigma for name, sigma in sigmas.items() if sigma is not None}
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Problems:
         """Apply a function to every tensor, for example to slice the batch or to move it to another device."""
         world, img, intrinsics, rotation, translation, inliers = map(function, (*self[:3], *self.pose, self.inliers))
-        return Problems(world, img, intrinsics, Pose(rotation, translation), inliers)
+        sigmas = (None if x is None else function(x) for x in self[5:])
+        return Problems(world, img, intrinsics, Pose(rotation, translation), inliers, *sigmas)

@@ -13,13 +13,14 @@ from kornia.geometry.camera.perspective import project_points
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch.utils._pytree import tree_leaves, tree_map
 
-from kornia_pnpnet import Correspondences, Pose
+from kornia_pnpnet import Correspondences, Noise, Pose
 from kornia_pnpnet.geometry import (
     MIN_DEPTH_RATIO,
     additive_tangent_map,
     change_tangent,
     move,
     normal_equations,
+    pixel_variance,
     problems_last,
     project,
     retract,
@@ -430,3 +431,18 @@ def test_all_zeros_is_finite(dtype):
     (sum(entries) + projection.sq_residual).sum().backward()
     assert zeros.grad.isfinite().all()
     assert translation.grad.isfinite().all()
+
+
+def test_pixel_variance_is_that_of_the_pixel(make_problems):
+    """Against the noise of many draws, mean over both coordinates."""
+    p = make_problems(n=5, batch=1, noise=False)
+    generator = torch.Generator().manual_seed(0)
+    moved = p.world_points + 0.05 * torch.randn(100_000, 5, 3, generator=generator, dtype=torch.float64)
+    off = 2.0 * torch.randn(100_000, 5, 2, generator=generator, dtype=torch.float64)
+    count = torch.ones(1, 5, dtype=torch.float64)
+    corr = Correspondences(p.world_points, p.img_points, count, p.intrinsics[0, 0, 0])
+    noise = Noise(2.0 * count, 0.05 * count)
+    variance = pixel_variance(project(p.pose, corr), noise, corr.focal)
+    cam = transform(Pose(*(x.expand(100_000, *x.shape[1:]) for x in p.pose)), moved)
+    drawn = (corr.focal * cam[..., :2] / cam[..., 2:] + off).var(0).mean(-1)
+    torch.testing.assert_close(variance[0], drawn, rtol=0.02, atol=0)

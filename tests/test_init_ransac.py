@@ -200,7 +200,7 @@ def test_the_chunks_do_not_matter(size, make_problems, correspond):
 
 def test_easy_problems_stop_early_and_change_nothing(found, make_problems, correspond):
     easy, hard = correspond(make_problems(60, 10))[0], correspond(make_problems(60, 10, outliers=42))[0]
-    both = Correspondences(*(torch.cat((a, b)) if a.ndim else a for a, b in zip(easy, hard, strict=True)))
+    both = Correspondences(*(torch.cat((a, b)) if a.ndim else a for a, b in zip(easy[:6], hard[:6], strict=True)))
     ransac = RANSAC(P3P(), **PROTOCOL)
     results = [outputs(ransac(corr)) for corr in (easy, hard, both)]
     alone, alone_hard, together = (x.samples for x in found)

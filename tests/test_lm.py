@@ -490,7 +490,7 @@ def test_float32_is_close_to_float64(update, make_problems, correspond, perturb)
     start = perturb(truth, angle=0.02, shift=0.02)
     lm = RobustWeightedLM(m=10, update=update)
     double = lm(corr, guess(start, corr))
-    low = Correspondences(*(x.float() for x in corr))
+    low = corr.map(torch.Tensor.float)
     single = lm(low, guess(Pose(*(x.float() for x in start)), low))
     assert {x.dtype for x in (*single.pose, single.weights, single.cost)} == {torch.float32}
     errors = pose_errors(Pose(*(x.double() for x in single.pose)), double.pose)

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from kornia_pnpnet import PnPResult, Pose, PoseLoss
+from kornia_pnpnet import Guess, Noise, PnPResult, Pose, PoseLoss, SetLoss
 from kornia_pnpnet.losses import pose_distances
 
 EPS = 1e-6
@@ -109,3 +109,76 @@ def test_the_first_stage_is_not_saturated(make_problems):
     far = Pose(p.pose.rotation, p.pose.translation + 1e3 * torch.eye(3).double()[0])
     total = PoseLoss(init_translation=1.0, saturation=0.5)(solved(p, far, p.pose), p).total
     torch.testing.assert_close(total, torch.tensor(1e3).double())
+
+
+# --- the set loss ---------------------------------------------------------------------------------------------------
+
+
+def trained_result(problems, refined, hypotheses, noise=None, weights=None):
+    """A result of a solver in training mode, with these hypotheses."""
+    first, others = hypotheses[0], hypotheses[1:]
+    stacked = Pose(*(torch.stack(parts, 1) for parts in zip(*others, strict=True))) if others else None
+    weights = problems.inliers.double() if weights is None else weights
+    result = solved(problems, first, refined)
+    return result._replace(weights=weights, guess=Guess(first, weights, result.ok, stacked, noise))
+
+
+def test_a_perfect_set_result_costs_nothing(make_problems, perturb):
+    p = make_problems(outliers=3)
+    terms = SetLoss(every=0.0)(trained_result(p, p.pose, [perturb(p.pose, angle=1.0), p.pose]), p)
+    assert terms.total < 1e-5
+    assert terms.weights < 1e-5
+
+
+def test_the_best_hypothesis_counts_and_a_little_all_of_them(make_problems, perturb):
+    p = make_problems()
+    near, far = perturb(p.pose, angle=0.1, shift=0.0), perturb(p.pose, angle=1.0, shift=0.0)
+    few, many = ([near], [far, near, far])
+    alone, several = (SetLoss(every=0.0)(trained_result(p, p.pose, x), p).total for x in (few, many))
+    torch.testing.assert_close(alone, several)
+    only_far = SetLoss(every=0.0)(trained_result(p, p.pose, [far]), p).total
+    mixed = SetLoss(every=0.3)(trained_result(p, p.pose, many), p).total
+    torch.testing.assert_close(mixed, 0.7 * alone + 0.3 * (alone + 2 * only_far) / 3)
+
+
+def test_the_set_loss_has_no_unit(make_problems, perturb):
+    p = make_problems(outliers=2)
+    refined, first = perturb(p.pose, angle=0.01), perturb(p.pose, angle=0.3)
+
+    def scaled(pose):
+        return Pose(pose.rotation, 1000.0 * pose.translation)
+
+    large = p._replace(world_points=1000.0 * p.world_points, pose=scaled(p.pose))
+    small_loss = SetLoss()(trained_result(p, refined, [first]), p).total
+    torch.testing.assert_close(
+        SetLoss()(trained_result(large, scaled(refined), [scaled(first)]), large).total, small_loss
+    )
+
+
+def test_before_the_ramp_nothing_after_the_refinement_counts(make_problems, perturb):
+    p = make_problems()
+    refined = Pose(*(x.clone().requires_grad_() for x in perturb(p.pose)))
+    first = Pose(*(x.clone().requires_grad_() for x in perturb(p.pose, angle=0.3)))
+    SetLoss()(trained_result(p, refined, [first]), p, 0.0).total.backward()
+    assert refined.rotation.grad is None
+    assert first.rotation.grad.abs().sum() > 0
+
+
+def test_the_true_noise_is_the_likeliest(make_problems):
+    """Among guesses of either sigma that are off by a factor of two."""
+    p = make_problems(batch=3000, outliers=2)
+    shape = p.inliers.shape
+
+    def term(img, world):
+        noise = Noise(*(torch.full(shape, x, dtype=torch.float64) for x in (img, world)))
+        return SetLoss()(trained_result(p, p.pose, [p.pose], noise), p).noise
+
+    true = term(1.0, 0.05)
+    assert all(term(*wrong) > true for wrong in ((2.0, 0.05), (0.1, 0.05), (1.0, 0.1), (1.0, 0.025), (2.0, 0.1)))
+
+
+def test_weights_are_compared_with_what_is_right(make_problems):
+    p = make_problems(outliers=3)
+    half = torch.full(p.inliers.shape, 0.5, dtype=torch.float64)
+    terms = SetLoss()(trained_result(p, p.pose, [p.pose], weights=half), p)
+    torch.testing.assert_close(terms.weights, torch.tensor(math.log(2.0), dtype=torch.float64))

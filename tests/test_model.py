@@ -948,3 +948,85 @@ def test_trained_weights_take_views_and_m(make_problems):
     assert eight > one + 0.02
     with pytest.raises(BaseError, match="views must be 1 to 8"):
         create_solver("pnpnet-n9", views=0)
+
+
+# --- noise that is known --------------------------------------------------------------------------------------------
+
+
+def test_known_noise_solves_more(make_problems, perturb):
+    """From near the truth, with wrong pairs: weighing by what each pair is worth passes what residuals alone allow."""
+    p = make_problems(batch=1000, outliers=3)
+    start = perturb(p.pose)
+    refine = RobustWeightedLM(10, kernel="geman_mcclure", robustness=6.0, damping=1e-4)
+    solver = PnPNet(None, refine)
+    plain = PnPNet(None, RobustWeightedLM(10, robustness=1.5, damping=1e-4))
+    told = solver(*p[:3], init=start, img_sigma=1.0, world_sigma=0.05)
+    rates = [success(pose_errors(r.pose, p.pose)).double().mean() for r in (told, plain(*p[:3], init=start))]
+    assert rates[0] > rates[1] + 0.03
+    assert told.ok.double().mean() > 0.97
+
+
+def test_known_noise_has_the_units_of_the_inputs(make_problems, perturb):
+    """A number, one of each problem or of each pair, in pixels and lengths of any camera and world."""
+    p = make_problems(batch=6, outliers=2)
+    solver, start = PnPNet(None, RobustWeightedLM(4, kernel="cauchy", robustness=3.0)), perturb(p.pose)
+    number = solver(*p[:3], init=start, img_sigma=1.0, world_sigma=0.05)
+    of_problems = solver(
+        *p[:3], init=start, img_sigma=torch.ones(6).double(), world_sigma=torch.full((6,), 0.05).double()
+    )
+    of_pairs = solver(*p[:3], init=start, img_sigma=torch.ones(6, 9).double(), world_sigma=0.05)
+    scaled = solver(
+        1000.0 * p.world_points,
+        p.img_points / 4.0,
+        p.intrinsics / torch.tensor([[4.0], [4.0], [1.0]]).double(),
+        init=Pose(start.rotation, 1000.0 * start.translation),
+        img_sigma=0.25,
+        world_sigma=50.0,
+    )
+    for other in (of_problems, of_pairs):
+        torch.testing.assert_close(other.matrix, number.matrix)
+        torch.testing.assert_close(other.weights, number.weights)
+    torch.testing.assert_close(scaled.rotation, number.rotation)
+    torch.testing.assert_close(scaled.translation, 1000.0 * number.translation)
+    torch.testing.assert_close(scaled.cost, number.cost)
+    assert torch.equal(scaled.ok, number.ok)
+
+
+def test_noise_of_pairs_stays_with_them_in_any_order(make_problems):
+    p = make_problems(batch=5, outliers=2)
+    sigma = torch.rand(5, 9, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 5 + 0.2
+    refine = RobustWeightedLM(5, kernel="cauchy", robustness=3.0)
+    results = [
+        PnPNet(None, refine, Normalize(order=order))(*p[:3], init=p.pose, img_sigma=sigma) for order in (False, True)
+    ]
+    torch.testing.assert_close(results[0].matrix, results[1].matrix)
+    torch.testing.assert_close(results[0].weights, results[1].weights)
+
+
+@pytest.mark.parametrize("name", ["img_sigma", "world_sigma"])
+def test_noise_that_makes_no_sense_is_not_ok_or_refused(name, make_problems):
+    p = make_problems(batch=6, noise=False)
+    solver = create_solver("epnp-lm")
+    sigma = torch.tensor([1.0, -1.0, torch.inf, 0.0, torch.nan, 1.0], dtype=torch.float64)
+    result = solver(*p[:3], **{name: sigma})
+    assert result.ok[[1, 2]].tolist() == [False, False]
+    assert result.ok[[0, 5]].all()
+    assert result.matrix.isfinite().all()
+    alone = solver(*(x[5:] for x in p[:3]), **{name: sigma[5:]})
+    assert torch.equal(alone.matrix[0], result.matrix[5])
+    for wrong, message in (
+        (torch.ones(5, dtype=torch.float64), "must be a number or have the shape"),
+        (torch.ones(6), "float32 but world_points is torch.float64"),
+        ("1", "must be a number or a tensor"),
+    ):
+        with pytest.raises(BaseError, match=message):
+            solver(*p[:3], **{name: wrong})
+
+
+def test_pairs_of_no_pose_are_not_ok_when_the_noise_is_known(make_problems):
+    p = make_problems(batch=500)
+    solver = create_solver("epnp-lm")
+    noise = {"img_sigma": 1.0, "world_sigma": 0.05}
+    garbage = solver(p.world_points, p.img_points.roll(1, 0), p.intrinsics, **noise)
+    assert garbage.ok.double().mean() < 0.02
+    assert solver(*p[:3], **noise).ok.double().mean() > 0.95

@@ -11,8 +11,16 @@ import torch
 from kornia.core.exceptions import BaseError
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
-from kornia_pnpnet import Pose, Problems
-from kornia_pnpnet.data import BoxPoints, MixedProblems, OutlierMix, SlabPoints, SyntheticProblems
+from kornia_pnpnet import Pose, Problems, create_solver
+from kornia_pnpnet.data import (
+    BoxPoints,
+    MixedProblems,
+    ObjectPoints,
+    OutlierMix,
+    SlabPoints,
+    SyntheticProblems,
+    VaryingSize,
+)
 from kornia_pnpnet.data.synthetic import batch_generator, random_poses
 from kornia_pnpnet.geometry import transform
 
@@ -442,3 +450,101 @@ def test_a_range_of_one_value_is_that_noise():
 def test_noise_that_cannot_be_drawn_is_refused(name, sigma):
     with pytest.raises(BaseError, match=name):
         SyntheticProblems(**{name: sigma})
+
+
+# --- wider than the protocol ----------------------------------------------------------------------------------------
+
+
+def test_told_problems_come_with_their_sigmas():
+    source = SyntheticProblems(batch_size=COUNT, told=0.4, img_sigma=(0.5, 5.0), world_sigma=0.05, n=4)
+    p = source.batch(0)
+    known = [~x.isnan() for x in (p.img_sigma, p.world_sigma)]
+    assert (known[0] & known[1]).double().mean().item() == pytest.approx(0.4, abs=0.015)
+    for one, other in (known, known[::-1]):
+        assert (one & ~other).double().mean().item() == pytest.approx(0.1, abs=0.01)
+    assert (p.world_sigma[known[1]] == 0.05).all()
+    log = p.img_sigma[known[0]].log()
+    assert_uniform(log, math.log(0.5) - 1e-6, math.log(5.0) + 1e-6)
+    assert set(p.told) == {"img_sigma", "world_sigma"}
+    assert SyntheticProblems(n=4).batch(0).told == {}
+
+
+def test_told_sigmas_are_those_of_the_noise():
+    p = SyntheticProblems(batch_size=500, n=200, told=1.0, img_sigma=(0.5, 5.0), world_sigma=0.0).batch(0)
+    cam = transform(p.pose, p.world_points)
+    off = (3400.0 * cam[..., :2] / cam[..., 2:] - p.img_points).flatten(1)
+    ratio = off.square().mean(1).sqrt() / p.img_sigma
+    assert (ratio - 1).abs().max() < 0.2
+
+
+def test_near_outliers_are_a_little_off():
+    mix = OutlierMix(count=3, near_share=1.0)
+    p = SyntheticProblems(batch_size=2000, n=9, outliers=mix, img_sigma=1.0, world_sigma=0.0).batch(0)
+    cam = transform(p.pose, p.world_points)
+    off = (3400.0 * cam[..., :2] / cam[..., 2:] - p.img_points).norm(dim=-1)
+    assert (p.inliers.sum(-1) == 6).all()
+    assert off[p.inliers].max() < 5.5
+    wrong = off[~p.inliers]
+    assert wrong.min() > 1.0
+    assert wrong.max() < 55.0
+
+
+def test_structured_outliers_agree_on_another_pose():
+    mix = OutlierMix(count=6, structured_share=1.0)
+    p = SyntheticProblems(batch_size=50, n=24, outliers=mix, img_sigma=0.0, world_sigma=0.0, dtype=torch.float64).batch(
+        0
+    )
+    wrong = ~p.inliers
+    assert (wrong.sum(-1) >= 6).all()  # a moved point that is not in front of the camera is wrong as well
+    explained = 0
+    for i in range(50):
+        at = wrong[i].nonzero()[:, 0]
+        if len(at) != 6:
+            continue
+        inputs = (p.world_points[i, at][None], p.img_points[i, at][None], p.intrinsics[i][None])
+        result = create_solver("epnp-lm")(*inputs)
+        explained += bool(result.ok) and result.cost.item() < 1e-3
+    assert explained > 20
+
+
+def test_at_least_so_many_stay_right():
+    assert OutlierMix(max_ratio=0.6, min_inliers=4).max_count(6) == 2
+    assert OutlierMix(max_ratio=0.6, min_inliers=4).max_count(3) == 0
+    assert OutlierMix(max_ratio=0.6, min_inliers=4).max_count(20) == 12
+
+
+def test_objects_are_where_they_were_put():
+    prior = ObjectPoints(distance=(3.0, 30.0), field_of_view=0.5, planar=0.25)
+    points = prior(COUNT, 12, batch_generator(0, 0))
+    centre = points.mean(1)
+    assert centre[:, 2].min() > 1.5
+    assert centre[:, 2].max() < 32
+    spread = points - centre[:, None]
+    values = torch.linalg.svdvals(spread)
+    assert (values[:, 2] < 1e-9).double().mean().item() == pytest.approx(0.25, abs=0.015)
+    assert (values[:, 1] > 1e-3).all()
+
+
+def test_points_behind_the_camera_come_with_wrong_pixels():
+    points = ObjectPoints(distance=(0.5, 1.0))
+    p = SyntheticProblems(batch_size=500, n=9, points=points, dtype=torch.float64, world_sigma=0.0).batch(0)
+    behind = transform(p.pose, p.world_points)[..., 2] <= 0
+    assert behind.any()
+    assert not p.inliers[behind].any()
+    assert p.img_points.isfinite().all()
+
+
+def test_varying_sizes_are_reproducible_and_come_from_the_list():
+    make = partial(
+        VaryingSize, partial(MixedProblems, [SyntheticProblems], told=0.5), n=[5, 9, 20], batch_size=40, seed=3
+    )
+    one, two = make(), make()
+    shapes = set()
+    for i in range(30):
+        a, b = one.batch(i), two.batch(i)
+        for x, y in zip(
+            (*a[:3], *a.pose, a.inliers, a.img_sigma), (*b[:3], *b.pose, b.inliers, b.img_sigma), strict=True
+        ):
+            torch.testing.assert_close(x, y, rtol=0, atol=0, equal_nan=True)
+        shapes.add(tuple(a.inliers.shape))
+    assert shapes == {(40, 5), (22, 9), (10, 20)}

@@ -3,16 +3,25 @@
 from kornia_pnpnet.data.colmap import Scene, View, load_colmap, load_matches, load_scene
 from kornia_pnpnet.data.outliers import OutlierMix
 from kornia_pnpnet.data.scenes import SceneProblems
-from kornia_pnpnet.data.synthetic import BoxPoints, MixedProblems, SlabPoints, SyntheticProblems
+from kornia_pnpnet.data.synthetic import (
+    BoxPoints,
+    MixedProblems,
+    ObjectPoints,
+    SlabPoints,
+    SyntheticProblems,
+    VaryingSize,
+)
 
 __all__ = [
     "BoxPoints",
     "MixedProblems",
+    "ObjectPoints",
     "OutlierMix",
     "Scene",
     "SceneProblems",
     "SlabPoints",
     "SyntheticProblems",
+    "VaryingSize",
     "View",
     "load_colmap",
     "load_matches",

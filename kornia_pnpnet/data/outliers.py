@@ -18,15 +18,23 @@ class OutlierDraw(NamedTuple):
     Attributes:
         mismatch: the pixel belongs to another point, bool, shape :math:`(B, N)`.
         sensing: the pixel is anywhere in the image, bool, shape :math:`(B, N)`.
+        near: the pixel is a little off, bool, shape :math:`(B, N)`; ``None``: none is.
+        structured: the pixel is where another pose, the same for all of these of a problem, would show the point,
+            bool, shape :math:`(B, N)`; ``None``: none is.
     """
 
     mismatch: Tensor
     sensing: Tensor
+    near: Tensor | None = None
+    structured: Tensor | None = None
 
     @property
     def inliers(self) -> Tensor:
-        """Pairs that are neither, bool, shape :math:`(B, N)`."""
-        return ~(self.mismatch | self.sensing)
+        """Pairs that are none of these, bool, shape :math:`(B, N)`."""
+        wrong = self.mismatch | self.sensing
+        for more in (self.near, self.structured):
+            wrong = wrong if more is None else wrong | more
+        return ~wrong
 
 
 class OutlierMix:
@@ -39,6 +47,10 @@ class OutlierMix:
         min_count: the fewest.
         mismatch_share: probability that a wrong pair is a *mismatch* (the projection of another point) rather than
             *sensing* (a pixel anywhere in the image).
+        near_share: probability that a wrong pair is *near* instead: a little off.
+        structured_share: probability that the wrong pairs of a problem are *structured* instead, up to a third of the
+            right ones: they agree on another pose, as repeated structure does.
+        min_inliers: so many pairs stay right, whatever ``max_ratio`` says.
 
     Raises:
         BaseError: for shares outside [0, 1] or negative counts.
@@ -55,19 +67,29 @@ class OutlierMix:
         count: int | None = None,
         min_count: int = 0,
         mismatch_share: float = 0.5,
+        near_share: float = 0.0,
+        structured_share: float = 0.0,
+        min_inliers: int = 0,
     ) -> None:
         KORNIA_CHECK(0.0 <= max_ratio <= 1.0, f"max_ratio must lie in [0, 1], got {max_ratio}.")
-        KORNIA_CHECK(0.0 <= mismatch_share <= 1.0, f"mismatch_share must lie in [0, 1], got {mismatch_share}.")
+        shares = {"mismatch": mismatch_share, "near": near_share, "structured": structured_share}
+        for name, share in shares.items():
+            KORNIA_CHECK(0.0 <= share <= 1.0, f"{name}_share must lie in [0, 1], got {share}.")
         KORNIA_CHECK(min_count >= 0, f"min_count must be at least 0, got {min_count}.")
         KORNIA_CHECK(count is None or count >= 0, f"count must be at least 0, got {count}.")
         self.max_ratio = max_ratio
         self.count = count
         self.min_count = min_count
         self.mismatch_share = mismatch_share
+        self.near_share = near_share
+        self.structured_share = structured_share
+        self.min_inliers = min_inliers
 
     def max_count(self, n: int) -> int:
         """The most wrong pairs among ``n``."""
-        return math.floor(n * self.max_ratio + 0.05) if self.count is None else self.count
+        if self.count is not None:
+            return self.count
+        return max(0, min(math.floor(n * self.max_ratio + 0.05), n - self.min_inliers))
 
     def draw(self, batch_size: int, n: int, generator: torch.Generator) -> OutlierDraw:
         r"""Draw the wrong pairs of a batch.
@@ -78,7 +100,7 @@ class OutlierMix:
             generator: source of randomness; the result is on its device.
 
         Returns:
-            Two masks of shape ``(batch_size, n)``.
+            Masks of shape ``(batch_size, n)``.
 
         Raises:
             BaseError: when more wrong pairs are asked for than there are pairs.
@@ -92,4 +114,12 @@ class OutlierMix:
         rank = torch.empty_like(order).scatter_(1, order, torch.arange(n, device=device).expand(batch_size, n))
         outlier = rank < count
         mismatch = torch.rand(batch_size, n, generator=generator, device=device) < self.mismatch_share
-        return OutlierDraw(outlier & mismatch, outlier & ~mismatch)
+        near = structured = None
+        if self.structured_share:
+            such = torch.rand(batch_size, 1, generator=generator, device=device) < self.structured_share
+            structured = outlier & such & (rank < (n - count) // 3)
+            outlier = outlier & ~structured
+        if self.near_share:
+            near = outlier & (torch.rand(batch_size, n, generator=generator, device=device) < self.near_share)
+            outlier = outlier & ~near
+        return OutlierDraw(outlier & mismatch, outlier & ~mismatch, near, structured)

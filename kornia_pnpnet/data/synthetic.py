@@ -19,13 +19,23 @@ from kornia_pnpnet.types import Pose, Problems
 __all__ = [
     "BoxPoints",
     "MixedProblems",
+    "ObjectPoints",
     "PointPrior",
     "SlabPoints",
     "SyntheticProblems",
+    "VaryingSize",
     "batch_generator",
     "random_poses",
     "uniform",
 ]
+
+
+# A pixel that is a little off is off by so many standard deviations, log-uniform.
+_NEAR = 5.0, 50.0
+# A point has a pixel when the cosine of its direction from the optical axis is more than this.
+_LEAST_COSINE = 0.05
+# The numbers of pairs are another stream than the problems.
+_SIZES = 1_000_003
 
 
 def batch_generator(seed: int, index: int, device: str | torch.device = "cpu") -> torch.Generator:
@@ -51,13 +61,14 @@ def _log_uniform(shape: Sequence[int], low: float, high: float, generator: torch
     return uniform(shape, math.log(low), math.log(high), generator).exp_()
 
 
-def _noise(shape: Sequence[int], sigma: float | Sequence[float], generator: torch.Generator) -> Tensor:
-    """Normal noise of one standard deviation, or for each problem of one from a range, log-uniform."""
+def _noise(shape: Sequence[int], sigma: float | Sequence[float], generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Normal noise, (B, N, ...), of one standard deviation or of one from a range for each problem, and these, (B,)."""
     noise = _normal(shape, generator)
     if isinstance(sigma, int | float):
-        return noise.mul_(sigma)
+        return noise.mul_(sigma), noise.new_full((shape[0],), sigma)
     low, high = sigma
-    return noise.mul_(_log_uniform((shape[0], *(1,) * (len(shape) - 1)), low, high, generator))
+    sigmas = _log_uniform((shape[0], *(1,) * (len(shape) - 1)), low, high, generator)
+    return noise.mul_(sigmas), sigmas.flatten()
 
 
 def random_poses(
@@ -163,6 +174,49 @@ class SlabPoints:
         return torch.cat((direction * z[..., None], z[..., None]), -1)
 
 
+class ObjectPoints:
+    r"""Points of an object of any proportions somewhere in the image, near or far.
+
+    The object is an ellipsoid or a box of half-size about 1, thinner by random factors along two of its axes and down
+    to a plane, turned at random. It lies in a random direction at a distance that is log-uniform in its half-sizes.
+
+    Args:
+        distance: smallest and largest distance of the centre in half-sizes, log-uniform.
+        field_of_view: the centre lies within this tangent on both axes.
+        thinnest: the smallest factor of an axis, log-uniform up to 1.
+        planar: share of problems whose points lie in a plane.
+    """
+
+    def __init__(
+        self,
+        *,
+        distance: tuple[float, float] = (1.5, 40.0),
+        field_of_view: float = 0.8,
+        thinnest: float = 0.05,
+        planar: float = 0.15,
+    ) -> None:
+        self.distance = distance
+        self.field_of_view = field_of_view
+        self.thinnest = thinnest
+        self.planar = planar
+
+    def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
+        """Draw points of shape ``(batch_size, n, 3)``."""
+        box = uniform((batch_size, n, 3), -1.0, 1.0, generator)
+        ball = 0.5 * _normal((batch_size, n, 3), generator)
+        is_box = uniform((batch_size, 1, 1), 0.0, 1.0, generator) < 0.5
+        factors = _log_uniform((batch_size, 1, 3), self.thinnest, 1.0, generator)
+        factors[..., 0] = 1.0
+        flat = uniform((batch_size, 1), 0.0, 1.0, generator) < self.planar
+        factors[..., 2] = torch.where(flat, 0.0, factors[..., 2])
+        turn = random_poses(batch_size, generator, max_angle=math.pi).rotation
+        points = (torch.where(is_box, box, ball) * factors) @ turn.mT
+        tangents = uniform((batch_size, 2), -self.field_of_view, self.field_of_view, generator)
+        away = _log_uniform((batch_size, 1), *self.distance, generator)
+        centre = away * torch.cat((tangents, torch.ones_like(away)), -1)
+        return points + centre[:, None]
+
+
 class SyntheticProblems:
     r"""Random problems of the protocol, endless and reproducible: batch ``i`` depends on ``seed`` and ``i`` alone.
 
@@ -185,6 +239,7 @@ class SyntheticProblems:
         img_sigma: standard deviation of the noise on each pixel coordinate; or the smallest and the largest, for each
             problem another, log-uniform.
         world_sigma: likewise of the noise on each world coordinate.
+        told: share of problems that come with both sigmas; of the others a third come with one of them.
         dtype: of the batches; everything is drawn in float64 first.
         device: of the batches.
 
@@ -212,6 +267,7 @@ class SyntheticProblems:
         half_image: float = 3400.0,
         img_sigma: float | Sequence[float] = 1.0,
         world_sigma: float | Sequence[float] = 0.05,
+        told: float = 0.0,
         dtype: torch.dtype = torch.float32,
         device: str | torch.device = "cpu",
     ) -> None:
@@ -231,6 +287,7 @@ class SyntheticProblems:
         self.half_image = half_image
         self.img_sigma = img_sigma
         self.world_sigma = world_sigma
+        self.told = told
         self.dtype = dtype
         self.device = torch.device(device)
 
@@ -264,19 +321,51 @@ class SyntheticProblems:
         anywhere = uniform((self.batch_size, self.n, 2), -self.half_image, self.half_image, generator)
 
         world_points = (cam_points - pose.translation[:, None]) @ pose.rotation
-        world_points += _noise(world_points.shape, self.world_sigma, generator)
+        noise, world_sigma = _noise(world_points.shape, self.world_sigma, generator)
+        world_points += noise
         seen = torch.where(draw.mismatch[..., None], other_points, cam_points)
+        if draw.structured is not None:
+            seen = torch.where(draw.structured[..., None], _moved(cam_points, generator), seen)
+        # A point that is not in front of the camera has no pixel: whatever pixel it comes with is wrong.
+        behind = seen[..., 2] <= _LEAST_COSINE * seen.norm(dim=-1)
+        seen = torch.where(behind[..., None], torch.ones_like(seen), seen)
         img_points = self.focal * seen[..., :2] / seen[..., 2:]
-        img_points = torch.where(draw.sensing[..., None], anywhere, img_points)
-        img_points += _noise(img_points.shape, self.img_sigma, generator)
+        img_points = torch.where((draw.sensing | behind)[..., None], anywhere, img_points)
+        noise, img_sigma = _noise(img_points.shape, self.img_sigma, generator)
+        img_points += noise
+        if draw.near is not None:
+            off = torch.nn.functional.normalize(_normal(img_points.shape, generator), dim=-1)
+            off *= _log_uniform((*img_points.shape[:2], 1), *_NEAR, generator) * img_sigma[:, None, None]
+            img_points += torch.where(draw.near[..., None], off, 0.0)
+        sigmas: tuple[Tensor, ...] = ()
+        if self.told:
+            chance = uniform((2, self.batch_size), 0.0, 1.0, generator)
+            one = (chance[0] < self.told + (1.0 - self.told) / 3.0) & (chance[0] >= self.told)
+            is_img = chance[1] < 0.5
+            hidden = (chance[0] >= self.told) & ~(one & is_img), (chance[0] >= self.told) & ~(one & ~is_img)
+            sigmas = tuple(
+                torch.where(hide, torch.nan, sigma).to(self.dtype)
+                for hide, sigma in zip(hidden, (img_sigma, world_sigma), strict=True)
+            )
         intrinsics = torch.diag(img_points.new_tensor((self.focal, self.focal, 1.0))).expand(self.batch_size, 3, 3)
         return Problems(
             world_points.to(self.dtype),
             img_points.to(self.dtype),
             intrinsics.to(self.dtype),
             Pose(pose.rotation.to(self.dtype), pose.translation.to(self.dtype)),
-            draw.inliers,
+            draw.inliers & ~behind,
+            *sigmas,
         )
+
+
+def _moved(cam_points: Tensor, generator: torch.Generator) -> Tensor:
+    """The points of each problem turned about their centre and shifted, (B, n, 3)."""
+    batch_size = len(cam_points)
+    centre = cam_points.mean(1, keepdim=True)
+    size = (cam_points - centre).square().sum(-1).mean(1).sqrt()[:, None, None]
+    turn = random_poses(batch_size, generator, max_angle=math.pi).rotation
+    shift = 0.5 * size * _normal((batch_size, 1, 3), generator)
+    return (cam_points - centre) @ turn.mT + centre + shift
 
 
 class MixedProblems:
@@ -338,10 +427,52 @@ class MixedProblems:
         """
         count = len(self.sources)  # no two sources see the same random numbers
         parts = [source.batch(count * index + i) for i, source in enumerate(self.sources)]
-        world_points, img_points, intrinsics, poses, inliers = zip(*parts, strict=True)
+        world_points, img_points, intrinsics, poses, inliers, *told = zip(*parts, strict=True)
         pose = Pose(*(torch.cat(entries) for entries in zip(*poses, strict=True)))
+        sigmas = (None if entries[0] is None else torch.cat(entries) for entries in told)
         problems = Problems(
-            torch.cat(world_points), torch.cat(img_points), torch.cat(intrinsics), pose, torch.cat(inliers)
+            torch.cat(world_points), torch.cat(img_points), torch.cat(intrinsics), pose, torch.cat(inliers), *sigmas
         )
         order = self._order.to(problems.inliers.device)
         return problems.map(lambda x: x[order])
+
+
+class VaryingSize:
+    """Batches whose problems have another number of pairs each time, and as many pairs in all.
+
+    Args:
+        source: makes a source from ``n``, ``batch_size`` and ``seed``, such as a :func:`functools.partial` of
+            :class:`MixedProblems`.
+        n: numbers of pairs, one of which each batch takes at random.
+        batch_size: problems in a batch of the smallest number of pairs, and in none more.
+        seed: of the stream.
+
+    Raises:
+        BaseError: when there is no number of pairs.
+
+    Example:
+        >>> source = VaryingSize(SyntheticProblems, n=(4, 8), batch_size=6)
+        >>> sorted({tuple(source.batch(i).inliers.shape) for i in range(20)})
+        [(3, 8), (6, 4)]
+    """
+
+    def __init__(
+        self,
+        source: Callable[..., SyntheticProblems | MixedProblems],
+        *,
+        n: Sequence[int],
+        batch_size: int = 1000,
+        seed: int = 0,
+    ) -> None:
+        KORNIA_CHECK(len(n) > 0, "VaryingSize needs at least one number of pairs.")
+        self.batch_size = batch_size
+        self.seed = seed
+        self.sources = [
+            source(n=count, batch_size=max(1, batch_size * min(n) // count), seed=seed + i) for i, count in enumerate(n)
+        ]
+
+    def batch(self, index: int) -> Problems:
+        """Draw batch ``index``."""
+        generator = batch_generator(self.seed + _SIZES, index)
+        turn = int(torch.randint(len(self.sources), (), generator=generator))
+        return self.sources[turn].batch(index)

@@ -5,5 +5,6 @@ from kornia_pnpnet.init.mlp import MLPInit
 from kornia_pnpnet.init.p3p import P3P, p3p
 from kornia_pnpnet.init.ransac import RANSAC, SubsetSolver
 from kornia_pnpnet.init.reppnp import REPPnP
+from kornia_pnpnet.init.set import SetInit
 
-__all__ = ["P3P", "RANSAC", "EPnP", "MLPInit", "REPPnP", "SubsetSolver", "p3p"]
+__all__ = ["P3P", "RANSAC", "EPnP", "MLPInit", "REPPnP", "SetInit", "SubsetSolver", "p3p"]

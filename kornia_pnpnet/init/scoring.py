@@ -47,8 +47,9 @@ class Thresholds(NamedTuple):
     r"""What counts as an inlier in each problem.
 
     Attributes:
-        img: :math:`\tau` in pixels of the normalised camera, shape :math:`(B,)`.
-        world: :math:`\omega` in units of the normalised world, shape :math:`(B,)`.
+        img: :math:`\tau` in pixels of the normalised camera, shape :math:`(B,)`; where a pose is judged also
+            :math:`(B, N)`.
+        world: :math:`\omega` in units of the normalised world, likewise.
     """
 
     img: Tensor
@@ -89,8 +90,9 @@ def judge(projection: Projection, corr: Correspondences, thresholds: Thresholds)
         >>> judge(projection, corr, Thresholds(torch.tensor([10.0]), torch.tensor([0.0])))
         Judged(weights=tensor([[1., 0.]]), errors=tensor([[0.0000, 6.2500]]))
     """
-    sq_img = thresholds.img.square()[:, None]
-    sq_limit = sq_img + (corr.focal * thresholds.world[:, None] * projection.inv_depth).square()
+    img, world = map(_of_pairs, thresholds)
+    sq_img = img.square()
+    sq_limit = sq_img + (corr.focal * world * projection.inv_depth).square()
     errors = projection.sq_residual / sq_limit
     errors = torch.where(projection.in_front, errors, MAX_ERROR)
     inlier = (errors < 1.0) & (corr.weights > 0)
@@ -125,10 +127,15 @@ def chance_of_inlier(corr: Correspondences, thresholds: Thresholds, judged: Judg
     eps = torch.finfo(high.dtype).eps  # a perfect fit of pixels that are all the same is no evidence
     sides = (high - low).clamp(min=eps)[:, None]  # (B, 1, 2)
     worst = torch.where(inlier, judged.errors, 0.0).amax(-1, keepdim=True).clamp(min=eps)
-    sq_radius = worst * thresholds.img.square()[:, None] / torch.where(inlier, judged.weights, 1.0)
+    sq_radius = worst * _of_pairs(thresholds.img).square() / torch.where(inlier, judged.weights, 1.0)
     strips = 2.0 * sq_radius.sqrt()[..., None] / sides  # (B, N, 2)
     chance = (0.25 * math.pi * strips.prod(-1)).minimum(strips.amin(-1)).clamp(max=1.0)
     return torch.where(inlier, chance, 0.0).sum(-1) / inlier.sum(-1).clamp(min=1)
+
+
+def _of_pairs(threshold: Tensor) -> Tensor:
+    """A threshold of each problem as one of each of its pairs."""
+    return threshold[:, None] if threshold.ndim == 1 else threshold
 
 
 class Scene(NamedTuple):

@@ -96,9 +96,7 @@ class Search:
     def __init__(self, plan: Plan, corr: Correspondences, thresholds: Thresholds) -> None:
         self.plan = plan
         self.corr = corr
-        self.low = Correspondences(
-            *(x.to(_DTYPE) for x in (corr.world_points, corr.img_points, corr.weights, corr.focal))
-        )
+        self.low = corr.map(lambda x: x.to(_DTYPE))
         self.thresholds = Thresholds(*(x.to(_DTYPE) for x in thresholds))
         self.scene = Scene.make(corr, thresholds, _DTYPE)
         size = plan.minimal.sample_size

@@ -1,0 +1,244 @@
+"""A network for any number of pairs in any order, of any world and any camera: poses, weights and noise."""
+
+from __future__ import annotations
+
+import torch
+from kornia.core.check import KORNIA_CHECK
+from torch import Tensor, nn
+from torch.nn import functional
+
+from kornia_pnpnet.init.control_points import align
+from kornia_pnpnet.small import dot
+from kornia_pnpnet.types import Correspondences, Guess, Noise, Pose
+
+__all__ = ["SetInit"]
+
+# Ridge of the affine camera, relative to the mean square of the world points: it keeps planes and lines apart.
+_RIDGE = 0.02
+# Features beyond this many times the spread of their kind are cut off: a wild pair need not be wilder.
+_MOST = 8.0
+# Noise is learned as a logarithm about this one, relative to the spread of the pixels and of the world.
+_LOG_NOISE = -5.0
+_FEATURES = 14
+# Added to the score of a pair that is not there.
+_ABSENT = -1e9
+
+
+class _View:
+    r"""Pairs as the network sees them: nothing depends on where world and camera point, or on their units.
+
+    The camera is turned so that the mean of the rays is its axis, and zoomed until their spread is 1; the world, which
+    comes centred and scaled, is turned to the axes of the affine camera that fits the pairs best (by ridge regression).
+    """
+
+    def __init__(self, corr: Correspondences) -> None:
+        world = corr.world_points.contiguous()
+        there = (corr.weights > 0).to(world.dtype)
+        share = (there / there.sum(1, keepdim=True).clamp(min=1.0))[..., None]  # (B, N, 1)
+        plane = corr.img_points / corr.focal
+        rays = functional.normalize(torch.cat((plane, torch.ones_like(plane[..., :1])), -1), dim=-1)
+        x, y, z = functional.normalize((share * rays).sum(1), dim=-1).unbind(-1)  # z > 0
+        k = (1.0 + z).reciprocal()
+        rows = (1.0 - k * x * x, -k * x * y, -x, -k * x * y, 1.0 - k * y * y, -y, x, y, z)
+        self.there = there
+        self.camera = torch.stack(rows, -1).unflatten(-1, (3, 3))  # (B, 3, 3), the least turn that does it
+        self.rays = rays @ self.camera.mT  # (B, N, 3)
+        tiny = 1e-12
+        self.spread = ((share * self.rays[..., :2].square()).sum((1, 2)) + tiny).sqrt()  # (B,)
+        seen = self.rays[..., :2] / self.spread[:, None, None]
+        seen = seen - (share * seen).sum(1, keepdim=True)
+
+        moment = world.mT @ (share * world) + _RIDGE * torch.eye(3, dtype=world.dtype, device=world.device)
+        affine = _solve_symmetric(moment, world.mT @ (share * seen)).mT  # (B, 2, 3)
+        self.world = _frame(affine)  # (B, 3, 3)
+        self.points = world @ self.world.mT  # (B, N, 3)
+        residual = seen - world @ affine.mT
+        sizes = 0.5 * (affine.square().sum(-1) + 1e-3).log()  # (B, 2)
+        self.log_spread = self.spread.log()
+        problem = torch.cat((self.log_spread[:, None], sizes), -1)[:, None].expand(-1, world.shape[1], -1)
+        self.known = self._known(corr)
+        noise = [torch.where(known, log - _LOG_NOISE, 0.0) for log, known in self.known]
+        flags = [known.to(world.dtype) for _, known in self.known]
+        parts = self.points, seen, residual, problem, *(x[..., None] for x in (*noise, *flags))
+        self.features = torch.cat(parts, -1).clamp(-_MOST, _MOST)
+
+    def _known(self, corr: Correspondences) -> list[tuple[Tensor, Tensor]]:
+        """Logarithms of the noise of pixels and world relative to their spread, and whether it is known."""
+        if corr.noise is None:
+            no = torch.zeros_like(corr.weights, dtype=torch.bool)
+            return [(torch.zeros_like(corr.weights), no)] * 2
+        units = corr.focal * self.spread[:, None], torch.ones_like(self.spread[:, None])
+        known = [torch.isfinite(x) for x in corr.noise]
+        safe = [torch.where(k, x / u, 1.0).clamp(min=1e-6) for x, u, k in zip(corr.noise, units, known, strict=True)]
+        return [(x.log(), k) for x, k in zip(safe, known, strict=True)]
+
+
+def _solve_symmetric(matrix: Tensor, right: Tensor) -> Tensor:
+    """Solve for positive definite matrices (B, 3, 3) by their cofactors."""
+    a, b, c = matrix.unbind(1)
+    adjugate = torch.stack((torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)), -1)
+    return (adjugate @ right) / (a * adjugate[..., 0]).sum(-1)[:, None, None]
+
+
+def _frame(affine: Tensor) -> Tensor:
+    """The rotation whose first two rows are nearest the rows of affine cameras (B, 2, 3); any where there is none."""
+    p, q = affine.unbind(1)
+    pp, pq, qq = dot(p.unbind(-1), p.unbind(-1)), dot(p.unbind(-1), q.unbind(-1)), dot(q.unbind(-1), q.unbind(-1))
+    # The inverse square root of [[pp, pq], [pq, qq]], up to a factor: (S + sqrt(det S) I)^-1.
+    ridge = 1e-3 * (pp + qq) + 1e-6
+    root = ((pp + ridge) * (qq + ridge) - pq * pq).clamp(min=1e-12).sqrt()
+    u = (qq + ridge + root)[:, None] * p - pq[:, None] * q
+    axis = torch.eye(3, dtype=u.dtype, device=u.device)[0]
+    u = functional.normalize(u + 1e-6 * axis, dim=-1)
+    v = (pp + ridge + root)[:, None] * q - pq[:, None] * p
+    v = v - (u * v).sum(-1, keepdim=True) * u + 1e-6 * _orthogonal(u)
+    v = functional.normalize(v, dim=-1)
+    return torch.stack((u, v, torch.linalg.cross(u, v)), 1)
+
+
+def _orthogonal(unit: Tensor) -> Tensor:
+    """A unit vector orthogonal to each, (B, 3)."""
+    x, y, z = unit.unbind(-1)
+    sign = torch.where(z < 0, -1.0, 1.0)
+    a = -(sign + z).reciprocal()
+    return torch.stack((1.0 + sign * x * x * a, sign * x * y * a, -sign * x), -1)
+
+
+class _Block(nn.Module):
+    """A residual layer on each pair with what some heads of attention see of all pairs."""
+
+    def __init__(self, width: int, heads: int, hidden: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.norm = nn.LayerNorm(width)
+        self.look = nn.Linear(width, width + heads)
+        self.pair = nn.Linear(width, hidden)
+        self.all = nn.Linear(width, hidden, bias=False)
+        self.out = nn.Linear(hidden, width)
+        with torch.no_grad():
+            self.out.weight *= 0.5
+            self.out.bias.zero_()
+
+    def forward(self, x: Tensor, absent: Tensor) -> Tensor:
+        """From (B, N, width) to the same; ``absent`` is minus infinity, or much, where there is no pair."""
+        y = self.norm(x)
+        values, scores = self.look(y).split((x.shape[-1], self.heads), -1)
+        attention = (scores + absent).softmax(1)  # (B, N, heads)
+        parts = values.unflatten(-1, (self.heads, -1))
+        context = (attention[..., None] * parts).sum(1).flatten(1)  # (B, width)
+        return x + self.out(functional.relu(self.pair(y) + self.all(context)[:, None]))
+
+
+class SetInit(nn.Module):
+    r"""A small network over the set of pairs: several coarse poses, a weight for each pair, and the noise.
+
+    Each pair passes residual layers that see all pairs through attention pooled over them: the cost is linear in their
+    number, and their order does not matter. For each of ``starts`` hypotheses the network then says how far along its
+    ray each point is and how much that counts, and the pose is the rigid motion that brings the world points there
+    (weighted least squares in closed form). So the poses are as equivariant as the network's input is invariant: to
+    similarity transforms of the world, also turns by any angle, and to the choice of the camera's axes but for its
+    roll; intrinsics enter as rays alone. The network runs in the dtype of its weights, what is around it in that of
+    the correspondences.
+
+    A pair weighs as much as it is likely to be right. The noise of pixels and points, which tells
+    the refinement how far pairs may be off, is what :attr:`~kornia_pnpnet.types.Correspondences.noise` says, or the
+    network's estimate where that says nothing.
+
+    The design is ours. Distances along rays before a closed-form alignment: J. Hesch and S. Roumeliotis, "A direct
+    least-squares method for PnP", ICCV 2011, among many; attention that is pooled over correspondences: W. Sun et al.,
+    "ACNe: Attentive context normalization for robust permutation-equivariant learning", CVPR 2020.
+
+    Args:
+        width: channels of each pair.
+        layers: residual layers.
+        heads: of the attention in each.
+        hidden: channels inside a layer.
+        starts: hypotheses, at least 1.
+
+    Raises:
+        BaseError: for numbers below 1, or a width that the heads do not divide.
+
+    Example:
+        >>> corr = Correspondences(torch.randn(2, 7, 3), torch.randn(2, 7, 2), torch.ones(2, 7), torch.tensor(3400.0))
+        >>> guess = SetInit(starts=3)(corr)
+        >>> guess.pose.rotation.shape, guess.others.translation.shape, guess.weights.shape
+        (torch.Size([2, 3, 3]), torch.Size([2, 2, 3]), torch.Size([2, 7]))
+    """
+
+    def __init__(self, *, width: int = 32, layers: int = 4, heads: int = 4, hidden: int = 64, starts: int = 4) -> None:
+        super().__init__()
+        self.config = {"width": width, "layers": layers, "heads": heads, "hidden": hidden, "starts": starts}
+        for name, value in self.config.items():
+            KORNIA_CHECK(type(value) is int and value >= 1, f"{name} must be an integer of at least 1, got {value!r}.")
+        KORNIA_CHECK(width % heads == 0, f"heads must divide width, got {heads} and {width}.")
+        self.starts = starts
+        self.first = nn.Linear(_FEATURES, width)
+        self.blocks = nn.ModuleList(_Block(width, heads, hidden) for _ in range(layers))
+        self.norm = nn.LayerNorm(width)
+        # For each pair: whether it is right; for each hypothesis how much it counts and how far along its ray it is.
+        self.pair = nn.Linear(width, 1 + 2 * starts)
+        # For each problem: how far the world is in each hypothesis; the noise of pixels and points.
+        self.problem = nn.Linear(width, starts + 2)
+        with torch.no_grad():
+            self.pair.weight *= 0.3
+            self.problem.weight *= 0.1
+            for layer in (self.pair, self.problem):
+                layer.bias.zero_()
+            self.pair.bias[0] = 2.0
+
+    def extra_repr(self) -> str:
+        """Show the constructor's arguments."""
+        return ", ".join(f"{key}={value!r}" for key, value in self.config.items())
+
+    def forward(self, corr: Correspondences) -> Guess:
+        """Guess poses, weights and noise.
+
+        Args:
+            corr: normalised correspondences of a centred and scaled world, of any :math:`N`, in any order.
+
+        Returns:
+            The first hypothesis as the pose and the rest as others; likelihoods as weights; the noise of each pair.
+        """
+        view = _View(corr)
+        dtype = corr.world_points.dtype
+        pair, problem = (x.to(dtype) for x in self._run(view.features, view.there))
+        starts = self.starts
+        right = torch.sigmoid(pair[..., 0])
+        counts, along = pair[..., 1:].movedim(-1, 0).unflatten(0, (2, starts)).unbind(0)  # (S, B, N) each
+        away, noise = problem.split((starts, 2), -1)
+        # Points are at the distance of the world's centre plus what lies between, so that far worlds keep their relief.
+        distance = (away.clamp(-6.0, 6.0) - view.log_spread[:, None]).exp().mT[..., None]  # (S, B, 1)
+        relief = (view.points[..., 2] + 3.0 * along) / distance
+        ranges = distance * relief.clamp(-3.0, 3.0).exp()
+        counts = (right * torch.exp(3.0 * torch.tanh(counts)) + 1e-6) * view.there
+        source = view.points.expand(starts, -1, -1, -1).flatten(0, 1)
+        pose, _ = align(source, (ranges[..., None] * view.rays).flatten(0, 1), counts.flatten(0, 1))
+        rotation, translation = (x.unflatten(0, (starts, -1)) for x in pose)
+        rotation = view.camera.mT @ rotation @ view.world
+        translation = (view.camera.mT @ translation[..., None])[..., 0]
+        return Guess(
+            Pose(rotation[0], translation[0]),
+            right,
+            others=Pose(rotation[1:].movedim(0, 1), translation[1:].movedim(0, 1)) if starts > 1 else None,
+            noise=self._noise(corr, view, noise),
+        )
+
+    def _run(self, features: Tensor, there: Tensor) -> tuple[Tensor, Tensor]:
+        """The network: outputs for each pair, (B, N, 1 + 2 S), and for each problem, (B, S + 2)."""
+        x = self.first(features.to(self.first.weight.dtype))
+        absent = torch.where(there > 0, 0.0, _ABSENT).to(x.dtype)[..., None]
+        for block in self.blocks:
+            x = block(x, absent)
+        x = self.norm(x)
+        pair = self.pair(x)
+        share = (pair[..., :1] + absent).softmax(1)
+        return pair, self.problem((share * x).sum(1))
+
+    def _noise(self, corr: Correspondences, view: _View, estimate: Tensor) -> Noise:
+        """What is known of the noise, and the network's estimate of the rest."""
+        units = (corr.focal * view.spread)[:, None], torch.ones_like(view.spread)[:, None]
+        pairs = []
+        for i, ((log, known), unit) in enumerate(zip(view.known, units, strict=True)):
+            guessed = _LOG_NOISE + 3.0 * torch.tanh(estimate[:, i : i + 1])
+            pairs.append(torch.where(known, log, guessed).exp() * unit)
+        return Noise(*pairs)

@@ -1,0 +1,195 @@
+"""The set network: what it must not depend on, what it must pass on, and what a few steps of training make of it."""
+
+import math
+
+import pytest
+import torch
+from kornia.core.exceptions import BaseError
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+
+from kornia_pnpnet import Normalize, PnPNet, Pose, RobustWeightedLM, SetInit, SetLoss, pose_errors, success
+from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+
+NOISE = {"img_sigma": 1.0, "world_sigma": 0.05}
+
+
+def solver(**options):
+    torch.manual_seed(0)
+    refine = RobustWeightedLM(4, kernel="geman_mcclure", robustness=6.0)
+    return PnPNet(SetInit(**options), refine, Normalize(order=False)).double().eval()
+
+
+def near(a, b, tolerance=1e-6):
+    for mine, others in zip(a, b, strict=True):
+        torch.testing.assert_close(mine, others, rtol=tolerance, atol=tolerance)
+
+
+@pytest.mark.parametrize("n", [4, 5, 9, 50, 1000])
+def test_any_number_of_pairs(n, make_problems):
+    p = make_problems(n=n, batch=3)
+    result = solver()(*p[:3])
+    assert result.weights.shape == (3, n)
+    assert result.matrix.isfinite().all()
+    assert ((result.weights >= 0) & (result.weights <= 1)).all()
+
+
+def test_the_order_of_the_pairs_does_not_matter(make_problems):
+    p = make_problems(n=12, outliers=3)
+    order = torch.randperm(12, generator=torch.Generator().manual_seed(0))
+    net = solver()
+    plain, shuffled = net(*p[:3]), net(p.world_points[:, order], p.img_points[:, order], p.intrinsics)
+    near(plain.init, shuffled.init)
+    near(plain.pose, shuffled.pose)
+    near([plain.weights[:, order]], [shuffled.weights])
+
+
+def test_poses_follow_similarity_transforms_of_the_world(make_problems):
+    """Turned by any angle, moved, in another unit: the network alone, and with known noise all of the solver."""
+    p = make_problems(n=9, batch=20, outliers=2)
+    net = solver()
+    generator = torch.Generator().manual_seed(1)
+    axis = torch.nn.functional.normalize(torch.randn(20, 3, generator=generator, dtype=torch.float64), dim=-1)
+    turn = axis_angle_to_rotation_matrix(axis * math.pi * torch.rand(20, 1, generator=generator, dtype=torch.float64))
+    shift, unit = torch.randn(20, 3, generator=generator, dtype=torch.float64) * 100, 1000.0
+    world = (unit * p.world_points) @ turn.mT + shift[:, None]
+
+    def back(pose):
+        """A pose of the other world, expressed for the first."""
+        rotation = pose.rotation @ turn
+        return Pose(rotation, (pose.translation + (pose.rotation @ shift[..., None])[..., 0]) / unit)
+
+    for noise, other in (({}, {}), (NOISE, {"img_sigma": 1.0, "world_sigma": 0.05 * unit})):
+        first, second = net(*p[:3], **noise), net(world, *p[1:3], **other)
+        near(back(second.init), first.init, 1e-5)
+        near(back(second.pose), first.pose, 1e-4)
+        near([second.weights], [first.weights], 1e-4)
+        assert torch.equal(first.ok, second.ok)
+
+
+def test_cameras_enter_as_rays(make_problems):
+    """Another focal length and principal point with the pixels that go with them change nothing."""
+    p = make_problems(n=9, batch=10, outliers=2)
+    K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=torch.float64)
+    focal = p.intrinsics[0, 0, 0]
+    pixels = p.img_points / focal * 500.0 + K[:2, 2]
+    net = solver()
+    noise = {"img_sigma": 500.0 / focal.item(), "world_sigma": 0.05}
+    near(net(p.world_points, pixels, K, **noise).pose, net(*p[:3], **NOISE).pose)
+
+
+def test_padding_does_not_matter(make_problems):
+    p = make_problems(n=9, batch=5)
+    net = solver()
+    plain = net(*p[:3])
+    world, pixels = (torch.cat((x, torch.full_like(x[:, :4], 7.0)), 1) for x in p[:2])
+    mask = torch.arange(13).expand(5, 13) < 9
+    padded = net(world, pixels, p.intrinsics, mask=mask)
+    near(padded.pose, plain.pose)
+    near([padded.weights[:, :9]], [plain.weights])
+    assert (padded.weights[:, 9:] == 0).all()
+
+
+def test_bad_problems_change_no_other_and_leave_finite_gradients(make_problems):
+    p = make_problems(n=9, batch=8)
+    world, pixels = p.world_points.clone(), p.img_points.clone()
+    world[1, 3] = torch.nan
+    pixels[2] = 5.0  # one pixel
+    world[3] = world[3, :1] + torch.linspace(0, 1, 9, dtype=torch.float64)[:, None] * world[3, 1:2]  # a line
+    pixels[4, :, 1] = 0.0  # a line of pixels
+    pixels[5] = torch.inf
+    world[6, :, 2] = 0.0  # a plane that the camera may see edge on
+    net = solver().train()
+    world.requires_grad_()
+    result = net(world, pixels, p.intrinsics)
+    plain = net(*p[:3])
+    for mine, others in zip(result[:5], plain[:5], strict=True):
+        assert torch.equal(mine[[0, 7]], others[[0, 7]])
+    assert result.matrix.isfinite().all()
+    assert not result.ok[[1, 3, 5]].any()
+    (result.init.rotation.sum() + result.rotation.sum() + result.weights.sum()).backward()
+    assert world.grad.isfinite().all()
+    assert all(parameter.grad.isfinite().all() for parameter in net.parameters() if parameter.grad is not None)
+
+
+def test_the_poses_are_rigid_and_there_are_as_many_as_were_asked_for(make_problems):
+    p = make_problems(n=9, batch=30, outliers=3)
+    corr, _ = Normalize(order=False)(*p[:3])
+    for starts in (1, 3):
+        guess = solver(starts=starts).init(corr)
+        rotations = guess.pose.rotation[:, None]
+        if starts > 1:
+            assert guess.others.translation.shape == (30, starts - 1, 3)
+            rotations = torch.cat((rotations, guess.others.rotation), 1)
+        else:
+            assert guess.others is None
+        eye = torch.eye(3, dtype=torch.float64).expand_as(rotations)
+        torch.testing.assert_close(rotations @ rotations.mT, eye)
+        torch.testing.assert_close(torch.linalg.det(rotations), torch.ones_like(rotations[..., 0, 0]))
+
+
+def test_noise_that_is_told_is_used_as_it_is_and_the_rest_is_estimated(make_problems):
+    p = make_problems(n=9, batch=4)
+    net = solver().train()
+    told = torch.tensor([0.5, torch.nan, 2.0, torch.nan], dtype=torch.float64)
+    noise = net(*p[:3], img_sigma=told).guess.noise
+    known = ~told.isnan()
+    torch.testing.assert_close(noise.img[known], told[known, None].expand(-1, 9))
+    estimated = net(*p[:3]).guess.noise
+    assert noise.img.isfinite().all()
+    assert ((noise.world > 0) & noise.world.isfinite()).all()
+    torch.testing.assert_close(noise.img[~known], estimated.img[~known])
+    of_pairs = torch.rand(4, 9, dtype=torch.float64) + 0.1
+    torch.testing.assert_close(net(*p[:3], world_sigma=of_pairs).guess.noise.world, of_pairs)
+
+
+def test_a_pose_by_hand_takes_the_place_of_the_guesses(make_problems, perturb):
+    p = make_problems(n=9, batch=20, outliers=2)
+    net = solver()
+    start = perturb(p.pose)
+    result = net(*p[:3], init=start, **NOISE)
+    near(result.init, start)
+    errors = pose_errors(result.pose, p.pose)
+    assert success(errors).double().mean() > 0.5  # an untrained network's own guesses are not that good
+    assert result.weights.isfinite().all()
+
+
+def test_float64_pairs_take_float32_weights(make_problems):
+    p = make_problems(n=9, batch=4)
+    result = solver().float()(*p[:3])
+    assert result.rotation.dtype == torch.float64
+
+
+@pytest.mark.parametrize("options", [{"width": 0}, {"width": 30, "heads": 4}, {"starts": 0}, {"layers": 1.5}])
+def test_numbers_that_make_no_network_are_refused(options):
+    with pytest.raises(BaseError, match="must"):
+        SetInit(**options)
+
+
+def test_it_is_saved_and_loaded(make_problems, tmp_path):
+    p = make_problems(n=9, batch=4)
+    net = solver(width=16, heads=2, starts=2)
+    net.save_pretrained(tmp_path)
+    near(PnPNet.from_pretrained(tmp_path).double()(*p[:3]).pose, net(*p[:3]).pose, 1e-5)
+
+
+def test_it_learns():
+    """In a hundred small steps: any rotation, with a third of the pairs wrong."""
+    torch.manual_seed(0)
+    refine = RobustWeightedLM(6, kernel="geman_mcclure", robustness=20.0)
+    net = PnPNet(SetInit(width=16, layers=2, hidden=32), refine, Normalize(order=False))
+    data = SyntheticProblems(n=9, batch_size=200, seed=1, outliers=OutlierMix(), max_angle=math.pi, told=0.5)
+    fresh = SyntheticProblems(n=9, batch_size=1000, seed=2, outliers=OutlierMix(), max_angle=math.pi).batch(0)
+    loss, optimizer = SetLoss(), torch.optim.Adam(net.parameters(), lr=4e-3)
+
+    def rate():
+        with torch.no_grad():
+            return success(pose_errors(net(*fresh[:3], **NOISE).pose, fresh.pose)).double().mean().item()
+
+    before = rate()
+    for i in range(100):
+        p = data.batch(i)
+        optimizer.zero_grad()
+        loss(net(*p[:3], **p.told), p).total.backward()
+        torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
+        optimizer.step()
+    assert rate() > max(0.65, before + 0.2)
