@@ -529,14 +529,14 @@ def ablation_text(rows: Sequence[Row]) -> str:
     sets = [key.removesuffix("/rate") for key in rows[0] if key.endswith("/rate")]
     recipe = [row for row in rows if row["experiment"] == "recipe"]
     lines = [
-        "| Run | " + " | ".join(f"{data} (%)" for data in sets) + " | µs |",
-        "|---" + "|---:" * (len(sets) + 1) + "|",
+        "| Run | " + " | ".join(f"{data} (%)" for data in sets) + " |",
+        "|---" + "|---:" * len(sets) + "|",
     ]
     for row in [*recipe, *(row for row in rows if row not in recipe)]:
         seed = f"seed={row['seed']}" if row.get("seed") else ""
         name = " ".join(filter(None, (row["experiment"], row.get(KERNEL), seed)))
         cells = ["{:.1f} [{:.1f}, {:.1f}]".format(*percent(row, data)) for data in sets]
-        lines.append(f"| `{name}` | " + " | ".join(cells) + f" | {float(row['us_per_problem']):.0f} |")
+        lines.append(f"| `{name}` | " + " | ".join(cells) + " |")
     findings = []
     for experiment in dict.fromkeys(row["experiment"] for row in rows if row not in recipe):
         findings.append(f"- `{experiment}`. *Claim:* {claim(experiment)}")
