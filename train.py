@@ -104,10 +104,13 @@ def main(config: DictConfig) -> float | None:
 
 
 def start_from(model: PnPNet, trained: PnPNet) -> None:
-    """Give a solver the weights of another one; where that has other iterations, its own start anew."""
+    """Give a solver the weights of another one; where that refines in another way, its own refinement starts anew."""
     state = trained.state_dict()
-    if trained.refine.m != model.refine.m:
-        log.info("The weights have m = %s: only the network starts from them.", trained.refine.m)
+    before, now = (
+        {key: refine.config[key] for key in ("m", "kernel", "shared")} for refine in (trained.refine, model.refine)
+    )
+    if before != now:
+        log.info("The weights are of a refinement with %s: only the network starts from them.", before)
         state = {name: value for name, value in state.items() if not name.startswith("refine.")}
         state |= {f"refine.{name}": value for name, value in model.refine.state_dict().items()}
     model.load_state_dict(state)

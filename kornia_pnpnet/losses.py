@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from kornia_pnpnet.geometry import transform
-from kornia_pnpnet.types import Noise, PnPResult, Pose, Problems
+from kornia_pnpnet.types import Guess, Noise, PnPResult, Pose, Problems
 
 __all__ = ["LossTerms", "PoseLoss", "SetLoss", "pose_distances"]
 
@@ -185,19 +185,18 @@ class SetLoss(nn.Module):
         self.rotation_unit = 2.0**0.5 * math.radians(rotation_unit)  # as a chordal distance
         self.translation_unit = translation_unit
 
-    def forward(self, result: PnPResult, problems: Problems, ramp: float = 1.0) -> LossTerms:
+    def forward(self, result: PnPResult, problems: Problems, ramp: float, guess: Guess) -> LossTerms:
         """Compare a solver's result with the truth.
 
         Args:
-            result: of a solver in training mode.
+            result: of :math:`B` problems.
             problems: what was solved, with the true poses.
             ramp: factor of the refined terms, 0 at the start of the training. Then no gradient goes through them.
+            guess: what the result was refined from, see :meth:`~kornia_pnpnet.model.PnPNet.with_guess`.
 
         Returns:
             The loss and its terms, means over the batch.
         """
-        guess = result.guess
-        assert guess is not None
         hypotheses = [x[:, None] for x in guess.pose]
         if guess.others is not None:
             hypotheses = [torch.cat(x, 1) for x in zip(hypotheses, guess.others, strict=True)]

@@ -194,15 +194,45 @@ class PnPNet(nn.Module):
             TypeCheckError: for dtypes that differ or are not float32 or float64.
             DeviceError: for tensors on different devices.
         """
-        check_inputs(world_points, img_points, intrinsics, weights, mask, init)
-        noise = None
-        if img_sigma is not None or world_sigma is not None:
-            sigmas = ("img_sigma", img_sigma), ("world_sigma", world_sigma)
-            noise = Noise(*(_sigmas(name, sigma, world_points) for name, sigma in sigmas))
-        if intrinsics.ndim == 2:
-            intrinsics = intrinsics.expand(world_points.shape[0], 3, 3)
+        inputs = _prepared(world_points, img_points, intrinsics, weights, mask, init, img_sigma, world_sigma)
         with torch.autocast(world_points.device.type, enabled=False):
-            return self._solve(first_stage_only, world_points, img_points, intrinsics, weights, mask, init, noise)
+            return self._solve(first_stage_only, *inputs)
+
+    def with_guess(
+        self,
+        world_points: Tensor,
+        img_points: Tensor,
+        intrinsics: Tensor,
+        weights: Tensor | None = None,
+        mask: Tensor | None = None,
+        init: Pose | None = None,
+        *,
+        img_sigma: Tensor | float | None = None,
+        world_sigma: Tensor | float | None = None,
+        first_stage_only: bool = False,
+    ) -> tuple[PnPResult, Guess]:
+        """As a call, and all that the first guess was, to train it: poses, weights and noise.
+
+        Args:
+            world_points: as of a call, and so are the others.
+            img_points: likewise.
+            intrinsics: likewise.
+            weights: likewise.
+            mask: likewise.
+            init: likewise.
+            img_sigma: likewise.
+            world_sigma: likewise.
+            first_stage_only: likewise.
+
+        Returns:
+            The result, and the guess in the frame, the order and the units of the inputs; its ``ok`` is whether the
+            problem is sound.
+        """
+        inputs = _prepared(world_points, img_points, intrinsics, weights, mask, init, img_sigma, world_sigma)
+        with torch.autocast(world_points.device.type, enabled=False):
+            stage = self._begin(1 if first_stage_only or self.refine.m == 0 else self.views, *inputs)
+            end = self.refine.iterate(stage.start, 0 if first_stage_only else None)
+            return self._finish(stage, end), self._whole_guess(stage)
 
     def _in_parts(self, first_stage_only: bool, *inputs: Any) -> PnPResult:
         """What is before the iterations, they themselves, and what is after them; inputs as of :meth:`_guess`."""
@@ -277,7 +307,6 @@ class PnPNet(nn.Module):
     def _result(self, stage: _Stage, end: LMStep) -> PnPResult:
         """Everything after the last iteration."""
         start, frame, guess = stage
-        training = self.training and isinstance(self.init, SetInit)
         refined = self.refine.finish(start, end)
         pose = self.normalize.undo(refined.pose, frame)
         first = self.normalize.undo(guess.pose, frame)
@@ -297,25 +326,25 @@ class PnPNet(nn.Module):
             _gate(refined.cost, ok, finite, torch.finfo(refined.cost.dtype).max ** 0.5),
             ok,
             _gate_pose(first, first_ok, first_ok),
-            self._whole_guess(start, guess, first, frame) if training else None,
         )
 
-    def _whole_guess(self, start: LMStart, guess: Guess, first: Pose, frame: Frame) -> Guess:
+    def _whole_guess(self, stage: _Stage) -> Guess:
         """A first guess in the frame, the order and the units of the inputs."""
-        others = guess.others
+        start, frame, guess = stage
+        others, noise, weights = guess.others, guess.noise, guess.weights
         if others is not None:
             count = others.rotation.shape[1]
             many = Frame(*(x.repeat_interleave(count, 0) for x in frame))
             flat = self.normalize.undo(Pose(*(x.flatten(0, 1) for x in others)), many)
             others = Pose(*(x.unflatten(0, (-1, count)) for x in flat))
-        weights = guess.weights
         if self.normalize.order:
             weights = torch.zeros_like(weights).scatter(1, frame.order, weights)
-        noise = guess.noise
         if noise is not None:
             scales = start.corr.img_scale, start.corr.world_scale
             noise = Noise(*(x if s is None else x / s[:, None] for x, s in zip(noise, scales, strict=True)))
-        return Guess(first, weights, frame.valid, others, noise)
+            if self.normalize.order:
+                noise = Noise(*(torch.zeros_like(x).scatter(1, frame.order, x) for x in noise))
+        return Guess(self.normalize.undo(guess.pose, frame), weights, frame.valid, others, noise)
 
     def _given(self, init: Pose | None, weights: Tensor, world_points: Tensor, frame: Frame) -> Guess:
         """Bring a pose given by hand (or the identity) to the normalised frame."""
@@ -451,6 +480,27 @@ def _gate_pose(pose: Pose, ok: Tensor, finite: Tensor) -> Pose:
     """:func:`_gate` for a pose; the identity fills."""
     eye = torch.eye(3, dtype=pose.rotation.dtype, device=pose.rotation.device)
     return Pose(_gate(pose.rotation, ok, finite, eye), _gate(pose.translation, ok, finite, 0.0))
+
+
+def _prepared(
+    world_points: Tensor,
+    img_points: Tensor,
+    intrinsics: Tensor,
+    weights: Tensor | None,
+    mask: Tensor | None,
+    init: Pose | None,
+    img_sigma: Tensor | float | None,
+    world_sigma: Tensor | float | None,
+) -> tuple[Any, ...]:
+    """Checked inputs: a camera for each problem, and the noise of each pair where any of it is known."""
+    check_inputs(world_points, img_points, intrinsics, weights, mask, init)
+    noise = None
+    if img_sigma is not None or world_sigma is not None:
+        sigmas = ("img_sigma", img_sigma), ("world_sigma", world_sigma)
+        noise = Noise(*(_sigmas(name, sigma, world_points) for name, sigma in sigmas))
+    if intrinsics.ndim == 2:
+        intrinsics = intrinsics.expand(world_points.shape[0], 3, 3)
+    return world_points, img_points, intrinsics, weights, mask, init, noise
 
 
 def _sigmas(name: str, sigma: Tensor | float | None, like: Tensor) -> Tensor:

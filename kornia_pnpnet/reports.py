@@ -26,7 +26,6 @@ __all__ = [
     "collect_weights",
     "find_results",
     "run_results",
-    "solver_results",
     "summarize_runs",
     "write_json",
     "write_model_card",
@@ -43,6 +42,7 @@ def write_json(path: str | Path, content: Any) -> None:
         file.write(json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
+@torch.no_grad()
 def run_results(
     model: PnPNet,
     validation: Mapping[str, Problems],
@@ -64,30 +64,6 @@ def run_results(
     Returns:
         Plain data, ready for :func:`write_json`.
     """
-    step, damping, robustness = model.refine.hyperparameters(torch.zeros((), dtype=torch.float64))
-    learned = {"step": step.tolist(), "damping": damping.tolist(), "robustness": robustness.tolist()}
-    return {
-        "overrides": overrides,
-        "run": asdict(report),
-        "learned": learned,
-        "config": config,
-        "environment": environment(),
-        "origin": origin,
-        **solver_results(model, validation),
-    }
-
-
-@torch.no_grad()
-def solver_results(model: PnPNet, validation: Mapping[str, Problems]) -> dict[str, Any]:
-    """What of :func:`run_results` is not about the training: the entries ``model``, ``validation``, ``us_per_problem``.
-
-    Args:
-        model: the solver.
-        validation: problems by name.
-
-    Returns:
-        Plain data.
-    """
     sets = {}
     for name, problems in validation.items():
         result = model(*problems[:3], **problems.told)
@@ -101,7 +77,19 @@ def solver_results(model: PnPNet, validation: Mapping[str, Problems]) -> dict[st
             "first_stage_median_rotation_error_deg": first.rotation_error_deg.median().item(),
             "first_stage_median_translation_error": first.translation_error.median().item(),
         }
-    return {"model": model.config(), "validation": sets, "us_per_problem": _us_per_problem(model, problems)}
+    step, damping, robustness = model.refine.hyperparameters(torch.zeros((), dtype=torch.float64))
+    learned = {"step": step.tolist(), "damping": damping.tolist(), "robustness": robustness.tolist()}
+    return {
+        "overrides": overrides,
+        "run": asdict(report),
+        "us_per_problem": _us_per_problem(model, problems),
+        "validation": sets,
+        "learned": learned,
+        "model": model.config(),
+        "config": config,
+        "environment": environment(),
+        "origin": origin,
+    }
 
 
 def find_results(weights: str | Path) -> dict[str, Any] | None:
@@ -245,9 +233,7 @@ def write_model_card(folder: str | Path, results: Mapping[str, Any], *, name: st
     n, m = config["model"]["n"], model["refine"]["m"]
     start, scope = ("The paper's network", "Exactly") if model["init"] else ("A start from the identity", "Trained on")
     views = model["views"]
-    trained = config["model"].get("views", 1)
     guesses = f" from {views} guesses for each problem" if views > 1 else ""
-    guesses += f", {trained} in training" if trained != views else ""
     lines = [
         f"# {name or config['name']}",
         "",
@@ -275,7 +261,10 @@ def write_model_card(folder: str | Path, results: Mapping[str, Any], *, name: st
         )
     if m > 0:
         lines += ["", "## Learned hyperparameters", ""]
-        lines += ["| Iteration | step γ | damping λ | robustness |", "|---|---|---|---|"]
+        lines += [
+            f"| Iteration | step γ | damping λ | robustness (`{model['refine']['kernel']}`) |",
+            "|---|---|---|---|",
+        ]
         for i, (step, damping, shape) in enumerate(zip(*learned.values(), strict=True), 1):
             lines.append(f"| {i} | {step:.3f} | {damping:.2e} | {shape:.3f} |")
     centred = model["normalize"]["center"] and model["normalize"]["scale"]

@@ -233,6 +233,7 @@ def fit(
     optimizer = torch.optim.Adam(groups, fused=True)
     parameters = [p for params, _ in trained for p in params]
     solver, fabric_optimizer = fabric.setup(model, optimizer)
+    solver.mark_forward_method("with_guess")
     if state is not None:  # now that the parameters are on their device, so that Adam's state follows them
         for group in state["optimizer"]["param_groups"]:
             group["fused"] = True  # how a step is computed is this code's choice, not the checkpoint's
@@ -270,7 +271,11 @@ def fit(
             clock.lap("rest")
             problems = _share(next(batches), fabric)
             clock.lap("data")
-            terms = loss(solver(*problems[:3], **problems.told, first_stage_only=ramp == 0.0), problems, ramp)
+            call = solver.with_guess if isinstance(loss, SetLoss) else solver
+            found = call(*problems[:3], **problems.told, first_stage_only=ramp == 0.0)
+            terms = (
+                loss(found[0], problems, ramp, found[1]) if isinstance(loss, SetLoss) else loss(found, problems, ramp)
+            )
             # The zero keeps the refiner in the graph before the ramp: processes expect gradients of every parameter.
             unused = sum(p.sum() for p in model.refine.parameters() if p.requires_grad) if ramp == 0.0 else 0.0
             clock.lap("forward")

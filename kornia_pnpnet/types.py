@@ -139,8 +139,6 @@ class PnPResult(NamedTuple):
             carry no gradient.
         init: the first guess that was refined. It carries a gradient whenever the problem itself is sound, so that it
             can be trained from guesses that refinement cannot save.
-        guess: all of the first guess, in the frame, the order and the units of the inputs, to train from; ``None`` but
-            from a solver in training mode.
     """
 
     rotation: Tensor
@@ -149,7 +147,6 @@ class PnPResult(NamedTuple):
     cost: Tensor
     ok: Tensor
     init: Pose
-    guess: Guess | None = None
 
     @property
     def pose(self) -> Pose:

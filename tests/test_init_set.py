@@ -98,7 +98,7 @@ def test_bad_problems_change_no_other_and_leave_finite_gradients(make_problems):
     pixels[4, :, 1] = 0.0  # a line of pixels
     pixels[5] = torch.inf
     world[6, :, 2] = 0.0  # a plane that the camera may see edge on
-    net = solver().train()
+    net = solver()
     world.requires_grad_()
     result = net(world, pixels, p.intrinsics)
     plain = net(*p[:3])
@@ -129,17 +129,17 @@ def test_the_poses_are_rigid_and_there_are_as_many_as_were_asked_for(make_proble
 
 def test_noise_that_is_told_is_used_as_it_is_and_the_rest_is_estimated(make_problems):
     p = make_problems(n=9, batch=4)
-    net = solver().train()
+    net = solver()
     told = torch.tensor([0.5, torch.nan, 2.0, torch.nan], dtype=torch.float64)
-    noise = net(*p[:3], img_sigma=told).guess.noise
+    noise = net.with_guess(*p[:3], img_sigma=told)[1].noise
     known = ~told.isnan()
     torch.testing.assert_close(noise.img[known], told[known, None].expand(-1, 9))
-    estimated = net(*p[:3]).guess.noise
+    estimated = net.with_guess(*p[:3])[1].noise
     assert noise.img.isfinite().all()
     assert ((noise.world > 0) & noise.world.isfinite()).all()
     torch.testing.assert_close(noise.img[~known], estimated.img[~known])
     of_pairs = torch.rand(4, 9, dtype=torch.float64) + 0.1
-    torch.testing.assert_close(net(*p[:3], world_sigma=of_pairs).guess.noise.world, of_pairs)
+    torch.testing.assert_close(net.with_guess(*p[:3], world_sigma=of_pairs)[1].noise.world, of_pairs)
 
 
 def test_a_pose_by_hand_takes_the_place_of_the_guesses(make_problems, perturb):
@@ -189,7 +189,8 @@ def test_it_learns():
     for i in range(100):
         p = data.batch(i)
         optimizer.zero_grad()
-        loss(net(*p[:3], **p.told), p).total.backward()
+        result, guess = net.with_guess(*p[:3], **p.told)
+        loss(result, p, 1.0, guess).total.backward()
         torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
         optimizer.step()
     assert rate() > max(0.65, before + 0.2)

@@ -114,18 +114,18 @@ def test_the_first_stage_is_not_saturated(make_problems):
 # --- the set loss ---------------------------------------------------------------------------------------------------
 
 
-def trained_result(problems, refined, hypotheses, noise=None, weights=None):
-    """A result of a solver in training mode, with these hypotheses."""
+def terms_of(loss, problems, refined, hypotheses, noise=None, weights=None, ramp=1.0):
+    """The loss of a result that was refined from these hypotheses."""
     first, others = hypotheses[0], hypotheses[1:]
     stacked = Pose(*(torch.stack(parts, 1) for parts in zip(*others, strict=True))) if others else None
     weights = problems.inliers.double() if weights is None else weights
-    result = solved(problems, first, refined)
-    return result._replace(weights=weights, guess=Guess(first, weights, result.ok, stacked, noise))
+    result = solved(problems, first, refined)._replace(weights=weights)
+    return loss(result, problems, ramp, Guess(first, weights, result.ok, stacked, noise))
 
 
 def test_a_perfect_set_result_costs_nothing(make_problems, perturb):
     p = make_problems(outliers=3)
-    terms = SetLoss(every=0.0)(trained_result(p, p.pose, [perturb(p.pose, angle=1.0), p.pose]), p)
+    terms = terms_of(SetLoss(every=0.0), p, p.pose, [perturb(p.pose, angle=1.0), p.pose])
     assert terms.total < 1e-5
     assert terms.weights < 1e-5
 
@@ -134,10 +134,10 @@ def test_the_best_hypothesis_counts_and_a_little_all_of_them(make_problems, pert
     p = make_problems()
     near, far = perturb(p.pose, angle=0.1, shift=0.0), perturb(p.pose, angle=1.0, shift=0.0)
     few, many = ([near], [far, near, far])
-    alone, several = (SetLoss(every=0.0)(trained_result(p, p.pose, x), p).total for x in (few, many))
+    alone, several = (terms_of(SetLoss(every=0.0), p, p.pose, x).total for x in (few, many))
     torch.testing.assert_close(alone, several)
-    only_far = SetLoss(every=0.0)(trained_result(p, p.pose, [far]), p).total
-    mixed = SetLoss(every=0.3)(trained_result(p, p.pose, many), p).total
+    only_far = terms_of(SetLoss(every=0.0), p, p.pose, [far]).total
+    mixed = terms_of(SetLoss(every=0.3), p, p.pose, many).total
     torch.testing.assert_close(mixed, 0.7 * alone + 0.3 * (alone + 2 * only_far) / 3)
 
 
@@ -149,17 +149,15 @@ def test_the_set_loss_has_no_unit(make_problems, perturb):
         return Pose(pose.rotation, 1000.0 * pose.translation)
 
     large = p._replace(world_points=1000.0 * p.world_points, pose=scaled(p.pose))
-    small_loss = SetLoss()(trained_result(p, refined, [first]), p).total
-    torch.testing.assert_close(
-        SetLoss()(trained_result(large, scaled(refined), [scaled(first)]), large).total, small_loss
-    )
+    small_loss = terms_of(SetLoss(), p, refined, [first]).total
+    torch.testing.assert_close(terms_of(SetLoss(), large, scaled(refined), [scaled(first)]).total, small_loss)
 
 
 def test_before_the_ramp_nothing_after_the_refinement_counts(make_problems, perturb):
     p = make_problems()
     refined = Pose(*(x.clone().requires_grad_() for x in perturb(p.pose)))
     first = Pose(*(x.clone().requires_grad_() for x in perturb(p.pose, angle=0.3)))
-    SetLoss()(trained_result(p, refined, [first]), p, 0.0).total.backward()
+    terms_of(SetLoss(), p, refined, [first], ramp=0.0).total.backward()
     assert refined.rotation.grad is None
     assert first.rotation.grad.abs().sum() > 0
 
@@ -171,7 +169,7 @@ def test_the_true_noise_is_the_likeliest(make_problems):
 
     def term(img, world):
         noise = Noise(*(torch.full(shape, x, dtype=torch.float64) for x in (img, world)))
-        return SetLoss()(trained_result(p, p.pose, [p.pose], noise), p).noise
+        return terms_of(SetLoss(), p, p.pose, [p.pose], noise).noise
 
     true = term(1.0, 0.05)
     assert all(term(*wrong) > true for wrong in ((2.0, 0.05), (0.1, 0.05), (1.0, 0.1), (1.0, 0.025), (2.0, 0.1)))
@@ -180,5 +178,5 @@ def test_the_true_noise_is_the_likeliest(make_problems):
 def test_weights_are_compared_with_what_is_right(make_problems):
     p = make_problems(outliers=3)
     half = torch.full(p.inliers.shape, 0.5, dtype=torch.float64)
-    terms = SetLoss()(trained_result(p, p.pose, [p.pose], weights=half), p)
+    terms = terms_of(SetLoss(), p, p.pose, [p.pose], weights=half)
     torch.testing.assert_close(terms.weights, torch.tensor(math.log(2.0), dtype=torch.float64))
