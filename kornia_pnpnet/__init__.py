@@ -1,5 +1,6 @@
 """A camera's pose from 2D-3D correspondences of which some are wrong, as a batched, differentiable PyTorch layer."""
 
+from kornia_pnpnet.covariance import pose_covariance
 from kornia_pnpnet.init import MLPInit, SetInit
 from kornia_pnpnet.lm import RobustWeightedLM
 from kornia_pnpnet.losses import PoseLoss, SetLoss
@@ -30,6 +31,7 @@ __all__ = [
     "__version__",
     "create_solver",
     "list_solvers",
+    "pose_covariance",
     "pose_errors",
     "shipped_weights",
     "success",

@@ -17,7 +17,7 @@ ROOT = Path(kornia_pnpnet.__file__).parent
 LAYERS = (
     ("types", "environment", "files", "compilation"),
     ("geometry", "small", "robust", "metrics", "pairs", "data.colmap"),
-    ("normalize", "lm", "init", "data"),
+    ("normalize", "lm", "init", "data", "covariance"),
     ("model", "losses"),
     ("registry", "peers", "bounds", "__init__"),
     ("results", "evaluation", "complexity", "runstate", "training", "choices", "reports"),

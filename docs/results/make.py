@@ -298,7 +298,8 @@ threshold methods were tuned by success on another seed:
 
 {tuned}
 
-`{ours}` is the paper's PnP-Net, `net-n9` its first stage alone, `-lm` the classical robust LM (α = 1) after a method,
+`{ours}` is the paper's PnP-Net, with a robust kernel whose scale is learned in place of the paper's power and the best
+of {shipped_views} guesses; `net-n9` its first stage alone, `-lm` the classical robust LM (α = 1) after a method,
 `ransac-epnp-lm` the paper's RANSAC on samples of 7. `p3p-ransac` has the threshold in pixels that every peer has;
 `p3p-ransac-noise` also allows for noise of the world points. `opencv-ransac` is OpenCV {opencv}'s RANSAC with AP3P
 and a final refinement, as it is usually called; `opencv-ransac-sqpnp` the same with SQPnP and no refinement, the

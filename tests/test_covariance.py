@@ -1,0 +1,66 @@
+"""The covariance of a pose against the errors that noise makes."""
+
+import pytest
+import torch
+from kornia.geometry.conversions import rotation_matrix_to_axis_angle
+
+from kornia_pnpnet import Normalize, PnPNet, Pose, RobustWeightedLM, pose_covariance
+
+
+def tangent(estimate, truth):
+    """(omega, v) of the estimate from the truth."""
+    turn = rotation_matrix_to_axis_angle(estimate.rotation @ truth.rotation.mT)
+    return torch.cat((turn, estimate.translation - truth.translation), -1)
+
+
+def solved(p):
+    """Weighted least squares from the truth."""
+    solver = PnPNet(None, RobustWeightedLM(15, robustness=0.0, damping=1e-6), Normalize(order=False))
+    return solver(*p[:3], init=p.pose, img_sigma=1.0, world_sigma=0.05).pose
+
+
+@pytest.mark.parametrize("n", [20, 60])
+def test_normalised_errors_are_chi_square(n, make_problems):
+    """Their mean is 6, and so is that of each of the parts its size."""
+    p = make_problems(n=n, batch=3000)
+    pose = solved(p)
+    covariance = pose_covariance(pose, *p[:3], img_sigma=1.0, world_sigma=0.05)
+    error = tangent(pose, p.pose)
+    squares = (error * torch.linalg.solve(covariance, error)).sum(-1)
+    assert squares.mean().item() == pytest.approx(6.0, rel=0.1)
+    for part in (slice(0, 3), slice(3, 6)):
+        inner = covariance[:, part, part]
+        squares = (error[:, part] * torch.linalg.solve(inner, error[:, part])).sum(-1)
+        assert squares.mean().item() == pytest.approx(3.0, rel=0.1)
+    # The 95 % point of chi-square with 3 degrees of freedom.
+    assert (squares < 7.815).double().mean().item() == pytest.approx(0.95, abs=0.02)
+
+
+def test_weights_of_zero_are_as_pairs_that_are_not_there(make_problems):
+    p = make_problems(n=12, batch=5)
+    weights = (torch.arange(12) < 8).double().expand(5, 12)
+    half = pose_covariance(p.pose, *p[:3], img_sigma=2.0, weights=weights)
+    part = pose_covariance(p.pose, p.world_points[:, :8], p.img_points[:, :8], p.intrinsics, img_sigma=2.0)
+    torch.testing.assert_close(half, part)
+
+
+def test_units_of_the_noise(make_problems):
+    """Numbers, of each problem, of each pair; twice the noise is four times the covariance."""
+    p = make_problems(n=12, batch=5)
+    plain = pose_covariance(p.pose, *p[:3], img_sigma=1.0, world_sigma=0.1)
+    double = pose_covariance(p.pose, *p[:3], img_sigma=torch.full((5,), 2.0), world_sigma=torch.full((5, 12), 0.2))
+    torch.testing.assert_close(double, 4.0 * plain)
+    scaled = Pose(p.pose.rotation, 1000.0 * p.pose.translation)
+    large = pose_covariance(scaled, 1000.0 * p.world_points, *p[1:3], img_sigma=1.0, world_sigma=100.0)
+    unit = torch.tensor([1.0] * 3 + [1000.0] * 3, dtype=torch.float64)
+    torch.testing.assert_close(large, plain * unit * unit[:, None])
+
+
+def test_what_is_not_determined_is_infinite(make_problems):
+    p = make_problems(n=6, batch=3)
+    weights = torch.ones(3, 6, dtype=torch.float64)
+    weights[1, 2:] = 0.0  # two pairs
+    covariance = pose_covariance(p.pose, *p[:3], img_sigma=1.0, weights=weights)
+    assert covariance[[0, 2]].isfinite().all()
+    assert covariance[1].diagonal().isinf().all()
+    assert (covariance[1] - covariance[1].diagonal().diag()).nan_to_num(0.0).eq(0).all()
