@@ -13,7 +13,7 @@ PAGES = [REPO / "README.md", *sorted((REPO / "docs").rglob("*.md"))]
 def test_python_blocks_run():
     text = (REPO / "README.md").read_text()
     blocks = re.findall(r"```python\n(.*?)```", text, flags=re.S)
-    assert len(blocks) == 3
+    assert len(blocks) == 4
     namespace = {}
     for block in blocks:
         exec(block, namespace)
@@ -22,6 +22,7 @@ def test_python_blocks_run():
     assert namespace["img_points"].grad.isfinite().all()
     assert torch.isfinite(namespace["refined"].matrix).all()
     assert namespace["robust"].ok.float().mean() > 0.9
+    assert namespace["covariance"][namespace["told"].ok].isfinite().all()
     assert ((namespace["robust"].weights > 0) == namespace["problems"].inliers).float().mean() > 0.9
 
 
