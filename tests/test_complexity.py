@@ -76,10 +76,12 @@ def differences(solver, measure, sizes=SIZES, outliers=None):
     )
 
 
+@pytest.mark.parametrize("kernel", ["power", "geman_mcclure"])
 @pytest.mark.parametrize(("m", "views"), [(0, 1), (1, 1), (5, 1), (0, 3), (1, 2), (4, 2), (5, 8)])
-def test_networks_cost_what_the_formulas_say(m, views, measure):
+def test_networks_cost_what_the_formulas_say(m, views, kernel, measure):
     for n in SIZES:
-        wrong = differences(PnPNet(MLPInit(n), RobustWeightedLM(m), views=views), measure, sizes=[n])
+        refine = RobustWeightedLM(m, kernel=kernel)
+        wrong = differences(PnPNet(MLPInit(n), refine, views=views), measure, sizes=[n])
         assert not wrong, wrong
 
 
@@ -193,7 +195,7 @@ def test_other_shares_of_outliers_and_other_solvers():
     [
         (PnPNet(None, RobustWeightedLM(update="additive")), "retraction"),
         (PnPNet(None, RobustWeightedLM(reject_worse=True)), "rejection"),
-        (PnPNet(None, RobustWeightedLM(kernel="huber")), "power"),
+        (PnPNet(None, RobustWeightedLM(kernel="huber")), "another kernel"),
         (PnPNet(torch.nn.Identity(), RobustWeightedLM()), "Identity"),
         (PnPNet(RANSAC(P3P()), RobustWeightedLM()), "Samples of 3"),
         (PnPNet(RANSAC(P3P(), scorer=torch.sqrt), RobustWeightedLM()), "sqrt"),

@@ -38,7 +38,7 @@ def _lm_calls(lm: RobustWeightedLM, n: int, times: float = 1, starts: int = 1) -
     """A refinement, of several starts until they are compared."""
     weight, loss = (f"robust.{function.__name__}" for function in (lm.kernel.weight, lm.kernel.loss))
     if lm.additive or lm.reject_worse or weight not in PARTS:
-        raise ValueCheckError(f"There is no formula for {lm}: it needs the retraction, no rejection, the power kernel.")
+        raise ValueCheckError(f"There is no formula for {lm}: it needs the retraction, no rejection, another kernel.")
     iterations = lm.m + (starts - 1) * lm.compared_at
     compared = starts if starts > 1 else 0
     yield "lm._iterate", iterations * times, (n,)

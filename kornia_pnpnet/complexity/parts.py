@@ -95,6 +95,8 @@ PARTS: dict[str, Callable[..., Operations]] = {
     ),
     # The kernel 1 / |r|^alpha with any alpha: a power; its loss with a series near alpha = 2.
     "robust._power_weight": lambda n: n * Operations(add=1, multiply=1, exp=1, log=1),
+    "robust._geman_mcclure_weight": lambda n: n * Operations(add=1, multiply=1, divide=2),
+    "robust._geman_mcclure_loss": lambda n: n * Operations(add=1, divide=2),
     "robust._power_loss": lambda n: n * Operations(add=5, multiply=7, divide=3, exp=1, log=1, compare=3, logic=3),
     # The step times the solution, where there is one.
     "lm.lm_step": lambda: Operations(multiply=6, logic=1),
