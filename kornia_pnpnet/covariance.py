@@ -82,9 +82,6 @@ def pose_covariance(
         lower = torch.cat((cross, size[..., None] * eye), -1)
         back = torch.cat((upper, lower), 1)
         covariance = back @ inverse @ back.mT
-        infinite = (
-            torch.full((6,), torch.inf, dtype=torch.float64, device=world.device)
-            .diag()
-            .nan_to_num(0.0, posinf=torch.inf)
-        )
+        diagonal = torch.eye(6, dtype=torch.bool, device=world.device)
+        infinite = covariance.new_zeros(6, 6).masked_fill(diagonal, torch.inf)
         return torch.where(known[:, None, None], covariance, infinite).to(dtype)

@@ -271,11 +271,12 @@ def fit(
             clock.lap("rest")
             problems = _share(next(batches), fabric)
             clock.lap("data")
-            call = solver.with_guess if isinstance(loss, SetLoss) else solver
-            found = call(*problems[:3], **problems.told, first_stage_only=ramp == 0.0)
-            terms = (
-                loss(found[0], problems, ramp, found[1]) if isinstance(loss, SetLoss) else loss(found, problems, ramp)
-            )
+            inputs = {**problems.told, "first_stage_only": ramp == 0.0}
+            if isinstance(loss, SetLoss):
+                result, guess = solver.with_guess(*problems[:3], **inputs)
+                terms = loss(result, problems, ramp, guess)
+            else:
+                terms = loss(solver(*problems[:3], **inputs), problems, ramp)
             # The zero keeps the refiner in the graph before the ramp: processes expect gradients of every parameter.
             unused = sum(p.sum() for p in model.refine.parameters() if p.requires_grad) if ramp == 0.0 else 0.0
             clock.lap("forward")
@@ -397,7 +398,7 @@ def train_briefly(seconds: float, folder: str | Path, *, progress: bool = True) 
         began = time.perf_counter()
         for index in range(10):
             problems = data.batch(index)
-            result = model(*problems[:3], **problems.told, first_stage_only=ramp == 0.0)
+            result = model(*problems[:3], first_stage_only=ramp == 0.0)
             loss(result, problems, ramp).total.backward()
         return (time.perf_counter() - began) / 10
 
