@@ -103,10 +103,10 @@ def test_run_starts_from_weights(tmp_path):
     trained = PnPNet.from_pretrained(tmp_path / "run" / "weights").state_dict()
     assert all(torch.equal(trained[name], value) for name, value in weights.state_dict().items())
     results = json.loads((tmp_path / "run" / "results.json").read_text())
-    assert results["origin"]["origin"]["run"]["update"] == 200_000
+    assert results["origin"]["origin"]["origin"]["run"]["update"] == 200_000
     card = (tmp_path / "run" / "weights" / "README.md").read_text()
-    assert card.count("`python train.py") == 3
-    lineage = ("200000 updates of 1000", "5000 updates of 1000", "weights=pnpnet-n9", "2 updates of 8")
+    assert card.count("`python train.py") == 4
+    lineage = ("200000 updates of 1000", "5000 updates", "\n  2000 updates", "weights=pnpnet-n9", "2 updates of 8")
     assert [*map(card.index, lineage)] == sorted(map(card.index, lineage))
     assert "points from BoxPoints and SlabPoints" in card.split("weights=pnpnet-n9")[1]
     run(f"hydra.run.dir={tmp_path / 'again'}", *options, f"weights={tmp_path / 'run' / 'weights'}", "train.updates=3")
@@ -115,7 +115,7 @@ def test_run_starts_from_weights(tmp_path):
         assert [row["update"] for row in csv.DictReader(file)] == ["1", "2", "3", "4", "5"]
     card = (tmp_path / "mine" / "README.md").read_text()
     assert card.startswith("# mine\n")
-    assert card.count("`python train.py") == 4
+    assert card.count("`python train.py") == 5
     done = run(f"hydra.run.dir={tmp_path / 'deeper'}", *options, *learn_nothing, f"model.m={weights.refine.m + 1}")
     assert "only the network" in done.stdout + done.stderr
     deeper = PnPNet.from_pretrained(tmp_path / "deeper" / "weights")
