@@ -156,6 +156,7 @@ class SetLoss(nn.Module):
     - The negative log-likelihood of the right pairs' residuals at the true pose under the estimated noise.
 
     Args:
+        starts: the first so many hypotheses are the network's, and count.
         every: weight of the mean over the hypotheses against the best of them.
         refined: weight of the terms after the refinement, before the ramp.
         saturation: of these, in units of success.
@@ -168,6 +169,7 @@ class SetLoss(nn.Module):
     def __init__(
         self,
         *,
+        starts: int = 4,
         every: float = 0.15,
         refined: float = 1.0,
         saturation: float = 2.0,
@@ -177,6 +179,7 @@ class SetLoss(nn.Module):
         translation_unit: float = 0.005,
     ) -> None:
         super().__init__()
+        self.starts = starts
         self.every = every
         self.refined = refined
         self.saturation = saturation
@@ -199,7 +202,7 @@ class SetLoss(nn.Module):
         """
         hypotheses = [x[:, None] for x in guess.pose]
         if guess.others is not None:
-            hypotheses = [torch.cat(x, 1) for x in zip(hypotheses, guess.others, strict=True)]
+            hypotheses = [torch.cat(x, 1)[:, : self.starts] for x in zip(hypotheses, guess.others, strict=True)]
         starts = hypotheses[0].shape[1]
         centre = problems.world_points.mean(1)
         away = (problems.pose.rotation @ centre[..., None])[..., 0] + problems.pose.translation

@@ -114,17 +114,65 @@ def test_bad_problems_change_no_other_and_leave_finite_gradients(make_problems):
 def test_the_poses_are_rigid_and_there_are_as_many_as_were_asked_for(make_problems):
     p = make_problems(n=9, batch=30, outliers=3)
     corr, _ = Normalize(order=False)(*p[:3])
-    for starts in (1, 3):
-        guess = solver(starts=starts).init(corr)
+    for starts, samples, others in ((1, 0, 0), (3, 0, 2), (1, 2, 1), (3, 8, 3)):
+        guess = solver(starts=starts, samples=samples).init(corr)
         rotations = guess.pose.rotation[:, None]
-        if starts > 1:
-            assert guess.others.translation.shape == (30, starts - 1, 3)
+        if others:
+            assert guess.others.translation.shape == (30, others, 3)
             rotations = torch.cat((rotations, guess.others.rotation), 1)
         else:
             assert guess.others is None
         eye = torch.eye(3, dtype=torch.float64).expand_as(rotations)
         torch.testing.assert_close(rotations @ rotations.mT, eye)
         torch.testing.assert_close(torch.linalg.det(rotations), torch.ones_like(rotations[..., 0, 0]))
+
+
+class Oracle(SetInit):
+    """Knows which pairs are right, as far as samples ask for it."""
+
+    right: torch.Tensor
+
+    def _sampled(self, corr, right, noise, fallback):
+        return super()._sampled(corr, self.right.to(right), noise, fallback)
+
+
+@pytest.mark.parametrize(("n", "wrong"), [(4, 0), (5, 1), (9, 5), (60, 50)])
+def test_samples_of_right_pairs_have_the_true_pose(n, wrong):
+    torch.manual_seed(0)
+    outliers = OutlierMix(count=wrong)
+    options = {"n": n, "batch_size": 50, "seed": 1, "max_angle": math.pi, "dtype": torch.float64}
+    p = SyntheticProblems(img_sigma=0.0, world_sigma=0.0, outliers=outliers, **options).batch(0)
+    net = PnPNet(Oracle(), RobustWeightedLM(0), Normalize(order=False)).double().eval()
+    net.init.right = p.inliers
+    _, guess = net.with_guess(*p[:3], img_sigma=0.1, world_sigma=0.001)
+    sampled = Pose(*(x[:, -1] for x in guess.others))
+    errors = pose_errors(sampled, p.pose)
+    assert (success(errors, 0.01, 0.01)).double().mean() > 0.95  # but for points in line and the like
+    # As padding the wrong pairs change nothing.
+    _, masked = net.with_guess(*p[:3], mask=p.inliers, img_sigma=0.1, world_sigma=0.001)
+    again = pose_errors(Pose(*(x[:, -1] for x in masked.others)), p.pose)
+    assert success(again, 0.01, 0.01).double().mean() > 0.95
+
+
+def test_where_no_sample_has_a_pose_the_first_guess_stands_in():
+    p = SyntheticProblems(n=6, batch_size=4, seed=3, dtype=torch.float64).batch(0)
+    line = p.world_points[:, :1] + torch.arange(6, dtype=torch.float64)[:, None] * torch.ones(3, dtype=torch.float64)
+    corr, _ = Normalize(order=False)(line, *p[1:3])
+    guess = solver().init(corr)
+    torch.testing.assert_close(guess.others.rotation[:, -1], guess.pose.rotation)
+    torch.testing.assert_close(guess.others.translation[:, -1], guess.pose.translation)
+
+
+def test_the_pose_of_samples_is_a_constant(make_problems):
+    p = make_problems(n=9, batch=5)
+    corr, _ = Normalize(order=False)(*p[:3])
+    world = corr.world_points.detach().requires_grad_()
+    net = solver().init
+    others = net(corr._replace(world_points=world)).others
+    for index, learns in ((-1, False), (0, True)):
+        total = others.rotation[:, index, 0].sum() + others.translation[:, index].sum()
+        (gradient,) = torch.autograd.grad(total, world, retain_graph=True)
+        assert gradient.any().item() is learns
 
 
 def test_noise_that_is_told_is_used_as_it_is_and_the_rest_is_estimated(make_problems):
@@ -159,7 +207,10 @@ def test_float64_pairs_take_float32_weights(make_problems):
     assert result.rotation.dtype == torch.float64
 
 
-@pytest.mark.parametrize("options", [{"width": 0}, {"width": 30, "heads": 4}, {"starts": 0}, {"layers": 1.5}])
+@pytest.mark.parametrize(
+    "options",
+    [{"width": 0}, {"width": 30, "heads": 4}, {"starts": 0}, {"layers": 1.5}, {"samples": 9}, {"samples": -1}],
+)
 def test_numbers_that_make_no_network_are_refused(options):
     with pytest.raises(BaseError, match="must"):
         SetInit(**options)
@@ -176,7 +227,7 @@ def test_it_learns():
     """In a hundred small steps: any rotation, with a third of the pairs wrong."""
     torch.manual_seed(0)
     refine = RobustWeightedLM(6, kernel="geman_mcclure", robustness=20.0)
-    net = PnPNet(SetInit(width=16, layers=2, hidden=32), refine, Normalize(order=False))
+    net = PnPNet(SetInit(width=16, layers=2, hidden=32, samples=0), refine, Normalize(order=False))
     data = SyntheticProblems(n=9, batch_size=200, seed=1, outliers=OutlierMix(), max_angle=math.pi, told=0.5)
     fresh = SyntheticProblems(n=9, batch_size=1000, seed=2, outliers=OutlierMix(), max_angle=math.pi).batch(0)
     loss, optimizer = SetLoss(), torch.optim.Adam(net.parameters(), lr=4e-3)

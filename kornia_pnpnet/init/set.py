@@ -7,7 +7,9 @@ from kornia.core.check import KORNIA_CHECK
 from torch import Tensor, nn
 from torch.nn import functional
 
+from kornia_pnpnet.geometry import pixel_variance, project
 from kornia_pnpnet.init.control_points import align
+from kornia_pnpnet.init.p3p import p3p
 from kornia_pnpnet.small import dot
 from kornia_pnpnet.types import Correspondences, Guess, Noise, Pose
 
@@ -22,6 +24,21 @@ _LOG_NOISE = -5.0
 _FEATURES = 14
 # Added to the score of a pair that is not there.
 _ABSENT = -1e9
+# Samples of three, by how likely their pairs are to be right; no two of them have more than two pairs in common.
+_SAMPLES = ((0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3), (0, 1, 4), (2, 3, 4), (0, 3, 4), (1, 2, 4))
+# So many of the likeliest pairs say how good the pose of a sample is: squared residuals count to this many variances.
+_MOST_JUDGES, _JUDGED = 32, 50.0
+
+
+@torch.library.custom_op("kornia_pnpnet::taken", mutates_args=())
+def _taken(values: Tensor, index: Tensor) -> Tensor:
+    """Some pairs of each problem, (C, K, B) of (B, N, C) by (B, K): an operation, for a compiler to lay them out so."""
+    return values.permute(2, 1, 0).gather(1, index.mT.expand(values.shape[-1], -1, -1))
+
+
+@_taken.register_fake
+def _(values: Tensor, index: Tensor) -> Tensor:
+    return values.new_empty(values.shape[-1], index.shape[1], index.shape[0])
 
 
 class _View:
@@ -140,6 +157,9 @@ class SetInit(nn.Module):
     roll; intrinsics enter as rays alone. The network runs in the dtype of its weights, what is around it in that of
     the correspondences.
 
+    The likeliest pairs also make ``samples`` of three, whose poses (see :func:`~kornia_pnpnet.init.p3p.p3p`) all pairs
+    judge; the best one of all samples is one more hypothesis, a constant without gradient. Its cost is fixed.
+
     A pair weighs as much as it is likely to be right. The noise of pixels and points, which tells
     the refinement how far pairs may be off, is what :attr:`~kornia_pnpnet.types.Correspondences.noise` says, or the
     network's estimate where that says nothing.
@@ -153,23 +173,37 @@ class SetInit(nn.Module):
         layers: residual layers.
         heads: of the attention in each.
         hidden: channels inside a layer.
-        starts: hypotheses, at least 1.
+        starts: hypotheses of the network, at least 1.
+        samples: of the likeliest pairs, 0 to 8.
 
     Raises:
-        BaseError: for numbers below 1, or a width that the heads do not divide.
+        BaseError: for numbers out of range, or a width that the heads do not divide.
 
     Example:
         >>> corr = Correspondences(torch.randn(2, 7, 3), torch.randn(2, 7, 2), torch.ones(2, 7), torch.tensor(3400.0))
         >>> guess = SetInit(starts=3)(corr)
         >>> guess.pose.rotation.shape, guess.others.translation.shape, guess.weights.shape
-        (torch.Size([2, 3, 3]), torch.Size([2, 2, 3]), torch.Size([2, 7]))
+        (torch.Size([2, 3, 3]), torch.Size([2, 3, 3]), torch.Size([2, 7]))
     """
 
-    def __init__(self, *, width: int = 32, layers: int = 4, heads: int = 4, hidden: int = 64, starts: int = 4) -> None:
+    def __init__(
+        self,
+        *,
+        width: int = 32,
+        layers: int = 4,
+        heads: int = 4,
+        hidden: int = 64,
+        starts: int = 4,
+        samples: int = len(_SAMPLES),
+    ) -> None:
         super().__init__()
         self.config = {"width": width, "layers": layers, "heads": heads, "hidden": hidden, "starts": starts}
         for name, value in self.config.items():
             KORNIA_CHECK(type(value) is int and value >= 1, f"{name} must be an integer of at least 1, got {value!r}.")
+        most = len(_SAMPLES)
+        KORNIA_CHECK(type(samples) is int and 0 <= samples <= most, f"samples must be 0 to {most}, got {samples!r}.")
+        self.config["samples"] = samples
+        self.samples = samples
         KORNIA_CHECK(width % heads == 0, f"heads must divide width, got {heads} and {width}.")
         self.starts = starts
         self.first = nn.Linear(_FEATURES, width)
@@ -197,7 +231,8 @@ class SetInit(nn.Module):
             corr: normalised correspondences of a centred and scaled world, of any :math:`N`, in any order.
 
         Returns:
-            The first hypothesis as the pose and the rest as others; likelihoods as weights; the noise of each pair.
+            The first hypothesis as the pose and the rest as others, that of the samples last; likelihoods as weights;
+            the noise of each pair.
         """
         view = _View(corr)
         dtype = corr.world_points.dtype
@@ -216,11 +251,45 @@ class SetInit(nn.Module):
         rotation, translation = (x.unflatten(0, (starts, -1)) for x in pose)
         rotation = view.camera.mT @ rotation @ view.world
         translation = (view.camera.mT @ translation[..., None])[..., 0]
-        return Guess(
-            Pose(rotation[0], translation[0]),
-            right,
-            others=Pose(rotation[1:].movedim(0, 1), translation[1:].movedim(0, 1)) if starts > 1 else None,
-            noise=self._noise(corr, view, noise),
+        noises = self._noise(corr, view, noise)
+        if self.samples:
+            sampled = self._sampled(corr, right, noises, Pose(rotation[0], translation[0]))
+            rotation, translation = (
+                torch.cat((x, y[None])) for x, y in zip((rotation, translation), sampled, strict=True)
+            )
+        others = Pose(rotation[1:].movedim(0, 1), translation[1:].movedim(0, 1)) if len(rotation) > 1 else None
+        return Guess(Pose(rotation[0], translation[0]), right, others=others, noise=noises)
+
+    @torch.no_grad()
+    def _sampled(self, corr: Correspondences, right: Tensor, noise: Noise, fallback: Pose) -> Pose:
+        """The pose that the likeliest pairs agree on most, of those from samples of three of them."""
+        batch, count = right.shape
+        weights, likely = torch.where(corr.weights > 0, right, 0.0).topk(min(_MOST_JUDGES, count))
+        img, world = (x.expand(batch, count)[..., None] for x in noise)
+        of_pairs = torch.cat((corr.world_points, corr.img_points, right[..., None], img, world), -1)  # (B, N, 8)
+        pairs = _taken(of_pairs, likely)  # (8, K, B)
+        chosen = torch.tensor([x for x in _SAMPLES if max(x) < count][: self.samples], device=right.device)  # (S, 3)
+        three = pairs[:5, chosen].permute(1, 3, 2, 0).flatten(0, 1)  # (S B, 3, 5)
+        pose, valid = p3p(three[..., :3], three[..., 3:] / corr.focal)
+        # Components first, then the four solutions and the samples, problems last: it is how they lie in memory.
+        rotation, translation = (x.movedim((0, 1), (-1, -2)).flatten(-2).unflatten(-1, (-1, batch)) for x in pose)
+        valid = valid.mT.unflatten(-1, (-1, batch)) & (weights[:, chosen] > 0).all(-1).mT  # (4, S, B)
+        # One more dimension after the problems, that of hypotheses: (B, 3, 3, H), (B, 3, H), and of pairs (B, 1, K).
+        every = Pose(rotation.permute(3, 0, 1, 2), translation.permute(2, 0, 1))
+        world, img, right, *sigmas = (x.permute(2, 1, 0)[:, None] for x in pairs.split((3, 2, 1, 1, 1)))
+        judges = Correspondences(world, img, right[..., 0], corr.focal)
+        projection = project(every, judges)
+        variance = pixel_variance(projection, Noise(*(x[..., 0] for x in sigmas)), corr.focal)
+        support = judges.weights / (1.0 + projection.sq_residual / (_JUDGED * variance))
+        support = torch.where(projection.in_front, support, 0.0).sum(-1)  # (B, H)
+        best = torch.where(valid.flatten(0, 1).mT, support, -1.0).max(1)
+        index = best.indices[:, None]
+        rotation = every.rotation.flatten(1, 2).gather(2, index[:, None].expand(-1, 9, -1)).view(batch, 3, 3)
+        translation = every.translation.gather(2, index[:, None].expand(-1, 3, -1))[..., 0]
+        found = best.values > 0.0
+        return Pose(
+            torch.where(found[:, None, None], rotation, fallback.rotation),
+            torch.where(found[:, None], translation, fallback.translation),
         )
 
     def _run(self, features: Tensor, there: Tensor) -> tuple[Tensor, Tensor]:
