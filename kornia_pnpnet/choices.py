@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import math
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
@@ -43,6 +44,7 @@ _slab = partial(SyntheticProblems, points=SlabPoints())
 PRIORS: dict[str, tuple[str, Callable[..., SyntheticProblems | MixedProblems]]] = {
     "synthetic": ("paper", SyntheticProblems),
     "gaussian_pose": ("gaussian_pose", partial(SyntheticProblems, translation_sigma=25.0)),
+    "any_rotation": ("any_rotation", partial(SyntheticProblems, max_angle=math.pi)),
     "slab": ("slab", _slab),
     "mixed": ("mixed", partial(MixedProblems, [SyntheticProblems, _slab])),
 }
@@ -156,6 +158,7 @@ def evaluation_sets(
     seed: int = DEFAULT_SEED,
     metric: bool = True,
     mismatches_only: bool = False,
+    told: bool = False,
     dtype: torch.dtype = torch.float32,
 ) -> dict[str, EvaluationData]:
     """Draw the problems that a user asked for, on the CPU.
@@ -168,6 +171,7 @@ def evaluation_sets(
         seed: of the problems.
         metric: whether the scenes are in metres.
         mismatches_only: outliers are pixels of other points, each of another one, never anywhere in the image.
+        told: whether solvers are told the noise of synthetic problems, which are the same.
         dtype: of the problems. They are drawn in float64 whatever it is.
 
     Returns:
@@ -194,13 +198,15 @@ def evaluation_sets(
             for size in sizes:
                 for label, (mix, number) in mixes[size].items():
                     common = {"n": size, "outliers": mix, "seed": seed, "dtype": dtype, "batch_size": _DRAW_BATCH}
+                    common |= {"told": 1.0} if told and scene is None else {}
                     # Mismatches alone: each to a point of its own. Several to one point agree on a wrong pose.
                     spares = max(1, mix.max_count(size)) if mismatches_only else 1
                     entry = _evaluation_data(source, scene, count, spares, common)
                     described = {"outliers": number, "mismatch_share": mix.mismatch_share, "seed": seed}
                     # Raw matches have mismatches of their own, to which those of the mix are added.
                     added = "+" if scene is not None and source.endswith(".npz") else ""
-                    sets[f"{name}, n = {size}, {added}{label}"] = entry._replace(
+                    knows = ", noise told" if told and scene is None else ""
+                    sets[f"{name}, n = {size}, {added}{label}{knows}"] = entry._replace(
                         description={**entry.description, **described}
                     )
         except ValueError as error:

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from kornia_pnpnet.environment import environment
 from kornia_pnpnet.metrics import PoseErrors, pose_errors, success, success_rate
+from kornia_pnpnet.model import PnPNet
 from kornia_pnpnet.results import (
     FORMAT,
     format_table,
@@ -100,7 +101,7 @@ def draw_problems(source: _Source, count: int) -> Problems:
     batches = [source.batch(0)]
     size = len(batches[0].world_points)
     batches += [source.batch(index) for index in range(1, math.ceil(count / size))]
-    fields = zip(*((*batch[:3], *batch.pose, batch.inliers) for batch in batches), strict=True)
+    fields = zip(*((*batch[:3], *batch.pose, batch.inliers, *batch.told.values()) for batch in batches), strict=True)
     joined = iter([torch.cat(field)[:count] for field in fields])
     return batches[0].map(lambda _: next(joined))
 
@@ -131,7 +132,9 @@ def evaluate(
 
     Args:
         solvers: by name, each called as ``solver(world_points, img_points, intrinsics)`` in evaluation mode, without
-            gradients. One that has ``solve_with_truth`` (see :class:`SeesTruth`) is given the answers as well.
+            gradients. One that has ``solve_with_truth`` (see :class:`SeesTruth`) is given the answers as well. A
+            :class:`~kornia_pnpnet.PnPNet` is told the noise where the problems have it
+            (:attr:`~kornia_pnpnet.types.Problems.told`).
         data: problems by name, on the device and in the dtype to solve them in.
         path: the results file to write and to continue; none when ``None``.
         overwrite: start anew, whatever is at ``path``.
@@ -206,7 +209,7 @@ def _digest(tensors: Iterable[Tensor]) -> str:
 
 def _problems_digest(problems: Problems) -> str:
     # In float32: on another machine the last bits of a float64 may differ.
-    tensors = (*problems[:3], *problems.pose)
+    tensors = (*problems[:3], *problems.pose, *problems.told.values())
     return _digest((*(tensor.float() for tensor in tensors), problems.inliers))
 
 
@@ -284,7 +287,8 @@ def _timed(solver: nn.Module, problems: Problems) -> tuple[PnPResult, float]:
     if isinstance(solver, SeesTruth):
         result = solver.solve_with_truth(problems)
     else:
-        result = solver(problems.world_points, problems.img_points, problems.intrinsics)
+        told = problems.told if isinstance(solver, PnPNet) else {}
+        result = solver(problems.world_points, problems.img_points, problems.intrinsics, **told)
     if on_gpu:
         torch.cuda.synchronize()
     return result, time.perf_counter() - start

@@ -17,6 +17,7 @@ from kornia_pnpnet.bounds import KnownInliersAndNoise
 from kornia_pnpnet.choices import BOUNDS, PRIORS, default_solvers, evaluation_sets, load_solver, missing_package
 from kornia_pnpnet.data import OutlierMix, Scene, SceneProblems, SlabPoints, SyntheticProblems, View
 from kornia_pnpnet.evaluation import SeesTruth
+from kornia_pnpnet.geometry import rotation_angle
 
 CONF = Path(__file__).resolve().parents[1] / "conf" / "data"
 
@@ -89,7 +90,7 @@ def test_mixed_has_as_many_boxes_as_slabs():
 @pytest.mark.parametrize("source", PRIORS)
 def test_priors_are_those_of_the_training_configuration(source):
     name, make = PRIORS[source]
-    if name == "slab":  # half of `mixed`, by itself only to evaluate
+    if name in ("slab", "any_rotation"):  # half of `mixed` and part of `wide`, by themselves only to evaluate
         return
     with initialize_config_dir(str(CONF.parent), version_base="1.3"):
         config = compose("train", overrides=[f"data={name}", "batch_size=4", "seed=3"])
@@ -97,6 +98,22 @@ def test_priors_are_those_of_the_training_configuration(source):
     ours = make(n=9, batch_size=4, seed=3, outliers=OutlierMix()).batch(2)
     for x, y in zip(trained[:3], ours[:3], strict=True):
         torch.testing.assert_close(x, y)
+
+
+def test_told_sets_have_the_same_problems_and_their_noise():
+    ((name, told),) = draw("synthetic", outliers="2", count=300, told=True).items()
+    ((plain_name, plain),) = draw("synthetic", outliers="2", count=300).items()
+    assert name == f"{plain_name}, noise told"
+    assert plain.problems.told == {}
+    assert torch.equal(told.problems.img_points, plain.problems.img_points)
+    assert told.problems.img_sigma.tolist() == [1.0] * 300
+    torch.testing.assert_close(told.problems.world_sigma, torch.full((300,), 0.05))
+
+
+def test_any_rotation_turns_further_than_a_quarter():
+    (entry,) = draw("any_rotation", outliers="none", count=500).values()
+    angles = rotation_angle(entry.problems.pose.rotation, torch.eye(3).expand(500, 3, 3))
+    assert 0.4 < (angles > math.pi / 2).double().mean() < 0.6
 
 
 @pytest.mark.parametrize(

@@ -398,6 +398,28 @@ def test_only_who_sees_the_truth_is_given_it(sets):
     assert [row["success"]["rate"] for row in rows] == [1.0, 0.0]
 
 
+def test_solvers_of_ours_are_told_the_noise(sets):
+    data = EvaluationData(draw_problems(SyntheticProblems(batch_size=40, seed=3, told=1.0), count=60))
+
+    heard = []
+
+    class Heard(PnPNet):
+        def forward(self, *args, img_sigma=None, world_sigma=None):
+            heard.append((img_sigma, world_sigma))
+            return super().forward(*args, img_sigma=img_sigma, world_sigma=world_sigma)
+
+    class Deaf(nn.Module):
+        def forward(self, world_points, img_points, intrinsics):
+            return PnPNet(None, RobustWeightedLM(1))(world_points, img_points, intrinsics)
+
+    evaluate({"ours": Heard(None, RobustWeightedLM(1)), "other": Deaf()}, {"told": data}, chunk=60)
+    assert all(torch.equal(a, data.problems.img_sigma) for a, _ in heard)
+    assert all(torch.equal(b, data.problems.world_sigma) for _, b in heard)
+    heard.clear()
+    evaluate({"ours": Heard(None, RobustWeightedLM(1))}, sets)
+    assert set(heard) == {(None, None)}
+
+
 def test_a_solver_for_another_n_is_left_out(tmp_path):
     data = {str(n): EvaluationData(draw_problems(SyntheticProblems(n=n, batch_size=10), 10)) for n in (6, 9)}
     path = tmp_path / "results.json"
