@@ -25,9 +25,11 @@ from kornia_pnpnet import PnPNet, RobustWeightedLM
 from kornia_pnpnet.choices import load_solver
 from kornia_pnpnet.types import Pose, Problems
 
-__all__ = ["CONTENDERS", "ONE", "OURS", "PLAIN", "TRAINED", "WHOLE"]
+__all__ = ["ANY", "CONTENDERS", "ONE", "OURS", "PLAIN", "TRAINED", "WHOLE"]
 
 TRAINED = "pnpnet-n9"
+#: For any number of pairs.
+ANY = "pnpnet-set"
 #: As the paper has it: its network, one guess, and the iterations that the targets are set for. The trained ones are
 #: more and belong together, so these are classical.
 PLAIN = "net-n9+lm"
@@ -111,6 +113,8 @@ OURS: dict[str, Callable[..., Contender]] = {
     PLAIN: functools.partial(Ours, TRAINED, classical=ITERATIONS),
     f"{PLAIN} compiled": functools.partial(Ours, TRAINED, classical=ITERATIONS, compiled=True),
     WHOLE: functools.partial(Ours, TRAINED, classical=ITERATIONS, compiled=True, whole=True),
+    ANY: functools.partial(Ours, ANY),
+    f"{ANY} compiled": functools.partial(Ours, ANY, compiled=True),
     "refinement": Refinement,
     "refinement compiled": functools.partial(Refinement, compiled=True),
     "epnp": functools.partial(Ours, "epnp"),

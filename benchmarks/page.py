@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from contenders import ONE, PLAIN, TRAINED
+from contenders import ANY, ONE, PLAIN, TRAINED
 from harness import HERE
 from tables import (
     PARTS,
@@ -41,8 +41,9 @@ Contenders: `{trained}` is the whole solver as it is shipped, with checks and no
 same from one guess for each problem; `{plain}` its network, one guess, and {m} iterations, which the times aimed at
 were set for, with classical hyperparameters; `refinement` such {m} iterations of robust Levenberg–Marquardt alone, on
 normalised pairs and from a pose {angle:g}° and {shift:g} % of the distance off.
-The others of ours are whole solvers. All of ours are in float32, *compiled* by `solver.compile()`, *compiled whole* by
-`solver.compile(whole=True)`. `opencv-*`, `poselib` and `pycolmap` are the libraries' calls for one problem after the
+`{any}` takes any number of pairs. The others of ours are whole solvers. All of ours are in float32, *compiled* by
+`solver.compile()`, *compiled whole* by `solver.compile(whole=True)`. `opencv-*`, `poselib` and `pycolmap` are the
+libraries' calls for one problem after the
 other, `kornia-dlt` is `solve_pnp_dlt`.
 `pypose-lm` is `pypose.optim.LM` with a robust kernel on the same normalised pairs from the same start, as many
 iterations, a few problems at once (its Jacobian is dense over all of them, so more at once take longer); it has no
@@ -138,6 +139,7 @@ def page(
         trained=TRAINED,
         plain=PLAIN,
         one=ONE,
+        any=ANY,
         shipped="{m} iterations, {views} views".format(**engine["shipped"]),
         m=engine["m"],
         n=engine["n"],

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
-from contenders import ONE, PLAIN, TRAINED
+from contenders import ANY, ONE, PLAIN, TRAINED
 from harness import in_turns, ratio, say, summary, target, threads
 from settings import N, Settings, draw, make_contenders
 from tasks import CannotBeTimedError, Contender, Task, first
@@ -144,6 +144,7 @@ def targets(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
             what = f"`{name}`, per problem"
             found.append(target(what, forward[name]["median_us"], most, unit="µs", at_most=True))
     ratios = [(forward, name, *least) for least in (("opencv-ransac", 20.0), ("poselib", 10.0)) for name in solvers]
+    ratios += [(forward, f"{ANY} compiled", "poselib", 5.0)]
     ratios += [(backward, "refinement compiled", name, 10.0) for name in ("pypose-lm", "pypose-parts")]
     firsts = [name for name in backward if "@" in name]
     for base in ("refinement", PLAIN):

@@ -84,7 +84,9 @@ def make_parser() -> argparse.ArgumentParser:
     )
     solve.add_argument("--intrinsics", metavar="fx,fy,cx,cy", help="the camera in pixels; goes before an NPZ's own")
     solve.add_argument(
-        "--solver", metavar="NAME", help="see `pnpnet list`, or a folder of weights; default: pnpnet-nN for N pairs"
+        "--solver",
+        metavar="NAME",
+        help="see `pnpnet list`, or a folder of weights; default: pnpnet-nN for N pairs, or pnpnet-set",
     )
     solve.add_argument("--plot", metavar="PNG", type=_picture, help="draw pixels, reprojections and rejected pairs")
     solve.add_argument(

@@ -51,6 +51,7 @@ PRIORS: dict[str, tuple[str, Callable[..., SyntheticProblems | MixedProblems]]] 
 
 # Every competitor of the protocol, in the order of its figures.
 _COMPETITORS = (
+    "pnpnet-set",
     "pnpnet-n{n}",
     "net-n{n}",
     "identity-lm",

@@ -64,10 +64,10 @@ def _solve(arguments: argparse.Namespace) -> int:
     count = len(pairs.world_points)
     name = arguments.solver
     if name is None:
-        name = f"pnpnet-n{count}"
-        if name not in shipped_weights():
-            print(f"pnpnet: no weights {name} are shipped, using identity-lm", file=sys.stderr)
-            name = "identity-lm"
+        suited, shipped = (f"pnpnet-n{count}", "pnpnet-set"), shipped_weights()
+        name = next((weights for weights in suited if weights in shipped), "identity-lm")
+        if name not in shipped:
+            print(f"pnpnet: no weights {suited[0]} are shipped, using {name}", file=sys.stderr)
     if name.partition(":")[0] in BOUNDS:
         raise ValueError(f"--solver: {name} is a bound, which has to see the true pose: it can only be evaluated")
     solver = load_solver(name)

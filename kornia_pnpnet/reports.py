@@ -190,10 +190,16 @@ def _rate(entry: Mapping[str, float]) -> str:
 
 def _mix(source: Mapping[str, Any], n: int) -> str:
     """What a data source's configuration says of its wrong pairs and its points."""
+    sizes = source["n"] if isinstance(source.get("n"), list) else [n]
+    source = source.get("source", source)
     mix = source.get("outliers")
-    most = 0 if mix is None else OutlierMix(**{k: v for k, v in mix.items() if k != "_target_"}).max_count(n)
-    least = most if mix is not None and mix.get("count") is not None else 0
-    wrong = f"{least} to {most} of {n} pairs wrong" if most > least else f"{most} of {n} pairs wrong"
+    draws = None if mix is None else OutlierMix(**{k: v for k, v in mix.items() if k != "_target_"})
+    least, most = (0 if draws is None else draws.max_count(size) for size in (min(sizes), max(sizes)))
+    least = least if len(sizes) > 1 or (mix is not None and mix.get("count") is not None) else 0
+    of = f"of {max(sizes)} pairs wrong"
+    wrong = f"{least} to {most} {of}" if most > least else f"{most} {of}"
+    if len(sizes) > 1:
+        wrong = f"{min(sizes)} to {max(sizes)} pairs, up to {least} of {min(sizes)} and {most} {of}"
     names = [name for part in source.get("sources", [source]) for name in _points({**source, **part})]
     return f"{wrong}, points from {' and '.join(names)}"
 
@@ -231,13 +237,18 @@ def write_model_card(folder: str | Path, results: Mapping[str, Any], *, name: st
     """
     model, config, learned = results["model"], results["config"], results["learned"]
     n, m = config["model"]["n"], model["refine"]["m"]
-    start, scope = ("The paper's network", "Exactly") if model["init"] else ("A start from the identity", "Trained on")
+    kind = (model["init"] or {}).get("name")
+    start, scope = ("The paper's network", "Exactly") if kind else ("A start from the identity", "Trained on")
     views = model["views"]
     guesses = f" from {views} guesses for each problem" if views > 1 else ""
+    what = f"{start} for n = {n} pairs"
+    if kind == "SetInit":
+        hypotheses = f"{model['init']['starts']} of its own and the best of {model['init']['samples']} P3P samples"
+        what, guesses = "A network for any number of pairs", f"\nfrom several guesses, {hypotheses}"
     lines = [
         f"# {name or config['name']}",
         "",
-        f"{start} for n = {n} pairs and m = {m} iterations of robust weighted LM{guesses}",
+        f"{what} and m = {m} iterations of robust weighted LM{guesses}",
         "(Sheffer and Wiesel, PnP-Net, 2020). Apache-2.0. Written from `results.json`, which has the configuration.",
         "",
         "    solver = kornia_pnpnet.PnPNet.from_pretrained(FOLDER)  # this one, or its name when it is shipped",
@@ -268,14 +279,20 @@ def write_model_card(folder: str | Path, results: Mapping[str, Any], *, name: st
         for i, (step, damping, shape) in enumerate(zip(*learned.values(), strict=True), 1):
             lines.append(f"| {i} | {step:.3f} | {damping:.2e} | {shape:.3f} |")
     centred = model["normalize"]["center"] and model["normalize"]["scale"]
-    lines += [
-        "",
-        "## Limits",
-        "",
-        f"{scope} {n} pairs, with wrong ones as in the training. Rotations within about a quarter turn of the identity",
-        "(the world's axes roughly the camera's), which is the training's prior. The world's unit and origin "
-        + ("do not matter." if centred else "must be the training's."),
-        "",
-    ]
+    lines += ["", "## Limits", ""]
+    if kind == "SetInit":
+        lines += [
+            "Any rotation, unit and origin of the world, and any camera: the network sees none of them. As many pairs",
+            "and as many wrong ones as in the training; more pairs work too. Of three it gives one of the poses.",
+            "",
+        ]
+    else:
+        lines += [
+            f"{scope} {n} pairs, with wrong ones as in the training. "
+            "Rotations within about a quarter turn of the identity",
+            "(the world's axes roughly the camera's), which is the training's prior. The world's unit and origin "
+            + ("do not matter." if centred else "must be the training's."),
+            "",
+        ]
     with atomic_open(Path(folder) / "README.md") as file:
         file.write("\n".join(lines))

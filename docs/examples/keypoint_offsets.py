@@ -1,0 +1,140 @@
+"""Learn where a detector is wrong, from poses alone: ``python docs/examples/keypoint_offsets.py``.
+
+A detector sees the 12 keypoints of an object, each with a bias of its own in pixels that it does not know of. What is
+learned is an offset for each keypoint; the only teacher is the pose of the camera, through a differentiable solver. In
+every image 30 % of the keypoints are anywhere, and how far the learned offsets are from the truth is written down after
+every step: with this package's `pnpnet-set`, its EPnP without weights, and Kornia's DLT. Writes `keypoint_offsets.json`
+and a picture of it beside this file.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from kornia.geometry import solve_pnp_dlt
+from torch import Tensor
+
+from kornia_pnpnet import create_solver
+from kornia_pnpnet.data.synthetic import batch_generator, random_poses
+from kornia_pnpnet.environment import environment
+from kornia_pnpnet.figures.style import BLUE, GREEN, ORANGE, make_figure, save, tidy
+from kornia_pnpnet.losses import pose_distances
+from kornia_pnpnet.results import save_results
+from kornia_pnpnet.types import Pose
+
+HERE = Path(__file__).resolve().parent
+KEYPOINTS, BATCH, WRONG = 12, 64, 0.3
+FOCAL, CENTRE, PIXEL_NOISE, BIAS = 800.0, 320.0, 1.0, 12.0
+SEED = 20_261_150
+
+Solve = Callable[[Tensor, Tensor, Tensor], tuple[Pose, Tensor]]
+
+
+def ours(name: str, **noise: float) -> Solve:
+    """A solver of ours, told how large the noise is; its problems count where it says ok."""
+    solver = create_solver(name)
+
+    def solve(world_points: Tensor, img_points: Tensor, intrinsics: Tensor) -> tuple[Pose, Tensor]:
+        result = solver(world_points, img_points, intrinsics, **noise)
+        return result.pose, result.ok
+
+    return solve
+
+
+def kornias_dlt(world_points: Tensor, img_points: Tensor, intrinsics: Tensor) -> tuple[Pose, Tensor]:
+    """Kornia's; what is not finite does not count."""
+    found = solve_pnp_dlt(world_points, img_points, intrinsics)
+    return Pose(found[..., :3], found[..., 3]), found.detach().isfinite().all(-1).all(-1)
+
+
+SOLVERS: dict[str, Callable[[], Solve]] = {
+    # Pixels that are off by their bias are no mismatches: without this they would hardly count, and never learn.
+    "pnpnet-set": lambda: ours("pnpnet-set", img_sigma=BIAS, world_sigma=0.0),
+    "epnp": lambda: ours("epnp"),
+    "kornia-dlt": lambda: kornias_dlt,
+}
+COLOURS = dict(zip(SOLVERS, (BLUE, ORANGE, GREEN), strict=True))
+
+
+def draw(index: int, keypoints: Tensor, bias: Tensor) -> tuple[Tensor, Tensor, Tensor, Pose]:
+    """A batch of images: world points, what the detector says, intrinsics and the true pose."""
+    generator = batch_generator(SEED, index + 1)
+    rotation = random_poses(BATCH, generator).rotation.float()
+    away = torch.rand(BATCH, 3, generator=generator) * torch.tensor([1.0, 1.0, 3.0]) + torch.tensor([-0.5, -0.5, 4.0])
+    pose = Pose(rotation, away)
+    cam = keypoints @ rotation.mT + away[:, None]
+    img_points = FOCAL * cam[..., :2] / cam[..., 2:] + CENTRE
+    img_points = img_points + bias + PIXEL_NOISE * torch.randn(img_points.shape, generator=generator)
+    anywhere = 2.0 * CENTRE * torch.rand(img_points.shape, generator=generator)
+    wrong = torch.rand(BATCH, KEYPOINTS, generator=generator) < WRONG
+    intrinsics = torch.tensor([[FOCAL, 0.0, CENTRE], [0.0, FOCAL, CENTRE], [0.0, 0.0, 1.0]])
+    img_points = torch.where(wrong[..., None], anywhere, img_points)
+    return keypoints.expand(BATCH, -1, -1), img_points, intrinsics.expand(BATCH, 3, 3), pose
+
+
+def learn(solve: Solve, steps: int) -> dict[str, Any]:
+    """The offsets' errors after every step, and how many gradients were not finite."""
+    generator = batch_generator(SEED, 0)
+    keypoints = torch.randn(KEYPOINTS, 3, generator=generator) * 0.5
+    bias = BIAS * torch.randn(KEYPOINTS, 2, generator=generator)
+    offsets = torch.zeros(KEYPOINTS, 2, requires_grad=True)
+    optimizer = torch.optim.Adam([offsets], lr=0.5)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps, eta_min=0.01)
+    errors, lost = [], 0
+    for step in range(steps):
+        with torch.no_grad():
+            errors.append(round((offsets + bias).square().sum(-1).mean().sqrt().item(), 4))
+        world_points, img_points, intrinsics, truth = draw(step, keypoints, bias)
+        pose, counts = solve(world_points, img_points + offsets, intrinsics)
+        rotation, translation = pose_distances(pose, truth)
+        # A pose that is far off says nothing about pixels: no sample may weigh more than a small one.
+        loss = rotation + translation
+        loss = torch.where(counts, loss / (1.0 + 5.0 * loss), 0.0).sum() / counts.sum().clamp(min=1)
+        optimizer.zero_grad()
+        loss.backward()
+        gradient = offsets.grad
+        if gradient is None or not gradient.isfinite().all():
+            lost += 1
+            continue
+        torch.nn.utils.clip_grad_norm_([offsets], 1.0)
+        optimizer.step()
+        schedule.step()
+    return {"error_px": errors, "steps_without_finite_gradient": lost}
+
+
+def plot(results: dict[str, Any], path: Path) -> None:
+    """The errors against steps."""
+    figure = make_figure(7.0, 3.6)
+    axes = figure.subplots()
+    for name, run in results["runs"].items():
+        axes.plot(run["error_px"], color=COLOURS[name], linewidth=1.7, label=name)
+    axes.set(xlabel="step", ylabel="error of the learned offsets (px)", yscale="log")
+    axes.set_title(f"{WRONG:.0%} of the keypoints anywhere", loc="left")
+    axes.legend(frameon=False)
+    tidy(axes)
+    save(figure, path)
+
+
+def main() -> None:
+    """Learn with every solver, write the results and draw them."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--steps", type=int, default=600)
+    parser.add_argument("--out", type=Path, default=HERE)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    runs = {name: learn(make(), options.steps) for name, make in SOLVERS.items()}
+    results = {"environment": environment(), "steps": options.steps, "runs": runs}
+    options.out.mkdir(parents=True, exist_ok=True)
+    save_results(results, options.out / "keypoint_offsets.json")
+    plot(results, options.out / "keypoint_offsets.png")
+    for name, run in runs.items():
+        first, last = run["error_px"][0], run["error_px"][-1]
+        print(f"{name}: {first:.2f} px at first, {last:.2f} px after {options.steps} steps")
+
+
+if __name__ == "__main__":
+    main()
