@@ -216,10 +216,12 @@ def _run_lines(results: Mapping[str, Any]) -> list[str]:
     """How a run was done; before it the one whose weights it began with."""
     run, config, made = results["run"], results["config"], results["environment"]
     overrides = [entry for entry in results["overrides"] if entry.split("=")[0] not in _HOW_IT_RAN]
+    most = "up to " if isinstance(config["data"]["train"].get("n"), list) else ""
     return [
         *(_run_lines(results["origin"]) if results.get("origin") else []),
         f"- `{' '.join(['python train.py', *overrides])}`:",
-        f"  {run['update']} updates of {config['batch_size']} synthetic problems, {run['skipped']} of them skipped;",
+        f"  {run['update']} updates of {most}{config['batch_size']} synthetic problems, "
+        f"{run['skipped']} of them skipped;",
         f"  {run['updates_per_second']:.1f} updates per second, peak memory {run['peak_memory_mib']:.0f} MiB,",
         f"  {made['threads']} thread(s) of {made['cpu']};",
         f"  {_mix(config['data']['train'], config['model']['n'])}.",
