@@ -55,6 +55,7 @@ def assert_same(result, expected, **tolerance):
     [
         *((name, 1, False, 3) for name in ("pnpnet-n9", "epnp-lm", "reppnp-lm", "identity-lm")),
         ("pnpnet-n9", 3, False, 4),  # and the choice among the starts
+        ("pnpnet-set", 1, False, 4),
         ("pnpnet-n9", 1, True, 1),
         ("pnpnet-n9", 3, True, 1),
     ],

@@ -4,7 +4,8 @@ import pytest
 import torch
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
-from kornia_pnpnet import Normalize, PnPNet, Pose, RobustWeightedLM, pose_covariance
+from kornia_pnpnet import Normalize, PnPNet, Pose, RobustWeightedLM, create_solver, pose_covariance
+from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 
 
 def tangent(estimate, truth):
@@ -64,3 +65,16 @@ def test_what_is_not_determined_is_infinite(make_problems):
     assert covariance[[0, 2]].isfinite().all()
     assert covariance[1].diagonal().isinf().all()
     assert (covariance[1] - covariance[1].diagonal().diag()).nan_to_num(0.0).eq(0).all()
+
+
+@pytest.mark.parametrize(("n", "wrong"), [(12, 0), (20, 5)])
+def test_the_shipped_network_says_how_sure_it_is(n, wrong):
+    """From its own weights, with wrong pairs as well: within 15 % of what chi-square asks."""
+    p = SyntheticProblems(n=n, batch_size=2000, seed=9, outliers=OutlierMix(count=wrong), dtype=torch.float64).batch(0)
+    noise = {"img_sigma": 1.0, "world_sigma": 0.05}
+    with torch.no_grad():
+        result = create_solver("pnpnet-set").double()(*p[:3], **noise)
+        covariance = pose_covariance(result.pose, *p[:3], **noise, weights=result.weights)
+    error = tangent(result.pose, p.pose)
+    squares = (error * torch.linalg.solve(covariance, error)).sum(-1)
+    assert squares.mean().item() == pytest.approx(6.0, rel=0.15)
