@@ -44,7 +44,6 @@ HERE = Path(__file__).resolve().parent
 OUTPUTS = HERE.parents[1] / "outputs" / "results"
 EXPERIMENTS = HERE.parents[1] / "conf" / "experiment"
 OURS = "pnpnet-n9"
-ANY = "pnpnet-set"
 METRIC_SCENES = ("strecha/fountain-P11", "strecha/Herz-Jesus-P25", "eth3d/courtyard")
 OTHER_SCENES = ("colmap/lund_door", "colmap/sceaux_castle")
 # Nothing was trained, tuned or looked at with these before.
@@ -72,7 +71,6 @@ PEERS = ("opencv-ransac", "opencv-ransac-sqpnp", "opencv-usac", "poselib", "pyco
 ROBUST = ("p3p-ransac", "p3p-ransac-noise", *PEERS)
 BOUNDS = ("known-inliers", "known-inliers-and-noise")
 VIEWS = (1, 2, 3, 4, 8)
-SYNTHETIC = ("paper", "any_rotation")
 SCALES = (("cauchy", 10.0), ("geman_mcclure", 20.0))
 
 
@@ -141,22 +139,6 @@ def run(name: str, solvers: Mapping[str, nn.Module], data: Mapping[str, Evaluati
     print(f"\n{name}\n{format_table(results)}", flush=True)
 
 
-def set_data(scenes: Path, count: int, real_count: int) -> dict[str, EvaluationData]:
-    """What a solver for any number of pairs must stand: numbers of pairs, rotations, shares of wrong ones, scenes."""
-    common: dict[str, Any] = {"dtype": torch.float64, "seed": SEED_REPORT + 20}
-    sets = evaluation_sets(["synthetic", "any_rotation"], "none,uniform,3", n=9, count=count, **common)
-    for n, wrong in ((6, "uniform"), (12, "uniform"), (20, "uniform,50%"), (50, "uniform,50%"), (200, "uniform,50%")):
-        sets |= evaluation_sets(["synthetic"], wrong, n=n, count=count if n < 100 else count // 5, **common)
-    common["count"] = real_count
-    for n, wrong in ((9, "2"), (12, "3")):
-        sets |= evaluation_sets([str(scenes / name) for name in METRIC_SCENES], wrong, n=n, **common)
-        sets |= evaluation_sets([str(scenes / name) for name in OTHER_SCENES], wrong, n=n, metric=False, **common)
-    matches = sorted(str(path) for path in (scenes / "matches").glob("*.npz"))
-    return sets | {
-        f"{name} (raw matches)": entry for name, entry in evaluation_sets(matches, "none", n=50, **common).items()
-    }
-
-
 def measure(scenes: Path, synthetic_count: int, real_count: int, only: Sequence[str]) -> None:
     """Solve everything and write the results files."""
     import cv2
@@ -223,19 +205,6 @@ def measure(scenes: Path, synthetic_count: int, real_count: int, only: Sequence[
         kernels |= {f"{name}, {scale:g} px": classical(name, scale) for name, scale in SCALES}
         guesses |= {f"{name} from the truth": FromTheTruth(solver) for name, solver in kernels.items()}
         run("views", guesses, sets)
-    if wanted("set"):
-        # Tuned by `paper` and `real`, where these are not measured along with this.
-        tuned = {name: load_results(HERE / f"{name}.json")["tuned"] for name in ("paper", "real")}
-        sets = set_data(scenes, 2 * synthetic_count, real_count)
-        synthetic_sets = {name: entry for name, entry in sets.items() if entry.description["source"] in SYNTHETIC}
-        every = (ANY, *(name for name in ROBUST if name != "pycolmap"), *BOUNDS)
-        run("set", named(every, tuned["paper"]), synthetic_sets, tuned=tuned["paper"])
-        real = {name: entry for name, entry in sets.items() if name not in synthetic_sets}
-        few = (ANY, OURS, "p3p-ransac", "opencv-ransac", "poselib", "known-inliers")
-        run("set_real", named(few, tuned["real"]), real, tuned=tuned["real"])
-        common = {**synthetic, "count": 2 * synthetic_count, "seed": SEED_REPORT + 20, "told": True}
-        sets = evaluation_sets(["synthetic", "any_rotation"], "none,uniform,3", **common)
-        run("set_told", named((ANY, "known-inliers-and-noise"), {}), sets)
     if wanted("complexity"):
         write_json(HERE / "complexity.json", complexity_results())
 
@@ -387,26 +356,6 @@ n = 100 with 50 and with 70 wrong pairs.
 
 {crowd}
 
-## One network for any number of pairs
-
-`{any}` on other problems than above: the protocol's, the same with rotations by any angle, other numbers of pairs and
-shares of wrong ones, and scenes, also the raw matches of two of them, whose mismatches are real. The weights are the
-same everywhere; thresholds are those tuned for the protocol's data and for scenes.
-
-{set}
-
-With the noise of pixels and points told (`img_sigma=1.0, world_sigma=0.05`):
-
-{set_told}
-
-Scenes:
-
-{set_real}
-
-Against the best of the threshold methods, ours and others:
-
-{set_peers}
-
 ## Against the number of pairs
 
 {against_n}
@@ -450,10 +399,7 @@ RANSAC (first table), and the learned iterations, which need not end in a minimu
 
 {trainings}
 """
-RESULTS = (
-    *("paper", "gaussian_pose", "real", "mismatches", "crowd", "against_n", "against_m", "views", "distribution"),
-    *("set", "set_told", "set_real"),
-)
+RESULTS = ("paper", "gaussian_pose", "real", "mismatches", "crowd", "against_n", "against_m", "views", "distribution")
 
 
 def claims(paper: Rates, real: Rates, complexity: Mapping[str, Any]) -> str:
@@ -514,17 +460,6 @@ def beside_peers(rates: Rates, solvers: Iterable[str]) -> str:
         peer = rates.best(data, (*PEERS, "opencv-epnp", "opencv-sqpnp"))
         parts = ", ".join(f"`{name}` {rates.versus(data, name, peer)}" for name in solvers)
         lines.append(f"- {data}, best is `{peer}` with {rates.rate(data, peer):.1f} %: {parts}.")
-    return "\n".join(lines)
-
-
-def beside_best(rates: Rates, solver: str, others: Iterable[str]) -> str:
-    """One line for each data set: how far a solver is from the best of others."""
-    lines = []
-    for data in rates.sets:
-        best = rates.best(data, others)
-        lines.append(
-            f"- {data}, best is `{best}` with {rates.rate(data, best):.1f} %: {rates.versus(data, solver, best)}."
-        )
     return "\n".join(lines)
 
 
@@ -687,13 +622,6 @@ def page(
         real_peers=beside_peers(rates["real"], ("p3p-ransac", "reppnp", OURS)),
         crowd=rates["crowd"].table(),
         against_n="\n\n".join(rates["against_n"].table(rates["against_n"].sets[i::2]) for i in (0, 1)),
-        any=ANY,
-        set="\n\n".join(
-            rates["set"].table(sets, times=False) for sets in (rates["set"].sets[:6], rates["set"].sets[6:])
-        ),
-        set_told=rates["set_told"].table(times=False),
-        set_real="\n\n".join(rates["set_real"].table(rates["set_real"].sets[i : i + 6], times=False) for i in (0, 6)),
-        set_peers="\n".join(beside_best(rates[name], ANY, ROBUST) for name in ("set", "set_real")),
         shipped_views=PnPNet.from_pretrained(OURS).views,
         views="\n\n".join(
             rates["views"].table(sets, times=False) for sets in (rates["views"].sets[:5], rates["views"].sets[5:])
@@ -714,7 +642,7 @@ def render() -> None:
     """Write the page and its pictures from the results files."""
     results = {name: load_results(HERE / f"{name}.json") for name in RESULTS}
     complexity = json.loads((HERE / "complexity.json").read_text())
-    paper_figures([*(results[name] for name in RESULTS[:7]), complexity], HERE)
+    paper_figures([*(results[name] for name in RESULTS[:-2]), complexity], HERE)
     for name in shipped_weights():
         plot_training(HERE / f"training-{name}.png", WEIGHTS_FOLDER / name / "history.csv")
     short_runs = [read_summary(HERE / f"{name}.csv") for name in ("ablation", "sweep")]
@@ -737,8 +665,9 @@ def compare(scenes: Path, count: int, runs: Sequence[Path]) -> None:
 
 def ship(runs: Sequence[Path]) -> None:
     """Put the weights of the last run into the package, with the curves of all."""
-    n = json.loads((runs[-1] / RESULTS_NAME).read_text())["config"]["model"]["n"]
-    collect_weights(runs, WEIGHTS_FOLDER / f"pnpnet-n{n}")
+    results = json.loads((runs[-1] / RESULTS_NAME).read_text())
+    kind = "set" if results["model"]["init"]["name"] == "SetInit" else f"n{results['config']['model']['n']}"
+    collect_weights(runs, WEIGHTS_FOLDER / f"pnpnet-{kind}")
 
 
 def main() -> None:
