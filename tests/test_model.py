@@ -939,13 +939,13 @@ def test_views_are_saved(make_problems, tmp_path):
 
 
 def test_trained_weights_take_views_and_m(make_problems):
-    p = make_problems(batch=300, outliers=2, noise=False)
+    p = make_problems(batch=1000, outliers=2, noise=False)
     assert create_solver("pnpnet-n9", views=3).views == 3
     shallow = create_solver("pnpnet-n9", m=2, views=8)
     assert (shallow.refine.m, shallow.views) == (2, 8)
     results = [create_solver("pnpnet-n9", views=views).double()(*p[:3]) for views in (1, 8)]
     one, eight = (success(pose_errors(result.pose, p.pose)).double().mean() for result in results)
-    assert eight > one + 0.02
+    assert eight > one + 0.01
     with pytest.raises(BaseError, match="views must be 1 to 8"):
         create_solver("pnpnet-n9", views=0)
 

@@ -57,7 +57,7 @@ def _load(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Tensor]:
     given = ring[:, :3]
     given[:3], given[3:] = world_points.permute(2, 1, 0), plane_points.permute(2, 1, 0)
     sound = given.abs().sum((0, 1)) <= torch.finfo(ring.dtype).max ** 0.2  # what is larger could overflow
-    given.masked_fill_(~sound, 0.0)
+    torch.where(sound, given, given.new_zeros(()), out=given)
     ring[:, 3:] = ring[:, :2]
     edges = ring[:3, 2:] - ring[:3, 1:4]
     return turned(ring, turn_to_largest(*dot(edges, edges))), sound
@@ -68,7 +68,7 @@ def _look(plane: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     ring = plane.new_empty(3, 5, plane.shape[-1])
     rays = ring[:, :3]
     depth = torch.mul(plane[0], plane[0], out=rays[2]).addcmul_(plane[1], plane[1]).add_(1.0).rsqrt_()
-    rays[:2] = plane * depth
+    torch.mul(plane, depth, out=rays[:2])
     ring[:, 3:] = ring[:, :2]
     gaps = ring[:, 2:] - ring[:, 1:4]
     det = dot(_cross(gaps[:, 1], gaps[:, 2]), rays[:, 0])
