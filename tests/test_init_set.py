@@ -154,6 +154,15 @@ def test_samples_of_right_pairs_have_the_true_pose(n, wrong):
     assert success(again, 0.01, 0.01).double().mean() > 0.95
 
 
+def test_padding_judges_no_sample(make_problems):
+    p = make_problems(n=9, batch=200, outliers=3)
+    mask = torch.arange(9).expand(200, 9) < 6
+    net = solver()
+    padded = net.with_guess(*p[:3], mask=mask, **NOISE)[1]
+    alone = net.with_guess(p.world_points[:, :6], p.img_points[:, :6], p.intrinsics, **NOISE)[1]
+    near(padded.others, alone.others)
+
+
 def test_where_no_sample_has_a_pose_the_first_guess_stands_in():
     p = SyntheticProblems(n=6, batch_size=4, seed=3, dtype=torch.float64).batch(0)
     line = p.world_points[:, :1] + torch.arange(6, dtype=torch.float64)[:, None] * torch.ones(3, dtype=torch.float64)

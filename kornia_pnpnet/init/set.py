@@ -24,7 +24,7 @@ _LOG_NOISE = -5.0
 _FEATURES = 14
 # Added to the score of a pair that is not there.
 _ABSENT = -1e9
-# Samples of three, by how likely their pairs are to be right; no two of them have more than two pairs in common.
+# Samples of three, by how likely their pairs are to be right.
 _SAMPLES = ((0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3), (0, 1, 4), (2, 3, 4), (0, 3, 4), (1, 2, 4))
 # So many of the likeliest pairs say how good the pose of a sample is: squared residuals count to this many variances.
 _MOST_JUDGES, _JUDGED = 32, 50.0
@@ -157,8 +157,8 @@ class SetInit(nn.Module):
     roll; intrinsics enter as rays alone. The network runs in the dtype of its weights, what is around it in that of
     the correspondences.
 
-    The likeliest pairs also make ``samples`` of three, whose poses (see :func:`~kornia_pnpnet.init.p3p.p3p`) all pairs
-    judge; the best one of all samples is one more hypothesis, a constant without gradient. Its cost is fixed.
+    The likeliest pairs also make ``samples`` of three, whose poses (see :func:`~kornia_pnpnet.init.p3p.p3p`) at most 32
+    of them judge; the best one of all samples is one more hypothesis, a constant without gradient. Its cost is fixed.
 
     A pair weighs as much as it is likely to be right. The noise of pixels and points, which tells
     the refinement how far pairs may be off, is what :attr:`~kornia_pnpnet.types.Correspondences.noise` says, or the
@@ -264,7 +264,8 @@ class SetInit(nn.Module):
     def _sampled(self, corr: Correspondences, right: Tensor, noise: Noise, fallback: Pose) -> Pose:
         """The pose that the likeliest pairs agree on most, of those from samples of three of them."""
         batch, count = right.shape
-        weights, likely = torch.where(corr.weights > 0, right, 0.0).topk(min(_MOST_JUDGES, count))
+        right = torch.where(corr.weights > 0, right, 0.0)  # pairs that are not there judge nothing
+        weights, likely = right.topk(min(_MOST_JUDGES, count))
         img, world = (x.expand(batch, count)[..., None] for x in noise)
         of_pairs = torch.cat((corr.world_points, corr.img_points, right[..., None], img, world), -1)  # (B, N, 8)
         pairs = _taken(of_pairs, likely)  # (8, K, B)
