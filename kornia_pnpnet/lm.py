@@ -386,11 +386,12 @@ class RobustWeightedLM(nn.Module):
         """
         step, damping, shape = (x.unbind() for x in self.hyperparameters(corr.world_points))
         corr = problems_last(corr)
-        poses: Iterable[Tensor] = guess.pose
+        # Problems last, after the starts.
+        poses = [x.movedim(0, -1) for x in guess.pose]
         if guess.others is not None:
-            every = (torch.cat((x[:, None], y), 1) for x, y in zip(guess.pose, guess.others, strict=True))
-            poses = (x.transpose(0, 1).flatten(0, 1) for x in every)
-        pose = Pose(*(x.movedim(0, -1).contiguous().movedim(-1, 0) for x in poses))
+            others = (x.movedim((0, 1), (-1, -2)) for x in guess.others)
+            poses = [torch.cat((x[..., None, :], y), -2).flatten(-2) for x, y in zip(poses, others, strict=True)]
+        pose = Pose(*(x.contiguous().movedim(-1, 0) for x in poses))
         prior = corr.weights * guess.weights.mT.contiguous().mT
         # The steps do not depend on a common factor of the weights; tiny ones must not vanish when multiplied.
         noise = None if guess.noise is None else Noise(*(x.mT.contiguous().mT for x in guess.noise))
@@ -535,9 +536,15 @@ class RobustWeightedLM(nn.Module):
 
 def _repeated(pairs: Correspondences, count: int) -> Correspondences:
     """The pairs of all problems several times over, problems last in memory."""
-    world_points, img_points = (x.permute(2, 1, 0).repeat(1, 1, count).permute(2, 1, 0) for x in pairs[:2])
-    weights = pairs.weights.mT.repeat(1, count).mT
-    noise = None if pairs.noise is None else Noise(*(x.mT.repeat(1, count).mT for x in pairs.noise))
+
+    def repeated(x: Tensor) -> Tensor:
+        # Expanded, not `repeat`, which would ask a compiler for a division at each entry.
+        reverse = tuple(reversed(range(x.ndim)))
+        last = x.permute(reverse)[..., None, :]
+        return last.expand(*last.shape[:-2], count, -1).flatten(-2).permute(reverse)
+
+    noise = None if pairs.noise is None else Noise(*map(repeated, pairs.noise))
+    world_points, img_points, weights = map(repeated, pairs[:3])
     return pairs._replace(world_points=world_points, img_points=img_points, weights=weights, noise=noise)
 
 

@@ -44,6 +44,7 @@ HERE = Path(__file__).resolve().parent
 OUTPUTS = HERE.parents[1] / "outputs" / "results"
 EXPERIMENTS = HERE.parents[1] / "conf" / "experiment"
 OURS = "pnpnet-n9"
+ANY = "pnpnet-set"
 METRIC_SCENES = ("strecha/fountain-P11", "strecha/Herz-Jesus-P25", "eth3d/courtyard")
 OTHER_SCENES = ("colmap/lund_door", "colmap/sceaux_castle")
 # Nothing was trained, tuned or looked at with these before.
@@ -71,6 +72,7 @@ PEERS = ("opencv-ransac", "opencv-ransac-sqpnp", "opencv-usac", "poselib", "pyco
 ROBUST = ("p3p-ransac", "p3p-ransac-noise", *PEERS)
 BOUNDS = ("known-inliers", "known-inliers-and-noise")
 VIEWS = (1, 2, 3, 4, 8)
+SYNTHETIC = ("paper", "any_rotation")
 SCALES = (("cauchy", 10.0), ("geman_mcclure", 20.0))
 
 
@@ -139,6 +141,22 @@ def run(name: str, solvers: Mapping[str, nn.Module], data: Mapping[str, Evaluati
     print(f"\n{name}\n{format_table(results)}", flush=True)
 
 
+def set_data(scenes: Path, count: int, real_count: int) -> dict[str, EvaluationData]:
+    """What a solver for any number of pairs must stand: numbers of pairs, rotations, shares of wrong ones, scenes."""
+    common: dict[str, Any] = {"dtype": torch.float64, "seed": SEED_REPORT + 20}
+    sets = evaluation_sets(["synthetic", "any_rotation"], "none,uniform,3", n=9, count=count, **common)
+    for n, wrong in ((6, "uniform"), (12, "uniform"), (20, "uniform,50%"), (50, "uniform,50%"), (200, "uniform,50%")):
+        sets |= evaluation_sets(["synthetic"], wrong, n=n, count=count if n < 100 else count // 5, **common)
+    common["count"] = real_count
+    for n, wrong in ((9, "2"), (12, "3")):
+        sets |= evaluation_sets([str(scenes / name) for name in METRIC_SCENES], wrong, n=n, **common)
+        sets |= evaluation_sets([str(scenes / name) for name in OTHER_SCENES], wrong, n=n, metric=False, **common)
+    matches = sorted(str(path) for path in (scenes / "matches").glob("*.npz"))
+    return sets | {
+        f"{name} (raw matches)": entry for name, entry in evaluation_sets(matches, "none", n=50, **common).items()
+    }
+
+
 def measure(scenes: Path, synthetic_count: int, real_count: int, only: Sequence[str]) -> None:
     """Solve everything and write the results files."""
     import cv2
@@ -205,6 +223,19 @@ def measure(scenes: Path, synthetic_count: int, real_count: int, only: Sequence[
         kernels |= {f"{name}, {scale:g} px": classical(name, scale) for name, scale in SCALES}
         guesses |= {f"{name} from the truth": FromTheTruth(solver) for name, solver in kernels.items()}
         run("views", guesses, sets)
+    if wanted("set"):
+        # Tuned by `paper` and `real`, where these are not measured along with this.
+        tuned = {name: load_results(HERE / f"{name}.json")["tuned"] for name in ("paper", "real")}
+        sets = set_data(scenes, 2 * synthetic_count, real_count)
+        synthetic_sets = {name: entry for name, entry in sets.items() if entry.description["source"] in SYNTHETIC}
+        every = (ANY, *(name for name in ROBUST if name != "pycolmap"), *BOUNDS)
+        run("set", named(every, tuned["paper"]), synthetic_sets, tuned=tuned["paper"])
+        real = {name: entry for name, entry in sets.items() if name not in synthetic_sets}
+        few = (ANY, OURS, "p3p-ransac", "opencv-ransac", "poselib", "known-inliers")
+        run("set_real", named(few, tuned["real"]), real, tuned=tuned["real"])
+        common = {**synthetic, "count": 2 * synthetic_count, "seed": SEED_REPORT + 20, "told": True}
+        sets = evaluation_sets(["synthetic", "any_rotation"], "none,uniform,3", **common)
+        run("set_told", named((ANY, "known-inliers-and-noise"), {}), sets)
     if wanted("complexity"):
         write_json(HERE / "complexity.json", complexity_results())
 
@@ -675,7 +706,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("step", choices=("measure", "compare", "ship", "render"))
     parser.add_argument(
-        "--only", nargs="+", default=(), choices=(*RESULTS, "complexity"), help="for measure: these files"
+        "--only", nargs="+", default=(), choices=(*RESULTS, "set", "complexity"), help="for measure: these files"
     )
     parser.add_argument("--scenes", type=Path, default=HERE.parents[2] / "shared" / "data")
     parser.add_argument("--synthetic-count", type=int, default=5000)

@@ -10,7 +10,7 @@ from torch.nn import functional
 from kornia_pnpnet.geometry import pixel_variance, project
 from kornia_pnpnet.init.control_points import align
 from kornia_pnpnet.init.p3p import p3p
-from kornia_pnpnet.small import dot
+from kornia_pnpnet.small import dot, small_product
 from kornia_pnpnet.types import Correspondences, Guess, Noise, Pose
 
 __all__ = ["SetInit"]
@@ -138,12 +138,21 @@ class _Block(nn.Module):
 
     def forward(self, x: Tensor, absent: Tensor) -> Tensor:
         """From (B, N, width) to the same; ``absent`` is minus infinity, or much, where there is no pair."""
+        width = x.shape[-1]
         y = self.norm(x)
-        values, scores = self.look(y).split((x.shape[-1], self.heads), -1)
+        # Biases go where there is one row for each problem, not one for each pair; that of the scores, which is as much
+        # for all pairs, does not count.
+        values, scores = functional.linear(y, self.look.weight).split((width, self.heads), -1)
         attention = (scores + absent).softmax(1)  # (B, N, heads)
         parts = values.unflatten(-1, (self.heads, -1))
-        context = (attention[..., None] * parts).sum(1).flatten(1)  # (B, width)
-        return x + self.out(functional.relu(self.pair(y) + self.all(context)[:, None]))
+        context = (attention[..., None] * parts).sum(1).flatten(1) + self.look.bias[:width]  # (B, width)
+        hidden = functional.linear(y, self.pair.weight) + (self.all(context) + self.pair.bias)[:, None]
+        return (x + self.out.bias) + functional.linear(functional.relu(hidden), self.out.weight)
+
+
+def _by_channel(x: Tensor, weight: Tensor) -> Tensor:
+    """A linear map of (B, N, width) to few channels; they lie one after the other in memory, faster for BLAS."""
+    return (weight @ x.flatten(0, 1).mT).unflatten(1, x.shape[:2]).movedim(0, -1)
 
 
 class SetInit(nn.Module):
@@ -248,33 +257,38 @@ class SetInit(nn.Module):
         counts = (right * torch.exp(3.0 * torch.tanh(counts)) + 1e-6) * view.there
         source = view.points.expand(starts, -1, -1, -1).flatten(0, 1)
         pose, _ = align(source, (ranges[..., None] * view.rays).flatten(0, 1), counts.flatten(0, 1))
-        rotation, translation = (x.unflatten(0, (starts, -1)) for x in pose)
-        rotation = view.camera.mT @ rotation @ view.world
-        translation = (view.camera.mT @ translation[..., None])[..., 0]
+        # Problems last, after the hypotheses: (3, 3, S, B) and (3, S, B).
+        rotation, translation = (x.movedim(0, -1).unflatten(-1, (starts, -1)) for x in pose)
+        back = view.camera.permute(2, 1, 0)[:, :, None]
+        rotation = small_product(small_product(back, rotation), view.world.permute(1, 2, 0)[:, :, None])
+        translation = small_product(back, translation[:, None])[:, 0]
         noises = self._noise(corr, view, noise)
         if self.samples:
-            sampled = self._sampled(corr, right, noises, Pose(rotation[0], translation[0]))
+            sampled = self._sampled(corr, right, noises, Pose(rotation[:, :, 0], translation[:, 0]))
             rotation, translation = (
-                torch.cat((x, y[None])) for x, y in zip((rotation, translation), sampled, strict=True)
+                torch.cat((x, y[..., None, :]), -2) for x, y in zip((rotation, translation), sampled, strict=True)
             )
-        others = Pose(rotation[1:].movedim(0, 1), translation[1:].movedim(0, 1)) if len(rotation) > 1 else None
-        return Guess(Pose(rotation[0], translation[0]), right, others=others, noise=noises)
+        every = Pose(rotation.permute(3, 2, 0, 1), translation.permute(2, 1, 0))  # (B, S, 3, 3) and (B, S, 3)
+        others = Pose(*(x[:, 1:] for x in every)) if every.rotation.shape[1] > 1 else None
+        return Guess(Pose(*(x[:, 0] for x in every)), right, others=others, noise=noises)
 
     @torch.no_grad()
     def _sampled(self, corr: Correspondences, right: Tensor, noise: Noise, fallback: Pose) -> Pose:
-        """The pose that the likeliest pairs agree on most, of those from samples of three of them."""
+        """The pose that the likeliest pairs agree on most, of those from samples of three of them; problems last."""
         batch, count = right.shape
         right = torch.where(corr.weights > 0, right, 0.0)  # pairs that are not there judge nothing
-        weights, likely = right.topk(min(_MOST_JUDGES, count))
+        likely = right.topk(min(_MOST_JUDGES, count)).indices
         img, world = (x.expand(batch, count)[..., None] for x in noise)
         of_pairs = torch.cat((corr.world_points, corr.img_points, right[..., None], img, world), -1)  # (B, N, 8)
         pairs = _taken(of_pairs, likely)  # (8, K, B)
-        chosen = torch.tensor([x for x in _SAMPLES if max(x) < count][: self.samples], device=right.device)  # (S, 3)
-        three = pairs[:5, chosen].permute(1, 3, 2, 0).flatten(0, 1)  # (S B, 3, 5)
-        pose, valid = p3p(three[..., :3], three[..., 3:] / corr.focal)
+        samples = [x for x in _SAMPLES if max(x) < count][: self.samples]
+        # (6, 3, S B), stacked, not indexed: a compiler then copies whole rows.
+        three = torch.stack([pairs[:6, k] for column in zip(*samples, strict=True) for k in column], 1)
+        three = three.unflatten(1, (3, -1)).flatten(2)
+        pose, valid = p3p(three[:3].permute(2, 1, 0), three[3:5].permute(2, 1, 0) / corr.focal)
         # Components first, then the four solutions and the samples, problems last: it is how they lie in memory.
         rotation, translation = (x.movedim((0, 1), (-1, -2)).flatten(-2).unflatten(-1, (-1, batch)) for x in pose)
-        valid = valid.mT.unflatten(-1, (-1, batch)) & (weights[:, chosen] > 0).all(-1).mT  # (4, S, B)
+        valid = (valid.mT & (three[5] > 0).all(0)).unflatten(-1, (-1, batch))  # (4, S, B)
         # One more dimension after the problems, that of hypotheses: (B, 3, 3, H), (B, 3, H), and of pairs (B, 1, K).
         every = Pose(rotation.permute(3, 0, 1, 2), translation.permute(2, 0, 1))
         world, img, right, *sigmas = (x.permute(2, 1, 0)[:, None] for x in pairs.split((3, 2, 1, 1, 1)))
@@ -284,14 +298,11 @@ class SetInit(nn.Module):
         support = judges.weights / (1.0 + projection.sq_residual / (_JUDGED * variance))
         support = torch.where(projection.in_front, support, 0.0).sum(-1)  # (B, H)
         best = torch.where(valid.flatten(0, 1).mT, support, -1.0).max(1)
-        index = best.indices[:, None]
-        rotation = every.rotation.flatten(1, 2).gather(2, index[:, None].expand(-1, 9, -1)).view(batch, 3, 3)
-        translation = every.translation.gather(2, index[:, None].expand(-1, 3, -1))[..., 0]
+        index = best.indices
+        rotation = rotation.flatten(0, 1).gather(1, index.expand(9, 1, -1)).view(3, 3, batch)
+        translation = translation.gather(1, index.expand(3, 1, -1))[:, 0]
         found = best.values > 0.0
-        return Pose(
-            torch.where(found[:, None, None], rotation, fallback.rotation),
-            torch.where(found[:, None], translation, fallback.translation),
-        )
+        return Pose(*(torch.where(found, x, y) for x, y in zip((rotation, translation), fallback, strict=True)))
 
     def _run(self, features: Tensor, there: Tensor) -> tuple[Tensor, Tensor]:
         """The network: outputs for each pair, (B, N, 1 + 2 S), and for each problem, (B, S + 2)."""
@@ -300,7 +311,7 @@ class SetInit(nn.Module):
         for block in self.blocks:
             x = block(x, absent)
         x = self.norm(x)
-        pair = self.pair(x)
+        pair = _by_channel(x, self.pair.weight) + self.pair.bias
         share = (pair[..., :1] + absent).softmax(1)
         return pair, self.problem((share * x).sum(1))
 
