@@ -25,7 +25,7 @@ from kornia_pnpnet import PnPNet, RobustWeightedLM
 from kornia_pnpnet.choices import load_solver
 from kornia_pnpnet.types import Pose, Problems
 
-__all__ = ["ANY", "CONTENDERS", "ONE", "OURS", "PLAIN", "TRAINED", "WHOLE"]
+__all__ = ["ANY", "CONTENDERS", "ONE", "ONE_THREAD", "OURS", "PLAIN", "TRAINED", "WHOLE"]
 
 TRAINED = "pnpnet-n9"
 #: For any number of pairs.
@@ -134,3 +134,5 @@ CONTENDERS: dict[str, Callable[..., Contender]] = {
     "pypose-lm": functools.partial(PyPose, own_loop=False),
     "pypose-parts": functools.partial(PyPose, own_loop=True),
 }
+#: Thousands of small operations, which wait for each other: on two threads they take minutes.
+ONE_THREAD = ("pypose-lm", "pypose-parts")

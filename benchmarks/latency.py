@@ -35,7 +35,7 @@ def measure_latency(settings: Settings, *, count: int) -> dict[str, list[dict[st
     problems = draw(N, settings.latency_calls if count == 1 else max(1, settings.latency_calls // 4), OutlierMix())
     rows = []
     with threads(count):
-        contenders, skipped = make_contenders(settings)
+        contenders, skipped = make_contenders(settings, count=count)
         tasks = {}
         for name, contender in contenders.items():
             say(f"latency: {count} thread(s), {name}")

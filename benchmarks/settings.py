@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
-from contenders import CONTENDERS, OURS
+from contenders import CONTENDERS, ONE_THREAD, OURS
 from harness import say
 from tasks import CannotBeTimedError, Contender
 from versions import version_contenders
@@ -104,12 +104,13 @@ class Made(NamedTuple):
     skipped: list[dict[str, Any]]
 
 
-def make_contenders(settings: Settings, *, versions: bool = False) -> Made:
+def make_contenders(settings: Settings, *, versions: bool = False, count: int = 1) -> Made:
     """Make what is asked for, as far as it is installed.
 
     Args:
         settings: say which, and the device.
         versions: earlier versions of the package, too.
+        count: of threads; some are measured on one only.
 
     Returns:
         Contenders by name, and for those that cannot be made the reason.
@@ -118,6 +119,9 @@ def make_contenders(settings: Settings, *, versions: bool = False) -> Made:
     wanted = [name for name in makers if settings.contenders is None or name in settings.contenders]
     made, skipped = {}, []
     for name in wanted:
+        if count > 1 and name in ONE_THREAD:
+            skipped.append({"contender": name, "why": "measured on one thread only"})
+            continue
         options = {"device": settings.device} if name in OURS else {}
         try:
             made[name] = makers[name](**options)

@@ -79,7 +79,7 @@ def measure_throughput(settings: Settings, *, count: int) -> dict[str, list[dict
     with threads(count):
         for n, points in grid(settings, count):
             torch.compiler.reset()  # who has one number of pairs does not compile for others
-            contenders, missing = make_contenders(settings, versions=n == N)
+            contenders, missing = make_contenders(settings, versions=n == N, count=count)
             skipped += [{**entry, "threads": count, "n": n} for entry in missing]
             problems = draw(n, max(settings.problems, *(batch for batch, _ in points)))
             rates: dict[str, dict[str, Any]] = {}
