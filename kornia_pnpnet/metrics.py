@@ -11,7 +11,7 @@ from torch import Tensor
 from kornia_pnpnet.geometry import rotation_angle
 from kornia_pnpnet.types import Pose
 
-__all__ = ["PoseErrors", "SuccessRate", "pose_errors", "success", "success_rate"]
+__all__ = ["PoseErrors", "Reliability", "SuccessRate", "pose_errors", "reliability", "success", "success_rate"]
 
 
 class PoseErrors(NamedTuple):
@@ -36,6 +36,57 @@ class SuccessRate(NamedTuple):
 
     def __str__(self) -> str:
         return f"{100 * self.rate:.1f} % [{100 * self.low:.1f}, {100 * self.high:.1f}]"
+
+
+class Reliability(NamedTuple):
+    r"""How often what is said to have a chance comes true, for equally wide ranges of chances from 0 to 1.
+
+    Attributes:
+        number: how many chances are in each range, shape :math:`(K,)`.
+        predicted: their mean, NaN where there are none, shape :math:`(K,)`.
+        observed: the share of them that came true, NaN where there are none, shape :math:`(K,)`.
+    """
+
+    number: Tensor
+    predicted: Tensor
+    observed: Tensor
+
+    @property
+    def expected_error(self) -> float:
+        """The expected calibration error: the mean over all chances of how far both are apart in their range."""
+        gap = (self.predicted - self.observed).abs().nan_to_num(0.0)
+        return float((self.number * gap).sum() / self.number.sum())
+
+
+def reliability(chances: Tensor, outcomes: Tensor, ranges: int = 10) -> Reliability:
+    r"""Compare chances with what came of them, for a reliability diagram.
+
+    Args:
+        chances: between 0 and 1, of any shape with at least one element.
+        outcomes: bool of the same shape.
+        ranges: into how many ranges the chances are sorted, :math:`K`.
+
+    Returns:
+        The :class:`Reliability`, in float64. Its error is the expected calibration error of C. Guo et al., "On
+        calibration of modern neural networks", ICML 2017, for the chance of one outcome.
+
+    Raises:
+        ValueError: when the shapes differ, or there is nothing.
+
+    Example:
+        >>> found = reliability(torch.tensor([0.9, 0.9, 0.9, 0.1]), torch.tensor([True, True, False, False]), ranges=2)
+        >>> found.number.tolist(), f"{found.expected_error:.3f}"
+        ([1.0, 3.0], '0.200')
+    """
+    if chances.shape != outcomes.shape or chances.numel() == 0:
+        shapes = f"{tuple(chances.shape)} and {tuple(outcomes.shape)}"
+        raise ValueError(f"reliability needs as many chances as outcomes, at least one, got {shapes}.")
+    chance, outcome = (x.detach().flatten().to(torch.float64) for x in (chances, outcomes))
+    place = (chance * ranges).long().clamp(0, ranges - 1)
+    count, predicted, observed = (
+        chance.new_zeros(ranges).index_add(0, place, x) for x in (torch.ones_like(chance), chance, outcome)
+    )
+    return Reliability(count, predicted / count, observed / count)
 
 
 def pose_errors(estimate: Pose, truth: Pose) -> PoseErrors:

@@ -16,7 +16,7 @@ pytest.importorskip("matplotlib")
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from kornia_pnpnet.figures import plot_errors, plot_pose, plot_success, plot_sweep, plot_training
+from kornia_pnpnet.figures import plot_errors, plot_pose, plot_reliability, plot_success, plot_sweep, plot_training
 
 
 def fake_results(solvers: int = 3, sets: int = 2, shift: float = 0.0) -> dict:
@@ -144,6 +144,18 @@ def test_pose_picture_takes_tensors_sizes_and_points_behind(tmp_path, problem):
     assert differ(whole, behind)
     pixels(plot_pose(tmp_path / "c.png", img, torch.full_like(img, torch.nan), rejected))
     pixels(plot_pose(tmp_path / "d.png", img[:, :1] * torch.tensor([0.0, 1.0]), projected, rejected))
+
+
+def test_reliability_picture_leaves_empty_ranges_out(tmp_path):
+    curve = {"number": [3.0, 0.0, 5.0], "predicted": [0.1, 0.0, 0.9], "observed": [0.2, 0.0, 0.7]}
+    first = pixels(plot_reliability(tmp_path / "a.png", {"a": curve}))
+    empty = {**curve, "predicted": [0.1, 0.5, 0.9], "observed": [0.2, 1.0, 0.7]}
+    assert not differ(first, pixels(plot_reliability(tmp_path / "b.png", {"a": empty})))
+    moved = {**curve, "observed": [0.2, 0.0, 0.3]}
+    assert differ(first, pixels(plot_reliability(tmp_path / "c.png", {"a": moved})))
+    pixels(plot_reliability(tmp_path / "d.png", {f"curve {i}": curve for i in range(8)}))
+    with pytest.raises(ValueError, match="at least one curve"):
+        plot_reliability(tmp_path / "e.png", {})
 
 
 HEADER = "update,total,init_rotation,init_translation,refined_rotation,refined_translation"

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from kornia_pnpnet import Pose, pose_errors, success, success_rate
-from kornia_pnpnet.metrics import PoseErrors
+from kornia_pnpnet.metrics import PoseErrors, reliability
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-3, 1.0, math.pi / 2, 3.0, math.pi])
@@ -87,3 +87,30 @@ def test_the_interval_covers():
 def test_nothing_has_no_rate():
     with pytest.raises(ValueError, match="at least one"):
         success_rate(torch.zeros(0, dtype=torch.bool))
+
+
+def test_chances_that_come_true_have_no_calibration_error():
+    """Outcomes drawn with their chances; with all chances doubled the error is what was added."""
+    generator = torch.Generator().manual_seed(1)
+    chances = 0.5 * torch.rand(200_000, generator=generator, dtype=torch.float64)
+    outcomes = torch.rand(200_000, generator=generator, dtype=torch.float64) < chances
+    found = reliability(chances.view(2, -1), outcomes.view(2, -1))
+    assert found.number.sum() == 200_000
+    assert found.expected_error < 0.01
+    assert found.predicted[5:].isnan().all()  # no chance was that high
+    assert reliability(2.0 * chances, outcomes).expected_error == pytest.approx(0.25, abs=0.01)
+
+
+def test_chances_of_0_and_1_are_in_the_outer_ranges():
+    found = reliability(torch.tensor([0.0, 1.0, 1.0]), torch.tensor([False, True, False]), ranges=4)
+    assert found.number.tolist() == [1.0, 0.0, 0.0, 2.0]
+    assert found.observed[3] == 0.5
+    assert found.expected_error == pytest.approx(1 / 3)
+
+
+@pytest.mark.parametrize(
+    ("chances", "outcomes"), [(torch.rand(3), torch.ones(2).bool()), (torch.rand(0), torch.ones(0).bool())]
+)
+def test_reliability_needs_as_many_outcomes(chances, outcomes):
+    with pytest.raises(ValueError, match="as many chances as outcomes"):
+        reliability(chances, outcomes)

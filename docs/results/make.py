@@ -27,14 +27,17 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 from torch import nn
 
-from kornia_pnpnet import PnPNet, RobustWeightedLM
+from kornia_pnpnet import PnPNet, RobustWeightedLM, pose_covariance
 from kornia_pnpnet.choices import evaluation_sets, load_solver
 from kornia_pnpnet.complexity import complexity_results
+from kornia_pnpnet.environment import environment
 from kornia_pnpnet.evaluation import EvaluationData, evaluate
-from kornia_pnpnet.figures import paper_figures, plot_sweep, plot_training
+from kornia_pnpnet.figures import paper_figures, plot_reliability, plot_sweep, plot_training
 from kornia_pnpnet.figures.sweep import mix_in_words
+from kornia_pnpnet.metrics import SuccessRate, reliability, success_rate
 from kornia_pnpnet.model import WEIGHTS_FOLDER, shipped_weights
 from kornia_pnpnet.reports import RESULTS_NAME, collect_weights, write_json
 from kornia_pnpnet.results import format_table, load_results, save_results
@@ -73,6 +76,10 @@ ROBUST = ("p3p-ransac", "p3p-ransac-noise", *PEERS)
 BOUNDS = ("known-inliers", "known-inliers-and-noise")
 VIEWS = (1, 2, 3, 4, 8)
 SYNTHETIC = ("paper", "any_rotation")
+# Noise of a scene's pixels that is tried, as thresholds are.
+SIGMAS = (0.25, 0.5, 1.0, 2.0)
+# Below this a chi-square number of six degrees of freedom is in 95 of 100 cases.
+CHI_SQUARE_95 = 12.592
 SCALES = (("cauchy", 10.0), ("geman_mcclure", 20.0))
 
 
@@ -157,6 +164,61 @@ def set_data(scenes: Path, count: int, real_count: int) -> dict[str, EvaluationD
     }
 
 
+def with_noise_told(sets: Mapping[str, EvaluationData], img_sigma: float) -> dict[str, EvaluationData]:
+    """Scenes of which a solver is told that pixels are off by so much, and points are not."""
+    found = {}
+    for name, entry in sets.items():
+        sigma = torch.full_like(entry.problems.world_points[:, 0, 0], img_sigma)
+        problems = entry.problems._replace(img_sigma=sigma, world_sigma=torch.zeros_like(sigma))
+        description = {**entry.description, "img_sigma": img_sigma, "world_sigma": 0.0}
+        found[f"{name}, noise told"] = entry._replace(problems=problems, description=description)
+    return found
+
+
+def honesty(tuned: Mapping[str, str], count: int) -> dict[str, Any]:
+    """What solvers say of their own answers: weights as chances, ``ok`` on garbage, covariances."""
+    solver = PnPNet.from_pretrained(ANY)
+    common: dict[str, Any] = {"count": count, "seed": SEED_REPORT + 30}
+
+    def drawn(n: int, outliers: str, **more: Any) -> Problems:
+        (entry,) = evaluation_sets(["synthetic"], outliers, n=n, **common, **more).values()
+        return entry.problems
+
+    sets = evaluation_sets(["synthetic"], "uniform", n=(6, 9, 20, 50), **common)
+    sets |= evaluation_sets(["any_rotation"], "uniform", n=9, **common)
+    sets |= evaluation_sets(["synthetic"], "50%", n=50, **common)
+    diagrams = {}
+    for name, entry in sets.items():
+        _, guess = solver.with_guess(*entry.problems[:3])
+        found = reliability(guess.weights, entry.problems.inliers)
+        lists = {key: x.nan_to_num(0.0).tolist() for key, x in found._asdict().items()}
+        diagrams[name] = {**lists, "error": found.expected_error}
+
+    oks: dict[str, dict[str, Any]] = {}
+    for n in (9, 20):
+        sound, noise = drawn(n, "none"), drawn(n, f"{n}")
+        others = sound._replace(img_points=sound.img_points.roll(1, 0))
+        kinds = {"no pair wrong": sound, "pixels of other problems": others, "all pairs random": noise}
+        names = (ANY, *((OURS,) if n == 9 else ()), "p3p-ransac", "opencv-ransac", "poselib")
+        for name, other in named(names, tuned).items():
+            for kind, problems in kinds.items():
+                rate = success_rate(other(*problems[:3]).ok)._asdict()
+                oks.setdefault(f"n = {n}, {kind}", {})[name] = rate
+
+    covariances = {}
+    for n, wrong in ((12, 0), (12, 3), (20, 0), (20, 5), (50, 0), (50, 12)):
+        problems = drawn(n, f"{wrong}" if wrong else "none", dtype=torch.float64, told=True)
+        result = PnPNet.from_pretrained(ANY).double()(*problems[:3], **problems.told)
+        covariance = pose_covariance(result.pose, *problems[:3], **problems.told, weights=result.weights)
+        turn = rotation_matrix_to_axis_angle(result.rotation @ problems.pose.rotation.mT)
+        error = torch.cat((turn, result.translation - problems.pose.translation), -1)
+        squares = (error * torch.linalg.solve(covariance, error)).sum(-1)
+        inside = success_rate(squares < CHI_SQUARE_95)._asdict()
+        covariances[f"n = {n}, {wrong} wrong"] = {"mean": squares.mean().item(), "inside": inside}
+    made = {"environment": environment(), "problems": count, "tuned": dict(tuned)}
+    return {**made, "reliability": diagrams, "ok": oks, "covariance": covariances}
+
+
 def measure(scenes: Path, synthetic_count: int, real_count: int, only: Sequence[str]) -> None:
     """Solve everything and write the results files."""
     import cv2
@@ -233,9 +295,23 @@ def measure(scenes: Path, synthetic_count: int, real_count: int, only: Sequence[
         real = {name: entry for name, entry in sets.items() if name not in synthetic_sets}
         few = (ANY, OURS, "p3p-ransac", "opencv-ransac", "poselib", "known-inliers")
         run("set_real", named(few, tuned["real"]), real, tuned=tuned["real"])
+        # What the threshold is to the others is the pixels' noise to this one.
+        sharpest = real_sets(scenes, "none,2", count=real_count // 5, seed=SEED_TUNE, others=False)
+        solved = dict.fromkeys(SIGMAS, 0.0)
+        for sigma in SIGMAS:
+            told = with_noise_told(sharpest, sigma)
+            path = OUTPUTS / "tuning" / f"set, {sigma:g}.json"
+            rows = evaluate(named((ANY,), {}), told, path=path, repeats=1)["rows"]
+            solved[sigma] = sum(row["success"]["rate"] for row in rows)
+        sigma = max(solved, key=lambda sigma: solved[sigma])
+        run("set_real_told", named((ANY,), {}), with_noise_told(real, sigma), img_sigma=sigma)
         common = {**synthetic, "count": 2 * synthetic_count, "seed": SEED_REPORT + 20, "told": True}
         sets = evaluation_sets(["synthetic", "any_rotation"], "none,uniform,3", **common)
         run("set_told", named((ANY, "known-inliers-and-noise"), {}), sets)
+    if wanted("honesty"):
+        with torch.no_grad():
+            found = honesty(load_results(HERE / "paper.json")["tuned"], synthetic_count // 2)
+        write_json(HERE / "honesty.json", found)
     if wanted("complexity"):
         write_json(HERE / "complexity.json", complexity_results())
 
@@ -387,6 +463,48 @@ n = 100 with 50 and with 70 wrong pairs.
 
 {crowd}
 
+## One network for any number of pairs
+
+`{any}` on other problems than above: the protocol's, the same with rotations by any angle, other numbers of pairs and
+shares of wrong ones, and scenes, also the raw matches of two of them, whose mismatches are real. The weights are the
+same everywhere; thresholds are those tuned for the protocol's data and for scenes.
+
+{set}
+
+With the noise of pixels and points told (`img_sigma=1.0, world_sigma=0.05`):
+
+{set_told}
+
+Scenes:
+
+{set_real}
+
+The same with `img_sigma={img_sigma:g}, world_sigma=0`, tuned as the others' thresholds are: points of a reconstruction
+are nearly exact, which the network, untold, cannot know.
+
+{set_real_told}
+
+Against the best of the threshold methods, ours and others:
+
+{set_peers}
+
+## What a solver says of its own answer
+
+The weights that the network of `{any}` gives the pairs before the refinement, against the share of them that are right:
+below the dotted line they are too high. The lower panel says how many pairs have such a weight. The expected
+calibration error: {calibration}.
+
+![Weights against the share of pairs that are right](reliability.png)
+
+How many answers are called `ok`, in per cent. Pixels of other problems, and pairs that are all random, have no answer:
+
+{oks}
+
+The error of the pose, squared and relative to what `pose_covariance` says from the weights of `{any}`, which is told
+the noise: of six degrees of freedom its mean should be 6, and 95 % of it below {chi_square:.1f}.
+
+{covariances}
+
 ## Against the number of pairs
 
 {against_n}
@@ -430,7 +548,10 @@ RANSAC (first table), and the learned iterations, which need not end in a minimu
 
 {trainings}
 """
-RESULTS = ("paper", "gaussian_pose", "real", "mismatches", "crowd", "against_n", "against_m", "views", "distribution")
+RESULTS = (
+    *("paper", "gaussian_pose", "real", "mismatches", "crowd", "against_n", "against_m", "views", "distribution"),
+    *("set", "set_told", "set_real", "set_real_told"),
+)
 
 
 def claims(paper: Rates, real: Rates, complexity: Mapping[str, Any]) -> str:
@@ -491,6 +612,33 @@ def beside_peers(rates: Rates, solvers: Iterable[str]) -> str:
         peer = rates.best(data, (*PEERS, "opencv-epnp", "opencv-sqpnp"))
         parts = ", ".join(f"`{name}` {rates.versus(data, name, peer)}" for name in solvers)
         lines.append(f"- {data}, best is `{peer}` with {rates.rate(data, peer):.1f} %: {parts}.")
+    return "\n".join(lines)
+
+
+def honesty_parts(found: Mapping[str, Any]) -> dict[str, str]:
+    """The section's texts."""
+    errors = ", ".join(f"{entry['error']:.3f} ({name})" for name, entry in found["reliability"].items())
+    names = list(dict.fromkeys(name for rates in found["ok"].values() for name in rates))
+    head = "| | " + " | ".join(f"`{name}`" for name in names) + " |\n|---|" + "---:|" * len(names)
+    lines = [
+        f"| {kind} | " + " | ".join(str(SuccessRate(**rates[name])) if name in rates else "–" for name in names) + " |"
+        for kind, rates in found["ok"].items()
+    ]
+    covariances = ["| | mean | below the limit |", "|---|---:|---:|"] + [
+        f"| {name} | {entry['mean']:.2f} | {SuccessRate(**entry['inside'])} |"
+        for name, entry in found["covariance"].items()
+    ]
+    return {"calibration": errors, "oks": "\n".join([head, *lines]), "covariances": "\n".join(covariances)}
+
+
+def beside_best(rates: Rates, solver: str, others: Iterable[str]) -> str:
+    """One line for each data set: how far a solver is from the best of others."""
+    lines = []
+    for data in rates.sets:
+        best = rates.best(data, others)
+        lines.append(
+            f"- {data}, best is `{best}` with {rates.rate(data, best):.1f} %: {rates.versus(data, solver, best)}."
+        )
     return "\n".join(lines)
 
 
@@ -626,10 +774,11 @@ def sweep_text(rows: Sequence[Row]) -> str:
 def page(
     results: Mapping[str, Mapping[str, Any]],
     complexity: Mapping[str, Any],
+    honest: Mapping[str, Any],
     ablation: Sequence[Row],
     sweep: Sequence[Row],
 ) -> str:
-    """The results page as Markdown, from the results by their names in ``RESULTS`` and the summaries of short runs."""
+    """The results page as Markdown, from the results files by their names and the summaries of short runs."""
     rates = {name: Rates(entry) for name, entry in results.items()}
     environment = results["paper"]["environment"]
     tuned = [
@@ -653,6 +802,19 @@ def page(
         real_peers=beside_peers(rates["real"], ("p3p-ransac", "reppnp", OURS)),
         crowd=rates["crowd"].table(),
         against_n="\n\n".join(rates["against_n"].table(rates["against_n"].sets[i::2]) for i in (0, 1)),
+        any=ANY,
+        set="\n\n".join(
+            rates["set"].table(sets, times=False) for sets in (rates["set"].sets[:6], rates["set"].sets[6:])
+        ),
+        set_told=rates["set_told"].table(times=False),
+        set_real="\n\n".join(rates["set_real"].table(rates["set_real"].sets[i : i + 6], times=False) for i in (0, 6)),
+        chi_square=CHI_SQUARE_95,
+        **honesty_parts(honest),
+        img_sigma=results["set_real_told"]["img_sigma"],
+        set_real_told="\n\n".join(
+            rates["set_real_told"].table(rates["set_real_told"].sets[i : i + 6], times=False) for i in (0, 6)
+        ),
+        set_peers="\n".join(beside_best(rates[name], ANY, ROBUST) for name in ("set", "set_real")),
         shipped_views=PnPNet.from_pretrained(OURS).views,
         views="\n\n".join(
             rates["views"].table(sets, times=False) for sets in (rates["views"].sets[:5], rates["views"].sets[5:])
@@ -673,14 +835,16 @@ def render() -> None:
     """Write the page and its pictures from the results files."""
     results = {name: load_results(HERE / f"{name}.json") for name in RESULTS}
     complexity = json.loads((HERE / "complexity.json").read_text())
-    paper_figures([*(results[name] for name in RESULTS[:-2]), complexity], HERE)
+    paper_figures([*(results[name] for name in RESULTS[:7]), complexity], HERE)
     for name in shipped_weights():
         plot_training(HERE / f"training-{name}.png", WEIGHTS_FOLDER / name / "history.csv")
     short_runs = [read_summary(HERE / f"{name}.csv") for name in ("ablation", "sweep")]
     if short_runs[1]:
         for against in ("n", "m"):
             plot_sweep(HERE / f"sweep_against_{against}.png", HERE / "sweep.csv", against=against)
-    (HERE / "README.md").write_text(page(results, complexity, *short_runs), encoding="utf-8")
+    honest = json.loads((HERE / "honesty.json").read_text())
+    plot_reliability(HERE / "reliability.png", honest["reliability"])
+    (HERE / "README.md").write_text(page(results, complexity, honest, *short_runs), encoding="utf-8")
 
 
 def compare(scenes: Path, count: int, runs: Sequence[Path]) -> None:
@@ -706,7 +870,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("step", choices=("measure", "compare", "ship", "render"))
     parser.add_argument(
-        "--only", nargs="+", default=(), choices=(*RESULTS, "set", "complexity"), help="for measure: these files"
+        "--only", nargs="+", default=(), choices=(*RESULTS, "honesty", "complexity"), help="for measure: these files"
     )
     parser.add_argument("--scenes", type=Path, default=HERE.parents[2] / "shared" / "data")
     parser.add_argument("--synthetic-count", type=int, default=5000)

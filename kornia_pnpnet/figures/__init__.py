@@ -14,6 +14,7 @@ from kornia_pnpnet.figures.errors import plot_errors
 from kornia_pnpnet.figures.operations import plot_operations
 from kornia_pnpnet.figures.paper import paper_figures
 from kornia_pnpnet.figures.problem import plot_pose
+from kornia_pnpnet.figures.reliability import plot_reliability
 from kornia_pnpnet.figures.sweep import plot_sweep
 from kornia_pnpnet.figures.training import plot_training
 
@@ -25,6 +26,7 @@ __all__ = [
     "plot_mismatches",
     "plot_operations",
     "plot_pose",
+    "plot_reliability",
     "plot_scenes",
     "plot_success",
     "plot_sweep",

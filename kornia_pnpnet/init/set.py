@@ -26,6 +26,8 @@ _FEATURES = 14
 _ABSENT = -1e9
 # Samples of three, by how likely their pairs are to be right.
 _SAMPLES = ((0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3), (0, 1, 4), (2, 3, 4), (0, 3, 4), (1, 2, 4))
+# With twice as many pairs or more there are as many samples again, spread over more of them.
+_SPREAD = 9
 # So many of the likeliest pairs say how good the pose of a sample is: squared residuals count to this many variances.
 _MOST_JUDGES, _JUDGED = 32, 50.0
 
@@ -167,7 +169,8 @@ class SetInit(nn.Module):
     the correspondences.
 
     The likeliest pairs also make ``samples`` of three, whose poses (see :func:`~kornia_pnpnet.init.p3p.p3p`) at most 32
-    of them judge; the best one of all samples is one more hypothesis, a constant without gradient. Its cost is fixed.
+    of them judge; from 18 pairs there are as many samples again, spread over the likeliest 32. The best one of all is
+    one more hypothesis, a constant without gradient. Its cost is fixed.
 
     A pair weighs as much as it is likely to be right. The noise of pixels and points, which tells
     the refinement how far pairs may be off, is what :attr:`~kornia_pnpnet.types.Correspondences.noise` says, or the
@@ -183,7 +186,7 @@ class SetInit(nn.Module):
         heads: of the attention in each.
         hidden: channels inside a layer.
         starts: hypotheses of the network, at least 1.
-        samples: of the likeliest pairs, 0 to 8.
+        samples: of the likeliest pairs, 0 to 8; twice as many from 18 pairs.
 
     Raises:
         BaseError: for numbers out of range, or a width that the heads do not divide.
@@ -282,6 +285,8 @@ class SetInit(nn.Module):
         of_pairs = torch.cat((corr.world_points, corr.img_points, right[..., None], img, world), -1)  # (B, N, 8)
         pairs = _taken(of_pairs, likely)  # (8, K, B)
         samples = [x for x in _SAMPLES if max(x) < count][: self.samples]
+        if (stride := likely.shape[1] // _SPREAD) > 1:  # where the likeliest are wrong together, others are not
+            samples += [(stride * i, stride * j, stride * k) for i, j, k in samples]
         # (6, 3, S B), stacked, not indexed: a compiler then copies whole rows.
         three = torch.stack([pairs[:6, k] for column in zip(*samples, strict=True) for k in column], 1)
         three = three.unflatten(1, (3, -1)).flatten(2)
