@@ -9,6 +9,7 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
 from kornia_pnpnet import Normalize, PnPNet, Pose, RobustWeightedLM, SetInit, SetLoss, pose_errors, success
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet.geometry import rotation_angle
 
 NOISE = {"img_sigma": 1.0, "world_sigma": 0.05}
 
@@ -154,13 +155,25 @@ def test_samples_of_right_pairs_have_the_true_pose(n, wrong):
     assert success(again, 0.01, 0.01).double().mean() > 0.95
 
 
-def test_padding_judges_no_sample(make_problems):
-    p = make_problems(n=9, batch=200, outliers=3)
-    mask = torch.arange(9).expand(200, 9) < 6
+@pytest.mark.parametrize(("n", "there"), [(9, 6), (24, 9), (30, 20)])
+def test_padding_makes_and_judges_no_sample(make_problems, n, there):
+    p = make_problems(n=n, batch=200, outliers=n // 3)
+    mask = torch.arange(n).expand(200, n) < there
     net = solver()
     padded = net.with_guess(*p[:3], mask=mask, **NOISE)[1]
-    alone = net.with_guess(p.world_points[:, :6], p.img_points[:, :6], p.intrinsics, **NOISE)[1]
+    alone = net.with_guess(p.world_points[:, :there], p.img_points[:, :there], p.intrinsics, **NOISE)[1]
     near(padded.others, alone.others)
+
+
+def test_many_pairs_make_more_samples(make_problems, monkeypatch):
+    """Spread samples find some poses that those of the likeliest alone miss, and cost nothing where they do not."""
+    p = make_problems(n=30, batch=500, outliers=15)
+    net = solver()
+    both = net.with_guess(*p[:3], **NOISE)[1].others.rotation[:, -1]
+    monkeypatch.setattr("kornia_pnpnet.init.set._MANY", 31)
+    near_only = net.with_guess(*p[:3], **NOISE)[1].others.rotation[:, -1]
+    error = [rotation_angle(x, p.pose.rotation) for x in (both, near_only)]
+    assert error[0].median() < error[1].median()
 
 
 def test_where_no_sample_has_a_pose_the_first_guess_stands_in():

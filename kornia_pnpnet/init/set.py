@@ -26,8 +26,8 @@ _FEATURES = 14
 _ABSENT = -1e9
 # Samples of three, by how likely their pairs are to be right.
 _SAMPLES = ((0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3), (0, 1, 4), (2, 3, 4), (0, 3, 4), (1, 2, 4))
-# With twice as many pairs or more there are as many samples again, spread over more of them.
-_SPREAD = 9
+# Problems of so many pairs have as many samples again, spread over so many times as many of the likeliest.
+_MANY, _SPREAD = 18, 3
 # So many of the likeliest pairs say how good the pose of a sample is: squared residuals count to this many variances.
 _MOST_JUDGES, _JUDGED = 32, 50.0
 
@@ -169,7 +169,7 @@ class SetInit(nn.Module):
     the correspondences.
 
     The likeliest pairs also make ``samples`` of three, whose poses (see :func:`~kornia_pnpnet.init.p3p.p3p`) at most 32
-    of them judge; from 18 pairs there are as many samples again, spread over the likeliest 32. The best one of all is
+    of them judge; from 18 pairs there are as many samples again, spread over the likeliest 13. The best one of all is
     one more hypothesis, a constant without gradient. Its cost is fixed.
 
     A pair weighs as much as it is likely to be right. The noise of pixels and points, which tells
@@ -285,8 +285,9 @@ class SetInit(nn.Module):
         of_pairs = torch.cat((corr.world_points, corr.img_points, right[..., None], img, world), -1)  # (B, N, 8)
         pairs = _taken(of_pairs, likely)  # (8, K, B)
         samples = [x for x in _SAMPLES if max(x) < count][: self.samples]
-        if (stride := likely.shape[1] // _SPREAD) > 1:  # where the likeliest are wrong together, others are not
-            samples += [(stride * i, stride * j, stride * k) for i, j, k in samples]
+        near = len(samples)
+        if count >= _MANY:  # where the likeliest are wrong together, others are not
+            samples += [(_SPREAD * i, _SPREAD * j, _SPREAD * k) for i, j, k in samples]
         # (6, 3, S B), stacked, not indexed: a compiler then copies whole rows.
         three = torch.stack([pairs[:6, k] for column in zip(*samples, strict=True) for k in column], 1)
         three = three.unflatten(1, (3, -1)).flatten(2)
@@ -294,6 +295,9 @@ class SetInit(nn.Module):
         # Components first, then the four solutions and the samples, problems last: it is how they lie in memory.
         rotation, translation = (x.movedim((0, 1), (-1, -2)).flatten(-2).unflatten(-1, (-1, batch)) for x in pose)
         valid = (valid.mT & (three[5] > 0).all(0)).unflatten(-1, (-1, batch))  # (4, S, B)
+        if count >= _MANY:  # by the pairs that are there, so that padding changes nothing
+            many = (corr.weights > 0).sum(1) >= _MANY
+            valid = torch.cat((valid[:, :near], valid[:, near:] & many), 1)
         # One more dimension after the problems, that of hypotheses: (B, 3, 3, H), (B, 3, H), and of pairs (B, 1, K).
         every = Pose(rotation.permute(3, 0, 1, 2), translation.permute(2, 0, 1))
         world, img, right, *sigmas = (x.permute(2, 1, 0)[:, None] for x in pairs.split((3, 2, 1, 1, 1)))
