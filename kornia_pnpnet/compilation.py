@@ -14,6 +14,11 @@ __all__ = ["Compiled"]
 # A solver of its own counts how often it was compiled: for other numbers of pairs, dtypes, with and without gradients.
 _LIMITS: dict[str, Any] = {"recompile_limit": 64, "isolate_recompiles": True}
 
+# Of so many pairs on, the compiler of PyTorch 2.13 for CPUs may order loops so that what it computes is wrong, where a
+# problem has more pairs than the batch has problems: it must then keep to the order that it is given, which takes up to
+# half as long again. Vectors of 16 numbers, which it transposes, are what goes wrong.
+_MANY = 16
+
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
@@ -40,8 +45,12 @@ class Compiled(Generic[_P, _T]):
         self.mode = mode
         # Else half of the first compilation would go into asking the C++ compiler which instructions it knows, for each
         # set of them that the processor has.
-        options: dict[str, Any] | None = {"cpp.vec_isa_ok": True} if mode is None else None
-        self._compiled = torch.compile(function, fullgraph=True, mode=mode, options=options, **_LIMITS)
+        options = {**torch._inductor.list_mode_options(mode or "default"), "cpp.vec_isa_ok": True}
+        few, many = (
+            torch.compile(function, fullgraph=True, options=more, **_LIMITS)
+            for more in (options, {**options, "pick_loop_orders": False})
+        )
+        self._compiled = {False: few, True: many}
         self._failed = False
         self._seen: set[tuple[torch.Size, torch.dtype, bool]] = set()
 
@@ -55,15 +64,16 @@ class Compiled(Generic[_P, _T]):
             return self.function(*args, **kwargs)
         first = next(_tensors(args))
         kind = first.shape, first.dtype, torch.is_grad_enabled()
+        compiled = self._compiled[first.ndim > 1 and first.shape[1] >= _MANY]
         try:
             if kind in self._seen:
-                return self._compiled(*args, **kwargs)
+                return compiled(*args, **kwargs)
             for tensor in _tensors(args):
                 if tensor.ndim and tensor.shape[0] > 1:
                     torch._dynamo.maybe_mark_dynamic(tensor, 0)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # what a compiler says of its own parts
-                result = self._compiled(*args, **kwargs)
+                result = compiled(*args, **kwargs)
             self._seen.add(kind)
             return result
         except (torch._dynamo.exc.TorchDynamoException, torch._inductor.exc.InductorError) as error:
