@@ -75,14 +75,16 @@ class LMStart(NamedTuple):
 
     Attributes:
         corr: the correspondences, problems last in memory.
-        prior: weight of each pair before its residual was looked at, :math:`(B, N)`.
-        pairs: the correspondences with these weights relative to the largest, what an iteration sees.
+        prior: weight of each pair before its residual was looked at, for the judgement, :math:`(B, N)`.
+        pairs: the correspondences with their weights relative to the largest, what an iteration sees.
         pose: the first pose.
         step: :math:`\gamma` of each iteration, scalars.
         damping: :math:`\lambda` of each.
         shape: the kernel's shape of each.
         starts: where a guess has :math:`S` other poses, ``pose`` holds :math:`(S + 1) B`, first the first ones of all
             problems, and this is ``pairs`` as often; else ``None``.
+        by_residual: ``pairs`` with the weights that came with the correspondences alone, what iterations that do not
+            ask the guess see; ``None`` where all do.
     """
 
     corr: Correspondences
@@ -93,6 +95,7 @@ class LMStart(NamedTuple):
     damping: tuple[Tensor, ...]
     shape: tuple[Tensor, ...]
     starts: Correspondences | None = None
+    by_residual: Correspondences | None = None
 
 
 class _State(NamedTuple):
@@ -254,6 +257,9 @@ class RobustWeightedLM(nn.Module):
     Where a guess has other poses, all of them are refined by the first seven tenths of the iterations, rounded down.
     Then, per problem, the one of the lowest cost by the kernel of the last of these goes on alone.
 
+    With ``by_residual`` the last iterations no longer ask the guess how much a pair counts: what it took for wrong
+    may by then have shown to be right, and the other way round.
+
     All operations are per problem: a problem that cannot be solved keeps its pose, reports ``ok=False`` and changes
     no other.
 
@@ -266,6 +272,8 @@ class RobustWeightedLM(nn.Module):
         shared: learn one set for all iterations instead of one each.
         update: ``"retraction"`` on the rotation group, or the paper's ``"additive"`` on the rotation vector.
         reject_worse: refuse, per problem, a step that raises the cost, and raise the damping after it tenfold.
+        by_residual: the last so many iterations, and the judgement after them, leave the guess's weights out. At most
+            those after the choice among several poses.
         learnable: whether the hyperparameters are trained.
         backward: how gradients pass. ``"unroll"``: through all iterations. ``"truncated"``: through the ``last`` ones,
             the pose before them counts as constant. ``"implicit"``: by the implicit function theorem, as through a
@@ -299,6 +307,7 @@ class RobustWeightedLM(nn.Module):
         shared: bool = False,
         update: str = "retraction",
         reject_worse: bool = False,
+        by_residual: int = 0,
         learnable: bool = True,
         backward: str = "unroll",
         last: int = 1,
@@ -309,6 +318,11 @@ class RobustWeightedLM(nn.Module):
         KORNIA_CHECK(update in ("retraction", "additive"), f"update must be retraction or additive, got {update!r}.")
         KORNIA_CHECK(backward in BACKWARDS, f"backward must be one of {BACKWARDS}, got {backward!r}.")
         KORNIA_CHECK(type(last) is int and last >= 1, f"last must be an integer of at least 1, got {last!r}.")
+        compared_at = 7 * m // 10  # the iteration before which the best of several starts is chosen
+        KORNIA_CHECK(
+            type(by_residual) is int and 0 <= by_residual <= m - compared_at,
+            f"by_residual must be an integer from 0 to {m - compared_at} for m = {m}, got {by_residual!r}.",
+        )
         self.config: dict[str, Any] = {
             "m": m,
             "kernel": kernel,
@@ -318,12 +332,14 @@ class RobustWeightedLM(nn.Module):
             "shared": shared,
             "update": update,
             "reject_worse": reject_worse,
+            "by_residual": by_residual,
             "learnable": learnable,
             "backward": backward,
             "last": last,
         }
         self.m = m
-        self.compared_at = 7 * m // 10  # the iteration before which the best of several starts is chosen
+        self.compared_at = compared_at
+        self.by_residual = by_residual
         self.backward = backward
         self.last = last
         self.kernel: RobustKernel = KERNELS[kernel]
@@ -397,7 +413,11 @@ class RobustWeightedLM(nn.Module):
         noise = None if guess.noise is None else Noise(*(x.mT.contiguous().mT for x in guess.noise))
         pairs = Correspondences(*corr[:2], relative(prior, prior), corr.focal, noise=noise)
         starts = None if guess.others is None else _repeated(pairs, 1 + guess.others.rotation.shape[1])
-        return LMStart(corr, prior, pairs, pose, step, damping, shape, starts)
+        by_residual = None
+        if self.by_residual:
+            by_residual = pairs._replace(weights=relative(corr.weights, corr.weights))
+            prior = corr.weights
+        return LMStart(corr, prior, pairs, pose, step, damping, shape, starts, by_residual)
 
     def iterate(self, start: LMStart, m: int | None = None) -> LMStep:
         """Run the iterations.
@@ -430,6 +450,8 @@ class RobustWeightedLM(nn.Module):
                 pairs = start.starts
             elif start.starts is not None and i == self.compared_at:
                 state = self._choose(start.pairs, start.starts, state, start.shape[max(i - 1, 0)])
+            if start.by_residual is not None and i >= self.m - self.by_residual:
+                pairs = start.by_residual
             pose, factor = state.pose, state.factor
             damping = start.damping[i] if factor is None else start.damping[i] * factor
             pose, solved = self._iterate(pairs, pose, start.step[i], damping, start.shape[i])
@@ -519,14 +541,15 @@ class RobustWeightedLM(nn.Module):
             projection, weights = _weighted(corr, at, shape, self.kernel.weight)
             return normal_equations(projection, _relative(weights, projection))
 
-        fixed = start.pairs.map(torch.Tensor.detach)
+        pairs = start.pairs if start.by_residual is None else start.by_residual
+        fixed = pairs.map(torch.Tensor.detach)
         zero = [torch.zeros_like(start.prior[:, 0]).requires_grad_() for _ in range(6)]
         with torch.enable_grad():
             around, gradient = equations(fixed, move(pose, zero), shape.detach())
             hessian = [
                 torch.autograd.grad(entry.sum(), zero[: i + 1], retain_graph=True) for i, entry in enumerate(gradient)
             ]
-        gradient = equations(start.pairs, pose, shape).gradient
+        gradient = equations(pairs, pose, shape).gradient
         none = torch.zeros_like(shape)
         newton, convex = solve_damped(NormalEquations(hessian, gradient), none)
         gauss_newton, solved = solve_damped(NormalEquations([[x.detach() for x in y] for y in around], gradient), none)
