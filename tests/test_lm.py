@@ -571,6 +571,30 @@ def test_external_and_initial_weights_multiply(make_problems, correspond, pertur
     torch.testing.assert_close(inside.weights, outside.weights)
 
 
+@pytest.mark.parametrize("backward", ["unroll", "truncated", "implicit"])
+def test_iterations_by_residual_leave_the_guess_s_weights_out_and_no_others(
+    backward, make_problems, correspond, perturb
+):
+    corr, truth = correspond(make_problems(9, outliers=2))
+    start, doubt = perturb(truth), torch.rand(7, 9, dtype=torch.float64)
+    lm = RobustWeightedLM(m=3, by_residual=1, backward=backward)
+    first = RobustWeightedLM(m=2)(corr, Guess(start, doubt)).pose
+    for given in (torch.ones_like(doubt), doubt.flip(1)):
+        refined = lm(corr._replace(weights=given), Guess(start, doubt / given))
+        last = RobustWeightedLM(m=1)(corr._replace(weights=given), guess(first, corr))
+        torch.testing.assert_close(refined.pose.matrix, last.pose.matrix, rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(refined.weights, last.weights)
+        torch.testing.assert_close(refined.cost, last.cost)
+
+
+@pytest.mark.parametrize(("m", "most"), [(0, 0), (1, 1), (3, 1), (6, 2), (10, 3)])
+def test_iterations_by_residual_come_after_the_choice_among_poses(m, most):
+    assert RobustWeightedLM(m=m, by_residual=most).config["by_residual"] == most
+    for wrong in (most + 1, -1, True, 1.0):
+        with pytest.raises(BaseError, match=f"by_residual must be an integer from 0 to {most}"):
+            RobustWeightedLM(m=m, by_residual=wrong)
+
+
 # --- gradients --------------------------------------------------------------------------------------------------------
 
 SMOOTH = [name for name in KERNELS if name != "truncated"]
