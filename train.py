@@ -107,7 +107,8 @@ def start_from(model: PnPNet, trained: PnPNet) -> None:
     """Give a solver the weights of another one; where that refines in another way, its own refinement starts anew."""
     state = trained.state_dict()
     before, now = (
-        {key: refine.config[key] for key in ("m", "kernel", "shared", "by_residual")} for refine in (trained.refine, model.refine)
+        {key: refine.config[key] for key in ("m", "kernel", "shared", "by_residual")}
+        for refine in (trained.refine, model.refine)
     )
     if before != now:
         log.info("The weights are of a refinement with %s: only the network starts from them.", before)

@@ -54,6 +54,9 @@ _MAX_RESIDUAL = 2.0
 # A pose explains the pixels when this share of the pairs has residuals below this share of the pixels' spread.
 # Just below the share, so that a sum of shares that is it but for rounding is enough.
 _EXPLAINED_SHARE, _EXPLAINED_RESIDUAL = 0.6 - 1e-5, 0.2
+# Iterations by residual believe the residuals' own variance factor where its likelihood is e to this power higher than
+# that of 1; no factor is taken to be less than the second number. Their kernel is then narrower by the third's root.
+_BELIEVED, _LEAST_FACTOR, _NARROWER = 3.0, 1e-4, 0.1
 # Factors of the damping after a refused and after an accepted step (only with `reject_worse`).
 _DAMPING_UP, _DAMPING_DOWN = 10.0, 0.3
 
@@ -193,17 +196,48 @@ def _weighted(
     return projection, corr.weights * precision * kernel_weight(projection.sq_residual * precision, shape)
 
 
+def _weighted_by_residual(
+    corr: Correspondences, pose: Pose, shape: Tensor, kernel_weight: Callable[[Tensor, Tensor], Tensor]
+) -> tuple[Projection, Tensor]:
+    """The same, where the residuals have a say in how large the noise is."""
+    projection = project(pose, corr)
+    if corr.noise is None:
+        return projection, corr.weights * kernel_weight(projection.sq_residual, shape)
+    precision = pixel_variance(projection, corr.noise, corr.focal).reciprocal()
+    residual = projection.sq_residual * precision
+    weights = torch.where(projection.in_front, corr.weights * kernel_weight(residual, shape), 0.0)
+    factor = _variance_factor(residual, weights)
+    residual = residual / torch.where(factor < 1.0, _NARROWER * factor, 1.0)
+    return projection, corr.weights * precision * kernel_weight(residual, shape)
+
+
+def _variance_factor(residual: Tensor, weights: Tensor) -> Tensor:
+    r"""By how much the variance of the noise is to be multiplied, at most 1, shape (B, 1).
+
+    The a posteriori variance factor of an adjustment, the weighted sum of squared residuals by the degrees of freedom,
+    where its likelihood ratio against 1 is beyond chance; else 1.
+
+    Args:
+        residual: squared residuals by their variance, :math:`(B, N)`.
+        weights: of the pairs, at most 1, :math:`(B, N)`.
+    """
+    freedom = (2.0 * weights.sum(-1, keepdim=True) - 6.0).clamp(min=1.0)
+    factor = ((weights * residual).sum(-1, keepdim=True) / freedom).clamp(min=_LEAST_FACTOR)
+    log_ratio = 0.5 * freedom * (factor - 1.0 - factor.log())
+    return torch.where((factor < 1.0) & (log_ratio > _BELIEVED), factor, 1.0)
+
+
 def _iterate(
     corr: Correspondences,
     pose: Pose,
     step: Tensor,
     damping: Tensor,
     shape: Tensor,
-    kernel_weight: Callable[[Tensor, Tensor], Tensor],
+    weigh: Callable[[Correspondences, Pose, Tensor], tuple[Projection, Tensor]],
     additive: bool,
 ) -> LMStep:
     """Weigh the pairs by their residuals and take one step."""
-    projection, weights = _weighted(corr, pose, shape, kernel_weight)
+    projection, weights = weigh(corr, pose, shape)
     return lm_step(corr, pose, projection, weights, step, damping, additive=additive)
 
 
@@ -258,7 +292,8 @@ class RobustWeightedLM(nn.Module):
     Then, per problem, the one of the lowest cost by the kernel of the last of these goes on alone.
 
     With ``by_residual`` the last iterations no longer ask the guess how much a pair counts: what it took for wrong
-    may by then have shown to be right, and the other way round.
+    may by then have shown to be right, and the other way round. Where residuals are so small that the guess's noise
+    cannot be (by their likelihood ratio), its variance is multiplied by their a posteriori variance factor.
 
     All operations are per problem: a problem that cannot be solved keeps its pose, reports ``ok=False`` and changes
     no other.
@@ -357,10 +392,12 @@ class RobustWeightedLM(nn.Module):
             logarithmic=self.kernel.logarithmic,
         )
         self.requires_grad_(learnable and m > 0)
-        self._iteration = partial(_iterate, kernel_weight=self.kernel.weight, additive=self.additive)
+        weighs = (partial(x, kernel_weight=self.kernel.weight) for x in (_weighted, _weighted_by_residual))
+        self._iteration, self._last_iteration = (partial(_iterate, weigh=x, additive=self.additive) for x in weighs)
         # What runs: these, or what `compile` made of them.
         self._begin: Callable[..., LMStart] = self.begin
         self._iterate: Callable[..., LMStep] = self._iteration
+        self._iterate_last: Callable[..., LMStep] = self._last_iteration
         self._choose: Callable[..., _State] = self.choose
         self._finish: Callable[..., Refinement] = self.finish
 
@@ -450,11 +487,12 @@ class RobustWeightedLM(nn.Module):
                 pairs = start.starts
             elif start.starts is not None and i == self.compared_at:
                 state = self._choose(start.pairs, start.starts, state, start.shape[max(i - 1, 0)])
+            iterate = self._iterate
             if start.by_residual is not None and i >= self.m - self.by_residual:
-                pairs = start.by_residual
+                iterate, pairs = self._iterate_last, start.by_residual
             pose, factor = state.pose, state.factor
             damping = start.damping[i] if factor is None else start.damping[i] * factor
-            pose, solved = self._iterate(pairs, pose, start.step[i], damping, start.shape[i])
+            pose, solved = iterate(pairs, pose, start.step[i], damping, start.shape[i])
             if factor is not None:
                 at = project(pose, pairs), project(state.pose, pairs)
                 new, old = (self._cost(x, pairs, pairs.weights, start.shape[i]) for x in at)
@@ -493,8 +531,11 @@ class RobustWeightedLM(nn.Module):
         sq_residual = projection.sq_residual
         if corr.noise is not None:
             sq_residual = sq_residual / pixel_variance(projection, corr.noise, corr.focal)
-        weights = start.prior * self.kernel.weight(sq_residual, shape)
-        weights = torch.where(projection.in_front, weights, 0.0)
+        weights = self.kernel.weight(sq_residual, shape)
+        if start.by_residual is not None and corr.noise is not None:
+            counted = torch.where(projection.in_front, start.by_residual.weights * weights, 0.0)
+            weights = self.kernel.weight(sq_residual / _variance_factor(sq_residual, counted), shape)
+        weights = torch.where(projection.in_front, start.prior * weights, 0.0)
         cost = self._cost(projection, corr, start.prior, shape)
         # With the noise known what explains the pixels is a question of evidence, which the solver answers.
         seen = explains(projection, corr, start.prior) if corr.noise is None else _enough(projection, start.prior)
@@ -526,6 +567,7 @@ class RobustWeightedLM(nn.Module):
         """
         self._begin = Compiled(self.begin, mode)
         self._iterate = Compiled(self._iteration, mode)
+        self._iterate_last = Compiled(self._last_iteration, mode)
         self._choose = Compiled(self.choose, mode)
         self._finish = Compiled(self.finish, mode)
 
@@ -538,10 +580,13 @@ class RobustWeightedLM(nn.Module):
         """
 
         def equations(corr: Correspondences, at: Pose, shape: Tensor) -> NormalEquations:
-            projection, weights = _weighted(corr, at, shape, self.kernel.weight)
+            projection, weights = weigh(corr, at, shape, self.kernel.weight)
             return normal_equations(projection, _relative(weights, projection))
 
-        pairs = start.pairs if start.by_residual is None else start.by_residual
+        if start.by_residual is None:
+            pairs, weigh = start.pairs, _weighted
+        else:
+            pairs, weigh = start.by_residual, _weighted_by_residual
         fixed = pairs.map(torch.Tensor.detach)
         zero = [torch.zeros_like(start.prior[:, 0]).requires_grad_() for _ in range(6)]
         with torch.enable_grad():

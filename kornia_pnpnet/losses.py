@@ -152,7 +152,7 @@ class SetLoss(nn.Module):
 
     - Of the hypotheses of a first guess the best one counts, and a little all of them, so that they may differ.
     - After the refinement, both errors in units of what counts as success, saturated as in :class:`PoseLoss`.
-    - Binary cross entropy of the weights: of the network's alone, then of those after the refinement.
+    - Binary cross entropy of the network's weights.
     - The negative log-likelihood of the right pairs' residuals at the true pose under the estimated noise.
 
     Args:
@@ -222,9 +222,7 @@ class SetLoss(nn.Module):
             translation = translation / distance
             refined = rotation / self.rotation_unit + translation / self.translation_unit
             refined = refined / (1.0 + refined / self.saturation)
-            # What cannot be refined at all says nothing about its weights.
-            after = torch.where(result.ok, _cross_entropy(result.weights, problems.inliers), 0.0)
-        entropy = (1.0 - 0.5 * min(ramp, 1.0)) * _cross_entropy(guess.weights, problems.inliers) + 0.5 * ramp * after
+        entropy = _cross_entropy(guess.weights, problems.inliers)
         likelihood = torch.zeros_like(first) if guess.noise is None else _surprise(guess.noise, problems)
         total = first + ramp * self.refined * refined + self.weights * entropy + self.noise * likelihood
         init = (x.gather(1, best)[:, 0] for x in (rotations, translations))
