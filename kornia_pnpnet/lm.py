@@ -205,22 +205,25 @@ def _weighted_by_residual(
         return projection, corr.weights * kernel_weight(projection.sq_residual, shape)
     precision = pixel_variance(projection, corr.noise, corr.focal).reciprocal()
     residual = projection.sq_residual * precision
-    weights = torch.where(projection.in_front, corr.weights * kernel_weight(residual, shape), 0.0)
-    factor = _variance_factor(residual, weights)
+    factor = _variance_factor(
+        residual, torch.where(projection.in_front, kernel_weight(residual, shape), 0.0), corr.weights
+    )
     residual = residual / torch.where(factor < 1.0, _NARROWER * factor, 1.0)
     return projection, corr.weights * precision * kernel_weight(residual, shape)
 
 
-def _variance_factor(residual: Tensor, weights: Tensor) -> Tensor:
+def _variance_factor(residual: Tensor, kernel_weight: Tensor, weights: Tensor) -> Tensor:
     r"""By how much the variance of the noise is to be multiplied, at most 1, shape (B, 1).
 
     The a posteriori variance factor of an adjustment, the weighted sum of squared residuals by the degrees of freedom,
-    where its likelihood ratio against 1 is beyond chance; else 1.
+    where its likelihood ratio against 1 is beyond chance; else 1. Only pairs deep within the kernel have a say.
 
     Args:
         residual: squared residuals by their variance, :math:`(B, N)`.
+        kernel_weight: by these residuals, at most 1, :math:`(B, N)`.
         weights: of the pairs, at most 1, :math:`(B, N)`.
     """
+    weights = weights * kernel_weight.square().square()
     freedom = (2.0 * weights.sum(-1, keepdim=True) - 6.0).clamp(min=1.0)
     factor = ((weights * residual).sum(-1, keepdim=True) / freedom).clamp(min=_LEAST_FACTOR)
     log_ratio = 0.5 * freedom * (factor - 1.0 - factor.log())
@@ -533,8 +536,9 @@ class RobustWeightedLM(nn.Module):
             sq_residual = sq_residual / pixel_variance(projection, corr.noise, corr.focal)
         weights = self.kernel.weight(sq_residual, shape)
         if start.by_residual is not None and corr.noise is not None:
-            counted = torch.where(projection.in_front, start.by_residual.weights * weights, 0.0)
-            weights = self.kernel.weight(sq_residual / _variance_factor(sq_residual, counted), shape)
+            within = torch.where(projection.in_front, weights, 0.0)
+            factor = _variance_factor(sq_residual, within, start.by_residual.weights)
+            weights = self.kernel.weight(sq_residual / factor, shape)
         weights = torch.where(projection.in_front, start.prior * weights, 0.0)
         cost = self._cost(projection, corr, start.prior, shape)
         # With the noise known what explains the pixels is a question of evidence, which the solver answers.

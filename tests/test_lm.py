@@ -12,7 +12,7 @@ import pytest
 import torch
 from kornia.core.exceptions import BaseError
 
-from kornia_pnpnet import Correspondences, Guess, Pose, RobustWeightedLM, pose_errors
+from kornia_pnpnet import Correspondences, Guess, Noise, Pose, RobustWeightedLM, pose_errors
 from kornia_pnpnet.geometry import (
     NormalEquations,
     Projection,
@@ -585,6 +585,58 @@ def test_iterations_by_residual_leave_the_guess_s_weights_out_and_no_others(
         torch.testing.assert_close(refined.pose.matrix, last.pose.matrix, rtol=1e-9, atol=1e-9)
         torch.testing.assert_close(refined.weights, last.weights)
         torch.testing.assert_close(refined.cost, last.cost)
+
+
+def _told(start, corr, img_sigma):
+    """A guess that says so much of the pixels' noise, and that points have none."""
+    sigma = torch.full_like(corr.weights, img_sigma)
+    return guess(start, corr)._replace(noise=Noise(sigma, torch.zeros_like(sigma)))
+
+
+def test_iterations_by_residual_correct_a_noise_that_is_said_to_be_too_large(make_problems, correspond, perturb):
+    corr, truth = correspond(make_problems(12, 50, noise=False))
+    generator = torch.Generator().manual_seed(4)
+    pixels = corr.img_points + 0.5 * torch.randn(corr.img_points.shape, generator=generator, dtype=torch.float64)
+    pixels[:, :2] += 60.0  # two pairs that are wrong, by six times what is said
+    corr, start = corr._replace(img_points=pixels), perturb(truth)
+    common = {"m": 10, "kernel": "geman_mcclure", "robustness": 6.0}
+    right, wrong, corrected = (
+        RobustWeightedLM(by_residual=by_residual, **common)(corr, _told(start, corr, sigma))
+        for by_residual, sigma in ((0, 0.5), (0, 10.0), (3, 10.0))
+    )
+    errors = [pose_errors(x.pose, truth).rotation_error_deg.median() for x in (right, wrong, corrected)]
+    assert errors[1] > 3.0 * errors[0]
+    assert errors[2] < 1.5 * errors[0]
+    assert wrong.weights[:, :2].median() > 0.05
+    assert corrected.weights[:, :2].median() < 1e-3
+    assert corrected.weights[:, 2:].median() > 0.8
+
+
+def test_iterations_by_residual_keep_a_noise_that_may_be_right(make_problems, correspond, perturb):
+    corr, truth = correspond(make_problems(9, 300, noise=False))
+    generator = torch.Generator().manual_seed(5)
+    noise = torch.randn(corr.img_points.shape, generator=generator, dtype=torch.float64)
+    start = perturb(truth)
+    for scale, most in ((2.0, 0.03), (6.0, 0.0)):  # as large as said, and larger
+        noisy = corr._replace(img_points=corr.img_points + scale * noise)
+        kept, by_residual = (
+            RobustWeightedLM(m=10, kernel="geman_mcclure", by_residual=x)(noisy, _told(start, corr, 2.0))
+            for x in (0, 3)
+        )
+        moved = (kept.pose.matrix - by_residual.pose.matrix).flatten(1).abs().amax(1) > 1e-9
+        assert moved.double().mean() <= most
+
+
+@pytest.mark.parametrize("backward", ["unroll", "implicit"])
+def test_gradients_of_iterations_by_residual_without_any_noise_are_finite(backward, make_problems, correspond):
+    corr, truth = correspond(make_problems(6, noise=False))
+    pixels = corr.img_points.clone().requires_grad_()
+    lm = RobustWeightedLM(m=3, kernel="geman_mcclure", by_residual=1, backward=backward)
+    refined = lm(corr._replace(img_points=pixels), _told(truth, corr, 1.0))
+    (refined.pose.rotation.sum() + refined.pose.translation.sum() + refined.weights.sum()).backward()
+    assert pixels.grad.isfinite().all()
+    assert pixels.grad.any()
+    torch.testing.assert_close(refined.pose.matrix, truth.matrix, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize(("m", "most"), [(0, 0), (1, 1), (3, 1), (6, 2), (10, 3)])
