@@ -298,15 +298,15 @@ class SetInit(nn.Module):
         if count >= _MANY:  # by the pairs that are there, so that padding changes nothing
             many = (corr.weights > 0).sum(1) >= _MANY
             valid = torch.cat((valid[:, :near], valid[:, near:] & many), 1)
-        # One more dimension after the problems, that of hypotheses: (B, 3, 3, H), (B, 3, H), and of pairs (B, 1, K).
-        every = Pose(rotation.permute(3, 0, 1, 2), translation.permute(2, 0, 1))
-        world, img, right, *sigmas = (x.permute(2, 1, 0)[:, None] for x in pairs.split((3, 2, 1, 1, 1)))
+        # Hypotheses are what is projected and problems are like points, so that they stay last: (H, K, B, 1).
+        every = Pose(rotation.permute(2, 0, 1, 3)[:, :, :, None], translation.permute(1, 0, 2)[:, :, None])
+        world, img, right, *sigmas = (x.permute(1, 2, 0)[..., None, :] for x in pairs.split((3, 2, 1, 1, 1)))
         judges = Correspondences(world, img, right[..., 0], corr.focal)
         projection = project(every, judges)
         variance = pixel_variance(projection, Noise(*(x[..., 0] for x in sigmas)), corr.focal)
         support = judges.weights / (1.0 + projection.sq_residual / (_JUDGED * variance))
-        support = torch.where(projection.in_front, support, 0.0).sum(-1)  # (B, H)
-        best = torch.where(valid.flatten(0, 1).mT, support, -1.0).max(1)
+        support = torch.where(projection.in_front, support, 0.0).sum(1)[..., 0]  # (H, B)
+        best = torch.where(valid.flatten(0, 1), support, -1.0).max(0)
         index = best.indices
         rotation = rotation.flatten(0, 1).gather(1, index.expand(9, 1, -1)).view(3, 3, batch)
         translation = translation.gather(1, index.expand(3, 1, -1))[:, 0]
