@@ -206,7 +206,7 @@ class SetInit(nn.Module):
         heads: int = 4,
         hidden: int = 64,
         starts: int = 4,
-        samples: int = len(_SAMPLES),
+        samples: int = 6,
     ) -> None:
         super().__init__()
         self.config = {"width": width, "layers": layers, "heads": heads, "hidden": hidden, "starts": starts}
