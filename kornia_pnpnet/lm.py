@@ -310,8 +310,8 @@ class RobustWeightedLM(nn.Module):
         shared: learn one set for all iterations instead of one each.
         update: ``"retraction"`` on the rotation group, or the paper's ``"additive"`` on the rotation vector.
         reject_worse: refuse, per problem, a step that raises the cost, and raise the damping after it tenfold.
-        by_residual: the last so many iterations, and the judgement after them, leave the guess's weights out. At most
-            those after the choice among several poses.
+        by_residual: the last so many iterations, of those after the choice among several poses, and the judgement after
+            them leave the guess's weights out.
         learnable: whether the hyperparameters are trained.
         backward: how gradients pass. ``"unroll"``: through all iterations. ``"truncated"``: through the ``last`` ones,
             the pose before them counts as constant. ``"implicit"``: by the implicit function theorem, as through a
@@ -356,10 +356,9 @@ class RobustWeightedLM(nn.Module):
         KORNIA_CHECK(update in ("retraction", "additive"), f"update must be retraction or additive, got {update!r}.")
         KORNIA_CHECK(backward in BACKWARDS, f"backward must be one of {BACKWARDS}, got {backward!r}.")
         KORNIA_CHECK(type(last) is int and last >= 1, f"last must be an integer of at least 1, got {last!r}.")
-        compared_at = 7 * m // 10  # the iteration before which the best of several starts is chosen
         KORNIA_CHECK(
-            type(by_residual) is int and 0 <= by_residual <= m - compared_at,
-            f"by_residual must be an integer from 0 to {m - compared_at} for m = {m}, got {by_residual!r}.",
+            type(by_residual) is int and by_residual >= 0,
+            f"by_residual must be an integer of at least 0, got {by_residual!r}.",
         )
         self.config: dict[str, Any] = {
             "m": m,
@@ -376,8 +375,8 @@ class RobustWeightedLM(nn.Module):
             "last": last,
         }
         self.m = m
-        self.compared_at = compared_at
-        self.by_residual = by_residual
+        self.compared_at = 7 * m // 10  # the iteration before which the best of several starts is chosen
+        self.by_residual = min(by_residual, m - self.compared_at)
         self.backward = backward
         self.last = last
         self.kernel: RobustKernel = KERNELS[kernel]

@@ -29,7 +29,8 @@ def _trained(weights: str, m: int | None = None, views: int | None = None) -> Pn
     refine = whole = solver.refine
     if m is not None:
         KORNIA_CHECK(type(m) is int and 0 <= m <= whole.m, f"m must be an integer from 0 to {whole.m}, got {m!r}.")
-        refine = RobustWeightedLM(**{**whole.config, "m": m})
+        by_residual = max(whole.by_residual - (whole.m - m), 0)  # they are the last ones
+        refine = RobustWeightedLM(**{**whole.config, "m": m, "by_residual": by_residual})
         for name, parameter in refine.named_parameters():
             parameter.data.copy_(whole.get_parameter(name)[: len(parameter)])
     return PnPNet(solver.init, refine, solver.normalize, views=solver.views if views is None else views)

@@ -640,11 +640,19 @@ def test_gradients_of_iterations_by_residual_without_any_noise_are_finite(backwa
 
 
 @pytest.mark.parametrize(("m", "most"), [(0, 0), (1, 1), (3, 1), (6, 2), (10, 3)])
-def test_iterations_by_residual_come_after_the_choice_among_poses(m, most):
-    assert RobustWeightedLM(m=m, by_residual=most).config["by_residual"] == most
-    for wrong in (most + 1, -1, True, 1.0):
-        with pytest.raises(BaseError, match=f"by_residual must be an integer from 0 to {most}"):
-            RobustWeightedLM(m=m, by_residual=wrong)
+def test_iterations_by_residual_come_after_the_choice_among_poses(m, most, make_problems, correspond, perturb):
+    corr, truth = correspond(make_problems(9, outliers=2))
+    starts = several(corr, perturb(truth), perturb(truth, seed=2))
+    some, more = (RobustWeightedLM(m=m, by_residual=count) for count in (most, most + 5))
+    assert (some.by_residual, more.by_residual) == (most, most)
+    assert more.config["by_residual"] == most + 5
+    torch.testing.assert_close(some(corr, starts).pose.matrix, more(corr, starts).pose.matrix, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("wrong", [-1, True, 1.0])
+def test_a_wrong_number_of_iterations_by_residual_is_refused(wrong):
+    with pytest.raises(BaseError, match="by_residual must be an integer of at least 0"):
+        RobustWeightedLM(m=6, by_residual=wrong)
 
 
 # --- gradients --------------------------------------------------------------------------------------------------------
