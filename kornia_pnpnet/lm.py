@@ -186,29 +186,25 @@ def _relative(weights: Tensor, projection: Projection) -> Tensor:
 
 
 def _weighted(
-    corr: Correspondences, pose: Pose, shape: Tensor, kernel_weight: Callable[[Tensor, Tensor], Tensor]
+    corr: Correspondences,
+    pose: Pose,
+    shape: Tensor,
+    kernel_weight: Callable[[Tensor, Tensor], Tensor],
+    by_residual: bool = False,
 ) -> tuple[Projection, Tensor]:
-    """The projection, and the weights of the pairs by their residuals there and by their noise."""
-    projection = project(pose, corr)
-    if corr.noise is None:
-        return projection, corr.weights * kernel_weight(projection.sq_residual, shape)
-    precision = pixel_variance(projection, corr.noise, corr.focal).reciprocal()
-    return projection, corr.weights * precision * kernel_weight(projection.sq_residual * precision, shape)
+    """The projection, and the weights of the pairs by their residuals there and by their noise.
 
-
-def _weighted_by_residual(
-    corr: Correspondences, pose: Pose, shape: Tensor, kernel_weight: Callable[[Tensor, Tensor], Tensor]
-) -> tuple[Projection, Tensor]:
-    """The same, where the residuals have a say in how large the noise is."""
+    With ``by_residual`` the residuals have a say in how large the noise is.
+    """
     projection = project(pose, corr)
     if corr.noise is None:
         return projection, corr.weights * kernel_weight(projection.sq_residual, shape)
     precision = pixel_variance(projection, corr.noise, corr.focal).reciprocal()
     residual = projection.sq_residual * precision
-    factor = _variance_factor(
-        residual, torch.where(projection.in_front, kernel_weight(residual, shape), 0.0), corr.weights
-    )
-    residual = residual / torch.where(factor < 1.0, _NARROWER * factor, 1.0)
+    if by_residual:
+        within = torch.where(projection.in_front, kernel_weight(residual, shape), 0.0)
+        factor = _variance_factor(residual, within, corr.weights)
+        residual = residual / torch.where(factor < 1.0, _NARROWER * factor, 1.0)
     return projection, corr.weights * precision * kernel_weight(residual, shape)
 
 
@@ -236,11 +232,12 @@ def _iterate(
     step: Tensor,
     damping: Tensor,
     shape: Tensor,
-    weigh: Callable[[Correspondences, Pose, Tensor], tuple[Projection, Tensor]],
+    kernel_weight: Callable[[Tensor, Tensor], Tensor],
     additive: bool,
+    by_residual: bool = False,
 ) -> LMStep:
     """Weigh the pairs by their residuals and take one step."""
-    projection, weights = weigh(corr, pose, shape)
+    projection, weights = _weighted(corr, pose, shape, kernel_weight, by_residual)
     return lm_step(corr, pose, projection, weights, step, damping, additive=additive)
 
 
@@ -394,8 +391,8 @@ class RobustWeightedLM(nn.Module):
             logarithmic=self.kernel.logarithmic,
         )
         self.requires_grad_(learnable and m > 0)
-        weighs = (partial(x, kernel_weight=self.kernel.weight) for x in (_weighted, _weighted_by_residual))
-        self._iteration, self._last_iteration = (partial(_iterate, weigh=x, additive=self.additive) for x in weighs)
+        self._iteration = partial(_iterate, kernel_weight=self.kernel.weight, additive=self.additive)
+        self._last_iteration = partial(self._iteration, by_residual=True)
         # What runs: these, or what `compile` made of them.
         self._begin: Callable[..., LMStart] = self.begin
         self._iterate: Callable[..., LMStep] = self._iteration
@@ -583,13 +580,10 @@ class RobustWeightedLM(nn.Module):
         """
 
         def equations(corr: Correspondences, at: Pose, shape: Tensor) -> NormalEquations:
-            projection, weights = weigh(corr, at, shape, self.kernel.weight)
+            projection, weights = _weighted(corr, at, shape, self.kernel.weight, start.by_residual is not None)
             return normal_equations(projection, _relative(weights, projection))
 
-        if start.by_residual is None:
-            pairs, weigh = start.pairs, _weighted
-        else:
-            pairs, weigh = start.by_residual, _weighted_by_residual
+        pairs = start.pairs if start.by_residual is None else start.by_residual
         fixed = pairs.map(torch.Tensor.detach)
         zero = [torch.zeros_like(start.prior[:, 0]).requires_grad_() for _ in range(6)]
         with torch.enable_grad():
