@@ -293,7 +293,8 @@ class RobustWeightedLM(nn.Module):
 
     With ``by_residual`` the last iterations no longer ask the guess how much a pair counts: what it took for wrong
     may by then have shown to be right, and the other way round. Where residuals are so small that the guess's noise
-    cannot be (by their likelihood ratio), its variance is multiplied by their a posteriori variance factor.
+    cannot be (by their likelihood ratio), its variance is multiplied by their a posteriori variance factor, in these
+    iterations by a tenth of it: where the noise is known so well, a narrower kernel tells pairs better apart.
 
     All operations are per problem: a problem that cannot be solved keeps its pose, reports ``ok=False`` and changes
     no other.

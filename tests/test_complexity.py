@@ -196,6 +196,7 @@ def test_other_shares_of_outliers_and_other_solvers():
         (PnPNet(None, RobustWeightedLM(update="additive")), "retraction"),
         (PnPNet(None, RobustWeightedLM(reject_worse=True)), "rejection"),
         (PnPNet(None, RobustWeightedLM(kernel="huber")), "another kernel"),
+        (PnPNet(None, RobustWeightedLM(by_residual=1)), "by residual"),
         (PnPNet(torch.nn.Identity(), RobustWeightedLM()), "Identity"),
         (PnPNet(RANSAC(P3P()), RobustWeightedLM()), "Samples of 3"),
         (PnPNet(RANSAC(P3P(), scorer=torch.sqrt), RobustWeightedLM()), "sqrt"),

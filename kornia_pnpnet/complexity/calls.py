@@ -37,8 +37,9 @@ def _step_calls(n: int, times: float) -> Iterator[Call]:
 def _lm_calls(lm: RobustWeightedLM, n: int, times: float = 1, starts: int = 1) -> Iterator[Call]:
     """A refinement, of several starts until they are compared."""
     weight, loss = (f"robust.{function.__name__}" for function in (lm.kernel.weight, lm.kernel.loss))
-    if lm.additive or lm.reject_worse or weight not in PARTS:
-        raise ValueCheckError(f"There is no formula for {lm}: it needs the retraction, no rejection, another kernel.")
+    if lm.additive or lm.reject_worse or lm.by_residual or weight not in PARTS:
+        reason = "it needs the retraction, no rejection, no iterations by residual, another kernel"
+        raise ValueCheckError(f"There is no formula for {lm}: {reason}.")
     iterations = lm.m + (starts - 1) * lm.compared_at
     compared = starts if starts > 1 else 0
     yield "lm._iterate", iterations * times, (n,)
