@@ -21,7 +21,7 @@ from kornia_pnpnet.complexity import (
     operations_by_part,
     part_calls,
 )
-from kornia_pnpnet.init import P3P, RANSAC, MLPInit, SubsetSolver
+from kornia_pnpnet.init import P3P, RANSAC, EPnP, MLPInit, SetInit, SubsetSolver
 from kornia_pnpnet.init.search import Search
 
 SIZES = (6, 9, 20, 50)
@@ -83,6 +83,28 @@ def test_networks_cost_what_the_formulas_say(m, views, kernel, measure):
         refine = RobustWeightedLM(m, kernel=kernel)
         wrong = differences(PnPNet(MLPInit(n), refine, views=views), measure, sizes=[n])
         assert not wrong, wrong
+
+
+@pytest.mark.parametrize(
+    ("init", "refine"),
+    [
+        ({}, {"by_residual": 2}),
+        ({}, {"by_residual": 9, "m": 1}),
+        ({"samples": 0}, {}),
+        ({"samples": 8}, {"m": 0}),
+        ({"samples": 0, "starts": 1}, {"kernel": "power", "by_residual": 1}),
+        ({"width": 12, "layers": 2, "heads": 3, "hidden": 20, "starts": 2, "samples": 3}, {"m": 2}),
+    ],
+)
+def test_set_networks_cost_what_the_formulas_say(init, refine, measure):
+    solver = PnPNet(SetInit(**init), RobustWeightedLM(**{"m": 5, "kernel": "geman_mcclure", **refine}), Normalize())
+    wrong = differences(solver, measure, sizes=(4, 9, 17, 18, 40))
+    assert not wrong, wrong
+
+
+def test_iterations_by_residual_cost_what_the_formulas_say(measure):
+    wrong = differences(PnPNet(EPnP(), RobustWeightedLM(by_residual=2)), measure)
+    assert not wrong, wrong
 
 
 @pytest.mark.parametrize(
@@ -196,7 +218,6 @@ def test_other_shares_of_outliers_and_other_solvers():
         (PnPNet(None, RobustWeightedLM(update="additive")), "retraction"),
         (PnPNet(None, RobustWeightedLM(reject_worse=True)), "rejection"),
         (PnPNet(None, RobustWeightedLM(kernel="huber")), "another kernel"),
-        (PnPNet(None, RobustWeightedLM(by_residual=1)), "by residual"),
         (PnPNet(torch.nn.Identity(), RobustWeightedLM()), "Identity"),
         (PnPNet(RANSAC(P3P()), RobustWeightedLM()), "Samples of 3"),
         (PnPNet(RANSAC(P3P(), scorer=torch.sqrt), RobustWeightedLM()), "sqrt"),

@@ -68,6 +68,15 @@ def test_every_kind_has_a_cost():
         (lambda x: x.argmin(-1), Operations(compare=9)),
         (lambda x: x.min(-1), Operations(compare=9)),
         (lambda x: torch.minimum(x, x), Operations(compare=12)),
+        (lambda x: x.tanh(), Operations(log=12)),
+        (lambda x: torch.linalg.cross(x.mT, x.mT), Operations(add=12, multiply=24)),
+        (lambda x: torch.linalg.vector_norm(x, dim=0), Operations(add=8, multiply=12, sqrt=4)),
+        (lambda x: torch.linalg.vector_norm(x, dim=(0, 1)), Operations(add=11, multiply=12, sqrt=1)),
+        (lambda x: x.softmax(-1), Operations(add=12 + 9, divide=12, exp=12, compare=9)),
+        (
+            lambda x: torch.nn.functional.layer_norm(x, (4,), x[0], x[1]),  # sums, differences, squares
+            3 * Operations(add=3 + 4 + 3 + 1 + 4, multiply=4 + 4 + 4, divide=3, sqrt=1),
+        ),
         (lambda x: (x > 0).all(-1), Operations(compare=12, logic=9)),
         (lambda x: x.sort(-1), Operations(compare=3 * 4 * 2)),
         (lambda x: x.argsort(dim=-1, stable=True), Operations(compare=3 * 4 * 2)),

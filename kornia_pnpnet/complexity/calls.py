@@ -10,12 +10,13 @@ from kornia.core.exceptions import ValueCheckError
 from torch import nn
 
 from kornia_pnpnet.complexity.parts import PARTS
-from kornia_pnpnet.init import P3P, RANSAC, EPnP, MLPInit, REPPnP, SubsetSolver
+from kornia_pnpnet.init import P3P, RANSAC, EPnP, MLPInit, REPPnP, SetInit, SubsetSolver
 from kornia_pnpnet.init.epnp import CASE_ITERATIONS
 from kornia_pnpnet.init.ransac import FINAL_STEPS
 from kornia_pnpnet.init.sampling import samples_needed
 from kornia_pnpnet.init.scoring import SCORERS
 from kornia_pnpnet.init.search import GROWTH
+from kornia_pnpnet.init.set import MOST_JUDGES
 from kornia_pnpnet.lm import RobustWeightedLM
 from kornia_pnpnet.model import PnPNet
 
@@ -34,22 +35,29 @@ def _step_calls(n: int, times: float) -> Iterator[Call]:
     yield "geometry.move", times, ()
 
 
-def _lm_calls(lm: RobustWeightedLM, n: int, times: float = 1, starts: int = 1) -> Iterator[Call]:
-    """A refinement, of several starts until they are compared."""
+def _lm_calls(lm: RobustWeightedLM, n: int, times: float = 1, starts: int = 1, noise: bool = False) -> Iterator[Call]:
+    """A refinement, of several starts until they are compared, whose guess may know the noise."""
     weight, loss = (f"robust.{function.__name__}" for function in (lm.kernel.weight, lm.kernel.loss))
-    if lm.additive or lm.reject_worse or lm.by_residual or weight not in PARTS:
-        reason = "it needs the retraction, no rejection, no iterations by residual, another kernel"
-        raise ValueCheckError(f"There is no formula for {lm}: {reason}.")
+    if lm.additive or lm.reject_worse or weight not in PARTS:
+        raise ValueCheckError(f"There is no formula for {lm}: it needs the retraction, no rejection, another kernel.")
     iterations = lm.m + (starts - 1) * lm.compared_at
     compared = starts if starts > 1 else 0
-    yield "lm._iterate", iterations * times, (n,)
+    by_residual = lm.by_residual > 0
+    # By residual the noise is corrected before its pairs are weighed again, in iterations and at the end.
+    corrected = lm.by_residual if noise else 0
+    factors = corrected + 1 if corrected else 0
+    yield "lm._iterate", (iterations - corrected) * times, (n, noise, False)
+    yield "lm._iterate", corrected * times, (n, noise, True)
+    yield "lm._variance_factor", factors * times, (n,)
     yield from _step_calls(n, iterations * times)
     yield "geometry.project", (iterations + compared + 1) * times, (n,)
-    yield weight, (iterations + 1) * times, (n,)
-    for part in ("lm.RobustWeightedLM._cost", loss):
-        yield part, (compared + 1) * times, (n,)
-    for part in ("lm.RobustWeightedLM.begin", "lm.RobustWeightedLM.finish", "lm.explains"):
-        yield part, times, (n,)
+    yield "geometry.pixel_variance", noise * (iterations + compared + 2) * times, (n, n)
+    yield weight, (iterations + 1 + factors) * times, (n,)
+    yield "lm.RobustWeightedLM._cost", (compared + 1) * times, (n, noise)
+    yield loss, (compared + 1) * times, (n,)
+    yield "lm.RobustWeightedLM.begin", times, (n, by_residual)
+    yield "lm.RobustWeightedLM.finish", times, (n, noise, by_residual)
+    yield "lm.explains", (not noise) * times, (n,)
     if compared:
         yield "lm.RobustWeightedLM.choose", times, (starts,)
 
@@ -95,6 +103,7 @@ def _ransac_calls(ransac: RANSAC, n: int, outliers: int | None, better: int | No
     match minimal:
         case P3P():
             yield "p3p.P3P.hypotheses", sum(rounds), ()
+            yield "p3p.p3p", sum(rounds), ()
         case SubsetSolver(init=init, refine=refine):
             yield from _init_calls(init, size, sum(rounds))
             yield from _lm_calls(refine, size, sum(rounds)) if refine is not None else ()
@@ -130,7 +139,25 @@ def _rounds(ransac: RANSAC, n: int, outliers: int | None) -> list[int]:
 
 def _says_ok(init: nn.Module | None) -> bool:
     """Whether an initialiser may say that it has no guess."""
-    return not isinstance(init, MLPInit | None)
+    return not isinstance(init, MLPInit | SetInit | None)
+
+
+def _set_calls(init: SetInit, n: int, times: float) -> Iterator[Call]:
+    """A set network that is not told the noise, and its samples."""
+    sizes = (init.config[key] for key in ("width", "layers", "heads", "hidden", "starts"))
+    yield "set._View.__init__", times, (n,)
+    yield "set.SetInit._run", times, (n, *sizes)
+    yield "set.SetInit.forward", times, (n, init.starts)
+    yield "small.nearest_rotation", init.starts * times, ()
+    yield "set.SetInit._noise", times, (n,)
+    if not init.samples:
+        return
+    near, spread = init.triples(n)
+    judges, drawn = min(MOST_JUDGES, n), len(near) + len(spread)
+    yield "set.SetInit._sampled", times, (n, judges, len(near), len(spread))
+    yield "p3p.p3p", drawn * times, ()
+    yield "geometry.project", 4 * drawn * times, (judges,)
+    yield "geometry.pixel_variance", times, (4 * drawn * judges, judges)
 
 
 def _init_calls(init: nn.Module | None, n: int, times: float = 1) -> Iterator[Call]:
@@ -142,6 +169,8 @@ def _init_calls(init: nn.Module | None, n: int, times: float = 1) -> Iterator[Ca
             yield "mlp.MLPInit.forward", times, (n,)
         case EPnP():
             yield from _epnp_calls(init, n, times)
+        case SetInit():
+            yield from _set_calls(init, n, times)
         case REPPnP():
             yield from _reppnp_calls(init, n, times)
         case _:
@@ -177,6 +206,13 @@ def part_calls(solver: PnPNet, n: int, *, outliers: int | None = None, better: i
         yield from _ransac_calls(solver.init, n, outliers, better)
     else:
         yield from _init_calls(solver.init, n, views)
-    yield from _lm_calls(solver.refine, n, starts=views)
+    noise, starts = False, views
+    if isinstance(solver.init, SetInit):
+        noise, starts = True, solver.init.starts + (solver.init.samples > 0)
+    yield "model.PnPNet._guess", 1, (n, noise)
+    yield from _lm_calls(solver.refine, n, starts=starts, noise=noise)
     yield "normalize.Normalize.undo", 2, ()
-    yield "model.PnPNet._result", 1, (n, _says_ok(solver.init))
+    yield "model.PnPNet._result", 1, (n, _says_ok(solver.init), noise)
+    if noise:
+        yield "geometry.project", 1, (n,)
+        yield "model._is_no_chance", 1, (n,)

@@ -38,7 +38,7 @@ _ELEMENTWISE: dict[str, Operations] = {
     **_each("empty_like expand eye fill flip full full_like gather index index_put index_select", _NOTHING),
     **_each("lift_fresh masked_select neg new_empty new_full new_ones new_zeros nonzero ones", _NOTHING),
     **_each("ones_like permute promote_types rand randperm repeat scalar_tensor scatter select", _NOTHING),
-    **_each("slice split split_with_sizes squeeze stack t transpose unbind unsqueeze view zero", _NOTHING),
+    **_each("slice split split_with_sizes squeeze stack t taken transpose unbind unsqueeze view zero", _NOTHING),
     **_each("zeros zeros_like", _NOTHING),
     **_each("add rsub sub", _ADD),
     **_each("mul", _MULTIPLY),
@@ -46,11 +46,12 @@ _ELEMENTWISE: dict[str, Operations] = {
     **_each("sqrt", _SQRT),
     **_each("rsqrt", _SQRT + _DIVIDE),
     **_each("exp expm1", _EXP),
-    **_each("acos atan2 cos lgamma log log1p sin", _LOG),
+    **_each("acos atan2 cos lgamma log log1p sin tanh", _LOG),
     **_each("sigmoid", _EXP + _ADD + _DIVIDE),
     **_each("addcmul", _MULTIPLY + _ADD),
     **_each("lerp", 2 * _ADD + _MULTIPLY),
-    **_each("ceil eq ge gt le lt maximum minimum ne relu", _COMPARE),
+    **_each("linalg_cross", _ADD + 2 * _MULTIPLY),
+    **_each("ceil clamp_min eq ge gt le lt maximum minimum ne relu", _COMPARE),
     **_each("abs copysign sgn sign", 2 * _COMPARE),
     **_each("bitwise_and bitwise_not bitwise_or masked_fill where", _LOGIC),
 }
@@ -61,6 +62,15 @@ _REDUCTIONS: dict[str, Operations] = {
     **_each("prod", _MULTIPLY),
     **_each("amax amin argmax argmin max min", _COMPARE),
     **_each("all any", _LOGIC),
+}
+
+#: Operations for a row, from its length: what is taken out of it, and what is done to each entry.
+_ROWS: dict[str, Callable[[int], Operations]] = {
+    "linalg_vector_norm": lambda length: Operations(add=length - 1, multiply=length, sqrt=1),
+    # Minus the largest, exponentials by their sum.
+    "_softmax": lambda length: Operations(add=2 * length - 1, divide=length, exp=length, compare=length - 1),
+    # Minus the mean, by the root of the variance and a small number; weight and bias.
+    "native_layer_norm": lambda length: Operations(add=4 * length - 1, multiply=3 * length, divide=3, sqrt=1),
 }
 
 #: Operations for one matrix of the batch, from the sizes of the matrices that come in.
@@ -101,6 +111,9 @@ def _operations(name: str, call: dict[str, Any], output: Any) -> Operations:
         entries = call["self"].numel()
         results = entries // call["self"].shape[call["dim"]] if name == "cumsum" else result.numel()
         return (entries - results) * _REDUCTIONS[name]
+    if name in _ROWS:
+        entries, length = _rows(call)
+        return entries // length * _ROWS[name](length)
     if name in ("sort", "topk"):
         length = call["self"].shape[call["dim"]]
         rows = call["self"].numel() // max(length, 1)
@@ -108,6 +121,15 @@ def _operations(name: str, call: dict[str, Any], output: Any) -> Operations:
             return rows * sort(length)
         return rows * (smallest(length, call["k"]) + (sort(call["k"]) if call["sorted"] else _NOTHING))
     raise NotImplementedError(f"What aten.{name} costs is unknown: say so in {__name__}.")
+
+
+def _rows(call: dict[str, Any]) -> tuple[int, int]:
+    """How many entries an operation on rows takes in, and how many of them are one row."""
+    tensor = next(value for value in call.values() if isinstance(value, Tensor))
+    if "normalized_shape" in call:
+        return tensor.numel(), math.prod(call["normalized_shape"])
+    dims = call["dim"] if isinstance(call["dim"], list | tuple) else [call["dim"]]
+    return tensor.numel(), math.prod(tensor.shape[dim] for dim in dims)
 
 
 # --- the instrument ---------------------------------------------------------------------------------------------------

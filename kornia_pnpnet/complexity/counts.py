@@ -21,6 +21,7 @@ __all__ = ["SOLVERS", "complexity_results", "operation_count", "operations_by_pa
 SOLVERS = (
     "net",
     "pnpnet",
+    "pnpnet-set",
     "epnp",
     "epnp-lm",
     "reppnp",

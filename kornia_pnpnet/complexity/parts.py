@@ -23,6 +23,36 @@ def _mlp(n: int) -> Operations:
     return scale_inputs + layers + rotation
 
 
+def _set_network(n: int, width: int, layers: int, heads: int, hidden: int, starts: int) -> Operations:
+    """The layers of a set network: nearly all of it is a product and a sum for each weight that a pair meets."""
+    features, outputs = 14, 1 + 2 * starts
+    norm = n * Operations(add=4 * width - 1, multiply=3 * width, divide=3, sqrt=1)
+
+    def pooled(channels: int, heads: int) -> Operations:
+        """The mean of the pairs by their scores: for each head a softmax over the pairs."""
+        softmax = heads * Operations(add=3 * n - 1, divide=n, exp=n, compare=n - 1)
+        return softmax + Operations(add=(n - 1) * channels, multiply=n * channels)
+
+    look = matmul(n, width, width + heads) + pooled(width, heads) + Operations(add=width)
+    inner = matmul(n, width, hidden) + matmul(1, width, hidden) + Operations(add=(n + 1) * hidden, compare=n * hidden)
+    outer = matmul(n, hidden, width) + Operations(add=2 * n * width)
+    first = matmul(n, features, width) + Operations(add=n * width, compare=n, logic=n)
+    of_pairs = matmul(n, width, outputs) + Operations(add=n * outputs)
+    of_problem = pooled(width, 1) + matmul(1, width, starts + 2) + Operations(add=starts + 2)
+    return first + layers * (norm + look + inner + outer) + norm + of_pairs + of_problem
+
+
+def _set_samples(n: int, judges: int, samples: int, more: int) -> Operations:
+    """The likeliest pairs, and how much of them each of the samples' four poses has on its side."""
+    drawn = samples + more
+    poses = 4 * drawn
+    scores = poses * Operations(add=3 * judges - 1, multiply=3 * judges, divide=2 * judges, logic=judges)
+    best = Operations(compare=poses, logic=poses + 12)
+    valid = Operations(divide=6 * drawn, compare=3 * drawn, logic=2 * drawn + poses)
+    there = Operations(add=n - 1, compare=n + 1, logic=4 * more) if more else Operations()
+    return Operations(compare=n, logic=n) + smallest(n, judges) + sort(judges) + valid + there + scores + best
+
+
 def _inverse(n: int) -> Operations:
     """REPPnP's inverse of a matrix with a ridge."""
     return solve(n, n) + Operations(add=n * n)
@@ -75,23 +105,58 @@ PARTS: dict[str, Callable[..., Operations]] = {
     "normalize.Normalize.apply_to_pose": lambda: matmul(3, 3, 1) + Operations(add=3, multiply=3),
     "normalize.Normalize.undo": lambda: matmul(3, 3, 1) + Operations(add=3, divide=3),
     # Checks of everything that is returned, of the initialiser's word, and of a pose that was given.
-    "model.PnPNet._result": lambda n, init_ok: Operations(add=n + 5, multiply=2, compare=8, logic=n + 28 + init_ok),
+    "model.PnPNet._result": lambda n, init_ok, noise: Operations(
+        add=n + 5, multiply=2, compare=8, logic=n + 28 + init_ok + noise
+    ),
     "model.PnPNet._given": lambda: Operations(compare=36, logic=13),
+    "model.PnPNet._guess": lambda n, noise: Operations(compare=noise * n),
+    # Whether so many inliers could be chance.
+    "model._is_no_chance": lambda n: Operations(
+        add=6 * n + 8, multiply=13 * n + 1, divide=5 * n + 1, sqrt=n, log=5, compare=14 * n + 5, logic=10 * n
+    ),
     "mlp.MLPInit.forward": _mlp,
+    # Rays, the frames of camera and world, the affine camera by cofactors.
+    "set._View.__init__": lambda n: (
+        n * Operations(add=47, multiply=56, divide=8, sqrt=1, compare=30, logic=2)
+        + Operations(add=63, multiply=110, divide=17, sqrt=5, log=3, compare=6, logic=1)
+    ),
+    "set.SetInit._run": _set_network,
+    # Likelihoods; for each hypothesis where the points are and how much they count, its alignment, and turning it back.
+    "set.SetInit.forward": lambda n, starts: (
+        Operations(add=n, divide=n, exp=n)
+        + starts * Operations(add=27 * n + 43, multiply=32 * n + 81, divide=2 * n + 1, exp=2 * n + 1, log=n)
+        + starts * Operations(compare=2 * n + 4, logic=2)
+    ),
+    "set.SetInit._noise": lambda n: Operations(add=2, multiply=2 * n + 3, exp=2 * n, log=2, logic=2 * n),
+    "set.SetInit._sampled": _set_samples,
     # R x + t (9 products, 9 sums), in front (3, 8), x/z and y/z (3), times the focal length minus the pixel (2, 4).
     "geometry.project": lambda n: n * Operations(add=14, multiply=24, divide=1, compare=3, logic=1),
+    # What a unit of the world is in pixels, for each projection; the square of the pixel's noise once for each pair.
+    "geometry.pixel_variance": lambda projections, n: Operations(add=3 * projections, multiply=7 * projections + 2 * n),
     # Of the 21 entries of the matrix and the 6 of the gradient what is not known beforehand.
     "geometry.normal_equations": lambda n: Operations(add=41 * n - 25, multiply=44 * n),
     # Cayley's map: two cross products with the rows of the rotation.
     "geometry.move": lambda: Operations(add=42, multiply=52, divide=1),
-    # Prior weights, relative to the largest; those of an iteration likewise, by the rows of the Jacobian.
-    "lm.RobustWeightedLM.begin": lambda n: Operations(multiply=n, divide=n, compare=n, logic=1),
-    "lm.RobustWeightedLM.finish": lambda n: Operations(add=n, multiply=3 * n, logic=n + 1),
+    # Prior weights, relative to the largest, with and without the guess's; those of an iteration by the rows of the
+    # Jacobian.
+    "lm.RobustWeightedLM.begin": lambda n, by_residual: (
+        Operations(multiply=n) + (1 + by_residual) * Operations(divide=n, compare=n, logic=1)
+    ),
+    "lm.RobustWeightedLM.finish": lambda n, noise, by_residual: (
+        Operations(add=n, multiply=3 * n, logic=n + 1)
+        + noise * Operations(add=n - 1, divide=n, compare=n + 1, logic=n)
+        + (noise and by_residual) * Operations(divide=n, logic=n)
+    ),
     "lm.RobustWeightedLM.choose": lambda starts: Operations(add=1, multiply=1, compare=starts - 1),
-    "lm._iterate": lambda n: n * Operations(add=1, multiply=3),
+    # Weights by the residuals, in standard deviations where the noise is known.
+    "lm._iterate": lambda n, noise, corrected: (
+        n * Operations(add=1, multiply=3 + 2 * noise, divide=noise)
+        + corrected * Operations(multiply=1, divide=n, compare=1, logic=n + 1)
+    ),
+    "lm._variance_factor": lambda n: Operations(add=2 * n + 1, multiply=4 * n + 3, divide=1, log=1, compare=4, logic=2),
     "lm._relative": lambda n: Operations(multiply=2 * n, divide=n, compare=n, logic=1),
-    "lm.RobustWeightedLM._cost": lambda n: Operations(
-        add=3 * n - 2, multiply=3 * n, divide=1, compare=2 * n + 1, logic=n
+    "lm.RobustWeightedLM._cost": lambda n, noise: Operations(
+        add=3 * n - 2, multiply=3 * n, divide=1 + noise * n, compare=2 * n + 1, logic=n
     ),
     # The kernel 1 / |r|^alpha with any alpha: a power; its loss with a series near alpha = 2.
     "robust._power_weight": lambda n: n * Operations(add=1, multiply=1, exp=1, log=1),
@@ -161,9 +226,8 @@ PARTS: dict[str, Callable[..., Operations]] = {
     "reppnp._normal_matrix": lambda n: matmul(6, 2 * n, 7) + Operations(multiply=12 * n, logic=n),
     "reppnp._step": lambda: _inverse(6) + matmul(6, 6, 1),
     # A root of a cubic, four candidates, their Newton steps and their rotations: nothing depends on n.
-    "p3p.P3P.hypotheses": lambda: Operations(
-        add=618, multiply=731, divide=42, sqrt=21, exp=1, log=1, compare=135, logic=18
-    ),
+    "p3p.p3p": lambda: Operations(add=618, multiply=731, divide=36, sqrt=21, exp=1, log=1, compare=135, logic=18),
+    "p3p.P3P.hypotheses": lambda: Operations(divide=6),
     # Whether the 12 numbers of a pose are finite.
     "ransac.SubsetSolver.hypotheses": lambda init_ok: Operations(multiply=12, compare=48, logic=23 + init_ok),
     "search.Search._best_of_samples": _best_of_samples,

@@ -25,11 +25,20 @@ _FEATURES = 14
 # Added to the score of a pair that is not there.
 _ABSENT = -1e9
 # Samples of three, by how likely their pairs are to be right.
-_SAMPLES = ((0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3), (0, 1, 4), (2, 3, 4), (0, 3, 4), (1, 2, 4))
+_SAMPLES: tuple[tuple[int, ...], ...] = (
+    (0, 1, 2),
+    (0, 1, 3),
+    (0, 2, 3),
+    (1, 2, 3),
+    (0, 1, 4),
+    (2, 3, 4),
+    (0, 3, 4),
+    (1, 2, 4),
+)
 # Problems of so many pairs have as many samples again, spread over so many times as many of the likeliest.
 _MANY, _SPREAD = 18, 3
 # So many of the likeliest pairs say how good the pose of a sample is: squared residuals count to this many variances.
-_MOST_JUDGES, _JUDGED = 32, 50.0
+MOST_JUDGES, _JUDGED = 32, 50.0
 
 
 @torch.library.custom_op("kornia_pnpnet::taken", mutates_args=())
@@ -275,29 +284,40 @@ class SetInit(nn.Module):
         others = Pose(*(x[:, 1:] for x in every)) if every.rotation.shape[1] > 1 else None
         return Guess(Pose(*(x[:, 0] for x in every)), right, others=others, noise=noises)
 
+    def triples(self, count: int) -> tuple[list[tuple[int, ...]], list[tuple[int, ...]]]:
+        """The samples of problems of so many pairs, by the places of their pairs among the likeliest.
+
+        Args:
+            count: number of pairs.
+
+        Returns:
+            Samples of the very likeliest, and as many that are spread further where there are many pairs.
+        """
+        near = [x for x in _SAMPLES if max(x) < count][: self.samples]
+        # Where the likeliest are wrong together, others are not.
+        spread = [tuple(_SPREAD * place for place in x) for x in near]
+        return near, spread if count >= _MANY else []
+
     @torch.no_grad()
     def _sampled(self, corr: Correspondences, right: Tensor, noise: Noise, fallback: Pose) -> Pose:
         """The pose that the likeliest pairs agree on most, of those from samples of three of them; problems last."""
         batch, count = right.shape
         right = torch.where(corr.weights > 0, right, 0.0)  # pairs that are not there judge nothing
-        likely = right.topk(min(_MOST_JUDGES, count)).indices
+        likely = right.topk(min(MOST_JUDGES, count)).indices
         img, world = (x.expand(batch, count)[..., None] for x in noise)
         of_pairs = torch.cat((corr.world_points, corr.img_points, right[..., None], img, world), -1)  # (B, N, 8)
         pairs = _taken(of_pairs, likely)  # (8, K, B)
-        samples = [x for x in _SAMPLES if max(x) < count][: self.samples]
-        near = len(samples)
-        if count >= _MANY:  # where the likeliest are wrong together, others are not
-            samples += [(_SPREAD * i, _SPREAD * j, _SPREAD * k) for i, j, k in samples]
+        near, spread = self.triples(count)
         # (6, 3, S B), stacked, not indexed: a compiler then copies whole rows.
-        three = torch.stack([pairs[:6, k] for column in zip(*samples, strict=True) for k in column], 1)
+        three = torch.stack([pairs[:6, k] for column in zip(*near, *spread, strict=True) for k in column], 1)
         three = three.unflatten(1, (3, -1)).flatten(2)
         pose, valid = p3p(three[:3].permute(2, 1, 0), three[3:5].permute(2, 1, 0) / corr.focal)
         # Components first, then the four solutions and the samples, problems last: it is how they lie in memory.
         rotation, translation = (x.movedim((0, 1), (-1, -2)).flatten(-2).unflatten(-1, (-1, batch)) for x in pose)
         valid = (valid.mT & (three[5] > 0).all(0)).unflatten(-1, (-1, batch))  # (4, S, B)
-        if count >= _MANY:  # by the pairs that are there, so that padding changes nothing
+        if spread:  # by the pairs that are there, so that padding changes nothing
             many = (corr.weights > 0).sum(1) >= _MANY
-            valid = torch.cat((valid[:, :near], valid[:, near:] & many), 1)
+            valid = torch.cat((valid[:, : len(near)], valid[:, len(near) :] & many), 1)
         # Hypotheses are what is projected and problems are like points, so that they stay last: (H, K, B, 1).
         every = Pose(rotation.permute(2, 0, 1, 3)[:, :, :, None], translation.permute(1, 0, 2)[:, :, None])
         world, img, right, *sigmas = (x.permute(1, 2, 0)[..., None, :] for x in pairs.split((3, 2, 1, 1, 1)))
