@@ -50,7 +50,7 @@ def ready(
         problems: the batch. A loop gets as many of them as take a given time.
         settings: the limits.
         backward: with gradients.
-        known: seconds per problem in a smaller batch.
+        known: about how many seconds a problem takes, by what was measured before.
 
     Raises:
         CannotBeTimedError: when it would take too long, or cannot compile.
@@ -76,14 +76,18 @@ def measure_throughput(settings: Settings, *, count: int) -> dict[str, list[dict
     """
     rows: list[dict[str, Any]] = []
     skipped: list[dict[str, Any]] = []
+    # Seconds per problem of what was measured last, brought to the number of pairs in proportion.
+    known: dict[tuple[str, str], float] = {}
+    before = 0
     with threads(count):
         for n, points in grid(settings, count):
+            known = {key: seconds * max(1.0, n / before) for key, seconds in known.items()}
+            before = n
             torch.compiler.reset()  # who has one number of pairs does not compile for others
             contenders, missing = make_contenders(settings, versions=n == N, count=count)
             skipped += [{**entry, "threads": count, "n": n} for entry in missing]
             problems = draw(n, max(settings.problems, *(batch for batch, _ in points)))
             rates: dict[str, dict[str, Any]] = {}
-            known: dict[tuple[str, str], float] = {}
             for batch, mode in points:
                 say(f"throughput: {count} thread(s), n = {n}, B = {batch}, {mode}")
                 tasks, sizes, once = {}, {}, {}
