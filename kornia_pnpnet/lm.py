@@ -86,6 +86,7 @@ class LMStart(NamedTuple):
         shape: the kernel's shape of each.
         starts: where a guess has :math:`S` other poses, ``pose`` holds :math:`(S + 1) B`, first the first ones of all
             problems, and this is ``pairs`` as often; else ``None``.
+        compared: ``starts`` with the weights by which their poses are compared.
         by_residual: ``pairs`` with the weights that came with the correspondences alone, what iterations that do not
             ask the guess see; ``None`` where all do.
     """
@@ -98,6 +99,7 @@ class LMStart(NamedTuple):
     damping: tuple[Tensor, ...]
     shape: tuple[Tensor, ...]
     starts: Correspondences | None = None
+    compared: Correspondences | None = None
     by_residual: Correspondences | None = None
 
 
@@ -291,10 +293,11 @@ class RobustWeightedLM(nn.Module):
     Where a guess has other poses, all of them are refined by the first seven tenths of the iterations, rounded down.
     Then, per problem, the one of the lowest cost by the kernel of the last of these goes on alone.
 
-    With ``by_residual`` the last iterations no longer ask the guess how much a pair counts: what it took for wrong
-    may by then have shown to be right, and the other way round. Where residuals are so small that the guess's noise
-    cannot be (by their likelihood ratio), its variance is multiplied by their a posteriori variance factor, in these
-    iterations by a tenth of it: where the noise is known so well, a narrower kernel tells pairs better apart.
+    With ``by_residual`` neither the choice among several poses nor the last iterations ask the guess how much a pair
+    counts: what it took for wrong may by then have shown to be right, and the other way round. Where residuals are so
+    small that the guess's noise cannot be (by their likelihood ratio), its variance is multiplied by their a posteriori
+    variance factor, in these iterations by a tenth of it: where the noise is known so well, a narrower kernel tells
+    pairs better apart.
 
     All operations are per problem: a problem that cannot be solved keeps its pose, reports ``ok=False`` and changes
     no other.
@@ -308,8 +311,8 @@ class RobustWeightedLM(nn.Module):
         shared: learn one set for all iterations instead of one each.
         update: ``"retraction"`` on the rotation group, or the paper's ``"additive"`` on the rotation vector.
         reject_worse: refuse, per problem, a step that raises the cost, and raise the damping after it tenfold.
-        by_residual: the last so many iterations, of those after the choice among several poses, and the judgement after
-            them leave the guess's weights out.
+        by_residual: the last so many iterations, of those after the choice among several poses, that choice, and the
+            judgement after them leave the guess's weights out.
         learnable: whether the hyperparameters are trained.
         backward: how gradients pass. ``"unroll"``: through all iterations. ``"truncated"``: through the ``last`` ones,
             the pose before them counts as constant. ``"implicit"``: by the implicit function theorem, as through a
@@ -449,12 +452,16 @@ class RobustWeightedLM(nn.Module):
         # The steps do not depend on a common factor of the weights; tiny ones must not vanish when multiplied.
         noise = None if guess.noise is None else Noise(*(x.mT.contiguous().mT for x in guess.noise))
         pairs = Correspondences(*corr[:2], relative(prior, prior), corr.focal, noise=noise)
-        starts = None if guess.others is None else _repeated(pairs, 1 + guess.others.rotation.shape[1])
-        by_residual = None
+        by_residual = starts = compared = None
         if self.by_residual:
             by_residual = pairs._replace(weights=relative(corr.weights, corr.weights))
             prior = corr.weights
-        return LMStart(corr, prior, pairs, pose, step, damping, shape, starts, by_residual)
+        if guess.others is not None:
+            count = 1 + guess.others.rotation.shape[1]
+            starts = compared = _repeated(pairs, count)
+            if by_residual is not None:
+                compared = starts._replace(weights=_repeat(by_residual.weights, count))
+        return LMStart(corr, prior, pairs, pose, step, damping, shape, starts, compared, by_residual)
 
     def iterate(self, start: LMStart, m: int | None = None) -> LMStep:
         """Run the iterations.
@@ -474,7 +481,7 @@ class RobustWeightedLM(nn.Module):
             state = self._run(start, state, range(m - unrolled))
         state = self._run(start, state, range(m - unrolled, m))
         if start.starts is not None and m <= self.compared_at:
-            state = self._choose(start.pairs, start.starts, state, start.shape[max(self.compared_at - 1, 0)])
+            state = self._choose(start.pairs, start.compared, state, start.shape[max(self.compared_at - 1, 0)])
         if unrolled == 0 and m and torch.is_grad_enabled():
             return LMStep(self._attach_gradient(start, state.pose, start.shape[m - 1]), state.solved)
         return LMStep(state.pose, state.solved)
@@ -486,7 +493,7 @@ class RobustWeightedLM(nn.Module):
             if start.starts is not None and i < self.compared_at:
                 pairs = start.starts
             elif start.starts is not None and i == self.compared_at:
-                state = self._choose(start.pairs, start.starts, state, start.shape[max(i - 1, 0)])
+                state = self._choose(start.pairs, start.compared, state, start.shape[max(i - 1, 0)])
             iterate = self._iterate
             if start.by_residual is not None and i >= self.m - self.by_residual:
                 iterate, pairs = self._iterate_last, start.by_residual
@@ -601,17 +608,18 @@ class RobustWeightedLM(nn.Module):
 
 
 def _repeated(pairs: Correspondences, count: int) -> Correspondences:
-    """The pairs of all problems several times over, problems last in memory."""
-
-    def repeated(x: Tensor) -> Tensor:
-        # Expanded, not `repeat`, which would ask a compiler for a division at each entry.
-        reverse = tuple(reversed(range(x.ndim)))
-        last = x.permute(reverse)[..., None, :]
-        return last.expand(*last.shape[:-2], count, -1).flatten(-2).permute(reverse)
-
-    noise = None if pairs.noise is None else Noise(*map(repeated, pairs.noise))
-    world_points, img_points, weights = map(repeated, pairs[:3])
+    """The pairs of all problems several times over."""
+    noise = None if pairs.noise is None else Noise(*(_repeat(x, count) for x in pairs.noise))
+    world_points, img_points, weights = (_repeat(x, count) for x in pairs[:3])
     return pairs._replace(world_points=world_points, img_points=img_points, weights=weights, noise=noise)
+
+
+def _repeat(x: Tensor, count: int) -> Tensor:
+    """All problems several times over, problems last in memory."""
+    # Expanded, not `repeat`, which would ask a compiler for a division at each entry.
+    reverse = tuple(reversed(range(x.ndim)))
+    last = x.permute(reverse)[..., None, :]
+    return last.expand(*last.shape[:-2], count, -1).flatten(-2).permute(reverse)
 
 
 def _chosen(first: Tensor, a: Iterable[Tensor], b: Iterable[Tensor]) -> Iterator[Tensor]:

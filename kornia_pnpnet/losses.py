@@ -169,7 +169,7 @@ class SetLoss(nn.Module):
     def __init__(
         self,
         *,
-        starts: int = 4,
+        starts: int = 2,
         every: float = 0.15,
         refined: float = 1.0,
         saturation: float = 2.0,

@@ -1,6 +1,7 @@
 """The set network: what it must not depend on, what it must pass on, and what a few steps of training make of it."""
 
 import math
+from itertools import combinations
 
 import pytest
 import torch
@@ -155,7 +156,7 @@ def test_samples_of_right_pairs_have_the_true_pose(n, wrong):
     assert success(again, 0.01, 0.01).double().mean() > 0.95
 
 
-@pytest.mark.parametrize(("n", "there"), [(9, 6), (24, 9), (30, 20)])
+@pytest.mark.parametrize(("n", "there"), [(9, 4), (9, 5), (9, 6), (24, 9), (30, 20), (32, 24)])
 def test_padding_makes_and_judges_no_sample(make_problems, n, there):
     p = make_problems(n=n, batch=200, outliers=n // 3)
     mask = torch.arange(n).expand(200, n) < there
@@ -165,12 +166,20 @@ def test_padding_makes_and_judges_no_sample(make_problems, n, there):
     near(padded.others, alone.others)
 
 
+@pytest.mark.parametrize(("count", "wrong"), [(5, 1), (6, 2)])
+def test_some_sample_is_right_whichever_are_wrong(count, wrong):
+    samples = solver().init.triples(count)[0]
+    assert len(samples) <= 6
+    for bad in combinations(range(count), wrong):
+        assert any(not set(bad) & set(sample) for sample in samples)
+
+
 def test_many_pairs_make_more_samples(make_problems, monkeypatch):
     """Spread samples find some poses that those of the likeliest alone miss, and cost nothing where they do not."""
     p = make_problems(n=30, batch=500, outliers=15)
     net = solver()
     both = net.with_guess(*p[:3], **NOISE)[1].others.rotation[:, -1]
-    monkeypatch.setattr("kornia_pnpnet.init.set._MANY", 31)
+    monkeypatch.setattr("kornia_pnpnet.init.set._SPREADS", {})
     near_only = net.with_guess(*p[:3], **NOISE)[1].others.rotation[:, -1]
     error = [rotation_angle(x, p.pose.rotation) for x in (both, near_only)]
     assert error[0].median() < error[1].median()

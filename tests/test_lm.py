@@ -976,6 +976,25 @@ def test_the_best_of_several_starts_goes_on(m, options, make_problems, correspon
         torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-12)
 
 
+def test_several_starts_are_compared_by_residual_where_the_last_iterations_are(make_problems, correspond, perturb):
+    """A guess that believes in three wrong pairs alone prefers the pose that they fit."""
+    corr, near = correspond(make_problems(n=9, batch=5, noise=False))
+    far = perturb(near, angle=0.5, shift=0.5)
+    img_points = corr.img_points.clone()
+    img_points[:, :3] = torch.stack([corr.focal * x[:, :3] for x in project(far, corr).plane_points], -1)
+    corr = corr._replace(img_points=img_points)
+    first = several(corr, far, near)
+    first = first._replace(
+        weights=torch.where(torch.arange(9) < 3, 1.0, 1e-6).to(first.weights).expand_as(first.weights)
+    )
+    misled, right = (
+        RobustWeightedLM(m=4, kernel="geman_mcclure", robustness=10.0, step=0.0, by_residual=count)(corr, first).pose
+        for count in (0, 1)
+    )
+    torch.testing.assert_close(misled, far)
+    torch.testing.assert_close(right, near)
+
+
 @pytest.mark.parametrize("m", [0, 1, 2, 3, 6])
 def test_stopped_early_the_best_of_several_starts_is_returned(m, make_problems, correspond, perturb):
     corr, pose = correspond(make_problems(noise=False))

@@ -144,7 +144,7 @@ def _says_ok(init: nn.Module | None) -> bool:
 
 def _set_calls(init: SetInit, n: int, times: float) -> Iterator[Call]:
     """A set network that is not told the noise, and its samples."""
-    sizes = (init.config[key] for key in ("width", "layers", "heads", "hidden", "starts"))
+    sizes = (init.config[key] for key in ("width", "layers", "hidden", "starts"))
     yield "set._View.__init__", times, (n,)
     yield "set.SetInit._run", times, (n, *sizes)
     yield "set.SetInit.forward", times, (n, init.starts)
@@ -152,9 +152,9 @@ def _set_calls(init: SetInit, n: int, times: float) -> Iterator[Call]:
     yield "set.SetInit._noise", times, (n,)
     if not init.samples:
         return
-    near, spread = init.triples(n)
-    judges, drawn = min(MOST_JUDGES, n), len(near) + len(spread)
-    yield "set.SetInit._sampled", times, (n, judges, len(near), len(spread))
+    samples = init.triples(n)
+    judges, drawn = min(MOST_JUDGES, n), sum(map(len, samples.values()))
+    yield "set.SetInit._sampled", times, (n, judges, drawn, len(samples))
     yield "p3p.p3p", drawn * times, ()
     yield "geometry.project", 4 * drawn * times, (judges,)
     yield "geometry.pixel_variance", times, (4 * drawn * judges, judges)

@@ -23,34 +23,34 @@ def _mlp(n: int) -> Operations:
     return scale_inputs + layers + rotation
 
 
-def _set_network(n: int, width: int, layers: int, heads: int, hidden: int, starts: int) -> Operations:
+def _set_network(n: int, width: int, layers: int, hidden: int, starts: int) -> Operations:
     """The layers of a set network: nearly all of it is a product and a sum for each weight that a pair meets."""
     features, outputs = 14, 1 + 2 * starts
     norm = n * Operations(add=4 * width - 1, multiply=3 * width, divide=3, sqrt=1)
 
-    def pooled(channels: int, heads: int) -> Operations:
-        """The mean of the pairs by their scores: for each head a softmax over the pairs."""
-        softmax = heads * Operations(add=3 * n - 1, divide=n, exp=n, compare=n - 1)
-        return softmax + Operations(add=(n - 1) * channels, multiply=n * channels)
+    def pooled(scores: int) -> Operations:
+        """The mean of the pairs by their scores, a softmax over the pairs."""
+        softmax = scores * Operations(add=3 * n - 1, divide=n, exp=n, compare=n - 1)
+        return softmax + Operations(add=(n - 1) * width, multiply=n * width)
 
-    look = matmul(n, width, width + heads) + pooled(width, heads) + Operations(add=width)
+    look = matmul(n, width, 2 * width) + pooled(width) + Operations(add=width)
     inner = matmul(n, width, hidden) + matmul(1, width, hidden) + Operations(add=(n + 1) * hidden, compare=n * hidden)
     outer = matmul(n, hidden, width) + Operations(add=2 * n * width)
     first = matmul(n, features, width) + Operations(add=n * width, compare=n, logic=n)
     of_pairs = matmul(n, width, outputs) + Operations(add=n * outputs)
-    of_problem = pooled(width, 1) + matmul(1, width, starts + 2) + Operations(add=starts + 2)
+    of_problem = pooled(1) + matmul(1, width, starts + 2) + Operations(add=starts + 2)
     return first + layers * (norm + look + inner + outer) + norm + of_pairs + of_problem
 
 
-def _set_samples(n: int, judges: int, samples: int, more: int) -> Operations:
+def _set_samples(n: int, judges: int, samples: int, groups: int) -> Operations:
     """The likeliest pairs, and how much of them each of the samples' four poses has on its side."""
-    drawn = samples + more
-    poses = 4 * drawn
+    poses = 4 * samples
+    votes = Operations(add=n, multiply=n, compare=n, logic=2 * n) + smallest(n, judges) + sort(judges)
+    valid = Operations(divide=6 * samples, compare=3 * samples, logic=2 * samples + poses)
+    # Which samples a problem has by the number of its pairs.
+    drawn = groups * Operations(add=n - 1, compare=1) + Operations(logic=poses) if groups > 1 else Operations()
     scores = poses * Operations(add=3 * judges - 1, multiply=3 * judges, divide=2 * judges, logic=judges)
-    best = Operations(compare=poses, logic=poses + 12)
-    valid = Operations(divide=6 * drawn, compare=3 * drawn, logic=2 * drawn + poses)
-    there = Operations(add=n - 1, compare=n + 1, logic=4 * more) if more else Operations()
-    return Operations(compare=n, logic=n) + smallest(n, judges) + sort(judges) + valid + there + scores + best
+    return votes + valid + drawn + scores + Operations(compare=poses, logic=poses + 12)
 
 
 def _inverse(n: int) -> Operations:

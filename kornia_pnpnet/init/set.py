@@ -24,21 +24,15 @@ _LOG_NOISE = -5.0
 _FEATURES = 14
 # Added to the score of a pair that is not there.
 _ABSENT = -1e9
-# Samples of three, by how likely their pairs are to be right.
-_SAMPLES: tuple[tuple[int, ...], ...] = (
-    (0, 1, 2),
-    (0, 1, 3),
-    (0, 2, 3),
-    (1, 2, 3),
-    (0, 1, 4),
-    (2, 3, 4),
-    (0, 3, 4),
-    (1, 2, 4),
-)
-# Problems of so many pairs have as many samples again, spread over so many times as many of the likeliest.
-_MANY, _SPREAD = 18, 3
+# Samples of three, by how likely their pairs are to be right. The first six are a Turan system: whichever two of the
+# likeliest six are wrong, one of them has only right ones; no five do that.
+_SAMPLES = ((0, 1, 2), (0, 1, 3), (2, 3, 4), (2, 3, 5), (0, 4, 5), (1, 4, 5), (0, 2, 3), (1, 2, 3))
+# From so many pairs on as many samples again are spread over so many times as many of the likeliest.
+_SPREADS = {18: 3, 24: 4, 30: 5}
 # So many of the likeliest pairs say how good the pose of a sample is: squared residuals count to this many variances.
 MOST_JUDGES, _JUDGED = 32, 50.0
+# The vote of a pair that is surely wrong, of one that is surely right it is 1.
+_LEAST_VOTE = 0.5
 
 
 @torch.library.custom_op("kornia_pnpnet::taken", mutates_args=())
@@ -65,7 +59,8 @@ class _View:
         share = (there / there.sum(1, keepdim=True).clamp(min=1.0))[..., None]  # (B, N, 1)
         plane = corr.img_points / corr.focal
         rays = functional.normalize(torch.cat((plane, torch.ones_like(plane[..., :1])), -1), dim=-1)
-        x, y, z = functional.normalize((share * rays).sum(1), dim=-1).unbind(-1)  # z > 0
+        mean = torch.stack([(share[..., 0] * ray).sum(1) for ray in rays.unbind(-1)], -1)
+        x, y, z = functional.normalize(mean, dim=-1).unbind(-1)  # z > 0
         k = (1.0 + z).reciprocal()
         rows = (1.0 - k * x * x, -k * x * y, -x, -k * x * y, 1.0 - k * y * y, -y, x, y, z)
         self.there = there
@@ -151,12 +146,14 @@ class _Block(nn.Module):
         """From (B, N, width) to the same; ``absent`` is minus infinity, or much, where there is no pair."""
         width = x.shape[-1]
         y = self.norm(x)
+        # A score for each channel, not for each head: reductions over pairs, of fewer numbers than the processor has
+        # lanes, are compiled to code that waits for all threads at each problem.
+        scores = self.look.weight[width:].repeat_interleave(width // self.heads, 0)
+        values, scores = functional.linear(y, torch.cat((self.look.weight[:width], scores))).chunk(2, -1)
+        attention = (scores + absent).softmax(1)  # (B, N, width)
         # Biases go where there is one row for each problem, not one for each pair; that of the scores, which is as much
         # for all pairs, does not count.
-        values, scores = functional.linear(y, self.look.weight).split((width, self.heads), -1)
-        attention = (scores + absent).softmax(1)  # (B, N, heads)
-        parts = values.unflatten(-1, (self.heads, -1))
-        context = (attention[..., None] * parts).sum(1).flatten(1) + self.look.bias[:width]  # (B, width)
+        context = (attention * values).sum(1) + self.look.bias[:width]  # (B, width)
         hidden = functional.linear(y, self.pair.weight) + (self.all(context) + self.pair.bias)[:, None]
         return (x + self.out.bias) + functional.linear(functional.relu(hidden), self.out.weight)
 
@@ -178,8 +175,8 @@ class SetInit(nn.Module):
     the correspondences.
 
     The likeliest pairs also make ``samples`` of three, whose poses (see :func:`~kornia_pnpnet.init.p3p.p3p`) at most 32
-    of them judge; from 18 pairs there are as many samples again, spread over the likeliest 13. The best one of all is
-    one more hypothesis, a constant without gradient. Its cost is fixed.
+    of them judge; of more pairs there are more samples, spread over more of the likeliest. The best one of all is one
+    more hypothesis, a constant without gradient. Its cost is fixed.
 
     A pair weighs as much as it is likely to be right. The noise of pixels and points, which tells
     the refinement how far pairs may be off, is what :attr:`~kornia_pnpnet.types.Correspondences.noise` says, or the
@@ -187,7 +184,8 @@ class SetInit(nn.Module):
 
     The design is ours. Distances along rays before a closed-form alignment: J. Hesch and S. Roumeliotis, "A direct
     least-squares method for PnP", ICCV 2011, among many; attention that is pooled over correspondences: W. Sun et al.,
-    "ACNe: Attentive context normalization for robust permutation-equivariant learning", CVPR 2020.
+    "ACNe: Attentive context normalization for robust permutation-equivariant learning", CVPR 2020. Six samples of six
+    pairs, one right whichever two are wrong: P. Turan's problem for (6, 4, 3), 1941.
 
     Args:
         width: channels of each pair.
@@ -195,7 +193,7 @@ class SetInit(nn.Module):
         heads: of the attention in each.
         hidden: channels inside a layer.
         starts: hypotheses of the network, at least 1.
-        samples: of the likeliest pairs, 0 to 8; twice as many from 18 pairs.
+        samples: of the likeliest six pairs, 0 to 8; as many again from 18, 24 and 30 pairs on.
 
     Raises:
         BaseError: for numbers out of range, or a width that the heads do not divide.
@@ -214,7 +212,7 @@ class SetInit(nn.Module):
         layers: int = 4,
         heads: int = 4,
         hidden: int = 64,
-        starts: int = 4,
+        starts: int = 2,
         samples: int = 6,
     ) -> None:
         super().__init__()
@@ -284,44 +282,47 @@ class SetInit(nn.Module):
         others = Pose(*(x[:, 1:] for x in every)) if every.rotation.shape[1] > 1 else None
         return Guess(Pose(*(x[:, 0] for x in every)), right, others=others, noise=noises)
 
-    def triples(self, count: int) -> tuple[list[tuple[int, ...]], list[tuple[int, ...]]]:
-        """The samples of problems of so many pairs, by the places of their pairs among the likeliest.
+    def triples(self, count: int) -> dict[int, list[tuple[int, int, int]]]:
+        """The samples of problems of so many pairs.
 
         Args:
             count: number of pairs.
 
         Returns:
-            Samples of the very likeliest, and as many that are spread further where there are many pairs.
+            Places of the pairs of each sample among the likeliest, under the number of pairs from which they are drawn:
+            where the likeliest are wrong together, others are not.
         """
-        near = [x for x in _SAMPLES if max(x) < count][: self.samples]
-        # Where the likeliest are wrong together, others are not.
-        spread = [tuple(_SPREAD * place for place in x) for x in near]
-        return near, spread if count >= _MANY else []
+        near = [x for x in _SAMPLES[: self.samples] if max(x) < count]
+        spread = {least: [(f * i, f * j, f * k) for i, j, k in near] for least, f in _SPREADS.items() if least <= count}
+        return {0: near, **spread}
 
     @torch.no_grad()
     def _sampled(self, corr: Correspondences, right: Tensor, noise: Noise, fallback: Pose) -> Pose:
         """The pose that the likeliest pairs agree on most, of those from samples of three of them; problems last."""
         batch, count = right.shape
-        right = torch.where(corr.weights > 0, right, 0.0)  # pairs that are not there judge nothing
-        likely = right.topk(min(MOST_JUDGES, count)).indices
+        there = corr.weights > 0
+        likely = torch.where(there, right, 0.0).topk(min(MOST_JUDGES, count)).indices
+        # What agrees may be right after all; pairs that are not there judge nothing.
+        vote = torch.where(there, _LEAST_VOTE + (1.0 - _LEAST_VOTE) * right, 0.0)
         img, world = (x.expand(batch, count)[..., None] for x in noise)
-        of_pairs = torch.cat((corr.world_points, corr.img_points, right[..., None], img, world), -1)  # (B, N, 8)
+        of_pairs = torch.cat((corr.world_points, corr.img_points, vote[..., None], img, world), -1)  # (B, N, 8)
         pairs = _taken(of_pairs, likely)  # (8, K, B)
-        near, spread = self.triples(count)
+        samples = self.triples(count)
+        drawn = [sample for group in samples.values() for sample in group]
         # (6, 3, S B), stacked, not indexed: a compiler then copies whole rows.
-        three = torch.stack([pairs[:6, k] for column in zip(*near, *spread, strict=True) for k in column], 1)
+        three = torch.stack([pairs[:6, k] for column in zip(*drawn, strict=True) for k in column], 1)
         three = three.unflatten(1, (3, -1)).flatten(2)
         pose, valid = p3p(three[:3].permute(2, 1, 0), three[3:5].permute(2, 1, 0) / corr.focal)
         # Components first, then the four solutions and the samples, problems last: it is how they lie in memory.
         rotation, translation = (x.movedim((0, 1), (-1, -2)).flatten(-2).unflatten(-1, (-1, batch)) for x in pose)
         valid = (valid.mT & (three[5] > 0).all(0)).unflatten(-1, (-1, batch))  # (4, S, B)
-        if spread:  # by the pairs that are there, so that padding changes nothing
-            many = (corr.weights > 0).sum(1) >= _MANY
-            valid = torch.cat((valid[:, : len(near)], valid[:, len(near) :] & many), 1)
+        if len(samples) > 1:  # by the pairs that are there, so that padding changes nothing
+            enough = [(there.sum(1) >= least).expand(len(group), -1) for least, group in samples.items()]
+            valid = valid & torch.cat(enough)
         # Hypotheses are what is projected and problems are like points, so that they stay last: (H, K, B, 1).
         every = Pose(rotation.permute(2, 0, 1, 3)[:, :, :, None], translation.permute(1, 0, 2)[:, :, None])
-        world, img, right, *sigmas = (x.permute(1, 2, 0)[..., None, :] for x in pairs.split((3, 2, 1, 1, 1)))
-        judges = Correspondences(world, img, right[..., 0], corr.focal)
+        world, img, vote, *sigmas = (x.permute(1, 2, 0)[..., None, :] for x in pairs.split((3, 2, 1, 1, 1)))
+        judges = Correspondences(world, img, vote[..., 0], corr.focal)
         projection = project(every, judges)
         variance = pixel_variance(projection, Noise(*(x[..., 0] for x in sigmas)), corr.focal)
         support = judges.weights / (1.0 + projection.sq_residual / (_JUDGED * variance))
