@@ -48,11 +48,12 @@ OURS = (
     "p3p-ransac:threshold=50",
     "p3p-ransac:threshold=10,world_threshold=0.3",
     "pnpnet-n9",
+    "pnpnet-set",
 )
 PEERS = ("opencv-epnp", "opencv-sqpnp", "opencv-ransac", "opencv-usac", "poselib", "pycolmap")
 # Those that are shown the large problems. The paper's RANSAC is not: few of its samples of 7 are without an outlier
 # there, so it tries all that it may, and one call takes longer than those of all the others together.
-ROBUST = ("p3p-ransac", "opencv-ransac", "opencv-usac", "poselib", "pycolmap")
+ROBUST = ("p3p-ransac", "pnpnet-set", "opencv-ransac", "opencv-usac", "poselib", "pycolmap")
 MEMORY_SET = "n = 100, 70 outliers"
 MEMORY_SOLVER, MEMORY_TARGET, MEMORY_RUNS = "p3p-ransac", 2 * 2**30, 5
 
