@@ -89,6 +89,8 @@ class LMStart(NamedTuple):
         compared: ``starts`` with the weights by which their poses are compared.
         by_residual: ``pairs`` with the weights that came with the correspondences alone, what iterations that do not
             ask the guess see; ``None`` where all do.
+        estimated: whether the noise of a problem is the guess's estimate alone, which those iterations may correct,
+            bool :math:`(B, 1)`; ``None`` without them.
     """
 
     corr: Correspondences
@@ -101,6 +103,7 @@ class LMStart(NamedTuple):
     starts: Correspondences | None = None
     compared: Correspondences | None = None
     by_residual: Correspondences | None = None
+    estimated: Tensor | None = None
 
 
 class _State(NamedTuple):
@@ -192,25 +195,25 @@ def _weighted(
     pose: Pose,
     shape: Tensor,
     kernel_weight: Callable[[Tensor, Tensor], Tensor],
-    by_residual: bool = False,
+    estimated: Tensor | None = None,
 ) -> tuple[Projection, Tensor]:
     """The projection, and the weights of the pairs by their residuals there and by their noise.
 
-    With ``by_residual`` the residuals have a say in how large the noise is.
+    Where the noise is ``estimated`` the residuals have a say in how large it is.
     """
     projection = project(pose, corr)
     if corr.noise is None:
         return projection, corr.weights * kernel_weight(projection.sq_residual, shape)
     precision = pixel_variance(projection, corr.noise, corr.focal).reciprocal()
     residual = projection.sq_residual * precision
-    if by_residual:
+    if estimated is not None:
         within = torch.where(projection.in_front, kernel_weight(residual, shape), 0.0)
-        factor = _variance_factor(residual, within, corr.weights)
+        factor = _variance_factor(residual, within, corr.weights, estimated)
         residual = residual / torch.where(factor < 1.0, _NARROWER * factor, 1.0)
     return projection, corr.weights * precision * kernel_weight(residual, shape)
 
 
-def _variance_factor(residual: Tensor, kernel_weight: Tensor, weights: Tensor) -> Tensor:
+def _variance_factor(residual: Tensor, kernel_weight: Tensor, weights: Tensor, estimated: Tensor) -> Tensor:
     r"""By how much the variance of the noise is to be multiplied, at most 1, shape (B, 1).
 
     The a posteriori variance factor of an adjustment, the weighted sum of squared residuals by the degrees of freedom,
@@ -220,12 +223,13 @@ def _variance_factor(residual: Tensor, kernel_weight: Tensor, weights: Tensor) -
         residual: squared residuals by their variance, :math:`(B, N)`.
         kernel_weight: by these residuals, at most 1, :math:`(B, N)`.
         weights: of the pairs, at most 1, :math:`(B, N)`.
+        estimated: where the factor may be other than 1, bool (B, 1).
     """
     weights = weights * kernel_weight.square().square()
     freedom = (2.0 * weights.sum(-1, keepdim=True) - 6.0).clamp(min=1.0)
     factor = ((weights * residual).sum(-1, keepdim=True) / freedom).clamp(min=_LEAST_FACTOR)
     log_ratio = 0.5 * freedom * (factor - 1.0 - factor.log())
-    return torch.where((factor < 1.0) & (log_ratio > _BELIEVED), factor, 1.0)
+    return torch.where(estimated & (factor < 1.0) & (log_ratio > _BELIEVED), factor, 1.0)
 
 
 def _iterate(
@@ -236,10 +240,10 @@ def _iterate(
     shape: Tensor,
     kernel_weight: Callable[[Tensor, Tensor], Tensor],
     additive: bool,
-    by_residual: bool = False,
+    estimated: Tensor | None = None,
 ) -> LMStep:
     """Weigh the pairs by their residuals and take one step."""
-    projection, weights = _weighted(corr, pose, shape, kernel_weight, by_residual)
+    projection, weights = _weighted(corr, pose, shape, kernel_weight, estimated)
     return lm_step(corr, pose, projection, weights, step, damping, additive=additive)
 
 
@@ -295,9 +299,9 @@ class RobustWeightedLM(nn.Module):
 
     With ``by_residual`` neither the choice among several poses nor the last iterations ask the guess how much a pair
     counts: what it took for wrong may by then have shown to be right, and the other way round. Where residuals are so
-    small that the guess's noise cannot be (by their likelihood ratio), its variance is multiplied by their a posteriori
-    variance factor, in these iterations by a tenth of it: where the noise is known so well, a narrower kernel tells
-    pairs better apart.
+    small that the noise which the guess estimated cannot be (by their likelihood ratio), its variance is multiplied by
+    their a posteriori variance factor, in these iterations by a tenth of it: where the noise is known so well, a
+    narrower kernel tells pairs better apart. Noise that came with the correspondences stays as it is.
 
     All operations are per problem: a problem that cannot be solved keeps its pose, reports ``ok=False`` and changes
     no other.
@@ -396,11 +400,10 @@ class RobustWeightedLM(nn.Module):
         )
         self.requires_grad_(learnable and m > 0)
         self._iteration = partial(_iterate, kernel_weight=self.kernel.weight, additive=self.additive)
-        self._last_iteration = partial(self._iteration, by_residual=True)
         # What runs: these, or what `compile` made of them.
         self._begin: Callable[..., LMStart] = self.begin
         self._iterate: Callable[..., LMStep] = self._iteration
-        self._iterate_last: Callable[..., LMStep] = self._last_iteration
+        self._iterate_last: Callable[..., LMStep] = self._iteration
         self._choose: Callable[..., _State] = self.choose
         self._finish: Callable[..., Refinement] = self.finish
 
@@ -452,16 +455,19 @@ class RobustWeightedLM(nn.Module):
         # The steps do not depend on a common factor of the weights; tiny ones must not vanish when multiplied.
         noise = None if guess.noise is None else Noise(*(x.mT.contiguous().mT for x in guess.noise))
         pairs = Correspondences(*corr[:2], relative(prior, prior), corr.focal, noise=noise)
-        by_residual = starts = compared = None
+        by_residual = estimated = starts = compared = None
         if self.by_residual:
             by_residual = pairs._replace(weights=relative(corr.weights, corr.weights))
             prior = corr.weights
+            estimated = torch.ones_like(prior[:, :1], dtype=torch.bool)
+            for told in corr.noise or ():
+                estimated = estimated & ~told.isfinite().any(1, keepdim=True)
         if guess.others is not None:
             count = 1 + guess.others.rotation.shape[1]
             starts = compared = _repeated(pairs, count)
             if by_residual is not None:
                 compared = starts._replace(weights=_repeat(by_residual.weights, count))
-        return LMStart(corr, prior, pairs, pose, step, damping, shape, starts, compared, by_residual)
+        return LMStart(corr, prior, pairs, pose, step, damping, shape, starts, compared, by_residual, estimated)
 
     def iterate(self, start: LMStart, m: int | None = None) -> LMStep:
         """Run the iterations.
@@ -496,7 +502,7 @@ class RobustWeightedLM(nn.Module):
                 state = self._choose(start.pairs, start.compared, state, start.shape[max(i - 1, 0)])
             iterate = self._iterate
             if start.by_residual is not None and i >= self.m - self.by_residual:
-                iterate, pairs = self._iterate_last, start.by_residual
+                iterate, pairs = partial(self._iterate_last, estimated=start.estimated), start.by_residual
             pose, factor = state.pose, state.factor
             damping = start.damping[i] if factor is None else start.damping[i] * factor
             pose, solved = iterate(pairs, pose, start.step[i], damping, start.shape[i])
@@ -539,9 +545,9 @@ class RobustWeightedLM(nn.Module):
         if corr.noise is not None:
             sq_residual = sq_residual / pixel_variance(projection, corr.noise, corr.focal)
         weights = self.kernel.weight(sq_residual, shape)
-        if start.by_residual is not None and corr.noise is not None:
+        if start.by_residual is not None and start.estimated is not None and corr.noise is not None:
             within = torch.where(projection.in_front, weights, 0.0)
-            factor = _variance_factor(sq_residual, within, start.by_residual.weights)
+            factor = _variance_factor(sq_residual, within, start.by_residual.weights, start.estimated)
             weights = self.kernel.weight(sq_residual / factor, shape)
         weights = torch.where(projection.in_front, start.prior * weights, 0.0)
         cost = self._cost(projection, corr, start.prior, shape)
@@ -575,7 +581,7 @@ class RobustWeightedLM(nn.Module):
         """
         self._begin = Compiled(self.begin, mode)
         self._iterate = Compiled(self._iteration, mode)
-        self._iterate_last = Compiled(self._last_iteration, mode)
+        self._iterate_last = Compiled(self._iteration, mode)
         self._choose = Compiled(self.choose, mode)
         self._finish = Compiled(self.finish, mode)
 
@@ -588,7 +594,7 @@ class RobustWeightedLM(nn.Module):
         """
 
         def equations(corr: Correspondences, at: Pose, shape: Tensor) -> NormalEquations:
-            projection, weights = _weighted(corr, at, shape, self.kernel.weight, start.by_residual is not None)
+            projection, weights = _weighted(corr, at, shape, self.kernel.weight, start.estimated)
             return normal_equations(projection, _relative(weights, projection))
 
         pairs = start.pairs if start.by_residual is None else start.by_residual

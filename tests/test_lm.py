@@ -610,6 +610,13 @@ def test_iterations_by_residual_correct_a_noise_that_is_said_to_be_too_large(mak
     assert wrong.weights[:, :2].median() > 0.05
     assert corrected.weights[:, :2].median() < 1e-3
     assert corrected.weights[:, 2:].median() > 0.8
+    # What the correspondences say stays, of each problem that has any.
+    noise = _told(start, corr, 10.0).noise
+    partly = Noise(noise.img.where(torch.arange(50)[:, None] < 25, torch.nan), torch.full_like(noise.world, torch.nan))
+    kept = RobustWeightedLM(by_residual=3, **common)(corr._replace(noise=partly), _told(start, corr, 10.0))
+    torch.testing.assert_close(kept.pose.matrix[:25], wrong.pose.matrix[:25])
+    torch.testing.assert_close(kept.weights[:25], wrong.weights[:25])
+    torch.testing.assert_close(kept.pose.matrix[25:], corrected.pose.matrix[25:])
 
 
 def test_iterations_by_residual_keep_a_noise_that_may_be_right(make_problems, correspond, perturb):

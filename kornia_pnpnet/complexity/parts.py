@@ -153,7 +153,7 @@ PARTS: dict[str, Callable[..., Operations]] = {
         n * Operations(add=1, multiply=3 + 2 * noise, divide=noise)
         + corrected * Operations(multiply=1, divide=n, compare=1, logic=n + 1)
     ),
-    "lm._variance_factor": lambda n: Operations(add=2 * n + 1, multiply=4 * n + 3, divide=1, log=1, compare=4, logic=2),
+    "lm._variance_factor": lambda n: Operations(add=2 * n + 1, multiply=4 * n + 3, divide=1, log=1, compare=4, logic=3),
     "lm._relative": lambda n: Operations(multiply=2 * n, divide=n, compare=n, logic=1),
     "lm.RobustWeightedLM._cost": lambda n, noise: Operations(
         add=3 * n - 2, multiply=3 * n, divide=1 + noise * n, compare=2 * n + 1, logic=n
