@@ -285,26 +285,30 @@ def measure(scenes: Path, synthetic_count: int, real_count: int, only: Sequence[
         kernels |= {f"{name}, {scale:g} px": classical(name, scale) for name, scale in SCALES}
         guesses |= {f"{name} from the truth": FromTheTruth(solver) for name, solver in kernels.items()}
         run("views", guesses, sets)
-    if wanted("set"):
+    if any(wanted(name) for name in ("set", "set_real", "set_real_told")):
         # Tuned by `paper` and `real`, where these are not measured along with this.
         tuned = {name: load_results(HERE / f"{name}.json")["tuned"] for name in ("paper", "real")}
         sets = set_data(scenes, 2 * synthetic_count, real_count)
         synthetic_sets = {name: entry for name, entry in sets.items() if entry.description["source"] in SYNTHETIC}
-        every = (ANY, *(name for name in ROBUST if name != "pycolmap"), *BOUNDS)
-        run("set", named(every, tuned["paper"]), synthetic_sets, tuned=tuned["paper"])
         real = {name: entry for name, entry in sets.items() if name not in synthetic_sets}
-        few = (ANY, OURS, "p3p-ransac", "opencv-ransac", "poselib", "known-inliers")
-        run("set_real", named(few, tuned["real"]), real, tuned=tuned["real"])
-        # What the threshold is to the others is the pixels' noise to this one.
-        sharpest = real_sets(scenes, "none,2", count=real_count // 5, seed=SEED_TUNE, others=False)
-        solved = dict.fromkeys(SIGMAS, 0.0)
-        for sigma in SIGMAS:
-            told = with_noise_told(sharpest, sigma)
-            path = OUTPUTS / "tuning" / f"set, {sigma:g}.json"
-            rows = evaluate(named((ANY,), {}), told, path=path, repeats=1)["rows"]
-            solved[sigma] = sum(row["success"]["rate"] for row in rows)
-        sigma = max(solved, key=lambda sigma: solved[sigma])
-        run("set_real_told", named((ANY,), {}), with_noise_told(real, sigma), img_sigma=sigma)
+        if wanted("set"):
+            every = (ANY, *(name for name in ROBUST if name != "pycolmap"), *BOUNDS)
+            run("set", named(every, tuned["paper"]), synthetic_sets, tuned=tuned["paper"])
+        if wanted("set_real"):
+            few = (ANY, OURS, "p3p-ransac", "opencv-ransac", "poselib", "known-inliers")
+            run("set_real", named(few, tuned["real"]), real, tuned=tuned["real"])
+        if wanted("set_real_told"):
+            # What the threshold is to the others is the pixels' noise to this one.
+            sharpest = real_sets(scenes, "none,2", count=real_count // 5, seed=SEED_TUNE, others=False)
+            solved = dict.fromkeys(SIGMAS, 0.0)
+            for sigma in SIGMAS:
+                told = with_noise_told(sharpest, sigma)
+                path = OUTPUTS / "tuning" / f"set, {sigma:g}.json"
+                rows = evaluate(named((ANY,), {}), told, path=path, repeats=1)["rows"]
+                solved[sigma] = sum(row["success"]["rate"] for row in rows)
+            sigma = max(solved, key=lambda sigma: solved[sigma])
+            run("set_real_told", named((ANY,), {}), with_noise_told(real, sigma), img_sigma=sigma)
+    if wanted("set_told"):
         common = {**synthetic, "count": 2 * synthetic_count, "seed": SEED_REPORT + 20, "told": True}
         sets = evaluation_sets(["synthetic", "any_rotation"], "none,uniform,3", **common)
         run("set_told", named((ANY, "known-inliers-and-noise"), {}), sets)
