@@ -34,7 +34,7 @@ class Settings(NamedTuple):
         pairs: numbers of pairs.
         most_backward: largest batch with gradients.
         rounds: at most so many.
-        loop_s: a loop over problems is cut to so many that it takes this long.
+        loop_s: in a round a loop over problems is cut to so many that it takes this long, and a shorter call repeated.
         call_s: larger batches that would take longer are left out.
         point_s: rounds of one comparison take about so long.
         latency_calls: calls with a single problem.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Generic, ParamSpec, TypeVar
 
 import torch
@@ -46,6 +46,7 @@ class Compiled(Generic[_P, _T]):
         # Else half of the first compilation would go into asking the C++ compiler which instructions it knows, for each
         # set of them that the processor has.
         options = {**torch._inductor.list_mode_options(mode or "default"), "cpp.vec_isa_ok": True}
+        options["guard_filter_fn"] = _worth_checking
         few, many = (
             torch.compile(function, fullgraph=True, options=more, **_LIMITS)
             for more in (options, {**options, "pick_loop_orders": False})
@@ -82,6 +83,11 @@ class Compiled(Generic[_P, _T]):
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             warnings.warn(f"Not compiled, running as it is. {reason[:300]}", RuntimeWarning, stacklevel=3)
             return result
+
+
+def _worth_checking(guards: Sequence[Any]) -> list[bool]:
+    """Functions and constants of modules do not change, and asking for all of them at each call takes time."""
+    return [guard.guard_type == "DUPLICATE_INPUT" or not guard.is_global for guard in guards]
 
 
 def _tensors(value: Any) -> Iterator[Tensor]:

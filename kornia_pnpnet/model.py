@@ -195,8 +195,26 @@ class PnPNet(nn.Module):
             DeviceError: for tensors on different devices.
         """
         inputs = _prepared(world_points, img_points, intrinsics, weights, mask, init, img_sigma, world_sigma)
+        parts = list(zip(*(_split(x, self._portions(world_points)) for x in inputs), strict=True))
         with torch.autocast(world_points.device.type, enabled=False):
-            return self._solve(first_stage_only, *inputs)
+            results = [self._solve(first_stage_only, *part) for part in parts]
+        if len(results) == 1:
+            return results[0]
+        fields = zip(*((*result[:5], *result.init) for result in results), strict=True)
+        rotation, translation, pair_weights, cost, ok, *first = map(torch.cat, fields)
+        return PnPResult(rotation, translation, pair_weights, cost, ok, Pose(*first))
+
+    def _portions(self, world_points: Tensor) -> int:
+        """In how many parts a batch is solved.
+
+        Without gradients, on a CPU, what the initialiser has in hand at once stays in the caches.
+        """
+        most = getattr(self.init, "pairs_at_once", None)
+        on_cpu = world_points.device.type == "cpu"
+        if most is None or not on_cpu or torch.is_grad_enabled() or torch.compiler.is_compiling():
+            return 1
+        batch, count = world_points.shape[:2]
+        return max(1, min(batch * count // (most * torch.get_num_threads()), batch // 2))
 
     def with_guess(
         self,
@@ -500,7 +518,16 @@ def _prepared(
         noise = Noise(*(_sigmas(name, sigma, world_points) for name, sigma in sigmas))
     if intrinsics.ndim == 2:
         intrinsics = intrinsics.expand(world_points.shape[0], 3, 3)
-    return world_points, img_points, intrinsics, weights, mask, init, noise
+    return world_points, img_points, intrinsics, weights, mask, None if init is None else Pose(*init), noise
+
+
+def _split(value: Tensor | Pose | Noise | None, count: int) -> list[Any]:
+    """In so many parts along the batch."""
+    if count == 1 or value is None:
+        return [value] * count
+    if isinstance(value, Tensor):
+        return list(value.tensor_split(count))
+    return [type(value)(*part) for part in zip(*(x.tensor_split(count) for x in value), strict=True)]
 
 
 def _sigmas(name: str, sigma: Tensor | float | None, like: Tensor) -> Tensor:

@@ -96,6 +96,8 @@ class _NearestRotation(torch.autograd.Function):
         radius = (mean * mean - minors / 3.0).clamp(min=eps * eps).sqrt()
         cosine = (mean * (mean * mean - 0.5 * minors) + 0.5 * determinant * determinant) / radius**3
         largest = (mean + 2.0 * radius * (cosine.clamp(-1.0, 1.0).acos() / 3.0).cos()).sqrt()
+        # Stacked, what takes many operations is computed by a compiler once for all nine entries.
+        largest, determinant = torch.stack((largest, determinant))
         # With singular values s₁ ≥ s₂ ≥ |s₃|, the last with the sign of the determinant, the matrix plus its cofactors
         # over s₁ has the same singular vectors and the values first = s₁ + s₂s₃/s₁ and, twice, second = s₂ + s₃, all
         # positive. Of two distinct values the inverse square root is a polynomial of degree 1.
@@ -110,6 +112,7 @@ class _NearestRotation(torch.autograd.Function):
         second = torch.where(unique, second, 1.0)
         constant = second.reciprocal() + second / (first * (first + second))
         linear = -(first * second * (first + second)).reciprocal()
+        constant, linear = torch.stack((constant, linear))
         eye = torch.eye(3, dtype=matrix.dtype, device=matrix.device).view(3, 3, *(1,) * (matrix.ndim - 2))
         gram = small_product(upright.transpose(0, 1), upright)
         rotation = small_product(upright, torch.addcmul(constant * eye, linear, gram))

@@ -276,3 +276,26 @@ def test_it_learns():
         torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
         optimizer.step()
     assert rate() > max(0.65, before + 0.2)
+
+
+@pytest.mark.parametrize("told", [False, True])
+def test_large_batches_are_solved_in_parts(told, make_problems, monkeypatch):
+    """Without gradients only, and with what belongs to each problem: cameras, masks, poses and noise."""
+    p = make_problems(n=10, batch=7, outliers=2)
+    net = solver()
+    generator = torch.Generator().manual_seed(0)
+    mask = torch.rand(7, 10, generator=generator) > 0.1
+    noise = torch.linspace(0.5, 2.0, 7, dtype=torch.float64)
+    extra = {"mask": mask, "init": tuple(p.pose), "img_sigma": noise} if told else {}
+    sizes = []
+    net.init.register_forward_hook(lambda _module, inputs, _output: sizes.append(len(inputs[0].weights)))
+    whole = net(*p[:3], **extra)
+    monkeypatch.setattr(SetInit, "pairs_at_once", 20 // torch.get_num_threads())
+    net(*p[:3], **extra)
+    assert sizes == [7, 7]
+    with torch.no_grad():
+        parts = net(*p[:3], **extra)
+    assert sizes[2:] == [3, 2, 2]
+    assert isinstance(parts.init, Pose)
+    near([*parts[:4], *parts.init], [*whole[:4], *whole.init], 1e-9)
+    assert parts.ok.equal(whole.ok)

@@ -226,7 +226,7 @@ PARTS: dict[str, Callable[..., Operations]] = {
     "reppnp._normal_matrix": lambda n: matmul(6, 2 * n, 7) + Operations(multiply=12 * n, logic=n),
     "reppnp._step": lambda: _inverse(6) + matmul(6, 6, 1),
     # A root of a cubic, four candidates, their Newton steps and their rotations: nothing depends on n.
-    "p3p.p3p": lambda: Operations(add=618, multiply=731, divide=36, sqrt=21, exp=1, log=1, compare=135, logic=18),
+    "p3p.p3p": lambda: Operations(add=634, multiply=748, divide=36, sqrt=21, exp=1, log=1, compare=135, logic=18),
     "p3p.P3P.hypotheses": lambda: Operations(divide=6),
     # Whether the 12 numbers of a pose are finite.
     "ransac.SubsetSolver.hypotheses": lambda init_ok: Operations(multiply=12, compare=48, logic=23 + init_ok),

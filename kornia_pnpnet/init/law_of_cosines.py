@@ -26,6 +26,9 @@ can predict, ``where`` takes a CPU ten times as long.
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -51,15 +54,16 @@ def turn_to_largest(first: Tensor, second: Tensor, third: Tensor) -> Turn:
     return greater(second, first), greater(third, torch.maximum(first, second))
 
 
-def turned(ring: Tensor, turn: Turn) -> Tensor:
-    """The triples (*, 3, C) after the turn of each problem; ``ring`` (*, 5, C) repeats their first two after them."""
-    return ring[..., 0:3, :].lerp(ring[..., 1:4, :], turn[0]).lerp_(ring[..., 2:5, :], turn[1])
+def turned(triple: Sequence[Tensor], turn: Turn) -> Triple:
+    """A triple (*, C) after the turn of each problem."""
+    x, y, z = triple
+    by1, by2 = turn
+    return x.lerp(y, by1).lerp_(z, by2), y.lerp(z, by1).lerp_(x, by2), z.lerp(x, by1).lerp_(y, by2)
 
 
 def _turned_back(triple: Triple, turn: Turn) -> Triple:
-    x, y, z = triple
-    by1, by2 = turn
-    return x.lerp(z, by1).lerp_(y, by2), y.lerp(x, by1).lerp_(z, by2), z.lerp(y, by1).lerp_(x, by2)
+    x, z, y = turned((triple[0], triple[2], triple[1]), turn)
+    return x, y, z
 
 
 def _sqrt(square: Tensor) -> Tensor:
@@ -73,9 +77,10 @@ def _isolated_root(k3: Tensor, k2: Tensor, k1: Tensor, k0: Tensor) -> tuple[Tens
     Where two solutions are close to each other so are two roots, and it is the third: it puts these two on one line.
     """
     tiny = torch.finfo(k3.dtype).tiny
-    k = torch.stack((k3, k2, k1, k0))
-    sizes = k.abs()
-    k3, k2, k1, k0 = k.mul_(sizes.amax(0).clamp_(min=tiny).reciprocal_())
+    k = k3, k2, k1, k0
+    sizes = [x.abs() for x in k]
+    inv = functools.reduce(torch.maximum, sizes).clamp_(min=tiny).reciprocal_()
+    k3, k2, k1, k0 = (x * inv for x in k)
     # Two roots must not be at infinity.
     swap = greater(sizes[2], sizes[1])
     k3, k0 = k3.lerp(k0, swap), k0.lerp(k3, swap)
@@ -98,21 +103,24 @@ def _isolated_root(k3: Tensor, k2: Tensor, k1: Tensor, k0: Tensor) -> tuple[Tens
     return u.lerp(v, swap), v.lerp(u, swap)
 
 
-def _lines(u: Tensor, h: Tensor, pairs: Tensor) -> tuple[Tensor, Tensor]:
-    r"""The two lines (2, C) that are the conic with the weights ``u`` (3, C), of which ``u[1] + u[2]`` is not small.
+def _lines(u: Triple, h: Triple, pairs: Tensor) -> tuple[Tensor, Tensor]:
+    r"""The two lines (2, C) that are the conic with the weights ``u``, of which ``u[1] + u[2]`` is not small.
 
-    ``h`` (3, C) is 1 - cos, ``pairs`` (C,) the first factor of the cubic. The lines are
+    ``h`` is 1 - cos, ``pairs`` the first factor of the cubic, all (C,). The lines are
     :math:`\lambda_1 - \lambda_3 = \text{slope}\,(\lambda_2 - \lambda_3) + \text{offset}\,\lambda_3`.
     """
-    tiny = torch.finfo(u.dtype).tiny
+    u1, u2, u3 = u
+    h1, h2, h3 = h
+    tiny = torch.finfo(pairs.dtype).tiny
     # The matrix D of the conic has u_2 + u_3 and the like on its diagonal and -u_1 cos_1 and the like beside it. The
     # lines cross in m with m mᵀ = -adj D, and D + [m]ₓ and D - [m]ₓ have rank one: their first rows are the lines.
-    uh = u * h
-    e1, e2, e3 = u - uh
-    d11 = u[1] + u[2]
+    uh2, uh3 = u2 * h2, u3 * h3
+    e1, e2, e3 = torch.addcmul(u1, u1, h1, value=-1.0), u2 - uh2, u3 - uh3
+    d11 = u2 + u3
     inv = d11 / (d11 * d11).add_(tiny)
-    us = (u[1:] * u[1:]).mul_(torch.addcmul(2.0 * h[1:], h[1:], h[1:], value=-1.0))
-    sq_m2, sq_m3 = (us + pairs).neg_().clamp_(min=tiny)
+    us2 = (u2 * u2).mul_(torch.addcmul(2.0 * h2, h2, h2, value=-1.0))
+    us3 = (u3 * u3).mul_(torch.addcmul(2.0 * h3, h3, h3, value=-1.0))
+    sq_m2, sq_m3 = ((us + pairs).neg_().clamp_(min=tiny) for us in (us2, us3))
     large = _sqrt(torch.maximum(sq_m2, sq_m3))
     # Where the lines are not real nothing else would bound what comes of them.
     least = -large
@@ -121,61 +129,58 @@ def _lines(u: Tensor, h: Tensor, pairs: Tensor) -> tuple[Tensor, Tensor]:
     m2, m3 = large.lerp(small, third), small.lerp(large, third)
     # m_3 - m_2 by the difference of the squares, unless the signs differ.
     same_sign = greater(small, torch.zeros_like(small))
-    apart = (us[0] - us[1]).div_((m2 + m3).abs_().clamp_(min=tiny**0.5)).clamp_(least, large)
+    apart = us2.sub_(us3).div_((m2 + m3).abs_().clamp_(min=tiny**0.5)).clamp_(least, large)
     apart = (m3 - m2).lerp_(apart, same_sign)
-    bend = (uh[1] + uh[2]).neg_()
-    slope = torch.stack((e3 + m3, e3 - m3)).mul_(inv)
-    return slope, torch.stack((bend + apart, bend - apart)).mul_(inv)
+    bend = uh2.add_(uh3).neg_()
+    sign = 1.0 - 2.0 * torch.arange(2, dtype=pairs.dtype, device=pairs.device)[:, None]
+    return torch.addcmul(e3, sign, m3).mul_(inv), torch.addcmul(bend, sign, apart).mul_(inv)
 
 
-def _meet(slope: Tensor, offset: Tensor, v: Tensor, h: Tensor) -> Triple:
-    """Where lines (2, C) meet the conic with the weights ``v`` (3, C): distances (2, 2, C) up to scale.
+def _meet(slope: Tensor, offset: Tensor, v: Triple, h: Triple) -> Triple:
+    """Where lines (2, C) meet the conic with the weights ``v`` (C,): distances (2, 2, C) up to scale.
 
     A line that misses the conic is taken to touch it. Of a line that touches it the second point is 0.
     """
     v1, v2, v3 = v
-    _, h2, h3 = h
-    vh1, vh2, vh3 = v * h
+    h1, h2, h3 = h
     # Coefficients of y², 2 y and 1 in y = (λ_2 - λ_3) / λ_3.
     v2_slope, less = slope * v2, slope - 1.0
     c2 = (less * less).addcmul_(slope, h3, value=2.0).mul_(v3).addcmul_(v2_slope, slope).add_(v1)
     c1 = (slope + offset).mul_(h3).add_(h3).addcmul_(less, offset).mul_(v3)
-    c1.addcmul_(v2_slope, offset + h2).add_(vh1)
-    vh23 = (vh2 + vh3).mul_(2.0)
-    c0 = (offset * offset).mul_(v2 + v3).addcmul_(offset, vh23).add_(torch.add(vh23, vh1, alpha=2))
+    c1.addcmul_(v2_slope, offset + h2).addcmul_(v1, h1)
+    vh23 = (v2 * h2).addcmul_(v3, h3).mul_(2.0)
+    c0 = (offset * offset).mul_(v2 + v3).addcmul_(offset, vh23).add_(vh23.addcmul_(v1, h1, value=2.0))
     disc = (c1 * c1).addcmul_(c2, c0, value=-1.0)
     two = greater(disc, torch.zeros_like(disc))
     z = _sqrt(disc.clamp_(min=torch.finfo(disc.dtype).tiny)).copysign_(c1).add_(c1).neg_()
-    y, dist3 = torch.stack((z, c0.mul_(two))), torch.stack((c2, z * two))
+    second = torch.arange(2, dtype=z.dtype, device=z.device)[:, None, None]
+    y, dist3 = z.lerp(c0.mul_(two), second), c2.lerp(z * two, second)
     dist1 = torch.addcmul(dist3, slope, y).addcmul_(offset, dist3)
     return dist1, y.add_(dist3), dist3
 
 
-def _candidates(p: Tensor, q: Tensor, r: Tensor, b: Tensor, g: Tensor) -> Triple:
+def _candidates(p: Tensor, q: Tensor, r: Tensor, b: Triple, g: Tensor) -> Triple:
     """Where all the equations of :func:`distances` meet, but for rounding."""
-    h = 0.5 * b
-    s = torch.addcmul(b, h, h, value=-1.0)
-    s1, s2, s3 = s
+    h1, h2, h3 = (0.5 * x for x in b)
+    s1, s2, s3 = (torch.addcmul(x, y, y, value=-1.0) for x, y in zip(b, (h1, h2, h3), strict=True))
     # With u_1 = -(p u_3 + q u_2) the cubic is one in u_3 : u_2, and s · u = t_3 u_3 + t_2 u_2.
-    t3, t2 = torch.addcmul(s3, p, s1, value=-1.0), torch.addcmul(s2, q, s1, value=-1.0)
+    t3, t2 = s3.addcmul_(p, s1, value=-1.0), s2.addcmul_(q, s1, value=-1.0)
     k2, k1 = (r * t3).addcmul_(p, g - t2), (r * t2).addcmul_(q, g - t3)
     u3, u2 = _isolated_root((p * t3).neg_(), k2, k1, (q * t2).neg_())
     u1 = (p * u3).addcmul_(q, u2).neg_()
     pairs = (u2 * u3).addcmul_(u1, u2 + u3)
     turn = turn_to_largest((u2 + u3).abs_(), (u3 + u1).abs_(), (u1 + u2).abs_())
     # As other conic the one at right angles: the weights (p u_2 - q u_3, u_3, -u_2).
-    v1, v3 = (p * u2).addcmul_(q, u3, value=-1.0), -u2
-    h1, h2, h3 = h
-    ring = torch.stack((u1, u2, u3, u1, u2, v1, u3, v3, v1, u3, h1, h2, h3, h1, h2)).view(3, 5, -1)
-    u, v, h = turned(ring, turn)
+    v = (p * u2).addcmul_(q, u3, value=-1.0), u3, -u2
+    u, v, h = (turned(x, turn) for x in ((u1, u2, u3), v, (h1, h2, h3)))
     slope, offset = _lines(u, h, pairs)
     return _turned_back(_meet(slope, offset, v, h), turn)
 
 
-def _refined(candidates: Triple, p: Tensor, q: Tensor, b: Tensor) -> Triple:
+def _refined(candidates: Triple, p: Tensor, q: Tensor, b: Triple) -> Triple:
     """One Newton step on the ratios of the distances."""
     dist1, dist2, dist3 = candidates
-    h1, h2, h3 = 0.5 * b
+    h1, h2, h3 = (0.5 * x for x in b)
     d1, d2, d3 = dist2 - dist3, dist3 - dist1, dist1 - dist2
     # The squared edges e, which should fulfil e2 = q e1 and e3 = p e1.
     e1 = (d1 * d1).addcmul_(b[0], dist2 * dist3)
@@ -195,14 +200,14 @@ def _refined(candidates: Triple, p: Tensor, q: Tensor, b: Tensor) -> Triple:
     return dist1, torch.addcmul(dist2, step2, inv, value=-0.5), torch.addcmul(dist3, step3, inv, value=-0.5)
 
 
-def distances(p: Tensor, q: Tensor, r: Tensor, b: Tensor, g: Tensor) -> Triple:
+def distances(p: Tensor, q: Tensor, r: Tensor, b: Triple, g: Tensor) -> Triple:
     r"""Solve the law of cosines for the three edges of a triangle of which the edge 1 is the longest and has length 1.
 
     Args:
         p: squared edge 3, shape :math:`(C,)`.
         q: squared edge 2, shape :math:`(C,)`.
         r: :math:`1 - p - q`, which may be known with more digits, shape :math:`(C,)`.
-        b: squared difference of the two rays to the ends of each edge, shape :math:`(3, C)`.
+        b: squared difference of the two rays to the ends of each edge, three of shape :math:`(C,)`.
         g: squared determinant of the three rays, shape :math:`(C,)`.
 
     Returns:
@@ -211,12 +216,12 @@ def distances(p: Tensor, q: Tensor, r: Tensor, b: Tensor, g: Tensor) -> Triple:
 
     Example:
         >>> one = torch.ones(1, dtype=torch.float64)  # the camera at the corner of a cube, points at its neighbours
-        >>> first, second, third = distances(one, one, -one, 2.0 * one.expand(3, 1), one)
+        >>> first, second, third = distances(one, one, -one, (2.0 * one,) * 3, one)
         >>> torch.stack((first, second, third)).amax((1, 2)).round(decimals=6).flatten()
         tensor([0.7071, 0.7071, 0.7071], dtype=torch.float64)
     """
     dist1, dist2, dist3 = _refined(_candidates(p, q, r, b, g), p, q, b)
     edge = dist2 - dist3
     sq_edge = edge.mul_(edge).addcmul_(b[0], dist2 * dist3)
-    scale = sq_edge.clamp_(min=torch.finfo(b.dtype).tiny ** 0.5).rsqrt_().copysign_(dist1)
+    scale = sq_edge.clamp_(min=torch.finfo(p.dtype).tiny ** 0.5).rsqrt_().copysign_(dist1)
     return dist1 * scale, dist2.mul_(scale), dist3.mul_(scale)

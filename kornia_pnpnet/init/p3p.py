@@ -2,7 +2,9 @@ r"""P3P: the up to four poses from which a camera sees three points where it saw
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
+from typing import TypeVar
 
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
@@ -15,6 +17,8 @@ from kornia_pnpnet.small import dot
 from kornia_pnpnet.types import Correspondences, Hypotheses, Pose
 
 __all__ = ["P3P", "p3p"]
+
+_T = TypeVar("_T")
 
 # A chunk's component of one value per problem has this many bytes: a few dozen of them fit into a core's caches.
 _CHUNK_BYTES = 2**16
@@ -48,38 +52,39 @@ def _axes(base: list[Tensor], side: list[Tensor]) -> tuple[list[Tensor], list[Te
     return axis1, [x.mul_(inv_height) for x in axis2], (inv_base, along, sq_height)
 
 
-def _load(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Tensor]:
-    """Points as components (5, 3, C), in an order in which the longest edge is opposite to the first.
+def _load(world_points: Tensor, plane_points: Tensor) -> tuple[list[Tensor], Tensor]:
+    """The three points by components (5, C), in an order in which the longest edge is opposite to the first.
 
     Returned after them: whether they are numbers with which one can calculate (C,). The others are 0.
     """
-    ring = world_points.new_empty(5, 5, world_points.shape[0])
-    given = ring[:, :3]
-    given[:3], given[3:] = world_points.permute(2, 1, 0), plane_points.permute(2, 1, 0)
-    sound = given.abs().sum((0, 1)) <= torch.finfo(ring.dtype).max ** 0.2  # what is larger could overflow
-    torch.where(sound, given, given.new_zeros(()), out=given)
-    ring[:, 3:] = ring[:, :2]
-    edges = ring[:3, 2:] - ring[:3, 1:4]
-    return turned(ring, turn_to_largest(*dot(edges, edges))), sound
+    given = torch.cat((world_points.permute(1, 2, 0), plane_points.permute(1, 2, 0)), 1)  # (3, 5, C)
+    sound = given.abs().sum((0, 1)) <= torch.finfo(given.dtype).max ** 0.2  # what is larger could overflow
+    points = [torch.where(sound, x, 0.0) for x in given]
+    edges = [x[:3] - y[:3] for x, y in _ends(points)]
+    return [*turned(points, turn_to_largest(*(dot(x, x) for x in edges)))], sound
 
 
-def _look(plane: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Unit rays (3, 3, C), squared differences (3, C) and squared determinant (C,) of them, and whether all see."""
-    ring = plane.new_empty(3, 5, plane.shape[-1])
-    rays = ring[:, :3]
-    depth = torch.mul(plane[0], plane[0], out=rays[2]).addcmul_(plane[1], plane[1]).add_(1.0).rsqrt_()
-    torch.mul(plane, depth, out=rays[:2])
-    ring[:, 3:] = ring[:, :2]
-    gaps = ring[:, 2:] - ring[:, 1:4]
-    det = dot(_cross(gaps[:, 1], gaps[:, 2]), rays[:, 0])
-    return rays, dot(gaps, gaps), det.mul_(det), depth.amin(0) > MIN_DEPTH_RATIO
+def _ends(points: Sequence[_T]) -> list[tuple[_T, _T]]:
+    """The ends of the edges opposite to each of three points."""
+    return [(points[2], points[1]), (points[0], points[2]), (points[1], points[0])]
 
 
-def _solve_chunk(world_points: Tensor, plane_points: Tensor, out: Tensor) -> Tensor:
-    """Write rotations and translations into ``out`` (12, 2, 2, C); return which are solutions (2, 2, C)."""
+def _look(plane: list[Tensor]) -> tuple[list[list[Tensor]], Triple, Tensor, Tensor]:
+    """Unit rays, three of three (C,), squared differences, squared determinant of them, and whether all see."""
+    depths = [(x * x).addcmul_(y, y).add_(1.0).rsqrt_() for x, y in plane]
+    rays = [[x * depth, y * depth, depth] for (x, y), depth in zip(plane, depths, strict=True)]
+    gaps = [[a - b for a, b in zip(x, y, strict=True)] for x, y in _ends(rays)]
+    det = dot(_cross(gaps[1], gaps[2]), rays[0])
+    sees = functools.reduce(torch.minimum, depths) > MIN_DEPTH_RATIO
+    b1, b2, b3 = (dot(x, x) for x in gaps)
+    return rays, (b1, b2, b3), det.mul_(det), sees
+
+
+def _solve_chunk(world_points: Tensor, plane_points: Tensor) -> tuple[list[Tensor], Tensor]:
+    """The twelve components of rotations and translations (2, 2, C), and which are solutions (2, 2, C)."""
     finfo = torch.finfo(world_points.dtype)
-    given, sound = _load(world_points, plane_points)
-    x1, x2, x3 = given[:3].unbind(1)
+    points, sound = _load(world_points, plane_points)
+    x1, x2, x3 = (x[:3] for x in points)
     axis1, axis2, (inv_base, along, sq_height) = _axes([*(x3 - x2)], [*(x1 - x2)])
     axis3 = _cross(axis1, axis2)
     inv_sq_base = inv_base * inv_base
@@ -89,13 +94,12 @@ def _solve_chunk(world_points: Tensor, plane_points: Tensor, out: Tensor) -> Ten
     rest = 1.0 - along
     p, q = (along * along).add_(sq_height), (rest * rest).add_(sq_height)
     r = rest.mul_(along).sub_(sq_height).mul_(2.0)
-    rays, b, g, sees = _look(given[3:])
+    rays, b, g, sees = _look([x[3:] for x in points])
     dist = distances(p, q, r, b, g)
 
     # Up to here the longest edge was 1 long.
     base_length = inv_base.reciprocal()
-    rays.mul_(base_length)
-    y1, y2, y3 = ([d * x for x in ray] for d, ray in zip(dist, rays.unbind(1), strict=True))
+    y1, y2, y3 = ([d * x for x in ray] for d, ray in zip([d * base_length for d in dist], rays, strict=True))
     base = [y.sub_(x) for y, x in zip(y3, y2, strict=True)]
     side = [torch.sub(y, x, out=x) for y, x in zip(y1, y2, strict=True)]
     cam1, cam2, (cam_inv_base, cam_along, cam_sq_height) = _axes(base, side)
@@ -113,39 +117,34 @@ def _solve_chunk(world_points: Tensor, plane_points: Tensor, out: Tensor) -> Ten
     # R = Σ camera axis · world axisᵀ, the last row from the first two; t = y1 - R x1.
     (a0, a1, a2), (b0, b1, b2) = cam1, cam2
     cam3 = ((a1 * b2).addcmul_(a2, b1, value=-1.0), (a2 * b0).addcmul_(a0, b2, value=-1.0))
-    for i in range(2):
-        for j in range(3):
-            torch.mul(cam1[i], axis1[j], out=out[3 * i + j]).addcmul_(cam2[i], axis2[j]).addcmul_(cam3[i], axis3[j])
-    for j, (k, m) in enumerate(((1, 2), (2, 0), (0, 1))):
-        torch.mul(out[k], out[3 + m], out=out[6 + j]).addcmul_(out[m], out[3 + k], value=-1.0)
+    rows = [
+        [(cam1[i] * axis1[j]).addcmul_(cam2[i], axis2[j]).addcmul_(cam3[i], axis3[j]) for j in range(3)]
+        for i in range(2)
+    ]
+    rows.append(_cross(*rows))
     back = -x1
-    for i in range(3):
-        row = out[3 * i : 3 * i + 3]
-        torch.addcmul(y1[i], row[0], back[0], out=out[9 + i]).addcmul_(row[1], back[1]).addcmul_(row[2], back[2])
-    return valid
+    translation = [
+        torch.addcmul(y, row[0], back[0]).addcmul_(row[1], back[1]).addcmul_(row[2], back[2])
+        for y, row in zip(y1, rows, strict=True)
+    ]
+    return [*rows[0], *rows[1], *rows[2], *translation], valid
 
 
 def _solve(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Tensor]:
     """Components of rotations and translations, (12, 4, B), and which of them are solutions, (4, B), in chunks."""
     batch = world_points.shape[0]
+    if torch.compiler.is_compiling():
+        entries, found = _solve_chunk(world_points, plane_points)
+        return torch.stack(entries).flatten(1, 2), found.flatten(0, 1)
     out = world_points.new_empty(12, 2, 2, batch)
     valid = torch.empty(2, 2, batch, dtype=torch.bool, device=world_points.device)
     chunk = _CHUNK_BYTES // world_points.element_size()
     with torch.inference_mode():  # an eighth faster than without gradients only; what is returned is made outside
         for start in range(0, batch, chunk):
             part = slice(start, start + chunk)
-            valid[..., part] = _solve_chunk(world_points[part], plane_points[part], out[..., part])
+            entries, valid[..., part] = _solve_chunk(world_points[part], plane_points[part])
+            torch.stack(entries, out=out[..., part])
     return out.flatten(1, 2), valid.flatten(0, 1)
-
-
-# A compiler makes this eight times as slow: it sees one operation.
-_solve_whole = torch.library.custom_op("kornia_pnpnet::p3p", _solve, mutates_args=())
-
-
-@_solve_whole.register_fake
-def _(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Tensor]:
-    batch = world_points.shape[0]
-    return world_points.new_empty(12, 4, batch), world_points.new_empty(4, batch, dtype=torch.bool)
 
 
 def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
@@ -196,8 +195,7 @@ def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
         )
     if plane_points.device != world_points.device:
         raise DeviceError(f"plane_points is on {plane_points.device} but world_points is on {world_points.device}.")
-    solve = _solve_whole if torch.compiler.is_compiling() else _solve
-    components, valid = solve(world_points.detach(), plane_points.detach())
+    components, valid = _solve(world_points.detach(), plane_points.detach())
     components = components.permute(2, 1, 0)  # (B, 4, 12)
     rotation, translation = components[..., :9].unflatten(-1, (3, 3)), components[..., 9:]
     return Hypotheses(Pose(rotation, translation), valid.mT)

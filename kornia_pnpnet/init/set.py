@@ -205,6 +205,9 @@ class SetInit(nn.Module):
         (torch.Size([2, 3, 3]), torch.Size([2, 3, 3]), torch.Size([2, 7]))
     """
 
+    #: More are solved in several parts where nothing speaks against it: this many stay in the caches of a core.
+    pairs_at_once = 8000
+
     def __init__(
         self,
         *,
