@@ -7,7 +7,7 @@ from kornia_pnpnet.losses import PoseLoss, SetLoss
 from kornia_pnpnet.metrics import pose_errors, success, success_rate
 from kornia_pnpnet.model import PnPNet, shipped_weights
 from kornia_pnpnet.normalize import Normalize
-from kornia_pnpnet.registry import create_solver, list_solvers
+from kornia_pnpnet.registry import create_solver, list_solvers, solve_pnp
 from kornia_pnpnet.types import Correspondences, Guess, Hypotheses, Noise, PnPResult, Pose, Problems, Refinement
 
 __version__ = "0.1.0"
@@ -34,6 +34,7 @@ __all__ = [
     "pose_covariance",
     "pose_errors",
     "shipped_weights",
+    "solve_pnp",
     "success",
     "success_rate",
 ]

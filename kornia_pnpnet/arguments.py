@@ -71,14 +71,19 @@ def make_parser() -> argparse.ArgumentParser:
 
     solve = command(
         "solve",
-        "find the pose of one image",
+        "find the pose of one image, or of very many",
         "Find the pose of one image and print it as JSON: x_cam = R x_world + t.\n\n"
         "  pnpnet solve pairs.csv --intrinsics 3400,3400,3024,2016 --plot pose.png\n\n"
+        "Solve files of many problems each, in bounded memory, and write their poses; the same command goes on where\n"
+        "it was stopped. Shards are NPZ files with world_points (B, N, 3), img_points (B, N, 2) and optionally\n"
+        "weights, intrinsics, img_sigma and world_sigma, or Parquet files with such columns, a problem in each row.\n\n"
+        "  pnpnet solve --batch shards/ --out poses/\n\n"
         "Exit code: 0 when solved, 1 when the solver found no pose that explains the pairs, 2 for bad input.",
     )
     solve.add_argument(
         "file",
         metavar="FILE",
+        nargs="+",
         help="CSV with the header X,Y,Z,u,v and optionally weight, or NPZ with world_points (N, 3), img_points (N, 2) "
         "and optionally weights (N,) and intrinsics (3, 3)",
     )
@@ -95,6 +100,12 @@ def make_parser() -> argparse.ArgumentParser:
         type=_positive,
         help="pairs with a larger reprojection error are rejected; default: a robust three sigma, at least 3 px",
     )
+    solve.add_argument("--batch", action="store_true", help="FILE are shards of many problems, or folders of them")
+    solve.add_argument("--out", metavar="FOLDER", help="where --batch writes poses; default: outputs/poses")
+    solve.add_argument(
+        "--batch-size", metavar="B", type=_positive_int, default=10_000, help="problems at once; default: 10000"
+    )
+    solve.add_argument("--overwrite", action="store_true", help="solve shards again whose poses are there")
 
     evaluate = command(
         "evaluate",
@@ -149,6 +160,16 @@ def make_parser() -> argparse.ArgumentParser:
         "files", metavar="RESULTS.json", nargs="+", help="what `pnpnet evaluate` wrote, or operation counts"
     )
     figures.add_argument("--out", metavar="FOLDER", default="outputs/figures", help="default: outputs/figures")
+
+    export = command(
+        "export",
+        "write a solver as an ONNX model",
+        "Write a solver as an ONNX model for batches of any size, which ONNX Runtime runs without PyTorch.\n\n"
+        "  pnpnet export pnpnet.onnx --solver pnpnet-set",
+    )
+    export.add_argument("file", metavar="ONNX", help="where to")
+    export.add_argument("--solver", metavar="NAME", default="pnpnet-set", help="default: pnpnet-set")
+    export.add_argument("--n", metavar="N", type=_positive_int, help="for just so many pairs: a smaller, faster graph")
 
     command("list", "list solvers and weights", "List the solvers that --solver takes.\n\n  pnpnet list")
 

@@ -53,14 +53,48 @@ def _one_line(error: Exception) -> str:
     return " ".join(" ".join([str(error) or type(error).__name__, *notes]).split())
 
 
+def _solve_batch(arguments: argparse.Namespace, camera: torch.Tensor | None) -> int:
+    from kornia_pnpnet.shards import solve_shards
+
+    if arguments.plot or arguments.threshold:
+        raise ValueError("--plot and --threshold are for one image, not for --batch")
+    name = arguments.solver or "pnpnet-set"
+    report = solve_shards(
+        _any_but_bounds(name),
+        arguments.file,
+        arguments.out or "outputs/poses",
+        name=name,
+        intrinsics=camera,
+        batch=arguments.batch_size,
+        overwrite=arguments.overwrite,
+        watch=lambda shard, solved, count: print(f"{shard}: {solved} of {count} solved", flush=True),
+    )
+    for line in report.failed:
+        print(f"pnpnet: {line}", file=sys.stderr)
+    kept = f"; {report.kept} shards had been solved before" if report.kept else ""
+    print(f"{report.solved} of {report.problems} problems in {report.shards} shards solved{kept}")
+    return 2 if report.failed else 0
+
+
+def _any_but_bounds(name: str) -> torch.nn.Module:
+    if name.partition(":")[0] in BOUNDS:
+        raise ValueError(f"--solver: {name} is a bound, which has to see the true pose: it can only be evaluated")
+    return load_solver(name)
+
+
 def _solve(arguments: argparse.Namespace) -> int:
     from kornia.geometry.conversions import rotation_matrix_to_quaternion
 
     camera = camera_matrix(arguments.intrinsics) if arguments.intrinsics else None
-    pairs = read_pairs(arguments.file)
+    if arguments.batch:
+        return _solve_batch(arguments, camera)
+    path, *more = arguments.file
+    if more or arguments.out or arguments.overwrite:
+        raise ValueError("several files, --out and --overwrite go with --batch")
+    pairs = read_pairs(path)
     camera = pairs.intrinsics if camera is None else camera
     if camera is None:
-        raise PairsError(arguments.file, "the camera is not in the file: pass --intrinsics fx,fy,cx,cy")
+        raise PairsError(path, "the camera is not in the file: pass --intrinsics fx,fy,cx,cy")
     count = len(pairs.world_points)
     name = arguments.solver
     if name is None:
@@ -68,9 +102,7 @@ def _solve(arguments: argparse.Namespace) -> int:
         name = next((weights for weights in suited if weights in shipped), "identity-lm")
         if name not in shipped:
             print(f"pnpnet: no weights {suited[0]} are shipped, using {name}", file=sys.stderr)
-    if name.partition(":")[0] in BOUNDS:
-        raise ValueError(f"--solver: {name} is a bound, which has to see the true pose: it can only be evaluated")
-    solver = load_solver(name)
+    solver = _any_but_bounds(name)
     weights = None if pairs.weights is None else pairs.weights[None]
     with torch.no_grad():
         result = solver(pairs.world_points[None], pairs.img_points[None], camera[None], weights)
@@ -151,6 +183,18 @@ def _figures(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _export(arguments: argparse.Namespace) -> int:
+    from kornia_pnpnet.export import INPUTS, OUTPUTS, export_onnx
+    from kornia_pnpnet.model import PnPNet
+
+    solver = _any_but_bounds(arguments.solver)
+    if not isinstance(solver, PnPNet):
+        raise ValueError(f"--solver: {arguments.solver} is another library's, which has no graph")
+    path = export_onnx(solver, arguments.file, arguments.n)
+    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, {', '.join(INPUTS)} -> {', '.join(OUTPUTS)}")
+    return 0
+
+
 def _list(_: argparse.Namespace) -> int:
     states = {}
     for name in list_solvers():
@@ -178,6 +222,7 @@ def _demo(arguments: argparse.Namespace) -> int:
 
 _COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "solve": _solve,
+    "export": _export,
     "evaluate": _evaluate,
     "figures": _figures,
     "list": _list,

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import torch
+from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kornia_pnpnet.geometry import normal_equations, pixel_variance, project
-from kornia_pnpnet.types import Correspondences, Noise, Pose
+from kornia_pnpnet.types import Correspondences, Noise, Pose, camera_matrices
 
 __all__ = ["pose_covariance"]
 
@@ -15,7 +16,7 @@ def pose_covariance(
     pose: Pose,
     world_points: Tensor,
     img_points: Tensor,
-    intrinsics: Tensor,
+    intrinsics: Tensor | PinholeCamera,
     *,
     img_sigma: Tensor | float,
     world_sigma: Tensor | float = 0.0,
@@ -32,7 +33,7 @@ def pose_covariance(
         pose: rotation :math:`(B, 3, 3)`, translation :math:`(B, 3)`.
         world_points: shape :math:`(B, N, 3)`.
         img_points: pixels, shape :math:`(B, N, 2)`.
-        intrinsics: shape :math:`(B, 3, 3)` or :math:`(3, 3)`.
+        intrinsics: shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or Kornia's cameras.
         img_sigma: standard deviation of the noise on each pixel coordinate, a number, :math:`(B,)` or :math:`(B, N)`.
         world_sigma: likewise on each world coordinate, in the unit of the world.
         weights: how likely each pair is right, shape :math:`(B, N)`, such as the ``weights`` of a result; 1 when
@@ -51,7 +52,7 @@ def pose_covariance(
     batch, count = world_points.shape[:2]
     dtype = world_points.dtype
     with torch.no_grad():
-        world, pixels, camera = (x.double() for x in (world_points, img_points, intrinsics))
+        world, pixels, camera = (x.double() for x in (world_points, img_points, camera_matrices(intrinsics)))
         focals, centre = camera.diagonal(dim1=-2, dim2=-1)[..., :2], camera[..., :2, 2]
         one = focals.new_ones(())  # rays: pixels of a camera with the focal length 1
         rays = (pixels - centre[..., None, :]) / focals[..., None, :]

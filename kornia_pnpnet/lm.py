@@ -520,7 +520,8 @@ class RobustWeightedLM(nn.Module):
         pose = Pose(*(x.detach() for x in state.pose))
         batch = pairs.weights.shape[0]
         cost = self._cost(project(pose, starts), starts, starts.weights, shape.detach())
-        best = cost.view(-1, batch).argmin(0)  # (B,), the first of equals
+        count = cost.shape[0] // batch if batch else 1
+        best = cost.view(count, batch).argmin(0)  # (B,), the first of equals
         index = torch.add(torch.arange(batch, device=best.device), best, alpha=batch)
 
         def kept(x: Tensor) -> Tensor:

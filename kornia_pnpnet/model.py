@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from kornia.core.check import KORNIA_CHECK, KORNIA_CHECK_SHAPE
 from kornia.core.exceptions import BaseError, DeviceError, ShapeError, TypeCheckError, ValueCheckError
+from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
 from kornia_pnpnet.compilation import Compiled
@@ -21,7 +22,7 @@ from kornia_pnpnet.init.sampling import log_false_alarms
 from kornia_pnpnet.init.scoring import Thresholds, chance_of_inlier, judge
 from kornia_pnpnet.lm import LMStart, LMStep, RobustWeightedLM
 from kornia_pnpnet.normalize import VIEWS, Frame, Normalize
-from kornia_pnpnet.types import Correspondences, Guess, Noise, PnPResult, Pose, Refinement
+from kornia_pnpnet.types import Correspondences, Guess, Noise, PnPResult, Pose, Refinement, camera_matrices
 
 __all__ = ["PnPNet", "find_weights", "shipped_weights"]
 
@@ -158,7 +159,7 @@ class PnPNet(nn.Module):
         self,
         world_points: Tensor,
         img_points: Tensor,
-        intrinsics: Tensor,
+        intrinsics: Tensor | PinholeCamera,
         weights: Tensor | None = None,
         mask: Tensor | None = None,
         init: Pose | None = None,
@@ -172,7 +173,8 @@ class PnPNet(nn.Module):
         Args:
             world_points: shape :math:`(B, N, 3)`, float32 or float64, any unit.
             img_points: pixels, shape :math:`(B, N, 2)`.
-            intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`.
+            intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or Kornia's cameras; where they are
+                does not matter.
             weights: how much each pair counts, at least 0, shape :math:`(B, N)`; 1 when ``None``.
             mask: False where a pair is padding, bool, shape :math:`(B, N)`. What padding holds does not matter.
             init: world-to-camera pose to start from instead of the initialiser's, :math:`(B, 3, 3)` and
@@ -220,7 +222,7 @@ class PnPNet(nn.Module):
         self,
         world_points: Tensor,
         img_points: Tensor,
-        intrinsics: Tensor,
+        intrinsics: Tensor | PinholeCamera,
         weights: Tensor | None = None,
         mask: Tensor | None = None,
         init: Pose | None = None,
@@ -503,7 +505,7 @@ def _gate_pose(pose: Pose, ok: Tensor, finite: Tensor) -> Pose:
 def _prepared(
     world_points: Tensor,
     img_points: Tensor,
-    intrinsics: Tensor,
+    intrinsics: Tensor | PinholeCamera,
     weights: Tensor | None,
     mask: Tensor | None,
     init: Pose | None,
@@ -511,6 +513,7 @@ def _prepared(
     world_sigma: Tensor | float | None,
 ) -> tuple[Any, ...]:
     """Checked inputs: a camera for each problem, and the noise of each pair where any of it is known."""
+    intrinsics = camera_matrices(intrinsics)
     check_inputs(world_points, img_points, intrinsics, weights, mask, init)
     noise = None
     if img_sigma is not None or world_sigma is not None:

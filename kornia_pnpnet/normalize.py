@@ -276,5 +276,12 @@ def _axes_back(entries: Tensor, axis: int, view: tuple[bool, bool, bool]) -> Ten
 def _order(keys: Tensor) -> Tensor:
     """Positions in ascending order of the first of two keys (2, N, B), ties by the second, (B, N)."""
     first, second = keys.mT.contiguous()  # sorting is twice as fast along the last dimension
-    by_second = second.argsort(stable=True, dim=-1)
-    return by_second.gather(1, first.gather(1, by_second).argsort(stable=True, dim=-1))
+    by_second = _ascending(second)
+    return by_second.gather(1, _ascending(first.gather(1, by_second)))
+
+
+def _ascending(keys: Tensor) -> Tensor:
+    """Positions along the last dimension in ascending order, of equal ones the first first."""
+    if torch.compiler.is_exporting():  # ONNX has no other sort; its largest are stable
+        return keys.topk(keys.shape[-1], largest=False).indices
+    return keys.argsort(stable=True, dim=-1)

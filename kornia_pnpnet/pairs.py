@@ -16,7 +16,7 @@ from torch import Tensor
 from kornia_pnpnet.geometry import transform
 from kornia_pnpnet.types import Pose
 
-__all__ = ["Pairs", "PairsError", "camera_matrix", "read_pairs", "rejection_limit", "reprojections"]
+__all__ = ["Pairs", "PairsError", "camera_matrix", "checked_camera", "read_pairs", "rejection_limit", "reprojections"]
 
 _COLUMNS = ("X", "Y", "Z", "u", "v")
 _WEIGHT = "weight"
@@ -69,10 +69,15 @@ def camera_matrix(text: str) -> Tensor:
     except ValueError:
         raise PairsError("--intrinsics", f"expected four numbers fx,fy,cx,cy, got {text!r}") from None
     matrix = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    return _checked_camera(matrix, "--intrinsics")
+    return checked_camera(matrix, "--intrinsics")
 
 
-def _checked_camera(matrix: Tensor, source: str | Path) -> Tensor:
+def checked_camera(matrix: Tensor, source: str | Path) -> Tensor:
+    """A camera matrix (3, 3) as it came.
+
+    Raises:
+        PairsError: when it is none of a pinhole camera without skew; ``source`` says where it is from.
+    """
     if not matrix.isfinite().all():
         raise PairsError(source, "the intrinsics are not finite")
     if matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
@@ -197,7 +202,7 @@ def _read_npz(path: Path, content: bytes) -> Pairs:
     if "weights" in tensors and (tensors["weights"] < 0).any():
         raise PairsError(path, f"weights[{int((tensors['weights'] < 0).int().argmax())}] is negative")
     if "intrinsics" in tensors:
-        _checked_camera(tensors["intrinsics"], path)
+        checked_camera(tensors["intrinsics"], path)
     return Pairs(**tensors)
 
 

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
+import torch
 from kornia.core.check import KORNIA_CHECK
 from kornia.core.exceptions import ValueCheckError
-from torch import nn
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor, nn
 
 from kornia_pnpnet.init import P3P, RANSAC, EPnP, REPPnP, SubsetSolver
 from kornia_pnpnet.lm import RobustWeightedLM
 from kornia_pnpnet.model import PnPNet, shipped_weights
 from kornia_pnpnet.normalize import Normalize
 
-__all__ = ["create_solver", "list_solvers"]
+__all__ = ["create_solver", "list_solvers", "solve_pnp"]
 
 # Iterations of the classical robust LM: from a pose that is nearly right, and from the identity.
 _FEW, _MANY = 10, 30
@@ -139,3 +141,49 @@ def create_solver(name: str, **options: Any) -> nn.Module:
         return builders[name](**options).eval()
     except TypeError as error:
         raise ValueCheckError(f"Solver {name!r} does not take these options: {error}.") from error
+
+
+@lru_cache(maxsize=8)
+def _frozen(name: str, device: torch.device) -> nn.Module:
+    """A solver that is made once; its own parameters take no part in gradients."""
+    return create_solver(name).to(device).requires_grad_(False)
+
+
+def solve_pnp(
+    world_points: Tensor,
+    img_points: Tensor,
+    intrinsics: Tensor | PinholeCamera,
+    weights: Tensor | None = None,
+    solver: str | nn.Module = "pnpnet-set",
+) -> Tensor:
+    r"""World-to-camera matrices, called like :func:`kornia.geometry.solve_pnp_dlt`; some pairs may be wrong.
+
+    What it leaves out (which pairs counted, how sure the pose is, masks) a solver of :func:`create_solver` returns.
+
+    Args:
+        world_points: shape :math:`(B, N, 3)`, float32 or float64, any unit, :math:`N` as the solver takes it.
+        img_points: pixels, shape :math:`(B, N, 2)`.
+        intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or Kornia's cameras.
+        weights: how much each pair counts, at least 0, shape :math:`(B, N)`; 1 when ``None``.
+        solver: one of :func:`list_solvers`, or a module that is called like these. A name is made into a solver once.
+
+    Returns:
+        :math:`[R\,|\,t]` with ``x_cam = R x_world + t``, shape :math:`(B, 3, 4)`, with gradients by points, pixels,
+        intrinsics and weights. NaN, without gradient, where a problem has no pose (``ok`` of the result is false):
+        nothing is raised for it, and the rest of the batch is as it would be alone.
+
+    Raises:
+        ValueCheckError: for an unknown name.
+        BaseError: for shapes, dtypes and devices that the solver does not take.
+
+    Example:
+        >>> from kornia_pnpnet.data import SyntheticProblems
+        >>> p = SyntheticProblems(n=12, batch_size=2, seed=0).batch(0)
+        >>> solve_pnp(p.world_points, p.img_points, p.intrinsics).shape
+        torch.Size([2, 3, 4])
+    """
+    if isinstance(solver, str):
+        device = world_points.device if isinstance(world_points, Tensor) else torch.device("cpu")
+        solver = _frozen(solver, device)
+    result = solver(world_points, img_points, intrinsics, weights)
+    return torch.where(result.ok[:, None, None], result.matrix[:, :3], torch.nan)

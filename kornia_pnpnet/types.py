@@ -9,7 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
+import torch
+from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import Rt_to_matrix4x4
+from kornia.geometry.liegroup import Se3
 from torch import Tensor
 
 __all__ = ["Correspondences", "Guess", "Hypotheses", "Noise", "PnPResult", "Pose", "Problems", "Refinement"]
@@ -30,6 +33,42 @@ class Pose(NamedTuple):
     def matrix(self) -> Tensor:
         """The homogeneous world-to-camera matrix, shape :math:`(B, 4, 4)`."""
         return Rt_to_matrix4x4(self.rotation, self.translation[..., None])
+
+    @property
+    def se3(self) -> Se3:
+        """As Kornia's group element, with the gradient of the pose; its tangent vectors are (translation, rotation)."""
+        return Se3.from_matrix(self.matrix)
+
+    def camera(self, intrinsics: Tensor | PinholeCamera, height: int = 1, width: int = 1) -> PinholeCamera:
+        r"""Kornia's camera with these extrinsics.
+
+        Args:
+            intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or a camera, whose size is kept.
+            height: of the image in pixels, which no projection needs.
+            width: likewise.
+
+        Example:
+            >>> pose = Pose(torch.eye(3)[None], torch.tensor([[0.0, 0.0, 2.0]]))
+            >>> camera = pose.camera(torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]))
+            >>> camera.project(torch.tensor([[0.1, 0.0, 0.0]]))
+            tensor([[345., 240.]])
+        """
+        batch = len(self.translation)
+        size = [self.translation.new_full((batch,), x) for x in (height, width)]
+        if isinstance(intrinsics, PinholeCamera):
+            size = [x.expand(batch) for x in (intrinsics.height, intrinsics.width)]
+        matrices = camera_matrices(intrinsics).expand(batch, 3, 3)
+        return PinholeCamera(
+            Rt_to_matrix4x4(matrices, torch.zeros_like(self.translation)[..., None]), self.matrix, *size
+        )
+
+
+def camera_matrices(intrinsics: Tensor | PinholeCamera) -> Tensor:
+    """The camera matrices (B, 3, 3) or (3, 3) of what a user gives as intrinsics; where it is does not matter."""
+    if not isinstance(intrinsics, PinholeCamera):
+        return intrinsics
+    matrices = intrinsics.camera_matrix
+    return matrices[0] if len(matrices) == 1 else matrices
 
 
 class Noise(NamedTuple):

@@ -71,6 +71,13 @@ def _sqrt(square: Tensor) -> Tensor:
     return square.rsqrt().mul_(square)
 
 
+def _signed(size: Tensor, sign: Tensor) -> Tensor:
+    """A positive number, which is overwritten, with the sign of another."""
+    if torch.compiler.is_exporting():  # ONNX has no such operation
+        return torch.where(sign < 0, -size, size)
+    return size.copysign_(sign)
+
+
 def _isolated_root(k3: Tensor, k2: Tensor, k1: Tensor, k0: Tensor) -> tuple[Tensor, Tensor]:
     """The real root, as a ratio ``u : v``, of a cubic form (C,) that is farthest from the other two.
 
@@ -97,7 +104,7 @@ def _isolated_root(k3: Tensor, k2: Tensor, k1: Tensor, k0: Tensor) -> tuple[Tens
     for _ in range(_CUBIC_STEPS):
         sq_x = x * x
         x = torch.addcmul(size, sq_x, x).mul_(2 / 3).div_(sq_x.sub_(p).clamp_(min=tiny))
-    u, v = x.copysign_(q).sub_(third), k3
+    u, v = _signed(x, q).sub_(third), k3
     inv = torch.maximum(u.abs(), v.abs()).clamp_(min=tiny).reciprocal_()
     u, v = u.mul_(inv), v * inv
     return u.lerp(v, swap), v.lerp(u, swap)
@@ -152,7 +159,7 @@ def _meet(slope: Tensor, offset: Tensor, v: Triple, h: Triple) -> Triple:
     c0 = (offset * offset).mul_(v2 + v3).addcmul_(offset, vh23).add_(vh23.addcmul_(v1, h1, value=2.0))
     disc = (c1 * c1).addcmul_(c2, c0, value=-1.0)
     two = greater(disc, torch.zeros_like(disc))
-    z = _sqrt(disc.clamp_(min=torch.finfo(disc.dtype).tiny)).copysign_(c1).add_(c1).neg_()
+    z = _signed(_sqrt(disc.clamp_(min=torch.finfo(disc.dtype).tiny)), c1).add_(c1).neg_()
     second = torch.arange(2, dtype=z.dtype, device=z.device)[:, None, None]
     y, dist3 = z.lerp(c0.mul_(two), second), c2.lerp(z * two, second)
     dist1 = torch.addcmul(dist3, slope, y).addcmul_(offset, dist3)
@@ -223,5 +230,5 @@ def distances(p: Tensor, q: Tensor, r: Tensor, b: Triple, g: Tensor) -> Triple:
     dist1, dist2, dist3 = _refined(_candidates(p, q, r, b, g), p, q, b)
     edge = dist2 - dist3
     sq_edge = edge.mul_(edge).addcmul_(b[0], dist2 * dist3)
-    scale = sq_edge.clamp_(min=torch.finfo(p.dtype).tiny ** 0.5).rsqrt_().copysign_(dist1)
+    scale = _signed(sq_edge.clamp_(min=torch.finfo(p.dtype).tiny ** 0.5).rsqrt_(), dist1)
     return dist1 * scale, dist2.mul_(scale), dist3.mul_(scale)

@@ -35,13 +35,16 @@ MOST_JUDGES, _JUDGED = 32, 50.0
 _LEAST_VOTE = 0.5
 
 
-@torch.library.custom_op("kornia_pnpnet::taken", mutates_args=())
 def _taken(values: Tensor, index: Tensor) -> Tensor:
-    """Some pairs of each problem, (C, K, B) of (B, N, C) by (B, K): an operation, for a compiler to lay them out so."""
+    """Some pairs of each problem, (C, K, B) of (B, N, C) by (B, K)."""
     return values.permute(2, 1, 0).gather(1, index.mT.expand(values.shape[-1], -1, -1))
 
 
-@_taken.register_fake
+# An operation, for a compiler to lay them out so.
+_taken_whole = torch.library.custom_op("kornia_pnpnet::taken", _taken, mutates_args=())
+
+
+@_taken_whole.register_fake
 def _(values: Tensor, index: Tensor) -> Tensor:
     return values.new_empty(values.shape[-1], index.shape[1], index.shape[0])
 
@@ -271,7 +274,7 @@ class SetInit(nn.Module):
         source = view.points.expand(starts, -1, -1, -1).flatten(0, 1)
         pose, _ = align(source, (ranges[..., None] * view.rays).flatten(0, 1), counts.flatten(0, 1))
         # Problems last, after the hypotheses: (3, 3, S, B) and (3, S, B).
-        rotation, translation = (x.movedim(0, -1).unflatten(-1, (starts, -1)) for x in pose)
+        rotation, translation = (x.movedim(0, -1).unflatten(-1, (starts, len(right))) for x in pose)
         back = view.camera.permute(2, 1, 0)[:, :, None]
         rotation = small_product(small_product(back, rotation), view.world.permute(1, 2, 0)[:, :, None])
         translation = small_product(back, translation[:, None])[:, 0]
@@ -304,21 +307,28 @@ class SetInit(nn.Module):
         """The pose that the likeliest pairs agree on most, of those from samples of three of them; problems last."""
         batch, count = right.shape
         there = corr.weights > 0
-        likely = torch.where(there, right, 0.0).topk(min(MOST_JUDGES, count)).indices
+        chances = torch.where(there, right, 0.0)
         # What agrees may be right after all; pairs that are not there judge nothing.
         vote = torch.where(there, _LEAST_VOTE + (1.0 - _LEAST_VOTE) * right, 0.0)
         img, world = (x.expand(batch, count)[..., None] for x in noise)
         of_pairs = torch.cat((corr.world_points, corr.img_points, vote[..., None], img, world), -1)  # (B, N, 8)
-        pairs = _taken(of_pairs, likely)  # (8, K, B)
+        if not isinstance(count, int):  # exported for any number: with as many that do not count as are asked for
+            more = of_pairs[:, :1] * torch.tensor((1, 1, 1, 1, 1, 0, 1, 1), dtype=vote.dtype, device=vote.device)
+            of_pairs = torch.cat((of_pairs, more.expand(-1, MOST_JUDGES, -1)), 1)
+            chances, count = functional.pad(chances, (0, MOST_JUDGES)), count + MOST_JUDGES
+        likely = chances.topk(min(MOST_JUDGES, count)).indices
+        exported = torch.compiler.is_exporting()  # for programs that do not know our operation
+        pairs = (_taken if exported else _taken_whole)(of_pairs, likely)  # (8, K, B)
         samples = self.triples(count)
         drawn = [sample for group in samples.values() for sample in group]
         # (6, 3, S B), stacked, not indexed: a compiler then copies whole rows.
         three = torch.stack([pairs[:6, k] for column in zip(*drawn, strict=True) for k in column], 1)
-        three = three.unflatten(1, (3, -1)).flatten(2)
+        three = three.unflatten(1, (3, len(drawn))).flatten(2)
         pose, valid = p3p(three[:3].permute(2, 1, 0), three[3:5].permute(2, 1, 0) / corr.focal)
         # Components first, then the four solutions and the samples, problems last: it is how they lie in memory.
-        rotation, translation = (x.movedim((0, 1), (-1, -2)).flatten(-2).unflatten(-1, (-1, batch)) for x in pose)
-        valid = (valid.mT & (three[5] > 0).all(0)).unflatten(-1, (-1, batch))  # (4, S, B)
+        each = len(drawn), batch
+        rotation, translation = (x.movedim((0, 1), (-1, -2)).unflatten(-1, each).flatten(-3, -2) for x in pose)
+        valid = (valid.mT & (three[5] > 0).all(0)).unflatten(-1, each)  # (4, S, B)
         if len(samples) > 1:  # by the pairs that are there, so that padding changes nothing
             enough = [(there.sum(1) >= least).expand(len(group), -1) for least, group in samples.items()]
             valid = valid & torch.cat(enough)

@@ -9,10 +9,11 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from kornia.core.check import KORNIA_CHECK
+from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
 from kornia_pnpnet.model import check_inputs
-from kornia_pnpnet.types import PnPResult, Pose
+from kornia_pnpnet.types import PnPResult, Pose, camera_matrices
 
 __all__ = ["PeerPose", "PeerSolver"]
 
@@ -85,7 +86,7 @@ class PeerSolver(nn.Module):
         self,
         world_points: Tensor,
         img_points: Tensor,
-        intrinsics: Tensor,
+        intrinsics: Tensor | PinholeCamera,
         weights: Tensor | None = None,
         mask: Tensor | None = None,
     ) -> PnPResult:
@@ -94,7 +95,7 @@ class PeerSolver(nn.Module):
         Args:
             world_points: shape :math:`(B, N, 3)`, float32 or float64, any unit.
             img_points: pixels, shape :math:`(B, N, 2)`.
-            intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`.
+            intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or Kornia's cameras.
             weights: pairs with 0 are left out, shape :math:`(B, N)`; 1 when ``None``.
             mask: False where a pair is padding, bool, shape :math:`(B, N)`.
 
@@ -108,6 +109,7 @@ class PeerSolver(nn.Module):
             TypeCheckError: for dtypes that differ or are not float32 or float64.
             DeviceError: for tensors on different devices.
         """
+        intrinsics = camera_matrices(intrinsics)
         check_inputs(world_points, img_points, intrinsics, weights, mask)
         batch, count = world_points.shape[:2]
         world, img, cameras = (x.detach().cpu().double().numpy() for x in (world_points, img_points, intrinsics))

@@ -1,0 +1,87 @@
+"""Exported solvers compute what the layer does, for batches of any size, without PyTorch."""
+
+import numpy as np
+import pytest
+import torch
+from kornia.core.exceptions import ValueCheckError
+
+from kornia_pnpnet import create_solver
+from kornia_pnpnet.cli import main
+from kornia_pnpnet.export import INPUTS, OUTPUTS, export_onnx, export_program
+
+
+def inputs_of(problems, weights=None):
+    weights = torch.ones_like(problems.world_points[..., 0]) if weights is None else weights
+    return tuple(x.float() for x in (*problems[:3], weights))
+
+
+def near(found, solver, inputs):
+    """Within a ten-thousandth of the scene; a problem at the edge of two minima may fall either way."""
+    with torch.no_grad():
+        expected = solver(*inputs)
+    rotation, translation, weights, cost, ok = (torch.as_tensor(x) for x in found)
+    size = expected.translation.norm(dim=-1)
+    off = (translation - expected.translation).norm(dim=-1) / size + (rotation - expected.rotation).abs().amax((1, 2))
+    assert (off < 1e-4).float().mean() >= 0.98
+    assert off.median() < 1e-5
+    same = off < 1e-4
+    torch.testing.assert_close(weights[same], expected.weights[same], rtol=0, atol=2e-2)
+    assert (ok == expected.ok).float().mean() >= 0.98
+    assert cost.isfinite().all()
+
+
+@pytest.mark.parametrize("name", ["pnpnet-n9", "epnp-lm", "reppnp-lm", "identity-lm"])
+def test_programs(name, make_problems):
+    solver = create_solver(name)
+    program = export_program(solver, None if name == "pnpnet-n9" else 9)
+    for batch in (2, 50):
+        inputs = inputs_of(make_problems(n=9, batch=batch, outliers=2))
+        near(program.module()(*inputs), solver, inputs)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n", [None, 9])
+def test_programs_of_the_set_network(n, make_problems):
+    solver = create_solver("pnpnet-set")
+    program = export_program(solver, n)
+    for count in (9,) if n else (4, 5, 9, 17, 18, 30, 40, 200):
+        inputs = inputs_of(make_problems(n=count, batch=20, outliers=count // 4))
+        near(program.module()(*inputs), solver, inputs)
+
+
+def run_onnx(path, inputs):
+    runtime = pytest.importorskip("onnxruntime")
+    session = runtime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    assert tuple(x.name for x in session.get_inputs()) == INPUTS
+    assert tuple(x.name for x in session.get_outputs()) == OUTPUTS
+    return session.run(None, {name: x.numpy() for name, x in zip(INPUTS, inputs, strict=True)})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "n"), [("pnpnet-n9", None), ("pnpnet-set", 9), ("pnpnet-set", None)])
+def test_onnx(name, n, make_problems, tmp_path):
+    solver = create_solver(name)
+    path = export_onnx(solver, tmp_path / "model.onnx", n)
+    for batch in (1, 3, 100):
+        for count in (9,) if n or name != "pnpnet-set" else (4, 9, 25, 60):
+            problems = make_problems(n=count, batch=batch, outliers=count // 4)
+            world = problems.world_points.clone()
+            weights = torch.ones(batch, count)
+            if batch == 100:
+                world[3, 1] = torch.nan
+                weights[5:, -1] = 0.0 if name == "pnpnet-set" and count > 4 else 1.0
+            inputs = inputs_of(problems._replace(world_points=world), weights)
+            found = run_onnx(path, inputs)
+            near(found, solver, inputs)
+            assert all(np.isfinite(x).all() for x in found[:4])
+            assert batch != 100 or not found[4][3]
+
+
+def test_what_has_no_graph(tmp_path, capsys):
+    with pytest.raises(ValueCheckError, match="RANSAC cannot be exported"):
+        export_program(create_solver("p3p-ransac"), 9)
+    with pytest.raises(ValueCheckError, match="takes 9 pairs"):
+        export_program(create_solver("pnpnet-n9"), 8)
+    assert main(["export", str(tmp_path / "x.onnx"), "--solver", "opencv-ransac"]) == 2
+    assert "another library's" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,102 @@
+"""Cameras and groups of Kornia in and out, and the function that is called like its DLT."""
+
+import pytest
+import torch
+from kornia.core.exceptions import ShapeError, ValueCheckError
+from kornia.geometry import solve_pnp_dlt
+from kornia.geometry.camera import PinholeCamera
+
+from kornia_pnpnet import PnPNet, create_solver, pose_covariance, solve_pnp
+
+
+def cameras(intrinsics, size=None):
+    """Cameras of Kornia anywhere: where they are must not matter."""
+    batch = len(intrinsics)
+    matrix = torch.eye(4, dtype=intrinsics.dtype).repeat(batch, 1, 1)
+    matrix[:, :3, :3] = intrinsics
+    elsewhere = torch.eye(4, dtype=intrinsics.dtype).repeat(batch, 1, 1)
+    elsewhere[:, :3, 3] = 5.0
+    height, width = torch.full((2, batch), 7.0)
+    return PinholeCamera(matrix, elsewhere, height, width)
+
+
+@pytest.mark.parametrize("name", ["pnpnet-set", "p3p-ransac", "epnp", "opencv-ransac"])
+def test_a_pinhole_camera_is_as_good_as_its_matrix(name, make_problems):
+    p = make_problems(n=9, batch=5)
+    solver = create_solver(name)
+    by_matrix, by_camera = solver(*p[:3]), solver(*p[:2], cameras(p.intrinsics))
+    assert by_camera.matrix.equal(by_matrix.matrix)
+    one = solver(*p[:2], cameras(p.intrinsics[:1]))
+    assert one.matrix.equal(solver(*p[:2], p.intrinsics[0]).matrix)
+    with pytest.raises(ShapeError, match="intrinsics"):
+        solver(*p[:2], cameras(p.intrinsics[:3]))
+
+
+def test_covariances_and_first_guesses_take_cameras(make_problems):
+    p = make_problems(n=9, batch=5)
+    known = {"img_sigma": 1.0}
+    expected = pose_covariance(p.pose, *p[:3], **known)
+    assert pose_covariance(p.pose, *p[:2], cameras(p.intrinsics), **known).equal(expected)
+    result, _ = PnPNet(None).with_guess(*p[:2], cameras(p.intrinsics), init=p.pose)
+    assert result.matrix.equal(PnPNet(None)(*p[:3], init=p.pose).matrix)
+
+
+def test_poses_as_elements_of_kornias_group(make_problems):
+    p = make_problems(batch=5)
+    translation = p.pose.translation.clone().requires_grad_()
+    element = p.pose._replace(translation=translation).se3
+    torch.testing.assert_close(element.matrix(), p.pose.matrix, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(
+        element * p.world_points[:, 0],
+        (p.pose.rotation @ p.world_points[:, 0, :, None])[..., 0] + p.pose.translation,
+        rtol=1e-9,
+        atol=1e-9,
+    )
+    element.inverse().t.sum().backward()
+    torch.testing.assert_close(translation.grad, -p.pose.rotation.sum(-1), rtol=1e-9, atol=1e-9)
+
+
+def test_cameras_at_a_pose_project_as_we_do(make_problems):
+    p = make_problems(n=9, batch=5, noise=False)
+    for intrinsics in (p.intrinsics, cameras(p.intrinsics)):
+        camera = p.pose.camera(intrinsics, height=480, width=640)
+        torch.testing.assert_close(
+            camera.project(p.world_points[:, :1])[:, 0], p.img_points[:, 0], rtol=1e-9, atol=1e-6
+        )
+        assert camera.extrinsics.equal(p.pose.matrix)
+    assert camera.height.tolist() == [7.0] * 5  # that of the camera that came
+    shared = p.pose.camera(p.intrinsics[0], height=480, width=640)
+    assert shared.intrinsics.shape == (5, 4, 4)
+    assert shared.width.tolist() == [640.0] * 5
+
+
+def test_solve_pnp_returns_what_kornias_dlt_does(make_problems):
+    p = make_problems(n=12, batch=5, noise=False)
+    torch.testing.assert_close(solve_pnp(*p[:3]), solve_pnp_dlt(*p[:3]), rtol=1e-4, atol=1e-4)
+    matrix = solve_pnp(*p[:2], cameras(p.intrinsics), torch.ones_like(p.img_points[..., 0]), solver="epnp-lm")
+    torch.testing.assert_close(matrix, p.pose.matrix[:, :3], rtol=1e-6, atol=1e-6)
+
+
+def test_solve_pnp_marks_what_it_cannot_solve(make_problems):
+    p = make_problems(n=9, batch=4)
+    world = p.world_points.clone()
+    world[1, 2] = torch.nan
+    pixels = p.img_points.clone().requires_grad_()
+    matrix = solve_pnp(world, pixels, p.intrinsics)
+    assert matrix.isnan().all((1, 2)).tolist() == [False, True, False, False]
+    assert matrix[0].equal(solve_pnp(p.world_points, p.img_points, p.intrinsics)[0])
+    matrix[..., 3].nansum().backward()
+    assert pixels.grad.isfinite().all()
+    assert (pixels.grad.abs().sum((1, 2)) > 0).tolist() == [True, False, True, True]
+
+
+def test_solve_pnp_makes_a_solver_once_and_takes_one(make_problems):
+    p = make_problems(n=9, batch=4)
+    seen = []
+    own = PnPNet(create_solver("epnp").init)
+    own.register_forward_hook(lambda *_: seen.append(1))
+    assert solve_pnp(*p[:3], solver=own).shape == (4, 3, 4)
+    assert seen == [1]
+    assert not solve_pnp(*p[:3]).requires_grad
+    with pytest.raises(ValueCheckError, match="No solver"):
+        solve_pnp(*p[:3], solver="magic")
