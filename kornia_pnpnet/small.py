@@ -82,6 +82,8 @@ def _turn(a: Tensor, b: Tensor) -> Tensor:
 
 
 class _NearestRotation(torch.autograd.Function):
+    generate_vmap_rule = True
+
     @staticmethod
     def forward(matrix: Tensor) -> tuple[Tensor, Tensor]:
         eps = torch.finfo(matrix.dtype).eps

@@ -180,6 +180,18 @@ def log_false_alarms(tested: Tensor, inliers: Tensor, counts: Tensor, chance: Te
     """
     extra = (inliers - MIN_PAIRS).clamp(min=0).double()
     free = torch.maximum((counts - MIN_PAIRS).clamp(min=0).double(), extra)
-    ways = torch.lgamma(free + 1) - torch.lgamma(extra + 1) - torch.lgamma(free - extra + 1)
+    ways = _log_factorial(free) - _log_factorial(extra) - _log_factorial(free - extra)
     tiny = torch.finfo(torch.float64).tiny
     return tested.clamp(min=1).double().log() + ways + extra * chance.double().clamp(min=tiny).log()
+
+
+def _log_factorial(x: Tensor) -> Tensor:
+    r"""Of whole numbers :math:`x \ge 0` in float64."""
+    if not torch.compiler.is_exporting():
+        return torch.lgamma(x + 1)
+    # ONNX has no such operation. Stirling's series of Γ(x + 9), which is Γ(x + 1) times eight factors: 12 digits.
+    y = x + 9.0
+    inv, sq = y.reciprocal(), y.reciprocal().square()
+    series = inv * (1 / 12 - sq * (1 / 360 - sq * (1 / 1260 - sq / 1680)))
+    factors = math.prod(x + i for i in range(1, 9))
+    return (y - 0.5) * y.log() - y + 0.5 * math.log(2.0 * math.pi) + series - torch.as_tensor(factors).log()

@@ -1,0 +1,244 @@
+"""Whatever comes in: shapes, dtypes, layouts, scales, numbers that are none, and geometry without a pose."""
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from kornia.core.exceptions import BaseError, ShapeError
+
+from kornia_pnpnet import create_solver, pose_covariance, pose_errors, solve_pnp, success
+from kornia_pnpnet.data import SyntheticProblems
+
+SOLVERS = {
+    name: create_solver(name)
+    for name in ("pnpnet-set", "pnpnet-n9", "net-n9", "epnp", "epnp-lm", "reppnp-lm", "p3p-ransac", "identity-lm")
+}
+PEERS = {name: create_solver(name) for name in ("opencv-ransac", "poselib")}
+NAN, INF = float("nan"), float("inf")
+
+
+def many(examples):
+    return settings(
+        max_examples=examples, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
+    )
+
+
+# What may be wrong with a problem; those in NO_POSE must not be ok.
+def _line(world, img, camera):
+    return world[:, :1] * torch.ones(3, dtype=world.dtype), img, camera
+
+
+def _plane(world, img, camera):
+    flat = world.clone()
+    flat[:, 2] = 0.0
+    return flat, img, camera
+
+
+def _entry(which, value):
+    def spoil(*inputs):
+        spoiled = list(inputs)
+        spoiled[which] = spoiled[which].clone()
+        spoiled[which].view(-1)[0] = value  # of the first pair, which no mask hides
+        return tuple(spoiled)
+
+    return spoil
+
+
+NO_POSE = {
+    "nan point": _entry(0, NAN),
+    "infinite point": _entry(0, -INF),
+    "nan pixel": _entry(1, NAN),
+    "infinite pixel": _entry(1, INF),
+    "nan focal length": _entry(2, NAN),
+    "no focal length": _entry(2, 0.0),
+    "negative focal length": _entry(2, -500.0),
+    "one point": lambda world, img, camera: (world[:1].expand_as(world).clone(), img, camera),
+    "a line": _line,
+}
+STRANGE = {
+    "nothing": lambda *inputs: inputs,
+    "a plane": _plane,
+    "one pixel": lambda world, img, camera: (world, img[:1].expand_as(img).clone(), camera),
+    "a huge number": _entry(0, 1e30),
+    "mirrored pixels": lambda world, img, camera: (world, -img, camera),
+    "all points twice": lambda world, img, camera: (world[[i // 2 for i in range(len(world))]], img, camera),
+}
+
+
+@st.composite
+def batches(draw, n=None, most=4):
+    """A batch of problems, what is wrong with each, and what else there is about its tensors."""
+    count, batch = draw(st.integers(4, 12) if n is None else st.just(n)), draw(st.integers(0, most))
+    dtype = draw(st.sampled_from([torch.float32, torch.float64]))
+    seed = draw(st.integers(0, 1000))
+    scale = 10.0 ** draw(st.integers(-6, 6))
+    problems = SyntheticProblems(n=count, batch_size=max(batch, 1), seed=seed, dtype=torch.float64)
+    world, img, camera = (x[:batch].clone() for x in problems.batch(0)[:3])
+    world *= scale
+    kinds = [draw(st.sampled_from([*NO_POSE, *STRANGE])) for _ in range(batch)]
+    for i, kind in enumerate(kinds):
+        world[i], img[i], camera[i] = {**NO_POSE, **STRANGE}[kind](world[i], img[i], camera[i])
+    inputs = [x.to(dtype) for x in (world, img, camera)]
+    layout = draw(st.sampled_from(["contiguous", "transposed", "every other"]))
+    if layout == "transposed":
+        inputs = [x.permute(2, 1, 0).contiguous().permute(2, 1, 0) for x in inputs]
+    elif layout == "every other":
+        inputs = [x.repeat_interleave(2, 0)[::2] for x in inputs]
+    mask = None
+    if draw(st.booleans()):
+        mask = torch.rand(batch, count, generator=torch.Generator().manual_seed(seed)) > 0.1
+        mask[:, 0] = True
+    weights = draw(st.sampled_from([None, 1.0, 1e-12, 1e6]))
+    weights = None if weights is None else torch.full((batch, count), weights, dtype=dtype)
+    if draw(st.booleans()):
+        inputs = [x.detach().requires_grad_() for x in inputs]
+    return inputs, mask, weights, kinds
+
+
+def check(result, inputs, kinds):
+    """What every result keeps."""
+    batch, count = inputs[0].shape[:2]
+    shapes = (batch, 3, 3), (batch, 3), (batch, count), (batch,), (batch,)
+    assert tuple(tuple(x.shape) for x in result[:5]) == shapes
+    for value in (*result[:4], *result.init):
+        assert value.dtype == inputs[0].dtype
+        assert value.isfinite().all()
+    assert result.ok.dtype == torch.bool
+    for ok, kind in zip(result.ok.tolist(), kinds, strict=True):
+        assert not (ok and kind in NO_POSE), kind
+    eye = torch.eye(3, dtype=torch.float64).expand(batch, 3, 3)
+    rotation = result.rotation.detach().double()
+    torch.testing.assert_close(rotation @ rotation.mT, eye, rtol=0, atol=1e-4)
+    tensors = [x for x in inputs if x.requires_grad]
+    if tensors and result.translation.requires_grad:
+        total = sum(x.sum() for x in (*result[:4], *result.init))
+        for gradient in torch.autograd.grad(total, tensors, allow_unused=True):
+            assert gradient is None or gradient.isfinite().all()
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_solvers_take_anything(name):
+    exactly = 9 if name.endswith("-n9") else None
+
+    @many(40)
+    @given(batches(exactly))
+    def run(case):
+        inputs, mask, weights, kinds = case
+        check(SOLVERS[name](*inputs, weights=weights, mask=mask), inputs, kinds)
+
+    run()
+
+
+@pytest.mark.parametrize("name", PEERS)
+def test_peers_take_anything(name):
+    @many(25)
+    @given(batches())
+    def run(case):
+        inputs, mask, weights, kinds = case
+        # Of points on a line they may say what they like.
+        kinds = ["nothing" if kind in ("one point", "a line") else kind for kind in kinds]
+        check(PEERS[name](*inputs, weights=weights, mask=mask), inputs, kinds)
+
+    run()
+
+
+@many(30)
+@given(batches(9), st.sampled_from(["pnpnet-set", "pnpnet-n9", "epnp-lm", "p3p-ransac"]))
+def test_a_problem_is_solved_as_if_it_were_alone(case, name):
+    inputs, mask, weights, _ = case
+    whole = SOLVERS[name](*inputs, weights=weights, mask=mask)
+    for i in range(len(inputs[0])):
+        part = slice(i, i + 1)
+        alone = SOLVERS[name](
+            *(x[part] for x in inputs),
+            weights=None if weights is None else weights[part],
+            mask=None if mask is None else mask[part],
+        )
+        assert alone.ok.equal(whole.ok[part])
+        if name != "p3p-ransac" and alone.ok.item():  # RANSAC draws for the whole batch
+            size = whole.translation[part].abs().max().item()
+            torch.testing.assert_close(alone.translation, whole.translation[part], rtol=1e-2, atol=1e-2 * size)
+
+
+@many(30)
+@given(
+    st.sampled_from(["pnpnet-set", "pnpnet-n9", "epnp-lm", "reppnp-lm"]),
+    st.integers(-6, 6),
+    st.integers(-3, 3),
+    st.integers(0, 100),
+)
+def test_units_of_world_and_camera_do_not_matter(name, world_power, pixel_power, seed):
+    problems = SyntheticProblems(n=9, batch_size=20, seed=seed, dtype=torch.float64).batch(0)
+    scale, zoom = 10.0**world_power, 10.0**pixel_power
+    camera = problems.intrinsics * torch.tensor([zoom, zoom, 1.0], dtype=torch.float64)[:, None]
+    plain = SOLVERS[name](*problems[:3])
+    scaled = SOLVERS[name](scale * problems.world_points, zoom * problems.img_points, camera)
+    assert scaled.ok.equal(plain.ok)
+    ok = plain.ok
+    torch.testing.assert_close(scaled.translation[ok] / scale, plain.translation[ok], rtol=1e-3, atol=1e-3)
+    assert (
+        success(pose_errors(scaled.pose._replace(translation=scaled.translation / scale), problems.pose)).float().mean()
+        > 0.6
+    )
+
+
+@many(60)
+@given(
+    st.sampled_from([*SOLVERS, *PEERS]),
+    st.tuples(st.integers(0, 3), st.integers(0, 12), st.integers(1, 4)),
+    st.tuples(st.integers(0, 3), st.integers(0, 12), st.integers(1, 3)),
+    st.sampled_from([(3, 3), (4, 4), (2, 3, 3), (3,), (3, 3, 3)]),
+    st.sampled_from([torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.int64]),
+    st.sampled_from([torch.float32, torch.float64]),
+)
+def test_what_does_not_fit_is_an_error_of_ours(name, world, img, camera, dtype, other):
+    solver = {**SOLVERS, **PEERS}[name]
+    inputs = torch.ones(world, dtype=dtype), torch.ones(img, dtype=other), torch.ones(camera, dtype=other)
+    fits = world[:2] == img[:2] and world[2] == 3 and img[2] == 2 and world[1] >= 3 and dtype == other
+    fits = fits and (camera == (3, 3) or camera == (world[0], 3, 3))
+    fits = fits and (world[1] == 9 or not name.endswith("-n9"))
+    if fits:
+        result = solver(*inputs)
+        assert not result.ok.any()  # all at one point
+    else:
+        with pytest.raises(BaseError):
+            solver(*inputs)
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("n", [0, 1, 2])
+def test_fewer_than_three_pairs_are_refused(name, n):
+    with pytest.raises(ShapeError):
+        SOLVERS[name](torch.zeros(2, n, 3), torch.zeros(2, n, 2), torch.eye(3))
+
+
+@many(40)
+@given(batches())
+def test_covariances_take_anything(case):
+    inputs, _, weights, _ = case
+    result = SOLVERS["pnpnet-set"](*inputs)
+    covariance = pose_covariance(result.pose, *inputs, img_sigma=1.0, weights=weights)
+    assert covariance.shape == (len(inputs[0]), 6, 6)
+    assert not covariance.requires_grad
+    assert not covariance[result.ok].isnan().any()
+
+
+@many(40)
+@given(batches())
+def test_matrices_take_anything(case):
+    inputs, _, weights, _ = case
+    matrix = solve_pnp(*inputs, weights)
+    ok = SOLVERS["pnpnet-set"](*inputs, weights).ok
+    assert matrix.isnan().all((1, 2)).equal(~ok)
+    assert matrix[ok].isfinite().all()
+
+
+@pytest.mark.filterwarnings("ignore:There is a performance drop:UserWarning")
+@pytest.mark.parametrize("name", ["pnpnet-n9", "epnp-lm", "reppnp-lm"])  # P3P writes in place what vmap cannot
+def test_vmap_is_a_larger_batch(name):
+    problems = SyntheticProblems(n=9, batch_size=6, seed=0, dtype=torch.float64).batch(0)
+    two = [x.unflatten(0, (2, 3)) for x in problems[:3]]
+    mapped = torch.func.vmap(lambda *x: SOLVERS[name](*x)[:5])(*two)
+    plain = SOLVERS[name](*problems[:3])
+    torch.testing.assert_close(mapped[1].flatten(0, 1), plain.translation, rtol=1e-6, atol=1e-6)
+    assert mapped[4].flatten().equal(plain.ok)
