@@ -19,7 +19,7 @@ $(STAMP): FORCE
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo bench test test-all lint clean FORCE
+.PHONY: help install demo bench test test-all docs lint clean FORCE
 
 help: ## Show this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' Makefile | while IFS='|' read -r name text; do \
@@ -42,6 +42,9 @@ test: lint ## Lint, types and the quick tests
 
 test-all: lint ## Lint, types and every test, the slow ones too
 	OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 $(PY) -m pytest -n $(WORKERS) -m "" $(PYTEST_ARGS)
+
+docs: $(STAMP) ## Build the documentation into site; warnings are errors, as in test-all
+	$(PY) -m sphinx -W --keep-going -b html docs site
 
 lint: $(STAMP) ## ruff and mypy
 	$(PY) -m ruff check .

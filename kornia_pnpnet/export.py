@@ -100,6 +100,11 @@ def export_onnx(solver: PnPNet, path: str | Path, n: int | None = None) -> Path:
         export_program(solver, n), dynamo=True, input_names=list(INPUTS), output_names=list(OUTPUTS), verbose=False
     )
     assert model is not None
+    graph = model.model_proto
+    batches = {value.type.tensor_type.shape.dim[0].dim_param for value in graph.graph.input}
+    if not batches.isdisjoint({"", *map(str, range(10))}):
+        # What is computed with the batch as a number would hold for the batch of the example alone.
+        raise ValueCheckError(f"{type(solver.init).__name__} cannot be exported to ONNX for batches of any size.")
     with atomic_open(path, "wb") as file:
-        file.write(model.model_proto.SerializeToString())
+        file.write(graph.SerializeToString())
     return path

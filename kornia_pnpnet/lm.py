@@ -520,8 +520,7 @@ class RobustWeightedLM(nn.Module):
         pose = Pose(*(x.detach() for x in state.pose))
         batch = pairs.weights.shape[0]
         cost = self._cost(project(pose, starts), starts, starts.weights, shape.detach())
-        count = cost.shape[0] // batch if batch else 1
-        best = cost.view(count, batch).argmin(0)  # (B,), the first of equals
+        best = (cost.view(-1, batch) if batch else cost[None]).argmin(0)  # (B,), the first of equals
         index = torch.add(torch.arange(batch, device=best.device), best, alpha=batch)
 
         def kept(x: Tensor) -> Tensor:

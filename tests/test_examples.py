@@ -20,3 +20,22 @@ def test_keypoint_offsets_are_learned_through_the_pose(tmp_path):
     assert ours[-1] < ours[0] / 10
     assert all(errors[-1] > errors[0] / 2 for errors in others)
     assert runs["pnpnet-set"]["steps_without_finite_gradient"] == 0
+
+
+@pytest.mark.slow
+def test_a_boards_mislabelled_corners_do_not_matter(tmp_path):
+    subprocess.run([sys.executable, EXAMPLES / "fiducial_board.py", "--frames", "20", "--out", tmp_path], check=True)
+    runs = json.loads((tmp_path / "fiducial_board.json").read_text())["runs"]
+    assert (tmp_path / "fiducial_board.png").stat().st_size > 0
+    assert all(row["within_10_mm"] == 1.0 for row in runs["pnpnet-set"].values())
+    assert all(row["median_mm"] < 2.0 for row in runs["pnpnet-set"].values())
+
+
+@pytest.mark.slow
+def test_photos_of_a_scene_are_localised(tmp_path):
+    subprocess.run([sys.executable, EXAMPLES / "localisation.py", "--out", tmp_path], check=True)
+    results = json.loads((tmp_path / "localisation.json").read_text())
+    assert (tmp_path / "localisation.png").stat().st_size > 0
+    found = results["within_1_deg_and_limit"]
+    assert found["pnpnet-set"] == len(results["images"]) == 12
+    assert found["pnpnet-set"] >= found["cv2.solvePnPRansac"]

@@ -274,7 +274,7 @@ class SetInit(nn.Module):
         source = view.points.expand(starts, -1, -1, -1).flatten(0, 1)
         pose, _ = align(source, (ranges[..., None] * view.rays).flatten(0, 1), counts.flatten(0, 1))
         # Problems last, after the hypotheses: (3, 3, S, B) and (3, S, B).
-        rotation, translation = (x.movedim(0, -1).unflatten(-1, (starts, len(right))) for x in pose)
+        rotation, translation = (x.movedim(0, -1).unflatten(-1, (starts, right.shape[0])) for x in pose)
         back = view.camera.permute(2, 1, 0)[:, :, None]
         rotation = small_product(small_product(back, rotation), view.world.permute(1, 2, 0)[:, :, None])
         translation = small_product(back, translation[:, None])[:, 0]

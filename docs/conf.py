@@ -1,0 +1,61 @@
+"""How Sphinx builds the documentation: ``make docs``."""
+
+import re
+from pathlib import Path
+
+from docutils.nodes import SkipNode
+from latex2mathml.converter import convert
+
+import kornia_pnpnet
+
+project = "kornia_pnpnet"
+author = copyright = "The kornia_pnpnet authors"
+version = release = kornia_pnpnet.__version__
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
+exclude_patterns = ["_build", "results/make.py"]
+html_theme = "furo"
+html_title = f"kornia_pnpnet {version}"
+html_math_renderer = "mathml"
+
+myst_enable_extensions = ["dollarmath", "colon_fence"]
+myst_heading_anchors = 3
+# Notebooks are run whenever the pages are built, and a failing one fails the build.
+nb_execution_mode = "cache"
+nb_execution_raise_on_error = True
+nb_execution_timeout = 300
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+autodoc_typehints_format = "short"
+python_use_unqualified_type_names = True
+napoleon_google_docstring = True
+napoleon_use_ivar = True  # else fields of named tuples would be there twice
+
+
+def _math(display):
+    """Formulas as MathML, which browsers draw by themselves."""
+
+    def visit(translator, node):
+        text = convert(node.astext(), display="block" if display else "inline")
+        translator.body.append(f'<div class="math">{text}</div>' if display else text)
+        raise SkipNode
+
+    return visit, None
+
+
+def _outside(app, name, source):
+    """What a page links to outside of the documentation is named by its path in the repository."""
+
+    def named(match):
+        target = (Path(app.srcdir) / name).parent.joinpath(match[2]).resolve()
+        if target.is_relative_to(app.srcdir):
+            return match[0]
+        return f"{match[1]} (`{target.relative_to(Path(app.srcdir).parent)}`)"
+
+    source[0] = re.sub(r"\[([^]]*)\]\(([^):#]+)\)", named, source[0])
+
+
+def setup(app):
+    """Register the way in which formulas are written, and what becomes of links that leave."""
+    app.connect("source-read", _outside)
+    app.add_html_math_renderer("mathml", inline_renderers=_math(False), block_renderers=_math(True))

@@ -1,0 +1,151 @@
+"""A ChArUco board, detected by OpenCV, with corners mislabelled: ``python docs/examples/fiducial_board.py``.
+
+A camera circles over a board, which is drawn in perspective, blurred and noisy. OpenCV finds the corners and says which
+is which; a share of them is then given the number of another one, as happens when markers are misread. The poses by
+`pnpnet-set` and by `cv2.solvePnPRansac` from the same corners, and the camera's path. Writes `fiducial_board.json` and
+`fiducial_board.png` beside this file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from torch.nn.utils.rnn import pad_sequence
+
+from kornia_pnpnet import Pose, create_solver
+from kornia_pnpnet.environment import environment
+from kornia_pnpnet.figures.style import BLUE, ORANGE, make_figure, save, tidy
+from kornia_pnpnet.geometry import rotation_angle
+from kornia_pnpnet.results import save_results
+
+HERE = Path(__file__).resolve().parent
+SQUARES, SQUARE, MARKER = (7, 5), 0.04, 0.03  # metres
+PIXELS_PER_SQUARE, SIZE, FOCAL = 60, (640, 480), 700.0
+CAMERA = np.array([[FOCAL, 0.0, SIZE[0] / 2 - 0.5], [0.0, FOCAL, SIZE[1] / 2 - 0.5], [0.0, 0.0, 1.0]])
+SHARES = (0.0, 0.2, 0.4)
+THRESHOLD_PX = 3.0
+
+
+def path(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations (F, 3, 3) and centres (F, 3) of a camera that circles over the board and looks at its middle."""
+    middle = np.array([SQUARES[0] * SQUARE / 2, SQUARES[1] * SQUARE / 2, 0.0])
+    turn = np.linspace(0.0, 2.0 * math.pi, count, endpoint=False)
+    radius, height = 0.22 + 0.06 * np.sin(3.0 * turn), 0.34 + 0.08 * np.cos(2.0 * turn)
+    # z of the board points away from the camera: OpenCV's boards have y down.
+    centre = middle + np.stack((radius * np.cos(turn), radius * np.sin(turn), -height), -1)
+    forward = middle - centre
+    forward /= np.linalg.norm(forward, axis=-1, keepdims=True)
+    right = np.cross(np.array([0.0, 1.0, 0.0]), forward)
+    right /= np.linalg.norm(right, axis=-1, keepdims=True)
+    return np.stack((right, np.cross(forward, right), forward), 1), centre
+
+
+def photograph(board: Any, rotation: np.ndarray, centre: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """What the camera sees of the board."""
+    width, height = (PIXELS_PER_SQUARE * x for x in SQUARES)
+    drawn = board.generateImage((width, height), marginSize=0)
+    drawn = cv2.copyMakeBorder(drawn, 40, 40, 40, 40, cv2.BORDER_CONSTANT, value=255)
+    # Pixel u of the drawing has its middle at (u + 0.5 - 40) / PIXELS_PER_SQUARE squares.
+    to_board = np.array([[1, 0, -39.5], [0, 1, -39.5], [0, 0, PIXELS_PER_SQUARE / SQUARE]]) * SQUARE / PIXELS_PER_SQUARE
+    to_camera = CAMERA @ np.column_stack((rotation[:, 0], rotation[:, 1], -rotation @ centre))
+    seen = cv2.warpPerspective(drawn, to_camera @ to_board, SIZE, flags=cv2.INTER_AREA, borderValue=150)
+    seen = cv2.GaussianBlur(seen, (0, 0), 0.8).astype(float) + rng.normal(0.0, 4.0, SIZE[::-1])
+    return seen.clip(0, 255).astype(np.uint8)
+
+
+def mislabelled(numbers: np.ndarray, share: float, rng: np.random.Generator) -> np.ndarray:
+    """The numbers of the corners with a share of them exchanged among each other."""
+    wrong = rng.permutation(len(numbers))[: round(share * len(numbers))]
+    numbers = numbers.copy()
+    numbers[wrong] = numbers[np.roll(wrong, 1)]
+    return numbers
+
+
+def opencv(corners: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation and translation by `cv2.solvePnPRansac`, NaN where it finds none."""
+    found, turn, shift, _ = cv2.solvePnPRansac(corners, pixels, CAMERA, None, reprojectionError=THRESHOLD_PX)
+    if not found:
+        return np.full((3, 3), np.nan), np.full(3, np.nan)
+    return cv2.Rodrigues(turn)[0], shift[:, 0]
+
+
+def main() -> None:
+    """Draw, detect, solve, and write what came out."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--frames", type=int, default=60)
+    parser.add_argument("--out", type=Path, default=HERE)
+    options = parser.parse_args()
+    rng = np.random.default_rng(0)
+    board = cv2.aruco.CharucoBoard(SQUARES, SQUARE, MARKER, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50))
+    corners = np.asarray(board.getChessboardCorners(), dtype=np.float64)
+    detector = cv2.aruco.CharucoDetector(board)
+    rotations, centres = path(options.frames)
+    frames = [photograph(board, *view, rng) for view in zip(rotations, centres, strict=True)]
+    seen = []
+    for i, frame in enumerate(frames):
+        pixels, numbers, _, _ = detector.detectBoard(frame)
+        if numbers is not None and len(numbers) >= 6:
+            seen.append((i, pixels.reshape(-1, 2).astype(np.float64), numbers.reshape(-1)))
+    truth = Pose(
+        torch.from_numpy(rotations[[i for i, _, _ in seen]]),
+        torch.from_numpy(-(rotations @ centres[..., None])[[i for i, _, _ in seen], :, 0]),
+    )
+
+    solver = create_solver("pnpnet-set")
+    runs: dict[str, dict[str, Any]] = {}
+    paths = {}
+    for share in SHARES:
+        labels = [mislabelled(numbers, share, rng) for _, _, numbers in seen]
+        pairs = [(torch.from_numpy(corners[x]), torch.from_numpy(y)) for x, (_, y, _) in zip(labels, seen, strict=True)]
+        world, img = (pad_sequence(list(x), batch_first=True) for x in zip(*pairs, strict=True))
+        mask = torch.arange(world.shape[1]) < torch.tensor([len(x) for x, _ in pairs])[:, None]
+        with torch.no_grad():
+            ours = solver(world, img, torch.from_numpy(CAMERA), mask=mask).pose
+        answers = [opencv(a.numpy(), b.numpy()) for a, b in pairs]
+        theirs = Pose(*(torch.from_numpy(np.stack(x)) for x in zip(*answers, strict=True)))
+        for name, pose in (("pnpnet-set", ours), ("cv2.solvePnPRansac", theirs)):
+            centre = -(pose.rotation.mT @ pose.translation[..., None])[..., 0]
+            away = 1000.0 * (centre - torch.from_numpy(centres[[i for i, _, _ in seen]])).norm(dim=-1)
+            angle = torch.rad2deg(rotation_angle(pose.rotation, truth.rotation))
+            runs.setdefault(name, {})[f"{share:.0%}"] = {
+                "median_mm": away.nanmedian().item(),
+                "median_deg": angle.nanmedian().item(),
+                "within_10_mm": (away < 10.0).double().mean().item(),
+            }
+            paths[name] = centre
+    results = {"environment": environment(), "frames": len(seen), "runs": runs}
+    options.out.mkdir(parents=True, exist_ok=True)
+    save_results(results, options.out / "fiducial_board.json")
+
+    figure = make_figure(8.0, 3.4)
+    left, right = figure.subplots(1, 2)
+    left.imshow(frames[seen[0][0]], cmap="gray")
+    left.scatter(*seen[0][1].T, s=9, color=BLUE)
+    left.set_axis_off()
+    left.set_title("a frame with OpenCV's corners", loc="left")
+    right.plot(*centres[:, :2].T, color="black", linewidth=0.8, label="true path")
+    for (name, found), colour, mark in zip(paths.items(), (BLUE, ORANGE), ("o", "x"), strict=True):
+        right.plot(*found[:, :2].mT, mark, color=colour, markersize=4, fillstyle="none", linestyle="none", label=name)
+    span = 1.3 * np.abs(centres[:, :2] - centres[:, :2].mean(0)).max()
+    middle = centres[:, :2].mean(0)
+    right.set(xlim=(middle[0] - span, middle[0] + span), ylim=(middle[1] - span, middle[1] + span), xlabel="x (m)")
+    right.set_aspect("equal")
+    right.set_title(f"camera, {SHARES[-1]:.0%} of the corners mislabelled", loc="left")
+    right.legend(frameon=False, fontsize=7)
+    tidy(right)
+    save(figure, options.out / "fiducial_board.png")
+    for name, found in runs.items():
+        for share, row in found.items():
+            print(
+                f"{name}, {share} mislabelled: {row['within_10_mm']:.0%} within 10 mm, median {row['median_mm']:.2f} mm"
+            )
+
+
+if __name__ == "__main__":
+    main()

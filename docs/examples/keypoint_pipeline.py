@@ -1,0 +1,276 @@
+"""From images to poses, trained end to end: ``python docs/examples/keypoint_pipeline.py``.
+
+A textured box is rendered under random poses, before a random background, behind occluders, blurred and noisy. A small
+network finds its 14 keypoints (Kornia's spatial softmax and expectation) and says of each how sure it is; `PnPNet`
+makes a pose of them. First the network learns where keypoints are. Then two copies go on for as long: one with the
+keypoint loss alone, the other with the loss of the pose, too, whose gradient comes through the solver. Both are tested
+with the same solver on images that neither saw. Writes `keypoint_pipeline.json` and pictures beside this file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from kornia.filters import gaussian_blur2d
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+from kornia.geometry.subpix import spatial_expectation2d, spatial_softmax2d
+from torch import Tensor, nn
+from torch.nn import functional
+
+from kornia_pnpnet import PnPResult, Pose, create_solver
+from kornia_pnpnet.environment import environment
+from kornia_pnpnet.figures.style import BLUE, ORANGE, make_figure, save, tidy
+from kornia_pnpnet.geometry import rotation_angle
+from kornia_pnpnet.results import save_results
+
+HERE = Path(__file__).resolve().parent
+SIZE, FOCAL, BATCH = 64, 90.0, 32
+CAMERA = torch.tensor([[FOCAL, 0.0, (SIZE - 1) / 2], [0.0, FOCAL, (SIZE - 1) / 2], [0.0, 0.0, 1.0]])
+HALF = torch.tensor([0.5, 0.4, 0.3])
+CORNERS = torch.tensor([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+CENTRES = torch.cat((torch.eye(3), -torch.eye(3)))
+KEYPOINTS = torch.cat((CORNERS, CENTRES)) * HALF  # (14, 3)
+EDGES = [(i, j) for i in range(8) for j in range(i) if (CORNERS[i] != CORNERS[j]).sum() == 1]
+TEXTURES = 8
+# A pose that is farther off than this counts as far off: keypoints a third of the box away.
+MOST = 0.3
+
+
+class Images(NamedTuple):
+    """Images (B, 3, SIZE, SIZE), the true pose and the true pixels of the keypoints (B, 14, 2)."""
+
+    images: Tensor
+    pose: Pose
+    pixels: Tensor
+
+
+def draw(seed: int, index: int, batch: int = BATCH) -> Images:
+    """The images of a batch: the same for the same seed and index."""
+    generator = torch.Generator().manual_seed(1_000_003 * seed + index)
+
+    def uniform(*shape: int, low: float = 0.0, high: float = 1.0) -> Tensor:
+        return low + (high - low) * torch.rand(*shape, generator=generator)
+
+    axis = functional.normalize(torch.randn(batch, 3, generator=generator), dim=-1)
+    rotation = axis_angle_to_rotation_matrix(axis * uniform(batch, 1, high=math.radians(75.0)))
+    translation = torch.cat((uniform(batch, 2, low=-0.35, high=0.35), uniform(batch, 1, low=2.2, high=3.4)), -1)
+    pose = Pose(rotation, translation)
+    images, hit = render(pose)
+    background = functional.interpolate(uniform(batch, 3, 5, 5), (SIZE, SIZE), mode="bicubic", align_corners=True)
+    images = torch.where(hit[:, None], images, background)
+    row, column = torch.meshgrid(torch.arange(SIZE), torch.arange(SIZE), indexing="ij")
+    for _ in range(3):
+        centre, half = uniform(batch, 2, low=8.0, high=SIZE - 8.0), uniform(batch, 2, low=2.0, high=10.0)
+        inside = ((row - centre[:, :1, None]).abs() < half[:, :1, None]) & (
+            (column - centre[:, 1:, None]).abs() < half[:, 1:, None]
+        )
+        images = torch.where(inside[:, None], uniform(batch, 3, 1, 1), images)
+    images = gaussian_blur2d(images, (5, 5), uniform(batch, 1, low=0.4, high=1.2).expand(-1, 2))
+    images = images + 0.04 * torch.randn(images.shape, generator=generator)
+    return Images(images - 0.5, pose, project(pose, KEYPOINTS))
+
+
+def project(pose: Pose, points: Tensor) -> Tensor:
+    """Pixels (B, K, 2) of points of the box."""
+    cam = points @ pose.rotation.mT + pose.translation[:, None]
+    return FOCAL * cam[..., :2] / cam[..., 2:] + CAMERA[:2, 2]
+
+
+def render(pose: Pose) -> tuple[Tensor, Tensor]:
+    """The box by the ray of each pixel: colours (B, 3, SIZE, SIZE), and where it is."""
+    generator = torch.Generator().manual_seed(7)
+    textures = torch.rand(6, 3, TEXTURES, TEXTURES, generator=generator) + torch.rand(6, 3, 1, 1, generator=generator)
+    textures = 0.5 * textures  # each side with a colour of its own
+    row, column = torch.meshgrid(torch.arange(float(SIZE)), torch.arange(float(SIZE)), indexing="ij")
+    rays = torch.stack((column, row, torch.ones_like(row)), -1).view(-1, 3) @ torch.linalg.inv(CAMERA).mT
+    direction = rays @ pose.rotation  # in the box's axes, (B, P, 3)
+    origin = -(pose.translation[:, None] @ pose.rotation)  # (B, 1, 3)
+    direction = torch.where(direction.abs() < 1e-6, 1e-6, direction)
+    near = (-HALF * direction.sign() - origin) / direction
+    far = (HALF * direction.sign() - origin) / direction
+    enter, side = near.max(-1)
+    hit = enter < far.amin(-1)
+    point = (origin + enter[..., None] * direction) / HALF  # on the surface, one entry is -1 or 1
+    face = side + 3 * (direction.gather(-1, side[..., None])[..., 0] > 0)
+    across = torch.stack(
+        (point.gather(-1, ((side + 1) % 3)[..., None]), point.gather(-1, ((side + 2) % 3)[..., None])), -1
+    )
+    cell = (0.5 * (across[..., 0, :] + 1.0) * TEXTURES).long().clamp(0, TEXTURES - 1)
+    colour = textures[face, :, cell[..., 0], cell[..., 1]]  # (B, P, 3)
+    light = 0.6 + 0.4 * direction.gather(-1, side[..., None]).abs() / direction.norm(dim=-1, keepdim=True)
+    shape = (-1, SIZE, SIZE)
+    return (colour * light).mT.unflatten(-1, (SIZE, SIZE)), hit.view(shape)
+
+
+class Keypoints(nn.Module):
+    """Pixels (B, 14, 2) of the keypoints, and for each how much it is to count, in [0, 1]."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        count = len(KEYPOINTS)
+
+        def block(size_in: int, size_out: int, stride: int) -> nn.Sequential:
+            layer = nn.Conv2d(size_in, size_out, 3, stride, 1, bias=False)
+            return nn.Sequential(layer, nn.GroupNorm(8, size_out), nn.ReLU())
+
+        self.first = block(3, 16, 1)
+        self.down = nn.ModuleList([block(16, 32, 2), block(32, 64, 2), block(64, 96, 2), block(96, 96, 2)])
+        self.up = nn.ModuleList([block(96 + 96, 64, 1), block(64 + 64, 48, 1), block(48 + 32, 48, 1)])
+        self.heads = nn.Conv2d(48, 2 * count, 1)
+
+    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        x = self.first(images)
+        kept = []
+        for layer in self.down:
+            x = layer(x)
+            kept.append(x)
+        for layer, skip in zip(self.up, kept[-2::-1], strict=True):
+            x = layer(torch.cat((functional.interpolate(x, scale_factor=2.0), skip), 1))
+        heat, sure = self.heads(x).chunk(2, 1)  # (B, 14, SIZE / 2, SIZE / 2) each
+        share = spatial_softmax2d(heat)
+        pixels = 2.0 * spatial_expectation2d(share, normalized_coordinates=False) + 0.5
+        return pixels, torch.sigmoid((share * sure).sum((-2, -1)))
+
+
+def solve(solver: nn.Module, pixels: Tensor, weights: Tensor | None) -> PnPResult:
+    """Poses of the box from its keypoints."""
+    result: PnPResult = solver(KEYPOINTS.expand(len(pixels), -1, -1), pixels, CAMERA, weights)
+    return result
+
+
+def distance(pose: Pose, truth: Pose) -> Tensor:
+    """How far the keypoints are from where they should be, the mean over all of them, (B,)."""
+    off = KEYPOINTS @ (pose.rotation - truth.rotation).mT + (pose.translation - truth.translation)[:, None]
+    return (off.square().sum(-1) + 1e-12).sqrt().mean(-1)
+
+
+def train(
+    network: Keypoints, solver: nn.Module | None, seed: int, updates: range, log: list[tuple[float, float | None]]
+) -> None:
+    """Go on with the keypoint loss, and with a solver with that of the pose, too."""
+    optimizer = torch.optim.AdamW(network.parameters(), lr=2e-3, weight_decay=1e-4)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 2e-3, total_steps=len(updates), pct_start=0.1)
+    for index in updates:
+        problem = draw(seed, index)
+        pixels, weights = network(problem.images)
+        keypoint_loss = functional.smooth_l1_loss(pixels, problem.pixels)
+        loss, off = keypoint_loss, None
+        if solver is not None:
+            result = solve(solver, pixels, weights)
+            error = distance(result.pose, problem.pose)
+            counts = result.ok & (error.detach() < 10.0 * MOST)
+            # Saturated: a pose that is far off has little to say about pixels.
+            loss = loss + 20.0 * torch.where(counts, error / (1.0 + error / MOST), 0.0).mean()
+            off = round(error.detach().median().item(), 5)
+        optimizer.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        optimizer.step()
+        schedule.step()
+        log.append((round(keypoint_loss.item(), 5), off))
+
+
+@torch.no_grad()
+def test(network: Keypoints, solver: nn.Module, *, weighted: bool, batches: int) -> dict[str, float]:
+    """Errors on images of a seed that no training uses."""
+    distances, angles, offs = [], [], []
+    for index in range(batches):
+        problem = draw(999_983, index)
+        pixels, weights = network(problem.images)
+        result = solve(solver, pixels, weights if weighted else None)
+        distances.append(distance(result.pose, problem.pose))
+        angles.append(torch.rad2deg(rotation_angle(result.rotation, problem.pose.rotation)))
+        offs.append((pixels - problem.pixels).norm(dim=-1).mean(-1))
+    off, angle, pixel = torch.cat(distances), torch.cat(angles), torch.cat(offs)
+    return {
+        "mean_distance": off.clamp(max=1.0).mean().item(),
+        "median_distance": off.median().item(),
+        "mean_rotation_deg": angle.mean().item(),
+        "median_rotation_deg": angle.median().item(),
+        "mean_keypoint_px": pixel.mean().item(),
+    }
+
+
+def run(seed: int, updates: int, batches: int) -> tuple[dict[str, Any], dict[str, Keypoints]]:
+    """Train both from one start."""
+    torch.manual_seed(seed)
+    solver = create_solver("pnpnet-set").requires_grad_(False)
+    start, before = Keypoints(), []
+    train(start, None, seed, range(updates), before)
+    found: dict[str, Any] = {"keypoints first": {"history": before}}
+    networks = {}
+    for name, end in (("keypoint loss alone", None), ("end to end", solver)):
+        networks[name], history = copy.deepcopy(start), []
+        train(networks[name], end, seed, range(updates, 2 * updates), history)
+        found[name] = {"history": history, **test(networks[name], solver, weighted=end is not None, batches=batches)}
+        print(
+            f"seed {seed}, {name}: {found[name]['mean_distance']:.4f} {found[name]['median_distance']:.4f} ", flush=True
+        )
+    return found, networks
+
+
+def plot_errors(results: dict[str, Any], path: Path) -> None:
+    """The errors of each seed, and their means."""
+    figure = make_figure(7.0, 3.2)
+    names = ("keypoint loss alone", "end to end")
+    parts = (("mean_distance", "mean distance of keypoints"), ("mean_rotation_deg", "mean rotation error (°)"))
+    for axes, (key, label) in zip(figure.subplots(1, 2), parts, strict=True):
+        for x, (name, colour) in enumerate(zip(names, (ORANGE, BLUE), strict=True)):
+            values = [found[name][key] for found in results["seeds"].values()]
+            axes.bar(x, sum(values) / len(values), color=colour, alpha=0.4, width=0.6)
+            axes.plot([x] * len(values), values, "o", color=colour)
+        axes.set_xticks(range(2), ("keypoint loss\nalone", "end to end"))
+        axes.set_ylabel(label)
+        tidy(axes)
+    save(figure, path)
+
+
+@torch.no_grad()
+def plot_overlays(networks: dict[str, Keypoints], path: Path, count: int = 6) -> None:
+    """The box as it is and as it is found, over test images."""
+    solver = create_solver("pnpnet-set")
+    problem = draw(999_983, 0)
+    figure = make_figure(9.0, 3.2)
+    for row, (name, network) in zip(figure.subplots(2, count), networks.items(), strict=True):
+        pixels, weights = network(problem.images)
+        result = solve(solver, pixels, weights if name == "end to end" else None)
+        found, truth = (project(pose, KEYPOINTS) for pose in (result.pose, problem.pose))
+        for i, axes in enumerate(row):
+            axes.imshow((problem.images[i] + 0.5).clamp(0, 1).permute(1, 2, 0))
+            for corners, colour in ((truth, "white"), (found, BLUE if name == "end to end" else ORANGE)):
+                for a, b in EDGES:
+                    axes.plot(*corners[i, [a, b]].mT, color=colour, linewidth=1.0)
+            axes.scatter(*pixels[i].mT, s=4.0 + 16.0 * weights[i] if name == "end to end" else 8.0, color="black")
+            axes.set_xlim(0, SIZE - 1)
+            axes.set_ylim(SIZE - 1, 0)
+            axes.set_axis_off()
+        row[0].set_title(name, loc="left", fontsize=8)
+    save(figure, path)
+
+
+def main() -> None:
+    """Train with every seed, write the results and draw them."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--updates", type=int, default=2000, help="of each half of the training")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--batches", type=int, default=32, help="of test images")
+    parser.add_argument("--out", type=Path, default=HERE)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    seeds, networks = {}, {}
+    for seed in range(options.seeds):
+        seeds[str(seed)], networks = run(seed, options.updates, options.batches)
+    results = {"environment": environment(), "updates": options.updates, "seeds": seeds}
+    options.out.mkdir(parents=True, exist_ok=True)
+    save_results(results, options.out / "keypoint_pipeline.json")
+    plot_errors(results, options.out / "keypoint_pipeline.png")
+    plot_overlays(networks, options.out / "keypoint_pipeline_overlays.png")
+
+
+if __name__ == "__main__":
+    main()
