@@ -54,7 +54,8 @@ def export_program(solver: PnPNet, n: int | None = None) -> torch.export.Exporte
         ValueCheckError: when the solver has no graph.
 
     Example:
-        >>> program = export_program(PnPNet(MLPInit(n=6)))
+        >>> from kornia_pnpnet import RobustWeightedLM
+        >>> program = export_program(PnPNet(MLPInit(n=6), RobustWeightedLM(m=1)))
         >>> inputs = torch.ones(5, 6, 3), torch.ones(5, 6, 2), torch.eye(3).expand(5, 3, 3), torch.ones(5, 6)
         >>> dict(zip(OUTPUTS, program.module()(*inputs)))["ok"]
         tensor([False, False, False, False, False])

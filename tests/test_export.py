@@ -30,6 +30,7 @@ def near(found, solver, inputs):
     assert cost.isfinite().all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["pnpnet-n9", "epnp-lm", "reppnp-lm", "identity-lm"])
 def test_programs(name, make_problems):
     solver = create_solver(name)

@@ -20,12 +20,22 @@ LAYERS = (
     ("normalize", "lm", "init", "data", "covariance"),
     ("model", "losses"),
     ("registry", "peers", "bounds", "__init__"),
-    ("results", "evaluation", "complexity", "runstate", "training", "choices", "reports"),
+    ("results", "evaluation", "complexity", "runstate", "training", "choices", "reports", "shards", "export"),
     ("figures", "arguments", "cli", "demo"),
 )
 
 #: What importing the package must not import: the extras, which a user of the layer need not have.
-EXTRAS = ("cv2", "hydra", "lightning_fabric", "matplotlib", "omegaconf", "poselib", "pycolmap", "tensorboard")
+EXTRAS = (
+    "cv2",
+    "hydra",
+    "lightning_fabric",
+    "matplotlib",
+    "omegaconf",
+    "poselib",
+    "pyarrow",
+    "pycolmap",
+    "tensorboard",
+)
 
 #: Optional packages and the only modules that may import them.
 OWNERS = {
@@ -34,6 +44,8 @@ OWNERS = {
     "cv2": {"peers"},
     "pycolmap": {"data.colmap", "peers"},
     "poselib": {"peers"},
+    "pyarrow": {"shards"},
+    "onnxscript": {"export"},
 }
 
 
