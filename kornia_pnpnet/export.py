@@ -19,7 +19,8 @@ __all__ = ["INPUTS", "OUTPUTS", "export_onnx", "export_program"]
 
 #: Names of the inputs of an exported solver, in their order, all float32.
 INPUTS = ("world_points", "img_points", "intrinsics", "weights")
-#: Names of its outputs: fields of :class:`~kornia_pnpnet.types.PnPResult`; ``ok`` is bool.
+#: Names of its outputs: fields of :class:`~kornia_pnpnet.types.PnPResult`, of which ``pair_weights`` is ``weights``: in
+#: ONNX no output has the name of an input. ``ok`` is bool.
 OUTPUTS = ("rotation", "translation", "pair_weights", "cost", "ok")
 _MOST_PAIRS = 65_536
 

@@ -197,7 +197,8 @@ class PnPNet(nn.Module):
             DeviceError: for tensors on different devices.
         """
         inputs = _prepared(world_points, img_points, intrinsics, weights, mask, init, img_sigma, world_sigma)
-        parts = list(zip(*(_split(x, self._portions(world_points)) for x in inputs), strict=True))
+        portions = self._portions(world_points)
+        parts = list(zip(*(_split(x, portions) for x in inputs), strict=True))
         with torch.autocast(world_points.device.type, enabled=False):
             results = [self._solve(first_stage_only, *part) for part in parts]
         if len(results) == 1:

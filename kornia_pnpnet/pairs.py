@@ -5,8 +5,9 @@ from __future__ import annotations
 import csv
 import io
 import math
+from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import IO, NamedTuple
 
 import numpy as np
 import torch
@@ -16,7 +17,17 @@ from torch import Tensor
 from kornia_pnpnet.geometry import transform
 from kornia_pnpnet.types import Pose
 
-__all__ = ["Pairs", "PairsError", "camera_matrix", "checked_camera", "read_pairs", "rejection_limit", "reprojections"]
+__all__ = [
+    "Pairs",
+    "PairsError",
+    "camera_matrix",
+    "check_present",
+    "checked_camera",
+    "read_arrays",
+    "read_pairs",
+    "rejection_limit",
+    "reprojections",
+]
 
 _COLUMNS = ("X", "Y", "Z", "u", "v")
 _WEIGHT = "weight"
@@ -176,16 +187,35 @@ def _row(path: Path, line: int, header: list[str], cells: list[str]) -> list[flo
     return numbers
 
 
-def _read_npz(path: Path, content: bytes) -> Pairs:
+def read_arrays(path: Path, stream: IO[bytes], names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Read those arrays of an NPZ file that are there.
+
+    Args:
+        path: of the file, for messages.
+        stream: its content.
+        names: of the arrays; ``world_points`` and ``img_points`` have to be there.
+
+    Raises:
+        PairsError: when it is not such a file, or one of the two is missing. Nothing is unpickled.
+    """
     try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as file:
-            names = ("world_points", "img_points", "weights", "intrinsics")
+        with np.load(stream, allow_pickle=False) as file:
             arrays = {name: np.asarray(file[name]) for name in names if name in file.files}
     except Exception as error:  # numpy, zipfile and zlib have a dozen ways to say that a file is broken
         raise PairsError(path, f"not an NPZ file of plain arrays: {error}") from None
+    check_present(path, arrays, "array")
+    return arrays
+
+
+def check_present(path: Path, arrays: Collection[str], kind: str) -> None:
+    """Raise a :class:`PairsError` where points or pixels are missing; ``kind`` is what they are called in the file."""
     for name in ("world_points", "img_points"):
         if name not in arrays:
-            raise PairsError(path, f"no array {name}")
+            raise PairsError(path, f"no {kind} {name}")
+
+
+def _read_npz(path: Path, content: bytes) -> Pairs:
+    arrays = read_arrays(path, io.BytesIO(content), ("world_points", "img_points", "weights", "intrinsics"))
     count = len(arrays["world_points"]) if arrays["world_points"].ndim else 0
     shapes = {"world_points": (count, 3), "img_points": (count, 2), "weights": (count,), "intrinsics": (3, 3)}
     for name, array in arrays.items():

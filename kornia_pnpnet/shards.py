@@ -14,7 +14,7 @@ from kornia.core.exceptions import BaseError
 from torch import Tensor, nn
 
 from kornia_pnpnet.files import atomic_open
-from kornia_pnpnet.pairs import PairsError, checked_camera
+from kornia_pnpnet.pairs import PairsError, check_present, checked_camera, read_arrays
 from kornia_pnpnet.types import PnPResult
 
 __all__ = ["SUFFIXES", "ShardReport", "solve_shards"]
@@ -144,10 +144,10 @@ def _claim(out: Path, name: str, solver: nn.Module, *, overwrite: bool) -> None:
 
 def _solve_npz(solver: nn.Module, shard: Path, target: Path, intrinsics: Tensor | None, batch: int) -> tuple[int, int]:
     try:
-        with shard.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            arrays = {key: np.asarray(file[key]) for key in _NUMBERS if key in file.files}
-    except Exception as error:  # numpy, zipfile and zlib have a dozen ways to say that a file is broken
-        raise PairsError(shard, f"not an NPZ file of plain arrays: {error}") from None
+        with shard.open("rb") as stream:
+            arrays = read_arrays(shard, stream, _NUMBERS)
+    except OSError as error:
+        raise PairsError(shard, error.strerror or str(error)) from None
     tensors = _tensors(shard, arrays, intrinsics)
     results = list(_solve(solver, shard, tensors, batch))
     parts = {key: np.concatenate([getattr(x, key).numpy() for x in results]) for key in _RESULTS}
@@ -158,9 +158,6 @@ def _solve_npz(solver: nn.Module, shard: Path, target: Path, intrinsics: Tensor 
 
 def _tensors(source: Path, arrays: dict[str, np.ndarray], intrinsics: Tensor | None) -> dict[str, Tensor]:
     """Checked inputs in float32. What is not finite is its problem's own affair, which is then not ok."""
-    for key in ("world_points", "img_points"):
-        if key not in arrays:
-            raise PairsError(source, f"no array {key}")
     shape = arrays["world_points"].shape
     if len(shape) != 3 or shape[2] != 3 or shape[1] < 3:
         raise PairsError(source, f"world_points must have the shape (B, N, 3) with N at least 3, got {shape}")
@@ -241,9 +238,7 @@ def _solve_parquet(
 
 def _padded(source: Path, columns: dict[str, list[Any]]) -> tuple[dict[str, np.ndarray], list[int]]:
     """Problems of different numbers of pairs as arrays with padding of the weight 0, and these numbers."""
-    for key in ("world_points", "img_points"):
-        if key not in columns:
-            raise PairsError(source, f"no column {key}")
+    check_present(source, columns, "column")
     sizes = [len(x or ()) // 3 for x in columns["world_points"]]
     longest, count = max([*sizes, 3]), len(sizes)
     widths = {"world_points": 3, "img_points": 2, "weights": 1}

@@ -1,6 +1,10 @@
 """The set network: what it must not depend on, what it must pass on, and what a few steps of training make of it."""
 
 import math
+import os
+import platform
+import subprocess
+import sys
 from itertools import combinations
 
 import pytest
@@ -299,3 +303,28 @@ def test_large_batches_are_solved_in_parts(told, make_problems, monkeypatch):
     assert isinstance(parts.init, Pose)
     near([*parts[:4], *parts.init], [*whole[:4], *whole.init], 1e-9)
     assert parts.ok.equal(whole.ok)
+
+
+_FAULTS = """
+import resource
+import torch
+from kornia_pnpnet import create_solver
+torch.set_num_threads(1)
+solver = create_solver("pnpnet-set")
+inputs = torch.randn(1000, 9, 3), torch.randn(1000, 9, 2), torch.eye(3)
+with torch.no_grad():
+    for _ in range(3):
+        solver(*inputs)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(10):
+        solver(*inputs)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another allocator")
+def test_memory_of_a_call_serves_the_next():
+    """Ten calls ask the system for hardly any pages; without care each would ask for thousands."""
+    plain = {key: value for key, value in os.environ.items() if not key.startswith(("MALLOC_", "LD_PRELOAD", "GLIBC"))}
+    done = subprocess.run([sys.executable, "-c", _FAULTS], capture_output=True, text=True, check=True, env=plain)
+    assert int(done.stdout) < 2000

@@ -131,7 +131,10 @@ def _solve_chunk(world_points: Tensor, plane_points: Tensor) -> tuple[list[Tenso
 
 
 def _solve(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Tensor]:
-    """Components of rotations and translations, (12, 4, B), and which of them are solutions, (4, B), in chunks."""
+    """Components of rotations and translations, (12, 4, B), and which of them are solutions, (4, B).
+
+    In chunks that fit into a core's caches; a compiler's loops need none.
+    """
     batch = world_points.shape[0]
     if torch.compiler.is_compiling():
         entries, found = _solve_chunk(world_points, plane_points)

@@ -31,6 +31,8 @@ _SAMPLES = ((0, 1, 2), (0, 1, 3), (2, 3, 4), (2, 3, 5), (0, 4, 5), (1, 4, 5), (0
 _SPREADS = {18: 3, 24: 4, 30: 5}
 # So many of the likeliest pairs say how good the pose of a sample is: squared residuals count to this many variances.
 MOST_JUDGES, _JUDGED = 32, 50.0
+# Somewhat below the most that glibc's threshold follows.
+_LARGEST_KEPT = 2**25 - 2**16
 # The vote of a pair that is surely wrong, of one that is surely right it is 1.
 _LEAST_VOTE = 0.5
 
@@ -47,6 +49,17 @@ _taken_whole = torch.library.custom_op("kornia_pnpnet::taken", _taken, mutates_a
 @_taken_whole.register_fake
 def _(values: Tensor, index: Tensor) -> Tensor:
     return values.new_empty(values.shape[-1], index.shape[1], index.shape[0])
+
+
+def _keep_freed_memory() -> None:
+    """Let glibc keep the memory of large temporaries for the next call.
+
+    Else each call asks the system for it anew, page by page, which takes up to a quarter of the time on a CPU. Memory
+    of the size that was once freed is no longer given back, up to 32 MiB, nor is the twofold of that in all:
+    mallopt(3), M_MMAP_THRESHOLD. These bytes are never touched. Other allocators, and a glibc whose thresholds were
+    set, stay as they are.
+    """
+    torch.empty(_LARGEST_KEPT, dtype=torch.uint8, device="cpu")
 
 
 class _View:
@@ -209,7 +222,7 @@ class SetInit(nn.Module):
     """
 
     #: More are solved in several parts where nothing speaks against it: this many stay in the caches of a core.
-    pairs_at_once = 8000
+    pairs_at_once = 12_000
 
     def __init__(
         self,
@@ -244,6 +257,7 @@ class SetInit(nn.Module):
             for layer in (self.pair, self.problem):
                 layer.bias.zero_()
             self.pair.bias[0] = 2.0
+        _keep_freed_memory()
 
     def extra_repr(self) -> str:
         """Show the constructor's arguments."""
