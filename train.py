@@ -67,7 +67,7 @@ def main(config: DictConfig) -> float | None:
             resume=config.resume,
             progress=config.progress,
         )
-    except TrainingError as error:
+    except (TrainingError, OSError) as error:
         if runtime.mode == RunMode.MULTIRUN:
             raise  # the sweep goes on with its other runs
         log.error("%s", error)

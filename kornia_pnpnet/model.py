@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Callable
@@ -28,6 +29,7 @@ __all__ = ["PnPNet", "find_weights", "shipped_weights"]
 
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 CONFIG_NAME, WEIGHTS_NAME = "config.json", "model.safetensors"
+_FINGERPRINT = "sha256"  # a key of the metadata in the file of the weights
 _INITIALISERS: dict[str, type[nn.Module]] = {
     "EPnP": EPnP,
     "MLPInit": MLPInit,
@@ -423,7 +425,7 @@ class PnPNet(nn.Module):
             raise ValueCheckError(f"{config['init']['name']} cannot be saved, only {sorted(_INITIALISERS)} can.")
         state = {name: value.detach().cpu().contiguous() for name, value in self.state_dict().items()}
         with atomic_open(Path(folder) / WEIGHTS_NAME, "wb") as file:
-            file.write(save(state))
+            file.write(save(state, {"format": "pt", _FINGERPRINT: _fingerprint(config, state)}))
         with atomic_open(Path(folder) / CONFIG_NAME) as file:
             file.write(json.dumps(config, indent=2) + "\n")
 
@@ -443,20 +445,33 @@ class PnPNet(nn.Module):
             ValueCheckError: when the files are damaged or of another model.
         """
         folder = find_weights(name_or_folder)
-        from safetensors import SafetensorError
-        from safetensors.torch import load_file
+        from safetensors import SafetensorError, safe_open
 
         try:
             config = json.loads((folder / CONFIG_NAME).read_text())
-            state = load_file(folder / WEIGHTS_NAME)
+            with safe_open(folder / WEIGHTS_NAME, "pt") as file:
+                metadata = file.metadata() or {}
+                state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         except (OSError, ValueError, SafetensorError) as error:
             raise ValueCheckError(f"Cannot read the weights in {folder}: {error}") from error
+        if metadata.get(_FINGERPRINT, _fingerprint(config, state)) != _fingerprint(config, state):
+            raise ValueCheckError(
+                f"The weights in {folder} are damaged: {CONFIG_NAME} and {WEIGHTS_NAME} do not match."
+            )
         model = cls.from_config(config)
         try:
             model.load_state_dict(state)
         except RuntimeError as error:
             raise ValueCheckError(f"The weights in {folder} are of another model: {error}") from error
         return model.eval()
+
+
+def _fingerprint(config: Any, state: dict[str, Tensor]) -> str:
+    """What tells whether a configuration and weights are those that were saved together."""
+    digest = hashlib.sha256(json.dumps(config, sort_keys=True).encode())
+    for name, value in sorted(state.items()):
+        digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode() + value.numpy().tobytes())
+    return digest.hexdigest()
 
 
 def find_weights(name_or_folder: str | Path) -> Path:

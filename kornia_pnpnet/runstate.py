@@ -95,6 +95,11 @@ class StageClock:
         return {stage: seconds / whole if whole > 0.0 else 0.0 for stage, seconds in spent.items()}
 
 
+def _whole(row: dict[str, str | None]) -> bool:
+    """Whether a row was written to its end, which a full disk or a crash prevents."""
+    return None not in row.values() and (row["update"] or "").isdigit()
+
+
 class History:
     """Learning curves in one CSV file and TensorBoard.
 
@@ -110,7 +115,7 @@ class History:
         rows: list[dict[str, Any]] = []
         if start and self._path.is_file():
             with self._path.open(newline="") as file:
-                rows = [row for row in csv.DictReader(file) if int(row["update"]) <= start]
+                rows = [row for row in csv.DictReader(file) if _whole(row) and int(row["update"]) <= start]
         with atomic_open(self._path, newline="") as file:
             writer = csv.DictWriter(file, columns, restval="", extrasaction="ignore")
             writer.writeheader()

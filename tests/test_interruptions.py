@@ -1,0 +1,208 @@
+"""Processes that die, disks that are full, files that are damaged: nothing that was saved is lost."""
+
+import contextlib
+import csv
+import json
+import multiprocessing
+import random
+import resource
+import shutil
+import sys
+import time
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from kornia.core.exceptions import ValueCheckError
+
+from kornia_pnpnet import MLPInit, PnPNet, PoseLoss, RobustWeightedLM, create_solver
+from kornia_pnpnet.data import SyntheticProblems
+from kornia_pnpnet.runstate import CHECKPOINT_NAME, HISTORY_NAME, save_checkpoint
+from kornia_pnpnet.shards import solve_shards
+from kornia_pnpnet.training import TrainSettings, fit
+
+KILLS = 20
+# Python 3.12 warns of every fork of a process with threads, which pytest-xdist's are.
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning"),
+    pytest.mark.skipif(sys.platform != "linux", reason="forks"),
+]
+
+
+class Then(PoseLoss):
+    """Has something happen at the given update."""
+
+    def __init__(self, update=-1, what=None):
+        super().__init__()
+        self.left, self.what = update, what
+
+    def forward(self, *args, **kwargs):
+        self.left -= 1
+        if self.left == 0:
+            self.what()
+        return super().forward(*args, **kwargs)
+
+
+def train(folder, updates=40, resume=False, loss=None):
+    torch.manual_seed(0)
+    model = PnPNet(MLPInit(6), RobustWeightedLM(2))
+    problems = SyntheticProblems(n=6, batch_size=16, seed=3)
+    ends = TrainSettings(updates, warmup=1, log_every=1, validate_every=50, checkpoint_every=5, ramp=(0.2, 0.5))
+    validation = {"none": SyntheticProblems(n=6, batch_size=32, seed=4).batch(0)}
+    fit(model, problems, validation, loss or Then(), ends, folder, resume=resume, progress=False)
+
+
+def state(folder):
+    saved = torch.load(folder / CHECKPOINT_NAME, weights_only=True)
+    with (folder / HISTORY_NAME).open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    timed = ("updates_per_second", "peak_memory_mib")
+    kept = [key for key in rows[0] if key not in timed and not key.endswith("_share")]
+    return saved["model"], [{key: row[key] for key in kept} for row in rows]
+
+
+def in_a_process(function, *arguments):
+    process = multiprocessing.get_context("fork").Process(target=function, args=arguments)
+    process.start()
+    return process
+
+
+@pytest.mark.slow
+def test_kill_9_at_any_moment_loses_nothing(tmp_path):
+    """However often it is killed, what is trained in the end is what is trained without."""
+    updates = 400
+    train(tmp_path / "whole", updates)
+    weights, history = state(tmp_path / "whole")
+    chance = random.Random(0)
+    killed, run = 0, 0
+    while killed < KILLS:
+        run += 1
+        folder, done = tmp_path / str(run), False
+        while not done:
+            process = in_a_process(train, folder, updates, (folder / CHECKPOINT_NAME).exists())
+            process.join(chance.uniform(0.05, 1.0) if killed < KILLS else None)
+            done = process.exitcode == 0
+            if process.exitcode is None:
+                process.kill()
+                process.join()
+                killed += 1
+            elif not done:
+                raise AssertionError(f"exit code {process.exitcode} after {killed} kills")
+        mine, rows = state(folder)
+        assert mine.keys() == weights.keys()
+        assert all(mine[key].equal(value) for key, value in weights.items())
+        assert rows == history
+        assert not list(folder.glob("*.tmp")) or killed  # what a killed process was writing may lie about
+    assert killed == KILLS
+
+
+def _with_a_full_disk(folder):
+    """Train where from some update on no file can have more than so many bytes; the exit code says how it ended."""
+
+    def full():
+        shutil.copy(folder / CHECKPOINT_NAME, folder / "before")
+        resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, 10_000))
+
+    try:
+        train(folder, loss=Then(23, full))
+    except OSError:
+        sys.exit(3)
+
+
+def test_a_full_disk_loses_nothing(tmp_path):
+    process = in_a_process(_with_a_full_disk, tmp_path / "run")
+    process.join()
+    assert process.exitcode == 3
+    assert (tmp_path / "run" / CHECKPOINT_NAME).read_bytes() == (tmp_path / "run" / "before").read_bytes()
+    assert list((tmp_path / "run").glob("*.tmp")) == []
+    train(tmp_path / "run", resume=True)
+    train(tmp_path / "whole")
+    (mine, rows), (weights, history) = state(tmp_path / "run"), state(tmp_path / "whole")
+    assert all(mine[key].equal(value) for key, value in weights.items())
+    assert rows == history
+
+
+def test_a_torn_row_of_the_curves_is_dropped(tmp_path):
+    def crash():
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(tmp_path, loss=Then(21, crash))
+    _, before = state(tmp_path)
+    with (tmp_path / HISTORY_NAME).open("a") as file:
+        file.write("2")  # of 21, and nothing after it
+    train(tmp_path, resume=True)
+    _, rows = state(tmp_path)
+    assert [row["update"] for row in rows] == [str(1 + i) for i in range(40)]
+    assert rows[:20] == before
+
+
+def _shards_on_a_full_disk(source, out):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+    try:
+        solve_shards(create_solver("epnp"), [source], out, name="epnp")
+    except OSError:
+        sys.exit(3)
+
+
+def test_shards_on_a_full_disk_are_whole_or_missing(tmp_path):
+    import numpy as np
+
+    source, out = tmp_path / "in", tmp_path / "out"
+    source.mkdir()
+    for name, count in (("a", 10), ("b", 1000), ("c", 10)):
+        problems = SyntheticProblems(n=6, batch_size=count, seed=0).batch(0)
+        arrays = dict(zip(("world_points", "img_points", "intrinsics"), problems[:3], strict=True))
+        np.savez(source / f"{name}.npz", **{key: value.numpy() for key, value in arrays.items()})
+    process = in_a_process(_shards_on_a_full_disk, source, out)
+    process.join()
+    assert process.exitcode == 3
+    assert {path.name for path in out.iterdir()} == {"manifest.json", "a.npz"}
+    report = solve_shards(create_solver("epnp"), [source], out, name="epnp")
+    assert (report.shards, report.kept) == (2, 1)
+
+
+@pytest.fixture(scope="module")
+def weights_folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("weights")
+    PnPNet(MLPInit(6), RobustWeightedLM(2)).save_pretrained(folder)
+    return folder
+
+
+@settings(max_examples=300, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@given(st.data())
+def test_damaged_weights_load_nothing(weights_folder, tmp_path_factory, data):
+    """Any byte changed, any end cut off: one clear error, or it was nothing that matters."""
+    folder = tmp_path_factory.mktemp("damaged", numbered=True)
+    try:
+        for path in weights_folder.iterdir():
+            shutil.copy(path, folder)
+        path = folder / data.draw(st.sampled_from(["config.json", "model.safetensors"]))
+        content = bytearray(path.read_bytes())
+        # The header and what follows it, as often as the many numbers.
+        place = data.draw(st.one_of(st.integers(0, 2000), st.integers(0, len(content) - 1))) % len(content)
+        if data.draw(st.booleans()):
+            content[place] = data.draw(st.integers(0, 255).filter(lambda x: x != content[place]))
+        else:
+            del content[place:]
+        path.write_bytes(content)
+        with contextlib.suppress(ValueCheckError):
+            loaded = PnPNet.from_pretrained(folder)
+            sound = PnPNet.from_pretrained(weights_folder)
+            assert json.dumps(loaded.config()) == json.dumps(sound.config())
+            theirs = loaded.state_dict()
+            assert all(theirs[key].equal(value) for key, value in sound.state_dict().items())
+    finally:
+        shutil.rmtree(folder)
+
+
+def test_a_checkpoint_is_not_replaced_by_half_of_one(tmp_path):
+    path = tmp_path / CHECKPOINT_NAME
+    save_checkpoint(path, {"a": 1})
+    process = in_a_process(save_checkpoint, path, {"a": torch.zeros(50_000_000)})
+    while process.is_alive() and not list(tmp_path.glob("*.tmp")):
+        time.sleep(0.001)
+    process.kill()
+    process.join()
+    assert torch.load(path)["a"] == 1
