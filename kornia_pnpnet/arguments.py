@@ -19,7 +19,7 @@ class _Parser(argparse.ArgumentParser):
     """Errors on one line, like all others."""
 
     def error(self, message: str) -> NoReturn:
-        self.exit(2, f"pnpnet: {message} (see {self.prog} --help)\n")
+        self.exit(2, f"pnpnet: {' '.join(message.split())} (see {self.prog} --help)\n")
 
 
 def _positive_int(text: str) -> int:

@@ -208,6 +208,16 @@ def _solve_parquet(
         from pyarrow import parquet
     except ImportError as error:
         raise ImportError("Parquet needs one more package: pip install 'kornia_pnpnet[shards]'") from error
+
+    def read() -> Iterator[dict[str, list[Any]]]:
+        try:
+            rows = parquet.ParquetFile(shard)
+            columns = [key for key in _NUMBERS if key in rows.schema_arrow.names]
+            for table in rows.iter_batches(batch, columns=columns):
+                yield table.to_pydict()
+        except Exception as error:  # Arrow has half a dozen ways to say that a file is broken
+            raise PairsError(shard, f"not a Parquet file of lists of numbers: {error}") from None
+
     lists = pyarrow.list_(pyarrow.float32())
     schema = pyarrow.schema(
         [(key, lists) for key in ("rotation", "translation", "weights")]
@@ -215,24 +225,18 @@ def _solve_parquet(
     )
     solved = count = 0
     with atomic_open(target, "wb") as file, parquet.ParquetWriter(file, schema) as writer:
-        try:
-            rows = parquet.ParquetFile(shard)
-            columns = [key for key in _NUMBERS if key in rows.schema_arrow.names]
-            batches = rows.iter_batches(batch, columns=columns)
-            for table in batches:
-                arrays, sizes = _padded(shard, table.to_pydict())
-                (result,) = _solve(solver, shard, _tensors(shard, arrays, intrinsics), batch)
-                fields: dict[str, Any] = {
-                    "rotation": [*result.rotation.flatten(1).numpy()],
-                    "translation": [*result.translation.numpy()],
-                    "weights": [x[:size] for x, size in zip(result.weights.numpy(), sizes, strict=True)],
-                    "cost": result.cost.numpy(),
-                    "ok": result.ok.numpy(),
-                }
-                writer.write_table(pyarrow.table(fields, schema=schema))
-                solved, count = solved + int(result.ok.sum()), count + len(sizes)
-        except pyarrow.ArrowException as error:
-            raise PairsError(shard, f"not a Parquet file of lists of numbers: {error}") from None
+        for columns in read():
+            arrays, sizes = _padded(shard, columns)
+            (result,) = _solve(solver, shard, _tensors(shard, arrays, intrinsics), batch)
+            fields: dict[str, Any] = {
+                "rotation": [*result.rotation.flatten(1).numpy()],
+                "translation": [*result.translation.numpy()],
+                "weights": [x[:size] for x, size in zip(result.weights.numpy(), sizes, strict=True)],
+                "cost": result.cost.numpy(),
+                "ok": result.ok.numpy(),
+            }
+            writer.write_table(pyarrow.table(fields, schema=schema))
+            solved, count = solved + int(result.ok.sum()), count + len(sizes)
     return solved, count
 
 

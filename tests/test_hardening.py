@@ -1,5 +1,10 @@
 """Whatever comes in: shapes, dtypes, layouts, scales, numbers that are none, and geometry without a pose."""
 
+import contextlib
+import io
+import json
+
+import numpy as np
 import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
@@ -7,6 +12,7 @@ from hypothesis import strategies as st
 from kornia.core.exceptions import BaseError, ShapeError
 
 from kornia_pnpnet import create_solver, pose_covariance, pose_errors, solve_pnp, success
+from kornia_pnpnet.cli import main
 from kornia_pnpnet.data import SyntheticProblems
 
 SOLVERS = {
@@ -242,3 +248,131 @@ def test_vmap_is_a_larger_batch(name):
     plain = SOLVERS[name](*problems[:3])
     torch.testing.assert_close(mapped[1].flatten(0, 1), plain.translation, rtol=1e-6, atol=1e-6)
     assert mapped[4].flatten().equal(plain.ok)
+
+
+# -- the command line: any file, any argument -------------------------------------------------------------------------
+
+TOKENS = (
+    b",",
+    b"\n",
+    b"\r",
+    b'"',
+    b"\0",
+    b"\xff",
+    b"nan",
+    b"inf",
+    b"-",
+    b"1e999",
+    b"9" * 400,
+    b";",
+    b" ",
+    b"PK\x03\x04",
+)
+
+
+def problem_file(kind):
+    """The bytes of a sound file, and how its name ends."""
+    problems = SyntheticProblems(n=9, batch_size=3, seed=0).batch(0)
+    arrays = dict(zip(("world_points", "img_points", "intrinsics"), (x.numpy() for x in problems[:3]), strict=True))
+    file = io.BytesIO()
+    match kind:
+        case "csv":
+            rows = np.concatenate((arrays["world_points"][0], arrays["img_points"][0]), 1)
+            file.write("\n".join(["X,Y,Z,u,v", *(",".join(map(str, row)) for row in rows)]).encode())
+        case "npz":
+            np.savez(file, **{name: array[0] for name, array in arrays.items()})
+        case "shard npz":
+            np.savez_compressed(file, **arrays)
+        case "shard parquet":
+            from pyarrow import parquet, table
+
+            parquet.write_table(table({name: [*array.reshape(3, -1)] for name, array in arrays.items()}), file)
+    return file.getvalue(), kind.split()[-1]
+
+
+@st.composite
+def damage(draw, content):
+    """A file of which something was lost, changed or put in, up to four times."""
+    content = bytearray(content)
+    for _ in range(draw(st.integers(1, 4))):
+        place = draw(st.integers(0, len(content)))
+        match draw(st.sampled_from(["cut", "lose", "change", "put in"])):
+            case "cut":
+                del content[place:]
+            case "lose":
+                del content[place : place + draw(st.integers(1, 40))]
+            case "change":
+                content[place : place + 1] = draw(st.binary(min_size=1, max_size=1))
+            case "put in":
+                content[place:place] = draw(st.sampled_from(TOKENS))
+    return bytes(content)
+
+
+def run_main(*arguments):
+    """Exit code and what was printed; an exception is one."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            code = main([str(x) for x in arguments])
+        except SystemExit as end:
+            code = end.code
+    return code, out.getvalue(), err.getvalue()
+
+
+@pytest.mark.filterwarnings("ignore")  # of NumPy, about headers and overlapping entries
+@pytest.mark.parametrize("kind", ["csv", "npz", "shard npz", "shard parquet"])
+def test_damaged_files_are_a_line_and_no_traceback(kind, tmp_path):
+    sound, suffix = problem_file(kind)
+
+    @many(150)
+    @given(damage(sound))
+    def check_file(content):
+        path = tmp_path / f"problem.{suffix}"
+        path.write_bytes(content)
+        if kind.startswith("shard"):
+            more = "--batch", "--out", tmp_path / "out", "--overwrite"
+        else:
+            more = ("--intrinsics", "3400,3400,960,540")
+        code, out, err = run_main("solve", path, *more, "--solver", "epnp")
+        assert code in (0, 1, 2)
+        if code == 2:
+            assert err.startswith(f"pnpnet: {path}")
+            assert err.count("\n") == 1
+        elif suffix in ("csv", "npz") and not kind.startswith("shard"):
+            assert json.loads(out)["n"] >= 3
+
+    code, _, _ = run_main(*_sound(kind, tmp_path, sound, suffix))
+    assert code == 0
+    check_file()
+
+
+def _sound(kind, folder, content, suffix):
+    path = folder / f"sound.{suffix}"
+    path.write_bytes(content)
+    more = ["--batch", "--out", folder / "sound"] if kind.startswith("shard") else ["--intrinsics", "3400,3400,960,540"]
+    return ["solve", path, *more, "--solver", "epnp"]
+
+
+# No slash: what has one could be the name of a repository on the Hub.
+WORDS = st.one_of(
+    st.text(st.characters(exclude_characters="/\0", exclude_categories=["Cs"]), max_size=12),
+    st.sampled_from(
+        ["800,800,320,240", "epnp", "p3p-ransac:threshold=2", "pnpnet-set:m=", "epnp:1", "nan", "-1", "--x"]
+    ),
+)
+
+
+@many(300)
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(["--intrinsics", "--solver", "--threshold", "--batch-size", "--batch", ""]), WORDS),
+        max_size=4,
+    ),
+    WORDS,
+)
+def test_any_arguments_are_a_line_and_no_traceback(options, file):
+    arguments = [x for pair in options for x in pair if x]
+    code, _, err = run_main("solve", *arguments, "--", file)
+    assert code == 2
+    assert err.startswith("pnpnet: ")
+    assert err.count("\n") == 1

@@ -228,7 +228,7 @@ class SetInit(nn.Module):
         self,
         *,
         width: int = 32,
-        layers: int = 4,
+        layers: int = 3,
         heads: int = 4,
         hidden: int = 64,
         starts: int = 2,
