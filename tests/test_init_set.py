@@ -66,7 +66,7 @@ def test_poses_follow_similarity_transforms_of_the_world(make_problems):
 
     for noise, other in (({}, {}), (NOISE, {"img_sigma": 1.0, "world_sigma": 0.05 * unit})):
         first, second = net(*p[:3], **noise), net(world, *p[1:3], **other)
-        near(back(second.init), first.init, 1e-5)
+        near(back(second.init), first.init, 1e-4)  # of translations of a hundred
         near(back(second.pose), first.pose, 1e-4)
         near([second.weights], [first.weights], 1e-4)
         assert torch.equal(first.ok, second.ok)
