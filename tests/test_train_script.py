@@ -155,3 +155,30 @@ def test_sweep_leaves_results_and_a_summary(tmp_path):
         assert float(row["uniform/rate"]) == pytest.approx(
             results["validation"]["uniform"]["success"]["rate"], abs=1e-4
         )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", [("joblib", "n_jobs=2"), ("submitit_local", "timeout_min=5")])
+def test_sweeps_by_other_launchers(launcher, tmp_path):
+    """The same runs and the same summary, and a second call finds nothing left to do."""
+    name, option = launcher
+    command = ("-m", f"hydra/launcher={name}", f"hydra.launcher.{option}", "model.n=6,9", "resume=true")
+    for _ in range(2):
+        run(*command, f"hydra.sweep.dir={tmp_path}")
+        assert len(list(tmp_path.glob("*/results.json"))) == 2
+        with (tmp_path / "summary.csv").open(newline="") as file:
+            assert {(row["model.n"], row["update"]) for row in csv.DictReader(file)} == {("6", "2"), ("9", "2")}
+    ends = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/last.ckpt")}
+    run(*command, f"hydra.sweep.dir={tmp_path}")
+    assert ends == {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/last.ckpt")}
+
+
+def test_the_slurm_launcher_takes_what_the_documentation_says():
+    page = (REPO / "docs" / "howto" / "sweeps.md").read_text()
+    words = page.split("## Slurm")[1].split("Submitit")[0].replace("\\\n", " ").split()
+    overrides = [word for word in words if word.startswith("hydra")]
+    assert len(overrides) == 7
+    with initialize_config_dir(str(REPO / "conf"), version_base="1.3"):
+        config = compose("train", overrides=overrides, return_hydra_config=True)
+    assert config.hydra.launcher._target_.endswith("SlurmLauncher")
+    assert config.hydra.launcher.timeout_min == 600

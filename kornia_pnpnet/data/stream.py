@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import signal
 from collections.abc import Generator
 from typing import Any, Protocol
@@ -60,6 +61,7 @@ def stream_batches(source: ProblemSource, start: int, stop: int, workers: int = 
     if start >= stop:
         return
     slots = _SharedSlots(source, source.batch(start), slots=workers * _AHEAD + 1)
+    methods = multiprocessing.get_all_start_methods()
     loader = DataLoader(
         slots,
         sampler=range(start, stop),
@@ -68,6 +70,8 @@ def stream_batches(source: ProblemSource, start: int, stop: int, workers: int = 
         prefetch_factor=_AHEAD,
         worker_init_fn=_ignore_signals,
         generator=torch.Generator(),  # not the global one, whose state is the caller's
+        # In its processes joblib puts a way of its own in place of the default, by which a loader cannot start any.
+        multiprocessing_context=None if multiprocessing.get_start_method() in methods else methods[0],
     )
     indices: Any = iter(loader)
     try:
