@@ -1,8 +1,10 @@
 """The documentation: its Python runs as it stands, the site builds without a warning, no link leads nowhere."""
 
 import importlib
+import json
 import pkgutil
 import re
+import runpy
 import subprocess
 import sys
 import zlib
@@ -100,3 +102,8 @@ INTERNAL = {
     f"kornia_pnpnet.{name}"
     for name in ("arguments", "choices", "cli", "compilation", "demo", "environment", "files", "pairs", "results")
 } | {"kornia_pnpnet.runstate", "kornia_pnpnet.small"}
+
+
+def test_the_page_on_hardening_is_of_its_results():
+    made = runpy.run_path(str(DOCS / "hardening.py"))
+    assert made["PAGE"].read_text() == made["page"](json.loads(made["RESULTS"].read_text()))

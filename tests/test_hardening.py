@@ -3,6 +3,7 @@
 import contextlib
 import io
 import json
+import os
 
 import numpy as np
 import pytest
@@ -25,7 +26,10 @@ NAN, INF = float("nan"), float("inf")
 
 def many(examples):
     return settings(
-        max_examples=examples, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
+        max_examples=examples * int(os.environ.get("PNPNET_EXAMPLES", "1")),
+        deadline=None,
+        derandomize=True,
+        suppress_health_check=[HealthCheck.too_slow],
     )
 
 
@@ -101,8 +105,10 @@ def batches(draw, n=None, most=4):
     return inputs, mask, weights, kinds
 
 
-def check(result, inputs, kinds):
+def check(result, inputs, kinds, tally):
     """What every result keeps."""
+    for kind in kinds:
+        tally("problems", kind)
     batch, count = inputs[0].shape[:2]
     shapes = (batch, 3, 3), (batch, 3), (batch, count), (batch,), (batch,)
     assert tuple(tuple(x.shape) for x in result[:5]) == shapes
@@ -123,34 +129,37 @@ def check(result, inputs, kinds):
 
 
 @pytest.mark.parametrize("name", SOLVERS)
-def test_solvers_take_anything(name):
+def test_solvers_take_anything(name, tally):
     exactly = 9 if name.endswith("-n9") else None
 
     @many(40)
     @given(batches(exactly))
     def run(case):
         inputs, mask, weights, kinds = case
-        check(SOLVERS[name](*inputs, weights=weights, mask=mask), inputs, kinds)
+        tally("batches", f"`{name}`")
+        check(SOLVERS[name](*inputs, weights=weights, mask=mask), inputs, kinds, tally)
 
     run()
 
 
 @pytest.mark.parametrize("name", PEERS)
-def test_peers_take_anything(name):
+def test_peers_take_anything(name, tally):
     @many(25)
     @given(batches())
     def run(case):
         inputs, mask, weights, kinds = case
         # Of points on a line they may say what they like.
         kinds = ["nothing" if kind in ("one point", "a line") else kind for kind in kinds]
-        check(PEERS[name](*inputs, weights=weights, mask=mask), inputs, kinds)
+        tally("batches", f"`{name}`")
+        check(PEERS[name](*inputs, weights=weights, mask=mask), inputs, kinds, tally)
 
     run()
 
 
 @many(30)
 @given(batches(9), st.sampled_from(["pnpnet-set", "pnpnet-n9", "epnp-lm", "p3p-ransac"]))
-def test_a_problem_is_solved_as_if_it_were_alone(case, name):
+def test_a_problem_is_solved_as_if_it_were_alone(tally, case, name):
+    tally("calls", "every problem of a batch again, alone: the same pose and `ok`")
     inputs, mask, weights, _ = case
     whole = SOLVERS[name](*inputs, weights=weights, mask=mask)
     for i in range(len(inputs[0])):
@@ -173,7 +182,8 @@ def test_a_problem_is_solved_as_if_it_were_alone(case, name):
     st.integers(-3, 3),
     st.integers(0, 100),
 )
-def test_units_of_world_and_camera_do_not_matter(name, world_power, pixel_power, seed):
+def test_units_of_world_and_camera_do_not_matter(tally, name, world_power, pixel_power, seed):
+    tally("calls", "world times 10⁻⁶ to 10⁶, pixels times 10⁻³ to 10³: the same pose")
     problems = SyntheticProblems(n=9, batch_size=20, seed=seed, dtype=torch.float64).batch(0)
     scale, zoom = 10.0**world_power, 10.0**pixel_power
     camera = problems.intrinsics * torch.tensor([zoom, zoom, 1.0], dtype=torch.float64)[:, None]
@@ -197,7 +207,8 @@ def test_units_of_world_and_camera_do_not_matter(name, world_power, pixel_power,
     st.sampled_from([torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.int64]),
     st.sampled_from([torch.float32, torch.float64]),
 )
-def test_what_does_not_fit_is_an_error_of_ours(name, world, img, camera, dtype, other):
+def test_what_does_not_fit_is_an_error_of_ours(tally, name, world, img, camera, dtype, other):
+    tally("calls", "shapes and dtypes that do not fit, half precision, integers: an error of the package's own types")
     solver = {**SOLVERS, **PEERS}[name]
     inputs = torch.ones(world, dtype=dtype), torch.ones(img, dtype=other), torch.ones(camera, dtype=other)
     fits = world[:2] == img[:2] and world[2] == 3 and img[2] == 2 and world[1] >= 3 and dtype == other
@@ -213,14 +224,16 @@ def test_what_does_not_fit_is_an_error_of_ours(name, world, img, camera, dtype, 
 
 @pytest.mark.parametrize("name", SOLVERS)
 @pytest.mark.parametrize("n", [0, 1, 2])
-def test_fewer_than_three_pairs_are_refused(name, n):
+def test_fewer_than_three_pairs_are_refused(name, n, tally):
+    tally("calls", "0, 1 or 2 pairs: `ShapeError`")
     with pytest.raises(ShapeError):
         SOLVERS[name](torch.zeros(2, n, 3), torch.zeros(2, n, 2), torch.eye(3))
 
 
 @many(40)
 @given(batches())
-def test_covariances_take_anything(case):
+def test_covariances_take_anything(tally, case):
+    tally("calls", "`pose_covariance` of any batch")
     inputs, _, weights, _ = case
     result = SOLVERS["pnpnet-set"](*inputs)
     covariance = pose_covariance(result.pose, *inputs, img_sigma=1.0, weights=weights)
@@ -231,7 +244,8 @@ def test_covariances_take_anything(case):
 
 @many(40)
 @given(batches())
-def test_matrices_take_anything(case):
+def test_matrices_take_anything(tally, case):
+    tally("calls", "`solve_pnp` of any batch: NaN where there is no pose, and only there")
     inputs, _, weights, _ = case
     matrix = solve_pnp(*inputs, weights)
     ok = SOLVERS["pnpnet-set"](*inputs, weights).ok
@@ -241,7 +255,8 @@ def test_matrices_take_anything(case):
 
 @pytest.mark.filterwarnings("ignore:There is a performance drop:UserWarning")
 @pytest.mark.parametrize("name", ["pnpnet-n9", "epnp-lm", "reppnp-lm"])  # P3P writes in place what vmap cannot
-def test_vmap_is_a_larger_batch(name):
+def test_vmap_is_a_larger_batch(name, tally):
+    tally("calls", "`torch.func.vmap`: as one larger batch")
     problems = SyntheticProblems(n=9, batch_size=6, seed=0, dtype=torch.float64).batch(0)
     two = [x.unflatten(0, (2, 3)) for x in problems[:3]]
     mapped = torch.func.vmap(lambda *x: SOLVERS[name](*x)[:5])(*two)
@@ -321,12 +336,13 @@ def run_main(*arguments):
 
 @pytest.mark.filterwarnings("ignore")  # of NumPy, about headers and overlapping entries
 @pytest.mark.parametrize("kind", ["csv", "npz", "shard npz", "shard parquet"])
-def test_damaged_files_are_a_line_and_no_traceback(kind, tmp_path):
+def test_damaged_files_are_a_line_and_no_traceback(kind, tmp_path, tally):
     sound, suffix = problem_file(kind)
 
     @many(150)
     @given(damage(sound))
     def check_file(content):
+        tally("files", f"`pnpnet solve` of a damaged {kind}: at most one line of error, no traceback")
         path = tmp_path / f"problem.{suffix}"
         path.write_bytes(content)
         if kind.startswith("shard"):
@@ -370,7 +386,8 @@ WORDS = st.one_of(
     ),
     WORDS,
 )
-def test_any_arguments_are_a_line_and_no_traceback(options, file):
+def test_any_arguments_are_a_line_and_no_traceback(tally, options, file):
+    tally("files", "`pnpnet solve` with any arguments: one line of error, exit code 2")
     arguments = [x for pair in options for x in pair if x]
     code, _, err = run_main("solve", *arguments, "--", file)
     assert code == 2
