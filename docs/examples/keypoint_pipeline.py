@@ -1,10 +1,11 @@
 """From images to poses, trained end to end: ``python docs/examples/keypoint_pipeline.py``.
 
 A textured box is rendered under random poses, before a random background, behind occluders, blurred and noisy. A small
-network finds its 14 keypoints (Kornia's spatial softmax and expectation) and says of each how sure it is; `PnPNet`
-makes a pose of them. First the network learns where keypoints are. Then two copies go on for as long: one with the
-keypoint loss alone, the other with the loss of the pose, too, whose gradient comes through the solver. Both are tested
-with the same solver on images that neither saw. Writes `keypoint_pipeline.json` and pictures beside this file.
+network finds its 14 keypoints (Kornia's spatial softmax and expectation) and says of each by how many pixels it may be
+off; `PnPNet` makes a pose of them. First the network learns where keypoints are. Then two copies go on for as long: one
+with the keypoint loss alone, which says nothing of how far off, the other with that of the pose, too, whose gradient
+comes through the solver. Both are tested with the same solver on images that neither saw. Writes
+`keypoint_pipeline.json` and pictures beside this file.
 """
 
 from __future__ import annotations
@@ -39,6 +40,10 @@ EDGES = [(i, j) for i in range(8) for j in range(i) if (CORNERS[i] != CORNERS[j]
 TEXTURES = 8
 # A pose that is farther off than this counts as far off: keypoints a third of the box away.
 MOST = 0.3
+# The loss of the pose counts this much beside that of the keypoints, in pixels.
+POSE_WEIGHT = 50.0
+# Points of a curve are means of so many updates.
+MEAN_OF = 50
 
 
 class Images(NamedTuple):
@@ -65,7 +70,7 @@ def draw(seed: int, index: int, batch: int = BATCH) -> Images:
     images = torch.where(hit[:, None], images, background)
     row, column = torch.meshgrid(torch.arange(SIZE), torch.arange(SIZE), indexing="ij")
     for _ in range(3):
-        centre, half = uniform(batch, 2, low=8.0, high=SIZE - 8.0), uniform(batch, 2, low=2.0, high=10.0)
+        centre, half = uniform(batch, 2, low=8.0, high=SIZE - 8.0), uniform(batch, 2, low=2.0, high=12.0)
         inside = ((row - centre[:, :1, None]).abs() < half[:, :1, None]) & (
             (column - centre[:, 1:, None]).abs() < half[:, 1:, None]
         )
@@ -108,7 +113,7 @@ def render(pose: Pose) -> tuple[Tensor, Tensor]:
 
 
 class Keypoints(nn.Module):
-    """Pixels (B, 14, 2) of the keypoints, and for each how much it is to count, in [0, 1]."""
+    """Pixels (B, 14, 2) of the keypoints, and of each the standard deviation (B, 14), 0.1 to 30 pixels."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -131,15 +136,15 @@ class Keypoints(nn.Module):
             kept.append(x)
         for layer, skip in zip(self.up, kept[-2::-1], strict=True):
             x = layer(torch.cat((functional.interpolate(x, scale_factor=2.0), skip), 1))
-        heat, sure = self.heads(x).chunk(2, 1)  # (B, 14, SIZE / 2, SIZE / 2) each
+        heat, off = self.heads(x).chunk(2, 1)  # (B, 14, SIZE / 2, SIZE / 2) each
         share = spatial_softmax2d(heat)
         pixels = 2.0 * spatial_expectation2d(share, normalized_coordinates=False) + 0.5
-        return pixels, torch.sigmoid((share * sure).sum((-2, -1)))
+        return pixels, torch.exp(0.5 + 3.0 * torch.tanh((share * off).sum((-2, -1)) / 3.0))
 
 
-def solve(solver: nn.Module, pixels: Tensor, weights: Tensor | None) -> PnPResult:
+def solve(solver: nn.Module, pixels: Tensor, sigma: Tensor | None) -> PnPResult:
     """Poses of the box from its keypoints."""
-    result: PnPResult = solver(KEYPOINTS.expand(len(pixels), -1, -1), pixels, CAMERA, weights)
+    result: PnPResult = solver(KEYPOINTS.expand(len(pixels), -1, -1), pixels, CAMERA, img_sigma=sigma)
     return result
 
 
@@ -149,40 +154,43 @@ def distance(pose: Pose, truth: Pose) -> Tensor:
     return (off.square().sum(-1) + 1e-12).sqrt().mean(-1)
 
 
-def train(
-    network: Keypoints, solver: nn.Module | None, seed: int, updates: range, log: list[tuple[float, float | None]]
-) -> None:
-    """Go on with the keypoint loss, and with a solver with that of the pose, too."""
+def train(network: Keypoints, solver: nn.Module | None, seed: int, updates: range) -> dict[str, list[float]]:
+    """Go on with the keypoint loss, and with a solver with that of the pose, too; returns curves."""
+    log: list[list[float]] = []
     optimizer = torch.optim.AdamW(network.parameters(), lr=2e-3, weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 2e-3, total_steps=len(updates), pct_start=0.1)
     for index in updates:
         problem = draw(seed, index)
-        pixels, weights = network(problem.images)
+        pixels, sigma = network(problem.images)
         keypoint_loss = functional.smooth_l1_loss(pixels, problem.pixels)
-        loss, off = keypoint_loss, None
+        loss, terms = keypoint_loss, [keypoint_loss.item()]
         if solver is not None:
-            result = solve(solver, pixels, weights)
+            result = solve(solver, pixels, sigma)
             error = distance(result.pose, problem.pose)
             counts = result.ok & (error.detach() < 10.0 * MOST)
             # Saturated: a pose that is far off has little to say about pixels.
-            loss = loss + 20.0 * torch.where(counts, error / (1.0 + error / MOST), 0.0).mean()
-            off = round(error.detach().median().item(), 5)
+            loss = loss + POSE_WEIGHT * torch.where(counts, error / (1.0 + error / MOST), 0.0).mean()
+            terms.append(error.detach().median().item())
         optimizer.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         optimizer.step()
         schedule.step()
-        log.append((round(keypoint_loss.item(), 5), off))
+        log.append(terms)
+    means = torch.tensor(log).split(MEAN_OF)
+    curves = torch.stack([x.mean(0) for x in means]).T.tolist()
+    names = "keypoint_loss", "median_distance"
+    return {name: [round(x, 5) for x in curve] for name, curve in zip(names, curves, strict=False)}
 
 
 @torch.no_grad()
-def test(network: Keypoints, solver: nn.Module, *, weighted: bool, batches: int) -> dict[str, float]:
+def test(network: Keypoints, solver: nn.Module, *, told: bool, batches: int) -> dict[str, float]:
     """Errors on images of a seed that no training uses."""
     distances, angles, offs = [], [], []
     for index in range(batches):
         problem = draw(999_983, index)
-        pixels, weights = network(problem.images)
-        result = solve(solver, pixels, weights if weighted else None)
+        pixels, sigma = network(problem.images)
+        result = solve(solver, pixels, sigma if told else None)
         distances.append(distance(result.pose, problem.pose))
         angles.append(torch.rad2deg(rotation_angle(result.rotation, problem.pose.rotation)))
         offs.append((pixels - problem.pixels).norm(dim=-1).mean(-1))
@@ -200,17 +208,15 @@ def run(seed: int, updates: int, batches: int) -> tuple[dict[str, Any], dict[str
     """Train both from one start."""
     torch.manual_seed(seed)
     solver = create_solver("pnpnet-set").requires_grad_(False)
-    start, before = Keypoints(), []
-    train(start, None, seed, range(updates), before)
-    found: dict[str, Any] = {"keypoints first": {"history": before}}
+    start = Keypoints()
+    found: dict[str, Any] = {"keypoints first": {"curves": train(start, None, seed, range(updates))}}
     networks = {}
     for name, end in (("keypoint loss alone", None), ("end to end", solver)):
-        networks[name], history = copy.deepcopy(start), []
-        train(networks[name], end, seed, range(updates, 2 * updates), history)
-        found[name] = {"history": history, **test(networks[name], solver, weighted=end is not None, batches=batches)}
-        print(
-            f"seed {seed}, {name}: {found[name]['mean_distance']:.4f} {found[name]['median_distance']:.4f} ", flush=True
-        )
+        networks[name] = copy.deepcopy(start)
+        curves = train(networks[name], end, seed, range(updates, 2 * updates))
+        found[name] = {"curves": curves, **test(networks[name], solver, told=end is not None, batches=batches)}
+        distances = ", ".join(f"{key} {found[name][key]:.4f}" for key in ("mean_distance", "median_distance"))
+        print(f"seed {seed}, {name}: {distances}", flush=True)
     return found, networks
 
 
@@ -237,15 +243,15 @@ def plot_overlays(networks: dict[str, Keypoints], path: Path, count: int = 6) ->
     problem = draw(999_983, 0)
     figure = make_figure(9.0, 3.2)
     for row, (name, network) in zip(figure.subplots(2, count), networks.items(), strict=True):
-        pixels, weights = network(problem.images)
-        result = solve(solver, pixels, weights if name == "end to end" else None)
+        pixels, sigma = network(problem.images)
+        result = solve(solver, pixels, sigma if name == "end to end" else None)
         found, truth = (project(pose, KEYPOINTS) for pose in (result.pose, problem.pose))
         for i, axes in enumerate(row):
             axes.imshow((problem.images[i] + 0.5).clamp(0, 1).permute(1, 2, 0))
             for corners, colour in ((truth, "white"), (found, BLUE if name == "end to end" else ORANGE)):
                 for a, b in EDGES:
                     axes.plot(*corners[i, [a, b]].mT, color=colour, linewidth=1.0)
-            axes.scatter(*pixels[i].mT, s=4.0 + 16.0 * weights[i] if name == "end to end" else 8.0, color="black")
+            axes.scatter(*pixels[i].mT, s=24.0 / (1.0 + sigma[i]) if name == "end to end" else 8.0, color="black")
             axes.set_xlim(0, SIZE - 1)
             axes.set_ylim(SIZE - 1, 0)
             axes.set_axis_off()
