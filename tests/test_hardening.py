@@ -192,10 +192,10 @@ def test_units_of_world_and_camera_do_not_matter(tally, name, world_power, pixel
     assert scaled.ok.equal(plain.ok)
     ok = plain.ok
     torch.testing.assert_close(scaled.translation[ok] / scale, plain.translation[ok], rtol=1e-3, atol=1e-3)
-    assert (
-        success(pose_errors(scaled.pose._replace(translation=scaled.translation / scale), problems.pose)).float().mean()
-        > 0.6
-    )
+    back = scaled.pose._replace(translation=scaled.translation / scale)
+    solved, as_well = (success(pose_errors(pose, problems.pose)) for pose in (plain.pose, back))
+    assert (solved == as_well).float().mean() > 0.9  # at the limit rounding may decide
+    assert solved.any()
 
 
 @many(60)

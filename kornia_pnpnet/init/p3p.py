@@ -85,7 +85,9 @@ def _solve_chunk(world_points: Tensor, plane_points: Tensor) -> tuple[list[Tenso
     finfo = torch.finfo(world_points.dtype)
     points, sound = _load(world_points, plane_points)
     x1, x2, x3 = (x[:3] for x in points)
-    axis1, axis2, (inv_base, along, sq_height) = _axes([*(x3 - x2)], [*(x1 - x2)])
+    # Component by component: an exporter does not know how to write into parts of a tensor for any number of problems.
+    base, side = ([x - y for x, y in zip(end, x2, strict=True)] for end in (x3, x1))
+    axis1, axis2, (inv_base, along, sq_height) = _axes(base, side)
     axis3 = _cross(axis1, axis2)
     inv_sq_base = inv_base * inv_base
     along, sq_height = along.mul_(inv_base), sq_height.mul_(inv_sq_base)
