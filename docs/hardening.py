@@ -68,7 +68,7 @@ def page(results: dict[str, Any]) -> str:
     ]
     for part, (heading, text, head) in PARTS.items():
         lines += ["", f"## {heading}", ""] + ([text, ""] if text else []) + [f"| {head} |", "|---|---|"]
-        lines += [f"| {what} | {count} |" for what, count in counts[part].items()]
+        lines += [f"| {what} | {count} |" for what, count in sorted(counts[part].items())]
     made = results["environment"]
     lines += ["", f"Commit {made['commit']}, {made['cpu']}, torch {made['versions']['torch']}."]
     return "\n".join(lines) + "\n"

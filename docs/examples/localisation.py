@@ -13,12 +13,14 @@ from __future__ import annotations
 import argparse
 import math
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
+from torch import Tensor
 
 from kornia_pnpnet import Pose, create_solver
 from kornia_pnpnet.data import View, load_scene
@@ -157,6 +159,18 @@ def described(view: View, folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndar
     return pixels, features, np.flatnonzero(known), view.world_points.numpy()[gaps.argmin(1)[known]]
 
 
+def raw_matches(found: Mapping[str, Any], name: str) -> tuple[Tensor, Tensor]:
+    """Points of the model (N, 3) and pixels of an image (N, 2) whose features are nearest to each other."""
+    pixels, features, _, _ = found[name]
+    others = [x for other, x in found.items() if other != name]
+    database = np.concatenate([x[1][x[2]] for x in others])
+    world = np.concatenate([x[3] for x in others])
+    matches = cv2.BFMatcher(cv2.NORM_L2, crossCheck=True).match(features, database)
+    matches = sorted(matches, key=lambda match: match.distance)[:MOST_MATCHES]
+    points = torch.from_numpy(world[[x.trainIdx for x in matches]])
+    return points, torch.from_numpy(pixels[[x.queryIdx for x in matches]])
+
+
 def main() -> None:
     """Localise every image of a scene, write what came out and draw some."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -174,21 +188,14 @@ def main() -> None:
     rows: list[dict[str, Any]] = []
     drawn = []
     for view in scene.views:
-        pixels, features, _, _ = found[view.name]
-        others = [x for name, x in found.items() if name != view.name]
-        database = np.concatenate([x[1][x[2]] for x in others])
-        world = np.concatenate([x[3] for x in others])
-        matches = cv2.BFMatcher(cv2.NORM_L2, crossCheck=True).match(features, database)
-        matches = sorted(matches, key=lambda match: match.distance)[:MOST_MATCHES]
-        img = torch.from_numpy(pixels[[x.queryIdx for x in matches]])
-        points = torch.from_numpy(world[[x.trainIdx for x in matches]])
+        points, img = raw_matches(found, view.name)
         with torch.no_grad():
             result = solver(points[None], img[None], view.intrinsics)
         ok, turn, shift, kept = cv2.solvePnPRansac(
             points.numpy(), img.numpy(), view.intrinsics.numpy(), None, reprojectionError=THRESHOLD_PX
         )
         theirs = Pose(torch.from_numpy(cv2.Rodrigues(turn)[0]), torch.from_numpy(shift[:, 0])) if ok else None
-        row: dict[str, Any] = {"image": view.name, "matches": len(matches)}
+        row: dict[str, Any] = {"image": view.name, "matches": len(points)}
         for name, pose in (
             ("pnpnet-set", Pose(result.rotation[0], result.translation[0])),
             ("cv2.solvePnPRansac", theirs),
@@ -203,7 +210,7 @@ def main() -> None:
         off = ((cam @ view.intrinsics.mT)[:, :2] / cam[:, 2:] - img).norm(dim=-1)
         row["wrong"] = (off > THRESHOLD_PX).double().mean().item()
         rows.append(row)
-        inliers = np.zeros(len(matches), bool)
+        inliers = np.zeros(len(points), bool)
         if kept is not None:
             inliers[kept[:, 0]] = True
         drawn.append((view.name, img, result.weights[0] > 0.5, inliers))
