@@ -6,6 +6,8 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
+import torch
+from harness import HERE
 from others import KorniaDLT, Peer, PyPose
 from tasks import (
     ITERATIONS,
@@ -23,6 +25,8 @@ from torch import nn
 
 from kornia_pnpnet import PnPNet, RobustWeightedLM
 from kornia_pnpnet.choices import load_solver
+from kornia_pnpnet.export import INPUTS, export_onnx
+from kornia_pnpnet.results import source_digest
 from kornia_pnpnet.types import Pose, Problems
 
 __all__ = ["ANY", "CONTENDERS", "ONE", "ONE_THREAD", "OURS", "PLAIN", "TRAINED", "WHOLE"]
@@ -104,6 +108,44 @@ class Refinement(Contender):
         return Task(call, lambda: undo(self.refine(corr, guess).pose), problems, waiting(self.device))
 
 
+class Onnx(Contender):
+    """A solver of this package as an ONNX model for nine pairs, under ONNX Runtime, in float32.
+
+    Exporting takes minutes: the models of this code are kept in ``outputs/onnx``.
+    """
+
+    differentiable = False
+    n = 9
+
+    def __init__(self, spec: str) -> None:
+        import onnxruntime
+
+        path = HERE.parent / "outputs" / "onnx" / f"{spec}-{source_digest()[:16]}.onnx"
+        if not path.exists():
+            solver = load_solver(spec)
+            assert isinstance(solver, PnPNet)
+            export_onnx(solver, path, self.n)
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = torch.get_num_threads()
+        options.log_severity_level = 3
+        self.session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+
+    def takes(self, n: int) -> bool:
+        """The number of pairs that it was exported for."""
+        return n == self.n
+
+    def task(self, problems: Problems, *, backward: bool = False) -> Task:
+        """The session's call with the whole batch."""
+        tensors = *float_inputs(problems, "cpu"), torch.ones(problems.world_points.shape[:2])
+        inputs = {name: x.numpy() for name, x in zip(INPUTS, tensors, strict=True)}
+
+        def poses() -> Pose:
+            rotation, translation, *_ = self.session.run(None, inputs)
+            return Pose(torch.from_numpy(rotation), torch.from_numpy(translation))
+
+        return Task(lambda: self.session.run(None, inputs), poses, problems)
+
+
 #: Ours, by name. RANSACs have the thresholds that suit the protocol's data (docs/results).
 OURS: dict[str, Callable[..., Contender]] = {
     TRAINED: functools.partial(Ours, TRAINED),
@@ -125,6 +167,8 @@ OURS: dict[str, Callable[..., Contender]] = {
 #: All that is timed.
 CONTENDERS: dict[str, Callable[..., Contender]] = {
     **OURS,
+    f"{TRAINED} ONNX": functools.partial(Onnx, TRAINED),
+    f"{ANY} ONNX": functools.partial(Onnx, ANY),
     "opencv-epnp": functools.partial(Peer, "opencv-epnp"),
     "opencv-ransac": functools.partial(Peer, "opencv-ransac"),
     "opencv-usac": functools.partial(Peer, "opencv-usac"),

@@ -42,7 +42,8 @@ same from one guess for each problem; `{plain}` its network, one guess, and {m} 
 were set for, with classical hyperparameters; `refinement` such {m} iterations of robust Levenberg–Marquardt alone, on
 normalised pairs and from a pose {angle:g}° and {shift:g} % of the distance off.
 `{any}` takes any number of pairs. The others of ours are whole solvers. All of ours are in float32, *compiled* by
-`solver.compile()`, *compiled whole* by `solver.compile(whole=True)`. `opencv-*`, `poselib` and `pycolmap` are the
+`solver.compile()`, *compiled whole* by `solver.compile(whole=True)`; *ONNX* is the same exported for {n} pairs, under
+ONNX Runtime, without PyTorch. `opencv-*`, `poselib` and `pycolmap` are the
 libraries' calls for one problem after the
 other, `kornia-dlt` is `solve_pnp_dlt`.
 `pypose-lm` is `pypose.optim.LM` with a robust kernel on the same normalised pairs from the same start, as many

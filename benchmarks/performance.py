@@ -49,9 +49,8 @@ def measure_part(part: str, settings: Settings) -> dict[str, Any]:
         found = {key: [entry for answer in answers for entry in answer[key]] for key in ("rows", "skipped")}
         found["targets"] = _THREADED[part][1](found["rows"])
     made_with = environment()
-    made_with["versions"]["pypose"] = next(
-        (entry.version for entry in distributions() if entry.name.lower() == "pypose"), None
-    )
+    installed = {entry.name.lower(): entry.version for entry in distributions()}
+    made_with["versions"] |= {name: installed.get(name) for name in ("pypose", "onnxruntime")}
     made = {"environment": made_with, "settings": settings._asdict(), "load_average": [before, load()]}
     return {**made, **found}
 

@@ -254,7 +254,12 @@ def test_the_coarse_pose_is_as_far_off_as_it_says(make_problems):
     torch.testing.assert_close(share, torch.full_like(share, tasks.COARSE_SHIFT))
 
 
-EAGER = [name for name in modules["contenders"].CONTENDERS if "compiled" not in name]
+# Exporting takes minutes.
+EAGER = [
+    pytest.param(name, marks=pytest.mark.slow) if "ONNX" in name else name
+    for name in modules["contenders"].CONTENDERS
+    if "compiled" not in name
+]
 
 
 @pytest.mark.parametrize("name", EAGER)
