@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import statistics
+import subprocess
+import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -16,6 +18,7 @@ __all__ = ["measure_startup", "targets"]
 
 # The first is the compiler's warm-up; the others show that another batch size does not compile everything anew.
 _BATCHES = (1000, 999, 100, 10, 1)
+_IMPORTS = 5
 COMPILED = f"{TRAINED} compiled"
 COLD, CACHED, EAGER = "cold", "cached", "eager"
 
@@ -39,7 +42,17 @@ def measure_startup(settings: Settings) -> dict[str, Any]:
             # A loop needs the memory of one problem, and PyPose's takes minutes for so many.
             batch = 0 if contender.loops else settings.memory_batch
             starts += start({**request, "memory_batch": batch}, settings)
-    return {"starts": starts, "skipped": made.skipped, "targets": targets(starts)}
+    imports = [import_seconds() for _ in range(_IMPORTS)]
+    return {"starts": starts, "imports_s": imports, "skipped": made.skipped, "targets": targets(starts, imports)}
+
+
+def import_seconds() -> float:
+    """Seconds that importing the package takes where torch and kornia are imported already, in a new process."""
+    code = (
+        "import time, torch, kornia; start = time.perf_counter(); import kornia_pnpnet; "
+        "print(time.perf_counter() - start)"
+    )
+    return float(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout)
 
 
 def start(request: Mapping[str, Any], settings: Settings) -> list[dict[str, Any]]:
@@ -72,9 +85,10 @@ def warm_ups(starts: Sequence[Mapping[str, Any]], name: str, backward: bool, cac
     ]
 
 
-def targets(starts: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """How long making a compiled solver and its first call may take."""
-    found = []
+def targets(starts: Sequence[Mapping[str, Any]], imports: Sequence[float]) -> list[dict[str, Any]]:
+    """How long the import may take, and making a compiled solver and its first call."""
+    what = "`import kornia_pnpnet` after torch and kornia"
+    found = [target(what, statistics.median(imports), 0.5, unit="s", at_most=True)] if imports else []
     for backward in (False, True):
         for cache, most in ((COLD, 20.0), (CACHED, 5.0)):
             times = warm_ups(starts, COMPILED, backward, cache)

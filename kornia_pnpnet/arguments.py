@@ -165,11 +165,11 @@ def make_parser() -> argparse.ArgumentParser:
         "export",
         "write a solver as an ONNX model",
         "Write a solver as an ONNX model for batches of any size, which ONNX Runtime runs without PyTorch.\n\n"
-        "  pnpnet export pnpnet.onnx --solver pnpnet-n9",
+        "  pnpnet export pnpnet-set.onnx",
     )
     export.add_argument("file", metavar="ONNX", help="where to")
-    export.add_argument("--solver", metavar="NAME", default="pnpnet-n9", help="default: pnpnet-n9")
-    export.add_argument("--n", metavar="N", type=_positive_int, help="for just so many pairs: a smaller, faster graph")
+    export.add_argument("--solver", metavar="NAME", default="pnpnet-set", help="default: pnpnet-set")
+    export.add_argument("--n", metavar="N", type=_positive_int, help="for just so many pairs; default: any number")
 
     command("list", "list solvers and weights", "List the solvers that --solver takes.\n\n  pnpnet list")
 

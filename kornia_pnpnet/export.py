@@ -44,8 +44,7 @@ def export_program(solver: PnPNet, n: int | None = None) -> torch.export.Exporte
 
     Args:
         solver: with trained or classical parts; RANSAC, which draws until it has seen enough, has no graph.
-        n: number of pairs. ``None``: what its network takes, and any number from 4 on where it takes any. For one
-            number the graph is smaller and faster.
+        n: number of pairs. ``None``: what its network takes, and any number from 4 on where it takes any.
 
     Returns:
         A program of :data:`INPUTS`: points :math:`(B, N, 3)`, pixels :math:`(B, N, 2)`, cameras :math:`(B, 3, 3)`,

@@ -482,11 +482,12 @@ def test_compiled_ones_start_cold_and_with_what_that_left(monkeypatch):
     settings = modules["settings"].FULL._replace(startup_runs=2)
     starts = startup.start({"contender": startup.COMPILED, "backward": False, "memory_batch": 7}, settings)
     assert caches == [(0, 0), (7, 1), (0, 0), (0, 1)]
-    cold, cached = startup.targets(starts)
+    imports, cold, cached = startup.targets(starts, [0.3, 0.2, 0.9])
+    assert (imports["measured"], imports["met"]) == (0.3, True)
     assert (cold["measured"], cached["measured"]) == (5.0, 2.0)
     for entry in starts:
         entry["warnings"] = ["There is no compiler"]
-    assert startup.targets(starts) == []
+    assert startup.targets(starts, []) == []
 
 
 def test_traffic_is_what_is_read_and_written():

@@ -74,6 +74,19 @@ def test_onnx(make_problems, tmp_path):
         assert batch != 100 or not found[4][3]
 
 
+@pytest.mark.slow
+def test_onnx_of_the_set_network(make_problems, tmp_path):
+    """For any number of pairs, padding included."""
+    solver = create_solver("pnpnet-set")
+    path = export_onnx(solver, tmp_path / "model.onnx")
+    for count, batch in ((4, 3), (9, 1), (9, 50), (20, 50), (100, 20)):
+        problems = make_problems(n=count, batch=batch, outliers=count // 4)
+        weights = torch.ones_like(problems.world_points[..., 0])
+        weights[:, 4:5] = 0.0
+        inputs = inputs_of(problems, weights)
+        near(run_onnx(path, inputs), solver, inputs)
+
+
 def test_what_has_no_graph(tmp_path, capsys):
     with pytest.raises(ValueCheckError, match="RANSAC cannot be exported"):
         export_program(create_solver("p3p-ransac"), 9)
