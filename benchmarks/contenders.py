@@ -25,8 +25,6 @@ from torch import nn
 
 from kornia_pnpnet import PnPNet, RobustWeightedLM
 from kornia_pnpnet.choices import load_solver
-from kornia_pnpnet.export import INPUTS, export_onnx
-from kornia_pnpnet.results import source_digest
 from kornia_pnpnet.types import Pose, Problems
 
 __all__ = ["ANY", "CONTENDERS", "ONE", "ONE_THREAD", "OURS", "PLAIN", "TRAINED", "WHOLE"]
@@ -120,6 +118,11 @@ class Onnx(Contender):
     def __init__(self, spec: str) -> None:
         import onnxruntime
 
+        # Here, since earlier versions of the package, which this file is used with too, do not have them.
+        from kornia_pnpnet.export import INPUTS, export_onnx
+        from kornia_pnpnet.results import source_digest
+
+        self.names = INPUTS
         path = HERE.parent / "outputs" / "onnx" / f"{spec}-{source_digest()[:16]}.onnx"
         if not path.exists():
             solver = load_solver(spec)
@@ -137,7 +140,7 @@ class Onnx(Contender):
     def task(self, problems: Problems, *, backward: bool = False) -> Task:
         """The session's call with the whole batch."""
         tensors = *float_inputs(problems, "cpu"), torch.ones(problems.world_points.shape[:2])
-        inputs = {name: x.numpy() for name, x in zip(INPUTS, tensors, strict=True)}
+        inputs = {name: x.numpy() for name, x in zip(self.names, tensors, strict=True)}
 
         def poses() -> Pose:
             rotation, translation, *_ = self.session.run(None, inputs)
