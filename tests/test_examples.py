@@ -39,3 +39,21 @@ def test_photos_of_a_scene_are_localised(tmp_path):
     found = results["within_1_deg_and_limit"]
     assert found["pnpnet-set"] == len(results["images"]) == 12
     assert found["pnpnet-set"] >= found["cv2.solvePnPRansac"]
+
+
+@pytest.mark.slow
+def test_images_become_poses_end_to_end(tmp_path):
+    """A few updates of it; what a whole training gives is in the results beside the script."""
+    script = EXAMPLES / "keypoint_pipeline.py"
+    arguments = ["--updates", "60", "--seeds", "1", "--batches", "1", "--out", tmp_path]
+    subprocess.run([sys.executable, script, *arguments], check=True)
+    found = json.loads((tmp_path / "keypoint_pipeline.json").read_text())["seeds"]["0"]
+    losses = found["keypoints first"]["curves"]["keypoint_loss"]
+    assert losses[-1] < 0.9 * losses[0]
+    assert 0.0 < found["end to end"]["mean_distance"] <= 1.0
+    for picture in ("keypoint_pipeline.png", "keypoint_pipeline_overlays.png"):
+        assert (tmp_path / picture).stat().st_size > 0
+    seeds = json.loads((EXAMPLES / "keypoint_pipeline.json").read_text())["seeds"]
+    assert len(seeds) == 3
+    for run in seeds.values():
+        assert run["end to end"]["mean_distance"] < 0.5 * run["keypoint loss alone"]["mean_distance"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
@@ -152,6 +152,38 @@ def _solve(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Tensor]:
     return out.flatten(1, 2), valid.flatten(0, 1)
 
 
+def folded(size: int, in_dims: Sequence[int | None], *tensors: Tensor) -> list[Tensor]:
+    """Arguments of a rule for ``torch.func.vmap`` with the mapped dimension made part of the batch, their first one."""
+    moved = [
+        x.expand(size, *x.shape) if dim is None else x.movedim(dim, 0) for x, dim in zip(tensors, in_dims, strict=True)
+    ]
+    return [x.flatten(0, 1) for x in moved]
+
+
+def unfolded(size: int, result: Tensor) -> Tensor:
+    """A result of :func:`folded` arguments, the batch last, with the mapped dimension before that again."""
+    return result.unflatten(-1, (size, -1))
+
+
+class _Solve(torch.autograd.Function):
+    """:func:`_solve`, which ``torch.func.vmap`` can map: it writes in place what a mapped dimension would not fit."""
+
+    @staticmethod
+    def forward(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Tensor]:
+        return _solve(world_points, plane_points)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: tuple[Tensor, Tensor]) -> None:
+        ctx.mark_non_differentiable(*output)
+
+    @staticmethod
+    def vmap(
+        info: Any, in_dims: tuple[int | None, int | None], *points: Tensor
+    ) -> tuple[tuple[Tensor, Tensor], tuple[int, int]]:
+        components, valid = _Solve.apply(*folded(info.batch_size, in_dims, *points))
+        return (unfolded(info.batch_size, components), unfolded(info.batch_size, valid)), (2, 1)
+
+
 def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
     r"""Find all poses from which a camera sees three world points where it saw them, for a batch of problems.
 
@@ -200,7 +232,8 @@ def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
         )
     if plane_points.device != world_points.device:
         raise DeviceError(f"plane_points is on {plane_points.device} but world_points is on {world_points.device}.")
-    components, valid = _solve(world_points.detach(), plane_points.detach())
+    solve = _solve if torch.compiler.is_compiling() else _Solve.apply
+    components, valid = solve(world_points.detach(), plane_points.detach())
     components = components.permute(2, 1, 0)  # (B, 4, 12)
     rotation, translation = components[..., :9].unflatten(-1, (3, 3)), components[..., 9:]
     return Hypotheses(Pose(rotation, translation), valid.mT)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from kornia.core.check import KORNIA_CHECK
 from torch import Tensor, nn
@@ -9,7 +11,7 @@ from torch.nn import functional
 
 from kornia_pnpnet.geometry import pixel_variance, project
 from kornia_pnpnet.init.control_points import align
-from kornia_pnpnet.init.p3p import p3p
+from kornia_pnpnet.init.p3p import folded, p3p, unfolded
 from kornia_pnpnet.small import dot, small_product
 from kornia_pnpnet.types import Correspondences, Guess, Noise, Pose
 
@@ -49,6 +51,11 @@ _taken_whole = torch.library.custom_op("kornia_pnpnet::taken", _taken, mutates_a
 @_taken_whole.register_fake
 def _(values: Tensor, index: Tensor) -> Tensor:
     return values.new_empty(values.shape[-1], index.shape[1], index.shape[0])
+
+
+@_taken_whole.register_vmap
+def _(info: Any, in_dims: tuple[int | None, int | None], *tensors: Tensor) -> tuple[Tensor, int]:
+    return unfolded(info.batch_size, _taken_whole(*folded(info.batch_size, in_dims, *tensors))), 2
 
 
 def _keep_freed_memory() -> None:
