@@ -254,9 +254,7 @@ def test_matrices_take_anything(tally, case):
 
 
 @pytest.mark.filterwarnings("ignore:There is a performance drop:UserWarning")
-@pytest.mark.parametrize(
-    "name", ["pnpnet-set", "pnpnet-n9", "epnp-lm", "reppnp-lm"]
-)  # RANSAC draws until it has seen enough
+@pytest.mark.parametrize("name", ["pnpnet-set", "pnpnet-n9", "epnp-lm", "reppnp-lm"])  # RANSAC looks at values
 def test_vmap_is_a_larger_batch(name, tally):
     tally("calls", "`torch.func.vmap`: as one larger batch")
     problems = SyntheticProblems(n=9, batch_size=6, seed=0, dtype=torch.float64).batch(0)
