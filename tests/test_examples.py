@@ -43,7 +43,7 @@ def test_photos_of_a_scene_are_localised(tmp_path):
 
 @pytest.mark.slow
 def test_images_become_poses_end_to_end(tmp_path):
-    """A few updates of it; what a whole training gives is in the results beside the script."""
+    """A few updates of it."""
     script = EXAMPLES / "keypoint_pipeline.py"
     arguments = ["--updates", "60", "--seeds", "1", "--batches", "1", "--out", tmp_path]
     subprocess.run([sys.executable, script, *arguments], check=True)
@@ -53,7 +53,3 @@ def test_images_become_poses_end_to_end(tmp_path):
     assert 0.0 < found["end to end"]["mean_distance"] <= 1.0
     for picture in ("keypoint_pipeline.png", "keypoint_pipeline_overlays.png"):
         assert (tmp_path / picture).stat().st_size > 0
-    seeds = json.loads((EXAMPLES / "keypoint_pipeline.json").read_text())["seeds"]
-    assert len(seeds) == 3
-    for run in seeds.values():
-        assert run["end to end"]["mean_distance"] < 0.5 * run["keypoint loss alone"]["mean_distance"]

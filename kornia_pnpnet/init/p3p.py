@@ -180,7 +180,7 @@ class _Solve(torch.autograd.Function):
     def vmap(
         info: Any, in_dims: tuple[int | None, int | None], *points: Tensor
     ) -> tuple[tuple[Tensor, Tensor], tuple[int, int]]:
-        components, valid = _Solve.apply(*folded(info.batch_size, in_dims, *points))
+        components, valid = _Solve.apply(*folded(info.batch_size, in_dims, *points))  # type: ignore[no-untyped-call]
         return (unfolded(info.batch_size, components), unfolded(info.batch_size, valid)), (2, 1)
 
 
