@@ -52,7 +52,7 @@ lint: $(STAMP) ## ruff and mypy
 	$(PY) -m mypy
 
 clean: ## Remove builds, caches and the demo's output; .venv and other outputs stay
-	rm -rf build dist site outputs/demo .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf build dist site jupyter_execute outputs/demo .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find . -path ./$(VENV) -prune -o -path ./.git -prune -o -type d -name __pycache__ -exec rm -rf {} +
 
 $(STAMP):
