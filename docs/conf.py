@@ -56,7 +56,13 @@ def _outside(app, name, source):
     source[0] = re.sub(r"\[([^]]*)\]\(([^):#]+)\)", named, source[0])
 
 
+def _is_field(app, what, name, member, skip, options):
+    """Fields of named tuples are described with their class; of themselves they only know their number."""
+    return True if type(member).__name__ == "_tuplegetter" else None
+
+
 def setup(app):
     """Register the way in which formulas are written, and what becomes of links that leave."""
     app.connect("source-read", _outside)
+    app.connect("autodoc-skip-member", _is_field)
     app.add_html_math_renderer("mathml", inline_renderers=_math(False), block_renderers=_math(True))
