@@ -454,7 +454,7 @@ class PnPNet(nn.Module):
                 state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         except (OSError, ValueError, SafetensorError) as error:
             raise ValueCheckError(f"Cannot read the weights in {folder}: {error}") from error
-        if metadata.get(_FINGERPRINT, _fingerprint(config, state)) != _fingerprint(config, state):
+        if _FINGERPRINT in metadata and metadata[_FINGERPRINT] != _fingerprint(config, state):
             raise ValueCheckError(
                 f"The weights in {folder} are damaged: {CONFIG_NAME} and {WEIGHTS_NAME} do not match."
             )
@@ -470,7 +470,8 @@ def _fingerprint(config: Any, state: dict[str, Tensor]) -> str:
     """What tells whether a configuration and weights are those that were saved together."""
     digest = hashlib.sha256(json.dumps(config, sort_keys=True).encode())
     for name, value in sorted(state.items()):
-        digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode() + value.numpy().tobytes())
+        digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
+        digest.update(value.reshape(-1).view(torch.uint8).numpy().tobytes())  # NumPy has not all dtypes
     return digest.hexdigest()
 
 
