@@ -334,6 +334,18 @@ def run_main(*arguments):
     return code, out.getvalue(), err.getvalue()
 
 
+def solving(kind, path):
+    """The arguments that solve a file."""
+    shard = "--batch", "--out", path.parent / "out", "--overwrite"
+    return (
+        "solve",
+        path,
+        *(shard if kind.startswith("shard") else ("--intrinsics", "3400,3400,960,540")),
+        "--solver",
+        "epnp",
+    )
+
+
 @pytest.mark.filterwarnings("ignore")  # of NumPy, about headers and overlapping entries
 @pytest.mark.parametrize("kind", ["csv", "npz", "shard npz", "shard parquet"])
 def test_damaged_files_are_a_line_and_no_traceback(kind, tmp_path, tally):
@@ -345,11 +357,7 @@ def test_damaged_files_are_a_line_and_no_traceback(kind, tmp_path, tally):
         tally("files", f"`pnpnet solve` of a damaged {kind}: at most one line of error, no traceback")
         path = tmp_path / f"problem.{suffix}"
         path.write_bytes(content)
-        if kind.startswith("shard"):
-            more = "--batch", "--out", tmp_path / "out", "--overwrite"
-        else:
-            more = ("--intrinsics", "3400,3400,960,540")
-        code, out, err = run_main("solve", path, *more, "--solver", "epnp")
+        code, out, err = run_main(*solving(kind, path))
         assert code in (0, 1, 2)
         if code == 2:
             assert err.startswith(f"pnpnet: {path}")
@@ -357,16 +365,10 @@ def test_damaged_files_are_a_line_and_no_traceback(kind, tmp_path, tally):
         elif suffix in ("csv", "npz") and not kind.startswith("shard"):
             assert json.loads(out)["n"] >= 3
 
-    code, _, _ = run_main(*_sound(kind, tmp_path, sound, suffix))
-    assert code == 0
+    path = tmp_path / f"sound.{suffix}"
+    path.write_bytes(sound)
+    assert run_main(*solving(kind, path))[0] == 0
     check_file()
-
-
-def _sound(kind, folder, content, suffix):
-    path = folder / f"sound.{suffix}"
-    path.write_bytes(content)
-    more = ["--batch", "--out", folder / "sound"] if kind.startswith("shard") else ["--intrinsics", "3400,3400,960,540"]
-    return ["solve", path, *more, "--solver", "epnp"]
 
 
 # No slash: what has one could be the name of a repository on the Hub.
