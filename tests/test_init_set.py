@@ -178,15 +178,25 @@ def test_some_sample_is_right_whichever_are_wrong(count, wrong):
         assert any(not set(bad) & set(sample) for sample in samples)
 
 
-def test_many_pairs_make_more_samples(make_problems, monkeypatch):
-    """Spread samples find some poses that those of the likeliest alone miss, and cost nothing where they do not."""
-    p = make_problems(n=30, batch=500, outliers=15)
+@pytest.mark.parametrize(("n", "wrong", "more"), [(30, 15, "_SPREADS"), (50, 36, "_RING")])
+def test_many_pairs_make_more_samples(make_problems, monkeypatch, n, wrong, more):
+    """More samples find some poses that the first miss, and cost nothing where they do not."""
+    p = make_problems(n=n, batch=500, outliers=wrong)
     net = solver()
     both = net.with_guess(*p[:3], **NOISE)[1].others.rotation[:, -1]
-    monkeypatch.setattr("kornia_pnpnet.init.set._SPREADS", {})
-    near_only = net.with_guess(*p[:3], **NOISE)[1].others.rotation[:, -1]
-    error = [rotation_angle(x, p.pose.rotation) for x in (both, near_only)]
+    monkeypatch.setattr(f"kornia_pnpnet.init.set.{more}", {})
+    fewer = net.with_guess(*p[:3], **NOISE)[1].others.rotation[:, -1]
+    error = [rotation_angle(x, p.pose.rotation) for x in (both, fewer)]
     assert error[0].median() < error[1].median()
+
+
+def test_the_last_samples_share_no_two_pairs():
+    few, many = (solver().init.triples(n) for n in (35, 36))
+    (least,) = set(many) - set(few)
+    assert least == 36
+    pairs = [pair for sample in many[36] for pair in combinations(sample, 2)]
+    assert len(pairs) == len(set(pairs))
+    assert {k for sample in many[36] for k in sample} == set(range(25))
 
 
 def test_where_no_sample_has_a_pose_the_first_guess_stands_in():

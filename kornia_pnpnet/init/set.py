@@ -31,6 +31,8 @@ _ABSENT = -1e9
 _SAMPLES = ((0, 1, 2), (0, 1, 3), (2, 3, 4), (2, 3, 5), (0, 4, 5), (1, 4, 5), (0, 2, 3), (1, 2, 3))
 # From so many pairs on as many samples again are spread over so many times as many of the likeliest.
 _SPREADS = {18: 3, 24: 4, 30: 5}
+# And from so many on more: each of the likeliest 25 is in three of them, no two are together twice.
+_RING = {36: [tuple(sorted((i % 25, (i + 1) % 25, (i + 6) % 25))) for i in range(25)]}
 # So many of the likeliest pairs say how good the pose of a sample is: squared residuals count to this many variances.
 MOST_JUDGES, _JUDGED = 32, 50.0
 # Somewhat below the most that glibc's threshold follows.
@@ -321,7 +323,7 @@ class SetInit(nn.Module):
         """
         near = [x for x in _SAMPLES[: self.samples] if max(x) < count]
         spread = {least: [(f * i, f * j, f * k) for i, j, k in near] for least, f in _SPREADS.items() if least <= count}
-        return {0: near, **spread}
+        return {0: near, **spread, **{least: ring for least, ring in _RING.items() if least <= count}}
 
     @torch.no_grad()
     def _sampled(self, corr: Correspondences, right: Tensor, noise: Noise, fallback: Pose) -> Pose:
