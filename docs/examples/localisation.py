@@ -31,7 +31,8 @@ from kornia_pnpnet.results import save_results
 
 HERE = Path(__file__).resolve().parent
 SIZE, FOCAL = (480, 360), 420.0
-THRESHOLD_PX, MOST_MATCHES, SNAP_PX = 8.0, 300, 2.0
+THRESHOLD_PX, SNAP_PX = 8.0, 2.0
+SOLVERS = ("pnpnet-set", "cv2.solvePnPRansac")
 
 
 def wall(rng: np.random.Generator) -> np.ndarray:
@@ -166,7 +167,6 @@ def raw_matches(found: Mapping[str, Any], name: str) -> tuple[Tensor, Tensor]:
     database = np.concatenate([x[1][x[2]] for x in others])
     world = np.concatenate([x[3] for x in others])
     matches = cv2.BFMatcher(cv2.NORM_L2, crossCheck=True).match(features, database)
-    matches = sorted(matches, key=lambda match: match.distance)[:MOST_MATCHES]
     points = torch.from_numpy(world[[x.trainIdx for x in matches]])
     return points, torch.from_numpy(pixels[[x.queryIdx for x in matches]])
 
@@ -196,10 +196,7 @@ def main() -> None:
         )
         theirs = Pose(torch.from_numpy(cv2.Rodrigues(turn)[0]), torch.from_numpy(shift[:, 0])) if ok else None
         row: dict[str, Any] = {"image": view.name, "matches": len(points)}
-        for name, pose in (
-            ("pnpnet-set", Pose(result.rotation[0], result.translation[0])),
-            ("cv2.solvePnPRansac", theirs),
-        ):
+        for name, pose in zip(SOLVERS, (Pose(result.rotation[0], result.translation[0]), theirs), strict=True):
             if pose is None:
                 row[name] = None
                 continue
@@ -213,29 +210,36 @@ def main() -> None:
         inliers = np.zeros(len(points), bool)
         if kept is not None:
             inliers[kept[:, 0]] = True
-        drawn.append((view.name, img, result.weights[0] > 0.5, inliers))
-    limit = 0.05 if scene.metric else 0.01
+        drawn.append((row, img, (result.weights[0].numpy() > 0.5, inliers)))
+    limit, name_of_unit = (0.05, "m") if scene.metric else (0.01, "depths")
     summary = {
-        name: sum(1 for row in rows if row[name] and row[name]["rotation_deg"] < 1.0 and row[name]["centre"] < limit)
-        for name in ("pnpnet-set", "cv2.solvePnPRansac")
+        name: {
+            "within_1_deg_and_limit": sum(
+                row[name] is not None and row[name]["rotation_deg"] < 1.0 and row[name]["centre"] < limit
+                for row in rows
+            ),
+            "median_centre": float(np.median([row[name]["centre"] if row[name] else math.inf for row in rows])),
+        }
+        for name in SOLVERS
     }
-    results = {"environment": environment(), "images": rows, "within_1_deg_and_limit": summary, "limit": limit}
+    results = {"environment": environment(), "images": rows, "limit": limit, "unit": name_of_unit, "solvers": summary}
     options.out.mkdir(parents=True, exist_ok=True)
     save_results(results, options.out / "localisation.json")
     figure = make_figure(9.0, 4.6)
     chosen = drawn[:: max(1, len(drawn) // 3)][:3]
-    for column, (name, img, ours_kept, theirs_kept) in zip(figure.subplots(2, 3).T, chosen, strict=False):
-        for axes, kept, colour, who in zip(
-            column, (ours_kept.numpy(), theirs_kept), (BLUE, ORANGE), ("pnpnet-set", "cv2.solvePnPRansac"), strict=True
-        ):
-            axes.imshow(images[name], cmap="gray")
+    for column, (row, img, both) in zip(figure.subplots(2, 3).T, chosen, strict=False):
+        for axes, kept, colour, who in zip(column, both, (BLUE, ORANGE), SOLVERS, strict=True):
+            axes.imshow(images[row["image"]], cmap="gray")
             axes.scatter(*img[torch.from_numpy(kept)].mT, s=6, color=colour)
             axes.scatter(*img[torch.from_numpy(~kept)].mT, s=8, color="red", marker="x", linewidths=0.6)
             axes.set_axis_off()
-            axes.set_title(f"{who}: {name}", loc="left", fontsize=8)
+            off = f"{row[who]['centre']:.4f} {name_of_unit} off" if row[who] else "no pose"
+            axes.set_title(f"{who}: {row['image']}, {off}", loc="left", fontsize=8)
     save(figure, options.out / "localisation.png")
-    for name, count in summary.items():
-        print(f"{name}: {count} of {len(rows)} images within 1° and {limit} {'m' if scene.metric else 'depths'}")
+    for name, found_by in summary.items():
+        count, median = found_by.values()
+        within = f"{count} of {len(rows)} images within 1° and {limit} {name_of_unit}"
+        print(f"{name}: {within}, camera centres {median:.4f} {name_of_unit} off (median)")
 
 
 if __name__ == "__main__":
