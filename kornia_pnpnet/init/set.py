@@ -32,7 +32,7 @@ _SAMPLES = ((0, 1, 2), (0, 1, 3), (2, 3, 4), (2, 3, 5), (0, 4, 5), (1, 4, 5), (0
 # From so many pairs on as many samples again are spread over so many times as many of the likeliest.
 _SPREADS = {18: 3, 24: 4, 30: 5}
 # And from so many on more: each of the likeliest 25 is in three of them, no two are together twice.
-_RING = {36: [tuple(sorted((i % 25, (i + 1) % 25, (i + 6) % 25))) for i in range(25)]}
+_RING = {36: [(a, b, c) for i in range(25) for a, b, c in [sorted((i, (i + 1) % 25, (i + 6) % 25))]]}
 # So many of the likeliest pairs say how good the pose of a sample is: squared residuals count to this many variances.
 MOST_JUDGES, _JUDGED = 32, 50.0
 # Somewhat below the most that glibc's threshold follows.
