@@ -63,8 +63,8 @@ def page(results: dict[str, Any]) -> str:
         "# What it withstands",
         "",
         f"{total} cases, all as they should be, counted by the tests themselves (`tests/test_hardening.py` and",
-        "`tests/test_interruptions.py`, of which `make test-all` runs a tenth). Written by `docs/hardening.py` from",
-        "`results/hardening.json`.",
+        "`tests/test_interruptions.py`; `make test-all` runs most with fewer cases). Written by `docs/hardening.py`",
+        "from `results/hardening.json`.",
     ]
     for part, (heading, text, head) in PARTS.items():
         lines += ["", f"## {heading}", ""] + ([text, ""] if text else []) + [f"| {head} |", "|---|---|"]

@@ -322,7 +322,11 @@ class PnPNet(nn.Module):
         """Noise in the units and the order of the correspondences; where it makes no sense, no problem is valid."""
         usable = torch.stack([((x >= 0) | x.isnan()).all(-1) & ~x.isinf().any(-1) for x in noise]).all(0)
         scales = corr.img_scale, corr.world_scale
-        parts = [x if scale is None else x * scale[:, None] for x, scale in zip(noise, scales, strict=True)]
+        # What is not known is NaN, and would be the gradient of its scale, too.
+        parts = [
+            x if scale is None else torch.where(x.isnan(), x, x.nan_to_num() * scale[:, None])
+            for x, scale in zip(noise, scales, strict=True)
+        ]
         if self.normalize.order:
             parts = [x.gather(1, frame.order) for x in parts]
         return corr._replace(noise=Noise(*parts)), frame._replace(valid=frame.valid & usable)

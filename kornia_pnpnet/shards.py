@@ -88,7 +88,7 @@ def solve_shards(
     """
     shards = _shards(sources)
     out = Path(out)
-    _claim(out, name, solver, overwrite=overwrite)
+    _claim(out, name, solver, {shard.name for shard in shards} if overwrite else set())
     solved = problems = done = kept = 0
     failed = []
     for shard in shards:
@@ -124,20 +124,25 @@ def _shards(sources: Sequence[str | Path]) -> list[Path]:
     return list(shards.values())
 
 
-def _claim(out: Path, name: str, solver: nn.Module, *, overwrite: bool) -> None:
-    """Write into a folder by which solver its results are, or see that it is the same."""
+def _claim(out: Path, name: str, solver: nn.Module, replaced: set[str]) -> None:
+    """Write into a folder by which solver its results are, or see that those that are not replaced are by the same."""
     digest = hashlib.sha256()
     for key, value in sorted(solver.state_dict().items()):
         digest.update(key.encode() + value.detach().cpu().numpy().tobytes())
     mine = {"solver": name, "parameters": digest.hexdigest()}
     path = out / MANIFEST
-    if path.exists() and not overwrite:
+    if path.exists():
         try:
             theirs = json.loads(path.read_text())
         except ValueError:
             theirs = None
         if theirs != mine:
-            raise PairsError(path, f"the results in this folder are not by this {name}: take another, or --overwrite")
+            results = [x for x in out.iterdir() if x.suffix in SUFFIXES]
+            if not {x.name for x in results} <= replaced:
+                how = "--overwrite all of them" if replaced else "--overwrite"
+                raise PairsError(path, f"the results in this folder are not by this {name}: take another, or {how}")
+            for result in results:  # now: whoever is stopped must not find them under the new name
+                result.unlink()
     with atomic_open(path) as file:
         json.dump(mine, file, indent=2)
 

@@ -54,3 +54,26 @@ def test_images_become_poses_end_to_end(tmp_path):
     assert 0.0 < found["end to end"]["mean_distance"] <= 1.0
     for picture in ("keypoint_pipeline.png", "keypoint_pipeline_overlays.png"):
         assert (tmp_path / picture).stat().st_size > 0
+
+
+def test_the_end_to_end_gradient_halves_the_error_for_every_seed():
+    """In the results that the documentation shows."""
+    results = json.loads((EXAMPLES / "keypoint_pipeline.json").read_text())
+    assert len(results["seeds"]) == 3
+    for runs in results["seeds"].values():
+        for key in ("mean_distance", "median_distance"):
+            assert runs["keypoint loss alone"][key] > 2.0 * runs["end to end"][key]
+
+
+def test_keypoints_are_visible_where_nothing_is_before_them(monkeypatch):
+    """The box alone: what shows is as near as the ray's hit with the box."""
+    monkeypatch.syspath_prepend(EXAMPLES)
+    import keypoint_pipeline as pipeline
+
+    pose = pipeline.draw(3, 0).pose
+    eye = -(pose.translation[:, None] @ pose.rotation)
+    rays = pipeline.KEYPOINTS - eye  # (B, 14, 3), hit the box first where they meet its slabs
+    near = ((-pipeline.HALF * rays.sign() - eye) / rays).amax(-1)
+    first = near > 1.0 - 1e-4
+    assert (first == pipeline.outside(pose)).all()
+    assert 0 < first.sum() < first.numel()

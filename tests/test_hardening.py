@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from kornia.core.exceptions import BaseError, ShapeError
 
-from kornia_pnpnet import create_solver, pose_covariance, pose_errors, solve_pnp, success
+from kornia_pnpnet import Pose, create_solver, pose_covariance, pose_errors, solve_pnp, success
 from kornia_pnpnet.cli import main
 from kornia_pnpnet.data import SyntheticProblems
 
@@ -138,6 +138,46 @@ def test_solvers_take_anything(name, tally):
         inputs, mask, weights, kinds = case
         tally("batches", f"`{name}`")
         check(SOLVERS[name](*inputs, weights=weights, mask=mask), inputs, kinds, tally)
+
+    run()
+
+
+@st.composite
+def numbers(draw, dtype, *shapes):
+    """Of one of the shapes; now and then one of them is no number that makes sense."""
+    seed, size = draw(st.integers(0, 1000)), 10.0 ** draw(st.integers(-6, 6))
+    shape = draw(st.sampled_from(shapes))
+    values = size * torch.rand(shape, generator=torch.Generator().manual_seed(seed)).to(dtype)
+    if values.numel() and draw(st.booleans()):
+        values.view(-1)[0] = draw(st.sampled_from([0.0, -1.0, NAN, INF, 1e30]))
+    return values
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_solvers_take_any_weights_noise_and_start(name, tally):
+    exactly = 9 if name.endswith("-n9") else None
+
+    @many(30)
+    @given(batches(exactly), st.data())
+    def run(case, data):
+        inputs, mask, _, kinds = case
+        batch, count = inputs[0].shape[:2]
+        tally("batches", f"`{name}`, with any weights, noise, masks and starts")
+        dtype, each = inputs[0].dtype, (batch, count)
+        weights = data.draw(numbers(dtype, each))
+        # The first pair is the one that is spoiled.
+        kinds = ["nothing" if weight == 0 else kind for kind, weight in zip(kinds, weights[:, 0], strict=True)]
+        sigma = st.one_of(st.none(), numbers(dtype, (), (batch,), each))
+        noise = {key: data.draw(sigma) for key in ("img_sigma", "world_sigma")}
+        if mask is not None and batch and data.draw(st.booleans()):
+            mask[0] = False  # of the first problem nothing is there
+            kinds[0] = "one point"
+        init = None
+        if data.draw(st.booleans()):
+            translation = 10.0 * torch.randn(batch, 3, generator=torch.Generator().manual_seed(batch))
+            init = Pose(torch.eye(3).expand(batch, 3, 3), translation)
+            init = Pose(*(x.to(inputs[0].dtype) for x in init))
+        check(SOLVERS[name](*inputs, weights=weights, mask=mask, init=init, **noise), inputs, kinds, tally)
 
     run()
 

@@ -1,6 +1,5 @@
 """Processes that die, disks that are full, files that are damaged: nothing that was saved is lost."""
 
-import contextlib
 import csv
 import json
 import multiprocessing
@@ -96,7 +95,6 @@ def test_kill_9_at_any_moment_loses_nothing(tmp_path, tally):
         assert mine.keys() == weights.keys()
         assert all(mine[key].equal(value) for key, value in weights.items())
         assert rows == history
-        assert not list(folder.glob("*.tmp")) or killed  # what a killed process was writing may lie about
     assert killed == KILLS
 
 
@@ -195,12 +193,14 @@ def test_damaged_weights_load_nothing(tally, weights_folder, tmp_path_factory, d
         else:
             del content[place:]
         path.write_bytes(content)
-        with contextlib.suppress(ValueCheckError):
+        sound = PnPNet.from_pretrained(weights_folder)
+        try:
             loaded = PnPNet.from_pretrained(folder)
-            sound = PnPNet.from_pretrained(weights_folder)
-            assert json.dumps(loaded.config()) == json.dumps(sound.config())
-            theirs = loaded.state_dict()
-            assert all(theirs[key].equal(value) for key, value in sound.state_dict().items())
+        except ValueCheckError:
+            return
+        assert json.dumps(loaded.config()) == json.dumps(sound.config())
+        theirs = loaded.state_dict()
+        assert all(theirs[key].equal(value) for key, value in sound.state_dict().items())
     finally:
         shutil.rmtree(folder)
 

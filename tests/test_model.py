@@ -1023,6 +1023,19 @@ def test_noise_that_makes_no_sense_is_not_ok_or_refused(name, make_problems):
             solver(*p[:3], **{name: wrong})
 
 
+@pytest.mark.parametrize("name", ["pnpnet-set", "pnpnet-n9", "epnp-lm", "reppnp-lm", "p3p-ransac", "identity-lm"])
+@pytest.mark.parametrize("told", [{"img_sigma": 50.0}, {"world_sigma": 0.5}], ids=repr)
+def test_gradients_are_finite_where_one_noise_is_told(name, told, make_problems):
+    problems = make_problems(n=9, batch=3)
+    inputs = [x.clone().requires_grad_() for x in problems[:3]]
+    result = create_solver(name)(*inputs, **told)
+    assert result.ok.any()
+    total = result.translation.sum() + result.init.translation.sum()
+    for gradient in torch.autograd.grad(total, inputs):
+        assert gradient.isfinite().all()
+        assert gradient.any()
+
+
 def test_pairs_of_no_pose_are_not_ok_when_the_noise_is_known(make_problems):
     p = make_problems(batch=500)
     solver = create_solver("epnp-lm")

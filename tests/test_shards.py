@@ -72,6 +72,17 @@ def test_another_solver_does_not_go_on_in_the_same_folder(shards, solver, tmp_pa
     solve_shards(solver, [folder], tmp_path / "out", name="reppnp")
     with pytest.raises(PairsError, match="not by this pnpnet-n9"):
         solve_shards(create_solver("pnpnet-n9"), [folder], tmp_path / "out", name="pnpnet-n9")
+    one = next(folder.iterdir())
+    with pytest.raises(PairsError, match="--overwrite all of them"):
+        solve_shards(create_solver("pnpnet-n9"), [one], tmp_path / "out", name="pnpnet-n9", overwrite=True)
+
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):  # what is left is by one solver
+        solve_shards(create_solver("epnp"), [folder], tmp_path / "out", name="epnp", overwrite=True, watch=stopped)
+    assert len(list((tmp_path / "out").glob("*.npz"))) == 1
+    assert solve_shards(solver, [folder], tmp_path / "out", name="reppnp", overwrite=True).shards == 3
     (tmp_path / "out" / MANIFEST).write_text("{")
     with pytest.raises(PairsError, match="not by this reppnp"):
         solve_shards(solver, [folder], tmp_path / "out", name="reppnp")

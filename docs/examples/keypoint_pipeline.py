@@ -4,9 +4,10 @@ A textured box is rendered under random poses, before a random background, behin
 network finds its 14 keypoints (Kornia's spatial softmax and expectation) and says of each by how many pixels it may be
 off; `PnPNet` makes a pose of them. First the network learns where keypoints are, from labels like those that people
 make: of the keypoints that can be seen, more than half of them hidden. Then two copies go on for as long: one with the
-keypoint loss alone, the other with that of the pose, too, whose gradient comes through the solver and teaches it where
-the hidden ones are and how far off each may be. Both are tested with the same solver on images that neither saw. Writes
-`keypoint_pipeline.json` and pictures beside this file.
+keypoint loss alone, the other with that of the pose, too, whose gradient comes through the solver and teaches it how
+far off each keypoint may be. Both are tested with the same solver, which only the second tells how far off, on images
+that neither saw; so are the second without telling, and one that learned as long from labels of all keypoints, as a
+known pose can make them. Writes `keypoint_pipeline.json` and pictures beside this file.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from torch.nn import functional
 
 from kornia_pnpnet import PnPResult, Pose, create_solver
 from kornia_pnpnet.environment import environment
-from kornia_pnpnet.figures.style import BLUE, GREEN, ORANGE, make_figure, save, tidy
+from kornia_pnpnet.figures.style import BLUE, GREEN, ORANGE, VERMILION, make_figure, save, tidy
 from kornia_pnpnet.geometry import rotation_angle
 from kornia_pnpnet.results import save_results
 
@@ -47,6 +48,7 @@ MOST = 0.3
 # The loss of the pose counts this much beside that of the keypoints, in pixels.
 POSE_WEIGHT = 50.0
 ALONE, END, UNTOLD = "keypoint loss alone", "end to end", "end to end, not told how far off"
+FULL = "keypoint loss alone, hidden ones labelled"
 # Points of a curve are means of so many updates.
 MEAN_OF = 50
 
@@ -171,8 +173,10 @@ def distance(pose: Pose, truth: Pose) -> Tensor:
     return (off.square().sum(-1) + 1e-12).sqrt().mean(-1)
 
 
-def train(network: Keypoints, solver: nn.Module | None, seed: int, updates: range) -> dict[str, list[float]]:
-    """Go on with the keypoint loss, and with a solver with that of the pose, too; returns curves."""
+def train(
+    network: Keypoints, solver: nn.Module | None, seed: int, updates: range, *, hidden: bool = False
+) -> dict[str, list[float]]:
+    """Go on with the keypoint loss, of hidden ones on request, and with a solver that of the pose; returns curves."""
     log: list[list[float]] = []
     optimizer = torch.optim.AdamW(network.parameters(), lr=2e-3, weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 2e-3, total_steps=len(updates), pct_start=0.1)
@@ -180,7 +184,8 @@ def train(network: Keypoints, solver: nn.Module | None, seed: int, updates: rang
         problem = draw(seed, index)
         pixels, sigma = network(problem.images)
         off = functional.smooth_l1_loss(pixels, problem.pixels, reduction="none").mean(-1)
-        keypoint_loss = (off * problem.visible).sum() / problem.visible.sum()
+        labelled = torch.ones_like(problem.visible) if hidden else problem.visible
+        keypoint_loss = (off * labelled).sum() / labelled.sum()
         loss, terms = keypoint_loss, [keypoint_loss.item()]
         if solver is not None:
             result = solve(solver, pixels, sigma)
@@ -228,6 +233,7 @@ def run(seed: int, updates: int, batches: int) -> tuple[dict[str, Any], dict[str
     torch.manual_seed(seed)
     solver = create_solver("pnpnet-set").requires_grad_(False)
     start = Keypoints()
+    untrained = copy.deepcopy(start.state_dict())
     found: dict[str, Any] = {"keypoints first": {"curves": train(start, None, seed, range(updates))}}
     networks = {name: copy.deepcopy(start) for name in (ALONE, END)}
     for name, end in ((ALONE, None), (END, solver)):
@@ -235,6 +241,11 @@ def run(seed: int, updates: int, batches: int) -> tuple[dict[str, Any], dict[str
         found[name] = {"curves": curves, **test(networks[name], solver, told=end is not None, batches=batches)}
         distances = ", ".join(f"{key} {found[name][key]:.4f}" for key in ("mean_distance", "median_distance"))
         print(f"seed {seed}, {name}: {distances}", flush=True)
+    full = Keypoints()
+    full.load_state_dict(untrained)
+    curves = [train(full, None, seed, range(first, first + updates), hidden=True) for first in (0, updates)][-1]
+    found[FULL] = {"curves": curves, **test(full, solver, told=False, batches=batches)}
+    print(f"seed {seed}, {FULL}: mean_distance {found[FULL]['mean_distance']:.4f}", flush=True)
     found[UNTOLD] = test(networks[END], solver, told=False, batches=batches)
     return found, networks
 
@@ -242,16 +253,18 @@ def run(seed: int, updates: int, batches: int) -> tuple[dict[str, Any], dict[str
 def plot_errors(results: dict[str, Any], path: Path) -> None:
     """The errors of each seed, and their means."""
     figure = make_figure(8.0, 3.4)
-    names = {ALONE: ORANGE, UNTOLD: GREEN, END: BLUE}
+    names = {ALONE: ORANGE, FULL: VERMILION, UNTOLD: GREEN, END: BLUE}
     parts = (("mean_distance", "mean distance of keypoints"), ("mean_rotation_deg", "mean rotation error (°)"))
     for axes, (key, label) in zip(figure.subplots(1, 2), parts, strict=True):
         for x, (name, colour) in enumerate(names.items()):
             values = [found[name][key] for found in results["seeds"].values()]
             axes.bar(x, sum(values) / len(values), color=colour, alpha=0.4, width=0.6)
             axes.plot([x] * len(values), values, "o", color=colour)
-        axes.set_xticks(range(3), ("keypoint loss\nalone", "end to end,\nσ not told", "end to end"))
+        labels = ("keypoint loss\nalone", "alone, hidden\nlabelled", "end to end,\nσ not told", "end to end")
+        axes.set_xticks(range(4), labels, fontsize=7)
         axes.set_ylabel(label)
-        axes.set_title(f"{results['times_lower'][key]:.2f} times lower", loc="left", fontsize=9)
+        times = (f"{results['times_lower'][name][key]:.2f}" for name in (ALONE, FULL))
+        axes.set_title("{} and {} times lower".format(*times), loc="left", fontsize=9)
         tidy(axes)
     save(figure, path)
 
@@ -293,9 +306,12 @@ def main() -> None:
         runs = list(pool.map(run, *arguments))
     seeds = {str(seed): found for seed, (found, _) in enumerate(runs)}
     times_lower = {
-        key: sum(x[ALONE][key] for x in seeds.values()) / sum(x[END][key] for x in seeds.values())
-        for key in seeds["0"][END]
-        if key != "curves"
+        name: {
+            key: sum(x[name][key] for x in seeds.values()) / sum(x[END][key] for x in seeds.values())
+            for key in seeds["0"][END]
+            if key != "curves"
+        }
+        for name in (ALONE, FULL)
     }
     made = {"environment": environment(), "updates": options.updates, "batches": options.batches}
     results = {**made, "times_lower": times_lower, "seeds": seeds}

@@ -117,8 +117,12 @@ class _View:
             return [(torch.zeros_like(corr.weights), no)] * 2
         units = corr.focal * self.spread[:, None], torch.ones_like(self.spread[:, None])
         known = [torch.isfinite(x) for x in corr.noise]
-        safe = [torch.where(k, x / u, 1.0).clamp(min=1e-6) for x, u, k in zip(corr.noise, units, known, strict=True)]
-        return [(x.log(), k) for x, k in zip(safe, known, strict=True)]
+        logs = []
+        for values, unit, told in zip(corr.noise, units, known, strict=True):
+            # What is not told is NaN, and would be the gradient of its unit, too.
+            relative = torch.where(told, values, 1.0) / torch.where(told, unit, 1.0)
+            logs.append(relative.clamp(min=1e-6).log())
+        return list(zip(logs, known, strict=True))
 
 
 def _solve_symmetric(matrix: Tensor, right: Tensor) -> Tensor:
