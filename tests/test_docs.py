@@ -97,7 +97,7 @@ def test_every_public_name_is_in_the_reference(site):
     assert {f"kornia_pnpnet.{x.name}" for x in pkgutil.iter_modules(kornia_pnpnet.__path__)} - set(modules) <= INTERNAL
 
 
-# How the package does what it does, and the command line, which has pages of its own.
+# How the package does what it does, and the command line, which has a page of its own.
 INTERNAL = {
     f"kornia_pnpnet.{name}"
     for name in ("arguments", "choices", "cli", "compilation", "demo", "environment", "files", "pairs", "results")
