@@ -15,7 +15,8 @@ from kornia_pnpnet.figures.style import SMALL, WIDTH, SolverStyle
 
 __all__ = ["plot_latency", "plot_times"]
 
-_COMPILED = " compiled"
+# How a solver may be run, by the end of its name, and the line of it.
+_WAYS = {" compiled": "-", " compiled whole": (0, (1, 1.3)), " ONNX": (0, (5, 1.5, 1, 1.5))}
 _DASHED = (0, (4, 2))
 _LAST_SHARE = 0.99  # drawn of a distribution; of the rest are calls that something else delayed
 
@@ -91,7 +92,7 @@ def plot_latency(path: str | Path, title: str, rows: Sequence[Mapping[str, Any]]
 
 
 def _looks(names: Iterable[str]) -> dict[str, SolverStyle]:
-    """Styles in order; what is also there compiled is open and dashed, its compiled self filled and solid.
+    """Styles in order; what is also there compiled is open and dashed, its compiled selves filled, each with its line.
 
     Raises:
         ValueError: when there is no name.
@@ -100,12 +101,12 @@ def _looks(names: Iterable[str]) -> dict[str, SolverStyle]:
     if not there:
         raise ValueError("There are no times to draw.")
     found = {}
-    for base, look in style.solver_styles({name.removesuffix(_COMPILED) for name in there}).items():
-        both = base in there and base + _COMPILED in there
+    bases = {name: next((name.removesuffix(way) for way in _WAYS if name.endswith(way)), name) for name in there}
+    for base, look in style.solver_styles(set(bases.values())).items():
+        ways = {base + way: dash for way, dash in _WAYS.items() if base + way in there}
         if base in there:
-            found[base] = look._replace(filled=False, dash=_DASHED) if both else look
-        if base + _COMPILED in there:
-            found[base + _COMPILED] = look._replace(filled=True, dash="-")
+            found[base] = look._replace(filled=False, dash=_DASHED) if ways else look
+        found |= {name: look._replace(filled=True, dash=dash) for name, dash in ways.items()}
     return found
 
 
