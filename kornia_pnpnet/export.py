@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -97,9 +98,11 @@ def export_onnx(solver: PnPNet, path: str | Path, n: int | None = None) -> Path:
     except ImportError as error:
         raise ImportError("ONNX needs more packages: pip install 'kornia_pnpnet[onnx]'") from error
     path = Path(path)
-    model = torch.onnx.export(
-        export_program(solver, n), dynamo=True, input_names=list(INPUTS), output_names=list(OUTPUTS), verbose=False
-    )
+    program = export_program(solver, n)
+    inputs, outputs = list(INPUTS), list(OUTPUTS)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # of the exporter, about itself
+        model = torch.onnx.export(program, dynamo=True, verbose=False, input_names=inputs, output_names=outputs)
     assert model is not None
     graph = model.model_proto
     batches = {value.type.tensor_type.shape.dim[0].dim_param for value in graph.graph.input}

@@ -75,7 +75,6 @@ def test_onnx(make_problems, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::FutureWarning")  # of the exporter, about itself
 def test_onnx_of_the_set_network(make_problems, tmp_path):
     """For any number of pairs, padding included."""
     solver = create_solver("pnpnet-set")
