@@ -82,12 +82,15 @@ def solve_shards(
         The :class:`ShardReport`.
 
     Raises:
-        PairsError: when there is no shard, two have one name, or the folder is another solver's.
+        PairsError: when there is no shard, two have one name, or the folder is another solver's or that of a shard.
         ImportError: for Parquet without the extra ``shards``.
         OSError: when the results cannot be written.
     """
     shards = _shards(sources)
     out = Path(out)
+    for shard in shards:
+        if shard.resolve() == (out / shard.name).resolve():
+            raise PairsError(shard, "its results would take its place: another folder for them")
     _claim(out, name, solver, {shard.name for shard in shards} if overwrite else set())
     solved = problems = done = kept = 0
     failed = []

@@ -67,6 +67,14 @@ def test_it_goes_on_with_the_first_shard_without_a_result(shards, solver, tmp_pa
     assert (out / "part0.npz").stat().st_mtime_ns > before
 
 
+def test_results_do_not_take_the_place_of_their_shards(shards, solver):
+    folder, _ = shards
+    before = {x.name: x.read_bytes() for x in folder.iterdir()}
+    with pytest.raises(PairsError, match="would take its place"):
+        solve_shards(solver, [folder], folder, name="reppnp", overwrite=True)
+    assert {x.name: x.read_bytes() for x in folder.iterdir()} == before
+
+
 def test_another_solver_does_not_go_on_in_the_same_folder(shards, solver, tmp_path):
     folder, _ = shards
     solve_shards(solver, [folder], tmp_path / "out", name="reppnp")
