@@ -233,7 +233,7 @@ def run(seed: int, updates: int, batches: int) -> tuple[dict[str, Any], dict[str
     torch.manual_seed(seed)
     solver = create_solver("pnpnet-set").requires_grad_(False)
     start = Keypoints()
-    untrained = copy.deepcopy(start.state_dict())
+    full = copy.deepcopy(start)
     found: dict[str, Any] = {"keypoints first": {"curves": train(start, None, seed, range(updates))}}
     networks = {name: copy.deepcopy(start) for name in (ALONE, END)}
     for name, end in ((ALONE, None), (END, solver)):
@@ -241,8 +241,6 @@ def run(seed: int, updates: int, batches: int) -> tuple[dict[str, Any], dict[str
         found[name] = {"curves": curves, **test(networks[name], solver, told=end is not None, batches=batches)}
         distances = ", ".join(f"{key} {found[name][key]:.4f}" for key in ("mean_distance", "median_distance"))
         print(f"seed {seed}, {name}: {distances}", flush=True)
-    full = Keypoints()
-    full.load_state_dict(untrained)
     curves = [train(full, None, seed, range(first, first + updates), hidden=True) for first in (0, updates)][-1]
     found[FULL] = {"curves": curves, **test(full, solver, told=False, batches=batches)}
     print(f"seed {seed}, {FULL}: mean_distance {found[FULL]['mean_distance']:.4f}", flush=True)
