@@ -219,7 +219,8 @@ def _solve_parquet(
 
     def read() -> Iterator[dict[str, list[Any]]]:
         try:
-            rows = parquet.ParquetFile(shard)
+            # As it comes, Arrow reads ahead to the end of the file, and row groups, which may be all of it, as a whole.
+            rows = parquet.ParquetFile(shard, pre_buffer=False, buffer_size=1 << 20)
             columns = [key for key in _NUMBERS if key in rows.schema_arrow.names]
             for table in rows.iter_batches(batch, columns=columns):
                 yield table.to_pydict()

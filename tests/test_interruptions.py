@@ -6,6 +6,7 @@ import multiprocessing
 import random
 import resource
 import shutil
+import signal
 import sys
 import time
 
@@ -16,9 +17,10 @@ from hypothesis import strategies as st
 from kornia.core.exceptions import ValueCheckError
 
 from kornia_pnpnet import MLPInit, PnPNet, PoseLoss, RobustWeightedLM, create_solver
+from kornia_pnpnet.cli import main
 from kornia_pnpnet.data import SyntheticProblems
 from kornia_pnpnet.runstate import CHECKPOINT_NAME, HISTORY_NAME, save_checkpoint
-from kornia_pnpnet.shards import solve_shards
+from kornia_pnpnet.shards import MANIFEST, solve_shards
 from kornia_pnpnet.training import TrainSettings, fit
 
 KILLS = 20
@@ -166,6 +168,67 @@ def test_shards_on_a_full_disk_are_whole_or_missing(tmp_path, tally):
     assert {path.name for path in out.iterdir()} == {"manifest.json", "a.npz"}
     report = solve_shards(create_solver("epnp"), [source], out, name="epnp")
     assert (report.shards, report.kept) == (2, 1)
+
+
+def _solve_batch(source, out):
+    sys.exit(main(["solve", "--batch", "--solver", "epnp", "--batch-size", "500", "--out", str(out), str(source)]))
+
+
+@pytest.mark.slow
+def test_kill_9_at_any_moment_loses_no_results(tmp_path, tally):
+    """However often it is killed, the results are those of a call that is not, and none is made twice."""
+    import numpy as np
+
+    pyarrow = pytest.importorskip("pyarrow")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    source, whole = tmp_path / "in", tmp_path / "whole"
+    source.mkdir()
+    for i in range(20):
+        problems = SyntheticProblems(n=6, batch_size=1000, seed=i).batch(0)
+        arrays = dict(zip(("world_points", "img_points", "intrinsics"), (x.numpy() for x in problems[:3]), strict=True))
+        np.savez(source / f"{i:02}.npz", **arrays)
+        if i % 4 == 0:
+            lists = {key: [*x.reshape(1000, -1)] for key, x in arrays.items()}
+            parquet.write_table(pyarrow.table(lists), source / f"{i:02}.parquet")
+
+    def read(path):
+        if path.suffix == ".parquet":
+            return parquet.read_table(path).to_pydict()
+        with np.load(path) as file:
+            return {key: file[key].tolist() for key in file.files}
+
+    began = time.monotonic()
+    process = in_a_process(_solve_batch, source, whole)
+    process.join()
+    took = time.monotonic() - began
+    assert process.exitcode == 0
+    names = {path.name for path in source.iterdir()}
+    chance = random.Random(0)
+    killed, amid, run = 0, 0, 0
+    while killed < KILLS:
+        run += 1
+        out, done, made = tmp_path / str(run), False, {}
+        while not done:
+            process = in_a_process(_solve_batch, source, out)
+            process.join(chance.uniform(0.0, took / 4) if killed < KILLS else None)
+            process.kill()  # nothing when it has ended
+            process.join()
+            done = process.exitcode == 0
+            found = {path.name: path.stat().st_mtime_ns for path in out.glob("*") if path.name in names}
+            assert made.items() <= found.items()
+            made = found
+            if not done:
+                assert process.exitcode == -signal.SIGKILL
+                killed += 1
+                amid += 0 < len(made) < len(names)
+                tally(
+                    "processes",
+                    "`kill -9` in `pnpnet solve --batch` at a random moment: the next call goes on, the results are "
+                    "the same",
+                )
+        assert {path.name for path in out.iterdir() if path.suffix != ".tmp"} == {MANIFEST, *names}
+        assert all(read(out / name) == read(whole / name) for name in names)
+    assert amid > KILLS / 2
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,9 @@
 """Very many problems from files: what goes in comes out, once, whatever stops it in between."""
 
 import json
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -206,3 +209,48 @@ def test_the_command(shards, tmp_path, capsys):
     assert main(["solve", str(folder / "part0.npz"), str(folder / "part1.npz")]) == 2
     assert "--batch" in capsys.readouterr().err
     assert main([*command, "--plot", "x.png"]) == 2
+
+
+# What `getrusage` says can include the process that started this one.
+PEAK = r"""
+import re, sys
+from pathlib import Path
+from kornia_pnpnet.cli import main
+code = main()
+print(re.search(r"VmHWM:\s+(\d+)", Path("/proc/self/status").read_text())[1])
+sys.exit(code)
+"""
+
+
+def peak_memory(folder, count):
+    """The most memory that the command holds while it solves so many problems."""
+    command = [sys.executable, "-c", PEAK, "solve", "--batch", "--solver", "epnp", "--batch-size", "1000", str(folder)]
+    plain = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run([*command, "--out", f"{folder}-out"], capture_output=True, text=True, check=True, env=plain)
+    *_, said, peak = done.stdout.splitlines()
+    assert f" of {count} problems" in said
+    return int(peak)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@pytest.mark.parametrize("kind", ["shards", "Parquet", "Parquet in row groups"])
+def test_memory_does_not_grow_with_the_data(kind, make_problems, tmp_path):
+    """Ten times the data, 160 MB: in shards, in one Parquet file that is one row group, in one that has many."""
+    one = arrays(make_problems(n=40, batch=10_000, dtype=torch.float32))
+    np.savez(tmp_path / "one.npz", **one)
+    rows = 1000 if kind == "Parquet in row groups" else 200_000
+    peaks = []
+    for times in (2, 20):
+        folder = tmp_path / f"{times}"
+        folder.mkdir()
+        if kind == "shards":
+            for i in range(times):
+                (folder / f"{i}.npz").symlink_to(tmp_path / "one.npz")
+        else:
+            pyarrow = pytest.importorskip("pyarrow")
+            parquet = pytest.importorskip("pyarrow.parquet")
+            table = pyarrow.table({key: [*x.reshape(10_000, -1)] for key, x in one.items()})
+            parquet.write_table(pyarrow.concat_tables(times * [table]), folder / "x.parquet", row_group_size=rows)
+        peaks.append(peak_memory(folder, times * 10_000))
+    assert peaks[1] < 1.1 * peaks[0]
