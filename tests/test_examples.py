@@ -1,6 +1,7 @@
 """The examples of the documentation run, and show what they say."""
 
 import json
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -63,6 +64,12 @@ def test_the_end_to_end_gradient_halves_the_error_for_every_seed():
     for runs in results["seeds"].values():
         for key in ("mean_distance", "median_distance"):
             assert runs["keypoint loss alone"][key] > 2.0 * runs["end to end"][key]
+
+
+def test_the_tables_of_the_page_are_of_the_results():
+    made = runpy.run_path(str(EXAMPLES / "tables.py"))
+    text = made["PAGE"].read_text()
+    assert made["page"](text) == text
 
 
 def test_keypoints_are_visible_where_nothing_is_before_them(monkeypatch):
