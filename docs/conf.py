@@ -16,6 +16,8 @@ exclude_patterns = ["_build", "results/make.py"]
 html_theme = "furo"
 html_title = f"kornia_pnpnet {version}"
 html_math_renderer = "mathml"
+html_static_path = ["_static"]
+html_css_files = ["pages.css"]
 
 myst_enable_extensions = ["dollarmath", "colon_fence"]
 myst_heading_anchors = 3
@@ -29,7 +31,14 @@ autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
 python_use_unqualified_type_names = True
-napoleon_google_docstring = True
+# A name of ours that leads nowhere is an error. Those of other projects and private ones have no page here.
+nitpicky = True
+nitpick_ignore_regex = [
+    ("py:.*", r"(torch|numpy|np|kornia|lightning_fabric|pathlib|collections|functools)\..*"),
+    ("py:class", r"Tensor|kornia_pnpnet\.(\w+\.)*_\w+"),
+    ("py:exc", r"(Base|Device|Shape|TypeCheck|ValueCheck)Error"),
+]
+napoleon_numpy_docstring = False  # all are Google's
 napoleon_use_ivar = True  # else fields of named tuples would be there twice
 
 
@@ -56,13 +65,23 @@ def _outside(app, name, source):
     source[0] = re.sub(r"\[([^]]*)\]\(([^):#]+)\)", named, source[0])
 
 
+def _without_types(app, what, name, obj, options, lines):
+    """Signatures have the types. Napoleon takes what is before a colon for one: it gets an empty one."""
+    starts = [i + 1 for i, line in enumerate(lines) if line.strip() in ("Returns:", "Yields:")]
+    if lines and what in ("attribute", "data", "property"):
+        starts.append(0)
+    for i in starts:
+        lines[i] = re.sub(r"(?=\S)", ": ", lines[i], count=1)
+
+
 def _is_field(app, what, name, member, skip, options):
     """Fields of named tuples are described with their class; of themselves they only know their number."""
     return True if type(member).__name__ == "_tuplegetter" else None
 
 
 def setup(app):
-    """Register the way in which formulas are written, and what becomes of links that leave."""
+    """Register the way in which formulas are written, and what becomes of links that leave and of docstrings."""
     app.connect("source-read", _outside)
+    app.connect("autodoc-process-docstring", _without_types, priority=400)  # before napoleon
     app.connect("autodoc-skip-member", _is_field)
     app.add_html_math_renderer("mathml", inline_renderers=_math(False), block_renderers=_math(True))
