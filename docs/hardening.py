@@ -1,7 +1,7 @@
 """What was thrown at the package, counted: ``python docs/hardening.py measure`` and ``... render``.
 
-``measure`` runs ``tests/test_hardening.py`` and ``tests/test_interruptions.py``, which count their cases, with ten
-times their examples, and writes ``results/hardening.json`` if all of them pass; ``render`` makes the page of it.
+``measure`` runs the tests named in ``TESTS``, which count their cases, with ten times their examples, and writes
+``results/hardening.json`` if all of them pass; ``render`` makes the page of it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from kornia_pnpnet.reports import write_json
 
 HERE = Path(__file__).resolve().parent
 RESULTS, PAGE = HERE / "results" / "hardening.json", HERE / "hardening.md"
-TESTS = "test_hardening.py", "test_interruptions.py"
+TESTS = "test_hardening.py", "test_hardening_parts.py", "test_interruptions.py"
 #: Headings, and what the cases under them have in common.
 PARTS = {
     "batches": (
@@ -34,6 +34,16 @@ PARTS = {
     ),
     "problems": ("Their problems, by fault", "Of the batches above.", "Fault | Problems"),
     "calls": ("Other calls", "", "What, and what has to come of it | Cases"),
+    "parts": (
+        "Parts, metrics and losses",
+        "The parts that solvers are made of, called by themselves, and what poses are judged by.",
+        "What, and what has to come of it | Cases",
+    ),
+    "options": (
+        "Options",
+        "Numbers of any size, none, infinite, negative, in place of sound ones. What can be made has to work.",
+        "What, and what has to come of it | Cases",
+    ),
     "files": ("Files and arguments", "", "What, and what has to come of it | Cases"),
     "processes": ("Dying processes and full disks", "", "What, and what has to come of it | Cases"),
 }
@@ -62,9 +72,10 @@ def page(results: dict[str, Any]) -> str:
     lines = [
         "# What it withstands",
         "",
-        f"{total} cases, all as they should be, counted by the tests themselves (`tests/test_hardening.py` and",
-        "`tests/test_interruptions.py`; `make test-all` runs most with fewer cases). Written by `docs/hardening.py`",
-        "from `results/hardening.json`.",
+        f"{total} cases, all as they should be, counted by the tests themselves (`tests/test_hardening.py`,",
+        "`test_hardening_parts.py` and `test_interruptions.py`; `make test-all` runs most with fewer cases).",
+        "A test checks that every public function and class of the reference takes part. Written by",
+        "`docs/hardening.py` from `results/hardening.json`.",
     ]
     for part, (heading, text, head) in PARTS.items():
         lines += ["", f"## {heading}", ""] + ([text, ""] if text else []) + [f"| {head} |", "|---|---|"]

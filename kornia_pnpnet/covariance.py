@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import torch
+from kornia.core.check import KORNIA_CHECK_SHAPE
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from kornia_pnpnet.checks import check_shapes
 from kornia_pnpnet.geometry import normal_equations, pixel_variance, project
 from kornia_pnpnet.types import Correspondences, Noise, Pose, camera_matrices
 
@@ -43,16 +45,32 @@ def pose_covariance(
         Shape :math:`(B, 6, 6)`, in radians and the world's unit. Where the pairs do not determine the pose it is
         infinite on the diagonal and 0 elsewhere.
 
+    Raises:
+        ShapeError: for shapes that do not go together.
+
     Example:
         >>> from kornia_pnpnet.data import SyntheticProblems
         >>> p = SyntheticProblems(n=50, batch_size=2, seed=0).batch(0)
         >>> pose_covariance(p.pose, *p[:3], img_sigma=1.0, world_sigma=0.05).shape
         torch.Size([2, 6, 6])
     """
+    KORNIA_CHECK_SHAPE(world_points, ["B", "N", "3"])
     batch, count = world_points.shape[:2]
+    camera = camera_matrices(intrinsics)
+    shapes: dict[str, tuple[Tensor | None, tuple[int, ...]]] = {
+        "img_points": (img_points, (batch, count, 2)),
+        "intrinsics": (camera, (3, 3) if camera.ndim == 2 else (batch, 3, 3)),
+        "rotation of the pose": (pose.rotation, (batch, 3, 3)),
+        "translation of the pose": (pose.translation, (batch, 3)),
+        "weights": (weights, (batch, count)),
+    }
+    for name, sigma in (("img_sigma", img_sigma), ("world_sigma", world_sigma)):
+        if isinstance(sigma, Tensor) and sigma.ndim > 0:
+            shapes[name] = (sigma, (batch,) if sigma.ndim == 1 else (batch, count))
+    check_shapes(shapes, f" to go with world_points of {tuple(world_points.shape)}")
     dtype = world_points.dtype
     with torch.no_grad():
-        world, pixels, camera = (x.double() for x in (world_points, img_points, camera_matrices(intrinsics)))
+        world, pixels, camera = (x.double() for x in (world_points, img_points, camera))
         focals, centre = camera.diagonal(dim1=-2, dim2=-1)[..., :2], camera[..., :2, 2]
         one = focals.new_ones(())  # rays: pixels of a camera with the focal length 1
         rays = (pixels - centre[..., None, :]) / focals[..., None, :]

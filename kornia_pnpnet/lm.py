@@ -17,6 +17,7 @@ import torch
 from kornia.core.check import KORNIA_CHECK
 from torch import Tensor, nn
 
+from kornia_pnpnet.checks import check_numbers, check_whole
 from kornia_pnpnet.compilation import Compiled
 from kornia_pnpnet.geometry import (
     NormalEquations,
@@ -260,7 +261,7 @@ class BoundedParameter(nn.Module):
         logarithmic: interpolate the logarithm; the bounds must be positive.
 
     Raises:
-        BaseError: when ``initial`` is not between the bounds.
+        BaseError: when the bounds are none, or ``initial`` is not between them.
 
     Example:
         >>> BoundedParameter(1e-3, size=2, lower=1e-6, upper=1.0, logarithmic=True)()
@@ -269,6 +270,10 @@ class BoundedParameter(nn.Module):
 
     def __init__(self, initial: float, *, size: int, lower: float, upper: float, logarithmic: bool = False) -> None:
         super().__init__()
+        check_whole(1, size=size)
+        check_numbers(-math.inf, lower=lower, upper=upper)
+        KORNIA_CHECK(lower < upper, f"The bounds must rise, got {lower} and {upper}.")
+        KORNIA_CHECK(not logarithmic or lower > 0, f"The bounds of a logarithm must be positive, got {lower}.")
         KORNIA_CHECK(lower <= initial <= upper, f"The initial value {initial} must lie between {lower} and {upper}.")
         self._logarithmic = logarithmic
         self._lower, self._upper = (math.log(lower), math.log(upper)) if logarithmic else (lower, upper)

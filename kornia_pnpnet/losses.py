@@ -8,7 +8,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from kornia_pnpnet.checks import check_numbers, check_positive, check_whole
 from kornia_pnpnet.geometry import transform
+from kornia_pnpnet.metrics import check_poses
 from kornia_pnpnet.types import Guess, Noise, PnPResult, Pose, Problems
 
 __all__ = ["LossTerms", "PoseLoss", "SetLoss", "pose_distances"]
@@ -51,12 +53,16 @@ def pose_distances(estimate: Pose, truth: Pose) -> tuple[Tensor, Tensor]:
     Returns:
         :math:`\|\hat R - R\|_F = 2\sqrt2 \sin(\theta / 2)` and :math:`\|\hat t - t\|`, each :math:`(B,)`.
 
+    Raises:
+        ShapeError: when the shapes are others, or differ.
+
     Example:
         >>> eye = Pose(torch.eye(3)[None], torch.zeros(1, 3))
         >>> turned = Pose(torch.tensor([[[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]]), torch.tensor([[3.0, 4, 0]]))
         >>> pose_distances(turned, eye)
         (tensor([2.]), tensor([5.]))
     """
+    check_poses(estimate, truth)
     return _lengths(_difference(estimate, truth))
 
 
@@ -96,6 +102,9 @@ class PoseLoss(nn.Module):
         refined: weight of the refined terms against the first stage's, before the ramp.
         saturation: :math:`c`; ``None`` does not saturate.
 
+    Raises:
+        BaseError: for a negative weight, or a saturation that is not positive.
+
     Example:
         >>> from kornia_pnpnet.data import SyntheticProblems
         >>> problems = SyntheticProblems(batch_size=1, seed=0).batch(0)
@@ -114,6 +123,11 @@ class PoseLoss(nn.Module):
         saturation: float | None = None,
     ) -> None:
         super().__init__()
+        check_numbers(
+            0.0, rotation=rotation, translation=translation, init_translation=init_translation, refined=refined
+        )
+        if saturation is not None:
+            check_positive(saturation=saturation)
         self.rotation = rotation
         self.translation = translation
         self.init_translation = init_translation
@@ -164,6 +178,9 @@ class SetLoss(nn.Module):
         noise: weight of the likelihood.
         rotation_unit: what counts as success, in degrees.
         translation_unit: likewise, as a share of the distance.
+
+    Raises:
+        BaseError: for a negative weight, or a saturation or unit that is not positive.
     """
 
     def __init__(
@@ -179,6 +196,10 @@ class SetLoss(nn.Module):
         translation_unit: float = 0.005,
     ) -> None:
         super().__init__()
+        check_whole(1, starts=starts)
+        check_numbers(0.0, 1.0, every=every)
+        check_numbers(0.0, refined=refined, weights=weights, noise=noise)
+        check_positive(saturation=saturation, rotation_unit=rotation_unit, translation_unit=translation_unit)
         self.starts = starts
         self.every = every
         self.refined = refined

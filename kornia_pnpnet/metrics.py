@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kornia_pnpnet.checks import check_shapes, check_whole
 from kornia_pnpnet.geometry import rotation_angle
 from kornia_pnpnet.types import Pose
 
@@ -71,7 +72,8 @@ def reliability(chances: Tensor, outcomes: Tensor, ranges: int = 10) -> Reliabil
         calibration of modern neural networks", ICML 2017, for the chance of one outcome.
 
     Raises:
-        ValueError: when the shapes differ, or there is nothing.
+        ValueError: when the shapes differ, there is nothing, or a chance is not between 0 and 1.
+        BaseError: for less than one range.
 
     Example:
         >>> found = reliability(torch.tensor([0.9, 0.9, 0.9, 0.1]), torch.tensor([True, True, False, False]), ranges=2)
@@ -81,12 +83,23 @@ def reliability(chances: Tensor, outcomes: Tensor, ranges: int = 10) -> Reliabil
     if chances.shape != outcomes.shape or chances.numel() == 0:
         shapes = f"{tuple(chances.shape)} and {tuple(outcomes.shape)}"
         raise ValueError(f"reliability needs as many chances as outcomes, at least one, got {shapes}.")
+    check_whole(1, ranges=ranges)
     chance, outcome = (x.detach().flatten().to(torch.float64) for x in (chances, outcomes))
+    if not ((chance >= 0) & (chance <= 1)).all():
+        raise ValueError("Chances are between 0 and 1, and some of these are not.")
     place = (chance * ranges).long().clamp(0, ranges - 1)
     count, predicted, observed = (
         chance.new_zeros(ranges).index_add(0, place, x) for x in (torch.ones_like(chance), chance, outcome)
     )
     return Reliability(count, predicted / count, observed / count)
+
+
+def check_poses(estimate: Pose, truth: Pose) -> None:
+    """Check that both are batches of as many poses: broadcasting would compare what does not belong together."""
+    batch = tuple(estimate.translation.shape[:1]) or (1,)
+    for name, pose in (("estimate", estimate), ("truth", truth)):
+        shapes = {"rotation": (pose.rotation, (*batch, 3, 3)), "translation": (pose.translation, (*batch, 3))}
+        check_shapes({f"The {part} of the {name}": shape for part, shape in shapes.items()})
 
 
 def pose_errors(estimate: Pose, truth: Pose) -> PoseErrors:
@@ -99,12 +112,16 @@ def pose_errors(estimate: Pose, truth: Pose) -> PoseErrors:
     Returns:
         The angle of :math:`\hat R R^\top` in degrees and :math:`\|\hat t - t\|`, each of shape :math:`(B,)`.
 
+    Raises:
+        ShapeError: when the shapes are others, or differ.
+
     Example:
         >>> truth = Pose(torch.eye(3)[None], torch.zeros(1, 3))
         >>> estimate = Pose(torch.eye(3)[None], torch.tensor([[3.0, 0.0, 4.0]]))
         >>> pose_errors(estimate, truth).translation_error
         tensor([5.])
     """
+    check_poses(estimate, truth)
     angle = rotation_angle(estimate.rotation, truth.rotation)
     return PoseErrors(angle * (180.0 / math.pi), (estimate.translation - truth.translation).norm(dim=-1))
 

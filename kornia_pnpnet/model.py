@@ -15,6 +15,7 @@ from kornia.core.exceptions import BaseError, DeviceError, ShapeError, TypeCheck
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
+from kornia_pnpnet.checks import check_shapes
 from kornia_pnpnet.compilation import Compiled
 from kornia_pnpnet.files import atomic_open
 from kornia_pnpnet.geometry import project
@@ -62,20 +63,16 @@ def check_inputs(
     KORNIA_CHECK_SHAPE(world_points, ["B", "N", "3"])
     KORNIA_CHECK_SHAPE(img_points, ["B", "N", "2"])
     batch, count = world_points.shape[:2]
-    shapes = {"img_points": (img_points, (batch, count, 2)), "weights": (weights, (batch, count))}
-    shapes["mask"] = (mask, (batch, count))
-    shapes["intrinsics"] = (intrinsics, (3, 3) if intrinsics.ndim == 2 else (batch, 3, 3))
     rotation, translation = (None, None) if init is None else init
-    shapes["init rotation"] = (rotation, (batch, 3, 3))
-    shapes["init translation"] = (translation, (batch, 3))
-    for name, (tensor, expected) in shapes.items():
-        if tensor is not None and tensor.shape != expected:
-            raise ShapeError(
-                f"{name} must have the shape {expected} to go with world_points of {tuple(world_points.shape)}, "
-                f"got {tuple(tensor.shape)}.",
-                actual_shape=tuple(tensor.shape),
-                expected_shape=expected,
-            )
+    shapes: dict[str, tuple[Tensor | None, tuple[int, ...]]] = {
+        "img_points": (img_points, (batch, count, 2)),
+        "weights": (weights, (batch, count)),
+        "mask": (mask, (batch, count)),
+        "intrinsics": (intrinsics, (3, 3) if intrinsics.ndim == 2 else (batch, 3, 3)),
+        "init rotation": (rotation, (batch, 3, 3)),
+        "init translation": (translation, (batch, 3)),
+    }
+    check_shapes(shapes, f" to go with world_points of {tuple(world_points.shape)}")
     if count < 3:
         raise ShapeError(f"A pose needs at least 3 pairs, got N = {count}.", actual_shape=tuple(world_points.shape))
     floats = {"img_points": img_points, "intrinsics": intrinsics, "weights": weights}

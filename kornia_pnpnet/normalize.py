@@ -12,6 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from kornia_pnpnet.checks import check_positive
 from kornia_pnpnet.geometry import MIN_DEPTH_RATIO
 from kornia_pnpnet.types import Correspondences, Pose
 
@@ -63,6 +64,9 @@ class Normalize(nn.Module):
         center: move the centroid of the world points to the origin.
         scale: scale the world to a root mean square distance of 1 from the origin.
 
+    Raises:
+        BaseError: when ``f_const`` is not a positive number.
+
     Example:
         >>> normalize = Normalize(order=False, center=True, scale=True)
         >>> world = torch.tensor([[[0.0, 0, 2], [2, 0, 2], [0, 2, 2], [2, 2, 2]]])
@@ -77,6 +81,7 @@ class Normalize(nn.Module):
         self, *, f_const: float = F_CONST, order: bool = True, center: bool = True, scale: bool = True
     ) -> None:
         super().__init__()
+        check_positive(f_const=f_const)
         self.config = {"f_const": f_const, "order": order, "center": center, "scale": scale}
         self.f_const = f_const
         self.order = order

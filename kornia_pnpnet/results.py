@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,93 @@ FORMAT = 1
 # What a file of each kind has; a file that names no kind is an evaluation.
 _PARTS = {"evaluation": {"environment", "solvers", "data", "rows"}, "complexity": {"n", "counts", "ransac"}}
 _SHOWN_DIFFERENCES = 3
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and 0 <= value < math.inf
+
+
+def _is_share(value: Any) -> bool:
+    return _is_number(value) and value <= 1
+
+
+def _is_count(value: Any) -> bool:
+    return type(value) is int and 0 <= value < 2**63
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str)
+
+
+def _is_outliers(value: Any) -> bool:
+    return _is_text(value) or _is_count(value)
+
+
+def _is_text_or_none(value: Any) -> bool:
+    return value is None or _is_text(value)
+
+
+def _is_mapping_or_none(value: Any) -> bool:
+    return value is None or isinstance(value, Mapping)
+
+
+# What readers ask of an evaluation: a check of a value, or what is under each key (`*` is any other, `?` ends one that
+# may be missing), or of what a list is.
+_QUARTILES = {"q25": _is_number, "median": _is_number, "q75": _is_number}
+_ROW = {
+    "data": _is_text,
+    "solver": _is_text,
+    "success": {"rate": _is_share, "low": _is_share, "high": _is_share, "total": _is_count},
+    "rotation_error_deg": _QUARTILES,
+    "translation_error": _QUARTILES,
+    "ok": _is_share,
+    "us_per_problem": _is_number,
+    "per_problem?": {"rotation_error_deg": [_is_number], "translation_error": [_is_number], "ok": [_is_share]},
+}
+_SET = {
+    "description?": {"source?": _is_text, "outliers?": _is_outliers},
+    "count": _is_count,
+    "n": _is_count,
+    "max_rotation_deg": _is_number,
+    "max_translation": _is_number,
+    "unit": _is_text,
+}
+_EVALUATION = {
+    "environment": {"versions?": {"*": _is_text_or_none}, "commit?": _is_text_or_none},
+    "solvers": {"*": {"config?": _is_mapping_or_none}},
+    "data": {"*": _SET},
+    "rows": [_ROW],
+}
+
+
+def _misfits(value: Any, form: Any, name: str = "") -> Iterator[str]:
+    """Names of what is missing or not of a form."""
+    if callable(form):
+        if not form(value):
+            yield name
+    elif isinstance(form, list):
+        if not isinstance(value, list):
+            yield name
+        else:
+            for i, entry in enumerate(value):
+                yield from _misfits(entry, form[0], f"{name}[{i}]")
+    elif not isinstance(value, Mapping):
+        yield name
+    else:
+        for key, inner in form.items():
+            wanted = value if key == "*" else [key.removesuffix("?")]
+            for one in wanted:
+                if one in value:
+                    yield from _misfits(value[one], inner, f"{name}.{one}" if name else one)
+                elif not key.endswith("?"):
+                    yield f"{name}.{one}" if name else one
+
+
+def _unknown_names(results: Mapping[str, Any]) -> Iterator[str]:
+    for i, row in enumerate(results["rows"]):
+        for key, names in (("data", "data"), ("solver", "solvers")):
+            if row[key] not in results[names]:
+                yield f"rows[{i}].{key}"
 
 
 def row_errors(row: Mapping[str, Any]) -> tuple[PoseErrors, Tensor]:
@@ -75,6 +164,9 @@ def load_results(path: str | Path, *, complexity: bool = False) -> dict[str, Any
     kind = results.get("kind", "evaluation")
     if kind not in kinds or not results.keys() >= _PARTS[kind]:
         raise ValueError(f"'{path}' is not a results file of {' or '.join(kinds)}.")
+    if kind == "evaluation":
+        for wrong in itertools.chain(_misfits(results, _EVALUATION), _unknown_names(results)):
+            raise ValueError(f"'{path}' is not a results file: {wrong} is missing or not what it has to be.")
     return results
 
 
@@ -123,11 +215,11 @@ def _differences(there: Mapping[str, Any], plan: Mapping[str, Any]) -> list[str]
     """Why rows that are there are not rows of a plan, in words."""
     found = []
     for package, version in plan["environment"]["versions"].items():
-        was = there["environment"]["versions"].get(package)
+        was = there["environment"].get("versions", {}).get(package)
         if was != version:
             found.append(f"{package} was {was} and is {version}")
     if there.get("code") != plan["code"]:
-        found.append(f"the package's code has changed since (commit {there['environment']['commit']})")
+        found.append(f"the package's code has changed since (commit {there['environment'].get('commit')})")
     for kind in ("solvers", "data"):
         for name, entry in there[kind].items():
             now = plan[kind].get(name)

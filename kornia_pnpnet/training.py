@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
+from kornia_pnpnet.checks import check_numbers, check_positive, check_whole
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.data.stream import ProblemSource, stream_batches
 from kornia_pnpnet.init import MLPInit
@@ -86,11 +87,14 @@ class TrainSettings:
         """Check the numbers.
 
         Raises:
-            BaseError: for intervals below 1, negative numbers of updates, or a ramp that does not rise.
+            BaseError: for intervals below 1, negative numbers of updates, rates that are none, or a ramp that falls.
         """
-        for name in ("log_every", "validate_every", "checkpoint_every"):
-            KORNIA_CHECK(getattr(self, name) >= 1, f"{name} must be at least 1, got {getattr(self, name)}.")
-        KORNIA_CHECK(self.updates >= 0, f"updates must be at least 0, got {self.updates}.")
+        given = asdict(self)
+        check_whole(1, **{name: given[name] for name in ("log_every", "validate_every", "checkpoint_every")})
+        check_whole(0, **{name: given[name] for name in ("updates", "warmup", "max_skipped")})
+        check_numbers(0.0, lr=self.lr, lr_refine=self.lr_refine)
+        check_positive(clip=self.clip)
+        check_numbers(0.0, 1.0, final_lr=self.final_lr)
         rises = len(self.ramp) == 2 and 0.0 <= self.ramp[0] <= self.ramp[1]
         KORNIA_CHECK(rises, f"ramp must be two shares that do not fall, got {self.ramp}.")
 

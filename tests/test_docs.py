@@ -1,12 +1,17 @@
 """The documentation: its Python runs as it stands, the site builds without a warning, no link leads nowhere."""
 
+import functools
+import http.server
 import importlib
 import json
 import pkgutil
+import queue
 import re
 import runpy
+import shutil
 import subprocess
 import sys
+import threading
 import zlib
 from html.parser import HTMLParser
 from pathlib import Path
@@ -84,6 +89,86 @@ def test_links_and_pictures_of_the_site_are_there(site):
     assert not broken
 
 
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+BROWSER = next(filter(None, map(shutil.which, BROWSERS)), None)
+
+# A page that opens all of the site's one after the other, as wide as a phone and as a desktop, and posts what is wrong.
+# Furo's column of text scrolls in place of the page where that is narrow, so what holds the heading must not scroll.
+OPENS_ALL = """<link rel="icon" href="data:,"><script>
+async function open(page, width) {
+  const frame = document.createElement("iframe");
+  frame.style = `border: 0; width: ${width}px; height: 800px`;
+  frame.src = `site/${page}`;
+  const loaded = new Promise(done => frame.onload = done);
+  document.body.append(frame);
+  await loaded;
+  const shown = frame.contentDocument, pictures = [...shown.images];
+  pictures.forEach(picture => picture.loading = "eager");
+  await Promise.allSettled(pictures.map(picture => picture.decode()));
+  await new Promise(done => setTimeout(done, 50));  // scripts go on
+  const broken = pictures.filter(picture => !picture.complete || !picture.naturalWidth);
+  const heading = shown.querySelector("h1, h2"), boxes = [];
+  for (let box = heading; box; box = box.parentElement)
+    if (box === shown.scrollingElement || getComputedStyle(box).overflowX !== "visible") boxes.push(box);
+  const wrong = [
+    ...broken.map(picture => `picture ${picture.getAttribute("src")} is broken`),
+    ...boxes.filter(box => box.scrollWidth > box.clientWidth).map(box => `${box.scrollWidth} px are too wide`),
+    ...(heading?.offsetHeight ? [] : ["no heading"]),
+    ...(parseFloat(getComputedStyle(shown.body).fontSize) < 14 ? ["small letters"] : []),
+  ];
+  frame.remove();
+  return wrong.map(what => `${page} at ${width} px: ${what}`);
+}
+async function openAll() {
+  const wrong = [];
+  for (const page of PAGES) for (const width of [390, 1280]) wrong.push(...await open(page, width));
+  return wrong;
+}
+const post = wrong => fetch("wrong", {method: "POST", body: JSON.stringify(wrong)});
+onload = () => openAll().then(post, error => post([String(error)]));
+</script>"""
+
+
+class Served(http.server.SimpleHTTPRequestHandler):
+    """Serves files, keeps what was asked for and is not there, and takes one answer."""
+
+    missing, answers = [], queue.Queue()
+
+    def do_POST(self):
+        self.answers.put(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
+        self.send_response(204)
+        self.end_headers()
+
+    def log_error(self, *args):
+        self.missing.append(self.path)
+
+    def log_request(self, *args):
+        pass
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(BROWSER is None, reason=f"needs a browser on the PATH: one of {', '.join(BROWSERS)}")
+def test_pages_look_right_in_a_browser(site, tmp_path):
+    pages = sorted(str(page.relative_to(site)) for page in site.rglob("*.html"))
+    pages[pages.index("search.html")] += "?q=pose"  # without a question it is empty
+    (tmp_path / "site").symlink_to(site)
+    (tmp_path / "all.html").write_text(OPENS_ALL.replace("PAGES", json.dumps(pages)))
+    command = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr"]
+    command.append(f"--user-data-dir={tmp_path / 'profile'}")
+    handler = functools.partial(Served, directory=tmp_path)
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server, (tmp_path / "log").open("w") as log:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        browser = subprocess.Popen([*command, f"http://127.0.0.1:{server.server_port}/all.html"], stderr=log)
+        try:
+            wrong = Served.answers.get(timeout=300)
+        finally:
+            browser.terminate()
+            browser.wait()
+            server.shutdown()
+    said = [line for line in (tmp_path / "log").read_text().splitlines() if ":CONSOLE" in line]
+    assert wrong + Served.missing + said == []
+
+
 @pytest.mark.slow
 def test_every_public_name_is_in_the_reference(site):
     lines = zlib.decompress((site / "objects.inv").read_bytes().split(b"\n", 4)[4]).decode().splitlines()
@@ -100,7 +185,18 @@ def test_every_public_name_is_in_the_reference(site):
 # How the package does what it does, and the command line, which has a page of its own.
 INTERNAL = {
     f"kornia_pnpnet.{name}"
-    for name in ("arguments", "choices", "cli", "compilation", "demo", "environment", "files", "pairs", "results")
+    for name in (
+        "arguments",
+        "checks",
+        "choices",
+        "cli",
+        "compilation",
+        "demo",
+        "environment",
+        "files",
+        "pairs",
+        "results",
+    )
 } | {"kornia_pnpnet.runstate", "kornia_pnpnet.small"}
 
 

@@ -15,7 +15,7 @@ ROOT = Path(kornia_pnpnet.__file__).parent
 
 #: From the bottom up. A module imports from its own layer and those below. The longest prefix counts.
 LAYERS = (
-    ("types", "environment", "files", "compilation"),
+    ("types", "checks", "environment", "files", "compilation"),
     ("geometry", "small", "robust", "metrics", "pairs", "data.colmap"),
     ("normalize", "lm", "init", "data", "covariance"),
     ("model", "losses"),

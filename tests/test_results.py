@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from functools import reduce
+from operator import getitem
 
 import pytest
 
@@ -12,8 +14,19 @@ from kornia_pnpnet.results import load_results, save_results, source_digest
 
 @pytest.fixture
 def results():
-    rows = [{"data": "a", "solver": "s", "per_problem": {"rotation_error_deg": [0.1, 2.5e-7]}}]
-    return {"format": 1, "environment": {"commit": None}, "solvers": {"s": {}}, "data": {"a": {}}, "rows": rows}
+    quartiles = {"q25": 0.1, "median": 0.2, "q75": 0.3}
+    row = {
+        "data": "a",
+        "solver": "s",
+        "success": {"rate": 1.0, "low": 0.5, "high": 1.0, "total": 2},
+        "rotation_error_deg": quartiles,
+        "translation_error": quartiles,
+        "ok": 1.0,
+        "us_per_problem": 12.5,
+        "per_problem": {"rotation_error_deg": [0.1, 2.5e-7], "translation_error": [0.0, 1e-3], "ok": [1, 1]},
+    }
+    data = {"count": 2, "n": 9, "max_rotation_deg": 1.0, "max_translation": 0.2, "unit": "m"}
+    return {"format": 1, "environment": {"commit": None}, "solvers": {"s": {}}, "data": {"a": data}, "rows": [row]}
 
 
 def test_results_file_round_trips(results, tmp_path):
@@ -39,6 +52,29 @@ def test_other_files_are_refused(tmp_path, content):
     path = tmp_path / "other.json"
     path.write_text(content)
     with pytest.raises(ValueError, match=r"other\.json"):
+        load_results(path)
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        ("rows.0.success.rate", 1.5),
+        ("rows.0.success", None),
+        ("rows.0.solver", "t"),
+        ("rows.0.per_problem.ok", 1),
+        ("data.a.unit", 3),
+        ("data.a.n", None),
+        ("data", []),
+        ("environment", ""),
+    ],
+)
+def test_what_is_wrong_in_a_file_is_named(results, place, value, tmp_path):
+    path = tmp_path / "results.json"
+    *inner, last = (int(x) if x.isdecimal() else x for x in place.split("."))
+    reduce(getitem, inner, results)[last] = value
+    save_results(results, path)
+    named = place.replace(".0", "[0]").replace(".", r"\.").replace("[", r"\[").replace("]", r"\]")
+    with pytest.raises(ValueError, match=rf"results\.json' is not a results file: {named} is missing or not"):
         load_results(path)
 
 

@@ -9,6 +9,7 @@ import torch
 from kornia.core.exceptions import ValueCheckError
 from torch import nn
 
+from kornia_pnpnet.checks import check_whole
 from kornia_pnpnet.complexity.parts import PARTS
 from kornia_pnpnet.init import P3P, RANSAC, EPnP, MLPInit, REPPnP, SetInit, SubsetSolver
 from kornia_pnpnet.init.epnp import CASE_ITERATIONS
@@ -187,11 +188,15 @@ def part_calls(solver: PnPNet, n: int, *, outliers: int | None = None, better: i
         better: how many rounds of RANSAC find a better pose; every one when ``None``.
 
     Returns:
-        Names of :data:`PARTS`, how often each is called, and with which sizes.
+        Names of :data:`~kornia_pnpnet.complexity.parts.PARTS`, how often each is called, and with which sizes.
 
     Raises:
         ValueCheckError: when there is no formula for the solver, or RANSAC's samples have more than n pairs.
+        BaseError: for no pairs, or more wrong ones than there are.
     """
+    check_whole(1, n=n)
+    if outliers is not None:
+        check_whole(0, outliers=outliers, inliers=n - outliers)
     normalize = solver.normalize
     if not (normalize.center and normalize.scale):
         raise ValueCheckError(f"There is no formula for {normalize}: the world has to be centred and scaled.")

@@ -48,7 +48,8 @@ def operations_by_part(
         better: how many rounds of RANSAC find a better pose.
 
     Returns:
-        For each name in :data:`PARTS` that the solver runs, the operations of all its calls.
+        For each name in :data:`~kornia_pnpnet.complexity.parts.PARTS` that the solver runs, the operations of all its
+        calls.
 
     Raises:
         ValueCheckError: when there is no formula.
@@ -70,7 +71,7 @@ def operation_count(solver: str | PnPNet, n: int, *, outliers: int | None = None
             ``None``.
 
     Returns:
-        Operations weighted by :data:`OPERATION_COSTS`.
+        Operations weighted by :data:`~kornia_pnpnet.complexity.operations.OPERATION_COSTS`.
 
     Raises:
         ValueCheckError: when there is no such solver, or no formula for it.

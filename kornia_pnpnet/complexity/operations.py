@@ -65,7 +65,7 @@ class Operations:
 
     @property
     def flops(self) -> float:
-        """The sum, weighted by :data:`OPERATION_COSTS`."""
+        """The sum, weighted by :data:`~kornia_pnpnet.complexity.operations.OPERATION_COSTS`."""
         return sum(OPERATION_COSTS[kind] * count for kind, count in asdict(self).items())
 
 

@@ -174,6 +174,8 @@ def load_colmap(folder: str | Path, *, metric: bool = True, min_points: int = 10
     world_points = {point_id: point.xyz for point_id, point in model.points3D.items()}
     try:
         views = [_colmap_view(image, world_points) for image in model.images.values()]
+    except KeyError as error:
+        raise ValueError(f"the COLMAP model in '{model_folder}' has no point {error} that an image observes") from error
     except ValueError as error:
         raise ValueError(f"the COLMAP model in '{model_folder}' cannot be used: {error}") from error
     return _scene(folder, _scene_name(folder), views, min_points, metric)

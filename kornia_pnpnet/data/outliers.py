@@ -9,6 +9,8 @@ import torch
 from kornia.core.check import KORNIA_CHECK
 from torch import Tensor
 
+from kornia_pnpnet.checks import check_numbers, check_whole
+
 __all__ = ["OutlierDraw", "OutlierMix"]
 
 
@@ -53,7 +55,7 @@ class OutlierMix:
         min_inliers: so many pairs stay right, whatever ``max_ratio`` says.
 
     Raises:
-        BaseError: for shares outside [0, 1] or negative counts.
+        BaseError: for shares outside [0, 1] or counts that are negative or not whole.
 
     Example:
         >>> OutlierMix().max_count(9), OutlierMix(max_ratio=0.33).max_count(9), OutlierMix(count=2).max_count(9)
@@ -71,12 +73,11 @@ class OutlierMix:
         structured_share: float = 0.0,
         min_inliers: int = 0,
     ) -> None:
-        KORNIA_CHECK(0.0 <= max_ratio <= 1.0, f"max_ratio must lie in [0, 1], got {max_ratio}.")
-        shares = {"mismatch": mismatch_share, "near": near_share, "structured": structured_share}
-        for name, share in shares.items():
-            KORNIA_CHECK(0.0 <= share <= 1.0, f"{name}_share must lie in [0, 1], got {share}.")
-        KORNIA_CHECK(min_count >= 0, f"min_count must be at least 0, got {min_count}.")
-        KORNIA_CHECK(count is None or count >= 0, f"count must be at least 0, got {count}.")
+        check_numbers(0.0, 1.0, max_ratio=max_ratio, mismatch_share=mismatch_share)
+        check_numbers(0.0, 1.0, near_share=near_share, structured_share=structured_share)
+        check_whole(0, min_count=min_count, min_inliers=min_inliers)
+        if count is not None:
+            check_whole(0, count=count)
         self.max_ratio = max_ratio
         self.count = count
         self.min_count = min_count

@@ -7,9 +7,9 @@ import math
 from collections.abc import Iterator
 
 import torch
-from kornia.core.check import KORNIA_CHECK
 from torch import Tensor
 
+from kornia_pnpnet.checks import check_numbers, check_whole
 from kornia_pnpnet.data.colmap import Scene
 from kornia_pnpnet.data.outliers import OutlierMix
 from kornia_pnpnet.data.synthetic import batch_generator, random_poses, uniform
@@ -82,8 +82,9 @@ class SceneProblems:
         dtype: torch.dtype = torch.float64,
         device: str | torch.device = "cpu",
     ) -> None:
-        KORNIA_CHECK(n >= 1 and batch_size >= 1, f"n and batch_size must be at least 1, got {n} and {batch_size}.")
-        KORNIA_CHECK(num_spares >= 1, f"num_spares must be at least 1, got {num_spares}.")
+        check_whole(1, n=n, batch_size=batch_size, num_spares=num_spares)
+        check_whole(0, seed=seed)
+        check_numbers(0.0, translation_box=translation_box, max_angle=max_angle)
         self.scene = scene
         self.n = n
         self.batch_size = batch_size

@@ -13,6 +13,7 @@ from kornia.core.check import KORNIA_CHECK
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
+from kornia_pnpnet.checks import check_numbers, check_positive, check_ranges, check_whole
 from kornia_pnpnet.data.outliers import OutlierMix
 from kornia_pnpnet.types import Pose, Problems
 
@@ -116,9 +117,14 @@ class BoxPoints:
         half_width: :math:`|x|` and :math:`|y|` are at most this.
         z_near: depth of the box's near face.
         depth: length of the box along the optical axis.
+
+    Raises:
+        BaseError: for a box that is not in front of the camera.
     """
 
     def __init__(self, *, half_width: float = 10.0, z_near: float = 10.0, depth: float = 80.0) -> None:
+        check_numbers(0.0, half_width=half_width, depth=depth)
+        check_positive(z_near=z_near)
         self.half_width = half_width
         self.z_near = z_near
         self.depth = depth
@@ -143,6 +149,9 @@ class SlabPoints:
         distance: smallest and largest distance :math:`d`, log-uniform.
         tilt: standard deviation of the slopes :math:`g`.
         thickness: smallest and largest thickness :math:`e` relative to the distance, log-uniform.
+
+    Raises:
+        BaseError: for a range that falls or is not positive, or a window that is larger than the field of view.
     """
 
     def __init__(
@@ -154,6 +163,9 @@ class SlabPoints:
         tilt: float = 0.5,
         thickness: tuple[float, float] = (0.02, 4.0),
     ) -> None:
+        check_ranges(window=window, distance=distance, thickness=thickness)
+        check_numbers(window[1], field_of_view=field_of_view)
+        check_numbers(0.0, tilt=tilt)
         self.window = window
         self.field_of_view = field_of_view
         self.distance = distance
@@ -185,6 +197,9 @@ class ObjectPoints:
         field_of_view: the centre lies within this tangent on both axes.
         thinnest: the smallest factor of an axis, log-uniform up to 1.
         planar: share of problems whose points lie in a plane.
+
+    Raises:
+        BaseError: for a range that falls or is not positive, or a share outside [0, 1].
     """
 
     def __init__(
@@ -195,6 +210,10 @@ class ObjectPoints:
         thinnest: float = 0.05,
         planar: float = 0.15,
     ) -> None:
+        check_ranges(distance=distance)
+        check_numbers(0.0, field_of_view=field_of_view)
+        check_positive(thinnest=thinnest)
+        check_numbers(0.0, 1.0, thinnest=thinnest, planar=planar)
         self.distance = distance
         self.field_of_view = field_of_view
         self.thinnest = thinnest
@@ -244,7 +263,8 @@ class SyntheticProblems:
         device: of the batches.
 
     Raises:
-        BaseError: for a size below 1, or a range of noise that is not of two positive, rising numbers.
+        BaseError: for a size below 1, a number that is not finite or out of its bounds, or a range of noise that is not
+            of two positive, rising numbers.
 
     Example:
         >>> problems = SyntheticProblems(n=9, batch_size=2, seed=1, outliers=OutlierMix(count=3)).batch(0)
@@ -271,10 +291,18 @@ class SyntheticProblems:
         dtype: torch.dtype = torch.float32,
         device: str | torch.device = "cpu",
     ) -> None:
-        KORNIA_CHECK(n >= 1 and batch_size >= 1, f"n and batch_size must be at least 1, got {n} and {batch_size}.")
+        check_whole(1, n=n, batch_size=batch_size)
+        check_whole(0, seed=seed)
+        check_numbers(0.0, translation_box=translation_box, max_angle=max_angle, half_image=half_image)
+        check_positive(focal=focal)
+        check_numbers(0.0, 1.0, told=told)
+        if translation_sigma is not None:
+            check_numbers(0.0, translation_sigma=translation_sigma)
         for name, sigma in (("img_sigma", img_sigma), ("world_sigma", world_sigma)):
-            right = sigma >= 0 if isinstance(sigma, int | float) else len(sigma) == 2 and 0 < sigma[0] <= sigma[1]
-            KORNIA_CHECK(right, f"{name} must be at least 0, or a range of two positive numbers, got {sigma}.")
+            if isinstance(sigma, int | float):
+                check_numbers(0.0, **{name: sigma})
+            else:
+                check_ranges(**{name: sigma})
         self.n = n
         self.batch_size = batch_size
         self.seed = seed
@@ -400,9 +428,10 @@ class MixedProblems:
         seed: int = 0,
         **options: Any,
     ) -> None:
+        check_whole(1, batch_size=batch_size)
         shares = [1.0] * len(sources) if shares is None else list(shares)
         KORNIA_CHECK(
-            len(shares) == len(sources) > 0 and min(shares) > 0,
+            len(shares) == len(sources) > 0 and min(shares) > 0 and sum(shares) < math.inf,
             f"MixedProblems needs one positive share for each source, got {shares} for {len(sources)} sources.",
         )
         self.batch_size = batch_size
@@ -448,7 +477,7 @@ class VaryingSize:
         seed: of the stream.
 
     Raises:
-        BaseError: when there is no number of pairs.
+        BaseError: when there is no number of pairs, or one below 1.
 
     Example:
         >>> source = VaryingSize(SyntheticProblems, n=(4, 8), batch_size=6)
@@ -465,6 +494,8 @@ class VaryingSize:
         seed: int = 0,
     ) -> None:
         KORNIA_CHECK(len(n) > 0, "VaryingSize needs at least one number of pairs.")
+        for count in n:
+            check_whole(1, n=count, batch_size=batch_size)
         self.batch_size = batch_size
         self.seed = seed
         self.sources = [

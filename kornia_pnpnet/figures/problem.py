@@ -36,10 +36,20 @@ def plot_pose(
         title: stands before the counts.
 
     Returns:
-        The path.
+        The path. Pairs whose pixel is not finite have no place in it.
+
+    Raises:
+        ValueError: for shapes that do not fit, or when no pixel is finite.
     """
     pixels, projected = np.asarray(img_points, dtype=float), np.asarray(reprojections, dtype=float)
     bad = np.asarray(rejected, dtype=bool)
+    if pixels.ndim != 2 or pixels.shape[1] != 2 or projected.shape != pixels.shape or bad.shape != pixels.shape[:1]:
+        shapes = f"{pixels.shape}, {projected.shape} and {bad.shape}"
+        raise ValueError(f"plot_pose needs pixels and projections (N, 2) and rejected (N,), got {shapes}.")
+    there = np.isfinite(pixels).all(axis=1)
+    if not there.any():
+        raise ValueError("There is no pixel to draw.")
+    pixels, projected, bad = pixels[there], projected[there], bad[there]
     seen = np.isfinite(projected).all(axis=1)
     left, top, right, bottom = (0.0, 0.0, *size) if size is not None else _bounds(pixels, projected[seen])
 

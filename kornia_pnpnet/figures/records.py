@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+import csv
+import math
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
@@ -19,6 +22,7 @@ __all__ = [
     "outliers_in_words",
     "outliers_in_order",
     "pooled",
+    "read_rows",
     "records",
     "success_limit",
     "usual_n",
@@ -71,6 +75,39 @@ class Record(NamedTuple):
         return without_m(self.solver) != self.solver
 
 
+def read_rows(path: str | Path, columns: Mapping[str, Callable[[str], Any]]) -> list[dict[str, str]]:
+    """Read a CSV file of numbers.
+
+    Args:
+        path: the file.
+        columns: those that must be there, and what reads their values; the others are taken as they are.
+
+    Returns:
+        Its rows, at least one, every value a text.
+
+    Raises:
+        ValueError: when it is no such file.
+    """
+    try:
+        with Path(path).open(newline="") as file:
+            rows = list(csv.DictReader(file))
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise ValueError(f"'{path}' is not a CSV file: {error}") from error
+    if not rows:
+        raise ValueError(f"'{path}' has no rows to draw.")
+    for column, read in columns.items():
+        if column not in rows[0]:
+            raise ValueError(f"'{path}' has no column '{column}'.")
+        for number, row in enumerate(rows, 1):
+            try:
+                right = math.isfinite(read(row[column]))
+            except (TypeError, ValueError):
+                right = False
+            if not right:
+                raise ValueError(f"'{path}': '{column}' of row {number} is {row[column]!r}.")
+    return rows
+
+
 def records(results: Iterable[Mapping[str, Any]]) -> list[Record]:
     """Read results.
 
@@ -109,7 +146,8 @@ def records(results: Iterable[Mapping[str, Any]]) -> list[Record]:
 
 def _iterations(solver: Mapping[str, Any]) -> int | None:
     refine = (solver.get("config") or {}).get("refine")
-    return refine.get("m") if isinstance(refine, Mapping) else None
+    m = refine.get("m") if isinstance(refine, Mapping) else None
+    return m if type(m) is int else None
 
 
 def without_m(solver: str) -> str:

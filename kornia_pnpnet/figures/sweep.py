@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from fractions import Fraction
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from matplotlib.axes import Axes
 
 from kornia_pnpnet.figures import style
 from kornia_pnpnet.figures.lines import Curve, draw_rates, few_ticks, list_curves, make_panels
+from kornia_pnpnet.figures.records import read_rows
 from kornia_pnpnet.figures.style import GREY, SMALL, SolverStyle
 
 __all__ = ["mix_in_words", "plot_sweep"]
@@ -39,6 +39,20 @@ class _Run(NamedTuple):
     rate: float
     low: float
     high: float
+
+
+def _per_cent(text: str) -> float:
+    return 100 * float(text)
+
+
+#: Where a run's fields are in the summary.
+_COLUMNS: dict[str, Callable[[str], Any]] = {
+    "model.n": int,
+    "model.m": int,
+    "data.outliers.max_ratio": float,
+    "us_per_problem": float,
+    **{f"uniform/{name}": _per_cent for name in ("rate", "low", "high")},
+}
 
 
 def mix_in_words(max_ratio: float) -> str:
@@ -118,23 +132,7 @@ def _draw_times(axes: Axes, times: Mapping[int, float], slowest: float) -> None:
 
 
 def _read(path: str | Path) -> list[_Run]:
-    with Path(path).open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    if not rows:
-        raise ValueError(f"'{path}' has no rows to draw.")
-    try:
-        runs = [
-            _Run(
-                int(row["model.n"]),
-                int(row["model.m"]),
-                float(row["data.outliers.max_ratio"]),
-                float(row["us_per_problem"]),
-                *(100 * float(row[f"uniform/{name}"]) for name in ("rate", "low", "high")),
-            )
-            for row in rows
-        ]
-    except KeyError as error:
-        raise ValueError(f"'{path}' has no column {error}.") from error
+    runs = [_Run(*(read(row[column]) for column, read in _COLUMNS.items())) for row in read_rows(path, _COLUMNS)]
     if len({run[:3] for run in runs}) < len(runs):
         raise ValueError(f"'{path}' has several runs with the same n, m and mix of wrong pairs.")
     return runs

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from pathlib import Path
 
+from kornia_pnpnet.figures.records import read_rows
 from kornia_pnpnet.figures.style import BLUE, GREEN, ORANGE, PURPLE, SKY, SMALL, TITLE, WIDTH, make_figure, save, tidy
 
 __all__ = ["plot_training"]
@@ -28,15 +28,16 @@ def plot_training(path: str | Path, history_csv: str | Path) -> Path:
     Raises:
         ValueError: when a column is missing or there are no rows.
     """
-    with Path(history_csv).open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    if not rows:
-        raise ValueError(f"'{history_csv}' has no rows to draw.")
+    rows = read_rows(history_csv, {"update": float})
 
     def curve(column: str) -> tuple[list[float], list[float]]:
+        filled = [row for row in rows if row.get(column)]
         if column not in rows[0]:
             raise ValueError(f"'{history_csv}' has no column '{column}'.")
-        pairs = [(float(row["update"]), float(row[column])) for row in rows if row[column]]
+        try:
+            pairs = [(float(row["update"]), float(row[column])) for row in filled]
+        except ValueError as error:
+            raise ValueError(f"'{history_csv}': '{column}' is no number: {error}") from error
         pairs = [pair for pair in pairs if math.isfinite(pair[1])]
         return [x for x, _ in pairs], [y for _, y in pairs]
 

@@ -41,7 +41,7 @@ class EPnP(nn.Module):
     Source: V. Lepetit, F. Moreno-Noguer and P. Fua, "EPnP: An Accurate O(n) Solution to the PnP Problem", IJCV 2009.
     We depart from it for accuracy, for speed and to do without eigenvectors of equal eigenvalues:
 
-    - Two thirds of the 12 unknowns are eliminated (:mod:`~kornia_pnpnet.init.depths`). What remains are the depths of
+    - Two thirds of the 12 unknowns are eliminated (``kornia_pnpnet.init.depths``). What remains are the depths of
       the control points; the null vectors are ordered by their algebraic error at equal depth of the centroid, not
       at equal length. Where fewer than six pairs leave several null vectors, those with the world's longest extents
       come first.

@@ -9,6 +9,7 @@ from kornia.core.check import KORNIA_CHECK
 from kornia.core.exceptions import ShapeError
 from torch import Tensor, nn
 
+from kornia_pnpnet.checks import check_positive
 from kornia_pnpnet.types import Correspondences, Guess, Pose
 
 __all__ = ["MLPInit"]
@@ -82,7 +83,7 @@ class MLPInit(nn.Module):
         img_scale: pixels by which image coordinates are divided.
 
     Raises:
-        BaseError: when ``n`` is less than 3.
+        BaseError: when ``n`` is less than 3, or a scale is not a positive number.
 
     Example:
         >>> corr = Correspondences(torch.randn(2, 9, 3), torch.randn(2, 9, 2), torch.ones(2, 9), torch.tensor(3400.0))
@@ -94,6 +95,7 @@ class MLPInit(nn.Module):
     def __init__(self, n: int, *, world_scale: float = 1.0, img_scale: float = 1000.0) -> None:
         super().__init__()
         KORNIA_CHECK(isinstance(n, int) and n >= 3, f"n must be an integer of at least 3, got {n!r}.")
+        check_positive(world_scale=world_scale, img_scale=img_scale)
         self.config = {"n": n, "world_scale": world_scale, "img_scale": img_scale}
         self.n = n
         self.world_scale = world_scale

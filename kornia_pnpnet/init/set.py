@@ -203,13 +203,13 @@ class SetInit(nn.Module):
     roll; intrinsics enter as rays alone. The network runs in the dtype of its weights, what is around it in that of
     the correspondences.
 
-    The likeliest pairs also make ``samples`` of three, whose poses (see :func:`~kornia_pnpnet.init.p3p.p3p`) at most 32
-    of them judge; of more pairs there are more samples, spread over more of the likeliest. The best one of all is one
+    The likeliest pairs also make ``samples`` of three, whose poses (see :func:`~kornia_pnpnet.init.p3p`) at most 32 of
+    them judge; of more pairs there are more samples, spread over more of the likeliest. The best one of all is one
     more hypothesis, a constant without gradient. Its cost is fixed.
 
     A pair weighs as much as it is likely to be right. The noise of pixels and points, which tells
-    the refinement how far pairs may be off, is what :attr:`~kornia_pnpnet.types.Correspondences.noise` says, or the
-    network's estimate where that says nothing.
+    the refinement how far pairs may be off, is what ``noise`` of :class:`~kornia_pnpnet.types.Correspondences` says, or
+    the network's estimate where that says nothing.
 
     The design is ours. Distances along rays before a closed-form alignment: J. Hesch and S. Roumeliotis, "A direct
     least-squares method for PnP", ICCV 2011, among many; attention that is pooled over correspondences: W. Sun et al.,

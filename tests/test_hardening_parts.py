@@ -1,0 +1,734 @@
+"""Whatever comes in, for the parts that solvers are made of and for all around them: metrics, data, readers, files."""
+
+import importlib
+import io
+import json
+import re
+from dataclasses import is_dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from kornia.core.exceptions import BaseError
+from test_colmap import make_scene, match_arrays, write_model
+from test_hardening import INF, NAN, batches, damage, many, numbers, run_main
+
+from kornia_pnpnet import (
+    Guess,
+    MLPInit,
+    Normalize,
+    PnPNet,
+    Pose,
+    PoseLoss,
+    RobustWeightedLM,
+    SetInit,
+    SetLoss,
+    create_solver,
+    list_solvers,
+    pose_covariance,
+    pose_errors,
+    success,
+    success_rate,
+)
+from kornia_pnpnet.complexity import operation_count
+from kornia_pnpnet.data import (
+    BoxPoints,
+    MixedProblems,
+    ObjectPoints,
+    OutlierMix,
+    SceneProblems,
+    SlabPoints,
+    SyntheticProblems,
+    VaryingSize,
+    load_colmap,
+    load_matches,
+    load_scene,
+)
+from kornia_pnpnet.figures import plot_pose, plot_sweep, plot_training
+from kornia_pnpnet.geometry import (
+    additive_tangent_map,
+    normal_equations,
+    pixel_variance,
+    project,
+    retract,
+    retract_additive,
+    rotation_angle,
+    transform,
+)
+from kornia_pnpnet.init import P3P, RANSAC, EPnP, REPPnP, SubsetSolver, p3p
+from kornia_pnpnet.lm import BACKWARDS, BoundedParameter, explains, lm_step, solve_damped
+from kornia_pnpnet.losses import pose_distances
+from kornia_pnpnet.metrics import reliability
+from kornia_pnpnet.peers import OpenCVPnP, OpenCVRansac, OpenCVUsac, PeerSolver, PoseLib, PyColmap
+from kornia_pnpnet.robust import KERNELS
+from kornia_pnpnet.training import TrainSettings
+from kornia_pnpnet.types import Noise
+
+ERRORS = BaseError, ValueError
+#: Numbers for options: sound ones, and those that make no sense.
+ANY = st.one_of(st.floats(-2.0, 200.0), st.sampled_from([0, 1, -1, 0.0, 1e-6, 1e6, INF, -INF, NAN]))
+COUNTS = st.one_of(st.integers(-2, 12), st.sampled_from([0.5, NAN, True]))
+RANGES = st.tuples(ANY, ANY)
+BOOL = st.booleans()
+WORD = st.text(st.characters(exclude_characters="/\0", exclude_categories=["Cs"]), max_size=8) | st.sampled_from(
+    [*KERNELS, *BACKWARDS, "additive", "msac", "AP3P", "EPNP", "USAC_FAST", "epnp-lm", "pnpnet-n9"]
+)
+
+
+def options(**values):
+    """Some of these options."""
+    return st.fixed_dictionaries({}, optional=values)
+
+
+def rotations(batch, seed, dtype=torch.float64):
+    generator = torch.Generator().manual_seed(seed)
+    q, r = torch.linalg.qr(torch.randn(batch, 3, 3, generator=generator, dtype=torch.float64))
+    q = q * r.diagonal(dim1=1, dim2=2).sign()[:, None]
+    return (q * q.det()[:, None, None]).to(dtype)
+
+
+@st.composite
+def poses(draw, batch, dtype):
+    """Of any size; finite."""
+    shift = torch.randn(batch, 3, generator=torch.Generator().manual_seed(draw(st.integers(0, 99))))
+    size = 10.0 ** draw(st.integers(-6, 6))
+    return Pose(rotations(batch, draw(st.integers(0, 99)), dtype), size * shift.to(dtype))
+
+
+def finite(*values):
+    for value in values:
+        if isinstance(value, torch.Tensor):
+            assert value.dtype == torch.bool or value.isfinite().all()
+        elif value is not None:
+            finite(*value)
+
+
+def are_rotations(matrices):
+    finite(matrices)
+    flat = matrices.detach().double().reshape(-1, 3, 3)
+    torch.testing.assert_close(flat @ flat.mT, torch.eye(3).double().expand_as(flat), rtol=0, atol=1e-4)
+
+
+def gradients_are_finite(values, tensors):
+    total = sum(x.sum() for x in values if x.requires_grad)
+    if tensors and isinstance(total, torch.Tensor):
+        finite(*(x for x in torch.autograd.grad(total, tensors, allow_unused=True) if x is not None))
+
+
+# -- metrics and losses -----------------------------------------------------------------------------------------------
+
+
+@st.composite
+def pose_pairs(draw):
+    dtype, batch = draw(st.sampled_from([torch.float32, torch.float64])), draw(st.integers(0, 4))
+    shapes = (batch, 3, 3), (batch, 3)
+    pairs = [Pose(*(draw(numbers(dtype, shape)) for shape in shapes)) for _ in range(2)]
+    sound = draw(st.booleans())
+    if sound:
+        pairs = [pose._replace(rotation=rotations(batch, i, dtype)) for i, pose in enumerate(pairs)]
+    return pairs
+
+
+@many(60)
+@given(pose_pairs(), ANY, ANY)
+def test_errors_of_any_poses(tally, pair, degrees, length):
+    tally("parts", "`pose_errors`, `success`, `success_rate`, `rotation_angle`, `pose_distances`: of any poses")
+    estimate, truth = pair
+    errors = pose_errors(estimate, truth)
+    batch = len(truth.translation)
+    assert all(x.shape == (batch,) and x.dtype == truth.translation.dtype for x in errors)
+    assert not (errors.rotation_error_deg < 0).any()
+    assert not (errors.rotation_error_deg > 180.001).any()
+    right = success(errors, degrees, length)
+    assert right.dtype == torch.bool
+    assert not right[errors.rotation_error_deg.isnan() | errors.translation_error.isnan()].any()
+    assert rotation_angle(*(pose.rotation for pose in pair)).shape == (batch,)
+    if batch:
+        rate = success_rate(right)
+        assert 0 <= rate.low <= rate.rate <= rate.high <= 1
+    else:
+        with pytest.raises(ValueError, match="at least one"):
+            success_rate(right)
+    tensors = [x.detach().clamp(-1e6, 1e6).nan_to_num(0.0).requires_grad_() for x in estimate]
+    distances = pose_distances(Pose(*tensors), Pose(*(x.clamp(-1e6, 1e6).nan_to_num(0.0) for x in truth)))
+    finite(distances)
+    gradients_are_finite(distances, tensors)
+
+
+@many(60)
+@given(st.lists(st.sampled_from([(), (1,), (3,), (2, 3), (1, 3, 3), (2, 3, 3), (3, 3)]), min_size=4, max_size=4))
+def test_poses_that_do_not_fit_are_an_error(tally, shapes):
+    tally("parts", "`pose_errors`, `pose_distances` of shapes that do not fit: an error of the package's own types")
+    assume(shapes != [(2, 3, 3), (2, 3)] * 2)
+    first, second = (Pose(*(torch.zeros(shape) for shape in pair)) for pair in (shapes[:2], shapes[2:]))
+    for function in (pose_errors, pose_distances):
+        with pytest.raises(BaseError):
+            function(first, second)
+
+
+@many(60)
+@given(st.data(), st.integers(-2, 12))
+def test_reliability_of_any_chances(tally, data, ranges):
+    tally("parts", "`reliability` of any numbers")
+    chances = data.draw(numbers(torch.float64, (0,), (1,), (7,), (2, 3)))
+    outcomes = torch.rand(data.draw(st.sampled_from([(0,), (1,), (7,), (2, 3)]))) > 0.5
+    try:
+        found = reliability(chances, outcomes, ranges)
+    except ERRORS:
+        return
+    assert found.number.sum() == chances.numel()
+    assert 0 <= found.expected_error <= 1
+
+
+@many(40)
+@given(batches(most=3), options(saturation=ANY, refined=ANY))
+def test_losses_of_any_result(tally, case, chosen):
+    tally("parts", "`PoseLoss`, `SetLoss` of the result of any batch: finite with its gradient")
+    inputs, mask, weights, kinds = case
+    if not kinds:
+        return
+    truth = SyntheticProblems(n=inputs[0].shape[1], batch_size=len(kinds), dtype=inputs[0].dtype).batch(0)
+    solver = SOLVER
+    result, guess = solver.with_guess(*inputs, weights=weights, mask=mask)
+    try:
+        losses = SetLoss(**{"saturation": 2.0, **chosen, "refined": 0.5}), PoseLoss(**chosen)
+    except ERRORS:
+        return
+    terms = [losses[0](result, truth, 1.0, guess), losses[1](result, truth)]
+    finite(terms)
+    gradients_are_finite([x.total for x in terms], [x for x in inputs if x.requires_grad] or [SOLVER.refine.step.raw])
+
+
+SOLVER = create_solver("pnpnet-set")
+
+
+# -- what solvers are made of -----------------------------------------------------------------------------------------
+
+
+@st.composite
+def correspondences(draw, n=None):
+    """Of any batch, as the parts of a solver see them."""
+    inputs, mask, weights, _ = draw(batches(n))
+    normalize = Normalize(**draw(options(order=st.booleans(), center=st.booleans(), scale=st.booleans())))
+    tensors = [x for x in inputs if x.requires_grad]
+    corr, frame = normalize(*inputs, weights=weights, mask=mask)
+    finite(corr, frame)
+    if draw(st.booleans()):
+        corr = corr._replace(noise=Noise(torch.full_like(corr.weights, 0.5), torch.full_like(corr.weights, 0.01)))
+    return corr, tensors
+
+
+KINDS = st.sampled_from(list(KERNELS))
+
+
+@many(60)
+@given(correspondences(), st.data())
+def test_the_calculus_takes_anything(tally, case, data):
+    tally("parts", "`project`, `normal_equations`, `retract`, `lm_step` and the like, of any batch and pose: finite")
+    corr, tensors = case
+    batch, dtype = len(corr.world_points), corr.world_points.dtype
+    pose = data.draw(poses(batch, dtype))
+    finite(transform(pose, corr.world_points))
+    projection = project(pose, corr)
+    finite(projection)
+    if corr.noise is not None:
+        assert (pixel_variance(projection, corr.noise, corr.focal) > 0).all()
+    equations = normal_equations(projection, corr.weights)
+    damping = torch.tensor(10.0 ** data.draw(st.integers(-8, 2)), dtype=dtype)
+    delta, solved = solve_damped(equations, damping)
+    assert solved.shape == (batch,)
+    finite([x[solved] for x in delta])
+    explains(projection, corr, corr.weights)
+    additive = data.draw(st.booleans())
+    moved = lm_step(corr, pose, projection, corr.weights, torch.tensor(1.0, dtype=dtype), damping, additive=additive)
+    finite(moved)
+    are_rotations(moved.pose.rotation)
+    gradients_are_finite([*moved.pose, *projection.residual], tensors)
+    tangent = torch.randn(batch, 6, dtype=dtype)
+    for move in (retract, retract_additive):
+        are_rotations(move(pose, tangent).rotation)
+    finite(additive_tangent_map(pose))
+
+
+@many(80)
+@given(
+    correspondences(),
+    st.integers(0, 4),
+    options(
+        kernel=KINDS,
+        shared=st.booleans(),
+        update=st.sampled_from(["retraction", "additive"]),
+        reject_worse=st.booleans(),
+        by_residual=st.integers(0, 3),
+        backward=st.sampled_from(BACKWARDS),
+    ),
+    st.data(),
+)
+def test_refinements_take_anything(tally, case, m, chosen, data):
+    tally("parts", "`RobustWeightedLM` with any options from any pose: finite with its gradient, a rotation")
+    corr, tensors = case
+    refine = RobustWeightedLM(m, **chosen).to(corr.world_points.dtype)
+    pose = data.draw(poses(len(corr.world_points), corr.world_points.dtype))
+    refined = refine(corr, Guess(pose, torch.ones_like(corr.weights)))
+    finite(refined)
+    are_rotations(refined.pose.rotation)
+    gradients_are_finite(
+        [*refined.pose, refined.cost], [*tensors, *(p for p in refine.parameters() if p.requires_grad)]
+    )
+
+
+INITIALISERS = {
+    "EPnP": EPnP(),
+    "REPPnP": REPPnP(),
+    "MLPInit": MLPInit(9),
+    "SetInit": SetInit(),
+    "RANSAC of P3P": RANSAC(P3P(), max_samples=40),
+    "RANSAC of SubsetSolver": RANSAC(SubsetSolver(EPnP(), size=5), max_samples=10, min_samples=5),
+}
+
+
+@pytest.mark.parametrize("name", INITIALISERS)
+def test_initialisers_take_anything(name, tally):
+    @many(30)
+    @given(correspondences(9))
+    def run(case):
+        tally("parts", f"`{name}` of any batch: finite with its gradient, a rotation")
+        corr, tensors = case
+        init = INITIALISERS[name].to(corr.world_points.dtype)
+        guess = init(corr)
+        finite(guess.pose, guess.weights, guess.others, guess.noise)
+        are_rotations(guess.pose.rotation[(corr.weights > 0).any(-1)])
+        assert (guess.weights >= 0).all()
+        gradients_are_finite([*guess.pose, guess.weights], tensors)
+
+    run()
+
+
+@many(80)
+@given(st.data(), st.integers(0, 4), st.sampled_from([torch.float32, torch.float64]))
+def test_p3p_takes_anything(tally, data, batch, dtype):
+    tally("parts", "`p3p` of any three points: finite with its gradient, rotations")
+    points = [data.draw(numbers(dtype, (batch, 3, size))).requires_grad_() for size in (3, 2)]
+    found = p3p(*points)
+    assert found.valid.shape == found.pose.rotation.shape[:2]
+    are_rotations(found.pose.rotation[found.valid])
+    finite(found)
+    gradients_are_finite(found.pose, points)
+
+
+@many(60)
+@given(st.data())
+def test_covariances_of_any_numbers(tally, data):
+    tally("parts", "`pose_covariance` of any numbers and shapes: an error of the package's own types, or no NaN")
+    batch, count = data.draw(st.integers(0, 3)), data.draw(st.integers(0, 12))
+    some = st.integers(0, 3)
+    shapes = [(batch, 3, 3), (batch, 3), (batch, count, 3), (batch, count, 2), (3, 3)]
+    if data.draw(st.booleans()):
+        which = data.draw(st.integers(0, 4))
+        shapes[which] = (*shapes[which][:-1], data.draw(some)) if data.draw(st.booleans()) else (data.draw(some),)
+    rotation, translation, world, img, camera = (data.draw(numbers(torch.float64, shape)) for shape in shapes)
+    sigma = data.draw(st.one_of(ANY, numbers(torch.float64, (), (batch,), (batch, count), (7,))))
+    sound = [(batch, 3, 3), (batch, 3), (batch, count, 3), (batch, count, 2), (3, 3)] == shapes
+    try:
+        found = pose_covariance(Pose(rotation, translation), world, img, camera, img_sigma=sigma)
+    except BaseError:
+        assert not sound or (isinstance(sigma, torch.Tensor) and sigma.shape == (7,))
+    else:
+        assert sound
+        assert found.shape == (batch, 6, 6)
+        assert not found.isnan().any()
+
+
+# -- options ----------------------------------------------------------------------------------------------------------
+
+SIGMAS = st.one_of(ANY, RANGES)
+MIX = options(
+    max_ratio=ANY,
+    count=COUNTS,
+    min_count=COUNTS,
+    mismatch_share=ANY,
+    near_share=ANY,
+    structured_share=ANY,
+    min_inliers=COUNTS,
+)
+POINTS = {
+    BoxPoints: options(half_width=ANY, z_near=ANY, depth=ANY),
+    SlabPoints: options(window=RANGES, field_of_view=ANY, distance=RANGES, tilt=ANY, thickness=RANGES),
+    ObjectPoints: options(distance=RANGES, field_of_view=ANY, thinnest=ANY, planar=ANY),
+}
+SOURCE = options(
+    n=COUNTS,
+    batch_size=COUNTS,
+    seed=COUNTS,
+    translation_box=ANY,
+    translation_sigma=ANY,
+    max_angle=ANY,
+    focal=ANY,
+    half_image=ANY,
+    img_sigma=SIGMAS,
+    world_sigma=SIGMAS,
+    told=ANY,
+)
+
+
+def sound(problems):
+    """What every batch of problems keeps."""
+    finite(*problems[:5])
+    are_rotations(problems.pose.rotation)
+    assert problems.inliers.shape == problems.world_points.shape[:2]
+
+
+@many(150)
+@given(SOURCE, MIX, st.sampled_from(list(POINTS)), st.data())
+def test_problems_of_any_options(tally, chosen, mix, prior, data):
+    tally("options", "`SyntheticProblems` with any options, wrong pairs and points: sound problems or an error")
+    try:
+        points = prior(**data.draw(POINTS[prior]))
+        source = SyntheticProblems(**{"batch_size": 4, **chosen}, outliers=OutlierMix(**mix), points=points)
+        problems = source.batch(0)
+    except ERRORS:
+        return
+    sound(problems)
+
+
+@many(60)
+@given(st.data())
+def test_mixtures_of_any_options(tally, data):
+    tally("options", "`MixedProblems`, `VaryingSize` with any options: sound problems or an error")
+    count = data.draw(st.integers(0, 3))
+    shares = data.draw(st.one_of(st.none(), st.lists(ANY, max_size=3)))
+    sizes = data.draw(st.lists(COUNTS, max_size=3))
+    try:
+        mixed = partial(MixedProblems, [SyntheticProblems] * count, shares=shares)
+        problems = VaryingSize(mixed, n=sizes, batch_size=data.draw(COUNTS), seed=data.draw(COUNTS)).batch(3)
+    except ERRORS:
+        return
+    sound(problems)
+
+
+@many(60)
+@given(
+    options(
+        n=COUNTS, batch_size=COUNTS, seed=COUNTS, num_spares=COUNTS, translation_box=ANY, max_angle=ANY, recentre=BOOL
+    ),
+    MIX,
+)
+def test_scenes_of_any_options(tally, chosen, mix):
+    tally("options", "`SceneProblems` with any options: sound problems or an error")
+    try:
+        problems = SceneProblems(make_scene(20, 12), **{"batch_size": 4, **chosen}, outliers=OutlierMix(**mix)).batch(0)
+    except ERRORS:
+        return
+    sound(problems)
+
+
+SAMPLING = {"threshold": ANY, "iterations": COUNTS, "confidence": ANY, "seed": COUNTS}
+MAKERS = {
+    "RobustWeightedLM": (
+        RobustWeightedLM,
+        options(
+            m=COUNTS,
+            kernel=WORD,
+            step=ANY,
+            damping=ANY,
+            robustness=ANY,
+            shared=BOOL,
+            update=WORD,
+            by_residual=COUNTS,
+            backward=WORD,
+            last=COUNTS,
+        ),
+    ),
+    "MLPInit": (lambda n=9, **sizes: MLPInit(n, **sizes), options(n=COUNTS, world_scale=ANY, img_scale=ANY)),
+    "SetInit": (SetInit, options(width=COUNTS, layers=COUNTS, heads=COUNTS, hidden=COUNTS, starts=COUNTS)),
+    "EPnP": (EPnP, options(iterations=COUNTS, algebraic_weight=ANY)),
+    "REPPnP": (REPPnP, options(max_error=ANY, quantile=ANY, null_iterations=COUNTS, rigid_iterations=COUNTS)),
+    "RANSAC": (
+        partial(RANSAC, P3P()),
+        options(threshold=ANY, world_threshold=ANY, scorer=WORD, max_samples=COUNTS, confidence=ANY, seed=COUNTS),
+    ),
+    "Normalize": (Normalize, options(f_const=ANY)),
+    "OpenCVPnP": (OpenCVPnP, options(method=WORD)),
+    "OpenCVRansac": (OpenCVRansac, options(**SAMPLING, method=WORD, refine=BOOL)),
+    "OpenCVUsac": (OpenCVUsac, options(**SAMPLING, method=WORD)),
+    "PoseLib": (PoseLib, options(threshold=ANY, min_iterations=COUNTS, max_iterations=COUNTS, confidence=ANY)),
+    "PyColmap": (PyColmap, options(threshold=ANY, loss_scale=ANY, min_iterations=COUNTS, max_iterations=COUNTS)),
+}
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_parts_of_any_options(name, tally):
+    """What can be made solves, and makes no NaN."""
+    make, chosen = MAKERS[name]
+    problems = SyntheticProblems(n=12, batch_size=3, seed=0).batch(0)
+
+    @many(60)
+    @given(chosen)
+    def run(values):
+        tally("options", f"`{name}` with any options: finite results or an error")
+        try:
+            part = make(**values)
+        except (*ERRORS, ImportError):
+            return
+        key = {"RobustWeightedLM": "refine", "Normalize": "normalize"}.get(name, "init")
+        solver = part if isinstance(part, PeerSolver) else PnPNet(**{"init": EPnP(), key: part})
+        n = values.get("n", 9)
+        finite(*solver(problems.world_points[:, :n], problems.img_points[:, :n], problems.intrinsics)[:4])
+
+    run()
+
+
+@many(80)
+@given(st.floats(-10, 10) | ANY, COUNTS, ANY, ANY, BOOL)
+def test_bounded_parameters_of_any_bounds(tally, initial, size, lower, upper, logarithmic):
+    tally("options", "`BoundedParameter` with any numbers: within its bounds or an error")
+    try:
+        value = BoundedParameter(initial, size=size, lower=lower, upper=upper, logarithmic=logarithmic)()
+    except ERRORS:
+        return
+    assert value.shape == (size,)
+    torch.testing.assert_close(value, torch.full_like(value, initial), rtol=1e-3, atol=1e-3 * (upper - lower))
+
+
+@many(150)
+@given(
+    st.sampled_from(list_solvers()) | WORD,
+    options(m=COUNTS, threshold=ANY, iterations=COUNTS, seed=COUNTS, confidence=ANY, views=COUNTS, unknown=ANY),
+)
+def test_solvers_of_any_name_and_options(tally, name, chosen):
+    tally("options", "`create_solver` of any name with any options: poses or an error")
+    try:
+        solver = create_solver(name, **chosen)
+    except (*ERRORS, FileNotFoundError):
+        return
+    n = int(name[-1]) if name[-2:] in ("n6", "n9") else int(name[-2:]) if name[-3:-2] == "n" else 9
+    problems = SyntheticProblems(n=n, batch_size=2, seed=0).batch(0)
+    finite(*solver(*problems[:3])[:4])
+
+
+@many(80)
+@given(st.sampled_from(list_solvers()) | WORD, COUNTS, st.none() | COUNTS)
+def test_costs_of_any_solver(tally, name, n, outliers):
+    tally("options", "`operation_count` of any solver for any number of pairs: a positive number or an error")
+    try:
+        count = operation_count(name, n, outliers=outliers)
+    except (*ERRORS, FileNotFoundError):
+        return
+    assert 0 < count < INF
+
+
+@many(80)
+@given(
+    options(
+        updates=COUNTS,
+        lr=ANY,
+        lr_refine=ANY,
+        warmup=COUNTS,
+        final_lr=ANY,
+        clip=ANY,
+        ramp=RANGES,
+        max_skipped=COUNTS,
+        log_every=COUNTS,
+        validate_every=COUNTS,
+        checkpoint_every=COUNTS,
+    ),
+    st.integers(0, 12),
+)
+def test_trainings_of_any_settings(tally, chosen, update):
+    tally("options", "`TrainSettings` of any numbers: rates that are finite and not negative, or an error")
+    try:
+        settings = TrainSettings(**{"updates": 12, **chosen})
+    except ERRORS:
+        return
+    assert 0 <= settings.lr_factor(update) < INF
+    assert 0 <= settings.ramp_factor(update) <= 1
+    assert 0 <= settings.lr < INF
+
+
+def names_the_file(error, path):
+    assert str(path) in str(error)
+
+
+# -- files ------------------------------------------------------------------------------------------------------------
+
+
+def test_damaged_scenes_are_an_error_of_ours(tally, tmp_path):
+    pytest.importorskip("pycolmap", reason="needs pycolmap")
+    model = tmp_path / "model"
+    write_model(model, "PINHOLE")
+    sound_files = {path.name: path.read_bytes() for path in model.iterdir()}
+
+    @many(100)
+    @given(st.sampled_from(sorted(sound_files)), st.data())
+    def run(name, data):
+        tally("files", "`load_colmap`, `load_scene` of a damaged text model: a scene of finite numbers, or one error")
+        (model / name).write_bytes(data.draw(damage(sound_files[name])))
+        try:
+            scene = data.draw(st.sampled_from([load_colmap, load_scene]))(model)
+        except (ValueError, OSError) as error:
+            names_the_file(error, model)
+        else:
+            finite(*((view.world_points, view.img_points, view.rotation, view.translation) for view in scene.views))
+        finally:
+            (model / name).write_bytes(sound_files[name])
+
+    run()
+
+
+def test_damaged_matches_are_an_error_of_ours(tally, tmp_path):
+    file = io.BytesIO()
+    np.savez(file, **match_arrays(30, 20))
+    path = tmp_path / "matches.npz"
+
+    @many(150)
+    @given(damage(file.getvalue()))
+    def run(content):
+        tally("files", "`load_matches` of a damaged file: a scene of finite numbers, or one error")
+        path.write_bytes(content)
+        try:
+            scene = load_matches(path)
+        except (ValueError, OSError) as error:
+            names_the_file(error, path)
+        else:
+            finite(*((view.world_points, view.img_points, view.rotation, view.translation) for view in scene.views))
+
+    run()
+
+
+@st.composite
+def spoiled(draw, content, places):
+    """Results of which some values were lost or replaced."""
+    content = json.loads(json.dumps(content))
+    for _ in range(draw(st.integers(1, 3))):
+        *path, last = draw(st.sampled_from(places))
+        inner = content
+        try:
+            for key in path:
+                inner = inner[key]
+            if draw(st.booleans()):
+                del inner[last]
+            else:
+                inner[last] = draw(st.sampled_from([None, "", "x", -1, 0, 1e300, [], {}, [None], True, {"a": 1}]))
+        except (KeyError, IndexError, TypeError):
+            continue
+    return content
+
+
+def places_in(content, path=()):
+    """All keys and indices of nested lists and dictionaries; of long lists the first two."""
+    items = (
+        content.items() if isinstance(content, dict) else enumerate(content[:2]) if isinstance(content, list) else ()
+    )
+    for key, value in items:
+        yield (*path, key)
+        yield from places_in(value, (*path, key))
+
+
+def test_spoiled_results_are_a_line_and_no_traceback(tally, tmp_path):
+    made = tmp_path / "results.json"
+    arguments = "evaluate", "--solver", "epnp", "--problems", "20", "--outliers", "none,3", "--out", made
+    assert run_main(*arguments)[0] == 0
+    content = json.loads(made.read_text())
+    path = tmp_path / "spoiled.json"
+
+    @many(150)
+    @given(spoiled(content, list(places_in(content))))
+    def run(results):
+        tally("files", "`pnpnet figures`, `pnpnet evaluate` of spoiled results: pictures, or one line of error")
+        path.write_text(json.dumps(results))
+        for command in (("figures", path, "--out", tmp_path / "figures"), (*arguments[:-1], path)):
+            code, _, err = run_main(*command)
+            assert code in (0, 2)
+            if code == 2:
+                assert err.startswith("pnpnet: ")
+                assert err.count("\n") == 1
+
+    run()
+
+
+def test_pictures_of_any_numbers(tally, tmp_path):
+    path = tmp_path / "picture.png"
+
+    @many(25)
+    @given(st.integers(0, 5), st.data(), st.none() | st.tuples(ANY, ANY))
+    def run(count, data, size):
+        tally("files", "`plot_pose` of any numbers: a picture or an error")
+        shapes = (count, 2), data.draw(st.sampled_from([(count, 2), (count, 2), (count, 3), (2,)]))
+        points = [data.draw(numbers(torch.float64, shape)) for shape in shapes]
+        path.unlink(missing_ok=True)
+        try:
+            plot_pose(path, *points, torch.arange(count) % 2 == 0, size)
+        except ERRORS:
+            assert not path.exists()
+        else:
+            assert path.stat().st_size > 1000
+
+    run()
+
+
+CURVES = {
+    plot_training: "update,total,init_rotation,init_translation,refined_rotation,refined_translation,val/a/success\n"
+    "0,3.5,1,2,3,4,\n100,2.5,1,2,3,4,0.5\n200,1.5,1,2,3,4,0.75\n",
+    partial(plot_sweep, against="n"): "model.n,model.m,data.outliers.max_ratio,us_per_problem,uniform/rate,uniform/low,"
+    "uniform/high\n6,5,0.33,20.5,0.5,0.4,0.6\n9,5,0.33,20.5,0.6,0.5,0.7\n9,8,0,20.5,0.8,0.7,0.9\n",
+}
+
+
+@pytest.mark.parametrize("plot", CURVES, ids=["plot_training", "plot_sweep"])
+def test_damaged_curves_are_an_error_of_ours(plot, tally, tmp_path, request):
+    path = tmp_path / "curves.csv"
+
+    @many(25)
+    @given(damage(CURVES[plot].encode()))
+    def run(content):
+        tally("files", f"`{request.node.callspec.id}` of a damaged CSV file: a picture, or one error")
+        path.write_bytes(content)
+        try:
+            plot(tmp_path / "picture.png", path)
+        except ValueError as error:
+            names_the_file(error, path)
+
+    run()
+
+
+#: Public functions and classes that take part through others, and in which of the tests.
+THROUGH_OTHERS = {
+    "`pnpnet evaluate` and `pnpnet figures` of spoiled results": """
+        draw_problems evaluate format_table load_results row_errors save_results
+        paper_figures plot_against_m plot_against_n plot_errors plot_mismatches plot_operations plot_reliability
+        plot_scenes plot_success plot_synthetic""",
+    "every call of a solver of ours": "Normalize Pose change_tangent move problems_last shipped_weights find_weights",
+    "every solver of another library": "PeerSolver",
+    "`pnpnet solve --batch` of damaged shards": "solve_shards",
+    "`operation_count`": "operations_by_part part_calls complexity_results OperationCounter count_per_problem",
+    "trainings that are killed and go on (test_interruptions.py)": """
+        fit train_briefly validate describe_shares run_results write_json write_model_card summarize_runs
+        collect_weights find_results ProblemSource stream_batches environment""",
+    "their own tests with fewer inputs (test_bounds.py, test_export.py: minutes for each export)": """
+        SeesTruth KnownInliers KnownInliersAndNoise export_onnx export_program""",
+    "protocols and errors": "MinimalSolver PointPrior PairsError TrainingError",
+}
+
+
+def test_every_public_name_takes_part():
+    """What the reference lists is in these files, or is said to be reached by something that is."""
+    here = Path(__file__).parent
+    files = "test_hardening.py", "test_hardening_parts.py", "test_interruptions.py"
+    source = "\n".join((here / name).read_text() for name in files).partition("THROUGH_OTHERS = {")[0]
+    named = set(re.findall(r"\w+", source)) | set(" ".join(THROUGH_OTHERS.values()).split())
+    missing = set()
+    for module in {x for page in (here.parent / "docs" / "api").glob("*.md") for x in modules_of(page)}:
+        for name in importlib.import_module(module).__all__:
+            value = getattr(importlib.import_module(module), name)
+            holds = isinstance(value, type) and (issubclass(value, tuple) or is_dataclass(value))
+            if callable(value) and not holds and name not in named:
+                missing.add(name)
+    assert not missing
+
+
+def modules_of(page):
+    return re.findall(r"automodule:: ([\w.]+)", page.read_text())
