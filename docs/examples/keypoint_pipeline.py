@@ -49,6 +49,7 @@ MOST = 0.3
 POSE_WEIGHT = 50.0
 ALONE, END, UNTOLD = "keypoint loss alone", "end to end", "end to end, not told how far off"
 FULL = "keypoint loss alone, hidden ones labelled"
+LIKELY, FULL_LIKELY = f"{ALONE}, how far off by likelihood", f"{FULL}, how far off by likelihood"
 # Points of a curve are means of so many updates.
 MEAN_OF = 50
 
@@ -174,9 +175,19 @@ def distance(pose: Pose, truth: Pose) -> Tensor:
 
 
 def train(
-    network: Keypoints, solver: nn.Module | None, seed: int, updates: range, *, hidden: bool = False
+    network: Keypoints,
+    solver: nn.Module | None,
+    seed: int,
+    updates: range,
+    *,
+    hidden: bool = False,
+    likelihood: bool = False,
 ) -> dict[str, list[float]]:
-    """Go on with the keypoint loss, of hidden ones on request, and with a solver that of the pose; returns curves."""
+    """Go on with the keypoint loss, and with a solver that of the pose; returns curves.
+
+    On request the hidden keypoints have labels, too; or the network learns how far off it is from its labels, by the
+    likelihood of normal noise, which leaves the keypoints alone.
+    """
     log: list[list[float]] = []
     optimizer = torch.optim.AdamW(network.parameters(), lr=2e-3, weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 2e-3, total_steps=len(updates), pct_start=0.1)
@@ -187,6 +198,10 @@ def train(
         labelled = torch.ones_like(problem.visible) if hidden else problem.visible
         keypoint_loss = (off * labelled).sum() / labelled.sum()
         loss, terms = keypoint_loss, [keypoint_loss.item()]
+        if likelihood:
+            sq_off = (pixels - problem.pixels).detach().square().sum(-1)
+            surprise = 0.5 * sq_off / sigma.square() + 2.0 * sigma.log()
+            loss = loss + (surprise * labelled).sum() / labelled.sum()
         if solver is not None:
             result = solve(solver, pixels, sigma)
             error = distance(result.pose, problem.pose)
@@ -233,17 +248,18 @@ def run(seed: int, updates: int, batches: int) -> tuple[dict[str, Any], dict[str
     torch.manual_seed(seed)
     solver = create_solver("pnpnet-set").requires_grad_(False)
     start = Keypoints()
-    full = copy.deepcopy(start)
+    untrained = copy.deepcopy(start)
     found: dict[str, Any] = {"keypoints first": {"curves": train(start, None, seed, range(updates))}}
-    networks = {name: copy.deepcopy(start) for name in (ALONE, END)}
-    for name, end in ((ALONE, None), (END, solver)):
-        curves = train(networks[name], end, seed, range(updates, 2 * updates))
-        found[name] = {"curves": curves, **test(networks[name], solver, told=end is not None, batches=batches)}
+    networks = {name: copy.deepcopy(start) for name in (ALONE, END, LIKELY)}
+    networks |= {name: copy.deepcopy(untrained) for name in (FULL, FULL_LIKELY)}
+    for name, network in networks.items():
+        labels = {"hidden": name in (FULL, FULL_LIKELY), "likelihood": name in (LIKELY, FULL_LIKELY)}
+        for first in (0, updates) if labels["hidden"] else (updates,):
+            curves = train(network, solver if name == END else None, seed, range(first, first + updates), **labels)
+        told = name in (END, LIKELY, FULL_LIKELY)
+        found[name] = {"curves": curves, **test(network, solver, told=told, batches=batches)}
         distances = ", ".join(f"{key} {found[name][key]:.4f}" for key in ("mean_distance", "median_distance"))
         print(f"seed {seed}, {name}: {distances}", flush=True)
-    curves = [train(full, None, seed, range(first, first + updates), hidden=True) for first in (0, updates)][-1]
-    found[FULL] = {"curves": curves, **test(full, solver, told=False, batches=batches)}
-    print(f"seed {seed}, {FULL}: mean_distance {found[FULL]['mean_distance']:.4f}", flush=True)
     found[UNTOLD] = test(networks[END], solver, told=False, batches=batches)
     return found, networks
 
@@ -309,7 +325,7 @@ def main() -> None:
             for key in seeds["0"][END]
             if key != "curves"
         }
-        for name in (ALONE, FULL)
+        for name in (ALONE, LIKELY, FULL, FULL_LIKELY)
     }
     made = {"environment": environment(), "updates": options.updates, "batches": options.batches}
     results = {**made, "times_lower": times_lower, "seeds": seeds}
