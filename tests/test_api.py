@@ -53,7 +53,7 @@ def interface():
 
 
 def test_the_interface_is_as_it_was():
-    assert interface() == FILE.read_text(), "The interface changed: tell the changelog, and run python tests/test_api.py"
+    assert interface() == FILE.read_text(), "It changed: tell the changelog, and run python tests/test_api.py"
 
 
 if __name__ == "__main__":

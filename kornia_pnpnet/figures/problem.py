@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.collections import LineCollection
 from torch import Tensor
 
+from kornia_pnpnet.checks import check_positive
 from kornia_pnpnet.figures.style import BLUE, RED, SMALL, TITLE, make_figure, save, tidy
 
 __all__ = ["plot_pose"]
@@ -40,12 +41,15 @@ def plot_pose(
 
     Raises:
         ValueError: for shapes that do not fit, or when no pixel is finite.
+        BaseError: for an image without a size.
     """
     pixels, projected = np.asarray(img_points, dtype=float), np.asarray(reprojections, dtype=float)
     bad = np.asarray(rejected, dtype=bool)
     if pixels.ndim != 2 or pixels.shape[1] != 2 or projected.shape != pixels.shape or bad.shape != pixels.shape[:1]:
         shapes = f"{pixels.shape}, {projected.shape} and {bad.shape}"
         raise ValueError(f"plot_pose needs pixels and projections (N, 2) and rejected (N,), got {shapes}.")
+    if size is not None:
+        check_positive(width=size[0], height=size[1])
     there = np.isfinite(pixels).all(axis=1)
     if not there.any():
         raise ValueError("There is no pixel to draw.")
