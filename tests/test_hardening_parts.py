@@ -678,7 +678,7 @@ CURVES = {
 }
 
 
-@pytest.mark.filterwarnings("ignore:No artists with labels:UserWarning")  # of curves that lost their name
+@pytest.mark.filterwarnings("ignore::UserWarning")  # about names of curves
 @pytest.mark.parametrize("plot", CURVES, ids=["plot_training", "plot_sweep"])
 def test_damaged_curves_are_an_error_of_ours(plot, tally, tmp_path, request):
     path = tmp_path / "curves.csv"
