@@ -41,8 +41,9 @@ PARTS = {
     ),
     "options": (
         "Options",
-        "Numbers of any size, none, infinite, negative, in place of sound ones. What can be made has to work.",
-        "What, and what has to come of it | Cases",
+        "Up to two sound values are replaced: by numbers of any size, none, infinite, negative, or by any text. What\n"
+        "can be made has to work, to finite results; the rest is refused with an error that says so.",
+        "What, and what came of it | Cases",
     ),
     "files": ("Files and arguments", "", "What, and what has to come of it | Cases"),
     "processes": ("Dying processes and full disks", "", "What, and what has to come of it | Cases"),
@@ -74,7 +75,7 @@ def page(results: dict[str, Any]) -> str:
         "",
         f"{total} cases, all as they should be, counted by the tests themselves (`tests/test_hardening.py`,",
         "`test_hardening_parts.py` and `test_interruptions.py`; `make test-all` runs most with fewer cases).",
-        "A test checks that every public function and class of the reference takes part. Written by",
+        "What of the public functions and classes they leave to other tests is listed there. Written by",
         "`docs/hardening.py` from `results/hardening.json`.",
     ]
     for part, (heading, text, head) in PARTS.items():

@@ -11,55 +11,72 @@ from kornia.core.check import KORNIA_CHECK
 from kornia.core.exceptions import ShapeError
 from torch import Tensor
 
-__all__ = ["check_numbers", "check_positive", "check_ranges", "check_shapes", "check_whole"]
+from kornia_pnpnet.types import Pose
+
+__all__ = ["check_numbers", "check_poses", "check_positive", "check_ranges", "check_shapes", "check_whole"]
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+    right = isinstance(value, Real) and not isinstance(value, bool)
+    return right and bool(-math.inf < value < math.inf)
 
 
 def check_whole(least: int, /, **values: Any) -> None:
-    """Whole numbers of at least so much."""
+    """Raise a ``BaseError`` unless these are whole numbers of at least so much."""
     for name, value in values.items():
-        whole = isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= least
-        KORNIA_CHECK(whole, f"{name} must be an integer of at least {least}, got {value!r}.")
+        whole = isinstance(value, Integral) and not isinstance(value, bool)
+        KORNIA_CHECK(whole and value >= least, f"{name} must be an integer of at least {least}, got {value!r}.")
 
 
 def check_numbers(low: float, high: float = math.inf, /, **values: Any) -> None:
-    """Finite numbers in ``[low, high]``."""
+    """Raise a ``BaseError`` unless these are finite numbers in ``[low, high]``."""
     limits = f"of at least {low:g}" if high == math.inf else f"in [{low:g}, {high:g}]"
     for name, value in values.items():
         KORNIA_CHECK(_is_number(value) and low <= value <= high, f"{name} must be a number {limits}, got {value!r}.")
 
 
-def check_positive(**values: Any) -> None:
-    """Finite numbers above 0."""
+def check_positive(*, or_infinite: bool = False, **values: Any) -> None:
+    """Raise a ``BaseError`` unless these are positive and finite, or infinite where that is allowed."""
     for name, value in values.items():
-        KORNIA_CHECK(_is_number(value) and value > 0, f"{name} must be a positive number, got {value!r}.")
+        right = (_is_number(value) and value > 0) or (or_infinite and value == math.inf)
+        KORNIA_CHECK(right, f"{name} must be a positive number, got {value!r}.")
 
 
 def check_ranges(**values: Any) -> None:
-    """Two finite positive numbers that do not fall."""
+    """Raise a ``BaseError`` unless these are two positive numbers each, the first not larger than the second."""
     for name, value in values.items():
         numbers = hasattr(value, "__len__") and len(value) == 2 and all(map(_is_number, value))
         right = numbers and 0 < value[0] <= value[1]
-        KORNIA_CHECK(right, f"{name} must be two positive numbers that do not fall, got {value!r}.")
+        KORNIA_CHECK(right, f"{name} must be two positive numbers, the second not smaller, got {value!r}.")
 
 
-def check_shapes(shapes: Mapping[str, tuple[Tensor | None, tuple[int, ...]]], beside: str = "") -> None:
-    """Tensors that are there have the shapes that go with each other.
+def check_shapes(shapes: Mapping[str, tuple[Tensor | None, tuple[int, ...]]], like: Tensor | None = None) -> None:
+    """Check that tensors have the shapes that go with each other.
 
     Args:
-        shapes: name of each tensor, what it is, and the shape that it must have.
-        beside: what else the message says, such as whose batch it is.
+        shapes: name of each tensor, what it is, and the shape that it must have; what is ``None`` may be missing.
+        like: the world points whose batch they belong to, for the message.
 
     Raises:
-        ShapeError: when one has not.
+        ShapeError: when one has another shape.
     """
     for name, (tensor, expected) in shapes.items():
         if tensor is not None and tensor.shape != expected:
+            beside = "" if like is None else f" to go with world_points of {tuple(like.shape)}"
             raise ShapeError(
                 f"{name} must have the shape {expected}{beside}, got {tuple(tensor.shape)}.",
                 actual_shape=tuple(tensor.shape),
                 expected_shape=expected,
             )
+
+
+def check_poses(estimate: Pose, truth: Pose) -> None:
+    """Check that both are as many poses: broadcasting would compare what does not belong together.
+
+    Raises:
+        ShapeError: when the shapes are not (*, 3, 3) and (*, 3), with the same leading ones.
+    """
+    batch = tuple(estimate.translation.shape[:-1])
+    for name, pose in (("estimate", estimate), ("truth", truth)):
+        shapes = {"rotation": (pose.rotation, (*batch, 3, 3)), "translation": (pose.translation, (*batch, 3))}
+        check_shapes({f"The {part} of the {name}": shape for part, shape in shapes.items()})

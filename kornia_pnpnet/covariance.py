@@ -56,18 +56,19 @@ def pose_covariance(
     """
     KORNIA_CHECK_SHAPE(world_points, ["B", "N", "3"])
     batch, count = world_points.shape[:2]
+    rotation, translation = pose
     camera = camera_matrices(intrinsics)
     shapes: dict[str, tuple[Tensor | None, tuple[int, ...]]] = {
         "img_points": (img_points, (batch, count, 2)),
         "intrinsics": (camera, (3, 3) if camera.ndim == 2 else (batch, 3, 3)),
-        "rotation of the pose": (pose.rotation, (batch, 3, 3)),
-        "translation of the pose": (pose.translation, (batch, 3)),
+        "rotation of the pose": (rotation, (batch, 3, 3)),
+        "translation of the pose": (translation, (batch, 3)),
         "weights": (weights, (batch, count)),
     }
     for name, sigma in (("img_sigma", img_sigma), ("world_sigma", world_sigma)):
         if isinstance(sigma, Tensor) and sigma.ndim > 0:
             shapes[name] = (sigma, (batch,) if sigma.ndim == 1 else (batch, count))
-    check_shapes(shapes, f" to go with world_points of {tuple(world_points.shape)}")
+    check_shapes(shapes, world_points)
     dtype = world_points.dtype
     with torch.no_grad():
         world, pixels, camera = (x.double() for x in (world_points, img_points, camera))
@@ -80,7 +81,7 @@ def pose_covariance(
         # About the centroid and in units of the spread, where turns and shifts are well apart.
         mean = world.mean(1, keepdim=True)
         size = (world - mean).square().sum(-1).mean(1).sqrt().clamp(min=torch.finfo(torch.float64).tiny)[:, None]
-        rotation, translation = (x.double() for x in pose)
+        rotation, translation = rotation.double(), translation.double()
         turned = (rotation @ mean.mT)[..., 0]
         moved = Pose(rotation, (translation + turned) / size)
         there = torch.ones_like(img) if weights is None else weights.double()

@@ -8,9 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from kornia_pnpnet.checks import check_numbers, check_positive, check_whole
+from kornia_pnpnet.checks import check_numbers, check_poses, check_positive, check_whole
 from kornia_pnpnet.geometry import transform
-from kornia_pnpnet.metrics import check_poses
 from kornia_pnpnet.types import Guess, Noise, PnPResult, Pose, Problems
 
 __all__ = ["LossTerms", "PoseLoss", "SetLoss", "pose_distances"]
@@ -127,7 +126,7 @@ class PoseLoss(nn.Module):
             0.0, rotation=rotation, translation=translation, init_translation=init_translation, refined=refined
         )
         if saturation is not None:
-            check_positive(saturation=saturation)
+            check_positive(saturation=saturation, or_infinite=True)
         self.rotation = rotation
         self.translation = translation
         self.init_translation = init_translation
@@ -199,7 +198,8 @@ class SetLoss(nn.Module):
         check_whole(1, starts=starts)
         check_numbers(0.0, 1.0, every=every)
         check_numbers(0.0, refined=refined, weights=weights, noise=noise)
-        check_positive(saturation=saturation, rotation_unit=rotation_unit, translation_unit=translation_unit)
+        check_positive(saturation=saturation, or_infinite=True)
+        check_positive(rotation_unit=rotation_unit, translation_unit=translation_unit)
         self.starts = starts
         self.every = every
         self.refined = refined

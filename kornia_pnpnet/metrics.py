@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_pnpnet.checks import check_shapes, check_whole
+from kornia_pnpnet.checks import check_poses, check_whole
 from kornia_pnpnet.geometry import rotation_angle
 from kornia_pnpnet.types import Pose
 
@@ -72,7 +72,7 @@ def reliability(chances: Tensor, outcomes: Tensor, ranges: int = 10) -> Reliabil
         calibration of modern neural networks", ICML 2017, for the chance of one outcome.
 
     Raises:
-        ValueError: when the shapes differ, there is nothing, or a chance is not between 0 and 1.
+        ValueError: when the shapes differ, or there is nothing.
         BaseError: for less than one range.
 
     Example:
@@ -85,21 +85,11 @@ def reliability(chances: Tensor, outcomes: Tensor, ranges: int = 10) -> Reliabil
         raise ValueError(f"reliability needs as many chances as outcomes, at least one, got {shapes}.")
     check_whole(1, ranges=ranges)
     chance, outcome = (x.detach().flatten().to(torch.float64) for x in (chances, outcomes))
-    if not ((chance >= 0) & (chance <= 1)).all():
-        raise ValueError("Chances are between 0 and 1, and some of these are not.")
     place = (chance * ranges).long().clamp(0, ranges - 1)
     count, predicted, observed = (
         chance.new_zeros(ranges).index_add(0, place, x) for x in (torch.ones_like(chance), chance, outcome)
     )
     return Reliability(count, predicted / count, observed / count)
-
-
-def check_poses(estimate: Pose, truth: Pose) -> None:
-    """Check that both are batches of as many poses: broadcasting would compare what does not belong together."""
-    batch = tuple(estimate.translation.shape[:1]) or (1,)
-    for name, pose in (("estimate", estimate), ("truth", truth)):
-        shapes = {"rotation": (pose.rotation, (*batch, 3, 3)), "translation": (pose.translation, (*batch, 3))}
-        check_shapes({f"The {part} of the {name}": shape for part, shape in shapes.items()})
 
 
 def pose_errors(estimate: Pose, truth: Pose) -> PoseErrors:

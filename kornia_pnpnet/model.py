@@ -72,7 +72,7 @@ def check_inputs(
         "init rotation": (rotation, (batch, 3, 3)),
         "init translation": (translation, (batch, 3)),
     }
-    check_shapes(shapes, f" to go with world_points of {tuple(world_points.shape)}")
+    check_shapes(shapes, world_points)
     if count < 3:
         raise ShapeError(f"A pose needs at least 3 pairs, got N = {count}.", actual_shape=tuple(world_points.shape))
     floats = {"img_points": img_points, "intrinsics": intrinsics, "weights": weights}

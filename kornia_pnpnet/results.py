@@ -19,17 +19,19 @@ from kornia_pnpnet.metrics import PoseErrors, SuccessRate
 __all__ = ["FORMAT", "format_table", "load_results", "resume", "row_errors", "save_results", "source_digest"]
 
 FORMAT = 1
-# What a file of each kind has; a file that names no kind is an evaluation.
-_PARTS = {"evaluation": {"environment", "solvers", "data", "rows"}, "complexity": {"n", "counts", "ransac"}}
 _SHOWN_DIFFERENCES = 3
 
 
 def _is_number(value: Any) -> bool:
-    return type(value) in (int, float) and 0 <= value < math.inf
+    return type(value) in (int, float) and -math.inf < value < math.inf
+
+
+def _is_number_or_none(value: Any) -> bool:
+    return value is None or _is_number(value)
 
 
 def _is_share(value: Any) -> bool:
-    return _is_number(value) and value <= 1
+    return _is_number(value) and 0 <= value <= 1
 
 
 def _is_count(value: Any) -> bool:
@@ -40,10 +42,6 @@ def _is_text(value: Any) -> bool:
     return isinstance(value, str)
 
 
-def _is_outliers(value: Any) -> bool:
-    return _is_text(value) or _is_count(value)
-
-
 def _is_text_or_none(value: Any) -> bool:
     return value is None or _is_text(value)
 
@@ -52,8 +50,8 @@ def _is_mapping_or_none(value: Any) -> bool:
     return value is None or isinstance(value, Mapping)
 
 
-# What readers ask of an evaluation: a check of a value, or what is under each key (`*` is any other, `?` ends one that
-# may be missing), or of what a list is.
+# What readers ask of a file: a check of a value; of a list, what all of it is; of a mapping, what is under each key
+# (`*` is any, `?` ends one that may be missing).
 _QUARTILES = {"q25": _is_number, "median": _is_number, "q75": _is_number}
 _ROW = {
     "data": _is_text,
@@ -66,18 +64,20 @@ _ROW = {
     "per_problem?": {"rotation_error_deg": [_is_number], "translation_error": [_is_number], "ok": [_is_share]},
 }
 _SET = {
-    "description?": {"source?": _is_text, "outliers?": _is_outliers},
-    "count": _is_count,
+    "description?": _is_mapping_or_none,
     "n": _is_count,
     "max_rotation_deg": _is_number,
     "max_translation": _is_number,
     "unit": _is_text,
 }
-_EVALUATION = {
-    "environment": {"versions?": {"*": _is_text_or_none}, "commit?": _is_text_or_none},
-    "solvers": {"*": {"config?": _is_mapping_or_none}},
-    "data": {"*": _SET},
-    "rows": [_ROW],
+_FORMS: dict[str, Any] = {
+    "evaluation": {
+        "environment": {"versions?": {"*": _is_text_or_none}, "commit?": _is_text_or_none},
+        "solvers": {"*": {"config?": _is_mapping_or_none}},
+        "data": {"*": _SET},
+        "rows": [_ROW],
+    },
+    "complexity": {"n": [_is_count], "counts": {"*": [_is_number_or_none]}, "ransac": [_is_text]},
 }
 
 
@@ -89,23 +89,24 @@ def _misfits(value: Any, form: Any, name: str = "") -> Iterator[str]:
     elif isinstance(form, list):
         if not isinstance(value, list):
             yield name
-        else:
+        elif not (callable(form[0]) and all(map(form[0], value))):
             for i, entry in enumerate(value):
                 yield from _misfits(entry, form[0], f"{name}[{i}]")
     elif not isinstance(value, Mapping):
         yield name
     else:
         for key, inner in form.items():
-            wanted = value if key == "*" else [key.removesuffix("?")]
-            for one in wanted:
+            for one in value if key == "*" else [key.removesuffix("?")]:
+                below = f"{name}.{one}" if name else one
                 if one in value:
-                    yield from _misfits(value[one], inner, f"{name}.{one}" if name else one)
+                    yield from _misfits(value[one], inner, below)
                 elif not key.endswith("?"):
-                    yield f"{name}.{one}" if name else one
+                    yield below
 
 
 def _unknown_names(results: Mapping[str, Any]) -> Iterator[str]:
-    for i, row in enumerate(results["rows"]):
+    """Places of names in rows that no entry has."""
+    for i, row in enumerate(results.get("rows", ())):
         for key, names in (("data", "data"), ("solver", "solvers")):
             if row[key] not in results[names]:
                 yield f"rows[{i}].{key}"
@@ -160,13 +161,13 @@ def load_results(path: str | Path, *, complexity: bool = False) -> dict[str, Any
         raise ValueError(f"'{path}' is not a results file: {error}") from error
     if not isinstance(results, dict) or results.get("format") != FORMAT:
         raise ValueError(f"'{path}' is not a results file of format {FORMAT}.")
-    kinds = tuple(_PARTS) if complexity else ("evaluation",)
+    kinds = tuple(_FORMS) if complexity else ("evaluation",)
     kind = results.get("kind", "evaluation")
-    if kind not in kinds or not results.keys() >= _PARTS[kind]:
+    if kind not in kinds:
         raise ValueError(f"'{path}' is not a results file of {' or '.join(kinds)}.")
-    if kind == "evaluation":
-        for wrong in itertools.chain(_misfits(results, _EVALUATION), _unknown_names(results)):
-            raise ValueError(f"'{path}' is not a results file: {wrong} is missing or not what it has to be.")
+    wrong = next(itertools.chain(_misfits(results, _FORMS[kind]), _unknown_names(results)), None)
+    if wrong is not None:
+        raise ValueError(f"'{path}' is not a results file of {kind}: {wrong} is missing or not what it has to be.")
     return results
 
 

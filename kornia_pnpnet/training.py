@@ -63,7 +63,7 @@ class TrainSettings:
         lr_refine: that of the refiner's few hyperparameters, which have far to go.
         warmup: updates over which the learning rate rises linearly.
         final_lr: share of the learning rate that is left at the end of the cosine; 1 keeps it constant.
-        clip: largest norm of the gradient.
+        clip: largest norm of the gradient; infinite does not clip.
         ramp: shares of the run at which the refined terms of the loss begin to count and count in full.
         max_skipped: the run stops when more steps than this had to be skipped.
         log_every: updates between rows of the history.
@@ -93,9 +93,9 @@ class TrainSettings:
         check_whole(1, **{name: given[name] for name in ("log_every", "validate_every", "checkpoint_every")})
         check_whole(0, **{name: given[name] for name in ("updates", "warmup", "max_skipped")})
         check_numbers(0.0, lr=self.lr, lr_refine=self.lr_refine)
-        check_positive(clip=self.clip)
+        check_positive(clip=self.clip, or_infinite=True)
         check_numbers(0.0, 1.0, final_lr=self.final_lr)
-        rises = len(self.ramp) == 2 and 0.0 <= self.ramp[0] <= self.ramp[1]
+        rises = len(self.ramp) == 2 and 0.0 <= self.ramp[0] <= self.ramp[1] < math.inf
         KORNIA_CHECK(rises, f"ramp must be two shares that do not fall, got {self.ramp}.")
 
     def lr_factor(self, update: int) -> float:

@@ -74,7 +74,9 @@ def test_what_is_wrong_in_a_file_is_named(results, place, value, tmp_path):
     reduce(getitem, inner, results)[last] = value
     save_results(results, path)
     named = place.replace(".0", "[0]").replace(".", r"\.").replace("[", r"\[").replace("]", r"\]")
-    with pytest.raises(ValueError, match=rf"results\.json' is not a results file: {named} is missing or not"):
+    with pytest.raises(
+        ValueError, match=rf"results\.json' is not a results file of evaluation: {named} is missing or not"
+    ):
         load_results(path)
 
 

@@ -30,7 +30,7 @@ from torch.nn import functional
 
 from kornia_pnpnet import PnPResult, Pose, create_solver
 from kornia_pnpnet.environment import environment
-from kornia_pnpnet.figures.style import BLUE, GREEN, ORANGE, VERMILION, make_figure, save, tidy
+from kornia_pnpnet.figures.style import BLUE, ORANGE, VERMILION, make_figure, save, tidy
 from kornia_pnpnet.geometry import rotation_angle
 from kornia_pnpnet.results import save_results
 
@@ -186,7 +186,7 @@ def train(
     """Go on with the keypoint loss, and with a solver that of the pose; returns curves.
 
     On request the hidden keypoints have labels, too; or the network learns how far off it is from its labels, by the
-    likelihood of normal noise, which leaves the keypoints alone.
+    likelihood of normal noise, which moves keypoints only through what says how far off they are.
     """
     log: list[list[float]] = []
     optimizer = torch.optim.AdamW(network.parameters(), lr=2e-3, weight_decay=1e-4)
@@ -261,25 +261,33 @@ def run(seed: int, updates: int, batches: int) -> tuple[dict[str, Any], dict[str
         distances = ", ".join(f"{key} {found[name][key]:.4f}" for key in ("mean_distance", "median_distance"))
         print(f"seed {seed}, {name}: {distances}", flush=True)
     found[UNTOLD] = test(networks[END], solver, told=False, batches=batches)
-    return found, networks
+    return found, {name: networks[name] for name in (ALONE, END)}
 
 
 def plot_errors(results: dict[str, Any], path: Path) -> None:
     """The errors of each seed, and their means."""
     figure = make_figure(8.0, 3.4)
-    names = {ALONE: ORANGE, FULL: VERMILION, UNTOLD: GREEN, END: BLUE}
+    looks = {
+        ALONE: ("labels of what is seen", ORANGE),
+        LIKELY: ("... and how far off, by likelihood", ORANGE),
+        FULL: ("labels of hidden ones, too", VERMILION),
+        FULL_LIKELY: ("... and how far off, by likelihood", VERMILION),
+        UNTOLD: ("end to end, how far off not told", BLUE),
+        END: ("end to end", BLUE),
+    }
     parts = (("mean_distance", "mean distance of keypoints"), ("mean_rotation_deg", "mean rotation error (°)"))
-    for axes, (key, label) in zip(figure.subplots(1, 2), parts, strict=True):
-        for x, (name, colour) in enumerate(names.items()):
+    for axes, (key, label) in zip(figure.subplots(1, 2, sharey=True), parts, strict=True):
+        best = results["times_lower"]
+        for y, (name, (_, colour)) in enumerate(looks.items()):
             values = [found[name][key] for found in results["seeds"].values()]
-            axes.bar(x, sum(values) / len(values), color=colour, alpha=0.4, width=0.6)
-            axes.plot([x] * len(values), values, "o", color=colour)
-        labels = ("keypoint loss\nalone", "alone, hidden\nlabelled", "end to end,\nσ not told", "end to end")
-        axes.set_xticks(range(4), labels, fontsize=7)
-        axes.set_ylabel(label)
-        times = (f"{results['times_lower'][name][key]:.2f}" for name in (ALONE, FULL))
-        axes.set_title("{} and {} times lower".format(*times), loc="left", fontsize=9)
-        tidy(axes)
+            axes.barh(y, sum(values) / len(values), color=colour, alpha=0.4, height=0.6)
+            axes.plot(values, [y] * len(values), "o", color=colour, markersize=4.0)
+            if name in best:
+                axes.annotate(f"× {best[name][key]:.2f}", (0.02, y), xycoords=("axes fraction", "data"), va="center")
+        axes.set_xlabel(label)
+        tidy(axes, "x")
+    axes.set_yticks(range(len(looks)), [text for text, _ in looks.values()])
+    axes.invert_yaxis()
     save(figure, path)
 
 

@@ -62,10 +62,19 @@ def _log_uniform(shape: Sequence[int], low: float, high: float, generator: torch
     return uniform(shape, math.log(low), math.log(high), generator).exp_()
 
 
+def _sigma(name: str, value: Any) -> float | tuple[float, float]:
+    """One standard deviation, or the smallest and the largest, checked."""
+    if hasattr(value, "__len__"):
+        check_ranges(**{name: value})
+        return float(value[0]), float(value[1])
+    check_numbers(0.0, **{name: value})
+    return float(value)
+
+
 def _noise(shape: Sequence[int], sigma: float | Sequence[float], generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Normal noise, (B, N, ...), of one standard deviation or of one from a range for each problem, and these, (B,)."""
     noise = _normal(shape, generator)
-    if isinstance(sigma, int | float):
+    if isinstance(sigma, float):
         return noise.mul_(sigma), noise.new_full((shape[0],), sigma)
     low, high = sigma
     sigmas = _log_uniform((shape[0], *(1,) * (len(shape) - 1)), low, high, generator)
@@ -164,8 +173,10 @@ class SlabPoints:
         thickness: tuple[float, float] = (0.02, 4.0),
     ) -> None:
         check_ranges(window=window, distance=distance, thickness=thickness)
-        check_numbers(window[1], field_of_view=field_of_view)
-        check_numbers(0.0, tilt=tilt)
+        check_numbers(0.0, field_of_view=field_of_view, tilt=tilt)
+        KORNIA_CHECK(
+            window[1] <= field_of_view, f"The window {window} must fit into the field of view, got {field_of_view}."
+        )
         self.window = window
         self.field_of_view = field_of_view
         self.distance = distance
@@ -298,11 +309,6 @@ class SyntheticProblems:
         check_numbers(0.0, 1.0, told=told)
         if translation_sigma is not None:
             check_numbers(0.0, translation_sigma=translation_sigma)
-        for name, sigma in (("img_sigma", img_sigma), ("world_sigma", world_sigma)):
-            if isinstance(sigma, int | float):
-                check_numbers(0.0, **{name: sigma})
-            else:
-                check_ranges(**{name: sigma})
         self.n = n
         self.batch_size = batch_size
         self.seed = seed
@@ -313,8 +319,8 @@ class SyntheticProblems:
         self.max_angle = max_angle
         self.focal = focal
         self.half_image = half_image
-        self.img_sigma = img_sigma
-        self.world_sigma = world_sigma
+        self.img_sigma = _sigma("img_sigma", img_sigma)
+        self.world_sigma = _sigma("world_sigma", world_sigma)
         self.told = told
         self.dtype = dtype
         self.device = torch.device(device)

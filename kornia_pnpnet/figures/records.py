@@ -22,6 +22,7 @@ __all__ = [
     "outliers_in_words",
     "outliers_in_order",
     "pooled",
+    "read_column",
     "read_rows",
     "records",
     "success_limit",
@@ -75,19 +76,8 @@ class Record(NamedTuple):
         return without_m(self.solver) != self.solver
 
 
-def read_rows(path: str | Path, columns: Mapping[str, Callable[[str], Any]]) -> list[dict[str, str]]:
-    """Read a CSV file of numbers.
-
-    Args:
-        path: the file.
-        columns: those that must be there, and what reads their values; the others are taken as they are.
-
-    Returns:
-        Its rows, at least one, every value a text.
-
-    Raises:
-        ValueError: when it is no such file.
-    """
+def read_rows(path: str | Path) -> list[dict[str, str]]:
+    """The rows of a CSV file with a header, at least one; raises ValueError when it is no such file."""
     try:
         with Path(path).open(newline="") as file:
             rows = list(csv.DictReader(file))
@@ -95,17 +85,43 @@ def read_rows(path: str | Path, columns: Mapping[str, Callable[[str], Any]]) -> 
         raise ValueError(f"'{path}' is not a CSV file: {error}") from error
     if not rows:
         raise ValueError(f"'{path}' has no rows to draw.")
-    for column, read in columns.items():
-        if column not in rows[0]:
-            raise ValueError(f"'{path}' has no column '{column}'.")
-        for number, row in enumerate(rows, 1):
-            try:
-                right = math.isfinite(read(row[column]))
-            except (TypeError, ValueError):
-                right = False
-            if not right:
-                raise ValueError(f"'{path}': '{column}' of row {number} is {row[column]!r}.")
     return rows
+
+
+def read_column(
+    path: str | Path,
+    rows: Sequence[Mapping[str, str]],
+    column: str,
+    read: Callable[[str], float],
+    *,
+    gaps: bool = False,
+) -> list[float]:
+    """The numbers of a column.
+
+    Args:
+        path: the file, for errors.
+        rows: of :func:`read_rows`.
+        column: its name.
+        read: makes a number of a cell.
+        gaps: whether cells may be empty or not finite; they are NaN then.
+
+    Raises:
+        ValueError: when there is no such column, or a cell is no number.
+    """
+    if column not in rows[0]:
+        raise ValueError(f"'{path}' has no column '{column}'.")
+    values = []
+    for number, row in enumerate(rows, 1):
+        try:
+            value = math.nan if gaps and not row[column] else read(row[column])
+        except (TypeError, ValueError, OverflowError) as error:
+            raise ValueError(f"'{path}': '{column}' of row {number} is {row[column]!r}.") from error
+        if not -math.inf < value < math.inf:
+            if not gaps:
+                raise ValueError(f"'{path}': '{column}' of row {number} is {row[column]!r}.")
+            value = math.nan
+        values.append(value)
+    return values
 
 
 def records(results: Iterable[Mapping[str, Any]]) -> list[Record]:
@@ -123,8 +139,8 @@ def records(results: Iterable[Mapping[str, Any]]) -> list[Record]:
     for result in results:
         for row in result.get("rows", ()):
             data = result["data"][row["data"]]
-            description = data.get("description", {})
-            if not {"source", "outliers"} <= description.keys():
+            description = data.get("description") or {}
+            if not (isinstance(description.get("source"), str) and isinstance(description.get("outliers"), int | str)):
                 continue
             outliers = 0 if description["outliers"] == "none" else description["outliers"]
             record = Record(

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 
 from kornia_pnpnet.figures import style
 from kornia_pnpnet.figures.lines import Curve, draw_rates, few_ticks, list_curves, make_panels
-from kornia_pnpnet.figures.records import read_rows
+from kornia_pnpnet.figures.records import read_column, read_rows
 from kornia_pnpnet.figures.style import GREY, SMALL, SolverStyle
 
 __all__ = ["mix_in_words", "plot_sweep"]
@@ -132,7 +132,9 @@ def _draw_times(axes: Axes, times: Mapping[int, float], slowest: float) -> None:
 
 
 def _read(path: str | Path) -> list[_Run]:
-    runs = [_Run(*(read(row[column]) for column, read in _COLUMNS.items())) for row in read_rows(path, _COLUMNS)]
+    rows = read_rows(path)
+    columns = [read_column(path, rows, name, read) for name, read in _COLUMNS.items()]
+    runs = [_Run(*values) for values in zip(*columns, strict=True)]
     if len({run[:3] for run in runs}) < len(runs):
         raise ValueError(f"'{path}' has several runs with the same n, m and mix of wrong pairs.")
     return runs

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from kornia_pnpnet.figures.records import read_rows
+from kornia_pnpnet.figures.records import read_column, read_rows
 from kornia_pnpnet.figures.style import BLUE, GREEN, ORANGE, PURPLE, SKY, SMALL, TITLE, WIDTH, make_figure, save, tidy
 
 __all__ = ["plot_training"]
@@ -26,19 +26,14 @@ def plot_training(path: str | Path, history_csv: str | Path) -> Path:
         The path.
 
     Raises:
-        ValueError: when a column is missing or there are no rows.
+        ValueError: when a column is missing, a cell is no number, or there are no rows.
     """
-    rows = read_rows(history_csv, {"update": float})
+    rows = read_rows(history_csv)
+    steps = read_column(history_csv, rows, "update", float)
 
     def curve(column: str) -> tuple[list[float], list[float]]:
-        filled = [row for row in rows if row.get(column)]
-        if column not in rows[0]:
-            raise ValueError(f"'{history_csv}' has no column '{column}'.")
-        try:
-            pairs = [(float(row["update"]), float(row[column])) for row in filled]
-        except ValueError as error:
-            raise ValueError(f"'{history_csv}': '{column}' is no number: {error}") from error
-        pairs = [pair for pair in pairs if math.isfinite(pair[1])]
+        values = read_column(history_csv, rows, column, float, gaps=True)
+        pairs = [pair for pair in zip(steps, values, strict=True) if not math.isnan(pair[1])]
         return [x for x, _ in pairs], [y for _, y in pairs]
 
     figure = make_figure(WIDTH, 5.4)
@@ -49,7 +44,8 @@ def plot_training(path: str | Path, history_csv: str | Path) -> Path:
         axes.plot(*curve(f"refined_{kind}"), color=BLUE, linewidth=1.7, label="after the refinement")
         axes.set(yscale="log", xlabel="update")
         axes.legend(frameon=False, fontsize=SMALL)
-    for index, column in enumerate(name for name in rows[0] if name.startswith("val/") and name.endswith("/success")):
+    validated = [name for name in rows[0] if name and name.startswith("val/") and name.endswith("/success")]
+    for index, column in enumerate(validated):
         colour, dash = _COLOURS[index % len(_COLOURS)], ("-", "--", ":")[index // len(_COLOURS) % 3]
         updates, rates = curve(column)
         label = column.removeprefix("val/").removesuffix("/success")
