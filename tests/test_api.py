@@ -38,12 +38,18 @@ def signature(value):
     return re.sub(r"<(function|object) ([\w.<>]+)( at 0x[0-9a-f]+)?>", r"<\2>", text)
 
 
+def reference_modules():
+    """Names of the modules that have a place in the reference."""
+    text = "\n".join(page.read_text() for page in PAGES.glob("*.md"))
+    return sorted(set(re.findall(r"automodule:: ([\w.]+)", text)))
+
+
 def interface():
     """All that the reference lists."""
     lines = ["# kornia_pnpnet " + re.sub(r"\.\d+$", "", importlib.import_module("kornia_pnpnet").__version__)]
-    modules = {x for page in PAGES.glob("*.md") for x in re.findall(r"automodule:: ([\w.]+)", page.read_text())}
-    homes = {name: module for module in sorted(modules) for name in importlib.import_module(module).__all__}
-    for module in ("kornia_pnpnet", *sorted(modules)):
+    modules = reference_modules()
+    homes = {name: module for module in modules for name in importlib.import_module(module).__all__}
+    for module in ("kornia_pnpnet", *modules):
         for name in sorted(importlib.import_module(module).__all__):
             if module == "kornia_pnpnet" and name in homes:
                 lines.append(f"{module}.{name} = {homes[name]}.{name}")

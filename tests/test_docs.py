@@ -18,6 +18,7 @@ from pathlib import Path
 from urllib.parse import unquote, urlparse
 
 import pytest
+from test_api import reference_modules
 
 import kornia_pnpnet
 
@@ -173,8 +174,7 @@ def test_pages_look_right_in_a_browser(site, tmp_path):
 def test_every_public_name_is_in_the_reference(site):
     lines = zlib.decompress((site / "objects.inv").read_bytes().split(b"\n", 4)[4]).decode().splitlines()
     documented = {line.split()[0] for line in lines}
-    text = " ".join(page.read_text() for page in (DOCS / "api").glob("*.md"))
-    modules = re.findall(r"automodule:: ([\w.]+)", text)
+    modules = reference_modules()
     wanted = [("kornia_pnpnet", name) for name in kornia_pnpnet.__all__]
     wanted += [(module, name) for module in modules for name in importlib.import_module(module).__all__]
     missing = {x for x in wanted if not any(y.startswith(f"{x[0]}.") and y.endswith(f".{x[1]}") for y in documented)}

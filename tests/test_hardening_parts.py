@@ -17,6 +17,7 @@ import torch
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from kornia.core.exceptions import BaseError
+from test_api import reference_modules
 from test_colmap import make_scene, match_arrays, write_model
 from test_hardening import INF, NAN, batches, damage, many, numbers, run_main
 
@@ -824,20 +825,15 @@ ELSEWHERE = {
 
 
 def test_every_public_name_is_accounted_for():
-    here = Path(__file__).parent
     files = "test_hardening.py", "test_hardening_parts.py", "test_interruptions.py"
-    source = "\n".join((here / name).read_text() for name in files).partition("ELSEWHERE = {")[0]
+    source = "\n".join(Path(__file__).with_name(name).read_text() for name in files).partition("ELSEWHERE = {")[0]
     elsewhere = set(" ".join(ELSEWHERE.values()).split())
     said = set(re.findall(r"\w+", source))
     missing = set()
-    for module in {x for page in (here.parent / "docs" / "api").glob("*.md") for x in modules_of(page)}:
+    for module in reference_modules():
         for name in importlib.import_module(module).__all__:
             value = getattr(importlib.import_module(module), name)
             holds = isinstance(value, type) and (issubclass(value, tuple) or is_dataclass(value))
             if callable(value) and not holds and name not in said | elsewhere:
                 missing.add(name)
     assert not missing
-
-
-def modules_of(page):
-    return re.findall(r"automodule:: ([\w.]+)", page.read_text())

@@ -228,7 +228,7 @@ def test_kill_9_at_any_moment_loses_no_results(tmp_path, tally):
                 )
         assert {path.name for path in out.iterdir() if path.suffix != ".tmp"} == {MANIFEST, *names}
         assert all(read(out / name) == read(whole / name) for name in names)
-    assert amid > KILLS / 2
+    assert amid >= 3  # else the moments say nothing
 
 
 @pytest.fixture(scope="module")

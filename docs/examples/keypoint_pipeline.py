@@ -3,11 +3,12 @@
 A textured box is rendered under random poses, before a random background, behind occluders, blurred and noisy. A small
 network finds its 14 keypoints (Kornia's spatial softmax and expectation) and says of each by how many pixels it may be
 off; `PnPNet` makes a pose of them. First the network learns where keypoints are, from labels like those that people
-make: of the keypoints that can be seen, more than half of them hidden. Then two copies go on for as long: one with the
-keypoint loss alone, the other with that of the pose, too, whose gradient comes through the solver and teaches it how
-far off each keypoint may be. Both are tested with the same solver, which only the second tells how far off, on images
-that neither saw; so are the second without telling, and one that learned as long from labels of all keypoints, as a
-known pose can make them. Writes `keypoint_pipeline.json` and pictures beside this file.
+make: of the keypoints that can be seen, more than half of them hidden. Then copies go on for as long: with the keypoint
+loss alone; with the likelihood of the labels, too, which teaches how far off a keypoint may be without a pose; and end
+to end, with the loss of the pose, whose gradient comes through the solver. Two more learn from labels of all keypoints,
+as only a known pose can make them. All are tested with the same solver on images that none saw; it is told how far off
+keypoints may be where a network has learned it, and once not told what the last one says. Writes
+`keypoint_pipeline.json` and pictures beside this file.
 """
 
 from __future__ import annotations
