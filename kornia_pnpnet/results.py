@@ -120,7 +120,12 @@ def row_errors(row: Mapping[str, Any]) -> tuple[PoseErrors, Tensor]:
 
     Returns:
         The errors in float64 and ok as bool, each of shape :math:`(B,)`.
+
+    Raises:
+        ValueError: when the row does not have them, as those in the repository do not.
     """
+    if "per_problem" not in row:
+        raise ValueError(f"The results of '{row['solver']}' on '{row['data']}' are without those of each problem.")
     errors = row["per_problem"]
     parts = (torch.tensor(errors[name], dtype=torch.float64) for name in PoseErrors._fields)
     return PoseErrors(*parts), torch.tensor(errors["ok"], dtype=torch.bool)
