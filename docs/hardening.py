@@ -54,7 +54,8 @@ def measure() -> None:
     """Run the tests and count."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "tally"
-        command = [sys.executable, "-m", "pytest", "-q", "-n", "2", "-m", "", *(str(HERE.parent / "tests" / x) for x in TESTS)]
+        tests = [str(HERE.parent / "tests" / name) for name in TESTS]
+        command = [sys.executable, "-m", "pytest", "-q", "-n", "2", "-m", "", *tests]
         subprocess.run(
             command, check=True, cwd=HERE.parent, env={**os.environ, "PNPNET_TALLY": str(path), "PNPNET_EXAMPLES": "10"}
         )
