@@ -43,7 +43,7 @@ PARTS = {
         "Options",
         "Up to two sound values are replaced: by numbers of any size, none, infinite, negative, or by any text. What\n"
         "can be made has to work, to finite results; the rest is refused with an error that says so.",
-        "What, and what came of it | Cases",
+        "What | Works | Refused",
     ),
     "files": ("Files and arguments", "", "What, and what has to come of it | Cases"),
     "processes": ("Dying processes and full disks", "", "What, and what has to come of it | Cases"),
@@ -80,8 +80,14 @@ def page(results: dict[str, Any]) -> str:
         "`docs/hardening.py` from `results/hardening.json`.",
     ]
     for part, (heading, text, head) in PARTS.items():
-        lines += ["", f"## {heading}", ""] + ([text, ""] if text else []) + [f"| {head} |", "|---|---|"]
-        lines += [f"| {what} | {count} |" for what, count in sorted(counts[part].items())]
+        lines += ["", f"## {heading}", ""] + ([text, ""] if text else []) + [f"| {head} |"]
+        rows = sorted(counts[part].items())
+        if part == "options":  # both outcomes of what was made in one row
+            found = dict.fromkeys(what.rpartition(": ")[0] for what, _ in rows)
+            rows = [
+                (what, " | ".join(str(counts[part][f"{what}: {x}"]) for x in ("works", "refused"))) for what in found
+            ]
+        lines += ["|" + head.count("|") * "---|" + "---|", *(f"| {what} | {count} |" for what, count in rows)]
     made = results["environment"]
     lines += ["", f"Commit {made['commit']}, {made['cpu']}, torch {made['versions']['torch']}."]
     return "\n".join(lines) + "\n"
