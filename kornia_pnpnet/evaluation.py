@@ -154,6 +154,15 @@ def evaluate(
     Raises:
         ValueError: when ``path`` is not a results file, or one that this evaluation cannot continue.
         OSError: when ``path`` cannot be written.
+
+    Example:
+        >>> from kornia_pnpnet import create_solver
+        >>> from kornia_pnpnet.data import SyntheticProblems
+        >>> data = {"synthetic": EvaluationData(SyntheticProblems(n=9, batch_size=100, seed=0).batch(0))}
+        >>> results = evaluate({"mine": create_solver("epnp-lm")}, data, repeats=1)
+        >>> row = results["rows"][0]
+        >>> row["success"]["total"], row["success"]["rate"] > 0.5
+        (100, True)
     """
     from tqdm import tqdm
 

@@ -86,6 +86,11 @@ def transform(pose: Pose, world_points: Tensor) -> Tensor:
 
     Returns:
         :math:`R x + t`, shape :math:`(B, N, 3)`.
+
+    Example:
+        >>> pose = Pose(torch.eye(3)[None], torch.tensor([[0.0, 0.0, 5.0]]))
+        >>> transform(pose, torch.tensor([[[1.0, 2.0, 3.0]]]))
+        tensor([[[1., 2., 8.]]])
     """
     return world_points @ pose.rotation.mT + pose.translation[:, None]
 
@@ -303,6 +308,11 @@ def rotation_angle(rotation_a: Tensor, rotation_b: Tensor) -> Tensor:
 
     Returns:
         The angle in radians, in [0, π], shape :math:`(*)`.
+
+    Example:
+        >>> quarter = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        >>> torch.rad2deg(rotation_angle(quarter, torch.eye(3)))
+        tensor(90.)
     """
     diff = rotation_a @ rotation_b.mT
     sine = 0.5 * So3.vee(diff - diff.mT).norm(dim=-1)

@@ -125,7 +125,11 @@ def success(errors: PoseErrors, max_rotation_deg: float = 1.0, max_translation: 
         max_translation: limit of the translation error in the unit of the world, a number or :math:`(B,)`.
 
     Returns:
-        bool of shape :math:`(B,)`.
+        bool of shape :math:`(B,)`; a NaN is no success.
+
+    Example:
+        >>> success(PoseErrors(torch.tensor([0.5, 0.5, 2.0]), torch.tensor([0.1, 0.3, 0.1])))
+        tensor([ True, False, False])
     """
     return (errors.rotation_error_deg < max_rotation_deg) & (errors.translation_error < max_translation)
 

@@ -129,6 +129,11 @@ class BoxPoints:
 
     Raises:
         BaseError: for a box that is not in front of the camera.
+
+    Example:
+        >>> points = BoxPoints(half_width=2.0, z_near=1.0, depth=3.0)(5, 9, torch.Generator().manual_seed(0))
+        >>> points.shape, bool((points[..., 2] >= 1.0).all()), bool((points[..., :2].abs() <= 2.0).all())
+        (torch.Size([5, 9, 3]), True, True)
     """
 
     def __init__(self, *, half_width: float = 10.0, z_near: float = 10.0, depth: float = 80.0) -> None:
@@ -211,6 +216,12 @@ class ObjectPoints:
 
     Raises:
         BaseError: for a range that falls or is not positive, or a share outside [0, 1].
+
+    Example:
+        >>> problems = SyntheticProblems(n=8, batch_size=2, points=ObjectPoints(planar=1.0), world_sigma=0.0).batch(0)
+        >>> centred = problems.world_points - problems.world_points.mean(1, keepdim=True)
+        >>> torch.linalg.matrix_rank(centred, rtol=1e-4)
+        tensor([2, 2])
     """
 
     def __init__(
