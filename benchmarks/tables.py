@@ -64,17 +64,21 @@ def names(rows: Iterable[Mapping[str, Any]]) -> list[str]:
 def machine(results: Mapping[str, Mapping[str, Any]]) -> str:
     """What the numbers were made with and on."""
     made = results["throughput"]["environment"]
+    versions = ", ".join(f"{name} {version}" for name, version in made["versions"].items() if version)
+    runs = "; ".join(f"{part} {_run(results[part])}" for part in PARTS)
+    return (
+        f"{made['cpu']}, {versions}. Each part was measured for itself, with its day, commit and load average before "
+        f"and after: {runs}. Well above the number of threads, something else ran and times are not to be trusted."
+    )
+
+
+def _run(results: Mapping[str, Any]) -> str:
+    """When a part was measured, at which commit, beside what."""
+    made = results["environment"]
     known = made["commit"] or "unknown"
     commit = known[:9] + ("+ (with changes)" if known.endswith("+") else "")
-    versions = ", ".join(f"{name} {version}" for name, version in made["versions"].items() if version)
-    loads = ", ".join(
-        f"{part} {before:.1f} before and {after:.1f} after"
-        for part, (before, after) in ((part, results[part]["load_average"]) for part in PARTS)
-    )
-    return (
-        f"{made['cpu']}, {made['date'][:10]}, commit {commit}, {versions}. Load average: "
-        f"{loads}; well above the number of threads, something else ran and times are not to be trusted."
-    )
+    before, after = results["load_average"]
+    return f"{made['date'][:10]}, {commit}, {before:.1f} and {after:.1f}"
 
 
 def targets_table(results: Mapping[str, Mapping[str, Any]]) -> str:
