@@ -89,9 +89,13 @@ class TrainSettings:
         Raises:
             BaseError: for intervals below 1, negative numbers of updates, rates that are none, or a ramp that falls.
         """
-        given = asdict(self)
-        check_whole(1, **{name: given[name] for name in ("log_every", "validate_every", "checkpoint_every")})
-        check_whole(0, **{name: given[name] for name in ("updates", "warmup", "max_skipped")})
+        check_whole(
+            1,
+            log_every=self.log_every,
+            validate_every=self.validate_every,
+            checkpoint_every=self.checkpoint_every,
+        )
+        check_whole(0, updates=self.updates, warmup=self.warmup, max_skipped=self.max_skipped)
         check_numbers(0.0, lr=self.lr, lr_refine=self.lr_refine)
         check_positive(clip=self.clip, or_infinite=True)
         check_numbers(0.0, 1.0, final_lr=self.final_lr)

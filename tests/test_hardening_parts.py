@@ -417,19 +417,28 @@ def sound(problems):
     assert problems.inliers.shape == problems.world_points.shape[:2]
 
 
-@pytest.mark.parametrize("prior", POINTS)
-def test_problems_of_any_options(prior, seen):
-    made = seen(f"`SyntheticProblems` and `{prior.__name__}` with any options")
+def draw_sound_problems(made, chosen, make):
+    """Every source that can be made of what is chosen draws sound problems."""
 
     @many(80)
-    @given(SOURCE, POINTS[prior])
-    def run(chosen, where):
-        problems = made(lambda: SyntheticProblems(**{"batch_size": 4, **chosen}, points=prior(**where)).batch(0))
+    @given(chosen)
+    def run(values):
+        problems = made(lambda: make(values))
         if problems is not None:
             sound(problems)
 
     run()
     made.both()
+
+
+@pytest.mark.parametrize("prior", POINTS)
+def test_problems_of_any_options(prior, seen):
+    def make(chosen):
+        source, points = chosen
+        return SyntheticProblems(**{"batch_size": 4, **source}, points=prior(**points)).batch(0)
+
+    made = seen(f"`SyntheticProblems` and `{prior.__name__}` with any options")
+    draw_sound_problems(made, st.tuples(SOURCE, POINTS[prior]), make)
 
 
 @pytest.mark.parametrize(
@@ -441,59 +450,35 @@ def test_problems_of_any_options(prior, seen):
 )
 def test_wrong_pairs_of_any_options(name, source, seen):
     made = seen(f"`OutlierMix` with any options, in `{name}`")
-
-    @many(80)
-    @given(MIX)
-    def run(mix):
-        problems = made(lambda: source(outliers=OutlierMix(**mix)).batch(0))
-        if problems is not None:
-            sound(problems)
-
-    run()
-    made.both()
+    draw_sound_problems(made, MIX, lambda mix: source(outliers=OutlierMix(**mix)).batch(0))
 
 
 def test_scenes_of_any_options(seen):
-    made = seen("`SceneProblems` with any options")
-
-    @many(80)
-    @given(
-        options(
-            n=COUNTS,
-            batch_size=COUNTS,
-            seed=COUNTS,
-            num_spares=COUNTS,
-            translation_box=ANY,
-            max_angle=ANY,
-            recentre=BOOL,
-        )
+    chosen = options(
+        n=COUNTS,
+        batch_size=COUNTS,
+        seed=COUNTS,
+        num_spares=COUNTS,
+        translation_box=ANY,
+        max_angle=ANY,
+        recentre=BOOL,
     )
-    def run(chosen):
-        problems = made(lambda: SceneProblems(make_scene(20, 12), **{"batch_size": 4, **chosen}).batch(0))
-        if problems is not None:
-            sound(problems)
-
-    run()
-    made.both()
+    made = seen("`SceneProblems` with any options")
+    draw_sound_problems(
+        made, chosen, lambda values: SceneProblems(make_scene(20, 12), **{"batch_size": 4, **values}).batch(0)
+    )
 
 
 def test_mixtures_of_any_options(seen):
+    def make(values):
+        given_options, count = values
+        sizes = {key: value for key, value in given_options.items() if key != "shares"}
+        mixed = partial(MixedProblems, [SyntheticProblems] * count, shares=given_options.get("shares"))
+        return VaryingSize(mixed, **{"n": (5, 9), "batch_size": 6, **sizes}).batch(3)
+
+    chosen = options(n=st.lists(COUNTS, max_size=3), batch_size=COUNTS, seed=COUNTS, shares=st.lists(ANY, max_size=3))
     made = seen("`MixedProblems`, `VaryingSize` with any options")
-
-    @many(80)
-    @given(
-        options(n=st.lists(COUNTS, max_size=3), batch_size=COUNTS, seed=COUNTS, shares=st.lists(ANY, max_size=3)),
-        st.integers(0, 3) | st.just(2),
-    )
-    def run(chosen, count):
-        shares = chosen.pop("shares", None)
-        mixed = partial(MixedProblems, [SyntheticProblems] * count, shares=shares)
-        problems = made(lambda: VaryingSize(mixed, **{"n": (5, 9), "batch_size": 6, **chosen}).batch(3))
-        if problems is not None:
-            sound(problems)
-
-    run()
-    made.both()
+    draw_sound_problems(made, st.tuples(chosen, st.integers(0, 3) | st.just(2)), make)
 
 
 SAMPLING = {"threshold": ANY, "iterations": COUNTS, "confidence": ANY, "seed": COUNTS}
@@ -656,11 +641,11 @@ def test_trainings_of_any_settings(seen):
     made.both()
 
 
+# -- files ------------------------------------------------------------------------------------------------------------
+
+
 def names_the_file(error, path):
     assert str(path) in str(error)
-
-
-# -- files ------------------------------------------------------------------------------------------------------------
 
 
 def test_damaged_scenes_are_an_error_of_ours(tally, tmp_path):
