@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import sys
@@ -18,7 +17,15 @@ from kornia.core.exceptions import ValueCheckError
 from omegaconf import DictConfig, OmegaConf
 
 from kornia_pnpnet.model import PnPNet
-from kornia_pnpnet.reports import RESULTS_NAME, find_results, run_results, summarize_runs, write_json, write_model_card
+from kornia_pnpnet.reports import (
+    RESULTS_NAME,
+    find_results,
+    load_run,
+    run_results,
+    summarize_runs,
+    write_json,
+    write_model_card,
+)
 from kornia_pnpnet.runstate import TrainingError
 from kornia_pnpnet.training import describe_shares, fit
 
@@ -27,7 +34,11 @@ log = logging.getLogger("train")
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="train")
 def main(config: DictConfig) -> float | None:
-    """Train, write results and weights; returns the success rate with outliers, which a sweeper may maximise."""
+    """Train, write results and weights.
+
+    Returns:
+        The success rate on the validation set ``uniform``, else the last one, which a sweeper may maximise.
+    """
     runtime = HydraConfig.get()
     folder = Path(runtime.runtime.output_dir)
     if config.threads is not None:
@@ -36,14 +47,18 @@ def main(config: DictConfig) -> float | None:
     fabric.launch()
     torch.manual_seed(config.seed)
     model = instantiate(config.model.solver)
+    origin = None
     if config.weights is not None:
         try:
             start_from(model, PnPNet.from_pretrained(config.weights))
-        except (FileNotFoundError, RuntimeError, ValueCheckError) as error:
+            origin = find_results(config.weights)
+        except (FileNotFoundError, RuntimeError, ValueError, ValueCheckError) as error:
             sys.exit(f"Cannot start n = {config.model.n} from weights={config.weights}: {error}")
     if config.compile:
         model.compile()
     validation = {name: instantiate(source).batch(0) for name, source in config.data.validation.items()}
+    if not validation:
+        sys.exit("data.validation is empty: at least one set tells how well the solver does.")
     settings = instantiate(config.train, _convert_="all")
     processes = int(os.environ.get("WORLD_SIZE", fabric.world_size))
     if processes != fabric.world_size:
@@ -87,9 +102,8 @@ def main(config: DictConfig) -> float | None:
         sys.exit(130)
     if report.start == report.update and (folder / RESULTS_NAME).exists():
         log.info("Nothing is left to train; the results stay as they are.")
-        results = json.loads((folder / RESULTS_NAME).read_text())
+        results = load_run(folder / RESULTS_NAME)
     else:
-        origin = None if config.weights is None else find_results(config.weights)
         results = run_results(model.cpu(), validation, report, resolved, list(runtime.overrides.task), origin)
         write_json(folder / RESULTS_NAME, results)
         model.save_pretrained(folder / "weights")
@@ -100,7 +114,8 @@ def main(config: DictConfig) -> float | None:
     log.info("Weights, model card and results are in %s", folder)
     if runtime.mode == RunMode.MULTIRUN:
         log.info("Sweep summary: %s", summarize_runs(runtime.sweep.dir))
-    return float(results["validation"]["uniform"]["success"]["rate"])
+    sets = results["validation"]
+    return float(sets.get("uniform", [*sets.values()][-1])["success"]["rate"])
 
 
 def start_from(model: PnPNet, trained: PnPNet) -> None:

@@ -21,7 +21,7 @@ from kornia_pnpnet.reports import write_json
 
 HERE = Path(__file__).resolve().parent
 RESULTS, PAGE = HERE / "results" / "hardening.json", HERE / "hardening.md"
-TESTS = "test_hardening.py", "test_hardening_parts.py", "test_interruptions.py"
+TESTS = "test_hardening.py", "test_hardening_parts.py", "test_hardening_tools.py", "test_interruptions.py"
 #: Headings, and what the cases under them have in common.
 PARTS = {
     "batches": (
@@ -71,13 +71,14 @@ def page(results: dict[str, Any]) -> str:
     """The page of the results."""
     counts = results["counts"]
     total = sum(count for part, found in counts.items() if part != "problems" for count in found.values())
+    tests = ", ".join(f"`tests/{name}`" for name in TESTS)
     lines = [
         "# What it withstands",
         "",
-        f"{total} cases, all as they should be, counted by the tests themselves (`tests/test_hardening.py`,",
-        "`test_hardening_parts.py` and `test_interruptions.py`; `make test-all` runs most with fewer cases).",
-        "What of the public functions and classes they leave to other tests is listed there. Written by",
-        "`docs/hardening.py` from `results/hardening.json`.",
+        f"{total} cases, all as they should be, counted by the tests themselves ({tests};",
+        "`make test-all` runs most with fewer cases). One of them asks that every public function and class is",
+        "called by one of these, or through another one. Written by `docs/hardening.py` from",
+        "`results/hardening.json`.",
     ]
     for part, (heading, text, head) in PARTS.items():
         lines += ["", f"## {heading}", ""] + ([text, ""] if text else []) + [f"| {head} |"]

@@ -9,6 +9,7 @@ import torch
 from kornia.core.check import KORNIA_CHECK
 from torch import Tensor, nn
 
+from kornia_pnpnet.checks import check_numbers
 from kornia_pnpnet.geometry import transform
 from kornia_pnpnet.lm import RobustWeightedLM
 from kornia_pnpnet.model import PnPNet
@@ -56,7 +57,8 @@ class KnownInliers(nn.Module):
             The minimum next to the true pose.
         """
         world_points, img_points, intrinsics = problems[:3]
-        return self.least_squares(world_points, img_points, intrinsics, self.pair_weights(problems), init=problems.pose)
+        weights = self.pair_weights(problems).detach()
+        return self.least_squares(world_points, img_points, intrinsics, weights, init=problems.pose)
 
 
 class KnownInliersAndNoise(KnownInliers):
@@ -73,7 +75,7 @@ class KnownInliersAndNoise(KnownInliers):
             protocol's, for scenes it has to be known.
 
     Raises:
-        BaseError: for a negative standard deviation, or when both are 0.
+        BaseError: for a standard deviation that is negative or no number, or when both are 0.
 
     Example:
         >>> KnownInliersAndNoise(world_sigma=0.01)
@@ -84,10 +86,8 @@ class KnownInliersAndNoise(KnownInliers):
 
     def __init__(self, *, img_sigma: float = 1.0, world_sigma: float = 0.05) -> None:
         super().__init__()
-        KORNIA_CHECK(
-            min(img_sigma, world_sigma) >= 0 and img_sigma + world_sigma > 0,
-            f"img_sigma and world_sigma must be at least 0 and not both 0, got {img_sigma} and {world_sigma}.",
-        )
+        check_numbers(0.0, img_sigma=img_sigma, world_sigma=world_sigma)
+        KORNIA_CHECK(img_sigma + world_sigma > 0, "img_sigma and world_sigma must not both be 0.")
         self.config = {"img_sigma": img_sigma, "world_sigma": world_sigma}
 
     def pair_weights(self, problems: Problems) -> Tensor:

@@ -8,12 +8,21 @@ from numbers import Integral, Real
 from typing import Any
 
 from kornia.core.check import KORNIA_CHECK
-from kornia.core.exceptions import ShapeError
+from kornia.core.exceptions import DeviceError, ShapeError, TypeCheckError
 from torch import Tensor
 
 from kornia_pnpnet.types import Pose
 
-__all__ = ["check_numbers", "check_poses", "check_positive", "check_ranges", "check_shapes", "check_whole"]
+__all__ = [
+    "check_devices",
+    "check_like",
+    "check_numbers",
+    "check_poses",
+    "check_positive",
+    "check_ranges",
+    "check_shapes",
+    "check_whole",
+]
 
 
 def _is_number(value: Any) -> bool:
@@ -70,13 +79,39 @@ def check_shapes(shapes: Mapping[str, tuple[Tensor | None, tuple[int, ...]]], li
             )
 
 
+def check_like(tensors: Mapping[str, Tensor | None], like: Tensor, name: str = "world_points") -> None:
+    """Check that tensors have the dtype of another one and are where it is; ``name`` is that of the other one.
+
+    Raises:
+        TypeCheckError: when one has another dtype.
+        DeviceError: when one is on another device.
+    """
+    for this, tensor in tensors.items():
+        if tensor is not None and tensor.dtype != like.dtype:
+            raise TypeCheckError(f"{this} is {tensor.dtype} but {name} is {like.dtype}.")
+    check_devices(tensors, like, name)
+
+
+def check_devices(tensors: Mapping[str, Tensor | None], like: Tensor, name: str = "world_points") -> None:
+    """Check that tensors are where another one is; raise a ``DeviceError`` for the first that is not."""
+    for this, tensor in tensors.items():
+        if tensor is not None and tensor.device != like.device:
+            raise DeviceError(f"{this} is on {tensor.device} but {name} is on {like.device}.")
+
+
 def check_poses(estimate: Pose, truth: Pose) -> None:
     """Check that both are as many poses: broadcasting would compare what does not belong together.
 
     Raises:
         ShapeError: when the shapes are not (*, 3, 3) and (*, 3), with the same leading ones.
+        TypeCheckError: when the dtypes differ.
+        DeviceError: when the devices differ.
     """
     batch = tuple(estimate.translation.shape[:-1])
+    shapes: dict[str, tuple[Tensor | None, tuple[int, ...]]] = {}
     for name, pose in (("estimate", estimate), ("truth", truth)):
-        shapes = {"rotation": (pose.rotation, (*batch, 3, 3)), "translation": (pose.translation, (*batch, 3))}
-        check_shapes({f"The {part} of the {name}": shape for part, shape in shapes.items()})
+        shapes[f"The rotation of the {name}"] = pose.rotation, (*batch, 3, 3)
+        shapes[f"The translation of the {name}"] = pose.translation, (*batch, 3)
+    check_shapes(shapes)
+    parts = {name: tensor for name, (tensor, _) in shapes.items()}
+    check_like(parts, truth.translation, "the translation of the truth")

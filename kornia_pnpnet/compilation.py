@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from typing import Any, Generic, ParamSpec, TypeVar
 
 import torch
@@ -66,9 +67,11 @@ class Compiled(Generic[_P, _T]):
         first = next(_tensors(args))
         kind = first.shape, first.dtype, torch.is_grad_enabled()
         compiled = self._compiled[first.ndim > 1 and first.shape[1] >= _MANY]
-        try:
-            if kind in self._seen:
+        errors = torch._dynamo.exc.TorchDynamoException, torch._inductor.exc.InductorError
+        if kind in self._seen:
+            with suppress(*errors):  # of what is compiled anew, a warning may be an error here: once more, in silence
                 return compiled(*args, **kwargs)
+        try:
             for tensor in _tensors(args):
                 if tensor.ndim and tensor.shape[0] > 1:
                     torch._dynamo.maybe_mark_dynamic(tensor, 0)
@@ -77,7 +80,7 @@ class Compiled(Generic[_P, _T]):
                 result = compiled(*args, **kwargs)
             self._seen.add(kind)
             return result
-        except (torch._dynamo.exc.TorchDynamoException, torch._inductor.exc.InductorError) as error:
+        except errors as error:
             result = self.function(*args, **kwargs)  # a mistake of the caller raises here as it would anywhere
             self._failed = True
             reason = " ".join(f"{type(error).__name__}: {error}".split())

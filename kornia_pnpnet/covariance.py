@@ -7,7 +7,7 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from kornia_pnpnet.checks import check_shapes
+from kornia_pnpnet.checks import check_devices, check_shapes
 from kornia_pnpnet.geometry import normal_equations, pixel_variance, project
 from kornia_pnpnet.types import Correspondences, Noise, Pose, camera_matrices
 
@@ -47,6 +47,7 @@ def pose_covariance(
 
     Raises:
         ShapeError: for shapes that do not go together.
+        DeviceError: for tensors on different devices.
 
     Example:
         >>> from kornia_pnpnet.data import SyntheticProblems
@@ -65,10 +66,13 @@ def pose_covariance(
         "translation of the pose": (translation, (batch, 3)),
         "weights": (weights, (batch, count)),
     }
-    for name, sigma in (("img_sigma", img_sigma), ("world_sigma", world_sigma)):
-        if isinstance(sigma, Tensor) and sigma.ndim > 0:
-            shapes[name] = (sigma, (batch,) if sigma.ndim == 1 else (batch, count))
+    sigmas = {"img_sigma": img_sigma, "world_sigma": world_sigma}
+    for name, sigma in sigmas.items():
+        if isinstance(sigma, Tensor):
+            each = (batch,) if sigma.ndim == 1 else (batch, count)
+            shapes[name] = sigma, each if sigma.ndim else ()
     check_shapes(shapes, world_points)
+    check_devices({name: tensor for name, (tensor, _) in shapes.items()}, world_points)
     dtype = world_points.dtype
     with torch.no_grad():
         world, pixels, camera = (x.double() for x in (world_points, img_points, camera))
@@ -76,8 +80,8 @@ def pose_covariance(
         one = focals.new_ones(())  # rays: pixels of a camera with the focal length 1
         rays = (pixels - centre[..., None, :]) / focals[..., None, :]
         focal = focals.log().mean(-1).exp().reshape(-1, 1)  # (B or 1, 1)
-        sigmas = [torch.as_tensor(x, dtype=torch.float64, device=world.device) for x in (img_sigma, world_sigma)]
-        img, length = ((x[:, None] if x.ndim == 1 else x).expand(batch, count) for x in sigmas)
+        numbers = (torch.as_tensor(x, dtype=torch.float64, device=world.device) for x in sigmas.values())
+        img, length = ((x[:, None] if x.ndim == 1 else x).expand(batch, count) for x in numbers)
         # About the centroid and in units of the spread, where turns and shifts are well apart.
         mean = world.mean(1, keepdim=True)
         size = (world - mean).square().sum(-1).mean(1).sqrt().clamp(min=torch.finfo(torch.float64).tiny)[:, None]

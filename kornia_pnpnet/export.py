@@ -11,6 +11,7 @@ import torch
 from kornia.core.exceptions import ValueCheckError
 from torch import Tensor, nn
 
+from kornia_pnpnet.checks import check_whole
 from kornia_pnpnet.data import SyntheticProblems
 from kornia_pnpnet.files import atomic_open
 from kornia_pnpnet.init import MLPInit
@@ -52,6 +53,7 @@ def export_program(solver: PnPNet, n: int | None = None) -> torch.export.Exporte
         weights :math:`(B, N)`, 0 for padding. It returns :data:`OUTPUTS`.
 
     Raises:
+        BaseError: when ``n`` is less than 3, or not what the network takes.
         ValueCheckError: when the solver has no graph.
 
     Example:
@@ -61,6 +63,8 @@ def export_program(solver: PnPNet, n: int | None = None) -> torch.export.Exporte
         >>> dict(zip(OUTPUTS, program.module()(*inputs)))["ok"]
         tensor([False, False, False, False, False])
     """
+    if n is not None:
+        check_whole(3, n=n)
     fixed = int(solver.init.config["n"]) if isinstance(solver.init, MLPInit) else n
     if n not in (None, fixed):
         raise ValueCheckError(f"The solver's network takes {fixed} pairs, so n cannot be {n!r}.")
@@ -89,7 +93,7 @@ def export_onnx(solver: PnPNet, path: str | Path, n: int | None = None) -> Path:
         The path.
 
     Raises:
-        ValueCheckError: when the solver has no graph.
+        BaseError: as of :func:`export_program`.
         ImportError: without the extra ``onnx``.
         OSError: when the file cannot be written.
     """

@@ -54,6 +54,8 @@ def pose_distances(estimate: Pose, truth: Pose) -> tuple[Tensor, Tensor]:
 
     Raises:
         ShapeError: when the shapes are others, or differ.
+        TypeCheckError: when the dtypes differ.
+        DeviceError: when the devices differ.
 
     Example:
         >>> eye = Pose(torch.eye(3)[None], torch.zeros(1, 3))
@@ -143,7 +145,12 @@ class PoseLoss(nn.Module):
 
         Returns:
             The loss and its terms, means over the batch.
+
+        Raises:
+            BaseError: when result and truth differ in shape, dtype or device.
         """
+        for pose in (result.pose, result.init):
+            check_poses(pose, problems.pose)
         centroid = problems.world_points.mean(1)
         init_rotation, init_translation = _lengths(_at(centroid, _difference(result.init, problems.pose)))
         with torch.set_grad_enabled(torch.is_grad_enabled() and ramp > 0.0):
@@ -220,7 +227,12 @@ class SetLoss(nn.Module):
 
         Returns:
             The loss and its terms, means over the batch.
+
+        Raises:
+            BaseError: when result and truth differ in shape, dtype or device.
         """
+        for pose in (result.pose, result.init):
+            check_poses(pose, problems.pose)
         hypotheses = [x[:, None] for x in guess.pose]
         if guess.others is not None:
             hypotheses = [torch.cat(x, 1)[:, : self.starts] for x in zip(hypotheses, guess.others, strict=True)]

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_pnpnet.checks import check_poses, check_whole
+from kornia_pnpnet.checks import check_devices, check_poses, check_whole
 from kornia_pnpnet.geometry import rotation_angle
 from kornia_pnpnet.types import Pose
 
@@ -73,7 +73,7 @@ def reliability(chances: Tensor, outcomes: Tensor, ranges: int = 10) -> Reliabil
 
     Raises:
         ValueError: when the shapes differ, or there is nothing.
-        BaseError: for less than one range.
+        BaseError: for less than one range, and for tensors on different devices.
 
     Example:
         >>> found = reliability(torch.tensor([0.9, 0.9, 0.9, 0.1]), torch.tensor([True, True, False, False]), ranges=2)
@@ -84,6 +84,7 @@ def reliability(chances: Tensor, outcomes: Tensor, ranges: int = 10) -> Reliabil
         shapes = f"{tuple(chances.shape)} and {tuple(outcomes.shape)}"
         raise ValueError(f"reliability needs as many chances as outcomes, at least one, got {shapes}.")
     check_whole(1, ranges=ranges)
+    check_devices({"outcomes": outcomes}, chances, "chances")
     chance, outcome = (x.detach().flatten().to(torch.float64) for x in (chances, outcomes))
     place = (chance * ranges).long().clamp(0, ranges - 1)
     count, predicted, observed = (
@@ -104,6 +105,8 @@ def pose_errors(estimate: Pose, truth: Pose) -> PoseErrors:
 
     Raises:
         ShapeError: when the shapes are others, or differ.
+        TypeCheckError: when the dtypes differ.
+        DeviceError: when the devices differ.
 
     Example:
         >>> truth = Pose(torch.eye(3)[None], torch.zeros(1, 3))
@@ -127,10 +130,17 @@ def success(errors: PoseErrors, max_rotation_deg: float = 1.0, max_translation: 
     Returns:
         bool of shape :math:`(B,)`; a NaN is no success.
 
+    Raises:
+        DeviceError: for tensors on different devices.
+
     Example:
         >>> success(PoseErrors(torch.tensor([0.5, 0.5, 2.0]), torch.tensor([0.1, 0.3, 0.1])))
         tensor([ True, False, False])
     """
+    others = {"rotation_error_deg": errors.rotation_error_deg}
+    if isinstance(max_translation, Tensor):
+        others["max_translation"] = max_translation
+    check_devices(others, errors.translation_error, "translation_error")
     return (errors.rotation_error_deg < max_rotation_deg) & (errors.translation_error < max_translation)
 
 

@@ -6,16 +6,17 @@ import hashlib
 import json
 import math
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from kornia.core.check import KORNIA_CHECK, KORNIA_CHECK_SHAPE
-from kornia.core.exceptions import BaseError, DeviceError, ShapeError, TypeCheckError, ValueCheckError
+from kornia.core.exceptions import BaseError, ShapeError, TypeCheckError, ValueCheckError
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
-from kornia_pnpnet.checks import check_shapes
+from kornia_pnpnet.checks import check_devices, check_like, check_shapes
 from kornia_pnpnet.compilation import Compiled
 from kornia_pnpnet.files import atomic_open
 from kornia_pnpnet.geometry import project
@@ -77,18 +78,14 @@ def check_inputs(
         raise ShapeError(f"A pose needs at least 3 pairs, got N = {count}.", actual_shape=tuple(world_points.shape))
     floats = {"img_points": img_points, "intrinsics": intrinsics, "weights": weights}
     floats |= {"init rotation": rotation, "init translation": translation}
-    for name, tensor in floats.items():
-        if tensor is not None and tensor.dtype != world_points.dtype:
-            raise TypeCheckError(f"{name} is {tensor.dtype} but world_points is {world_points.dtype}.")
+    check_like(floats, world_points)
     if world_points.dtype not in (torch.float32, torch.float64):
         raise TypeCheckError(
             f"world_points must be float32 or float64, got {world_points.dtype}: cast the inputs with .float()."
         )
     if mask is not None and mask.dtype != torch.bool:
         raise TypeCheckError(f"mask must be bool, got {mask.dtype}.")
-    for name, tensor in {**floats, "mask": mask}.items():
-        if tensor is not None and tensor.device != world_points.device:
-            raise DeviceError(f"{name} is on {tensor.device} but world_points is on {world_points.device}.")
+    check_devices({"mask": mask}, world_points)
 
 
 class _Stage(NamedTuple):
@@ -193,12 +190,12 @@ class PnPNet(nn.Module):
             ShapeError: for shapes that do not fit each other, fewer than 3 pairs, or another N than the initialiser
                 was built for.
             TypeCheckError: for dtypes that differ or are not float32 or float64.
-            DeviceError: for tensors on different devices.
+            DeviceError: for tensors on different devices, or on another one than a network of the solver.
         """
         inputs = _prepared(world_points, img_points, intrinsics, weights, mask, init, img_sigma, world_sigma)
         portions = self._portions(world_points)
         parts = list(zip(*(_split(x, portions) for x in inputs), strict=True))
-        with torch.autocast(world_points.device.type, enabled=False):
+        with _in_full_precision(world_points.device.type):
             results = [self._solve(first_stage_only, *part) for part in parts]
         if len(results) == 1:
             return results[0]
@@ -249,7 +246,7 @@ class PnPNet(nn.Module):
             problem is sound.
         """
         inputs = _prepared(world_points, img_points, intrinsics, weights, mask, init, img_sigma, world_sigma)
-        with torch.autocast(world_points.device.type, enabled=False):
+        with _in_full_precision(world_points.device.type):
             stage = self._begin(1 if first_stage_only or self.refine.m == 0 else self.views, *inputs)
             end = self.refine.iterate(stage.start, 0 if first_stage_only else None)
             return self._finish(stage, end), self._whole_guess(stage)
@@ -542,6 +539,11 @@ def _prepared(
     return world_points, img_points, intrinsics, weights, mask, None if init is None else Pose(*init), noise
 
 
+def _in_full_precision(device: str) -> AbstractContextManager[Any]:
+    """Without autocast, where there is such a thing: not for tensors without values (``meta``)."""
+    return torch.autocast(device, enabled=False) if torch.amp.is_autocast_available(device) else nullcontext()
+
+
 def _split(value: Tensor | Pose | Noise | None, count: int) -> list[Any]:
     """In so many parts along the batch."""
     if count == 1 or value is None:
@@ -558,10 +560,7 @@ def _sigmas(name: str, sigma: Tensor | float | None, like: Tensor) -> Tensor:
         return like.new_full((batch, count), torch.nan if sigma is None else sigma)
     if not isinstance(sigma, Tensor):
         raise TypeCheckError(f"{name} must be a number or a tensor, got {type(sigma).__name__}.")
-    if sigma.dtype != like.dtype:
-        raise TypeCheckError(f"{name} is {sigma.dtype} but world_points is {like.dtype}.")
-    if sigma.device != like.device:
-        raise DeviceError(f"{name} is on {sigma.device} but world_points is on {like.device}.")
+    check_like({name: sigma}, like)
     if sigma.shape not in ((), (batch,), (batch, count)):
         raise ShapeError(
             f"{name} must be a number or have the shape {(batch,)} or {(batch, count)}, got {tuple(sigma.shape)}.",

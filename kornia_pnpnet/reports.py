@@ -6,18 +6,34 @@ import csv
 import json
 import shutil
 import time
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
+from kornia.core.exceptions import BaseError
 
+from kornia_pnpnet.checks import check_whole
 from kornia_pnpnet.data import OutlierMix
 from kornia_pnpnet.environment import environment
 from kornia_pnpnet.files import atomic_open
 from kornia_pnpnet.metrics import pose_errors, success, success_rate
 from kornia_pnpnet.model import CONFIG_NAME, WEIGHTS_NAME, PnPNet, find_weights
+from kornia_pnpnet.readers import (
+    RATE,
+    is_count,
+    is_flag,
+    is_number,
+    is_text,
+    is_text_or_none,
+    misfits,
+    read_column,
+    read_json,
+    read_rows,
+)
 from kornia_pnpnet.runstate import HISTORY_NAME
 from kornia_pnpnet.training import FitReport
 from kornia_pnpnet.types import Problems
@@ -25,6 +41,7 @@ from kornia_pnpnet.types import Problems
 __all__ = [
     "collect_weights",
     "find_results",
+    "load_run",
     "run_results",
     "summarize_runs",
     "write_json",
@@ -32,6 +49,45 @@ __all__ = [
 ]
 
 RESULTS_NAME = "results.json"
+_LEARNED = "step", "damping", "robustness"
+
+
+def _is_initialiser(value: Any) -> bool:
+    if not isinstance(value, Mapping):
+        return value is None
+    return is_text(value.get("name")) and (value["name"] != "SetInit" or not any(misfits(value, _STARTS)))
+
+
+# What readers ask of the results of a run, and of those of the run before it, see `misfits`.
+_STARTS = {"starts": is_count, "samples": is_count}
+_SET = {
+    "success": RATE,
+    "first_stage_success": RATE,
+    "median_rotation_error_deg": is_number,
+    "median_translation_error": is_number,
+}
+_BEFORE: dict[str, Any] = {
+    "overrides": [is_text],
+    "run": {"update": is_count, "skipped": is_count, "updates_per_second": is_number, "peak_memory_mib": is_number},
+    "config": {
+        "batch_size": is_count,
+        "model": {"n": is_count},
+        "data": {"train": {"_target_": is_text}, "validation": {"*": {"_target_": is_text}}},
+    },
+    "environment": {"threads": is_count, "cpu": is_text, "commit": is_text_or_none, "versions": {"torch": is_text}},
+}
+_RUN: dict[str, Any] = {
+    **_BEFORE,
+    "us_per_problem": is_number,
+    "validation": {"*": _SET},
+    "learned": {name: [is_number] for name in _LEARNED},
+    "model": {
+        "init": _is_initialiser,
+        "refine": {"m": is_count, "kernel": is_text},
+        "views": is_count,
+        "normalize": {"center": is_flag, "scale": is_flag},
+    },
+}
 # Overrides that say how a run was done, not what it found.
 _HOW_IT_RAN = ("resume", "progress", "threads", "data_workers", "compile")
 
@@ -63,7 +119,12 @@ def run_results(
 
     Returns:
         Plain data, ready for :func:`write_json`.
+
+    Raises:
+        ValueError: when there is no validation set.
     """
+    if not validation:
+        raise ValueError("The results of a run need at least one validation set, got none.")
     sets = {}
     for name, problems in validation.items():
         result = model(*problems[:3], **problems.told)
@@ -77,14 +138,13 @@ def run_results(
             "first_stage_median_rotation_error_deg": first.rotation_error_deg.median().item(),
             "first_stage_median_translation_error": first.translation_error.median().item(),
         }
-    step, damping, robustness = model.refine.hyperparameters(torch.zeros((), dtype=torch.float64))
-    learned = {"step": step.tolist(), "damping": damping.tolist(), "robustness": robustness.tolist()}
+    learned = zip(_LEARNED, model.refine.hyperparameters(torch.zeros((), dtype=torch.float64)), strict=True)
     return {
         "overrides": overrides,
         "run": asdict(report),
         "us_per_problem": _us_per_problem(model, problems),
         "validation": sets,
-        "learned": learned,
+        "learned": {name: values.tolist() for name, values in learned},
         "model": model.config(),
         "config": config,
         "environment": environment(),
@@ -103,13 +163,43 @@ def find_results(weights: str | Path) -> dict[str, Any] | None:
 
     Raises:
         FileNotFoundError: when there are no such weights.
+        ValueError: as of :func:`load_run`.
     """
     folder = find_weights(weights)
-    for path in (folder / RESULTS_NAME, folder.parent / RESULTS_NAME):
-        if path.is_file():
-            found: dict[str, Any] = json.loads(path.read_text())
-            return found
-    return None
+    paths = (folder / RESULTS_NAME, folder.parent / RESULTS_NAME)
+    return next((load_run(path) for path in paths if path.is_file()), None)
+
+
+def load_run(path: str | Path) -> dict[str, Any]:
+    """Read the results file of a run.
+
+    Args:
+        path: of the file that :func:`write_json` wrote of what :func:`run_results` returned.
+
+    Returns:
+        The results.
+
+    Raises:
+        FileNotFoundError: when there is no such file.
+        ValueError: when it is not a results file of a run.
+    """
+    results = read_json(path, "a results file of a run")
+    wrong = _wrong(results)
+    if wrong is not None:
+        raise ValueError(f"'{path}' is not a results file of a run: {wrong} is missing or not what it has to be.")
+    return cast("dict[str, Any]", results)
+
+
+def _wrong(results: Any) -> str | None:
+    """The first of what is wrong with results of a run, or with those of the runs before it."""
+    wrong = next(misfits(results, _RUN, "results"), None)
+    if wrong is None and len({len(results["learned"][name]) for name in _LEARNED}) > 1:
+        wrong = "results.learned"
+    name = "results"
+    while wrong is None and results.get("origin") is not None:
+        results, name = results["origin"], f"{name}.origin"
+        wrong = next(misfits(results, _BEFORE, name), None)
+    return wrong
 
 
 def collect_weights(runs: Sequence[str | Path], folder: str | Path, *, most_rows: int = 100) -> None:
@@ -119,22 +209,37 @@ def collect_weights(runs: Sequence[str | Path], folder: str | Path, *, most_rows
         runs: folders of ``train.py``, each of which but the first began with the weights of the one before.
         folder: where the files go; its name is that of the weights.
         most_rows: of the curves of each run that are kept, all of them with a validation.
+
+    Raises:
+        BaseError: when ``most_rows`` is less than 1, or the weights are damaged.
+        FileNotFoundError: when a file is missing.
+        ValueError: when there is no run, or a file is damaged. Nothing is written then.
     """
+    check_whole(1, most_rows=most_rows)
+    if not runs:
+        raise ValueError("collect_weights needs at least one run, got none.")
     folder = Path(folder)
     rows: list[dict[str, str]] = []
     done = 0
-    for run in map(Path, runs):
-        with (run / HISTORY_NAME).open(newline="") as file:
-            validated = [row for row in csv.DictReader(file) if any(row[key] for key in row if key.startswith("val/"))]
+    for path in (Path(run) / HISTORY_NAME for run in runs):
+        there = read_rows(path)
+        updates = map(int, read_column(path, there, "update", int))
+        validated = [
+            {**row, "update": str(done + update)}
+            for row, update in zip(there, updates, strict=True)
+            if any(value for key, value in row.items() if key is not None and key.startswith("val/"))
+        ]
+        if not validated:
+            raise ValueError(f"'{path}' has no row with a validation.")
         step = -(-len(validated) // most_rows)
-        kept = [*reversed(validated[::-1][::step])]  # the last one always
-        rows += [{**row, "update": str(done + int(row["update"]))} for row in kept]
+        rows += reversed(validated[::-1][::step])  # the last one always
         done = int(rows[-1]["update"])
     last = Path(runs[-1])
+    results = load_run(last / RESULTS_NAME)
+    PnPNet.from_pretrained(last / "weights")
     folder.mkdir(parents=True, exist_ok=True)
     for name in (CONFIG_NAME, WEIGHTS_NAME):
         shutil.copyfile(last / "weights" / name, folder / name)
-    results = json.loads((last / RESULTS_NAME).read_text())
     write_json(folder / RESULTS_NAME, results)
     write_model_card(folder, results, name=folder.name)
     with atomic_open(folder / HISTORY_NAME, newline="") as file:
@@ -161,14 +266,20 @@ def summarize_runs(folder: str | Path) -> Path | None:
         folder: the sweep's folder, with one run per sub-folder.
 
     Returns:
-        The summary's path, or ``None`` when there is no results file yet.
+        The summary's path, or ``None`` when there is no results file yet. A file that is not one of a run is left out,
+        with a warning.
     """
     folder = Path(folder)
     rows = []
     for path in sorted(folder.glob(f"**/{RESULTS_NAME}")):
-        results = json.loads(path.read_text())
-        row = {"run": str(path.parent.relative_to(folder))}
-        row |= dict(override.lstrip("+").split("=", 1) for override in results["overrides"])
+        try:
+            results = load_run(path)
+        except ValueError as error:
+            warnings.warn(f"Left out of the summary: {error}", stacklevel=2)
+            continue
+        row: dict[str, Any] = {"run": str(path.parent.relative_to(folder))}
+        overrides = (override.lstrip("+").partition("=") for override in results["overrides"])
+        row |= {key: value for key, _, value in overrides}
         row |= {key: results["run"][key] for key in ("update", "skipped", "updates_per_second", "peak_memory_mib")}
         row["us_per_problem"] = f"{results['us_per_problem']:.4g}"
         for name, entry in results["validation"].items():
@@ -189,7 +300,28 @@ def _rate(entry: Mapping[str, float]) -> str:
 
 
 def _mix(source: Mapping[str, Any], n: int) -> str:
-    """What a data source's configuration says of its wrong pairs and its points."""
+    """What a data source's configuration says of its wrong pairs and its points, or whose it is."""
+    named = list(dict.fromkeys(_targets(source)))
+    others = [name for name in named if not name.startswith("kornia_pnpnet.data.")]
+    with suppress(AttributeError, LookupError, TypeError, ValueError, BaseError):
+        if not others:
+            return _our_mix(source, n)
+    return f"problems from {' and '.join(others or named)}"
+
+
+def _targets(config: Any) -> Iterator[str]:
+    """All classes that a configuration names."""
+    if isinstance(config, Mapping):
+        if isinstance(config.get("_target_"), str):
+            yield config["_target_"]
+        config = list(config.values())
+    if isinstance(config, list):
+        for entry in config:
+            yield from _targets(entry)
+
+
+def _our_mix(source: Mapping[str, Any], n: int) -> str:
+    """The same of a source of ours."""
     sizes = source["n"] if isinstance(source.get("n"), list) else [n]
     source = source.get("source", source)
     mix = source.get("outliers")
@@ -236,7 +368,14 @@ def write_model_card(folder: str | Path, results: Mapping[str, Any], *, name: st
         folder: where the weights are.
         results: what :func:`run_results` returned.
         name: of the weights, that of the run when ``None``.
+
+    Raises:
+        ValueError: when they are no such results.
+        OSError: when the file cannot be written.
     """
+    wrong = _wrong(results)
+    if wrong is not None:
+        raise ValueError(f"No results of a run: {wrong} is missing or not what it has to be.")
     model, config, learned = results["model"], results["config"], results["learned"]
     n, m = config["model"]["n"], model["refine"]["m"]
     kind = (model["init"] or {}).get("name")
@@ -248,7 +387,7 @@ def write_model_card(folder: str | Path, results: Mapping[str, Any], *, name: st
         hypotheses = f"{model['init']['starts']} of its own and the best of {model['init']['samples']} P3P samples"
         what, guesses = "A network for any number of pairs", f"\nfrom several guesses, {hypotheses}"
     lines = [
-        f"# {name or config['name']}",
+        f"# {name or config.get('name', kind)}",
         "",
         f"{what} and m = {m} iterations of robust weighted LM{guesses}",
         "(Sheffer and Wiesel, PnP-Net, 2020). Apache-2.0. Written from `results.json`, which has the configuration.",
@@ -278,7 +417,7 @@ def write_model_card(folder: str | Path, results: Mapping[str, Any], *, name: st
             f"| Iteration | step γ | damping λ | robustness (`{model['refine']['kernel']}`) |",
             "|---|---|---|---|",
         ]
-        for i, (step, damping, shape) in enumerate(zip(*learned.values(), strict=True), 1):
+        for i, (step, damping, shape) in enumerate(zip(*(learned[key] for key in _LEARNED), strict=True), 1):
             lines.append(f"| {i} | {step:.3f} | {damping:.2e} | {shape:.3f} |")
     centred = model["normalize"]["center"] and model["normalize"]["scale"]
     lines += ["", "## Limits", ""]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
-import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,19 @@ from torch import Tensor
 
 from kornia_pnpnet.files import atomic_open
 from kornia_pnpnet.metrics import PoseErrors, SuccessRate
+from kornia_pnpnet.readers import (
+    RATE,
+    is_count,
+    is_mapping_or_none,
+    is_number,
+    is_number_or_none,
+    is_positive,
+    is_share,
+    is_text,
+    is_text_or_none,
+    misfits,
+    read_json,
+)
 
 __all__ = ["FORMAT", "format_table", "load_results", "resume", "row_errors", "save_results", "source_digest"]
 
@@ -22,91 +34,43 @@ FORMAT = 1
 _SHOWN_DIFFERENCES = 3
 
 
-def _is_number(value: Any) -> bool:
-    return type(value) in (int, float) and -math.inf < value < math.inf
-
-
-def _is_number_or_none(value: Any) -> bool:
-    return value is None or _is_number(value)
-
-
-def _is_share(value: Any) -> bool:
-    return _is_number(value) and 0 <= value <= 1
-
-
-def _is_count(value: Any) -> bool:
-    return type(value) is int and 0 <= value < 2**63
-
-
-def _is_text(value: Any) -> bool:
-    return isinstance(value, str)
-
-
-def _is_text_or_none(value: Any) -> bool:
-    return value is None or _is_text(value)
-
-
-def _is_mapping_or_none(value: Any) -> bool:
-    return value is None or isinstance(value, Mapping)
-
-
-# What readers ask of a file: a check of a value; of a list, what all of it is; of a mapping, what is under each key
-# (`*` is any, `?` ends one that may be missing).
-_QUARTILES = {"q25": _is_number, "median": _is_number, "q75": _is_number}
+# What readers ask of a file, see `misfits`.
+_PER_PROBLEM = {"rotation_error_deg": [is_number], "translation_error": [is_number], "ok": [is_share]}
+_QUARTILES = {"q25": is_number, "median": is_number, "q75": is_number}
 _ROW = {
-    "data": _is_text,
-    "solver": _is_text,
-    "success": {"rate": _is_share, "low": _is_share, "high": _is_share, "total": _is_count},
+    "data": is_text,
+    "solver": is_text,
+    "success": RATE,
     "rotation_error_deg": _QUARTILES,
     "translation_error": _QUARTILES,
-    "ok": _is_share,
-    "us_per_problem": _is_number,
-    "per_problem?": {"rotation_error_deg": [_is_number], "translation_error": [_is_number], "ok": [_is_share]},
+    "ok": is_share,
+    "us_per_problem": is_positive,
+    "per_problem?": _PER_PROBLEM,
 }
 _SET = {
-    "description?": _is_mapping_or_none,
-    "n": _is_count,
-    "max_rotation_deg": _is_number,
-    "max_translation": _is_number,
-    "unit": _is_text,
+    "description?": is_mapping_or_none,
+    "n": is_count,
+    "max_rotation_deg": is_number,
+    "max_translation": is_number,
+    "unit": is_text,
 }
 _FORMS: dict[str, Any] = {
     "evaluation": {
-        "environment": {"versions?": {"*": _is_text_or_none}, "commit?": _is_text_or_none},
-        "solvers": {"*": {"config?": _is_mapping_or_none}},
+        "environment": {"versions?": {"*": is_text_or_none}, "commit?": is_text_or_none},
+        "solvers": {"*": {"config?": is_mapping_or_none}},
         "data": {"*": _SET},
         "rows": [_ROW],
     },
-    "complexity": {"n": [_is_count], "counts": {"*": [_is_number_or_none]}, "ransac": [_is_text]},
+    "complexity": {"n": [is_count], "counts": {"*": [is_number_or_none]}, "ransac": [is_text]},
 }
 
 
-def _misfits(value: Any, form: Any, name: str = "") -> Iterator[str]:
-    """Names of what is missing or not of a form."""
-    if callable(form):
-        if not form(value):
-            yield name
-    elif isinstance(form, list):
-        if not isinstance(value, list):
-            yield name
-        elif not (callable(form[0]) and all(map(form[0], value))):
-            for i, entry in enumerate(value):
-                yield from _misfits(entry, form[0], f"{name}[{i}]")
-    elif not isinstance(value, Mapping):
-        yield name
-    else:
-        for key, inner in form.items():
-            for one in value if key == "*" else [key.removesuffix("?")]:
-                below = f"{name}.{one}" if name else one
-                if one in value:
-                    yield from _misfits(value[one], inner, below)
-                elif not key.endswith("?"):
-                    yield below
-
-
-def _unknown_names(results: Mapping[str, Any]) -> Iterator[str]:
-    """Places of names in rows that no entry has."""
+def _contradictions(results: Mapping[str, Any]) -> Iterator[str]:
+    """Places of names in rows that no entry has, and of lists that are not as long as the one beside them."""
     for i, row in enumerate(results.get("rows", ())):
+        lists = row.get("per_problem", {})
+        if len({len(lists[key]) for key in _PER_PROBLEM if lists}) > 1:
+            yield f"rows[{i}].per_problem"
         for key, names in (("data", "data"), ("solver", "solvers")):
             if row[key] not in results[names]:
                 yield f"rows[{i}].{key}"
@@ -160,17 +124,14 @@ def load_results(path: str | Path, *, complexity: bool = False) -> dict[str, Any
         FileNotFoundError: when there is no such file.
         ValueError: when it is not a results file of this format.
     """
-    try:
-        results = json.loads(Path(path).read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"'{path}' is not a results file: {error}") from error
+    results = read_json(path, "a results file")
     if not isinstance(results, dict) or results.get("format") != FORMAT:
         raise ValueError(f"'{path}' is not a results file of format {FORMAT}.")
     kinds = tuple(_FORMS) if complexity else ("evaluation",)
     kind = results.get("kind", "evaluation")
     if kind not in kinds:
         raise ValueError(f"'{path}' is not a results file of {' or '.join(kinds)}.")
-    wrong = next(itertools.chain(_misfits(results, _FORMS[kind]), _unknown_names(results)), None)
+    wrong = next(itertools.chain(misfits(results, _FORMS[kind]), _contradictions(results)), None)
     if wrong is not None:
         raise ValueError(f"'{path}' is not a results file of {kind}: {wrong} is missing or not what it has to be.")
     return results
@@ -259,7 +220,7 @@ def format_table(results: Mapping[str, Any]) -> str:
             (
                 row["data"],
                 row["solver"],
-                str(SuccessRate(**row["success"])),
+                str(SuccessRate._make(row["success"][key] for key in SuccessRate._fields)),
                 f"{_three_digits(row['rotation_error_deg']['median'])}°",
                 f"{_three_digits(row['translation_error']['median'])} {unit}".rstrip(),
                 f"{row['us_per_problem']:.0f}",

@@ -387,7 +387,11 @@ def train_briefly(seconds: float, folder: str | Path, *, progress: bool = True) 
 
     Returns:
         The path of the learning curves, a CSV file.
+
+    Raises:
+        BaseError: when ``seconds`` is not a positive number.
     """
+    check_positive(seconds=seconds)
     folder = Path(folder)
     for name in (CHECKPOINT_NAME, HISTORY_NAME):
         (folder / name).unlink(missing_ok=True)

@@ -195,6 +195,7 @@ INTERNAL = {
         "environment",
         "files",
         "pairs",
+        "readers",
         "results",
     )
 } | {"kornia_pnpnet.runstate", "kornia_pnpnet.small"}

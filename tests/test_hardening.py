@@ -1,20 +1,34 @@
 """Whatever comes in: shapes, dtypes, layouts, scales, numbers that are none, and geometry without a pose."""
 
 import contextlib
+import copy
 import io
 import json
 import os
+import warnings
 
 import numpy as np
 import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from kornia.core.exceptions import BaseError, ShapeError
+from kornia.core.exceptions import BaseError, DeviceError, ShapeError
 
-from kornia_pnpnet import Pose, create_solver, pose_covariance, pose_errors, solve_pnp, success
+from kornia_pnpnet import (
+    Pose,
+    PoseLoss,
+    SetLoss,
+    create_solver,
+    pose_covariance,
+    pose_errors,
+    solve_pnp,
+    success,
+)
 from kornia_pnpnet.cli import main
 from kornia_pnpnet.data import SyntheticProblems
+from kornia_pnpnet.init import p3p
+from kornia_pnpnet.losses import pose_distances
+from kornia_pnpnet.metrics import PoseErrors, reliability
 
 SOLVERS = {
     name: create_solver(name)
@@ -24,9 +38,13 @@ PEERS = {name: create_solver(name) for name in ("opencv-ransac", "poselib")}
 NAN, INF = float("nan"), float("inf")
 
 
-def many(examples):
+TIMES = int(os.environ.get("PNPNET_EXAMPLES", "1"))
+
+
+def many(examples, times=TIMES):
+    """So many examples, and more for the page; ``times=1`` where each takes seconds."""
     return settings(
-        max_examples=examples * int(os.environ.get("PNPNET_EXAMPLES", "1")),
+        max_examples=examples * times,
         deadline=None,
         derandomize=True,
         suppress_health_check=[HealthCheck.too_slow],
@@ -293,16 +311,179 @@ def test_matrices_take_anything(tally, case):
     assert matrix[ok].isfinite().all()
 
 
+# -- wherever tensors are, and what PyTorch makes of a solver ----------------------------------------------------------
+
+#: ``meta`` has shapes and no values: whoever looks at one, or makes a tensor somewhere else, raises there.
+DEVICES = ["meta", *(["cuda"] if torch.cuda.is_available() else [])]
+GRAPHS = [name for name in SOLVERS if name != "p3p-ransac"]  # RANSAC looks at values
+
+
+@st.composite
+def calls(draw, n=None):
+    """All that a solver can be given, by name; what is not given is missing."""
+    (world, img, camera), mask, weights, _ = draw(batches(n))
+    batch, count = world.shape[:2]
+    sigma = st.none() | numbers(world.dtype, (), (batch,), (batch, count))
+    init = Pose(torch.eye(3, dtype=world.dtype).expand(batch, 3, 3), torch.ones(batch, 3, dtype=world.dtype))
+    call = {"world_points": world, "img_points": img, "intrinsics": camera, "weights": weights, "mask": mask}
+    call |= {"init": draw(st.sampled_from([None, init])), "img_sigma": draw(sigma), "world_sigma": draw(sigma)}
+    return {name: value for name, value in call.items() if value is not None}
+
+
+def moved(call, device, names):
+    """Some of the tensors on another device."""
+    pose = {name: Pose(*(x.to(device) for x in call[name])) for name in names if name == "init"}
+    return {**call, **{name: call[name].to(device) for name in names if name != "init"}, **pose}
+
+
+@pytest.mark.parametrize("name", GRAPHS)
+def test_solvers_stay_where_their_inputs_are(name, tally):
+    solvers = {device: copy.deepcopy(SOLVERS[name]).to(device) for device in DEVICES}
+
+    @many(15)
+    @given(st.sampled_from(DEVICES), calls(9 if name.endswith("-n9") else None))
+    def run(device, call):
+        tally("calls", f"`{name}`, all tensors on the device `{device}`: nothing is made elsewhere, no value looked at")
+        result, guess = solvers[device].with_guess(**moved(call, device, call))
+        expected = SOLVERS[name](**call)
+        for ours, there in zip((*result[:5], *result.init), (*expected[:5], *expected.init), strict=True):
+            assert ours.device.type == guess.weights.device.type == device
+            assert (ours.shape, ours.dtype) == (there.shape, there.dtype)
+
+    run()
+
+
+@many(80)
+@given(st.sampled_from([*SOLVERS, *PEERS]), st.sampled_from(DEVICES), calls(9), st.data())
+def test_inputs_on_different_devices_are_an_error_of_ours(tally, name, device, call, data):
+    tally("calls", "solvers with some tensors on another device: `DeviceError`")
+    call = dict(list(call.items())[:3]) if name in PEERS else call
+    names = data.draw(st.lists(st.sampled_from(list(call)), min_size=1, max_size=len(call) - 1, unique=True))
+    with pytest.raises(DeviceError, match=f"on {device}"):
+        {**SOLVERS, **PEERS}[name](**moved(call, device, names))
+
+
+def functions_of_tensors():
+    """Public functions of tensors, with some that they take."""
+    problems = SyntheticProblems(n=9, batch_size=3, seed=0).batch(0)
+    result, guess = SOLVERS["pnpnet-set"].with_guess(*problems[:3])
+    inputs, both, each = problems[:3], (*result.pose, *problems.pose), torch.full((3, 9), 0.5)
+
+    def loss(a, b, c, d):
+        outcome, truth = (
+            result._replace(rotation=a, init=Pose(b, result.translation)),
+            problems._replace(pose=Pose(c, d)),
+        )
+        return PoseLoss()(outcome, truth), SetLoss()(outcome, truth, 1.0, guess)
+
+    def covariance(a, b, world, img, camera, sigma, length, weights):
+        return pose_covariance(Pose(a, b), world, img, camera, img_sigma=sigma, world_sigma=length, weights=weights)
+
+    sigmas = torch.tensor(1.0), torch.ones(3), each
+    return {
+        "solve_pnp": (solve_pnp, (*inputs, each)),
+        "p3p": (p3p, (problems.world_points[:, :3], problems.img_points[:, :3])),
+        "pose_covariance": (covariance, (*both[:2], *inputs, *sigmas)),
+        "pose_errors": (lambda a, b, c, d: pose_errors(Pose(a, b), Pose(c, d)), both),
+        "pose_distances": (lambda a, b, c, d: pose_distances(Pose(a, b), Pose(c, d)), both),
+        "success": (lambda a, b, c: success(PoseErrors(a, b), 1.0, c), torch.ones(3, 3).unbind()),
+        "reliability": (reliability, (each, each > 0.2)),
+        "losses": (loss, (result.rotation, result.init.rotation, *problems.pose)),
+    }
+
+
+FUNCTIONS = functions_of_tensors()
+
+
+@many(100)
+@given(st.sampled_from(list(FUNCTIONS)), st.sampled_from(DEVICES), st.data())
+def test_tensors_on_different_devices_are_an_error_of_ours(tally, name, device, data):
+    tally("calls", f"{', '.join(f'`{x}`' for x in FUNCTIONS)} with some tensors on another device: `DeviceError`")
+    function, tensors = FUNCTIONS[name]
+    function(*tensors)
+    which = data.draw(st.lists(st.integers(0, len(tensors) - 1), min_size=1, max_size=len(tensors) - 1, unique=True))
+    with pytest.raises(DeviceError, match=f"on {device}"):
+        function(*(x.to(device) if i in which else x for i, x in enumerate(tensors)))
+
+
+def same(result, expected):
+    """The same `ok` and the same poses where there are any; of strange problems the minima are flat."""
+    assert result[4].equal(expected[4])
+    ok = expected[4]
+    for ours, there in zip(result[:2], expected[:2], strict=True):
+        assert ours.isfinite().all()
+        size = there[ok].detach().abs().max().item() if ok.any() else 0.0
+        torch.testing.assert_close(ours[ok], there[ok], rtol=1e-2, atol=1e-2 * size)
+
+
+def tensors_of(case):
+    """All tensors of a batch, and a function of them that solves it."""
+    inputs, mask, weights, _ = case
+    others = {name: value for name, value in (("weights", weights), ("mask", mask)) if value is not None}
+
+    def solve(solver, *tensors):
+        return solver(*tensors[:3], **dict(zip(others, tensors[3:], strict=True)))
+
+    return (*inputs, *others.values()), solve
+
+
 @pytest.mark.filterwarnings("ignore:There is a performance drop:UserWarning")
-@pytest.mark.parametrize("name", ["pnpnet-set", "pnpnet-n9", "epnp-lm", "reppnp-lm"])  # RANSAC looks at values
+@pytest.mark.parametrize("name", GRAPHS)
 def test_vmap_is_a_larger_batch(name, tally):
-    tally("calls", "`torch.func.vmap`: as one larger batch")
-    problems = SyntheticProblems(n=9, batch_size=6, seed=0, dtype=torch.float64).batch(0)
-    two = [x.unflatten(0, (2, 3)) for x in problems[:3]]
-    mapped = torch.func.vmap(lambda *x: SOLVERS[name](*x)[:5])(*two)
-    plain = SOLVERS[name](*problems[:3])
-    torch.testing.assert_close(mapped[1].flatten(0, 1), plain.translation, rtol=1e-6, atol=1e-6)
-    assert mapped[4].flatten().equal(plain.ok)
+    solver = SOLVERS[name]
+
+    @many(15)
+    @given(batches(9 if name.endswith("-n9") else None))
+    def run(case):
+        tally("calls", f"`{name}` under `torch.func.vmap`: the results of one batch; under `vmap` of `grad`, too")
+        tensors, solve = tensors_of(case)
+        mapped = torch.func.vmap(lambda *x: solve(solver, *x)[:5])(*(torch.stack((x, x.flip(0))) for x in tensors))
+        plain = solve(solver, *tensors)
+        same([x[0] for x in mapped], plain)
+        same([x[1].flip(0) for x in mapped], plain)
+        if not len(tensors[0]):
+            return
+        tensors = [x.detach() for x in tensors]
+
+        def outcome(*problem):
+            return solve(solver, *(x[None] for x in problem)).rotation.sum()
+
+        each = torch.func.vmap(torch.func.grad(outcome, argnums=1))(*tensors)
+        img = tensors[1].clone().requires_grad_()
+        (whole,) = torch.autograd.grad(solve(solver, tensors[0], img, *tensors[2:]).rotation.sum(), img)
+        assert each.isfinite().all()
+        usual = torch.tensor([kind == "nothing" for kind in case[3]])
+        size = whole[usual].abs().max().item() if usual.any() else 0.0
+        torch.testing.assert_close(each[usual], whole[usual], rtol=0.05, atol=0.05 * size)
+
+    run()
+
+
+@pytest.mark.filterwarnings("ignore:.*should not be instantiated:DeprecationWarning")
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["pnpnet-set", "pnpnet-n9", "epnp-lm"])
+def test_compiled_solvers_take_anything(name, tally, monkeypatch):
+    """Captured and traced with its gradients; the graphs run as they are, for want of the time to compile them."""
+    compile_ = torch.compile
+    monkeypatch.setattr(
+        torch, "compile", lambda f, **more: compile_(f, **{**more, "options": None, "backend": "aot_eager"})
+    )
+    torch.compiler.reset()
+    solver = copy.deepcopy(SOLVERS[name])
+    solver.compile()
+
+    @many(8, times=1)
+    @given(batches(9))
+    def run(case):
+        tally("calls", f"`{name}`, compiled (`aot_eager`): the results of one that is not")
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", RuntimeWarning)  # that it was not compiled
+            check(solver(*case[0], weights=case[2], mask=case[1]), case[0], case[3], tally)
+        tensors, solve = tensors_of(case)
+        same(solve(solver, *tensors), solve(SOLVERS[name], *tensors))
+
+    run()
+    torch.compiler.reset()
 
 
 # -- the command line: any file, any argument -------------------------------------------------------------------------

@@ -15,7 +15,7 @@ ROOT = Path(kornia_pnpnet.__file__).parent
 
 #: From the bottom up. A module imports from its own layer and those below. The longest prefix counts.
 LAYERS = (
-    ("types", "checks", "environment", "files", "compilation"),
+    ("types", "checks", "environment", "files", "readers", "compilation"),
     ("geometry", "small", "robust", "metrics", "pairs", "data.colmap"),
     ("normalize", "lm", "init", "data", "covariance"),
     ("model", "losses"),

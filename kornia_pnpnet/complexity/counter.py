@@ -34,10 +34,10 @@ def _each(names: str, operations: Operations) -> dict[str, Operations]:
 
 #: Operations for each entry of the result. The first ones move, make or view data, change signs or draw at random.
 _ELEMENTWISE: dict[str, Operations] = {
-    **_each("_to_copy _unsafe_view alias arange cat clone copy detach diag_embed diagonal empty", _NOTHING),
-    **_each("empty_like expand eye fill flip full full_like gather index index_put index_select", _NOTHING),
-    **_each("lift_fresh masked_select neg new_empty new_full new_ones new_zeros nonzero ones", _NOTHING),
-    **_each("ones_like permute promote_types rand randperm repeat scalar_tensor scatter select", _NOTHING),
+    **_each("_to_copy _unsafe_view alias arange cat clone constant_pad_nd copy detach diag_embed", _NOTHING),
+    **_each("diagonal empty empty_like expand eye fill flip full full_like gather index index_put", _NOTHING),
+    **_each("index_select lift_fresh masked_select neg new_empty new_full new_ones new_zeros nonzero", _NOTHING),
+    **_each("ones ones_like permute promote_types rand randperm repeat scalar_tensor scatter select", _NOTHING),
     **_each("slice split split_with_sizes squeeze stack t taken transpose unbind unsqueeze view zero", _NOTHING),
     **_each("zeros zeros_like", _NOTHING),
     **_each("add rsub sub", _ADD),

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import csv
-import math
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -22,8 +19,6 @@ __all__ = [
     "outliers_in_words",
     "outliers_in_order",
     "pooled",
-    "read_column",
-    "read_rows",
     "records",
     "success_limit",
     "usual_n",
@@ -76,54 +71,6 @@ class Record(NamedTuple):
         return without_m(self.solver) != self.solver
 
 
-def read_rows(path: str | Path) -> list[dict[str, str]]:
-    """The rows of a CSV file with a header, at least one; raises ValueError when it is no such file."""
-    try:
-        with Path(path).open(newline="") as file:
-            rows = list(csv.DictReader(file))
-    except (csv.Error, UnicodeDecodeError) as error:
-        raise ValueError(f"'{path}' is not a CSV file: {error}") from error
-    if not rows:
-        raise ValueError(f"'{path}' has no rows to draw.")
-    return rows
-
-
-def read_column(
-    path: str | Path,
-    rows: Sequence[Mapping[str, str]],
-    column: str,
-    read: Callable[[str], float],
-    *,
-    gaps: bool = False,
-) -> list[float]:
-    """The numbers of a column.
-
-    Args:
-        path: the file, for errors.
-        rows: of :func:`read_rows`.
-        column: its name.
-        read: makes a number of a cell.
-        gaps: whether cells may be empty or not finite; they are NaN then.
-
-    Raises:
-        ValueError: when there is no such column, or a cell is no number.
-    """
-    if column not in rows[0]:
-        raise ValueError(f"'{path}' has no column '{column}'.")
-    values = []
-    for number, row in enumerate(rows, 1):
-        try:
-            value = math.nan if gaps and not row[column] else read(row[column])
-        except (TypeError, ValueError, OverflowError) as error:
-            raise ValueError(f"'{path}': '{column}' of row {number} is {row[column]!r}.") from error
-        if not -math.inf < value < math.inf:
-            if not gaps:
-                raise ValueError(f"'{path}': '{column}' of row {number} is {row[column]!r}.")
-            value = math.nan
-        values.append(value)
-    return values
-
-
 def records(results: Iterable[Mapping[str, Any]]) -> list[Record]:
     """Read results.
 
@@ -150,7 +97,7 @@ def records(results: Iterable[Mapping[str, Any]]) -> list[Record]:
                 n=data["n"],
                 solver=row["solver"],
                 m=_iterations(result["solvers"][row["solver"]]),
-                success=SuccessRate(**row["success"]),
+                success=SuccessRate._make(row["success"][key] for key in SuccessRate._fields),
                 us_per_problem=row["us_per_problem"],
                 limit=success_limit(data),
             )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -25,23 +26,31 @@ def plot_reliability(path: str | Path, curves: Mapping[str, Mapping[str, Sequenc
         The path.
 
     Raises:
-        ValueError: when there is no curve.
+        ValueError: when there is no curve, or one without numbers, or with lists of different lengths.
     """
     if not curves:
         raise ValueError("plot_reliability needs at least one curve, got none.")
+    for name, curve in curves.items():
+        lists = [curve.get(key, ()) for key in ("number", "predicted", "observed")]
+        counted = all(0 <= count < math.inf for count in lists[0]) and sum(lists[0]) > 0
+        if len(set(map(len, lists))) > 1 or not counted:
+            raise ValueError(f"The curve '{name}' needs three lists of one length, of counts that are not all 0 first.")
     figure = make_figure(0.72 * WIDTH, 6.0)
     chance, share = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
     chance.plot((0, 1), (0, 1), color=GREY, linewidth=1.0, linestyle=":")
-    for index, (name, curve) in enumerate(curves.items()):
+    for index, curve in enumerate(curves.values()):
         colour, marker = _COLOURS[index % len(_COLOURS)], _MARKERS[index % len(_MARKERS)]
         there = [i for i, count in enumerate(curve["number"]) if count > 0]
         x, y = ([curve[key][i] for i in there] for key in ("predicted", "observed"))
-        chance.plot(x, y, color=colour, marker=marker, markersize=4.5, linewidth=1.5, label=name)
+        chance.plot(x, y, color=colour, marker=marker, markersize=4.5, linewidth=1.5)
         total = sum(curve["number"])
         shares = [100 * curve["number"][i] / total for i in there]
         share.plot(x, shares, color=colour, marker=marker, markersize=4.5, linewidth=1.0)
     chance.set(ylim=(-0.02, 1.02), xlim=(-0.02, 1.02), ylabel="share that is right")
-    chance.legend(frameon=False, fontsize=SMALL, loc="upper left")
+    # A name may begin with an underscore, which would hide it here, or have a dollar sign.
+    legend = chance.legend(chance.lines[1:], ["-"] * len(curves), frameon=False, fontsize=SMALL, loc="upper left")
+    for text, name in zip(legend.get_texts(), curves, strict=True):
+        text.set(text=name, parse_math=False)
     share.set(yscale="log", xlabel="weight: the chance that a pair is right", ylabel="pairs (%)")
     for axes in (chance, share):
         tidy(axes)

@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 
 from kornia_pnpnet.figures import style
 from kornia_pnpnet.figures.lines import Curve, draw_rates, few_ticks, list_curves, make_panels
-from kornia_pnpnet.figures.records import read_column, read_rows
 from kornia_pnpnet.figures.style import GREY, SMALL, SolverStyle
+from kornia_pnpnet.readers import read_column, read_rows
 
 __all__ = ["mix_in_words", "plot_sweep"]
 

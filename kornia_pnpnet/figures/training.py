@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from kornia_pnpnet.figures.records import read_column, read_rows
 from kornia_pnpnet.figures.style import BLUE, GREEN, ORANGE, PURPLE, SKY, SMALL, TITLE, WIDTH, make_figure, save, tidy
+from kornia_pnpnet.readers import read_column, read_rows
 
 __all__ = ["plot_training"]
 

@@ -9,7 +9,7 @@ from kornia.core.check import KORNIA_CHECK
 from kornia.core.exceptions import ShapeError
 from torch import Tensor, nn
 
-from kornia_pnpnet.checks import check_positive
+from kornia_pnpnet.checks import check_devices, check_positive
 from kornia_pnpnet.types import Correspondences, Guess, Pose
 
 __all__ = ["MLPInit"]
@@ -121,6 +121,7 @@ class MLPInit(nn.Module):
 
         Raises:
             ShapeError: when :math:`N` is not ``n``.
+            DeviceError: when the correspondences are not where the network is.
         """
         count = corr.world_points.shape[1]
         if count != self.n:
@@ -129,6 +130,7 @@ class MLPInit(nn.Module):
                 actual_shape=tuple(corr.world_points.shape),
                 expected_shape=["B", str(self.n), "3"],
             )
+        check_devices({"world_points": corr.world_points}, next(self.parameters()), "the network")
         # The pairs one after the other, x, y, z, u, v of each, as columns: that is how they lie in memory.
         world_points, img_points = corr.world_points / self.world_scale, corr.img_points / self.img_scale
         features = torch.cat((world_points.permute(1, 2, 0), img_points.permute(1, 2, 0)), 1).flatten(0, 1)  # (5n, B)

@@ -8,9 +8,10 @@ from typing import Any, TypeVar
 
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
-from kornia.core.exceptions import DeviceError, ShapeError, TypeCheckError
+from kornia.core.exceptions import ShapeError, TypeCheckError
 from torch import Tensor, nn
 
+from kornia_pnpnet.checks import check_like
 from kornia_pnpnet.geometry import MIN_DEPTH_RATIO
 from kornia_pnpnet.init.law_of_cosines import Triple, distances, turn_to_largest, turned
 from kornia_pnpnet.small import dot
@@ -225,13 +226,9 @@ def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
             actual_shape=tuple(plane_points.shape),
             expected_shape=(batch, 3, 2),
         )
-    if plane_points.dtype != world_points.dtype or world_points.dtype not in (torch.float32, torch.float64):
-        raise TypeCheckError(
-            f"world_points and plane_points must both be float32 or both float64, got {world_points.dtype} and "
-            f"{plane_points.dtype}."
-        )
-    if plane_points.device != world_points.device:
-        raise DeviceError(f"plane_points is on {plane_points.device} but world_points is on {world_points.device}.")
+    if world_points.dtype not in (torch.float32, torch.float64):
+        raise TypeCheckError(f"world_points must be float32 or float64, got {world_points.dtype}.")
+    check_like({"plane_points": plane_points}, world_points)
     solve = _solve if torch.compiler.is_compiling() else _Solve.apply
     components, valid = solve(world_points.detach(), plane_points.detach())
     components = components.permute(2, 1, 0)  # (B, 4, 12)

@@ -9,6 +9,7 @@ from kornia.core.check import KORNIA_CHECK
 from torch import Tensor, nn
 from torch.nn import functional
 
+from kornia_pnpnet.checks import check_devices
 from kornia_pnpnet.geometry import pixel_variance, project
 from kornia_pnpnet.init.control_points import align
 from kornia_pnpnet.init.p3p import folded, p3p, unfolded
@@ -285,7 +286,11 @@ class SetInit(nn.Module):
         Returns:
             The first hypothesis as the pose and the rest as others, that of the samples last; likelihoods as weights;
             the noise of each pair.
+
+        Raises:
+            DeviceError: when the correspondences are not where the network is.
         """
+        check_devices({"world_points": corr.world_points}, self.pair.bias, "the network")
         view = _View(corr)
         dtype = corr.world_points.dtype
         pair, problem = (x.to(dtype) for x in self._run(view.features, view.there))
