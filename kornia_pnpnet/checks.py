@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from numbers import Integral, Real
-from typing import Any
+from typing import Any, TypeAlias
 
 from kornia.core.check import KORNIA_CHECK
 from kornia.core.exceptions import DeviceError, ShapeError, TypeCheckError
@@ -14,6 +14,7 @@ from torch import Tensor
 from kornia_pnpnet.types import Pose
 
 __all__ = [
+    "Shapes",
     "check_devices",
     "check_like",
     "check_numbers",
@@ -23,6 +24,9 @@ __all__ = [
     "check_shapes",
     "check_whole",
 ]
+
+#: By name what a tensor is, ``None`` where it is missing, and the shape that it must have.
+Shapes: TypeAlias = dict[str, tuple[Tensor | None, tuple[int, ...]]]
 
 
 def _is_number(value: Any) -> bool:
@@ -59,11 +63,11 @@ def check_ranges(**values: Any) -> None:
         KORNIA_CHECK(right, f"{name} must be two positive numbers, the second not smaller, got {value!r}.")
 
 
-def check_shapes(shapes: Mapping[str, tuple[Tensor | None, tuple[int, ...]]], like: Tensor | None = None) -> None:
+def check_shapes(shapes: Shapes, like: Tensor | None = None) -> None:
     """Check that tensors have the shapes that go with each other.
 
     Args:
-        shapes: name of each tensor, what it is, and the shape that it must have; what is ``None`` may be missing.
+        shapes: see :data:`Shapes`.
         like: the world points whose batch they belong to, for the message.
 
     Raises:
@@ -108,7 +112,7 @@ def check_poses(estimate: Pose, truth: Pose) -> None:
         DeviceError: when the devices differ.
     """
     batch = tuple(estimate.translation.shape[:-1])
-    shapes: dict[str, tuple[Tensor | None, tuple[int, ...]]] = {}
+    shapes: Shapes = {}
     for name, pose in (("estimate", estimate), ("truth", truth)):
         shapes[f"The rotation of the {name}"] = pose.rotation, (*batch, 3, 3)
         shapes[f"The translation of the {name}"] = pose.translation, (*batch, 3)

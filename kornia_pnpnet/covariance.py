@@ -7,7 +7,7 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from kornia_pnpnet.checks import check_devices, check_shapes
+from kornia_pnpnet.checks import Shapes, check_devices, check_shapes
 from kornia_pnpnet.geometry import normal_equations, pixel_variance, project
 from kornia_pnpnet.types import Correspondences, Noise, Pose, camera_matrices
 
@@ -59,7 +59,7 @@ def pose_covariance(
     batch, count = world_points.shape[:2]
     rotation, translation = pose
     camera = camera_matrices(intrinsics)
-    shapes: dict[str, tuple[Tensor | None, tuple[int, ...]]] = {
+    shapes: Shapes = {
         "img_points": (img_points, (batch, count, 2)),
         "intrinsics": (camera, (3, 3) if camera.ndim == 2 else (batch, 3, 3)),
         "rotation of the pose": (rotation, (batch, 3, 3)),

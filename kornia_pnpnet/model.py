@@ -16,7 +16,7 @@ from kornia.core.exceptions import BaseError, ShapeError, TypeCheckError, ValueC
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
-from kornia_pnpnet.checks import check_devices, check_like, check_shapes
+from kornia_pnpnet.checks import Shapes, check_devices, check_like, check_shapes
 from kornia_pnpnet.compilation import Compiled
 from kornia_pnpnet.files import atomic_open
 from kornia_pnpnet.geometry import project
@@ -65,7 +65,7 @@ def check_inputs(
     KORNIA_CHECK_SHAPE(img_points, ["B", "N", "2"])
     batch, count = world_points.shape[:2]
     rotation, translation = (None, None) if init is None else init
-    shapes: dict[str, tuple[Tensor | None, tuple[int, ...]]] = {
+    shapes: Shapes = {
         "img_points": (img_points, (batch, count, 2)),
         "weights": (weights, (batch, count)),
         "mask": (mask, (batch, count)),

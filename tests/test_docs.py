@@ -102,7 +102,8 @@ async function open(page, width) {
   frame.src = `site/${page}`;
   const loaded = new Promise(done => frame.onload = done);
   document.body.append(frame);
-  await loaded;
+  const late = new Promise(done => setTimeout(done, 20000, "late"));
+  if (await Promise.race([loaded, late]) === "late") return [`${page} at ${width} px: does not load`];
   const shown = frame.contentDocument, pictures = [...shown.images];
   pictures.forEach(picture => picture.loading = "eager");
   await Promise.allSettled(pictures.map(picture => picture.decode()));

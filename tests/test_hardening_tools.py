@@ -35,6 +35,10 @@ from kornia_pnpnet.reports import (
 from kornia_pnpnet.training import FitReport, train_briefly
 from kornia_pnpnet.types import Problems
 
+# It would hide what failed.
+pytestmark = pytest.mark.filterwarnings("ignore:Generating overly large repr")
+
+
 # -- bounds and counts ------------------------------------------------------------------------------------------------
 
 
@@ -351,7 +355,7 @@ def evaluations(draw, full=False):
         for source, wrong, n in itertools.product(some(*SOURCES), outliers, numbers)
     }
     rates = few(st.fixed_dictionaries({"rate": SHARE, "low": SHARE, "high": SHARE, "total": st.integers(1, 300)}))
-    times, lost = few(st.floats(1e-300, 1e300)), few(st.sampled_from([False, False, False, True]))
+    times, lost = few(st.floats(1e-9, 1e12)), few(st.sampled_from([False, False, False, True]))
     rows = [
         {"data": data, "solver": solver, "success": next(rates), "us_per_problem": next(times)}
         for data, solver in itertools.product(sets, names)

@@ -130,6 +130,47 @@ def test_run_starts_from_weights(tmp_path):
         assert "Traceback" not in done.stderr
 
 
+MINE = """
+from kornia_pnpnet.data import SyntheticProblems
+
+
+class Mine:
+    def __init__(self, n, batch_size, seed, corners):
+        self.problems = SyntheticProblems(n=n, batch_size=batch_size, seed=seed)
+
+    def batch(self, index):
+        return self.problems.batch(index)
+"""
+
+
+def test_data_of_ones_own_and_any_validation_sets(tmp_path, monkeypatch):
+    """In a sweep, which ends with a summary, and with an override that takes something away."""
+    (tmp_path / "mine.py").write_text(MINE)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    source = "{_target_: mine.Mine, n: 9, batch_size: 8, seed: 7, corners: 4}"
+    away = "~data.validation.uniform", "~data.validation.none", "~data.validation.slab"
+    sets = *away, f"+data.validation.board={source}", f"hydra.sweep.dir={tmp_path / 'sweep'}", "model.m=1"
+    run("-m", *sets)
+    (folder,) = (path.parent for path in tmp_path.glob("sweep/*/results.json"))
+    card = (folder / "weights" / "README.md").read_text()
+    assert "- Validation, board: problems from mine.Mine." in card
+    assert "board/rate" in (tmp_path / "sweep" / "summary.csv").read_text()
+    done = run(*away, f"hydra.run.dir={tmp_path}/none", check=False)
+    assert done.returncode == 1
+    assert "data.validation is empty" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_damaged_results_beside_weights_are_an_error_before_the_training(tmp_path):
+    PnPNet.from_pretrained("pnpnet-n9").save_pretrained(tmp_path / "weights")
+    (tmp_path / "weights" / "results.json").write_text('{"overrides": [1]}')
+    done = run(f"weights={tmp_path / 'weights'}", f"hydra.run.dir={tmp_path}/run", "model.m=10", check=False)
+    assert done.returncode == 1
+    assert "is not a results file of a run: results.overrides[0] is missing" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "run" / "last.ckpt").exists()
+
+
 @pytest.mark.slow
 def test_compilation_changes_neither_the_numbers_nor_what_is_saved(tmp_path):
     for compiled in ("false", "true"):
