@@ -12,7 +12,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from test_hardening import SOLVERS, batches, check, damage, many, same
+from test_hardening import SOLVERS, WORDS, batches, check, damage, many, run_main, same
 from test_hardening_parts import ANY, ERRORS, WORD, Seen, finite, names_the_file, options, places_in, poses, spoiled
 
 from kornia_pnpnet import MLPInit, PnPNet, RobustWeightedLM, create_solver
@@ -398,3 +398,64 @@ def test_reliability_pictures_of_any_numbers(tally, tmp_path):
     drawn(
         tally, tmp_path, "`plot_reliability` of any numbers", plot_reliability, st.dictionaries(WORD, curve, max_size=3)
     )
+
+
+# -- the other commands -----------------------------------------------------------------------------------------------
+
+#: What each needs to be quick, and what it can be given.
+COMMANDS = {
+    "evaluate": (("--solver", "epnp", "--problems", 3), "--solver --data --n --outliers --seed --dtype --plot"),
+    "figures": ((), "--out"),
+    "export": (("--solver", "p3p-ransac"), "--n"),
+    "list": ((), "--x"),
+    "demo": (("--problems", 3, "--train-seconds", 0), "--data --problems"),
+}
+SAID = WORDS | st.sampled_from(
+    ["9", "6,9", "none,2", "50%", "uniform", "float64", "gaussian_pose", "p3p-ransac", "1e9"]
+)
+
+
+def test_any_arguments_of_other_commands_are_a_line_and_no_traceback(tally, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    codes = Counter()
+
+    @many(80)
+    @given(st.sampled_from(sorted(COMMANDS)), st.data())
+    def run(name, data):
+        tally("files", "other commands with any arguments: what they are for, or one line of error")
+        quick, may = COMMANDS[name]
+        pairs = data.draw(st.lists(st.tuples(st.sampled_from(may.split()), SAID), max_size=2))
+        files = data.draw(st.lists(SAID, max_size=1))
+        code, out, err = run_main(name, *quick, *(x for pair in pairs for x in pair), *files)
+        codes[code] += 1
+        assert code in (0, 2)
+        if code == 2:
+            assert err.startswith("pnpnet: ")
+            assert err.count("\n") == 1
+        else:
+            assert out
+
+    run()
+    assert min(codes[0], codes[2]) >= 3
+
+
+# -- poses and cameras of Kornia ---------------------------------------------------------------------------------------
+
+
+@many(60)
+@given(batches(), st.data(), st.sampled_from(["pnpnet-set", "epnp-lm", "p3p-ransac"]))
+def test_cameras_of_kornia_take_anything(tally, case, data, name):
+    tally("parts", "`Pose.matrix`, `Pose.se3`, `Pose.camera` of any pose, and a `PinholeCamera` for any intrinsics")
+    (world, img, matrices), mask, weights, _ = case
+    batch = len(world)
+    pose = data.draw(poses(batch, world.dtype))
+    camera = pose.camera(matrices, 480, 640)
+    assert pose.matrix.shape == (batch, 4, 4)
+    assert pose.matrix[:, :3, 3].equal(pose.translation)
+    assert camera.extrinsics.equal(pose.matrix)
+    if batch:  # Kornia's quaternions have at least one
+        torch.testing.assert_close(pose.se3.matrix(), pose.matrix, rtol=1e-3, atol=1e-3)
+    assert camera.intrinsics[:, :3, :3].equal(matrices) or matrices.isnan().any()
+    ours, plain = (SOLVERS[name](world, img, x, weights=weights, mask=mask) for x in (camera, matrices))
+    assert ours.translation.equal(plain.translation)
+    assert ours.ok.equal(plain.ok)
