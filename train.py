@@ -37,7 +37,8 @@ def main(config: DictConfig) -> float | None:
     """Train, write results and weights.
 
     Returns:
-        The success rate on the validation set ``uniform``, else the last one, which a sweeper may maximise.
+        The success rate, which a sweeper may maximise, on the validation set ``uniform``, or on the last one where
+        there is no such set.
     """
     runtime = HydraConfig.get()
     folder = Path(runtime.runtime.output_dir)
@@ -102,7 +103,12 @@ def main(config: DictConfig) -> float | None:
         sys.exit(130)
     if report.start == report.update and (folder / RESULTS_NAME).exists():
         log.info("Nothing is left to train; the results stay as they are.")
-        results = load_run(folder / RESULTS_NAME)
+        try:
+            results = load_run(folder / RESULTS_NAME)
+        except ValueError as error:
+            if runtime.mode == RunMode.MULTIRUN:
+                raise
+            sys.exit(str(error))
     else:
         results = run_results(model.cpu(), validation, report, resolved, list(runtime.overrides.task), origin)
         write_json(folder / RESULTS_NAME, results)
@@ -115,7 +121,7 @@ def main(config: DictConfig) -> float | None:
     if runtime.mode == RunMode.MULTIRUN:
         log.info("Sweep summary: %s", summarize_runs(runtime.sweep.dir))
     sets = results["validation"]
-    return float(sets.get("uniform", [*sets.values()][-1])["success"]["rate"])
+    return float(sets["uniform" if "uniform" in sets else [*sets][-1]]["success"]["rate"])
 
 
 def start_from(model: PnPNet, trained: PnPNet) -> None:

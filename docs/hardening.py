@@ -77,7 +77,7 @@ def page(results: dict[str, Any]) -> str:
         "",
         f"{total} cases, all as they should be, counted by the tests themselves ({tests};",
         "`make test-all` runs most with fewer cases). One of them asks that every public function and class is",
-        "called by one of these, or through another one. Written by `docs/hardening.py` from",
+        "named in these, or listed with where it is called. Written by `docs/hardening.py` from",
         "`results/hardening.json`.",
     ]
     for part, (heading, text, head) in PARTS.items():

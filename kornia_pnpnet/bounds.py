@@ -57,8 +57,7 @@ class KnownInliers(nn.Module):
             The minimum next to the true pose.
         """
         world_points, img_points, intrinsics = problems[:3]
-        weights = self.pair_weights(problems).detach()
-        return self.least_squares(world_points, img_points, intrinsics, weights, init=problems.pose)
+        return self.least_squares(world_points, img_points, intrinsics, self.pair_weights(problems), init=problems.pose)
 
 
 class KnownInliersAndNoise(KnownInliers):
@@ -75,7 +74,7 @@ class KnownInliersAndNoise(KnownInliers):
             protocol's, for scenes it has to be known.
 
     Raises:
-        BaseError: for a standard deviation that is negative or no number, or when both are 0.
+        BaseError: for a standard deviation that is negative or not finite, or when both are 0.
 
     Example:
         >>> KnownInliersAndNoise(world_sigma=0.01)
@@ -90,8 +89,12 @@ class KnownInliersAndNoise(KnownInliers):
         KORNIA_CHECK(img_sigma + world_sigma > 0, "img_sigma and world_sigma must not both be 0.")
         self.config = {"img_sigma": img_sigma, "world_sigma": world_sigma}
 
+    @torch.no_grad()
     def pair_weights(self, problems: Problems) -> Tensor:
-        """Weigh the pairs of some problems by the variance of their pixels, 0 for outliers, shape :math:`(B, N)`."""
+        """Weigh the pairs of some problems by the variance of their pixels, 0 for outliers, shape :math:`(B, N)`.
+
+        The weights have no gradient: one of a point that is NaN would reach all others.
+        """
         cam_points = transform(problems.pose, problems.world_points)  # (B, N, 3)
         depth = cam_points[..., 2:]
         depth = torch.where(depth > 0, depth, 1.0)  # pairs behind the camera do not count anyway

@@ -25,7 +25,7 @@ __all__ = [
     "check_whole",
 ]
 
-#: By name what a tensor is, ``None`` where it is missing, and the shape that it must have.
+#: For the name of each tensor: the tensor, or ``None`` where it was left out, and the shape that it must have.
 Shapes: TypeAlias = dict[str, tuple[Tensor | None, tuple[int, ...]]]
 
 
@@ -97,7 +97,11 @@ def check_like(tensors: Mapping[str, Tensor | None], like: Tensor, name: str = "
 
 
 def check_devices(tensors: Mapping[str, Tensor | None], like: Tensor, name: str = "world_points") -> None:
-    """Check that tensors are where another one is; raise a ``DeviceError`` for the first that is not."""
+    """Check that tensors are where another one is, those of no dimension, too; ``name`` is that of the other one.
+
+    Raises:
+        DeviceError: when one is on another device.
+    """
     for this, tensor in tensors.items():
         if tensor is not None and tensor.device != like.device:
             raise DeviceError(f"{this} is on {tensor.device} but {name} is on {like.device}.")

@@ -48,7 +48,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _one_line(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename and error.strerror:
-        return f"{error.filename}: {error.strerror}"
+        return " ".join(f"{error.filename}: {error.strerror}".splitlines())  # a name may have several
     notes = (f"({note})" for note in getattr(error, "__notes__", ()))
     return " ".join(" ".join([str(error) or type(error).__name__, *notes]).split())
 

@@ -69,7 +69,7 @@ class Compiled(Generic[_P, _T]):
         compiled = self._compiled[first.ndim > 1 and first.shape[1] >= _MANY]
         errors = torch._dynamo.exc.TorchDynamoException, torch._inductor.exc.InductorError
         if kind in self._seen:
-            with suppress(*errors):  # of what is compiled anew, a warning may be an error here: once more, in silence
+            with suppress(*errors):  # recompiling may warn, and warnings may be errors here: try again without them
                 return compiled(*args, **kwargs)
         try:
             for tensor in _tensors(args):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ __all__ = [
 
 def is_number(value: Any) -> bool:
     """Whether it is a finite number."""
-    return type(value) in (int, float) and -math.inf < value < math.inf
+    return type(value) in (int, float) and abs(value) <= sys.float_info.max
 
 
 def is_number_or_none(value: Any) -> bool:
@@ -120,16 +121,31 @@ def read_json(path: str | Path, what: str) -> Any:
 
     Raises:
         FileNotFoundError: when there is no such file.
-        ValueError: when it is not JSON.
+        ValueError: when it is not JSON, which has no NaN and no infinity.
     """
+
+    def refuse(number: str) -> None:
+        raise ValueError(f"{number} is no number of JSON")
+
     try:
-        return json.loads(Path(path).read_text(encoding="utf-8"))
+        return json.loads(Path(path).read_text(encoding="utf-8"), parse_constant=refuse)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"'{path}' is not {what}: {error}") from error
 
 
 def read_rows(path: str | Path) -> list[dict[str, str]]:
-    """The rows of a CSV file with a header, at least one; raises ValueError when it is no such file."""
+    """Read a CSV file with a header.
+
+    Args:
+        path: of the file.
+
+    Returns:
+        The rows, at least one.
+
+    Raises:
+        FileNotFoundError: when there is no such file.
+        ValueError: when it is not CSV, has no rows, or one has more cells than the header.
+    """
     try:
         with Path(path).open(newline="") as file:
             rows = list(csv.DictReader(file))
@@ -137,6 +153,9 @@ def read_rows(path: str | Path) -> list[dict[str, str]]:
         raise ValueError(f"'{path}' is not a CSV file: {error}") from error
     if not rows:
         raise ValueError(f"'{path}' has no rows.")
+    for number, row in enumerate(rows, 1):
+        if None in row:
+            raise ValueError(f"'{path}': row {number} has more cells than the header.")
     return rows
 
 

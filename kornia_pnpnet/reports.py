@@ -26,6 +26,7 @@ from kornia_pnpnet.readers import (
     RATE,
     is_count,
     is_flag,
+    is_mapping_or_none,
     is_number,
     is_text,
     is_text_or_none,
@@ -49,13 +50,8 @@ __all__ = [
 ]
 
 RESULTS_NAME = "results.json"
+_CARD_NAME = "README.md"
 _LEARNED = "step", "damping", "robustness"
-
-
-def _is_initialiser(value: Any) -> bool:
-    if not isinstance(value, Mapping):
-        return value is None
-    return is_text(value.get("name")) and (value["name"] != "SetInit" or not any(misfits(value, _STARTS)))
 
 
 # What readers ask of the results of a run, and of those of the run before it, see `misfits`.
@@ -82,7 +78,7 @@ _RUN: dict[str, Any] = {
     "validation": {"*": _SET},
     "learned": {name: [is_number] for name in _LEARNED},
     "model": {
-        "init": _is_initialiser,
+        "init": is_mapping_or_none,
         "refine": {"m": is_count, "kernel": is_text},
         "views": is_count,
         "normalize": {"center": is_flag, "scale": is_flag},
@@ -93,7 +89,17 @@ _HOW_IT_RAN = ("resume", "progress", "threads", "data_workers", "compile")
 
 
 def write_json(path: str | Path, content: Any) -> None:
-    """Write a JSON file that people can read, in one piece."""
+    """Write a JSON file that people can read, in one piece.
+
+    Args:
+        path: of the file; folders are made when missing.
+        content: plain data.
+
+    Raises:
+        TypeError: for what JSON does not know.
+        ValueError: for numbers that are not finite.
+        OSError: when the file cannot be written. In each case the old file stays as it was.
+    """
     with atomic_open(path) as file:
         file.write(json.dumps(content, indent=2, allow_nan=False) + "\n")
 
@@ -159,14 +165,17 @@ def find_results(weights: str | Path) -> dict[str, Any] | None:
         weights: what :meth:`~kornia_pnpnet.model.PnPNet.from_pretrained` takes.
 
     Returns:
-        What :func:`run_results` returned then, or ``None`` where the file is neither beside nor above the weights.
+        What :func:`run_results` returned then, or ``None`` where there is no such file beside the weights, or above
+        a folder ``weights``.
 
     Raises:
         FileNotFoundError: when there are no such weights.
         ValueError: as of :func:`load_run`.
     """
     folder = find_weights(weights)
-    paths = (folder / RESULTS_NAME, folder.parent / RESULTS_NAME)
+    # As `train.py` leaves them; above weights elsewhere it would be a file of something else.
+    folders = [folder, folder.parent] if folder.name == "weights" else [folder]
+    paths = (place / RESULTS_NAME for place in folders)
     return next((load_run(path) for path in paths if path.is_file()), None)
 
 
@@ -192,14 +201,23 @@ def load_run(path: str | Path) -> dict[str, Any]:
 
 def _wrong(results: Any) -> str | None:
     """The first of what is wrong with results of a run, or with those of the runs before it."""
-    wrong = next(misfits(results, _RUN, "results"), None)
-    if wrong is None and len({len(results["learned"][name]) for name in _LEARNED}) > 1:
-        wrong = "results.learned"
-    name = "results"
-    while wrong is None and results.get("origin") is not None:
-        results, name = results["origin"], f"{name}.origin"
-        wrong = next(misfits(results, _BEFORE, name), None)
-    return wrong
+
+    def all_wrong() -> Iterator[str]:
+        yield from misfits(results, _RUN, "results")
+        model, learned = results["model"], results["learned"]
+        if not results["validation"]:
+            yield "results.validation"
+        if {len(learned[key]) for key in _LEARNED} != {max(1, model["refine"]["m"])}:
+            yield "results.learned"
+        if model["init"] is not None:
+            form = _STARTS if model["init"].get("name") == "SetInit" else {"name": is_text}
+            yield from misfits(model["init"], form, "results.model.init")
+        before, name = results.get("origin"), "results.origin"
+        while before is not None:
+            yield from misfits(before, _BEFORE, name)
+            before, name = before.get("origin"), f"{name}.origin"
+
+    return next(all_wrong(), None)
 
 
 def collect_weights(runs: Sequence[str | Path], folder: str | Path, *, most_rows: int = 100) -> None:
@@ -211,9 +229,9 @@ def collect_weights(runs: Sequence[str | Path], folder: str | Path, *, most_rows
         most_rows: of the curves of each run that are kept, all of them with a validation.
 
     Raises:
-        BaseError: when ``most_rows`` is less than 1, or the weights are damaged.
-        FileNotFoundError: when a file is missing.
-        ValueError: when there is no run, or a file is damaged. Nothing is written then.
+        BaseError: when ``most_rows`` is less than 1, or the weights are damaged or not all there.
+        FileNotFoundError: when another file is missing.
+        ValueError: when there is no run, or another file is damaged. In each case nothing is written.
     """
     check_whole(1, most_rows=most_rows)
     if not runs:
@@ -227,7 +245,7 @@ def collect_weights(runs: Sequence[str | Path], folder: str | Path, *, most_rows
         validated = [
             {**row, "update": str(done + update)}
             for row, update in zip(there, updates, strict=True)
-            if any(value for key, value in row.items() if key is not None and key.startswith("val/"))
+            if any(value for key, value in row.items() if key.startswith("val/"))
         ]
         if not validated:
             raise ValueError(f"'{path}' has no row with a validation.")
@@ -236,12 +254,14 @@ def collect_weights(runs: Sequence[str | Path], folder: str | Path, *, most_rows
         done = int(rows[-1]["update"])
     last = Path(runs[-1])
     results = load_run(last / RESULTS_NAME)
+    card = _card(results, folder.name)
     PnPNet.from_pretrained(last / "weights")
     folder.mkdir(parents=True, exist_ok=True)
     for name in (CONFIG_NAME, WEIGHTS_NAME):
         shutil.copyfile(last / "weights" / name, folder / name)
     write_json(folder / RESULTS_NAME, results)
-    write_model_card(folder, results, name=folder.name)
+    with atomic_open(folder / _CARD_NAME, "wb") as file:
+        file.write(card)
     with atomic_open(folder / HISTORY_NAME, newline="") as file:
         writer = csv.DictWriter(file, list(dict.fromkeys(key for row in rows for key in row)), restval="")
         writer.writeheader()
@@ -268,6 +288,9 @@ def summarize_runs(folder: str | Path) -> Path | None:
     Returns:
         The summary's path, or ``None`` when there is no results file yet. A file that is not one of a run is left out,
         with a warning.
+
+    Raises:
+        OSError: when the summary cannot be written.
     """
     folder = Path(folder)
     rows = []
@@ -302,11 +325,16 @@ def _rate(entry: Mapping[str, float]) -> str:
 def _mix(source: Mapping[str, Any], n: int) -> str:
     """What a data source's configuration says of its wrong pairs and its points, or whose it is."""
     named = list(dict.fromkeys(_targets(source)))
-    others = [name for name in named if not name.startswith("kornia_pnpnet.data.")]
-    with suppress(AttributeError, LookupError, TypeError, ValueError, BaseError):
-        if not others:
+    others = [name for name in named if not _is_synthetic(name)]
+    if not others:
+        with suppress(AttributeError, LookupError, TypeError, ValueError, BaseError):  # of options as they cannot be
             return _our_mix(source, n)
     return f"problems from {' and '.join(others or named)}"
+
+
+def _is_synthetic(name: str) -> bool:
+    """Whether a class is one of our synthetic sources, or of what they are made of."""
+    return name.startswith("kornia_pnpnet.data.") and not name.endswith(".SceneProblems")
 
 
 def _targets(config: Any) -> Iterator[str]:
@@ -321,9 +349,12 @@ def _targets(config: Any) -> Iterator[str]:
 
 
 def _our_mix(source: Mapping[str, Any], n: int) -> str:
-    """The same of a source of ours."""
-    sizes = source["n"] if isinstance(source.get("n"), list) else [n]
+    """Wrong pairs and points of one of our synthetic sources."""
+    sizes = source.get("n", n)
+    sizes = sizes if isinstance(sizes, list) else [sizes]
     source = source.get("source", source)
+    if any("outliers" in part for part in source.get("sources", ())):
+        raise LookupError("Each source has wrong pairs of its own.")
     mix = source.get("outliers")
     draws = None if mix is None else OutlierMix(**{k: v for k, v in mix.items() if k != "_target_"})
     least, most = (0 if draws is None else draws.max_count(size) for size in (min(sizes), max(sizes)))
@@ -349,11 +380,11 @@ def _run_lines(results: Mapping[str, Any]) -> list[str]:
     run, config, made = results["run"], results["config"], results["environment"]
     overrides = [entry for entry in results["overrides"] if entry.split("=")[0] not in _HOW_IT_RAN]
     most = "up to " if isinstance(config["data"]["train"].get("n"), list) else ""
+    kind = "synthetic " if all(map(_is_synthetic, _targets(config["data"]["train"]))) else ""
     return [
         *(_run_lines(results["origin"]) if results.get("origin") else []),
         f"- `{' '.join(['python train.py', *overrides])}`:",
-        f"  {run['update']} updates of {most}{config['batch_size']} synthetic problems, "
-        f"{run['skipped']} of them skipped;",
+        f"  {run['update']} updates of {most}{config['batch_size']} {kind}problems, {run['skipped']} of them skipped;",
         f"  {run['updates_per_second']:.1f} updates per second, peak memory {run['peak_memory_mib']:.0f} MiB,",
         f"  {made['threads']} thread(s) of {made['cpu']};",
         f"  {_mix(config['data']['train'], config['model']['n'])}.",
@@ -373,6 +404,13 @@ def write_model_card(folder: str | Path, results: Mapping[str, Any], *, name: st
         ValueError: when they are no such results.
         OSError: when the file cannot be written.
     """
+    card = _card(results, name)
+    with atomic_open(Path(folder) / _CARD_NAME, "wb") as file:
+        file.write(card)
+
+
+def _card(results: Mapping[str, Any], name: str | None) -> bytes:
+    """The model card of some results; raises a ``ValueError`` when they are no such results."""
     wrong = _wrong(results)
     if wrong is not None:
         raise ValueError(f"No results of a run: {wrong} is missing or not what it has to be.")
@@ -387,7 +425,7 @@ def write_model_card(folder: str | Path, results: Mapping[str, Any], *, name: st
         hypotheses = f"{model['init']['starts']} of its own and the best of {model['init']['samples']} P3P samples"
         what, guesses = "A network for any number of pairs", f"\nfrom several guesses, {hypotheses}"
     lines = [
-        f"# {name or config.get('name', kind)}",
+        f"# {name or config.get('name') or kind or 'PnPNet'}",
         "",
         f"{what} and m = {m} iterations of robust weighted LM{guesses}",
         "(Sheffer and Wiesel, PnP-Net, 2020). Apache-2.0. Written from `results.json`, which has the configuration.",
@@ -419,6 +457,12 @@ def write_model_card(folder: str | Path, results: Mapping[str, Any], *, name: st
         ]
         for i, (step, damping, shape) in enumerate(zip(*(learned[key] for key in _LEARNED), strict=True), 1):
             lines.append(f"| {i} | {step:.3f} | {damping:.2e} | {shape:.3f} |")
+    rotations = (
+        "Rotations within about a quarter turn of the identity",
+        ("(the world's axes roughly the camera's), which is the training's prior."),
+    )
+    if not all(map(_is_synthetic, _targets(config["data"]["train"]))):
+        rotations = "Rotations", "and points as in the training, too."
     centred = model["normalize"]["center"] and model["normalize"]["scale"]
     lines += ["", "## Limits", ""]
     if kind == "SetInit":
@@ -429,11 +473,10 @@ def write_model_card(folder: str | Path, results: Mapping[str, Any], *, name: st
         ]
     else:
         lines += [
-            f"{scope} {n} pairs, with wrong ones as in the training. "
-            "Rotations within about a quarter turn of the identity",
-            "(the world's axes roughly the camera's), which is the training's prior. The world's unit and origin "
+            f"{scope} {n} pairs, with wrong ones as in the training. " + rotations[0],
+            rotations[1]
+            + " The world's unit and origin "
             + ("do not matter." if centred else "must be the training's."),
             "",
         ]
-    with atomic_open(Path(folder) / "README.md") as file:
-        file.write("\n".join(lines))
+    return "\n".join(lines).encode()

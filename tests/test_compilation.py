@@ -138,6 +138,20 @@ def test_without_a_compiler_it_runs_as_it_is(monkeypatch):
 compile_ = torch.compile
 
 
+def test_what_recompiling_warns_of_is_no_reason_to_stop(backend):
+    """PyTorch warns of a tensor that is no leaf of the graph, which is the pose that an iteration begins with."""
+    solver, eager = create_solver("identity-lm", m=1), create_solver("identity-lm", m=1)
+    solver.compile()
+    world, img, intrinsics = problems(3)[:3]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", ".*should not be instantiated", DeprecationWarning)
+        for img_points in (img, img.clone().requires_grad_() * 1.0):  # of the same shape, but with a gradient
+            assert_same(
+                solver(world, img_points, intrinsics), eager(world, img_points, intrinsics), rtol=1e-6, atol=1e-6
+            )
+
+
 def test_errors_of_the_caller_are_the_callers(backend):
     solver = create_solver("pnpnet-n9")
     solver.compile()

@@ -6,6 +6,7 @@ import io
 import json
 import os
 import warnings
+from functools import partial
 
 import numpy as np
 import pytest
@@ -369,12 +370,9 @@ def functions_of_tensors():
     result, guess = SOLVERS["pnpnet-set"].with_guess(*problems[:3])
     inputs, both, each = problems[:3], (*result.pose, *problems.pose), torch.full((3, 9), 0.5)
 
-    def loss(a, b, c, d):
-        outcome, truth = (
-            result._replace(rotation=a, init=Pose(b, result.translation)),
-            problems._replace(pose=Pose(c, d)),
-        )
-        return PoseLoss()(outcome, truth), SetLoss()(outcome, truth, 1.0, guess)
+    def loss(function, *parts):
+        outcome = result._replace(rotation=parts[0], translation=parts[1], init=Pose(*parts[2:4]))
+        return function(outcome, problems._replace(pose=Pose(*parts[4:])))
 
     def covariance(a, b, world, img, camera, sigma, length, weights):
         return pose_covariance(Pose(a, b), world, img, camera, img_sigma=sigma, world_sigma=length, weights=weights)
@@ -388,7 +386,11 @@ def functions_of_tensors():
         "pose_distances": (lambda a, b, c, d: pose_distances(Pose(a, b), Pose(c, d)), both),
         "success": (lambda a, b, c: success(PoseErrors(a, b), 1.0, c), torch.ones(3, 3).unbind()),
         "reliability": (reliability, (each, each > 0.2)),
-        "losses": (loss, (result.rotation, result.init.rotation, *problems.pose)),
+        "PoseLoss": (partial(loss, PoseLoss()), (*result.pose, *result.init, *problems.pose)),
+        "SetLoss": (
+            partial(loss, partial(SetLoss(), ramp=1.0, guess=guess)),
+            (*result.pose, *result.init, *problems.pose),
+        ),
     }
 
 

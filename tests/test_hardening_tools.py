@@ -12,6 +12,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from kornia.core.exceptions import BaseError
 from test_hardening import SOLVERS, WORDS, batches, check, damage, many, run_main, same
 from test_hardening_parts import ANY, ERRORS, WORD, Seen, finite, names_the_file, options, places_in, poses, spoiled
 
@@ -54,8 +55,7 @@ def test_bounds_take_anything(tally, case, data, bound):
     batch, count = inputs[0].shape[:2]
     inliers = torch.rand(batch, count, generator=torch.Generator().manual_seed(batch)) > 0.3
     problems = Problems(*inputs, data.draw(poses(batch, inputs[0].dtype)), inliers)
-    # What is no inlier is not looked at, and the first pair is the one that is spoiled.
-    kinds = [kind if first else "nothing" for kind, first in zip(kinds, inliers[:, :1].all(1), strict=True)]
+    inliers[:, 0] = True  # the one that is spoiled
     check(bound.solve_with_truth(problems), inputs, kinds, tally)
 
 
@@ -84,9 +84,8 @@ def test_counted_solvers_are_the_same_solvers(tally, name, case):
     assert all(0 <= x.flops < math.inf for x in counter.counts.values())
     if len(inputs[0]):
         assert counter.counts[""].flops > 0
-    if name != "p3p-ransac":
-        for ours, plain in zip(result[:5], SOLVERS[name](*inputs, weights=weights, mask=mask)[:5], strict=True):
-            assert ours.equal(plain)
+    for ours, plain in zip(result[:5], SOLVERS[name](*inputs, weights=weights, mask=mask)[:5], strict=True):
+        assert ours.equal(plain)
 
 
 SIZES = st.integers(1, 6)
@@ -218,7 +217,7 @@ def test_damaged_runs_are_an_error_of_ours(tally, tmp_path):
     outcomes = Counter()
 
     @many(100)
-    @given(st.sampled_from(sorted(files)), st.data(), st.booleans(), st.sampled_from([100, 1, 0, -1, 0.5]))
+    @given(st.sampled_from(sorted(files)), st.data(), st.booleans(), st.sampled_from([100, 3, 2, 1]))
     def run(name, data, last, most_rows):
         tally("files", "`collect_weights` of damaged runs: all of it, or one error and nothing")
         (spoilt / name).write_bytes(data.draw(damage(files[name])))
@@ -237,6 +236,9 @@ def test_damaged_runs_are_an_error_of_ours(tally, tmp_path):
 
     run()
     assert min(outcomes["refused"], outcomes["works"]) >= 5
+    for most_rows in (0, -1, 0.5, math.nan):
+        with pytest.raises(BaseError):
+            collect_weights([sound], tmp_path / "none", most_rows=most_rows)
     with pytest.raises(ValueError, match="at least one run"):
         collect_weights([], tmp_path / "none")
     (spoilt / "history.csv").unlink()
@@ -253,7 +255,10 @@ REPORT = FitReport(0, 100, 0, False, 10.0, 10.0, {"data": 0.5, "forward": 0.5}, 
     st.integers(0, 3), st.sampled_from([0, 1, 4]), st.booleans(), st.booleans(), st.lists(WORD, max_size=3), st.data()
 )
 def test_results_of_any_run_make_a_card_and_a_summary(tally, tmp_path_factory, sets, m, network, told, words, data):
-    tally("files", "`run_results` of any solver and sets, its card and its row in a summary: read as they were written")
+    tally(
+        "files",
+        "`run_results` of some solvers and any sets, its card and its row in a summary: as they were written",
+    )
     folder = tmp_path_factory.mktemp("run")
     model = PnPNet(MLPInit(9) if network else None, RobustWeightedLM(m))
     source = {"_target_": data.draw(st.sampled_from(["kornia_pnpnet.data.SyntheticProblems", "mine.Source"]))}
@@ -263,7 +268,7 @@ def test_results_of_any_run_make_a_card_and_a_summary(tally, tmp_path_factory, s
         size, noise = data.draw(st.integers(1, 3)), (0.01, 0.05) if told else 0.05
         problems = SyntheticProblems(n=9, batch_size=size, seed=i, outliers=OutlierMix(), world_sigma=noise).batch(0)
         validation[f"set {i}"] = problems
-    config = {"batch_size": 8, "model": {"n": 9}, "name": data.draw(st.none() | WORD)}
+    config = {"batch_size": 8, "model": {"n": 9}, "name": data.draw(st.sampled_from([None, "drone"]))}
     config["data"] = {"train": source, "validation": dict.fromkeys(validation, source)}
     make = partial(run_results, model, validation, REPORT, config, [*words, "~x", "+a.b=1", "c=d=e"])
     if not sets:
@@ -275,8 +280,11 @@ def test_results_of_any_run_make_a_card_and_a_summary(tally, tmp_path_factory, s
     assert load_run(folder / "results.json") == json.loads(json.dumps(results))
     write_model_card(folder, results)
     card = (folder / "README.md").read_text()
+    assert card.startswith(f"# {config['name'] or ('MLPInit' if network else 'PnPNet')}\n")
     assert all(name in card for name in validation)
-    assert ("mine.Source" in card) == (source["_target_"] == "mine.Source")
+    own = "mine.Source" in str(source) or "mine.Mix" in str(source)
+    assert ("from mine." in card) == own
+    assert ("synthetic problems" in card) == (not own)
     summary = summarize_runs(folder).read_text()
     assert "d=e" in summary
 
@@ -308,8 +316,9 @@ def test_any_content_is_written_whole_or_not_at_all(tally, tmp_path_factory, con
 
 
 def test_trainings_of_any_length(tally, tmp_path):
-    made = Seen(tally, "`train_briefly` for any number of seconds; what is refused leaves the old run as it was")
-    history = tmp_path / "history.csv"
+    made = Seen(tally, "`train_briefly` for seconds that are none; the old run stays as it was")
+    history, checkpoint = tmp_path / "history.csv", tmp_path / "last.ckpt"
+    checkpoint.write_bytes(b"old")
 
     @many(20)
     @given(st.sampled_from([0.0, -1.0, math.nan, math.inf, -math.inf, None, "1", True, [1.0]]))
@@ -317,6 +326,7 @@ def test_trainings_of_any_length(tally, tmp_path):
         history.write_text("old")
         made(lambda: train_briefly(seconds, tmp_path, progress=False))
         assert history.read_text() == "old"
+        assert checkpoint.read_bytes() == b"old"
 
     run()
     made(lambda: train_briefly(1e-6, tmp_path, progress=False))
@@ -422,12 +432,15 @@ def test_any_arguments_of_other_commands_are_a_line_and_no_traceback(tally, tmp_
     @many(80)
     @given(st.sampled_from(sorted(COMMANDS)), st.data())
     def run(name, data):
-        tally("files", "other commands with any arguments: what they are for, or one line of error")
+        tally(
+            "files",
+            "`pnpnet evaluate`, `figures`, `export`, `list`, `demo` with any arguments: at most one line of error",
+        )
         quick, may = COMMANDS[name]
         pairs = data.draw(st.lists(st.tuples(st.sampled_from(may.split()), SAID), max_size=2))
         files = data.draw(st.lists(SAID, max_size=1))
         code, out, err = run_main(name, *quick, *(x for pair in pairs for x in pair), *files)
-        codes[code] += 1
+        codes[name, code] += 1
         assert code in (0, 2)
         if code == 2:
             assert err.startswith("pnpnet: ")
@@ -436,7 +449,8 @@ def test_any_arguments_of_other_commands_are_a_line_and_no_traceback(tally, tmp_
             assert out
 
     run()
-    assert min(codes[0], codes[2]) >= 3
+    assert all(codes[name, 2] for name in COMMANDS)
+    assert all(codes[name, 0] for name in ("evaluate", "list", "demo"))  # what others need is not among the words
 
 
 # -- poses and cameras of Kornia ---------------------------------------------------------------------------------------
@@ -455,7 +469,7 @@ def test_cameras_of_kornia_take_anything(tally, case, data, name):
     assert camera.extrinsics.equal(pose.matrix)
     if batch:  # Kornia's quaternions have at least one
         torch.testing.assert_close(pose.se3.matrix(), pose.matrix, rtol=1e-3, atol=1e-3)
-    assert camera.intrinsics[:, :3, :3].equal(matrices) or matrices.isnan().any()
+    torch.testing.assert_close(camera.intrinsics[:, :3, :3], matrices, rtol=0, atol=0, equal_nan=True)
     ours, plain = (SOLVERS[name](world, img, x, weights=weights, mask=mask) for x in (camera, matrices))
-    assert ours.translation.equal(plain.translation)
-    assert ours.ok.equal(plain.ok)
+    for one, other in zip(ours[:5], plain[:5], strict=True):
+        assert one.equal(other)

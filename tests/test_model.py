@@ -1043,3 +1043,32 @@ def test_pairs_of_no_pose_are_not_ok_when_the_noise_is_known(make_problems):
     garbage = solver(p.world_points, p.img_points.roll(1, 0), p.intrinsics, **noise)
     assert garbage.ok.double().mean() < 0.02
     assert solver(*p[:3], **noise).ok.double().mean() > 0.95
+
+
+# --- torch.func ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")  # PyTorch's own, of jvp
+@pytest.mark.parametrize("name", ["pnpnet-set", "pnpnet-n9", "epnp-lm", "reppnp-lm", "identity-lm"])
+def test_transforms_of_torch_func(name, make_problems):
+    """As the page on training loops says: reverse mode for all, forward mode without EPnP, REPPnP and P3P."""
+    world, img, intrinsics = make_problems(9, 3)[:3]
+    solver = create_solver(name)
+
+    def translations(pixels):
+        return solver(world, pixels, intrinsics).translation
+
+    jacobian = torch.func.jacrev(lambda pixels: translations(pixels).sum(0))(img)  # (3, B, N, 2)
+    pixels = img.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(translations(pixels)[:, 2].sum(), pixels)
+    torch.testing.assert_close(jacobian[2], gradient)
+    direction = torch.randn(img.shape, dtype=img.dtype)
+
+    def forward():
+        return torch.func.jvp(translations, (img,), (direction,))[1]
+
+    if name in ("pnpnet-n9", "identity-lm"):
+        torch.testing.assert_close(forward().sum(0), (jacobian * direction).sum((1, 2, 3)), rtol=1e-4, atol=1e-6)
+    else:
+        with pytest.raises(NotImplementedError, match="jvp"):
+            forward()

@@ -26,7 +26,8 @@ def plot_reliability(path: str | Path, curves: Mapping[str, Mapping[str, Sequenc
         The path.
 
     Raises:
-        ValueError: when there is no curve, or one without numbers, or with lists of different lengths.
+        ValueError: when there is no curve, a list is missing or not as long as the others, or the numbers are none that
+            can have been counted, or all 0.
     """
     if not curves:
         raise ValueError("plot_reliability needs at least one curve, got none.")
@@ -34,7 +35,10 @@ def plot_reliability(path: str | Path, curves: Mapping[str, Mapping[str, Sequenc
         lists = [curve.get(key, ()) for key in ("number", "predicted", "observed")]
         counted = all(0 <= count < math.inf for count in lists[0]) and sum(lists[0]) > 0
         if len(set(map(len, lists))) > 1 or not counted:
-            raise ValueError(f"The curve '{name}' needs three lists of one length, of counts that are not all 0 first.")
+            raise ValueError(
+                f"The curve '{name}' needs 'number', 'predicted' and 'observed' of one length, and numbers of "
+                "at least 0 that are not all 0."
+            )
     figure = make_figure(0.72 * WIDTH, 6.0)
     chance, share = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
     chance.plot((0, 1), (0, 1), color=GREY, linewidth=1.0, linestyle=":")
