@@ -154,7 +154,7 @@ class PoseLoss(nn.Module):
         centroid = problems.world_points.mean(1)
         init_rotation, init_translation = _lengths(_at(centroid, _difference(result.init, problems.pose)))
         with torch.set_grad_enabled(torch.is_grad_enabled() and ramp > 0.0):
-            rotation, translation = pose_distances(result.pose, problems.pose)
+            rotation, translation = _lengths(_difference(result.pose, problems.pose))
         init = self.rotation * init_rotation + self.init_translation * init_translation
         refined = self.rotation * rotation + self.translation * translation
         if self.saturation is not None:

@@ -324,17 +324,22 @@ def _rate(entry: Mapping[str, float]) -> str:
 
 def _mix(source: Mapping[str, Any], n: int) -> str:
     """What a data source's configuration says of its wrong pairs and its points, or whose it is."""
-    named = list(dict.fromkeys(_targets(source)))
-    others = [name for name in named if not _is_synthetic(name)]
-    if not others:
+    if _is_synthetic(source):
         with suppress(AttributeError, LookupError, TypeError, ValueError, BaseError):  # of options as they cannot be
             return _our_mix(source, n)
+    named = dict.fromkeys(_targets(source))
+    others = [name for name in named if not _is_ours(name)]
     return f"problems from {' and '.join(others or named)}"
 
 
-def _is_synthetic(name: str) -> bool:
+def _is_ours(name: str) -> bool:
     """Whether a class is one of our synthetic sources, or of what they are made of."""
     return name.startswith("kornia_pnpnet.data.") and not name.endswith(".SceneProblems")
+
+
+def _is_synthetic(source: Mapping[str, Any]) -> bool:
+    """Whether a configuration names none but such classes."""
+    return all(map(_is_ours, _targets(source)))
 
 
 def _targets(config: Any) -> Iterator[str]:
@@ -380,7 +385,7 @@ def _run_lines(results: Mapping[str, Any]) -> list[str]:
     run, config, made = results["run"], results["config"], results["environment"]
     overrides = [entry for entry in results["overrides"] if entry.split("=")[0] not in _HOW_IT_RAN]
     most = "up to " if isinstance(config["data"]["train"].get("n"), list) else ""
-    kind = "synthetic " if all(map(_is_synthetic, _targets(config["data"]["train"]))) else ""
+    kind = "synthetic " if _is_synthetic(config["data"]["train"]) else ""
     return [
         *(_run_lines(results["origin"]) if results.get("origin") else []),
         f"- `{' '.join(['python train.py', *overrides])}`:",
@@ -461,7 +466,7 @@ def _card(results: Mapping[str, Any], name: str | None) -> bytes:
         "Rotations within about a quarter turn of the identity",
         ("(the world's axes roughly the camera's), which is the training's prior."),
     )
-    if not all(map(_is_synthetic, _targets(config["data"]["train"]))):
+    if not _is_synthetic(config["data"]["train"]):
         rotations = "Rotations", "and points as in the training, too."
     centred = model["normalize"]["center"] and model["normalize"]["scale"]
     lines += ["", "## Limits", ""]
