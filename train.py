@@ -16,8 +16,10 @@ from hydra.utils import instantiate
 from kornia.core.exceptions import ValueCheckError
 from omegaconf import DictConfig, OmegaConf
 
-from kornia_pnpnet.model import PnPNet
-from kornia_pnpnet.reports import (
+from kornia_pnpnet.solver import PnPNet
+from kornia_pnpnet.training import describe_shares, fit
+from kornia_pnpnet.training.checkpoint import TrainingError
+from kornia_pnpnet.training.results import (
     RESULTS_NAME,
     find_results,
     load_run,
@@ -26,8 +28,6 @@ from kornia_pnpnet.reports import (
     write_json,
     write_model_card,
 )
-from kornia_pnpnet.runstate import TrainingError
-from kornia_pnpnet.training import describe_shares, fit
 
 log = logging.getLogger("train")
 

@@ -24,7 +24,7 @@ from tasks import (
 from torch import nn
 
 from kornia_pnpnet import PnPNet, RobustWeightedLM
-from kornia_pnpnet.choices import load_solver
+from kornia_pnpnet.evaluation.choices import load_solver
 from kornia_pnpnet.types import Pose, Problems
 
 __all__ = ["ANY", "CONTENDERS", "ONE", "ONE_THREAD", "OURS", "PLAIN", "TRAINED", "WHOLE"]
@@ -118,9 +118,10 @@ class Onnx(Contender):
     def __init__(self, spec: str) -> None:
         import onnxruntime
 
+        from kornia_pnpnet.evaluation.results import source_digest
+
         # Here, since earlier versions of the package, which this file is used with too, do not have them.
         from kornia_pnpnet.export import INPUTS, export_onnx
-        from kornia_pnpnet.results import source_digest
 
         self.names = INPUTS
         path = HERE.parent / "outputs" / "onnx" / f"{spec}-{source_digest()[:16]}.onnx"

@@ -16,7 +16,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from kornia_pnpnet import PnPNet, RobustWeightedLM, create_solver
-from kornia_pnpnet.complexity import Operations, operations_by_part
+from kornia_pnpnet.evaluation.operations import Operations, operations_by_part
 
 __all__ = ["GPU", "measure_engine"]
 

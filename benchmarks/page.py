@@ -25,7 +25,7 @@ from tasks import COARSE_ANGLE_DEG, COARSE_SHIFT
 from throughput import BACKWARD, FORWARD
 from versions import load_versions
 
-from kornia_pnpnet.files import atomic_open
+from kornia_pnpnet.core.files import atomic_open
 
 __all__ = ["PAGE", "page", "render"]
 
@@ -179,7 +179,7 @@ def load_parts(folder: Path) -> tuple[dict[str, Any], dict[str, Any] | None]:
 
 def render(folder: Path, path: Path) -> None:
     """Write the page and its pictures from the results files of a folder."""
-    from kornia_pnpnet.figures.performance import plot_latency, plot_times
+    from kornia_pnpnet.evaluation.figures.performance import plot_latency, plot_times
 
     results, gpu = load_parts(folder)
     rows = [row for row in results["throughput"]["rows"] if row["threads"] == 1 and "@" not in row["contender"]]

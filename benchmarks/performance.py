@@ -22,8 +22,8 @@ from settings import FULL, QUICK, Settings
 from startup import measure_startup
 from tables import PARTS
 
-from kornia_pnpnet.environment import environment
-from kornia_pnpnet.results import save_results
+from kornia_pnpnet.core.environment import environment
+from kornia_pnpnet.evaluation.results import save_results
 
 # What is measured on one thread and on two, each in a process of its own: compiled code is made for the threads that
 # there are.

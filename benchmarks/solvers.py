@@ -21,11 +21,11 @@ from others import bare_call
 from torch import nn
 
 from kornia_pnpnet import pose_errors, success, success_rate
-from kornia_pnpnet.choices import load_solver
+from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
-from kornia_pnpnet.environment import environment
 from kornia_pnpnet.evaluation import draw_problems
-from kornia_pnpnet.results import save_results
+from kornia_pnpnet.evaluation.choices import load_solver
+from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.types import Problems
 
 # Nothing was trained, tuned or looked at with these problems before.
@@ -151,7 +151,7 @@ def measure(specs: Sequence[str], *, count: int, repeats: int, memory_count: int
     """Measure everything, with a line on standard error for each step.
 
     Args:
-        specs: solvers, as :func:`kornia_pnpnet.choices.load_solver` takes them. Those whose package is not installed
+        specs: solvers, as :func:`load_solver` takes them. Those whose package is not installed
             are skipped.
         count: problems in a batch.
         repeats: rounds.

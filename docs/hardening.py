@@ -16,8 +16,8 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from kornia_pnpnet.environment import environment
-from kornia_pnpnet.reports import write_json
+from kornia_pnpnet.core.environment import environment
+from kornia_pnpnet.training.results import write_json
 
 HERE = Path(__file__).resolve().parent
 RESULTS, PAGE = HERE / "results" / "hardening.json", HERE / "hardening.md"

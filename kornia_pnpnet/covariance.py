@@ -7,7 +7,7 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from kornia_pnpnet.checks import Shapes, check_devices, check_shapes
+from kornia_pnpnet.core.checks import Shapes, check_devices, check_shapes
 from kornia_pnpnet.geometry import normal_equations, pixel_variance, project
 from kornia_pnpnet.types import Correspondences, Noise, Pose, camera_matrices
 

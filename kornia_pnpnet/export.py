@@ -11,11 +11,11 @@ import torch
 from kornia.core.exceptions import ValueCheckError
 from torch import Tensor, nn
 
-from kornia_pnpnet.checks import check_whole
+from kornia_pnpnet.core.checks import check_whole
+from kornia_pnpnet.core.files import atomic_open
 from kornia_pnpnet.data import SyntheticProblems
-from kornia_pnpnet.files import atomic_open
 from kornia_pnpnet.init import MLPInit
-from kornia_pnpnet.model import PnPNet
+from kornia_pnpnet.solver import PnPNet
 
 __all__ = ["INPUTS", "OUTPUTS", "export_onnx", "export_program"]
 

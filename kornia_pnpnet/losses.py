@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from kornia_pnpnet.checks import check_numbers, check_poses, check_positive, check_whole
+from kornia_pnpnet.core.checks import check_numbers, check_poses, check_positive, check_whole
 from kornia_pnpnet.geometry import transform
 from kornia_pnpnet.types import Guess, Noise, PnPResult, Pose, Problems
 
@@ -223,7 +223,7 @@ class SetLoss(nn.Module):
             result: of :math:`B` problems.
             problems: what was solved, with the true poses.
             ramp: factor of the refined terms, 0 at the start of the training. Then no gradient goes through them.
-            guess: what the result was refined from, see :meth:`~kornia_pnpnet.model.PnPNet.with_guess`.
+            guess: what the result was refined from, see :meth:`~kornia_pnpnet.solver.PnPNet.with_guess`.
 
         Returns:
             The loss and its terms, means over the batch.

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_pnpnet.checks import check_devices, check_poses, check_whole
+from kornia_pnpnet.core.checks import check_devices, check_poses, check_whole
 from kornia_pnpnet.geometry import rotation_angle
 from kornia_pnpnet.types import Pose
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from kornia_pnpnet.checks import check_positive
+from kornia_pnpnet.core.checks import check_positive
 from kornia_pnpnet.geometry import MIN_DEPTH_RATIO
 from kornia_pnpnet.types import Correspondences, Pose
 

@@ -13,9 +13,10 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
 from kornia_pnpnet.init import P3P, RANSAC, EPnP, REPPnP, SubsetSolver
-from kornia_pnpnet.lm import RobustWeightedLM
-from kornia_pnpnet.model import PnPNet, shipped_weights
 from kornia_pnpnet.normalize import Normalize
+from kornia_pnpnet.pretrained import shipped_weights
+from kornia_pnpnet.refine.lm import RobustWeightedLM
+from kornia_pnpnet.solver import PnPNet
 
 __all__ = ["create_solver", "list_solvers", "solve_pnp"]
 
@@ -117,7 +118,7 @@ def create_solver(name: str, **options: Any) -> nn.Module:
         name: one of :func:`list_solvers`.
         options: of that solver: ``m``, the number of iterations, of ``identity-lm``, every ``-lm`` and trained weights
             (at most their own); ``views``, the guesses for each problem, of trained weights (see
-            :class:`~kornia_pnpnet.model.PnPNet`); the arguments of :class:`~kornia_pnpnet.init.EPnP` of ``epnp`` and
+            :class:`~kornia_pnpnet.solver.PnPNet`); the arguments of :class:`~kornia_pnpnet.init.EPnP` of ``epnp`` and
             ``epnp-lm``, of :class:`~kornia_pnpnet.init.REPPnP` of ``reppnp`` and ``reppnp-lm``, of
             :class:`~kornia_pnpnet.init.RANSAC` of ``p3p-ransac`` and ``ransac-epnp-lm``, and of the classes of
             :mod:`kornia_pnpnet.peers`.

@@ -15,6 +15,8 @@ from kornia.geometry.conversions import Rt_to_matrix4x4
 from kornia.geometry.liegroup import Se3
 from torch import Tensor
 
+from kornia_pnpnet.core.trees import map_tensors
+
 __all__ = ["Correspondences", "Guess", "Hypotheses", "Noise", "PnPResult", "Pose", "Problems", "Refinement"]
 
 
@@ -108,12 +110,8 @@ class Correspondences(NamedTuple):
     noise: Noise | None = None
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Correspondences:
-        """Apply a function to points, pixels, weights, focal length and noise; the scales stay."""
-        noise = None if self.noise is None else Noise(function(self.noise.img), function(self.noise.world))
-        world_points, img_points, weights, focal = map(function, self[:4])
-        return self._replace(
-            world_points=world_points, img_points=img_points, weights=weights, focal=focal, noise=noise
-        )
+        """Apply a function to every tensor."""
+        return map_tensors(function, self)
 
 
 class Guess(NamedTuple):
@@ -172,7 +170,7 @@ class PnPResult(NamedTuple):
         rotation: world-to-camera rotation, shape :math:`(B, 3, 3)`.
         translation: world-to-camera translation in the unit of the world points, shape :math:`(B, 3)`.
         weights: final weight of each pair, in the order in which the pairs were given, shape :math:`(B, N)`.
-        cost: mean robust loss of the pairs, in the kernel's unit (see :mod:`kornia_pnpnet.robust`), shape
+        cost: mean robust loss of the pairs, in the kernel's unit (see :mod:`kornia_pnpnet.refine.kernels`), shape
             :math:`(B,)`. Comparable between problems solved by the same solver.
         ok: whether the pose can be used, bool, shape :math:`(B,)`. Where it is false the fields above are finite and
             carry no gradient.
@@ -207,9 +205,10 @@ class Problems(NamedTuple):
         intrinsics: camera matrices, shape :math:`(B, 3, 3)`.
         pose: the true world-to-camera pose.
         inliers: whether the pixel of a pair belongs to its point, bool, shape :math:`(B, N)`.
-        img_sigma: standard deviation of the noise on each pixel coordinate, NaN where a solver is not told, shape
-            :math:`(B,)`; ``None``: no solver is told.
-        world_sigma: likewise of each world coordinate.
+        img_sigma: standard deviation of the noise on each pixel coordinate, as a solver may know it: NaN where it is
+            unknown, ``None`` where it is unknown for all problems, shape :math:`(B,)`.
+        world_sigma: standard deviation of the noise on each world coordinate, NaN and ``None`` as for ``img_sigma``,
+            shape :math:`(B,)`.
     """
 
     world_points: Tensor
@@ -221,13 +220,11 @@ class Problems(NamedTuple):
     world_sigma: Tensor | None = None
 
     @property
-    def told(self) -> dict[str, Tensor]:
-        """What a solver is told of the noise, as arguments of its call."""
+    def sigmas(self) -> dict[str, Tensor]:
+        """The known standard deviations, as keyword arguments of a solver's call."""
         sigmas = {"img_sigma": self.img_sigma, "world_sigma": self.world_sigma}
         return {name: sigma for name, sigma in sigmas.items() if sigma is not None}
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Problems:
         """Apply a function to every tensor, for example to slice the batch or to move it to another device."""
-        world, img, intrinsics, rotation, translation, inliers = map(function, (*self[:3], *self.pose, self.inliers))
-        sigmas = (None if x is None else function(x) for x in self[5:])
-        return Problems(world, img, intrinsics, Pose(rotation, translation), inliers, *sigmas)
+        return map_tensors(function, self)

@@ -18,7 +18,7 @@ import torch
 from torch import nn
 
 from kornia_pnpnet import create_solver, pose_errors
-from kornia_pnpnet.complexity import operation_count
+from kornia_pnpnet.evaluation.operations import operation_count
 
 FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"
 PATH = FOLDER / "solvers.py"

@@ -15,12 +15,12 @@ import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import nn
 
-import kornia_pnpnet.model
+import kornia_pnpnet.solver
 from kornia_pnpnet import MLPInit, PnPNet, RobustWeightedLM, create_solver, list_solvers
-from kornia_pnpnet.choices import BOUNDS, default_solvers
-from kornia_pnpnet.cli import main
-from kornia_pnpnet.evaluation import load_results, save_results
-from kornia_pnpnet.pairs import rejection_limit, reprojections
+from kornia_pnpnet.cli.main import main
+from kornia_pnpnet.cli.pairs import rejection_limit, reprojections
+from kornia_pnpnet.evaluation.choices import BOUNDS, default_solvers
+from kornia_pnpnet.evaluation.comparison import load_results, save_results
 from kornia_pnpnet.types import Pose
 
 CAMERA = "800,810,320,240"
@@ -57,7 +57,7 @@ def weights_folder(tmp_path):
 def shipped(tmp_path, monkeypatch):
     """Pretend that untrained weights pnpnet-n9 come with the package."""
     PnPNet(MLPInit(n=9), RobustWeightedLM(m=5)).save_pretrained(tmp_path / "shipped" / "pnpnet-n9")
-    monkeypatch.setattr(kornia_pnpnet.model, "WEIGHTS_FOLDER", tmp_path / "shipped")
+    monkeypatch.setattr(kornia_pnpnet.solver, "WEIGHTS_FOLDER", tmp_path / "shipped")
 
 
 def run(capsys, *arguments) -> tuple[int, str, str]:
@@ -173,7 +173,7 @@ def test_default_solver_is_the_shipped_one_for_that_n(capsys, csv_file, shipped)
 
 
 def test_default_solver_without_weights_says_so(capsys, csv_file, tmp_path, monkeypatch):
-    monkeypatch.setattr(kornia_pnpnet.model, "WEIGHTS_FOLDER", tmp_path / "none")
+    monkeypatch.setattr(kornia_pnpnet.solver, "WEIGHTS_FOLDER", tmp_path / "none")
     code, out, err = run(capsys, "solve", csv_file, "--intrinsics", CAMERA)
     assert code == 0
     assert json.loads(out)["solver"] == "identity-lm"
@@ -406,7 +406,7 @@ def test_evaluate_writes_what_it_prints(capsys, tmp_path, shipped):
 
 
 def test_the_same_command_continues_and_another_is_refused(capsys, tmp_path, monkeypatch):
-    monkeypatch.setattr("kornia_pnpnet.evaluation.source_digest", lambda: "edited by nobody meanwhile")
+    monkeypatch.setattr("kornia_pnpnet.evaluation.comparison.source_digest", lambda: "edited by nobody meanwhile")
     out_file = tmp_path / "results.json"
     common = ("evaluate", "--problems", 5, "--out", out_file, "--outliers", "none")
     assert run(capsys, *common, "--solver", "identity-lm", "--n", "6")[0] == 0
@@ -442,7 +442,7 @@ def test_interrupting_an_evaluation_says_how_to_go_on(capsys, tmp_path, monkeypa
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("kornia_pnpnet.evaluation.evaluate", interrupt)
+    monkeypatch.setattr("kornia_pnpnet.evaluation.comparison.evaluate", interrupt)
     out_file = tmp_path / "results.json"
     code, out, err = run(capsys, "evaluate", "--problems", 5, "--solver", "identity-lm", "--out", out_file)
     assert (code, out, err) == (130, "", f"pnpnet: interrupted; the same command continues {out_file}\n")
@@ -537,7 +537,7 @@ def test_an_error_in_a_solver_says_where(capsys, tmp_path, monkeypatch):
         def forward(self, *_):
             raise ValueError("a bad\nday")
 
-    monkeypatch.setattr("kornia_pnpnet.cli.load_solver", lambda name: Broken())
+    monkeypatch.setattr("kornia_pnpnet.cli.main.load_solver", lambda name: Broken())
     arguments = ("--problems", 5, "--outliers", "none", "--solver", "broken", "--out", tmp_path / "results.json")
     code, _, err = run(capsys, "evaluate", *arguments)
     assert (code, err) == (2, "pnpnet: a bad day (broken on synthetic, n = 9, 0 outliers)\n")
@@ -603,9 +603,9 @@ def test_demo_compares_trains_and_draws(capsys, tmp_path, shipped, monkeypatch):
         (folder / "history.csv").write_text(f"{columns}\n1,1,1,1,1,1,0.25\n2,1,1,1,1,1,\n3,1,1,1,1,1,0.5\n")
         return folder / "history.csv"
 
-    training = ModuleType("kornia_pnpnet.training")
+    training = ModuleType("kornia_pnpnet.training.loop")
     training.train_briefly = train_briefly
-    monkeypatch.setitem(sys.modules, "kornia_pnpnet.training", training)
+    monkeypatch.setitem(sys.modules, "kornia_pnpnet.training.loop", training)
     folder = tmp_path / "demo"
     code, out, err = run(capsys, "demo", "--out", folder, "--problems", 20, "--train-seconds", 3)
     assert (code, err) == (0, "")
@@ -624,7 +624,7 @@ def test_interrupting_is_one_line(capsys, monkeypatch):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("kornia_pnpnet.cli.list_solvers", interrupt)
+    monkeypatch.setattr("kornia_pnpnet.cli.main.list_solvers", interrupt)
     assert run(capsys, "list") == (130, "", "pnpnet: interrupted\n")
 
 
@@ -636,7 +636,7 @@ def test_version(capsys):
 
 
 def test_the_command_as_a_process(csv_file):
-    code = "import sys; from kornia_pnpnet.cli import main; sys.exit(main())"
+    code = "import sys; from kornia_pnpnet.cli.main import main; sys.exit(main())"
     arguments = ["solve", str(csv_file), "--intrinsics", CAMERA, "--solver", "identity-lm"]
     command = [sys.executable, "-W", "error", "-c", code, *arguments]
     solved = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)

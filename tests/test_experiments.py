@@ -11,7 +11,7 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from kornia_pnpnet.robust import KERNELS
+from kornia_pnpnet.refine.kernels import KERNELS
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 FILES = {path.stem: path for path in sorted((CONF / "experiment").glob("*.yaml"))}

@@ -16,7 +16,14 @@ pytest.importorskip("matplotlib")
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from kornia_pnpnet.figures import plot_errors, plot_pose, plot_reliability, plot_success, plot_sweep, plot_training
+from kornia_pnpnet.evaluation.figures import (
+    plot_errors,
+    plot_pose,
+    plot_reliability,
+    plot_success,
+    plot_sweep,
+    plot_training,
+)
 
 
 def fake_results(solvers: int = 3, sets: int = 2, shift: float = 0.0) -> dict:
@@ -252,9 +259,9 @@ def test_sweeps_that_cannot_be_drawn(tmp_path, change, message):
 
 def test_no_pyplot_and_no_matplotlib_without_figures():
     code = (
-        "import sys, kornia_pnpnet, kornia_pnpnet.cli\n"
+        "import sys, kornia_pnpnet, kornia_pnpnet.cli.main\n"
         "assert not {'matplotlib', 'cv2', 'pycolmap', 'hydra', 'lightning_fabric'} & set(sys.modules)\n"
-        "import kornia_pnpnet.figures\n"
+        "import kornia_pnpnet.evaluation.figures\n"
         "assert 'matplotlib.pyplot' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
@@ -262,6 +269,6 @@ def test_no_pyplot_and_no_matplotlib_without_figures():
 
 def test_without_matplotlib_the_error_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    monkeypatch.delitem(sys.modules, "kornia_pnpnet.figures")
+    monkeypatch.delitem(sys.modules, "kornia_pnpnet.evaluation.figures")
     with pytest.raises(ImportError, match=r"pip install 'kornia_pnpnet\[eval\]'"):
-        importlib.import_module("kornia_pnpnet.figures")
+        importlib.import_module("kornia_pnpnet.evaluation.figures")

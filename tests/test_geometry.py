@@ -28,7 +28,7 @@ from kornia_pnpnet.geometry import (
     rotation_angle,
     transform,
 )
-from kornia_pnpnet.lm import lm_step
+from kornia_pnpnet.refine.lm import lm_step
 
 FOCAL = torch.tensor(3400.0, dtype=torch.float64)
 

@@ -17,8 +17,8 @@ import torch
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from kornia.core.exceptions import BaseError
-from test_api import reference_modules
-from test_colmap import make_scene, match_arrays, write_model
+from test_data_colmap import make_scene, match_arrays, write_model
+from test_docs import reference_modules
 from test_hardening import INF, NAN, batches, damage, many, numbers, run_main
 
 from kornia_pnpnet import (
@@ -38,7 +38,6 @@ from kornia_pnpnet import (
     success,
     success_rate,
 )
-from kornia_pnpnet.complexity import SOLVERS, complexity_results, operation_count
 from kornia_pnpnet.data import (
     BoxPoints,
     MixedProblems,
@@ -52,7 +51,9 @@ from kornia_pnpnet.data import (
     load_matches,
     load_scene,
 )
-from kornia_pnpnet.figures import plot_pose, plot_sweep, plot_training
+from kornia_pnpnet.evaluation.figures import plot_pose, plot_sweep, plot_training
+from kornia_pnpnet.evaluation.operations import SOLVERS, complexity_results, operation_count
+from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.geometry import (
     additive_tangent_map,
     normal_equations,
@@ -64,13 +65,12 @@ from kornia_pnpnet.geometry import (
     transform,
 )
 from kornia_pnpnet.init import P3P, RANSAC, EPnP, REPPnP, SubsetSolver, p3p
-from kornia_pnpnet.lm import BACKWARDS, BoundedParameter, explains, lm_step, solve_damped
 from kornia_pnpnet.losses import pose_distances
 from kornia_pnpnet.metrics import reliability
 from kornia_pnpnet.peers import OpenCVPnP, OpenCVRansac, OpenCVUsac, PeerSolver, PoseLib, PyColmap
-from kornia_pnpnet.results import save_results
-from kornia_pnpnet.robust import KERNELS
-from kornia_pnpnet.training import TrainSettings
+from kornia_pnpnet.refine.kernels import KERNELS
+from kornia_pnpnet.refine.lm import BACKWARDS, BoundedParameter, explains, lm_step, solve_damped
+from kornia_pnpnet.training.loop import TrainSettings
 from kornia_pnpnet.types import Noise
 
 ERRORS = BaseError, ValueError
@@ -406,7 +406,7 @@ SOURCE = options(
     half_image=ANY,
     img_sigma=SIGMAS,
     world_sigma=SIGMAS,
-    told=ANY,
+    known_noise=ANY,
 )
 
 

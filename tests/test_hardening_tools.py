@@ -17,14 +17,21 @@ from test_hardening import SOLVERS, WORDS, batches, check, damage, many, run_mai
 from test_hardening_parts import ANY, ERRORS, WORD, Seen, finite, names_the_file, options, places_in, poses, spoiled
 
 from kornia_pnpnet import MLPInit, PnPNet, RobustWeightedLM, create_solver
-from kornia_pnpnet.bounds import KnownInliers, KnownInliersAndNoise
-from kornia_pnpnet.complexity import OperationCounter, count_per_problem
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
-from kornia_pnpnet.evaluation import SeesTruth
+from kornia_pnpnet.evaluation.bounds import KnownInliers, KnownInliersAndNoise
+from kornia_pnpnet.evaluation.comparison import SeesTruth
+from kornia_pnpnet.evaluation.figures import (
+    plot_against_m,
+    plot_against_n,
+    plot_mismatches,
+    plot_reliability,
+    plot_scenes,
+)
+from kornia_pnpnet.evaluation.operations import OperationCounter, count_per_problem
 from kornia_pnpnet.export import export_onnx, export_program
-from kornia_pnpnet.figures import plot_against_m, plot_against_n, plot_mismatches, plot_reliability, plot_scenes
-from kornia_pnpnet.model import WEIGHTS_FOLDER
-from kornia_pnpnet.reports import (
+from kornia_pnpnet.pretrained import WEIGHTS_FOLDER
+from kornia_pnpnet.training.loop import FitReport, train_briefly
+from kornia_pnpnet.training.results import (
     collect_weights,
     find_results,
     load_run,
@@ -33,7 +40,6 @@ from kornia_pnpnet.reports import (
     write_json,
     write_model_card,
 )
-from kornia_pnpnet.training import FitReport, train_briefly
 from kornia_pnpnet.types import Problems
 
 # It would hide what failed.

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from kornia_pnpnet import Correspondences
-from kornia_pnpnet.init.control_points import align, control_points
+from kornia_pnpnet.init.epnp.control_points import align, control_points
 
 FLAT = torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
 

@@ -10,15 +10,15 @@ from kornia.core.exceptions import BaseError
 from kornia_pnpnet import Correspondences, Normalize, PnPNet, Pose, RobustWeightedLM
 from kornia_pnpnet.data import SyntheticProblems
 from kornia_pnpnet.geometry import transform
-from kornia_pnpnet.init.control_points import control_points
-from kornia_pnpnet.init.depths import (
+from kornia_pnpnet.init.epnp.control_points import control_points
+from kornia_pnpnet.init.epnp.depths import (
     attach_gradient,
     control_points_in_camera,
     depth_system,
     four_cases,
     minimize,
 )
-from kornia_pnpnet.init.epnp import EPnP, best_case
+from kornia_pnpnet.init.epnp.epnp import EPnP, best_case
 from kornia_pnpnet.metrics import pose_errors, success
 
 DTYPES = (torch.float32, torch.float64)

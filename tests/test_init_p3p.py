@@ -13,8 +13,8 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
 from kornia_pnpnet import Correspondences, Pose
 from kornia_pnpnet.data import SyntheticProblems
-from kornia_pnpnet.init.law_of_cosines import distances
-from kornia_pnpnet.init.p3p import P3P, p3p
+from kornia_pnpnet.init.ransac.law_of_cosines import distances
+from kornia_pnpnet.init.ransac.p3p import P3P, p3p
 from kornia_pnpnet.types import Hypotheses
 
 DTYPES = (torch.float64, torch.float32)

@@ -14,11 +14,11 @@ from torch import nn
 from kornia_pnpnet import Correspondences, Guess, PnPNet, Pose, RobustWeightedLM, pose_errors, success
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.geometry import transform
-from kornia_pnpnet.init.epnp import EPnP
-from kornia_pnpnet.init.p3p import P3P
-from kornia_pnpnet.init.ransac import RANSAC, SubsetSolver
-from kornia_pnpnet.init.scoring import Scene
-from kornia_pnpnet.init.search import Search
+from kornia_pnpnet.init.epnp.epnp import EPnP
+from kornia_pnpnet.init.ransac.p3p import P3P
+from kornia_pnpnet.init.ransac.ransac import RANSAC, SubsetSolver
+from kornia_pnpnet.init.ransac.scoring import Scene
+from kornia_pnpnet.init.ransac.search import Search
 
 #: What suits the noise of the protocol: 1 px and 0.05 m.
 PROTOCOL = {"threshold": 6.0, "world_threshold": 0.3}
@@ -475,7 +475,7 @@ def test_ten_thousand_problems_of_a_hundred_pairs_fit_into_two_gibibytes():
         "import resource, torch; torch.set_num_threads(1);"
         "from kornia_pnpnet import PnPNet, RobustWeightedLM;"
         "from kornia_pnpnet.data import OutlierMix, SyntheticProblems;"
-        "from kornia_pnpnet.init.p3p import P3P; from kornia_pnpnet.init.ransac import RANSAC;"
+        "from kornia_pnpnet.init.ransac.p3p import P3P; from kornia_pnpnet.init.ransac.ransac import RANSAC;"
         "data = SyntheticProblems(n=100, batch_size=10000, outliers=OutlierMix(count=50), dtype=torch.float64);"
         "p = data.batch(0); net = PnPNet(RANSAC(P3P(), threshold=6.0, world_threshold=0.3), RobustWeightedLM(m=0));"
         "torch.set_grad_enabled(False); ok = net(p.world_points, p.img_points, p.intrinsics).ok;"

@@ -8,7 +8,7 @@ import math
 import pytest
 import torch
 
-from kornia_pnpnet.init.sampling import (
+from kornia_pnpnet.init.ransac.sampling import (
     Samples,
     draw_subsets,
     good_sample_share,

@@ -9,7 +9,7 @@ import torch
 
 from kornia_pnpnet import Correspondences, Pose
 from kornia_pnpnet.geometry import project, transform
-from kornia_pnpnet.init.scoring import (
+from kornia_pnpnet.init.ransac.scoring import (
     MAX_ERROR,
     SCORERS,
     Scene,

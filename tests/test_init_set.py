@@ -273,7 +273,7 @@ def test_it_learns():
     torch.manual_seed(0)
     refine = RobustWeightedLM(6, kernel="geman_mcclure", robustness=20.0)
     net = PnPNet(SetInit(width=16, layers=2, hidden=32, samples=0), refine, Normalize(order=False))
-    data = SyntheticProblems(n=9, batch_size=200, seed=1, outliers=OutlierMix(), max_angle=math.pi, told=0.5)
+    data = SyntheticProblems(n=9, batch_size=200, seed=1, outliers=OutlierMix(), max_angle=math.pi, known_noise=0.5)
     fresh = SyntheticProblems(n=9, batch_size=1000, seed=2, outliers=OutlierMix(), max_angle=math.pi).batch(0)
     loss, optimizer = SetLoss(), torch.optim.Adam(net.parameters(), lr=4e-3)
 
@@ -285,7 +285,7 @@ def test_it_learns():
     for i in range(100):
         p = data.batch(i)
         optimizer.zero_grad()
-        result, guess = net.with_guess(*p[:3], **p.told)
+        result, guess = net.with_guess(*p[:3], **p.sigmas)
         loss(result, p, 1.0, guess).total.backward()
         torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
         optimizer.step()

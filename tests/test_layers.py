@@ -13,15 +13,15 @@ import kornia_pnpnet
 
 ROOT = Path(kornia_pnpnet.__file__).parent
 
-#: From the bottom up. A module imports from its own layer and those below. The longest prefix counts.
+#: From the bottom up, by folder or module. A module imports from its own layer and those below.
 LAYERS = (
-    ("types", "checks", "environment", "files", "readers", "compilation"),
-    ("geometry", "small", "robust", "metrics", "pairs", "data.colmap"),
-    ("normalize", "lm", "init", "data", "covariance"),
-    ("model", "losses"),
-    ("registry", "peers", "bounds", "__init__"),
-    ("results", "evaluation", "complexity", "runstate", "training", "choices", "reports", "shards", "export"),
-    ("figures", "arguments", "cli", "demo"),
+    ("core", "types"),
+    ("geometry", "refine", "data"),
+    ("normalize", "init", "losses", "metrics", "covariance", "pretrained"),
+    ("solver",),
+    ("registry", "peers", "__init__"),
+    ("training", "evaluation", "export"),
+    ("cli",),
 )
 
 #: What importing the package must not import: the extras, which a user of the layer need not have.
@@ -39,12 +39,12 @@ EXTRAS = (
 
 #: Optional packages and the only modules that may import them.
 OWNERS = {
-    "matplotlib": {"figures"},
+    "matplotlib": {"evaluation.figures"},
     "hydra": set(),
     "cv2": {"peers"},
     "pycolmap": {"data.colmap", "peers"},
     "poselib": {"peers"},
-    "pyarrow": {"shards"},
+    "pyarrow": {"cli.shards"},
     "onnxscript": {"export"},
 }
 

@@ -15,7 +15,7 @@ from matplotlib.colors import same_color
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from kornia_pnpnet.figures import (
+from kornia_pnpnet.evaluation.figures import (
     paper_figures,
     plot_against_m,
     plot_against_n,
@@ -24,8 +24,8 @@ from kornia_pnpnet.figures import (
     plot_scenes,
     plot_synthetic,
 )
-from kornia_pnpnet.figures.lines import _apart
-from kornia_pnpnet.figures.style import SMALL, shortened, solver_styles, wrapped
+from kornia_pnpnet.evaluation.figures.lines import _apart
+from kornia_pnpnet.evaluation.figures.style import SMALL, shortened, solver_styles, wrapped
 from kornia_pnpnet.metrics import success_rate
 
 SOLVERS = (

@@ -10,8 +10,8 @@ import torch
 from kornia_pnpnet import PnPNet, create_solver, pose_errors, shipped_weights, success, success_rate
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.metrics import reliability
-from kornia_pnpnet.model import WEIGHTS_FOLDER
-from kornia_pnpnet.reports import write_model_card
+from kornia_pnpnet.pretrained import WEIGHTS_FOLDER
+from kornia_pnpnet.training.results import write_model_card
 
 
 def rate(solver, problems):

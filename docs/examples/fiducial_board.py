@@ -19,10 +19,10 @@ import torch
 from torch.nn.utils.rnn import pad_sequence
 
 from kornia_pnpnet import Pose, create_solver
-from kornia_pnpnet.environment import environment
-from kornia_pnpnet.figures.style import BLUE, ORANGE, make_figure, save, tidy
+from kornia_pnpnet.core.environment import environment
+from kornia_pnpnet.evaluation.figures.style import BLUE, ORANGE, make_figure, save, tidy
+from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.geometry import rotation_angle
-from kornia_pnpnet.results import save_results
 
 HERE = Path(__file__).resolve().parent
 SQUARES, SQUARE, MARKER = (7, 5), 0.04, 0.03  # metres

@@ -19,11 +19,11 @@ from kornia.geometry import solve_pnp_dlt
 from torch import Tensor
 
 from kornia_pnpnet import create_solver
+from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.data.synthetic import batch_generator, random_poses
-from kornia_pnpnet.environment import environment
-from kornia_pnpnet.figures.style import BLUE, GREEN, ORANGE, make_figure, save, tidy
+from kornia_pnpnet.evaluation.figures.style import BLUE, GREEN, ORANGE, make_figure, save, tidy
+from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.losses import pose_distances
-from kornia_pnpnet.results import save_results
 from kornia_pnpnet.types import Pose
 
 HERE = Path(__file__).resolve().parent

@@ -30,10 +30,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from kornia_pnpnet import PnPResult, Pose, create_solver
-from kornia_pnpnet.environment import environment
-from kornia_pnpnet.figures.style import BLUE, ORANGE, VERMILION, make_figure, save, tidy
+from kornia_pnpnet.core.environment import environment
+from kornia_pnpnet.evaluation.figures.style import BLUE, ORANGE, VERMILION, make_figure, save, tidy
+from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.geometry import rotation_angle
-from kornia_pnpnet.results import save_results
 
 HERE = Path(__file__).resolve().parent
 SIZE, FOCAL, BATCH = 64, 90.0, 32

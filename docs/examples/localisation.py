@@ -23,11 +23,11 @@ import torch
 from torch import Tensor
 
 from kornia_pnpnet import Pose, create_solver
+from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.data import View, load_scene
-from kornia_pnpnet.environment import environment
-from kornia_pnpnet.figures.style import BLUE, ORANGE, make_figure, save
+from kornia_pnpnet.evaluation.figures.style import BLUE, ORANGE, make_figure, save
+from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.geometry import rotation_angle
-from kornia_pnpnet.results import save_results
 
 HERE = Path(__file__).resolve().parent
 SIZE, FOCAL = (480, 360), 420.0

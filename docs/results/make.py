@@ -31,16 +31,16 @@ from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 from torch import nn
 
 from kornia_pnpnet import PnPNet, RobustWeightedLM, pose_covariance
-from kornia_pnpnet.choices import evaluation_sets, load_solver
-from kornia_pnpnet.complexity import complexity_results
-from kornia_pnpnet.environment import environment
+from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.evaluation import EvaluationData, evaluate
-from kornia_pnpnet.figures import paper_figures, plot_reliability, plot_sweep, plot_training
-from kornia_pnpnet.figures.sweep import mix_in_words
+from kornia_pnpnet.evaluation.choices import evaluation_sets, load_solver
+from kornia_pnpnet.evaluation.figures import paper_figures, plot_reliability, plot_sweep, plot_training
+from kornia_pnpnet.evaluation.figures.sweep import mix_in_words
+from kornia_pnpnet.evaluation.operations import complexity_results
+from kornia_pnpnet.evaluation.results import format_table, load_results, save_results
 from kornia_pnpnet.metrics import SuccessRate, reliability, success_rate
-from kornia_pnpnet.model import WEIGHTS_FOLDER, shipped_weights
-from kornia_pnpnet.reports import RESULTS_NAME, collect_weights, write_json
-from kornia_pnpnet.results import format_table, load_results, save_results
+from kornia_pnpnet.pretrained import WEIGHTS_FOLDER, shipped_weights
+from kornia_pnpnet.training.results import RESULTS_NAME, collect_weights, write_json
 from kornia_pnpnet.types import PnPResult, Problems
 
 HERE = Path(__file__).resolve().parent
@@ -207,9 +207,9 @@ def honesty(tuned: Mapping[str, str], count: int) -> dict[str, Any]:
 
     covariances = {}
     for n, wrong in ((12, 0), (12, 3), (20, 0), (20, 5), (50, 0), (50, 12)):
-        problems = drawn(n, f"{wrong}" if wrong else "none", dtype=torch.float64, told=True)
-        result = PnPNet.from_pretrained(ANY).double()(*problems[:3], **problems.told)
-        covariance = pose_covariance(result.pose, *problems[:3], **problems.told, weights=result.weights)
+        problems = drawn(n, f"{wrong}" if wrong else "none", dtype=torch.float64, known_noise=True)
+        result = PnPNet.from_pretrained(ANY).double()(*problems[:3], **problems.sigmas)
+        covariance = pose_covariance(result.pose, *problems[:3], **problems.sigmas, weights=result.weights)
         turn = rotation_matrix_to_axis_angle(result.rotation @ problems.pose.rotation.mT)
         error = torch.cat((turn, result.translation - problems.pose.translation), -1)
         squares = (error * torch.linalg.solve(covariance, error)).sum(-1)
@@ -309,7 +309,7 @@ def measure(scenes: Path, synthetic_count: int, real_count: int, only: Sequence[
             sigma = max(solved, key=lambda sigma: solved[sigma])
             run("set_real_told", named((ANY,), {}), with_noise_told(real, sigma), img_sigma=sigma)
     if wanted("set_told"):
-        common = {**synthetic, "count": 2 * synthetic_count, "seed": SEED_REPORT + 20, "told": True}
+        common = {**synthetic, "count": 2 * synthetic_count, "seed": SEED_REPORT + 20, "known_noise": True}
         sets = evaluation_sets(["synthetic", "any_rotation"], "none,uniform,3", **common)
         run("set_told", named((ANY, "known-inliers-and-noise"), {}), sets)
     if wanted("honesty"):
@@ -439,7 +439,7 @@ Against the best of the other libraries:
 ## Operations
 
 Counted by the protocol of Minka's Lightspeed toolbox from formulas that a test holds against an instrumented run
-(`kornia_pnpnet.complexity`).
+(`kornia_pnpnet.evaluation.operations`).
 
 ![Operations against n](figure1_operations.png)
 

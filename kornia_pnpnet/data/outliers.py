@@ -9,7 +9,7 @@ import torch
 from kornia.core.check import KORNIA_CHECK
 from torch import Tensor
 
-from kornia_pnpnet.checks import check_numbers, check_whole
+from kornia_pnpnet.core.checks import check_numbers, check_whole
 
 __all__ = ["OutlierDraw", "OutlierMix"]
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from kornia_pnpnet.checks import check_numbers, check_whole
+from kornia_pnpnet.core.checks import check_numbers, check_whole
 from kornia_pnpnet.data.colmap import Scene
 from kornia_pnpnet.data.outliers import OutlierMix
 from kornia_pnpnet.data.synthetic import batch_generator, random_poses, uniform

@@ -13,7 +13,7 @@ from kornia.core.check import KORNIA_CHECK
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
-from kornia_pnpnet.checks import check_numbers, check_positive, check_ranges, check_whole
+from kornia_pnpnet.core.checks import check_numbers, check_positive, check_ranges, check_whole
 from kornia_pnpnet.data.outliers import OutlierMix
 from kornia_pnpnet.types import Pose, Problems
 
@@ -280,7 +280,7 @@ class SyntheticProblems:
         img_sigma: standard deviation of the noise on each pixel coordinate; or the smallest and the largest, for each
             problem another, log-uniform.
         world_sigma: likewise of the noise on each world coordinate.
-        told: share of problems that come with both sigmas; of the others a third come with one of them.
+        known_noise: share of the problems that come with both sigmas. A third of the other problems come with one.
         dtype: of the batches; everything is drawn in float64 first.
         device: of the batches.
 
@@ -309,7 +309,7 @@ class SyntheticProblems:
         half_image: float = 3400.0,
         img_sigma: float | Sequence[float] = 1.0,
         world_sigma: float | Sequence[float] = 0.05,
-        told: float = 0.0,
+        known_noise: float = 0.0,
         dtype: torch.dtype = torch.float32,
         device: str | torch.device = "cpu",
     ) -> None:
@@ -317,7 +317,7 @@ class SyntheticProblems:
         check_whole(0, seed=seed)
         check_numbers(0.0, translation_box=translation_box, max_angle=max_angle, half_image=half_image)
         check_positive(focal=focal)
-        check_numbers(0.0, 1.0, told=told)
+        check_numbers(0.0, 1.0, known_noise=known_noise)
         if translation_sigma is not None:
             check_numbers(0.0, translation_sigma=translation_sigma)
         self.n = n
@@ -332,7 +332,7 @@ class SyntheticProblems:
         self.half_image = half_image
         self.img_sigma = _sigma("img_sigma", img_sigma)
         self.world_sigma = _sigma("world_sigma", world_sigma)
-        self.told = told
+        self.known_noise = known_noise
         self.dtype = dtype
         self.device = torch.device(device)
 
@@ -383,11 +383,13 @@ class SyntheticProblems:
             off *= _log_uniform((*img_points.shape[:2], 1), *_NEAR, generator) * img_sigma[:, None, None]
             img_points += torch.where(draw.near[..., None], off, 0.0)
         sigmas: tuple[Tensor, ...] = ()
-        if self.told:
+        if self.known_noise:
             chance = uniform((2, self.batch_size), 0.0, 1.0, generator)
-            one = (chance[0] < self.told + (1.0 - self.told) / 3.0) & (chance[0] >= self.told)
+            known = self.known_noise
+            unknown = chance[0] >= known
+            one = unknown & (chance[0] < known + (1.0 - known) / 3.0)
             is_img = chance[1] < 0.5
-            hidden = (chance[0] >= self.told) & ~(one & is_img), (chance[0] >= self.told) & ~(one & ~is_img)
+            hidden = unknown & ~(one & is_img), unknown & ~(one & ~is_img)
             sigmas = tuple(
                 torch.where(hide, torch.nan, sigma).to(self.dtype)
                 for hide, sigma in zip(hidden, (img_sigma, world_sigma), strict=True)

@@ -2,8 +2,7 @@
 
 from kornia_pnpnet.init.epnp import EPnP
 from kornia_pnpnet.init.mlp import MLPInit
-from kornia_pnpnet.init.p3p import P3P, p3p
-from kornia_pnpnet.init.ransac import RANSAC, SubsetSolver
+from kornia_pnpnet.init.ransac import P3P, RANSAC, SubsetSolver, p3p
 from kornia_pnpnet.init.reppnp import REPPnP
 from kornia_pnpnet.init.set import SetInit
 

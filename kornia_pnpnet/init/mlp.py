@@ -9,7 +9,7 @@ from kornia.core.check import KORNIA_CHECK
 from kornia.core.exceptions import ShapeError
 from torch import Tensor, nn
 
-from kornia_pnpnet.checks import check_devices, check_positive
+from kornia_pnpnet.core.checks import check_devices, check_positive
 from kornia_pnpnet.types import Correspondences, Guess, Pose
 
 __all__ = ["MLPInit"]

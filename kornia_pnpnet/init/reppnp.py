@@ -15,7 +15,7 @@ from kornia.core.check import KORNIA_CHECK
 from torch import Tensor, nn
 
 from kornia_pnpnet.geometry import retract
-from kornia_pnpnet.init.control_points import ControlPoints, align, control_points
+from kornia_pnpnet.init.epnp.control_points import ControlPoints, align, control_points
 from kornia_pnpnet.types import Correspondences, Guess, Pose
 
 __all__ = ["REPPnP"]

@@ -9,11 +9,11 @@ from kornia.core.check import KORNIA_CHECK
 from torch import Tensor, nn
 from torch.nn import functional
 
-from kornia_pnpnet.checks import check_devices
+from kornia_pnpnet.core.checks import check_devices
+from kornia_pnpnet.core.linalg import dot, small_product
 from kornia_pnpnet.geometry import pixel_variance, project
-from kornia_pnpnet.init.control_points import align
-from kornia_pnpnet.init.p3p import folded, p3p, unfolded
-from kornia_pnpnet.small import dot, small_product
+from kornia_pnpnet.init.epnp.control_points import align
+from kornia_pnpnet.init.ransac.p3p import folded, p3p, unfolded
 from kornia_pnpnet.types import Correspondences, Guess, Noise, Pose
 
 __all__ = ["SetInit"]

@@ -12,7 +12,7 @@ from kornia.core.check import KORNIA_CHECK
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
-from kornia_pnpnet.model import check_inputs
+from kornia_pnpnet.solver import check_inputs
 from kornia_pnpnet.types import PnPResult, Pose, camera_matrices
 
 __all__ = ["PeerPose", "PeerSolver"]

@@ -1,0 +1,74 @@
+"""What numbers were made with and on, for the files that hold them."""
+
+from __future__ import annotations
+
+import datetime
+import platform
+import subprocess
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import torch
+
+__all__ = ["environment"]
+
+# Distributions that bring OpenCV, the usual one first.
+_OPENCV = tuple(f"opencv-{kind}" for kind in ("python-headless", "python", "contrib-python-headless", "contrib-python"))
+
+
+def environment() -> dict[str, Any]:
+    """What the numbers were made with and on.
+
+    Returns:
+        ``versions`` of the packages (``None`` when not installed), ``python``, ``platform``, ``cpu``, ``threads`` of
+        PyTorch, ``gpu``, ``commit`` of the checkout the package runs from (ending in ``+`` when files differ from
+        it, ``None`` outside a checkout) and the ``date`` in UTC.
+    """
+    names = ("kornia_pnpnet", "torch", "kornia", "numpy")
+    versions = {name: _version(name) for name in names}
+    versions["opencv"] = next(filter(None, map(_version, _OPENCV)), None)
+    versions |= {name: _version(name) for name in ("poselib", "pycolmap")}
+    return {
+        "versions": versions,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "cpu": _cpu_name(),
+        "threads": torch.get_num_threads(),
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "commit": _commit(),
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    }
+
+
+def _version(name: str) -> str | None:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _cpu_name() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def _commit() -> str | None:
+    """The commit of the checkout that holds this file; not of a checkout that merely has it installed below it."""
+    root = Path(__file__).resolve().parents[2]
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(root), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+
+    try:
+        if Path(git("rev-parse", "--show-toplevel")).resolve() != root:
+            return None
+        changed = git("status", "--porcelain", "--untracked-files=no")
+        return git("rev-parse", "HEAD") + ("+" if changed else "")
+    except (OSError, subprocess.SubprocessError):
+        return None

@@ -1,0 +1,45 @@
+"""Nested tuples of tensors, visited as a whole: no code lists their fields by position."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, TypeVar
+
+from torch import Tensor
+
+__all__ = ["iter_tensors", "map_tensors"]
+
+_T = TypeVar("_T")
+
+
+def map_tensors(function: Callable[..., Any], tree: _T, *others: _T) -> _T:
+    """Apply a function to every tensor of nested tuples.
+
+    Args:
+        function: receives the tensors at the same place of all trees.
+        tree: a tensor, ``None``, or a (named) tuple or list of trees. ``None`` stays ``None``.
+        others: more trees of the same structure.
+
+    Returns:
+        A tree of the same types that holds what the function returned.
+
+    Example:
+        >>> import torch
+        >>> map_tensors(torch.add, (torch.ones(2), None), (torch.ones(2), None))
+        (tensor([2., 2.]), None)
+    """
+    if tree is None:
+        return tree
+    if isinstance(tree, Tensor):
+        return function(tree, *others)
+    parts = (map_tensors(function, *entries) for entries in zip(tree, *others, strict=True))  # type: ignore[call-overload]
+    return type(tree)(*parts) if hasattr(tree, "_fields") else type(tree)(parts)  # type: ignore[call-arg]
+
+
+def iter_tensors(tree: Any) -> Iterator[Tensor]:
+    """Yield every tensor of nested tuples and lists, in order; anything else is passed over."""
+    if isinstance(tree, Tensor):
+        yield tree
+    elif isinstance(tree, (tuple, list)):
+        for entry in tree:
+            yield from iter_tensors(entry)

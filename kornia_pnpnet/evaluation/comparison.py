@@ -1,0 +1,321 @@
+"""Solvers on problems: every solver on the same ones, into one results file that tables and figures read."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import statistics
+import sys
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import torch
+from kornia.core.exceptions import ShapeError
+from torch import Tensor, nn
+
+from kornia_pnpnet.core.environment import environment
+from kornia_pnpnet.evaluation.results import (
+    FORMAT,
+    format_table,
+    load_results,
+    resume,
+    row_errors,
+    save_results,
+    source_digest,
+)
+from kornia_pnpnet.metrics import PoseErrors, pose_errors, success, success_rate
+from kornia_pnpnet.solver import PnPNet
+from kornia_pnpnet.types import PnPResult, Pose, Problems
+
+__all__ = [
+    "EvaluationData",
+    "SeesTruth",
+    "draw_problems",
+    "evaluate",
+    "format_table",
+    "load_results",
+    "row_errors",
+    "save_results",
+]
+
+_QUARTILES = {"q25": 0.25, "median": 0.5, "q75": 0.75}
+# What a row was made on and may differ from that of other rows; what it was made with may not.
+_MACHINE = ("python", "platform", "cpu", "threads", "gpu", "commit")
+
+
+class EvaluationData(NamedTuple):
+    """Problems and what counts as solving them.
+
+    Attributes:
+        problems: a batch of any size.
+        max_rotation_deg: a success has a smaller rotation error, in degrees.
+        max_translation: a success has a smaller translation error, in the unit of the world.
+        unit: the unit of the world, for axis labels.
+        description: where the problems come from, as plain data for the results file.
+    """
+
+    problems: Problems
+    max_rotation_deg: float = 1.0
+    max_translation: float = 0.2
+    unit: str = "m"
+    description: Mapping[str, Any] = {}
+
+
+class _Source(Protocol):
+    """What :func:`draw_problems` needs of a data source."""
+
+    def batch(self, index: int) -> Problems:
+        """Draw batch ``index``."""
+        ...
+
+
+@runtime_checkable
+class SeesTruth(Protocol):
+    """A bound: a module that :func:`evaluate` gives the answers along with the problems."""
+
+    def solve_with_truth(self, problems: Problems) -> PnPResult:
+        """Solve problems whose answers are known."""
+        ...
+
+
+def draw_problems(source: _Source, count: int) -> Problems:
+    """Take the first problems of a source.
+
+    Args:
+        source: has ``batch(index)``, for example :class:`~kornia_pnpnet.data.SyntheticProblems`.
+        count: how many problems, at least 1.
+
+    Returns:
+        ``count`` problems: the source's batches 0, 1, ... one after the other, cut to length. With the same batch
+        size, more problems begin with the fewer ones.
+
+    Example:
+        >>> from kornia_pnpnet.data import SyntheticProblems
+        >>> draw_problems(SyntheticProblems(batch_size=4), count=6).world_points.shape
+        torch.Size([6, 9, 3])
+    """
+    if count < 1:
+        raise ValueError(f"count must be at least 1, got {count}.")
+    batches = [source.batch(0)]
+    size = len(batches[0].world_points)
+    batches += [source.batch(index) for index in range(1, math.ceil(count / size))]
+    fields = zip(*((*batch[:3], *batch.pose, batch.inliers, *batch.sigmas.values()) for batch in batches), strict=True)
+    joined = iter([torch.cat(field)[:count] for field in fields])
+    return batches[0].map(lambda _: next(joined))
+
+
+def _chunks(problems: Problems, size: int) -> Iterator[Problems]:
+    for start in range(0, len(problems.world_points), size):
+        yield problems.map(lambda part, start=start: part[start : start + size])  # type: ignore[misc]
+
+
+def evaluate(
+    solvers: Mapping[str, nn.Module],
+    data: Mapping[str, EvaluationData],
+    *,
+    path: str | Path | None = None,
+    overwrite: bool = False,
+    chunk: int = 1000,
+    repeats: int = 3,
+    progress: bool | None = None,
+) -> dict[str, Any]:
+    """Solve the same problems with every solver.
+
+    A non-finite pose counts as the identity with ``ok=False``. All summaries are computed from the per-problem errors
+    as they are stored, rounded to six digits, so that whoever reads the file finds the same numbers.
+
+    With a ``path`` the results are on disk after every row, and calling again with the same arguments continues where
+    the file ends: an evaluation that was killed loses the row it was at. More solvers and data sets may be added that
+    way. A file with rows of other code, versions, weights, configurations or problems is refused.
+
+    Args:
+        solvers: by name, each called as ``solver(world_points, img_points, intrinsics)`` in evaluation mode, without
+            gradients. One that has ``solve_with_truth`` (see :class:`SeesTruth`) is given the answers as well. A
+            :class:`~kornia_pnpnet.solver.PnPNet` is told the noise where the problems have it
+            (:attr:`~kornia_pnpnet.types.Problems.sigmas`).
+        data: problems by name, on the device and in the dtype to solve them in.
+        path: the results file to write and to continue; none when ``None``.
+        overwrite: start anew, whatever is at ``path``.
+        chunk: problems per call, which bounds the memory.
+        repeats: calls to time at least. The first chunk is solved once before, untimed.
+        progress: show a progress bar; when ``None``, if standard error is a terminal.
+
+    Returns:
+        Plain data: ``format``, ``environment`` (see :func:`environment`), ``code`` (a digest
+        of the package), ``solvers`` with each one's configuration and a digest of its weights, ``data`` with each set's
+        description, limits and a digest of its problems, and ``rows``, one for each set and solver: ``success`` (rate,
+        low, high, total), quartiles of ``rotation_error_deg`` and ``translation_error``, the share ``ok``,
+        ``us_per_problem`` (median over the timed calls), the ``per_problem`` errors and ok, and what differs from
+        ``environment`` if another machine continued. A solver that refuses the shape of a set (another n than its own)
+        has an entry in ``left_out`` instead: ``data``, ``solver`` and ``reason``.
+
+    Raises:
+        ValueError: when ``path`` is not a results file, or one that this evaluation cannot continue.
+        OSError: when ``path`` cannot be written.
+
+    Example:
+        >>> from kornia_pnpnet import create_solver
+        >>> from kornia_pnpnet.data import SyntheticProblems
+        >>> data = {"synthetic": EvaluationData(SyntheticProblems(n=9, batch_size=100, seed=0).batch(0))}
+        >>> results = evaluate({"mine": create_solver("epnp-lm")}, data, repeats=1)
+        >>> row = results["rows"][0]
+        >>> row["success"]["total"], row["success"]["rate"] > 0.5
+        (100, True)
+    """
+    from tqdm import tqdm
+
+    results: dict[str, Any] = {
+        "format": FORMAT,
+        "environment": environment(),
+        "code": source_digest(),
+        "solvers": {name: _describe_solver(solver) for name, solver in solvers.items()},
+        "data": {name: {**_describe(entry), "chunk": chunk} for name, entry in data.items()},
+        "rows": [],
+    }
+    machine = {key: results["environment"][key] for key in _MACHINE}
+    if path is not None and not overwrite:
+        results = resume(results, path)
+    results["left_out"] = []
+    elsewhere = {key: value for key, value in machine.items() if results["environment"].get(key) != value}
+
+    plan = [(data_name, solver_name) for data_name in data for solver_name in solvers]
+    done = {(row["data"], row["solver"]): row for row in results["rows"]}
+    if path is not None:
+        save_results(results, path)  # before the work: a file that cannot be written is found out now
+    hidden = not (sys.stderr.isatty() if progress is None else progress)
+    with tqdm(total=len(plan), initial=len(done), disable=hidden, unit="run") as bar:
+        for names in plan:
+            if names in done:
+                continue
+            row = dict(zip(("data", "solver"), names, strict=True))
+            bar.set_postfix_str("{solver} on {data}".format(**row))
+            try:
+                solved = _row(solvers[row["solver"]], data[row["data"]], chunk, repeats)
+            except ShapeError as error:
+                results["left_out"].append({**row, "reason": str(error).splitlines()[0]})
+            except Exception as error:
+                error.add_note("{solver} on {data}".format(**row))
+                raise
+            else:
+                done[names] = {**row, **solved, **({"environment": elsewhere} if elsewhere else {})}
+                results["rows"] = [done[key] for key in plan if key in done]
+            if path is not None:
+                save_results(results, path)
+            bar.update()
+    return results
+
+
+def _digest(tensors: Iterable[Tensor]) -> str:
+    """A digest of shapes and values."""
+    digest = hashlib.sha256()
+    for tensor in tensors:
+        digest.update(repr(tuple(tensor.shape)).encode())
+        digest.update(tensor.detach().cpu().flatten().view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()
+
+
+def _problems_digest(problems: Problems) -> str:
+    # In float32: on another machine the last bits of a float64 may differ.
+    tensors = (*problems[:3], *problems.pose, *problems.sigmas.values())
+    return _digest((*(tensor.float() for tensor in tensors), problems.inliers))
+
+
+def _describe_solver(solver: nn.Module) -> dict[str, Any]:
+    config = getattr(solver, "config", None)
+    config = config() if callable(config) else config
+    state = {name: value for name, value in solver.state_dict().items() if isinstance(value, Tensor)}
+    return {
+        "class": type(solver).__name__,
+        "config": config if isinstance(config, dict) else None,
+        "weights": _digest(state.values()) if state else None,
+    }
+
+
+def _describe(entry: EvaluationData) -> dict[str, Any]:
+    problems = entry.problems
+    return {
+        "description": dict(entry.description),
+        "count": len(problems.world_points),
+        "n": problems.world_points.shape[1],
+        "mean_outliers": _rounded((~problems.inliers).sum(-1).double().mean().item()),
+        "max_rotation_deg": entry.max_rotation_deg,
+        "max_translation": entry.max_translation,
+        "unit": entry.unit,
+        "dtype": str(problems.world_points.dtype).removeprefix("torch."),
+        "device": problems.world_points.device.type,
+        "digest": _problems_digest(problems),
+    }
+
+
+def _row(solver: nn.Module, entry: EvaluationData, chunk: int, repeats: int) -> dict[str, Any]:
+    """Solve, time, compare and summarise one set with one solver."""
+    was_training = solver.training
+    solver.eval()
+    try:
+        with torch.no_grad():
+            errors, ok, seconds = _run(solver, entry.problems, chunk, repeats)
+    finally:
+        solver.train(was_training)
+    per_problem = {name: [_rounded(value) for value in values.tolist()] for name, values in errors._asdict().items()}
+    stored = PoseErrors(*(torch.tensor(values, dtype=torch.float64) for values in per_problem.values()))
+    rate = success_rate(success(stored, entry.max_rotation_deg, entry.max_translation))
+    return {
+        "success": {name: value if name == "total" else _rounded(value) for name, value in rate._asdict().items()},
+        **{name: _quartiles(values) for name, values in stored._asdict().items()},
+        "ok": _rounded(ok.double().mean().item()),
+        "us_per_problem": _rounded(1e6 * seconds),
+        "per_problem": {**per_problem, "ok": ok.int().tolist()},
+    }
+
+
+def _run(solver: nn.Module, problems: Problems, chunk: int, repeats: int) -> tuple[PoseErrors, Tensor, float]:
+    """Errors and ok of all problems, and the median time per problem in seconds."""
+    chunks = list(_chunks(problems, chunk))
+    _timed(solver, chunks[0])
+    results, seconds = [], []
+    for part in chunks:
+        result, elapsed = _timed(solver, part)
+        results.append(_compare(result, part.pose))
+        seconds.append((len(part.world_points), elapsed / len(part.world_points)))
+    while len(seconds) < repeats:
+        part = chunks[len(seconds) % len(chunks)]
+        seconds.append((len(part.world_points), _timed(solver, part)[1] / len(part.world_points)))
+    # A short last chunk pays the cost of a call for few problems: it does not count beside full ones.
+    full = max(size for size, _ in seconds)
+    rotation, translation, ok = (torch.cat(values) for values in zip(*results, strict=True))
+    return PoseErrors(rotation, translation), ok, statistics.median(time for size, time in seconds if size == full)
+
+
+def _timed(solver: nn.Module, problems: Problems) -> tuple[PnPResult, float]:
+    on_gpu = problems.world_points.is_cuda
+    if on_gpu:
+        torch.cuda.synchronize()
+    start = time.perf_counter()
+    if isinstance(solver, SeesTruth):
+        result = solver.solve_with_truth(problems)
+    else:
+        told = problems.sigmas if isinstance(solver, PnPNet) else {}
+        result = solver(problems.world_points, problems.img_points, problems.intrinsics, **told)
+    if on_gpu:
+        torch.cuda.synchronize()
+    return result, time.perf_counter() - start
+
+
+def _compare(result: PnPResult, truth: Pose) -> tuple[Tensor, Tensor, Tensor]:
+    """Errors in float64 on the CPU, and ok."""
+    rotation, translation, *true = (x.double().cpu() for x in (result.rotation, result.translation, *truth))
+    finite = rotation.isfinite().flatten(1).all(-1) & translation.isfinite().all(-1)
+    rotation = torch.where(finite[:, None, None], rotation, torch.eye(3, dtype=torch.float64))
+    translation = torch.where(finite[:, None], translation, 0.0)
+    return *pose_errors(Pose(rotation, translation), Pose(*true)), result.ok.cpu() & finite
+
+
+def _rounded(value: float) -> float:
+    """Six significant digits: a results file of 10 000 problems stays small."""
+    return float(f"{value:.6g}")
+
+
+def _quartiles(values: Tensor) -> dict[str, float]:
+    return {name: _rounded(values.quantile(share).item()) for name, share in _QUARTILES.items()}

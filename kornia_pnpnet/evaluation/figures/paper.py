@@ -1,0 +1,61 @@
+"""All figures that results files hold data for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from kornia_pnpnet.evaluation.figures.curves import plot_against_m, plot_against_n, plot_mismatches
+from kornia_pnpnet.evaluation.figures.dots import plot_scenes, plot_synthetic
+from kornia_pnpnet.evaluation.figures.operations import plot_operations
+from kornia_pnpnet.evaluation.figures.records import NothingToDrawError
+
+__all__ = ["paper_figures"]
+
+_OPERATIONS = "figure1_operations.png"
+_FIGURES: Mapping[str, Callable[[Path, Sequence[Mapping[str, Any]]], Path]] = {
+    "figure2_paper.png": partial(plot_synthetic, source="paper"),
+    "figure3_gaussian_pose.png": partial(plot_synthetic, source="gaussian_pose"),
+    "figure4_scenes.png": plot_scenes,
+    "figure5_mismatches.png": plot_mismatches,
+    "success_against_n.png": plot_against_n,
+    "success_against_m.png": plot_against_m,
+}
+
+
+def paper_figures(results: Sequence[Mapping[str, Any]], folder: str | Path) -> list[Path]:
+    """Draw the protocol's five figures, success against n and success against m, as far as there is data for them.
+
+    Args:
+        results: results of :func:`~kornia_pnpnet.evaluation.evaluate`, and operation counts, in which ``kind`` is
+            ``"complexity"``. Where several results have the same source, outliers, n and solver, that with the most
+            problems counts, the last of these. A solver looks the same in all figures; one whose name sets m is only
+            in the last.
+        folder: where the pictures go, made when missing: ``figure1_operations.png``, ``figure2_paper.png``,
+            ``figure3_gaussian_pose.png``, ``figure4_scenes.png``, ``figure5_mismatches.png``,
+            ``success_against_n.png`` and ``success_against_m.png``.
+
+    Returns:
+        The paths of what was drawn.
+
+    Raises:
+        ValueError: when there are no results, none of them has data for a figure, or there are several operation
+            counts.
+    """
+    if not results:
+        raise ValueError("There are no results to draw: expected at least one results file.")
+    folder = Path(folder)
+    complexity = [entry for entry in results if entry.get("kind") == "complexity"]
+    solved = [entry for entry in results if entry.get("kind") != "complexity"]
+    if len(complexity) > 1:
+        raise ValueError(f"Operation counts come from one file, got {len(complexity)}.")
+    made = [plot_operations(folder / _OPERATIONS, entry) for entry in complexity]
+    for name, plot in _FIGURES.items():
+        with suppress(NothingToDrawError):
+            made.append(plot(folder / name, solved))
+    if not made:
+        raise ValueError("The results hold no data for any figure: no data set has a source and outliers to compare.")
+    return made

@@ -1,0 +1,90 @@
+"""One problem in its image."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.collections import LineCollection
+from torch import Tensor
+
+from kornia_pnpnet.core.checks import check_positive
+from kornia_pnpnet.evaluation.figures.style import BLUE, RED, SMALL, TITLE, make_figure, save, tidy
+
+__all__ = ["plot_pose"]
+
+
+def plot_pose(
+    path: str | Path,
+    img_points: np.ndarray | Tensor,
+    reprojections: np.ndarray | Tensor,
+    rejected: np.ndarray | Tensor,
+    size: tuple[float, float] | None = None,
+    *,
+    title: str = "",
+) -> Path:
+    r"""Draw one problem in its image: each pixel, joined to where the pose puts its point.
+
+    Args:
+        path: where the picture goes; the ending gives the format.
+        img_points: measured pixels, shape :math:`(N, 2)`.
+        reprojections: projections of the points, shape :math:`(N, 2)`; not finite for points behind the camera,
+            which have no place in the image.
+        rejected: whether the pair is taken for wrong, bool, shape :math:`(N,)`.
+        size: width and height of the image in pixels, the origin in its corner; when ``None``, what the pixels and
+            the reprojections near them need.
+        title: stands before the counts.
+
+    Returns:
+        The path. Pairs whose pixel is not finite have no place in it.
+
+    Raises:
+        ValueError: for shapes that do not fit, or when no pixel is finite.
+        BaseError: for an image without a size.
+    """
+    pixels, projected = np.asarray(img_points, dtype=float), np.asarray(reprojections, dtype=float)
+    bad = np.asarray(rejected, dtype=bool)
+    if pixels.ndim != 2 or pixels.shape[1] != 2 or projected.shape != pixels.shape or bad.shape != pixels.shape[:1]:
+        shapes = f"{pixels.shape}, {projected.shape} and {bad.shape}"
+        raise ValueError(f"plot_pose needs pixels and projections (N, 2) and rejected (N,), got {shapes}.")
+    if size is not None:
+        check_positive(width=size[0], height=size[1])
+    there = np.isfinite(pixels).all(axis=1)
+    if not there.any():
+        raise ValueError("There is no pixel to draw.")
+    pixels, projected, bad = pixels[there], projected[there], bad[there]
+    seen = np.isfinite(projected).all(axis=1)
+    left, top, right, bottom = (0.0, 0.0, *size) if size is not None else _bounds(pixels, projected[seen])
+
+    ratio = (bottom - top) / (right - left)
+    width = min(6.1, 7.0 / ratio)
+    figure = make_figure(max(5.0, width + 0.9), max(3.5, width * ratio + 1.1))
+    axes = figure.subplots()
+    for which, colour, dash in ((seen & ~bad, BLUE, "-"), (seen & bad, RED, "--")):
+        lines = np.stack((pixels[which], projected[which]), axis=1)
+        axes.add_collection(LineCollection(list(lines), colors=colour, linewidths=1.2, linestyles=dash, alpha=0.8))
+    marks: dict[str, Any] = {"markersize": 9.0, "linestyle": "none"}
+    axes.plot(*pixels[~bad].T, "o", color=BLUE, markerfacecolor="none", label="pixel, kept", **marks)
+    axes.plot(*pixels[bad].T, "x", color=RED, markeredgewidth=2.2, label="pixel, rejected", **marks)
+    axes.plot(*projected[seen].T, "+", color="black", markeredgewidth=1.3, label="reprojection", **marks)
+    axes.set(xlim=(left, right), ylim=(bottom, top), xlabel="u (px)", ylabel="v (px)", aspect="equal")
+    tidy(axes)
+    counts = f"n = {len(pixels)}, {int(bad.sum())} rejected"
+    hidden = int((~seen).sum())
+    counts += f", {hidden} behind the camera" if hidden else ""
+    axes.set_title(f"{title}: {counts}" if title else counts, fontsize=TITLE, parse_math=False)
+    figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=SMALL)
+    return save(figure, path)
+
+
+def _bounds(pixels: np.ndarray, projected: np.ndarray) -> tuple[float, float, float, float]:
+    """Left, top, right and bottom around the pixels and those reprojections that are not far off."""
+    low, high = pixels.min(axis=0), pixels.max(axis=0)
+    reach = max(1.0, float((high - low).max()))
+    near = ((projected > low - 0.5 * reach) & (projected < high + 0.5 * reach)).all(axis=1)
+    points = np.concatenate((pixels, projected[near]))
+    low, high = points.min(axis=0) - 0.06 * reach, points.max(axis=0) + 0.06 * reach
+    # A strip would leave no room for the marks: at least a third as wide as long, and the other way round.
+    middle, half = (low + high) / 2, np.maximum((high - low) / 2, (high - low).max() / 6)
+    return *(middle - half), *(middle + half)

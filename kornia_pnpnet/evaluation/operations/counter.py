@@ -1,0 +1,215 @@
+"""Counts scalar operations by running the code: the instrument that the formulas are held against."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Collection
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from kornia_pnpnet.evaluation.operations.operations import (
+    Operations,
+    cholesky,
+    matmul,
+    smallest,
+    solve,
+    sort,
+)
+
+__all__ = ["OperationCounter", "count_per_problem"]
+
+_NOTHING, _ADD, _MULTIPLY, _DIVIDE = Operations(), Operations(add=1), Operations(multiply=1), Operations(divide=1)
+_SQRT, _EXP, _LOG = Operations(sqrt=1), Operations(exp=1), Operations(log=1)
+_COMPARE, _LOGIC = Operations(compare=1), Operations(logic=1)
+
+
+def _each(names: str, operations: Operations) -> dict[str, Operations]:
+    return dict.fromkeys(names.split(), operations)
+
+
+#: Operations for each entry of the result. The first ones move, make or view data, change signs or draw at random.
+_ELEMENTWISE: dict[str, Operations] = {
+    **_each("_to_copy _unsafe_view alias arange cat clone constant_pad_nd copy detach diag_embed", _NOTHING),
+    **_each("diagonal empty empty_like expand eye fill flip full full_like gather index index_put", _NOTHING),
+    **_each("index_select lift_fresh masked_select neg new_empty new_full new_ones new_zeros nonzero", _NOTHING),
+    **_each("ones ones_like permute promote_types rand randperm repeat scalar_tensor scatter select", _NOTHING),
+    **_each("slice split split_with_sizes squeeze stack t taken transpose unbind unsqueeze view zero", _NOTHING),
+    **_each("zeros zeros_like", _NOTHING),
+    **_each("add rsub sub", _ADD),
+    **_each("mul", _MULTIPLY),
+    **_each("div floor_divide reciprocal", _DIVIDE),
+    **_each("sqrt", _SQRT),
+    **_each("rsqrt", _SQRT + _DIVIDE),
+    **_each("exp expm1", _EXP),
+    **_each("acos atan2 cos lgamma log log1p sin tanh", _LOG),
+    **_each("sigmoid", _EXP + _ADD + _DIVIDE),
+    **_each("addcmul", _MULTIPLY + _ADD),
+    **_each("lerp", 2 * _ADD + _MULTIPLY),
+    **_each("linalg_cross", _ADD + 2 * _MULTIPLY),
+    **_each("ceil clamp_min eq ge gt le lt maximum minimum ne relu", _COMPARE),
+    **_each("abs copysign sgn sign", 2 * _COMPARE),
+    **_each("bitwise_and bitwise_not bitwise_or masked_fill where", _LOGIC),
+}
+
+#: Operations for each entry that a reduction takes in beyond the first of each result.
+_REDUCTIONS: dict[str, Operations] = {
+    **_each("cumsum sum", _ADD),
+    **_each("prod", _MULTIPLY),
+    **_each("amax amin argmax argmin max min", _COMPARE),
+    **_each("all any", _LOGIC),
+}
+
+#: Operations for a row, from its length: what is taken out of it, and what is done to each entry.
+_ROWS: dict[str, Callable[[int], Operations]] = {
+    "linalg_vector_norm": lambda length: Operations(add=length - 1, multiply=length, sqrt=1),
+    # Minus the largest, exponentials by their sum.
+    "_softmax": lambda length: Operations(add=2 * length - 1, divide=length, exp=length, compare=length - 1),
+    # Minus the mean, by the root of the variance and a small number; weight and bias.
+    "native_layer_norm": lambda length: Operations(add=4 * length - 1, multiply=3 * length, divide=3, sqrt=1),
+}
+
+#: Operations for one matrix of the batch, from the sizes of the matrices that come in.
+_MATRIX: dict[str, Callable[..., Operations]] = {
+    "mm": lambda first, second: matmul(first[0], first[1], second[1]),
+    "bmm": lambda first, second: matmul(first[0], first[1], second[1]),
+    "addmm": lambda bias, first, second: matmul(first[0], first[1], second[1]) + first[0] * second[1] * _ADD,
+    "linalg_cholesky_ex": lambda matrix: cholesky(matrix[0]),
+    "linalg_inv_ex": lambda matrix: solve(matrix[0], matrix[0]),
+}
+
+
+def _power(exponent: Any) -> Operations:
+    """Raising to a power (``flops_pow``): by products and a root where that does it."""
+    if isinstance(exponent, Tensor) or not float(2 * exponent).is_integer():
+        return _EXP + _LOG + _MULTIPLY
+    whole, half = divmod(abs(exponent), 1)
+    products = int(whole).bit_length() + int(whole).bit_count() - 2 if whole else 0
+    root = (_SQRT + min(whole, 1) * _MULTIPLY) if half else _NOTHING
+    return products * _MULTIPLY + root + (_DIVIDE if exponent < 0 else _NOTHING)
+
+
+def _operations(name: str, call: dict[str, Any], output: Any) -> Operations:
+    """Operations of one call of PyTorch's operation of that name."""
+    result = output[0] if isinstance(output, tuple | list) else output
+    if name in _ELEMENTWISE:
+        cost = _ELEMENTWISE[name]
+        scaled = name in ("add", "sub", "addcmul") and call.get("alpha", call.get("value", 1)) not in (1, -1)
+        return _NOTHING if cost is _NOTHING else result.numel() * (cost + _MULTIPLY if scaled else cost)
+    if name == "pow":
+        return result.numel() * _power(call["exponent"])
+    if name == "clamp":
+        return result.numel() * sum(call[bound] is not None for bound in ("min", "max")) * _COMPARE
+    if name in _MATRIX:
+        tensors = [value for value in call.values() if isinstance(value, Tensor)]
+        return math.prod(result.shape[:-2]) * _MATRIX[name](*(tensor.shape[-2:] for tensor in tensors))
+    if name in _REDUCTIONS:
+        entries = call["self"].numel()
+        results = entries // call["self"].shape[call["dim"]] if name == "cumsum" else result.numel()
+        return (entries - results) * _REDUCTIONS[name]
+    if name in _ROWS:
+        entries, length = _rows(call)
+        return entries // length * _ROWS[name](length)
+    if name in ("sort", "topk"):
+        length = call["self"].shape[call["dim"]]
+        rows = call["self"].numel() // max(length, 1)
+        if name == "sort":
+            return rows * sort(length)
+        return rows * (smallest(length, call["k"]) + (sort(call["k"]) if call["sorted"] else _NOTHING))
+    raise NotImplementedError(f"What aten.{name} costs is unknown: say so in {__name__}.")
+
+
+def _rows(call: dict[str, Any]) -> tuple[int, int]:
+    """How many entries an operation on rows takes in, and how many of them are one row."""
+    tensor = next(value for value in call.values() if isinstance(value, Tensor))
+    if "normalized_shape" in call:
+        return tensor.numel(), math.prod(call["normalized_shape"])
+    dims = call["dim"] if isinstance(call["dim"], list | tuple) else [call["dim"]]
+    return tensor.numel(), math.prod(tensor.shape[dim] for dim in dims)
+
+
+# --- the instrument ---------------------------------------------------------------------------------------------------
+
+_PACKAGE = str(Path(__file__).parents[2])
+
+
+class OperationCounter(TorchDispatchMode):
+    """Count the operations of the tensor code that runs inside a ``with`` block.
+
+    Args:
+        parts: functions to tell apart, as ``module.qualified_name`` below this package, for example
+            ``"lm.lm_step"``. An operation counts for the innermost of them that is running, else for ``""``.
+
+    Attributes:
+        counts: the :class:`Operations` of each part.
+
+    Raises:
+        NotImplementedError: for an operation of PyTorch whose cost is not known: none is lost in silence.
+
+    Example:
+        >>> with OperationCounter() as counter:
+        ...     product = torch.ones(4, 2, 3) @ torch.ones(4, 3, 5)
+        >>> counter.counts[""].multiply, counter.counts[""].add
+        (120, 80)
+    """
+
+    def __init__(self, parts: Collection[str] = ()) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]
+        self._parts = frozenset(parts)
+        self.counts: dict[str, Operations] = {}
+
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        """Run one operation and add what it cost."""
+        output = func(*args, **(kwargs or {}))
+        names = [argument.name for argument in func._schema.arguments]
+        call = {argument.name: argument.default_value for argument in func._schema.arguments}
+        call |= dict(zip(names, args, strict=False)) | (kwargs or {})
+        operations = _operations(func.overloadpacket.__name__.rstrip("_"), call, output)
+        if operations != _NOTHING:
+            part = self._part()
+            self.counts[part] = self.counts.get(part, _NOTHING) + operations
+        return output
+
+    def _part(self) -> str:
+        """The innermost running function that is one of the parts."""
+        frame = sys._getframe(2) if self._parts else None
+        while frame is not None:
+            code = frame.f_code
+            if code.co_filename.startswith(_PACKAGE):
+                name = f"{Path(code.co_filename).stem}.{code.co_qualname}"
+                if name in self._parts:
+                    return name
+            frame = frame.f_back
+        return ""
+
+
+def count_per_problem(run: Callable[[int], object], parts: Collection[str] = ()) -> dict[str, Operations]:
+    """Operations that each further problem of a batch costs, by parts.
+
+    What is computed once for the whole batch drops out: the difference of a run of four and a run of two is taken.
+
+    Args:
+        run: solves a batch of the given size.
+        parts: see :class:`OperationCounter`.
+
+    Returns:
+        The operations for one problem; parts without any are left out.
+
+    Example:
+        >>> count_per_problem(lambda batch: torch.ones(batch, 5).sum(-1) * torch.ones(3).sum())[""].add
+        4.0
+    """
+    counters = []
+    for batch in (2, 4):
+        with torch.no_grad(), OperationCounter(parts) as counter:
+            run(batch)
+        counters.append(counter.counts)
+    small, large = counters
+    differences = {part: 0.5 * (count + -1 * small.get(part, _NOTHING)) for part, count in large.items()}
+    return {part: operations for part, operations in differences.items() if operations != _NOTHING}

@@ -1,0 +1,131 @@
+r"""What EPnP and REPPnP share: coordinates of the world points in a frame of their own, and orthogonal Procrustes.
+
+A world point is written as :math:`p_i = \sum_j a_{ij} c_j`, and so is the same point in the camera frame, with the
+same :math:`a_{ij}` and unknown :math:`c_j`. Lepetit et al. take four control points and barycentric coordinates. Here
+:math:`c_0` is the centroid and :math:`c_1, c_2, c_3` are *vectors* from it, so that :math:`a_{i0} = 1`. The affine maps
+that both describe are the same; but with vectors the coordinates can be made orthonormal,
+:math:`\sum_i w_i a_i a_i^\top = I`, and what is computed from them need not depend on the axes of the world.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kornia_pnpnet.core.linalg import nearest_rotation
+from kornia_pnpnet.types import Correspondences, Pose
+
+__all__ = ["ControlPoints", "align", "control_points"]
+
+# Points are planar when their extent across the plane is below this share of that along it, a thousandth.
+_PLANAR_RATIO = 1e-3
+
+
+class ControlPoints(NamedTuple):
+    r"""The world points in coordinates of their own.
+
+    The tensors lie in memory with the problems last, see :func:`control_points`.
+
+    Attributes:
+        points: the centroid and three vectors from it, shape :math:`(B, 4, 3)`. The vectors are a square root of the
+            covariance of the points. Planar points have 0 as the third.
+        coordinates: :math:`a`, with ``coordinates @ points`` the world points and
+            :math:`\sum_i w_i a_i a_i^\top = I`, shape :math:`(B, N, 4)`. Planar points have 0 as the last one.
+        weights: the weights of the pairs, with the sum 1, shape :math:`(B, N)`.
+        planar: whether the points lie in one plane (or on a line), bool, shape :math:`(B,)`.
+        ok: whether the points span more than a line, bool, shape :math:`(B,)`.
+    """
+
+    points: Tensor
+    coordinates: Tensor
+    weights: Tensor
+    planar: Tensor
+    ok: Tensor
+
+
+def control_points(corr: Correspondences) -> ControlPoints:
+    r"""Choose the control points by weighted Gram-Schmidt on the coordinates of the world points.
+
+    The axis along which the points spread most comes first, what it explains is taken from the others, and so on. The
+    principal directions of the paper would be the same but for an orthogonal transform of :math:`c_1, c_2, c_3`,
+    which costs an eigendecomposition and has no gradient where two extents are equal.
+
+    Results are views of tensors with the problems in the last dimension: elementwise operations on those are several
+    times faster than on problems in the first.
+
+    Args:
+        corr: normalised correspondences. Pairs with the weight 0 do not matter.
+
+    Returns:
+        The :class:`ControlPoints`.
+
+    Example:
+        >>> world = torch.tensor([[[4.0, 0, 0], [-4, 0, 0], [0, 2, 0], [0, -2, 0]]])
+        >>> corr = Correspondences(world, torch.zeros(1, 4, 2), torch.ones(1, 4), torch.tensor(1.0))
+        >>> control = control_points(corr)
+        >>> control.planar, torch.allclose(control.coordinates @ control.points, world)
+        (tensor([True]), True)
+    """
+    weights = corr.weights.mT.contiguous()  # (N, B)
+    total = weights.sum(0)
+    weights = weights / torch.where(total > 0, total, 1.0)
+    world = corr.world_points.permute(2, 1, 0).contiguous()  # (3, N, B)
+    centroid = (world * weights).sum(1)  # (3, B)
+    rest = world - centroid[:, None]
+    # Below these an axis is rounding: the first is absolute, the others relative to the extent of the one before.
+    limit = torch.full_like(total, torch.finfo(rest.dtype).tiny ** 0.5)
+    line_ratio = torch.finfo(rest.dtype).eps ** 0.5
+    vectors, coordinates, found = [centroid], [torch.ones_like(weights)], []
+    for ratio in (line_ratio, _PLANAR_RATIO, 1.0):
+        variance = (rest.square() * weights).sum(1)  # (3, B)
+        largest, position = variance.max(0)
+        there = largest > limit
+        inverse = torch.where(there, torch.where(there, largest, 1.0).rsqrt(), 0.0)
+        axis = rest.gather(0, position.expand(1, *weights.shape))[0] * inverse  # (N, B)
+        vector = (rest * (weights * axis)).sum(1)  # (3, B)
+        rest = rest - vector[:, None] * axis
+        vectors.append(vector)
+        coordinates.append(axis)
+        found.append(there)
+        limit = torch.where(there, (largest.detach() * ratio**2).maximum(limit), torch.inf)
+    return ControlPoints(
+        torch.stack(vectors, 1).permute(2, 1, 0),
+        torch.stack(coordinates).permute(2, 1, 0),
+        weights.mT,
+        ~found[2],
+        found[1],
+    )
+
+
+def align(source: Tensor, target: Tensor, weights: Tensor) -> tuple[Pose, Tensor]:
+    r"""Move points onto others by a similarity, best by weighted least squares.
+
+    Source: S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991.
+
+    Args:
+        source: shape :math:`(B, K, 3)`.
+        target: shape :math:`(B, K, 3)`.
+        weights: at least 0, shape :math:`(B, K)`.
+
+    Returns:
+        The motion :math:`(R, t)` and the scale :math:`s`, shape :math:`(B,)`. Rigidly the points move best by
+        :math:`R x + t`, with a scale by :math:`s R (x - \bar x) + \bar y`, where the bars are weighted means.
+
+    Example:
+        >>> points = torch.tensor([[[0.0, 0, 0], [2, 0, 0], [0, 2, 0], [0, 0, 2]]])
+        >>> pose, scale = align(points, 3.0 * points + 1.0, torch.ones(1, 4))
+        >>> pose.translation, scale
+        (tensor([[2., 2., 2.]]), tensor([3.]))
+    """
+    total = weights.sum(-1, keepdim=True)
+    share = (weights / torch.where(total > 0, total, 1.0))[..., None]
+    source_mean, target_mean = (share * source).sum(1), (share * target).sum(1)
+    centred = source - source_mean[:, None]
+    covariance = (target - target_mean[:, None]).mT @ (share * centred)  # (B, 3, 3)
+    rotation = nearest_rotation(covariance.permute(1, 2, 0))[0].permute(2, 0, 1).contiguous()
+    mean_square = (share * centred.square()).sum((1, 2))
+    scale = (rotation * covariance).sum((1, 2)) / torch.where(mean_square > 0, mean_square, 1.0)
+    translation = target_mean - (rotation @ source_mean[..., None])[..., 0]
+    return Pose(rotation, translation), scale

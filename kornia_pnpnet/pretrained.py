@@ -1,0 +1,122 @@
+"""Weights on disk: the shipped ones by name, local folders and Hub repositories, as safetensors."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from kornia.core.exceptions import ValueCheckError
+from torch import Tensor
+
+from kornia_pnpnet.core.files import atomic_open
+
+__all__ = [
+    "CONFIG_NAME",
+    "WEIGHTS_FOLDER",
+    "WEIGHTS_NAME",
+    "find_weights",
+    "read_weights",
+    "shipped_weights",
+    "write_weights",
+]
+
+WEIGHTS_FOLDER = Path(__file__).parent / "weights"
+CONFIG_NAME, WEIGHTS_NAME = "config.json", "model.safetensors"
+# Key of the digest in the metadata of the weights file.
+_FINGERPRINT = "sha256"
+
+
+def shipped_weights() -> list[str]:
+    """Names of the weights that come with the package."""
+    return sorted(path.parent.name for path in WEIGHTS_FOLDER.glob(f"*/{CONFIG_NAME}"))
+
+
+def write_weights(folder: str | Path, config: Mapping[str, Any], state: Mapping[str, Tensor]) -> None:
+    """Write ``config.json`` and ``model.safetensors``.
+
+    Args:
+        folder: destination; created when missing.
+        config: constructor arguments as plain data.
+        state: parameters and buffers by name.
+
+    Raises:
+        OSError: when a file cannot be written.
+    """
+    from safetensors.torch import save
+
+    state = {name: value.detach().cpu().contiguous() for name, value in state.items()}
+    with atomic_open(Path(folder) / WEIGHTS_NAME, "wb") as file:
+        file.write(save(state, {"format": "pt", _FINGERPRINT: _fingerprint(config, state)}))
+    with atomic_open(Path(folder) / CONFIG_NAME) as file:
+        file.write(json.dumps(config, indent=2) + "\n")
+
+
+def read_weights(name_or_folder: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Read what :func:`write_weights` wrote. Nothing is unpickled.
+
+    Args:
+        name_or_folder: see :func:`find_weights`.
+
+    Returns:
+        The constructor arguments, and parameters and buffers by name.
+
+    Raises:
+        FileNotFoundError: when there is no such name, folder or repository.
+        ValueCheckError: when the files are damaged or do not belong together.
+    """
+    folder = find_weights(name_or_folder)
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        config = json.loads((folder / CONFIG_NAME).read_text())
+        with safe_open(folder / WEIGHTS_NAME, "pt") as file:
+            metadata = file.metadata() or {}
+            state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (OSError, ValueError, SafetensorError) as error:
+        raise ValueCheckError(f"Cannot read the weights in {folder}: {error}") from error
+    if _FINGERPRINT in metadata and metadata[_FINGERPRINT] != _fingerprint(config, state):
+        raise ValueCheckError(f"The weights in {folder} are damaged: {CONFIG_NAME} and {WEIGHTS_NAME} do not match.")
+    return config, state
+
+
+def _fingerprint(config: Any, state: dict[str, Tensor]) -> str:
+    """What tells whether a configuration and weights are those that were saved together."""
+    digest = hashlib.sha256(json.dumps(config, sort_keys=True).encode())
+    for name, value in sorted(state.items()):
+        digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
+        digest.update(value.reshape(-1).view(torch.uint8).numpy().tobytes())  # NumPy has not all dtypes
+    return digest.hexdigest()
+
+
+def find_weights(name_or_folder: str | Path) -> Path:
+    """Find the folder of some weights: shipped, local, or on the Hub.
+
+    Args:
+        name_or_folder: see :meth:`PnPNet.from_pretrained`.
+
+    Returns:
+        The folder.
+
+    Raises:
+        FileNotFoundError: when there is none.
+    """
+    name = str(name_or_folder)
+    for folder in (WEIGHTS_FOLDER / name, Path(name)):
+        if (folder / CONFIG_NAME).is_file():
+            return folder
+    message = f"No weights {name!r}: shipped are {shipped_weights()}; a folder needs {CONFIG_NAME} and {WEIGHTS_NAME}"
+    if isinstance(name_or_folder, Path) or name.count("/") != 1 or Path(name).exists():
+        raise FileNotFoundError(f"{message}.")
+    from huggingface_hub import hf_hub_download
+    from huggingface_hub.errors import HfHubHTTPError
+
+    try:
+        config = hf_hub_download(name, CONFIG_NAME)
+        hf_hub_download(name, WEIGHTS_NAME)
+    except (HfHubHTTPError, OSError, ValueError) as error:
+        raise FileNotFoundError(f"{message}; the Hub said: {error}") from error
+    return Path(config).parent

@@ -1,0 +1,182 @@
+"""What lets a training run be stopped at any moment, continued and followed: signals, checkpoints, curves, times."""
+
+from __future__ import annotations
+
+import csv
+import signal
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch.utils.tensorboard import SummaryWriter
+
+from kornia_pnpnet.core.files import atomic_open
+
+__all__ = [
+    "CHECKPOINT_NAME",
+    "HISTORY_NAME",
+    "History",
+    "StageClock",
+    "TrainingError",
+    "load_checkpoint",
+    "save_checkpoint",
+    "stop_on_signal",
+]
+
+CHECKPOINT_NAME, HISTORY_NAME = "last.ckpt", "history.csv"
+
+
+class TrainingError(RuntimeError):
+    """The training cannot go on, or cannot be continued as asked; the message says why and what to do."""
+
+
+@contextmanager
+def stop_on_signal() -> Iterator[threading.Event]:
+    """Turn SIGTERM and Ctrl-C into an event, so that the loop can save before it ends."""
+    event = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield event
+        return
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+
+    def restore() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+    def stop(*_: object) -> None:
+        event.set()
+        restore()  # a second signal ends the process as usual
+
+    for number in before:
+        signal.signal(number, stop)
+    try:
+        yield event
+    finally:
+        restore()
+
+
+class StageClock:
+    """Wall-clock time of a loop by stage. Nothing is lost between stages: their times add up to that of the loop.
+
+    Work that a GPU does later counts where the loop waits for it.
+
+    Args:
+        stages: their names.
+
+    Attributes:
+        seconds: time of each stage so far.
+
+    Example:
+        >>> clock = StageClock("data", "rest")
+        >>> clock.lap("data")
+        >>> clock.lap("rest")
+        >>> sum(clock.shares().values())
+        1.0
+    """
+
+    def __init__(self, *stages: str) -> None:
+        self.seconds = dict.fromkeys(stages, 0.0)
+        self._last = time.perf_counter()
+
+    def lap(self, stage: str) -> None:
+        """Count the time since the last lap as that of a stage."""
+        now = time.perf_counter()
+        self.seconds[stage] += now - self._last
+        self._last = now
+
+    def shares(self, before: Mapping[str, float] | None = None) -> dict[str, float]:
+        """Share of each stage of the time since ``before``, an earlier copy of ``seconds``; of all when ``None``."""
+        spent = {stage: seconds - (before or {}).get(stage, 0.0) for stage, seconds in self.seconds.items()}
+        whole = sum(spent.values())
+        return {stage: seconds / whole if whole > 0.0 else 0.0 for stage, seconds in spent.items()}
+
+
+def _whole(row: dict[str, str | None]) -> bool:
+    """Whether a row was written to its end, which a full disk or a crash prevents."""
+    return None not in row.values() and (row["update"] or "").isdigit()
+
+
+class History:
+    """Learning curves in one CSV file and TensorBoard.
+
+    Args:
+        folder: where they go.
+        columns: of the CSV file; a row may leave some empty.
+        start: rows of a former call that are later than this update are dropped.
+    """
+
+    def __init__(self, folder: Path, columns: list[str], start: int) -> None:
+        self._path = folder / HISTORY_NAME
+        self._columns = columns
+        rows: list[dict[str, Any]] = []
+        if start and self._path.is_file():
+            with self._path.open(newline="") as file:
+                rows = [row for row in csv.DictReader(file) if _whole(row) and int(row["update"]) <= start]
+        with atomic_open(self._path, newline="") as file:
+            writer = csv.DictWriter(file, columns, restval="", extrasaction="ignore")
+            writer.writeheader()
+            writer.writerows(rows)
+        self._board = SummaryWriter(folder / "tensorboard", purge_step=start or None)
+
+    def write(self, row: dict[str, float]) -> None:
+        """Append a row, which must have ``update``."""
+        with self._path.open("a", newline="") as file:
+            csv.DictWriter(file, self._columns, restval="").writerow(
+                {key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()}
+            )
+        for key, value in row.items():
+            if key != "update":
+                self._board.add_scalar(key, value, int(row["update"]))
+
+    def close(self) -> None:
+        """Close TensorBoard's file."""
+        self._board.close()
+
+
+def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
+    """Write a checkpoint in one piece: a run killed at any moment leaves the old one or the new one."""
+    with atomic_open(path, "wb") as file:
+        torch.save(state, file)
+
+
+def load_checkpoint(path: Path, identity: dict[str, Any]) -> dict[str, Any]:
+    """Read a checkpoint.
+
+    Args:
+        path: what :func:`save_checkpoint` wrote. Only tensors and plain data are read; nothing is unpickled.
+        identity: settings that must be those of the checkpoint's run.
+
+    Returns:
+        The state.
+
+    Raises:
+        TrainingError: when the file is damaged or of another run.
+    """
+    try:
+        state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+        saved = state["identity"]
+    except Exception as error:  # torch.load raises many types on a damaged file
+        raise TrainingError(f"Cannot read the checkpoint {path}: {error}") from error
+    there, now = _leaves(saved), _leaves(identity)
+    differing = [key for key in {**there, **now} if there.get(key) != now.get(key)]
+    if differing:
+        details = "; ".join(f"{key} was {there.get(key)!r} and is {now.get(key)!r}" for key in differing)
+        raise TrainingError(f"The checkpoint {path} is of another run: {details}.")
+    return state
+
+
+def _leaves(value: Any, prefix: str = "") -> dict[str, Any]:
+    """Nested plain data as ``{"a.b.0": leaf}``."""
+    if isinstance(value, dict):
+        entries = list(value.items())
+    elif isinstance(value, (list, tuple)):
+        entries = list(enumerate(value))
+    else:
+        return {prefix: value}
+    return {
+        k: v for key, entry in entries for k, v in _leaves(entry, f"{prefix}.{key}" if prefix else str(key)).items()
+    }

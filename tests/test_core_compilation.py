@@ -1,0 +1,245 @@
+"""A compiled solver is the same solver; where it cannot be compiled it runs as it is, and says so once."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+import warnings
+from functools import partial
+
+import pytest
+import torch
+from torch._dynamo.testing import CompileCounter
+from torch._subclasses.fake_tensor import FakeTensorMode
+
+from kornia_pnpnet import MLPInit, PnPNet, Pose, RobustWeightedLM, create_solver
+from kornia_pnpnet.core.compilation import Compiled
+from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet.types import PnPResult
+
+# torch.compile makes an instance of an autograd function while it looks into it.
+pytestmark = pytest.mark.filterwarnings("ignore:.*should not be instantiated:DeprecationWarning")
+
+
+@pytest.fixture
+def backend(monkeypatch):
+    """Dynamo captures and guards, its graphs run as they are: what needs no C++ compiler. Counts the graphs."""
+    torch.compiler.reset()
+    counter = CompileCounter()
+    compile_ = torch.compile
+
+    def capture(function, **options):
+        return compile_(function, **{**options, "options": None, "backend": counter})
+
+    monkeypatch.setattr(torch, "compile", capture)
+    yield counter
+    torch.compiler.reset()
+
+
+def problems(count, n=9, dtype=torch.float64):
+    return SyntheticProblems(n=n, batch_size=count, seed=5, outliers=OutlierMix(), dtype=dtype).batch(0)
+
+
+def tensors(result):
+    return (*result[:5], *result.init)
+
+
+def assert_same(result, expected, **tolerance):
+    assert type(result) is PnPResult
+    for a, b in zip(tensors(result), tensors(expected), strict=True):
+        torch.testing.assert_close(a, b, **tolerance)
+
+
+@pytest.mark.parametrize(
+    ("name", "views", "whole", "graphs"),
+    [
+        *((name, 1, False, 3) for name in ("pnpnet-n9", "epnp-lm", "reppnp-lm", "identity-lm")),
+        ("pnpnet-n9", 3, False, 4),  # and the choice among the starts
+        ("pnpnet-set", 1, False, 4),
+        ("pnpnet-n9", 1, True, 1),
+        ("pnpnet-n9", 3, True, 1),
+    ],
+)
+def test_each_part_is_one_graph_and_the_batch_may_change(name, views, whole, graphs, backend):
+    eager, compiled = create_solver(name, m=2), create_solver(name, m=2)
+    eager.views = compiled.views = views
+    compiled.compile(whole=whole)
+    with torch.no_grad(), warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        for count in (7, 5, 64):
+            inputs = problems(count)[:3]
+            assert_same(compiled(*inputs), eager(*inputs), rtol=1e-6, atol=1e-6)
+    assert backend.frame_count == graphs  # before, in and after an iteration
+
+
+@pytest.mark.parametrize(("views", "whole"), [(1, False), (2, False), (2, True)])
+def test_gradients_are_those_of_the_eager_solver(views, whole, backend):
+    solver = create_solver("pnpnet-n9", m=2).double()
+    solver.views = views
+    compiled = copy.deepcopy(solver)
+    compiled.compile(whole=whole)
+    leaves = []
+    for net in (solver, compiled):
+        world, img, intrinsics = (x.clone().requires_grad_() for x in problems(4)[:3])
+        result = net(world, img, intrinsics)
+        (result.rotation.sum() + result.weights.sum() + result.cost.sum() + result.init.translation.sum()).backward()
+        leaves.append([world, img, intrinsics, *net.parameters()])
+    assert leaves[0][0].grad.any()
+    for a, b in zip(*leaves, strict=True):
+        torch.testing.assert_close(a.grad, b.grad)
+
+
+def test_the_first_stage_alone_and_other_arguments(backend):
+    eager, compiled = create_solver("pnpnet-n9"), create_solver("pnpnet-n9")
+    compiled.compile()
+    inputs = problems(3)[:3]
+    weights = torch.ones(3, 9, dtype=torch.float64)
+    weights[:, 2] = 0.0
+    mask = torch.arange(9).expand(3, 9) < 8
+    with torch.no_grad():
+        assert_same(compiled(*inputs, first_stage_only=True), eager(*inputs, first_stage_only=True))
+        assert_same(compiled(*inputs, weights=weights, mask=mask), eager(*inputs, weights=weights, mask=mask))
+        pose = eager(*inputs).pose
+        assert_same(compiled(*inputs, init=pose), eager(*inputs, init=pose))
+        assert_same(compiled(inputs[0], inputs[1], inputs[2][0]), eager(inputs[0], inputs[1], inputs[2][0]))
+
+
+def test_what_cannot_be_captured_runs_as_it_is_with_one_warning(backend):
+    eager, compiled = create_solver("p3p-ransac", seed=1), create_solver("p3p-ransac", seed=1)
+    compiled.compile()
+    inputs = problems(3)[:3]
+    with torch.no_grad():
+        with pytest.warns(RuntimeWarning, match="Not compiled, running as it is") as caught:
+            first = compiled(*inputs)
+        assert len(caught) == 1
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", RuntimeWarning)
+            second = compiled(*inputs)
+        for result in (first, second):
+            assert_same(result, eager(*inputs), rtol=0, atol=0)
+
+
+def test_without_a_compiler_it_runs_as_it_is(monkeypatch):
+    torch.compiler.reset()
+
+    def broken(graph, inputs):
+        raise RuntimeError("no compiler here")
+
+    monkeypatch.setattr(torch, "compile", lambda f, **options: compile_(f, fullgraph=True, backend=broken))
+    twice = Compiled(lambda x: 2 * x)
+    with pytest.warns(RuntimeWarning, match="no compiler here") as caught:
+        assert torch.equal(twice(torch.ones(3)), 2 * torch.ones(3))
+    assert len(caught) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        assert torch.equal(twice(torch.ones(3)), 2 * torch.ones(3))
+
+
+compile_ = torch.compile
+
+
+def test_what_recompiling_warns_of_is_no_reason_to_stop(backend):
+    """PyTorch warns of a tensor that is no leaf of the graph, which is the pose that an iteration begins with."""
+    solver, eager = create_solver("identity-lm", m=1), create_solver("identity-lm", m=1)
+    solver.compile()
+    world, img, intrinsics = problems(3)[:3]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", ".*should not be instantiated", DeprecationWarning)
+        for img_points in (img, img.clone().requires_grad_() * 1.0):  # of the same shape, but with a gradient
+            assert_same(
+                solver(world, img_points, intrinsics), eager(world, img_points, intrinsics), rtol=1e-6, atol=1e-6
+            )
+
+
+def test_errors_of_the_caller_are_the_callers(backend):
+    solver = create_solver("pnpnet-n9")
+    solver.compile()
+    world, img, intrinsics = problems(3)[:3]
+    with pytest.raises(Exception, match=r"img_points must have the shape"):
+        solver(world, img[:, :8], intrinsics)
+    with pytest.raises(Exception, match=r"built for n = 9"):
+        solver(world[:, :8], img[:, :8], intrinsics)
+    with torch.no_grad():
+        assert solver(world, img, intrinsics).ok.any()
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_compiling_changes_no_weights_and_copies_are_not_compiled(whole):
+    solver = create_solver("pnpnet-n9")
+    names = list(solver.state_dict())
+    solver.compile(whole=whole)
+    assert list(solver.state_dict()) == names
+    for other in (copy.deepcopy(solver), pickle.loads(pickle.dumps(solver))):
+        for a, b in zip(solver.parameters(), other.parameters(), strict=True):
+            assert torch.equal(a, b)
+            assert a is not b
+        assert (other._solve if whole else other._begin).function.__self__ is other
+
+
+def test_compiling_again_takes_the_place_of_what_was_compiled(backend):
+    solver, eager = (create_solver("pnpnet-n9", m=1, views=1) for _ in range(2))
+    inputs = problems(3)[:3]
+    for whole, graphs in ((True, 1), (False, 4)):
+        solver.compile(whole=whole)
+        with torch.no_grad():
+            assert_same(solver(*inputs), eager(*inputs), rtol=1e-6, atol=1e-6)
+        assert backend.frame_count == graphs
+
+
+@pytest.mark.parametrize("name", ["pnpnet-n9", "epnp-lm", "reppnp-lm"])
+def test_nothing_reads_a_value_back(name):
+    """So a solve can be captured as one CUDA graph: fake tensors have no values to branch on."""
+    solver = create_solver(name)
+    inputs = problems(3)[:3]
+    solver.double()
+    with FakeTensorMode(allow_non_fake_inputs=True) as mode, torch.no_grad():
+        result = solver(*(mode.from_tensor(x) for x in inputs))
+    assert result.rotation.shape == (3, 3, 3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("whole", [False, True])
+def test_inductor_computes_the_same(whole):
+    torch.compiler.reset()
+    solver = PnPNet(MLPInit(6), RobustWeightedLM(3), views=2).double()
+    compiled = copy.deepcopy(solver)
+    compiled.compile(whole=whole)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        for count in (50, 31, 1):
+            inputs = problems(count, n=6)[:3]
+            with torch.no_grad():
+                assert_same(compiled(*inputs), solver(*inputs), rtol=1e-6, atol=1e-8)
+        grads = []
+        for net in (solver, compiled):
+            result = net(*problems(50, n=6)[:3])
+            (result.rotation.sum() + result.init.translation.sum()).backward()
+            grads.append([p.grad for p in net.parameters()])
+    for a, b in zip(*grads, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_inductor_computes_the_same_with_more_pairs_than_problems():
+    """In float32 and with loops in an order of its own the compiler of PyTorch 2.13 gave 18 of these 20 wrong poses."""
+    torch.compiler.reset()
+    solver = PnPNet(None, RobustWeightedLM(2)).float()
+    compiled = copy.deepcopy(solver)
+    compiled.compile()
+    for count in (20, 50):
+        batch = problems(count, n=40)
+        inputs = [x.float() for x in batch[:3]]
+        start = Pose(*(x.float() for x in batch.pose))
+        with torch.no_grad():
+            ours, eager = compiled(*inputs, init=start), solver(*inputs, init=start)
+        torch.testing.assert_close(ours.matrix, eager.matrix, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.slow
+def test_without_a_real_compiler(monkeypatch):
+    torch.compiler.reset()
+    with torch._inductor.config.patch({"cpp.cxx": ("/no/such/compiler",), "force_disable_caches": True}):
+        three = Compiled(partial(torch.mul, 3.0))
+        with pytest.warns(RuntimeWarning, match="Not compiled"):
+            assert torch.equal(three(torch.ones(2000)), 3 * torch.ones(2000))

@@ -1,0 +1,194 @@
+"""Linear algebra of small matrices, beside LAPACK's."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from kornia_pnpnet.core.linalg import (
+    dot,
+    eigenvectors,
+    factorise,
+    nearest_rotation,
+    small_product,
+    solve_leading,
+    substitute,
+)
+from kornia_pnpnet.geometry import rotation_angle
+
+
+def svd_rotation(matrix):
+    """Kabsch's solution of matrices (B, 3, 3)."""
+    U, _, Vh = torch.linalg.svd(matrix)
+    sign = torch.ones_like(U[:, 0])
+    sign[:, 2] = torch.linalg.det(U @ Vh)
+    return (U * sign[:, None]) @ Vh
+
+
+def test_small_product_is_the_matrix_product(generator):
+    a = torch.randn(2, 3, 5, generator=generator, dtype=torch.float64)
+    b = torch.randn(3, 4, 5, generator=generator, dtype=torch.float64)
+    expected = a.permute(2, 0, 1) @ b.permute(2, 0, 1)
+    torch.testing.assert_close(small_product(a, b).permute(2, 0, 1), expected)
+
+
+# --- the nearest rotation -------------------------------------------------------------------------------------------
+
+
+EASY = [(1, 1, 1), (3, 2, 1), (3, 2, 0), (3, 2, -1), (1, 1e-3, 1e-6)]
+HARD = [(1, 1e-5, -1e-7), (1, 1e-10, 0)]
+
+
+@pytest.mark.parametrize(
+    ("dtype", "values", "tolerance"),
+    [(torch.float32, values, 3e-6) for values in EASY] + [(torch.float64, values, 5e-15) for values in EASY + HARD],
+)
+def test_nearest_rotation_is_known_from_its_singular_vectors(dtype, values, tolerance, random_rotations):
+    left, right = random_rotations(50), random_rotations(50, seed=1)
+    matrix = (left * torch.tensor(values, dtype=torch.float64)) @ right.mT
+    rotation, unique = nearest_rotation(matrix.to(dtype).permute(1, 2, 0))
+    assert unique.all()
+    rotation = rotation.permute(2, 0, 1).double()
+    eye = torch.eye(3, dtype=torch.float64).expand(50, 3, 3)
+    torch.testing.assert_close(rotation @ rotation.mT, eye, rtol=0, atol=tolerance)
+    # Rounding of the matrix alone turns the rotation by about its relative error over the smallest gap.
+    gap = (values[1] + values[2]) / values[0]
+    assert (rotation_angle(rotation, left @ right.mT) < tolerance / gap).all()
+
+
+def test_nearest_rotation_agrees_with_the_singular_value_decomposition(generator):
+    matrix = torch.randn(1000, 3, 3, generator=generator, dtype=torch.float64)
+    rotation, unique = nearest_rotation(matrix.permute(1, 2, 0))
+    assert unique.all()
+    assert (torch.linalg.det(matrix) < 0).any()
+    torch.testing.assert_close(rotation.permute(2, 0, 1), svd_rotation(matrix), rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize(("dtype", "factors"), [(torch.float32, (1e-8, 1e15)), (torch.float64, (1e-70, 1e100))])
+def test_nearest_rotation_does_not_depend_on_the_unit(dtype, factors, generator):
+    matrix = torch.randn(3, 3, 20, generator=generator, dtype=torch.float64).to(dtype)
+    rotation, _ = nearest_rotation(matrix)
+    for factor in factors:
+        scaled, unique = nearest_rotation(factor * matrix)
+        assert unique.all()
+        torch.testing.assert_close(scaled, rotation)
+
+
+def test_where_there_is_no_nearest_rotation_it_is_the_identity_without_gradient(random_rotations):
+    left, right = random_rotations(5), random_rotations(5, seed=1)
+    values = [[0, 0, 0], [1, 0, 0], [3, 1, -1], [3e-200, 2e-200, 1e-200], [2, 1, 1]]
+    values = torch.tensor(values, dtype=torch.float64)
+    matrix = ((left * values[:, None]) @ right.mT).permute(1, 2, 0).requires_grad_()
+    rotation, unique = nearest_rotation(matrix)
+    assert unique.tolist() == [False, False, False, False, True]
+    eye = torch.eye(3, dtype=torch.float64)[..., None].expand(3, 3, 4)
+    assert torch.equal(rotation[..., :4], eye)
+    loss = (rotation * torch.arange(9.0).view(3, 3, 1)).sum()
+    (gradient,) = torch.autograd.grad(loss, matrix, create_graph=True)
+    assert not gradient[..., :4].any()
+    assert gradient[..., 4].any()
+    (second,) = torch.autograd.grad(gradient.sum(), matrix)
+    assert gradient.isfinite().all()
+    assert second.isfinite().all()
+
+
+def test_gradcheck_of_the_nearest_rotation(generator):
+    matrix = torch.randn(3, 3, 4, generator=generator, dtype=torch.float64)
+    flat = matrix * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)[:, None]
+    for x in (matrix, flat):
+        inputs = (x.clone().requires_grad_(),)
+        assert torch.autograd.gradcheck(lambda m: nearest_rotation(m)[0], inputs)
+        assert torch.autograd.gradgradcheck(lambda m: nearest_rotation(m)[0], inputs)
+
+
+# --- systems and eigenvectors ---------------------------------------------------------------------------------------
+
+
+def test_dot_is_the_sum_of_products(generator):
+    a, b = torch.randn(2, 5, 3, generator=generator)
+    torch.testing.assert_close(dot(a.unbind(0), b.unbind(0)), (a * b).sum(0))
+
+
+@pytest.fixture
+def systems(generator):
+    """Positive definite matrices (20, 6, 6), right sides (20, 6), and the rows of the lower triangles."""
+    root = torch.randn(20, 6, 8, generator=generator, dtype=torch.float64)
+    matrix, rhs = root @ root.mT, torch.randn(20, 6, generator=generator, dtype=torch.float64)
+    rows = [list(row[: i + 1].unbind(0)) for i, row in enumerate(matrix.permute(1, 2, 0).unbind(0))]
+    return matrix, rhs, rows
+
+
+def test_the_factors_are_those_of_cholesky(systems):
+    """With the square roots of the pivots in them; and the right side comes along."""
+    matrix, rhs, rows = systems
+    pivots = []
+
+    def inverse(k, pivot):
+        assert k == len(pivots)
+        pivots.append(pivot)
+        return pivot.reciprocal()
+
+    lower, scaled = factorise(rows, list(rhs.unbind(-1)), inverse)
+    assert sorted(lower) == [(i, k) for i in range(6) for k in range(i)]
+    unit = torch.eye(6, dtype=torch.float64).repeat(20, 1, 1)
+    for (i, k), entry in lower.items():
+        unit[:, i, k] = entry
+    pivots = torch.stack(pivots, -1)
+    torch.testing.assert_close(unit * pivots.sqrt()[:, None], torch.linalg.cholesky(matrix), rtol=1e-9, atol=1e-9)
+    forward = torch.linalg.solve_triangular(unit, rhs[..., None], upper=False, unitriangular=True)[..., 0]
+    torch.testing.assert_close(torch.stack(scaled, -1), forward / pivots, rtol=1e-9, atol=1e-9)
+    for size in (1, 4, 6):
+        expected = torch.linalg.solve(matrix[:, :size, :size], rhs[:, :size])
+        solution = torch.stack(substitute(lower, scaled[:size]), -1)
+        torch.testing.assert_close(solution, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_an_unknown_whose_pivot_has_no_inverse_is_left_out(systems):
+    """The others have the solution of the system without its row and column."""
+    matrix, rhs, rows = systems
+    lower, scaled = factorise(
+        rows, list(rhs.unbind(-1)), lambda k, pivot: torch.zeros_like(pivot) if k == 2 else pivot.reciprocal()
+    )
+    solution = torch.stack(substitute(lower, scaled), -1)
+    kept = [0, 1, 3, 4, 5]
+    expected = torch.linalg.solve(matrix[:, kept][..., kept], rhs[:, kept])
+    torch.testing.assert_close(solution[:, kept], expected, rtol=1e-9, atol=1e-9)
+
+
+def test_leading_blocks_are_solved(systems):
+    matrix, rhs, rows = systems
+    sizes = (1, 3, 6)
+    for size, solution in zip(sizes, solve_leading(rows, rhs.mT.unbind(0), sizes), strict=True):
+        expected = torch.linalg.solve(matrix[:, :size, :size], rhs[:, :size])
+        # The ridge is 16 roundings of the diagonal.
+        torch.testing.assert_close(torch.stack(solution, -1), expected, rtol=1e-10, atol=1e-10)
+    nan = torch.full_like(rhs[:, 0], torch.nan)
+    padded = [[*row, *[nan] * (5 - i)] for i, row in enumerate(rows)]  # above the diagonal nothing is read
+    again = solve_leading(padded, rhs.mT.unbind(0), (6,))[0]
+    assert torch.equal(torch.stack(again), torch.stack(solution))
+
+
+def test_a_singular_system_in_its_range_has_a_finite_solution():
+    matrix = torch.zeros(3, 3, 1, dtype=torch.float64)
+    matrix[:2, :2] = 1.0
+    rhs = torch.tensor([2.0, 2.0, 0.0], dtype=torch.float64)[:, None]
+    (solution,) = solve_leading([row.unbind(0) for row in matrix.unbind(0)], rhs.unbind(0), (3,))
+    reached = (matrix[..., 0] @ torch.stack(solution)[:, 0])[:, None]
+    torch.testing.assert_close(reached, rhs)
+    assert torch.stack(solution).isfinite().all()
+
+
+def test_eigenvectors_are_orthonormal_and_nearly_diagonalise(generator):
+    matrix = torch.randn(500, 3, 3, generator=generator, dtype=torch.float64)
+    matrix = matrix @ matrix.mT
+    matrix[0], matrix[1] = torch.eye(3), torch.zeros(3, 3)  # equal eigenvalues
+    pairs = eigenvectors(matrix.permute(1, 2, 0))
+    values = torch.stack([value for value, _ in pairs], -1)
+    vectors = torch.stack([vector.mT for _, vector in pairs], -1)  # (B, 3, 3)
+    eye = torch.eye(3, dtype=torch.float64).expand(500, 3, 3)
+    torch.testing.assert_close(vectors @ vectors.mT, eye, rtol=0, atol=1e-12)
+    scale = torch.linalg.matrix_norm(matrix)[:, None]
+    error = (values - torch.linalg.eigvalsh(matrix)).abs() / scale.clamp(min=1e-300)
+    assert (error < 1e-2).all()
+    assert error.median() < 1e-9
+    torch.testing.assert_close(values, values.sort(-1).values)

@@ -1,0 +1,126 @@
+"""Bounds see the truth, use what they are said to use of it, and reach what the protocol measured."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from kornia.core.exceptions import BaseError
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+
+from kornia_pnpnet import Pose, pose_errors, success
+from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet.evaluation.bounds import KnownInliers, KnownInliersAndNoise
+
+BOUNDS = (KnownInliers, KnownInliersAndNoise)
+
+
+def pixels(rotation, translation, world_points, intrinsics):
+    """One problem: (N, 3) -> (N, 2)."""
+    projected = (world_points @ rotation.mT + translation) @ intrinsics.mT
+    return projected[:, :2] / projected[:, 2:]
+
+
+def rate(bound, problems):
+    return success(pose_errors(bound.solve_with_truth(problems).pose, problems.pose)).double().mean().item()
+
+
+@pytest.mark.parametrize("bound", BOUNDS)
+def test_the_pose_minimises_the_weighted_squares_of_the_inliers(make_problems, bound):
+    problems = make_problems(batch=5, outliers=2)
+    bound = bound()
+    weights = bound.pair_weights(problems)
+    assert torch.equal(weights > 0, problems.inliers)
+    result = bound.solve_with_truth(problems)
+    assert result.ok.all()
+    turn = torch.zeros(5, 3, dtype=torch.float64, requires_grad=True)
+    shift = torch.zeros(5, 3, dtype=torch.float64, requires_grad=True)
+    rotation = axis_angle_to_rotation_matrix(turn) @ result.rotation
+    largest = 0.0
+    for i in range(5):
+        where = pixels(rotation[i], result.translation[i] + shift[i], problems.world_points[i], problems.intrinsics[i])
+        cost = (weights[i] * (where - problems.img_points[i]).square().sum(-1)).sum()
+        largest = max(largest, cost.item())
+        cost.backward(retain_graph=True)
+    # A radian moves pixels by thousands: what is left of the gradient is rounding.
+    assert turn.grad.abs().max() < 1e-6 * largest
+    assert shift.grad.abs().max() < 1e-6 * largest
+
+
+@pytest.mark.parametrize("bound", BOUNDS)
+def test_without_noise_it_is_the_truth_whatever_the_outliers(make_problems, bound):
+    problems = make_problems(outliers=3, noise=False)
+    errors = pose_errors(bound().solve_with_truth(problems).pose, problems.pose)
+    assert errors.rotation_error_deg.max() < 1e-9
+    assert errors.translation_error.max() < 1e-9
+
+
+@pytest.mark.parametrize("bound", BOUNDS)
+def test_what_the_outliers_hold_does_not_matter(make_problems, bound):
+    problems = make_problems(outliers=3)
+    moved = torch.where(problems.inliers[..., None], problems.img_points, problems.img_points.flip(0) + 7.0)
+    whole, other = (bound().solve_with_truth(p) for p in (problems, problems._replace(img_points=moved)))
+    torch.testing.assert_close(other.pose, whole.pose, rtol=1e-9, atol=1e-9)
+
+
+def test_weights_are_inverse_variances_by_the_jacobian(make_problems):
+    problems = make_problems(batch=3, outliers=1)
+    camera = torch.tensor([[800.0, 0, 320], [0, 950, 240], [0, 0, 1]], dtype=torch.float64)
+    problems = problems._replace(intrinsics=camera.expand(3, 3, 3))
+    weights = KnownInliersAndNoise(img_sigma=2.0, world_sigma=0.3).pair_weights(problems)
+    for i in range(3):
+        pose = problems.pose.rotation[i], problems.pose.translation[i]
+        for j in range(9):
+
+            def project(point, pose=pose):
+                return pixels(*pose, point[None], camera)[0]
+
+            jacobian = torch.autograd.functional.jacobian(project, problems.world_points[i, j])
+            expected = 1.0 / (2.0**2 + 0.3**2 * jacobian.square().sum() / 2.0)
+            assert weights[i, j].item() == pytest.approx(expected.item() if problems.inliers[i, j] else 0.0)
+
+
+def test_a_point_behind_the_camera_changes_nothing_else(make_problems):
+    problems = make_problems(batch=2)
+    world_points = problems.world_points.clone()
+    centre = -problems.pose.rotation[0].mT @ problems.pose.translation[0]
+    world_points[0, 0] = (
+        2.0 * centre - world_points[0, 0]
+    )  # through the camera's centre: as far behind as it was before
+    broken = KnownInliersAndNoise().solve_with_truth(problems._replace(world_points=world_points))
+    whole = KnownInliersAndNoise().solve_with_truth(problems)
+    assert broken.pose.matrix.isfinite().all()
+    assert torch.equal(broken.pose.matrix[1], whole.pose.matrix[1])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    ("mix", "inliers", "inliers_and_noise"),
+    [(None, 0.850, 0.907), (OutlierMix(), 0.783, 0.836), (OutlierMix(count=3), 0.690, 0.739)],
+)
+def test_success_is_what_the_protocol_measured(mix, inliers, inliers_and_noise, dtype):
+    problems = SyntheticProblems(batch_size=4000, seed=77, outliers=mix, dtype=dtype).batch(0)
+    # Three standard deviations of 4000 problems are 0.014 to 0.022.
+    assert rate(KnownInliers(), problems) == pytest.approx(inliers, abs=0.022)
+    assert rate(KnownInliersAndNoise(), problems) == pytest.approx(inliers_and_noise, abs=0.022)
+
+
+def test_a_bound_has_no_call_without_the_truth(make_problems):
+    with pytest.raises(NotImplementedError):
+        KnownInliers()(*make_problems()[:3])
+
+
+@pytest.mark.parametrize("sigmas", [{"img_sigma": -1.0}, {"img_sigma": 0.0, "world_sigma": 0.0}])
+def test_sigmas_are_checked(sigmas):
+    with pytest.raises(BaseError, match="img_sigma"):
+        KnownInliersAndNoise(**sigmas)
+
+
+def test_a_problem_without_inliers_fails_alone(make_problems):
+    problems = make_problems(batch=3)
+    inliers = problems.inliers.clone()
+    inliers[1] = False
+    result = KnownInliers().solve_with_truth(problems._replace(inliers=inliers))
+    assert result.ok.tolist() == [True, False, True]
+    alone = KnownInliers().solve_with_truth(problems)
+    for i in (0, 2):
+        assert torch.equal(Pose(*result.pose).matrix[i], alone.pose.matrix[i])

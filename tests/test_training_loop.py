@@ -1,0 +1,394 @@
+"""The training loop: resuming equals not stopping, bad steps are skipped, two processes equal one."""
+
+import csv
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from kornia.core.exceptions import BaseError
+from torch import nn
+
+from kornia_pnpnet import MLPInit, PnPNet, PoseLoss, RobustWeightedLM
+from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet.training.checkpoint import CHECKPOINT_NAME, HISTORY_NAME, TrainingError, save_checkpoint
+from kornia_pnpnet.training.loop import TrainSettings, fit, train_briefly
+
+REPO = Path(__file__).resolve().parents[1]
+SHARES = [f"{stage}_share" for stage in ("data", "forward", "backward", "optimizer", "rest")]
+
+# Python 3.12 warns of every fork of a process with threads, which pytest-xdist's are.
+forks = pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
+
+
+def make_parts(updates=6, **changes):
+    torch.manual_seed(0)
+    settings = {"warmup": 1, "log_every": 1, "validate_every": 3, "checkpoint_every": 2, "ramp": (0.2, 0.5), **changes}
+    return {
+        "model": PnPNet(MLPInit(6), RobustWeightedLM(2)),
+        "data": SyntheticProblems(n=6, batch_size=16, seed=3, outliers=OutlierMix()),
+        "validation": {"none": SyntheticProblems(n=6, batch_size=32, seed=4).batch(0)},
+        "loss": PoseLoss(saturation=0.02),
+        "settings": TrainSettings(updates, **settings),
+        "progress": False,
+    }
+
+
+def read_history(folder):
+    with (folder / HISTORY_NAME).open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def comparable(rows):
+    """History rows without what depends on the clock or the memory."""
+    timed = ("updates_per_second", "peak_memory_mib", *SHARES)
+    return [{k: v for k, v in row.items() if k not in timed} for row in rows]
+
+
+def assert_same_weights(model, other):
+    state = other.state_dict()
+    for name, value in model.state_dict().items():
+        assert torch.equal(value, state[name]), name
+
+
+class StoppingLoss(PoseLoss):
+    """Sends a signal to this process and its workers while the given update is computed, as a terminal does."""
+
+    def __init__(self, at, number):
+        super().__init__(saturation=0.02)
+        self.calls, self.at, self.number = 0, at, number
+
+    def forward(self, *args, **kwargs):
+        self.calls += 1
+        if self.calls == self.at:
+            for pid in (os.getpid(), *(child.pid for child in multiprocessing.active_children())):
+                os.kill(pid, self.number)
+        return super().forward(*args, **kwargs)
+
+
+class BrokenLoss(PoseLoss):
+    """Returns a loss that is not finite at some updates."""
+
+    def __init__(self, at, value):
+        super().__init__(saturation=0.02)
+        self.calls, self.at, self.value = 0, at, value
+
+    def forward(self, *args, **kwargs):
+        terms = super().forward(*args, **kwargs)
+        self.calls += 1
+        return terms._replace(total=terms.total * self.value) if self.calls in self.at else terms
+
+
+@forks
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize(("workers", "workers_later"), [(0, 0), (1, 0), (0, 1), (1, 1)])
+def test_resuming_after_a_signal_equals_not_stopping(tmp_path, number, workers, workers_later):
+    whole = make_parts()
+    fit(folder=tmp_path / "whole", **whole)
+
+    stopped = make_parts()
+    handler = signal.getsignal(number)
+    stopped["loss"] = StoppingLoss(3, number)
+    report = fit(folder=tmp_path / "parts", data_workers=workers, **stopped)
+    assert not multiprocessing.active_children()
+    assert report.interrupted
+    assert report.update == 3
+    assert signal.getsignal(number) is handler
+    assert len(read_history(tmp_path / "parts")) == 3
+
+    torch.manual_seed(77)  # a fresh process: other weights at first
+    again = make_parts()
+    again["model"] = PnPNet(MLPInit(6), RobustWeightedLM(2))
+    report = fit(folder=tmp_path / "parts", resume=True, data_workers=workers_later, **again)
+    assert not report.interrupted
+    assert report.update == 6
+    assert_same_weights(whole["model"], again["model"])
+    assert comparable(read_history(tmp_path / "parts")) == comparable(read_history(tmp_path / "whole"))
+
+
+def test_history_after_the_checkpoint_is_written_again(tmp_path):
+    """A killed run has rows beyond its last checkpoint; resuming replaces them."""
+    fit(folder=tmp_path / "whole", **make_parts())
+    parts = make_parts(checkpoint_every=4)
+    loss = BrokenLoss(at=(6,), value=1.0)
+    loss.forward = lambda *a, **k: (
+        (_ for _ in ()).throw(KeyboardInterrupt) if loss.calls == 5 else _count(loss, *a, **k)
+    )
+    with pytest.raises(KeyboardInterrupt):
+        fit(folder=tmp_path / "killed", **{**parts, "loss": loss})
+    assert [row["update"] for row in read_history(tmp_path / "killed")] == ["1", "2", "3", "4", "5"]
+    resumed = make_parts(checkpoint_every=4)
+    fit(folder=tmp_path / "killed", resume=True, **resumed)
+    assert comparable(read_history(tmp_path / "killed")) == comparable(read_history(tmp_path / "whole"))
+
+
+def _count(loss, *args, **kwargs):
+    loss.calls += 1
+    return PoseLoss.forward(loss, *args, **kwargs)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_steps_that_are_not_finite_are_skipped_and_counted(tmp_path, value):
+    parts = make_parts(updates=1)
+    before = {name: p.clone() for name, p in parts["model"].state_dict().items()}
+    report = fit(folder=tmp_path / "one", **{**parts, "loss": BrokenLoss((1,), value)})
+    assert report.skipped == 1
+    for name, p in parts["model"].state_dict().items():
+        assert torch.equal(p, before[name]), name
+
+    parts = make_parts(updates=5)
+    report = fit(folder=tmp_path / "some", **{**parts, "loss": BrokenLoss((2, 4), value)})
+    assert report.skipped == 2
+    assert all(p.isfinite().all() for p in parts["model"].parameters())
+    assert [row["skipped"] for row in read_history(tmp_path / "some")] == ["0", "1", "1", "2", "2"]
+
+
+def test_too_many_bad_steps_stop_the_run(tmp_path):
+    parts = make_parts(updates=9, max_skipped=2)
+    with pytest.raises(TrainingError, match=r"3 steps .* max_skipped = 2"):
+        fit(folder=tmp_path, **{**parts, "loss": BrokenLoss(range(1, 10), float("nan"))})
+
+
+def test_a_run_is_not_overwritten_by_accident(tmp_path):
+    fit(folder=tmp_path, **make_parts())
+    content = (tmp_path / CHECKPOINT_NAME).read_bytes()
+    with pytest.raises(TrainingError, match="resume=true"):
+        fit(folder=tmp_path, **make_parts())
+    assert (tmp_path / CHECKPOINT_NAME).read_bytes() == content
+
+
+def test_a_checkpoint_of_other_settings_is_refused(tmp_path):
+    fit(folder=tmp_path, **make_parts())
+    with pytest.raises(TrainingError, match="of another run: settings"):
+        fit(folder=tmp_path, resume=True, **make_parts(lr=1.0))
+
+
+@pytest.mark.parametrize("content", [b"", b"not a checkpoint", None])
+def test_a_damaged_checkpoint_is_refused(tmp_path, content):
+    fit(folder=tmp_path, **make_parts())
+    path = tmp_path / CHECKPOINT_NAME
+    path.write_bytes(path.read_bytes()[:-100] if content is None else content)
+    with pytest.raises(TrainingError, match="Cannot read the checkpoint"):
+        fit(folder=tmp_path, resume=True, **make_parts())
+
+
+def test_no_partial_checkpoint_is_left_when_writing_fails(tmp_path, monkeypatch):
+    path = tmp_path / CHECKPOINT_NAME
+    fit(folder=tmp_path, **make_parts(updates=2))
+    content = path.read_bytes()
+
+    def full_disk(state, file):
+        file.write(b"half of it")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(torch, "save", full_disk)
+    with pytest.raises(OSError, match="No space left"):
+        save_checkpoint(path, {})
+    assert list(tmp_path.glob("*.tmp")) == []
+    assert path.read_bytes() == content
+
+
+def test_schedules():
+    settings = TrainSettings(1000, warmup=10, final_lr=0.1, ramp=(0.2, 0.4))
+    assert settings.lr_factor(0) == pytest.approx(0.1, rel=1e-5)
+    assert settings.lr_factor(9) == pytest.approx(1.0, abs=1e-3)
+    assert settings.lr_factor(1000) == pytest.approx(0.1)
+    assert [settings.ramp_factor(u) for u in (0, 200, 300, 400, 999)] == [0.0, 0.0, 0.5, 1.0, 1.0]
+    assert TrainSettings(10, ramp=(0.0, 0.0)).ramp_factor(0) == 1.0
+
+
+def test_learning_lowers_the_loss(tmp_path):
+    parts = make_parts(updates=400, log_every=50, validate_every=50, checkpoint_every=400)
+    parts["data"] = SyntheticProblems(n=6, batch_size=128, seed=3)
+    fit(folder=tmp_path, **parts)
+    rows = read_history(tmp_path)
+    first, last = rows[0], rows[-1]
+    assert first["refined_rotation"] == ""  # the network learns alone at first
+    for name in ("init_rotation", "init_translation", "val/none/rotation_error_deg"):
+        assert float(last[name]) < 0.95 * float(first[name]), name
+
+
+def test_validation_does_not_change_the_training(tmp_path):
+    with_it, without = make_parts(validate_every=1), make_parts(validate_every=100)
+    fit(folder=tmp_path / "a", **with_it)
+    fit(folder=tmp_path / "b", **without)
+    assert_same_weights(with_it["model"], without["model"])
+
+
+def test_training_outside_the_main_thread(tmp_path):
+    """Signals cannot be caught there; training works all the same."""
+    result = []
+    thread = threading.Thread(target=lambda: result.append(fit(folder=tmp_path, **make_parts())))
+    thread.start()
+    thread.join()
+    assert result[0].update == 6
+
+
+def test_train_briefly(tmp_path):
+    curves = train_briefly(1.0, tmp_path, progress=False)
+    assert curves == tmp_path / HISTORY_NAME
+    rows = read_history(tmp_path)
+    assert len(rows) >= 10
+    assert float(rows[-1]["val/none/success"]) > float(rows[0]["val/none/success"])
+
+
+DDP_SCRIPT = """
+import sys, torch
+sys.path.insert(0, {tests!r})
+from lightning_fabric import Fabric
+from test_training_loop import make_parts
+from kornia_pnpnet.training.loop import fit
+torch.set_num_threads(1)
+fabric = Fabric(accelerator="cpu", devices={devices}, strategy={strategy!r})
+fabric.launch()
+parts = make_parts()
+parts["model"].double()
+parts["data"].dtype = torch.float64
+parts["validation"] = {{}}
+fit(folder={folder!r}, fabric=fabric, **parts)
+if fabric.is_global_zero:
+    torch.save(parts["model"].state_dict(), {out!r})
+"""
+
+
+def test_two_processes_equal_one(tmp_path):
+    """Two CPU processes with gloo share the batch of one and arrive at the same weights."""
+    states = []
+    for devices, strategy in ((1, "auto"), (2, "ddp")):
+        script, out = tmp_path / f"run{devices}.py", tmp_path / f"{devices}.pt"
+        script.write_text(
+            DDP_SCRIPT.format(
+                tests=str(REPO / "tests"),
+                devices=devices,
+                strategy=strategy,
+                folder=str(tmp_path / str(devices)),
+                out=str(out),
+            )
+        )
+        done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=240, check=False)
+        assert done.returncode == 0, done.stderr
+        states.append(torch.load(out, weights_only=True))
+    assert "distributed_backend=gloo" in done.stderr
+    for name, value in states[0].items():
+        torch.testing.assert_close(states[1][name], value, rtol=0, atol=1e-9)
+    start = make_parts()["model"].double().state_dict()
+    assert any(not torch.equal(states[0][name], start[name]) for name in start)
+
+
+def test_a_batch_that_cannot_be_shared_is_refused(tmp_path):
+    class ThreeProcesses:
+        world_size, global_rank, is_global_zero, device = 3, 0, True, torch.device("cpu")
+
+    with pytest.raises(Exception, match="batch of 16 cannot be shared equally among 3"):
+        fit(folder=tmp_path, fabric=ThreeProcesses(), **make_parts())
+
+
+def test_first_stage_only_trains(tmp_path):
+    """m = 0 leaves no hyperparameters to learn."""
+    parts = make_parts()
+    parts["model"] = PnPNet(MLPInit(6), RobustWeightedLM(0))
+    before = [p.clone() for p in parts["model"].init.parameters()]
+    fit(folder=tmp_path, **parts)
+    assert any(not torch.equal(a, b) for a, b in zip(before, parts["model"].init.parameters(), strict=True))
+    assert isinstance(parts["model"].init, nn.Module)
+
+
+def test_another_run_is_not_continued(tmp_path):
+    """Whatever the caller names as the run's identity must be the same, and the message names what is not."""
+    fit(folder=tmp_path, identity={"data": {"seed": 3, "sigma": [1.0, 2.0]}}, **make_parts())
+    with pytest.raises(TrainingError, match=r"of another run: data\.sigma\.1 was 2\.0 and is 5\.0\.$"):
+        fit(folder=tmp_path, identity={"data": {"seed": 3, "sigma": [1.0, 5.0]}}, resume=True, **make_parts())
+    report = fit(folder=tmp_path, identity={"data": {"seed": 3, "sigma": (1.0, 2.0)}}, resume=True, **make_parts())
+    assert (report.start, report.update) == (6, 6)
+
+
+def test_validation_has_its_own_interval(tmp_path):
+    fit(folder=tmp_path, **make_parts(updates=9, log_every=4, validate_every=3))
+    rows = read_history(tmp_path)
+    assert [row["update"] for row in rows] == ["3", "4", "6", "8", "9"]
+    assert [row["update"] for row in rows if row["val/none/success"]] == ["3", "6", "9"]
+
+
+def test_a_signal_in_the_last_update_is_no_interruption(tmp_path):
+    report = fit(folder=tmp_path, **{**make_parts(), "loss": StoppingLoss(6, signal.SIGTERM)})
+    assert (report.update, report.interrupted) == (6, False)
+
+
+@pytest.mark.parametrize("wrong", [{"log_every": 0}, {"updates": -1}, {"ramp": (0.5, 0.2)}, {"checkpoint_every": 0}])
+def test_settings_out_of_range_are_refused(wrong):
+    with pytest.raises(BaseError, match=next(iter(wrong))):
+        TrainSettings(**{"updates": 10, **wrong})
+
+
+def test_a_ramp_may_be_a_step():
+    assert [TrainSettings(10, ramp=(0.5, 0.5)).ramp_factor(update) for update in (0, 4, 5, 9)] == [0.0, 0.0, 1.0, 1.0]
+    assert TrainSettings(10, ramp=(1.0, 1.0)).ramp_factor(9) == 0.0
+
+
+@forks
+def test_data_drawn_meanwhile_changes_nothing(tmp_path):
+    plain, overlapped = make_parts(updates=30), make_parts(updates=30)
+    fit(folder=tmp_path / "plain", **plain)
+    fit(folder=tmp_path / "overlapped", data_workers=1, **overlapped)
+    assert_same_weights(plain["model"], overlapped["model"])
+    assert comparable(read_history(tmp_path / "overlapped")) == comparable(read_history(tmp_path / "plain"))
+
+
+class BrokenSource(SyntheticProblems):
+    def batch(self, index):
+        if index == 4:
+            raise ArithmeticError("batch 4 cannot be drawn")
+        return super().batch(index)
+
+
+@forks
+@pytest.mark.parametrize("workers", [0, 1])
+def test_an_error_in_the_data_ends_the_run_with_its_message(tmp_path, workers):
+    parts = {**make_parts(), "data": BrokenSource(n=6, batch_size=16)}
+    with pytest.raises(ArithmeticError, match="batch 4 cannot be drawn"):
+        fit(folder=tmp_path, data_workers=workers, **parts)
+    assert not multiprocessing.active_children()
+    assert torch.load(tmp_path / CHECKPOINT_NAME, weights_only=True)["update"] == 4
+
+
+def test_a_checkpoint_of_an_optimizer_that_was_not_fused_is_continued(tmp_path):
+    """How a step is computed may change between two calls: the numbers that it continues from may not."""
+    whole = make_parts()
+    fit(folder=tmp_path / "whole", **whole)
+    fit(folder=tmp_path / "parts", **{**make_parts(), "loss": StoppingLoss(4, signal.SIGTERM)})
+    path = tmp_path / "parts" / CHECKPOINT_NAME
+    state = torch.load(path, weights_only=True)
+    for group in state["optimizer"]["param_groups"]:
+        assert group["fused"]
+        group["fused"] = None
+    torch.save(state, path)
+    again = make_parts()
+    fit(folder=tmp_path / "parts", resume=True, **again)
+    assert_same_weights(whole["model"], again["model"])
+
+
+def test_the_shares_of_the_time_add_up(tmp_path):
+    report = fit(folder=tmp_path, **make_parts())
+    assert [f"{stage}_share" for stage in report.time_shares] == SHARES
+    for shares in (report.time_shares.values(), *([float(row[s]) for s in SHARES] for row in read_history(tmp_path))):
+        assert all(share > 0.0 for share in shares)
+        assert sum(shares) == pytest.approx(1.0, abs=1e-4)  # six digits are written
+
+
+class SlowSource(SyntheticProblems):
+    def batch(self, index):
+        time.sleep(0.2)
+        return super().batch(index)
+
+
+def test_waiting_for_data_is_counted_as_that(tmp_path):
+    quick, slow = ({**make_parts(), "data": kind(n=6, batch_size=16)} for kind in (SyntheticProblems, SlowSource))
+    shares = [fit(folder=tmp_path / name, **parts).time_shares for name, parts in (("quick", quick), ("slow", slow))]
+    assert shares[1]["data"] > shares[0]["data"]
+    assert shares[1]["data"] == max(shares[1].values())
