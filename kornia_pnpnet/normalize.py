@@ -1,4 +1,4 @@
-r"""From pixels of any camera and a world in any frame to what the networks and the refiner see, and back.
+r"""Into the solver's frame and back: from any camera and any world to what initialisers and refiners see.
 
 Pixels become those of a camera with the focal length ``f_const`` and the principal point 0; the pairs may be ordered
 by their pixels, as the paper does; the world may be centred and scaled, which makes the solved pose equivariant to
@@ -10,11 +10,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_positive
+from kornia_pnpnet.core.configured import Configured
+from kornia_pnpnet.core.performance import exporting
+from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import MIN_DEPTH_RATIO
-from kornia_pnpnet.types import Correspondences, Pose
+from kornia_pnpnet.types import Correspondences, Guess, Noise, Pose
 
 __all__ = ["F_CONST", "VIEWS", "Frame", "Normalize"]
 
@@ -34,28 +37,30 @@ VIEWS = (
 
 
 class Frame(NamedTuple):
-    r"""What :class:`Normalize` did, so that it can be undone.
+    r"""How :class:`Normalize` moved and ordered a problem, so that it can be undone.
 
     Attributes:
         centroid: the world point that became the origin, shape :math:`(B, 3)`.
-        scale: the factor on world lengths, shape :math:`(B,)`.
-        order: position in the input of each normalised pair, int64, shape :math:`(B, N)`.
+        scale: factor of world lengths, shape :math:`(B,)`.
+        img_scale: factor of pixels, the geometric mean of both axes, shape :math:`(B,)`.
+        order: position in the input of each normalised pair, int64, shape :math:`(B, N)`; ``None``: unchanged.
         valid: whether the problem can be solved at all, bool, shape :math:`(B,)`.
     """
 
     centroid: Tensor
     scale: Tensor
-    order: Tensor
+    img_scale: Tensor
+    order: Tensor | None
     valid: Tensor
 
 
-class Normalize(nn.Module):
+class Normalize(Configured):
     r"""Normalise cameras, order and world frame.
 
-    A problem is *valid* when what its pairs hold is finite (and can be squared twice), its weights are not negative, at
-    least three pairs have a weight, its camera is a pinhole without skew, and its points do not lie on one line or
-    point. The inputs of invalid problems are replaced by zeros, which keeps values and gradients finite everywhere
-    behind. A pair without weight is padding: what it holds does not matter.
+    A problem is *valid* when its numbers are finite (and can be squared twice), its weights are not negative, at least
+    three pairs have a weight, its camera is a pinhole without skew, and its points do not lie on one line or coincide.
+    The inputs of invalid problems are replaced by zeros, which keeps all later values and gradients finite. A pair
+    without weight is padding: its numbers do not matter.
 
     Args:
         f_const: focal length of the normalised camera in pixels.
@@ -80,17 +85,12 @@ class Normalize(nn.Module):
     def __init__(
         self, *, f_const: float = F_CONST, order: bool = True, center: bool = True, scale: bool = True
     ) -> None:
-        super().__init__()
+        super().__init__(locals())
         check_positive(f_const=f_const)
-        self.config = {"f_const": f_const, "order": order, "center": center, "scale": scale}
         self.f_const = f_const
         self.order = order
         self.center = center
         self.scale = scale
-
-    def extra_repr(self) -> str:
-        """Show the constructor's arguments."""
-        return ", ".join(f"{key}={value!r}" for key, value in self.config.items())
 
     def forward(
         self,
@@ -99,6 +99,7 @@ class Normalize(nn.Module):
         intrinsics: Tensor,
         weights: Tensor | None = None,
         mask: Tensor | None = None,
+        noise: Noise | None = None,
     ) -> tuple[Correspondences, Frame]:
         r"""Normalise a batch.
 
@@ -108,10 +109,10 @@ class Normalize(nn.Module):
             intrinsics: shape :math:`(B, 3, 3)`.
             weights: at least 0, shape :math:`(B, N)`; 1 when ``None``.
             mask: False where a pair is padding, bool, shape :math:`(B, N)`.
+            noise: standard deviations in pixels and in the unit of the world; NaN where unknown.
 
         Returns:
-            The normalised correspondences, in memory as :func:`~kornia_pnpnet.geometry.problems_last` would have them,
-            and the :class:`Frame` that undoes it.
+            The normalised correspondences, with the problems last in memory, and the :class:`Frame` that undoes it.
         """
         batch, count = world_points.shape[:2]
         usable = _is_pinhole(intrinsics)
@@ -159,44 +160,60 @@ class Normalize(nn.Module):
         factors = torch.where(valid, torch.cat((scale.expand(3, batch), img_scales, one)), zero)
         rows = moved * factors[:, None]
 
+        order = None
         if self.order:
             order = _order(torch.where(there, rows[3:5].detach(), torch.inf))
             rows = rows.gather(1, order.mT.expand(6, -1, -1))
-        else:
-            order = torch.arange(count, device=rows.device).expand(batch, count)
         world_points, img_points, weights = rows.permute(2, 1, 0).split((3, 2, 1), -1)
         horizontal, vertical = img_scales.sqrt()
-        corr = Correspondences(world_points, img_points, weights[..., 0], focal, horizontal * vertical, scale)
-        return corr, Frame(centroid.mT, scale, order, valid)
+        frame = Frame(centroid.mT, scale, horizontal * vertical, order, valid)
+        if noise is not None:
+            frame = frame._replace(valid=valid & _is_usable(noise))
+            noise = self._apply_to_noise(noise, frame)
+        corr = Correspondences(world_points, img_points, weights[..., 0], focal, frame.img_scale, scale, noise)
+        return corr, frame
+
+    def _apply_to_noise(self, noise: Noise, frame: Frame) -> Noise:
+        """Standard deviations in the units and the order of the normalised correspondences."""
+
+        def scaled(sigma: Tensor, scale: Tensor) -> Tensor:
+            # Unknown sigmas are NaN. Replace them before scaling, or the gradient of the scale becomes NaN.
+            sigma = torch.where(sigma.isnan(), sigma, sigma.nan_to_num() * scale[:, None])
+            return sigma if frame.order is None else sigma.gather(1, frame.order)
+
+        return Noise(scaled(noise.img, frame.img_scale), scaled(noise.world, frame.scale))
 
     def views(self, corr: Correspondences, count: int) -> Correspondences:
-        """The same problems seen in mirrors: the axes of image and world exchanged or reversed, both alike.
+        """Mirror problems: the axes of image and world are exchanged or reversed, both in the same way.
 
-        The distribution of random problems does not change, but what a network makes of one does.
+        The distribution of random problems does not change, but a network answers each mirrored problem differently.
 
         Args:
             corr: normalised correspondences of :math:`B` problems.
-            count: of the views of each, the problem itself first, at most 8.
+            count: number of views of each problem, at most 8; the first view is the problem itself.
 
         Returns:
-            The correspondences of all problems in the first view, then in the second, and so on.
+            The correspondences of all problems in the first view, then in the second view, and so on.
         """
         rows = torch.cat((corr.world_points.permute(2, 1, 0), corr.img_points.permute(2, 1, 0), corr.weights.mT[None]))
         x, y, z, u, v, weights = rows  # (N, B) each
         seen = [torch.stack((*_exchanged(x, y, *view), z, *_exchanged(u, v, *view), weights)) for view in VIEWS[:count]]
+        noise = map_tensors(lambda sigma: sigma.repeat(count, 1), corr.noise)
         if self.order:
             keys = torch.cat([torch.where(view[5] != 0, view[3:5].detach(), torch.inf) for view in seen[1:]], -1)
-            order = _order(keys).mT.expand(6, -1, -1)
-            seen = [seen[0], torch.cat(seen[1:], -1).gather(1, order)]
+            order = _order(keys)  # (B * (count - 1), N)
+            seen = [seen[0], torch.cat(seen[1:], -1).gather(1, order.mT.expand(6, -1, -1))]
+            batch = len(corr.weights)
+            noise = map_tensors(lambda sigma: torch.cat((sigma[:batch], sigma[batch:].gather(1, order))), noise)
         world_points, img_points, weights = torch.cat(seen, -1).permute(2, 1, 0).split((3, 2, 1), -1)
-        return Correspondences(world_points, img_points, weights[..., 0], corr.focal)
+        return Correspondences(world_points, img_points, weights[..., 0], corr.focal, noise=noise)
 
     def undo_views(self, pose: Pose, count: int) -> tuple[Pose, Pose]:
-        """Poses of :meth:`views`, expressed for the problems themselves.
+        """Express poses of :meth:`views` for the problems themselves.
 
         Args:
-            pose: of all views.
-            count: of the views.
+            pose: poses of all views.
+            count: number of views.
 
         Returns:
             The poses from the first view, and those from the others, :math:`(B, S, 3, 3)` and :math:`(B, S, 3)`.
@@ -237,6 +254,29 @@ class Normalize(nn.Module):
         rotation, translation = pose
         offset = (rotation * frame.centroid[:, None]).sum(-1)
         return Pose(rotation, (translation + offset) * frame.scale[:, None])
+
+    def undo_pairs(self, values: Tensor, frame: Frame) -> Tensor:
+        """Bring values of pairs, :math:`(B, N)`, back to the order in which the pairs came."""
+        return values if frame.order is None else torch.zeros_like(values).scatter(1, frame.order, values)
+
+    def undo_guess(self, guess: Guess, frame: Frame) -> Guess:
+        """Express a guess in the frame, the order and the units of the inputs; ``ok``: whether the problem is valid."""
+        others, noise = guess.others, guess.noise
+        if others is not None:
+            batch, count = others.translation.shape[:2]
+            frames = map_tensors(lambda x: x.repeat_interleave(count, 0), frame)
+            others = self.undo(map_tensors(lambda x: x.flatten(0, 1), others), frames)
+            others = map_tensors(lambda x: x.unflatten(0, (batch, count)), others)
+        if noise is not None:
+            noise = Noise(noise.img / frame.img_scale[:, None], noise.world / frame.scale[:, None])
+            noise = map_tensors(lambda x: self.undo_pairs(x, frame), noise)
+        return Guess(self.undo(guess.pose, frame), self.undo_pairs(guess.weights, frame), frame.valid, others, noise)
+
+
+def _is_usable(noise: Noise) -> Tensor:
+    """Whether standard deviations are finite and not negative, or unknown, bool (B,)."""
+    usable = [((x >= 0) | x.isnan()).all(-1) & ~x.isinf().any(-1) for x in noise]
+    return torch.stack(usable).all(0)
 
 
 def _is_pinhole(intrinsics: Tensor) -> Tensor:
@@ -287,6 +327,6 @@ def _order(keys: Tensor) -> Tensor:
 
 def _ascending(keys: Tensor) -> Tensor:
     """Positions along the last dimension in ascending order, of equal ones the first first."""
-    if torch.compiler.is_exporting():  # ONNX has no other sort; its largest are stable
+    if exporting():  # ONNX has no stable sort, but its top-k is stable
         return keys.topk(keys.shape[-1], largest=False).indices
     return keys.argsort(stable=True, dim=-1)

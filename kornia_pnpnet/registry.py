@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from kornia_pnpnet.init import P3P, RANSAC, EPnP, REPPnP, SubsetSolver
 from kornia_pnpnet.normalize import Normalize
 from kornia_pnpnet.pretrained import shipped_weights
-from kornia_pnpnet.refine.lm import RobustWeightedLM
+from kornia_pnpnet.refine import RobustWeightedLM
 from kornia_pnpnet.solver import PnPNet
 
 __all__ = ["create_solver", "list_solvers", "solve_pnp"]

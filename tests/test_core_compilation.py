@@ -13,7 +13,7 @@ from torch._dynamo.testing import CompileCounter
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from kornia_pnpnet import MLPInit, PnPNet, Pose, RobustWeightedLM, create_solver
-from kornia_pnpnet.core.compilation import Compiled
+from kornia_pnpnet.core.performance import Compiled
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.types import PnPResult
 

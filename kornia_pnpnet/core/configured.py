@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping
+from numbers import Integral
 from typing import Any
 
 from torch import nn
@@ -28,8 +29,13 @@ class Configured(nn.Module):
     def __init__(self, arguments: Mapping[str, Any]) -> None:
         super().__init__()
         values = {name: arguments[name] for name in inspect.signature(type(self)).parameters}
-        self.config = {name: value for name, value in values.items() if not isinstance(value, nn.Module)}
+        self.config = {name: _plain(value) for name, value in values.items() if not isinstance(value, nn.Module)}
 
     def extra_repr(self) -> str:
         """Show the arguments of the constructor."""
         return ", ".join(f"{name}={value!r}" for name, value in self.config.items())
+
+
+def _plain(value: Any) -> Any:
+    """NumPy's integers as Python's, which JSON can hold."""
+    return int(value) if isinstance(value, Integral) and not isinstance(value, bool) else value

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from kornia_pnpnet.core.checks import check_numbers
 from kornia_pnpnet.geometry import transform
-from kornia_pnpnet.refine.lm import RobustWeightedLM
+from kornia_pnpnet.refine import RobustWeightedLM
 from kornia_pnpnet.solver import PnPNet
 from kornia_pnpnet.types import PnPResult, Problems
 

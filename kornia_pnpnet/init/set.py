@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from kornia.core.check import KORNIA_CHECK
 from torch import Tensor, nn
@@ -11,9 +9,10 @@ from torch.nn import functional
 
 from kornia_pnpnet.core.checks import check_devices
 from kornia_pnpnet.core.linalg import dot, small_product
+from kornia_pnpnet.core.performance import take_pairs
 from kornia_pnpnet.geometry import pixel_variance, project
 from kornia_pnpnet.init.epnp.control_points import align
-from kornia_pnpnet.init.ransac.p3p import folded, p3p, unfolded
+from kornia_pnpnet.init.ransac import p3p
 from kornia_pnpnet.types import Correspondences, Guess, Noise, Pose
 
 __all__ = ["SetInit"]
@@ -36,40 +35,8 @@ _SPREADS = {18: 3, 24: 4, 30: 5}
 _RING = {36: [(a, b, c) for i in range(25) for a, b, c in [sorted((i, (i + 1) % 25, (i + 6) % 25))]]}
 # So many of the likeliest pairs say how good the pose of a sample is: squared residuals count to this many variances.
 MOST_JUDGES, _JUDGED = 32, 50.0
-# Somewhat below the most that glibc's threshold follows.
-_LARGEST_KEPT = 2**25 - 2**16
 # The vote of a pair that is surely wrong, of one that is surely right it is 1.
 _LEAST_VOTE = 0.5
-
-
-def _taken(values: Tensor, index: Tensor) -> Tensor:
-    """Some pairs of each problem, (C, K, B) of (B, N, C) by (B, K)."""
-    return values.permute(2, 1, 0).gather(1, index.mT.expand(values.shape[-1], -1, -1))
-
-
-# An operation, for a compiler to lay them out so.
-_taken_whole = torch.library.custom_op("kornia_pnpnet::taken", _taken, mutates_args=())
-
-
-@_taken_whole.register_fake
-def _(values: Tensor, index: Tensor) -> Tensor:
-    return values.new_empty(values.shape[-1], index.shape[1], index.shape[0])
-
-
-@_taken_whole.register_vmap
-def _(info: Any, in_dims: tuple[int | None, int | None], *tensors: Tensor) -> tuple[Tensor, int]:
-    return unfolded(info.batch_size, _taken_whole(*folded(info.batch_size, in_dims, *tensors))), 2
-
-
-def _keep_freed_memory() -> None:
-    """Let glibc keep the memory of large temporaries for the next call.
-
-    Else each call asks the system for it anew, page by page, which takes up to a quarter of the time on a CPU. Memory
-    of the size that was once freed is no longer given back, up to 32 MiB, nor is the twofold of that in all:
-    mallopt(3), M_MMAP_THRESHOLD. These bytes are never touched. Other allocators, and a glibc whose thresholds were
-    set, stay as they are.
-    """
-    torch.empty(_LARGEST_KEPT, dtype=torch.uint8, device="cpu")
 
 
 class _View:
@@ -271,7 +238,6 @@ class SetInit(nn.Module):
             for layer in (self.pair, self.problem):
                 layer.bias.zero_()
             self.pair.bias[0] = 2.0
-        _keep_freed_memory()
 
     def extra_repr(self) -> str:
         """Show the constructor's arguments."""
@@ -349,8 +315,7 @@ class SetInit(nn.Module):
             of_pairs = torch.cat((of_pairs, more.expand(-1, MOST_JUDGES, -1)), 1)
             chances, count = functional.pad(chances, (0, MOST_JUDGES)), count + MOST_JUDGES
         likely = chances.topk(min(MOST_JUDGES, count)).indices
-        exported = torch.compiler.is_exporting()  # for programs that do not know our operation
-        pairs = (_taken if exported else _taken_whole)(of_pairs, likely)  # (8, K, B)
+        pairs = take_pairs(of_pairs, likely)  # (8, K, B)
         samples = self.triples(count)
         drawn = [sample for group in samples.values() for sample in group]
         # (6, 3, S B), stacked, not indexed: a compiler then copies whole rows.
