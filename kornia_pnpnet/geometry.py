@@ -192,15 +192,16 @@ def normal_equations(projection: Projection, weights: Tensor) -> NormalEquations
         (minus_p, minus_q),
     ]
     weights = weights * projection.inv_depth * projection.inv_depth
+    zero = torch.zeros_like(weights[:, 0])
     weighted: list[_Column] = [(_times(u, weights), _times(v, weights)) for u, v in columns]
 
     def inner(a: _Column, b: _Column) -> Tensor:
         """Sum over pairs and rows of the products of two columns, (B,)."""
         (a_u, a_v), (b_u, b_v) = a, b
-        if all(isinstance(x, Tensor) for x in (a_u, a_v, b_u, b_v)):
+        if type(a_u) is type(a_v) is type(b_u) is type(b_v):
             return torch.addcmul(a_u * b_u, a_v, b_v).sum(1)
-        products = [x for x in (_times(a_u, b_u), _times(a_v, b_v)) if isinstance(x, Tensor)]
-        return products[0].sum(1) if products else torch.zeros_like(weights[:, 0])
+        products = [x for x in (_times(a_u, b_u), _times(a_v, b_v)) if type(x) is not float]
+        return products[0].sum(1) if products else zero
 
     hessian = [[inner(weighted[j], columns[i]) for j in range(i + 1)] for i in range(6)]
     return NormalEquations(hessian, [inner(column, projection.scaled_residual) for column in weighted])
@@ -208,10 +209,11 @@ def normal_equations(projection: Projection, weights: Tensor) -> NormalEquations
 
 def _times(a: Any, b: Any) -> Any:
     """A product in which a factor that is known to be 0 or 1 costs nothing."""
-    if isinstance(a, Tensor) and isinstance(b, Tensor):
-        return a * b
-    known, other = (b, a) if isinstance(a, Tensor) else (a, b)
-    return other if known == 1.0 else 0.0
+    if type(a) is float:
+        return b if a == 1.0 else 0.0
+    if type(b) is float:
+        return a if b == 1.0 else 0.0
+    return a * b
 
 
 def change_tangent(equations: NormalEquations, tangent_map: Tensor) -> NormalEquations:

@@ -53,7 +53,7 @@ def problems_last(tree: _T) -> _T:
     One coordinate of all problems is then one row of memory, so that elementwise operations run at full width however
     few pairs a problem has, and a compiler can keep a problem in registers: half the time of an iteration at n = 9.
     """
-    return map_tensors(lambda x: _reversed(_reversed(x).contiguous()), tree)
+    return map_tensors(lambda x: _reversed(_reversed(x).contiguous()) if x.ndim > 1 else x, tree)
 
 
 def repeat_problems(tree: _T, count: int) -> _T:
@@ -80,7 +80,7 @@ def split_batch(tree: _T, count: int) -> list[_T]:
 
 
 def _reversed(x: Tensor) -> Tensor:
-    return x.permute(tuple(reversed(range(x.ndim))))
+    return x.permute(*range(x.ndim - 1, -1, -1))
 
 
 # -- one custom operation ----------------------------------------------------------------------------------------------
