@@ -208,7 +208,7 @@ class Normalize(Configured):
         world_points, img_points, weights = torch.cat(seen, -1).permute(2, 1, 0).split((3, 2, 1), -1)
         return Correspondences(world_points, img_points, weights[..., 0], corr.focal, noise=noise)
 
-    def undo_views(self, pose: Pose, count: int) -> tuple[Pose, Pose]:
+    def undo_views(self, pose: Pose, count: int) -> list[Pose]:
         """Express poses of :meth:`views` for the problems themselves.
 
         Args:
@@ -216,16 +216,15 @@ class Normalize(Configured):
             count: number of views.
 
         Returns:
-            The poses from the first view, and those from the others, :math:`(B, S, 3, 3)` and :math:`(B, S, 3)`.
+            The poses from each view, the first view first.
         """
         seen = []
         matrices, vectors = (x.movedim(0, -1).unflatten(-1, (count, -1)).unbind(-2) for x in pose)
         for view, matrix, vector in zip(VIEWS, matrices, vectors, strict=False):  # (3, 3, B), (3, B)
             for axis in (0, 1):
                 matrix = _axes_back(matrix, axis, view)
-            seen.append((matrix.movedim(-1, 0), _axes_back(vector, 0, view).movedim(-1, 0)))
-        (first, *others) = (Pose(*view) for view in seen)
-        return first, Pose(*(torch.stack(entries, 1) for entries in zip(*others, strict=True)))
+            seen.append(Pose(matrix.movedim(-1, 0), _axes_back(vector, 0, view).movedim(-1, 0)))
+        return seen
 
     def undo(self, pose: Pose, frame: Frame) -> Pose:
         r"""Express a pose of the normalised world in the original one.

@@ -246,9 +246,10 @@ class PnPNet(nn.Module):
         else:
             batch = len(world_points)
             guess = self.init(self.normalize.views(corr, views))
-            pose, others = self.normalize.undo_views(guess.pose, views)
+            first, *others = [x for pose in guess.poses for x in self.normalize.undo_views(pose, views)]
+            others = map_tensors(lambda *x: torch.stack(x, 1), *others)
             # Weights, ok and noise of the first view, whose pairs have the order of the correspondences.
-            guess = map_tensors(lambda x: x[:batch], guess)._replace(pose=pose, others=others)
+            guess = map_tensors(lambda x: x[:batch], guess)._replace(pose=first, others=others)
         return _Begun(self.refine.begin(corr, guess), frame, guess)
 
     def _given(self, init: Pose | None, world_points: Tensor, frame: Frame) -> Pose:

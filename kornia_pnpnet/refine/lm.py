@@ -250,10 +250,9 @@ class RobustWeightedLM(Configured):
         if self.by_residual:
             by_residual = guided._replace(weights=relative(corr.weights, corr.weights))
             prior = corr.weights
-        poses = [guess.pose]
+        poses = guess.poses
         starts, rivals = guided, None
-        if guess.others is not None:
-            poses += map(Pose, guess.others.rotation.unbind(1), guess.others.translation.unbind(1))
+        if len(poses) > 1:
             starts = repeat_problems(guided, len(poses))
             rivals = starts._replace(weights=repeat_problems(by_residual.weights, len(poses)))
         # Problems last in memory, too: (3, 3, S B) and (3, S B).
