@@ -203,7 +203,7 @@ class Normalize(Configured):
             keys = torch.cat([torch.where(view[5] != 0, view[3:5].detach(), torch.inf) for view in seen[1:]], -1)
             order = _order(keys)  # (B * (count - 1), N)
             seen = [seen[0], torch.cat(seen[1:], -1).gather(1, order.mT.expand(6, -1, -1))]
-            batch = len(corr.weights)
+            batch = corr.weights.shape[0]
             noise = map_tensors(lambda sigma: torch.cat((sigma[:batch], sigma[batch:].gather(1, order))), noise)
         world_points, img_points, weights = torch.cat(seen, -1).permute(2, 1, 0).split((3, 2, 1), -1)
         return Correspondences(world_points, img_points, weights[..., 0], corr.focal, noise=noise)

@@ -244,7 +244,7 @@ class PnPNet(nn.Module):
         elif views == 1:
             guess = self.init(corr)
         else:
-            batch = len(world_points)
+            batch = world_points.shape[0]
             guess = self.init(self.normalize.views(corr, views))
             first, *others = [x for pose in guess.poses for x in self.normalize.undo_views(pose, views)]
             others = map_tensors(lambda *x: torch.stack(x, 1), *others)
@@ -254,7 +254,7 @@ class PnPNet(nn.Module):
 
     def _given(self, init: Pose | None, world_points: Tensor, frame: Frame) -> Pose:
         """A pose given by the caller (or the identity) in the normalised frame."""
-        batch = len(world_points)
+        batch = world_points.shape[0]
         if init is None:
             eye = torch.eye(3, dtype=world_points.dtype, device=world_points.device).expand(batch, 3, 3)
             init = Pose(eye, world_points.new_zeros(batch, 3))

@@ -20,7 +20,7 @@ from kornia_pnpnet.evaluation.operations.operations import (
     sort,
 )
 from kornia_pnpnet.geometry import NormalEquations, move
-from kornia_pnpnet.refine.lm import solve_damped
+from kornia_pnpnet.refine import solve_damped
 from kornia_pnpnet.types import Pose
 
 

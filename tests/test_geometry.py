@@ -21,14 +21,13 @@ from kornia_pnpnet.geometry import (
     move,
     normal_equations,
     pixel_variance,
-    problems_last,
     project,
     retract,
     retract_additive,
     rotation_angle,
     transform,
 )
-from kornia_pnpnet.refine.lm import lm_step
+from kornia_pnpnet.refine import lm_step
 
 FOCAL = torch.tensor(3400.0, dtype=torch.float64)
 
@@ -141,23 +140,6 @@ def test_projection_keeps_dtype_and_shapes(dtype, random_rotations):
         entries = tree_leaves(equations_at(pose, corr, corr.weights, additive=additive))
         assert len(entries) == 21 + 6
         assert all(x.shape == (7,) and x.dtype == dtype for x in entries)
-
-
-def test_problems_last_is_the_same_in_another_order_of_memory(random_rotations):
-    corr, pose = random_scene(4, random_rotations(7))
-    there = problems_last(corr)
-    for one, other in zip(there[:4], corr[:4], strict=True):
-        assert torch.equal(one, other)
-    # The problem is the fastest index, then the pair.
-    assert there.world_points.stride() == there.img_points.stride() == (1, 7, 28)
-    assert there.weights.stride() == (1, 7)
-    projection = project(pose, there)
-    assert all(x.stride() == (1, 7) for x in tree_leaves(projection))  # and it stays so
-    for one, other in zip(tree_leaves(projection), tree_leaves(project(pose, corr)), strict=True):
-        assert torch.equal(one, other)
-    scales = corr._replace(img_scale=torch.arange(7.0), world_scale=torch.ones(7))
-    assert problems_last(scales).img_scale is scales.img_scale
-    assert problems_last(scales).world_scale is scales.world_scale
 
 
 # --- Jacobian ------------------------------------------------------------------------------------------------------

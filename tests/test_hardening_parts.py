@@ -68,8 +68,8 @@ from kornia_pnpnet.init import P3P, RANSAC, EPnP, REPPnP, SubsetSolver, p3p
 from kornia_pnpnet.losses import pose_distances
 from kornia_pnpnet.metrics import reliability
 from kornia_pnpnet.peers import OpenCVPnP, OpenCVRansac, OpenCVUsac, PeerSolver, PoseLib, PyColmap
+from kornia_pnpnet.refine import BACKWARDS, BoundedParameter, explains, lm_step, solve_damped
 from kornia_pnpnet.refine.kernels import KERNELS
-from kornia_pnpnet.refine.lm import BACKWARDS, BoundedParameter, explains, lm_step, solve_damped
 from kornia_pnpnet.training.loop import TrainSettings
 from kornia_pnpnet.types import Noise
 

@@ -46,14 +46,18 @@ def test_undo_is_the_inverse_on_poses(n, options, make_problems):
     torch.testing.assert_close(forth.matrix, p.pose.matrix, rtol=0, atol=1e-12 * 100)
 
 
+def in_order(values, frame):
+    """Values of pairs, (B, N, C), in the order of the normalised pairs."""
+    return values if frame.order is None else values.gather(1, frame.order[..., None].expand_as(values))
+
+
 @pytest.mark.parametrize("options", OPTIONS, ids=str)
 def test_poses_and_points_move_together(options, make_problems):
     p = make_problems()
     normalize = Normalize(**options)
     corr, frame = normalize(p.world_points, p.img_points, p.intrinsics)
     moved = transform(normalize.apply_to_pose(p.pose, frame), corr.world_points)
-    order = frame.order[..., None].expand(-1, -1, 3)
-    original = transform(p.pose, p.world_points).gather(1, order)
+    original = in_order(transform(p.pose, p.world_points), frame)
     torch.testing.assert_close(moved, original * frame.scale[:, None, None], rtol=1e-12, atol=1e-12)
     if options["center"]:
         assert corr.world_points.mean(1).abs().max() < 1e-12 * 100
@@ -78,7 +82,7 @@ def test_residuals_scale_with_the_focal_length(f, options, make_problems):
     normalize = Normalize(**options)
     corr, frame = normalize(p.world_points, pixels, K)
     residual = torch.stack(project(normalize.apply_to_pose(p.pose, frame), corr).residual, -1)
-    expected = expected.gather(1, frame.order[..., None].expand(-1, -1, 2))
+    expected = in_order(expected, frame)
     torch.testing.assert_close(residual, expected * (F_CONST / f), rtol=1e-9, atol=1e-7)
     assert corr.focal == F_CONST
 
@@ -396,7 +400,7 @@ def test_two_pairs_are_invalid_wherever_they_are(offset, size, dtype):
 
 @pytest.mark.parametrize("options", OPTIONS, ids=str)
 def test_problems_are_side_by_side_in_memory(options, make_problems):
-    """One coordinate of one pair of all problems is a row: see ``problems_last``."""
+    """One coordinate of one pair of all problems is a row: see ``core.performance.problems_last``."""
     corr, _ = Normalize(**options)(*make_problems()[:3])
     assert corr.world_points.permute(2, 1, 0).is_contiguous()
     assert corr.img_points.permute(2, 1, 0).is_contiguous()
@@ -472,10 +476,10 @@ def test_mirrors_show_the_same_problems_and_are_undone(order, make_problems):
         poses.append((mirror @ true.rotation @ mirror.mT, true.translation @ mirror.mT))
     stacked = Pose(*(torch.cat(entries) for entries in zip(*poses, strict=True)))
     assert project(stacked, seen).sq_residual.max() < 1e-12
-    first, others = normalize.undo_views(stacked, count)
-    torch.testing.assert_close(first, true)
-    for i in range(count - 1):
-        torch.testing.assert_close(Pose(*(x[:, i] for x in others)), true)
+    undone = normalize.undo_views(stacked, count)
+    assert len(undone) == count
+    for pose in undone:
+        torch.testing.assert_close(pose, true)
 
 
 def test_the_first_view_is_the_problem_and_no_two_are_alike(make_problems):

@@ -869,7 +869,7 @@ def untrained(views=1, m=6, n=9):
 
 @pytest.mark.parametrize("views", [0, 9, 2.0, True, "2"])
 def test_a_number_of_views_that_there_is_not_is_refused(views):
-    with pytest.raises(BaseError, match="views must be 1 to 8"):
+    with pytest.raises(BaseError, match="views must be an integer from 1 to 8"):
         PnPNet(MLPInit(9), views=views)
 
 
@@ -946,7 +946,7 @@ def test_trained_weights_take_views_and_m(make_problems):
     results = [create_solver("pnpnet-n9", views=views).double()(*p[:3]) for views in (1, 8)]
     one, eight = (success(pose_errors(result.pose, p.pose)).double().mean() for result in results)
     assert eight > one + 0.01
-    with pytest.raises(BaseError, match="views must be 1 to 8"):
+    with pytest.raises(BaseError, match="views must be an integer from 1 to 8"):
         create_solver("pnpnet-n9", views=0)
 
 
@@ -1072,3 +1072,12 @@ def test_transforms_of_torch_func(name, make_problems):
     else:
         with pytest.raises(NotImplementedError, match="jvp"):
             forward()
+
+
+def test_views_keep_the_noise_and_the_hypotheses_of_a_set_network(make_problems):
+    """More views of a network that estimates noise and gives several poses do not solve fewer problems."""
+    p = make_problems(batch=1000, outliers=3, dtype=torch.float32)
+    one, three = (create_solver("pnpnet-set", views=views)(*p[:3]) for views in (1, 3))
+    rates = [success(pose_errors(result.pose, p.pose)).float().mean() for result in (one, three)]
+    assert rates[1] > rates[0] - 0.02
+    assert three.ok.float().mean() > 0.99

@@ -80,7 +80,7 @@ def split_batch(tree: _T, count: int) -> list[_T]:
 
 
 def _reversed(x: Tensor) -> Tensor:
-    return x.permute(*range(x.ndim - 1, -1, -1))
+    return x.permute(tuple(reversed(range(x.ndim))))
 
 
 # -- one custom operation ----------------------------------------------------------------------------------------------

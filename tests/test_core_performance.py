@@ -13,8 +13,10 @@ from torch._dynamo.testing import CompileCounter
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from kornia_pnpnet import MLPInit, PnPNet, Pose, RobustWeightedLM, create_solver
-from kornia_pnpnet.core.performance import Compiled
+from kornia_pnpnet.core.performance import Compiled, problems_last, repeat_problems, split_batch
+from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet.geometry import project
 from kornia_pnpnet.types import PnPResult
 
 # torch.compile makes an instance of an autograd function while it looks into it.
@@ -109,7 +111,7 @@ def test_what_cannot_be_captured_runs_as_it_is_with_one_warning(backend):
     compiled.compile()
     inputs = problems(3)[:3]
     with torch.no_grad():
-        with pytest.warns(RuntimeWarning, match="Not compiled, running as it is") as caught:
+        with pytest.warns(RuntimeWarning, match="Not compiled, running uncompiled") as caught:
             first = compiled(*inputs)
         assert len(caught) == 1
         with warnings.catch_warnings():
@@ -243,3 +245,27 @@ def test_without_a_real_compiler(monkeypatch):
         three = Compiled(partial(torch.mul, 3.0))
         with pytest.warns(RuntimeWarning, match="Not compiled"):
             assert torch.equal(three(torch.ones(2000)), 3 * torch.ones(2000))
+
+
+def test_problems_last_changes_only_the_order_of_memory(make_problems, correspond):
+    corr, pose = correspond(make_problems(n=4, batch=7))
+    laid = problems_last(corr)
+    for one, other in zip(iter_tensors(laid), iter_tensors(corr), strict=True):
+        assert torch.equal(one, other)
+    # The problem is the fastest index, then the pair.
+    assert laid.world_points.stride() == laid.img_points.stride() == (1, 7, 28)
+    assert laid.weights.stride() == (1, 7)
+    assert all(x.stride() == (1, 7) for x in iter_tensors(project(pose, laid)))  # arithmetic keeps the layout
+
+
+def test_repeated_problems_are_the_problems_several_times(make_problems, correspond):
+    corr, _ = correspond(make_problems(n=4, batch=3))
+    for one, other in zip(iter_tensors(repeat_problems(corr, 2)), iter_tensors(corr), strict=True):
+        assert torch.equal(one, torch.cat((other, other)) if other.ndim else other)
+
+
+def test_split_batches_join_to_the_batch(make_problems):
+    problems = make_problems(batch=7)
+    parts = split_batch(problems, 3)
+    joined = map_tensors(lambda *x: torch.cat(x), *parts)
+    assert all(torch.equal(*pair) for pair in zip(iter_tensors(joined), iter_tensors(problems), strict=True))
