@@ -22,7 +22,7 @@ from kornia_pnpnet.pretrained import read_weights, write_weights
 from kornia_pnpnet.refine import LMStart, LMStep, RobustWeightedLM
 from kornia_pnpnet.types import Guess, Noise, PnPResult, Pose, camera_matrices
 
-__all__ = ["PnPNet"]
+__all__ = ["PnPNet", "check_inputs"]
 
 _INITIALISERS: dict[str, type[nn.Module]] = {
     "EPnP": EPnP,
@@ -365,18 +365,21 @@ def _gate_pose(pose: Pose, ok: Tensor, finite: Tensor) -> Pose:
     return Pose(_gate(pose.rotation, ok, finite, eye), _gate(pose.translation, ok, finite, 0.0))
 
 
-def _checked(
+def check_inputs(
     world_points: Tensor,
     img_points: Tensor,
-    intrinsics: Tensor | PinholeCamera,
+    intrinsics: Tensor,
     weights: Tensor | None,
     mask: Tensor | None,
-    init: Pose | None,
-    img_sigma: Tensor | float | None,
-    world_sigma: Tensor | float | None,
-) -> _Inputs:
-    """Check shapes, dtypes and devices; never values, which would stall a GPU and let one problem fail a batch."""
-    intrinsics = camera_matrices(intrinsics)
+    init: Pose | None = None,
+) -> None:
+    """Check shapes, dtypes and devices; never values, which would stall a GPU and let one problem fail a batch.
+
+    Raises:
+        ShapeError: for shapes that do not fit each other, or fewer than 3 pairs.
+        TypeCheckError: for arguments that are no tensors, dtypes that differ or are not float32 or float64.
+        DeviceError: for tensors on different devices.
+    """
     for name, value in (("world_points", world_points), ("img_points", img_points), ("intrinsics", intrinsics)):
         if not isinstance(value, Tensor):
             raise TypeCheckError(f"{name} must be a tensor, got {type(value).__name__}.")
@@ -403,12 +406,27 @@ def _checked(
     if mask is not None and mask.dtype != torch.bool:
         raise TypeCheckError(f"mask must be bool, got {mask.dtype}.")
     check_devices({"mask": mask}, world_points)
+
+
+def _checked(
+    world_points: Tensor,
+    img_points: Tensor,
+    intrinsics: Tensor | PinholeCamera,
+    weights: Tensor | None,
+    mask: Tensor | None,
+    init: Pose | None,
+    img_sigma: Tensor | float | None,
+    world_sigma: Tensor | float | None,
+) -> _Inputs:
+    """Check the arguments of a call, and expand them to all problems and pairs."""
+    intrinsics = camera_matrices(intrinsics)
+    check_inputs(world_points, img_points, intrinsics, weights, mask, init)
     noise = None
     if img_sigma is not None or world_sigma is not None:
         img, world = (expand_sigma(*x, world_points) for x in (("img_sigma", img_sigma), ("world_sigma", world_sigma)))
         noise = Noise(img, world)
     if intrinsics.ndim == 2:
-        intrinsics = intrinsics.expand(batch, 3, 3)
+        intrinsics = intrinsics.expand(world_points.shape[0], 3, 3)
     init = None if init is None else Pose(*init)
     return _Inputs(world_points, img_points, intrinsics, weights, mask, init, noise)
 

@@ -1,23 +1,24 @@
-"""Operation counts of solvers."""
+"""Operation counts of solvers by name, for figure 1."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from kornia.core.exceptions import ValueCheckError
+from kornia.core.exceptions import ShapeError, ValueCheckError
+from torch import nn
 
 from kornia_pnpnet.core.environment import environment
+from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.evaluation.choices import load_solver
-from kornia_pnpnet.evaluation.operations.calls import part_calls
-from kornia_pnpnet.evaluation.operations.operations import OPERATION_COSTS, Operations
-from kornia_pnpnet.evaluation.operations.parts import PARTS
-from kornia_pnpnet.init import RANSAC
+from kornia_pnpnet.evaluation.operations.costs import OPERATION_COSTS
+from kornia_pnpnet.evaluation.operations.counter import count_per_problem
+from kornia_pnpnet.init import RANSAC, MLPInit
 from kornia_pnpnet.solver import PnPNet
 
-__all__ = ["SOLVERS", "complexity_results", "operation_count", "operations_by_part"]
+__all__ = ["SOLVERS", "complexity_results", "operation_count"]
 
-#: The solvers that have a formula, by their names.
+#: The solvers of figure 1, by name.
 SOLVERS = (
     "net",
     "pnpnet",
@@ -31,64 +32,59 @@ SOLVERS = (
     "identity-lm",
 )
 
-# The shipped weights behind the names without n: the count of a network only needs its architecture.
+# The shipped weights behind the names without n: the count of a network depends on its architecture alone.
 _ANY_N = {"net": "net-n9", "pnpnet": "pnpnet-n9"}
 _FORMAT = 1
+# Problems over which the count of a RANSAC is averaged, and their seed. Other solvers cost the same for all problems.
+_PROBLEMS, _SEED = 8, 2024
+# Pixels. No pair is ever within this threshold: RANSAC draws all its samples.
+_ENDLESS = 1e-9
 
 
-def operations_by_part(
-    solver: PnPNet, n: int, *, outliers: int | None = None, better: int | None = None
-) -> dict[str, Operations]:
-    """Operations for one problem of n pairs, by parts.
-
-    Args:
-        solver: see :func:`part_calls`, as are the others.
-        n: number of pairs.
-        outliers: how many of them are wrong.
-        better: how many rounds of RANSAC find a better pose.
-
-    Returns:
-        For each name in :data:`PARTS` that the solver runs, the operations of all its
-        calls.
-
-    Raises:
-        ValueCheckError: when there is no formula.
-    """
-    total: dict[str, Operations] = {}
-    for part, times, sizes in part_calls(solver, n, outliers=outliers, better=better):
-        total[part] = total.get(part, Operations()) + times * PARTS[part](*sizes)
-    return total
-
-
-def operation_count(solver: str | PnPNet, n: int, *, outliers: int | None = None) -> float:
-    """Flops for one problem of n pairs.
+def operation_count(solver: str | PnPNet, n: int, *, outliers: int = 0) -> float:
+    """Count the weighted operations of a run, per problem.
 
     Args:
-        solver: the solver, or its name as for the command line (``"p3p-ransac:confidence=0.99"``). A network counts as
-            one that is built for n pairs; ``net`` and ``pnpnet`` are the names without n.
+        solver: the solver, or its name as for the command line (``"p3p-ransac:confidence=0.99"``). A network of a fixed
+            number of pairs counts as one of the same kind that is built for n pairs; ``net`` and ``pnpnet`` are the
+            names without n.
         n: number of pairs.
-        outliers: how many of them are wrong, for the rule by which RANSAC stops; it draws all its samples when
-            ``None``.
+        outliers: number of outliers in each problem; only the counts of RANSAC depend on it.
 
     Returns:
-        Operations weighted by :data:`~kornia_pnpnet.evaluation.operations.operations.OPERATION_COSTS`.
+        Operations weighted by :data:`OPERATION_COSTS`, the mean over some synthetic problems.
 
     Raises:
-        ValueCheckError: when there is no such solver, or no formula for it.
+        ValueCheckError: when there is no such solver, or it is not one of this package.
+        BaseError: when the solver does not take n pairs, or there are more outliers than pairs.
+        NotImplementedError: when the solver runs an operation of unknown cost.
 
     Example:
         >>> round(operation_count("identity-lm", 9), -4)
         70000.0
     """
-    solver = _solver(solver) if isinstance(solver, str) else solver
-    return sum(operations.flops for operations in operations_by_part(solver, n, outliers=outliers).values())
+    built = _built(solver, n)
+    count = _PROBLEMS if isinstance(built.init, RANSAC) else 2
+    source = SyntheticProblems(n=n, batch_size=count, seed=_SEED, outliers=OutlierMix(count=outliers))
+    problems = source.batch(0)
+
+    def run(times: int) -> None:
+        repeated = problems.map(lambda x: x.repeat(times, *(1,) * (x.ndim - 1)))
+        built(repeated.world_points, repeated.img_points, repeated.intrinsics)
+
+    return count_per_problem(run).flops / count
 
 
-def _solver(spec: str) -> PnPNet:
-    name, colon, options = spec.partition(":")
-    solver = load_solver(_ANY_N.get(name, name) + colon + options)
-    if not isinstance(solver, PnPNet):
-        raise ValueCheckError(f"There is no formula for {spec!r}: it is not made of this package's parts.")
+def _built(solver: str | PnPNet, n: int) -> PnPNet:
+    """The solver, with an untrained network for n pairs in place of a network for another number."""
+    if isinstance(solver, str):
+        name, colon, options = solver.partition(":")
+        made: nn.Module = load_solver(_ANY_N.get(name, name) + colon + options)
+        if not isinstance(made, PnPNet):
+            raise ValueCheckError(f"Cannot count the operations of {solver!r}: it is not a solver of this package.")
+        solver = made
+    if isinstance(solver.init, MLPInit):
+        return PnPNet(MLPInit(n), solver.refine, solver.normalize, views=solver.views).eval()
     return solver
 
 
@@ -100,23 +96,26 @@ def complexity_results(
     Args:
         solvers: names, see :func:`operation_count`.
         n: numbers of pairs.
-        outlier_share: of how many outliers RANSAC is to be sure: the share of the pairs, rounded down.
+        outlier_share: share of outliers, rounded down to a number.
 
     Returns:
-        ``kind`` and ``format``; ``n``; ``counts``, for each solver one number for each n, ``None`` where its samples
-        have more than n pairs; ``ransac``, the solvers that draw samples; ``all_samples``, their counts when they do
-        not stop before the last sample; ``outliers`` for each n; ``costs``, the table of costs; ``environment``.
+        ``kind`` and ``format``; ``n``; ``counts``, for each solver one number for each n, ``None`` where the solver
+        needs more than n pairs; ``ransac``, the names of the solvers that draw samples; ``all_samples``, their counts
+        when they draw all samples; ``outliers`` for each n; ``costs``, the table of costs; ``environment``.
     """
     sizes = list(n)
     outliers = [int(outlier_share * size + 1e-9) for size in sizes]
-    built = {name: _solver(name) for name in solvers}
+    built = {name: _built(name, sizes[0]) for name in solvers}
     ransac = [name for name, solver in built.items() if isinstance(solver.init, RANSAC)]
 
-    def count(name: str, size: int, wrong: int | None) -> float | None:
-        init = built[name].init
-        if isinstance(init, RANSAC) and size < init.minimal.sample_size:
+    def count(spec: str, size: int, wrong: int) -> float | None:
+        try:
+            return operation_count(spec, size, outliers=wrong)
+        except ShapeError:  # its samples have more pairs
             return None
-        return operation_count(built[name], size, outliers=wrong)
+
+    def endless(spec: str) -> str:
+        return f"{spec}{',' if ':' in spec else ':'}threshold={_ENDLESS}"
 
     return {
         "kind": "complexity",
@@ -124,7 +123,7 @@ def complexity_results(
         "n": sizes,
         "counts": {name: [count(name, *pair) for pair in zip(sizes, outliers, strict=True)] for name in built},
         "ransac": ransac,
-        "all_samples": {name: [count(name, size, None) for size in sizes] for name in ransac},
+        "all_samples": {name: [count(endless(name), size, 0) for size in sizes] for name in ransac},
         "outliers": outliers,
         "costs": dict(OPERATION_COSTS),
         "environment": environment(),

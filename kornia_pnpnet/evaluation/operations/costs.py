@@ -1,7 +1,7 @@
-"""Numbers of scalar operations, what they cost, and how many of them linear algebra takes.
+"""The cost of scalar operations, and the numbers of them in linear algebra.
 
-What counts is what a scalar program would have to compute: additions, multiplications, divisions, square roots,
-exponentials, logarithms and other special functions, comparisons, logic. Moving data and changing signs count nothing.
+Counted is what a scalar program would have to compute: additions, multiplications, divisions, square roots,
+exponentials, logarithms and other special functions, comparisons, logic. Moving data and changing signs is free.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ __all__ = [
     "sort",
 ]
 
-#: What one operation of each kind costs in "flops". Source: T. Minka's Lightspeed toolbox for MATLAB 2.8 (the protocol
-#: that the paper follows): ``flops.m`` and ``flops_div``, ``_sqrt``, ``_exp``, ``_log``, which time a Pentium 4. There
-#: sines and other special functions cost as a logarithm, a change of sign and moved data cost nothing, and an absolute
-#: value (4) costs as two comparisons. Logic (and, or, not, choosing one of two) is not in that table: 1 is ours.
+#: Cost of one operation of each kind in "flops". Source: T. Minka's Lightspeed toolbox for MATLAB 2.8 (the protocol
+#: that the paper follows): ``flops.m`` and ``flops_div``, ``_sqrt``, ``_exp``, ``_log``, which time a Pentium 4. In
+#: that table sines and other special functions cost as much as a logarithm, changes of sign and moves of data nothing,
+#: and an absolute value (4) as much as two comparisons. Logic (and, or, not, select) is not in that table: 1 is ours.
 OPERATION_COSTS: dict[str, int] = {
     "add": 1,
     "multiply": 1,
@@ -39,7 +39,7 @@ OPERATION_COSTS: dict[str, int] = {
 
 @dataclass(frozen=True)
 class Operations:
-    """How many operations of each kind; they can be added, and multiplied by a number.
+    """Numbers of operations of each kind; they can be added, and multiplied by a number.
 
     Example:
         >>> (3 * Operations(add=1, divide=2) + Operations(add=4)).flops
@@ -65,7 +65,7 @@ class Operations:
 
     @property
     def flops(self) -> float:
-        """The sum, weighted by :data:`~kornia_pnpnet.evaluation.operations.operations.OPERATION_COSTS`."""
+        """The sum, weighted by :data:`~kornia_pnpnet.evaluation.operations.costs.OPERATION_COSTS`."""
         return sum(OPERATION_COSTS[kind] * count for kind, count in asdict(self).items())
 
 
