@@ -49,7 +49,9 @@ def test_units_of_the_noise(make_problems):
     """Numbers, of each problem, of each pair; twice the noise is four times the covariance."""
     p = make_problems(n=12, batch=5)
     plain = pose_covariance(p.pose, *p[:3], img_sigma=1.0, world_sigma=0.1)
-    double = pose_covariance(p.pose, *p[:3], img_sigma=torch.full((5,), 2.0), world_sigma=torch.full((5, 12), 0.2))
+    double = pose_covariance(
+        p.pose, *p[:3], img_sigma=p.world_points.new_full((5,), 2.0), world_sigma=p.world_points.new_full((5, 12), 0.2)
+    )
     torch.testing.assert_close(double, 4.0 * plain)
     scaled = Pose(p.pose.rotation, 1000.0 * p.pose.translation)
     large = pose_covariance(scaled, 1000.0 * p.world_points, *p[1:3], img_sigma=1.0, world_sigma=100.0)
