@@ -767,8 +767,8 @@ def test_only_the_best_start_has_a_gradient(backward, near_and_far):
     for with_far in (True, False):
         (near, far), points = map_tensors(lambda x: x.clone().requires_grad_(), (poses, corr.world_points))
         first = guess(far, corr, near) if with_far else guess(near, corr)
-        m, robustness = (4, None) if backward == "unroll" else (20, 0.0)  # short gradients need a minimum
-        lm = RobustWeightedLM(m, robustness=robustness, backward=backward, last=12)
+        m = 4 if backward == "unroll" else 20  # implicit gradients are those of a minimum
+        lm = RobustWeightedLM(m, robustness=0.0, backward=backward, last=12)
         refined = lm(corr._replace(world_points=points), first)
         leaves = (points, *near, *far)
         gradients.append(torch.autograd.grad(refined.pose.translation.sum(), leaves, materialize_grads=True))

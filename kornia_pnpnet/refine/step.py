@@ -191,7 +191,7 @@ def robust_weights(
     estimated: Tensor | None,
     narrower: float = 1.0,
 ) -> Tensor:
-    """Robust weights by residuals, in standard deviations that the residuals themselves correct where told to.
+    """Robust weights by residuals; where the noise is an estimate, the residuals correct it first.
 
     Args:
         sq_residual: what :func:`sq_standardised` returned, :math:`(B, N)`.
