@@ -17,7 +17,7 @@ from torch import Tensor
 
 __all__ = ["KERNELS", "POWER_FLOOR", "RobustKernel"]
 
-#: Residuals below this many pixels count as this many in ``power``, whose weight would be infinite at 0.
+#: Pixels. Smaller residuals count as this in ``power``, whose weight would be infinite at 0.
 POWER_FLOOR = 0.1
 
 
