@@ -284,7 +284,7 @@ class RobustWeightedLM(Configured):
         """
         explored = 0 if start.rivals is None else min(self.compared_at, m)
         guided = max(self.m - self.by_residual, explored)
-        seen = [(start.starts, None)] * explored
+        seen: list[tuple[Correspondences, Tensor | None]] = [(start.starts, None)] * explored
         seen += [(start.guided, None)] * (guided - explored)
         seen += [(start.by_residual, start.estimated)] * (self.m - guided)
         advance = self._advance_if_better if self.reject_worse else self._advance
