@@ -331,9 +331,9 @@ class PnPNet(nn.Module):
         """Load a trained solver, in evaluation mode.
 
         Args:
-            name_or_folder: the name of shipped weights (see :func:`~kornia_pnpnet.shipped_weights`), which needs no
-                network; a local folder; or a Hugging Face Hub repository id. The first that exists is taken. Nothing is
-                unpickled.
+            name_or_folder: the name of shipped weights (see :func:`~kornia_pnpnet.pretrained.shipped_weights`), which
+                needs no network; a local folder; or a Hugging Face Hub repository id. The first that exists is taken.
+                Nothing is unpickled.
 
         Returns:
             The solver in float32 on the CPU.

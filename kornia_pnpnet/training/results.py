@@ -119,7 +119,7 @@ def run_results(
     Args:
         model: the trained solver.
         validation: problems by name.
-        report: what :func:`~kornia_pnpnet.training.loop.fit` returned.
+        report: what :func:`~kornia_pnpnet.training.fit` returned.
         config: the resolved configuration.
         overrides: the command line's overrides, ``key=value``.
         origin: the results of the run with whose weights this one began.

@@ -96,7 +96,7 @@ class RANSAC(nn.Module):
     :math:`f/z` times as much. Least squares weigh an inlier by the inverse of the right hand side.
 
     The guess is ``ok`` when so many inliers among pairs without any pose behind them would be a rare chance (see
-    :func:`log_false_alarms`; fewer than 0.01 such poses are expected). Of three pairs
+    :func:`~kornia_pnpnet.refine.verdict.log_false_alarms`; fewer than 0.01 such poses are expected). Of three pairs
     alone that cannot be told: they are ``ok`` when there is a pose.
 
     Gradients: which pairs are inliers, and the weights that their depths give them, are selected without a gradient.
