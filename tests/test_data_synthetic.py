@@ -21,7 +21,7 @@ from kornia_pnpnet.data import (
     SyntheticProblems,
     VaryingSize,
 )
-from kornia_pnpnet.data.synthetic import batch_generator, random_poses
+from kornia_pnpnet.data.draws import batch_generator, random_poses
 from kornia_pnpnet.geometry import transform
 
 COUNT = 20_000
@@ -548,3 +548,11 @@ def test_varying_sizes_are_reproducible_and_come_from_the_list():
             torch.testing.assert_close(x, y, rtol=0, atol=0, equal_nan=True)
         shapes.add(tuple(a.inliers.shape))
     assert shapes == {(40, 5), (22, 9), (10, 20)}
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_in_a_mixture_unknown_noise_is_nan(first):
+    """Whichever of the sources comes first."""
+    sources = [SyntheticProblems, partial(SyntheticProblems, known_noise=1.0)]
+    problems = MixedProblems(sources if first == 0 else sources[::-1], batch_size=10, n=4).batch(0)
+    assert problems.img_sigma.isnan().sum() == problems.world_sigma.isnan().sum() == 5
