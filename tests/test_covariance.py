@@ -2,7 +2,11 @@
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from kornia.core.exceptions import BaseError
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
+from strategies import ANY, SOLVERS, batches, many, numbers
 
 from kornia_pnpnet import Normalize, PnPNet, Pose, RobustWeightedLM, create_solver, pose_covariance
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
@@ -80,3 +84,39 @@ def test_the_shipped_network_says_how_sure_it_is(n, wrong):
     error = tangent(result.pose, p.pose)
     squares = (error * torch.linalg.solve(covariance, error)).sum(-1)
     assert squares.mean().item() == pytest.approx(6.0, rel=0.15)
+
+
+# -- whatever comes in -------------------------------------------------------------------------------------------------
+
+
+@many(40)
+@given(batches())
+def test_covariances_take_anything(case):
+    inputs, _, weights, _ = case
+    result = SOLVERS["pnpnet-set"](*inputs)
+    covariance = pose_covariance(result.pose, *inputs, img_sigma=1.0, weights=weights)
+    assert covariance.shape == (len(inputs[0]), 6, 6)
+    assert not covariance.requires_grad
+    assert not covariance[result.ok].isnan().any()
+
+
+@many(60)
+@given(st.data())
+def test_covariances_of_any_numbers(data):
+    batch, count = data.draw(st.integers(0, 3)), data.draw(st.integers(0, 12))
+    some = st.integers(0, 3)
+    shapes = [(batch, 3, 3), (batch, 3), (batch, count, 3), (batch, count, 2), (3, 3)]
+    if data.draw(st.booleans()):
+        which = data.draw(st.integers(0, 4))
+        shapes[which] = (*shapes[which][:-1], data.draw(some)) if data.draw(st.booleans()) else (data.draw(some),)
+    rotation, translation, world, img, camera = (data.draw(numbers(torch.float64, shape)) for shape in shapes)
+    sigma = data.draw(st.one_of(ANY, numbers(torch.float64, (), (batch,), (batch, count), (7,))))
+    sound = [(batch, 3, 3), (batch, 3), (batch, count, 3), (batch, count, 2), (3, 3)] == shapes
+    try:
+        found = pose_covariance(Pose(rotation, translation), world, img, camera, img_sigma=sigma)
+    except BaseError:
+        assert not sound or (isinstance(sigma, torch.Tensor) and sigma.shape == (7,))
+    else:
+        assert sound
+        assert found.shape == (batch, 6, 6)
+        assert not found.isnan().any()
