@@ -112,5 +112,5 @@ def test_chances_of_0_and_1_are_in_the_outer_ranges():
     ("chances", "outcomes"), [(torch.rand(3), torch.ones(2).bool()), (torch.rand(0), torch.ones(0).bool())]
 )
 def test_reliability_needs_as_many_outcomes(chances, outcomes):
-    with pytest.raises(ValueError, match="as many chances as outcomes"):
+    with pytest.raises(ValueError, match="chances and outcomes"):
         reliability(chances, outcomes)
