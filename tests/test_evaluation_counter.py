@@ -6,8 +6,6 @@ import math
 
 import pytest
 import torch
-
-from kornia_pnpnet.evaluation.operations.counter import OperationCounter, count_per_problem
 from kornia_pnpnet.evaluation.operations.operations import (
     OPERATION_COSTS,
     Operations,
@@ -19,6 +17,8 @@ from kornia_pnpnet.evaluation.operations.operations import (
     solve_triangular,
     sort,
 )
+
+from kornia_pnpnet.evaluation.operations.counter import OperationCounter, count_per_problem
 from kornia_pnpnet.geometry import NormalEquations, move
 from kornia_pnpnet.refine.lm import solve_damped
 from kornia_pnpnet.types import Pose

@@ -8,7 +8,7 @@ from typing import Any
 from kornia.core.exceptions import ValueCheckError
 
 from kornia_pnpnet.core.environment import environment
-from kornia_pnpnet.evaluation.choices import load_solver
+from kornia_pnpnet.evaluation.named_solvers import load_solver
 from kornia_pnpnet.evaluation.operations.calls import part_calls
 from kornia_pnpnet.evaluation.operations.operations import OPERATION_COSTS, Operations
 from kornia_pnpnet.evaluation.operations.parts import PARTS
