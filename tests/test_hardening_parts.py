@@ -52,7 +52,7 @@ from kornia_pnpnet.data import (
     load_scene,
 )
 from kornia_pnpnet.evaluation.figures import plot_pose, plot_sweep, plot_training
-from kornia_pnpnet.evaluation.operations import SOLVERS, complexity_results, operation_count
+from kornia_pnpnet.evaluation.operations import complexity_results
 from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.geometry import (
     additive_tangent_map,
@@ -595,21 +595,6 @@ def test_solvers_of_any_name_and_options(seen):
     made.both()
 
 
-def test_costs_of_any_solver(seen):
-    made = seen("`operation_count` of any solver for any number of pairs")
-    counted = sorted({x for x in SOLVERS if x in list_solvers()})
-
-    @many(80)
-    @given(st.sampled_from(counted) | st.sampled_from(list_solvers()) | WORD, options(n=COUNTS, outliers=COUNTS))
-    def run(name, values):
-        count = made(lambda: operation_count(name, **{"n": 9, **values}), (*ERRORS, FileNotFoundError))
-        if count is not None:
-            assert 0 < count < INF
-
-    run()
-    made.both()
-
-
 def test_trainings_of_any_settings(seen):
     made = seen("`TrainSettings` of any numbers")
 
@@ -799,7 +784,6 @@ ELSEWHERE = {
         draw_problems evaluate format_table load_results row_errors paper_figures plot_errors plot_operations
         plot_success plot_synthetic""",
     "here, by solvers": "Normalize Pose PeerSolver change_tangent find_weights move problems_last shipped_weights",
-    "here, by `operation_count`": "operations_by_part part_calls",
     "here, by `pnpnet solve --batch`": "solve_shards",
     "in trainings that are killed (test_interruptions.py)": "fit validate describe_shares",
     "nowhere: what others have to be like": "PointPrior",

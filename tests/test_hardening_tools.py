@@ -89,9 +89,7 @@ def test_counted_solvers_are_the_same_solvers(tally, name, case):
     inputs, mask, weights, _ = case
     with OperationCounter() as counter:
         result = SOLVERS[name](*inputs, weights=weights, mask=mask)
-    assert all(0 <= x.flops < math.inf for x in counter.counts.values())
-    if len(inputs[0]):
-        assert counter.counts[""].flops > 0
+    assert (len(inputs[0]) > 0) <= counter.operations.flops < math.inf
     for ours, plain in zip(result[:5], SOLVERS[name](*inputs, weights=weights, mask=mask)[:5], strict=True):
         assert ours.equal(plain)
 
@@ -108,7 +106,7 @@ def test_counts_of_any_size_are_those_of_the_formula(tally, rows, inner, columns
         constant = torch.ones(inner, columns, dtype=dtype)
         return (torch.ones(batch, rows, inner, dtype=dtype) @ (constant / 2.0)).exp()
 
-    (counts,) = count_per_problem(run).values()
+    counts = count_per_problem(run)
     cells = rows * columns
     assert (counts.multiply, counts.add, counts.exp) == (cells * inner, cells * (inner - 1), cells)
     assert counts.divide == 0  # of what is the same for the whole batch
@@ -118,7 +116,7 @@ def test_counts_of_any_size_are_those_of_the_formula(tally, rows, inner, columns
 @given(st.sampled_from([torch.fft.fft, torch.special.bessel_j0, torch.erfinv, torch.linalg.svd]), SIZES)
 def test_operations_of_unknown_cost_are_an_error(tally, function, size):
     tally("parts", "`OperationCounter` around operations whose cost it does not know: an error that names them")
-    with pytest.raises(NotImplementedError, match=r"What aten\.\w+ costs is unknown"), OperationCounter():
+    with pytest.raises(NotImplementedError, match=r"aten\.\w+"), OperationCounter():
         function(torch.rand(size, size))
 
 
