@@ -25,8 +25,8 @@ from kornia_pnpnet import MLPInit, PnPNet, RobustWeightedLM, create_solver, list
 from kornia_pnpnet.cli.main import main
 from kornia_pnpnet.cli.pairs import rejection_limit, reprojections
 from kornia_pnpnet.data import SyntheticProblems
-from kornia_pnpnet.evaluation.choices import BOUNDS, default_solvers
 from kornia_pnpnet.evaluation.comparison import load_results, save_results
+from kornia_pnpnet.evaluation.named_solvers import BOUNDS, default_solvers
 from kornia_pnpnet.evaluation.operations import complexity_results
 from kornia_pnpnet.types import Pose
 
