@@ -1,7 +1,7 @@
 """RANSAC: drawing samples, solving them, scoring their poses.
 
-``ransac`` has the initialiser and ``search`` its rounds; ``minimal`` the contract of a minimal solver; ``p3p`` the solver
-of three pairs, on ``law_of_cosines``; ``sampling`` which samples are drawn; ``scoring`` the scoring rules.
+``ransac`` has the initialiser and ``search`` its rounds; ``minimal`` the contract of a minimal solver; ``p3p`` the
+solver of three pairs, on ``law_of_cosines``; ``sampling`` the sampling rule; ``scoring`` the scoring rules.
 """
 
 from kornia_pnpnet.init.ransac.minimal import MinimalSolver, SubsetSolver
