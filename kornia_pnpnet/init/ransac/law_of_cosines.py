@@ -7,8 +7,8 @@ The unknowns are the distances :math:`\lambda_k` of the points along their unit 
 
 with the squared length :math:`a_k` of the edge and the squared length :math:`b_k` of the difference of the two rays.
 (:math:`b_k` keeps the digits that :math:`2 - 2\cos` loses between rays close to each other.) A sum of the three
-equations with weights :math:`u` such that :math:`a \cdot u = 0` is a conic in the ratios of the distances. The conic is a
-pair of lines when
+equations with weights :math:`u` such that :math:`a \cdot u = 0` is a conic in the ratios of the distances. The conic
+is a pair of lines when
 
 .. math:: (u_1 u_2 + u_2 u_3 + u_3 u_1)\,(s \cdot u) = g\, u_1 u_2 u_3,
 
@@ -133,7 +133,7 @@ def _lines(u: Triple, h: Triple, pairs: Tensor) -> tuple[Tensor, Tensor]:
     h1, h2, h3 = h
     tiny = torch.finfo(pairs.dtype).tiny
     # The matrix D of the conic has u_2 + u_3, u_3 + u_1, u_1 + u_2 on its diagonal and -u_k cos_k beside it. The lines
-    # cross in m with m mᵀ = -adj D. The matrices D + [m]ₓ and D - [m]ₓ have rank one, and their first rows are the lines.
+    # cross in m with m mᵀ = -adj D. The matrices D + [m]ₓ and D - [m]ₓ have rank one; their first rows are the lines.
     uh2, uh3 = u2 * h2, u3 * h3
     e1, e2, e3 = torch.addcmul(u1, u1, h1, value=-1.0), u2 - uh2, u3 - uh3
     d11 = u2 + u3
@@ -207,8 +207,8 @@ def _refined(candidates: Triple, p: Tensor, q: Tensor, b: Triple) -> Triple:
     e2 = (d2 * d2).addcmul_(b[1], dist3 * dist1)
     e3 = (d3 * d3).addcmul_(b[2], dist1 * dist2)
     r2, r3 = torch.addcmul(e2, q, e1, value=-1.0), torch.addcmul(e3, p, e1, value=-1.0)
-    # e12: half the derivative of e1 by dist2; e13: minus half that by dist3; e23 and e32 in the same way for e2 and e3.
-    # From these the derivatives of r2 and r3 by dist2 and dist3, up to signs.
+    # Half the derivatives: of e1 by dist2, of -e1 by dist3, of e2 by dist3, of -e3 by dist2; from these, of -r2 and -r3
+    # by dist2 (r22, r32), and of r2 and r3 by dist3 (r23, r33).
     e12, e13 = torch.addcmul(d1, h1, dist3), d1.addcmul_(h1, dist2, value=-1.0)
     e23, e32 = d2.addcmul_(h2, dist1), d3.addcmul_(h3, dist1, value=-1.0)
     r22, r23 = q * e12, e23.addcmul_(q, e13)
