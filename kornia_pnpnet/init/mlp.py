@@ -108,8 +108,8 @@ class MLPInit(Configured):
         r"""Guess the pose.
 
         Args:
-            corr: normalised correspondences with :math:`N` = ``n``, ordered by their pixels. The network was not
-                trained on padding.
+            corr: normalised correspondences with :math:`N` = ``n``, ordered by their pixels. A pair without
+                weight enters as zeros; the network was not trained on such pairs.
 
         Returns:
             The coarse pose, and weights of 1.
