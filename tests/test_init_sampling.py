@@ -12,9 +12,9 @@ from kornia_pnpnet.init.ransac.sampling import (
     Samples,
     draw_subsets,
     good_sample_share,
-    log_false_alarms,
     samples_needed,
 )
+from kornia_pnpnet.refine.verdict import log_false_alarms
 
 
 def uniform_numbers(count, size, seed=0):

@@ -9,15 +9,8 @@ import torch
 
 from kornia_pnpnet import Correspondences, Pose
 from kornia_pnpnet.geometry import project, transform
-from kornia_pnpnet.init.ransac.scoring import (
-    MAX_ERROR,
-    SCORERS,
-    Scene,
-    Thresholds,
-    chance_of_inlier,
-    judge,
-    standardised_errors,
-)
+from kornia_pnpnet.init.ransac.scoring import SCORERS, Scene, standardised_errors
+from kornia_pnpnet.refine.verdict import MAX_ERROR, Thresholds, chance_of_inlier, judge
 
 
 @pytest.fixture
