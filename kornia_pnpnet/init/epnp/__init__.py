@@ -1,4 +1,4 @@
-"""EPnP: ``epnp`` has the initialiser, ``control_points`` the control points, ``depths`` the equations of their depths."""
+"""EPnP: the initialiser (``epnp``), its control points and the equations of their depths (``depths``)."""
 
 from kornia_pnpnet.init.epnp.epnp import EPnP
 
