@@ -41,11 +41,11 @@ MIN_DEPTH_RATIO = 1e-3
 
 
 class Projection(NamedTuple):
-    r"""Where the points fall, coordinate by coordinate: every tensor is of shape :math:`(B, N)`.
+    r"""Points projected at a pose, coordinate by coordinate: every tensor has the shape :math:`(B, N)`.
 
     Attributes:
-        residual: projection minus measurement in pixels, horizontal and vertical. It says nothing where ``in_front``
-            is false, but is finite there.
+        residual: projection minus measurement in pixels, horizontal and vertical. Where ``in_front`` is false the
+            residual is finite but meaningless.
         in_front: whether the point is in front of the camera, bool.
         rotated: the points in the camera's axes before translation, :math:`y = R x`, three coordinates.
         plane_points: :math:`(x/z, y/z)`, 0 for points behind the camera.
@@ -120,7 +120,7 @@ def project(pose: Pose, corr: Correspondences) -> Projection:
     matrix = [row.unbind(1) for row in pose.rotation[..., None].unbind(1)]
     y0, y1, y2 = (torch.addcmul(torch.addcmul(i * a, j, b), k, c) for i, j, k in matrix)
     x, y, z = (r + t for r, t in zip((y0, y1, y2), pose.translation[..., None].unbind(1), strict=True))
-    # z |z| > ratio² |x|²: one comparison for both conditions, and no square root, whose gradient is infinite at 0.
+    # z |z| > ratio² |x|² tests the sign and the ratio at once, without a square root, whose gradient is infinite at 0.
     margin = z * z.abs()
     for coordinate in (x, y, z):
         margin = torch.addcmul(margin, coordinate, coordinate, value=-MIN_DEPTH_RATIO * MIN_DEPTH_RATIO)
@@ -133,9 +133,9 @@ def project(pose: Pose, corr: Correspondences) -> Projection:
 
 
 def pixel_variance(projection: Projection, noise: Noise, focal: Tensor) -> Tensor:
-    r"""Variance of a pixel coordinate that noise of the pixel and of the world point make together.
+    r"""Variance of a pixel coordinate, from the noise of the pixel and of the world point.
 
-    A move of the point by :math:`d` moves its pixel by :math:`J d` with :math:`J = \tfrac fz [I_2 \mid -(p, q)^\top]`,
+    A shift of the point by :math:`d` moves its pixel by :math:`J d` with :math:`J = \tfrac fz [I_2 \mid -(p, q)^\top]`,
     :math:`p = x/z`, :math:`q = y/z`. The mean over both coordinates is returned:
     :math:`\sigma_\mathrm{img}^2 + \sigma_\mathrm{world}^2 \, \mathrm{tr}(J J^\top) / 2`, where the trace is
     :math:`(f/z)^2 (2 + p^2 + q^2)`.
@@ -146,7 +146,7 @@ def pixel_variance(projection: Projection, noise: Noise, focal: Tensor) -> Tenso
         focal: the focal length in pixels, a scalar.
 
     Returns:
-        Shape :math:`(B, N)`. Behind the camera it is that of the pixel alone.
+        Shape :math:`(B, N)`. Behind the camera it is the variance of the pixel alone.
 
     Example:
         >>> points = torch.tensor([[[0.0, 0.0, 4.0]]])
@@ -192,7 +192,7 @@ def normal_equations(projection: Projection, weights: Tensor) -> NormalEquations
         (minus_p, minus_q),
     ]
     weights = weights * projection.inv_depth * projection.inv_depth
-    zero = torch.zeros_like(weights[:, 0])
+    zero = torch.zeros_like(weights.sum(1))
     weighted: list[_Column] = [(_times(u, weights), _times(v, weights)) for u, v in columns]
 
     def inner(a: _Column, b: _Column) -> Tensor:
@@ -217,7 +217,7 @@ def _times(a: Any, b: Any) -> Any:
 
 
 def change_tangent(equations: NormalEquations, tangent_map: Tensor) -> NormalEquations:
-    r"""Express normal equations by other rotation parameters.
+    r"""Express normal equations in other rotation parameters.
 
     Args:
         equations: by the tangent :math:`(\omega, v)`.
@@ -225,7 +225,7 @@ def change_tangent(equations: NormalEquations, tangent_map: Tensor) -> NormalEqu
             :func:`retract_additive` the :func:`additive_tangent_map`.
 
     Returns:
-        The system with :math:`M^\top` and :math:`M` around the blocks of the rotation.
+        The system with the rotation's blocks multiplied by :math:`M^\top` and :math:`M`.
     """
     h, g = equations
     turn = torch.stack([torch.stack([h[max(i, j)][min(i, j)] for j in range(3)], -1) for i in range(3)], -1)
@@ -240,11 +240,11 @@ def change_tangent(equations: NormalEquations, tangent_map: Tensor) -> NormalEqu
 def retract(pose: Pose, delta: Tensor) -> Pose:
     r"""Move a pose along a tangent vector, :math:`(\mathrm{cay}(\omega) R,\; t + v)`.
 
-    Rotation and translation move apart, so that with a centred world a turn leaves the centroid where it is: the
-    two stay well separated in the normal equations however far the points are. The rotation is Cayley's,
+    Rotation and translation move independently. With a centred world a rotation then leaves the centroid in place, so
+    that both stay well separated in the normal equations at any distance of the points. The rotation is Cayley's,
     :math:`\mathrm{cay}(\omega) = (I - \tfrac12[\omega]_\times)^{-1}(I + \tfrac12[\omega]_\times)`, which agrees with
-    the exponential to second order, turns by :math:`2 \arctan(|\omega|/2)` and so never by more than a half turn, and
-    needs neither trigonometry nor a branch at 0.
+    the exponential to second order, rotates by :math:`2 \arctan(|\omega|/2)`, at most half a turn, and needs neither
+    trigonometry nor a branch at 0.
 
     Args:
         pose: rotation :math:`(B, 3, 3)`, translation :math:`(B, 3)`.

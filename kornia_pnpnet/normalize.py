@@ -23,7 +23,7 @@ __all__ = ["F_CONST", "VIEWS", "Frame", "Normalize"]
 
 #: Focal length of the normalised camera in pixels (PROTOCOL.md: an ETH3D DSLR has 3400-3430).
 F_CONST = 3400.0
-#: The mirrors that leave a square image a square image: are x and y exchanged, then x reversed, then y?
+#: The symmetries of a square image, as three flags: exchange x and y, then reverse x, then reverse y.
 VIEWS = (
     (False, False, False),
     (True, False, False),
@@ -121,18 +121,18 @@ class Normalize(Configured):
         else:
             weights = weights if mask is None else torch.where(mask, weights, 0.0)
             usable = usable & (weights >= 0).all(-1)
-        # From here on the problems are side by side in memory: coordinates and weight of each pair, (6, N, B), and the
-        # entries of each camera, (9, B), of which fx, fy = [:5:4] and cx, cy = [2:6:3].
+        # From here on problems are the last dimension: coordinates and weight of each pair, (6, N, B), and the entries
+        # of each camera, (9, B), of which fx, fy = [:5:4] and cx, cy = [2:6:3].
         rows = torch.cat((world_points.permute(2, 1, 0), img_points.permute(2, 1, 0), weights.mT[None]))
         camera = intrinsics.flatten(1).mT
         there = rows[5] != 0
 
-        # Inputs are made safe before anything is computed from them: between this limit and its inverse, squares of
-        # squares neither overflow nor vanish. NaN compares false, and is what the root of a negative number is.
+        # Make inputs safe before computing with them: between this limit and its inverse, squares of squares neither
+        # overflow nor vanish. NaN compares false, and the root of a negative number is NaN.
         limit = torch.finfo(rows.dtype).max ** 0.25
         zero, one = rows.new_zeros(1, batch), rows.new_ones(1, batch)
         sizes = torch.where(there, rows.detach().abs(), zero).amax(1)
-        size = sizes[:3].amax(0)  # of the world
+        size = sizes[:3].amax(0)  # largest coordinate of the world
         entries = camera.detach()
         largest = torch.maximum(sizes.amax(0), size.reciprocal())
         largest_entry = torch.maximum(entries.abs().amax(0), entries[:5:4].rsqrt().amax(0))
@@ -142,7 +142,7 @@ class Normalize(Configured):
         camera = torch.where(usable, camera, one)
         present = there.to(rows.dtype)
 
-        focal = rows.new_full((), self.f_const)  # made on the device: nothing here waits for the CPU
+        focal = rows.new_full((), self.f_const)  # made on the device, so that a GPU need not wait for the CPU
         share = present.sum(0).clamp(min=1.0).reciprocal()
         mean = rows[:3].sum(1) * share
         centroid = mean if self.center else zero.expand(3, batch)
@@ -153,8 +153,7 @@ class Normalize(Configured):
         scale = torch.where(spread_out, mean_square, one[0]).rsqrt() if self.scale else one[0]
         img_scales = focal / camera[:5:4]  # (2, B)
 
-        # No point in front of the camera has a pixel beyond a limit. A problem that is not valid becomes zeros: behind
-        # this nothing of it has a gradient.
+        # No point in front of the camera projects beyond a limit. An invalid problem becomes zeros, without gradient.
         img_sizes = moved[3:5].detach().abs().amax(1) * img_scales.detach()
         valid = spread_out & (img_sizes.amax(0) <= self.f_const / MIN_DEPTH_RATIO)
         factors = torch.where(valid, torch.cat((scale.expand(3, batch), img_scales, one)), zero)
@@ -280,23 +279,23 @@ def _is_usable(noise: Noise) -> Tensor:
 
 def _is_pinhole(intrinsics: Tensor) -> Tensor:
     """Whether cameras with positive focal lengths have no skew and the last row 0, 0, 1, bool (B,)."""
-    # Where both focal lengths are there, no other entry of the first two columns may be.
+    # Where both focal lengths are not 0, all other entries of the first two columns must be 0.
     return ((intrinsics[..., :2] != 0).sum((1, 2)) == 2) & (intrinsics[:, 2, 2] == 1)
 
 
 def _is_spread_out(centred: Tensor, share: Tensor, size: Tensor) -> Tensor:
-    """Whether points are more than a line or a point, so that there are at least three.
+    """Whether the points span more than a line, so that there are at least three.
 
     Args:
-        centred: the points about their mean, 0 where there is none, (3, N, B).
+        centred: the points minus their mean, 0 for padding, (3, N, B).
         share: one over the number of points, (B,).
-        size: the largest coordinate before the points were centred, (B,). Where it is 0 or NaN the answer is no.
+        size: the largest coordinate before the points were centred, (B,). Where it is 0 or NaN the result is false.
 
     Returns:
         bool of shape (B,).
     """
-    # The second largest variance from the invariants of the covariance: it is about the sum of the principal minors,
-    # half of trace² - sum of squares, over the trace. On a line or a point only rounding is left of it.
+    # The second largest variance is about the sum of the principal minors of the covariance, (trace² - sum of squares)
+    # / 2, over the trace. For points on a line only rounding remains.
     eps = torch.finfo(centred.dtype).eps
     covariance = (centred[:, None] * centred).sum(2) * (share / (size * size))  # (3, 3, B) in the unit of the size
     trace = covariance.diagonal().sum(-1)
@@ -304,13 +303,13 @@ def _is_spread_out(centred: Tensor, share: Tensor, size: Tensor) -> Tensor:
 
 
 def _exchanged(x: Tensor, y: Tensor, swap: bool, reverse_x: bool, reverse_y: bool) -> tuple[Tensor, Tensor]:
-    """Two coordinates in a mirror."""
+    """Two coordinates of a mirrored view."""
     x, y = (y, x) if swap else (x, y)
     return -x if reverse_x else x, -y if reverse_y else y
 
 
 def _axes_back(entries: Tensor, axis: int, view: tuple[bool, bool, bool]) -> Tensor:
-    """Undo a mirror in one dimension, of three coordinates."""
+    """Undo a mirrored view along one axis of three coordinates."""
     swap, reverse_x, reverse_y = view
     x, y, z = entries.unbind(axis)
     x, y = -x if reverse_x else x, -y if reverse_y else y
@@ -318,14 +317,14 @@ def _axes_back(entries: Tensor, axis: int, view: tuple[bool, bool, bool]) -> Ten
 
 
 def _order(keys: Tensor) -> Tensor:
-    """Positions in ascending order of the first of two keys (2, N, B), ties by the second, (B, N)."""
-    first, second = keys.mT.contiguous()  # sorting is twice as fast along the last dimension
+    """Ascending order by the first of two keys (2, N, B), ties by the second key, (B, N)."""
+    first, second = keys.mT.contiguous()  # sorting along the last dimension is twice as fast
     by_second = _ascending(second)
     return by_second.gather(1, _ascending(first.gather(1, by_second)))
 
 
 def _ascending(keys: Tensor) -> Tensor:
-    """Positions along the last dimension in ascending order, of equal ones the first first."""
+    """Stable ascending order along the last dimension."""
     if exporting():  # ONNX has no stable sort, but its top-k is stable
         return keys.topk(keys.shape[-1], largest=False).indices
     return keys.argsort(stable=True, dim=-1)

@@ -246,8 +246,8 @@ class PnPNet(nn.Module):
         else:
             batch = world_points.shape[0]
             guess = self.init(self.normalize.views(corr, views))
-            first, *others = [x for pose in guess.poses for x in self.normalize.undo_views(pose, views)]
-            others = map_tensors(lambda *x: torch.stack(x, 1), *others)
+            first, *rest = [x for pose in guess.poses for x in self.normalize.undo_views(pose, views)]
+            others = map_tensors(lambda *x: torch.stack(x, 1), *rest)
             # Weights, ok and noise of the first view, whose pairs have the order of the correspondences.
             guess = map_tensors(lambda x: x[:batch], guess)._replace(pose=first, others=others)
         return _Begun(self.refine.begin(corr, guess), frame, guess)
@@ -331,9 +331,9 @@ class PnPNet(nn.Module):
         """Load a trained solver, in evaluation mode.
 
         Args:
-            name_or_folder: the name of shipped weights (see :func:`~kornia_pnpnet.shipped_weights`), which needs no
-                network; a local folder; or a Hugging Face Hub repository id. The first that exists is taken. Nothing is
-                unpickled.
+            name_or_folder: the name of shipped weights (see :func:`~kornia_pnpnet.pretrained.shipped_weights`), which
+                needs no network; a local folder; or a Hugging Face Hub repository id. The first that exists is taken.
+                Nothing is unpickled.
 
         Returns:
             The solver in float32 on the CPU.

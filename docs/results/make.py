@@ -33,10 +33,11 @@ from torch import nn
 from kornia_pnpnet import PnPNet, RobustWeightedLM, pose_covariance
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.evaluation import EvaluationData, evaluate
-from kornia_pnpnet.evaluation.choices import evaluation_sets, load_solver
 from kornia_pnpnet.evaluation.figures import paper_figures, plot_reliability, plot_sweep, plot_training
 from kornia_pnpnet.evaluation.figures.sweep import mix_in_words
+from kornia_pnpnet.evaluation.named_solvers import load_solver
 from kornia_pnpnet.evaluation.operations import complexity_results
+from kornia_pnpnet.evaluation.problem_sets import evaluation_sets
 from kornia_pnpnet.evaluation.results import format_table, load_results, save_results
 from kornia_pnpnet.metrics import SuccessRate, reliability, success_rate
 from kornia_pnpnet.pretrained import WEIGHTS_FOLDER, shipped_weights

@@ -76,7 +76,7 @@ def split_batch(tree: _T, count: int) -> list[_T]:
     """Split every tensor of a tree into parts along the batch."""
     if count == 1:
         return [tree]
-    return [map_tensors(lambda x, i=i: x.tensor_split(count)[i], tree) for i in range(count)]  # type: ignore[misc]
+    return [map_tensors(lambda x, i=i: x.tensor_split(count)[i], tree) for i in range(count)]
 
 
 def _reversed(x: Tensor) -> Tensor:

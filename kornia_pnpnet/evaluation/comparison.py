@@ -143,13 +143,13 @@ def evaluate(
         progress: show a progress bar; when ``None``, if standard error is a terminal.
 
     Returns:
-        Plain data: ``format``, ``environment`` (see :func:`environment`), ``code`` (a digest
-        of the package), ``solvers`` with each one's configuration and a digest of its weights, ``data`` with each set's
-        description, limits and a digest of its problems, and ``rows``, one for each set and solver: ``success`` (rate,
-        low, high, total), quartiles of ``rotation_error_deg`` and ``translation_error``, the share ``ok``,
-        ``us_per_problem`` (median over the timed calls), the ``per_problem`` errors and ok, and what differs from
-        ``environment`` if another machine continued. A solver that refuses the shape of a set (another n than its own)
-        has an entry in ``left_out`` instead: ``data``, ``solver`` and ``reason``.
+        Plain data: ``format``, ``environment`` (see :func:`~kornia_pnpnet.core.environment.environment`), ``code`` (a
+        digest of the package), ``solvers`` with each one's configuration and a digest of its weights, ``data`` with
+        each set's description, limits and a digest of its problems, and ``rows``, one for each set and solver:
+        ``success`` (rate, low, high, total), quartiles of ``rotation_error_deg`` and ``translation_error``, the share
+        ``ok``, ``us_per_problem`` (median over the timed calls), the ``per_problem`` errors and ok, and what differs
+        from ``environment`` if another machine continued. A solver that refuses the shape of a set (another n than its
+        own) has an entry in ``left_out`` instead: ``data``, ``solver`` and ``reason``.
 
     Raises:
         ValueError: when ``path`` is not a results file, or one that this evaluation cannot continue.

@@ -26,6 +26,7 @@ from kornia_pnpnet.core.schema import (
     misfits,
     read_json,
 )
+from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.metrics import PoseErrors, SuccessRate
 
 __all__ = ["FORMAT", "format_table", "load_results", "resume", "row_errors", "save_results", "source_digest"]
@@ -212,11 +213,11 @@ def format_table(results: Mapping[str, Any]) -> str:
     Returns:
         One line for each set and solver: success with its 95 % interval, median errors, time and share of ok.
     """
-    head = ("data", "solver", "success [95 %]", "median rotation error", "median translation error", "µs/problem", "ok")
-    cells = [head]
+    header = ("data", "solver", "success [95 %]", "median rotation error", "median translation error")
+    rows = []
     for row in results["rows"]:
         unit = results["data"][row["data"]]["unit"]
-        cells.append(
+        rows.append(
             (
                 row["data"],
                 row["solver"],
@@ -227,13 +228,4 @@ def format_table(results: Mapping[str, Any]) -> str:
                 f"{100 * row['ok']:.1f} %",
             )
         )
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    left = 2  # the names; numbers are aligned to the right
-    lines = [
-        "| "
-        + " | ".join(c.ljust(w) if i < left else c.rjust(w) for i, (c, w) in enumerate(zip(line, widths, strict=True)))
-        + " |"
-        for line in cells
-    ]
-    rule = "|" + "|".join("-" * (w + 2) if i < left else "-" * (w + 1) + ":" for i, w in enumerate(widths)) + "|"
-    return "\n".join([lines[0], rule, *lines[1:]])
+    return markdown_table((*header, "µs/problem", "ok"), rows, align="llrrrrr", pad=True)

@@ -6,7 +6,7 @@ to be believed.
 """
 
 from kornia_pnpnet.refine.kernels import KERNELS, RobustKernel
-from kornia_pnpnet.refine.lm import LMStart, RobustWeightedLM, Stage
+from kornia_pnpnet.refine.lm import LMStart, RobustWeightedLM, Stage, State
 from kornia_pnpnet.refine.parameters import BoundedParameter
 from kornia_pnpnet.refine.step import LMStep, lm_step, solve_damped
 from kornia_pnpnet.refine.verdict import explains
@@ -19,6 +19,7 @@ __all__ = [
     "RobustKernel",
     "RobustWeightedLM",
     "Stage",
+    "State",
     "explains",
     "lm_step",
     "solve_damped",

@@ -26,7 +26,7 @@ from kornia_pnpnet.refine.step import LMStep, iterate, robust_weights, solve_dam
 from kornia_pnpnet.refine.verdict import explains, has_enough, is_evident
 from kornia_pnpnet.types import Correspondences, Guess, Noise, Pose, Refinement
 
-__all__ = ["BACKWARDS", "LMStart", "RobustWeightedLM", "Stage"]
+__all__ = ["BACKWARDS", "LMStart", "RobustWeightedLM", "Stage", "State"]
 
 #: How gradients pass through a refinement, see :class:`RobustWeightedLM`.
 BACKWARDS = ("unroll", "truncated", "implicit")
@@ -122,7 +122,7 @@ class RobustWeightedLM(Configured):
 
     Args:
         m: number of iterations; 0 leaves the guess as it is and only judges it.
-        kernel: name of the robust kernel, a key of :data:`~kornia_pnpnet.refine.KERNELS`.
+        kernel: name of the robust kernel, a key of :data:`~kornia_pnpnet.refine.kernels.KERNELS`.
         step: initial :math:`\gamma`, in [0, 2].
         damping: initial :math:`\lambda`, in [1e-8, 100].
         robustness: initial shape of the kernel, its classical value when ``None``. With 0, ``power`` is least squares.
@@ -284,7 +284,7 @@ class RobustWeightedLM(Configured):
         """
         explored = 0 if start.rivals is None else min(self.compared_at, m)
         guided = max(self.m - self.by_residual, explored)
-        seen = [(start.starts, None)] * explored
+        seen: list[tuple[Correspondences, Tensor | None]] = [(start.starts, None)] * explored
         seen += [(start.guided, None)] * (guided - explored)
         seen += [(start.by_residual, start.estimated)] * (self.m - guided)
         advance = self._advance_if_better if self.reject_worse else self._advance

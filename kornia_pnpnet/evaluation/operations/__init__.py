@@ -8,8 +8,7 @@ with a third of outliers; beside it stands the count when no sample has an inlie
 drawn.
 
 Source: R. Sheffer and A. Wiesel, "PnP-Net: A hybrid Perspective-n-Point Network", 2020, who count by T. Minka's
-    Lightspeed
-toolbox.
+Lightspeed toolbox.
 """
 
 from kornia_pnpnet.evaluation.operations.costs import OPERATION_COSTS, Operations

@@ -10,7 +10,7 @@ from torch import nn
 
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
-from kornia_pnpnet.evaluation.choices import load_solver
+from kornia_pnpnet.evaluation.named_solvers import load_solver
 from kornia_pnpnet.evaluation.operations.costs import OPERATION_COSTS
 from kornia_pnpnet.evaluation.operations.counter import count_per_problem
 from kornia_pnpnet.init import RANSAC, MLPInit
@@ -52,7 +52,8 @@ def operation_count(solver: str | PnPNet, n: int, *, outliers: int = 0) -> float
         outliers: number of outliers in each problem; only the counts of RANSAC depend on it.
 
     Returns:
-        Operations weighted by :data:`OPERATION_COSTS`, the mean over some synthetic problems.
+        Operations weighted by :data:`~kornia_pnpnet.evaluation.operations.costs.OPERATION_COSTS`, the mean over some
+        synthetic problems.
 
     Raises:
         ValueCheckError: when there is no such solver, or it is not one of this package.
