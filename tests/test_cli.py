@@ -17,7 +17,7 @@ from torch import nn
 
 import kornia_pnpnet.solver
 from kornia_pnpnet import MLPInit, PnPNet, RobustWeightedLM, create_solver, list_solvers
-from kornia_pnpnet.cli.main import main
+from kornia_pnpnet.cli import main
 from kornia_pnpnet.cli.pairs import rejection_limit, reprojections
 from kornia_pnpnet.evaluation.choices import BOUNDS, default_solvers
 from kornia_pnpnet.evaluation.comparison import load_results, save_results
@@ -636,7 +636,7 @@ def test_version(capsys):
 
 
 def test_the_command_as_a_process(csv_file):
-    code = "import sys; from kornia_pnpnet.cli.main import main; sys.exit(main())"
+    code = "import sys; from kornia_pnpnet.cli import main; sys.exit(main())"
     arguments = ["solve", str(csv_file), "--intrinsics", CAMERA, "--solver", "identity-lm"]
     command = [sys.executable, "-W", "error", "-c", code, *arguments]
     solved = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)

@@ -6,7 +6,7 @@ import torch
 from kornia.core.exceptions import ValueCheckError
 
 from kornia_pnpnet import create_solver
-from kornia_pnpnet.cli.main import main
+from kornia_pnpnet.cli import main
 from kornia_pnpnet.export import INPUTS, OUTPUTS, export_onnx, export_program
 
 

@@ -25,7 +25,7 @@ from kornia_pnpnet import (
     solve_pnp,
     success,
 )
-from kornia_pnpnet.cli.main import main
+from kornia_pnpnet.cli import main
 from kornia_pnpnet.data import SyntheticProblems
 from kornia_pnpnet.init import p3p
 from kornia_pnpnet.losses import pose_distances
