@@ -19,8 +19,8 @@ import kornia_pnpnet.solver
 from kornia_pnpnet import MLPInit, PnPNet, RobustWeightedLM, create_solver, list_solvers
 from kornia_pnpnet.cli.main import main
 from kornia_pnpnet.cli.pairs import rejection_limit, reprojections
-from kornia_pnpnet.evaluation.comparison import load_results, save_results
 from kornia_pnpnet.evaluation.named_solvers import BOUNDS, default_solvers
+from kornia_pnpnet.evaluation.results import load_results, save_results
 from kornia_pnpnet.types import Pose
 
 CAMERA = "800,810,320,240"

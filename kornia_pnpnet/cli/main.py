@@ -129,7 +129,8 @@ def _solve(arguments: argparse.Namespace) -> int:
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
-    from kornia_pnpnet.evaluation.comparison import evaluate, format_table, load_results
+    from kornia_pnpnet.evaluation.comparison import evaluate
+    from kornia_pnpnet.evaluation.results import format_table, load_results
 
     out = Path(arguments.out)
     kept = len(load_results(out)["rows"]) if out.exists() and not arguments.overwrite else 0
@@ -170,8 +171,8 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 
 
 def _figures(arguments: argparse.Namespace) -> int:
-    from kornia_pnpnet.evaluation.comparison import load_results
     from kornia_pnpnet.evaluation.figures import paper_figures
+    from kornia_pnpnet.evaluation.results import load_results
 
     pictures = paper_figures([load_results(path, complexity=True) for path in arguments.files], arguments.out)
     print(*pictures, sep="\n")
