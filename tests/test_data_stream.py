@@ -10,6 +10,7 @@ from itertools import islice
 import pytest
 import torch
 
+from kornia_pnpnet.core.trees import iter_tensors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.data.stream import stream_batches
 
@@ -21,14 +22,10 @@ def make_source(**options):
     return SyntheticProblems(n=6, batch_size=5, seed=3, outliers=OutlierMix(), **options)
 
 
-def tensors(problems):
-    return (*problems[:3], *problems.pose, problems.inliers)
-
-
 def assert_equal(problems, expected):
-    for value, wanted in zip(tensors(problems), tensors(expected), strict=True):
+    for value, wanted in zip(iter_tensors(problems), iter_tensors(expected), strict=True):
         assert value.dtype == wanted.dtype
-        assert torch.equal(value, wanted)
+        torch.testing.assert_close(value, wanted, rtol=0, atol=0, equal_nan=True)
 
 
 class BrokenSource(SyntheticProblems):
@@ -48,6 +45,28 @@ def test_batches_are_those_of_the_source_in_order(workers, dtype):
         count += 1
     assert count == 21
     assert not multiprocessing.active_children()
+
+
+@pytest.mark.parametrize("known_noise", [0.5, 1.0])
+def test_workers_send_the_sigmas(known_noise):
+    source = make_source(known_noise=known_noise, img_sigma=(0.5, 5.0))
+    for index, problems in enumerate(stream_batches(source, 0, 12, 1)):
+        assert_equal(problems, source.batch(index))
+
+
+_LEFT_OPEN = """
+from kornia_pnpnet.data import SyntheticProblems
+from kornia_pnpnet.data.stream import stream_batches
+stream = stream_batches(SyntheticProblems(n=6, batch_size=5), 0, 10**9, workers=2)
+for problems in stream:
+    break
+print("end")
+"""
+
+
+def test_a_stream_that_is_left_open_does_not_keep_the_process():
+    done = subprocess.run([sys.executable, "-c", _LEFT_OPEN], capture_output=True, text=True, timeout=120, check=True)
+    assert done.stdout == "end\n"
 
 
 @pytest.mark.parametrize("workers", [0, 1])

@@ -6,7 +6,11 @@ import math
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import SOLVERS, batches, many
 
+from kornia_pnpnet.core.trees import iter_tensors
 from kornia_pnpnet.evaluation.operations.costs import (
     OPERATION_COSTS,
     Operations,
@@ -131,3 +135,15 @@ def test_cost_of_sorting():
     assert sort(0) == sort(1) == Operations()
     assert sort(8) == Operations(compare=24)
     assert smallest(8, 1) == smallest(8, 7) == Operations(compare=9)
+
+
+@pytest.mark.slow
+@many(40)
+@given(st.sampled_from([name for name in SOLVERS if not name.endswith("-n9")]), batches())
+def test_counting_changes_no_result(name, case):
+    inputs, mask, weights, _ = case
+    plain = SOLVERS[name](*inputs, weights=weights, mask=mask)
+    with OperationCounter() as counter:
+        counted = SOLVERS[name](*inputs, weights=weights, mask=mask)
+    assert (len(inputs[0]) > 0) <= counter.operations.flops < math.inf
+    assert all(map(torch.equal, iter_tensors(counted), iter_tensors(plain)))

@@ -9,10 +9,8 @@ import torch
 from kornia.core.exceptions import ShapeError, ValueCheckError
 
 from kornia_pnpnet import PnPNet, RobustWeightedLM, create_solver
-from kornia_pnpnet.core.trees import iter_tensors
 from kornia_pnpnet.evaluation.operations import (
     OPERATION_COSTS,
-    OperationCounter,
     complexity_results,
     count_per_problem,
     operation_count,
@@ -35,10 +33,6 @@ def test_counts_do_not_depend_on_the_data(name, make_problems):
 
     def count(problems):
         inputs = problems.world_points, problems.img_points, problems.intrinsics
-        result = solver(*inputs)
-        with OperationCounter():
-            counted = solver(*inputs)
-        assert all(map(torch.equal, iter_tensors(counted), iter_tensors(result)))  # counting changes nothing
         return count_per_problem(lambda batch: solver(*(part[:batch] for part in inputs)))
 
     counts = [count(make_problems(n=9, batch=4, outliers=k, noise=k > 0, seed=k)) for k in (0, 3)]

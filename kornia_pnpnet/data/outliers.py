@@ -1,4 +1,4 @@
-"""How many pairs are wrong, which, and in what way."""
+"""Outliers of synthetic problems and of scenes: their number, their positions and their kinds."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ __all__ = ["OutlierDraw", "OutlierMix"]
 
 
 class OutlierDraw(NamedTuple):
-    r"""Which pairs of a batch are wrong.
+    r"""The outliers of a batch, by kind.
 
     Attributes:
-        mismatch: the pixel belongs to another point, bool, shape :math:`(B, N)`.
-        sensing: the pixel is anywhere in the image, bool, shape :math:`(B, N)`.
-        near: the pixel is a little off, bool, shape :math:`(B, N)`; ``None``: none is.
-        structured: the pixel is where another pose, the same for all of these of a problem, would show the point,
-            bool, shape :math:`(B, N)`; ``None``: none is.
+        mismatch: the pixel shows another point, bool, shape :math:`(B, N)`.
+        sensing: the pixel is uniform in the image, bool, shape :math:`(B, N)`.
+        near: the pixel is a near miss, bool, shape :math:`(B, N)`; ``None``: no pair is.
+        structured: the pixel shows the point from another pose, which all structured outliers of a problem share, bool,
+            shape :math:`(B, N)`; ``None``: no pair is.
     """
 
     mismatch: Tensor
@@ -32,27 +32,27 @@ class OutlierDraw(NamedTuple):
 
     @property
     def inliers(self) -> Tensor:
-        """Pairs that are none of these, bool, shape :math:`(B, N)`."""
-        wrong = self.mismatch | self.sensing
-        for more in (self.near, self.structured):
-            wrong = wrong if more is None else wrong | more
-        return ~wrong
+        """Pairs that are no outliers, bool, shape :math:`(B, N)`."""
+        outliers = self.mismatch | self.sensing
+        for kind in (self.near, self.structured):
+            outliers = outliers if kind is None else outliers | kind
+        return ~outliers
 
 
 class OutlierMix:
-    r"""The number of wrong pairs, uniform over the integers from ``min_count`` to a maximum, at random positions.
+    r"""Outliers at random positions, their number uniform over the integers from ``min_count`` to a maximum.
 
     Args:
-        max_ratio: the maximum as a share of the pairs, rounded down. A twentieth of a pair is forgiven, so that a
-            third written as 0.33 means :math:`\lfloor n/3 \rfloor` for every n up to 15.
-        count: exactly this many instead.
-        min_count: the fewest.
-        mismatch_share: probability that a wrong pair is a *mismatch* (the projection of another point) rather than
-            *sensing* (a pixel anywhere in the image).
-        near_share: probability that a wrong pair is *near* instead: a little off.
-        structured_share: probability that the wrong pairs of a problem are *structured* instead, up to a third of the
-            right ones: they agree on another pose, as repeated structure does.
-        min_inliers: so many pairs stay right, whatever ``max_ratio`` says.
+        max_ratio: the maximum as a share of the pairs, rounded down with a tolerance of a twentieth of a pair, so that
+            a third written as 0.33 means :math:`\lfloor n/3 \rfloor` for every n up to 15.
+        count: exact number of outliers, which replaces the range.
+        min_count: smallest number of outliers.
+        mismatch_share: probability that an outlier is a *mismatch* (the projection of another point) rather than
+            *sensing* (a uniform pixel of the image).
+        near_share: probability that an outlier is a *near* miss instead.
+        structured_share: probability that the outliers of a problem are *structured* instead, up to a third of its
+            inliers: they agree on another pose, as with repeated structure.
+        min_inliers: smallest number of inliers, which limits the maximum.
 
     Raises:
         BaseError: for shares outside [0, 1] or counts that are negative or not whole.
@@ -87,24 +87,24 @@ class OutlierMix:
         self.min_inliers = min_inliers
 
     def max_count(self, n: int) -> int:
-        """The most wrong pairs among ``n``."""
+        """The largest number of outliers among ``n`` pairs."""
         if self.count is not None:
             return self.count
         return max(0, min(math.floor(n * self.max_ratio + 0.05), n - self.min_inliers))
 
     def draw(self, batch_size: int, n: int, generator: torch.Generator) -> OutlierDraw:
-        r"""Draw the wrong pairs of a batch.
+        r"""Draw the outliers of a batch.
 
         Args:
             batch_size: number of problems.
-            n: pairs in each.
+            n: number of pairs of each problem.
             generator: source of randomness; the result is on its device.
 
         Returns:
             Masks of shape ``(batch_size, n)``.
 
         Raises:
-            BaseError: when more wrong pairs are asked for than there are pairs.
+            BaseError: when there are to be more outliers than pairs.
         """
         most = self.max_count(n)
         least = min(self.min_count, most) if self.count is None else self.count
@@ -117,8 +117,8 @@ class OutlierMix:
         mismatch = torch.rand(batch_size, n, generator=generator, device=device) < self.mismatch_share
         near = structured = None
         if self.structured_share:
-            such = torch.rand(batch_size, 1, generator=generator, device=device) < self.structured_share
-            structured = outlier & such & (rank < (n - count) // 3)
+            chosen = torch.rand(batch_size, 1, generator=generator, device=device) < self.structured_share
+            structured = outlier & chosen & (rank < (n - count) // 3)
             outlier = outlier & ~structured
         if self.near_share:
             near = outlier & (torch.rand(batch_size, n, generator=generator, device=device) < self.near_share)

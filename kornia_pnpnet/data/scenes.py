@@ -11,8 +11,8 @@ from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_numbers, check_whole
 from kornia_pnpnet.data.colmap import Scene
+from kornia_pnpnet.data.draws import batch_generator, random_poses, uniform
 from kornia_pnpnet.data.outliers import OutlierMix
-from kornia_pnpnet.data.synthetic import batch_generator, random_poses, uniform
 from kornia_pnpnet.types import Pose, Problems
 
 __all__ = ["SceneProblems"]
@@ -21,28 +21,28 @@ __all__ = ["SceneProblems"]
 class SceneProblems:
     r"""Random problems of a scene, endless and reproducible: batch ``i`` depends on ``seed`` and ``i`` alone.
 
-    Each problem is a random image, ``n`` random points that it observes and their pixels, of which some are spoilt:
-    a *mismatch* gets the pixel of a spare point of the same image, a *sensing* outlier a uniform pixel of the image.
-    ``outliers=OutlierMix(count=2)`` is the protocol's real data with outliers: 10 points are drawn, and 2 of the
-    first 9 get the 10th point's pixel or a uniform one. Points and poses do not depend on ``outliers``, so that
-    numbers of outliers are compared on the same problems.
+    Each problem is a random image with ``n`` random points that it observes and their pixels. Some pairs become
+    outliers: a *mismatch* gets the pixel of a spare point of the same image, a *sensing* outlier a uniform pixel of the
+    image. ``outliers=OutlierMix(count=2)`` is the protocol's real data with outliers: 10 points are drawn, and 2 of the
+    first 9 get the pixel of the 10th point or a uniform pixel. Points and poses do not depend on ``outliers``, so that
+    different numbers of outliers are compared on the same problems.
 
     As in the paper the world is centred on a coarse pose: a pose :math:`(R^*, t^*)` is drawn from the training prior
-    and the world is moved so that it is the true one, :math:`x' = R^{*\top}(R x + t - t^*)`.
+    and the world is moved so that this pose is the true one, :math:`x' = R^{*\top}(R x + t - t^*)`.
 
     Args:
-        scene: where the problems are drawn from. Only its images with at least ``n + num_spares`` points are used.
-        n: pairs per problem.
-        batch_size: problems per batch.
-        seed: of the stream, at least 0.
-        outliers: how many pairs are spoilt and how; none when ``None``. Raw matches bring their own mismatches.
-        num_spares: extra points drawn per problem, given to its mismatches in turn. The protocol draws one, which
-            all mismatches share; as many as there are mismatches give each its own.
+        scene: the scene. Only its images with at least ``n + num_spares`` points are used.
+        n: number of pairs per problem.
+        batch_size: number of problems per batch.
+        seed: seed of the stream, at least 0.
+        outliers: number and kinds of outliers; no outliers when ``None``. Raw matches have mismatches of their own.
+        num_spares: number of spare points per problem, which its mismatches use in turn. The protocol draws one, which
+            all mismatches share; with one per mismatch each has its own.
         recentre: whether to move the world.
         translation_box: side of the box centred at 0 in which :math:`t^*` is uniform.
         max_angle: the angle of :math:`R^*` is uniform from 0 to this many radians, its axis uniform in direction.
-        dtype: of the batches; everything is drawn in float64 first.
-        device: of the batches; everything is drawn on the CPU first.
+        dtype: dtype of the batches; numbers are drawn in float64 and cast.
+        device: device of the batches; numbers are drawn on the CPU and moved.
 
     Raises:
         BaseError: for an argument out of range.
@@ -131,11 +131,11 @@ class SceneProblems:
             index: at least 0.
 
         Returns:
-            The problems; points, pixels, intrinsics and pose in ``dtype`` on ``device``. A pair is an inlier if it
-            is one in the scene and was not spoilt.
+            The problems; points, pixels, intrinsics and pose in ``dtype`` on ``device``. A pair is an inlier when it is
+            an inlier of the scene and did not become an outlier.
         """
         generator = batch_generator(self.seed, index)
-        # What depends on the outlier options is drawn last.
+        # Draws that depend on the outlier options come last.
         view = torch.randint(len(self.views), (self.batch_size,), generator=generator)
         rows = _choose(self._counts[view], self.n + self.num_spares, generator) + self._starts[view, None]
         rows, spare_rows = rows[:, : self.n], rows[:, self.n :]  # (B, N), (B, num_spares)
@@ -149,7 +149,7 @@ class SceneProblems:
         else:
             pose = Pose(self._rotation[view], self._translation[view])
             world_points = self._world_points[rows]
-        turn = (draw.mismatch.cumsum(1) - 1) % self.num_spares  # (B, N), read only at mismatches
+        turn = (draw.mismatch.cumsum(1) - 1) % self.num_spares  # (B, N), used at mismatches only
         seen = torch.where(draw.mismatch, spare_rows.gather(1, turn), rows)
         img_points = torch.where(draw.sensing[..., None], anywhere, self._img_points[seen])
         return Problems(
@@ -171,7 +171,7 @@ def _choose(counts: Tensor, k: int, generator: torch.Generator) -> Tensor:
 
     Args:
         counts: at least k each, shape :math:`(B,)`.
-        k: how many to choose.
+        k: number of choices.
         generator: source of randomness.
 
     Returns:
@@ -180,9 +180,9 @@ def _choose(counts: Tensor, k: int, generator: torch.Generator) -> Tensor:
     draws = uniform((len(counts), k), 0.0, 1.0, generator)
     chosen = torch.empty((len(counts), k), dtype=torch.int64)
     for i in range(k):
-        last = counts - k + i  # the range grows by one each time, so its last element is never taken yet
+        last = counts - k + i  # the range grows by one each time, so that its last element was not chosen before
         candidate = (draws[:, i] * (last + 1)).long().minimum(last)
-        taken = (chosen[:, :i] == candidate[:, None]).any(1)
-        chosen[:, i] = torch.where(taken, last, candidate)
-    # Uniform as a set so far, but late elements sit late: shuffle each row.
+        chosen_before = (chosen[:, :i] == candidate[:, None]).any(1)
+        chosen[:, i] = torch.where(chosen_before, last, candidate)
+    # The set is uniform, its order is not: shuffle each row.
     return chosen.gather(1, uniform((len(counts), k), 0.0, 1.0, generator).argsort(1))

@@ -5,15 +5,17 @@ A bound needs the true poses and inliers, so it cannot solve new problems.
 
 from __future__ import annotations
 
-import inspect
+from collections.abc import Mapping
+from typing import Any
 
 import torch
 from kornia.core.check import KORNIA_CHECK
-from torch import Tensor, nn
+from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_numbers
+from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.geometry import transform
-from kornia_pnpnet.refine.lm import RobustWeightedLM
+from kornia_pnpnet.refine import RobustWeightedLM
 from kornia_pnpnet.solver import PnPNet
 from kornia_pnpnet.types import PnPResult, Problems
 
@@ -23,7 +25,36 @@ __all__ = ["KnownInliers", "KnownInliersAndNoise"]
 _ITERATIONS = 10
 
 
-class KnownInliers(nn.Module):
+class _Bound(Configured):
+    """Weighted least squares of the reprojection errors, started from the true pose."""
+
+    def __init__(self, arguments: Mapping[str, Any]) -> None:
+        super().__init__(arguments)
+        self.least_squares = PnPNet(None, RobustWeightedLM(_ITERATIONS, robustness=0.0, learnable=False))
+
+    def pair_weights(self, problems: Problems) -> Tensor:
+        """Return the weight of each pair, shape :math:`(B, N)`."""
+        raise NotImplementedError
+
+    def solve_with_truth(self, problems: Problems) -> PnPResult:
+        r"""Solve problems with the help of their true poses and inliers.
+
+        Args:
+            problems: :math:`B` problems with :math:`N` pairs each.
+
+        Returns:
+            The minimum next to the true pose.
+        """
+        return self.least_squares(
+            problems.world_points,
+            problems.img_points,
+            problems.intrinsics,
+            self.pair_weights(problems),
+            init=problems.pose,
+        )
+
+
+class KnownInliers(_Bound):
     r"""Least squares of the reprojection errors of the true inliers, started from the true pose.
 
     This is the best result of a method that finds all inliers and then minimises the reprojection error. Source: the
@@ -38,42 +69,18 @@ class KnownInliers(nn.Module):
     """
 
     def __init__(self) -> None:
-        super().__init__()
-        self.least_squares = PnPNet(None, RobustWeightedLM(_ITERATIONS, robustness=0.0, learnable=False))
-
-    @property
-    def config(self) -> dict[str, float]:
-        """The constructor's arguments as plain data."""
-        return {name: getattr(self, name) for name in inspect.signature(type(self)).parameters}
-
-    def extra_repr(self) -> str:
-        """Show the constructor's arguments."""
-        return ", ".join(f"{key}={value!r}" for key, value in self.config.items())
+        super().__init__(locals())
 
     def pair_weights(self, problems: Problems) -> Tensor:
         """Return the weight of each pair, 1 for an inlier and 0 for an outlier, shape :math:`(B, N)`."""
         return problems.inliers.to(problems.world_points.dtype)
 
-    def solve_with_truth(self, problems: Problems) -> PnPResult:
-        r"""Solve problems with the help of their true poses and inliers.
 
-        Args:
-            problems: :math:`B` problems with :math:`N` pairs each.
-
-        Returns:
-            The minimum next to the true pose.
-        """
-        weights = self.pair_weights(problems)
-        return self.least_squares(
-            problems.world_points, problems.img_points, problems.intrinsics, weights, init=problems.pose
-        )
-
-
-class KnownInliersAndNoise(KnownInliers):
+class KnownInliersAndNoise(_Bound):
     r"""Least squares as in :class:`KnownInliers`, with each inlier weighted by the inverse variance of its pixel.
 
-    The noise of a world point moves the pixels of near points more than those of far points. With :math:`J_x` the derivative of the pixel by
-    the point at the true pose, the weight is
+    The noise of a world point moves the pixels of near points more than those of far points. With :math:`J_x` the
+    derivative of the pixel by the point at the true pose, the weight is
     :math:`1 / (\sigma_\mathrm{img}^2 + \sigma_\mathrm{world}^2\,\mathrm{tr}(J_x J_x^\top) / 2)`. Source: the
     protocol's bound *known inliers and noise*.
 
@@ -93,7 +100,7 @@ class KnownInliersAndNoise(KnownInliers):
     """
 
     def __init__(self, *, img_sigma: float = 1.0, world_sigma: float = 0.05) -> None:
-        super().__init__()
+        super().__init__(locals())
         check_numbers(0.0, img_sigma=img_sigma, world_sigma=world_sigma)
         KORNIA_CHECK(img_sigma + world_sigma > 0, "img_sigma and world_sigma must not both be 0.")
         self.img_sigma = img_sigma

@@ -128,13 +128,13 @@ def evaluate(
         progress: show a progress bar; when ``None``, only if standard error is a terminal.
 
     Returns:
-        Plain data: ``format``, ``environment`` (see :func:`environment`), ``code`` (a digest of the package),
-        ``solvers`` with each one's configuration and a digest of its weights, ``data`` with each set's description,
-        limits and a digest of its problems, and ``rows``, one for each set and solver: ``success`` (rate, low, high,
-        total), quartiles of ``rotation_error_deg`` and ``translation_error``, the share ``ok``, ``us_per_problem``
-        (median over the timed calls), the ``per_problem`` errors and ok, and the differences from ``environment`` when
-        another machine continued the file. A solver that refuses the shape of a set (a network for another n) has an
-        entry in ``left_out`` instead: ``data``, ``solver`` and ``reason``.
+        Plain data: ``format``, ``environment`` (see :func:`~kornia_pnpnet.core.environment.environment`), ``code`` (a
+        digest of the package), ``solvers`` with each one's configuration and a digest of its weights, ``data`` with
+        each set's description, limits and a digest of its problems, and ``rows``, one for each set and solver:
+        ``success`` (rate, low, high, total), quartiles of ``rotation_error_deg`` and ``translation_error``, the share
+        ``ok``, ``us_per_problem`` (median over the timed calls), the ``per_problem`` errors and ok, and the differences
+        from ``environment`` when another machine continued the file. A solver that refuses the shape of a set (a
+        network for another n) has an entry in ``left_out`` instead: ``data``, ``solver`` and ``reason``.
 
     Raises:
         ValueError: when ``path`` is not a results file, or one that this evaluation cannot continue.
@@ -246,18 +246,18 @@ def _run(solver: nn.Module, problems: Problems, chunk: int, repeats: int) -> tup
     """Errors and ok of all problems, and the median time per problem in seconds."""
     chunks = list(_chunks(problems, chunk))
     _timed(solver, chunks[0])
-    results, seconds = [], []
+    compared, seconds = [], []
     for part in chunks:
         result, elapsed = _timed(solver, part)
-        results.append(_compare(result, part.pose))
+        compared.append(_compare(result, part.pose))
         seconds.append((len(part.world_points), elapsed / len(part.world_points)))
     while len(seconds) < repeats:
         part = chunks[len(seconds) % len(chunks)]
         seconds.append((len(part.world_points), _timed(solver, part)[1] / len(part.world_points)))
     # A short last chunk pays the fixed cost of a call for few problems, so only full chunks count.
     full = max(size for size, _ in seconds)
-    rotation, translation, ok = (torch.cat(values) for values in zip(*results, strict=True))
-    return PoseErrors(rotation, translation), ok, statistics.median(time for size, time in seconds if size == full)
+    errors, ok = map_tensors(lambda *parts: torch.cat(parts), *compared)
+    return errors, ok, statistics.median(time for size, time in seconds if size == full)
 
 
 def _timed(solver: nn.Module, problems: Problems) -> tuple[PnPResult, float]:
@@ -275,14 +275,13 @@ def _timed(solver: nn.Module, problems: Problems) -> tuple[PnPResult, float]:
     return result, time.perf_counter() - start
 
 
-def _compare(result: PnPResult, truth: Pose) -> tuple[Tensor, Tensor, Tensor]:
-    """Rotation errors, translation errors and ok, on the CPU; the errors in float64."""
+def _compare(result: PnPResult, truth: Pose) -> tuple[PoseErrors, Tensor]:
+    """Errors in float64, and ok, on the CPU."""
     pose, true = (map_tensors(lambda part: part.double().cpu(), pose) for pose in (result.pose, truth))
     finite = pose.rotation.isfinite().flatten(1).all(-1) & pose.translation.isfinite().all(-1)
     rotation = torch.where(finite[:, None, None], pose.rotation, torch.eye(3, dtype=torch.float64))
     translation = torch.where(finite[:, None], pose.translation, 0.0)
-    errors = pose_errors(Pose(rotation, translation), true)
-    return errors.rotation_error_deg, errors.translation_error, result.ok.cpu() & finite
+    return pose_errors(Pose(rotation, translation), true), result.ok.cpu() & finite
 
 
 def _rounded(value: float) -> float:

@@ -31,7 +31,7 @@ from kornia_pnpnet.data.stream import ProblemSource, stream_batches
 from kornia_pnpnet.init import MLPInit
 from kornia_pnpnet.losses import LossTerms, PoseLoss, SetLoss
 from kornia_pnpnet.metrics import pose_errors, success, success_rate
-from kornia_pnpnet.refine.lm import RobustWeightedLM
+from kornia_pnpnet.refine import RobustWeightedLM
 from kornia_pnpnet.solver import PnPNet
 from kornia_pnpnet.training.checkpoint import (
     CHECKPOINT_NAME,

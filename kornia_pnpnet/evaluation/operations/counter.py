@@ -30,7 +30,7 @@ _ELEMENTWISE: dict[str, Operations] = {
     **_each("diagonal empty empty_like expand eye fill flip full full_like gather index index_put", _NOTHING),
     **_each("index_select lift_fresh masked_select neg new_empty new_full new_ones new_zeros nonzero", _NOTHING),
     **_each("ones ones_like permute promote_types rand randperm repeat scalar_tensor scatter select", _NOTHING),
-    **_each("slice split split_with_sizes squeeze stack t taken transpose unbind unsqueeze view zero", _NOTHING),
+    **_each("slice split split_with_sizes squeeze stack t take_pairs transpose unbind unsqueeze view zero", _NOTHING),
     **_each("zeros zeros_like", _NOTHING),
     **_each("add rsub sub", _ADD),
     **_each("mul", _MULTIPLY),

@@ -18,7 +18,7 @@ from torch import Tensor
 from kornia_pnpnet.core.linalg import dot, eigenvectors, small_product, solve_leading
 from kornia_pnpnet.geometry import NormalEquations
 from kornia_pnpnet.init.epnp.control_points import ControlPoints
-from kornia_pnpnet.refine.lm import solve_damped
+from kornia_pnpnet.refine import solve_damped
 
 __all__ = [
     "DepthSystem",

@@ -11,7 +11,8 @@ from kornia.core.exceptions import ShapeError
 from torch import Tensor, nn
 
 from kornia_pnpnet.core.linalg import relative
-from kornia_pnpnet.geometry import problems_last, project
+from kornia_pnpnet.core.performance import problems_last
+from kornia_pnpnet.geometry import project
 from kornia_pnpnet.init.ransac.sampling import MIN_PAIRS, log_false_alarms
 from kornia_pnpnet.init.ransac.scoring import SCORERS, Judged, Scorer, Thresholds, chance_of_inlier, judge
 from kornia_pnpnet.init.ransac.search import (
@@ -24,7 +25,7 @@ from kornia_pnpnet.init.ransac.search import (
     full_vectors,
     take,
 )
-from kornia_pnpnet.refine.lm import RobustWeightedLM, lm_step
+from kornia_pnpnet.refine import RobustWeightedLM, lm_step
 from kornia_pnpnet.types import Correspondences, Guess, Hypotheses, Pose
 
 __all__ = ["RANSAC", "SubsetSolver"]
@@ -95,7 +96,7 @@ class RANSAC(nn.Module):
     :math:`f/z` times as much. Least squares weigh an inlier by the inverse of the right hand side.
 
     The guess is ``ok`` when so many inliers among pairs without any pose behind them would be a rare chance (see
-    :func:`log_false_alarms`; fewer than 0.01 such poses are expected). Of three pairs
+    :func:`~kornia_pnpnet.refine.verdict.log_false_alarms`; fewer than 0.01 such poses are expected). Of three pairs
     alone that cannot be told: they are ``ok`` when there is a pose.
 
     Gradients: which pairs are inliers, and the weights that their depths give them, are selected without a gradient.

@@ -7,10 +7,11 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from kornia_pnpnet.geometry import problems_last, project
+from kornia_pnpnet.core.performance import problems_last
+from kornia_pnpnet.geometry import project
 from kornia_pnpnet.init.ransac.sampling import Samples, samples_needed
 from kornia_pnpnet.init.ransac.scoring import Scene, Scorer, Thresholds, judge
-from kornia_pnpnet.refine.lm import lm_step
+from kornia_pnpnet.refine import lm_step
 from kornia_pnpnet.types import Correspondences, Hypotheses, Pose
 
 __all__ = ["Found", "MinimalSolver", "Plan", "Search", "full_vectors", "take"]
