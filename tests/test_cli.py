@@ -25,9 +25,9 @@ import kornia_pnpnet.solver
 from kornia_pnpnet import MLPInit, PnPNet, RobustWeightedLM, create_solver, list_solvers
 from kornia_pnpnet.cli import main
 from kornia_pnpnet.data import SyntheticProblems
-from kornia_pnpnet.evaluation.comparison import load_results, save_results
 from kornia_pnpnet.evaluation.named_solvers import BOUNDS, default_solvers
 from kornia_pnpnet.evaluation.operations import complexity_results
+from kornia_pnpnet.evaluation.results import load_results, save_results
 from kornia_pnpnet.types import Pose
 
 CAMERA = "800,810,320,240"
