@@ -24,7 +24,7 @@ from tasks import (
 from torch import nn
 
 from kornia_pnpnet import PnPNet, RobustWeightedLM
-from kornia_pnpnet.evaluation.choices import load_solver
+from kornia_pnpnet.evaluation.named_solvers import load_solver
 from kornia_pnpnet.types import Pose, Problems
 
 __all__ = ["ANY", "CONTENDERS", "ONE", "ONE_THREAD", "OURS", "PLAIN", "TRAINED", "WHOLE"]

@@ -15,8 +15,8 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from kornia_pnpnet import PnPNet, RobustWeightedLM, create_solver
-from kornia_pnpnet.evaluation.operations import Operations, operations_by_part
+from kornia_pnpnet import RobustWeightedLM, create_solver
+from kornia_pnpnet.evaluation.operations import Operations, count_per_problem
 
 __all__ = ["GPU", "measure_engine"]
 
@@ -72,9 +72,9 @@ def count_bytes(values: Iterable[Tensor]) -> int:
 
 def refinement_operations(m: int) -> Operations:
     """Operations of the refinement alone, with ``m`` iterations, for one problem."""
-    parts = operations_by_part(PnPNet(None, RobustWeightedLM(m)), N)
-    around = ("normalize.", "model.")
-    return sum((part for name, part in parts.items() if not name.startswith(around)), Operations())
+    refine = RobustWeightedLM(m)
+    inputs = {batch: normalized(draw(N, batch), "cpu")[:2] for batch in (2, 4)}
+    return count_per_problem(lambda batch: refine(*inputs[batch]), batch=2)
 
 
 @torch.no_grad()

@@ -12,7 +12,7 @@ from kornia.geometry.calibration.pnp import solve_pnp_dlt
 from tasks import ITERATIONS, Contender, Task, float_inputs, gradient, leaves_of, normalized, without_gradient
 from torch import Tensor, nn
 
-from kornia_pnpnet.evaluation.choices import load_solver
+from kornia_pnpnet.evaluation.named_solvers import load_solver
 from kornia_pnpnet.peers import PeerSolver
 from kornia_pnpnet.types import Pose, Problems
 

@@ -24,7 +24,7 @@ from kornia_pnpnet import pose_errors, success, success_rate
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.evaluation import draw_problems
-from kornia_pnpnet.evaluation.choices import load_solver
+from kornia_pnpnet.evaluation.named_solvers import load_solver
 from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.types import Problems
 

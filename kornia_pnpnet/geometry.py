@@ -192,7 +192,7 @@ def normal_equations(projection: Projection, weights: Tensor) -> NormalEquations
         (minus_p, minus_q),
     ]
     weights = weights * projection.inv_depth * projection.inv_depth
-    zero = torch.zeros_like(weights[:, 0])
+    zero = torch.zeros_like(weights.sum(1))
     weighted: list[_Column] = [(_times(u, weights), _times(v, weights)) for u, v in columns]
 
     def inner(a: _Column, b: _Column) -> Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,19 +23,6 @@ if TYPE_CHECKING:
 def _one_thread() -> None:
     """The tensors are small: threads only get into each other's way, above all under pytest-xdist."""
     torch.set_num_threads(1)
-
-
-@pytest.fixture(scope="session")
-def tally() -> Callable[..., None]:
-    """Count cases by what they are, for the table of ``docs/hardening.py``, which names the file."""
-    path = os.environ.get("PNPNET_TALLY")
-
-    def count(*what: str) -> None:
-        if path is not None:
-            with Path(path).open("a") as file:
-                file.write("\t".join(what) + "\n")
-
-    return count
 
 
 @pytest.fixture(autouse=True)

@@ -1,3 +1,4 @@
+import io
 import itertools
 import math
 import sys
@@ -7,7 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from kornia.core.exceptions import BaseError
+from strategies import damage, finite, many, names_the_file
 from torch.testing import assert_close
 
 from kornia_pnpnet.data.colmap import Scene, View, load_colmap, load_matches, load_scene
@@ -653,3 +657,47 @@ def test_real_matches(name, mismatches):
     assert_close(wrong, mismatches, rtol=0, atol=1e-3)
     problems = SceneProblems(scene, batch_size=2000).batch(0)
     assert 0.5 * mismatches < (~problems.inliers).double().mean() < 2 * mismatches
+
+
+# -- whatever comes in -------------------------------------------------------------------------------------------------
+
+
+def test_damaged_scenes_are_an_error_of_ours(tmp_path):
+    pytest.importorskip("pycolmap", reason="needs pycolmap")
+    model = tmp_path / "model"
+    write_model(model, "PINHOLE")
+    sound_files = {path.name: path.read_bytes() for path in model.iterdir()}
+
+    @many(100)
+    @given(st.sampled_from(sorted(sound_files)), st.data())
+    def run(name, data):
+        (model / name).write_bytes(data.draw(damage(sound_files[name])))
+        try:
+            scene = data.draw(st.sampled_from([load_colmap, load_scene]))(model)
+        except (ValueError, OSError) as error:
+            names_the_file(error, model)
+        else:
+            finite(*((view.world_points, view.img_points, view.rotation, view.translation) for view in scene.views))
+        finally:
+            (model / name).write_bytes(sound_files[name])
+
+    run()
+
+
+def test_damaged_matches_are_an_error_of_ours(tmp_path):
+    file = io.BytesIO()
+    np.savez(file, **match_arrays(30, 20))
+    path = tmp_path / "matches.npz"
+
+    @many(150)
+    @given(damage(file.getvalue()))
+    def run(content):
+        path.write_bytes(content)
+        try:
+            scene = load_matches(path)
+        except (ValueError, OSError) as error:
+            names_the_file(error, path)
+        else:
+            finite(*((view.world_points, view.img_points, view.rotation, view.translation) for view in scene.views))
+
+    run()

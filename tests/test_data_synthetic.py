@@ -8,8 +8,12 @@ from functools import partial
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from kornia.core.exceptions import BaseError
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
+from strategies import ANY, BOOL, COUNTS, RANGES, Seen, are_rotations, finite, many, options
+from test_data_colmap import make_scene
 
 from kornia_pnpnet import Pose, Problems, create_solver
 from kornia_pnpnet.data import (
@@ -17,6 +21,7 @@ from kornia_pnpnet.data import (
     MixedProblems,
     ObjectPoints,
     OutlierMix,
+    SceneProblems,
     SlabPoints,
     SyntheticProblems,
     VaryingSize,
@@ -236,9 +241,9 @@ def test_mismatched_pixels_belong_to_another_point_of_the_box_with_noise():
 
 
 def test_impossible_mixes_raise(generator):
-    for options in ({"max_ratio": 1.5}, {"max_ratio": -0.1}, {"count": -1}, {"min_count": -1}, {"mismatch_share": 2.0}):
-        with pytest.raises(BaseError, match=str(next(iter(options.values())))):
-            OutlierMix(**options)
+    for wrong in ({"max_ratio": 1.5}, {"max_ratio": -0.1}, {"count": -1}, {"min_count": -1}, {"mismatch_share": 2.0}):
+        with pytest.raises(BaseError, match=str(next(iter(wrong.values())))):
+            OutlierMix(**wrong)
     with pytest.raises(BaseError, match=r"10 outliers.*9"):
         OutlierMix(count=10).draw(1, 9, generator)
     with pytest.raises(BaseError, match="0"):
@@ -556,3 +561,113 @@ def test_in_a_mixture_unknown_noise_is_nan(first):
     sources = [SyntheticProblems, partial(SyntheticProblems, known_noise=1.0)]
     problems = MixedProblems(sources if first == 0 else sources[::-1], batch_size=10, n=4).batch(0)
     assert problems.img_sigma.isnan().sum() == problems.world_sigma.isnan().sum() == 5
+
+
+# -- whatever comes in -------------------------------------------------------------------------------------------------
+
+
+SIGMAS = ANY | RANGES
+
+
+MIX = options(
+    max_ratio=ANY,
+    count=COUNTS,
+    min_count=COUNTS,
+    mismatch_share=ANY,
+    near_share=ANY,
+    structured_share=ANY,
+    min_inliers=COUNTS,
+)
+
+
+POINTS = {
+    BoxPoints: options(half_width=ANY, z_near=ANY, depth=ANY),
+    SlabPoints: options(window=RANGES, field_of_view=ANY, distance=RANGES, tilt=ANY, thickness=RANGES),
+    ObjectPoints: options(distance=RANGES, field_of_view=ANY, thinnest=ANY, planar=ANY),
+}
+
+
+SOURCE = options(
+    n=COUNTS,
+    batch_size=COUNTS,
+    seed=COUNTS,
+    translation_box=ANY,
+    translation_sigma=ANY,
+    max_angle=ANY,
+    focal=ANY,
+    half_image=ANY,
+    img_sigma=SIGMAS,
+    world_sigma=SIGMAS,
+    known_noise=ANY,
+)
+
+
+def sound(problems):
+    """What every batch of problems keeps."""
+    finite(*problems[:5])
+    are_rotations(problems.pose.rotation)
+    assert problems.inliers.shape == problems.world_points.shape[:2]
+
+
+def draw_sound_problems(made, chosen, make):
+    """Every source that can be made of what is chosen draws sound problems."""
+
+    @many(80)
+    @given(chosen)
+    def run(values):
+        problems = made(lambda: make(values))
+        if problems is not None:
+            sound(problems)
+
+    run()
+    made.both()
+
+
+@pytest.mark.parametrize("prior", POINTS)
+def test_problems_of_any_options(prior):
+    def make(chosen):
+        source, points = chosen
+        return SyntheticProblems(**{"batch_size": 4, **source}, points=prior(**points)).batch(0)
+
+    made = Seen()
+    draw_sound_problems(made, st.tuples(SOURCE, POINTS[prior]), make)
+
+
+@pytest.mark.parametrize(
+    ("name", "source"),
+    {
+        "SyntheticProblems": partial(SyntheticProblems, batch_size=4),
+        "SceneProblems": partial(SceneProblems, make_scene(20, 12), batch_size=4),
+    }.items(),
+)
+def test_wrong_pairs_of_any_options(name, source):
+    made = Seen()
+    draw_sound_problems(made, MIX, lambda mix: source(outliers=OutlierMix(**mix)).batch(0))
+
+
+def test_scenes_of_any_options():
+    chosen = options(
+        n=COUNTS,
+        batch_size=COUNTS,
+        seed=COUNTS,
+        num_spares=COUNTS,
+        translation_box=ANY,
+        max_angle=ANY,
+        recentre=BOOL,
+    )
+    made = Seen()
+    draw_sound_problems(
+        made, chosen, lambda values: SceneProblems(make_scene(20, 12), **{"batch_size": 4, **values}).batch(0)
+    )
+
+
+def test_mixtures_of_any_options():
+    def make(values):
+        given_options, count = values
+        sizes = {key: value for key, value in given_options.items() if key != "shares"}
+        mixed = partial(MixedProblems, [SyntheticProblems] * count, shares=given_options.get("shares"))
+        return VaryingSize(mixed, **{"n": (5, 9), "batch_size": 6, **sizes}).batch(3)
+
+    chosen = options(n=st.lists(COUNTS, max_size=3), batch_size=COUNTS, seed=COUNTS, shares=st.lists(ANY, max_size=3))
+    made = Seen()
+    draw_sound_problems(made, st.tuples(chosen, st.integers(0, 3) | st.just(2)), make)

@@ -7,7 +7,6 @@ import json
 import pkgutil
 import queue
 import re
-import runpy
 import shutil
 import subprocess
 import sys
@@ -205,8 +204,3 @@ INTERNAL = {
         "results",
     )
 } | {"kornia_pnpnet.training.checkpoint", "kornia_pnpnet.core.linalg"}
-
-
-def test_the_page_on_hardening_is_of_its_results():
-    made = runpy.run_path(str(DOCS / "hardening.py"))
-    assert made["PAGE"].read_text() == made["page"](json.loads(made["RESULTS"].read_text()))

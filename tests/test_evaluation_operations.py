@@ -7,11 +7,14 @@ import math
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from kornia.core.exceptions import ValueCheckError
+from strategies import SOLVERS, batches, many
 
 from kornia_pnpnet import MLPInit, Normalize
 from kornia_pnpnet.data import SyntheticProblems
-from kornia_pnpnet.evaluation.operations import complexity_results, operation_count
+from kornia_pnpnet.evaluation.operations import OperationCounter, complexity_results, operation_count
 from kornia_pnpnet.evaluation.operations.costs import (
     OPERATION_COSTS,
     Operations,
@@ -23,7 +26,7 @@ from kornia_pnpnet.evaluation.operations.costs import (
     solve_triangular,
     sort,
 )
-from kornia_pnpnet.evaluation.operations.counter import OperationCounter, count_per_problem
+from kornia_pnpnet.evaluation.operations.counter import count_per_problem
 
 
 def count(function, *shapes):
@@ -170,6 +173,7 @@ def test_an_iteration_costs_the_same_each_time():
     assert counts[3] - counts[2] == pytest.approx(27 * iteration)
 
 
+@pytest.mark.slow
 def test_ransac_costs_more_with_more_outliers_and_at_most_all_samples():
     few = [operation_count("p3p-ransac", 50, outliers=k) for k in (0, 15, 30, 45)]
     assert few == sorted(few)
@@ -195,3 +199,28 @@ def test_only_solvers_of_the_package_are_counted(name):
         pytest.importorskip("cv2")
     with pytest.raises(ValueCheckError, match=name):
         operation_count(name, 9)
+
+
+# -- whatever comes in -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@many(40)
+@given(st.sampled_from([name for name in SOLVERS if not name.endswith("-n9")]), batches())
+def test_counted_solvers_are_the_same_solvers(name, case):
+    inputs, mask, weights, _ = case
+    with OperationCounter() as counter:
+        result = SOLVERS[name](*inputs, weights=weights, mask=mask)
+    assert (0 < counter.total.flops < math.inf) or not len(inputs[0])
+    for ours, plain in zip(result[:5], SOLVERS[name](*inputs, weights=weights, mask=mask)[:5], strict=True):
+        assert ours.equal(plain)
+
+
+SIZES = st.integers(1, 6)
+
+
+@many(10)
+@given(st.sampled_from([torch.fft.fft, torch.special.bessel_j0, torch.erfinv, torch.linalg.svd]), SIZES)
+def test_operations_of_unknown_cost_are_an_error(function, size):
+    with pytest.raises(NotImplementedError, match=r"The cost of aten\.\w+ is unknown"), OperationCounter():
+        function(torch.rand(size, size))

@@ -6,8 +6,11 @@ import math
 
 import pytest
 import torch
+from hypothesis import given
+from strategies import ANY, BOOL, COUNTS, Seen, batches, finite, gradients_are_finite, many, options
 
-from kornia_pnpnet import Guess, Noise, PnPResult, Pose, PoseLoss, SetLoss
+from kornia_pnpnet import Guess, Noise, PnPResult, Pose, PoseLoss, SetLoss, create_solver
+from kornia_pnpnet.data import SyntheticProblems
 from kornia_pnpnet.losses import pose_distances
 
 EPS = 1e-6
@@ -180,3 +183,44 @@ def test_weights_are_compared_with_what_is_right(make_problems):
     half = torch.full(p.inliers.shape, 0.5, dtype=torch.float64)
     terms = terms_of(SetLoss(), p, p.pose, [p.pose], weights=half)
     torch.testing.assert_close(terms.weights, torch.tensor(math.log(2.0), dtype=torch.float64))
+
+
+# -- whatever comes in -------------------------------------------------------------------------------------------------
+
+
+@many(40)
+@given(batches(most=3))
+def test_losses_of_any_result(case):
+    inputs, mask, weights, kinds = case
+    if not kinds:
+        return
+    truth = SyntheticProblems(n=inputs[0].shape[1], batch_size=len(kinds), dtype=inputs[0].dtype).batch(0)
+    solver = SOLVER
+    result, guess = solver.with_guess(*inputs, weights=weights, mask=mask)
+    terms = [SetLoss()(result, truth, 1.0, guess), PoseLoss()(result, truth)]
+    finite(terms)
+    gradients_are_finite([x.total for x in terms], [x for x in inputs if x.requires_grad] or [SOLVER.refine.step.raw])
+
+
+SOLVER = create_solver("pnpnet-set")
+
+
+def test_losses_of_any_options():
+    made = Seen()
+    problems = SyntheticProblems(n=9, batch_size=3, seed=0).batch(0)
+    result, guess = SOLVER.with_guess(*problems[:3])
+
+    @many(80)
+    @given(
+        BOOL,
+        options(refined=ANY, saturation=ANY),
+        options(rotation=ANY, translation=ANY, init_translation=ANY),
+        options(starts=COUNTS, every=ANY, weights=ANY, noise=ANY, rotation_unit=ANY, translation_unit=ANY),
+    )
+    def run(of_set, both, first, second):
+        loss = made(lambda: SetLoss(**both, **second) if of_set else PoseLoss(**both, **first))
+        if loss is not None:
+            finite(loss(result, problems, 1.0, guess) if of_set else loss(result, problems))
+
+    run()
+    made.both()

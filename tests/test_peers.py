@@ -9,7 +9,9 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
 from kornia.core.exceptions import BaseError, ShapeError, TypeCheckError
+from strategies import batches, check, many
 
 from kornia_pnpnet import create_solver, pose_errors, success, success_rate
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
@@ -357,3 +359,21 @@ def test_another_peer_only_solves_one_problem(make_problems):
     result = solve(_Other(threshold=1.0), make_problems(batch=4))
     assert result.ok.tolist() == [True, False, False, True]
     assert result.translation.tolist() == [[1, 2, 3], [0, 0, 0], [0, 0, 0], [1, 2, 3]]
+
+
+# -- whatever comes in -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["opencv-ransac", "poselib"])
+def test_peers_take_anything(name):
+    solver = create_solver(name)
+
+    @many(25)
+    @given(batches())
+    def run(case):
+        inputs, mask, weights, kinds = case
+        # Of points on a line they may say what they like.
+        kinds = ["nothing" if kind in ("one point", "a line") else kind for kind in kinds]
+        check(solver(*inputs, weights=weights, mask=mask), inputs, kinds)
+
+    run()

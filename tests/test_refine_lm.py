@@ -7,12 +7,29 @@ import math
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from kornia.core.exceptions import BaseError
+from strategies import (
+    ANY,
+    BOOL,
+    COUNTS,
+    KINDS,
+    Seen,
+    are_rotations,
+    correspondences,
+    finite,
+    gradients_are_finite,
+    many,
+    options,
+    poses,
+)
 
 from kornia_pnpnet import Correspondences, Guess, Noise, Pose, RobustWeightedLM, pose_errors
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.geometry import NormalEquations, project, retract, retract_additive
 from kornia_pnpnet.refine import KERNELS, BoundedParameter, explains, lm_step, solve_damped
+from kornia_pnpnet.refine.lm import BACKWARDS
 
 DTYPES = (torch.float32, torch.float64)
 UPDATES = ("retraction", "additive")
@@ -434,9 +451,9 @@ def test_iterations_by_residual_ignore_the_guessed_weights_but_not_the_given_one
     doubt = torch.rand(7, 9, generator=generator, dtype=torch.float64)
     lm = RobustWeightedLM(m=3, by_residual=1, backward=backward)
     first = RobustWeightedLM(m=2)(corr, Guess(start, doubt)).pose
-    for given in (torch.ones_like(doubt), doubt.flip(1)):
-        refined = lm(corr._replace(weights=given), Guess(start, doubt / given))
-        last = RobustWeightedLM(m=1)(corr._replace(weights=given), guess(first, corr))
+    for weights in (torch.ones_like(doubt), doubt.flip(1)):
+        refined = lm(corr._replace(weights=weights), Guess(start, doubt / weights))
+        last = RobustWeightedLM(m=1)(corr._replace(weights=weights), guess(first, corr))
         assert_close(refined, last, rtol=1e-7)
 
 
@@ -767,3 +784,51 @@ def test_a_spoilt_start_is_never_the_best(spoilt, case):
     best = lm(corr, guess(bad, corr, start))
     assert_close(best.pose, lm(corr, guess(start, corr)).pose, atol=1e-12)
     assert best.ok.all()
+
+
+# -- whatever comes in -------------------------------------------------------------------------------------------------
+
+
+@many(80)
+@given(
+    correspondences(),
+    st.integers(0, 4),
+    options(
+        kernel=KINDS,
+        shared=st.booleans(),
+        update=st.sampled_from(["retraction", "additive"]),
+        reject_worse=st.booleans(),
+        by_residual=st.integers(0, 3),
+        backward=st.sampled_from(BACKWARDS),
+    ),
+    st.data(),
+)
+def test_refinements_take_anything(case, m, chosen, data):
+    corr, tensors = case
+    refine = RobustWeightedLM(m, **chosen).to(corr.world_points.dtype)
+    pose = data.draw(poses(len(corr.world_points), corr.world_points.dtype))
+    refined = refine(corr, Guess(pose, torch.ones_like(corr.weights)))
+    finite(refined)
+    are_rotations(refined.pose.rotation)
+    gradients_are_finite(
+        [*refined.pose, refined.cost], [*tensors, *(p for p in refine.parameters() if p.requires_grad)]
+    )
+
+
+def test_bounded_parameters_of_any_bounds():
+    made = Seen()
+
+    @many(80)
+    @given(options(initial=ANY, size=COUNTS, lower=ANY, upper=ANY, logarithmic=BOOL))
+    def run(chosen):
+        values = {"initial": 3.0, "size": 2, "lower": 1.0, "upper": 50.0, **chosen}
+        parameter = made(lambda: BoundedParameter(**values))
+        if parameter is not None:
+            value = parameter()
+            assert value.shape == (values["size"],)
+            wanted = torch.full_like(value, values["initial"])
+            slack = 1e-3 * (values["upper"] - values["lower"])
+            torch.testing.assert_close(value, wanted, rtol=1e-3, atol=slack)
+
+    run()
+    made.both()

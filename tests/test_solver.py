@@ -20,7 +20,6 @@ from kornia_pnpnet import (
     PnPNet,
     PnPResult,
     Pose,
-    PoseLoss,
     RobustWeightedLM,
     create_solver,
     list_solvers,
@@ -227,6 +226,7 @@ SOLVERS = {
     "additive": lambda: net(9, 5, update="additive"),
     "rejecting": lambda: net(9, 5, reject_worse=True),
     "first_stage": lambda: net(9, 0),
+    "views": lambda: PnPNet(MLPInit(9), RobustWeightedLM(m=5), views=3),
     "identity": lambda: PnPNet(None, RobustWeightedLM(m=5)),
 }
 
@@ -305,23 +305,22 @@ def test_everything_behind_the_true_pose_is_not_ok(make_problems):
     assert_same(result.pose, p.pose, rtol=1e-12, atol=1e-12)  # there is no way from there
 
 
-@pytest.mark.parametrize("bad", ["nan", "inf", "zero_rotation", "far"])
-def test_a_bad_pose_by_hand_spoils_only_its_problem(bad, make_problems, perturb):
+@pytest.mark.parametrize(
+    ("part", "at", "value"),
+    [
+        ("rotation", (2, 0, 0), math.nan),
+        ("rotation", 2, 0.0),
+        ("translation", (2, 1), math.inf),
+        ("translation", 2, 1e300),
+    ],
+)
+def test_a_bad_given_pose_fails_its_problem_alone(part, at, value, make_problems, perturb):
     p = make_problems()
     init = perturb(p.pose)
-    rotation, translation = init.rotation.clone(), init.translation.clone()
-    match bad:
-        case "nan":
-            rotation[2, 0, 0] = math.nan
-        case "inf":
-            translation[2, 1] = math.inf
-        case "zero_rotation":
-            rotation[2] = 0.0
-        case "far":
-            translation[2] = 1e300
+    bad = Pose(init.rotation.clone(), init.translation.clone())
+    getattr(bad, part)[at] = value
     inputs = [x.clone().requires_grad_() for x in p[:3]]
-    result = PnPNet()(*inputs, init=Pose(rotation, translation))
-    reference = PnPNet()(*p[:3], init=init)
+    result, reference = PnPNet()(*inputs, init=bad), PnPNet()(*p[:3], init=init)
     assert_same(only(OTHERS, result), only(OTHERS, reference))
     assert all(x.isfinite().all() for x in pytree.tree_leaves(result))
     sum(x.sum() for x in pytree.tree_leaves(result) if x.requires_grad).backward()
@@ -331,9 +330,8 @@ def test_a_bad_pose_by_hand_spoils_only_its_problem(bad, make_problems, perturb)
 # --- gradients --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("first", ["given", "net"])
-def test_gradcheck_through_the_whole_layer(first, weighted, make_problems, perturb):
+def test_gradcheck_through_the_whole_layer(first, make_problems, perturb):
     p = make_problems(5, 2, outliers=1)
     torch.manual_seed(1)
     solver = PnPNet(MLPInit(5), RobustWeightedLM(m=2)).double()
@@ -354,9 +352,7 @@ def test_gradcheck_through_the_whole_layer(first, weighted, make_problems, pertu
         return tuple(outputs)
 
     generator = torch.Generator().manual_seed(2)
-    weights = torch.ones(2, 5, dtype=torch.float64)
-    if weighted:
-        weights = 0.5 + torch.rand(2, 5, generator=generator, dtype=torch.float64)
+    weights = 0.5 + torch.rand(2, 5, generator=generator, dtype=torch.float64)
     focal = torch.tensor([[3.4, 3.4], [3.0, 3.8]], dtype=torch.float64)
     centre = torch.tensor([[0.0, 0.0], [0.1, -0.1]], dtype=torch.float64)
     pixels = p.img_points / 3400 * focal[:, None] + centre[:, None]
@@ -366,22 +362,6 @@ def test_gradcheck_through_the_whole_layer(first, weighted, make_problems, pertu
     if first == "given":
         assert solver(p.world_points, 1000 * pixels, camera(focal, centre), weights, init=init).ok.all()
     assert torch.autograd.gradcheck(run, inputs, eps=1e-6, atol=1e-4, rtol=1e-4)
-
-
-def test_the_whole_layer_trains(make_problems):
-    """A few steps of Adam on the first guess of one batch lower its loss."""
-    p = make_problems(9, 200, dtype=torch.float32)
-    solver = net(9, 2)
-    loss = PoseLoss(saturation=1.0)
-    optimizer = torch.optim.Adam(solver.parameters(), lr=1e-3)
-    losses = []
-    for _ in range(30):
-        terms = loss(solver(*p[:3]), p)
-        optimizer.zero_grad()
-        terms.total.backward()
-        optimizer.step()
-        losses.append(terms.total.item())
-    assert losses[-1] < 0.8 * losses[0]
 
 
 # --- compile, export, autocast, copies --------------------------------------------------------------------------------
@@ -599,17 +579,6 @@ def test_every_solver_of_ours_keeps_the_contract(name, make_problems):
 # --- regressions -----------------------------------------------------------------------------------
 
 
-def test_a_weight_of_zero_has_no_gradient(make_problems, perturb):
-    p = make_problems()
-    weights = torch.ones(7, 9, dtype=torch.float64)
-    weights[:, 3] = 0.0
-    weights.requires_grad_()
-    result = PnPNet(None, RobustWeightedLM(m=3))(*p[:3], weights, init=perturb(p.pose))
-    result.translation.sum().backward()
-    assert (weights.grad[:, 3] == 0).all()
-    assert (weights.grad[result.ok][:, :3] != 0).any()
-
-
 def test_cameras_that_are_no_pinholes_are_refused(make_problems):
     p = make_problems()
     K = p.intrinsics.clone()
@@ -707,7 +676,7 @@ def test_views_keep_the_first_guess_and_a_given_pose(views, make_problems, pertu
 
 
 def test_more_views_solve_more(make_problems):
-    """Also for a network that has learned little: the poses it starts from are simply more."""
+    """Also for an untrained network: refinement starts from more poses."""
     p = make_problems(batch=400)
     rates = [success(pose_errors(untrained(views, m=10)(*p[:3]).pose, p.pose)).double().mean() for views in (1, 2, 8)]
     assert rates[0] + 0.03 < rates[1]
@@ -720,31 +689,6 @@ def test_views_of_a_method_that_mirrors_do_not_change(make_problems):
     assert one.ok.any()
     torch.testing.assert_close(four.pose, one.pose, rtol=1e-6, atol=1e-8)
     torch.testing.assert_close(four.weights, one.weights, rtol=1e-6, atol=1e-8)
-
-
-def test_views_of_one_problem_do_not_touch_another(make_problems):
-    p = make_problems(batch=5, outliers=1)
-    solver = untrained(3)
-    together = solver(*p[:3])
-    for i in range(5):
-        torch.testing.assert_close(solver(*(x[i : i + 1] for x in p[:3])).matrix, together.matrix[i : i + 1])
-    spoilt = p.world_points.clone()
-    spoilt[2, 4] = torch.nan
-    result = solver(spoilt, *p[1:3])
-    others = torch.arange(5) != 2
-    assert not result.ok[2]
-    assert result.matrix.isfinite().all()
-    torch.testing.assert_close(result.matrix[others], together.matrix[others])
-
-
-def test_gradients_with_views_are_finite_and_reach_the_network(make_problems):
-    p = make_problems(batch=5)
-    solver = untrained(3)
-    p.world_points[1] = 0.0
-    result = solver(*p[:3])
-    (result.translation.sum() + result.weights.sum() + result.init.translation.sum()).backward()
-    assert all(x.grad.isfinite().all() for x in solver.parameters())
-    assert all(x.grad.abs().sum() > 0 for x in solver.init.parameters())
 
 
 def test_trained_weights_take_views_and_m(make_problems):
@@ -760,7 +704,7 @@ def test_trained_weights_take_views_and_m(make_problems):
 
 
 def test_known_noise_solves_more(make_problems, perturb):
-    """From near the truth, with wrong pairs: weighing by what each pair is worth passes what residuals alone allow."""
+    """From near the truth, with outliers: weights of known noise beat weights of residuals alone."""
     p = make_problems(batch=1000, outliers=3)
     start = perturb(p.pose)
     refine = RobustWeightedLM(10, kernel="geman_mcclure", robustness=6.0, damping=1e-4)
@@ -781,6 +725,12 @@ def test_known_noise_has_the_units_of_the_inputs(make_problems, perturb):
         *p[:3], init=start, img_sigma=torch.ones(6).double(), world_sigma=torch.full((6,), 0.05).double()
     )
     of_pairs = solver(*p[:3], init=start, img_sigma=torch.ones(6, 9).double(), world_sigma=0.05)
+    sigma = torch.linspace(0.2, 5.0, 54, dtype=torch.float64).view(6, 9)  # stays with its pair in any order
+    ordered, plain = (
+        PnPNet(None, solver.refine, Normalize(order=order))(*p[:3], init=start, img_sigma=sigma)
+        for order in (True, False)
+    )
+    assert_same(ordered, plain, rtol=1e-9, atol=1e-9)
     scaled = solver(
         1000.0 * p.world_points,
         p.img_points / 4.0,
@@ -796,17 +746,6 @@ def test_known_noise_has_the_units_of_the_inputs(make_problems, perturb):
     torch.testing.assert_close(scaled.translation, 1000.0 * number.translation)
     torch.testing.assert_close(scaled.cost, number.cost)
     assert torch.equal(scaled.ok, number.ok)
-
-
-def test_noise_of_pairs_stays_with_them_in_any_order(make_problems):
-    p = make_problems(batch=5, outliers=2)
-    sigma = torch.rand(5, 9, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 5 + 0.2
-    refine = RobustWeightedLM(5, kernel="cauchy", robustness=3.0)
-    results = [
-        PnPNet(None, refine, Normalize(order=order))(*p[:3], init=p.pose, img_sigma=sigma) for order in (False, True)
-    ]
-    torch.testing.assert_close(results[0].matrix, results[1].matrix)
-    torch.testing.assert_close(results[0].weights, results[1].weights)
 
 
 @pytest.mark.parametrize("name", ["img_sigma", "world_sigma"])

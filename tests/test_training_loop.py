@@ -1,6 +1,7 @@
 """The training loop: resuming equals not stopping, bad steps are skipped, two processes equal one."""
 
 import csv
+import math
 import multiprocessing
 import os
 import signal
@@ -12,7 +13,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from kornia.core.exceptions import BaseError
+from strategies import ANY, COUNTS, INF, RANGES, Seen, many, options
 from torch import nn
 
 from kornia_pnpnet import MLPInit, PnPNet, PoseLoss, RobustWeightedLM
@@ -392,3 +396,56 @@ def test_waiting_for_data_is_counted_as_that(tmp_path):
     shares = [fit(folder=tmp_path / name, **parts).time_shares for name, parts in (("quick", quick), ("slow", slow))]
     assert shares[1]["data"] > shares[0]["data"]
     assert shares[1]["data"] == max(shares[1].values())
+
+
+# -- whatever comes in -------------------------------------------------------------------------------------------------
+
+
+def test_trainings_of_any_settings():
+    made = Seen()
+
+    @many(120)
+    @given(
+        options(
+            updates=COUNTS,
+            lr=ANY,
+            lr_refine=ANY,
+            warmup=COUNTS,
+            final_lr=ANY,
+            clip=ANY,
+            ramp=RANGES,
+            max_skipped=COUNTS,
+            log_every=COUNTS,
+            validate_every=COUNTS,
+            checkpoint_every=COUNTS,
+        ),
+        st.integers(0, 12),
+    )
+    def run(chosen, update):
+        settings = made(lambda: TrainSettings(**{"updates": 12, **chosen}))
+        if settings is not None:
+            assert 0 <= settings.lr_factor(update) < INF
+            assert 0 <= settings.ramp_factor(update) <= 1
+            assert 0 <= settings.lr < INF
+
+    run()
+    made.both()
+
+
+def test_trainings_of_any_length(tmp_path):
+    made = Seen()
+    history, checkpoint = tmp_path / "history.csv", tmp_path / "last.ckpt"
+    checkpoint.write_bytes(b"old")
+
+    @many(20)
+    @given(st.sampled_from([0.0, -1.0, math.nan, math.inf, -math.inf, None, "1", True, [1.0]]))
+    def run(seconds):
+        history.write_text("old")
+        made(lambda: train_briefly(seconds, tmp_path, progress=False))
+        assert history.read_text() == "old"
+        assert checkpoint.read_bytes() == b"old"
+
+    run()
+    made(lambda: train_briefly(1e-6, tmp_path, progress=False))
+    assert made.counts["works"] == 1
+    assert history.read_text().startswith("update,")

@@ -15,8 +15,9 @@ from torch import nn
 from kornia_pnpnet import PnPNet, RobustWeightedLM, pose_covariance
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.evaluation import EvaluationData, evaluate
-from kornia_pnpnet.evaluation.choices import evaluation_sets, load_solver
+from kornia_pnpnet.evaluation.named_solvers import load_solver
 from kornia_pnpnet.evaluation.operations import complexity_results
+from kornia_pnpnet.evaluation.problem_sets import evaluation_sets
 from kornia_pnpnet.evaluation.results import format_table, load_results, save_results
 from kornia_pnpnet.metrics import reliability, success_rate
 from kornia_pnpnet.pretrained import WEIGHTS_FOLDER, shipped_weights
@@ -82,7 +83,7 @@ class Counts(NamedTuple):
     real: int
 
     def draw(self, sources: Sequence[str], outliers: str, **changed: Any) -> dict[str, EvaluationData]:
-        """Synthetic sets of the report, 9 pairs unless ``changed`` says otherwise."""
+        """Sets of the seed for the report, 9 pairs unless ``changed`` says otherwise."""
         options: dict[str, Any] = {"dtype": torch.float64, "seed": SEED_REPORT, "n": 9, "count": self.synthetic}
         return evaluation_sets(list(sources), outliers, **{**options, **changed})
 

@@ -303,8 +303,8 @@ def overview(results: Mapping[str, Any]) -> tuple[list[OverviewRow], str]:
     header = ["Solver", "solved, no outliers", "solved, 0–3 outliers of 9", "µs per problem, 0–3 outliers"]
     made, settings = results["environment"], results["settings"]
     source = (
-        f"9 pairs, {settings['count']} synthetic problems for each column, solved in one call (other libraries: one call "
-        f"per problem), one thread, {made['cpu']}. Solved: rotation error below 1° and translation error below 0.2. "
+        f"9 pairs, {settings['count']} synthetic problems for each column, solved in one call (other libraries: one "
+        f"call per problem), one thread, {made['cpu']}. Solved: rotation error below 1°, translation error below 0.2. "
         "All solvers and sets: [benchmarks](benchmarks/solvers.md)."
     )
     return rows, f"{markdown_table(header, lines)}\n\n{source}"

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from kornia_pnpnet import __version__
-from kornia_pnpnet.evaluation.choices import DEFAULT_SEED, PRIORS
+from kornia_pnpnet.evaluation.problem_sets import DEFAULT_SEED, PRIORS
 
 __all__ = ["make_parser"]
 

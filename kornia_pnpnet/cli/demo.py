@@ -10,9 +10,10 @@ import torch
 from torch import nn
 
 from kornia_pnpnet.cli.pairs import rejection_limit, reprojections
-from kornia_pnpnet.evaluation.choices import default_solvers, evaluation_sets, load_solver
 from kornia_pnpnet.evaluation.comparison import EvaluationData, evaluate, format_table, save_results
 from kornia_pnpnet.evaluation.figures import plot_errors, plot_pose, plot_success, plot_training
+from kornia_pnpnet.evaluation.named_solvers import default_solvers, load_solver
+from kornia_pnpnet.evaluation.problem_sets import evaluation_sets
 
 __all__ = ["run_demo"]
 

@@ -15,13 +15,8 @@ from kornia.core.exceptions import BaseError
 from kornia_pnpnet import list_solvers, shipped_weights
 from kornia_pnpnet.cli.arguments import make_parser
 from kornia_pnpnet.cli.pairs import PairsError, camera_matrix, read_pairs, rejection_limit, reprojections
-from kornia_pnpnet.evaluation.choices import (
-    BOUNDS,
-    default_solvers,
-    evaluation_sets,
-    load_solver,
-    missing_package,
-)
+from kornia_pnpnet.evaluation.named_solvers import BOUNDS, default_solvers, load_solver, missing_package
+from kornia_pnpnet.evaluation.problem_sets import evaluation_sets
 
 __all__ = ["main"]
 

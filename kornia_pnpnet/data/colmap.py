@@ -261,7 +261,8 @@ def _colmap_view(image: Any, world_points: Mapping[int, np.ndarray]) -> View:
     intrinsics = camera.calibration_matrix()
 
     plane = camera.cam_from_img(distorted)  # (M, 2), nan where the lens model has no inverse
-    pixels = plane @ intrinsics[:2, :2].T + intrinsics[:2, 2]
+    with np.errstate(invalid="ignore"):  # infinite where a focal length is 0
+        pixels = plane @ intrinsics[:2, :2].T + intrinsics[:2, 2]
     depth = points @ world_to_cam[2, :3] + world_to_cam[2, 3]
     # `~(depth <= 0)`, so that a pose that is not finite reaches the check in View.
     seen = np.isfinite(pixels).all(axis=1) & ~(depth <= 0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import shutil
 import time
 import warnings
@@ -36,7 +37,7 @@ from kornia_pnpnet.data import OutlierMix
 from kornia_pnpnet.metrics import pose_errors, success, success_rate
 from kornia_pnpnet.pretrained import CONFIG_NAME, WEIGHTS_NAME, find_weights
 from kornia_pnpnet.solver import PnPNet
-from kornia_pnpnet.training.checkpoint import HISTORY_NAME
+from kornia_pnpnet.training.checkpoint import HISTORY_NAME, leaves
 from kornia_pnpnet.training.loop import FitReport
 from kornia_pnpnet.types import Problems
 
@@ -381,15 +382,44 @@ def _points(source: Mapping[str, Any]) -> list[str]:
     return [entry["_target_"].rpartition(".")[2] + known for entry in prior.get("priors", [prior])]
 
 
+# Absolute paths, not the slashes of a URL or of a relative path.
+_PATH = re.compile(r"(?:file://|(?<![\w./\\])(?:~|[A-Za-z]:)?)(?:/(?!/)|\\)[^\s,;'\"\]})]*")
+
+
+def _command(results: Mapping[str, Any]) -> str:
+    """The command of a run: weights by the name of their run, and no folder of the machine that ran the command."""
+    words = []
+    for override in results["overrides"]:
+        key, _, value = override.partition("=")
+        if key == "weights" and results.get("origin") and _PATH.fullmatch(value):
+            words.append(f"weights=outputs/{_run_name(results['origin'])}/weights")
+        elif key not in _HOW_IT_RAN:
+            words.append(_PATH.sub("PATH", override))
+    return " ".join(["python train.py", *words])
+
+
+def _run_name(results: Mapping[str, Any]) -> str:
+    return str(results["config"].get("name") or "the run before")
+
+
+def _start(results: Mapping[str, Any]) -> str:
+    """The run whose weights a run began with, and options of the model that differ between both."""
+    origin = results.get("origin")
+    if not origin:
+        return ""
+    before, now = leaves(origin.get("model")), leaves(results.get("model"))
+    changed = [f"{key} {before[key]}, now {now[key]}" for key in now if key in before and before[key] != now[key]]
+    return f", from the weights of `{_run_name(origin)}`" + (f" with changes ({'; '.join(changed)})" if changed else "")
+
+
 def _run_lines(results: Mapping[str, Any]) -> list[str]:
     """How a run was done; before it the one whose weights it began with."""
     run, config, made = results["run"], results["config"], results["environment"]
-    overrides = [entry for entry in results["overrides"] if entry.split("=")[0] not in _HOW_IT_RAN]
     most = "up to " if isinstance(config["data"]["train"].get("n"), list) else ""
     kind = "synthetic " if _is_synthetic(config["data"]["train"]) else ""
     return [
         *(_run_lines(results["origin"]) if results.get("origin") else []),
-        f"- `{' '.join(['python train.py', *overrides])}`:",
+        f"- `{_command(results)}`{_start(results)}:",
         f"  {run['update']} updates of {most}{config['batch_size']} {kind}problems, {run['skipped']} of them skipped;",
         f"  {run['updates_per_second']:.1f} updates per second, peak memory {run['peak_memory_mib']:.0f} MiB,",
         f"  {made['threads']} thread(s) of {made['cpu']};",

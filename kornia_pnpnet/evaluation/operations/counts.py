@@ -10,7 +10,7 @@ from torch import nn
 
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
-from kornia_pnpnet.evaluation.choices import load_solver
+from kornia_pnpnet.evaluation.named_solvers import load_solver
 from kornia_pnpnet.evaluation.operations.costs import OPERATION_COSTS
 from kornia_pnpnet.evaluation.operations.counter import count_per_problem
 from kornia_pnpnet.init import RANSAC, MLPInit
