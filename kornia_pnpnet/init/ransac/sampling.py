@@ -11,7 +11,7 @@ import math
 import torch
 from torch import Tensor
 
-__all__ = ["Samples", "draw_subsets", "good_sample_share", "samples_needed"]
+__all__ = ["Samples", "draw_subsets", "samples_needed"]
 
 
 def draw_subsets(numbers: Tensor, counts: Tensor) -> Tensor:
@@ -105,38 +105,18 @@ class Samples:
         return self._present_first[problems].gather(1, ranks.flatten(1)).view_as(ranks)
 
 
-def good_sample_share(inliers: Tensor, counts: Tensor, size: int) -> Tensor:
-    r"""Share of samples without an outlier, :math:`\binom{k}{s} / \binom{c}{s}`, which is at most :math:`(k/c)^s`.
-
-    Args:
-        inliers: number of inliers :math:`k`, shape :math:`(B,)`.
-        counts: number of pairs :math:`c`, shape :math:`(B,)`.
-        size: number of pairs in a sample.
-
-    Returns:
-        float64 of shape :math:`(B,)`.
-
-    Example:
-        >>> good_sample_share(torch.tensor([6, 2]), torch.tensor([9, 9]), 3)
-        tensor([0.2381, 0.0000], dtype=torch.float64)
-    """
-    share = torch.ones_like(inliers, dtype=torch.float64)
-    for j in range(size):
-        share = share * (inliers - j).clamp(min=0) / (counts - j).clamp(min=1)
-    return share.clamp(max=1.0)
-
-
 def samples_needed(inliers: Tensor, counts: Tensor, size: int, confidence: float) -> Tensor:
     r"""Number of samples of which at least one has no outlier with the confidence :math:`p`.
 
-    The number is :math:`\log(1-p) / \log(1-w)`, with the share :math:`w` of :func:`good_sample_share`.
+    The number is :math:`\log(1-p) / \log(1-w)`, where :math:`w = \binom{k}{s} / \binom{c}{s}` is the share of samples
+    without an outlier.
 
     Source: M. Fischler and R. Bolles, "Random sample consensus", Communications of the ACM 24(6), 1981, section II.B.
 
     Args:
-        inliers: number of inliers of the best pose so far, shape :math:`(B,)`.
-        counts: number of pairs, shape :math:`(B,)`.
-        size: number of pairs in a sample.
+        inliers: number of inliers :math:`k` of the best pose so far, shape :math:`(B,)`.
+        counts: number of pairs :math:`c`, shape :math:`(B,)`.
+        size: number of pairs :math:`s` in a sample.
         confidence: :math:`p`, in (0, 1).
 
     Returns:
@@ -146,4 +126,7 @@ def samples_needed(inliers: Tensor, counts: Tensor, size: int, confidence: float
         >>> samples_needed(torch.tensor([9, 6, 2]), torch.tensor([9, 9, 9]), 3, 0.999)
         tensor([ 0.0000, 25.4023,     inf], dtype=torch.float64)
     """
-    return math.log1p(-confidence) / torch.log1p(-good_sample_share(inliers, counts, size))
+    share = torch.ones_like(inliers, dtype=torch.float64)
+    for j in range(size):
+        share = share * (inliers - j).clamp(min=0) / (counts - j).clamp(min=1)
+    return math.log1p(-confidence) / torch.log1p(-share.clamp(max=1.0))
