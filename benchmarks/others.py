@@ -158,9 +158,7 @@ class PyPose(Contender):
                     summed, zero, create_graph=differentiable, vectorize=True
                 ).transpose(0, 1)  # (B, 2N, 6)
             residual = self._residual(points, pixels, pose)
-            share = (
-                1.0 + residual.square().sum(-1, keepdim=True) / _PYPOSE_DELTA**2
-            ).rsqrt()  # square root of the weight
+            share = (1.0 + residual.square().sum(-1, keepdim=True) / _PYPOSE_DELTA**2).rsqrt()  # root of weight
             scaled = (jacobian.unflatten(1, (-1, 2)) * share[..., None]).flatten(1, 2)
             normal = scaled.mT @ scaled
             damped = normal + _PYPOSE_DAMPING * torch.diag_embed(normal.diagonal(dim1=-2, dim2=-1))

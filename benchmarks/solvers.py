@@ -12,7 +12,7 @@ import json
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from harness import in_turns, load, peak_bytes, ratio, run_child, say, seconds, summary, threads
@@ -59,15 +59,8 @@ MEMORY_SET = "n = 100, 70 outliers"
 MEMORY_SOLVER, MEMORY_TARGET, MEMORY_RUNS = "p3p-ransac", 2 * 2**30, 5
 
 
-class Speedup(NamedTuple):
-    """Target of the time of a peer by the time of a solver of ours, on the small problems."""
-
-    solver: str
-    peer: str
-    target: float
-
-
-SPEEDUPS = (Speedup("epnp", "opencv-epnp", 3.0), Speedup("p3p-ransac", "poselib", 1.0))
+# Targets of the time of a peer by the time of a solver of ours, on the small problems.
+SPEEDUPS = {("epnp", "opencv-epnp"): 3.0, ("p3p-ransac", "poselib"): 1.0}
 
 
 def draw(name: str, count: int, seed: int) -> Problems:
@@ -81,11 +74,6 @@ def draw(name: str, count: int, seed: int) -> Problems:
 def base_name(spec: str) -> str:
     """The name of a solver without its options."""
     return spec.partition(":")[0]
-
-
-def runs_on(spec: str, name: str) -> bool:
-    """Whether a solver solves a set."""
-    return SETS[name][0] == SMALL or base_name(spec) in ROBUST
 
 
 @torch.no_grad()
@@ -109,14 +97,13 @@ def measure_set(
 def speedups(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Every target of speed on every small set on which both sides were measured."""
     found = []
-    for wanted in SPEEDUPS:
+    for (solver, peer), target in SPEEDUPS.items():
         for mine, theirs in itertools.product(rows, rows):
-            names = base_name(mine["solver"]), base_name(theirs["solver"])
-            if names != wanted[:2] or mine["set"] != theirs["set"] or SETS[mine["set"]][0] != SMALL:
-                continue
-            times = ratio(mine, theirs)
-            entry = {"solver": mine["solver"], "peer": theirs["solver"], "set": mine["set"], "ratio": times}
-            found.append({**entry, "target": wanted.target, "met": times >= wanted.target})
+            names = (base_name(mine["solver"]), base_name(theirs["solver"]))
+            if names == (solver, peer) and mine["set"] == theirs["set"] and SETS[mine["set"]][0] == SMALL:
+                times = ratio(mine, theirs)
+                entry = {"solver": mine["solver"], "peer": theirs["solver"], "set": mine["set"], "ratio": times}
+                found.append({**entry, "target": target, "met": times >= target})
     return found
 
 
@@ -134,6 +121,7 @@ def measure_memory(spec: str, count: int, seed: int) -> dict[str, Any]:
 
     Peaks of the same call differ with the memory that the allocator has given back.
     """
+    say(f"memory of {spec}")
     arguments = ("--memory-of", spec, "--memory-count", str(count), "--seed", str(seed))
     runs = [run_child(Path(__file__), *arguments) for _ in range(MEMORY_RUNS)]
     peak = max(run["peak_bytes"] for run in runs)
@@ -171,27 +159,18 @@ def measure(specs: Sequence[str], *, count: int, repeats: int, memory_count: int
         except ImportError as error:
             skipped[spec] = str(error)
             say(f"skipped: {spec}: {error}")
-    memory = []
-    for spec in solvers if memory_count else ():
-        if base_name(spec) == MEMORY_SOLVER:
-            say(f"memory of {spec}")
-            memory.append(measure_memory(spec, memory_count, seed))
+    wanted = [spec for spec in solvers if memory_count and base_name(spec) == MEMORY_SOLVER]
+    memory = [measure_memory(spec, memory_count, seed) for spec in wanted]
     rows = []
     with threads():
         for name in SETS:
             say(name)
-            chosen = {spec: solver for spec, solver in solvers.items() if runs_on(spec, name)}
+            small = SETS[name][0] == SMALL
+            chosen = {spec: solver for spec, solver in solvers.items() if small or base_name(spec) in ROBUST}
             rows += measure_set(chosen, name, count, repeats, seed)
         settings = {"solvers": list(specs), "count": count, "repeats": repeats, "seed": seed, "dtype": "float64"}
-        return {
-            "environment": environment(),
-            "settings": settings,
-            "load_average": [before, load()],
-            "skipped": skipped,
-            "rows": rows,
-            "speedups": speedups(rows),
-            "memory": memory,
-        }
+        made = {"environment": environment(), "settings": settings, "load_average": [before, load()]}
+    return {**made, "skipped": skipped, "rows": rows, "speedups": speedups(rows), "memory": memory}
 
 
 def format_tables(results: Mapping[str, Any]) -> str:
@@ -234,15 +213,11 @@ Written by `benchmarks/solvers.py`, see [README.md](README.md). Median and minim
 def make_parser() -> argparse.ArgumentParser:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "--out", type=Path, help="the results file, ending in .json; the tables are written beside it, ending in .md"
-    )
+    parser.add_argument("--out", type=Path, help="the results file (.json); the tables go beside it (.md)")
     parser.add_argument("--solvers", nargs="+", default=[*OURS, *PEERS], help="names, with options after a colon")
     parser.add_argument("--count", type=int, default=1000, help="number of problems in a batch")
     parser.add_argument("--repeats", type=int, default=7, help="number of rounds")
-    parser.add_argument(
-        "--memory-count", type=int, default=10_000, help="number of problems of the memory measurement; 0: none"
-    )
+    parser.add_argument("--memory-count", type=int, default=10_000, help="problems of the memory measurement; 0: none")
     parser.add_argument("--seed", type=int, default=SEED, help="seed of the problems")
     parser.add_argument("--memory-of", help=argparse.SUPPRESS)  # a process of `measure_memory`
     return parser
