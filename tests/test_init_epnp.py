@@ -302,7 +302,7 @@ def test_fewer_than_three_pairs_in_front_are_not_ok():
 
 @pytest.mark.parametrize(("n", "planar"), [(5, False), (9, True)])
 def test_gradcheck_through_the_solver(n, planar):
-    p = problems(n, 2, planar=planar, seed=2005)
+    p = problems(n, 1, planar=planar, seed=2005)
     net = solver(iterations=8)
     assert net(*p[:3]).ok.all()
 
@@ -313,9 +313,9 @@ def test_gradcheck_through_the_solver(n, planar):
         result = net(world, 1000.0 * pixels, 1000.0 * rows.unflatten(-1, (3, 3)), weights)
         return result.rotation, result.translation
 
-    entries = torch.tensor([3.4, 3.4, 0.1, -0.1], dtype=torch.float64).repeat(2, 1)
+    entries = torch.tensor([3.4, 3.4, 0.1, -0.1], dtype=torch.float64)[None]
     shift = torch.tensor([0.1, -0.1], dtype=torch.float64)
-    weights = 0.5 + torch.rand(2, n, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    weights = 0.5 + torch.rand(1, n, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     inputs = [x.clone().requires_grad_() for x in (p.world_points, p.img_points / 1000.0 + shift, entries, weights)]
     assert torch.autograd.gradcheck(run, inputs, eps=1e-6, atol=1e-5, rtol=1e-4)
 
@@ -341,19 +341,6 @@ def test_a_plane_parallel_to_the_image_has_a_gradient(plane):
     # Pixels that grow together come from a camera that is closer: d(1/z) = dz / z.
     growth = (corr.img_points.grad * corr.img_points.detach()).sum()
     torch.testing.assert_close(growth, torch.tensor(-4.0).double(), rtol=1e-6, atol=0)
-
-
-def test_exact_zeros_of_a_plane_stay_zero_and_keep_the_gradient():
-    corr = parallel_plane(SQUARE)
-    control = control_points(corr)
-    system = depth_system(control, corr.img_points.permute(2, 1, 0))
-    depths = torch.tensor([4.0, 0.0, 0.0, 0.0], dtype=torch.float64)[:, None] / system.unit.detach()
-    torch.testing.assert_close(minimize(system, depths, 0.3, 1), depths)
-    attached = attach_gradient(system, depths, control.planar, 0.3)
-    assert torch.equal(attached, depths)
-    attached[0].backward()
-    growth = (corr.img_points.grad * corr.img_points.detach()).sum()
-    torch.testing.assert_close(growth, -depths[0, 0])
 
 
 def test_an_indefinite_curvature_takes_no_step():
