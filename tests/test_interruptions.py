@@ -20,8 +20,8 @@ from kornia_pnpnet import MLPInit, PnPNet, PoseLoss, RobustWeightedLM, create_so
 from kornia_pnpnet.cli.main import main
 from kornia_pnpnet.cli.shards import MANIFEST, solve_shards
 from kornia_pnpnet.data import SyntheticProblems
+from kornia_pnpnet.training import TrainSettings, fit
 from kornia_pnpnet.training.checkpoint import CHECKPOINT_NAME, HISTORY_NAME, save_checkpoint
-from kornia_pnpnet.training.loop import TrainSettings, fit
 
 KILLS = 20
 # Python 3.12 warns of every fork of a process with threads, which pytest-xdist's are.

@@ -12,7 +12,7 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
 from kornia_pnpnet import PnPNet
-from kornia_pnpnet.training.results import collect_weights
+from kornia_pnpnet.training.collect import collect_weights
 
 REPO = Path(__file__).resolve().parents[1]
 DATA = sorted(path.stem for path in (REPO / "conf" / "data").glob("*.yaml"))

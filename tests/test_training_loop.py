@@ -21,8 +21,8 @@ from torch import nn
 
 from kornia_pnpnet import MLPInit, PnPNet, PoseLoss, RobustWeightedLM
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet.training import TrainSettings, fit, train_briefly
 from kornia_pnpnet.training.checkpoint import CHECKPOINT_NAME, HISTORY_NAME, TrainingError, save_checkpoint
-from kornia_pnpnet.training.loop import TrainSettings, fit, train_briefly
 
 REPO = Path(__file__).resolve().parents[1]
 SHARES = [f"{stage}_share" for stage in ("data", "forward", "backward", "optimizer", "rest")]
@@ -247,7 +247,7 @@ import sys, torch
 sys.path.insert(0, {tests!r})
 from lightning_fabric import Fabric
 from test_training_loop import make_parts
-from kornia_pnpnet.training.loop import fit
+from kornia_pnpnet.training import fit
 torch.set_num_threads(1)
 fabric = Fabric(accelerator="cpu", devices={devices}, strategy={strategy!r})
 fabric.launch()

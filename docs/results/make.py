@@ -32,6 +32,7 @@ from torch import nn
 
 from kornia_pnpnet import PnPNet, RobustWeightedLM, pose_covariance
 from kornia_pnpnet.core.environment import environment
+from kornia_pnpnet.core.files import write_json
 from kornia_pnpnet.evaluation import EvaluationData, evaluate
 from kornia_pnpnet.evaluation.figures import paper_figures, plot_reliability, plot_sweep, plot_training
 from kornia_pnpnet.evaluation.figures.sweep import mix_in_words
@@ -41,7 +42,8 @@ from kornia_pnpnet.evaluation.problem_sets import evaluation_sets
 from kornia_pnpnet.evaluation.results import format_table, load_results, save_results
 from kornia_pnpnet.metrics import SuccessRate, reliability, success_rate
 from kornia_pnpnet.pretrained import WEIGHTS_FOLDER, shipped_weights
-from kornia_pnpnet.training.results import RESULTS_NAME, collect_weights, write_json
+from kornia_pnpnet.training.collect import collect_weights
+from kornia_pnpnet.training.results import load_run
 from kornia_pnpnet.types import PnPResult, Problems
 
 HERE = Path(__file__).resolve().parent
@@ -865,8 +867,8 @@ def compare(scenes: Path, count: int, runs: Sequence[Path]) -> None:
 
 def ship(runs: Sequence[Path]) -> None:
     """Put the weights of the last run into the package, with the curves of all."""
-    results = json.loads((runs[-1] / RESULTS_NAME).read_text())
-    kind = "set" if results["model"]["init"]["name"] == "SetInit" else f"n{results['config']['model']['n']}"
+    results = load_run(runs[-1] / "results.json")
+    kind = "set" if results.initializer == "SetInit" else f"n{results.config['model']['n']}"
     collect_weights(runs, WEIGHTS_FOLDER / f"pnpnet-{kind}")
 
 
