@@ -15,13 +15,13 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from kornia.core.exceptions import ValueCheckError
+from kornia_pnpnet.cli.main import main
 
 from kornia_pnpnet import MLPInit, PnPNet, PoseLoss, RobustWeightedLM, create_solver
-from kornia_pnpnet.cli import main
 from kornia_pnpnet.cli.shards import MANIFEST, solve_shards
 from kornia_pnpnet.data import SyntheticProblems
+from kornia_pnpnet.training import TrainSettings, fit
 from kornia_pnpnet.training.checkpoint import CHECKPOINT_NAME, HISTORY_NAME, save_checkpoint
-from kornia_pnpnet.training.loop import TrainSettings, fit
 
 KILLS = 20
 # Python 3.12 warns of every fork of a process with threads, which pytest-xdist's are.
@@ -32,7 +32,7 @@ pytestmark = [
 
 
 class Then(PoseLoss):
-    """Has something happen at the given update."""
+    """Calls a function at an update."""
 
     def __init__(self, update=-1, what=None):
         super().__init__()
@@ -71,7 +71,7 @@ def in_a_process(function, *arguments):
 
 @pytest.mark.slow
 def test_kill_9_at_any_moment_loses_nothing(tmp_path):
-    """However often it is killed, what is trained in the end is what is trained without."""
+    """After any number of kills the weights and curves are those of a run without kills."""
     updates = 400
     train(tmp_path / "whole", updates)
     weights, history = state(tmp_path / "whole")
@@ -98,7 +98,7 @@ def test_kill_9_at_any_moment_loses_nothing(tmp_path):
 
 
 def _with_a_full_disk(folder):
-    """Train where from some update on no file can have more than so many bytes; the exit code says how it ended."""
+    """Train with files limited to 10 kB from update 23 on. Exit code 3: a file could not be written."""
 
     def full():
         shutil.copy(folder / CHECKPOINT_NAME, folder / "before")
@@ -170,7 +170,7 @@ def _solve_batch(source, out):
 
 @pytest.mark.slow
 def test_kill_9_at_any_moment_loses_no_results(tmp_path):
-    """However often it is killed, the results are those of a call that is not, and none is made twice."""
+    """After any number of kills the results are those of a call without kills, and no result is made twice."""
     import numpy as np
 
     pyarrow = pytest.importorskip("pyarrow")
@@ -230,7 +230,7 @@ def weights_folder(tmp_path_factory):
 @settings(max_examples=300, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(st.data())
 def test_damaged_weights_load_nothing(weights_folder, tmp_path_factory, data):
-    """Any byte changed, any end cut off: one clear error, or it was nothing that matters."""
+    """A changed byte or a cut end gives an error, or changes neither the configuration nor the weights."""
     folder = tmp_path_factory.mktemp("damaged", numbered=True)
     try:
         for path in weights_folder.iterdir():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
@@ -14,6 +13,7 @@ from torch import nn
 
 from kornia_pnpnet import PnPNet, RobustWeightedLM, pose_covariance
 from kornia_pnpnet.core.environment import environment
+from kornia_pnpnet.core.files import write_json
 from kornia_pnpnet.evaluation import EvaluationData, evaluate
 from kornia_pnpnet.evaluation.named_solvers import load_solver
 from kornia_pnpnet.evaluation.operations import complexity_results
@@ -21,7 +21,8 @@ from kornia_pnpnet.evaluation.problem_sets import evaluation_sets
 from kornia_pnpnet.evaluation.results import format_table, load_results, save_results
 from kornia_pnpnet.metrics import reliability, success_rate
 from kornia_pnpnet.pretrained import WEIGHTS_FOLDER, shipped_weights
-from kornia_pnpnet.training.results import RESULTS_NAME, collect_weights, write_json
+from kornia_pnpnet.training.collect import collect_weights
+from kornia_pnpnet.training.results import load_run
 from kornia_pnpnet.types import PnPResult, Problems
 
 __all__ = ["ANY", "CHI_SQUARE_95", "HERE", "OURS", "PEERS", "RESULTS", "ROBUST", "compare", "measure", "ship"]
@@ -360,13 +361,13 @@ def measure(scenes: Path, synthetic_count: int, real_count: int, only: Sequence[
 def compare(scenes: Path, count: int, runs: Sequence[Path]) -> None:
     """Solve the scenes with two runs of ``train.py`` on different data, named by their folders."""
     solvers = {f"data={folder.name}": PnPNet.from_pretrained(folder / "weights") for folder in runs}
-    files = {name: json.loads((folder / RESULTS_NAME).read_text()) for name, folder in zip(solvers, runs, strict=True)}
-    updates = {name: file["run"]["update"] for name, file in files.items()}
+    folders = dict(zip(solvers, runs, strict=True))
+    updates = {name: load_run(folder / "results.json").run.update for name, folder in folders.items()}
     run("distribution", solvers, Counts(scenes, 0, count).draw_scenes("none,2"), updates=updates)
 
 
 def ship(runs: Sequence[Path]) -> None:
     """Put the weights of the last run into the package, with the learning curves of all runs."""
-    results = json.loads((runs[-1] / RESULTS_NAME).read_text())
-    kind = "set" if results["model"]["init"]["name"] == "SetInit" else f"n{results['config']['model']['n']}"
+    results = load_run(runs[-1] / "results.json")
+    kind = "set" if results.initializer == "SetInit" else f"n{results.config['model']['n']}"
     collect_weights(runs, WEIGHTS_FOLDER / f"pnpnet-{kind}")
