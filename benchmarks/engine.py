@@ -74,7 +74,7 @@ def refinement_operations(m: int) -> Operations:
     """Operations of the refinement alone, with ``m`` iterations, for one problem."""
     refine = RobustWeightedLM(m)
     inputs = {batch: normalized(draw(N, batch), "cpu")[:2] for batch in (2, 4)}
-    return count_per_problem(lambda batch: refine(*inputs[batch]), batch=2)
+    return count_per_problem(lambda batch: refine(*inputs[batch]))
 
 
 @torch.no_grad()

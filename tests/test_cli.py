@@ -17,17 +17,17 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
+from kornia_pnpnet.cli.pairs import rejection_limit, reprojections
 from strategies import BOOL, WORDS, damage, many, places_in, run_main, spoiled
 from torch import nn
 
 import kornia_pnpnet.solver
 from kornia_pnpnet import MLPInit, PnPNet, RobustWeightedLM, create_solver, list_solvers
-from kornia_pnpnet.cli.main import main
-from kornia_pnpnet.cli.pairs import rejection_limit, reprojections
+from kornia_pnpnet.cli import main
 from kornia_pnpnet.data import SyntheticProblems
-from kornia_pnpnet.evaluation.comparison import load_results, save_results
 from kornia_pnpnet.evaluation.named_solvers import BOUNDS, default_solvers
 from kornia_pnpnet.evaluation.operations import complexity_results
+from kornia_pnpnet.evaluation.results import load_results, save_results
 from kornia_pnpnet.types import Pose
 
 CAMERA = "800,810,320,240"
@@ -643,7 +643,7 @@ def test_version(capsys):
 
 
 def test_the_command_as_a_process(csv_file):
-    code = "import sys; from kornia_pnpnet.cli.main import main; sys.exit(main())"
+    code = "import sys; from kornia_pnpnet.cli import main; sys.exit(main())"
     arguments = ["solve", str(csv_file), "--intrinsics", CAMERA, "--solver", "identity-lm"]
     command = [sys.executable, "-W", "error", "-c", code, *arguments]
     solved = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)

@@ -8,10 +8,10 @@ import sys
 import numpy as np
 import pytest
 import torch
+from kornia_pnpnet.cli.pairs import PairsError
 
 from kornia_pnpnet import create_solver
-from kornia_pnpnet.cli.main import main
-from kornia_pnpnet.cli.pairs import PairsError
+from kornia_pnpnet.cli import main
 from kornia_pnpnet.cli.shards import MANIFEST, solve_shards
 
 NAMES = ("world_points", "img_points", "intrinsics")
@@ -215,7 +215,7 @@ def test_the_command(shards, tmp_path, capsys):
 PEAK = r"""
 import re, sys
 from pathlib import Path
-from kornia_pnpnet.cli.main import main
+from kornia_pnpnet.cli import main
 code = main()
 print(re.search(r"VmHWM:\s+(\d+)", Path("/proc/self/status").read_text())[1])
 sys.exit(code)

@@ -14,9 +14,9 @@ from kornia.core.exceptions import BaseError
 from strategies import damage, finite, many, names_the_file
 from torch.testing import assert_close
 
-from kornia_pnpnet.data.colmap import Scene, View, load_colmap, load_matches, load_scene
+from kornia_pnpnet.data.colmap import load_colmap, load_matches, load_scene
 from kornia_pnpnet.data.outliers import OutlierMix
-from kornia_pnpnet.data.scenes import SceneProblems, _choose
+from kornia_pnpnet.data.scenes import Scene, SceneProblems, View, _choose
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason=f"needs the real data in {SHARED}")

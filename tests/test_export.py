@@ -12,7 +12,7 @@ from kornia.core.exceptions import ValueCheckError
 from strategies import Seen, batches, many, same
 
 from kornia_pnpnet import MLPInit, PnPNet, RobustWeightedLM, create_solver
-from kornia_pnpnet.cli.main import main
+from kornia_pnpnet.cli import main
 from kornia_pnpnet.export import INPUTS, OUTPUTS, export_onnx, export_program
 
 

@@ -261,7 +261,7 @@ def test_the_module_reads_normalised_correspondences():
     assert_same_solutions(solver.hypotheses(corr), p3p(world_points, plane_points))
     assert solver.sample_size == 3
     assert P3P(**solver.config).config == solver.config
-    with pytest.raises(ShapeError, match="3 pairs, got N = 4"):
+    with pytest.raises(ShapeError):
         solver.hypotheses(Correspondences(torch.zeros(2, 4, 3), torch.zeros(2, 4, 2), torch.ones(2, 4), focal))
 
 

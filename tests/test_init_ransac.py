@@ -15,8 +15,8 @@ from kornia_pnpnet import Correspondences, Guess, PnPNet, Pose, RobustWeightedLM
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.geometry import transform
 from kornia_pnpnet.init.epnp.epnp import EPnP
+from kornia_pnpnet.init.ransac import RANSAC, SubsetSolver
 from kornia_pnpnet.init.ransac.p3p import P3P
-from kornia_pnpnet.init.ransac.ransac import RANSAC, SubsetSolver
 from kornia_pnpnet.init.ransac.scoring import Scene
 from kornia_pnpnet.init.ransac.search import Search
 
