@@ -1,4 +1,4 @@
-"""What numbers were made with and on, for the files that hold them."""
+"""Versions and machine, for files that hold measured numbers."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ import torch
 
 __all__ = ["environment"]
 
-# Distributions that bring OpenCV, the usual one first.
+# Distributions that contain OpenCV, the most common first.
 _OPENCV = tuple(f"opencv-{kind}" for kind in ("python-headless", "python", "contrib-python-headless", "contrib-python"))
 
 
 def environment() -> dict[str, Any]:
-    """What the numbers were made with and on.
+    """Describe the versions and the machine that numbers are measured with.
 
     Returns:
-        ``versions`` of the packages (``None`` when not installed), ``python``, ``platform``, ``cpu``, ``threads`` of
-        PyTorch, ``gpu``, ``commit`` of the checkout the package runs from (ending in ``+`` when files differ from
-        it, ``None`` outside a checkout) and the ``date`` in UTC.
+        ``versions`` of the packages (``None``: not installed), ``python``, ``platform``, ``cpu``, ``threads`` of PyTorch,
+        ``gpu``, ``commit`` of the checkout that the package runs from (``+`` at the end: with changed files; ``None``:
+        outside a checkout) and the ``date`` in UTC.
     """
     names = ("kornia_pnpnet", "torch", "kornia", "numpy")
     versions = {name: _version(name) for name in names}
@@ -58,7 +58,7 @@ def _cpu_name() -> str:
 
 
 def _commit() -> str | None:
-    """The commit of the checkout that holds this file; not of a checkout that merely has it installed below it."""
+    """The commit of the checkout that this file belongs to; a checkout with an installed copy below it does not count."""
     root = Path(__file__).resolve().parents[2]
 
     def git(*arguments: str) -> str:

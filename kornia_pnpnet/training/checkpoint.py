@@ -1,4 +1,4 @@
-"""What lets a training run be stopped at any moment, continued and followed: signals, checkpoints, curves, times."""
+"""Parts of a run that can be stopped, continued and watched: signals, checkpoints, learning curves, times."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ CHECKPOINT_NAME, HISTORY_NAME = "last.ckpt", "history.csv"
 
 
 class TrainingError(RuntimeError):
-    """The training cannot go on, or cannot be continued as asked; the message says why and what to do."""
+    """The training cannot go on or cannot be continued. The message names the reason and a remedy."""
 
 
 @contextmanager
@@ -61,12 +61,12 @@ def stop_on_signal() -> Iterator[threading.Event]:
 
 
 class StageClock:
-    """Wall-clock time of a loop by stage. Nothing is lost between stages: their times add up to that of the loop.
+    """Wall-clock time of the stages of a loop. The times of all stages add up to the time of the loop.
 
-    Work that a GPU does later counts where the loop waits for it.
+    The work of a GPU counts in the stage that waits for the result.
 
     Args:
-        stages: their names.
+        stages: names of the stages.
 
     Attributes:
         seconds: time of each stage so far.
@@ -84,20 +84,20 @@ class StageClock:
         self._last = time.perf_counter()
 
     def lap(self, stage: str) -> None:
-        """Count the time since the last lap as that of a stage."""
+        """Add the time since the last lap to a stage."""
         now = time.perf_counter()
         self.seconds[stage] += now - self._last
         self._last = now
 
     def shares(self, before: Mapping[str, float] | None = None) -> dict[str, float]:
-        """Share of each stage of the time since ``before``, an earlier copy of ``seconds``; of all when ``None``."""
+        """Share of each stage in the time since ``before``, an earlier copy of ``seconds``; in all time when ``None``."""
         spent = {stage: seconds - (before or {}).get(stage, 0.0) for stage, seconds in self.seconds.items()}
         whole = sum(spent.values())
         return {stage: seconds / whole if whole > 0.0 else 0.0 for stage, seconds in spent.items()}
 
 
 def _whole(row: dict[str, str | None]) -> bool:
-    """Whether a row was written to its end, which a full disk or a crash prevents."""
+    """Whether a row is complete. A full disk or a crash can cut the last row."""
     return None not in row.values() and (row["update"] or "").isdigit()
 
 
@@ -105,9 +105,9 @@ class History:
     """Learning curves in one CSV file and TensorBoard.
 
     Args:
-        folder: where they go.
-        columns: of the CSV file; a row may leave some empty.
-        start: rows of a former call that are later than this update are dropped.
+        folder: folder of the files.
+        columns: columns of the CSV file; cells of a row may stay empty.
+        start: the update to continue from. Rows of later updates are dropped.
     """
 
     def __init__(self, folder: Path, columns: list[str], start: int) -> None:
@@ -124,7 +124,7 @@ class History:
         self._board = SummaryWriter(folder / "tensorboard", purge_step=start or None)
 
     def write(self, row: dict[str, float]) -> None:
-        """Append a row, which must have ``update``."""
+        """Append a row. The key ``update`` is required."""
         with self._path.open("a", newline="") as file:
             csv.DictWriter(file, self._columns, restval="").writerow(
                 {key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()}
@@ -139,7 +139,7 @@ class History:
 
 
 def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
-    """Write a checkpoint in one piece: a run killed at any moment leaves the old one or the new one."""
+    """Write a checkpoint in one piece: a run that is killed leaves the old checkpoint or the new one."""
     with atomic_open(path, "wb") as file:
         torch.save(state, file)
 
@@ -148,14 +148,14 @@ def load_checkpoint(path: Path, identity: dict[str, Any]) -> dict[str, Any]:
     """Read a checkpoint.
 
     Args:
-        path: what :func:`save_checkpoint` wrote. Only tensors and plain data are read; nothing is unpickled.
-        identity: settings that must be those of the checkpoint's run.
+        path: file of :func:`save_checkpoint`. Only tensors and plain data are read; nothing is unpickled.
+        identity: plain data that must equal the identity in the checkpoint.
 
     Returns:
         The state.
 
     Raises:
-        TrainingError: when the file is damaged or of another run.
+        TrainingError: when the file is damaged or belongs to another run.
     """
     try:
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
