@@ -19,14 +19,18 @@ from kornia_pnpnet.refine import RobustWeightedLM
 from kornia_pnpnet.solver import PnPNet
 from kornia_pnpnet.types import PnPResult, Problems
 
-__all__ = ["KnownInliers", "KnownInliersAndNoise"]
+__all__ = ["Bound", "KnownInliers", "KnownInliersAndNoise"]
 
 # From the true pose 3 iterations reach the minimum to 7 digits of the cost, 10 to the last digit of float64.
 _ITERATIONS = 10
 
 
-class _Bound(Configured):
-    """Weighted least squares of the reprojection errors, started from the true pose."""
+class Bound(Configured):
+    """Weighted least squares of the reprojection errors, started from the true pose; the base of all bounds.
+
+    Args:
+        arguments: ``locals()`` of the constructor of the subclass.
+    """
 
     def __init__(self, arguments: Mapping[str, Any]) -> None:
         super().__init__(arguments)
@@ -54,7 +58,7 @@ class _Bound(Configured):
         )
 
 
-class KnownInliers(_Bound):
+class KnownInliers(Bound):
     r"""Least squares of the reprojection errors of the true inliers, started from the true pose.
 
     This is the best result of a method that finds all inliers and then minimises the reprojection error. Source: the
@@ -76,7 +80,7 @@ class KnownInliers(_Bound):
         return problems.inliers.to(problems.world_points.dtype)
 
 
-class KnownInliersAndNoise(_Bound):
+class KnownInliersAndNoise(Bound):
     r"""Least squares as in :class:`KnownInliers`, with each inlier weighted by the inverse variance of its pixel.
 
     The noise of a world point moves the pixels of near points more than those of far points. With :math:`J_x` the

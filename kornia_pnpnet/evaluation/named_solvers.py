@@ -60,11 +60,11 @@ def load_solver(spec: str) -> nn.Module:
     """Build a solver or a bound from its name.
 
     Args:
-        spec: a name of :func:`~kornia_pnpnet.list_solvers` or of :data:`BOUNDS`, with options after a colon
+        spec: a name of :func:`~kornia_pnpnet.registry.list_solvers` or of :data:`BOUNDS`, with options after a colon
             (``"opencv-ransac:threshold=12,refine=false"``), or a folder of weights.
 
     Returns:
-        The solver in evaluation mode. A bound is a :class:`~kornia_pnpnet.evaluation.comparison.SeesTruth`.
+        The solver in evaluation mode. A bound is a :class:`~kornia_pnpnet.evaluation.SeesTruth`.
 
     Raises:
         BaseError: for an unknown name or option.
