@@ -44,8 +44,8 @@ def fiducial_board(results: dict[str, Any]) -> str:
         ]
         lines.append([share.replace("%", " %"), *cells])
     share = f"Share of the {results['frames']} frames with the camera within 10 mm"
-    table = markdown_table(["Corners mislabelled", *(f"`{name}`" for name in runs)], lines)
-    return f"{share}, and median errors of the poses found:\n\n{table}"
+    header = ["Corners mislabelled", *(f"`{name}`" for name in runs)]
+    return f"{share}, and median errors of the poses found:\n\n{markdown_table(header, lines)}"
 
 
 def page(text: str) -> str:

@@ -1,6 +1,6 @@
-"""Pictures of results, the only part that needs matplotlib. They are drawn without pyplot: nothing global changes.
+"""Pictures of results. Only this folder needs matplotlib, and not pyplot, so no global state changes.
 
-``paper_figures`` draws the protocol's figures from results files. The functions behind it and the others each draw one.
+``paper_figures`` draws all figures of the paper's protocol from results files. Every other function draws one picture.
 """
 
 try:

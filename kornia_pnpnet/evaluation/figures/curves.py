@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from kornia_pnpnet.evaluation.figures import style
@@ -28,24 +29,25 @@ from kornia_pnpnet.metrics import SuccessRate
 
 __all__ = ["plot_against_m", "plot_against_n", "plot_mismatches"]
 
-_FEWEST_MISMATCHES = 3  # different numbers of mismatches that make a curve
+_FEWEST_MISMATCHES = 3  # numbers of mismatches of a curve
 
 
 def plot_mismatches(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Path:
     """Draw success on scenes against the number of mismatches: figure 5 of the protocol.
 
+    The scenes with the most numbers of mismatches are pooled, at n = 9 or the smallest n of the results. A solver that
+    solved all these scenes at three numbers or more has a curve. Without sets of mismatches only, the outliers of the
+    protocol are drawn.
+
     Args:
-        path: where the picture goes; the ending gives the format.
-        results: what :func:`~kornia_pnpnet.evaluation.evaluate` returned, any number of times. Taken together are the
-            scenes that have all numbers of mismatches that any scene has, at n = 9 or the smallest n there is; a
-            solver that was given all of them at three numbers or more has a curve. Without mismatches alone, the
-            protocol's mix is drawn.
+        path: the picture to write; the ending gives the format.
+        results: results files of :func:`~kornia_pnpnet.evaluation.evaluate`.
 
     Returns:
         The path.
 
     Raises:
-        ValueError: when there are no scenes with three numbers of mismatches or more.
+        ValueError: when no scene has three numbers of mismatches.
     """
     everything = records(results)
     here = [r for r in everything if r.scene and not r.swept and isinstance(r.outliers, int)]
@@ -81,10 +83,11 @@ def plot_mismatches(path: str | Path, results: Sequence[Mapping[str, Any]]) -> P
 def plot_against_n(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Path:
     """Draw success on the protocol's data against the number of pairs, a panel for each outlier setting.
 
+    Solvers for one n each, such as ``pnpnet-n9`` and ``pnpnet-n20``, make one curve. Other solvers need two n.
+
     Args:
-        path: where the picture goes; the ending gives the format.
-        results: what :func:`~kornia_pnpnet.evaluation.evaluate` returned, any number of times. Solvers for one n
-            each, such as ``pnpnet-n9`` and ``pnpnet-n20``, make one curve. Others need two numbers of pairs.
+        path: See :func:`plot_mismatches`.
+        results: See :func:`plot_mismatches`.
 
     Returns:
         The path.
@@ -113,14 +116,11 @@ def plot_against_n(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Pa
         axes.set(xscale="log", xlabel="pairs n")
         axes.set_title(outliers_in_words(setting), fontsize=SMALL, loc="left")
     style.head(figure, f"Success on {style.SOURCES['paper']} against the number of pairs", in_words(here))
-    drawn = {curve.name for curves in panels.values() for curve in curves}
-    list_curves(figure, {name: look for name, look in looks.items() if name in drawn})
-    few_ticks(figure, {axes: {int(x) for curve in curves for x in curve.x} for axes, curves in panels.items()})
-    return style.save(figure, path)
+    return _finish(figure, panels, looks, path)
 
 
 def _names_over_n(chosen: Iterable[Record]) -> dict[tuple[str, int], str]:
-    """What the curve of a solver at some n is called: solvers that differ only in the n they are for share one."""
+    """The name of the curve of a solver at some n: solvers that differ only in the n of their names share a curve."""
     families: dict[str, set[tuple[str, int]]] = {}
     for record in chosen:
         family = re.sub(rf"-n{record.n}\b", "-n*", record.solver)
@@ -135,17 +135,18 @@ def _names_over_n(chosen: Iterable[Record]) -> dict[tuple[str, int], str]:
 def plot_against_m(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Path:
     """Draw success on the protocol's data, and time, against the iterations of the refinement.
 
+    Solvers that differ only in the option m, such as ``epnp-lm`` and ``epnp-lm:m=3``, make one curve; m is read from
+    their configurations. n is 9 or the smallest n of the results. The time is of the last outlier setting.
+
     Args:
-        path: where the picture goes; the ending gives the format.
-        results: what :func:`~kornia_pnpnet.evaluation.evaluate` returned, any number of times. Solvers that are the
-            same but for the option m, such as ``epnp-lm`` and ``epnp-lm:m=3``, make one curve; each has the m of its
-            configuration. n = 9 or the smallest n there is. The time is that of the last outlier setting drawn.
+        path: See :func:`plot_mismatches`.
+        results: See :func:`plot_mismatches`.
 
     Returns:
         The path.
 
     Raises:
-        ValueError: when there is no solver with two m.
+        ValueError: when no solver has two m.
     """
     everything = records(results)
     here = [r for r in everything if r.source == "paper" and not r.mismatches and r.m is not None]
@@ -178,6 +179,13 @@ def plot_against_m(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Pa
     for axes in grid:
         axes.set(xlabel="iterations m")
     style.head(figure, f"Success on {style.SOURCES['paper']} against m, n = {n}", in_words(here))
+    return _finish(figure, panels, looks, path)
+
+
+def _finish(
+    figure: Figure, panels: Mapping[Axes, Sequence[Curve]], looks: Mapping[str, SolverStyle], path: str | Path
+) -> Path:
+    """List the curves below the panels, tick their places, and write the picture."""
     drawn = {curve.name for curves in panels.values() for curve in curves}
     list_curves(figure, {name: look for name, look in looks.items() if name in drawn})
     few_ticks(figure, {axes: {int(x) for curve in curves for x in curve.x} for axes, curves in panels.items()})

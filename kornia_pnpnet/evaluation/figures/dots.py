@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from kornia_pnpnet.evaluation.figures import style
 from kornia_pnpnet.evaluation.figures.records import (
     NothingToDrawError,
-    by_solver,
+    Record,
     in_words,
     limits_in_words,
     outliers_in_words,
@@ -27,13 +27,13 @@ from kornia_pnpnet.metrics import SuccessRate
 __all__ = ["plot_scenes", "plot_success", "plot_synthetic"]
 
 _ROW = 0.152  # inches from one solver to the next: a line of small letters
-_SPOILT = 2  # of the pairs on scenes, as in the paper
-_NUMBERS = 11  # letters that fit into the place of a panel's numbers
+_SCENE_OUTLIERS = 2  # as in the paper
+_NUMBERS = 11  # letters of the space for the numbers of a panel
 _PANELS_PER_LINE, _SCENES_PER_LINE = 3, 5
 
 
 class _Panel(NamedTuple):
-    """One set of problems: success by solver, and whether there is room for the numbers."""
+    """One set of problems: success by solver, and whether numbers stand beside the dots."""
 
     title: str
     rates: Mapping[str, SuccessRate]
@@ -41,7 +41,7 @@ class _Panel(NamedTuple):
 
 
 class _Line(NamedTuple):
-    """Panels side by side, and what they have in common."""
+    """Panels side by side, and their common title."""
 
     panels: Sequence[_Panel]
     title: str = ""
@@ -51,8 +51,8 @@ def plot_success(path: str | Path, results: Mapping[str, Any]) -> Path:
     """Draw the success rates of all solvers on all data sets, with their 95 % intervals.
 
     Args:
-        path: where the picture goes; the ending gives the format.
-        results: what :func:`~kornia_pnpnet.evaluation.evaluate` returned.
+        path: the picture to write; the ending gives the format.
+        results: a results file of :func:`~kornia_pnpnet.evaluation.evaluate`.
 
     Returns:
         The path.
@@ -78,17 +78,18 @@ def plot_success(path: str | Path, results: Mapping[str, Any]) -> Path:
 def plot_synthetic(path: str | Path, results: Sequence[Mapping[str, Any]], source: str = "paper") -> Path:
     """Draw success on synthetic data without and with outliers: figures 2 and 3 of the protocol.
 
+    The panels are no outliers, 0 to a third of the pairs, and a third, at n = 9 or the smallest n of the results.
+
     Args:
-        path: where the picture goes; the ending gives the format.
-        results: what :func:`~kornia_pnpnet.evaluation.evaluate` returned, any number of times. Drawn are no outliers,
-            as many as a uniform number up to a third, and exactly a third, at n = 9 or the smallest n there is.
+        path: See :func:`plot_success`.
+        results: results files of :func:`~kornia_pnpnet.evaluation.evaluate`.
         source: ``paper`` or ``gaussian_pose``.
 
     Returns:
         The path.
 
     Raises:
-        ValueError: when the results hold nothing of it.
+        ValueError: when the results have no such problems.
     """
     everything = records(results)
     here = [record for record in everything if record.source == source and not (record.swept or record.mismatches)]
@@ -96,11 +97,8 @@ def plot_synthetic(path: str | Path, results: Sequence[Mapping[str, Any]], sourc
         raise NothingToDrawError(f"The results hold no success on '{source}'.")
     n = usual_n(here)
     here = [record for record in here if record.n == n and record.outliers in (0, "uniform", n // 3)]
-    panels = []
-    for setting in (0, "uniform", n // 3):
-        chosen = [record for record in here if record.outliers == setting]
-        if chosen:
-            panels.append(_Panel(outliers_in_words(setting, n), by_solver(chosen)))
+    rates = {setting: _by_solver(r for r in here if r.outliers == setting) for setting in (0, "uniform", n // 3)}
+    panels = [_Panel(outliers_in_words(setting, n), by_solver) for setting, by_solver in rates.items() if by_solver]
     if not panels:
         raise NothingToDrawError(f"The results hold no success on '{source}' with none, uniform or {n // 3} outliers.")
     heading = (f"Success on {style.SOURCES.get(source, source)}, n = {n}", in_words(here))
@@ -108,30 +106,32 @@ def plot_synthetic(path: str | Path, results: Sequence[Mapping[str, Any]], sourc
 
 
 def plot_scenes(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Path:
-    """Draw success on scenes without and with outliers, over all scenes and for each: figure 4 of the protocol.
+    """Draw success on scenes, over all scenes and for each: figure 4 of the protocol.
+
+    The panels are without outliers and with two, at n = 9 or the smallest n of the results. A solver has a dot over all
+    scenes when it solved all of them.
 
     Args:
-        path: where the picture goes; the ending gives the format.
-        results: what :func:`~kornia_pnpnet.evaluation.evaluate` returned, any number of times. Drawn are no and two
-            outliers, at n = 9 or the smallest n there is. Over all scenes a solver has a dot when it was given all.
+        path: See :func:`plot_success`.
+        results: See :func:`plot_synthetic`.
 
     Returns:
         The path.
 
     Raises:
-        ValueError: when the results hold no such scenes.
+        ValueError: when the results have no such scenes.
     """
     everything = records(results)
-    here = [r for r in everything if r.scene and not (r.swept or r.mismatches) and r.outliers in (0, _SPOILT)]
+    here = [r for r in everything if r.scene and not (r.swept or r.mismatches) and r.outliers in (0, _SCENE_OUTLIERS)]
     if not here:
-        raise NothingToDrawError(f"The results hold no success on scenes with 0 or {_SPOILT} outliers.")
+        raise NothingToDrawError(f"The results hold no success on scenes with 0 or {_SCENE_OUTLIERS} outliers.")
     n = usual_n(here)
     here = [record for record in here if record.n == n]
     lines = []
-    for setting in (0, _SPOILT):
+    for setting in (0, _SCENE_OUTLIERS):
         chosen = [record for record in here if record.outliers == setting]
         scenes = list(dict.fromkeys(record.source for record in chosen))
-        panels = [_Panel(name, by_solver(r for r in chosen if r.source == name), len(scenes) <= 2) for name in scenes]
+        panels = [_Panel(name, _by_solver(r for r in chosen if r.source == name), len(scenes) <= 2) for name in scenes]
         if len(scenes) > 1:
             panels.insert(0, _Panel(f"all {len(scenes)} scenes", pooled(chosen, scenes)))
         lines += _lines(panels, _SCENES_PER_LINE + 1, outliers_in_words(setting, n)) if panels else []
@@ -139,14 +139,18 @@ def plot_scenes(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Path:
     return _draw(path, heading, lines, style.solver_styles(r.solver for r in everything))
 
 
+def _by_solver(chosen: Iterable[Record]) -> dict[str, SuccessRate]:
+    return {record.solver: record.success for record in chosen}
+
+
 def _lines(panels: Sequence[_Panel], most: int, title: str = "") -> list[_Line]:
-    """The panels in lines of at most so many, about as many in each."""
+    """The panels in lines of about equal length, at most ``most`` in a line."""
     size = math.ceil(len(panels) / math.ceil(len(panels) / most))
     return [_Line(panels[i : i + size], title if i == 0 else "") for i in range(0, len(panels), size)]
 
 
 def _draw(path: str | Path, heading: Sequence[str], lines: Sequence[_Line], styles: Mapping[str, SolverStyle]) -> Path:
-    """Draw lines of panels with the same rows in all of them."""
+    """Draw lines of panels; all panels have the same rows."""
     there = {solver for line in lines for panel in line.panels for solver in panel.rates}
     rows = _Rows.of({name: look for name, look in styles.items() if name in there})
     columns = max(len(line.panels) for line in lines)
@@ -169,7 +173,7 @@ def _draw(path: str | Path, heading: Sequence[str], lines: Sequence[_Line], styl
 
 
 class _Rows(NamedTuple):
-    """Which row a solver has, counted from the top, and each group's title."""
+    """The row of each solver and of each title of a group, counted from the top."""
 
     total: int
     styles: Mapping[str, SolverStyle]
@@ -207,13 +211,13 @@ def _draw_panel(axes: Axes, panel: _Panel, rows: _Rows, ticks: Sequence[int]) ->
         value, low, high = 100 * rate.rate, 100 * rate.low, 100 * rate.high
         if look.bound:
             axes.axvline(value, color=look.colour, linestyle=look.dash, linewidth=0.9, zorder=1)
-        # Rounded in the file, a bound may lie a hair inside.
+        # A rate of the file is rounded, so a bound can lie just inside.
         reach = [[max(0.0, value - low)], [max(0.0, high - value)]]
         dot = {"color": look.colour, "linestyle": "none", **look.dot(), "marker": look.marker or "|", "clip_on": False}
-        dot["markersize"] *= 0.85  # its row tells the solver: room for the interval
+        dot["markersize"] *= 0.85  # smaller than in other pictures, so that the interval shows
         axes.errorbar([value], [row], xerr=reach, label=solver, elinewidth=1.6, **dot)
         if panel.numbers:
-            # To the right of the panel, where numbers cannot meet dots.
+            # To the right of the panel, where no dots are.
             place: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points"}
             font: dict[str, Any] = {"fontsize": SMALL, "ha": "right", "va": "center_baseline"}
             axes.annotate(f"{value:.1f}", (1, row), (28, 0), fontweight="bold" if look.ours else None, **place, **font)

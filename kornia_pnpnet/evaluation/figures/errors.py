@@ -1,4 +1,4 @@
-"""Distributions of the errors."""
+"""Distributions of the pose errors."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ __all__ = ["plot_errors"]
 
 
 def plot_errors(path: str | Path, results: Mapping[str, Any]) -> Path:
-    """Draw how many problems have an error of at most x: a row of two panels for each data set.
+    """Draw the share of problems with an error of at most x: a row of two panels for each data set.
 
     Args:
-        path: where the picture goes; the ending gives the format.
-        results: what :func:`~kornia_pnpnet.evaluation.evaluate` returned.
+        path: the picture to write; the ending gives the format.
+        results: a results file of :func:`~kornia_pnpnet.evaluation.evaluate`.
 
     Returns:
         The path.
@@ -71,10 +71,10 @@ def plot_errors(path: str | Path, results: Mapping[str, Any]) -> Path:
 
 
 def _draw_shares(axes: Axes, errors: np.ndarray, solver: str, look: SolverStyle, shift: float) -> None:
-    """Draw the share of errors up to x; markers stand at equal distances, moved along the curve by ``shift``."""
+    """Draw the share of errors up to x. Markers stand at equal distances, moved along the curve by ``shift``."""
     left, right = axes.get_xlim()
     errors = np.sort(errors)
     share = 100 * np.arange(len(errors) + 1) / len(errors)
-    # The curve comes from the left edge and leaves at the right one, wherever the errors lie.
+    # The curve reaches both edges, whatever the errors.
     ends = np.concatenate((errors[:1].clip(max=left), errors, errors[-1:].clip(min=right)))
     axes.step(ends, [*share, share[-1]], where="post", label=solver, markevery=(shift, 0.15), **look.line())

@@ -1,4 +1,4 @@
-"""Curves with a name at the end of each: what the pictures against n, m and the number of mismatches share."""
+"""Curves, their names and their ticks, for the pictures against n, m and the number of mismatches."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 from matplotlib.text import Annotation
 
@@ -23,8 +24,6 @@ from kornia_pnpnet.evaluation.figures.style import (
 )
 from kornia_pnpnet.metrics import SuccessRate
 
-__all__ = ["Curve", "draw_rates", "few_ticks", "list_curves", "make_panels", "name_curves"]
-
 _LINE_PT, _TICK_PT = 9.6, 13.5  # from one name to the next, and from one tick to the next, in points
 _BESIDE = 1.06  # where names begin, in widths of the axes
 _MOST_COLUMNS, _HEIGHT = 3, 2.9  # of panels side by side; inches of each
@@ -32,16 +31,7 @@ _LEGEND_COLUMNS, _HANDLE = 4, 11  # at most; what a piece of line takes beside i
 
 
 class Curve(NamedTuple):
-    """A value at some places, perhaps with its interval, all of the same length.
-
-    Attributes:
-        name: what is written at its end.
-        look: its colour, marker and dash.
-        x: places, ascending.
-        y: values.
-        low: lower ends of the intervals.
-        high: upper ends of the intervals.
-    """
+    """Values at some places, ``x`` ascending, with or without the ends of their intervals."""
 
     name: str
     look: SolverStyle
@@ -52,14 +42,14 @@ class Curve(NamedTuple):
 
     @classmethod
     def of_rates(cls, name: str, look: SolverStyle, rates: Mapping[float, SuccessRate]) -> Curve:
-        """Success in per cent, by what it is drawn against."""
+        """Success in per cent, by its place on the horizontal axis."""
         x = sorted(rates)
         y, low, high = ([100 * getattr(rates[place], key) for place in x] for key in ("rate", "low", "high"))
         return cls(name, look, x, y, low, high)
 
 
 def make_panels(count: int) -> tuple[Figure, list[Axes]]:
-    """A figure with so many panels, three side by side or two."""
+    """A figure with ``count`` panels, three side by side or two."""
     columns = count if count <= _MOST_COLUMNS else 2
     lines = -(-count // columns)
     figure = make_figure(WIDTH, 1.1 + _HEIGHT * lines)
@@ -70,10 +60,10 @@ def make_panels(count: int) -> tuple[Figure, list[Axes]]:
 
 
 def draw_rates(axes: Axes, curves: Sequence[Curve]) -> None:
-    """Draw curves of success and set the axes up for them, all but the horizontal one."""
+    """Draw curves of success and set up the vertical axis."""
     for curve in curves:
         y = np.array(curve.y)
-        # Rounded in the file, a bound may lie a hair inside.
+        # A rate of the file is rounded, so a bound can lie just inside.
         reach = np.stack((y - curve.low, np.array(curve.high) - y)).clip(min=0)
         axes.errorbar(curve.x, y, yerr=reach, label=curve.name, capsize=1.8, elinewidth=0.9, **curve.look.line())
     place = axes.get_subplotspec()
@@ -83,11 +73,9 @@ def draw_rates(axes: Axes, curves: Sequence[Curve]) -> None:
 
 
 def few_ticks(figure: Figure, panels: Mapping[Axes, Iterable[int]]) -> None:
-    """Tick the first and the last of some places, and those between that have room. Call it last: it needs the layout.
+    """Tick the first and the last place of each horizontal axis, and the places between with room for a number.
 
-    Args:
-        figure: of the axes.
-        panels: the places on each horizontal axis.
+    This needs the layout: call this function last.
     """
     figure.draw_without_rendering()
     for axes, places in panels.items():
@@ -100,18 +88,22 @@ def few_ticks(figure: Figure, panels: Mapping[Axes, Iterable[int]]) -> None:
         axes.set_xticks([], minor=True)
 
 
-def name_curves(figure: Figure, panels: Mapping[Axes, Sequence[Curve]]) -> None:
-    """Write each curve's name beside the axes, moved apart from the others and joined to its end.
+def write_names(legend: Legend, names: Iterable[str]) -> None:
+    """Write names into a legend as they are: matplotlib hides labels with an underscore and parses dollar signs."""
+    for text, name in zip(legend.get_texts(), names, strict=True):
+        text.set(text=name, parse_math=False)
 
-    Args:
-        figure: of the axes. Call it last: the names need the layout.
-        panels: the curves of each axes, which are drawn already.
+
+def name_curves(figure: Figure, panels: Mapping[Axes, Sequence[Curve]]) -> None:
+    """Write the names of drawn curves beside the axes, moved apart, each joined to the end of its curve.
+
+    This needs the layout: call this function last.
     """
     beside = {}
     for axes, curves in panels.items():
         right = max(curve.x[-1] for curve in curves)
         beside[axes] = [_write_name(axes, curve, right) for curve in curves]
-    figure.draw_without_rendering()  # now the axes have their size, with room for the names
+    figure.draw_without_rendering()  # gives the axes their size, with room for the names
     for axes, names in beside.items():
         height = axes.get_window_extent().height * 72 / figure.dpi
         ends = [height * axes.transAxes.inverted().transform(axes.transData.transform(name.xy))[1] for name in names]
@@ -121,7 +113,7 @@ def name_curves(figure: Figure, panels: Mapping[Axes, Sequence[Curve]]) -> None:
 
 def _write_name(axes: Axes, curve: Curve, right: float) -> Annotation:
     leader: dict[str, Any] = {"arrowstyle": "-", "linewidth": 0.7, "relpos": (0, 0.5), "shrinkA": 1, "shrinkB": 3}
-    # From an end further left, it must not look as if the curve went on.
+    # A solid line from an end further left would look like the curve.
     leader |= {"color": curve.look.colour} if curve.x[-1] == right else {"color": GREY, "linestyle": ":"}
     font: dict[str, Any] = {"fontsize": SMALL, "fontweight": "bold" if curve.look.ours else None, "parse_math": False}
     return axes.annotate(
@@ -137,28 +129,23 @@ def _write_name(axes: Axes, curve: Curve, right: float) -> Annotation:
 
 
 def list_curves(figure: Figure, looks: Mapping[str, SolverStyle]) -> None:
-    """Write below all panels what the curves are: where these end together, names beside their ends cannot tell.
-
-    Args:
-        figure: of the panels.
-        looks: of the curves, by name.
-    """
+    """Write a legend below all panels, for curves that end too close together for names beside their ends."""
     handles = [Line2D([], [], **look.line()) for look in looks.values()]
-    # A name may begin with an underscore, which would hide it here, or have a dollar sign.
     names = [shortened(name) for name in looks]
     columns = min(_LEGEND_COLUMNS, LETTERS // (_HANDLE + max(map(len, names))))
     lines = -(-len(names) // columns)
     place: dict[str, Any] = {"loc": "outside lower center", "ncols": -(-len(names) // lines)}
     legend = figure.legend(handles, ["-"] * len(names), fontsize=SMALL, frameon=False, handlelength=3.4, **place)
-    for text, name, look in zip(legend.get_texts(), names, looks.values(), strict=True):
-        text.set(text=name, parse_math=False, fontweight="bold" if look.ours else "normal")
+    write_names(legend, names)
+    for text, look in zip(legend.get_texts(), looks.values(), strict=True):
+        text.set(fontweight="bold" if look.ours else "normal")
 
 
 def _apart(places: Sequence[float], gap: float, height: float) -> list[float]:
-    """Places at least ``gap`` from each other, inside 0 ... ``height`` if they fit, as near as can be to those given.
+    """Places at least ``gap`` apart, within 0 and ``height`` if there is room, with the least squared moves.
 
-    In order and less ``gap`` for each one below, they must not fall: least squares under that condition is solved by
-    pooling neighbours that do into their mean (Ayer et al., 1955).
+    Sorted and less ``gap`` for each place below, the places must not decrease. Least squares under this condition pools
+    decreasing neighbours into their mean (Ayer et al., 1955).
     """
     order = np.argsort(places, kind="stable")
     pools: list[tuple[float, int]] = []

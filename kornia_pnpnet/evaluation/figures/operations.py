@@ -16,18 +16,18 @@ __all__ = ["plot_operations"]
 
 
 def plot_operations(path: str | Path, complexity: Mapping[str, Any]) -> Path:
-    """Draw how many operations a problem of n pairs takes: figure 1 of the protocol.
+    """Draw the operations of a solver for one problem of n pairs: figure 1 of the protocol.
 
     Args:
-        path: where the picture goes; the ending gives the format.
-        complexity: ``n``, numbers of pairs; ``counts``, for each solver as many operation counts, ``None`` where it
-            has none; ``ransac``, the names of those that draw samples, which have a panel of their own.
+        path: the picture to write; the ending gives the format.
+        complexity: ``n``, numbers of pairs; ``counts``, by solver one operation count for each n, or ``None``;
+            ``ransac``, the names of the solvers of the second panel.
 
     Returns:
         The path.
 
     Raises:
-        ValueError: when there is no solver, or one has more or fewer counts than there are n.
+        ValueError: when there is no solver, or the counts of a solver are not one for each n.
     """
     n, sampled = list(complexity["n"]), set(complexity["ransac"])
     counts = {name: np.array(values, dtype=float) for name, values in complexity["counts"].items()}

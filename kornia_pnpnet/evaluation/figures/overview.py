@@ -42,7 +42,7 @@ def plot_overview(path: str | Path, rows: Sequence[OverviewRow], *, outliers: st
     """Draw success (left) and time per problem (right) as bars, one row for each solver.
 
     Args:
-        path: where the picture goes; the ending gives the format.
+        path: the picture to write; the ending gives the format.
         rows: the solvers, from the top of the picture down.
         outliers: number of outliers of :attr:`OverviewRow.with_outliers` in words, for the legend.
 

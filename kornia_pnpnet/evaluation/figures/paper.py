@@ -1,4 +1,4 @@
-"""All figures that results files hold data for."""
+"""All figures of the paper's protocol."""
 
 from __future__ import annotations
 
@@ -27,23 +27,21 @@ _FIGURES: Mapping[str, Callable[[Path, Sequence[Mapping[str, Any]]], Path]] = {
 
 
 def paper_figures(results: Sequence[Mapping[str, Any]], folder: str | Path) -> list[Path]:
-    """Draw the protocol's five figures, success against n and success against m, as far as there is data for them.
+    """Draw the protocol's five figures, success against n and success against m. Figures without data are left out.
 
     Args:
-        results: results of :func:`~kornia_pnpnet.evaluation.evaluate`, and operation counts, in which ``kind`` is
-            ``"complexity"``. Where several results have the same source, outliers, n and solver, that with the most
-            problems counts, the last of these. A solver looks the same in all figures; one whose name sets m is only
-            in the last.
-        folder: where the pictures go, made when missing: ``figure1_operations.png``, ``figure2_paper.png``,
-            ``figure3_gaussian_pose.png``, ``figure4_scenes.png``, ``figure5_mismatches.png``,
-            ``success_against_n.png`` and ``success_against_m.png``.
+        results: results files of :func:`~kornia_pnpnet.evaluation.evaluate`, and at most one file of operation counts
+            (``kind`` is ``"complexity"``). Of several results with the same source, outliers, n and solver, the one
+            with the most problems is drawn, and of these the last. A solver whose name sets m is in the figure against
+            m only.
+        folder: folder of the pictures, made when missing.
 
     Returns:
-        The paths of what was drawn.
+        The paths of the pictures: ``figure1_operations.png``, ``figure2_paper.png``, ``figure3_gaussian_pose.png``,
+        ``figure4_scenes.png``, ``figure5_mismatches.png``, ``success_against_n.png`` and ``success_against_m.png``.
 
     Raises:
-        ValueError: when there are no results, none of them has data for a figure, or there are several operation
-            counts.
+        ValueError: when no figure has data, or there are several files of operation counts.
     """
     if not results:
         raise ValueError("There are no results to draw: expected at least one results file.")

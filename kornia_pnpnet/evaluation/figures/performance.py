@@ -1,4 +1,4 @@
-"""Times: against the batch or the number of pairs, and as a distribution over single calls."""
+"""Times against the batch size or the number of pairs, and the distribution of the times of single calls."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from kornia_pnpnet.evaluation.figures.style import SMALL, WIDTH, SolverStyle
 
 __all__ = ["plot_latency", "plot_times"]
 
-# How a solver may be run, by the end of its name, and the line of it.
+# Line styles by the end of a name, which says how the solver runs.
 _WAYS = {" compiled": "-", " compiled whole": (0, (1, 1.3)), " ONNX": (0, (5, 1.5, 1, 1.5))}
 _DASHED = (0, (4, 2))
-_LAST_SHARE = 0.99  # drawn of a distribution; of the rest are calls that something else delayed
+_LAST_SHARE = 0.99  # share of the calls drawn; other programs delayed the slowest
 
 
 def plot_times(
     path: str | Path, title: str, panels: Mapping[str, Sequence[Mapping[str, Any]]], *, against: str, label: str
 ) -> Path:
-    """Draw the time per problem against something, one curve for each contender.
+    """Draw the time per problem against a column of the rows, one curve for each contender.
 
     Args:
-        path: where the picture goes; the ending gives the format.
-        title: above all panels.
-        panels: by their titles, rows with ``contender``, ``median_us`` and what they are drawn against.
-        against: the key of that.
-        label: of the horizontal axis.
+        path: the picture to write; the ending gives the format.
+        title: title above all panels.
+        panels: rows by the title of the panel, with ``contender``, ``median_us`` and the column ``against``.
+        against: column of the horizontal axis.
+        label: label of the horizontal axis.
 
     Returns:
         The path.
@@ -60,12 +60,12 @@ def plot_times(
 
 
 def plot_latency(path: str | Path, title: str, rows: Sequence[Mapping[str, Any]]) -> Path:
-    """Draw which share of the calls with one problem is done within a time, without the slowest hundredth.
+    """Draw the share of the calls with one problem that end within a time, without the slowest hundredth.
 
     Args:
-        path: where the picture goes; the ending gives the format.
-        title: above the panel.
-        rows: with ``contender`` and ``quantiles_us``, the times below which equally spaced shares of the calls are.
+        path: See :func:`plot_times`.
+        title: See :func:`plot_times`.
+        rows: rows with ``contender`` and ``quantiles_us``, the quantiles of the times at equally spaced shares.
 
     Returns:
         The path.
@@ -92,7 +92,7 @@ def plot_latency(path: str | Path, title: str, rows: Sequence[Mapping[str, Any]]
 
 
 def _looks(names: Iterable[str]) -> dict[str, SolverStyle]:
-    """Styles in order; what is also there compiled is open and dashed, its compiled selves filled, each with its line.
+    """Styles in order. A solver that also runs compiled is open and dashed; each way of compiling has its own line.
 
     Raises:
         ValueError: when there is no name.

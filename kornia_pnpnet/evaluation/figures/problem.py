@@ -24,24 +24,23 @@ def plot_pose(
     *,
     title: str = "",
 ) -> Path:
-    r"""Draw one problem in its image: each pixel, joined to where the pose puts its point.
+    r"""Draw one problem in its image: each pixel, joined to the projection of its point.
 
     Args:
-        path: where the picture goes; the ending gives the format.
-        img_points: measured pixels, shape :math:`(N, 2)`.
-        reprojections: projections of the points, shape :math:`(N, 2)`; not finite for points behind the camera,
-            which have no place in the image.
-        rejected: whether the pair is taken for wrong, bool, shape :math:`(N,)`.
-        size: width and height of the image in pixels, the origin in its corner; when ``None``, what the pixels and
-            the reprojections near them need.
-        title: stands before the counts.
+        path: the picture to write; the ending gives the format.
+        img_points: measured pixels, shape :math:`(N, 2)`. Pairs whose pixel is not finite are left out.
+        reprojections: projections of the points in pixels, shape :math:`(N, 2)`; not finite for points behind the
+            camera, which are not drawn.
+        rejected: whether the solver rejected the pair, bool, shape :math:`(N,)`.
+        size: width and height of the image in pixels; ``None``: the range of the pixels and the projections near them.
+        title: text before the counts.
 
     Returns:
-        The path. Pairs whose pixel is not finite have no place in it.
+        The path.
 
     Raises:
-        ValueError: for shapes that do not fit, or when no pixel is finite.
-        BaseError: for an image without a size.
+        ValueError: when the shapes do not agree, or when no pixel is finite.
+        BaseError: when the size is not positive.
     """
     pixels, projected = np.asarray(img_points, dtype=float), np.asarray(reprojections, dtype=float)
     bad = np.asarray(rejected, dtype=bool)
@@ -79,12 +78,12 @@ def plot_pose(
 
 
 def _bounds(pixels: np.ndarray, projected: np.ndarray) -> tuple[float, float, float, float]:
-    """Left, top, right and bottom around the pixels and those reprojections that are not far off."""
+    """Left, top, right and bottom around the pixels and the projections near them."""
     low, high = pixels.min(axis=0), pixels.max(axis=0)
     reach = max(1.0, float((high - low).max()))
     near = ((projected > low - 0.5 * reach) & (projected < high + 0.5 * reach)).all(axis=1)
     points = np.concatenate((pixels, projected[near]))
     low, high = points.min(axis=0) - 0.06 * reach, points.max(axis=0) + 0.06 * reach
-    # A strip would leave no room for the marks: at least a third as wide as long, and the other way round.
+    # Room for the marks: neither side is shorter than a third of the other.
     middle, half = (low + high) / 2, np.maximum((high - low) / 2, (high - low).max() / 6)
     return *(middle - half), *(middle + half)

@@ -1,4 +1,4 @@
-"""What the paper's figures take from results files, in one list."""
+"""Results files as one list of records, for the figures of the paper."""
 
 from __future__ import annotations
 
@@ -10,24 +10,7 @@ import torch
 from kornia_pnpnet.evaluation.problem_sets import PRIORS
 from kornia_pnpnet.metrics import SuccessRate, success_rate
 
-__all__ = [
-    "NothingToDrawError",
-    "Record",
-    "by_solver",
-    "in_words",
-    "limits_in_words",
-    "outliers_in_words",
-    "outliers_in_order",
-    "pooled",
-    "records",
-    "success_limit",
-    "usual_n",
-    "without_m",
-]
-
 _SYNTHETIC = {name for name, _ in PRIORS.values()}
-
-
 _PROTOCOL_N = 9
 
 
@@ -40,14 +23,14 @@ class Record(NamedTuple):
 
     Attributes:
         source: ``paper``, another prior, or a scene.
-        outliers: how many of the pairs are wrong, ``"uniform"`` (0 to a third of them), or what the file says.
-        mismatches: whether every wrong pixel is that of another point, none anywhere in the image.
+        outliers: number of outliers, ``"uniform"`` (0 to a third of the pairs), or another text of the file.
+        mismatches: whether every outlier shows another point. Otherwise some show any place in the image.
         n: pairs per problem.
-        solver: its name, options after a colon.
-        m: iterations of its refinement, when its configuration says so.
+        solver: name of the solver, options after a colon.
+        m: iterations of the refinement, when the configuration has a number.
         success: rate, interval and number of problems.
         us_per_problem: time in microseconds.
-        limit: what a success is, see :func:`success_limit`.
+        limit: limits of a success, see :func:`success_limit`.
     """
 
     source: str
@@ -62,25 +45,25 @@ class Record(NamedTuple):
 
     @property
     def scene(self) -> bool:
-        """Whether the problems come from a scene."""
+        """Whether the problems are of a scene."""
         return self.source not in _SYNTHETIC
 
     @property
     def swept(self) -> bool:
-        """Whether the solver's name sets m: one point of a curve against m, no solver of its own."""
+        """Whether the solver's name sets m: a point of a curve against m."""
         return without_m(self.solver) != self.solver
 
 
 def records(results: Iterable[Mapping[str, Any]]) -> list[Record]:
-    """Read results.
+    """Read results files.
 
     Args:
-        results: what :func:`~kornia_pnpnet.evaluation.evaluate` returned, any number of times. Data sets whose
-            description names no source and outliers are left out; operation counts are, too.
+        results: results of :func:`~kornia_pnpnet.evaluation.evaluate`. Operation counts and data sets without a source
+            or outliers in their description are left out.
 
     Returns:
-        One record for each source, outliers, n and solver: when there are several, that with the most problems, the
-        last one of these. Mismatches alone are other outliers than the protocol's mix.
+        One record for each source, outliers, kind of outliers, n and solver. Of several, the one with the most
+        problems, and of these the last.
     """
     found: dict[tuple[object, ...], Record] = {}
     for result in results:
@@ -125,20 +108,12 @@ def without_m(solver: str) -> str:
     return ":".join([name, *filter(None, [",".join(others)])])
 
 
-def by_solver(chosen: Iterable[Record]) -> dict[str, SuccessRate]:
-    """Success by solver."""
-    return {record.solver: record.success for record in chosen}
-
-
 def pooled(chosen: Sequence[Record], scenes: Iterable[str]) -> dict[str, SuccessRate]:
-    """Success over all problems of several scenes, for the solvers that all of these were given to.
+    """Success over all problems of some scenes, for each solver that solved all these scenes.
 
     Args:
-        chosen: records of these scenes, with the same outliers and n.
-        scenes: their names.
-
-    Returns:
-        The share of all problems and its interval, by solver.
+        chosen: records of the scenes, with the same outliers and n.
+        scenes: names of the scenes.
     """
     found: dict[str, dict[str, SuccessRate]] = {}
     for record in chosen:
@@ -153,12 +128,12 @@ def pooled(chosen: Sequence[Record], scenes: Iterable[str]) -> dict[str, Success
 
 
 def success_limit(data: Mapping[str, Any]) -> tuple[float, float, str]:
-    """What solving a problem of an entry of ``results["data"]`` means: degrees, length, and the unit of the length."""
+    """Limits of a success on a data set of a results file: degrees, length, and unit of the length."""
     return data["max_rotation_deg"], data["max_translation"], data["unit"]
 
 
 def limits_in_words(limits: Iterable[tuple[float, float, str]]) -> str:
-    """What counts as a success, in words."""
+    """The limits of a success, in words."""
     rotations: set[float] = set()
     by_unit: dict[str, set[float]] = {}
     for rotation_deg, translation, unit in limits:
@@ -169,19 +144,19 @@ def limits_in_words(limits: Iterable[tuple[float, float, str]]) -> str:
 
 
 def in_words(chosen: Collection[Record]) -> str:
-    """What counts as a success, and how many problems there are in each set."""
+    """The limits of a success and the number of problems in each set."""
     totals = _span({record.success.total for record in chosen}, "d")
     return f"{limits_in_words(record.limit for record in chosen)}. {totals} problems in each set, 95 % intervals."
 
 
 def _span(values: Collection[float], form: str) -> str:
-    """The value, or the least and the largest when they differ in the form in which they are written."""
+    """The value, or the least and the largest value when their texts differ."""
     low, high = f"{min(values):{form}}", f"{max(values):{form}}"
     return low if low == high else f"{low} to {high}"
 
 
 def outliers_in_words(outliers: int | str, n: int | None = None) -> str:
-    """How many pairs are wrong, for a title; of how many when ``n`` is said."""
+    """The number of outliers, and with ``n`` the number of pairs, for a title."""
     if outliers == 0:
         return "no wrong pairs"
     if outliers == "uniform":
@@ -192,7 +167,7 @@ def outliers_in_words(outliers: int | str, n: int | None = None) -> str:
 
 
 def outliers_in_order(chosen: Iterable[Record]) -> list[int | str]:
-    """The outlier settings there are: none, uniform, other numbers, anything else."""
+    """The outlier settings in order: none, uniform, other numbers, other texts."""
     settings = {record.outliers for record in chosen}
     numbers = sorted(value for value in settings if isinstance(value, int))
     words = sorted(value for value in settings if isinstance(value, str))
@@ -200,6 +175,6 @@ def outliers_in_order(chosen: Iterable[Record]) -> list[int | str]:
 
 
 def usual_n(chosen: Iterable[Record]) -> int:
-    """The n that a figure is about which does not vary it: the protocol's 9, or the smallest there is."""
+    """The n of a figure that does not vary n: 9 as in the protocol, or the smallest n."""
     numbers = {record.n for record in chosen}
     return _PROTOCOL_N if _PROTOCOL_N in numbers else min(numbers, default=_PROTOCOL_N)

@@ -1,4 +1,4 @@
-"""Reliability diagrams: how often what is said to have a chance comes true."""
+"""Reliability diagrams: predicted probabilities against observed shares."""
 
 from __future__ import annotations
 
@@ -6,40 +6,27 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from kornia_pnpnet.evaluation.figures.style import (
-    BLUE,
-    GREEN,
-    GREY,
-    ORANGE,
-    PURPLE,
-    SKY,
-    SMALL,
-    WIDTH,
-    make_figure,
-    save,
-    tidy,
-)
+from kornia_pnpnet.evaluation.figures.lines import write_names
+from kornia_pnpnet.evaluation.figures.style import COLOURS, GREY, SMALL, WIDTH, make_figure, save, tidy
 
 __all__ = ["plot_reliability"]
 
-_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, "#000000")
 _MARKERS = ("o", "s", "^", "D", "v", "P")
 
 
 def plot_reliability(path: str | Path, curves: Mapping[str, Mapping[str, Sequence[float]]]) -> Path:
-    """Draw chances against what came of them, and below how many chances there are in each range.
+    """Draw observed shares against predicted probabilities, and below the number of predictions in each range.
 
     Args:
-        path: where the picture goes; the ending gives the format.
-        curves: by name the lists of a :class:`~kornia_pnpnet.metrics.Reliability`: ``number``, ``predicted`` and
-            ``observed``, of equally many ranges. Ranges with a number of 0 are left out.
+        path: the picture to write; the ending gives the format.
+        curves: by name the lists ``number``, ``predicted`` and ``observed`` of a
+            :class:`~kornia_pnpnet.metrics.Reliability`, with one entry for each range. Empty ranges are left out.
 
     Returns:
         The path.
 
     Raises:
-        ValueError: when there is no curve, a list is missing or not as long as the others, or the numbers are none that
-            can have been counted, or all 0.
+        ValueError: when there is no curve, the lists differ in length, or a number is negative, or all are 0.
     """
     if not curves:
         raise ValueError("plot_reliability needs at least one curve, got none.")
@@ -55,7 +42,7 @@ def plot_reliability(path: str | Path, curves: Mapping[str, Mapping[str, Sequenc
     chance, share = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
     chance.plot((0, 1), (0, 1), color=GREY, linewidth=1.0, linestyle=":")
     for index, curve in enumerate(curves.values()):
-        colour, marker = _COLOURS[index % len(_COLOURS)], _MARKERS[index % len(_MARKERS)]
+        colour, marker = COLOURS[index % len(COLOURS)], _MARKERS[index % len(_MARKERS)]
         there = [i for i, count in enumerate(curve["number"]) if count > 0]
         x, y = ([curve[key][i] for i in there] for key in ("predicted", "observed"))
         chance.plot(x, y, color=colour, marker=marker, markersize=4.5, linewidth=1.5)
@@ -63,10 +50,8 @@ def plot_reliability(path: str | Path, curves: Mapping[str, Mapping[str, Sequenc
         shares = [100 * curve["number"][i] / total for i in there]
         share.plot(x, shares, color=colour, marker=marker, markersize=4.5, linewidth=1.0)
     chance.set(ylim=(-0.02, 1.02), xlim=(-0.02, 1.02), ylabel="share that is right")
-    # A name may begin with an underscore, which would hide it here, or have a dollar sign.
     legend = chance.legend(chance.lines[1:], ["-"] * len(curves), frameon=False, fontsize=SMALL, loc="upper left")
-    for text, name in zip(legend.get_texts(), curves, strict=True):
-        text.set(text=name, parse_math=False)
+    write_names(legend, curves)
     share.set(yscale="log", xlabel="weight: the chance that a pair is right", ylabel="pairs (%)")
     for axes in (chance, share):
         tidy(axes)

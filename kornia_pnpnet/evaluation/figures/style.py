@@ -1,4 +1,4 @@
-"""The look of all pictures: the page, the sizes of the letters, and the colour, marker and place of each solver."""
+"""The look of all pictures: page, letters, and the colour, marker and order of the solvers."""
 
 from __future__ import annotations
 
@@ -10,47 +10,23 @@ from typing import Any, Literal, NamedTuple
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-__all__ = [
-    "BLUE",
-    "GREEN",
-    "GREY",
-    "GROUPS",
-    "LETTERS",
-    "ORANGE",
-    "PURPLE",
-    "RED",
-    "SKY",
-    "SMALL",
-    "SOURCES",
-    "TITLE",
-    "WIDTH",
-    "SolverStyle",
-    "head",
-    "make_figure",
-    "save",
-    "shortened",
-    "solver_styles",
-    "tidy",
-    "wrapped",
-]
-
-#: Of a page with two columns, in inches: drawn at its final size, letters keep theirs, in points.
-WIDTH = 7.2
-SMALL, TITLE = 8.0, 9.0
-#: How many small letters are as wide as the page, about.
-LETTERS = 112
+WIDTH = 7.2  #: inches; the width of a page with two columns, so that letters are printed at their size
+SMALL, TITLE = 8.0, 9.0  #: sizes of letters in points
+LETTERS = 112  #: number of small letters across the page, about
 _DPI = 300
 
-# Okabe and Ito's colours, which the colour-blind can tell apart; markers and dashes tell the solvers apart in grey.
+# Okabe and Ito's colours, which colour-blind readers can tell apart. In grey, markers and dashes tell solvers apart.
 BLUE, ORANGE, GREY, RED = "#0072B2", "#E69F00", "#5f5f5f", "#CC3311"
 SKY, GREEN, VERMILION, PURPLE = "#56B4E9", "#009E73", "#D55E00", "#B5528C"
 _BLACK = "#222222"
 _SOLID, _DASHED, _DOTTED, _DASH_DOTTED = "-", (0, (4, 2)), (0, (1, 1.3)), (0, (5, 1.5, 1, 1.5))
 
-#: What solvers are sorted into, from the top of a picture down.
+#: Colours of curves that are not solvers.
+COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, "#000000")
+#: Groups of solvers, from the top of a picture down.
 GROUPS = ("PnP-Net", "methods of the paper", "beyond the paper", "other libraries", "others", "bounds")
 _OTHERS, _BOUNDS = 4, 5
-#: What the protocol's priors are called in a title.
+#: The protocol's priors in a title.
 SOURCES = {"paper": "the paper's data", "gaussian_pose": "data with Gaussian positions"}
 
 
@@ -59,9 +35,9 @@ class SolverStyle(NamedTuple):
 
     Attributes:
         group: index into :data:`GROUPS`.
-        colour: of its line and marker.
-        marker: matplotlib's letter for it; empty for a bound, which is a line.
-        filled: whether the marker is.
+        colour: colour of line and marker.
+        marker: matplotlib's letter of the marker; empty for a bound, which is a line.
+        filled: whether the marker is filled.
         dash: matplotlib's line style.
     """
 
@@ -73,12 +49,12 @@ class SolverStyle(NamedTuple):
 
     @property
     def ours(self) -> bool:
-        """Whether the line is to stand out."""
+        """Whether the solver stands out."""
         return self.group == 0 and self.filled
 
     @property
     def bound(self) -> bool:
-        """Whether it is no solver but the most that one could reach."""
+        """Whether this is a bound on the success of all solvers."""
         return self.group == _BOUNDS
 
     def line(self) -> dict[str, Any]:
@@ -92,7 +68,7 @@ class SolverStyle(NamedTuple):
         }
 
     def dot(self) -> dict[str, Any]:
-        """The part of :meth:`line` that is about the marker."""
+        """The arguments of :meth:`line` for the marker."""
         return {
             "marker": self.marker,
             "markersize": 5.2 if self.ours else 4.4,
@@ -102,8 +78,8 @@ class SolverStyle(NamedTuple):
         }
 
 
-# By the longest beginning of the name that is here, up to a hyphen; in the order of the rows. A method alone is open
-# and dashed, the same one refined is filled and solid.
+# Styles in the order of the rows. A solver has the style of the longest name that its name begins with, up to a hyphen.
+# A method alone is open and dashed; with refinement, filled and solid.
 _KNOWN = {
     "pnpnet": SolverStyle(0, BLUE, "o", True, _SOLID),
     "pnpnet-set": SolverStyle(0, BLUE, "D", True, _DASH_DOTTED),
@@ -135,11 +111,11 @@ def solver_styles(names: Iterable[str]) -> dict[str, SolverStyle]:
     """Styles by name, in the order in which solvers are listed.
 
     Args:
-        names: of solvers, options after a colon. Known ones always look the same, and so does a solver with other
-            options. Unknown ones differ from each other as long as there are no more than 20.
+        names: names of solvers, options after a colon. A known solver has the same style in all pictures, with any
+            options. Up to 20 unknown solvers have different styles.
 
     Returns:
-        A style for each name: sorted by group, within it as the paper lists them, then by name.
+        A style for each name, sorted by group, then in the order of the paper, then by name.
 
     Example:
         >>> list(solver_styles(["poselib", "mine", "epnp-lm:m=3", "pnpnet-n9"]))
@@ -173,22 +149,22 @@ def _known(name: str) -> str | None:
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    """Sorts n9 before n20."""
+    """Key that sorts n9 before n20."""
     return [(int(part), "") if part.isdecimal() else (0, part) for part in re.split(r"(\d+)", name)]
 
 
 def make_figure(width: float, height: float) -> Figure:
-    """An opaque white figure, readable on a dark page too; its size in inches."""
+    """An opaque white figure, readable on a dark page too. Sizes are in inches."""
     return Figure(figsize=(width, height), layout="constrained", facecolor="white")
 
 
 def head(figure: Figure, *lines: str) -> None:
-    """Say above all panels what they show."""
+    """Write a title above all panels."""
     figure.suptitle("\n".join(lines), x=0.01, ha="left", fontsize=TITLE, parse_math=False)
 
 
 def save(figure: Figure, path: str | Path, *, dpi: int = _DPI) -> Path:
-    """Write the figure, making folders when missing; the path's ending gives the format."""
+    """Write the figure and make missing folders. The ending of the path gives the format."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=dpi)
@@ -206,7 +182,7 @@ def tidy(axes: Axes, grid: Literal["both", "x", "y"] = "both") -> None:
 
 
 def shortened(name: str, most: int = 27) -> str:
-    """The name, its middle left out when it is longer than ``most`` letters.
+    """The name; the middle of names above ``most`` letters is left out.
 
     Example:
         >>> shortened("outputs/2026-11-21/12-00-00/weights")
@@ -217,7 +193,7 @@ def shortened(name: str, most: int = 27) -> str:
 
 
 def wrapped(name: str, width: int) -> str:
-    """The name in lines of at most ``width`` letters, broken behind signs where it can be."""
+    """The name in lines of at most ``width`` letters, broken after signs where possible."""
     lines = [""]
     for word in re.findall(rf"[^-_ ,/]{{1,{width}}}[-_ ,/]*|[-_ ,/]+", name):
         if lines[-1] and len(lines[-1]) + len(word.rstrip()) > width:

@@ -1,4 +1,4 @@
-"""What a sweep of short trainings found: success and time against n and against m."""
+"""Success and time of a sweep of short trainings, against n and against m."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _per_cent(text: str) -> float:
     return 100 * float(text)
 
 
-#: Where a run's fields are in the summary.
+#: The columns of the fields of a run, in their order.
 _COLUMNS: dict[str, Callable[[str], Any]] = {
     "model.n": int,
     "model.m": int,
@@ -56,7 +56,7 @@ _COLUMNS: dict[str, Callable[[str], Any]] = {
 
 
 def mix_in_words(max_ratio: float) -> str:
-    """The mix of wrong pairs that a largest share of them stands for.
+    """The mix of outliers with a largest share, in words.
 
     Example:
         >>> mix_in_words(0.0), mix_in_words(0.33)
@@ -72,20 +72,20 @@ def mix_in_words(max_ratio: float) -> str:
 def plot_sweep(path: str | Path, summary_csv: str | Path, *, against: Literal["n", "m"]) -> Path:
     """Draw the success of trained networks against n or m: a panel for each value of the other, a line for each mix.
 
-    The time is on the right: the least over the mixes, on which it does not depend.
+    The axis on the right is time: the least over the mixes, which do not change the time.
 
     Args:
-        path: where the picture goes; the ending gives the format.
-        summary_csv: the summary of ``train.py -m experiment=sweep``, in which every run is tested on the mix of wrong
-            pairs that it was trained on. Read are ``model.n``, ``model.m``, ``data.outliers.max_ratio``,
-            ``us_per_problem`` and ``uniform/rate``, ``/low``, ``/high``.
-        against: what is on the horizontal axis.
+        path: the picture to write; the ending gives the format.
+        summary_csv: the summary of ``train.py -m experiment=sweep``, with the columns ``model.n``, ``model.m``,
+            ``data.outliers.max_ratio``, ``us_per_problem`` and ``uniform/rate``, ``/low``, ``/high``. Each run is
+            tested on the mix of outliers of its training.
+        against: the horizontal axis.
 
     Returns:
         The path.
 
     Raises:
-        ValueError: when a column is missing, there are no rows, or two have the same n, m and mix.
+        ValueError: when a column is missing, there are no rows, or two rows have the same n, m and mix.
     """
     runs = _read(summary_csv)
     other = "m" if against == "n" else "n"
@@ -118,13 +118,13 @@ def plot_sweep(path: str | Path, summary_csv: str | Path, *, against: Literal["n
 
 
 def _draw_times(axes: Axes, times: Mapping[int, float], slowest: float) -> None:
-    """Draw microseconds on an axis on the right, behind the success that is drawn already."""
+    """Draw microseconds on an axis on the right, behind the curves of success."""
     right = axes.twinx()
     axes.set_zorder(right.get_zorder() + 1)
-    axes.patch.set_visible(False)  # it would hide what is behind
+    axes.patch.set_visible(False)  # it would hide the time
     right.plot(list(times), list(times.values()), label=_TIME, **_TIME_LOOK.line())
     place = axes.get_subplotspec()
-    low, high = (share / 100 * slowest for share in axes.get_ylim())  # the zeros of both axes side by side
+    low, high = (share / 100 * slowest for share in axes.get_ylim())  # aligns the zeros of both axes
     right.set(ylim=(low, high), ylabel="µs per problem" if place is None or place.is_last_col() else "")
     right.spines[["top", "left"]].set_visible(False)
     right.tick_params(labelsize=SMALL, colors=GREY)

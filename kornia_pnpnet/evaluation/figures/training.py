@@ -6,39 +6,25 @@ import math
 from pathlib import Path
 
 from kornia_pnpnet.core.schema import read_column, read_rows
-from kornia_pnpnet.evaluation.figures.style import (
-    BLUE,
-    GREEN,
-    ORANGE,
-    PURPLE,
-    SKY,
-    SMALL,
-    TITLE,
-    WIDTH,
-    make_figure,
-    save,
-    tidy,
-)
+from kornia_pnpnet.evaluation.figures.style import BLUE, COLOURS, ORANGE, SMALL, TITLE, WIDTH, make_figure, save, tidy
 
 __all__ = ["plot_training"]
-
-_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, "#000000")
 
 
 def plot_training(path: str | Path, history_csv: str | Path) -> Path:
     """Draw the learning curves of a run.
 
     Args:
-        path: where the picture goes; the ending gives the format.
-        history_csv: the run's history, a CSV file with the columns ``update``, ``total``, ``init_rotation``,
+        path: the picture to write; the ending gives the format.
+        history_csv: the history of the run, with the columns ``update``, ``total``, ``init_rotation``,
             ``init_translation``, ``refined_rotation``, ``refined_translation`` and any ``val/<set>/success``. Empty
-            cells are skipped, other columns are not read.
+            cells are skipped.
 
     Returns:
         The path.
 
     Raises:
-        ValueError: when a column is missing, a cell is no number, or there are no rows.
+        ValueError: when a column is missing, a cell is not a number, or there are no rows.
     """
     rows = read_rows(history_csv)
     steps = read_column(history_csv, rows, "update", float)
@@ -58,7 +44,7 @@ def plot_training(path: str | Path, history_csv: str | Path) -> Path:
         axes.legend(frameon=False, fontsize=SMALL)
     validated = [name for name in rows[0] if name and name.startswith("val/") and name.endswith("/success")]
     for index, column in enumerate(validated):
-        colour, dash = _COLOURS[index % len(_COLOURS)], ("-", "--", ":")[index // len(_COLOURS) % 3]
+        colour, dash = COLOURS[index % len(COLOURS)], ("-", "--", ":")[index // len(COLOURS) % 3]
         updates, rates = curve(column)
         label = column.removeprefix("val/").removesuffix("/success")
         success.plot(updates, [100 * rate for rate in rates], color=colour, linestyle=dash, marker=".", label=label)
