@@ -354,5 +354,3 @@ def test_the_configuration_is_plain_data():
 def test_wrong_arguments_raise(wrong):
     with pytest.raises(BaseError, match=next(iter(wrong))):
         SubsetSolver(EPnP(), **wrong) if "size" in wrong else RANSAC(P3P(), **wrong)
-
-
