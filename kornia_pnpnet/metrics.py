@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_devices, check_poses, check_whole
+from kornia_pnpnet.core.schema import Count, Share
 from kornia_pnpnet.geometry import rotation_angle
 from kornia_pnpnet.types import Pose
 
@@ -40,10 +41,10 @@ class SuccessRate(NamedTuple):
         total: number of trials.
     """
 
-    rate: float
-    low: float
-    high: float
-    total: int
+    rate: Share
+    low: Share
+    high: Share
+    total: Count
 
     def __str__(self) -> str:
         return f"{100 * self.rate:.1f} % [{100 * self.low:.1f}, {100 * self.high:.1f}]"

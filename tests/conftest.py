@@ -16,7 +16,7 @@ from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.geometry import retract
 
 if TYPE_CHECKING:
-    from kornia_pnpnet.training.loop import FitReport
+    from kornia_pnpnet.training import FitReport
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -106,7 +106,7 @@ def fit_config(tmp_path: Path) -> Callable[..., FitReport]:
     """Train what a composed configuration describes, as ``train.py`` does, or another solver in its place."""
     from hydra.utils import instantiate
 
-    from kornia_pnpnet.training.loop import fit
+    from kornia_pnpnet.training import fit
 
     def run(config: Any, solver: torch.nn.Module | None = None) -> FitReport:
         return fit(

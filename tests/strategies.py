@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from kornia.core.exceptions import BaseError
 
 from kornia_pnpnet import Normalize, Pose, create_solver
-from kornia_pnpnet.cli.main import main
+from kornia_pnpnet.cli import main
 from kornia_pnpnet.data import SyntheticProblems
 from kornia_pnpnet.refine.kernels import KERNELS
 from kornia_pnpnet.refine.lm import BACKWARDS

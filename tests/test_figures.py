@@ -272,7 +272,7 @@ def test_sweeps_that_cannot_be_drawn(tmp_path, change, message):
 
 def test_no_pyplot_and_no_matplotlib_without_figures():
     code = (
-        "import sys, kornia_pnpnet, kornia_pnpnet.cli.main\n"
+        "import sys, kornia_pnpnet, kornia_pnpnet.cli\n"
         "assert not {'matplotlib', 'cv2', 'pycolmap', 'hydra', 'lightning_fabric'} & set(sys.modules)\n"
         "import kornia_pnpnet.evaluation.figures\n"
         "assert 'matplotlib.pyplot' not in sys.modules"

@@ -11,7 +11,8 @@ from kornia_pnpnet import PnPNet, create_solver, pose_errors, shipped_weights, s
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.metrics import reliability
 from kornia_pnpnet.pretrained import WEIGHTS_FOLDER
-from kornia_pnpnet.training.results import write_model_card
+from kornia_pnpnet.training.card import write_model_card
+from kornia_pnpnet.training.results import load_run
 
 
 def rate(solver, problems):
@@ -94,13 +95,11 @@ def test_net_n9_is_the_first_guess_of_pnpnet_n9():
 @pytest.mark.parametrize("name", shipped_weights())
 def test_model_card_is_generated_from_the_run(name, tmp_path):
     folder = WEIGHTS_FOLDER / name
-    results = json.loads((folder / "results.json").read_text())
+    results = load_run(folder / "results.json")
     write_model_card(tmp_path, results, name=name)
     assert (tmp_path / "README.md").read_text() == (folder / "README.md").read_text()
-    assert PnPNet.from_config(results["model"]).config() == PnPNet.from_pretrained(name).config()
-    updates, run = 0, results
-    while run:
-        updates, run = updates + run["run"]["update"], run.get("origin")
+    assert PnPNet.from_config(results.model).config() == PnPNet.from_pretrained(name).config()
+    updates = sum(run.run.update for run in results.lineage())
     assert updates >= (40_000 if name == "pnpnet-set" else 200_000)
     assert sum(path.stat().st_size for path in folder.iterdir()) < 2_000_000
 

@@ -1,19 +1,20 @@
 """Model cards: written from the results of a run, without the machine that the run was on."""
 
-import copy
-import json
 import re
+from dataclasses import replace
 
 import pytest
+from huggingface_hub import ModelCard
 
 from kornia_pnpnet.pretrained import WEIGHTS_FOLDER, shipped_weights
-from kornia_pnpnet.training.results import write_model_card
+from kornia_pnpnet.training.card import write_model_card
+from kornia_pnpnet.training.results import load_run
 
-RESULTS = json.loads((WEIGHTS_FOLDER / "pnpnet-set" / "results.json").read_text())
+RESULTS = load_run(WEIGHTS_FOLDER / "pnpnet-set" / "results.json")
 
 
-def card_of(results, folder):
-    write_model_card(folder, results)
+def card_of(results, folder, name=None):
+    write_model_card(folder, results, name=name)
     return (folder / "README.md").read_text()
 
 
@@ -29,10 +30,10 @@ def card_of(results, folder):
     ],
 )
 def test_a_card_names_no_folder_of_a_machine(override, tmp_path):
-    results = copy.deepcopy(RESULTS)
-    results["overrides"] = ["train.ramp=[0,0]", override, "url=https://host/a", "weights=outputs/a/weights"]
-    for card in (card_of(results, tmp_path), card_of({**results, "origin": None}, tmp_path)):
-        assert "runs" not in card
+    overrides = ["train.ramp=[0,0]", override, "url=https://host/a", "weights=outputs/a/weights"]
+    for origin in (RESULTS.origin, None):
+        card = card_of(replace(RESULTS, overrides=overrides, origin=origin), tmp_path)
+        assert "/runs" not in card
         assert "mine" not in card
         assert "train.ramp=[0,0]" in card
         assert "url=https://host/a weights=outputs/a/weights" in card
@@ -40,20 +41,21 @@ def test_a_card_names_no_folder_of_a_machine(override, tmp_path):
 
 def test_a_card_names_the_run_that_each_run_began_with(tmp_path):
     card = card_of(RESULTS, tmp_path)
-    run, names = RESULTS["origin"], []
-    while run:
-        names.insert(0, run["config"]["name"])
-        run = run.get("origin")
-    assert len(names) == 4
-    places = [card.index(f"from the weights of `{name}`") for name in names]
+    names = [run.name for run in RESULTS.lineage()]
+    assert names == ["pnpnet-set", "set-samples", "set-six", "set-two", "set-three"]
+    places = [card.index(f"the weights of {name}") for name in names[:-1]]
     assert places == sorted(places)
-    assert "init.layers 4, now 3" in card  # the weights were changed in between
+    assert "`init.layers` was 4 and is 3" in card  # the weights were changed in between
 
 
 @pytest.mark.parametrize("name", shipped_weights())
 def test_shipped_cards_are_those_of_their_results(name, tmp_path):
-    results = json.loads((WEIGHTS_FOLDER / name / "results.json").read_text())
-    write_model_card(tmp_path, results, name=name)
-    card = (WEIGHTS_FOLDER / name / "README.md").read_text()
-    assert (tmp_path / "README.md").read_text() == card
+    folder = WEIGHTS_FOLDER / name
+    results = load_run(folder / "results.json")
+    card = (folder / "README.md").read_text()
+    assert card_of(results, tmp_path, name) == card
     assert not re.search(r"[=\s`](/|~|[A-Z]:)\w", card)
+    metadata = ModelCard(card).data
+    assert (metadata.license, metadata.library_name, metadata.model_name) == ("apache-2.0", "kornia_pnpnet", name)
+    rates = {entry.dataset_name: entry.metric_value for entry in metadata.eval_results}
+    assert rates == {key: pytest.approx(entry.success.rate, abs=1e-4) for key, entry in results.validation.items()}

@@ -1,5 +1,74 @@
-"""The command ``pnpnet``: its arguments, the files of pairs that it reads, and one module per command."""
+"""The command ``pnpnet``: one module per command, with the command's arguments and its action.
 
-from kornia_pnpnet.cli.main import main
+To add a command, write a module whose docstring is the command's help (the first line its summary), with
+``add_arguments(parser)`` and ``run(arguments)``, which returns the exit code. Register the module in :data:`COMMANDS`.
+"""
 
-__all__ = ["main"]
+from __future__ import annotations
+
+import argparse
+import sys
+from types import ModuleType
+
+from kornia.core.exceptions import BaseError
+
+from kornia_pnpnet import __version__
+from kornia_pnpnet.cli import demo, evaluate, export, figures, listing, solve
+from kornia_pnpnet.cli.arguments import OneLineParser
+
+__all__ = ["COMMANDS", "main", "make_parser"]
+
+#: All commands by name, in the order of ``pnpnet --help``.
+COMMANDS: dict[str, ModuleType] = {
+    "solve": solve,
+    "evaluate": evaluate,
+    "figures": figures,
+    "export": export,
+    "list": listing,
+    "demo": demo,
+}
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Build the parser of ``pnpnet``; the parsed ``command`` is a key of :data:`COMMANDS`."""
+    parser = OneLineParser(prog="pnpnet", description="Camera poses from 2D-3D matches, even when some are wrong.")
+    parser.add_argument("--version", action="version", version=f"pnpnet {__version__}")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", dest="command", required=True)
+    for name, command in COMMANDS.items():
+        text = command.__doc__ or ""
+        command.add_arguments(
+            commands.add_parser(
+                name,
+                help=text.partition("\n")[0].rstrip("."),
+                description=text,
+                formatter_class=argparse.RawDescriptionHelpFormatter,
+            )
+        )
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        argv: arguments after ``pnpnet``. With ``None`` those of the process.
+
+    Returns:
+        The exit code: 0; 1 when ``solve`` found no pose; 2 for bad input; 130 when interrupted.
+    """
+    arguments = make_parser().parse_args(argv)
+    try:
+        return COMMANDS[arguments.command].run(arguments)
+    except (BaseError, OSError, ImportError, ValueError) as error:
+        print(f"pnpnet: {_one_line(error)}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("pnpnet: interrupted", file=sys.stderr)
+        return 130
+
+
+def _one_line(error: Exception) -> str:
+    if isinstance(error, OSError) and error.filename and error.strerror:
+        return " ".join(f"{error.filename}: {error.strerror}".splitlines())  # file names may contain line breaks
+    notes = (f"({note})" for note in getattr(error, "__notes__", ()))
+    return " ".join(" ".join([str(error) or type(error).__name__, *notes]).split())

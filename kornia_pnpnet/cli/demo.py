@@ -1,78 +1,128 @@
-"""``pnpnet demo``: the shipped weights beside OpenCV, a short training, pictures of both."""
+"""Solve problems beside OpenCV and PoseLib, then train for a minute.
+
+The problems are random, without and with outliers. The demo prints a table, trains a small network and draws pictures.
+
+  pnpnet demo --data path/to/colmap --out outputs/demo
+"""
 
 from __future__ import annotations
 
+import argparse
 import csv
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import nn
 
-from kornia_pnpnet.cli.pairs import rejection_limit, reprojections
-from kornia_pnpnet.evaluation.comparison import EvaluationData, evaluate, format_table, save_results
-from kornia_pnpnet.evaluation.figures import plot_errors, plot_pose, plot_success, plot_training
+from kornia_pnpnet.cli.arguments import add_arbitrary_unit, positive_float, whole_number
+from kornia_pnpnet.cli.reprojection import reproject
+from kornia_pnpnet.evaluation.comparison import EvaluationData, evaluate
 from kornia_pnpnet.evaluation.named_solvers import default_solvers, load_solver
 from kornia_pnpnet.evaluation.problem_sets import evaluation_sets
-
-__all__ = ["run_demo"]
+from kornia_pnpnet.evaluation.results import format_table, save_results
 
 _N = 9
-_SOLVERS = (f"pnpnet-n{_N}", f"net-n{_N}", "epnp-lm", "p3p-ransac", "opencv-ransac")  # enough to see at a glance
+_SOLVERS = ("pnpnet-set", f"pnpnet-n{_N}", "opencv-ransac", "poselib")
 
 
-def run_demo(
-    folder: Path, *, data: str | None = None, metric: bool = True, count: int = 1000, train_seconds: float = 60.0
-) -> None:
-    """Compare the solvers, train, draw; print what comes out.
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of ``pnpnet demo``."""
+    parser.add_argument(
+        "--data", metavar="FOLDER", help="a COLMAP model or an .npz file of matches instead of random problems"
+    )
+    add_arbitrary_unit(parser)
+    parser.add_argument("--out", metavar="FOLDER", default="outputs/demo", help="default: outputs/demo")
+    parser.add_argument(
+        "--problems", metavar="COUNT", type=whole_number(1), default=1000, help="problems per set; default: 1000"
+    )
+    parser.add_argument(
+        "--train-seconds",
+        metavar="SECONDS",
+        type=lambda text: 0.0 if text in ("0", "0.0") else positive_float(text),
+        default=60.0,
+        help="approximate duration of the training; 0 skips the training; default: 60",
+    )
 
-    Args:
-        folder: where ``results.json``, the pictures and the training run go.
-        data: a scene (see :func:`~kornia_pnpnet.data.load_scene`) instead of synthetic problems.
-        metric: whether the scene is in metres.
-        count: problems per set.
-        train_seconds: how long to train, roughly; 0 leaves it out.
-    """
-    names = [name for name in default_solvers(_N, [data or "synthetic"]) if name.partition(":")[0] in _SOLVERS]
-    if f"pnpnet-n{_N}" not in names:
-        print(f"pnpnet: no weights pnpnet-n{_N} are shipped, going on without", file=sys.stderr)
+
+def run(arguments: argparse.Namespace) -> int:
+    """Compare the solvers, draw, train; end with the :func:`verdict`."""
+    from kornia_pnpnet.evaluation.figures import plot_errors, plot_success, plot_training
+
+    sources = [arguments.data or "synthetic"]
+    names = [name for name in default_solvers(_N, sources) if name.partition(":")[0] in _SOLVERS]
+    for missing in sorted({*_SOLVERS} - {name.partition(":")[0] for name in names}):
+        print(f"pnpnet: the demo runs without {missing}, which is not installed", file=sys.stderr)
     sets = evaluation_sets(
-        [data or "synthetic"], "none,2" if data else "none,uniform", n=_N, count=count, metric=metric
+        sources,
+        "none,2" if arguments.data else "none,uniform",
+        n=_N,
+        count=arguments.problems,
+        metric=not arguments.arbitrary_unit,
     )
     solvers = {name: load_solver(name) for name in names}
-
-    # Tensors are small: more threads are no faster, and crawl when another process computes beside them.
+    # The tensors are small: more threads gain nothing, and lose much when another process computes at the same time.
     torch.set_num_threads(1)
-    print(f"{count} problems of {_N} pairs in each set, all solvers on the same ones, one thread:\n", flush=True)
+    print(f"{arguments.problems} problems of {_N} correspondences in each set, one thread:\n", flush=True)
     results = evaluate(solvers, sets)
     print(format_table(results), flush=True)
+    folder = Path(arguments.out)
     save_results(results, folder / "results.json")
-    made = [folder / "results.json"]
-    made += [plot_success(folder / "success.png", results), plot_errors(folder / "errors.png", results)]
-    name = names[0]
-    made.append(_draw_one(folder / "problem.png", name, solvers[name], list(sets.values())[-1]))
-    if train_seconds > 0:
-        history = _train(train_seconds, folder / "training")
+    files = [folder / "results.json"]
+    files += [plot_success(folder / "success.png", results), plot_errors(folder / "errors.png", results)]
+    files.append(_draw_one(folder / "problem.png", names[0], solvers[names[0]], list(sets.values())[-1]))
+    if arguments.train_seconds > 0:
+        history = _train(arguments.train_seconds, folder / "training")
         if history is not None:
-            made.append(plot_training(folder / "training.png", history))
-    print("\nSaved:", *made, sep="\n  ")
+            files.append(plot_training(folder / "training.png", history))
+    print("\nSaved:", *files, sep="\n  ")
+    print(f"\n{verdict(results)}")
+    return 0
+
+
+def verdict(results: Mapping[str, Any]) -> str:
+    """One sentence that says which solver solved the most problems of each set, and which one was the fastest.
+
+    Args:
+        results: what :func:`~kornia_pnpnet.evaluation.evaluate` returned.
+
+    Returns:
+        The sentence. Solvers whose 95 % interval contains the highest success rate share the first place.
+    """
+    parts = []
+    for data in results["data"]:
+        rows = [row for row in results["rows"] if row["data"] == data]
+        if not rows:
+            continue
+        best = max(row["success"]["rate"] for row in rows)
+        first = [_told(row) for row in rows if row["success"]["high"] >= best]
+        fastest = min(rows, key=lambda row: row["us_per_problem"])
+        parts.append(f"on {data!r} {' and '.join(first)} solved the most problems and {_told(fastest)} was the fastest")
+    return f"In short: {'; '.join(parts)}."
+
+
+def _told(row: Mapping[str, Any]) -> str:
+    return f"{row['solver']} ({100 * row['success']['rate']:.1f} %, {row['us_per_problem']:.0f} µs per problem)"
 
 
 def _draw_one(path: Path, name: str, solver: nn.Module, entry: EvaluationData) -> Path:
-    """Draw the first of the problems with the most outliers: whichever it is, not a chosen one."""
+    """Draw the first one of the problems with the most outliers, so that the picture is not a selected success."""
+    from kornia_pnpnet.evaluation.figures import plot_pose
+
     outliers = (~entry.problems.inliers).sum(-1)
     index = int((outliers == outliers.max()).int().argmax())
-    world, img, intrinsics = (part[index : index + 1] for part in entry.problems[:3])
+    problem = entry.problems.map(lambda part: part[index : index + 1])
     with torch.no_grad():
-        result = solver(world, img, intrinsics)
-    projected = reprojections(world, result.pose, intrinsics)[0]
-    errors = (projected - img[0]).norm(dim=-1)
-    rejected = ~(errors <= rejection_limit(errors))
-    return plot_pose(path, img[0], projected, rejected, title=f"{name}, {int(outliers[index])} wrong pairs")
+        result = solver(problem.world_points, problem.img_points, problem.intrinsics)
+    found = reproject(problem.world_points[0], problem.img_points[0], problem.intrinsics[0], result.pose)
+    title = f"{name}, {int(outliers[index])} outliers"
+    return plot_pose(path, problem.img_points[0], found.pixels, found.rejected, title=title)
 
 
 def _train(seconds: float, folder: Path) -> Path | None:
-    """Train briefly and say how far it came."""
+    """Train briefly and print the success rate before and after; ``None`` without the packages for training."""
     try:
         from kornia_pnpnet.training.loop import train_briefly
     except ImportError as error:

@@ -1,13 +1,8 @@
-"""Real scenes: COLMAP and ETH3D models and files of raw matches.
-
-Convention: ``x_cam = R x_world + t``. Pixels and camera matrices are COLMAP's: the centre of the top-left pixel is
-(0.5, 0.5). Everything is kept in float64 on the CPU.
-"""
+"""Readers of real scenes: COLMAP and ETH3D models, and files of raw matches."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,102 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["Scene", "View", "load_colmap", "load_matches", "load_scene"]
+from kornia_pnpnet.data.scenes import Scene, View
+
+__all__ = ["load_colmap", "load_matches", "load_scene"]
 
 # Folders of a model below the user's folder: the folder itself, ETH3D's layout, COLMAP's layout.
 _MODEL_FOLDERS = (".", "dslr_calibration_undistorted", "sparse/0", "sparse")
 _MODEL_FILES = ("cameras", "images", "points3D")
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    r"""One image of a scene: its observations and its pose.
-
-    Attributes:
-        name: the image's name, with its sub-folders if it has any.
-        world_points: the observed points in the unit of the scene, shape :math:`(M, 3)`, float64.
-        img_points: pixels of the points, with lens distortion removed, shape :math:`(M, 2)`, float64.
-        intrinsics: pinhole camera matrix in pixels, shape :math:`(3, 3)`.
-        rotation: world-to-camera rotation, shape :math:`(3, 3)`.
-        translation: world-to-camera translation, shape :math:`(3,)`.
-        width: image width in pixels.
-        height: image height in pixels.
-        inliers: whether the pixel shows the point, bool, shape :math:`(M,)`.
-
-    Raises:
-        ValueError: if a shape is wrong, a value is not finite, or ``rotation`` is not a rotation.
-    """
-
-    name: str
-    world_points: Tensor
-    img_points: Tensor
-    intrinsics: Tensor
-    rotation: Tensor
-    translation: Tensor
-    width: int
-    height: int
-    inliers: Tensor
-
-    def __post_init__(self) -> None:
-        count = len(self.world_points)
-        expected = {
-            "world_points": (count, 3),
-            "img_points": (count, 2),
-            "intrinsics": (3, 3),
-            "rotation": (3, 3),
-            "translation": (3,),
-            "inliers": (count,),
-        }
-        for field, shape in expected.items():
-            value: Tensor = getattr(self, field)
-            if value.shape != shape:
-                raise ValueError(f"image '{self.name}': {field} has shape {tuple(value.shape)}, expected {shape}")
-            if not value.isfinite().all():
-                raise ValueError(f"image '{self.name}': {field} has values that are not finite")
-        deviation = (self.rotation @ self.rotation.mT - torch.eye(3, dtype=self.rotation.dtype)).abs().max()
-        if deviation > 1e-3 or self.rotation.det() < 0:
-            raise ValueError(f"image '{self.name}': rotation is not a rotation matrix")
-
-    @property
-    def cam_points(self) -> Tensor:
-        """The observed points in the camera's frame, shape :math:`(M, 3)`."""
-        return self.world_points @ self.rotation.mT + self.translation
-
-    @property
-    def median_depth(self) -> float:
-        """Median depth of the observed points in the unit of the scene."""
-        return self.cam_points[:, 2].median().item()
-
-    @property
-    def reprojection_error_px(self) -> Tensor:
-        """Distance of each pixel to its point's projection, infinite behind the camera, shape :math:`(M,)`."""
-        cam_points = self.cam_points  # (M, 3)
-        in_front = cam_points[:, 2] > 0
-        projected = cam_points @ self.intrinsics.mT  # (M, 3)
-        error = (projected[:, :2] / projected[:, 2:] - self.img_points).norm(dim=1)
-        return torch.where(in_front, error, torch.inf)
-
-
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """The images of one scene.
-
-    Attributes:
-        name: the scene's name.
-        views: the images that observe enough points, sorted by name.
-        skipped: names of the images left out because they observe too few points.
-        metric: whether the unit is the metre; otherwise it is arbitrary.
-    """
-
-    name: str
-    views: tuple[View, ...]
-    skipped: tuple[str, ...] = ()
-    metric: bool = True
-
-    @property
-    def median_depth(self) -> float:
-        """Median depth of all observations in the unit of the scene."""
-        return torch.cat([view.cam_points[:, 2] for view in self.views]).median().item()
 
 
 def load_scene(path: str | Path, *, metric: bool = True, min_points: int = 10, max_error_px: float = 10.0) -> Scene:

@@ -18,7 +18,7 @@ from kornia_pnpnet.types import Problems
 
 __all__ = ["MixedProblems", "VaryingSize"]
 
-# Added to the seed for the numbers of pairs, which are another stream than the problems.
+# Added to the seed of the numbers of pairs. Large, because the sources have the seeds next to that of the stream.
 _SIZES = 1_000_003
 
 

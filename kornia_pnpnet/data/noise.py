@@ -1,6 +1,6 @@
-"""The noise of synthetic problems: its standard deviations, and which of them a solver knows.
+"""The noise model of synthetic problems: Gaussian noise, its standard deviations, and which of them a solver knows.
 
-Another noise model is another :func:`draw_noise`.
+To change the noise model, change :func:`draw_noise`: all noise of pixels and world points is drawn there.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def hide_sigmas(
     Args:
         img_sigma: standard deviation of the pixels of each problem, :math:`(B,)`.
         world_sigma: standard deviation of the points of each problem, :math:`(B,)`.
-        known: share of problems whose standard deviations are both known. Of the others a third know one of them.
+        known: share of problems whose standard deviations are both known. In a third of the others one is known.
         generator: source of randomness.
 
     Returns:

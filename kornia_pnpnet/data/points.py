@@ -1,6 +1,6 @@
-"""Priors of world points, drawn in the camera's frame: the protocol's box, slabs, objects.
+"""Priors of points in the camera's frame: the protocol's box, slabs, objects.
 
-A new prior is one more class with the call of :class:`PointPrior`.
+A new prior is one more class with the ``__call__`` of :class:`PointPrior`.
 """
 
 from __future__ import annotations
@@ -17,6 +17,9 @@ from kornia_pnpnet.data.draws import log_uniform, normal, random_poses, uniform
 
 __all__ = ["BoxPoints", "ObjectPoints", "PointPrior", "SlabPoints"]
 
+# Smallest depth of a slab's tilted surface relative to its distance. A choice: keeps it in front of the camera.
+_LEAST_SURFACE = 0.3
+
 
 class PointPrior(Protocol):
     """Draws points in the camera frame, shape ``(batch_size, n, 3)``, float64."""
@@ -30,12 +33,12 @@ class BoxPoints:
     r"""The protocol's points: uniform in a box in front of the camera, in its frame.
 
     Args:
-        half_width: :math:`|x|` and :math:`|y|` are at most this.
-        z_near: depth of the box's near face.
-        depth: length of the box along the optical axis.
+        half_width: largest :math:`|x|` and :math:`|y|`, in the unit of the world.
+        z_near: depth of the box's near face, in the unit of the world.
+        depth: length of the box along the optical axis, in the unit of the world.
 
     Raises:
-        BaseError: for a box that is not in front of the camera.
+        BaseError: for a negative length, or a near face that is not in front of the camera.
 
     Example:
         >>> points = BoxPoints(half_width=2.0, z_near=1.0, depth=3.0)(5, 9, torch.Generator().manual_seed(0))
@@ -67,7 +70,7 @@ class SlabPoints:
     Args:
         window: smallest and largest half-size of the window as tangents of the viewing angle, uniform for each axis.
         field_of_view: the window lies within this tangent on both axes.
-        distance: smallest and largest distance :math:`d`, log-uniform.
+        distance: smallest and largest distance :math:`d` in the unit of the world, log-uniform.
         tilt: standard deviation of the slopes :math:`g`.
         thickness: smallest and largest thickness :math:`e` relative to the distance, log-uniform.
 
@@ -102,7 +105,7 @@ class SlabPoints:
         direction = centre + half * uniform((batch_size, n, 2), -1.0, 1.0, generator)
         slope = self.tilt * normal((batch_size, 1, 2), generator)
         rise = slope * (direction - centre)  # (B, n, 2)
-        surface = (1.0 + (rise[..., 0] + rise[..., 1])).clamp(min=0.3)
+        surface = (1.0 + (rise[..., 0] + rise[..., 1])).clamp(min=_LEAST_SURFACE)
         thickness = log_uniform((batch_size, 1), *self.thickness, generator)
         layer = 1.0 + thickness * uniform((batch_size, n), 0.0, 1.0, generator)
         z = log_uniform((batch_size, 1), *self.distance, generator) * surface * layer  # (B, n)

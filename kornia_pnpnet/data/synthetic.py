@@ -1,4 +1,4 @@
-"""The protocol's random problems, as an endless, seeded stream of batches."""
+"""Synthetic problems: an endless, seeded source of batches, made of points, noise and outliers."""
 
 from __future__ import annotations
 
@@ -10,25 +10,23 @@ import torch
 from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_numbers, check_positive, check_whole
-from kornia_pnpnet.data.draws import batch_generator, log_uniform, normal, random_poses, uniform
+from kornia_pnpnet.data.draws import batch_generator, random_poses, uniform
 from kornia_pnpnet.data.noise import checked_sigma, draw_noise, hide_sigmas
-from kornia_pnpnet.data.outliers import OutlierMix
+from kornia_pnpnet.data.outliers import OutlierMix, near_offsets, structured_points
 from kornia_pnpnet.data.points import BoxPoints, PointPrior
 from kornia_pnpnet.types import Problems
 
 __all__ = ["SyntheticProblems"]
 
-# Standard deviations. The distance of a near outlier from its pixel is log-uniform in this range.
-_NEAR = 5.0, 50.0
-# A point is seen when the cosine between its direction and the optical axis is more than this.
+# A camera sees a point when the cosine between its direction and the optical axis is larger. A choice: 87 degrees.
 _LEAST_COSINE = 0.05
 
 
 class SyntheticProblems:
     r"""Random problems of the protocol, endless and reproducible: batch ``i`` depends on ``seed`` and ``i`` alone.
 
-    A pose is drawn, and points in the camera's frame, which the inverse pose moves to the world. World coordinates and
-    pixels get Gaussian noise, and some pairs become outliers. The defaults are the protocol's ``paper``
+    Points are drawn in the camera's frame, and the inverse of a random pose moves them to the world. World coordinates
+    and pixels get Gaussian noise, and some pairs become outliers. The defaults are the protocol's ``paper``
     distribution; ``gaussian_pose`` is ``translation_sigma=25`` and ``fixed_mismatches`` is
     ``outliers=OutlierMix(count=k, mismatch_share=1.0)``.
 
@@ -46,7 +44,8 @@ class SyntheticProblems:
         img_sigma: standard deviation of the noise on each pixel coordinate, or a range from which each problem draws
             one, log-uniform.
         world_sigma: standard deviation of the noise on each world coordinate, or a range.
-        known_noise: share of the problems that come with both sigmas. A third of the other problems come with one.
+        known_noise: share of the problems that come with both sigmas. A third of the other problems come with one of
+            them; unknown sigmas are NaN.
         dtype: dtype of the batches; numbers are drawn in float64 and cast.
         device: device of the batches.
 
@@ -133,7 +132,7 @@ class SyntheticProblems:
         world_points += noise
         seen = torch.where(draw.mismatch[..., None], other_points, cam_points)
         if draw.structured is not None:
-            seen = torch.where(draw.structured[..., None], _moved(cam_points, generator), seen)
+            seen = torch.where(draw.structured[..., None], structured_points(cam_points, generator), seen)
         # A point that is not in front of the camera has no pixel: its pair is an outlier.
         behind = seen[..., 2] <= _LEAST_COSINE * seen.norm(dim=-1)
         seen = torch.where(behind[..., None], torch.ones_like(seen), seen)
@@ -142,9 +141,7 @@ class SyntheticProblems:
         noise, img_sigma = draw_noise(img_points.shape, self.img_sigma, generator)
         img_points += noise
         if draw.near is not None:
-            off = torch.nn.functional.normalize(normal(img_points.shape, generator), dim=-1)
-            off *= log_uniform((*img_points.shape[:2], 1), *_NEAR, generator) * img_sigma[:, None, None]
-            img_points += torch.where(draw.near[..., None], off, 0.0)
+            img_points += torch.where(draw.near[..., None], near_offsets(img_sigma, self.n, generator), 0.0)
         sigmas: dict[str, Tensor] = {}
         if self.known_noise:
             img_sigma, world_sigma = hide_sigmas(img_sigma, world_sigma, self.known_noise, generator)
@@ -152,13 +149,3 @@ class SyntheticProblems:
         intrinsics = torch.diag(img_points.new_tensor((self.focal, self.focal, 1.0))).expand(self.batch_size, 3, 3)
         problems = Problems(world_points, img_points, intrinsics, pose, draw.inliers & ~behind, **sigmas)
         return problems.map(lambda x: x.to(self.dtype) if x.is_floating_point() else x)
-
-
-def _moved(cam_points: Tensor, generator: torch.Generator) -> Tensor:
-    """The points of each problem rotated about their centre and shifted, (B, n, 3)."""
-    batch_size = len(cam_points)
-    centre = cam_points.mean(1, keepdim=True)
-    size = (cam_points - centre).square().sum(-1).mean(1).sqrt()[:, None, None]
-    turn = random_poses(batch_size, generator, max_angle=math.pi).rotation
-    shift = 0.5 * size * normal((batch_size, 1, 3), generator)
-    return (cam_points - centre) @ turn.mT + centre + shift

@@ -1,4 +1,4 @@
-"""The instrument: counts the scalar operations of tensor code while it runs."""
+"""Count scalar operations by running the code."""
 
 from __future__ import annotations
 
@@ -10,14 +10,7 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from kornia_pnpnet.evaluation.operations.costs import (
-    Operations,
-    cholesky,
-    matmul,
-    smallest,
-    solve,
-    sort,
-)
+from kornia_pnpnet.evaluation.operations.costs import Operations, cholesky, matmul, smallest, solve, sort
 
 __all__ = ["OperationCounter", "count_per_problem"]
 
@@ -30,7 +23,8 @@ def _each(names: str, operations: Operations) -> dict[str, Operations]:
     return dict.fromkeys(names.split(), operations)
 
 
-#: Operations per entry of the result. The first group moves, makes or views data, changes signs or draws at random.
+# Operations for each entry of the result. The first rows only create, move or view data, change signs or draw random
+# numbers, which costs nothing.
 _ELEMENTWISE: dict[str, Operations] = {
     **_each("_to_copy _unsafe_view alias arange cat clone constant_pad_nd copy detach diag_embed", _NOTHING),
     **_each("diagonal empty empty_like expand eye fill flip full full_like gather index index_put", _NOTHING),
@@ -54,7 +48,7 @@ _ELEMENTWISE: dict[str, Operations] = {
     **_each("bitwise_and bitwise_not bitwise_or masked_fill where", _LOGIC),
 }
 
-#: Operations per reduced entry, except the first entry of each result.
+# Operations for each input entry of a reduction, except for the first entry of each result.
 _REDUCTIONS: dict[str, Operations] = {
     **_each("cumsum sum", _ADD),
     **_each("prod", _MULTIPLY),
@@ -62,16 +56,16 @@ _REDUCTIONS: dict[str, Operations] = {
     **_each("all any", _LOGIC),
 }
 
-#: Operations per row, from its length.
+# Operations for one row, by its length.
 _ROWS: dict[str, Callable[[int], Operations]] = {
     "linalg_vector_norm": lambda length: Operations(add=length - 1, multiply=length, sqrt=1),
-    # Subtract the largest, divide exponentials by their sum.
+    # Subtract the maximum, divide the exponentials by their sum.
     "_softmax": lambda length: Operations(add=2 * length - 1, divide=length, exp=length, compare=length - 1),
-    # Subtract the mean, divide by the root of the variance plus a small number, apply weight and bias.
+    # Subtract the mean, divide by the root of variance plus epsilon, apply weight and bias.
     "native_layer_norm": lambda length: Operations(add=4 * length - 1, multiply=3 * length, divide=3, sqrt=1),
 }
 
-#: Operations per matrix of the batch, from the sizes of the arguments.
+# Operations for one matrix of the batch, by the shapes of the input matrices.
 _MATRIX: dict[str, Callable[..., Operations]] = {
     "mm": lambda first, second: matmul(first[0], first[1], second[1]),
     "bmm": lambda first, second: matmul(first[0], first[1], second[1]),
@@ -82,7 +76,7 @@ _MATRIX: dict[str, Callable[..., Operations]] = {
 
 
 def _power(exponent: Any) -> Operations:
-    """Raising to a power (``flops_pow``): by products and a root where the exponent allows it."""
+    """Cost of a power (``flops_pow``): products and a root for a multiple of 1/2, else exponential and logarithm."""
     if isinstance(exponent, Tensor) or not float(2 * exponent).is_integer():
         return _EXP + _LOG + _MULTIPLY
     whole, half = divmod(abs(exponent), 1)
@@ -92,7 +86,7 @@ def _power(exponent: Any) -> Operations:
 
 
 def _operations(name: str, call: dict[str, Any], output: Any) -> Operations:
-    """Operations of one call of an ATen operation."""
+    """Operations of one call of the PyTorch operation ``aten.<name>`` with the given arguments and output."""
     result = output[0] if isinstance(output, tuple | list) else output
     if name in _ELEMENTWISE:
         cost = _ELEMENTWISE[name]
@@ -118,11 +112,11 @@ def _operations(name: str, call: dict[str, Any], output: Any) -> Operations:
         if name == "sort":
             return rows * sort(length)
         return rows * (smallest(length, call["k"]) + (sort(call["k"]) if call["sorted"] else _NOTHING))
-    raise NotImplementedError(f"The cost of aten.{name} is unknown: add it to {__name__}.")
+    raise NotImplementedError(f"The cost of aten.{name} is unknown. Add the cost to {__name__}.")
 
 
 def _rows(call: dict[str, Any]) -> tuple[int, int]:
-    """Number of entries of the argument of an operation on rows, and the length of a row."""
+    """Number of input entries of an operation on rows, and the length of one row."""
     tensor = next(value for value in call.values() if isinstance(value, Tensor))
     if "normalized_shape" in call:
         return tensor.numel(), math.prod(call["normalized_shape"])
@@ -130,28 +124,25 @@ def _rows(call: dict[str, Any]) -> tuple[int, int]:
     return tensor.numel(), math.prod(tensor.shape[dim] for dim in dims)
 
 
-# --- the instrument ---------------------------------------------------------------------------------------------------
-
-
 class OperationCounter(TorchDispatchMode):
     """Count the operations of the tensor code that runs inside a ``with`` block.
 
     Attributes:
-        total: the :class:`Operations` so far.
+        operations: the :class:`Operations` so far.
 
     Raises:
-        NotImplementedError: for an ATen operation of unknown cost, so that none is left out unnoticed.
+        NotImplementedError: for a PyTorch operation whose cost is unknown, so that no operation is missed.
 
     Example:
         >>> with OperationCounter() as counter:
         ...     product = torch.ones(4, 2, 3) @ torch.ones(4, 3, 5)
-        >>> counter.total.multiply, counter.total.add
+        >>> counter.operations.multiply, counter.operations.add
         (120, 80)
     """
 
     def __init__(self) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
-        self.total = _NOTHING
+        self.operations = Operations()
 
     def __torch_dispatch__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
@@ -161,17 +152,19 @@ class OperationCounter(TorchDispatchMode):
         names = [argument.name for argument in func._schema.arguments]
         call = {argument.name: argument.default_value for argument in func._schema.arguments}
         call |= dict(zip(names, args, strict=False)) | (kwargs or {})
-        self.total += _operations(func.overloadpacket.__name__.rstrip("_"), call, output)
+        self.operations += _operations(func.overloadpacket.__name__.rstrip("_"), call, output)
         return output
 
 
-def count_per_problem(run: Callable[[int], object]) -> Operations:
+def count_per_problem(run: Callable[[int], object], batch: int = 2) -> Operations:
     """Count the operations that each further problem of a batch costs.
 
-    Work that is done once for the whole batch drops out: the counts of a run of two and a run of four are subtracted.
+    The count is the difference between a run of ``2 * batch`` and a run of ``batch`` problems, divided by ``batch``.
+    Operations that a batch executes once for all problems cancel out.
 
     Args:
         run: solves a batch of the given size.
+        batch: number of problems in the smaller run.
 
     Returns:
         The operations for one problem.
@@ -180,10 +173,10 @@ def count_per_problem(run: Callable[[int], object]) -> Operations:
         >>> count_per_problem(lambda batch: torch.ones(batch, 5).sum(-1) * torch.ones(3).sum()).add
         4.0
     """
-    totals = []
-    for batch in (2, 4):
+    counts = []
+    for size in (batch, 2 * batch):
         with torch.no_grad(), OperationCounter() as counter:
-            run(batch)
-        totals.append(counter.total)
-    small, large = totals
-    return 0.5 * (large + -1 * small)
+            run(size)
+        counts.append(counter.operations)
+    small, large = counts
+    return 1 / batch * (large + -1 * small)

@@ -1,4 +1,4 @@
-"""EPnP: the initialiser (``epnp``), its control points and the equations of their depths (``depths``)."""
+"""EPnP: ``epnp`` has the initialiser, ``control_points`` the control points, ``depths`` the equations of depths."""
 
 from kornia_pnpnet.init.epnp.epnp import EPnP
 

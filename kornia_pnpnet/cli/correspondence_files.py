@@ -1,0 +1,214 @@
+"""Files of the correspondences of one image, CSV or NPZ, and the camera of the command line."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import IO, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+__all__ = [
+    "ImageCorrespondences",
+    "InputError",
+    "camera_matrix",
+    "check_camera",
+    "check_points_present",
+    "check_shapes",
+    "read_arrays",
+    "read_correspondences",
+]
+
+_COLUMNS = ("X", "Y", "Z", "u", "v")
+_MIN_COUNT = 3
+_ZIP_MAGIC = b"PK\x03\x04"
+
+
+class InputError(ValueError):
+    """A file or a camera cannot be used. The message is one line and names the file and, in text files, the line."""
+
+    def __init__(self, source: str | Path, message: str, line: int | None = None) -> None:
+        where = f"{source}:{line}" if line is not None else str(source)
+        super().__init__(f"{where}: {' '.join(message.split())}")
+
+
+class ImageCorrespondences(NamedTuple):
+    r"""The correspondences of one image, in float64.
+
+    Attributes:
+        world_points: shape :math:`(N, 3)`.
+        img_points: pixels, shape :math:`(N, 2)`.
+        weights: at least 0, shape :math:`(N,)`, or ``None``.
+        intrinsics: camera matrix, shape :math:`(3, 3)`, or ``None``.
+    """
+
+    world_points: Tensor
+    img_points: Tensor
+    weights: Tensor | None = None
+    intrinsics: Tensor | None = None
+
+
+def camera_matrix(text: str) -> Tensor:
+    """Read a camera from ``fx,fy,cx,cy`` in pixels.
+
+    Args:
+        text: four numbers with commas between them; the focal lengths must be positive.
+
+    Returns:
+        The camera matrix, shape :math:`(3, 3)`, float64.
+
+    Raises:
+        InputError: for other text or a focal length that is not positive.
+
+    Example:
+        >>> camera_matrix("100,100,320,240")[0]
+        tensor([100.,   0., 320.], dtype=torch.float64)
+    """
+    try:
+        fx, fy, cx, cy = (float(part) for part in text.split(","))
+    except ValueError:
+        raise InputError("--intrinsics", f"expected four numbers fx,fy,cx,cy, got {text!r}") from None
+    matrix = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    return check_camera(matrix, "--intrinsics")
+
+
+def check_camera(matrix: Tensor, source: str | Path) -> Tensor:
+    r"""Return a camera matrix unchanged when it is one of a pinhole camera without skew.
+
+    Args:
+        matrix: shape :math:`(3, 3)`.
+        source: the file or option that holds the matrix, for the message.
+
+    Raises:
+        InputError: for any other matrix.
+    """
+    if not matrix.isfinite().all():
+        raise InputError(source, "the intrinsics are not finite")
+    if matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
+        focal = f"{matrix[0, 0]:g} and {matrix[1, 1]:g}"
+        raise InputError(source, f"the focal lengths must be positive, got {focal}")
+    if matrix[0, 1] != 0:
+        raise InputError(source, f"the camera must have no skew, got {matrix[0, 1]:g}")
+    if matrix[1, 0] != 0 or not torch.equal(matrix[2], matrix.new_tensor((0.0, 0.0, 1.0))):
+        raise InputError(source, "the intrinsics must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+    return matrix
+
+
+def read_correspondences(path: str | Path) -> ImageCorrespondences:
+    """Read the correspondences of one image.
+
+    Args:
+        path: a CSV file with the header ``X,Y,Z,u,v`` in any order, an optional column ``weight`` and any others; or
+            an NPZ file with the arrays ``world_points`` (N, 3), ``img_points`` (N, 2) and optionally ``weights``
+            (N,) and ``intrinsics`` (3, 3). Nothing is unpickled.
+
+    Returns:
+        At least three finite correspondences, in the order of the file.
+
+    Raises:
+        InputError: when the content cannot be used.
+        OSError: when the file cannot be read.
+    """
+    path = Path(path)
+    content = path.read_bytes()
+    is_npz = path.suffix.lower() == ".npz" or content.startswith(_ZIP_MAGIC)
+    read = _read_npz(path, content) if is_npz else _read_csv(path, content)
+    if len(read.world_points) < _MIN_COUNT:
+        raise InputError(path, f"a pose needs at least {_MIN_COUNT} correspondences, got {len(read.world_points)}")
+    return read
+
+
+def _read_csv(path: Path, content: bytes) -> ImageCorrespondences:
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(path, "not a text file in UTF-8", content[: error.start].count(b"\n") + 1) from None
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    try:
+        lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
+    except csv.Error as error:
+        raise InputError(path, f"not a CSV file: {error}", reader.line_num) from None
+    lines = [(line, cells) for line, cells in lines if any(cells)]
+    (header_line, header), *rows = lines or [(1, [""])]
+    columns = [*_COLUMNS, "weight"] if "weight" in header else [*_COLUMNS]
+    if any(header.count(column) != 1 for column in columns):
+        found = ",".join(header)[:60]
+        raise InputError(path, f"expected the header {','.join(_COLUMNS)}, each once, found {found!r}", header_line)
+    numbers = []
+    for line, cells in rows:
+        if len(cells) != len(header):
+            raise InputError(path, f"{len(cells)} values, but the header has {len(header)} columns", line)
+        numbers.append([_number(path, line, column, cells[header.index(column)]) for column in columns])
+    table = torch.tensor(numbers, dtype=torch.float64).reshape(-1, len(columns))
+    return ImageCorrespondences(table[:, :3], table[:, 3:5], table[:, 5] if "weight" in columns else None)
+
+
+def _number(path: Path, line: int, column: str, cell: str) -> float:
+    try:
+        value = float(cell)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value) or (column == "weight" and value < 0):
+        wanted = "a number of at least 0" if column == "weight" else "a finite number"
+        raise InputError(path, f"{column} must be {wanted}, got {cell[:40]!r}", line)
+    return value
+
+
+def _read_npz(path: Path, content: bytes) -> ImageCorrespondences:
+    arrays = read_arrays(path, io.BytesIO(content), ("world_points", "img_points", "weights", "intrinsics"))
+    count = len(arrays["world_points"]) if arrays["world_points"].ndim else 0
+    shapes = {"world_points": (count, 3), "img_points": (count, 2), "weights": (count,), "intrinsics": (3, 3)}
+    check_shapes(path, arrays, {name: (shape,) for name, shape in shapes.items()})
+    for name, array in arrays.items():
+        bad = ~np.isfinite(array) | ((name == "weights") & (array < 0))
+        if bad.any():
+            wanted = "finite and at least 0" if name == "weights" else "finite"
+            raise InputError(path, f"{name}[{int(np.nonzero(bad)[0][0])}] must be {wanted}")
+    tensors = {name: torch.tensor(array.astype(np.float64)) for name, array in arrays.items()}
+    if "intrinsics" in tensors:
+        check_camera(tensors["intrinsics"], path)
+    return ImageCorrespondences(**tensors)
+
+
+def read_arrays(path: Path, stream: IO[bytes], names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Read arrays of an NPZ file without unpickling.
+
+    Args:
+        path: the path of the file, for messages.
+        stream: the content of the file.
+        names: the arrays to read. Only ``world_points`` and ``img_points`` must be in the file.
+
+    Returns:
+        The arrays that are in the file, by name.
+
+    Raises:
+        InputError: when the file is no NPZ file of plain arrays, or ``world_points`` or ``img_points`` is missing.
+    """
+    try:
+        with np.load(stream, allow_pickle=False) as file:
+            arrays = {name: np.asarray(file[name]) for name in names if name in file.files}
+    except Exception as error:  # numpy, zipfile and zlib raise a dozen types of errors for broken files
+        raise InputError(path, f"not an NPZ file of plain arrays: {error}") from None
+    check_points_present(path, arrays, "array")
+    return arrays
+
+
+def check_points_present(path: Path, names: Collection[str], kind: str) -> None:
+    """Raise an :class:`InputError` when ``world_points`` or ``img_points``, an "array" or "column", is missing."""
+    for name in ("world_points", "img_points"):
+        if name not in names:
+            raise InputError(path, f"no {kind} {name}")
+
+
+def check_shapes(path: Path, arrays: Mapping[str, np.ndarray], shapes: Mapping[str, Sequence[tuple[int, ...]]]) -> None:
+    """Raise an :class:`InputError` when an array holds no numbers or has none of the shapes allowed for its name."""
+    for name, array in arrays.items():
+        if array.dtype.kind not in "fiub" or array.shape not in shapes[name]:
+            wanted = " or ".join(map(str, shapes[name]))
+            got = f"{array.dtype} of {array.shape}"
+            raise InputError(path, f"{name} must hold numbers of the shape {wanted}, got {got}")

@@ -1,0 +1,36 @@
+"""Write a solver as an ONNX model.
+
+The model solves batches of any size. ONNX Runtime runs the model without PyTorch.
+
+  pnpnet export pnpnet-set.onnx
+"""
+
+from __future__ import annotations
+
+import argparse
+
+from kornia_pnpnet.cli.arguments import load_solver_without_truth, whole_number
+from kornia_pnpnet.export import INPUTS, OUTPUTS, export_onnx
+from kornia_pnpnet.solver import PnPNet
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of ``pnpnet export``."""
+    parser.add_argument("file", metavar="ONNX", help="the file to write")
+    parser.add_argument("--solver", metavar="NAME", default="pnpnet-set", help="default: pnpnet-set")
+    parser.add_argument(
+        "--n",
+        metavar="N",
+        type=whole_number(1),
+        help="correspondences per problem; default: any number",
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Write the model; print its size, inputs and outputs."""
+    solver = load_solver_without_truth(arguments.solver)
+    if not isinstance(solver, PnPNet):
+        raise ValueError(f"--solver: {arguments.solver} belongs to another library and cannot be exported")
+    path = export_onnx(solver, arguments.file, arguments.n)
+    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, {', '.join(INPUTS)} -> {', '.join(OUTPUTS)}")
+    return 0

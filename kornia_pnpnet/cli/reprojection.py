@@ -1,0 +1,76 @@
+"""How well a pose explains the correspondences of one image: reprojection errors and rejected correspondences."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from kornia.geometry.conversions import convert_points_from_homogeneous, denormalize_points_with_intrinsics
+from torch import Tensor
+
+from kornia_pnpnet.geometry import transform
+from kornia_pnpnet.types import Pose
+
+__all__ = ["Reprojection", "rejection_limit", "reproject"]
+
+#: Median absolute deviation to standard deviation of a normal distribution.
+_MAD_TO_SIGMA = 1.4826
+#: Lowest limit in pixels: about three standard deviations of a corner detector's noise.
+_MIN_LIMIT_PX = 3.0
+
+
+class Reprojection(NamedTuple):
+    r"""The correspondences of one image under a pose.
+
+    Attributes:
+        pixels: projections of the world points, shape :math:`(N, 2)`; NaN where a point is not in front of the camera.
+        errors_px: reprojection errors in pixels, shape :math:`(N,)`; NaN where ``pixels`` is NaN.
+        limit_px: largest error in pixels of a correspondence that is not rejected.
+        rejected: whether the error is NaN or above the limit, shape :math:`(N,)`, bool.
+    """
+
+    pixels: Tensor
+    errors_px: Tensor
+    limit_px: float
+    rejected: Tensor
+
+
+def reproject(
+    world_points: Tensor, img_points: Tensor, intrinsics: Tensor, pose: Pose, limit_px: float | None = None
+) -> Reprojection:
+    r"""Compare the pixels of one image with the projections of its world points.
+
+    Args:
+        world_points: shape :math:`(N, 3)`.
+        img_points: pixels, shape :math:`(N, 2)`.
+        intrinsics: shape :math:`(3, 3)`.
+        pose: world-to-camera pose with a batch of 1.
+        limit_px: error in pixels above which a correspondence is rejected. With ``None`` the :func:`rejection_limit`.
+    """
+    cam_points = transform(pose, world_points[None])[0]
+    in_front = cam_points[:, 2:] > 0
+    plane_points = convert_points_from_homogeneous(torch.where(in_front, cam_points, 1.0), eps=0.0)
+    pixels = torch.where(in_front, denormalize_points_with_intrinsics(plane_points, intrinsics), torch.nan)
+    errors = (pixels - img_points).norm(dim=-1)
+    limit = rejection_limit(errors) if limit_px is None else limit_px
+    return Reprojection(pixels, errors, limit, ~(errors <= limit))
+
+
+def rejection_limit(errors_px: Tensor) -> float:
+    r"""Robust estimate of three standard deviations of the inliers' reprojection errors.
+
+    Args:
+        errors_px: reprojection errors of one image in pixels, shape :math:`(N,)`. Errors that are not finite are
+            ignored.
+
+    Returns:
+        Three times 1.4826 times the median error in pixels, at least 3 px.
+
+    Example:
+        >>> rejection_limit(torch.tensor([0.1, 0.2, 900.0])), rejection_limit(torch.tensor([9.0, 10.0, 11.0]))
+        (3.0, 44.478)
+    """
+    finite = errors_px[errors_px.isfinite()]
+    if not len(finite):
+        return _MIN_LIMIT_PX
+    return max(_MIN_LIMIT_PX, 3.0 * _MAD_TO_SIGMA * finite.double().quantile(0.5).item())

@@ -1,0 +1,149 @@
+"""Find the pose of one image, or of many problems in files.
+
+The pose of one image is printed as JSON: x_cam = R x_world + t.
+
+  pnpnet solve matches.csv --intrinsics 3400,3400,3024,2016 --plot pose.png
+
+With --batch, files of many problems are solved in bounded memory and their poses are written to files. The same command
+continues where it was stopped. The files, called shards, are NPZ files with world_points (B, N, 3), img_points
+(B, N, 2) and optionally weights, intrinsics, img_sigma and world_sigma, or Parquet files with columns of these names
+and one problem per row.
+
+  pnpnet solve --batch shards/ --out poses/
+
+Exit code: 0 when solved, 1 when no pose explains the correspondences, 2 for bad input.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+
+import torch
+from kornia.geometry.conversions import rotation_matrix_to_quaternion
+from torch import Tensor
+
+from kornia_pnpnet import shipped_weights
+from kornia_pnpnet.cli.arguments import load_solver_without_truth, picture_path, positive_float, whole_number
+from kornia_pnpnet.cli.correspondence_files import InputError, camera_matrix, read_correspondences
+from kornia_pnpnet.cli.reprojection import reproject
+from kornia_pnpnet.cli.shards import solve_shards
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of ``pnpnet solve``."""
+    parser.add_argument(
+        "file",
+        metavar="FILE",
+        nargs="+",
+        help="CSV with the header X,Y,Z,u,v and optionally weight, or NPZ with world_points (N, 3), img_points (N, 2) "
+        "and optionally weights (N,) and intrinsics (3, 3)",
+    )
+    parser.add_argument(
+        "--intrinsics", metavar="fx,fy,cx,cy", help="the camera in pixels; replaces the intrinsics of an NPZ file"
+    )
+    parser.add_argument(
+        "--solver",
+        metavar="NAME",
+        help="a name of `pnpnet list`, or a folder of weights; default: pnpnet-nN for N correspondences where such "
+        "weights are shipped, or else pnpnet-set",
+    )
+    parser.add_argument(
+        "--plot", metavar="PNG", type=picture_path, help="draw pixels, reprojections and rejected correspondences"
+    )
+    parser.add_argument(
+        "--threshold",
+        metavar="PX",
+        type=positive_float,
+        help="reject correspondences with a larger reprojection error; default: a robust estimate of three standard "
+        "deviations, at least 3 px",
+    )
+    parser.add_argument("--batch", action="store_true", help="FILE are shards of many problems, or folders of shards")
+    parser.add_argument("--out", metavar="FOLDER", help="where --batch writes poses; default: outputs/poses")
+    parser.add_argument(
+        "--batch-size",
+        metavar="B",
+        type=whole_number(1),
+        default=10_000,
+        help="problems per call; default: 10000",
+    )
+    parser.add_argument("--overwrite", action="store_true", help="also solve the shards that have results")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Solve one image or, with ``--batch``, shards."""
+    camera = camera_matrix(arguments.intrinsics) if arguments.intrinsics else None
+    if arguments.batch:
+        return _solve_batch(arguments, camera)
+    if len(arguments.file) > 1 or arguments.out or arguments.overwrite:
+        raise ValueError("several files, --out and --overwrite need --batch")
+    return _solve_image(arguments, camera)
+
+
+def _solve_batch(arguments: argparse.Namespace, camera: Tensor | None) -> int:
+    if arguments.plot or arguments.threshold:
+        raise ValueError("--plot and --threshold are for one image, not for --batch")
+    name = arguments.solver or "pnpnet-set"
+    report = solve_shards(
+        load_solver_without_truth(name),
+        arguments.file,
+        arguments.out or "outputs/poses",
+        name=name,
+        intrinsics=camera,
+        batch=arguments.batch_size,
+        overwrite=arguments.overwrite,
+        watch=lambda shard, solved, count: print(f"{shard}: {solved} of {count} solved", flush=True),
+    )
+    for line in report.failed:
+        print(f"pnpnet: {line}", file=sys.stderr)
+    kept = f"; {report.kept} shards had been solved before" if report.kept else ""
+    print(f"{report.solved} of {report.problems} problems in {report.shards} shards solved{kept}")
+    return 2 if report.failed else 0
+
+
+def _solve_image(arguments: argparse.Namespace, camera: Tensor | None) -> int:
+    (path,) = arguments.file
+    matches = read_correspondences(path)
+    camera = matches.intrinsics if camera is None else camera
+    if camera is None:
+        raise InputError(path, "the file has no intrinsics: pass --intrinsics fx,fy,cx,cy")
+    count = len(matches.world_points)
+    name = arguments.solver or _default_solver(count)
+    solver = load_solver_without_truth(name)
+    weights = None if matches.weights is None else matches.weights[None]
+    with torch.no_grad():
+        result = solver(matches.world_points[None], matches.img_points[None], camera[None], weights)
+    found = reproject(matches.world_points, matches.img_points, camera, result.pose, arguments.threshold)
+    columns = (x.tolist() for x in (result.weights[0], found.errors_px, found.rejected))
+    answer = {
+        "solver": name,
+        "n": count,
+        "ok": result.ok.item(),
+        "rotation": result.rotation[0].tolist(),
+        "translation": result.translation[0].tolist(),
+        "quaternion_wxyz": rotation_matrix_to_quaternion(result.rotation)[0].tolist(),
+        "cost": result.cost.item(),
+        "rejected_above_px": found.limit_px,
+        "pairs": [
+            {"weight": weight, "reprojection_error_px": error if math.isfinite(error) else None, "rejected": rejected}
+            for weight, error, rejected in zip(*columns, strict=True)
+        ],
+    }
+    print(json.dumps(answer, indent=2, allow_nan=False))
+    if arguments.plot:
+        from kornia_pnpnet.evaluation.figures import plot_pose
+
+        plot_pose(arguments.plot, matches.img_points, found.pixels, found.rejected, title=name)
+    return 0 if answer["ok"] else 1
+
+
+def _default_solver(count: int) -> str:
+    """The shipped network for this number of correspondences, or else for any number."""
+    shipped = shipped_weights()
+    for name in (f"pnpnet-n{count}", "pnpnet-set"):
+        if name in shipped:
+            return name
+    print("pnpnet: no weights are shipped for these correspondences, using identity-lm", file=sys.stderr)
+    return "identity-lm"
