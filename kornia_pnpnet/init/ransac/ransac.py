@@ -151,7 +151,7 @@ class RANSAC(Configured):
         size = self.minimal.sample_size
         if corr.weights.shape[1] < size:
             raise ShapeError(
-                f"Samples of {size} pairs need at least as many, got N = {corr.weights.shape[1]}.",
+                f"Samples of {size} pairs need N >= {size}, got N = {corr.weights.shape[1]}.",
                 actual_shape=tuple(corr.world_points.shape),
                 expected_shape=["B", f"{size} or more", "3"],
             )
