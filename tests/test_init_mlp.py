@@ -9,7 +9,7 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import nn
 
 from kornia_pnpnet import Correspondences, MLPInit
-from kornia_pnpnet.init.mlp import _rotation
+from kornia_pnpnet.init.mlp import rotation_about
 
 
 def correspondences(n, batch=5, dtype=torch.float32, seed=0):
@@ -54,7 +54,7 @@ def test_axis_and_angle_turn_as_kornias_rotation_vectors(dtype):
     for at in (dtype, torch.float64):
         leaves = [x.to(dtype).to(at).requires_grad_() for x in (axis, angle)]
         if at == dtype:
-            rotation = _rotation(*leaves)
+            rotation = rotation_about(*leaves)
         else:
             floor = torch.finfo(dtype).eps
             length = (leaves[0].square().sum(0) + floor).sqrt()

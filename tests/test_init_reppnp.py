@@ -41,17 +41,6 @@ def flattened(corr, truth):
     return change(corr, world_points=(cam_points - truth.translation[:, None]) @ truth.rotation)
 
 
-@pytest.mark.parametrize("reject_outliers", [False, True])
-@pytest.mark.parametrize(("n", "planar"), [(6, False), (20, False), (50, False), (5, True), (20, True)])
-def test_exact_pairs_give_the_exact_pose(n, planar, reject_outliers, make_problems, correspond):
-    corr, truth = correspond(make_problems(n, 100, noise=False))
-    corr = flattened(corr, truth) if planar else corr
-    guess = REPPnP(reject_outliers=reject_outliers)(corr)
-    assert guess.ok.all()
-    assert guess.weights.all()
-    assert_same(guess.pose, truth, 1e-6 if planar else 1e-7)
-
-
 @pytest.mark.parametrize(("n", "outliers"), [(9, 1), (50, 12)])
 def test_gross_outliers_are_found_and_do_not_move_the_pose(n, outliers, make_problems, correspond):
     problems = make_problems(n, 200, outliers=outliers, noise=False)
@@ -111,65 +100,6 @@ def test_a_guess_is_hardly_ever_worse_in_float32(make_problems, correspond):
     assert errors.translation_error.max() < 1e-3
 
 
-@pytest.mark.parametrize("reject_outliers", [False, True])
-def test_a_pair_with_weight_zero_is_ignored(reject_outliers, make_problems, correspond, generator):
-    corr, _ = correspond(make_problems(12, 50, outliers=2))
-    weights = 0.5 + torch.rand(50, 12, generator=generator, dtype=torch.float64)
-    keep = [0, 2, 3, 5, 6, 7, 8, 10, 11]
-    part = change(corr, **{name: getattr(corr, name)[:, keep] for name in ("world_points", "img_points")})
-    part = part._replace(weights=weights[:, keep])
-    weights[:, [1, 4, 9]] = 0.0
-    model = REPPnP(reject_outliers=reject_outliers)
-    zero, removed = model(corr._replace(weights=weights)), model(part)
-    assert torch.equal(zero.weights[:, keep], removed.weights)
-    assert not zero.weights[:, [1, 4, 9]].any()
-    assert torch.equal(zero.ok, removed.ok)
-    good = removed.ok & removed.weights.all(-1) if not reject_outliers else removed.ok
-    assert_same(chosen(zero.pose, good), chosen(removed.pose, good))
-
-
-def test_weights_pull_the_pose(make_problems, correspond):
-    """In EPPnP a pair of weight 3 counts as three pairs."""
-    corr, _ = correspond(make_problems(8, 50))
-    times = torch.tensor([1, 3, 1, 1, 2, 1, 1, 1])
-    repeated = change(
-        corr,
-        world_points=corr.world_points.repeat_interleave(times, 1),
-        img_points=corr.img_points.repeat_interleave(times, 1),
-        weights=corr.weights.repeat_interleave(times, 1),
-    )
-    model = REPPnP(reject_outliers=False)
-    assert_same(model(corr._replace(weights=times.double().expand(50, 8))).pose, model(repeated).pose)
-
-
-def test_the_pose_follows_order_frame_and_unit_of_the_world(make_problems, correspond, random_rotations, generator):
-    corr, _ = correspond(make_problems(20, 50, outliers=5))
-    guess = REPPnP()(corr)
-    order = torch.randperm(20, generator=generator)
-    shuffled = REPPnP()(corr.map(lambda x: x[:, order] if x.ndim > 1 else x))
-    assert torch.equal(guess.weights[:, order], shuffled.weights)
-    assert_same(guess.pose, shuffled.pose)
-    rotation, shift, scale = random_rotations(50), torch.tensor([3.0, -5.0, 2.0], dtype=torch.float64), 37.0
-    moved = REPPnP()(change(corr, world_points=scale * corr.world_points @ rotation.mT + shift))
-    assert torch.equal(guess.weights, moved.weights)
-    expected = guess.pose.rotation @ rotation.mT
-    assert_same(moved.pose, Pose(expected, scale * guess.pose.translation - expected @ shift), 1e-6)
-
-
-def test_another_problem_changes_nothing_by_a_bit(make_problems, correspond):
-    corr, _ = correspond(make_problems(9, 20, outliers=2))
-    line = torch.linspace(0, 1, 9, dtype=torch.float64)[:, None].expand(9, 3)
-    world, weights = corr.world_points.clone(), corr.weights.clone()
-    world[3], weights[11] = line, 0.0
-    before, after = REPPnP()(corr), REPPnP()(change(corr, world_points=world, weights=weights))
-    others = [i for i in range(20) if i not in (3, 11)]
-    for one, other in zip(
-        (*before.pose, before.weights, before.ok), (*after.pose, after.weights, after.ok), strict=True
-    ):
-        assert torch.equal(one[others], other[others])
-    assert not after.ok[[3, 11]].any()
-
-
 @pytest.mark.parametrize(("reject_outliers", "planar"), [(False, True), (True, False)])
 def test_gradcheck(reject_outliers, planar, make_problems, correspond):
     corr, truth = correspond(make_problems(9, 1, seed=5))
@@ -207,25 +137,6 @@ def test_three_steps_pass_on_the_derivative_of_the_minimum(make_problems, corres
         gradients.append(gradient.flatten(1))
     error = (gradients[0] - gradients[1]).norm(dim=-1) / gradients[1].norm(dim=-1)
     assert error.max() < 1e-3
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_problems_without_a_pose_are_not_ok(dtype, make_problems, correspond):
-    corr = correspond(make_problems(9, 5))[0].map(lambda x: x.to(dtype))
-    world, weights = corr.world_points, corr.weights.clone()
-    weights[:, 3:] = 0.0
-    for spoilt in (
-        change(corr, world_points=world[:, :, :1].expand_as(world)),  # a line
-        change(corr, world_points=world[:, :1].expand_as(world)),  # a point
-        change(corr, weights=weights),  # three pairs
-        change(corr, weights=torch.zeros_like(weights)),
-        corr.map(lambda x: x[:, :3] if x.ndim > 1 else x),
-    ):
-        guess = REPPnP()(spoilt)
-        assert not guess.ok.any()
-        assert all(x.isfinite().all() for x in (*guess.pose, guess.weights))
-    empty = REPPnP()(corr.map(lambda x: x[:0] if x.ndim else x))
-    assert empty.pose.matrix.shape == (0, 4, 4)
 
 
 def test_the_limit_and_the_quantile_decide_which_pairs_are_kept(make_problems, correspond):

@@ -12,7 +12,7 @@ from kornia_pnpnet.core.checks import check_devices, check_positive, check_whole
 from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.types import Correspondences, Guess, Pose
 
-__all__ = ["MLPInit"]
+__all__ = ["MLPInit", "rotation_about"]
 
 
 def _relu_layers(sizes: list[int]) -> list[nn.Module]:
@@ -41,7 +41,7 @@ def _run(layers: nn.Sequential, hidden: Tensor) -> Tensor:
     return hidden
 
 
-def _rotation(axis: Tensor, angle: Tensor) -> Tensor:
+def rotation_about(axis: Tensor, angle: Tensor) -> Tensor:
     r"""Rotations about unnormalised axes.
 
     Args:
@@ -131,7 +131,7 @@ class MLPInit(Configured):
         features = torch.cat((world_points.permute(1, 2, 0), img_points.permute(1, 2, 0)), 1).flatten(0, 1)  # (5n, B)
         hidden = _run(self.shared, features)  # (3n, B)
         axis, angle = _run(self.rotation, hidden).split((3, 1))
-        rotation = _rotation(axis, angle[0])
+        rotation = rotation_about(axis, angle[0])
         translation = _run(self.translation, hidden).mT
         pose = Pose(rotation.to(features.dtype), translation.to(features.dtype))
         return Guess(pose, torch.ones_like(corr.weights))

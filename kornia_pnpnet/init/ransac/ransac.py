@@ -125,23 +125,15 @@ class RANSAC(Configured):
         check_numbers(0.0, world_threshold=world_threshold)
         KORNIA_CHECK(0 < confidence < 1, f"confidence must lie in (0, 1), got {confidence}.")
         KORNIA_CHECK(callable(scorer) or scorer in SCORERS, f"scorer must be one of {sorted(SCORERS)}, got {scorer!r}.")
-        name = scorer if isinstance(scorer, str) else getattr(scorer, "__name__", type(scorer).__name__)
+        name = getattr(scorer, "__name__", type(scorer).__name__) if callable(scorer) else scorer
         self.config.update(minimal=describe(minimal), scorer=name)
         self.minimal = minimal
         self.threshold = threshold
         self.world_threshold = world_threshold
         self.chunk_size = chunk_size
-        self.plan = Plan(
-            minimal=minimal,
-            scorer=scorer if callable(scorer) else SCORERS[scorer],
-            max_samples=max_samples,
-            min_samples=min_samples,
-            confidence=confidence,
-            local_candidates=local_candidates,
-            local_iterations=local_iterations,
-            seed=int(seed),
-            chunk_size=chunk_size,
-        )
+        options = {name: self.config[name] for name in Plan._fields}
+        options.update(minimal=minimal, scorer=scorer if callable(scorer) else SCORERS[scorer])
+        self.plan = Plan(**options)
 
     def forward(self, corr: Correspondences) -> Guess:
         r"""Find the poses.
@@ -159,7 +151,7 @@ class RANSAC(Configured):
         size = self.minimal.sample_size
         if corr.weights.shape[1] < size:
             raise ShapeError(
-                f"Samples of {size} pairs need at least as many, got N = {corr.weights.shape[1]}.",
+                f"Samples of {size} pairs need N >= {size}, got N = {corr.weights.shape[1]}.",
                 actual_shape=tuple(corr.world_points.shape),
                 expected_shape=["B", f"{size} or more", "3"],
             )

@@ -25,7 +25,7 @@ _T = TypeVar("_T")
 _DTYPE = torch.float32
 # Number of pairs that score all poses of a round first, see `_rank`.
 _FIRST_PAIRS = 16
-# Each ranking keeps one pose in this many, and the next ranking scores the kept poses on this many times as many pairs.
+# Factor between two rankings: the number of poses is divided by it, the number of pairs that score multiplied by it.
 _KEPT_ONE_IN = 4
 # Each round draws at least this share of the samples before it. More: fewer rounds, but more needless samples.
 _GROWTH = 0.5
