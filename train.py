@@ -16,29 +16,24 @@ from hydra.utils import instantiate
 from kornia.core.exceptions import ValueCheckError
 from omegaconf import DictConfig, OmegaConf
 
+from kornia_pnpnet.core.files import write_json
+from kornia_pnpnet.core.schema import to_json
 from kornia_pnpnet.solver import PnPNet
-from kornia_pnpnet.training import describe_shares, fit
-from kornia_pnpnet.training.checkpoint import TrainingError
-from kornia_pnpnet.training.results import (
-    RESULTS_NAME,
-    find_results,
-    load_run,
-    run_results,
-    summarize_runs,
-    write_json,
-    write_model_card,
-)
+from kornia_pnpnet.training import TrainingError, describe_shares, fit
+from kornia_pnpnet.training.card import write_model_card
+from kornia_pnpnet.training.collect import summarize_runs
+from kornia_pnpnet.training.results import RESULTS_NAME, find_results, load_run, run_results
 
 log = logging.getLogger("train")
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="train")
 def main(config: DictConfig) -> float | None:
-    """Train, write results and weights.
+    """Train, and write results and weights.
 
     Returns:
-        The success rate, which a sweeper may maximise, on the validation set ``uniform``, or on the last one where
-        there is no such set.
+        The success rate on the validation set ``uniform``, or on the last set without a set of this name. A sweeper may
+        maximise this rate.
     """
     runtime = HydraConfig.get()
     folder = Path(runtime.runtime.output_dir)
@@ -59,7 +54,7 @@ def main(config: DictConfig) -> float | None:
         model.compile()
     validation = {name: instantiate(source).batch(0) for name, source in config.data.validation.items()}
     if not validation:
-        sys.exit("data.validation is empty: at least one set tells how well the solver does.")
+        sys.exit("data.validation is empty: a run needs at least one validation set.")
     settings = instantiate(config.train, _convert_="all")
     processes = int(os.environ.get("WORLD_SIZE", fabric.world_size))
     if processes != fabric.world_size:
@@ -111,28 +106,26 @@ def main(config: DictConfig) -> float | None:
             sys.exit(str(error))
     else:
         results = run_results(model.cpu(), validation, report, resolved, list(runtime.overrides.task), origin)
-        write_json(folder / RESULTS_NAME, results)
+        write_json(folder / RESULTS_NAME, to_json(results))
         model.save_pretrained(folder / "weights")
         write_model_card(folder / "weights", results)
-    for name, entry in results["validation"].items():
-        rate = entry["success"]
-        log.info("%s: success %.1f %% [%.1f, %.1f]", name, *(100 * rate[key] for key in ("rate", "low", "high")))
+    for name, entry in results.validation.items():
+        log.info("%s: success %s", name, entry.success)
     log.info("Weights, model card and results are in %s", folder)
     if runtime.mode == RunMode.MULTIRUN:
         log.info("Sweep summary: %s", summarize_runs(runtime.sweep.dir))
-    sets = results["validation"]
-    return float(sets["uniform" if "uniform" in sets else [*sets][-1]]["success"]["rate"])
+    return results.validation.get("uniform", entry).success.rate
 
 
 def start_from(model: PnPNet, trained: PnPNet) -> None:
-    """Give a solver the weights of another one; where that refines in another way, its own refinement starts anew."""
+    """Copy the weights of another solver. A refinement of another kind keeps its initial hyperparameters."""
     state = trained.state_dict()
     before, now = (
         {key: refine.config[key] for key in ("m", "kernel", "shared", "by_residual")}
         for refine in (trained.refine, model.refine)
     )
     if before != now:
-        log.info("The weights are of a refinement with %s: only the network starts from them.", before)
+        log.info("The weights are of a refinement with %s: only the network starts from the weights.", before)
         state = {name: value for name, value in state.items() if not name.startswith("refine.")}
         state |= {f"refine.{name}": value for name, value in model.refine.state_dict().items()}
     model.load_state_dict(state)

@@ -6,7 +6,7 @@ from kornia_pnpnet.losses import PoseLoss, SetLoss
 from kornia_pnpnet.metrics import pose_errors, success, success_rate
 from kornia_pnpnet.normalize import Normalize
 from kornia_pnpnet.pretrained import shipped_weights
-from kornia_pnpnet.refine.lm import RobustWeightedLM
+from kornia_pnpnet.refine import RobustWeightedLM
 from kornia_pnpnet.registry import create_solver, list_solvers, solve_pnp
 from kornia_pnpnet.solver import PnPNet
 from kornia_pnpnet.types import Correspondences, Guess, Hypotheses, Noise, PnPResult, Pose, Problems, Refinement

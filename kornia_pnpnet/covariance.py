@@ -1,13 +1,16 @@
-"""How sure a pose is: its covariance, from what the pairs are worth."""
+"""Covariance of a pose: how accurate the pose is, given the noise of its correspondences."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from kornia.geometry.camera import PinholeCamera
+from kornia.geometry.liegroup import So3
 from torch import Tensor
 
-from kornia_pnpnet.core.checks import Shapes, check_devices, check_shapes
+from kornia_pnpnet.core.checks import Shapes, check_devices, check_shapes, expand_sigma
 from kornia_pnpnet.geometry import normal_equations, pixel_variance, project
 from kornia_pnpnet.types import Correspondences, Noise, Pose, camera_matrices
 
@@ -24,88 +27,92 @@ def pose_covariance(
     world_sigma: Tensor | float = 0.0,
     weights: Tensor | None = None,
 ) -> Tensor:
-    r"""Covariance of a pose that was found by weighted least squares, to first order.
+    r"""First-order covariance of a pose found by weighted least squares.
 
-    It is :math:`(\sum_i w_i J_i^\top J_i / \sigma_i^2)^{-1}` with the Jacobian of the pixels by the tangent
-    :math:`(\omega, v)` of :func:`~kornia_pnpnet.geometry.retract`: the estimate is about
-    :math:`(\mathrm{cay}(\omega) R,\; t + v)` when :math:`(R, t)` is true. :math:`\sigma_i^2` is the
-    :func:`~kornia_pnpnet.geometry.pixel_variance`. It is computed in float64 and has no gradient.
+    The covariance is :math:`(\sum_i w_i J_i^\top J_i / \sigma_i^2)^{-1}`. :math:`J_i` is the Jacobian of pixel
+    :math:`i` by the tangent :math:`(\omega, v)` of :func:`~kornia_pnpnet.geometry.retract`: when :math:`(R, t)` is the
+    true pose, the estimate is about :math:`(\mathrm{cay}(\omega) R,\; t + v)`. :math:`\sigma_i^2` is the
+    :func:`~kornia_pnpnet.geometry.pixel_variance`. The computation runs in float64 and records no gradient.
 
     Args:
-        pose: rotation :math:`(B, 3, 3)`, translation :math:`(B, 3)`.
+        pose: the estimated world-to-camera pose, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
         world_points: shape :math:`(B, N, 3)`.
         img_points: pixels, shape :math:`(B, N, 2)`.
-        intrinsics: shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or Kornia's cameras.
-        img_sigma: standard deviation of the noise on each pixel coordinate, a number, :math:`(B,)` or :math:`(B, N)`.
-        world_sigma: likewise on each world coordinate, in the unit of the world.
-        weights: how likely each pair is right, shape :math:`(B, N)`, such as the ``weights`` of a result; 1 when
-            ``None``.
+        intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or Kornia's cameras.
+        img_sigma: standard deviation of the noise on each pixel coordinate, in pixels: a number, :math:`(B,)` or
+            :math:`(B, N)`.
+        world_sigma: standard deviation of the noise on each world coordinate, in the unit of ``world_points``: a
+            number, :math:`(B,)` or :math:`(B, N)`.
+        weights: probability that each pair is an inlier, shape :math:`(B, N)`, for example the ``weights`` of a
+            result; ``None``: 1 for every pair.
 
     Returns:
-        Shape :math:`(B, 6, 6)`, in radians and the world's unit. Where the pairs do not determine the pose it is
-        infinite on the diagonal and 0 elsewhere.
+        Shape :math:`(B, 6, 6)`, in radians and the unit of the world. Where the pairs do not determine the pose, the
+        diagonal is infinite and all other entries are 0.
 
     Raises:
-        ShapeError: for shapes that do not go together.
-        DeviceError: for tensors on different devices.
+        ShapeError: when shapes do not match.
+        TypeCheckError: when a sigma is neither a number nor a tensor of the dtype of ``world_points``.
+        DeviceError: when tensors are on different devices.
 
     Example:
         >>> from kornia_pnpnet.data import SyntheticProblems
         >>> p = SyntheticProblems(n=50, batch_size=2, seed=0).batch(0)
-        >>> pose_covariance(p.pose, *p[:3], img_sigma=1.0, world_sigma=0.05).shape
+        >>> noise = {"img_sigma": 1.0, "world_sigma": 0.05}
+        >>> pose_covariance(p.pose, p.world_points, p.img_points, p.intrinsics, **noise).shape
         torch.Size([2, 6, 6])
     """
     KORNIA_CHECK_SHAPE(world_points, ["B", "N", "3"])
     batch, count = world_points.shape[:2]
-    rotation, translation = pose
     camera = camera_matrices(intrinsics)
     shapes: Shapes = {
         "img_points": (img_points, (batch, count, 2)),
         "intrinsics": (camera, (3, 3) if camera.ndim == 2 else (batch, 3, 3)),
-        "rotation of the pose": (rotation, (batch, 3, 3)),
-        "translation of the pose": (translation, (batch, 3)),
+        "rotation of the pose": (pose.rotation, (batch, 3, 3)),
+        "translation of the pose": (pose.translation, (batch, 3)),
         "weights": (weights, (batch, count)),
     }
-    sigmas = {"img_sigma": img_sigma, "world_sigma": world_sigma}
-    for name, sigma in sigmas.items():
-        if isinstance(sigma, Tensor):
-            each = (batch,) if sigma.ndim == 1 else (batch, count)
-            shapes[name] = sigma, each if sigma.ndim else ()
     check_shapes(shapes, world_points)
     check_devices({name: tensor for name, (tensor, _) in shapes.items()}, world_points)
-    dtype = world_points.dtype
+    noise = Noise(
+        expand_sigma("img_sigma", img_sigma, world_points).double(),
+        expand_sigma("world_sigma", world_sigma, world_points).double(),
+    )
     with torch.no_grad():
-        world, pixels, camera = (x.double() for x in (world_points, img_points, camera))
-        focals, centre = camera.diagonal(dim1=-2, dim2=-1)[..., :2], camera[..., :2, 2]
-        one = focals.new_ones(())  # rays: pixels of a camera with the focal length 1
-        rays = (pixels - centre[..., None, :]) / focals[..., None, :]
-        focal = focals.log().mean(-1).exp().reshape(-1, 1)  # (B or 1, 1)
-        numbers = (torch.as_tensor(x, dtype=torch.float64, device=world.device) for x in sigmas.values())
-        img, length = ((x[:, None] if x.ndim == 1 else x).expand(batch, count) for x in numbers)
-        # About the centroid and in units of the spread, where turns and shifts are well apart.
-        mean = world.mean(1, keepdim=True)
-        size = (world - mean).square().sum(-1).mean(1).sqrt().clamp(min=torch.finfo(torch.float64).tiny)[:, None]
-        rotation, translation = rotation.double(), translation.double()
-        turned = (rotation @ mean.mT)[..., 0]
-        moved = Pose(rotation, (translation + turned) / size)
-        there = torch.ones_like(img) if weights is None else weights.double()
-        corr = Correspondences((world - mean) / size[..., None], rays, there, one)
-        projection = project(moved, corr)
-        variance = pixel_variance(projection, Noise(img / focal, length / size), one)
-        rows = normal_equations(projection, there / variance).hessian
-        hessian = torch.stack([torch.stack([rows[max(i, j)][min(i, j)] for j in range(6)], -1) for i in range(6)], -2)
-        inverse, info = torch.linalg.inv_ex(hessian)
-        known = (info == 0) & inverse.isfinite().all((1, 2)) & (inverse.diagonal(dim1=1, dim2=2) > 0).all(-1)
-        inverse = torch.where(known[:, None, None], inverse, 0.0)
-        # v of the world as it was: size times that of the centred one, and what a turn about the centroid shifts.
-        x, y, z = turned.unbind(-1)
-        zero = torch.zeros_like(x)
-        cross = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), -1).unflatten(-1, (3, 3))
-        eye = torch.eye(3, dtype=torch.float64, device=world.device).expand(batch, 3, 3)
-        upper = torch.cat((eye, torch.zeros_like(eye)), -1)
-        lower = torch.cat((cross, size[..., None] * eye), -1)
-        back = torch.cat((upper, lower), 1)
-        covariance = back @ inverse @ back.mT
-        diagonal = torch.eye(6, dtype=torch.bool, device=world.device)
-        infinite = covariance.new_zeros(6, 6).masked_fill(diagonal, torch.inf)
-        return torch.where(known[:, None, None], covariance, infinite).to(dtype)
+        points, rotation, camera = world_points.double(), pose.rotation.double(), camera.double()
+        inlier = torch.ones_like(noise.img) if weights is None else weights.double()
+
+        # Coordinates in which the matrix is well conditioned: centroid 0, spread 1, focal length 1.
+        centroid = points.mean(1, keepdim=True)  # (B, 1, 3)
+        offsets = points - centroid
+        spread = offsets.square().sum(-1).mean(1, keepdim=True).sqrt()  # (B, 1)
+        spread = spread.clamp(min=torch.finfo(torch.float64).tiny)
+        rotated_centroid = (rotation @ centroid.mT)[..., 0]  # (B, 3)
+        centred_pose = Pose(rotation, (pose.translation.double() + rotated_centroid) / spread)
+        focals, principal_point = camera.diagonal(dim1=-2, dim2=-1)[..., :2], camera[..., :2, 2]
+        rays = (img_points.double() - principal_point[..., None, :]) / focals[..., None, :]
+        mean_focal = focals.log().mean(-1).exp().reshape(-1, 1)  # (B or 1, 1), geometric mean of fx and fy
+        unit_focal = focals.new_ones(())
+        corr = Correspondences(offsets / spread[..., None], rays, inlier, unit_focal)
+
+        projection = project(centred_pose, corr)
+        variance = pixel_variance(projection, Noise(noise.img / mean_focal, noise.world / spread), unit_focal)
+        information = _symmetric(normal_equations(projection, inlier / variance).hessian)
+        inverse, info = torch.linalg.inv_ex(information)
+        positive = (inverse.diagonal(dim1=1, dim2=2) > 0).all(-1)
+        determined = ((info == 0) & inverse.isfinite().all((1, 2)) & positive)[:, None, None]
+
+        # Back to the given coordinates: omega stays, v = spread * v_centred + (R centroid) x omega.
+        eye = torch.eye(3, dtype=torch.float64, device=points.device).expand(batch, 3, 3)
+        omega_rows = torch.cat((eye, torch.zeros_like(eye)), -1)
+        v_rows = torch.cat((So3.hat(rotated_centroid), spread[..., None] * eye), -1)
+        back = torch.cat((omega_rows, v_rows), 1)  # (B, 6, 6)
+        covariance = back @ torch.where(determined, inverse, 0.0) @ back.mT
+        undetermined = covariance.new_full((6,), torch.inf).diag()
+        return torch.where(determined, covariance, undetermined).to(world_points.dtype)
+
+
+def _symmetric(rows: Sequence[Sequence[Tensor]]) -> Tensor:
+    """The matrices (B, K, K) from the rows of their lower triangles; every entry is of shape (B,)."""
+    size = range(len(rows))
+    return torch.stack([torch.stack([rows[max(i, j)][min(i, j)] for j in size], -1) for i in size], -2)

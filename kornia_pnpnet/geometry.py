@@ -8,7 +8,7 @@ and the principal point 0 (see :mod:`kornia_pnpnet.normalize`). A point is *in f
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import torch
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix, rotation_matrix_to_axis_angle
@@ -26,7 +26,6 @@ __all__ = [
     "move",
     "pixel_variance",
     "normal_equations",
-    "problems_last",
     "project",
     "retract",
     "retract_additive",
@@ -34,16 +33,19 @@ __all__ = [
     "transform",
 ]
 
+# Two rows of a column of the Jacobian; an entry that is the same for all pairs is a plain number.
+_Column: TypeAlias = tuple[Any, Any]
+
 #: A point with ``z <= MIN_DEPTH_RATIO * |x|`` counts as behind the camera. It bounds ``|x / z|`` by 1000.
 MIN_DEPTH_RATIO = 1e-3
 
 
 class Projection(NamedTuple):
-    r"""Where the points fall, coordinate by coordinate: every tensor is of shape :math:`(B, N)`.
+    r"""Points projected at a pose, coordinate by coordinate: every tensor has the shape :math:`(B, N)`.
 
     Attributes:
-        residual: projection minus measurement in pixels, horizontal and vertical. It says nothing where ``in_front``
-            is false, but is finite there.
+        residual: projection minus measurement in pixels, horizontal and vertical. Where ``in_front`` is false the
+            residual is finite but meaningless.
         in_front: whether the point is in front of the camera, bool.
         rotated: the points in the camera's axes before translation, :math:`y = R x`, three coordinates.
         plane_points: :math:`(x/z, y/z)`, 0 for points behind the camera.
@@ -95,16 +97,6 @@ def transform(pose: Pose, world_points: Tensor) -> Tensor:
     return world_points @ pose.rotation.mT + pose.translation[:, None]
 
 
-def problems_last(corr: Correspondences) -> Correspondences:
-    """The same correspondences with the problems side by side in memory, which is where the arithmetic is fastest.
-
-    Shapes and values stay. One coordinate of all problems is then one row of memory, so that elementwise operations
-    run at full width however few pairs a problem has, and a compiler can keep a problem in registers.
-    """
-    world_points, img_points = (x.permute(2, 1, 0).contiguous().permute(2, 1, 0) for x in corr[:2])
-    return corr._replace(world_points=world_points, img_points=img_points, weights=corr.weights.mT.contiguous().mT)
-
-
 def project(pose: Pose, corr: Correspondences) -> Projection:
     r"""Project the points of normalised correspondences and compare them with their pixels.
 
@@ -128,7 +120,7 @@ def project(pose: Pose, corr: Correspondences) -> Projection:
     matrix = [row.unbind(1) for row in pose.rotation[..., None].unbind(1)]
     y0, y1, y2 = (torch.addcmul(torch.addcmul(i * a, j, b), k, c) for i, j, k in matrix)
     x, y, z = (r + t for r, t in zip((y0, y1, y2), pose.translation[..., None].unbind(1), strict=True))
-    # z |z| > ratio² |x|²: one comparison for both conditions, and no square root, whose gradient is infinite at 0.
+    # z |z| > ratio² |x|² tests the sign and the ratio at once, without a square root, whose gradient is infinite at 0.
     margin = z * z.abs()
     for coordinate in (x, y, z):
         margin = torch.addcmul(margin, coordinate, coordinate, value=-MIN_DEPTH_RATIO * MIN_DEPTH_RATIO)
@@ -141,9 +133,9 @@ def project(pose: Pose, corr: Correspondences) -> Projection:
 
 
 def pixel_variance(projection: Projection, noise: Noise, focal: Tensor) -> Tensor:
-    r"""Variance of a pixel coordinate that noise of the pixel and of the world point make together.
+    r"""Variance of a pixel coordinate, from the noise of the pixel and of the world point.
 
-    A move of the point by :math:`d` moves its pixel by :math:`J d` with :math:`J = \tfrac fz [I_2 \mid -(p, q)^\top]`,
+    A shift of the point by :math:`d` moves its pixel by :math:`J d` with :math:`J = \tfrac fz [I_2 \mid -(p, q)^\top]`,
     :math:`p = x/z`, :math:`q = y/z`. The mean over both coordinates is returned:
     :math:`\sigma_\mathrm{img}^2 + \sigma_\mathrm{world}^2 \, \mathrm{tr}(J J^\top) / 2`, where the trace is
     :math:`(f/z)^2 (2 + p^2 + q^2)`.
@@ -154,7 +146,7 @@ def pixel_variance(projection: Projection, noise: Noise, focal: Tensor) -> Tenso
         focal: the focal length in pixels, a scalar.
 
     Returns:
-        Shape :math:`(B, N)`. Behind the camera it is that of the pixel alone.
+        Shape :math:`(B, N)`. Behind the camera it is the variance of the pixel alone.
 
     Example:
         >>> points = torch.tensor([[[0.0, 0.0, 4.0]]])
@@ -172,43 +164,60 @@ def pixel_variance(projection: Projection, noise: Noise, focal: Tensor) -> Tenso
 def normal_equations(projection: Projection, weights: Tensor) -> NormalEquations:
     r"""The normal equations of the residuals by the six pose parameters.
 
-    With :math:`y = R x`, :math:`p = x/z`, :math:`q = y/z` of the camera point, and the tangent
-    :math:`(\omega, v)` of :func:`retract`, the rows of the Jacobian divided by the focal length are
-    :math:`\tfrac1z [-p y_y,\; y_z + p y_x,\; -y_y,\; 1,\; 0,\; -p]` and
-    :math:`\tfrac1z [-y_z - q y_y,\; q y_x,\; y_x,\; 0,\; 1,\; -q]`. The factor :math:`1/z` goes into the weights,
-    and what is known of the rows (a one, a zero, columns that both rows share) is not multiplied.
+    With :math:`y = R x`, :math:`p = x/z`, :math:`q = y/z` of the camera point, and the tangent :math:`(\omega, v)` of
+    :func:`retract`, the Jacobian of a pair, divided by the focal length, is
+
+    .. math:: J = \frac1z \begin{pmatrix}
+        -p y_2 & y_3 + p y_1 & -y_2 & 1 & 0 & -p \\
+        -y_3 - q y_2 & q y_1 & y_1 & 0 & 1 & -q \end{pmatrix}.
 
     Args:
         projection: what :func:`project` returned at the pose.
-        weights: weight of each pair, :math:`(B, N)`; points behind the camera do not count whatever it is.
+        weights: weight of each pair, :math:`(B, N)`. Points behind the camera do not count.
 
     Returns:
         :math:`J^\top W J` and :math:`J^\top W r` with :math:`J` divided by the focal length and :math:`r` in pixels.
     """
-    y0, y1, y2 = projection.rotated
-    p, q = (-i for i in projection.plane_points)
-    e, f = projection.scaled_residual
-    w = weights * projection.inv_depth * projection.inv_depth
-    # The two rows of a pair by the rotation; by the translation they are (1, 0, p) and (0, 1, q).
-    left, up, back = -y0, -y1, -y2
-    u = p * y1, torch.addcmul(y2, p, left), up
-    v = torch.addcmul(back, q, y1), q * left, y0
-    wu, wv, wp, wq = [w * i for i in u], [w * i for i in v], w * p, w * q
+    y1, y2, y3 = projection.rotated
+    p, q = projection.plane_points
+    minus_p, minus_q, minus_y2 = -p, -q, -y2
+    # Columns of z J: an entry in the row of u and one in the row of v. The factor 1/z² goes into the weights, and with
+    # it the residual is the one times the depth.
+    columns: list[_Column] = [
+        (minus_p * y2, -torch.addcmul(y3, q, y2)),
+        (torch.addcmul(y3, p, y1), q * y1),
+        (minus_y2, y1),
+        (1.0, 0.0),
+        (0.0, 1.0),
+        (minus_p, minus_q),
+    ]
+    weights = weights * projection.inv_depth * projection.inv_depth
+    zero = torch.zeros_like(weights.sum(1))
+    weighted: list[_Column] = [(_times(u, weights), _times(v, weights)) for u, v in columns]
 
-    def total(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
-        return torch.addcmul(a * b, c, d).sum(1)
+    def inner(a: _Column, b: _Column) -> Tensor:
+        """Sum over pairs and rows of the products of two columns, (B,)."""
+        (a_u, a_v), (b_u, b_v) = a, b
+        if type(a_u) is type(a_v) is type(b_u) is type(b_v):
+            return torch.addcmul(a_u * b_u, a_v, b_v).sum(1)
+        products = [x for x in (_times(a_u, b_u), _times(a_v, b_v)) if type(x) is not float]
+        return products[0].sum(1) if products else zero
 
-    one = w.sum(1)
-    rows = [[total(wu[i], u[j], wv[i], v[j]) for j in range(i + 1)] for i in range(3)]
-    rows.append([*(x.sum(1) for x in wu), one])
-    rows.append([*(x.sum(1) for x in wv), torch.zeros_like(one), one])
-    rows.append([*(total(x, p, y, q) for x, y in zip(wu, wv, strict=True)), wp.sum(1), wq.sum(1), total(wp, p, wq, q)])
-    gradient = [total(x, e, y, f) for x, y in zip(wu, wv, strict=True)]
-    return NormalEquations(rows, [*gradient, (w * e).sum(1), (w * f).sum(1), total(wp, e, wq, f)])
+    hessian = [[inner(weighted[j], columns[i]) for j in range(i + 1)] for i in range(6)]
+    return NormalEquations(hessian, [inner(column, projection.scaled_residual) for column in weighted])
+
+
+def _times(a: Any, b: Any) -> Any:
+    """A product in which a factor that is known to be 0 or 1 costs nothing."""
+    if type(a) is float:
+        return b if a == 1.0 else 0.0
+    if type(b) is float:
+        return a if b == 1.0 else 0.0
+    return a * b
 
 
 def change_tangent(equations: NormalEquations, tangent_map: Tensor) -> NormalEquations:
-    r"""Express normal equations by other rotation parameters.
+    r"""Express normal equations in other rotation parameters.
 
     Args:
         equations: by the tangent :math:`(\omega, v)`.
@@ -216,7 +225,7 @@ def change_tangent(equations: NormalEquations, tangent_map: Tensor) -> NormalEqu
             :func:`retract_additive` the :func:`additive_tangent_map`.
 
     Returns:
-        The system with :math:`M^\top` and :math:`M` around the blocks of the rotation.
+        The system with the rotation's blocks multiplied by :math:`M^\top` and :math:`M`.
     """
     h, g = equations
     turn = torch.stack([torch.stack([h[max(i, j)][min(i, j)] for j in range(3)], -1) for i in range(3)], -1)
@@ -231,11 +240,11 @@ def change_tangent(equations: NormalEquations, tangent_map: Tensor) -> NormalEqu
 def retract(pose: Pose, delta: Tensor) -> Pose:
     r"""Move a pose along a tangent vector, :math:`(\mathrm{cay}(\omega) R,\; t + v)`.
 
-    Rotation and translation move apart, so that with a centred world a turn leaves the centroid where it is: the
-    two stay well separated in the normal equations however far the points are. The rotation is Cayley's,
+    Rotation and translation move independently. With a centred world a rotation then leaves the centroid in place, so
+    that both stay well separated in the normal equations at any distance of the points. The rotation is Cayley's,
     :math:`\mathrm{cay}(\omega) = (I - \tfrac12[\omega]_\times)^{-1}(I + \tfrac12[\omega]_\times)`, which agrees with
-    the exponential to second order, turns by :math:`2 \arctan(|\omega|/2)` and so never by more than a half turn, and
-    needs neither trigonometry nor a branch at 0.
+    the exponential to second order, rotates by :math:`2 \arctan(|\omega|/2)`, at most half a turn, and needs neither
+    trigonometry nor a branch at 0.
 
     Args:
         pose: rotation :math:`(B, 3, 3)`, translation :math:`(B, 3)`.

@@ -1,4 +1,4 @@
-"""Distances between poses that can be trained with, and the paper's loss over both stages."""
+"""Distances between poses that can be trained with, and the losses over both stages of a solver."""
 
 from __future__ import annotations
 
@@ -9,28 +9,29 @@ import torch
 from torch import Tensor, nn
 
 from kornia_pnpnet.core.checks import check_numbers, check_poses, check_positive, check_whole
+from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import transform
 from kornia_pnpnet.types import Guess, Noise, PnPResult, Pose, Problems
 
 __all__ = ["LossTerms", "PoseLoss", "SetLoss", "pose_distances"]
 
-# Probabilities this close to 0 and 1 are no surer: a pair that is wrong about them costs no more than it teaches.
-_LEAST_CHANCE = 1e-3
-# Squared residuals beyond this many variances are no noise.
+# Probability. The cross entropy treats smaller probabilities as this one, which bounds the loss of a single pair.
+_LEAST_PROBABILITY = 1e-3
+# Variances. Squared residuals are clipped here: larger residuals are not noise.
 _MOST_VARIANCES = 20.0
 
 
 class LossTerms(NamedTuple):
-    """The loss and what it weighs, each a scalar and a mean over the batch.
+    """The loss and its terms, each a scalar and a mean over the batch.
 
     Attributes:
-        total: the weighted sum, saturated per problem.
+        total: weighted sum of the terms, saturated per problem.
         init_rotation: chordal rotation distance of the first guess.
         init_translation: translation distance of the first guess at the centroid of the points.
         refined_rotation: chordal rotation distance after refinement.
         refined_translation: translation distance after refinement.
-        weights: cross entropy of the weights as probabilities of being right; 0 where no loss looks at it.
-        noise: likelihood of the right pairs under the estimated noise; likewise.
+        weights: cross entropy of the weights as probabilities of being an inlier; 0 where the loss ignores weights.
+        noise: negative log-likelihood of the inliers under the estimated noise; 0 where the loss ignores noise.
     """
 
     total: Tensor
@@ -43,17 +44,17 @@ class LossTerms(NamedTuple):
 
 
 def pose_distances(estimate: Pose, truth: Pose) -> tuple[Tensor, Tensor]:
-    r"""Distances whose gradient is bounded everywhere, also at 0.
+    r"""Distances between poses whose gradients are bounded everywhere, also at 0.
 
     Args:
         estimate: rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
-        truth: the same shapes.
+        truth: rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
 
     Returns:
         :math:`\|\hat R - R\|_F = 2\sqrt2 \sin(\theta / 2)` and :math:`\|\hat t - t\|`, each :math:`(B,)`.
 
     Raises:
-        ShapeError: when the shapes are others, or differ.
+        ShapeError: when a shape is wrong, or the batches differ.
         TypeCheckError: when the dtypes differ.
         DeviceError: when the devices differ.
 
@@ -64,43 +65,35 @@ def pose_distances(estimate: Pose, truth: Pose) -> tuple[Tensor, Tensor]:
         (tensor([2.]), tensor([5.]))
     """
     check_poses(estimate, truth)
-    return _lengths(_difference(estimate, truth))
+    return _distances(estimate, truth)
 
 
-def _difference(estimate: Pose, truth: Pose) -> Pose:
-    """The estimate minus the truth, entry by entry."""
-    return Pose(estimate.rotation - truth.rotation, estimate.translation - truth.translation)
-
-
-def _lengths(difference: Pose) -> tuple[Tensor, Tensor]:
-    """Frobenius and Euclidean norm of the parts, each (B,)."""
-    tiny = torch.finfo(difference.rotation.dtype).tiny
-    rotation = (difference.rotation.square().sum((-2, -1)) + tiny).sqrt()
-    translation = (difference.translation.square().sum(-1) + tiny).sqrt()
-    return rotation, translation
-
-
-def _at(points: Tensor, difference: Pose) -> Pose:
-    """The difference of the same poses for a world whose origin is at ``points``, (B, 3)."""
-    turned = (difference.rotation * points[:, None]).sum(-1)
-    return Pose(difference.rotation, difference.translation + turned)
+def _distances(estimate: Pose, truth: Pose, origin: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """:func:`pose_distances` with the translations of a world whose origin is at the points ``origin``, (B, 3)."""
+    rotation = estimate.rotation - truth.rotation
+    translation = estimate.translation - truth.translation
+    if origin is not None:
+        translation = translation + (rotation * origin[:, None]).sum(-1)
+    tiny = torch.finfo(rotation.dtype).tiny
+    return (rotation.square().sum((-2, -1)) + tiny).sqrt(), (translation.square().sum(-1) + tiny).sqrt()
 
 
 class PoseLoss(nn.Module):
-    r"""Weighted sum of four distances: rotation and translation, after the first stage and after the refinement.
+    r"""Weighted sum of four distances: rotation and translation, of the first guess and after the refinement.
 
-    After the refinement the translation is compared as it is scored. The first stage's is compared at the centroid of
-    the world points: at the world's origin, which may be far from them, it would mostly repeat the rotation error.
+    The refined translation is compared at the world's origin, as it is scored. The first guess's translation is
+    compared at the centroid of the world points: at an origin far from the points it would mostly repeat the rotation
+    error.
 
-    A refinement that fails is off by any amount; so that such problems do not drown the others, the refined distance
+    A failed refinement may be off by any amount. So that such problems do not dominate the batch, the refined distance
     :math:`d` of a problem may be saturated to :math:`d / (1 + d / c)`. With :math:`c` near the limit of success the
     loss follows the success rate.
 
     Args:
         rotation: weight of the chordal rotation distances.
         translation: weight of the refined translation distance, per unit of length.
-        init_translation: weight of the first stage's translation distance, per unit of length.
-        refined: weight of the refined terms against the first stage's, before the ramp.
+        init_translation: weight of the first guess's translation distance, per unit of length.
+        refined: weight of the refined terms relative to the first guess's terms, at the ramp 1.
         saturation: :math:`c`; ``None`` does not saturate.
 
     Raises:
@@ -139,9 +132,9 @@ class PoseLoss(nn.Module):
         r"""Compare a solver's result with the truth.
 
         Args:
-            result: of :math:`B` problems.
-            problems: what was solved, with the true poses.
-            ramp: factor of the refined terms, 0 at the start of the training. Then no gradient goes through them.
+            result: the result for :math:`B` problems.
+            problems: the problems with their true poses.
+            ramp: factor of the refined terms. At 0, the start of a training, no gradient passes through them.
 
         Returns:
             The loss and its terms, means over the batch.
@@ -151,39 +144,40 @@ class PoseLoss(nn.Module):
         """
         for pose in (result.pose, result.init):
             check_poses(pose, problems.pose)
-        centroid = problems.world_points.mean(1)
-        init_rotation, init_translation = _lengths(_at(centroid, _difference(result.init, problems.pose)))
+        init_rotation, init_translation = _distances(result.init, problems.pose, problems.world_points.mean(1))
         with torch.set_grad_enabled(torch.is_grad_enabled() and ramp > 0.0):
-            rotation, translation = _lengths(_difference(result.pose, problems.pose))
+            rotation, translation = _distances(result.pose, problems.pose)
         init = self.rotation * init_rotation + self.init_translation * init_translation
         refined = self.rotation * rotation + self.translation * translation
         if self.saturation is not None:
             refined = refined / (1.0 + refined / self.saturation)
         total = init + ramp * self.refined * refined
         none = torch.zeros_like(total)
-        terms = (total, init_rotation, init_translation, rotation, translation, none, none)
-        return LossTerms(*(term.mean() for term in terms))
+        terms = LossTerms(total, init_rotation, init_translation, rotation, translation, weights=none, noise=none)
+        return map_tensors(torch.mean, terms)
 
 
 class SetLoss(nn.Module):
-    r"""What a set network learns from: the pose before and after the refinement, right and wrong pairs, and noise.
+    r"""The loss of a set network: poses before and after the refinement, inlier probabilities, and noise.
 
-    Nothing in it has a unit: translations are compared at the centroid of the points, as a share of its distance.
+    The loss has no unit: translations are compared at the centroid of the points, relative to its distance from the
+    camera. The terms are:
 
-    - Of the hypotheses of a first guess the best one counts, and a little all of them, so that they may differ.
-    - After the refinement, both errors in units of what counts as success, saturated as in :class:`PoseLoss`.
+    - First guess: the distance of the best hypothesis, plus a small share of the mean over all hypotheses, so that the
+      hypotheses may differ.
+    - Refined pose: both distances in units of the limit of success, saturated as in :class:`PoseLoss`.
     - Binary cross entropy of the network's weights.
-    - The negative log-likelihood of the right pairs' residuals at the true pose under the estimated noise.
+    - Negative log-likelihood of the inliers' residuals at the true pose under the estimated noise.
 
     Args:
-        starts: the first so many hypotheses are the network's, and count.
-        every: weight of the mean over the hypotheses against the best of them.
-        refined: weight of the terms after the refinement, before the ramp.
-        saturation: of these, in units of success.
+        starts: number of the network's hypotheses, which come first among all hypotheses.
+        every: weight of the mean over the hypotheses; the best hypothesis has one minus this weight.
+        refined: weight of the refined term, at the ramp 1.
+        saturation: saturation of the refined term, in units of success.
         weights: weight of the cross entropy.
-        noise: weight of the likelihood.
-        rotation_unit: what counts as success, in degrees.
-        translation_unit: likewise, as a share of the distance.
+        noise: weight of the negative log-likelihood.
+        rotation_unit: limit of success of the rotation, in degrees.
+        translation_unit: limit of success of the translation, as a share of the distance.
 
     Raises:
         BaseError: for a negative weight, or a saturation or unit that is not positive.
@@ -220,10 +214,10 @@ class SetLoss(nn.Module):
         """Compare a solver's result with the truth.
 
         Args:
-            result: of :math:`B` problems.
-            problems: what was solved, with the true poses.
-            ramp: factor of the refined terms, 0 at the start of the training. Then no gradient goes through them.
-            guess: what the result was refined from, see :meth:`~kornia_pnpnet.solver.PnPNet.with_guess`.
+            result: see :meth:`PoseLoss.forward`.
+            problems: see :meth:`PoseLoss.forward`.
+            ramp: see :meth:`PoseLoss.forward`.
+            guess: the first guess of the result, see :meth:`~kornia_pnpnet.solver.PnPNet.with_guess`.
 
         Returns:
             The loss and its terms, means over the batch.
@@ -233,44 +227,37 @@ class SetLoss(nn.Module):
         """
         for pose in (result.pose, result.init):
             check_poses(pose, problems.pose)
-        hypotheses = [x[:, None] for x in guess.pose]
-        if guess.others is not None:
-            hypotheses = [torch.cat(x, 1)[:, : self.starts] for x in zip(hypotheses, guess.others, strict=True)]
-        starts = hypotheses[0].shape[1]
         centre = problems.world_points.mean(1)
-        away = (problems.pose.rotation @ centre[..., None])[..., 0] + problems.pose.translation
-        distance = away.norm(dim=-1)
+        distance = transform(problems.pose, centre[:, None])[:, 0].norm(dim=-1)
 
-        truth = Pose(*(x.repeat_interleave(starts, 0) for x in problems.pose))
-        flat = Pose(*(x.flatten(0, 1) for x in hypotheses))
-        lengths = _lengths(_at(centre.repeat_interleave(starts, 0), _difference(flat, truth)))
-        rotations, translations = (x.view(-1, starts) for x in lengths)
+        every = [_distances(pose, problems.pose, centre) for pose in guess.poses[: self.starts]]
+        rotations, translations = (torch.stack(x, 1) for x in zip(*every, strict=True))  # (B, S) each
         translations = translations / distance[:, None]
-        each = rotations + translations
-        best = each.argmin(1, keepdim=True)
-        first = (1.0 - self.every) * each.gather(1, best)[:, 0] + self.every * each.mean(1)
+        sums = rotations + translations
+        best = sums.argmin(1, keepdim=True)
+        init_rotation, init_translation, least = (x.gather(1, best)[:, 0] for x in (rotations, translations, sums))
+        first = (1.0 - self.every) * least + self.every * sums.mean(1)
 
         with torch.set_grad_enabled(torch.is_grad_enabled() and ramp > 0.0):
-            rotation, translation = _lengths(_at(centre, _difference(result.pose, problems.pose)))
+            rotation, translation = _distances(result.pose, problems.pose, centre)
             translation = translation / distance
             refined = rotation / self.rotation_unit + translation / self.translation_unit
             refined = refined / (1.0 + refined / self.saturation)
         entropy = _cross_entropy(guess.weights, problems.inliers)
-        likelihood = torch.zeros_like(first) if guess.noise is None else _surprise(guess.noise, problems)
-        total = first + ramp * self.refined * refined + self.weights * entropy + self.noise * likelihood
-        init = (x.gather(1, best)[:, 0] for x in (rotations, translations))
-        terms = (total, *init, rotation, translation, entropy, likelihood)
-        return LossTerms(*(term.mean() for term in terms))
+        noise = torch.zeros_like(first) if guess.noise is None else _negative_log_likelihood(guess.noise, problems)
+        total = first + ramp * self.refined * refined + self.weights * entropy + self.noise * noise
+        terms = LossTerms(total, init_rotation, init_translation, rotation, translation, entropy, noise)
+        return map_tensors(torch.mean, terms)
 
 
 def _cross_entropy(weights: Tensor, inliers: Tensor) -> Tensor:
-    """Mean binary cross entropy of each problem, (B,)."""
-    right = torch.where(inliers, weights, 1.0 - weights)
-    return -right.clamp(min=_LEAST_CHANCE).log().mean(-1)
+    """Binary cross entropy of the weights, mean over the pairs, (B,)."""
+    probability = torch.where(inliers, weights, 1.0 - weights)
+    return -probability.clamp(min=_LEAST_PROBABILITY).log().mean(-1)
 
 
-def _surprise(noise: Noise, problems: Problems) -> Tensor:
-    """Negative log-likelihood of the right pairs' residuals at the true pose, up to a constant, mean of each, (B,)."""
+def _negative_log_likelihood(noise: Noise, problems: Problems) -> Tensor:
+    """Negative log-likelihood of the residuals at the true pose up to a constant, mean over the inliers, (B,)."""
     cam = transform(problems.pose, problems.world_points)
     z = torch.where(problems.inliers, cam[..., 2], 1.0)
     focal = problems.intrinsics.diagonal(dim1=1, dim2=2)[:, None, :2]
@@ -279,5 +266,5 @@ def _surprise(noise: Noise, problems: Problems) -> Tensor:
     sq_residual = (focal * plane + centre - problems.img_points).square().sum(-1)
     moved = focal.mean(-1) * noise.world / z
     variance = noise.img.square() + moved.square() * (1.0 + 0.5 * plane.square().sum(-1))
-    surprise = variance.log() + 0.5 * (sq_residual / variance).clamp(max=_MOST_VARIANCES)
-    return torch.where(problems.inliers, surprise, 0.0).sum(-1) / problems.inliers.sum(-1).clamp(min=1)
+    loss = variance.log() + 0.5 * (sq_residual / variance).clamp(max=_MOST_VARIANCES)
+    return torch.where(problems.inliers, loss, 0.0).sum(-1) / problems.inliers.sum(-1).clamp(min=1)

@@ -1,4 +1,4 @@
-"""How far a pose is from the truth, in the units people report: degrees and the unit of the world."""
+"""Evaluation metrics: pose errors in degrees and in the unit of the world, success rates, calibration."""
 
 from __future__ import annotations
 
@@ -9,10 +9,14 @@ import torch
 from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_devices, check_poses, check_whole
+from kornia_pnpnet.core.schema import Count, Share
 from kornia_pnpnet.geometry import rotation_angle
 from kornia_pnpnet.types import Pose
 
 __all__ = ["PoseErrors", "Reliability", "SuccessRate", "pose_errors", "reliability", "success", "success_rate"]
+
+# The 97.5 % point of the standard normal distribution: a two-sided 95 % interval.
+_Z_95 = 1.959963984540054
 
 
 class PoseErrors(NamedTuple):
@@ -28,24 +32,31 @@ class PoseErrors(NamedTuple):
 
 
 class SuccessRate(NamedTuple):
-    """A share of successes with its binomial 95 % (Wilson) interval, all between 0 and 1."""
+    """A success rate with its 95 % Wilson interval.
 
-    rate: float
-    low: float
-    high: float
-    total: int
+    Attributes:
+        rate: share of successes, between 0 and 1.
+        low: lower bound of the interval.
+        high: upper bound of the interval.
+        total: number of trials.
+    """
+
+    rate: Share
+    low: Share
+    high: Share
+    total: Count
 
     def __str__(self) -> str:
         return f"{100 * self.rate:.1f} % [{100 * self.low:.1f}, {100 * self.high:.1f}]"
 
 
 class Reliability(NamedTuple):
-    r"""How often what is said to have a chance comes true, for equally wide ranges of chances from 0 to 1.
+    r"""Predicted probabilities against observed frequencies, in :math:`K` equally wide bins from 0 to 1.
 
     Attributes:
-        number: how many chances are in each range, shape :math:`(K,)`.
-        predicted: their mean, NaN where there are none, shape :math:`(K,)`.
-        observed: the share of them that came true, NaN where there are none, shape :math:`(K,)`.
+        number: number of predictions in each bin, shape :math:`(K,)`.
+        predicted: mean predicted probability of each bin, NaN for an empty bin, shape :math:`(K,)`.
+        observed: share of true outcomes in each bin, NaN for an empty bin, shape :math:`(K,)`.
     """
 
     number: Tensor
@@ -54,26 +65,28 @@ class Reliability(NamedTuple):
 
     @property
     def expected_error(self) -> float:
-        """The expected calibration error: the mean over all chances of how far both are apart in their range."""
+        """The expected calibration error: the mean gap between predicted and observed, weighted by ``number``."""
         gap = (self.predicted - self.observed).abs().nan_to_num(0.0)
         return float((self.number * gap).sum() / self.number.sum())
 
 
 def reliability(chances: Tensor, outcomes: Tensor, ranges: int = 10) -> Reliability:
-    r"""Compare chances with what came of them, for a reliability diagram.
+    r"""Compare predicted probabilities with outcomes, for a reliability diagram.
+
+    Source: C. Guo et al., "On calibration of modern neural networks", ICML 2017, for the probability of one outcome.
 
     Args:
-        chances: between 0 and 1, of any shape with at least one element.
-        outcomes: bool of the same shape.
-        ranges: into how many ranges the chances are sorted, :math:`K`.
+        chances: predicted probabilities between 0 and 1, any shape with at least one element.
+        outcomes: whether each predicted event happened, bool, same shape.
+        ranges: number of bins, :math:`K`.
 
     Returns:
-        The :class:`Reliability`, in float64. Its error is the expected calibration error of C. Guo et al., "On
-        calibration of modern neural networks", ICML 2017, for the chance of one outcome.
+        The :class:`Reliability` in float64.
 
     Raises:
-        ValueError: when the shapes differ, or there is nothing.
-        BaseError: for less than one range, and for tensors on different devices.
+        ValueError: when the shapes differ or the tensors are empty.
+        BaseError: when ``ranges`` is not an integer of at least 1.
+        DeviceError: when the tensors are on different devices.
 
     Example:
         >>> found = reliability(torch.tensor([0.9, 0.9, 0.9, 0.1]), torch.tensor([True, True, False, False]), ranges=2)
@@ -82,15 +95,15 @@ def reliability(chances: Tensor, outcomes: Tensor, ranges: int = 10) -> Reliabil
     """
     if chances.shape != outcomes.shape or chances.numel() == 0:
         shapes = f"{tuple(chances.shape)} and {tuple(outcomes.shape)}"
-        raise ValueError(f"reliability needs as many chances as outcomes, at least one, got {shapes}.")
+        raise ValueError(f"chances and outcomes must have the same shape and at least one element, got {shapes}.")
     check_whole(1, ranges=ranges)
     check_devices({"outcomes": outcomes}, chances, "chances")
     chance, outcome = (x.detach().flatten().to(torch.float64) for x in (chances, outcomes))
-    place = (chance * ranges).long().clamp(0, ranges - 1)
-    count, predicted, observed = (
-        chance.new_zeros(ranges).index_add(0, place, x) for x in (torch.ones_like(chance), chance, outcome)
+    bins = (chance * ranges).long().clamp(0, ranges - 1)
+    number, predicted, observed = (
+        chance.new_zeros(ranges).index_add(0, bins, x) for x in (torch.ones_like(chance), chance, outcome)
     )
-    return Reliability(count, predicted / count, observed / count)
+    return Reliability(number, predicted / number, observed / number)
 
 
 def pose_errors(estimate: Pose, truth: Pose) -> PoseErrors:
@@ -104,7 +117,7 @@ def pose_errors(estimate: Pose, truth: Pose) -> PoseErrors:
         The angle of :math:`\hat R R^\top` in degrees and :math:`\|\hat t - t\|`, each of shape :math:`(B,)`.
 
     Raises:
-        ShapeError: when the shapes are others, or differ.
+        ShapeError: when a shape is not as above or the shapes differ.
         TypeCheckError: when the dtypes differ.
         DeviceError: when the devices differ.
 
@@ -120,7 +133,7 @@ def pose_errors(estimate: Pose, truth: Pose) -> PoseErrors:
 
 
 def success(errors: PoseErrors, max_rotation_deg: float = 1.0, max_translation: float | Tensor = 0.2) -> Tensor:
-    r"""Tell which poses are right: both errors below their limits.
+    r"""Decide which poses succeed: both errors are below their limits.
 
     Args:
         errors: the errors, each of shape :math:`(B,)`.
@@ -128,31 +141,30 @@ def success(errors: PoseErrors, max_rotation_deg: float = 1.0, max_translation: 
         max_translation: limit of the translation error in the unit of the world, a number or :math:`(B,)`.
 
     Returns:
-        bool of shape :math:`(B,)`; a NaN is no success.
+        bool of shape :math:`(B,)`; False where an error is NaN.
 
     Raises:
-        DeviceError: for tensors on different devices.
+        DeviceError: when tensors are on different devices.
 
     Example:
         >>> success(PoseErrors(torch.tensor([0.5, 0.5, 2.0]), torch.tensor([0.1, 0.3, 0.1])))
         tensor([ True, False, False])
     """
-    others = {"rotation_error_deg": errors.rotation_error_deg}
-    if isinstance(max_translation, Tensor):
-        others["max_translation"] = max_translation
-    check_devices(others, errors.translation_error, "translation_error")
+    limit = max_translation if isinstance(max_translation, Tensor) else None
+    tensors = {"rotation_error_deg": errors.rotation_error_deg, "max_translation": limit}
+    check_devices(tensors, errors.translation_error, "translation_error")
     return (errors.rotation_error_deg < max_rotation_deg) & (errors.translation_error < max_translation)
 
 
 def success_rate(successes: Tensor) -> SuccessRate:
-    r"""Share of successes with its 95 % interval.
+    r"""Success rate with its 95 % interval.
 
     Args:
-        successes: bool of any shape with at least one element.
+        successes: bool, any shape with at least one element.
 
     Returns:
-        The rate and the bounds of the Wilson score interval (E. B. Wilson, 1927), which, unlike the normal
-        approximation, stays inside [0, 1] and does not collapse at 0 or 1.
+        The rate and the bounds of the Wilson score interval (E. B. Wilson, 1927). Unlike the interval of the normal
+        approximation it stays inside [0, 1] and keeps a positive width at 0 and 1.
 
     Raises:
         ValueError: when ``successes`` is empty.
@@ -165,8 +177,8 @@ def success_rate(successes: Tensor) -> SuccessRate:
     if count == 0:
         raise ValueError("success_rate needs at least one problem, got none.")
     rate = successes.to(torch.float64).mean().item()
-    z = 1.959963984540054  # the 97.5 % point of the normal distribution
+    z = _Z_95
     centre = (rate + z * z / (2 * count)) / (1 + z * z / count)
     half = z / (1 + z * z / count) * math.sqrt(rate * (1 - rate) / count + z * z / (4 * count * count))
-    # The bounds hold the rate; at 0 and 1 rounding could put them past it.
+    # The interval contains the rate. At rates of 0 and 1 rounding could put a bound on the wrong side.
     return SuccessRate(rate, max(0.0, min(rate, centre - half)), min(1.0, max(rate, centre + half)), count)

@@ -1,4 +1,4 @@
-r"""From pixels of any camera and a world in any frame to what the networks and the refiner see, and back.
+r"""Into the solver's frame and back: from any camera and any world to what initialisers and refiners see.
 
 Pixels become those of a camera with the focal length ``f_const`` and the principal point 0; the pairs may be ordered
 by their pixels, as the paper does; the world may be centred and scaled, which makes the solved pose equivariant to
@@ -10,17 +10,20 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_positive
+from kornia_pnpnet.core.configured import Configured
+from kornia_pnpnet.core.performance import exporting
+from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import MIN_DEPTH_RATIO
-from kornia_pnpnet.types import Correspondences, Pose
+from kornia_pnpnet.types import Correspondences, Guess, Noise, Pose
 
 __all__ = ["F_CONST", "VIEWS", "Frame", "Normalize"]
 
 #: Focal length of the normalised camera in pixels (PROTOCOL.md: an ETH3D DSLR has 3400-3430).
 F_CONST = 3400.0
-#: The mirrors that leave a square image a square image: are x and y exchanged, then x reversed, then y?
+#: The symmetries of a square image, as three flags: exchange x and y, then reverse x, then reverse y.
 VIEWS = (
     (False, False, False),
     (True, False, False),
@@ -34,28 +37,30 @@ VIEWS = (
 
 
 class Frame(NamedTuple):
-    r"""What :class:`Normalize` did, so that it can be undone.
+    r"""How :class:`Normalize` moved and ordered a problem, so that it can be undone.
 
     Attributes:
         centroid: the world point that became the origin, shape :math:`(B, 3)`.
-        scale: the factor on world lengths, shape :math:`(B,)`.
-        order: position in the input of each normalised pair, int64, shape :math:`(B, N)`.
+        scale: factor of world lengths, shape :math:`(B,)`.
+        img_scale: factor of pixels, the geometric mean of both axes, shape :math:`(B,)`.
+        order: position in the input of each normalised pair, int64, shape :math:`(B, N)`; ``None``: unchanged.
         valid: whether the problem can be solved at all, bool, shape :math:`(B,)`.
     """
 
     centroid: Tensor
     scale: Tensor
-    order: Tensor
+    img_scale: Tensor
+    order: Tensor | None
     valid: Tensor
 
 
-class Normalize(nn.Module):
+class Normalize(Configured):
     r"""Normalise cameras, order and world frame.
 
-    A problem is *valid* when what its pairs hold is finite (and can be squared twice), its weights are not negative, at
-    least three pairs have a weight, its camera is a pinhole without skew, and its points do not lie on one line or
-    point. The inputs of invalid problems are replaced by zeros, which keeps values and gradients finite everywhere
-    behind. A pair without weight is padding: what it holds does not matter.
+    A problem is *valid* when its numbers are finite (and can be squared twice), its weights are not negative, at least
+    three pairs have a weight, its camera is a pinhole without skew, and its points do not lie on one line or coincide.
+    The inputs of invalid problems are replaced by zeros, which keeps all later values and gradients finite. A pair
+    without weight is padding: its numbers do not matter.
 
     Args:
         f_const: focal length of the normalised camera in pixels.
@@ -80,17 +85,12 @@ class Normalize(nn.Module):
     def __init__(
         self, *, f_const: float = F_CONST, order: bool = True, center: bool = True, scale: bool = True
     ) -> None:
-        super().__init__()
+        super().__init__(locals())
         check_positive(f_const=f_const)
-        self.config = {"f_const": f_const, "order": order, "center": center, "scale": scale}
         self.f_const = f_const
         self.order = order
         self.center = center
         self.scale = scale
-
-    def extra_repr(self) -> str:
-        """Show the constructor's arguments."""
-        return ", ".join(f"{key}={value!r}" for key, value in self.config.items())
 
     def forward(
         self,
@@ -99,6 +99,7 @@ class Normalize(nn.Module):
         intrinsics: Tensor,
         weights: Tensor | None = None,
         mask: Tensor | None = None,
+        noise: Noise | None = None,
     ) -> tuple[Correspondences, Frame]:
         r"""Normalise a batch.
 
@@ -108,10 +109,10 @@ class Normalize(nn.Module):
             intrinsics: shape :math:`(B, 3, 3)`.
             weights: at least 0, shape :math:`(B, N)`; 1 when ``None``.
             mask: False where a pair is padding, bool, shape :math:`(B, N)`.
+            noise: standard deviations in pixels and in the unit of the world; NaN where unknown.
 
         Returns:
-            The normalised correspondences, in memory as :func:`~kornia_pnpnet.geometry.problems_last` would have them,
-            and the :class:`Frame` that undoes it.
+            The normalised correspondences, with the problems last in memory, and the :class:`Frame` that undoes it.
         """
         batch, count = world_points.shape[:2]
         usable = _is_pinhole(intrinsics)
@@ -120,18 +121,18 @@ class Normalize(nn.Module):
         else:
             weights = weights if mask is None else torch.where(mask, weights, 0.0)
             usable = usable & (weights >= 0).all(-1)
-        # From here on the problems are side by side in memory: coordinates and weight of each pair, (6, N, B), and the
-        # entries of each camera, (9, B), of which fx, fy = [:5:4] and cx, cy = [2:6:3].
+        # From here on problems are the last dimension: coordinates and weight of each pair, (6, N, B), and the entries
+        # of each camera, (9, B), of which fx, fy = [:5:4] and cx, cy = [2:6:3].
         rows = torch.cat((world_points.permute(2, 1, 0), img_points.permute(2, 1, 0), weights.mT[None]))
         camera = intrinsics.flatten(1).mT
         there = rows[5] != 0
 
-        # Inputs are made safe before anything is computed from them: between this limit and its inverse, squares of
-        # squares neither overflow nor vanish. NaN compares false, and is what the root of a negative number is.
+        # Make inputs safe before computing with them: between this limit and its inverse, squares of squares neither
+        # overflow nor vanish. NaN compares false, and the root of a negative number is NaN.
         limit = torch.finfo(rows.dtype).max ** 0.25
         zero, one = rows.new_zeros(1, batch), rows.new_ones(1, batch)
         sizes = torch.where(there, rows.detach().abs(), zero).amax(1)
-        size = sizes[:3].amax(0)  # of the world
+        size = sizes[:3].amax(0)  # largest coordinate of the world
         entries = camera.detach()
         largest = torch.maximum(sizes.amax(0), size.reciprocal())
         largest_entry = torch.maximum(entries.abs().amax(0), entries[:5:4].rsqrt().amax(0))
@@ -141,7 +142,7 @@ class Normalize(nn.Module):
         camera = torch.where(usable, camera, one)
         present = there.to(rows.dtype)
 
-        focal = rows.new_full((), self.f_const)  # made on the device: nothing here waits for the CPU
+        focal = rows.new_full((), self.f_const)  # made on the device, so that a GPU need not wait for the CPU
         share = present.sum(0).clamp(min=1.0).reciprocal()
         mean = rows[:3].sum(1) * share
         centroid = mean if self.center else zero.expand(3, batch)
@@ -152,63 +153,77 @@ class Normalize(nn.Module):
         scale = torch.where(spread_out, mean_square, one[0]).rsqrt() if self.scale else one[0]
         img_scales = focal / camera[:5:4]  # (2, B)
 
-        # No point in front of the camera has a pixel beyond a limit. A problem that is not valid becomes zeros: behind
-        # this nothing of it has a gradient.
+        # No point in front of the camera projects beyond a limit. An invalid problem becomes zeros, without gradient.
         img_sizes = moved[3:5].detach().abs().amax(1) * img_scales.detach()
         valid = spread_out & (img_sizes.amax(0) <= self.f_const / MIN_DEPTH_RATIO)
         factors = torch.where(valid, torch.cat((scale.expand(3, batch), img_scales, one)), zero)
         rows = moved * factors[:, None]
 
+        order = None
         if self.order:
             order = _order(torch.where(there, rows[3:5].detach(), torch.inf))
             rows = rows.gather(1, order.mT.expand(6, -1, -1))
-        else:
-            order = torch.arange(count, device=rows.device).expand(batch, count)
         world_points, img_points, weights = rows.permute(2, 1, 0).split((3, 2, 1), -1)
         horizontal, vertical = img_scales.sqrt()
-        corr = Correspondences(world_points, img_points, weights[..., 0], focal, horizontal * vertical, scale)
-        return corr, Frame(centroid.mT, scale, order, valid)
+        frame = Frame(centroid.mT, scale, horizontal * vertical, order, valid)
+        if noise is not None:
+            frame = frame._replace(valid=valid & _is_usable(noise))
+            noise = self._apply_to_noise(noise, frame)
+        corr = Correspondences(world_points, img_points, weights[..., 0], focal, frame.img_scale, scale, noise)
+        return corr, frame
+
+    def _apply_to_noise(self, noise: Noise, frame: Frame) -> Noise:
+        """Standard deviations in the units and the order of the normalised correspondences."""
+
+        def scaled(sigma: Tensor, scale: Tensor) -> Tensor:
+            # Unknown sigmas are NaN. Replace them before scaling, or the gradient of the scale becomes NaN.
+            sigma = torch.where(sigma.isnan(), sigma, sigma.nan_to_num() * scale[:, None])
+            return sigma if frame.order is None else sigma.gather(1, frame.order)
+
+        return Noise(scaled(noise.img, frame.img_scale), scaled(noise.world, frame.scale))
 
     def views(self, corr: Correspondences, count: int) -> Correspondences:
-        """The same problems seen in mirrors: the axes of image and world exchanged or reversed, both alike.
+        """Mirror problems: the axes of image and world are exchanged or reversed, both in the same way.
 
-        The distribution of random problems does not change, but what a network makes of one does.
+        The distribution of random problems does not change, but a network answers each mirrored problem differently.
 
         Args:
             corr: normalised correspondences of :math:`B` problems.
-            count: of the views of each, the problem itself first, at most 8.
+            count: number of views of each problem, at most 8; the first view is the problem itself.
 
         Returns:
-            The correspondences of all problems in the first view, then in the second, and so on.
+            The correspondences of all problems in the first view, then in the second view, and so on.
         """
         rows = torch.cat((corr.world_points.permute(2, 1, 0), corr.img_points.permute(2, 1, 0), corr.weights.mT[None]))
         x, y, z, u, v, weights = rows  # (N, B) each
         seen = [torch.stack((*_exchanged(x, y, *view), z, *_exchanged(u, v, *view), weights)) for view in VIEWS[:count]]
+        noise = map_tensors(lambda sigma: sigma.repeat(count, 1), corr.noise)
         if self.order:
             keys = torch.cat([torch.where(view[5] != 0, view[3:5].detach(), torch.inf) for view in seen[1:]], -1)
-            order = _order(keys).mT.expand(6, -1, -1)
-            seen = [seen[0], torch.cat(seen[1:], -1).gather(1, order)]
+            order = _order(keys)  # (B * (count - 1), N)
+            seen = [seen[0], torch.cat(seen[1:], -1).gather(1, order.mT.expand(6, -1, -1))]
+            batch = corr.weights.shape[0]
+            noise = map_tensors(lambda sigma: torch.cat((sigma[:batch], sigma[batch:].gather(1, order))), noise)
         world_points, img_points, weights = torch.cat(seen, -1).permute(2, 1, 0).split((3, 2, 1), -1)
-        return Correspondences(world_points, img_points, weights[..., 0], corr.focal)
+        return Correspondences(world_points, img_points, weights[..., 0], corr.focal, noise=noise)
 
-    def undo_views(self, pose: Pose, count: int) -> tuple[Pose, Pose]:
-        """Poses of :meth:`views`, expressed for the problems themselves.
+    def undo_views(self, pose: Pose, count: int) -> list[Pose]:
+        """Express poses of :meth:`views` for the problems themselves.
 
         Args:
-            pose: of all views.
-            count: of the views.
+            pose: poses of all views.
+            count: number of views.
 
         Returns:
-            The poses from the first view, and those from the others, :math:`(B, S, 3, 3)` and :math:`(B, S, 3)`.
+            The poses from each view, the first view first.
         """
         seen = []
         matrices, vectors = (x.movedim(0, -1).unflatten(-1, (count, -1)).unbind(-2) for x in pose)
         for view, matrix, vector in zip(VIEWS, matrices, vectors, strict=False):  # (3, 3, B), (3, B)
             for axis in (0, 1):
                 matrix = _axes_back(matrix, axis, view)
-            seen.append((matrix.movedim(-1, 0), _axes_back(vector, 0, view).movedim(-1, 0)))
-        (first, *others) = (Pose(*view) for view in seen)
-        return first, Pose(*(torch.stack(entries, 1) for entries in zip(*others, strict=True)))
+            seen.append(Pose(matrix.movedim(-1, 0), _axes_back(vector, 0, view).movedim(-1, 0)))
+        return seen
 
     def undo(self, pose: Pose, frame: Frame) -> Pose:
         r"""Express a pose of the normalised world in the original one.
@@ -238,26 +253,49 @@ class Normalize(nn.Module):
         offset = (rotation * frame.centroid[:, None]).sum(-1)
         return Pose(rotation, (translation + offset) * frame.scale[:, None])
 
+    def undo_pairs(self, values: Tensor, frame: Frame) -> Tensor:
+        """Bring values of pairs, :math:`(B, N)`, back to the order in which the pairs came."""
+        return values if frame.order is None else torch.zeros_like(values).scatter(1, frame.order, values)
+
+    def undo_guess(self, guess: Guess, frame: Frame) -> Guess:
+        """Express a guess in the frame, the order and the units of the inputs; ``ok``: whether the problem is valid."""
+        others, noise = guess.others, guess.noise
+        if others is not None:
+            batch, count = others.translation.shape[:2]
+            frames = map_tensors(lambda x: x.repeat_interleave(count, 0), frame)
+            others = self.undo(map_tensors(lambda x: x.flatten(0, 1), others), frames)
+            others = map_tensors(lambda x: x.unflatten(0, (batch, count)), others)
+        if noise is not None:
+            noise = Noise(noise.img / frame.img_scale[:, None], noise.world / frame.scale[:, None])
+            noise = map_tensors(lambda x: self.undo_pairs(x, frame), noise)
+        return Guess(self.undo(guess.pose, frame), self.undo_pairs(guess.weights, frame), frame.valid, others, noise)
+
+
+def _is_usable(noise: Noise) -> Tensor:
+    """Whether standard deviations are finite and not negative, or unknown, bool (B,)."""
+    usable = [((x >= 0) | x.isnan()).all(-1) & ~x.isinf().any(-1) for x in noise]
+    return torch.stack(usable).all(0)
+
 
 def _is_pinhole(intrinsics: Tensor) -> Tensor:
     """Whether cameras with positive focal lengths have no skew and the last row 0, 0, 1, bool (B,)."""
-    # Where both focal lengths are there, no other entry of the first two columns may be.
+    # Where both focal lengths are not 0, all other entries of the first two columns must be 0.
     return ((intrinsics[..., :2] != 0).sum((1, 2)) == 2) & (intrinsics[:, 2, 2] == 1)
 
 
 def _is_spread_out(centred: Tensor, share: Tensor, size: Tensor) -> Tensor:
-    """Whether points are more than a line or a point, so that there are at least three.
+    """Whether the points span more than a line, so that there are at least three.
 
     Args:
-        centred: the points about their mean, 0 where there is none, (3, N, B).
+        centred: the points minus their mean, 0 for padding, (3, N, B).
         share: one over the number of points, (B,).
-        size: the largest coordinate before the points were centred, (B,). Where it is 0 or NaN the answer is no.
+        size: the largest coordinate before the points were centred, (B,). Where it is 0 or NaN the result is false.
 
     Returns:
         bool of shape (B,).
     """
-    # The second largest variance from the invariants of the covariance: it is about the sum of the principal minors,
-    # half of trace² - sum of squares, over the trace. On a line or a point only rounding is left of it.
+    # The second largest variance is about the sum of the principal minors of the covariance, (trace² - sum of squares)
+    # / 2, over the trace. For points on a line only rounding remains.
     eps = torch.finfo(centred.dtype).eps
     covariance = (centred[:, None] * centred).sum(2) * (share / (size * size))  # (3, 3, B) in the unit of the size
     trace = covariance.diagonal().sum(-1)
@@ -265,13 +303,13 @@ def _is_spread_out(centred: Tensor, share: Tensor, size: Tensor) -> Tensor:
 
 
 def _exchanged(x: Tensor, y: Tensor, swap: bool, reverse_x: bool, reverse_y: bool) -> tuple[Tensor, Tensor]:
-    """Two coordinates in a mirror."""
+    """Two coordinates of a mirrored view."""
     x, y = (y, x) if swap else (x, y)
     return -x if reverse_x else x, -y if reverse_y else y
 
 
 def _axes_back(entries: Tensor, axis: int, view: tuple[bool, bool, bool]) -> Tensor:
-    """Undo a mirror in one dimension, of three coordinates."""
+    """Undo a mirrored view along one axis of three coordinates."""
     swap, reverse_x, reverse_y = view
     x, y, z = entries.unbind(axis)
     x, y = -x if reverse_x else x, -y if reverse_y else y
@@ -279,14 +317,14 @@ def _axes_back(entries: Tensor, axis: int, view: tuple[bool, bool, bool]) -> Ten
 
 
 def _order(keys: Tensor) -> Tensor:
-    """Positions in ascending order of the first of two keys (2, N, B), ties by the second, (B, N)."""
-    first, second = keys.mT.contiguous()  # sorting is twice as fast along the last dimension
+    """Ascending order by the first of two keys (2, N, B), ties by the second key, (B, N)."""
+    first, second = keys.mT.contiguous()  # sorting along the last dimension is twice as fast
     by_second = _ascending(second)
     return by_second.gather(1, _ascending(first.gather(1, by_second)))
 
 
 def _ascending(keys: Tensor) -> Tensor:
-    """Positions along the last dimension in ascending order, of equal ones the first first."""
-    if torch.compiler.is_exporting():  # ONNX has no other sort; its largest are stable
+    """Stable ascending order along the last dimension."""
+    if exporting():  # ONNX has no stable sort, but its top-k is stable
         return keys.topk(keys.shape[-1], largest=False).indices
     return keys.argsort(stable=True, dim=-1)

@@ -84,7 +84,7 @@ def read_weights(name_or_folder: str | Path) -> tuple[dict[str, Any], dict[str, 
 
 
 def _fingerprint(config: Any, state: dict[str, Tensor]) -> str:
-    """What tells whether a configuration and weights are those that were saved together."""
+    """Digest of a configuration and its weights: it tells whether both were saved together."""
     digest = hashlib.sha256(json.dumps(config, sort_keys=True).encode())
     for name, value in sorted(state.items()):
         digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
@@ -93,22 +93,25 @@ def _fingerprint(config: Any, state: dict[str, Tensor]) -> str:
 
 
 def find_weights(name_or_folder: str | Path) -> Path:
-    """Find the folder of some weights: shipped, local, or on the Hub.
+    """Find the folder of weights: shipped, local, or on the Hugging Face Hub.
 
     Args:
-        name_or_folder: see :meth:`PnPNet.from_pretrained`.
+        name_or_folder: the name of shipped weights (see :func:`shipped_weights`), which needs no network; a local
+            folder; or a Hub repository id. The first that exists is used.
 
     Returns:
         The folder.
 
     Raises:
-        FileNotFoundError: when there is none.
+        FileNotFoundError: when there is no such name, folder or repository.
     """
     name = str(name_or_folder)
     for folder in (WEIGHTS_FOLDER / name, Path(name)):
         if (folder / CONFIG_NAME).is_file():
             return folder
-    message = f"No weights {name!r}: shipped are {shipped_weights()}; a folder needs {CONFIG_NAME} and {WEIGHTS_NAME}"
+    message = (
+        f"No weights {name!r}: shipped weights are {shipped_weights()}; a folder needs {CONFIG_NAME} and {WEIGHTS_NAME}"
+    )
     if isinstance(name_or_folder, Path) or name.count("/") != 1 or Path(name).exists():
         raise FileNotFoundError(f"{message}.")
     from huggingface_hub import hf_hub_download

@@ -7,15 +7,15 @@ from functools import lru_cache, partial
 from typing import Any
 
 import torch
-from kornia.core.check import KORNIA_CHECK
 from kornia.core.exceptions import ValueCheckError
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
+from kornia_pnpnet.core.checks import check_whole
 from kornia_pnpnet.init import P3P, RANSAC, EPnP, REPPnP, SubsetSolver
 from kornia_pnpnet.normalize import Normalize
 from kornia_pnpnet.pretrained import shipped_weights
-from kornia_pnpnet.refine.lm import RobustWeightedLM
+from kornia_pnpnet.refine import RobustWeightedLM
 from kornia_pnpnet.solver import PnPNet
 
 __all__ = ["create_solver", "list_solvers", "solve_pnp"]
@@ -27,12 +27,12 @@ _PAPERS_SAMPLE = 7
 
 
 def _trained(weights: str, m: int | None = None, views: int | None = None) -> PnPNet:
-    """Shipped weights; with ``m``, only their first iterations (0: the network alone, the paper's "Net")."""
+    """Shipped weights, with the first ``m`` of their iterations (0: the network alone, the paper's "Net")."""
     solver = PnPNet.from_pretrained(weights)
     refine = whole = solver.refine
     if m is not None:
-        KORNIA_CHECK(type(m) is int and 0 <= m <= whole.m, f"m must be an integer from 0 to {whole.m}, got {m!r}.")
-        by_residual = max(whole.by_residual - (whole.m - m), 0)  # they are the last ones
+        check_whole(0, whole.m, m=m)
+        by_residual = max(whole.by_residual - (whole.m - m), 0)  # the iterations by residual are the last ones
         refine = RobustWeightedLM(**{**whole.config, "m": m, "by_residual": by_residual})
         for name, parameter in refine.named_parameters():
             parameter.data.copy_(whole.get_parameter(name)[: len(parameter)])
@@ -40,12 +40,12 @@ def _trained(weights: str, m: int | None = None, views: int | None = None) -> Pn
 
 
 def _judged(init: nn.Module, *, order: bool = True) -> PnPNet:
-    """An initialiser by itself: its pose is only judged, and its weights are those of the result."""
+    """An initialiser without refinement: its pose is judged, and its weights are the weights of the result."""
     return PnPNet(init, RobustWeightedLM(0, robustness=0.0, learnable=False), Normalize(order=order))
 
 
 def _alone(init: Callable[..., nn.Module], **options: Any) -> PnPNet:
-    """A method to which the order of the pairs does not matter, unrefined."""
+    """An unrefined method that does not depend on the order of the pairs."""
     return _judged(init(**options), order=False)
 
 
@@ -116,11 +116,11 @@ def create_solver(name: str, **options: Any) -> nn.Module:
 
     Args:
         name: one of :func:`list_solvers`.
-        options: of that solver: ``m``, the number of iterations, of ``identity-lm``, every ``-lm`` and trained weights
-            (at most their own); ``views``, the guesses for each problem, of trained weights (see
-            :class:`~kornia_pnpnet.solver.PnPNet`); the arguments of :class:`~kornia_pnpnet.init.EPnP` of ``epnp`` and
-            ``epnp-lm``, of :class:`~kornia_pnpnet.init.REPPnP` of ``reppnp`` and ``reppnp-lm``, of
-            :class:`~kornia_pnpnet.init.RANSAC` of ``p3p-ransac`` and ``ransac-epnp-lm``, and of the classes of
+        options: options of that solver. ``identity-lm``, every ``-lm`` and trained weights take ``m``, the number of
+            iterations (trained weights at most their own number); trained weights take ``views``, the number of guesses
+            per problem (see :class:`~kornia_pnpnet.solver.PnPNet`); ``epnp`` and ``epnp-lm`` take the arguments of
+            :class:`~kornia_pnpnet.init.EPnP`, ``reppnp`` and ``reppnp-lm`` of :class:`~kornia_pnpnet.init.REPPnP`,
+            ``p3p-ransac`` and ``ransac-epnp-lm`` of :class:`~kornia_pnpnet.init.RANSAC`, peers of their class in
             :mod:`kornia_pnpnet.peers`.
 
     Returns:
@@ -128,7 +128,7 @@ def create_solver(name: str, **options: Any) -> nn.Module:
 
     Raises:
         ValueCheckError: for an unknown name or option.
-        BaseError: for an option that is out of its range.
+        BaseError: for an option out of its range.
         ImportError: when the solver needs a package that is not installed.
 
     Example:
@@ -146,7 +146,7 @@ def create_solver(name: str, **options: Any) -> nn.Module:
 
 @lru_cache(maxsize=8)
 def _frozen(name: str, device: torch.device) -> nn.Module:
-    """A solver that is made once; its own parameters take no part in gradients."""
+    """A solver that is built once, without gradients of its parameters."""
     return create_solver(name).to(device).requires_grad_(False)
 
 
@@ -157,21 +157,21 @@ def solve_pnp(
     weights: Tensor | None = None,
     solver: str | nn.Module = "pnpnet-set",
 ) -> Tensor:
-    r"""World-to-camera matrices, called like :func:`kornia.geometry.solve_pnp_dlt`; some pairs may be wrong.
+    r"""Find world-to-camera matrices, with the signature of :func:`kornia.geometry.solve_pnp_dlt`, despite outliers.
 
-    What it leaves out (which pairs counted, how sure the pose is, masks) a solver of :func:`create_solver` returns.
+    For masks, the weights of the pairs and the uncertainty of the pose use a solver of :func:`create_solver`.
 
     Args:
         world_points: shape :math:`(B, N, 3)`, float32 or float64, any unit, :math:`N` as the solver takes it.
         img_points: pixels, shape :math:`(B, N, 2)`.
         intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or Kornia's cameras.
-        weights: how much each pair counts, at least 0, shape :math:`(B, N)`; 1 when ``None``.
-        solver: one of :func:`list_solvers`, or a module that is called like these. A name is made into a solver once.
+        weights: weight of each pair, at least 0, shape :math:`(B, N)`; 1 when ``None``.
+        solver: one of :func:`list_solvers`, or a module with the same signature. A named solver is built once.
 
     Returns:
-        :math:`[R\,|\,t]` with ``x_cam = R x_world + t``, shape :math:`(B, 3, 4)`, with gradients by points, pixels,
-        intrinsics and weights. NaN, without gradient, where a problem has no pose (``ok`` of the result is false):
-        nothing is raised for it, and the rest of the batch is as it would be alone.
+        :math:`[R\,|\,t]` with ``x_cam = R x_world + t``, shape :math:`(B, 3, 4)`, with gradients to points, pixels,
+        intrinsics and weights. A problem without a pose (``ok`` of the result is false) is NaN without gradient;
+        nothing is raised, and no other problem of the batch changes.
 
     Raises:
         ValueCheckError: for an unknown name.

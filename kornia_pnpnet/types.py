@@ -45,9 +45,10 @@ class Pose(NamedTuple):
         r"""Kornia's camera with these extrinsics.
 
         Args:
-            intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or a camera, whose size is kept.
-            height: of the image in pixels, which no projection needs.
-            width: likewise.
+            intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or a camera, whose image size is
+                kept.
+            height: height of the image in pixels; projection does not need it.
+            width: width of the image in pixels; projection does not need it.
 
         Example:
             >>> pose = Pose(torch.eye(3)[None], torch.tensor([[0.0, 0.0, 2.0]]))
@@ -66,7 +67,7 @@ class Pose(NamedTuple):
 
 
 def camera_matrices(intrinsics: Tensor | PinholeCamera) -> Tensor:
-    """The camera matrices (B, 3, 3) or (3, 3) of what a user gives as intrinsics; where it is does not matter."""
+    """Camera matrices (B, 3, 3) or (3, 3) from matrices or from Kornia's camera, whose extrinsics are ignored."""
     if not isinstance(intrinsics, PinholeCamera):
         return intrinsics
     matrices = intrinsics.camera_matrix
@@ -74,11 +75,11 @@ def camera_matrices(intrinsics: Tensor | PinholeCamera) -> Tensor:
 
 
 class Noise(NamedTuple):
-    r"""Standard deviations of the noise of each pair, on each coordinate alike.
+    r"""Standard deviations of the noise of each pair, the same on each coordinate.
 
     Attributes:
-        img: of its pixel, shape :math:`(B, N)`.
-        world: of its world point, shape :math:`(B, N)`.
+        img: standard deviation of the pixel, shape :math:`(B, N)`.
+        world: standard deviation of the world point, shape :math:`(B, N)`.
     """
 
     img: Tensor
@@ -86,19 +87,19 @@ class Noise(NamedTuple):
 
 
 class Correspondences(NamedTuple):
-    r"""Normalised 2D-3D pairs: what an initialiser and a refiner see.
+    r"""Normalised 2D-3D correspondences: the input of initialisers and refiners.
 
     Attributes:
         world_points: points in the (possibly centred and scaled) world frame, shape :math:`(B, N, 3)`.
         img_points: pixels of a camera with the focal length ``focal`` and the principal point 0,
             shape :math:`(B, N, 2)`.
-        weights: how much each pair counts, at least 0; 0 means that the pair is not there, shape :math:`(B, N)`.
+        weights: weight of each pair, at least 0; 0 means that the pair is padding, shape :math:`(B, N)`.
         focal: the focal length in pixels that all pairs share, a scalar.
-        img_scale: pixels of ``img_points`` per pixel of the camera that was given, shape :math:`(B,)`; ``None`` is 1.
-            What a user says in pixels, a threshold for example, is multiplied by it.
-        world_scale: lengths of ``world_points`` per unit of the world that was given, shape :math:`(B,)`; ``None`` is
-            1.
-        noise: in the units of ``img_points`` and ``world_points``; NaN where it is not known, ``None`` where none is.
+        img_scale: pixels of ``img_points`` per pixel of the user's camera, shape :math:`(B,)`; ``None`` is 1. It
+            multiplies values that the user gives in pixels, such as a threshold.
+        world_scale: lengths of ``world_points`` per unit of the user's world, shape :math:`(B,)`; ``None`` is 1.
+        noise: noise of each pair in the units of ``img_points`` and ``world_points``, NaN where unknown; ``None``: all
+            unknown.
     """
 
     world_points: Tensor
@@ -115,7 +116,7 @@ class Correspondences(NamedTuple):
 
 
 class Guess(NamedTuple):
-    r"""What an initialiser returns.
+    r"""A first guess: what an initialiser returns.
 
     Attributes:
         pose: a coarse pose in the frame of the :class:`Correspondences`.
@@ -124,8 +125,8 @@ class Guess(NamedTuple):
             always.
         others: more poses to start from, rotations :math:`(B, S, 3, 3)` and translations :math:`(B, S, 3)`; ``None``:
             no others.
-        noise: of each pair, in the units of the correspondences and known everywhere; residuals then count in
-            standard deviations. ``None``: they count in pixels.
+        noise: noise of each pair in the units of the correspondences, where unknown the initialiser's estimate;
+            residuals then count in standard deviations. ``None``: the initialiser does not estimate noise.
     """
 
     pose: Pose
@@ -134,13 +135,19 @@ class Guess(NamedTuple):
     others: Pose | None = None
     noise: Noise | None = None
 
+    @property
+    def poses(self) -> list[Pose]:
+        """The pose and the others, each of rotations :math:`(B, 3, 3)` and translations :math:`(B, 3)`."""
+        others = () if self.others is None else map(Pose, *(x.unbind(1) for x in self.others))
+        return [self.pose, *others]
+
 
 class Hypotheses(NamedTuple):
-    r"""What a solver of minimal or small samples returns: up to :math:`S` poses for each sample.
+    r"""Up to :math:`S` poses for each sample: what a minimal solver returns.
 
     Attributes:
         pose: rotations :math:`(B, S, 3, 3)` and translations :math:`(B, S, 3)` in the frame of the sample.
-        valid: which of them are solutions, bool, shape :math:`(B, S)`. The others are finite.
+        valid: which slots hold a solution, bool, shape :math:`(B, S)`. The other slots are finite.
     """
 
     pose: Pose
@@ -148,13 +155,13 @@ class Hypotheses(NamedTuple):
 
 
 class Refinement(NamedTuple):
-    r"""What a refiner returns.
+    r"""A refined pose: what a refiner returns.
 
     Attributes:
         pose: the refined pose in the frame of the :class:`Correspondences`.
         weights: the weight of each pair at that pose, shape :math:`(B, N)`.
         cost: mean robust loss of the pairs at that pose, shape :math:`(B,)`.
-        ok: whether the pose explains the pairs, bool, shape :math:`(B,)`.
+        ok: whether the pose is to be believed, bool, shape :math:`(B,)`.
     """
 
     pose: Pose
@@ -164,18 +171,18 @@ class Refinement(NamedTuple):
 
 
 class PnPResult(NamedTuple):
-    r"""What every solver returns.
+    r"""The result of every solver.
 
     Attributes:
         rotation: world-to-camera rotation, shape :math:`(B, 3, 3)`.
         translation: world-to-camera translation in the unit of the world points, shape :math:`(B, 3)`.
         weights: final weight of each pair, in the order in which the pairs were given, shape :math:`(B, N)`.
         cost: mean robust loss of the pairs, in the kernel's unit (see :mod:`kornia_pnpnet.refine.kernels`), shape
-            :math:`(B,)`. Comparable between problems solved by the same solver.
-        ok: whether the pose can be used, bool, shape :math:`(B,)`. Where it is false the fields above are finite and
-            carry no gradient.
-        init: the first guess that was refined. It carries a gradient whenever the problem itself is sound, so that it
-            can be trained from guesses that refinement cannot save.
+            :math:`(B,)`. Comparable between problems that the same solver solved.
+        ok: whether the pose is to be believed, bool, shape :math:`(B,)`. Where ``ok`` is false the fields above are
+            finite and carry no gradient.
+        init: the first guess. It carries a gradient for every valid problem, also where refinement failed, so that an
+            initialiser can learn from its failures.
     """
 
     rotation: Tensor
@@ -197,14 +204,14 @@ class PnPResult(NamedTuple):
 
 
 class Problems(NamedTuple):
-    r"""A batch of problems with their answers: what every data source yields.
+    r"""A batch of problems with their true poses: what every data source yields.
 
     Attributes:
         world_points: shape :math:`(B, N, 3)`.
         img_points: pixels, shape :math:`(B, N, 2)`.
         intrinsics: camera matrices, shape :math:`(B, 3, 3)`.
         pose: the true world-to-camera pose.
-        inliers: whether the pixel of a pair belongs to its point, bool, shape :math:`(B, N)`.
+        inliers: whether the pixel of a pair shows its point, bool, shape :math:`(B, N)`.
         img_sigma: standard deviation of the noise on each pixel coordinate, as a solver may know it: NaN where it is
             unknown, ``None`` where it is unknown for all problems, shape :math:`(B,)`.
         world_sigma: standard deviation of the noise on each world coordinate, NaN and ``None`` as for ``img_sigma``,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,26 +16,13 @@ from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.geometry import retract
 
 if TYPE_CHECKING:
-    from kornia_pnpnet.training.loop import FitReport
+    from kornia_pnpnet.training import FitReport
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _one_thread() -> None:
     """The tensors are small: threads only get into each other's way, above all under pytest-xdist."""
     torch.set_num_threads(1)
-
-
-@pytest.fixture(scope="session")
-def tally() -> Callable[..., None]:
-    """Count cases by what they are, for the table of ``docs/hardening.py``, which names the file."""
-    path = os.environ.get("PNPNET_TALLY")
-
-    def count(*what: str) -> None:
-        if path is not None:
-            with Path(path).open("a") as file:
-                file.write("\t".join(what) + "\n")
-
-    return count
 
 
 @pytest.fixture(autouse=True)
@@ -120,7 +106,7 @@ def fit_config(tmp_path: Path) -> Callable[..., FitReport]:
     """Train what a composed configuration describes, as ``train.py`` does, or another solver in its place."""
     from hydra.utils import instantiate
 
-    from kornia_pnpnet.training.loop import fit
+    from kornia_pnpnet.training import fit
 
     def run(config: Any, solver: torch.nn.Module | None = None) -> FitReport:
         return fit(

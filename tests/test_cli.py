@@ -19,8 +19,8 @@ from kornia_pnpnet import MLPInit, PnPNet, RobustWeightedLM, create_solver, list
 from kornia_pnpnet.cli import COMMANDS, main
 from kornia_pnpnet.cli.demo import verdict
 from kornia_pnpnet.cli.reprojection import rejection_limit, reproject
-from kornia_pnpnet.evaluation.choices import BOUNDS, default_solvers
-from kornia_pnpnet.evaluation.comparison import load_results
+from kornia_pnpnet.evaluation.named_solvers import BOUNDS, default_solvers
+from kornia_pnpnet.evaluation.results import load_results
 from kornia_pnpnet.types import Pose
 
 CAMERA = "800,810,320,240"

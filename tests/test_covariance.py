@@ -1,8 +1,12 @@
-"""The covariance of a pose against the errors that noise makes."""
+"""The covariance of a pose against the pose errors of many noisy problems."""
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from kornia.core.exceptions import BaseError
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
+from strategies import ANY, SOLVERS, batches, many, numbers
 
 from kornia_pnpnet import Normalize, PnPNet, Pose, RobustWeightedLM, create_solver, pose_covariance
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
@@ -22,7 +26,7 @@ def solved(p):
 
 @pytest.mark.parametrize("n", [20, 60])
 def test_normalised_errors_are_chi_square(n, make_problems):
-    """Their mean is 6, and so is that of each of the parts its size."""
+    """The mean is 6 for the whole pose, 3 for rotation and for translation."""
     p = make_problems(n=n, batch=3000)
     pose = solved(p)
     covariance = pose_covariance(pose, *p[:3], img_sigma=1.0, world_sigma=0.05)
@@ -37,7 +41,7 @@ def test_normalised_errors_are_chi_square(n, make_problems):
     assert (squares < 7.815).double().mean().item() == pytest.approx(0.95, abs=0.02)
 
 
-def test_weights_of_zero_are_as_pairs_that_are_not_there(make_problems):
+def test_zero_weight_equals_removing(make_problems):
     p = make_problems(n=12, batch=5)
     weights = (torch.arange(12) < 8).double().expand(5, 12)
     half = pose_covariance(p.pose, *p[:3], img_sigma=2.0, weights=weights)
@@ -46,10 +50,12 @@ def test_weights_of_zero_are_as_pairs_that_are_not_there(make_problems):
 
 
 def test_units_of_the_noise(make_problems):
-    """Numbers, of each problem, of each pair; twice the noise is four times the covariance."""
+    """A number, one per problem or one per pair; twice the noise is four times the covariance."""
     p = make_problems(n=12, batch=5)
     plain = pose_covariance(p.pose, *p[:3], img_sigma=1.0, world_sigma=0.1)
-    double = pose_covariance(p.pose, *p[:3], img_sigma=torch.full((5,), 2.0), world_sigma=torch.full((5, 12), 0.2))
+    double = pose_covariance(
+        p.pose, *p[:3], img_sigma=p.world_points.new_full((5,), 2.0), world_sigma=p.world_points.new_full((5, 12), 0.2)
+    )
     torch.testing.assert_close(double, 4.0 * plain)
     scaled = Pose(p.pose.rotation, 1000.0 * p.pose.translation)
     large = pose_covariance(scaled, 1000.0 * p.world_points, *p[1:3], img_sigma=1.0, world_sigma=100.0)
@@ -57,7 +63,7 @@ def test_units_of_the_noise(make_problems):
     torch.testing.assert_close(large, plain * unit * unit[:, None])
 
 
-def test_what_is_not_determined_is_infinite(make_problems):
+def test_an_undetermined_pose_has_infinite_variances(make_problems):
     p = make_problems(n=6, batch=3)
     weights = torch.ones(3, 6, dtype=torch.float64)
     weights[1, 2:] = 0.0  # two pairs
@@ -67,10 +73,12 @@ def test_what_is_not_determined_is_infinite(make_problems):
     assert (covariance[1] - covariance[1].diagonal().diag()).nan_to_num(0.0).eq(0).all()
 
 
-@pytest.mark.parametrize(("n", "wrong"), [(12, 0), (20, 5)])
-def test_the_shipped_network_says_how_sure_it_is(n, wrong):
-    """From its own weights, with wrong pairs as well: within 15 % of what chi-square asks."""
-    p = SyntheticProblems(n=n, batch_size=2000, seed=9, outliers=OutlierMix(count=wrong), dtype=torch.float64).batch(0)
+@pytest.mark.parametrize(("n", "outliers"), [(12, 0), (20, 5)])
+def test_covariances_from_the_weights_of_the_shipped_network(n, outliers):
+    """The mean normalised squared error is within 15 % of 6, that of chi-square, with outliers as well."""
+    p = SyntheticProblems(n=n, batch_size=2000, seed=9, outliers=OutlierMix(count=outliers), dtype=torch.float64).batch(
+        0
+    )
     noise = {"img_sigma": 1.0, "world_sigma": 0.05}
     with torch.no_grad():
         result = create_solver("pnpnet-set").double()(*p[:3], **noise)
@@ -78,3 +86,39 @@ def test_the_shipped_network_says_how_sure_it_is(n, wrong):
     error = tangent(result.pose, p.pose)
     squares = (error * torch.linalg.solve(covariance, error)).sum(-1)
     assert squares.mean().item() == pytest.approx(6.0, rel=0.15)
+
+
+# -- whatever comes in -------------------------------------------------------------------------------------------------
+
+
+@many(40)
+@given(batches())
+def test_covariances_take_anything(case):
+    inputs, _, weights, _ = case
+    result = SOLVERS["pnpnet-set"](*inputs)
+    covariance = pose_covariance(result.pose, *inputs, img_sigma=1.0, weights=weights)
+    assert covariance.shape == (len(inputs[0]), 6, 6)
+    assert not covariance.requires_grad
+    assert not covariance[result.ok].isnan().any()
+
+
+@many(60)
+@given(st.data())
+def test_covariances_of_any_numbers(data):
+    batch, count = data.draw(st.integers(0, 3)), data.draw(st.integers(0, 12))
+    some = st.integers(0, 3)
+    shapes = [(batch, 3, 3), (batch, 3), (batch, count, 3), (batch, count, 2), (3, 3)]
+    if data.draw(st.booleans()):
+        which = data.draw(st.integers(0, 4))
+        shapes[which] = (*shapes[which][:-1], data.draw(some)) if data.draw(st.booleans()) else (data.draw(some),)
+    rotation, translation, world, img, camera = (data.draw(numbers(torch.float64, shape)) for shape in shapes)
+    sigma = data.draw(st.one_of(ANY, numbers(torch.float64, (), (batch,), (batch, count), (7,))))
+    sound = [(batch, 3, 3), (batch, 3), (batch, count, 3), (batch, count, 2), (3, 3)] == shapes
+    try:
+        found = pose_covariance(Pose(rotation, translation), world, img, camera, img_sigma=sigma)
+    except BaseError:
+        assert not sound or (isinstance(sigma, torch.Tensor) and sigma.shape == (7,))
+    else:
+        assert sound
+        assert found.shape == (batch, 6, 6)
+        assert not found.isnan().any()

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from kornia.core.exceptions import BaseError
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+from strategies import ANY, SOLVERS, Seen, batches, check, finite, many, options, poses
 
 from kornia_pnpnet import Pose, pose_errors, success
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.evaluation.bounds import KnownInliers, KnownInliersAndNoise
+from kornia_pnpnet.evaluation.comparison import SeesTruth
+from kornia_pnpnet.types import Problems
 
 BOUNDS = (KnownInliers, KnownInliersAndNoise)
 
@@ -124,3 +129,38 @@ def test_a_problem_without_inliers_fails_alone(make_problems):
     alone = KnownInliers().solve_with_truth(problems)
     for i in (0, 2):
         assert torch.equal(Pose(*result.pose).matrix[i], alone.pose.matrix[i])
+
+
+# -- whatever comes in -------------------------------------------------------------------------------------------------
+
+
+@many(60)
+@given(
+    batches(), st.data(), st.sampled_from([KnownInliers(), KnownInliersAndNoise(), KnownInliersAndNoise(img_sigma=0)])
+)
+def test_bounds_take_anything(case, data, bound):
+    inputs, _, _, kinds = case
+    assert isinstance(bound, SeesTruth)
+    assert not isinstance(SOLVERS["epnp"], SeesTruth)
+    batch, count = inputs[0].shape[:2]
+    inliers = torch.rand(batch, count, generator=torch.Generator().manual_seed(batch)) > 0.3
+    problems = Problems(*inputs, data.draw(poses(batch, inputs[0].dtype)), inliers)
+    inliers[:, 0] = True  # the one that is spoiled
+    if isinstance(bound, KnownInliersAndNoise):  # whose noise is infinite, too: such a pair weighs nothing
+        kinds = ["nothing" if kind == "infinite point" else kind for kind in kinds]
+    check(bound.solve_with_truth(problems), inputs, kinds)
+
+
+def test_bounds_of_any_options():
+    made = Seen()
+    problems = SyntheticProblems(n=9, batch_size=3, seed=0).batch(0)
+
+    @many(60)
+    @given(options(img_sigma=ANY, world_sigma=ANY))
+    def run(values):
+        bound = made(lambda: KnownInliersAndNoise(**values))
+        if bound is not None:
+            finite(*bound.solve_with_truth(problems)[:4])
+
+    run()
+    made.both()

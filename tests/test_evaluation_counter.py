@@ -1,4 +1,4 @@
-"""The instrument behind the formulas: what operations cost, that none is lost, and to which part it belongs."""
+"""The operation counter: the cost of each PyTorch operation, and that no operation is missed."""
 
 from __future__ import annotations
 
@@ -6,9 +6,12 @@ import math
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import SOLVERS, batches, many
 
-from kornia_pnpnet.evaluation.operations.counter import OperationCounter, count_per_problem
-from kornia_pnpnet.evaluation.operations.operations import (
+from kornia_pnpnet.core.trees import iter_tensors
+from kornia_pnpnet.evaluation.operations.costs import (
     OPERATION_COSTS,
     Operations,
     cholesky,
@@ -19,17 +22,15 @@ from kornia_pnpnet.evaluation.operations.operations import (
     solve_triangular,
     sort,
 )
-from kornia_pnpnet.geometry import NormalEquations, move
-from kornia_pnpnet.refine.lm import solve_damped
-from kornia_pnpnet.types import Pose
+from kornia_pnpnet.evaluation.operations.counter import OperationCounter, count_per_problem
 
 
 def count(function, *shapes):
-    """Operations of a function of random tensors of these shapes, made beforehand."""
+    """Operations of a function of random tensors of these shapes, which are made outside of the count."""
     tensors = [torch.rand(shape, dtype=torch.float64) + 0.5 for shape in shapes]
     with OperationCounter() as counter:
         function(*tensors)
-    return counter.counts.get("", Operations())
+    return counter.operations
 
 
 def test_every_kind_has_a_cost():
@@ -42,35 +43,25 @@ def test_every_kind_has_a_cost():
     [
         (lambda x: x + 1, Operations(add=12)),
         (lambda x: 3 - x, Operations(add=12)),
-        (lambda x: x * x, Operations(multiply=12)),
         (lambda x: x[:, None] * x[None], Operations(multiply=3 * 3 * 4)),
         (lambda x: x / 3, Operations(divide=12)),
         (lambda x: x.rsqrt(), Operations(sqrt=12, divide=12)),
         (lambda x: x.exp_(), Operations(exp=12)),
         (lambda x: x.sin() + x.log(), Operations(log=24, add=12)),
         (lambda x: x.abs() > 1, Operations(compare=36)),
-        (lambda x: x.clamp(min=0), Operations(compare=12)),
         (lambda x: x.clamp(min=0, max=1), Operations(compare=24)),
         (lambda x: torch.where(x > 1, x, 0.0), Operations(compare=12, logic=12)),
         (lambda x: torch.addcmul(x, x, x), Operations(add=12, multiply=12)),
         (lambda x: x.square(), Operations(multiply=12)),
         (lambda x: x**5, Operations(multiply=36)),  # x² twice, times x
-        (lambda x: x**8, Operations(multiply=36)),
         (lambda x: x**-2, Operations(multiply=12, divide=12)),
-        (lambda x: x**0.5, Operations(sqrt=12)),
         (lambda x: x**1.5, Operations(sqrt=12, multiply=12)),
         (lambda x: x**0.3, Operations(exp=12, log=12, multiply=12)),
-        (lambda x: x**x, Operations(exp=12, log=12, multiply=12)),
         (lambda x: x.sum(-1), Operations(add=9)),
-        (lambda x: x.sum(), Operations(add=11)),
         (lambda x: x.cumsum(-1), Operations(add=9)),
         (lambda x: x.amax(-1), Operations(compare=9)),
-        (lambda x: x.argmin(-1), Operations(compare=9)),
         (lambda x: x.min(-1), Operations(compare=9)),
-        (lambda x: torch.minimum(x, x), Operations(compare=12)),
-        (lambda x: x.tanh(), Operations(log=12)),
         (lambda x: torch.linalg.cross(x.mT, x.mT), Operations(add=12, multiply=24)),
-        (lambda x: torch.linalg.vector_norm(x, dim=0), Operations(add=8, multiply=12, sqrt=4)),
         (lambda x: torch.linalg.vector_norm(x, dim=(0, 1)), Operations(add=11, multiply=12, sqrt=1)),
         (lambda x: x.softmax(-1), Operations(add=12 + 9, divide=12, exp=12, compare=9)),
         (
@@ -79,13 +70,10 @@ def test_every_kind_has_a_cost():
         ),
         (lambda x: (x > 0).all(-1), Operations(compare=12, logic=9)),
         (lambda x: x.sort(-1), Operations(compare=3 * 4 * 2)),
-        (lambda x: x.argsort(dim=-1, stable=True), Operations(compare=3 * 4 * 2)),
         (lambda x: x.sort(0), Operations(compare=4 * 3 * math.log2(3))),
-        (lambda x: x.topk(1), Operations(compare=3 * 5)),
         (lambda x: x.topk(2), Operations(compare=3 * (6 + 2))),
         (lambda x: x.topk(2, sorted=False), Operations(compare=3 * 6)),
         (lambda x: torch.lerp(x, x, x), Operations(add=24, multiply=12)),
-        (lambda x: torch.addcmul(x, x, x, value=-1), Operations(add=12, multiply=12)),
         (lambda x: torch.addcmul(x, x, x, value=2), Operations(add=12, multiply=24)),
         (lambda x: torch.add(x, x, alpha=3), Operations(add=12, multiply=12)),
         (lambda x: (-x).T.reshape(2, 6).flip(0).clone()[:, [0, 1]], Operations()),
@@ -99,7 +87,6 @@ def test_cost_of_an_operation(function, expected):
     ("function", "shapes", "expected"),
     [
         (lambda a, b: a @ b, [(2, 3), (3, 4)], matmul(2, 3, 4)),
-        (lambda a, b: a @ b, [(5, 2, 3), (5, 3, 4)], 5 * matmul(2, 3, 4)),
         (lambda a, b: a @ b, [(5, 2, 3), (3, 4)], 5 * matmul(2, 3, 4)),
         (lambda a, b: a @ b, [(5, 6, 2, 3), (6, 3, 4)], 30 * matmul(2, 3, 4)),
         (torch.nn.functional.linear, [(5, 3), (4, 3), (4,)], 5 * Operations(multiply=12, add=12)),
@@ -112,8 +99,7 @@ def test_cost_of_linear_algebra(function, shapes, expected):
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 6])
-def test_formulas_agree_with_the_algorithms_written_out(n):
-    """The loops of the textbook, counted one by one."""
+def test_counts_of_linear_algebra_agree_with_the_loops_of_the_textbook(n):
     add = divide = 0
     for k in range(n):  # Gaussian elimination
         for _ in range(k + 1, n):
@@ -131,33 +117,33 @@ def test_formulas_agree_with_the_algorithms_written_out(n):
     assert matmul(n, n, 1).add == n * (n - 1)
 
 
-def test_an_unknown_operation_is_not_lost():
+def test_an_operation_without_a_known_cost_is_an_error():
     with pytest.raises(NotImplementedError, match=r"aten\.erf"):
         count(lambda x: x.erf(), (3,))
 
 
-def test_what_the_batch_shares_is_not_counted():
+@pytest.mark.parametrize("batch", [2, 5])
+def test_operations_shared_by_the_batch_are_not_counted(batch):
     table = torch.rand(5, 5)
-    counts = count_per_problem(lambda batch: torch.rand(batch, 5) @ (table @ table).exp() + table.sum())
-    assert counts == {"": Operations(add=5 * 4 + 5, multiply=5 * 5)}
-
-
-def test_an_operation_belongs_to_the_innermost_part():
-    def run(batch):
-        ones, eye = torch.ones(batch), torch.eye(3).expand(batch, 3, 3)
-        equations = NormalEquations([[ones] * (i + 1) for i in range(6)], [ones] * 6)
-        delta, _ = solve_damped(equations, torch.tensor(1.0))
-        return move(Pose(eye, eye[:, 0]), [2 * x for x in delta])
-
-    alone = count_per_problem(run)
-    apart = count_per_problem(run, ["lm.solve_damped", "geometry.move"])
-    assert set(apart) == {"", "lm.solve_damped", "geometry.move"}
-    assert apart[""] == Operations(multiply=6)
-    assert sum(apart.values(), Operations()) == alone[""]
-    assert count_per_problem(run, ["lm.solve"]) == alone
+    counts = count_per_problem(lambda size: torch.rand(size, 5) @ (table @ table).exp() + table.sum(), batch)
+    assert counts.add == pytest.approx(5 * 4 + 5)
+    assert counts.multiply == pytest.approx(5 * 5)
+    assert counts.exp == 0
 
 
 def test_cost_of_sorting():
     assert sort(0) == sort(1) == Operations()
     assert sort(8) == Operations(compare=24)
     assert smallest(8, 1) == smallest(8, 7) == Operations(compare=9)
+
+
+@pytest.mark.slow
+@many(40)
+@given(st.sampled_from([name for name in SOLVERS if not name.endswith("-n9")]), batches())
+def test_counting_changes_no_result(name, case):
+    inputs, mask, weights, _ = case
+    plain = SOLVERS[name](*inputs, weights=weights, mask=mask)
+    with OperationCounter() as counter:
+        counted = SOLVERS[name](*inputs, weights=weights, mask=mask)
+    assert (len(inputs[0]) > 0) <= counter.operations.flops < math.inf
+    assert all(map(torch.equal, iter_tensors(counted), iter_tensors(plain)))

@@ -1,8 +1,9 @@
-"""A results file is whole or not there, and it is known of which code it is."""
+"""Results files: written in one piece, checked when read, and the digest of the code."""
 
 from __future__ import annotations
 
 import math
+import re
 from functools import reduce
 from operator import getitem
 
@@ -59,42 +60,37 @@ def test_other_files_are_refused(tmp_path, content):
     ("place", "value"),
     [
         ("rows.0.success.rate", 1.5),
-        ("rows.0.success", None),
         ("rows.0.solver", "t"),
         ("rows.0.per_problem.ok", 1),
-        ("data.a.unit", 3),
+        ("rows.0.per_problem", {"rotation_error_deg": [], "translation_error": [0.0], "ok": [1]}),
         ("data.a.n", None),
         ("data", []),
-        ("environment", ""),
     ],
 )
-def test_what_is_wrong_in_a_file_is_named(results, place, value, tmp_path):
+def test_the_wrong_entry_of_a_file_is_named(results, place, value, tmp_path):
     path = tmp_path / "results.json"
     *inner, last = (int(x) if x.isdecimal() else x for x in place.split("."))
     reduce(getitem, inner, results)[last] = value
     save_results(results, path)
-    named = place.replace(".0", "[0]").replace(".", r"\.").replace("[", r"\[").replace("]", r"\]")
-    with pytest.raises(
-        ValueError, match=rf"results\.json' is not a results file of evaluation: {named} is missing or not"
-    ):
+    with pytest.raises(ValueError, match=r"results\.json.*: " + re.escape(place.replace(".0", "[0]"))):
         load_results(path)
 
 
-def test_operation_counts_are_taken_where_they_are_asked_for(results, tmp_path):
+def test_operation_counts_are_read_only_on_request(results, tmp_path):
     path = tmp_path / "counts.json"
     counts = {"kind": "complexity", "format": 1, "n": [6], "counts": {"epnp": [1.0]}, "ransac": []}
     save_results(counts, path)
     assert load_results(path, complexity=True) == counts
-    with pytest.raises(ValueError, match=r"counts\.json' is not a results file of evaluation\."):
+    with pytest.raises(ValueError, match=r"counts\.json.* evaluation"):
         load_results(path)
     save_results({**counts, "kind": ["other"]}, path)
-    with pytest.raises(ValueError, match=r"is not a results file of evaluation or complexity\."):
+    with pytest.raises(ValueError, match=r"counts\.json.* complexity"):
         load_results(path, complexity=True)
     save_results(results, path)
     assert load_results(path, complexity=True) == results
 
 
-def test_the_digest_is_of_the_package_and_nothing_else(tmp_path, monkeypatch):
+def test_the_digest_of_the_code_covers_python_files_and_their_places(tmp_path, monkeypatch):
     monkeypatch.setattr(kornia_pnpnet.evaluation.results, "__file__", str(tmp_path / "results.py"))
     (tmp_path / "data").mkdir()
     (tmp_path / "results.py").write_text("a = 1\n")

@@ -4,12 +4,29 @@ from __future__ import annotations
 
 import csv
 import importlib
+import itertools
 import subprocess
 import sys
+import warnings
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import ANY, ERRORS, WORD, Seen, damage, many, names_the_file, numbers
+
+from kornia_pnpnet.evaluation.figures import (
+    plot_against_m,
+    plot_against_n,
+    plot_mismatches,
+    plot_pose,
+    plot_reliability,
+    plot_scenes,
+    plot_sweep,
+    plot_training,
+)
 
 pytest.importorskip("matplotlib")
 
@@ -18,11 +35,7 @@ from matplotlib.image import imread
 
 from kornia_pnpnet.evaluation.figures import (
     plot_errors,
-    plot_pose,
-    plot_reliability,
     plot_success,
-    plot_sweep,
-    plot_training,
 )
 
 
@@ -272,3 +285,128 @@ def test_without_matplotlib_the_error_names_the_extra(monkeypatch):
     monkeypatch.delitem(sys.modules, "kornia_pnpnet.evaluation.figures")
     with pytest.raises(ImportError, match=r"pip install 'kornia_pnpnet\[eval\]'"):
         importlib.import_module("kornia_pnpnet.evaluation.figures")
+
+
+# -- whatever comes in -------------------------------------------------------------------------------------------------
+
+
+def test_pictures_of_any_numbers(tmp_path):
+    path = tmp_path / "picture.png"
+
+    @many(25)
+    @given(st.integers(0, 5), st.data(), st.none() | st.tuples(ANY, ANY))
+    def run(count, data, size):
+        shapes = (count, 2), data.draw(st.sampled_from([(count, 2), (count, 2), (count, 3), (2,)]))
+        points = [data.draw(numbers(torch.float64, shape)) for shape in shapes]
+        path.unlink(missing_ok=True)
+        try:
+            plot_pose(path, *points, torch.arange(count) % 2 == 0, size)
+        except ERRORS:
+            assert not path.exists()
+        else:
+            assert path.stat().st_size > 1000
+
+    run()
+
+
+CURVES = {
+    plot_training: "update,total,init_rotation,init_translation,refined_rotation,refined_translation,val/a/success\n"
+    "0,3.5,1,2,3,4,\n100,2.5,1,2,3,4,0.5\n200,1.5,1,2,3,4,0.75\n",
+    partial(plot_sweep, against="n"): "model.n,model.m,data.outliers.max_ratio,us_per_problem,uniform/rate,uniform/low,"
+    "uniform/high\n6,5,0.33,20.5,0.5,0.4,0.6\n9,5,0.33,20.5,0.6,0.5,0.7\n9,8,0,20.5,0.8,0.7,0.9\n",
+}
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")  # about names of curves
+@pytest.mark.parametrize("plot", CURVES, ids=["plot_training", "plot_sweep"])
+def test_damaged_curves_are_an_error_of_ours(plot, tmp_path, request):
+    path = tmp_path / "curves.csv"
+
+    @many(25)
+    @given(damage(CURVES[plot].encode()))
+    def run(content):
+        path.write_bytes(content)
+        try:
+            plot(tmp_path / "picture.png", path)
+        except ValueError as error:
+            names_the_file(error, path)
+
+    run()
+
+
+SOURCES = "paper", "gaussian_pose", "fox", "the $b_a^r$n"
+
+
+NAMES = "epnp-lm", "epnp-lm:m=3", "pnpnet-n6", "pnpnet-n9", "known-inliers"
+
+
+SHARE = st.floats(0.0, 1.0)
+
+
+NUMBER = st.one_of(st.floats(0.0, 200.0), st.sampled_from([-1.0, 0.0, 1e-300, 1e300]))
+
+
+@st.composite
+def evaluations(draw, full=False):
+    """Results of any solvers on any sets, each on most of them; ``full``: of all there are here."""
+
+    def some(*values):
+        return values if full else draw(st.lists(st.sampled_from(values), min_size=1, max_size=3, unique=True))
+
+    def few(values):  # one for each set and solver would be more than can be drawn
+        return itertools.cycle(draw(st.lists(values, min_size=1, max_size=3)))
+
+    names, outliers, numbers = some(*NAMES, draw(WORD)), some("none", "uniform", 1, 2, "many"), some(6, 9, 0)
+    limits, units, shares = few(NUMBER), few(WORD), few(st.sampled_from([0.5, 1]))
+    sets = {
+        f"{source} {wrong} {n}": {
+            "description": {"source": source, "outliers": wrong, "mismatch_share": next(shares)},
+            "n": n,
+            "max_rotation_deg": next(limits),
+            "max_translation": next(limits),
+            "unit": next(units),
+        }
+        for source, wrong, n in itertools.product(some(*SOURCES), outliers, numbers)
+    }
+    rates = few(st.fixed_dictionaries({"rate": SHARE, "low": SHARE, "high": SHARE, "total": st.integers(1, 300)}))
+    times, lost = few(st.floats(1e-9, 1e12)), few(st.sampled_from([False, False, False, True]))
+    rows = [
+        {"data": data, "solver": solver, "success": next(rates), "us_per_problem": next(times)}
+        for data, solver in itertools.product(sets, names)
+        if not next(lost)
+    ]
+    depths = few(st.sampled_from([None, {"refine": 1}, *({"refine": {"m": m}} for m in (0, 3, 5))]))
+    if full:
+        depths = itertools.cycle([{"refine": {"m": 10}}, {"refine": {"m": 3}}])
+    return {"data": sets, "solvers": {name: {"config": next(depths)} for name in names}, "rows": rows}
+
+
+def drawn(tmp_path, what, plot, strategy, examples=16):
+    """Draw pictures: there is one, or an error and none."""
+    made = Seen()
+    path = tmp_path / "picture.png"
+
+    @many(examples)
+    @given(strategy)
+    def run(values):
+        path.unlink(missing_ok=True)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "Glyph", UserWarning)  # that the font does not have
+            assert (made(lambda: plot(path, values)) is not None) == path.exists()
+
+    run()
+    made.both(1)
+
+
+@pytest.mark.parametrize("plot", [plot_against_m, plot_against_n, plot_mismatches, plot_scenes])
+def test_pictures_of_any_results(plot, tmp_path):
+    strategy = st.lists(evaluations(), max_size=2) | st.lists(evaluations(full=True), min_size=1, max_size=1)
+    drawn(tmp_path, f"`{plot.__name__}` of any results", plot, strategy)
+
+
+def test_reliability_pictures_of_any_numbers(tmp_path):
+    keys = "number", "predicted", "observed"
+    equal = st.lists(st.tuples(st.integers(0, 9), ANY, ANY), min_size=1, max_size=4)
+    equal = equal.map(lambda rows: dict(zip(keys, zip(*rows, strict=True), strict=True)))
+    curve = equal | st.fixed_dictionaries(dict.fromkeys(keys, st.lists(ANY, max_size=3)))
+    drawn(tmp_path, "`plot_reliability` of any numbers", plot_reliability, st.dictionaries(WORD, curve, max_size=3))

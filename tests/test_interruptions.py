@@ -15,13 +15,13 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from kornia.core.exceptions import ValueCheckError
+from kornia_pnpnet.cli.main import main
 
 from kornia_pnpnet import MLPInit, PnPNet, PoseLoss, RobustWeightedLM, create_solver
-from kornia_pnpnet.cli import main
 from kornia_pnpnet.cli.shards import MANIFEST, solve_shards
 from kornia_pnpnet.data import SyntheticProblems
+from kornia_pnpnet.training import TrainSettings, fit
 from kornia_pnpnet.training.checkpoint import CHECKPOINT_NAME, HISTORY_NAME, save_checkpoint
-from kornia_pnpnet.training.loop import TrainSettings, fit
 
 KILLS = 20
 # Python 3.12 warns of every fork of a process with threads, which pytest-xdist's are.
@@ -32,7 +32,7 @@ pytestmark = [
 
 
 class Then(PoseLoss):
-    """Has something happen at the given update."""
+    """Calls a function at an update."""
 
     def __init__(self, update=-1, what=None):
         super().__init__()
@@ -70,8 +70,8 @@ def in_a_process(function, *arguments):
 
 
 @pytest.mark.slow
-def test_kill_9_at_any_moment_loses_nothing(tmp_path, tally):
-    """However often it is killed, what is trained in the end is what is trained without."""
+def test_kill_9_at_any_moment_loses_nothing(tmp_path):
+    """After any number of kills the weights and curves are those of a run without kills."""
     updates = 400
     train(tmp_path / "whole", updates)
     weights, history = state(tmp_path / "whole")
@@ -88,9 +88,6 @@ def test_kill_9_at_any_moment_loses_nothing(tmp_path, tally):
                 process.kill()
                 process.join()
                 killed += 1
-                tally(
-                    "processes", "`kill -9` in a training at a random moment: it resumes to the same weights and curves"
-                )
             elif not done:
                 raise AssertionError(f"exit code {process.exitcode} after {killed} kills")
         mine, rows = state(folder)
@@ -101,7 +98,7 @@ def test_kill_9_at_any_moment_loses_nothing(tmp_path, tally):
 
 
 def _with_a_full_disk(folder):
-    """Train where from some update on no file can have more than so many bytes; the exit code says how it ended."""
+    """Train with files limited to 10 kB from update 23 on. Exit code 3: a file could not be written."""
 
     def full():
         shutil.copy(folder / CHECKPOINT_NAME, folder / "before")
@@ -113,8 +110,7 @@ def _with_a_full_disk(folder):
         sys.exit(3)
 
 
-def test_a_full_disk_loses_nothing(tmp_path, tally):
-    tally("processes", "no room for a checkpoint: the one before stays and is resumed")
+def test_a_full_disk_loses_nothing(tmp_path):
     process = in_a_process(_with_a_full_disk, tmp_path / "run")
     process.join()
     assert process.exitcode == 3
@@ -127,8 +123,7 @@ def test_a_full_disk_loses_nothing(tmp_path, tally):
     assert rows == history
 
 
-def test_a_torn_row_of_the_curves_is_dropped(tmp_path, tally):
-    tally("processes", "a torn row in the curves: dropped")
+def test_a_torn_row_of_the_curves_is_dropped(tmp_path):
 
     def crash():
         raise KeyboardInterrupt
@@ -152,8 +147,7 @@ def _shards_on_a_full_disk(source, out):
         sys.exit(3)
 
 
-def test_shards_on_a_full_disk_are_whole_or_missing(tmp_path, tally):
-    tally("processes", "no room for the results of a shard: whole or missing, the next call goes on")
+def test_shards_on_a_full_disk_are_whole_or_missing(tmp_path):
     import numpy as np
 
     source, out = tmp_path / "in", tmp_path / "out"
@@ -175,8 +169,8 @@ def _solve_batch(source, out):
 
 
 @pytest.mark.slow
-def test_kill_9_at_any_moment_loses_no_results(tmp_path, tally):
-    """However often it is killed, the results are those of a call that is not, and none is made twice."""
+def test_kill_9_at_any_moment_loses_no_results(tmp_path):
+    """After any number of kills the results are those of a call without kills, and no result is made twice."""
     import numpy as np
 
     pyarrow = pytest.importorskip("pyarrow")
@@ -221,11 +215,6 @@ def test_kill_9_at_any_moment_loses_no_results(tmp_path, tally):
                 assert process.exitcode == -signal.SIGKILL
                 killed += 1
                 amid += 0 < len(made) < len(names)
-                tally(
-                    "processes",
-                    "`kill -9` in `pnpnet solve --batch` at a random moment: the next call goes on, the results are "
-                    "the same",
-                )
         assert {path.name for path in out.iterdir() if path.suffix != ".tmp"} == {MANIFEST, *names}
         assert all(read(out / name) == read(whole / name) for name in names)
     assert amid >= 3  # else the moments say nothing
@@ -240,9 +229,8 @@ def weights_folder(tmp_path_factory):
 
 @settings(max_examples=300, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(st.data())
-def test_damaged_weights_load_nothing(tally, weights_folder, tmp_path_factory, data):
-    """Any byte changed, any end cut off: one clear error, or it was nothing that matters."""
-    tally("files", "weights or their configuration with a byte changed or cut off: an error, or nothing that matters")
+def test_damaged_weights_load_nothing(weights_folder, tmp_path_factory, data):
+    """A changed byte or a cut end gives an error, or changes neither the configuration nor the weights."""
     folder = tmp_path_factory.mktemp("damaged", numbered=True)
     try:
         for path in weights_folder.iterdir():
@@ -268,8 +256,7 @@ def test_damaged_weights_load_nothing(tally, weights_folder, tmp_path_factory, d
         shutil.rmtree(folder)
 
 
-def test_a_checkpoint_is_not_replaced_by_half_of_one(tmp_path, tally):
-    tally("processes", "`kill -9` while a checkpoint is written: the old one stays")
+def test_a_checkpoint_is_not_replaced_by_half_of_one(tmp_path):
     path = tmp_path / CHECKPOINT_NAME
     save_checkpoint(path, {"a": 1})
     process = in_a_process(save_checkpoint, path, {"a": torch.zeros(50_000_000)})

@@ -112,9 +112,13 @@ def test_optional_packages_have_one_door(package, owners):
     assert not {user for user in users if not any(f"{user}.".startswith(f"{owner}.") for owner in owners)}
 
 
-def test_the_layers_name_what_exists():
-    listed = {name for members in LAYERS for name in members} - {"__main__"}
-    assert listed <= MODULES.keys(), "LAYERS names modules that are gone."
+def test_the_house_stays_small():
+    """A newcomer can read each file in one sitting and the top folder at a glance."""
+    assert {name for members in LAYERS for name in members} <= MODULES.keys(), "LAYERS names modules that are gone."
+    top = [path.name for path in ROOT.glob("*.py") if path.name != "__init__.py"]
+    assert len(top) <= 14, top
+    long = {name: count for name, path in MODULES.items() if (count := len(path.read_text().splitlines())) > 450}
+    assert not long, long
 
 
 def test_importing_the_package_imports_no_extras():

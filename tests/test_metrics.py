@@ -6,12 +6,18 @@ import math
 
 import pytest
 import torch
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from kornia.core.exceptions import BaseError
+from strategies import ANY, ERRORS, finite, gradients_are_finite, many, numbers, rotations
 
 from kornia_pnpnet import Pose, pose_errors, success, success_rate
+from kornia_pnpnet.geometry import rotation_angle
+from kornia_pnpnet.losses import pose_distances
 from kornia_pnpnet.metrics import PoseErrors, reliability
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-3, 1.0, math.pi / 2, 3.0, math.pi])
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1.0, math.pi])
 def test_errors_of_a_known_motion(angle, random_rotations):
     base = random_rotations(50, seed=1)
     estimate = Pose(
@@ -21,15 +27,6 @@ def test_errors_of_a_known_motion(angle, random_rotations):
     expected = torch.full((50,), math.degrees(angle), dtype=torch.float64)
     torch.testing.assert_close(errors.rotation_error_deg, expected, rtol=0, atol=1e-12)
     torch.testing.assert_close(errors.translation_error, torch.full((50,), 5.0).double())
-
-
-@pytest.mark.parametrize("angle", [0.1, 1.0, 3.0])
-def test_the_rotation_error_is_the_protocols(angle, random_rotations):
-    one, two = random_rotations(50, seed=1), random_rotations(50, angle=angle, seed=2)
-    trace = (one @ two.mT).diagonal(dim1=-2, dim2=-1).sum(-1)
-    expected = torch.rad2deg(torch.arccos((trace - 1) / 2))
-    zeros = torch.zeros(50, 3).double()
-    torch.testing.assert_close(pose_errors(Pose(one, zeros), Pose(two, zeros)).rotation_error_deg, expected)
 
 
 def test_success_needs_both_and_is_strict():
@@ -63,28 +60,10 @@ def test_the_interval_is_wilsons(successes, count, low, high):
     assert mirrored.high == pytest.approx(1 - rate.low)
 
 
-def test_the_interval_solves_its_equation():
-    """The bounds are the rates from which the observed one is 1.96 standard errors away."""
-    rate = success_rate(torch.tensor([True] * 37 + [False] * 63))
-    for bound in (rate.low, rate.high):
-        assert abs(rate.rate - bound) / math.sqrt(bound * (1 - bound) / 100) == pytest.approx(1.959964, abs=1e-6)
-
-
 def test_all_and_none():
     assert success_rate(torch.ones(50, dtype=torch.bool)).high == 1.0
     assert 0.9 < success_rate(torch.ones(50, dtype=torch.bool)).low < 0.95
     assert success_rate(torch.zeros(2, 25, dtype=torch.bool)).low == 0.0
-    assert str(success_rate(torch.tensor([True] * 8 + [False] * 2))) == "80.0 % [49.0, 94.3]"
-
-
-def test_the_interval_covers():
-    generator = torch.Generator().manual_seed(0)
-    outcomes = torch.rand(2000, 200, generator=generator) < 0.8
-    covered = [r.low <= 0.8 <= r.high for r in map(success_rate, outcomes)]
-    assert 0.935 < sum(covered) / 2000 < 0.965
-
-
-def test_nothing_has_no_rate():
     with pytest.raises(ValueError, match="at least one"):
         success_rate(torch.zeros(0, dtype=torch.bool))
 
@@ -112,5 +91,68 @@ def test_chances_of_0_and_1_are_in_the_outer_ranges():
     ("chances", "outcomes"), [(torch.rand(3), torch.ones(2).bool()), (torch.rand(0), torch.ones(0).bool())]
 )
 def test_reliability_needs_as_many_outcomes(chances, outcomes):
-    with pytest.raises(ValueError, match="as many chances as outcomes"):
+    with pytest.raises(ValueError, match="chances and outcomes"):
         reliability(chances, outcomes)
+
+
+# -- whatever comes in -------------------------------------------------------------------------------------------------
+
+
+@st.composite
+def pose_pairs(draw):
+    dtype, batch = draw(st.sampled_from([torch.float32, torch.float64])), draw(st.integers(0, 4))
+    shapes = (batch, 3, 3), (batch, 3)
+    pairs = [Pose(*(draw(numbers(dtype, shape)) for shape in shapes)) for _ in range(2)]
+    sound = draw(st.booleans())
+    if sound:
+        pairs = [pose._replace(rotation=rotations(batch, i, dtype)) for i, pose in enumerate(pairs)]
+    return pairs
+
+
+@many(60)
+@given(pose_pairs(), ANY, ANY)
+def test_errors_of_any_poses(pair, degrees, length):
+    estimate, truth = pair
+    errors = pose_errors(estimate, truth)
+    batch = len(truth.translation)
+    assert all(x.shape == (batch,) and x.dtype == truth.translation.dtype for x in errors)
+    assert not (errors.rotation_error_deg < 0).any()
+    assert not (errors.rotation_error_deg > 180.001).any()
+    right = success(errors, degrees, length)
+    assert right.dtype == torch.bool
+    assert not right[errors.rotation_error_deg.isnan() | errors.translation_error.isnan()].any()
+    assert rotation_angle(*(pose.rotation for pose in pair)).shape == (batch,)
+    if batch:
+        rate = success_rate(right)
+        assert 0 <= rate.low <= rate.rate <= rate.high <= 1
+    else:
+        with pytest.raises(ValueError, match="at least one"):
+            success_rate(right)
+    tensors = [x.detach().clamp(-1e6, 1e6).nan_to_num(0.0).requires_grad_() for x in estimate]
+    distances = pose_distances(Pose(*tensors), Pose(*(x.clamp(-1e6, 1e6).nan_to_num(0.0) for x in truth)))
+    finite(distances)
+    gradients_are_finite(distances, tensors)
+
+
+@many(60)
+@given(st.lists(st.sampled_from([(), (1,), (3,), (2, 3), (1, 3, 3), (2, 3, 3), (3, 3)]), min_size=4, max_size=4))
+def test_poses_that_do_not_fit_are_an_error(shapes):
+    assume(shapes not in ([(2, 3, 3), (2, 3)] * 2, [(3, 3), (3,)] * 2))
+    first, second = (Pose(*(torch.zeros(shape) for shape in pair)) for pair in (shapes[:2], shapes[2:]))
+    for function in (pose_errors, pose_distances):
+        with pytest.raises(BaseError):
+            function(first, second)
+
+
+@many(60)
+@given(st.sampled_from([(0,), (1,), (7,), (2, 3)]), st.sampled_from([(7,), (2, 3)]), st.integers(-1, 12), st.data())
+def test_reliability_of_any_chances(shape, other, ranges, data):
+    chances = data.draw(numbers(torch.float64, shape)).nan_to_num(0.5).clamp(0, 1)
+    outcomes = torch.arange(math.prod(other)).view(other) % 2 == 0
+    if shape == other and ranges >= 1:
+        found = reliability(chances, outcomes, ranges)
+        assert found.number.sum() == chances.numel()
+        assert 0 <= found.expected_error <= 1
+    else:
+        with pytest.raises(ERRORS):
+            reliability(chances, outcomes, ranges)

@@ -1,4 +1,4 @@
-"""The shipped weights: what they must reach, and that all that is written about them comes from their run."""
+"""The shipped weights: the success they must reach, and model cards made from the results of their run."""
 
 import json
 import math
@@ -11,7 +11,8 @@ from kornia_pnpnet import PnPNet, create_solver, pose_errors, shipped_weights, s
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.metrics import reliability
 from kornia_pnpnet.pretrained import WEIGHTS_FOLDER
-from kornia_pnpnet.training.results import write_model_card
+from kornia_pnpnet.training.card import write_model_card
+from kornia_pnpnet.training.results import load_run
 
 
 def rate(solver, problems):
@@ -20,7 +21,7 @@ def rate(solver, problems):
     return success_rate(success(pose_errors(result.pose, problems.pose))).rate
 
 
-# Success without wrong pairs and with k uniform that each must keep: about two points below what its run found.
+# Success without outliers and with a random number of outliers: about two points below what the training run found.
 FLOORS = {6: (0.67, 0.53), 9: (0.85, 0.77), 12: (0.92, 0.87), 20: (0.97, 0.95)}
 
 
@@ -40,7 +41,7 @@ def test_these_are_shipped():
     assert set(shipped_weights()) == {f"pnpnet-n{n}" for n in FLOORS} | {"pnpnet-set"}
 
 
-# Likewise for one set of weights, any rotation and any number of pairs.
+# The same floors for the one set of weights for any rotation and any number of pairs.
 SET_FLOORS = {6: (0.71, 0.55), 9: (0.88, 0.79), 12: (0.94, 0.89), 20: (0.98, 0.97), 50: (0.99, 0.99)}
 
 
@@ -54,8 +55,8 @@ def test_one_network_for_any_number_of_pairs_and_any_rotation(n):
     assert rate(solver, uniform) >= SET_FLOORS[n][1]
 
 
-def test_weights_of_the_set_network_are_the_chance_to_be_right():
-    """Expected calibration error over ten bins, n from 6 to 50 and up to a third of the pairs wrong."""
+def test_weights_of_the_set_network_are_inlier_probabilities():
+    """Expected calibration error over ten bins, n from 6 to 50 and up to a third of outliers."""
     solver = create_solver("pnpnet-set")
     weights, right = [], []
     for n in (6, 9, 20, 50):
@@ -66,7 +67,7 @@ def test_weights_of_the_set_network_are_the_chance_to_be_right():
         right.append(problems.inliers.flatten())
     chance, truth = torch.cat(weights), torch.cat(right)
     assert reliability(chance, truth).expected_error < 0.05
-    assert (chance - truth.float()).abs().mean() < 0.25  # and they say something
+    assert (chance - truth.float()).abs().mean() < 0.25  # a constant would be calibrated, too
 
 
 @pytest.mark.parametrize(("name", "n"), [*((f"pnpnet-n{n}", n) for n in FLOORS), *(("pnpnet-set", n) for n in FLOORS)])
@@ -94,13 +95,11 @@ def test_net_n9_is_the_first_guess_of_pnpnet_n9():
 @pytest.mark.parametrize("name", shipped_weights())
 def test_model_card_is_generated_from_the_run(name, tmp_path):
     folder = WEIGHTS_FOLDER / name
-    results = json.loads((folder / "results.json").read_text())
+    results = load_run(folder / "results.json")
     write_model_card(tmp_path, results, name=name)
     assert (tmp_path / "README.md").read_text() == (folder / "README.md").read_text()
-    assert PnPNet.from_config(results["model"]).config() == PnPNet.from_pretrained(name).config()
-    updates, run = 0, results
-    while run:
-        updates, run = updates + run["run"]["update"], run.get("origin")
+    assert PnPNet.from_config(results.model).config() == PnPNet.from_pretrained(name).config()
+    updates = sum(run.run.update for run in results.lineage())
     assert updates >= (40_000 if name == "pnpnet-set" else 200_000)
     assert sum(path.stat().st_size for path in folder.iterdir()) < 2_000_000
 

@@ -8,8 +8,8 @@ import torch
 from kornia_pnpnet.refine.kernels import KERNELS
 
 # The power kernel's exponent through its special value 2 and both ends; scales of the others in pixels.
-ALPHAS = (0.0, 1e-3, 0.5, 1.0, 1.9, 1.999, 2.0 - 1e-9, 2.0, 2.0 + 1e-9, 2.001, 2.1, 3.0)
-SCALES = (0.1, 1.0, 5.0, 20.0, 1e3, 1e4)
+ALPHAS = (0.0, 1e-3, 1.0, 1.999, 2.0 - 1e-9, 2.0, 2.0 + 1e-9, 3.0)
+SCALES = (0.1, 5.0, 1e4)
 CASES = [(name, shape) for name in KERNELS for shape in (ALPHAS if name == "power" else SCALES)]
 SQ_RESIDUALS = torch.cat((torch.zeros(1), torch.logspace(-8, 12, 241))).double()
 
@@ -97,10 +97,3 @@ def test_closed_forms():
     torch.testing.assert_close(KERNELS["power"].weight(tensor([1e6]), tensor(1.0)), tensor([1e-3]), rtol=1e-6, atol=0)
     torch.testing.assert_close(KERNELS["power"].loss(s, tensor(0.0)), s)
     torch.testing.assert_close(KERNELS["power"].loss(s, two), torch.log1p(s / 0.01))
-
-
-@pytest.mark.parametrize("name", KERNELS)
-def test_the_classical_shape_lies_within_its_bounds(name):
-    kernel = KERNELS[name]
-    assert kernel.lower < kernel.default < kernel.upper
-    assert kernel.lower > 0 or not kernel.logarithmic

@@ -12,7 +12,8 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
 from kornia_pnpnet import PnPNet
-from kornia_pnpnet.training.results import collect_weights
+from kornia_pnpnet.training.collect import collect_weights
+from kornia_pnpnet.training.results import load_run
 
 REPO = Path(__file__).resolve().parents[1]
 DATA = sorted(path.stem for path in (REPO / "conf" / "data").glob("*.yaml"))
@@ -32,7 +33,7 @@ def run(*arguments, check=True):
 
 @pytest.mark.parametrize("data", DATA)
 def test_every_data_config_trains(data, fit_config):
-    model = ["model=set"] if data == "wide" else []  # its batches are of different sizes
+    model = ["model=set"] if data == "wide" else []  # batches of different sizes
     config = composed(f"data={data}", "debug=two_updates", *model)
     assert fit_config(config).update == 2
 
@@ -56,14 +57,8 @@ def test_overrides_reach_the_parts():
 def test_protocol_is_the_papers():
     config = composed("experiment=protocol")
     settings = instantiate(config.train, _convert_="all")
-    assert (settings.updates, settings.lr, config.batch_size, config.model.n, config.model.m) == (
-        200_000,
-        1e-4,
-        1000,
-        9,
-        10,
-    )
-    assert settings.lr_factor(100_000) == 1.0
+    assert (settings.updates, settings.lr, settings.lr_factor(100_000)) == (200_000, 1e-4, 1.0)
+    assert (config.batch_size, config.model.n, config.model.m) == (1000, 9, 10)
     assert instantiate(config.data.train).outliers.max_count(9) == 3
 
 
@@ -82,7 +77,6 @@ def test_run_writes_results_and_resumes(tmp_path):
     model = PnPNet.from_pretrained(tmp_path / "weights")
     checkpoint = torch.load(tmp_path / "last.ckpt", weights_only=True)["model"]
     assert all(torch.equal(value, checkpoint[name]) for name, value in model.state_dict().items())
-    assert "model.n=" not in (tmp_path / "weights" / "README.md").read_text()
 
     again = run(f"hydra.run.dir={tmp_path}", "train.updates=1", check=False)
     assert again.returncode == 1
@@ -93,7 +87,7 @@ def test_run_writes_results_and_resumes(tmp_path):
 
 
 def test_run_starts_from_weights(tmp_path):
-    """With learning rates of 0 they are what comes out."""
+    """With learning rates of 0 the weights stay as they are."""
     learn_nothing = ("train.lr=0", "train.lr_refine=0", "train.ramp=[0,0]")
     weights = PnPNet.from_pretrained("pnpnet-n9")
     kernel = weights.refine.config["kernel"]
@@ -102,20 +96,16 @@ def test_run_starts_from_weights(tmp_path):
     run(f"hydra.run.dir={tmp_path / 'run'}", *options, *learn_nothing)
     trained = PnPNet.from_pretrained(tmp_path / "run" / "weights").state_dict()
     assert all(torch.equal(trained[name], value) for name, value in weights.state_dict().items())
-    results = json.loads((tmp_path / "run" / "results.json").read_text())
-    assert results["origin"]["origin"]["origin"]["run"]["update"] == 200_000
-    card = (tmp_path / "run" / "weights" / "README.md").read_text()
-    assert card.count("`python train.py") == 4
-    lineage = ("200000 updates of 1000", "5000 updates", "\n  2000 updates", "weights=pnpnet-n9", "2 updates of 8")
-    assert [*map(card.index, lineage)] == sorted(map(card.index, lineage))
-    assert "points from BoxPoints and SlabPoints" in card.split("weights=pnpnet-n9")[1]
+    lineage = load_run(tmp_path / "run" / "results.json").lineage()
+    assert [entry.run.update for entry in lineage] == [200_000, 5000, 2000, 2]
     run(f"hydra.run.dir={tmp_path / 'again'}", *options, f"weights={tmp_path / 'run' / 'weights'}", "train.updates=3")
     collect_weights([tmp_path / "run", tmp_path / "again"], tmp_path / "mine")
     with (tmp_path / "mine" / "history.csv").open(newline="") as file:
         assert [row["update"] for row in csv.DictReader(file)] == ["1", "2", "3", "4", "5"]
     card = (tmp_path / "mine" / "README.md").read_text()
-    assert card.startswith("# mine\n")
+    assert "\n# mine\n" in card
     assert card.count("`python train.py") == 5
+    assert str(tmp_path) not in card
     done = run(f"hydra.run.dir={tmp_path / 'deeper'}", *options, *learn_nothing, f"model.m={weights.refine.m + 1}")
     assert "only the network" in done.stdout + done.stderr
     deeper = PnPNet.from_pretrained(tmp_path / "deeper" / "weights")
@@ -153,7 +143,7 @@ def test_data_of_ones_own_and_any_validation_sets(tmp_path, monkeypatch):
     run("-m", *sets)
     (folder,) = (path.parent for path in tmp_path.glob("sweep/*/results.json"))
     card = (folder / "weights" / "README.md").read_text()
-    assert "- Validation, board: problems from mine.Mine." in card
+    assert "- board: problems from mine.Mine." in card
     assert "board/rate" in (tmp_path / "sweep" / "summary.csv").read_text()
     done = run(*away, f"hydra.run.dir={tmp_path}/none", check=False)
     assert done.returncode == 1
@@ -166,7 +156,7 @@ def test_damaged_results_beside_weights_are_an_error_before_the_training(tmp_pat
     (tmp_path / "weights" / "results.json").write_text('{"overrides": [1]}')
     done = run(f"weights={tmp_path / 'weights'}", f"hydra.run.dir={tmp_path}/run", "model.m=10", check=False)
     assert done.returncode == 1
-    assert "is not a results file of a run: results.overrides[0] is missing" in done.stderr
+    assert "is not a results file of a run: overrides[0] is 1" in done.stderr
     assert "Traceback" not in done.stderr
     assert not (tmp_path / "run" / "last.ckpt").exists()
 
@@ -212,14 +202,3 @@ def test_sweeps_by_other_launchers(launcher, tmp_path):
     ends = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/last.ckpt")}
     run(*command, f"hydra.sweep.dir={tmp_path}")
     assert ends == {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/last.ckpt")}
-
-
-def test_the_slurm_launcher_takes_what_the_documentation_says():
-    page = (REPO / "docs" / "howto" / "sweeps.md").read_text()
-    words = page.split("## Slurm")[1].split("Submitit")[0].replace("\\\n", " ").split()
-    overrides = [word for word in words if word.startswith("hydra")]
-    assert len(overrides) == 7
-    with initialize_config_dir(str(REPO / "conf"), version_base="1.3"):
-        config = compose("train", overrides=overrides, return_hydra_config=True)
-    assert config.hydra.launcher._target_.endswith("SlurmLauncher")
-    assert config.hydra.launcher.timeout_min == 600

@@ -1,6 +1,7 @@
 """The training loop: resuming equals not stopping, bad steps are skipped, two processes equal one."""
 
 import csv
+import math
 import multiprocessing
 import os
 import signal
@@ -12,13 +13,14 @@ from pathlib import Path
 
 import pytest
 import torch
-from kornia.core.exceptions import BaseError
-from torch import nn
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import ANY, COUNTS, INF, RANGES, Seen, many, options
 
 from kornia_pnpnet import MLPInit, PnPNet, PoseLoss, RobustWeightedLM
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet.training import TrainSettings, fit, train_briefly
 from kornia_pnpnet.training.checkpoint import CHECKPOINT_NAME, HISTORY_NAME, TrainingError, save_checkpoint
-from kornia_pnpnet.training.loop import TrainSettings, fit, train_briefly
 
 REPO = Path(__file__).resolve().parents[1]
 SHARES = [f"{stage}_share" for stage in ("data", "forward", "backward", "optimizer", "rest")]
@@ -57,44 +59,42 @@ def assert_same_weights(model, other):
         assert torch.equal(value, state[name]), name
 
 
-class StoppingLoss(PoseLoss):
-    """Sends a signal to this process and its workers while the given update is computed, as a terminal does."""
+class LossWith(PoseLoss):
+    """Calls a function at some updates. The loss is multiplied by the result of the function."""
 
-    def __init__(self, at, number):
+    def __init__(self, function, at):
         super().__init__(saturation=0.02)
-        self.calls, self.at, self.number = 0, at, number
-
-    def forward(self, *args, **kwargs):
-        self.calls += 1
-        if self.calls == self.at:
-            for pid in (os.getpid(), *(child.pid for child in multiprocessing.active_children())):
-                os.kill(pid, self.number)
-        return super().forward(*args, **kwargs)
-
-
-class BrokenLoss(PoseLoss):
-    """Returns a loss that is not finite at some updates."""
-
-    def __init__(self, at, value):
-        super().__init__(saturation=0.02)
-        self.calls, self.at, self.value = 0, at, value
+        self.calls, self.function, self.at = 0, function, at
 
     def forward(self, *args, **kwargs):
         terms = super().forward(*args, **kwargs)
         self.calls += 1
-        return terms._replace(total=terms.total * self.value) if self.calls in self.at else terms
+        return terms._replace(total=terms.total * self.function()) if self.calls in self.at else terms
+
+
+def stopping_loss(at, number):
+    """Sends a signal to this process and its workers during one update, as a terminal does."""
+
+    def stop():
+        for pid in (os.getpid(), *(child.pid for child in multiprocessing.active_children())):
+            os.kill(pid, number)
+        return 1.0
+
+    return LossWith(stop, at=(at,))
 
 
 @forks
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-@pytest.mark.parametrize(("workers", "workers_later"), [(0, 0), (1, 0), (0, 1), (1, 1)])
+@pytest.mark.parametrize(
+    ("number", "workers", "workers_later"),
+    [(signal.SIGTERM, 0, 0), (signal.SIGINT, 1, 0), (signal.SIGINT, 0, 1), (signal.SIGTERM, 1, 1)],
+)
 def test_resuming_after_a_signal_equals_not_stopping(tmp_path, number, workers, workers_later):
     whole = make_parts()
     fit(folder=tmp_path / "whole", **whole)
 
     stopped = make_parts()
     handler = signal.getsignal(number)
-    stopped["loss"] = StoppingLoss(3, number)
+    stopped["loss"] = stopping_loss(3, number)
     report = fit(folder=tmp_path / "parts", data_workers=workers, **stopped)
     assert not multiprocessing.active_children()
     assert report.interrupted
@@ -113,37 +113,31 @@ def test_resuming_after_a_signal_equals_not_stopping(tmp_path, number, workers, 
 
 
 def test_history_after_the_checkpoint_is_written_again(tmp_path):
-    """A killed run has rows beyond its last checkpoint; resuming replaces them."""
+    """A killed run has rows beyond its last checkpoint. Resuming replaces these rows."""
     fit(folder=tmp_path / "whole", **make_parts())
-    parts = make_parts(checkpoint_every=4)
-    loss = BrokenLoss(at=(6,), value=1.0)
-    loss.forward = lambda *a, **k: (
-        (_ for _ in ()).throw(KeyboardInterrupt) if loss.calls == 5 else _count(loss, *a, **k)
-    )
+
+    def crash():
+        raise KeyboardInterrupt
+
     with pytest.raises(KeyboardInterrupt):
-        fit(folder=tmp_path / "killed", **{**parts, "loss": loss})
+        fit(folder=tmp_path / "killed", **{**make_parts(checkpoint_every=4), "loss": LossWith(crash, at=(6,))})
     assert [row["update"] for row in read_history(tmp_path / "killed")] == ["1", "2", "3", "4", "5"]
     resumed = make_parts(checkpoint_every=4)
     fit(folder=tmp_path / "killed", resume=True, **resumed)
     assert comparable(read_history(tmp_path / "killed")) == comparable(read_history(tmp_path / "whole"))
 
 
-def _count(loss, *args, **kwargs):
-    loss.calls += 1
-    return PoseLoss.forward(loss, *args, **kwargs)
-
-
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 def test_steps_that_are_not_finite_are_skipped_and_counted(tmp_path, value):
     parts = make_parts(updates=1)
     before = {name: p.clone() for name, p in parts["model"].state_dict().items()}
-    report = fit(folder=tmp_path / "one", **{**parts, "loss": BrokenLoss((1,), value)})
+    report = fit(folder=tmp_path / "one", **{**parts, "loss": LossWith(lambda: value, at=(1,))})
     assert report.skipped == 1
     for name, p in parts["model"].state_dict().items():
         assert torch.equal(p, before[name]), name
 
     parts = make_parts(updates=5)
-    report = fit(folder=tmp_path / "some", **{**parts, "loss": BrokenLoss((2, 4), value)})
+    report = fit(folder=tmp_path / "some", **{**parts, "loss": LossWith(lambda: value, at=(2, 4))})
     assert report.skipped == 2
     assert all(p.isfinite().all() for p in parts["model"].parameters())
     assert [row["skipped"] for row in read_history(tmp_path / "some")] == ["0", "1", "1", "2", "2"]
@@ -152,21 +146,23 @@ def test_steps_that_are_not_finite_are_skipped_and_counted(tmp_path, value):
 def test_too_many_bad_steps_stop_the_run(tmp_path):
     parts = make_parts(updates=9, max_skipped=2)
     with pytest.raises(TrainingError, match=r"3 steps .* max_skipped = 2"):
-        fit(folder=tmp_path, **{**parts, "loss": BrokenLoss(range(1, 10), float("nan"))})
+        fit(folder=tmp_path, **{**parts, "loss": LossWith(lambda: math.nan, at=range(1, 10))})
 
 
-def test_a_run_is_not_overwritten_by_accident(tmp_path):
-    fit(folder=tmp_path, **make_parts())
+def test_a_checkpoint_is_continued_by_the_same_run_only(tmp_path):
+    """Any difference is named: the settings, and plain data that the caller passes as the identity of the run."""
+    identity = {"data": {"seed": 3, "sigma": [1.0, 2.0]}}
+    fit(folder=tmp_path, identity=identity, **make_parts())
     content = (tmp_path / CHECKPOINT_NAME).read_bytes()
     with pytest.raises(TrainingError, match="resume=true"):
-        fit(folder=tmp_path, **make_parts())
+        fit(folder=tmp_path, identity=identity, **make_parts())
+    with pytest.raises(TrainingError, match=r"of another run: settings\.lr"):
+        fit(folder=tmp_path, identity=identity, resume=True, **make_parts(lr=1.0))
+    with pytest.raises(TrainingError, match=r"of another run: data\.sigma\.1 was 2\.0 and is 5\.0\.$"):
+        fit(folder=tmp_path, identity={"data": {"seed": 3, "sigma": [1.0, 5.0]}}, resume=True, **make_parts())
     assert (tmp_path / CHECKPOINT_NAME).read_bytes() == content
-
-
-def test_a_checkpoint_of_other_settings_is_refused(tmp_path):
-    fit(folder=tmp_path, **make_parts())
-    with pytest.raises(TrainingError, match="of another run: settings"):
-        fit(folder=tmp_path, resume=True, **make_parts(lr=1.0))
+    report = fit(folder=tmp_path, identity={"data": {"seed": 3, "sigma": (1.0, 2.0)}}, resume=True, **make_parts())
+    assert (report.start, report.update) == (6, 6)
 
 
 @pytest.mark.parametrize("content", [b"", b"not a checkpoint", None])
@@ -201,6 +197,8 @@ def test_schedules():
     assert settings.lr_factor(1000) == pytest.approx(0.1)
     assert [settings.ramp_factor(u) for u in (0, 200, 300, 400, 999)] == [0.0, 0.0, 0.5, 1.0, 1.0]
     assert TrainSettings(10, ramp=(0.0, 0.0)).ramp_factor(0) == 1.0
+    assert [TrainSettings(10, ramp=(0.5, 0.5)).ramp_factor(update) for update in (0, 4, 5, 9)] == [0.0, 0.0, 1.0, 1.0]
+    assert TrainSettings(10, ramp=(1.0, 1.0)).ramp_factor(9) == 0.0
 
 
 def test_learning_lowers_the_loss(tmp_path):
@@ -222,7 +220,7 @@ def test_validation_does_not_change_the_training(tmp_path):
 
 
 def test_training_outside_the_main_thread(tmp_path):
-    """Signals cannot be caught there; training works all the same."""
+    """Signals cannot be caught there. The training runs anyway."""
     result = []
     thread = threading.Thread(target=lambda: result.append(fit(folder=tmp_path, **make_parts())))
     thread.start()
@@ -243,7 +241,7 @@ import sys, torch
 sys.path.insert(0, {tests!r})
 from lightning_fabric import Fabric
 from test_training_loop import make_parts
-from kornia_pnpnet.training.loop import fit
+from kornia_pnpnet.training import fit
 torch.set_num_threads(1)
 fabric = Fabric(accelerator="cpu", devices={devices}, strategy={strategy!r})
 fabric.launch()
@@ -281,33 +279,6 @@ def test_two_processes_equal_one(tmp_path):
     assert any(not torch.equal(states[0][name], start[name]) for name in start)
 
 
-def test_a_batch_that_cannot_be_shared_is_refused(tmp_path):
-    class ThreeProcesses:
-        world_size, global_rank, is_global_zero, device = 3, 0, True, torch.device("cpu")
-
-    with pytest.raises(Exception, match="batch of 16 cannot be shared equally among 3"):
-        fit(folder=tmp_path, fabric=ThreeProcesses(), **make_parts())
-
-
-def test_first_stage_only_trains(tmp_path):
-    """m = 0 leaves no hyperparameters to learn."""
-    parts = make_parts()
-    parts["model"] = PnPNet(MLPInit(6), RobustWeightedLM(0))
-    before = [p.clone() for p in parts["model"].init.parameters()]
-    fit(folder=tmp_path, **parts)
-    assert any(not torch.equal(a, b) for a, b in zip(before, parts["model"].init.parameters(), strict=True))
-    assert isinstance(parts["model"].init, nn.Module)
-
-
-def test_another_run_is_not_continued(tmp_path):
-    """Whatever the caller names as the run's identity must be the same, and the message names what is not."""
-    fit(folder=tmp_path, identity={"data": {"seed": 3, "sigma": [1.0, 2.0]}}, **make_parts())
-    with pytest.raises(TrainingError, match=r"of another run: data\.sigma\.1 was 2\.0 and is 5\.0\.$"):
-        fit(folder=tmp_path, identity={"data": {"seed": 3, "sigma": [1.0, 5.0]}}, resume=True, **make_parts())
-    report = fit(folder=tmp_path, identity={"data": {"seed": 3, "sigma": (1.0, 2.0)}}, resume=True, **make_parts())
-    assert (report.start, report.update) == (6, 6)
-
-
 def test_validation_has_its_own_interval(tmp_path):
     fit(folder=tmp_path, **make_parts(updates=9, log_every=4, validate_every=3))
     rows = read_history(tmp_path)
@@ -316,28 +287,8 @@ def test_validation_has_its_own_interval(tmp_path):
 
 
 def test_a_signal_in_the_last_update_is_no_interruption(tmp_path):
-    report = fit(folder=tmp_path, **{**make_parts(), "loss": StoppingLoss(6, signal.SIGTERM)})
+    report = fit(folder=tmp_path, **{**make_parts(), "loss": stopping_loss(6, signal.SIGTERM)})
     assert (report.update, report.interrupted) == (6, False)
-
-
-@pytest.mark.parametrize("wrong", [{"log_every": 0}, {"updates": -1}, {"ramp": (0.5, 0.2)}, {"checkpoint_every": 0}])
-def test_settings_out_of_range_are_refused(wrong):
-    with pytest.raises(BaseError, match=next(iter(wrong))):
-        TrainSettings(**{"updates": 10, **wrong})
-
-
-def test_a_ramp_may_be_a_step():
-    assert [TrainSettings(10, ramp=(0.5, 0.5)).ramp_factor(update) for update in (0, 4, 5, 9)] == [0.0, 0.0, 1.0, 1.0]
-    assert TrainSettings(10, ramp=(1.0, 1.0)).ramp_factor(9) == 0.0
-
-
-@forks
-def test_data_drawn_meanwhile_changes_nothing(tmp_path):
-    plain, overlapped = make_parts(updates=30), make_parts(updates=30)
-    fit(folder=tmp_path / "plain", **plain)
-    fit(folder=tmp_path / "overlapped", data_workers=1, **overlapped)
-    assert_same_weights(plain["model"], overlapped["model"])
-    assert comparable(read_history(tmp_path / "overlapped")) == comparable(read_history(tmp_path / "plain"))
 
 
 class BrokenSource(SyntheticProblems):
@@ -358,10 +309,10 @@ def test_an_error_in_the_data_ends_the_run_with_its_message(tmp_path, workers):
 
 
 def test_a_checkpoint_of_an_optimizer_that_was_not_fused_is_continued(tmp_path):
-    """How a step is computed may change between two calls: the numbers that it continues from may not."""
+    """The way a step is computed may change between two calls, the numbers may not."""
     whole = make_parts()
     fit(folder=tmp_path / "whole", **whole)
-    fit(folder=tmp_path / "parts", **{**make_parts(), "loss": StoppingLoss(4, signal.SIGTERM)})
+    fit(folder=tmp_path / "parts", **{**make_parts(), "loss": stopping_loss(4, signal.SIGTERM)})
     path = tmp_path / "parts" / CHECKPOINT_NAME
     state = torch.load(path, weights_only=True)
     for group in state["optimizer"]["param_groups"]:
@@ -373,22 +324,72 @@ def test_a_checkpoint_of_an_optimizer_that_was_not_fused_is_continued(tmp_path):
     assert_same_weights(whole["model"], again["model"])
 
 
-def test_the_shares_of_the_time_add_up(tmp_path):
-    report = fit(folder=tmp_path, **make_parts())
-    assert [f"{stage}_share" for stage in report.time_shares] == SHARES
-    for shares in (report.time_shares.values(), *([float(row[s]) for s in SHARES] for row in read_history(tmp_path))):
-        assert all(share > 0.0 for share in shares)
-        assert sum(shares) == pytest.approx(1.0, abs=1e-4)  # six digits are written
-
-
 class SlowSource(SyntheticProblems):
     def batch(self, index):
         time.sleep(0.2)
         return super().batch(index)
 
 
-def test_waiting_for_data_is_counted_as_that(tmp_path):
+def test_shares_of_the_time_add_up_and_show_slow_data(tmp_path):
     quick, slow = ({**make_parts(), "data": kind(n=6, batch_size=16)} for kind in (SyntheticProblems, SlowSource))
     shares = [fit(folder=tmp_path / name, **parts).time_shares for name, parts in (("quick", quick), ("slow", slow))]
+    assert [f"{stage}_share" for stage in shares[0]] == SHARES
+    rows = [[float(row[share]) for share in SHARES] for row in read_history(tmp_path / "quick")]
+    for values in (*(entry.values() for entry in shares), *rows):
+        assert all(value > 0.0 for value in values)
+        assert sum(values) == pytest.approx(1.0, abs=1e-4)  # six digits are written
     assert shares[1]["data"] > shares[0]["data"]
     assert shares[1]["data"] == max(shares[1].values())
+
+
+# -- whatever comes in -------------------------------------------------------------------------------------------------
+
+
+def test_trainings_of_any_settings():
+    made = Seen()
+
+    @many(120)
+    @given(
+        options(
+            updates=COUNTS,
+            lr=ANY,
+            lr_refine=ANY,
+            warmup=COUNTS,
+            final_lr=ANY,
+            clip=ANY,
+            ramp=RANGES,
+            max_skipped=COUNTS,
+            log_every=COUNTS,
+            validate_every=COUNTS,
+            checkpoint_every=COUNTS,
+        ),
+        st.integers(0, 12),
+    )
+    def run(chosen, update):
+        settings = made(lambda: TrainSettings(**{"updates": 12, **chosen}))
+        if settings is not None:
+            assert 0 <= settings.lr_factor(update) < INF
+            assert 0 <= settings.ramp_factor(update) <= 1
+            assert 0 <= settings.lr < INF
+
+    run()
+    made.both()
+
+
+def test_trainings_of_any_length(tmp_path):
+    made = Seen()
+    history, checkpoint = tmp_path / "history.csv", tmp_path / "last.ckpt"
+    checkpoint.write_bytes(b"old")
+
+    @many(20)
+    @given(st.sampled_from([0.0, -1.0, math.nan, math.inf, -math.inf, None, "1", True, [1.0]]))
+    def run(seconds):
+        history.write_text("old")
+        made(lambda: train_briefly(seconds, tmp_path, progress=False))
+        assert history.read_text() == "old"
+        assert checkpoint.read_bytes() == b"old"
+
+    run()
+    made(lambda: train_briefly(1e-6, tmp_path, progress=False))
+    assert made.counts["works"] == 1
+    assert history.read_text().startswith("update,")

@@ -10,7 +10,7 @@ from typing import NoReturn
 
 from torch import nn
 
-from kornia_pnpnet.evaluation.choices import BOUNDS, load_solver
+from kornia_pnpnet.evaluation.named_solvers import BOUNDS, load_solver
 
 __all__ = [
     "OneLineParser",
@@ -80,7 +80,7 @@ def load_solver_without_truth(name: str) -> nn.Module:
     """Make the solver named by ``--solver``, but no bound, which needs the true pose.
 
     Args:
-        name: see :func:`~kornia_pnpnet.evaluation.choices.load_solver`.
+        name: see :func:`~kornia_pnpnet.evaluation.named_solvers.load_solver`.
 
     Raises:
         ValueError: when the name is that of a bound.

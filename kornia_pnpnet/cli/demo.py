@@ -19,8 +19,10 @@ from torch import nn
 
 from kornia_pnpnet.cli.arguments import add_arbitrary_unit, positive_float, whole_number
 from kornia_pnpnet.cli.reprojection import reproject
-from kornia_pnpnet.evaluation.choices import default_solvers, evaluation_sets, load_solver
-from kornia_pnpnet.evaluation.comparison import EvaluationData, evaluate, format_table, save_results
+from kornia_pnpnet.evaluation.comparison import EvaluationData, evaluate
+from kornia_pnpnet.evaluation.named_solvers import default_solvers, load_solver
+from kornia_pnpnet.evaluation.problem_sets import evaluation_sets
+from kornia_pnpnet.evaluation.results import format_table, save_results
 
 _N = 9
 _SOLVERS = ("pnpnet-set", f"pnpnet-n{_N}", "opencv-ransac", "poselib")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 
-from kornia_pnpnet.evaluation.comparison import load_results
+from kornia_pnpnet.evaluation.results import load_results
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

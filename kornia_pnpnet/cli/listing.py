@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 
 from kornia_pnpnet import list_solvers, shipped_weights
-from kornia_pnpnet.evaluation.choices import BOUNDS, missing_package
+from kornia_pnpnet.evaluation.named_solvers import BOUNDS, missing_package
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

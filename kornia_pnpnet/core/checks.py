@@ -1,4 +1,4 @@
-"""Checks of arguments, each with an error that says which one is wrong, what it must be and what it was."""
+"""Checks of arguments. Every error names the argument, what it must be and what it was."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from numbers import Integral, Real
 from typing import Any, TypeAlias
 
+import torch
 from kornia.core.check import KORNIA_CHECK
 from kornia.core.exceptions import DeviceError, ShapeError, TypeCheckError
 from torch import Tensor
@@ -23,55 +24,87 @@ __all__ = [
     "check_ranges",
     "check_shapes",
     "check_whole",
+    "expand_sigma",
 ]
 
-#: For the name of each tensor: the tensor, or ``None`` where it was left out, and the shape that it must have.
+#: Maps the name of each argument to its tensor (``None``: not given, not checked) and the shape it must have.
 Shapes: TypeAlias = dict[str, tuple[Tensor | None, tuple[int, ...]]]
 
 
 def _is_number(value: Any) -> bool:
-    right = isinstance(value, Real) and not isinstance(value, bool)
-    return right and bool(-math.inf < value < math.inf)
+    is_real = isinstance(value, Real) and not isinstance(value, bool)
+    return is_real and bool(-math.inf < value < math.inf)
 
 
-def check_whole(least: int, /, **values: Any) -> None:
-    """Raise a ``BaseError`` unless these are whole numbers of at least so much."""
+def check_whole(least: int, most: int | None = None, /, **values: Any) -> None:
+    """Check that each value is an integer of at least ``least`` and, unless ``most`` is ``None``, at most ``most``.
+
+    NumPy integers pass, booleans do not.
+
+    Args:
+        least: smallest allowed value.
+        most: largest allowed value; ``None``: no upper bound.
+        values: the values by the name of their argument.
+
+    Raises:
+        BaseError: when a value is not such an integer.
+
+    Example:
+        >>> check_whole(1, 8, views=9)
+        Traceback (most recent call last):
+        ...
+        kornia.core.exceptions.BaseError: views must be an integer from 1 to 8, got 9.
+    """
+    bounds = f"of at least {least}" if most is None else f"from {least} to {most}"
     for name, value in values.items():
         whole = isinstance(value, Integral) and not isinstance(value, bool)
-        KORNIA_CHECK(whole and value >= least, f"{name} must be an integer of at least {least}, got {value!r}.")
+        inside = whole and least <= value and (most is None or value <= most)
+        KORNIA_CHECK(inside, f"{name} must be an integer {bounds}, got {value!r}.")
 
 
 def check_numbers(low: float, high: float = math.inf, /, **values: Any) -> None:
-    """Raise a ``BaseError`` unless these are finite numbers in ``[low, high]``."""
-    limits = f"of at least {low:g}" if high == math.inf else f"in [{low:g}, {high:g}]"
+    """Check that each value is a finite number in ``[low, high]``.
+
+    Raises:
+        BaseError: when a value is not.
+    """
+    bounds = f"of at least {low:g}" if high == math.inf else f"in [{low:g}, {high:g}]"
     for name, value in values.items():
-        KORNIA_CHECK(_is_number(value) and low <= value <= high, f"{name} must be a number {limits}, got {value!r}.")
+        KORNIA_CHECK(_is_number(value) and low <= value <= high, f"{name} must be a number {bounds}, got {value!r}.")
 
 
 def check_positive(*, or_infinite: bool = False, **values: Any) -> None:
-    """Raise a ``BaseError`` unless these are positive and finite, or infinite where that is allowed."""
+    """Check that each value is a positive, finite number. ``or_infinite`` also allows infinity.
+
+    Raises:
+        BaseError: when a value is not.
+    """
     for name, value in values.items():
-        right = (_is_number(value) and value > 0) or (or_infinite and value == math.inf)
-        KORNIA_CHECK(right, f"{name} must be a positive number, got {value!r}.")
+        positive = (_is_number(value) and value > 0) or (or_infinite and value == math.inf)
+        KORNIA_CHECK(positive, f"{name} must be a positive number, got {value!r}.")
 
 
 def check_ranges(**values: Any) -> None:
-    """Raise a ``BaseError`` unless these are two positive numbers each, the first not larger than the second."""
+    """Check that each value is a pair of positive numbers, the second not smaller than the first.
+
+    Raises:
+        BaseError: when a value is not.
+    """
     for name, value in values.items():
-        numbers = hasattr(value, "__len__") and len(value) == 2 and all(map(_is_number, value))
-        right = numbers and 0 < value[0] <= value[1]
-        KORNIA_CHECK(right, f"{name} must be two positive numbers, the second not smaller, got {value!r}.")
+        two_numbers = hasattr(value, "__len__") and len(value) == 2 and all(map(_is_number, value))
+        in_order = two_numbers and 0 < value[0] <= value[1]
+        KORNIA_CHECK(in_order, f"{name} must be two positive numbers, the second not smaller, got {value!r}.")
 
 
 def check_shapes(shapes: Shapes, like: Tensor | None = None) -> None:
-    """Check that tensors have the shapes that go with each other.
+    """Check the shapes of several tensors.
 
     Args:
         shapes: see :data:`Shapes`.
-        like: the world points whose batch they belong to, for the message.
+        like: the world points from which the expected shapes were derived. Only the error message uses them.
 
     Raises:
-        ShapeError: when one has another shape.
+        ShapeError: when a tensor has another shape.
     """
     for name, (tensor, expected) in shapes.items():
         if tensor is not None and tensor.shape != expected:
@@ -83,35 +116,45 @@ def check_shapes(shapes: Shapes, like: Tensor | None = None) -> None:
             )
 
 
-def check_like(tensors: Mapping[str, Tensor | None], like: Tensor, name: str = "world_points") -> None:
-    """Check that tensors have the dtype of another one and are where it is; ``name`` is that of the other one.
+def check_like(tensors: Mapping[str, Tensor | None], like: Tensor, like_name: str = "world_points") -> None:
+    """Check that tensors have the dtype and the device of another tensor.
+
+    Args:
+        tensors: the tensors by the name of their argument; ``None`` is not checked.
+        like: the tensor to compare with.
+        like_name: name of ``like`` in error messages.
 
     Raises:
-        TypeCheckError: when one has another dtype.
-        DeviceError: when one is on another device.
+        TypeCheckError: when a dtype differs.
+        DeviceError: when a device differs.
     """
-    for this, tensor in tensors.items():
+    for name, tensor in tensors.items():
         if tensor is not None and tensor.dtype != like.dtype:
-            raise TypeCheckError(f"{this} is {tensor.dtype} but {name} is {like.dtype}.")
-    check_devices(tensors, like, name)
+            raise TypeCheckError(f"{name} is {tensor.dtype} but {like_name} is {like.dtype}.")
+    check_devices(tensors, like, like_name)
 
 
-def check_devices(tensors: Mapping[str, Tensor | None], like: Tensor, name: str = "world_points") -> None:
-    """Check that tensors are where another one is, those of no dimension, too; ``name`` is that of the other one.
+def check_devices(tensors: Mapping[str, Tensor | None], like: Tensor, like_name: str = "world_points") -> None:
+    """Check that tensors are on the device of another tensor. This includes tensors without dimensions.
+
+    Args:
+        tensors: the tensors by the name of their argument; ``None`` is not checked.
+        like: the tensor to compare with.
+        like_name: name of ``like`` in error messages.
 
     Raises:
-        DeviceError: when one is on another device.
+        DeviceError: when a device differs.
     """
-    for this, tensor in tensors.items():
+    for name, tensor in tensors.items():
         if tensor is not None and tensor.device != like.device:
-            raise DeviceError(f"{this} is on {tensor.device} but {name} is on {like.device}.")
+            raise DeviceError(f"{name} is on {tensor.device} but {like_name} is on {like.device}.")
 
 
 def check_poses(estimate: Pose, truth: Pose) -> None:
-    """Check that both are as many poses: broadcasting would compare what does not belong together.
+    r"""Check that two batches of poses match exactly. Broadcasting would compare poses of different problems.
 
     Raises:
-        ShapeError: when the shapes are not (*, 3, 3) and (*, 3), with the same leading ones.
+        ShapeError: unless both are of shape (\*, 3, 3) and (\*, 3) with the same leading dimensions.
         TypeCheckError: when the dtypes differ.
         DeviceError: when the devices differ.
     """
@@ -121,5 +164,41 @@ def check_poses(estimate: Pose, truth: Pose) -> None:
         shapes[f"The rotation of the {name}"] = pose.rotation, (*batch, 3, 3)
         shapes[f"The translation of the {name}"] = pose.translation, (*batch, 3)
     check_shapes(shapes)
-    parts = {name: tensor for name, (tensor, _) in shapes.items()}
-    check_like(parts, truth.translation, "the translation of the truth")
+    tensors = {name: tensor for name, (tensor, _) in shapes.items()}
+    check_like(tensors, truth.translation, "the translation of the truth")
+
+
+def expand_sigma(name: str, sigma: Tensor | float | None, world_points: Tensor) -> Tensor:
+    r"""Check a standard deviation that a user gave, and expand it to every pair.
+
+    Args:
+        name: name of the argument in error messages.
+        sigma: a number, a tensor of shape :math:`()`, :math:`(B,)` or :math:`(B, N)`, or ``None``: unknown.
+        world_points: shape :math:`(B, N, 3)`; gives batch, number of pairs, dtype and device.
+
+    Returns:
+        Shape :math:`(B, N)`; NaN where ``sigma`` is ``None``.
+
+    Raises:
+        TypeCheckError: when ``sigma`` is neither a number nor a tensor, or a tensor of another dtype.
+        ShapeError: when a tensor has another shape.
+        DeviceError: when a tensor is on another device.
+
+    Example:
+        >>> expand_sigma("img_sigma", torch.tensor([1.0, 2.0]), torch.zeros(2, 3, 3))
+        tensor([[1., 1., 1.],
+                [2., 2., 2.]])
+    """
+    batch, count = world_points.shape[:2]
+    if sigma is None or isinstance(sigma, int | float):
+        return world_points.new_full((batch, count), torch.nan if sigma is None else sigma)
+    if not isinstance(sigma, Tensor):
+        raise TypeCheckError(f"{name} must be a number or a tensor, got {type(sigma).__name__}.")
+    check_like({name: sigma}, world_points)
+    if sigma.shape not in ((), (batch,), (batch, count)):
+        raise ShapeError(
+            f"{name} must be a number or have the shape {(batch,)} or {(batch, count)}, got {tuple(sigma.shape)}.",
+            actual_shape=tuple(sigma.shape),
+            expected_shape=["B", "N"],
+        )
+    return (sigma[:, None] if sigma.ndim == 1 else sigma).expand(batch, count)

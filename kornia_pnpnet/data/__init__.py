@@ -1,17 +1,17 @@
-"""Sources of problems: synthetic ones, and real scenes."""
+"""Sources of problems: synthetic problems and real scenes.
 
-from kornia_pnpnet.data.colmap import Scene, View, load_colmap, load_matches, load_scene
+``synthetic`` puts problems together from ``points`` (priors of points), ``noise`` (the noise model), ``outliers``
+(number and kinds of outliers) and ``draws`` (random poses and numbers); ``mixtures`` combines several sources;
+``scenes`` draws problems from real scenes, which ``colmap`` reads from files; ``stream`` draws batches in other
+processes. A new data source is one more class with ``batch_size`` and ``batch(index)``.
+"""
+
+from kornia_pnpnet.data.colmap import load_colmap, load_matches, load_scene
+from kornia_pnpnet.data.mixtures import MixedProblems, VaryingSize
 from kornia_pnpnet.data.outliers import OutlierDraw, OutlierMix
-from kornia_pnpnet.data.scenes import SceneProblems
-from kornia_pnpnet.data.synthetic import (
-    BoxPoints,
-    MixedProblems,
-    ObjectPoints,
-    PointPrior,
-    SlabPoints,
-    SyntheticProblems,
-    VaryingSize,
-)
+from kornia_pnpnet.data.points import BoxPoints, ObjectPoints, PointPrior, SlabPoints
+from kornia_pnpnet.data.scenes import Scene, SceneProblems, View
+from kornia_pnpnet.data.synthetic import SyntheticProblems
 
 __all__ = [
     "BoxPoints",

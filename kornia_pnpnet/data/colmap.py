@@ -1,13 +1,8 @@
-"""Real scenes: COLMAP and ETH3D models and files of raw matches.
-
-Convention: ``x_cam = R x_world + t``. Pixels and camera matrices are COLMAP's: the centre of the top-left pixel is
-(0.5, 0.5). Everything is kept in float64 on the CPU.
-"""
+"""Readers of real scenes: COLMAP and ETH3D models, and files of raw matches."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,102 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["Scene", "View", "load_colmap", "load_matches", "load_scene"]
+from kornia_pnpnet.data.scenes import Scene, View
 
-# Where a model lies below the folder a user names: right there, in ETH3D's layout, in COLMAP's.
+__all__ = ["load_colmap", "load_matches", "load_scene"]
+
+# Folders of a model below the user's folder: the folder itself, ETH3D's layout, COLMAP's layout.
 _MODEL_FOLDERS = (".", "dslr_calibration_undistorted", "sparse/0", "sparse")
 _MODEL_FILES = ("cameras", "images", "points3D")
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    r"""One image of a scene: what it observes and where it was taken from.
-
-    Attributes:
-        name: the image's name, with its sub-folders if it has any.
-        world_points: the observed points in the unit of the scene, shape :math:`(M, 3)`, float64.
-        img_points: their pixels, freed from lens distortion, shape :math:`(M, 2)`, float64.
-        intrinsics: pinhole camera matrix in pixels, shape :math:`(3, 3)`.
-        rotation: world-to-camera rotation, shape :math:`(3, 3)`.
-        translation: world-to-camera translation, shape :math:`(3,)`.
-        width: image width in pixels.
-        height: image height in pixels.
-        inliers: whether the pixel belongs to the point, bool, shape :math:`(M,)`.
-
-    Raises:
-        ValueError: if a shape is wrong, a value is not finite, or ``rotation`` is not a rotation.
-    """
-
-    name: str
-    world_points: Tensor
-    img_points: Tensor
-    intrinsics: Tensor
-    rotation: Tensor
-    translation: Tensor
-    width: int
-    height: int
-    inliers: Tensor
-
-    def __post_init__(self) -> None:
-        count = len(self.world_points)
-        expected = {
-            "world_points": (count, 3),
-            "img_points": (count, 2),
-            "intrinsics": (3, 3),
-            "rotation": (3, 3),
-            "translation": (3,),
-            "inliers": (count,),
-        }
-        for field, shape in expected.items():
-            value: Tensor = getattr(self, field)
-            if value.shape != shape:
-                raise ValueError(f"image '{self.name}': {field} has shape {tuple(value.shape)}, expected {shape}")
-            if not value.isfinite().all():
-                raise ValueError(f"image '{self.name}': {field} has values that are not finite")
-        deviation = (self.rotation @ self.rotation.mT - torch.eye(3, dtype=self.rotation.dtype)).abs().max()
-        if deviation > 1e-3 or self.rotation.det() < 0:
-            raise ValueError(f"image '{self.name}': rotation is not a rotation matrix")
-
-    @property
-    def cam_points(self) -> Tensor:
-        """The observed points in the camera's frame, shape :math:`(M, 3)`."""
-        return self.world_points @ self.rotation.mT + self.translation
-
-    @property
-    def median_depth(self) -> float:
-        """Median depth of the observed points in the unit of the scene."""
-        return self.cam_points[:, 2].median().item()
-
-    @property
-    def reprojection_error_px(self) -> Tensor:
-        """Distance of each pixel to its point's projection, infinite behind the camera, shape :math:`(M,)`."""
-        cam_points = self.cam_points  # (M, 3)
-        in_front = cam_points[:, 2] > 0
-        projected = cam_points @ self.intrinsics.mT  # (M, 3)
-        error = (projected[:, :2] / projected[:, 2:] - self.img_points).norm(dim=1)
-        return torch.where(in_front, error, torch.inf)
-
-
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """The images of one scene.
-
-    Attributes:
-        name: the scene's name.
-        views: the images that observe enough points, sorted by name.
-        skipped: names of the images left out because they observe too few points.
-        metric: whether the unit is the metre; otherwise it is arbitrary.
-    """
-
-    name: str
-    views: tuple[View, ...]
-    skipped: tuple[str, ...] = ()
-    metric: bool = True
-
-    @property
-    def median_depth(self) -> float:
-        """Median depth of all observations in the unit of the scene."""
-        return torch.cat([view.cam_points[:, 2] for view in self.views]).median().item()
 
 
 def load_scene(path: str | Path, *, metric: bool = True, min_points: int = 10, max_error_px: float = 10.0) -> Scene:
@@ -120,15 +26,15 @@ def load_scene(path: str | Path, *, metric: bool = True, min_points: int = 10, m
         path: the file (see :func:`load_matches`) or the folder (see :func:`load_colmap`).
         metric: whether the unit of the scene is the metre.
         min_points: images with fewer points are skipped.
-        max_error_px: matches with a larger reprojection error under the true pose are mismatches; of no effect on
-            COLMAP models.
+        max_error_px: matches with a larger reprojection error under the true pose are outliers; ignored for COLMAP
+            models.
 
     Returns:
         The scene.
 
     Raises:
         FileNotFoundError: if there is nothing at ``path`` or no model in the folder.
-        ValueError: if what is there cannot be used; the message says why.
+        ValueError: if the file or the model cannot be used; the message says why.
     """
     path = Path(path)
     if path.suffix == ".npz" and not path.is_dir():
@@ -139,9 +45,9 @@ def load_scene(path: str | Path, *, metric: bool = True, min_points: int = 10, m
 def load_colmap(folder: str | Path, *, metric: bool = True, min_points: int = 10) -> Scene:
     """Load a COLMAP model, text or binary, through ``pycolmap``.
 
-    Distorted cameras are undone: pixels become those of the pinhole camera with the same focal length and principal
-    point. A point that an image observes twice is taken once, and points behind the camera are dropped, which only a
-    fisheye lens can see.
+    Pixels of distorted cameras are undistorted to the pinhole camera with the same focal length and principal point.
+    A point that an image observes twice is used once, and points behind the camera, which only a fisheye lens can see,
+    are dropped.
 
     Args:
         folder: the folder of the model or a scene above it: ETH3D's, with the model in
@@ -155,7 +61,7 @@ def load_colmap(folder: str | Path, *, metric: bool = True, min_points: int = 10
     Raises:
         ImportError: if ``pycolmap`` is missing.
         FileNotFoundError: if the folder or the model in it is missing.
-        ValueError: if the model cannot be read, has no images, or all of them are skipped.
+        ValueError: if the model cannot be read, has no images, or all images are skipped.
     """
     folder = Path(folder)
     model_folder = _find_model(folder)
@@ -165,7 +71,7 @@ def load_colmap(folder: str | Path, *, metric: bool = True, min_points: int = 10
         raise ImportError("reading COLMAP models needs pycolmap: pip install 'kornia_pnpnet[eval]'") from error
     try:
         model = pycolmap.Reconstruction(str(model_folder))
-    except Exception as error:  # whatever its C++ code threw at a bad file, std::bad_alloc included
+    except Exception as error:  # its C++ code throws many types on bad files, std::bad_alloc included
         reason = " ".join(str(error).split())
         raise ValueError(f"pycolmap cannot read the model in '{model_folder}': {reason}") from error
     if not model.images:
@@ -192,7 +98,7 @@ def load_matches(path: str | Path, *, metric: bool = True, min_points: int = 10,
         path: the ``.npz`` file.
         metric: whether the unit of the world is the metre.
         min_points: images with fewer matches are skipped.
-        max_error_px: matches with a larger error are mismatches.
+        max_error_px: matches with a larger error are outliers.
 
     Returns:
         The scene.
@@ -219,7 +125,7 @@ def load_matches(path: str | Path, *, metric: bool = True, min_points: int = 10,
 
 
 def _scene(path: Path, name: str, views: list[View], min_points: int, metric: bool) -> Scene:
-    """Sort the views by name and set those with too few points apart."""
+    """Sort the views by name, and skip views with too few points."""
     views = sorted(views, key=lambda view: view.name)
     kept = tuple(view for view in views if len(view.world_points) >= min_points)
     if not kept:
@@ -251,7 +157,7 @@ def _scene_name(folder: Path) -> str:
 
 
 def _colmap_view(image: Any, world_points: Mapping[int, np.ndarray]) -> View:
-    """What one ``pycolmap.Image`` observes."""
+    """The observations of one ``pycolmap.Image``."""
     camera = image.camera
     observed = image.get_observation_points2D()
     ids, first = np.unique(np.array([point.point3D_id for point in observed], dtype=np.uint64), return_index=True)
@@ -261,9 +167,10 @@ def _colmap_view(image: Any, world_points: Mapping[int, np.ndarray]) -> View:
     intrinsics = camera.calibration_matrix()
 
     plane = camera.cam_from_img(distorted)  # (M, 2), nan where the lens model has no inverse
-    pixels = plane @ intrinsics[:2, :2].T + intrinsics[:2, 2]
+    with np.errstate(invalid="ignore"):  # infinite where a focal length is 0
+        pixels = plane @ intrinsics[:2, :2].T + intrinsics[:2, 2]
     depth = points @ world_to_cam[2, :3] + world_to_cam[2, 3]
-    # A pose that is not finite must reach the check in View, not be read as "no point in front".
+    # `~(depth <= 0)`, so that a pose that is not finite reaches the check in View.
     seen = np.isfinite(pixels).all(axis=1) & ~(depth <= 0)
     return View(
         name=image.name,

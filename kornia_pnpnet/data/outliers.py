@@ -1,4 +1,4 @@
-"""How many pairs are wrong, which, and in what way."""
+"""Outliers of synthetic problems and of scenes: their number, positions and kinds, and the pixels of each kind."""
 
 from __future__ import annotations
 
@@ -10,19 +10,27 @@ from kornia.core.check import KORNIA_CHECK
 from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_numbers, check_whole
+from kornia_pnpnet.data.draws import log_uniform, normal, random_poses
 
-__all__ = ["OutlierDraw", "OutlierMix"]
+__all__ = ["OutlierDraw", "OutlierMix", "near_offsets", "structured_points"]
+
+# Standard deviations of the pixel noise. The distance of a near outlier from its pixel is log-uniform in this range,
+# from just outside the noise to ten times that.
+_NEAR = 5.0, 50.0
+# Pairs. Added to the largest number of outliers before rounding down, so that 0.33 is a third for every n up to 15.
+_SLACK = 0.05
 
 
 class OutlierDraw(NamedTuple):
-    r"""Which pairs of a batch are wrong.
+    r"""The outliers of a batch, by kind.
 
     Attributes:
-        mismatch: the pixel belongs to another point, bool, shape :math:`(B, N)`.
-        sensing: the pixel is anywhere in the image, bool, shape :math:`(B, N)`.
-        near: the pixel is a little off, bool, shape :math:`(B, N)`; ``None``: none is.
-        structured: the pixel is where another pose, the same for all of these of a problem, would show the point,
-            bool, shape :math:`(B, N)`; ``None``: none is.
+        mismatch: the pixel shows another point, bool, shape :math:`(B, N)`.
+        sensing: the pixel is uniform in the image, bool, shape :math:`(B, N)`.
+        near: the pixel is off by 5 to 50 standard deviations of the noise, bool, shape :math:`(B, N)`; ``None``: no
+            pair is.
+        structured: the pixel shows the point from another pose, which all structured outliers of a problem share, bool,
+            shape :math:`(B, N)`; ``None``: no pair is.
     """
 
     mismatch: Tensor
@@ -32,27 +40,27 @@ class OutlierDraw(NamedTuple):
 
     @property
     def inliers(self) -> Tensor:
-        """Pairs that are none of these, bool, shape :math:`(B, N)`."""
-        wrong = self.mismatch | self.sensing
-        for more in (self.near, self.structured):
-            wrong = wrong if more is None else wrong | more
-        return ~wrong
+        """Pairs that are no outliers, bool, shape :math:`(B, N)`."""
+        outliers = self.mismatch | self.sensing
+        for kind in (self.near, self.structured):
+            outliers = outliers if kind is None else outliers | kind
+        return ~outliers
 
 
 class OutlierMix:
-    r"""The number of wrong pairs, uniform over the integers from ``min_count`` to a maximum, at random positions.
+    r"""Outliers at random positions, their number uniform over the integers from ``min_count`` to a maximum.
 
     Args:
-        max_ratio: the maximum as a share of the pairs, rounded down. A twentieth of a pair is forgiven, so that a
-            third written as 0.33 means :math:`\lfloor n/3 \rfloor` for every n up to 15.
-        count: exactly this many instead.
-        min_count: the fewest.
-        mismatch_share: probability that a wrong pair is a *mismatch* (the projection of another point) rather than
-            *sensing* (a pixel anywhere in the image).
-        near_share: probability that a wrong pair is *near* instead: a little off.
-        structured_share: probability that the wrong pairs of a problem are *structured* instead, up to a third of the
-            right ones: they agree on another pose, as repeated structure does.
-        min_inliers: so many pairs stay right, whatever ``max_ratio`` says.
+        max_ratio: the maximum as a share of the pairs, rounded down. 0.33 means :math:`\lfloor n/3 \rfloor` for every n
+            up to 15.
+        count: exact number of outliers, which replaces the range.
+        min_count: smallest number of outliers.
+        mismatch_share: probability that an outlier is a *mismatch* (the projection of another point) rather than
+            *sensing* (a uniform pixel of the image).
+        near_share: probability that an outlier is *near* its pixel instead, off by 5 to 50 standard deviations.
+        structured_share: probability that the outliers of a problem are *structured* instead, up to a third of its
+            inliers: they agree on another pose, as with repeated structure.
+        min_inliers: smallest number of inliers, which limits the maximum.
 
     Raises:
         BaseError: for shares outside [0, 1] or counts that are negative or not whole.
@@ -87,24 +95,24 @@ class OutlierMix:
         self.min_inliers = min_inliers
 
     def max_count(self, n: int) -> int:
-        """The most wrong pairs among ``n``."""
+        """The largest number of outliers among ``n`` pairs."""
         if self.count is not None:
             return self.count
-        return max(0, min(math.floor(n * self.max_ratio + 0.05), n - self.min_inliers))
+        return max(0, min(math.floor(n * self.max_ratio + _SLACK), n - self.min_inliers))
 
     def draw(self, batch_size: int, n: int, generator: torch.Generator) -> OutlierDraw:
-        r"""Draw the wrong pairs of a batch.
+        r"""Draw the outliers of a batch.
 
         Args:
             batch_size: number of problems.
-            n: pairs in each.
+            n: number of pairs of each problem.
             generator: source of randomness; the result is on its device.
 
         Returns:
             Masks of shape ``(batch_size, n)``.
 
         Raises:
-            BaseError: when more wrong pairs are asked for than there are pairs.
+            BaseError: when there are to be more outliers than pairs.
         """
         most = self.max_count(n)
         least = min(self.min_count, most) if self.count is None else self.count
@@ -117,10 +125,27 @@ class OutlierMix:
         mismatch = torch.rand(batch_size, n, generator=generator, device=device) < self.mismatch_share
         near = structured = None
         if self.structured_share:
-            such = torch.rand(batch_size, 1, generator=generator, device=device) < self.structured_share
-            structured = outlier & such & (rank < (n - count) // 3)
+            chosen = torch.rand(batch_size, 1, generator=generator, device=device) < self.structured_share
+            structured = outlier & chosen & (rank < (n - count) // 3)
             outlier = outlier & ~structured
         if self.near_share:
             near = outlier & (torch.rand(batch_size, n, generator=generator, device=device) < self.near_share)
             outlier = outlier & ~near
         return OutlierDraw(outlier & mismatch, outlier & ~mismatch, near, structured)
+
+
+def near_offsets(img_sigma: Tensor, n: int, generator: torch.Generator) -> Tensor:
+    """Draw the offsets in pixels of near outliers, (B, n, 2), from the pixel noise of each problem, (B,)."""
+    batch_size = len(img_sigma)
+    direction = torch.nn.functional.normalize(normal((batch_size, n, 2), generator), dim=-1)
+    return direction * (log_uniform((batch_size, n, 1), *_NEAR, generator) * img_sigma[:, None, None])
+
+
+def structured_points(cam_points: Tensor, generator: torch.Generator) -> Tensor:
+    """The points of each problem rotated about their centre and shifted, (B, N, 3): structured outliers show these."""
+    batch_size = len(cam_points)
+    centre = cam_points.mean(1, keepdim=True)
+    size = (cam_points - centre).square().sum(-1).mean(1).sqrt()[:, None, None]
+    turn = random_poses(batch_size, generator, max_angle=math.pi).rotation
+    shift = 0.5 * size * normal((batch_size, 1, 3), generator)
+    return (cam_points - centre) @ turn.mT + centre + shift

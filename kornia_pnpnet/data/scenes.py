@@ -1,55 +1,151 @@
-"""Random problems drawn from real scenes."""
+"""Real scenes: the images of one scene with their poses, and random problems drawn from them.
+
+Convention: ``x_cam = R x_world + t``. Pixels and camera matrices are COLMAP's: the centre of the top-left pixel is
+(0.5, 0.5). A scene is in float64 on the CPU.
+"""
 
 from __future__ import annotations
 
 import itertools
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import torch
+from kornia.core.check import KORNIA_CHECK
 from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_numbers, check_whole
-from kornia_pnpnet.data.colmap import Scene
+from kornia_pnpnet.data.draws import batch_generator, random_poses, uniform
 from kornia_pnpnet.data.outliers import OutlierMix
-from kornia_pnpnet.data.synthetic import batch_generator, random_poses, uniform
 from kornia_pnpnet.types import Pose, Problems
 
-__all__ = ["SceneProblems"]
+__all__ = ["Scene", "SceneProblems", "View"]
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    r"""One image of a scene: its observations and its pose.
+
+    Attributes:
+        name: the image's name, with its sub-folders if it has any.
+        world_points: the observed points in the unit of the scene, shape :math:`(M, 3)`, float64.
+        img_points: pixels of the points, with lens distortion removed, shape :math:`(M, 2)`, float64.
+        intrinsics: pinhole camera matrix in pixels, shape :math:`(3, 3)`.
+        rotation: world-to-camera rotation, shape :math:`(3, 3)`.
+        translation: world-to-camera translation, shape :math:`(3,)`.
+        width: image width in pixels.
+        height: image height in pixels.
+        inliers: whether the pixel shows the point, bool, shape :math:`(M,)`.
+
+    Raises:
+        ValueError: if a shape is wrong, a value is not finite, or ``rotation`` is not a rotation.
+    """
+
+    name: str
+    world_points: Tensor
+    img_points: Tensor
+    intrinsics: Tensor
+    rotation: Tensor
+    translation: Tensor
+    width: int
+    height: int
+    inliers: Tensor
+
+    def __post_init__(self) -> None:
+        count = len(self.world_points)
+        expected = {
+            "world_points": (count, 3),
+            "img_points": (count, 2),
+            "intrinsics": (3, 3),
+            "rotation": (3, 3),
+            "translation": (3,),
+            "inliers": (count,),
+        }
+        for field, shape in expected.items():
+            value: Tensor = getattr(self, field)
+            if value.shape != shape:
+                raise ValueError(f"image '{self.name}': {field} has shape {tuple(value.shape)}, expected {shape}")
+            if not value.isfinite().all():
+                raise ValueError(f"image '{self.name}': {field} has values that are not finite")
+        deviation = (self.rotation @ self.rotation.mT - torch.eye(3, dtype=self.rotation.dtype)).abs().max()
+        if deviation > 1e-3 or self.rotation.det() < 0:
+            raise ValueError(f"image '{self.name}': rotation is not a rotation matrix")
+
+    @property
+    def cam_points(self) -> Tensor:
+        """The observed points in the camera's frame, shape :math:`(M, 3)`."""
+        return self.world_points @ self.rotation.mT + self.translation
+
+    @property
+    def median_depth(self) -> float:
+        """Median depth of the observed points in the unit of the scene."""
+        return self.cam_points[:, 2].median().item()
+
+    @property
+    def reprojection_error_px(self) -> Tensor:
+        """Distance of each pixel to its point's projection, infinite behind the camera, shape :math:`(M,)`."""
+        cam_points = self.cam_points  # (M, 3)
+        in_front = cam_points[:, 2] > 0
+        projected = cam_points @ self.intrinsics.mT  # (M, 3)
+        error = (projected[:, :2] / projected[:, 2:] - self.img_points).norm(dim=1)
+        return torch.where(in_front, error, torch.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """The images of one scene.
+
+    Attributes:
+        name: the scene's name.
+        views: the images that observe enough points, sorted by name.
+        skipped: names of the images left out because they observe too few points.
+        metric: whether the unit is the metre; otherwise it is arbitrary.
+    """
+
+    name: str
+    views: tuple[View, ...]
+    skipped: tuple[str, ...] = ()
+    metric: bool = True
+
+    @property
+    def median_depth(self) -> float:
+        """Median depth of all observations in the unit of the scene."""
+        return torch.cat([view.cam_points[:, 2] for view in self.views]).median().item()
 
 
 class SceneProblems:
     r"""Random problems of a scene, endless and reproducible: batch ``i`` depends on ``seed`` and ``i`` alone.
 
-    Each problem is a random image, ``n`` random points that it observes and their pixels, of which some are spoilt:
-    a *mismatch* gets the pixel of a spare point of the same image, a *sensing* outlier a uniform pixel of the image.
-    ``outliers=OutlierMix(count=2)`` is the protocol's real data with outliers: 10 points are drawn, and 2 of the
-    first 9 get the 10th point's pixel or a uniform one. Points and poses do not depend on ``outliers``, so that
-    numbers of outliers are compared on the same problems.
+    Each problem is a random image with ``n`` random points that it observes and their pixels. Some pairs become
+    outliers: a *mismatch* gets the pixel of a spare point of the same image, a *sensing* outlier a uniform pixel of the
+    image. ``outliers=OutlierMix(count=2)`` is the protocol's real data with outliers: 10 points are drawn, and 2 of the
+    first 9 get the pixel of the 10th point or a uniform pixel. Points and poses do not depend on ``outliers``, so that
+    different numbers of outliers are compared on the same problems.
 
     As in the paper the world is centred on a coarse pose: a pose :math:`(R^*, t^*)` is drawn from the training prior
-    and the world is moved so that it is the true one, :math:`x' = R^{*\top}(R x + t - t^*)`.
+    and the world is moved so that this pose is the true one, :math:`x' = R^{*\top}(R x + t - t^*)`.
 
     Args:
-        scene: where the problems are drawn from. Only its images with at least ``n + num_spares`` points are used.
-        n: pairs per problem.
-        batch_size: problems per batch.
-        seed: of the stream, at least 0.
-        outliers: how many pairs are spoilt and how; none when ``None``. Raw matches bring their own mismatches.
-        num_spares: extra points drawn per problem, given to its mismatches in turn. The protocol draws one, which
-            all mismatches share; as many as there are mismatches give each its own.
+        scene: the scene. Only its images with at least ``n + num_spares`` points are used.
+        n: number of pairs per problem.
+        batch_size: number of problems per batch.
+        seed: seed of the stream, at least 0.
+        outliers: number of outliers, and the share of mismatches among them; no outliers when ``None``. Raw matches
+            have mismatches of their own.
+        num_spares: number of spare points per problem. Its mismatches get the pixels of the spare points in turn: with
+            the protocol's one spare point all mismatches of a problem share a pixel.
         recentre: whether to move the world.
         translation_box: side of the box centred at 0 in which :math:`t^*` is uniform.
         max_angle: the angle of :math:`R^*` is uniform from 0 to this many radians, its axis uniform in direction.
-        dtype: of the batches; everything is drawn in float64 first.
-        device: of the batches; everything is drawn on the CPU first.
+        dtype: dtype of the batches; numbers are drawn in float64 and cast.
+        device: device of the batches; numbers are drawn on the CPU and moved.
 
     Raises:
-        BaseError: for an argument out of range.
+        BaseError: for an argument out of range, or ``outliers`` with *near* or *structured* outliers.
         ValueError: if no image has enough points.
 
     Example:
-        >>> from kornia_pnpnet.data.colmap import View
         >>> world_points = torch.rand(20, 3, dtype=torch.float64) + torch.tensor([0.0, 0.0, 4.0])
         >>> view = View(
         ...     name="a.jpg",
@@ -90,6 +186,11 @@ class SceneProblems:
         self.batch_size = batch_size
         self.seed = seed
         self.outliers = OutlierMix(count=0) if outliers is None else outliers
+        KORNIA_CHECK(
+            self.outliers.near_share == self.outliers.structured_share == 0,
+            "SceneProblems has no near or structured outliers: near_share and structured_share must be 0, got "
+            f"{self.outliers.near_share} and {self.outliers.structured_share}.",
+        )
         self.num_spares = num_spares
         self.recentre = recentre
         self.translation_box = translation_box
@@ -131,11 +232,11 @@ class SceneProblems:
             index: at least 0.
 
         Returns:
-            The problems; points, pixels, intrinsics and pose in ``dtype`` on ``device``. A pair is an inlier if it
-            is one in the scene and was not spoilt.
+            The problems; points, pixels, intrinsics and pose in ``dtype`` on ``device``. A pair is an inlier when it is
+            an inlier of the scene and did not become an outlier.
         """
         generator = batch_generator(self.seed, index)
-        # What depends on the outlier options is drawn last.
+        # Draws that depend on the outlier options come last.
         view = torch.randint(len(self.views), (self.batch_size,), generator=generator)
         rows = _choose(self._counts[view], self.n + self.num_spares, generator) + self._starts[view, None]
         rows, spare_rows = rows[:, : self.n], rows[:, self.n :]  # (B, N), (B, num_spares)
@@ -149,19 +250,12 @@ class SceneProblems:
         else:
             pose = Pose(self._rotation[view], self._translation[view])
             world_points = self._world_points[rows]
-        turn = (draw.mismatch.cumsum(1) - 1) % self.num_spares  # (B, N), read only at mismatches
+        turn = (draw.mismatch.cumsum(1) - 1) % self.num_spares  # (B, N), used at mismatches only
         seen = torch.where(draw.mismatch, spare_rows.gather(1, turn), rows)
         img_points = torch.where(draw.sensing[..., None], anywhere, self._img_points[seen])
-        return Problems(
-            self._cast(world_points),
-            self._cast(img_points),
-            self._cast(self._intrinsics[view]),
-            Pose(self._cast(pose.rotation), self._cast(pose.translation)),
-            (self._inliers[rows] & draw.inliers).to(self.device),
-        )
-
-    def _cast(self, values: Tensor) -> Tensor:
-        return values.to(device=self.device, dtype=self.dtype)
+        inliers = self._inliers[rows] & draw.inliers
+        problems = Problems(world_points, img_points, self._intrinsics[view], pose, inliers)
+        return problems.map(lambda x: x.to(self.device, self.dtype if x.is_floating_point() else x.dtype))
 
 
 def _choose(counts: Tensor, k: int, generator: torch.Generator) -> Tensor:
@@ -171,7 +265,7 @@ def _choose(counts: Tensor, k: int, generator: torch.Generator) -> Tensor:
 
     Args:
         counts: at least k each, shape :math:`(B,)`.
-        k: how many to choose.
+        k: number of choices.
         generator: source of randomness.
 
     Returns:
@@ -180,9 +274,9 @@ def _choose(counts: Tensor, k: int, generator: torch.Generator) -> Tensor:
     draws = uniform((len(counts), k), 0.0, 1.0, generator)
     chosen = torch.empty((len(counts), k), dtype=torch.int64)
     for i in range(k):
-        last = counts - k + i  # the range grows by one each time, so its last element is never taken yet
+        last = counts - k + i  # the range grows by one each time, so that its last element was not chosen before
         candidate = (draws[:, i] * (last + 1)).long().minimum(last)
-        taken = (chosen[:, :i] == candidate[:, None]).any(1)
-        chosen[:, i] = torch.where(taken, last, candidate)
-    # Uniform as a set so far, but late elements sit late: shuffle each row.
+        chosen_before = (chosen[:, :i] == candidate[:, None]).any(1)
+        chosen[:, i] = torch.where(chosen_before, last, candidate)
+    # The set is uniform, its order is not: shuffle each row.
     return chosen.gather(1, uniform((len(counts), k), 0.0, 1.0, generator).argsort(1))

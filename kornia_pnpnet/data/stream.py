@@ -1,26 +1,27 @@
-"""Batches in order, drawn by another process while the caller works on the one before."""
+"""Streams of batches: other processes draw the next batches while the caller works on the current batch."""
 
 from __future__ import annotations
 
+import atexit
 import multiprocessing
 import signal
 from collections.abc import Generator
 from typing import Any, Protocol
 
 import torch
-from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
+from kornia_pnpnet.core.trees import iter_tensors
 from kornia_pnpnet.types import Problems
 
 __all__ = ["ProblemSource", "stream_batches"]
 
-# Batches that each worker is asked for in advance: enough to go on through the pause of a validation.
+# Batches that each worker draws in advance: enough to keep drawing during a validation.
 _AHEAD = 4
 
 
 class ProblemSource(Protocol):
-    """What draws batch ``i``: always the same numbers, and all batches of one shape."""
+    """A source of problems: batch ``i`` always has the same numbers, and all batches have one shape."""
 
     batch_size: int
 
@@ -32,21 +33,22 @@ class ProblemSource(Protocol):
 def stream_batches(source: ProblemSource, start: int, stop: int, workers: int = 0) -> Generator[Problems, None, None]:
     """Yield the batches from ``start`` to ``stop``, excluding ``stop``.
 
-    Close the iterator (or exhaust it) to end the workers. SIGTERM and Ctrl-C, which often reach a whole group of
-    processes, do not end them: what to do then is for the caller to decide.
+    The workers end when the iterator is exhausted, closed or deleted, at the latest with the process. SIGTERM and
+    Ctrl-C, which often reach a whole group of processes, do not end the workers: the caller decides what to do.
 
     Args:
-        source: what to draw from. Where processes are spawned rather than forked it must be possible to pickle it, and
-            the main module must be safe to import.
-        start: the first batch.
-        stop: the one after the last.
-        workers: processes that draw ahead; 0 draws each batch when it is asked for. The numbers are the same.
+        source: the source of the problems. Where processes are spawned rather than forked, the source must be
+            picklable and the main module safe to import.
+        start: number of the first batch.
+        stop: number after the last batch.
+        workers: number of processes that draw ahead; 0 draws each batch when it is requested. The numbers drawn do not
+            depend on the number of workers.
 
     Yields:
-        The problems. With workers they lie in memory that is used again: a batch is gone when the next is asked for.
+        The problems. With workers the memory of a batch is reused when the next batch is requested.
 
     Raises:
-        Exception: what a worker raised, with its traceback in the message.
+        Exception: the error of a worker, with its traceback in the message.
 
     Example:
         >>> from kornia_pnpnet.data import SyntheticProblems
@@ -69,22 +71,26 @@ def stream_batches(source: ProblemSource, start: int, stop: int, workers: int = 
         num_workers=workers,
         prefetch_factor=_AHEAD,
         worker_init_fn=_ignore_signals,
-        generator=torch.Generator(),  # not the global one, whose state is the caller's
-        # In its processes joblib puts a way of its own in place of the default, by which a loader cannot start any.
+        generator=torch.Generator(),  # not the global generator, whose state is the caller's
+        # In joblib's processes the default start method is joblib's own, which a loader cannot use.
         multiprocessing_context=None if multiprocessing.get_start_method() in methods else methods[0],
     )
     indices: Any = iter(loader)
+    # A stream may be left open until the interpreter ends. The workers must end before multiprocessing's own exit waits
+    # for them: it sends one SIGTERM, which they ignore.
+    atexit.register(indices._shutdown_workers)
     try:
         yield from map(slots.read, indices)
     finally:
+        atexit.unregister(indices._shutdown_workers)
         indices._shutdown_workers()  # else they live as long as the traceback of an error that refers to them
 
 
 class _SharedSlots(Dataset[int]):
-    """Draws batch ``i`` into one of some slots in memory that all processes share, so that only ``i`` is sent.
+    """Draws batch ``i`` into a slot of memory that all processes share, so that processes exchange only ``i``.
 
-    Sent as they are, tensors become new shared memory each time, which takes about as long as drawing them. One slot
-    more than batches are asked for in advance keeps the caller's batch from being overwritten.
+    Tensors that are sent become new shared memory each time, which takes about as long as drawing them. There is one
+    slot more than batches drawn in advance, so that the caller's batch is not overwritten.
     """
 
     def __init__(self, source: ProblemSource, example: Problems, slots: int) -> None:
@@ -93,17 +99,13 @@ class _SharedSlots(Dataset[int]):
         self._memory = example.map(lambda x: torch.empty((slots, *x.shape), dtype=x.dtype).share_memory_())
 
     def __getitem__(self, index: int) -> int:
-        for slot, drawn in zip(_tensors(self.read(index)), _tensors(self._source.batch(index)), strict=True):
+        for slot, drawn in zip(iter_tensors(self.read(index)), iter_tensors(self._source.batch(index)), strict=True):
             slot.copy_(drawn)
         return index
 
     def read(self, index: int) -> Problems:
         """The slot of batch ``index``."""
         return self._memory.map(lambda x: x[index % self._slots])
-
-
-def _tensors(problems: Problems) -> tuple[Tensor, ...]:
-    return (*problems[:3], *problems.pose, problems.inliers)
 
 
 def _ignore_signals(_worker: int) -> None:

@@ -1,4 +1,4 @@
-"""Evaluation: solvers on problems into a results file, bounds, operation counts, and figures."""
+"""Evaluation: comparing solvers on sets of problems, bounds, operation counts, and figures."""
 
 from kornia_pnpnet.evaluation.comparison import EvaluationData, SeesTruth, draw_problems, evaluate
 from kornia_pnpnet.evaluation.results import format_table, load_results, row_errors, save_results

@@ -1,29 +1,63 @@
-"""Bounds: what a solver could reach if it knew the wrong pairs, and if it knew the noise as well.
+"""Bounds: the accuracy that a solver could reach if it knew the inliers, or the inliers and the noise.
 
-They are given the answers, so they stand beside the solvers of a comparison and not among them.
+A bound needs the true poses and inliers, so it cannot solve new problems.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
 from kornia.core.check import KORNIA_CHECK
-from torch import Tensor, nn
+from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_numbers
+from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.geometry import transform
-from kornia_pnpnet.refine.lm import RobustWeightedLM
+from kornia_pnpnet.refine import RobustWeightedLM
 from kornia_pnpnet.solver import PnPNet
 from kornia_pnpnet.types import PnPResult, Problems
 
 __all__ = ["KnownInliers", "KnownInliersAndNoise"]
 
-_ITERATIONS = 10  # from the true pose 3 reach the minimum to 7 digits of the cost, 10 to the last
+# From the true pose 3 iterations reach the minimum to 7 digits of the cost, 10 to the last digit of float64.
+_ITERATIONS = 10
 
 
-class KnownInliers(nn.Module):
-    r"""Least squares of the pixels of the true inliers, started from the true pose.
+class _Bound(Configured):
+    """Weighted least squares of the reprojection errors, started from the true pose."""
 
-    The best that a method can do which finds all wrong pairs and then minimises the reprojection error. Source: the
+    def __init__(self, arguments: Mapping[str, Any]) -> None:
+        super().__init__(arguments)
+        self.least_squares = PnPNet(None, RobustWeightedLM(_ITERATIONS, robustness=0.0, learnable=False))
+
+    def pair_weights(self, problems: Problems) -> Tensor:
+        """Return the weight of each pair, shape :math:`(B, N)`."""
+        raise NotImplementedError
+
+    def solve_with_truth(self, problems: Problems) -> PnPResult:
+        r"""Solve problems with the help of their true poses and inliers.
+
+        Args:
+            problems: :math:`B` problems with :math:`N` pairs each.
+
+        Returns:
+            The minimum next to the true pose.
+        """
+        return self.least_squares(
+            problems.world_points,
+            problems.img_points,
+            problems.intrinsics,
+            self.pair_weights(problems),
+            init=problems.pose,
+        )
+
+
+class KnownInliers(_Bound):
+    r"""Least squares of the reprojection errors of the true inliers, started from the true pose.
+
+    This is the best result of a method that finds all inliers and then minimises the reprojection error. Source: the
     protocol's bound *known inliers*.
 
     Example:
@@ -35,43 +69,25 @@ class KnownInliers(nn.Module):
     """
 
     def __init__(self) -> None:
-        super().__init__()
-        self.config: dict[str, float] = {}
-        self.least_squares = PnPNet(None, RobustWeightedLM(_ITERATIONS, robustness=0.0, learnable=False))
-
-    def extra_repr(self) -> str:
-        """Show the constructor's arguments."""
-        return ", ".join(f"{key}={value!r}" for key, value in self.config.items())
+        super().__init__(locals())
 
     def pair_weights(self, problems: Problems) -> Tensor:
-        """Weigh the pairs of some problems: 1 for an inlier, else 0, shape :math:`(B, N)`."""
+        """Return the weight of each pair, 1 for an inlier and 0 for an outlier, shape :math:`(B, N)`."""
         return problems.inliers.to(problems.world_points.dtype)
 
-    def solve_with_truth(self, problems: Problems) -> PnPResult:
-        r"""Solve problems whose answers are known.
 
-        Args:
-            problems: :math:`B` problems with :math:`N` pairs each.
+class KnownInliersAndNoise(_Bound):
+    r"""Least squares as in :class:`KnownInliers`, with each inlier weighted by the inverse variance of its pixel.
 
-        Returns:
-            The minimum next to the true pose.
-        """
-        world_points, img_points, intrinsics = problems[:3]
-        return self.least_squares(world_points, img_points, intrinsics, self.pair_weights(problems), init=problems.pose)
-
-
-class KnownInliersAndNoise(KnownInliers):
-    r"""The same with each pair weighted by the inverse variance of its pixel.
-
-    Noise of a world point moves its pixel the more the nearer it is. With :math:`J_x` the derivative of the pixel by
-    the point at the true pose, the weight is
+    The noise of a world point moves the pixels of near points more than those of far points. With :math:`J_x` the
+    derivative of the pixel by the point at the true pose, the weight is
     :math:`1 / (\sigma_\mathrm{img}^2 + \sigma_\mathrm{world}^2\,\mathrm{tr}(J_x J_x^\top) / 2)`. Source: the
     protocol's bound *known inliers and noise*.
 
     Args:
-        img_sigma: standard deviation of each pixel coordinate in pixels; the default is the protocol's.
-        world_sigma: standard deviation of each world coordinate in the unit of the world; the default is the
-            protocol's, for scenes it has to be known.
+        img_sigma: standard deviation of each pixel coordinate, in pixels. The default is the protocol's.
+        world_sigma: standard deviation of each world coordinate, in the unit of the world. The default is that of the
+            protocol's synthetic data; a scene has its own.
 
     Raises:
         BaseError: for a standard deviation that is negative or not finite, or when both are 0.
@@ -84,23 +100,24 @@ class KnownInliersAndNoise(KnownInliers):
     """
 
     def __init__(self, *, img_sigma: float = 1.0, world_sigma: float = 0.05) -> None:
-        super().__init__()
+        super().__init__(locals())
         check_numbers(0.0, img_sigma=img_sigma, world_sigma=world_sigma)
         KORNIA_CHECK(img_sigma + world_sigma > 0, "img_sigma and world_sigma must not both be 0.")
-        self.config = {"img_sigma": img_sigma, "world_sigma": world_sigma}
+        self.img_sigma = img_sigma
+        self.world_sigma = world_sigma
 
     @torch.no_grad()
     def pair_weights(self, problems: Problems) -> Tensor:
-        """Weigh the pairs of some problems by the variance of their pixels, 0 for outliers, shape :math:`(B, N)`.
+        """Return the weight of each pair, its inverse variance in 1/px² or 0 for an outlier, shape :math:`(B, N)`.
 
-        The weights have no gradient: one of a point that is NaN would reach all others.
+        The weights carry no gradient, because the gradient of a NaN point would reach all other points.
         """
         cam_points = transform(problems.pose, problems.world_points)  # (B, N, 3)
         depth = cam_points[..., 2:]
-        depth = torch.where(depth > 0, depth, 1.0)  # pairs behind the camera do not count anyway
+        depth = torch.where(depth > 0, depth, 1.0)  # pairs behind the camera have no weight in the solver
         plane_points = cam_points[..., :2] / depth
         focal = problems.intrinsics.diagonal(dim1=-2, dim2=-1)[:, None, :2]
-        # J_x = (f / z) [1, 0, -p; 0, 1, -q] R, and the rotation drops out of the trace.
+        # J_x = (f / z) [1, 0, -p; 0, 1, -q] R; the rotation cancels in the trace.
         trace = ((focal / depth).square() * (1.0 + plane_points.square())).sum(-1)  # (B, N)
-        variance = self.config["img_sigma"] ** 2 + self.config["world_sigma"] ** 2 * trace / 2.0
+        variance = self.img_sigma**2 + self.world_sigma**2 * trace / 2.0
         return torch.where(problems.inliers, variance.reciprocal(), 0.0)

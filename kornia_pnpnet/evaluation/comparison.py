@@ -1,13 +1,12 @@
-"""Solvers on problems: every solver on the same ones, into one results file that tables and figures read."""
+"""Comparing solvers: every solver solves the same problems, and one results file holds the errors and times."""
 
 from __future__ import annotations
 
-import hashlib
 import math
 import statistics
 import sys
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -16,44 +15,29 @@ from kornia.core.exceptions import ShapeError
 from torch import Tensor, nn
 
 from kornia_pnpnet.core.environment import environment
-from kornia_pnpnet.evaluation.results import (
-    FORMAT,
-    format_table,
-    load_results,
-    resume,
-    row_errors,
-    save_results,
-    source_digest,
-)
+from kornia_pnpnet.core.files import digest
+from kornia_pnpnet.core.trees import iter_tensors, map_tensors
+from kornia_pnpnet.evaluation.results import FORMAT, resume, save_results, source_digest
 from kornia_pnpnet.metrics import PoseErrors, pose_errors, success, success_rate
 from kornia_pnpnet.solver import PnPNet
 from kornia_pnpnet.types import PnPResult, Pose, Problems
 
-__all__ = [
-    "EvaluationData",
-    "SeesTruth",
-    "draw_problems",
-    "evaluate",
-    "format_table",
-    "load_results",
-    "row_errors",
-    "save_results",
-]
+__all__ = ["EvaluationData", "SeesTruth", "draw_problems", "evaluate"]
 
 _QUARTILES = {"q25": 0.25, "median": 0.5, "q75": 0.75}
-# What a row was made on and may differ from that of other rows; what it was made with may not.
+# Entries of the environment that may differ between the rows of a file. Versions may not.
 _MACHINE = ("python", "platform", "cpu", "threads", "gpu", "commit")
 
 
 class EvaluationData(NamedTuple):
-    """Problems and what counts as solving them.
+    """A set of problems and the limits of a success.
 
     Attributes:
         problems: a batch of any size.
-        max_rotation_deg: a success has a smaller rotation error, in degrees.
-        max_translation: a success has a smaller translation error, in the unit of the world.
+        max_rotation_deg: the rotation error of a success is below this limit, in degrees.
+        max_translation: the translation error of a success is below this limit, in the unit of the world.
         unit: the unit of the world, for axis labels.
-        description: where the problems come from, as plain data for the results file.
+        description: the origin of the problems, as plain data for the results file.
     """
 
     problems: Problems
@@ -64,7 +48,7 @@ class EvaluationData(NamedTuple):
 
 
 class _Source(Protocol):
-    """What :func:`draw_problems` needs of a data source."""
+    """A data source for :func:`draw_problems`."""
 
     def batch(self, index: int) -> Problems:
         """Draw batch ``index``."""
@@ -73,10 +57,10 @@ class _Source(Protocol):
 
 @runtime_checkable
 class SeesTruth(Protocol):
-    """A bound: a module that :func:`evaluate` gives the answers along with the problems."""
+    """A bound: a module to which :func:`evaluate` passes the true poses and inliers."""
 
     def solve_with_truth(self, problems: Problems) -> PnPResult:
-        """Solve problems whose answers are known."""
+        """Solve problems with the help of their true poses and inliers."""
         ...
 
 
@@ -85,11 +69,14 @@ def draw_problems(source: _Source, count: int) -> Problems:
 
     Args:
         source: has ``batch(index)``, for example :class:`~kornia_pnpnet.data.SyntheticProblems`.
-        count: how many problems, at least 1.
+        count: number of problems, at least 1.
 
     Returns:
         ``count`` problems: the source's batches 0, 1, ... one after the other, cut to length. With the same batch
-        size, more problems begin with the fewer ones.
+        size, a smaller count gives the first problems of a larger count.
+
+    Raises:
+        ValueError: when ``count`` is below 1.
 
     Example:
         >>> from kornia_pnpnet.data import SyntheticProblems
@@ -101,9 +88,7 @@ def draw_problems(source: _Source, count: int) -> Problems:
     batches = [source.batch(0)]
     size = len(batches[0].world_points)
     batches += [source.batch(index) for index in range(1, math.ceil(count / size))]
-    fields = zip(*((*batch[:3], *batch.pose, batch.inliers, *batch.sigmas.values()) for batch in batches), strict=True)
-    joined = iter([torch.cat(field)[:count] for field in fields])
-    return batches[0].map(lambda _: next(joined))
+    return map_tensors(lambda *parts: torch.cat(parts)[:count], *batches)
 
 
 def _chunks(problems: Problems, size: int) -> Iterator[Problems]:
@@ -123,33 +108,33 @@ def evaluate(
 ) -> dict[str, Any]:
     """Solve the same problems with every solver.
 
-    A non-finite pose counts as the identity with ``ok=False``. All summaries are computed from the per-problem errors
-    as they are stored, rounded to six digits, so that whoever reads the file finds the same numbers.
+    A pose that is not finite counts as the identity with ``ok=False``. All summaries are computed from the per-problem
+    errors as they are stored, rounded to six digits, so that a reader of the file can reproduce the summaries.
 
-    With a ``path`` the results are on disk after every row, and calling again with the same arguments continues where
-    the file ends: an evaluation that was killed loses the row it was at. More solvers and data sets may be added that
-    way. A file with rows of other code, versions, weights, configurations or problems is refused.
+    With a ``path``, the file is written after every row, and a call with the same arguments continues where the file
+    ends: an evaluation that was killed loses only the unfinished row. The call may add solvers and data sets. A file
+    with rows of other code, versions, weights, configurations or problems is refused.
 
     Args:
         solvers: by name, each called as ``solver(world_points, img_points, intrinsics)`` in evaluation mode, without
-            gradients. One that has ``solve_with_truth`` (see :class:`SeesTruth`) is given the answers as well. A
-            :class:`~kornia_pnpnet.solver.PnPNet` is told the noise where the problems have it
+            gradients. A bound (see :class:`SeesTruth`) also gets the true poses and inliers. A
+            :class:`~kornia_pnpnet.solver.PnPNet` gets the noise level where the problems have it
             (:attr:`~kornia_pnpnet.types.Problems.sigmas`).
-        data: problems by name, on the device and in the dtype to solve them in.
+        data: problems by name. Each set is solved on its own device and in its own dtype.
         path: the results file to write and to continue; none when ``None``.
-        overwrite: start anew, whatever is at ``path``.
+        overwrite: start anew and replace the file at ``path``.
         chunk: problems per call, which bounds the memory.
-        repeats: calls to time at least. The first chunk is solved once before, untimed.
-        progress: show a progress bar; when ``None``, if standard error is a terminal.
+        repeats: number of timed calls, at least. One untimed call on the first chunk comes before.
+        progress: show a progress bar; when ``None``, only if standard error is a terminal.
 
     Returns:
-        Plain data: ``format``, ``environment`` (see :func:`environment`), ``code`` (a digest
-        of the package), ``solvers`` with each one's configuration and a digest of its weights, ``data`` with each set's
-        description, limits and a digest of its problems, and ``rows``, one for each set and solver: ``success`` (rate,
-        low, high, total), quartiles of ``rotation_error_deg`` and ``translation_error``, the share ``ok``,
-        ``us_per_problem`` (median over the timed calls), the ``per_problem`` errors and ok, and what differs from
-        ``environment`` if another machine continued. A solver that refuses the shape of a set (another n than its own)
-        has an entry in ``left_out`` instead: ``data``, ``solver`` and ``reason``.
+        Plain data: ``format``, ``environment`` (see :func:`~kornia_pnpnet.core.environment.environment`), ``code`` (a
+        digest of the package), ``solvers`` with each one's configuration and a digest of its weights, ``data`` with
+        each set's description, limits and a digest of its problems, and ``rows``, one for each set and solver:
+        ``success`` (rate, low, high, total), quartiles of ``rotation_error_deg`` and ``translation_error``, the share
+        ``ok``, ``us_per_problem`` (median over the timed calls), the ``per_problem`` errors and ok, and the differences
+        from ``environment`` when another machine continued the file. A solver that refuses the shape of a set (a
+        network for another n) has an entry in ``left_out`` instead: ``data``, ``solver`` and ``reason``.
 
     Raises:
         ValueError: when ``path`` is not a results file, or one that this evaluation cannot continue.
@@ -183,7 +168,7 @@ def evaluate(
     plan = [(data_name, solver_name) for data_name in data for solver_name in solvers]
     done = {(row["data"], row["solver"]): row for row in results["rows"]}
     if path is not None:
-        save_results(results, path)  # before the work: a file that cannot be written is found out now
+        save_results(results, path)  # fails before the work when the file cannot be written
     hidden = not (sys.stderr.isatty() if progress is None else progress)
     with tqdm(total=len(plan), initial=len(done), disable=hidden, unit="run") as bar:
         for names in plan:
@@ -207,34 +192,21 @@ def evaluate(
     return results
 
 
-def _digest(tensors: Iterable[Tensor]) -> str:
-    """A digest of shapes and values."""
-    digest = hashlib.sha256()
-    for tensor in tensors:
-        digest.update(repr(tuple(tensor.shape)).encode())
-        digest.update(tensor.detach().cpu().flatten().view(torch.uint8).numpy().tobytes())
-    return digest.hexdigest()
-
-
-def _problems_digest(problems: Problems) -> str:
-    # In float32: on another machine the last bits of a float64 may differ.
-    tensors = (*problems[:3], *problems.pose, *problems.sigmas.values())
-    return _digest((*(tensor.float() for tensor in tensors), problems.inliers))
-
-
 def _describe_solver(solver: nn.Module) -> dict[str, Any]:
     config = getattr(solver, "config", None)
     config = config() if callable(config) else config
-    state = {name: value for name, value in solver.state_dict().items() if isinstance(value, Tensor)}
+    state = [value for value in solver.state_dict().values() if isinstance(value, Tensor)]
     return {
         "class": type(solver).__name__,
         "config": config if isinstance(config, dict) else None,
-        "weights": _digest(state.values()) if state else None,
+        "weights": digest(*state) if state else None,
     }
 
 
 def _describe(entry: EvaluationData) -> dict[str, Any]:
     problems = entry.problems
+    # In float32, because the last bits of float64 problems differ between machines.
+    rounded = problems.map(lambda part: part.float() if part.is_floating_point() else part)
     return {
         "description": dict(entry.description),
         "count": len(problems.world_points),
@@ -245,7 +217,7 @@ def _describe(entry: EvaluationData) -> dict[str, Any]:
         "unit": entry.unit,
         "dtype": str(problems.world_points.dtype).removeprefix("torch."),
         "device": problems.world_points.device.type,
-        "digest": _problems_digest(problems),
+        "digest": digest(*iter_tensors(rounded)),
     }
 
 
@@ -274,18 +246,18 @@ def _run(solver: nn.Module, problems: Problems, chunk: int, repeats: int) -> tup
     """Errors and ok of all problems, and the median time per problem in seconds."""
     chunks = list(_chunks(problems, chunk))
     _timed(solver, chunks[0])
-    results, seconds = [], []
+    compared, seconds = [], []
     for part in chunks:
         result, elapsed = _timed(solver, part)
-        results.append(_compare(result, part.pose))
+        compared.append(_compare(result, part.pose))
         seconds.append((len(part.world_points), elapsed / len(part.world_points)))
     while len(seconds) < repeats:
         part = chunks[len(seconds) % len(chunks)]
         seconds.append((len(part.world_points), _timed(solver, part)[1] / len(part.world_points)))
-    # A short last chunk pays the cost of a call for few problems: it does not count beside full ones.
+    # A short last chunk pays the fixed cost of a call for few problems, so only full chunks count.
     full = max(size for size, _ in seconds)
-    rotation, translation, ok = (torch.cat(values) for values in zip(*results, strict=True))
-    return PoseErrors(rotation, translation), ok, statistics.median(time for size, time in seconds if size == full)
+    errors, ok = map_tensors(lambda *parts: torch.cat(parts), *compared)
+    return errors, ok, statistics.median(time for size, time in seconds if size == full)
 
 
 def _timed(solver: nn.Module, problems: Problems) -> tuple[PnPResult, float]:
@@ -296,24 +268,24 @@ def _timed(solver: nn.Module, problems: Problems) -> tuple[PnPResult, float]:
     if isinstance(solver, SeesTruth):
         result = solver.solve_with_truth(problems)
     else:
-        told = problems.sigmas if isinstance(solver, PnPNet) else {}
-        result = solver(problems.world_points, problems.img_points, problems.intrinsics, **told)
+        sigmas = problems.sigmas if isinstance(solver, PnPNet) else {}
+        result = solver(problems.world_points, problems.img_points, problems.intrinsics, **sigmas)
     if on_gpu:
         torch.cuda.synchronize()
     return result, time.perf_counter() - start
 
 
-def _compare(result: PnPResult, truth: Pose) -> tuple[Tensor, Tensor, Tensor]:
-    """Errors in float64 on the CPU, and ok."""
-    rotation, translation, *true = (x.double().cpu() for x in (result.rotation, result.translation, *truth))
-    finite = rotation.isfinite().flatten(1).all(-1) & translation.isfinite().all(-1)
-    rotation = torch.where(finite[:, None, None], rotation, torch.eye(3, dtype=torch.float64))
-    translation = torch.where(finite[:, None], translation, 0.0)
-    return *pose_errors(Pose(rotation, translation), Pose(*true)), result.ok.cpu() & finite
+def _compare(result: PnPResult, truth: Pose) -> tuple[PoseErrors, Tensor]:
+    """Errors in float64, and ok, on the CPU."""
+    pose, true = (map_tensors(lambda part: part.double().cpu(), pose) for pose in (result.pose, truth))
+    finite = pose.rotation.isfinite().flatten(1).all(-1) & pose.translation.isfinite().all(-1)
+    rotation = torch.where(finite[:, None, None], pose.rotation, torch.eye(3, dtype=torch.float64))
+    translation = torch.where(finite[:, None], pose.translation, 0.0)
+    return pose_errors(Pose(rotation, translation), true), result.ok.cpu() & finite
 
 
 def _rounded(value: float) -> float:
-    """Six significant digits: a results file of 10 000 problems stays small."""
+    """Round to six significant digits, which keeps a results file of 10 000 problems small."""
     return float(f"{value:.6g}")
 
 

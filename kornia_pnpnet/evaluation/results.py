@@ -1,31 +1,18 @@
-"""Results files: written in one piece, continued by the same evaluation, read by tables and figures."""
+"""Results files: their form, continuing an interrupted evaluation, and the table of an evaluation."""
 
 from __future__ import annotations
 
-import hashlib
-import itertools
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NotRequired, TypedDict
 
 import torch
 from torch import Tensor
 
-from kornia_pnpnet.core.files import atomic_open
-from kornia_pnpnet.core.schema import (
-    RATE,
-    is_count,
-    is_mapping_or_none,
-    is_number,
-    is_number_or_none,
-    is_positive,
-    is_share,
-    is_text,
-    is_text_or_none,
-    misfits,
-    read_json,
-)
+from kornia_pnpnet.core.files import atomic_open, digest
+from kornia_pnpnet.core.schema import Count, Positive, Share, from_json, read_json
+from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.metrics import PoseErrors, SuccessRate
 
 __all__ = ["FORMAT", "format_table", "load_results", "resume", "row_errors", "save_results", "source_digest"]
@@ -34,62 +21,95 @@ FORMAT = 1
 _SHOWN_DIFFERENCES = 3
 
 
-# What readers ask of a file, see `misfits`.
-_PER_PROBLEM = {"rotation_error_deg": [is_number], "translation_error": [is_number], "ok": [is_share]}
-_QUARTILES = {"q25": is_number, "median": is_number, "q75": is_number}
-_ROW = {
-    "data": is_text,
-    "solver": is_text,
-    "success": RATE,
-    "rotation_error_deg": _QUARTILES,
-    "translation_error": _QUARTILES,
-    "ok": is_share,
-    "us_per_problem": is_positive,
-    "per_problem?": _PER_PROBLEM,
-}
-_SET = {
-    "description?": is_mapping_or_none,
-    "n": is_count,
-    "max_rotation_deg": is_number,
-    "max_translation": is_number,
-    "unit": is_text,
-}
-_FORMS: dict[str, Any] = {
-    "evaluation": {
-        "environment": {"versions?": {"*": is_text_or_none}, "commit?": is_text_or_none},
-        "solvers": {"*": {"config?": is_mapping_or_none}},
-        "data": {"*": _SET},
-        "rows": [_ROW],
-    },
-    "complexity": {"n": [is_count], "counts": {"*": [is_number_or_none]}, "ransac": [is_text]},
-}
+# The form of results files, as far as a reader relies on it.
+class _Rate(TypedDict):
+    rate: Share
+    low: Share
+    high: Share
+    total: Count
+
+
+class _Quartiles(TypedDict):
+    q25: float
+    median: float
+    q75: float
+
+
+class _PerProblem(TypedDict):
+    rotation_error_deg: list[float]
+    translation_error: list[float]
+    ok: list[Share]
+
+
+class _Row(TypedDict):
+    data: str
+    solver: str
+    success: _Rate
+    rotation_error_deg: _Quartiles
+    translation_error: _Quartiles
+    ok: Share
+    us_per_problem: Positive
+    per_problem: NotRequired[_PerProblem]
+
+
+class _ProblemSet(TypedDict):
+    description: NotRequired[dict[str, Any] | None]
+    n: Count
+    max_rotation_deg: float
+    max_translation: float
+    unit: str
+
+
+class _Solver(TypedDict):
+    config: NotRequired[dict[str, Any] | None]
+
+
+class _Environment(TypedDict):
+    versions: NotRequired[dict[str, str | None]]
+    commit: NotRequired[str | None]
+
+
+class _Evaluation(TypedDict):
+    environment: _Environment
+    solvers: dict[str, _Solver]
+    data: dict[str, _ProblemSet]
+    rows: list[_Row]
+
+
+class _Complexity(TypedDict):
+    n: list[Count]
+    counts: dict[str, list[float | None]]
+    ransac: list[str]
+
+
+_FORMS: dict[str, type] = {"evaluation": _Evaluation, "complexity": _Complexity}
 
 
 def _contradictions(results: Mapping[str, Any]) -> Iterator[str]:
-    """Places of names in rows that no entry has, and of lists that are not as long as the one beside them."""
+    """Describe names in rows that have no entry, and lists of different lengths."""
     for i, row in enumerate(results.get("rows", ())):
         lists = row.get("per_problem", {})
-        if len({len(lists[key]) for key in _PER_PROBLEM if lists}) > 1:
-            yield f"rows[{i}].per_problem"
+        if len({len(lists[key]) for key in _PerProblem.__annotations__ if lists}) > 1:
+            yield f"rows[{i}].per_problem has lists of different lengths"
         for key, names in (("data", "data"), ("solver", "solvers")):
             if row[key] not in results[names]:
-                yield f"rows[{i}].{key}"
+                yield f"rows[{i}].{key} is {row[key]!r}, which {names} does not contain"
 
 
 def row_errors(row: Mapping[str, Any]) -> tuple[PoseErrors, Tensor]:
-    """The per-problem errors of a row of the results.
+    """Read the per-problem errors of a row.
 
     Args:
         row: one of ``results["rows"]``.
 
     Returns:
-        The errors in float64 and ok as bool, each of shape :math:`(B,)`.
+        The errors in float64, and ok as bool, each of shape :math:`(B,)`.
 
     Raises:
-        ValueError: when the row does not have them, as those in the repository do not.
+        ValueError: when the row has no per-problem errors, like the rows of the files in the repository.
     """
     if "per_problem" not in row:
-        raise ValueError(f"The results of '{row['solver']}' on '{row['data']}' are without those of each problem.")
+        raise ValueError(f"The row of '{row['solver']}' on '{row['data']}' has no per-problem errors.")
     errors = row["per_problem"]
     parts = (torch.tensor(errors[name], dtype=torch.float64) for name in PoseErrors._fields)
     return PoseErrors(*parts), torch.tensor(errors["ok"], dtype=torch.bool)
@@ -100,10 +120,11 @@ def save_results(results: Mapping[str, Any], path: str | Path) -> None:
 
     Args:
         results: what :func:`~kornia_pnpnet.evaluation.evaluate` returned.
-        path: where to; folders are made when missing.
+        path: the file; missing folders are made.
 
     Raises:
-        ValueError: when a number is not finite, which JSON does not know.
+        ValueError: when a number is not finite, which JSON cannot express.
+        OSError: when the file cannot be written.
     """
     text = json.dumps(results, separators=(",", ":"), allow_nan=False) + "\n"
     with atomic_open(path, encoding="utf-8") as file:
@@ -114,15 +135,15 @@ def load_results(path: str | Path, *, complexity: bool = False) -> dict[str, Any
     """Read a results file.
 
     Args:
-        path: what :func:`save_results` wrote.
-        complexity: take operation counts, too (:func:`~kornia_pnpnet.evaluation.operations.complexity_results`).
+        path: a file of :func:`save_results`.
+        complexity: also accept operation counts (:func:`~kornia_pnpnet.evaluation.operations.complexity_results`).
 
     Returns:
         The results.
 
     Raises:
         FileNotFoundError: when there is no such file.
-        ValueError: when it is not a results file of this format.
+        ValueError: when the file is not a results file of this format; the message names the first wrong entry.
     """
     results = read_json(path, "a results file")
     if not isinstance(results, dict) or results.get("format") != FORMAT:
@@ -131,37 +152,37 @@ def load_results(path: str | Path, *, complexity: bool = False) -> dict[str, Any
     kind = results.get("kind", "evaluation")
     if kind not in kinds:
         raise ValueError(f"'{path}' is not a results file of {' or '.join(kinds)}.")
-    wrong = next(itertools.chain(misfits(results, _FORMS[kind]), _contradictions(results)), None)
-    if wrong is not None:
-        raise ValueError(f"'{path}' is not a results file of {kind}: {wrong} is missing or not what it has to be.")
+    try:
+        results = from_json(_FORMS[kind], results)
+        for contradiction in _contradictions(results):
+            raise ValueError(contradiction)
+    except ValueError as error:
+        raise ValueError(f"'{path}' is not a results file of {kind}: {error}.") from error
     return results
 
 
 def source_digest() -> str:
-    """A digest of the package's Python files: tells whether rows are of the same code, committed or not."""
+    """Compute a digest of the package's Python files: rows with the same digest come from the same code."""
     root = Path(__file__).resolve().parents[1]
-    digest = hashlib.sha256()
-    for path in sorted(root.rglob("*.py")):
-        content = path.read_bytes()
-        digest.update(f"{path.relative_to(root).as_posix()} {len(content)}\n".encode() + content)
-    return digest.hexdigest()
+    return digest({path.relative_to(root).as_posix(): digest(path.read_bytes()) for path in root.rglob("*.py")})
 
 
 def resume(plan: Mapping[str, Any], path: str | Path) -> dict[str, Any]:
-    """Join a plan with the results file that it continues.
+    """Join the plan of an evaluation with the results file that the evaluation continues.
 
-    It continues a file that was made by the same code and versions, when all solvers and data sets of the file are
-    those of the plan; the plan may have more.
+    A file can be continued by the same code and versions. The plan must have all solvers and data sets of the file,
+    unchanged, and may have more.
 
     Args:
-        plan: results as they are before the first row.
-        path: a results file; nothing is to be continued when there is no file, or no row in it.
+        plan: the results before the first row.
+        path: the results file. It may be missing or have no rows.
 
     Returns:
-        The results of the file with the plan's solvers and data, or the plan.
+        The results of the file with the plan's solvers and data; the plan when there are no rows to continue.
 
     Raises:
-        ValueError: when the file is not a results file, or holds rows of another plan; the message says what differs.
+        ValueError: when the file is not a results file, or holds rows of another plan; the message names the
+            differences.
     """
     fresh: dict[str, Any] = json.loads(json.dumps(plan))  # tuples become lists, as in a file
     there = load_results(path) if Path(path).exists() else fresh
@@ -172,14 +193,14 @@ def resume(plan: Mapping[str, Any], path: str | Path) -> dict[str, Any]:
         shown = "; ".join(differing[:_SHOWN_DIFFERENCES])
         more = f"; and {len(differing) - _SHOWN_DIFFERENCES} more" if len(differing) > _SHOWN_DIFFERENCES else ""
         raise ValueError(
-            f"'{path}' holds another evaluation, which this one cannot continue: {shown}{more}. Take another file, or "
-            "overwrite this one."
+            f"'{path}' holds another evaluation, which this one cannot continue: {shown}{more}. Choose another file, "
+            "or overwrite this one."
         )
     return {**there, "solvers": fresh["solvers"], "data": fresh["data"]}
 
 
 def _differences(there: Mapping[str, Any], plan: Mapping[str, Any]) -> list[str]:
-    """Why rows that are there are not rows of a plan, in words."""
+    """Describe why the rows of a file do not belong to a plan."""
     found = []
     for package, version in plan["environment"]["versions"].items():
         was = there["environment"].get("versions", {}).get(package)
@@ -191,7 +212,7 @@ def _differences(there: Mapping[str, Any], plan: Mapping[str, Any]) -> list[str]
         for name, entry in there[kind].items():
             now = plan[kind].get(name)
             if now is None:
-                found.append(f"{kind}: '{name}' is not asked for")
+                found.append(f"{kind}: '{name}' is not part of this one")
             elif now != entry:
                 keys = [key for key in {**entry, **now} if entry.get(key) != now.get(key)]
                 found.append(f"{kind}: '{name}' has another {', another '.join(keys)}")
@@ -199,12 +220,12 @@ def _differences(there: Mapping[str, Any], plan: Mapping[str, Any]) -> list[str]
 
 
 def _three_digits(value: float) -> str:
-    """Three significant digits, zeros at the end kept: 0.160."""
+    """Format three significant digits, with zeros at the end: 0.160."""
     return f"{value:#.3g}".rstrip(".")
 
 
 def format_table(results: Mapping[str, Any]) -> str:
-    """The results as a Markdown table that also reads well as plain text.
+    """Format the results as a Markdown table that also reads well as plain text.
 
     Args:
         results: what :func:`~kornia_pnpnet.evaluation.evaluate` returned.
@@ -212,11 +233,11 @@ def format_table(results: Mapping[str, Any]) -> str:
     Returns:
         One line for each set and solver: success with its 95 % interval, median errors, time and share of ok.
     """
-    head = ("data", "solver", "success [95 %]", "median rotation error", "median translation error", "µs/problem", "ok")
-    cells = [head]
+    header = ("data", "solver", "success [95 %]", "median rotation error", "median translation error")
+    rows = []
     for row in results["rows"]:
         unit = results["data"][row["data"]]["unit"]
-        cells.append(
+        rows.append(
             (
                 row["data"],
                 row["solver"],
@@ -227,13 +248,4 @@ def format_table(results: Mapping[str, Any]) -> str:
                 f"{100 * row['ok']:.1f} %",
             )
         )
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    left = 2  # the names; numbers are aligned to the right
-    lines = [
-        "| "
-        + " | ".join(c.ljust(w) if i < left else c.rjust(w) for i, (c, w) in enumerate(zip(line, widths, strict=True)))
-        + " |"
-        for line in cells
-    ]
-    rule = "|" + "|".join("-" * (w + 2) if i < left else "-" * (w + 1) + ":" for i, w in enumerate(widths)) + "|"
-    return "\n".join([lines[0], rule, *lines[1:]])
+    return markdown_table((*header, "µs/problem", "ok"), rows, align="llrrrrr", pad=True)

@@ -1,4 +1,8 @@
-"""Initialisers: from normalised correspondences to a first guess of the pose."""
+"""Initialisers: from normalised correspondences to a first guess of the pose.
+
+A new initialiser is one new file here: a module that maps :class:`~kornia_pnpnet.types.Correspondences` to a
+:class:`~kornia_pnpnet.types.Guess`.
+"""
 
 from kornia_pnpnet.init.epnp import EPnP
 from kornia_pnpnet.init.mlp import MLPInit

@@ -1,76 +1,84 @@
-r"""EPPnP and REPPnP: the null space of the projection equations, freed from outliers by the algebraic error alone.
+r"""EPPnP and REPPnP: the null space of the projection equations, with outliers rejected by their algebraic error.
 
-A world point is :math:`p_i = \sum_j a_{ij} c_j` of four control points. In the camera frame these are twelve unknowns,
-and a pair gives two equations, :math:`X_i - u_i Z_i = 0` and :math:`Y_i - v_i Z_i = 0`. What is left of them is the
-algebraic error, the pixel error times the depth over the focal length: a length, which needs no projection.
+A world point is :math:`p_i = \sum_j a_{ij} c_j` with four control points :math:`c_j`. In the camera frame the control
+points are twelve unknowns, and a pair gives two equations, :math:`X_i - u_i Z_i = 0` and :math:`Y_i - v_i Z_i = 0`.
+Their residual is the algebraic error: the pixel error times the depth over the focal length, a length.
 """
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import torch
 from kornia.core.check import KORNIA_CHECK
-from torch import Tensor, nn
+from torch import Tensor
 
+from kornia_pnpnet.core.checks import check_numbers, check_whole
+from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.geometry import retract
 from kornia_pnpnet.init.epnp.control_points import ControlPoints, align, control_points
 from kornia_pnpnet.types import Correspondences, Guess, Pose
 
 __all__ = ["REPPnP"]
 
-# The pairs that are kept whatever their errors. A pair gives 2 equations; the null vector has 11 unknowns, a pose 6:
-# to the fewest that determine them come one and two more, without which no error could show.
-_NULL_FLOOR, _RIGID_FLOOR = 7, 5
+# Number of pairs that are kept at any error with the null vector: 11 unknowns need 6 pairs of 2 equations, and one more
+# pair so that errors show.
+_NULL_FLOOR = 7
+# Number of pairs that are kept at any error with rigid control points: 6 unknowns need 3 pairs, and two more.
+_RIGID_FLOOR = 5
+# Number of pairs below which a problem is not `ok`.
 _MIN_PAIRS = 4
-# Weight of the squared depths of the control points, relative to the centroid's, while outliers are looked for and at
-# last. Anything from 1e-3 to 3e-2 does for the first; the second must stay below what a narrow view sees of depth.
-_DEPTH_PRIOR, _FINAL_DEPTH_PRIOR = 5e-3, 1e-5
+# Weight of the squared depths of the control points relative to the centroid, during outlier rejection. Values from
+# 1e-3 to 3e-2 work equally well on the protocol's problems.
+_DEPTH_PRIOR = 5e-3
+# The same weight for the last null vector: small enough to keep the little depth that a narrow view shows.
+_FINAL_DEPTH_PRIOR = 1e-5
+# Added to 1 minus the leverage: a pair that alone determines an unknown has the leverage 1 and the error 0.
+_LEVERAGE_RIDGE = 1e-6
 
 
-class REPPnP(nn.Module):
-    r"""Null space of the projection equations, algebraic outlier rejection, and the pose of what is left.
+class REPPnP(Configured):
+    r"""Null space of the projection equations, algebraic outlier rejection, and the pose of the remaining pairs.
 
-    All pairs count at first. In each iteration the null vector of the pairs that count is found, and then those
-    count whose algebraic error is at most :math:`\max(Q, \delta_{\max})`, where :math:`Q` is a quantile of the
-    errors. The control points of the last null vector are aligned with those of the world (orthogonal Procrustes).
-    With ``reject_outliers=False`` this is EPPnP.
+    At first all pairs are kept. Each iteration finds the null vector of the kept pairs, and then keeps the pairs whose
+    algebraic error is at most :math:`\max(Q, \delta_{\max})`, where :math:`Q` is a quantile of the errors. The control
+    points of the last null vector are aligned with the control points of the world (orthogonal Procrustes). With
+    ``reject_outliers=False`` the method is EPPnP.
 
     Source: L. Ferraz, X. Binefa and F. Moreno-Noguer, "Very Fast Solution to the PnP Problem with Algebraic Outlier
-    Rejection", CVPR 2014. We depart from it for success on the protocol's problems and for batches:
+    Rejection", CVPR 2014. Our changes are for success on the protocol's problems and for batches:
 
-    - The null vector is the one of least error among those with the centroid at depth 1, not among those of length
-      1. It solves a linear system instead of an eigenproblem, its sign is right, and it does not depend on the
-      choice of the control points, on the frame of the world or on its unit.
-    - While outliers are looked for, the depths of the control points are kept close to the centroid's by a small
-      ridge. That takes away ways to bend to outliers, and where a view is too narrow to show depth it leaves the
-      weak perspective that it does show.
-    - The error that is compared is that of leaving the pair out (of letting it in, for one that is out),
-      :math:`e^\top (1 \mp w H)^{-1} e` with the leverage :math:`H` of the pair. One outlier among few pairs bends the
-      fit to itself, and its plain error is small.
-    - The quantile is the median, not 25 %, and at least 7 pairs are kept: a quarter of 20 pairs does not determine a
-      null vector.
-    - The same loop then goes on with rigid control points, one Gauss-Newton step of their algebraic error per
-      iteration: with 6 unknowns instead of 11, fewer pairs tell who is wrong.
-    - The pose minimises the algebraic error over the rigid motions by Gauss-Newton, which weighs every direction by
-      what it costs. The paper alternates between the span of four null vectors, in which every direction is
-      free, and the rigid control points.
-    - Both loops have a fixed length; the paper's stops when the quantile no longer falls.
+    - The null vector has the least error among the vectors with the centroid at depth 1, instead of the vectors of
+      length 1. It solves a linear system instead of an eigenproblem, has the right sign, and does not depend on the
+      control points, the frame of the world or the unit.
+    - During outlier rejection, a small ridge keeps the depths of the control points close to the depth of the
+      centroid. The fit can then bend less to outliers, and a view too narrow to show depth is fitted by weak
+      perspective.
+    - Pairs are compared by their leave-one-out error, :math:`e^\top (1 \mp w H)^{-1} e` with the leverage :math:`H` of
+      the pair (for a rejected pair, the error when it is added). A single outlier among few pairs bends the fit to
+      itself, so that its plain error is small.
+    - The quantile is the median instead of 25 %, and at least 7 pairs are kept: a quarter of 20 pairs does not
+      determine a null vector.
+    - The same loop then continues with rigid control points and one Gauss-Newton step of their algebraic error per
+      iteration: with 6 unknowns instead of 11, fewer pairs suffice to find the outliers.
+    - The pose minimises the algebraic error over rigid motions by Gauss-Newton, which weighs every direction by its
+      error. The paper alternates between the span of four null vectors, in which no direction has a cost, and the rigid
+      control points.
+    - Both loops have a fixed length; the paper's loop stops when the quantile no longer falls.
 
     Gradients: the selection is piecewise constant, and the last Gauss-Newton steps start from a detached pose. Close to
-    the minimum, what they pass on is the derivative of the minimum.
+    the minimum, their gradient is the derivative of the minimum.
 
     Args:
-        reject_outliers: look for outliers; otherwise all pairs count.
+        reject_outliers: reject outliers; otherwise all pairs are kept.
         max_error: :math:`\delta_{\max}` as a share of the root mean square radius of the world.
-        quantile: the share of the pairs that always counts, in (0, 1].
-        null_iterations: rounds of rejection by the null vector.
-        rigid_iterations: rounds of rejection by rigid control points.
-        refine_iterations: Gauss-Newton steps after the last selection, at least 1.
+        quantile: share of the pairs that is always kept, in (0, 1].
+        null_iterations: number of rejections by the null vector.
+        rigid_iterations: number of rejections by rigid control points.
+        refine_iterations: number of Gauss-Newton steps after the last rejection, at least 1.
 
     Raises:
-        BaseError: for a quantile outside (0, 1], a negative error, or a wrong number of iterations.
+        BaseError: when an argument is out of range.
 
     Example:
         >>> from kornia_pnpnet import Normalize
@@ -92,31 +100,18 @@ class REPPnP(nn.Module):
         rigid_iterations: int = 4,
         refine_iterations: int = 3,
     ) -> None:
-        super().__init__()
+        super().__init__(locals())
         KORNIA_CHECK(0.0 < quantile <= 1.0, f"quantile must lie in (0, 1], got {quantile}.")
-        KORNIA_CHECK(0.0 <= max_error < math.inf, f"max_error must be finite and at least 0, got {max_error}.")
         KORNIA_CHECK(type(reject_outliers) is bool, f"reject_outliers must be true or false, got {reject_outliers!r}.")
-        self.config = {
-            "reject_outliers": reject_outliers,
-            "max_error": max_error,
-            "quantile": quantile,
-            "null_iterations": null_iterations,
-            "rigid_iterations": rigid_iterations,
-            "refine_iterations": refine_iterations,
-        }
-        for name, least in (("null_iterations", 0), ("rigid_iterations", 0), ("refine_iterations", 1)):
-            count = self.config[name]
-            KORNIA_CHECK(type(count) is int and count >= least, f"{name} must be an integer >= {least}, got {count!r}.")
+        check_numbers(0.0, max_error=max_error)
+        check_whole(0, null_iterations=null_iterations, rigid_iterations=rigid_iterations)
+        check_whole(1, refine_iterations=refine_iterations)
         self.reject_outliers = reject_outliers
         self.max_error = max_error
         self.quantile = quantile
         self.null_iterations = null_iterations
         self.rigid_iterations = rigid_iterations
         self.refine_iterations = refine_iterations
-
-    def extra_repr(self) -> str:
-        """Show the constructor's arguments."""
-        return ", ".join(f"{key}={value!r}" for key, value in self.config.items())
 
     def forward(self, corr: Correspondences) -> Guess:
         r"""Guess the pose and the inliers.
@@ -125,9 +120,9 @@ class REPPnP(nn.Module):
             corr: normalised correspondences, with any frame and unit of the world.
 
         Returns:
-            The pose; as weights 1 for the pairs that count and 0 for the others; and ``ok``, false for fewer than 4
-            pairs, for points on a line, for equations that do not determine a pose, and for a pose that has the
-            centroid of the points behind the camera.
+            The pose; as weights 1 for the kept pairs and 0 for the outliers; and ``ok``, false for fewer than 4 pairs,
+            for points on a line, for equations that do not determine a pose, and for a pose with the centroid of the
+            points behind the camera.
         """
         with torch.no_grad():
             control = control_points(corr)
@@ -145,7 +140,7 @@ class REPPnP(nn.Module):
         return Guess(pose, kept.to(corr.weights.dtype), ok)
 
     def _select(self, pairs: _Pairs) -> tuple[Tensor, Pose]:
-        """The pairs that count, bool (B, N), and a pose that fits them, in the pairs' own frame."""
+        """The kept pairs, bool (B, N), and a pose that fits these pairs, in the frame of :class:`_Pairs`."""
         kept = pairs.there
         features = _features(pairs)
         if self.reject_outliers:
@@ -163,7 +158,7 @@ class REPPnP(nn.Module):
         return kept, pose
 
     def _keep(self, pairs: _Pairs, sq_error: Tensor, floor: int) -> Tensor:
-        """The pairs whose error is at most the larger of the quantile and the limit, bool (B, N)."""
+        """The pairs whose error is at most the larger of quantile and limit, at least ``floor`` pairs; bool (B, N)."""
         rank = (self.quantile * pairs.there.sum(-1, keepdim=True)).ceil().long().clamp(min=floor)  # (B, 1)
         rank = rank.clamp(max=sq_error.shape[-1]) - 1
         ascending = torch.where(pairs.there, sq_error, torch.inf).sort(-1).values
@@ -171,9 +166,9 @@ class REPPnP(nn.Module):
 
 
 class _Pairs(NamedTuple):
-    """The pairs in a world of their own, with the centroid 0 and the root mean square radius 1."""
+    """The pairs in a world whose centroid is 0 and whose root mean square radius is 1."""
 
-    coordinates: Tensor  # a, of the control points, (B, 4, N)
+    coordinates: Tensor  # a, see ControlPoints, (B, 4, N)
     world: Tensor  # (B, 3, N)
     u: Tensor  # pixel over focal length, (B, N)
     v: Tensor
@@ -184,21 +179,21 @@ class _Pairs(NamedTuple):
 
 
 class _Null(NamedTuple):
-    """The null vector, and what the leverage of a pair is made of."""
+    """The null vector, and the matrices from which leverages are computed."""
 
     control: Tensor  # control points in the camera frame, sheared by (x - mean_u z, y - mean_v z, z), (B, 4, 3)
-    solution: Tensor  # T, with T_x z and T_y z the best x and y for the depths z, (B, 4, 8)
+    solution: Tensor  # (T_x, T_y): T_x z and T_y z are the best x and y for the depths z, (B, 4, 8)
     inverse_gram: Tensor  # (B, 4, 4)
-    inverse_depths: Tensor  # inverse of the normal matrix of the depths but the centroid's, (B, 3, 3)
+    inverse_depths: Tensor  # inverse normal matrix of the depths of the control vectors, (B, 3, 3)
 
 
 def _own_frame(corr: Correspondences, control: ControlPoints) -> tuple[_Pairs, Tensor]:
-    """The pairs in their own frame, and the root mean square radius (B,) that became 1."""
+    """The pairs in the frame of :class:`_Pairs`, and the root mean square radius (B,) before."""
     mean_square = control.points[:, 1:].square().sum((1, 2))
     radius = torch.where(control.ok, mean_square, 1.0).sqrt()
     world = (corr.world_points.mT - control.points[:, 0, :, None]) / radius[:, None, None]
     u, v = (corr.img_points / corr.focal).unbind(-1)
-    # The frame is not differentiated: the pose does not depend on it, nor on a common factor of the weights.
+    # No gradient through the frame and the sum of weights: the pose depends on neither.
     total = corr.weights.detach().sum(-1, keepdim=True)
     weights = corr.weights / torch.where(total > 0, total, 1.0)
     mean_u, mean_v = ((control.weights * x).sum(-1, keepdim=True) for x in (u, v))
@@ -207,14 +202,14 @@ def _own_frame(corr: Correspondences, control: ControlPoints) -> tuple[_Pairs, T
 
 
 def _features(pairs: _Pairs) -> Tensor:
-    """The right factors a, u a, v a, (u² + v²) a of the products that the normal matrix sums, (B, 16, N)."""
+    """The right factors a, u a, v a, (u² + v²) a of the products in the normal matrix, (B, 16, N)."""
     a = pairs.coordinates
     u, v = (pairs.u - pairs.mean_u)[:, None], (pairs.v - pairs.mean_v)[:, None]
     return torch.cat((a, u * a, v * a, (u * u + v * v) * a), 1)
 
 
 def _inverse(matrix: Tensor, ridge: float = 0.0) -> Tensor:
-    """Inverse of positive semi-definite matrices; what they do not determine is small instead of infinite."""
+    """Inverse of positive semi-definite matrices plus a ridge, which keeps singular matrices finite."""
     ridge = ridge + 32.0 * torch.finfo(matrix.dtype).eps
     eye = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
     return torch.linalg.inv_ex(matrix + ridge * eye).inverse
@@ -223,8 +218,8 @@ def _inverse(matrix: Tensor, ridge: float = 0.0) -> Tensor:
 def _null_vector(pairs: _Pairs, features: Tensor, kept: Tensor, depth_prior: float) -> _Null:
     r"""Control points in the camera frame with the centroid at depth 1 and the least algebraic error.
 
-    With the pixels relative to their mean, a shear of the camera frame that changes no error but keeps the digits of
-    a narrow view, the normal matrix is :math:`[[A, 0, -U], [0, A, -V], [-U, -V, Q]]`: sums of :math:`a a^\top`,
+    The pixels are relative to their mean: a shear of the camera frame that changes no error but keeps the digits of a
+    narrow view. The normal matrix is then :math:`[[A, 0, -U], [0, A, -V], [-U, -V, Q]]`: sums of :math:`a a^\top`,
     :math:`u a a^\top`, :math:`v a a^\top` and :math:`(u^2 + v^2) a a^\top`. Eliminating x and y as :math:`A^{-1} U z`
     and :math:`A^{-1} V z` leaves :math:`Q - U A^{-1} U - V A^{-1} V` for the depths z.
     """
@@ -241,11 +236,11 @@ def _null_vector(pairs: _Pairs, features: Tensor, kept: Tensor, depth_prior: flo
 
 
 def _null_error(pairs: _Pairs, features: Tensor, null: _Null, kept: Tensor) -> Tensor:
-    """Squared errors of leaving pairs out, relative to the size of the null vector, (B, N)."""
+    """Squared leave-one-out errors of the null vector, relative to its size, (B, N)."""
     a = pairs.coordinates
     moved = torch.cat((null.solution, null.inverse_gram), -1).mT @ a  # (B, 12, N)
-    from_xy = (moved[:, 8:] * a).sum(1)  # the leverage that x alone and y alone give
-    # The equations once x and y are eliminated, in the depth of the centroid and in the other depths.
+    from_xy = (moved[:, 8:] * a).sum(1)  # the leverage by x alone, and by y alone
+    # The equations without x and y: coefficients of the depth of the centroid, and of the other depths.
     first = torch.cat((moved[:, 0] - features[:, 4], moved[:, 4] - features[:, 8]), -1)  # (B, 2N)
     rows = torch.cat((moved[:, 1:4] - features[:, 5:8], moved[:, 5:8] - features[:, 9:12]), -1)  # (B, 3, 2N)
     residual = first + (null.control[:, None, 1:, 2] @ rows)[:, 0]
@@ -256,7 +251,7 @@ def _null_error(pairs: _Pairs, features: Tensor, null: _Null, kept: Tensor) -> T
 
 
 def _aligned(pairs: _Pairs, null: _Null, kept: Tensor) -> Pose:
-    """The rigid motion that fits the null vector best."""
+    """The rigid motion that fits the null vector best, by alignment of the points."""
     x, y, z = null.control.unbind(-1)
     control = torch.stack((x + pairs.mean_u * z, y + pairs.mean_v * z, z), -1)  # (B, 4, 3)
     cam_points = pairs.coordinates.mT @ control
@@ -266,7 +261,7 @@ def _aligned(pairs: _Pairs, null: _Null, kept: Tensor) -> Pose:
 
 
 def _linearize(pairs: _Pairs, pose: Pose) -> Tensor:
-    """Jacobian of the algebraic errors by the tangent of ``retract``, and below it the errors, (B, 7, 2N)."""
+    """Jacobian of the algebraic errors by the tangent of ``retract``; the last row holds the errors, (B, 7, 2N)."""
     u, v = pairs.u, pairs.v
     rotated = pose.rotation @ pairs.world
     x, y, z = rotated.unbind(1)  # (B, N) each
@@ -288,18 +283,18 @@ def _linearize(pairs: _Pairs, pose: Pose) -> Tensor:
 
 
 def _normal_matrix(rows: Tensor, weights: Tensor, kept: Tensor) -> Tensor:
-    """Normal matrix of the pairs that count and, as its last column, the gradient, (B, 6, 7)."""
+    """Normal matrix of the kept pairs; the last column holds the gradient, (B, 6, 7)."""
     weights = torch.where(kept, weights, 0.0)
     return (rows[:, :6] * torch.cat((weights, weights), -1)[:, None]) @ rows.mT
 
 
 def _step(pose: Pose, normal: Tensor) -> Pose:
-    """One Gauss-Newton step."""
+    """Take one Gauss-Newton step."""
     return retract(pose, -(_inverse(normal[..., :6]) @ normal[..., 6:])[..., 0])
 
 
 def _rigid_error(pairs: _Pairs, rows: Tensor, normal: Tensor, kept: Tensor) -> Tensor:
-    """Squared errors of leaving pairs out of the linearised rigid problem, (B, N)."""
+    """Squared leave-one-out errors of the linearised rigid problem, (B, N)."""
     jacobian = rows[:, :6]
     return _leave_one_out(rows[:, 6], *_leverage(jacobian, _inverse(normal[..., :6]) @ jacobian), pairs, kept)
 
@@ -312,18 +307,17 @@ def _leverage(jacobian: Tensor, solved: Tensor) -> tuple[Tensor, Tensor, Tensor]
 
 
 def _leave_one_out(residual: Tensor, uu: Tensor, uv: Tensor, vv: Tensor, pairs: _Pairs, kept: Tensor) -> Tensor:
-    r"""How much the cost falls when a pair leaves the fit, or rises when it enters, over its weight, (B, N).
+    r"""Decrease of the cost when a pair leaves the fit, or increase when it enters, over its weight, (B, N).
 
-    It is :math:`e^\top (1 \mp w H)^{-1} e` with the pair's error :math:`e` in (B, 2N) and leverage :math:`H`, minus for
-    the pairs that are in the fit.
+    The value is :math:`e^\top (1 \mp w H)^{-1} e` with the pair's error :math:`e` from ``residual`` (B, 2N) and the
+    entries ``uu``, ``uv``, ``vv`` of its leverage :math:`H`; minus for the kept pairs.
     """
     e_u, e_v = residual.chunk(2, -1)
     weights = torch.where(kept, pairs.weights, -pairs.weights)
-    # What only one pair determines has the leverage 1: its error is 0, and this keeps 0 / 0 away.
-    a = (1.0 + 1e-6) - weights * uu
-    d = (1.0 + 1e-6) - weights * vv
+    a = (1.0 + _LEVERAGE_RIDGE) - weights * uu
+    d = (1.0 + _LEVERAGE_RIDGE) - weights * vv
     b = weights * uv
-    return (d * e_u * e_u + 2.0 * b * e_u * e_v + a * e_v * e_v) / (a * d - b * b).clamp(min=1e-12)
+    return (d * e_u * e_u + 2.0 * b * e_u * e_v + a * e_v * e_v) / (a * d - b * b).clamp(min=_LEVERAGE_RIDGE**2)
 
 
 def _determined(normal: Tensor) -> Tensor:

@@ -1,82 +1,57 @@
-"""A network for any number of pairs in any order, of any world and any camera: poses, weights and noise."""
+"""A network over the set of pairs, for any number, order, world and camera: poses, weights and noise."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import torch
 from kornia.core.check import KORNIA_CHECK
 from torch import Tensor, nn
 from torch.nn import functional
 
-from kornia_pnpnet.core.checks import check_devices
+from kornia_pnpnet.core.checks import check_devices, check_whole
+from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.linalg import dot, small_product
+from kornia_pnpnet.core.performance import take_pairs
 from kornia_pnpnet.geometry import pixel_variance, project
 from kornia_pnpnet.init.epnp.control_points import align
-from kornia_pnpnet.init.ransac.p3p import folded, p3p, unfolded
+from kornia_pnpnet.init.ransac import p3p
 from kornia_pnpnet.types import Correspondences, Guess, Noise, Pose
 
 __all__ = ["SetInit"]
 
-# Ridge of the affine camera, relative to the mean square of the world points: it keeps planes and lines apart.
+# Ridge of the affine camera, relative to the mean square of the world points. It makes the fit unique for planar
+# points.
 _RIDGE = 0.02
-# Features beyond this many times the spread of their kind are cut off: a wild pair need not be wilder.
+# Features are clipped at this many times the spread of their kind, so that a wild pair does not dominate the network.
 _MOST = 8.0
-# Noise is learned as a logarithm about this one, relative to the spread of the pixels and of the world.
+# Centre of the logarithm of the estimated noise, relative to the spread of the pixels and of the world.
 _LOG_NOISE = -5.0
+# Noise of less than this share of the spread counts as this share: scores divide by the variance.
+_LEAST_NOISE = 1e-6
+# Numbers per pair: 3 of the world, 2 of the image, 2 of the residual, 3 of the problem, 2 of the noise, 2 flags.
 _FEATURES = 14
-# Added to the score of a pair that is not there.
+# Added to the score of padding.
 _ABSENT = -1e9
-# Samples of three, by how likely their pairs are to be right. The first six are a Turan system: whichever two of the
-# likeliest six are wrong, one of them has only right ones; no five do that.
+# Minimal samples, as ranks of pairs by likelihood. The first six are a Turán system: whichever two of the six likeliest
+# pairs are outliers, one of the six samples has only inliers. No five samples have this property.
 _SAMPLES = ((0, 1, 2), (0, 1, 3), (2, 3, 4), (2, 3, 5), (0, 4, 5), (1, 4, 5), (0, 2, 3), (1, 2, 3))
-# From so many pairs on as many samples again are spread over so many times as many of the likeliest.
+# From 18, 24 and 30 pairs on, the same samples are drawn again with their ranks multiplied by 3, 4 and 5.
 _SPREADS = {18: 3, 24: 4, 30: 5}
-# And from so many on more: each of the likeliest 25 is in three of them, no two are together twice.
+# From 36 pairs on, 25 further samples: each of the 25 likeliest pairs is in three of them, no two pairs meet twice.
 _RING = {36: [(a, b, c) for i in range(25) for a, b, c in [sorted((i, (i + 1) % 25, (i + 6) % 25))]]}
-# So many of the likeliest pairs say how good the pose of a sample is: squared residuals count to this many variances.
-MOST_JUDGES, _JUDGED = 32, 50.0
-# Somewhat below the most that glibc's threshold follows.
-_LARGEST_KEPT = 2**25 - 2**16
-# The vote of a pair that is surely wrong, of one that is surely right it is 1.
+#: Number of top-ranked pairs that score each hypothesis.
+MOST_JUDGES = 32
+# Variances. Squared residuals of this size halve the score of a pair.
+_JUDGED = 50.0
+# Score of a pair whose likelihood is 0, relative to a pair whose likelihood is 1.
 _LEAST_VOTE = 0.5
 
 
-def _taken(values: Tensor, index: Tensor) -> Tensor:
-    """Some pairs of each problem, (C, K, B) of (B, N, C) by (B, K)."""
-    return values.permute(2, 1, 0).gather(1, index.mT.expand(values.shape[-1], -1, -1))
-
-
-# An operation, for a compiler to lay them out so.
-_taken_whole = torch.library.custom_op("kornia_pnpnet::taken", _taken, mutates_args=())
-
-
-@_taken_whole.register_fake
-def _(values: Tensor, index: Tensor) -> Tensor:
-    return values.new_empty(values.shape[-1], index.shape[1], index.shape[0])
-
-
-@_taken_whole.register_vmap
-def _(info: Any, in_dims: tuple[int | None, int | None], *tensors: Tensor) -> tuple[Tensor, int]:
-    return unfolded(info.batch_size, _taken_whole(*folded(info.batch_size, in_dims, *tensors))), 2
-
-
-def _keep_freed_memory() -> None:
-    """Let glibc keep the memory of large temporaries for the next call.
-
-    Else each call asks the system for it anew, page by page, which takes up to a quarter of the time on a CPU. Memory
-    of the size that was once freed is no longer given back, up to 32 MiB, nor is the twofold of that in all:
-    mallopt(3), M_MMAP_THRESHOLD. These bytes are never touched. Other allocators, and a glibc whose thresholds were
-    set, stay as they are.
-    """
-    torch.empty(_LARGEST_KEPT, dtype=torch.uint8, device="cpu")
-
-
 class _View:
-    r"""Pairs as the network sees them: nothing depends on where world and camera point, or on their units.
+    r"""The network's input: invariant to rotations of world and camera and to their units.
 
-    The camera is turned so that the mean of the rays is its axis, and zoomed until their spread is 1; the world, which
-    comes centred and scaled, is turned to the axes of the affine camera that fits the pairs best (by ridge regression).
+    The camera is rotated so that the mean of the rays is its axis, and zoomed until the spread of the rays is 1. The
+    world, already centred and scaled, is rotated to the axes of the affine camera that fits the pairs best (by ridge
+    regression).
     """
 
     def __init__(self, corr: Correspondences) -> None:
@@ -90,7 +65,7 @@ class _View:
         k = (1.0 + z).reciprocal()
         rows = (1.0 - k * x * x, -k * x * y, -x, -k * x * y, 1.0 - k * y * y, -y, x, y, z)
         self.there = there
-        self.camera = torch.stack(rows, -1).unflatten(-1, (3, 3))  # (B, 3, 3), the least turn that does it
+        self.camera = torch.stack(rows, -1).unflatten(-1, (3, 3))  # (B, 3, 3), the smallest such rotation
         self.rays = rays @ self.camera.mT  # (B, N, 3)
         tiny = 1e-12
         self.spread = ((share * self.rays[..., :2].square()).sum((1, 2)) + tiny).sqrt()  # (B,)
@@ -112,29 +87,29 @@ class _View:
         self.features = torch.cat(parts, -1).clamp(-_MOST, _MOST)
 
     def _known(self, corr: Correspondences) -> list[tuple[Tensor, Tensor]]:
-        """Logarithms of the noise of pixels and world relative to their spread, and whether it is known."""
+        """Logarithms of the noise of pixels and of points relative to their spread, and whether the noise is known."""
         if corr.noise is None:
             no = torch.zeros_like(corr.weights, dtype=torch.bool)
             return [(torch.zeros_like(corr.weights), no)] * 2
         units = corr.focal * self.spread[:, None], torch.ones_like(self.spread[:, None])
         known = [torch.isfinite(x) for x in corr.noise]
         logs = []
-        for values, unit, told in zip(corr.noise, units, known, strict=True):
-            # What is not told is NaN, and would be the gradient of its unit, too.
-            relative = torch.where(told, values, 1.0) / torch.where(told, unit, 1.0)
-            logs.append(relative.clamp(min=1e-6).log())
+        for sigma, unit, is_known in zip(corr.noise, units, known, strict=True):
+            # Unknown sigmas are NaN. Replace them before dividing, or the gradient of the unit becomes NaN.
+            relative = torch.where(is_known, sigma, 1.0) / torch.where(is_known, unit, 1.0)
+            logs.append(relative.clamp(min=_LEAST_NOISE).log())
         return list(zip(logs, known, strict=True))
 
 
 def _solve_symmetric(matrix: Tensor, right: Tensor) -> Tensor:
-    """Solve for positive definite matrices (B, 3, 3) by their cofactors."""
+    """Solve systems with positive definite matrices (B, 3, 3) by cofactors."""
     a, b, c = matrix.unbind(1)
     adjugate = torch.stack((torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)), -1)
     return (adjugate @ right) / (a * adjugate[..., 0]).sum(-1)[:, None, None]
 
 
 def _frame(affine: Tensor) -> Tensor:
-    """The rotation whose first two rows are nearest the rows of affine cameras (B, 2, 3); any where there is none."""
+    """The rotation whose first two rows are nearest the rows of an affine camera (B, 2, 3); any rotation if it is 0."""
     p, q = affine.unbind(1)
     pp, pq, qq = dot(p.unbind(-1), p.unbind(-1)), dot(p.unbind(-1), q.unbind(-1)), dot(q.unbind(-1), q.unbind(-1))
     # The inverse square root of [[pp, pq], [pq, qq]], up to a factor: (S + sqrt(det S) I)^-1.
@@ -158,7 +133,7 @@ def _orthogonal(unit: Tensor) -> Tensor:
 
 
 class _Block(nn.Module):
-    """A residual layer on each pair with what some heads of attention see of all pairs."""
+    """A residual layer on each pair, with a context that attention pools over all pairs."""
 
     def __init__(self, width: int, heads: int, hidden: int) -> None:
         super().__init__()
@@ -173,60 +148,58 @@ class _Block(nn.Module):
             self.out.bias.zero_()
 
     def forward(self, x: Tensor, absent: Tensor) -> Tensor:
-        """From (B, N, width) to the same; ``absent`` is minus infinity, or much, where there is no pair."""
+        """Map (B, N, width) to the same shape; ``absent`` is a large negative number for padding, else 0."""
         width = x.shape[-1]
         y = self.norm(x)
-        # A score for each channel, not for each head: reductions over pairs, of fewer numbers than the processor has
-        # lanes, are compiled to code that waits for all threads at each problem.
+        # A score for each channel, not for each head: a reduction over pairs of fewer numbers than the processor has
+        # lanes compiles to code that synchronises all threads at each problem.
         scores = self.look.weight[width:].repeat_interleave(width // self.heads, 0)
         values, scores = functional.linear(y, torch.cat((self.look.weight[:width], scores))).chunk(2, -1)
         attention = (scores + absent).softmax(1)  # (B, N, width)
-        # Biases go where there is one row for each problem, not one for each pair; that of the scores, which is as much
-        # for all pairs, does not count.
+        # Biases are added where there is one row per problem instead of one per pair. The scores need none: the softmax
+        # over pairs cancels it.
         context = (attention * values).sum(1) + self.look.bias[:width]  # (B, width)
         hidden = functional.linear(y, self.pair.weight) + (self.all(context) + self.pair.bias)[:, None]
         return (x + self.out.bias) + functional.linear(functional.relu(hidden), self.out.weight)
 
 
 def _by_channel(x: Tensor, weight: Tensor) -> Tensor:
-    """A linear map of (B, N, width) to few channels; they lie one after the other in memory, faster for BLAS."""
+    """A linear map of (B, N, width) to few channels, each contiguous in memory, which is faster for BLAS."""
     return (weight @ x.flatten(0, 1).mT).unflatten(1, x.shape[:2]).movedim(0, -1)
 
 
-class SetInit(nn.Module):
+class SetInit(Configured):
     r"""A small network over the set of pairs: several coarse poses, a weight for each pair, and the noise.
 
-    Each pair passes residual layers that see all pairs through attention pooled over them: the cost is linear in their
-    number, and their order does not matter. For each of ``starts`` hypotheses the network then says how far along its
-    ray each point is and how much that counts, and the pose is the rigid motion that brings the world points there
-    (weighted least squares in closed form). So the poses are as equivariant as the network's input is invariant: to
-    similarity transforms of the world, also turns by any angle, and to the choice of the camera's axes but for its
-    roll; intrinsics enter as rays alone. The network runs in the dtype of its weights, what is around it in that of
-    the correspondences.
+    Each pair passes residual layers that see all pairs through pooled attention: the cost is linear in the number of
+    pairs, and their order does not matter. For each of ``starts`` hypotheses the network then predicts the distance of
+    each point along its ray and a weight for it, and the pose is the rigid motion that moves the world points there
+    (weighted least squares in closed form). The poses are equivariant to similarity transforms of the world, rotations
+    by any angle included, and to rotations of the camera except its roll; intrinsics enter through the rays alone. The
+    network runs in the dtype of its weights, everything around it in the dtype of the correspondences.
 
-    The likeliest pairs also make ``samples`` of three, whose poses (see :func:`~kornia_pnpnet.init.p3p`) at most 32 of
-    them judge; of more pairs there are more samples, spread over more of the likeliest. The best one of all is one
-    more hypothesis, a constant without gradient. Its cost is fixed.
+    The likeliest pairs also form ``samples`` minimal samples of three, and more samples where there are more pairs.
+    The poses of the samples (see :func:`~kornia_pnpnet.init.p3p`) are scored by the 32 likeliest pairs, and the best
+    pose is one more hypothesis: a constant without gradient, at a fixed cost.
 
-    A pair weighs as much as it is likely to be right. The noise of pixels and points, which tells
-    the refinement how far pairs may be off, is what ``noise`` of :class:`~kornia_pnpnet.types.Correspondences` says, or
-    the network's estimate where that says nothing.
+    The weight of a pair is the estimated probability that it is an inlier. The noise is the ``noise`` of the
+    :class:`~kornia_pnpnet.types.Correspondences` where known, else the network's estimate.
 
     The design is ours. Distances along rays before a closed-form alignment: J. Hesch and S. Roumeliotis, "A direct
-    least-squares method for PnP", ICCV 2011, among many; attention that is pooled over correspondences: W. Sun et al.,
-    "ACNe: Attentive context normalization for robust permutation-equivariant learning", CVPR 2020. Six samples of six
-    pairs, one right whichever two are wrong: P. Turan's problem for (6, 4, 3), 1941.
+    least-squares method for PnP", ICCV 2011, among many; attention pooled over correspondences: W. Sun et al., "ACNe:
+    Attentive context normalization for robust permutation-equivariant learning", CVPR 2020; six samples of six pairs of
+    which one is free of any two outliers: P. Turán's problem for (6, 4, 3), 1941.
 
     Args:
-        width: channels of each pair.
-        layers: residual layers.
-        heads: of the attention in each.
-        hidden: channels inside a layer.
-        starts: hypotheses of the network, at least 1.
-        samples: of the likeliest six pairs, 0 to 8; as many again from 18, 24 and 30 pairs on.
+        width: number of channels of each pair.
+        layers: number of residual layers.
+        heads: number of attention heads of each layer.
+        hidden: number of channels inside a layer.
+        starts: number of hypotheses of the network, at least 1.
+        samples: number of minimal samples of the six likeliest pairs, 0 to 8; more pairs have more samples.
 
     Raises:
-        BaseError: for numbers out of range, or a width that the heads do not divide.
+        BaseError: for numbers out of range, or when ``heads`` does not divide ``width``.
 
     Example:
         >>> corr = Correspondences(torch.randn(2, 7, 3), torch.randn(2, 7, 2), torch.ones(2, 7), torch.tensor(3400.0))
@@ -235,7 +208,7 @@ class SetInit(nn.Module):
         (torch.Size([2, 3, 3]), torch.Size([2, 3, 3]), torch.Size([2, 7]))
     """
 
-    #: More are solved in several parts where nothing speaks against it: this many stay in the caches of a core.
+    #: Pairs per core whose temporaries stay in its caches. A solver splits larger batches where gradients allow it.
     pairs_at_once = 12_000
 
     def __init__(
@@ -248,22 +221,18 @@ class SetInit(nn.Module):
         starts: int = 2,
         samples: int = 6,
     ) -> None:
-        super().__init__()
-        self.config = {"width": width, "layers": layers, "heads": heads, "hidden": hidden, "starts": starts}
-        for name, value in self.config.items():
-            KORNIA_CHECK(type(value) is int and value >= 1, f"{name} must be an integer of at least 1, got {value!r}.")
-        most = len(_SAMPLES)
-        KORNIA_CHECK(type(samples) is int and 0 <= samples <= most, f"samples must be 0 to {most}, got {samples!r}.")
-        self.config["samples"] = samples
+        super().__init__(locals())
+        check_whole(1, width=width, layers=layers, heads=heads, hidden=hidden, starts=starts)
+        check_whole(0, len(_SAMPLES), samples=samples)
         self.samples = samples
         KORNIA_CHECK(width % heads == 0, f"heads must divide width, got {heads} and {width}.")
         self.starts = starts
         self.first = nn.Linear(_FEATURES, width)
         self.blocks = nn.ModuleList(_Block(width, heads, hidden) for _ in range(layers))
         self.norm = nn.LayerNorm(width)
-        # For each pair: whether it is right; for each hypothesis how much it counts and how far along its ray it is.
+        # Per pair: the logit of being an inlier; per hypothesis a weight and a distance along the ray.
         self.pair = nn.Linear(width, 1 + 2 * starts)
-        # For each problem: how far the world is in each hypothesis; the noise of pixels and points.
+        # Per problem: the distance of the world in each hypothesis; the noise of pixels and of points.
         self.problem = nn.Linear(width, starts + 2)
         with torch.no_grad():
             self.pair.weight *= 0.3
@@ -271,11 +240,6 @@ class SetInit(nn.Module):
             for layer in (self.pair, self.problem):
                 layer.bias.zero_()
             self.pair.bias[0] = 2.0
-        _keep_freed_memory()
-
-    def extra_repr(self) -> str:
-        """Show the constructor's arguments."""
-        return ", ".join(f"{key}={value!r}" for key, value in self.config.items())
 
     def forward(self, corr: Correspondences) -> Guess:
         """Guess poses, weights and noise.
@@ -284,11 +248,11 @@ class SetInit(nn.Module):
             corr: normalised correspondences of a centred and scaled world, of any :math:`N`, in any order.
 
         Returns:
-            The first hypothesis as the pose and the rest as others, that of the samples last; likelihoods as weights;
-            the noise of each pair.
+            The first hypothesis as the pose and the other hypotheses as others, the best sample last; probabilities of
+            being an inlier as weights; the noise of each pair.
 
         Raises:
-            DeviceError: when the correspondences are not where the network is.
+            DeviceError: when the correspondences and the network are on different devices.
         """
         check_devices({"world_points": corr.world_points}, self.pair.bias, "the network")
         view = _View(corr)
@@ -298,7 +262,7 @@ class SetInit(nn.Module):
         right = torch.sigmoid(pair[..., 0])
         counts, along = pair[..., 1:].movedim(-1, 0).unflatten(0, (2, starts)).unbind(0)  # (S, B, N) each
         away, noise = problem.split((starts, 2), -1)
-        # Points are at the distance of the world's centre plus what lies between, so that far worlds keep their relief.
+        # A point's distance is the distance of the world's centre plus an offset, so that far worlds keep their relief.
         distance = (away.clamp(-6.0, 6.0) - view.log_spread[:, None]).exp().mT[..., None]  # (S, B, 1)
         relief = (view.points[..., 2] + 3.0 * along) / distance
         ranges = distance * relief.clamp(-3.0, 3.0).exp()
@@ -321,14 +285,14 @@ class SetInit(nn.Module):
         return Guess(Pose(*(x[:, 0] for x in every)), right, others=others, noise=noises)
 
     def triples(self, count: int) -> dict[int, list[tuple[int, int, int]]]:
-        """The samples of problems of so many pairs.
+        """Minimal samples of a problem.
 
         Args:
             count: number of pairs.
 
         Returns:
-            Places of the pairs of each sample among the likeliest, under the number of pairs from which they are drawn:
-            where the likeliest are wrong together, others are not.
+            Groups of samples, as ranks of pairs by likelihood, by the least number of pairs of a problem that uses the
+            group. Groups that spread over more pairs help where the likeliest pairs are outliers that agree.
         """
         near = [x for x in _SAMPLES[: self.samples] if max(x) < count]
         spread = {least: [(f * i, f * j, f * k) for i, j, k in near] for least, f in _SPREADS.items() if least <= count}
@@ -336,35 +300,34 @@ class SetInit(nn.Module):
 
     @torch.no_grad()
     def _sampled(self, corr: Correspondences, right: Tensor, noise: Noise, fallback: Pose) -> Pose:
-        """The pose that the likeliest pairs agree on most, of those from samples of three of them; problems last."""
+        """The best pose of the minimal samples by the score of the likeliest pairs; problems last."""
         batch, count = right.shape
         there = corr.weights > 0
         chances = torch.where(there, right, 0.0)
-        # What agrees may be right after all; pairs that are not there judge nothing.
+        # An unlikely pair that agrees may be an inlier after all; padding does not score.
         vote = torch.where(there, _LEAST_VOTE + (1.0 - _LEAST_VOTE) * right, 0.0)
         img, world = (x.expand(batch, count)[..., None] for x in noise)
         of_pairs = torch.cat((corr.world_points, corr.img_points, vote[..., None], img, world), -1)  # (B, N, 8)
-        if not isinstance(count, int):  # exported for any number: with as many that do not count as are asked for
+        if not isinstance(count, int):  # exported for any number of pairs: pad to the number of judges
             more = of_pairs[:, :1] * torch.tensor((1, 1, 1, 1, 1, 0, 1, 1), dtype=vote.dtype, device=vote.device)
             of_pairs = torch.cat((of_pairs, more.expand(-1, MOST_JUDGES, -1)), 1)
             chances, count = functional.pad(chances, (0, MOST_JUDGES)), count + MOST_JUDGES
         likely = chances.topk(min(MOST_JUDGES, count)).indices
-        exported = torch.compiler.is_exporting()  # for programs that do not know our operation
-        pairs = (_taken if exported else _taken_whole)(of_pairs, likely)  # (8, K, B)
+        pairs = take_pairs(of_pairs, likely)  # (8, K, B)
         samples = self.triples(count)
         drawn = [sample for group in samples.values() for sample in group]
-        # (6, 3, S B), stacked, not indexed: a compiler then copies whole rows.
+        # (6, 3, S B), stacked, not indexed, so that a compiler copies whole rows.
         three = torch.stack([pairs[:6, k] for column in zip(*drawn, strict=True) for k in column], 1)
         three = three.unflatten(1, (3, len(drawn))).flatten(2)
         pose, valid = p3p(three[:3].permute(2, 1, 0), three[3:5].permute(2, 1, 0) / corr.focal)
-        # Components first, then the four solutions and the samples, problems last: it is how they lie in memory.
+        # Components first, then the four solutions and the samples, problems last: the layout of p3p's results.
         each = len(drawn), batch
         rotation, translation = (x.movedim((0, 1), (-1, -2)).unflatten(-1, each).flatten(-3, -2) for x in pose)
         valid = (valid.mT & (three[5] > 0).all(0)).unflatten(-1, each)  # (4, S, B)
-        if len(samples) > 1:  # by the pairs that are there, so that padding changes nothing
+        if len(samples) > 1:  # by the number of pairs without padding, so that padding changes nothing
             enough = [(there.sum(1) >= least).expand(len(group), -1) for least, group in samples.items()]
             valid = valid & torch.cat(enough)
-        # Hypotheses are what is projected and problems are like points, so that they stay last: (H, K, B, 1).
+        # `project` sees hypotheses as the batch and problems as points, so that problems stay last: (H, K, B, 1).
         every = Pose(rotation.permute(2, 0, 1, 3)[:, :, :, None], translation.permute(1, 0, 2)[:, :, None])
         world, img, vote, *sigmas = (x.permute(1, 2, 0)[..., None, :] for x in pairs.split((3, 2, 1, 1, 1)))
         judges = Correspondences(world, img, vote[..., 0], corr.focal)
@@ -391,7 +354,7 @@ class SetInit(nn.Module):
         return pair, self.problem((share * x).sum(1))
 
     def _noise(self, corr: Correspondences, view: _View, estimate: Tensor) -> Noise:
-        """What is known of the noise, and the network's estimate of the rest."""
+        """The known noise, and the network's estimate where unknown."""
         units = (corr.focal * view.spread)[:, None], torch.ones_like(view.spread)[:, None]
         pairs = []
         for i, ((log, known), unit) in enumerate(zip(view.known, units, strict=True)):

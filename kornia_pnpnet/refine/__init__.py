@@ -1,7 +1,15 @@
-"""Refinement: robust weighted Levenberg-Marquardt, its step, its kernels and its learned parameters."""
+"""Refinement: robust weighted Levenberg-Marquardt.
+
+``lm`` has the module, its stages and its loop; ``step`` one iteration as pure functions; ``kernels`` the robust kernels
+(a new kernel is one entry there); ``parameters`` values that are learned within bounds; ``verdict`` whether a pose is
+to be believed.
+"""
 
 from kornia_pnpnet.refine.kernels import KERNELS, RobustKernel
-from kornia_pnpnet.refine.lm import BoundedParameter, LMStart, LMStep, RobustWeightedLM, explains, lm_step, solve_damped
+from kornia_pnpnet.refine.lm import LMStart, RobustWeightedLM, Stage, State
+from kornia_pnpnet.refine.parameters import BoundedParameter
+from kornia_pnpnet.refine.step import LMStep, lm_step, solve_damped
+from kornia_pnpnet.refine.verdict import explains
 
 __all__ = [
     "KERNELS",
@@ -10,6 +18,8 @@ __all__ = [
     "LMStep",
     "RobustKernel",
     "RobustWeightedLM",
+    "Stage",
+    "State",
     "explains",
     "lm_step",
     "solve_damped",

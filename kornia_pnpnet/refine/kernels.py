@@ -1,4 +1,6 @@
-r"""Robust kernels: how much a pair counts, as a function of its squared residual.
+r"""Robust kernels: the weight of a pair as a function of its squared residual.
+
+A new kernel is one more entry of :data:`KERNELS`.
 
 A kernel is a loss :math:`\rho(s)` of the squared residual :math:`s = \|r\|^2` in square pixels with one *shape*
 parameter, and its derivative :math:`w(s) = \rho'(s)`: iterating weighted least squares with the weight :math:`w`
@@ -17,7 +19,7 @@ from torch import Tensor
 
 __all__ = ["KERNELS", "POWER_FLOOR", "RobustKernel"]
 
-#: Residuals below this many pixels count as this many in ``power``, whose weight would be infinite at 0.
+#: Pixels. Smaller residuals count as this in ``power``, whose weight would be infinite at 0.
 POWER_FLOOR = 0.1
 
 

@@ -1,6 +1,18 @@
-"""Training: the loop, its checkpoints, and the results file and model card of a run."""
+"""Training: the loop, its checkpoints, validation, and the results file and model card of a run."""
 
 from kornia_pnpnet.training.checkpoint import TrainingError
-from kornia_pnpnet.training.loop import FitReport, TrainSettings, describe_shares, fit, train_briefly, validate
+from kornia_pnpnet.training.loop import fit, train_briefly
+from kornia_pnpnet.training.run import FitReport, describe_shares
+from kornia_pnpnet.training.settings import TrainSettings
+from kornia_pnpnet.training.validation import ValidationResult, validate
 
-__all__ = ["FitReport", "TrainSettings", "TrainingError", "describe_shares", "fit", "train_briefly", "validate"]
+__all__ = [
+    "FitReport",
+    "TrainSettings",
+    "TrainingError",
+    "ValidationResult",
+    "describe_shares",
+    "fit",
+    "train_briefly",
+    "validate",
+]

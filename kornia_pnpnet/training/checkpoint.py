@@ -22,6 +22,7 @@ __all__ = [
     "History",
     "StageClock",
     "TrainingError",
+    "leaves",
     "load_checkpoint",
     "save_checkpoint",
     "stop_on_signal",
@@ -161,7 +162,7 @@ def load_checkpoint(path: Path, identity: dict[str, Any]) -> dict[str, Any]:
         saved = state["identity"]
     except Exception as error:  # torch.load raises many types on a damaged file
         raise TrainingError(f"Cannot read the checkpoint {path}: {error}") from error
-    there, now = _leaves(saved), _leaves(identity)
+    there, now = leaves(saved), leaves(identity)
     differing = [key for key in {**there, **now} if there.get(key) != now.get(key)]
     if differing:
         details = "; ".join(f"{key} was {there.get(key)!r} and is {now.get(key)!r}" for key in differing)
@@ -169,7 +170,7 @@ def load_checkpoint(path: Path, identity: dict[str, Any]) -> dict[str, Any]:
     return state
 
 
-def _leaves(value: Any, prefix: str = "") -> dict[str, Any]:
+def leaves(value: Any, prefix: str = "") -> dict[str, Any]:
     """Nested plain data as ``{"a.b.0": leaf}``."""
     if isinstance(value, dict):
         entries = list(value.items())
@@ -177,6 +178,4 @@ def _leaves(value: Any, prefix: str = "") -> dict[str, Any]:
         entries = list(enumerate(value))
     else:
         return {prefix: value}
-    return {
-        k: v for key, entry in entries for k, v in _leaves(entry, f"{prefix}.{key}" if prefix else str(key)).items()
-    }
+    return {k: v for key, entry in entries for k, v in leaves(entry, f"{prefix}.{key}" if prefix else str(key)).items()}

@@ -12,6 +12,7 @@ from kornia_pnpnet.evaluation.figures.curves import plot_against_m, plot_against
 from kornia_pnpnet.evaluation.figures.dots import plot_scenes, plot_success, plot_synthetic
 from kornia_pnpnet.evaluation.figures.errors import plot_errors
 from kornia_pnpnet.evaluation.figures.operations import plot_operations
+from kornia_pnpnet.evaluation.figures.overview import OverviewRow, plot_overview
 from kornia_pnpnet.evaluation.figures.paper import paper_figures
 from kornia_pnpnet.evaluation.figures.problem import plot_pose
 from kornia_pnpnet.evaluation.figures.reliability import plot_reliability
@@ -19,12 +20,14 @@ from kornia_pnpnet.evaluation.figures.sweep import plot_sweep
 from kornia_pnpnet.evaluation.figures.training import plot_training
 
 __all__ = [
+    "OverviewRow",
     "paper_figures",
     "plot_against_m",
     "plot_against_n",
     "plot_errors",
     "plot_mismatches",
     "plot_operations",
+    "plot_overview",
     "plot_pose",
     "plot_reliability",
     "plot_scenes",

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from kornia_pnpnet.evaluation.choices import PRIORS
+from kornia_pnpnet.evaluation.problem_sets import PRIORS
 from kornia_pnpnet.metrics import SuccessRate, success_rate
 
 __all__ = [

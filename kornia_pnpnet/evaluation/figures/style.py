@@ -187,11 +187,11 @@ def head(figure: Figure, *lines: str) -> None:
     figure.suptitle("\n".join(lines), x=0.01, ha="left", fontsize=TITLE, parse_math=False)
 
 
-def save(figure: Figure, path: str | Path) -> Path:
+def save(figure: Figure, path: str | Path, *, dpi: int = _DPI) -> Path:
     """Write the figure, making folders when missing; the path's ending gives the format."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=_DPI)
+    figure.savefig(path, dpi=dpi)
     return path
 
 

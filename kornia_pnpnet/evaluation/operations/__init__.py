@@ -1,33 +1,28 @@
-r"""How many operations a solver needs, as a formula in the number of pairs (figure 1 of the paper).
+r"""Operation counts: how many scalar operations a solver executes for one problem of n pairs (figure 1 of the paper).
 
-A solver runs *parts*, functions of this package, each with some sizes: :func:`part_calls` says which and how often,
-:data:`PARTS` how many operations a call takes. Both describe what the batched code
-executes: both sides of a branch are computed, numbers of iterations are fixed. ``tests/test_complexity.py`` holds every
-part of every solver against an instrumented run (:class:`OperationCounter`); they agree to the last operation.
+Every count is measured: :class:`OperationCounter` runs the solver and adds up what each PyTorch operation costs,
+weighted by the table :data:`~kornia_pnpnet.evaluation.operations.costs.OPERATION_COSTS`. The batched code computes both
+sides of a branch and runs a fixed number of iterations, so the counts of all solvers but RANSAC are the same for every
+problem of n pairs.
 
-What RANSAC draws depends on the data. Its formula is exact for a given number of outliers in the sense of its own rule:
-it stops after the first round with as many samples as the rule asks for, and every round finds a better pose, which is
-the most that can happen.
+RANSAC draws samples until its stopping rule is met, so its count depends on the problem. :func:`operation_count` takes
+the mean over 64 problems of the protocol with a given number of outliers and without noise: every inlier then lies
+within the threshold, and RANSAC stops as early as its rule allows. With noise RANSAC draws more samples.
 
 Source: R. Sheffer and A. Wiesel, "PnP-Net: A hybrid Perspective-n-Point Network", 2020, which counts by T. Minka's
-Lightspeed toolbox; :data:`~kornia_pnpnet.evaluation.operations.operations.OPERATION_COSTS` has its costs.
+Lightspeed toolbox.
 """
 
-from kornia_pnpnet.evaluation.operations.calls import part_calls
+from kornia_pnpnet.evaluation.operations.costs import OPERATION_COSTS, Operations
 from kornia_pnpnet.evaluation.operations.counter import OperationCounter, count_per_problem
-from kornia_pnpnet.evaluation.operations.counts import SOLVERS, complexity_results, operation_count, operations_by_part
-from kornia_pnpnet.evaluation.operations.operations import OPERATION_COSTS, Operations
-from kornia_pnpnet.evaluation.operations.parts import PARTS
+from kornia_pnpnet.evaluation.operations.counts import SOLVERS, complexity_results, operation_count
 
 __all__ = [
     "OPERATION_COSTS",
-    "PARTS",
     "SOLVERS",
     "OperationCounter",
     "Operations",
     "complexity_results",
     "count_per_problem",
     "operation_count",
-    "operations_by_part",
-    "part_calls",
 ]

@@ -1,25 +1,16 @@
-"""Counts scalar operations by running the code: the instrument that the formulas are held against."""
+"""Count scalar operations by running the code."""
 
 from __future__ import annotations
 
 import math
-import sys
-from collections.abc import Callable, Collection
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from kornia_pnpnet.evaluation.operations.operations import (
-    Operations,
-    cholesky,
-    matmul,
-    smallest,
-    solve,
-    sort,
-)
+from kornia_pnpnet.evaluation.operations.costs import Operations, cholesky, matmul, smallest, solve, sort
 
 __all__ = ["OperationCounter", "count_per_problem"]
 
@@ -32,13 +23,14 @@ def _each(names: str, operations: Operations) -> dict[str, Operations]:
     return dict.fromkeys(names.split(), operations)
 
 
-#: Operations for each entry of the result. The first ones move, make or view data, change signs or draw at random.
+# Operations for each entry of the result. The first rows only create, move or view data, change signs or draw random
+# numbers, which costs nothing.
 _ELEMENTWISE: dict[str, Operations] = {
     **_each("_to_copy _unsafe_view alias arange cat clone constant_pad_nd copy detach diag_embed", _NOTHING),
     **_each("diagonal empty empty_like expand eye fill flip full full_like gather index index_put", _NOTHING),
     **_each("index_select lift_fresh masked_select neg new_empty new_full new_ones new_zeros nonzero", _NOTHING),
     **_each("ones ones_like permute promote_types rand randperm repeat scalar_tensor scatter select", _NOTHING),
-    **_each("slice split split_with_sizes squeeze stack t taken transpose unbind unsqueeze view zero", _NOTHING),
+    **_each("slice split split_with_sizes squeeze stack t take_pairs transpose unbind unsqueeze view zero", _NOTHING),
     **_each("zeros zeros_like", _NOTHING),
     **_each("add rsub sub", _ADD),
     **_each("mul", _MULTIPLY),
@@ -56,7 +48,7 @@ _ELEMENTWISE: dict[str, Operations] = {
     **_each("bitwise_and bitwise_not bitwise_or masked_fill where", _LOGIC),
 }
 
-#: Operations for each entry that a reduction takes in beyond the first of each result.
+# Operations for each input entry of a reduction, except for the first entry of each result.
 _REDUCTIONS: dict[str, Operations] = {
     **_each("cumsum sum", _ADD),
     **_each("prod", _MULTIPLY),
@@ -64,16 +56,16 @@ _REDUCTIONS: dict[str, Operations] = {
     **_each("all any", _LOGIC),
 }
 
-#: Operations for a row, from its length: what is taken out of it, and what is done to each entry.
+# Operations for one row, by its length.
 _ROWS: dict[str, Callable[[int], Operations]] = {
     "linalg_vector_norm": lambda length: Operations(add=length - 1, multiply=length, sqrt=1),
-    # Minus the largest, exponentials by their sum.
+    # Subtract the maximum, divide the exponentials by their sum.
     "_softmax": lambda length: Operations(add=2 * length - 1, divide=length, exp=length, compare=length - 1),
-    # Minus the mean, by the root of the variance and a small number; weight and bias.
+    # Subtract the mean, divide by the root of variance plus epsilon, apply weight and bias.
     "native_layer_norm": lambda length: Operations(add=4 * length - 1, multiply=3 * length, divide=3, sqrt=1),
 }
 
-#: Operations for one matrix of the batch, from the sizes of the matrices that come in.
+# Operations for one matrix of the batch, by the shapes of the input matrices.
 _MATRIX: dict[str, Callable[..., Operations]] = {
     "mm": lambda first, second: matmul(first[0], first[1], second[1]),
     "bmm": lambda first, second: matmul(first[0], first[1], second[1]),
@@ -84,7 +76,7 @@ _MATRIX: dict[str, Callable[..., Operations]] = {
 
 
 def _power(exponent: Any) -> Operations:
-    """Raising to a power (``flops_pow``): by products and a root where that does it."""
+    """Cost of a power (``flops_pow``): products and a root for a multiple of 1/2, else exponential and logarithm."""
     if isinstance(exponent, Tensor) or not float(2 * exponent).is_integer():
         return _EXP + _LOG + _MULTIPLY
     whole, half = divmod(abs(exponent), 1)
@@ -94,7 +86,7 @@ def _power(exponent: Any) -> Operations:
 
 
 def _operations(name: str, call: dict[str, Any], output: Any) -> Operations:
-    """Operations of one call of PyTorch's operation of that name."""
+    """Operations of one call of the PyTorch operation ``aten.<name>`` with the given arguments and output."""
     result = output[0] if isinstance(output, tuple | list) else output
     if name in _ELEMENTWISE:
         cost = _ELEMENTWISE[name]
@@ -120,11 +112,11 @@ def _operations(name: str, call: dict[str, Any], output: Any) -> Operations:
         if name == "sort":
             return rows * sort(length)
         return rows * (smallest(length, call["k"]) + (sort(call["k"]) if call["sorted"] else _NOTHING))
-    raise NotImplementedError(f"What aten.{name} costs is unknown: say so in {__name__}.")
+    raise NotImplementedError(f"The cost of aten.{name} is unknown. Add the cost to {__name__}.")
 
 
 def _rows(call: dict[str, Any]) -> tuple[int, int]:
-    """How many entries an operation on rows takes in, and how many of them are one row."""
+    """Number of input entries of an operation on rows, and the length of one row."""
     tensor = next(value for value in call.values() if isinstance(value, Tensor))
     if "normalized_shape" in call:
         return tensor.numel(), math.prod(call["normalized_shape"])
@@ -132,84 +124,59 @@ def _rows(call: dict[str, Any]) -> tuple[int, int]:
     return tensor.numel(), math.prod(tensor.shape[dim] for dim in dims)
 
 
-# --- the instrument ---------------------------------------------------------------------------------------------------
-
-_PACKAGE = str(Path(__file__).parents[2])
-
-
 class OperationCounter(TorchDispatchMode):
     """Count the operations of the tensor code that runs inside a ``with`` block.
 
-    Args:
-        parts: functions to tell apart, as ``module.qualified_name`` below this package, for example
-            ``"lm.lm_step"``. An operation counts for the innermost of them that is running, else for ``""``.
-
     Attributes:
-        counts: the :class:`Operations` of each part.
+        operations: the :class:`Operations` so far.
 
     Raises:
-        NotImplementedError: for an operation of PyTorch whose cost is not known: none is lost in silence.
+        NotImplementedError: for a PyTorch operation whose cost is unknown, so that no operation is missed.
 
     Example:
         >>> with OperationCounter() as counter:
         ...     product = torch.ones(4, 2, 3) @ torch.ones(4, 3, 5)
-        >>> counter.counts[""].multiply, counter.counts[""].add
+        >>> counter.operations.multiply, counter.operations.add
         (120, 80)
     """
 
-    def __init__(self, parts: Collection[str] = ()) -> None:
+    def __init__(self) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
-        self._parts = frozenset(parts)
-        self.counts: dict[str, Operations] = {}
+        self.operations = Operations()
 
     def __torch_dispatch__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
-        """Run one operation and add what it cost."""
+        """Run one operation and add its cost."""
         output = func(*args, **(kwargs or {}))
         names = [argument.name for argument in func._schema.arguments]
         call = {argument.name: argument.default_value for argument in func._schema.arguments}
         call |= dict(zip(names, args, strict=False)) | (kwargs or {})
-        operations = _operations(func.overloadpacket.__name__.rstrip("_"), call, output)
-        if operations != _NOTHING:
-            part = self._part()
-            self.counts[part] = self.counts.get(part, _NOTHING) + operations
+        self.operations += _operations(func.overloadpacket.__name__.rstrip("_"), call, output)
         return output
 
-    def _part(self) -> str:
-        """The innermost running function that is one of the parts."""
-        frame = sys._getframe(2) if self._parts else None
-        while frame is not None:
-            code = frame.f_code
-            if code.co_filename.startswith(_PACKAGE):
-                name = f"{Path(code.co_filename).stem}.{code.co_qualname}"
-                if name in self._parts:
-                    return name
-            frame = frame.f_back
-        return ""
 
+def count_per_problem(run: Callable[[int], object], batch: int = 2) -> Operations:
+    """Count the operations that each further problem of a batch costs.
 
-def count_per_problem(run: Callable[[int], object], parts: Collection[str] = ()) -> dict[str, Operations]:
-    """Operations that each further problem of a batch costs, by parts.
-
-    What is computed once for the whole batch drops out: the difference of a run of four and a run of two is taken.
+    The count is the difference between a run of ``2 * batch`` and a run of ``batch`` problems, divided by ``batch``.
+    Operations that a batch executes once for all problems cancel out.
 
     Args:
         run: solves a batch of the given size.
-        parts: see :class:`OperationCounter`.
+        batch: number of problems in the smaller run.
 
     Returns:
-        The operations for one problem; parts without any are left out.
+        The operations for one problem.
 
     Example:
-        >>> count_per_problem(lambda batch: torch.ones(batch, 5).sum(-1) * torch.ones(3).sum())[""].add
+        >>> count_per_problem(lambda batch: torch.ones(batch, 5).sum(-1) * torch.ones(3).sum()).add
         4.0
     """
-    counters = []
-    for batch in (2, 4):
-        with torch.no_grad(), OperationCounter(parts) as counter:
-            run(batch)
-        counters.append(counter.counts)
-    small, large = counters
-    differences = {part: 0.5 * (count + -1 * small.get(part, _NOTHING)) for part, count in large.items()}
-    return {part: operations for part, operations in differences.items() if operations != _NOTHING}
+    counts = []
+    for size in (batch, 2 * batch):
+        with torch.no_grad(), OperationCounter() as counter:
+            run(size)
+        counts.append(counter.operations)
+    small, large = counts
+    return 1 / batch * (large + -1 * small)

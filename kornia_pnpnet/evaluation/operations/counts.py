@@ -1,23 +1,25 @@
-"""Operation counts of solvers."""
+"""Operation counts of solvers by name, and the results file behind figure 1."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+import torch
 from kornia.core.exceptions import ValueCheckError
 
 from kornia_pnpnet.core.environment import environment
-from kornia_pnpnet.evaluation.choices import load_solver
-from kornia_pnpnet.evaluation.operations.calls import part_calls
-from kornia_pnpnet.evaluation.operations.operations import OPERATION_COSTS, Operations
-from kornia_pnpnet.evaluation.operations.parts import PARTS
-from kornia_pnpnet.init import RANSAC
+from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet.evaluation.named_solvers import load_solver
+from kornia_pnpnet.evaluation.operations.costs import OPERATION_COSTS
+from kornia_pnpnet.evaluation.operations.counter import count_per_problem
+from kornia_pnpnet.evaluation.results import FORMAT
+from kornia_pnpnet.init import RANSAC, MLPInit
 from kornia_pnpnet.solver import PnPNet
 
-__all__ = ["SOLVERS", "complexity_results", "operation_count", "operations_by_part"]
+__all__ = ["SOLVERS", "complexity_results", "operation_count"]
 
-#: The solvers that have a formula, by their names.
+#: The solvers of figure 1. ``net`` and ``pnpnet`` are networks built for each number of pairs.
 SOLVERS = (
     "net",
     "pnpnet",
@@ -31,100 +33,93 @@ SOLVERS = (
     "identity-lm",
 )
 
-# The shipped weights behind the names without n: the count of a network only needs its architecture.
+# Shipped solvers behind the names without n. Their networks are replaced by untrained ones for n pairs: a count depends
+# on the architecture alone.
 _ANY_N = {"net": "net-n9", "pnpnet": "pnpnet-n9"}
-_FORMAT = 1
+# Problems in a run. RANSAC pads its samples to multiples of 64, so a batch of 64 needs next to no padding.
+_BATCH = 64
 
 
-def operations_by_part(
-    solver: PnPNet, n: int, *, outliers: int | None = None, better: int | None = None
-) -> dict[str, Operations]:
-    """Operations for one problem of n pairs, by parts.
-
-    Args:
-        solver: see :func:`part_calls`, as are the others.
-        n: number of pairs.
-        outliers: how many of them are wrong.
-        better: how many rounds of RANSAC find a better pose.
-
-    Returns:
-        For each name in :data:`PARTS` that the solver runs, the operations of all its
-        calls.
-
-    Raises:
-        ValueCheckError: when there is no formula.
-    """
-    total: dict[str, Operations] = {}
-    for part, times, sizes in part_calls(solver, n, outliers=outliers, better=better):
-        total[part] = total.get(part, Operations()) + times * PARTS[part](*sizes)
-    return total
-
-
-def operation_count(solver: str | PnPNet, n: int, *, outliers: int | None = None) -> float:
-    """Flops for one problem of n pairs.
+def operation_count(solver: str | PnPNet, n: int, *, outliers: int = 0) -> float:
+    """Count the operations that a solver executes for one problem, by running it.
 
     Args:
-        solver: the solver, or its name as for the command line (``"p3p-ransac:confidence=0.99"``). A network counts as
-            one that is built for n pairs; ``net`` and ``pnpnet`` are the names without n.
-        n: number of pairs.
-        outliers: how many of them are wrong, for the rule by which RANSAC stops; it draws all its samples when
-            ``None``.
+        solver: the solver, or its name as for :func:`~kornia_pnpnet.evaluation.named_solvers.load_solver`. The names
+            ``net`` and ``pnpnet`` stand for networks that are built for ``n`` pairs.
+        n: number of pairs, at least 3.
+        outliers: number of outliers among them. Only the counts of RANSAC depend on it.
 
     Returns:
-        Operations weighted by :data:`~kornia_pnpnet.evaluation.operations.operations.OPERATION_COSTS`.
+        Operations weighted by :data:`~kornia_pnpnet.evaluation.operations.costs.OPERATION_COSTS`, the mean over 64
+        problems without noise.
 
     Raises:
-        ValueCheckError: when there is no such solver, or no formula for it.
+        ValueCheckError: when the solver does not run in PyTorch, and so cannot be counted.
+        BaseError: for an unknown name, or numbers of pairs and outliers that do not fit each other or the solver.
 
     Example:
         >>> round(operation_count("identity-lm", 9), -4)
         70000.0
     """
-    solver = _solver(solver) if isinstance(solver, str) else solver
-    return sum(operations.flops for operations in operations_by_part(solver, n, outliers=outliers).values())
+    runnable = _solver(solver, n) if isinstance(solver, str) else solver
+    mix = OutlierMix(count=outliers)
+    source = SyntheticProblems(n=n, batch_size=_BATCH, outliers=mix, img_sigma=0.0, world_sigma=0.0)
+    problems = source.batch(0)
+
+    def run(batch: int) -> None:
+        repeated = problems.map(lambda part: torch.cat([part] * (batch // _BATCH)))
+        runnable(repeated.world_points, repeated.img_points, repeated.intrinsics)
+
+    return count_per_problem(run, _BATCH).flops
 
 
-def _solver(spec: str) -> PnPNet:
+def _solver(spec: str, n: int) -> PnPNet:
     name, colon, options = spec.partition(":")
     solver = load_solver(_ANY_N.get(name, name) + colon + options)
     if not isinstance(solver, PnPNet):
-        raise ValueCheckError(f"There is no formula for {spec!r}: it is not made of this package's parts.")
+        raise ValueCheckError(f"The operations of {spec!r} cannot be counted: it is not a solver in PyTorch.")
+    if name in _ANY_N:
+        solver.init = MLPInit(n)
     return solver
+
+
+def _sample_size(spec: str) -> int:
+    """Number of pairs in a sample of RANSAC, 0 for a solver that draws no samples."""
+    init = _solver(spec, n=9).init
+    return init.minimal.sample_size if isinstance(init, RANSAC) else 0
 
 
 def complexity_results(
     solvers: Sequence[str] = SOLVERS, n: Iterable[int] = range(6, 51), *, outlier_share: float = 1 / 3
 ) -> dict[str, Any]:
-    """Operation counts as plain data, for the results file behind figure 1.
+    """Count the operations of solvers for the results file behind figure 1.
 
     Args:
         solvers: names, see :func:`operation_count`.
         n: numbers of pairs.
-        outlier_share: of how many outliers RANSAC is to be sure: the share of the pairs, rounded down.
+        outlier_share: share of outliers among the pairs of each problem; their number is rounded down.
 
     Returns:
-        ``kind`` and ``format``; ``n``; ``counts``, for each solver one number for each n, ``None`` where its samples
-        have more than n pairs; ``ransac``, the solvers that draw samples; ``all_samples``, their counts when they do
-        not stop before the last sample; ``outliers`` for each n; ``costs``, the table of costs; ``environment``.
+        ``kind`` and ``format``; ``n``; ``counts``, for each solver one number for each n, ``None`` where a sample of
+        RANSAC has more than n pairs; ``ransac``, the solvers that draw samples; ``outliers`` for each n; ``costs``, the
+        table of costs; ``environment``.
     """
     sizes = list(n)
-    outliers = [int(outlier_share * size + 1e-9) for size in sizes]
-    built = {name: _solver(name) for name in solvers}
-    ransac = [name for name, solver in built.items() if isinstance(solver.init, RANSAC)]
-
-    def count(name: str, size: int, wrong: int | None) -> float | None:
-        init = built[name].init
-        if isinstance(init, RANSAC) and size < init.minimal.sample_size:
-            return None
-        return operation_count(built[name], size, outliers=wrong)
-
+    outliers = [int(outlier_share * size + 1e-9) for size in sizes]  # 1/3 of 9 is 3, not 2 by rounding
+    smallest = {name: _sample_size(name) for name in solvers}
+    counts = {
+        name: [
+            operation_count(name, size, outliers=wrong) if size >= least else None
+            for size, wrong in zip(sizes, outliers, strict=True)
+        ]
+        for name, least in smallest.items()
+    }
     return {
         "kind": "complexity",
-        "format": _FORMAT,
+        "format": FORMAT,
         "n": sizes,
-        "counts": {name: [count(name, *pair) for pair in zip(sizes, outliers, strict=True)] for name in built},
-        "ransac": ransac,
-        "all_samples": {name: [count(name, size, None) for size in sizes] for name in ransac},
+        "counts": counts,
+        "ransac": [name for name, least in smallest.items() if least],
         "outliers": outliers,
         "costs": dict(OPERATION_COSTS),
         "environment": environment(),

@@ -1,4 +1,4 @@
-"""EPnP: control points, their depths, and the solver."""
+"""EPnP: ``epnp`` has the initialiser, ``control_points`` the control points, ``depths`` the equations of depths."""
 
 from kornia_pnpnet.init.epnp.epnp import EPnP
 

@@ -1,10 +1,10 @@
-r"""What EPnP and REPPnP share: coordinates of the world points in a frame of their own, and orthogonal Procrustes.
+r"""Control points and point alignment, which EPnP and REPPnP share.
 
-A world point is written as :math:`p_i = \sum_j a_{ij} c_j`, and so is the same point in the camera frame, with the
-same :math:`a_{ij}` and unknown :math:`c_j`. Lepetit et al. take four control points and barycentric coordinates. Here
-:math:`c_0` is the centroid and :math:`c_1, c_2, c_3` are *vectors* from it, so that :math:`a_{i0} = 1`. The affine maps
-that both describe are the same; but with vectors the coordinates can be made orthonormal,
-:math:`\sum_i w_i a_i a_i^\top = I`, and what is computed from them need not depend on the axes of the world.
+A world point is :math:`p_i = \sum_j a_{ij} c_j`. In the camera frame the same point has the same coordinates
+:math:`a_{ij}` with unknown :math:`c_j`. Lepetit et al. take four control points :math:`c_j` and barycentric
+coordinates. Here :math:`c_0` is the centroid and :math:`c_1, c_2, c_3` are *vectors* from the centroid, so that
+:math:`a_{i0} = 1`. Both describe the same affine maps, but with vectors the coordinates can be orthonormal,
+:math:`\sum_i w_i a_i a_i^\top = I`, and results do not depend on the axes of the world.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from kornia_pnpnet.types import Correspondences, Pose
 
 __all__ = ["ControlPoints", "align", "control_points"]
 
-# Points are planar when their extent across the plane is below this share of that along it, a thousandth.
+# Points are planar when their extent across the plane is below this share of their extent along the plane.
 _PLANAR_RATIO = 1e-3
 
 
 class ControlPoints(NamedTuple):
-    r"""The world points in coordinates of their own.
+    r"""Control points and the coordinates of the world points.
 
-    The tensors lie in memory with the problems last, see :func:`control_points`.
+    In memory the problems are the last dimension, see :func:`control_points`.
 
     Attributes:
-        points: the centroid and three vectors from it, shape :math:`(B, 4, 3)`. The vectors are a square root of the
-            covariance of the points. Planar points have 0 as the third.
-        coordinates: :math:`a`, with ``coordinates @ points`` the world points and
-            :math:`\sum_i w_i a_i a_i^\top = I`, shape :math:`(B, N, 4)`. Planar points have 0 as the last one.
+        points: the centroid and three vectors from the centroid, shape :math:`(B, 4, 3)`. The vectors are a square
+            root of the covariance of the points. The third vector of planar points is 0.
+        coordinates: :math:`a`, such that ``coordinates @ points`` are the world points and
+            :math:`\sum_i w_i a_i a_i^\top = I`, shape :math:`(B, N, 4)`. The last coordinate of planar points is 0.
         weights: the weights of the pairs, with the sum 1, shape :math:`(B, N)`.
         planar: whether the points lie in one plane (or on a line), bool, shape :math:`(B,)`.
         ok: whether the points span more than a line, bool, shape :math:`(B,)`.
@@ -48,15 +48,15 @@ class ControlPoints(NamedTuple):
 def control_points(corr: Correspondences) -> ControlPoints:
     r"""Choose the control points by weighted Gram-Schmidt on the coordinates of the world points.
 
-    The axis along which the points spread most comes first, what it explains is taken from the others, and so on. The
-    principal directions of the paper would be the same but for an orthogonal transform of :math:`c_1, c_2, c_3`,
-    which costs an eigendecomposition and has no gradient where two extents are equal.
+    The axis along which the points spread most comes first and is projected out of the other axes, and so on. The
+    principal directions of the paper differ only by an orthogonal transform of :math:`c_1, c_2, c_3`; they cost an
+    eigendecomposition and have no gradient where two extents are equal.
 
-    Results are views of tensors with the problems in the last dimension: elementwise operations on those are several
-    times faster than on problems in the first.
+    Results are views of tensors with the problems in the last dimension, on which elementwise operations are several
+    times faster.
 
     Args:
-        corr: normalised correspondences. Pairs with the weight 0 do not matter.
+        corr: normalised correspondences. Pairs with the weight 0 are ignored.
 
     Returns:
         The :class:`ControlPoints`.
@@ -74,7 +74,7 @@ def control_points(corr: Correspondences) -> ControlPoints:
     world = corr.world_points.permute(2, 1, 0).contiguous()  # (3, N, B)
     centroid = (world * weights).sum(1)  # (3, B)
     rest = world - centroid[:, None]
-    # Below these an axis is rounding: the first is absolute, the others relative to the extent of the one before.
+    # An axis below its limit is rounding. The first limit is absolute, the others are relative to the previous extent.
     limit = torch.full_like(total, torch.finfo(rest.dtype).tiny ** 0.5)
     line_ratio = torch.finfo(rest.dtype).eps ** 0.5
     vectors, coordinates, found = [centroid], [torch.ones_like(weights)], []
@@ -100,18 +100,18 @@ def control_points(corr: Correspondences) -> ControlPoints:
 
 
 def align(source: Tensor, target: Tensor, weights: Tensor) -> tuple[Pose, Tensor]:
-    r"""Move points onto others by a similarity, best by weighted least squares.
+    r"""Find the rigid motion and the scale that move points onto other points, by weighted least squares.
 
     Source: S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991.
 
     Args:
-        source: shape :math:`(B, K, 3)`.
-        target: shape :math:`(B, K, 3)`.
+        source: points :math:`x`, shape :math:`(B, K, 3)`.
+        target: points :math:`y`, shape :math:`(B, K, 3)`.
         weights: at least 0, shape :math:`(B, K)`.
 
     Returns:
-        The motion :math:`(R, t)` and the scale :math:`s`, shape :math:`(B,)`. Rigidly the points move best by
-        :math:`R x + t`, with a scale by :math:`s R (x - \bar x) + \bar y`, where the bars are weighted means.
+        The motion :math:`(R, t)` and the scale :math:`s`, shape :math:`(B,)`. The best rigid motion is
+        :math:`R x + t`, the best similarity :math:`s R (x - \bar x) + \bar y`, where the bars are weighted means.
 
     Example:
         >>> points = torch.tensor([[[0.0, 0, 0], [2, 0, 0], [0, 2, 0], [0, 0, 2]]])

@@ -2,10 +2,11 @@ r"""EPnP's equations in the four depths of the control points, with the problems
 
 With orthonormal coordinates (see :mod:`~kornia_pnpnet.init.epnp.control_points`) the equations
 :math:`\sum_j a_{ij} (x_j - u_i z_j) = 0`, and the same with :math:`y` and :math:`v`, are solved for x and y in closed
-form: :math:`x = P z` with :math:`P = \sum_i w_i u_i a_i a_i^\top`, :math:`y = Q z` with :math:`v_i`. What is left, the
-algebraic error :math:`z^\top K z`, has 4 unknowns where :math:`M^\top M` has 12, and every :math:`z` is a candidate:
-what the paper calls the null space for N = 4. The control vectors in the camera frame are the columns of a 3 by 3
-matrix :math:`D(z)`, and they are those of the world turned when :math:`D^\top D = L^\top L`.
+form: :math:`x = P z` with :math:`P = \sum_i w_i u_i a_i a_i^\top`, and :math:`y = Q z` with :math:`v_i` instead of
+:math:`u_i`. The remaining algebraic error :math:`z^\top K z` has 4 unknowns where the paper's :math:`M^\top M` has 12,
+and every :math:`z` is a candidate, as in the paper's null space for N = 4. The control vectors in the camera frame are
+the columns of a 3 by 3 matrix :math:`D(z)`. They are the rotated control vectors :math:`L` of the world when
+:math:`D^\top D = L^\top L`.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from torch import Tensor
 from kornia_pnpnet.core.linalg import dot, eigenvectors, small_product, solve_leading
 from kornia_pnpnet.geometry import NormalEquations
 from kornia_pnpnet.init.epnp.control_points import ControlPoints
-from kornia_pnpnet.refine.lm import solve_damped
+from kornia_pnpnet.refine import solve_damped
 
 __all__ = [
     "DepthSystem",
@@ -29,23 +30,25 @@ __all__ = [
     "minimize",
 ]
 
-# In a tie the control points lie at equal depths, or else tilt along the world's longest extents. Relative to the
-# spread of the pixels: a hundredth of it, squared. It decides where an iteration starts, not where it ends.
+# Share of the squared spread of the pixels. A ridge of this size breaks ties between null vectors: equal depths come
+# first, then tilts along the world's longest extents. It affects where the iterations start, not where they end.
 _TIE = 1e-4
+# Upper entries of a symmetric 4 by 4 matrix.
 _UPPER = [(i, j) for i in range(4) for j in range(i, 4)]
-_EDGES = [(i, j) for i in range(3) for j in range(i, 3)]  # of the Gram matrix of the control vectors
+# Upper entries of the Gram matrix of the three control vectors; an entry is the equation of an "edge".
+_EDGES = [(i, j) for i in range(3) for j in range(i, 3)]
 
 
 class DepthSystem(NamedTuple):
-    r"""What the pixels and the world say about the depths of the control points.
+    r"""The equations of the depths of the control points.
 
     Attributes:
         first: :math:`P`, shape :math:`(4, 4, B)`.
         second: :math:`Q`, shape :math:`(4, 4, B)`.
         error: :math:`K`, shape :math:`(4, 4, B)`.
-        gram: :math:`L^\top L` of the control vectors, with trace 1, shape :math:`(3, 3, B)`.
-        unit: the root mean square distance of the world points from their centroid, which is the unit of the depths,
-            shape :math:`(B,)`.
+        gram: :math:`L^\top L`, scaled to the trace 1, shape :math:`(3, 3, B)`.
+        unit: unit of the depths, the root mean square distance of the world points from their centroid, shape
+            :math:`(B,)`.
     """
 
     first: Tensor
@@ -68,13 +71,13 @@ class _Objective(NamedTuple):
 
 
 def _symmetric(upper: dict[tuple[int, int], Tensor]) -> Tensor:
-    """Matrices (*, 4, 4, B) of their upper entries (*, B)."""
+    """Symmetric matrices (*, 4, 4, B) from their upper entries (*, B)."""
     entries = [upper[min(i, j), max(i, j)] for i in range(4) for j in range(4)]
     return torch.stack(entries, -2).unflatten(-2, (4, 4))
 
 
 def depth_system(control: ControlPoints, plane_points: Tensor) -> DepthSystem:
-    r"""Eliminate the first two coordinates of the control points.
+    r"""Eliminate the x and y coordinates of the control points.
 
     Args:
         control: the control points in the world.
@@ -88,7 +91,7 @@ def depth_system(control: ControlPoints, plane_points: Tensor) -> DepthSystem:
     weighted = [weights, *(weights * a for a in coordinates)]
     scaled = [plane_points, *(plane_points * a for a in coordinates)]  # (2, N, B) each
     moments = {(i, j): (weighted[i] * scaled[j]).sum(1) for i, j in _UPPER}  # (2, B) each
-    # K as the squares of what the elimination leaves, not as a difference of moments: float32 would lose it.
+    # K is a sum of squared residuals of the elimination. As a difference of moments float32 would lose it.
     errors = []
     for j in range(4):
         error = scaled[j] - moments[0, j][:, None]
@@ -105,15 +108,14 @@ def depth_system(control: ControlPoints, plane_points: Tensor) -> DepthSystem:
 
 
 def control_points_in_camera(system: DepthSystem, depths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    r"""The control points of some depths.
+    r"""The control points in the camera frame that belong to depths.
 
     Args:
         system: the equations.
         depths: :math:`z`, shape :math:`(4, *, B)`.
 
     Returns:
-        x, y and z of the centroid and the vectors in the camera frame, in units of ``system.unit``, each
-        :math:`(4, *, B)`.
+        x, y and z of the centroid and the vectors, in units of ``system.unit``, each :math:`(4, *, B)`.
     """
     z = depths.unbind(0)
     shape = (4, *(1,) * (depths.ndim - 2), -1)
@@ -123,12 +125,12 @@ def control_points_in_camera(system: DepthSystem, depths: Tensor) -> tuple[Tenso
 
 
 def _null_space(system: DepthSystem) -> Tensor:
-    """Depths in the order of their algebraic error, (4, 4 vectors, B): z = β₁v₁ + β₂v₂ + β₃v₃ + β₄v₄.
+    """A basis of depths in the order of their algebraic error, (4, 4 vectors, B): z = β₁v₁ + β₂v₂ + β₃v₃ + β₄v₄.
 
-    The first has the least error of those with the centroid at depth 1; the others have the centroid at 0 and are the
-    eigenvectors of what remains of K, so that K is diagonal in this basis.
+    The first vector has the least error with the centroid at depth 1. The other vectors have the centroid at depth 0;
+    they are the eigenvectors of the rest of K, so that K is diagonal in this basis.
     """
-    first, second, error, gram, _ = system
+    first, second, error, gram = system.first, system.second, system.error, system.gram
     spread = error[0, 0] + (first[0, 1:].square() + second[0, 1:].square()).sum(0)
     eye = torch.eye(3, dtype=gram.dtype, device=gram.device)[..., None]
     inner = torch.addcmul(error[1:, 1:], _TIE * spread, 1.1 * eye - gram)
@@ -144,21 +146,21 @@ def _null_space(system: DepthSystem) -> Tensor:
 
 
 def four_cases(system: DepthSystem) -> Tensor:
-    r"""The depths that the paper's four cases give for the number of null vectors.
+    r"""The depths of the paper's four cases, which differ in the number of null vectors.
 
-    For :math:`N = 1, 2, 3` the products of the betas are solved for by least squares, for N = 3 without
-    :math:`\beta_3^2`, which is the least of them. N = 4 takes :math:`\beta_1 \beta_4` as well, as many unknowns as
-    there are equations (the paper linearises the four remaining products again). All are leading blocks of one system.
+    For :math:`N = 1, 2, 3` the products of the betas are found by least squares; for N = 3 without :math:`\beta_3^2`,
+    the smallest product. N = 4 adds :math:`\beta_1 \beta_4`, so that there are as many unknowns as equations (the paper
+    linearises the four remaining products again). The systems of all cases are leading blocks of one system.
 
     Args:
         system: the equations.
 
     Returns:
-        Depths, shape :math:`(4, 4, B)`, the cases in the second dimension.
+        Depths, shape :math:`(4, 4, B)`, with the cases in the second dimension.
     """
     basis = _null_space(system)  # (4, 4 vectors, B)
     camera = control_points_in_camera(system, basis)
-    vectors = [axis.unbind(0)[1:] for axis in camera]  # (4 vectors, B) of every axis and control vector
+    vectors = [axis.unbind(0)[1:] for axis in camera]  # (4 vectors, B) for each axis and control vector
     single = [[control.unbind(0) for control in axis] for axis in vectors]
     normal, rhs = basis.new_zeros(6, 6, basis.shape[-1]), basis.new_zeros(6, basis.shape[-1])
     for k, j in _EDGES:
@@ -192,9 +194,9 @@ def four_cases(system: DepthSystem) -> Tensor:
 
 
 def _objective(system: DepthSystem, weight: float, cases: bool) -> _Objective:
-    """Lay the system out for one candidate per problem, or for several in a dimension of their own."""
+    """Lay out the system for one candidate per problem, or, with ``cases``, for several in the middle dimension."""
     shape = (4, 1, -1) if cases else (4, -1)
-    first, second = (tuple(row.view(shape) for row in matrix.unbind(0)) for matrix in system[:2])
+    first, second = (tuple(row.view(shape) for row in x.unbind(0)) for x in (system.first, system.second))
     eye = torch.eye(4, dtype=system.error.dtype, device=system.error.device)
     return _Objective(
         first,
@@ -218,7 +220,8 @@ def _normal_equations(objective: _Objective, depths: Tensor) -> tuple[Tensor, Te
         slope = (x[k] * first[j + 1]).addcmul_(y[k], second[j + 1]).addcmul_(z[k], axes[j])
         if k != j:
             slope.addcmul_(x[j], first[k + 1]).addcmul_(y[j], second[k + 1]).addcmul_(z[j], axes[k])
-        # An edge with itself appears once in the Frobenius norm and its slope is halved, the others appear twice.
+        # A diagonal entry of the Gram matrix appears once in the Frobenius norm, and its slope is halved; the other
+        # entries appear twice.
         normal.addcmul_(slope[:, None], slope, value=1.0 if k != j else 2.0)
         gradient.addcmul_(slope, misfit)
     return normal, gradient, misfits
@@ -227,17 +230,17 @@ def _normal_equations(objective: _Objective, depths: Tensor) -> tuple[Tensor, Te
 def minimize(system: DepthSystem, depths: Tensor, weight: float, iterations: int) -> Tensor:
     r"""Gauss-Newton on :math:`\|D^\top D - L^\top L\|_F^2 + \mu\, z^\top K z`.
 
-    The six entries of the Gram matrix say what the paper's six distances between control points say, but in a norm
-    that does not change with the choice of the control points.
+    The six entries of the Gram matrix are equivalent to the paper's six distances between control points, but their
+    norm does not depend on the choice of the control points.
 
     Args:
         system: the equations.
-        depths: where to start, shape :math:`(4, B)` or :math:`(4, C, B)` for C candidates per problem.
+        depths: start, shape :math:`(4, B)`, or :math:`(4, C, B)` for C candidates per problem.
         weight: :math:`\mu`.
-        iterations: how many.
+        iterations: number of iterations.
 
     Returns:
-        The depths, in the shape that came.
+        The depths, in the shape of ``depths``.
     """
     objective = _objective(system, weight, depths.ndim > 2)
     for _ in range(iterations):
@@ -248,19 +251,19 @@ def minimize(system: DepthSystem, depths: Tensor, weight: float, iterations: int
 
 
 def attach_gradient(system: DepthSystem, depths: Tensor, planar: Tensor, weight: float) -> Tensor:
-    r"""Give a minimum the gradient of a minimum, by the implicit function theorem.
+    r"""Give the minimum its gradient, by the implicit function theorem.
 
-    What is returned is the depths minus one Newton step, which is left out of the value. So the iterations need not
-    be differentiated, and the gradient does not depend on how the minimum was found.
+    The result has the value of ``depths`` and the gradient of one Newton step. So the iterations need not be
+    differentiated, and the gradient does not depend on how the minimum was found.
 
     Args:
         system: the equations, with a gradient.
-        depths: a minimum of what :func:`minimize` minimises, shape :math:`(4, B)`.
+        depths: a minimum of the objective of :func:`minimize`, shape :math:`(4, B)`.
         planar: whether the points of a problem are planar, bool, shape :math:`(B,)`.
         weight: :math:`\mu`.
 
     Returns:
-        The same depths, with a gradient. It is 0 where the minimum is not isolated.
+        The depths with a gradient, which is 0 where the minimum is not isolated.
     """
     normal, gradient, misfits = _normal_equations(_objective(system, weight, False), depths)
     with torch.no_grad():
@@ -269,7 +272,7 @@ def attach_gradient(system: DepthSystem, depths: Tensor, planar: Tensor, weight:
         for matrix in (system.first[1:], system.second[1:]):
             normal = normal + small_product(matrix.transpose(0, 1), small_product(misfit, matrix))
         normal = normal + torch.nn.functional.pad(misfit, (0, 0, 1, 0, 1, 0))
-        # The depth of the third vector of planar points is 0 and nothing else.
+        # The depth of the third vector of planar points is always 0: an identity row keeps the system regular.
         last = torch.zeros_like(normal[:, :, :1])
         last[3, 3] = 1.0
         normal = normal + last * planar

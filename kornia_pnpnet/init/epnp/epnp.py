@@ -1,13 +1,14 @@
-"""EPnP: a pose from four or more pairs in closed form and a few Gauss-Newton steps in four unknowns."""
+"""EPnP: a pose from four or more pairs, in closed form and by a few Gauss-Newton steps in four unknowns."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import torch
-from kornia.core.check import KORNIA_CHECK
-from torch import Tensor, nn
+from torch import Tensor
 
+from kornia_pnpnet.core.checks import check_numbers, check_whole
+from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.linalg import dot, nearest_rotation, small_product
 from kornia_pnpnet.init.epnp.control_points import ControlPoints, control_points
 from kornia_pnpnet.init.epnp.depths import (
@@ -22,45 +23,49 @@ from kornia_pnpnet.types import Correspondences, Guess, Pose
 
 __all__ = ["EPnP", "best_case"]
 
-_MIN_PAIRS, _MIN_IN_FRONT = 4, 3
-# Gauss-Newton steps of every case before one of them is chosen.
-CASE_ITERATIONS = 2
-# A reprojection error counts up to this many squared focal lengths, and a point behind the camera counts as much.
+# Number of pairs below which a problem is not `ok`: EPnP is defined from four pairs on.
+_MIN_PAIRS = 4
+# Number of pairs that must be in front of the camera: fewer do not determine a pose.
+_MIN_IN_FRONT = 3
+# Number of Gauss-Newton steps of every case before the best case is chosen.
+_CASE_ITERATIONS = 2
+# Squared focal lengths. Larger squared reprojection errors, and points behind the camera, count as this error.
 _MAX_SQ_RESIDUAL = 4.0
 
 
-class EPnP(nn.Module):
+class EPnP(Configured):
     r"""EPnP with weights, planar points and gradients, for batches.
 
-    The control points of the world are expressed in the camera frame as a combination of the null vectors of the
-    projection equations; the coefficients make the control points as far from each other as they are in the world.
-    Four cases, N = 1 … 4 null vectors, start Gauss-Newton; the case with the least weighted reprojection error is taken
-    (a point behind the camera counts as an error of two focal lengths). The pose moves the control points of the
-    world to those in the camera (orthogonal Procrustes).
+    The control points in the camera frame are a combination of the null vectors of the projection equations. The
+    coefficients are chosen so that the control points have the same distances from each other as in the world. Four
+    cases, N = 1 … 4 null vectors, start Gauss-Newton, and the case with the least weighted reprojection error is
+    selected (a point behind the camera counts as an error of two focal lengths). The pose moves the control points of
+    the world to the control points in the camera frame (orthogonal Procrustes).
 
     Source: V. Lepetit, F. Moreno-Noguer and P. Fua, "EPnP: An Accurate O(n) Solution to the PnP Problem", IJCV 2009.
-    We depart from it for accuracy, for speed and to do without eigenvectors of equal eigenvalues:
+    Our changes are for accuracy, for speed, and to avoid eigenvectors of equal eigenvalues:
 
-    - Two thirds of the 12 unknowns are eliminated (``kornia_pnpnet.init.epnp.depths``). What remains are the depths of
-      the control points; the null vectors are ordered by their algebraic error at equal depth of the centroid, not
-      at equal length. Where fewer than six pairs leave several null vectors, those with the world's longest extents
-      come first.
-    - The distances are compared in a norm that does not depend on the choice of the control points, and the algebraic
-      error stays in the objective with the weight ``algebraic_weight``: with a dozen noisy pairs the null vectors
-      are not equally free. 0 is the paper.
-    - Planar points have three control points in the same equations, with 0 as the fourth; no branch of its own.
+    - Two thirds of the 12 unknowns are eliminated (``kornia_pnpnet.init.epnp.depths``); the depths of the control
+      points remain. The null vectors are ordered by their algebraic error at equal depth of the centroid instead of
+      equal length. Where fewer than six pairs leave several null vectors, the vectors along the world's longest
+      extents come first.
+    - The distances are compared in a norm that does not depend on the choice of the control points. The algebraic
+      error stays in the objective with the weight ``algebraic_weight``, since with a dozen noisy pairs the null
+      vectors are not equally free. The weight 0 is the paper's method.
+    - Planar points use the same equations, with 0 as the fourth control point.
 
-    Four pairs are the fewest, and like five they work by the null space: there they leave up to four solutions, of
-    which the least reprojection error need not be the right one. A problem is not ``ok`` with fewer pairs, with
-    points on a line, and when fewer than three pairs are in front of the camera.
+    Four or five pairs leave up to four solutions in the null space, and the solution with the least reprojection error
+    may be wrong. A problem is not ``ok`` with fewer than four pairs, with points on a line, and when fewer than three
+    pairs are in front of the camera.
 
-    Gradients to points, pixels and weights are those of the minimum that Gauss-Newton found, by the implicit function
-    theorem. They are first derivatives; the choice among the cases is not differentiated.
+    Gradients to points, pixels and weights are first derivatives of the minimum that Gauss-Newton found, by the
+    implicit function theorem. The choice among the cases is not differentiated.
 
     Args:
-        iterations: Gauss-Newton steps, at least 2. Two of them are made in every case, the others in the best one.
-        algebraic_weight: :math:`\mu \ge 0`, weight of the algebraic error beside the squared error of the distances,
-            for points of unit root mean square distance from their centroid and pixels over the focal length.
+        iterations: number of Gauss-Newton steps, at least 2: two steps in every case, the other steps in the best case.
+        algebraic_weight: :math:`\mu \ge 0`, weight of the algebraic error relative to the squared error of the
+            distances, for points of unit root mean square distance from their centroid and pixels over the focal
+            length.
 
     Raises:
         BaseError: when an argument is out of its range.
@@ -80,21 +85,11 @@ class EPnP(nn.Module):
     """
 
     def __init__(self, *, iterations: int = 5, algebraic_weight: float = 0.3) -> None:
-        super().__init__()
-        KORNIA_CHECK(
-            isinstance(iterations, int) and iterations >= CASE_ITERATIONS,
-            f"iterations must be an integer of at least {CASE_ITERATIONS}, got {iterations!r}.",
-        )
-        KORNIA_CHECK(
-            0.0 <= algebraic_weight < float("inf"), f"algebraic_weight must be at least 0, got {algebraic_weight!r}."
-        )
-        self.config = {"iterations": iterations, "algebraic_weight": algebraic_weight}
+        super().__init__(locals())
+        check_whole(_CASE_ITERATIONS, iterations=iterations)
+        check_numbers(0.0, algebraic_weight=algebraic_weight)
         self.iterations = iterations
         self.algebraic_weight = algebraic_weight
-
-    def extra_repr(self) -> str:
-        """Show the constructor's arguments."""
-        return ", ".join(f"{key}={value!r}" for key, value in self.config.items())
 
     def forward(self, corr: Correspondences) -> Guess:
         r"""Find the pose.
@@ -103,7 +98,7 @@ class EPnP(nn.Module):
             corr: normalised correspondences.
 
         Returns:
-            The pose, weights of one, and whether there is a pose. Where there is none the pose is finite.
+            The pose, weights of 1, and ``ok``. Where ``ok`` is false the pose is finite.
         """
         control = control_points(corr)
         plane_points = (corr.img_points.permute(2, 1, 0) / corr.focal).contiguous()  # (2, N, B)
@@ -117,7 +112,7 @@ class EPnP(nn.Module):
         camera = torch.stack(control_points_in_camera(system, depths))  # (3, 4, B)
         affine = camera[:, 1:]
         rotation, unique = nearest_rotation(small_product(affine, vectors.transpose(0, 1)))
-        # The control points miss their distances a little. Their size is known.
+        # The control points miss their distances a little. The scale restores the known size of the world.
         size = affine.square().sum((0, 1))
         scale = (small_product(rotation, vectors) * affine).sum((0, 1)) / torch.where(size > 0, size, 1.0)
         offset = dot(rotation.unbind(1), control.points[:, 0].mT.unbind(0))
@@ -133,12 +128,12 @@ class EPnP(nn.Module):
     def _depths(
         self, system: DepthSystem, control: ControlPoints, plane_points: Tensor, vectors: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """The depths (4, B) of the best case, and whether they could be found (B,); else those of equal depth."""
-        cases = minimize(system, four_cases(system), self.algebraic_weight, CASE_ITERATIONS)
+        """The depths (4, B) of the best case, and whether they were found (B,); where not, equal depths."""
+        cases = minimize(system, four_cases(system), self.algebraic_weight, _CASE_ITERATIONS)
         best = best_case(system, cases, control, plane_points, vectors)
         depths = cases.gather(1, best.expand(4, 1, -1))[:, 0]
-        depths = minimize(system, depths, self.algebraic_weight, self.iterations - CASE_ITERATIONS)
-        # Greater ratios than rounding resolves are a failure; NaN compares false.
+        depths = minimize(system, depths, self.algebraic_weight, self.iterations - _CASE_ITERATIONS)
+        # Depths beyond the precision of the dtype are a failure; NaN compares false.
         solved = (depths.abs() < 1.0 / torch.finfo(depths.dtype).eps).all(0)
         flat = torch.zeros_like(depths)
         flat[0] = 1.0
@@ -146,7 +141,7 @@ class EPnP(nn.Module):
 
 
 def _frame(one: Sequence[Tensor], two: Sequence[Tensor]) -> list[tuple[Tensor, ...]]:
-    """Orthonormal axes of two vectors; a vector is a triple."""
+    """Orthonormal axes from two vectors by Gram-Schmidt; a vector is a triple of tensors."""
     length = dot(one, one).rsqrt()
     a, b, c = (entry * length for entry in one)
     along = dot((a, b, c), two)
@@ -159,9 +154,10 @@ def _frame(one: Sequence[Tensor], two: Sequence[Tensor]) -> list[tuple[Tensor, .
 def best_case(
     system: DepthSystem, cases: Tensor, control: ControlPoints, plane_points: Tensor, vectors: Tensor
 ) -> Tensor:
-    r"""Choose among the cases of every problem by the weighted mean of their squared reprojection errors.
+    r"""Choose the case of each problem with the least weighted sum of squared reprojection errors.
 
-    The control vectors of a case are nearly those of the world turned: frames of two of them stand in for Procrustes.
+    The control vectors of a case are nearly the rotated control vectors of the world. The rotation between frames of
+    two of these vectors, which is faster, replaces Procrustes.
 
     Args:
         system: the equations.
@@ -171,7 +167,7 @@ def best_case(
         vectors: the control vectors of the world in units of ``system.unit``, shape :math:`(3, 3, B)`.
 
     Returns:
-        The number of the best case, shape :math:`(B,)`.
+        Number of the best case, int64, shape :math:`(B,)`.
     """
     camera = zip(*(axis.unbind(0) for axis in control_points_in_camera(system, cases)), strict=True)
     centroid, *affine = camera  # triples of (C, B)
@@ -194,6 +190,6 @@ def best_case(
         inverse = z.reciprocal()
         x, y = torch.addcmul(minus_u, x, inverse), torch.addcmul(minus_v, y, inverse)
         error = (x * x).addcmul_(y, y).clamp_(max=_MAX_SQ_RESIDUAL)
-        error = torch.where(z > 0, error, _MAX_SQ_RESIDUAL)  # also where a case has failed: NaN compares false
+        error = torch.where(z > 0, error, _MAX_SQ_RESIDUAL)  # failed cases, too: NaN compares false
         errors.append((error * weights).sum(0))
     return torch.stack(errors).argmin(0)

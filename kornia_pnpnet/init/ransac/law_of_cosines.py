@@ -5,43 +5,50 @@ The unknowns are the distances :math:`\lambda_k` of the points along their unit 
 
 .. math:: (\lambda_i - \lambda_j)^2 + b_k \lambda_i \lambda_j = a_k,
 
-with the squared length :math:`a_k` of the edge and :math:`b_k` that of the difference of the two rays, which keeps the
-digits that :math:`2 - 2\cos` loses between rays close to each other. Weights :math:`u` of the three equations with
-:math:`a \cdot u = 0` give conics in the ratios of the distances. Those that are pairs of lines solve a cubic,
+with the squared length :math:`a_k` of the edge and the squared length :math:`b_k` of the difference of the two rays.
+(:math:`b_k` keeps the digits that :math:`2 - 2\cos` loses between rays close to each other.) A sum of the three
+equations with weights :math:`u` such that :math:`a \cdot u = 0` is a conic in the ratios of the distances. The conic
+is a pair of lines when
 
 .. math:: (u_1 u_2 + u_2 u_3 + u_3 u_1)\,(s \cdot u) = g\, u_1 u_2 u_3,
 
-:math:`s_k` being the squared sine of the angle of two rays and :math:`g` the squared determinant of all three. One
-root gives two lines, each of which meets the other conics in two points. A Newton step then refines the ratios.
+with the squared sine :math:`s_k` of the angle of two rays and the squared determinant :math:`g` of all three rays. One
+root of this cubic gives two lines, and each line meets the other conics in two points. A Newton step then refines the
+ratios.
 
 Sources: M. Persson and K. Nordberg, "Lambda Twist", ECCV 2018, for the route by one degenerate conic; Y. Ding, J. Yang,
-V. Larsson, C. Olsson and K. Åström, "Revisiting the P3P Problem", CVPR 2023, for what the roots of the cubic say about
+V. Larsson, C. Olsson and K. Åström, "Revisiting the P3P Problem", CVPR 2023, for how the roots of the cubic determine
 the solutions and for the lines from the adjugate matrix. The short form of the cubic, the choice of its root and the
 lines in differences of distances are ours.
 
-Everything is computed by components, (C,) numbers at a time, one plain operation after the other. A choice between two
-finite values is a ``lerp`` with a weight of exactly 0 or 1, which returns exactly one of them: with a mask that nobody
-can predict, ``where`` takes a CPU ten times as long.
+Everything is computed by components, (C,) numbers at a time. A choice between two finite values is a ``lerp`` with a
+weight of exactly 0 or 1, which returns exactly one of the values: with an unpredictable mask, ``where`` takes a CPU ten
+times as long.
 """
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
+from typing import TypeAlias
 
 import torch
 from torch import Tensor
 
+from kornia_pnpnet.core.performance import exporting
+
 __all__ = ["Triple", "Turn", "distances", "greater", "turn_to_largest", "turned"]
 
-# Newton steps for the root of the cubic, which start within a tenth of it.
+# Number of Newton steps for the root of the cubic: from an error of a tenth at the start to rounding in float64.
 _CUBIC_STEPS = 4
-# The Newton step fades out where its squared determinant is less than this power of the machine epsilon of the squares
-# of the edges. Two solutions meet there: the step would be noise, and the lines have found them as well as can be.
+# Power of the machine epsilon. The last Newton step fades out where its squared determinant is less than this power, in
+# squared edges: there two solutions meet, and the step would be noise.
 _DAMPING_POWER = 1.25
 
-Triple = tuple[Tensor, Tensor, Tensor]
-Turn = tuple[Tensor, Tensor]
+#: One number per point or edge, (*, C) each.
+Triple: TypeAlias = tuple[Tensor, Tensor, Tensor]
+#: Weights 0.0 or 1.0 (C,): whether to rotate a triple by one place, and by two places.
+Turn: TypeAlias = tuple[Tensor, Tensor]
 
 
 def greater(first: Tensor, second: Tensor) -> Tensor:
@@ -50,45 +57,47 @@ def greater(first: Tensor, second: Tensor) -> Tensor:
 
 
 def turn_to_largest(first: Tensor, second: Tensor, third: Tensor) -> Turn:
-    """Whether one place, and whether two places, bring the largest of three (C,) to the front: weights 0 or 1."""
+    """The turn that brings the largest of three numbers (C,) to the front."""
     return greater(second, first), greater(third, torch.maximum(first, second))
 
 
 def turned(triple: Sequence[Tensor], turn: Turn) -> Triple:
-    """A triple (*, C) after the turn of each problem."""
+    """Turn the triple of each problem."""
     x, y, z = triple
     by1, by2 = turn
     return x.lerp(y, by1).lerp_(z, by2), y.lerp(z, by1).lerp_(x, by2), z.lerp(x, by1).lerp_(y, by2)
 
 
 def _turned_back(triple: Triple, turn: Turn) -> Triple:
+    """Undo :func:`turned`."""
     x, z, y = turned((triple[0], triple[2], triple[1]), turn)
     return x, y, z
 
 
 def _sqrt(square: Tensor) -> Tensor:
-    """The root of a positive number, in less time than `torch.sqrt`."""
+    """The square root of a positive number, faster than ``torch.sqrt``."""
     return square.rsqrt().mul_(square)
 
 
 def _signed(size: Tensor, sign: Tensor) -> Tensor:
-    """A positive number, which is overwritten, with the sign of another."""
-    if torch.compiler.is_exporting():  # ONNX has no such operation
+    """Give a positive number, which is overwritten, the sign of another number."""
+    if exporting():  # ONNX has no `copysign`
         return torch.where(sign < 0, -size, size)
     return size.copysign_(sign)
 
 
 def _isolated_root(k3: Tensor, k2: Tensor, k1: Tensor, k0: Tensor) -> tuple[Tensor, Tensor]:
-    """The real root, as a ratio ``u : v``, of a cubic form (C,) that is farthest from the other two.
+    """The real root, as a ratio ``u : v``, of a cubic form (C,) that is farthest from the other two roots.
 
-    Where two solutions are close to each other so are two roots, and it is the third: it puts these two on one line.
+    Where two solutions of the P3P problem are close, two roots are close, too. The third root, which is returned, then
+    has both solutions on one of its lines.
     """
     tiny = torch.finfo(k3.dtype).tiny
     k = k3, k2, k1, k0
     sizes = [x.abs() for x in k]
     inv = functools.reduce(torch.maximum, sizes).clamp_(min=tiny).reciprocal_()
     k3, k2, k1, k0 = (x * inv for x in k)
-    # Two roots must not be at infinity.
+    # Swap u and v where two roots could be at infinity.
     swap = greater(sizes[2], sizes[1])
     k3, k0 = k3.lerp(k0, swap), k0.lerp(k3, swap)
     k2, k1 = k2.lerp(k1, swap), k1.lerp(k2, swap)
@@ -111,16 +120,20 @@ def _isolated_root(k3: Tensor, k2: Tensor, k1: Tensor, k0: Tensor) -> tuple[Tens
 
 
 def _lines(u: Triple, h: Triple, pairs: Tensor) -> tuple[Tensor, Tensor]:
-    r"""The two lines (2, C) that are the conic with the weights ``u``, of which ``u[1] + u[2]`` is not small.
+    r"""The two lines (2, C) that form the conic with the weights ``u``, of which ``u[1] + u[2]`` is not small.
 
-    ``h`` is 1 - cos, ``pairs`` the first factor of the cubic, all (C,). The lines are
-    :math:`\lambda_1 - \lambda_3 = \text{slope}\,(\lambda_2 - \lambda_3) + \text{offset}\,\lambda_3`.
+    The lines are :math:`\lambda_1 - \lambda_3 = \text{slope}\,(\lambda_2 - \lambda_3) + \text{offset}\,\lambda_3`.
+
+    Args:
+        u: root of the cubic, (C,) each.
+        h: :math:`1 - \cos` of the angles between the rays, (C,) each.
+        pairs: first factor of the cubic, :math:`u_1 u_2 + u_2 u_3 + u_3 u_1`, (C,).
     """
     u1, u2, u3 = u
     h1, h2, h3 = h
     tiny = torch.finfo(pairs.dtype).tiny
-    # The matrix D of the conic has u_2 + u_3 and the like on its diagonal and -u_1 cos_1 and the like beside it. The
-    # lines cross in m with m mᵀ = -adj D, and D + [m]ₓ and D - [m]ₓ have rank one: their first rows are the lines.
+    # The matrix D of the conic has u_2 + u_3, u_3 + u_1, u_1 + u_2 on its diagonal and -u_k cos_k beside it. The lines
+    # cross in m with m mᵀ = -adj D. The matrices D + [m]ₓ and D - [m]ₓ have rank one; their first rows are the lines.
     uh2, uh3 = u2 * h2, u3 * h3
     e1, e2, e3 = torch.addcmul(u1, u1, h1, value=-1.0), u2 - uh2, u3 - uh3
     d11 = u2 + u3
@@ -129,12 +142,12 @@ def _lines(u: Triple, h: Triple, pairs: Tensor) -> tuple[Tensor, Tensor]:
     us3 = (u3 * u3).mul_(torch.addcmul(2.0 * h3, h3, h3, value=-1.0))
     sq_m2, sq_m3 = ((us + pairs).neg_().clamp_(min=tiny) for us in (us2, us3))
     large = _sqrt(torch.maximum(sq_m2, sq_m3))
-    # Where the lines are not real nothing else would bound what comes of them.
+    # The bound matters where the lines are not real.
     least = -large
     small = (e1 * d11).addcmul_(e2, e3).neg_().div_(large).clamp_(least, large)
     third = greater(sq_m3, sq_m2)
     m2, m3 = large.lerp(small, third), small.lerp(large, third)
-    # m_3 - m_2 by the difference of the squares, unless the signs differ.
+    # m_3 - m_2 from the difference of the squares, which keeps more digits, unless the signs differ.
     same_sign = greater(small, torch.zeros_like(small))
     apart = us2.sub_(us3).div_((m2 + m3).abs_().clamp_(min=tiny**0.5)).clamp_(least, large)
     apart = (m3 - m2).lerp_(apart, same_sign)
@@ -144,9 +157,9 @@ def _lines(u: Triple, h: Triple, pairs: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _meet(slope: Tensor, offset: Tensor, v: Triple, h: Triple) -> Triple:
-    """Where lines (2, C) meet the conic with the weights ``v`` (C,): distances (2, 2, C) up to scale.
+    """The points where lines (2, C) meet the conic with the weights ``v`` (C,): distances (2, 2, C) up to scale.
 
-    A line that misses the conic is taken to touch it. Of a line that touches it the second point is 0.
+    A line that misses the conic counts as touching it. Where a line touches the conic, the second point is 0.
     """
     v1, v2, v3 = v
     h1, h2, h3 = h
@@ -167,7 +180,7 @@ def _meet(slope: Tensor, offset: Tensor, v: Triple, h: Triple) -> Triple:
 
 
 def _candidates(p: Tensor, q: Tensor, r: Tensor, b: Triple, g: Tensor) -> Triple:
-    """Where all the equations of :func:`distances` meet, but for rounding."""
+    """Solutions of the equations of :func:`distances` up to rounding."""
     h1, h2, h3 = (0.5 * x for x in b)
     s1, s2, s3 = (torch.addcmul(x, y, y, value=-1.0) for x, y in zip(b, (h1, h2, h3), strict=True))
     # With u_1 = -(p u_3 + q u_2) the cubic is one in u_3 : u_2, and s · u = t_3 u_3 + t_2 u_2.
@@ -177,7 +190,7 @@ def _candidates(p: Tensor, q: Tensor, r: Tensor, b: Triple, g: Tensor) -> Triple
     u1 = (p * u3).addcmul_(q, u2).neg_()
     pairs = (u2 * u3).addcmul_(u1, u2 + u3)
     turn = turn_to_largest((u2 + u3).abs_(), (u3 + u1).abs_(), (u1 + u2).abs_())
-    # As other conic the one at right angles: the weights (p u_2 - q u_3, u_3, -u_2).
+    # Intersect the lines with the conic whose weights are orthogonal to u: (p u_2 - q u_3, u_3, -u_2).
     v = (p * u2).addcmul_(q, u3, value=-1.0), u3, -u2
     u, v, h = (turned(x, turn) for x in ((u1, u2, u3), v, (h1, h2, h3)))
     slope, offset = _lines(u, h, pairs)
@@ -185,16 +198,17 @@ def _candidates(p: Tensor, q: Tensor, r: Tensor, b: Triple, g: Tensor) -> Triple
 
 
 def _refined(candidates: Triple, p: Tensor, q: Tensor, b: Triple) -> Triple:
-    """One Newton step on the ratios of the distances."""
+    """Take one Newton step on the ratios of the distances."""
     dist1, dist2, dist3 = candidates
     h1, h2, h3 = (0.5 * x for x in b)
     d1, d2, d3 = dist2 - dist3, dist3 - dist1, dist1 - dist2
-    # The squared edges e, which should fulfil e2 = q e1 and e3 = p e1.
+    # The squared edges e; the equations are e2 = q e1 and e3 = p e1.
     e1 = (d1 * d1).addcmul_(b[0], dist2 * dist3)
     e2 = (d2 * d2).addcmul_(b[1], dist3 * dist1)
     e3 = (d3 * d3).addcmul_(b[2], dist1 * dist2)
     r2, r3 = torch.addcmul(e2, q, e1, value=-1.0), torch.addcmul(e3, p, e1, value=-1.0)
-    # Half the derivatives of e1 by 2, minus e1 by 3, e2 by 3, minus e3 by 2; then of minus r by 2 and r by 3.
+    # Half the derivatives: of e1 by dist2, of -e1 by dist3, of e2 by dist3, of -e3 by dist2; from these, of -r2 and -r3
+    # by dist2 (r22, r32), and of r2 and r3 by dist3 (r23, r33).
     e12, e13 = torch.addcmul(d1, h1, dist3), d1.addcmul_(h1, dist2, value=-1.0)
     e23, e32 = d2.addcmul_(h2, dist1), d3.addcmul_(h3, dist1, value=-1.0)
     r22, r23 = q * e12, e23.addcmul_(q, e13)
@@ -208,18 +222,18 @@ def _refined(candidates: Triple, p: Tensor, q: Tensor, b: Triple) -> Triple:
 
 
 def distances(p: Tensor, q: Tensor, r: Tensor, b: Triple, g: Tensor) -> Triple:
-    r"""Solve the law of cosines for the three edges of a triangle of which the edge 1 is the longest and has length 1.
+    r"""Solve the law of cosines for a triangle whose edge 1 is the longest edge and has the length 1.
 
     Args:
         p: squared edge 3, shape :math:`(C,)`.
         q: squared edge 2, shape :math:`(C,)`.
-        r: :math:`1 - p - q`, which may be known with more digits, shape :math:`(C,)`.
+        r: :math:`1 - p - q`, which the caller may know with more digits, shape :math:`(C,)`.
         b: squared difference of the two rays to the ends of each edge, three of shape :math:`(C,)`.
         g: squared determinant of the three rays, shape :math:`(C,)`.
 
     Returns:
-        Four candidates for the distances, :math:`(2, 2, C)` for each point, the first not negative. A candidate that is
-        no solution for positive distances is finite.
+        Four candidates for the distances, :math:`(2, 2, C)` for each point. The first distance is not negative. A
+        candidate that is no solution with positive distances is finite.
 
     Example:
         >>> one = torch.ones(1, dtype=torch.float64)  # the camera at the corner of a cube, points at its neighbours

@@ -1,4 +1,4 @@
-r"""P3P: the up to four poses from which a camera sees three points where it saw them, for whole batches."""
+r"""P3P: the up to four poses that project three world points exactly onto three pixels, for whole batches."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ from typing import Any, TypeVar
 
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
-from kornia.core.exceptions import ShapeError, TypeCheckError
-from torch import Tensor, nn
+from kornia.core.exceptions import TypeCheckError
+from torch import Tensor
 
-from kornia_pnpnet.core.checks import check_like
+from kornia_pnpnet.core.checks import check_like, check_shapes
+from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.linalg import dot
+from kornia_pnpnet.core.performance import compiling, fold_vmap, unfold_vmap
 from kornia_pnpnet.geometry import MIN_DEPTH_RATIO
 from kornia_pnpnet.init.ransac.law_of_cosines import Triple, distances, turn_to_largest, turned
 from kornia_pnpnet.types import Correspondences, Hypotheses, Pose
@@ -21,27 +23,29 @@ __all__ = ["P3P", "p3p"]
 
 _T = TypeVar("_T")
 
-# A chunk's component of one value per problem has this many bytes: a few dozen of them fit into a core's caches.
+# Bytes. One number per problem of a chunk takes this many: a few dozen of these vectors fit into a core's caches.
 _CHUNK_BYTES = 2**16
-# The triangle of a solution differs from the given one by less than this power of the machine epsilon, times distance.
+# Power of the machine epsilon. The triangle of a solution differs from the given triangle, whose longest edge is 1, by
+# less than this power times the distance.
 _ERROR_POWER = 2 / 3
-# And by less than this share of its longest edge, however far it is.
+# Share of the longest edge. The two triangles differ by less than this share at any distance.
 _LARGEST_ERROR = 0.01
-# A triangle is a line when it is less high than this many machine epsilons of its coordinates and its longest edge.
+# Machine epsilons of the coordinates and the longest edge. A triangle less high than this is a line.
 _LINE = 32.0
-# A camera is this many longest edges, times the same power, away from each point: from closer by, rounding would decide
-# in which direction it sees the point.
+# Longest edges, times the machine epsilon to the power `_ERROR_POWER`. A camera closer to a point than this is no
+# solution: rounding would decide in which direction it sees the point.
 _CLOSE = 64.0
 
 
 def _cross(v: Sequence[Tensor] | Tensor, w: Sequence[Tensor] | Tensor) -> list[Tensor]:
+    """The cross product of two vectors by components."""
     return [(v[i] * w[j]).addcmul_(v[j], w[i], value=-1.0) for i, j in ((1, 2), (2, 0), (0, 1))]
 
 
 def _axes(base: list[Tensor], side: list[Tensor]) -> tuple[list[Tensor], list[Tensor], Triple]:
-    """Unit vectors along a side of a triangle and along the height over it; both arguments are overwritten.
+    """Unit vectors along the base and the height of a triangle, whose two sides are overwritten.
 
-    Returned after them: one over the length of the base, the other side along the base, and the squared height.
+    The third result is: one over the length of the base, the other side along the base, and the squared height.
     """
     tiny = torch.finfo(base[0].dtype).tiny
     inv_base = dot(base, base).clamp_(min=tiny).rsqrt_()
@@ -54,12 +58,13 @@ def _axes(base: list[Tensor], side: list[Tensor]) -> tuple[list[Tensor], list[Te
 
 
 def _load(world_points: Tensor, plane_points: Tensor) -> tuple[list[Tensor], Tensor]:
-    """The three points by components (5, C), in an order in which the longest edge is opposite to the first.
+    """The three points by components (5, C), ordered so that the longest edge is opposite to the first point.
 
-    Returned after them: whether they are numbers with which one can calculate (C,). The others are 0.
+    The second result is whether the components are finite and small enough for arithmetic, (C,). The points of other
+    problems are 0.
     """
     given = torch.cat((world_points.permute(1, 2, 0), plane_points.permute(1, 2, 0)), 1)  # (3, 5, C)
-    sound = given.abs().sum((0, 1)) <= torch.finfo(given.dtype).max ** 0.2  # what is larger could overflow
+    sound = given.abs().sum((0, 1)) <= torch.finfo(given.dtype).max ** 0.2  # larger numbers could overflow
     points = [torch.where(sound, x, 0.0) for x in given]
     edges = [x[:3] - y[:3] for x, y in _ends(points)]
     return [*turned(points, turn_to_largest(*(dot(x, x) for x in edges)))], sound
@@ -71,7 +76,7 @@ def _ends(points: Sequence[_T]) -> list[tuple[_T, _T]]:
 
 
 def _look(plane: list[Tensor]) -> tuple[list[list[Tensor]], Triple, Tensor, Tensor]:
-    """Unit rays, three of three (C,), squared differences, squared determinant of them, and whether all see."""
+    """Three unit rays of three (C,), their squared differences, their squared determinant, whether all are in view."""
     depths = [(x * x).addcmul_(y, y).add_(1.0).rsqrt_() for x, y in plane]
     rays = [[x * depth, y * depth, depth] for (x, y), depth in zip(plane, depths, strict=True)]
     gaps = [[a - b for a, b in zip(x, y, strict=True)] for x, y in _ends(rays)]
@@ -82,11 +87,11 @@ def _look(plane: list[Tensor]) -> tuple[list[list[Tensor]], Triple, Tensor, Tens
 
 
 def _solve_chunk(world_points: Tensor, plane_points: Tensor) -> tuple[list[Tensor], Tensor]:
-    """The twelve components of rotations and translations (2, 2, C), and which are solutions (2, 2, C)."""
+    """The twelve components of rotations and translations (2, 2, C), and which poses are solutions (2, 2, C)."""
     finfo = torch.finfo(world_points.dtype)
     points, sound = _load(world_points, plane_points)
     x1, x2, x3 = (x[:3] for x in points)
-    # Component by component: an exporter does not know how to write into parts of a tensor for any number of problems.
+    # Component by component: an exporter cannot write into parts of a tensor for a variable number of problems.
     base, side = ([x - y for x, y in zip(end, x2, strict=True)] for end in (x3, x1))
     axis1, axis2, (inv_base, along, sq_height) = _axes(base, side)
     axis3 = _cross(axis1, axis2)
@@ -100,7 +105,7 @@ def _solve_chunk(world_points: Tensor, plane_points: Tensor) -> tuple[list[Tenso
     rays, b, g, sees = _look([x[3:] for x in points])
     dist = distances(p, q, r, b, g)
 
-    # Up to here the longest edge was 1 long.
+    # So far the longest edge had the length 1; from here on lengths are in the unit of the world.
     base_length = inv_base.reciprocal()
     y1, y2, y3 = ([d * x for x in ray] for d, ray in zip([d * base_length for d in dist], rays, strict=True))
     base = [y.sub_(x) for y, x in zip(y3, y2, strict=True)]
@@ -113,7 +118,7 @@ def _solve_chunk(world_points: Tensor, plane_points: Tensor) -> tuple[list[Tenso
     sq_error = base_error.mul_(base_error).addcmul_(along_error, along_error).addcmul_(height_error, height_error)
     least = torch.minimum(torch.minimum(dist[0], dist[1]), dist[2])
     bound = sound.bitwise_and_(sees) * least.new_full((), finfo.eps ** (2 * _ERROR_POWER))
-    # No distance is more than dist[0] + 1.
+    # No distance is more than dist[0] + 1, in longest edges.
     room = least.addcmul_(least, dist[0]).sub_(_CLOSE * finfo.eps**_ERROR_POWER).mul_(bound)
     valid = sq_error < room.clamp_(max=_LARGEST_ERROR**2)
 
@@ -134,18 +139,18 @@ def _solve_chunk(world_points: Tensor, plane_points: Tensor) -> tuple[list[Tenso
 
 
 def _solve(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Tensor]:
-    """Components of rotations and translations, (12, 4, B), and which of them are solutions, (4, B).
+    """Components of rotations and translations, (12, 4, B), and which poses are solutions, (4, B).
 
-    In chunks that fit into a core's caches; a compiler's loops need none.
+    The problems are solved in chunks that fit into a core's caches. The loops of a compiler need no chunks.
     """
     batch = world_points.shape[0]
-    if torch.compiler.is_compiling():
+    if compiling():
         entries, found = _solve_chunk(world_points, plane_points)
         return torch.stack(entries).flatten(1, 2), found.flatten(0, 1)
     out = world_points.new_empty(12, 2, 2, batch)
     valid = torch.empty(2, 2, batch, dtype=torch.bool, device=world_points.device)
     chunk = _CHUNK_BYTES // world_points.element_size()
-    with torch.inference_mode():  # an eighth faster than without gradients only; what is returned is made outside
+    with torch.inference_mode():  # an eighth faster than `no_grad`; the results were made outside
         for start in range(0, batch, chunk):
             part = slice(start, start + chunk)
             entries, valid[..., part] = _solve_chunk(world_points[part], plane_points[part])
@@ -153,21 +158,8 @@ def _solve(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Tensor]:
     return out.flatten(1, 2), valid.flatten(0, 1)
 
 
-def folded(size: int, in_dims: Sequence[int | None], *tensors: Tensor) -> list[Tensor]:
-    """Arguments of a rule for ``torch.func.vmap`` with the mapped dimension made part of the batch, their first one."""
-    moved = [
-        x.expand(size, *x.shape) if dim is None else x.movedim(dim, 0) for x, dim in zip(tensors, in_dims, strict=True)
-    ]
-    return [x.flatten(0, 1) for x in moved]
-
-
-def unfolded(size: int, result: Tensor) -> Tensor:
-    """A result of :func:`folded` arguments, the batch last, with the mapped dimension before that again."""
-    return result.unflatten(-1, (size, -1))
-
-
 class _Solve(torch.autograd.Function):
-    """:func:`_solve`, which ``torch.func.vmap`` can map: it writes in place what a mapped dimension would not fit."""
+    """:func:`_solve` with a rule for ``torch.func.vmap``, which cannot map operations that write in place."""
 
     @staticmethod
     def forward(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Tensor]:
@@ -181,31 +173,33 @@ class _Solve(torch.autograd.Function):
     def vmap(
         info: Any, in_dims: tuple[int | None, int | None], *points: Tensor
     ) -> tuple[tuple[Tensor, Tensor], tuple[int, int]]:
-        components, valid = _Solve.apply(*folded(info.batch_size, in_dims, *points))  # type: ignore[no-untyped-call]
-        return (unfolded(info.batch_size, components), unfolded(info.batch_size, valid)), (2, 1)
+        components, valid = _Solve.apply(*fold_vmap(info.batch_size, in_dims, *points))  # type: ignore[no-untyped-call]
+        return (unfold_vmap(info.batch_size, components), unfold_vmap(info.batch_size, valid)), (2, 1)
 
 
 def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
-    r"""Find all poses from which a camera sees three world points where it saw them, for a batch of problems.
+    r"""Find all poses that project three world points exactly onto three image points, for a batch of problems.
 
     Convention: ``x_cam = R x_world + t``, the camera looks along +z.
 
-    The poses carry no gradient: which one of them survives is a choice, and what is made of it is refined afterwards on
-    all pairs. They are stored by components, as if the batch came last, which suits arithmetic over many of them.
+    The poses carry no gradient: they are hypotheses, of which one is selected and refined on all pairs. In memory the
+    batch is the last dimension, which suits arithmetic over many poses.
+
+    Source: see :mod:`kornia_pnpnet.init.ransac.law_of_cosines`.
 
     Args:
-        world_points: shape :math:`(B, 3, 3)`, in any unit.
+        world_points: points in any unit, shape :math:`(B, 3, 3)`.
         plane_points: :math:`(x/z, y/z)` of the points in the camera frame, shape :math:`(B, 3, 2)`.
 
     Returns:
-        Four slots for each problem. A slot is valid when its pose is a solution with all three points in front of the
-        camera. A double solution fills one slot. The other slots hold finite numbers. No slot is valid for points on a
-        line (they have no pose or too many), for NaN and infinity, and where a point is seen further out than
+        Four slots per problem. A slot is valid when its pose is a solution with all three points in front of the
+        camera. A double solution fills one slot. Invalid slots are finite. No slot is valid for points on a line, which
+        have no pose or infinitely many, for NaN and infinity, and where a point is further off the axis than
         :data:`~kornia_pnpnet.geometry.MIN_DEPTH_RATIO` allows.
 
     Raises:
-        ShapeError: when the shapes are not these.
-        TypeCheckError: for dtypes other than float32 and float64, or two different ones.
+        ShapeError: when a tensor has another shape, or the batches differ.
+        TypeCheckError: for dtypes other than float32 and float64, or two different dtypes.
         DeviceError: for tensors on two devices.
 
     Example:
@@ -218,26 +212,19 @@ def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
         True
     """
     KORNIA_CHECK_SHAPE(world_points, ["B", "3", "3"])
-    KORNIA_CHECK_SHAPE(plane_points, ["B", "3", "2"])
-    batch = world_points.shape[0]
-    if plane_points.shape[0] != batch:
-        raise ShapeError(
-            f"plane_points must be of as many problems as world_points, {batch}, got {plane_points.shape[0]}.",
-            actual_shape=tuple(plane_points.shape),
-            expected_shape=(batch, 3, 2),
-        )
+    check_shapes({"plane_points": (plane_points, (world_points.shape[0], 3, 2))}, world_points)
     if world_points.dtype not in (torch.float32, torch.float64):
         raise TypeCheckError(f"world_points must be float32 or float64, got {world_points.dtype}.")
     check_like({"plane_points": plane_points}, world_points)
-    solve = _solve if torch.compiler.is_compiling() else _Solve.apply
+    solve = _solve if compiling() else _Solve.apply
     components, valid = solve(world_points.detach(), plane_points.detach())
     components = components.permute(2, 1, 0)  # (B, 4, 12)
     rotation, translation = components[..., :9].unflatten(-1, (3, 3)), components[..., 9:]
     return Hypotheses(Pose(rotation, translation), valid.mT)
 
 
-class P3P(nn.Module):
-    r"""Solver of minimal samples of three pairs, for :class:`~kornia_pnpnet.init.RANSAC`: :func:`p3p` as a module.
+class P3P(Configured):
+    r"""Minimal solver of three pairs for :class:`~kornia_pnpnet.init.RANSAC`: :func:`p3p` as a module.
 
     Example:
         >>> corr = Correspondences(torch.randn(7, 3, 3), torch.randn(7, 3, 2), torch.ones(7, 3), torch.tensor(1.0))
@@ -245,29 +232,22 @@ class P3P(nn.Module):
         torch.Size([7, 4, 3, 3])
     """
 
-    #: Pairs in a sample.
+    #: Number of pairs in a sample.
     sample_size = 3
 
     def __init__(self) -> None:
-        super().__init__()
-        self.config: dict[str, object] = {}
+        super().__init__(locals())
 
     def hypotheses(self, corr: Correspondences) -> Hypotheses:
         r"""Solve samples of three pairs.
 
         Args:
-            corr: normalised correspondences with :math:`N = 3`. Their weights do not matter.
+            corr: normalised correspondences with :math:`N = 3`. Their weights are ignored.
 
         Returns:
-            Four slots for each sample, :math:`S = 4`, without gradients.
+            Four slots per sample, without gradients.
 
         Raises:
             ShapeError: when :math:`N` is not 3.
         """
-        if corr.world_points.shape[1] != self.sample_size:
-            raise ShapeError(
-                f"P3P solves samples of 3 pairs, got N = {corr.world_points.shape[1]}.",
-                actual_shape=tuple(corr.world_points.shape),
-                expected_shape=["B", "3", "3"],
-            )
         return p3p(corr.world_points, corr.img_points / corr.focal)

@@ -1,45 +1,42 @@
-r"""The rounds of RANSAC: samples, their best poses, local optimisation, and which problems are done."""
+r"""The rounds of RANSAC: solve samples, keep the best poses, improve these on their inliers, stop solved problems."""
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
-from kornia_pnpnet.geometry import problems_last, project
+from kornia_pnpnet.core.performance import problems_last
+from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.geometry import Projection, project
+from kornia_pnpnet.init.ransac.minimal import MinimalSolver
 from kornia_pnpnet.init.ransac.sampling import Samples, samples_needed
-from kornia_pnpnet.init.ransac.scoring import Scene, Scorer, Thresholds, judge
-from kornia_pnpnet.refine.lm import lm_step
-from kornia_pnpnet.types import Correspondences, Hypotheses, Pose
+from kornia_pnpnet.init.ransac.scoring import Scene, Scorer
+from kornia_pnpnet.refine import lm_step
+from kornia_pnpnet.refine.verdict import Thresholds, judge
+from kornia_pnpnet.types import Correspondences, Pose
 
-__all__ = ["Found", "MinimalSolver", "Plan", "Search", "full_vectors", "take"]
+__all__ = ["PAIRS_PER_SAMPLE", "Found", "Plan", "Search", "full_vectors", "least_squares", "take"]
 
-# Poses are compared and improved in this precision: a ten thousandth of a pixel at the protocol's focal length.
+_T = TypeVar("_T")
+
+# Poses are compared and improved in this precision, which resolves 1e-4 px at the protocol's focal length of 3400 px.
 _DTYPE = torch.float32
-# Of many pairs, this many are scored first, four times as many for the best quarter, and so on.
-FIRST_PAIRS, KEPT_ONE_IN = 16, 4
-# Each round has at least this share of the samples before it: fewer rounds against fewer samples too many.
-GROWTH = 0.5
-# Samples are solved in multiples of this, twice the numbers in the longest vector of a processor.
+# Number of pairs that score all poses of a round first, see `_rank`.
+_FIRST_PAIRS = 16
+# Each ranking keeps one pose in this many, and the next ranking scores the kept poses on this many times as many pairs.
+_KEPT_ONE_IN = 4
+# Each round draws at least this share of the samples before it. More: fewer rounds, but more needless samples.
+_GROWTH = 0.5
+# Number of samples that are solved at once, up to multiples: twice the numbers in the longest vector of a processor.
 _VECTOR = 64
-# Damping of the least squares: next to none, they start close to their minimum.
-DAMPING = 1e-6
-# The first least squares take inliers up to this many times the threshold: the pose of a noisy sample misses some.
+# Relative damping of least squares: next to none, since the start is close to the minimum.
+_DAMPING = 1e-6
+# Thresholds. The first least squares use the pairs up to this limit: the pose of a noisy sample misses some inliers.
 _WIDE = 3.0
-# Pairs of problems that are improved together, for each sample that is solved together.
+#: Number of pairs that are improved together, per sample that is solved together: both need about as much memory.
 PAIRS_PER_SAMPLE = 4
-
-
-class MinimalSolver(Protocol):
-    """Solves samples of ``sample_size`` pairs each."""
-
-    @property
-    def sample_size(self) -> int:
-        """Number of pairs in a sample."""
-
-    def hypotheses(self, corr: Correspondences) -> Hypotheses:
-        """Return the poses of a batch of samples."""
 
 
 class Plan(NamedTuple):
@@ -60,10 +57,10 @@ class Found(NamedTuple):
     r"""The best pose of each problem.
 
     Attributes:
-        pose: in the frame of the correspondences, in their dtype.
+        pose: the pose in the frame of the correspondences, in their dtype.
         loss: its loss, infinite where there is no pose, shape :math:`(B,)`.
-        poses: how many poses were scored, int64, shape :math:`(B,)`.
-        samples: how many samples were drawn, int64, shape :math:`(B,)`.
+        poses: number of poses that were scored, int64, shape :math:`(B,)`.
+        samples: number of samples that were drawn, int64, shape :math:`(B,)`.
     """
 
     pose: Pose
@@ -77,8 +74,8 @@ class Search:
 
     Args:
         plan: how to search.
-        corr: normalised correspondences whose world is centred: the search has few digits.
-        thresholds: what counts as an inlier.
+        corr: normalised correspondences whose world is centred, since the search runs in float32.
+        thresholds: thresholds of an inlier, shape :math:`(B,)` each.
 
     Example:
         >>> from kornia_pnpnet.init.ransac.p3p import P3P
@@ -96,16 +93,15 @@ class Search:
     def __init__(self, plan: Plan, corr: Correspondences, thresholds: Thresholds) -> None:
         self.plan = plan
         self.corr = corr
-        self.low = corr.map(lambda x: x.to(_DTYPE))
-        self.thresholds = Thresholds(*(x.to(_DTYPE) for x in thresholds))
+        self.low = map_tensors(lambda x: x.to(_DTYPE), (corr, thresholds))
         self.scene = Scene.make(corr, thresholds, _DTYPE)
         size = plan.minimal.sample_size
         self.samples = Samples(corr.weights > 0, size=size, most=plan.max_samples, seed=plan.seed)
-        # A pair's numbers side by side, so that a sample is gathered pair by pair.
+        # The numbers of a pair side by side, so that a sample is gathered pair by pair.
         self.pairs = torch.cat((corr.world_points, corr.img_points, corr.weights[..., None]), -1).flatten(0, 1)
 
     def run(self) -> Found:
-        """Search until every problem is done."""
+        """Search until every problem has a sample without an outlier at the confidence, or all its samples."""
         plan, samples = self.plan, self.samples
         batch, count = self.corr.weights.shape
         device = self.corr.weights.device
@@ -125,7 +121,7 @@ class Search:
             for some in better.split(max(1, PAIRS_PER_SAMPLE * plan.chunk_size // (count * top_losses.shape[1]))):
                 at = active[some]
                 loss[at], matrix[at] = self._improve(at, top_losses[some], top_matrices[some])
-                corr, thresholds = self._of(at)
+                corr, thresholds = take(self.low, at)
                 judged = judge(project(_pose(matrix[at]), corr), corr, thresholds)
                 inliers[at] = (judged.weights > 0).sum(-1)
             needed = samples_needed(inliers[active], samples.counts[active], samples.size, plan.confidence)
@@ -133,44 +129,38 @@ class Search:
         return Found(_orthonormal(_pose(matrix.to(self.corr.weights))), loss, poses, drawn)
 
     def _round(self, done: int) -> int:
-        """How many samples come after the first ``done``."""
-        return min(max(self.plan.min_samples, int(GROWTH * done)), self.plan.chunk_size)
-
-    def _of(self, problems: Tensor) -> tuple[Correspondences, Thresholds]:
-        """Correspondences and thresholds of some problems."""
-        return take(self.low, problems), Thresholds(*(x[problems] for x in self.thresholds))
+        """Number of samples of the round after the first ``done`` samples."""
+        return min(max(self.plan.min_samples, int(_GROWTH * done)), self.plan.chunk_size)
 
     def _best_of_samples(self, problems: Tensor, start: int, stop: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Losses (P, K), ascending, and matrices (P, K, 3, 4) of the best poses of some samples, how many there are."""
+        """Losses (P, K), ascending, and matrices (P, K, 3, 4) of the best poses; number of poses of the samples."""
         scene = self.scene.of(problems)
         positions = self.samples.positions(problems, start, stop)  # (P, H, s)
         batch, count, size = positions.shape
         rows = (positions + problems[:, None, None] * self.corr.weights.shape[1]).flatten(0, 1)  # (P H, s)
-        # Some arithmetic rounds differently in what is left over from a processor's vectors: nothing is left over, so
-        # that a sample has the same poses wherever it stands.
+        # Some arithmetic rounds differently in the remainder of a processor's vectors. With full vectors a sample has
+        # the same poses at any place in the batch.
         rows = full_vectors(rows)
         values = self.pairs.index_select(0, rows.flatten()).view(-1, size, 6)
         world, img, weights = values.split((3, 2, 1), -1)
         owners = full_vectors(problems.repeat_interleave(count))
-        img_scale, world_scale = (
-            None if x is None else x[owners] for x in (self.corr.img_scale, self.corr.world_scale)
-        )
+        img_scale, world_scale = take((self.corr.img_scale, self.corr.world_scale), owners)
         sample = Correspondences(world, img, weights[..., 0], self.corr.focal, img_scale, world_scale)
         solved = self.plan.minimal.hypotheses(sample)
-        valid = solved.valid & (weights[..., 0] > 0).all(-1, keepdim=True)
-        parts = (x[: batch * count].unflatten(0, (batch, count)) for x in (*solved.pose, valid))
-        rotation, translation, valid = parts
-        losses, packed = self._rank(problems, scene, scene.pack(rotation, translation), valid.mT.flatten(1))
+        solved = solved._replace(valid=solved.valid & (weights[..., 0] > 0).all(-1, keepdim=True))
+        pose, valid = map_tensors(lambda x: x[: batch * count].unflatten(0, (batch, count)), solved)
+        packed = scene.pack(pose.rotation, pose.translation)
+        losses, packed = self._rank(problems, scene, packed, valid.mT.flatten(1))
         return losses, scene.unpack(packed), valid.sum((1, 2))
 
     def _rank(self, problems: Tensor, scene: Scene, packed: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-        """The best poses and their losses; of many pairs some are scored first, then more for the better poses."""
-        pairs, width = FIRST_PAIRS, packed.shape[-1]
+        """Losses and poses of the best; of many pairs, a few score all poses first, then more pairs the best poses."""
+        pairs, width = _FIRST_PAIRS, packed.shape[-1]
         while 2 * pairs <= scene.points.shape[1]:
             some = scene.pairs(self.samples.spread(problems, pairs))
-            width = max(width // KEPT_ONE_IN, self.plan.local_candidates)
+            width = max(width // _KEPT_ONE_IN, self.plan.local_candidates)
             _, packed, valid = self._keep(some, packed, valid, width, ordered=False)
-            pairs *= KEPT_ONE_IN
+            pairs *= _KEPT_ONE_IN
         losses, packed, _ = self._keep(scene, packed, valid, self.plan.local_candidates)
         return losses, packed
 
@@ -183,7 +173,7 @@ class Search:
         return losses, packed.gather(3, order[:, None, None].expand(-1, 4, 3, -1)), valid.gather(1, order)
 
     def _improve(self, problems: Tensor, losses: Tensor, matrices: Tensor) -> tuple[Tensor, Tensor]:
-        """Improve the best poses (P, K) of some problems, then the best of them further; losses (P,), matrices."""
+        """Improve all the poses (P, K) once, then the best of each problem further; losses (P,), matrices."""
         loss, matrix = losses.flatten(), matrices.flatten(0, 1)  # (P K,), (P K, 3, 4)
         rows = problems.repeat_interleave(losses.shape[1])
         for i in range(self.plan.local_iterations):
@@ -195,31 +185,34 @@ class Search:
         return loss, matrix
 
     def _descend(self, problems: Tensor, loss: Tensor, matrix: Tensor, limit: float) -> tuple[Tensor, Tensor]:
-        """One step of least squares on the pairs within so many thresholds, where it lowers the loss."""
-        corr, thresholds = self._of(full_vectors(problems))
+        """Take one step of least squares on the pairs within ``limit`` thresholds, where it lowers the loss."""
+        corr, thresholds = take(self.low, full_vectors(problems))
         corr, start = problems_last(corr), _pose(full_vectors(matrix))
         scene = self.scene.of(problems)
-        one, damping = loss.new_tensor((1.0, DAMPING))
         projection = project(start, corr)
-        judged = judge(projection, corr, Thresholds(*(limit * x for x in thresholds)))
-        moved = lm_step(corr, start, projection, corr.weights * judged.weights, one, damping).pose
-        pose = Pose(*(x[: len(problems)] for x in moved))
-        new_loss = scene.losses(scene.pack(*(x[:, None, None] for x in pose)), self.plan.scorer)[:, 0]
-        better = (new_loss < loss) & loss.isfinite()  # what is no pose stays none
+        wide = map_tensors(lambda x: limit * x, thresholds)
+        moved = least_squares(corr, start, projection, judge(projection, corr, wide).weights)
+        pose = take(moved, slice(len(problems)))
+        packed = scene.pack(pose.rotation[:, None, None], pose.translation[:, None, None])
+        new_loss = scene.losses(packed, self.plan.scorer)[:, 0]
+        better = (new_loss < loss) & loss.isfinite()  # an invalid pose stays invalid
         new_matrix = torch.cat((pose.rotation, pose.translation[..., None]), -1)
         return torch.where(better, new_loss, loss), torch.where(better[:, None, None], new_matrix, matrix)
 
 
-def take(corr: Correspondences, at: Tensor | slice) -> Correspondences:
-    """The correspondences of some problems."""
-    img_scale, world_scale = (None if x is None else x[at] for x in (corr.img_scale, corr.world_scale))
-    return Correspondences(
-        corr.world_points[at], corr.img_points[at], corr.weights[at], corr.focal, img_scale, world_scale
-    )
+def take(tree: _T, at: Tensor | slice) -> _T:
+    """Select problems from every tensor of a tree that has a batch."""
+    return map_tensors(lambda x: x[at] if x.ndim else x, tree)
+
+
+def least_squares(corr: Correspondences, pose: Pose, projection: Projection, weights: Tensor) -> Pose:
+    """Take one step of least squares with the weights (B, N) times the weights of the pairs."""
+    one, damping = corr.weights.new_tensor((1.0, _DAMPING))
+    return lm_step(corr, pose, projection, corr.weights * weights, one, damping).pose
 
 
 def full_vectors(rows: Tensor) -> Tensor:
-    """The rows, and the first of them again until their number fills a processor's vectors."""
+    """Repeat the first row at the end until the number of rows fills a processor's vectors."""
     left_over = -len(rows) % _VECTOR
     return torch.cat((rows, rows[:1].expand(left_over, *rows.shape[1:]))) if left_over else rows
 
@@ -230,7 +223,7 @@ def _pose(matrix: Tensor) -> Pose:
 
 
 def _orthonormal(pose: Pose) -> Pose:
-    """The nearest rotation to one with rounding errors, by two steps of Newton's iteration for the polar factor."""
+    """The nearest rotation to a rotation with rounding errors, by two Newton steps for the polar factor."""
     rotation = pose.rotation
     for _ in range(2):
         rotation = 1.5 * rotation - 0.5 * rotation @ (rotation.mT @ rotation)

@@ -1,7 +1,7 @@
-"""Numbers of scalar operations, what they cost, and how many of them linear algebra takes.
+"""The cost of scalar operations, and the operation counts of linear algebra.
 
-What counts is what a scalar program would have to compute: additions, multiplications, divisions, square roots,
-exponentials, logarithms and other special functions, comparisons, logic. Moving data and changing signs count nothing.
+Counted are additions, multiplications, divisions, square roots, exponentials, logarithms and other special functions,
+comparisons, and logic. Moving data and changing signs cost nothing.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ __all__ = [
     "sort",
 ]
 
-#: What one operation of each kind costs in "flops". Source: T. Minka's Lightspeed toolbox for MATLAB 2.8 (the protocol
-#: that the paper follows): ``flops.m`` and ``flops_div``, ``_sqrt``, ``_exp``, ``_log``, which time a Pentium 4. There
-#: sines and other special functions cost as a logarithm, a change of sign and moved data cost nothing, and an absolute
-#: value (4) costs as two comparisons. Logic (and, or, not, choosing one of two) is not in that table: 1 is ours.
+#: The cost of one operation of each kind in "flops". Source: T. Minka's Lightspeed toolbox for MATLAB 2.8, which the
+#: paper follows: ``flops.m`` and ``flops_div``, ``_sqrt``, ``_exp``, ``_log`` (timed on a Pentium 4). There a sine or
+#: another special function costs as much as a logarithm, and an absolute value (4) as much as two comparisons. The
+#: table has no logic (and, or, not, choosing one of two values); its cost of 1 is ours.
 OPERATION_COSTS: dict[str, int] = {
     "add": 1,
     "multiply": 1,
@@ -39,7 +39,7 @@ OPERATION_COSTS: dict[str, int] = {
 
 @dataclass(frozen=True)
 class Operations:
-    """How many operations of each kind; they can be added, and multiplied by a number.
+    """Number of operations of each kind. Counts can be added and multiplied by a number.
 
     Example:
         >>> (3 * Operations(add=1, divide=2) + Operations(add=4)).flops
@@ -65,7 +65,7 @@ class Operations:
 
     @property
     def flops(self) -> float:
-        """The sum, weighted by :data:`~kornia_pnpnet.evaluation.operations.operations.OPERATION_COSTS`."""
+        """The sum, weighted by :data:`~kornia_pnpnet.evaluation.operations.costs.OPERATION_COSTS`."""
         return sum(OPERATION_COSTS[kind] * count for kind, count in asdict(self).items())
 
 
@@ -75,22 +75,22 @@ class Operations:
 
 
 def _half(flops: float) -> Operations:
-    """As many additions as multiplications."""
+    """Half of the flops as additions, half as multiplications."""
     return Operations(add=flops / 2, multiply=flops / 2)
 
 
 def matmul(rows: int, inner: int, columns: int) -> Operations:
-    """A product of matrices (``flops_mul``)."""
+    """Matrix product (``flops_mul``)."""
     return rows * columns * Operations(add=inner - 1, multiply=inner)
 
 
 def cholesky(n: int) -> Operations:
-    """A Cholesky factorisation (``flops_chol``)."""
+    """Cholesky factorisation (``flops_chol``)."""
     return _half((n**3 - n) / 3) + Operations(divide=n * (n - 1) / 2, sqrt=n)
 
 
 def solve_triangular(n: int, columns: int, *, unit: bool = False) -> Operations:
-    """A triangular system with several right-hand sides (``flops_solve_tri``)."""
+    """Triangular system of n unknowns with several right-hand sides (``flops_solve_tri``)."""
     return columns * (_half(n * n - n) + Operations(divide=0 if unit else n))
 
 
@@ -101,15 +101,18 @@ def lu(n: int) -> Operations:
 
 
 def solve(n: int, columns: int) -> Operations:
-    """A square system with several right-hand sides: :func:`lu` and two triangular systems."""
+    """Square system with several right-hand sides: :func:`lu` and two triangular systems."""
     return lu(n) + solve_triangular(n, columns, unit=True) + solve_triangular(n, columns)
 
 
 def sort(n: int) -> Operations:
-    r"""Sorting, or anything else that is done by sorting, with :math:`n \log_2 n` comparisons."""
+    r"""Sorting n numbers with :math:`n \log_2 n` comparisons."""
     return Operations(compare=n * math.log2(n) if n > 1 else 0)
 
 
 def smallest(n: int, k: int) -> Operations:
-    """Finding the k smallest (R. Floyd and R. Rivest, "Expected time bounds for selection", CACM 18(3), 1975)."""
+    """Selecting the k smallest of n numbers.
+
+    Source: R. Floyd and R. Rivest, "Expected time bounds for selection", CACM 18(3), 1975.
+    """
     return Operations(compare=n + min(k, n - k))

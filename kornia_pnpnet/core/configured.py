@@ -1,0 +1,41 @@
+"""Modules that remember the arguments of their constructor, for their configuration file and their text."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping
+from numbers import Integral
+from typing import Any
+
+from torch import nn
+
+__all__ = ["Configured"]
+
+
+class Configured(nn.Module):
+    """A module whose ``config`` holds the arguments of its constructor, except those that are modules.
+
+    Args:
+        arguments: ``locals()`` of the subclass's constructor, before it assigns any other variable.
+
+    Example:
+        >>> class Scale(Configured):
+        ...     def __init__(self, factor: float = 2.0) -> None:
+        ...         super().__init__(locals())
+        >>> Scale().config, Scale()
+        ({'factor': 2.0}, Scale(factor=2.0))
+    """
+
+    def __init__(self, arguments: Mapping[str, Any]) -> None:
+        super().__init__()
+        values = {name: arguments[name] for name in inspect.signature(type(self)).parameters}
+        self.config = {name: _plain(value) for name, value in values.items() if not isinstance(value, nn.Module)}
+
+    def extra_repr(self) -> str:
+        """Show the arguments of the constructor."""
+        return ", ".join(f"{name}={value!r}" for name, value in self.config.items())
+
+
+def _plain(value: Any) -> Any:
+    """NumPy's integers as Python's, which JSON can hold."""
+    return int(value) if isinstance(value, Integral) and not isinstance(value, bool) else value

@@ -1,0 +1,234 @@
+"""What exists only to be fast: compilation, memory layouts, one custom operation, the allocator's setting.
+
+Nothing here changes a result. Each part says what it buys; times are of PyTorch 2.13 on one thread of an AMD EPYC.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import Any, Generic, ParamSpec, TypeVar
+
+import torch
+from torch import Tensor
+
+from kornia_pnpnet.core.trees import iter_tensors, map_tensors
+
+__all__ = [
+    "Compiled",
+    "compiling",
+    "exporting",
+    "fold_vmap",
+    "keep_freed_memory",
+    "problems_last",
+    "repeat_problems",
+    "split_batch",
+    "take_pairs",
+    "unfold_vmap",
+]
+
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
+
+# -- switches ----------------------------------------------------------------------------------------------------------
+
+
+def compiling() -> bool:
+    """Whether ``torch.compile`` or ``torch.export`` traces: loops over chunks would break the graph."""
+    return torch.compiler.is_compiling()
+
+
+def exporting() -> bool:
+    """Whether ``torch.export`` traces: ONNX has no stable sort, no ``copysign`` and none of our custom operations."""
+    return torch.compiler.is_exporting()
+
+
+# -- memory layouts ----------------------------------------------------------------------------------------------------
+
+
+def problems_last(tree: _T) -> _T:
+    """Lay out tensors (B, N, C) as (C, N, B) in memory; shapes and values stay.
+
+    One coordinate of all problems is then one row of memory, so that elementwise operations run at full width however
+    few pairs a problem has, and a compiler can keep a problem in registers: half the time of an iteration at n = 9.
+    """
+    return map_tensors(lambda x: _reversed(_reversed(x).contiguous()) if x.ndim > 1 else x, tree)
+
+
+def repeat_problems(tree: _T, count: int) -> _T:
+    """Repeat the batch of every tensor that has one, problems last in memory.
+
+    The batch is expanded, not repeated by ``Tensor.repeat``: a compiler would compute an index by division for each
+    entry.
+    """
+
+    def repeat(x: Tensor) -> Tensor:
+        if x.ndim == 0:
+            return x
+        last = _reversed(x)[..., None, :]
+        return _reversed(last.expand(*last.shape[:-2], count, -1).flatten(-2))
+
+    return map_tensors(repeat, tree)
+
+
+def split_batch(tree: _T, count: int) -> list[_T]:
+    """Split every tensor of a tree into parts along the batch."""
+    if count == 1:
+        return [tree]
+    return [map_tensors(lambda x, i=i: x.tensor_split(count)[i], tree) for i in range(count)]
+
+
+def _reversed(x: Tensor) -> Tensor:
+    return x.permute(tuple(reversed(range(x.ndim))))
+
+
+# -- one custom operation ----------------------------------------------------------------------------------------------
+
+
+def fold_vmap(size: int, in_dims: Sequence[int | None], *tensors: Tensor) -> list[Tensor]:
+    """Make the dimension that ``torch.func.vmap`` maps a part of the batch, which is the first dimension."""
+    moved = [
+        x.expand(size, *x.shape) if dim is None else x.movedim(dim, 0) for x, dim in zip(tensors, in_dims, strict=True)
+    ]
+    return [x.flatten(0, 1) for x in moved]
+
+
+def unfold_vmap(size: int, result: Tensor) -> Tensor:
+    """Undo :func:`fold_vmap` for a result whose batch is the last dimension: the mapped dimension comes before it."""
+    return result.unflatten(-1, (size, -1))
+
+
+def _take_pairs(values: Tensor, index: Tensor) -> Tensor:
+    return values.permute(2, 1, 0).gather(1, index.mT.expand(values.shape[-1], -1, -1))
+
+
+# A compiler does not look inside, so that the result is laid out as it says. Fused into what reads it, every reader
+# would gather anew: the compiled hypotheses of the set network take a third longer.
+_take_pairs_opaque = torch.library.custom_op("kornia_pnpnet::take_pairs", _take_pairs, mutates_args=())
+
+
+@_take_pairs_opaque.register_fake
+def _(values: Tensor, index: Tensor) -> Tensor:
+    return values.new_empty(values.shape[-1], index.shape[1], index.shape[0])
+
+
+@_take_pairs_opaque.register_vmap
+def _(info: Any, in_dims: tuple[int | None, int | None], *tensors: Tensor) -> tuple[Tensor, int]:
+    return unfold_vmap(info.batch_size, _take_pairs_opaque(*fold_vmap(info.batch_size, in_dims, *tensors))), 2
+
+
+def take_pairs(values: Tensor, index: Tensor) -> Tensor:
+    """Take some pairs of each problem.
+
+    Args:
+        values: shape :math:`(B, N, C)`.
+        index: positions of pairs, int64, shape :math:`(B, K)`.
+
+    Returns:
+        Shape :math:`(C, K, B)`.
+    """
+    return (_take_pairs if exporting() else _take_pairs_opaque)(values, index)
+
+
+# -- the allocator -----------------------------------------------------------------------------------------------------
+
+# Bytes. glibc follows freed chunks up to 32 MiB with its mmap threshold (mallopt(3), M_MMAP_THRESHOLD); 64 KiB are left
+# for its header and for alignment.
+_LARGEST_KEPT = 2**25 - 2**16
+
+
+def keep_freed_memory() -> None:
+    """Let glibc keep the memory of large temporaries for the next call, for the whole process.
+
+    Without it every call asks the system anew for the memory of each tensor of more than 128 KiB, page by page: batches
+    of 1000 and more problems on a CPU take 20 to 45 % longer with ``pnpnet-set``; small batches do not change. The
+    process then holds up to 64 MiB of freed memory. Other allocators, and a glibc whose thresholds were set, stay as
+    they are. Nothing calls this function but the command ``pnpnet`` and the benchmarks: a library must not decide for
+    its process.
+
+    Example:
+        >>> keep_freed_memory()
+    """
+    torch.empty(_LARGEST_KEPT, dtype=torch.uint8, device="cpu")  # freed at once, and never touched
+
+
+# -- compilation -------------------------------------------------------------------------------------------------------
+
+# Each solver counts its own compilations: numbers of pairs, dtypes, with and without gradients.
+_LIMITS: dict[str, Any] = {"recompile_limit": 64, "isolate_recompiles": True}
+
+# Pairs. From this number on, the loop order that the CPU compiler of PyTorch 2.13 chooses can give wrong results where
+# a problem has more pairs than the batch has problems (it transposes vectors of 16 numbers). The given order is then
+# kept, which takes up to half as long again.
+_MANY_PAIRS = 16
+
+
+class Compiled(Generic[_P, _T]):
+    r"""A function of batches that is compiled when it is first called.
+
+    The first dimension of its tensors, the batch, may change without a new compilation, except to or from a batch of
+    one. Other sizes, dtypes, and whether gradients are recorded are compiled for anew. When compilation fails, because
+    there is no C++ compiler or because the function cannot be traced, the function runs uncompiled after one warning.
+
+    Args:
+        function: takes tensors and nested tuples of tensors. The first dimension of each tensor that has one is the
+            batch.
+        mode: mode of ``torch.compile``.
+
+    Example:
+        >>> double = Compiled(lambda x: 2 * x)
+        >>> double.function(torch.ones(2))
+        tensor([2., 2.])
+    """
+
+    def __init__(self, function: Callable[_P, _T], mode: str | None = None) -> None:
+        self.function = function
+        self.mode = mode
+        # `vec_isa_ok` skips asking the C++ compiler for each instruction set: half of the first compilation.
+        options = {**torch._inductor.list_mode_options(mode or "default"), "cpp.vec_isa_ok": True}
+        options["guard_filter_fn"] = _is_worth_checking
+        few, many = (
+            torch.compile(function, fullgraph=True, options=more, **_LIMITS)
+            for more in (options, {**options, "pick_loop_orders": False})
+        )
+        self._compiled = {False: few, True: many}
+        self._failed = False
+        self._seen: set[tuple[torch.Size, torch.dtype, int, bool]] = set()
+
+    def __reduce__(self) -> tuple[type[Compiled[_P, _T]], tuple[Callable[_P, _T], str | None]]:
+        """Copies and other processes compile for themselves."""
+        return type(self), (self.function, self.mode)
+
+    def __call__(self, *args: _P.args, **kwargs: _P.kwargs) -> _T:
+        """Call the function."""
+        if self._failed or compiling():
+            return self.function(*args, **kwargs)
+        tensors = list(iter_tensors(args))
+        first = tensors[0]
+        kind = first.shape, first.dtype, len(tensors), torch.is_grad_enabled()
+        compiled = self._compiled[first.ndim > 1 and first.shape[1] >= _MANY_PAIRS]
+        errors = torch._dynamo.exc.TorchDynamoException, torch._inductor.exc.InductorError
+        if kind in self._seen:
+            with suppress(*errors):  # recompiling may warn, and warnings may be errors here: try again without them
+                return compiled(*args, **kwargs)
+        try:
+            for tensor in tensors:
+                if tensor.ndim and tensor.shape[0] > 1:
+                    torch._dynamo.maybe_mark_dynamic(tensor, 0)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # warnings of the compiler about itself
+                result = compiled(*args, **kwargs)
+            self._seen.add(kind)
+            return result
+        except errors as error:
+            result = self.function(*args, **kwargs)  # a mistake of the caller raises here as it would anywhere
+            self._failed = True
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            warnings.warn(f"Not compiled, running uncompiled. {reason[:300]}", RuntimeWarning, stacklevel=3)
+            return result
+
+
+def _is_worth_checking(guards: Sequence[Any]) -> list[bool]:
+    """Skip checks of functions and constants of modules, which do not change: they take time at each call."""
+    return [guard.guard_type == "DUPLICATE_INPUT" or not guard.is_global for guard in guards]

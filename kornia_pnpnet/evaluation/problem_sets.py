@@ -1,0 +1,157 @@
+"""Sets of problems by the names that a user types: sources (synthetic data and scenes) and numbers of outliers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+from typing import Any
+
+import torch
+from kornia.core.exceptions import ValueCheckError
+
+from kornia_pnpnet.data import (
+    MixedProblems,
+    OutlierMix,
+    Scene,
+    SceneProblems,
+    SlabPoints,
+    SyntheticProblems,
+    load_scene,
+)
+from kornia_pnpnet.evaluation.comparison import EvaluationData, draw_problems
+
+__all__ = ["DEFAULT_SEED", "PRIORS", "evaluation_sets"]
+
+#: Seed of the problems that solvers are compared on. Nothing is trained or tuned on this seed.
+DEFAULT_SEED = 12345
+
+_slab = partial(SyntheticProblems, points=SlabPoints())
+#: Synthetic data by the name of a source: the name in results files (the names of conf/data), and the constructor.
+PRIORS: dict[str, tuple[str, Callable[..., SyntheticProblems | MixedProblems]]] = {
+    "synthetic": ("paper", SyntheticProblems),
+    "gaussian_pose": ("gaussian_pose", partial(SyntheticProblems, translation_sigma=25.0)),
+    "any_rotation": ("any_rotation", partial(SyntheticProblems, max_angle=math.pi)),
+    "slab": ("slab", _slab),
+    "mixed": ("mixed", partial(MixedProblems, [SyntheticProblems, _slab])),
+}
+
+# Problems per drawn batch. A constant, so that a smaller count gives the first problems of a larger one.
+_DRAW_BATCH = 1000
+
+
+def _outlier_mix(word: str, n: int, mismatch_share: float) -> OutlierMix:
+    """Read one word of ``--outliers``: ``none``, ``uniform``, ``2`` or ``50%``."""
+    if word == "uniform":
+        return OutlierMix(mismatch_share=mismatch_share)
+    if word == "none" or word.isdecimal():
+        count = 0 if word == "none" else int(word)
+    else:
+        try:
+            share = float(word[:-1]) / 100 if word.endswith("%") else -1.0
+        except ValueError:
+            share = -1.0
+        if not 0 <= share <= 1:
+            raise ValueCheckError(
+                f"--outliers: expected none, uniform, numbers or shares like 50%, separated by commas, got {word!r}"
+            )
+        count = OutlierMix(max_ratio=share).max_count(n)
+    if count > n:
+        raise ValueCheckError(f"--outliers: {count} outliers do not fit into n = {n} pairs")
+    return OutlierMix(count=count, mismatch_share=mismatch_share)
+
+
+def _outlier_mixes(text: str, n: int, mismatches_only: bool) -> dict[str, tuple[OutlierMix, str | int]]:
+    """Read ``--outliers``: for each label the mix and its number in results (``none``, ``uniform`` or an integer)."""
+    one, many = ("mismatch", "mismatches") if mismatches_only else ("outlier", "outliers")
+    mixes: dict[str, tuple[OutlierMix, str | int]] = {}
+    for word in (part.strip() for part in text.split(",")):
+        mix = _outlier_mix(word, n, 1.0 if mismatches_only else 0.5)
+        if mix.count is None:
+            mixes[f"0-{mix.max_count(n)} {many}"] = mix, "uniform"
+        else:
+            mixes[f"{mix.count} {one if mix.count == 1 else many}"] = mix, mix.count or "none"
+    return mixes
+
+
+def evaluation_sets(
+    sources: Iterable[str],
+    outliers: str,
+    *,
+    n: int | Iterable[int],
+    count: int,
+    seed: int = DEFAULT_SEED,
+    metric: bool = True,
+    mismatches_only: bool = False,
+    known_noise: bool = False,
+    dtype: torch.dtype = torch.float32,
+) -> dict[str, EvaluationData]:
+    """Draw sets of problems on the CPU.
+
+    Args:
+        sources: names of :data:`PRIORS`, folders with COLMAP models, or ``.npz`` files of raw matches.
+        outliers: ``none``, ``uniform``, numbers or shares like ``50%``, separated by commas.
+        n: pairs per problem, one number or several.
+        count: problems per set.
+        seed: seed of the problems.
+        metric: whether the scenes are in metres.
+        mismatches_only: an outlier is the pixel of another point, a different one for each outlier, and never a random
+            pixel.
+        known_noise: pass the noise level of synthetic problems to the solvers. The problems are the same.
+        dtype: dtype of the problems. They are drawn in float64 and then converted.
+
+    Returns:
+        One set for each source, n and mix of outliers, by name. Each description has the keys ``source`` (the prior or
+        the scene's name), ``outliers`` (``"none"``, ``"uniform"`` or their number), ``mismatch_share``, ``seed`` and,
+        for scenes, ``path``.
+
+    Raises:
+        BaseError: when a source or a mix cannot be used.
+        FileNotFoundError: when a source does not exist.
+        ImportError: when a source needs a package that is not installed.
+    """
+    sizes = [n] if isinstance(n, int) else list(n)
+    if min(sizes) < 3:
+        raise ValueCheckError(f"--n: a pose needs at least 3 pairs, got {min(sizes)}")
+    mixes = {size: _outlier_mixes(outliers, size, mismatches_only) for size in sizes}  # checked before any is drawn
+    sets: dict[str, EvaluationData] = {}
+    for source in dict.fromkeys(sources):
+        try:
+            scene = None if source in PRIORS else load_scene(source, metric=metric)
+            name = source if scene is None else scene.name
+            if any(key.startswith(f"{name}, ") for key in sets):
+                name = source  # another scene of the same name
+            for size in sizes:
+                for label, (mix, number) in mixes[size].items():
+                    options = {"n": size, "outliers": mix, "seed": seed, "dtype": dtype, "batch_size": _DRAW_BATCH}
+                    options |= {"known_noise": 1.0} if known_noise and scene is None else {}
+                    # A mismatch takes the pixel of a spare point. With one spare, all mismatches would share a pixel
+                    # and agree on a wrong pose.
+                    spares = max(1, mix.max_count(size)) if mismatches_only else 1
+                    drawn = _draw_set(source, scene, count, spares, options)
+                    described = {"outliers": number, "mismatch_share": mix.mismatch_share, "seed": seed}
+                    # Raw matches already contain outliers; those of the mix come on top.
+                    added = "+" if scene is not None and source.endswith(".npz") else ""
+                    noise = ", noise told" if known_noise and scene is None else ""
+                    sets[f"{name}, n = {size}, {added}{label}{noise}"] = drawn._replace(
+                        description={**drawn.description, **described}
+                    )
+        except ValueError as error:
+            raise ValueCheckError(f"{source}: {error}") from error
+    return sets
+
+
+def _draw_set(
+    source: str, scene: Scene | None, count: int, num_spares: int, options: Mapping[str, Any]
+) -> EvaluationData:
+    """Draw the problems of one set; the description names their source."""
+    if scene is None:
+        prior, make = PRIORS[source]
+        return EvaluationData(draw_problems(make(**options), count), description={"source": prior})
+    drawn = SceneProblems(scene, num_spares=num_spares, **options)
+    return EvaluationData(
+        draw_problems(drawn, count),
+        max_translation=drawn.max_translation,
+        unit="m" if scene.metric else "",
+        description={"source": scene.name, "path": source},
+    )

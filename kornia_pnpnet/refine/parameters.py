@@ -1,0 +1,51 @@
+"""Hyperparameters that are learned without bounds and used within bounds."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from kornia.core.check import KORNIA_CHECK
+from torch import Tensor, nn
+
+from kornia_pnpnet.core.checks import check_numbers, check_whole
+
+__all__ = ["BoundedParameter"]
+
+
+class BoundedParameter(nn.Module):
+    r"""Values that are learned without bounds and used within bounds.
+
+    The free parameter passes a sigmoid onto ``[lower, upper]``, in log space when ``logarithmic``.
+
+    Args:
+        initial: first value of each entry, between the bounds. A value at a bound never changes.
+        size: number of entries.
+        lower: lower bound.
+        upper: upper bound.
+        logarithmic: interpolate the logarithm; the bounds must be positive.
+
+    Raises:
+        BaseError: when the bounds do not rise, or ``initial`` is not between the bounds.
+
+    Example:
+        >>> BoundedParameter(1e-3, size=2, lower=1e-6, upper=1.0, logarithmic=True)()
+        tensor([0.0010, 0.0010], grad_fn=<ExpBackward0>)
+    """
+
+    def __init__(self, initial: float, *, size: int, lower: float, upper: float, logarithmic: bool = False) -> None:
+        super().__init__()
+        check_whole(1, size=size)
+        check_numbers(-math.inf, lower=lower, upper=upper)
+        KORNIA_CHECK(lower < upper, f"The bounds must rise, got {lower} and {upper}.")
+        KORNIA_CHECK(not logarithmic or lower > 0, f"The bounds of a logarithm must be positive, got {lower}.")
+        KORNIA_CHECK(lower <= initial <= upper, f"The initial value {initial} must lie between {lower} and {upper}.")
+        self._logarithmic = logarithmic
+        self._lower, self._upper = (math.log(lower), math.log(upper)) if logarithmic else (lower, upper)
+        share = ((math.log(initial) if logarithmic else initial) - self._lower) / (self._upper - self._lower)
+        self.raw = nn.Parameter(torch.full((size,), share).logit())
+
+    def forward(self) -> Tensor:
+        """Return the bounded values, shape ``(size,)``."""
+        value = self._lower + (self._upper - self._lower) * torch.sigmoid(self.raw)
+        return value.exp() if self._logarithmic else value

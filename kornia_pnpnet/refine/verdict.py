@@ -1,0 +1,239 @@
+r"""Is this pose to be believed? Whether it explains the pixels, and whether its inliers could be chance.
+
+A pair is an inlier of a pose when :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`, with the threshold :math:`\tau` in
+pixels and the pixels by which a shift of the world point by the threshold :math:`\omega` moves its projection at the
+depth :math:`z`. The ratio of the two sides is the *standardised* squared residual.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kornia_pnpnet.core.performance import exporting
+from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.geometry import Projection
+from kornia_pnpnet.types import Correspondences
+
+__all__ = [
+    "MAX_ERROR",
+    "MAX_FALSE_ALARMS",
+    "MIN_PAIRS",
+    "Judged",
+    "Thresholds",
+    "chance_of_inlier",
+    "explains",
+    "has_enough",
+    "is_evident",
+    "judge",
+    "log_false_alarms",
+]
+
+#: Pairs that determine a pose up to a few solutions.
+MIN_PAIRS = 3
+#: Largest standardised squared residual; points behind the camera have it.
+MAX_ERROR = 1e6
+#: A pose is evident when fewer poses than this are expected to have as many inliers by chance.
+MAX_FALSE_ALARMS = 0.01
+# Standard deviations. Pairs further off than this are no evidence for a pose.
+_EVIDENT = 3.5
+# A pose explains the pixels when this share of the pairs (by weight) has small residuals. Just below 0.6, so that a sum
+# of shares that is 0.6 up to rounding suffices.
+_EXPLAINED_SHARE = 0.6 - 1e-5
+# A residual is small when it is below this share of the pixels' spread. A compromise: points behind the camera nearly
+# always leave larger residuals, small objects with noise of a tenth of their size leave smaller residuals.
+_EXPLAINED_RESIDUAL = 0.2
+
+
+def has_enough(projection: Projection, weights: Tensor) -> Tensor:
+    """Tell whether at least three pairs that have a weight are in front of the camera, bool (B,)."""
+    return (projection.in_front & (weights > 0)).sum(-1) >= MIN_PAIRS
+
+
+def explains(projection: Projection, corr: Correspondences, weights: Tensor) -> Tensor:
+    r"""Tell whether a pose explains the pixels, when the noise is unknown.
+
+    A pose explains the pixels when at least three pairs are in front of the camera, and when the residual that 60 % of
+    the pairs (by weight) stay below is less than a fifth of the distance from their mean that 60 % of the pixels stay
+    below: a pose hardly better than "everything is at one point" is no answer. Both sides scale with the image, so that
+    no threshold is in pixels.
+
+    Args:
+        projection: :func:`~kornia_pnpnet.geometry.project` of the pose.
+        corr: normalised correspondences.
+        weights: weight of each pair before its residual was looked at, :math:`(B, N)`.
+
+    Returns:
+        bool of shape :math:`(B,)`.
+    """
+    weights = weights.detach()
+    share = weights / weights.sum(-1, keepdim=True).clamp(min=torch.finfo(weights.dtype).tiny)  # (B, N)
+    pixels = corr.img_points.detach()
+    spread = (pixels - (share[..., None] * pixels).sum(1, keepdim=True)).square().sum(-1)
+    ascending, order = spread.sort(-1)
+    position = (share.gather(-1, order).cumsum(-1) < _EXPLAINED_SHARE).sum(-1, keepdim=True)
+    limit = _EXPLAINED_RESIDUAL**2 * ascending.gather(-1, position.clamp(max=ascending.shape[-1] - 1))
+    explained = projection.in_front & (projection.sq_residual.detach() <= limit)
+    enough = torch.where(explained, share, 0.0).sum(-1) >= _EXPLAINED_SHARE
+    return enough & has_enough(projection, weights)
+
+
+def is_evident(projection: Projection, corr: Correspondences) -> Tensor:
+    """Tell whether a pose has more inliers than chance would give it, when the noise is known for every pair.
+
+    Args:
+        projection: :func:`~kornia_pnpnet.geometry.project` of the pose.
+        corr: normalised correspondences with their noise.
+
+    Returns:
+        bool of shape :math:`(B,)`.
+    """
+    projection, corr = map_tensors(torch.Tensor.detach, projection), corr.map(torch.Tensor.detach)
+    assert corr.noise is not None
+    thresholds = Thresholds(_EVIDENT * corr.noise.img, _EVIDENT * corr.noise.world)
+    judged = judge(projection, corr, thresholds)
+    inliers, counts = (judged.weights > 0).sum(-1), (corr.weights > 0).sum(-1)
+    chance = chance_of_inlier(corr, thresholds, judged)
+    return log_false_alarms(counts, inliers, counts, chance) < math.log(MAX_FALSE_ALARMS)
+
+
+class Thresholds(NamedTuple):
+    r"""The thresholds of an inlier in each problem.
+
+    Attributes:
+        img: :math:`\tau` in pixels of the normalised camera, shape :math:`(B,)` or :math:`(B, N)`.
+        world: :math:`\omega` in units of the normalised world, shape :math:`(B,)` or :math:`(B, N)`.
+    """
+
+    img: Tensor
+    world: Tensor
+
+
+class Judged(NamedTuple):
+    r"""Inliers and residuals of one pose per problem.
+
+    Attributes:
+        weights: :math:`\tau^2 / (\tau^2 + (f \omega / z)^2)` for inliers, which is 1 without a threshold in the world,
+            and 0 for all others, shape :math:`(B, N)`.
+        errors: standardised squared residuals, below 1 for inliers, :data:`MAX_ERROR` behind the camera, shape
+            :math:`(B, N)`.
+    """
+
+    weights: Tensor
+    errors: Tensor
+
+
+def judge(projection: Projection, corr: Correspondences, thresholds: Thresholds) -> Judged:
+    """Tell which pairs are inliers of a pose, and how precise the inliers are.
+
+    Args:
+        projection: :func:`~kornia_pnpnet.geometry.project` of a pose for each problem.
+        corr: normalised correspondences. Pairs without weight are no inliers.
+        thresholds: what counts as an inlier.
+
+    Returns:
+        Weights and errors of the pairs.
+
+    Example:
+        >>> from kornia_pnpnet.geometry import project
+        >>> from kornia_pnpnet.types import Pose
+        >>> points = torch.tensor([[[0.0, 0.0, 4.0], [1.0, 0.0, 4.0]]])
+        >>> corr = Correspondences(points, torch.zeros(1, 2, 2), torch.ones(1, 2), torch.tensor(100.0))
+        >>> projection = project(Pose(torch.eye(3)[None], torch.zeros(1, 3)), corr)
+        >>> judge(projection, corr, Thresholds(torch.tensor([10.0]), torch.tensor([0.0])))
+        Judged(weights=tensor([[1., 0.]]), errors=tensor([[0.0000, 6.2500]]))
+    """
+    img, world = map(_of_pairs, thresholds)
+    sq_img = img.square()
+    sq_limit = sq_img + (corr.focal * world * projection.inv_depth).square()
+    errors = projection.sq_residual / sq_limit
+    errors = torch.where(projection.in_front, errors, MAX_ERROR)
+    inlier = (errors < 1.0) & (corr.weights > 0)
+    return Judged(torch.where(inlier, sq_img / sq_limit, 0.0), errors)
+
+
+def chance_of_inlier(corr: Correspondences, thresholds: Thresholds, judged: Judged) -> Tensor:
+    r"""Probability that a pixel anywhere among the pixels of a problem fits as well as the worst inlier does.
+
+    Such a pixel is uniform in the smallest axis-parallel box around the pixels. It fits when it falls into the disc
+    around a projection whose radius is the worst inlier's share of its threshold. The disc covers at most its area, and
+    at most the strips of the box that are as wide as the disc. The mean over the inliers is returned.
+
+    Args:
+        corr: normalised correspondences.
+        thresholds: what counts as an inlier.
+        judged: what :func:`judge` returned.
+
+    Returns:
+        At most 1, shape :math:`(B,)`.
+
+    Example:
+        >>> pixels = torch.tensor([[[0.0, 0.0], [400.0, 0.0], [0.0, 200.0]]])
+        >>> corr = Correspondences(torch.zeros(1, 3, 3), pixels, torch.ones(1, 3), torch.tensor(100.0))
+        >>> judged = Judged(torch.ones(1, 3), torch.tensor([[0.0, 0.1, 0.25]]))  # the worst is 5 px off
+        >>> chance_of_inlier(corr, Thresholds(torch.tensor([10.0]), torch.tensor([0.0])), judged) * 400 * 200
+        tensor([78.5398])
+    """
+    there, inlier = corr.weights[..., None] > 0, judged.weights > 0
+    high = torch.where(there, corr.img_points, -torch.inf).amax(1)
+    low = torch.where(there, corr.img_points, torch.inf).amin(1)
+    eps = torch.finfo(high.dtype).eps  # a perfect fit of pixels that all coincide is no evidence
+    sides = (high - low).clamp(min=eps)[:, None]  # (B, 1, 2)
+    worst = torch.where(inlier, judged.errors, 0.0).amax(-1, keepdim=True).clamp(min=eps)
+    sq_radius = worst * _of_pairs(thresholds.img).square() / torch.where(inlier, judged.weights, 1.0)
+    strips = 2.0 * sq_radius.sqrt()[..., None] / sides  # (B, N, 2)
+    chance = (0.25 * math.pi * strips.prod(-1)).minimum(strips.amin(-1)).clamp(max=1.0)
+    return torch.where(inlier, chance, 0.0).sum(-1) / inlier.sum(-1).clamp(min=1)
+
+
+def _of_pairs(threshold: Tensor) -> Tensor:
+    """Thresholds of problems as thresholds of their pairs."""
+    return threshold[:, None] if threshold.ndim == 1 else threshold
+
+
+def log_false_alarms(tested: Tensor, inliers: Tensor, counts: Tensor, chance: Tensor) -> Tensor:
+    r"""Natural logarithm of the number of poses that are expected to have as many inliers by chance.
+
+    Three pairs give a pose, which leaves :math:`\binom{c - 3}{k - 3}` ways to choose the other inliers. Each of them is
+    an inlier by chance with the probability :math:`p`, and every tested pose is another chance. So the expected number
+    of such poses is at most :math:`T \binom{c-3}{k-3} p^{k-3}`.
+
+    Source: L. Moisan and B. Stival, "A probabilistic criterion to detect rigid point matches between two images and
+    estimate the fundamental matrix", IJCV 57(3), 2004; P. Moulon, P. Monasse and R. Marlet, "Adaptive structure from
+    motion with a contrario model estimation", ACCV 2012. These count the poses that could be tested; here the poses
+    that were tested count.
+
+    Args:
+        tested: number of poses :math:`T` that were tested, shape :math:`(B,)`.
+        inliers: number of inliers :math:`k` of the best pose, shape :math:`(B,)`.
+        counts: number of pairs :math:`c`, shape :math:`(B,)`.
+        chance: probability :math:`p` that a pixel from anywhere is an inlier, shape :math:`(B,)`.
+
+    Returns:
+        float64 of shape :math:`(B,)`; with fewer than three inliers the logarithm of the number of tested poses.
+
+    Example:
+        >>> chance = torch.tensor([1e-4, 1e-4, 1e-4], dtype=torch.float64)
+        >>> log_false_alarms(torch.tensor(100), torch.tensor([3, 4, 6]), torch.tensor([9, 9, 9]), chance)
+        tensor([  4.6052,  -2.8134, -20.0301], dtype=torch.float64)
+    """
+    extra = (inliers - MIN_PAIRS).clamp(min=0).double()
+    free = torch.maximum((counts - MIN_PAIRS).clamp(min=0).double(), extra)
+    ways = _log_factorial(free) - _log_factorial(extra) - _log_factorial(free - extra)
+    tiny = torch.finfo(torch.float64).tiny
+    return tested.clamp(min=1).double().log() + ways + extra * chance.double().clamp(min=tiny).log()
+
+
+def _log_factorial(x: Tensor) -> Tensor:
+    r"""Logarithm of :math:`x!` for integers :math:`x \ge 0`, in float64."""
+    if not exporting():
+        return torch.lgamma(x + 1)
+    # ONNX has no log-gamma. Stirling's series of Γ(x + 9), which is Γ(x + 1) times eight factors: 12 digits.
+    y = x + 9.0
+    inv, sq = y.reciprocal(), y.reciprocal().square()
+    series = inv * (1 / 12 - sq * (1 / 360 - sq * (1 / 1260 - sq / 1680)))
+    factors = math.prod(x + i for i in range(1, 9))
+    return (y - 0.5) * y.log() - y + 0.5 * math.log(2.0 * math.pi) + series - torch.as_tensor(factors).log()

@@ -1,0 +1,266 @@
+"""The state of a training run and what one update does to it."""
+
+from __future__ import annotations
+
+import logging
+import resource
+import sys
+import threading
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from lightning_fabric import Fabric
+from torch import Tensor, nn
+
+from kornia_pnpnet.core.schema import Count
+from kornia_pnpnet.losses import LossTerms, PoseLoss, SetLoss
+from kornia_pnpnet.solver import PnPNet
+from kornia_pnpnet.training.checkpoint import (
+    CHECKPOINT_NAME,
+    History,
+    StageClock,
+    TrainingError,
+    load_checkpoint,
+    save_checkpoint,
+)
+from kornia_pnpnet.training.settings import TrainSettings
+from kornia_pnpnet.training.validation import CURVES, validate
+from kornia_pnpnet.types import Problems
+
+__all__ = ["FitReport", "Run", "describe_shares"]
+
+_log = logging.getLogger(__name__)
+
+# Parts of an update. The rest is between updates: rows of the learning curves, validations, checkpoints.
+_STAGES = ("data", "forward", "backward", "optimizer", "rest")
+
+
+@dataclass(frozen=True)
+class FitReport:
+    """Report of one call of :func:`fit`.
+
+    Attributes:
+        start: updates done by earlier calls.
+        update: updates done in all.
+        skipped: steps skipped in all, because the loss or the gradient was not finite.
+        interrupted: whether a signal ended the call early. The checkpoint is saved.
+        seconds: wall-clock time of this call.
+        updates_per_second: updates per second of this call.
+        time_shares: shares of ``seconds`` spent waiting for data, on forward, backward, optimizer, and the rest.
+        peak_memory_mib: largest resident memory of this process, or largest allocation on the GPU that is used.
+    """
+
+    start: Count
+    update: Count
+    skipped: Count
+    interrupted: bool
+    seconds: float
+    updates_per_second: float
+    time_shares: dict[str, float]
+    peak_memory_mib: float
+
+
+def _peak_memory_mib(device: torch.device) -> float:
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / 2**20
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (2**20 if sys.platform == "darwin" else 2**10)  # bytes on macOS, KiB elsewhere
+
+
+class _Step(NamedTuple):
+    """Values of one update that the learning curves show."""
+
+    terms: LossTerms
+    ramp: float
+    lr: float
+    grad_norm: Tensor
+
+
+class Run:
+    """State of a run: solver, optimizer, update, learning curves, clock. A checkpoint in the folder is continued."""
+
+    def __init__(
+        self,
+        model: PnPNet,
+        loss: PoseLoss | SetLoss,
+        validation: Mapping[str, Problems],
+        settings: TrainSettings,
+        folder: Path,
+        fabric: Fabric,
+        identity: Mapping[str, Any],
+        resume: bool,
+    ) -> None:
+        self.model, self.loss, self.settings, self.fabric = model, loss, settings, fabric
+        self.identity = _plain({"settings": asdict(settings), "model": model.config(), **identity})
+        self.checkpoint = folder / CHECKPOINT_NAME
+        self.update, self.skipped, self.interrupted = 0, 0, False
+        self.rates = ""  # success rates of the last validation, for the progress bar
+        state = None
+        if self.checkpoint.exists():
+            if not resume:
+                raise TrainingError(
+                    f"{self.checkpoint} exists: pass resume=true to continue, or choose another folder."
+                )
+            state = load_checkpoint(self.checkpoint, self.identity)
+            self.update, self.skipped = state["update"], state["skipped"]
+            model.load_state_dict(state["model"])
+        self.start = self.update
+
+        parts = ((model.init, settings.lr), (model.refine, settings.lr_refine))
+        trained = [([p for p in part.parameters() if p.requires_grad], lr) for part, lr in parts if part is not None]
+        groups = [{"params": params, "lr": lr, "initial_lr": lr} for params, lr in trained if params]
+        self.parameters = [p for params, _ in trained for p in params]
+        self.optimizer = torch.optim.Adam(groups, fused=True)
+        self.solver, self.fabric_optimizer = fabric.setup(model, self.optimizer)
+        self.solver.mark_forward_method("with_guess")
+        if state is not None:  # after the parameters are on their device, so that Adam's state follows them
+            for group in state["optimizer"]["param_groups"]:
+                group["fused"] = True  # changes how a step is computed, not its result
+            self.optimizer.load_state_dict(state["optimizer"])
+
+        self.validation = {name: problems.map(lambda x: x.to(fabric.device)) for name, problems in validation.items()}
+        columns = ["update", *LossTerms._fields, "ramp", "lr", "grad_norm", "skipped", "updates_per_second"]
+        columns += [*(f"{stage}_share" for stage in _STAGES), "peak_memory_mib"]
+        columns += [f"val/{name}/{column}" for name in validation for column in CURVES]
+        self.history = History(folder, columns, self.start) if fabric.is_global_zero else None
+        model.train()
+        self.clock = StageClock(*_STAGES)
+        self.logged_update, self.logged_seconds = self.start, dict(self.clock.seconds)
+
+    @property
+    def finished(self) -> bool:
+        """Whether all updates are done."""
+        return self.update >= self.settings.updates
+
+    def share(self, problems: Problems) -> Problems:
+        """Every ``world_size``-th problem: the batches of all processes together are the batch of one process."""
+        part = slice(self.fabric.global_rank, None, self.fabric.world_size)
+        return problems.map(lambda x: x[part].to(self.fabric.device))
+
+    def forward(self, problems: Problems, ramp: float) -> LossTerms:
+        """Solve the problems and compare the results with the true poses."""
+        inputs = problems.world_points, problems.img_points, problems.intrinsics
+        options = {**problems.sigmas, "first_stage_only": ramp == 0.0}
+        if isinstance(self.loss, SetLoss):
+            result, guess = self.solver.with_guess(*inputs, **options)
+            return self.loss(result, problems, ramp, guess)
+        return self.loss(self.solver(*inputs, **options), problems, ramp)
+
+    def step(self, problems: Problems, stop: threading.Event) -> _Step:
+        """One update, skipped when the loss or the gradient is not finite."""
+        factor, ramp = self.settings.lr_factor(self.update), self.settings.ramp_factor(self.update)
+        for group in self.optimizer.param_groups:
+            group["lr"] = group["initial_lr"] * factor
+        terms = self.forward(problems, ramp)
+        # The zero keeps the refiner in the graph before the ramp: processes expect gradients of every parameter.
+        unused = sum(p.sum() for p in self.model.refine.parameters() if p.requires_grad) if ramp == 0.0 else 0.0
+        self.clock.lap("forward")
+        self.optimizer.zero_grad()
+        self.fabric.backward(terms.total + 0.0 * unused)
+        self.clock.lap("backward")
+        norm = nn.utils.clip_grad_norm_(self.parameters, self.settings.clip)
+        # All processes must take the same branch, whichever process saw the bad number or the signal.
+        bad, stopped = _agree(self.fabric, not bool(torch.isfinite(terms.total + norm)), stop.is_set())
+        self.update += 1
+        if bad:
+            self.skip()
+        else:
+            self.fabric_optimizer.step()
+        self.clock.lap("optimizer")
+        self.interrupted = stopped and not self.finished
+        return _Step(terms, ramp, self.settings.lr * factor, norm)
+
+    def skip(self) -> None:
+        """Count a step that is not finite. Too many such steps end the run."""
+        self.skipped += 1
+        if self.fabric.is_global_zero:
+            _log.warning("update %s: loss or gradient not finite, step skipped (%s so far)", self.update, self.skipped)
+        if self.skipped > self.settings.max_skipped:
+            raise TrainingError(
+                f"{self.skipped} steps had a loss or a gradient that is not finite, more than max_skipped = "
+                f"{self.settings.max_skipped}, up to update {self.update}. Lower the learning rate or check the data."
+            )
+
+    def log(self, step: _Step, validates: bool) -> None:
+        """Append a row to the learning curves, with a validation or without."""
+        means = _mean(self.fabric, torch.stack([term.detach() for term in step.terms]))
+        if self.history is None:
+            return
+        self.clock.lap("rest")
+        shares = self.clock.shares(self.logged_seconds)
+        elapsed = sum(self.clock.seconds.values()) - sum(self.logged_seconds.values())
+        speed = (self.update - self.logged_update) / max(elapsed, 1e-9)
+        row: dict[str, float] = {"update": self.update, **dict(zip(step.terms._fields, means, strict=True))}
+        if step.ramp == 0.0:  # nothing was refined yet
+            row = {name: value for name, value in row.items() if not name.startswith("refined")}
+        row |= {"ramp": step.ramp, "lr": step.lr, "grad_norm": step.grad_norm.item(), "skipped": self.skipped}
+        row |= {"updates_per_second": speed, **{f"{stage}_share": shares[stage] for stage in _STAGES}}
+        row["peak_memory_mib"] = _peak_memory_mib(self.fabric.device)
+        if validates:
+            self.model.eval()
+            results = validate(self.model, self.validation)
+            self.model.train()
+            for name, result in results.items():
+                row |= result.curves(name)
+            self.rates = ", ".join(f"{name} {100 * result.success.rate:.1f} %" for name, result in results.items())
+            work = f"{speed:.1f} updates/s ({describe_shares(shares)}); {row['peak_memory_mib']:.0f} MiB"
+            _log.info("update %s: success %s; %s", self.update, self.rates, work)
+        self.history.write(row)
+        self.clock.lap("rest")
+        self.logged_update, self.logged_seconds = self.update, dict(self.clock.seconds)
+
+    def save(self) -> None:
+        """Write the checkpoint."""
+        if self.fabric.is_global_zero:
+            content = {"update": self.update, "skipped": self.skipped, "identity": self.identity}
+            content |= {"model": self.model.state_dict(), "optimizer": self.optimizer.state_dict()}
+            save_checkpoint(self.checkpoint, content)
+        self.fabric.barrier()
+
+    def report(self) -> FitReport:
+        """Close the learning curves and sum up."""
+        if self.history is not None:
+            self.history.close()
+        self.model.eval()
+        self.clock.lap("rest")
+        seconds = sum(self.clock.seconds.values())
+        return FitReport(
+            start=self.start,
+            update=self.update,
+            skipped=self.skipped,
+            interrupted=self.interrupted,
+            seconds=seconds,
+            updates_per_second=(self.update - self.start) / max(seconds, 1e-9),
+            time_shares=self.clock.shares(),
+            peak_memory_mib=_peak_memory_mib(self.fabric.device),
+        )
+
+
+def describe_shares(shares: Mapping[str, float]) -> str:
+    """Shares of the time as a line of a log, for example ``"data 1 %, forward 40 %"``."""
+    return ", ".join(f"{stage} {100 * share:.0f} %" for stage, share in shares.items())
+
+
+def _plain(value: Any) -> Any:
+    """Tuples as lists: what a checkpoint gives back."""
+    if isinstance(value, dict):
+        return {key: _plain(entry) for key, entry in value.items()}
+    return [_plain(entry) for entry in value] if isinstance(value, (list, tuple)) else value
+
+
+def _mean(fabric: Fabric, values: Tensor) -> list[float]:
+    """The mean of each value over all processes."""
+    if fabric.world_size > 1:
+        values = torch.as_tensor(fabric.all_reduce(values, reduce_op="mean"))
+    return values.tolist()
+
+
+def _agree(fabric: Fabric, *flags: bool) -> list[bool]:
+    """Whether each flag is set on any process."""
+    if fabric.world_size == 1:
+        return list(flags)
+    counts = fabric.all_reduce(torch.tensor(flags, dtype=torch.float32, device=fabric.device), reduce_op="sum")
+    return (torch.as_tensor(counts) > 0).tolist()

@@ -1,0 +1,78 @@
+"""Success and errors of a solver on validation sets: one summary for learning curves, results files and model cards."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from operator import attrgetter
+
+import torch
+from torch import nn
+
+from kornia_pnpnet.metrics import SuccessRate, pose_errors, success, success_rate
+from kornia_pnpnet.types import Problems
+
+__all__ = ["CURVES", "ValidationResult", "validate"]
+
+#: Columns of the learning curves, after ``val/<set>/``, and the field that each column shows.
+CURVES = {
+    "success": "success.rate",
+    "rotation_error_deg": "median_rotation_error_deg",
+    "translation_error": "median_translation_error",
+    "init_rotation_error_deg": "first_stage_median_rotation_error_deg",
+    "init_translation_error": "first_stage_median_translation_error",
+}
+
+
+@dataclass(frozen=True)
+class ValidationResult:
+    """Success (rotation error below 1°, translation error below 0.2) and errors on one validation set.
+
+    Attributes:
+        success: success rate of the refined poses.
+        first_stage_success: success rate of the initial poses.
+        median_rotation_error_deg: of the refined poses, in degrees.
+        median_translation_error: of the refined poses, in the unit of the world.
+        first_stage_median_rotation_error_deg: of the initial poses, in degrees.
+        first_stage_median_translation_error: of the initial poses, in the unit of the world.
+    """
+
+    success: SuccessRate
+    first_stage_success: SuccessRate
+    median_rotation_error_deg: float
+    median_translation_error: float
+    first_stage_median_rotation_error_deg: float
+    first_stage_median_translation_error: float
+
+    def curves(self, name: str) -> dict[str, float]:
+        """The columns of the learning curves for a set of this name."""
+        return {f"val/{name}/{column}": attrgetter(field)(self) for column, field in CURVES.items()}
+
+
+@torch.no_grad()
+def validate(model: nn.Module, validation: Mapping[str, Problems]) -> dict[str, ValidationResult]:
+    """Solve fixed problems and summarise the errors.
+
+    Args:
+        model: a solver.
+        validation: problems by the name of their set.
+
+    Returns:
+        The result of each set.
+
+    Raises:
+        ValueError: when a set has no problems.
+    """
+    results = {}
+    for name, problems in validation.items():
+        result = model(problems.world_points, problems.img_points, problems.intrinsics, **problems.sigmas)
+        refined, first = (pose_errors(pose, problems.pose) for pose in (result.pose, result.init))
+        results[name] = ValidationResult(
+            success_rate(success(refined)),
+            success_rate(success(first)),
+            refined.rotation_error_deg.median().item(),
+            refined.translation_error.median().item(),
+            first.rotation_error_deg.median().item(),
+            first.translation_error.median().item(),
+        )
+    return results

@@ -1,0 +1,80 @@
+"""Mixtures of sources and batches of varying size."""
+
+from functools import partial
+
+import pytest
+import torch
+from data_helpers import check_any_options, reprojection, same
+from hypothesis import strategies as st
+from kornia.core.exceptions import BaseError
+from strategies import ANY, COUNTS, options
+
+from kornia_pnpnet.data import BoxPoints, MixedProblems, OutlierMix, SyntheticProblems, VaryingSize
+from kornia_pnpnet.geometry import transform
+
+
+def mixed(shares=None, batch_size=60, **chosen):
+    """A mixture of three sources whose points are at the depths 1, 2 and 3."""
+    planes = [partial(SyntheticProblems, points=BoxPoints(z_near=z, depth=0.0)) for z in (1.0, 2.0, 3.0)]
+    chosen = {"world_sigma": 0.0, **chosen}
+    return MixedProblems(planes, shares=shares, batch_size=batch_size, seed=7, n=4, dtype=torch.float64, **chosen)
+
+
+@pytest.mark.parametrize("shares", [(1.0, 1.0, 1.0), (3.0, 1.0, 1.0)])
+def test_mixed_sources_have_their_shares_in_every_part_of_a_batch(shares):
+    p = mixed(shares).batch(0)
+    depth = transform(p.pose, p.world_points)[..., 2]
+    assert (depth.amax(1) - depth.amin(1)).max() < 1e-9, "a problem's points come from one source"
+    for part in (slice(60), slice(20), slice(20, 40)):
+        found = depth[part, 0].round().long().bincount(minlength=4)[1:]
+        expected = torch.tensor(shares) / sum(shares) * len(depth[part])
+        assert (found - expected).abs().max() <= 1
+
+
+def test_mixed_sources_do_not_see_the_same_random_numbers():
+    source = mixed()
+    translations = torch.cat([source.batch(i).pose.translation for i in range(3)])
+    assert len(translations.unique(dim=0)) == 180
+
+
+def test_answers_of_mixed_problems_stay_with_their_problems():
+    p = mixed(img_sigma=0.0, outliers=OutlierMix(count=1)).batch(1)
+    wrong = reprojection(p).norm(dim=-1) > 1e-6
+    assert (wrong <= ~p.inliers).all()
+    assert wrong.double().mean() > 0.2
+
+
+def test_mixed_batches_have_the_requested_size():
+    for size in (1, 2, 7):
+        assert len(mixed(batch_size=size).batch(0).inliers) == size
+
+
+def test_shares_that_do_not_fit_raise():
+    for count, shares in ((0, None), (2, (1.0,)), (2, (1.0, 0.0)), (2, (1.0, -1.0))):
+        with pytest.raises(BaseError, match=f"{count} sources"):
+            MixedProblems([SyntheticProblems] * count, shares=shares)
+
+
+def test_in_a_mixture_unknown_noise_is_nan():
+    sources = [SyntheticProblems, partial(SyntheticProblems, known_noise=1.0)]
+    for order in (sources, sources[::-1]):
+        problems = MixedProblems(order, batch_size=10, n=4).batch(0)
+        assert problems.img_sigma.isnan().sum() == problems.world_sigma.isnan().sum() == 5
+
+
+def test_varying_sizes_are_reproducible_and_come_from_the_list():
+    mixture = partial(MixedProblems, [SyntheticProblems], known_noise=0.5)
+    one, two = (VaryingSize(mixture, n=[5, 9, 20], batch_size=40, seed=3) for _ in range(2))
+    assert all(same(one.batch(i), two.batch(i)) for i in range(30))
+    assert {tuple(one.batch(i).inliers.shape) for i in range(30)} == {(40, 5), (22, 9), (10, 20)}
+
+
+def test_mixtures_of_any_options():
+    def make(values):
+        given_options, count = values
+        sizes = {key: value for key, value in given_options.items() if key != "shares"}
+        mixture = partial(MixedProblems, [SyntheticProblems] * count, shares=given_options.get("shares"))
+        return VaryingSize(mixture, **{"n": (5, 9), "batch_size": 6, **sizes}).batch(3)
+
+    chosen = options(n=st.lists(COUNTS, max_size=3), batch_size=COUNTS, seed=COUNTS, shares=st.lists(ANY, max_size=3))
+    check_any_options(st.tuples(chosen, st.integers(0, 3) | st.just(2)), make)

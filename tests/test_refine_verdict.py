@@ -1,0 +1,63 @@
+"""Laws of the verdict: which pairs are inliers, and how many inliers chance would give."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from kornia_pnpnet import Correspondences
+from kornia_pnpnet.geometry import project, transform
+from kornia_pnpnet.refine.verdict import MAX_ERROR, Judged, Thresholds, chance_of_inlier, judge, log_false_alarms
+
+
+def test_inliers_weigh_by_the_inverse_of_their_threshold(make_problems, correspond):
+    corr, truth = correspond(make_problems(9, 7, outliers=2))
+    corr = corr._replace(weights=torch.ones_like(corr.weights).index_fill(1, torch.tensor([3]), 0.0))
+    limits = torch.linspace(5.0, 50.0, 7, dtype=torch.float64)
+    thresholds = Thresholds(limits, limits / 500)
+    projection = project(truth, corr)
+    judged = judge(projection, corr, thresholds)
+    depth = transform(truth, corr.world_points)[..., 2]
+    sq_limit = limits[:, None] ** 2 + (corr.focal * thresholds.world[:, None] / depth) ** 2
+    inlier = projection.in_front & (projection.sq_residual < sq_limit) & (corr.weights > 0)
+    assert inlier.any()
+    assert not inlier.all()
+    assert torch.equal(judged.weights > 0, inlier)
+    torch.testing.assert_close(judged.weights[inlier], (limits[:, None] ** 2 / sq_limit)[inlier])
+    plain = judge(projection, corr, thresholds._replace(world=torch.zeros_like(limits)))
+    assert set(plain.weights.unique().tolist()) == {0.0, 1.0}
+    back = truth._replace(translation=truth.translation - 1e4)
+    judged = judge(project(back, corr), corr, thresholds)
+    assert (judged.errors == MAX_ERROR).all()
+    assert not judged.weights.any()
+
+
+@pytest.mark.parametrize(
+    ("pixels", "errors", "expected"),
+    [
+        ([[0.0, 0.0], [400.0, 0.0], [0.0, 200.0]], [0.1, 0.25, 0.0], math.pi * 0.25 * 10.0**2 / (400.0 * 200.0)),
+        ([[0.0, 0.0], [400.0, 0.0], [100.0, 0.0]], [1.0, 0.0, 0.0], 20.0 / 400.0),
+        ([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], [1.0, 0.5, 0.0], 1.0),
+    ],
+    ids=["a disc in a box", "a strip of a thin box", "at most 1"],
+)
+def test_chance_is_the_share_of_the_box(pixels, errors, expected):
+    corr = Correspondences(torch.zeros(1, 3, 3), torch.tensor([pixels]), torch.ones(1, 3), torch.tensor(100.0))
+    thresholds = Thresholds(torch.tensor([10.0]), torch.zeros(1))
+    judged = Judged(torch.ones(1, 3), torch.tensor([errors]))
+    assert chance_of_inlier(corr, thresholds, judged).item() == pytest.approx(expected)
+    nothing = torch.zeros(1, 3)
+    assert chance_of_inlier(corr._replace(weights=nothing), thresholds, Judged(nothing, judged.errors)).item() == 0.0
+
+
+def test_false_alarms_by_counting():
+    for tested, inliers, count, chance in ((10, 5, 9, 0.01), (1, 4, 4, 0.3), (500, 30, 100, 0.001), (7, 3, 8, 0.5)):
+        expected = tested * math.comb(count - 3, inliers - 3) * chance ** (inliers - 3)
+        log = log_false_alarms(*(torch.tensor([x]) for x in (tested, inliers, count)), torch.tensor([chance]))
+        assert log.item() == pytest.approx(math.log(expected), abs=1e-5)
+    zero = torch.zeros(1, dtype=torch.long)
+    for inliers, count in ((0, 0), (2, 2), (3, 3), (9, 9)):
+        for chance in (0.0, 1.0):
+            assert log_false_alarms(zero, zero + inliers, zero + count, torch.tensor([chance])).isfinite().all()

@@ -1,0 +1,138 @@
+"""Results of runs: their files, cards and summaries, sound or damaged."""
+
+import json
+import math
+import shutil
+from collections import Counter
+from functools import partial
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from kornia.core.exceptions import BaseError
+from strategies import ERRORS, WORD, damage, many, names_the_file, options, places_in, spoiled
+
+from kornia_pnpnet import MLPInit, PnPNet, RobustWeightedLM
+from kornia_pnpnet.core.files import write_json
+from kornia_pnpnet.core.schema import from_json, to_json
+from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet.pretrained import WEIGHTS_FOLDER
+from kornia_pnpnet.training import FitReport
+from kornia_pnpnet.training.card import write_model_card
+from kornia_pnpnet.training.collect import collect_weights, summarize_runs
+from kornia_pnpnet.training.results import RunResults, find_results, load_run, run_results
+
+
+def made_run(folder):
+    """The folder of a run, as ``train.py`` leaves it: that of shipped weights."""
+    shipped = WEIGHTS_FOLDER / "pnpnet-n6"
+    (folder / "weights").mkdir(parents=True)
+    for name in ("results.json", "history.csv"):
+        shutil.copy(shipped / name, folder / name)
+    for name in ("config.json", "model.safetensors"):
+        shutil.copy(shipped / name, folder / "weights" / name)
+    return folder
+
+
+def test_spoiled_results_of_runs_are_an_error_of_ours(tmp_path):
+    run_folder = made_run(tmp_path / "run")
+    path = run_folder / "results.json"
+    content = json.loads(path.read_text())
+    places, outcomes = list(places_in(content)), Counter()
+
+    @many(150)
+    @given(spoiled(content, places))
+    def run(results):
+        path.write_text(json.dumps(results))
+        card = tmp_path / "README.md"
+        card.unlink(missing_ok=True)
+        try:
+            loaded = load_run(path)
+            assert find_results(run_folder / "weights") == loaded == from_json(RunResults, to_json(loaded))
+        except ValueError as error:
+            outcomes["refused"] += 1
+            names_the_file(error, path)
+            with pytest.warns(UserWarning, match="Left out of the summary"):
+                assert summarize_runs(tmp_path) is None
+        else:
+            outcomes["works"] += 1
+            write_model_card(tmp_path, loaded)
+            assert card.stat().st_size > 1000
+            assert summarize_runs(tmp_path).read_text().count("\n") >= 2
+            (tmp_path / "summary.csv").unlink()
+
+    run()
+    assert min(outcomes["refused"], outcomes["works"]) >= 5
+
+
+def test_damaged_runs_are_an_error_of_ours(tmp_path):
+    sound, spoilt = (made_run(tmp_path / name) for name in ("sound", "spoilt"))
+    files = {path.relative_to(spoilt): path.read_bytes() for path in spoilt.rglob("*.*")}
+    outcomes = Counter()
+
+    @many(100)
+    @given(st.sampled_from(sorted(files)), st.data(), st.booleans(), st.sampled_from([100, 3, 2, 1]))
+    def run(name, data, last, most_rows):
+        (spoilt / name).write_bytes(data.draw(damage(files[name])))
+        folder = tmp_path / "collected"
+        shutil.rmtree(folder, ignore_errors=True)
+        try:
+            collect_weights([sound, spoilt] if last else [spoilt, sound], folder, most_rows=most_rows)
+        except ERRORS:
+            outcomes["refused"] += 1
+            assert not folder.exists()
+        else:
+            outcomes["works"] += 1
+            PnPNet.from_pretrained(folder)
+            assert len([*folder.iterdir()]) == 5
+        (spoilt / name).write_bytes(files[name])
+
+    run()
+    assert min(outcomes["refused"], outcomes["works"]) >= 5
+    for most_rows in (0, -1, 0.5, math.nan):
+        with pytest.raises(BaseError):
+            collect_weights([sound], tmp_path / "none", most_rows=most_rows)
+    with pytest.raises(ValueError, match="at least one run"):
+        collect_weights([], tmp_path / "none")
+    (spoilt / "history.csv").unlink()
+    with pytest.raises(FileNotFoundError):
+        collect_weights([spoilt], tmp_path / "none")
+    assert not (tmp_path / "none").exists()
+
+
+REPORT = FitReport(0, 100, 0, False, 10.0, 10.0, {"data": 0.5, "forward": 0.5}, 300.0)
+
+
+@many(12)
+@given(
+    st.integers(0, 3), st.sampled_from([0, 1, 4]), st.booleans(), st.booleans(), st.lists(WORD, max_size=3), st.data()
+)
+def test_results_of_any_run_make_a_card_and_a_summary(tmp_path_factory, sets, m, network, told, words, data):
+    folder = tmp_path_factory.mktemp("run")
+    model = PnPNet(MLPInit(9) if network else None, RobustWeightedLM(m))
+    source = {"_target_": data.draw(st.sampled_from(["kornia_pnpnet.data.SyntheticProblems", "mine.Source"]))}
+    source |= data.draw(options(n=st.just([6, 9]), outliers=st.just({"_target_": "mine.Mix", "x": 1}), points=WORD))
+    validation = {}
+    for i in range(sets):
+        size, noise = data.draw(st.integers(1, 3)), (0.01, 0.05) if told else 0.05
+        problems = SyntheticProblems(n=9, batch_size=size, seed=i, outliers=OutlierMix(), world_sigma=noise).batch(0)
+        validation[f"set {i}"] = problems
+    config = {"batch_size": 8, "model": {"n": 9}, "name": data.draw(st.sampled_from([None, "drone"]))}
+    config["data"] = {"train": source, "validation": dict.fromkeys(validation, source)}
+    make = partial(run_results, model, validation, REPORT, config, [*words, "~x", "+a.b=1", "c=d=e"])
+    if not sets:
+        with pytest.raises(ValueError, match="at least one validation set"):
+            make()
+        return
+    results = make()
+    write_json(folder / "results.json", to_json(results))
+    assert load_run(folder / "results.json") == results
+    write_model_card(folder, results)
+    card = (folder / "README.md").read_text()
+    assert f"\n# {config['name'] or ('MLPInit' if network else 'PnPNet')}\n" in card
+    assert all(name in card for name in validation)
+    own = "mine.Source" in str(source) or "mine.Mix" in str(source)
+    assert ("from mine." in card) == own
+    assert ("synthetic problems" in card) == (not own)
+    summary = summarize_runs(folder).read_text()
+    assert "d=e" in summary
