@@ -60,6 +60,7 @@ clean: ## Remove builds, caches and the demo's output; .venv and other outputs s
 	rm -rf build dist site jupyter_execute outputs/demo .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find . -path ./$(VENV) -prune -o -path ./.git -prune -o -type d -name __pycache__ -exec rm -rf {} +
 
+# Without --no-compile pip compiles every module of every package; Python compiles those that are imported.
 $(ALL): EXTRA := all
 $(DEMO): EXTRA := demo
 $(ALL) $(DEMO): FORCE
@@ -68,7 +69,7 @@ $(ALL) $(DEMO): FORCE
 	echo "Installing kornia_pnpnet[$(EXTRA)] into $(VENV); a few minutes the first time"; \
 	rm -f $(ALL) $(DEMO); \
 	set -- -q -e '.[$(EXTRA)]' -c constraints.txt; \
-	{ command -v uv >/dev/null && uv pip install --python $(PY) $(UV_OPTIONS) "$$@"; } || $(PY) -m pip install "$$@"; \
+	{ command -v uv >/dev/null && uv pip install --python $(PY) $(UV_OPTIONS) "$$@"; } || $(PY) -m pip install --no-compile "$$@"; \
 	$(STATE) | tee $(if $(filter all,$(EXTRA)),$(DEMO)) > $@
 
 FORCE:

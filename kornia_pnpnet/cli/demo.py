@@ -91,19 +91,21 @@ def verdict(results: Mapping[str, Any]) -> str:
     Returns:
         The sentence. Solvers whose 95 % interval contains the highest success rate share the first place.
     """
-    parts = []
+    sentences = []
     for data in results["data"]:
         rows = [row for row in results["rows"] if row["data"] == data]
         if not rows:
             continue
         best = max(row["success"]["rate"] for row in rows)
-        first = [_told(row) for row in rows if row["success"]["high"] >= best]
+        most = [row for row in rows if row["success"]["high"] >= best]
         fastest = min(rows, key=lambda row: row["us_per_problem"])
-        parts.append(f"on {data!r} {' and '.join(first)} solved the most problems and {_told(fastest)} was the fastest")
-    return f"In short: {'; '.join(parts)}."
+        winners = " and ".join(map(_described, most))
+        second = "was" if most == [fastest] else f"{_described(fastest)} was"
+        sentences.append(f'on "{data}", {winners} solved the most problems and {second} the fastest')
+    return f"In short: {'; '.join(sentences)}."
 
 
-def _told(row: Mapping[str, Any]) -> str:
+def _described(row: Mapping[str, Any]) -> str:
     return f"{row['solver']} ({100 * row['success']['rate']:.1f} %, {row['us_per_problem']:.0f} µs per problem)"
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -20,7 +19,7 @@ from kornia_pnpnet.cli.correspondence_files import (
     check_shapes,
     read_arrays,
 )
-from kornia_pnpnet.core.files import atomic_open
+from kornia_pnpnet.core.files import atomic_open, digest, write_json
 from kornia_pnpnet.types import PnPResult
 
 __all__ = ["MANIFEST", "SUFFIXES", "ShardReport", "solve_shards"]
@@ -136,10 +135,8 @@ def _find(sources: Sequence[str | Path]) -> list[Path]:
 
 def _claim(out: Path, name: str, solver: nn.Module, replaced: set[str]) -> None:
     """Write the manifest of this solver; refuse a folder with results of another solver that are not replaced."""
-    digest = hashlib.sha256()
-    for key, value in sorted(solver.state_dict().items()):
-        digest.update(key.encode() + value.detach().cpu().numpy().tobytes())
-    manifest = {"solver": name, "parameters": digest.hexdigest()}
+    state = sorted(solver.state_dict().items())
+    manifest = {"solver": name, "parameters": digest(*(part for item in state for part in item))}
     path = out / MANIFEST
     if path.exists():
         try:
@@ -153,8 +150,7 @@ def _claim(out: Path, name: str, solver: nn.Module, replaced: set[str]) -> None:
                 raise InputError(path, f"the folder has results of another solver than this {name}: change it or {how}")
             for result in results:  # before the manifest: a run stopped in between must not mix two solvers
                 result.unlink()
-    with atomic_open(path) as file:
-        json.dump(manifest, file, indent=2)
+    write_json(path, manifest)
 
 
 def _solve_npz(solver: nn.Module, shard: Path, target: Path, intrinsics: Tensor | None, batch: int) -> tuple[int, int]:
