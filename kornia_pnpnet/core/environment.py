@@ -21,8 +21,8 @@ def environment() -> dict[str, Any]:
     """Describe the versions and the machine that numbers are measured with.
 
     Returns:
-        ``versions`` of the packages (``None``: not installed), ``python``, ``platform``, ``cpu``, ``threads`` of PyTorch,
-        ``gpu``, ``commit`` of the checkout that the package runs from (``+`` at the end: with changed files; ``None``:
+        ``versions`` of the packages (``None``: not installed), ``python``, ``platform``, ``cpu``, ``threads`` of
+        PyTorch, ``gpu``, ``commit`` of the checkout that the package runs from (``+`` at the end: with changed files; ``None``:
         outside a checkout) and the ``date`` in UTC.
     """
     names = ("kornia_pnpnet", "torch", "kornia", "numpy")
@@ -58,7 +58,7 @@ def _cpu_name() -> str:
 
 
 def _commit() -> str | None:
-    """The commit of the checkout that this file belongs to; a checkout with an installed copy below it does not count."""
+    """The commit of the checkout that this file belongs to, not of a checkout with an installed copy."""
     root = Path(__file__).resolve().parents[2]
 
     def git(*arguments: str) -> str:
