@@ -22,8 +22,8 @@ def environment() -> dict[str, Any]:
 
     Returns:
         ``versions`` of the packages (``None``: not installed), ``python``, ``platform``, ``cpu``, ``threads`` of
-        PyTorch, ``gpu``, ``commit`` of the checkout that the package runs from (``+`` at the end: with changed files; ``None``:
-        outside a checkout) and the ``date`` in UTC.
+        PyTorch, ``gpu``, ``commit`` of the checkout that the package runs from (``+`` at the end: with changed files;
+        ``None``: outside a checkout) and the ``date`` in UTC.
     """
     names = ("kornia_pnpnet", "torch", "kornia", "numpy")
     versions = {name: _version(name) for name in names}
