@@ -1,5 +1,6 @@
-# demo, bench, test, test-all and lint make .venv when it is missing, with every extra, and bring it up to date when
-# pyproject.toml or constraints.txt changed. Linux wheels of torch on PyPI bring CUDA along; to leave it out:
+# Every command makes .venv when it is missing and updates it when pyproject.toml or constraints.txt changed. "make demo"
+# installs what the demo needs, the other commands install everything. uv installs the packages when it is on the PATH,
+# or else pip. On Linux PyPI's wheels of torch include CUDA; without CUDA:
 #   PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu make demo
 
 PYTHON ?= python3
@@ -9,29 +10,33 @@ DATA ?=
 
 VENV := .venv
 PY := $(VENV)/bin/python
-STAMP := $(VENV)/.installed
+ALL := $(VENV)/.installed-all
+DEMO := $(VENV)/.installed-demo
 
-# What .venv was installed from. Compared by content, not by age: a checkout or a restored CI cache sets any file time.
-# It names the folder and the interpreter too, since a moved .venv or one that lost its Python must be noticed.
-FINGERPRINT = { cksum pyproject.toml constraints.txt; echo '$(CURDIR)'; $(PY) -V 2>/dev/null || echo 'no Python'; }
-ifneq ($(strip $(shell $(FINGERPRINT))),$(strip $(shell cat $(STAMP) 2>/dev/null)))
-$(STAMP): FORCE
-endif
+# The state that .venv was installed from, compared by content: a checkout or a restored CI cache changes the times of
+# files. The folder and the interpreter are part of the state, because a .venv that was moved does not work.
+STATE = { cksum pyproject.toml constraints.txt; echo '$(CURDIR)'; $(PY) -V 2>/dev/null || echo 'no Python'; }
+
+# uv does not read pip's configuration: pass on the indexes and folders of wheels, and pip's way to choose among them.
+UV_OPTIONS = --index-strategy unsafe-best-match $$($(PY) -m pip config list | \
+	sed -n "s/\\\\n/ /g; s/^[^.]*\.\(index-url\|extra-index-url\|find-links\)='\(.*\)'/\1 \2/p" | \
+	while read -r option values; do for value in $$values; do echo "--$$option $$value"; done; done)
 
 .DEFAULT_GOAL := help
+.NOTPARALLEL:
 .PHONY: help install demo bench test test-all docs lint clean FORCE
 
 help: ## Show this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' Makefile | while IFS='|' read -r name text; do \
 		printf '  make %-10s %s\n' "$$name" "$$text"; done
 
-install: $(STAMP) ## Make .venv with every extra
+install: $(ALL) ## Make .venv with every extra
 
-demo: $(STAMP) ## Solve problems with the shipped weights, beside OpenCV; DATA=folder solves that COLMAP scene
-	@mkdir -p outputs/demo
+# A scene of COLMAP is read by pycolmap, which the random problems do not need.
+demo: $(if $(DATA),$(ALL),$(DEMO)) ## Solve problems beside OpenCV and PoseLib; DATA=folder solves a COLMAP scene
 	$(VENV)/bin/pnpnet demo $(if $(DATA),--data '$(DATA)')
 
-bench: $(STAMP) ## Time and memory beside other libraries; writes benchmarks/*.json and docs/performance.md
+bench: $(ALL) ## Time and memory beside other libraries; writes benchmarks/*.json and docs/performance.md
 	$(PY) benchmarks/solvers.py --repeats 5 --out benchmarks/solvers.json
 	$(PY) benchmarks/performance.py measure
 	$(PY) benchmarks/performance.py render
@@ -43,10 +48,10 @@ test: lint ## Lint, types and the quick tests
 test-all: lint ## Lint, types and every test, the slow ones too
 	OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 $(PY) -m pytest -n $(WORKERS) -m "" $(PYTEST_ARGS)
 
-docs: $(STAMP) ## Build the documentation into site; warnings are errors, as in test-all
+docs: $(ALL) ## Build the documentation into site; warnings are errors, as in test-all
 	$(PY) -m sphinx -W --keep-going -b html docs site
 
-lint: $(STAMP) ## ruff and mypy
+lint: $(ALL) ## ruff and mypy
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 	$(PY) -m mypy
@@ -55,10 +60,15 @@ clean: ## Remove builds, caches and the demo's output; .venv and other outputs s
 	rm -rf build dist site jupyter_execute outputs/demo .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find . -path ./$(VENV) -prune -o -path ./.git -prune -o -type d -name __pycache__ -exec rm -rf {} +
 
-$(STAMP):
-	@$(PY) -m pip --version >/dev/null 2>&1 || { echo "Making $(VENV)"; $(PYTHON) -m venv --clear $(VENV); }
-	@echo "Installing kornia_pnpnet with every extra into $(VENV); minutes the first time"
-	@$(PY) -m pip install -q -e '.[all]' -c constraints.txt
-	@$(FINGERPRINT) > $@
+$(ALL): EXTRA := all
+$(DEMO): EXTRA := demo
+$(ALL) $(DEMO): FORCE
+	@if $(STATE) | cmp -s - $@; then exit 0; fi; set -e; \
+	$(PY) -m pip --version >/dev/null 2>&1 || { echo "Making $(VENV)"; $(PYTHON) -m venv --clear $(VENV); }; \
+	echo "Installing kornia_pnpnet[$(EXTRA)] into $(VENV); a few minutes the first time"; \
+	rm -f $(ALL) $(DEMO); \
+	set -- -q -e '.[$(EXTRA)]' -c constraints.txt; \
+	{ command -v uv >/dev/null && uv pip install --python $(PY) $(UV_OPTIONS) "$$@"; } || $(PY) -m pip install "$$@"; \
+	$(STATE) | tee $(if $(filter all,$(EXTRA)),$(DEMO)) > $@
 
 FORCE:

@@ -1,4 +1,4 @@
-"""What is timed: solvers of ours, and by name all of them and those of other libraries."""
+"""The contenders by name: solvers of ours, and of other libraries."""
 
 from __future__ import annotations
 
@@ -27,21 +27,18 @@ from kornia_pnpnet import PnPNet, RobustWeightedLM
 from kornia_pnpnet.evaluation.named_solvers import load_solver
 from kornia_pnpnet.types import Pose, Problems
 
-__all__ = ["ANY", "CONTENDERS", "ONE", "ONE_THREAD", "OURS", "PLAIN", "TRAINED", "WHOLE"]
-
-TRAINED = "pnpnet-n9"
-#: For any number of pairs.
-ANY = "pnpnet-set"
-#: As the paper has it: its network, one guess, and the iterations that the targets are set for. The trained ones are
-#: more and belong together, so these are classical.
+#: The paper's solver as it is shipped, and the solver for any number of pairs.
+TRAINED, ANY = "pnpnet-n9", "pnpnet-set"
+#: The network of ``TRAINED``, one guess, and the number of iterations that the targets were set for, with classical
+#: hyperparameters: the trained hyperparameters belong to more iterations.
 PLAIN = "net-n9+lm"
-#: All of its iterations, from one guess.
+#: ``TRAINED`` with one guess.
 ONE = f"{TRAINED}:views=1"
 WHOLE = f"{PLAIN} compiled whole"
 
 
 class Ours(Contender):
-    """A solver of this package: the whole call, in float32. Gradients go to points, pixels and what is learned."""
+    """A solver of this package: the whole call, in float32. Gradients go to points, pixels and parameters."""
 
     def __init__(
         self,
@@ -66,21 +63,21 @@ class Ours(Contender):
             compile_or_raise(self.solver, **({"whole": True} if whole else {}))
 
     def takes(self, n: int) -> bool:
-        """A network takes its own number of pairs."""
+        """The paper's network has a fixed number of pairs."""
         return self.only_n in (None, n)
 
     def task(self, problems: Problems, *, backward: bool = False) -> Task:
         """The call with the whole batch."""
-        inputs = float_inputs(problems, self.device)
+        world, img, intrinsics = float_inputs(problems, self.device)
 
         def poses() -> Pose:
-            return Pose(*self.solver(*inputs).pose)
+            return Pose(*self.solver(world, img, intrinsics).pose)
 
-        call: Callable[[], object] = without_gradient(lambda: self.solver(*inputs))
+        call: Callable[[], object] = without_gradient(lambda: self.solver(world, img, intrinsics))
         if backward:
-            leaves = leaves_of(*inputs[:2])
+            leaves = leaves_of(world, img)
             learned = [x for x in self.solver.parameters() if x.requires_grad]
-            call = lambda: gradient(self.solver(*leaves, inputs[2]).pose, [*leaves, *learned])  # noqa: E731
+            call = lambda: gradient(self.solver(*leaves, intrinsics).pose, [*leaves, *learned])  # noqa: E731
         return Task(call, poses, problems, waiting(self.device))
 
 
@@ -94,12 +91,12 @@ class Refinement(Contender):
             compile_or_raise(self.refine)
 
     def task(self, problems: Problems, *, backward: bool = False) -> Task:
-        """The refiner's call."""
+        """The call of the refinement."""
         corr, guess, undo = normalized(problems, self.device)
         call: Callable[[], object] = without_gradient(lambda: self.refine(corr, guess))
         if backward:
-            # Not cloned: the layout in memory is the one in which pairs arrive.
-            leaves = [x.detach().requires_grad_() for x in corr[:2]]
+            # Not cloned: a clone would change the layout in memory in which the solver hands pairs over.
+            leaves = [x.detach().requires_grad_() for x in (corr.world_points, corr.img_points)]
             wanted = corr._replace(world_points=leaves[0], img_points=leaves[1])
             learned = [x for x in self.refine.parameters() if x.requires_grad]
             call = lambda: gradient(self.refine(wanted, guess).pose, [*leaves, *learned])  # noqa: E731
@@ -109,7 +106,7 @@ class Refinement(Contender):
 class Onnx(Contender):
     """A solver of this package as an ONNX model for nine pairs, under ONNX Runtime, in float32.
 
-    Exporting takes minutes: the models of this code are kept in ``outputs/onnx``.
+    Exporting takes minutes, so ``outputs/onnx`` keeps the models of the present code.
     """
 
     differentiable = False
@@ -119,8 +116,6 @@ class Onnx(Contender):
         import onnxruntime
 
         from kornia_pnpnet.evaluation.results import source_digest
-
-        # Here, since earlier versions of the package, which this file is used with too, do not have them.
         from kornia_pnpnet.export import INPUTS, export_onnx
 
         self.names = INPUTS
@@ -135,11 +130,11 @@ class Onnx(Contender):
         self.session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
 
     def takes(self, n: int) -> bool:
-        """The number of pairs that it was exported for."""
+        """The number of pairs of the exported model."""
         return n == self.n
 
     def task(self, problems: Problems, *, backward: bool = False) -> Task:
-        """The session's call with the whole batch."""
+        """The call of the session with the whole batch."""
         tensors = *float_inputs(problems, "cpu"), torch.ones(problems.world_points.shape[:2])
         inputs = {name: x.numpy() for name, x in zip(self.names, tensors, strict=True)}
 
@@ -150,7 +145,7 @@ class Onnx(Contender):
         return Task(lambda: self.session.run(None, inputs), poses, problems)
 
 
-#: Ours, by name. RANSACs have the thresholds that suit the protocol's data (docs/results).
+#: Our solvers. The threshold of the RANSAC is tuned for the protocol's data (docs/results).
 OURS: dict[str, Callable[..., Contender]] = {
     TRAINED: functools.partial(Ours, TRAINED),
     f"{TRAINED} compiled": functools.partial(Ours, TRAINED, compiled=True),
@@ -163,24 +158,20 @@ OURS: dict[str, Callable[..., Contender]] = {
     f"{ANY} compiled": functools.partial(Ours, ANY, compiled=True),
     "refinement": Refinement,
     "refinement compiled": functools.partial(Refinement, compiled=True),
-    "epnp": functools.partial(Ours, "epnp"),
     "epnp-lm": functools.partial(Ours, "epnp-lm"),
-    "reppnp": functools.partial(Ours, "reppnp"),
     "p3p-ransac": functools.partial(Ours, "p3p-ransac:threshold=50"),
 }
-#: All that is timed.
+#: All contenders.
 CONTENDERS: dict[str, Callable[..., Contender]] = {
     **OURS,
     f"{TRAINED} ONNX": functools.partial(Onnx, TRAINED),
     f"{ANY} ONNX": functools.partial(Onnx, ANY),
-    "opencv-epnp": functools.partial(Peer, "opencv-epnp"),
     "opencv-ransac": functools.partial(Peer, "opencv-ransac"),
-    "opencv-usac": functools.partial(Peer, "opencv-usac"),
     "poselib": functools.partial(Peer, "poselib"),
     "pycolmap": functools.partial(Peer, "pycolmap"),
     "kornia-dlt": KorniaDLT,
     "pypose-lm": functools.partial(PyPose, own_loop=False),
     "pypose-parts": functools.partial(PyPose, own_loop=True),
 }
-#: Thousands of small operations, which wait for each other: on two threads they take minutes.
+#: Contenders of thousands of small operations that wait for each other: on two threads they take minutes.
 ONE_THREAD = ("pypose-lm", "pypose-parts")

@@ -17,27 +17,13 @@ from typing import Any
 
 import torch
 
-__all__ = [
-    "in_turns",
-    "load",
-    "peak_bytes",
-    "quantiles",
-    "ratio",
-    "run_child",
-    "say",
-    "seconds",
-    "summary",
-    "target",
-    "threads",
-]
-
 HERE = Path(__file__).resolve().parent
 
 
 @contextmanager
 def threads(count: int = 1) -> Iterator[None]:
-    """PyTorch and OpenCV on so many threads, and as they were afterwards; both are settings of the whole process."""
-    cv2 = sys.modules.get("cv2")  # imported by its solvers, if there are any
+    """Run PyTorch and OpenCV on ``count`` threads, and restore both settings of the process afterwards."""
+    cv2 = sys.modules.get("cv2")  # its solvers have imported it
     before = torch.get_num_threads(), None if cv2 is None else cv2.getNumThreads()
     torch.set_num_threads(count)
     if cv2 is not None:
@@ -50,13 +36,25 @@ def threads(count: int = 1) -> Iterator[None]:
             cv2.setNumThreads(before[1])
 
 
+@contextmanager
+def without_garbage_collection() -> Iterator[None]:
+    """Do not collect garbage, as in :mod:`timeit`."""
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collecting:
+            gc.enable()
+
+
 def load() -> float:
-    """The load average of the last minute: well above one, something else runs and times are not to be trusted."""
+    """Load average of the last minute. Well above the number of threads, times are not to be trusted."""
     return os.getloadavg()[0]
 
 
 def seconds(call: Callable[[], object], times: int = 1) -> float:
-    """Seconds that a call takes, the mean over ``times`` of them."""
+    """Seconds of a call, the mean over ``times`` calls."""
     start = time.perf_counter()
     for _ in range(times):
         call()
@@ -64,20 +62,12 @@ def seconds(call: Callable[[], object], times: int = 1) -> float:
 
 
 def in_turns(timers: Mapping[str, Callable[[], float]], rounds: int) -> dict[str, list[float]]:
-    """Ask each timer once in every round, so that a slow minute of the machine hits all of them.
-
-    Garbage is not collected meanwhile, as in :mod:`timeit`.
-    """
+    """Ask each timer once in every round, so that a slow minute of the machine hits all of them."""
     found: dict[str, list[float]] = {name: [] for name in timers}
-    collecting = gc.isenabled()
-    gc.disable()
-    try:
+    with without_garbage_collection():
         for _ in range(rounds):
             for name, timer in timers.items():
                 found[name].append(timer())
-    finally:
-        if collecting:
-            gc.enable()
     return found
 
 
@@ -87,46 +77,43 @@ def summary(rounds_us: Sequence[float]) -> dict[str, Any]:
 
 
 def ratio(mine: Mapping[str, Any], theirs: Mapping[str, Any]) -> float:
-    """How many times as long as mine theirs takes: the median over the rounds of the ratio in the same round."""
+    """Time of theirs by time of mine: the median over the rounds of the ratio in the same round."""
     rounds = zip(theirs["rounds_us"], mine["rounds_us"], strict=True)
     return statistics.median(other / own for other, own in rounds)
 
 
 def quantiles(values: Sequence[float], steps: int) -> list[float]:
-    """The values below which 0, 1/steps, ..., 1 of the values are: always one of them, never between two."""
+    """Quantiles at 0, 1/steps, ..., 1. Each is one of the values."""
     ascending = sorted(values)
     return [ascending[max(0, math.ceil(step / steps * len(ascending)) - 1)] for step in range(steps + 1)]
 
 
 def peak_bytes() -> int:
-    """The most memory that this process has held so far.
-
-    Not ``getrusage``: what it says of a new process can include the one that started it.
-    """
+    """Peak memory of this process (Linux). ``getrusage`` can include the process that started this one."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:"))
 
 
 def run_child(script: Path, *arguments: str, **environment: str) -> Any:
-    """Run a script in a process of its own and read the JSON that it prints; what else it says is seen at once.
+    """Run a script in a process of its own and return the JSON that it prints. Its standard error is shown at once.
 
     Raises:
-        RuntimeError: when it fails.
+        RuntimeError: when the script fails.
     """
     command = [sys.executable, str(script), *arguments]
     variables = {**os.environ, **environment}
     output = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False, env=variables)
     if output.returncode:
-        raise RuntimeError(f"{' '.join(command)} failed; what it said is above.")
+        raise RuntimeError(f"{' '.join(command)} failed; its error is above.")
     return json.loads(output.stdout)
 
 
 def target(what: str, measured: float, wanted: float, *, unit: str, at_most: bool) -> dict[str, Any]:
-    """A target beside what was measured, and whether it is met."""
+    """A target beside the measurement, and whether the target is met."""
     met = measured <= wanted if at_most else measured >= wanted
     return {"what": what, "measured": measured, "target": wanted, "unit": unit, "at_most": at_most, "met": met}
 
 
 def say(text: str) -> None:
-    """A line for whoever watches."""
+    """Write a line of progress."""
     print(text, file=sys.stderr, flush=True)

@@ -1,37 +1,33 @@
-"""The time of a single problem, as a distribution: a fixed cost is the claim."""
+"""The distribution of the time of a single problem, since the claim is a fixed cost."""
 
 from __future__ import annotations
 
-import gc
 import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from contenders import ONE, PLAIN, TRAINED, WHOLE
-from harness import quantiles, say, target, threads
+from harness import quantiles, say, target, threads, without_garbage_collection
 from settings import N, Settings, draw, make_contenders
 from tasks import CannotBeTimedError, Contender, Task, first
 
 from kornia_pnpnet.data import OutlierMix
 from kornia_pnpnet.types import Problems
 
-__all__ = ["QUANTILE_STEPS", "measure_latency", "targets"]
-
-#: The file keeps so many quantiles of each distribution, and the smallest.
+#: Number of quantiles of a distribution in the file, besides the smallest value.
 QUANTILE_STEPS = 200
-# Calls in a row before it is another's turn; the first of them is not timed.
-_TURN = 20
-_WARM = 10
+_TURN = 20  # calls of a contender in a row; one more call before them is not timed
+_WARM = 10  # calls before all others
 
 
 def measure_latency(settings: Settings, *, count: int) -> dict[str, list[dict[str, Any]]]:
-    """Call everything with one problem at a time, on ``count`` threads.
+    """Call every contender with one problem at a time, on ``count`` threads.
 
     Returns:
         ``rows``, one for each contender: ``calls``, ``median_us``, ``p90_us``, ``p99_us``, ``max_us`` and
         ``quantiles_us``; and ``skipped``.
     """
-    # The distribution is shown on one thread; a second changes the median, or does not.
+    # The page shows the distribution on one thread, and only the median on two.
     problems = draw(N, settings.latency_calls if count == 1 else max(1, settings.latency_calls // 4), OutlierMix())
     rows = []
     with threads(count):
@@ -64,7 +60,7 @@ def measure_latency(settings: Settings, *, count: int) -> dict[str, list[dict[st
 
 
 def single_tasks(contender: Contender, problems: Problems, settings: Settings) -> list[Task]:
-    """A warm task for each problem, as many as take a given time."""
+    """Warm tasks of one problem each, for ``settings.latency_s`` seconds of calls."""
 
     def one(index: int) -> Task:
         return contender.task(problems.map(lambda x: x[index : index + 1]))
@@ -77,28 +73,24 @@ def single_tasks(contender: Contender, problems: Problems, settings: Settings) -
 
 
 def latencies(tasks: Mapping[str, Sequence[Task]]) -> dict[str, list[float]]:
-    """Microseconds of every call, some calls of each contender in turn."""
+    """Microseconds of every call, ``_TURN`` calls of each contender in turn."""
     found: dict[str, list[float]] = {name: [] for name in tasks}
-    collecting = gc.isenabled()
-    gc.disable()
-    try:
+    with without_garbage_collection():
         for start in range(0, max(map(len, tasks.values()), default=0), _TURN):
             for name, mine in tasks.items():
                 for index, task in enumerate(mine[start : start + _TURN]):
                     if index == 0:
                         task.seconds()
                     found[name].append(1e6 * task.seconds())
-    finally:
-        if collecting:
-            gc.enable()
     return found
 
 
 def targets(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """What is wanted of one problem on one thread."""
+    """Targets of one problem on one thread."""
     found = []
-    compiled = WHOLE, *(f"{name} compiled" for name in (PLAIN, ONE, TRAINED))
-    for name, most_ms in (*((name, 0.4) for name in compiled), *((name, 3.0) for name in (PLAIN, ONE, TRAINED))):
+    compiled = (WHOLE, *(f"{name} compiled" for name in (PLAIN, ONE, TRAINED)))
+    most = dict.fromkeys(compiled, 0.4) | dict.fromkeys((PLAIN, ONE, TRAINED), 3.0)
+    for name, most_ms in most.items():
         for row in rows:
             if (row["contender"], row["threads"]) == (name, 1):
                 median = f"`{name}`, one problem, median"

@@ -1,4 +1,4 @@
-"""Solvers of other libraries. Nothing here is slower than what a user of the library would write."""
+"""Solvers of other libraries, called as fast as a user of the library can call them."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from kornia_pnpnet.evaluation.named_solvers import load_solver
 from kornia_pnpnet.peers import PeerSolver
 from kornia_pnpnet.types import Pose, Problems
 
-__all__ = ["KorniaDLT", "Peer", "PyPose", "bare_call"]
-
-# PyPose's kernel begins at a residual of 10 px; the damping is our classical one.
-_PYPOSE_DELTA, _PYPOSE_DAMPING = 10.0 / 3400.0, 1e-3
-# PyPose's optimiser has one dense Jacobian for all problems together: more at once take longer, fewer as well.
+_PYPOSE_DELTA = 10.0 / 3400.0  # scale of the kernel: 10 px, in focal lengths of the protocol's camera
+_PYPOSE_DAMPING = 1e-3  # the damping of our classical refinement
+# Problems in one step of PyPose's optimiser, whose Jacobian is dense over all of them. The time per problem is least at
+# 10.
 _PYPOSE_AT_ONCE = 10
 
 
 def bare_call(solver: nn.Module, problems: Problems) -> Callable[[], object]:
-    """One call with the whole batch for a solver of ours, the bare calls of the library for a peer's."""
+    """One call with the whole batch for a solver of ours; the calls of the library alone for a peer."""
+    inputs = (problems.world_points, problems.img_points, problems.intrinsics)
     if isinstance(solver, PeerSolver):
-        single = list(zip(*(x.numpy() for x in problems[:3]), strict=True))
+        single = list(zip(*(x.numpy() for x in inputs), strict=True))
         return lambda: [solver.solve_one(*one) for one in single]
-    return lambda: solver(*problems[:3])
+    return lambda: solver(*inputs)
 
 
 class Peer(Contender):
-    """A library's call for each problem, on arrays in float64 that lie ready."""
+    """The call of a library for each problem, on arrays in float64 that are prepared."""
 
     loops, differentiable = True, False
 
@@ -42,14 +42,18 @@ class Peer(Contender):
 
     def task(self, problems: Problems, *, backward: bool = False) -> Task:
         """The calls one after the other."""
-        return Task(bare_call(self.solver, problems), lambda: self.solver(*problems[:3]).pose, problems)
+
+        def poses() -> Pose:
+            return Pose(*self.solver(problems.world_points, problems.img_points, problems.intrinsics).pose)
+
+        return Task(bare_call(self.solver, problems), poses, problems)
 
 
 class KorniaDLT(Contender):
-    """Kornia's direct linear transform, batched, in float32; float64 solves as many problems."""
+    """Kornia's direct linear transform, batched, in float32. Float64 has the same success."""
 
     def takes(self, n: int) -> bool:
-        """It needs six pairs. Its singular value decomposition of all pairs takes too long for very many."""
+        """At least six pairs. Above 200 the singular value decomposition of all pairs takes too long."""
         return 6 <= n <= 200
 
     def task(self, problems: Problems, *, backward: bool = False) -> Task:
@@ -68,15 +72,14 @@ class KorniaDLT(Contender):
 
 
 class PyPose(Contender):
-    """PyPose on the normalised pairs and from the start of :class:`Refinement`, in float32.
+    """PyPose on the normalised pairs and from the start of ``contenders.Refinement``, in float32.
 
     Args:
-        own_loop: False: ``pypose.optim.LM`` as its documentation has it, a robust kernel with ``FastTriggs``, the
-            other settings its own, a few problems at once. It is made to be stepped, not differentiated: for a
-            gradient, one differentiable step of the other kind follows at its result.
-            True: a loop of our own out of PyPose's parts: its Lie groups, reprojection error and linear solver, with
-            the Jacobian of each problem alone by vectorised reverse mode. That is batched and differentiates through
-            all iterations.
+        own_loop: False: ``pypose.optim.LM`` as in its documentation, with a robust kernel and ``FastTriggs``, other
+            settings at their defaults, a few problems at once. The optimiser has no gradient; for a gradient, one
+            differentiable step of our loop follows at the result.
+            True: a batched loop of our own from PyPose's Lie groups, reprojection error and linear solver, with the
+            Jacobian of each problem by vectorised reverse mode. Gradients go through all iterations.
     """
 
     def __init__(self, *, own_loop: bool) -> None:
@@ -87,14 +90,16 @@ class PyPose(Contender):
         self.cauchy = self.pypose.optim.kernel.Cauchy(delta=_PYPOSE_DELTA)
 
     def takes(self, n: int) -> bool:
-        """Of the loop the time at one n says enough; the other takes minutes where there are many pixels."""
+        """The optimiser at one n; our loop up to 100 pairs, above which a call takes minutes."""
         return n <= 100 if self.own_loop else n == 9
 
     def task(self, problems: Problems, *, backward: bool = False) -> Task:
-        """Refine all of them."""
+        """Refine all problems."""
         corr, guess, undo = normalized(problems, "cpu")
         points, pixels = corr.world_points.contiguous(), (corr.img_points / corr.focal).contiguous()
-        start = self.pypose.mat2SE3(torch.cat((guess.pose[0], guess.pose[1][..., None]), -1), check=False)
+        start = self.pypose.mat2SE3(
+            torch.cat((guess.pose.rotation, guess.pose.translation[..., None]), -1), check=False
+        )
         refine: Callable[..., Any] = self._steps if self.own_loop else self._optimize
         leaves = leaves_of(points, pixels)
 
@@ -138,13 +143,13 @@ class PyPose(Contender):
         return self.pypose.SE3(torch.cat(found))
 
     def _steps(self, points: Tensor, pixels: Tensor, pose: Any, count: int = ITERATIONS) -> Any:
-        """Steps of a batched Levenberg-Marquardt with the same kernel."""
+        """Steps of a batched Levenberg–Marquardt with the same kernel."""
         differentiable = torch.is_grad_enabled()
         zero = points.new_zeros(len(points), 6)
         for _ in range(count):
 
             def summed(tangent: Tensor, pose: Any = pose) -> Tensor:
-                # Problems do not depend on each other: the sum's Jacobian holds that of each.
+                # Problems are independent: the Jacobian of the sum holds the Jacobian of each problem.
                 moved = self.pypose.se3(tangent).Exp() @ pose
                 return self._residual(points, pixels, moved).flatten(1).sum(0)
 
@@ -153,7 +158,7 @@ class PyPose(Contender):
                     summed, zero, create_graph=differentiable, vectorize=True
                 ).transpose(0, 1)  # (B, 2N, 6)
             residual = self._residual(points, pixels, pose)
-            share = (1.0 + residual.square().sum(-1, keepdim=True) / _PYPOSE_DELTA**2).rsqrt()  # root of the weight
+            share = (1.0 + residual.square().sum(-1, keepdim=True) / _PYPOSE_DELTA**2).rsqrt()  # root of weight
             scaled = (jacobian.unflatten(1, (-1, 2)) * share[..., None]).flatten(1, 2)
             normal = scaled.mT @ scaled
             damped = normal + _PYPOSE_DAMPING * torch.diag_embed(normal.diagonal(dim1=-2, dim2=-1))
@@ -164,7 +169,7 @@ class PyPose(Contender):
 
 def _import_pypose() -> Any:
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # it still scripts a function, which PyTorch has deprecated
+        warnings.simplefilter("ignore")  # PyPose scripts a function, which PyTorch has deprecated
         try:
             return importlib.import_module("pypose")
         except ImportError as error:

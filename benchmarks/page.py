@@ -1,177 +1,162 @@
-"""``docs/performance.md`` and its pictures, from the results files: every number of the page comes from them."""
+"""``docs/performance.md`` and its pictures, from ``performance.md.jinja`` and the results files."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from contenders import ANY, ONE, PLAIN, TRAINED
 from harness import HERE
-from tables import (
-    PARTS,
-    gpu_text,
-    latency_table,
-    machine,
-    memory_table,
-    skipped_list,
-    startup_table,
-    targets_table,
-    throughput_table,
-    versions_table,
-)
-from tasks import COARSE_ANGLE_DEG, COARSE_SHIFT
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from settings import N
+from startup import EAGER
+from tasks import COARSE_ANGLE_DEG, COARSE_SHIFT, ITERATIONS
 from throughput import BACKWARD, FORWARD
-from versions import load_versions
 
+from kornia_pnpnet import PnPNet
 from kornia_pnpnet.core.files import atomic_open
-
-__all__ = ["PAGE", "page", "render"]
+from kornia_pnpnet.core.tables import markdown_table
+from kornia_pnpnet.metrics import SuccessRate
 
 PAGE = HERE.parent / "docs" / "performance.md"
+PARTS = ("throughput", "latency", "startup")
 
-_TEXT = """\
-# Performance
-
-Written by `benchmarks/performance.py render` from the results files in [benchmarks](../benchmarks/README.md); no number
-here is typed but those of predictions, which were made before. {machine}
-
-Contenders: `{trained}` is the whole solver as it is shipped, with checks and normalisation ({shipped}); `{one}` the
-same from one guess for each problem; `{plain}` its network, one guess, and {m} iterations, which the times aimed at
-were set for, with classical hyperparameters; `refinement` such {m} iterations of robust Levenberg–Marquardt alone, on
-normalised pairs and from a pose {angle:g}° and {shift:g} % of the distance off.
-`{any}` takes any number of pairs. The others of ours are whole solvers. All of ours are in float32, *compiled* by
-`solver.compile()`, *compiled whole* by `solver.compile(whole=True)`; *ONNX* is the same exported for {n} pairs, under
-ONNX Runtime, without PyTorch. `opencv-*`, `poselib` and `pycolmap` are the
-libraries' calls for one problem after the
-other, `kornia-dlt` is `solve_pnp_dlt`.
-`pypose-lm` is `pypose.optim.LM` with a robust kernel on the same normalised pairs from the same start, as many
-iterations, a few problems at once (its Jacobian is dense over all of them, so more at once take longer); it has no
-gradient, so *forward+backward* adds one differentiable step at its result. `pypose-parts` is a batched loop of our own
-from PyPose's Lie groups, reprojection error and linear solver with PyTorch's automatic differentiation, differentiated
-through all iterations: the best that we know how to make of it. Success is beside every time, because a solver that
-gives up early is fast: rotation error below 1°, translation error below 0.2, on problems that nothing was trained or
-tuned on.
-
-## Targets
-
-{targets}
-
-## {batch} problems at once
-
-n = 9, 3 of the pairs mismatched. µs per problem, the median over rounds in which all take turns; backward: from the
-poses to points, pixels and whatever is learned.
-
-{throughput}
-
-![Time against the batch](performance/batch.png)
-
-![Time against the number of pairs](performance/pairs.png)
-
-A third of the pairs is mismatched at every n; batches of {batch}, fewer where the picture says so. Curves end where a
-call would take more than {call_s:g} s.
-
-## One problem at a time
-
-n = 9, none to 3 of the pairs wrong. {calls} calls of different problems, fewer where they take long, some of each
-contender in turn. A fixed cost is the claim: the 99th percentile by the median tells. The picture leaves out the
-slowest hundredth.
-
-{latency}
-
-![Distribution of the time of one problem](performance/latency.png)
-
-## Cold start
-
-Processes of their own, one thread; where there are several, medians. *Import* is PyTorch and this package; *first
-call* includes making the solver, which imports a peer's library, and compiling; cold: with an empty cache of the
-compiler, cached: with the one that the process before left. *Next batch sizes* are the first calls at other sizes,
-{sizes}, together.
-
-{startup}
-
-## Memory
-
-What one call with {memory_batch} problems of 9 pairs adds to the peak of a process of its own, beyond its inputs. Loops
-over problems need next to nothing.
-
-{memory}
-
-## Engine
-
-For each problem and iteration of the refinement, n = {n}: **{operations:,.0f} operations** ({flops:,.0f} with the
-costs of [figure 1](results/README.md)) and **{iteration_bytes:,.0f} bytes** to read and write if an iteration is one
-kernel, {fused_intensity:.3g} operations a byte. Eager mode moves {eager_bytes:,.0f} bytes in {kernels} kernels,
-{excess:.0f} times as many: {intensity:.2g} operations a byte.
-
-{versions}
-
-In brackets: what was predicted before the version was written. Every version is measured in the same run as the others,
-those with a commit from a copy of it in a process of its own.
-
-## GPU
-
-{gpu}
-
-## What was left out
-
-{skipped}
-"""
+Row = Mapping[str, Any]
 
 
-def page(
-    results: Mapping[str, Mapping[str, Any]],
-    versions: Sequence[Mapping[str, Any]],
-    measured_on_gpu: Mapping[str, Any] | None = None,
-) -> str:
+def three_digits(value: float) -> str:
+    """Three significant digits, never an exponent."""
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:#.3g}".rstrip(".")
+
+
+def percent(rate: Mapping[str, Any]) -> str:
+    """Success with its interval, without the sign."""
+    return str(SuccessRate(**rate)).replace(" %", "")
+
+
+def matching(rows: Iterable[Row], **wanted: Any) -> dict[str, Row]:
+    """Rows with these values, by contender."""
+    return {row["contender"]: row for row in rows if all(row[key] == value for key, value in wanted.items())}
+
+
+def targets_table(results: Mapping[str, Mapping[str, Any]]) -> str:
+    """Every target beside the measurement."""
+    lines = []
+    for part in PARTS:
+        for entry in results[part]["targets"]:
+            bound, unit = "at most" if entry["at_most"] else "at least", f" {entry['unit']}".rstrip()
+            measured = f"{three_digits(entry['measured'])}{unit}"
+            verdict = "met" if entry["met"] else "**missed**"
+            lines.append((entry["what"], f"{bound} {entry['target']:g}{unit}", measured, verdict))
+    return markdown_table(("What", "Wanted", "Measured", "Verdict"), lines)
+
+
+def throughput_table(results: Mapping[str, Any], batch: int) -> str:
+    """One batch size on one thread and two, forward and with gradients."""
+    rows = [row for row in results["rows"] if (row["n"], row["batch"]) == (N, batch)]
+    columns = [matching(rows, threads=count, mode=mode) for mode in (FORWARD, BACKWARD) for count in (1, 2)]
+    lines = []
+    for name in dict.fromkeys(row["contender"] for row in rows):
+        there = [column.get(name) for column in columns]
+        cells = [three_digits(row["median_us"]) if row else "–" for row in there]
+        rate = next(row["success"] for row in there if row)
+        lines.append((f"`{name}`", *cells, percent(rate)))
+    head = ("Contender", "one thread", "two", "forward+backward, one", "two", "success (%)")
+    return markdown_table(head, lines)
+
+
+def latency_table(results: Mapping[str, Any]) -> str:
+    """The distributions on one thread, and the median on two."""
+    one, two = (matching(results["rows"], threads=count) for count in (1, 2))
+    lines = []
+    for name, row in one.items():
+        cells = [three_digits(row[key] / 1e3) for key in ("median_us", "p90_us", "p99_us", "max_us")]
+        other = three_digits(two[name]["median_us"] / 1e3) if name in two else "–"
+        lines.append((f"`{name}`", *cells, f"{row['p99_us'] / row['median_us']:.2f}", other, percent(row["success"])))
+    head = ("Contender", "median (ms)", "90 %", "99 %", "largest", "99 % by median", "median, two threads")
+    return markdown_table((*head, "success (%)"), lines)
+
+
+def startup_table(results: Mapping[str, Any]) -> str:
+    """Cold starts, a line for each contender, mode and cache."""
+    lines = []
+    for entry in results["starts"]:
+        if entry["backward"] and entry["cache"] == EAGER:
+            continue  # eager with gradients starts as without
+        first, *others = entry["calls"]
+        kinds = [BACKWARD] * entry["backward"] + [entry["cache"]] * (entry["cache"] != EAGER)
+        times = (entry["torch_s"] + entry["package_s"], entry["make_s"] + first["first_s"], 1e3 * first["second_s"])
+        later = three_digits(sum(call["first_s"] for call in others)) if others else "–"
+        lines.append((", ".join([f"`{entry['contender']}`", *kinds]), *map(three_digits, times), later))
+    head = ("Contender", "import (s)", "first call (s)", "second call (ms)", "next batch sizes (s)")
+    return markdown_table(head, lines)
+
+
+def memory_table(results: Mapping[str, Any]) -> str:
+    """How much calls add to the peak of a process."""
+    found: dict[str, dict[bool, str]] = {}
+    for entry in results["starts"]:
+        if entry["memory"] is not None:
+            added = (entry["memory"]["peak_bytes"] - entry["memory"]["before_bytes"]) / 2**20
+            found.setdefault(entry["contender"], {})[entry["backward"]] = three_digits(added)
+    lines = [(f"`{name}`", cells.get(False, "–"), cells.get(True, "–")) for name, cells in found.items()]
+    return markdown_table(("Contender", "forward (MiB)", "forward+backward (MiB)"), lines)
+
+
+def gpu_table(results: Mapping[str, Any]) -> str:
+    """The best batch size of each contender on a GPU."""
+    rows = [row for row in results["rows"] if (row["threads"], row["n"], row["mode"]) == (1, N, FORWARD)]
+    lines = []
+    for name in dict.fromkeys(row["contender"] for row in rows):
+        best = min((row for row in rows if row["contender"] == name), key=lambda row: row["median_us"])
+        lines.append((f"`{name}`", f"{best['batch']}", f"{1e6 / best['median_us']:.2e}", percent(best["success"])))
+    return markdown_table(("Contender", "best batch", "problems a second", "success (%)"), lines)
+
+
+def skipped_reasons(results: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Why a row is missing, each reason once."""
+    found: dict[str, None] = {}
+    for part in PARTS:
+        for entry in results[part]["skipped"]:
+            place = ", ".join(f"{key} = {entry[key]}" for key in ("n", "batch") if key in entry)
+            mode = f", {entry['mode']}" if entry.get("mode") == BACKWARD else ""
+            found[f"`{entry['contender']}`{f' at {place}' if place else ''}{mode}: {entry['why']}."] = None
+    return list(found)
+
+
+def page(results: Mapping[str, Mapping[str, Any]], gpu: Mapping[str, Any] | None = None) -> str:
     """The page as Markdown.
 
     Args:
-        results: by their names in ``PARTS``.
-        versions: see :func:`versions.load_versions`.
-        measured_on_gpu: the throughput there.
+        results: the results files by their names in ``PARTS``.
+        gpu: the results file of the throughput on a GPU.
     """
-    engine, settings = results["engine"], results["throughput"]["settings"]
-    operations = sum(engine["operations"].values())
-    lists: list[Any] = [entry["calls"] for entry in results["startup"]["starts"] if len(entry["calls"]) > 1]
-    return _TEXT.format(
-        machine=machine(results),
-        trained=TRAINED,
-        plain=PLAIN,
-        one=ONE,
-        any=ANY,
-        shipped="{m} iterations, {views} views".format(**engine["shipped"]),
-        m=engine["m"],
-        n=engine["n"],
-        angle=COARSE_ANGLE_DEG,
-        shift=100 * COARSE_SHIFT,
+    settings, shipped = results["throughput"]["settings"], PnPNet.from_pretrained(TRAINED)
+    sizes = [entry["calls"][1:] for entry in results["startup"]["starts"] if len(entry["calls"]) > 1]
+    options: dict[str, Any] = {"trim_blocks": True, "keep_trailing_newline": True, "undefined": StrictUndefined}
+    environment = Environment(loader=FileSystemLoader(HERE), autoescape=False, **options)
+    return environment.get_template("performance.md.jinja").render(
+        **{"trained": TRAINED, "plain": PLAIN, "one": ONE, "any": ANY, "n": N, "m": ITERATIONS},
+        **{"angle": COARSE_ANGLE_DEG, "shift": 100 * COARSE_SHIFT},
+        shipped={"m": shipped.refine.m, "views": shipped.views},
+        made=results["throughput"]["environment"],
+        results=results,
+        settings=settings,
         targets=targets_table(results),
         throughput=throughput_table(results["throughput"], settings["problems"]),
-        batch=settings["problems"],
-        call_s=settings["call_s"],
-        calls=results["latency"]["settings"]["latency_calls"],
         latency=latency_table(results["latency"]),
-        sizes=", ".join(str(call["batch"]) for call in lists[0][1:]) if lists else "none",
+        sizes=[call["batch"] for call in sizes[0]] if sizes else [],
         startup=startup_table(results["startup"]),
-        memory_batch=results["startup"]["settings"]["memory_batch"],
         memory=memory_table(results["startup"]),
-        operations=operations,
-        flops=engine["iteration_flops"],
-        iteration_bytes=engine["floor_bytes"]["iteration"],
-        eager_bytes=engine["iteration_bytes"],
-        kernels=engine["iteration_kernels"],
-        excess=engine["iteration_bytes"] / engine["floor_bytes"]["iteration"],
-        intensity=operations / engine["iteration_bytes"],
-        fused_intensity=operations / engine["floor_bytes"]["iteration"],
-        versions=versions_table(results["throughput"], versions),
-        gpu=gpu_text(engine, measured_on_gpu),
-        skipped=skipped_list(results),
+        gpu=None if gpu is None else {"name": gpu["environment"]["gpu"], "table": gpu_table(gpu)},
+        skipped=skipped_reasons(results),
     )
 
 
 def load_parts(folder: Path) -> tuple[dict[str, Any], dict[str, Any] | None]:
-    """The results files, and the one of a GPU if there is one."""
+    """The results files, and the results file of a GPU when there is one."""
     results = {part: json.loads((folder / f"{part}.json").read_text(encoding="utf-8")) for part in PARTS}
     gpu = folder / "throughput_cuda.json"
     return results, json.loads(gpu.read_text(encoding="utf-8")) if gpu.exists() else None
@@ -182,11 +167,11 @@ def render(folder: Path, path: Path) -> None:
     from kornia_pnpnet.evaluation.figures.performance import plot_latency, plot_times
 
     results, gpu = load_parts(folder)
+    # Names with an @ are earlier versions of the package: the pictures leave them out.
     rows = [row for row in results["throughput"]["rows"] if row["threads"] == 1 and "@" not in row["contender"]]
-    pictures = path.parent / path.stem
-    batches = {mode: [row for row in rows if (row["mode"], row["n"]) == (mode, 9)] for mode in (FORWARD, BACKWARD)}
-    size = results["throughput"]["settings"]["problems"]
-    pairs = [row for row in rows if row["mode"] == FORWARD and (row["batch"] == size or row["n"] != 9)]
+    pictures, size = path.parent / path.stem, results["throughput"]["settings"]["problems"]
+    batches = {mode: [row for row in rows if (row["mode"], row["n"]) == (mode, N)] for mode in (FORWARD, BACKWARD)}
+    pairs = [row for row in rows if row["mode"] == FORWARD and (row["batch"] == size or row["n"] != N)]
     plot_times(pictures / "batch.png", "n = 9, 3 mismatches, one thread", batches, against="batch", label="problems B")
     fewer = "".join(f" ({b} at n = {n})" for n, b in sorted({(x["n"], x["batch"]) for x in pairs}) if b < size)
     title = f"B = {size}{fewer}, a third of the pairs mismatched, one thread"
@@ -194,4 +179,4 @@ def render(folder: Path, path: Path) -> None:
     alone = [row for row in results["latency"]["rows"] if row["threads"] == 1]
     plot_latency(pictures / "latency.png", "One problem at a time, n = 9, 0 to 3 wrong pairs, one thread", alone)
     with atomic_open(path, encoding="utf-8") as file:
-        file.write(page(results, load_versions(), gpu))
+        file.write(page(results, gpu))

@@ -1,7 +1,7 @@
-"""One contender in a process of its own: how long its first calls take, and how much memory a large one.
+"""One contender in a process of its own: seconds of its first calls, and memory of a large call.
 
 ``python process.py '{"contender": "epnp", "backward": false, "batches": [1000], "memory_batch": 10000}'`` prints JSON.
-What it imports at the top must import nothing heavy: the imports are what is timed first.
+The top of this file must not import PyTorch: the imports are timed.
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-# Small batches of different sizes before the large one: whatever a first call does is done then.
+# Batch sizes of the calls before the memory measurement: they do the work of first calls.
 _WARM = (64, 65)
 
 
 def main(request: dict[str, Any]) -> dict[str, Any]:
-    """What the request asks for.
+    """Measure one contender.
 
     Args:
-        request: ``contender``; ``backward``; ``batches``, each called twice, in this order; ``memory_batch``, whose
-            memory is measured, or 0; ``device``.
+        request: ``contender``; ``backward``; ``batches``, batch sizes that are called twice each, in this order;
+            ``memory_batch``, the batch size of the memory measurement, 0 for none; ``device``.
 
     Returns:
-        ``torch_s``, ``package_s`` (without PyTorch), ``make_s``; ``calls``, for each batch ``first_s`` and
-        ``second_s``; ``memory``: ``before_bytes`` and ``peak_bytes`` of the process around the call, or ``None``;
-        ``warnings`` that the first calls gave.
+        ``contender``, ``backward``; ``torch_s``, ``package_s`` (without PyTorch), ``make_s``; ``calls``, for each batch
+        size ``first_s`` and ``second_s``; ``memory``: ``before_bytes`` and ``peak_bytes`` of the process around the
+        call, or ``None``; ``warnings`` of the calls.
     """
     start = time.perf_counter()
     import torch  # noqa: F401
@@ -37,9 +37,9 @@ def main(request: dict[str, Any]) -> dict[str, Any]:
     import kornia_pnpnet  # noqa: F401
 
     package_s = time.perf_counter() - start
-    import settings
     from contenders import CONTENDERS, OURS
     from harness import peak_bytes, threads
+    from settings import N, draw
 
     options = {"device": request["device"]} if request["contender"] in OURS else {}
     start = time.perf_counter()
@@ -47,36 +47,33 @@ def main(request: dict[str, Any]) -> dict[str, Any]:
     make_s = time.perf_counter() - start
     calls: list[dict[str, float]] = []
     memory = None
+
+    def task(batch: int) -> Any:
+        return contender.task(draw(N, batch), backward=request["backward"])
+
     with threads(1), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         for batch in request["batches"]:
-            task = contender.task(settings.draw(settings.N, batch), backward=request["backward"])
-            calls.append({"batch": batch, "first_s": task.seconds(), "second_s": task.seconds()})
+            made = task(batch)
+            calls.append({"batch": batch, "first_s": made.seconds(), "second_s": made.seconds()})
         if request["memory_batch"]:
             for batch in _WARM:
-                contender.task(settings.draw(settings.N, batch), backward=request["backward"]).seconds()
-            task = contender.task(settings.draw(settings.N, request["memory_batch"]), backward=request["backward"])
-            forget_peak()
+                task(batch).seconds()
+            made = task(request["memory_batch"])
+            Path("/proc/self/clear_refs").write_text("5")  # Linux: the peak begins again at the present memory
             before = peak_bytes()
-            task.seconds()
+            made.seconds()
             memory = {"batch": request["memory_batch"], "before_bytes": before, "peak_bytes": peak_bytes()}
+    ignored = DeprecationWarning | FutureWarning
     return {
-        "contender": request["contender"],
-        "backward": request["backward"],
+        **{key: request[key] for key in ("contender", "backward")},
         "torch_s": torch_s,
         "package_s": package_s,
         "make_s": make_s,
         "calls": calls,
         "memory": memory,
-        "warnings": [
-            str(entry.message) for entry in caught if not issubclass(entry.category, DeprecationWarning | FutureWarning)
-        ],
+        "warnings": [str(entry.message) for entry in caught if not issubclass(entry.category, ignored)],
     }
-
-
-def forget_peak() -> None:
-    """Let the peak begin again at what the process holds now (Linux)."""
-    Path("/proc/self/clear_refs").write_text("5")
 
 
 if __name__ == "__main__":

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
 from contenders import CONTENDERS, ONE_THREAD, OURS
 from harness import say
 from tasks import CannotBeTimedError, Contender
-from versions import version_contenders
 
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.evaluation import draw_problems
 from kornia_pnpnet.types import Problems
 
-__all__ = ["FULL", "N", "QUICK", "Settings", "draw", "make_contenders", "mismatches"]
-
-#: Pairs where n is not said.
+#: Number of pairs unless a row says otherwise.
 N = 9
-# Nothing was trained, tuned or looked at with these problems before.
+# Seed of the problems. No training or tuning used it.
 _SEED = 20_270_400
 
 
@@ -27,20 +23,19 @@ class Settings(NamedTuple):
     """How much is measured.
 
     Attributes:
-        contenders: names; ``None``: all, versions too.
+        contenders: names; ``None``: all.
         device: of the solvers of ours; the others run on the CPU.
-        problems: how many success is counted on, and the batch at which numbers of pairs are compared.
+        problems: number of problems that success is counted on, and batch size of the rows with other numbers of pairs.
         batches: batch sizes at 9 pairs.
         pairs: numbers of pairs.
-        most_backward: largest batch with gradients.
-        rounds: at most so many.
-        loop_s: in a round a loop over problems is cut to so many that it takes this long, and a shorter call repeated.
-        call_s: larger batches that would take longer are left out.
-        point_s: rounds of one comparison take about so long.
-        latency_calls: calls with a single problem.
-        latency_s: cut to what takes this long.
-        startup_runs: processes for each cold start.
-        memory_batch: batch whose memory is measured.
+        most_backward: largest batch size with gradients.
+        rounds: largest number of rounds.
+        loop_s: seconds for a contender in a round: a loop over problems solves fewer, a shorter call is repeated.
+        call_s: batches whose call takes more seconds are left out.
+        point_s: seconds for all rounds of one comparison, about.
+        latency_calls: number of calls with a single problem.
+        latency_s: seconds of these calls; slow contenders get fewer calls.
+        memory_batch: batch size of the memory measurement.
     """
 
     contenders: tuple[str, ...] | None = None
@@ -55,18 +50,11 @@ class Settings(NamedTuple):
     point_s: float = 3.0
     latency_calls: int = 1000
     latency_s: float = 2.5
-    startup_runs: int = 1
     memory_batch: int = 10_000
-
-    @classmethod
-    def of(cls, plain: dict[str, Any]) -> Settings:
-        """From JSON, which has lists for tuples."""
-        values: dict[str, Any] = {key: tuple(x) if isinstance(x, list) else x for key, x in plain.items()}
-        return cls(**values)
 
 
 FULL = Settings()
-#: To see that everything runs.
+#: A few small problems: does everything run?
 QUICK = Settings(
     problems=20,
     batches=(1, 20),
@@ -78,54 +66,39 @@ QUICK = Settings(
     point_s=1.0,
     latency_calls=20,
     latency_s=1.0,
-    startup_runs=1,
     memory_batch=100,
 )
 
 
-def mismatches(n: int) -> int:
-    """How many pairs are wrong: a third."""
-    return n // 3
-
-
 def draw(n: int, count: int, outliers: OutlierMix | None = None) -> Problems:
-    """Problems of the protocol's data in float64, a third of the pairs mismatched unless said otherwise."""
-    mix = OutlierMix(count=mismatches(n), mismatch_share=1.0) if outliers is None else outliers
-    # The batch size is fixed, so that more problems begin with the fewer ones.
-    return draw_problems(
-        SyntheticProblems(n=n, batch_size=1000, seed=_SEED + n, outliers=mix, dtype=torch.float64), count
-    )
+    """Problems of the protocol's data in float64; a third of the pairs are mismatches unless ``outliers`` is given."""
+    mix = OutlierMix(count=n // 3, mismatch_share=1.0) if outliers is None else outliers
+    # A constant batch size: a smaller count gives the first problems of a larger one.
+    source = SyntheticProblems(n=n, batch_size=1000, seed=_SEED + n, outliers=mix, dtype=torch.float64)
+    return draw_problems(source, count)
 
 
-class Made(NamedTuple):
-    """What :func:`make_contenders` returns."""
-
-    contenders: dict[str, Contender]
-    skipped: list[dict[str, Any]]
-
-
-def make_contenders(settings: Settings, *, versions: bool = False, count: int = 1) -> Made:
-    """Make what is asked for, as far as it is installed.
+def make_contenders(settings: Settings, *, count: int = 1) -> tuple[dict[str, Contender], list[dict[str, Any]]]:
+    """Make the contenders that are asked for.
 
     Args:
-        settings: say which, and the device.
-        versions: earlier versions of the package, too.
-        count: of threads; some are measured on one only.
+        settings: names and device.
+        count: number of threads; some contenders are measured on one thread only.
 
     Returns:
-        Contenders by name, and for those that cannot be made the reason.
+        Contenders by name, and for each contender that cannot be made its name and the reason.
     """
-    makers: dict[str, Callable[..., Contender]] = {**CONTENDERS, **(version_contenders() if versions else {})}
-    wanted = [name for name in makers if settings.contenders is None or name in settings.contenders]
-    made, skipped = {}, []
-    for name in wanted:
+    made: dict[str, Contender] = {}
+    skipped: list[dict[str, Any]] = []
+    for name, make in CONTENDERS.items():
+        if settings.contenders is not None and name not in settings.contenders:
+            continue
         if count > 1 and name in ONE_THREAD:
             skipped.append({"contender": name, "why": "measured on one thread only"})
             continue
-        options = {"device": settings.device} if name in OURS else {}
         try:
-            made[name] = makers[name](**options)
+            made[name] = make(**({"device": settings.device} if name in OURS else {}))
         except (ImportError, CannotBeTimedError) as error:
             skipped.append({"contender": name, "why": str(error)})
             say(f"skipped: {name}: {error}")
-    return Made(made, skipped)
+    return made, skipped

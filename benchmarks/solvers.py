@@ -1,7 +1,7 @@
 """Time, success and memory of solvers beside peers: ``python benchmarks/solvers.py --out benchmarks/solvers.json``.
 
-All solvers have the same problems of the protocol's data in the same run, on one thread. README.md beside this file
-says what is measured and how to read it.
+All solvers solve the same problems of the protocol's data in the same run, on one thread. README.md beside this file
+describes the measurements.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import json
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from harness import in_turns, load, peak_bytes, ratio, run_child, say, seconds, summary, threads
@@ -22,13 +22,14 @@ from torch import nn
 
 from kornia_pnpnet import pose_errors, success, success_rate
 from kornia_pnpnet.core.environment import environment
+from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.evaluation import draw_problems
 from kornia_pnpnet.evaluation.named_solvers import load_solver
 from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.types import Problems
 
-# Nothing was trained, tuned or looked at with these problems before.
+# Seed of the problems. No training or tuning used it.
 SEED = 20_270_300
 SMALL, LARGE = 9, 100
 SETS = {
@@ -38,8 +39,8 @@ SETS = {
     "n = 100, 50 outliers": (LARGE, OutlierMix(count=50)),
     "n = 100, 70 outliers": (LARGE, OutlierMix(count=70)),
 }
-# Thresholds: what docs/results/make.py found on its tuning seed, as the peers' defaults were found on theirs. Once
-# `p3p-ransac` has the threshold in pixels that every peer has, once it allows for noise of the world points.
+# Thresholds were tuned by docs/results/make.py on its tuning seed, like the defaults of the peers. `p3p-ransac` runs
+# once with one threshold in pixels, like every peer, and once allowing for noise of the world points.
 OURS = (
     "epnp",
     "epnp-lm",
@@ -51,26 +52,19 @@ OURS = (
     "pnpnet-set",
 )
 PEERS = ("opencv-epnp", "opencv-sqpnp", "opencv-ransac", "opencv-usac", "poselib", "pycolmap")
-# Those that are shown the large problems. The paper's RANSAC is not: few of its samples of 7 are without an outlier
-# there, so it tries all that it may, and one call takes longer than those of all the others together.
+# Solvers of the large problems. The paper's RANSAC is not among them: few samples of 7 pairs are free of outliers, so
+# one call of it would take longer than all others together.
 ROBUST = ("p3p-ransac", "pnpnet-set", "opencv-ransac", "opencv-usac", "poselib", "pycolmap")
 MEMORY_SET = "n = 100, 70 outliers"
 MEMORY_SOLVER, MEMORY_TARGET, MEMORY_RUNS = "p3p-ransac", 2 * 2**30, 5
 
 
-class Speedup(NamedTuple):
-    """How many times as fast as a peer a solver of ours has to be, on the small problems."""
-
-    solver: str
-    peer: str
-    target: float
-
-
-SPEEDUPS = (Speedup("epnp", "opencv-epnp", 3.0), Speedup("p3p-ransac", "poselib", 1.0))
+# Targets of the time of a peer by the time of a solver of ours, on the small problems.
+SPEEDUPS = {("epnp", "opencv-epnp"): 3.0, ("p3p-ransac", "poselib"): 1.0}
 
 
 def draw(name: str, count: int, seed: int) -> Problems:
-    """Problems of one of ``SETS``, in float64; another seed for each set."""
+    """Problems of one of ``SETS``, in float64, each set from its own seed."""
     n, outliers = SETS[name]
     seed += list(SETS).index(name)
     source = SyntheticProblems(n=n, batch_size=min(count, 1000), seed=seed, outliers=outliers, dtype=torch.float64)
@@ -82,20 +76,15 @@ def base_name(spec: str) -> str:
     return spec.partition(":")[0]
 
 
-def runs_on(spec: str, name: str) -> bool:
-    """Whether a solver is shown a set."""
-    return SETS[name][0] == SMALL or base_name(spec) in ROBUST
-
-
 @torch.no_grad()
 def measure_set(
     solvers: Mapping[str, nn.Module], name: str, count: int, repeats: int, seed: int
 ) -> list[dict[str, Any]]:
-    """Time the solvers on one set in rounds, each solver once in a round, and count what they solve."""
+    """Time the solvers on one set, each solver once in a round, and measure success."""
     problems = draw(name, count, seed)
     rates, timers = {}, {}
     for spec, solver in solvers.items():
-        result = solver(*problems[:3])  # not timed: first calls are slower
+        result = solver(problems.world_points, problems.img_points, problems.intrinsics)  # not timed: slower
         rates[spec] = success_rate(success(pose_errors(result.pose, problems.pose)))
         timers[spec] = partial(seconds, bare_call(solver, problems))
     rounds = in_turns(timers, repeats)
@@ -108,30 +97,31 @@ def measure_set(
 def speedups(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Every target of speed on every small set on which both sides were measured."""
     found = []
-    for wanted in SPEEDUPS:
+    for (solver, peer), target in SPEEDUPS.items():
         for mine, theirs in itertools.product(rows, rows):
-            names = base_name(mine["solver"]), base_name(theirs["solver"])
-            if names != wanted[:2] or mine["set"] != theirs["set"] or SETS[mine["set"]][0] != SMALL:
-                continue
-            times = ratio(mine, theirs)
-            entry = {"solver": mine["solver"], "peer": theirs["solver"], "set": mine["set"], "ratio": times}
-            found.append({**entry, "target": wanted.target, "met": times >= wanted.target})
+            names = (base_name(mine["solver"]), base_name(theirs["solver"]))
+            if names == (solver, peer) and mine["set"] == theirs["set"] and SETS[mine["set"]][0] == SMALL:
+                times = ratio(mine, theirs)
+                entry = {"solver": mine["solver"], "peer": theirs["solver"], "set": mine["set"], "ratio": times}
+                found.append({**entry, "target": target, "met": times >= target})
     return found
 
 
 def memory_here(spec: str, count: int, seed: int) -> dict[str, int]:
-    """Solve one large batch in this process; its peak before there were problems, and in the end."""
+    """Solve one large batch in this process; the peak memory before and after."""
     before = peak_bytes()
     with threads(), torch.no_grad():
-        load_solver(spec)(*draw(MEMORY_SET, count, seed)[:3])
+        problems = draw(MEMORY_SET, count, seed)
+        load_solver(spec)(problems.world_points, problems.img_points, problems.intrinsics)
     return {"imports_bytes": before, "peak_bytes": peak_bytes()}
 
 
 def measure_memory(spec: str, count: int, seed: int) -> dict[str, Any]:
-    """Solve one large batch in processes of its own and compare the largest peak with the target.
+    """Solve one large batch in several processes and compare the largest peak with the target.
 
-    Peaks of the same run differ: it is chance what the allocator has given back when the next tensor comes.
+    Peaks of the same call differ with the memory that the allocator has given back.
     """
+    say(f"memory of {spec}")
     arguments = ("--memory-of", spec, "--memory-count", str(count), "--seed", str(seed))
     runs = [run_child(Path(__file__), *arguments) for _ in range(MEMORY_RUNS)]
     peak = max(run["peak_bytes"] for run in runs)
@@ -151,16 +141,15 @@ def measure(specs: Sequence[str], *, count: int, repeats: int, memory_count: int
     """Measure everything, with a line on standard error for each step.
 
     Args:
-        specs: solvers, as :func:`load_solver` takes them. Those whose package is not installed
-            are skipped.
-        count: problems in a batch.
-        repeats: rounds.
-        memory_count: problems in the batch whose memory is measured; 0: none is.
-        seed: of the problems.
+        specs: solvers, as for :func:`load_solver`. Solvers without their package are skipped.
+        count: number of problems in a batch.
+        repeats: number of rounds.
+        memory_count: number of problems of the memory measurement; 0: none.
+        seed: seed of the problems.
 
     Returns:
-        ``environment``, ``settings``, ``load_average`` (of the last minute, before and after), ``skipped`` (why, by
-        solver), ``rows`` (one for each solver and set), ``speedups`` and ``memory``.
+        ``environment``, ``settings``, ``load_average`` (before and after), ``skipped`` (the reason by solver), ``rows``
+        (one for each solver and set), ``speedups`` and ``memory``.
     """
     before = load()
     solvers, skipped = {}, {}
@@ -170,32 +159,18 @@ def measure(specs: Sequence[str], *, count: int, repeats: int, memory_count: int
         except ImportError as error:
             skipped[spec] = str(error)
             say(f"skipped: {spec}: {error}")
-    memory = []
-    for spec in solvers if memory_count else ():
-        if base_name(spec) == MEMORY_SOLVER:
-            say(f"memory of {spec}")
-            memory.append(measure_memory(spec, memory_count, seed))
+    wanted = [spec for spec in solvers if memory_count and base_name(spec) == MEMORY_SOLVER]
+    memory = [measure_memory(spec, memory_count, seed) for spec in wanted]
     rows = []
     with threads():
         for name in SETS:
             say(name)
-            chosen = {spec: solver for spec, solver in solvers.items() if runs_on(spec, name)}
+            small = SETS[name][0] == SMALL
+            chosen = {spec: solver for spec, solver in solvers.items() if small or base_name(spec) in ROBUST}
             rows += measure_set(chosen, name, count, repeats, seed)
         settings = {"solvers": list(specs), "count": count, "repeats": repeats, "seed": seed, "dtype": "float64"}
-        return {
-            "environment": environment(),
-            "settings": settings,
-            "load_average": [before, load()],
-            "skipped": skipped,
-            "rows": rows,
-            "speedups": speedups(rows),
-            "memory": memory,
-        }
-
-
-def verdict(met: bool) -> str:
-    """What the tables say of a target."""
-    return "target met" if met else "target missed"
+        made = {"environment": environment(), "settings": settings, "load_average": [before, load()]}
+    return {**made, "skipped": skipped, "rows": rows, "speedups": speedups(rows), "memory": memory}
 
 
 def format_tables(results: Mapping[str, Any]) -> str:
@@ -204,48 +179,52 @@ def format_tables(results: Mapping[str, Any]) -> str:
     for row in results["rows"]:
         time_us, rate = f"{row['median_us']:.1f} µs (min {row['min_us']:.1f})", 100 * row["success"]["rate"]
         cells[row["solver"], row["set"]] = f"{time_us}, {rate:.1f} %"
-    lines = ["| Solver | " + " | ".join(SETS) + " |", "|---" * (1 + len(SETS)) + "|"]
-    for spec in dict.fromkeys(row["solver"] for row in results["rows"]):
-        lines.append(f"| `{spec}` | " + " | ".join(cells.get((spec, name), "–") for name in SETS) + " |")
-    lines += ["", "| Target | Set | Measured | Verdict |", "|---|---|---|---|"]
+    solvers = dict.fromkeys(row["solver"] for row in results["rows"])
+    lines = [[f"`{spec}`", *(cells.get((spec, name), "–") for name in SETS)] for spec in solvers]
+    times = markdown_table(["Solver", *SETS], lines, align="l" * (1 + len(SETS)))
+    found = []
     for entry in results["speedups"]:
         wanted = f"`{entry['solver']}` at least {entry['target']:g} times as fast as `{entry['peer']}`"
-        lines.append(f"| {wanted} | {entry['set']} | {entry['ratio']:.2f} times | {verdict(entry['met'])} |")
+        found.append((entry, wanted, f"{entry['ratio']:.2f} times"))
     for entry in results["memory"]:
         peak, rise, target = (entry[f"{key}_bytes"] / 2**30 for key in ("peak", "rise", "target"))
         wanted = f"`{entry['solver']}` on {entry['count']} problems below {target:g} GiB"
-        measured = f"{peak:.2f} GiB, {rise:.2f} GiB of it not the imports' (the largest of {len(entry['runs'])} runs)"
-        lines.append(f"| {wanted} | {entry['set']} | {measured} | {verdict(entry['met'])} |")
-    return "\n".join(lines)
+        found.append((entry, wanted, f"{peak:.2f} GiB, {rise:.2f} GiB without the imports"))
+    lines = [
+        [wanted, entry["set"], measured, "met" if entry["met"] else "**missed**"] for entry, wanted, measured in found
+    ]
+    return f"{times}\n\n{markdown_table(['Target', 'Set', 'Measured', 'Verdict'], lines, align='llll')}"
 
 
 def page(results: Mapping[str, Any]) -> str:
-    """The tables as a page that says where they are from."""
-    count, load = results["settings"]["count"], results["load_average"]
+    """The tables as a page."""
+    load = results["load_average"]
     where = f"{results['environment']['cpu']}, {results['environment']['date']}"
-    return (
-        "# Time, success and memory\n\n"
-        "Written by `benchmarks/solvers.py`, see [README.md](README.md). Median and minimum in µs per problem, calls\n"
-        f"of {count} problems, one thread, {where}, load average {load[0]:.1f} before and {load[1]:.1f} after.\n\n"
-        f"{format_tables(results)}\n"
-    )
+    return f"""\
+# Time, success and memory
+
+Written by `benchmarks/solvers.py`, see [README.md](README.md). Median and minimum in µs per problem, calls of
+{results["settings"]["count"]} problems, one thread, {where}, load average {load[0]:.1f} before and {load[1]:.1f} after.
+
+{format_tables(results)}
+"""
 
 
 def make_parser() -> argparse.ArgumentParser:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, help="the results file, ending in .json; the tables go beside it, into .md")
+    parser.add_argument("--out", type=Path, help="the results file (.json); the tables go beside it (.md)")
     parser.add_argument("--solvers", nargs="+", default=[*OURS, *PEERS], help="names, with options after a colon")
-    parser.add_argument("--count", type=int, default=1000, help="problems in a batch")
-    parser.add_argument("--repeats", type=int, default=7, help="rounds")
-    parser.add_argument("--memory-count", type=int, default=10_000, help="problems for the memory; 0: none")
-    parser.add_argument("--seed", type=int, default=SEED, help="of the problems")
-    parser.add_argument("--memory-of", help=argparse.SUPPRESS)  # what the process for the memory is started with
+    parser.add_argument("--count", type=int, default=1000, help="number of problems in a batch")
+    parser.add_argument("--repeats", type=int, default=7, help="number of rounds")
+    parser.add_argument("--memory-count", type=int, default=10_000, help="problems of the memory measurement; 0: none")
+    parser.add_argument("--seed", type=int, default=SEED, help="seed of the problems")
+    parser.add_argument("--memory-of", help=argparse.SUPPRESS)  # a process of `measure_memory`
     return parser
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Measure, write the file and print the tables."""
+    """Measure, write the files and print the tables."""
     parser = make_parser()
     options = parser.parse_args(arguments)
     if options.count < 1 or options.repeats < 1 or options.memory_count < 0:

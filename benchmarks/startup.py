@@ -14,11 +14,9 @@ from contenders import ONE, PLAIN, TRAINED, WHOLE
 from harness import HERE, run_child, say, target
 from settings import Settings, make_contenders
 
-__all__ = ["measure_startup", "targets"]
-
-# The first is the compiler's warm-up; the others show that another batch size does not compile everything anew.
+# The first batch size shows the compiler's warm-up, the others whether another size compiles again.
 _BATCHES = (1000, 999, 100, 10, 1)
-_IMPORTS = 5
+_IMPORTS = 5  # processes; the median counts
 COMPILED = f"{TRAINED} compiled"
 COLD, CACHED, EAGER = "cold", "cached", "eager"
 
@@ -26,28 +24,28 @@ COLD, CACHED, EAGER = "cold", "cached", "eager"
 def measure_startup(settings: Settings) -> dict[str, Any]:
     """Start every contender alone, forward and with gradients, on one thread.
 
-    Compiled ones start with an empty cache of the compiler and then again with the one that the first left.
+    Compiled contenders start with an empty cache of the compiler, and again with the cache of that first start.
 
     Returns:
-        ``starts``, one for each process: what ``process.py`` says, and the ``cache``; ``skipped`` and ``targets``.
+        ``starts``, one for each process: the answer of ``process.py``, and the ``cache``; ``skipped`` and ``targets``.
     """
-    made = make_contenders(settings)
+    contenders, skipped = make_contenders(settings)
     starts = []
-    for name, contender in made.contenders.items():
+    for name, contender in contenders.items():
         if name.startswith((PLAIN, ONE)) and name != WHOLE:
             continue  # as TRAINED
         for backward in (False, True) if contender.differentiable and name != WHOLE else (False,):
             say(f"cold start: {name}{', backward' if backward else ''}")
-            request: dict[str, Any] = {"contender": name, "backward": backward, "device": settings.device}
-            # A loop needs the memory of one problem, and PyPose's takes minutes for so many.
+            # A loop needs the memory of one problem.
             batch = 0 if contender.loops else settings.memory_batch
-            starts += start({**request, "memory_batch": batch}, settings)
+            request = {"contender": name, "backward": backward, "device": settings.device, "memory_batch": batch}
+            starts += start(request, settings)
     imports = [import_seconds() for _ in range(_IMPORTS)]
-    return {"starts": starts, "imports_s": imports, "skipped": made.skipped, "targets": targets(starts, imports)}
+    return {"starts": starts, "imports_s": imports, "skipped": skipped, "targets": targets(starts, imports)}
 
 
 def import_seconds() -> float:
-    """Seconds that importing the package takes where torch and kornia are imported already, in a new process."""
+    """Seconds to import the package in a new process that has imported torch and kornia."""
     code = (
         "import time, torch, kornia; start = time.perf_counter(); import kornia_pnpnet; "
         "print(time.perf_counter() - start)"
@@ -56,46 +54,34 @@ def import_seconds() -> float:
 
 
 def start(request: Mapping[str, Any], settings: Settings) -> list[dict[str, Any]]:
-    """Start a contender in processes of its own, one after the other. Only the last measures memory."""
+    """Start a contender in processes of its own, one after the other. Only the last process measures memory."""
     if "compiled" not in request["contender"]:
         return [{**measure({**request, "batches": [1]}), "cache": EAGER}]
     batches = [min(size, settings.problems) for size in _BATCHES]
     found = []
-    for run in range(settings.startup_runs if request["contender"] == COMPILED else 1):
-        with tempfile.TemporaryDirectory(prefix="inductor-") as folder:
-            for cache in (COLD, CACHED):
-                memory = request["memory_batch"] if run == 0 and cache == CACHED else 0
-                wanted = {**request, "batches": batches, "memory_batch": memory}
-                found.append({**measure(wanted, TORCHINDUCTOR_CACHE_DIR=folder), "cache": cache})
+    with tempfile.TemporaryDirectory(prefix="inductor-") as folder:
+        for cache in (COLD, CACHED):
+            memory = request["memory_batch"] if cache == CACHED else 0
+            wanted = {**request, "batches": batches, "memory_batch": memory}
+            found.append({**measure(wanted, TORCHINDUCTOR_CACHE_DIR=folder), "cache": cache})
     return found
 
 
 def measure(request: Mapping[str, Any], **environment: str) -> dict[str, Any]:
-    """What ``process.py`` says."""
+    """Run ``process.py``."""
     found: dict[str, Any] = run_child(HERE / "process.py", json.dumps(request), OMP_NUM_THREADS="1", **environment)
     return found
 
 
-def warm_ups(starts: Sequence[Mapping[str, Any]], name: str, backward: bool, cache: str) -> list[float]:
-    """Seconds of the first call of a contender, one for each run."""
-    return [
-        entry["make_s"] + entry["calls"][0]["first_s"]
-        for entry in starts
-        if (entry["contender"], entry["backward"], entry["cache"]) == (name, backward, cache)
-    ]
-
-
 def targets(starts: Sequence[Mapping[str, Any]], imports: Sequence[float]) -> list[dict[str, Any]]:
-    """How long the import may take, and making a compiled solver and its first call."""
+    """Most seconds of the import, and of making a compiled solver with its first call."""
     what = "`import kornia_pnpnet` after torch and kornia"
     found = [target(what, statistics.median(imports), 0.5, unit="s", at_most=True)] if imports else []
-    for backward in (False, True):
-        for cache, most in ((COLD, 20.0), (CACHED, 5.0)):
-            times = warm_ups(starts, COMPILED, backward, cache)
-            compiled = not any(
-                "compil" in text for entry in starts if entry["contender"] == COMPILED for text in entry["warnings"]
-            )
-            if times and compiled:
-                what = f"`{COMPILED}`, first call, {'forward+backward' if backward else 'forward'}, {cache}"
-                found.append(target(what, statistics.median(times), most, unit="s", at_most=True))
+    compiled = [entry for entry in starts if entry["contender"] == COMPILED]
+    if any("compil" in text for entry in compiled for text in entry["warnings"]):
+        return found  # there is no compiler
+    for entry in sorted(compiled, key=lambda entry: (entry["backward"], entry["cache"] == CACHED)):
+        most, mode = 20.0 if entry["cache"] == COLD else 5.0, "forward+backward" if entry["backward"] else "forward"
+        what, first = f"`{COMPILED}`, first call, {mode}, {entry['cache']}", entry["calls"][0]["first_s"]
+        found.append(target(what, entry["make_s"] + first, most, unit="s", at_most=True))
     return found

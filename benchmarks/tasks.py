@@ -1,7 +1,7 @@
-"""The interface of what is timed, and what all of it starts from.
+"""The interface of a contender, and the inputs that all contenders start from.
 
-A contender makes a task of a batch of problems; the task is called, forward or forward and backward, and says how many
-problems its poses solve.
+A contender makes a task of a batch of problems. A task can be timed, forward or forward and backward, and counts how
+many problems its poses solve.
 """
 
 from __future__ import annotations
@@ -20,32 +20,15 @@ from kornia_pnpnet import Guess, Normalize, pose_errors, success, success_rate
 from kornia_pnpnet.metrics import SuccessRate
 from kornia_pnpnet.types import Correspondences, Pose, Problems
 
-__all__ = [
-    "COARSE_ANGLE_DEG",
-    "COARSE_SHIFT",
-    "ITERATIONS",
-    "CannotBeTimedError",
-    "Contender",
-    "Task",
-    "coarse_pose",
-    "compile_or_raise",
-    "first",
-    "float_inputs",
-    "gradient",
-    "leaves_of",
-    "normalized",
-    "waiting",
-    "without_gradient",
-]
-
-# How far the pose is from the true one from which refinements start: what the first stage of the network leaves.
+# Errors of the pose that refinements start from, about those of the network's guess: the angle, and the distance as a
+# share of the distance to the points.
 COARSE_ANGLE_DEG, COARSE_SHIFT = 5.0, 0.05
-# Iterations of every refinement, the trained one's number.
+#: Iterations of every refinement.
 ITERATIONS = 5
 
 
 class CannotBeTimedError(Exception):
-    """Why a contender has no time."""
+    """Why a contender cannot be timed."""
 
 
 @dataclass
@@ -53,8 +36,8 @@ class Task:
     """A call on given problems.
 
     Attributes:
-        call: solves all of them once; forward and backward when it was made so.
-        poses: the poses in the frame of the problems, in float64; not timed.
+        call: solves all problems once, forward, or forward and backward.
+        poses: returns the poses in the frame of the problems; not timed.
         problems: the problems.
         finish: waits for the device.
     """
@@ -65,7 +48,7 @@ class Task:
     finish: Callable[[], None] | None = None
 
     def seconds(self, times: int = 1) -> float:
-        """Seconds that a call takes, the mean over ``times`` of them."""
+        """Seconds of a call, the mean over ``times`` calls."""
         if self.finish is None:
             return seconds(self.call, times)
         self.finish()
@@ -78,10 +61,10 @@ class Task:
         return seconds(everything) / times
 
     def warm(self) -> float:
-        """Call it twice, the first time to compile and to fill caches, and return the seconds of the second.
+        """Call twice, first to compile and to fill caches, and return the seconds of the second call.
 
         Raises:
-            CannotBeTimedError: when it warns that it does not compile: what is called compiled would not be.
+            CannotBeTimedError: when the call warns that it does not compile.
         """
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
@@ -91,7 +74,7 @@ class Task:
         return once
 
     def success(self) -> SuccessRate:
-        """How many of the problems are solved."""
+        """Share of the problems that are solved."""
         with torch.no_grad():
             pose = Pose(*(x.double().cpu() for x in self.poses()))
         return success_rate(success(pose_errors(pose, self.problems.pose)))
@@ -104,10 +87,10 @@ def _raise_uncompiled(caught: Sequence[warnings.WarningMessage]) -> None:
 
 
 def compile_or_raise(module: nn.Module, **options: bool) -> None:
-    """Call its ``compile``.
+    """Call the module's ``compile``.
 
     Raises:
-        CannotBeTimedError: when it warns that it does not.
+        CannotBeTimedError: when ``compile`` warns that it does not compile.
     """
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -116,10 +99,10 @@ def compile_or_raise(module: nn.Module, **options: bool) -> None:
 
 
 class Contender:
-    """Something that is timed.
+    """A solver to be timed.
 
     Attributes:
-        loops: whether problems are solved one after the other, so that a part of a batch tells the time of one.
+        loops: whether problems are solved one after the other. Then a part of a batch tells the time per problem.
         differentiable: whether there are gradients.
     """
 
@@ -127,50 +110,48 @@ class Contender:
     differentiable = True
 
     def takes(self, n: int) -> bool:
-        """Whether it is shown problems of ``n`` pairs."""
+        """Whether the contender gets problems of ``n`` pairs."""
         return True
 
     def task(self, problems: Problems, *, backward: bool = False) -> Task:
-        """Make everything ready that is not to be timed."""
+        """Prepare a batch; this is not timed."""
         raise NotImplementedError
-
-    def close(self) -> None:
-        """Give back what it holds."""
 
 
 def first(problems: Problems, count: int) -> Problems:
-    """The first of a batch."""
+    """The first ``count`` problems of a batch."""
     return problems.map(lambda x: x[:count])
 
 
 def float_inputs(problems: Problems, device: str) -> list[Tensor]:
-    """Points, pixels and cameras in float32 on a device."""
-    return [x.to(device, torch.float32) for x in problems[:3]]
+    """Points, pixels and intrinsics in float32 on a device."""
+    inputs = (problems.world_points, problems.img_points, problems.intrinsics)
+    return [x.to(device, torch.float32) for x in inputs]
 
 
 def leaves_of(*tensors: Tensor) -> list[Tensor]:
-    """Copies that gradients go to."""
+    """Copies that collect gradients."""
     return [x.detach().clone().requires_grad_() for x in tensors]
 
 
 def gradient(pose: Pose | Tensor, leaves: list[Tensor]) -> tuple[Tensor, ...]:
-    """Backward from the sum of all entries of the poses."""
-    total = pose.sum() if isinstance(pose, Tensor) else pose[0].sum() + pose[1].sum()
+    """Gradients of the sum of all entries of the poses."""
+    total = pose.sum() if isinstance(pose, Tensor) else pose.rotation.sum() + pose.translation.sum()
     return torch.autograd.grad(total, leaves, allow_unused=True)
 
 
 def waiting(device: str) -> Callable[[], None] | None:
-    """What waits for a device, if anything has to."""
+    """The function that waits for a device, ``None`` for the CPU."""
     return torch.cuda.synchronize if device.startswith("cuda") else None
 
 
 def without_gradient(call: Callable[[], Any]) -> Callable[[], Any]:
-    """The call with no gradients recorded."""
+    """The call without recording gradients."""
     return torch.no_grad()(call)
 
 
 def coarse_pose(problems: Problems, seed: int = 0) -> Pose:
-    """The true poses, turned about the points' centre and moved: what refinements start from.
+    """The true poses, turned about the centre of the points and moved.
 
     Returns:
         Poses in the frame of the problems, in their dtype.
@@ -187,7 +168,7 @@ def coarse_pose(problems: Problems, seed: int = 0) -> Pose:
 
 
 def normalized(problems: Problems, device: str) -> tuple[Correspondences, Guess, Callable[[Pose], Pose]]:
-    """Normalised pairs, the coarse pose in their frame, and the way back; none of it is timed."""
+    """Normalised pairs, the coarse pose in their frame, and the function that undoes normalisation for a pose."""
     normalize = Normalize(order=False)
     with torch.no_grad():
         corr, frame = normalize(*float_inputs(problems, device))

@@ -14,20 +14,15 @@ from tasks import CannotBeTimedError, Contender, Task, first
 
 from kornia_pnpnet.types import Problems
 
-__all__ = ["BACKWARD", "FORWARD", "measure_throughput", "targets"]
-
 FORWARD, BACKWARD = "forward", "forward+backward"
-# A loop is tried on so many problems first.
-_PROBE = 10
+_PROBE = 10  # problems of the first call of a loop
 _FEWEST_ROUNDS = 3
+# Pairs in a batch of the rows that vary n: the memory of some contenders grows with the square of n.
 _MOST_PAIRS = 100_000
 
 
 def grid(settings: Settings, count: int) -> Iterator[tuple[int, list[tuple[int, str]]]]:
-    """For each number of pairs the batches and modes that are measured.
-
-    With more than one thread only what shows the difference.
-    """
+    """For each number of pairs the batch sizes and modes; fewer of them with more than one thread."""
     sizes = [size for size in settings.batches if count == 1 or size >= settings.problems]
     backward = [size for size in sizes if size <= settings.most_backward]
     if count > 1:
@@ -36,24 +31,23 @@ def grid(settings: Settings, count: int) -> Iterator[tuple[int, list[tuple[int, 
         if n == N:
             yield n, [*((size, FORWARD) for size in sizes), *((size, BACKWARD) for size in backward)]
         elif count == 1:
-            # The same number of pairs in all at most: some of the others need memory with the square of n.
             yield n, [(max(1, min(settings.problems, _MOST_PAIRS // n)), FORWARD)]
 
 
 def ready(
     contender: Contender, problems: Problems, settings: Settings, *, backward: bool, known: float | None
 ) -> tuple[Task, int, float]:
-    """A warm task, how many problems it solves, and the seconds that it takes.
+    """A warm task, its number of problems, and the seconds of its call.
 
     Args:
-        contender: what is timed.
-        problems: the batch. A loop gets as many of them as take a given time.
+        contender: the solver.
+        problems: the batch. A loop gets its first problems, enough for ``settings.loop_s`` seconds.
         settings: the limits.
         backward: with gradients.
-        known: about how many seconds a problem takes, by what was measured before.
+        known: seconds per problem of an earlier measurement, or ``None``.
 
     Raises:
-        CannotBeTimedError: when it would take too long, or cannot compile.
+        CannotBeTimedError: when the call would take too long, or the contender cannot compile.
     """
     count = len(problems.world_points)
     if contender.loops:
@@ -72,19 +66,19 @@ def measure_throughput(settings: Settings, *, count: int) -> dict[str, list[dict
 
     Returns:
         ``rows``, one for each contender and point: ``contender``, ``threads``, ``mode``, ``n``, ``batch``, ``count``
-        (of problems that were solved, fewer than the batch for a loop), ``success``, times; and ``skipped``.
+        (number of problems, less than the batch for a loop), ``success``, times; and ``skipped``.
     """
     rows: list[dict[str, Any]] = []
     skipped: list[dict[str, Any]] = []
-    # Seconds per problem of what was measured last, brought to the number of pairs in proportion.
+    # Seconds per problem of the last measurement, scaled in proportion to the number of pairs.
     known: dict[tuple[str, str], float] = {}
     before = 0
     with threads(count):
         for n, points in grid(settings, count):
             known = {key: seconds * max(1.0, n / before) for key, seconds in known.items()}
             before = n
-            torch.compiler.reset()  # who has one number of pairs does not compile for others
-            contenders, missing = make_contenders(settings, versions=n == N, count=count)
+            torch.compiler.reset()  # compile for this number of pairs only
+            contenders, missing = make_contenders(settings, count=count)
             skipped += [{**entry, "threads": count, "n": n} for entry in missing]
             problems = draw(n, max(settings.problems, *(batch for batch, _ in points)))
             rates: dict[str, dict[str, Any]] = {}
@@ -102,20 +96,18 @@ def measure_throughput(settings: Settings, *, count: int) -> dict[str, list[dict
                         place = {"contender": name, "threads": count, "n": n, "batch": batch, "mode": mode}
                         skipped.append({**place, "why": str(error)})
                         continue
-                    if name not in rates:  # after the first call, which tells whether it compiles
+                    if name not in rates:  # after the first call, which shows whether the contender compiles
                         rates[name] = rate(contender, first(problems, settings.problems), settings)
                     tasks[name], sizes[name], once[name] = found
                     known[name, mode] = once[name] / sizes[name]
                 for name, times in timed(tasks, sizes, once, settings).items():
                     place = {"contender": name, "threads": count, "mode": mode, "n": n, "batch": batch}
                     rows.append({**place, "count": sizes[name], "success": rates[name], **summary(times)})
-            for contender in contenders.values():
-                contender.close()
     return {"rows": rows, "skipped": skipped}
 
 
 def rate(contender: Contender, problems: Problems, settings: Settings) -> dict[str, Any]:
-    """Success on as many problems as a loop solves in a few of its turns."""
+    """Success; a loop gets the problems that it solves in a tenth of ``settings.point_s``."""
     if contender.loops:
         _, _, once = ready(contender, first(problems, _PROBE), settings, backward=False, known=None)
         most = int(_PROBE * settings.point_s / 10 / once)
@@ -127,7 +119,7 @@ def timed(
     tasks: Mapping[str, Task], sizes: Mapping[str, int], once: Mapping[str, float], settings: Settings
 ) -> dict[str, list[float]]:
     """Microseconds per problem of each round."""
-    # As long as a loop has: a single call after all the others starts with their data in the caches.
+    # Repeated for as long as a loop takes: a single call would begin with the data of other contenders in the caches.
     times = {name: max(1, math.ceil(settings.loop_s / seconds)) for name, seconds in once.items()}
     a_round = sum(times[name] * seconds for name, seconds in once.items())
     rounds = min(settings.rounds, max(_FEWEST_ROUNDS, int(settings.point_s / a_round))) if tasks else 0
@@ -139,7 +131,7 @@ def timed(
 
 
 def targets(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """What is wanted of 1000 problems of 9 pairs with 3 mismatches on one thread, as far as it was measured."""
+    """Targets of 1000 problems of 9 pairs with 3 mismatches on one thread, where both sides were measured."""
     here = [row for row in rows if (row["threads"], row["n"], row["batch"]) == (1, N, 1000)]
     forward, backward = ({row["contender"]: row for row in here if row["mode"] == mode} for mode in (FORWARD, BACKWARD))
     found = []
@@ -151,10 +143,6 @@ def targets(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     ratios = [(forward, name, *least) for least in (("opencv-ransac", 20.0), ("poselib", 10.0)) for name in solvers]
     ratios += [(forward, f"{ANY} compiled", "poselib", 5.0)]
     ratios += [(backward, "refinement compiled", name, 10.0) for name in ("pypose-lm", "pypose-parts")]
-    firsts = [name for name in backward if "@" in name]
-    for base in ("refinement", PLAIN):
-        first_version = next((name for name in firsts if name.startswith(base)), None)
-        ratios += [(backward, f"{base} compiled", first_version, 10.0)] if first_version else []
     for times, mine, theirs, least in ratios:
         if mine in times and theirs in times:
             what = f"`{mine}` against `{theirs}`, {times[mine]['mode']}"

@@ -1,4 +1,4 @@
-"""A solver as a graph for other programs: ``torch.export`` and ONNX."""
+"""Export of solvers as graphs for other programs: ``torch.export`` and ONNX."""
 
 from __future__ import annotations
 
@@ -19,16 +19,18 @@ from kornia_pnpnet.solver import PnPNet
 
 __all__ = ["INPUTS", "OUTPUTS", "export_onnx", "export_program"]
 
-#: Names of the inputs of an exported solver, in their order, all float32.
+#: Names of the inputs of an exported solver, in this order, all float32.
 INPUTS = ("world_points", "img_points", "intrinsics", "weights")
-#: Names of its outputs: fields of :class:`~kornia_pnpnet.types.PnPResult`, of which ``pair_weights`` is ``weights``: in
-#: ONNX no output has the name of an input. ``ok`` is bool.
+#: Names of the outputs: fields of :class:`~kornia_pnpnet.types.PnPResult`. ``ok`` is bool. ``pair_weights`` are the
+#: result's ``weights``: ONNX requires another name than that of the input.
 OUTPUTS = ("rotation", "translation", "pair_weights", "cost", "ok")
-_MOST_PAIRS = 65_536
+#: Upper bounds of the dynamic dimensions: torch.export simplifies its guards with finite ranges.
+_MAX_BATCH = 2**20
+_MAX_N = 2**16
 
 
 class _Graph(nn.Module):
-    """Tensors in, tensors out."""
+    """A solver whose result is a plain tuple of tensors."""
 
     def __init__(self, solver: PnPNet) -> None:
         super().__init__()
@@ -45,16 +47,17 @@ def export_program(solver: PnPNet, n: int | None = None) -> torch.export.Exporte
     r"""Trace a solver for batches of any size.
 
     Args:
-        solver: with trained or classical parts; RANSAC, which draws until it has seen enough, has no graph.
-        n: number of pairs. ``None``: what its network takes, and any number from 4 on where it takes any.
+        solver: any solver but RANSAC, whose number of iterations depends on the data.
+        n: number of correspondences per problem. With ``None`` the n of the network, or any n of at least 4 when the
+            network accepts any n.
 
     Returns:
-        A program of :data:`INPUTS`: points :math:`(B, N, 3)`, pixels :math:`(B, N, 2)`, cameras :math:`(B, 3, 3)`,
-        weights :math:`(B, N)`, 0 for padding. It returns :data:`OUTPUTS`.
+        A program that maps :data:`INPUTS` to :data:`OUTPUTS`. The inputs are world points :math:`(B, N, 3)`, pixels
+        :math:`(B, N, 2)`, camera matrices :math:`(B, 3, 3)` and weights :math:`(B, N)`, 0 for padding.
 
     Raises:
-        BaseError: when ``n`` is less than 3, or not what the network takes.
-        ValueCheckError: when the solver has no graph.
+        BaseError: when ``n`` is less than 3 or not the n of the network.
+        ValueCheckError: when the solver cannot be traced.
 
     Example:
         >>> from kornia_pnpnet import RobustWeightedLM
@@ -67,12 +70,13 @@ def export_program(solver: PnPNet, n: int | None = None) -> torch.export.Exporte
         check_whole(3, n=n)
     fixed = int(solver.init.config["n"]) if isinstance(solver.init, MLPInit) else n
     if n not in (None, fixed):
-        raise ValueCheckError(f"The solver's network takes {fixed} pairs, so n cannot be {n!r}.")
+        raise ValueCheckError(f"The solver's network was built for n = {fixed}, got n = {n!r}.")
     problems = SyntheticProblems(n=12 if fixed is None else fixed, batch_size=3, seed=0).batch(0)
-    inputs = (*problems[:3], torch.ones_like(problems.world_points[..., 0]))
-    batch = torch.export.Dim("batch", min=1, max=2**20)
-    pairs = {} if fixed is not None else {1: torch.export.Dim("pairs", min=4, max=_MOST_PAIRS)}
-    shapes: tuple[dict[int, Any], ...] = ({0: batch, **pairs}, {0: batch, **pairs}, {0: batch}, {0: batch, **pairs})
+    weights = torch.ones_like(problems.world_points[..., 0])
+    inputs = (problems.world_points, problems.img_points, problems.intrinsics, weights)
+    batch: dict[int, Any] = {0: torch.export.Dim("batch", min=1, max=_MAX_BATCH)}
+    points = batch if fixed is not None else {**batch, 1: torch.export.Dim("pairs", min=4, max=_MAX_N)}
+    shapes = (points, points, batch, points)
     try:
         with torch.no_grad():
             return torch.export.export(_Graph(copy.deepcopy(solver).float().eval()), inputs, dynamic_shapes=shapes)
@@ -82,18 +86,18 @@ def export_program(solver: PnPNet, n: int | None = None) -> torch.export.Exporte
 
 
 def export_onnx(solver: PnPNet, path: str | Path, n: int | None = None) -> Path:
-    """Write a solver as an ONNX model, in one file, which ONNX Runtime runs without PyTorch.
+    """Write a solver as an ONNX model in one file. ONNX Runtime runs the model without PyTorch.
 
     Args:
-        solver: as for :func:`export_program`.
-        path: of the file; replaced whole or not at all.
-        n: likewise.
+        solver: see :func:`export_program`.
+        path: the file to write. An existing file is replaced when the model is complete.
+        n: see :func:`export_program`.
 
     Returns:
         The path.
 
     Raises:
-        BaseError: as of :func:`export_program`.
+        BaseError: see :func:`export_program`.
         ImportError: without the extra ``onnx``.
         OSError: when the file cannot be written.
     """
@@ -105,13 +109,13 @@ def export_onnx(solver: PnPNet, path: str | Path, n: int | None = None) -> Path:
     program = export_program(solver, n)
     inputs, outputs = list(INPUTS), list(OUTPUTS)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)  # of the exporter, about itself
+        warnings.simplefilter("ignore", FutureWarning)  # the exporter warns about its own code
         model = torch.onnx.export(program, dynamo=True, verbose=False, input_names=inputs, output_names=outputs)
     assert model is not None
     graph = model.model_proto
     batches = {value.type.tensor_type.shape.dim[0].dim_param for value in graph.graph.input}
     if not batches.isdisjoint({"", *map(str, range(10))}):
-        # What is computed with the batch as a number would hold for the batch of the example alone.
+        # The exporter replaced the batch size by that of the example inputs.
         raise ValueCheckError(f"{type(solver.init).__name__} cannot be exported to ONNX for batches of any size.")
     with atomic_open(path, "wb") as file:
         file.write(graph.SerializeToString())

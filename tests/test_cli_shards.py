@@ -1,4 +1,4 @@
-"""Very many problems from files: what goes in comes out, once, whatever stops it in between."""
+"""Shards of problems: the poses are those of a call, each shard is solved once, also after an interruption."""
 
 import json
 import os
@@ -8,10 +8,10 @@ import sys
 import numpy as np
 import pytest
 import torch
-from kornia_pnpnet.cli.pairs import PairsError
 
 from kornia_pnpnet import create_solver
 from kornia_pnpnet.cli import main
+from kornia_pnpnet.cli.correspondence_files import InputError
 from kornia_pnpnet.cli.shards import MANIFEST, solve_shards
 
 NAMES = ("world_points", "img_points", "intrinsics")
@@ -23,7 +23,7 @@ def solver():
 
 
 def arrays(problems):
-    return {name: x.numpy() for name, x in zip(NAMES, problems[:3], strict=True)}
+    return {name: getattr(problems, name).numpy() for name in NAMES}
 
 
 @pytest.fixture
@@ -70,32 +70,24 @@ def test_it_goes_on_with_the_first_shard_without_a_result(shards, solver, tmp_pa
     assert (out / "part0.npz").stat().st_mtime_ns > before
 
 
-def test_results_do_not_take_the_place_of_their_shards(shards, solver):
-    folder, _ = shards
-    before = {x.name: x.read_bytes() for x in folder.iterdir()}
-    with pytest.raises(PairsError, match="would take its place"):
-        solve_shards(solver, [folder], folder, name="reppnp", overwrite=True)
-    assert {x.name: x.read_bytes() for x in folder.iterdir()} == before
-
-
 def test_another_solver_does_not_go_on_in_the_same_folder(shards, solver, tmp_path):
     folder, _ = shards
     solve_shards(solver, [folder], tmp_path / "out", name="reppnp")
-    with pytest.raises(PairsError, match="not by this pnpnet-n9"):
+    with pytest.raises(InputError, match="pnpnet-n9"):
         solve_shards(create_solver("pnpnet-n9"), [folder], tmp_path / "out", name="pnpnet-n9")
     one = next(folder.iterdir())
-    with pytest.raises(PairsError, match="--overwrite all of them"):
+    with pytest.raises(InputError, match="all of them"):
         solve_shards(create_solver("pnpnet-n9"), [one], tmp_path / "out", name="pnpnet-n9", overwrite=True)
 
     def stopped(*_):
         raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):  # what is left is by one solver
+    with pytest.raises(KeyboardInterrupt):  # the results left in the folder are by one solver
         solve_shards(create_solver("epnp"), [folder], tmp_path / "out", name="epnp", overwrite=True, watch=stopped)
     assert len(list((tmp_path / "out").glob("*.npz"))) == 1
     assert solve_shards(solver, [folder], tmp_path / "out", name="reppnp", overwrite=True).shards == 3
     (tmp_path / "out" / MANIFEST).write_text("{")
-    with pytest.raises(PairsError, match="not by this reppnp"):
+    with pytest.raises(InputError, match="reppnp"):
         solve_shards(solver, [folder], tmp_path / "out", name="reppnp")
 
 
@@ -130,7 +122,7 @@ def test_one_bad_problem_is_not_ok_and_no_more(shards, solver, tmp_path):
         assert np.isfinite(found["rotation"]).all()
 
 
-def test_weights_noise_and_one_camera_for_all(make_problems, tmp_path):
+def test_weights_noise_and_a_shared_camera(make_problems, tmp_path):
     p = make_problems(n=9, batch=5, dtype=torch.float32)
     weights = torch.ones(5, 9)
     weights[:, 7:] = 0.0
@@ -152,7 +144,7 @@ def test_parquet_with_numbers_of_pairs_that_differ(make_problems, tmp_path):
     pyarrow = pytest.importorskip("pyarrow")
     parquet = pytest.importorskip("pyarrow.parquet")
     drawn = [make_problems(n=n, batch=1, dtype=torch.float32) for n in (6, 12, 9, 30)]
-    rows = [{name: x[0].flatten().tolist() for name, x in zip(NAMES, p[:3], strict=True)} for p in drawn]
+    rows = [{name: x[0].flatten().tolist() for name, x in arrays(p).items()} for p in drawn]
     parquet.write_table(pyarrow.Table.from_pylist(rows), tmp_path / "x.parquet")
     solver = create_solver("pnpnet-set")
     report = solve_shards(solver, [tmp_path / "x.parquet"], tmp_path / "out", name="pnpnet-set", batch=3)
@@ -175,24 +167,22 @@ def test_parquet_with_numbers_of_pairs_that_differ(make_problems, tmp_path):
     assert not (tmp_path / "out" / "bad.parquet").exists()
 
 
-@pytest.mark.parametrize(
-    ("make", "why"),
-    [
-        (lambda folder: folder, "no .npz or .parquet file"),
-        (lambda folder: folder / "x.npz", "no such file"),
-        (lambda folder: folder / "x.txt", "a shard ends in"),
-    ],
-)
-def test_what_are_no_shards(make, why, solver, tmp_path):
-    with pytest.raises(PairsError, match=why):
-        solve_shards(solver, [make(tmp_path)], tmp_path / "out", name="reppnp")
-
-
-def test_two_shards_of_one_name_are_refused(shards, solver, tmp_path):
+def test_sources_that_are_no_shards(shards, solver, tmp_path):
     folder, drawn = shards
+    (tmp_path / "empty").mkdir()
     np.savez(tmp_path / "part0.npz", **arrays(drawn[0]))
-    with pytest.raises(PairsError, match="would take the name"):
-        solve_shards(solver, [folder, tmp_path / "part0.npz"], tmp_path / "out", name="reppnp")
+    for sources, why in (
+        ([tmp_path / "empty"], "no .npz or .parquet file"),
+        ([tmp_path / "x.npz"], "no such file"),
+        ([tmp_path / "x.txt"], "must end in"),
+        ([folder, tmp_path / "part0.npz"], "same name"),
+        ([folder], None),
+    ):
+        out = folder if why is None else tmp_path / "out"
+        before = {x.name: x.read_bytes() for x in folder.iterdir()}
+        with pytest.raises(InputError, match=why or "overwrite the shard"):
+            solve_shards(solver, sources, out, name="reppnp", overwrite=True)
+        assert {x.name: x.read_bytes() for x in folder.iterdir()} == before
 
 
 def test_the_command(shards, tmp_path, capsys):
@@ -211,7 +201,7 @@ def test_the_command(shards, tmp_path, capsys):
     assert main([*command, "--plot", "x.png"]) == 2
 
 
-# What `getrusage` says can include the process that started this one.
+# `getrusage` may include the memory of the parent process.
 PEAK = r"""
 import re, sys
 from pathlib import Path
@@ -223,7 +213,7 @@ sys.exit(code)
 
 
 def peak_memory(folder, count):
-    """The most memory that the command holds while it solves so many problems."""
+    """The largest resident memory of the command while it solves ``count`` problems."""
     command = [sys.executable, "-c", PEAK, "solve", "--batch", "--solver", "epnp", "--batch-size", "1000", str(folder)]
     plain = {**os.environ, "OMP_NUM_THREADS": "1"}
     done = subprocess.run([*command, "--out", f"{folder}-out"], capture_output=True, text=True, check=True, env=plain)

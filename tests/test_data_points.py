@@ -1,8 +1,8 @@
 """Priors of points: where they put points in the camera's frame."""
 
+import pytest
 import torch
 from data_helpers import COUNT, assert_uniform, draw
-from pytest import approx, mark
 
 from kornia_pnpnet.data import BoxPoints, ObjectPoints, SlabPoints
 from kornia_pnpnet.geometry import transform
@@ -14,7 +14,7 @@ def test_box_constants_are_arguments(generator):
     assert_uniform(points[..., 2], 5, 7)
 
 
-@mark.parametrize("field_of_view", [0.9, 0.6])
+@pytest.mark.parametrize("field_of_view", [0.9, 0.6])
 def test_slabs_are_in_view_and_in_front(field_of_view, generator):
     window = (0.15, min(0.8, field_of_view))
     points = SlabPoints(field_of_view=field_of_view, window=window)(COUNT, 9, generator)
@@ -37,7 +37,7 @@ def test_objects_are_where_they_were_put(generator):
     assert centre[:, 2].min() > 1.5
     assert centre[:, 2].max() < 32
     values = torch.linalg.svdvals(points - centre[:, None])
-    assert (values[:, 2] < 1e-9).double().mean().item() == approx(0.25, abs=0.015)
+    assert (values[:, 2] < 1e-9).double().mean().item() == pytest.approx(0.25, abs=0.015)
     assert (values[:, 1] > 1e-3).all()
 
 

@@ -1,8 +1,7 @@
-"""EPnP: laws, the minimum it looks for, gradients, and OpenCV's beside it."""
+"""EPnP: laws, the minimum of its objective, gradients, and OpenCV's EPnP beside it."""
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 import torch
 from kornia.core.exceptions import BaseError
@@ -53,12 +52,9 @@ def correspondences(p, **normalization):
     return normalize(p.world_points, p.img_points, p.intrinsics)[0]
 
 
-# --- exact data -----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 0.02), (torch.float64, 1e-9)])
 @pytest.mark.parametrize("planar", [False, True])
-@pytest.mark.parametrize("n", [6, 9, 50])
+@pytest.mark.parametrize("n", [6, 50])
 def test_exact_data_give_the_exact_pose(n, planar, dtype, tolerance):
     p = problems(n, 500, planar=planar, noise=False).map(lambda x: x.to(dtype) if x.is_floating_point() else x)
     result = solver()(*p[:3])
@@ -75,7 +71,7 @@ def test_four_and_five_exact_pairs_work_through_the_null_space():
         assert (pose_errors(result.pose, p.pose).rotation_error_deg < 1e-4).double().mean() >= share
 
 
-@pytest.mark.parametrize("thickness", [1e-2, 1e-3, 1e-5, 1e-8, 0.0])
+@pytest.mark.parametrize("thickness", [1e-2, 1e-3, 1e-8, 0.0])
 def test_nearly_planar_points_are_solved_on_either_side_of_the_threshold(thickness):
     p = problems(9, 200, planar=True, noise=False)
     bump = torch.randn(p.world_points.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -88,7 +84,25 @@ def test_nearly_planar_points_are_solved_on_either_side_of_the_threshold(thickne
     assert (pose_errors(result.pose, p.pose).rotation_error_deg < tolerance).double().mean() >= 0.98
 
 
-# --- weights, order, frames -----------------------------------------------------------------------------------------
+def test_weights_count_pairs():
+    """A pair of weight 3 counts as three pairs, and a common factor of the weights does not matter."""
+    corr = correspondences(problems(6))
+    times = torch.tensor([1, 3, 1, 2, 1, 1])
+    weighted, scaled = (EPnP()(corr._replace(weights=factor * times.double().expand(50, 6))) for factor in (1.0, 1e-6))
+    world, img, weights = (x.repeat_interleave(times, 1) for x in (corr.world_points, corr.img_points, corr.weights))
+    repeated = EPnP()(Correspondences(world, img, weights, corr.focal))
+    for other in (scaled, repeated):
+        torch.testing.assert_close(weighted.pose.matrix, other.pose.matrix, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("n", "planar"), [(4, False), (5, False), (9, False), (9, True)])
+def test_order_does_not_matter(n, planar):
+    corr = correspondences(problems(n, planar=planar))
+    order = torch.randperm(n, generator=torch.Generator().manual_seed(1))
+    guess, shuffled = EPnP()(corr), EPnP()(corr.map(lambda x: x[:, order] if x.ndim > 1 else x))
+    same = (guess.pose.matrix - shuffled.pose.matrix).abs().flatten(1).amax(-1) < 1e-6
+    # With four pairs two cases may reach the same error, or rounding decides where Gauss-Newton ends.
+    assert same.double().mean() >= (1.0 if n > 4 else 0.9)
 
 
 @pytest.mark.parametrize("planar", [False, True])
@@ -106,36 +120,10 @@ def test_weight_zero_equals_absence(planar):
     torch.testing.assert_close(masked.matrix, without.matrix, rtol=0, atol=1e-9)
 
 
-def test_integer_weights_equal_repeating():
-    p = problems(6)
-    times = torch.tensor([1, 3, 1, 2, 1, 1])
-    corr = correspondences(p)
-    weighted = EPnP()(corr._replace(weights=times.double().expand(50, 6)))
-    repeated = EPnP()(Correspondences(*(x.repeat_interleave(times, 1) for x in corr[:3]), corr.focal))
-    torch.testing.assert_close(weighted.pose.matrix, repeated.pose.matrix, rtol=0, atol=1e-9)
-
-
-def test_a_common_factor_of_the_weights_does_not_matter():
-    corr = correspondences(problems(9))
-    one, other = (EPnP()(corr._replace(weights=factor * corr.weights)).pose.matrix for factor in (1.0, 1e-6))
-    torch.testing.assert_close(one, other, rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize(("n", "planar"), [(4, False), (5, False), (9, False), (9, True)])
-def test_order_does_not_matter(n, planar):
-    p = problems(n, planar=planar)
-    order = torch.randperm(n, generator=torch.Generator().manual_seed(1))
-    corr = correspondences(p)
-    guess, shuffled = EPnP()(corr), EPnP()(Correspondences(*(x[:, order] for x in corr[:3]), corr.focal))
-    same = (guess.pose.matrix - shuffled.pose.matrix).abs().flatten(1).amax(-1) < 1e-6
-    # With four pairs two cases may reach the same error, or rounding decides where Gauss-Newton ends.
-    assert same.double().mean() >= (1.0 if n > 4 else 0.9)
-
-
-@pytest.mark.parametrize("normalization", [{}, {"scale": False}, {"center": False, "scale": False}])
-@pytest.mark.parametrize(("n", "planar"), [(5, False), (9, False), (9, True)])
+@pytest.mark.parametrize("normalization", [{}, {"center": False, "scale": False}])
+@pytest.mark.parametrize(("n", "planar"), [(5, False), (9, True)])
 def test_the_pose_moves_with_the_world(n, planar, normalization, random_rotations):
-    """A similarity of the world, which normalisation does not take away when told not to."""
+    """A similarity of the world, with and without normalisation."""
     p = problems(n, planar=planar)
     factor, shift = 30.0, torch.tensor([3.0, -200.0, 50.0], dtype=torch.float64)
     rotation = random_rotations(50)
@@ -148,7 +136,7 @@ def test_the_pose_moves_with_the_world(n, planar, normalization, random_rotation
 
 
 def test_every_problem_is_alone():
-    """Whatever the other problems of the batch are, not a bit changes."""
+    """Other problems of the batch change no bit."""
     p = problems(6, 40)
     corr = correspondences(p)
     guess = EPnP()(corr)
@@ -160,11 +148,8 @@ def test_every_problem_is_alone():
         assert torch.equal(spoilt.pose.matrix[~odd], guess.pose.matrix[~odd])
         assert spoilt.ok[~odd].all()
         assert not spoilt.ok[odd].any()
-    alone = EPnP()(Correspondences(*(x[7:8] for x in corr[:3]), corr.focal))
+    alone = EPnP()(corr.map(lambda x: x[7:8] if x.ndim else x))
     torch.testing.assert_close(alone.pose.matrix, guess.pose.matrix[7:8], rtol=0, atol=1e-10)
-
-
-# --- the minimum ----------------------------------------------------------------------------------------------------
 
 
 def reference_equations(corr):
@@ -183,7 +168,7 @@ def reference_equations(corr):
 
 
 def reference_minimum(corr, weight):
-    """The least value of the objective that Gauss-Newton with step control finds from eigenvectors of K."""
+    """The least value of the objective by Levenberg-Marquardt from eigenvectors of K."""
     camera, K, L = reference_equations(corr)
     gram = L.mT @ L
     root = torch.linalg.cholesky(K + 1e-15 * torch.eye(4)).mT
@@ -211,7 +196,7 @@ def reference_minimum(corr, weight):
     return best
 
 
-@pytest.mark.parametrize(("n", "weight"), [(6, 0.3), (9, 0.3), (9, 0.0), (20, 0.3)])
+@pytest.mark.parametrize(("n", "weight"), [(6, 0.3), (9, 0.0), (20, 0.3)])
 def test_the_minimum_is_that_of_the_twelve_unknowns(n, weight):
     corr = correspondences(problems(n, 200))
     control = control_points(corr)
@@ -231,7 +216,7 @@ def test_the_minimum_is_that_of_the_twelve_unknowns(n, weight):
 
 
 def test_the_size_of_the_world_is_known():
-    """The centroid is as far as the control points say when they are scaled to those of the world."""
+    """The depth of the centroid is that of the control points, scaled to the control points of the world."""
     corr = correspondences(problems(6))
     control = control_points(corr)
     system = depth_system(control, (corr.img_points / corr.focal).permute(2, 1, 0))
@@ -253,11 +238,8 @@ def test_the_algebraic_weight_pays():
     assert shares[1] > shares[0] + 0.01
 
 
-# --- the choice of the case -----------------------------------------------------------------------------------------
-
-
 def choose(p, *, img_points=None):
-    """Whether the true depths are chosen, rather than those of a flat scene far away, (B,)."""
+    """Whether the true depths are chosen instead of the depths of a flat scene far away, (B,)."""
     normalize = Normalize(order=False)
     corr, frame = normalize(*p[:3])
     truth = normalize.apply_to_pose(p.pose, frame)
@@ -275,55 +257,35 @@ def choose(p, *, img_points=None):
 
 
 def test_the_true_case_is_chosen():
-    assert choose(problems(9, 200, noise=False)).all()
-
-
-def test_a_point_behind_the_camera_counts_as_a_large_error():
-    """The point is moved through the camera: its pixel stays."""
     p = problems(9, 200, noise=False)
+    assert choose(p).all()
+    # A point behind the camera counts as a large error. It is moved through the camera: its pixel stays.
     cam = transform(p.pose, p.world_points)
     world = p.world_points.clone()
     world[:, 0] = ((-cam[:, 0] - p.pose.translation)[:, None] @ p.pose.rotation)[:, 0]
-    moved = p._replace(world_points=world)
-    assert (~choose(moved)).double().mean() > 0.8
-
-
-def test_a_large_error_is_bounded():
-    """Else where the one wrong pixel falls would decide."""
-    p = problems(9, 200, noise=False)
+    assert (~choose(p._replace(world_points=world))).double().mean() > 0.8
+    # A large error is bounded: one outlier does not decide.
     img = p.img_points.clone()
     img[:, 0, 0] = 1e5
     assert choose(p, img_points=img).all()
 
 
-# --- degenerate problems --------------------------------------------------------------------------------------------
-
-
-def degenerate(dtype):
-    """Correspondences without a pose, by name."""
-    corr = Correspondences(*(x.to(dtype) for x in correspondences(problems(6, 8))[:4]))
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_degenerate_problems_are_not_ok(dtype):
+    corr = correspondences(problems(6, 8)).map(lambda x: x.to(dtype))
     weights = corr.weights.clone()
     weights[:, 3:] = 0.0
     axis = torch.tensor([1.0, 0.0, 0.0], dtype=dtype)
-    return {
-        "three pairs": corr._replace(weights=weights),
-        "no pairs": corr._replace(weights=torch.zeros_like(weights)),
-        "a line": corr._replace(world_points=corr.world_points * axis),
-        "a point": corr._replace(world_points=torch.zeros_like(corr.world_points)),
-        "one pixel": corr._replace(img_points=torch.full_like(corr.img_points, 100.0)),
-    }
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("name", degenerate(torch.float64))
-def test_degenerate_problems_are_not_ok_and_finite(name, dtype):
-    corr = degenerate(dtype)[name]
-    inputs = [x.clone().requires_grad_() for x in corr[:3]]
-    guess = EPnP()(Correspondences(*inputs, corr.focal))
-    assert not guess.ok.any()
-    assert guess.pose.matrix.isfinite().all()
-    guess.pose.matrix.sum().backward()
-    assert all(x.grad.isfinite().all() for x in inputs)
+    for spoilt in (
+        corr._replace(weights=weights),  # three pairs
+        corr._replace(weights=torch.zeros_like(weights)),
+        corr._replace(world_points=corr.world_points * axis),  # a line
+        corr._replace(world_points=torch.zeros_like(corr.world_points)),
+        corr._replace(img_points=torch.full_like(corr.img_points, 100.0)),
+    ):
+        guess = EPnP()(spoilt)
+        assert not guess.ok.any()
+        assert guess.pose.matrix.isfinite().all()
 
 
 def test_fewer_than_three_pairs_in_front_are_not_ok():
@@ -338,60 +300,24 @@ def test_fewer_than_three_pairs_in_front_are_not_ok():
     assert guess.ok[in_front >= 3].double().mean() > 0.95
 
 
-# --- gradients ------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("n", "planar"), [(4, True), (5, False), (6, False), (9, False), (9, True)])
+@pytest.mark.parametrize(("n", "planar"), [(5, False), (9, True)])
 def test_gradcheck_through_the_solver(n, planar):
-    p = problems(n, 2, planar=planar, seed=2005)
+    p = problems(n, 1, planar=planar, seed=2005)
     net = solver(iterations=8)
     assert net(*p[:3]).ok.all()
 
-    # Everything near 1, so that one difference step suits all; only the four free entries of the intrinsics.
+    # All inputs near 1, so that one difference step suits all; only the four free entries of the intrinsics.
     def run(world, pixels, entries, weights):
         (fx, fy, cx, cy), zero = entries.unbind(-1), torch.zeros_like(entries[:, 0])
         rows = torch.stack((fx, zero, cx, zero, fy, cy, zero, zero, zero + 1e-3), -1)
         result = net(world, 1000.0 * pixels, 1000.0 * rows.unflatten(-1, (3, 3)), weights)
         return result.rotation, result.translation
 
-    entries = torch.tensor([3.4, 3.4, 0.1, -0.1], dtype=torch.float64).repeat(2, 1)
+    entries = torch.tensor([3.4, 3.4, 0.1, -0.1], dtype=torch.float64)[None]
     shift = torch.tensor([0.1, -0.1], dtype=torch.float64)
-    weights = 0.5 + torch.rand(2, n, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    weights = 0.5 + torch.rand(1, n, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     inputs = [x.clone().requires_grad_() for x in (p.world_points, p.img_points / 1000.0 + shift, entries, weights)]
     assert torch.autograd.gradcheck(run, inputs, eps=1e-6, atol=1e-5, rtol=1e-4)
-
-
-def test_the_gradient_does_not_depend_on_how_the_minimum_was_found():
-    corr = correspondences(problems(9))
-    gradients = []
-    for iterations in (8, 20):
-        world = corr.world_points.clone().requires_grad_()
-        guess = EPnP(iterations=iterations)(corr._replace(world_points=world))
-        guess.pose.matrix.square().sum().backward()
-        gradients.append(world.grad)
-    torch.testing.assert_close(*gradients, rtol=1e-7, atol=1e-9)
-
-
-def test_values_are_the_same_with_and_without_gradients():
-    corr = correspondences(problems(9))
-    with_gradient = EPnP()(corr._replace(world_points=corr.world_points.clone().requires_grad_()))
-    with torch.no_grad():
-        without = EPnP()(corr)
-    assert torch.equal(with_gradient.pose.matrix, without.pose.matrix)
-    assert with_gradient.pose.rotation.requires_grad
-    assert not without.pose.rotation.requires_grad
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize(("n", "planar"), [(4, False), (4, True), (5, False), (6, False), (6, True)])
-def test_gradients_are_finite_on_exact_data(n, planar, dtype):
-    p = problems(n, 200, planar=planar, noise=False).map(lambda x: x.to(dtype) if x.is_floating_point() else x)
-    weights = torch.ones(200, n, dtype=dtype)
-    inputs = [x.clone().requires_grad_() for x in (*p[:3], weights)]
-    result = solver()(*inputs)
-    (result.matrix.sum() + result.init.matrix.sum()).backward()
-    assert result.matrix.isfinite().all()
-    assert all(x.grad.isfinite().all() for x in inputs)
 
 
 SQUARE = torch.tensor([[[-1, -1], [1, -1], [-1, 1], [1, 1], [2, 0], [-2, 0]]], dtype=torch.float64)
@@ -417,19 +343,6 @@ def test_a_plane_parallel_to_the_image_has_a_gradient(plane):
     torch.testing.assert_close(growth, torch.tensor(-4.0).double(), rtol=1e-6, atol=0)
 
 
-def test_exact_zeros_of_a_plane_stay_zero_and_keep_the_gradient():
-    corr = parallel_plane(SQUARE)
-    control = control_points(corr)
-    system = depth_system(control, corr.img_points.permute(2, 1, 0))
-    depths = torch.tensor([4.0, 0.0, 0.0, 0.0], dtype=torch.float64)[:, None] / system.unit.detach()
-    torch.testing.assert_close(minimize(system, depths, 0.3, 1), depths)
-    attached = attach_gradient(system, depths, control.planar, 0.3)
-    assert torch.equal(attached, depths)
-    attached[0].backward()
-    growth = (corr.img_points.grad * corr.img_points.detach()).sum()
-    torch.testing.assert_close(growth, -depths[0, 0])
-
-
 def test_an_indefinite_curvature_takes_no_step():
     corr = correspondences(problems(9, 5))
     control = control_points(corr._replace(world_points=corr.world_points.clone().requires_grad_()))
@@ -440,48 +353,49 @@ def test_an_indefinite_curvature_takes_no_step():
     assert not gradient.any()
 
 
-# --- beside OpenCV --------------------------------------------------------------------------------------------------
+def test_gradients_belong_to_the_minimum():
+    """They do not depend on how the minimum was found, and asking for them does not change the values."""
+    corr = correspondences(problems(9))
+    gradients = []
+    for iterations in (8, 20):
+        world = corr.world_points.clone().requires_grad_()
+        guess = EPnP(iterations=iterations)(corr._replace(world_points=world))
+        guess.pose.matrix.square().sum().backward()
+        gradients.append(world.grad)
+        with torch.no_grad():
+            assert torch.equal(guess.pose.matrix, EPnP(iterations=iterations)(corr).pose.matrix)
+    torch.testing.assert_close(*gradients, rtol=1e-7, atol=1e-9)
 
 
-@pytest.mark.parametrize(("n", "planar"), [(4, False), (5, False), (6, False), (9, False), (20, False), (50, False)])
-def test_success_is_at_least_opencvs(n, planar):
-    compare_with_opencv(problems(n, 2000, planar=planar, seed=2002))
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(("n", "planar"), [(4, False), (4, True), (6, True)])
+def test_gradients_are_finite_on_exact_data(n, planar, dtype):
+    p = problems(n, 200, planar=planar, noise=False).map(lambda x: x.to(dtype) if x.is_floating_point() else x)
+    inputs = [x.clone().requires_grad_() for x in (*p[:3], torch.ones(200, n, dtype=dtype))]
+    result = solver()(*inputs)
+    (result.matrix.sum() + result.init.matrix.sum()).backward()
+    assert result.matrix.isfinite().all()
+    assert all(x.grad.isfinite().all() for x in inputs)
 
 
+@pytest.mark.parametrize("planar", [False, True])
 @pytest.mark.parametrize("n", [4, 6, 9, 50])
-def test_success_on_planes_is_at_least_opencvs(n):
-    compare_with_opencv(problems(n, 1000, planar=True, seed=2002))
-
-
-def compare_with_opencv(p):
+def test_success_is_at_least_opencvs(n, planar):
     cv2 = pytest.importorskip("cv2")
-    rotation, translation = np.tile(np.eye(3), (len(p.world_points), 1, 1)), np.zeros((len(p.world_points), 3))
+    p = problems(n, 1000, planar=planar, seed=2002)
+    rotation, translation = torch.eye(3).double().repeat(1000, 1, 1), torch.zeros(1000, 3, dtype=torch.float64)
     for i, (world, img, camera) in enumerate(zip(*(x.numpy() for x in p[:3]), strict=True)):
         found, turn, shift = cv2.solvePnP(world, img, camera, None, flags=cv2.SOLVEPNP_EPNP)
         if found:
-            rotation[i], translation[i] = cv2.Rodrigues(turn)[0], shift[:, 0]
-    theirs = success(pose_errors(Pose(torch.from_numpy(rotation), torch.from_numpy(translation)), p.pose))
-    ours = success(pose_errors(solver()(*p[:3]).pose, p.pose))
-    assert ours.double().mean() >= theirs.double().mean() - 0.01
-
-
-# --- the module -----------------------------------------------------------------------------------------------------
+            rotation[i], translation[i] = torch.from_numpy(cv2.Rodrigues(turn)[0]), torch.from_numpy(shift[:, 0])
+    theirs = success(pose_errors(Pose(rotation, translation), p.pose)).double().mean()
+    assert success(pose_errors(solver()(*p[:3]).pose, p.pose)).double().mean() >= theirs - 0.01
 
 
 def test_the_config_rebuilds_the_module():
     module = EPnP(iterations=7, algebraic_weight=0.1)
-    again = EPnP(**module.config)
-    assert again.config == module.config
-    assert "iterations=7" in repr(module)
     corr = correspondences(problems(6, 5))
-    assert torch.equal(again(corr).pose.matrix, module(corr).pose.matrix)
-    assert torch.equal(module(corr).weights, torch.ones_like(corr.weights))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [({"iterations": 1}, "1"), ({"iterations": 2.5}, "2.5"), ({"algebraic_weight": -0.1}, "-0.1")],
-)
-def test_wrong_arguments_raise_and_say_what_came(arguments, message):
-    with pytest.raises(BaseError, match=message):
-        EPnP(**arguments)
+    assert torch.equal(EPnP(**module.config)(corr).pose.matrix, module(corr).pose.matrix)
+    for name, value in (("iterations", 1), ("iterations", 2.5), ("algebraic_weight", -0.1)):
+        with pytest.raises(BaseError, match=f"{name}.*{value}"):
+            EPnP(**{name: value})

@@ -1,4 +1,4 @@
-"""Laws of P3P: all solutions and nothing else, whatever the order, the unit and the company of the points."""
+"""Laws of P3P: all solutions and nothing else, in any order and unit, for every problem of a batch alone."""
 
 from __future__ import annotations
 
@@ -13,35 +13,32 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
 from kornia_pnpnet import Correspondences, Pose
 from kornia_pnpnet.data import SyntheticProblems
+from kornia_pnpnet.init import P3P, p3p
 from kornia_pnpnet.init.ransac.law_of_cosines import distances
-from kornia_pnpnet.init.ransac.p3p import P3P, p3p
 from kornia_pnpnet.types import Hypotheses
 
 DTYPES = (torch.float64, torch.float32)
 NEAR = 1e-6
 
 
-def rotations(batch, generator):
-    """Uniform over all rotations: unit quaternions uniform on their sphere."""
-    w, *v = torch.nn.functional.normalize(
-        torch.randn(batch, 4, generator=generator, dtype=torch.float64), dim=-1
-    ).unbind(-1)
+def random_rotations(batch, generator):
+    """Uniform over all rotations: unit quaternions that are uniform on their sphere."""
+    w, *v = torch.nn.functional.normalize(torch.randn(batch, 4, generator=generator).double(), dim=-1).unbind(-1)
     axis = torch.stack(v, -1)
-    return axis_angle_to_rotation_matrix(
-        2.0 * torch.atan2(axis.norm(dim=-1), w)[:, None] * axis / axis.norm(dim=-1)[:, None]
-    )
+    length = axis.norm(dim=-1)
+    return axis_angle_to_rotation_matrix((2.0 * torch.atan2(length, w) / length)[:, None] * axis)
 
 
 def seen(cam_points, generator):
     """World points and plane points of points in the camera frame, and the pose, which is anywhere."""
-    rotation = rotations(len(cam_points), generator)
+    rotation = random_rotations(len(cam_points), generator)
     translation = torch.randn(len(cam_points), 3, generator=generator, dtype=torch.float64)
     world_points = (cam_points - translation[:, None]) @ rotation
     return world_points, cam_points[..., :2] / cam_points[..., 2:], Pose(rotation, translation)
 
 
 def wide(batch, seed=0):
-    """A right angle wide field of view, depths from 0.1 to 10."""
+    """A field of view of 90 degrees, depths from 0.1 to 10."""
     generator = torch.Generator().manual_seed(seed)
     xy, z = torch.rand(batch, 3, 3, generator=generator, dtype=torch.float64).split((2, 1), -1)
     return seen(torch.cat((2.0 * xy - 1.0, torch.ones_like(z)), -1) * (0.1 + 9.9 * z), generator)
@@ -78,7 +75,7 @@ def in_camera(found, world_points):
 
 
 def reprojection_errors(found, world_points, plane_points):
-    """The largest of each valid solution; infinite behind the camera."""
+    """The largest error of each valid solution; infinite behind the camera."""
     cam_points = in_camera(found, world_points)
     error = (cam_points[..., :2] / cam_points[..., 2:] - plane_points[:, None]).norm(dim=-1).amax(-1)
     return torch.where((cam_points[..., 2] > 0).all(-1), error, torch.inf)[found.valid]
@@ -128,26 +125,23 @@ def test_rays_of_no_pose_have_few_solutions_and_these_are_true(generator):
     assert (reprojection_errors(found, world_points, plane_points) < 1e-8).all()
 
 
-@pytest.mark.parametrize("order", [(1, 2, 0), (1, 0, 2), (2, 1, 0)])
-def test_the_order_of_the_points_does_not_matter(order):
+def test_order_frame_and_unit_of_the_points_do_not_matter(generator):
     world_points, plane_points, _ = wide(5000)
-    assert_same_solutions(p3p(world_points[:, order], plane_points[:, order]), p3p(world_points, plane_points))
-
-
-@pytest.mark.parametrize("scale", [1e-12, 1e12])
-def test_the_frame_and_the_unit_of_the_world_do_not_matter(scale, generator):
-    world_points, plane_points, _ = wide(5000)
-    turn, shift = rotations(5000, generator), torch.randn(5000, 3, generator=generator, dtype=torch.float64)
-    found = p3p(scale * (world_points @ turn.mT + shift[:, None]), plane_points)
-    # x_cam = R' s (Q x + c) + t' is s times R' Q x + R' c + t' / s
-    rotation = found.pose.rotation @ turn[:, None]
-    moved = (found.pose.rotation @ shift[:, None, :, None])[..., 0] + found.pose.translation / scale
-    assert_same_solutions(Hypotheses(Pose(rotation, moved), found.valid), p3p(world_points, plane_points))
+    expected = p3p(world_points, plane_points)
+    for order in ((1, 2, 0), (1, 0, 2), (2, 1, 0)):
+        assert_same_solutions(p3p(world_points[:, order], plane_points[:, order]), expected)
+    turn, shift = random_rotations(5000, generator), torch.randn(5000, 3, generator=generator, dtype=torch.float64)
+    for scale in (1e-12, 1e12):
+        found = p3p(scale * (world_points @ turn.mT + shift[:, None]), plane_points)
+        # x_cam = R' s (Q x + c) + t' is s times R' Q x + R' c + t' / s
+        rotation = found.pose.rotation @ turn[:, None]
+        moved = (found.pose.rotation @ shift[:, None, :, None])[..., 0] + found.pose.translation / scale
+        assert_same_solutions(Hypotheses(Pose(rotation, moved), found.valid), expected)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_a_symmetric_scene_whose_cubic_has_its_roots_at_zero_and_infinity(dtype):
-    # An equilateral triangle seen from its axis: the pose upright and three that look at it from aside.
+    # An equilateral triangle seen from its axis: one pose upright, and three poses from the side.
     angle = torch.tensor([0.0, 2.0, 4.0], dtype=dtype) * math.pi / 3.0
     world_points = torch.stack((angle.cos(), angle.sin(), torch.zeros_like(angle)), -1)[None]
     cam_points = world_points + torch.tensor([0.0, 0.0, 4.0], dtype=dtype)
@@ -158,7 +152,7 @@ def test_a_symmetric_scene_whose_cubic_has_its_roots_at_zero_and_infinity(dtype)
     assert (found.pose.rotation[..., 2, 2] < 0.99).sum() == 3
 
 
-@pytest.mark.parametrize("offset", [0.0, 1e-15, 1e-12, 1e-9, 1e-6])
+@pytest.mark.parametrize("offset", [0.0, 1e-12, 1e-6])
 def test_two_solutions_that_meet_are_not_lost(offset, generator):
     # They meet where the camera is on the cylinder upright on the circle through the points.
     angles = 2.0 * math.pi * torch.rand(5000, 4, generator=generator, dtype=torch.float64)
@@ -169,7 +163,7 @@ def test_two_solutions_that_meet_are_not_lost(offset, generator):
     rotation = torch.stack((axis1, torch.linalg.cross(axis3, axis1), axis3), -2)
     cam_points = (circle[:, :3] - centre[:, None]) @ rotation.mT
     edges = (circle[:, :3] - circle[:, :3].roll(1, 1)).norm(dim=-1).amin(-1)
-    cam_points = cam_points[edges > 0.2]  # whose rounding is not the problem
+    cam_points = cam_points[edges > 0.2]  # short edges would lose digits
     world_points, plane_points, pose = seen(cam_points, generator)
     found = p3p(world_points, plane_points)
     assert found.valid.any(-1).all()
@@ -178,46 +172,36 @@ def test_two_solutions_that_meet_are_not_lost(offset, generator):
     assert (reprojection_errors(found, world_points, plane_points) < 1e-9).all()
 
 
-def spoiled(points, how):
-    """What is wrong with some points (3, 3) or (3, 2)."""
-    points = points.clone()
-    if how in ("nan", "inf"):
-        points[1, 0] = float(how)
-    elif how == "zeros":
-        points[:] = 0.0
-    elif how == "huge":
-        points *= torch.finfo(points.dtype).max ** 0.9
-    elif how == "tiny":
-        points *= torch.finfo(points.dtype).tiny ** 0.9
-    elif how == "coincident":
-        points[2] = points[0]
-    elif how == "line":
-        points[2] = 0.3 * points[0] + 0.7 * points[1]
-    return points
-
-
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("which", ["world", "plane"])
-@pytest.mark.parametrize("how", ["nan", "inf", "zeros", "huge", "tiny", "coincident", "line"])
-def test_a_bad_problem_has_no_solution_and_changes_no_other(how, which, dtype):
-    world_points, plane_points = (x.to(dtype) for x in wide(50)[:2])
-    good = p3p(world_points, plane_points)
-    points = world_points if which == "world" else plane_points
-    points[7] = spoiled(points[7], how)
-    found = p3p(world_points, plane_points)
-    assert_finite(found)
+def test_a_bad_problem_has_no_solution_and_changes_no_other(which, dtype):
+    points = [x.to(dtype) for x in wide(50)[:2]]
+    good = p3p(*points)
+    one = points[0 if which == "world" else 1]
+    corner = one[7].clone()
+    limits = torch.finfo(dtype)
+    bad = {
+        "nan": corner.index_fill(0, torch.tensor([1]), torch.nan),
+        "inf": corner.index_fill(0, torch.tensor([1]), torch.inf),
+        "zeros": torch.zeros_like(corner),
+        "huge": corner * limits.max**0.9,
+        "tiny": corner * limits.tiny**0.9,
+        "coincident": torch.stack((corner[0], corner[1], corner[0])),
+        "line": torch.stack((corner[0], corner[1], 0.3 * corner[0] + 0.7 * corner[1])),
+    }
     others = torch.arange(50) != 7
-    for mine, before in zip((*found.pose, found.valid), (*good.pose, good.valid), strict=True):
-        assert torch.equal(mine[others], before[others])
-    if which == "plane" and how in ("coincident", "line"):  # which may happen to be right
-        assert (reprojection_errors(found, world_points, plane_points) < 1e-3).all()
-    else:
-        assert not found.valid[7].any()
-
-
-def test_points_beside_the_camera_are_not_seen():
-    world_points, plane_points, _ = wide(50)
-    assert not p3p(world_points, 1e4 * plane_points).valid.any()
+    for kind, spoilt in bad.items():
+        one[7] = spoilt
+        found = p3p(*points)
+        assert_finite(found)
+        for mine, before in zip((*found.pose, found.valid), (*good.pose, good.valid), strict=True):
+            assert torch.equal(mine[others], before[others]), kind
+        if which == "plane" and kind in ("coincident", "line"):  # such rays may have poses
+            assert (reprojection_errors(found, *points) < 1e-3).all()
+        else:
+            assert not found.valid[7].any(), kind
+    far = p3p(points[0], 1e4 * points[1])  # beside the camera
+    assert which == "plane" or not far.valid.any()
 
 
 @pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
@@ -253,38 +237,6 @@ def test_the_poses_carry_no_gradient_and_can_be_used_where_gradients_flow():
     assert world_points.grad.isfinite().all()
 
 
-def test_the_module_reads_normalised_correspondences():
-    world_points, plane_points, _ = wide(50)
-    focal = torch.tensor(3400.0, dtype=torch.float64)
-    solver = P3P()
-    corr = Correspondences(world_points, focal * plane_points, torch.zeros(50, 3, dtype=torch.float64), focal)
-    assert_same_solutions(solver.hypotheses(corr), p3p(world_points, plane_points))
-    assert solver.sample_size == 3
-    assert P3P(**solver.config).config == solver.config
-    with pytest.raises(ShapeError):
-        solver.hypotheses(Correspondences(torch.zeros(2, 4, 3), torch.zeros(2, 4, 2), torch.ones(2, 4), focal))
-
-
-@pytest.mark.parametrize(
-    ("plane_points", "error"),
-    [
-        (torch.zeros(2, 3, 3), ShapeError),
-        (torch.zeros(2, 4, 2), ShapeError),
-        (torch.zeros(3, 3, 2), ShapeError),
-        (torch.zeros(2, 3, 2, dtype=torch.float64), TypeCheckError),
-        (torch.zeros(2, 3, 2, device="meta"), DeviceError),
-    ],
-)
-def test_wrong_arguments_say_so(plane_points, error):
-    with pytest.raises(error):
-        p3p(torch.zeros(2, 3, 3), plane_points)
-
-
-def test_half_precision_is_refused():
-    with pytest.raises(TypeCheckError, match="float16"):
-        p3p(torch.zeros(2, 3, 3, dtype=torch.float16), torch.zeros(2, 3, 2, dtype=torch.float16))
-
-
 def test_distances_fulfil_the_law_of_cosines(generator):
     rays = torch.randn(3, 3, 1000, generator=generator, dtype=torch.float64)
     rays = rays / rays.norm(dim=0)  # (xyz, point, C)
@@ -302,51 +254,48 @@ def test_distances_fulfil_the_law_of_cosines(generator):
     assert (apart[longest_first] < NEAR).all()
 
 
-# --- beside the peers -------------------------------------------------------------------------------------------------
+def test_the_module_reads_normalised_correspondences():
+    world_points, plane_points, _ = wide(50)
+    focal = torch.tensor(3400.0, dtype=torch.float64)
+    solver = P3P()
+    corr = Correspondences(world_points, focal * plane_points, torch.zeros(50, 3, dtype=torch.float64), focal)
+    assert_same_solutions(solver.hypotheses(corr), p3p(world_points, plane_points))
+    assert P3P(**solver.config).sample_size == 3
 
 
-def of_peer(solutions, batch):
-    """What a peer found, problem by problem, as ours."""
-    rotation, translation = np.zeros((batch, 4, 3, 3)), np.zeros((batch, 4, 3))
-    valid = np.zeros((batch, 4), bool)
-    for i, poses in enumerate(solutions):
-        for j, pose in enumerate(poses):
-            rotation[i, j], translation[i, j] = pose
-            valid[i, j] = np.isfinite(pose[0]).all()
-    return Hypotheses(Pose(torch.from_numpy(rotation), torch.from_numpy(translation)), torch.from_numpy(valid))
-
-
-def misses(found, pose):
-    return int((errors(found, pose).amin(-1) > NEAR).sum())
+@pytest.mark.parametrize(
+    ("plane_points", "error"),
+    [
+        (torch.zeros(2, 3, 3), ShapeError),
+        (torch.zeros(2, 4, 2), ShapeError),
+        (torch.zeros(3, 3, 2), ShapeError),
+        (torch.zeros(2, 3, 2, dtype=torch.float64), TypeCheckError),
+        (torch.zeros(2, 3, 2, device="meta"), DeviceError),
+    ],
+)
+def test_wrong_arguments_raise(plane_points, error):
+    with pytest.raises(error):
+        p3p(torch.zeros(2, 3, 3), plane_points)
+    with pytest.raises(TypeCheckError, match="float16"):
+        p3p(torch.zeros(2, 3, 3).half(), torch.zeros(2, 3, 2).half())
 
 
 @pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
-def test_it_misses_no_more_than_poselib(scene):
+def test_no_pose_is_missed_beside_poselib(scene):
     poselib = pytest.importorskip("poselib")
-    world_points, plane_points, pose = scene(100_000, seed=1)
-    rays = torch.cat((plane_points, torch.ones_like(plane_points[..., :1])), -1)
+    count = 50_000
+    world_points, plane_points, pose = scene(count, seed=1)
+    rays = torch.nn.functional.pad(plane_points, (0, 1), value=1.0)
     rays = torch.nn.functional.normalize(rays, dim=-1).numpy()
-    pairs = zip(rays, world_points.numpy(), strict=True)
-    theirs = of_peer(([(s.R, s.t) for s in poselib.p3p(*pair)] for pair in pairs), len(rays))
+    rotation, translation = np.zeros((count, 4, 3, 3)), np.zeros((count, 4, 3))
+    valid = np.zeros((count, 4), bool)
+    for i, pair in enumerate(zip(rays, world_points.numpy(), strict=True)):
+        for j, solution in enumerate(poselib.p3p(*pair)):
+            rotation[i, j], translation[i, j] = solution.R, solution.t
+            valid[i, j] = np.isfinite(solution.R).all()
+    theirs = Hypotheses(Pose(torch.from_numpy(rotation), torch.from_numpy(translation)), torch.from_numpy(valid))
     ours = p3p(world_points, plane_points)
-    assert misses(ours, pose) <= misses(theirs, pose)
-    assert misses(ours, pose) == 0
+    best, their_best = (errors(found, pose).amin(-1) for found in (ours, theirs))
+    assert (best < NEAR).all()
     assert (ours.valid.sum(-1) != theirs.valid.sum(-1)).sum() <= 2
-    assert torch.median(errors(ours, pose).amin(-1)) < torch.median(errors(theirs, pose).amin(-1))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", ["P3P", "AP3P"])
-@pytest.mark.parametrize("scene", [wide, protocol])
-def test_it_misses_no_more_than_opencv(scene, method):
-    cv2 = pytest.importorskip("cv2")
-    world_points, plane_points, pose = scene(100_000, seed=1)
-    flags, camera = getattr(cv2, f"SOLVEPNP_{method}"), np.eye(3)
-
-    def solved(world, plane):
-        _, turns, shifts = cv2.solveP3P(world, plane, camera, None, flags=flags)
-        return [(cv2.Rodrigues(turn)[0], shift[:, 0]) for turn, shift in zip(turns, shifts, strict=True)]
-
-    pairs = zip(world_points.numpy(), plane_points.numpy(), strict=True)
-    theirs = of_peer((solved(*pair) for pair in pairs), len(world_points))
-    assert misses(p3p(world_points, plane_points), pose) <= misses(theirs, pose)
+    assert best.median() < their_best.median()

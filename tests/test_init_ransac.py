@@ -1,26 +1,23 @@
-"""Laws of RANSAC: it finds the pose, says what it used, and every problem is on its own."""
+"""Laws of RANSAC: the pose is found, the weights are its inliers, and every problem is independent."""
 
 from __future__ import annotations
 
+import json
 import math
-import subprocess
-import sys
 
 import pytest
 import torch
 from kornia.core.exceptions import BaseError, ShapeError
 from torch import nn
 
-from kornia_pnpnet import Correspondences, Guess, PnPNet, Pose, RobustWeightedLM, pose_errors, success
+from kornia_pnpnet import Guess, PnPNet, Pose, RobustWeightedLM, pose_errors, success
+from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.geometry import transform
-from kornia_pnpnet.init.epnp.epnp import EPnP
-from kornia_pnpnet.init.ransac import RANSAC, SubsetSolver
-from kornia_pnpnet.init.ransac.p3p import P3P
-from kornia_pnpnet.init.ransac.scoring import Scene
-from kornia_pnpnet.init.ransac.search import Search
+from kornia_pnpnet.init import P3P, RANSAC, EPnP, SubsetSolver
+from kornia_pnpnet.init.ransac.search import Search, take
 
-#: What suits the noise of the protocol: 1 px and 0.05 m.
+#: Thresholds for the noise of the protocol: 1 px and 0.05 m.
 PROTOCOL = {"threshold": 6.0, "world_threshold": 0.3}
 
 
@@ -32,23 +29,13 @@ def solve(net, problems):
     return net(problems.world_points, problems.img_points, problems.intrinsics)
 
 
-def part(corr, at):
-    return Correspondences(*(x if x is None or x.ndim == 0 else x[at] for x in corr))
-
-
 def outputs(guess):
     return (*guess.pose, guess.weights, guess.ok)
 
 
-def garbage(n, batch, seed=0):
-    """Pixels anywhere, of no pose."""
-    mix = OutlierMix(count=n, mismatch_share=0.0)
-    return SyntheticProblems(n=n, batch_size=batch, seed=seed, outliers=mix, dtype=torch.float64).batch(0)
-
-
 @pytest.fixture
 def found(monkeypatch):
-    """What every search of the test has found."""
+    """The results of all searches of the test."""
     seen = []
     run = Search.run
 
@@ -60,11 +47,7 @@ def found(monkeypatch):
     return seen
 
 
-# --- it finds the pose ------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("scorer", ["msac", "inliers"])
-@pytest.mark.parametrize(("n", "outliers"), [(10, 4), (50, 20), (200, 80)])
+@pytest.mark.parametrize(("n", "outliers", "scorer"), [(10, 4, "msac"), (50, 20, "inliers"), (200, 80, "msac")])
 def test_exact_recovery_among_outliers(n, outliers, scorer, make_problems):
     problems = make_problems(n, 20, outliers=outliers, noise=False)
     result = solve(solver(threshold=1.0, scorer=scorer), problems)
@@ -72,12 +55,12 @@ def test_exact_recovery_among_outliers(n, outliers, scorer, make_problems):
     assert errors.rotation_error_deg.max() < 1e-9
     assert errors.translation_error.max() < 1e-9
     assert result.ok.all()
-    # A wrong pair may fall on the right place by chance; a right one is never missed.
+    # An outlier may fall on the right place by chance; an inlier is never missed.
     assert (result.weights > 0)[problems.inliers].all()
     assert ((result.weights > 0) & ~problems.inliers).double().mean() < 0.01
 
 
-def test_float32_finds_it_too(make_problems):
+def test_float32_finds_the_pose_too(make_problems):
     problems = make_problems(20, 50, outliers=8, dtype=torch.float32)
     result = solve(solver(**PROTOCOL), problems)
     assert {x.dtype for x in (result.rotation, result.translation, result.weights)} == {torch.float32}
@@ -85,16 +68,24 @@ def test_float32_finds_it_too(make_problems):
     assert result.ok.all()
 
 
-def test_noise_of_the_world_counts_by_depth(make_problems):
-    """Weighing by depth is worth success: the protocol's near points are noisier than the far ones."""
+def test_weighing_by_depth_pays(make_problems):
+    """The protocol's near points have more noise in the image than its far points."""
     problems = make_problems(9, 300, outliers=3)
-    rates = [
-        success(pose_errors(solve(solver(threshold=t, world_threshold=w), problems).pose, problems.pose))
-        .double()
-        .mean()
-        for t, w in ((50.0, 0.0), (6.0, 0.3))
-    ]
-    assert rates[1] > rates[0] + 0.02
+    plain, by_depth = (
+        success(pose_errors(solve(solver(**options), problems).pose, problems.pose)).double().mean()
+        for options in ({"threshold": 50.0}, PROTOCOL)
+    )
+    assert by_depth > plain + 0.02
+
+
+@pytest.mark.parametrize("outliers", [0, 3])
+def test_the_papers_ransac_finds_the_pose(outliers, make_problems):
+    """EPnP and the robust LM on subsets of seven of nine; with three outliers every subset holds one."""
+    problems = make_problems(9, 50, outliers=outliers, noise=False)
+    minimal = SubsetSolver(EPnP(), RobustWeightedLM(m=5, learnable=False), size=7)
+    result = solve(solver(minimal, threshold=5.0), problems)
+    right = success(pose_errors(result.pose, problems.pose)).double().mean()
+    assert right > (0.3 if outliers else 0.95)
 
 
 def test_weights_decide_between_two_poses(make_problems):
@@ -127,24 +118,20 @@ def test_the_world_need_not_be_centred(make_problems, correspond):
     torch.testing.assert_close(translation, near.pose.translation, rtol=0, atol=1e-6)
 
 
-# --- the mask is that of the pose -------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("world_threshold", [0.0, 0.1])
-def test_the_mask_is_the_residual_test_at_the_returned_pose(world_threshold, make_problems):
+def test_the_weights_are_the_inliers_of_the_returned_pose(world_threshold, make_problems):
     """In the units of the user: another camera, and a world in centimetres."""
     problems = make_problems(30, 50, outliers=10)
     K = torch.tensor([[800.0, 0.0, 320.0], [0.0, 800.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
     pixels = problems.img_points * (800.0 / 3400.0) + torch.tensor([320.0, 240.0], dtype=torch.float64)
     world = 100.0 * problems.world_points
-    net = solver(threshold=2.0, world_threshold=100.0 * world_threshold)
-    result = net(world, pixels, K)
+    result = solver(threshold=2.0, world_threshold=100.0 * world_threshold)(world, pixels, K)
     cam = transform(result.pose, world)
     depth = cam[..., 2]
     sq_residual = (800.0 * cam[..., :2] / depth[..., None] + K[:2, 2] - pixels).square().sum(-1)
     sq_limit = 2.0**2 + (800.0 * 100.0 * world_threshold / depth) ** 2
-    assert torch.equal(result.weights > 0, (depth > 0) & (sq_residual < sq_limit))
     inlier = result.weights > 0
+    assert torch.equal(inlier, (depth > 0) & (sq_residual < sq_limit))
     torch.testing.assert_close(result.weights[inlier], (2.0**2 / sq_limit)[inlier])
     assert result.ok.all()
 
@@ -154,53 +141,63 @@ def test_pairs_without_weight_are_no_inliers(make_problems):
     mask = torch.ones(20, 12, dtype=torch.bool)
     mask[:, [2, 5, 11]] = False
     world = problems.world_points.clone()
-    world[:, 5] = math.nan  # what padding holds does not matter
+    world[:, 5] = math.nan  # padding may hold anything
     result = solver(threshold=1.0)(world, problems.img_points, problems.intrinsics, mask=mask)
     assert torch.equal(result.weights > 0, mask)
     assert pose_errors(result.pose, problems.pose).rotation_error_deg.max() < 1e-9
 
 
-# --- every problem is on its own --------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("n", [9, 40])
-def test_the_same_call_has_the_same_result_to_the_bit(n, make_problems, correspond):
-    corr, _ = correspond(make_problems(n, 50, outliers=n // 3))
-    ransac = RANSAC(P3P(), **PROTOCOL)
-    first = ransac(corr)
-    torch.rand(5)  # the global generator is not ours
-    assert all(torch.equal(a, b) for a, b in zip(outputs(first), outputs(ransac(corr)), strict=True))
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize(("n", "outliers"), [(4, 0), (9, 3), (40, 20)])
-def test_a_problem_is_itself_in_every_batch(n, outliers, dtype, make_problems, correspond):
+def test_a_problem_has_the_same_result_in_every_batch(n, outliers, dtype, make_problems, correspond):
     corr, _ = correspond(make_problems(n, 60, outliers=outliers, dtype=dtype))
     ransac = RANSAC(P3P(), **PROTOCOL)
     together = outputs(ransac(corr))
     tolerance = 1e-9 if dtype == torch.float64 else 1e-5
+    torch.rand(5)  # the global generator is not used
+    assert all(torch.equal(a, b) for a, b in zip(outputs(ransac(corr)), together, strict=True))
     for at in (torch.tensor([0]), torch.tensor([59, 3]), torch.arange(59, -1, -1)):
-        for a, b in zip(outputs(ransac(part(corr, at))), together, strict=True):
+        for a, b in zip(outputs(ransac(take(corr, at))), together, strict=True):
             if n == 9:
                 assert torch.equal(a, b[at])
-            else:  # the kernels for a single problem, or for four samples, may round the last bit otherwise
+            else:  # the kernels for a single problem, or for four samples, may round the last bit differently
                 torch.testing.assert_close(a, b[at], rtol=tolerance, atol=tolerance)
 
 
-@pytest.mark.parametrize("size", [1, 50, 10**6])
-def test_the_chunks_do_not_matter(size, make_problems, correspond):
+def test_chunks_do_not_matter(make_problems, correspond):
     corr, _ = correspond(make_problems(40, 20, outliers=15))
     # Rounds are no longer than a chunk: with the same rounds everything is the same.
     options = {**PROTOCOL, "min_samples": 100, "max_samples": 100}
-    some, default = RANSAC(P3P(), **options, chunk_size=max(size, 100))(corr), RANSAC(P3P(), **options)(corr)
-    for a, b in zip(outputs(some), outputs(default), strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
-    assert RANSAC(P3P(), **options, chunk_size=size)(corr).ok.all()
+    default = outputs(RANSAC(P3P(), **options)(corr))
+    for size in (100, 10**6):
+        for a, b in zip(outputs(RANSAC(P3P(), **options, chunk_size=size)(corr)), default, strict=True):
+            torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
+    assert RANSAC(P3P(), **options, chunk_size=1)(take(corr, slice(2))).ok.all()
+
+
+class Counting(P3P):
+    """P3P that records the number of samples of each call."""
+
+    def __init__(self):
+        super().__init__()
+        self.sizes = []
+
+    def hypotheses(self, corr):
+        self.sizes.append(len(corr.weights))
+        return super().hypotheses(corr)
+
+
+@pytest.mark.parametrize(("n", "batch"), [(9, 300), (1000, 3)])
+def test_a_chunk_bounds_the_samples_that_are_solved_together(n, batch, make_problems, correspond):
+    minimal = Counting()
+    RANSAC(minimal, **PROTOCOL, chunk_size=200)(correspond(make_problems(n, batch, outliers=n // 2))[0])
+    assert max(minimal.sizes) <= 200
+    assert len(minimal.sizes) > 1
 
 
 def test_easy_problems_stop_early_and_change_nothing(found, make_problems, correspond):
-    easy, hard = correspond(make_problems(60, 10))[0], correspond(make_problems(60, 10, outliers=42))[0]
-    both = Correspondences(*(torch.cat((a, b)) if a.ndim else a for a, b in zip(easy[:6], hard[:6], strict=True)))
+    easy, hard = (correspond(make_problems(60, 10, outliers=k))[0] for k in (0, 42))
+    both = map_tensors(lambda a, b: torch.cat((a, b)) if a.ndim else a, easy, hard)
     ransac = RANSAC(P3P(), **PROTOCOL)
     results = [outputs(ransac(corr)) for corr in (easy, hard, both)]
     alone, alone_hard, together = (x.samples for x in found)
@@ -210,7 +207,7 @@ def test_easy_problems_stop_early_and_change_nothing(found, make_problems, corre
         torch.testing.assert_close(torch.cat((a, b)), c, rtol=1e-9, atol=1e-9)
 
 
-def test_how_many_samples_are_drawn(found, make_problems, correspond):
+def test_options_decide_how_many_samples_are_drawn(found, make_problems, correspond):
     corr, _ = correspond(make_problems(40, 20, outliers=20, noise=False))
 
     def samples(**options):
@@ -224,92 +221,57 @@ def test_how_many_samples_are_drawn(found, make_problems, correspond):
     assert samples(min_samples=400).min() >= 400
     assert samples(min_samples=400, chunk_size=150).min() >= 400
     assert samples(max_samples=77, threshold=1e-6).max() <= 77  # no inliers, no early end
+    poses = [samples(seed=seed, max_samples=20) is not None and found[-1].poses for seed in (0, 1)]
+    assert not torch.equal(*poses)
 
 
-def test_the_seed_decides_what_is_drawn(found, make_problems, correspond):
-    corr, _ = correspond(make_problems(40, 20, outliers=28))
-    for seed in (0, 1):
-        RANSAC(P3P(), **PROTOCOL, seed=seed, max_samples=20)(corr)
-    assert not torch.equal(found[0].poses, found[1].poses)
-
-
-# --- failure is data --------------------------------------------------------------------------------------------------
-
-
-def bad_problems(problems):
-    """Name and problems of which the second is spoilt."""
-    world, img = problems.world_points, problems.img_points
-
-    def spoilt(*, world_points=world, img_points=img, weights=None):
-        weights = torch.ones_like(world[..., 0]) if weights is None else weights
-        return world_points, img_points, weights
-
-    one = torch.tensor([1])
-    line = world[1, :1] + torch.arange(len(world[1]), dtype=world.dtype)[:, None] * torch.ones(3, dtype=world.dtype)
+def test_bad_problems_fail_alone(make_problems):
+    problems = make_problems(9, 7, outliers=2)
+    world, img = problems.world_points.clone(), problems.img_points.clone()
     weights = torch.ones_like(world[..., 0])
-    two = weights.clone()
-    two[1, 2:] = 0.0
-    return {
-        "nan": spoilt(world_points=world.index_fill(0, one, math.nan)),
-        "no weight": spoilt(weights=weights.index_fill(0, one, 0.0)),
-        "two pairs": spoilt(weights=two),
-        "a line": spoilt(world_points=world.index_copy(0, one, line[None])),
-        "one point": spoilt(world_points=world.index_fill(0, one, 1.0)),
-        "one pixel": spoilt(img_points=img.index_fill(0, one, 7.0)),
-    }
-
-
-@pytest.mark.parametrize("n", [9, 40])
-@pytest.mark.parametrize("kind", ["nan", "no weight", "two pairs", "a line", "one point", "one pixel"])
-def test_bad_problems_fail_alone(kind, n, make_problems):
-    problems = make_problems(n, 3, outliers=2)
-    world, img, weights = bad_problems(problems)[kind]
-    leaves = [x.clone().requires_grad_() for x in (world, img, weights)]
+    world[1] = math.nan
+    weights[2] = 0.0
+    weights[3, 2:] = 0.0  # two pairs
+    world[4] = world[4, :1] + torch.arange(9, dtype=world.dtype)[:, None]  # a line
+    world[5] = 1.0
+    img[6] = 7.0
+    leaves = [x.requires_grad_() for x in (world, img, weights)]
     net = solver(**PROTOCOL)
-    result = net(leaves[0], leaves[1], problems.intrinsics, weights=leaves[2])
-    sound = solve(net, problems)
-    assert result.ok.tolist() == [True, False, True]
+    result, sound = net(world, img, problems.intrinsics, weights=weights), solve(net, problems)
+    assert result.ok.tolist() == [True] + 6 * [False]
     for a, b in ((result.rotation, sound.rotation), (result.translation, sound.translation)):
         assert a.isfinite().all()
-        assert torch.equal(a[[0, 2]], b[[0, 2]])
+        assert torch.equal(a[0], b[0])
     (result.rotation.sum() + result.translation.sum() + result.weights.sum()).backward()
     for leaf in leaves:
         assert leaf.grad.isfinite().all()
-        assert not leaf.grad[1].any()
-        assert leaf.grad[0].any() or leaf is leaves[2]
+        assert not leaf.grad[1:].any()
+    assert world.grad[0].any()
+    assert img.grad[0].any()
 
 
-@pytest.mark.parametrize("n", [4, 5, 9, 40])
-def test_garbage_is_not_ok(n):
-    problems = garbage(n, 300)
-    for options in (PROTOCOL, {"threshold": 4.0}):
-        assert solve(solver(**options), problems).ok.double().mean() <= 0.01
+def test_sound_problems_are_ok_and_pixels_of_no_pose_are_not(make_problems):
+    for n, outliers in ((3, 0), (4, 0), (5, 0), (9, 3), (40, 28)):
+        problems = make_problems(n, 200, outliers=outliers)
+        assert solve(solver(**PROTOCOL), problems).ok.double().mean() > 0.97
+    for n in (4, 5, 9, 40):
+        mix = OutlierMix(count=n, mismatch_share=0.0)
+        problems = SyntheticProblems(n=n, batch_size=300, outliers=mix, dtype=torch.float64).batch(0)
+        for options in (PROTOCOL, {"threshold": 4.0}):
+            assert solve(solver(**options), problems).ok.double().mean() <= 0.01
 
 
-@pytest.mark.parametrize(("n", "outliers"), [(3, 0), (4, 0), (5, 0), (9, 3), (40, 28)])
-def test_sound_problems_are_ok(n, outliers, make_problems):
-    problems = make_problems(n, 200, outliers=outliers)
-    assert solve(solver(**PROTOCOL), problems).ok.double().mean() > 0.97
-
-
-def test_too_few_pairs_for_a_sample(make_problems, correspond):
+def test_too_few_pairs_and_no_problems(make_problems, correspond):
     corr, _ = correspond(make_problems(5, 2))
-    with pytest.raises(ShapeError, match="Samples of 7 pairs"):
+    with pytest.raises(ShapeError, match=r"7 pairs.*N = 5"):
         RANSAC(SubsetSolver(EPnP(), size=7))(corr)
-
-
-def test_no_problem_at_all(make_problems, correspond):
-    corr, _ = correspond(make_problems(9, 2))
-    guess = RANSAC(P3P())(part(corr, slice(0, 0)))
+    guess = RANSAC(P3P())(take(corr, slice(0, 0)))
     assert guess.pose.rotation.shape == (0, 3, 3)
     assert guess.ok.shape == (0,)
 
 
-# --- gradients --------------------------------------------------------------------------------------------------------
-
-
 def test_gradcheck_of_the_last_refinement(make_problems, correspond):
-    """With the inliers, their weights and the start fixed, as the docstring says."""
+    """With the inliers, their weights and the start fixed."""
     corr, _ = correspond(make_problems(9, 2, outliers=3))
     ransac = RANSAC(P3P(), threshold=50.0)  # the weights are 1
     start = ransac(corr).pose
@@ -319,12 +281,12 @@ def test_gradcheck_of_the_last_refinement(make_problems, correspond):
         moved = corr._replace(world_points=world, img_points=img, weights=weights)
         return tuple(ransac._refine(moved, start, thresholds)[0])
 
-    leaves = [x.clone().requires_grad_() for x in corr[:3]]
+    leaves = [x.clone().requires_grad_() for x in (corr.world_points, corr.img_points, corr.weights)]
     assert torch.autograd.gradcheck(refine, leaves, atol=1e-5)
 
 
 def test_the_gradient_is_that_of_the_result(make_problems, correspond):
-    """The start is so near the minimum that ignoring what it depends on costs little."""
+    """The start is so near the minimum that a constant start costs little."""
     corr, _ = correspond(make_problems(12, 4, outliers=4))
     ransac = RANSAC(P3P(), **PROTOCOL)
     img = corr.img_points.clone().requires_grad_()
@@ -332,24 +294,13 @@ def test_the_gradient_is_that_of_the_result(make_problems, correspond):
     direction = torch.randn(img.shape, generator=generator, dtype=torch.float64)
     probe = torch.randn(4, 3, generator=generator, dtype=torch.float64)
     guess = ransac(corr._replace(img_points=img))
+    assert not guess.weights.requires_grad
     (guess.pose.translation * probe).sum().backward()
-    # The weights are those at the start, which is found in single precision: smaller steps would show its rounding.
+    # The weights belong to the start, which is found in single precision: smaller steps would show its rounding.
     step = 1e-2
     ends = [ransac(corr._replace(img_points=corr.img_points + s * direction)).pose.translation for s in (step, -step)]
     numeric = ((ends[0] - ends[1]) * probe).sum(-1) / (2 * step)
-    analytic = (img.grad * direction).sum((1, 2))
-    torch.testing.assert_close(analytic, numeric, rtol=1e-2, atol=1e-8)
-
-
-def test_the_selection_has_no_gradient(make_problems, correspond):
-    corr, _ = correspond(make_problems(9, 2))
-    leaves = [x.clone().requires_grad_() for x in corr[:3]]
-    guess = RANSAC(P3P(), **PROTOCOL)(Correspondences(*leaves, *corr[3:]))
-    assert not guess.weights.requires_grad
-    assert guess.pose.rotation.requires_grad
-
-
-# --- parts and options ------------------------------------------------------------------------------------------------
+    torch.testing.assert_close((img.grad * direction).sum((1, 2)), numeric, rtol=1e-2, atol=1e-8)
 
 
 def test_a_scorer_may_be_any_function(make_problems, correspond):
@@ -358,22 +309,11 @@ def test_a_scorer_may_be_any_function(make_problems, correspond):
     own = RANSAC(P3P(), **PROTOCOL, scorer=lambda error: 3.0 * torch.minimum(error, torch.ones_like(error)))(corr)
     for a, b in zip(outputs(built_in), outputs(own), strict=True):
         torch.testing.assert_close(a, b)
-    cauchy = RANSAC(P3P(), **PROTOCOL, scorer=torch.log1p)(corr)
-    assert cauchy.ok.all()
-
-
-@pytest.mark.parametrize("outliers", [0, 2, 3])
-def test_the_papers_ransac_finds_the_pose(outliers, make_problems):
-    """EPnP and the robust LM on subsets of seven of nine; with three outliers every subset holds one."""
-    problems = make_problems(9, 50, outliers=outliers, noise=False)
-    minimal = SubsetSolver(EPnP(), RobustWeightedLM(m=5, learnable=False), size=7)
-    result = solve(solver(minimal, threshold=5.0), problems)
-    right = success(pose_errors(result.pose, problems.pose)).double().mean()
-    assert right > (0.95 if outliers < 3 else 0.3)
+    assert RANSAC(P3P(), **PROTOCOL, scorer=torch.log1p)(corr).ok.all()
 
 
 class Stubborn(nn.Module):
-    """An initialiser with a guess for every other problem and a pose that is no number for every third."""
+    """An initialiser with a guess for every other problem and NaN for every third."""
 
     def forward(self, corr):
         index = torch.arange(len(corr.weights))
@@ -383,65 +323,18 @@ class Stubborn(nn.Module):
         return Guess(Pose(rotation, translation), torch.ones_like(corr.weights), index % 2 == 0)
 
 
-def test_a_subset_solver_says_what_is_no_solution(make_problems, correspond):
+def test_a_subset_solver_knows_which_poses_are_valid(make_problems, correspond):
     corr, _ = correspond(make_problems(7, 12))
     hypotheses = SubsetSolver(Stubborn(), size=7).hypotheses(corr)
     assert hypotheses.valid[:, 0].tolist() == [i % 2 == 0 and i % 3 != 0 for i in range(12)]
     assert hypotheses.pose.translation.isfinite().all()
 
 
-class Counting(P3P):
-    """P3P that remembers how many samples it was given at once."""
-
-    def __init__(self):
-        super().__init__()
-        self.sizes = []
-
-    def hypotheses(self, corr):
-        self.sizes.append(len(corr.weights))
-        return super().hypotheses(corr)
-
-
-@pytest.mark.parametrize(("n", "batch"), [(9, 300), (100, 50), (1000, 3)])
-def test_the_working_set_is_bounded(n, batch, make_problems, correspond, monkeypatch):
-    largest = []
-
-    def recorded(self, packed, scorer):
-        largest.append(self.points.shape[0] * self.points.shape[1] * packed.shape[-1])
-        return losses(self, packed, scorer)
-
-    losses = Scene.losses
-    monkeypatch.setattr(Scene, "losses", recorded)
-    corr, _ = correspond(make_problems(n, batch, outliers=n // 2))
-    minimal = Counting()
-    ransac = RANSAC(minimal, **PROTOCOL, chunk_size=200)
-    ransac(corr)
-    assert max(minimal.sizes) <= 200
-    assert len(minimal.sizes) > 1
-    assert max(largest) <= 128 * 200
-
-
-def test_many_pairs_are_scored_in_part(make_problems, correspond, monkeypatch):
-    seen = []
-    rank = Search._keep
-
-    def recorded(self, scene, packed, valid, width, **options):
-        seen.append((scene.points.shape[1], packed.shape[-1]))
-        return rank(self, scene, packed, valid, width, **options)
-
-    monkeypatch.setattr(Search, "_keep", recorded)
-    corr, _ = correspond(make_problems(300, 2, outliers=100))
-    RANSAC(P3P(), **PROTOCOL, min_samples=64, max_samples=64)(corr)
-    assert seen == [(16, 256), (64, 64), (300, 16)]
-
-
-def test_its_configuration_is_data():
-    ransac = RANSAC(SubsetSolver(EPnP(), RobustWeightedLM(m=5), size=7), threshold=3.0, scorer="inliers")
-    assert ransac.config["minimal"]["name"] == "SubsetSolver"
+def test_the_configuration_is_plain_data():
+    ransac = RANSAC(SubsetSolver(EPnP(), RobustWeightedLM(m=5), size=7), threshold=3.0, scorer=torch.log1p)
+    assert json.loads(json.dumps(ransac.config)) == ransac.config
     assert ransac.config["minimal"]["init"] == {"name": "EPnP", **EPnP().config}
-    arguments = {key: value for key, value in ransac.config.items() if key != "minimal"}
-    assert RANSAC(P3P(), **arguments).config == {**ransac.config, "minimal": {"name": "P3P", **P3P().config}}
-    assert "threshold=3.0" in repr(ransac)
+    assert ransac.config["threshold"] == 3.0
 
 
 @pytest.mark.parametrize(
@@ -454,34 +347,10 @@ def test_its_configuration_is_data():
         {"max_samples": 0},
         {"min_samples": 1.5},
         {"confidence": 1.0},
-        {"local_candidates": 0},
         {"local_iterations": -1},
-        {"chunk_size": 0},
+        {"size": 2},
     ],
 )
 def test_wrong_arguments_raise(wrong):
     with pytest.raises(BaseError, match=next(iter(wrong))):
-        RANSAC(P3P(), **wrong)
-
-
-def test_a_subset_has_three_pairs_or_more():
-    with pytest.raises(BaseError, match="size"):
-        SubsetSolver(EPnP(), size=2)
-
-
-@pytest.mark.slow
-def test_ten_thousand_problems_of_a_hundred_pairs_fit_into_two_gibibytes():
-    code = (
-        "import resource, torch; torch.set_num_threads(1);"
-        "from kornia_pnpnet import PnPNet, RobustWeightedLM;"
-        "from kornia_pnpnet.data import OutlierMix, SyntheticProblems;"
-        "from kornia_pnpnet.init.ransac.p3p import P3P; from kornia_pnpnet.init.ransac.ransac import RANSAC;"
-        "data = SyntheticProblems(n=100, batch_size=10000, outliers=OutlierMix(count=50), dtype=torch.float64);"
-        "p = data.batch(0); net = PnPNet(RANSAC(P3P(), threshold=6.0, world_threshold=0.3), RobustWeightedLM(m=0));"
-        "torch.set_grad_enabled(False); ok = net(p.world_points, p.img_points, p.intrinsics).ok;"
-        "print(ok.double().mean().item(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
-    )
-    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    ok, kibibytes = output.stdout.split()
-    assert float(ok) > 0.99
-    assert float(kibibytes) < 2 * 1024**2
+        SubsetSolver(EPnP(), **wrong) if "size" in wrong else RANSAC(P3P(), **wrong)

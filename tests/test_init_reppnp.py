@@ -1,4 +1,4 @@
-"""EPPnP and REPPnP: exact on exact pairs, blind to frame, unit and order, honest about what cannot be solved."""
+"""EPPnP and REPPnP: exact on exact pairs, equivariant to frame, unit and order, not ok where there is no pose."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def chosen(pose, index):
 
 
 def change(corr, **changes):
-    """Other pairs, for which the scales of the normalisation do not hold."""
+    """Other pairs, without the scales of the normalisation."""
     return corr._replace(img_scale=None, world_scale=None, **changes)
 
 
@@ -41,35 +41,22 @@ def flattened(corr, truth):
     return change(corr, world_points=(cam_points - truth.translation[:, None]) @ truth.rotation)
 
 
-# --- what is exact ----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("reject_outliers", [False, True])
-@pytest.mark.parametrize("n", [6, 9, 20, 50])
-def test_exact_pairs_give_the_exact_pose_and_all_count(n, reject_outliers, make_problems, correspond):
+@pytest.mark.parametrize(("n", "planar"), [(6, False), (20, False), (50, False), (5, True), (20, True)])
+def test_exact_pairs_give_the_exact_pose(n, planar, reject_outliers, make_problems, correspond):
     corr, truth = correspond(make_problems(n, 100, noise=False))
+    corr = flattened(corr, truth) if planar else corr
     guess = REPPnP(reject_outliers=reject_outliers)(corr)
     assert guess.ok.all()
     assert guess.weights.all()
-    assert_same(guess.pose, truth)
+    assert_same(guess.pose, truth, 1e-6 if planar else 1e-7)
 
 
-@pytest.mark.parametrize("n", [5, 9, 20])
-def test_exact_planar_pairs_give_the_exact_pose(n, make_problems, correspond):
-    corr, truth = correspond(make_problems(n, 100, noise=False))
-    corr = flattened(corr, truth)
-    centred = corr.world_points - corr.world_points.mean(1, keepdim=True)
-    assert torch.linalg.svdvals(centred)[:, 2].max() < 1e-12
-    guess = REPPnP()(corr)
-    assert guess.ok.all()
-    assert_same(guess.pose, truth, 1e-6)
-
-
-@pytest.mark.parametrize(("n", "outliers"), [(9, 1), (20, 4), (50, 12)])
+@pytest.mark.parametrize(("n", "outliers"), [(9, 1), (50, 12)])
 def test_gross_outliers_are_found_and_do_not_move_the_pose(n, outliers, make_problems, correspond):
     problems = make_problems(n, 200, outliers=outliers, noise=False)
     corr, truth = correspond(problems)
-    # Some mismatches happen to be close to the right pixel: those need not be found.
+    # Some mismatches happen to be close to the right pixel: they need not be found.
     gross = (problems.inliers | (algebraic_error(corr, truth) > 0.1)).all(-1)
     assert gross.sum() > 100
     guess = REPPnP()(corr)
@@ -81,10 +68,10 @@ def test_gross_outliers_are_found_and_do_not_move_the_pose(n, outliers, make_pro
     assert success(pose_errors(every.pose, truth))[gross].double().mean() < 0.03
 
 
-@pytest.mark.parametrize("thickness", [0.0, 0.05, 1.0])
+@pytest.mark.parametrize("thickness", [0.0, 1.0])
 @pytest.mark.parametrize(("dtype", "max_error_deg"), [(torch.float64, 1e-6), (torch.float32, 0.5)])
 def test_a_view_through_a_telephoto_lens(dtype, max_error_deg, thickness, random_rotations, generator):
-    """Seen from 100 radii there is hardly any depth, and off the axis the pixels are nearly all the same."""
+    """From a distance of 100 radii there is hardly any depth, and off the axis all pixels nearly coincide."""
     world = torch.randn(100, 20, 3, generator=generator, dtype=torch.float64)
     world[..., 2] *= thickness
     truth = Pose(random_rotations(100), torch.tensor([50.0, -30.0, 100.0], dtype=torch.float64).expand(100, 3))
@@ -99,31 +86,24 @@ def test_a_view_through_a_telephoto_lens(dtype, max_error_deg, thickness, random
     assert (guess.weights[right].sum(-1) == 17).all()
 
 
-# --- the floors that the method has to hold ---------------------------------------------------------------------------
-
-# Share of success of 1000 problems of the protocol, about three standard deviations below what is measured on 5000
-# (90.5, 75.6, 98.8 and 100 %). (Pairs, most outliers.)
-FLOORS = {(9, None): 0.88, (9, 3): 0.715, (20, 6): 0.975, (50, 16): 0.995}
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize(("n", "most"), FLOORS)
-def test_success_on_the_protocols_problems(n, most, dtype):
+# Shares of success by pairs and most outliers, about three standard deviations below those of 5000 problems.
+@pytest.mark.parametrize(("n", "most", "floor"), [(9, None, 0.88), (9, 3, 0.715), (20, 6, 0.975), (50, 16, 0.995)])
+def test_success_on_the_protocols_problems(n, most, floor):
     mix = None if most is None else OutlierMix()
     assert mix is None or mix.max_count(n) == most
-    problems = SyntheticProblems(n=n, batch_size=1000, seed=7, outliers=mix, dtype=dtype).batch(0)
+    problems = SyntheticProblems(n=n, batch_size=1000, seed=7, outliers=mix).batch(0)
     normalize = Normalize(order=False)
     corr, frame = normalize(problems.world_points, problems.img_points, problems.intrinsics)
     guess = REPPnP()(corr)
-    assert {x.dtype for x in (*guess.pose, guess.weights)} == {dtype}
+    assert {x.dtype for x in (*guess.pose, guess.weights)} == {torch.float32}
     right = guess.ok & success(pose_errors(normalize.undo(guess.pose, frame), problems.pose))
-    assert right.double().mean() > FLOORS[n, most]
+    assert right.double().mean() > floor
 
 
 def test_a_guess_is_hardly_ever_worse_in_float32(make_problems, correspond):
     corr, truth = correspond(make_problems(20, 500, outliers=3))
     double = REPPnP()(corr)
-    single = REPPnP()(Correspondences(*(None if x is None else x.float() for x in corr)))
+    single = REPPnP()(corr.map(torch.Tensor.float))
     same = (double.weights == single.weights).all(-1) & success(pose_errors(double.pose, truth), max_translation=0.05)
     assert same.double().mean() > 0.9
     errors = pose_errors(Pose(*(x[same].double() for x in single.pose)), chosen(double.pose, same))
@@ -131,11 +111,8 @@ def test_a_guess_is_hardly_ever_worse_in_float32(make_problems, correspond):
     assert errors.translation_error.max() < 1e-3
 
 
-# --- invariances ------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("reject_outliers", [False, True])
-def test_a_pair_with_weight_zero_is_not_there(reject_outliers, make_problems, correspond, generator):
+def test_a_pair_with_weight_zero_is_ignored(reject_outliers, make_problems, correspond, generator):
     corr, _ = correspond(make_problems(12, 50, outliers=2))
     weights = 0.5 + torch.rand(50, 12, generator=generator, dtype=torch.float64)
     keep = [0, 2, 3, 5, 6, 7, 8, 10, 11]
@@ -152,7 +129,7 @@ def test_a_pair_with_weight_zero_is_not_there(reject_outliers, make_problems, co
 
 
 def test_weights_pull_the_pose(make_problems, correspond):
-    """A pair of weight 3 counts as three pairs in EPPnP."""
+    """In EPPnP a pair of weight 3 counts as three pairs."""
     corr, _ = correspond(make_problems(8, 50))
     times = torch.tensor([1, 3, 1, 1, 2, 1, 1, 1])
     repeated = change(
@@ -165,23 +142,18 @@ def test_weights_pull_the_pose(make_problems, correspond):
     assert_same(model(corr._replace(weights=times.double().expand(50, 8))).pose, model(repeated).pose)
 
 
-def test_shuffled_pairs_give_the_same_pose(make_problems, correspond, generator):
+def test_the_pose_follows_order_frame_and_unit_of_the_world(make_problems, correspond, random_rotations, generator):
     corr, _ = correspond(make_problems(20, 50, outliers=5))
+    guess = REPPnP()(corr)
     order = torch.randperm(20, generator=generator)
-    straight = REPPnP()(corr)
-    shuffled = REPPnP()(Correspondences(*(x[:, order] for x in corr[:3]), corr.focal))
-    assert torch.equal(straight.weights[:, order], shuffled.weights)
-    assert_same(straight.pose, shuffled.pose)
-
-
-def test_the_pose_follows_the_frame_and_the_unit_of_the_world(make_problems, correspond, random_rotations):
-    corr, _ = correspond(make_problems(20, 50, outliers=5))
+    shuffled = REPPnP()(corr.map(lambda x: x[:, order] if x.ndim > 1 else x))
+    assert torch.equal(guess.weights[:, order], shuffled.weights)
+    assert_same(guess.pose, shuffled.pose)
     rotation, shift, scale = random_rotations(50), torch.tensor([3.0, -5.0, 2.0], dtype=torch.float64), 37.0
-    moved = change(corr, world_points=scale * corr.world_points @ rotation.mT + shift)
-    here, there = REPPnP()(corr), REPPnP()(moved)
-    assert torch.equal(here.weights, there.weights)
-    expected = here.pose.rotation @ rotation.mT
-    assert_same(there.pose, Pose(expected, scale * here.pose.translation - expected @ shift), 1e-6)
+    moved = REPPnP()(change(corr, world_points=scale * corr.world_points @ rotation.mT + shift))
+    assert torch.equal(guess.weights, moved.weights)
+    expected = guess.pose.rotation @ rotation.mT
+    assert_same(moved.pose, Pose(expected, scale * guess.pose.translation - expected @ shift), 1e-6)
 
 
 def test_another_problem_changes_nothing_by_a_bit(make_problems, correspond):
@@ -198,64 +170,9 @@ def test_another_problem_changes_nothing_by_a_bit(make_problems, correspond):
     assert not after.ok[[3, 11]].any()
 
 
-# --- degenerate pairs -------------------------------------------------------------------------------------------------
-
-
-def degenerate(kind, corr):
-    world, weights = corr.world_points.clone(), corr.weights.clone()
-    if kind == "line":
-        world = world[:, :, :1].expand_as(world)
-    elif kind == "point":
-        world = world[:, :1].expand_as(world)
-    elif kind == "three pairs":
-        weights[:, 3:] = 0.0
-    elif kind == "nothing":
-        weights = torch.zeros_like(weights)
-    elif kind == "one pixel":
-        return change(corr, img_points=corr.img_points[:, :1].expand_as(corr.img_points).contiguous())
-    return change(corr, world_points=world, weights=weights)
-
-
-@pytest.mark.parametrize("reject_outliers", [False, True])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("kind", ["line", "point", "three pairs", "nothing", "one pixel", "random"])
-def test_everything_stays_finite(kind, dtype, reject_outliers, make_problems, correspond, generator):
-    corr, _ = correspond(make_problems(9, 50))
-    corr = degenerate(kind, corr)
-    if kind == "random":
-        corr = change(corr, img_points=3000 * torch.randn(50, 9, 2, generator=generator, dtype=torch.float64))
-    inputs = [x.to(dtype).detach().requires_grad_() for x in corr[:3]]
-    guess = REPPnP(reject_outliers=reject_outliers)(Correspondences(*inputs, corr.focal.to(dtype)))
-    if kind not in ("random", "one pixel"):
-        assert not guess.ok.any()
-    assert all(x.isfinite().all() for x in (*guess.pose, guess.weights))
-    eye = torch.eye(3, dtype=dtype).expand(50, 3, 3)
-    torch.testing.assert_close(guess.pose.rotation @ guess.pose.rotation.mT, eye, rtol=0, atol=1e-4)
-    (guess.pose.rotation.sum() + guess.pose.translation.sum()).backward()
-    assert all(x.grad is not None and x.grad.isfinite().all() for x in inputs)
-
-
-def test_an_empty_batch_has_no_guesses():
-    empty = Correspondences(torch.zeros(0, 9, 3), torch.zeros(0, 9, 2), torch.zeros(0, 9), torch.tensor(3400.0))
-    guess = REPPnP()(empty)
-    assert guess.pose.matrix.shape == (0, 4, 4)
-    assert guess.ok.shape == (0,)
-
-
-def test_three_pairs_have_no_guess(correspond, make_problems):
-    corr, _ = correspond(make_problems(3))
-    guess = REPPnP()(corr)
-    assert not guess.ok.any()
-    assert all(x.isfinite().all() for x in guess.pose)
-
-
-# --- gradients --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("planar", [False, True])
-@pytest.mark.parametrize("reject_outliers", [False, True])
+@pytest.mark.parametrize(("reject_outliers", "planar"), [(False, True), (True, False)])
 def test_gradcheck(reject_outliers, planar, make_problems, correspond):
-    corr, truth = correspond(make_problems(9, 3, seed=5))
+    corr, truth = correspond(make_problems(9, 1, seed=5))
     if planar:
         corr = flattened(corr, truth)
     if reject_outliers:
@@ -267,13 +184,13 @@ def test_gradcheck(reject_outliers, planar, make_problems, correspond):
     assert first.ok.all()
     assert first.weights.all() != reject_outliers
 
-    # Pixels near 1, so that one difference step suits all.
+    # All inputs near 1, so that one difference step suits all.
     def run(world, pixels, weights, focal):
         guess = model(Correspondences(world, 1000.0 * pixels, weights, 1000.0 * focal))
         assert torch.equal(guess.weights, first.weights)
         return tuple(guess.pose)
 
-    weights = 0.5 + torch.rand(3, 9, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    weights = 0.5 + torch.rand(1, 9, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     first = model(corr._replace(weights=weights))
     inputs = [corr.world_points, corr.img_points / 1000.0, weights, corr.focal / 1000.0]
     inputs = [x.detach().clone().requires_grad_() for x in inputs]
@@ -292,37 +209,46 @@ def test_three_steps_pass_on_the_derivative_of_the_minimum(make_problems, corres
     assert error.max() < 1e-3
 
 
-# --- options ----------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_problems_without_a_pose_are_not_ok(dtype, make_problems, correspond):
+    corr = correspond(make_problems(9, 5))[0].map(lambda x: x.to(dtype))
+    world, weights = corr.world_points, corr.weights.clone()
+    weights[:, 3:] = 0.0
+    for spoilt in (
+        change(corr, world_points=world[:, :, :1].expand_as(world)),  # a line
+        change(corr, world_points=world[:, :1].expand_as(world)),  # a point
+        change(corr, weights=weights),  # three pairs
+        change(corr, weights=torch.zeros_like(weights)),
+        corr.map(lambda x: x[:, :3] if x.ndim > 1 else x),
+    ):
+        guess = REPPnP()(spoilt)
+        assert not guess.ok.any()
+        assert all(x.isfinite().all() for x in (*guess.pose, guess.weights))
+    empty = REPPnP()(corr.map(lambda x: x[:0] if x.ndim else x))
+    assert empty.pose.matrix.shape == (0, 4, 4)
 
 
-def test_the_limit_and_the_quantile_decide_who_counts(make_problems, correspond):
+def test_the_limit_and_the_quantile_decide_which_pairs_are_kept(make_problems, correspond):
     corr, _ = correspond(make_problems(20, 50, outliers=5))
     assert REPPnP(quantile=1.0)(corr).weights.all()
     assert REPPnP(max_error=1e6)(corr).weights.all()
-    strict = REPPnP(max_error=0.0)(corr)
-    assert (strict.weights.sum(-1) == 10).all()
-    default = REPPnP()(corr)
-    assert (default.weights.sum(-1) >= 10).all()
-    assert (default.weights.sum(-1) > 10).any()
+    assert (REPPnP(max_error=0.0)(corr).weights.sum(-1) == 10).all()
+    kept = REPPnP()(corr).weights.sum(-1)
+    assert (kept >= 10).all()
+    assert (kept > 10).any()
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("name", "value"),
     [
-        ({"quantile": 0.0}, "quantile.*0.0"),
-        ({"quantile": 1.1}, "quantile.*1.1"),
-        ({"max_error": -1.0}, "max_error.*-1.0"),
-        ({"null_iterations": -1}, "null_iterations.*-1"),
-        ({"rigid_iterations": 2.5}, "rigid_iterations.*2.5"),
-        ({"refine_iterations": 0}, "refine_iterations.*0"),
+        ("quantile", 0.0),
+        ("quantile", 1.1),
+        ("max_error", -1.0),
+        ("null_iterations", -1),
+        ("rigid_iterations", 2.5),
+        ("refine_iterations", 0),
     ],
 )
-def test_wrong_arguments_raise_and_say_what_came(arguments, message):
-    with pytest.raises(BaseError, match=message):
-        REPPnP(**arguments)
-
-
-def test_the_config_rebuilds_the_module():
-    model = REPPnP(reject_outliers=False, max_error=0.1, quantile=0.4, null_iterations=2, rigid_iterations=1)
-    assert REPPnP(**model.config).config == model.config
-    assert "max_error=0.1" in repr(model)
+def test_wrong_arguments_raise(name, value):
+    with pytest.raises(BaseError, match=f"{name}.*{value}"):
+        REPPnP(**{name: value})

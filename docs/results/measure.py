@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
@@ -23,7 +22,7 @@ from kornia_pnpnet.evaluation.results import format_table, load_results, save_re
 from kornia_pnpnet.metrics import reliability, success_rate
 from kornia_pnpnet.pretrained import WEIGHTS_FOLDER, shipped_weights
 from kornia_pnpnet.training.collect import collect_weights
-from kornia_pnpnet.training.results import RESULTS_NAME, load_run
+from kornia_pnpnet.training.results import load_run
 from kornia_pnpnet.types import PnPResult, Problems
 
 __all__ = ["ANY", "CHI_SQUARE_95", "HERE", "OURS", "PEERS", "RESULTS", "ROBUST", "compare", "measure", "ship"]
@@ -362,13 +361,13 @@ def measure(scenes: Path, synthetic_count: int, real_count: int, only: Sequence[
 def compare(scenes: Path, count: int, runs: Sequence[Path]) -> None:
     """Solve the scenes with two runs of ``train.py`` on different data, named by their folders."""
     solvers = {f"data={folder.name}": PnPNet.from_pretrained(folder / "weights") for folder in runs}
-    files = {name: json.loads((folder / RESULTS_NAME).read_text()) for name, folder in zip(solvers, runs, strict=True)}
-    updates = {name: file["run"]["update"] for name, file in files.items()}
+    folders = dict(zip(solvers, runs, strict=True))
+    updates = {name: load_run(folder / "results.json").run.update for name, folder in folders.items()}
     run("distribution", solvers, Counts(scenes, 0, count).draw_scenes("none,2"), updates=updates)
 
 
 def ship(runs: Sequence[Path]) -> None:
     """Put the weights of the last run into the package, with the learning curves of all runs."""
-    results = load_run(runs[-1] / RESULTS_NAME)
+    results = load_run(runs[-1] / "results.json")
     kind = "set" if results.initializer == "SetInit" else f"n{results.config['model']['n']}"
     collect_weights(runs, WEIGHTS_FOLDER / f"pnpnet-{kind}")

@@ -19,6 +19,7 @@ from kornia_pnpnet.cli.arguments import add_arbitrary_unit, counts, whole_number
 from kornia_pnpnet.evaluation import comparison
 from kornia_pnpnet.evaluation.named_solvers import default_solvers, load_solver
 from kornia_pnpnet.evaluation.problem_sets import DEFAULT_SEED, PRIORS, evaluation_sets
+from kornia_pnpnet.evaluation.results import format_table, load_results
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -74,7 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Evaluate the solvers; print the table and the path of the results."""
     out = Path(arguments.out)
-    found = len(comparison.load_results(out)["rows"]) if out.exists() and not arguments.overwrite else 0
+    found = len(load_results(out)["rows"]) if out.exists() and not arguments.overwrite else 0
     sources = arguments.data or ["synthetic"]
     solvers = {name: load_solver(name) for name in arguments.solver or default_solvers(arguments.n, sources)}
     sets = evaluation_sets(
@@ -100,7 +101,7 @@ def run(arguments: argparse.Namespace) -> int:
         reasons.setdefault(entry["solver"], []).append(entry["reason"])
     for solver, given in reasons.items():
         print(f"pnpnet: {solver} is skipped on {len(given)} of {len(sets)} sets: {given[0]}", file=sys.stderr)
-    print(comparison.format_table(results))
+    print(format_table(results))
     print(f"\nResults: {out}" + (f" ({found} of {len(results['rows'])} rows were there)" if found else ""))
     if arguments.plot:
         from kornia_pnpnet.evaluation.figures import plot_errors, plot_success

@@ -1,6 +1,6 @@
-"""Solvers of other libraries behind the signature of ours, so that they can be compared on the same problems.
+"""Solvers of other libraries behind the signature of our solvers, to compare both on the same problems.
 
-Nothing here imports a library before one of its solvers is made.
+A library is imported when one of its solvers is made.
 """
 
 from kornia_pnpnet.peers.base import PeerPose, PeerSolver

@@ -1,9 +1,11 @@
-"""What every peer shares: a loop over problems, which of them it may be shown, and its answers as a result of ours."""
+"""The base of every peer: the loop over problems, the checks before each problem, and the conversion of its results."""
 
 from __future__ import annotations
 
+import importlib
 import inspect
 import math
+from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +14,7 @@ from kornia.core.check import KORNIA_CHECK
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
+from kornia_pnpnet.core.checks import check_positive, check_whole
 from kornia_pnpnet.solver import check_inputs
 from kornia_pnpnet.types import PnPResult, Pose, camera_matrices
 
@@ -19,15 +22,15 @@ __all__ = ["PeerPose", "PeerSolver"]
 
 
 class PeerPose(NamedTuple):
-    r"""What a peer finds for one problem, in float64.
+    r"""The solution of one problem, in float64.
 
     Attributes:
         rotation: world-to-camera rotation, shape :math:`(3, 3)`.
         translation: world-to-camera translation, shape :math:`(3,)`.
-        inliers: which of the pairs it was given the peer kept, bool, shape :math:`(N,)`.
-        init_rotation: rotation before the last refinement, shape :math:`(3, 3)`; ``None``: the peer does not say, and
-            the result stands in for it.
-        init_translation: translation before the last refinement, shape :math:`(3,)`, or ``None`` likewise.
+        inliers: the pairs that the peer kept, bool, shape :math:`(N,)`.
+        init_rotation: rotation before the last refinement, shape :math:`(3, 3)`. ``None`` when the peer does not
+            report the pose before its refinement; the result then repeats the final pose.
+        init_translation: translation before the last refinement, shape :math:`(3,)`, or ``None``.
     """
 
     rotation: np.ndarray
@@ -38,18 +41,19 @@ class PeerPose(NamedTuple):
 
 
 class PeerSolver(nn.Module):
-    r"""A solver that takes one problem at a time, as a batched layer without gradients.
+    r"""A solver of another library, which takes one problem at a time, as a batched layer without gradients.
 
-    A subclass implements :meth:`solve_one` and keeps its constructor's arguments as attributes of the same names.
-    Pairs with the weight 0 and padding are never shown to it; other weights do not matter. A problem that is not
-    finite, has a negative weight, fewer than three pairs or a camera with skew or without a positive focal length, and
-    one that the peer gives up, has ``ok=False`` and the identity as its pose.
+    A subclass implements :meth:`solve_one` and keeps the arguments of its constructor as attributes of the same names.
+    The peer sees only the pairs that are present and have a weight above 0; the size of the weight has no effect. A
+    problem fails, with ``ok=False`` and the identity as its pose, when the peer finds no pose, and without asking the
+    peer when the problem is not finite, has a negative weight, fewer than three pairs, or a camera with skew or without
+    a positive focal length.
 
     Convention: ``x_cam = R x_world + t``, +z forward, pixels ``u = fx x/z + cx``.
 
     Args:
-        threshold: largest reprojection error of an inlier, in the pixels that the solver is given. Infinite for a
-            peer that keeps all pairs.
+        threshold: largest reprojection error of an inlier, in pixels of the input. Infinite for a peer that keeps all
+            pairs.
 
     Raises:
         BaseError: when ``threshold`` is not positive.
@@ -57,15 +61,15 @@ class PeerSolver(nn.Module):
 
     def __init__(self, *, threshold: float) -> None:
         super().__init__()
-        KORNIA_CHECK(threshold > 0, f"threshold must be positive, got {threshold}.")
+        check_positive(or_infinite=True, threshold=threshold)
         self.threshold = threshold
 
     def config(self) -> dict[str, float | int | str | bool]:
-        """The constructor arguments, as plain data."""
+        """Return the arguments of the constructor as plain data."""
         return {name: getattr(self, name) for name in inspect.signature(type(self)).parameters}
 
     def extra_repr(self) -> str:
-        """Show the constructor's arguments."""
+        """Show the arguments of the constructor."""
         return ", ".join(f"{key}={value!r}" for key, value in self.config().items())
 
     def solve_one(self, world_points: np.ndarray, img_points: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:
@@ -77,7 +81,7 @@ class PeerSolver(nn.Module):
             intrinsics: shape :math:`(3, 3)`.
 
         Returns:
-            What was found, or ``None`` when nothing was.
+            The pose, or ``None`` when the peer finds none.
         """
         raise NotImplementedError
 
@@ -96,7 +100,7 @@ class PeerSolver(nn.Module):
             world_points: shape :math:`(B, N, 3)`, float32 or float64, any unit.
             img_points: pixels, shape :math:`(B, N, 2)`.
             intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or Kornia's cameras.
-            weights: pairs with 0 are left out, shape :math:`(B, N)`; 1 when ``None``.
+            weights: pairs of weight 0 are left out, shape :math:`(B, N)`; 1 when ``None``.
             mask: False where a pair is padding, bool, shape :math:`(B, N)`.
 
         Returns:
@@ -129,7 +133,7 @@ class PeerSolver(nn.Module):
             origin = found.translation if found.init_translation is None else found.init_translation
             if not all(np.isfinite(part).all() for part in (found.rotation, found.translation, start, origin)):
                 continue
-            rotation[i], translation[i], pair_weights[i, used[i]] = found[:3]
+            rotation[i], translation[i], pair_weights[i, used[i]] = found.rotation, found.translation, found.inliers
             first_rotation[i], first_translation[i] = start, origin
             ok[i] = True
 
@@ -152,13 +156,13 @@ class PeerSolver(nn.Module):
 
 
 class RobustPeer(PeerSolver):
-    """What the peers that draw samples share: their options, checked and kept.
+    """Base of the peers that draw samples: checks and keeps their options.
 
     Args:
-        threshold: as for :class:`PeerSolver`, finite.
-        confidence: probability to have seen an outlier-free sample, in (0, 1).
-        seed: of the samples.
-        counts: whole numbers of at least 1 (``True`` is none), kept under their names.
+        threshold: largest reprojection error of an inlier, in pixels, finite.
+        confidence: probability of having drawn an outlier-free sample, in (0, 1).
+        seed: seed of the samples.
+        counts: integers of at least 1, kept under their names.
 
     Raises:
         BaseError: for an argument out of range.
@@ -166,21 +170,20 @@ class RobustPeer(PeerSolver):
 
     def __init__(self, *, threshold: float, confidence: float, seed: int, **counts: int) -> None:
         super().__init__(threshold=threshold)
-        KORNIA_CHECK(threshold < math.inf, f"threshold must be positive and finite, got {threshold}.")
+        check_positive(threshold=threshold)
         KORNIA_CHECK(0 < confidence < 1, f"confidence must lie in (0, 1), got {confidence}.")
-        KORNIA_CHECK(type(seed) is int and seed >= 0, f"seed must be a whole number of at least 0, got {seed!r}.")
+        check_whole(0, seed=seed)
+        check_whole(1, **counts)
         self.confidence = confidence
-        self.seed = seed
+        self.seed = int(seed)
         for name, count in counts.items():
-            whole = type(count) is int and count >= 1
-            KORNIA_CHECK(whole, f"{name} must be a whole number of at least 1, got {count!r}.")
-            setattr(self, name, count)
+            setattr(self, name, int(count))
 
 
 def _solvable(
     world: np.ndarray, img: np.ndarray, cameras: np.ndarray, weights: np.ndarray, present: np.ndarray
 ) -> np.ndarray:
-    """Which problems may be shown to a peer, (B,); the rules of :class:`~kornia_pnpnet.normalize.Normalize`."""
+    """Return which problems are passed to the peer, (B,), by the rules of ``Normalize``."""
     sound = np.isfinite(world).all(-1) & np.isfinite(img).all(-1) & np.isfinite(weights) & (weights >= 0)  # (B, N)
     enough = (present & (weights > 0)).sum(-1) >= 3
     pinhole = (cameras[:, 0, 1] == 0) & (cameras[:, 1, 0] == 0) & (cameras[:, 2] == (0.0, 0.0, 1.0)).all(-1)
@@ -196,7 +199,7 @@ def _squared_errors(
     cameras: np.ndarray,
     used: np.ndarray,
 ) -> np.ndarray:
-    """Squared reprojection errors in px², infinite behind the camera and 0 for pairs that are not used, (B, N)."""
+    """Return the squared reprojection errors in px², infinite behind the camera, 0 for unused pairs, (B, N)."""
     cameras = np.where(used.sum(-1)[:, None, None] > 0, cameras, np.eye(3))
     world, img = (np.where(used[..., None], x, 0.0) for x in (world, img))
     with np.errstate(over="ignore", invalid="ignore"):
@@ -208,6 +211,14 @@ def _squared_errors(
     return np.where(used, np.nan_to_num(errors, nan=math.inf, posinf=math.inf), 0.0)
 
 
-def missing(library: str) -> ImportError:
-    """What to raise where a library that a solver needs is not installed."""
-    return ImportError(f"This solver needs {library}: pip install 'kornia_pnpnet[eval]'")
+def import_library(module: str, library: str) -> ModuleType:
+    """Import a module, or raise an ImportError that names the extra which installs the library."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise ImportError(f"This solver needs {library}: pip install 'kornia_pnpnet[eval]'") from error
+
+
+def pinhole_parameters(intrinsics: np.ndarray) -> list[float]:
+    """Return focal lengths and principal point in the order of COLMAP's camera model ``PINHOLE``."""
+    return [intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]]

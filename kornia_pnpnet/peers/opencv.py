@@ -8,17 +8,13 @@ from types import ModuleType
 import numpy as np
 from kornia.core.check import KORNIA_CHECK
 
-from kornia_pnpnet.peers.base import PeerPose, PeerSolver, RobustPeer, missing
+from kornia_pnpnet.peers.base import PeerPose, PeerSolver, RobustPeer, import_library
 
 __all__ = ["OpenCVPnP", "OpenCVRansac", "OpenCVUsac"]
 
 
 def _import_opencv() -> ModuleType:
-    try:
-        import cv2
-    except ImportError as error:
-        raise missing("OpenCV") from error
-    return cv2
+    return import_library("cv2", "OpenCV")
 
 
 def _check_method(cv2: ModuleType, method: str) -> None:
@@ -26,13 +22,12 @@ def _check_method(cv2: ModuleType, method: str) -> None:
 
 
 class OpenCVPnP(PeerSolver):
-    r"""OpenCV's ``solvePnP`` on all pairs, problem by problem: nothing in it is robust to a wrong pair.
+    r"""OpenCV's ``solvePnP`` on all pairs, problem by problem. The solver is not robust to outliers.
 
     Every pair is reported as an inlier; the cost is not truncated.
 
     Args:
-        method: OpenCV's name of the solver, for example ``"EPNP"`` for ``SOLVEPNP_EPNP``. A name, because the numbers
-            differ between OpenCV's versions.
+        method: OpenCV's name of the solver, for example ``"EPNP"`` for ``SOLVEPNP_EPNP``.
 
     Raises:
         ImportError: when OpenCV is not installed.
@@ -65,48 +60,61 @@ class OpenCVPnP(PeerSolver):
 
 
 class _Robust(RobustPeer):
-    """What the families of ``solvePnPRansac`` share."""
+    """OpenCV's ``solvePnPRansac``."""
 
     iterations: int
+    method: str
+    refine = False
+    # Start of the method's name in OpenCV.
+    prefix = ""
 
-    def _search(
-        self, world_points: np.ndarray, img_points: np.ndarray, intrinsics: np.ndarray, flag: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """The rotation vector, the translation and the indices of the inliers, or ``None`` when nothing was found."""
+    def solve_one(self, world_points: np.ndarray, img_points: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:
+        """Solve one problem, see :meth:`PeerSolver.solve_one`."""
         cv2 = _import_opencv()
         cv2.setRNGSeed(self.seed)
-        found, rotation_vector, translation, kept = cv2.solvePnPRansac(
-            world_points,
-            img_points,
-            intrinsics,
-            None,
-            iterationsCount=self.iterations,
-            reprojectionError=self.threshold,
-            confidence=self.confidence,
-            flags=flag,
-        )
-        return (rotation_vector, translation, kept.ravel()) if found and kept is not None else None
+        try:
+            found, rotation_vector, translation, kept = cv2.solvePnPRansac(
+                world_points,
+                img_points,
+                intrinsics,
+                None,
+                iterationsCount=self.iterations,
+                reprojectionError=self.threshold,
+                confidence=self.confidence,
+                flags=getattr(cv2, self.prefix + self.method),
+            )
+            if not found or kept is None:
+                return None
+            kept = kept.ravel()
+            first = cv2.Rodrigues(rotation_vector)[0], translation.ravel().copy()
+            if self.refine and len(kept) > 3:
+                rotation_vector, translation = cv2.solvePnPRefineLM(
+                    world_points[kept], img_points[kept], intrinsics, None, rotation_vector, translation
+                )
+            rotation = cv2.Rodrigues(rotation_vector)[0]
+        except cv2.error:  # an assertion of OpenCV's, on degenerate or too few pairs
+            return None
+        return PeerPose(rotation, translation.ravel(), np.isin(np.arange(len(world_points)), kept), *first)
 
 
 class OpenCVRansac(_Robust):
-    r"""OpenCV's ``solvePnPRansac`` and ``solvePnPRefineLM`` on its inliers, problem by problem.
+    r"""OpenCV's ``solvePnPRansac``, then ``solvePnPRefineLM`` on its inliers, problem by problem.
 
-    The defaults are the best of a grid on the protocol's data (3000 problems of another seed without and with
-    outliers, f = 3400 px, thresholds from 30 to 120 px): the noise of the world points alone moves a near point's
-    pixel by 17 px. Pixels of a sharper world want a lower threshold. With noise in the world points,
-    ``method="SQPNP", refine=False`` solves more problems: its error in space, not in the image, suits that noise. It
-    takes several times as long.
+    The defaults are the best of a grid on the protocol's data (3000 problems of another seed without and with outliers,
+    focal length 3400 px, thresholds from 30 to 120 px), where the noise of a near world point alone moves its pixel by
+    17 px. Sharper world points need a lower threshold. With noise in the world points, ``method="SQPNP", refine=False``
+    solves more problems, because SQPnP minimises an error in space and not in the image, but it takes several times as
+    long.
 
     Args:
-        threshold: largest reprojection error of an inlier, in the pixels that the solver is given.
+        threshold: largest reprojection error of an inlier, in pixels of the input.
         iterations: largest number of RANSAC iterations.
-        confidence: RANSAC ends when it has seen an outlier-free sample with this probability, in (0, 1).
-        method: OpenCV's name of the solver of samples, for example ``"AP3P"`` for ``SOLVEPNP_AP3P``. A name,
-            because the numbers differ between OpenCV's versions.
-        refine: minimise the squared reprojection error of the inliers from the RANSAC pose, which is kept as
-            ``init``.
-        seed: of OpenCV's global random numbers, set before each problem: a problem has the same result whatever is
-            solved before it.
+        confidence: RANSAC stops when it has drawn an outlier-free sample with this probability, in (0, 1).
+        method: OpenCV's name of the solver of minimal samples, for example ``"AP3P"`` for ``SOLVEPNP_AP3P``.
+        refine: minimise the squared reprojection error of the inliers, started from RANSAC's pose. The result keeps
+            that pose as ``init``.
+        seed: seed of OpenCV's global random numbers, set before each problem, so that the result of a problem does not
+            depend on the problems before it.
 
     Raises:
         ImportError: when OpenCV is not installed.
@@ -118,6 +126,8 @@ class OpenCVRansac(_Robust):
         >>> OpenCVRansac()(problems.world_points, problems.img_points, problems.intrinsics).ok
         tensor([True, True, True, True])
     """
+
+    prefix = "SOLVEPNP_"
 
     def __init__(
         self,
@@ -135,40 +145,21 @@ class OpenCVRansac(_Robust):
         self.method = method
         self.refine = refine
 
-    def solve_one(self, world_points: np.ndarray, img_points: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:
-        """Solve one problem, see :meth:`PeerSolver.solve_one`."""
-        cv2 = _import_opencv()
-        try:
-            found = self._search(world_points, img_points, intrinsics, getattr(cv2, f"SOLVEPNP_{self.method}"))
-            if found is None:
-                return None
-            rotation_vector, translation, kept = found
-            first = cv2.Rodrigues(rotation_vector)[0], translation.ravel().copy()
-            if self.refine and len(kept) > 3:
-                rotation_vector, translation = cv2.solvePnPRefineLM(
-                    world_points[kept], img_points[kept], intrinsics, None, rotation_vector, translation
-                )
-            rotation = cv2.Rodrigues(rotation_vector)[0]
-        except cv2.error:  # an assertion of OpenCV's, on degenerate or too few pairs
-            return None
-        return PeerPose(rotation, translation.ravel(), np.isin(np.arange(len(world_points)), kept), *first)
-
 
 class OpenCVUsac(_Robust):
     r"""OpenCV's ``solvePnPRansac`` in one of its USAC variants, problem by problem.
 
-    USAC has its own samples, local optimisation and final polishing; nothing is refined afterwards. The default
-    threshold is tuned as that of :class:`OpenCVRansac`.
+    USAC has its own sampling, local optimisation and final refinement; nothing is refined afterwards. The default
+    threshold is tuned in the same way as that of :class:`OpenCVRansac`.
 
     Args:
-        threshold: largest reprojection error of an inlier, in the pixels that the solver is given.
+        threshold: largest reprojection error of an inlier, in pixels of the input.
         method: OpenCV's name of the variant, for example ``"USAC_ACCURATE"`` or ``"USAC_MAGSAC"``. ``USAC_PROSAC``
-            expects the pairs from the best to the worst. A name, because the numbers differ between OpenCV's
-            versions.
+            expects the pairs sorted from the best to the worst.
         iterations: largest number of iterations.
-        confidence: it ends when it has seen an outlier-free sample with this probability, in (0, 1).
-        seed: of OpenCV's global random numbers, set before each problem; the local optimisation draws from them. The
-            samples are drawn from a generator that OpenCV starts anew for every problem.
+        confidence: USAC stops when it has drawn an outlier-free sample with this probability, in (0, 1).
+        seed: seed of OpenCV's global random numbers, set before each problem and used by the local optimisation. The
+            samples come from a generator that OpenCV starts anew for every problem.
 
     Raises:
         ImportError: when OpenCV is not installed.
@@ -192,20 +183,7 @@ class OpenCVUsac(_Robust):
     ) -> None:
         super().__init__(threshold=threshold, iterations=iterations, confidence=confidence, seed=seed)
         cv2 = _import_opencv()
-        # USAC_FM_8PTS is in the same list but finds fundamental matrices.
+        # USAC_FM_8PTS is in the same list of OpenCV but computes fundamental matrices.
         known = method.startswith("USAC_") and method != "USAC_FM_8PTS" and hasattr(cv2, method)
         KORNIA_CHECK(known, f"OpenCV {cv2.__version__} has no {method} for poses.")
         self.method = method
-
-    def solve_one(self, world_points: np.ndarray, img_points: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:
-        """Solve one problem, see :meth:`PeerSolver.solve_one`."""
-        cv2 = _import_opencv()
-        try:
-            found = self._search(world_points, img_points, intrinsics, getattr(cv2, self.method))
-            if found is None:
-                return None
-            rotation_vector, translation, kept = found
-            rotation = cv2.Rodrigues(rotation_vector)[0]
-        except cv2.error:  # an assertion of OpenCV's, on degenerate or too few pairs
-            return None
-        return PeerPose(rotation, translation.ravel(), np.isin(np.arange(len(world_points)), kept))

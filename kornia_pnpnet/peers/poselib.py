@@ -2,43 +2,34 @@
 
 from __future__ import annotations
 
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 from kornia.core.check import KORNIA_CHECK
 
-from kornia_pnpnet.peers.base import PeerPose, RobustPeer, missing
+from kornia_pnpnet.peers.base import PeerPose, RobustPeer, import_library, pinhole_parameters
 
 __all__ = ["PoseLib"]
-
-
-def _import_poselib() -> ModuleType:
-    try:
-        import poselib
-    except ImportError as error:
-        raise missing("PoseLib") from error
-    return poselib
 
 
 class PoseLib(RobustPeer):
     r"""PoseLib's ``estimate_absolute_pose``, problem by problem: P3P, LO-RANSAC and a robust refinement of the inliers.
 
     The default threshold is the best of a grid on the protocol's data, see
-    :class:`~kornia_pnpnet.peers.OpenCVRansac`. PoseLib itself asks for 1000 iterations at least, ten times as many as
-    here, which with nine pairs finds nothing more.
+    :class:`~kornia_pnpnet.peers.OpenCVRansac`. PoseLib's own minimum of 1000 iterations, ten times
+    the default here, finds nothing more with nine pairs.
 
     Args:
-        threshold: largest reprojection error of an inlier, in the pixels that the solver is given.
+        threshold: largest reprojection error of an inlier, in pixels of the input.
         min_iterations: smallest number of iterations.
-        max_iterations: largest number of iterations, which a problem without a pose takes.
-        confidence: it ends when it has seen an outlier-free sample with this probability, in (0, 1).
-        seed: of the samples, the same for each problem.
+        max_iterations: largest number of iterations. A problem without a pose takes all of them.
+        confidence: RANSAC stops when it has drawn an outlier-free sample with this probability, in (0, 1).
+        seed: seed of the samples, the same for each problem.
 
     Raises:
         ImportError: when PoseLib is not installed.
-        BaseError: for an argument out of range, or when the installed PoseLib has other options: it would ignore
-            those that it does not know.
+        BaseError: for an argument out of range, or when the installed PoseLib lacks one of the options; PoseLib
+            itself would ignore an unknown option.
 
     Example:
         >>> from kornia_pnpnet.data import SyntheticProblems
@@ -66,12 +57,12 @@ class PoseLib(RobustPeer):
             min_iterations=min_iterations,
             max_iterations=max_iterations,
         )
-        poselib = _import_poselib()
+        poselib = import_library("poselib", "PoseLib")
         unknown = self._options().keys() - poselib.RansacOptions().keys()
         KORNIA_CHECK(not unknown, f"PoseLib {poselib.__version__} has no options {sorted(unknown)}.")
 
     def _options(self) -> dict[str, Any]:
-        """Our options by PoseLib's names."""
+        """Return the options under PoseLib's names."""
         return {
             "max_reproj_error": self.threshold,
             "min_iterations": self.min_iterations,
@@ -82,10 +73,9 @@ class PoseLib(RobustPeer):
 
     def solve_one(self, world_points: np.ndarray, img_points: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:
         """Solve one problem, see :meth:`~kornia_pnpnet.peers.PeerSolver.solve_one`."""
-        poselib = _import_poselib()
-        focal_and_centre = [intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]]
-        camera = {"model": "PINHOLE", "width": -1, "height": -1, "params": focal_and_centre}
+        poselib = import_library("poselib", "PoseLib")
+        camera = {"model": "PINHOLE", "width": -1, "height": -1, "params": pinhole_parameters(intrinsics)}
         pose, report = poselib.estimate_absolute_pose(img_points, world_points, camera, self._options(), {})
-        if report["num_inliers"] == 0:  # PoseLib's way to say that it found nothing
+        if report["num_inliers"] == 0:  # PoseLib found no pose
             return None
         return PeerPose(pose.R, pose.t, np.array(report["inliers"]))

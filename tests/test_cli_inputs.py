@@ -1,0 +1,159 @@
+"""The command line, whatever comes in: damaged files, any arguments, spoiled results."""
+
+import io
+import json
+from collections import Counter
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import BOOL, WORDS, damage, many, places_in, run_main, spoiled
+
+from kornia_pnpnet.data import SyntheticProblems
+from kornia_pnpnet.evaluation.operations import complexity_results
+from kornia_pnpnet.evaluation.results import save_results
+
+
+def problem_file(kind):
+    """The bytes of a sound file, and how its name ends."""
+    problems = SyntheticProblems(n=9, batch_size=3, seed=0).batch(0)
+    arrays = dict(zip(("world_points", "img_points", "intrinsics"), (x.numpy() for x in problems[:3]), strict=True))
+    file = io.BytesIO()
+    match kind:
+        case "csv":
+            rows = np.concatenate((arrays["world_points"][0], arrays["img_points"][0]), 1)
+            file.write("\n".join(["X,Y,Z,u,v", *(",".join(map(str, row)) for row in rows)]).encode())
+        case "npz":
+            np.savez(file, **{name: array[0] for name, array in arrays.items()})
+        case "shard npz":
+            np.savez_compressed(file, **arrays)
+        case "shard parquet":
+            from pyarrow import parquet, table
+
+            parquet.write_table(table({name: [*array.reshape(3, -1)] for name, array in arrays.items()}), file)
+    return file.getvalue(), kind.split()[-1]
+
+
+def solving(kind, path):
+    """The arguments that solve a file."""
+    shard = "--batch", "--out", path.parent / "out", "--overwrite"
+    return (
+        "solve",
+        path,
+        *(shard if kind.startswith("shard") else ("--intrinsics", "3400,3400,960,540")),
+        "--solver",
+        "epnp",
+    )
+
+
+@pytest.mark.filterwarnings("ignore")  # of NumPy, about headers and overlapping entries
+@pytest.mark.parametrize("kind", ["csv", "npz", "shard npz", "shard parquet"])
+def test_damaged_files_are_a_line_and_no_traceback(kind, tmp_path):
+    sound, suffix = problem_file(kind)
+
+    @many(150)
+    @given(damage(sound))
+    def check_file(content):
+        path = tmp_path / f"problem.{suffix}"
+        path.write_bytes(content)
+        code, out, err = run_main(*solving(kind, path))
+        assert code in (0, 1, 2)
+        if code == 2:
+            assert err.startswith(f"pnpnet: {path}")
+            assert err.count("\n") == 1
+        elif suffix in ("csv", "npz") and not kind.startswith("shard"):
+            assert json.loads(out)["n"] >= 3
+
+    path = tmp_path / f"sound.{suffix}"
+    path.write_bytes(sound)
+    assert run_main(*solving(kind, path))[0] == 0
+    check_file()
+
+
+@many(300)
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(["--intrinsics", "--solver", "--threshold", "--batch-size", "--batch", ""]), WORDS),
+        max_size=4,
+    ),
+    st.one_of(WORDS, st.none()),
+)
+def test_any_arguments_are_a_line_and_no_traceback(tmp_path_factory, options, file):
+    """Of a file that is not there, or of a sound one."""
+    sound = tmp_path_factory.getbasetemp() / "sound.csv"
+    if not sound.exists():
+        sound.write_bytes(problem_file("csv")[0])
+    arguments = [x for pair in options for x in pair if x]
+    code, out, err = run_main("solve", *arguments, "--", str(sound) if file is None else file)
+    if code == 2:
+        assert err.startswith("pnpnet: ")
+        assert err.count("\n") == 1
+    else:
+        assert file is None
+        assert json.loads(out)["n"] == 9
+
+
+def test_spoiled_results_are_a_line_and_no_traceback(tmp_path):
+    made, costs, path = (tmp_path / f"{name}.json" for name in ("results", "costs", "spoiled"))
+    arguments = "evaluate", "--solver", "epnp", "--problems", "20", "--n", "9,12", "--outliers", "none,3", "--out"
+    assert run_main(*arguments, made)[0] == 0
+    save_results(complexity_results(["epnp"], range(6, 9)), costs)
+    both = [json.loads(file.read_text()) for file in (made, costs)]
+    both = {kind: (content, list(places_in(content))) for kind, content in zip(("results", "costs"), both, strict=True)}
+    codes = Counter()
+
+    @many(60)
+    @given(st.sampled_from(sorted(both)), BOOL, st.data())
+    def run(kind, plot, data):
+        path.write_text(json.dumps(data.draw(spoiled(*both[kind]))))
+        more = ("--plot", tmp_path / "plot") if plot else ()
+        figures = "figures", path, "--out", tmp_path / "figures"
+        code, _, err = run_main(*((*arguments, path, *more) if kind == "results" and plot else figures))
+        codes[code] += 1
+        assert code in (0, 2)
+        if code == 2:
+            assert err.startswith("pnpnet: ")
+            assert err.count("\n") == 1
+
+    run()
+    assert min(codes[0], codes[2]) >= 5
+
+
+#: What each needs to be quick, and what it can be given.
+COMMANDS = {
+    "evaluate": (("--solver", "epnp", "--problems", 3), "--solver --data --n --outliers --seed --dtype --plot"),
+    "figures": ((), "--out"),
+    "export": (("--solver", "p3p-ransac"), "--n"),
+    "list": ((), "--x"),
+    "demo": (("--problems", 3, "--train-seconds", 0), "--data --problems"),
+}
+
+
+SAID = WORDS | st.sampled_from(
+    ["9", "6,9", "none,2", "50%", "uniform", "float64", "gaussian_pose", "p3p-ransac", "1e9"]
+)
+
+
+def test_any_arguments_of_other_commands_are_a_line_and_no_traceback(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    codes = Counter()
+
+    @many(80)
+    @given(st.sampled_from(sorted(COMMANDS)), st.data())
+    def run(name, data):
+        quick, may = COMMANDS[name]
+        pairs = data.draw(st.lists(st.tuples(st.sampled_from(may.split()), SAID), max_size=2))
+        files = data.draw(st.lists(SAID, max_size=1))
+        code, out, err = run_main(name, *quick, *(x for pair in pairs for x in pair), *files)
+        codes[name, code] += 1
+        assert code in (0, 2)
+        if code == 2:
+            assert err.startswith("pnpnet: ")
+            assert err.count("\n") == 1
+        else:
+            assert out
+
+    run()
+    assert all(codes[name, 2] for name in COMMANDS)
+    assert all(codes[name, 0] for name in ("evaluate", "list", "demo"))  # what others need is not among the words

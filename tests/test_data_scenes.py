@@ -1,0 +1,229 @@
+"""Scenes: their images, and the random problems drawn from them."""
+
+import itertools
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from data_helpers import (
+    HEIGHT,
+    WIDTH,
+    assert_counts,
+    assert_uniform,
+    check_any_options,
+    make_scene,
+    make_view,
+    reprojection,
+    same,
+)
+from kornia.core.exceptions import BaseError
+from kornia.geometry.conversions import rotation_matrix_to_axis_angle
+from strategies import ANY, BOOL, COUNTS, options
+from torch.testing import assert_close
+
+from kornia_pnpnet.core.trees import iter_tensors
+from kornia_pnpnet.data import OutlierMix, Scene, SceneProblems
+
+# --- views ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("img_points", torch.zeros(29, 2), r"img_points has shape \(29, 2\), expected \(30, 2\)"),
+        ("rotation", torch.full((3, 3), math.nan), "rotation has values that are not finite"),
+        ("rotation", 2 * torch.eye(3), "not a rotation matrix"),
+        ("rotation", -torch.eye(3), "not a rotation matrix"),
+    ],
+)
+def test_view_checks_itself(field, value, message):
+    with pytest.raises(ValueError, match=message):
+        replace(make_view(), **{field: value})
+
+
+def test_match_behind_the_camera_has_infinite_error():
+    view = make_view()
+    behind = view.rotation.mT @ (torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64) - view.translation)
+    view = replace(view, world_points=torch.cat([view.world_points[:-1], behind[None]]))
+    assert view.reprojection_error_px[-1] == math.inf
+    assert view.reprojection_error_px[:-1].max() < 1e-9
+
+
+# --- problems ---------------------------------------------------------------------------------------------------------
+
+
+def test_shapes_and_dtypes():
+    problems = SceneProblems(make_scene(20, 30), n=7, batch_size=5, dtype=torch.float32).batch(0)
+    shapes = [(5, 7, 3), (5, 7, 2), (5, 3, 3), (5, 3, 3), (5, 3), (5, 7)]
+    assert [tuple(x.shape) for x in iter_tensors(problems)] == shapes
+    assert [x.dtype for x in iter_tensors(problems)] == [torch.float32] * 5 + [torch.bool]
+    assert SceneProblems(make_scene(20)).batch(0).world_points.dtype == torch.float64
+
+
+@pytest.mark.parametrize("recentre", [True, False])
+@pytest.mark.parametrize("outliers", [None, OutlierMix()])
+def test_inliers_reproject_exactly_and_outliers_do_not(recentre, outliers):
+    problems = SceneProblems(make_scene(40, 30), batch_size=500, outliers=outliers, recentre=recentre).batch(3)
+    error = reprojection(problems).norm(dim=-1)
+    assert error[problems.inliers].max() < 1e-9
+    wrong = error[~problems.inliers]
+    assert outliers is None or wrong.median() > 50
+    assert (wrong > 1e-3).all()
+
+
+@pytest.mark.parametrize(("box", "angle"), [(25.0, math.pi / 2), (2.0, 0.1)])
+def test_recentred_poses_have_the_protocols_prior(box, angle):
+    source = SceneProblems(make_scene(20), batch_size=20_000, translation_box=box, max_angle=angle)
+    pose = source.batch(0).pose
+    assert_uniform(pose.translation, -box / 2, box / 2)
+    assert_uniform(rotation_matrix_to_axis_angle(pose.rotation).norm(dim=-1), 0.0, angle + 1e-9)
+
+
+def test_recentring_moves_the_world_rigidly():
+    scene = make_scene(30)
+    moved = SceneProblems(scene, batch_size=50).batch(0)
+    still = SceneProblems(scene, batch_size=50, recentre=False).batch(0)
+    assert torch.equal(moved.img_points, still.img_points)
+    assert_close(
+        torch.cdist(moved.world_points, moved.world_points), torch.cdist(still.world_points, still.world_points)
+    )
+    assert torch.equal(still.pose.rotation, scene.views[0].rotation.expand(50, 3, 3))
+    assert not torch.allclose(moved.world_points, still.world_points)
+
+
+def test_a_batch_depends_on_seed_and_index_alone():
+    scene = make_scene(20, 30)
+
+    def make(seed=0):
+        return SceneProblems(scene, batch_size=4, seed=seed, outliers=OutlierMix())
+
+    later = make().batch(1)
+    torch.manual_seed(5)
+    assert all(same(batch, make().batch(i)) for i, batch in enumerate(itertools.islice(make(), 3)))
+    assert same(make().batch(1), later)
+    for other in (make().batch(0), make(seed=1).batch(1)):
+        assert not torch.equal(other.world_points, later.world_points)
+
+
+def test_outliers_do_not_change_points_and_poses():
+    scene = make_scene(20, 30)
+    clean = SceneProblems(scene, batch_size=100).batch(0)
+    spoilt = SceneProblems(scene, batch_size=100, outliers=OutlierMix(count=4)).batch(0)
+    assert torch.equal(clean.world_points, spoilt.world_points)
+    assert torch.equal(clean.pose.translation, spoilt.pose.translation)
+    assert torch.equal(clean.img_points[spoilt.inliers], spoilt.img_points[spoilt.inliers])
+    assert (clean.img_points != spoilt.img_points).any(-1)[~spoilt.inliers].all()
+
+
+def from_the_scene(scene: Scene, img_points: torch.Tensor) -> torch.Tensor:
+    """Whether a pixel is one that some view of the scene observed, (B, N)."""
+    known = torch.cat([view.img_points for view in scene.views])
+    return (img_points[..., None, :] == known).all(-1).any(-1)
+
+
+def test_both_kinds_of_outliers_as_in_the_protocol():
+    scene = make_scene(20, 30)
+    problems = SceneProblems(scene, batch_size=2000, outliers=OutlierMix(count=2)).batch(0)
+    assert ((~problems.inliers).sum(1) == 2).all()
+    share = (~problems.inliers).double().mean(0)
+    assert_close(share, torch.full_like(share, 2 / 9), rtol=0, atol=0.04)
+    wrong = problems.img_points[~problems.inliers].reshape(2000, 2, 2)
+    mismatch = from_the_scene(scene, wrong)
+    assert_close(mismatch.double().mean().item(), 0.5, rtol=0, atol=0.03)
+    # One spare point: two mismatches of a problem share its pixel, which no inlier has.
+    both = mismatch.all(1)
+    assert 400 < both.sum() < 600
+    assert torch.equal(wrong[both, 0], wrong[both, 1])
+    own = problems.img_points[:, :, None] == problems.img_points[:, None]
+    assert not (own.all(-1) & problems.inliers[:, :, None] & ~problems.inliers[:, None]).any()
+    # The others are anywhere in the image.
+    sensed = wrong[~mismatch]
+    assert (sensed >= 0).all()
+    assert (sensed <= torch.tensor([WIDTH, HEIGHT])).all()
+    expected = torch.tensor([WIDTH, HEIGHT], dtype=torch.float64)
+    assert_close(sensed.mean(0), expected / 2, rtol=0.05, atol=0)
+    assert_close(sensed.std(0), expected / math.sqrt(12), rtol=0.05, atol=0)
+
+
+def test_fixed_number_of_mismatches_with_spares_of_their_own():
+    scene = make_scene(20, 30)
+    for count in (0, 1, 5):
+        mix = OutlierMix(count=count, mismatch_share=1.0)
+        problems = SceneProblems(scene, batch_size=200, outliers=mix, num_spares=5).batch(0)
+        assert ((~problems.inliers).sum(1) == count).all()
+        assert from_the_scene(scene, problems.img_points).all()
+        for pixels in problems.img_points[:20]:
+            assert len(pixels.unique(dim=0)) == 9, "no two pairs share a pixel"
+
+
+def test_mismatch_comes_from_the_same_image():
+    scene = make_scene(20, 30)
+    mix = OutlierMix(count=3, mismatch_share=1.0)
+    problems = SceneProblems(scene, batch_size=50, outliers=mix, recentre=False).batch(0)
+    for view in scene.views:
+        mine = (problems.pose.translation == view.translation).all(-1)
+        assert mine.any()
+        pixels = problems.img_points[mine].reshape(-1, 1, 2)
+        assert (pixels == view.img_points).all(-1).any(-1).all()
+
+
+def test_real_mismatches_are_marked_without_any_spoiling():
+    inliers = torch.arange(40) % 4 != 0
+    view = make_view(count=40, inliers=inliers)
+    view = replace(view, img_points=view.img_points + 100.0 * ~inliers[:, None])
+    source = SceneProblems(Scene("toy", (view,)), batch_size=500)
+    problems = source.batch(0)
+    error = reprojection(problems).norm(dim=-1)
+    assert torch.equal(error < 1, problems.inliers)
+    assert_close(problems.inliers.double().mean().item(), 0.75, rtol=0, atol=0.03)
+
+
+def test_images_are_equally_likely_and_small_ones_unused():
+    scene = make_scene(10, 500, 9)
+    source = SceneProblems(scene, batch_size=4000, recentre=False)
+    assert [view.name for view in source.views] == ["0.jpg", "1.jpg"]
+    translation = source.batch(0).pose.translation
+    hits = torch.stack([(translation == view.translation).all(-1).sum() for view in scene.views])
+    assert hits[2] == 0
+    assert_counts(hits[:2])
+
+
+def test_points_of_an_image_are_a_uniform_ordered_choice_without_repetition():
+    scene = make_scene(5)
+    world_points = SceneProblems(scene, n=3, batch_size=60_000, recentre=False).batch(0).world_points
+    which = torch.cdist(world_points, scene.views[0].world_points.expand(60_000, 5, 3)).argmin(-1)  # (B, 3)
+    _, hits = (which @ torch.tensor([25, 5, 1])).unique(return_counts=True)
+    assert len(hits) == 60  # 5 · 4 · 3, so no point comes twice
+    assert (hits - 1000).abs().max() < 150  # standard deviation 31
+
+
+def test_success_limit():
+    assert SceneProblems(make_scene(20)).max_translation == 0.2
+    scene = make_scene(20, 30, metric=False)
+    assert_close(SceneProblems(scene).max_translation, 0.005 * scene.median_depth)
+
+
+def test_wrong_arguments():
+    for name in ("n", "batch_size", "num_spares"):
+        with pytest.raises(BaseError, match=f"{name} must be .* at least 1"):
+            SceneProblems(make_scene(20), **{name: 0})
+    with pytest.raises(ValueError, match="no image of 'toy' has the 51 points for n = 50 and num_spares = 1"):
+        SceneProblems(make_scene(20, 30), n=50)
+    for name in ("near_share", "structured_share"):  # their pixels would be those of inliers
+        with pytest.raises(BaseError, match=f"{name}.*0.5"):
+            SceneProblems(make_scene(20), outliers=OutlierMix(**{name: 0.5}))
+
+
+def test_scenes_of_any_options():
+    scene = make_scene(20, 12)
+    chosen = options(
+        n=COUNTS,
+        batch_size=COUNTS,
+        seed=COUNTS,
+        num_spares=COUNTS,
+        translation_box=ANY,
+        max_angle=ANY,
+        recentre=BOOL,
+    )
+    check_any_options(chosen, lambda values: SceneProblems(scene, **{"batch_size": 4, **values}).batch(0))
