@@ -15,9 +15,13 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from kornia.core.exceptions import ValueCheckError
+<<<<<<< HEAD
 from kornia_pnpnet.cli import main
+=======
+>>>>>>> h-training
 
 from kornia_pnpnet import MLPInit, PnPNet, PoseLoss, RobustWeightedLM, create_solver
+from kornia_pnpnet.cli import main
 from kornia_pnpnet.cli.shards import MANIFEST, solve_shards
 from kornia_pnpnet.data import SyntheticProblems
 from kornia_pnpnet.training import TrainSettings, fit

@@ -58,7 +58,7 @@ def _cpu_name() -> str:
 
 
 def _commit() -> str | None:
-    """The commit of the checkout that this file belongs to; a checkout with an installed copy below it does not count."""
+    """The commit of the checkout that this file belongs to, not of a checkout with an installed copy."""
     root = Path(__file__).resolve().parents[2]
 
     def git(*arguments: str) -> str:

@@ -90,7 +90,7 @@ class StageClock:
         self._last = now
 
     def shares(self, before: Mapping[str, float] | None = None) -> dict[str, float]:
-        """Share of each stage in the time since ``before``, an earlier copy of ``seconds``; in all time when ``None``."""
+        """Share of each stage in the time since ``before`` (an earlier copy of ``seconds``), or in all time."""
         spent = {stage: seconds - (before or {}).get(stage, 0.0) for stage, seconds in self.seconds.items()}
         whole = sum(spent.values())
         return {stage: seconds / whole if whole > 0.0 else 0.0 for stage, seconds in spent.items()}
