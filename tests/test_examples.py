@@ -1,4 +1,4 @@
-"""The examples of the documentation run, and show what they say."""
+"""The examples of the documentation run, and their results support the page."""
 
 import json
 import runpy

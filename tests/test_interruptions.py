@@ -15,10 +15,6 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from kornia.core.exceptions import ValueCheckError
-<<<<<<< HEAD
-from kornia_pnpnet.cli import main
-=======
->>>>>>> h-training
 
 from kornia_pnpnet import MLPInit, PnPNet, PoseLoss, RobustWeightedLM, create_solver
 from kornia_pnpnet.cli import main

@@ -1,8 +1,9 @@
-"""What the results page says of short runs follows from their intervals."""
+"""The results page follows from its files, and its verdicts from intervals."""
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
+import json
 from pathlib import Path
 
 import pytest
@@ -10,14 +11,14 @@ import pytest
 pytest.importorskip("matplotlib")
 
 REPO = Path(__file__).resolve().parents[1]
+FOLDER = REPO / "docs" / "results"
 
 
 @pytest.fixture(scope="module")
-def make():
-    spec = importlib.util.spec_from_file_location("make_results", REPO / "docs" / "results" / "make.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def render():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(FOLDER)
+        yield importlib.import_module("render")
 
 
 def row(rate, *, half=1.0, **columns):
@@ -26,39 +27,60 @@ def row(rate, *, half=1.0, **columns):
     return {"update": "4000", "us_per_problem": "12.3", **columns, **shares}
 
 
-@pytest.mark.parametrize(
-    ("rates", "others", "verdict"),
-    [
-        ([75.0], [70.0], "+5.0 points (above)"),
-        ([65.0], [70.0], "-5.0 points (below)"),
-        ([71.5], [70.0], "+1.5 points (not told apart)"),
-        ([75.0], [70.0, 74.0], "+3.0 points (not told apart)"),  # one seed of the others comes near
-        ([75.0, 71.0], [70.0], "+3.0 points (not told apart)"),
-    ],
-)
-def test_runs_are_told_apart_by_all_their_intervals(make, rates, others, verdict):
-    assert make.compared([row(rate) for rate in rates], [row(rate) for rate in others], "none") == verdict
+def test_the_page_is_rendered_from_its_files(render):
+    results = {name: render.load_results(FOLDER / f"{name}.json") for name in render.RESULTS}
+    files = [json.loads((FOLDER / f"{name}.json").read_text()) for name in ("complexity", "honesty")]
+    runs = {name: render.read_summary(FOLDER / f"{name}.csv") for name in ("ablation", "sweep")}
+    assert render.page(results, *files, runs) == (FOLDER / "README.md").read_text(encoding="utf-8")
 
 
-def test_every_experiment_has_a_claim(make):
-    for path in make.EXPERIMENTS.glob("*.yaml"):
-        assert path.stem in ("protocol", "finetune", "set") or make.claim(path.stem).endswith("."), path
+def test_the_overview_has_the_numbers_of_its_file_between_the_lines_of_the_readme(render):
+    results = json.loads((REPO / "benchmarks" / "solvers.json").read_text())
+    rows, table = render.overview(results)
+    assert [row.ours for row in rows].count(True) == 1
+    assert [row.us_per_problem for row in rows] == sorted(row.us_per_problem for row in rows)
+    for entry in rows:
+        numbers = [f"{100 * rate.rate:.1f} %" for rate in (entry.without_outliers, entry.with_outliers)]
+        (line,) = (line for line in table.splitlines() if entry.name in line)
+        assert all(number in line for number in (*numbers, f"{entry.us_per_problem:.0f}"))
+    text = f"before\n{render.BEGIN}\nold\n{render.END}\nafter\n"
+    replaced = render.with_block(text, table)
+    assert replaced == render.with_block(replaced, table) == text.replace("old", table)
+    with pytest.raises(ValueError, match="overview:begin"):
+        render.with_block("before", table)
 
 
-def test_the_ablations_are_said_beside_the_recipe(make):
+def test_runs_are_apart_only_when_all_their_intervals_are(render):
+    for rates, others, difference, verdict in (
+        ([75.0], [70.0], "+5.0", "above"),
+        ([65.0], [70.0], "-5.0", "below"),
+        ([71.5], [70.0], "+1.5", "overlap"),
+        ([75.0], [70.0, 74.0], "+3.0", "overlap"),  # one seed of the others comes near
+        ([75.0, 71.0], [70.0], "+3.0", "overlap"),
+    ):
+        found = render.compared([row(rate) for rate in rates], [row(rate) for rate in others], "none")
+        assert found.startswith(difference)
+        assert verdict in found
+
+
+def test_every_experiment_has_a_claim(render):
+    for path in render.EXPERIMENTS.glob("*.yaml"):
+        assert path.stem in ("protocol", "finetune", "set") or render.claim(path.stem).endswith("."), path
+
+
+def test_ablations_stand_beside_the_recipe(render):
     seeds = [row(rate, experiment="recipe", seed=f"{seed}") for seed, rate in enumerate((80.0, 81.5))]
-    kernels = [row(rate, experiment="kernels", **{make.KERNEL: name}) for name, rate in (("huber", 70), ("cauchy", 81))]
-    text = make.ablation_text([*kernels, *seeds, row(90.0, experiment="shared", seed="", **{make.KERNEL: ""})])
-    assert "| `recipe seed=1` | 81.5 [80.5, 82.5] | 81.5 [80.5, 82.5] |" in text
-    assert "up to 1.5 points" in text
-    assert "| `shared` |" in text
-    assert make.claim("kernels") in text
-    assert "*Found, huber:* none -10.8 points (below), uniform -10.8 points (below)." in text
-    assert "*Found, cauchy:* none +0.2 points (not told apart)" in text
-    assert "*Found:* none +9.2 points (above)" in text
+    kernels = [row(rate, experiment="kernels", **{render.KERNEL: k}) for k, rate in (("huber", 70), ("cauchy", 81))]
+    facts = render.ablation([*kernels, *seeds, row(90.0, experiment="shared", seed="", **{render.KERNEL: ""})])
+    assert (facts["seeds"], facts["spread"]) == (2, pytest.approx(1.5))
+    assert "| `recipe seed=1` | 81.5 [80.5, 82.5] | 81.5 [80.5, 82.5] |" in facts["table"]
+    by_name = {finding["experiment"]: finding["found"] for finding in facts["findings"]}
+    assert by_name["kernels"]["huber"].startswith("none -10.8 points (below)")
+    assert by_name["kernels"]["cauchy"].startswith("none +0.2 points (intervals overlap)")
+    assert by_name["shared"][""].startswith("none +9.2 points (above)")
 
 
-def test_the_sweep_is_a_table_with_its_steps(make):
+def test_the_sweep_is_a_table_with_its_steps(render):
     rows = [
         row(rate, **{"model.n": f"{n}", "model.m": f"{m}", "data.outliers.max_ratio": mix})
         for mix, drop in (("0", 0), ("0.33", 20))
@@ -67,9 +89,8 @@ def test_the_sweep_is_a_table_with_its_steps(make):
         for rate in (30.0 + 5 * n + (m == 5) - drop,)
     ]
     rows[0]["us_per_problem"] = "7"
-    text = make.sweep_text(rows)
-    assert "| 9 | 0 to ⌊n/3⌋ pairs wrong | 55.0 [54.0, 56.0] | 56.0 [55.0, 57.0] |" in text
-    assert "| 6 | µs | 7 | 12 |" in text
-    assert (
-        "- no wrong pairs: m at n = 9, 2 → 5 +1.0 points (not told apart); n at m = 5, 6 → 9 +15.0 points (above)."
-    ) in text
+    facts = render.sweep(rows)
+    assert "| 55.0 [54.0, 56.0] | 56.0 [55.0, 57.0] |" in facts["table"]
+    assert "| 6 | µs | 7 | 12 |" in facts["table"]
+    assert "2 → 5 +1.0 points (intervals overlap)" in facts["findings"][0]
+    assert "6 → 9 +15.0 points (above)" in facts["findings"][0]
