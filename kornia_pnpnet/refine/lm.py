@@ -6,7 +6,7 @@ the loop.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -312,9 +312,9 @@ class RobustWeightedLM(Configured):
         plan = self.stages(start, m)
         ones = torch.ones_like(start.pose.translation[:, 0])
         state = State(start.pose, ones.bool(), ones)
-        with torch.set_grad_enabled(torch.is_grad_enabled() and live == 0):
-            state = _run((stage for stage in plan if stage.iteration < live), state)
-        state = _run((stage for stage in plan if stage.iteration >= live), state)
+        for stage in plan:
+            with torch.set_grad_enabled(torch.is_grad_enabled() and stage.iteration >= live):
+                state = stage.advance(state)
         if self.backward == "implicit" and m and torch.is_grad_enabled():
             return LMStep(self._attach_gradient(start, state.pose, start.shape[m - 1]), state.solved)
         return LMStep(state.pose, state.solved)
@@ -428,12 +428,6 @@ class RobustWeightedLM(Configured):
         gauss_newton, solved = solve_damped(NormalEquations([[x.detach() for x in y] for y in around], gradient), none)
         steps = (torch.where(convex, x, torch.where(solved, y, 0.0)) for x, y in zip(newton, gauss_newton, strict=True))
         return move(pose, [step.detach() - step for step in steps])
-
-
-def _run(stages: Iterable[Stage], state: State) -> State:
-    for stage in stages:
-        state = stage.advance(state)
-    return state
 
 
 def _complete_noise(corr: Correspondences, guess: Guess) -> Noise | None:
