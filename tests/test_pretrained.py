@@ -1,8 +1,6 @@
 """The shipped weights: the success they must reach, and model cards made from the results of their run."""
 
-import json
 import math
-from pathlib import Path
 
 import pytest
 import torch
@@ -102,15 +100,3 @@ def test_model_card_is_generated_from_the_run(name, tmp_path):
     updates = sum(run.run.update for run in results.lineage())
     assert updates >= (40_000 if name == "pnpnet-set" else 200_000)
     assert sum(path.stat().st_size for path in folder.iterdir()) < 2_000_000
-
-
-def test_results_page_is_generated_from_its_files():
-    make = Path(__file__).resolve().parents[1] / "docs" / "results" / "make.py"
-    namespace = {"__name__": "make", "__file__": str(make)}
-    exec(compile(make.read_text(), make, "exec"), namespace)
-    folder = make.parent
-    results = {name: namespace["load_results"](folder / f"{name}.json") for name in namespace["RESULTS"]}
-    complexity = json.loads((folder / "complexity.json").read_text())
-    honest = json.loads((folder / "honesty.json").read_text())
-    short_runs = (namespace["read_summary"](folder / f"{name}.csv") for name in ("ablation", "sweep"))
-    assert namespace["page"](results, complexity, honest, *short_runs) == (folder / "README.md").read_text()
