@@ -17,12 +17,18 @@ from typing import Any
 
 import torch
 
+from kornia_pnpnet.core.performance import keep_freed_memory
+
 HERE = Path(__file__).resolve().parent
 
 
 @contextmanager
 def threads(count: int = 1) -> Iterator[None]:
-    """Run PyTorch and OpenCV on ``count`` threads, and restore both settings of the process afterwards."""
+    """Run PyTorch and OpenCV on ``count`` threads, and restore both settings of the process afterwards.
+
+    The allocator is set as the documentation advises for large batches.
+    """
+    keep_freed_memory()
     cv2 = sys.modules.get("cv2")  # its solvers have imported it
     before = torch.get_num_threads(), None if cv2 is None else cv2.getNumThreads()
     torch.set_num_threads(count)

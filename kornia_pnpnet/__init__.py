@@ -1,4 +1,4 @@
-"""A camera's pose from 2D-3D correspondences of which some are wrong, as a batched, differentiable PyTorch layer."""
+"""Camera poses from 2D-3D correspondences with outliers, as a batched, differentiable PyTorch layer."""
 
 from kornia_pnpnet.covariance import pose_covariance
 from kornia_pnpnet.init import MLPInit, SetInit

@@ -285,6 +285,7 @@ def measured(tmp_path_factory):
     return folder, page.load_parts(folder)[0]
 
 
+@pytest.mark.slow
 def test_throughput_has_a_row_for_every_point(measured):
     results, quick = measured[1]["throughput"], settings.QUICK
     assert results["settings"]["contenders"] == list(SMALL)
@@ -346,6 +347,7 @@ def test_targets_of_throughput():
     ]
 
 
+@pytest.mark.slow
 def test_latency_keeps_the_distribution(measured):
     results = measured[1]["latency"]
     assert [(row["contender"], row["threads"]) for row in results["rows"]] == [(n, t) for t in (1, 2) for n in SMALL]
@@ -380,6 +382,7 @@ def test_targets_of_latency():
     assert not tail["met"]
 
 
+@pytest.mark.slow
 def test_cold_starts_and_memory(measured):
     starts = measured[1]["startup"]["starts"]
     modes = {(entry["contender"], entry["backward"]) for entry in starts}
@@ -430,6 +433,7 @@ def test_the_pages_are_rendered_from_their_files():
     assert page.page(*page.load_parts(FOLDER)) == page.PAGE.read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_a_page_shows_the_numbers_of_a_small_run(measured, tmp_path):
     pytest.importorskip("matplotlib")
     folder, results = measured
@@ -443,6 +447,7 @@ def test_a_page_shows_the_numbers_of_a_small_run(measured, tmp_path):
         assert page.three_digits(row["median_us"] / 1e3) in text
 
 
+@pytest.mark.slow
 def test_the_page_shows_verdicts_and_a_gpu(measured):
     results = {key: dict(value) for key, value in measured[1].items()}
     found = [

@@ -15,6 +15,7 @@ from kornia.core.exceptions import BaseError
 from kornia_pnpnet import __version__
 from kornia_pnpnet.cli import demo, evaluate, export, figures, listing, solve
 from kornia_pnpnet.cli.arguments import OneLineParser
+from kornia_pnpnet.core.performance import keep_freed_memory
 
 __all__ = ["COMMANDS", "main", "make_parser"]
 
@@ -57,6 +58,7 @@ def main(argv: list[str] | None = None) -> int:
         The exit code: 0; 1 when ``solve`` found no pose; 2 for bad input; 130 when interrupted.
     """
     arguments = make_parser().parse_args(argv)
+    keep_freed_memory()
     try:
         return COMMANDS[arguments.command].run(arguments)
     except (BaseError, OSError, ImportError, ValueError) as error:
