@@ -167,7 +167,10 @@ class Normalize(Configured):
         horizontal, vertical = img_scales.sqrt()
         frame = Frame(centroid.mT, scale, horizontal * vertical, order, valid)
         if noise is not None:
-            frame = frame._replace(valid=valid & _is_usable(noise))
+            usable = _is_usable(noise)
+            frame = frame._replace(valid=valid & usable)
+            # Scaling an infinite sigma would give gradients of NaN: an invalid problem has no known noise.
+            noise = map_tensors(lambda sigma: torch.where(usable[:, None], sigma, torch.nan), noise)
             noise = self._apply_to_noise(noise, frame)
         corr = Correspondences(world_points, img_points, weights[..., 0], focal, frame.img_scale, scale, noise)
         return corr, frame

@@ -819,3 +819,14 @@ def test_views_keep_the_noise_and_the_hypotheses_of_a_set_network(make_problems)
     rates = [success(pose_errors(result.pose, p.pose)).float().mean() for result in (one, three)]
     assert rates[1] > rates[0] - 0.02
     assert three.ok.float().mean() > 0.99
+
+
+@pytest.mark.parametrize("name", ["pnpnet-set", "epnp-lm"])
+def test_an_infinite_sigma_is_a_bad_problem_with_finite_gradients(name, make_problems):
+    p = make_problems(batch=2)
+    img = p.img_points.clone().requires_grad_()
+    sigma = torch.tensor([torch.inf, 0.05], dtype=torch.float64)
+    result = create_solver(name).double()(p.world_points, img, p.intrinsics, world_sigma=sigma, img_sigma=1.0)
+    result.translation.sum().backward()
+    assert result.ok.tolist() == [False, True]
+    assert img.grad.isfinite().all()

@@ -272,7 +272,7 @@ def page(
         peers=(*PEERS, "opencv-epnp", "opencv-sqpnp"),
         robust=ROBUST,
         beside_peers=beside_peers,
-        honest=honest | honesty_tables(honest),
+        honest={**honest, **honesty_tables(honest)},
         chi_square=CHI_SQUARE_95,
         distribution_table=format_table(results["distribution"]),
         ablation=ablation(short_runs["ablation"]),
