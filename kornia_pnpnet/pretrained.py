@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
 from kornia.core.exceptions import ValueCheckError
 from torch import Tensor
 
-from kornia_pnpnet.core.files import atomic_open
+from kornia_pnpnet.core.files import atomic_open, digest
 
 __all__ = [
     "CONFIG_NAME",
@@ -85,11 +83,7 @@ def read_weights(name_or_folder: str | Path) -> tuple[dict[str, Any], dict[str, 
 
 def _fingerprint(config: Any, state: dict[str, Tensor]) -> str:
     """Digest of a configuration and its weights: it tells whether both were saved together."""
-    digest = hashlib.sha256(json.dumps(config, sort_keys=True).encode())
-    for name, value in sorted(state.items()):
-        digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
-        digest.update(value.reshape(-1).view(torch.uint8).numpy().tobytes())  # NumPy has not all dtypes
-    return digest.hexdigest()
+    return digest(config, *(part for item in sorted(state.items()) for part in item))
 
 
 def find_weights(name_or_folder: str | Path) -> Path:

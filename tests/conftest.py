@@ -27,7 +27,7 @@ def _one_thread() -> None:
 
 @pytest.fixture(autouse=True)
 def _seed() -> None:
-    """Networks draw their weights from the global generator: the same ones whatever ran before."""
+    """Networks draw their weights from the global generator: the same weights in any order of tests."""
     torch.manual_seed(0)
 
 

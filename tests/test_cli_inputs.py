@@ -1,4 +1,4 @@
-"""The command line, whatever comes in: damaged files, any arguments, spoiled results."""
+"""Fuzz of the command line: damaged files, arbitrary arguments, damaged results."""
 
 import io
 import json

@@ -1,4 +1,4 @@
-"""Digests: of the contents, whatever their dtype, layout or order of keys."""
+"""Digests of the contents, for any dtype, layout and order of keys."""
 
 import hashlib
 import json

@@ -88,7 +88,7 @@ def test_covariances_from_the_weights_of_the_shipped_network(n, outliers):
     assert squares.mean().item() == pytest.approx(6.0, rel=0.15)
 
 
-# -- whatever comes in -------------------------------------------------------------------------------------------------
+# -- fuzz --------------------------------------------------------------------------------------------------------------
 
 
 @many(40)

@@ -315,7 +315,7 @@ def test_pixel_variance_is_that_of_the_pixel(make_problems):
     torch.testing.assert_close(variance[0], drawn, rtol=0.02, atol=0)
 
 
-# -- whatever comes in -------------------------------------------------------------------------------------------------
+# -- fuzz --------------------------------------------------------------------------------------------------------------
 
 
 @many(60)

@@ -1,4 +1,4 @@
-"""Initialisers, whatever comes in."""
+"""Fuzz of the initialisers."""
 
 import pytest
 import torch

@@ -95,7 +95,7 @@ def test_reliability_needs_as_many_outcomes(chances, outcomes):
         reliability(chances, outcomes)
 
 
-# -- whatever comes in -------------------------------------------------------------------------------------------------
+# -- fuzz --------------------------------------------------------------------------------------------------------------
 
 
 @st.composite

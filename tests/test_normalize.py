@@ -188,7 +188,7 @@ def test_padding_equals_removing_and_has_no_gradient(options, make_problems, per
 
 @pytest.mark.parametrize("content", PADDING)
 def test_a_pair_without_weight_is_padding(content, make_problems):
-    """To the bit, whatever the pair holds."""
+    """To the bit, for any numbers of the pair."""
     p = make_problems(9)
     mask = (torch.arange(9) != 2).expand(7, 9)
     world, pixels = p.world_points.clone(), p.img_points.clone()

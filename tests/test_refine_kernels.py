@@ -1,4 +1,4 @@
-"""Laws of the robust kernels: the weight is the derivative of the loss, whatever the shape."""
+"""Laws of the robust kernels: the weight is the derivative of the loss, for any shape."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Solvers by name, whatever comes in: shapes, dtypes, devices, scales, geometry without a pose."""
+"""Fuzz of solvers by name: shapes, dtypes, devices, scales, geometry without a pose."""
 
 import contextlib
 import copy

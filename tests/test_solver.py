@@ -267,7 +267,7 @@ def test_a_batch_of_bad_problems_gives_identities(dtype, make_problems):
 @pytest.mark.parametrize("how", ["nan_world", "all_equal", "behind"])
 @pytest.mark.parametrize("module_dtype", DTYPES)
 def test_good_problems_equal_being_solved_alone(module_dtype, how, make_problems, perturb):
-    """To 1e-9 in float64, whatever the dtype of the weights: shipped ones are float32."""
+    """To 1e-9 in float64, for weights of any dtype: shipped weights are float32."""
     p = make_problems()
     init = perturb(p.pose)
     inputs = spoil(p, 2, how)

@@ -342,7 +342,7 @@ def test_shares_of_the_time_add_up_and_show_slow_data(tmp_path):
     assert shares[1]["data"] == max(shares[1].values())
 
 
-# -- whatever comes in -------------------------------------------------------------------------------------------------
+# -- fuzz --------------------------------------------------------------------------------------------------------------
 
 
 def test_trainings_of_any_settings():

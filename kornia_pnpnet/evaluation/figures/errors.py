@@ -75,6 +75,6 @@ def _draw_shares(axes: Axes, errors: np.ndarray, solver: str, look: SolverStyle,
     left, right = axes.get_xlim()
     errors = np.sort(errors)
     share = 100 * np.arange(len(errors) + 1) / len(errors)
-    # The curve reaches both edges, whatever the errors.
+    # The curve reaches both edges for any errors.
     ends = np.concatenate((errors[:1].clip(max=left), errors, errors[-1:].clip(min=right)))
     axes.step(ends, [*share, share[-1]], where="post", label=solver, markevery=(shift, 0.15), **look.line())
