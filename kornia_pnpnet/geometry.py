@@ -1,4 +1,4 @@
-r"""Projection, residual, Jacobian and retraction: the calculus under every refiner, on kornia's conversions.
+r"""Projection, residual, Jacobian, retraction and alignment, on kornia's conversions.
 
 Convention: ``x_cam = R x_world + t``; the camera looks along +z; pixels are those of a camera with one focal length
 and the principal point 0 (see :mod:`kornia_pnpnet.normalize`). A point is *in front* when its depth is more than
@@ -15,6 +15,7 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix, rotation_
 from kornia.geometry.liegroup import So3
 from torch import Tensor
 
+from kornia_pnpnet.core.linalg import nearest_rotation
 from kornia_pnpnet.types import Correspondences, Noise, Pose
 
 __all__ = [
@@ -22,6 +23,7 @@ __all__ = [
     "NormalEquations",
     "Projection",
     "additive_tangent_map",
+    "align",
     "change_tangent",
     "move",
     "pixel_variance",
@@ -327,3 +329,35 @@ def rotation_angle(rotation_a: Tensor, rotation_b: Tensor) -> Tensor:
     sine = 0.5 * So3.vee(diff - diff.mT).norm(dim=-1)
     cosine = 0.5 * (diff.diagonal(dim1=-2, dim2=-1).sum(-1) - 1.0)
     return torch.atan2(sine, cosine)
+
+
+def align(source: Tensor, target: Tensor, weights: Tensor) -> tuple[Pose, Tensor]:
+    r"""Find the rigid motion and the scale that move points onto other points, by weighted least squares.
+
+    Source: S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991.
+
+    Args:
+        source: points :math:`x`, shape :math:`(B, K, 3)`.
+        target: points :math:`y`, shape :math:`(B, K, 3)`.
+        weights: at least 0, shape :math:`(B, K)`.
+
+    Returns:
+        The motion :math:`(R, t)` and the scale :math:`s`, shape :math:`(B,)`. The best rigid motion is
+        :math:`R x + t`, the best similarity :math:`s R (x - \bar x) + \bar y`, where the bars are weighted means.
+
+    Example:
+        >>> points = torch.tensor([[[0.0, 0, 0], [2, 0, 0], [0, 2, 0], [0, 0, 2]]])
+        >>> pose, scale = align(points, 3.0 * points + 1.0, torch.ones(1, 4))
+        >>> pose.translation, scale
+        (tensor([[2., 2., 2.]]), tensor([3.]))
+    """
+    total = weights.sum(-1, keepdim=True)
+    share = (weights / torch.where(total > 0, total, 1.0))[..., None]
+    source_mean, target_mean = (share * source).sum(1), (share * target).sum(1)
+    centred = source - source_mean[:, None]
+    covariance = (target - target_mean[:, None]).mT @ (share * centred)  # (B, 3, 3)
+    rotation = nearest_rotation(covariance.permute(1, 2, 0))[0].permute(2, 0, 1).contiguous()
+    mean_square = (share * centred.square()).sum((1, 2))
+    scale = (rotation * covariance).sum((1, 2)) / torch.where(mean_square > 0, mean_square, 1.0)
+    translation = target_mean - (rotation @ source_mean[..., None])[..., 0]
+    return Pose(rotation, translation), scale

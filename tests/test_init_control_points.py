@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from kornia_pnpnet import Correspondences
-from kornia_pnpnet.init.epnp.control_points import align, control_points
+from kornia_pnpnet.geometry import align
+from kornia_pnpnet.init.epnp.control_points import control_points
 
 
 def correspondences(world, weights=None):

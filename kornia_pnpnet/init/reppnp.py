@@ -15,8 +15,8 @@ from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_numbers, check_whole
 from kornia_pnpnet.core.configured import Configured
-from kornia_pnpnet.geometry import retract
-from kornia_pnpnet.init.epnp.control_points import ControlPoints, align, control_points
+from kornia_pnpnet.geometry import align, retract
+from kornia_pnpnet.init.epnp.control_points import ControlPoints, control_points
 from kornia_pnpnet.types import Correspondences, Guess, Pose
 
 __all__ = ["REPPnP"]

@@ -11,8 +11,7 @@ from kornia_pnpnet.core.checks import check_devices, check_whole
 from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.linalg import dot, small_product
 from kornia_pnpnet.core.performance import take_pairs
-from kornia_pnpnet.geometry import pixel_variance, project
-from kornia_pnpnet.init.epnp.control_points import align
+from kornia_pnpnet.geometry import align, pixel_variance, project
 from kornia_pnpnet.init.ransac import p3p
 from kornia_pnpnet.types import Correspondences, Guess, Noise, Pose
 

@@ -287,9 +287,8 @@ class RobustWeightedLM(Configured):
         seen: list[tuple[Correspondences, Tensor | None]] = [(start.starts, None)] * explored
         seen += [(start.guided, None)] * (guided - explored)
         seen += [(start.by_residual, start.estimated)] * (self.m - guided)
-        advance = self._advance_if_better if self.reject_worse else self._advance
         plan = [
-            Stage(i, partial(advance, pairs, start.step[i], start.damping[i], start.shape[i], estimated))
+            Stage(i, partial(self._advance, pairs, start.step[i], start.damping[i], start.shape[i], estimated))
             for i, (pairs, estimated) in enumerate(seen[:m])
         ]
         if start.rivals is not None:
@@ -366,21 +365,11 @@ class RobustWeightedLM(Configured):
         estimated: Tensor | None,
         state: State,
     ) -> State:
-        """One iteration."""
+        """One iteration. With ``reject_worse``, a problem whose cost would rise keeps its pose."""
+        damping = damping * state.factor if self.reject_worse else damping
         pose, solved = self._iterate(pairs, state.pose, step, damping, shape, estimated)
-        return State(pose, solved, state.factor)
-
-    def _advance_if_better(
-        self,
-        pairs: Correspondences,
-        step: Tensor,
-        damping: Tensor,
-        shape: Tensor,
-        estimated: Tensor | None,
-        state: State,
-    ) -> State:
-        """One iteration that keeps the pose of a problem where the cost would rise."""
-        pose, solved = self._iterate(pairs, state.pose, step, damping * state.factor, shape, estimated)
+        if not self.reject_worse:
+            return State(pose, solved, state.factor)
         new, old = (self._cost(project(x, pairs), pairs, pairs.weights, shape) for x in (pose, state.pose))
         better = new <= old
         factor = torch.where(better, state.factor * _DAMPING_DOWN, state.factor * _DAMPING_UP)

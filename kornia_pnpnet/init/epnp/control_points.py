@@ -1,4 +1,4 @@
-r"""Control points and point alignment, which EPnP and REPPnP share.
+r"""Control points, which EPnP and REPPnP share.
 
 A world point is :math:`p_i = \sum_j a_{ij} c_j`. In the camera frame the same point has the same coordinates
 :math:`a_{ij}` with unknown :math:`c_j`. Lepetit et al. take four control points :math:`c_j` and barycentric
@@ -14,10 +14,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_pnpnet.core.linalg import nearest_rotation
-from kornia_pnpnet.types import Correspondences, Pose
+from kornia_pnpnet.types import Correspondences
 
-__all__ = ["ControlPoints", "align", "control_points"]
+__all__ = ["ControlPoints", "control_points"]
 
 # Points are planar when their extent across the plane is below this share of their extent along the plane.
 _PLANAR_RATIO = 1e-3
@@ -97,35 +96,3 @@ def control_points(corr: Correspondences) -> ControlPoints:
         ~found[2],
         found[1],
     )
-
-
-def align(source: Tensor, target: Tensor, weights: Tensor) -> tuple[Pose, Tensor]:
-    r"""Find the rigid motion and the scale that move points onto other points, by weighted least squares.
-
-    Source: S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991.
-
-    Args:
-        source: points :math:`x`, shape :math:`(B, K, 3)`.
-        target: points :math:`y`, shape :math:`(B, K, 3)`.
-        weights: at least 0, shape :math:`(B, K)`.
-
-    Returns:
-        The motion :math:`(R, t)` and the scale :math:`s`, shape :math:`(B,)`. The best rigid motion is
-        :math:`R x + t`, the best similarity :math:`s R (x - \bar x) + \bar y`, where the bars are weighted means.
-
-    Example:
-        >>> points = torch.tensor([[[0.0, 0, 0], [2, 0, 0], [0, 2, 0], [0, 0, 2]]])
-        >>> pose, scale = align(points, 3.0 * points + 1.0, torch.ones(1, 4))
-        >>> pose.translation, scale
-        (tensor([[2., 2., 2.]]), tensor([3.]))
-    """
-    total = weights.sum(-1, keepdim=True)
-    share = (weights / torch.where(total > 0, total, 1.0))[..., None]
-    source_mean, target_mean = (share * source).sum(1), (share * target).sum(1)
-    centred = source - source_mean[:, None]
-    covariance = (target - target_mean[:, None]).mT @ (share * centred)  # (B, 3, 3)
-    rotation = nearest_rotation(covariance.permute(1, 2, 0))[0].permute(2, 0, 1).contiguous()
-    mean_square = (share * centred.square()).sum((1, 2))
-    scale = (rotation * covariance).sum((1, 2)) / torch.where(mean_square > 0, mean_square, 1.0)
-    translation = target_mean - (rotation @ source_mean[..., None])[..., 0]
-    return Pose(rotation, translation), scale

@@ -185,7 +185,7 @@ def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
     The poses carry no gradient: they are hypotheses, of which one is selected and refined on all pairs. In memory the
     batch is the last dimension, which suits arithmetic over many poses.
 
-    Source: see :mod:`kornia_pnpnet.init.ransac.law_of_cosines`.
+    Source: see ``law_of_cosines.py``.
 
     Args:
         world_points: points in any unit, shape :math:`(B, 3, 3)`.
