@@ -185,7 +185,8 @@ def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
     The poses carry no gradient: they are hypotheses, of which one is selected and refined on all pairs. In memory the
     batch is the last dimension, which suits arithmetic over many poses.
 
-    Source: see ``law_of_cosines.py``.
+    Source: M. Persson and K. Nordberg, "Lambda Twist", ECCV 2018; Y. Ding et al., "Revisiting the P3P Problem", CVPR
+    2023; details in ``init/ransac/law_of_cosines.py``.
 
     Args:
         world_points: points in any unit, shape :math:`(B, 3, 3)`.
