@@ -9,7 +9,7 @@ from kornia_pnpnet.pretrained import shipped_weights
 from kornia_pnpnet.refine import RobustWeightedLM
 from kornia_pnpnet.registry import create_solver, list_solvers, solve_pnp
 from kornia_pnpnet.solver import PnPNet
-from kornia_pnpnet.types import Correspondences, Guess, Hypotheses, Noise, PnPResult, Pose, Problems, Refinement
+from kornia_pnpnet.types import Correspondences, Guess, Hypotheses, Noise, PnPResult, Pose, Problems, Refinement, Status
 
 __version__ = "0.1.0"
 
@@ -29,6 +29,7 @@ __all__ = [
     "RobustWeightedLM",
     "SetInit",
     "SetLoss",
+    "Status",
     "__version__",
     "create_solver",
     "list_solvers",

@@ -17,7 +17,7 @@ from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.performance import exporting
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import MIN_DEPTH_RATIO
-from kornia_pnpnet.types import Correspondences, Guess, Noise, Pose
+from kornia_pnpnet.types import MIN_PAIRS, Correspondences, Guess, Noise, Pose, Status
 
 __all__ = ["F_CONST", "VIEWS", "Frame", "Normalize"]
 
@@ -36,6 +36,16 @@ VIEWS = (
 )
 
 
+# Typical distances from the median of the points: beyond the first the pair does not count for centre and scale, beyond
+# the second the numbers of a float32 have too few digits for it. Few pairs say little about what is typical.
+_FAR, _LARGEST_DISTANCE = 5.0, 1e6
+_MANY, _FAR_OF_FEW = 7, 25.0
+# Tangent of 85 degrees, more than a lens without distortion can show.
+_FAR_ANGLE = 11.4
+# Pairs. Up to this number, ranks are found by comparing all pairs.
+_FEW = 16
+
+
 class Frame(NamedTuple):
     r"""How :class:`Normalize` moved and ordered a problem, so that it can be undone.
 
@@ -44,23 +54,32 @@ class Frame(NamedTuple):
         scale: factor of world lengths, shape :math:`(B,)`.
         img_scale: factor of pixels, the geometric mean of both axes, shape :math:`(B,)`.
         order: position in the input of each normalised pair, int64, shape :math:`(B, N)`; ``None``: unchanged.
-        valid: whether the problem can be solved at all, bool, shape :math:`(B,)`.
+        status: ``Status.SOLVED`` where the problem can be solved at all, else why not, int8, shape :math:`(B,)`.
     """
 
     centroid: Tensor
     scale: Tensor
     img_scale: Tensor
     order: Tensor | None
-    valid: Tensor
+    status: Tensor
+
+    @property
+    def valid(self) -> Tensor:
+        """Whether the problem can be solved at all, bool, shape :math:`(B,)`."""
+        return self.status == Status.SOLVED
 
 
 class Normalize(Configured):
     r"""Normalise cameras, order and world frame.
 
-    A problem is *valid* when its numbers are finite (and can be squared twice), its weights are not negative, at least
-    three pairs have a weight, its camera is a pinhole without skew, and its points do not lie on one line or coincide.
-    The inputs of invalid problems are replaced by zeros, which keeps all later values and gradients finite. A pair
-    without weight is padding: its numbers do not matter.
+    A problem is *valid* when its numbers are finite, its weights are not negative, at least three pairs have a weight,
+    its camera is a pinhole (any multiple of its matrix, with or without skew), and its points do not lie on one line or
+    coincide. The inputs of invalid problems are replaced by zeros, which keeps all later values and gradients finite. A
+    pair without weight is padding: its numbers do not matter.
+
+    Bad triangulations and bad detections do not spoil the frame: centroid and scale are those of the pairs that are
+    *near*, at most five times as far from the median of the points as two thirds of them, and less than 85° off the
+    camera's axis. Pairs a million times as far, or too close to 90° to be seen, are outliers and lose their weight.
 
     Args:
         f_const: focal length of the normalised camera in pixels.
@@ -115,64 +134,81 @@ class Normalize(Configured):
             The normalised correspondences, with the problems last in memory, and the :class:`Frame` that undoes it.
         """
         batch, count = world_points.shape[:2]
-        usable = _is_pinhole(intrinsics)
         if weights is None:
             weights = world_points.new_ones(batch, count) if mask is None else mask.to(world_points.dtype)
         else:
             weights = weights if mask is None else torch.where(mask, weights, 0.0)
-            usable = usable & (weights >= 0).all(-1)
         # From here on problems are the last dimension: coordinates and weight of each pair, (6, N, B), and the entries
         # of each camera, (9, B), of which fx, fy = [:5:4] and cx, cy = [2:6:3].
         rows = torch.cat((world_points.permute(2, 1, 0), img_points.permute(2, 1, 0), weights.mT[None]))
-        camera = intrinsics.flatten(1).mT
-        there = rows[5] != 0
+        zero, one = rows.new_zeros(1, batch), rows.new_ones(1, batch)
+        camera, is_camera = _pinhole(intrinsics.flatten(1).mT)
 
         # Make inputs safe before computing with them: between this limit and its inverse, squares of squares neither
-        # overflow nor vanish. NaN compares false, and the root of a negative number is NaN.
+        # overflow nor vanish. NaN compares false.
         limit = torch.finfo(rows.dtype).max ** 0.25
-        zero, one = rows.new_zeros(1, batch), rows.new_ones(1, batch)
-        sizes = torch.where(there, rows.detach().abs(), zero).amax(1)
-        size = sizes[:3].amax(0)  # largest coordinate of the world
-        entries = camera.detach()
-        largest = torch.maximum(sizes.amax(0), size.reciprocal())
-        largest_entry = torch.maximum(entries.abs().amax(0), entries[:5:4].rsqrt().amax(0))
-        usable = usable & (torch.maximum(largest, largest_entry) < limit)
-        there = there & usable
+        there = rows[5] != 0
+        sizes = torch.where(there, rows.detach().abs(), zero)
+        is_finite = (sizes.amax((0, 1)) < torch.inf) & (sizes[5].amax(0) < limit) & (rows[5] >= 0).all(0)
+        if noise is not None:
+            has_noise = _is_usable(noise)
+            is_finite = is_finite & has_noise
+        there = there & is_camera & is_finite & (sizes[:5].amax(0) < limit)
         rows = torch.where(there, rows, zero)
-        camera = torch.where(usable, camera, one)
-        present = there.to(rows.dtype)
-
+        centre = torch.cat((zero, zero, zero, camera[2:6:3], zero))[:, None]
+        rows = torch.addcmul(rows, centre, there.to(rows.dtype), value=-1)
         focal = rows.new_full((), self.f_const)  # made on the device, so that a GPU need not wait for the CPU
-        share = present.sum(0).clamp(min=1.0).reciprocal()
-        mean = rows[:3].sum(1) * share
-        centroid = mean if self.center else zero.expand(3, batch)
-        moved = torch.addcmul(rows, torch.cat((centroid, camera[2:6:3], zero))[:, None], present, value=-1)
-        centred = moved[:3] if self.center else torch.addcmul(rows[:3], mean[:, None], present, value=-1)
-        spread_out = _is_spread_out(centred.detach(), share, size)
-        mean_square = moved[:3].square().sum((0, 1)) * share
-        scale = torch.where(spread_out, mean_square, one[0]).rsqrt() if self.scale else one[0]
         img_scales = focal / camera[:5:4]  # (2, B)
 
-        # No point in front of the camera projects beyond a limit. An invalid problem becomes zeros, without gradient.
-        img_sizes = moved[3:5].detach().abs().amax(1) * img_scales.detach()
-        valid = spread_out & (img_sizes.amax(0) <= self.f_const / MIN_DEPTH_RATIO)
+        # A pair far off is no reason to refuse the problem: beyond any angle or distance it is an outlier.
+        angle = (rows[3:5].detach().abs() * (img_scales.detach() / focal)[:, None]).amax(0)
+        sq_distance, typical = _distances(rows[:3].detach(), there)
+        there = there & (angle <= 1.0 / MIN_DEPTH_RATIO) & (sq_distance <= _LARGEST_DISTANCE**2 * typical)
+        few = (there.sum(0) < _MANY).to(rows.dtype)
+        near = there & (angle <= _FAR_ANGLE) & (sq_distance <= (_FAR + few * (_FAR_OF_FEW - _FAR)) ** 2 * typical)
+        rows = torch.where(there, rows, zero)
+
+        # Centre and scale by the pairs that are near.
+        share = near.sum(0).to(rows.dtype).clamp(min=1.0).reciprocal()
+        by_near = torch.where(near, share, zero)
+        mean = (rows[:3] * by_near).sum(1)
+        centroid = mean if self.center else zero.expand(3, batch)
+        world = torch.where(there, rows[:3] - centroid[:, None], zero) if self.center else rows[:3]
+        centred = torch.where(near, (world if self.center else rows[:3] - mean[:, None]).detach(), zero)
+        size = torch.where(near, sizes[:3].amax(0), zero).amax(0)  # largest coordinate of the world
+        spread_out = _is_spread_out(centred, share, size) & (size.reciprocal() < limit)
+        mean_square = (world.square() * by_near).sum((0, 1))
+        scale = torch.where(spread_out, mean_square, one[0]).rsqrt() if self.scale else one[0]
+
+        status = torch.where(spread_out, Status.SOLVED, Status.DEGENERATE)
+        for fine, otherwise in (
+            (there.sum(0) >= MIN_PAIRS, Status.TOO_FEW_PAIRS),
+            (is_camera, Status.CAMERA),
+            (is_finite, Status.NOT_FINITE),
+        ):
+            status = torch.where(fine, status, otherwise)
+        valid = status == Status.SOLVED
+        # An invalid problem becomes zeros, without gradient.
         factors = torch.where(valid, torch.cat((scale.expand(3, batch), img_scales, one)), zero)
-        rows = moved * factors[:, None]
+        horizontal, vertical, weight = rows[3:].unbind()
+        horizontal = horizontal - camera[1] / camera[4] * vertical  # skew
+        rows = torch.cat((world, torch.stack((horizontal, vertical, weight)))) * factors[:, None]
 
         order = None
         if self.order:
-            order = _order(torch.where(there, rows[3:5].detach(), torch.inf))
+            order = _order(torch.where(near, rows[3:5].detach(), torch.inf))
             rows = rows.gather(1, order.mT.expand(6, -1, -1))
+            near = near.gather(0, order.mT)
         world_points, img_points, weights = rows.permute(2, 1, 0).split((3, 2, 1), -1)
         horizontal, vertical = img_scales.sqrt()
-        frame = Frame(centroid.mT, scale, horizontal * vertical, order, valid)
+        frame = Frame(centroid.mT, scale, horizontal * vertical, order, status.to(torch.int8))
         if noise is not None:
-            usable = _is_usable(noise)
-            frame = frame._replace(valid=valid & usable)
             # Scaling an infinite sigma would give gradients of NaN: an invalid problem has no known noise.
-            noise = map_tensors(lambda sigma: torch.where(usable[:, None], sigma, torch.nan), noise)
+            noise = map_tensors(lambda sigma: torch.where(has_noise[:, None], sigma, torch.nan), noise)
             noise = self._apply_to_noise(noise, frame)
-        corr = Correspondences(world_points, img_points, weights[..., 0], focal, frame.img_scale, scale, noise)
+        corr = Correspondences(
+            world_points, img_points, weights[..., 0], focal, frame.img_scale, scale, noise, near.to(rows.dtype).mT
+        )
         return corr, frame
 
     def _apply_to_noise(self, noise: Noise, frame: Frame) -> Noise:
@@ -200,15 +236,17 @@ class Normalize(Configured):
         rows = torch.cat((corr.world_points.permute(2, 1, 0), corr.img_points.permute(2, 1, 0), corr.weights.mT[None]))
         x, y, z, u, v, weights = rows  # (N, B) each
         seen = [torch.stack((*_exchanged(x, y, *view), z, *_exchanged(u, v, *view), weights)) for view in VIEWS[:count]]
-        noise = map_tensors(lambda sigma: sigma.repeat(count, 1), corr.noise)
+        of_pairs = map_tensors(lambda values: values.repeat(count, 1), (corr.noise, corr.near))
         if self.order:
-            keys = torch.cat([torch.where(view[5] != 0, view[3:5].detach(), torch.inf) for view in seen[1:]], -1)
+            there = (corr.near_weights != 0).mT
+            keys = torch.cat([torch.where(there, view[3:5].detach(), torch.inf) for view in seen[1:]], -1)
             order = _order(keys)  # (B * (count - 1), N)
             seen = [seen[0], torch.cat(seen[1:], -1).gather(1, order.mT.expand(6, -1, -1))]
             batch = corr.weights.shape[0]
-            noise = map_tensors(lambda sigma: torch.cat((sigma[:batch], sigma[batch:].gather(1, order))), noise)
+            of_pairs = map_tensors(lambda x: torch.cat((x[:batch], x[batch:].gather(1, order))), of_pairs)
         world_points, img_points, weights = torch.cat(seen, -1).permute(2, 1, 0).split((3, 2, 1), -1)
-        return Correspondences(world_points, img_points, weights[..., 0], corr.focal, noise=noise)
+        noise, near = of_pairs
+        return Correspondences(world_points, img_points, weights[..., 0], corr.focal, noise=noise, near=near)
 
     def undo_views(self, pose: Pose, count: int) -> list[Pose]:
         """Express poses of :meth:`views` for the problems themselves.
@@ -280,10 +318,46 @@ def _is_usable(noise: Noise) -> Tensor:
     return torch.stack(usable).all(0)
 
 
-def _is_pinhole(intrinsics: Tensor) -> Tensor:
-    """Whether cameras with positive focal lengths have no skew and the last row 0, 0, 1, bool (B,)."""
-    # Where both focal lengths are not 0, all other entries of the first two columns must be 0.
-    return ((intrinsics[..., :2] != 0).sum((1, 2)) == 2) & (intrinsics[:, 2, 2] == 1)
+def _pinhole(camera: Tensor) -> tuple[Tensor, Tensor]:
+    """Cameras (9, B) scaled to a last entry of 1, and whether they are pinhole cameras, bool (B,).
+
+    A pinhole camera has positive focal lengths and any skew; the entries below the diagonal are 0. Any multiple of its
+    matrix is the same camera. Other matrices become ones.
+    """
+    limit = torch.finfo(camera.dtype).max ** 0.25
+    entries = camera.detach()
+    sized = (entries.abs().amax(0) < limit) & (entries[8].abs() > 1.0 / limit)
+    camera = torch.where(sized, camera, 1.0)
+    camera = camera / camera[8:]
+    entries = camera.detach()
+    fine = sized & (torch.maximum(entries.abs().amax(0), entries[:5:4].rsqrt().amax(0)) < limit)  # NaN compares false
+    fine = fine & (entries[3] == 0) & (entries[6] == 0) & (entries[7] == 0)
+    return torch.where(fine, camera, 1.0), fine
+
+
+def _distances(points: Tensor, there: Tensor) -> tuple[Tensor, Tensor]:
+    """Squared distances (N, B) from the median of the points (3, N, B), and the distance that two thirds stay below.
+
+    The typical distance (B,) is squared, too, and infinite where two thirds of the points coincide.
+    """
+    counts = there.sum(0)
+    sq_distance = (points - _ranked(points, there, (counts - 1) // 2)[:, None]).square().sum(0)
+    typical = _ranked(sq_distance[None], there, 2 * counts // 3)[0]
+    return sq_distance, torch.where(typical > 0, typical, torch.inf)
+
+
+def _ranked(values: Tensor, there: Tensor, rank: Tensor) -> Tensor:
+    """The value of a rank among those that are there: values (C, N, B), ranks (B,) from 0, result (C, B)."""
+    values = torch.where(there, values, torch.inf)
+    count = values.shape[1]
+    if isinstance(count, int) and count <= _FEW:  # comparing all pairs is faster than sorting
+        below = (values[:, None] < values[:, :, None]).sum(2)  # (C, N, B)
+        upto = (values[:, None] <= values[:, :, None]).sum(2)
+        found = torch.where((below <= rank) & (rank < upto), values, -torch.inf).amax(1)
+    else:
+        ascending = values.topk(count, 1, largest=False).values if exporting() else values.sort(1).values
+        found = ascending.gather(1, rank.clamp(min=0).expand(len(values), 1, -1))[:, 0]
+    return torch.where(found.isfinite(), found, 0.0)
 
 
 def _is_spread_out(centred: Tensor, share: Tensor, size: Tensor) -> Tensor:

@@ -8,21 +8,22 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
-from kornia.core.exceptions import BaseError, ShapeError, TypeCheckError, ValueCheckError
+from kornia.core.exceptions import BaseError, ValueCheckError
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
-from kornia_pnpnet.core.checks import Shapes, check_devices, check_like, check_shapes, check_whole, expand_sigma
+from kornia_pnpnet.core.checks import check_whole
 from kornia_pnpnet.core.performance import Compiled, compiling, split_batch
 from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.geometry import project
 from kornia_pnpnet.init import EPnP, MLPInit, REPPnP, SetInit
+from kornia_pnpnet.inputs import Inputs, checked_inputs
 from kornia_pnpnet.normalize import VIEWS, Frame, Normalize
 from kornia_pnpnet.pretrained import read_weights, write_weights
 from kornia_pnpnet.refine import LMStart, LMStep, RobustWeightedLM
-from kornia_pnpnet.types import Guess, Noise, PnPResult, Pose, camera_matrices
+from kornia_pnpnet.types import Correspondences, Guess, PnPResult, Pose, Status
 
-__all__ = ["PnPNet", "check_inputs"]
+__all__ = ["PnPNet"]
 
 _INITIALISERS: dict[str, type[nn.Module]] = {
     "EPnP": EPnP,
@@ -32,16 +33,8 @@ _INITIALISERS: dict[str, type[nn.Module]] = {
 }
 
 
-class _Inputs(NamedTuple):
-    """Checked arguments of a call: a camera for each problem, sigmas of each pair where any of them is known."""
-
-    world_points: Tensor
-    img_points: Tensor
-    intrinsics: Tensor
-    weights: Tensor | None
-    mask: Tensor | None
-    init: Pose | None
-    noise: Noise | None
+# Focal lengths. A pair that is not near takes part when the first guess sees it this close to its pixel.
+_SEEN = 0.25
 
 
 class _Begun(NamedTuple):
@@ -57,10 +50,11 @@ class PnPNet(nn.Module):
 
     The layer normalises the correspondences, lets ``init`` guess a pose, refines the guess, and expresses the pose in
     the frame of the inputs. All of it is batched and differentiable. A bad problem (non-finite input, fewer than three
-    pairs, points on a line, a pose that does not explain the pixels) has ``ok=False`` and a finite pose without
-    gradient, and changes no other problem.
+    pairs, points on a line, a pose that does not explain the pixels) has ``ok=False``, a ``status`` that says why, a
+    finite pose without gradient, and changes no other problem.
 
-    Convention: ``x_cam = R x_world + t``, +z forward, pixels ``u = fx x/z + cx``; skew must be 0.
+    Convention: ``x_cam = R x_world + t``, +z forward, pixels ``u = fx x/z + s y/z + cx`` with the skew ``s``; any
+    multiple of a camera matrix is the same camera.
 
     Precision: the layer computes in the dtype of its inputs, float32 or float64, also inside :class:`torch.autocast`,
     which does not change its results. Half precision has too few digits for a pixel: cast inputs of float16 or bfloat16
@@ -149,7 +143,7 @@ class PnPNet(nn.Module):
             TypeCheckError: for dtypes that differ or are not float32 or float64.
             DeviceError: for tensors on different devices, or on another device than a network of the solver.
         """
-        inputs = _checked(world_points, img_points, intrinsics, weights, mask, init, img_sigma, world_sigma)
+        inputs = checked_inputs(world_points, img_points, intrinsics, weights, mask, init, img_sigma, world_sigma)
         with _in_full_precision(world_points.device.type):
             results = [
                 self._solve(first_stage_only, part) for part in split_batch(inputs, self._portions(world_points))
@@ -186,7 +180,7 @@ class PnPNet(nn.Module):
             The result, and the guess in the frame, the order and the units of the inputs; its ``ok`` says whether the
             problem is valid.
         """
-        inputs = _checked(world_points, img_points, intrinsics, weights, mask, init, img_sigma, world_sigma)
+        inputs = checked_inputs(world_points, img_points, intrinsics, weights, mask, init, img_sigma, world_sigma)
         with _in_full_precision(world_points.device.type):
             begun, result = self._parts(first_stage_only, inputs)
             return result, self.normalize.undo_guess(begun.guess, begun.frame)
@@ -224,16 +218,16 @@ class PnPNet(nn.Module):
         batch, count = world_points.shape[:2]
         return max(1, min(batch * count // (most * torch.get_num_threads()), batch // 2))
 
-    def _in_parts(self, first_stage_only: bool, inputs: _Inputs) -> PnPResult:
+    def _in_parts(self, first_stage_only: bool, inputs: Inputs) -> PnPResult:
         return self._parts(first_stage_only, inputs)[1]
 
-    def _parts(self, first_stage_only: bool, inputs: _Inputs) -> tuple[_Begun, PnPResult]:
+    def _parts(self, first_stage_only: bool, inputs: Inputs) -> tuple[_Begun, PnPResult]:
         """Before the iterations, the iterations, and after them."""
         begun = self._begin(1 if first_stage_only or self.refine.m == 0 else self.views, inputs)
         end = self.refine.iterate(begun.start, 0 if first_stage_only else None)
         return begun, self._finish(begun, end)
 
-    def _guess(self, views: int, inputs: _Inputs) -> _Begun:
+    def _guess(self, views: int, inputs: Inputs) -> _Begun:
         """Everything before the first iteration."""
         world_points, img_points, intrinsics, weights, mask, init, noise = inputs
         corr, frame = self.normalize(world_points, img_points, intrinsics, weights, mask, noise)
@@ -250,6 +244,8 @@ class PnPNet(nn.Module):
             others = map_tensors(lambda *x: torch.stack(x, 1), *rest)
             # Weights, ok and noise of the first view, whose pairs have the order of the correspondences.
             guess = map_tensors(lambda x: x[:batch], guess)._replace(pose=first, others=others)
+        if corr.near is not None and not getattr(self.init, "weighs_far_pairs", False):
+            guess = guess._replace(weights=guess.weights * torch.where(_is_seen(guess, corr), 1.0, corr.near))
         return _Begun(self.refine.begin(corr, guess), frame, guess)
 
     def _given(self, init: Pose | None, world_points: Tensor, frame: Frame) -> Pose:
@@ -273,6 +269,9 @@ class PnPNet(nn.Module):
         finite = frame.valid & (pose.translation.sum(-1) + refined.weights.sum(-1) + refined.cost).isfinite()
         ok = finite & refined.ok if guess.ok is None else finite & refined.ok & guess.ok
         first_ok = frame.valid & first.translation.sum(-1).isfinite()
+        status = torch.where(refined.in_front, Status.NOT_BELIEVED, Status.BEHIND)
+        status = torch.where(ok, Status.SOLVED, torch.where(finite, status, Status.DEGENERATE))
+        status = torch.where(frame.valid, status.to(frame.status), frame.status)
         rotation, translation = _gate_pose(pose, ok, finite)
         return PnPResult(
             rotation,
@@ -281,6 +280,7 @@ class PnPNet(nn.Module):
             _gate(refined.cost, ok, finite, torch.finfo(refined.cost.dtype).max ** 0.5),
             ok,
             _gate_pose(first, first_ok, first_ok),
+            status,
         )
 
     # -- weights on disk ---------------------------------------------------------------------------------------------
@@ -351,6 +351,15 @@ class PnPNet(nn.Module):
         return model.eval()
 
 
+def _is_seen(guess: Guess, corr: Correspondences) -> Tensor:
+    """Whether any pose of a guess sees a pair's point about where its pixel is, bool (B, N)."""
+    seen = []
+    for pose in guess.poses:
+        projection = project(map_tensors(torch.Tensor.detach, pose), corr.map(torch.Tensor.detach))
+        seen.append(projection.in_front & (projection.sq_residual < (_SEEN * corr.focal) ** 2))
+    return torch.stack(seen).any(0)
+
+
 def _gate(value: Tensor, ok: Tensor, finite: Tensor, fill: float | Tensor) -> Tensor:
     """Keep the gradient of problems that are ok, the value of those that are finite, and fill the others."""
     shape = (-1,) + (1,) * (value.ndim - 1)
@@ -363,72 +372,6 @@ def _gate_pose(pose: Pose, ok: Tensor, finite: Tensor) -> Pose:
     """:func:`_gate` for a pose; the identity fills."""
     eye = torch.eye(3, dtype=pose.rotation.dtype, device=pose.rotation.device)
     return Pose(_gate(pose.rotation, ok, finite, eye), _gate(pose.translation, ok, finite, 0.0))
-
-
-def check_inputs(
-    world_points: Tensor,
-    img_points: Tensor,
-    intrinsics: Tensor,
-    weights: Tensor | None,
-    mask: Tensor | None,
-    init: Pose | None = None,
-) -> None:
-    """Check shapes, dtypes and devices; never values, which would stall a GPU and let one problem fail a batch.
-
-    Raises:
-        ShapeError: for shapes that do not fit each other, or fewer than 3 pairs.
-        TypeCheckError: for arguments that are no tensors, dtypes that differ or are not float32 or float64.
-        DeviceError: for tensors on different devices.
-    """
-    for name, value in (("world_points", world_points), ("img_points", img_points), ("intrinsics", intrinsics)):
-        if not isinstance(value, Tensor):
-            raise TypeCheckError(f"{name} must be a tensor, got {type(value).__name__}.")
-    KORNIA_CHECK_SHAPE(world_points, ["B", "N", "3"])
-    KORNIA_CHECK_SHAPE(img_points, ["B", "N", "2"])
-    batch, count = world_points.shape[:2]
-    rotation, translation = (None, None) if init is None else init
-    shapes: Shapes = {
-        "img_points": (img_points, (batch, count, 2)),
-        "weights": (weights, (batch, count)),
-        "mask": (mask, (batch, count)),
-        "intrinsics": (intrinsics, (3, 3) if intrinsics.ndim == 2 else (batch, 3, 3)),
-        "init rotation": (rotation, (batch, 3, 3)),
-        "init translation": (translation, (batch, 3)),
-    }
-    check_shapes(shapes, world_points)
-    if count < 3:
-        raise ShapeError(f"A pose needs at least 3 pairs, got N = {count}.", actual_shape=tuple(world_points.shape))
-    check_like({name: tensor for name, (tensor, _) in shapes.items() if name != "mask"}, world_points)
-    if world_points.dtype not in (torch.float32, torch.float64):
-        raise TypeCheckError(
-            f"world_points must be float32 or float64, got {world_points.dtype}: cast the inputs with .float()."
-        )
-    if mask is not None and mask.dtype != torch.bool:
-        raise TypeCheckError(f"mask must be bool, got {mask.dtype}.")
-    check_devices({"mask": mask}, world_points)
-
-
-def _checked(
-    world_points: Tensor,
-    img_points: Tensor,
-    intrinsics: Tensor | PinholeCamera,
-    weights: Tensor | None,
-    mask: Tensor | None,
-    init: Pose | None,
-    img_sigma: Tensor | float | None,
-    world_sigma: Tensor | float | None,
-) -> _Inputs:
-    """Check the arguments of a call, and expand them to all problems and pairs."""
-    intrinsics = camera_matrices(intrinsics)
-    check_inputs(world_points, img_points, intrinsics, weights, mask, init)
-    noise = None
-    if img_sigma is not None or world_sigma is not None:
-        img, world = (expand_sigma(*x, world_points) for x in (("img_sigma", img_sigma), ("world_sigma", world_sigma)))
-        noise = Noise(img, world)
-    if intrinsics.ndim == 2:
-        intrinsics = intrinsics.expand(world_points.shape[0], 3, 3)
-    init = None if init is None else Pose(*init)
-    return _Inputs(world_points, img_points, intrinsics, weights, mask, init, noise)
 
 
 def _in_full_precision(device: str) -> AbstractContextManager[Any]:

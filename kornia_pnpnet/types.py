@@ -7,6 +7,7 @@ are. The letters are the same everywhere: ``B`` problems in the batch, ``N`` pai
 from __future__ import annotations
 
 from collections.abc import Callable
+from enum import IntEnum
 from typing import NamedTuple
 
 import torch
@@ -17,7 +18,30 @@ from torch import Tensor
 
 from kornia_pnpnet.core.trees import map_tensors
 
-__all__ = ["Correspondences", "Guess", "Hypotheses", "Noise", "PnPResult", "Pose", "Problems", "Refinement"]
+__all__ = ["Correspondences", "Guess", "Hypotheses", "Noise", "PnPResult", "Pose", "Problems", "Refinement", "Status"]
+
+
+#: Pairs that determine a pose up to a few solutions.
+MIN_PAIRS = 3
+
+
+class Status(IntEnum):
+    """Why a problem is not ``ok``: the values of ``PnPResult.status``."""
+
+    #: ``ok``.
+    SOLVED = 0
+    #: Fewer than 3 pairs have a weight and are at an angle that a camera can see.
+    TOO_FEW_PAIRS = 1
+    #: The points lie on a line or coincide, or the pairs do not determine a pose.
+    DEGENERATE = 2
+    #: A coordinate, weight or sigma is NaN or infinite, or a weight or sigma is negative.
+    NOT_FINITE = 3
+    #: The intrinsics are not a multiple of ``[[fx, s, cx], [0, fy, cy], [0, 0, 1]]`` with positive ``fx`` and ``fy``.
+    CAMERA = 4
+    #: No pose was found with which enough pairs agree.
+    NOT_BELIEVED = 5
+    #: The pose that was found has fewer than 3 pairs in front of the camera.
+    BEHIND = 6
 
 
 class Pose(NamedTuple):
@@ -100,6 +124,8 @@ class Correspondences(NamedTuple):
         world_scale: lengths of ``world_points`` per unit of the user's world, shape :math:`(B,)`; ``None`` is 1.
         noise: noise of each pair in the units of ``img_points`` and ``world_points``, NaN where unknown; ``None``: all
             unknown.
+        near: 0 where a world point is many times as far off as most of them, or its pixel at a wide angle: bad data or
+            the horizon, which an initialiser that is not robust leaves out; else 1, shape :math:`(B, N)`; ``None``: 1.
     """
 
     world_points: Tensor
@@ -109,6 +135,12 @@ class Correspondences(NamedTuple):
     img_scale: Tensor | None = None
     world_scale: Tensor | None = None
     noise: Noise | None = None
+    near: Tensor | None = None
+
+    @property
+    def near_weights(self) -> Tensor:
+        """The weights, 0 for pairs that are not near, shape :math:`(B, N)`."""
+        return self.weights if self.near is None else self.weights * self.near
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Correspondences:
         """Apply a function to every tensor."""
@@ -162,12 +194,14 @@ class Refinement(NamedTuple):
         weights: the weight of each pair at that pose, shape :math:`(B, N)`.
         cost: mean robust loss of the pairs at that pose, shape :math:`(B,)`.
         ok: whether the pose is to be believed, bool, shape :math:`(B,)`.
+        in_front: whether at least three pairs with a weight are in front of the camera, bool, shape :math:`(B,)`.
     """
 
     pose: Pose
     weights: Tensor
     cost: Tensor
     ok: Tensor
+    in_front: Tensor
 
 
 class PnPResult(NamedTuple):
@@ -183,6 +217,8 @@ class PnPResult(NamedTuple):
             finite and carry no gradient.
         init: the first guess. It carries a gradient for every valid problem, also where refinement failed, so that an
             initialiser can learn from its failures.
+        status: why a problem is not ``ok``: the value of a :class:`Status`, int8, shape :math:`(B,)`. Every solver of
+            this package sets it.
     """
 
     rotation: Tensor
@@ -191,6 +227,7 @@ class PnPResult(NamedTuple):
     cost: Tensor
     ok: Tensor
     init: Pose
+    status: Tensor | None = None
 
     @property
     def pose(self) -> Pose:

@@ -215,7 +215,7 @@ SPOILT = {
     "focal_zero": ("intrinsics", (1, 0, 0), 0.0),
     "focal_negative": ("intrinsics", (1, 1, 1), -1.0),
     "intrinsics_nan": ("intrinsics", (1, 0, 2), math.nan),
-    "skew": ("intrinsics", (1, 0, 1), 1e-3),
+    "turned_camera": ("intrinsics", (1, 1, 0), 1e-3),
     "all_equal": ("world", (1,), torch.tensor([3.0, 4, 5])),
     "all_equal_inexact": ("world", (1,), torch.tensor([1 / 3, 0.1, 1e4 / 7])),
     "all_zero": ("world", (1,), 0.0),

@@ -109,7 +109,7 @@ class MLPInit(Configured):
 
         Args:
             corr: normalised correspondences with :math:`N` = ``n``, ordered by their pixels. A pair without
-                weight enters as zeros; the network was not trained on such pairs.
+                weight or not near enters as zeros; the network was not trained on such pairs.
 
         Returns:
             The coarse pose, and weights of 1.
@@ -128,6 +128,8 @@ class MLPInit(Configured):
         check_devices({"world_points": corr.world_points}, next(self.parameters()), "the network")
         # One column per problem: x, y, z, u, v of the first pair, then of the next, which is their order in memory.
         world_points, img_points = corr.world_points / self.world_scale, corr.img_points / self.img_scale
+        if corr.near is not None:
+            world_points, img_points = (x * corr.near[..., None] for x in (world_points, img_points))
         features = torch.cat((world_points.permute(1, 2, 0), img_points.permute(1, 2, 0)), 1).flatten(0, 1)  # (5n, B)
         hidden = _run(self.shared, features)  # (3n, B)
         axis, angle = _run(self.rotation, hidden).split((3, 1))

@@ -124,6 +124,7 @@ class REPPnP(Configured):
             for points on a line, for equations that do not determine a pose, and for a pose with the centroid of the
             points behind the camera.
         """
+        corr = corr._replace(weights=corr.near_weights)
         with torch.no_grad():
             control = control_points(corr)
         pairs, radius = _own_frame(corr, control)
@@ -137,6 +138,7 @@ class REPPnP(Configured):
         ok = ok & (pose.translation[:, 2] > 0)
         offset = (pose.rotation @ control.points[:, 0, :, None])[..., 0]
         pose = Pose(pose.rotation, pose.translation * radius[:, None] - offset)
+        kept = kept if corr.near is None else kept | (corr.near == 0)  # the solver decides about them
         return Guess(pose, kept.to(corr.weights.dtype), ok)
 
     def _select(self, pairs: _Pairs) -> tuple[Tensor, Pose]:

@@ -55,7 +55,7 @@ class _View:
 
     def __init__(self, corr: Correspondences) -> None:
         world = corr.world_points.contiguous()
-        there = (corr.weights > 0).to(world.dtype)
+        there = (corr.near_weights > 0).to(world.dtype)
         share = (there / there.sum(1, keepdim=True).clamp(min=1.0))[..., None]  # (B, N, 1)
         plane = corr.img_points / corr.focal
         rays = functional.normalize(torch.cat((plane, torch.ones_like(plane[..., :1])), -1), dim=-1)
@@ -209,6 +209,8 @@ class SetInit(Configured):
 
     #: Pairs per core whose temporaries stay in its caches. A solver splits larger batches where gradients allow it.
     pairs_at_once = 12_000
+    #: The weights say which of the pairs that are not near are inliers.
+    weighs_far_pairs = True
 
     def __init__(
         self,
@@ -301,7 +303,7 @@ class SetInit(Configured):
     def _sampled(self, corr: Correspondences, right: Tensor, noise: Noise, fallback: Pose) -> Pose:
         """The best pose of the minimal samples by the score of the likeliest pairs; problems last."""
         batch, count = right.shape
-        there = corr.weights > 0
+        there = corr.near_weights > 0
         chances = torch.where(there, right, 0.0)
         # An unlikely pair that agrees may be an inlier after all; padding does not score.
         vote = torch.where(there, _LEAST_VOTE + (1.0 - _LEAST_VOTE) * right, 0.0)

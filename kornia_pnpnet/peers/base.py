@@ -15,8 +15,8 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
 from kornia_pnpnet.core.checks import check_positive, check_whole
-from kornia_pnpnet.solver import check_inputs
-from kornia_pnpnet.types import PnPResult, Pose, camera_matrices
+from kornia_pnpnet.inputs import check_inputs
+from kornia_pnpnet.types import MIN_PAIRS, PnPResult, Pose, Status, camera_matrices
 
 __all__ = ["PeerPose", "PeerSolver"]
 
@@ -118,6 +118,8 @@ class PeerSolver(nn.Module):
         batch, count = world_points.shape[:2]
         world, img, cameras = (x.detach().cpu().double().numpy() for x in (world_points, img_points, intrinsics))
         cameras = np.broadcast_to(cameras, (batch, 3, 3))
+        with np.errstate(all="ignore"):  # a camera without a last entry is refused below
+            cameras = cameras / cameras[:, 2:, 2:]
         shares = np.ones((batch, count)) if weights is None else weights.detach().cpu().double().numpy()
         present = np.ones((batch, count), dtype=bool) if mask is None else mask.detach().cpu().numpy()
         used = present & (shares > 0)
@@ -125,7 +127,8 @@ class PeerSolver(nn.Module):
         rotation, translation = np.tile(np.eye(3), (batch, 1, 1)), np.zeros((batch, 3))
         first_rotation, first_translation = rotation.copy(), translation.copy()
         pair_weights, ok = np.zeros((batch, count)), np.zeros(batch, dtype=bool)
-        for i in np.flatnonzero(_solvable(world, img, cameras, shares, present)):
+        status = _status(world, img, cameras, shares, present)
+        for i in np.flatnonzero(status == Status.NOT_BELIEVED):
             found = self.solve_one(world[i, used[i]], img[i, used[i]], cameras[i])
             if found is None:
                 continue
@@ -152,6 +155,7 @@ class PeerSolver(nn.Module):
             back(cost),
             torch.from_numpy(ok).to(world_points.device),
             Pose(back(first_rotation), back(first_translation)),
+            torch.from_numpy(np.where(ok, Status.SOLVED, status).astype(np.int8)).to(world_points.device),
         )
 
 
@@ -180,15 +184,17 @@ class RobustPeer(PeerSolver):
             setattr(self, name, int(count))
 
 
-def _solvable(
+def _status(
     world: np.ndarray, img: np.ndarray, cameras: np.ndarray, weights: np.ndarray, present: np.ndarray
 ) -> np.ndarray:
-    """Return which problems are passed to the peer, (B,), by the rules of ``Normalize``."""
+    """Why problems are not passed to the peer, by the rules of ``Normalize``; ``NOT_BELIEVED`` for the others, (B,)."""
     sound = np.isfinite(world).all(-1) & np.isfinite(img).all(-1) & np.isfinite(weights) & (weights >= 0)  # (B, N)
-    enough = (present & (weights > 0)).sum(-1) >= 3
-    pinhole = (cameras[:, 0, 1] == 0) & (cameras[:, 1, 0] == 0) & (cameras[:, 2] == (0.0, 0.0, 1.0)).all(-1)
-    pinhole &= np.isfinite(cameras).all((-1, -2)) & (cameras[:, 0, 0] > 0) & (cameras[:, 1, 1] > 0)
-    return (sound | ~present).all(-1) & enough & pinhole
+    enough = (present & (weights > 0)).sum(-1) >= MIN_PAIRS
+    # No peer takes a skew.
+    pinhole = np.isfinite(cameras).all((-1, -2)) & (cameras[:, 0, 0] > 0) & (cameras[:, 1, 1] > 0)
+    pinhole &= (cameras[:, (0, 1, 2, 2), (1, 0, 0, 1)] == 0).all(-1)
+    reasons = [~(sound | ~present).all(-1), ~pinhole, ~enough]
+    return np.select(reasons, [Status.NOT_FINITE, Status.CAMERA, Status.TOO_FEW_PAIRS], Status.NOT_BELIEVED)
 
 
 def _squared_errors(

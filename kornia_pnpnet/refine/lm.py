@@ -338,8 +338,9 @@ class RobustWeightedLM(Configured):
         if start.corr.noise is None:
             believed = explains(projection, start.corr, start.prior)
         else:
-            believed = has_enough(projection, start.prior) & is_evident(projection, start.guided)
-        return Refinement(end.pose, weights, cost, end.solved & believed)
+            believed = is_evident(projection, start.guided)
+        in_front = has_enough(projection, start.prior)
+        return Refinement(end.pose, weights, cost, end.solved & believed & in_front, in_front)
 
     def compile(self, mode: str | None = None) -> None:
         """Compile with ``torch.compile``, in place: what is before, in, and after an iteration, each once.

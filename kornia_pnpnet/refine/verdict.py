@@ -16,12 +16,11 @@ from torch import Tensor
 from kornia_pnpnet.core.performance import exporting
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import Projection
-from kornia_pnpnet.types import Correspondences
+from kornia_pnpnet.types import MIN_PAIRS, Correspondences
 
 __all__ = [
     "MAX_ERROR",
     "MAX_FALSE_ALARMS",
-    "MIN_PAIRS",
     "Judged",
     "Thresholds",
     "chance_of_inlier",
@@ -32,8 +31,6 @@ __all__ = [
     "log_false_alarms",
 ]
 
-#: Pairs that determine a pose up to a few solutions.
-MIN_PAIRS = 3
 #: Largest standardised squared residual; points behind the camera have it.
 MAX_ERROR = 1e6
 #: A pose is evident when fewer poses than this are expected to have as many inliers by chance.

@@ -100,6 +100,7 @@ class EPnP(Configured):
         Returns:
             The pose, weights of 1, and ``ok``. Where ``ok`` is false the pose is finite.
         """
+        corr = corr._replace(weights=corr.near_weights)
         control = control_points(corr)
         plane_points = (corr.img_points.permute(2, 1, 0) / corr.focal).contiguous()  # (2, N, B)
         system = depth_system(control, plane_points)

@@ -28,14 +28,13 @@ from kornia_pnpnet.init.ransac.search import (
 )
 from kornia_pnpnet.refine.verdict import (
     MAX_FALSE_ALARMS,
-    MIN_PAIRS,
     Judged,
     Thresholds,
     chance_of_inlier,
     judge,
     log_false_alarms,
 )
-from kornia_pnpnet.types import Correspondences, Guess, Pose
+from kornia_pnpnet.types import MIN_PAIRS, Correspondences, Guess, Pose
 
 __all__ = ["RANSAC"]
 
@@ -102,6 +101,9 @@ class RANSAC(Configured):
         (True, [True, True, True, True])
     """
 
+    #: The weights say which of the pairs that are not near are inliers.
+    weighs_far_pairs = True
+
     def __init__(
         self,
         minimal: MinimalSolver,
@@ -158,7 +160,7 @@ class RANSAC(Configured):
         # Contiguous, so that a sum over pairs rounds alike at every place in the batch; the noise is not used.
         corr = corr._replace(noise=None).map(torch.Tensor.contiguous)
         with torch.no_grad():
-            share = (corr.weights > 0).to(corr.weights)
+            share = (corr.near_weights > 0).to(corr.weights)
             share = share / share.sum(-1, keepdim=True).clamp(min=1.0)
             centre = (share[..., None] * corr.world_points).sum(1)  # (B, 3), a constant
         # Weights relative to the largest weight, so that their unit does not matter.
