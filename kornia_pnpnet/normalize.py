@@ -14,7 +14,7 @@ from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_positive
 from kornia_pnpnet.core.configured import Configured
-from kornia_pnpnet.core.performance import exporting
+from kornia_pnpnet.core.performance import compiling, exporting
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import MIN_DEPTH_RATIO
 from kornia_pnpnet.types import MIN_PAIRS, Correspondences, Guess, Noise, Pose, Status
@@ -66,7 +66,7 @@ class Frame(NamedTuple):
     @property
     def valid(self) -> Tensor:
         """Whether the problem can be solved at all, bool, shape :math:`(B,)`."""
-        return self.status == Status.SOLVED
+        return self.status == Status.SOLVED.value
 
 
 class Normalize(Configured):
@@ -134,6 +134,7 @@ class Normalize(Configured):
             The normalised correspondences, with the problems last in memory, and the :class:`Frame` that undoes it.
         """
         batch, count = world_points.shape[:2]
+        padded = weights is not None or mask is not None
         if weights is None:
             weights = world_points.new_ones(batch, count) if mask is None else mask.to(world_points.dtype)
         else:
@@ -142,57 +143,58 @@ class Normalize(Configured):
         # of each camera, (9, B), of which fx, fy = [:5:4] and cx, cy = [2:6:3].
         rows = torch.cat((world_points.permute(2, 1, 0), img_points.permute(2, 1, 0), weights.mT[None]))
         zero, one = rows.new_zeros(1, batch), rows.new_ones(1, batch)
-        camera, is_camera = _pinhole(intrinsics.flatten(1).mT)
+        camera, is_camera = _pinhole(intrinsics.flatten(1).mT.contiguous())
 
         # Make inputs safe before computing with them: between this limit and its inverse, squares of squares neither
         # overflow nor vanish. NaN compares false.
         limit = torch.finfo(rows.dtype).max ** 0.25
         there = rows[5] != 0
         sizes = torch.where(there, rows.detach().abs(), zero)
-        is_finite = (sizes.amax((0, 1)) < torch.inf) & (sizes[5].amax(0) < limit) & (rows[5] >= 0).all(0)
+        size = sizes[:5].amax(0)  # of each pair
+        is_finite = (size.amax(0) < torch.inf) & (sizes[5].amax(0) < limit) & (rows[5] >= 0).all(0)
         if noise is not None:
             has_noise = _is_usable(noise)
             is_finite = is_finite & has_noise
-        there = there & is_camera & is_finite & (sizes[:5].amax(0) < limit)
-        rows = torch.where(there, rows, zero)
-        centre = torch.cat((zero, zero, zero, camera[2:6:3], zero))[:, None]
-        rows = torch.addcmul(rows, centre, there.to(rows.dtype), value=-1)
+        there = there & (is_camera & is_finite) & (size < limit)
+        rows = rows - torch.cat((zero, zero, zero, camera[2:6:3], zero))[:, None]
         focal = rows.new_full((), self.f_const)  # made on the device, so that a GPU need not wait for the CPU
         img_scales = focal / camera[:5:4]  # (2, B)
 
         # A pair far off is no reason to refuse the problem: beyond any angle or distance it is an outlier.
-        angle = (rows[3:5].detach().abs() * (img_scales.detach() / focal)[:, None]).amax(0)
-        sq_distance, typical = _distances(rows[:3].detach(), there)
+        angle = (rows[3:5].detach().abs() * (1.0 / camera.detach()[:5:4])[:, None]).amax(0)
+        sq_distance, typical = _distances(rows[:3].detach(), there, padded)
         there = there & (angle <= 1.0 / MIN_DEPTH_RATIO) & (sq_distance <= _LARGEST_DISTANCE**2 * typical)
-        few = (there.sum(0) < _MANY).to(rows.dtype)
-        near = there & (angle <= _FAR_ANGLE) & (sq_distance <= (_FAR + few * (_FAR_OF_FEW - _FAR)) ** 2 * typical)
+        far = torch.where(there.sum(0) < _MANY, _FAR_OF_FEW**2 * typical, _FAR**2 * typical)
+        near = there & (angle <= _FAR_ANGLE) & (sq_distance <= far)
         rows = torch.where(there, rows, zero)
 
         # Centre and scale by the pairs that are near.
         share = near.sum(0).to(rows.dtype).clamp(min=1.0).reciprocal()
-        by_near = torch.where(near, share, zero)
-        mean = (rows[:3] * by_near).sum(1)
-        centroid = mean if self.center else zero.expand(3, batch)
-        world = torch.where(there, rows[:3] - centroid[:, None], zero) if self.center else rows[:3]
-        centred = torch.where(near, (world if self.center else rows[:3] - mean[:, None]).detach(), zero)
-        size = torch.where(near, sizes[:3].amax(0), zero).amax(0)  # largest coordinate of the world
-        spread_out = _is_spread_out(centred, share, size) & (size.reciprocal() < limit)
-        mean_square = (world.square() * by_near).sum((0, 1))
+        centroid = mean = torch.where(near, rows[:3], zero).sum(1) * share
+        world = rows[:3]
+        if self.center:
+            world = torch.where(there, world - mean[:, None], zero)
+        else:
+            centroid = zero.expand(3, batch)
+        centred = world if self.center else world - mean[:, None]
+        largest = torch.where(near, sizes[:3], zero).amax((0, 1))
+        spread_out = _is_spread_out(torch.where(near, centred.detach(), zero), share, largest)
+        spread_out = spread_out & (largest.reciprocal() < limit)
+        mean_square = torch.where(near, world, zero).square().sum((0, 1)) * share
         scale = torch.where(spread_out, mean_square, one[0]).rsqrt() if self.scale else one[0]
 
-        status = torch.where(spread_out, Status.SOLVED, Status.DEGENERATE)
+        status = torch.where(spread_out, Status.SOLVED.value, Status.DEGENERATE.value)
         for fine, otherwise in (
             (there.sum(0) >= MIN_PAIRS, Status.TOO_FEW_PAIRS),
             (is_camera, Status.CAMERA),
             (is_finite, Status.NOT_FINITE),
         ):
-            status = torch.where(fine, status, otherwise)
-        valid = status == Status.SOLVED
+            status = torch.where(fine, status, otherwise.value)
+        valid = status == Status.SOLVED.value
         # An invalid problem becomes zeros, without gradient.
         factors = torch.where(valid, torch.cat((scale.expand(3, batch), img_scales, one)), zero)
-        horizontal, vertical, weight = rows[3:].unbind()
-        horizontal = horizontal - camera[1] / camera[4] * vertical  # skew
-        rows = torch.cat((world, torch.stack((horizontal, vertical, weight)))) * factors[:, None]
+        without_skew = torch.addcmul(rows[3:4], camera[1] / camera[4], rows[4:5], value=-1)
+        rows = torch.cat((world, without_skew, rows[4:])) * factors[:, None]
 
         order = None
         if self.order:
@@ -335,29 +337,32 @@ def _pinhole(camera: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(fine, camera, 1.0), fine
 
 
-def _distances(points: Tensor, there: Tensor) -> tuple[Tensor, Tensor]:
+def _distances(points: Tensor, there: Tensor, padded: bool) -> tuple[Tensor, Tensor]:
     """Squared distances (N, B) from the median of the points (3, N, B), and the distance that two thirds stay below.
 
     The typical distance (B,) is squared, too, and infinite where two thirds of the points coincide.
     """
-    counts = there.sum(0)
-    sq_distance = (points - _ranked(points, there, (counts - 1) // 2)[:, None]).square().sum(0)
+    counts = there.sum(0) if padded else points.shape[1]
+    middle = _ranked(points, there, (counts - 1) // 2)
+    sq_distance = (points - middle[:, None]).square().sum(0)
     typical = _ranked(sq_distance[None], there, 2 * counts // 3)[0]
     return sq_distance, torch.where(typical > 0, typical, torch.inf)
 
 
-def _ranked(values: Tensor, there: Tensor, rank: Tensor) -> Tensor:
-    """The value of a rank among those that are there: values (C, N, B), ranks (B,) from 0, result (C, B)."""
+def _ranked(values: Tensor, there: Tensor, rank: Tensor | int) -> Tensor:
+    """The value of a rank, from 0, among those that are there: values (C, N, B), ranks (B,), result (C, B)."""
     values = torch.where(there, values, torch.inf)
     count = values.shape[1]
-    if isinstance(count, int) and count <= _FEW:  # comparing all pairs is faster than sorting
+    if compiling() and isinstance(count, int) and count <= _FEW:  # comparisons become one loop, unlike sorting
         below = (values[:, None] < values[:, :, None]).sum(2)  # (C, N, B)
-        upto = (values[:, None] <= values[:, :, None]).sum(2)
-        found = torch.where((below <= rank) & (rank < upto), values, -torch.inf).amax(1)
-    else:
-        ascending = values.topk(count, 1, largest=False).values if exporting() else values.sort(1).values
-        found = ascending.gather(1, rank.clamp(min=0).expand(len(values), 1, -1))[:, 0]
-    return torch.where(found.isfinite(), found, 0.0)
+        found = torch.where(below <= rank, values, -torch.inf).amax(1)
+    elif isinstance(rank, Tensor) or exporting():
+        rank = torch.as_tensor(rank, device=values.device).expand(values.shape[-1]).clamp(min=0)
+        rows = [row.topk(count, 0, largest=False) if exporting() else row.sort(0) for row in values]
+        found = torch.stack([row.values.gather(0, rank[None])[0] for row in rows])
+    else:  # one coordinate after the other, which is faster
+        found = torch.stack([row.kthvalue(rank + 1, 0).values for row in values])
+    return torch.where(found.abs() < torch.inf, found, 0.0)
 
 
 def _is_spread_out(centred: Tensor, share: Tensor, size: Tensor) -> Tensor:

@@ -269,8 +269,8 @@ class PnPNet(nn.Module):
         finite = frame.valid & (pose.translation.sum(-1) + refined.weights.sum(-1) + refined.cost).isfinite()
         ok = finite & refined.ok if guess.ok is None else finite & refined.ok & guess.ok
         first_ok = frame.valid & first.translation.sum(-1).isfinite()
-        status = torch.where(refined.in_front, Status.NOT_BELIEVED, Status.BEHIND)
-        status = torch.where(ok, Status.SOLVED, torch.where(finite, status, Status.DEGENERATE))
+        status = torch.where(refined.in_front, Status.NOT_BELIEVED.value, Status.BEHIND.value)
+        status = torch.where(ok, Status.SOLVED.value, torch.where(finite, status, Status.DEGENERATE.value))
         status = torch.where(frame.valid, status.to(frame.status), frame.status)
         rotation, translation = _gate_pose(pose, ok, finite)
         return PnPResult(

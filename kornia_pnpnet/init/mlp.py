@@ -92,6 +92,9 @@ class MLPInit(Configured):
         (torch.Size([2, 3, 3]), torch.Size([2, 3]))
     """
 
+    #: The pairs that are not near have a weight of 0.
+    weighs_far_pairs = True
+
     def __init__(self, n: int, *, world_scale: float = 1.0, img_scale: float = 1000.0) -> None:
         super().__init__(locals())
         check_whole(3, n=n)
@@ -112,7 +115,7 @@ class MLPInit(Configured):
                 weight or not near enters as zeros; the network was not trained on such pairs.
 
         Returns:
-            The coarse pose, and weights of 1.
+            The coarse pose, and weights of 1, or 0 for pairs that are not near.
 
         Raises:
             ShapeError: when :math:`N` is not ``n``.
@@ -136,4 +139,4 @@ class MLPInit(Configured):
         rotation = rotation_about(axis, angle[0])
         translation = _run(self.translation, hidden).mT
         pose = Pose(rotation.to(features.dtype), translation.to(features.dtype))
-        return Guess(pose, torch.ones_like(corr.weights))
+        return Guess(pose, torch.ones_like(corr.weights) if corr.near is None else corr.near)
