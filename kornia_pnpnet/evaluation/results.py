@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NotRequired, TypedDict
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from kornia_pnpnet.core.files import atomic_open, digest
-from kornia_pnpnet.core.schema import Count, Positive, Share, from_json, read_json
 from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.metrics import PoseErrors, SuccessRate
 
@@ -19,81 +18,6 @@ __all__ = ["FORMAT", "format_table", "load_results", "resume", "row_errors", "sa
 
 FORMAT = 1
 _SHOWN_DIFFERENCES = 3
-
-
-# The form of results files, as far as a reader relies on it.
-class _Rate(TypedDict):
-    rate: Share
-    low: Share
-    high: Share
-    total: Count
-
-
-class _Quartiles(TypedDict):
-    q25: float
-    median: float
-    q75: float
-
-
-class _PerProblem(TypedDict):
-    rotation_error_deg: list[float]
-    translation_error: list[float]
-    ok: list[Share]
-
-
-class _Row(TypedDict):
-    data: str
-    solver: str
-    success: _Rate
-    rotation_error_deg: _Quartiles
-    translation_error: _Quartiles
-    ok: Share
-    us_per_problem: Positive
-    per_problem: NotRequired[_PerProblem]
-
-
-class _ProblemSet(TypedDict):
-    description: NotRequired[dict[str, Any] | None]
-    n: Count
-    max_rotation_deg: float
-    max_translation: float
-    unit: str
-
-
-class _Solver(TypedDict):
-    config: NotRequired[dict[str, Any] | None]
-
-
-class _Environment(TypedDict):
-    versions: NotRequired[dict[str, str | None]]
-    commit: NotRequired[str | None]
-
-
-class _Evaluation(TypedDict):
-    environment: _Environment
-    solvers: dict[str, _Solver]
-    data: dict[str, _ProblemSet]
-    rows: list[_Row]
-
-
-class _Complexity(TypedDict):
-    n: list[Count]
-    counts: dict[str, list[float | None]]
-    ransac: list[str]
-
-
-_FORMS: dict[str, type] = {"evaluation": _Evaluation, "complexity": _Complexity}
-
-
-def _contradictions(results: Mapping[str, Any]) -> Iterator[str]:
-    """Describe names in rows that have no entry, and lists of different lengths."""
-    for i, row in enumerate(results.get("rows", ())):
-        lists = row.get("per_problem", {})
-        if len({len(lists[key]) for key in _PerProblem.__annotations__ if lists}) > 1:
-            yield f"rows[{i}].per_problem has lists of different lengths"
-        for key, names in (("data", "data"), ("solver", "solvers")):
-            if row[key] not in results[names]:
-                yield f"rows[{i}].{key} is {row[key]!r}, which {names} does not contain"
 
 
 def row_errors(row: Mapping[str, Any]) -> tuple[PoseErrors, Tensor]:
@@ -145,20 +69,9 @@ def load_results(path: str | Path, *, complexity: bool = False) -> dict[str, Any
         FileNotFoundError: when there is no such file.
         ValueError: when the file is not a results file of this format; the message names the first wrong entry.
     """
-    results = read_json(path, "a results file")
-    if not isinstance(results, dict) or results.get("format") != FORMAT:
-        raise ValueError(f"'{path}' is not a results file of format {FORMAT}.")
-    kinds = tuple(_FORMS) if complexity else ("evaluation",)
-    kind = results.get("kind", "evaluation")
-    if kind not in kinds:
-        raise ValueError(f"'{path}' is not a results file of {' or '.join(kinds)}.")
-    try:
-        results = from_json(_FORMS[kind], results)
-        for contradiction in _contradictions(results):
-            raise ValueError(contradiction)
-    except ValueError as error:
-        raise ValueError(f"'{path}' is not a results file of {kind}: {error}.") from error
-    return results
+    from kornia_pnpnet.evaluation.forms import read_results  # needs pydantic
+
+    return read_results(path, complexity)
 
 
 def source_digest() -> str:
