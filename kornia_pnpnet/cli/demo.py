@@ -83,13 +83,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def verdict(results: Mapping[str, Any]) -> str:
-    """One sentence that says which solver solved the most problems of each set, and which one was the fastest.
+    """One sentence on the solvers that solved the most problems of each set, and on the fastest one.
 
-    Args:
-        results: what :func:`~kornia_pnpnet.evaluation.evaluate` returned.
-
-    Returns:
-        The sentence. Solvers whose 95 % interval contains the highest success rate share the first place.
+    Solvers whose 95 % interval contains the highest success rate share the first place.
     """
     sentences = []
     for data in results["data"]:

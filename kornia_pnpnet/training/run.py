@@ -135,11 +135,6 @@ class Run:
         """Whether all updates are done."""
         return self.update >= self.settings.updates
 
-    def share(self, problems: Problems) -> Problems:
-        """Every ``world_size``-th problem: the batches of all processes together are the batch of one process."""
-        part = slice(self.fabric.global_rank, None, self.fabric.world_size)
-        return problems.map(lambda x: x[part].to(self.fabric.device))
-
     def forward(self, problems: Problems, ramp: float) -> LossTerms:
         """Solve the problems and compare the results with the true poses."""
         inputs = problems.world_points, problems.img_points, problems.intrinsics
@@ -166,15 +161,14 @@ class Run:
         bad, stopped = _agree(self.fabric, not bool(torch.isfinite(terms.total + norm)), stop.is_set())
         self.update += 1
         if bad:
-            self.skip()
+            self._skip()
         else:
             self.fabric_optimizer.step()
         self.clock.lap("optimizer")
         self.interrupted = stopped and not self.finished
         return _Step(terms, ramp, self.settings.lr * factor, norm)
 
-    def skip(self) -> None:
-        """Count a step that is not finite. Too many such steps end the run."""
+    def _skip(self) -> None:
         self.skipped += 1
         if self.fabric.is_global_zero:
             _log.warning("update %s: loss or gradient not finite, step skipped (%s so far)", self.update, self.skipped)
@@ -186,14 +180,16 @@ class Run:
 
     def log(self, step: _Step, validates: bool) -> None:
         """Append a row to the learning curves, with a validation or without."""
-        means = _mean(self.fabric, torch.stack([term.detach() for term in step.terms]))
+        values = torch.stack([term.detach() for term in step.terms])
+        if self.fabric.world_size > 1:
+            values = torch.as_tensor(self.fabric.all_reduce(values, reduce_op="mean"))
         if self.history is None:
             return
         self.clock.lap("rest")
         shares = self.clock.shares(self.logged_seconds)
         elapsed = sum(self.clock.seconds.values()) - sum(self.logged_seconds.values())
         speed = (self.update - self.logged_update) / max(elapsed, 1e-9)
-        row: dict[str, float] = {"update": self.update, **dict(zip(step.terms._fields, means, strict=True))}
+        row: dict[str, float] = {"update": self.update, **dict(zip(step.terms._fields, values.tolist(), strict=True))}
         if step.ramp == 0.0:  # nothing was refined yet
             row = {name: value for name, value in row.items() if not name.startswith("refined")}
         row |= {"ramp": step.ramp, "lr": step.lr, "grad_norm": step.grad_norm.item(), "skipped": self.skipped}
@@ -223,7 +219,7 @@ class Run:
     def report(self) -> FitReport:
         """Close the learning curves and sum up."""
         if self.history is not None:
-            self.history.close()
+            self.history.board.close()
         self.model.eval()
         self.clock.lap("rest")
         seconds = sum(self.clock.seconds.values())
@@ -249,13 +245,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _plain(entry) for key, entry in value.items()}
     return [_plain(entry) for entry in value] if isinstance(value, (list, tuple)) else value
-
-
-def _mean(fabric: Fabric, values: Tensor) -> list[float]:
-    """The mean of each value over all processes."""
-    if fabric.world_size > 1:
-        values = torch.as_tensor(fabric.all_reduce(values, reduce_op="mean"))
-    return values.tolist()
 
 
 def _agree(fabric: Fabric, *flags: bool) -> list[bool]:
