@@ -1,5 +1,6 @@
 """The form of results files, as far as their readers rely on it. Needs pydantic."""
 
+# ruff: noqa: UP013  (a few lines for each small mapping)
 from __future__ import annotations
 
 from pathlib import Path
@@ -13,23 +14,15 @@ from kornia_pnpnet.core.schema import STRICT, Count, Kept, Positive, Share, read
 __all__ = ["read_results"]
 
 
-class _Rate(TypedDict):
-    rate: Share
-    low: Share
-    high: Share
-    total: Count
-
-
-class _Quartiles(TypedDict):
-    q25: float
-    median: float
-    q75: float
-
-
-class _PerProblem(TypedDict):
-    rotation_error_deg: list[float]
-    translation_error: list[float]
-    ok: list[Share]
+_Rate = TypedDict("_Rate", {"rate": Share, "low": Share, "high": Share, "total": Count})
+_Quartiles = TypedDict("_Quartiles", {"q25": float, "median": float, "q75": float})
+_PerProblem = TypedDict(
+    "_PerProblem", {"rotation_error_deg": list[float], "translation_error": list[float], "ok": list[Share]}
+)
+_Solver = TypedDict("_Solver", {"config": NotRequired[dict[str, Any] | None]})
+_Environment = TypedDict(
+    "_Environment", {"versions": NotRequired[dict[str, str | None]], "commit": NotRequired[str | None]}
+)
 
 
 class _Row(TypedDict):
@@ -49,15 +42,6 @@ class _ProblemSet(TypedDict):
     max_rotation_deg: float
     max_translation: float
     unit: str
-
-
-class _Solver(TypedDict):
-    config: NotRequired[dict[str, Any] | None]
-
-
-class _Environment(TypedDict):
-    versions: NotRequired[dict[str, str | None]]
-    commit: NotRequired[str | None]
 
 
 class _Evaluation(TypedDict):
@@ -83,10 +67,9 @@ def _consistent(results: _Evaluation) -> _Evaluation:
     for i, row in enumerate(results["rows"]):
         if len({len(values) for values in row.get("per_problem", {}).values()}) > 1:  # type: ignore[arg-type]
             raise ValueError(f"rows[{i}].per_problem has lists of different lengths")
-        if row["data"] not in results["data"]:
-            raise ValueError(f"rows[{i}].data is {row['data']!r}, which data does not contain")
-        if row["solver"] not in results["solvers"]:
-            raise ValueError(f"rows[{i}].solver is {row['solver']!r}, which solvers does not contain")
+        for key, name, names in (("data", row["data"], "data"), ("solver", row["solver"], "solvers")):
+            if name not in results[names]:  # type: ignore[literal-required]
+                raise ValueError(f"rows[{i}].{key} is {name!r}, which {names} does not contain")
     return results
 
 

@@ -50,9 +50,8 @@ def save_results(results: Mapping[str, Any], path: str | Path) -> None:
         ValueError: when a number is not finite, which JSON cannot express.
         OSError: when the file cannot be written.
     """
-    text = json.dumps(results, separators=(",", ":"), allow_nan=False) + "\n"
     with atomic_open(path, encoding="utf-8") as file:
-        file.write(text)
+        file.write(json.dumps(results, separators=(",", ":"), allow_nan=False) + "\n")
 
 
 def load_results(path: str | Path, *, complexity: bool = False) -> dict[str, Any]:
@@ -81,21 +80,10 @@ def source_digest() -> str:
 
 
 def resume(plan: Mapping[str, Any], path: str | Path) -> dict[str, Any]:
-    """Join the plan of an evaluation with the results file that the evaluation continues.
+    """Join the plan of an evaluation, its results without rows, with the rows of the results file at ``path``, if any.
 
     A file can be continued by the same code and versions. The plan must have all solvers and data sets of the file,
-    unchanged, and may have more.
-
-    Args:
-        plan: the results before the first row.
-        path: the results file. It may be missing or have no rows.
-
-    Returns:
-        The results of the file with the plan's solvers and data; the plan when there are no rows to continue.
-
-    Raises:
-        ValueError: when the file is not a results file, or holds rows of another plan; the message names the
-            differences.
+    unchanged, and may have more; or else a ``ValueError`` names the differences.
     """
     fresh: dict[str, Any] = json.loads(json.dumps(plan))  # tuples become lists, as in a file
     there = load_results(path) if Path(path).exists() else fresh
@@ -132,11 +120,6 @@ def _differences(there: Mapping[str, Any], plan: Mapping[str, Any]) -> list[str]
     return found
 
 
-def _three_digits(value: float) -> str:
-    """Format three significant digits, with zeros at the end: 0.160."""
-    return f"{value:#.3g}".rstrip(".")
-
-
 def format_table(results: Mapping[str, Any]) -> str:
     """Format the results as a Markdown table that also reads well as plain text.
 
@@ -149,14 +132,15 @@ def format_table(results: Mapping[str, Any]) -> str:
     header = ("data", "solver", "success [95 %]", "median rotation error", "median translation error")
     rows = []
     for row in results["rows"]:
-        unit = results["data"][row["data"]]["unit"]
+        errors = (row[name]["median"] for name in PoseErrors._fields)
+        rotation, translation = (f"{error:#.3g}".rstrip(".") for error in errors)  # zeros at the end stay: 0.160
         rows.append(
             (
                 row["data"],
                 row["solver"],
                 str(SuccessRate._make(row["success"][key] for key in SuccessRate._fields)),
-                f"{_three_digits(row['rotation_error_deg']['median'])}°",
-                f"{_three_digits(row['translation_error']['median'])} {unit}".rstrip(),
+                f"{rotation}°",
+                f"{translation} {results['data'][row['data']]['unit']}".rstrip(),
                 f"{row['us_per_problem']:.0f}",
                 f"{100 * row['ok']:.1f} %",
             )
