@@ -170,7 +170,7 @@ def _tensors(source: Path, arrays: dict[str, np.ndarray], intrinsics: Tensor | N
         raise InputError(source, f"world_points must have the shape (B, N, 3) with N at least 3, got {shape}")
     count, n = shape[:2]
     sigmas: list[tuple[int, ...]] = [(), (count,), (count, n)]
-    shapes = {
+    shapes: dict[str, list[tuple[int, ...]]] = {
         "world_points": [shape],
         "img_points": [(count, n, 2)],
         "intrinsics": [(3, 3), (count, 3, 3)],
