@@ -93,17 +93,10 @@ def read_column(
     *,
     gaps: bool = False,
 ) -> list[float]:
-    """Convert a column of a CSV file to numbers.
-
-    Args:
-        path: the file, for error messages.
-        rows: rows of :func:`read_rows`.
-        column: name of the column.
-        read: converts the text of a cell to a number.
-        gaps: allow cells that are empty or not finite. Their value is NaN.
+    """Convert a column of :func:`read_rows` to numbers with ``read``. With ``gaps``, an empty cell is NaN.
 
     Raises:
-        ValueError: when there is no such column, or a cell is not a number.
+        ValueError: when there is no such column, or a cell is not a finite number; the message names ``path``.
     """
     if column not in rows[0]:
         raise ValueError(f"'{path}' has no column '{column}'.")
