@@ -128,8 +128,7 @@ def _train(seconds: float, folder: Path) -> Path | None:
         return None
     print(f"\nTraining a new network for about {seconds:.0f} s:", flush=True)
     history = train_briefly(seconds, folder)
-    with history.open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = list(csv.DictReader(history.read_text().splitlines()))
     for column in (name for name in rows[0] if name.startswith("val/") and name.endswith("/success")):
         filled = [row for row in rows if row[column]]
         if filled:

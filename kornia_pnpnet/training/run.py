@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import resource
 import sys
@@ -94,7 +95,8 @@ class Run:
         resume: bool,
     ) -> None:
         self.model, self.loss, self.settings, self.fabric = model, loss, settings, fabric
-        self.identity = _plain({"settings": asdict(settings), "model": model.config(), **identity})
+        plain = json.dumps({"settings": asdict(settings), "model": model.config(), **identity})
+        self.identity = json.loads(plain)  # tuples become lists, as in a checkpoint
         self.checkpoint = folder / CHECKPOINT_NAME
         self.update, self.skipped, self.interrupted = 0, 0, False
         self.rates = ""  # success rates of the last validation, for the progress bar
@@ -238,13 +240,6 @@ class Run:
 def describe_shares(shares: Mapping[str, float]) -> str:
     """Shares of the time as a line of a log, for example ``"data 1 %, forward 40 %"``."""
     return ", ".join(f"{stage} {100 * share:.0f} %" for stage, share in shares.items())
-
-
-def _plain(value: Any) -> Any:
-    """Tuples as lists: what a checkpoint gives back."""
-    if isinstance(value, dict):
-        return {key: _plain(entry) for key, entry in value.items()}
-    return [_plain(entry) for entry in value] if isinstance(value, (list, tuple)) else value
 
 
 def _agree(fabric: Fabric, *flags: bool) -> list[bool]:
