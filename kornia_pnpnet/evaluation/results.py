@@ -68,8 +68,10 @@ def load_results(path: str | Path, *, complexity: bool = False) -> dict[str, Any
         FileNotFoundError: when there is no such file.
         ValueError: when the file is not a results file of this format; the message names the first wrong entry.
     """
-    from kornia_pnpnet.evaluation.forms import read_results  # needs pydantic
-
+    try:
+        from kornia_pnpnet.evaluation.forms import read_results
+    except ImportError as error:
+        raise ImportError("reading results files needs pydantic: pip install 'kornia_pnpnet[eval]'") from error
     return read_results(path, complexity)
 
 
