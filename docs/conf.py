@@ -30,6 +30,8 @@ nb_render_markdown_format = "myst"
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
+# Aliases with rules for pydantic, by what a reader needs to know.
+autodoc_type_aliases = {"Count": "int", "ModelConfig": "dict", "RunConfig": "dict", "RunEnvironment": "dict"}
 python_use_unqualified_type_names = True
 # A name of ours that leads nowhere is an error. Those of other projects and private ones have no page here.
 nitpicky = True

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_devices, check_poses, check_whole
-from kornia_pnpnet.core.schema import Count, Share
 from kornia_pnpnet.geometry import rotation_angle
 from kornia_pnpnet.types import Pose
 
@@ -41,10 +40,10 @@ class SuccessRate(NamedTuple):
         total: number of trials.
     """
 
-    rate: Share
-    low: Share
-    high: Share
-    total: Count
+    rate: float
+    low: float
+    high: float
+    total: int
 
     def __str__(self) -> str:
         return f"{100 * self.rate:.1f} % [{100 * self.low:.1f}, {100 * self.high:.1f}]"

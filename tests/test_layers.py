@@ -34,6 +34,7 @@ EXTRAS = (
     "poselib",
     "pyarrow",
     "pycolmap",
+    "pydantic",
     "tensorboard",
 )
 
@@ -45,6 +46,7 @@ OWNERS = {
     "pycolmap": {"data.colmap", "peers"},
     "poselib": {"peers"},
     "pyarrow": {"cli.shards"},
+    "pydantic": {"core.schema", "evaluation.forms"},
     "onnxscript": {"export"},
 }
 

@@ -1,7 +1,6 @@
 """Results of runs: their files, cards and summaries, sound or damaged."""
 
 import json
-import math
 import shutil
 from collections import Counter
 from functools import partial
@@ -9,18 +8,17 @@ from functools import partial
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from kornia.core.exceptions import BaseError
 from strategies import ERRORS, WORD, damage, many, names_the_file, options, places_in, spoiled
 
 from kornia_pnpnet import MLPInit, PnPNet, RobustWeightedLM
 from kornia_pnpnet.core.files import write_json
-from kornia_pnpnet.core.schema import from_json, to_json
+from kornia_pnpnet.core.schema import to_json
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.pretrained import WEIGHTS_FOLDER
 from kornia_pnpnet.training import FitReport
 from kornia_pnpnet.training.card import write_model_card
 from kornia_pnpnet.training.collect import collect_weights, summarize_runs
-from kornia_pnpnet.training.results import RunResults, find_results, load_run, run_results
+from kornia_pnpnet.training.results import find_results, load_run, run_results
 
 
 def made_run(folder):
@@ -48,7 +46,8 @@ def test_spoiled_results_of_runs_are_an_error_of_ours(tmp_path):
         card.unlink(missing_ok=True)
         try:
             loaded = load_run(path)
-            assert find_results(run_folder / "weights") == loaded == from_json(RunResults, to_json(loaded))
+            write_json(tmp_path / "again.json", to_json(loaded))
+            assert find_results(run_folder / "weights") == loaded == load_run(tmp_path / "again.json")
         except ValueError as error:
             outcomes["refused"] += 1
             names_the_file(error, path)
@@ -71,13 +70,13 @@ def test_damaged_runs_are_an_error_of_ours(tmp_path):
     outcomes = Counter()
 
     @many(100)
-    @given(st.sampled_from(sorted(files)), st.data(), st.booleans(), st.sampled_from([100, 3, 2, 1]))
-    def run(name, data, last, most_rows):
+    @given(st.sampled_from(sorted(files)), st.data(), st.booleans())
+    def run(name, data, last):
         (spoilt / name).write_bytes(data.draw(damage(files[name])))
         folder = tmp_path / "collected"
         shutil.rmtree(folder, ignore_errors=True)
         try:
-            collect_weights([sound, spoilt] if last else [spoilt, sound], folder, most_rows=most_rows)
+            collect_weights([sound, spoilt] if last else [spoilt, sound], folder)
         except ERRORS:
             outcomes["refused"] += 1
             assert not folder.exists()
@@ -89,9 +88,6 @@ def test_damaged_runs_are_an_error_of_ours(tmp_path):
 
     run()
     assert min(outcomes["refused"], outcomes["works"]) >= 5
-    for most_rows in (0, -1, 0.5, math.nan):
-        with pytest.raises(BaseError):
-            collect_weights([sound], tmp_path / "none", most_rows=most_rows)
     with pytest.raises(ValueError, match="at least one run"):
         collect_weights([], tmp_path / "none")
     (spoilt / "history.csv").unlink()

@@ -77,14 +77,7 @@ def add_arbitrary_unit(parser: argparse.ArgumentParser) -> None:
 
 
 def load_solver_without_truth(name: str) -> nn.Module:
-    """Make the solver named by ``--solver``, but no bound, which needs the true pose.
-
-    Args:
-        name: see :func:`~kornia_pnpnet.evaluation.named_solvers.load_solver`.
-
-    Raises:
-        ValueError: when the name is that of a bound.
-    """
+    """Make the solver named by ``--solver``; raise a ``ValueError`` for a bound, which needs the true pose."""
     if name.partition(":")[0] in BOUNDS:
         raise ValueError(f"--solver: {name} is a bound, which needs the true pose: use it with `pnpnet evaluate` only")
     return load_solver(name)

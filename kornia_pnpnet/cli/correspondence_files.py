@@ -7,11 +7,13 @@ import io
 import math
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
+
+from kornia_pnpnet.core.files import read_npz
 
 __all__ = [
     "ImageCorrespondences",
@@ -54,21 +56,7 @@ class ImageCorrespondences(NamedTuple):
 
 
 def camera_matrix(text: str) -> Tensor:
-    """Read a camera from ``fx,fy,cx,cy`` in pixels.
-
-    Args:
-        text: four numbers with commas between them; the focal lengths must be positive.
-
-    Returns:
-        The camera matrix, shape :math:`(3, 3)`, float64.
-
-    Raises:
-        InputError: for other text or a focal length that is not positive.
-
-    Example:
-        >>> camera_matrix("100,100,320,240")[0]
-        tensor([100.,   0., 320.], dtype=torch.float64)
-    """
+    """Read ``fx,fy,cx,cy`` in pixels as a camera matrix, shape (3, 3), float64."""
     try:
         fx, fy, cx, cy = (float(part) for part in text.split(","))
     except ValueError:
@@ -78,20 +66,11 @@ def camera_matrix(text: str) -> Tensor:
 
 
 def check_camera(matrix: Tensor, source: str | Path) -> Tensor:
-    r"""Return a camera matrix unchanged when it is one of a pinhole camera without skew.
-
-    Args:
-        matrix: shape :math:`(3, 3)`.
-        source: the file or option that holds the matrix, for the message.
-
-    Raises:
-        InputError: for any other matrix.
-    """
+    """Return the camera matrix of a pinhole camera without skew; raise an :class:`InputError` for any other matrix."""
     if not matrix.isfinite().all():
         raise InputError(source, "the intrinsics are not finite")
     if matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
-        focal = f"{matrix[0, 0]:g} and {matrix[1, 1]:g}"
-        raise InputError(source, f"the focal lengths must be positive, got {focal}")
+        raise InputError(source, f"the focal lengths must be positive, got {matrix[0, 0]:g} and {matrix[1, 1]:g}")
     if matrix[0, 1] != 0:
         raise InputError(source, f"the camera must have no skew, got {matrix[0, 1]:g}")
     if matrix[1, 0] != 0 or not torch.equal(matrix[2], matrix.new_tensor((0.0, 0.0, 1.0))):
@@ -100,24 +79,17 @@ def check_camera(matrix: Tensor, source: str | Path) -> Tensor:
 
 
 def read_correspondences(path: str | Path) -> ImageCorrespondences:
-    """Read the correspondences of one image.
+    """Read the correspondences of one image: at least three, all finite, in the order of the file.
 
     Args:
         path: a CSV file with the header ``X,Y,Z,u,v`` in any order, an optional column ``weight`` and any others; or
             an NPZ file with the arrays ``world_points`` (N, 3), ``img_points`` (N, 2) and optionally ``weights``
-            (N,) and ``intrinsics`` (3, 3). Nothing is unpickled.
-
-    Returns:
-        At least three finite correspondences, in the order of the file.
-
-    Raises:
-        InputError: when the content cannot be used.
-        OSError: when the file cannot be read.
+            (N,) and ``intrinsics`` (3, 3).
     """
     path = Path(path)
     content = path.read_bytes()
     is_npz = path.suffix.lower() == ".npz" or content.startswith(_ZIP_MAGIC)
-    read = _read_npz(path, content) if is_npz else _read_csv(path, content)
+    read = _read_npz(path) if is_npz else _read_csv(path, content)
     if len(read.world_points) < _MIN_COUNT:
         raise InputError(path, f"a pose needs at least {_MIN_COUNT} correspondences, got {len(read.world_points)}")
     return read
@@ -159,8 +131,8 @@ def _number(path: Path, line: int, column: str, cell: str) -> float:
     return value
 
 
-def _read_npz(path: Path, content: bytes) -> ImageCorrespondences:
-    arrays = read_arrays(path, io.BytesIO(content), ("world_points", "img_points", "weights", "intrinsics"))
+def _read_npz(path: Path) -> ImageCorrespondences:
+    arrays = read_arrays(path, ("world_points", "img_points", "weights", "intrinsics"))
     count = len(arrays["world_points"]) if arrays["world_points"].ndim else 0
     shapes = {"world_points": (count, 3), "img_points": (count, 2), "weights": (count,), "intrinsics": (3, 3)}
     check_shapes(path, arrays, {name: (shape,) for name, shape in shapes.items()})
@@ -175,25 +147,12 @@ def _read_npz(path: Path, content: bytes) -> ImageCorrespondences:
     return ImageCorrespondences(**tensors)
 
 
-def read_arrays(path: Path, stream: IO[bytes], names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Read arrays of an NPZ file without unpickling.
-
-    Args:
-        path: the path of the file, for messages.
-        stream: the content of the file.
-        names: the arrays to read. Only ``world_points`` and ``img_points`` must be in the file.
-
-    Returns:
-        The arrays that are in the file, by name.
-
-    Raises:
-        InputError: when the file is no NPZ file of plain arrays, or ``world_points`` or ``img_points`` is missing.
-    """
+def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
+    """Read the arrays that the NPZ file ``path`` has, of which only the points must be there."""
     try:
-        with np.load(stream, allow_pickle=False) as file:
-            arrays = {name: np.asarray(file[name]) for name in names if name in file.files}
-    except Exception as error:  # numpy, zipfile and zlib raise a dozen types of errors for broken files
-        raise InputError(path, f"not an NPZ file of plain arrays: {error}") from None
+        arrays = read_npz(path, names)
+    except ValueError as error:
+        raise InputError(path, str(error)) from None
     check_points_present(path, arrays, "array")
     return arrays
 

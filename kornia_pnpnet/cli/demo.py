@@ -83,13 +83,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def verdict(results: Mapping[str, Any]) -> str:
-    """One sentence that says which solver solved the most problems of each set, and which one was the fastest.
+    """One sentence on the solvers that solved the most problems of each set, and on the fastest one.
 
-    Args:
-        results: what :func:`~kornia_pnpnet.evaluation.evaluate` returned.
-
-    Returns:
-        The sentence. Solvers whose 95 % interval contains the highest success rate share the first place.
+    Solvers whose 95 % interval contains the highest success rate share the first place.
     """
     sentences = []
     for data in results["data"]:
@@ -132,8 +128,7 @@ def _train(seconds: float, folder: Path) -> Path | None:
         return None
     print(f"\nTraining a new network for about {seconds:.0f} s:", flush=True)
     history = train_briefly(seconds, folder)
-    with history.open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = list(csv.DictReader(history.read_text().splitlines()))
     for column in (name for name in rows[0] if name.startswith("val/") and name.endswith("/success")):
         filled = [row for row in rows if row[column]]
         if filled:

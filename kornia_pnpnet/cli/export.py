@@ -19,10 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", metavar="ONNX", help="the file to write")
     parser.add_argument("--solver", metavar="NAME", default="pnpnet-set", help="default: pnpnet-set")
     parser.add_argument(
-        "--n",
-        metavar="N",
-        type=whole_number(1),
-        help="correspondences per problem; default: any number",
+        "--n", metavar="N", type=whole_number(1), help="correspondences per problem; default: any number"
     )
 
 

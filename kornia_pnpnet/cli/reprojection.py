@@ -38,14 +38,9 @@ class Reprojection(NamedTuple):
 def reproject(
     world_points: Tensor, img_points: Tensor, intrinsics: Tensor, pose: Pose, limit_px: float | None = None
 ) -> Reprojection:
-    r"""Compare the pixels of one image with the projections of its world points.
+    """Compare the pixels (N, 2) of one image with the projections of its world points (N, 3).
 
-    Args:
-        world_points: shape :math:`(N, 3)`.
-        img_points: pixels, shape :math:`(N, 2)`.
-        intrinsics: shape :math:`(3, 3)`.
-        pose: world-to-camera pose with a batch of 1.
-        limit_px: error in pixels above which a correspondence is rejected. With ``None`` the :func:`rejection_limit`.
+    The pose has a batch of 1. Errors above ``limit_px`` are rejected, or above the :func:`rejection_limit`.
     """
     cam_points = transform(pose, world_points[None])[0]
     in_front = cam_points[:, 2:] > 0
@@ -57,14 +52,7 @@ def reproject(
 
 
 def rejection_limit(errors_px: Tensor) -> float:
-    r"""Robust estimate of three standard deviations of the inliers' reprojection errors.
-
-    Args:
-        errors_px: reprojection errors of one image in pixels, shape :math:`(N,)`. Errors that are not finite are
-            ignored.
-
-    Returns:
-        Three times 1.4826 times the median error in pixels, at least 3 px.
+    """Robust estimate of three standard deviations of the inliers' errors, at least 3 px; only finite errors count.
 
     Example:
         >>> rejection_limit(torch.tensor([0.1, 0.2, 900.0])), rejection_limit(torch.tensor([9.0, 10.0, 11.0]))

@@ -155,12 +155,8 @@ def _claim(out: Path, name: str, solver: nn.Module, replaced: set[str]) -> None:
 
 def _solve_npz(solver: nn.Module, shard: Path, target: Path, intrinsics: Tensor | None, batch: int) -> tuple[int, int]:
     """Solve an NPZ shard; return the number of solved problems and of all problems."""
-    try:
-        with shard.open("rb") as stream:
-            arrays = read_arrays(shard, stream, _INPUTS)
-    except OSError as error:
-        raise InputError(shard, error.strerror or str(error)) from None
-    results = list(_solve(solver, shard, _tensors(shard, arrays, intrinsics), batch))
+    tensors = _tensors(shard, read_arrays(shard, _INPUTS), intrinsics)
+    results = list(_solve(solver, shard, tensors, batch))
     outputs = {key: np.concatenate([getattr(x, key).numpy() for x in results]) for key in _OUTPUTS}
     with atomic_open(target, "wb") as file:
         np.savez(file, allow_pickle=False, **outputs)
@@ -173,13 +169,14 @@ def _tensors(source: Path, arrays: dict[str, np.ndarray], intrinsics: Tensor | N
     if len(shape) != 3 or shape[2] != 3 or shape[1] < 3:
         raise InputError(source, f"world_points must have the shape (B, N, 3) with N at least 3, got {shape}")
     count, n = shape[:2]
+    sigmas: list[tuple[int, ...]] = [(), (count,), (count, n)]
     shapes: dict[str, list[tuple[int, ...]]] = {
         "world_points": [shape],
         "img_points": [(count, n, 2)],
         "intrinsics": [(3, 3), (count, 3, 3)],
         "weights": [(count, n)],
-        "img_sigma": [(), (count,), (count, n)],
-        "world_sigma": [(), (count,), (count, n)],
+        "img_sigma": sigmas,
+        "world_sigma": sigmas,
     }
     check_shapes(source, arrays, shapes)
     tensors = {key: torch.from_numpy(array.astype(np.float32)) for key, array in arrays.items()}
@@ -223,27 +220,16 @@ def _solve_parquet(
         except Exception as error:  # Arrow raises half a dozen types of errors for broken files
             raise InputError(shard, f"not a Parquet file of lists of numbers: {error}") from None
 
-    lists = pyarrow.list_(pyarrow.float32())
-    types = {
-        "rotation": lists,
-        "translation": lists,
-        "weights": lists,
-        "cost": pyarrow.float32(),
-        "ok": pyarrow.bool_(),
-    }
-    schema = pyarrow.schema(types)
+    types = dict.fromkeys(_OUTPUTS, pyarrow.list_(pyarrow.float32()))
+    schema = pyarrow.schema(types | {"cost": pyarrow.float32(), "ok": pyarrow.bool_()})
     solved = count = 0
     with atomic_open(target, "wb") as file, parquet.ParquetWriter(file, schema) as writer:
         for columns in read():
             arrays, sizes = _padded(shard, columns)
             (result,) = _solve(solver, shard, _tensors(shard, arrays, intrinsics), batch)
-            outputs: dict[str, Any] = {
-                "rotation": [*result.rotation.flatten(1).numpy()],
-                "translation": [*result.translation.numpy()],
-                "weights": [x[:size] for x, size in zip(result.weights.numpy(), sizes, strict=True)],
-                "cost": result.cost.numpy(),
-                "ok": result.ok.numpy(),
-            }
+            outputs: dict[str, Any] = {key: [*getattr(result, key).flatten(1).numpy()] for key in _OUTPUTS[:2]}
+            outputs["weights"] = [x[:size] for x, size in zip(result.weights.numpy(), sizes, strict=True)]
+            outputs |= {"cost": result.cost.numpy(), "ok": result.ok.numpy()}
             writer.write_table(pyarrow.table(outputs, schema=schema))
             solved, count = solved + int(result.ok.sum()), count + len(sizes)
     return solved, count

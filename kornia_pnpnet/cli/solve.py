@@ -63,11 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--batch", action="store_true", help="FILE are shards of many problems, or folders of shards")
     parser.add_argument("--out", metavar="FOLDER", help="where --batch writes poses; default: outputs/poses")
     parser.add_argument(
-        "--batch-size",
-        metavar="B",
-        type=whole_number(1),
-        default=10_000,
-        help="problems per call; default: 10000",
+        "--batch-size", metavar="B", type=whole_number(1), default=10_000, help="problems per call; default: 10000"
     )
     parser.add_argument("--overwrite", action="store_true", help="also solve the shards that have results")
 

@@ -37,17 +37,9 @@ def _is_number(value: Any) -> bool:
 
 
 def check_whole(least: int, most: int | None = None, /, **values: Any) -> None:
-    """Check that each value is an integer of at least ``least`` and, unless ``most`` is ``None``, at most ``most``.
+    """Raise ``BaseError`` unless each value is an integer from ``least`` to ``most`` (``None``: without upper bound).
 
     NumPy integers pass, booleans do not.
-
-    Args:
-        least: smallest allowed value.
-        most: largest allowed value; ``None``: no upper bound.
-        values: the values by the name of their argument.
-
-    Raises:
-        BaseError: when a value is not such an integer.
 
     Example:
         >>> check_whole(1, 8, views=9)
@@ -63,33 +55,21 @@ def check_whole(least: int, most: int | None = None, /, **values: Any) -> None:
 
 
 def check_numbers(low: float, high: float = math.inf, /, **values: Any) -> None:
-    """Check that each value is a finite number in ``[low, high]``.
-
-    Raises:
-        BaseError: when a value is not.
-    """
+    """Raise ``BaseError`` unless each value is a finite number in ``[low, high]``."""
     bounds = f"of at least {low:g}" if high == math.inf else f"in [{low:g}, {high:g}]"
     for name, value in values.items():
         KORNIA_CHECK(_is_number(value) and low <= value <= high, f"{name} must be a number {bounds}, got {value!r}.")
 
 
 def check_positive(*, or_infinite: bool = False, **values: Any) -> None:
-    """Check that each value is a positive, finite number. ``or_infinite`` also allows infinity.
-
-    Raises:
-        BaseError: when a value is not.
-    """
+    """Raise ``BaseError`` unless each value is a positive, finite number. ``or_infinite`` also allows infinity."""
     for name, value in values.items():
         positive = (_is_number(value) and value > 0) or (or_infinite and value == math.inf)
         KORNIA_CHECK(positive, f"{name} must be a positive number, got {value!r}.")
 
 
 def check_ranges(**values: Any) -> None:
-    """Check that each value is a pair of positive numbers, the second not smaller than the first.
-
-    Raises:
-        BaseError: when a value is not.
-    """
+    """Raise ``BaseError`` unless each value is a pair of positive numbers, the second not smaller than the first."""
     for name, value in values.items():
         two_numbers = hasattr(value, "__len__") and len(value) == 2 and all(map(_is_number, value))
         in_order = two_numbers and 0 < value[0] <= value[1]
@@ -97,15 +77,7 @@ def check_ranges(**values: Any) -> None:
 
 
 def check_shapes(shapes: Shapes, like: Tensor | None = None) -> None:
-    """Check the shapes of several tensors.
-
-    Args:
-        shapes: see :data:`Shapes`.
-        like: the world points from which the expected shapes were derived. Only the error message uses them.
-
-    Raises:
-        ShapeError: when a tensor has another shape.
-    """
+    """Raise ``ShapeError`` for a tensor of another shape. ``like``: the world points that the error message names."""
     for name, (tensor, expected) in shapes.items():
         if tensor is not None and tensor.shape != expected:
             beside = "" if like is None else f" to go with world_points of {tuple(like.shape)}"
@@ -117,17 +89,7 @@ def check_shapes(shapes: Shapes, like: Tensor | None = None) -> None:
 
 
 def check_like(tensors: Mapping[str, Tensor | None], like: Tensor, like_name: str = "world_points") -> None:
-    """Check that tensors have the dtype and the device of another tensor.
-
-    Args:
-        tensors: the tensors by the name of their argument; ``None`` is not checked.
-        like: the tensor to compare with.
-        like_name: name of ``like`` in error messages.
-
-    Raises:
-        TypeCheckError: when a dtype differs.
-        DeviceError: when a device differs.
-    """
+    """Raise ``TypeCheckError`` or ``DeviceError`` for a tensor of another dtype or device. ``None`` is not checked."""
     for name, tensor in tensors.items():
         if tensor is not None and tensor.dtype != like.dtype:
             raise TypeCheckError(f"{name} is {tensor.dtype} but {like_name} is {like.dtype}.")
@@ -135,54 +97,33 @@ def check_like(tensors: Mapping[str, Tensor | None], like: Tensor, like_name: st
 
 
 def check_devices(tensors: Mapping[str, Tensor | None], like: Tensor, like_name: str = "world_points") -> None:
-    """Check that tensors are on the device of another tensor. This includes tensors without dimensions.
-
-    Args:
-        tensors: the tensors by the name of their argument; ``None`` is not checked.
-        like: the tensor to compare with.
-        like_name: name of ``like`` in error messages.
-
-    Raises:
-        DeviceError: when a device differs.
-    """
+    """Raise ``DeviceError`` for a tensor on another device, even one without dimensions. ``None`` is not checked."""
     for name, tensor in tensors.items():
         if tensor is not None and tensor.device != like.device:
             raise DeviceError(f"{name} is on {tensor.device} but {like_name} is on {like.device}.")
 
 
 def check_poses(estimate: Pose, truth: Pose) -> None:
-    r"""Check that two batches of poses match exactly. Broadcasting would compare poses of different problems.
-
-    Raises:
-        ShapeError: unless both are of shape (\*, 3, 3) and (\*, 3) with the same leading dimensions.
-        TypeCheckError: when the dtypes differ.
-        DeviceError: when the devices differ.
-    """
+    """Check that two batches of poses match exactly. Broadcasting would compare poses of different problems."""
     batch = tuple(estimate.translation.shape[:-1])
-    shapes: Shapes = {}
-    for name, pose in (("estimate", estimate), ("truth", truth)):
-        shapes[f"The rotation of the {name}"] = pose.rotation, (*batch, 3, 3)
-        shapes[f"The translation of the {name}"] = pose.translation, (*batch, 3)
+    shapes: Shapes = {
+        "The rotation of the estimate": (estimate.rotation, (*batch, 3, 3)),
+        "The translation of the estimate": (estimate.translation, (*batch, 3)),
+        "The rotation of the truth": (truth.rotation, (*batch, 3, 3)),
+        "The translation of the truth": (truth.translation, (*batch, 3)),
+    }
     check_shapes(shapes)
     tensors = {name: tensor for name, (tensor, _) in shapes.items()}
     check_like(tensors, truth.translation, "the translation of the truth")
 
 
 def expand_sigma(name: str, sigma: Tensor | float | None, world_points: Tensor) -> Tensor:
-    r"""Check a standard deviation that a user gave, and expand it to every pair.
+    """Check a standard deviation that a user gave, and expand it to every pair: shape (B, N).
 
     Args:
         name: name of the argument in error messages.
-        sigma: a number, a tensor of shape :math:`()`, :math:`(B,)` or :math:`(B, N)`, or ``None``: unknown.
-        world_points: shape :math:`(B, N, 3)`; gives batch, number of pairs, dtype and device.
-
-    Returns:
-        Shape :math:`(B, N)`; NaN where ``sigma`` is ``None``.
-
-    Raises:
-        TypeCheckError: when ``sigma`` is neither a number nor a tensor, or a tensor of another dtype.
-        ShapeError: when a tensor has another shape.
-        DeviceError: when a tensor is on another device.
+        sigma: a number, a tensor of shape (), (B,) or (B, N) like ``world_points``, or ``None`` for unknown: NaN.
+        world_points: shape (B, N, 3).
 
     Example:
         >>> expand_sigma("img_sigma", torch.tensor([1.0, 2.0]), torch.zeros(2, 3, 3))

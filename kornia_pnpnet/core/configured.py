@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Mapping
 from numbers import Integral
 from typing import Any
@@ -16,7 +15,7 @@ class Configured(nn.Module):
     """A module whose ``config`` holds the arguments of its constructor, except those that are modules.
 
     Args:
-        arguments: ``locals()`` of the subclass's constructor, before it assigns any other variable.
+        arguments: ``locals()`` of the constructor that calls this one, before any other variable is assigned.
 
     Example:
         >>> class Scale(Configured):
@@ -28,7 +27,7 @@ class Configured(nn.Module):
 
     def __init__(self, arguments: Mapping[str, Any]) -> None:
         super().__init__()
-        values = {name: arguments[name] for name in inspect.signature(type(self)).parameters}
+        values = {name: value for name, value in arguments.items() if name not in ("self", "__class__")}
         self.config = {name: _plain(value) for name, value in values.items() if not isinstance(value, nn.Module)}
 
     def extra_repr(self) -> str:

@@ -6,15 +6,16 @@ import errno
 import hashlib
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["atomic_open", "digest", "write_json"]
+__all__ = ["atomic_open", "digest", "read_npz", "write_json"]
 
 
 @contextmanager
@@ -22,18 +23,7 @@ def atomic_open(path: str | Path, mode: str = "w", **options: Any) -> Iterator[I
     """Open a file for writing that takes its name only when it is complete and on disk.
 
     A process that is killed or finds the disk full leaves the old file as it was: a reader sees the old file or the
-    new one, never a part.
-
-    Args:
-        path: the file; missing folders are made.
-        mode: ``"w"`` or ``"wb"``.
-        options: passed to :func:`open`.
-
-    Yields:
-        The open file.
-
-    Raises:
-        OSError: when the file cannot be written.
+    new one, never a part. Missing folders are made.
     """
     path = Path(path)
     if path.is_dir():
@@ -51,30 +41,28 @@ def atomic_open(path: str | Path, mode: str = "w", **options: Any) -> Iterator[I
 
 
 def write_json(path: str | Path, content: Any) -> None:
-    """Write an indented JSON file in one piece.
-
-    Args:
-        path: the file; missing folders are made.
-        content: plain data.
-
-    Raises:
-        TypeError: for values that JSON does not have.
-        ValueError: for numbers that are not finite.
-        OSError: when the file cannot be written. After any of these errors the old file is as it was.
-    """
+    """Write an indented JSON file in one piece. ``ValueError`` for numbers that are not finite."""
     with atomic_open(path, encoding="utf-8") as file:
         file.write(json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
+def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
+    """Read the arrays of an NPZ file, or those of these names that it has, without unpickling.
+
+    Raises:
+        ValueError: when the file is not an NPZ file of plain arrays. The message does not name the file.
+    """
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as content:  # np.load leaves broken files open
+            return {name: np.asarray(content[name]) for name in content.files if names is None or name in names}
+    except Exception as error:  # numpy, zipfile and zlib raise a dozen types of errors for broken files
+        raise ValueError(f"not an NPZ file of plain arrays: {error}") from error
+
+
 def digest(*parts: Any) -> str:
-    """SHA-256 of contents, one after the other.
+    """SHA-256, in hexadecimal, of contents one after the other.
 
-    Args:
-        parts: bytes and texts; tensors of any dtype and device, by dtype, shape and values; other plain data as JSON
-            with sorted keys.
-
-    Returns:
-        The digest in hexadecimal.
+    Tensors count by dtype, shape and values, on any device; plain data as JSON with sorted keys.
 
     Example:
         >>> state = {"weight": torch.ones(2)}

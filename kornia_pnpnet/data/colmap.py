@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kornia_pnpnet.core.files import read_npz
 from kornia_pnpnet.data.scenes import Scene, View
 
 __all__ = ["load_colmap", "load_matches", "load_scene"]
@@ -111,12 +112,7 @@ def load_matches(path: str | Path, *, metric: bool = True, min_points: int = 10,
     if not path.is_file():
         raise FileNotFoundError(f"no file of matches at '{path}'")
     try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            arrays = {key: np.asarray(file[key]) for key in file.files}
-    except Exception as error:  # numpy, zipfile and zlib have a dozen ways to say that a file is broken
-        raise ValueError(f"'{path}' is not a readable .npz file of plain arrays: {error}") from error
-    try:
-        views = _match_views(arrays, max_error_px)
+        views = _match_views(read_npz(path), max_error_px)
     except ValueError as error:
         raise ValueError(f"the matches in '{path}' cannot be used: {error}") from error
     if not views:

@@ -6,7 +6,7 @@ import math
 import statistics
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.core.files import digest
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
+from kornia_pnpnet.data.stream import ProblemSource
 from kornia_pnpnet.evaluation.results import FORMAT, resume, save_results, source_digest
 from kornia_pnpnet.metrics import PoseErrors, pose_errors, success, success_rate
 from kornia_pnpnet.solver import PnPNet
@@ -47,14 +48,6 @@ class EvaluationData(NamedTuple):
     description: Mapping[str, Any] = {}
 
 
-class _Source(Protocol):
-    """A data source for :func:`draw_problems`."""
-
-    def batch(self, index: int) -> Problems:
-        """Draw batch ``index``."""
-        ...
-
-
 @runtime_checkable
 class SeesTruth(Protocol):
     """A bound: a module to which :func:`evaluate` passes the true poses and inliers."""
@@ -64,7 +57,7 @@ class SeesTruth(Protocol):
         ...
 
 
-def draw_problems(source: _Source, count: int) -> Problems:
+def draw_problems(source: ProblemSource, count: int) -> Problems:
     """Take the first problems of a source.
 
     Args:
@@ -89,11 +82,6 @@ def draw_problems(source: _Source, count: int) -> Problems:
     size = len(batches[0].world_points)
     batches += [source.batch(index) for index in range(1, math.ceil(count / size))]
     return map_tensors(lambda *parts: torch.cat(parts)[:count], *batches)
-
-
-def _chunks(problems: Problems, size: int) -> Iterator[Problems]:
-    for start in range(0, len(problems.world_points), size):
-        yield problems.map(lambda part, start=start: part[start : start + size])  # type: ignore[misc]
 
 
 def evaluate(
@@ -159,11 +147,11 @@ def evaluate(
         "data": {name: {**_describe(entry), "chunk": chunk} for name, entry in data.items()},
         "rows": [],
     }
-    machine = {key: results["environment"][key] for key in _MACHINE}
+    here = results["environment"]
     if path is not None and not overwrite:
         results = resume(results, path)
     results["left_out"] = []
-    elsewhere = {key: value for key, value in machine.items() if results["environment"].get(key) != value}
+    elsewhere = {key: here[key] for key in _MACHINE if results["environment"].get(key) != here[key]}
 
     plan = [(data_name, solver_name) for data_name in data for solver_name in solvers]
     done = {(row["data"], row["solver"]): row for row in results["rows"]}
@@ -174,17 +162,17 @@ def evaluate(
         for names in plan:
             if names in done:
                 continue
-            row = dict(zip(("data", "solver"), names, strict=True))
-            bar.set_postfix_str("{solver} on {data}".format(**row))
+            row: dict[str, Any] = {"data": names[0], "solver": names[1]}
+            bar.set_postfix_str(f"{names[1]} on {names[0]}")
             try:
-                solved = _row(solvers[row["solver"]], data[row["data"]], chunk, repeats)
+                row |= _row(solvers[names[1]], data[names[0]], chunk, repeats)
             except ShapeError as error:
                 results["left_out"].append({**row, "reason": str(error).splitlines()[0]})
             except Exception as error:
-                error.add_note("{solver} on {data}".format(**row))
+                error.add_note(f"{names[1]} on {names[0]}")
                 raise
             else:
-                done[names] = {**row, **solved, **({"environment": elsewhere} if elsewhere else {})}
+                done[names] = row | ({"environment": elsewhere} if elsewhere else {})
                 results["rows"] = [done[key] for key in plan if key in done]
             if path is not None:
                 save_results(results, path)
@@ -222,7 +210,6 @@ def _describe(entry: EvaluationData) -> dict[str, Any]:
 
 
 def _row(solver: nn.Module, entry: EvaluationData, chunk: int, repeats: int) -> dict[str, Any]:
-    """Solve, time, compare and summarise one set with one solver."""
     was_training = solver.training
     solver.eval()
     try:
@@ -235,7 +222,10 @@ def _row(solver: nn.Module, entry: EvaluationData, chunk: int, repeats: int) -> 
     rate = success_rate(success(stored, entry.max_rotation_deg, entry.max_translation))
     return {
         "success": {name: value if name == "total" else _rounded(value) for name, value in rate._asdict().items()},
-        **{name: _quartiles(values) for name, values in stored._asdict().items()},
+        **{
+            name: {key: _rounded(values.quantile(share).item()) for key, share in _QUARTILES.items()}
+            for name, values in stored._asdict().items()
+        },
         "ok": _rounded(ok.double().mean().item()),
         "us_per_problem": _rounded(1e6 * seconds),
         "per_problem": {**per_problem, "ok": ok.int().tolist()},
@@ -244,20 +234,20 @@ def _row(solver: nn.Module, entry: EvaluationData, chunk: int, repeats: int) -> 
 
 def _run(solver: nn.Module, problems: Problems, chunk: int, repeats: int) -> tuple[PoseErrors, Tensor, float]:
     """Errors and ok of all problems, and the median time per problem in seconds."""
-    chunks = list(_chunks(problems, chunk))
+    starts = range(0, len(problems.world_points), chunk)
+    chunks = [problems.map(lambda part, i=start: part[i : i + chunk]) for start in starts]  # type: ignore[misc]
+    full = len(chunks[0].world_points)
     _timed(solver, chunks[0])
     compared, seconds = [], []
-    for part in chunks:
+    for i in range(max(repeats, len(chunks))):
+        part = chunks[i % len(chunks)]
         result, elapsed = _timed(solver, part)
-        compared.append(_compare(result, part.pose))
-        seconds.append((len(part.world_points), elapsed / len(part.world_points)))
-    while len(seconds) < repeats:
-        part = chunks[len(seconds) % len(chunks)]
-        seconds.append((len(part.world_points), _timed(solver, part)[1] / len(part.world_points)))
-    # A short last chunk pays the fixed cost of a call for few problems, so only full chunks count.
-    full = max(size for size, _ in seconds)
+        if i < len(chunks):
+            compared.append(_compare(result, part.pose))
+        if len(part.world_points) == full:  # a short last chunk pays the fixed cost of a call for few problems
+            seconds.append(elapsed / full)
     errors, ok = map_tensors(lambda *parts: torch.cat(parts), *compared)
-    return errors, ok, statistics.median(time for size, time in seconds if size == full)
+    return errors, ok, statistics.median(seconds)
 
 
 def _timed(solver: nn.Module, problems: Problems) -> tuple[PnPResult, float]:
@@ -287,7 +277,3 @@ def _compare(result: PnPResult, truth: Pose) -> tuple[PoseErrors, Tensor]:
 def _rounded(value: float) -> float:
     """Round to six significant digits, which keeps a results file of 10 000 problems small."""
     return float(f"{value:.6g}")
-
-
-def _quartiles(values: Tensor) -> dict[str, float]:
-    return {name: _rounded(values.quantile(share).item()) for name, share in _QUARTILES.items()}

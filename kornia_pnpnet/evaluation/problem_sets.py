@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Any
@@ -46,16 +47,12 @@ def _outlier_mix(word: str, n: int, mismatch_share: float) -> OutlierMix:
         return OutlierMix(mismatch_share=mismatch_share)
     if word == "none" or word.isdecimal():
         count = 0 if word == "none" else int(word)
+    elif re.fullmatch(r"(\d+\.?\d*|\.\d+)\s*%", word, re.ASCII) and float(word[:-1]) <= 100:
+        count = OutlierMix(max_ratio=float(word[:-1]) / 100).max_count(n)
     else:
-        try:
-            share = float(word[:-1]) / 100 if word.endswith("%") else -1.0
-        except ValueError:
-            share = -1.0
-        if not 0 <= share <= 1:
-            raise ValueCheckError(
-                f"--outliers: expected none, uniform, numbers or shares like 50%, separated by commas, got {word!r}"
-            )
-        count = OutlierMix(max_ratio=share).max_count(n)
+        raise ValueCheckError(
+            f"--outliers: expected none, uniform, numbers or shares like 50%, separated by commas, got {word!r}"
+        )
     if count > n:
         raise ValueCheckError(f"--outliers: {count} outliers do not fit into n = {n} pairs")
     return OutlierMix(count=count, mismatch_share=mismatch_share)
@@ -125,10 +122,7 @@ def evaluation_sets(
                 for label, (mix, number) in mixes[size].items():
                     options = {"n": size, "outliers": mix, "seed": seed, "dtype": dtype, "batch_size": _DRAW_BATCH}
                     options |= {"known_noise": 1.0} if known_noise and scene is None else {}
-                    # A mismatch takes the pixel of a spare point. With one spare, all mismatches would share a pixel
-                    # and agree on a wrong pose.
-                    spares = max(1, mix.max_count(size)) if mismatches_only else 1
-                    drawn = _draw_set(source, scene, count, spares, options)
+                    drawn = _draw_set(source, scene, count, mismatches_only, options)
                     described = {"outliers": number, "mismatch_share": mix.mismatch_share, "seed": seed}
                     # Raw matches already contain outliers; those of the mix come on top.
                     added = "+" if scene is not None and source.endswith(".npz") else ""
@@ -142,13 +136,15 @@ def evaluation_sets(
 
 
 def _draw_set(
-    source: str, scene: Scene | None, count: int, num_spares: int, options: Mapping[str, Any]
+    source: str, scene: Scene | None, count: int, mismatches_only: bool, options: Mapping[str, Any]
 ) -> EvaluationData:
     """Draw the problems of one set; the description names their source."""
     if scene is None:
         prior, make = PRIORS[source]
         return EvaluationData(draw_problems(make(**options), count), description={"source": prior})
-    drawn = SceneProblems(scene, num_spares=num_spares, **options)
+    # A mismatch takes the pixel of a spare point. With one spare, all mismatches would agree on a wrong pose.
+    spares = max(1, options["outliers"].max_count(options["n"])) if mismatches_only else 1
+    drawn = SceneProblems(scene, num_spares=spares, **options)
     return EvaluationData(
         draw_problems(drawn, count),
         max_translation=drawn.max_translation,

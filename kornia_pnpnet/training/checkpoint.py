@@ -61,22 +61,9 @@ def stop_on_signal() -> Iterator[threading.Event]:
 
 
 class StageClock:
-    """Wall-clock time of the stages of a loop. The times of all stages add up to the time of the loop.
+    """Wall-clock ``seconds`` of the stages of a loop, which add up to the time of the loop.
 
     The work of a GPU counts in the stage that waits for the result.
-
-    Args:
-        stages: names of the stages.
-
-    Attributes:
-        seconds: time of each stage so far.
-
-    Example:
-        >>> clock = StageClock("data", "rest")
-        >>> clock.lap("data")
-        >>> clock.lap("rest")
-        >>> sum(clock.shares().values())
-        1.0
     """
 
     def __init__(self, *stages: str) -> None:
@@ -96,19 +83,8 @@ class StageClock:
         return {stage: seconds / whole if whole > 0.0 else 0.0 for stage, seconds in spent.items()}
 
 
-def _whole(row: dict[str, str | None]) -> bool:
-    """Whether a row is complete. A full disk or a crash can cut the last row."""
-    return None not in row.values() and (row["update"] or "").isdigit()
-
-
 class History:
-    """Learning curves in one CSV file and TensorBoard.
-
-    Args:
-        folder: folder of the files.
-        columns: columns of the CSV file; cells of a row may stay empty.
-        start: the update to continue from. Rows of later updates are dropped.
-    """
+    """Learning curves in one CSV file and TensorBoard. Rows of updates after ``start`` are dropped."""
 
     def __init__(self, folder: Path, columns: list[str], start: int) -> None:
         self._path = folder / HISTORY_NAME
@@ -116,12 +92,13 @@ class History:
         rows: list[dict[str, Any]] = []
         if start and self._path.is_file():
             with self._path.open(newline="") as file:
-                rows = [row for row in csv.DictReader(file) if _whole(row) and int(row["update"]) <= start]
+                rows = [row for row in csv.DictReader(file) if None not in row.values()]  # a crash can cut the last row
+            rows = [row for row in rows if row["update"].isdigit() and int(row["update"]) <= start]
         with atomic_open(self._path, newline="") as file:
             writer = csv.DictWriter(file, columns, restval="", extrasaction="ignore")
             writer.writeheader()
             writer.writerows(rows)
-        self._board = SummaryWriter(folder / "tensorboard", purge_step=start or None)
+        self.board = SummaryWriter(folder / "tensorboard", purge_step=start or None)
 
     def write(self, row: dict[str, float]) -> None:
         """Append a row. The key ``update`` is required."""
@@ -131,32 +108,17 @@ class History:
             )
         for key, value in row.items():
             if key != "update":
-                self._board.add_scalar(key, value, int(row["update"]))
-
-    def close(self) -> None:
-        """Close TensorBoard's file."""
-        self._board.close()
+                self.board.add_scalar(key, value, int(row["update"]))
 
 
 def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
-    """Write a checkpoint in one piece: a run that is killed leaves the old checkpoint or the new one."""
+    """Write a checkpoint in one piece."""
     with atomic_open(path, "wb") as file:
         torch.save(state, file)
 
 
 def load_checkpoint(path: Path, identity: dict[str, Any]) -> dict[str, Any]:
-    """Read a checkpoint.
-
-    Args:
-        path: file of :func:`save_checkpoint`. Only tensors and plain data are read; nothing is unpickled.
-        identity: plain data that must equal the identity in the checkpoint.
-
-    Returns:
-        The state.
-
-    Raises:
-        TrainingError: when the file is damaged or belongs to another run.
-    """
+    """Read a checkpoint; ``TrainingError`` when the file is damaged or its identity is another one."""
     try:
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
         saved = state["identity"]

@@ -5,11 +5,10 @@ from __future__ import annotations
 import csv
 import shutil
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from kornia_pnpnet.core.checks import check_whole
 from kornia_pnpnet.core.files import atomic_open, write_json
 from kornia_pnpnet.core.schema import read_column, read_rows, to_json
 from kornia_pnpnet.pretrained import CONFIG_NAME, WEIGHTS_NAME
@@ -20,27 +19,29 @@ from kornia_pnpnet.training.results import RESULTS_NAME, load_run
 
 __all__ = ["collect_weights", "summarize_runs"]
 
+_MOST_ROWS = 100
 
-def collect_weights(runs: Sequence[str | Path], folder: str | Path, *, most_rows: int = 100) -> None:
+
+def collect_weights(runs: Sequence[str | Path], folder: str | Path) -> None:
     """Gather weights, results, model card and learning curves of successive runs in one folder.
+
+    Of each run's learning curves at most 100 rows are kept, all with a validation.
 
     Args:
         runs: folders of ``train.py``. Each run but the first began with the weights of the run before.
         folder: the destination; its name becomes the name of the weights.
-        most_rows: largest number of rows of each run's learning curves to keep. Only rows with a validation are kept.
 
     Raises:
-        BaseError: when ``most_rows`` is less than 1, or weights are damaged or incomplete.
+        BaseError: when weights are damaged or incomplete.
         FileNotFoundError: when another file is missing.
         ValueError: when there is no run, or another file is damaged. After any of these errors nothing is written.
     """
-    check_whole(1, most_rows=most_rows)
     if not runs:
         raise ValueError("collect_weights needs at least one run, got none.")
     folder, last = Path(folder), Path(runs[-1])
     rows: list[dict[str, str]] = []
     for run in runs:
-        rows += _validated_rows(Path(run) / HISTORY_NAME, int(rows[-1]["update"]) if rows else 0, most_rows)
+        rows += _validated_rows(Path(run) / HISTORY_NAME, int(rows[-1]["update"]) if rows else 0)
     results = load_run(last / RESULTS_NAME)
     PnPNet.from_pretrained(last / "weights")
     folder.mkdir(parents=True, exist_ok=True)
@@ -51,8 +52,8 @@ def collect_weights(runs: Sequence[str | Path], folder: str | Path, *, most_rows
     _write_rows(folder / HISTORY_NAME, rows)
 
 
-def _validated_rows(path: Path, start: int, most: int) -> list[dict[str, str]]:
-    """At most ``most`` evenly spaced rows with a validation, the last one included; updates count from ``start``."""
+def _validated_rows(path: Path, start: int) -> list[dict[str, str]]:
+    """Evenly spaced rows with a validation, the last one included; updates count from ``start``."""
     rows = read_rows(path)
     updates = map(int, read_column(path, rows, "update", int))
     validated = [
@@ -62,7 +63,7 @@ def _validated_rows(path: Path, start: int, most: int) -> list[dict[str, str]]:
     ]
     if not validated:
         raise ValueError(f"'{path}' has no row with a validation.")
-    return validated[::-1][:: -(-len(validated) // most)][::-1]
+    return validated[::-1][:: -(-len(validated) // _MOST_ROWS)][::-1]
 
 
 def summarize_runs(folder: str | Path) -> Path | None:
@@ -102,9 +103,8 @@ def summarize_runs(folder: str | Path) -> Path | None:
     return folder / "summary.csv"
 
 
-def _write_rows(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
+def _write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """Write a CSV file in one piece, since runs of a parallel launcher may end at the same time."""
-    rows = list(rows)
     with atomic_open(path, newline="") as file:
         writer = csv.DictWriter(file, list(dict.fromkeys(key for row in rows for key in row)), restval="")
         writer.writeheader()

@@ -82,13 +82,14 @@ def fit(
         f"A batch of {data.batch_size} cannot be shared equally among {fabric.world_size} processes.",
     )
     run = Run(model, loss, validation, settings, Path(folder), fabric, identity or {}, resume)
+    part = slice(fabric.global_rank, None, fabric.world_size)  # all processes together have the batch of one process
     hidden = not (progress and fabric.is_global_zero)
     bar = tqdm(total=settings.updates, initial=run.start, disable=hidden, unit="update")
     batches = stream_batches(data, run.start, settings.updates, data_workers)
     with stop_on_signal() as stop, closing(batches), bar, logging_redirect_tqdm():
         while not (run.finished or run.interrupted):
             run.clock.lap("rest")
-            problems = run.share(next(batches))
+            problems = next(batches).map(lambda x: x[part].to(fabric.device))
             run.clock.lap("data")
             step = run.step(problems, stop)
             bar.update()

@@ -7,12 +7,13 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, NotRequired, TypedDict
+from typing import Annotated, Any, ClassVar, NamedTuple, NotRequired, cast
 
 import torch
+from typing_extensions import TypedDict
 
 from kornia_pnpnet.core.environment import environment
-from kornia_pnpnet.core.schema import Count, from_json, read_json
+from kornia_pnpnet.core.schema import STRICT, Count, Kept, read_json
 from kornia_pnpnet.pretrained import find_weights
 from kornia_pnpnet.solver import PnPNet
 from kornia_pnpnet.training.run import FitReport
@@ -44,31 +45,33 @@ _Data = TypedDict("_Data", {"train": _Source, "validation": dict[str, _Source]})
 _Versions = TypedDict("_Versions", {"torch": str})
 
 
-class ModelConfig(TypedDict):
-    """What :meth:`PnPNet.config` returns; weights of old versions do not have ``views``."""
-
+class _ModelConfig(TypedDict):
     init: _Init | None
     refine: _Refine
     normalize: _Normalize
-    views: NotRequired[Count]
+    views: NotRequired[Count]  # weights of old versions do not have it
 
 
-class RunConfig(TypedDict):
-    """The resolved configuration of ``train.py``."""
-
+class _RunConfig(TypedDict):
     name: NotRequired[Any]
     batch_size: Count
     model: _Size
     data: _Data
 
 
-class RunEnvironment(TypedDict):
-    """What :func:`~kornia_pnpnet.core.environment.environment` returned during the run."""
-
+class _RunEnvironment(TypedDict):
     threads: Count
     cpu: str
     commit: str | None
     versions: _Versions
+
+
+#: What :meth:`PnPNet.config` returned.
+ModelConfig = Annotated[_ModelConfig, Kept]
+#: The resolved configuration of ``train.py``.
+RunConfig = Annotated[_RunConfig, Kept]
+#: What :func:`~kornia_pnpnet.core.environment.environment` returned during the run.
+RunEnvironment = Annotated[_RunEnvironment, Kept]
 
 
 @dataclass(frozen=True)
@@ -89,6 +92,8 @@ class RunResults:
     Raises:
         ValueError: when there is no validation set, or the hyperparameters do not fit the model.
     """
+
+    __pydantic_config__: ClassVar = STRICT
 
     overrides: list[str]
     run: FitReport
@@ -159,9 +164,9 @@ def run_results(
         us_per_problem=_us_per_problem(model, problems),
         validation=sets,
         learned=Learned(*(values.tolist() for values in learned)),
-        model=from_json(ModelConfig, model.config(), "model"),
+        model=cast(ModelConfig, model.config()),
         config=config,
-        environment=from_json(RunEnvironment, environment(), "environment"),
+        environment=cast(RunEnvironment, environment()),
         origin=origin,
     )
 
@@ -189,11 +194,7 @@ def load_run(path: str | Path) -> RunResults:
         FileNotFoundError: when there is no such file.
         ValueError: when the file does not hold the results of a run; the message names the wrong entry.
     """
-    data = read_json(path, "a results file of a run")
-    try:
-        return from_json(RunResults, data)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"'{path}' is not a results file of a run: {error}.") from error
+    return read_json(path, RunResults, "a results file of a run")
 
 
 def find_results(weights: str | Path) -> RunResults | None:

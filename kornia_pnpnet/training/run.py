@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import resource
 import sys
@@ -94,7 +95,8 @@ class Run:
         resume: bool,
     ) -> None:
         self.model, self.loss, self.settings, self.fabric = model, loss, settings, fabric
-        self.identity = _plain({"settings": asdict(settings), "model": model.config(), **identity})
+        plain = json.dumps({"settings": asdict(settings), "model": model.config(), **identity})
+        self.identity = json.loads(plain)  # tuples become lists, as in a checkpoint
         self.checkpoint = folder / CHECKPOINT_NAME
         self.update, self.skipped, self.interrupted = 0, 0, False
         self.rates = ""  # success rates of the last validation, for the progress bar
@@ -135,11 +137,6 @@ class Run:
         """Whether all updates are done."""
         return self.update >= self.settings.updates
 
-    def share(self, problems: Problems) -> Problems:
-        """Every ``world_size``-th problem: the batches of all processes together are the batch of one process."""
-        part = slice(self.fabric.global_rank, None, self.fabric.world_size)
-        return problems.map(lambda x: x[part].to(self.fabric.device))
-
     def forward(self, problems: Problems, ramp: float) -> LossTerms:
         """Solve the problems and compare the results with the true poses."""
         inputs = problems.world_points, problems.img_points, problems.intrinsics
@@ -166,15 +163,14 @@ class Run:
         bad, stopped = _agree(self.fabric, not bool(torch.isfinite(terms.total + norm)), stop.is_set())
         self.update += 1
         if bad:
-            self.skip()
+            self._skip()
         else:
             self.fabric_optimizer.step()
         self.clock.lap("optimizer")
         self.interrupted = stopped and not self.finished
         return _Step(terms, ramp, self.settings.lr * factor, norm)
 
-    def skip(self) -> None:
-        """Count a step that is not finite. Too many such steps end the run."""
+    def _skip(self) -> None:
         self.skipped += 1
         if self.fabric.is_global_zero:
             _log.warning("update %s: loss or gradient not finite, step skipped (%s so far)", self.update, self.skipped)
@@ -186,14 +182,16 @@ class Run:
 
     def log(self, step: _Step, validates: bool) -> None:
         """Append a row to the learning curves, with a validation or without."""
-        means = _mean(self.fabric, torch.stack([term.detach() for term in step.terms]))
+        values = torch.stack([term.detach() for term in step.terms])
+        if self.fabric.world_size > 1:
+            values = torch.as_tensor(self.fabric.all_reduce(values, reduce_op="mean"))
         if self.history is None:
             return
         self.clock.lap("rest")
         shares = self.clock.shares(self.logged_seconds)
         elapsed = sum(self.clock.seconds.values()) - sum(self.logged_seconds.values())
         speed = (self.update - self.logged_update) / max(elapsed, 1e-9)
-        row: dict[str, float] = {"update": self.update, **dict(zip(step.terms._fields, means, strict=True))}
+        row: dict[str, float] = {"update": self.update, **dict(zip(step.terms._fields, values.tolist(), strict=True))}
         if step.ramp == 0.0:  # nothing was refined yet
             row = {name: value for name, value in row.items() if not name.startswith("refined")}
         row |= {"ramp": step.ramp, "lr": step.lr, "grad_norm": step.grad_norm.item(), "skipped": self.skipped}
@@ -223,7 +221,7 @@ class Run:
     def report(self) -> FitReport:
         """Close the learning curves and sum up."""
         if self.history is not None:
-            self.history.close()
+            self.history.board.close()
         self.model.eval()
         self.clock.lap("rest")
         seconds = sum(self.clock.seconds.values())
@@ -242,20 +240,6 @@ class Run:
 def describe_shares(shares: Mapping[str, float]) -> str:
     """Shares of the time as a line of a log, for example ``"data 1 %, forward 40 %"``."""
     return ", ".join(f"{stage} {100 * share:.0f} %" for stage, share in shares.items())
-
-
-def _plain(value: Any) -> Any:
-    """Tuples as lists: what a checkpoint gives back."""
-    if isinstance(value, dict):
-        return {key: _plain(entry) for key, entry in value.items()}
-    return [_plain(entry) for entry in value] if isinstance(value, (list, tuple)) else value
-
-
-def _mean(fabric: Fabric, values: Tensor) -> list[float]:
-    """The mean of each value over all processes."""
-    if fabric.world_size > 1:
-        values = torch.as_tensor(fabric.all_reduce(values, reduce_op="mean"))
-    return values.tolist()
 
 
 def _agree(fabric: Fabric, *flags: bool) -> list[bool]:

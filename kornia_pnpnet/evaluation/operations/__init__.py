@@ -13,7 +13,7 @@ Source: R. Sheffer and A. Wiesel, "PnP-Net: A hybrid Perspective-n-Point Network
 Lightspeed toolbox.
 """
 
-from kornia_pnpnet.evaluation.operations.costs import OPERATION_COSTS, Operations
+from kornia_pnpnet.evaluation.operations.costs import OPERATION_COSTS
 from kornia_pnpnet.evaluation.operations.counter import OperationCounter, count_per_problem
 from kornia_pnpnet.evaluation.operations.counts import SOLVERS, complexity_results, operation_count
 
@@ -21,7 +21,6 @@ __all__ = [
     "OPERATION_COSTS",
     "SOLVERS",
     "OperationCounter",
-    "Operations",
     "complexity_results",
     "count_per_problem",
     "operation_count",

@@ -70,7 +70,7 @@ def operation_count(solver: str | PnPNet, n: int, *, outliers: int = 0) -> float
         repeated = problems.map(lambda part: torch.cat([part] * (batch // _BATCH)))
         runnable(repeated.world_points, repeated.img_points, repeated.intrinsics)
 
-    return count_per_problem(run, _BATCH).flops
+    return count_per_problem(run, _BATCH)
 
 
 def _solver(spec: str, n: int) -> PnPNet:
