@@ -116,9 +116,11 @@ def _operations(name: str, call: dict[str, Any], output: Any) -> float:
     if name in _ROWS:
         entries, length = _rows(call)
         return entries // length * _ROWS[name](length)
-    if name in ("sort", "topk"):
+    if name in ("sort", "topk", "kthvalue"):
         length = call["self"].shape[call["dim"]]
         rows = call["self"].numel() // max(length, 1)
+        if name == "kthvalue":
+            return rows * smallest(length, call["k"])
         if name == "sort":
             return rows * sort(length)
         return rows * (smallest(length, call["k"]) + (sort(call["k"]) if call["sorted"] else 0))
