@@ -32,6 +32,7 @@ __all__ = [
     "retract",
     "retract_additive",
     "rotation_angle",
+    "span_a_plane",
     "transform",
 ]
 
@@ -361,3 +362,22 @@ def align(source: Tensor, target: Tensor, weights: Tensor) -> tuple[Pose, Tensor
     scale = (rotation * covariance).sum((1, 2)) / torch.where(mean_square > 0, mean_square, 1.0)
     translation = target_mean - (rotation @ source_mean[..., None])[..., 0]
     return Pose(rotation, translation), scale
+
+
+def span_a_plane(centred: Tensor, share: Tensor, size: Tensor) -> Tensor:
+    """Whether points span more than a line, so that there are at least three.
+
+    Args:
+        centred: the points minus their mean, 0 for padding, (3, N, B).
+        share: one over the number of points, (B,).
+        size: the largest coordinate before the points were centred, (B,). Where it is 0 or NaN the result is false.
+
+    Returns:
+        bool of shape (B,).
+    """
+    # The second largest variance is about the sum of the principal minors of the covariance, (trace² - sum of squares)
+    # / 2, over the trace. For points on a line only rounding remains.
+    eps = torch.finfo(centred.dtype).eps
+    covariance = (centred[:, None] * centred).sum(2) * (share / (size * size))  # (3, 3, B) in the unit of the size
+    trace = covariance.diagonal().sum(-1)
+    return ((1.0 - 16.0 * eps) * trace - 2.0 * (64.0 * eps) ** 2) * trace > (covariance * covariance).sum((0, 1))

@@ -16,7 +16,7 @@ from kornia_pnpnet.core.checks import check_positive
 from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.performance import compiling, exporting
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.geometry import MIN_DEPTH_RATIO
+from kornia_pnpnet.geometry import MIN_DEPTH_RATIO, span_a_plane
 from kornia_pnpnet.types import MIN_PAIRS, Correspondences, Guess, Noise, Pose, Status
 
 __all__ = ["F_CONST", "VIEWS", "Frame", "Normalize"]
@@ -39,7 +39,7 @@ VIEWS = (
 # Typical distances from the median of the points: beyond the first the pair does not count for centre and scale, beyond
 # the second the numbers of a float32 have too few digits for it. Few pairs say little about what is typical.
 _FAR, _LARGEST_DISTANCE = 5.0, 1e6
-_MANY, _FAR_OF_FEW = 7, 25.0
+_MANY, _FAR_OF_FEW = 12, 25.0
 # Tangent of 85 degrees, more than a lens without distortion can show.
 _FAR_ANGLE = 11.4
 # Pairs. Up to this number a compiled solver sorts by a network of minima and maxima, which takes next to no time.
@@ -178,7 +178,7 @@ class Normalize(Configured):
             centroid = zero.expand(3, batch)
         centred = world if self.center else world - mean[:, None]
         largest = torch.where(near, sizes[:3], zero).amax((0, 1))
-        spread_out = _is_spread_out(torch.where(near, centred.detach(), zero), share, largest)
+        spread_out = span_a_plane(torch.where(near, centred.detach(), zero), share, largest)
         spread_out = spread_out & (largest.reciprocal() < limit)
         mean_square = torch.where(near, world, zero).square().sum((0, 1)) * share
         scale = torch.where(spread_out, mean_square, one[0]).rsqrt() if self.scale else one[0]
@@ -367,25 +367,6 @@ def _ranked(values: Tensor, there: Tensor, rank: Tensor | int) -> Tensor:
     else:  # one coordinate after the other, which is faster
         found = torch.stack([row.kthvalue(rank + 1, 0).values for row in values])
     return torch.where(found.abs() < torch.inf, found, 0.0)
-
-
-def _is_spread_out(centred: Tensor, share: Tensor, size: Tensor) -> Tensor:
-    """Whether the points span more than a line, so that there are at least three.
-
-    Args:
-        centred: the points minus their mean, 0 for padding, (3, N, B).
-        share: one over the number of points, (B,).
-        size: the largest coordinate before the points were centred, (B,). Where it is 0 or NaN the result is false.
-
-    Returns:
-        bool of shape (B,).
-    """
-    # The second largest variance is about the sum of the principal minors of the covariance, (trace² - sum of squares)
-    # / 2, over the trace. For points on a line only rounding remains.
-    eps = torch.finfo(centred.dtype).eps
-    covariance = (centred[:, None] * centred).sum(2) * (share / (size * size))  # (3, 3, B) in the unit of the size
-    trace = covariance.diagonal().sum(-1)
-    return ((1.0 - 16.0 * eps) * trace - 2.0 * (64.0 * eps) ** 2) * trace > (covariance * covariance).sum((0, 1))
 
 
 def _exchanged(x: Tensor, y: Tensor, swap: bool, reverse_x: bool, reverse_y: bool) -> tuple[Tensor, Tensor]:

@@ -292,7 +292,7 @@ def test_points_behind_the_camera_never_lower_the_cost(kernel, case):
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize(("n", "unit"), [(3, 1.0), (5, 1e-30), (9, 1e30), (10, 1.0)])
+@pytest.mark.parametrize(("n", "unit"), [(5, 1e-30), (9, 1e30), (10, 1.0)])
 def test_explains_compares_two_weighted_quantiles(n, unit, dtype, generator):
     """Counted in integers, with weights of 0, ties, and shares of exactly 60 %."""
     batch = 400
@@ -314,7 +314,9 @@ def test_explains_compares_two_weighted_quantiles(n, unit, dtype, generator):
     below = 5 * prior.gather(-1, order).cumsum(-1) >= 3 * total
     limit = 0.2 * spread.gather(-1, below.int().argmax(-1, keepdim=True))
     explained = in_front & (residual <= limit)
-    expected = (5 * (prior * explained).sum(-1) >= 3 * total[:, 0]) & ((in_front & (prior > 0)).sum(-1) >= 3)
+    expected = (5 * (prior * explained).sum(-1) >= 3 * total[:, 0]) & (
+        (explained & (prior > 0)).sum(-1) >= (prior > 0).sum(-1).clamp(3, 4)
+    )
     assert torch.equal(explains(project(pose, corr), corr, unit * prior.to(dtype)), expected)
     assert 0.1 < expected.double().mean() < 0.9
     far = Pose(pose.rotation, number([0.0, 0.0, 1e6], dtype).expand(batch, 3))  # the image shrinks to one point

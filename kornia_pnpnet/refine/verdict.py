@@ -15,7 +15,7 @@ from torch import Tensor
 
 from kornia_pnpnet.core.performance import exporting
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.geometry import Projection
+from kornia_pnpnet.geometry import Projection, span_a_plane
 from kornia_pnpnet.types import MIN_PAIRS, Correspondences
 
 __all__ = [
@@ -53,10 +53,10 @@ def has_enough(projection: Projection, weights: Tensor) -> Tensor:
 def explains(projection: Projection, corr: Correspondences, weights: Tensor) -> Tensor:
     r"""Tell whether a pose explains the pixels, when the noise is unknown.
 
-    A pose explains the pixels when at least three pairs are in front of the camera, and when the residual that 60 % of
-    the pairs (by weight) stay below is less than a fifth of the distance from their mean that 60 % of the pixels stay
-    below: a pose hardly better than "everything is at one point" is no answer. Both sides scale with the image, so that
-    no threshold is in pixels.
+    A pose explains the pixels when the residual that 60 % of the pairs (by weight) stay below is less than a fifth of
+    the distance from their mean that 60 % of the pixels stay below: a pose hardly better than "everything is at one
+    point" is no answer. Both sides scale with the image, so that no threshold is in pixels. At least four pairs have to
+    agree (of three pairs all three), and their points must span more than a line.
 
     Args:
         projection: :func:`~kornia_pnpnet.geometry.project` of the pose.
@@ -75,7 +75,10 @@ def explains(projection: Projection, corr: Correspondences, weights: Tensor) -> 
     limit = _EXPLAINED_RESIDUAL**2 * ascending.gather(-1, position.clamp(max=ascending.shape[-1] - 1))
     explained = projection.in_front & (projection.sq_residual.detach() <= limit)
     enough = torch.where(explained, share, 0.0).sum(-1) >= _EXPLAINED_SHARE
-    return enough & has_enough(projection, weights)
+    # Any three pairs have a pose that explains them: of more pairs, a fourth has to agree.
+    agree = explained & (weights > 0)
+    enough = enough & (agree.sum(-1) >= (weights > 0).sum(-1).clamp(MIN_PAIRS, MIN_PAIRS + 1))
+    return enough & _span_a_plane(corr.world_points.detach(), agree)
 
 
 def is_evident(projection: Projection, corr: Correspondences) -> Tensor:
@@ -94,7 +97,18 @@ def is_evident(projection: Projection, corr: Correspondences) -> Tensor:
     judged = judge(projection, corr, thresholds)
     inliers, counts = (judged.weights > 0).sum(-1), (corr.weights > 0).sum(-1)
     chance = chance_of_inlier(corr, thresholds, judged)
-    return log_false_alarms(counts, inliers, counts, chance) < math.log(MAX_FALSE_ALARMS)
+    triples = counts * (counts - 1) * (counts - 2) // 6  # any three pairs could have given the pose
+    evident = log_false_alarms(triples, inliers, counts, chance) < math.log(MAX_FALSE_ALARMS)
+    return evident & _span_a_plane(corr.world_points, judged.weights > 0)
+
+
+def _span_a_plane(world_points: Tensor, inliers: Tensor) -> Tensor:
+    """Whether the points (B, N, 3) of the inliers (B, N) span more than a line: a line leaves the pose open."""
+    there, points = inliers.mT, world_points.permute(2, 1, 0)
+    share = there.sum(0).to(points.dtype).clamp(min=1.0).reciprocal()
+    points = torch.where(there, points, 0.0)
+    centred = torch.where(there, points - (points.sum(1) * share)[:, None], 0.0)
+    return span_a_plane(centred, share, points.abs().amax((0, 1)))
 
 
 class Thresholds(NamedTuple):
