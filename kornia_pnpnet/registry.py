@@ -11,7 +11,6 @@ from kornia.core.exceptions import ValueCheckError
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
-from kornia_pnpnet.core.checks import check_whole
 from kornia_pnpnet.init import P3P, RANSAC, EPnP, REPPnP, SubsetSolver
 from kornia_pnpnet.normalize import Normalize
 from kornia_pnpnet.pretrained import shipped_weights
@@ -27,15 +26,9 @@ _PAPERS_SAMPLE = 7
 
 
 def _trained(weights: str, m: int | None = None, views: int | None = None) -> PnPNet:
-    """Shipped weights, with the first ``m`` of their iterations (0: the network alone, the paper's "Net")."""
+    """Shipped weights with ``m`` iterations (0: the network alone, the paper's "Net")."""
     solver = PnPNet.from_pretrained(weights)
-    refine = whole = solver.refine
-    if m is not None:
-        check_whole(0, whole.m, m=m)
-        by_residual = max(whole.by_residual - (whole.m - m), 0)  # the iterations by residual are the last ones
-        refine = RobustWeightedLM(**{**whole.config, "m": m, "by_residual": by_residual})
-        for name, parameter in refine.named_parameters():
-            parameter.data.copy_(whole.get_parameter(name)[: len(parameter)])
+    refine = solver.refine if m is None else solver.refine.with_iterations(m)
     return PnPNet(solver.init, refine, solver.normalize, views=solver.views if views is None else views)
 
 
@@ -117,11 +110,11 @@ def create_solver(name: str, **options: Any) -> nn.Module:
     Args:
         name: one of :func:`list_solvers`.
         options: options of that solver. ``identity-lm``, every ``-lm`` and trained weights take ``m``, the number of
-            iterations (trained weights at most their own number); trained weights take ``views``, the number of guesses
-            per problem (see :class:`~kornia_pnpnet.solver.PnPNet`); ``epnp`` and ``epnp-lm`` take the arguments of
-            :class:`~kornia_pnpnet.init.EPnP`, ``reppnp`` and ``reppnp-lm`` of :class:`~kornia_pnpnet.init.REPPnP`,
-            ``p3p-ransac`` and ``ransac-epnp-lm`` of :class:`~kornia_pnpnet.init.RANSAC`, peers of their class in
-            :mod:`kornia_pnpnet.peers`.
+            iterations (see :meth:`~kornia_pnpnet.refine.RobustWeightedLM.with_iterations`); trained weights take
+            ``views``, the number of guesses per problem (see :class:`~kornia_pnpnet.solver.PnPNet`); ``epnp`` and
+            ``epnp-lm`` take the arguments of :class:`~kornia_pnpnet.init.EPnP`, ``reppnp`` and ``reppnp-lm`` of
+            :class:`~kornia_pnpnet.init.REPPnP`, ``p3p-ransac`` and ``ransac-epnp-lm`` of
+            :class:`~kornia_pnpnet.init.RANSAC`, peers of their class in :mod:`kornia_pnpnet.peers`.
 
     Returns:
         The solver as a module in evaluation mode.

@@ -16,7 +16,7 @@ from kornia_pnpnet.core.checks import check_whole
 from kornia_pnpnet.core.performance import Compiled, compiling, split_batch
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import project
-from kornia_pnpnet.init import EPnP, MLPInit, REPPnP, SetInit
+from kornia_pnpnet.init import RANSAC, EPnP, MLPInit, REPPnP, SetInit
 from kornia_pnpnet.inputs import Inputs, checked_inputs
 from kornia_pnpnet.normalize import VIEWS, Frame, Normalize
 from kornia_pnpnet.pretrained import read_weights, write_weights
@@ -123,8 +123,9 @@ class PnPNet(nn.Module):
                 extrinsics are ignored.
             weights: weight of each pair, at least 0, shape :math:`(B, N)`; 1 when ``None``.
             mask: False where a pair is padding, bool, shape :math:`(B, N)`. The numbers of padding do not matter.
-            init: world-to-camera pose to start from instead of the initialiser's, :math:`(B, 3, 3)` and
-                :math:`(B, 3)`. A set network still weighs the pairs.
+            init: a world-to-camera pose, for example of the frame before, :math:`(B, 3, 3)` and :math:`(B, 3)`. It
+                competes with the poses of the initialiser and is refined as they are. Without an initialiser the
+                refinement starts from it.
             img_sigma: standard deviation of the noise on each pixel coordinate, a number, :math:`(B,)` or
                 :math:`(B, N)`, at least 0; NaN where unknown. With this or ``world_sigma``, residuals and the scales of
                 the refinement's kernel count in standard deviations.
@@ -231,10 +232,12 @@ class PnPNet(nn.Module):
         """Everything before the first iteration."""
         world_points, img_points, intrinsics, weights, mask, init, noise = inputs
         corr, frame = self.normalize(world_points, img_points, intrinsics, weights, mask, noise)
-        if self.init is None or init is not None:
-            guess = Guess(self._given(init, world_points, frame), torch.ones_like(corr.weights))
-            if isinstance(self.init, SetInit):
-                guess = self.init(corr)._replace(pose=guess.pose, others=None)
+        given = self._given(init, world_points, frame) if self.init is None or init is not None else None
+        if self.init is None:
+            assert given is not None
+            guess = Guess(given, torch.ones_like(corr.weights))
+        elif isinstance(self.init, RANSAC):
+            guess = self.init(corr, given)
         elif views == 1:
             guess = self.init(corr)
         else:
@@ -244,6 +247,9 @@ class PnPNet(nn.Module):
             others = map_tensors(lambda *x: torch.stack(x, 1), *rest)
             # Weights, ok and noise of the first view, whose pairs have the order of the correspondences.
             guess = map_tensors(lambda x: x[:batch], guess)._replace(pose=first, others=others)
+        if given is not None and not (self.init is None or isinstance(self.init, RANSAC)):
+            others = map_tensors(lambda *x: torch.stack(x, 1), *guess.poses[1:], given)
+            guess = guess._replace(others=others, ok=None)
         if corr.near is not None and not getattr(self.init, "weighs_far_pairs", False):
             guess = guess._replace(weights=guess.weights * torch.where(_is_seen(guess, corr), 1.0, corr.near))
         return _Begun(self.refine.begin(corr, guess), frame, guess)

@@ -39,8 +39,8 @@ def found(monkeypatch):
     seen = []
     run = Search.run
 
-    def recorded(self):
-        seen.append(run(self))
+    def recorded(self, given=None):
+        seen.append(run(self, given))
         return seen[-1]
 
     monkeypatch.setattr(Search, "run", recorded)

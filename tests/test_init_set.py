@@ -212,12 +212,11 @@ def test_known_noise_is_used_as_it_is_and_unknown_noise_is_estimated(make_proble
     torch.testing.assert_close(net.with_guess(*p[:3], world_sigma=of_pairs)[1].noise.world, of_pairs)
 
 
-def test_a_pose_by_hand_takes_the_place_of_the_guesses(make_problems, perturb):
+def test_a_pose_by_hand_competes_with_the_guesses(make_problems, perturb):
     p = make_problems(n=9, batch=20, outliers=2)
     net = solver()
     start = perturb(p.pose)
     result = net(*p[:3], init=start, **NOISE)
-    near(result.init, start)
     errors = pose_errors(result.pose, p.pose)
     assert success(errors).double().mean() > 0.5  # an untrained network's own guesses are not that good
     assert result.weights.isfinite().all()

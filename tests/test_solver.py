@@ -427,15 +427,26 @@ def test_copies_and_dtypes_of_the_module(make_problems):
 # --- a pose by hand ---------------------------------------------------------------------------------------------------
 
 
-def test_a_given_pose_replaces_that_of_the_network(make_problems, perturb):
+def test_a_given_pose_is_one_more_hypothesis(make_problems, perturb):
     p = make_problems()
     init = perturb(p.pose)
-    by_hand = net(9, 5)(*p[:3], init=init)
-    torch.testing.assert_close(by_hand.init.matrix, init.matrix, rtol=1e-12, atol=1e-11)
+    by_hand, alone = net(9, 5)(*p[:3], init=init), PnPNet(None, RobustWeightedLM(m=5))
     assert by_hand.ok.all()
-    without = PnPNet(None, RobustWeightedLM(m=5))
-    assert_same(by_hand, without(*p[:3], init=init))
-    assert_same(by_hand, without(*p[:3], init=tuple(init)))
+    for given in (init, tuple(init)):
+        assert_same(by_hand._replace(init=None), alone(*p[:3], init=given)._replace(init=None))
+
+
+@pytest.mark.parametrize(
+    "name", ["p3p-ransac", "ransac-epnp-lm", "epnp", "reppnp", "epnp-lm", "pnpnet-set", "pnpnet-n9"]
+)
+def test_a_given_pose_helps_and_does_no_harm(name, make_problems, perturb):
+    p = make_problems(noise=False)
+    far = Pose(p.pose.rotation.flip(0), -3.0 * p.pose.translation)
+    solver = create_solver(name)
+    assert_same(solver(*p[:3], init=far).matrix, p.pose.matrix, atol=1e-2)
+    close = perturb(p.pose, angle=1e-3, shift=1e-2)
+    result = solver(*p[:3], init=close)
+    assert (result.matrix - p.pose.matrix).norm() < 0.1 * (close.matrix - p.pose.matrix).norm()
     identity = PnPNet(None, RobustWeightedLM(m=0))(*p[:3])  # the guess where there is no other
     torch.testing.assert_close(identity.matrix, torch.eye(4).double().expand(7, 4, 4), rtol=0, atol=1e-12)
 
@@ -533,8 +544,15 @@ def test_solvers_by_name(make_problems):
     for wrong in (["epnp"], None):
         with pytest.raises(ValueCheckError):
             create_solver(wrong)
-    with pytest.raises(BaseError, match=r"m .*51"):
-        create_solver("pnpnet-n9", m=51)
+    with pytest.raises(BaseError, match="m must"):
+        create_solver("pnpnet-n9", m=-1)
+
+
+@pytest.mark.parametrize("name", ["pnpnet-n9", "pnpnet-set"])
+def test_more_iterations_converge_further(name, make_problems):
+    p = make_problems(batch=50)
+    own, more, end = (create_solver(name, m=m)(*p[:3]).matrix for m in (None, 40, 80))
+    assert (more - end).flatten(1).norm(dim=1).median() < 0.1 * (own - end).flatten(1).norm(dim=1).median()
 
 
 def test_the_first_iterations_of_trained_weights(make_problems):

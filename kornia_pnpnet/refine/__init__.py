@@ -6,8 +6,9 @@ to be believed.
 """
 
 from kornia_pnpnet.refine.kernels import KERNELS, RobustKernel
-from kornia_pnpnet.refine.lm import LMStart, RobustWeightedLM, Stage, State
+from kornia_pnpnet.refine.lm import RobustWeightedLM
 from kornia_pnpnet.refine.parameters import BoundedParameter
+from kornia_pnpnet.refine.stages import LMStart, Stage, State
 from kornia_pnpnet.refine.step import LMStep, lm_step, solve_damped
 from kornia_pnpnet.refine.verdict import explains
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
 
 import torch
 from kornia.core.check import KORNIA_CHECK
@@ -22,11 +21,12 @@ from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import NormalEquations, Projection, move, project
 from kornia_pnpnet.refine.kernels import KERNELS, RobustKernel
 from kornia_pnpnet.refine.parameters import BoundedParameter
+from kornia_pnpnet.refine.stages import LMStart, Stage, State
 from kornia_pnpnet.refine.step import LMStep, iterate, robust_weights, solve_damped, sq_standardised, weighted_equations
 from kornia_pnpnet.refine.verdict import explains, has_enough, is_evident
 from kornia_pnpnet.types import Correspondences, Guess, Noise, Pose, Refinement
 
-__all__ = ["BACKWARDS", "LMStart", "RobustWeightedLM", "Stage", "State"]
+__all__ = ["BACKWARDS", "RobustWeightedLM"]
 
 #: How gradients pass through a refinement, see :class:`RobustWeightedLM`.
 BACKWARDS = ("unroll", "truncated", "implicit")
@@ -38,59 +38,6 @@ _MAX_RESIDUAL = 2.0
 _LEAST_NOISE = 1e-6
 # Factors of the damping after a refused and after an accepted step (Marquardt 1963; only with `reject_worse`).
 _DAMPING_UP, _DAMPING_DOWN = 10.0, 0.3
-
-
-class LMStart(NamedTuple):
-    r"""Everything that the iterations of a refinement need, made before the first of them.
-
-    Attributes:
-        corr: the correspondences with the weights of the caller, problems last in memory. Their noise is known for
-            every pair, or ``None``.
-        prior: weight of each pair before its residual is looked at, for cost and verdict, :math:`(B, N)`.
-        pose: the first poses, :math:`(S B)`: one pose of every problem, then the next pose of every problem.
-        guided: ``corr`` with weights of caller and initialiser, relative to the largest.
-        by_residual: ``corr`` with the weights that the last iterations see: those of the caller alone, relative to the
-            largest, or ``guided`` without such iterations.
-        starts: ``guided`` once for each of the :math:`S` poses.
-        rivals: the pairs by whose cost the :math:`S` poses compete; ``None`` when :math:`S = 1`.
-        estimated: problems whose noise the initialiser estimated, so that the last iterations may correct it, bool
-            :math:`(B, 1)`; ``None`` when there are no such iterations.
-        step: :math:`\gamma` of each iteration, scalars.
-        damping: :math:`\lambda` of each iteration, scalars.
-        shape: shape of the kernel of each iteration, scalars.
-    """
-
-    corr: Correspondences
-    prior: Tensor
-    pose: Pose
-    guided: Correspondences
-    by_residual: Correspondences
-    starts: Correspondences
-    rivals: Correspondences | None
-    estimated: Tensor | None
-    step: tuple[Tensor, ...]
-    damping: tuple[Tensor, ...]
-    shape: tuple[Tensor, ...]
-
-
-class State(NamedTuple):
-    """Between two stages: the poses, whether the last equations were solved, and a factor of the damping."""
-
-    pose: Pose
-    solved: Tensor
-    factor: Tensor
-
-
-class Stage(NamedTuple):
-    """One entry of a refinement's plan.
-
-    Attributes:
-        iteration: number of the iteration that it is, or that it precedes.
-        advance: from the state before the stage to the state after it.
-    """
-
-    iteration: int
-    advance: Callable[[State], State]
 
 
 class RobustWeightedLM(Configured):
@@ -137,6 +84,7 @@ class RobustWeightedLM(Configured):
             through a minimum, at a memory that does not grow with ``m``; exact once the iterations have converged.
             Step, damping and the first guess then have no gradient.
         last: number of iterations that ``"truncated"`` passes through.
+        compared_at: number of iterations before the choice among several poses; seven tenths of ``m`` when ``None``.
 
     Raises:
         BaseError: for an unknown kernel or update, a negative ``m``, or an initial value out of its bounds.
@@ -167,6 +115,7 @@ class RobustWeightedLM(Configured):
         learnable: bool = True,
         backward: str = "unroll",
         last: int = 1,
+        compared_at: int | None = None,
     ) -> None:
         super().__init__(locals())
         check_whole(0, m=m, by_residual=by_residual)
@@ -175,7 +124,8 @@ class RobustWeightedLM(Configured):
         KORNIA_CHECK(update in ("retraction", "additive"), f"update must be retraction or additive, got {update!r}.")
         KORNIA_CHECK(backward in BACKWARDS, f"backward must be one of {BACKWARDS}, got {backward!r}.")
         self.m = m
-        self.compared_at = 7 * m // 10  # number of iterations before the choice among several poses
+        check_whole(0, m, **({} if compared_at is None else {"compared_at": compared_at}))
+        self.compared_at = 7 * m // 10 if compared_at is None else compared_at
         self.by_residual = min(by_residual, m - self.compared_at)
         self.backward = backward
         self.last = last
@@ -212,6 +162,31 @@ class RobustWeightedLM(Configured):
         count = max(self.m, 1)
         step, damping, shape = (p().to(like).expand(count) for p in (self.step, self.damping, self.robustness))
         return step, damping, shape
+
+    def with_iterations(self, m: int) -> RobustWeightedLM:
+        """A copy with another number of iterations, its hyperparameters included.
+
+        Args:
+            m: number of iterations. Fewer: the first of them, and the same share before the choice among several poses.
+                More: the last iteration is repeated, so that poses converge further.
+
+        Returns:
+            The refiner, not compiled.
+
+        Example:
+            >>> refine = RobustWeightedLM(m=5).with_iterations(20)
+            >>> refine.m, refine.step().shape
+            (20, torch.Size([20]))
+        """
+        check_whole(0, m=m)
+        more = m - self.m
+        config = {**self.config, "m": m, "by_residual": max(self.by_residual + more, 0)}
+        config["compared_at"] = self.compared_at if more > 0 else None
+        refine = RobustWeightedLM(**config)
+        for name, parameter in refine.named_parameters():
+            trained = self.get_parameter(name).detach()
+            parameter.data = trained[torch.arange(len(parameter)).clamp(max=len(trained) - 1)]
+        return refine
 
     def forward(self, corr: Correspondences, guess: Guess, *, m: int | None = None) -> Refinement:
         r"""Refine a guess.

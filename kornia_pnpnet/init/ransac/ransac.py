@@ -137,11 +137,12 @@ class RANSAC(Configured):
         options.update(minimal=minimal, scorer=scorer if callable(scorer) else SCORERS[scorer])
         self.plan = Plan(**options)
 
-    def forward(self, corr: Correspondences) -> Guess:
+    def forward(self, corr: Correspondences, given: Pose | None = None) -> Guess:
         r"""Find the poses.
 
         Args:
             corr: normalised correspondences.
+            given: poses in the frame of the correspondences that compete with those of the samples.
 
         Returns:
             The poses; as weights :math:`\tau^2 / (\tau^2 + (f \omega / z)^2)` for the inliers, 0 for the outliers; and
@@ -168,7 +169,9 @@ class RANSAC(Configured):
         corr = corr._replace(world_points=corr.world_points - centre[:, None], weights=weights)
         with torch.no_grad():
             thresholds = self._thresholds(corr)
-            found = Search(self.plan, corr, thresholds).run()
+            if given is not None:
+                given = given._replace(translation=given.translation + (given.rotation @ centre[..., None])[..., 0])
+            found = Search(self.plan, corr, thresholds).run(given)
         pose, judged = self._refine(corr, found.pose, thresholds)
         with torch.no_grad():
             ok = self._is_evident(found, corr, thresholds, judged)

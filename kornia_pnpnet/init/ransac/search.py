@@ -100,8 +100,12 @@ class Search:
         # The numbers of a pair side by side, so that a sample is gathered pair by pair.
         self.pairs = torch.cat((corr.world_points, corr.img_points, corr.weights[..., None]), -1).flatten(0, 1)
 
-    def run(self) -> Found:
-        """Search until every problem has a sample without an outlier at the confidence, or all its samples."""
+    def run(self, given: Pose | None = None) -> Found:
+        """Search until every problem has a sample without an outlier at the confidence, or all its samples.
+
+        Args:
+            given: poses that compete with those of the samples, in the frame of the correspondences.
+        """
         plan, samples = self.plan, self.samples
         batch, count = self.corr.weights.shape
         device = self.corr.weights.device
@@ -109,6 +113,21 @@ class Search:
         loss = matrix.new_full((batch,), torch.inf)
         inliers, poses, drawn = torch.zeros(3, batch, dtype=torch.long, device=device)
         active = (samples.counts >= samples.size).nonzero()[:, 0]
+
+        def improve(at: Tensor, losses: Tensor, matrices: Tensor) -> None:
+            size = max(1, PAIRS_PER_SAMPLE * plan.chunk_size // (count * losses.shape[1]))
+            for one, some, part in zip(*(x.split(size) for x in (at, losses, matrices)), strict=True):
+                loss[one], matrix[one] = self._improve(one, some, part)
+                corr, thresholds = take(self.low, one)
+                judged = judge(project(_pose(matrix[one]), corr), corr, thresholds)
+                inliers[one] = (judged.weights > 0).sum(-1)
+
+        if given is not None and len(active):
+            rotation, translation = (x.to(_DTYPE) for x in given)
+            packed = self.scene.pack(rotation[:, None, None], translation[:, None, None])
+            matrices = torch.cat((rotation, translation[..., None]), -1)[:, None]
+            improve(active, self.scene.losses(packed, plan.scorer)[active], matrices[active])
+            poses[active] += 1
         stop = 0
         while stop < samples.total and len(active):
             start, stop = stop, min(samples.total, stop + self._round(stop))
@@ -118,12 +137,7 @@ class Search:
             poses[active] += tested
             drawn[active] = stop
             better = (top_losses[:, 0] < loss[active]).nonzero()[:, 0]
-            for some in better.split(max(1, PAIRS_PER_SAMPLE * plan.chunk_size // (count * top_losses.shape[1]))):
-                at = active[some]
-                loss[at], matrix[at] = self._improve(at, top_losses[some], top_matrices[some])
-                corr, thresholds = take(self.low, at)
-                judged = judge(project(_pose(matrix[at]), corr), corr, thresholds)
-                inliers[at] = (judged.weights > 0).sum(-1)
+            improve(active[better], top_losses[better], top_matrices[better])
             needed = samples_needed(inliers[active], samples.counts[active], samples.size, plan.confidence)
             active = active[needed.clamp(min=plan.min_samples) > stop]
         return Found(_orthonormal(_pose(matrix.to(self.corr.weights))), loss, poses, drawn)

@@ -1,0 +1,65 @@
+"""What a refinement plans before its first iteration, and what passes from one stage of the plan to the next."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from torch import Tensor
+
+from kornia_pnpnet.types import Correspondences, Pose
+
+__all__ = ["LMStart", "Stage", "State"]
+
+
+class LMStart(NamedTuple):
+    r"""Everything that the iterations of a refinement need, made before the first of them.
+
+    Attributes:
+        corr: the correspondences with the weights of the caller, problems last in memory. Their noise is known for
+            every pair, or ``None``.
+        prior: weight of each pair before its residual is looked at, for cost and verdict, :math:`(B, N)`.
+        pose: the first poses, :math:`(S B)`: one pose of every problem, then the next pose of every problem.
+        guided: ``corr`` with weights of caller and initialiser, relative to the largest.
+        by_residual: ``corr`` with the weights that the last iterations see: those of the caller alone, relative to the
+            largest, or ``guided`` without such iterations.
+        starts: ``guided`` once for each of the :math:`S` poses.
+        rivals: the pairs by whose cost the :math:`S` poses compete; ``None`` when :math:`S = 1`.
+        estimated: problems whose noise the initialiser estimated, so that the last iterations may correct it, bool
+            :math:`(B, 1)`; ``None`` when there are no such iterations.
+        step: :math:`\gamma` of each iteration, scalars.
+        damping: :math:`\lambda` of each iteration, scalars.
+        shape: shape of the kernel of each iteration, scalars.
+    """
+
+    corr: Correspondences
+    prior: Tensor
+    pose: Pose
+    guided: Correspondences
+    by_residual: Correspondences
+    starts: Correspondences
+    rivals: Correspondences | None
+    estimated: Tensor | None
+    step: tuple[Tensor, ...]
+    damping: tuple[Tensor, ...]
+    shape: tuple[Tensor, ...]
+
+
+class State(NamedTuple):
+    """Between two stages: the poses, whether the last equations were solved, and a factor of the damping."""
+
+    pose: Pose
+    solved: Tensor
+    factor: Tensor
+
+
+class Stage(NamedTuple):
+    """One entry of a refinement's plan.
+
+    Attributes:
+        iteration: number of the iteration that it is, or that it precedes.
+        advance: from the state before the stage to the state after it.
+    """
+
+    iteration: int
+    advance: Callable[[State], State]
