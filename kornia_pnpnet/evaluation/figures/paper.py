@@ -1,22 +1,212 @@
-"""All figures of the paper's protocol."""
+"""The figures of the paper's protocol."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import re
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from kornia_pnpnet.evaluation.figures.curves import plot_against_m, plot_against_n, plot_mismatches
-from kornia_pnpnet.evaluation.figures.dots import plot_scenes, plot_synthetic
-from kornia_pnpnet.evaluation.figures.operations import plot_operations
-from kornia_pnpnet.evaluation.figures.records import NothingToDrawError
+import pandas as pd
+from matplotlib import rc_context
 
-__all__ = ["paper_figures"]
+from kornia_pnpnet.evaluation.figures.panels import draw_curves, draw_dots
+from kornia_pnpnet.evaluation.figures.records import (
+    NothingToDrawError,
+    at_usual_n,
+    in_words,
+    outliers_in_words,
+    pooled,
+    records,
+)
+from kornia_pnpnet.evaluation.figures.style import THEME
 
-_OPERATIONS = "figure1_operations.png"
-_FIGURES: Mapping[str, Callable[[Path, Sequence[Mapping[str, Any]]], Path]] = {
+_SOURCES = {"paper": "the paper's data", "gaussian_pose": "data with Gaussian positions"}
+_SCENE_OUTLIERS = 2  # as in the paper
+_MOST_SCENES = 6  # panels side by side
+_FEWEST_MISMATCHES = 3  # numbers of mismatches of a curve
+
+
+@rc_context(THEME)
+def plot_synthetic(path: str | Path, results: Sequence[Mapping[str, Any]], source: str = "paper") -> Path:
+    """Draw success on synthetic data without and with outliers: figures 2 and 3 of the protocol.
+
+    The panels are no outliers, 0 to a third of the pairs, and a third, at n = 9 or the smallest n of the results.
+
+    Args:
+        path: the picture to write; the ending gives the format.
+        results: results files of :func:`~kornia_pnpnet.evaluation.evaluate`.
+        source: ``paper`` or ``gaussian_pose``.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: when the results have no such problems.
+    """
+    table, n = at_usual_n(records(results).query("source == @source and not swept and not mismatches"))
+    settings = {setting: table[table.outliers == setting] for setting in (0, "uniform", n // 3)}
+    panels = {outliers_in_words(setting, n): part for setting, part in settings.items() if len(part)}
+    if not panels:
+        raise NothingToDrawError(f"The results hold no success on '{source}' with none, uniform or {n // 3} outliers.")
+    heading = [f"Success on {_SOURCES.get(source, source)}, n = {n}", in_words(pd.concat(panels.values()))]
+    return draw_dots(path, heading, [panels], len(settings))
+
+
+@rc_context(THEME)
+def plot_scenes(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Path:
+    """Draw success on scenes, over all scenes and for each: figure 4 of the protocol.
+
+    The panels are without outliers and with two, at n = 9 or the smallest n of the results. A solver has a dot over all
+    scenes when it solved all of them.
+
+    Args:
+        path: See :func:`plot_synthetic`.
+        results: See :func:`plot_synthetic`.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: when the results have no such scenes.
+    """
+    table = records(results).query("scene and not swept and not mismatches")
+    table, n = at_usual_n(table[table.outliers.isin([0, _SCENE_OUTLIERS])])
+    if table.empty:
+        raise NothingToDrawError(f"The results hold no success on scenes with 0 or {_SCENE_OUTLIERS} outliers.")
+    lines = []
+    for setting, chosen in table.groupby("outliers"):
+        scenes = dict(list(chosen.groupby("source", sort=False)))
+        first, words = next(iter(scenes)), outliers_in_words(setting, n)
+        whole = {f"{words}: all {len(scenes)} scenes": pooled(chosen)}
+        lines.append({**whole, **scenes} if len(scenes) > 1 else {f"{words}: {first}": scenes[first]})
+    return draw_dots(path, [f"Success on scenes, n = {n}", in_words(table)], lines, _MOST_SCENES)
+
+
+def plot_mismatches(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Path:
+    """Draw success on scenes against the number of mismatches: figure 5 of the protocol.
+
+    The scenes with the most numbers of mismatches are pooled, at n = 9 or the smallest n of the results. A solver that
+    solved all these scenes at three numbers or more has a curve. Without sets of mismatches only, the outliers of the
+    protocol are drawn.
+
+    Args:
+        path: See :func:`plot_synthetic`.
+        results: See :func:`plot_synthetic`.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: when no scene has three numbers of mismatches.
+    """
+    table = records(results).query("scene and not swept")
+    table = table[[isinstance(outliers, int) for outliers in table.outliers]]
+    kind = table.mismatches.any()
+    table, n = at_usual_n(table[(table.mismatches == kind) | (table.outliers == 0)])
+    counts = table.groupby("source").outliers.agg(set)
+    most = max(counts, key=len, default=set())
+    table = table[table.source.isin(counts.index[counts >= most]) & table.outliers.isin(most)]
+    parts = [pooled(part).assign(outliers=number) for number, part in table.groupby("outliers")]
+    rates = pd.concat(parts) if len(parts) >= _FEWEST_MISMATCHES else table[:0]
+    rates = rates[rates.groupby("solver").outliers.transform("size") >= _FEWEST_MISMATCHES]
+    if rates.empty:
+        raise NothingToDrawError(f"The results hold no scenes with {_FEWEST_MISMATCHES} numbers of mismatches.")
+    scenes, label = table.source.unique(), f"{'mismatches' if kind else 'outliers'} among {n} pairs"
+    heading = [f"Success on {f'{len(scenes)} scenes' if len(scenes) > 1 else scenes[0]}, n = {n}", in_words(table)]
+    return draw_curves(path, heading, [("", rates, "rate")], "outliers", label)
+
+
+def plot_against_n(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Path:
+    """Draw success on the protocol's data against the number of pairs, a panel for each outlier setting.
+
+    Solvers for one n each, such as ``pnpnet-n9`` and ``pnpnet-n20``, make one curve. Other solvers need two n.
+
+    Args:
+        path: See :func:`plot_synthetic`.
+        results: See :func:`plot_synthetic`.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: when no outlier setting has two numbers of pairs.
+    """
+    table = records(results).query("source == 'paper' and not swept and not mismatches")
+    table = table[table.groupby("outliers").n.transform("nunique") > 1]
+    if table.empty:
+        raise NothingToDrawError("The results hold no success on 'paper' with several n and the same outliers.")
+    families = [re.sub(rf"-n{n}\b", "-n*", solver) for solver, n in zip(table.solver, table.n, strict=True)]
+    single = table.groupby(families).solver.transform("nunique") == 1
+    table = table.assign(solver=table.solver.where(single, families))
+    several = table.groupby(["solver", "outliers"]).n.transform("size") > 1
+    table = table[several | table.solver.str.match("pnpnet|net")]
+    heading = [f"Success on {_SOURCES['paper']} against the number of pairs", in_words(table)]
+    return draw_curves(path, heading, _by_outliers(table, "n"), "n", "pairs n", log=True)
+
+
+def plot_against_m(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Path:
+    """Draw success on the protocol's data, and time, against the iterations of the refinement.
+
+    Solvers that differ only in the option m, such as ``epnp-lm`` and ``epnp-lm:m=3``, make one curve; m is read from
+    their configurations. n is 9 or the smallest n of the results. The time is of the last outlier setting.
+
+    Args:
+        path: See :func:`plot_synthetic`.
+        results: See :func:`plot_synthetic`.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: when no solver has two m.
+    """
+    table, n = at_usual_n(records(results).query("source == 'paper' and m >= 0 and not mismatches"))
+    table = table.assign(solver=table.base).drop_duplicates(["solver", "outliers", "m"], keep="last")
+    table = table[table.groupby(["solver", "outliers"]).m.transform("size") > 1]
+    if table.empty:
+        raise NothingToDrawError("The results hold no success on 'paper' of a solver with several m.")
+    panels = _by_outliers(table, n)
+    panels.append((f"time, {panels[-1][0]}", panels[-1][1], "us"))
+    heading = [f"Success on {_SOURCES['paper']} against m, n = {n}", in_words(table)]
+    return draw_curves(path, heading, panels, "m", "iterations m")
+
+
+def _by_outliers(table: pd.DataFrame, n: int | str) -> list[tuple[str, pd.DataFrame, str]]:
+    """A panel of rates for each outlier setting: none, uniform, other numbers, other texts."""
+    settings = sorted(table.outliers.unique(), key=lambda x: (x != 0, x != "uniform", isinstance(x, str), x))
+    return [(outliers_in_words(setting, n), table[table.outliers == setting], "rate") for setting in settings]
+
+
+def plot_operations(path: str | Path, complexity: Mapping[str, Any]) -> Path:
+    """Draw the operations of a solver for one problem of n pairs: figure 1 of the protocol.
+
+    Args:
+        path: the picture to write; the ending gives the format.
+        complexity: ``n``, numbers of pairs; ``counts``, by solver one operation count for each n, or ``None``;
+            ``ransac``, the names of the solvers of the second panel.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: when there is no solver, or the counts of a solver are not one for each n.
+    """
+    n, counts = list(complexity["n"]), complexity["counts"]
+    if not n or not counts:
+        raise ValueError("There are no operation counts to draw.")
+    for name, values in counts.items():
+        if len(values) != len(n):
+            raise ValueError(f"There are {len(n)} numbers of pairs, but {len(values)} operation counts of '{name}'.")
+    table = pd.DataFrame({"n": n, **counts}).melt("n", var_name="solver", value_name="operations")
+    sampled = table.solver.isin(complexity["ransac"]).map({False: "without RANSAC", True: "with RANSAC"})
+    panels = [(title, part, "operations") for title, part in table.groupby(sampled, sort=False)]
+    return draw_curves(path, ["Operations that a problem of n pairs takes"], panels, "n", "pairs n")
+
+
+_FIGURES = {
     "figure2_paper.png": partial(plot_synthetic, source="paper"),
     "figure3_gaussian_pose.png": partial(plot_synthetic, source="gaussian_pose"),
     "figure4_scenes.png": plot_scenes,
@@ -45,15 +235,14 @@ def paper_figures(results: Sequence[Mapping[str, Any]], folder: str | Path) -> l
     """
     if not results:
         raise ValueError("There are no results to draw: expected at least one results file.")
-    folder = Path(folder)
     complexity = [entry for entry in results if entry.get("kind") == "complexity"]
     solved = [entry for entry in results if entry.get("kind") != "complexity"]
     if len(complexity) > 1:
         raise ValueError(f"Operation counts come from one file, got {len(complexity)}.")
-    made = [plot_operations(folder / _OPERATIONS, entry) for entry in complexity]
+    made = [plot_operations(Path(folder) / "figure1_operations.png", entry) for entry in complexity]
     for name, plot in _FIGURES.items():
         with suppress(NothingToDrawError):
-            made.append(plot(folder / name, solved))
+            made.append(plot(Path(folder) / name, solved))
     if not made:
         raise ValueError("The results hold no data for any figure: no data set has a source and outliers to compare.")
     return made

@@ -6,15 +6,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.collections import LineCollection
 from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_positive
-from kornia_pnpnet.evaluation.figures.style import BLUE, RED, SMALL, TITLE, make_figure, save, tidy
-
-__all__ = ["plot_pose"]
+from kornia_pnpnet.evaluation.figures.style import BLUE, THEME, VERMILION, make_figure, save
 
 
+@rc_context(THEME)
 def plot_pose(
     path: str | Path,
     img_points: np.ndarray | Tensor,
@@ -60,20 +60,19 @@ def plot_pose(
     width = min(6.1, 7.0 / ratio)
     figure = make_figure(max(5.0, width + 0.9), max(3.5, width * ratio + 1.1))
     axes = figure.subplots()
-    for which, colour, dash in ((seen & ~bad, BLUE, "-"), (seen & bad, RED, "--")):
+    for which, colour, dash in ((seen & ~bad, BLUE, "-"), (seen & bad, VERMILION, "--")):
         lines = np.stack((pixels[which], projected[which]), axis=1)
         axes.add_collection(LineCollection(list(lines), colors=colour, linewidths=1.2, linestyles=dash, alpha=0.8))
     marks: dict[str, Any] = {"markersize": 9.0, "linestyle": "none"}
     axes.plot(*pixels[~bad].T, "o", color=BLUE, markerfacecolor="none", label="pixel, kept", **marks)
-    axes.plot(*pixels[bad].T, "x", color=RED, markeredgewidth=2.2, label="pixel, rejected", **marks)
+    axes.plot(*pixels[bad].T, "x", color=VERMILION, markeredgewidth=2.2, label="pixel, rejected", **marks)
     axes.plot(*projected[seen].T, "+", color="black", markeredgewidth=1.3, label="reprojection", **marks)
     axes.set(xlim=(left, right), ylim=(bottom, top), xlabel="u (px)", ylabel="v (px)", aspect="equal")
-    tidy(axes)
     counts = f"n = {len(pixels)}, {int(bad.sum())} rejected"
     hidden = int((~seen).sum())
     counts += f", {hidden} behind the camera" if hidden else ""
-    axes.set_title(f"{title}: {counts}" if title else counts, fontsize=TITLE, parse_math=False)
-    figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=SMALL)
+    axes.set_title(f"{title}: {counts}" if title else counts)
+    figure.legend(loc="outside lower center", ncols=3)
     return save(figure, path)
 
 

@@ -1,166 +1,112 @@
-"""The look of all pictures: page, letters, and the colour, marker and order of the solvers."""
+"""The look of all pictures: theme, legend, and the colour, marker and order of the solvers."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
-from matplotlib.axes import Axes
+import seaborn as sns
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import Formatter, LogLocator, NullFormatter
+
+#: Colours that colour-blind readers can tell apart.
+COLOURS = tuple(sns.color_palette("colorblind").as_hex())
+BLUE, ORANGE, GREEN, VERMILION, PINK, BROWN, _, GREY, _, SKY = COLOURS
+_BLACK = "#222222"
 
 WIDTH = 7.2  #: inches; the width of a page with two columns, so that letters are printed at their size
-SMALL, TITLE = 8.0, 9.0  #: sizes of letters in points
-LETTERS = 112  #: number of small letters across the page, about
-_DPI = 300
+_DPI = 200  # 1440 pixels across: sharp on a web page of 800 pixels, and a small file
+_LETTERS, _HANDLE = 105, 11  # of a legend: letters across the page, and letters that a piece of line takes
 
-# Okabe and Ito's colours, which colour-blind readers can tell apart. In grey, markers and dashes tell solvers apart.
-BLUE, ORANGE, GREY, RED = "#0072B2", "#E69F00", "#5f5f5f", "#CC3311"
-SKY, GREEN, VERMILION, PURPLE = "#56B4E9", "#009E73", "#D55E00", "#B5528C"
-_BLACK = "#222222"
-_SOLID, _DASHED, _DOTTED, _DASH_DOTTED = "-", (0, (4, 2)), (0, (1, 1.3)), (0, (5, 1.5, 1, 1.5))
-
-#: Colours of curves that are not solvers.
-COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, "#000000")
-#: Groups of solvers, from the top of a picture down.
-GROUPS = ("PnP-Net", "methods of the paper", "beyond the paper", "other libraries", "others", "bounds")
-_OTHERS, _BOUNDS = 4, 5
-#: The protocol's priors in a title.
-SOURCES = {"paper": "the paper's data", "gaussian_pose": "data with Gaussian positions"}
-
-
-class SolverStyle(NamedTuple):
-    """How a solver is drawn in every picture.
-
-    Attributes:
-        group: index into :data:`GROUPS`.
-        colour: colour of line and marker.
-        marker: matplotlib's letter of the marker; empty for a bound, which is a line.
-        filled: whether the marker is filled.
-        dash: matplotlib's line style.
-    """
-
-    group: int
-    colour: str
-    marker: str
-    filled: bool
-    dash: Any
-
-    @property
-    def ours(self) -> bool:
-        """Whether the solver stands out."""
-        return self.group == 0 and self.filled
-
-    @property
-    def bound(self) -> bool:
-        """Whether this is a bound on the success of all solvers."""
-        return self.group == _BOUNDS
-
-    def line(self) -> dict[str, Any]:
-        """Arguments of ``Axes.plot`` and ``Axes.errorbar``."""
-        return {
-            "color": self.colour,
-            "linestyle": self.dash,
-            "linewidth": 2.0 if self.ours else 1.2,
-            "zorder": 4 if self.ours else 3,
-            **self.dot(),
-        }
-
-    def dot(self) -> dict[str, Any]:
-        """The arguments of :meth:`line` for the marker."""
-        return {
-            "marker": self.marker,
-            "markersize": 5.2 if self.ours else 4.4,
-            "markerfacecolor": self.colour if self.filled else "white",
-            "markeredgecolor": self.colour,
-            "markeredgewidth": 1.0,
-        }
-
-
-# Styles in the order of the rows. A solver has the style of the longest name that its name begins with, up to a hyphen.
-# A method alone is open and dashed; with refinement, filled and solid.
-_KNOWN = {
-    "pnpnet": SolverStyle(0, BLUE, "o", True, _SOLID),
-    "pnpnet-set": SolverStyle(0, BLUE, "D", True, _DASH_DOTTED),
-    "net": SolverStyle(0, SKY, "o", False, _DASHED),
-    "epnp": SolverStyle(1, VERMILION, "v", False, _DASHED),
-    "epnp-lm": SolverStyle(1, VERMILION, "v", True, _SOLID),
-    "reppnp": SolverStyle(1, GREEN, "^", False, _DASHED),
-    "reppnp-lm": SolverStyle(1, GREEN, "^", True, _SOLID),
-    "ransac-epnp-lm": SolverStyle(1, PURPLE, "s", True, _SOLID),
-    "p3p-ransac": SolverStyle(2, ORANGE, "P", True, _SOLID),
-    "p3p-ransac-noise": SolverStyle(2, ORANGE, "D", False, _DASHED),
-    "identity-lm": SolverStyle(2, "#7A5C2E", "X", True, _DASH_DOTTED),
-    "opencv-epnp": SolverStyle(3, _BLACK, "<", False, _DOTTED),
-    "opencv-sqpnp": SolverStyle(3, _BLACK, "<", True, _DASHED),
-    "opencv-ransac": SolverStyle(3, _BLACK, ">", True, _SOLID),
-    "opencv-ransac-sqpnp": SolverStyle(3, _BLACK, "*", True, _DASH_DOTTED),
-    "opencv-usac": SolverStyle(3, _BLACK, ">", False, _DASH_DOTTED),
-    "opencv": SolverStyle(3, _BLACK, "*", False, _DOTTED),
-    "poselib": SolverStyle(3, "#8a8a8a", "p", True, _SOLID),
-    "pycolmap": SolverStyle(3, "#8a8a8a", "h", False, _DASHED),
-    "known-inliers": SolverStyle(_BOUNDS, "#000000", "", True, _DASH_DOTTED),
-    "known-inliers-and-noise": SolverStyle(_BOUNDS, "#000000", "", True, _DOTTED),
+#: Settings of matplotlib while a picture is drawn: ``@rc_context(THEME)``. Names of solvers are not read as formulas.
+THEME: dict[str, Any] = {
+    **sns.axes_style("whitegrid"),
+    **sns.plotting_context("paper", font_scale=0.95),  # the smallest letters have 8.4 points
+    "axes.edgecolor": "#444444",
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlelocation": "left",
+    "errorbar.capsize": 1.6,
+    "font.sans-serif": ["DejaVu Sans"],
+    "grid.color": "#dddddd",
+    "legend.frameon": False,
+    "text.parse_math": False,
 }
-_RANKS = {name: rank for rank, name in enumerate(_KNOWN)}
-_MORE_COLOURS, _MORE_MARKERS = ("#882255", "#44AA99", "#999933", "#6644AA", "#AA7766"), ("d", "8", "H", "P")
+
+# Colour, marker and line of a solver, in the order of the rows. A solver has the look of the longest name that its name
+# begins with, up to a hyphen. A bound has no marker.
+_LOOKS = {
+    "pnpnet": (BLUE, "o", "-"),
+    "pnpnet-set": (BLUE, "D", "-."),
+    "net": (SKY, "o", "--"),
+    "epnp": (VERMILION, "v", "--"),
+    "epnp-lm": (VERMILION, "v", "-"),
+    "reppnp": (GREEN, "^", "--"),
+    "reppnp-lm": (GREEN, "^", "-"),
+    "ransac-epnp-lm": (PINK, "s", "-"),
+    "p3p-ransac": (ORANGE, "P", "-"),
+    "p3p-ransac-noise": (ORANGE, "D", "--"),
+    "identity-lm": (BROWN, "X", "-."),
+    "opencv-epnp": (_BLACK, "<", ":"),
+    "opencv-sqpnp": (_BLACK, "<", "-."),
+    "opencv-ransac": (_BLACK, ">", "-"),
+    "opencv-ransac-sqpnp": (_BLACK, "*", "-."),
+    "opencv-usac": (_BLACK, ">", "--"),
+    "opencv": (_BLACK, "*", ":"),
+    "poselib": (GREY, "p", "-"),
+    "pycolmap": (GREY, "h", "--"),
+    "": ("", "", ""),  # all other solvers
+    "known-inliers": (_BLACK, "", "-."),
+    "known-inliers-and-noise": (_BLACK, "", ":"),
+}
+_OTHERS = [(COLOURS[i], marker, line) for line in ("-", "--", ":") for i, marker in ((8, "d"), (6, "8"), (4, "H"))]
 
 
-def solver_styles(names: Iterable[str]) -> dict[str, SolverStyle]:
-    """Styles by name, in the order in which solvers are listed.
+def solver_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """Arguments of ``Axes.plot`` by name of the solver, in the order of legends.
 
-    Args:
-        names: names of solvers, options after a colon. A known solver has the same style in all pictures, with any
-            options. Up to 20 unknown solvers have different styles.
-
-    Returns:
-        A style for each name, sorted by group, then in the order of the paper, then by name.
+    A known solver has the same look in all pictures, with any options. Up to 9 unknown solvers have different looks.
 
     Example:
         >>> list(solver_styles(["poselib", "mine", "epnp-lm:m=3", "pnpnet-n9"]))
         ['pnpnet-n9', 'epnp-lm:m=3', 'poselib', 'mine']
     """
-    keys = {name: _known(name) for name in names}
-    unknown = sorted({_base(name) for name, key in keys.items() if key is None})
-    styles = {}
-    for name, key in keys.items():
-        if key is not None:
-            styles[name] = _KNOWN[key]
-        else:
-            index = unknown.index(_base(name))
-            colour, marker = _MORE_COLOURS[index % 5], _MORE_MARKERS[index % 4]
-            styles[name] = SolverStyle(_OTHERS, colour, marker, index % 2 == 0, (_SOLID, _DASHED, _DOTTED)[index % 3])
+    base = {name: name.partition(":")[0] for name in names}
+    known = {
+        n: max((key for key in _LOOKS if f"{b}-".startswith(f"{key}-")), key=len, default="") for n, b in base.items()
+    }
+    unknown = sorted({base[name] for name, key in known.items() if not key})
+    ranks = list(_LOOKS)
 
-    def rank(name: str) -> tuple[int, int, list[tuple[int, str]]]:
-        return styles[name].group, _RANKS.get(keys[name] or "", 0), _natural(name)
+    def order(name: str) -> tuple[Any, ...]:
+        return ranks.index(known[name]), [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
 
-    return {name: styles[name] for name in sorted(styles, key=rank)}
+    looks = {n: _LOOKS[known[n]] if known[n] else _OTHERS[unknown.index(base[n]) % len(_OTHERS)] for n in base}
+    return {name: line_style(*looks[name], ours=is_ours(name)) for name in sorted(base, key=order)}
 
 
-def _base(name: str) -> str:
-    return name.partition(":")[0]
+def line_style(colour: str, marker: str, line: str, *, ours: bool = False) -> dict[str, Any]:
+    """Arguments of ``Axes.plot``. Dashed and dotted lines have open markers, our lines are thick."""
+    face = "white" if line in ("--", ":") else colour
+    marks = {"marker": marker, "markersize": 4.6, "markerfacecolor": face, "markeredgecolor": colour}
+    return {"color": colour, "linestyle": line, "linewidth": 2.0 if ours else 1.2, "zorder": 4 if ours else 3, **marks}
 
 
-def _known(name: str) -> str | None:
-    base = _base(name)
-    fits = [key for key in _KNOWN if base == key or base.startswith(f"{key}-")]
-    return max(fits, key=len, default=None)
+def is_ours(name: str) -> bool:
+    """Whether the solver stands out."""
+    return name.startswith("pnpnet")
 
 
-def _natural(name: str) -> list[tuple[int, str]]:
-    """Key that sorts n9 before n20."""
-    return [(int(part), "") if part.isdecimal() else (0, part) for part in re.split(r"(\d+)", name)]
-
-
-def make_figure(width: float, height: float) -> Figure:
-    """An opaque white figure, readable on a dark page too. Sizes are in inches."""
-    return Figure(figsize=(width, height), layout="constrained", facecolor="white")
-
-
-def head(figure: Figure, *lines: str) -> None:
-    """Write a title above all panels."""
-    figure.suptitle("\n".join(lines), x=0.01, ha="left", fontsize=TITLE, parse_math=False)
+def make_figure(width: float, height: float, *heading: str) -> Figure:
+    """An opaque white figure with lines of a title, readable on a dark page too. Sizes are in inches."""
+    figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
+    if heading:
+        figure.suptitle("\n".join(heading), x=0.01, ha="left", fontsize=9)
+    return figure
 
 
 def save(figure: Figure, path: str | Path, *, dpi: int = _DPI) -> Path:
@@ -171,14 +117,23 @@ def save(figure: Figure, path: str | Path, *, dpi: int = _DPI) -> Path:
     return path
 
 
-def tidy(axes: Axes, grid: Literal["both", "x", "y"] = "both") -> None:
-    """Frame on two sides, a pale grid behind the data, small letters."""
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(axis=grid, color="#dddddd", linewidth=0.6)
-    axes.set_axisbelow(True)
-    axes.tick_params(which="both", labelsize=SMALL)
-    axes.xaxis.label.set_fontsize(SMALL)
-    axes.yaxis.label.set_fontsize(SMALL)
+def draw_legend(figure: Figure, styles: Mapping[str, Mapping[str, Any]]) -> None:
+    """Write a legend below all panels, our solvers in bold."""
+    names = [shortened(name) for name in styles]
+    columns = min(4, _LETTERS // (_HANDLE + max(map(len, names))))
+    handles = [Line2D([], [], **style) for style in styles.values()]
+    legend = figure.legend(handles, names, loc="outside lower center", ncols=columns, handlelength=3.4)
+    for text in legend.get_texts():
+        text.set_fontweight("bold" if is_ours(text.get_text()) else "normal")
+
+
+def log_scale(axis: Axis, formatter: Formatter | str = "{x:g}") -> None:
+    """Make an axis logarithmic, with a number at every power of 10, and at more places of a short axis."""
+    axis.axes.set(**{f"{axis.axis_name}scale": "log"})
+    low, high = axis.get_view_interval()
+    axis.set_major_locator(LogLocator(subs=(1, 2, 3, 5) if high < 100 * low else (1,)))
+    axis.set_major_formatter(formatter)
+    axis.set_minor_formatter(NullFormatter())
 
 
 def shortened(name: str, most: int = 27) -> str:
@@ -190,13 +145,3 @@ def shortened(name: str, most: int = 27) -> str:
     """
     half = (most - 1) // 2
     return name if len(name) <= most else f"{name[: half - 1]}…{name[-half - 1 :]}"
-
-
-def wrapped(name: str, width: int) -> str:
-    """The name in lines of at most ``width`` letters, broken after signs where possible."""
-    lines = [""]
-    for word in re.findall(rf"[^-_ ,/]{{1,{width}}}[-_ ,/]*|[-_ ,/]+", name):
-        if lines[-1] and len(lines[-1]) + len(word.rstrip()) > width:
-            lines.append("")
-        lines[-1] += word
-    return "\n".join(line.rstrip() for line in lines)
