@@ -10,19 +10,19 @@ try:
 except ImportError as error:
     raise ImportError("Pictures need matplotlib and seaborn: pip install 'kornia_pnpnet[eval]'") from error
 
-from kornia_pnpnet.evaluation.figures.paper import (
+from kornia_pnpnet.evaluation.figures.problem import plot_pose
+from kornia_pnpnet.evaluation.figures.results import (
     paper_figures,
     plot_against_m,
     plot_against_n,
+    plot_errors,
     plot_mismatches,
     plot_operations,
     plot_scenes,
+    plot_success,
     plot_synthetic,
 )
-from kornia_pnpnet.evaluation.figures.problem import plot_pose
-from kornia_pnpnet.evaluation.figures.reliability import plot_reliability
-from kornia_pnpnet.evaluation.figures.summaries import plot_errors, plot_success
-from kornia_pnpnet.evaluation.figures.training import plot_sweep, plot_training
+from kornia_pnpnet.evaluation.figures.training import plot_reliability, plot_sweep, plot_training
 
 __all__ = [
     "paper_figures",

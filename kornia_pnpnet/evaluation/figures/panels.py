@@ -14,17 +14,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.ticker import EngFormatter, LogLocator, MaxNLocator
 
-from kornia_pnpnet.evaluation.figures.style import (
-    THEME,
-    WIDTH,
-    draw_legend,
-    is_ours,
-    log_scale,
-    make_figure,
-    save,
-    shortened,
-    solver_styles,
-)
+from kornia_pnpnet.evaluation.figures import style
 
 _ROW = 0.165  # inches from one solver to the next: a line of letters
 _WITH_NUMBERS = 3  # largest number of panels side by side that each have room for numbers
@@ -47,10 +37,10 @@ def draw_dots(path: str | Path, heading: Sequence[str], lines: Sequence[Mapping[
     grouped = [list(line.items()) for line in lines]
     sizes = [math.ceil(len(line) / math.ceil(len(line) / most)) for line in grouped]  # lines of about equal length
     split = [line[i : i + size] for line, size in zip(grouped, sizes, strict=True) for i in range(0, len(line), size)]
-    styles = solver_styles(solver for line in split for _, table in line for solver in table.solver)
+    styles = style.solver_styles(solver for line in split for _, table in line for solver in table.solver)
     columns = max(sizes)
     narrow = columns > _WITH_NUMBERS
-    figure = make_figure(WIDTH, 0.5 + (_ROW * len(styles) + 0.85) * len(split), *heading)
+    figure = style.make_figure(style.WIDTH, 0.5 + (_ROW * len(styles) + 0.85) * len(split), *heading)
     ratios = [2 if narrow and column == 0 else 1 for column in range(columns)]
     grid = figure.subplots(len(split), columns, sharex=True, sharey=True, squeeze=False, width_ratios=ratios)
     for line, places in zip(split, grid, strict=True):
@@ -60,11 +50,11 @@ def draw_dots(path: str | Path, heading: Sequence[str], lines: Sequence[Mapping[
             axes.set_xlabel(_LABELS["rate"])
         for axes in places[len(line) :]:
             axes.remove()
-        places[0].set_yticks(range(len(styles)), [shortened(name) for name in styles])
+        places[0].set_yticks(range(len(styles)), [style.shortened(name) for name in styles])
         for label, name in zip(places[0].get_yticklabels(), styles, strict=True):
-            label.set_fontweight("bold" if is_ours(name) else "normal")
+            label.set_fontweight("bold" if style.is_ours(name) else "normal")
     grid[0, 0].set(xlim=(-3, 103), ylim=(len(styles) - 0.4, -0.6), xticks=range(0, 101, 50 if narrow else 25))
-    return save(figure, path)
+    return style.save(figure, path)
 
 
 def _draw_dots(axes: Axes, table: pd.DataFrame, styles: Styles, *, numbers: bool) -> None:
@@ -76,12 +66,12 @@ def _draw_dots(axes: Axes, table: pd.DataFrame, styles: Styles, *, numbers: bool
         dot = {**look, "linestyle": "none", "marker": look["marker"] or "|"}
         axes.errorbar([rate], [row], xerr=[[low], [high]], label=name, elinewidth=1.4, clip_on=False, **dot)
         if numbers:
-            font: dict[str, Any] = {"fontsize": 8, "fontweight": "bold" if is_ours(name) else "normal"}
+            font: dict[str, Any] = {"fontsize": 8, "fontweight": "bold" if style.is_ours(name) else "normal"}
             place: dict[str, Any] = {"transform": axes.get_yaxis_transform(), "va": "center_baseline"}
             axes.text(1.04, row, f"{rate:.1f} ±{max(low, high):.1f}", **font, **place)
 
 
-@rc_context(THEME)
+@rc_context(style.THEME)
 def draw_curves(
     path: str | Path,
     heading: Sequence[str],
@@ -99,10 +89,10 @@ def draw_curves(
     (with ``low`` and ``high``), ``us`` or ``operations``. Panels with the same vertical axis share its limits.
     """
     found = {solver for _, table, _ in panels for solver in table.solver}
-    styles = {name: look for name, look in (styles or solver_styles(found)).items() if name in found}
+    styles = {name: look for name, look in (styles or style.solver_styles(found)).items() if name in found}
     columns = min(columns, len(panels))
     lines = -(-len(panels) // columns)
-    figure = make_figure(WIDTH, 1.0 + (2.4 if lines > 1 else 3.0) * lines + 0.04 * len(styles), *heading)
+    figure = style.make_figure(style.WIDTH, 1.0 + (2.4 if lines > 1 else 3.0) * lines + 0.04 * len(styles), *heading)
     grid = list(figure.subplots(lines, columns, squeeze=False).flat)
     first: dict[str, Axes] = {}
     for index, (axes, (title, table, y)) in enumerate(zip(grid, panels, strict=False)):
@@ -129,6 +119,6 @@ def draw_curves(
         if y == "rate":
             axes.set(ylim=(-3, 103), yticks=range(0, 101, 20))
         else:
-            log_scale(axes.yaxis, EngFormatter(sep="") if y == "operations" else "{x:g}")
-    draw_legend(figure, styles)
-    return save(figure, path)
+            style.log_scale(axes.yaxis, EngFormatter(sep="") if y == "operations" else "{x:g}")
+    style.draw_legend(figure, styles)
+    return style.save(figure, path)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sized
 from typing import Any
 
 import pandas as pd
@@ -19,6 +19,12 @@ _RATE = ["rate", "low", "high", "total"]
 
 class NothingToDrawError(ValueError):
     """The results hold no data for a figure."""
+
+
+def require(found: Sized, what: str) -> None:
+    """Raise when nothing was found."""
+    if not len(found):
+        raise NothingToDrawError(f"The results hold no {what} to draw.")
 
 
 def records(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
@@ -58,12 +64,7 @@ def percent(success: Mapping[str, Any]) -> tuple[float, float, float, int]:
 
 
 def without_m(solver: str) -> str:
-    """The solver's name without the option m.
-
-    Example:
-        >>> without_m("epnp-lm:m=3,damping=1"), without_m("pnpnet-n9:m=2")
-        ('epnp-lm:damping=1', 'pnpnet-n9')
-    """
+    """The solver's name without the option m."""
     name, _, options = solver.partition(":")
     others = [option for option in options.split(",") if option and not option.startswith("m=")]
     return ":".join([name, *filter(None, [",".join(others)])])

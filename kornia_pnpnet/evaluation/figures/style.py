@@ -39,30 +39,19 @@ THEME: dict[str, Any] = {
 
 # Colour, marker and line of a solver, in the order of the rows. A solver has the look of the longest name that its name
 # begins with, up to a hyphen. A bound has no marker.
+# fmt: off
 _LOOKS = {
-    "pnpnet": (BLUE, "o", "-"),
-    "pnpnet-set": (BLUE, "D", "-."),
-    "net": (SKY, "o", "--"),
-    "epnp": (VERMILION, "v", "--"),
-    "epnp-lm": (VERMILION, "v", "-"),
-    "reppnp": (GREEN, "^", "--"),
-    "reppnp-lm": (GREEN, "^", "-"),
-    "ransac-epnp-lm": (PINK, "s", "-"),
-    "p3p-ransac": (ORANGE, "P", "-"),
-    "p3p-ransac-noise": (ORANGE, "D", "--"),
-    "identity-lm": (BROWN, "X", "-."),
-    "opencv-epnp": (_BLACK, "<", ":"),
-    "opencv-sqpnp": (_BLACK, "<", "-."),
-    "opencv-ransac": (_BLACK, ">", "-"),
-    "opencv-ransac-sqpnp": (_BLACK, "*", "-."),
-    "opencv-usac": (_BLACK, ">", "--"),
-    "opencv": (_BLACK, "*", ":"),
-    "poselib": (GREY, "p", "-"),
-    "pycolmap": (GREY, "h", "--"),
+    "pnpnet": (BLUE, "o", "-"), "pnpnet-set": (BLUE, "D", "-."), "net": (SKY, "o", "--"),
+    "epnp": (VERMILION, "v", "--"), "epnp-lm": (VERMILION, "v", "-"),
+    "reppnp": (GREEN, "^", "--"), "reppnp-lm": (GREEN, "^", "-"), "ransac-epnp-lm": (PINK, "s", "-"),
+    "p3p-ransac": (ORANGE, "P", "-"), "p3p-ransac-noise": (ORANGE, "D", "--"), "identity-lm": (BROWN, "X", "-."),
+    "opencv-epnp": (_BLACK, "<", ":"), "opencv-sqpnp": (_BLACK, "<", "-."), "opencv-ransac": (_BLACK, ">", "-"),
+    "opencv-ransac-sqpnp": (_BLACK, "*", "-."), "opencv-usac": (_BLACK, ">", "--"), "opencv": (_BLACK, "*", ":"),
+    "poselib": (GREY, "p", "-"), "pycolmap": (GREY, "h", "--"),
     "": ("", "", ""),  # all other solvers
-    "known-inliers": (_BLACK, "", "-."),
-    "known-inliers-and-noise": (_BLACK, "", ":"),
+    "known-inliers": (_BLACK, "", "-."), "known-inliers-and-noise": (_BLACK, "", ":"),
 }
+# fmt: on
 _OTHERS = [(COLOURS[i], marker, line) for line in ("-", "--", ":") for i, marker in ((8, "d"), (6, "8"), (4, "H"))]
 
 
@@ -70,23 +59,14 @@ def solver_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
     """Arguments of ``Axes.plot`` by name of the solver, in the order of legends.
 
     A known solver has the same look in all pictures, with any options. Up to 9 unknown solvers have different looks.
-
-    Example:
-        >>> list(solver_styles(["poselib", "mine", "epnp-lm:m=3", "pnpnet-n9"]))
-        ['pnpnet-n9', 'epnp-lm:m=3', 'poselib', 'mine']
     """
     base = {name: name.partition(":")[0] for name in names}
-    known = {
-        n: max((key for key in _LOOKS if f"{b}-".startswith(f"{key}-")), key=len, default="") for n, b in base.items()
-    }
+    known = {n: max((key for key in _LOOKS if f"{b}-".startswith(key and f"{key}-")), key=len) for n, b in base.items()}
     unknown = sorted({base[name] for name, key in known.items() if not key})
-    ranks = list(_LOOKS)
-
-    def order(name: str) -> tuple[Any, ...]:
-        return ranks.index(known[name]), [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
-
-    looks = {n: _LOOKS[known[n]] if known[n] else _OTHERS[unknown.index(base[n]) % len(_OTHERS)] for n in base}
-    return {name: line_style(*looks[name], ours=is_ours(name)) for name in sorted(base, key=order)}
+    looks = {name: _LOOKS[key] if key else _OTHERS[unknown.index(base[name]) % 9] for name, key in known.items()}
+    natural = {name: [part.zfill(9) for part in re.findall(r"\d+|\D+", name)] for name in base}
+    order = sorted(base, key=lambda name: (list(_LOOKS).index(known[name]), natural[name]))
+    return {name: line_style(*looks[name], ours=is_ours(name)) for name in order}
 
 
 def line_style(colour: str, marker: str, line: str, *, ours: bool = False) -> dict[str, Any]:
@@ -136,12 +116,6 @@ def log_scale(axis: Axis, formatter: Formatter | str = "{x:g}") -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def shortened(name: str, most: int = 27) -> str:
-    """The name; the middle of names above ``most`` letters is left out.
-
-    Example:
-        >>> shortened("outputs/2026-11-21/12-00-00/weights")
-        'outputs/2026…-00-00/weights'
-    """
-    half = (most - 1) // 2
-    return name if len(name) <= most else f"{name[: half - 1]}…{name[-half - 1 :]}"
+def shortened(name: str) -> str:
+    """The name; the middle of names above 27 letters is left out."""
+    return name if len(name) <= 27 else f"{name[:12]}…{name[-14:]}"

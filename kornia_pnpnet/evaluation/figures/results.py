@@ -1,4 +1,4 @@
-"""The figures of the paper's protocol."""
+"""Pictures of results files: success, errors, and the figures of the paper's protocol."""
 
 from __future__ import annotations
 
@@ -10,18 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+import seaborn as sns
 from matplotlib import rc_context
 
+from kornia_pnpnet.evaluation.figures import records, style
 from kornia_pnpnet.evaluation.figures.panels import draw_curves, draw_dots
-from kornia_pnpnet.evaluation.figures.records import (
-    NothingToDrawError,
-    at_usual_n,
-    in_words,
-    outliers_in_words,
-    pooled,
-    records,
-)
-from kornia_pnpnet.evaluation.figures.style import THEME
+from kornia_pnpnet.evaluation.results import row_errors
 
 _SOURCES = {"paper": "the paper's data", "gaussian_pose": "data with Gaussian positions"}
 _SCENE_OUTLIERS = 2  # as in the paper
@@ -29,14 +23,75 @@ _MOST_SCENES = 6  # panels side by side
 _FEWEST_MISMATCHES = 3  # numbers of mismatches of a curve
 
 
-@rc_context(THEME)
+@rc_context(style.THEME)
+def plot_success(path: str | Path, results: Mapping[str, Any]) -> Path:
+    """Draw the success rates of all solvers on all data sets, with their 95 % intervals.
+
+    Args:
+        path: the picture to write; the ending gives the format.
+        results: a results file of :func:`~kornia_pnpnet.evaluation.evaluate`.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: when there are no rows.
+    """
+    records.require(results["rows"], "rows")
+    rows = [(row["data"], row["solver"], *records.percent(row["success"])) for row in results["rows"]]
+    table = pd.DataFrame(rows, columns=["data", "solver", "rate", "low", "high", "total"])
+    limits = records.limits_in_words(records.success_limit(entry) for entry in results["data"].values())
+    return draw_dots(path, ["Success with 95 % intervals", limits], [dict(list(table.groupby("data", sort=False)))], 3)
+
+
+@rc_context(style.THEME)
+def plot_errors(path: str | Path, results: Mapping[str, Any]) -> Path:
+    """Draw the share of problems with an error of at most x: a row of two panels for each data set.
+
+    Args:
+        path: See :func:`plot_success`.
+        results: See :func:`plot_success`.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: when there are no rows.
+    """
+    sets = list(dict.fromkeys(row["data"] for row in results["rows"]))
+    records.require(sets, "rows")
+    styles = style.solver_styles(row["solver"] for row in results["rows"])
+    heading = "Problems with an error of at most x", "Vertical line: limit of a success."
+    figure = style.make_figure(style.WIDTH, 1.2 + 2.4 * len(sets), *heading)
+    for name, panels in zip(sets, figure.subplots(len(sets), 2, squeeze=False, sharey=True), strict=True):
+        entry = results["data"][name]
+        errors = {row["solver"]: row_errors(row)[0] for row in results["rows"] if row["data"] == name}
+        labels = "rotation error (°)", f"translation error ({entry['unit'] or 'world units'})"
+        limits = entry["max_rotation_deg"], entry["max_translation"]
+        for index, (axes, limit, label) in enumerate(zip(panels, limits, labels, strict=True)):
+            for place, (solver, look) in enumerate(styles.items()):
+                if solver in errors:
+                    values = errors[solver][index].clamp(1e-12).numpy()  # 0 has no place on a logarithmic axis
+                    marks = {"label": solver, "markevery": (0.01 * place, 0.15)}
+                    sns.ecdfplot(x=values, stat="percent", log_scale=True, ax=axes, **marks, **look)
+            sharp = min(error[index].quantile(0.02).item() for error in errors.values()) < limit / 100
+            left, right = limit / (1000 if sharp else 100), 180.0 if index == 0 else limit * 100
+            axes.set(xlim=(left, right), ylim=(0, 101), xlabel=label, ylabel="problems (%)")
+            axes.axvline(limit, color=style.GREY, linewidth=1.2)
+            style.log_scale(axes.xaxis)
+        panels[0].set_title(name)
+    style.draw_legend(figure, styles)
+    return style.save(figure, path)
+
+
+@rc_context(style.THEME)
 def plot_synthetic(path: str | Path, results: Sequence[Mapping[str, Any]], source: str = "paper") -> Path:
     """Draw success on synthetic data without and with outliers: figures 2 and 3 of the protocol.
 
     The panels are no outliers, 0 to a third of the pairs, and a third, at n = 9 or the smallest n of the results.
 
     Args:
-        path: the picture to write; the ending gives the format.
+        path: See :func:`plot_success`.
         results: results files of :func:`~kornia_pnpnet.evaluation.evaluate`.
         source: ``paper`` or ``gaussian_pose``.
 
@@ -46,16 +101,15 @@ def plot_synthetic(path: str | Path, results: Sequence[Mapping[str, Any]], sourc
     Raises:
         ValueError: when the results have no such problems.
     """
-    table, n = at_usual_n(records(results).query("source == @source and not swept and not mismatches"))
+    table, n = records.at_usual_n(records.records(results).query("source == @source and not swept and not mismatches"))
     settings = {setting: table[table.outliers == setting] for setting in (0, "uniform", n // 3)}
-    panels = {outliers_in_words(setting, n): part for setting, part in settings.items() if len(part)}
-    if not panels:
-        raise NothingToDrawError(f"The results hold no success on '{source}' with none, uniform or {n // 3} outliers.")
-    heading = [f"Success on {_SOURCES.get(source, source)}, n = {n}", in_words(pd.concat(panels.values()))]
+    panels = {records.outliers_in_words(setting, n): part for setting, part in settings.items() if len(part)}
+    records.require(panels, f"success on '{source}' with none, uniform or {n // 3} outliers")
+    heading = [f"Success on {_SOURCES.get(source, source)}, n = {n}", records.in_words(pd.concat(panels.values()))]
     return draw_dots(path, heading, [panels], len(settings))
 
 
-@rc_context(THEME)
+@rc_context(style.THEME)
 def plot_scenes(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Path:
     """Draw success on scenes, over all scenes and for each: figure 4 of the protocol.
 
@@ -72,17 +126,16 @@ def plot_scenes(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Path:
     Raises:
         ValueError: when the results have no such scenes.
     """
-    table = records(results).query("scene and not swept and not mismatches")
-    table, n = at_usual_n(table[table.outliers.isin([0, _SCENE_OUTLIERS])])
-    if table.empty:
-        raise NothingToDrawError(f"The results hold no success on scenes with 0 or {_SCENE_OUTLIERS} outliers.")
+    table = records.records(results).query("scene and not swept and not mismatches")
+    table, n = records.at_usual_n(table[table.outliers.isin([0, _SCENE_OUTLIERS])])
+    records.require(table, f"success on scenes with 0 or {_SCENE_OUTLIERS} outliers")
     lines = []
     for setting, chosen in table.groupby("outliers"):
         scenes = dict(list(chosen.groupby("source", sort=False)))
-        first, words = next(iter(scenes)), outliers_in_words(setting, n)
-        whole = {f"{words}: all {len(scenes)} scenes": pooled(chosen)}
+        first, words = next(iter(scenes)), records.outliers_in_words(setting, n)
+        whole = {f"{words}: all {len(scenes)} scenes": records.pooled(chosen)}
         lines.append({**whole, **scenes} if len(scenes) > 1 else {f"{words}: {first}": scenes[first]})
-    return draw_dots(path, [f"Success on scenes, n = {n}", in_words(table)], lines, _MOST_SCENES)
+    return draw_dots(path, [f"Success on scenes, n = {n}", records.in_words(table)], lines, _MOST_SCENES)
 
 
 def plot_mismatches(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Path:
@@ -102,20 +155,22 @@ def plot_mismatches(path: str | Path, results: Sequence[Mapping[str, Any]]) -> P
     Raises:
         ValueError: when no scene has three numbers of mismatches.
     """
-    table = records(results).query("scene and not swept")
+    table = records.records(results).query("scene and not swept")
     table = table[[isinstance(outliers, int) for outliers in table.outliers]]
     kind = table.mismatches.any()
-    table, n = at_usual_n(table[(table.mismatches == kind) | (table.outliers == 0)])
+    table, n = records.at_usual_n(table[(table.mismatches == kind) | (table.outliers == 0)])
     counts = table.groupby("source").outliers.agg(set)
     most = max(counts, key=len, default=set())
     table = table[table.source.isin(counts.index[counts >= most]) & table.outliers.isin(most)]
-    parts = [pooled(part).assign(outliers=number) for number, part in table.groupby("outliers")]
+    parts = [records.pooled(part).assign(outliers=number) for number, part in table.groupby("outliers")]
     rates = pd.concat(parts) if len(parts) >= _FEWEST_MISMATCHES else table[:0]
     rates = rates[rates.groupby("solver").outliers.transform("size") >= _FEWEST_MISMATCHES]
-    if rates.empty:
-        raise NothingToDrawError(f"The results hold no scenes with {_FEWEST_MISMATCHES} numbers of mismatches.")
+    records.require(rates, f"scenes with {_FEWEST_MISMATCHES} numbers of mismatches")
     scenes, label = table.source.unique(), f"{'mismatches' if kind else 'outliers'} among {n} pairs"
-    heading = [f"Success on {f'{len(scenes)} scenes' if len(scenes) > 1 else scenes[0]}, n = {n}", in_words(table)]
+    heading = [
+        f"Success on {f'{len(scenes)} scenes' if len(scenes) > 1 else scenes[0]}, n = {n}",
+        records.in_words(table),
+    ]
     return draw_curves(path, heading, [("", rates, "rate")], "outliers", label)
 
 
@@ -134,16 +189,15 @@ def plot_against_n(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Pa
     Raises:
         ValueError: when no outlier setting has two numbers of pairs.
     """
-    table = records(results).query("source == 'paper' and not swept and not mismatches")
+    table = records.records(results).query("source == 'paper' and not swept and not mismatches")
     table = table[table.groupby("outliers").n.transform("nunique") > 1]
-    if table.empty:
-        raise NothingToDrawError("The results hold no success on 'paper' with several n and the same outliers.")
+    records.require(table, "success on 'paper' with several n and the same outliers")
     families = [re.sub(rf"-n{n}\b", "-n*", solver) for solver, n in zip(table.solver, table.n, strict=True)]
     single = table.groupby(families).solver.transform("nunique") == 1
     table = table.assign(solver=table.solver.where(single, families))
     several = table.groupby(["solver", "outliers"]).n.transform("size") > 1
     table = table[several | table.solver.str.match("pnpnet|net")]
-    heading = [f"Success on {_SOURCES['paper']} against the number of pairs", in_words(table)]
+    heading = [f"Success on {_SOURCES['paper']} against the number of pairs", records.in_words(table)]
     return draw_curves(path, heading, _by_outliers(table, "n"), "n", "pairs n", log=True)
 
 
@@ -163,28 +217,27 @@ def plot_against_m(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Pa
     Raises:
         ValueError: when no solver has two m.
     """
-    table, n = at_usual_n(records(results).query("source == 'paper' and m >= 0 and not mismatches"))
+    table, n = records.at_usual_n(records.records(results).query("source == 'paper' and m >= 0 and not mismatches"))
     table = table.assign(solver=table.base).drop_duplicates(["solver", "outliers", "m"], keep="last")
     table = table[table.groupby(["solver", "outliers"]).m.transform("size") > 1]
-    if table.empty:
-        raise NothingToDrawError("The results hold no success on 'paper' of a solver with several m.")
+    records.require(table, "success on 'paper' of a solver with several m")
     panels = _by_outliers(table, n)
     panels.append((f"time, {panels[-1][0]}", panels[-1][1], "us"))
-    heading = [f"Success on {_SOURCES['paper']} against m, n = {n}", in_words(table)]
+    heading = [f"Success on {_SOURCES['paper']} against m, n = {n}", records.in_words(table)]
     return draw_curves(path, heading, panels, "m", "iterations m")
 
 
 def _by_outliers(table: pd.DataFrame, n: int | str) -> list[tuple[str, pd.DataFrame, str]]:
     """A panel of rates for each outlier setting: none, uniform, other numbers, other texts."""
     settings = sorted(table.outliers.unique(), key=lambda x: (x != 0, x != "uniform", isinstance(x, str), x))
-    return [(outliers_in_words(setting, n), table[table.outliers == setting], "rate") for setting in settings]
+    return [(records.outliers_in_words(setting, n), table[table.outliers == setting], "rate") for setting in settings]
 
 
 def plot_operations(path: str | Path, complexity: Mapping[str, Any]) -> Path:
     """Draw the operations of a solver for one problem of n pairs: figure 1 of the protocol.
 
     Args:
-        path: the picture to write; the ending gives the format.
+        path: See :func:`plot_success`.
         complexity: ``n``, numbers of pairs; ``counts``, by solver one operation count for each n, or ``None``;
             ``ransac``, the names of the solvers of the second panel.
 
@@ -241,7 +294,7 @@ def paper_figures(results: Sequence[Mapping[str, Any]], folder: str | Path) -> l
         raise ValueError(f"Operation counts come from one file, got {len(complexity)}.")
     made = [plot_operations(Path(folder) / "figure1_operations.png", entry) for entry in complexity]
     for name, plot in _FIGURES.items():
-        with suppress(NothingToDrawError):
+        with suppress(records.NothingToDrawError):
             made.append(plot(Path(folder) / name, solved))
     if not made:
         raise ValueError("The results hold no data for any figure: no data set has a source and outliers to compare.")
