@@ -13,15 +13,13 @@ from torch import Tensor
 from kornia_pnpnet.core.checks import check_positive
 from kornia_pnpnet.evaluation.figures import style
 
-Array = np.ndarray | Tensor
-
 
 @rc_context(style.THEME)
 def plot_pose(
     path: str | Path,
-    img_points: Array,
-    reprojections: Array,
-    rejected: Array,
+    img_points: np.ndarray | Tensor,
+    reprojections: np.ndarray | Tensor,
+    rejected: np.ndarray | Tensor,
     size: tuple[float, float] | None = None,
     *,
     title: str = "",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Sized
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -11,16 +11,119 @@ from typing import Any
 
 import pandas as pd
 import seaborn as sns
+import torch
 from matplotlib import rc_context
 
-from kornia_pnpnet.evaluation.figures import records, style
-from kornia_pnpnet.evaluation.figures.panels import draw_curves, draw_dots
+from kornia_pnpnet.evaluation.figures import style
+from kornia_pnpnet.evaluation.figures.style import draw_curves, draw_dots
+from kornia_pnpnet.evaluation.problem_sets import PRIORS
 from kornia_pnpnet.evaluation.results import row_errors
+from kornia_pnpnet.metrics import success_rate
 
+_SYNTHETIC = {name for name, _ in PRIORS.values()}
+_PROTOCOL_N = 9
+_KEYS = ["source", "outliers", "mismatches", "n", "solver"]
+_RATE = ["rate", "low", "high", "total"]
 _SOURCES = {"paper": "the paper's data", "gaussian_pose": "data with Gaussian positions"}
 _SCENE_OUTLIERS = 2  # as in the paper
 _MOST_SCENES = 6  # panels side by side
 _FEWEST_MISMATCHES = 3  # numbers of mismatches of a curve
+
+
+class NothingToDrawError(ValueError):
+    """The results hold no data for a figure."""
+
+
+def require(found: Sized, what: str) -> None:
+    """Raise when nothing was found."""
+    if not len(found):
+        raise NothingToDrawError(f"The results hold no {what} to draw.")
+
+
+def read_records(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
+    """Read results files. Operation counts and data sets without a source or outliers are left out.
+
+    One row for each source, outliers, kind of outliers, n and solver. Of several, the one with the most problems, and
+    of these the last. ``source`` is a prior or a scene; ``outliers`` a number, ``"uniform"`` for 0 to a third of the
+    pairs, or another text; ``mismatches`` says that every outlier shows another point. ``base`` is the solver's name
+    without the option m, ``m`` is -1 without a number in the configuration. Rates and intervals are in per cent.
+    """
+    rows = []
+    for result in results:
+        for row in result.get("rows", ()):
+            data, solver = result["data"][row["data"]], row["solver"]
+            description = data.get("description") or {}
+            source, outliers = description.get("source"), description.get("outliers")
+            if isinstance(source, str) and isinstance(outliers, int | str):
+                outliers = 0 if outliers == "none" else outliers
+                mismatches = outliers != 0 and description.get("mismatch_share") == 1
+                refine = (result["solvers"][solver].get("config") or {}).get("refine")
+                m = refine.get("m") if isinstance(refine, Mapping) else None
+                base, m = without_m(solver), m if type(m) is int else -1
+                key = (source, outliers, mismatches, data["n"], solver, base, m, base != solver)
+                more = (source not in _SYNTHETIC, row["us_per_problem"], success_limit(data))
+                rows.append((*key, *more, *percent(row["success"])))
+    table = pd.DataFrame(rows, columns=[*_KEYS, "base", "m", "swept", "scene", "us", "limit", *_RATE])
+    table = table.astype({"outliers": object, "mismatches": bool, "swept": bool, "scene": bool})
+    return table.sort_values("total", kind="stable").drop_duplicates(_KEYS, keep="last").sort_index()
+
+
+def percent(success: Mapping[str, Any]) -> tuple[float, float, float, int]:
+    """Rate and interval of a success in per cent, and the number of problems."""
+    return 100 * success["rate"], 100 * success["low"], 100 * success["high"], success["total"]
+
+
+def without_m(solver: str) -> str:
+    """The solver's name without the option m."""
+    name, _, options = solver.partition(":")
+    others = [option for option in options.split(",") if option and not option.startswith("m=")]
+    return ":".join([name, *filter(None, [",".join(others)])])
+
+
+def pooled(table: pd.DataFrame) -> pd.DataFrame:
+    """Success over all scenes of a table with one n and one outlier setting, for solvers that solved all scenes."""
+    rows = []
+    for solver, parts in table.groupby("solver", sort=False):
+        if len(parts) == table.source.nunique():
+            solved = (parts.rate * parts.total / 100).round().sum()  # a rate in a file has six digits
+            rows.append((solver, *percent(success_rate(torch.arange(parts.total.sum()) < solved)._asdict())))
+    return pd.DataFrame(rows, columns=["solver", *_RATE])
+
+
+def success_limit(data: Mapping[str, Any]) -> tuple[float, float, str]:
+    """Limits of a success on a data set of a results file: degrees, length, and unit of the length."""
+    return data["max_rotation_deg"], data["max_translation"], data["unit"] or "world units"
+
+
+def limits_in_words(limits: Iterable[tuple[float, float, str]]) -> str:
+    """The limits of a success, in words."""
+    table = pd.DataFrame(list(limits), columns=["degrees", "length", "unit"])
+    lengths = [f"{_span(part.length, '.2g')} {unit}" for unit, part in table.groupby("unit", sort=False)]
+    return f"Solved: errors below {_span(table.degrees, 'g')}° and {' or '.join(lengths)}."
+
+
+def in_words(table: pd.DataFrame) -> str:
+    """The limits of a success and the number of problems in each set."""
+    return f"{limits_in_words(table.limit)} {_span(table.total, 'd')} problems in each set, 95 % intervals."
+
+
+def _span(values: pd.Series, form: str) -> str:
+    """The value, or the least and the largest value when their texts differ."""
+    low, high = f"{values.min():{form}}", f"{values.max():{form}}"
+    return low if low == high else f"{low} to {high}"
+
+
+def outliers_in_words(outliers: int | str, n: int | str = "n") -> str:
+    """The number of outliers among ``n`` pairs, for a title."""
+    if outliers in (0, "uniform"):
+        return f"0 to {'⌊n/3⌋' if isinstance(n, str) else n // 3} outliers of {n}" if outliers else "no outliers"
+    return outliers if isinstance(outliers, str) else f"{outliers} outliers of {n}"
+
+
+def at_usual_n(table: pd.DataFrame) -> tuple[pd.DataFrame, int]:
+    """The rows at the n of a figure that does not vary n: 9 as in the protocol, or the smallest n."""
+    n = _PROTOCOL_N if table.empty or (table.n == _PROTOCOL_N).any() else int(table.n.min())
+    return table[table.n == n], n
 
 
 @rc_context(style.THEME)
@@ -37,10 +140,10 @@ def plot_success(path: str | Path, results: Mapping[str, Any]) -> Path:
     Raises:
         ValueError: when there are no rows.
     """
-    records.require(results["rows"], "rows")
-    rows = [(row["data"], row["solver"], *records.percent(row["success"])) for row in results["rows"]]
+    require(results["rows"], "rows")
+    rows = [(row["data"], row["solver"], *percent(row["success"])) for row in results["rows"]]
     table = pd.DataFrame(rows, columns=["data", "solver", "rate", "low", "high", "total"])
-    limits = records.limits_in_words(records.success_limit(entry) for entry in results["data"].values())
+    limits = limits_in_words(success_limit(entry) for entry in results["data"].values())
     return draw_dots(path, ["Success with 95 % intervals", limits], [dict(list(table.groupby("data", sort=False)))], 3)
 
 
@@ -59,7 +162,7 @@ def plot_errors(path: str | Path, results: Mapping[str, Any]) -> Path:
         ValueError: when there are no rows.
     """
     sets = list(dict.fromkeys(row["data"] for row in results["rows"]))
-    records.require(sets, "rows")
+    require(sets, "rows")
     styles = style.solver_styles(row["solver"] for row in results["rows"])
     heading = "Problems with an error of at most x", "Vertical line: limit of a success."
     figure = style.make_figure(style.WIDTH, 1.2 + 2.4 * len(sets), *heading)
@@ -101,11 +204,11 @@ def plot_synthetic(path: str | Path, results: Sequence[Mapping[str, Any]], sourc
     Raises:
         ValueError: when the results have no such problems.
     """
-    table, n = records.at_usual_n(records.records(results).query("source == @source and not swept and not mismatches"))
+    table, n = at_usual_n(read_records(results).query("source == @source and not swept and not mismatches"))
     settings = {setting: table[table.outliers == setting] for setting in (0, "uniform", n // 3)}
-    panels = {records.outliers_in_words(setting, n): part for setting, part in settings.items() if len(part)}
-    records.require(panels, f"success on '{source}' with none, uniform or {n // 3} outliers")
-    heading = [f"Success on {_SOURCES.get(source, source)}, n = {n}", records.in_words(pd.concat(panels.values()))]
+    panels = {outliers_in_words(setting, n): part for setting, part in settings.items() if len(part)}
+    require(panels, f"success on '{source}' with none, uniform or {n // 3} outliers")
+    heading = [f"Success on {_SOURCES.get(source, source)}, n = {n}", in_words(pd.concat(panels.values()))]
     return draw_dots(path, heading, [panels], len(settings))
 
 
@@ -126,16 +229,16 @@ def plot_scenes(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Path:
     Raises:
         ValueError: when the results have no such scenes.
     """
-    table = records.records(results).query("scene and not swept and not mismatches")
-    table, n = records.at_usual_n(table[table.outliers.isin([0, _SCENE_OUTLIERS])])
-    records.require(table, f"success on scenes with 0 or {_SCENE_OUTLIERS} outliers")
+    table = read_records(results).query("scene and not swept and not mismatches")
+    table, n = at_usual_n(table[table.outliers.isin([0, _SCENE_OUTLIERS])])
+    require(table, f"success on scenes with 0 or {_SCENE_OUTLIERS} outliers")
     lines = []
     for setting, chosen in table.groupby("outliers"):
         scenes = dict(list(chosen.groupby("source", sort=False)))
-        first, words = next(iter(scenes)), records.outliers_in_words(setting, n)
-        whole = {f"{words}: all {len(scenes)} scenes": records.pooled(chosen)}
+        first, words = next(iter(scenes)), outliers_in_words(setting, n)
+        whole = {f"{words}: all {len(scenes)} scenes": pooled(chosen)}
         lines.append({**whole, **scenes} if len(scenes) > 1 else {f"{words}: {first}": scenes[first]})
-    return draw_dots(path, [f"Success on scenes, n = {n}", records.in_words(table)], lines, _MOST_SCENES)
+    return draw_dots(path, [f"Success on scenes, n = {n}", in_words(table)], lines, _MOST_SCENES)
 
 
 def plot_mismatches(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Path:
@@ -155,23 +258,22 @@ def plot_mismatches(path: str | Path, results: Sequence[Mapping[str, Any]]) -> P
     Raises:
         ValueError: when no scene has three numbers of mismatches.
     """
-    table = records.records(results).query("scene and not swept")
-    table = table[[isinstance(outliers, int) for outliers in table.outliers]]
+    table = read_records(results).query("scene and not swept")
+    table = table[table.outliers.map(type) == int]
     kind = table.mismatches.any()
-    table, n = records.at_usual_n(table[(table.mismatches == kind) | (table.outliers == 0)])
+    table, n = at_usual_n(table[(table.mismatches == kind) | (table.outliers == 0)])
     counts = table.groupby("source").outliers.agg(set)
     most = max(counts, key=len, default=set())
     table = table[table.source.isin(counts.index[counts >= most]) & table.outliers.isin(most)]
-    parts = [records.pooled(part).assign(outliers=number) for number, part in table.groupby("outliers")]
-    rates = pd.concat(parts) if len(parts) >= _FEWEST_MISMATCHES else table[:0]
-    rates = rates[rates.groupby("solver").outliers.transform("size") >= _FEWEST_MISMATCHES]
-    records.require(rates, f"scenes with {_FEWEST_MISMATCHES} numbers of mismatches")
-    scenes, label = table.source.unique(), f"{'mismatches' if kind else 'outliers'} among {n} pairs"
-    heading = [
-        f"Success on {f'{len(scenes)} scenes' if len(scenes) > 1 else scenes[0]}, n = {n}",
-        records.in_words(table),
-    ]
-    return draw_curves(path, heading, [("", rates, "rate")], "outliers", label)
+    label = f"{'mismatches' if kind else 'outliers'} among {n} pairs"
+    parts = [pooled(part).assign(**{label: number}) for number, part in table.groupby("outliers")]
+    require(parts[_FEWEST_MISMATCHES - 1 :], f"scenes with {_FEWEST_MISMATCHES} numbers of mismatches")
+    rates = pd.concat(parts)
+    rates = rates[rates.groupby("solver").rate.transform("size") >= _FEWEST_MISMATCHES]
+    require(rates, f"solvers with {_FEWEST_MISMATCHES} numbers of mismatches")
+    scenes = table.source.unique()
+    title = f"Success on {f'{len(scenes)} scenes' if len(scenes) > 1 else scenes[0]}, n = {n}"
+    return draw_curves(path, [title, in_words(table)], [("", rates, "rate")], label)
 
 
 def plot_against_n(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Path:
@@ -189,16 +291,16 @@ def plot_against_n(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Pa
     Raises:
         ValueError: when no outlier setting has two numbers of pairs.
     """
-    table = records.records(results).query("source == 'paper' and not swept and not mismatches")
+    table = read_records(results).query("source == 'paper' and not swept and not mismatches")
     table = table[table.groupby("outliers").n.transform("nunique") > 1]
-    records.require(table, "success on 'paper' with several n and the same outliers")
+    require(table, "success on 'paper' with several n and the same outliers")
     families = [re.sub(rf"-n{n}\b", "-n*", solver) for solver, n in zip(table.solver, table.n, strict=True)]
     single = table.groupby(families).solver.transform("nunique") == 1
     table = table.assign(solver=table.solver.where(single, families))
     several = table.groupby(["solver", "outliers"]).n.transform("size") > 1
     table = table[several | table.solver.str.match("pnpnet|net")]
-    heading = [f"Success on {_SOURCES['paper']} against the number of pairs", records.in_words(table)]
-    return draw_curves(path, heading, _by_outliers(table, "n"), "n", "pairs n", log=True)
+    heading = [f"Success on {_SOURCES['paper']} against the number of pairs", in_words(table)]
+    return draw_curves(path, heading, _by_outliers(table, "n"), "n")
 
 
 def plot_against_m(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Path:
@@ -217,20 +319,20 @@ def plot_against_m(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Pa
     Raises:
         ValueError: when no solver has two m.
     """
-    table, n = records.at_usual_n(records.records(results).query("source == 'paper' and m >= 0 and not mismatches"))
+    table, n = at_usual_n(read_records(results).query("source == 'paper' and m >= 0 and not mismatches"))
     table = table.assign(solver=table.base).drop_duplicates(["solver", "outliers", "m"], keep="last")
     table = table[table.groupby(["solver", "outliers"]).m.transform("size") > 1]
-    records.require(table, "success on 'paper' of a solver with several m")
+    require(table, "success on 'paper' of a solver with several m")
     panels = _by_outliers(table, n)
     panels.append((f"time, {panels[-1][0]}", panels[-1][1], "us"))
-    heading = [f"Success on {_SOURCES['paper']} against m, n = {n}", records.in_words(table)]
-    return draw_curves(path, heading, panels, "m", "iterations m")
+    heading = [f"Success on {_SOURCES['paper']} against m, n = {n}", in_words(table)]
+    return draw_curves(path, heading, panels, "m")
 
 
 def _by_outliers(table: pd.DataFrame, n: int | str) -> list[tuple[str, pd.DataFrame, str]]:
     """A panel of rates for each outlier setting: none, uniform, other numbers, other texts."""
     settings = sorted(table.outliers.unique(), key=lambda x: (x != 0, x != "uniform", isinstance(x, str), x))
-    return [(records.outliers_in_words(setting, n), table[table.outliers == setting], "rate") for setting in settings]
+    return [(outliers_in_words(setting, n), table[table.outliers == setting], "rate") for setting in settings]
 
 
 def plot_operations(path: str | Path, complexity: Mapping[str, Any]) -> Path:
@@ -256,7 +358,7 @@ def plot_operations(path: str | Path, complexity: Mapping[str, Any]) -> Path:
     table = pd.DataFrame({"n": n, **counts}).melt("n", var_name="solver", value_name="operations")
     sampled = table.solver.isin(complexity["ransac"]).map({False: "without RANSAC", True: "with RANSAC"})
     panels = [(title, part, "operations") for title, part in table.groupby(sampled, sort=False)]
-    return draw_curves(path, ["Operations that a problem of n pairs takes"], panels, "n", "pairs n")
+    return draw_curves(path, ["Operations that a problem of n pairs takes"], panels, "n")
 
 
 _FIGURES = {
@@ -294,7 +396,7 @@ def paper_figures(results: Sequence[Mapping[str, Any]], folder: str | Path) -> l
         raise ValueError(f"Operation counts come from one file, got {len(complexity)}.")
     made = [plot_operations(Path(folder) / "figure1_operations.png", entry) for entry in complexity]
     for name, plot in _FIGURES.items():
-        with suppress(records.NothingToDrawError):
+        with suppress(NothingToDrawError):
             made.append(plot(Path(folder) / name, solved))
     if not made:
         raise ValueError("The results hold no data for any figure: no data set has a source and outliers to compare.")

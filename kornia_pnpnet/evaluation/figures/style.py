@@ -1,17 +1,23 @@
-"""The look of all pictures: theme, legend, and the colour, marker and order of the solvers."""
+"""The look of all pictures: theme, legend, colour, marker and order of the solvers, panels of dots and of curves."""
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Iterable, Mapping
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pandas as pd
 import seaborn as sns
+from matplotlib import rc_context
+from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import Formatter, LogLocator, NullFormatter
+from matplotlib.ticker import EngFormatter, Formatter, LogLocator, MaxNLocator, NullFormatter
 
 #: Colours that colour-blind readers can tell apart.
 COLOURS = tuple(sns.color_palette("colorblind").as_hex())
@@ -53,6 +59,13 @@ _LOOKS = {
 }
 # fmt: on
 _OTHERS = [(COLOURS[i], marker, line) for line in ("-", "--", ":") for i, marker in ((8, "d"), (6, "8"), (4, "H"))]
+_ROW = 0.165  # inches from one solver to the next: a line of letters
+_WITH_NUMBERS = 3  # largest number of panels side by side that each have room for numbers
+_MOST_TICKS = 6  # largest number of places on a horizontal axis that are all ticked
+_LABELS = {"rate": "solved (%)", "us": "µs per problem", "n": "pairs n", "m": "iterations m", "batch": "problems B"}
+
+Styles = Mapping[str, Mapping[str, Any]]  # arguments of Axes.plot by name
+Panel = tuple[str, pd.DataFrame, str]
 
 
 def solver_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
@@ -119,3 +132,90 @@ def log_scale(axis: Axis, formatter: Formatter | str = "{x:g}") -> None:
 def shortened(name: str) -> str:
     """The name; the middle of names above 27 letters is left out."""
     return name if len(name) <= 27 else f"{name[:12]}…{name[-14:]}"
+
+
+def reach(table: pd.DataFrame) -> np.ndarray:
+    """Lengths of the intervals below and above the rates. A rounded rate can lie just outside its interval."""
+    return np.clip([table.rate - table.low, table.high - table.rate], 0, None)
+
+
+def draw_dots(path: str | Path, heading: Sequence[str], lines: Sequence[Mapping[str, pd.DataFrame]], most: int) -> Path:
+    """Draw success: a row for each solver, a panel for each table with ``solver``, ``rate``, ``low`` and ``high``.
+
+    Tables are by title, at most ``most`` side by side. The first panel has numbers, and others where there is room.
+    """
+    grouped = [list(line.items()) for line in lines]
+    sizes = [math.ceil(len(line) / math.ceil(len(line) / most)) for line in grouped]  # lines of about equal length
+    split = [line[i : i + size] for line, size in zip(grouped, sizes, strict=True) for i in range(0, len(line), size)]
+    styles = solver_styles(solver for line in split for _, table in line for solver in table.solver)
+    columns = max(sizes)
+    narrow = columns > _WITH_NUMBERS
+    figure = make_figure(WIDTH, 0.5 + (_ROW * len(styles) + 0.85) * len(split), *heading)
+    ratios = [2 if narrow and column == 0 else 1 for column in range(columns)]
+    grid = figure.subplots(len(split), columns, sharex=True, sharey=True, squeeze=False, width_ratios=ratios)
+    for line, places in zip(split, grid, strict=True):
+        for index, (axes, (title, table)) in enumerate(zip(places, line, strict=False)):
+            for name, rate, (low, high) in zip(table.solver, table.rate, reach(table).T, strict=True):
+                look, row = styles[name], list(styles).index(name)
+                if not look["marker"]:  # a bound is a line across the panel
+                    axes.axvline(rate, color=look["color"], linestyle=look["linestyle"], linewidth=0.9, zorder=1)
+                dot = {**look, "linestyle": "none", "marker": look["marker"] or "|", "clip_on": False}
+                axes.errorbar([rate], [row], xerr=[[low], [high]], label=name, elinewidth=1.4, **dot)
+                if index == 0 or not narrow:
+                    place: dict[str, Any] = {"transform": axes.get_yaxis_transform(), "va": "center_baseline"}
+                    bold = "bold" if is_ours(name) else "normal"
+                    axes.text(1.04, row, f"{rate:.1f} ±{max(low, high):.1f}", fontsize=8, fontweight=bold, **place)
+            axes.set_title(textwrap.fill(title.replace("_", " "), 11 if narrow and index else 34))
+            axes.set_xlabel(_LABELS["rate"])
+        for axes in places[len(line) :]:
+            axes.remove()
+        places[0].set_yticks(range(len(styles)), [shortened(name) for name in styles])
+        for label, name in zip(places[0].get_yticklabels(), styles, strict=True):
+            label.set_fontweight("bold" if is_ours(name) else "normal")
+    grid[0, 0].set(xlim=(-3, 103), ylim=(len(styles) - 0.4, -0.6), xticks=range(0, 101, 50 if narrow else 25))
+    return save(figure, path)
+
+
+@rc_context(THEME)
+def draw_curves(
+    path: str | Path, heading: Sequence[str], panels: Sequence[Panel], x: str, styles: Styles | None = None
+) -> Path:
+    """Draw panels of curves against the column ``x``, with one legend below.
+
+    A panel is a title, a table with the column ``solver``, and the column of its vertical axis: ``rate`` in per cent
+    (with ``low`` and ``high``), ``us`` or ``operations``. Panels with the same vertical axis share its limits.
+    """
+    found = {solver for _, table, _ in panels for solver in table.solver}
+    styles = {name: look for name, look in (styles or solver_styles(found)).items() if name in found}
+    lines, log = math.ceil(len(panels) / 4), x in ("n", "batch")
+    columns = math.ceil(len(panels) / lines)
+    figure = make_figure(WIDTH, 1.0 + (2.4 if lines > 1 else 3.0) * lines + 0.04 * len(styles), *heading)
+    grid = list(figure.subplots(lines, columns, squeeze=False).flat)
+    first: dict[str, Axes] = {}
+    for index, (axes, (title, table, y)) in enumerate(zip(grid, panels, strict=False)):
+        for name, look in styles.items():
+            line = table[table.solver == name].sort_values(x)
+            error, every = reach(line) if y == "rate" else None, max(1, len(line) // 8)
+            if len(line):
+                axes.errorbar(line[x], line[y], yerr=error, label=name, elinewidth=1.0, markevery=every, **look)
+        axes.set(title=title, xlabel=_LABELS.get(x, x), xscale="log" if log else "linear")
+        if index % columns == 0 or panels[index - 1][2] != y:
+            axes.set_ylabel(_LABELS.get(y, y))
+        if y in first:
+            axes.sharey(first[y])
+        first.setdefault(y, axes)
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)) if log else MaxNLocator(_MOST_TICKS, integer=True))
+        places = sorted(table[x].unique())
+        if len(places) <= _MOST_TICKS:
+            axes.set_xticks(places)
+        axes.xaxis.set_major_formatter("{x:,.0f}")
+        axes.set_xticks([], minor=True)
+    for axes in grid[len(panels) :]:
+        axes.remove()
+    for y, axes in first.items():
+        if y == "rate":
+            axes.set(ylim=(-3, 103), yticks=range(0, 101, 20))
+        else:
+            log_scale(axes.yaxis, EngFormatter(sep="") if y == "operations" else "{x:g}")
+    draw_legend(figure, styles)
+    return save(figure, path)

@@ -14,7 +14,6 @@ from matplotlib import rc_context
 
 from kornia_pnpnet.core.schema import read_column, read_rows
 from kornia_pnpnet.evaluation.figures import style
-from kornia_pnpnet.evaluation.figures.panels import draw_curves
 
 _STAGES = {"init": "network alone", "refined": "after the refinement"}
 _MIXES = ((style.GREEN, "o", "-"), (style.BLUE, "s", "--"), (style.VERMILION, "^", "-."), (style.PINK, "D", ":"))
@@ -103,8 +102,8 @@ def plot_sweep(path: str | Path, summary_csv: str | Path, *, against: Literal["n
     panels += [("", times[times[other] == value], "us") for value in values]
     heading = [f"Success and time of short trainings against {against}, with 95 % intervals"]
     heading.append("Each network is tested on the mix of wrong pairs that it was trained on.")
-    label, styles[_TIME] = {"n": "pairs n", "m": "iterations m"}[against], style.line_style(style.GREY, "X", "-")
-    return draw_curves(path, heading, panels, against, label, columns=len(values), styles=styles)
+    styles[_TIME] = style.line_style(style.GREY, "X", "-")
+    return style.draw_curves(path, heading, panels, against, styles)
 
 
 @rc_context(style.THEME)
