@@ -15,7 +15,6 @@ import torch
 from matplotlib import rc_context
 
 from kornia_pnpnet.evaluation.figures import style
-from kornia_pnpnet.evaluation.figures.style import draw_curves, draw_dots
 from kornia_pnpnet.evaluation.problem_sets import PRIORS
 from kornia_pnpnet.evaluation.results import row_errors
 from kornia_pnpnet.metrics import success_rate
@@ -23,6 +22,7 @@ from kornia_pnpnet.metrics import success_rate
 _SYNTHETIC = {name for name, _ in PRIORS.values()}
 _PROTOCOL_N = 9
 _KEYS = ["source", "outliers", "mismatches", "n", "solver"]
+_LIMIT = ["max_rotation_deg", "max_translation", "unit"]
 _RATE = ["rate", "low", "high", "total"]
 _SOURCES = {"paper": "the paper's data", "gaussian_pose": "data with Gaussian positions"}
 _SCENE_OUTLIERS = 2  # as in the paper
@@ -59,9 +59,18 @@ def read_records(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
                 mismatches = outliers != 0 and description.get("mismatch_share") == 1
                 refine = (result["solvers"][solver].get("config") or {}).get("refine")
                 m = refine.get("m") if isinstance(refine, Mapping) else None
-                base, m = without_m(solver), m if type(m) is int else -1
-                key = (source, outliers, mismatches, data["n"], solver, base, m, base != solver)
-                more = (source not in _SYNTHETIC, row["us_per_problem"], success_limit(data))
+                base = re.sub(r"([:,])m=[^,]*(,?)", lambda option: option[1] if option[2] else "", solver)
+                key = (
+                    source,
+                    outliers,
+                    mismatches,
+                    data["n"],
+                    solver,
+                    base,
+                    m if type(m) is int else -1,
+                    base != solver,
+                )
+                more = (source not in _SYNTHETIC, row["us_per_problem"], [data[key] for key in _LIMIT])
                 rows.append((*key, *more, *percent(row["success"])))
     table = pd.DataFrame(rows, columns=[*_KEYS, "base", "m", "swept", "scene", "us", "limit", *_RATE])
     table = table.astype({"outliers": object, "mismatches": bool, "swept": bool, "scene": bool})
@@ -71,13 +80,6 @@ def read_records(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
 def percent(success: Mapping[str, Any]) -> tuple[float, float, float, int]:
     """Rate and interval of a success in per cent, and the number of problems."""
     return 100 * success["rate"], 100 * success["low"], 100 * success["high"], success["total"]
-
-
-def without_m(solver: str) -> str:
-    """The solver's name without the option m."""
-    name, _, options = solver.partition(":")
-    others = [option for option in options.split(",") if option and not option.startswith("m=")]
-    return ":".join([name, *filter(None, [",".join(others)])])
 
 
 def pooled(table: pd.DataFrame) -> pd.DataFrame:
@@ -90,26 +92,17 @@ def pooled(table: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["solver", *_RATE])
 
 
-def success_limit(data: Mapping[str, Any]) -> tuple[float, float, str]:
-    """Limits of a success on a data set of a results file: degrees, length, and unit of the length."""
-    return data["max_rotation_deg"], data["max_translation"], data["unit"] or "world units"
-
-
-def limits_in_words(limits: Iterable[tuple[float, float, str]]) -> str:
-    """The limits of a success, in words."""
-    table = pd.DataFrame(list(limits), columns=["degrees", "length", "unit"])
+def in_words(limits: Iterable[Sequence[Any]], totals: Sequence[int] = ()) -> str:
+    """The limits of a success (degrees, length, unit of the length), and the numbers of problems."""
+    table = pd.DataFrame(list(limits), columns=["degrees", "length", "unit"]).fillna("").replace("", "world units")
     lengths = [f"{_span(part.length, '.2g')} {unit}" for unit, part in table.groupby("unit", sort=False)]
-    return f"Solved: errors below {_span(table.degrees, 'g')}° and {' or '.join(lengths)}."
+    problems = f" {_span(totals, 'd')} problems in each set, 95 % intervals." if len(totals) else ""
+    return f"Solved: errors below {_span(table.degrees, 'g')}° and {' or '.join(lengths)}.{problems}"
 
 
-def in_words(table: pd.DataFrame) -> str:
-    """The limits of a success and the number of problems in each set."""
-    return f"{limits_in_words(table.limit)} {_span(table.total, 'd')} problems in each set, 95 % intervals."
-
-
-def _span(values: pd.Series, form: str) -> str:
+def _span(values: Iterable[float], form: str) -> str:
     """The value, or the least and the largest value when their texts differ."""
-    low, high = f"{values.min():{form}}", f"{values.max():{form}}"
+    low, high = f"{min(values):{form}}", f"{max(values):{form}}"
     return low if low == high else f"{low} to {high}"
 
 
@@ -143,8 +136,10 @@ def plot_success(path: str | Path, results: Mapping[str, Any]) -> Path:
     require(results["rows"], "rows")
     rows = [(row["data"], row["solver"], *percent(row["success"])) for row in results["rows"]]
     table = pd.DataFrame(rows, columns=["data", "solver", "rate", "low", "high", "total"])
-    limits = limits_in_words(success_limit(entry) for entry in results["data"].values())
-    return draw_dots(path, ["Success with 95 % intervals", limits], [dict(list(table.groupby("data", sort=False)))], 3)
+    limits = in_words([entry[key] for key in _LIMIT] for entry in results["data"].values())
+    return style.draw_dots(
+        path, ["Success with 95 % intervals", limits], [dict(list(table.groupby("data", sort=False)))]
+    )
 
 
 @rc_context(style.THEME)
@@ -177,9 +172,7 @@ def plot_errors(path: str | Path, results: Mapping[str, Any]) -> Path:
                     values = errors[solver][index].clamp(1e-12).numpy()  # 0 has no place on a logarithmic axis
                     marks = {"label": solver, "markevery": (0.01 * place, 0.15)}
                     sns.ecdfplot(x=values, stat="percent", log_scale=True, ax=axes, **marks, **look)
-            sharp = min(error[index].quantile(0.02).item() for error in errors.values()) < limit / 100
-            left, right = limit / (1000 if sharp else 100), 180.0 if index == 0 else limit * 100
-            axes.set(xlim=(left, right), ylim=(0, 101), xlabel=label, ylabel="problems (%)")
+            axes.set(xlim=(limit / 1000, limit * 180), ylim=(0, 101), xlabel=label, ylabel="problems (%)")
             axes.axvline(limit, color=style.GREY, linewidth=1.2)
             style.log_scale(axes.xaxis)
         panels[0].set_title(name)
@@ -205,11 +198,12 @@ def plot_synthetic(path: str | Path, results: Sequence[Mapping[str, Any]], sourc
         ValueError: when the results have no such problems.
     """
     table, n = at_usual_n(read_records(results).query("source == @source and not swept and not mismatches"))
-    settings = {setting: table[table.outliers == setting] for setting in (0, "uniform", n // 3)}
-    panels = {outliers_in_words(setting, n): part for setting, part in settings.items() if len(part)}
+    parts = {setting: table[table.outliers == setting] for setting in (0, "uniform", n // 3)}
+    panels = {outliers_in_words(setting, n): part for setting, part in parts.items() if len(part)}
     require(panels, f"success on '{source}' with none, uniform or {n // 3} outliers")
-    heading = [f"Success on {_SOURCES.get(source, source)}, n = {n}", in_words(pd.concat(panels.values()))]
-    return draw_dots(path, heading, [panels], len(settings))
+    table = pd.concat(panels.values())
+    heading = [f"Success on {_SOURCES.get(source, source)}, n = {n}", in_words(table.limit, table.total)]
+    return style.draw_dots(path, heading, [panels])
 
 
 @rc_context(style.THEME)
@@ -238,7 +232,9 @@ def plot_scenes(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Path:
         first, words = next(iter(scenes)), outliers_in_words(setting, n)
         whole = {f"{words}: all {len(scenes)} scenes": pooled(chosen)}
         lines.append({**whole, **scenes} if len(scenes) > 1 else {f"{words}: {first}": scenes[first]})
-    return draw_dots(path, [f"Success on scenes, n = {n}", in_words(table)], lines, _MOST_SCENES)
+    return style.draw_dots(
+        path, [f"Success on scenes, n = {n}", in_words(table.limit, table.total)], lines, _MOST_SCENES
+    )
 
 
 def plot_mismatches(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Path:
@@ -259,7 +255,7 @@ def plot_mismatches(path: str | Path, results: Sequence[Mapping[str, Any]]) -> P
         ValueError: when no scene has three numbers of mismatches.
     """
     table = read_records(results).query("scene and not swept")
-    table = table[table.outliers.map(type) == int]
+    table = table[table.outliers.map(lambda outliers: isinstance(outliers, int)).astype(bool)]
     kind = table.mismatches.any()
     table, n = at_usual_n(table[(table.mismatches == kind) | (table.outliers == 0)])
     counts = table.groupby("source").outliers.agg(set)
@@ -273,7 +269,7 @@ def plot_mismatches(path: str | Path, results: Sequence[Mapping[str, Any]]) -> P
     require(rates, f"solvers with {_FEWEST_MISMATCHES} numbers of mismatches")
     scenes = table.source.unique()
     title = f"Success on {f'{len(scenes)} scenes' if len(scenes) > 1 else scenes[0]}, n = {n}"
-    return draw_curves(path, [title, in_words(table)], [("", rates, "rate")], label)
+    return style.draw_curves(path, [title, in_words(table.limit, table.total)], [("", rates, "rate")], label)
 
 
 def plot_against_n(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Path:
@@ -299,8 +295,8 @@ def plot_against_n(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Pa
     table = table.assign(solver=table.solver.where(single, families))
     several = table.groupby(["solver", "outliers"]).n.transform("size") > 1
     table = table[several | table.solver.str.match("pnpnet|net")]
-    heading = [f"Success on {_SOURCES['paper']} against the number of pairs", in_words(table)]
-    return draw_curves(path, heading, _by_outliers(table, "n"), "n")
+    heading = [f"Success on {_SOURCES['paper']} against the number of pairs", in_words(table.limit, table.total)]
+    return style.draw_curves(path, heading, _by_outliers(table, "n"), "n")
 
 
 def plot_against_m(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Path:
@@ -325,8 +321,8 @@ def plot_against_m(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Pa
     require(table, "success on 'paper' of a solver with several m")
     panels = _by_outliers(table, n)
     panels.append((f"time, {panels[-1][0]}", panels[-1][1], "us"))
-    heading = [f"Success on {_SOURCES['paper']} against m, n = {n}", in_words(table)]
-    return draw_curves(path, heading, panels, "m")
+    heading = [f"Success on {_SOURCES['paper']} against m, n = {n}", in_words(table.limit, table.total)]
+    return style.draw_curves(path, heading, panels, "m")
 
 
 def _by_outliers(table: pd.DataFrame, n: int | str) -> list[tuple[str, pd.DataFrame, str]]:
@@ -352,13 +348,10 @@ def plot_operations(path: str | Path, complexity: Mapping[str, Any]) -> Path:
     n, counts = list(complexity["n"]), complexity["counts"]
     if not n or not counts:
         raise ValueError("There are no operation counts to draw.")
-    for name, values in counts.items():
-        if len(values) != len(n):
-            raise ValueError(f"There are {len(n)} numbers of pairs, but {len(values)} operation counts of '{name}'.")
     table = pd.DataFrame({"n": n, **counts}).melt("n", var_name="solver", value_name="operations")
     sampled = table.solver.isin(complexity["ransac"]).map({False: "without RANSAC", True: "with RANSAC"})
     panels = [(title, part, "operations") for title, part in table.groupby(sampled, sort=False)]
-    return draw_curves(path, ["Operations that a problem of n pairs takes"], panels, "n")
+    return style.draw_curves(path, ["Operations that a problem of n pairs takes"], panels, "n")
 
 
 _FIGURES = {
@@ -382,8 +375,7 @@ def paper_figures(results: Sequence[Mapping[str, Any]], folder: str | Path) -> l
         folder: folder of the pictures, made when missing.
 
     Returns:
-        The paths of the pictures: ``figure1_operations.png``, ``figure2_paper.png``, ``figure3_gaussian_pose.png``,
-        ``figure4_scenes.png``, ``figure5_mismatches.png``, ``success_against_n.png`` and ``success_against_m.png``.
+        The paths of the pictures.
 
     Raises:
         ValueError: when no figure has data, or there are several files of operation counts.

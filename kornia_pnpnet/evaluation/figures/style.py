@@ -22,7 +22,6 @@ from matplotlib.ticker import EngFormatter, Formatter, LogLocator, MaxNLocator, 
 #: Colours that colour-blind readers can tell apart.
 COLOURS = tuple(sns.color_palette("colorblind").as_hex())
 BLUE, ORANGE, GREEN, VERMILION, PINK, BROWN, _, GREY, _, SKY = COLOURS
-_BLACK = "#222222"
 
 WIDTH = 7.2  #: inches; the width of a page with two columns, so that letters are printed at their size
 _DPI = 200  # 1440 pixels across: sharp on a web page of 800 pixels, and a small file
@@ -51,11 +50,11 @@ _LOOKS = {
     "epnp": (VERMILION, "v", "--"), "epnp-lm": (VERMILION, "v", "-"),
     "reppnp": (GREEN, "^", "--"), "reppnp-lm": (GREEN, "^", "-"), "ransac-epnp-lm": (PINK, "s", "-"),
     "p3p-ransac": (ORANGE, "P", "-"), "p3p-ransac-noise": (ORANGE, "D", "--"), "identity-lm": (BROWN, "X", "-."),
-    "opencv-epnp": (_BLACK, "<", ":"), "opencv-sqpnp": (_BLACK, "<", "-."), "opencv-ransac": (_BLACK, ">", "-"),
-    "opencv-ransac-sqpnp": (_BLACK, "*", "-."), "opencv-usac": (_BLACK, ">", "--"), "opencv": (_BLACK, "*", ":"),
+    "opencv-epnp": ("k", "<", ":"), "opencv-sqpnp": ("k", "<", "-."), "opencv-ransac": ("k", ">", "-"),
+    "opencv-ransac-sqpnp": ("k", "*", "-."), "opencv-usac": ("k", ">", "--"), "opencv": ("k", "*", ":"),
     "poselib": (GREY, "p", "-"), "pycolmap": (GREY, "h", "--"),
     "": ("", "", ""),  # all other solvers
-    "known-inliers": (_BLACK, "", "-."), "known-inliers-and-noise": (_BLACK, "", ":"),
+    "known-inliers": ("k", "", "-."), "known-inliers-and-noise": ("k", "", ":"),
 }
 # fmt: on
 _OTHERS = [(COLOURS[i], marker, line) for line in ("-", "--", ":") for i, marker in ((8, "d"), (6, "8"), (4, "H"))]
@@ -77,7 +76,7 @@ def solver_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
     known = {n: max((key for key in _LOOKS if f"{b}-".startswith(key and f"{key}-")), key=len) for n, b in base.items()}
     unknown = sorted({base[name] for name, key in known.items() if not key})
     looks = {name: _LOOKS[key] if key else _OTHERS[unknown.index(base[name]) % 9] for name, key in known.items()}
-    natural = {name: [part.zfill(9) for part in re.findall(r"\d+|\D+", name)] for name in base}
+    natural = {name: re.sub(r"\d+", lambda number: number[0].zfill(9), name) for name in base}  # n9 before n20
     order = sorted(base, key=lambda name: (list(_LOOKS).index(known[name]), natural[name]))
     return {name: line_style(*looks[name], ours=is_ours(name)) for name in order}
 
@@ -139,7 +138,9 @@ def reach(table: pd.DataFrame) -> np.ndarray:
     return np.clip([table.rate - table.low, table.high - table.rate], 0, None)
 
 
-def draw_dots(path: str | Path, heading: Sequence[str], lines: Sequence[Mapping[str, pd.DataFrame]], most: int) -> Path:
+def draw_dots(
+    path: str | Path, heading: Sequence[str], lines: Sequence[Mapping[str, pd.DataFrame]], most: int = _WITH_NUMBERS
+) -> Path:
     """Draw success: a row for each solver, a panel for each table with ``solver``, ``rate``, ``low`` and ``high``.
 
     Tables are by title, at most ``most`` side by side. The first panel has numbers, and others where there is room.
