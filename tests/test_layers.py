@@ -31,15 +31,19 @@ EXTRAS = (
     "lightning_fabric",
     "matplotlib",
     "omegaconf",
+    "pandas",
     "poselib",
     "pyarrow",
     "pycolmap",
+    "seaborn",
     "tensorboard",
 )
 
 #: Optional packages and the only modules that may import them.
 OWNERS = {
     "matplotlib": {"evaluation.figures"},
+    "pandas": {"evaluation.figures"},
+    "seaborn": {"evaluation.figures"},
     "hydra": set(),
     "cv2": {"peers"},
     "pycolmap": {"data.colmap", "peers"},

@@ -25,7 +25,7 @@ BLUE, ORANGE, GREEN, VERMILION, PINK, BROWN, _, GREY, _, SKY = COLOURS
 
 WIDTH = 7.2  #: inches; the width of a page with two columns, so that letters are printed at their size
 _DPI = 200  # 1440 pixels across: sharp on a web page of 800 pixels, and a small file
-_LETTERS, _HANDLE = 105, 11  # of a legend: letters across the page, and letters that a piece of line takes
+_LETTERS, _HANDLE = 112, 11  # of a legend: letters across the page, and letters that a piece of line takes
 
 #: Settings of matplotlib while a picture is drawn: ``@rc_context(THEME)``. Names of solvers are not read as formulas.
 THEME: dict[str, Any] = {
@@ -57,11 +57,12 @@ _LOOKS = {
     "known-inliers": ("k", "", "-."), "known-inliers-and-noise": ("k", "", ":"),
 }
 # fmt: on
-_OTHERS = [(COLOURS[i], marker, line) for line in ("-", "--", ":") for i, marker in ((8, "d"), (6, "8"), (4, "H"))]
+_MORE = (("#882255", "d"), ("#44AA99", "8"), ("#999933", "H"))
+_OTHERS = [(colour, marker, line) for line in ("-", "--", ":") for colour, marker in _MORE]
 _ROW = 0.165  # inches from one solver to the next: a line of letters
 _WITH_NUMBERS = 3  # largest number of panels side by side that each have room for numbers
 _MOST_TICKS = 6  # largest number of places on a horizontal axis that are all ticked
-_LABELS = {"rate": "solved (%)", "us": "µs per problem", "n": "pairs n", "m": "iterations m", "batch": "problems B"}
+_LABELS = {"rate": "solved (%)", "us": "µs per problem", "n": "pairs n", "m": "iterations m"}
 
 Styles = Mapping[str, Mapping[str, Any]]  # arguments of Axes.plot by name
 Panel = tuple[str, pd.DataFrame, str]
@@ -188,7 +189,7 @@ def draw_curves(
     """
     found = {solver for _, table, _ in panels for solver in table.solver}
     styles = {name: look for name, look in (styles or solver_styles(found)).items() if name in found}
-    lines, log = math.ceil(len(panels) / 4), x in ("n", "batch")
+    lines = math.ceil(len(panels) / 4)
     columns = math.ceil(len(panels) / lines)
     figure = make_figure(WIDTH, 1.0 + (2.4 if lines > 1 else 3.0) * lines + 0.04 * len(styles), *heading)
     grid = list(figure.subplots(lines, columns, squeeze=False).flat)
@@ -199,6 +200,8 @@ def draw_curves(
             error, every = reach(line) if y == "rate" else None, max(1, len(line) // 8)
             if len(line):
                 axes.errorbar(line[x], line[y], yerr=error, label=name, elinewidth=1.0, markevery=every, **look)
+        places = sorted(table[x].unique())
+        log = 0 < 8 * places[0] < places[-1]
         axes.set(title=title, xlabel=_LABELS.get(x, x), xscale="log" if log else "linear")
         if index % columns == 0 or panels[index - 1][2] != y:
             axes.set_ylabel(_LABELS.get(y, y))
@@ -206,7 +209,6 @@ def draw_curves(
             axes.sharey(first[y])
         first.setdefault(y, axes)
         axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)) if log else MaxNLocator(_MOST_TICKS, integer=True))
-        places = sorted(table[x].unique())
         if len(places) <= _MOST_TICKS:
             axes.set_xticks(places)
         axes.xaxis.set_major_formatter("{x:,.0f}")
