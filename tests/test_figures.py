@@ -7,7 +7,6 @@ import importlib
 import itertools
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +16,6 @@ pytest.importorskip("seaborn")
 
 import matplotlib as mpl
 from matplotlib import pyplot
-from matplotlib.figure import Figure
 
 from kornia_pnpnet.evaluation.figures import (
     plot_errors,
@@ -41,19 +39,6 @@ def fake_results(sets=2):
         rows.append({"data": data, "solver": solver, "success": success, "per_problem": per_problem})
     entry = {"max_rotation_deg": 1.0, "max_translation": 0.2, "unit": "m"}
     return {"solvers": dict.fromkeys(names), "data": {f"set {i}": entry for i in range(sets)}, "rows": rows}
-
-
-@pytest.fixture
-def drawn(monkeypatch):
-    """Figures by file name, laid out as they would have been saved."""
-    found = {}
-
-    def keep(self, path, **_):
-        self.draw_without_rendering()
-        found[Path(path).name] = self
-
-    monkeypatch.setattr(Figure, "savefig", keep)
-    return found
 
 
 @pytest.mark.parametrize("plot", [plot_success, plot_errors])
@@ -102,7 +87,7 @@ def test_pose_picture_marks_rejected_pairs_and_takes_points_behind_the_camera(tm
         assert abs(np.diff(axes.get_xlim())[0]) < 1000
     plot_pose(tmp_path / "b.png", img, torch.full_like(img, torch.nan), rejected)
     for bad in ((img[:3], projected, rejected), (img * torch.nan, projected, rejected)):
-        with pytest.raises(ValueError, match="plot_pose needs|no pixel"):
+        with pytest.raises(ValueError, match=r"plot_pose needs|no pixel"):
             plot_pose(tmp_path / "c.png", *bad)
 
 
