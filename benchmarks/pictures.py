@@ -40,7 +40,7 @@ def plot_latency(path: Path, title: str, rows: Sequence[Mapping[str, Any]]) -> P
             x, y = np.array(row["quantiles_us"])[kept] / 1e3, 100 * shares[kept]
             axes.plot(x, y, **look, markevery=max(1, len(x) // 5))
     axes.set(xlabel="ms for one problem", ylabel="calls done (%)", ylim=(0, 100))
-    style.log_scale(axes.xaxis)
+    style.log_scale(axes, "x")
     style.draw_legend(figure, looks)
     return style.save(figure, path)
 

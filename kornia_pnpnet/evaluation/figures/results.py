@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence, Sized
+from collections.abc import Callable, Iterable, Mapping, Sequence, Sized
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -26,7 +26,6 @@ _LIMIT = ["max_rotation_deg", "max_translation", "unit"]
 _RATE = ["rate", "low", "high", "total"]
 _SOURCES = {"paper": "the paper's data", "gaussian_pose": "data with Gaussian positions"}
 _SCENE_OUTLIERS = 2  # as in the paper
-_MOST_SCENES = 6  # panels side by side
 _FEWEST_MISMATCHES = 3  # numbers of mismatches of a curve
 
 
@@ -60,19 +59,10 @@ def read_records(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
                 refine = (result["solvers"][solver].get("config") or {}).get("refine")
                 m = refine.get("m") if isinstance(refine, Mapping) else None
                 base = re.sub(r"([:,])m=[^,]*(,?)", lambda option: option[1] if option[2] else "", solver)
-                key = (
-                    source,
-                    outliers,
-                    mismatches,
-                    data["n"],
-                    solver,
-                    base,
-                    m if type(m) is int else -1,
-                    base != solver,
-                )
-                more = (source not in _SYNTHETIC, row["us_per_problem"], [data[key] for key in _LIMIT])
+                key = (source, outliers, mismatches, data["n"], solver, base, base != solver, source not in _SYNTHETIC)
+                more = (m if type(m) is int else -1, row["us_per_problem"], [data[key] for key in _LIMIT])
                 rows.append((*key, *more, *percent(row["success"])))
-    table = pd.DataFrame(rows, columns=[*_KEYS, "base", "m", "swept", "scene", "us", "limit", *_RATE])
+    table = pd.DataFrame(rows, columns=[*_KEYS, "base", "swept", "scene", "m", "us", "limit", *_RATE])
     table = table.astype({"outliers": object, "mismatches": bool, "swept": bool, "scene": bool})
     return table.sort_values("total", kind="stable").drop_duplicates(_KEYS, keep="last").sort_index()
 
@@ -137,9 +127,8 @@ def plot_success(path: str | Path, results: Mapping[str, Any]) -> Path:
     rows = [(row["data"], row["solver"], *percent(row["success"])) for row in results["rows"]]
     table = pd.DataFrame(rows, columns=["data", "solver", "rate", "low", "high", "total"])
     limits = in_words([entry[key] for key in _LIMIT] for entry in results["data"].values())
-    return style.draw_dots(
-        path, ["Success with 95 % intervals", limits], [dict(list(table.groupby("data", sort=False)))]
-    )
+    panels = dict(list(table.groupby("data", sort=False)))
+    return style.draw_dots(path, ["Success with 95 % intervals", limits], [panels])
 
 
 @rc_context(style.THEME)
@@ -167,14 +156,13 @@ def plot_errors(path: str | Path, results: Mapping[str, Any]) -> Path:
         labels = "rotation error (°)", f"translation error ({entry['unit'] or 'world units'})"
         limits = entry["max_rotation_deg"], entry["max_translation"]
         for index, (axes, limit, label) in enumerate(zip(panels, limits, labels, strict=True)):
-            for place, (solver, look) in enumerate(styles.items()):
-                if solver in errors:
-                    values = errors[solver][index].clamp(1e-12).numpy()  # 0 has no place on a logarithmic axis
-                    marks = {"label": solver, "markevery": (0.01 * place, 0.15)}
-                    sns.ecdfplot(x=values, stat="percent", log_scale=True, ax=axes, **marks, **look)
+            style.log_scale(axes, "x")
             axes.set(xlim=(limit / 1000, limit * 180), ylim=(0, 101), xlabel=label, ylabel="problems (%)")
             axes.axvline(limit, color=style.GREY, linewidth=1.2)
-            style.log_scale(axes.xaxis)
+            for place, (solver, look) in enumerate(styles.items()):
+                if solver in errors:
+                    values, marks = errors[solver][index].numpy(), {"markevery": (0.01 * place, 0.15)}
+                    sns.ecdfplot(x=values, stat="percent", ax=axes, label=solver, **marks, **look)
         panels[0].set_title(name)
     style.draw_legend(figure, styles)
     return style.save(figure, path)
@@ -232,9 +220,7 @@ def plot_scenes(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Path:
         first, words = next(iter(scenes)), outliers_in_words(setting, n)
         whole = {f"{words}: all {len(scenes)} scenes": pooled(chosen)}
         lines.append({**whole, **scenes} if len(scenes) > 1 else {f"{words}: {first}": scenes[first]})
-    return style.draw_dots(
-        path, [f"Success on scenes, n = {n}", in_words(table.limit, table.total)], lines, _MOST_SCENES
-    )
+    return style.draw_dots(path, [f"Success on scenes, n = {n}", in_words(table.limit, table.total)], lines, 6)
 
 
 def plot_mismatches(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Path:
@@ -354,7 +340,7 @@ def plot_operations(path: str | Path, complexity: Mapping[str, Any]) -> Path:
     return style.draw_curves(path, ["Operations that a problem of n pairs takes"], panels, "n")
 
 
-_FIGURES = {
+_FIGURES: dict[str, Callable[..., Path]] = {
     "figure2_paper.png": partial(plot_synthetic, source="paper"),
     "figure3_gaussian_pose.png": partial(plot_synthetic, source="gaussian_pose"),
     "figure4_scenes.png": plot_scenes,
@@ -380,12 +366,10 @@ def paper_figures(results: Sequence[Mapping[str, Any]], folder: str | Path) -> l
     Raises:
         ValueError: when no figure has data, or there are several files of operation counts.
     """
-    if not results:
-        raise ValueError("There are no results to draw: expected at least one results file.")
     complexity = [entry for entry in results if entry.get("kind") == "complexity"]
     solved = [entry for entry in results if entry.get("kind") != "complexity"]
-    if len(complexity) > 1:
-        raise ValueError(f"Operation counts come from one file, got {len(complexity)}.")
+    if len(complexity) > 1 or not results:
+        raise ValueError(f"Expected at least one results file and at most one of operation counts, got {len(results)}.")
     made = [plot_operations(Path(folder) / "figure1_operations.png", entry) for entry in complexity]
     for name, plot in _FIGURES.items():
         with suppress(NothingToDrawError):

@@ -14,7 +14,6 @@ import pandas as pd
 import seaborn as sns
 from matplotlib import rc_context
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, Formatter, LogLocator, MaxNLocator, NullFormatter
@@ -28,7 +27,7 @@ _DPI = 200  # 1440 pixels across: sharp on a web page of 800 pixels, and a small
 _LETTERS, _HANDLE = 112, 11  # of a legend: letters across the page, and letters that a piece of line takes
 
 #: Settings of matplotlib while a picture is drawn: ``@rc_context(THEME)``. Names of solvers are not read as formulas.
-THEME: dict[str, Any] = {
+THEME: Any = {
     **sns.axes_style("whitegrid"),
     **sns.plotting_context("paper", font_scale=0.95),  # the smallest letters have 8.4 points
     "axes.edgecolor": "#444444",
@@ -120,10 +119,10 @@ def draw_legend(figure: Figure, styles: Mapping[str, Mapping[str, Any]]) -> None
         text.set_fontweight("bold" if is_ours(text.get_text()) else "normal")
 
 
-def log_scale(axis: Axis, formatter: Formatter | str = "{x:g}") -> None:
-    """Make an axis logarithmic, with a number at every power of 10, and at more places of a short axis."""
-    axis.axes.set(**{f"{axis.axis_name}scale": "log"})
-    low, high = axis.get_view_interval()
+def log_scale(axes: Axes, name: str, formatter: Formatter | str = "{x:g}") -> None:
+    """Make the axis x or y logarithmic, with a number at every power of 10, and at more places of a short axis."""
+    axes.set(**{f"{name}scale": "log"})
+    axis, (low, high) = getattr(axes, f"{name}axis"), getattr(axes, f"get_{name}lim")()
     axis.set_major_locator(LogLocator(subs=(1, 2, 3, 5) if high < 100 * low else (1,)))
     axis.set_major_formatter(formatter)
     axis.set_minor_formatter(NullFormatter())
@@ -219,6 +218,6 @@ def draw_curves(
         if y == "rate":
             axes.set(ylim=(-3, 103), yticks=range(0, 101, 20))
         else:
-            log_scale(axes.yaxis, EngFormatter(sep="") if y == "operations" else "{x:g}")
+            log_scale(axes, "y", EngFormatter(sep="") if y == "operations" else "{x:g}")
     draw_legend(figure, styles)
     return save(figure, path)

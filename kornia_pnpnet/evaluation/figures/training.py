@@ -54,10 +54,9 @@ def plot_training(path: str | Path, history_csv: str | Path) -> Path:
         for (stage, label), colour, line in zip(_STAGES.items(), (style.ORANGE, style.BLUE), ("--", "-"), strict=True):
             axes.plot(history[f"{stage}_{kind}"].dropna(), color=colour, linestyle=line, label=label)
         axes.set(ylabel=unit, xlabel="update", title=f"{kind} distance")
-        style.log_scale(axes.yaxis)
-    for axes, side in ((rotation, "left"), (success, "right")):
-        if axes.lines:
-            figure.legend(*axes.get_legend_handles_labels(), loc=f"outside lower {side}", ncols=2)
+        style.log_scale(axes, "y")
+    figure.legend(handles=rotation.lines, loc="outside lower left", ncols=2)
+    figure.legend(handles=success.lines, loc="outside lower right", ncols=2)
     return style.save(figure, path)
 
 
