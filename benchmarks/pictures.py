@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib import rc_context
 
 from kornia_pnpnet.evaluation.figures import style
 
@@ -27,7 +26,7 @@ def plot_times(
     return style.draw_curves(path, [title], curves, label, _looks(pd.concat(tables.values()).contender))
 
 
-@rc_context(style.THEME)
+@style.themed
 def plot_latency(path: Path, title: str, rows: Sequence[Mapping[str, Any]]) -> Path:
     """Draw the share of the calls with one problem that end within a time, without the slowest hundredth."""
     looks = _looks(row["contender"] for row in rows)

@@ -8,15 +8,7 @@ import torch
 
 pytest.importorskip("seaborn")
 
-from kornia_pnpnet.evaluation.figures import (
-    paper_figures,
-    plot_against_m,
-    plot_against_n,
-    plot_mismatches,
-    plot_operations,
-    plot_scenes,
-    plot_synthetic,
-)
+from kornia_pnpnet.evaluation import figures
 from kornia_pnpnet.metrics import success_rate
 
 
@@ -52,7 +44,7 @@ def test_dots_stand_in_their_rows_at_their_rates(tmp_path, drawn):
     rows = [("paper", k or "none", 9, name, count) for k in solved for name, count in solved[k].items()]
     rows = [(source, "uniform" if k == 1 else k, *more) for source, k, *more in rows]
     rows.append(("paper", "none", 9, "reppnp:m=2", 1, 2))  # a point of a curve against m
-    assert plot_synthetic(tmp_path / "a.png", [results_of(rows)]) == tmp_path / "a.png"
+    assert figures.plot_synthetic(tmp_path / "a.png", [results_of(rows)]) == tmp_path / "a.png"
     panels = drawn["a.png"].axes
     names = [label.get_text() for label in panels[0].get_yticklabels()]
     assert names == ["pnpnet-n9", "reppnp", "known-inliers"]
@@ -68,7 +60,7 @@ def test_dots_stand_in_their_rows_at_their_rates(tmp_path, drawn):
 def test_scenes_are_pooled_over_all_their_problems(tmp_path, drawn):
     rows = [("a", "none", 9, "epnp", 30), ("b", "none", 9, "epnp", 10), ("a", "none", 9, "mine", 1)]
     rows += [("a", 2, 9, "epnp", 5), ("a", 3, 9, "epnp", 7)]
-    plot_scenes(tmp_path / "a.png", [results_of(rows)])
+    figures.plot_scenes(tmp_path / "a.png", [results_of(rows)])
     pooled, first, _, spoilt = drawn["a.png"].axes
     assert percents(pooled) == {"epnp": [20]}  # the other solver solved one scene only
     assert percents(first) == {"epnp": [30], "mine": [1]}
@@ -80,18 +72,18 @@ def test_mismatches_against_their_number(tmp_path, drawn):
     alone = [(scene, k or "none", 9, "epnp", 80 - k, None, 1.0) for k in range(3) for scene in ("a", "b")]
     alone += [("c", 2, 9, "epnp", 100, None, 1.0), ("a", 2, 20, "epnp", 50, None, 1.0), ("a", 1, 9, "p", 1, None, 1.0)]
     for results in ([mixed, alone], [alone, mixed]):
-        plot_mismatches(tmp_path / "a.png", [results_of(rows) for rows in results])
+        figures.plot_mismatches(tmp_path / "a.png", [results_of(rows) for rows in results])
         (axes,) = drawn["a.png"].axes
         assert points(axes).keys() == {"epnp"}
         assert points(axes)["epnp"][1:] == [[1, 79], [2, 78]]
-    plot_mismatches(tmp_path / "b.png", [results_of(mixed)])  # without sets of mismatches only
+    figures.plot_mismatches(tmp_path / "b.png", [results_of(mixed)])  # without sets of mismatches only
 
 
 def test_solvers_for_one_n_each_share_a_curve(tmp_path, drawn):
     rows = [("paper", "none", n, f"pnpnet-n{n}", n) for n in (6, 9, 20)]
     rows += [("paper", outliers, n, "epnp", 2 * n) for outliers in ("none", "uniform") for n in (6, 9, 20)]
     rows += [("paper", "uniform", 9, "pnpnet-n9", 7), ("paper", 3, 9, "epnp", 1)]
-    plot_against_n(tmp_path / "a.png", [results_of(rows)])
+    figures.plot_against_n(tmp_path / "a.png", [results_of(rows)])
     none, uniform = (points(axes) for axes in drawn["a.png"].axes)
     assert none["pnpnet-n*"] == [[n, n] for n in (6, 9, 20)]
     assert none["epnp"] == uniform["epnp"] == [[n, 2 * n] for n in (6, 9, 20)]
@@ -101,7 +93,7 @@ def test_solvers_for_one_n_each_share_a_curve(tmp_path, drawn):
 def test_m_is_read_from_the_configuration(tmp_path, drawn):
     names = (("epnp-lm:m=3,x=1", 3), ("epnp-lm:x=1", 9), ("epnp-lm:x=1,m=1", 1), ("identity-lm", 8))
     rows = [("paper", k, 9, name, 10 * m, m) for k in ("none", "uniform") for name, m in names]
-    plot_against_m(tmp_path / "a.png", [results_of([*rows, ("paper", 3, 9, "epnp-lm", 1, 9)])])
+    figures.plot_against_m(tmp_path / "a.png", [results_of([*rows, ("paper", 3, 9, "epnp-lm", 1, 9)])])
     *panels, time = drawn["a.png"].axes
     for axes in panels:
         assert points(axes) == {"epnp-lm:x=1": [[m, 10 * m] for m in (1, 3, 9)]}
@@ -112,18 +104,18 @@ COUNTS = {"n": [6, 9, 50], "counts": {"epnp": [10, 20, None], "p3p-ransac": [1, 
 
 
 def test_operations_with_and_without_ransac(tmp_path, drawn):
-    plot_operations(tmp_path / "a.png", COUNTS)
+    figures.plot_operations(tmp_path / "a.png", COUNTS)
     first, second = (points(axes) for axes in drawn["a.png"].axes)
     np.testing.assert_equal(first, {"epnp": [[6, 10], [9, 20], [50, np.nan]]})
     assert second == {"p3p-ransac": [[6, 1], [9, 2], [50, 3]]}
     for bad in ({}, {"epnp": [1]}):
         with pytest.raises(ValueError, match=r"operation counts|length"):
-            plot_operations(tmp_path / "a.png", {**COUNTS, "counts": bad})
+            figures.plot_operations(tmp_path / "a.png", {**COUNTS, "counts": bad})
 
 
 def test_figures_without_data_are_left_out(tmp_path, drawn):
     def names(*results):
-        return [path.name.partition("_")[0] for path in paper_figures(results, tmp_path)]
+        return [path.name.partition("_")[0] for path in figures.paper_figures(results, tmp_path)]
 
     one, counts = results_of([("paper", "none", 9, "epnp", 5)]), {**COUNTS, "kind": "complexity"}
     assert names(one) == ["figure2"]
@@ -134,14 +126,14 @@ def test_figures_without_data_are_left_out(tmp_path, drawn):
     unnamed = results_of([("paper", None, 9, "epnp", 5)])
     for nothing in ([], [results_of([])], [unnamed], [counts] * 2):
         with pytest.raises(ValueError, match=r"results|counts"):
-            paper_figures(nothing, tmp_path)
+            figures.paper_figures(nothing, tmp_path)
 
 
 def test_more_problems_count_then_the_last_file(tmp_path, drawn):
     one, more, last = (results_of([("paper", "none", 9, "epnp", solved)]) for solved in (90, 50, 25))
     more["rows"][0]["success"]["total"] = last["rows"][0]["success"]["total"] = 200
     for files, rate in (((one, more), 50), ((more, one), 50), ((more, last), 25)):
-        plot_synthetic(tmp_path / "a.png", files)
+        figures.plot_synthetic(tmp_path / "a.png", files)
         assert percents(drawn["a.png"].axes[0]) == {"epnp": [rate]}
 
 
@@ -152,7 +144,7 @@ def test_texts_stay_on_the_page_and_odd_names_are_written(tmp_path, drawn):
     rows += [(scene, k or "none", 9, name, 50) for scene in scenes for k in range(4) for name in names]
     rows += [("paper", "none", 9, f"epnp-lm:m={m}", 50, m) for m in range(1, 9)]
     counts = {"n": [6, 9], "counts": {name: [1, 2] for name in names}, "ransac": [], "kind": "complexity"}
-    paper_figures([results_of(rows), counts], tmp_path)
+    figures.paper_figures([results_of(rows), counts], tmp_path)
     assert len(drawn) == 6
     for name, figure in drawn.items():
         box = figure.get_tightbbox()

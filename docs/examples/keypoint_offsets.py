@@ -16,13 +16,12 @@ from typing import Any
 
 import torch
 from kornia.geometry import solve_pnp_dlt
-from matplotlib import rc_context
 from torch import Tensor
 
 from kornia_pnpnet import create_solver
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.data.draws import batch_generator, random_poses
-from kornia_pnpnet.evaluation.figures.style import BLUE, GREEN, ORANGE, THEME, make_figure, save
+from kornia_pnpnet.evaluation.figures.style import BLUE, GREEN, ORANGE, make_figure, save, themed
 from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.losses import pose_distances
 from kornia_pnpnet.types import Pose
@@ -107,7 +106,7 @@ def learn(solve: Solve, steps: int) -> dict[str, Any]:
     return {"error_px": errors, "steps_without_finite_gradient": lost}
 
 
-@rc_context(THEME)
+@themed
 def plot(results: dict[str, Any], path: Path) -> None:
     """The errors against steps."""
     figure = make_figure(7.0, 3.6)

@@ -26,13 +26,12 @@ import torch
 from kornia.filters import gaussian_blur2d
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from kornia.geometry.subpix import spatial_expectation2d, spatial_softmax2d
-from matplotlib import rc_context
 from torch import Tensor, nn
 from torch.nn import functional
 
 from kornia_pnpnet import PnPResult, Pose, create_solver
 from kornia_pnpnet.core.environment import environment
-from kornia_pnpnet.evaluation.figures.style import BLUE, ORANGE, THEME, VERMILION, make_figure, save
+from kornia_pnpnet.evaluation.figures.style import BLUE, ORANGE, VERMILION, make_figure, save, themed
 from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.geometry import rotation_angle
 
@@ -266,7 +265,7 @@ def run(seed: int, updates: int, batches: int) -> tuple[dict[str, Any], dict[str
     return found, {name: networks[name] for name in (ALONE, END)}
 
 
-@rc_context(THEME)
+@themed
 def plot_errors(results: dict[str, Any], path: Path) -> None:
     """The errors of each seed, and their means."""
     figure = make_figure(8.0, 3.4)

@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib import rc_context
 from matplotlib.patches import Patch
 
-from kornia_pnpnet.evaluation.figures.style import BLUE, GREY, SKY, THEME, WIDTH, make_figure, save
+from kornia_pnpnet.evaluation.figures.style import BLUE, GREY, SKY, WIDTH, make_figure, save, themed
 from kornia_pnpnet.metrics import SuccessRate
 
 _PALE = {BLUE: SKY, GREY: "#cccccc"}
@@ -27,7 +26,7 @@ class OverviewRow(NamedTuple):
     us_per_problem: float
 
 
-@rc_context(THEME)
+@themed
 def plot_overview(path: str | Path, rows: Sequence[OverviewRow], *, outliers: str) -> Path:
     """Draw success (left) and time per problem (right) as bars. ``outliers`` is the number of outliers in words."""
     places = np.arange(len(rows))

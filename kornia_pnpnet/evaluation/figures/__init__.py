@@ -1,8 +1,6 @@
-"""Pictures of results. Only this folder needs matplotlib and seaborn.
+"""Pictures of results: all figures of the paper's protocol at once, or one picture by each other function.
 
-Importing this folder imports ``matplotlib.pyplot``, which seaborn needs, but no pyplot figure is made. matplotlib's
-settings are changed only while a picture is drawn. ``paper_figures`` draws all figures of the paper's protocol from
-results files. Every other function draws one picture.
+Only this folder needs matplotlib and seaborn. matplotlib's settings change only while a picture is drawn.
 """
 
 try:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import rc_context
 from matplotlib.collections import LineCollection
 from torch import Tensor
 
@@ -14,7 +13,7 @@ from kornia_pnpnet.core.checks import check_positive
 from kornia_pnpnet.evaluation.figures import style
 
 
-@rc_context(style.THEME)
+@style.themed
 def plot_pose(
     path: str | Path,
     img_points: np.ndarray | Tensor,
@@ -73,8 +72,8 @@ def plot_pose(
     axes.plot(*pixels[bad].T, "x", color=style.VERMILION, markeredgewidth=2.2, label="pixel, rejected", **marks)
     axes.plot(*projected[seen].T, "+", color="black", markeredgewidth=1.3, label="reprojection", **marks)
     axes.set(xlim=(low[0], high[0]), ylim=(high[1], low[1]), xlabel="u (px)", ylabel="v (px)", aspect="equal")
-    hidden = f", {(~seen).sum()} behind the camera" if not seen.all() else ""
-    counts = f"n = {len(pixels)}, {bad.sum()} rejected{hidden}"
+    counts = f"n = {len(pixels)}, {bad.sum()} rejected"
+    counts += f", {(~seen).sum()} behind the camera" if not seen.all() else ""
     axes.set_title(f"{title}: {counts}" if title else counts)
     figure.legend(loc="outside lower center", ncols=3)
     return style.save(figure, path)

@@ -5,14 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence, Sized
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 import seaborn as sns
 import torch
-from matplotlib import rc_context
 
 from kornia_pnpnet.evaluation.figures import style
 from kornia_pnpnet.evaluation.problem_sets import PRIORS
@@ -20,12 +18,11 @@ from kornia_pnpnet.evaluation.results import row_errors
 from kornia_pnpnet.metrics import success_rate
 
 _SYNTHETIC = {name for name, _ in PRIORS.values()}
-_PROTOCOL_N = 9
 _KEYS = ["source", "outliers", "mismatches", "n", "solver"]
 _LIMIT = ["max_rotation_deg", "max_translation", "unit"]
 _RATE = ["rate", "low", "high", "total"]
 _SOURCES = {"paper": "the paper's data", "gaussian_pose": "data with Gaussian positions"}
-_SCENE_OUTLIERS = 2  # as in the paper
+_PROTOCOL_N, _SCENE_OUTLIERS = 9, 2  # as in the paper
 _FEWEST_MISMATCHES = 3  # numbers of mismatches of a curve
 
 
@@ -109,7 +106,7 @@ def at_usual_n(table: pd.DataFrame) -> tuple[pd.DataFrame, int]:
     return table[table.n == n], n
 
 
-@rc_context(style.THEME)
+@style.themed
 def plot_success(path: str | Path, results: Mapping[str, Any]) -> Path:
     """Draw the success rates of all solvers on all data sets, with their 95 % intervals.
 
@@ -131,7 +128,7 @@ def plot_success(path: str | Path, results: Mapping[str, Any]) -> Path:
     return style.draw_dots(path, ["Success with 95 % intervals", limits], [panels])
 
 
-@rc_context(style.THEME)
+@style.themed
 def plot_errors(path: str | Path, results: Mapping[str, Any]) -> Path:
     """Draw the share of problems with an error of at most x: a row of two panels for each data set.
 
@@ -168,7 +165,7 @@ def plot_errors(path: str | Path, results: Mapping[str, Any]) -> Path:
     return style.save(figure, path)
 
 
-@rc_context(style.THEME)
+@style.themed
 def plot_synthetic(path: str | Path, results: Sequence[Mapping[str, Any]], source: str = "paper") -> Path:
     """Draw success on synthetic data without and with outliers: figures 2 and 3 of the protocol.
 
@@ -194,7 +191,7 @@ def plot_synthetic(path: str | Path, results: Sequence[Mapping[str, Any]], sourc
     return style.draw_dots(path, heading, [panels])
 
 
-@rc_context(style.THEME)
+@style.themed
 def plot_scenes(path: str | Path, results: Sequence[Mapping[str, Any]]) -> Path:
     """Draw success on scenes, over all scenes and for each: figure 4 of the protocol.
 
@@ -245,7 +242,7 @@ def plot_mismatches(path: str | Path, results: Sequence[Mapping[str, Any]]) -> P
     kind = table.mismatches.any()
     table, n = at_usual_n(table[(table.mismatches == kind) | (table.outliers == 0)])
     counts = table.groupby("source").outliers.agg(set)
-    most = max(counts, key=len, default=set())
+    most: set[int] = max(counts, key=len, default=set())
     table = table[table.source.isin(counts.index[counts >= most]) & table.outliers.isin(most)]
     label = f"{'mismatches' if kind else 'outliers'} among {n} pairs"
     parts = [pooled(part).assign(**{label: number}) for number, part in table.groupby("outliers")]
@@ -341,8 +338,8 @@ def plot_operations(path: str | Path, complexity: Mapping[str, Any]) -> Path:
 
 
 _FIGURES: dict[str, Callable[..., Path]] = {
-    "figure2_paper.png": partial(plot_synthetic, source="paper"),
-    "figure3_gaussian_pose.png": partial(plot_synthetic, source="gaussian_pose"),
+    "figure2_paper.png": plot_synthetic,
+    "figure3_gaussian_pose.png": lambda path, results: plot_synthetic(path, results, "gaussian_pose"),
     "figure4_scenes.png": plot_scenes,
     "figure5_mismatches.png": plot_mismatches,
     "success_against_n.png": plot_against_n,

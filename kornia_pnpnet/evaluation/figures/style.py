@@ -21,12 +21,11 @@ from matplotlib.ticker import EngFormatter, Formatter, LogLocator, MaxNLocator, 
 #: Colours that colour-blind readers can tell apart.
 COLOURS = tuple(sns.color_palette("colorblind").as_hex())
 BLUE, ORANGE, GREEN, VERMILION, PINK, BROWN, _, GREY, _, SKY = COLOURS
-
 WIDTH = 7.2  #: inches; the width of a page with two columns, so that letters are printed at their size
 _DPI = 200  # 1440 pixels across: sharp on a web page of 800 pixels, and a small file
 _LETTERS, _HANDLE = 112, 11  # of a legend: letters across the page, and letters that a piece of line takes
 
-#: Settings of matplotlib while a picture is drawn: ``@rc_context(THEME)``. Names of solvers are not read as formulas.
+#: Settings of matplotlib while a picture is drawn. Names of solvers are not read as formulas.
 THEME: Any = {
     **sns.axes_style("whitegrid"),
     **sns.plotting_context("paper", font_scale=0.95),  # the smallest letters have 8.4 points
@@ -36,10 +35,10 @@ THEME: Any = {
     "axes.titlelocation": "left",
     "errorbar.capsize": 1.6,
     "font.sans-serif": ["DejaVu Sans"],
-    "grid.color": "#dddddd",
     "legend.frameon": False,
     "text.parse_math": False,
 }
+themed = rc_context(THEME)  #: Decorator of functions that draw.
 
 # Colour, marker and line of a solver, in the order of the rows. A solver has the look of the longest name that its name
 # begins with, up to a hyphen. A bound has no marker.
@@ -62,7 +61,6 @@ _ROW = 0.165  # inches from one solver to the next: a line of letters
 _WITH_NUMBERS = 3  # largest number of panels side by side that each have room for numbers
 _MOST_TICKS = 6  # largest number of places on a horizontal axis that are all ticked
 _LABELS = {"rate": "solved (%)", "us": "µs per problem", "n": "pairs n", "m": "iterations m"}
-
 Styles = Mapping[str, Mapping[str, Any]]  # arguments of Axes.plot by name
 Panel = tuple[str, pd.DataFrame, str]
 
@@ -101,12 +99,11 @@ def make_figure(width: float, height: float, *heading: str) -> Figure:
     return figure
 
 
-def save(figure: Figure, path: str | Path, *, dpi: int = _DPI) -> Path:
+def save(figure: Figure, path: str | Path) -> Path:
     """Write the figure and make missing folders. The ending of the path gives the format."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=dpi)
-    return path
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=_DPI)
+    return Path(path)
 
 
 def draw_legend(figure: Figure, styles: Mapping[str, Mapping[str, Any]]) -> None:
@@ -149,8 +146,7 @@ def draw_dots(
     sizes = [math.ceil(len(line) / math.ceil(len(line) / most)) for line in grouped]  # lines of about equal length
     split = [line[i : i + size] for line, size in zip(grouped, sizes, strict=True) for i in range(0, len(line), size)]
     styles = solver_styles(solver for line in split for _, table in line for solver in table.solver)
-    columns = max(sizes)
-    narrow = columns > _WITH_NUMBERS
+    columns, narrow = max(sizes), max(sizes) > _WITH_NUMBERS
     figure = make_figure(WIDTH, 0.5 + (_ROW * len(styles) + 0.85) * len(split), *heading)
     ratios = [2 if narrow and column == 0 else 1 for column in range(columns)]
     grid = figure.subplots(len(split), columns, sharex=True, sharey=True, squeeze=False, width_ratios=ratios)
@@ -163,11 +159,11 @@ def draw_dots(
                 dot = {**look, "linestyle": "none", "marker": look["marker"] or "|", "clip_on": False}
                 axes.errorbar([rate], [row], xerr=[[low], [high]], label=name, elinewidth=1.4, **dot)
                 if index == 0 or not narrow:
-                    place: dict[str, Any] = {"transform": axes.get_yaxis_transform(), "va": "center_baseline"}
-                    bold = "bold" if is_ours(name) else "normal"
-                    axes.text(1.04, row, f"{rate:.1f} ±{max(low, high):.1f}", fontsize=8, fontweight=bold, **place)
-            axes.set_title(textwrap.fill(title.replace("_", " "), 11 if narrow and index else 34))
-            axes.set_xlabel(_LABELS["rate"])
+                    font: dict[str, Any] = {"fontsize": 8, "fontweight": "bold" if is_ours(name) else "normal"}
+                    font |= {"transform": axes.get_yaxis_transform(), "va": "center_baseline"}
+                    axes.text(1.04, row, f"{rate:.1f} ±{max(low, high):.1f}", **font)
+            title = textwrap.fill(title.replace("_", " "), 11 if narrow and index else 34)
+            axes.set(title=title, xlabel=_LABELS["rate"])
         for axes in places[len(line) :]:
             axes.remove()
         places[0].set_yticks(range(len(styles)), [shortened(name) for name in styles])
@@ -177,7 +173,7 @@ def draw_dots(
     return save(figure, path)
 
 
-@rc_context(THEME)
+@themed
 def draw_curves(
     path: str | Path, heading: Sequence[str], panels: Sequence[Panel], x: str, styles: Styles | None = None
 ) -> Path:

@@ -10,7 +10,6 @@ from typing import Literal
 
 import numpy as np
 import pandas as pd
-from matplotlib import rc_context
 
 from kornia_pnpnet.core.schema import read_column, read_rows
 from kornia_pnpnet.evaluation.figures import style
@@ -21,7 +20,7 @@ _TIME = "time, least over the mixes"
 _COLUMNS = {"n": "model.n", "m": "model.m", "mix": "data.outliers.max_ratio", "us": "us_per_problem"}
 
 
-@rc_context(style.THEME)
+@style.themed
 def plot_training(path: str | Path, history_csv: str | Path) -> Path:
     """Draw the learning curves of a run.
 
@@ -92,8 +91,8 @@ def plot_sweep(path: str | Path, summary_csv: str | Path, *, against: Literal["n
     runs[["rate", "low", "high"]] *= 100
     if runs.duplicated(["n", "m", "mix"]).any():
         raise ValueError(f"'{summary_csv}' has several runs with the same n, m and mix of wrong pairs.")
-    mixes = sorted(runs.mix.unique())
-    styles = {mix_in_words(mix): style.line_style(*_MIXES[index % len(_MIXES)]) for index, mix in enumerate(mixes)}
+    mixes = {mix_in_words(mix): _MIXES[index % len(_MIXES)] for index, mix in enumerate(sorted(runs.mix.unique()))}
+    styles = {name: style.line_style(*look) for name, look in {**mixes, _TIME: (style.GREY, "X", "-")}.items()}
     times = runs.groupby(["n", "m"], as_index=False).us.min().assign(solver=_TIME)
     other = "m" if against == "n" else "n"
     values = sorted(runs[other].unique())
@@ -101,11 +100,10 @@ def plot_sweep(path: str | Path, summary_csv: str | Path, *, against: Literal["n
     panels += [("", times[times[other] == value], "us") for value in values]
     heading = [f"Success and time of short trainings against {against}, with 95 % intervals"]
     heading.append("Each network is tested on the mix of wrong pairs that it was trained on.")
-    styles[_TIME] = style.line_style(style.GREY, "X", "-")
     return style.draw_curves(path, heading, panels, against, styles)
 
 
-@rc_context(style.THEME)
+@style.themed
 def plot_reliability(path: str | Path, curves: Mapping[str, Mapping[str, Sequence[float]]]) -> Path:
     """Draw observed shares against predicted probabilities, and below the number of predictions in each range.
 
