@@ -13,6 +13,7 @@ import torch
 pytest.importorskip("seaborn")
 
 import matplotlib as mpl
+import pandas as pd
 from matplotlib import pyplot
 
 from kornia_pnpnet.evaluation import figures
@@ -93,42 +94,35 @@ def test_reliability_picture_leaves_empty_ranges_out(tmp_path, drawn):
             figures.plot_reliability(tmp_path / "b.png", bad)
 
 
-HEADER = "update,total,init_rotation,init_translation,refined_rotation,refined_translation"
-
-
 def test_training_picture_reads_the_history(tmp_path, drawn):
+    header = "update,total,init_rotation,init_translation,refined_rotation,refined_translation"
     rows = [f"{i},{2 / i},{1 / i},{9 / i},nan,{4 / i},{'' if i % 2 else 0.1 * i}" for i in range(1, 9)]
     history = tmp_path / "a.csv"
-    history.write_text("\n".join([f"{HEADER},val/none/success", *rows]) + "\n")
+    history.write_text("\n".join([f"{header},val/none/success", *rows]) + "\n")
     figures.plot_training(tmp_path / "a.png", history)
     loss, success, *_ = drawn["a.png"].axes
     assert loss.lines[0].get_ydata() == pytest.approx([2 / i for i in range(1, 9)])
     assert pytest.approx(np.array([[i, 10 * i] for i in (2, 4, 6, 8)])) == np.array(success.lines[0].get_data()).T
-    for text, message in (("", "no rows"), (HEADER, "no rows"), ("update\n1", "'total'")):
+    for text, message in (("", "no rows"), (header, "no rows"), ("update\n1", "'total'")):
         history.write_text(text)
         with pytest.raises(ValueError, match=message):
             figures.plot_training(tmp_path / "a.png", history)
 
 
-def sweep_rows():
+@pytest.fixture
+def runs():
     """A summary of a sweep; the rate identifies the run."""
-    rows = []
-    for mix, (n, m) in itertools.product(("0.33", "0"), ((9, 10), (9, 2), (6, 2), (6, 10))):
-        rate = n / 100 + m / 1000 + float(mix)
-        rows.append({"model.n": f"{n}", "model.m": f"{m}", "data.outliers.max_ratio": mix})
-        rows[-1] |= {"uniform/rate": f"{rate}", "uniform/low": f"{rate - 0.01}", "uniform/high": f"{rate + 0.01}"}
-        rows[-1]["us_per_problem"] = f"{n * m + 10 * float(mix)}"
-    return rows
-
-
-def write_summary(path, rows):
-    path.write_text("\n".join(",".join(line) for line in (rows[0], *(row.values() for row in rows))))
-    return path
+    columns = ["data.outliers.max_ratio", "model.n", "model.m"]
+    runs = pd.DataFrame(itertools.product((0.33, 0), (9, 6), (10, 2)), columns=columns)
+    rate = runs["model.n"] / 100 + runs["model.m"] / 1000 + runs["data.outliers.max_ratio"]
+    runs["us_per_problem"] = runs["model.n"] * runs["model.m"] + 10 * runs["data.outliers.max_ratio"]
+    return runs.assign(**{"uniform/rate": rate, "uniform/low": rate - 0.01, "uniform/high": rate + 0.01})
 
 
 @pytest.mark.parametrize(("against", "places", "panels"), [("m", [2, 10], [6, 9]), ("n", [6, 9], [2, 10])])
-def test_sweep_picture_shows_success_and_time(tmp_path, drawn, against, places, panels):
-    figures.plot_sweep(tmp_path / "a.png", write_summary(tmp_path / "a.csv", sweep_rows()), against=against)
+def test_sweep_picture_shows_success_and_time(tmp_path, drawn, runs, against, places, panels):
+    runs.to_csv(tmp_path / "a.csv", index=False)
+    figures.plot_sweep(tmp_path / "a.png", tmp_path / "a.csv", against=against)
     rates, times = drawn["a.png"].axes[:2], drawn["a.png"].axes[2:]
     for axes, below, value in zip(rates, times, panels, strict=True):
         pairs = [(place, value) if against == "n" else (value, place) for place in places]
@@ -140,14 +134,14 @@ def test_sweep_picture_shows_success_and_time(tmp_path, drawn, against, places, 
         assert list(time.lines[0].get_ydata()) == pytest.approx([n * m for n, m in pairs])  # the least over the mixes
 
 
-def test_an_unfinished_sweep_is_drawn_and_a_contradictory_one_is_not(tmp_path, drawn):
-    figures.plot_sweep(tmp_path / "a.png", write_summary(tmp_path / "a.csv", sweep_rows()[:5]), against="n")
-    for key, rows in (
-        ("several runs", [{**row, "model.m": "2"} for row in sweep_rows()]),
-        ("us_per_problem", [{key: row[key] for key in row if key != "us_per_problem"} for row in sweep_rows()]),
-    ):
-        with pytest.raises(ValueError, match=key):
-            figures.plot_sweep(tmp_path / "a.png", write_summary(tmp_path / "a.csv", rows), against="n")
+def test_an_unfinished_sweep_is_drawn_and_a_contradictory_one_is_not(tmp_path, drawn, runs):
+    path, contradictory = tmp_path / "a.csv", runs.assign(**{"model.m": 2})
+    runs[:5].to_csv(path, index=False)
+    figures.plot_sweep(tmp_path / "a.png", path, against="n")
+    for wrong, message in ((contradictory, "several runs"), (runs.drop(columns="us_per_problem"), "us_per_problem")):
+        wrong.to_csv(path, index=False)
+        with pytest.raises(ValueError, match=message):
+            figures.plot_sweep(tmp_path / "a.png", path, against="n")
 
 
 def test_a_missing_package_is_named(monkeypatch):

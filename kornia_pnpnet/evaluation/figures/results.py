@@ -39,10 +39,9 @@ def require(found: Sized, what: str) -> None:
 def read_records(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
     """Read results files. Operation counts and data sets without a source or outliers are left out.
 
-    One row for each source, outliers, kind of outliers, n and solver. Of several, the one with the most problems, and
-    of these the last. ``source`` is a prior or a scene; ``outliers`` a number, ``"uniform"`` for 0 to a third of the
-    pairs, or another text; ``mismatches`` says that every outlier shows another point. ``base`` is the solver's name
-    without the option m, ``m`` is -1 without a number in the configuration. Rates and intervals are in per cent.
+    One row for each source, outliers, kind of outliers, n and solver: the one with the most problems, then the last.
+    ``outliers`` is a number, ``"uniform"`` for 0 to a third of the pairs, or another text; ``mismatches`` says that
+    every outlier shows another point; ``base`` is the solver's name without the option m; an unknown ``m`` is -1.
     """
     rows = []
     for result in results:
