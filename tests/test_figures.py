@@ -77,7 +77,6 @@ def test_pose_picture_marks_rejected_pairs_and_takes_points_behind_the_camera(tm
         (axes,) = drawn["a.png"].axes
         assert [len(line.get_xdata()) for line in axes.lines] == [7, 1, 7]  # kept, rejected, projected
         assert abs(np.diff(axes.get_xlim())[0]) < 1000
-    figures.plot_pose(tmp_path / "b.png", img, torch.full_like(img, torch.nan), rejected)
     for bad in ((img[:3], projected, rejected), (img * torch.nan, projected, rejected)):
         with pytest.raises(ValueError, match=r"plot_pose needs|no pixel"):
             figures.plot_pose(tmp_path / "c.png", *bad)

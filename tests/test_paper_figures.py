@@ -40,18 +40,16 @@ def percents(axes):
 
 
 def test_dots_stand_in_their_rows_at_their_rates(tmp_path, drawn):
-    solved = {0: {"pnpnet-n9": 84, "reppnp": 56, "known-inliers": 85}, 1: {"pnpnet-n9": 100, "known-inliers": 99}}
-    rows = [("paper", k or "none", 9, name, count) for k in solved for name, count in solved[k].items()]
-    rows = [(source, "uniform" if k == 1 else k, *more) for source, k, *more in rows]
+    solved = {"none": {"pnpnet-n9": 84, "reppnp": 56, "known-inliers": 85}, "uniform": {"pnpnet-n9": 100, "epnp": 0}}
+    rows = [("paper", k, 9, name, count) for k in solved for name, count in solved[k].items()]
     rows.append(("paper", "none", 9, "reppnp:m=2", 1, 2))  # a point of a curve against m
     assert figures.plot_synthetic(tmp_path / "a.png", [results_of(rows)]) == tmp_path / "a.png"
     panels = drawn["a.png"].axes
     names = [label.get_text() for label in panels[0].get_yticklabels()]
-    assert names == ["pnpnet-n9", "reppnp", "known-inliers"]
+    assert names == ["pnpnet-n9", "epnp", "reppnp", "known-inliers"]
     for axes, rates in zip(panels, solved.values(), strict=True):
-        assert {name: (x, names[int(row)]) for name, [(x, row)] in points(axes).items()} == {
-            name: (pytest.approx(rate), name) for name, rate in rates.items()
-        }
+        assert {names[int(row)]: x for [(x, row)] in points(axes).values()} == rates
+        assert {name: round(x) for name, [(x, _)] in points(axes).items()} == rates
         low, high = axes.containers[0].lines[2][0].get_segments()[0][:, 0]
         rate = success_rate(torch.arange(100) < rates["pnpnet-n9"])
         assert [low, high] == pytest.approx([100 * rate.low, 100 * rate.high])

@@ -152,14 +152,14 @@ def plot_errors(path: str | Path, results: Mapping[str, Any]) -> Path:
         labels = "rotation error (°)", f"translation error ({entry['unit'] or 'world units'})"
         limits = entry["max_rotation_deg"], entry["max_translation"]
         for index, (axes, limit, label) in enumerate(zip(panels, limits, labels, strict=True)):
+            axes.set(xscale="log", xlim=(limit / 1000, limit * 180), ylim=(0, 101), xlabel=label)
             style.log_scale(axes, "x")
-            axes.set(xlim=(limit / 1000, limit * 180), ylim=(0, 101), xlabel=label, ylabel="problems (%)")
             axes.axvline(limit, color=style.GREY, linewidth=1.2)
             for place, (solver, look) in enumerate(styles.items()):
                 if solver in errors:
                     values, marks = errors[solver][index].numpy(), {"markevery": (0.01 * place, 0.15)}
                     sns.ecdfplot(x=values, stat="percent", ax=axes, label=solver, **marks, **look)
-        panels[0].set_title(name)
+        panels[0].set(title=name, ylabel="problems (%)")
     style.draw_legend(figure, styles)
     return style.save(figure, path)
 

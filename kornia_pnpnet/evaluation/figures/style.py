@@ -55,7 +55,7 @@ _LOOKS = {
     "known-inliers": ("k", "", "-."), "known-inliers-and-noise": ("k", "", ":"),
 }
 # fmt: on
-_MORE = (("#882255", "d"), ("#44AA99", "8"), ("#999933", "H"))
+_MORE = (("#882255", "d"), ("#44AA99", "8"), ("#999933", "H"), ("#6644AA", "P"))
 _OTHERS = [(colour, marker, line) for line in ("-", "--", ":") for colour, marker in _MORE]
 _ROW = 0.165  # inches from one solver to the next: a line of letters
 _WITH_NUMBERS = 3  # largest number of panels side by side that each have room for numbers
@@ -68,12 +68,12 @@ Panel = tuple[str, pd.DataFrame, str]
 def solver_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
     """Arguments of ``Axes.plot`` by name of the solver, in the order of legends.
 
-    A known solver has the same look in all pictures, with any options. Up to 9 unknown solvers have different looks.
+    A known solver has the same look in all pictures, with any options. Up to 12 unknown solvers have different looks.
     """
     base = {name: name.partition(":")[0] for name in names}
     known = {n: max((key for key in _LOOKS if f"{b}-".startswith(key and f"{key}-")), key=len) for n, b in base.items()}
     unknown = sorted({base[name] for name, key in known.items() if not key})
-    looks = {name: _LOOKS[key] if key else _OTHERS[unknown.index(base[name]) % 9] for name, key in known.items()}
+    looks = {name: _LOOKS[key] if key else _OTHERS[unknown.index(base[name]) % 12] for name, key in known.items()}
     natural = {name: re.sub(r"\d+", lambda number: number[0].zfill(9), name) for name in base}  # n9 before n20
     order = sorted(base, key=lambda name: (list(_LOOKS).index(known[name]), natural[name]))
     return {name: line_style(*looks[name], ours=is_ours(name)) for name in order}
