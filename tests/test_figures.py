@@ -21,9 +21,7 @@ from kornia_pnpnet.evaluation import figures
 
 def fake_results(sets=2):
     """A results file, as far as a picture reads it."""
-    generator = np.random.default_rng(0)
-    names = ("pnpnet-n9", "mine", "epnp")
-    rows = []
+    generator, names, rows = np.random.default_rng(0), ("pnpnet-n9", "mine", "epnp"), []
     for data, (index, solver) in itertools.product((f"set {i}" for i in range(sets)), enumerate(names)):
         rate, errors = 0.9 - 0.2 * index, np.exp(generator.normal(index, 1.0, 50)).tolist()
         per_problem = {"rotation_error_deg": errors, "translation_error": errors, "ok": [1] * 50}
