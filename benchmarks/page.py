@@ -164,7 +164,7 @@ def load_parts(folder: Path) -> tuple[dict[str, Any], dict[str, Any] | None]:
 
 def render(folder: Path, path: Path) -> None:
     """Write the page and its pictures from the results files of a folder."""
-    from kornia_pnpnet.evaluation.figures.performance import plot_latency, plot_times
+    from pictures import plot_latency, plot_times  # needs matplotlib
 
     results, gpu = load_parts(folder)
     # Names with an @ are earlier versions of the package: the pictures leave them out.

@@ -121,3 +121,17 @@ def fit_config(tmp_path: Path) -> Callable[..., FitReport]:
         )
 
     return run
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """Figures by file name, laid out as they would have been saved."""
+    figure = pytest.importorskip("matplotlib.figure")
+    found = {}
+
+    def keep(self, path, **_):
+        self.draw_without_rendering()
+        found[Path(path).name] = self
+
+    monkeypatch.setattr(figure.Figure, "savefig", keep)
+    return found

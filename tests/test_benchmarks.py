@@ -435,7 +435,7 @@ def test_the_pages_are_rendered_from_their_files():
 
 @pytest.mark.slow
 def test_a_page_shows_the_numbers_of_a_small_run(measured, tmp_path):
-    pytest.importorskip("matplotlib")
+    pytest.importorskip("seaborn")
     folder, results = measured
     performance.main(["render", "--results", str(folder), "--page", str(tmp_path / "a.md")])
     text = (tmp_path / "a.md").read_text(encoding="utf-8")

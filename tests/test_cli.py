@@ -195,7 +195,7 @@ def test_no_pose_is_exit_code_one(capsys, tmp_path):
 
 
 def test_plot_draws_a_picture(capsys, csv_file, tmp_path):
-    pytest.importorskip("matplotlib")
+    pytest.importorskip("seaborn")
     picture = tmp_path / "sub" / "pose.png"
     answer(capsys, csv_file, "--intrinsics", CAMERA, "--solver", "identity-lm", "--plot", picture)
     assert picture.read_bytes().startswith(b"\x89PNG")
@@ -328,7 +328,7 @@ def test_help_and_version(capsys):
 
 
 def test_evaluate_writes_what_it_prints(capsys, tmp_path, shipped):
-    pytest.importorskip("matplotlib")
+    pytest.importorskip("seaborn")
     out_file, pictures = tmp_path / "results.json", tmp_path / "pictures"
     code, out, err = run(
         capsys, "evaluate", "--outliers", "none,uniform,2", "--problems", 20, "--out", out_file, "--plot", pictures
@@ -465,7 +465,7 @@ def test_an_error_in_a_solver_says_where(capsys, tmp_path, monkeypatch):
 
 
 def test_figures_prints_what_it_draws(capsys, tmp_path):
-    pytest.importorskip("matplotlib")
+    pytest.importorskip("seaborn")
     out_file, folder = tmp_path / "results.json", tmp_path / "figures"
     solvers = ("identity-lm", "known-inliers")
     run(capsys, "evaluate", "--problems", 5, "--n", "6,9", "--solver", *solvers, "--out", out_file)
@@ -477,7 +477,7 @@ def test_figures_prints_what_it_draws(capsys, tmp_path):
 
 
 def test_figures_refuses_in_one_line(capsys, tmp_path):
-    pytest.importorskip("matplotlib")
+    pytest.importorskip("seaborn")
     no_results = tmp_path / "other.json"
     no_results.write_text('{"success": 1}')
     for path in (no_results, tmp_path / "missing.json"):
@@ -497,7 +497,7 @@ def test_list_names_solvers_and_missing_packages(capsys, shipped, monkeypatch):
 
 
 def test_demo_compares_trains_and_draws(capsys, tmp_path, monkeypatch):
-    pytest.importorskip("matplotlib")
+    pytest.importorskip("seaborn")
     asked = []
 
     def train_briefly(seconds, folder):

@@ -31,16 +31,20 @@ EXTRAS = (
     "lightning_fabric",
     "matplotlib",
     "omegaconf",
+    "pandas",
     "poselib",
     "pyarrow",
     "pycolmap",
     "pydantic",
+    "seaborn",
     "tensorboard",
 )
 
 #: Optional packages and the only modules that may import them.
 OWNERS = {
     "matplotlib": {"evaluation.figures"},
+    "pandas": {"evaluation.figures"},
+    "seaborn": {"evaluation.figures"},
     "hydra": set(),
     "cv2": {"peers"},
     "pycolmap": {"data.colmap", "peers"},

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("matplotlib")
+pytest.importorskip("seaborn")
 
 REPO = Path(__file__).resolve().parents[1]
 FOLDER = REPO / "docs" / "results"

@@ -20,7 +20,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from kornia_pnpnet import Pose, create_solver
 from kornia_pnpnet.core.environment import environment
-from kornia_pnpnet.evaluation.figures.style import BLUE, ORANGE, make_figure, save, tidy
+from kornia_pnpnet.evaluation.figures.style import BLUE, ORANGE, make_figure, save
 from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.geometry import rotation_angle
 
@@ -138,7 +138,7 @@ def main() -> None:
     right.set_aspect("equal")
     right.set_title(f"camera, {SHARES[-1]:.0%} of the corners mislabelled", loc="left")
     right.legend(frameon=False, fontsize=7)
-    tidy(right)
+    right.grid(color="#dddddd")
     save(figure, options.out / "fiducial_board.png")
     for name, found in runs.items():
         for share, row in found.items():

@@ -21,7 +21,7 @@ from torch import Tensor
 from kornia_pnpnet import create_solver
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.data.draws import batch_generator, random_poses
-from kornia_pnpnet.evaluation.figures.style import BLUE, GREEN, ORANGE, make_figure, save, tidy
+from kornia_pnpnet.evaluation.figures.style import BLUE, GREEN, ORANGE, make_figure, save, themed
 from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.losses import pose_distances
 from kornia_pnpnet.types import Pose
@@ -106,6 +106,7 @@ def learn(solve: Solve, steps: int) -> dict[str, Any]:
     return {"error_px": errors, "steps_without_finite_gradient": lost}
 
 
+@themed
 def plot(results: dict[str, Any], path: Path) -> None:
     """The errors against steps."""
     figure = make_figure(7.0, 3.6)
@@ -115,7 +116,6 @@ def plot(results: dict[str, Any], path: Path) -> None:
     axes.set(xlabel="step", ylabel="error of the learned offsets (px)", yscale="log")
     axes.set_title(f"{WRONG:.0%} of the keypoints anywhere", loc="left")
     axes.legend(frameon=False)
-    tidy(axes)
     save(figure, path)
 
 

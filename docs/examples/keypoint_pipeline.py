@@ -31,7 +31,7 @@ from torch.nn import functional
 
 from kornia_pnpnet import PnPResult, Pose, create_solver
 from kornia_pnpnet.core.environment import environment
-from kornia_pnpnet.evaluation.figures.style import BLUE, ORANGE, VERMILION, make_figure, save, tidy
+from kornia_pnpnet.evaluation.figures.style import BLUE, ORANGE, VERMILION, make_figure, save, themed
 from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.geometry import rotation_angle
 
@@ -265,6 +265,7 @@ def run(seed: int, updates: int, batches: int) -> tuple[dict[str, Any], dict[str
     return found, {name: networks[name] for name in (ALONE, END)}
 
 
+@themed
 def plot_errors(results: dict[str, Any], path: Path) -> None:
     """The errors of each seed, and their means."""
     figure = make_figure(8.0, 3.4)
@@ -286,7 +287,7 @@ def plot_errors(results: dict[str, Any], path: Path) -> None:
             if name in best:
                 axes.annotate(f"× {best[name][key]:.2f}", (0.02, y), xycoords=("axes fraction", "data"), va="center")
         axes.set_xlabel(label)
-        tidy(axes, "x")
+        axes.grid(visible=False, axis="y")
     axes.set_yticks(range(len(looks)), [text for text, _ in looks.values()])
     axes.invert_yaxis()
     save(figure, path)

@@ -11,18 +11,12 @@ from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from measure import ANY, CHI_SQUARE_95, HERE, OURS, PEERS, RESULTS, ROBUST
+from overview_picture import OverviewRow, plot_overview
 
 from kornia_pnpnet import PnPNet
 from kornia_pnpnet.core.tables import markdown_table
-from kornia_pnpnet.evaluation.figures import (
-    OverviewRow,
-    paper_figures,
-    plot_overview,
-    plot_reliability,
-    plot_sweep,
-    plot_training,
-)
-from kornia_pnpnet.evaluation.figures.sweep import mix_in_words
+from kornia_pnpnet.evaluation.figures import paper_figures, plot_reliability, plot_sweep, plot_training
+from kornia_pnpnet.evaluation.figures.training import mix_in_words
 from kornia_pnpnet.evaluation.results import format_table, load_results
 from kornia_pnpnet.metrics import SuccessRate
 from kornia_pnpnet.pretrained import WEIGHTS_FOLDER, shipped_weights

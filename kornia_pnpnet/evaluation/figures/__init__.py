@@ -1,33 +1,34 @@
-"""Pictures of results. Only this folder needs matplotlib, and not pyplot, so no global state changes.
+"""Pictures of results: all figures of the paper's protocol at once, or one picture by each other function.
 
-``paper_figures`` draws all figures of the paper's protocol from results files. Every other function draws one picture.
+Only this folder needs matplotlib and seaborn. matplotlib's settings change only while a picture is drawn.
 """
 
 try:
-    import matplotlib  # noqa: F401
+    import seaborn  # noqa: F401
 except ImportError as error:
-    raise ImportError("Pictures need matplotlib: pip install 'kornia_pnpnet[eval]'") from error
+    raise ImportError("Pictures need matplotlib and seaborn: pip install 'kornia_pnpnet[eval]'") from error
 
-from kornia_pnpnet.evaluation.figures.curves import plot_against_m, plot_against_n, plot_mismatches
-from kornia_pnpnet.evaluation.figures.dots import plot_scenes, plot_success, plot_synthetic
-from kornia_pnpnet.evaluation.figures.errors import plot_errors
-from kornia_pnpnet.evaluation.figures.operations import plot_operations
-from kornia_pnpnet.evaluation.figures.overview import OverviewRow, plot_overview
-from kornia_pnpnet.evaluation.figures.paper import paper_figures
 from kornia_pnpnet.evaluation.figures.problem import plot_pose
-from kornia_pnpnet.evaluation.figures.reliability import plot_reliability
-from kornia_pnpnet.evaluation.figures.sweep import plot_sweep
-from kornia_pnpnet.evaluation.figures.training import plot_training
+from kornia_pnpnet.evaluation.figures.results import (
+    paper_figures,
+    plot_against_m,
+    plot_against_n,
+    plot_errors,
+    plot_mismatches,
+    plot_operations,
+    plot_scenes,
+    plot_success,
+    plot_synthetic,
+)
+from kornia_pnpnet.evaluation.figures.training import plot_reliability, plot_sweep, plot_training
 
 __all__ = [
-    "OverviewRow",
     "paper_figures",
     "plot_against_m",
     "plot_against_n",
     "plot_errors",
     "plot_mismatches",
     "plot_operations",
-    "plot_overview",
     "plot_pose",
     "plot_reliability",
     "plot_scenes",

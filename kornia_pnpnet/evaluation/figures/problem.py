@@ -10,11 +10,10 @@ from matplotlib.collections import LineCollection
 from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_positive
-from kornia_pnpnet.evaluation.figures.style import BLUE, RED, SMALL, TITLE, make_figure, save, tidy
-
-__all__ = ["plot_pose"]
+from kornia_pnpnet.evaluation.figures import style
 
 
+@style.themed
 def plot_pose(
     path: str | Path,
     img_points: np.ndarray | Tensor,
@@ -44,46 +43,37 @@ def plot_pose(
     """
     pixels, projected = np.asarray(img_points, dtype=float), np.asarray(reprojections, dtype=float)
     bad = np.asarray(rejected, dtype=bool)
-    if pixels.ndim != 2 or pixels.shape[1] != 2 or projected.shape != pixels.shape or bad.shape != pixels.shape[:1]:
+    if pixels.shape != (len(bad), 2) or projected.shape != pixels.shape or bad.ndim != 1:
         shapes = f"{pixels.shape}, {projected.shape} and {bad.shape}"
         raise ValueError(f"plot_pose needs pixels and projections (N, 2) and rejected (N,), got {shapes}.")
-    if size is not None:
-        check_positive(width=size[0], height=size[1])
     there = np.isfinite(pixels).all(axis=1)
     if not there.any():
         raise ValueError("There is no pixel to draw.")
     pixels, projected, bad = pixels[there], projected[there], bad[there]
     seen = np.isfinite(projected).all(axis=1)
-    left, top, right, bottom = (0.0, 0.0, *size) if size is not None else _bounds(pixels, projected[seen])
-
-    ratio = (bottom - top) / (right - left)
-    width = min(6.1, 7.0 / ratio)
-    figure = make_figure(max(5.0, width + 0.9), max(3.5, width * ratio + 1.1))
-    axes = figure.subplots()
-    for which, colour, dash in ((seen & ~bad, BLUE, "-"), (seen & bad, RED, "--")):
-        lines = np.stack((pixels[which], projected[which]), axis=1)
-        axes.add_collection(LineCollection(list(lines), colors=colour, linewidths=1.2, linestyles=dash, alpha=0.8))
-    marks: dict[str, Any] = {"markersize": 9.0, "linestyle": "none"}
-    axes.plot(*pixels[~bad].T, "o", color=BLUE, markerfacecolor="none", label="pixel, kept", **marks)
-    axes.plot(*pixels[bad].T, "x", color=RED, markeredgewidth=2.2, label="pixel, rejected", **marks)
-    axes.plot(*projected[seen].T, "+", color="black", markeredgewidth=1.3, label="reprojection", **marks)
-    axes.set(xlim=(left, right), ylim=(bottom, top), xlabel="u (px)", ylabel="v (px)", aspect="equal")
-    tidy(axes)
-    counts = f"n = {len(pixels)}, {int(bad.sum())} rejected"
-    hidden = int((~seen).sum())
-    counts += f", {hidden} behind the camera" if hidden else ""
-    axes.set_title(f"{title}: {counts}" if title else counts, fontsize=TITLE, parse_math=False)
-    figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=SMALL)
-    return save(figure, path)
-
-
-def _bounds(pixels: np.ndarray, projected: np.ndarray) -> tuple[float, float, float, float]:
-    """Left, top, right and bottom around the pixels and the projections near them."""
     low, high = pixels.min(axis=0), pixels.max(axis=0)
-    reach = max(1.0, float((high - low).max()))
-    near = ((projected > low - 0.5 * reach) & (projected < high + 0.5 * reach)).all(axis=1)
-    points = np.concatenate((pixels, projected[near]))
-    low, high = points.min(axis=0) - 0.06 * reach, points.max(axis=0) + 0.06 * reach
-    # Room for the marks: neither side is shorter than a third of the other.
-    middle, half = (low + high) / 2, np.maximum((high - low) / 2, (high - low).max() / 6)
-    return *(middle - half), *(middle + half)
+    if size is not None:
+        check_positive(width=size[0], height=size[1])
+        low, high = np.zeros(2), np.array(size)
+    else:  # around the pixels and the projections near them; neither side is shorter than a third of the other
+        reach = max(1.0, (high - low).max())
+        near = seen & (np.abs(projected - (low + high) / 2) < (high - low) / 2 + reach / 2).all(axis=1)
+        points = np.concatenate((pixels, projected[near]))
+        middle, half = (points.max(axis=0) + points.min(axis=0)) / 2, np.ptp(points, axis=0) / 2 + 0.06 * reach
+        low, high = middle - np.maximum(half, half.max() / 3), middle + np.maximum(half, half.max() / 3)
+    width, height = (high - low) * min(6.1 / (high - low)[0], 7.0 / (high - low)[1])
+    figure = style.make_figure(max(5.0, width + 0.9), max(3.5, height + 1.1))
+    axes = figure.subplots()
+    for which, colour, dash in ((seen & ~bad, style.BLUE, "-"), (seen & bad, style.VERMILION, "--")):
+        lines = list(np.stack((pixels[which], projected[which]), axis=1))
+        axes.add_collection(LineCollection(lines, colors=colour, linewidths=1.2, linestyles=dash, alpha=0.8))
+    marks: dict[str, Any] = {"markersize": 9.0, "linestyle": "none"}
+    axes.plot(*pixels[~bad].T, "o", color=style.BLUE, markerfacecolor="none", label="pixel, kept", **marks)
+    axes.plot(*pixels[bad].T, "x", color=style.VERMILION, markeredgewidth=2.2, label="pixel, rejected", **marks)
+    axes.plot(*projected[seen].T, "+", color="black", markeredgewidth=1.3, label="reprojection", **marks)
+    axes.set(xlim=(low[0], high[0]), ylim=(high[1], low[1]), xlabel="u (px)", ylabel="v (px)", aspect="equal")
+    counts = f"n = {len(pixels)}, {bad.sum()} rejected"
+    counts += f", {(~seen).sum()} behind the camera" if not seen.all() else ""
+    axes.set_title(f"{title}: {counts}" if title else counts)
+    figure.legend(loc="outside lower center", ncols=3)
+    return style.save(figure, path)
