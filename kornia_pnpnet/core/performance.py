@@ -104,18 +104,22 @@ def _take_pairs(values: Tensor, index: Tensor) -> Tensor:
 
 
 # A compiler does not look inside, so that the result is laid out as it says. Fused into what reads it, every reader
-# would gather anew: the compiled hypotheses of the set network take a third longer.
-_take_pairs_opaque = torch.library.custom_op("kornia_pnpnet::take_pairs", _take_pairs, mutates_args=())
+# would gather anew: the compiled hypotheses of the set network take a third longer. `torch.library.custom_op` would do
+# the same, but its first call imports 800 modules, which takes 2 to 3 s.
+_LIBRARY = torch.library.Library("kornia_pnpnet", "DEF")
+_LIBRARY.define("take_pairs(Tensor values, Tensor index) -> Tensor")
+_LIBRARY.impl("take_pairs", _take_pairs, "CompositeExplicitAutograd")
 
 
-@_take_pairs_opaque.register_fake
+@torch.library.register_fake("kornia_pnpnet::take_pairs", lib=_LIBRARY)  # type: ignore[untyped-decorator]
 def _(values: Tensor, index: Tensor) -> Tensor:
     return values.new_empty(values.shape[-1], index.shape[1], index.shape[0])
 
 
-@_take_pairs_opaque.register_vmap
+@torch.library.register_vmap("kornia_pnpnet::take_pairs", lib=_LIBRARY)  # type: ignore[untyped-decorator]
 def _(info: Any, in_dims: tuple[int | None, int | None], *tensors: Tensor) -> tuple[Tensor, int]:
-    return unfold_vmap(info.batch_size, _take_pairs_opaque(*fold_vmap(info.batch_size, in_dims, *tensors))), 2
+    taken = torch.ops.kornia_pnpnet.take_pairs(*fold_vmap(info.batch_size, in_dims, *tensors))
+    return unfold_vmap(info.batch_size, taken), 2
 
 
 def take_pairs(values: Tensor, index: Tensor) -> Tensor:
@@ -128,7 +132,7 @@ def take_pairs(values: Tensor, index: Tensor) -> Tensor:
     Returns:
         Shape :math:`(C, K, B)`.
     """
-    return (_take_pairs if exporting() else _take_pairs_opaque)(values, index)
+    return (_take_pairs if exporting() else torch.ops.kornia_pnpnet.take_pairs)(values, index)
 
 
 # -- the allocator -----------------------------------------------------------------------------------------------------

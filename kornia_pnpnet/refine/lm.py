@@ -223,7 +223,7 @@ class RobustWeightedLM(Configured):
         guided = corr._replace(weights=relative(prior, prior), img_scale=None, world_scale=None)
         by_residual = guided
         if self.by_residual:
-            by_residual = guided._replace(weights=relative(corr.weights, corr.weights))
+            by_residual = guided._replace(weights=_relative_to_mean(corr.weights))
             prior = corr.weights
         poses = guess.poses
         starts, rivals = guided, None
@@ -393,6 +393,12 @@ class RobustWeightedLM(Configured):
         gauss_newton, solved = solve_damped(NormalEquations([[x.detach() for x in y] for y in around], gradient), none)
         steps = (torch.where(convex, x, torch.where(solved, y, 0.0)) for x, y in zip(newton, gauss_newton, strict=True))
         return move(pose, [step.detach() - step for step in steps])
+
+
+def _relative_to_mean(weights: Tensor) -> Tensor:
+    """Weights over the mean of those that are not 0: unlike the largest weight, the mean has a derivative at ties."""
+    mean = weights.sum(-1, keepdim=True) / (weights > 0).sum(-1, keepdim=True).clamp(min=1)
+    return weights / torch.where(mean > 0, mean, 1.0)
 
 
 def _complete_noise(corr: Correspondences, guess: Guess) -> Noise | None:
