@@ -112,7 +112,7 @@ def test_solve_prints_what_the_library_returns(capsys, csv_file, problem, weight
     for pair, point, error in zip(got["pairs"], cam[0], (pixels - img[0]).norm(dim=-1), strict=True):
         if point[2] > 0:
             assert pair["reprojection_error_px"] == pytest.approx(error.item())
-            assert pair["rejected"] == (error.item() > got["rejected_above_px"])
+            assert pair["rejected"] == (not got["ok"] or error.item() > got["rejected_above_px"])
         else:
             assert pair == {"weight": 0.0, "reprojection_error_px": None, "rejected": True}
 
@@ -176,22 +176,21 @@ def test_weights_keep_their_order_and_zero_means_absent(capsys, csv_file, tmp_pa
     assert [pair["rejected"] for pair in got["pairs"]] == [factor == 0 for factor in factors]
 
 
-def test_default_solver_is_the_shipped_one_for_that_n(capsys, csv_file, shipped, tmp_path, monkeypatch):
-    assert answer(capsys, csv_file, "--intrinsics", CAMERA)["solver"] == "pnpnet-n9"
-    monkeypatch.setattr(pretrained, "WEIGHTS_FOLDER", tmp_path / "none")
-    code, out, err = run(capsys, "solve", csv_file, "--intrinsics", CAMERA)
-    assert code == 0
-    assert json.loads(out)["solver"] == "identity-lm"
-    assert err.startswith("pnpnet: no weights")
+def test_the_default_solver_takes_any_number_of_pairs_and_any_rotation(capsys, csv_file):
+    assert answer(capsys, csv_file, "--intrinsics", CAMERA)["solver"] == "pnpnet-set"
 
 
-def test_no_pose_is_exit_code_one(capsys, tmp_path):
+def test_no_pose_is_exit_code_one_with_the_reason(capsys, tmp_path):
     path = tmp_path / "line.csv"
     path.write_text("X,Y,Z,u,v\n" + "\n".join(f"{i},{2 * i},{5 + i},{10 * i},{7 * i}" for i in range(9)))
     for solver in ("identity-lm", "opencv-ransac"):
         got = answer(capsys, path, "--intrinsics", CAMERA, "--solver", solver)
         assert not got["ok"]
+        assert got["status"] in ("degenerate", "not_believed")
+        assert all(pair["rejected"] for pair in got["pairs"])
         assert got["rotation"] == torch.eye(3).tolist()
+    _, _, err = run(capsys, "solve", path, "--intrinsics", CAMERA)
+    assert err.startswith("pnpnet: not solved (degenerate)")
 
 
 def test_plot_draws_a_picture(capsys, csv_file, tmp_path):

@@ -20,16 +20,28 @@ import argparse
 import json
 import math
 import sys
+from pathlib import Path
 
 import torch
 from kornia.geometry.conversions import rotation_matrix_to_quaternion
 from torch import Tensor
 
-from kornia_pnpnet import shipped_weights
+from kornia_pnpnet import Status
 from kornia_pnpnet.cli.arguments import load_solver_without_truth, picture_path, positive_float, whole_number
 from kornia_pnpnet.cli.correspondence_files import InputError, camera_matrix, read_correspondences
 from kornia_pnpnet.cli.reprojection import reproject
 from kornia_pnpnet.cli.shards import solve_shards
+
+_DEFAULT = "pnpnet-set"
+_ADVICE = {
+    Status.TOO_FEW_PAIRS: "a pose needs at least three correspondences that a camera can see",
+    Status.DEGENERATE: "the points lie on a line or coincide",
+    Status.NOT_FINITE: "the file has NaN, infinity or a negative weight",
+    Status.CAMERA: "the intrinsics are not those of a pinhole camera that this solver takes",
+    Status.NOT_BELIEVED: "too few correspondences agree with the pose; with many outliers try "
+    "--solver p3p-ransac:threshold=PX, and check units, intrinsics and the order of the columns",
+    Status.BEHIND: "the points are behind the camera; check the axes: x to the right, y down, z forward",
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -47,8 +59,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--solver",
         metavar="NAME",
-        help="a name of `pnpnet list`, or a folder of weights; default: pnpnet-nN for N correspondences where such "
-        "weights are shipped, or else pnpnet-set",
+        default=_DEFAULT,
+        help="a name of `pnpnet list`, or a folder of weights; default: %(default)s",
     )
     parser.add_argument(
         "--plot", metavar="PNG", type=picture_path, help="draw pixels, reprojections and rejected correspondences"
@@ -65,7 +77,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--batch-size", metavar="B", type=whole_number(1), default=10_000, help="problems per call; default: 10000"
     )
-    parser.add_argument("--overwrite", action="store_true", help="also solve the shards that have results")
+    parser.add_argument(
+        "--overwrite",
+        action="store_true",
+        help="replace the picture; with --batch also solve the shards that have results",
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -73,15 +89,15 @@ def run(arguments: argparse.Namespace) -> int:
     camera = camera_matrix(arguments.intrinsics) if arguments.intrinsics else None
     if arguments.batch:
         return _solve_batch(arguments, camera)
-    if len(arguments.file) > 1 or arguments.out or arguments.overwrite:
-        raise ValueError("several files, --out and --overwrite need --batch")
+    if len(arguments.file) > 1 or arguments.out:
+        raise ValueError("several files and --out need --batch")
     return _solve_image(arguments, camera)
 
 
 def _solve_batch(arguments: argparse.Namespace, camera: Tensor | None) -> int:
     if arguments.plot or arguments.threshold:
         raise ValueError("--plot and --threshold are for one image, not for --batch")
-    name = arguments.solver or "pnpnet-set"
+    name = arguments.solver
     report = solve_shards(
         load_solver_without_truth(name),
         arguments.file,
@@ -106,17 +122,22 @@ def _solve_image(arguments: argparse.Namespace, camera: Tensor | None) -> int:
     if camera is None:
         raise InputError(path, "the file has no intrinsics: pass --intrinsics fx,fy,cx,cy")
     count = len(matches.world_points)
-    name = arguments.solver or _default_solver(count)
+    name = arguments.solver
+    if arguments.plot and Path(arguments.plot).exists() and not arguments.overwrite:
+        raise ValueError(f"'{arguments.plot}' exists: pass --overwrite to replace it")
     solver = load_solver_without_truth(name)
     weights = None if matches.weights is None else matches.weights[None]
     with torch.no_grad():
         result = solver(matches.world_points[None], matches.img_points[None], camera[None], weights)
     found = reproject(matches.world_points, matches.img_points, camera, result.pose, arguments.threshold)
-    columns = (x.tolist() for x in (result.weights[0], found.errors_px, found.rejected))
+    ok, status = bool(result.ok), Status(int(result.status))
+    rejected = found.rejected if ok else torch.ones_like(found.rejected)  # without a pose no pair is accepted
+    columns = (x.tolist() for x in (result.weights[0], found.errors_px, rejected))
     answer = {
         "solver": name,
         "n": count,
-        "ok": result.ok.item(),
+        "ok": ok,
+        "status": status.name.lower(),
         "rotation": result.rotation[0].tolist(),
         "translation": result.translation[0].tolist(),
         "quaternion_wxyz": rotation_matrix_to_quaternion(result.rotation)[0].tolist(),
@@ -131,15 +152,9 @@ def _solve_image(arguments: argparse.Namespace, camera: Tensor | None) -> int:
     if arguments.plot:
         from kornia_pnpnet.evaluation.figures import plot_pose
 
-        plot_pose(arguments.plot, matches.img_points, found.pixels, found.rejected, title=name)
-    return 0 if answer["ok"] else 1
-
-
-def _default_solver(count: int) -> str:
-    """The shipped network for this number of correspondences, or else for any number."""
-    shipped = shipped_weights()
-    for name in (f"pnpnet-n{count}", "pnpnet-set"):
-        if name in shipped:
-            return name
-    print("pnpnet: no weights are shipped for these correspondences, using identity-lm", file=sys.stderr)
-    return "identity-lm"
+        plot_pose(
+            arguments.plot, matches.img_points, found.pixels, rejected, title=name if ok else f"{name}: NOT SOLVED"
+        )
+    if not ok:
+        print(f"pnpnet: not solved ({answer['status']}): {_ADVICE[status]}", file=sys.stderr)
+    return 0 if ok else 1

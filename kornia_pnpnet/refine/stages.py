@@ -21,8 +21,8 @@ class LMStart(NamedTuple):
         prior: weight of each pair before its residual is looked at, for cost and verdict, :math:`(B, N)`.
         pose: the first poses, :math:`(S B)`: one pose of every problem, then the next pose of every problem.
         guided: ``corr`` with weights of caller and initialiser, relative to the largest.
-        by_residual: ``corr`` with the weights that the last iterations see: those of the caller alone, relative to their
-            mean, or ``guided`` without such iterations.
+        by_residual: ``corr`` with the weights that the last iterations see: those of the caller alone, relative to
+            their mean, or ``guided`` without such iterations.
         starts: ``guided`` once for each of the :math:`S` poses.
         rivals: the pairs by whose cost the :math:`S` poses compete; ``None`` when :math:`S = 1`.
         estimated: problems whose noise the initialiser estimated, so that the last iterations may correct it, bool
