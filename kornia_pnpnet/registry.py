@@ -114,7 +114,8 @@ def create_solver(name: str, **options: Any) -> nn.Module:
             ``views``, the number of guesses per problem (see :class:`~kornia_pnpnet.solver.PnPNet`); ``epnp`` and
             ``epnp-lm`` take the arguments of :class:`~kornia_pnpnet.init.EPnP`, ``reppnp`` and ``reppnp-lm`` of
             :class:`~kornia_pnpnet.init.REPPnP`, ``p3p-ransac`` and ``ransac-epnp-lm`` of
-            :class:`~kornia_pnpnet.init.RANSAC`, peers of their class in :mod:`kornia_pnpnet.peers`.
+            :class:`~kornia_pnpnet.init.RANSAC`, peers of their class in :mod:`kornia_pnpnet.peers`. All
+            but the peers take ``gradient``, see :class:`~kornia_pnpnet.solver.PnPNet`.
 
     Returns:
         The solver as a module in evaluation mode.
@@ -131,8 +132,14 @@ def create_solver(name: str, **options: Any) -> nn.Module:
     builders = _builders()
     if not isinstance(name, str) or name not in builders:
         raise ValueCheckError(f"No solver {name!r}. There are: {', '.join(sorted(builders))}.")
+    gradient = options.pop("gradient", None)
     try:
-        return builders[name](**options).eval()
+        solver = builders[name](**options).eval()
+        if gradient is None:
+            return solver
+        if not isinstance(solver, PnPNet):
+            raise TypeError("gradient is an option of solvers with gradients")
+        return PnPNet(solver.init, solver.refine, solver.normalize, views=solver.views, gradient=gradient).eval()
     except TypeError as error:
         raise ValueCheckError(f"Solver {name!r} does not take these options: {error}.") from error
 

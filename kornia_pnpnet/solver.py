@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from kornia.core.check import KORNIA_CHECK
 from kornia.core.exceptions import BaseError, ValueCheckError
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
 from kornia_pnpnet.core.checks import check_whole
+from kornia_pnpnet.core.linalg import bound_gradient
 from kornia_pnpnet.core.performance import Compiled, compiling, split_batch
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import project
@@ -33,6 +35,8 @@ _INITIALISERS: dict[str, type[nn.Module]] = {
 }
 
 
+# Bound of a problem's gradient by normalised coordinates, in which those of a problem that is ok are about 1.
+_LONGEST_GRADIENT = 10.0
 # Focal lengths. A pair that is not near takes part when the first guess sees it this close to its pixel.
 _SEEN = 0.25
 
@@ -65,13 +69,16 @@ class PnPNet(nn.Module):
             :mod:`kornia_pnpnet.init`; ``None`` starts from the identity or from the pose given with the call.
         refine: the refiner; classical :class:`~kornia_pnpnet.refine.RobustWeightedLM` when ``None``.
         normalize: the normalisation; the default centres and scales the world and orders the pairs.
+        gradient: which problems carry a gradient: those that are ``"ok"``, or ``"always"`` every valid problem, to
+            train a network that does not predict anything sensible yet. The gradient of each problem to its normalised
+            points, pixels and weights is then finite and at most 10 long.
         views: number of guesses for each problem, 1 to 8: one of the problem itself and others of its mirror images
             (see :meth:`~kornia_pnpnet.normalize.Normalize.views`), which a network answers differently. All guesses are
             refined; after seven tenths of the iterations the best one goes on alone. More views cost more and solve
             more. The number may differ from that of the training.
 
     Raises:
-        BaseError: when ``views`` is not an integer from 1 to 8.
+        BaseError: when ``views`` is not an integer from 1 to 8, or ``gradient`` neither of its values.
 
     Example:
         >>> from kornia_pnpnet.data import SyntheticProblems
@@ -89,9 +96,11 @@ class PnPNet(nn.Module):
         normalize: Normalize | None = None,
         *,
         views: int = 1,
+        gradient: str = "ok",
     ) -> None:
         super().__init__()
         check_whole(1, len(VIEWS), views=views)
+        self.gradient = _checked_gradient(gradient)
         self.views = int(views)
         self.init = init
         self.refine = RobustWeightedLM(learnable=False) if refine is None else refine
@@ -113,6 +122,7 @@ class PnPNet(nn.Module):
         img_sigma: Tensor | float | None = None,
         world_sigma: Tensor | float | None = None,
         first_stage_only: bool = False,
+        gradient: str | None = None,
     ) -> PnPResult:
         r"""Solve a batch of problems.
 
@@ -132,6 +142,7 @@ class PnPNet(nn.Module):
             world_sigma: standard deviation of the noise on each world coordinate, in the unit of ``world_points``;
                 shapes and NaN as for ``img_sigma``.
             first_stage_only: return the first guess unrefined, the paper's "Net", at the cost of ``m=0``.
+            gradient: ``"ok"`` or ``"always"``; the solver's own when ``None``.
 
         Returns:
             The :class:`~kornia_pnpnet.types.PnPResult`. Gradients flow through rotation, translation, weights and cost
@@ -146,9 +157,9 @@ class PnPNet(nn.Module):
         """
         inputs = checked_inputs(world_points, img_points, intrinsics, weights, mask, init, img_sigma, world_sigma)
         with _in_full_precision(world_points.device.type):
-            results = [
-                self._solve(first_stage_only, part) for part in split_batch(inputs, self._portions(world_points))
-            ]
+            always = _checked_gradient(gradient or self.gradient) == "always"
+            parts = split_batch(inputs, self._portions(world_points))
+            results = [self._solve(first_stage_only, always, part) for part in parts]
         return results[0] if len(results) == 1 else map_tensors(lambda *x: torch.cat(x), *results)
 
     def with_guess(
@@ -163,6 +174,7 @@ class PnPNet(nn.Module):
         img_sigma: Tensor | float | None = None,
         world_sigma: Tensor | float | None = None,
         first_stage_only: bool = False,
+        gradient: str | None = None,
     ) -> tuple[PnPResult, Guess]:
         """Solve a batch and return the whole first guess as well (poses, weights and noise), to train it.
 
@@ -176,6 +188,7 @@ class PnPNet(nn.Module):
             img_sigma: See forward.
             world_sigma: See forward.
             first_stage_only: See forward.
+            gradient: See forward.
 
         Returns:
             The result, and the guess in the frame, the order and the units of the inputs; its ``ok`` says whether the
@@ -183,7 +196,8 @@ class PnPNet(nn.Module):
         """
         inputs = checked_inputs(world_points, img_points, intrinsics, weights, mask, init, img_sigma, world_sigma)
         with _in_full_precision(world_points.device.type):
-            begun, result = self._parts(first_stage_only, inputs)
+            always = _checked_gradient(gradient or self.gradient) == "always"
+            begun, result = self._parts(first_stage_only, always, inputs)
             return result, self.normalize.undo_guess(begun.guess, begun.frame)
 
     def compile(self, mode: str | None = None, *, whole: bool = False) -> None:
@@ -219,19 +233,22 @@ class PnPNet(nn.Module):
         batch, count = world_points.shape[:2]
         return max(1, min(batch * count // (most * torch.get_num_threads()), batch // 2))
 
-    def _in_parts(self, first_stage_only: bool, inputs: Inputs) -> PnPResult:
-        return self._parts(first_stage_only, inputs)[1]
+    def _in_parts(self, first_stage_only: bool, always: bool, inputs: Inputs) -> PnPResult:
+        return self._parts(first_stage_only, always, inputs)[1]
 
-    def _parts(self, first_stage_only: bool, inputs: Inputs) -> tuple[_Begun, PnPResult]:
+    def _parts(self, first_stage_only: bool, always: bool, inputs: Inputs) -> tuple[_Begun, PnPResult]:
         """Before the iterations, the iterations, and after them."""
-        begun = self._begin(1 if first_stage_only or self.refine.m == 0 else self.views, inputs)
+        begun = self._begin(1 if first_stage_only or self.refine.m == 0 else self.views, always, inputs)
         end = self.refine.iterate(begun.start, 0 if first_stage_only else None)
-        return begun, self._finish(begun, end)
+        return begun, self._finish(begun, end, always)
 
-    def _guess(self, views: int, inputs: Inputs) -> _Begun:
+    def _guess(self, views: int, always: bool, inputs: Inputs) -> _Begun:
         """Everything before the first iteration."""
         world_points, img_points, intrinsics, weights, mask, init, noise = inputs
         corr, frame = self.normalize(world_points, img_points, intrinsics, weights, mask, noise)
+        if always:
+            world, img, pair_weights = (bound_gradient(x, _LONGEST_GRADIENT) for x in corr[:3])
+            corr = corr._replace(world_points=world, img_points=img, weights=pair_weights)
         given = self._given(init, world_points, frame) if self.init is None or init is not None else None
         if self.init is None:
             assert given is not None
@@ -264,7 +281,7 @@ class PnPNet(nn.Module):
         usable = frame.valid & (torch.cat((init.rotation.flatten(1), init.translation), 1).abs().amax(-1) < limit)
         return self.normalize.apply_to_pose(_gate_pose(init, usable, usable), frame)
 
-    def _result(self, begun: _Begun, end: LMStep) -> PnPResult:
+    def _result(self, begun: _Begun, end: LMStep, always: bool) -> PnPResult:
         """Everything after the last iteration."""
         start, frame, guess = begun
         refined = self.refine.finish(start, end)
@@ -278,12 +295,13 @@ class PnPNet(nn.Module):
         status = torch.where(refined.in_front, Status.NOT_BELIEVED.value, Status.BEHIND.value)
         status = torch.where(ok, Status.SOLVED.value, torch.where(finite, status, Status.DEGENERATE.value))
         status = torch.where(frame.valid, status.to(frame.status), frame.status)
-        rotation, translation = _gate_pose(pose, ok, finite)
+        live = finite if always else ok
+        rotation, translation = _gate_pose(pose, live, finite)
         return PnPResult(
             rotation,
             translation,
-            _gate(self.normalize.undo_pairs(refined.weights, frame), ok, finite, 0.0),
-            _gate(refined.cost, ok, finite, torch.finfo(refined.cost.dtype).max ** 0.5),
+            _gate(self.normalize.undo_pairs(refined.weights, frame), live, finite, 0.0),
+            _gate(refined.cost, live, finite, torch.finfo(refined.cost.dtype).max ** 0.5),
             ok,
             _gate_pose(first, first_ok, first_ok),
             status,
@@ -357,6 +375,11 @@ class PnPNet(nn.Module):
         return model.eval()
 
 
+def _checked_gradient(gradient: str) -> str:
+    KORNIA_CHECK(gradient in ("ok", "always"), f"gradient must be 'ok' or 'always', got {gradient!r}.")
+    return gradient
+
+
 def _is_seen(guess: Guess, corr: Correspondences) -> Tensor:
     """Whether any pose of a guess sees a pair's point about where its pixel is, bool (B, N)."""
     seen = []
@@ -366,11 +389,11 @@ def _is_seen(guess: Guess, corr: Correspondences) -> Tensor:
     return torch.stack(seen).any(0)
 
 
-def _gate(value: Tensor, ok: Tensor, finite: Tensor, fill: float | Tensor) -> Tensor:
-    """Keep the gradient of problems that are ok, the value of those that are finite, and fill the others."""
+def _gate(value: Tensor, live: Tensor, finite: Tensor, fill: float | Tensor) -> Tensor:
+    """Keep the gradient of problems that are live, the value of those that are finite, and fill the others."""
     shape = (-1,) + (1,) * (value.ndim - 1)
     if value.requires_grad:
-        value = torch.where(ok.view(shape), value, value.detach())
+        value = torch.where(live.view(shape), value, value.detach())
     return torch.where(finite.view(shape), value, fill).contiguous()
 
 

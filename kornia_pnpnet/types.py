@@ -12,7 +12,13 @@ from typing import NamedTuple
 
 import torch
 from kornia.geometry.camera import PinholeCamera
-from kornia.geometry.conversions import Rt_to_matrix4x4
+from kornia.geometry.conversions import (
+    Rt_to_matrix4x4,
+    axis_angle_to_rotation_matrix,
+    quaternion_to_rotation_matrix,
+    rotation_matrix_to_axis_angle,
+    rotation_matrix_to_quaternion,
+)
 from kornia.geometry.liegroup import Se3
 from torch import Tensor
 
@@ -59,6 +65,41 @@ class Pose(NamedTuple):
     def matrix(self) -> Tensor:
         """The homogeneous world-to-camera matrix, shape :math:`(B, 4, 4)`."""
         return Rt_to_matrix4x4(self.rotation, self.translation[..., None])
+
+    @classmethod
+    def from_rvec(cls, rvec: Tensor, translation: Tensor) -> Pose:
+        r"""A pose from a rotation vector, as OpenCV's ``rvec`` and ``tvec``.
+
+        Args:
+            rvec: axis times angle in radians, shape :math:`(B, 3)`.
+            translation: shape :math:`(B, 3)`.
+
+        Example:
+            >>> pose = Pose.from_rvec(torch.tensor([[0.0, 0.0, 0.5]]), torch.zeros(1, 3))
+            >>> pose.rvec
+            tensor([[0.0000, 0.0000, 0.5000]])
+        """
+        return cls(axis_angle_to_rotation_matrix(rvec), translation)
+
+    @classmethod
+    def from_quaternion(cls, quaternion: Tensor, translation: Tensor) -> Pose:
+        r"""A pose from a quaternion :math:`(w, x, y, z)`, as COLMAP's and Kornia's, of any length but 0.
+
+        Args:
+            quaternion: shape :math:`(B, 4)`.
+            translation: shape :math:`(B, 3)`.
+        """
+        return cls(quaternion_to_rotation_matrix(quaternion), translation)
+
+    @property
+    def rvec(self) -> Tensor:
+        """The rotation vector, axis times angle in radians, shape :math:`(B, 3)`."""
+        return rotation_matrix_to_axis_angle(self.rotation)
+
+    @property
+    def quaternion(self) -> Tensor:
+        """The unit quaternion (w, x, y, z), shape :math:`(B, 4)`."""
+        return rotation_matrix_to_quaternion(self.rotation)
 
     @property
     def se3(self) -> Se3:

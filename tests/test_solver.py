@@ -6,6 +6,7 @@ import copy
 import json
 import math
 import pickle
+from functools import partial
 
 import pytest
 import torch
@@ -425,6 +426,31 @@ def test_copies_and_dtypes_of_the_module(make_problems):
 
 
 # --- a pose by hand ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["pnpnet-set", "epnp-lm", "pnpnet-n9"])
+def test_a_pose_that_is_not_ok_carries_a_gradient_on_request(name, make_problems, generator):
+    p = make_problems()
+    pixels = p.img_points.clone()
+    pixels[3:] = 2000.0 * torch.rand(4, 9, 2, generator=generator, dtype=torch.float64)
+    solver = create_solver(name)
+    found = []
+    for call in (solver, partial(solver, gradient="always"), create_solver(name, gradient="always")):
+        leaf = pixels.clone().requires_grad_()
+        result = call(p.world_points, leaf, p.intrinsics)
+        (gradient,) = torch.autograd.grad((result.rotation.sum() + result.translation.sum()), leaf)
+        assert gradient.isfinite().all()
+        found.append((result.ok, gradient.flatten(1).norm(dim=1)))
+    (ok, own), *others = found
+    assert ok[:3].all()
+    assert not ok.all()
+    assert not own[~ok].any()
+    for same, norms in others:
+        assert torch.equal(same, ok)
+        assert norms.all()
+        assert torch.equal(norms[ok], own[ok])
+    with pytest.raises(BaseError, match="gradient must"):
+        solver(*p[:3], gradient="never")
 
 
 def test_a_given_pose_is_one_more_hypothesis(make_problems, perturb):

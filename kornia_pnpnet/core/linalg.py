@@ -38,6 +38,37 @@ def dot(a: Iterable[Tensor], b: Iterable[Tensor]) -> Tensor:
     return total
 
 
+class _BoundedGradient(torch.autograd.Function):
+    """See :func:`bound_gradient`."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(values: Tensor, limit: float) -> Tensor:
+        return values.view_as(values)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, float], output: Tensor) -> None:
+        ctx.limit = inputs[1]
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        norm = gradient.flatten(1).norm(dim=1).view(-1, *(1,) * (gradient.ndim - 1))
+        bounded = gradient * (ctx.limit / norm.clamp(min=ctx.limit))
+        return torch.where(norm.isfinite(), bounded, 0.0), None
+
+
+def bound_gradient(values: Tensor, limit: float) -> Tensor:
+    r"""Return the values; their gradient is shortened, per problem, to a norm of at most ``limit``.
+
+    Args:
+        values: shape :math:`(B, *)`.
+        limit: largest norm of the gradient of a problem. A gradient that is not finite becomes 0.
+    """
+    bounded: Tensor = _BoundedGradient.apply(values, limit)  # type: ignore[no-untyped-call]
+    return bounded
+
+
 def relative(values: Tensor, size: Tensor) -> Tensor:
     r"""Divide the values of each problem by the largest ``size`` of that problem.
 

@@ -216,7 +216,9 @@ class RobustWeightedLM(Configured):
             What the iterations need.
         """
         step, damping, shape = (x.unbind() for x in self.hyperparameters(corr.world_points))
-        estimated = _is_unknown(corr) if self.by_residual else None
+        unknown = _is_unknown(corr) if self.by_residual or corr.noise is not None else None
+        estimated = unknown if self.by_residual else None
+        noiseless = None if unknown is None or corr.noise is None or guess.noise is not None else unknown[:, 0]
         corr = problems_last(corr._replace(noise=_complete_noise(corr, guess)))
         prior = corr.weights * problems_last(guess.weights)
         # Steps do not depend on a common factor of the weights; tiny weights must not vanish when multiplied.
@@ -241,6 +243,7 @@ class RobustWeightedLM(Configured):
             starts=starts,
             rivals=rivals,
             estimated=None if corr.noise is None else estimated,
+            noiseless=noiseless,
             step=step,
             damping=damping,
             shape=shape,
@@ -314,6 +317,8 @@ class RobustWeightedLM(Configured):
             believed = explains(projection, start.corr, start.prior)
         else:
             believed = is_evident(projection, start.guided)
+            if start.noiseless is not None:
+                believed = torch.where(start.noiseless, explains(projection, start.corr, start.prior), believed)
         in_front = has_enough(projection, start.prior)
         return Refinement(end.pose, weights, cost, end.solved & believed & in_front, in_front)
 

@@ -27,6 +27,8 @@ class LMStart(NamedTuple):
         rivals: the pairs by whose cost the :math:`S` poses compete; ``None`` when :math:`S = 1`.
         estimated: problems whose noise the initialiser estimated, so that the last iterations may correct it, bool
             :math:`(B, 1)`; ``None`` when there are no such iterations.
+        noiseless: problems for which neither the caller gave a sigma nor the initialiser an estimate, although the
+            caller gave one for others, bool :math:`(B,)`; ``None``: no such problems.
         step: :math:`\gamma` of each iteration, scalars.
         damping: :math:`\lambda` of each iteration, scalars.
         shape: shape of the kernel of each iteration, scalars.
@@ -40,6 +42,7 @@ class LMStart(NamedTuple):
     starts: Correspondences
     rivals: Correspondences | None
     estimated: Tensor | None
+    noiseless: Tensor | None
     step: tuple[Tensor, ...]
     damping: tuple[Tensor, ...]
     shape: tuple[Tensor, ...]
