@@ -21,7 +21,7 @@ from kornia_pnpnet.types import MIN_PAIRS, Correspondences, Guess, Noise, Pose, 
 
 __all__ = ["F_CONST", "VIEWS", "Frame", "Normalize"]
 
-#: Focal length of the normalised camera in pixels (PROTOCOL.md: an ETH3D DSLR has 3400-3430).
+#: Focal length of the normalised camera in pixels (the cameras of ETH3D have 3400 to 3430).
 F_CONST = 3400.0
 #: The symmetries of a square image, as three flags: exchange x and y, then reverse x, then reverse y.
 VIEWS = (
@@ -36,10 +36,12 @@ VIEWS = (
 )
 
 
-# Typical distances from the median of the points: beyond the first the pair does not count for centre and scale, beyond
-# the second the numbers of a float32 have too few digits for it. Few pairs say little about what is typical.
-_FAR, _LARGEST_DISTANCE = 5.0, 1e6
+# Typical distances from the median of the points. Beyond this a pair does not count for centre and scale.
+_FAR = 5.0
+# The same with fewer pairs than this: few pairs say little about what is typical.
 _MANY, _FAR_OF_FEW = 12, 25.0
+# Typical distances. Beyond this a float32 has too few digits for the pair.
+_LARGEST_DISTANCE = 1e6
 # Tangent of 85 degrees, more than a lens without distortion can show.
 _FAR_ANGLE = 11.4
 # Pairs. Up to this number a compiled solver sorts by a network of minima and maxima, which takes next to no time.

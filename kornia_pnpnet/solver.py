@@ -37,7 +37,7 @@ _INITIALISERS: dict[str, type[nn.Module]] = {
 
 # Bound of a problem's gradient by normalised coordinates, in which those of a problem that is ok are about 1.
 _LONGEST_GRADIENT = 10.0
-# Focal lengths. A pair that is not near takes part when the first guess sees it this close to its pixel.
+# Focal lengths. A pair that is not near is refined only when some first guess projects it this close to its pixel.
 _SEEN = 0.25
 
 

@@ -165,8 +165,9 @@ class Correspondences(NamedTuple):
         world_scale: lengths of ``world_points`` per unit of the user's world, shape :math:`(B,)`; ``None`` is 1.
         noise: noise of each pair in the units of ``img_points`` and ``world_points``, NaN where unknown; ``None``: all
             unknown.
-        near: 0 where a world point is many times as far off as most of them, or its pixel at a wide angle: bad data or
-            the horizon, which an initialiser that is not robust leaves out; else 1, shape :math:`(B, N)`; ``None``: 1.
+        near: 0 for points that are many times as far from the others as these are from each other, and for pixels at
+            extreme angles; 1 for all other pairs, shape :math:`(B, N)`; ``None``: 1. An initialiser that is not robust
+            leaves out the pairs with 0 (:attr:`near_weights`): they are bad data or the horizon.
     """
 
     world_points: Tensor

@@ -1,4 +1,4 @@
-"""Arrows go one way: which module of the package may import which (ARCHITECTURE.md)."""
+"""Arrows go one way: which module of the package may import which."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def layer(name):
         for level, members in enumerate(LAYERS):
             if prefix in members:
                 return level
-    pytest.fail(f"{name} is in no layer: say in LAYERS (and in ARCHITECTURE.md) where it belongs.")
+    pytest.fail(f"{name} is in no layer: say in LAYERS where it belongs.")
 
 
 @pytest.mark.parametrize("name", MODULES)

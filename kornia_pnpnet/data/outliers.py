@@ -17,7 +17,7 @@ __all__ = ["OutlierDraw", "OutlierMix", "near_offsets", "structured_points"]
 # Standard deviations of the pixel noise. The distance of a near outlier from its pixel is log-uniform in this range,
 # from just outside the noise to ten times that.
 _NEAR = 5.0, 50.0
-# Pairs. Added to the largest number of outliers before rounding down, so that 0.33 is a third for every n up to 15.
+# Pairs. Added to n * max_ratio before rounding down: 0.33 gives floor(n / 3) for n up to 15, although 0.33 < 1/3.
 _SLACK = 0.05
 
 

@@ -4,9 +4,9 @@ A new kernel is one more entry of :data:`KERNELS`.
 
 A kernel is a loss :math:`\rho(s)` of the squared residual :math:`s = \|r\|^2` in square pixels with one *shape*
 parameter, and its derivative :math:`w(s) = \rho'(s)`: iterating weighted least squares with the weight :math:`w`
-minimises :math:`\sum \rho`. The scale of ``huber``, ``cauchy``, ``geman_mcclure`` and ``truncated`` is in pixels of
-the normalised camera; the shape of ``power`` is the exponent :math:`\alpha` of the paper's
-:math:`w = 1/\|r\|^\alpha`.
+minimises :math:`\sum \rho`. The scale of ``huber``, ``cauchy``, ``geman_mcclure`` and ``truncated`` is in pixels of the
+normalised camera, or in standard deviations where the noise is known; the shape of ``power`` is the exponent
+:math:`\alpha` of the paper's :math:`w = 1/\|r\|^\alpha`.
 """
 
 from __future__ import annotations

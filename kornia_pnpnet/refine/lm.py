@@ -57,12 +57,11 @@ class RobustWeightedLM(Configured):
     *Several poses.* Where a guess has other poses, the first seven tenths of the iterations (rounded down) refine all
     of them. Then the pose of the lowest cost by the kernel of the last of these iterations goes on alone, per problem.
 
-    *By residual.* The last ``by_residual`` iterations, the choice among several poses and the verdict ignore the
-    initialiser's weights: a pair that it took for an outlier may by then have shown to be an inlier, and the other way
-    round. Where the initialiser estimated the noise and the residuals are too small for it (by their likelihood
-    ratio), its variance is multiplied by the residuals' a posteriori variance factor; the iterations multiply by a
-    tenth of that factor, since a narrower kernel then separates inliers from outliers better. Noise that came with the
-    correspondences stays as it is.
+    *By residual.* The last ``by_residual`` iterations and the choice among several poses ignore the initialiser's
+    weights: by then the residuals say better which pairs are outliers. Where the initialiser estimated the noise, and
+    the residuals show that its variance is too large (by a likelihood ratio), :meth:`finish` multiplies the variance by
+    the a posteriori variance factor of the residuals. The iterations multiply by a tenth of that factor, since a
+    narrower kernel separates inliers from outliers better. Noise that the caller gave stays as it is.
 
     All operations are per problem: a problem that cannot be solved keeps its pose, reports ``ok=False`` and changes
     no other.
@@ -407,7 +406,7 @@ def _relative_to_mean(weights: Tensor) -> Tensor:
 
 
 def _complete_noise(corr: Correspondences, guess: Guess) -> Noise | None:
-    """The noise of every pair: the initialiser's, else the caller's with 0 where unknown; ``None``: all unknown."""
+    """The noise of the guess; if it has none, the caller's with 0 for unknown sigmas; ``None`` if neither exists."""
     noise = guess.noise
     if noise is None and corr.noise is not None:
         noise = map_tensors(lambda x: x.nan_to_num(0.0), corr.noise)

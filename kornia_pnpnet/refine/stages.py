@@ -18,15 +18,16 @@ class LMStart(NamedTuple):
     Attributes:
         corr: the correspondences with the weights of the caller, problems last in memory. Their noise is known for
             every pair, or ``None``.
-        prior: weight of each pair before its residual is looked at, for cost and verdict, :math:`(B, N)`.
+        prior: weight of each pair without the robust factor, for cost and verdict: the caller's times the
+            initialiser's, or the caller's alone when there are iterations by residual, :math:`(B, N)`.
         pose: the first poses, :math:`(S B)`: one pose of every problem, then the next pose of every problem.
         guided: ``corr`` with weights of caller and initialiser, relative to the largest.
         by_residual: ``corr`` with the weights that the last iterations see: those of the caller alone, relative to
             their mean, or ``guided`` without such iterations.
         starts: ``guided`` once for each of the :math:`S` poses.
         rivals: the pairs by whose cost the :math:`S` poses compete; ``None`` when :math:`S = 1`.
-        estimated: problems whose noise the initialiser estimated, so that the last iterations may correct it, bool
-            :math:`(B, 1)`; ``None`` when there are no such iterations.
+        estimated: problems for which the caller gave no sigma, so that the last iterations may correct the
+            initialiser's estimate, bool :math:`(B, 1)`; ``None`` when there are no such iterations.
         noiseless: problems for which neither the caller gave a sigma nor the initialiser an estimate, although the
             caller gave one for others, bool :math:`(B,)`; ``None``: no such problems.
         step: :math:`\gamma` of each iteration, scalars.

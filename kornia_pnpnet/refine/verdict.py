@@ -170,8 +170,9 @@ def chance_of_inlier(corr: Correspondences, thresholds: Thresholds, judged: Judg
     r"""Probability that a pixel anywhere among the pixels of a problem fits as well as the worst inlier does.
 
     Such a pixel is uniform in the smallest axis-parallel box around the pixels. It fits when it falls into the disc
-    around a projection whose radius is the worst inlier's share of its threshold. The disc covers at most its area, and
-    at most the strips of the box that are as wide as the disc. The mean over the inliers is returned.
+    around a projection whose radius is the worst inlier's share of its threshold. The chance is the smaller of two
+    shares: that of the disc's area in the box's, and that of the disc's diameter in the shorter side. The mean over the
+    inliers is returned.
 
     Args:
         corr: normalised correspondences.
