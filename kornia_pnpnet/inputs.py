@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
@@ -13,7 +13,7 @@ from torch import Tensor
 from kornia_pnpnet.core.checks import Shapes, check_devices, check_like, check_shapes, expand_sigma
 from kornia_pnpnet.types import Noise, Pose, camera_matrices
 
-__all__ = ["Inputs", "check_inputs", "checked_inputs"]
+__all__ = ["Inputs", "check_inputs", "checked_inputs", "one_batch"]
 
 
 class Inputs(NamedTuple):
@@ -26,6 +26,22 @@ class Inputs(NamedTuple):
     mask: Tensor | None
     init: Pose | None
     noise: Noise | None
+
+
+def one_batch(size: torch.Size, argument: Any) -> Any:
+    """Reshape an argument of problems with any leading dimensions to one batch dimension.
+
+    Args:
+        size: the leading dimensions of ``world_points``; none for a single problem.
+        argument: a tensor with these leading dimensions, a pose of such tensors, or what all problems share.
+    """
+    if isinstance(argument, tuple):
+        return Pose(*(one_batch(size, x) for x in argument))
+    own = isinstance(argument, Tensor) and argument.ndim > 0 and argument.shape[: len(size)] == size
+    # A matrix (3, 3), or a sigma of one problem's pairs, has no leading dimensions when there are any.
+    if not own or (size and argument.shape == (3, 3)):
+        return argument
+    return argument.reshape(size.numel(), *argument.shape[len(size) :])
 
 
 def check_inputs(

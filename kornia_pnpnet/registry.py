@@ -187,4 +187,4 @@ def solve_pnp(
         device = world_points.device if isinstance(world_points, Tensor) else torch.device("cpu")
         solver = _frozen(solver, device)
     result = solver(world_points, img_points, intrinsics, weights)
-    return torch.where(result.ok[:, None, None], result.matrix[:, :3], torch.nan)
+    return torch.where(result.ok[..., None, None], result.matrix[..., :3, :], torch.nan)

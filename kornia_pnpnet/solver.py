@@ -13,17 +13,17 @@ from kornia.core.exceptions import BaseError, ValueCheckError
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
-from kornia_pnpnet.core.checks import check_whole
+from kornia_pnpnet.core.checks import check_shapes, check_whole
 from kornia_pnpnet.core.linalg import bound_gradient
 from kornia_pnpnet.core.performance import Compiled, compiling, split_batch
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import project
 from kornia_pnpnet.init import RANSAC, EPnP, MLPInit, REPPnP, SetInit
-from kornia_pnpnet.inputs import Inputs, checked_inputs
+from kornia_pnpnet.inputs import Inputs, checked_inputs, one_batch
 from kornia_pnpnet.normalize import VIEWS, Frame, Normalize
 from kornia_pnpnet.pretrained import read_weights, write_weights
 from kornia_pnpnet.refine import LMStart, LMStep, RobustWeightedLM
-from kornia_pnpnet.types import Correspondences, Guess, PnPResult, Pose, Status
+from kornia_pnpnet.types import Correspondences, Guess, PnPResult, Pose, Status, camera_matrices
 
 __all__ = ["PnPNet"]
 
@@ -127,7 +127,8 @@ class PnPNet(nn.Module):
         r"""Solve a batch of problems.
 
         Args:
-            world_points: shape :math:`(B, N, 3)`, float32 or float64, any unit.
+            world_points: shape :math:`(B, N, 3)`, float32 or float64, any unit. Any leading dimensions may stand in
+                place of :math:`B`, in all arguments and in the result; a single problem has none.
             img_points: pixels, shape :math:`(B, N, 2)`.
             intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or Kornia's cameras, whose
                 extrinsics are ignored.
@@ -155,6 +156,14 @@ class PnPNet(nn.Module):
             TypeCheckError: for dtypes that differ or are not float32 or float64.
             DeviceError: for tensors on different devices, or on another device than a network of the solver.
         """
+        if isinstance(world_points, Tensor) and world_points.ndim >= 2 and world_points.ndim != 3:
+            size = world_points.shape[:-2]
+            check_shapes({"img_points": (img_points, (*world_points.shape[:-1], 2))}, world_points)
+            given = world_points, img_points, camera_matrices(intrinsics), weights, mask, init
+            flat = [one_batch(size, x) for x in (*given, img_sigma, world_sigma)]
+            sigmas = {"img_sigma": flat[6], "world_sigma": flat[7]}
+            result = self(*flat[:6], **sigmas, first_stage_only=first_stage_only, gradient=gradient)
+            return map_tensors(lambda x: x.reshape((*size, *x.shape[1:])), result)
         inputs = checked_inputs(world_points, img_points, intrinsics, weights, mask, init, img_sigma, world_sigma)
         with _in_full_precision(world_points.device.type):
             always = _checked_gradient(gradient or self.gradient) == "always"

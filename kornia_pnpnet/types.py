@@ -64,7 +64,9 @@ class Pose(NamedTuple):
     @property
     def matrix(self) -> Tensor:
         """The homogeneous world-to-camera matrix, shape :math:`(B, 4, 4)`."""
-        return Rt_to_matrix4x4(self.rotation, self.translation[..., None])
+        size = self.translation.shape[:-1]  # any leading dimensions
+        matrix = Rt_to_matrix4x4(self.rotation.reshape(-1, 3, 3), self.translation.reshape(-1, 3, 1))
+        return matrix.reshape((*size, 4, 4))
 
     @classmethod
     def from_rvec(cls, rvec: Tensor, translation: Tensor) -> Pose:

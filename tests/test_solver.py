@@ -111,7 +111,7 @@ def bad_calls(p):
     world, pixels, K = p.world_points, p.img_points, p.intrinsics
     ones, mask = torch.ones(7, 9, dtype=torch.float64), torch.ones(7, 9, dtype=torch.bool)
     return {
-        "world_2d": ((world[0], pixels, K), {}, ShapeError, r"\[9, 3\]"),
+        "world_2d": ((world[0], pixels, K), {}, ShapeError, r"img_points.*\(9, 2\)"),
         "world_of_4": ((torch.cat((world, world[..., :1]), -1), pixels, K), {}, ShapeError, r"4"),
         "pixels_of_3": ((world, world, K), {}, ShapeError, r"3"),
         "pixels_2d": ((world, pixels[0], K), {}, ShapeError, r"\[9, 2\]"),
@@ -451,6 +451,21 @@ def test_a_pose_that_is_not_ok_carries_a_gradient_on_request(name, make_problems
         assert torch.equal(norms[ok], own[ok])
     with pytest.raises(BaseError, match="gradient must"):
         solver(*p[:3], gradient="never")
+
+
+def test_any_leading_dimensions(make_problems):
+    p = make_problems(9, 6)
+    solver = create_solver("pnpnet-set")
+    options = {"weights": torch.rand(6, 9).double() + 0.5, "init": p.pose, "img_sigma": torch.ones(6).double()}
+    batch = solver(*p[:3], **options)
+    for shape in ((2, 3), (6, 1, 1)):
+        nested = pytree.tree_map(lambda x, shape=shape: x.unflatten(0, shape), (p[:3], options))
+        result = solver(*nested[0], **nested[1])
+        assert result.matrix.shape == (*shape, 4, 4)
+        assert_same(pytree.tree_map(lambda x, shape=shape: x.flatten(0, len(shape) - 1), result), batch)
+    one = solver(*(x[2] for x in p[:3]), **{key: only(2, value) for key, value in options.items()})
+    assert_same(one, only(2, batch), atol=1e-7)
+    assert solver(p.world_points[2], p.img_points[2], p.intrinsics[2], img_sigma=torch.ones(9).double()).ok
 
 
 def test_a_given_pose_is_one_more_hypothesis(make_problems, perturb):
