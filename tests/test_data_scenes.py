@@ -11,7 +11,6 @@ from data_helpers import (
     WIDTH,
     assert_counts,
     assert_uniform,
-    check_any_options,
     make_scene,
     make_view,
     reprojection,
@@ -19,7 +18,6 @@ from data_helpers import (
 )
 from kornia.core.exceptions import BaseError
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
-from strategies import ANY, BOOL, COUNTS, options
 from torch.testing import assert_close
 
 from kornia_pnpnet.core.trees import iter_tensors
@@ -213,17 +211,3 @@ def test_wrong_arguments():
     for name in ("near_share", "structured_share"):  # their pixels would be those of inliers
         with pytest.raises(BaseError, match=f"{name}.*0.5"):
             SceneProblems(make_scene(20), outliers=OutlierMix(**{name: 0.5}))
-
-
-def test_scenes_of_any_options():
-    scene = make_scene(20, 12)
-    chosen = options(
-        n=COUNTS,
-        batch_size=COUNTS,
-        seed=COUNTS,
-        num_spares=COUNTS,
-        translation_box=ANY,
-        max_angle=ANY,
-        recentre=BOOL,
-    )
-    check_any_options(chosen, lambda values: SceneProblems(scene, **{"batch_size": 4, **values}).batch(0))

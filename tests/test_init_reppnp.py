@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 import torch
-from kornia.core.exceptions import BaseError
 
 from kornia_pnpnet import Correspondences, Normalize, Pose
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
@@ -147,19 +146,3 @@ def test_the_limit_and_the_quantile_decide_which_pairs_are_kept(make_problems, c
     kept = REPPnP()(corr).weights.sum(-1)
     assert (kept >= 10).all()
     assert (kept > 10).any()
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("quantile", 0.0),
-        ("quantile", 1.1),
-        ("max_error", -1.0),
-        ("null_iterations", -1),
-        ("rigid_iterations", 2.5),
-        ("refine_iterations", 0),
-    ],
-)
-def test_wrong_arguments_raise(name, value):
-    with pytest.raises(BaseError, match=f"{name}.*{value}"):
-        REPPnP(**{name: value})

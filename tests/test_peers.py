@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from functools import partial
 
@@ -248,28 +247,6 @@ def test_inputs_are_checked(make_problems):
         solve(OpenCVRansac(), problems._replace(img_points=problems.img_points[:, :5]))
     with pytest.raises(TypeCheckError, match="intrinsics"):
         solve(OpenCVRansac(), problems._replace(intrinsics=problems.intrinsics.float()))
-
-
-@pytest.mark.parametrize(
-    ("name", "options", "message"),
-    [
-        ("opencv-sqpnp", {"method": "NOPE"}, "SOLVEPNP_NOPE"),
-        ("opencv-ransac", {"threshold": math.inf}, "threshold"),
-        ("opencv-ransac", {"iterations": 0}, "iterations"),
-        ("opencv-ransac", {"confidence": 1.0}, "confidence"),
-        ("opencv-ransac", {"seed": -1}, "seed"),
-        ("opencv-ransac", {"refine": 1}, "refine"),
-        ("opencv-usac", {"method": "USAC_FM_8PTS"}, "USAC_FM_8PTS"),
-        ("opencv-usac", {"method": "SOLVEPNP_EPNP"}, "SOLVEPNP_EPNP"),
-        ("poselib", {"threshold": -1.0}, "threshold"),
-        ("poselib", {"min_iterations": 0}, "min_iterations"),
-        ("pycolmap", {"loss_scale": 0.0}, "loss_scale"),
-        ("pycolmap", {"max_iterations": 50}, "max_iterations"),
-    ],
-)
-def test_a_bad_argument_is_named(name, options, message):
-    with pytest.raises(BaseError, match=message):
-        make(name, **options)
 
 
 def test_options_that_poselib_would_ignore_are_an_error(monkeypatch):
