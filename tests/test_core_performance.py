@@ -51,11 +51,10 @@ def assert_same(result, expected, **tolerance):
 @pytest.mark.parametrize(
     ("name", "views", "whole", "graphs"),
     [
-        *((name, 1, False, 3) for name in ("pnpnet-n9", "epnp-lm", "reppnp-lm")),
-        ("pnpnet-n9", 3, False, 4),  # and the choice among the starts
-        ("pnpnet-set", 1, False, 4),
-        ("pnpnet-n9", 1, True, 1),
+        ("pnpnet-n9", 3, False, 4),  # the fourth is the choice among the starts
         ("pnpnet-n9", 3, True, 1),
+        *(pytest.param(name, 1, False, 3, marks=pytest.mark.slow) for name in ("pnpnet-n9", "epnp-lm", "reppnp-lm")),
+        pytest.param("pnpnet-set", 1, False, 4, marks=pytest.mark.slow),
     ],
 )
 def test_each_part_is_one_graph_and_the_batch_may_change(name, views, whole, graphs, backend):
@@ -70,7 +69,7 @@ def test_each_part_is_one_graph_and_the_batch_may_change(name, views, whole, gra
     assert backend.frame_count == graphs  # before, in and after an iteration
 
 
-@pytest.mark.parametrize(("views", "whole"), [(1, False), (2, False), (2, True)])
+@pytest.mark.parametrize(("views", "whole"), [(1, False), (2, True)])
 def test_gradients_are_those_of_the_eager_solver(views, whole, backend):
     solver = create_solver("pnpnet-n9", m=2).double()
     solver.views = views
@@ -88,7 +87,7 @@ def test_gradients_are_those_of_the_eager_solver(views, whole, backend):
 
 
 def test_the_first_stage_alone_and_other_arguments(backend):
-    eager, compiled = create_solver("pnpnet-n9"), create_solver("pnpnet-n9")
+    eager, compiled = create_solver("pnpnet-n9", m=1), create_solver("pnpnet-n9", m=1)
     compiled.compile()
     inputs = problems(3)[:3]
     weights = torch.ones(3, 9, dtype=torch.float64)
@@ -149,7 +148,7 @@ def test_what_recompiling_warns_of_is_no_reason_to_stop(backend):
 
 
 def test_errors_of_the_caller_are_the_callers(backend):
-    solver = create_solver("pnpnet-n9")
+    solver = create_solver("pnpnet-n9", m=0)
     solver.compile()
     world, img, intrinsics = problems(3)[:3]
     with pytest.raises(Exception, match=r"img_points must have the shape"):
@@ -157,15 +156,14 @@ def test_errors_of_the_caller_are_the_callers(backend):
     with pytest.raises(Exception, match=r"built for n = 9"):
         solver(world[:, :8], img[:, :8], intrinsics)
     with torch.no_grad():
-        assert solver(world, img, intrinsics).ok.any()
+        assert solver(world, img, intrinsics).matrix.isfinite().all()
 
 
-@pytest.mark.parametrize("whole", [False, True])
-def test_compiling_changes_no_weights_and_copies_use_their_own(whole, backend):
-    solver = create_solver("pnpnet-n9", m=1)
+def test_compiling_changes_no_weights_and_copies_use_their_own(backend):
+    solver = create_solver("pnpnet-n9", m=0)
     eager = copy.deepcopy(solver)
     names, inputs = list(solver.state_dict()), problems(3)[:3]
-    for again in (not whole, whole):  # compiling again replaces what was compiled
+    for again in (True, False):  # compiling again replaces what was compiled
         solver.compile(whole=again)
         with torch.no_grad():
             assert_same(solver(*inputs), eager(*inputs), rtol=1e-6, atol=1e-6)

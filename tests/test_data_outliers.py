@@ -127,9 +127,6 @@ def test_structured_outliers_agree_on_another_pose():
 
 
 def test_impossible_mixes_raise(generator):
-    for wrong in ({"max_ratio": 1.5}, {"max_ratio": -0.1}, {"count": -1}, {"min_count": -1}, {"mismatch_share": 2.0}):
-        with pytest.raises(BaseError, match=str(next(iter(wrong.values())))):
-            OutlierMix(**wrong)
     with pytest.raises(BaseError, match=r"10 outliers.*9"):
         OutlierMix(count=10).draw(1, 9, generator)
     with pytest.raises(TypeError, match="ratio"):

@@ -203,9 +203,6 @@ def test_success_limit():
 
 
 def test_wrong_arguments():
-    for name in ("n", "batch_size", "num_spares"):
-        with pytest.raises(BaseError, match=f"{name} must be .* at least 1"):
-            SceneProblems(make_scene(20), **{name: 0})
     with pytest.raises(ValueError, match="no image of 'toy' has the 51 points for n = 50 and num_spares = 1"):
         SceneProblems(make_scene(20, 30), n=50)
     for name in ("near_share", "structured_share"):  # their pixels would be those of inliers

@@ -33,6 +33,19 @@ def outputs(guess):
     return (*guess.pose, guess.weights, guess.ok)
 
 
+class Counting(P3P):
+    """P3P that records the number of samples of each call, and the weights of the pairs of each sample."""
+
+    def __init__(self):
+        super().__init__()
+        self.sizes, self.samples = [], []
+
+    def hypotheses(self, corr):
+        self.sizes.append(len(corr.weights))
+        self.samples += corr.weights.unbind()
+        return super().hypotheses(corr)
+
+
 @pytest.fixture
 def found(monkeypatch):
     """The results of all searches of the test."""
@@ -147,6 +160,19 @@ def test_pairs_without_weight_are_no_inliers(make_problems):
     assert pose_errors(result.pose, problems.pose).rotation_error_deg.max() < 1e-9
 
 
+@pytest.mark.parametrize(("masked", "weighted"), [(True, False), (False, True)])
+def test_pairs_without_weight_are_never_drawn(masked, weighted, make_problems):
+    """Neither pairs that the mask hides nor pairs of weight 0, where there are too many subsets to try each."""
+    problems = make_problems(60, 10, outliers=20)
+    there = torch.rand(10, 60, generator=torch.Generator().manual_seed(0)) < 0.5
+    minimal = Counting()
+    net, K = solver(minimal, **PROTOCOL), problems.intrinsics
+    weights = torch.where(there, 0.1, 0.0).double() if weighted else None
+    net(problems.world_points, problems.img_points, K, weights=weights, mask=there if masked else None)
+    assert len(minimal.samples) > 100
+    assert all((weight > 0).all() for weight in minimal.samples)
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize(("n", "outliers"), [(4, 0), (9, 3), (40, 20)])
 def test_a_problem_has_the_same_result_in_every_batch(n, outliers, dtype, make_problems, correspond):
@@ -173,18 +199,6 @@ def test_chunks_do_not_matter(make_problems, correspond):
         for a, b in zip(outputs(RANSAC(P3P(), **options, chunk_size=size)(corr)), default, strict=True):
             torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
     assert RANSAC(P3P(), **options, chunk_size=1)(take(corr, slice(2))).ok.all()
-
-
-class Counting(P3P):
-    """P3P that records the number of samples of each call."""
-
-    def __init__(self):
-        super().__init__()
-        self.sizes = []
-
-    def hypotheses(self, corr):
-        self.sizes.append(len(corr.weights))
-        return super().hypotheses(corr)
 
 
 @pytest.mark.parametrize(("n", "batch"), [(9, 300), (1000, 3)])
@@ -223,31 +237,6 @@ def test_options_decide_how_many_samples_are_drawn(found, make_problems, corresp
     assert samples(max_samples=77, threshold=1e-6).max() <= 77  # no inliers, no early end
     poses = [samples(seed=seed, max_samples=20) is not None and found[-1].poses for seed in (0, 1)]
     assert not torch.equal(*poses)
-
-
-def test_bad_problems_fail_alone(make_problems):
-    problems = make_problems(9, 7, outliers=2)
-    world, img = problems.world_points.clone(), problems.img_points.clone()
-    weights = torch.ones_like(world[..., 0])
-    world[1] = math.nan
-    weights[2] = 0.0
-    weights[3, 2:] = 0.0  # two pairs
-    world[4] = world[4, :1] + torch.arange(9, dtype=world.dtype)[:, None]  # a line
-    world[5] = 1.0
-    img[6] = 7.0
-    leaves = [x.requires_grad_() for x in (world, img, weights)]
-    net = solver(**PROTOCOL)
-    result, sound = net(world, img, problems.intrinsics, weights=weights), solve(net, problems)
-    assert result.ok.tolist() == [True] + 6 * [False]
-    for a, b in ((result.rotation, sound.rotation), (result.translation, sound.translation)):
-        assert a.isfinite().all()
-        assert torch.equal(a[0], b[0])
-    (result.rotation.sum() + result.translation.sum() + result.weights.sum()).backward()
-    for leaf in leaves:
-        assert leaf.grad.isfinite().all()
-        assert not leaf.grad[1:].any()
-    assert world.grad[0].any()
-    assert img.grad[0].any()
 
 
 def test_sound_problems_are_ok_and_pixels_of_no_pose_are_not(make_problems):

@@ -331,6 +331,8 @@ def test_a_given_pose_replaces_that_of_the_network(make_problems, perturb):
     without = PnPNet(None, RobustWeightedLM(m=5))
     assert_same(by_hand, without(*p[:3], init=init))
     assert_same(by_hand, without(*p[:3], init=tuple(init)))
+    of_set = create_solver("pnpnet-set")(*p[:3], init=init)
+    torch.testing.assert_close(of_set.init.matrix, init.matrix, rtol=1e-9, atol=1e-9)
     identity = PnPNet(None, RobustWeightedLM(m=0))(*p[:3])  # the guess where there is no other
     torch.testing.assert_close(identity.matrix, torch.eye(4).double().expand(7, 4, 4), rtol=0, atol=1e-12)
 
