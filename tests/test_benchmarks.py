@@ -354,19 +354,6 @@ def test_targets_of_latency():
     assert not tail["met"]
 
 
-@pytest.mark.slow
-def test_cold_starts_and_memory(measured):
-    starts = measured[1]["startup"]["starts"]
-    modes = {(entry["contender"], entry["backward"]) for entry in starts}
-    assert modes == {(name, backward) for name in SMALL for backward in (False, True) if name != LOOP or not backward}
-    for entry in starts:
-        (call,) = entry["calls"]
-        assert call["first_s"] > 0
-        assert (entry["memory"] is None) == (entry["contender"] == LOOP)
-        if entry["memory"]:
-            assert entry["memory"]["peak_bytes"] >= entry["memory"]["before_bytes"] > 2**26
-
-
 def test_a_large_call_shows_in_the_memory_of_its_process():
     request = {"contender": "refinement", "backward": True, "device": "cpu", "batches": [2], "memory_batch": 5000}
     found = harness.run_child(FOLDER / "process.py", json.dumps(request), OMP_NUM_THREADS="1")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import pickle
 import warnings
-from functools import partial
 
 import pytest
 import torch
@@ -13,8 +12,8 @@ from torch._dynamo.testing import CompileCounter
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from kornia_pnpnet import MLPInit, PnPNet, Pose, RobustWeightedLM, create_solver
-from kornia_pnpnet.core.performance import Compiled, problems_last, repeat_problems, split_batch
-from kornia_pnpnet.core.trees import iter_tensors, map_tensors
+from kornia_pnpnet.core.performance import Compiled, problems_last
+from kornia_pnpnet.core.trees import iter_tensors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.geometry import project
 from kornia_pnpnet.types import PnPResult
@@ -225,15 +224,6 @@ def test_inductor_computes_the_same_with_more_pairs_than_problems():
         torch.testing.assert_close(ours.matrix, eager.matrix, rtol=1e-3, atol=1e-3)
 
 
-@pytest.mark.slow
-def test_without_a_real_compiler():
-    torch.compiler.reset()
-    with torch._inductor.config.patch({"cpp.cxx": ("/no/such/compiler",), "force_disable_caches": True}):
-        three = Compiled(partial(torch.mul, 3.0))
-        with pytest.warns(RuntimeWarning, match="Not compiled"):
-            assert torch.equal(three(torch.ones(2000)), 3 * torch.ones(2000))
-
-
 def test_problems_last_changes_only_the_order_of_memory(make_problems, correspond):
     corr, pose = correspond(make_problems(n=4, batch=7))
     laid = problems_last(corr)
@@ -243,16 +233,3 @@ def test_problems_last_changes_only_the_order_of_memory(make_problems, correspon
     assert laid.world_points.stride() == laid.img_points.stride() == (1, 7, 28)
     assert laid.weights.stride() == (1, 7)
     assert all(x.stride() == (1, 7) for x in iter_tensors(project(pose, laid)))  # arithmetic keeps the layout
-
-
-def test_repeated_problems_are_the_problems_several_times(make_problems, correspond):
-    corr, _ = correspond(make_problems(n=4, batch=3))
-    for one, other in zip(iter_tensors(repeat_problems(corr, 2)), iter_tensors(corr), strict=True):
-        assert torch.equal(one, torch.cat((other, other)) if other.ndim else other)
-
-
-def test_split_batches_join_to_the_batch(make_problems):
-    problems = make_problems(batch=7)
-    parts = split_batch(problems, 3)
-    joined = map_tensors(lambda *x: torch.cat(x), *parts)
-    assert all(torch.equal(*pair) for pair in zip(iter_tensors(joined), iter_tensors(problems), strict=True))

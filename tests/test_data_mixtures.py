@@ -42,11 +42,6 @@ def test_answers_of_mixed_problems_stay_with_their_problems():
     assert wrong.double().mean() > 0.2
 
 
-def test_mixed_batches_have_the_requested_size():
-    for size in (1, 2, 7):
-        assert len(mixed(batch_size=size).batch(0).inliers) == size
-
-
 def test_shares_that_do_not_fit_raise():
     for count, shares in ((0, None), (2, (1.0,)), (2, (1.0, 0.0)), (2, (1.0, -1.0))):
         with pytest.raises(BaseError, match=f"{count} sources"):

@@ -4,14 +4,7 @@ import math
 
 import pytest
 import torch
-from data_helpers import (
-    COUNT,
-    assert_counts,
-    assert_normal,
-    assert_uniform,
-    draw,
-    reprojection,
-)
+from data_helpers import COUNT, assert_counts, assert_normal, assert_uniform, draw, reprojection
 from kornia.core.exceptions import BaseError
 
 from kornia_pnpnet import create_solver

@@ -6,16 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from data_helpers import (
-    HEIGHT,
-    WIDTH,
-    assert_counts,
-    assert_uniform,
-    make_scene,
-    make_view,
-    reprojection,
-    same,
-)
+from data_helpers import HEIGHT, WIDTH, assert_counts, assert_uniform, make_scene, make_view, reprojection, same
 from kornia.core.exceptions import BaseError
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 from torch.testing import assert_close

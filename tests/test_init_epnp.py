@@ -9,14 +9,8 @@ from kornia_pnpnet import Correspondences, Normalize, PnPNet, Pose, RobustWeight
 from kornia_pnpnet.data import SyntheticProblems
 from kornia_pnpnet.geometry import transform
 from kornia_pnpnet.init.epnp.control_points import control_points
-from kornia_pnpnet.init.epnp.depths import (
-    attach_gradient,
-    control_points_in_camera,
-    depth_system,
-    four_cases,
-    minimize,
-)
-from kornia_pnpnet.init.epnp.epnp import EPnP, best_case
+from kornia_pnpnet.init.epnp.depths import attach_gradient, depth_system, four_cases, minimize
+from kornia_pnpnet.init.epnp.epnp import EPnP
 from kornia_pnpnet.metrics import pose_errors, success
 
 DTYPES = (torch.float32, torch.float64)
@@ -134,59 +128,10 @@ def test_the_minimum_is_that_of_the_twelve_unknowns(n, weight):
     assert reached.double().mean() >= 0.995
 
 
-def test_the_size_of_the_world_is_known():
-    """The depth of the centroid is that of the control points, scaled to the control points of the world."""
-    corr = correspondences(problems(6))
-    control = control_points(corr)
-    system = depth_system(control, (corr.img_points / corr.focal).permute(2, 1, 0))
-    module = EPnP(iterations=20, algebraic_weight=30.0)
-    pose = module(corr).pose
-    depths = minimize(system, four_cases(system), 30.0, 20)[:, 0]
-    camera = torch.stack(control_points_in_camera(system, depths)).permute(2, 1, 0)  # (B, 4, 3)
-    turned = control.points[:, 1:] @ pose.rotation.mT
-    scale = (turned * camera[:, 1:]).sum((1, 2)) / camera[:, 1:].square().sum((1, 2))
-    expected = scale[:, None] * camera[:, 0]
-    reached = transform(pose, control.points[:, :1])[:, 0]
-    torch.testing.assert_close(reached, expected, rtol=0, atol=1e-8)
-    assert (scale / system.unit - 1.0).abs().median() > 1e-4
-
-
 def test_the_algebraic_weight_pays():
     p = problems(9, 1000)
     shares = [success(pose_errors(solver(algebraic_weight=w)(*p[:3]).pose, p.pose)).double().mean() for w in (0.0, 0.3)]
     assert shares[1] > shares[0] + 0.01
-
-
-def choose(p, *, img_points=None):
-    """Whether the true depths are chosen instead of the depths of a flat scene far away, (B,)."""
-    normalize = Normalize(order=False)
-    corr, frame = normalize(*p[:3])
-    truth = normalize.apply_to_pose(p.pose, frame)
-    control = control_points(corr)
-    system = depth_system(control, (corr.img_points / corr.focal).permute(2, 1, 0))
-    points = control.points @ truth.rotation[:, 2, :, None]  # (B, 4, 1)
-    depths = points[..., 0].mT.clone()
-    depths[0] += truth.translation[:, 2]
-    flat = torch.zeros_like(depths)
-    flat[0] = 10.0
-    cases = torch.stack((depths / system.unit, flat), 1)
-    seen = corr.img_points if img_points is None else img_points
-    vectors = control.points[:, 1:].permute(2, 1, 0) / system.unit
-    return best_case(system, cases, control, (seen / corr.focal).permute(2, 1, 0), vectors) == 0
-
-
-def test_the_true_case_is_chosen():
-    p = problems(9, 200, noise=False)
-    assert choose(p).all()
-    # A point behind the camera counts as a large error. It is moved through the camera: its pixel stays.
-    cam = transform(p.pose, p.world_points)
-    world = p.world_points.clone()
-    world[:, 0] = ((-cam[:, 0] - p.pose.translation)[:, None] @ p.pose.rotation)[:, 0]
-    assert (~choose(p._replace(world_points=world))).double().mean() > 0.8
-    # A large error is bounded: one outlier does not decide.
-    img = p.img_points.clone()
-    img[:, 0, 0] = 1e5
-    assert choose(p, img_points=img).all()
 
 
 def test_fewer_than_three_pairs_in_front_are_not_ok():

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import math
 
 import pytest
 import torch
 from kornia.core.exceptions import ShapeError
-from torch import nn
 
-from kornia_pnpnet import Guess, PnPNet, Pose, RobustWeightedLM, pose_errors, success
+from kornia_pnpnet import PnPNet, RobustWeightedLM, pose_errors, success
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.geometry import transform
@@ -266,31 +264,6 @@ def test_a_scorer_may_be_any_function(make_problems, correspond):
     for a, b in zip(outputs(built_in), outputs(own), strict=True):
         torch.testing.assert_close(a, b)
     assert RANSAC(P3P(), **PROTOCOL, scorer=torch.log1p)(corr).ok.all()
-
-
-class Stubborn(nn.Module):
-    """An initialiser with a guess for every other problem and NaN for every third."""
-
-    def forward(self, corr):
-        index = torch.arange(len(corr.weights))
-        rotation = torch.eye(3, dtype=corr.weights.dtype).repeat(len(index), 1, 1)
-        translation = torch.zeros(len(index), 3, dtype=corr.weights.dtype)
-        translation[::3] = math.nan
-        return Guess(Pose(rotation, translation), torch.ones_like(corr.weights), index % 2 == 0)
-
-
-def test_a_subset_solver_knows_which_poses_are_valid(make_problems, correspond):
-    corr, _ = correspond(make_problems(7, 12))
-    hypotheses = SubsetSolver(Stubborn(), size=7).hypotheses(corr)
-    assert hypotheses.valid[:, 0].tolist() == [i % 2 == 0 and i % 3 != 0 for i in range(12)]
-    assert hypotheses.pose.translation.isfinite().all()
-
-
-def test_the_configuration_is_plain_data():
-    ransac = RANSAC(SubsetSolver(EPnP(), RobustWeightedLM(m=5), size=7), threshold=3.0, scorer=torch.log1p)
-    assert json.loads(json.dumps(ransac.config)) == ransac.config
-    assert ransac.config["minimal"]["init"] == {"name": "EPnP", **EPnP().config}
-    assert ransac.config["threshold"] == 3.0
 
 
 def test_the_gradient_is_that_of_the_result(make_problems, correspond):

@@ -111,15 +111,6 @@ def test_some_sample_is_right_whichever_are_wrong(count, wrong):
         assert any(not set(bad) & set(sample) for sample in samples)
 
 
-def test_the_last_samples_share_no_two_pairs():
-    few, many = (solver().init.triples(n) for n in (35, 36))
-    (least,) = set(many) - set(few)
-    assert least == 36
-    pairs = [pair for sample in many[36] for pair in combinations(sample, 2)]
-    assert len(pairs) == len(set(pairs))
-    assert {k for sample in many[36] for k in sample} == set(range(25))
-
-
 def test_where_no_sample_has_a_pose_the_first_guess_stands_in():
     p = SyntheticProblems(n=6, batch_size=4, seed=3, dtype=torch.float64).batch(0)
     line = p.world_points[:, :1] + torch.arange(6, dtype=torch.float64)[:, None] * torch.ones(3, dtype=torch.float64)

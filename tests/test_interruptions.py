@@ -10,6 +10,7 @@ import signal
 import sys
 import time
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -140,6 +141,12 @@ def test_a_torn_row_of_the_curves_is_dropped(tmp_path):
     assert rows[:20] == before
 
 
+def arrays_of(source):
+    """The arrays of a shard."""
+    inputs = (x.numpy() for x in source.batch(0)[:3])
+    return dict(zip(("world_points", "img_points", "intrinsics"), inputs, strict=True))
+
+
 def _shards_on_a_full_disk(source, out):
     resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
     try:
@@ -149,14 +156,10 @@ def _shards_on_a_full_disk(source, out):
 
 
 def test_shards_on_a_full_disk_are_whole_or_missing(tmp_path):
-    import numpy as np
-
     source, out = tmp_path / "in", tmp_path / "out"
     source.mkdir()
     for name, count in (("a", 10), ("b", 1000), ("c", 10)):
-        problems = SyntheticProblems(n=6, batch_size=count, seed=0).batch(0)
-        arrays = dict(zip(("world_points", "img_points", "intrinsics"), problems[:3], strict=True))
-        np.savez(source / f"{name}.npz", **{key: value.numpy() for key, value in arrays.items()})
+        np.savez(source / f"{name}.npz", **arrays_of(SyntheticProblems(n=6, batch_size=count, seed=0)))
     process = in_a_process(_shards_on_a_full_disk, source, out)
     process.join()
     assert process.exitcode == 3
@@ -172,15 +175,12 @@ def _solve_batch(source, out):
 @pytest.mark.slow
 def test_kill_9_at_any_moment_loses_no_results(tmp_path):
     """After any number of kills the results are those of a call without kills, and no result is made twice."""
-    import numpy as np
-
     pyarrow = pytest.importorskip("pyarrow")
     parquet = pytest.importorskip("pyarrow.parquet")
     source, whole = tmp_path / "in", tmp_path / "whole"
     source.mkdir()
     for i in range(20):
-        problems = SyntheticProblems(n=6, batch_size=1000, seed=i).batch(0)
-        arrays = dict(zip(("world_points", "img_points", "intrinsics"), (x.numpy() for x in problems[:3]), strict=True))
+        arrays = arrays_of(SyntheticProblems(n=6, batch_size=1000, seed=i))
         np.savez(source / f"{i:02}.npz", **arrays)
         if i % 4 == 0:
             lists = {key: [*x.reshape(1000, -1)] for key, x in arrays.items()}

@@ -264,21 +264,6 @@ def test_points_off_a_line_are_valid(n, dtype, random_rotations, generator):
         assert Normalize()(points.to(dtype), pixels, K)[1].valid.all(), (shape, offset, unit)
 
 
-def test_gradcheck(make_problems, generator):
-    p = make_problems(5, 2)
-    normalize = Normalize()
-
-    def run(world, pixels, focal, weights):
-        K = torch.diag_embed(torch.cat((focal[:2], torch.ones(1).double()))).expand(2, 3, 3)
-        K = K + torch.nn.functional.pad(focal[2:, None], (2, 0, 0, 1))
-        corr, frame = normalize(world, pixels, K, weights)
-        return corr.world_points, corr.img_points, corr.weights, frame.centroid, frame.scale
-
-    focal = torch.tensor([3400.0, 3000, 20, 30], dtype=torch.float64)
-    inputs = [p.world_points, p.img_points, focal, torch.rand(2, 5, generator=generator, dtype=torch.float64) + 0.5]
-    assert torch.autograd.gradcheck(run, [x.detach().requires_grad_() for x in inputs])
-
-
 def test_units_of_the_user_are_brought_along(make_problems):
     """A pixel and a unit of the world that were given become ``img_scale`` pixels and ``world_scale`` units."""
     p = make_problems(n=9)

@@ -95,81 +95,60 @@ def mixture(count=2, shares=None, **values):
 BOUNDS = {"initial": 3.0, "size": 2, "lower": 1.0, "upper": 50.0}
 SAMPLING = {"counts": "iterations seed", "numbers": "threshold confidence", "words": "method"}
 SOURCE = "n batch_size seed"
+POSES = "translation_box translation_sigma max_angle focal half_image known_noise"
 MIX = chosen("count min_count min_inliers", "max_ratio mismatch_share near_share structured_share")
 
-#: Per name: a constructor, its options, and what the product must do.
-CASES = {
+#: Per name: a constructor and its options.
+PARTS = {
     "RobustWeightedLM": (
         RobustWeightedLM,
         chosen("m by_residual last", "step damping robustness", "kernel update backward", "shared"),
-        solves,
     ),
-    "BoundedParameter": (
-        lambda **values: BoundedParameter(**{**BOUNDS, **values}),
-        chosen("size", "initial lower upper", flags="logarithmic"),
-        has_its_initial_value,
-    ),
-    "MLPInit": (lambda n=9, **sizes: MLPInit(n, **sizes), chosen("n", "world_scale img_scale"), solves),
-    "SetInit": (SetInit, chosen("width layers heads hidden starts"), solves),
-    "EPnP": (EPnP, chosen("iterations", "algebraic_weight"), solves),
-    "REPPnP": (REPPnP, chosen("null_iterations rigid_iterations", "max_error quantile"), solves),
-    "RANSAC": (
-        partial(RANSAC, P3P()),
-        chosen("max_samples seed", "threshold world_threshold confidence", "scorer"),
-        solves,
-    ),
-    "Normalize": (Normalize, chosen(numbers="f_const"), solves),
-    "OpenCVPnP": (OpenCVPnP, chosen(words="method"), solves),
-    "OpenCVRansac": (OpenCVRansac, chosen(**SAMPLING, flags="refine"), solves),
-    "OpenCVUsac": (OpenCVUsac, chosen(**SAMPLING), solves),
-    "PoseLib": (PoseLib, chosen("min_iterations max_iterations", "threshold confidence"), solves),
-    "PyColmap": (PyColmap, chosen("min_iterations max_iterations", "threshold loss_scale"), solves),
-    "PoseLoss": (PoseLoss, chosen(numbers="refined saturation rotation translation init_translation"), costs),
-    "SetLoss": (
-        SetLoss,
-        chosen("starts", "refined saturation every weights noise rotation_unit translation_unit"),
-        costs,
-    ),
-    "SyntheticProblems": (
-        synthetic,
-        chosen(
-            SOURCE,
-            "translation_box translation_sigma max_angle focal half_image known_noise",
-            img_sigma=ANY | RANGES,
-            world_sigma=ANY | RANGES,
-        ),
-        is_sound,
-    ),
-    "SceneProblems": (
-        from_scene,
-        chosen(f"{SOURCE} num_spares", "translation_box max_angle", flags="recentre"),
-        is_sound,
-    ),
-    "BoxPoints": (partial(with_points, BoxPoints), chosen(numbers="half_width z_near depth"), is_sound),
+    "MLPInit": (lambda n=9, **sizes: MLPInit(n, **sizes), chosen("n", "world_scale img_scale")),
+    "SetInit": (SetInit, chosen("width layers heads hidden starts")),
+    "EPnP": (EPnP, chosen("iterations", "algebraic_weight")),
+    "REPPnP": (REPPnP, chosen("null_iterations rigid_iterations", "max_error quantile")),
+    "RANSAC": (partial(RANSAC, P3P()), chosen("max_samples seed", "threshold world_threshold confidence", "scorer")),
+    "Normalize": (Normalize, chosen(numbers="f_const")),
+    "OpenCVPnP": (OpenCVPnP, chosen(words="method")),
+    "OpenCVRansac": (OpenCVRansac, chosen(**SAMPLING, flags="refine")),
+    "OpenCVUsac": (OpenCVUsac, chosen(**SAMPLING)),
+    "PoseLib": (PoseLib, chosen("min_iterations max_iterations", "threshold confidence")),
+    "PyColmap": (PyColmap, chosen("min_iterations max_iterations", "threshold loss_scale")),
+}
+LOSSES = {
+    "PoseLoss": (PoseLoss, chosen(numbers="refined saturation rotation translation init_translation")),
+    "SetLoss": (SetLoss, chosen("starts", "refined saturation every weights noise rotation_unit translation_unit")),
+}
+SOURCES = {
+    "SyntheticProblems": (synthetic, chosen(SOURCE, POSES, img_sigma=ANY | RANGES, world_sigma=ANY | RANGES)),
+    "SceneProblems": (from_scene, chosen(f"{SOURCE} num_spares", "translation_box max_angle", flags="recentre")),
+    "BoxPoints": (partial(with_points, BoxPoints), chosen(numbers="half_width z_near depth")),
     "SlabPoints": (
         partial(with_points, SlabPoints),
         chosen(numbers="field_of_view tilt", ranges="window distance thickness"),
-        is_sound,
     ),
     "ObjectPoints": (
         partial(with_points, ObjectPoints),
         chosen(numbers="field_of_view thinnest planar", ranges="distance"),
-        is_sound,
     ),
-    "OutlierMix": (partial(with_mix, synthetic), MIX, is_sound),
-    "OutlierMix of a scene": (partial(with_mix, from_scene), MIX, is_sound),
+    "OutlierMix": (partial(with_mix, synthetic), MIX),
+    "OutlierMix of a scene": (partial(with_mix, from_scene), MIX),
     "VaryingSize": (
         mixture,
-        options(
-            n=st.lists(COUNTS, max_size=3),
-            batch_size=COUNTS,
-            seed=COUNTS,
-            shares=st.lists(ANY, max_size=3),
-            count=st.integers(0, 3),
+        chosen(
+            "batch_size seed", n=st.lists(COUNTS, max_size=3), shares=st.lists(ANY, max_size=3), count=st.integers(0, 3)
         ),
-        is_sound,
     ),
 }
+PARAMETERS = {
+    "BoundedParameter": (
+        lambda **values: BoundedParameter(**{**BOUNDS, **values}),
+        chosen("size", "initial lower upper", flags="logarithmic"),
+    )
+}
+USES = ((PARTS, solves), (LOSSES, costs), (SOURCES, is_sound), (PARAMETERS, has_its_initial_value))
+CASES = {name: (*case, use) for cases, use in USES for name, case in cases.items()}
 
 
 @pytest.mark.parametrize("name", CASES)

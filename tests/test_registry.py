@@ -10,21 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import BaseError, DeviceError
-from strategies import (
-    ANY,
-    COUNTS,
-    ERRORS,
-    SOLVERS,
-    WORD,
-    Seen,
-    batches,
-    check,
-    finite,
-    many,
-    numbers,
-    options,
-    same,
-)
+from strategies import ANY, COUNTS, ERRORS, SOLVERS, WORD, Seen, batches, check, finite, many, numbers, options, same
 
 from kornia_pnpnet import (
     Pose,

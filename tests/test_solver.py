@@ -596,16 +596,20 @@ def test_known_noise_has_the_units_of_the_inputs(make_problems, perturb):
 
 
 @pytest.mark.parametrize("name", ["img_sigma", "world_sigma"])
-def test_an_impossible_noise_fails_its_problem_alone(name, make_problems):
+@pytest.mark.parametrize("solver", ["pnpnet-set", "epnp-lm"])
+def test_an_impossible_noise_fails_its_problem_alone(solver, name, make_problems):
     p = make_problems(batch=6, noise=False)
-    solver = create_solver("epnp-lm")
+    solver = create_solver(solver).double()
     sigma = torch.tensor([1.0, -1.0, torch.inf, 0.0, torch.nan, 1.0], dtype=torch.float64)
-    result = solver(*p[:3], **{name: sigma})
+    img = p.img_points.clone().requires_grad_()
+    result = solver(p.world_points, img, p.intrinsics, **{name: sigma})
+    result.translation.sum().backward()
+    assert img.grad.isfinite().all()
     assert not result.ok[[1, 2]].any()
     assert result.ok[[0, 5]].all()
     assert result.matrix.isfinite().all()
     alone = solver(*only(slice(5, 6), p[:3]), **{name: sigma[5:]})
-    assert torch.equal(alone.matrix[0], result.matrix[5])
+    torch.testing.assert_close(alone.matrix[0], result.matrix[5], rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["pnpnet-set", "pnpnet-n9", "epnp-lm", "p3p-ransac"])
@@ -666,14 +670,3 @@ def test_views_keep_the_noise_and_the_hypotheses_of_a_set_network(make_problems)
     rates = [success(pose_errors(result.pose, p.pose)).float().mean() for result in (one, three)]
     assert rates[1] > rates[0] - 0.02
     assert three.ok.float().mean() > 0.99
-
-
-@pytest.mark.parametrize("name", ["pnpnet-set", "epnp-lm"])
-def test_an_infinite_sigma_is_a_bad_problem_with_finite_gradients(name, make_problems):
-    p = make_problems(batch=2)
-    img = p.img_points.clone().requires_grad_()
-    sigma = torch.tensor([torch.inf, 0.05], dtype=torch.float64)
-    result = create_solver(name).double()(p.world_points, img, p.intrinsics, world_sigma=sigma, img_sigma=1.0)
-    result.translation.sum().backward()
-    assert result.ok.tolist() == [False, True]
-    assert img.grad.isfinite().all()
