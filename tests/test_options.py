@@ -168,7 +168,7 @@ def test_any_options_work_or_are_refused(name):
             use(product, values)
 
     run()
-    made.both()
+    made.both(1)
 
 
 #: Options that make no sense, by constructor.
