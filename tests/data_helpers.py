@@ -4,8 +4,6 @@ import math
 
 import numpy as np
 import torch
-from hypothesis import given
-from strategies import Seen, are_rotations, finite, many
 
 from kornia_pnpnet.core.trees import iter_tensors
 from kornia_pnpnet.data import Scene, SyntheticProblems, View
@@ -89,20 +87,3 @@ def make_view(name="a.jpg", count=30, seed=0, inliers=None):
 
 def make_scene(*counts, metric=True):
     return Scene("toy", tuple(make_view(f"{i}.jpg", count, seed=i) for i, count in enumerate(counts)), (), metric)
-
-
-def check_any_options(chosen, make):
-    """Every source that the drawn options make draws sound problems; other options are refused."""
-    made = Seen()
-
-    @many(80)
-    @given(chosen)
-    def run(values):
-        problems = made(lambda: make(values))
-        if problems is not None:
-            finite(problems._replace(img_sigma=None, world_sigma=None))
-            are_rotations(problems.pose.rotation)
-            assert problems.inliers.shape == problems.world_points.shape[:2]
-
-    run()
-    made.both()

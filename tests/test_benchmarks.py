@@ -39,7 +39,7 @@ def written(tmp_path_factory):
     path = tmp_path_factory.mktemp("benchmark") / "solvers.json"
     sizes = ("--count", "20", "--repeats", "3", "--memory-count", "20")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(benchmark, "MEMORY_RUNS", 2)
+        patch.setattr(benchmark, "MEMORY_RUNS", 1)
         benchmark.main(["--out", str(path), *sizes, "--solvers", *SOLVERS])
     return json.loads(path.read_text())
 
@@ -69,16 +69,20 @@ def test_every_solver_has_a_row_for_every_set_it_solves(written):
 
 def test_memory_is_the_largest_peak_of_processes_of_their_own(written, monkeypatch):
     (memory,) = written["memory"]
-    assert memory["solver"] == SOLVERS[1]
-    assert len(memory["runs"]) == 2
-    assert all(run["peak_bytes"] > run["imports_bytes"] > 2**26 for run in memory["runs"])  # PyTorch alone is more
-    assert memory["peak_bytes"] == max(run["peak_bytes"] for run in memory["runs"])
-    assert memory["met"] == (memory["peak_bytes"] < memory["target_bytes"])
-    with pytest.raises(RuntimeError, match="nonsense"):
-        benchmark.measure_memory("nonsense", 5, 0)
-    monkeypatch.setattr(benchmark, "MEMORY_TARGET", 2**20)
-    monkeypatch.setattr(benchmark, "run_child", lambda *_: {"imports_bytes": 2**20, "peak_bytes": 2**21})
-    assert not benchmark.measure_memory("p3p-ransac", 5, 0)["met"]
+    (run,) = memory["runs"]
+    assert memory["peak_bytes"] == run["peak_bytes"] > run["imports_bytes"] > 2**26  # PyTorch alone is more
+    runs = iter([{"imports_bytes": 2**20, "peak_bytes": peak} for peak in (2**21, 2**20)])
+    monkeypatch.setattr(benchmark, "MEMORY_RUNS", 2)
+    monkeypatch.setattr(benchmark, "MEMORY_TARGET", 2**20 + 1)
+    monkeypatch.setattr(benchmark, "run_child", lambda *_: next(runs))
+    memory = benchmark.measure_memory("p3p-ransac", 5, 0)
+    assert (memory["peak_bytes"], memory["met"]) == (2**21, False)
+
+
+def test_a_child_that_fails_stops_the_measurement(tmp_path):
+    (tmp_path / "child.py").write_text("raise SystemExit(3)")
+    with pytest.raises(RuntimeError, match="failed"):
+        harness.run_child(tmp_path / "child.py")
 
 
 def test_a_speedup_is_the_median_over_rounds_of_the_ratio_on_the_same_set():
@@ -91,16 +95,6 @@ def test_a_speedup_is_the_median_over_rounds_of_the_ratio_on_the_same_set():
     assert not entry["met"]
     elsewhere = solver_row("opencv-epnp", [9.0], "n = 9, no outliers")
     assert benchmark.speedups([solver_row("epnp", [1.0]), elsewhere]) == []
-
-
-def test_tables_show_every_number_and_verdict(written):
-    table = benchmark.format_tables(written)
-    for entry in written["rows"]:
-        assert f"{entry['median_us']:.1f} µs" in table
-        assert f"{100 * entry['success']['rate']:.1f} %" in table
-    verdicts = [entry["met"] for entry in (*written["speedups"], *written["memory"])]
-    assert table.count("| met |") == sum(verdicts)
-    assert table.count("missed") == len(verdicts) - sum(verdicts)
 
 
 def test_peers_are_timed_without_our_adapter(make_problems):
@@ -119,20 +113,6 @@ def test_missing_packages_are_skipped_with_a_reason(monkeypatch):
     assert "PoseLib" in results["skipped"]["poselib"]
     assert {entry["solver"] for entry in results["rows"]} == {"epnp"}
     assert results["speedups"] == results["memory"] == []
-
-
-@pytest.mark.parametrize(
-    ("arguments", "named"),
-    [
-        (["--solvers", "nonsense"], "nonsense"),
-        (["--solvers", "epnp:unknown=1"], "unknown"),
-        (["--count", "0"], "count"),
-    ],
-)
-def test_wrong_arguments_are_named(arguments, named, capsys):
-    with pytest.raises(SystemExit):
-        benchmark.main(arguments)
-    assert named in capsys.readouterr().err
 
 
 def test_sets_differ_and_the_same_seed_gives_the_same_problems():
@@ -179,14 +159,6 @@ def test_timers_take_turns_and_no_garbage_is_collected_meanwhile():
     assert order == [("a", False), ("b", False), ("a", False), ("b", False)]
     assert found == {"a": [1.0, 3.0], "b": [2.0, 4.0]}
     assert gc.isenabled()
-
-
-def test_quantiles_are_values_that_were_measured():
-    values = [float(x) for x in range(1, 101)]
-    found = harness.quantiles(values[::-1], 200)
-    assert (found[0], found[100], found[198], found[-1]) == (1.0, 50.0, 99.0, 100.0)
-    assert len(found) == 201
-    assert set(harness.quantiles([3.0], 4)) == {3.0}
 
 
 def test_a_target_is_met_at_its_limit():
@@ -382,19 +354,6 @@ def test_targets_of_latency():
     assert not tail["met"]
 
 
-@pytest.mark.slow
-def test_cold_starts_and_memory(measured):
-    starts = measured[1]["startup"]["starts"]
-    modes = {(entry["contender"], entry["backward"]) for entry in starts}
-    assert modes == {(name, backward) for name in SMALL for backward in (False, True) if name != LOOP or not backward}
-    for entry in starts:
-        (call,) = entry["calls"]
-        assert call["first_s"] > 0
-        assert (entry["memory"] is None) == (entry["contender"] == LOOP)
-        if entry["memory"]:
-            assert entry["memory"]["peak_bytes"] >= entry["memory"]["before_bytes"] > 2**26
-
-
 def test_a_large_call_shows_in_the_memory_of_its_process():
     request = {"contender": "refinement", "backward": True, "device": "cpu", "batches": [2], "memory_batch": 5000}
     found = harness.run_child(FOLDER / "process.py", json.dumps(request), OMP_NUM_THREADS="1")
@@ -431,38 +390,3 @@ def test_the_pages_are_rendered_from_their_files():
     results = json.loads((FOLDER / "solvers.json").read_text())
     assert benchmark.page(results) == (FOLDER / "solvers.md").read_text(encoding="utf-8")
     assert page.page(*page.load_parts(FOLDER)) == page.PAGE.read_text(encoding="utf-8")
-
-
-@pytest.mark.slow
-def test_a_page_shows_the_numbers_of_a_small_run(measured, tmp_path):
-    pytest.importorskip("seaborn")
-    folder, results = measured
-    performance.main(["render", "--results", str(folder), "--page", str(tmp_path / "a.md")])
-    text = (tmp_path / "a.md").read_text(encoding="utf-8")
-    assert sorted(path.name for path in (tmp_path / "a").iterdir()) == ["batch.png", "latency.png", "pairs.png"]
-    for row in results["throughput"]["rows"]:
-        if (row["n"], row["batch"]) == (9, settings.QUICK.problems):
-            assert page.three_digits(row["median_us"]) in text
-    for row in results["latency"]["rows"]:
-        assert page.three_digits(row["median_us"] / 1e3) in text
-
-
-@pytest.mark.slow
-def test_the_page_shows_verdicts_and_a_gpu(measured):
-    results = {key: dict(value) for key, value in measured[1].items()}
-    found = [
-        harness.target("a", 1.0, 2.0, unit="s", at_most=True),
-        harness.target("b", 1.0, 2.0, unit="", at_most=False),
-    ]
-    results["startup"]["targets"] = found
-    success = {"rate": 0.5, "low": 0.2, "high": 0.8, "total": 4}
-    rows = [a_time("refinement", [time], batch=batch, success=success) for time, batch in ((2.0, 10), (1.0, 1000))]
-    text = page.page(results, {"rows": rows, "environment": {"gpu": "a GPU"}})
-    assert "| a | at most 2 s | 1.00 s | met |" in text
-    assert "| b | at least 2 | 1.00 | **missed** |" in text
-    assert "| `refinement` | 1000 | 1.00e+06 | 50.0 [20.0, 80.0] |" in text
-
-
-def test_numbers_have_three_digits():
-    numbers = {0.01234: "0.0123", 1.0: "1.00", 99.96: "100", 123.4: "123", 1234.5: "1,234"}
-    assert {number: page.three_digits(number) for number in numbers} == numbers

@@ -5,25 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from kornia_pnpnet.core.linalg import (
-    dot,
-    eigenvectors,
-    factorise,
-    nearest_rotation,
-    small_product,
-    solve_leading,
-    substitute,
-)
+from kornia_pnpnet.core.linalg import eigenvectors, factorise, nearest_rotation, solve_leading, substitute
 from kornia_pnpnet.geometry import rotation_angle
-
-
-def test_products_are_those_of_matmul(generator):
-    a = torch.randn(2, 3, 5, generator=generator, dtype=torch.float64)
-    b = torch.randn(3, 4, 5, generator=generator, dtype=torch.float64)
-    expected = (a.permute(2, 0, 1) @ b.permute(2, 0, 1)).permute(1, 2, 0)
-    torch.testing.assert_close(small_product(a, b), expected)
-    torch.testing.assert_close(dot(a[0], b[:, 0]), expected[0, 0])
-
 
 # --- the nearest rotation -------------------------------------------------------------------------------------------
 

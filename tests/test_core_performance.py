@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import pickle
 import warnings
-from functools import partial
 
 import pytest
 import torch
@@ -13,8 +12,8 @@ from torch._dynamo.testing import CompileCounter
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from kornia_pnpnet import MLPInit, PnPNet, Pose, RobustWeightedLM, create_solver
-from kornia_pnpnet.core.performance import Compiled, problems_last, repeat_problems, split_batch
-from kornia_pnpnet.core.trees import iter_tensors, map_tensors
+from kornia_pnpnet.core.performance import Compiled, problems_last
+from kornia_pnpnet.core.trees import iter_tensors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.geometry import project
 from kornia_pnpnet.types import PnPResult
@@ -51,11 +50,10 @@ def assert_same(result, expected, **tolerance):
 @pytest.mark.parametrize(
     ("name", "views", "whole", "graphs"),
     [
-        *((name, 1, False, 3) for name in ("pnpnet-n9", "epnp-lm", "reppnp-lm")),
-        ("pnpnet-n9", 3, False, 4),  # and the choice among the starts
-        ("pnpnet-set", 1, False, 4),
-        ("pnpnet-n9", 1, True, 1),
+        ("pnpnet-n9", 3, False, 4),  # the fourth is the choice among the starts
         ("pnpnet-n9", 3, True, 1),
+        *(pytest.param(name, 1, False, 3, marks=pytest.mark.slow) for name in ("pnpnet-n9", "epnp-lm", "reppnp-lm")),
+        pytest.param("pnpnet-set", 1, False, 4, marks=pytest.mark.slow),
     ],
 )
 def test_each_part_is_one_graph_and_the_batch_may_change(name, views, whole, graphs, backend):
@@ -70,7 +68,7 @@ def test_each_part_is_one_graph_and_the_batch_may_change(name, views, whole, gra
     assert backend.frame_count == graphs  # before, in and after an iteration
 
 
-@pytest.mark.parametrize(("views", "whole"), [(1, False), (2, False), (2, True)])
+@pytest.mark.parametrize(("views", "whole"), [(1, False), (2, True)])
 def test_gradients_are_those_of_the_eager_solver(views, whole, backend):
     solver = create_solver("pnpnet-n9", m=2).double()
     solver.views = views
@@ -88,7 +86,7 @@ def test_gradients_are_those_of_the_eager_solver(views, whole, backend):
 
 
 def test_the_first_stage_alone_and_other_arguments(backend):
-    eager, compiled = create_solver("pnpnet-n9"), create_solver("pnpnet-n9")
+    eager, compiled = create_solver("pnpnet-n9", m=1), create_solver("pnpnet-n9", m=1)
     compiled.compile()
     inputs = problems(3)[:3]
     weights = torch.ones(3, 9, dtype=torch.float64)
@@ -149,7 +147,7 @@ def test_what_recompiling_warns_of_is_no_reason_to_stop(backend):
 
 
 def test_errors_of_the_caller_are_the_callers(backend):
-    solver = create_solver("pnpnet-n9")
+    solver = create_solver("pnpnet-n9", m=0)
     solver.compile()
     world, img, intrinsics = problems(3)[:3]
     with pytest.raises(Exception, match=r"img_points must have the shape"):
@@ -157,15 +155,14 @@ def test_errors_of_the_caller_are_the_callers(backend):
     with pytest.raises(Exception, match=r"built for n = 9"):
         solver(world[:, :8], img[:, :8], intrinsics)
     with torch.no_grad():
-        assert solver(world, img, intrinsics).ok.any()
+        assert solver(world, img, intrinsics).matrix.isfinite().all()
 
 
-@pytest.mark.parametrize("whole", [False, True])
-def test_compiling_changes_no_weights_and_copies_use_their_own(whole, backend):
-    solver = create_solver("pnpnet-n9", m=1)
+def test_compiling_changes_no_weights_and_copies_use_their_own(backend):
+    solver = create_solver("pnpnet-n9", m=0)
     eager = copy.deepcopy(solver)
     names, inputs = list(solver.state_dict()), problems(3)[:3]
-    for again in (not whole, whole):  # compiling again replaces what was compiled
+    for again in (True, False):  # compiling again replaces what was compiled
         solver.compile(whole=again)
         with torch.no_grad():
             assert_same(solver(*inputs), eager(*inputs), rtol=1e-6, atol=1e-6)
@@ -227,15 +224,6 @@ def test_inductor_computes_the_same_with_more_pairs_than_problems():
         torch.testing.assert_close(ours.matrix, eager.matrix, rtol=1e-3, atol=1e-3)
 
 
-@pytest.mark.slow
-def test_without_a_real_compiler():
-    torch.compiler.reset()
-    with torch._inductor.config.patch({"cpp.cxx": ("/no/such/compiler",), "force_disable_caches": True}):
-        three = Compiled(partial(torch.mul, 3.0))
-        with pytest.warns(RuntimeWarning, match="Not compiled"):
-            assert torch.equal(three(torch.ones(2000)), 3 * torch.ones(2000))
-
-
 def test_problems_last_changes_only_the_order_of_memory(make_problems, correspond):
     corr, pose = correspond(make_problems(n=4, batch=7))
     laid = problems_last(corr)
@@ -245,16 +233,3 @@ def test_problems_last_changes_only_the_order_of_memory(make_problems, correspon
     assert laid.world_points.stride() == laid.img_points.stride() == (1, 7, 28)
     assert laid.weights.stride() == (1, 7)
     assert all(x.stride() == (1, 7) for x in iter_tensors(project(pose, laid)))  # arithmetic keeps the layout
-
-
-def test_repeated_problems_are_the_problems_several_times(make_problems, correspond):
-    corr, _ = correspond(make_problems(n=4, batch=3))
-    for one, other in zip(iter_tensors(repeat_problems(corr, 2)), iter_tensors(corr), strict=True):
-        assert torch.equal(one, torch.cat((other, other)) if other.ndim else other)
-
-
-def test_split_batches_join_to_the_batch(make_problems):
-    problems = make_problems(batch=7)
-    parts = split_batch(problems, 3)
-    joined = map_tensors(lambda *x: torch.cat(x), *parts)
-    assert all(torch.equal(*pair) for pair in zip(iter_tensors(joined), iter_tensors(problems), strict=True))

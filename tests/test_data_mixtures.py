@@ -4,10 +4,8 @@ from functools import partial
 
 import pytest
 import torch
-from data_helpers import check_any_options, reprojection, same
-from hypothesis import strategies as st
+from data_helpers import reprojection, same
 from kornia.core.exceptions import BaseError
-from strategies import ANY, COUNTS, options
 
 from kornia_pnpnet.data import BoxPoints, MixedProblems, OutlierMix, SyntheticProblems, VaryingSize
 from kornia_pnpnet.geometry import transform
@@ -44,11 +42,6 @@ def test_answers_of_mixed_problems_stay_with_their_problems():
     assert wrong.double().mean() > 0.2
 
 
-def test_mixed_batches_have_the_requested_size():
-    for size in (1, 2, 7):
-        assert len(mixed(batch_size=size).batch(0).inliers) == size
-
-
 def test_shares_that_do_not_fit_raise():
     for count, shares in ((0, None), (2, (1.0,)), (2, (1.0, 0.0)), (2, (1.0, -1.0))):
         with pytest.raises(BaseError, match=f"{count} sources"):
@@ -67,14 +60,3 @@ def test_varying_sizes_are_reproducible_and_come_from_the_list():
     one, two = (VaryingSize(mixture, n=[5, 9, 20], batch_size=40, seed=3) for _ in range(2))
     assert all(same(one.batch(i), two.batch(i)) for i in range(30))
     assert {tuple(one.batch(i).inliers.shape) for i in range(30)} == {(40, 5), (22, 9), (10, 20)}
-
-
-def test_mixtures_of_any_options():
-    def make(values):
-        given_options, count = values
-        sizes = {key: value for key, value in given_options.items() if key != "shares"}
-        mixture = partial(MixedProblems, [SyntheticProblems] * count, shares=given_options.get("shares"))
-        return VaryingSize(mixture, **{"n": (5, 9), "batch_size": 6, **sizes}).batch(3)
-
-    chosen = options(n=st.lists(COUNTS, max_size=3), batch_size=COUNTS, seed=COUNTS, shares=st.lists(ANY, max_size=3))
-    check_any_options(st.tuples(chosen, st.integers(0, 3) | st.just(2)), make)

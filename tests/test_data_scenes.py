@@ -6,20 +6,9 @@ from dataclasses import replace
 
 import pytest
 import torch
-from data_helpers import (
-    HEIGHT,
-    WIDTH,
-    assert_counts,
-    assert_uniform,
-    check_any_options,
-    make_scene,
-    make_view,
-    reprojection,
-    same,
-)
+from data_helpers import HEIGHT, WIDTH, assert_counts, assert_uniform, make_scene, make_view, reprojection, same
 from kornia.core.exceptions import BaseError
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
-from strategies import ANY, BOOL, COUNTS, options
 from torch.testing import assert_close
 
 from kornia_pnpnet.core.trees import iter_tensors
@@ -205,25 +194,8 @@ def test_success_limit():
 
 
 def test_wrong_arguments():
-    for name in ("n", "batch_size", "num_spares"):
-        with pytest.raises(BaseError, match=f"{name} must be .* at least 1"):
-            SceneProblems(make_scene(20), **{name: 0})
     with pytest.raises(ValueError, match="no image of 'toy' has the 51 points for n = 50 and num_spares = 1"):
         SceneProblems(make_scene(20, 30), n=50)
     for name in ("near_share", "structured_share"):  # their pixels would be those of inliers
         with pytest.raises(BaseError, match=f"{name}.*0.5"):
             SceneProblems(make_scene(20), outliers=OutlierMix(**{name: 0.5}))
-
-
-def test_scenes_of_any_options():
-    scene = make_scene(20, 12)
-    chosen = options(
-        n=COUNTS,
-        batch_size=COUNTS,
-        seed=COUNTS,
-        num_spares=COUNTS,
-        translation_box=ANY,
-        max_angle=ANY,
-        recentre=BOOL,
-    )
-    check_any_options(chosen, lambda values: SceneProblems(scene, **{"batch_size": 4, **values}).batch(0))

@@ -76,14 +76,6 @@ def test_an_error_of_the_source_arrives_with_its_message(workers):
     assert not multiprocessing.active_children()
 
 
-def test_the_global_generator_is_left_alone():
-    torch.manual_seed(5)
-    expected = torch.rand(3)
-    torch.manual_seed(5)
-    list(stream_batches(make_source(), 0, 3, 1))
-    assert torch.equal(torch.rand(3), expected)
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_to_the_group_does_not_end_the_workers(number):
     source = make_source()

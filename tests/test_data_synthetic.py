@@ -5,15 +5,12 @@ import math
 
 import pytest
 import torch
-from data_helpers import COUNT, assert_normal, assert_uniform, check_any_options, draw, reprojection, same
-from hypothesis import strategies as st
-from kornia.core.exceptions import BaseError
+from data_helpers import COUNT, assert_normal, assert_uniform, draw, reprojection, same
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
-from strategies import ANY, COUNTS, RANGES, options
 
 from kornia_pnpnet import Pose, Problems
 from kornia_pnpnet.core.trees import iter_tensors
-from kornia_pnpnet.data import BoxPoints, ObjectPoints, OutlierMix, SlabPoints, SyntheticProblems
+from kornia_pnpnet.data import OutlierMix, SlabPoints, SyntheticProblems
 from kornia_pnpnet.data.draws import random_poses
 from kornia_pnpnet.geometry import transform
 
@@ -95,14 +92,6 @@ def test_noise_from_a_range_is_log_uniform_over_the_problems(name):
     assert (sigma(constant) / 0.05 - 1).abs().max() < 0.4
 
 
-def test_noise_that_cannot_be_drawn_is_refused():
-    for name, sigma in itertools.product(
-        ("img_sigma", "world_sigma"), (-1.0, (0.0, 1.0), (2.0, 1.0), (1.0,), (1.0, 2.0, 3.0))
-    ):
-        with pytest.raises(BaseError, match=name):
-            SyntheticProblems(**{name: sigma})
-
-
 def test_a_share_of_problems_comes_with_sigmas():
     p = draw(4, known_noise=0.4, img_sigma=(0.5, 5.0), world_sigma=0.05)
     known = [~x.isnan() for x in (p.img_sigma, p.world_sigma)]
@@ -162,34 +151,3 @@ def test_dtype_and_shapes():
     assert [tuple(x.shape) for x in iter_tensors(p)] == [(3, 4, 3), (3, 4, 2), (3, 3, 3), (3, 3, 3), (3, 3), (3, 4)]
     assert {x.dtype for x in iter_tensors(double)} == {torch.float64, torch.bool}
     assert same(double.map(lambda x: x.float() if x.dtype == torch.float64 else x), p)
-
-
-# --- any options ------------------------------------------------------------------------------------------------------
-
-POINTS = {
-    BoxPoints: options(half_width=ANY, z_near=ANY, depth=ANY),
-    SlabPoints: options(window=RANGES, field_of_view=ANY, distance=RANGES, tilt=ANY, thickness=RANGES),
-    ObjectPoints: options(distance=RANGES, field_of_view=ANY, thinnest=ANY, planar=ANY),
-}
-SOURCE = options(
-    n=COUNTS,
-    batch_size=COUNTS,
-    seed=COUNTS,
-    translation_box=ANY,
-    translation_sigma=ANY,
-    max_angle=ANY,
-    focal=ANY,
-    half_image=ANY,
-    img_sigma=ANY | RANGES,
-    world_sigma=ANY | RANGES,
-    known_noise=ANY,
-)
-
-
-@pytest.mark.parametrize("prior", POINTS)
-def test_problems_of_any_options(prior):
-    def make(chosen):
-        source, points = chosen
-        return SyntheticProblems(**{"batch_size": 4, **source}, points=prior(**points)).batch(0)
-
-    check_any_options(st.tuples(SOURCE, POINTS[prior]), make)

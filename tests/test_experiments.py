@@ -110,11 +110,3 @@ def test_sweep_tests_on_the_mix_it_trains_on(max_ratio):
     most = {source.outliers.max_count(12) for source in sources}
     assert most == {round(12 * float(max_ratio))}
     assert len({source.seed for source in sources}) == 2
-
-
-def test_finetune_goes_on_with_weights_on_sharper_slabs_and_two_views():
-    config = composed("experiment=finetune", "weights=pnpnet-n9")
-    _, slabs = instantiate(config.data.train).sources
-    assert list(slabs.world_sigma) == [0.002, 0.05]
-    assert instantiate(config.model.solver).views == 2
-    assert config.train.ramp == [0.0, 0.0]

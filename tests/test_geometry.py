@@ -100,9 +100,8 @@ ROTATIONS = {"any": None, "identity": 0.0, "near_identity": 1e-5, "taylor_switch
 RETRACTIONS = {"retraction": retract, "additive": retract_additive}
 
 
-@pytest.mark.parametrize("shift", [0.0, 1e4])
+@pytest.mark.parametrize(("n", "shift"), [(3, 0.0), (9, 1e4)])
 @pytest.mark.parametrize("angle", ROTATIONS.values(), ids=ROTATIONS.keys())
-@pytest.mark.parametrize("n", [3, 9])
 @pytest.mark.parametrize("update", RETRACTIONS)
 def test_normal_equations_are_of_the_derivative_through_the_retraction(update, n, angle, shift, random_rotations):
     """The Jacobian by autograd is that by central differences, and makes the analytic equations."""
@@ -132,31 +131,7 @@ def test_normal_equations_are_of_the_derivative_through_the_retraction(update, n
         assert ((right_side - gradient) / most).abs().max() < tolerance
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("unit", [2.0**-20, 2.0**20])
-def test_normal_equations_in_another_unit_of_the_world(unit, dtype, random_rotations):
-    """A translation is the unit's, a turn is not: to the bit, since powers of two round nothing."""
-    corr, pose = map_tensors(lambda x: x.to(dtype), random_scene(9, random_rotations(7)))
-    scaled = corr._replace(world_points=unit * corr.world_points)
-    matrix, right_side = normal_matrices(pose._replace(translation=unit * pose.translation), scaled, corr.weights)
-    expected_matrix, expected = normal_matrices(pose, corr, corr.weights)
-    unit = torch.tensor([1.0] * 3 + [unit] * 3, dtype=dtype)
-    factor = matrix[:, :1, :1] / expected_matrix[:, :1, :1]  # a common factor of the equations is free
-    assert torch.equal(unit[:, None] * matrix * unit, factor * expected_matrix)
-    assert torch.equal(unit * right_side, factor[:, 0] * expected)
-
-
 # --- retraction -----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("angle", ROTATIONS.values(), ids=ROTATIONS.keys())
-def test_retraction_by_zero_is_the_identity(angle, random_rotations):
-    pose = Pose(random_rotations(7, angle=angle), torch.arange(21, dtype=torch.float64).view(7, 3))
-    # The additive update passes kornia's rotation vector, accurate to 2e-10 in its low-angle branch.
-    for update, atol in ((retract, 0.0), (retract_additive, 1e-9)):
-        moved = update(pose, torch.zeros(7, 6, dtype=torch.float64))
-        torch.testing.assert_close(moved.rotation, pose.rotation, rtol=0, atol=atol)
-        assert torch.equal(moved.translation, pose.translation)
 
 
 @pytest.fixture
@@ -172,7 +147,7 @@ def turns(random_rotations, generator):
     return pose, delta, exponential
 
 
-@pytest.mark.parametrize("length", [1e-12, 1e-6, 1e-3, 0.03, 1.0, 30.0, 1e6])
+@pytest.mark.parametrize("length", [0.0, 1e-12, 1e-3, 0.03, 1.0, 1e6])
 def test_retraction_is_cayleys(length, turns):
     """It turns about its axis by 2 arctan(length / 2) = x - x³/12 + x⁵/80 - …; the opposite one undoes it."""
     pose, delta, exponential = turns
@@ -201,17 +176,10 @@ def test_retraction_by_anything_is_a_rotation_with_finite_gradients(length, dtyp
     assert delta.grad.isfinite().all()
 
 
-def test_gradcheck_of_the_retraction(turns):
-    pose, delta, _ = turns
-    leaves = [x[:3].clone().requires_grad_() for x in (*pose, delta)]
-    for factor in (0.0, 1.0):
-        assert torch.autograd.gradcheck(lambda r, t, d, factor=factor: tuple(retract(Pose(r, t), factor * d)), leaves)
-
-
 def test_additive_update_adds_rotation_vectors():
     vector, change = torch.tensor([[[0.3, -0.2, 0.5]], [[0.1, 0.4, -0.2]]], dtype=torch.float64)
     pose = Pose(axis_angle_to_rotation_matrix(vector), torch.zeros(1, 3).double())
-    for factor in (1.0, 1e-3, 10.0):
+    for factor in (0.0, 1.0, 1e-3, 10.0):
         moved = retract_additive(pose, torch.cat((factor * change, torch.ones(1, 3).double()), 1))
         torch.testing.assert_close(moved.rotation, axis_angle_to_rotation_matrix(vector + factor * change))
         torch.testing.assert_close(moved.translation, torch.ones(1, 3).double())

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
+from init_helpers import assert_same, change, flattened
 
-from kornia_pnpnet import Correspondences, Pose
+from kornia_pnpnet import Correspondences, Pose, pose_errors
 from kornia_pnpnet.init import EPnP, REPPnP
 
 INITIALISERS = {"EPnP": EPnP(), "EPPnP": REPPnP(reject_outliers=False), "REPPnP": REPPnP()}
@@ -16,36 +17,22 @@ def init(request):
     return INITIALISERS[request.param]
 
 
-def change(corr, **changes):
-    """Other pairs, without the scales of the normalisation."""
-    return corr._replace(img_scale=None, world_scale=None, **changes)
-
-
-def flattened(corr, truth):
-    """The same pairs with the world points moved along their rays onto a slanted plane."""
-    normal = torch.tensor([0.2, -0.3, 1.0], dtype=torch.float64)
-    rays = torch.nn.functional.pad(corr.img_points / corr.focal, (0, 1), value=1.0)
-    cam_points = rays * (2.0 / (rays @ normal))[..., None]
-    return change(corr, world_points=(cam_points - truth.translation[:, None]) @ truth.rotation)
-
-
 def select(corr, pairs):
     """Some of the pairs of every problem."""
     return corr.map(lambda x: x[:, pairs] if x.ndim > 1 else x)
 
 
-def assert_same(got, expected, tolerance=1e-7):
-    torch.testing.assert_close(got.rotation, expected.rotation, rtol=0, atol=tolerance)
-    torch.testing.assert_close(got.translation, expected.translation, rtol=tolerance, atol=tolerance)
-
-
 @pytest.mark.parametrize(("n", "planar"), [(6, False), (50, False), (5, True), (20, True)])
 def test_exact_pairs_give_the_exact_pose(init, n, planar, make_problems, correspond):
     corr, truth = correspond(make_problems(n, 100, noise=False))
-    guess = init(flattened(corr, truth) if planar else corr)
+    corr = flattened(corr, truth) if planar else corr
+    guess = init(corr)
     assert guess.ok.all()
     assert guess.weights.all()
     assert_same(guess.pose, truth, 1e-6)
+    single = pose_errors(init(corr.map(torch.Tensor.float)).pose, Pose(*(x.float() for x in truth)))
+    assert single.rotation_error_deg.max() < 0.05
+    assert single.translation_error.max() < 0.02
 
 
 @pytest.mark.parametrize("planar", [False, True])
@@ -90,21 +77,6 @@ def test_a_pair_with_weight_zero_is_ignored(init, make_problems, correspond, gen
     assert torch.equal(zero.weights[:, keep], removed.weights)
     assert torch.equal(zero.ok, removed.ok)
     assert_same(Pose(*(x[zero.ok] for x in zero.pose)), Pose(*(x[zero.ok] for x in removed.pose)))
-
-
-def test_other_problems_change_no_bit(init, make_problems, correspond):
-    corr, _ = correspond(make_problems(9, 40, outliers=2))
-    before = init(corr)
-    odd = torch.arange(40) % 2 == 1
-    for bad in (torch.nan, torch.inf, 0.0, 1e30):
-        world, img = (torch.where(odd[:, None, None], bad, x) for x in (corr.world_points, corr.img_points))
-        after = init(corr._replace(world_points=world, img_points=img))
-        for one, other in zip((*before.pose, before.weights), (*after.pose, after.weights), strict=True):
-            assert torch.equal(one[~odd], other[~odd])
-        assert torch.equal(after.ok[~odd], before.ok[~odd])
-        assert not after.ok[odd].any()
-    alone = init(corr.map(lambda x: x[6:7] if x.ndim else x))
-    torch.testing.assert_close(alone.pose.matrix, before.pose.matrix[6:7], rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

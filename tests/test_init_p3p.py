@@ -7,13 +7,12 @@ import math
 import numpy as np
 import pytest
 import torch
-from kornia.core.exceptions import DeviceError, ShapeError, TypeCheckError
+from kornia.core.exceptions import ShapeError, TypeCheckError
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
 from kornia_pnpnet import Correspondences, Pose
 from kornia_pnpnet.data import SyntheticProblems
 from kornia_pnpnet.init import P3P, p3p
-from kornia_pnpnet.init.ransac.law_of_cosines import distances
 from kornia_pnpnet.types import Hypotheses
 
 DTYPES = (torch.float64, torch.float32)
@@ -235,23 +234,6 @@ def test_the_poses_carry_no_gradient_and_can_be_used_where_gradients_flow():
     assert world_points.grad.isfinite().all()
 
 
-def test_distances_fulfil_the_law_of_cosines(generator):
-    rays = torch.randn(3, 3, 1000, generator=generator, dtype=torch.float64)
-    rays = rays / rays.norm(dim=0)  # (xyz, point, C)
-    truth = 0.5 + torch.rand(3, 1000, generator=generator, dtype=torch.float64)
-    points = rays * truth
-    edges = (points.roll(1, 1) - points.roll(-1, 1)).square().sum(0)
-    longest_first = edges[0] >= edges.amax(0)
-    unit = edges[0].sqrt()
-    p, q = edges[2] / edges[0], edges[1] / edges[0]
-    b = (rays.roll(1, 1) - rays.roll(-1, 1)).square().sum(0)
-    g = torch.linalg.det(rays.permute(2, 0, 1)).square()
-    found = torch.stack(distances(p, q, 1.0 - p - q, b, g))  # (3, 2, 2, C)
-    assert found.isfinite().all()
-    apart = (found - (truth / unit)[:, None, None]).abs().amax(0).flatten(0, 1).amin(0)
-    assert (apart[longest_first] < NEAR).all()
-
-
 def test_the_module_reads_normalised_correspondences():
     world_points, plane_points, _ = wide(50)
     focal = torch.tensor(3400.0, dtype=torch.float64)
@@ -261,19 +243,12 @@ def test_the_module_reads_normalised_correspondences():
     assert P3P(**solver.config).sample_size == 3
 
 
-@pytest.mark.parametrize(
-    ("plane_points", "error"),
-    [
-        (torch.zeros(2, 3, 3), ShapeError),
-        (torch.zeros(2, 4, 2), ShapeError),
-        (torch.zeros(3, 3, 2), ShapeError),
-        (torch.zeros(2, 3, 2, dtype=torch.float64), TypeCheckError),
-        (torch.zeros(2, 3, 2, device="meta"), DeviceError),
-    ],
-)
-def test_wrong_arguments_raise(plane_points, error):
-    with pytest.raises(error):
-        p3p(torch.zeros(2, 3, 3), plane_points)
+def test_wrong_arguments_raise():
+    shapes = ((2, 3, 3), (2, 4, 2), (3, 3, 2))
+    wrong = [(torch.zeros(shape), ShapeError) for shape in shapes] + [(torch.zeros(2, 3, 2).double(), TypeCheckError)]
+    for plane_points, error in wrong:
+        with pytest.raises(error):
+            p3p(torch.zeros(2, 3, 3), plane_points)
     with pytest.raises(TypeCheckError, match="float16"):
         p3p(torch.zeros(2, 3, 3).half(), torch.zeros(2, 3, 2).half())
 
@@ -281,7 +256,7 @@ def test_wrong_arguments_raise(plane_points, error):
 @pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
 def test_no_pose_is_missed_beside_poselib(scene):
     poselib = pytest.importorskip("poselib")
-    count = 50_000
+    count = 10_000
     world_points, plane_points, pose = scene(count, seed=1)
     rays = torch.nn.functional.pad(plane_points, (0, 1), value=1.0)
     rays = torch.nn.functional.normalize(rays, dim=-1).numpy()

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import math
 
 import pytest
 import torch
-from kornia.core.exceptions import BaseError, ShapeError
-from torch import nn
+from kornia.core.exceptions import ShapeError
 
-from kornia_pnpnet import Guess, PnPNet, Pose, RobustWeightedLM, pose_errors, success
+from kornia_pnpnet import PnPNet, RobustWeightedLM, pose_errors, success
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.geometry import transform
@@ -31,6 +29,19 @@ def solve(net, problems):
 
 def outputs(guess):
     return (*guess.pose, guess.weights, guess.ok)
+
+
+class Counting(P3P):
+    """P3P that records the number of samples of each call, and the weights of the pairs of each sample."""
+
+    def __init__(self):
+        super().__init__()
+        self.sizes, self.samples = [], []
+
+    def hypotheses(self, corr):
+        self.sizes.append(len(corr.weights))
+        self.samples += corr.weights.unbind()
+        return super().hypotheses(corr)
 
 
 @pytest.fixture
@@ -147,6 +158,19 @@ def test_pairs_without_weight_are_no_inliers(make_problems):
     assert pose_errors(result.pose, problems.pose).rotation_error_deg.max() < 1e-9
 
 
+@pytest.mark.parametrize(("masked", "weighted"), [(True, False), (False, True)])
+def test_pairs_without_weight_are_never_drawn(masked, weighted, make_problems):
+    """Neither pairs that the mask hides nor pairs of weight 0, where there are too many subsets to try each."""
+    problems = make_problems(60, 10, outliers=20)
+    there = torch.rand(10, 60, generator=torch.Generator().manual_seed(0)) < 0.5
+    minimal = Counting()
+    net, K = solver(minimal, **PROTOCOL), problems.intrinsics
+    weights = torch.where(there, 0.1, 0.0).double() if weighted else None
+    net(problems.world_points, problems.img_points, K, weights=weights, mask=there if masked else None)
+    assert len(minimal.samples) > 100
+    assert all((weight > 0).all() for weight in minimal.samples)
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize(("n", "outliers"), [(4, 0), (9, 3), (40, 20)])
 def test_a_problem_has_the_same_result_in_every_batch(n, outliers, dtype, make_problems, correspond):
@@ -173,18 +197,6 @@ def test_chunks_do_not_matter(make_problems, correspond):
         for a, b in zip(outputs(RANSAC(P3P(), **options, chunk_size=size)(corr)), default, strict=True):
             torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
     assert RANSAC(P3P(), **options, chunk_size=1)(take(corr, slice(2))).ok.all()
-
-
-class Counting(P3P):
-    """P3P that records the number of samples of each call."""
-
-    def __init__(self):
-        super().__init__()
-        self.sizes = []
-
-    def hypotheses(self, corr):
-        self.sizes.append(len(corr.weights))
-        return super().hypotheses(corr)
 
 
 @pytest.mark.parametrize(("n", "batch"), [(9, 300), (1000, 3)])
@@ -225,31 +237,6 @@ def test_options_decide_how_many_samples_are_drawn(found, make_problems, corresp
     assert not torch.equal(*poses)
 
 
-def test_bad_problems_fail_alone(make_problems):
-    problems = make_problems(9, 7, outliers=2)
-    world, img = problems.world_points.clone(), problems.img_points.clone()
-    weights = torch.ones_like(world[..., 0])
-    world[1] = math.nan
-    weights[2] = 0.0
-    weights[3, 2:] = 0.0  # two pairs
-    world[4] = world[4, :1] + torch.arange(9, dtype=world.dtype)[:, None]  # a line
-    world[5] = 1.0
-    img[6] = 7.0
-    leaves = [x.requires_grad_() for x in (world, img, weights)]
-    net = solver(**PROTOCOL)
-    result, sound = net(world, img, problems.intrinsics, weights=weights), solve(net, problems)
-    assert result.ok.tolist() == [True] + 6 * [False]
-    for a, b in ((result.rotation, sound.rotation), (result.translation, sound.translation)):
-        assert a.isfinite().all()
-        assert torch.equal(a[0], b[0])
-    (result.rotation.sum() + result.translation.sum() + result.weights.sum()).backward()
-    for leaf in leaves:
-        assert leaf.grad.isfinite().all()
-        assert not leaf.grad[1:].any()
-    assert world.grad[0].any()
-    assert img.grad[0].any()
-
-
 def test_sound_problems_are_ok_and_pixels_of_no_pose_are_not(make_problems):
     for n, outliers in ((3, 0), (4, 0), (5, 0), (9, 3), (40, 28)):
         problems = make_problems(n, 200, outliers=outliers)
@@ -277,50 +264,6 @@ def test_a_scorer_may_be_any_function(make_problems, correspond):
     for a, b in zip(outputs(built_in), outputs(own), strict=True):
         torch.testing.assert_close(a, b)
     assert RANSAC(P3P(), **PROTOCOL, scorer=torch.log1p)(corr).ok.all()
-
-
-class Stubborn(nn.Module):
-    """An initialiser with a guess for every other problem and NaN for every third."""
-
-    def forward(self, corr):
-        index = torch.arange(len(corr.weights))
-        rotation = torch.eye(3, dtype=corr.weights.dtype).repeat(len(index), 1, 1)
-        translation = torch.zeros(len(index), 3, dtype=corr.weights.dtype)
-        translation[::3] = math.nan
-        return Guess(Pose(rotation, translation), torch.ones_like(corr.weights), index % 2 == 0)
-
-
-def test_a_subset_solver_knows_which_poses_are_valid(make_problems, correspond):
-    corr, _ = correspond(make_problems(7, 12))
-    hypotheses = SubsetSolver(Stubborn(), size=7).hypotheses(corr)
-    assert hypotheses.valid[:, 0].tolist() == [i % 2 == 0 and i % 3 != 0 for i in range(12)]
-    assert hypotheses.pose.translation.isfinite().all()
-
-
-def test_the_configuration_is_plain_data():
-    ransac = RANSAC(SubsetSolver(EPnP(), RobustWeightedLM(m=5), size=7), threshold=3.0, scorer=torch.log1p)
-    assert json.loads(json.dumps(ransac.config)) == ransac.config
-    assert ransac.config["minimal"]["init"] == {"name": "EPnP", **EPnP().config}
-    assert ransac.config["threshold"] == 3.0
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"threshold": 0.0},
-        {"threshold": math.nan},
-        {"world_threshold": -1.0},
-        {"scorer": "best"},
-        {"max_samples": 0},
-        {"min_samples": 1.5},
-        {"confidence": 1.0},
-        {"local_iterations": -1},
-        {"size": 2},
-    ],
-)
-def test_wrong_arguments_raise(wrong):
-    with pytest.raises(BaseError, match=next(iter(wrong))):
-        SubsetSolver(EPnP(), **wrong) if "size" in wrong else RANSAC(P3P(), **wrong)
 
 
 def test_the_gradient_is_that_of_the_result(make_problems, correspond):

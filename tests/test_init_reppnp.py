@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from kornia.core.exceptions import BaseError
+from init_helpers import assert_same, change, flattened
 
 from kornia_pnpnet import Correspondences, Normalize, Pose
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
@@ -13,32 +13,14 @@ from kornia_pnpnet.init.reppnp import REPPnP
 from kornia_pnpnet.metrics import pose_errors, success
 
 
-def assert_same(got, expected, tolerance=1e-7):
-    torch.testing.assert_close(got.rotation, expected.rotation, rtol=0, atol=tolerance)
-    torch.testing.assert_close(got.translation, expected.translation, rtol=tolerance, atol=tolerance)
-
-
 def chosen(pose, index):
     return Pose(pose.rotation[index], pose.translation[index])
-
-
-def change(corr, **changes):
-    """Other pairs, without the scales of the normalisation."""
-    return corr._replace(img_scale=None, world_scale=None, **changes)
 
 
 def algebraic_error(corr, pose):
     """Pixel error times depth over focal length, (B, N)."""
     cam_points = transform(pose, corr.world_points)
     return (cam_points[..., :2] - corr.img_points / corr.focal * cam_points[..., 2:]).norm(dim=-1)
-
-
-def flattened(corr, truth):
-    """The same pairs with the world points moved along their rays onto a slanted plane."""
-    normal = torch.tensor([0.2, -0.3, 1.0], dtype=torch.float64)
-    rays = torch.nn.functional.pad(corr.img_points / corr.focal, (0, 1), value=1.0)
-    cam_points = rays * (2.0 / (rays @ normal))[..., None]
-    return change(corr, world_points=(cam_points - truth.translation[:, None]) @ truth.rotation)
 
 
 @pytest.mark.parametrize(("n", "outliers"), [(9, 1), (50, 12)])
@@ -89,17 +71,6 @@ def test_success_on_the_protocols_problems(n, most, floor):
     assert right.double().mean() > floor
 
 
-def test_a_guess_is_hardly_ever_worse_in_float32(make_problems, correspond):
-    corr, truth = correspond(make_problems(20, 500, outliers=3))
-    double = REPPnP()(corr)
-    single = REPPnP()(corr.map(torch.Tensor.float))
-    same = (double.weights == single.weights).all(-1) & success(pose_errors(double.pose, truth), max_translation=0.05)
-    assert same.double().mean() > 0.9
-    errors = pose_errors(Pose(*(x[same].double() for x in single.pose)), chosen(double.pose, same))
-    assert errors.rotation_error_deg.max() < 0.01
-    assert errors.translation_error.max() < 1e-3
-
-
 @pytest.mark.parametrize(("reject_outliers", "planar"), [(False, True), (True, False)])
 def test_gradcheck(reject_outliers, planar, make_problems, correspond):
     corr, truth = correspond(make_problems(9, 1, seed=5))
@@ -147,19 +118,3 @@ def test_the_limit_and_the_quantile_decide_which_pairs_are_kept(make_problems, c
     kept = REPPnP()(corr).weights.sum(-1)
     assert (kept >= 10).all()
     assert (kept > 10).any()
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("quantile", 0.0),
-        ("quantile", 1.1),
-        ("max_error", -1.0),
-        ("null_iterations", -1),
-        ("rigid_iterations", 2.5),
-        ("refine_iterations", 0),
-    ],
-)
-def test_wrong_arguments_raise(name, value):
-    with pytest.raises(BaseError, match=f"{name}.*{value}"):
-        REPPnP(**{name: value})

@@ -7,7 +7,7 @@ import torch
 
 from kornia_pnpnet import Correspondences, Pose
 from kornia_pnpnet.geometry import project, transform
-from kornia_pnpnet.init.ransac.scoring import SCORERS, Scene, standardised_errors
+from kornia_pnpnet.init.ransac.scoring import Scene, standardised_errors
 from kornia_pnpnet.refine.verdict import MAX_ERROR, Thresholds, judge
 
 
@@ -65,38 +65,6 @@ def test_points_behind_the_camera_and_in_its_centre(scene):
     fast = Scene.make(corr, Thresholds(torch.ones(1), torch.zeros(1)), torch.float32)
     pose = Pose(torch.eye(3)[None, None], torch.zeros(1, 1, 3))
     assert standardised_errors(fast, pack(fast, pose)).isfinite().all()
-
-
-def test_packing_keeps_the_poses_and_the_slots(scene):
-    corr, poses, thresholds = scene
-    fast = Scene.make(corr, thresholds, torch.float64)
-    packed = pack(fast, poses)
-    matrices = fast.unpack(packed)
-    torch.testing.assert_close(matrices[..., :3], poses.rotation)
-    torch.testing.assert_close(matrices[..., 3], poses.translation)
-    slots = fast.pack(*(x.unflatten(1, (5, 2)) for x in poses))  # five samples of two solutions
-    torch.testing.assert_close(slots, packed[..., torch.arange(10).view(5, 2).T.flatten()])  # slot by slot
-
-
-def test_losses_are_weighted_sums(scene):
-    corr, poses, thresholds = scene
-    weights = torch.rand(7, 9, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    fast = Scene.make(corr._replace(weights=weights), thresholds, torch.float64)
-    packed = pack(fast, poses)
-    errors = standardised_errors(fast, packed)
-    for name, loss in (("msac", errors.clamp(max=1.0)), ("inliers", (errors >= 1.0).double())):
-        torch.testing.assert_close(fast.losses(packed, SCORERS[name]), (weights[:, :, None] * loss).sum(1))
-
-
-def test_some_pairs_of_some_problems(scene, generator):
-    corr, poses, thresholds = scene
-    fast = Scene.make(corr, thresholds, torch.float64)
-    errors = standardised_errors(fast, pack(fast, poses))
-    chosen = torch.tensor([4, 1])
-    positions = torch.randint(0, 9, (2, 5), generator=generator)
-    some = fast.of(chosen).pairs(positions)
-    part = standardised_errors(some, pack(some, Pose(*(x[chosen] for x in poses))))
-    torch.testing.assert_close(part, errors[chosen].gather(1, positions[..., None].expand(-1, -1, 10)))
 
 
 def test_the_unit_of_the_world_does_not_matter(scene):

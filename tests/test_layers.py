@@ -118,27 +118,14 @@ def test_optional_packages_have_one_door(package, owners):
     assert not {user for user in users if not any(f"{user}.".startswith(f"{owner}.") for owner in owners)}
 
 
-def test_the_house_stays_small():
-    """A newcomer can read each file in one sitting and the top folder at a glance."""
-    assert {name for members in LAYERS for name in members} <= MODULES.keys(), "LAYERS names modules that are gone."
-    top = [path.name for path in ROOT.glob("*.py") if path.name != "__init__.py"]
-    assert len(top) <= 14, top
-    long = {name: count for name, path in MODULES.items() if (count := len(path.read_text().splitlines())) > 450}
-    assert not long, long
-
-
-def test_importing_the_package_imports_no_extras():
-    code = f"import sys, kornia_pnpnet; print([name for name in {EXTRAS!r} if name in sys.modules])"
-    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert output.stdout.strip() == "[]"
-
-
-def test_importing_the_package_leaves_no_trace():
-    """No global state at import: neither the seed, the threads nor the default type change."""
+def test_importing_the_package_imports_no_extras_and_leaves_no_trace():
+    """Importing changes neither the seed, the threads nor the default type."""
     code = (
-        "import torch; torch.manual_seed(5); before = (torch.get_rng_state(), torch.get_num_threads());"
+        "import sys, torch; torch.manual_seed(5); before = (torch.get_rng_state(), torch.get_num_threads());"
         "import kornia_pnpnet; after = (torch.get_rng_state(), torch.get_num_threads());"
         "assert torch.equal(before[0], after[0]) and before[1] == after[1];"
-        "assert torch.get_default_dtype() == torch.float32"
+        "assert torch.get_default_dtype() == torch.float32;"
+        f"print([name for name in {EXTRAS!r} if name in sys.modules])"
     )
-    subprocess.run([sys.executable, "-c", code], check=True)
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert output.stdout.strip() == "[]"

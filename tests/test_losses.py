@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 from hypothesis import given
-from strategies import ANY, BOOL, COUNTS, Seen, batches, finite, gradients_are_finite, many, options
+from strategies import batches, finite, gradients_are_finite, many
 
 from kornia_pnpnet import Guess, Noise, PnPResult, Pose, PoseLoss, SetLoss, create_solver
 from kornia_pnpnet.data import SyntheticProblems
@@ -181,24 +181,3 @@ def test_losses_of_any_result(case):
 
 
 SOLVER = create_solver("pnpnet-set")
-
-
-def test_losses_of_any_options():
-    made = Seen()
-    problems = SyntheticProblems(n=9, batch_size=3, seed=0).batch(0)
-    result, guess = SOLVER.with_guess(*problems[:3])
-
-    @many(80)
-    @given(
-        BOOL,
-        options(refined=ANY, saturation=ANY),
-        options(rotation=ANY, translation=ANY, init_translation=ANY),
-        options(starts=COUNTS, every=ANY, weights=ANY, noise=ANY, rotation_unit=ANY, translation_unit=ANY),
-    )
-    def run(of_set, both, first, second):
-        loss = made(lambda: SetLoss(**both, **second) if of_set else PoseLoss(**both, **first))
-        if loss is not None:
-            finite(loss(result, problems, 1.0, guess) if of_set else loss(result, problems))
-
-    run()
-    made.both()

@@ -39,6 +39,18 @@ def test_these_are_shipped():
     assert set(shipped_weights()) == {f"pnpnet-n{n}" for n in FLOORS} | {"pnpnet-set"}
 
 
+@pytest.mark.parametrize("name", ["no-such-name", "", "a/b/c"])
+def test_an_unknown_name_is_an_error_that_lists_the_shipped_weights_without_a_network(name, monkeypatch):
+    def connect(*_):
+        raise AssertionError("a connection was opened")
+
+    monkeypatch.setattr("socket.socket.connect", connect)
+    monkeypatch.setattr("socket.getaddrinfo", connect)
+    with pytest.raises(FileNotFoundError) as raised:
+        PnPNet.from_pretrained(name)
+    assert all(shipped in str(raised.value) for shipped in shipped_weights())
+
+
 # The same floors for the one set of weights for any rotation and any number of pairs.
 SET_FLOORS = {6: (0.71, 0.55), 9: (0.88, 0.79), 12: (0.94, 0.89), 20: (0.98, 0.97), 50: (0.99, 0.99)}
 

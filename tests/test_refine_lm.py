@@ -9,26 +9,12 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from kornia.core.exceptions import BaseError
-from strategies import (
-    ANY,
-    BOOL,
-    COUNTS,
-    KINDS,
-    Seen,
-    are_rotations,
-    correspondences,
-    finite,
-    gradients_are_finite,
-    many,
-    options,
-    poses,
-)
+from strategies import KINDS, are_rotations, correspondences, finite, gradients_are_finite, many, options, poses
 
 from kornia_pnpnet import Correspondences, Guess, Noise, Pose, RobustWeightedLM, pose_errors
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.geometry import NormalEquations, project, retract, retract_additive
-from kornia_pnpnet.refine import KERNELS, BoundedParameter, explains, lm_step, solve_damped
+from kornia_pnpnet.refine import KERNELS, explains, lm_step, solve_damped
 from kornia_pnpnet.refine.lm import BACKWARDS
 
 DTYPES = (torch.float32, torch.float64)
@@ -142,22 +128,6 @@ def test_singular_systems_are_reported_finite_and_change_no_other(rank, dtype, g
     solution, solved = solve(missing, torch.ones(1, 6, dtype=dtype), number(0.1, dtype))
     assert not solved
     assert solution.isfinite().all()
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_the_units_of_the_unknowns_and_of_the_equations_do_not_matter(dtype, generator):
-    """To the bit: powers of two round nothing. Half of the systems are singular, and stay so."""
-    root = torch.randn(40, 6, 9, generator=generator, dtype=dtype)
-    root[::2, 5] = root[::2, 4]
-    hessian, rhs = root @ root.mT, torch.randn(40, 6, generator=generator, dtype=dtype)
-    solution, solved = solve(hessian, rhs, number(0.0, dtype))
-    assert torch.equal(solved, torch.arange(40) % 2 == 1)
-    for unit in (2.0**-20, 2.0**20):
-        units = torch.tensor([1.0, 1.0, 1.0, unit, unit, unit], dtype=dtype)
-        for scale, factor in ((units, 1.0), (torch.ones_like(units), unit)):
-            scaled, same = solve(factor * scale[:, None] * hessian * scale, factor * scale * rhs, number(0.0, dtype))
-            assert torch.equal((scale * scaled)[solved], solution[solved])
-            assert torch.equal(same, solved)
 
 
 # --- the step -------------------------------------------------------------------------------------------------------
@@ -687,23 +657,6 @@ def test_hyperparameters_start_classical_and_stay_bounded(kernel, shared, case):
         assert all(p.grad.isfinite().all() for p in lm.parameters())
 
 
-@pytest.mark.parametrize("logarithmic", [False, True])
-def test_a_bounded_parameter_is_what_it_was_set_to(logarithmic):
-    for initial in (0.01, 0.011, 0.3, 4.9, 5.0):
-        parameter = BoundedParameter(initial, size=3, lower=0.01, upper=5.0, logarithmic=logarithmic)
-        torch.testing.assert_close(parameter(), torch.full((3,), initial), rtol=1e-4, atol=0)
-    for initial in (0.0099, 5.01, -1.0, 9.0, math.nan):
-        with pytest.raises(BaseError, match="between"):
-            BoundedParameter(initial, size=1, lower=0.01, upper=5.0, logarithmic=logarithmic)
-
-
-def test_wrong_arguments_raise_and_name_the_value():
-    wrong = {"kernel": "tukey", "update": "se3", "backward": "none", "step": 2.1, "damping": 0.0, "robustness": 3.5}
-    for name, value in [*wrong.items(), ("m", -1), ("m", 2.5), ("last", 0), ("by_residual", -1), ("by_residual", True)]:
-        with pytest.raises(BaseError, match=str(value)):
-            RobustWeightedLM(**{name: value})
-
-
 def test_unlearned_hyperparameters_take_no_gradient(case):
     corr, truth, _ = case()
     lm = RobustWeightedLM(learnable=False)
@@ -815,22 +768,3 @@ def test_refinements_take_anything(case, m, chosen, data):
     gradients_are_finite(
         [*refined.pose, refined.cost], [*tensors, *(p for p in refine.parameters() if p.requires_grad)]
     )
-
-
-def test_bounded_parameters_of_any_bounds():
-    made = Seen()
-
-    @many(80)
-    @given(options(initial=ANY, size=COUNTS, lower=ANY, upper=ANY, logarithmic=BOOL))
-    def run(chosen):
-        values = {"initial": 3.0, "size": 2, "lower": 1.0, "upper": 50.0, **chosen}
-        parameter = made(lambda: BoundedParameter(**values))
-        if parameter is not None:
-            value = parameter()
-            assert value.shape == (values["size"],)
-            wanted = torch.full_like(value, values["initial"])
-            slack = 1e-3 * (values["upper"] - values["lower"])
-            torch.testing.assert_close(value, wanted, rtol=1e-3, atol=slack)
-
-    run()
-    made.both()

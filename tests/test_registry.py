@@ -1,6 +1,5 @@
 """Fuzz of solvers by name: shapes, dtypes, devices, scales, geometry without a pose."""
 
-import contextlib
 import copy
 import re
 import warnings
@@ -10,33 +9,12 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from kornia.core.exceptions import BaseError, DeviceError, ShapeError
-from strategies import (
-    ANY,
-    BOOL,
-    COUNTS,
-    ERRORS,
-    SOLVERS,
-    WORD,
-    Seen,
-    batches,
-    check,
-    finite,
-    many,
-    numbers,
-    options,
-    poses,
-    same,
-)
+from kornia.core.exceptions import BaseError, DeviceError
+from strategies import ANY, COUNTS, ERRORS, SOLVERS, WORD, Seen, batches, check, finite, many, numbers, options, same
 
 from kornia_pnpnet import (
-    MLPInit,
-    Normalize,
-    PnPNet,
     Pose,
     PoseLoss,
-    RobustWeightedLM,
-    SetInit,
     SetLoss,
     create_solver,
     list_solvers,
@@ -46,71 +24,42 @@ from kornia_pnpnet import (
     success,
 )
 from kornia_pnpnet.data import SyntheticProblems
-from kornia_pnpnet.init import P3P, RANSAC, EPnP, REPPnP, p3p
+from kornia_pnpnet.init import p3p
 from kornia_pnpnet.losses import pose_distances
 from kornia_pnpnet.metrics import PoseErrors, reliability
-from kornia_pnpnet.peers import OpenCVPnP, OpenCVRansac, OpenCVUsac, PeerSolver, PoseLib, PyColmap
 
 PEERS = {name: create_solver(name) for name in ("opencv-ransac", "poselib")}
 
 
-@pytest.mark.parametrize("name", SOLVERS)
-def test_solvers_take_anything(name):
-    exactly = 9 if name.endswith("-n9") else None
-
-    @many(40)
-    @given(batches(exactly))
-    def run(case):
-        inputs, mask, weights, kinds = case
-        check(SOLVERS[name](*inputs, weights=weights, mask=mask), inputs, kinds)
-
-    run()
-
-
-@pytest.mark.parametrize("name", SOLVERS)
-def test_solvers_take_any_weights_noise_and_start(name):
-    exactly = 9 if name.endswith("-n9") else None
-
-    @many(30)
-    @given(batches(exactly), st.data())
-    def run(case, data):
-        inputs, mask, _, kinds = case
-        batch, count = inputs[0].shape[:2]
-        dtype, each = inputs[0].dtype, (batch, count)
-        weights = data.draw(numbers(dtype, each))
+@st.composite
+def calls(draw, n=None):
+    """Arguments of a solver by name, some of them missing, and what is wrong with each problem."""
+    (world, img, camera), mask, weights, kinds = draw(batches(n))
+    batch, count = world.shape[:2]
+    if draw(st.booleans()):
+        weights = draw(numbers(world.dtype, (batch, count)))
         # The first pair is the one that is spoiled.
         kinds = ["nothing" if weight == 0 else kind for kind, weight in zip(kinds, weights[:, 0], strict=True)]
-        sigma = st.one_of(st.none(), numbers(dtype, (), (batch,), each))
-        noise = {key: data.draw(sigma) for key in ("img_sigma", "world_sigma")}
-        if mask is not None and batch and data.draw(st.booleans()):
-            mask[0] = False  # of the first problem nothing is there
-            kinds[0] = "one point"
-        init = None
-        if data.draw(st.booleans()):
-            translation = 10.0 * torch.randn(batch, 3, generator=torch.Generator().manual_seed(batch))
-            init = Pose(torch.eye(3).expand(batch, 3, 3), translation)
-            init = Pose(*(x.to(inputs[0].dtype) for x in init))
-        check(SOLVERS[name](*inputs, weights=weights, mask=mask, init=init, **noise), inputs, kinds)
+    if mask is not None and batch and draw(st.booleans()):
+        mask[0] = False  # no pair of the first problem
+        kinds[0] = "one point"
+    sigma = st.none() | numbers(world.dtype, (), (batch,), (batch, count))
+    translation = 10.0 * torch.randn(batch, 3, generator=torch.Generator().manual_seed(batch))
+    init = Pose(torch.eye(3, dtype=world.dtype).expand(batch, 3, 3), translation.to(world.dtype))
+    call = {"world_points": world, "img_points": img, "intrinsics": camera, "weights": weights, "mask": mask}
+    call |= {"init": draw(st.sampled_from([None, init])), "img_sigma": draw(sigma), "world_sigma": draw(sigma)}
+    return {name: value for name, value in call.items() if value is not None}, kinds
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_solvers_take_anything(name):
+    @many(50)
+    @given(calls(9 if name.endswith("-n9") else None))
+    def run(case):
+        call, kinds = case
+        check(SOLVERS[name](**call), list(call.values())[:3], kinds)
 
     run()
-
-
-@many(30)
-@given(batches(9), st.sampled_from(["pnpnet-set", "pnpnet-n9", "epnp-lm", "p3p-ransac"]))
-def test_a_problem_is_solved_as_if_it_were_alone(case, name):
-    inputs, mask, weights, _ = case
-    whole = SOLVERS[name](*inputs, weights=weights, mask=mask)
-    for i in range(len(inputs[0])):
-        part = slice(i, i + 1)
-        alone = SOLVERS[name](
-            *(x[part] for x in inputs),
-            weights=None if weights is None else weights[part],
-            mask=None if mask is None else mask[part],
-        )
-        assert alone.ok.equal(whole.ok[part])
-        if name != "p3p-ransac" and alone.ok.item():  # RANSAC draws for the whole batch
-            size = whole.translation[part].abs().max().item()
-            torch.testing.assert_close(alone.translation, whole.translation[part], rtol=1e-2, atol=1e-2 * size)
 
 
 @many(30)
@@ -158,40 +107,11 @@ def test_what_does_not_fit_is_an_error_of_ours(name, world, img, camera, dtype, 
             solver(*inputs)
 
 
-@pytest.mark.parametrize("name", SOLVERS)
-@pytest.mark.parametrize("n", [0, 1, 2])
-def test_fewer_than_three_pairs_are_refused(name, n):
-    with pytest.raises(ShapeError):
-        SOLVERS[name](torch.zeros(2, n, 3), torch.zeros(2, n, 2), torch.eye(3))
-
-
-@many(40)
-@given(batches())
-def test_matrices_take_anything(case):
-    inputs, _, weights, _ = case
-    matrix = solve_pnp(*inputs, weights)
-    ok = SOLVERS["pnpnet-set"](*inputs, weights).ok
-    assert matrix.isnan().all((1, 2)).equal(~ok)
-    assert matrix[ok].isfinite().all()
-
-
 #: ``meta`` has shapes and no values: whoever looks at one, or makes a tensor somewhere else, raises there.
 DEVICES = ["meta", *(["cuda"] if torch.cuda.is_available() else [])]
 
 
 GRAPHS = [name for name in SOLVERS if name != "p3p-ransac"]  # RANSAC looks at values
-
-
-@st.composite
-def calls(draw, n=None):
-    """All that a solver can be given, by name; what is not given is missing."""
-    (world, img, camera), mask, weights, _ = draw(batches(n))
-    batch, count = world.shape[:2]
-    sigma = st.none() | numbers(world.dtype, (), (batch,), (batch, count))
-    init = Pose(torch.eye(3, dtype=world.dtype).expand(batch, 3, 3), torch.ones(batch, 3, dtype=world.dtype))
-    call = {"world_points": world, "img_points": img, "intrinsics": camera, "weights": weights, "mask": mask}
-    call |= {"init": draw(st.sampled_from([None, init])), "img_sigma": draw(sigma), "world_sigma": draw(sigma)}
-    return {name: value for name, value in call.items() if value is not None}
 
 
 def moved(call, device, names):
@@ -207,7 +127,8 @@ def test_solvers_stay_where_their_inputs_are(name):
 
     @many(15)
     @given(st.sampled_from(DEVICES), calls(9 if name.endswith("-n9") else None))
-    def run(device, call):
+    def run(device, case):
+        call, _ = case
         result, guess = solvers[device].with_guess(**moved(call, device, call))
         expected = SOLVERS[name](**call)
         for ours, there in zip((*result[:5], *result.init), (*expected[:5], *expected.init), strict=True):
@@ -219,8 +140,8 @@ def test_solvers_stay_where_their_inputs_are(name):
 
 @many(80)
 @given(st.sampled_from([*SOLVERS, *PEERS]), st.sampled_from(DEVICES), calls(9), st.data())
-def test_inputs_on_different_devices_are_an_error_of_ours(name, device, call, data):
-    call = dict(list(call.items())[:3]) if name in PEERS else call
+def test_inputs_on_different_devices_are_an_error_of_ours(name, device, case, data):
+    call = dict(list(case[0].items())[:3]) if name in PEERS else case[0]
     names = data.draw(st.lists(st.sampled_from(list(call)), min_size=1, max_size=len(call) - 1, unique=True))
     with pytest.raises(DeviceError, match=f"on {device}"):
         {**SOLVERS, **PEERS}[name](**moved(call, device, names))
@@ -338,65 +259,6 @@ def test_compiled_solvers_take_anything(name, monkeypatch):
     torch.compiler.reset()
 
 
-SAMPLING = {"threshold": ANY, "iterations": COUNTS, "confidence": ANY, "seed": COUNTS}
-
-
-MAKERS = {
-    "RobustWeightedLM": (
-        RobustWeightedLM,
-        options(
-            m=COUNTS,
-            kernel=WORD,
-            step=ANY,
-            damping=ANY,
-            robustness=ANY,
-            shared=BOOL,
-            update=WORD,
-            by_residual=COUNTS,
-            backward=WORD,
-            last=COUNTS,
-        ),
-    ),
-    "MLPInit": (lambda n=9, **sizes: MLPInit(n, **sizes), options(n=COUNTS, world_scale=ANY, img_scale=ANY)),
-    "SetInit": (SetInit, options(width=COUNTS, layers=COUNTS, heads=COUNTS, hidden=COUNTS, starts=COUNTS)),
-    "EPnP": (EPnP, options(iterations=COUNTS, algebraic_weight=ANY)),
-    "REPPnP": (REPPnP, options(max_error=ANY, quantile=ANY, null_iterations=COUNTS, rigid_iterations=COUNTS)),
-    "RANSAC": (
-        partial(RANSAC, P3P()),
-        options(threshold=ANY, world_threshold=ANY, scorer=WORD, max_samples=COUNTS, confidence=ANY, seed=COUNTS),
-    ),
-    "Normalize": (Normalize, options(f_const=ANY)),
-    "OpenCVPnP": (OpenCVPnP, options(method=WORD)),
-    "OpenCVRansac": (OpenCVRansac, options(**SAMPLING, method=WORD, refine=BOOL)),
-    "OpenCVUsac": (OpenCVUsac, options(**SAMPLING, method=WORD)),
-    "PoseLib": (PoseLib, options(threshold=ANY, min_iterations=COUNTS, max_iterations=COUNTS, confidence=ANY)),
-    "PyColmap": (PyColmap, options(threshold=ANY, loss_scale=ANY, min_iterations=COUNTS, max_iterations=COUNTS)),
-}
-
-
-@pytest.mark.parametrize("name", MAKERS)
-def test_parts_of_any_options(name):
-    make, chosen = MAKERS[name]
-    problems = SyntheticProblems(n=12, batch_size=3, seed=0).batch(0)
-    made = Seen()
-    with contextlib.suppress(ImportError):
-        make()
-
-    @many(60)
-    @given(chosen)
-    def run(values):
-        part = made(lambda: make(**values))
-        if part is None:
-            return
-        key = {"RobustWeightedLM": "refine", "Normalize": "normalize"}.get(name, "init")
-        solver = part if isinstance(part, PeerSolver) else PnPNet(**{"init": EPnP(), key: part})
-        n = values.get("n", 9)
-        finite(*solver(problems.world_points[:, :n], problems.img_points[:, :n], problems.intrinsics)[:4])
-
-    run()
-    made.both()
-
-
 def test_solvers_of_any_name_and_options():
     made = Seen()
     chosen = options(m=COUNTS, threshold=ANY, iterations=COUNTS, seed=COUNTS, confidence=ANY, views=COUNTS, unknown=ANY)
@@ -412,21 +274,3 @@ def test_solvers_of_any_name_and_options():
 
     run()
     made.both()
-
-
-@many(60)
-@given(batches(), st.data(), st.sampled_from(["pnpnet-set", "epnp-lm", "p3p-ransac"]))
-def test_cameras_of_kornia_take_anything(case, data, name):
-    (world, img, matrices), mask, weights, _ = case
-    batch = len(world)
-    pose = data.draw(poses(batch, world.dtype))
-    camera = pose.camera(matrices, 480, 640)
-    assert pose.matrix.shape == (batch, 4, 4)
-    assert pose.matrix[:, :3, 3].equal(pose.translation)
-    assert camera.extrinsics.equal(pose.matrix)
-    if batch:  # Kornia's quaternions have at least one
-        torch.testing.assert_close(pose.se3.matrix(), pose.matrix, rtol=1e-3, atol=1e-3)
-    torch.testing.assert_close(camera.intrinsics[:, :3, :3], matrices, rtol=0, atol=0, equal_nan=True)
-    ours, plain = (SOLVERS[name](world, img, x, weights=weights, mask=mask) for x in (camera, matrices))
-    for one, other in zip(ours[:5], plain[:5], strict=True):
-        assert one.equal(other)

@@ -63,11 +63,6 @@ def test_runs_are_apart_only_when_all_their_intervals_are(render):
         assert verdict in found
 
 
-def test_every_experiment_has_a_claim(render):
-    for path in render.EXPERIMENTS.glob("*.yaml"):
-        assert path.stem in ("protocol", "finetune", "set") or render.claim(path.stem).endswith("."), path
-
-
 def test_ablations_stand_beside_the_recipe(render):
     seeds = [row(rate, experiment="recipe", seed=f"{seed}") for seed, rate in enumerate((80.0, 81.5))]
     kernels = [row(rate, experiment="kernels", **{render.KERNEL: k}) for k, rate in (("huber", 70), ("cauchy", 81))]
@@ -78,19 +73,3 @@ def test_ablations_stand_beside_the_recipe(render):
     assert by_name["kernels"]["huber"].startswith("none -10.8 points (below)")
     assert by_name["kernels"]["cauchy"].startswith("none +0.2 points (intervals overlap)")
     assert by_name["shared"][""].startswith("none +9.2 points (above)")
-
-
-def test_the_sweep_is_a_table_with_its_steps(render):
-    rows = [
-        row(rate, **{"model.n": f"{n}", "model.m": f"{m}", "data.outliers.max_ratio": mix})
-        for mix, drop in (("0", 0), ("0.33", 20))
-        for n in (6, 9)
-        for m in (2, 5)
-        for rate in (30.0 + 5 * n + (m == 5) - drop,)
-    ]
-    rows[0]["us_per_problem"] = "7"
-    facts = render.sweep(rows)
-    assert "| 55.0 [54.0, 56.0] | 56.0 [55.0, 57.0] |" in facts["table"]
-    assert "| 6 | µs | 7 | 12 |" in facts["table"]
-    assert "2 → 5 +1.0 points (intervals overlap)" in facts["findings"][0]
-    assert "6 → 9 +15.0 points (above)" in facts["findings"][0]

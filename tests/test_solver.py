@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import copy
-import json
 import math
 import pickle
 from functools import partial
 
 import pytest
 import torch
-from kornia.core.exceptions import BaseError, DeviceError, ShapeError, TypeCheckError, ValueCheckError
+from kornia.core.exceptions import BaseError, ShapeError, TypeCheckError, ValueCheckError
 from safetensors.torch import save_file
+from strategies import NO_POSE, STRANGE
 from torch.utils import _pytree as pytree
 
 from kornia_pnpnet import (
@@ -52,7 +52,7 @@ OTHERS = torch.arange(7) != 2  # problem 2 is the bad one
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize(("batch", "n"), [(0, 9), (1, 3), (1, 50), (3, 4), (7, 9)])
+@pytest.mark.parametrize(("batch", "n"), [(0, 9), (1, 3), (7, 50)])
 def test_shapes_and_dtypes(batch, n, dtype, make_problems):
     p = make_problems(n, 7, dtype=dtype).map(lambda x: x[:batch])
     inputs = [x.clone() for x in p[:3]]
@@ -114,31 +114,21 @@ def bad_calls(p):
         "world_2d": ((world[0], pixels, K), {}, ShapeError, r"img_points.*\(9, 2\)"),
         "world_of_4": ((torch.cat((world, world[..., :1]), -1), pixels, K), {}, ShapeError, r"4"),
         "pixels_of_3": ((world, world, K), {}, ShapeError, r"3"),
-        "pixels_2d": ((world, pixels[0], K), {}, ShapeError, r"\[9, 2\]"),
         "other_batch": ((world, pixels[:6], K), {}, ShapeError, r"img_points.*\(7, 9, 2\).*\(6, 9, 2\)"),
         "other_n": ((world, pixels[:, :8], K), {}, ShapeError, r"img_points.*\(7, 9, 2\).*\(7, 8, 2\)"),
         "K_of_other_batch": ((world, pixels, K[:6]), {}, ShapeError, r"intrinsics.*\(7, 3, 3\).*\(6, 3, 3\)"),
-        "K_of_4": ((world, pixels, torch.eye(4).double()), {}, ShapeError, r"intrinsics.*\(4, 4\)"),
-        "K_vector": ((world, pixels, K[0, 0]), {}, ShapeError, r"intrinsics.*\(3,\)"),
         "weights": ((world, pixels, K), {"weights": ones[:, :8]}, ShapeError, r"weights.*\(7, 9\).*\(7, 8\)"),
         "mask": ((world, pixels, K), {"mask": mask[:1]}, ShapeError, r"mask.*\(7, 9\).*\(1, 9\)"),
         "two_pairs": ((world[:, :2], pixels[:, :2], K), {}, ShapeError, r"3 pairs.*2"),
         "float32_pixels": ((world, pixels.float(), K), {}, TypeCheckError, r"img_points.*float32.*float64"),
-        "float32_K": ((world, pixels, K.float()), {}, TypeCheckError, r"intrinsics.*float32.*float64"),
         "float32_weights": ((world, pixels, K), {"weights": ones.float()}, TypeCheckError, r"weights.*float32"),
         "half": ((world.half(), pixels.half(), K.half()), {}, TypeCheckError, r"float16.*\.float\(\)"),
-        "bfloat16": ((world.bfloat16(), pixels.bfloat16(), K.bfloat16()), {}, TypeCheckError, r"bfloat16.*\.float\(\)"),
         "integers": ((world.long(), pixels.long(), K.long()), {}, TypeCheckError, r"int64"),
         "float_mask": ((world, pixels, K), {"mask": ones}, TypeCheckError, r"mask.*bool.*float64"),
-        "meta_pixels": ((world, pixels.to("meta"), K), {}, DeviceError, r"img_points.*meta.*cpu"),
-        "meta_K": ((world, pixels, K.to("meta")), {}, DeviceError, r"intrinsics.*meta.*cpu"),
-        "meta_mask": ((world, pixels, K), {"mask": mask.to("meta")}, DeviceError, r"mask.*meta.*cpu"),
         "init": ((world, pixels, K), {"init": Pose(p.pose.rotation[:6], p.pose.translation)}, ShapeError, r"6"),
-        "init_t": ((world, pixels, K), {"init": Pose(p.pose.rotation, p.pose.rotation)}, ShapeError, r"3"),
         "init_float": ((world, pixels, K), {"init": Pose(*(x.float() for x in p.pose))}, TypeCheckError, r"init rot"),
         "list": ((world.tolist(), pixels, K), {}, TypeCheckError, r"world_points.*list"),
         "sigmas": ((world, pixels, K), {"img_sigma": ones[0]}, ShapeError, r"img_sigma.*\(7, 9\).*\(9,\)"),
-        "float32_sigma": ((world, pixels, K), {"world_sigma": ones.float()}, TypeCheckError, r"world_sigma.*float32"),
         "text_sigma": ((world, pixels, K), {"img_sigma": "1"}, TypeCheckError, r"img_sigma.*str"),
     }
 
@@ -153,12 +143,6 @@ def test_wrong_inputs_raise_typed_errors_that_name_argument_and_value(solver, ma
         net(9)(*make_problems(10)[:3])
 
 
-@pytest.mark.parametrize("views", [0, 9, 2.0, True, "2"])
-def test_a_wrong_number_of_views_is_refused(views):
-    with pytest.raises(BaseError, match=f"views.*{views}"):
-        PnPNet(MLPInit(9), views=views)
-
-
 # --- bad problems among good ones -------------------------------------------------------------------------------------
 
 
@@ -170,89 +154,42 @@ def turn_away(p, i):
     return world, p.intrinsics[i, 0, 0] * cam[:, :2] / cam[:, 2:]
 
 
-def spoil(p, i, how):
-    """The inputs with problem ``i`` spoilt in one way."""
-    world, pixels, K = (x.clone() for x in p[:3])
-    match how:
-        case "nan_world":
-            world[i, 4, 1] = math.nan
-        case "all_nan":
-            world[i], pixels[i], K[i] = math.nan, math.nan, math.nan
-        case "inf_world":
-            world[i, 0, 0] = math.inf
-        case "nan_pixel":
-            pixels[i, 8, 0] = math.nan
-        case "inf_pixel":
-            pixels[i] = -math.inf
-        case "nan_camera":
-            K[i, 1, 1] = math.nan
-        case "zero_camera":
-            K[i] = 0.0
-        case "huge":
-            world[i] = torch.finfo(world.dtype).max
-        case "huge_spread":
-            world[i] *= 1e30
-        case "huge_pixels":
-            pixels[i] *= 1e30
-        case "huge_pixel":
-            pixels[i, 4, 1] = 1e9
-        case "tiny":
-            world[i] *= 1e-30
-        case "all_zero":
-            world[i], pixels[i] = 0.0, 0.0
-        case "all_equal":
-            world[i] = world[i, :1].clone()
-        case "equal_pixels":
-            pixels[i] = pixels[i, :1].clone()
-        case "collinear":
-            step = torch.arange(9, dtype=world.dtype)[:, None]
-            world[i] = world[i, :1] + step * torch.tensor([1.0, 2, -0.5]).to(world)
-        case "behind":
-            world[i], pixels[i] = turn_away(p, i)
-        case "all_outliers":
-            uniform = torch.rand(9, 2, generator=torch.Generator().manual_seed(5))
-            pixels[i] = 3400 * (2 * uniform - 1).to(pixels)
-    return world, pixels, K
-
-
-#: Inputs to which, by the contract, there is no answer.
-HOPELESS = (
-    *("nan_world", "all_nan", "inf_world", "nan_pixel", "inf_pixel", "nan_camera", "zero_camera"),
-    *("all_zero", "all_equal", "collinear"),
-)
-ODD = (*HOPELESS, "equal_pixels", "huge", "huge_spread", "huge_pixels", "huge_pixel", "tiny", "behind", "all_outliers")
+KINDS = {**NO_POSE, **STRANGE}
 SOLVERS = {
     "net": lambda: net(9, 5),
-    "net_double": lambda: net(9, 5).double(),
-    "additive": lambda: net(9, 5, update="additive"),
-    "rejecting": lambda: net(9, 5, reject_worse=True),
-    "first_stage": lambda: net(9, 0),
-    "views": lambda: PnPNet(MLPInit(9), RobustWeightedLM(m=5), views=3),
+    "additive": lambda: net(9, 5, update="additive", reject_worse=True),
+    "first stage": lambda: net(9, 0),
+    "views": lambda: PnPNet(MLPInit(9), RobustWeightedLM(m=5), views=3).double(),
     "identity": lambda: PnPNet(None, RobustWeightedLM(m=5)),
+    **{name: partial(create_solver, name) for name in ("pnpnet-set", "epnp-lm", "reppnp-lm", "p3p-ransac")},
+    "ransac-epnp-lm": lambda: create_solver("ransac-epnp-lm", max_samples=20),
 }
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("solver", SOLVERS.values(), ids=SOLVERS.keys())
-def test_a_bad_problem_changes_no_other_by_a_bit(solver, dtype, make_problems):
+def test_a_bad_problem_changes_no_other_by_a_bit(solver, make_problems):
     """Every output may enter a loss: all gradients are finite, and 0 where there is no answer."""
-    p = make_problems(outliers=1, dtype=dtype)
     solver = solver()
-    reference = solver(*p[:3])
-    for how in ODD:
-        inputs = [x.requires_grad_() for x in spoil(p, 2, how)]
-        result = solver(*inputs)
-        assert_same(only(OTHERS, result), only(OTHERS, reference))
-        floats = [x for x in pytree.tree_leaves(result) if x.is_floating_point()]
-        assert all(x.isfinite().all() for x in floats), how
-        assert not (how in (*HOPELESS, "equal_pixels", "huge_pixel") and result.ok[2]), how
-        leaves = [*inputs, *(x for x in solver.parameters() if x.requires_grad)]
-        gradients = torch.autograd.grad(sum(x.sum() for x in floats), leaves, retain_graph=True)
-        assert all(x.isfinite().all() for x in gradients), how
-        if how in HOPELESS:
-            assert not any(x[2].any() for x in gradients[:3]), how
-            of_problem = sum(x[2].sum() for x in floats)
-            assert not any(x.any() for x in torch.autograd.grad(of_problem, leaves)), how
+    for dtype in DTYPES:
+        p = make_problems(outliers=1, dtype=dtype)
+        reference = solver(*p[:3])
+        for how, change in KINDS.items():
+            inputs = [x.clone() for x in p[:3]]
+            for tensor, changed in zip(inputs, change(*(x[2] for x in p[:3])), strict=True):
+                tensor[2] = changed
+            inputs = [x.requires_grad_() for x in inputs]
+            result = solver(*inputs)
+            assert_same(only(OTHERS, result), only(OTHERS, reference))
+            floats = [x for x in pytree.tree_leaves(result) if x.is_floating_point()]
+            assert all(x.isfinite().all() for x in floats), how
+            assert not (how in (*NO_POSE, "one pixel") and result.ok[2]), how
+            leaves = [*inputs, *(x for x in solver.parameters() if x.requires_grad)]
+            totals = sum(x.sum() for x in floats), sum(x[2].sum() for x in floats)
+            of_all, of_problem = (
+                torch.autograd.grad(total, leaves, retain_graph=True, materialize_grads=True) for total in totals
+            )
+            assert all(x.isfinite().all() for x in of_all), how
+            assert how not in NO_POSE or not any(x.any() for x in of_problem), how
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -263,26 +200,6 @@ def test_a_batch_of_bad_problems_gives_identities(dtype, make_problems):
     assert torch.equal(result.rotation, torch.eye(3, dtype=dtype).expand(4, 3, 3))
     assert not result.weights.any()
     assert result.cost.sum().isfinite()
-
-
-@pytest.mark.parametrize("how", ["nan_world", "all_equal", "behind"])
-@pytest.mark.parametrize("module_dtype", DTYPES)
-def test_good_problems_equal_being_solved_alone(module_dtype, how, make_problems, perturb):
-    """To 1e-9 in float64, for weights of any dtype: shipped weights are float32."""
-    p = make_problems()
-    init = perturb(p.pose)
-    inputs = spoil(p, 2, how)
-    given, with_net = PnPNet(None, RobustWeightedLM(m=5)), net(9, 3).to(module_dtype)
-    together, guessed = given(*inputs, init=init), with_net(*inputs)
-    for i in OTHERS.nonzero()[:, 0].tolist():
-        part = slice(i, i + 1)
-        alone = given(*only(part, inputs), init=only(part, init))
-        assert alone.ok
-        assert_same(only(part, together), alone, rtol=1e-9, atol=1e-9)
-        alone = with_net(*only(part, inputs))
-        assert_same(only(part, guessed.init), alone.init, rtol=1e-9, atol=1e-9)
-        if alone.ok and module_dtype == torch.float64:
-            assert_same(only(part, guessed.pose), alone.pose, rtol=1e-9, atol=1e-9)
 
 
 def test_a_failed_refinement_gives_no_gradient_through_the_pose(make_problems):
@@ -369,13 +286,12 @@ def test_gradcheck_through_the_whole_layer(first, make_problems, perturb):
 
 
 @pytest.mark.parametrize("cast_dtype", [torch.bfloat16, torch.float16])
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("name", ["net", "additive", "identity"])
-def test_autocast_around_the_layer_changes_no_bit(name, dtype, cast_dtype, make_problems):
+@pytest.mark.parametrize("name", ["additive", "epnp-lm"])
+def test_autocast_around_the_layer_changes_no_bit(name, cast_dtype, make_problems):
     """Neither of the results nor of the gradients."""
     outcomes = []
     for enabled in (False, True):
-        world, pixels, K = (x.requires_grad_() for x in make_problems(dtype=dtype)[:3])
+        world, pixels, K = (x.requires_grad_() for x in make_problems(dtype=torch.float32)[:3])
         torch.manual_seed(0)
         solver = SOLVERS[name]()
         with torch.autocast("cpu", dtype=cast_dtype, enabled=enabled):
@@ -386,27 +302,6 @@ def test_autocast_around_the_layer_changes_no_bit(name, dtype, cast_dtype, make_
         outcomes.append((*pytree.tree_leaves(result), *gradients))
     for plain, cast in zip(*outcomes, strict=True):
         assert plain is cast is None or torch.equal(plain, cast)
-
-
-@pytest.mark.parametrize(
-    "solver",
-    [
-        lambda: net(9, 2).double(),
-        lambda: PnPNet(None, RobustWeightedLM(m=2, update="additive", reject_worse=True, kernel="huber")),
-    ],
-    ids=["net", "additive"],
-)
-@pytest.mark.slow
-def test_export_and_compile_with_any_batch(solver, make_problems):
-    solver = solver().eval()
-    p, q = make_problems(batch=4), make_problems(batch=6, seed=1)
-    expected = solver(*q[:3])
-    program = torch.export.export(solver, tuple(p[:3]), dynamic_shapes=({0: torch.export.Dim("B")},) * 3)
-    assert_same(program.module()(*q[:3]).pose, expected.pose, rtol=1e-9, atol=1e-9)
-    compiled = torch.compile(solver, backend="eager", fullgraph=True, dynamic=True)
-    mask = torch.ones(6, 9, dtype=torch.bool)
-    for options in ({}, {"mask": mask}):
-        assert_same(compiled(*q[:3], **options), expected, rtol=1e-9, atol=1e-9)
 
 
 def test_copies_and_dtypes_of_the_module(make_problems):
@@ -464,7 +359,7 @@ def test_any_leading_dimensions(make_problems):
         assert result.matrix.shape == (*shape, 4, 4)
         assert_same(pytree.tree_map(lambda x, shape=shape: x.flatten(0, len(shape) - 1), result), batch)
     one = solver(*(x[2] for x in p[:3]), **{key: only(2, value) for key, value in options.items()})
-    assert_same(one, only(2, batch), atol=1e-7)
+    assert_same(one, only(2, batch), rtol=1e-6, atol=1e-6)
     assert solver(p.world_points[2], p.img_points[2], p.intrinsics[2], img_sigma=torch.ones(9).double()).ok
 
 
@@ -526,40 +421,16 @@ def test_saving_and_loading_gives_bit_equal_outputs(solver, tmp_path, make_probl
             assert_same(again(*p[:3]), solver(*p[:3]))
 
 
-def edit(**changes):
-    """Damage: change entries of ``config.json``; the name of an entry is ``part__key``; ``None`` deletes."""
-
-    def damage(config, weights):
-        content = json.loads(config.read_text())
-        for path, value in changes.items():
-            *parts, key = path.split("__")
-            entries = content[parts[0]] if parts else content
-            entries.pop(key) if value is None else entries.update({key: value})
-        config.write_text(json.dumps(content))
-
-    return damage
-
-
 DAMAGES = {
     "truncated": lambda config, weights: weights.write_bytes(weights.read_bytes()[:-100]),
     "empty": lambda config, weights: weights.write_bytes(b""),
-    "noise": lambda config, weights: weights.write_bytes(bytes(range(256)) * 8),
-    "pickle": lambda config, weights: weights.write_bytes(pickle.dumps({"a": 1})),
-    "torch_save": lambda config, weights: torch.save({"a": torch.zeros(1)}, weights),
+    "pickle": lambda config, weights: torch.save({"a": torch.zeros(1)}, weights),
     "missing": lambda config, weights: weights.unlink(),
     "foreign": lambda config, weights: save_file({"linear.weight": torch.zeros(2, 2)}, weights),
-    "not_json": lambda config, weights: config.write_text("{n: 9"),
-    "not_a_dict": lambda config, weights: config.write_text("[1, 2]"),
-    "null": lambda config, weights: config.write_text("null"),
-    "binary_config": lambda config, weights: config.write_bytes(b"\xff\xfe\x00"),
-    "other_n": edit(init__n=7),
-    "wrong_type": edit(init__n="six"),
-    "unknown_init": edit(init__name="Oracle"),
-    "no_refine": edit(refine=None),
-    "refine_is_a_list": edit(refine=[1]),
-    "unknown_key": edit(refine__momentum=0.9),
-    "unknown_kernel": edit(refine__kernel="tukey"),
-    "unknown_part": edit(colour="red"),
+    "not JSON": lambda config, weights: config.write_text("{n: 9"),
+    "no dictionary": lambda config, weights: config.write_text("[1, 2]"),
+    "not text": lambda config, weights: config.write_bytes(b"\xff\xfe\x00"),
+    "another configuration": lambda config, weights: config.write_text(config.read_text().replace("cauchy", "huber")),
 }
 
 
@@ -570,6 +441,11 @@ def test_damaged_weights_raise_a_typed_error(tmp_path):
         damage(folder / "config.json", folder / "model.safetensors")
         with pytest.raises(ValueCheckError, match=r"\S"):
             PnPNet.from_pretrained(folder)
+    sound = saved_net().config()
+    wrong = ({"init": {**sound["init"], "n": "six"}}, {"init": {"name": "Oracle"}}, {"refine": None}, {"refine": [1]})
+    for change in (*wrong, {"refine": {**sound["refine"], "kernel": "tukey"}}, {"colour": "red"}):
+        with pytest.raises(BaseError):
+            PnPNet.from_config({**sound, **change})
 
 
 def test_solvers_by_name(make_problems):
@@ -602,37 +478,32 @@ def test_the_first_iterations_of_trained_weights(make_problems):
     corr, _ = whole.normalize(*p[:3])
     guess = whole.init(corr)
     for m in (0, 2, whole.refine.m):
-        solver = create_solver("pnpnet-n9", m=m)
-        assert solver.refine.m == m
+        solver = create_solver("pnpnet-n9", m=m, views=3)
+        assert (solver.refine.m, solver.views) == (m, 3)
         assert_same(solver.refine(corr, guess).pose, whole.refine(corr, guess, m=m).pose)
 
 
 @pytest.mark.parametrize("name", [name for name in list_solvers() if not name.startswith(("opencv", "poselib", "pyc"))])
 def test_every_solver_of_ours_keeps_the_contract(name, make_problems):
-    """Shapes, dtype, permutation of the pairs, and a bad problem that changes no other by a bit."""
+    """Shapes, dtype, and the same result for a problem alone, in any order of the pairs and with padding."""
     n = int(name.rpartition("-n")[2]) if "net-n" in name else 9
     p = make_problems(n=n, dtype=torch.float64)
     solver = create_solver(name)
-    with torch.no_grad():
-        result = solver(*p[:3])
-        broken = p.world_points.clone()
-        broken[3] = torch.nan
-        beside = solver(broken, *p[1:3])
-        order = torch.randperm(n, generator=torch.Generator().manual_seed(0))
-        shuffled = solver(p.world_points[:, order], p.img_points[:, order], p.intrinsics)
+    result = solver(*p[:3])
     assert result.matrix.shape == (7, 4, 4)
     assert result.weights.shape == (7, n)
     assert result.matrix.dtype == result.cost.dtype == torch.float64
-    others = torch.arange(7) != 3
-    assert not beside.ok[3]
-    assert beside.matrix[3].isfinite().all()
-    for mine, theirs in zip(beside[:5], result[:5], strict=True):
-        assert torch.equal(mine[others], theirs[others])
-    # The order does not matter, save that enumerated samples are tried in it.
-    if "ransac" not in name:
-        ok = result.ok & shuffled.ok
-        torch.testing.assert_close(shuffled.matrix[ok], result.matrix[ok], rtol=1e-6, atol=1e-6)
-        assert torch.equal(shuffled.ok, result.ok)
+    same = [(only(slice(2, 3), result), solver(*only(slice(2, 3), p[:3])))]
+    if "ransac" not in name:  # which tries its samples in the order of the pairs
+        order = torch.randperm(n, generator=torch.Generator().manual_seed(0))
+        same += [(result, solver(p.world_points[:, order], p.img_points[:, order], p.intrinsics))]
+        if "net-n" not in name:
+            world, pixels = (torch.nn.functional.pad(x, (0, 0, 0, 3), value=math.nan) for x in p[:2])
+            same += [(result, solver(world, pixels, p.intrinsics, mask=torch.arange(n + 3).expand(7, -1) < n))]
+            assert not same[-1][1].weights[:, n:].any()
+    for expected, found in same:
+        assert torch.equal(found.ok, expected.ok)
+        torch.testing.assert_close(found.matrix[found.ok], expected.matrix[found.ok], rtol=1e-6, atol=1e-6)
 
 
 # --- regressions -----------------------------------------------------------------------------------
@@ -678,23 +549,6 @@ def test_an_initialiser_without_a_guess_fails_its_problem_alone(make_problems):
     gradient = world_points.grad.abs().sum((1, 2))
     assert gradient[2] == 0
     assert (gradient[result.ok] > 0).all()
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("name", ["epnp-lm", "reppnp-lm", "p3p-ransac", "ransac-epnp-lm"])
-def test_degenerate_worlds_leave_no_gradient_anywhere(name, dtype, make_problems):
-    """Not even in what all problems share: a parameter, or a factor before the layer."""
-    p = make_problems(n=9, dtype=dtype)
-    world = p.world_points.clone()
-    world[1], world[2], world[3] = 0.0, 1.0, world[3] * torch.finfo(dtype).tiny ** 0.5
-    world[4] = world[4, :1] + torch.arange(9, dtype=dtype)[:, None] * torch.ones(3, dtype=dtype)
-    factor = torch.ones((), dtype=dtype, requires_grad=True)
-    leaf = world.requires_grad_()
-    result = create_solver(name)(leaf * factor, p.img_points * factor, p.intrinsics)
-    assert not result.ok[1:5].any()
-    (result.cost.sum() + result.translation.sum() + result.init.translation.sum()).backward()
-    assert factor.grad.isfinite()
-    assert torch.equal(leaf.grad[1:5], torch.zeros(4, 9, 3, dtype=dtype))
 
 
 @pytest.mark.parametrize("unit", [1e-46, 1e39])
@@ -751,15 +605,6 @@ def test_views_of_a_method_that_mirrors_do_not_change(make_problems):
     torch.testing.assert_close(four.weights, one.weights, rtol=1e-6, atol=1e-8)
 
 
-def test_trained_weights_take_views_and_m(make_problems):
-    p = make_problems(batch=1000, outliers=2, noise=False)
-    shallow = create_solver("pnpnet-n9", m=2, views=8)
-    assert (shallow.refine.m, shallow.views) == (2, 8)
-    results = [create_solver("pnpnet-n9", views=views).double()(*p[:3]) for views in (1, 8)]
-    one, eight = (success(pose_errors(result.pose, p.pose)).double().mean() for result in results)
-    assert eight > one + 0.01
-
-
 # --- known noise --------------------------------------------------------------------------------------------
 
 
@@ -809,19 +654,23 @@ def test_known_noise_has_the_units_of_the_inputs(make_problems, perturb):
 
 
 @pytest.mark.parametrize("name", ["img_sigma", "world_sigma"])
-def test_an_impossible_noise_fails_its_problem_alone(name, make_problems):
+@pytest.mark.parametrize("solver", ["pnpnet-set", "epnp-lm"])
+def test_an_impossible_noise_fails_its_problem_alone(solver, name, make_problems):
     p = make_problems(batch=6, noise=False)
-    solver = create_solver("epnp-lm")
+    solver = create_solver(solver).double()
     sigma = torch.tensor([1.0, -1.0, torch.inf, 0.0, torch.nan, 1.0], dtype=torch.float64)
-    result = solver(*p[:3], **{name: sigma})
+    img = p.img_points.clone().requires_grad_()
+    result = solver(p.world_points, img, p.intrinsics, **{name: sigma})
+    result.translation.sum().backward()
+    assert img.grad.isfinite().all()
     assert not result.ok[[1, 2]].any()
     assert result.ok[[0, 5]].all()
     assert result.matrix.isfinite().all()
     alone = solver(*only(slice(5, 6), p[:3]), **{name: sigma[5:]})
-    assert torch.equal(alone.matrix[0], result.matrix[5])
+    torch.testing.assert_close(alone.matrix[0], result.matrix[5], rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["pnpnet-set", "pnpnet-n9", "epnp-lm", "reppnp-lm", "p3p-ransac", "identity-lm"])
+@pytest.mark.parametrize("name", ["pnpnet-set", "pnpnet-n9", "epnp-lm", "p3p-ransac"])
 @pytest.mark.parametrize("known", [{"img_sigma": 50.0}, {"world_sigma": 0.5}], ids=repr)
 def test_gradients_are_finite_where_one_noise_is_known(name, known, make_problems):
     problems = make_problems(n=9, batch=3)
@@ -879,14 +728,3 @@ def test_views_keep_the_noise_and_the_hypotheses_of_a_set_network(make_problems)
     rates = [success(pose_errors(result.pose, p.pose)).float().mean() for result in (one, three)]
     assert rates[1] > rates[0] - 0.02
     assert three.ok.float().mean() > 0.99
-
-
-@pytest.mark.parametrize("name", ["pnpnet-set", "epnp-lm"])
-def test_an_infinite_sigma_is_a_bad_problem_with_finite_gradients(name, make_problems):
-    p = make_problems(batch=2)
-    img = p.img_points.clone().requires_grad_()
-    sigma = torch.tensor([torch.inf, 0.05], dtype=torch.float64)
-    result = create_solver(name).double()(p.world_points, img, p.intrinsics, world_sigma=sigma, img_sigma=1.0)
-    result.translation.sum().backward()
-    assert result.ok.tolist() == [False, True]
-    assert img.grad.isfinite().all()
