@@ -68,7 +68,7 @@ def test_each_part_is_one_graph_and_the_batch_may_change(name, views, whole, gra
     assert backend.frame_count == graphs  # before, in and after an iteration
 
 
-@pytest.mark.parametrize(("views", "whole"), [(1, False), (2, True)])
+@pytest.mark.parametrize(("views", "whole"), [pytest.param(1, False, marks=pytest.mark.slow), (2, True)])
 def test_gradients_are_those_of_the_eager_solver(views, whole, backend):
     solver = create_solver("pnpnet-n9", m=2).double()
     solver.views = views
