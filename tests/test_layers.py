@@ -129,3 +129,9 @@ def test_importing_the_package_imports_no_extras_and_leaves_no_trace():
     )
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert output.stdout.strip() == "[]"
+
+
+def test_the_house_stays_small():
+    """A newcomer can read each file in one sitting and the top folder at a glance."""
+    assert len([path for path in ROOT.glob("*.py") if path.name != "__init__.py"]) <= 14
+    assert not [name for name, path in MODULES.items() if len(path.read_text().splitlines()) > 450]

@@ -10,11 +10,13 @@ import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from kornia.core.exceptions import BaseError
 from strategies import ANY, COUNTS, INF, RANGES, Seen, many, options
 
 from kornia_pnpnet import MLPInit, PnPNet, PoseLoss, RobustWeightedLM
@@ -393,3 +395,12 @@ def test_trainings_of_any_length(tmp_path):
     made(lambda: train_briefly(1e-6, tmp_path, progress=False))
     assert made.counts["works"] == 1
     assert history.read_text().startswith("update,")
+
+
+@pytest.mark.parametrize(("batch_size", "processes"), [(15, 2), (2, 4)])
+def test_a_batch_that_cannot_be_shared_equally_is_refused_before_training(batch_size, processes, tmp_path):
+    problems = SyntheticProblems(n=6, batch_size=batch_size)
+    solver, fabric = PnPNet(MLPInit(6), RobustWeightedLM(2)), SimpleNamespace(world_size=processes)
+    with pytest.raises(BaseError, match=rf"{batch_size}.*{processes} processes"):
+        fit(solver, problems, {}, PoseLoss(), TrainSettings(3), tmp_path, fabric=fabric, progress=False)
+    assert list(tmp_path.iterdir()) == []
