@@ -26,8 +26,8 @@ pytest.importorskip("pycolmap")
 OURS = ("pnpnet-set", "p3p-ransac", "epnp-lm", "epnp")
 #: Three standard deviations of the protocol's noise.
 PROTOCOL = {"p3p-ransac": {"threshold": 3.0, "world_threshold": 0.15}}
-#: Errors in radians and units of the world: what OpenCV's suite allows, and what float32 leaves of it.
-LIMIT = {torch.float64: 1e-6, torch.float32: 1e-4}
+#: Errors in radians and units of the world. OpenCV's suite allows 1e-6, where the rounding of its pixels decides.
+LIMIT = {torch.float64: 1e-5, torch.float32: 1e-4}
 
 
 @pytest.fixture(params=LIMIT, ids=str)
@@ -67,7 +67,7 @@ def count(solver: nn.Module, p: Problems, limit: float, dtype: torch.dtype = tor
 
 
 def opencv_poses(world: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """The first of ten poses (rotation vector in (0.001, 1), depth in (0.01, 1)) that sees all points, else the last."""
+    """First of ten poses (rotation vector in (0.001, 1), depth in (0.01, 1)) that sees all points, or the last."""
     vector, shift = torch.rand(2, len(world), 10, 3, generator=generator, dtype=torch.float64)
     shift = shift * torch.tensor([2.0, 2, 0.99]) - torch.tensor([1.0, 1, -0.01])
     rotation = axis_angle_to_rotation_matrix(1e-3 + 0.999 * vector.flatten(0, 1)).unflatten(0, (-1, 10))
@@ -140,7 +140,7 @@ def test_opencv_scenes_with_outliers(kind, name, dtype):
 
 @pytest.mark.parametrize("name", OURS)
 def test_opencv_distorted_planes(name, dtype):
-    """``CV_solvePnP_Test`` with distortion: OpenCV gets its coefficients, ours the pixels of ``cv2.undistortPoints``."""
+    """``CV_solvePnP_Test`` with distortion: OpenCV gets the coefficients, ours ``cv2.undistortPoints``."""
     p, distortion = opencv_scenes("plane", 30, seed=3, distortion=1e-6)
     parts = [*zip(*(x.numpy() for x in p[:3]), distortion, strict=True)]
     img = torch.from_numpy(np.stack([cv2.undistortPoints(i[:, None], k, d, P=k)[:, 0] for _, i, k, d in parts]))
