@@ -16,7 +16,7 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor, nn
 
 from kornia_pnpnet import PnPResult, Pose, Problems, Status, create_solver, pose_errors, solve_pnp, success
-from kornia_pnpnet.data import SyntheticProblems
+from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.peers import OpenCVPnP, OpenCVRansac, PoseLib, PyColmap
 
 cv2 = pytest.importorskip("cv2")
@@ -118,7 +118,7 @@ def test_opencv_scenes_without_outliers(kind, n, name, dtype, request):
 
     Rounded pixels decide about the last 3 % at 1e-6, where OpenCV minimises pixels and we minimise angles.
     """
-    reason = "92 of 100 (IPPE 100): 4 wrong minima, and 4 tags with a corner over 85° off the axis, which is not near"
+    reason = "91 of 100 (IPPE 100): in 9 a corner is over 85° off the axis, and three pairs are left near"
     lost(request, kind == "tag" and name in ("epnp", "epnp-lm"), reason)
     p, _ = opencv_scenes(kind, n, seed=1)
     methods = {"cloud": ("ITERATIVE", "EPNP"), "plane": ("ITERATIVE", "IPPE", "EPNP"), "tag": ("IPPE_SQUARE", "IPPE")}
@@ -153,6 +153,13 @@ def test_opencv_distorted_planes(name, dtype):
     assert count(create_solver(name), p._replace(img_points=img), 1e-4, dtype) >= max(70, best - 2)
 
 
+def test_opencv_bad_input_points(dtype):
+    """OpenCV's ``bad_input_points_19253``: five of six pairs are inliers, too few for its last solver."""
+    mix = OutlierMix(count=1)
+    p = SyntheticProblems(n=6, batch_size=50, seed=7, outliers=mix, world_sigma=0.0, dtype=torch.float64).batch(0)
+    assert count(create_solver("p3p-ransac"), p, 0.1, dtype) >= max(45, count(OpenCVRansac(threshold=4.0), p, 0.1) - 1)
+
+
 @pytest.mark.parametrize("name", [*OURS, "reppnp-lm"])
 def test_opencv_double_support(name):
     """OpenCV's ``double_support``: float32 and float64 agree on ten points of two lines and integer pixels.
@@ -167,10 +174,9 @@ def test_opencv_double_support(name):
     camera = torch.tensor([[547.94130238, 0, 298.355457], [0, 548.177240027, 230.62194052], [0, 0, 1]]).double()
     p = problems_of(world, img, camera, torch.eye(3)[None].double(), torch.zeros(1, 3).double())
     single, double = (solve(create_solver(name), p, dtype) for dtype in (torch.float32, torch.float64))
-    assert single.ok.all()
-    assert double.ok.all()
+    assert (single.ok & double.ok).all()
     torch.testing.assert_close(single.rotation, double.rotation, rtol=0, atol=2e-5)
-    torch.testing.assert_close(single.translation, double.translation, rtol=1e-5, atol=0)
+    torch.testing.assert_close(single.translation, double.translation, rtol=2e-5, atol=0)
     peer = solve(OpenCVRansac(threshold=8.0, iterations=100, confidence=0.999, method="P3P", refine=False), p)
     assert (project(world, *double.pose, camera) - img).norm() < (project(world, *peer.pose, camera) - img).norm()
 
