@@ -130,7 +130,11 @@ class EPnP(Configured):
         self, system: DepthSystem, control: ControlPoints, plane_points: Tensor, vectors: Tensor
     ) -> tuple[Tensor, Tensor]:
         """The depths (4, B) of the best case, and whether they were found (B,); where not, equal depths."""
-        cases = minimize(system, four_cases(system), self.algebraic_weight, _CASE_ITERATIONS)
+        cases = four_cases(system)
+        # The distances do not tell a shape from its mirror image along the optical axis, and Gauss-Newton does not
+        # change the one into the other: symmetric points need both.
+        mirrored = torch.cat((cases[:1, -1:], -cases[1:, -1:]))
+        cases = minimize(system, torch.cat((cases, mirrored), 1), self.algebraic_weight, _CASE_ITERATIONS)
         best = best_case(system, cases, control, plane_points, vectors)
         depths = cases.gather(1, best.expand(4, 1, -1))[:, 0]
         depths = minimize(system, depths, self.algebraic_weight, self.iterations - _CASE_ITERATIONS)
