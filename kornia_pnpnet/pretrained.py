@@ -28,6 +28,12 @@ CONFIG_NAME, WEIGHTS_NAME = "config.json", "model.safetensors"
 _FINGERPRINT = "sha256"
 
 
+# Bytes. No configuration comes near.
+_LARGEST_CONFIG = 2**20
+# Sizes up to this one take little memory, whatever the tensors are.
+_SMALL = 1000
+
+
 def shipped_weights() -> list[str]:
     """Names of the weights that come with the package."""
     return sorted(path.parent.name for path in WEIGHTS_FOLDER.glob(f"*/{CONFIG_NAME}"))
@@ -70,15 +76,37 @@ def read_weights(name_or_folder: str | Path) -> tuple[dict[str, Any], dict[str, 
     from safetensors import SafetensorError, safe_open
 
     try:
+        for name, largest in ((CONFIG_NAME, _LARGEST_CONFIG), (WEIGHTS_NAME, None)):
+            path = folder / name
+            if not path.is_file() or (largest and path.stat().st_size > largest):  # a pipe would wait for ever
+                raise ValueError(f"{name} is no file" if not path.is_file() else f"{name} has over {largest} bytes")
         config = json.loads((folder / CONFIG_NAME).read_text())
         with safe_open(folder / WEIGHTS_NAME, "pt") as file:
             metadata = file.metadata() or {}
             state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (OSError, ValueError, SafetensorError) as error:
+    except (OSError, ValueError, RecursionError, SafetensorError) as error:
         raise ValueCheckError(f"Cannot read the weights in {folder}: {error}") from error
     if _FINGERPRINT in metadata and metadata[_FINGERPRINT] != _fingerprint(config, state):
         raise ValueCheckError(f"The weights in {folder} are damaged: {CONFIG_NAME} and {WEIGHTS_NAME} do not match.")
+    for name, tensor in state.items():
+        if not tensor.isfinite().all():
+            raise ValueCheckError(f"The weights in {folder} are not finite: {name}.")
+    _check_sizes(config, state, folder)
     return config, state
+
+
+def _check_sizes(config: Any, state: Mapping[str, Tensor], folder: Path) -> None:
+    """Refuse numbers that cannot be sizes of these tensors, before anything of such a size is built."""
+    largest = max([_SMALL, *(size for tensor in state.values() for size in tensor.shape)])
+    entries = [("", config)]
+    while entries:
+        name, entry = entries.pop()
+        if isinstance(entry, dict):
+            entries += entry.items()
+        elif isinstance(entry, int) and entry > (len(state) if name == "layers" else largest):
+            raise ValueCheckError(
+                f"{folder / CONFIG_NAME}: {name} is {entry}, too large for the tensors in {WEIGHTS_NAME}."
+            )
 
 
 def _fingerprint(config: Any, state: dict[str, Tensor]) -> str:

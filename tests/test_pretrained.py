@@ -1,14 +1,17 @@
 """The shipped weights: the success they must reach, and model cards made from the results of their run."""
 
 import math
+import os
+import shutil
 
 import pytest
 import torch
+from kornia.core.exceptions import ValueCheckError
 
 from kornia_pnpnet import PnPNet, create_solver, pose_errors, shipped_weights, success, success_rate
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.metrics import reliability
-from kornia_pnpnet.pretrained import WEIGHTS_FOLDER
+from kornia_pnpnet.pretrained import WEIGHTS_FOLDER, find_weights, read_weights, write_weights
 from kornia_pnpnet.training.card import write_model_card
 from kornia_pnpnet.training.results import load_run
 
@@ -112,3 +115,49 @@ def test_model_card_is_generated_from_the_run(name, tmp_path):
     updates = sum(run.run.update for run in results.lineage())
     assert updates >= (40_000 if name == "pnpnet-set" else 200_000)
     assert sum(path.stat().st_size for path in folder.iterdir()) < 2_000_000
+
+
+@pytest.mark.parametrize("name", shipped_weights())
+def test_shipped_weights_have_a_checksum(name, tmp_path):
+    folder = tmp_path / name
+    shutil.copytree(find_weights(name), folder)
+    PnPNet.from_pretrained(folder)
+    path = folder / "model.safetensors"
+    content = bytearray(path.read_bytes())
+    content[-5] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(ValueCheckError, match="damaged"):
+        PnPNet.from_pretrained(folder)
+
+
+def test_weights_that_are_not_finite_are_refused(tmp_path):
+    solver = PnPNet.from_pretrained("pnpnet-n9")
+    solver.init.shared[0].bias.data[3] = math.nan
+    solver.save_pretrained(tmp_path)
+    with pytest.raises(ValueCheckError, match=r"not finite.*shared.0.bias"):
+        PnPNet.from_pretrained(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("part", "name", "value"),
+    [("init", "width", 2**17), ("init", "layers", 10**7), ("refine", "m", 10**9), ("refine", "by_residual", 10**12)],
+)
+def test_sizes_that_the_weights_do_not_have_are_refused_before_they_are_built(part, name, value, tmp_path):
+    config, state = read_weights("pnpnet-set")
+    config[part][name] = value
+    write_weights(tmp_path, config, state)
+    with pytest.raises(ValueCheckError, match=rf"{name} is {value}, too large"):
+        PnPNet.from_pretrained(tmp_path)
+
+
+def test_configurations_that_are_no_small_files_are_refused(tmp_path):
+    shutil.copytree(find_weights("pnpnet-n9"), tmp_path, dirs_exist_ok=True)
+    config = tmp_path / "config.json"
+    for content in ("[" * 100_000, " " * 2**21, '{"init": []}'):
+        config.write_text(content)
+        with pytest.raises(ValueCheckError):
+            PnPNet.from_pretrained(tmp_path)
+    (tmp_path / "model.safetensors").unlink()
+    os.mkfifo(tmp_path / "model.safetensors")
+    with pytest.raises(ValueCheckError, match="no file"):
+        PnPNet.from_pretrained(tmp_path)
