@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from torch import nn
 
@@ -26,7 +27,11 @@ _PICTURES = (".pdf", ".png", ".svg")
 
 
 class OneLineParser(argparse.ArgumentParser):
-    """A parser whose errors are one line, as all errors of ``pnpnet`` are."""
+    """A parser whose errors are one line, as all errors of ``pnpnet`` are, and that takes lists of negative numbers."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._negative_number_matcher = re.compile(r"-[\d.]")  # argparse takes "-1,2" for an option
 
     def error(self, message: str) -> NoReturn:
         """Print the message in one line and exit with the code 2."""

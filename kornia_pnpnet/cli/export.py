@@ -8,6 +8,9 @@ The model solves batches of any size. ONNX Runtime runs the model without PyTorc
 from __future__ import annotations
 
 import argparse
+import sys
+import warnings
+from pathlib import Path
 
 from kornia_pnpnet.cli.arguments import load_solver_without_truth, whole_number
 from kornia_pnpnet.export import INPUTS, OUTPUTS, export_onnx
@@ -28,6 +31,13 @@ def run(arguments: argparse.Namespace) -> int:
     solver = load_solver_without_truth(arguments.solver)
     if not isinstance(solver, PnPNet):
         raise ValueError(f"--solver: {arguments.solver} belongs to another library and cannot be exported")
-    path = export_onnx(solver, arguments.file, arguments.n)
+    target = Path(arguments.file)
+    target.parent.mkdir(parents=True, exist_ok=True)  # an error now, not after minutes
+    if target.is_dir():
+        raise ValueError(f"'{target}' is a folder")
+    print("Tracing and converting; PyTorch's exporter takes some minutes", file=sys.stderr, flush=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the exporter about itself
+        path = export_onnx(solver, target, arguments.n)
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, {', '.join(INPUTS)} -> {', '.join(OUTPUTS)}")
     return 0

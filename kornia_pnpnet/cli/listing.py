@@ -12,17 +12,35 @@ import argparse
 from kornia_pnpnet import list_solvers, shipped_weights
 from kornia_pnpnet.evaluation.named_solvers import BOUNDS, missing_package
 
+#: What each solver is, by the beginning of its name; the longest beginning counts.
+_WHAT = {
+    "pnpnet-set": "network over any number of pairs, then learned LM: the default",
+    "pnpnet-n": "the paper's network for that number of pairs, then learned LM; camera near the world's axes",
+    "net-": "the network alone, without refinement",
+    "epnp": "EPnP, without outliers",
+    "epnp-lm": "EPnP, then robust LM",
+    "reppnp": "EPnP that rejects outliers by their algebraic error",
+    "reppnp-lm": "REPPnP, then robust LM",
+    "p3p-ransac": "RANSAC on samples of three: most outliers",
+    "ransac-epnp-lm": "the paper's RANSAC on samples of seven",
+    "identity-lm": "robust LM from the identity, or from a given pose",
+    "opencv-": "OpenCV's solver, one problem at a time",
+    "poselib": "PoseLib's RANSAC, one problem at a time",
+    "pycolmap": "COLMAP's RANSAC, one problem at a time",
+}
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """``pnpnet list`` has no arguments."""
 
 
 def run(_: argparse.Namespace) -> int:
-    """Print each solver with the package that it needs and that is not installed."""
+    """Print what each solver is, and the package that it needs where it is not installed."""
     states = {}
     for name in list_solvers():
         package = missing_package(name)
-        states[name] = f"needs {package}: pip install 'kornia_pnpnet[eval]'" if package else "installed"
+        missing = f" (needs {package}: pip install 'kornia_pnpnet[eval]')" if package else ""
+        states[name] = _WHAT[max((start for start in _WHAT if name.startswith(start)), key=len)] + missing
     states |= dict.fromkeys(BOUNDS, "bound: needs the true pose, for `pnpnet evaluate` only")
     for name, state in states.items():
         print(f"{name:<{max(map(len, states))}}  {state}")
