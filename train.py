@@ -49,7 +49,8 @@ def main(config: DictConfig) -> float | None:
             start_from(model, PnPNet.from_pretrained(config.weights))
             origin = find_results(config.weights)
         except (FileNotFoundError, RuntimeError, ValueError, ValueCheckError) as error:
-            sys.exit(f"Cannot start n = {config.model.n} from weights={config.weights}: {error}")
+            reason = " ".join(str(error).split())[:300]
+            sys.exit(f"Cannot start n = {config.model.n} from weights={config.weights}: {reason}")
     if config.compile:
         model.compile()
     validation = {name: instantiate(source).batch(0) for name, source in config.data.validation.items()}

@@ -64,6 +64,11 @@ def main(argv: list[str] | None = None) -> int:
     except (BaseError, OSError, ImportError, ValueError) as error:
         print(f"pnpnet: {_one_line(error)}", file=sys.stderr)
         return 2
+    except (MemoryError, RuntimeError) as error:
+        if not isinstance(error, MemoryError) and "allocate" not in str(error):
+            raise
+        print(f"pnpnet: not enough memory for so much at once: {_one_line(error)}", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         print("pnpnet: interrupted", file=sys.stderr)
         return 130

@@ -38,12 +38,12 @@ class OneLineParser(argparse.ArgumentParser):
         self.exit(2, f"pnpnet: {' '.join(message.split())} (see {self.prog} --help)\n")
 
 
-def whole_number(low: int) -> Callable[[str], int]:
-    """Make a parser of integers of at least ``low``."""
+def whole_number(low: int, high: int = 10**8) -> Callable[[str], int]:
+    """Make a parser of integers from ``low`` to ``high``; more problems or pairs than the default fill no memory."""
 
     def parse(text: str) -> int:
-        if not text.isdecimal() or int(text) < low:
-            raise argparse.ArgumentTypeError(f"expected an integer of at least {low}, got {text!r}")
+        if not text.isdecimal() or not low <= int(text[:20]) <= high:
+            raise argparse.ArgumentTypeError(f"expected an integer from {low} to {high}, got {text!r}")
         return int(text)
 
     return parse

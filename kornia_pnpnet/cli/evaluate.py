@@ -63,7 +63,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--problems", metavar="COUNT", type=whole_number(1), default=1000, help="problems per set; default: 1000"
     )
     parser.add_argument(
-        "--seed", type=whole_number(0), default=DEFAULT_SEED, help=f"seed of the problems; default: {DEFAULT_SEED}"
+        "--seed",
+        type=whole_number(0, 2**63 - 1),
+        default=DEFAULT_SEED,
+        help=f"seed of the problems; default: {DEFAULT_SEED}",
     )
     parser.add_argument("--dtype", choices=("float32", "float64"), default="float32", help="default: float32")
     add_arbitrary_unit(parser)
