@@ -6,8 +6,8 @@ A new initialiser is one new file here: a module that maps :class:`~kornia_pnpne
 
 from kornia_pnpnet.init.epnp import EPnP
 from kornia_pnpnet.init.mlp import MLPInit
-from kornia_pnpnet.init.ransac import P3P, RANSAC, SubsetSolver, p3p
+from kornia_pnpnet.init.ransac import P3P, RANSAC, MinimalSolver, SubsetSolver, p3p
 from kornia_pnpnet.init.reppnp import REPPnP
 from kornia_pnpnet.init.set import SetInit
 
-__all__ = ["P3P", "RANSAC", "EPnP", "MLPInit", "REPPnP", "SetInit", "SubsetSolver", "p3p"]
+__all__ = ["P3P", "RANSAC", "EPnP", "MLPInit", "MinimalSolver", "REPPnP", "SetInit", "SubsetSolver", "p3p"]

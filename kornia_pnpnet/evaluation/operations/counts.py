@@ -59,7 +59,7 @@ def operation_count(solver: str | PnPNet, n: int, *, outliers: int = 0) -> float
 
     Example:
         >>> round(operation_count("identity-lm", 9), -4)
-        70000.0
+        80000.0
     """
     runnable = _solver(solver, n) if isinstance(solver, str) else solver
     mix = OutlierMix(count=outliers)
