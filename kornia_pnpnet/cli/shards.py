@@ -238,7 +238,11 @@ def _solve_parquet(
 def _padded(source: Path, columns: dict[str, list[Any]]) -> tuple[dict[str, np.ndarray], list[int]]:
     """Arrays of rows of different lengths, padded with weight 0, and the number of correspondences of each row."""
     check_points_present(source, columns, "column")
-    sizes = [len(x or ()) // 3 for x in columns["world_points"]]
+    try:  # rows may be nested lists, as `.tolist()` makes them
+        columns = {key: [np.ravel(x) if isinstance(x, list) else x for x in values] for key, values in columns.items()}
+    except ValueError as error:
+        raise InputError(source, f"lists of different lengths: {error}") from None
+    sizes = [0 if x is None else len(x) // 3 for x in columns["world_points"]]
     columns = {"weights": [[1.0] * size for size in sizes], **columns}
     shapes = {"world_points": (3,), "img_points": (2,), "weights": (), "img_sigma": (), "world_sigma": ()}
     arrays: dict[str, np.ndarray] = {}
