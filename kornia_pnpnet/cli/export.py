@@ -8,7 +8,6 @@ The model solves batches of any size. ONNX Runtime runs the model without PyTorc
 from __future__ import annotations
 
 import argparse
-import sys
 import warnings
 from pathlib import Path
 
@@ -35,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
     target.parent.mkdir(parents=True, exist_ok=True)  # an error now, not after minutes
     if target.is_dir():
         raise ValueError(f"'{target}' is a folder")
-    print("Tracing and converting; PyTorch's exporter takes some minutes", file=sys.stderr, flush=True)
+    print("Tracing and converting; PyTorch's exporter takes some minutes", flush=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the exporter about itself
         path = export_onnx(solver, target, arguments.n)
