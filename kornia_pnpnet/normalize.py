@@ -56,7 +56,7 @@ class Frame(NamedTuple):
         scale: factor of world lengths, shape :math:`(B,)`.
         img_scale: factor of pixels, the geometric mean of both axes, shape :math:`(B,)`.
         order: position in the input of each normalised pair, int64, shape :math:`(B, N)`; ``None``: unchanged.
-        status: ``Status.SOLVED`` where the problem can be solved at all, else why not, int8, shape :math:`(B,)`.
+        status: ``Status.SOLVED`` where the problem can be solved at all, else why not, int64, shape :math:`(B,)`.
     """
 
     centroid: Tensor
@@ -206,7 +206,7 @@ class Normalize(Configured):
             near = near.gather(0, order.mT)
         world_points, img_points, weights = rows.permute(2, 1, 0).split((3, 2, 1), -1)
         horizontal, vertical = img_scales.sqrt()
-        frame = Frame(centroid.mT, scale, horizontal * vertical, order, status.to(torch.int8))
+        frame = Frame(centroid.mT, scale, horizontal * vertical, order, status)
         if noise is not None:
             # Scaling an infinite sigma would give gradients of NaN: an invalid problem has no known noise.
             noise = map_tensors(lambda sigma: torch.where(has_noise[:, None], sigma, torch.nan), noise)

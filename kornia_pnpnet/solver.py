@@ -303,7 +303,8 @@ class PnPNet(nn.Module):
         first_ok = frame.valid & first.translation.sum(-1).isfinite()
         status = torch.where(refined.in_front, Status.NOT_BELIEVED.value, Status.BEHIND.value)
         status = torch.where(ok, Status.SOLVED.value, torch.where(finite, status, Status.DEGENERATE.value))
-        status = torch.where(frame.valid, status.to(frame.status), frame.status)
+        # ONNX Runtime chooses among int64, not among int8.
+        status = torch.where(frame.valid, status, frame.status).to(torch.int8)
         live = finite if always else ok
         rotation, translation = _gate_pose(pose, live, finite)
         return PnPResult(
