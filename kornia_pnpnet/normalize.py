@@ -168,7 +168,7 @@ class Normalize(Configured):
         there = there & (angle <= 1.0 / MIN_DEPTH_RATIO) & (sq_distance <= _LARGEST_DISTANCE**2 * typical)
         far = torch.where(there.sum(0) < _MANY, _FAR_OF_FEW**2 * typical, _FAR**2 * typical)
         seen = there & (angle <= _FAR_ANGLE)
-        near = torch.where(seen.sum(0) > MIN_PAIRS, seen, there) & (sq_distance <= far)  # a wide angle may be right
+        near = (seen | (there & (seen.sum(0) <= MIN_PAIRS))) & (sq_distance <= far)  # a wide angle may be right
         rows = torch.where(there, rows, zero)
 
         # Centre and scale by the pairs that are near.
