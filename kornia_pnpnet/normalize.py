@@ -153,7 +153,8 @@ class Normalize(Configured):
         there = rows[5] != 0
         sizes = torch.where(there, rows.detach().abs(), zero)
         size = sizes[:5].amax(0)  # of each pair
-        is_finite = (size.amax(0) < torch.inf) & (sizes[5].amax(0) < limit) & (rows[5] >= 0).all(0)
+        # Sums, because the maximum of ONNX Runtime leaves NaN out.
+        is_finite = (sizes.sum((0, 1)) < torch.inf) & (sizes[5].amax(0) < limit) & (rows[5] >= 0).all(0)
         if noise is not None:
             has_noise = _is_usable(noise)
             is_finite = is_finite & has_noise
@@ -331,11 +332,11 @@ def _pinhole(camera: Tensor) -> tuple[Tensor, Tensor]:
     """
     limit = torch.finfo(camera.dtype).max ** 0.25
     entries = camera.detach()
-    sized = (entries.abs().amax(0) < limit) & (entries[8].abs() > 1.0 / limit)
+    sized = (entries.abs().sum(0) < limit) & (entries[8].abs() > 1.0 / limit)
     camera = torch.where(sized, camera, 1.0)
     camera = camera / camera[8:]
     entries = camera.detach()
-    fine = sized & (torch.maximum(entries.abs().amax(0), entries[:5:4].rsqrt().amax(0)) < limit)  # NaN compares false
+    fine = sized & (entries.abs().sum(0) + entries[:5:4].rsqrt().sum(0) < limit)  # NaN compares false
     fine = fine & (entries[3] == 0) & (entries[6] == 0) & (entries[7] == 0)
     return torch.where(fine, camera, 1.0), fine
 
