@@ -54,7 +54,7 @@ class Ours(Contender):
         if views is not None:
             solver.views = views
         if classical is not None:
-            solver = PnPNet(solver.init, RobustWeightedLM(classical), solver.normalize).eval()
+            solver = PnPNet(solver.init, RobustWeightedLM(classical, reject_worse=False), solver.normalize).eval()
         solver = solver.float().to(device)
         self.solver: nn.Module = solver
         self.device = device
@@ -85,7 +85,7 @@ class Refinement(Contender):
     """A refinement alone, on normalised pairs and from the coarse pose."""
 
     def __init__(self, *, compiled: bool = False, device: str = "cpu") -> None:
-        self.refine: nn.Module = RobustWeightedLM(ITERATIONS).to(device)
+        self.refine: nn.Module = RobustWeightedLM(ITERATIONS, reject_worse=False).to(device)
         self.device = device
         if compiled:
             compile_or_raise(self.refine)

@@ -2,6 +2,7 @@
 
 from kornia_pnpnet.covariance import pose_covariance
 from kornia_pnpnet.init import MLPInit, SetInit
+from kornia_pnpnet.likelihood import monte_carlo_pose_loss
 from kornia_pnpnet.losses import PoseLoss, SetLoss
 from kornia_pnpnet.metrics import pose_errors, success, success_rate
 from kornia_pnpnet.normalize import Normalize
@@ -33,6 +34,7 @@ __all__ = [
     "__version__",
     "create_solver",
     "list_solvers",
+    "monte_carlo_pose_loss",
     "pose_covariance",
     "pose_errors",
     "shipped_weights",

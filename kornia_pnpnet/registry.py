@@ -42,13 +42,18 @@ def _alone(init: Callable[..., nn.Module], **options: Any) -> PnPNet:
     return _judged(init(**options), order=False)
 
 
+def _paper_lm(m: int) -> RobustWeightedLM:
+    """The classical robust LM of the paper's comparisons: alpha = 1, and every step is taken."""
+    return RobustWeightedLM(m, learnable=False, reject_worse=False)
+
+
 def _refined(init: Callable[..., nn.Module], m: int = _FEW, **options: Any) -> PnPNet:
-    """The paper's "-LM": the classical robust LM, alpha = 1, started from a method."""
-    return PnPNet(init(**options), RobustWeightedLM(m, learnable=False), Normalize(order=False))
+    """The paper's "-LM": started from a method."""
+    return PnPNet(init(**options), _paper_lm(m), Normalize(order=False))
 
 
 def _identity_lm(m: int = _MANY) -> PnPNet:
-    return PnPNet(None, RobustWeightedLM(m, learnable=False))
+    return PnPNet(None, _paper_lm(m))
 
 
 def _p3p_ransac(**options: Any) -> PnPNet:
@@ -56,7 +61,7 @@ def _p3p_ransac(**options: Any) -> PnPNet:
 
 
 def _ransac_epnp_lm(m: int = _FEW, **options: Any) -> PnPNet:
-    samples = SubsetSolver(EPnP(), RobustWeightedLM(m, learnable=False), size=_PAPERS_SAMPLE)
+    samples = SubsetSolver(EPnP(), _paper_lm(m), size=_PAPERS_SAMPLE)
     return _judged(RANSAC(samples, **options))
 
 

@@ -233,7 +233,9 @@ def test_rejecting_worse_steps_never_raises_the_cost(kernel, update, case):
         assert (after <= before * (1 + 1e-12)).all()
     assert (costs[-1] < costs[0]).double().mean() > 0.9
     if kernel == "power":  # the law can fail: without rejection, steps from far away do raise the cost of some problems
-        costs = [RobustWeightedLM(m, update=update)(corr, guess(start, corr)).cost for m in range(3)]
+        costs = [
+            RobustWeightedLM(m, update=update, reject_worse=False)(corr, guess(start, corr)).cost for m in range(3)
+        ]
         assert ((costs[1] > costs[0]) | (costs[2] > costs[1])).any()
 
 
@@ -421,11 +423,11 @@ def with_noise(start, corr, img_sigma):
 def test_iterations_by_residual_ignore_the_guessed_weights_but_not_the_given_ones(backward, case, generator):
     corr, _, start = case(outliers=2)
     doubt = torch.rand(7, 9, generator=generator, dtype=torch.float64)
-    lm = RobustWeightedLM(m=3, by_residual=1, backward=backward)
-    first = RobustWeightedLM(m=2)(corr, Guess(start, doubt)).pose
+    lm = RobustWeightedLM(m=3, by_residual=1, backward=backward, reject_worse=False)
+    first = RobustWeightedLM(m=2, reject_worse=False)(corr, Guess(start, doubt)).pose
     for weights in (torch.ones_like(doubt), doubt.flip(1)):
         refined = lm(corr._replace(weights=weights), Guess(start, doubt / weights))
-        last = RobustWeightedLM(m=1)(corr._replace(weights=weights), guess(first, corr))
+        last = RobustWeightedLM(m=1, reject_worse=False)(corr._replace(weights=weights), guess(first, corr))
         assert_close(refined, last, rtol=1e-7)
 
 
@@ -564,7 +566,7 @@ def gradients(case, generator):
         at = start
         with torch.no_grad():
             if skip:
-                at = RobustWeightedLM(m=skip).double()(corr, guess(start, corr)).pose
+                at = RobustWeightedLM(m=skip, reject_worse=False).double()(corr, guess(start, corr)).pose
             ends = [lm(corr, guess(at, corr), m=m).pose for m in (lm.m - 1, lm.m)]
             counted = (ends[1].matrix - ends[0].matrix).abs().amax((1, 2)) < 1e-12
             counted &= project(ends[1], corr).in_front.all(-1)  # else the pose diverged and stopped
@@ -585,8 +587,8 @@ def gradients(case, generator):
 
 def test_truncated_gradients_are_those_of_the_last_iterations(gradients):
     """From a constant pose: no gradient of the guess, nor of the hyperparameters before."""
-    truncated = gradients(RobustWeightedLM(m=5, backward="truncated", last=2).double())
-    last = gradients(RobustWeightedLM(m=2).double(), skip=3)
+    truncated = gradients(RobustWeightedLM(m=5, backward="truncated", last=2, reject_worse=False).double())
+    last = gradients(RobustWeightedLM(m=2, reject_worse=False).double(), skip=3)
     assert_close(truncated[:3], last[:3], atol=1e-12)
     for a, b in zip(truncated[4:], last[4:], strict=True):
         torch.testing.assert_close(a[3:], b, rtol=1e-9, atol=1e-12)
@@ -603,7 +605,9 @@ def test_truncated_gradients_are_those_of_the_last_iterations(gradients):
 @pytest.mark.parametrize("kernel", SMOOTH)
 def test_implicit_gradients_are_those_of_unrolling_to_the_minimum(kernel, gradients):
     unrolled, implicit = (
-        gradients(RobustWeightedLM(m=100, backward=b, **CONVERGING[kernel]).double(), converged=True)
+        gradients(
+            RobustWeightedLM(m=100, backward=b, reject_worse=False, **CONVERGING[kernel]).double(), converged=True
+        )
         for b in ("unroll", "implicit")
     )
     for a, b in zip(unrolled, implicit, strict=True):
@@ -703,7 +707,7 @@ def test_only_the_best_start_has_a_gradient(backward, near_and_far):
         (near, far), points = map_tensors(lambda x: x.clone().requires_grad_(), (poses, corr.world_points))
         first = guess(far, corr, near) if with_far else guess(near, corr)
         m = 4 if backward == "unroll" else 20  # implicit gradients are those of a minimum
-        lm = RobustWeightedLM(m, robustness=0.0, backward=backward, last=12)
+        lm = RobustWeightedLM(m, robustness=0.0, backward=backward, last=12, reject_worse=False)
         refined = lm(corr._replace(world_points=points), first)
         leaves = (points, *near, *far)
         gradients.append(torch.autograd.grad(refined.pose.translation.sum(), leaves, materialize_grads=True))
@@ -769,3 +773,16 @@ def test_refinements_take_anything(case, m, chosen, data):
     gradients_are_finite(
         [*refined.pose, refined.cost], [*tensors, *(p for p in refine.parameters() if p.requires_grad)]
     )
+
+
+@pytest.mark.parametrize("distance", [3.0, 10.0])
+def test_a_far_start_does_not_diverge(distance, make_problems, correspond):
+    """The default refiner comes home from a camera several times as far away, where plain iterations all diverge."""
+    corr, truth = correspond(make_problems(20, 100))
+    far = truth._replace(translation=distance * truth.translation)
+    shares = []
+    for changes in ({}, {"reject_worse": False}):
+        refined = RobustWeightedLM(m=30, **changes)(corr, guess(far, corr))
+        shares.append((pose_errors(refined.pose, truth).rotation_error_deg < 1.0).double().mean())
+    assert shares[0] > 0.95
+    assert shares[1] < 0.5

@@ -209,7 +209,7 @@ def measure_views(counts: Counts) -> None:
     kernels = {f"alpha = {alpha:g}": ("power", alpha) for alpha in (1.0, 1.5, 2.0)}
     kernels |= {f"{kernel}, {scale:g} px": (kernel, scale) for kernel, scale in SCALES}
     for name, (kernel, shape) in kernels.items():
-        classical = PnPNet(None, RobustWeightedLM(30, kernel=kernel, robustness=shape, learnable=False))
+        classical = PnPNet(None, RobustWeightedLM(30, kernel=kernel, robustness=shape, reject_worse=False))
         solvers[f"{name} from the truth"] = FromTheTruth(classical)
     run("views", solvers, counts.draw_scenes("2") | counts.draw(["synthetic"], "none,uniform,3"))
 

@@ -34,7 +34,7 @@ class Bound(Configured):
 
     def __init__(self, arguments: Mapping[str, Any]) -> None:
         super().__init__(arguments)
-        self.least_squares = PnPNet(None, RobustWeightedLM(_ITERATIONS, robustness=0.0, learnable=False))
+        self.least_squares = PnPNet(None, RobustWeightedLM(_ITERATIONS, robustness=0.0, reject_worse=False))
 
     def pair_weights(self, problems: Problems) -> Tensor:
         """Return the weight of each pair, shape :math:`(B, N)`."""

@@ -36,6 +36,8 @@ BACKWARDS = ("unroll", "truncated", "implicit")
 _MAX_RESIDUAL = 2.0
 # Focal lengths. Pixels are never known better than this, so that weights stay finite.
 _LEAST_NOISE = 1e-6
+# Units in the last place. With `reject_worse`, costs and residuals that differ by less count as equal.
+_ROUNDING = 100.0
 # Factors of the damping after a refused and after an accepted step (Marquardt 1963; only with `reject_worse`).
 _DAMPING_UP, _DAMPING_DOWN = 10.0, 0.3
 
@@ -74,7 +76,9 @@ class RobustWeightedLM(Configured):
         robustness: initial shape of the kernel, its classical value when ``None``. With 0, ``power`` is least squares.
         shared: learn one set for all iterations instead of one each.
         update: ``"retraction"`` on the rotation group, or the paper's ``"additive"`` on the rotation vector.
-        reject_worse: refuse, per problem, a step that raises the cost, and raise the damping tenfold after it.
+        reject_worse: refuse, per problem, a step that raises the cost, and raise the damping tenfold after it. From a
+            start far away the iterations diverge otherwise; from a good guess they take the same steps, and are faster
+            without.
         by_residual: number of final iterations that ignore the initialiser's weights, at most those after the choice
             among several poses.
         learnable: whether the hyperparameters are trained.
@@ -109,7 +113,7 @@ class RobustWeightedLM(Configured):
         robustness: float | None = None,
         shared: bool = False,
         update: str = "retraction",
-        reject_worse: bool = False,
+        reject_worse: bool = True,
         by_residual: int = 0,
         learnable: bool = True,
         backward: str = "unroll",
@@ -348,10 +352,12 @@ class RobustWeightedLM(Configured):
         """One iteration. With ``reject_worse``, a problem whose cost would rise keeps its pose."""
         damping = damping * state.factor if self.reject_worse else damping
         pose, solved = self._iterate(pairs, state.pose, step, damping, shape, estimated)
-        if not self.reject_worse:
+        if not self.reject_worse or estimated is not None:  # the cost does not know the corrected noise
             return State(pose, solved, state.factor)
         new, old = (self._cost(project(x, pairs), pairs, pairs.weights, shape) for x in (pose, state.pose))
-        better = new <= old
+        # At a minimum, rounding decides which cost is lower. A refused step has no gradient there: take the step.
+        rounding = _ROUNDING * torch.finfo(new.dtype).eps
+        better = new <= old * (1.0 + rounding) + (rounding * pairs.focal).square()
         factor = torch.where(better, state.factor * _DAMPING_DOWN, state.factor * _DAMPING_UP)
 
         def chosen(new: Tensor, old: Tensor) -> Tensor:

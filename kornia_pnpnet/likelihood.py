@@ -1,0 +1,316 @@
+"""The likelihood of a pose given its correspondences: a loss for networks whose predictions do not fit any pose yet."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from kornia.core.check import KORNIA_CHECK
+from kornia.geometry.camera import PinholeCamera
+from kornia.geometry.conversions import quaternion_to_rotation_matrix
+from kornia.geometry.liegroup import So3
+from torch import Tensor
+
+from kornia_pnpnet.core.checks import check_positive, check_whole
+from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.geometry import normal_equations, pixel_variance, project, retract
+from kornia_pnpnet.inputs import checked_inputs
+from kornia_pnpnet.normalize import Normalize
+from kornia_pnpnet.refine.kernels import KERNELS, RobustKernel
+from kornia_pnpnet.refine.step import iterate
+from kornia_pnpnet.types import Correspondences, Pose
+
+__all__ = ["monte_carlo_pose_loss"]
+
+# Degrees of freedom of the t distributions: their tails are heavier than those of a likelihood, so that no sample has a
+# very large weight.
+_FREEDOM = 3.0
+# Scale of the prior of the translation, as a share of the distance between camera and points.
+_PRIOR_TRANSLATION = 0.5
+# Radians. A component is at most about this wide; beyond it a tangent vector describes rotations badly.
+_WIDEST_ROTATION = 1.0
+# Iterations from the likeliest sample to the mode beside it, and their damping.
+_MODE_ITERATIONS, _MODE_DAMPING = 4, 1e-3
+# Share of the distance between camera and points. Nearer points, and points behind the camera, project as if they were
+# this far away, and their depth counts as a residual.
+_LEAST_DEPTH = 0.02
+
+
+class _Component(NamedTuple):
+    """A t distribution around a pose: its precision matrix is the square of the factor, lower triangular (B, 6, 6)."""
+
+    pose: Pose
+    factor: Tensor
+
+
+class _Samples(NamedTuple):
+    """Poses drawn for each problem: rotations (S, B, 3, 3), translations (S, B, 3)."""
+
+    rotation: Tensor
+    translation: Tensor
+
+
+def monte_carlo_pose_loss(
+    truth: Pose,
+    hypotheses: Pose | Sequence[Pose],
+    world_points: Tensor,
+    img_points: Tensor,
+    intrinsics: Tensor | PinholeCamera,
+    weights: Tensor | None = None,
+    mask: Tensor | None = None,
+    *,
+    img_sigma: Tensor | float,
+    world_sigma: Tensor | float | None = None,
+    samples: int = 96,
+    rounds: int = 2,
+    kernel: str = "huber",
+    scale: float = 3.0,
+) -> Tensor:
+    r"""Negative log-likelihood of the true pose under the distribution of poses that the correspondences define.
+
+    The density of a pose :math:`y` is :math:`p(y) = \exp(-c(y))\,p_0(y) / Z`. The cost :math:`c` is half the sum over
+    the pairs of the weight times the robust loss of the squared residual in variances. :math:`Z` is an integral over
+    all poses, estimated by importance sampling. A distance between poses has no useful gradient while the
+    correspondences fit no pose; this loss has one from the first step, because it compares the true pose with all
+    others.
+
+    Samples come in equal numbers from the prior, from a
+    t distribution around the true pose and around each hypothesis, with the precision of the normal equations there,
+    and from ``rounds`` more, each around the mode next to the likeliest sample so far. The prior :math:`p_0` has
+    uniform rotations, and translations of a t distribution around the true one as wide as half the distance between
+    camera and points. It only matters while the correspondences say little.
+
+    Gradients flow to points, pixels, cameras, weights and sigmas, not to the poses. A problem that a solver would
+    refuse (NaN, points on a line, no pinhole camera) has the loss 0 without gradient.
+
+    Source: H. Chen et al., "EPro-PnP: Generalized End-to-End Probabilistic Perspective-n-Points", CVPR 2022, equations
+    4 to 7. Differences: several hypotheses, a prior, modes found by refinement in place of fitted proposals.
+
+    Args:
+        truth: true world-to-camera poses, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
+        hypotheses: poses around which to look as well, such as the ``pose`` of a result.
+        world_points: shape :math:`(B, N, 3)`.
+        img_points: pixels, shape :math:`(B, N, 2)`.
+        intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or Kornia's cameras.
+        weights: at least 0, shape :math:`(B, N)`.
+        mask: False where a pair is padding, bool, shape :math:`(B, N)`.
+        img_sigma: standard deviation of the noise on each pixel coordinate, in pixels: a number, :math:`(B,)` or
+            :math:`(B, N)`. A network that predicts it learns from this loss how sure it is.
+        world_sigma: standard deviation of the noise on each world coordinate, in the unit of ``world_points``;
+            ``None``: exact points.
+        samples: number of poses drawn per problem.
+        rounds: number of components that are added one after the other.
+        kernel: name of the robust kernel, a key of :data:`~kornia_pnpnet.refine.kernels.KERNELS`.
+        scale: shape of the kernel, in standard deviations.
+
+    Returns:
+        The loss of each problem, shape :math:`(B,)`, in nats, for a density per radian³ and world unit³.
+
+    Raises:
+        ShapeError: for shapes that do not fit each other.
+        TypeCheckError: for dtypes that differ or are not float32 or float64.
+        DeviceError: for tensors on different devices.
+        BaseError: for an unknown kernel, a scale that is not positive, or fewer samples than components.
+
+    Example:
+        >>> from kornia_pnpnet.data import SyntheticProblems
+        >>> p = SyntheticProblems(n=20, batch_size=2, seed=0).batch(0)
+        >>> pixels = torch.randn_like(p.img_points).requires_grad_()  # of a network that has learned nothing
+        >>> loss = monte_carlo_pose_loss(p.pose, p.pose, p.world_points, pixels, p.intrinsics, img_sigma=100.0)
+        >>> loss.mean().backward()
+        >>> loss.shape, bool(pixels.grad.isfinite().all()), bool((pixels.grad != 0).any())
+        (torch.Size([2]), True, True)
+    """
+    others = [hypotheses] if isinstance(hypotheses, Pose) else list(hypotheses)
+    count = len(others) + 2 + rounds
+    check_whole(0, rounds=rounds)
+    check_whole(count, samples=samples)
+    check_positive(scale=scale)
+    KORNIA_CHECK(kernel in KERNELS, f"kernel must be one of {sorted(KERNELS)}, got {kernel!r}.")
+    for pose in (truth, *others):
+        noise_of_points = 0.0 if world_sigma is None else world_sigma
+        arguments = world_points, img_points, intrinsics, weights, mask, pose, img_sigma, noise_of_points
+        inputs = checked_inputs(*arguments)
+    assert inputs.noise is not None
+    known = inputs.noise.img.isfinite().all(1) & (inputs.noise.img > 0).all(1) & inputs.noise.world.isfinite().all(1)
+    noise = map_tensors(lambda x: torch.where(known[:, None], x, 1.0), inputs.noise)
+
+    with torch.no_grad():
+        _, frame = Normalize(order=False)(*inputs[:5], noise)
+    corr, _ = Normalize(center=False, scale=False, order=False)(*inputs[:5], noise)
+    # The frame is a constant: its gradient would only add noise to that of the integral.
+    there = frame.valid[:, None, None] & (corr.weights > 0)[..., None]
+    world = torch.where(there, (corr.world_points - frame.centroid[:, None]) * frame.scale[:, None, None], 0.0)
+    assert corr.noise is not None
+    corr = corr._replace(world_points=world, noise=corr.noise._replace(world=corr.noise.world * frame.scale[:, None]))
+
+    live = frame.valid & known
+    for pose in (truth, *others):
+        live = live & torch.cat((pose.rotation.flatten(1), pose.translation), 1).isfinite().all(1)
+    eye = torch.eye(3, dtype=world.dtype, device=world.device)
+    poses = []
+    for pose in (truth, *others):
+        rotation = torch.where(live[:, None, None], pose.rotation.detach(), eye)
+        translation = torch.where(live[:, None], pose.translation.detach(), eye[2])
+        poses.append(Normalize().apply_to_pose(Pose(rotation, translation), frame))
+    model = _Posterior(corr, *poses[0], KERNELS[kernel], world.new_tensor(scale), world_sigma is not None)
+    with torch.no_grad():
+        drawn, log_proposal = _draw(model._replace(corr=corr.map(torch.Tensor.detach)), poses, samples // count, rounds)
+    log_weights = model.log_density(drawn) - log_proposal
+    log_total = torch.logsumexp(log_weights, 0) - math.log(len(log_weights))
+    log_density = model.log_density(_Samples(*(x[None] for x in poses[0])))[0] - log_total
+    return torch.where(live, -log_density - 3.0 * frame.scale.log(), 0.0)
+
+
+class _Posterior(NamedTuple):
+    """The density of poses, up to a factor, in the frame of the normalised correspondences.
+
+    Attributes:
+        corr: normalised correspondences with known noise.
+        rotation: rotation of the true pose, (B, 3, 3).
+        translation: translation of the true pose, (B, 3).
+        kernel: the robust kernel.
+        shape: its shape, a scalar.
+        noisy_points: whether world points have noise, so that the variance of a pixel depends on the pose.
+    """
+
+    corr: Correspondences
+    rotation: Tensor
+    translation: Tensor
+    kernel: RobustKernel
+    shape: Tensor
+    noisy_points: bool
+
+    @property
+    def distance(self) -> Tensor:
+        """Distance between the true camera and the points, (B, 1)."""
+        return self.translation.norm(dim=-1, keepdim=True)
+
+    def log_density(self, poses: _Samples) -> Tensor:
+        """Logarithm of likelihood times prior, (S, B)."""
+        return self.log_prior(poses.translation) - self._cost(poses)
+
+    def log_prior(self, translation: Tensor) -> Tensor:
+        """Logarithm of the prior's density, (S, B); it does not depend on the rotation."""
+        width = _PRIOR_TRANSLATION * self.distance
+        sq_distance = ((translation - self.translation) / width).square().sum(-1)
+        return _log_t(sq_distance, 3) - 3.0 * width.log().mT - math.log(8.0 * math.pi**2)
+
+    def sample_prior(self, count: int) -> _Samples:
+        """Uniform rotations, and translations around the true one."""
+        batch = self.translation.shape[0]
+        rotation = quaternion_to_rotation_matrix(torch.randn(count, batch, 4).to(self.translation))
+        shift = _sample_t(count, self.translation)
+        return _Samples(rotation, self.translation + _PRIOR_TRANSLATION * self.distance * shift)
+
+    def _cost(self, poses: _Samples) -> Tensor:
+        """Half the weighted sum of robust losses, (S, B)."""
+        corr = self.corr
+        cam = corr.world_points @ poses.rotation.mT + poses.translation[..., None, :]  # (S, B, N, 3)
+        least = _LEAST_DEPTH * self.distance
+        depth = cam[..., 2].maximum(least)
+        plane = cam[..., :2] / depth[..., None]
+        behind = (depth - cam[..., 2]) / least
+        sq_residual = (corr.focal * plane - corr.img_points).square().sum(-1) + (corr.focal * behind).square()
+        assert corr.noise is not None
+        variance = corr.noise.img.square()
+        if self.noisy_points:
+            sides = 1.0 + 0.5 * plane.square().sum(-1)
+            variance = variance + (corr.focal * corr.noise.world / depth).square() * sides
+        loss = self.kernel.loss(sq_residual / variance, self.shape)
+        if self.noisy_points:
+            loss = loss + 2.0 * variance.log()  # of both coordinates
+        return 0.5 * (corr.weights * loss).sum(-1)
+
+    def component(self, pose: Pose) -> _Component:
+        """The t distribution whose precision is that of the normal equations at a pose, with a bounded width."""
+        corr, projection = self.corr, project(pose, self.corr)
+        assert corr.noise is not None
+        precision = corr.weights / pixel_variance(projection, corr.noise, corr.focal)
+        robust = self.kernel.weight(
+            projection.sq_residual / pixel_variance(projection, corr.noise, corr.focal), self.shape
+        )
+        rows = normal_equations(projection, corr.focal.square() * precision * robust).hessian
+        matrix = torch.stack([torch.stack([rows[max(i, j)][min(i, j)] for j in range(6)], -1) for i in range(6)], -2)
+        least = torch.cat((torch.ones_like(self.translation) / _WIDEST_ROTATION**2, self._translation_precision), -1)
+        matrix = matrix + torch.diag_embed(least)
+        # Scaled to a diagonal of one, so that rounding does not depend on units.
+        scale = matrix.diagonal(dim1=-2, dim2=-1).rsqrt()
+        eye = torch.eye(6, dtype=scale.dtype, device=scale.device)
+        scaled = matrix * scale[..., None] * scale[..., None, :] + 10.0 * torch.finfo(scale.dtype).eps * eye
+        return _Component(pose, torch.linalg.cholesky_ex(scaled)[0] / scale[..., None])
+
+    @property
+    def _translation_precision(self) -> Tensor:
+        return (_PRIOR_TRANSLATION * self.distance).square().reciprocal().expand(-1, 3)
+
+    def mode(self, poses: _Samples, log_weights: Tensor) -> Pose:
+        """The mode next to the pose of the largest weight."""
+        best = log_weights.argmax(0)
+        rows = torch.arange(len(best), device=best.device)
+        pose = Pose(poses.rotation[best, rows], poses.translation[best, rows])
+        one, damping = torch.ones_like(self.shape), torch.full_like(self.shape, _MODE_DAMPING)
+        for _ in range(_MODE_ITERATIONS):
+            step = iterate(self.corr, pose, one, damping, self.shape, None, kernel_weight=self.kernel.weight)
+            pose = step.pose
+        return pose
+
+
+def _draw(model: _Posterior, poses: Sequence[Pose], each: int, rounds: int) -> tuple[_Samples, Tensor]:
+    """Draw from the prior and from a component around every pose and every mode that is found.
+
+    Returns:
+        The samples, and the logarithm of the density of the mixture that they come from, (S, B).
+    """
+    components = [model.component(pose) for pose in poses]
+    parts = [model.sample_prior(each), *(_sample(component, each) for component in components)]
+
+    def log_mixture(drawn: _Samples) -> Tensor:
+        every = [model.log_prior(drawn.translation), *(_log_density(component, drawn) for component in components)]
+        return torch.logsumexp(torch.stack(every), 0) - math.log(len(every))
+
+    for _ in range(rounds):
+        drawn = _Samples(*map(torch.cat, zip(*parts, strict=True)))
+        components.append(model.component(model.mode(drawn, model.log_density(drawn) - log_mixture(drawn))))
+        parts.append(_sample(components[-1], each))
+    drawn = _Samples(*map(torch.cat, zip(*parts, strict=True)))
+    return drawn, log_mixture(drawn)
+
+
+def _sample_t(count: int, like: Tensor) -> Tensor:
+    """Vectors of the standard t distribution, ``count`` for each row of ``like``."""
+    normal = torch.randn(count, *like.shape, dtype=like.dtype, device=like.device)
+    freedom = torch.full((count, *like.shape[:-1], 1), 0.5 * _FREEDOM, dtype=like.dtype, device=like.device)
+    return normal * (0.5 * _FREEDOM / torch._standard_gamma(freedom)).sqrt()
+
+
+def _log_t(sq_distance: Tensor, size: int) -> Tensor:
+    """Logarithm of the density of the standard t distribution of ``size`` dimensions, by squared length."""
+    both = 0.5 * (_FREEDOM + size)
+    constant = math.lgamma(both) - math.lgamma(0.5 * _FREEDOM) - 0.5 * size * math.log(_FREEDOM * math.pi)
+    return constant - both * torch.log1p(sq_distance / _FREEDOM)
+
+
+def _sample(component: _Component, count: int) -> _Samples:
+    """Poses of a component."""
+    pose, factor = component
+    vectors = _sample_t(count, factor[..., 0])  # (S, B, 6)
+    tangents = torch.linalg.solve_triangular(factor.mT, vectors.permute(1, 2, 0), upper=True).permute(2, 0, 1)
+    moved = retract(map_tensors(lambda x: x.repeat(count, *(1,) * (x.ndim - 1)), pose), tangents.flatten(0, 1))
+    return _Samples(*map_tensors(lambda x: x.unflatten(0, (count, -1)), moved))
+
+
+def _log_density(component: _Component, poses: _Samples) -> Tensor:
+    """Logarithm of the density of a component per radian³ and unit³, (S, B)."""
+    pose, factor = component
+    turn = poses.rotation @ pose.rotation.mT
+    # The inverse of Cayley's map; half a turn would be infinitely far away.
+    cosine = 1.0 + turn.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True)
+    omega = 2.0 * So3.vee(turn - turn.mT) / cosine.clamp(min=1e-4)
+    tangent = torch.cat((omega, poses.translation - pose.translation), -1)
+    sq_distance = (tangent[..., None, :] @ factor)[..., 0, :].square().sum(-1)
+    log_determinant = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    # Volume of rotations by volume of Cayley's vectors: 1 / (1 + |omega|² / 4)².
+    return _log_t(sq_distance, 6) + log_determinant + 2.0 * torch.log1p(0.25 * omega.square().sum(-1))

@@ -1,0 +1,186 @@
+"""The Monte Carlo pose loss: an integral with known values, and a gradient from the first step."""
+
+import math
+
+import pytest
+import torch
+
+from kornia_pnpnet import (
+    PnPNet,
+    Pose,
+    RobustWeightedLM,
+    create_solver,
+    monte_carlo_pose_loss,
+    pose_covariance,
+    pose_errors,
+)
+from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+
+DOUBLE = torch.float64
+
+
+def problems(n=30, batch=4, seed=5, **noise):
+    return SyntheticProblems(
+        n=n, batch_size=batch, seed=seed, dtype=DOUBLE, outliers=OutlierMix(count=0), **noise
+    ).batch(0)
+
+
+def inputs(p):
+    return p.world_points, p.img_points, p.intrinsics
+
+
+def loss_of(p, hypothesis=None, **options):
+    torch.manual_seed(0)
+    return monte_carlo_pose_loss(p.pose, hypothesis or p.pose, *inputs(p), **options)
+
+
+@pytest.mark.parametrize("world_sigma", [None, 0.05])
+def test_is_gaussian_where_the_noise_is_small(world_sigma):
+    """Laplace's approximation is exact in the limit: the density of the covariance at the mode."""
+    p = problems(n=60, world_sigma=0.0, img_sigma=0.0)
+    solver = create_solver("epnp-lm")
+    noise = {"img_sigma": 1.0, "world_sigma": world_sigma}
+    mode = solver(*inputs(p), img_sigma=1.0).pose
+    known = {"img_sigma": 1.0, "world_sigma": world_sigma or 0.0}
+    covariance = pose_covariance(mode, *inputs(p), **known)
+    expected = 0.5 * torch.logdet(2.0 * math.pi * covariance)
+    loss = loss_of(p, mode, **noise, samples=2000, kernel="truncated", scale=1e3)
+    torch.testing.assert_close(loss, expected, rtol=0.0, atol=0.1)
+
+
+def test_integral_by_the_prior_alone():
+    """Where the noise is large, plain Monte Carlo over the prior finds the same integral."""
+    p = problems(n=12, batch=2)
+    loss = loss_of(p, img_sigma=20000.0, samples=4000, kernel="cauchy")
+    plain = loss_of(p, [], img_sigma=20000.0, samples=60000, rounds=0, kernel="cauchy")
+    torch.testing.assert_close(loss, plain, rtol=0.0, atol=0.1)
+
+
+def test_hypotheses_find_other_modes():
+    """A second pose that explains the pairs as well adds its integral, if the samples find it."""
+    p = problems(n=40, world_sigma=0.0, img_sigma=0.0)
+    turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=DOUBLE))
+    # Half of the pairs see the scene, the other half the scene turned upside down around its centre.
+    centre = p.world_points.mean(1, keepdim=True)
+    turned = (p.world_points - centre) @ turn + centre
+    even = (torch.arange(40) % 2 == 0).to(DOUBLE)
+    world = torch.where(even.bool()[:, None], p.world_points, turned)
+    rotation = p.pose.rotation @ turn
+    other = Pose(rotation, p.pose.translation + ((p.pose.rotation - rotation) @ centre.mT)[..., 0])
+    arguments = (world, p.img_points, p.intrinsics)
+    options = {"img_sigma": 2.0, "kernel": "truncated", "scale": 4.0, "samples": 600, "rounds": 0}
+    torch.manual_seed(0)
+    one = monte_carlo_pose_loss(p.pose, [], *arguments, **options)
+    two = monte_carlo_pose_loss(p.pose, other, *arguments, **options)
+    first, second = (
+        pose_covariance(pose, *arguments, img_sigma=2.0, weights=share.expand(4, 40)).logdet()
+        for pose, share in ((p.pose, even), (other, 1.0 - even))
+    )
+    torch.testing.assert_close(two - one, torch.log1p((0.5 * (second - first)).exp()), rtol=0.0, atol=0.2)
+
+
+def test_gradient_of_the_integral():
+    """With many samples the gradient is that of the loss: along a random direction it equals central differences."""
+    p = problems(n=12, batch=2)
+    direction = torch.randn(p.img_points.shape, generator=torch.Generator().manual_seed(1), dtype=DOUBLE)
+
+    def loss(shift):
+        torch.manual_seed(0)
+        pixels = p.img_points + shift * direction
+        options = {"img_sigma": 300.0, "samples": 60000, "rounds": 0}
+        return monte_carlo_pose_loss(p.pose, p.pose, p.world_points, pixels, p.intrinsics, **options).sum()
+
+    shift = torch.zeros((), dtype=DOUBLE, requires_grad=True)
+    (gradient,) = torch.autograd.grad(loss(shift), shift)
+    with torch.no_grad():
+        difference = (loss(torch.tensor(20.0)) - loss(torch.tensor(-20.0))) / 40.0
+    torch.testing.assert_close(gradient, difference, rtol=0.05, atol=2e-3)
+
+
+def test_units():
+    """A density per unit of the world: a thousand times the unit is a thousand times the density, in each direction."""
+    p = problems()
+    metres = loss_of(p, img_sigma=2.0, world_sigma=0.05)
+    pose = Pose(p.pose.rotation, 1000.0 * p.pose.translation)
+    torch.manual_seed(0)
+    millimetres = monte_carlo_pose_loss(
+        pose, pose, 1000.0 * p.world_points, p.img_points, p.intrinsics, img_sigma=2.0, world_sigma=50.0
+    )
+    torch.testing.assert_close(millimetres, metres + 3.0 * math.log(1000.0))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, DOUBLE])
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e4])
+def test_gradient_from_nothing(dtype, size):
+    """Predictions that fit no pose, of any size, have a finite gradient that is not zero, in every problem."""
+    generator = torch.Generator().manual_seed(3)
+    p = SyntheticProblems(n=16, batch_size=8, seed=2, dtype=dtype).batch(0)
+    live = [(size * torch.randn(8, 16, k, generator=generator)).to(dtype).requires_grad_() for k in (3, 2)]
+    sigma = torch.full((8, 16), 50.0, dtype=dtype, requires_grad=True)
+    loss = monte_carlo_pose_loss(p.pose, p.pose, *live, p.intrinsics, img_sigma=sigma)
+    loss.sum().backward()
+    assert loss.isfinite().all()
+    for tensor in (*live, sigma):
+        assert tensor.grad.isfinite().all()
+        assert (tensor.grad.flatten(1).abs().amax(1) > 0).all()
+
+
+def test_padding_and_bad_problems():
+    """Padded pairs do not matter, and a bad problem has the loss 0, no gradient, and changes no other."""
+    p = problems(n=20)
+    reference = loss_of(p, img_sigma=2.0)
+    mask = torch.arange(20).expand(4, 20) < 16
+    shorter = loss_of(p._replace(world_points=p.world_points[:, :16], img_points=p.img_points[:, :16]), img_sigma=2.0)
+    world = p.world_points.masked_fill(~mask[..., None], torch.nan).requires_grad_()
+    padded = loss_of(p._replace(world_points=world), img_sigma=2.0, mask=mask)
+    padded.sum().backward()
+    torch.testing.assert_close(padded, shorter)
+    assert world.grad.isfinite().all()
+    assert not world.grad[:, 16:].any()
+
+    world = p.world_points.clone()
+    world[1, 3, 0] = torch.nan
+    world[2] = world[2, :1]
+    pixels = p.img_points.clone().requires_grad_()
+    spoilt = loss_of(p._replace(world_points=world, img_points=pixels), img_sigma=2.0)
+    spoilt.sum().backward()
+    assert not spoilt[1:3].any()
+    assert not pixels.grad[1:3].any()
+    assert pixels.grad[0].any()
+    assert torch.equal(spoilt[[0, 3]], reference[[0, 3]])
+
+
+def test_unknown_sigma_is_a_bad_problem():
+    p = problems()
+    sigma = torch.tensor([1.0, torch.nan, -1.0, torch.inf], dtype=DOUBLE)
+    loss = loss_of(p, img_sigma=sigma)
+    assert loss[0] != 0
+    assert not loss[1:].any()
+
+
+def test_descends_to_the_truth():
+    """Pixels that begin as noise descend to where the true pose is the best one."""
+    torch.manual_seed(0)
+    p = SyntheticProblems(n=12, batch_size=3, seed=7, outliers=OutlierMix(count=0)).batch(0)
+    pixels = (p.img_points.std() * torch.randn_like(p.img_points)).requires_grad_()
+    log_sigma = torch.full((3, 1), 7.5, requires_grad=True)
+    optimizer = torch.optim.Adam([{"params": pixels, "lr": 60.0}, {"params": log_sigma, "lr": 0.05}])
+    options = {"samples": 48, "rounds": 1}
+    for _ in range(80):
+        arguments = (p.world_points, pixels, p.intrinsics)
+        loss = monte_carlo_pose_loss(p.pose, [], *arguments, img_sigma=log_sigma.exp().expand(3, 12), **options)
+        optimizer.zero_grad()
+        loss.mean().backward()
+        optimizer.step()
+    found = PnPNet(None, RobustWeightedLM(10))(p.world_points, pixels.detach(), p.intrinsics, init=p.pose)
+    assert pose_errors(found.pose, p.pose).rotation_error_deg.median() < 5.0
+
+
+def test_errors():
+    p = problems()
+    with pytest.raises(Exception, match="kernel must be one of"):
+        loss_of(p, img_sigma=1.0, kernel="wide")
+    with pytest.raises(Exception, match="samples"):
+        loss_of(p, img_sigma=1.0, samples=3)
+    with pytest.raises(Exception, match="rotation"):
+        monte_carlo_pose_loss(Pose(p.pose.rotation[:2], p.pose.translation[:2]), [], *inputs(p), img_sigma=1.0)
