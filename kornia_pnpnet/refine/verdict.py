@@ -67,17 +67,20 @@ def explains(projection: Projection, corr: Correspondences, weights: Tensor) -> 
         bool of shape :math:`(B,)`.
     """
     weights = weights.detach()
+    there = weights > 0
     share = weights / weights.sum(-1, keepdim=True).clamp(min=torch.finfo(weights.dtype).tiny)  # (B, N)
-    pixels = corr.img_points.detach()
-    spread = (pixels - (share[..., None] * pixels).sum(1, keepdim=True)).square().sum(-1)
+    spread = torch.zeros_like(share)
+    for pixels in corr.img_points.detach().unbind(-1):
+        centred = pixels - (share * pixels).sum(-1, keepdim=True)
+        spread = torch.addcmul(spread, centred, centred)
     ascending, order = spread.sort(-1)
     position = (share.gather(-1, order).cumsum(-1) < _EXPLAINED_SHARE).sum(-1, keepdim=True)
     limit = _EXPLAINED_RESIDUAL**2 * ascending.gather(-1, position.clamp(max=ascending.shape[-1] - 1))
     explained = projection.in_front & (projection.sq_residual.detach() <= limit)
-    enough = torch.where(explained, share, 0.0).sum(-1) >= _EXPLAINED_SHARE
+    enough = (share * explained).sum(-1) >= _EXPLAINED_SHARE
     # Any three pairs have a pose that explains them: of more pairs, a fourth has to agree.
-    agree = explained & (weights > 0)
-    enough = enough & (agree.sum(-1) >= (weights > 0).sum(-1).clamp(MIN_PAIRS, MIN_PAIRS + 1))
+    agree = explained & there
+    enough = enough & (agree.sum(-1) >= there.sum(-1).clamp(MIN_PAIRS, MIN_PAIRS + 1))
     return enough & _span_a_plane(corr.world_points.detach(), agree)
 
 
@@ -104,10 +107,10 @@ def is_evident(projection: Projection, corr: Correspondences) -> Tensor:
 
 def _span_a_plane(world_points: Tensor, inliers: Tensor) -> Tensor:
     """Whether the points (B, N, 3) of the inliers (B, N) span more than a line: a line leaves the pose open."""
-    there, points = inliers.mT, world_points.permute(2, 1, 0)
-    share = there.sum(0).to(points.dtype).clamp(min=1.0).reciprocal()
-    points = torch.where(there, points, 0.0)
-    centred = torch.where(there, points - (points.sum(1) * share)[:, None], 0.0)
+    inlier = inliers.mT.to(world_points.dtype)
+    share = inlier.sum(0).clamp(min=1.0).reciprocal()
+    points = world_points.permute(2, 1, 0) * inlier
+    centred = torch.addcmul(points, (points.sum(1) * share)[:, None], inlier, value=-1)
     return span_a_plane(centred, share, points.abs().amax((0, 1)))
 
 
