@@ -12,7 +12,7 @@ from torch._dynamo.testing import CompileCounter
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from kornia_pnpnet import MLPInit, PnPNet, Pose, RobustWeightedLM, create_solver
-from kornia_pnpnet.core.performance import Compiled, ascending_order, problems_last, ranked
+from kornia_pnpnet.core.performance import Compiled, ascending_order, in_order, problems_last, ranked
 from kornia_pnpnet.core.trees import iter_tensors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.geometry import project
@@ -247,6 +247,8 @@ def test_ranks_are_those_of_a_sort(batch, count, backend):
     ordered = values.sort(1).values
     ranks = torch.arange(batch) % (count + 1) - 1  # a negative rank means 0
     expected = ordered.gather(1, ranks.clamp(min=0).expand(3, 1, -1))[:, 0]
+    for sort in (in_order, Compiled(in_order)):
+        torch.testing.assert_close(sort(values), ordered)
     for found in (ranked, Compiled(ranked)):
         torch.testing.assert_close(found(values, count // 2), ordered[:, count // 2])
         torch.testing.assert_close(found(values, ranks), expected)

@@ -22,6 +22,7 @@ __all__ = [
     "compiling",
     "exporting",
     "fold_vmap",
+    "in_order",
     "keep_freed_memory",
     "problems_last",
     "ranked",
@@ -96,6 +97,25 @@ _FEW_COMPILED, _FEW = 12, 32
 _MANY_PROBLEMS = 256
 
 
+def in_order(values: Tensor) -> Tensor:
+    """Sort along the second dimension.
+
+    Args:
+        values: no NaN, shape :math:`(C, N, B)`.
+
+    Returns:
+        The values in ascending order, shape :math:`(C, N, B)`.
+
+    Example:
+        >>> in_order(torch.tensor([[[3.0], [1.0], [2.0]]])).flatten()
+        tensor([1., 2., 3.])
+    """
+    if _are_few(values):
+        return torch.stack(_through_network(values, None), 1)
+    # ONNX sorts by a top-k.
+    return values.topk(values.shape[1], 1, largest=False).values if exporting() else values.sort(1).values
+
+
 def ranked(values: Tensor, rank: Tensor | int) -> Tensor:
     """Find the value of a rank along the second dimension.
 
@@ -110,25 +130,29 @@ def ranked(values: Tensor, rank: Tensor | int) -> Tensor:
         >>> ranked(torch.tensor([[[3.0], [1.0], [2.0]]]), 1)
         tensor([[2.]])
     """
-    count, batch = values.shape[1:]
-    if compiling():
-        few = isinstance(count, int) and count <= _FEW_COMPILED
-    else:
-        few = count <= _FEW and batch >= _MANY_PROBLEMS and values.device.type == "cpu"
-    if few:
-        rows = list(values.unbind(1))
-        for i, j, smaller, larger in _network(count, rank if isinstance(rank, int) else None):
-            a, b = rows[i], rows[j]
-            rows[i], rows[j] = torch.minimum(a, b) if smaller else a, torch.maximum(a, b) if larger else b
-        if isinstance(rank, int):
-            return rows[rank]
-        ordered = torch.stack(rows, 1)
-    elif isinstance(rank, int) and not exporting():
+    if isinstance(rank, int) and _are_few(values):
+        return _through_network(values, rank)[rank]
+    if isinstance(rank, int) and not exporting():  # ONNX has no k-th value
         return values.kthvalue(rank + 1, 1).values
-    else:  # ONNX has no k-th value, and its sort is a top-k
-        ordered = values.topk(count, 1, largest=False).values if exporting() else values.sort(1).values
     rank = torch.as_tensor(rank, device=values.device).clamp(min=0).expand(values.shape[0], 1, values.shape[-1])
-    return ordered.gather(1, rank)[:, 0]
+    return in_order(values).gather(1, rank)[:, 0]
+
+
+def _are_few(values: Tensor) -> bool:
+    """Whether a network takes less time than a sort of values (C, N, B)."""
+    count = values.shape[1]
+    if compiling():
+        return isinstance(count, int) and count <= _FEW_COMPILED
+    return count <= _FEW and values.shape[2] >= _MANY_PROBLEMS and values.device.type == "cpu"
+
+
+def _through_network(values: Tensor, rank: int | None) -> list[Tensor]:
+    """The rows (C, B) of values (C, N, B) in ascending order, or with the one of a rank at its place."""
+    rows = list(values.unbind(1))
+    for i, j, smaller, larger in _network(len(rows), rank):
+        a, b = rows[i], rows[j]
+        rows[i], rows[j] = torch.minimum(a, b) if smaller else a, torch.maximum(a, b) if larger else b
+    return rows
 
 
 @cache

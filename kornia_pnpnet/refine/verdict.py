@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_pnpnet.core.performance import exporting
+from kornia_pnpnet.core.performance import exporting, in_order
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import Projection, span_a_plane
 from kornia_pnpnet.types import MIN_PAIRS, Correspondences
@@ -215,7 +215,7 @@ def chance_of_inlier(corr: Correspondences, thresholds: Thresholds, judged: Judg
     chance = (0.25 * math.pi * strips.prod(-1)).minimum(strips.amin(-1)).clamp(max=1.0)
     anywhere = torch.where(inlier, chance, 0.0).sum(-1) / inlier.sum(-1).clamp(min=1)
     outlier = (corr.weights > 0) & ~inlier
-    sq_distance = torch.where(outlier, judged.errors, torch.inf).sort(-1).values[:, 1:]  # from the second outlier on
+    sq_distance = in_order(torch.where(outlier, judged.errors, torch.inf).mT[None])[0, 1:].mT  # from the second on
     within = torch.arange(2, corr.weights.shape[1] + 1, device=outlier.device)
     others = ((corr.weights > 0).sum(-1, keepdim=True) - MIN_PAIRS).clamp(min=1)
     by_outliers = within / others * worst / sq_distance.maximum(_REACH**2 * worst)
