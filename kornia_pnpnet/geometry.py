@@ -195,7 +195,8 @@ def normal_equations(projection: Projection, weights: Tensor) -> NormalEquations
         (minus_p, minus_q),
     ]
     weights = weights * projection.inv_depth * projection.inv_depth
-    zero = torch.zeros_like(weights.sum(1))
+    total = weights.sum(1)
+    zero = torch.zeros_like(total)
     weighted: list[_Column] = [(_times(u, weights), _times(v, weights)) for u, v in columns]
 
     def inner(a: _Column, b: _Column) -> Tensor:
@@ -204,9 +205,13 @@ def normal_equations(projection: Projection, weights: Tensor) -> NormalEquations
         if type(a_u) is type(a_v) is type(b_u) is type(b_v):
             return torch.addcmul(a_u * b_u, a_v, b_v).sum(1)
         products = [x for x in (_times(a_u, b_u), _times(a_v, b_v)) if type(x) is not float]
-        return products[0].sum(1) if products else zero
+        if not products:
+            return zero
+        return total if products[0] is weights else products[0].sum(1)
 
-    hessian = [[inner(weighted[j], columns[i]) for j in range(i + 1)] for i in range(6)]
+    # The products of the last column with the two constant ones are its weighted entries.
+    hessian = [[inner(weighted[j], columns[i]) for j in range(i + 1)] for i in range(5)]
+    hessian.append([inner(weighted[5], column) for column in columns])
     return NormalEquations(hessian, [inner(column, projection.scaled_residual) for column in weighted])
 
 
@@ -380,4 +385,4 @@ def span_a_plane(centred: Tensor, share: Tensor, size: Tensor) -> Tensor:
     eps = torch.finfo(centred.dtype).eps
     covariance = (centred[:, None] * centred).sum(2) * (share / (size * size))  # (3, 3, B) in the unit of the size
     trace = covariance.diagonal().sum(-1)
-    return ((1.0 - 16.0 * eps) * trace - 2.0 * (64.0 * eps) ** 2) * trace > (covariance * covariance).sum((0, 1))
+    return ((1.0 - 16.0 * eps) * trace - 2.0 * (64.0 * eps) ** 2) * trace > covariance.square().sum((0, 1))

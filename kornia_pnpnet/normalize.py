@@ -14,8 +14,8 @@ from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_positive
 from kornia_pnpnet.core.configured import Configured
-from kornia_pnpnet.core.performance import compiling, exporting
-from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.core.performance import ascending_order, ranked
+from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.geometry import MIN_DEPTH_RATIO, span_a_plane
 from kornia_pnpnet.types import MIN_PAIRS, Correspondences, Guess, Noise, Pose, Status
 
@@ -44,8 +44,6 @@ _MANY, _FAR_OF_FEW = 12, 25.0
 _LARGEST_DISTANCE = 1e6
 # Tangent of 85 degrees, more than a lens without distortion can show.
 _FAR_ANGLE = 11.4
-# Pairs. Up to this number a compiled solver sorts by a network of minima and maxima, which takes next to no time.
-_FEW = 12
 
 
 class Frame(NamedTuple):
@@ -151,60 +149,63 @@ class Normalize(Configured):
         # overflow nor vanish. NaN compares false.
         limit = torch.finfo(rows.dtype).max ** 0.25
         there = rows[5] != 0
-        sizes = torch.where(there, rows.detach().abs(), zero)
+        sizes = rows.detach().abs()
+        if padded:
+            sizes = torch.where(there, sizes, zero)
         size = sizes[:5].amax(0)  # of each pair
         # Sums, because the maximum of ONNX Runtime leaves NaN out.
-        is_finite = (sizes.sum((0, 1)) < torch.inf) & (sizes[5].amax(0) < limit) & (rows[5] >= 0).all(0)
+        is_finite = sizes.sum((0, 1)) < torch.inf
+        if padded:
+            is_finite = is_finite & ((rows[5] >= 0) & (rows[5] < limit)).all(0)
         if noise is not None:
             has_noise = _is_usable(noise)
             is_finite = is_finite & has_noise
         there = there & (is_camera & is_finite) & (size < limit)
-        rows = rows - torch.cat((zero, zero, zero, camera[2:6:3], zero))[:, None]
+        rows = torch.where(there, rows, zero)  # finite, so that products with 0 are 0 from here on
         focal = rows.new_full((), self.f_const)  # made on the device, so that a GPU need not wait for the CPU
         img_scales = focal / camera[:5:4]  # (2, B)
 
         # A pair far off is no reason to refuse the problem: beyond any angle or distance it is an outlier.
-        angle = (rows[3:5].detach().abs() * (1.0 / camera.detach()[:5:4])[:, None]).amax(0)
+        pixels = (rows[3:5] - camera[2:6:3, None]) * img_scales[:, None]
+        tangent = pixels.detach().abs().amax(0) / self.f_const
         sq_distance, typical = _distances(rows[:3].detach(), there, padded)
-        there = there & (angle <= 1.0 / MIN_DEPTH_RATIO) & (sq_distance <= _LARGEST_DISTANCE**2 * typical)
-        far = torch.where(there.sum(0) < _MANY, _FAR_OF_FEW**2 * typical, _FAR**2 * typical)
-        seen = there & (angle <= _FAR_ANGLE)
+        there = there & (tangent <= 1.0 / MIN_DEPTH_RATIO) & (sq_distance <= _LARGEST_DISTANCE**2 * typical)
+        number = there.sum(0)
+        far = torch.where(number < _MANY, _FAR_OF_FEW**2, _FAR**2) * typical
+        seen = there & (tangent <= _FAR_ANGLE)
         near = (seen | (there & (seen.sum(0) <= MIN_PAIRS))) & (sq_distance <= far)  # a wide angle may be right
-        rows = torch.where(there, rows, zero)
+        is_near, is_there = near.to(rows.dtype), there.to(rows.dtype)
 
         # Centre and scale by the pairs that are near.
-        share = near.sum(0).to(rows.dtype).clamp(min=1.0).reciprocal()
-        centroid = mean = torch.where(near, rows[:3], zero).sum(1) * share
-        world = rows[:3]
-        if self.center:
-            world = torch.where(there, world - mean[:, None], zero)
-        else:
-            centroid = zero.expand(3, batch)
-        centred = world if self.center else world - mean[:, None]
-        largest = torch.where(near, sizes[:3], zero).amax((0, 1))
-        spread_out = span_a_plane(torch.where(near, centred.detach(), zero), share, largest)
-        spread_out = spread_out & (largest.reciprocal() < limit)
-        mean_square = torch.where(near, world, zero).square().sum((0, 1)) * share
+        share = is_near.sum(0).clamp(min=1.0).reciprocal()
+        near_points = rows[:3] * is_near
+        mean = near_points.sum(1) * share
+        centred = torch.addcmul(near_points, mean[:, None], is_near, value=-1)
+        largest = near_points.detach().abs().amax((0, 1))
+        spread_out = span_a_plane(centred.detach(), share, largest) & (largest > 1.0 / limit)
+        mean_square = (centred if self.center else near_points).square().sum((0, 1)) * share
         scale = torch.where(spread_out, mean_square, one[0]).rsqrt() if self.scale else one[0]
+        centroid = mean if self.center else zero.expand(3, batch)
 
         status = torch.where(spread_out, Status.SOLVED.value, Status.DEGENERATE.value)
         for fine, otherwise in (
-            (there.sum(0) >= MIN_PAIRS, Status.TOO_FEW_PAIRS),
+            (number >= MIN_PAIRS, Status.TOO_FEW_PAIRS),
             (is_camera, Status.CAMERA),
             (is_finite, Status.NOT_FINITE),
         ):
             status = torch.where(fine, status, otherwise.value)
         valid = status == Status.SOLVED.value
+        # The skew is 0 for pairs that are left out, whose pixels may be so large that products overflow.
+        without_skew = torch.addcmul(pixels[:1], camera[1] / camera[0] * is_there, pixels[1:], value=-1)
+        world = (rows[:3] - centroid[:, None]) * scale
         # An invalid problem becomes zeros, without gradient.
-        factors = torch.where(valid, torch.cat((scale.expand(3, batch), img_scales, one)), zero)
-        without_skew = torch.addcmul(rows[3:4], camera[1] / camera[4], rows[4:5], value=-1)
-        rows = torch.cat((world, without_skew, rows[4:])) * factors[:, None]
+        rows = torch.cat((world, without_skew, pixels[1:], rows[5:])) * (is_there * valid)
 
         order = None
         if self.order:
-            order = _order(torch.where(near, rows[3:5].detach(), torch.inf))
+            order = ascending_order(torch.where(near, rows[3:5].detach(), torch.inf))
             rows = rows.gather(1, order.mT.expand(6, -1, -1))
-            near = near.gather(0, order.mT)
+            is_near = is_near.gather(0, order.mT)
         world_points, img_points, weights = rows.permute(2, 1, 0).split((3, 2, 1), -1)
         horizontal, vertical = img_scales.sqrt()
         frame = Frame(centroid.mT, scale, horizontal * vertical, order, status)
@@ -213,7 +214,7 @@ class Normalize(Configured):
             noise = map_tensors(lambda sigma: torch.where(has_noise[:, None], sigma, torch.nan), noise)
             noise = self._apply_to_noise(noise, frame)
         corr = Correspondences(
-            world_points, img_points, weights[..., 0], focal, frame.img_scale, scale, noise, near.to(rows.dtype).mT
+            world_points, img_points, weights[..., 0], focal, frame.img_scale, scale, noise, is_near.mT
         )
         return corr, frame
 
@@ -239,20 +240,19 @@ class Normalize(Configured):
         Returns:
             The correspondences of all problems in the first view, then in the second view, and so on.
         """
-        rows = torch.cat((corr.world_points.permute(2, 1, 0), corr.img_points.permute(2, 1, 0), corr.weights.mT[None]))
-        x, y, z, u, v, weights = rows  # (N, B) each
-        seen = [torch.stack((*_exchanged(x, y, *view), z, *_exchanged(u, v, *view), weights)) for view in VIEWS[:count]]
-        of_pairs = map_tensors(lambda values: values.repeat(count, 1), (corr.noise, corr.near))
+        others = [values.mT for values in iter_tensors((corr.weights, corr.noise, corr.near))]  # (N, B) each
+        x, y, z, u, v = (*corr.world_points.permute(2, 1, 0), *corr.img_points.permute(2, 1, 0))
+        seen = [torch.stack((*_exchanged(x, y, *view), z, *_exchanged(u, v, *view), *others)) for view in VIEWS[:count]]
         if self.order:
             there = (corr.near_weights != 0).mT
             keys = torch.cat([torch.where(there, view[3:5].detach(), torch.inf) for view in seen[1:]], -1)
-            order = _order(keys)  # (B * (count - 1), N)
-            seen = [seen[0], torch.cat(seen[1:], -1).gather(1, order.mT.expand(6, -1, -1))]
-            batch = corr.weights.shape[0]
-            of_pairs = map_tensors(lambda x: torch.cat((x[:batch], x[batch:].gather(1, order))), of_pairs)
-        world_points, img_points, weights = torch.cat(seen, -1).permute(2, 1, 0).split((3, 2, 1), -1)
-        noise, near = of_pairs
-        return Correspondences(world_points, img_points, weights[..., 0], corr.focal, noise=noise, near=near)
+            order = ascending_order(keys)  # (B * (count - 1), N)
+            seen = [seen[0], torch.cat(seen[1:], -1).gather(1, order.mT.expand(5 + len(others), -1, -1))]
+        rows = torch.cat(seen, -1)
+        world_points, img_points = rows[:5].permute(2, 1, 0).split((3, 2), -1)
+        rest = iter(rows[5:].mT)
+        weights, noise, near = map_tensors(lambda _: next(rest), (corr.weights, corr.noise, corr.near))
+        return Correspondences(world_points, img_points, weights, corr.focal, noise=noise, near=near)
 
     def undo_views(self, pose: Pose, count: int) -> list[Pose]:
         """Express poses of :meth:`views` for the problems themselves.
@@ -332,13 +332,13 @@ def _pinhole(camera: Tensor) -> tuple[Tensor, Tensor]:
     """
     limit = torch.finfo(camera.dtype).max ** 0.25
     entries = camera.detach()
-    sized = (entries.abs().sum(0) < limit) & (entries[8].abs() > 1.0 / limit)
-    camera = torch.where(sized, camera, 1.0)
-    camera = camera / camera[8:]
-    entries = camera.detach()
-    fine = sized & (entries.abs().sum(0) + entries[:5:4].rsqrt().sum(0) < limit)  # NaN compares false
-    fine = fine & (entries[3] == 0) & (entries[6] == 0) & (entries[7] == 0)
-    return torch.where(fine, camera, 1.0), fine
+    scaled = entries / entries[8:]
+    # A sum below the limit bounds each term; NaN compares false.
+    largest = torch.cat((entries, entries[8:].reciprocal(), scaled, scaled[:5:4].rsqrt())).abs().sum(0)
+    below_diagonal = torch.cat((entries[3:4], entries[6:8])).any(0)
+    fine = (largest < limit) & ~below_diagonal
+    camera = torch.where(fine, camera, 1.0)
+    return camera / camera[8:], fine
 
 
 def _distances(points: Tensor, there: Tensor, padded: bool) -> tuple[Tensor, Tensor]:
@@ -347,30 +347,11 @@ def _distances(points: Tensor, there: Tensor, padded: bool) -> tuple[Tensor, Ten
     The typical distance (B,) is squared, too, and infinite where two thirds of the points coincide.
     """
     counts = there.sum(0) if padded else points.shape[1]
-    middle = _ranked(points, there, (counts - 1) // 2)
+    points = torch.where(there, points, torch.inf)
+    middle = ranked(points, (counts - 1) // 2).nan_to_num(posinf=0.0)
     sq_distance = (points - middle[:, None]).square().sum(0)
-    typical = _ranked(sq_distance[None], there, 2 * counts // 3)[0]
-    return sq_distance, torch.where(typical > 0, typical, torch.inf)
-
-
-def _ranked(values: Tensor, there: Tensor, rank: Tensor | int) -> Tensor:
-    """The value of a rank, from 0, among those that are there: values (C, N, B), ranks (B,), result (C, B)."""
-    values = torch.where(there, values, torch.inf)
-    count = values.shape[1]
-    if compiling() and isinstance(count, int) and count <= _FEW:  # a sorting network becomes one loop
-        rows = list(values.unbind(1))
-        for i in range(count):
-            for j in range(i % 2, count - 1, 2):
-                rows[j : j + 2] = torch.minimum(*rows[j : j + 2]), torch.maximum(*rows[j : j + 2])
-        rank = torch.as_tensor(rank, device=values.device).expand(values.shape[-1]).clamp(min=0)
-        found = torch.stack(rows).gather(0, rank.expand(1, *rows[0].shape))[0]
-    elif isinstance(rank, Tensor) or exporting():
-        rank = torch.as_tensor(rank, device=values.device).expand(values.shape[-1]).clamp(min=0)
-        ordered = [row.topk(count, 0, largest=False)[0] if exporting() else row.sort(0)[0] for row in values]
-        found = torch.stack([row.gather(0, rank[None])[0] for row in ordered])
-    else:  # one coordinate after the other, which is faster
-        found = torch.stack([row.kthvalue(rank + 1, 0).values for row in values])
-    return torch.where(found.abs() < torch.inf, found, 0.0)
+    typical = ranked(sq_distance[None], 2 * counts // 3)[0]
+    return sq_distance, typical.masked_fill(typical == 0, torch.inf)
 
 
 def _exchanged(x: Tensor, y: Tensor, swap: bool, reverse_x: bool, reverse_y: bool) -> tuple[Tensor, Tensor]:
@@ -385,17 +366,3 @@ def _axes_back(entries: Tensor, axis: int, view: tuple[bool, bool, bool]) -> Ten
     x, y, z = entries.unbind(axis)
     x, y = -x if reverse_x else x, -y if reverse_y else y
     return torch.stack((y, x, z) if swap else (x, y, z), axis)
-
-
-def _order(keys: Tensor) -> Tensor:
-    """Ascending order by the first of two keys (2, N, B), ties by the second key, (B, N)."""
-    first, second = keys.mT.contiguous()  # sorting along the last dimension is twice as fast
-    by_second = _ascending(second)
-    return by_second.gather(1, _ascending(first.gather(1, by_second)))
-
-
-def _ascending(keys: Tensor) -> Tensor:
-    """Stable ascending order along the last dimension."""
-    if exporting():  # ONNX has no stable sort, but its top-k is stable
-        return keys.topk(keys.shape[-1], largest=False).indices
-    return keys.argsort(stable=True, dim=-1)

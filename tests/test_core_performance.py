@@ -12,7 +12,7 @@ from torch._dynamo.testing import CompileCounter
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from kornia_pnpnet import MLPInit, PnPNet, Pose, RobustWeightedLM, create_solver
-from kornia_pnpnet.core.performance import Compiled, problems_last
+from kornia_pnpnet.core.performance import Compiled, ascending_order, in_order, problems_last, ranked
 from kornia_pnpnet.core.trees import iter_tensors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.geometry import project
@@ -233,3 +233,34 @@ def test_problems_last_changes_only_the_order_of_memory(make_problems, correspon
     assert laid.world_points.stride() == laid.img_points.stride() == (1, 7, 28)
     assert laid.weights.stride() == (1, 7)
     assert all(x.stride() == (1, 7) for x in iter_tensors(project(pose, laid)))  # arithmetic keeps the layout
+
+
+def several(values, *shape):
+    """Whole numbers, so that many are equal."""
+    return torch.randint(values, shape, generator=torch.Generator().manual_seed(1)).to(torch.float32) - values // 2
+
+
+@pytest.mark.parametrize("batch", [1, 300])
+@pytest.mark.parametrize("count", [3, 9, 16, 33])
+def test_ranks_are_those_of_a_sort(batch, count, backend):
+    values = several(50, 3, count, batch)
+    ordered = values.sort(1).values
+    ranks = torch.arange(batch) % (count + 1) - 1  # a negative rank means 0
+    expected = ordered.gather(1, ranks.clamp(min=0).expand(3, 1, -1))[:, 0]
+    for sort in (in_order, Compiled(in_order)):
+        torch.testing.assert_close(sort(values), ordered)
+    for found in (ranked, Compiled(ranked)):
+        torch.testing.assert_close(found(values, count // 2), ordered[:, count // 2])
+        torch.testing.assert_close(found(values, ranks), expected)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("batch", [1, 300])
+@pytest.mark.parametrize("count", [3, 9, 33])
+def test_ties_of_the_first_key_are_ordered_by_the_second_and_equal_pairs_stay(count, batch, dtype, backend):
+    keys = torch.stack((several(5, count, batch), several(3, count, batch))).to(dtype)
+    keys[:, 0] *= -1.0  # -0 equals 0
+    keys[:, -1] = torch.inf
+    expected = [sorted(range(count), key=lambda i, pairs=pairs: pairs[i]) for pairs in keys.permute(2, 1, 0).tolist()]
+    for order in (ascending_order, Compiled(ascending_order)):
+        assert order(keys).tolist() == expected

@@ -52,6 +52,24 @@ def test_chance_is_the_share_of_the_box(pixels, errors, expected):
     assert chance_of_inlier(corr._replace(weights=nothing), thresholds, Judged(nothing, judged.errors)).item() == 0.0
 
 
+def test_outliers_close_to_their_projections_make_a_fit_likely_by_chance():
+    """Two of five other pairs are outliers within thirty radii of the worst inlier's disc."""
+    pixels = torch.zeros(1, 8, 2, dtype=torch.float64)
+    pixels[0, 0], pixels[0, 1] = 1e4, -1e4
+    corr = Correspondences(pixels.new_zeros(1, 8, 3), pixels, pixels.new_ones(1, 8), pixels.new_tensor(100.0))
+    thresholds = Thresholds(pixels.new_tensor([1.0]), pixels.new_tensor([0.0]))
+    weights = pixels.new_tensor([[1.0, 1, 1, 1, 1, 1, 0, 0]])
+
+    def chance(*far):
+        errors = pixels.new_tensor([[0.25, 0, 0, 0, 0, 0, *far]])
+        return chance_of_inlier(corr, thresholds, Judged(weights, errors)).item()
+
+    alone = chance(1e5, 1e6)
+    assert chance(225.0, 1e6) == alone  # one outlier may be a slip
+    assert chance(200.0, 225.0) == pytest.approx(2 / 5 * 0.25 / 225.0)
+    assert chance(2.0, 3.0) == pytest.approx(2 / 5 / 20**2)  # however close
+
+
 def test_false_alarms_by_counting():
     for tested, inliers, count, chance in ((10, 5, 9, 0.01), (1, 4, 4, 0.3), (500, 30, 100, 0.001), (7, 3, 8, 0.5)):
         expected = tested * math.comb(count - 3, inliers - 3) * chance ** (inliers - 3)

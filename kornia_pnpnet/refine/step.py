@@ -128,7 +128,7 @@ def lm_step(
     if additive:
         equations = change_tangent(equations, additive_tangent_map(pose))
     delta, solved = solve_damped(equations, damping)
-    factor = torch.where(solved, -step / corr.focal, torch.zeros_like(step))
+    factor = solved * (-step / corr.focal)
     delta = [factor * x for x in delta]
     return LMStep(retract_additive(pose, torch.stack(delta).mT) if additive else move(pose, delta), solved)
 
