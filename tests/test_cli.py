@@ -19,6 +19,7 @@ from kornia_pnpnet import MLPInit, PnPNet, RobustWeightedLM, create_solver, list
 from kornia_pnpnet.cli import COMMANDS, main
 from kornia_pnpnet.cli.demo import verdict
 from kornia_pnpnet.cli.reprojection import rejection_limit, reproject
+from kornia_pnpnet.core import files
 from kornia_pnpnet.evaluation.named_solvers import BOUNDS, default_solvers
 from kornia_pnpnet.evaluation.results import load_results
 from kornia_pnpnet.types import Pose
@@ -241,13 +242,12 @@ def test_bad_npz_files(capsys, tmp_path):
         ({"img_points": np.ones((5, 2))}, "img_points must hold numbers of the shape (4, 2), got float64 of (5, 2)"),
         ({"world_points": np.ones(())}, "world_points must hold numbers"),
         ({"world_points": np.ones((4, 3)).astype("U1")}, "world_points must hold numbers"),
-        ({"world_points": np.array([{}], dtype=object)}, "not an NPZ file of plain arrays"),
+        ({"world_points": np.array([{}], dtype=object)}, "not an NPZ file of numbers"),
         ({"world_points": np.ones((0, 3)), "img_points": np.ones((0, 2))}, "at least 3 correspondences, got 0"),
         ({"img_points": np.array([[0, 0], [1, 1], [0, math.nan], [2, 2]])}, "img_points[2] must be finite"),
         ({"weights": np.array([1, 1, -2.0, 1])}, "weights[2] must be finite and at least 0"),
-        ({"intrinsics": -np.eye(3)}, "focal lengths must be positive, got -1 and -1"),
-        ({"intrinsics": np.eye(3) + np.eye(3, k=1)}, "skew, got 1"),
-        ({"intrinsics": 2 * np.eye(3)}, "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"),
+        ({"intrinsics": np.diag([1.0, -1.0, 1.0])}, "focal lengths must be positive, got 1 and -1"),
+        ({"intrinsics": np.eye(3) + np.eye(3, k=-1)}, "[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]"),
         ({}, "--intrinsics"),
     ):
         np.savez(path, **{name: array for name, array in (points | changed).items() if array is not None})
@@ -257,6 +257,33 @@ def test_bad_npz_files(capsys, tmp_path):
     for content in (b"", b"garbage\n", path.read_bytes()[:-40]):
         path.write_bytes(content)
         assert f"{path}: not an NPZ file" in refused(capsys, "solve", path, "--intrinsics", CAMERA)
+
+
+def test_cameras_with_skew_and_scale(capsys, tmp_path):
+    """Reprojections of the command use the whole matrix, as the solver does."""
+    world = np.random.default_rng(0).uniform((-2, -2, 4), (2, 2, 9), (12, 3))
+    camera = 2.0 * np.array([[800.0, 150.0, 320.0], [0.0, 810.0, 240.0], [0.0, 0.0, 1.0]])
+    img = world @ camera.T
+    path = tmp_path / "skew.npz"
+    np.savez(path, world_points=world, img_points=img[:, :2] / img[:, 2:], intrinsics=camera)
+    assert main(["solve", str(path)]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert max(pair["reprojection_error_px"] for pair in answer["pairs"]) < 1e-2
+
+
+def test_a_small_file_that_unpacks_to_gigabytes_is_refused(capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "MOST_BYTES", 10**6)
+    path = tmp_path / "zeros.npz"
+    np.savez_compressed(path, world_points=np.zeros((50_000, 3)), img_points=np.zeros((50_000, 2)))
+    assert path.stat().st_size < 10_000
+    assert "more than 0.0 GB: split the file" in refused(capsys, "solve", path, "--intrinsics", CAMERA)
+
+
+def test_export_does_not_overwrite(capsys, tmp_path):
+    path = tmp_path / "model.onnx"
+    path.write_text("mine")
+    assert "pass --overwrite" in refused(capsys, "export", path)
+    assert path.read_text() == "mine"
 
 
 def test_missing_files_and_folders(capsys, tmp_path):

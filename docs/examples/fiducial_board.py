@@ -3,7 +3,7 @@
 A camera circles over a board, which is drawn in perspective, blurred and noisy. OpenCV finds the corners and says which
 is which; a share of them is then given the number of another one, as happens when markers are misread. The poses by
 `pnpnet-set` and by `cv2.solvePnPRansac` from the same corners, and the camera's path. Writes `fiducial_board.json` and
-`fiducial_board.png` beside this file.
+`fiducial_board.png` to `--out`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ from kornia_pnpnet.evaluation.figures.style import BLUE, ORANGE, make_figure, sa
 from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.geometry import rotation_angle
 
-HERE = Path(__file__).resolve().parent
 SQUARES, SQUARE, MARKER = (7, 5), 0.04, 0.03  # metres
 PIXELS_PER_SQUARE, SIZE, FOCAL = 60, (640, 480), 700.0
 CAMERA = np.array([[FOCAL, 0.0, SIZE[0] / 2 - 0.5], [0.0, FOCAL, SIZE[1] / 2 - 0.5], [0.0, 0.0, 1.0]])
@@ -79,7 +78,7 @@ def main() -> None:
     """Draw, detect, solve, and write what came out."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=60)
-    parser.add_argument("--out", type=Path, default=HERE)
+    parser.add_argument("--out", type=Path, default=Path("outputs/examples"))
     options = parser.parse_args()
     rng = np.random.default_rng(0)
     board = cv2.aruco.CharucoBoard(SQUARES, SQUARE, MARKER, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50))

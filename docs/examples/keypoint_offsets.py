@@ -4,7 +4,7 @@ A detector sees the 12 keypoints of an object, each with a bias of its own in pi
 learned is an offset for each keypoint; the only teacher is the pose of the camera, through a differentiable solver. In
 every image 30 % of the keypoints are anywhere, and how far the learned offsets are from the truth is written down after
 every step: with this package's `pnpnet-set`, its EPnP without weights, and Kornia's DLT. Writes `keypoint_offsets.json`
-and a picture of it beside this file.
+and a picture of it to `--out`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.losses import pose_distances
 from kornia_pnpnet.types import Pose
 
-HERE = Path(__file__).resolve().parent
 KEYPOINTS, BATCH, WRONG = 12, 64, 0.3
 FOCAL, CENTRE, PIXEL_NOISE, BIAS = 800.0, 320.0, 1.0, 12.0
 SEED = 20_261_150
@@ -123,7 +122,7 @@ def main() -> None:
     """Learn with every solver, write the results and draw them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=600)
-    parser.add_argument("--out", type=Path, default=HERE)
+    parser.add_argument("--out", type=Path, default=Path("outputs/examples"))
     options = parser.parse_args()
     torch.set_num_threads(1)
     runs = {name: learn(make(), options.steps) for name, make in SOLVERS.items()}

@@ -8,7 +8,7 @@ loss alone; with the likelihood of the labels, too, which teaches how far off a 
 to end, with the loss of the pose, whose gradient comes through the solver. Two more learn from labels of all keypoints,
 as only a known pose can make them. All are tested with the same solver on images that none saw; it is told how far off
 keypoints may be where a network has learned it, and once not told what the last one says. Writes
-`keypoint_pipeline.json` and pictures beside this file.
+`keypoint_pipeline.json` and pictures to `--out`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,6 @@ from kornia_pnpnet.evaluation.figures.style import BLUE, ORANGE, VERMILION, make
 from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.geometry import rotation_angle
 
-HERE = Path(__file__).resolve().parent
 SIZE, FOCAL, BATCH = 64, 90.0, 32
 CAMERA = torch.tensor([[FOCAL, 0.0, (SIZE - 1) / 2], [0.0, FOCAL, (SIZE - 1) / 2], [0.0, 0.0, 1.0]])
 HALF = torch.tensor([0.5, 0.4, 0.3])
@@ -323,7 +322,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--jobs", type=int, default=1, help="so many seeds at the same time")
     parser.add_argument("--batches", type=int, default=32, help="of test images")
-    parser.add_argument("--out", type=Path, default=HERE)
+    parser.add_argument("--out", type=Path, default=Path("outputs/examples"))
     options = parser.parse_args()
     arguments = range(options.seeds), repeat(options.updates), repeat(options.batches)
     with ProcessPoolExecutor(options.jobs, multiprocessing.get_context("spawn")) as pool:

@@ -5,7 +5,7 @@ its SIFT features are matched with those of all others that see a point of the m
 neighbour, with no ratio test, so that many matches are wrong. From these raw matches `pnpnet-set` and
 `cv2.solvePnPRansac` find the pose; what each of them took for wrong is drawn. Without `--scene` a small scene is made
 first: a room's corner with repeated patterns, seen from twelve places. Writes `localisation.json` and
-`localisation.png` beside this file.
+`localisation.png` to `--out`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,6 @@ from kornia_pnpnet.evaluation.figures.style import BLUE, ORANGE, make_figure, sa
 from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.geometry import rotation_angle
 
-HERE = Path(__file__).resolve().parent
 SIZE, FOCAL = (480, 360), 420.0
 THRESHOLD_PX, SNAP_PX = 8.0, 2.0
 SOLVERS = ("pnpnet-set", "cv2.solvePnPRansac")
@@ -176,7 +175,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", type=Path, help="a COLMAP model, its images in the folder images")
     parser.add_argument("--arbitrary-unit", action="store_true", help="the scene is not in metres")
-    parser.add_argument("--out", type=Path, default=HERE)
+    parser.add_argument("--out", type=Path, default=Path("outputs/examples"))
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         folder = options.scene or make_scene(Path(temporary) / "scene")

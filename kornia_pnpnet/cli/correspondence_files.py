@@ -66,15 +66,14 @@ def camera_matrix(text: str) -> Tensor:
 
 
 def check_camera(matrix: Tensor, source: str | Path) -> Tensor:
-    """Return the camera matrix of a pinhole camera without skew; raise an :class:`InputError` for any other matrix."""
+    """Return the matrix of a pinhole camera, scaled to end in 1; raise an :class:`InputError` for any other matrix."""
     if not matrix.isfinite().all():
         raise InputError(source, "the intrinsics are not finite")
+    if matrix[1, 0] != 0 or matrix[2, :2].any() or matrix[2, 2] == 0:
+        raise InputError(source, "the intrinsics must be [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] or a multiple of it")
+    matrix = matrix / matrix[2, 2]
     if matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
         raise InputError(source, f"the focal lengths must be positive, got {matrix[0, 0]:g} and {matrix[1, 1]:g}")
-    if matrix[0, 1] != 0:
-        raise InputError(source, f"the camera must have no skew, got {matrix[0, 1]:g}")
-    if matrix[1, 0] != 0 or not torch.equal(matrix[2], matrix.new_tensor((0.0, 0.0, 1.0))):
-        raise InputError(source, "the intrinsics must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
     return matrix
 
 
@@ -143,7 +142,7 @@ def _read_npz(path: Path) -> ImageCorrespondences:
             raise InputError(path, f"{name}[{int(np.nonzero(bad)[0][0])}] must be {wanted}")
     tensors = {name: torch.tensor(array.astype(np.float64)) for name, array in arrays.items()}
     if "intrinsics" in tensors:
-        check_camera(tensors["intrinsics"], path)
+        tensors["intrinsics"] = check_camera(tensors["intrinsics"], path)
     return ImageCorrespondences(**tensors)
 
 

@@ -23,6 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--n", metavar="N", type=whole_number(1), help="correspondences per problem; default: any number"
     )
+    parser.add_argument("--overwrite", action="store_true", help="replace the file")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -34,6 +35,8 @@ def run(arguments: argparse.Namespace) -> int:
     target.parent.mkdir(parents=True, exist_ok=True)  # an error now, not after minutes
     if target.is_dir():
         raise ValueError(f"'{target}' is a folder")
+    if target.exists() and not arguments.overwrite:
+        raise ValueError(f"'{target}' exists: pass --overwrite to replace it")
     print("Tracing and converting; PyTorch's exporter takes some minutes", flush=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the exporter about itself

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from kornia.geometry.conversions import convert_points_from_homogeneous, denormalize_points_with_intrinsics
+from kornia.geometry.conversions import convert_points_from_homogeneous
 from torch import Tensor
 
 from kornia_pnpnet.geometry import transform
@@ -44,8 +44,8 @@ def reproject(
     """
     cam_points = transform(pose, world_points[None])[0]
     in_front = cam_points[:, 2:] > 0
-    plane_points = convert_points_from_homogeneous(torch.where(in_front, cam_points, 1.0), eps=0.0)
-    pixels = torch.where(in_front, denormalize_points_with_intrinsics(plane_points, intrinsics), torch.nan)
+    pixels = convert_points_from_homogeneous(torch.where(in_front, cam_points, 1.0) @ intrinsics.mT, eps=0.0)
+    pixels = torch.where(in_front, pixels, torch.nan)
     errors = (pixels - img_points).norm(dim=-1)
     limit = rejection_limit(errors) if limit_px is None else limit_px
     return Reprojection(pixels, errors, limit, ~(errors <= limit))

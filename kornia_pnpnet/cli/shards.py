@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +22,7 @@ from kornia_pnpnet.cli.correspondence_files import (
     check_shapes,
     read_arrays,
 )
-from kornia_pnpnet.core.files import atomic_open, digest, write_json
+from kornia_pnpnet.core.files import atomic_open, check_size, digest, npz_shapes, write_json
 from kornia_pnpnet.types import PnPResult
 
 __all__ = ["MANIFEST", "SUFFIXES", "ShardReport", "solve_shards"]
@@ -60,6 +63,7 @@ def solve_shards(
     batch: int = 10_000,
     overwrite: bool = False,
     watch: Callable[[Path, int, int], None] = lambda path, solved, count: None,
+    progress: bool = False,
 ) -> ShardReport:
     r"""Solve shards of problems one after the other, and write the results of each shard to a file of its name.
 
@@ -71,7 +75,8 @@ def solve_shards(
     format of the shard, in float32. An NPZ file is read as a whole, a Parquet file ``batch`` rows at a time.
 
     A file of results gets its name when it is complete, so a run that was stopped can be repeated: shards with results
-    are skipped. A shard that cannot be read is reported and the other shards are solved.
+    are skipped. A shard that cannot be read, or whose numbers would need more memory than
+    :data:`~kornia_pnpnet.core.files.MOST_BYTES` at once, is reported and the other shards are solved.
 
     Args:
         solver: any solver.
@@ -82,6 +87,7 @@ def solve_shards(
         batch: number of problems solved at once.
         overwrite: also solve the shards that have results.
         watch: called after each shard with its path, the number of solved problems and the number of problems.
+        progress: show a progress bar with the rate on stderr, where stderr is a terminal and tqdm is installed.
 
     Returns:
         The :class:`ShardReport`.
@@ -98,22 +104,46 @@ def solve_shards(
         if shard.resolve() == (out / shard.name).resolve():
             raise InputError(shard, "the results would overwrite the shard: choose another folder")
     _claim(out, name, solver, {shard.name for shard in shards} if overwrite else set())
-    solved = problems = done = kept = 0
+    waiting = [shard for shard in shards if overwrite or not (out / shard.name).exists()]
+    solved = problems = done = 0
     failed = []
+    with _bar(waiting, batch, progress) as advance:
+        for shard in waiting:
+            solve = _solve_npz if shard.suffix == ".npz" else _solve_parquet
+            try:
+                ok, count = solve(solver, shard, out / shard.name, intrinsics, batch, advance)
+            except InputError as error:
+                failed.append(str(error))
+                continue
+            solved, problems, done = solved + ok, problems + count, done + 1
+            watch(shard, ok, count)
+    return ShardReport(solved, problems, done, len(shards) - len(waiting), failed)
+
+
+@contextmanager
+def _bar(shards: Sequence[Path], batch: int, shown: bool) -> Iterator[Callable[[int], object]]:
+    """A progress bar over the problems of shards; yields what advances it by a number of problems."""
+    if not shown or not sys.stderr.isatty() or find_spec("tqdm") is None:
+        yield lambda count: None
+        return
+    from tqdm import tqdm
+
+    total = 0
     for shard in shards:
-        target = out / shard.name
-        if target.exists() and not overwrite:
-            kept += 1
-            continue
-        solve = _solve_npz if shard.suffix == ".npz" else _solve_parquet
+        with suppress(InputError, ImportError):  # reported when the shard's turn comes
+            total += _count(shard, batch)
+    with tqdm(total=total, unit="problem", unit_scale=True) as bar:
+        yield bar.update
+
+
+def _count(shard: Path, batch: int) -> int:
+    """Number of problems of a shard, from its header; an :class:`InputError` for one that needs too much memory."""
+    if shard.suffix == ".npz":
         try:
-            ok, count = solve(solver, shard, target, intrinsics, batch)
-        except InputError as error:
-            failed.append(str(error))
-            continue
-        solved, problems, done = solved + ok, problems + count, done + 1
-        watch(shard, ok, count)
-    return ShardReport(solved, problems, done, kept, failed)
+            return (npz_shapes(shard, _INPUTS).get("world_points") or (0,))[0]
+        except ValueError as error:
+            raise InputError(shard, str(error)) from None
+    return _open_parquet(shard, batch).metadata.num_rows
 
 
 def _find(sources: Sequence[str | Path]) -> list[Path]:
@@ -153,10 +183,20 @@ def _claim(out: Path, name: str, solver: nn.Module, replaced: set[str]) -> None:
     write_json(path, manifest)
 
 
-def _solve_npz(solver: nn.Module, shard: Path, target: Path, intrinsics: Tensor | None, batch: int) -> tuple[int, int]:
+def _solve_npz(
+    solver: nn.Module,
+    shard: Path,
+    target: Path,
+    intrinsics: Tensor | None,
+    batch: int,
+    advance: Callable[[int], object],
+) -> tuple[int, int]:
     """Solve an NPZ shard; return the number of solved problems and of all problems."""
     tensors = _tensors(shard, read_arrays(shard, _INPUTS), intrinsics)
-    results = list(_solve(solver, shard, tensors, batch))
+    results = []
+    for result in _solve(solver, shard, tensors, batch):
+        results.append(result)
+        advance(len(result.ok))
     outputs = {key: np.concatenate([getattr(x, key).numpy() for x in results]) for key in _OUTPUTS}
     with atomic_open(target, "wb") as file:
         np.savez(file, allow_pickle=False, **outputs)
@@ -200,24 +240,46 @@ def _solve(solver: nn.Module, source: Path, tensors: dict[str, Tensor], batch: i
             raise InputError(source, str(error)) from None
 
 
-def _solve_parquet(
-    solver: nn.Module, shard: Path, target: Path, intrinsics: Tensor | None, batch: int
-) -> tuple[int, int]:
-    """Solve a Parquet shard; return the number of solved problems and of all problems."""
+def _open_parquet(shard: Path, batch: int) -> Any:
+    """Open a Parquet shard; an :class:`InputError` when ``batch`` rows need too much memory."""
     try:
-        import pyarrow
         from pyarrow import parquet
     except ImportError as error:
         raise ImportError("Parquet needs one more package: pip install 'kornia_pnpnet[shards]'") from error
+    try:
+        # With pre_buffer Arrow reads ahead to the end of the file, and without buffer_size a row group at once.
+        file = parquet.ParquetFile(shard, pre_buffer=False, buffer_size=1 << 20)
+        groups = [file.metadata.row_group(i) for i in range(file.metadata.num_row_groups)]
+        values = [(sum(x.column(j).num_values for j in range(x.num_columns)), x.num_rows) for x in groups]
+    except Exception as error:  # Arrow raises half a dozen types of errors for broken files
+        raise InputError(shard, f"not a Parquet file of lists of numbers: {error}") from None
+    most = max((count * min(batch, rows) // max(rows, 1) for count, rows in values), default=0)
+    try:
+        check_size(8 * most, "choose a smaller --batch-size, or split the file")
+    except ValueError as error:
+        raise InputError(shard, str(error)) from None
+    return file
+
+
+def _solve_parquet(
+    solver: nn.Module,
+    shard: Path,
+    target: Path,
+    intrinsics: Tensor | None,
+    batch: int,
+    advance: Callable[[int], object],
+) -> tuple[int, int]:
+    """Solve a Parquet shard; return the number of solved problems and of all problems."""
+    rows = _open_parquet(shard, batch)
+    import pyarrow
+    from pyarrow import parquet
 
     def read() -> Iterator[dict[str, list[Any]]]:
         try:
-            # With pre_buffer Arrow reads ahead to the end of the file, and without buffer_size a row group at once.
-            rows = parquet.ParquetFile(shard, pre_buffer=False, buffer_size=1 << 20)
             columns = [key for key in _INPUTS if key in rows.schema_arrow.names]
             for table in rows.iter_batches(batch, columns=columns):
                 yield table.to_pydict()
-        except Exception as error:  # Arrow raises half a dozen types of errors for broken files
+        except Exception as error:
             raise InputError(shard, f"not a Parquet file of lists of numbers: {error}") from None
 
     types = dict.fromkeys(_OUTPUTS, pyarrow.list_(pyarrow.float32()))
@@ -232,6 +294,7 @@ def _solve_parquet(
             outputs |= {"cost": result.cost.numpy(), "ok": result.ok.numpy()}
             writer.write_table(pyarrow.table(outputs, schema=schema))
             solved, count = solved + int(result.ok.sum()), count + len(sizes)
+            advance(len(sizes))
     return solved, count
 
 

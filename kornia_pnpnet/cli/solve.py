@@ -97,17 +97,26 @@ def run(arguments: argparse.Namespace) -> int:
 def _solve_batch(arguments: argparse.Namespace, camera: Tensor | None) -> int:
     if arguments.plot or arguments.threshold:
         raise ValueError("--plot and --threshold are for one image, not for --batch")
-    name = arguments.solver
-    report = solve_shards(
-        load_solver_without_truth(name),
-        arguments.file,
-        arguments.out or "outputs/poses",
-        name=name,
-        intrinsics=camera,
-        batch=arguments.batch_size,
-        overwrite=arguments.overwrite,
-        watch=lambda shard, solved, count: print(f"{shard}: {solved} of {count} solved", flush=True),
-    )
+    name, out = arguments.solver, arguments.out or "outputs/poses"
+    try:
+        report = solve_shards(
+            load_solver_without_truth(name),
+            arguments.file,
+            out,
+            name=name,
+            intrinsics=camera,
+            batch=arguments.batch_size,
+            overwrite=arguments.overwrite,
+            watch=lambda shard, solved, count: print(f"{shard}: {solved} of {count} solved", flush=True),
+            progress=True,
+        )
+    except KeyboardInterrupt:
+        again = " without --overwrite" if arguments.overwrite else ""
+        print(
+            f"pnpnet: interrupted; the shards solved so far are in {out}: the same command{again} solves the others",
+            file=sys.stderr,
+        )
+        return 130
     for line in report.failed:
         print(f"pnpnet: {line}", file=sys.stderr)
     kept = f"; {report.kept} shards had been solved before" if report.kept else ""

@@ -54,7 +54,7 @@ _ELEMENTWISE: dict[str, float] = {
     **_each("lerp", 2 * ADD + MULTIPLY),
     **_each("linalg_cross", ADD + 2 * MULTIPLY),
     **_each("ceil clamp_min eq ge gt le lt maximum minimum ne relu", COMPARE),
-    **_each("abs copysign sgn sign", 2 * COMPARE),
+    **_each("abs copysign nan_to_num sgn sign", 2 * COMPARE),
     **_each("bitwise_and bitwise_not bitwise_or masked_fill where", LOGIC),
 }
 
