@@ -14,7 +14,7 @@ from kornia_pnpnet.core.checks import Shapes, check_devices, check_shapes, commo
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.types import Noise, Pose, camera_matrices
 
-__all__ = ["Inputs", "checked_inputs", "restore_leading"]
+__all__ = ["Inputs", "checked_inputs", "one_batch", "restore_leading"]
 
 _T = TypeVar("_T")
 
@@ -100,12 +100,13 @@ def checked_inputs(
         noise = Noise(*(expand_sigma(name, sigma, like) for name, sigma in sigmas.items()))
     cameras = matrices.expand(*size, 3, 3)
     given = Inputs(world_points, img_points, cameras, weights, mask, None if init is None else Pose(*init), noise)
+    return size, map_tensors(lambda x: one_batch(x, size, dtype), given)
 
-    def one_batch(x: Tensor) -> Tensor:
-        x = x if x.dtype in (dtype, torch.bool) else x.to(dtype)
-        return x if len(size) == 1 else x.reshape((size.numel(), *x.shape[len(size) :]))
 
-    return size, map_tensors(one_batch, given)
+def one_batch(x: Tensor, size: torch.Size, dtype: torch.dtype) -> Tensor:
+    """Reshape a tensor with the leading dimensions ``size`` to one batch, and convert it unless it is a mask."""
+    x = x if x.dtype in (dtype, torch.bool) else x.to(dtype)
+    return x if len(size) == 1 else x.reshape((size.numel(), *x.shape[len(size) :]))
 
 
 def restore_leading(size: torch.Size, result: _T) -> _T:
