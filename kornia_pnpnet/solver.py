@@ -398,7 +398,7 @@ def _is_seen(guess: Guess, corr: Correspondences) -> Tensor:
 def _gate(value: Tensor, live: Tensor, finite: Tensor, fill: float | Tensor) -> Tensor:
     """Keep the gradient of problems that are live, the value of those that are finite, and fill the others."""
     shape = (-1,) + (1,) * (value.ndim - 1)
-    if value.requires_grad:
+    if torch.is_grad_enabled():  # a tensor that forward mode differentiates does not require a gradient
         value = torch.where(live.view(shape), value, value.detach())
     return torch.where(finite.view(shape), value, fill).contiguous()
 

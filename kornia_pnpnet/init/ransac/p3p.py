@@ -170,6 +170,10 @@ class _Solve(torch.autograd.Function):
         ctx.mark_non_differentiable(*output)
 
     @staticmethod
+    def jvp(ctx: Any, *changes: Tensor) -> tuple[None, None]:
+        return None, None
+
+    @staticmethod
     def vmap(
         info: Any, in_dims: tuple[int | None, int | None], *points: Tensor
     ) -> tuple[tuple[Tensor, Tensor], tuple[int, int]]:
