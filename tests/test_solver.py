@@ -217,6 +217,18 @@ def test_a_failed_refinement_gives_no_gradient_through_the_pose(make_problems):
     assert not any(x.grad is not None and x.grad.any() for x in inputs)
 
 
+@pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")  # PyTorch's own use of it in forward mode
+def test_a_failed_refinement_gives_no_derivative_in_forward_mode(make_problems):
+    p = make_problems(9, 100)
+    solver = net(9, 5)
+    everywhere = torch.ones_like(p.img_points)
+    _, moved = torch.func.jvp(lambda x: solver(p[0], x, p[2]).pose, (p.img_points,), (everywhere,))
+    ok = solver(*p[:3]).ok
+    assert (~ok).any()
+    assert not any(x[~ok].any() for x in moved)
+    assert all(x[ok].flatten(1).any(1).all() for x in moved)
+
+
 def test_everything_behind_the_true_pose_is_not_ok(make_problems):
     p = make_problems(9, 200)
     seen = [turn_away(p, i) for i in range(200)]
@@ -748,35 +760,6 @@ def test_pairs_of_no_pose_are_not_ok_when_the_noise_is_known(make_problems):
     garbage = solver(p.world_points, p.img_points.roll(1, 0), p.intrinsics, **noise)
     assert garbage.ok.double().mean() < 0.02
     assert solver(*p[:3], **noise).ok.double().mean() > 0.95
-
-
-# --- torch.func ------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")  # PyTorch's own, of jvp
-@pytest.mark.parametrize("name", ["pnpnet-set", "pnpnet-n9", "epnp-lm", "reppnp-lm", "identity-lm"])
-def test_transforms_of_torch_func(name, make_problems):
-    """As the page on training loops says: reverse mode for all, forward mode without EPnP, REPPnP and P3P."""
-    world, img, intrinsics = make_problems(9, 3)[:3]
-    solver = create_solver(name)
-
-    def translations(pixels):
-        return solver(world, pixels, intrinsics).translation
-
-    jacobian = torch.func.jacrev(lambda pixels: translations(pixels).sum(0))(img)  # (3, B, N, 2)
-    pixels = img.clone().requires_grad_()
-    (gradient,) = torch.autograd.grad(translations(pixels)[:, 2].sum(), pixels)
-    torch.testing.assert_close(jacobian[2], gradient)
-    direction = torch.randn(img.shape, dtype=img.dtype)
-
-    def forward():
-        return torch.func.jvp(translations, (img,), (direction,))[1]
-
-    if name in ("pnpnet-n9", "identity-lm"):
-        torch.testing.assert_close(forward().sum(0), (jacobian * direction).sum((1, 2, 3)), rtol=1e-4, atol=1e-6)
-    else:
-        with pytest.raises(NotImplementedError, match="jvp"):
-            forward()
 
 
 def test_views_keep_the_noise_and_the_hypotheses_of_a_set_network(make_problems):
