@@ -1,7 +1,7 @@
 """Camera poses from 2D-3D correspondences with outliers, as a batched, differentiable PyTorch layer."""
 
 from kornia_pnpnet.covariance import pose_covariance
-from kornia_pnpnet.init import MLPInit, SetInit
+from kornia_pnpnet.init import MLPInit, SetInit, p3p
 from kornia_pnpnet.likelihood import monte_carlo_pose_loss
 from kornia_pnpnet.losses import PoseLoss, SetLoss
 from kornia_pnpnet.metrics import pose_errors, success, success_rate
@@ -35,6 +35,7 @@ __all__ = [
     "create_solver",
     "list_solvers",
     "monte_carlo_pose_loss",
+    "p3p",
     "pose_covariance",
     "pose_errors",
     "shipped_weights",

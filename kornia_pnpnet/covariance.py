@@ -10,7 +10,7 @@ from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.liegroup import So3
 from torch import Tensor
 
-from kornia_pnpnet.core.checks import Shapes, check_devices, check_shapes, expand_sigma
+from kornia_pnpnet.core.checks import Shapes, check_devices, check_shapes, common_dtype, expand_sigma
 from kornia_pnpnet.geometry import normal_equations, pixel_variance, project
 from kornia_pnpnet.types import Correspondences, Noise, Pose, camera_matrices
 
@@ -47,12 +47,13 @@ def pose_covariance(
             result; ``None``: 1 for every pair.
 
     Returns:
-        Shape :math:`(B, 6, 6)`, in radians and the unit of the world. Where the pairs do not determine the pose, the
+        Shape :math:`(B, 6, 6)`, in radians and the unit of the world, float64 when the points, the camera, the weights
+        or the pose are, else float32. Where the pairs do not determine the pose, the
         diagonal is infinite and all other entries are 0.
 
     Raises:
         ShapeError: when shapes do not match.
-        TypeCheckError: when a sigma is neither a number nor a tensor of the dtype of ``world_points``.
+        TypeCheckError: when a sigma is neither a number nor a tensor, or a tensor holds booleans or complex numbers.
         DeviceError: when tensors are on different devices.
 
     Example:
@@ -73,10 +74,12 @@ def pose_covariance(
         "weights": (weights, (batch, count)),
     }
     check_shapes(shapes, world_points)
-    check_devices({name: tensor for name, (tensor, _) in shapes.items()}, world_points)
+    tensors = {name: tensor for name, (tensor, _) in shapes.items()}
+    check_devices(tensors, world_points)
+    dtype = common_dtype({"world_points": world_points, **tensors})
     noise = Noise(
-        expand_sigma("img_sigma", img_sigma, world_points).double(),
-        expand_sigma("world_sigma", world_sigma, world_points).double(),
+        expand_sigma("img_sigma", img_sigma, world_points.double()),
+        expand_sigma("world_sigma", world_sigma, world_points.double()),
     )
     with torch.no_grad():
         points, rotation, camera = world_points.double(), pose.rotation.double(), camera.double()
@@ -109,7 +112,7 @@ def pose_covariance(
         back = torch.cat((omega_rows, v_rows), 1)  # (B, 6, 6)
         covariance = back @ torch.where(determined, inverse, 0.0) @ back.mT
         undetermined = covariance.new_full((6,), torch.inf).diag()
-        return torch.where(determined, covariance, undetermined).to(world_points.dtype)
+        return torch.where(determined, covariance, undetermined).to(dtype)
 
 
 def _symmetric(rows: Sequence[Sequence[Tensor]]) -> Tensor:

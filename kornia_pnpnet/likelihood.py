@@ -82,7 +82,8 @@ def monte_carlo_pose_loss(
     uniform rotations, and translations of a t distribution around the true one as wide as half the distance between
     camera and points. It only matters while the correspondences say little.
 
-    Gradients flow to points, pixels, cameras, weights and sigmas, not to the poses. A problem that a solver would
+    Shapes below are those of a batch; any leading dimensions and dtypes are as in a solver's call. Gradients flow to
+    points, pixels, cameras, weights and sigmas, not to the poses. A problem that a solver would
     refuse (NaN, points on a line, no pinhole camera) has the loss 0 without gradient.
 
     Source: H. Chen et al., "EPro-PnP: Generalized End-to-End Probabilistic Perspective-n-Points", CVPR 2022, equations
@@ -110,7 +111,7 @@ def monte_carlo_pose_loss(
 
     Raises:
         ShapeError: for shapes that do not fit each other.
-        TypeCheckError: for dtypes that differ or are not float32 or float64.
+        TypeCheckError: for tensors of booleans or complex numbers.
         DeviceError: for tensors on different devices.
         BaseError: for an unknown kernel, a scale that is not positive, or fewer samples than components.
 
@@ -129,10 +130,11 @@ def monte_carlo_pose_loss(
     check_whole(count, samples=samples)
     check_positive(scale=scale)
     KORNIA_CHECK(kernel in KERNELS, f"kernel must be one of {sorted(KERNELS)}, got {kernel!r}.")
-    for pose in (truth, *others):
-        noise_of_points = 0.0 if world_sigma is None else world_sigma
-        arguments = world_points, img_points, intrinsics, weights, mask, pose, img_sigma, noise_of_points
-        inputs = checked_inputs(*arguments)
+    numbers = world_points, img_points, intrinsics, weights, mask
+    sigmas = img_sigma, 0.0 if world_sigma is None else world_sigma
+    checked = [checked_inputs(*numbers, pose, *sigmas) for pose in (truth, *others)]
+    size, inputs = checked[0]
+    given = [Pose(*x.init) for _, x in checked if x.init is not None]
     assert inputs.noise is not None
     known = inputs.noise.img.isfinite().all(1) & (inputs.noise.img > 0).all(1) & inputs.noise.world.isfinite().all(1)
     noise = map_tensors(lambda x: torch.where(known[:, None], x, 1.0), inputs.noise)
@@ -147,11 +149,11 @@ def monte_carlo_pose_loss(
     corr = corr._replace(world_points=world, noise=corr.noise._replace(world=corr.noise.world * frame.scale[:, None]))
 
     live = frame.valid & known
-    for pose in (truth, *others):
+    for pose in given:
         live = live & torch.cat((pose.rotation.flatten(1), pose.translation), 1).isfinite().all(1)
     eye = torch.eye(3, dtype=world.dtype, device=world.device)
     poses = []
-    for pose in (truth, *others):
+    for pose in given:
         rotation = torch.where(live[:, None, None], pose.rotation.detach(), eye)
         translation = torch.where(live[:, None], pose.translation.detach(), eye[2])
         poses.append(Normalize().apply_to_pose(Pose(rotation, translation), frame))
@@ -161,7 +163,7 @@ def monte_carlo_pose_loss(
     log_weights = model.log_density(drawn) - log_proposal
     log_total = torch.logsumexp(log_weights, 0) - math.log(len(log_weights))
     log_density = model.log_density(_Samples(*(x[None] for x in poses[0])))[0] - log_total
-    return torch.where(live, -log_density - 3.0 * frame.scale.log(), 0.0)
+    return torch.where(live, -log_density - 3.0 * frame.scale.log(), 0.0).reshape(size)
 
 
 class _Posterior(NamedTuple):

@@ -167,16 +167,17 @@ def solve_pnp(
     For masks, the weights of the pairs and the uncertainty of the pose use a solver of :func:`create_solver`.
 
     Args:
-        world_points: shape :math:`(B, N, 3)`, float32 or float64, any unit, :math:`N` as the solver takes it.
+        world_points: shape :math:`(B, N, 3)`, any unit, floats or integers, :math:`N` as the solver takes it. Any
+            leading dimensions may stand in place of :math:`B`, in all arguments and in the result.
         img_points: pixels, shape :math:`(B, N, 2)`.
         intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or Kornia's cameras.
         weights: weight of each pair, at least 0, shape :math:`(B, N)`; 1 when ``None``.
         solver: one of :func:`list_solvers`, or a module with the same signature. A named solver is built once.
 
     Returns:
-        :math:`[R\,|\,t]` with ``x_cam = R x_world + t``, shape :math:`(B, 3, 4)`, with gradients to points, pixels,
-        intrinsics and weights. A problem without a pose (``ok`` of the result is false) is NaN without gradient;
-        nothing is raised, and no other problem of the batch changes.
+        :math:`[R\,|\,t]` with ``x_cam = R x_world + t``, shape :math:`(B, 3, 4)`, float64 when any input is, else
+        float32, with gradients to points, pixels, intrinsics and weights. A problem without a pose (``ok`` of the
+        result is false) is NaN without gradient; nothing is raised, and no other problem of the batch changes.
 
     Raises:
         ValueCheckError: for an unknown name.

@@ -13,17 +13,17 @@ from kornia.core.exceptions import BaseError, ValueCheckError
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
-from kornia_pnpnet.core.checks import check_shapes, check_whole
+from kornia_pnpnet.core.checks import check_whole
 from kornia_pnpnet.core.linalg import bound_gradient
 from kornia_pnpnet.core.performance import Compiled, compiling, split_batch
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import project
 from kornia_pnpnet.init import RANSAC, EPnP, MLPInit, REPPnP, SetInit
-from kornia_pnpnet.inputs import Inputs, checked_inputs, one_batch
+from kornia_pnpnet.inputs import Inputs, checked_inputs, restore_leading
 from kornia_pnpnet.normalize import VIEWS, Frame, Normalize
 from kornia_pnpnet.pretrained import read_weights, write_weights
 from kornia_pnpnet.refine import LMStart, LMStep, RobustWeightedLM
-from kornia_pnpnet.types import Correspondences, Guess, PnPResult, Pose, Status, camera_matrices
+from kornia_pnpnet.types import Correspondences, Guess, PnPResult, Pose, Status
 
 __all__ = ["PnPNet"]
 
@@ -60,9 +60,9 @@ class PnPNet(nn.Module):
     Convention: ``x_cam = R x_world + t``, +z forward, pixels ``u = fx x/z + s y/z + cx`` with the skew ``s``; any
     multiple of a camera matrix is the same camera.
 
-    Precision: the layer computes in the dtype of its inputs, float32 or float64, also inside :class:`torch.autocast`,
-    which does not change its results. Half precision has too few digits for a pixel: cast inputs of float16 or bfloat16
-    with ``.float()``.
+    Precision: the layer computes in float64 when any input tensor is float64, else in float32; results have that dtype.
+    Inputs of float16, bfloat16 and integers are converted, because half precision has too few digits for a pixel; each
+    input gets its gradient in its own dtype. :class:`torch.autocast` does not change the results.
 
     Args:
         init: maps :class:`~kornia_pnpnet.types.Correspondences` to a :class:`~kornia_pnpnet.types.Guess`, see
@@ -127,12 +127,12 @@ class PnPNet(nn.Module):
         r"""Solve a batch of problems.
 
         Args:
-            world_points: shape :math:`(B, N, 3)`, float32 or float64, any unit. Any leading dimensions may stand in
+            world_points: shape :math:`(B, N, 3)`, any unit, floats or integers. Any leading dimensions may stand in
                 place of :math:`B`, in all arguments and in the result; a single problem has none.
             img_points: pixels, shape :math:`(B, N, 2)`.
             intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or Kornia's cameras, whose
                 extrinsics are ignored.
-            weights: weight of each pair, at least 0, shape :math:`(B, N)`; 1 when ``None``.
+            weights: weight of each pair, the same for u and v, at least 0, shape :math:`(B, N)`; 1 when ``None``.
             mask: False where a pair is padding, bool, shape :math:`(B, N)`. The numbers of padding do not matter.
             init: a world-to-camera pose, for example of the frame before, :math:`(B, 3, 3)` and :math:`(B, 3)`. It
                 competes with the poses of the initialiser and is refined as they are. Without an initialiser the
@@ -146,30 +146,25 @@ class PnPNet(nn.Module):
             gradient: ``"ok"`` or ``"always"``; the solver's own when ``None``.
 
         Returns:
-            The :class:`~kornia_pnpnet.types.PnPResult`. Gradients flow through rotation, translation, weights and cost
-            of the problems that are ``ok``, and through the first guess of every valid problem. A problem that cannot
-            be solved has the identity as its pose and a cost of the square root of the dtype's largest number.
+            The :class:`~kornia_pnpnet.types.PnPResult`, in float64 when any input is, else in float32. Gradients flow
+            through rotation, translation, weights and cost of the problems that are ``ok``, and through the first guess
+            of every valid problem. A problem that cannot be solved has the identity as its pose and a cost of the
+            square root of the dtype's largest number.
 
         Raises:
             ShapeError: for shapes that do not fit each other, fewer than 3 pairs, or another N than the initialiser
                 was built for.
-            TypeCheckError: for dtypes that differ or are not float32 or float64.
+            TypeCheckError: for arguments that are no tensors, or hold booleans or complex numbers.
             DeviceError: for tensors on different devices, or on another device than a network of the solver.
         """
-        if isinstance(world_points, Tensor) and world_points.ndim >= 2 and world_points.ndim != 3:
-            size = world_points.shape[:-2]
-            check_shapes({"img_points": (img_points, (*world_points.shape[:-1], 2))}, world_points)
-            given = world_points, img_points, camera_matrices(intrinsics), weights, mask, init
-            flat = [one_batch(size, x) for x in (*given, img_sigma, world_sigma)]
-            sigmas = {"img_sigma": flat[6], "world_sigma": flat[7]}
-            result = self(*flat[:6], **sigmas, first_stage_only=first_stage_only, gradient=gradient)
-            return map_tensors(lambda x: x.reshape((*size, *x.shape[1:])), result)
-        inputs = checked_inputs(world_points, img_points, intrinsics, weights, mask, init, img_sigma, world_sigma)
-        with _in_full_precision(world_points.device.type):
+        given = world_points, img_points, intrinsics, weights, mask, init, img_sigma, world_sigma
+        size, inputs = checked_inputs(*given)
+        with _in_full_precision(inputs.world_points.device.type):
             always = _checked_gradient(gradient or self.gradient) == "always"
-            parts = split_batch(inputs, self._portions(world_points))
+            parts = split_batch(inputs, self._portions(inputs.world_points))
             results = [self._solve(first_stage_only, always, part) for part in parts]
-        return results[0] if len(results) == 1 else map_tensors(lambda *x: torch.cat(x), *results)
+        result = results[0] if len(results) == 1 else map_tensors(lambda *x: torch.cat(x), *results)
+        return restore_leading(size, result)
 
     def with_guess(
         self,
@@ -203,11 +198,12 @@ class PnPNet(nn.Module):
             The result, and the guess in the frame, the order and the units of the inputs; its ``ok`` says whether the
             problem is valid.
         """
-        inputs = checked_inputs(world_points, img_points, intrinsics, weights, mask, init, img_sigma, world_sigma)
-        with _in_full_precision(world_points.device.type):
+        given = world_points, img_points, intrinsics, weights, mask, init, img_sigma, world_sigma
+        size, inputs = checked_inputs(*given)
+        with _in_full_precision(inputs.world_points.device.type):
             always = _checked_gradient(gradient or self.gradient) == "always"
             begun, result = self._parts(first_stage_only, always, inputs)
-            return result, self.normalize.undo_guess(begun.guess, begun.frame)
+            return restore_leading(size, (result, self.normalize.undo_guess(begun.guess, begun.frame)))
 
     def compile(self, mode: str | None = None, *, whole: bool = False) -> None:
         """Compile with ``torch.compile``, in place: what is before, in, and after an iteration, each once.
@@ -402,7 +398,7 @@ def _is_seen(guess: Guess, corr: Correspondences) -> Tensor:
 def _gate(value: Tensor, live: Tensor, finite: Tensor, fill: float | Tensor) -> Tensor:
     """Keep the gradient of problems that are live, the value of those that are finite, and fill the others."""
     shape = (-1,) + (1,) * (value.ndim - 1)
-    if value.requires_grad:
+    if torch.is_grad_enabled():  # a tensor that forward mode differentiates does not require a gradient
         value = torch.where(live.view(shape), value, value.detach())
     return torch.where(finite.view(shape), value, fill).contiguous()
 

@@ -44,7 +44,8 @@ class Status(IntEnum):
     NOT_FINITE = 3
     #: The intrinsics are not a multiple of ``[[fx, s, cx], [0, fy, cy], [0, 0, 1]]`` with positive ``fx`` and ``fy``.
     CAMERA = 4
-    #: No pose was found with which enough pairs agree.
+    #: No pose was found with which enough pairs agree. Of three pairs most solvers answer this: see
+    #: :func:`kornia_pnpnet.init.p3p`, which finds all poses of three pairs.
     NOT_BELIEVED = 5
     #: The pose that was found has fewer than 3 pairs in front of the camera.
     BEHIND = 6

@@ -71,12 +71,13 @@ def test_where_there_is_no_nearest_rotation_it_is_the_identity_without_gradient(
     assert second.isfinite().all()
 
 
+@pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")  # PyTorch's own use of it in forward mode
 def test_gradcheck_of_the_nearest_rotation(generator):
     matrix = torch.randn(3, 3, 4, generator=generator, dtype=torch.float64)
     flat = matrix * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)[:, None]
     for x in (matrix, flat):
         inputs = (x.clone().requires_grad_(),)
-        assert torch.autograd.gradcheck(lambda m: nearest_rotation(m)[0], inputs)
+        assert torch.autograd.gradcheck(lambda m: nearest_rotation(m)[0], inputs, check_forward_ad=True)
         assert torch.autograd.gradgradcheck(lambda m: nearest_rotation(m)[0], inputs)
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 from kornia.core.exceptions import ShapeError, TypeCheckError
-from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix, normalize_points_with_intrinsics
 
-from kornia_pnpnet import Correspondences, Pose
+from kornia_pnpnet import Correspondences, Pose, Status, create_solver
 from kornia_pnpnet.data import SyntheticProblems
 from kornia_pnpnet.init import P3P, p3p
 from kornia_pnpnet.types import Hypotheses
@@ -245,12 +245,40 @@ def test_the_module_reads_normalised_correspondences():
 
 def test_wrong_arguments_raise():
     shapes = ((2, 3, 3), (2, 4, 2), (3, 3, 2))
-    wrong = [(torch.zeros(shape), ShapeError) for shape in shapes] + [(torch.zeros(2, 3, 2).double(), TypeCheckError)]
+    wrong = [(torch.zeros(shape), ShapeError) for shape in shapes] + [(torch.zeros(2, 3, 2).bool(), TypeCheckError)]
     for plane_points, error in wrong:
         with pytest.raises(error):
             p3p(torch.zeros(2, 3, 3), plane_points)
-    with pytest.raises(TypeCheckError, match="float16"):
-        p3p(torch.zeros(2, 3, 3).half(), torch.zeros(2, 3, 2).half())
+
+
+def test_all_poses_of_three_pixels_with_any_leading_dimensions():
+    """From pixels, as a user with three pairs has them: every pose reprojects exactly, and one is the truth."""
+    p = SyntheticProblems(n=3, batch_size=600, seed=3, img_sigma=0.0, world_sigma=0.0, dtype=torch.float64).batch(0)
+    plane_points = normalize_points_with_intrinsics(p.img_points, p.intrinsics)
+    whole = p3p(p.world_points, plane_points)
+    assert (errors(whole, p.pose).amin(-1) < NEAR).all()
+    assert (3400.0 * reprojection_errors(whole, p.world_points, plane_points) < 1e-6).all()  # px
+    assert (create_solver("pnpnet-set")(*p[:3]).status == Status.NOT_BELIEVED).all()
+    assert create_solver("p3p-ransac")(*p[:3]).ok.all()
+    for size in ((), (1,), (2, 3), (0,), (5, 0), (4, 5, 6)):
+        first = math.prod(size)
+        found = p3p(p.world_points[:first].reshape(*size, 3, 3), plane_points[:first].reshape(*size, 3, 2))
+        assert found.valid.shape == (*size, 4)
+        assert found.pose.matrix.shape == (*size, 4, 4, 4)
+        flat = Hypotheses(Pose(*(x.flatten(0, len(size)) for x in found.pose)), found.valid.flatten())
+        expected = (x[:first].flatten(0, 1) for x in (*whole.pose, whole.valid))
+        for one, other in zip((*flat.pose, flat.valid), expected, strict=True):
+            assert torch.equal(one, other)
+
+
+def test_points_of_any_dtype_are_solved_in_float32_or_float64():
+    world_points, plane_points = (x.half() for x in wide(50)[:2])
+    single = p3p(world_points.float(), plane_points.float())
+    double = p3p(world_points.double(), plane_points.double())
+    for points, expected in (((world_points, plane_points), single), ((world_points, plane_points.double()), double)):
+        found = p3p(*points)
+        for one, other in zip((*found.pose, found.valid), (*expected.pose, expected.valid), strict=True):
+            assert torch.equal(one, other)
 
 
 @pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)

@@ -150,6 +150,21 @@ def test_padding_and_bad_problems():
     assert torch.equal(spoilt[[0, 3]], reference[[0, 3]])
 
 
+def test_single_problems_and_half_precision():
+    p = problems(n=20, batch=1)
+    reference = loss_of(p, img_sigma=2.0)
+    alone = loss_of(p._replace(pose=Pose(*(x[0] for x in p.pose)), **one(p)), img_sigma=2.0)
+    assert alone.shape == ()
+    torch.testing.assert_close(alone, reference[0])
+    half = p.world_points.bfloat16().requires_grad_()
+    loss_of(p._replace(world_points=half), img_sigma=50.0).sum().backward()
+    assert half.grad.isfinite().all()
+
+
+def one(p):
+    return {"world_points": p.world_points[0], "img_points": p.img_points[0], "intrinsics": p.intrinsics[0]}
+
+
 def test_unknown_sigma_is_a_bad_problem():
     p = problems()
     sigma = torch.tensor([1.0, torch.nan, -1.0, torch.inf], dtype=DOUBLE)

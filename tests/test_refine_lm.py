@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import KINDS, are_rotations, correspondences, finite, gradients_are_finite, many, options, poses
 
-from kornia_pnpnet import Correspondences, Guess, Noise, Pose, RobustWeightedLM, pose_errors
+from kornia_pnpnet import Correspondences, Guess, Noise, PnPNet, Pose, RobustWeightedLM, pose_errors
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.geometry import NormalEquations, project, retract, retract_additive
 from kornia_pnpnet.refine import KERNELS, explains, lm_step, solve_damped
@@ -616,6 +616,21 @@ def test_implicit_gradients_are_those_of_unrolling_to_the_minimum(kernel, gradie
     assert implicit[-1].any()
     # The start, the step length and the damping do not move a minimum.
     assert not any(x.any() for x in implicit[3:6])
+
+
+def test_implicit_second_derivatives_are_those_of_unrolling_to_the_minimum(make_problems, perturb):
+    p = make_problems(n=8, batch=2)
+    direction = torch.randn_like(p.img_points)
+    products = []
+    for backward in ("unroll", "implicit"):
+        refine = RobustWeightedLM(60, kernel="cauchy", step=1.0, damping=1e-4, robustness=3.0, backward=backward)
+        img_points = p.img_points.clone().requires_grad_()
+        result = PnPNet(None, refine).double()(p.world_points, img_points, p.intrinsics, init=perturb(p.pose))
+        (gradient,) = torch.autograd.grad(
+            result.rotation.sum() + result.translation.sum(), img_points, create_graph=True
+        )
+        products.append(torch.autograd.grad((gradient * direction).sum(), img_points)[0])
+    assert (products[1] - products[0]).norm() < 1e-5 * products[0].norm()
 
 
 @pytest.mark.parametrize(("backward", "grows"), [("unroll", True), ("truncated", False), ("implicit", False)])

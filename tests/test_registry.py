@@ -274,3 +274,77 @@ def test_solvers_of_any_name_and_options():
 
     run()
     made.both()
+
+
+# --- torch.func -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings("ignore:There is a performance drop:UserWarning")
+@pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")  # PyTorch's own use of it in forward mode
+@pytest.mark.parametrize("name", [x for x in list_solvers() if not x.startswith(("opencv", "poselib", "pycolmap"))])
+def test_transforms_of_every_solver_of_ours(name):
+    """First derivatives against ``backward``, second against central differences of it, ``vmap`` against a loop.
+
+    Pixels move along three directions. Where the pose is found from a start that is a constant, derivatives leave out
+    what the start would change, which the last iterations nearly forget: hence the tolerance of second derivatives.
+    """
+    number = re.search(r"-n(\d+)$", name)
+    chosen = {"m": 2} if name.endswith("-lm") or "pnpnet-n" in name else {}
+    chosen |= {"pnpnet-set": {"m": 4}, "ransac-epnp-lm": {"max_samples": 20}}.get(name, {})
+    p = SyntheticProblems(n=int(number[1]) if number else 8, batch_size=2, seed=3, dtype=torch.float64).batch(0)
+    solver = create_solver(name, **chosen).double().requires_grad_(False)
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.randn(3, *p.img_points.shape, generator=generator).double()
+    mixture = torch.randn(24, generator=generator).double()
+
+    def outputs(world_points, img_points, intrinsics):
+        result = solver(world_points, img_points, intrinsics)
+        parts = (*result.pose, *result.init)
+        return torch.cat([x.flatten(-2) if x.shape[-2:] == (3, 3) else x for x in parts], -1)
+
+    def moved(shift):
+        img_points = p.img_points + (shift[:, None, None, None] * directions).sum(0)
+        return outputs(p.world_points, img_points, p.intrinsics)
+
+    def loss(shift):
+        return (moved(shift) @ mixture).sum()
+
+    def gradient(shift):
+        leaf = shift.clone().requires_grad_()
+        return torch.autograd.grad(loss(leaf), leaf)[0]
+
+    zero, steps = torch.zeros(3).double(), 1e-3 * torch.eye(3).double()
+    first = gradient(zero)
+    second = torch.stack([(gradient(step) - gradient(-step)) / 2e-3 for step in steps])
+    assert first.all()
+    assert second.any()
+
+    def close(found, expected, tolerance):
+        assert (found - expected).norm() <= tolerance * expected.norm()
+
+    def of_loss(jacobian):
+        return torch.einsum("boi,o->i", jacobian, mixture)
+
+    close(torch.func.grad(loss)(zero), first, 1e-7)
+    close(of_loss(torch.func.jacrev(moved)(zero)), first, 1e-7)
+    close(torch.autograd.functional.hessian(loss, zero), second, 2e-3)
+    close(torch.func.jacrev(torch.func.jacrev(loss))(zero), second, 2e-3)
+    close(torch.func.jvp(loss, (zero,), (steps[0],))[1], 1e-3 * first[0], 1e-3)
+
+    def each(img_points, world_points, intrinsics):
+        return outputs(world_points, img_points, intrinsics) @ mixture
+
+    problems = p.img_points, p.world_points, p.intrinsics
+    if "ransac" in name:
+        with pytest.raises(NotImplementedError, match="vmap"):
+            torch.func.vmap(each)(*problems)
+        for transform in (torch.func.hessian, torch.func.jacfwd):
+            with pytest.raises(RuntimeError, match="random"):
+                transform(loss)(zero)
+        close(torch.func.jacfwd(loss, randomness="same")(zero), first, 1e-3)
+        return
+    close(torch.func.jacfwd(loss)(zero), first, 1e-3)
+    close(torch.func.hessian(loss)(zero), second, 2e-3)
+    close(torch.func.vmap(each)(*problems), torch.stack([each(*x) for x in zip(*problems, strict=True)]), 1e-7)
+    by_problem = torch.func.vmap(torch.func.grad(each))(*problems)
+    close((by_problem * directions).flatten(1).sum(1), first, 1e-6)

@@ -24,6 +24,7 @@ __all__ = [
     "check_ranges",
     "check_shapes",
     "check_whole",
+    "common_dtype",
     "expand_sigma",
 ]
 
@@ -103,6 +104,25 @@ def check_devices(tensors: Mapping[str, Tensor | None], like: Tensor, like_name:
             raise DeviceError(f"{name} is on {tensor.device} but {like_name} is on {like.device}.")
 
 
+def common_dtype(tensors: Mapping[str, Tensor | None]) -> torch.dtype:
+    """The dtype to compute in: float64 when any tensor is float64, else float32. ``None`` does not count.
+
+    Half precision has too few digits for a pixel, and integers have no gradient.
+
+    Raises:
+        TypeCheckError: for a tensor of booleans or complex numbers.
+
+    Example:
+        >>> common_dtype({"img_points": torch.zeros(2).half(), "world_points": torch.zeros(2).double()})
+        torch.float64
+    """
+    given = {name: tensor.dtype for name, tensor in tensors.items() if tensor is not None}
+    for name, dtype in given.items():
+        if dtype == torch.bool or dtype.is_complex:
+            raise TypeCheckError(f"{name} must hold floats or integers, got {dtype}.")
+    return torch.float64 if torch.float64 in given.values() else torch.float32
+
+
 def check_poses(estimate: Pose, truth: Pose) -> None:
     """Check that two batches of poses match exactly. Broadcasting would compare poses of different problems."""
     batch = tuple(estimate.translation.shape[:-1])
@@ -118,28 +138,29 @@ def check_poses(estimate: Pose, truth: Pose) -> None:
 
 
 def expand_sigma(name: str, sigma: Tensor | float | None, world_points: Tensor) -> Tensor:
-    """Check a standard deviation that a user gave, and expand it to every pair: shape (B, N).
+    """Check a standard deviation that a user gave, and expand it to every pair: shape (*, N), like ``world_points``.
 
     Args:
         name: name of the argument in error messages.
-        sigma: a number, a tensor of shape (), (B,) or (B, N) like ``world_points``, or ``None`` for unknown: NaN.
-        world_points: shape (B, N, 3).
+        sigma: a number, a tensor of shape (), (*) or (*, N), or ``None`` for unknown: NaN.
+        world_points: shape (*, N, 3).
 
     Example:
         >>> expand_sigma("img_sigma", torch.tensor([1.0, 2.0]), torch.zeros(2, 3, 3))
         tensor([[1., 1., 1.],
                 [2., 2., 2.]])
     """
-    batch, count = world_points.shape[:2]
+    pairs = world_points.shape[:-1]
     if sigma is None or isinstance(sigma, int | float):
-        return world_points.new_full((batch, count), torch.nan if sigma is None else sigma)
+        return world_points.new_full(pairs, torch.nan if sigma is None else sigma)
     if not isinstance(sigma, Tensor):
         raise TypeCheckError(f"{name} must be a number or a tensor, got {type(sigma).__name__}.")
-    check_like({name: sigma}, world_points)
-    if sigma.shape not in ((), (batch,), (batch, count)):
+    check_devices({name: sigma}, world_points)
+    if sigma.shape not in ((), pairs[:-1], pairs):
         raise ShapeError(
-            f"{name} must be a number or have the shape {(batch,)} or {(batch, count)}, got {tuple(sigma.shape)}.",
+            f"{name} must be a number or have the shape {tuple(pairs[:-1])} or {tuple(pairs)}, "
+            f"got {tuple(sigma.shape)}.",
             actual_shape=tuple(sigma.shape),
-            expected_shape=["B", "N"],
+            expected_shape=["*", "N"],
         )
-    return (sigma[:, None] if sigma.ndim == 1 else sigma).expand(batch, count)
+    return (sigma if sigma.shape == pairs else sigma[..., None]).expand(pairs).to(world_points.dtype)

@@ -158,11 +158,21 @@ class _NearestRotation(torch.autograd.Function):
     def setup_context(ctx: Any, inputs: tuple[Tensor], output: tuple[Tensor, Tensor]) -> None:
         ctx.mark_non_differentiable(output[1])
         ctx.save_for_backward(inputs[0], *output)
+        ctx.save_for_forward(inputs[0], *output)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> Tensor:
+        # The map from dM to dR is symmetric: it takes a gradient by R to the gradient by M.
+        return _NearestRotation._turned(ctx.saved_tensors, gradients[0])
+
+    @staticmethod
+    def jvp(ctx: Any, change: Tensor) -> tuple[Tensor, None]:
+        return _NearestRotation._turned(ctx.saved_tensors, change), None
+
+    @staticmethod
+    def _turned(saved: tuple[Tensor, Tensor, Tensor], change: Tensor) -> Tensor:
         # With M = R S, a change dM turns the rotation by dR = R [w], where (tr S - S) w is the vector of Rᵀ dM - dMᵀ R.
-        matrix, rotation, unique = ctx.saved_tensors
+        matrix, rotation, unique = saved
         inner = small_product(rotation.transpose(0, 1), matrix)
         size = inner.abs().amax((0, 1))
         inner = inner / torch.where(unique, size, 1.0)
@@ -172,7 +182,7 @@ class _NearestRotation(torch.autograd.Function):
         cofactors = _cofactors(normal)
         determinant = (normal[0] * cofactors[0]).sum(0)
         determinant = torch.where(unique, determinant * size, 1.0)
-        turn = (cofactors * _turn(rotation, gradients[0])).sum(1) / determinant
+        turn = (cofactors * _turn(rotation, change)).sum(1) / determinant
         x, y, z = torch.where(unique, turn, 0.0).unbind(0)
         zero = torch.zeros_like(x)
         cross = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero)).unflatten(0, (3, 3))

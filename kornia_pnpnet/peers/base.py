@@ -15,8 +15,8 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
 from kornia_pnpnet.core.checks import check_positive, check_whole
-from kornia_pnpnet.inputs import check_inputs
-from kornia_pnpnet.types import MIN_PAIRS, PnPResult, Pose, Status, camera_matrices
+from kornia_pnpnet.inputs import checked_inputs, restore_leading
+from kornia_pnpnet.types import MIN_PAIRS, PnPResult, Pose, Status
 
 __all__ = ["PeerPose", "PeerSolver"]
 
@@ -97,27 +97,27 @@ class PeerSolver(nn.Module):
         r"""Solve a batch of problems, one after the other, on the CPU in float64.
 
         Args:
-            world_points: shape :math:`(B, N, 3)`, float32 or float64, any unit.
+            world_points: shape :math:`(B, N, 3)`, any unit, floats or integers. Any leading dimensions may stand in
+                place of :math:`B`, in all arguments and in the result; a single problem has none.
             img_points: pixels, shape :math:`(B, N, 2)`.
             intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or Kornia's cameras.
             weights: pairs of weight 0 are left out, shape :math:`(B, N)`; 1 when ``None``.
             mask: False where a pair is padding, bool, shape :math:`(B, N)`.
 
         Returns:
-            The :class:`~kornia_pnpnet.types.PnPResult` in the dtype and on the device of the input, without
-            gradients. Its weights are 1 for the inliers that the peer reports, else 0; its cost is the mean over the
-            pairs of the squared reprojection error in px², truncated at the squared threshold.
+            The :class:`~kornia_pnpnet.types.PnPResult` on the device of the input, without gradients; float64 when any
+            input is, else float32. Its weights are 1 for the inliers that the peer reports, else 0; its cost is the
+            mean over the pairs of the squared reprojection error in px², truncated at the squared threshold.
 
         Raises:
             ShapeError: for shapes that do not fit each other, or fewer than 3 pairs.
-            TypeCheckError: for dtypes that differ or are not float32 or float64.
+            TypeCheckError: for arguments that are no tensors, or hold booleans or complex numbers.
             DeviceError: for tensors on different devices.
         """
-        intrinsics = camera_matrices(intrinsics)
-        check_inputs(world_points, img_points, intrinsics, weights, mask)
+        size, inputs = checked_inputs(world_points, img_points, intrinsics, weights, mask)
+        world_points, img_points, intrinsics, weights, mask = inputs[:5]
         batch, count = world_points.shape[:2]
         world, img, cameras = (x.detach().cpu().double().numpy() for x in (world_points, img_points, intrinsics))
-        cameras = np.broadcast_to(cameras, (batch, 3, 3))
         with np.errstate(all="ignore"):  # a camera without a last entry is refused below
             cameras = cameras / cameras[:, 2:, 2:]
         shares = np.ones((batch, count)) if weights is None else weights.detach().cpu().double().numpy()
@@ -148,7 +148,7 @@ class PeerSolver(nn.Module):
         def back(values: np.ndarray) -> Tensor:
             return torch.from_numpy(values).clamp(-largest, largest).to(world_points)
 
-        return PnPResult(
+        result = PnPResult(
             back(rotation),
             back(translation),
             back(pair_weights),
@@ -157,6 +157,7 @@ class PeerSolver(nn.Module):
             Pose(back(first_rotation), back(first_translation)),
             torch.from_numpy(np.where(ok, Status.SOLVED, status).astype(np.int8)).to(world_points.device),
         )
+        return restore_leading(size, result)
 
 
 class RobustPeer(PeerSolver):

@@ -387,7 +387,8 @@ class RobustWeightedLM(Configured):
 
         With :math:`g(\delta) = J^\top W r` at the pose moved by :math:`\delta`, which is 0 at the minimum,
         :math:`d\delta = -(\partial g / \partial \delta)^{-1} dg`: one Newton step whose value is left out. Where the
-        matrix is not positive definite the pose is no minimum yet, and the Gauss-Newton matrix replaces it.
+        matrix is not positive definite the pose is no minimum yet, and the Gauss-Newton matrix replaces it. A second
+        step with the same matrix makes second derivatives exact.
         """
         equations = partial(weighted_equations, estimated=start.estimated, kernel_weight=self.kernel.weight)
         pairs = start.by_residual
@@ -397,12 +398,15 @@ class RobustWeightedLM(Configured):
             hessian = [
                 torch.autograd.grad(entry.sum(), zero[: i + 1], retain_graph=True) for i, entry in enumerate(gradient)
             ]
-        gradient = equations(pairs, pose, shape).gradient
-        none = torch.zeros_like(shape)
-        newton, convex = solve_damped(NormalEquations(hessian, gradient), none)
-        gauss_newton, solved = solve_damped(NormalEquations([[x.detach() for x in y] for y in around], gradient), none)
-        steps = (torch.where(convex, x, torch.where(solved, y, 0.0)) for x, y in zip(newton, gauss_newton, strict=True))
-        return move(pose, [step.detach() - step for step in steps])
+        around, none = [[x.detach() for x in row] for row in around], torch.zeros_like(shape)
+        for _ in range(2):
+            gradient = equations(pairs, pose, shape).gradient
+            newton, convex = solve_damped(NormalEquations(hessian, gradient), none)
+            gauss_newton, solved = solve_damped(NormalEquations(around, gradient), none)
+            both = zip(newton, gauss_newton, strict=True)
+            steps = [torch.where(convex, x, torch.where(solved, y, 0.0)) for x, y in both]
+            pose = move(pose, [step.detach() - step for step in steps])
+        return pose
 
 
 def _relative_to_mean(weights: Tensor) -> Tensor:

@@ -253,7 +253,8 @@ def minimize(system: DepthSystem, depths: Tensor, weight: float, iterations: int
 def attach_gradient(system: DepthSystem, depths: Tensor, planar: Tensor, weight: float) -> Tensor:
     r"""Give the minimum its gradient, by the implicit function theorem.
 
-    The result has the value of ``depths`` and the gradient of one Newton step. So the iterations need not be
+    The result has the value of ``depths`` and the derivatives of two Newton steps with a constant matrix: the first
+    step makes first derivatives exact, the second step second derivatives. So the iterations need not be
     differentiated, and the gradient does not depend on how the minimum was found.
 
     Args:
@@ -265,7 +266,8 @@ def attach_gradient(system: DepthSystem, depths: Tensor, planar: Tensor, weight:
     Returns:
         The depths with a gradient, which is 0 where the minimum is not isolated.
     """
-    normal, gradient, misfits = _normal_equations(_objective(system, weight, False), depths)
+    objective, depths = _objective(system, weight, False), depths.detach()
+    normal, gradient, misfits = _normal_equations(objective, depths)
     with torch.no_grad():
         entries = [misfits[min(i, j), max(i, j)] for i in range(3) for j in range(3)]
         misfit = torch.stack(entries).unflatten(0, (3, 3))
@@ -276,8 +278,13 @@ def attach_gradient(system: DepthSystem, depths: Tensor, planar: Tensor, weight:
         last = torch.zeros_like(normal[:, :, :1])
         last[3, 3] = 1.0
         normal = normal + last * planar
-    rows = [row[: i + 1].unbind(0) for i, row in enumerate(normal.unbind(0))]
-    zero = torch.zeros((), dtype=depths.dtype, device=depths.device)
-    solution, solved = solve_damped(NormalEquations(rows, gradient.unbind(0)), zero)
-    step = torch.where(solved, torch.stack(solution), 0.0)
-    return depths - step + step.detach()
+        rows = [row[: i + 1].unbind(0) for i, row in enumerate(normal.unbind(0))]
+        eye = torch.eye(4, dtype=depths.dtype, device=depths.device)[..., None]
+        solution, solved = solve_damped(NormalEquations(rows, eye.unbind(0)), eye.new_zeros(()))
+        inverse = torch.where(solved, torch.stack(solution), 0.0).detach()  # (4, 4, B)
+    for again in (True, False):
+        step = small_product(inverse, gradient[:, None])[:, 0]
+        depths = depths - step + step.detach()
+        if again:
+            gradient = _normal_equations(objective, depths)[1]
+    return depths

@@ -130,7 +130,7 @@ class EPnP(Configured):
         self, system: DepthSystem, control: ControlPoints, plane_points: Tensor, vectors: Tensor
     ) -> tuple[Tensor, Tensor]:
         """The depths (4, B) of the best case, and whether they were found (B,); where not, equal depths."""
-        cases = four_cases(system)
+        cases = four_cases(system).detach()  # forward mode starts here: the square roots of 0 have no derivative
         # The distances do not tell a shape from its mirror image along the optical axis, and Gauss-Newton does not
         # change the one into the other: symmetric points need both.
         mirrored = torch.cat((cases[:1, -1:], -cases[1:, -1:]))

@@ -8,15 +8,15 @@ from typing import Any, TypeVar
 
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
-from kornia.core.exceptions import TypeCheckError
 from torch import Tensor
 
-from kornia_pnpnet.core.checks import check_like, check_shapes
+from kornia_pnpnet.core.checks import check_devices, check_shapes, common_dtype
 from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.linalg import dot
 from kornia_pnpnet.core.performance import compiling, fold_vmap, unfold_vmap
 from kornia_pnpnet.geometry import MIN_DEPTH_RATIO
 from kornia_pnpnet.init.ransac.law_of_cosines import Triple, distances, turn_to_largest, turned
+from kornia_pnpnet.inputs import one_batch, restore_leading
 from kornia_pnpnet.types import Correspondences, Hypotheses, Pose
 
 __all__ = ["P3P", "p3p"]
@@ -170,6 +170,10 @@ class _Solve(torch.autograd.Function):
         ctx.mark_non_differentiable(*output)
 
     @staticmethod
+    def jvp(ctx: Any, *changes: Tensor) -> tuple[None, None]:
+        return None, None
+
+    @staticmethod
     def vmap(
         info: Any, in_dims: tuple[int | None, int | None], *points: Tensor
     ) -> tuple[tuple[Tensor, Tensor], tuple[int, int]]:
@@ -180,6 +184,9 @@ class _Solve(torch.autograd.Function):
 def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
     r"""Find all poses that project three world points exactly onto three image points, for a batch of problems.
 
+    Use this function when there are exactly three pairs. A solver answers with one pose, which most solvers do not
+    believe (:attr:`~kornia_pnpnet.types.Status.NOT_BELIEVED`), because no fourth pair confirms it.
+
     Convention: ``x_cam = R x_world + t``, the camera looks along +z.
 
     The poses carry no gradient: they are hypotheses, of which one is selected and refined on all pairs. In memory the
@@ -189,39 +196,43 @@ def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
     2023; details in ``init/ransac/law_of_cosines.py``.
 
     Args:
-        world_points: points in any unit, shape :math:`(B, 3, 3)`.
-        plane_points: :math:`(x/z, y/z)` of the points in the camera frame, shape :math:`(B, 3, 2)`.
+        world_points: points in any unit, shape :math:`(B, 3, 3)`. Any leading dimensions may stand in place of
+            :math:`B`, in both arguments and in the result; a single problem has none.
+        plane_points: :math:`(x/z, y/z)` of the points in the camera frame, shape :math:`(B, 3, 2)`. Kornia's
+            ``normalize_points_with_intrinsics`` computes them from pixels.
 
     Returns:
-        Four slots per problem. A slot is valid when its pose is a solution with all three points in front of the
-        camera. A double solution fills one slot. Invalid slots are finite. No slot is valid for points on a line, which
-        have no pose or infinitely many, for NaN and infinity, and where a point is further off the axis than
-        :data:`~kornia_pnpnet.geometry.MIN_DEPTH_RATIO` allows.
+        Four slots per problem, in float64 when an argument is, else in float32. A slot is valid when its pose is a
+        solution with all three points in front of the camera. A double solution fills one slot. Invalid slots are
+        finite. No slot is valid for points on a line, which have no pose or infinitely many, for NaN and infinity, and
+        where a point is further off the axis than :data:`~kornia_pnpnet.geometry.MIN_DEPTH_RATIO` allows.
 
     Raises:
         ShapeError: when a tensor has another shape, or the batches differ.
-        TypeCheckError: for dtypes other than float32 and float64, or two different dtypes.
+        TypeCheckError: for booleans or complex numbers.
         DeviceError: for tensors on two devices.
 
     Example:
-        >>> world_points = torch.tensor([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.5]]], dtype=torch.float64)
-        >>> cam_points = world_points + torch.tensor([0.0, 0.0, 4.0])
-        >>> pose, valid = p3p(world_points, cam_points[..., :2] / cam_points[..., 2:])
-        >>> pose.rotation.shape, valid.sum(-1)
-        (torch.Size([1, 4, 3, 3]), tensor([2]))
-        >>> bool((pose.translation[valid] - torch.tensor([0.0, 0.0, 4.0])).norm(dim=-1).min() < 1e-12)
+        >>> from kornia.geometry.conversions import normalize_points_with_intrinsics
+        >>> intrinsics = torch.tensor([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]])
+        >>> img_points = torch.tensor([[320.0, 240.0], [445.0, 240.0], [320.0, 351.11111]])
+        >>> world_points = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.5]])
+        >>> pose, valid = p3p(world_points, normalize_points_with_intrinsics(img_points, intrinsics))
+        >>> pose.rotation.shape, valid.sum()
+        (torch.Size([4, 3, 3]), tensor(2))
+        >>> bool((pose.translation[valid] - torch.tensor([0.0, 0.0, 4.0])).norm(dim=-1).min() < 1e-4)
         True
     """
-    KORNIA_CHECK_SHAPE(world_points, ["B", "3", "3"])
-    check_shapes({"plane_points": (plane_points, (world_points.shape[0], 3, 2))}, world_points)
-    if world_points.dtype not in (torch.float32, torch.float64):
-        raise TypeCheckError(f"world_points must be float32 or float64, got {world_points.dtype}.")
-    check_like({"plane_points": plane_points}, world_points)
+    KORNIA_CHECK_SHAPE(world_points, ["*", "3", "3"])
+    size = world_points.shape[:-2]
+    check_shapes({"plane_points": (plane_points, (*size, 3, 2))}, world_points)
+    check_devices({"plane_points": plane_points}, world_points)
+    dtype = common_dtype({"world_points": world_points, "plane_points": plane_points})
     solve = _solve if compiling() else _Solve.apply
-    components, valid = solve(world_points.detach(), plane_points.detach())
+    components, valid = solve(*(one_batch(x.detach(), size, dtype) for x in (world_points, plane_points)))
     components = components.permute(2, 1, 0)  # (B, 4, 12)
     rotation, translation = components[..., :9].unflatten(-1, (3, 3)), components[..., 9:]
-    return Hypotheses(Pose(rotation, translation), valid.mT)
+    return restore_leading(size, Hypotheses(Pose(rotation, translation), valid.mT))
 
 
 class P3P(Configured):

@@ -3,6 +3,7 @@ r"""RANSAC: the pose with the most inliers among the poses of many small samples
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from kornia.core.check import KORNIA_CHECK
@@ -163,7 +164,7 @@ class RANSAC(Configured):
         with torch.no_grad():
             share = (corr.near_weights > 0).to(corr.weights)
             share = share / share.sum(-1, keepdim=True).clamp(min=1.0)
-            centre = (share[..., None] * corr.world_points).sum(1)  # (B, 3), a constant
+            centre = (share[..., None] * _constant(*corr[:3])).sum(1)  # (B, 3)
         # Weights relative to the largest weight, so that their unit does not matter.
         weights = relative(corr.weights, corr.weights)
         corr = corr._replace(world_points=corr.world_points - centre[:, None], weights=weights)
@@ -171,7 +172,8 @@ class RANSAC(Configured):
             thresholds = self._thresholds(corr)
             if given is not None:
                 given = given._replace(translation=given.translation + (given.rotation @ centre[..., None])[..., 0])
-            found = Search(self.plan, corr, thresholds).run(given)
+                given = map_tensors(torch.Tensor.detach, given)
+            found = Search(self.plan, corr.map(torch.Tensor.detach), thresholds).run(given)
         pose, judged = self._refine(corr, found.pose, thresholds)
         with torch.no_grad():
             ok = self._is_evident(found, corr, thresholds, judged)
@@ -181,7 +183,7 @@ class RANSAC(Configured):
     def _thresholds(self, corr: Correspondences) -> Thresholds:
         """The thresholds in units of the correspondences, (B,) each."""
         one = torch.ones_like(corr.weights[:, 0])
-        img, world = (one if scale is None else scale for scale in (corr.img_scale, corr.world_scale))
+        img, world = (one if scale is None else scale.detach() for scale in (corr.img_scale, corr.world_scale))
         return Thresholds(self.threshold * img, self.world_threshold * world)
 
     def _refine(self, corr: Correspondences, start: Pose, thresholds: Thresholds) -> tuple[Pose, Judged]:
@@ -195,12 +197,12 @@ class RANSAC(Configured):
             part = problems_last(part)
             projection = project(pose, part)
             with torch.no_grad():
-                inliers = judge(projection, part, limits).weights
+                inliers = judge(projection, part, limits).weights.detach()
             for _ in range(_FINAL_STEPS):
                 pose = least_squares(part, pose, projection, inliers)
                 projection = project(pose, part)
             with torch.no_grad():
-                judged = judge(projection, part, limits)
+                judged = map_tensors(torch.Tensor.detach, judge(projection, part, limits))
             results.append(take((pose, judged), slice(last - first)))
         pose, judged = map_tensors(lambda *parts: torch.cat(parts), *results)
         return map_tensors(torch.Tensor.contiguous, pose), judged
@@ -213,3 +215,28 @@ class RANSAC(Configured):
         tests = found.poses * (counts - MIN_PAIRS).clamp(min=1)
         rare = log_false_alarms(tests, inliers, counts, chance) < math.log(MAX_FALSE_ALARMS)
         return found.loss.isfinite() & (rare | ((inliers == MIN_PAIRS) & (counts == MIN_PAIRS)))
+
+
+class _Constant(torch.autograd.Function):
+    """See :func:`_constant`."""
+
+    @staticmethod
+    def forward(world_points: Tensor, img_points: Tensor, weights: Tensor) -> Tensor:
+        return world_points.clone()
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+        ctx.mark_non_differentiable(output)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *tensors: Tensor) -> tuple[Tensor, int]:
+        raise NotImplementedError(
+            "torch.func.vmap cannot map RANSAC, whose search ends when its problems are solved. "
+            "Give the solver a larger batch: it takes any leading dimensions."
+        )
+
+
+def _constant(world_points: Tensor, img_points: Tensor, weights: Tensor) -> Tensor:
+    """The points as a constant; an error that says what to do inside of ``torch.func.vmap``."""
+    constant: Tensor = _Constant.apply(*(x.detach() for x in (world_points, img_points, weights)))  # type: ignore[no-untyped-call]
+    return constant
