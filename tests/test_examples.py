@@ -57,6 +57,23 @@ def test_images_become_poses_end_to_end(tmp_path):
         assert (tmp_path / picture).stat().st_size > 0
 
 
+@pytest.mark.slow
+def test_an_incremental_map_registers_its_images(tmp_path):
+    subprocess.run([sys.executable, EXAMPLES / "incremental_map.py", "--scenes", "4", "--out", tmp_path], check=True)
+    theirs, ours = json.loads((tmp_path / "incremental_map.json").read_text())["runs"].values()
+    assert ours["5%"]["within_1_deg"] > 0.9
+    assert all(ours[share]["within_1_deg"] >= theirs[share]["within_1_deg"] for share in ours)
+
+
+@pytest.mark.slow
+def test_a_pose_network_learns_from_nothing(tmp_path):
+    arguments = ["--steps", "200", "--seeds", "1", "--out", tmp_path]
+    subprocess.run([sys.executable, EXAMPLES / "pose_network.py", *arguments], check=True)
+    *distances, likelihood = json.loads((tmp_path / "pose_network.json").read_text())["runs"].values()
+    assert likelihood[0]["rotation_deg"] < 20.0
+    assert all(likelihood[0]["rotation_deg"] < rows[0]["rotation_deg"] for rows in distances)
+
+
 def test_the_end_to_end_gradient_halves_the_error_for_every_seed():
     """In the results that the documentation shows."""
     results = json.loads((EXAMPLES / "keypoint_pipeline.json").read_text())
@@ -68,8 +85,8 @@ def test_the_end_to_end_gradient_halves_the_error_for_every_seed():
 
 def test_the_tables_of_the_page_are_of_the_results():
     made = runpy.run_path(str(EXAMPLES / "tables.py"))
-    text = made["PAGE"].read_text()
-    assert made["page"](text) == text
+    for name in made["PAGES"]:
+        assert made["page"](name) == (EXAMPLES / name).read_text()
 
 
 def test_keypoints_are_visible_where_nothing_is_before_them(monkeypatch):

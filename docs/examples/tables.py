@@ -1,4 +1,4 @@
-"""Write the tables of ``README.md`` from the results of the examples: ``python docs/examples/tables.py``."""
+"""Write the tables of ``README.md`` and ``clients.md`` from the results: ``python docs/examples/tables.py``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from typing import Any
 from kornia_pnpnet.core.tables import markdown_table
 
 HERE = Path(__file__).resolve().parent
-PAGE = HERE / "README.md"
 
 
 def localisation(results: dict[str, Any]) -> str:
@@ -48,9 +47,38 @@ def fiducial_board(results: dict[str, Any]) -> str:
     return f"{share}, and median errors of the poses found:\n\n{markdown_table(header, lines)}"
 
 
-def page(text: str) -> str:
-    """The page with its tables between the comments that name their files."""
-    for table in (localisation, fiducial_board):
+def incremental_map(results: dict[str, Any]) -> str:
+    """Success of each way to register an image, by the share of wrong matches."""
+    runs = results["runs"]
+    lines = []
+    for share in next(iter(runs.values())):
+        cells = [f"{100 * run[share]['within_1_deg']:.0f} %, {run[share]['median_deg']:.3f}°" for run in runs.values()]
+        lines.append([share.replace("%", " %"), *cells])
+    header = ["Wrong matches", *(f"`{name}`" for name in runs)]
+    caption = f"Share of images within 1° and median error, {results['scenes']} scenes of {results['images']} images"
+    return f"{caption}:\n\n{markdown_table(header, lines)}"
+
+
+def pose_network(results: dict[str, Any]) -> str:
+    """Errors of the networks of each loss."""
+    lines = []
+    for name, rows in results["runs"].items():
+        turns = ", ".join(f"{row['rotation_deg']:.1f}°" for row in rows)
+        shifts = ", ".join(f"{row['translation']:.2f}" for row in rows)
+        lines.append([name, turns, shifts])
+    seeds = len(next(iter(results["runs"].values())))
+    caption = f"Median errors on test poses after {results['steps']} steps from nothing, {seeds} seeds"
+    return f"{caption}:\n\n{markdown_table(['Loss', 'rotation', 'translation'], lines)}"
+
+
+#: The tables of each page.
+PAGES = {"README.md": (localisation, fiducial_board), "clients.md": (incremental_map, pose_network)}
+
+
+def page(name: str) -> str:
+    """A page with its tables between the comments that name their files."""
+    text = (HERE / name).read_text()
+    for table in PAGES[name]:
         path = HERE / f"{table.__name__}.json"
         comment, end = f"<!-- {path.name}, by tables.py -->", "<!-- end -->"
         before, rest = text.split(comment)
@@ -60,4 +88,5 @@ def page(text: str) -> str:
 
 
 if __name__ == "__main__":
-    PAGE.write_text(page(PAGE.read_text()))
+    for name in PAGES:
+        (HERE / name).write_text(page(name))
