@@ -12,6 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kornia_pnpnet.core.performance import compiling
+
 __all__ = [
     "dot",
     "eigenvectors",
@@ -158,19 +160,15 @@ class _NearestRotation(torch.autograd.Function):
     def setup_context(ctx: Any, inputs: tuple[Tensor], output: tuple[Tensor, Tensor]) -> None:
         ctx.mark_non_differentiable(output[1])
         ctx.save_for_backward(inputs[0], *output)
-        ctx.save_for_forward(inputs[0], *output)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> Tensor:
         # The map from dM to dR is symmetric: it takes a gradient by R to the gradient by M.
-        return _NearestRotation._turned(ctx.saved_tensors, gradients[0])
+        return _NearestRotation.turned(ctx.saved_tensors, gradients[0])
 
     @staticmethod
-    def jvp(ctx: Any, change: Tensor) -> tuple[Tensor, None]:
-        return _NearestRotation._turned(ctx.saved_tensors, change), None
-
-    @staticmethod
-    def _turned(saved: tuple[Tensor, Tensor, Tensor], change: Tensor) -> Tensor:
+    def turned(saved: tuple[Tensor, Tensor, Tensor], change: Tensor) -> Tensor:
+        """The change of the rotation by a change of the matrix."""
         # With M = R S, a change dM turns the rotation by dR = R [w], where (tr S - S) w is the vector of Rᵀ dM - dMᵀ R.
         matrix, rotation, unique = saved
         inner = small_product(rotation.transpose(0, 1), matrix)
@@ -187,6 +185,21 @@ class _NearestRotation(torch.autograd.Function):
         zero = torch.zeros_like(x)
         cross = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero)).unflatten(0, (3, 3))
         return small_product(rotation, cross)
+
+
+class _NearestRotationForward(_NearestRotation):
+    """With a rule for forward mode, which ``torch.compile`` refuses to trace."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor], output: tuple[Tensor, Tensor]) -> None:
+        _NearestRotation.setup_context(ctx, inputs, output)
+        ctx.save_for_forward(inputs[0], *output)
+
+    @staticmethod
+    def jvp(ctx: Any, change: Tensor) -> tuple[Tensor, None]:
+        return _NearestRotation.turned(ctx.saved_tensors, change), None
 
 
 def nearest_rotation(matrix: Tensor) -> tuple[Tensor, Tensor]:
@@ -207,7 +220,8 @@ def nearest_rotation(matrix: Tensor) -> tuple[Tensor, Tensor]:
         >>> torch.allclose(rotation, torch.eye(3), atol=1e-6), unique
         (True, tensor(True))
     """
-    rotation, unique = _NearestRotation.apply(matrix)  # type: ignore[no-untyped-call]
+    function = _NearestRotation if compiling() else _NearestRotationForward
+    rotation, unique = function.apply(matrix)  # type: ignore[no-untyped-call]
     return rotation, unique
 
 
