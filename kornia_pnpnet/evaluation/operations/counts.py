@@ -58,8 +58,8 @@ def operation_count(solver: str | PnPNet, n: int, *, outliers: int = 0) -> float
         BaseError: for an unknown name, or numbers of pairs and outliers that do not fit each other or the solver.
 
     Example:
-        >>> round(operation_count("identity-lm", 9), -4)
-        80000.0
+        >>> round(operation_count("identity-lm", 9), -5)
+        100000.0
     """
     runnable = _solver(solver, n) if isinstance(solver, str) else solver
     mix = OutlierMix(count=outliers)
