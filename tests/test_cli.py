@@ -18,9 +18,11 @@ from torch import nn
 from kornia_pnpnet import MLPInit, PnPNet, RobustWeightedLM, create_solver, list_solvers, pretrained
 from kornia_pnpnet.cli import COMMANDS, main
 from kornia_pnpnet.cli.demo import verdict
+from kornia_pnpnet.cli.evaluate import SYNTHETIC
 from kornia_pnpnet.cli.reprojection import rejection_limit, reproject
 from kornia_pnpnet.core import files
 from kornia_pnpnet.evaluation.named_solvers import BOUNDS, default_solvers
+from kornia_pnpnet.evaluation.problem_sets import PRIORS
 from kornia_pnpnet.evaluation.results import load_results
 from kornia_pnpnet.types import Pose
 
@@ -324,8 +326,8 @@ def test_wrong_n_and_wrong_solvers(capsys, csv_file, tmp_path, weights_folder):
         (),
         ("solve",),
         ("fly",),
-        ("solve", "x.csv", "--threshold", "0"),
-        ("solve", "x.csv", "--plot", "x.doc"),
+        ("solve", __file__, "--threshold", "0"),
+        ("solve", __file__, "--plot", "x.doc"),
         ("evaluate", "--problems", "0"),
         ("evaluate", "--seed", "-1"),
         ("evaluate", "--n", "9,"),
@@ -408,7 +410,7 @@ def test_interruptions_are_one_line(capsys, tmp_path, monkeypatch):
     code, out, err = run(capsys, "evaluate", "--problems", 5, "--solver", "identity-lm", "--out", out_file)
     assert (code, out, err.count("\n")) == (130, "", 1)
     assert str(out_file) in err
-    monkeypatch.setattr("kornia_pnpnet.cli.listing.list_solvers", interrupt)
+    monkeypatch.setattr("kornia_pnpnet.list_solvers", interrupt)
     assert run(capsys, "list") == (130, "", "pnpnet: interrupted\n")
 
 
@@ -483,7 +485,7 @@ def test_an_error_in_a_solver_says_where(capsys, tmp_path, monkeypatch):
         def forward(self, *_):
             raise ValueError("a bad\nday")
 
-    monkeypatch.setattr("kornia_pnpnet.cli.evaluate.load_solver", lambda name: Broken())
+    monkeypatch.setattr("kornia_pnpnet.evaluation.named_solvers.load_solver", lambda name: Broken())
     arguments = ("--problems", 5, "--outliers", "none", "--solver", "broken", "--out", tmp_path / "results.json")
     err = refused(capsys, "evaluate", *arguments)
     assert "a bad day" in err
@@ -574,6 +576,24 @@ def test_the_command_as_a_process(csv_file):
     solved = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
     assert json.loads(solved.stdout)["ok"]
     assert solved.stderr == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"), [(["--help"], 0), (["solve", "missing.csv"], 2), (["evaluate", "--data", "missing"], 2)]
+)
+def test_what_needs_no_pytorch_imports_none(arguments, code):
+    script = (
+        "import sys\nfrom kornia_pnpnet.cli import main\n"
+        "try: code = main()\nexcept SystemExit as end: code = end.code\n"
+        "assert not {'torch', 'kornia', 'numpy'} & sys.modules.keys()\nsys.exit(code)"
+    )
+    done = subprocess.run([sys.executable, "-c", script, *arguments], capture_output=True, text=True, check=False)
+    assert done.returncode == code, done.stderr
+    assert "missing" in done.stderr or code == 0
+
+
+def test_the_names_of_synthetic_data():
+    assert tuple(PRIORS) == SYNTHETIC
 
 
 # -- reprojection ----------------------------------------------------------------------------------------------------

@@ -2,6 +2,8 @@
 
 To add a command, write a module whose docstring is the command's help (the first line its summary), with
 ``add_arguments(parser)`` and ``run(arguments)``, which returns the exit code. Register the module in :data:`COMMANDS`.
+PyTorch takes seconds to import: modules of commands import what needs PyTorch inside ``run``, so that wrong arguments
+and missing files are told at once.
 """
 
 from __future__ import annotations
@@ -10,12 +12,9 @@ import argparse
 import sys
 from types import ModuleType
 
-from kornia.core.exceptions import BaseError
-
 from kornia_pnpnet import __version__
 from kornia_pnpnet.cli import demo, evaluate, export, figures, listing, solve
 from kornia_pnpnet.cli.arguments import OneLineParser
-from kornia_pnpnet.core.performance import keep_freed_memory
 
 __all__ = ["COMMANDS", "main", "make_parser"]
 
@@ -57,7 +56,15 @@ def main(argv: list[str] | None = None) -> int:
     Returns:
         The exit code: 0; 1 when ``solve`` found no pose; 2 for bad input; 130 when interrupted.
     """
-    arguments = make_parser().parse_args(argv)
+    try:
+        arguments = make_parser().parse_args(argv)
+    except OSError as error:
+        print(f"pnpnet: {_one_line(error)}", file=sys.stderr)
+        return 2
+    from kornia.core.exceptions import BaseError
+
+    from kornia_pnpnet.core.performance import keep_freed_memory
+
     keep_freed_memory()
     try:
         return COMMANDS[arguments.command].run(arguments)

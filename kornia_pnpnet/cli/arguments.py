@@ -7,16 +7,16 @@ import math
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
-from torch import nn
-
-from kornia_pnpnet.evaluation.named_solvers import BOUNDS, load_solver
+if TYPE_CHECKING:
+    from torch import nn
 
 __all__ = [
     "OneLineParser",
     "add_arbitrary_unit",
     "counts",
+    "existing_path",
     "load_solver_without_truth",
     "picture_path",
     "positive_float",
@@ -65,6 +65,12 @@ def positive_float(text: str) -> float:
     return value
 
 
+def existing_path(text: str) -> str:
+    """Parse the path of a file or a folder; ``OSError`` where there is none."""
+    Path(text).stat()
+    return text
+
+
 def picture_path(text: str) -> Path:
     """Parse the path of a picture, whose ending gives the format."""
     if Path(text).suffix.lower() not in _PICTURES:
@@ -83,6 +89,8 @@ def add_arbitrary_unit(parser: argparse.ArgumentParser) -> None:
 
 def load_solver_without_truth(name: str) -> nn.Module:
     """Make the solver named by ``--solver``; raise a ``ValueError`` for a bound, which needs the true pose."""
+    from kornia_pnpnet.evaluation.named_solvers import BOUNDS, load_solver
+
     if name.partition(":")[0] in BOUNDS:
         raise ValueError(f"--solver: {name} is a bound, which needs the true pose: use it with `pnpnet evaluate` only")
     return load_solver(name)

@@ -12,17 +12,14 @@ import csv
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
-from torch import nn
+from kornia_pnpnet.cli.arguments import add_arbitrary_unit, existing_path, positive_float, whole_number
 
-from kornia_pnpnet.cli.arguments import add_arbitrary_unit, positive_float, whole_number
-from kornia_pnpnet.cli.reprojection import reproject
-from kornia_pnpnet.evaluation.comparison import EvaluationData, evaluate
-from kornia_pnpnet.evaluation.named_solvers import default_solvers, load_solver
-from kornia_pnpnet.evaluation.problem_sets import evaluation_sets
-from kornia_pnpnet.evaluation.results import format_table, save_results
+if TYPE_CHECKING:
+    from torch import nn
+
+    from kornia_pnpnet.evaluation import EvaluationData
 
 _N = 9
 _SOLVERS = ("pnpnet-set", f"pnpnet-n{_N}", "opencv-ransac", "poselib")
@@ -31,7 +28,10 @@ _SOLVERS = ("pnpnet-set", f"pnpnet-n{_N}", "opencv-ransac", "poselib")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``pnpnet demo``."""
     parser.add_argument(
-        "--data", metavar="FOLDER", help="a COLMAP model or an .npz file of matches instead of random problems"
+        "--data",
+        metavar="FOLDER",
+        type=existing_path,
+        help="a COLMAP model or an .npz file of matches instead of random problems",
     )
     add_arbitrary_unit(parser)
     parser.add_argument("--out", metavar="FOLDER", default="outputs/demo", help="default: outputs/demo")
@@ -49,7 +49,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Compare the solvers, draw, train; end with the :func:`verdict`."""
+    import torch
+
+    from kornia_pnpnet.evaluation import evaluate, format_table, save_results
     from kornia_pnpnet.evaluation.figures import plot_errors, plot_success, plot_training
+    from kornia_pnpnet.evaluation.named_solvers import default_solvers, load_solver
+    from kornia_pnpnet.evaluation.problem_sets import evaluation_sets
 
     sources = [arguments.data or "synthetic"]
     names = [name for name in default_solvers(_N, sources) if name.partition(":")[0] in _SOLVERS]
@@ -107,6 +112,9 @@ def _described(row: Mapping[str, Any]) -> str:
 
 def _draw_one(path: Path, name: str, solver: nn.Module, entry: EvaluationData) -> Path:
     """Draw the first one of the problems with the most outliers, so that the picture is not a selected success."""
+    import torch
+
+    from kornia_pnpnet.cli.reprojection import reproject
     from kornia_pnpnet.evaluation.figures import plot_pose
 
     outliers = (~entry.problems.inliers).sum(-1)

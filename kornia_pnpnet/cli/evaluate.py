@@ -13,13 +13,10 @@ import argparse
 import sys
 from pathlib import Path
 
-import torch
+from kornia_pnpnet.cli.arguments import add_arbitrary_unit, counts, existing_path, whole_number
 
-from kornia_pnpnet.cli.arguments import add_arbitrary_unit, counts, whole_number
-from kornia_pnpnet.evaluation import comparison
-from kornia_pnpnet.evaluation.named_solvers import default_solvers, load_solver
-from kornia_pnpnet.evaluation.problem_sets import DEFAULT_SEED, PRIORS, evaluation_sets
-from kornia_pnpnet.evaluation.results import format_table, load_results
+#: Names of synthetic data for ``--data``.
+SYNTHETIC = ("synthetic", "gaussian_pose", "any_rotation", "slab", "mixed")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,7 +35,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DATA",
         nargs="+",
         action="extend",
-        help=f"{', '.join(PRIORS)}, a folder with a COLMAP model, or an .npz file of matches; default: synthetic",
+        type=lambda text: text if text in SYNTHETIC else existing_path(text),
+        help=f"{', '.join(SYNTHETIC)}, a folder with a COLMAP model, or an .npz file of matches; default: synthetic",
     )
     parser.add_argument(
         "--n",
@@ -65,8 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seed",
         type=whole_number(0, 2**63 - 1),
-        default=DEFAULT_SEED,
-        help=f"seed of the problems; default: {DEFAULT_SEED}",
+        help="seed of the problems; default: that of the published results",
     )
     parser.add_argument("--dtype", choices=("float32", "float64"), default="float32", help="default: float32")
     add_arbitrary_unit(parser)
@@ -77,6 +74,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Evaluate the solvers; print the table and the path of the results."""
+    import torch
+
+    from kornia_pnpnet.evaluation import comparison, format_table, load_results
+    from kornia_pnpnet.evaluation.named_solvers import default_solvers, load_solver
+    from kornia_pnpnet.evaluation.problem_sets import DEFAULT_SEED, evaluation_sets
+
     out = Path(arguments.out)
     found = len(load_results(out)["rows"]) if out.exists() and not arguments.overwrite else 0
     sources = arguments.data or ["synthetic"]
@@ -86,7 +89,7 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.outliers,
         n=arguments.n,
         count=arguments.problems,
-        seed=arguments.seed,
+        seed=DEFAULT_SEED if arguments.seed is None else arguments.seed,
         metric=not arguments.arbitrary_unit,
         mismatches_only=arguments.mismatches_only,
         dtype=getattr(torch, arguments.dtype),

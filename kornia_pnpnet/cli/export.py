@@ -12,8 +12,6 @@ import warnings
 from pathlib import Path
 
 from kornia_pnpnet.cli.arguments import load_solver_without_truth, whole_number
-from kornia_pnpnet.export import INPUTS, OUTPUTS, export_onnx
-from kornia_pnpnet.solver import PnPNet
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,6 +26,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Write the model; print its size, inputs and outputs."""
+    from kornia_pnpnet.export import INPUTS, OUTPUTS, export_onnx
+    from kornia_pnpnet.solver import PnPNet
+
     solver = load_solver_without_truth(arguments.solver)
     if not isinstance(solver, PnPNet):
         raise ValueError(f"--solver: {arguments.solver} belongs to another library and cannot be exported")

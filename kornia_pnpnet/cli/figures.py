@@ -9,19 +9,24 @@ from __future__ import annotations
 
 import argparse
 
-from kornia_pnpnet.evaluation.results import load_results
+from kornia_pnpnet.cli.arguments import existing_path
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``pnpnet figures``."""
     parser.add_argument(
-        "files", metavar="RESULTS.json", nargs="+", help="results of `pnpnet evaluate`, or operation counts"
+        "files",
+        metavar="RESULTS.json",
+        nargs="+",
+        type=existing_path,
+        help="results of `pnpnet evaluate`, or operation counts",
     )
     parser.add_argument("--out", metavar="FOLDER", default="outputs/figures", help="default: outputs/figures")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Draw the figures and print their paths."""
+    from kornia_pnpnet.evaluation import load_results
     from kornia_pnpnet.evaluation.figures import paper_figures
 
     pictures = paper_figures([load_results(path, complexity=True) for path in arguments.files], arguments.out)

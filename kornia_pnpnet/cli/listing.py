@@ -9,9 +9,6 @@ from __future__ import annotations
 
 import argparse
 
-from kornia_pnpnet import list_solvers, shipped_weights
-from kornia_pnpnet.evaluation.named_solvers import BOUNDS, missing_package
-
 #: What each solver is, by the beginning of its name; the longest beginning counts.
 _WHAT = {
     "pnpnet-set": "network over any number of pairs, then learned LM: the default",
@@ -36,6 +33,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(_: argparse.Namespace) -> int:
     """Print what each solver is, and the package that it needs where it is not installed."""
+    from kornia_pnpnet import list_solvers, shipped_weights
+    from kornia_pnpnet.evaluation.named_solvers import BOUNDS, missing_package
+
     states = {}
     for name in list_solvers():
         package = missing_package(name)

@@ -21,26 +21,28 @@ import json
 import math
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import torch
-from kornia.geometry.conversions import rotation_matrix_to_quaternion
-from torch import Tensor
+from kornia_pnpnet.cli.arguments import (
+    existing_path,
+    load_solver_without_truth,
+    picture_path,
+    positive_float,
+    whole_number,
+)
 
-from kornia_pnpnet import Status
-from kornia_pnpnet.cli.arguments import load_solver_without_truth, picture_path, positive_float, whole_number
-from kornia_pnpnet.cli.correspondence_files import InputError, camera_matrix, read_correspondences
-from kornia_pnpnet.cli.reprojection import reproject
-from kornia_pnpnet.cli.shards import solve_shards
+if TYPE_CHECKING:
+    from torch import Tensor
 
 _DEFAULT = "pnpnet-set"
 _ADVICE = {
-    Status.TOO_FEW_PAIRS: "a pose needs at least three correspondences that a camera can see",
-    Status.DEGENERATE: "the points lie on a line or coincide",
-    Status.NOT_FINITE: "the file has NaN, infinity or a negative weight",
-    Status.CAMERA: "the intrinsics are not those of a pinhole camera that this solver takes",
-    Status.NOT_BELIEVED: "too few correspondences agree with the pose; with many outliers try "
+    "too_few_pairs": "a pose needs at least three correspondences that a camera can see",
+    "degenerate": "the points lie on a line or coincide",
+    "not_finite": "the file has NaN, infinity or a negative weight",
+    "camera": "the intrinsics are not those of a pinhole camera that this solver takes",
+    "not_believed": "too few correspondences agree with the pose; with many outliers try "
     "--solver p3p-ransac:threshold=PX, and check units, intrinsics and the order of the columns",
-    Status.BEHIND: "the points are behind the camera; check the axes: x to the right, y down, z forward",
+    "behind": "the points are behind the camera; check the axes: x to the right, y down, z forward",
 }
 
 
@@ -50,6 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "file",
         metavar="FILE",
         nargs="+",
+        type=existing_path,
         help="CSV with the header X,Y,Z,u,v and optionally weight, or NPZ with world_points (N, 3), img_points (N, 2) "
         "and optionally weights (N,) and intrinsics (3, 3)",
     )
@@ -86,6 +89,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Solve one image or, with ``--batch``, shards."""
+    from kornia_pnpnet.cli.correspondence_files import camera_matrix
+
     camera = camera_matrix(arguments.intrinsics) if arguments.intrinsics else None
     if arguments.batch:
         return _solve_batch(arguments, camera)
@@ -95,6 +100,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _solve_batch(arguments: argparse.Namespace, camera: Tensor | None) -> int:
+    from kornia_pnpnet.cli.shards import solve_shards
+
     if arguments.plot or arguments.threshold:
         raise ValueError("--plot and --threshold are for one image, not for --batch")
     name, out = arguments.solver, arguments.out or "outputs/poses"
@@ -125,6 +132,13 @@ def _solve_batch(arguments: argparse.Namespace, camera: Tensor | None) -> int:
 
 
 def _solve_image(arguments: argparse.Namespace, camera: Tensor | None) -> int:
+    import torch
+    from kornia.geometry.conversions import rotation_matrix_to_quaternion
+
+    from kornia_pnpnet import Status
+    from kornia_pnpnet.cli.correspondence_files import InputError, read_correspondences
+    from kornia_pnpnet.cli.reprojection import reproject
+
     (path,) = arguments.file
     matches = read_correspondences(path)
     camera = matches.intrinsics if camera is None else camera
@@ -165,5 +179,5 @@ def _solve_image(arguments: argparse.Namespace, camera: Tensor | None) -> int:
             arguments.plot, matches.img_points, found.pixels, rejected, title=name if ok else f"{name}: NOT SOLVED"
         )
     if not ok:
-        print(f"pnpnet: not solved ({answer['status']}): {_ADVICE[status]}", file=sys.stderr)
+        print(f"pnpnet: not solved ({answer['status']}): {_ADVICE[answer['status']]}", file=sys.stderr)
     return 0 if ok else 1
