@@ -410,5 +410,7 @@ def _gate_pose(pose: Pose, ok: Tensor, finite: Tensor) -> Pose:
 
 
 def _in_full_precision(device: str) -> AbstractContextManager[Any]:
-    """Disable autocast on devices that have it; ``meta`` does not."""
-    return torch.autocast(device, enabled=False) if torch.amp.is_autocast_available(device) else nullcontext()
+    """Disable autocast on devices that have it; ``meta`` does not. In a graph for other programs it has no meaning."""
+    if torch.compiler.is_exporting() or not torch.amp.is_autocast_available(device):
+        return nullcontext()
+    return torch.autocast(device, enabled=False)

@@ -51,6 +51,7 @@ OWNERS = {
     "poselib": {"peers"},
     "pyarrow": {"cli.shards"},
     "pydantic": {"core.schema", "evaluation.forms"},
+    "onnx_ir": {"export"},
     "onnxscript": {"export"},
 }
 

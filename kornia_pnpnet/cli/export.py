@@ -38,7 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise ValueError(f"'{target}' is a folder")
     if target.exists() and not arguments.overwrite:
         raise ValueError(f"'{target}' exists: pass --overwrite to replace it")
-    print("Tracing and converting; PyTorch's exporter takes some minutes", flush=True)
+    print("Tracing and converting; PyTorch's exporter takes a minute or more", flush=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the exporter about itself
         path = export_onnx(solver, target, arguments.n)
