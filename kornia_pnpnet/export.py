@@ -126,9 +126,10 @@ def export_onnx(solver: PnPNet, path: str | Path, n: int | None = None) -> Path:
 
 
 def _simplify(model: Any) -> None:
-    """What ``torch.onnx.export(optimize=True)`` does but its rewrite rules, whose time grows with the square of the size.
+    """Simplify as ``torch.onnx.export(optimize=True)`` does, but without its rewrite rules.
 
-    For the thousands of nodes of a solver they take nine tenths of all time, and take a twentieth of the nodes away.
+    The time of the rules grows with the square of the size. For the thousands of nodes of a solver they take nine
+    tenths of all time, and take a twentieth of the nodes away.
     """
     from onnx_ir.passes import Sequential, common
     from onnxscript import optimizer
