@@ -120,7 +120,7 @@ def create_solver(name: str, **options: Any) -> nn.Module:
             ``epnp-lm`` take the arguments of :class:`~kornia_pnpnet.init.EPnP`, ``reppnp`` and ``reppnp-lm`` of
             :class:`~kornia_pnpnet.init.REPPnP`, ``p3p-ransac`` and ``ransac-epnp-lm`` of
             :class:`~kornia_pnpnet.init.RANSAC`, peers of their class in :mod:`kornia_pnpnet.peers`. All
-            but the peers take ``gradient``, see :class:`~kornia_pnpnet.solver.PnPNet`.
+            but the peers take ``gradient`` and ``effort``, see :class:`~kornia_pnpnet.solver.PnPNet`.
 
     Returns:
         The solver as a module in evaluation mode.
@@ -137,14 +137,14 @@ def create_solver(name: str, **options: Any) -> nn.Module:
     builders = _builders()
     if not isinstance(name, str) or name not in builders:
         raise ValueCheckError(f"No solver {name!r}. There are: {', '.join(sorted(builders))}.")
-    gradient = options.pop("gradient", None)
+    ours = {key: options.pop(key) for key in ("effort", "gradient") if key in options}
     try:
         solver = builders[name](**options).eval()
-        if gradient is None:
+        if not ours:
             return solver
         if not isinstance(solver, PnPNet):
-            raise TypeError("gradient is an option of solvers with gradients")
-        return PnPNet(solver.init, solver.refine, solver.normalize, views=solver.views, gradient=gradient).eval()
+            raise TypeError(f"{' and '.join(ours)}: for solvers of this package only")
+        return PnPNet(solver.init, solver.refine, solver.normalize, views=solver.views, **ours).eval()
     except TypeError as error:
         raise ValueCheckError(f"Solver {name!r} does not take these options: {error}.") from error
 

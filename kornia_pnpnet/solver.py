@@ -15,10 +15,11 @@ from torch import Tensor, nn
 
 from kornia_pnpnet.core.checks import check_whole
 from kornia_pnpnet.core.linalg import bound_gradient
-from kornia_pnpnet.core.performance import Compiled, compiling, split_batch
+from kornia_pnpnet.core.performance import Compiled, compiling, sees_values, split_batch
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import project
 from kornia_pnpnet.init import RANSAC, EPnP, MLPInit, REPPnP, SetInit
+from kornia_pnpnet.init.ransac import search_on
 from kornia_pnpnet.inputs import Inputs, checked_inputs, restore_leading
 from kornia_pnpnet.normalize import VIEWS, Frame, Normalize
 from kornia_pnpnet.pretrained import read_weights, write_weights
@@ -69,6 +70,11 @@ class PnPNet(nn.Module):
             :mod:`kornia_pnpnet.init`; ``None`` starts from the identity or from the pose given with the call.
         refine: the refiner; classical :class:`~kornia_pnpnet.refine.RobustWeightedLM` when ``None``.
         normalize: the normalisation; the default centres and scales the world and orders the pairs.
+        effort: ``"fixed"``, or ``"adaptive"``: problems for which the poses of the initialiser do not suffice get more
+            minimal samples, as many as they need (see :func:`~kornia_pnpnet.init.ransac.ransac.search_on`), without
+            holding up the others. Needs an initialiser that estimates the noise, :class:`~kornia_pnpnet.init.SetInit`.
+            The samples have no gradient. Exported graphs, ``torch.func.vmap`` and the device ``meta`` have the fixed
+            effort.
         gradient: which problems carry a gradient: those that are ``"ok"``, or ``"always"`` every valid problem, to
             train a network that does not predict anything sensible yet. The gradient of each problem to its normalised
             points, pixels and weights is then finite and at most 10 long.
@@ -78,7 +84,7 @@ class PnPNet(nn.Module):
             more. The number may differ from that of the training.
 
     Raises:
-        BaseError: when ``views`` is not an integer from 1 to 8, or ``gradient`` neither of its values.
+        BaseError: when ``views`` is not an integer from 1 to 8, or ``gradient`` or ``effort`` neither of its values.
 
     Example:
         >>> from kornia_pnpnet.data import SyntheticProblems
@@ -97,16 +103,20 @@ class PnPNet(nn.Module):
         *,
         views: int = 1,
         gradient: str = "ok",
+        effort: str = "fixed",
     ) -> None:
         super().__init__()
         check_whole(1, len(VIEWS), views=views)
         self.gradient = _checked_gradient(gradient)
+        KORNIA_CHECK(effort in ("fixed", "adaptive"), f"effort must be 'fixed' or 'adaptive', got {effort!r}.")
+        self.effort = effort
         self.views = int(views)
         self.init = init
         self.refine = RobustWeightedLM(learnable=False) if refine is None else refine
         self.normalize = Normalize() if normalize is None else normalize
         # What runs: these functions, or what `compile` made of them.
         self._solve: Callable[..., PnPResult] = self._in_parts
+        self._first: Callable[..., tuple[Correspondences, Frame, Guess]] = self._first_guess
         self._begin: Callable[..., _Begun] = self._guess
         self._finish: Callable[..., PnPResult] = self._result
 
@@ -217,9 +227,12 @@ class PnPNet(nn.Module):
         Args:
             mode: mode of ``torch.compile``; ``"reduce-overhead"`` captures CUDA graphs.
             whole: compile the solver as one graph, with its iterations one after the other. The first call takes
-                longer; calls of a few problems, which mostly wait for Python, take half the time.
+                longer; calls of a few problems, which mostly wait for Python, take half the time. The search of
+                ``effort="adaptive"`` is no graph: with it, parts are compiled.
         """
+        whole = whole and self.effort == "fixed"
         self._solve = Compiled(self._in_parts, mode) if whole else self._in_parts
+        self._first = self._first_guess if whole else Compiled(self._first_guess, mode)
         self._begin = self._guess if whole else Compiled(self._guess, mode)
         self._finish = self._result if whole else Compiled(self._result, mode)
         if not whole:
@@ -243,12 +256,23 @@ class PnPNet(nn.Module):
 
     def _parts(self, first_stage_only: bool, always: bool, inputs: Inputs) -> tuple[_Begun, PnPResult]:
         """Before the iterations, the iterations, and after them."""
-        begun = self._begin(1 if first_stage_only or self.refine.m == 0 else self.views, always, inputs)
+        views = 1 if first_stage_only or self.refine.m == 0 else self.views
+        if self.effort == "fixed" or first_stage_only or not sees_values(inputs.world_points):
+            begun = self._begin(views, always, inputs)
+        else:
+            corr, frame, guess = self._first(views, always, inputs)
+            guess = search_on(corr, guess)
+            begun = _Begun(self.refine.begin(corr, guess), frame, guess)
         end = self.refine.iterate(begun.start, 0 if first_stage_only else None)
         return begun, self._finish(begun, end, always)
 
     def _guess(self, views: int, always: bool, inputs: Inputs) -> _Begun:
         """Everything before the first iteration."""
+        corr, frame, guess = self._first_guess(views, always, inputs)
+        return _Begun(self.refine.begin(corr, guess), frame, guess)
+
+    def _first_guess(self, views: int, always: bool, inputs: Inputs) -> tuple[Correspondences, Frame, Guess]:
+        """Normalise and guess."""
         world_points, img_points, intrinsics, weights, mask, init, noise = inputs
         corr, frame = self.normalize(world_points, img_points, intrinsics, weights, mask, noise)
         if always:
@@ -274,7 +298,7 @@ class PnPNet(nn.Module):
             guess = guess._replace(others=others, ok=None)
         if corr.near is not None and not getattr(self.init, "weighs_far_pairs", False):
             guess = guess._replace(weights=guess.weights * torch.where(_is_seen(guess, corr), 1.0, corr.near))
-        return _Begun(self.refine.begin(corr, guess), frame, guess)
+        return corr, frame, guess
 
     def _given(self, init: Pose | None, world_points: Tensor, frame: Frame) -> Pose:
         """A pose given by the caller (or the identity) in the normalised frame."""

@@ -8,7 +8,7 @@ import math
 import pytest
 import torch
 
-from kornia_pnpnet.init.ransac.sampling import Samples, draw_subsets, samples_needed
+from kornia_pnpnet.init.ransac.sampling import Samples, draw_likely, draw_subsets, samples_needed
 
 
 def uniform_numbers(count, size):
@@ -40,6 +40,34 @@ def test_every_subset_is_equally_likely(count, size):
 def test_the_ends_of_the_unit_interval_stay_inside():
     ends = torch.tensor([[0.0] * 3, [1.0 - 2.0**-53] * 3], dtype=torch.float64)
     assert draw_subsets(ends, torch.tensor([2**30])).tolist() == [[[0, 1, 2], [2**30 - 3, 2**30 - 2, 2**30 - 1]]]
+
+
+def test_likely_items_are_drawn_more_often_and_none_twice():
+    """Items one after the other in proportion to their probabilities among those that are left."""
+    draws, chances = 40000, torch.tensor([0.5, 0.2, 0.0, 0.2, 0.1], dtype=torch.float64)
+    subsets = draw_likely(uniform_numbers(draws, 3), chances.cumsum(-1)[None])[0]
+    for order in itertools.permutations((0, 1, 3, 4), 3):
+        a, b, c = (chances[i].item() for i in order)
+        expected = a * b / (1 - a) * c / (1 - a - b)
+        seen = (subsets == torch.tensor(order)).all(-1).double().mean().item()
+        assert abs(seen - expected) < 4 * math.sqrt(expected / draws), order
+    assert (subsets != 2).all()
+    assert (subsets.sort(-1).values.diff(dim=-1) > 0).all()
+
+
+def test_equal_chances_are_no_chances(generator):
+    there = torch.rand(5, 40, generator=generator) < 0.7
+    inliers = there & (torch.rand(5, 40, generator=generator) < 0.5)
+    problems = torch.arange(5)
+    alike = Samples(there, size=3, most=200, seed=0, chances=torch.full((5, 40), 0.3))
+    plain = Samples(there, size=3, most=200, seed=0)
+    assert torch.allclose(alike.needed(problems, inliers, 0.999), plain.needed(problems, inliers, 0.999))
+    assert torch.equal(alike.spread(problems, 16), plain.spread(problems, 16))
+    positions = alike.positions(problems, 0, 200)
+    assert there[problems[:, None, None], positions].all()
+    # Inliers that are likely need fewer samples.
+    likely = Samples(there, size=3, most=200, seed=0, chances=0.1 + inliers.float())
+    assert (likely.needed(problems, inliers, 0.999) < 0.5 * plain.needed(problems, inliers, 0.999)).all()
 
 
 @pytest.mark.parametrize(("pairs", "size"), [(3, 3), (9, 7), (12, 4)])

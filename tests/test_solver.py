@@ -27,6 +27,8 @@ from kornia_pnpnet import (
     pose_errors,
     solve_pnp,
 )
+from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.data import OutlierMix, SlabPoints, SyntheticProblems
 from kornia_pnpnet.init import EPnP
 from kornia_pnpnet.metrics import success
 
@@ -295,6 +297,54 @@ def test_gradcheck_through_the_whole_layer(first, make_problems, perturb):
     if first == "given":
         assert solver(p.world_points, 1000 * pixels, camera(focal, centre), weights, init=init).ok.all()
     assert torch.autograd.gradcheck(run, inputs, eps=1e-6, atol=1e-4, rtol=1e-4)
+
+
+# --- effort -------------------------------------------------------------------------------------------------------
+
+
+def hard_problems(count=30):
+    mix = OutlierMix(count=180)
+    points = SlabPoints()
+    return SyntheticProblems(n=200, batch_size=count, seed=5, points=points, outliers=mix, world_sigma=0.01).batch(0)
+
+
+def test_adaptive_effort_finds_poses_among_nine_tenths_of_outliers():
+    problems = hard_problems()
+    rates = {}
+    for effort in ("fixed", "adaptive"):
+        solver = create_solver("pnpnet-set", effort=effort)
+        with torch.no_grad():
+            result = solver(*problems[:3])
+        errors = pose_errors(result.pose, problems.pose)
+        rates[effort] = success(errors, max_translation=0.5).double().mean().item()
+        again = create_solver("pnpnet-set", effort=effort)(*problems[:3])  # deterministic, with gradients, too
+        assert torch.allclose(again.translation, result.translation, rtol=1e-4, atol=1e-4)
+    assert rates["adaptive"] > max(0.95, rates["fixed"] + 0.15), rates
+
+
+def test_adaptive_effort_depends_on_no_other_problem():
+    hard = hard_problems(6)
+    easy = SyntheticProblems(n=200, batch_size=6, seed=6).batch(0)
+    solver = create_solver("pnpnet-set", effort="adaptive").double()
+    both = map_tensors(lambda *x: torch.cat(x).double(), hard[:3], easy[:3])
+    with torch.no_grad():
+        together = solver(*both)
+        for i in (0, 3, 8):
+            alone = solver(*(x[i : i + 1] for x in both))
+            assert torch.allclose(alone.translation, together.translation[i : i + 1], rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore:There is a performance drop")  # of vmap, without a rule for addcmul
+def test_adaptive_effort_in_graphs_and_without_noise():
+    problems = SyntheticProblems(n=20, batch_size=3, seed=1).batch(0)
+    fixed, adaptive = (create_solver("pnpnet-set", effort=effort) for effort in ("fixed", "adaptive"))
+    expected = fixed(*problems[:3]).translation
+    mapped = torch.func.vmap(lambda *x: adaptive(*x).translation)(*problems[:3])
+    assert torch.allclose(mapped, expected, rtol=1e-4, atol=1e-4)
+    with pytest.raises(BaseError, match="effort"):
+        create_solver("epnp-lm", effort="adaptive")(*problems[:3])
+    with pytest.raises(BaseError, match="effort"):
+        create_solver("pnpnet-set", effort="much")
 
 
 # --- compile, export, autocast, copies --------------------------------------------------------------------------------

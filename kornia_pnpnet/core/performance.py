@@ -27,6 +27,7 @@ __all__ = [
     "problems_last",
     "ranked",
     "repeat_problems",
+    "sees_values",
     "split_batch",
     "take_pairs",
     "unfold_vmap",
@@ -46,6 +47,16 @@ def compiling() -> bool:
 def exporting() -> bool:
     """Whether ``torch.export`` traces: ONNX has no stable sort, no ``copysign`` and none of our custom operations."""
     return torch.compiler.is_exporting()
+
+
+def sees_values(x: Tensor) -> bool:
+    """Whether what happens next may depend on values: not in graphs, in ``torch.func.vmap`` and on the device meta."""
+    functorch = torch._C._functorch
+    while functorch.is_functorch_wrapped_tensor(x):
+        if functorch.is_batchedtensor(x):
+            return False
+        x = functorch.get_unwrapped(x)
+    return not (compiling() or x.device.type == "meta")
 
 
 # -- memory layouts ----------------------------------------------------------------------------------------------------

@@ -6,6 +6,6 @@ solver of three pairs, on ``law_of_cosines``; ``sampling`` the sampling rule; ``
 
 from kornia_pnpnet.init.ransac.minimal import MinimalSolver, SubsetSolver
 from kornia_pnpnet.init.ransac.p3p import P3P, p3p
-from kornia_pnpnet.init.ransac.ransac import RANSAC
+from kornia_pnpnet.init.ransac.ransac import RANSAC, search_on
 
-__all__ = ["P3P", "RANSAC", "MinimalSolver", "SubsetSolver", "p3p"]
+__all__ = ["P3P", "RANSAC", "MinimalSolver", "SubsetSolver", "p3p", "search_on"]

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 from kornia.core.check import KORNIA_CHECK
-from kornia.core.exceptions import ShapeError
+from kornia.core.exceptions import ShapeError, ValueCheckError
 from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_numbers, check_positive, check_whole
@@ -17,6 +17,7 @@ from kornia_pnpnet.core.performance import problems_last
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import project
 from kornia_pnpnet.init.ransac.minimal import MinimalSolver, describe
+from kornia_pnpnet.init.ransac.p3p import P3P
 from kornia_pnpnet.init.ransac.scoring import SCORERS, Scorer
 from kornia_pnpnet.init.ransac.search import (
     PAIRS_PER_SAMPLE,
@@ -37,10 +38,14 @@ from kornia_pnpnet.refine.verdict import (
 )
 from kornia_pnpnet.types import MIN_PAIRS, Correspondences, Guess, Pose
 
-__all__ = ["RANSAC"]
+__all__ = ["FURTHER", "RANSAC", "search_on"]
 
 # Number of least-squares steps from the best pose, which is near the minimum already.
 _FINAL_STEPS = 2
+# Standard deviations. :func:`search_on` counts nearer pairs as inliers.
+_INLIER = 3.0
+# :func:`search_on` draws a pair of weight 0 this often, relative to a pair of weight 1.
+_ANY = 0.5
 
 
 class RANSAC(Configured):
@@ -172,7 +177,7 @@ class RANSAC(Configured):
             thresholds = self._thresholds(corr)
             if given is not None:
                 given = given._replace(translation=given.translation + (given.rotation @ centre[..., None])[..., 0])
-                given = map_tensors(torch.Tensor.detach, given)
+                given = map_tensors(lambda x: x.detach()[:, None], given)
             found = Search(self.plan, corr.map(torch.Tensor.detach), thresholds).run(given)
         pose, judged = self._refine(corr, found.pose, thresholds)
         with torch.no_grad():
@@ -215,6 +220,54 @@ class RANSAC(Configured):
         tests = found.poses * (counts - MIN_PAIRS).clamp(min=1)
         rare = log_false_alarms(tests, inliers, counts, chance) < math.log(MAX_FALSE_ALARMS)
         return found.loss.isfinite() & (rare | ((inliers == MIN_PAIRS) & (counts == MIN_PAIRS)))
+
+
+#: How :func:`search_on` searches unless told otherwise.
+FURTHER = Plan(
+    minimal=P3P(),
+    scorer=SCORERS["msac"],
+    max_samples=5000,
+    min_samples=32,
+    confidence=0.999,
+    local_candidates=3,
+    local_iterations=2,
+    seed=0,
+    chunk_size=4096,
+)
+
+
+@torch.no_grad()
+def search_on(corr: Correspondences, guess: Guess, plan: Plan = FURTHER) -> Guess:
+    r"""Go on searching where the poses of a guess do not suffice, with samples of likely inliers.
+
+    Samples are drawn from the pairs in proportion to a half plus half the weight of the guess, so that weights which
+    mislead cost at most some samples. An inlier is within three standard deviations of the guess' noise (its mean over
+    the pairs). The best pose of the guess, improved on its inliers, stands for ``plan.min_samples`` samples: a problem
+    for which so many suffice at ``plan.confidence`` is not searched. Problems that are done leave the batch, and no
+    problem's result depends on the others.
+
+    Args:
+        corr: normalised correspondences of a centred and scaled world.
+        guess: poses, probabilities of being an inlier as weights, and the noise of the pairs.
+        plan: how to search.
+
+    Returns:
+        The guess with the best pose, a constant, in place of the last of its poses.
+
+    Raises:
+        ValueCheckError: when the initialiser does not estimate the noise.
+    """
+    if guess.noise is None or guess.others is None:
+        raise ValueCheckError('effort="adaptive" needs an initialiser with several poses and the noise, as SetInit.')
+    corr = corr._replace(noise=None).map(lambda x: x.detach().contiguous())
+    there = corr.weights > 0
+    share = there / there.sum(-1, keepdim=True).clamp(min=1)
+    thresholds = Thresholds(*(_INLIER * (torch.where(there, x.detach(), 0.0) * share).sum(-1) for x in guess.noise))
+    chances = _ANY + (1.0 - _ANY) * guess.weights.detach()
+    given = map_tensors(lambda *x: torch.stack(x, 1).detach(), *guess.poses)
+    found = Search(plan, corr, thresholds, chances).run(given, worth=plan.min_samples)
+    others = map_tensors(lambda x, y: torch.cat((x[:, :-1], y[:, None]), 1), guess.others, found.pose)
+    return guess._replace(others=others)
 
 
 class _Constant(torch.autograd.Function):

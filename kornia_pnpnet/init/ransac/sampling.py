@@ -11,7 +11,7 @@ import math
 import torch
 from torch import Tensor
 
-__all__ = ["Samples", "draw_subsets", "samples_needed"]
+__all__ = ["Samples", "draw_likely", "draw_subsets", "samples_needed"]
 
 
 def draw_subsets(numbers: Tensor, counts: Tensor) -> Tensor:
@@ -41,17 +41,55 @@ def draw_subsets(numbers: Tensor, counts: Tensor) -> Tensor:
     return torch.stack(chosen, -1)
 
 
+def draw_likely(numbers: Tensor, upper: Tensor) -> Tensor:
+    r"""Turn uniform numbers into subsets of unequally likely items, item by item without replacement.
+
+    Args:
+        numbers: uniform in [0, 1), float64, shape :math:`(H, s)`.
+        upper: cumulative probabilities of the items of each problem, float64, shape :math:`(P, N)`.
+
+    Returns:
+        :math:`H` subsets for each problem, int64, shape :math:`(P, H, s)`. Items of probability 0 are drawn only where
+        there are less than :math:`s` others.
+
+    Example:
+        >>> draw_likely(
+        ...     torch.tensor([[0.0, 0.5, 0.9]]).double(), torch.tensor([[0.1, 0.9, 0.9, 1.0]]).double()
+        ... ).tolist()
+        [[[0, 1, 3]]]
+    """
+    lower = torch.cat((torch.zeros_like(upper[:, :1]), upper[:, :-1]), 1)
+    chosen: list[tuple[Tensor, Tensor]] = []  # where the interval of an item begins, and its length, ascending
+    items = []
+    for j in range(numbers.shape[1]):
+        left = 1.0 - sum(length for _, length in chosen) if chosen else torch.ones_like(upper[:, :1])
+        at = numbers[:, j] * left  # (P, H), among the intervals that are left
+        for begin, length in chosen:
+            at = at + torch.where(at >= begin, length, 0.0)
+        item = torch.searchsorted(upper, at.contiguous(), right=True).clamp(max=upper.shape[1] - 1)
+        items.append(item)
+        begin, length = lower.gather(1, item), (upper - lower).gather(1, item)
+        for i, (other, size) in enumerate(chosen):
+            swap = other > begin
+            chosen[i] = torch.where(swap, begin, other), torch.where(swap, length, size)
+            begin, length = torch.where(swap, other, begin), torch.where(swap, size, length)
+        chosen.append((begin, length))
+    return torch.stack(items, -1)
+
+
 class Samples:
     r"""The samples that RANSAC tries, for every problem of a batch.
 
     When the :math:`N` pairs have at most ``most`` subsets, each subset is a sample once, in an order that ``seed``
-    fixes. Otherwise ``most`` samples are drawn from the pairs that have a weight.
+    fixes. Otherwise ``most`` samples are drawn from the pairs that have a weight, all equally likely or with
+    probabilities in proportion to ``chances``.
 
     Args:
         there: which pairs have a weight, bool, shape :math:`(B, N)`.
         size: number of pairs in a sample.
         most: largest number of samples.
         seed: seed of the random numbers, which are the same for every problem.
+        chances: at least 0, shape :math:`(B, N)`.
 
     Example:
         >>> samples = Samples(torch.ones(1, 4, dtype=torch.bool), size=3, most=10, seed=0)
@@ -59,7 +97,7 @@ class Samples:
         (4, [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]])
     """
 
-    def __init__(self, there: Tensor, *, size: int, most: int, seed: int) -> None:
+    def __init__(self, there: Tensor, *, size: int, most: int, seed: int, chances: Tensor | None = None) -> None:
         pairs = there.shape[1]
         generator = torch.Generator().manual_seed(seed)  # on the CPU: the same numbers on every device
         self.size = size
@@ -75,6 +113,11 @@ class Samples:
         else:
             self._table = torch.rand(most, size, generator=generator, dtype=torch.float64).to(there.device)
         self.total = len(self._table)
+        self.share: Tensor | None = None
+        if chances is not None and not self.enumerated:
+            share = torch.where(there, chances, 0.0).double()
+            self.share = share / share.sum(-1, keepdim=True).clamp(min=torch.finfo(share.dtype).tiny)
+            self._upper = self.share.gather(1, self._present_first).cumsum(-1)
 
     def positions(self, problems: Tensor, start: int, stop: int) -> Tensor:
         r"""Samples ``start`` to ``stop - 1`` of some problems.
@@ -90,14 +133,40 @@ class Samples:
         table = self._table[start:stop]
         if self.enumerated:
             return table.expand(len(problems), -1, -1)
+        if self.share is not None:
+            return self._present(problems, draw_likely(table, self._upper[problems]))
         return self._present(problems, draw_subsets(table, self.counts[problems]))
+
+    def needed(self, problems: Tensor, inliers: Tensor, confidence: float) -> Tensor:
+        r"""Number of samples of which at least one has no outlier, see :func:`samples_needed`.
+
+        Args:
+            problems: indices of the problems, int64, shape :math:`(P,)`.
+            inliers: inliers of the best pose so far, bool, shape :math:`(P, N)`.
+            confidence: in (0, 1).
+
+        Returns:
+            float64 of shape :math:`(P,)`.
+        """
+        if self.share is None:
+            return samples_needed(inliers.sum(-1), self.counts[problems], self.size, confidence)
+        # As if all pairs were equally likely, as many as the inliers' mean share says (weighted by the share).
+        share = torch.where(inliers, self.share[problems], 0.0)
+        mass = share.sum(-1)
+        count = mass / share.square().sum(-1).clamp(min=torch.finfo(share.dtype).tiny)
+        return samples_needed(mass * count, count, self.size, confidence)
 
     def spread(self, problems: Tensor, count: int) -> Tensor:
         r"""Positions of ``count`` pairs spread evenly over the pairs that have a weight, shape :math:`(P, count)`.
 
-        Pairs that :class:`~kornia_pnpnet.normalize.Normalize` has ordered are then spread over the image.
+        Pairs that :class:`~kornia_pnpnet.normalize.Normalize` has ordered are then spread over the image. Where pairs
+        are unequally likely, likely ones come more often.
         """
         middle = 2 * torch.arange(count, device=problems.device) + 1
+        if self.share is not None:
+            at = (middle / (2 * count)).to(self._upper).expand(len(problems), -1).contiguous()
+            ranks = torch.searchsorted(self._upper[problems], at, right=True)
+            return self._present(problems, ranks.clamp(max=self._upper.shape[1] - 1))
         return self._present(problems, middle * self.counts[problems, None] // (2 * count))
 
     def _present(self, problems: Tensor, ranks: Tensor) -> Tensor:
@@ -114,7 +183,7 @@ def samples_needed(inliers: Tensor, counts: Tensor, size: int, confidence: float
     Source: M. Fischler and R. Bolles, "Random sample consensus", Communications of the ACM 24(6), 1981, section II.B.
 
     Args:
-        inliers: number of inliers :math:`k` of the best pose so far, shape :math:`(B,)`.
+        inliers: number of inliers :math:`k` of the best pose so far, shape :math:`(B,)`, whole or not.
         counts: number of pairs :math:`c`, shape :math:`(B,)`.
         size: number of pairs :math:`s` in a sample.
         confidence: :math:`p`, in (0, 1).

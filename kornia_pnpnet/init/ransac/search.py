@@ -11,7 +11,7 @@ from kornia_pnpnet.core.performance import problems_last
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import Projection, project
 from kornia_pnpnet.init.ransac.minimal import MinimalSolver
-from kornia_pnpnet.init.ransac.sampling import Samples, samples_needed
+from kornia_pnpnet.init.ransac.sampling import Samples
 from kornia_pnpnet.init.ransac.scoring import Scene, Scorer
 from kornia_pnpnet.refine import lm_step
 from kornia_pnpnet.refine.verdict import Thresholds, judge
@@ -76,6 +76,7 @@ class Search:
         plan: how to search.
         corr: normalised correspondences whose world is centred, since the search runs in float32.
         thresholds: thresholds of an inlier, shape :math:`(B,)` each.
+        chances: how likely a pair is an inlier, up to a factor, shape :math:`(B, N)`; all the same when ``None``.
 
     Example:
         >>> from kornia_pnpnet.init.ransac.p3p import P3P
@@ -90,28 +91,34 @@ class Search:
         (5.0, tensor([20]))
     """
 
-    def __init__(self, plan: Plan, corr: Correspondences, thresholds: Thresholds) -> None:
+    def __init__(
+        self, plan: Plan, corr: Correspondences, thresholds: Thresholds, chances: Tensor | None = None
+    ) -> None:
         self.plan = plan
         self.corr = corr
         self.low = map_tensors(lambda x: x.to(_DTYPE), (corr, thresholds))
         self.scene = Scene.make(corr, thresholds, _DTYPE)
         size = plan.minimal.sample_size
-        self.samples = Samples(corr.weights > 0, size=size, most=plan.max_samples, seed=plan.seed)
+        self.samples = Samples(corr.weights > 0, size=size, most=plan.max_samples, seed=plan.seed, chances=chances)
         # The numbers of a pair side by side, so that a sample is gathered pair by pair.
         self.pairs = torch.cat((corr.world_points, corr.img_points, corr.weights[..., None]), -1).flatten(0, 1)
 
-    def run(self, given: Pose | None = None) -> Found:
+    def run(self, given: Pose | None = None, worth: int = 0) -> Found:
         """Search until every problem has a sample without an outlier at the confidence, or all its samples.
 
         Args:
-            given: poses that compete with those of the samples, in the frame of the correspondences.
+            given: :math:`S` poses of each problem that compete with those of the samples, :math:`(B, S, 3, 3)` and
+                :math:`(B, S, 3)`, in the frame of the correspondences.
+            worth: number of samples that the given poses stand for. A problem for which so many suffice is not
+                searched.
         """
         plan, samples = self.plan, self.samples
         batch, count = self.corr.weights.shape
         device = self.corr.weights.device
         matrix = torch.eye(3, 4, dtype=_DTYPE, device=device).repeat(batch, 1, 1)
         loss = matrix.new_full((batch,), torch.inf)
-        inliers, poses, drawn = torch.zeros(3, batch, dtype=torch.long, device=device)
+        poses, drawn = torch.zeros(2, batch, dtype=torch.long, device=device)
+        needed = loss.double()
         active = (samples.counts >= samples.size).nonzero()[:, 0]
 
         def improve(at: Tensor, losses: Tensor, matrices: Tensor) -> None:
@@ -120,14 +127,16 @@ class Search:
                 loss[one], matrix[one] = self._improve(one, some, part)
                 corr, thresholds = take(self.low, one)
                 judged = judge(project(_pose(matrix[one]), corr), corr, thresholds)
-                inliers[one] = (judged.weights > 0).sum(-1)
+                needed[one] = samples.needed(one, judged.weights > 0, plan.confidence)
 
         if given is not None and len(active):
             rotation, translation = (x.to(_DTYPE) for x in given)
-            packed = self.scene.pack(rotation[:, None, None], translation[:, None, None])
-            matrices = torch.cat((rotation, translation[..., None]), -1)[:, None]
+            packed = self.scene.pack(rotation[:, :, None], translation[:, :, None])
+            matrices = torch.cat((rotation, translation[..., None]), -1)
             improve(active, self.scene.losses(packed, plan.scorer)[active], matrices[active])
-            poses[active] += 1
+            poses[active] += rotation.shape[1]
+            if worth:
+                active = active[needed[active] > worth]
         stop = 0
         while stop < samples.total and len(active):
             start, stop = stop, min(samples.total, stop + self._round(stop))
@@ -138,8 +147,7 @@ class Search:
             drawn[active] = stop
             better = (top_losses[:, 0] < loss[active]).nonzero()[:, 0]
             improve(active[better], top_losses[better], top_matrices[better])
-            needed = samples_needed(inliers[active], samples.counts[active], samples.size, plan.confidence)
-            active = active[needed.clamp(min=plan.min_samples) > stop]
+            active = active[needed[active].clamp(min=plan.min_samples) > stop]
         return Found(_orthonormal(_pose(matrix.to(self.corr.weights))), loss, poses, drawn)
 
     def _round(self, done: int) -> int:
