@@ -29,6 +29,7 @@ class Inputs(NamedTuple):
     mask: Tensor | None
     init: Pose | None
     noise: Noise | None
+    confidence: Tensor | None
 
 
 def checked_inputs(
@@ -40,6 +41,7 @@ def checked_inputs(
     init: Pose | None = None,
     img_sigma: Tensor | float | None = None,
     world_sigma: Tensor | float | None = None,
+    confidence: Tensor | None = None,
 ) -> tuple[torch.Size, Inputs]:
     """Check the arguments of a call, and make them one batch of one dtype, see :func:`common_dtype`.
 
@@ -62,6 +64,7 @@ def checked_inputs(
         "weights": weights,
         "init rotation": rotation,
         "init translation": translation,
+        "confidence": confidence,
     }
     required = ("world_points", "img_points", "intrinsics")
     for name, value in (*tensors.items(), ("mask", mask)):
@@ -82,6 +85,7 @@ def checked_inputs(
         "img_points": (img_points, (*size, count, 2)),
         "weights": (weights, (*size, count)),
         "mask": (mask, (*size, count)),
+        "confidence": (confidence, (*size, count)),
         "intrinsics": (matrices, (3, 3) if matrices.ndim == 2 else (*size, 3, 3)),
         "init rotation": (rotation, (*size, 3, 3)),
         "init translation": (translation, (*size, 3)),
@@ -99,7 +103,8 @@ def checked_inputs(
         like = world_points.to(dtype)
         noise = Noise(*(expand_sigma(name, sigma, like) for name, sigma in sigmas.items()))
     cameras = matrices.expand(*size, 3, 3)
-    given = Inputs(world_points, img_points, cameras, weights, mask, None if init is None else Pose(*init), noise)
+    pose = None if init is None else Pose(*init)
+    given = Inputs(world_points, img_points, cameras, weights, mask, pose, noise, confidence)
     return size, map_tensors(lambda x: one_batch(x, size, dtype), given)
 
 

@@ -119,6 +119,7 @@ class Normalize(Configured):
         weights: Tensor | None = None,
         mask: Tensor | None = None,
         noise: Noise | None = None,
+        confidence: Tensor | None = None,
     ) -> tuple[Correspondences, Frame]:
         r"""Normalise a batch.
 
@@ -129,6 +130,7 @@ class Normalize(Configured):
             weights: at least 0, shape :math:`(B, N)`; 1 when ``None``.
             mask: False where a pair is padding, bool, shape :math:`(B, N)`.
             noise: standard deviations in pixels and in the unit of the world; NaN where unknown.
+            confidence: the caller's belief that a pair is an inlier, in [0, 1], shape :math:`(B, N)`.
 
         Returns:
             The normalised correspondences, with the problems last in memory, and the :class:`Frame` that undoes it.
@@ -160,6 +162,12 @@ class Normalize(Configured):
         if noise is not None:
             has_noise = _is_usable(noise)
             is_finite = is_finite & has_noise
+        if confidence is not None:
+            there_is = there.mT
+            confidence = torch.where(there_is, confidence, 0.0)
+            is_probability = (confidence >= 0) & (confidence <= 1)
+            is_finite = is_finite & is_probability.all(-1)
+            confidence = torch.where(is_probability, confidence, 0.0)
         there = there & (is_camera & is_finite) & (size < limit)
         rows = torch.where(there, rows, zero)  # finite, so that products with 0 are 0 from here on
         focal = rows.new_full((), self.f_const)  # made on the device, so that a GPU need not wait for the CPU
@@ -213,8 +221,10 @@ class Normalize(Configured):
             # Scaling an infinite sigma would give gradients of NaN: an invalid problem has no known noise.
             noise = map_tensors(lambda sigma: torch.where(has_noise[:, None], sigma, torch.nan), noise)
             noise = self._apply_to_noise(noise, frame)
+        if confidence is not None and order is not None:
+            confidence = confidence.gather(1, order)
         corr = Correspondences(
-            world_points, img_points, weights[..., 0], focal, frame.img_scale, scale, noise, is_near.mT
+            world_points, img_points, weights[..., 0], focal, frame.img_scale, scale, noise, is_near.mT, confidence
         )
         return corr, frame
 
@@ -240,7 +250,8 @@ class Normalize(Configured):
         Returns:
             The correspondences of all problems in the first view, then in the second view, and so on.
         """
-        others = [values.mT for values in iter_tensors((corr.weights, corr.noise, corr.near))]  # (N, B) each
+        of_pairs = corr.weights, corr.noise, corr.near, corr.confidence
+        others = [values.mT for values in iter_tensors(of_pairs)]  # (N, B) each
         x, y, z, u, v = (*corr.world_points.permute(2, 1, 0), *corr.img_points.permute(2, 1, 0))
         seen = [torch.stack((*_exchanged(x, y, *view), z, *_exchanged(u, v, *view), *others)) for view in VIEWS[:count]]
         if self.order:
@@ -251,8 +262,10 @@ class Normalize(Configured):
         rows = torch.cat(seen, -1)
         world_points, img_points = rows[:5].permute(2, 1, 0).split((3, 2), -1)
         rest = iter(rows[5:].mT)
-        weights, noise, near = map_tensors(lambda _: next(rest), (corr.weights, corr.noise, corr.near))
-        return Correspondences(world_points, img_points, weights, corr.focal, noise=noise, near=near)
+        weights, noise, near, confidence = map_tensors(lambda _: next(rest), of_pairs)
+        return Correspondences(
+            world_points, img_points, weights, corr.focal, noise=noise, near=near, confidence=confidence
+        )
 
     def undo_views(self, pose: Pose, count: int) -> list[Pose]:
         """Express poses of :meth:`views` for the problems themselves.

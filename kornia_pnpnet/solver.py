@@ -131,6 +131,7 @@ class PnPNet(nn.Module):
         *,
         img_sigma: Tensor | float | None = None,
         world_sigma: Tensor | float | None = None,
+        confidence: Tensor | None = None,
         first_stage_only: bool = False,
         gradient: str | None = None,
     ) -> PnPResult:
@@ -152,6 +153,9 @@ class PnPNet(nn.Module):
                 the refinement's kernel count in standard deviations.
             world_sigma: standard deviation of the noise on each world coordinate, in the unit of ``world_points``;
                 shapes and NaN as for ``img_sigma``.
+            confidence: your own belief that a pair is an inlier, in [0, 1], for example a matcher's score, shape
+                :math:`(B, N)`. Minimal samples are drawn from likely pairs more often, and a network that was trained
+                with confidences sees them. What they are worth need not be the same in every problem.
             first_stage_only: return the first guess unrefined, the paper's "Net", at the cost of ``m=0``.
             gradient: ``"ok"`` or ``"always"``; the solver's own when ``None``.
 
@@ -167,7 +171,7 @@ class PnPNet(nn.Module):
             TypeCheckError: for arguments that are no tensors, or hold booleans or complex numbers.
             DeviceError: for tensors on different devices, or on another device than a network of the solver.
         """
-        given = world_points, img_points, intrinsics, weights, mask, init, img_sigma, world_sigma
+        given = world_points, img_points, intrinsics, weights, mask, init, img_sigma, world_sigma, confidence
         size, inputs = checked_inputs(*given)
         with _in_full_precision(inputs.world_points.device.type):
             always = _checked_gradient(gradient or self.gradient) == "always"
@@ -187,6 +191,7 @@ class PnPNet(nn.Module):
         *,
         img_sigma: Tensor | float | None = None,
         world_sigma: Tensor | float | None = None,
+        confidence: Tensor | None = None,
         first_stage_only: bool = False,
         gradient: str | None = None,
     ) -> tuple[PnPResult, Guess]:
@@ -201,6 +206,7 @@ class PnPNet(nn.Module):
             init: See forward.
             img_sigma: See forward.
             world_sigma: See forward.
+            confidence: See forward.
             first_stage_only: See forward.
             gradient: See forward.
 
@@ -208,7 +214,7 @@ class PnPNet(nn.Module):
             The result, and the guess in the frame, the order and the units of the inputs; its ``ok`` says whether the
             problem is valid.
         """
-        given = world_points, img_points, intrinsics, weights, mask, init, img_sigma, world_sigma
+        given = world_points, img_points, intrinsics, weights, mask, init, img_sigma, world_sigma, confidence
         size, inputs = checked_inputs(*given)
         with _in_full_precision(inputs.world_points.device.type):
             always = _checked_gradient(gradient or self.gradient) == "always"
@@ -273,8 +279,8 @@ class PnPNet(nn.Module):
 
     def _first_guess(self, views: int, always: bool, inputs: Inputs) -> tuple[Correspondences, Frame, Guess]:
         """Normalise and guess."""
-        world_points, img_points, intrinsics, weights, mask, init, noise = inputs
-        corr, frame = self.normalize(world_points, img_points, intrinsics, weights, mask, noise)
+        world_points, img_points, intrinsics, weights, mask, init, noise, confidence = inputs
+        corr, frame = self.normalize(world_points, img_points, intrinsics, weights, mask, noise, confidence)
         if always:
             world, img, pair_weights = (bound_gradient(x, _LONGEST_GRADIENT) for x in corr[:3])
             corr = corr._replace(world_points=world, img_points=img, weights=pair_weights)

@@ -40,7 +40,8 @@ class Status(IntEnum):
     TOO_FEW_PAIRS = 1
     #: The points lie on a line or coincide, or the pairs do not determine a pose.
     DEGENERATE = 2
-    #: A coordinate, weight or sigma is NaN or infinite, or a weight or sigma is negative.
+    #: A coordinate, weight or sigma is NaN or infinite, or a weight or sigma is negative, or a confidence is outside of
+    #: [0, 1].
     NOT_FINITE = 3
     #: The intrinsics are not a multiple of ``[[fx, s, cx], [0, fy, cy], [0, 0, 1]]`` with positive ``fx`` and ``fy``.
     CAMERA = 4
@@ -171,6 +172,7 @@ class Correspondences(NamedTuple):
         near: 0 for points that are many times as far from the others as these are from each other, and for pixels at
             extreme angles; 1 for all other pairs, shape :math:`(B, N)`; ``None``: 1. An initialiser that is not robust
             leaves out the pairs with 0 (:attr:`near_weights`): they are bad data or the horizon.
+        confidence: the caller's belief that a pair is an inlier, in [0, 1], shape :math:`(B, N)`; ``None``: unknown.
     """
 
     world_points: Tensor
@@ -181,6 +183,7 @@ class Correspondences(NamedTuple):
     world_scale: Tensor | None = None
     noise: Noise | None = None
     near: Tensor | None = None
+    confidence: Tensor | None = None
 
     @property
     def near_weights(self) -> Tensor:

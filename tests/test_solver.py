@@ -22,6 +22,8 @@ from kornia_pnpnet import (
     PnPResult,
     Pose,
     RobustWeightedLM,
+    SetInit,
+    Status,
     create_solver,
     list_solvers,
     pose_errors,
@@ -345,6 +347,63 @@ def test_adaptive_effort_in_graphs_and_without_noise():
         create_solver("epnp-lm", effort="adaptive")(*problems[:3])
     with pytest.raises(BaseError, match="effort"):
         create_solver("pnpnet-set", effort="much")
+
+
+# --- confidence ---------------------------------------------------------------------------------------------------
+
+
+def believed(problems, generator):
+    """A confidence that tells little of a single pair: an inlier's is larger than an outlier's in 84 of 100 cases."""
+    noise = torch.randn(problems.inliers.shape, generator=generator)
+    return torch.sigmoid(1.4 * problems.inliers + noise)
+
+
+def test_confidence_guides_the_samples(generator):
+    problems = hard_problems(100)
+    confidence = believed(problems, generator)
+    solver = create_solver("p3p-ransac", max_samples=300, threshold=8.0)
+    rates = []
+    with torch.no_grad():
+        for given in (None, confidence):
+            errors = pose_errors(solver(*problems[:3], confidence=given).pose, problems.pose)
+            rates.append(success(errors, max_translation=0.5).double().mean().item())
+    assert rates[1] > rates[0] + 0.1, rates
+
+
+def test_a_bad_confidence_costs_its_own_problem_alone():
+    problems = SyntheticProblems(n=12, batch_size=5, seed=2, world_sigma=0.0, dtype=torch.float64).batch(0)
+    confidence = torch.rand(problems.inliers.shape, dtype=torch.float64)
+    solver = create_solver("p3p-ransac")
+    sound = solver(*problems[:3], confidence=confidence)
+    assert sound.ok.all()
+    for bad in (math.nan, -0.1, 1.1, math.inf):
+        spoilt = confidence.clone()
+        spoilt[2, 4] = bad
+        result = solver(*problems[:3], confidence=spoilt)
+        assert result.status[2] == Status.NOT_FINITE
+        others = torch.arange(len(result.ok)) != 2
+        assert torch.equal(result.translation[others], sound.translation[others])
+        mask = torch.ones_like(problems.inliers)
+        mask[2, 4] = False  # the numbers of padding do not matter
+        assert solver(*problems[:3], mask=mask, confidence=spoilt).ok[2]
+    with pytest.raises(ShapeError, match="confidence"):
+        solver(*problems[:3], confidence=confidence[:, :3])
+
+
+def test_a_network_may_see_the_confidence(make_problems, generator):
+    problems = make_problems(12)
+    confidence = believed(problems, generator).requires_grad_()
+    blind, seeing = (PnPNet(SetInit(confidence=sees), normalize=Normalize(order=False)) for sees in (False, True))
+    result, guess = seeing.with_guess(*problems[:3], confidence=confidence)
+    (gradient,) = torch.autograd.grad(guess.weights.sum(), confidence)
+    assert gradient.isfinite().all()
+    assert gradient.any()
+    order = torch.randperm(12, generator=generator)
+    shuffled = seeing(problems[0][:, order], problems[1][:, order], problems[2], confidence=confidence[:, order])
+    assert torch.allclose(shuffled.translation, result.translation, rtol=1e-6, atol=1e-6)
+    assert not torch.equal(seeing.with_guess(*problems[:3])[1].weights, guess.weights)
+    same = [blind.with_guess(*problems[:3], confidence=c)[1].weights for c in (None, confidence)]
+    assert torch.equal(*same)
 
 
 # --- compile, export, autocast, copies --------------------------------------------------------------------------------

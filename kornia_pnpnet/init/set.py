@@ -28,6 +28,9 @@ _LOG_NOISE = -5.0
 _LEAST_NOISE = 1e-6
 # Numbers per pair: 3 of the world, 2 of the image, 2 of the residual, 3 of the problem, 2 of the noise, 2 flags.
 _FEATURES = 14
+# With confidences: their logit and a flag more. Confidences are clipped to this distance from 0 and from 1.
+_CONFIDENCE_FEATURES = 2
+_LEAST_CONFIDENCE = 1e-3
 # Added to the score of padding.
 _ABSENT = -1e9
 # Minimal samples, as ranks of pairs by likelihood. The first six are a Turán system: whichever two of the six likeliest
@@ -53,7 +56,7 @@ class _View:
     regression).
     """
 
-    def __init__(self, corr: Correspondences) -> None:
+    def __init__(self, corr: Correspondences, confidence: bool = False) -> None:
         world = corr.world_points.contiguous()
         there = (corr.near_weights > 0).to(world.dtype)
         share = (there / there.sum(1, keepdim=True).clamp(min=1.0))[..., None]  # (B, N, 1)
@@ -82,6 +85,11 @@ class _View:
         self.known = self._known(corr)
         noise = [torch.where(known, log - _LOG_NOISE, 0.0) for log, known in self.known]
         flags = [known.to(world.dtype) for _, known in self.known]
+        if confidence:
+            logit = torch.zeros_like(corr.weights)
+            if corr.confidence is not None:
+                logit = corr.confidence.clamp(_LEAST_CONFIDENCE, 1.0 - _LEAST_CONFIDENCE).logit()
+            flags += [logit, torch.full_like(logit, corr.confidence is not None)]
         parts = self.points, seen, residual, problem, *(x[..., None] for x in (*noise, *flags))
         self.features = torch.cat(parts, -1).clamp(-_MOST, _MOST)
 
@@ -196,6 +204,7 @@ class SetInit(Configured):
         hidden: number of channels inside a layer.
         starts: number of hypotheses of the network, at least 1.
         samples: number of minimal samples of the six likeliest pairs, 0 to 8; more pairs have more samples.
+        confidence: whether the network sees the ``confidence`` of the correspondences.
 
     Raises:
         BaseError: for numbers out of range, or when ``heads`` does not divide ``width``.
@@ -221,6 +230,7 @@ class SetInit(Configured):
         hidden: int = 64,
         starts: int = 2,
         samples: int = 6,
+        confidence: bool = False,
     ) -> None:
         super().__init__(locals())
         check_whole(1, width=width, layers=layers, heads=heads, hidden=hidden, starts=starts)
@@ -228,7 +238,8 @@ class SetInit(Configured):
         self.samples = samples
         KORNIA_CHECK(width % heads == 0, f"heads must divide width, got {heads} and {width}.")
         self.starts = starts
-        self.first = nn.Linear(_FEATURES, width)
+        self.confidence = confidence
+        self.first = nn.Linear(_FEATURES + (_CONFIDENCE_FEATURES if confidence else 0), width)
         self.blocks = nn.ModuleList(_Block(width, heads, hidden) for _ in range(layers))
         self.norm = nn.LayerNorm(width)
         # Per pair: the logit of being an inlier; per hypothesis a weight and a distance along the ray.
@@ -256,7 +267,7 @@ class SetInit(Configured):
             DeviceError: when the correspondences and the network are on different devices.
         """
         check_devices({"world_points": corr.world_points}, self.pair.bias, "the network")
-        view = _View(corr)
+        view = _View(corr, self.confidence)
         dtype = corr.world_points.dtype
         pair, problem = (x.to(dtype) for x in self._run(view.features, view.there))
         starts = self.starts

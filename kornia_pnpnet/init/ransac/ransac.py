@@ -44,8 +44,9 @@ __all__ = ["FURTHER", "RANSAC", "search_on"]
 _FINAL_STEPS = 2
 # Standard deviations. :func:`search_on` counts nearer pairs as inliers.
 _INLIER = 3.0
-# :func:`search_on` draws a pair of weight 0 this often, relative to a pair of weight 1.
-_ANY = 0.5
+# A pair whose weight or confidence is 0 is drawn this often, relative to a pair where it is 1. Networks mislead more
+# often than callers: where repeated structure or crowds agree, for example.
+_DOUBT, _LEAST_TRUST = 0.5, 0.05
 
 
 class RANSAC(Configured):
@@ -65,6 +66,9 @@ class RANSAC(Configured):
     The guess is ``ok`` when fewer than 0.01 poses with as many inliers are expected by chance, from pairs without any
     pose behind them (see :func:`~kornia_pnpnet.refine.verdict.log_false_alarms`). A problem of only three pairs is
     ``ok`` when it has a pose: three pairs hold no evidence.
+
+    Where the caller gave a confidence for each pair, samples hold pairs in proportion to it, and fewer samples suffice
+    when the inliers are those with much confidence.
 
     Gradients: the inliers, and their weights by depth, are selected without a gradient. The last refinement, unrolled
     least squares on the inliers from a constant start near the minimum, has a gradient to points, pixels and weights.
@@ -178,7 +182,8 @@ class RANSAC(Configured):
             if given is not None:
                 given = given._replace(translation=given.translation + (given.rotation @ centre[..., None])[..., 0])
                 given = map_tensors(lambda x: x.detach()[:, None], given)
-            found = Search(self.plan, corr.map(torch.Tensor.detach), thresholds).run(given)
+            detached = corr.map(torch.Tensor.detach)
+            found = Search(self.plan, detached, thresholds, _trusted(detached.confidence)).run(given)
         pose, judged = self._refine(corr, found.pose, thresholds)
         with torch.no_grad():
             ok = self._is_evident(found, corr, thresholds, judged)
@@ -236,15 +241,20 @@ FURTHER = Plan(
 )
 
 
+def _trusted(confidence: Tensor | None) -> Tensor | None:
+    """How often pairs are drawn, by the caller's confidence, (B, N)."""
+    return None if confidence is None else _LEAST_TRUST + (1.0 - _LEAST_TRUST) * confidence
+
+
 @torch.no_grad()
 def search_on(corr: Correspondences, guess: Guess, plan: Plan = FURTHER) -> Guess:
     r"""Go on searching where the poses of a guess do not suffice, with samples of likely inliers.
 
-    Samples are drawn from the pairs in proportion to a half plus half the weight of the guess, so that weights which
-    mislead cost at most some samples. An inlier is within three standard deviations of the guess' noise (its mean over
-    the pairs). The best pose of the guess, improved on its inliers, stands for ``plan.min_samples`` samples: a problem
-    for which so many suffice at ``plan.confidence`` is not searched. Problems that are done leave the batch, and no
-    problem's result depends on the others.
+    Samples hold pairs in proportion to a half plus half the weight of the guess, times the caller's confidence: weights
+    that mislead then cost some samples, but no pose. An inlier is within three standard deviations of the guess' noise
+    (its mean over the pairs). The best pose of the guess, improved on its inliers, stands for
+    ``plan.min_samples`` samples: a problem for which so many suffice at ``plan.confidence`` is not searched. Problems
+    that are done leave the batch, and no problem's result depends on the others.
 
     Args:
         corr: normalised correspondences of a centred and scaled world.
@@ -263,7 +273,9 @@ def search_on(corr: Correspondences, guess: Guess, plan: Plan = FURTHER) -> Gues
     there = corr.weights > 0
     share = there / there.sum(-1, keepdim=True).clamp(min=1)
     thresholds = Thresholds(*(_INLIER * (torch.where(there, x.detach(), 0.0) * share).sum(-1) for x in guess.noise))
-    chances = _ANY + (1.0 - _ANY) * guess.weights.detach()
+    chances = _DOUBT + (1.0 - _DOUBT) * guess.weights.detach()
+    trusted = _trusted(corr.confidence)
+    chances = chances if trusted is None else chances * trusted
     given = map_tensors(lambda *x: torch.stack(x, 1).detach(), *guess.poses)
     found = Search(plan, corr, thresholds, chances).run(given, worth=plan.min_samples)
     others = map_tensors(lambda x, y: torch.cat((x[:, :-1], y[:, None]), 1), guess.others, found.pose)
