@@ -298,9 +298,9 @@ class Problems(NamedTuple):
         pose: the true world-to-camera pose.
         inliers: whether the pixel of a pair shows its point, bool, shape :math:`(B, N)`.
         img_sigma: standard deviation of the noise on each pixel coordinate, as a solver may know it: NaN where it is
-            unknown, ``None`` where it is unknown for all problems, shape :math:`(B,)`.
-        world_sigma: standard deviation of the noise on each world coordinate, NaN and ``None`` as for ``img_sigma``,
-            shape :math:`(B,)`.
+            unknown, ``None`` where it is unknown for all problems, shape :math:`(B,)` or :math:`(B, N)`.
+        world_sigma: standard deviation of the noise on each world coordinate, NaN, ``None`` and shape as for
+            ``img_sigma``.
     """
 
     world_points: Tensor

@@ -33,7 +33,7 @@ def run(*arguments, check=True):
 
 @pytest.mark.parametrize("data", DATA)
 def test_every_data_config_trains(data, fit_config):
-    model = ["model=set"] if data == "wide" else []  # batches of different sizes
+    model = ["model=set"] if data in ("matches", "wide") else []  # batches of different sizes
     config = composed(f"data={data}", "debug=two_updates", *model)
     assert fit_config(config).update == 2
 

@@ -9,17 +9,28 @@ processes. A new data source is one more class with ``batch_size`` and ``batch(i
 from kornia_pnpnet.data.colmap import load_colmap, load_matches, load_scene
 from kornia_pnpnet.data.mixtures import MixedProblems, VaryingSize
 from kornia_pnpnet.data.outliers import OutlierDraw, OutlierMix
-from kornia_pnpnet.data.points import BoxPoints, ObjectPoints, PointPrior, SlabPoints
+from kornia_pnpnet.data.points import (
+    BoxPoints,
+    DrivePoints,
+    FacadePoints,
+    ObjectPoints,
+    PointPrior,
+    RoomPoints,
+    SlabPoints,
+)
 from kornia_pnpnet.data.scenes import Scene, SceneProblems, View
 from kornia_pnpnet.data.synthetic import SyntheticProblems
 
 __all__ = [
     "BoxPoints",
+    "DrivePoints",
+    "FacadePoints",
     "MixedProblems",
     "ObjectPoints",
     "OutlierDraw",
     "OutlierMix",
     "PointPrior",
+    "RoomPoints",
     "Scene",
     "SceneProblems",
     "SlabPoints",

@@ -84,19 +84,26 @@ class MixedProblems:
         count = len(self.sources)  # no two sources see the same random numbers
         parts = [source.batch(count * index + i) for i, source in enumerate(self.sources)]
         for name in ("img_sigma", "world_sigma"):
-            if any(getattr(part, name) is not None for part in parts):
-                parts = [_with_unknown(part, name) for part in parts]
+            parts = _with_sigmas_alike(parts, name)
         problems = map_tensors(lambda *x: torch.cat(x), *parts)
         order = self._order.to(problems.inliers.device)
         return problems.map(lambda x: x[order])
 
 
-def _with_unknown(problems: Problems, name: str) -> Problems:
-    """Problems whose standard deviation of that name is a tensor, NaN if it was unknown for all problems."""
-    if getattr(problems, name) is not None:
-        return problems
-    unknown = problems.world_points.new_full((problems.world_points.shape[0],), torch.nan)
-    return problems._replace(**{name: unknown})  # type: ignore[arg-type]
+def _with_sigmas_alike(parts: list[Problems], name: str) -> list[Problems]:
+    """Problems whose standard deviations of that name have one shape, with NaN for those that were ``None``."""
+    dimensions = {sigma.ndim for part in parts if (sigma := getattr(part, name)) is not None}
+    if not dimensions:
+        return parts
+    alike = []
+    for part in parts:
+        sigma = getattr(part, name)
+        if sigma is None:
+            sigma = part.world_points.new_full(part.world_points.shape[:1], torch.nan)
+        if sigma.ndim < max(dimensions):
+            sigma = sigma[:, None].expand(part.inliers.shape)
+        alike.append(part._replace(**{name: sigma}))
+    return alike
 
 
 class VaryingSize:

@@ -1,10 +1,11 @@
-"""The noise model of synthetic problems: Gaussian noise, its standard deviations, and which of them a solver knows.
+"""The noise model of synthetic problems: noise, its standard deviations, and which of them a solver knows.
 
 To change the noise model, change :func:`draw_noise`: all noise of pixels and world points is drawn there.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,41 +15,84 @@ from torch import Tensor
 from kornia_pnpnet.core.checks import check_numbers, check_ranges
 from kornia_pnpnet.data.draws import log_uniform, normal, uniform
 
-__all__ = ["checked_sigma", "draw_noise", "hide_sigmas"]
+__all__ = ["LEAST_DEGREES", "MOST_NOISE", "MOST_SPREAD", "checked_sigma", "draw_noise", "hide_sigmas"]
+
+#: Bounds of the degrees of freedom and of the spread: noise stays a finite float32.
+LEAST_DEGREES, MOST_SPREAD = 1.0, 3.0
+#: Standard deviations. A choice: a pair whose pixel has more noise is called an outlier.
+MOST_NOISE = 10.0
+
+# Squared standard deviations. Keeps the quotient of the tails from 0 / 0; float64 resolves the quotient here.
+_LEAST_SQ_LENGTH = 1e-12
 
 
-def checked_sigma(name: str, value: Any) -> float | tuple[float, float]:
-    """Check one standard deviation, or the smallest and the largest of a range.
+def checked_sigma(name: str, value: Any, low: float = 0.0, high: float = math.inf) -> float | tuple[float, float]:
+    """Check one standard deviation or other number of the noise, or the smallest and the largest of a range.
+
+    Args:
+        name: name of the argument in error messages.
+        value: the number or range.
+        low: smallest sound number; 0, which turns an option off, is sound as well.
+        high: largest sound number.
 
     Raises:
-        BaseError: for a number that is negative or not finite, or a range that is not of two positive, rising numbers.
+        BaseError: for a number that is negative, not finite or out of bounds, or a range that is not of two positive,
+            rising numbers.
     """
     if hasattr(value, "__len__"):
         check_ranges(**{name: value})
+        check_numbers(low, high, **{name: value[0]})
+        check_numbers(low, high, **{name: value[1]})
         return float(value[0]), float(value[1])
-    check_numbers(0.0, **{name: value})
+    check_numbers(0.0 if value == 0 else low, high, **{name: value})
     return float(value)
 
 
 def draw_noise(
-    shape: Sequence[int], sigma: float | Sequence[float], generator: torch.Generator
+    shape: Sequence[int],
+    sigma: float | tuple[float, float],
+    generator: torch.Generator,
+    *,
+    spread: float | tuple[float, float] = 0.0,
+    degrees: float | tuple[float, float] = 0.0,
 ) -> tuple[Tensor, Tensor]:
-    """Draw Gaussian noise.
+    r"""Draw Gaussian noise, or noise with heavy tails.
+
+    The length :math:`r` of normal noise on a pair, in standard deviations, becomes
+    :math:`\sqrt{\nu(\exp(r^2/\nu) - 1)}`: noise of two coordinates then has the bivariate Student distribution with
+    :math:`\nu` degrees of freedom. Short noise stays what it was, so that the standard deviation remains that of the
+    bulk; the tails are as :math:`r^{-\nu}`.
 
     Args:
         shape: :math:`(B, N, ...)`.
         sigma: standard deviation, or the ends of a range from which each problem draws one, log-uniform.
         generator: source of randomness.
+        spread: standard deviation of the logarithm of each pair's standard deviation about that of its problem, or a
+            range as for ``sigma``; 0: all pairs of a problem have the same.
+        degrees: degrees of freedom :math:`\nu` of the tails, or a range as for ``sigma``; 0: Gaussian noise.
 
     Returns:
-        The noise, and the standard deviation of each problem, :math:`(B,)`.
+        The noise, and the standard deviation of each problem, :math:`(B,)`, or with a spread of each pair,
+        :math:`(B, N)`.
     """
     noise = normal(shape, generator)
-    if isinstance(sigma, float):
-        return noise.mul_(sigma), noise.new_full((shape[0],), sigma)
-    low, high = sigma
-    sigmas = log_uniform((shape[0], *(1,) * (len(shape) - 1)), low, high, generator)
-    return noise.mul_(sigmas), sigmas.flatten()
+    each = (shape[0], *(1,) * (len(shape) - 1))
+    sigmas = _of_problems(each, sigma, generator)
+    if spread:
+        factor = normal((*shape[:2], *each[2:]), generator).mul_(_of_problems(each, spread, generator)).exp_()
+        sigmas = sigmas * factor
+    if degrees:
+        freedom = _of_problems(each, degrees, generator)
+        sq_length = noise.square().sum(-1, keepdim=True).clamp(min=_LEAST_SQ_LENGTH)
+        noise *= (freedom * (sq_length / freedom).expm1() / sq_length).sqrt()
+    return noise.mul_(sigmas), sigmas.flatten(0 if not spread else 1)
+
+
+def _of_problems(shape: Sequence[int], value: float | tuple[float, float], generator: torch.Generator) -> Tensor:
+    """A number for each problem: a given one, or one drawn log-uniform from a range."""
+    if isinstance(value, float):
+        return torch.full(tuple(shape), value, dtype=torch.float64, device=generator.device)
+    return log_uniform(shape, *value, generator)
 
 
 def hide_sigmas(
@@ -57,8 +101,8 @@ def hide_sigmas(
     """Replace standard deviations that a solver does not know by NaN.
 
     Args:
-        img_sigma: standard deviation of the pixels of each problem, :math:`(B,)`.
-        world_sigma: standard deviation of the points of each problem, :math:`(B,)`.
+        img_sigma: standard deviation of the pixels of each problem, :math:`(B,)`, or of each pair, :math:`(B, N)`.
+        world_sigma: standard deviation of the points, in the same shape.
         known: share of problems whose standard deviations are both known. In a third of the others one is known.
         generator: source of randomness.
 
@@ -70,4 +114,6 @@ def hide_sigmas(
     one = unknown & (chance[0] < known + (1.0 - known) / 3.0)
     is_img = chance[1] < 0.5
     hide_img, hide_world = unknown & ~(one & is_img), unknown & ~(one & ~is_img)
+    if img_sigma.ndim > 1:
+        hide_img, hide_world = hide_img[:, None], hide_world[:, None]
     return torch.where(hide_img, torch.nan, img_sigma), torch.where(hide_world, torch.nan, world_sigma)

@@ -142,7 +142,7 @@ class SceneProblems:
         device: device of the batches; numbers are drawn on the CPU and moved.
 
     Raises:
-        BaseError: for an argument out of range, or ``outliers`` with *near* or *structured* outliers.
+        BaseError: for an argument out of range, or ``outliers`` with *near* or *structured* outliers or crowds.
         ValueError: if no image has enough points.
 
     Example:
@@ -187,9 +187,10 @@ class SceneProblems:
         self.seed = seed
         self.outliers = OutlierMix(count=0) if outliers is None else outliers
         KORNIA_CHECK(
-            self.outliers.near_share == self.outliers.structured_share == 0,
-            "SceneProblems has no near or structured outliers: near_share and structured_share must be 0, got "
-            f"{self.outliers.near_share} and {self.outliers.structured_share}.",
+            self.outliers.near_share == self.outliers.structured_share == self.outliers.crowd_share == 0,
+            "SceneProblems has no near or structured outliers and no crowds: near_share, structured_share and "
+            f"crowd_share must be 0, got {self.outliers.near_share}, {self.outliers.structured_share} and "
+            f"{self.outliers.crowd_share}.",
         )
         self.num_spares = num_spares
         self.recentre = recentre
