@@ -58,7 +58,11 @@ def test_protocol_is_the_papers():
     config = composed("experiment=protocol")
     settings = instantiate(config.train, _convert_="all")
     assert (settings.updates, settings.lr, settings.lr_factor(100_000)) == (200_000, 1e-4, 1.0)
-    assert (config.batch_size, config.model.n, config.model.m) == (1000, 9, 10)
+    assert (config.batch_size, config.model.n, config.model.m, config.model.views) == (1000, 9, 5, 1)
+    solver = instantiate(config.model.solver)
+    normalize = solver.normalize.config
+    assert (normalize["order"], normalize["center"], normalize["scale"]) == (True, False, False)
+    assert (solver.refine.config["kernel"], solver.refine.config["shared"]) == ("power", False)
     assert instantiate(config.data.train).outliers.max_count(9) == 3
 
 
