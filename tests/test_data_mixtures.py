@@ -55,6 +55,15 @@ def test_in_a_mixture_unknown_noise_is_nan():
         assert problems.img_sigma.isnan().sum() == problems.world_sigma.isnan().sum() == 5
 
 
+def test_in_a_mixture_sigmas_of_pairs_go_with_those_of_problems():
+    sources = [partial(SyntheticProblems, sigma_spread=x, known_noise=1.0) for x in (0.0, 0.5)]
+    p = MixedProblems([*sources, SyntheticProblems], batch_size=30, n=4).batch(0)
+    assert p.img_sigma.shape == p.world_sigma.shape == (30, 4)
+    constant = (p.img_sigma == 1.0).all(1)
+    assert (constant.sum(), p.img_sigma.isnan().all(1).sum()) == (10, 10)
+    assert torch.equal(constant, (p.world_sigma == p.world_sigma[constant][0, 0]).all(1))
+
+
 def test_varying_sizes_are_reproducible_and_come_from_the_list():
     mixture = partial(MixedProblems, [SyntheticProblems], known_noise=0.5)
     one, two = (VaryingSize(mixture, n=[5, 9, 20], batch_size=40, seed=3) for _ in range(2))

@@ -20,6 +20,8 @@ __all__ = ["SyntheticProblems"]
 
 # A camera sees a point when the cosine between its direction and the optical axis is larger. A choice: 87 degrees.
 _LEAST_COSINE = 0.05
+# Mean distances between points in the image. A choice: bunches are sharp to hardly visible.
+_MOST_BLUR = 2.0
 
 
 class SyntheticProblems:
@@ -210,7 +212,7 @@ def _bunched(scene: Tensor, displaced: Tensor, share: float, generator: torch.Ge
     batch_size, twice = scene.shape[:2]
     direction = torch.nn.functional.normalize(scene, dim=-1)
     distance = (direction - direction[:, :1]).square().sum(-1).sqrt()
-    blur = uniform((batch_size, 1), 0.0, 1.0, generator) * uniform((batch_size, twice), 0.0, 1.0, generator)
+    blur = uniform((batch_size, 1), 0.0, _MOST_BLUR, generator) * uniform((batch_size, twice), 0.0, 1.0, generator)
     score = distance / distance.mean(1, keepdim=True).clamp(min=torch.finfo(distance.dtype).tiny) + blur
     chosen = uniform((batch_size, 1), 0.0, 1.0, generator) < share
     score = torch.where(chosen, score, uniform((batch_size, twice), 0.0, 1.0, generator))
