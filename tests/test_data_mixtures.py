@@ -4,10 +4,10 @@ from functools import partial
 
 import pytest
 import torch
-from data_helpers import reprojection, same
+from data_helpers import assert_counts, reprojection, same
 from kornia.core.exceptions import BaseError
 
-from kornia_pnpnet.data import BoxPoints, MixedProblems, OutlierMix, SyntheticProblems, VaryingSize
+from kornia_pnpnet.data import BoxPoints, MixedPoints, MixedProblems, OutlierMix, SyntheticProblems, VaryingSize
 from kornia_pnpnet.geometry import transform
 
 
@@ -53,6 +53,17 @@ def test_in_a_mixture_unknown_noise_is_nan():
     for order in (sources, sources[::-1]):
         problems = MixedProblems(order, batch_size=10, n=4).batch(0)
         assert problems.img_sigma.isnan().sum() == problems.world_sigma.isnan().sum() == 5
+
+
+def test_mixed_points_have_their_shares_in_small_batches_too(generator):
+    planes = [BoxPoints(z_near=z, depth=0.0) for z in (1.0, 2.0, 3.0)]
+    points = MixedPoints(planes, shares=(6.0, 3.0, 1.0))
+    depth = torch.cat([points(3, 4, generator)[..., 2] for _ in range(2000)])
+    assert torch.equal(depth, depth[:, :1].expand_as(depth)), "a problem's points come from one prior"
+    assert_counts(depth[:, 0].round().long().bincount()[1:], (0.6, 0.3, 0.1))
+    assert_counts(depth[::3, 0].round().long().bincount()[1:], (0.6, 0.3, 0.1))
+    with pytest.raises(BaseError, match="2 priors"):
+        MixedPoints(planes[:2], shares=(1.0,))
 
 
 def test_in_a_mixture_sigmas_of_pairs_go_with_those_of_problems():

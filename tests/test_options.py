@@ -18,6 +18,7 @@ from kornia_pnpnet.data import (
     BoxPoints,
     DrivePoints,
     FacadePoints,
+    MixedPoints,
     MixedProblems,
     ObjectPoints,
     OutlierMix,
@@ -146,6 +147,10 @@ SOURCES = {
     "DrivePoints": (partial(with_points, DrivePoints), chosen(numbers="turn nearer", ranges=f"{VIEW} height side end")),
     "OutlierMix": (partial(with_mix, synthetic), MIX),
     "OutlierMix of a scene": (partial(with_mix, from_scene), MIX),
+    "MixedPoints": (
+        lambda count=2, shares=None: synthetic(points=MixedPoints([BoxPoints()] * count, shares=shares)),
+        chosen(shares=st.lists(ANY, max_size=3), count=st.integers(0, 3)),
+    ),
     "VaryingSize": (
         mixture,
         chosen(
