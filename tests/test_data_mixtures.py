@@ -4,10 +4,10 @@ from functools import partial
 
 import pytest
 import torch
-from data_helpers import reprojection, same
+from data_helpers import assert_counts, reprojection, same
 from kornia.core.exceptions import BaseError
 
-from kornia_pnpnet.data import BoxPoints, MixedProblems, OutlierMix, SyntheticProblems, VaryingSize
+from kornia_pnpnet.data import BoxPoints, MixedPoints, MixedProblems, OutlierMix, SyntheticProblems, VaryingSize
 from kornia_pnpnet.geometry import transform
 
 
@@ -53,6 +53,26 @@ def test_in_a_mixture_unknown_noise_is_nan():
     for order in (sources, sources[::-1]):
         problems = MixedProblems(order, batch_size=10, n=4).batch(0)
         assert problems.img_sigma.isnan().sum() == problems.world_sigma.isnan().sum() == 5
+
+
+def test_mixed_points_have_their_shares_in_small_batches_too(generator):
+    planes = [BoxPoints(z_near=z, depth=0.0) for z in (1.0, 2.0, 3.0)]
+    points = MixedPoints(planes, shares=(6.0, 3.0, 1.0))
+    depth = torch.cat([points(3, 4, generator)[..., 2] for _ in range(2000)])
+    assert torch.equal(depth, depth[:, :1].expand_as(depth)), "a problem's points come from one prior"
+    assert_counts(depth[:, 0].round().long().bincount()[1:], (0.6, 0.3, 0.1))
+    assert_counts(depth[::3, 0].round().long().bincount()[1:], (0.6, 0.3, 0.1))
+    with pytest.raises(BaseError, match="2 priors"):
+        MixedPoints(planes[:2], shares=(1.0,))
+
+
+def test_in_a_mixture_sigmas_of_pairs_go_with_those_of_problems():
+    sources = [partial(SyntheticProblems, sigma_spread=x, known_noise=1.0) for x in (0.0, 0.5)]
+    p = MixedProblems([*sources, SyntheticProblems], batch_size=30, n=4).batch(0)
+    assert p.img_sigma.shape == p.world_sigma.shape == (30, 4)
+    constant = (p.img_sigma == 1.0).all(1)
+    assert (constant.sum(), p.img_sigma.isnan().all(1).sum()) == (10, 10)
+    assert torch.equal(constant, (p.world_sigma == p.world_sigma[constant][0, 0]).all(1))
 
 
 def test_varying_sizes_are_reproducible_and_come_from_the_list():

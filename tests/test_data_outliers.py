@@ -9,6 +9,7 @@ from kornia.core.exceptions import BaseError
 
 from kornia_pnpnet import create_solver
 from kornia_pnpnet.data import BoxPoints, OutlierMix, SlabPoints
+from kornia_pnpnet.data.outliers import structured_points
 
 
 def counts(mix, n=9):
@@ -117,6 +118,77 @@ def test_structured_outliers_agree_on_another_pose():
     world, img = (x[six][wrong[six]].unflatten(0, (-1, 6)) for x in (p.world_points, p.img_points))
     result = create_solver("epnp-lm")(world, img, p.intrinsics[six])
     assert (result.ok & (result.cost < 1e-3)).sum() > 20
+
+
+def test_near_outliers_have_distances_in_pixels_beyond_the_noise():
+    mix = OutlierMix(count=3, near_share=1.0, near_pixels=(3.0, 30.0))
+    off = reprojection(p := draw(9, outliers=mix, world_sigma=0.0, img_sigma=1e-6)).norm(dim=-1)[~p.inliers]
+    assert_uniform(off.log(), math.log(3.0) - 1e-5, math.log(30.0) + 1e-5)
+    off = reprojection(p := draw(9, 2000, outliers=mix, world_sigma=0.0, img_sigma=5.0)).norm(dim=-1)[~p.inliers]
+    assert off.min() > 25 - 4 * 5  # 5 and 10 standard deviations, with noise
+    assert off.max() < 50 + 5 * 5
+
+
+def test_the_least_share_of_outliers():
+    found = counts(OutlierMix(min_ratio=0.8, max_ratio=0.95, min_inliers=4), 100)
+    assert found[:80].sum() == 0
+    assert len(found) == 96
+    assert_counts(torch.stack((found[80:88].sum(), found[88:].sum())))
+    assert [OutlierMix(min_ratio=0.5, max_ratio=0.9, min_inliers=4).least_count(n) for n in (4, 6, 9)] == [0, 2, 5]
+
+
+def test_crowds_have_their_share(generator):
+    kinds = OutlierMix(count=30, crowd_share=0.3).draw(COUNT, 40, generator)
+    found = kinds.crowd.sum(-1)
+    # A uniform share of 30 outliers gives each number from 0 to 30 with the same probability.
+    assert_counts(torch.stack(((found == 0).sum(), (found > 0).sum())), (0.7 + 0.3 / 31, 0.3 * 30 / 31))
+    assert_counts(found.bincount()[1:].unflatten(0, (10, 3)).sum(-1)[:9])
+    assert not (kinds.crowd & (kinds.mismatch | kinds.sensing)).any()
+    assert (kinds.inliers.sum(-1) == 10).all()
+
+
+def test_crowds_share_few_pixels():
+    p = draw(40, 2000, outliers=OutlierMix(count=30, crowd_share=1.0, max_crowds=3), world_sigma=0.0)
+    alike = (p.img_points[:, :, None] == p.img_points[:, None]).all(-1)  # (B, n, n)
+    members = alike.sum(-1)
+    first = alike.long().argmax(-1) == torch.arange(40)  # the first pair with its pixel
+    pixels = ((members > 1) & first).sum(-1)
+    assert pixels.max() == 3
+    assert (pixels.bincount()[1:] > 400).all()
+    right = members[p.inliers]
+    assert 0.01 < (right > 1).double().mean() < 0.1, "some crowds gather on the pixel of an inlier"
+    assert reprojection(p)[p.inliers].norm(dim=-1).max() < 6
+
+
+def test_structured_outliers_may_outnumber_a_third_of_the_inliers(generator):
+    mix = OutlierMix(count=60, structured_share=1.0, structured_ratio=(0.2, 0.8))
+    kinds = mix.draw(4000, 100, generator)
+    found = kinds.structured.sum(-1)
+    assert (found.min(), found.max()) == (8, 32)
+    assert_counts(found[(found > 8) & (found < 32)].bincount()[9:].unflatten(0, (-1, 1))[:20, 0])
+
+
+@pytest.mark.parametrize("mirrored", [0.0, 1.0])
+def test_mirrored_outliers_agree_on_a_pose_of_the_mirrored_points(mirrored):
+    options = {"structured_share": 1.0, "mirrored_share": mirrored, "structured_angle": 0.0}
+    p = draw(24, 50, outliers=OutlierMix(count=6, **options), img_sigma=0.0, world_sigma=0.0)
+    six = (~p.inliers).sum(-1) == 6
+    wrong = ~p.inliers[six]
+    world, img = (x[six][wrong].unflatten(0, (-1, 6)) for x in (p.world_points, p.img_points))
+    agree = []
+    for sign in (1.0, -1.0):
+        points = world * torch.tensor([sign, 1.0, 1.0], dtype=world.dtype)
+        result = create_solver("epnp-lm")(points, img, p.intrinsics[six])
+        agree.append((result.ok & (result.cost < 1e-3)).double().mean().item())
+    assert agree[int(mirrored)] > 0.5
+    assert agree[1 - int(mirrored)] < 0.1
+
+
+def test_a_shifted_part_is_not_turned(generator):
+    points = SlabPoints()(20, 30, generator)
+    offset = structured_points(points, generator, max_angle=0.0) - points
+    torch.testing.assert_close(offset, offset[:, :1].expand_as(offset))
+    assert offset.norm(dim=-1).min() > 0
 
 
 def test_impossible_mixes_raise(generator):

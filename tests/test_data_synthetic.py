@@ -10,7 +10,7 @@ from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
 from kornia_pnpnet import Pose, Problems
 from kornia_pnpnet.core.trees import iter_tensors
-from kornia_pnpnet.data import OutlierMix, SlabPoints, SyntheticProblems
+from kornia_pnpnet.data import FacadePoints, ObjectPoints, OutlierMix, SlabPoints, SyntheticProblems
 from kornia_pnpnet.data.draws import random_poses
 from kornia_pnpnet.geometry import transform
 
@@ -110,6 +110,69 @@ def test_known_sigmas_are_those_of_the_noise():
     assert (ratio - 1).abs().max() < 0.2
 
 
+def test_heavy_tails_keep_the_sigma_of_the_bulk():
+    def lengths(degrees):
+        p = draw(20, 4000, img_sigma=2.0, world_sigma=0.0, degrees=degrees)
+        return reprojection(p).norm(dim=-1) / 2.0, p.inliers
+
+    for degrees in (2.0, 5.0):
+        length, inliers = lengths(degrees)
+        # The squared length of bivariate Student noise: P(r^2 > x) = (1 + x / degrees)^(-degrees / 2).
+        assert_uniform((1 + length.square() / degrees) ** (-degrees / 2), 0.0, 1.0)
+        assert torch.equal(inliers, length <= 10.0)
+        assert inliers.all() == (length.max() <= 10.0)
+    normal, few, many = (lengths(degrees)[0].flatten() for degrees in (0.0, 2.0, 1000.0))
+    assert few.quantile(0.2).item() == pytest.approx(normal.quantile(0.2).item(), rel=0.1)
+    assert few.quantile(0.95) > 1.9 * normal.quantile(0.95)
+    assert many.quantile(0.95).item() == pytest.approx(normal.quantile(0.95).item(), rel=0.01)
+
+
+def test_degrees_of_freedom_differ_between_problems():
+    p = draw(400, 500, world_sigma=0.0, degrees=(1.5, 50.0))
+    length = reprojection(p).norm(dim=-1)
+    heavy = length.quantile(0.99, dim=1) / length.quantile(0.5, dim=1)
+    assert heavy.quantile(0.05) < 2.9  # normal noise has 2.6
+    assert heavy.quantile(0.95) > 8.0
+
+
+def test_sigmas_of_pairs_are_log_normal_about_that_of_the_problem():
+    p = draw(40, 1000, sigma_spread=0.5, known_noise=0.4, img_sigma=2.0, world_sigma=0.01)
+    known = [~x.isnan() for x in (p.img_sigma, p.world_sigma)]
+    assert p.img_sigma.shape == p.world_sigma.shape == (1000, 40)
+    for sigma, has, middle in zip((p.img_sigma, p.world_sigma), known, (2.0, 0.01), strict=True):
+        assert torch.equal(has.all(1), has.any(1))
+        assert_normal((sigma[has] / middle).log(), 0.5)
+    assert (known[0] & known[1]).double().mean().item() == pytest.approx(0.4, abs=0.05)
+    p = draw(200, 500, sigma_spread=(0.1, 1.0), known_noise=1.0, world_sigma=0.0)
+    assert_normal(reprojection(p) / p.img_sigma[..., None], 1.0)
+    spread = p.img_sigma.log().std(1).log10()
+    torch.testing.assert_close(spread.quantile(0.5).item(), -0.5, rtol=0, atol=0.06)
+
+
+def test_bunched_inliers_lie_together_and_outliers_anywhere():
+    mix = OutlierMix(count=60, mismatch_share=1.0)
+    area = {}
+    for share in (0.0, 0.5, 1.0):
+        p = draw(80, 1000, bunched_share=share, outliers=mix, img_sigma=0.0, world_sigma=0.0)
+        assert reprojection(p)[p.inliers].abs().max() < 1e-8
+        assert (p.inliers.sum(-1) == 20).all()
+        pixels = p.img_points[p.inliers].unflatten(0, (-1, 20))
+        wrong = p.img_points[~p.inliers].unflatten(0, (-1, 60))
+        area[share] = pixels.var(1).prod(-1).sqrt() / wrong.var(1).prod(-1).sqrt()
+    assert area[0.0].median().item() == pytest.approx(1.0, abs=0.1)
+    assert area[1.0].median() < 0.6
+    plain, half, all_of_them = ((x < 0.5).double().mean().item() for x in area.values())
+    assert half == pytest.approx((plain + all_of_them) / 2, abs=0.06)
+
+
+def test_an_image_without_a_size_holds_the_points():
+    mix = OutlierMix(count=6, mismatch_share=0.0)
+    views = FacadePoints(field_of_view=(20.0, 20.0), window=(1.0, 1.0))
+    p = draw(60, 200, points=views, half_image=None, outliers=mix, img_sigma=0.0, world_sigma=0.0)
+    half = 3400 * math.tan(math.radians(10.0))
+    assert_uniform(p.img_points[~p.inliers] / half, -1.0, 1.0)
+
+
 # --- streams ----------------------------------------------------------------------------------------------------------
 
 
@@ -131,6 +194,17 @@ def test_a_batch_depends_on_seed_and_index_alone():
         assert same(batch, source(3).batch(index))
 
 
+def test_a_batch_with_every_option_is_reproducible_and_finite():
+    mix = OutlierMix(
+        max_ratio=0.95, structured_share=0.5, structured_ratio=(0.1, 0.8), mirrored_share=0.5, near_share=0.2,
+        near_pixels=(3.0, 30.0), crowd_share=0.5,
+    )  # fmt: skip
+    options = {"sigma_spread": (0.1, 1.0), "degrees": (1.5, 9.0), "bunched_share": 0.5, "half_image": None}
+    one, two = (SyntheticProblems(n=30, outliers=mix, known_noise=1.0, **options).batch(3) for _ in range(2))
+    assert same(one, two)
+    assert all(x.isfinite().all() for x in iter_tensors(one))
+
+
 def test_the_stream_is_the_same_in_every_version():
     """Checkpoints are continued, and results compared, on the batches that they began with."""
     source = SyntheticProblems(
@@ -142,6 +216,26 @@ def test_the_stream_is_the_same_in_every_version():
     found = torch.cat((p.world_points[1, 3], p.img_points[1, 3], p.pose.translation[1]))
     torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float64), rtol=1e-9, atol=0)
     assert p.inliers.tolist() == [[True, False, False, True], [True, True, False, False]]
+
+
+def test_the_stream_of_all_kinds_of_outliers_is_the_same_in_every_version():
+    source = SyntheticProblems(
+        n=12,
+        batch_size=2,
+        seed=1,
+        outliers=OutlierMix(count=6, near_share=0.3, structured_share=1.0),
+        points=ObjectPoints(),
+        img_sigma=(0.3, 6.0),
+        world_sigma=(0.001, 0.01),
+        known_noise=0.5,
+        dtype=torch.float64,
+    )
+    p = source.batch(5)
+    expected = [23.067263258722, 18.199892259688, 9.537124951628, 303.953631751419, -2612.142990805551]
+    expected += [3.971357934598, 0.395595077194, 0.001169390653, 0.001973564060]
+    found = torch.cat((p.world_points[1, 11], p.img_points[1, 11], p.img_sigma, p.world_sigma))
+    torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float64), rtol=1e-8, atol=0)
+    assert p.inliers[1].tolist() == [x == "1" for x in "010011100110"]
 
 
 def test_dtype_and_shapes():

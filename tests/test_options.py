@@ -16,9 +16,13 @@ from strategies import ANY, BOOL, COUNTS, RANGES, WORD, Seen, are_rotations, fin
 from kornia_pnpnet import MLPInit, Normalize, PnPNet, PoseLoss, RobustWeightedLM, SetInit, SetLoss, create_solver
 from kornia_pnpnet.data import (
     BoxPoints,
+    DrivePoints,
+    FacadePoints,
+    MixedPoints,
     MixedProblems,
     ObjectPoints,
     OutlierMix,
+    RoomPoints,
     SceneProblems,
     SlabPoints,
     SyntheticProblems,
@@ -95,8 +99,11 @@ def mixture(count=2, shares=None, **values):
 BOUNDS = {"initial": 3.0, "size": 2, "lower": 1.0, "upper": 50.0}
 SAMPLING = {"counts": "iterations seed", "numbers": "threshold confidence", "words": "method"}
 SOURCE = "n batch_size seed"
-POSES = "translation_box translation_sigma max_angle focal half_image known_noise"
-MIX = chosen("count min_count min_inliers", "max_ratio mismatch_share near_share structured_share")
+NUMBERS = "translation_box translation_sigma max_angle focal half_image known_noise bunched_share"
+NOISES = dict.fromkeys(("img_sigma", "world_sigma", "degrees", "sigma_spread"), ANY | RANGES)
+SHARES = "min_ratio max_ratio mismatch_share near_share structured_share mirrored_share crowd_share structured_angle"
+MIX = chosen("count min_count min_inliers max_crowds", SHARES, ranges="near_pixels structured_ratio")
+VIEW = "field_of_view window"
 
 #: Per name: a constructor and its options.
 PARTS = {
@@ -121,7 +128,7 @@ LOSSES = {
     "SetLoss": (SetLoss, chosen("starts", "refined saturation every weights noise rotation_unit translation_unit")),
 }
 SOURCES = {
-    "SyntheticProblems": (synthetic, chosen(SOURCE, POSES, img_sigma=ANY | RANGES, world_sigma=ANY | RANGES)),
+    "SyntheticProblems": (synthetic, chosen(SOURCE, NUMBERS, **NOISES)),
     "SceneProblems": (from_scene, chosen(f"{SOURCE} num_spares", "translation_box max_angle", flags="recentre")),
     "BoxPoints": (partial(with_points, BoxPoints), chosen(numbers="half_width z_near depth")),
     "SlabPoints": (
@@ -132,8 +139,18 @@ SOURCES = {
         partial(with_points, ObjectPoints),
         chosen(numbers="field_of_view thinnest planar", ranges="distance"),
     ),
+    "FacadePoints": (
+        partial(with_points, FacadePoints),
+        chosen(numbers="slant corner", ranges=f"{VIEW} distance relief"),
+    ),
+    "RoomPoints": (partial(with_points, RoomPoints), chosen("furniture", ranges=f"{VIEW} side height")),
+    "DrivePoints": (partial(with_points, DrivePoints), chosen(numbers="turn nearer", ranges=f"{VIEW} height side end")),
     "OutlierMix": (partial(with_mix, synthetic), MIX),
     "OutlierMix of a scene": (partial(with_mix, from_scene), MIX),
+    "MixedPoints": (
+        lambda count=2, shares=None: synthetic(points=MixedPoints([BoxPoints()] * count, shares=shares)),
+        chosen(shares=st.lists(ANY, max_size=3), count=st.integers(0, 3)),
+    ),
     "VaryingSize": (
         mixture,
         chosen(
@@ -195,6 +212,12 @@ REFUSED = [
     (PoseLib, {"threshold": -1.0, "min_iterations": 0}),
     (PyColmap, {"loss_scale": 0.0, "max_iterations": 50}),
     (OutlierMix, {"max_ratio": 1.5, "count": -1, "min_count": -1, "mismatch_share": 2.0}),
+    (OutlierMix, {"near_pixels": (3.0, 1.0), "structured_ratio": (0.0, 0.5), "crowd_share": 1.1, "max_crowds": 0}),
+    (OutlierMix, {"min_ratio": -0.1, "structured_angle": -1.0, "mirrored_share": 1.5}),
+    (FacadePoints, {"field_of_view": (15.0, 180.0), "window": (0.1, 1.1), "slant": 90.0}),
+    (RoomPoints, {"side": (0.0, 2.0), "height": (3.0, 2.0), "furniture": 0.5}),
+    (DrivePoints, {"end": (0.0, 9.0), "nearer": 1.1, "turn": math.inf}),
+    (SyntheticProblems, {"degrees": 0.5, "sigma_spread": 4.0, "bunched_share": -0.1, "half_image": -1.0}),
     (SyntheticProblems, {"img_sigma": -1.0, "world_sigma": (0.0, 1.0)}),
     (SyntheticProblems, {"img_sigma": (2.0, 1.0), "world_sigma": (1.0, 2.0, 3.0)}),
     (partial(SceneProblems, make_scene(20)), {"n": 0, "batch_size": 0, "num_spares": 0}),

@@ -7,7 +7,7 @@ processes. A new data source is one more class with ``batch_size`` and ``batch(i
 """
 
 from kornia_pnpnet.data.colmap import load_colmap, load_matches, load_scene
-from kornia_pnpnet.data.mixtures import MixedProblems, VaryingSize
+from kornia_pnpnet.data.mixtures import MixedPoints, MixedProblems, VaryingSize
 from kornia_pnpnet.data.outliers import OutlierDraw, OutlierMix
 from kornia_pnpnet.data.points import (
     BoxPoints,
@@ -25,6 +25,7 @@ __all__ = [
     "BoxPoints",
     "DrivePoints",
     "FacadePoints",
+    "MixedPoints",
     "MixedProblems",
     "ObjectPoints",
     "OutlierDraw",

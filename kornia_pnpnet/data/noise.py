@@ -17,8 +17,10 @@ from kornia_pnpnet.data.draws import log_uniform, normal, uniform
 
 __all__ = ["LEAST_DEGREES", "MOST_NOISE", "MOST_SPREAD", "checked_sigma", "draw_noise", "hide_sigmas"]
 
-#: Bounds of the degrees of freedom and of the spread: noise stays a finite float32.
-LEAST_DEGREES, MOST_SPREAD = 1.0, 3.0
+#: Smallest degrees of freedom of the tails: noise stays finite in float32.
+LEAST_DEGREES = 1.0
+#: Largest standard deviation of the logarithm of the pairs' sigmas: noise stays finite in float32.
+MOST_SPREAD = 3.0
 #: Standard deviations. A choice: a pair whose pixel has more noise is called an outlier.
 MOST_NOISE = 10.0
 

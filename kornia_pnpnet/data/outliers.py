@@ -228,7 +228,9 @@ def structured_points(
     batch_size = len(cam_points)
     centre = cam_points.mean(1, keepdim=True)
     size = (cam_points - centre).square().sum(-1).mean(1).sqrt()[:, None, None]
-    turn = random_poses(batch_size, generator, max_angle=max_angle).rotation
+    turn = torch.eye(3, dtype=cam_points.dtype, device=cam_points.device)
+    if max_angle:
+        turn = random_poses(batch_size, generator, max_angle=max_angle).rotation
     shift = 0.5 * size * normal((batch_size, 1, 3), generator)
     if mirrored_share:
         axis = torch.nn.functional.normalize(normal((batch_size, 3, 1), generator), dim=1)

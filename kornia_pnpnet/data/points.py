@@ -20,11 +20,13 @@ __all__ = ["BoxPoints", "DrivePoints", "FacadePoints", "ObjectPoints", "PointPri
 
 # Smallest depth of a slab's tilted surface relative to its distance. A choice: keeps it in front of the camera.
 _LEAST_SURFACE = 0.3
-# Smallest cosine between a ray and a façade's normal, relative to that of the middle ray. A choice: the depths of a
-# façade differ by a factor of at most 20.
+# Smallest cosine between a ray and a façade's normal, relative to that of the middle ray. A choice: rays that meet a
+# façade further away than 20 times its distance see something else at that depth.
 _LEAST_FACING = 0.05
 # Added to components of rays before dividing by them: rays along a wall meet it far away instead of at infinity.
 _PARALLEL = 1e-9
+# Depth of the nearest furniture relative to the wall behind it. A choice: nobody photographs a cupboard's door.
+_NEAREST = 0.15
 # Degrees. A camera's projection needs less than 180.
 _WIDEST = 170.0
 # Depth in metres of what is not there, such as the ceiling of a street.
@@ -232,7 +234,7 @@ class FacadePoints(_View):
         self,
         *,
         field_of_view: tuple[float, float] = (15.0, 120.0),
-        window: tuple[float, float] = (0.05, 1.0),
+        window: tuple[float, float] = (0.1, 1.0),
         distance: tuple[float, float] = (4.0, 60.0),
         slant: float = 70.0,
         relief: tuple[float, float] = (0.001, 0.1),
@@ -289,7 +291,7 @@ class RoomPoints(_View):
         self,
         *,
         field_of_view: tuple[float, float] = (15.0, 120.0),
-        window: tuple[float, float] = (0.05, 1.0),
+        window: tuple[float, float] = (0.1, 1.0),
         side: tuple[float, float] = (2.0, 15.0),
         height: tuple[float, float] = (2.2, 5.0),
         furniture: int = 4,
@@ -307,7 +309,7 @@ class RoomPoints(_View):
         turn = random_poses(batch_size, generator, max_angle=math.pi).rotation
         ground = log_uniform((batch_size, 1, 2), *self.side, generator)
         size = torch.cat((ground, uniform((batch_size, 1, 1), *self.height, generator)), -1)  # (B, 1, 3)
-        low = -size * uniform((batch_size, 1, 3), 0.1, 0.9, generator)  # from the camera, in the room's axes
+        low = -size * uniform((batch_size, 1, 3), 0.15, 0.85, generator)  # from the camera, in the room's axes
         in_room = rays @ turn.mT
         z = _far_side(in_room, low, low + size)
         # Furniture stands on the floor and not where the camera is.
@@ -317,7 +319,7 @@ class RoomPoints(_View):
         start[..., 2] = low[..., 2]
         near = _near_side(in_room[:, :, None], start[:, None], (start + extent)[:, None])  # (B, n, furniture)
         for hit in near.unbind(-1):
-            z = torch.where((hit > 0.05 * z) & (hit < z), hit, z)
+            z = torch.where((hit > _NEAREST * z) & (hit < z), hit, z)
         return rays * z[..., None]
 
 
@@ -348,7 +350,7 @@ class DrivePoints(_View):
         self,
         *,
         field_of_view: tuple[float, float] = (15.0, 120.0),
-        window: tuple[float, float] = (0.05, 1.0),
+        window: tuple[float, float] = (0.1, 1.0),
         height: tuple[float, float] = (1.0, 3.0),
         side: tuple[float, float] = (2.5, 20.0),
         end: tuple[float, float] = (30.0, 200.0),

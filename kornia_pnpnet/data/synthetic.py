@@ -20,6 +20,10 @@ __all__ = ["SyntheticProblems"]
 
 # A camera sees a point when the cosine between its direction and the optical axis is larger. A choice: 87 degrees.
 _LEAST_COSINE = 0.05
+# Half the side of the widest image at a focal length of 1, so that objects next to the camera fit into an image.
+_WIDEST_TANGENT = math.tan(math.radians(60.0))
+# Mean distances between points in the image. A choice: bunches are sharp to hardly visible.
+_MOST_BLUR = 2.0
 
 
 class SyntheticProblems:
@@ -41,7 +45,8 @@ class SyntheticProblems:
         max_angle: largest rotation angle in radians.
         focal: focal length in pixels; the principal point is 0.
         half_image: pixels of *sensing* outliers are uniform in ``[-half_image, half_image]`` on both axes; ``None``:
-            in the smallest such square that holds the pixels of all points of the problem.
+            in the smallest such square that holds the pixels of all points of the problem, up to a field of view of
+            120°.
         img_sigma: standard deviation of the noise on each pixel coordinate, or a range from which each problem draws
             one, log-uniform.
         world_sigma: standard deviation of the noise on each world coordinate, or a range.
@@ -192,7 +197,7 @@ class SyntheticProblems:
         in_front = _is_in_front(scene)[..., None]
         depth = torch.where(in_front, scene[..., 2:], 1.0)
         tangent = torch.where(in_front, scene[..., :2] / depth, 0.0)
-        half = self.focal * tangent.abs().amax((1, 2), keepdim=True)
+        half = self.focal * tangent.abs().amax((1, 2), keepdim=True).clamp(max=_WIDEST_TANGENT)
         return half * uniform(shape, -1.0, 1.0, generator)
 
 
@@ -210,7 +215,7 @@ def _bunched(scene: Tensor, displaced: Tensor, share: float, generator: torch.Ge
     batch_size, twice = scene.shape[:2]
     direction = torch.nn.functional.normalize(scene, dim=-1)
     distance = (direction - direction[:, :1]).square().sum(-1).sqrt()
-    blur = uniform((batch_size, 1), 0.0, 1.0, generator) * uniform((batch_size, twice), 0.0, 1.0, generator)
+    blur = uniform((batch_size, 1), 0.0, _MOST_BLUR, generator) * uniform((batch_size, twice), 0.0, 1.0, generator)
     score = distance / distance.mean(1, keepdim=True).clamp(min=torch.finfo(distance.dtype).tiny) + blur
     chosen = uniform((batch_size, 1), 0.0, 1.0, generator) < share
     score = torch.where(chosen, score, uniform((batch_size, twice), 0.0, 1.0, generator))

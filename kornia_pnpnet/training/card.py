@@ -130,7 +130,7 @@ def _describe_synthetic(source: Mapping[str, Any], n: int) -> str:
             f"{small} to {large} pairs, up to {mix.max_count(small)} outliers among {small} and {most} among {large}"
         )
     else:
-        least = most if mix.count is not None else min(mix.min_count, most)
+        least = mix.least_count(large)
         pairs = f"{f'{least} to ' if least < most else ''}{most} outliers among {large} pairs"
     return f"{pairs}, points from {' and '.join(name for part in parts for name in _points({**source, **part}))}"
 
