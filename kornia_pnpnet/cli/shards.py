@@ -76,7 +76,7 @@ def solve_shards(
 
     A file of results gets its name when it is complete, so a run that was stopped can be repeated: shards with results
     are skipped. A shard that cannot be read, or whose numbers would need more memory than
-    :data:`~kornia_pnpnet.core.files.MOST_BYTES` at once, is reported and the other shards are solved.
+    ``core.files.MOST_BYTES`` at once, is reported and the other shards are solved.
 
     Args:
         solver: any solver.
