@@ -130,7 +130,8 @@ class Normalize(Configured):
             weights: at least 0, shape :math:`(B, N)`; 1 when ``None``.
             mask: False where a pair is padding, bool, shape :math:`(B, N)`.
             noise: standard deviations in pixels and in the unit of the world; NaN where unknown.
-            confidence: the caller's belief that a pair is an inlier, in [0, 1], shape :math:`(B, N)`.
+            confidence: the caller's belief that a pair is an inlier, in [0, 1], shape :math:`(B, N)`; NaN where
+                unknown.
 
         Returns:
             The normalised correspondences, with the problems last in memory, and the :class:`Frame` that undoes it.
@@ -163,11 +164,9 @@ class Normalize(Configured):
             has_noise = _is_usable(noise)
             is_finite = is_finite & has_noise
         if confidence is not None:
-            there_is = there.mT
-            confidence = torch.where(there_is, confidence, 0.0)
-            is_probability = (confidence >= 0) & (confidence <= 1)
-            is_finite = is_finite & is_probability.all(-1)
-            confidence = torch.where(is_probability, confidence, 0.0)
+            is_probability = ((confidence >= 0) & (confidence <= 1)) | confidence.isnan()
+            is_finite = is_finite & (is_probability | ~there.mT).all(-1)
+            confidence = torch.where(is_probability & there.mT, confidence, torch.nan)
         there = there & (is_camera & is_finite) & (size < limit)
         rows = torch.where(there, rows, zero)  # finite, so that products with 0 are 0 from here on
         focal = rows.new_full((), self.f_const)  # made on the device, so that a GPU need not wait for the CPU

@@ -71,10 +71,9 @@ class PnPNet(nn.Module):
         refine: the refiner; classical :class:`~kornia_pnpnet.refine.RobustWeightedLM` when ``None``.
         normalize: the normalisation; the default centres and scales the world and orders the pairs.
         effort: ``"fixed"``, or ``"adaptive"``: problems for which the poses of the initialiser do not suffice get more
-            minimal samples, as many as they need (see :func:`~kornia_pnpnet.init.ransac.ransac.search_on`), without
-            holding up the others. Needs an initialiser that estimates the noise, :class:`~kornia_pnpnet.init.SetInit`.
-            The samples have no gradient. Exported graphs, ``torch.func.vmap`` and the device ``meta`` have the fixed
-            effort.
+            minimal samples, as many as they need (``init.ransac.search_on``), without holding up the others. Needs an
+            initialiser that estimates the noise, :class:`~kornia_pnpnet.init.SetInit`. The samples have no gradient.
+            Exported graphs, ``torch.func.vmap`` and the device ``meta`` have the fixed effort.
         gradient: which problems carry a gradient: those that are ``"ok"``, or ``"always"`` every valid problem, to
             train a network that does not predict anything sensible yet. The gradient of each problem to its normalised
             points, pixels and weights is then finite and at most 10 long.
@@ -154,8 +153,8 @@ class PnPNet(nn.Module):
             world_sigma: standard deviation of the noise on each world coordinate, in the unit of ``world_points``;
                 shapes and NaN as for ``img_sigma``.
             confidence: your own belief that a pair is an inlier, in [0, 1], for example a matcher's score, shape
-                :math:`(B, N)`. Minimal samples are drawn from likely pairs more often, and a network that was trained
-                with confidences sees them. What they are worth need not be the same in every problem.
+                :math:`(B, N)`; NaN where unknown. Minimal samples are drawn from likely pairs more often, and a network
+                that was trained with confidences sees them. What they are worth may differ between problems.
             first_stage_only: return the first guess unrefined, the paper's "Net", at the cost of ``m=0``.
             gradient: ``"ok"`` or ``"always"``; the solver's own when ``None``.
 

@@ -172,7 +172,8 @@ class Correspondences(NamedTuple):
         near: 0 for points that are many times as far from the others as these are from each other, and for pixels at
             extreme angles; 1 for all other pairs, shape :math:`(B, N)`; ``None``: 1. An initialiser that is not robust
             leaves out the pairs with 0 (:attr:`near_weights`): they are bad data or the horizon.
-        confidence: the caller's belief that a pair is an inlier, in [0, 1], shape :math:`(B, N)`; ``None``: unknown.
+        confidence: the caller's belief that a pair is an inlier, in [0, 1], NaN where unknown, shape :math:`(B, N)`;
+            ``None``: all unknown.
     """
 
     world_points: Tensor
@@ -301,6 +302,8 @@ class Problems(NamedTuple):
             unknown, ``None`` where it is unknown for all problems, shape :math:`(B,)` or :math:`(B, N)`.
         world_sigma: standard deviation of the noise on each world coordinate, NaN, ``None`` and shape as for
             ``img_sigma``.
+        confidence: belief that a pair is an inlier, in [0, 1], NaN and ``None`` as for ``img_sigma``, shape
+            :math:`(B, N)`.
     """
 
     world_points: Tensor
@@ -310,12 +313,18 @@ class Problems(NamedTuple):
     inliers: Tensor
     img_sigma: Tensor | None = None
     world_sigma: Tensor | None = None
+    confidence: Tensor | None = None
 
     @property
     def sigmas(self) -> dict[str, Tensor]:
         """The known standard deviations, as keyword arguments of a solver's call."""
         sigmas = {"img_sigma": self.img_sigma, "world_sigma": self.world_sigma}
         return {name: sigma for name, sigma in sigmas.items() if sigma is not None}
+
+    @property
+    def known(self) -> dict[str, Tensor]:
+        """The known standard deviations and the confidences, as keyword arguments of a solver's call."""
+        return self.sigmas if self.confidence is None else {**self.sigmas, "confidence": self.confidence}
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Problems:
         """Apply a function to every tensor, for example to slice the batch or to move it to another device."""

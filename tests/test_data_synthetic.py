@@ -245,3 +245,19 @@ def test_dtype_and_shapes():
     assert [tuple(x.shape) for x in iter_tensors(p)] == [(3, 4, 3), (3, 4, 2), (3, 3, 3), (3, 3, 3), (3, 3), (3, 4)]
     assert {x.dtype for x in iter_tensors(double)} == {torch.float64, torch.bool}
     assert same(double.map(lambda x: x.float() if x.dtype == torch.float64 else x), p)
+
+
+def test_confidences_tell_inliers_from_outliers_more_or_less():
+    mix = OutlierMix(max_ratio=0.6)
+    p = SyntheticProblems(n=100, batch_size=400, seed=3, outliers=mix, confidence_share=0.5).batch(0)
+    given = ~p.confidence.isnan()
+    assert torch.equal(given.all(-1), given.any(-1))
+    assert 0.4 < given.all(-1).double().mean() < 0.6
+    areas = []  # under the curve: how often an inlier has the larger confidence
+    for confidence, inliers in zip(p.confidence[given.all(-1)], p.inliers[given.all(-1)], strict=True):
+        if 10 < inliers.sum() < 90:
+            areas.append((confidence[inliers][:, None] > confidence[~inliers]).double().mean().item())
+    assert min(areas) < 0.6 < 0.95 < max(areas)
+    assert sum(areas) / len(areas) > 0.75
+    assert SyntheticProblems(n=9, batch_size=2, seed=3).batch(0).known == {}
+    assert set(p.known) == {"confidence"}

@@ -81,8 +81,8 @@ class MixedProblems:
         """
         count = len(self.sources)  # no two sources see the same random numbers
         parts = [source.batch(count * index + i) for i, source in enumerate(self.sources)]
-        for name in ("img_sigma", "world_sigma"):
-            parts = _with_sigmas_alike(parts, name)
+        for name in ("img_sigma", "world_sigma", "confidence"):
+            parts = _with_known_alike(parts, name)
         problems = map_tensors(lambda *x: torch.cat(x), *parts)
         order = self._order.to(problems.inliers.device)
         return problems.map(lambda x: x[order])
@@ -97,19 +97,19 @@ def _checked_shares(what: str, count: int, shares: Sequence[float] | None) -> li
     return shares
 
 
-def _with_sigmas_alike(parts: list[Problems], name: str) -> list[Problems]:
-    """Problems whose standard deviations of that name have one shape, with NaN for those that were ``None``."""
-    dimensions = {sigma.ndim for part in parts if (sigma := getattr(part, name)) is not None}
+def _with_known_alike(parts: list[Problems], name: str) -> list[Problems]:
+    """Problems whose sigmas or confidences have one shape, with NaN for those that were ``None``."""
+    dimensions = {known.ndim for part in parts if (known := getattr(part, name)) is not None}
     if not dimensions:
         return parts
     alike = []
     for part in parts:
-        sigma = getattr(part, name)
-        if sigma is None:
-            sigma = part.world_points.new_full(part.world_points.shape[:1], torch.nan)
-        if sigma.ndim < max(dimensions):
-            sigma = sigma[:, None].expand(part.inliers.shape)
-        alike.append(part._replace(**{name: sigma}))
+        known = getattr(part, name)
+        if known is None:
+            known = part.world_points.new_full(part.world_points.shape[:1], torch.nan)
+        if known.ndim < max(dimensions):
+            known = known[:, None].expand(part.inliers.shape)
+        alike.append(part._replace(**{name: known}))
     return alike
 
 

@@ -15,7 +15,15 @@ from torch import Tensor
 from kornia_pnpnet.core.checks import check_numbers, check_ranges
 from kornia_pnpnet.data.draws import log_uniform, normal, uniform
 
-__all__ = ["LEAST_DEGREES", "MOST_NOISE", "MOST_SPREAD", "checked_sigma", "draw_noise", "hide_sigmas"]
+__all__ = [
+    "LEAST_DEGREES",
+    "MOST_NOISE",
+    "MOST_SPREAD",
+    "checked_sigma",
+    "draw_confidence",
+    "draw_noise",
+    "hide_sigmas",
+]
 
 #: Smallest degrees of freedom of the tails: noise stays finite in float32.
 LEAST_DEGREES = 1.0
@@ -24,6 +32,9 @@ MOST_SPREAD = 3.0
 #: Standard deviations. A choice: a pair whose pixel has more noise is called an outlier.
 MOST_NOISE = 10.0
 
+# Ranges of what a confidence is worth: by how many standard deviations it tells inliers from outliers, how much it says
+# of the noise, and how its scale and its centre differ between problems.
+_TELLING, _NOISINESS, _GAIN, _OFFSET = (0.0, 4.0), (0.0, 1.0), (0.3, 3.0), 1.5
 # Squared standard deviations. Keeps the quotient of the tails from 0 / 0; float64 resolves the quotient here.
 _LEAST_SQ_LENGTH = 1e-12
 
@@ -119,3 +130,25 @@ def hide_sigmas(
     if img_sigma.ndim > 1:
         hide_img, hide_world = hide_img[:, None], hide_world[:, None]
     return torch.where(hide_img, torch.nan, img_sigma), torch.where(hide_world, torch.nan, world_sigma)
+
+
+def draw_confidence(inliers: Tensor, errors: Tensor, share: float, generator: torch.Generator) -> Tensor:
+    """Draw the belief of a caller in each pair, as from a matcher or a keypoint network.
+
+    What a confidence is worth differs between problems: from nothing to four standard deviations between inliers and
+    outliers, of any scale and centre. Those of noisy inliers are lower.
+
+    Args:
+        inliers: bool, shape :math:`(B, N)`.
+        errors: length of the noise of each pixel, in the problem's standard deviations, shape :math:`(B, N)`.
+        share: share of the problems that have confidences.
+        generator: source of randomness.
+
+    Returns:
+        In (0, 1), NaN for the other problems, shape :math:`(B, N)`.
+    """
+    each = len(inliers), 1
+    telling, noisiness = (uniform(each, *bounds, generator) for bounds in (_TELLING, _NOISINESS))
+    score = normal(inliers.shape, generator) + torch.where(inliers, telling - noisiness * errors.log1p(), 0.0)
+    logit = log_uniform(each, *_GAIN, generator) * score + _OFFSET * normal(each, generator)
+    return torch.where(uniform(each, 0.0, 1.0, generator) < share, torch.sigmoid(logit), torch.nan)

@@ -11,13 +11,23 @@ from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_numbers, check_positive, check_whole
 from kornia_pnpnet.data.draws import batch_generator, random_poses, uniform
-from kornia_pnpnet.data.noise import LEAST_DEGREES, MOST_NOISE, MOST_SPREAD, checked_sigma, draw_noise, hide_sigmas
+from kornia_pnpnet.data.noise import (
+    LEAST_DEGREES,
+    MOST_NOISE,
+    MOST_SPREAD,
+    checked_sigma,
+    draw_confidence,
+    draw_noise,
+    hide_sigmas,
+)
 from kornia_pnpnet.data.outliers import OutlierMix, crowded_pixels, near_offsets, structured_points
 from kornia_pnpnet.data.points import BoxPoints, PointPrior
 from kornia_pnpnet.types import Problems
 
 __all__ = ["SyntheticProblems"]
 
+# Pixels. Noise of no size divides by this.
+_TINY = 1e-9
 # A camera sees a point when the cosine between its direction and the optical axis is larger. A choice: 87 degrees.
 _LEAST_COSINE = 0.05
 # Half the side of the widest image at a focal length of 1, so that objects next to the camera fit into an image.
@@ -58,6 +68,8 @@ class SyntheticProblems:
             pair, shape ``(batch_size, n)``.
         known_noise: share of the problems that come with both sigmas. A third of the other problems come with one of
             them; unknown sigmas are NaN.
+        confidence_share: share of the problems that come with confidences, see
+            :func:`~kornia_pnpnet.data.noise.draw_confidence`.
         bunched_share: share of the problems whose inliers are bunched in a part of the image; the points and pixels of
             outliers, but for *near* and *structured* ones, come from the rest of the scene.
         dtype: dtype of the batches; numbers are drawn in float64 and cast.
@@ -91,6 +103,7 @@ class SyntheticProblems:
         degrees: float | Sequence[float] = 0.0,
         sigma_spread: float | Sequence[float] = 0.0,
         known_noise: float = 0.0,
+        confidence_share: float = 0.0,
         bunched_share: float = 0.0,
         dtype: torch.dtype = torch.float32,
         device: str | torch.device = "cpu",
@@ -100,6 +113,7 @@ class SyntheticProblems:
         check_numbers(0.0, translation_box=translation_box, max_angle=max_angle)
         check_positive(focal=focal)
         check_numbers(0.0, 1.0, known_noise=known_noise, bunched_share=bunched_share)
+        check_numbers(0.0, 1.0, confidence_share=confidence_share)
         if half_image is not None:
             check_numbers(0.0, half_image=half_image)
         if translation_sigma is not None:
@@ -119,6 +133,7 @@ class SyntheticProblems:
         self.degrees = checked_sigma("degrees", degrees, LEAST_DEGREES)
         self.sigma_spread = checked_sigma("sigma_spread", sigma_spread, 0.0, MOST_SPREAD)
         self.known_noise = known_noise
+        self.confidence_share = confidence_share
         self.bunched_share = bunched_share
         self.dtype = dtype
         self.device = torch.device(device)
@@ -181,12 +196,15 @@ class SyntheticProblems:
         if draw.crowd is not None:
             shared = crowded_pixels(img_points, self.outliers.max_crowds, generator)
             img_points = torch.where(draw.crowd[..., None], shared, img_points)
-        sigmas: dict[str, Tensor] = {}
+        known: dict[str, Tensor] = {}
+        errors = noise.norm(dim=-1) / img_sigma.reshape(self.batch_size, -1).mean(1, keepdim=True).clamp(min=_TINY)
         if self.known_noise:
             img_sigma, world_sigma = hide_sigmas(img_sigma, world_sigma, self.known_noise, generator)
-            sigmas = {"img_sigma": img_sigma, "world_sigma": world_sigma}
+            known = {"img_sigma": img_sigma, "world_sigma": world_sigma}
+        if self.confidence_share:
+            known["confidence"] = draw_confidence(inliers, errors, self.confidence_share, generator)
         intrinsics = torch.diag(img_points.new_tensor((self.focal, self.focal, 1.0))).expand(self.batch_size, 3, 3)
-        problems = Problems(world_points, img_points, intrinsics, pose, inliers, **sigmas)
+        problems = Problems(world_points, img_points, intrinsics, pose, inliers, **known)
         return problems.map(lambda x: x.to(self.dtype) if x.is_floating_point() else x)
 
     def _anywhere(self, scene: Tensor, generator: torch.Generator) -> Tensor:

@@ -107,7 +107,7 @@ def evaluate(
         solvers: by name, each called as ``solver(world_points, img_points, intrinsics)`` in evaluation mode, without
             gradients. A bound (see :class:`SeesTruth`) also gets the true poses and inliers. A
             :class:`~kornia_pnpnet.solver.PnPNet` gets the noise level where the problems have it
-            (:attr:`~kornia_pnpnet.types.Problems.sigmas`).
+            (:attr:`~kornia_pnpnet.types.Problems.known`).
         data: problems by name. Each set is solved on its own device and in its own dtype.
         path: the results file to write and to continue; none when ``None``.
         overwrite: start anew and replace the file at ``path``.
@@ -258,8 +258,8 @@ def _timed(solver: nn.Module, problems: Problems) -> tuple[PnPResult, float]:
     if isinstance(solver, SeesTruth):
         result = solver.solve_with_truth(problems)
     else:
-        sigmas = problems.sigmas if isinstance(solver, PnPNet) else {}
-        result = solver(problems.world_points, problems.img_points, problems.intrinsics, **sigmas)
+        known = problems.known if isinstance(solver, PnPNet) else {}
+        result = solver(problems.world_points, problems.img_points, problems.intrinsics, **known)
     if on_gpu:
         torch.cuda.synchronize()
     return result, time.perf_counter() - start

@@ -86,10 +86,9 @@ class _View:
         noise = [torch.where(known, log - _LOG_NOISE, 0.0) for log, known in self.known]
         flags = [known.to(world.dtype) for _, known in self.known]
         if confidence:
-            logit = torch.zeros_like(corr.weights)
-            if corr.confidence is not None:
-                logit = corr.confidence.clamp(_LEAST_CONFIDENCE, 1.0 - _LEAST_CONFIDENCE).logit()
-            flags += [logit, torch.full_like(logit, corr.confidence is not None)]
+            given = torch.full_like(corr.weights, torch.nan) if corr.confidence is None else corr.confidence
+            believed = given.nan_to_num(0.5).clamp(_LEAST_CONFIDENCE, 1.0 - _LEAST_CONFIDENCE)
+            flags += [believed.logit(), (~given.isnan()).to(world.dtype)]
         parts = self.points, seen, residual, problem, *(x[..., None] for x in (*noise, *flags))
         self.features = torch.cat(parts, -1).clamp(-_MOST, _MOST)
 

@@ -140,7 +140,7 @@ class Run:
     def forward(self, problems: Problems, ramp: float) -> LossTerms:
         """Solve the problems and compare the results with the true poses."""
         inputs = problems.world_points, problems.img_points, problems.intrinsics
-        options = {**problems.sigmas, "first_stage_only": ramp == 0.0}
+        options = {**problems.known, "first_stage_only": ramp == 0.0}
         if isinstance(self.loss, SetLoss):
             result, guess = self.solver.with_guess(*inputs, **options)
             return self.loss(result, problems, ramp, guess)

@@ -65,7 +65,7 @@ def validate(model: nn.Module, validation: Mapping[str, Problems]) -> dict[str, 
     """
     results = {}
     for name, problems in validation.items():
-        result = model(problems.world_points, problems.img_points, problems.intrinsics, **problems.sigmas)
+        result = model(problems.world_points, problems.img_points, problems.intrinsics, **problems.known)
         refined, first = (pose_errors(pose, problems.pose) for pose in (result.pose, result.init))
         results[name] = ValidationResult(
             success_rate(success(refined)),

@@ -243,7 +243,7 @@ FURTHER = Plan(
 
 def _trusted(confidence: Tensor | None) -> Tensor | None:
     """How often pairs are drawn, by the caller's confidence, (B, N)."""
-    return None if confidence is None else _LEAST_TRUST + (1.0 - _LEAST_TRUST) * confidence
+    return None if confidence is None else _LEAST_TRUST + (1.0 - _LEAST_TRUST) * confidence.nan_to_num(0.5)
 
 
 @torch.no_grad()
