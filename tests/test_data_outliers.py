@@ -160,6 +160,17 @@ def test_crowds_share_few_pixels():
     assert reprojection(p)[p.inliers].norm(dim=-1).max() < 6
 
 
+def test_crowds_of_a_point_have_many_pixels():
+    mix = OutlierMix(count=30, crowd_share=1.0, max_crowds=3, point_crowd_share=0.5)
+    p = draw(40, 2000, outliers=mix, world_sigma=0.0)
+    points, pixels = (
+        ((x[:, :, None] == x[:, None]).all(-1).sum(-1) > 1).any(-1) for x in (p.world_points, p.img_points)
+    )
+    assert not (points & pixels).any()
+    assert_counts(torch.stack((points.sum(), pixels.sum())), (0.5 * 30 / 31, 0.5 * 30 / 31))
+    assert reprojection(p)[p.inliers].norm(dim=-1).max() < 6
+
+
 def test_structured_outliers_may_outnumber_a_third_of_the_inliers(generator):
     mix = OutlierMix(count=60, structured_share=1.0, structured_ratio=(0.2, 0.8))
     kinds = mix.draw(4000, 100, generator)

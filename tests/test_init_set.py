@@ -14,6 +14,7 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from kornia_pnpnet import Normalize, PnPNet, Pose, RobustWeightedLM, SetInit, SetLoss, pose_errors, success
 from kornia_pnpnet.core.trees import iter_tensors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet.init.set import _same
 
 NOISE = {"img_sigma": 1.0, "world_sigma": 0.05}
 
@@ -169,6 +170,13 @@ def test_it_learns():
         torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
         optimizer.step()
     assert rate() > max(0.65, before + 0.2)
+
+
+def test_pairs_with_the_same_point_are_counted(generator):
+    places = torch.randint(0, 3, (5, 40, 2), generator=generator).double()
+    there = (torch.rand(5, 40, generator=generator) < 0.7).double()
+    expected = ((places[:, :, None] == places[:, None]).all(-1) * there[:, None]).sum(-1)
+    torch.testing.assert_close(_same(places, there)[there > 0], expected[there > 0])
 
 
 @pytest.mark.parametrize("given", [False, True])

@@ -102,6 +102,7 @@ SOURCE = "n batch_size seed"
 NUMBERS = "translation_box translation_sigma max_angle focal half_image known_noise bunched_share"
 NOISES = dict.fromkeys(("img_sigma", "world_sigma", "degrees", "sigma_spread"), ANY | RANGES)
 SHARES = "min_ratio max_ratio mismatch_share near_share structured_share mirrored_share crowd_share structured_angle"
+SHARES += " point_crowd_share"
 MIX = chosen("count min_count min_inliers max_crowds", SHARES, ranges="near_pixels structured_ratio")
 VIEW = "field_of_view window"
 

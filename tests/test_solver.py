@@ -390,6 +390,27 @@ def test_a_bad_confidence_costs_its_own_problem_alone():
         solver(*problems[:3], confidence=confidence[:, :3])
 
 
+def test_a_network_may_see_repeats(make_problems):
+    """Not their place among the pairs, nor padding."""
+    problems = make_problems(12)
+    pixels = problems.img_points.clone()
+    pixels[:, 7:] = pixels[:, 6:7]
+    blind, seeing = (PnPNet(SetInit(repeats=sees), normalize=Normalize(order=False)) for sees in (False, True))
+    seeing.init.first.weight.data[:, :14] = blind.init.first.weight.data
+    seeing.load_state_dict({k: v for k, v in blind.state_dict().items() if k != "init.first.weight"}, strict=False)
+    weights = [net.with_guess(problems[0], pixels, problems[2])[1].weights for net in (blind, seeing)]
+    assert (weights[0] != weights[1]).all()
+    distinct = [net.with_guess(*problems[:3])[1].weights for net in (blind, seeing)]
+    assert torch.allclose(*distinct)
+    order = torch.arange(12).flip(0)
+    shuffled = seeing.with_guess(problems[0][:, order], pixels[:, order], problems[2])[1].weights
+    assert torch.allclose(shuffled.flip(1), weights[1])
+    mask = torch.arange(15) < 12
+    padded = [torch.cat((x, x[:, -1:].expand(-1, 3, -1)), 1) for x in (problems[0], pixels)]
+    padded = seeing.with_guess(*padded, problems[2], mask=mask.expand(len(pixels), -1))[1].weights
+    assert torch.allclose(padded[:, :12], weights[1])
+
+
 def test_a_network_may_see_the_confidence(make_problems, generator):
     problems = make_problems(12)
     confidence = believed(problems, generator).requires_grad_()

@@ -12,7 +12,7 @@ from torch import Tensor
 from kornia_pnpnet.core.checks import check_numbers, check_ranges, check_whole
 from kornia_pnpnet.data.draws import log_uniform, normal, random_poses, uniform
 
-__all__ = ["OutlierDraw", "OutlierMix", "crowded_pixels", "near_offsets", "structured_points"]
+__all__ = ["OutlierDraw", "OutlierMix", "crowd_leaders", "near_offsets", "structured_points"]
 
 # Standard deviations of the pixel noise. The distance of a near outlier from its pixel is log-uniform in this range,
 # from just outside the noise to ten times that.
@@ -32,8 +32,9 @@ class OutlierDraw(NamedTuple):
         near: the pixel is a little off, bool, shape :math:`(B, N)`; ``None``: no pair is.
         structured: the pixel shows the point from another pose, which all structured outliers of a problem share, bool,
             shape :math:`(B, N)`; ``None``: no pair is.
-        crowd: the pixel is one of a few that many outliers of the problem share, bool, shape :math:`(B, N)`; ``None``:
-            no pair is.
+        crowd: the pixel, or the point, is one of a few that many outliers of the problem share, bool, shape
+            :math:`(B, N)`; ``None``: no pair is.
+        of_points: problems whose crowds share points instead of pixels, bool, shape :math:`(B, 1)`; ``None``: none do.
     """
 
     mismatch: Tensor
@@ -41,6 +42,7 @@ class OutlierDraw(NamedTuple):
     near: Tensor | None = None
     structured: Tensor | None = None
     crowd: Tensor | None = None
+    of_points: Tensor | None = None
 
     @property
     def inliers(self) -> Tensor:
@@ -83,6 +85,8 @@ class OutlierMix:
         crowd_share: probability that a problem has *crowds*: a share of its outliers, uniform from 0 to 1, show few
             pixels, those of other pairs of the problem.
         max_crowds: largest number of these pixels; their number is uniform from 1.
+        point_crowd_share: probability that the crowds of a problem share few points instead: many pixels, each of some
+            other point, that a matcher took for the same point.
         min_inliers: smallest number of inliers, which limits the maximum.
 
     Raises:
@@ -111,10 +115,12 @@ class OutlierMix:
         mirrored_share: float = 0.0,
         crowd_share: float = 0.0,
         max_crowds: int = 4,
+        point_crowd_share: float = 0.0,
     ) -> None:
         check_numbers(0.0, 1.0, max_ratio=max_ratio, min_ratio=min_ratio, mismatch_share=mismatch_share)
         check_numbers(0.0, 1.0, near_share=near_share, structured_share=structured_share)
         check_numbers(0.0, 1.0, mirrored_share=mirrored_share, crowd_share=crowd_share)
+        check_numbers(0.0, 1.0, point_crowd_share=point_crowd_share)
         check_numbers(0.0, structured_angle=structured_angle)
         check_ranges(structured_ratio=structured_ratio)
         check_whole(0, min_count=min_count, min_inliers=min_inliers)
@@ -137,6 +143,7 @@ class OutlierMix:
         self.mirrored_share = mirrored_share
         self.crowd_share = crowd_share
         self.max_crowds = max_crowds
+        self.point_crowd_share = point_crowd_share
 
     def max_count(self, n: int) -> int:
         """The largest number of outliers among ``n`` pairs."""
@@ -172,7 +179,7 @@ class OutlierMix:
         rank = torch.empty_like(order).scatter_(1, order, torch.arange(n, device=device).expand(batch_size, n))
         outlier = rank < count
         mismatch = torch.rand(batch_size, n, generator=generator, device=device) < self.mismatch_share
-        near = structured = crowd = None
+        near = structured = crowd = of_points = None
         if self.structured_share:
             chosen = torch.rand(batch_size, 1, generator=generator, device=device) < self.structured_share
             structured = outlier & chosen & (rank < self._most_structured(n - count, generator))
@@ -185,7 +192,9 @@ class OutlierMix:
             share = torch.rand(batch_size, 1, generator=generator, device=device)
             crowd = outlier & chosen & (torch.rand(batch_size, n, generator=generator, device=device) < share)
             outlier = outlier & ~crowd
-        return OutlierDraw(outlier & mismatch, outlier & ~mismatch, near, structured, crowd)
+            if self.point_crowd_share:
+                of_points = torch.rand(batch_size, 1, generator=generator, device=device) < self.point_crowd_share
+        return OutlierDraw(outlier & mismatch, outlier & ~mismatch, near, structured, crowd, of_points)
 
     def _most_structured(self, inliers: Tensor, generator: torch.Generator) -> Tensor:
         """The largest number of structured outliers for each number of inliers, (B, 1)."""
@@ -239,17 +248,17 @@ def structured_points(
     return (cam_points - centre) @ turn.mT + centre + shift
 
 
-def crowded_pixels(img_points: Tensor, max_crowds: int, generator: torch.Generator) -> Tensor:
-    """Draw for each pair the pixel of one of a few pairs of its problem, (B, N, 2): crowds show these.
+def crowd_leaders(batch_size: int, n: int, max_crowds: int, generator: torch.Generator) -> Tensor:
+    """Draw for each pair one of a few pairs of its problem, (B, N): a crowd shows its pixel, or is of its point.
 
     Args:
-        img_points: shape (B, N, 2).
-        max_crowds: largest number of different pixels in a problem; their number is uniform from 1.
+        batch_size: number of problems.
+        n: number of pairs of each problem.
+        max_crowds: largest number of different pairs in a problem; their number is uniform from 1.
         generator: source of randomness.
     """
-    batch_size, n = img_points.shape[:2]
     chance = uniform((batch_size, max_crowds), 0.0, 1.0, generator)
-    leader = (n * chance).long().clamp(max=n - 1)  # (B, max_crowds), pairs whose pixels are shared
+    leader = (n * chance).long().clamp(max=n - 1)  # (B, max_crowds)
     crowds = 1 + (max_crowds * uniform((batch_size, 1), 0.0, 1.0, generator)).long()  # (B, 1)
     crowd = (crowds * uniform((batch_size, n), 0.0, 1.0, generator)).long().clamp(max=max_crowds - 1)
-    return img_points.gather(1, leader.gather(1, crowd)[..., None].expand(-1, -1, 2))
+    return leader.gather(1, crowd)

@@ -20,7 +20,7 @@ from kornia_pnpnet.data.noise import (
     draw_noise,
     hide_sigmas,
 )
-from kornia_pnpnet.data.outliers import OutlierMix, crowded_pixels, near_offsets, structured_points
+from kornia_pnpnet.data.outliers import OutlierMix, crowd_leaders, near_offsets, structured_points
 from kornia_pnpnet.data.points import BoxPoints, PointPrior
 from kornia_pnpnet.types import Problems
 
@@ -194,8 +194,13 @@ class SyntheticProblems:
             offsets = near_offsets(img_sigma, self.n, generator, self.outliers.near_pixels)
             img_points += torch.where(draw.near[..., None], offsets, 0.0)
         if draw.crowd is not None:
-            shared = crowded_pixels(img_points, self.outliers.max_crowds, generator)
-            img_points = torch.where(draw.crowd[..., None], shared, img_points)
+            leader = crowd_leaders(self.batch_size, self.n, self.outliers.max_crowds, generator)[..., None]
+            of_pixels, of_points = draw.crowd[..., None], torch.zeros_like(leader, dtype=torch.bool)
+            if draw.of_points is not None:
+                of_points = of_pixels & draw.of_points[..., None]
+            shared = img_points.take_along_dim(leader, 1), world_points.take_along_dim(leader, 1)
+            img_points = torch.where(of_pixels & ~of_points, shared[0], img_points)
+            world_points = torch.where(of_points, shared[1], world_points)
         known: dict[str, Tensor] = {}
         errors = noise.norm(dim=-1) / img_sigma.reshape(self.batch_size, -1).mean(1, keepdim=True).clamp(min=_TINY)
         if self.known_noise:

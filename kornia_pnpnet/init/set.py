@@ -31,6 +31,11 @@ _FEATURES = 14
 # With confidences: their logit and a flag more. Confidences are clipped to this distance from 0 and from 1.
 _CONFIDENCE_FEATURES = 2
 _LEAST_CONFIDENCE = 1e-3
+# With repeats: the logarithms of the numbers of pairs with the same pixel and with the same point.
+_REPEAT_FEATURES = 2
+# Points are sorted by a sum of their coordinates with these incommensurable factors, so that equal points are
+# neighbours, and points of a grid, too, have different keys.
+_KEY = 1.0, 0.7548776662, 0.5698402910
 # Added to the score of padding.
 _ABSENT = -1e9
 # Minimal samples, as ranks of pairs by likelihood. The first six are a Turán system: whichever two of the six likeliest
@@ -56,7 +61,7 @@ class _View:
     regression).
     """
 
-    def __init__(self, corr: Correspondences, confidence: bool = False) -> None:
+    def __init__(self, corr: Correspondences, confidence: bool = False, repeats: bool = False) -> None:
         world = corr.world_points.contiguous()
         there = (corr.near_weights > 0).to(world.dtype)
         share = (there / there.sum(1, keepdim=True).clamp(min=1.0))[..., None]  # (B, N, 1)
@@ -89,6 +94,8 @@ class _View:
             given = torch.full_like(corr.weights, torch.nan) if corr.confidence is None else corr.confidence
             believed = given.nan_to_num(0.5).clamp(_LEAST_CONFIDENCE, 1.0 - _LEAST_CONFIDENCE)
             flags += [believed.logit(), (~given.isnan()).to(world.dtype)]
+        if repeats:
+            flags += [_same(corr.img_points, there).log(), _same(corr.world_points, there).log()]
         parts = self.points, seen, residual, problem, *(x[..., None] for x in (*noise, *flags))
         self.features = torch.cat(parts, -1).clamp(-_MOST, _MOST)
 
@@ -105,6 +112,18 @@ class _View:
             relative = torch.where(is_known, sigma, 1.0) / torch.where(is_known, unit, 1.0)
             logs.append(relative.clamp(min=_LEAST_NOISE).log())
         return list(zip(logs, known, strict=True))
+
+
+@torch.no_grad()
+def _same(points: Tensor, there: Tensor) -> Tensor:
+    """Number of pairs of the problem whose point is exactly the same, at least 1; ``points`` (B, N, K), (B, N)."""
+    key = sum(x * factor for x, factor in zip(points.unbind(-1), _KEY, strict=False))
+    order = key.argsort(1)  # equal points are neighbours
+    ordered = points.gather(1, order[..., None].expand_as(points))
+    new = functional.pad((ordered[:, 1:] != ordered[:, :-1]).any(-1), (1, 0), value=True)
+    run = new.cumsum(1) - 1
+    sizes = torch.zeros_like(there).scatter_add(1, run, there.gather(1, order))
+    return torch.empty_like(there).scatter(1, order, sizes.gather(1, run)).clamp(min=1.0)
 
 
 def _solve_symmetric(matrix: Tensor, right: Tensor) -> Tensor:
@@ -204,6 +223,7 @@ class SetInit(Configured):
         starts: number of hypotheses of the network, at least 1.
         samples: number of minimal samples of the six likeliest pairs, 0 to 8; more pairs have more samples.
         confidence: whether the network sees the ``confidence`` of the correspondences.
+        repeats: whether the network sees how many pairs have the same pixel and how many have the same point.
 
     Raises:
         BaseError: for numbers out of range, or when ``heads`` does not divide ``width``.
@@ -230,6 +250,7 @@ class SetInit(Configured):
         starts: int = 2,
         samples: int = 6,
         confidence: bool = False,
+        repeats: bool = False,
     ) -> None:
         super().__init__(locals())
         check_whole(1, width=width, layers=layers, heads=heads, hidden=hidden, starts=starts)
@@ -238,7 +259,8 @@ class SetInit(Configured):
         KORNIA_CHECK(width % heads == 0, f"heads must divide width, got {heads} and {width}.")
         self.starts = starts
         self.confidence = confidence
-        self.first = nn.Linear(_FEATURES + (_CONFIDENCE_FEATURES if confidence else 0), width)
+        self.repeats = repeats
+        self.first = nn.Linear(_FEATURES + _CONFIDENCE_FEATURES * confidence + _REPEAT_FEATURES * repeats, width)
         self.blocks = nn.ModuleList(_Block(width, heads, hidden) for _ in range(layers))
         self.norm = nn.LayerNorm(width)
         # Per pair: the logit of being an inlier; per hypothesis a weight and a distance along the ray.
@@ -266,7 +288,7 @@ class SetInit(Configured):
             DeviceError: when the correspondences and the network are on different devices.
         """
         check_devices({"world_points": corr.world_points}, self.pair.bias, "the network")
-        view = _View(corr, self.confidence)
+        view = _View(corr, self.confidence, self.repeats)
         dtype = corr.world_points.dtype
         pair, problem = (x.to(dtype) for x in self._run(view.features, view.there))
         starts = self.starts
