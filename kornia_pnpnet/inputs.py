@@ -11,12 +11,24 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kornia_pnpnet.core.checks import Shapes, check_devices, check_shapes, common_dtype, expand_sigma
+from kornia_pnpnet.core.performance import sees_values
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.types import Noise, Pose, camera_matrices
+from kornia_pnpnet.types import Noise, PnPResult, Pose, camera_matrices
 
-__all__ = ["Inputs", "checked_inputs", "one_batch", "restore_leading"]
+__all__ = [
+    "Inputs",
+    "Part",
+    "checked_inputs",
+    "joined",
+    "one_batch",
+    "restore_leading",
+    "split_batch",
+]
 
 _T = TypeVar("_T")
+
+# Pairs. Problems are not cut to less, so that no solver sees too few.
+_LEAST_PAIRS = 16
 
 
 class Inputs(NamedTuple):
@@ -30,6 +42,22 @@ class Inputs(NamedTuple):
     init: Pose | None
     noise: Noise | None
     confidence: Tensor | None
+
+
+class Part(NamedTuple):
+    """Some problems of a batch.
+
+    Attributes:
+        inputs: the problems.
+        problems: their positions in the batch, (P,); ``None``: they follow those of the part before.
+        pairs: positions of their pairs among the N pairs of the batch, (P, n); ``None``: they have all pairs in order.
+        most_pairs: the number N.
+    """
+
+    inputs: Inputs
+    problems: Tensor | None = None
+    pairs: Tensor | None = None
+    most_pairs: int = 0
 
 
 def checked_inputs(
@@ -117,3 +145,69 @@ def one_batch(x: Tensor, size: torch.Size, dtype: torch.dtype) -> Tensor:
 def restore_leading(size: torch.Size, result: _T) -> _T:
     """Give a result of one batch the leading dimensions that :func:`checked_inputs` returned."""
     return result if len(size) == 1 else map_tensors(lambda x: x.reshape((*size, *x.shape[1:])), result)
+
+
+def split_batch(inputs: Inputs, most: int | None, any_number: bool) -> list[Part]:
+    """Split a batch into the parts that are solved one after the other.
+
+    Only on a CPU, where a small part stays in the caches, and only where values are seen.
+
+    Args:
+        inputs: the batch.
+        most: largest number of pairs of a part for each thread, without gradients; ``None``: the whole batch.
+        any_number: whether parts may have fewer pairs than the batch, so that they have little padding.
+    """
+    batch, count = inputs.world_points.shape[:2]
+    if inputs.world_points.device.type != "cpu" or not sees_values(inputs.world_points) or not batch:
+        return [Part(inputs)]
+    most = batch * count if most is None or torch.is_grad_enabled() else most * torch.get_num_threads()
+    if any_number and inputs.mask is not None:
+        return _without_padding(inputs, most)
+    parts = max(1, min(batch * count // most, batch // 2))
+    if parts == 1:
+        return [Part(inputs)]
+    return [Part(map_tensors(lambda x, i=i: x.tensor_split(parts)[i], inputs)) for i in range(parts)]
+
+
+def _without_padding(inputs: Inputs, most: int) -> list[Part]:
+    """Parts of problems of about the same number of pairs, at least two where there are two."""
+    assert inputs.mask is not None
+    batch, count = inputs.mask.shape
+    counts = inputs.mask.sum(1)
+    if batch * count <= most and int(counts.max()) == count:
+        return [Part(inputs)]
+    # Present pairs first, in order.
+    ranks = torch.where(inputs.mask, inputs.mask.cumsum(1), counts[:, None] + (~inputs.mask).cumsum(1)) - 1
+    order = torch.empty_like(ranks).scatter_(1, ranks, torch.arange(count, device=ranks.device).expand_as(ranks))
+    sizes, problems = counts.sort(stable=True)
+    parts, stop = [], batch
+    while stop:
+        width = min(count, max(int(sizes[stop - 1]), _LEAST_PAIRS))
+        start = max(stop - max(most // width, 2), 0)
+        start = 0 if start == 1 else start
+        at = problems[start:stop]
+        pairs = order[at, :width]
+
+        cameras, init = map_tensors(lambda x, at=at: x[at], (inputs.intrinsics, inputs.init))
+        world, img, _, weights, mask, _, noise, confidence = map_tensors(
+            lambda x, at=at, pairs=pairs: x[at[:, None], pairs], inputs._replace(intrinsics=inputs.mask, init=None)
+        )
+        parts.append(Part(Inputs(world, img, cameras, weights, mask, init, noise, confidence), at, pairs, count))
+        stop = start
+    return parts
+
+
+def joined(parts: list[Part], results: list[PnPResult]) -> PnPResult:
+    """The results of all problems and pairs of a batch from those of its parts."""
+    padded = []
+    for part, result in zip(parts, results, strict=True):
+        if part.pairs is not None:
+            weights = result.weights.new_zeros(len(part.pairs), part.most_pairs)
+            result = result._replace(weights=weights.scatter(1, part.pairs, result.weights))
+        padded.append(result)
+    result = padded[0] if len(padded) == 1 else map_tensors(lambda *x: torch.cat(x), *padded)
+    if parts[0].problems is None:
+        return result
+    problems = torch.cat([part.problems for part in parts if part.problems is not None])
+    back = torch.empty_like(problems).scatter_(0, problems, torch.arange(len(problems), device=problems.device))
+    return map_tensors(lambda x: x[back], result)

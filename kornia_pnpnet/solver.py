@@ -15,12 +15,12 @@ from torch import Tensor, nn
 
 from kornia_pnpnet.core.checks import check_whole
 from kornia_pnpnet.core.linalg import bound_gradient
-from kornia_pnpnet.core.performance import Compiled, compiling, sees_values, split_batch
+from kornia_pnpnet.core.performance import Compiled, sees_values
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import project
 from kornia_pnpnet.init import RANSAC, EPnP, MLPInit, REPPnP, SetInit
 from kornia_pnpnet.init.ransac import search_on
-from kornia_pnpnet.inputs import Inputs, checked_inputs, restore_leading
+from kornia_pnpnet.inputs import Inputs, checked_inputs, joined, restore_leading, split_batch
 from kornia_pnpnet.normalize import VIEWS, Frame, Normalize
 from kornia_pnpnet.pretrained import read_weights, write_weights
 from kornia_pnpnet.refine import LMStart, LMStep, RobustWeightedLM
@@ -174,10 +174,11 @@ class PnPNet(nn.Module):
         size, inputs = checked_inputs(*given)
         with _in_full_precision(inputs.world_points.device.type):
             always = _checked_gradient(gradient or self.gradient) == "always"
-            parts = split_batch(inputs, self._portions(inputs.world_points))
-            results = [self._solve(first_stage_only, always, part) for part in parts]
-        result = results[0] if len(results) == 1 else map_tensors(lambda *x: torch.cat(x), *results)
-        return restore_leading(size, result)
+            compiled = isinstance(self._first, Compiled) or isinstance(self._solve, Compiled)
+            any_number = not (compiled or isinstance(self.init, MLPInit))
+            parts = split_batch(inputs, getattr(self.init, "pairs_at_once", None), any_number)
+            results = [self._solve(first_stage_only, always, part.inputs) for part in parts]
+        return restore_leading(size, joined(parts, results))
 
     def with_guess(
         self,
@@ -244,17 +245,6 @@ class PnPNet(nn.Module):
             self.refine.compile(mode)
 
     # -- the parts of a call -------------------------------------------------------------------------------------------
-
-    def _portions(self, world_points: Tensor) -> int:
-        """Number of parts in which a batch is solved.
-
-        Without gradients, on a CPU, the initialiser's temporaries then stay in the caches.
-        """
-        most = getattr(self.init, "pairs_at_once", None)
-        if most is None or world_points.device.type != "cpu" or torch.is_grad_enabled() or compiling():
-            return 1
-        batch, count = world_points.shape[:2]
-        return max(1, min(batch * count // (most * torch.get_num_threads()), batch // 2))
 
     def _in_parts(self, first_stage_only: bool, always: bool, inputs: Inputs) -> PnPResult:
         return self._parts(first_stage_only, always, inputs)[1]

@@ -23,7 +23,7 @@ def scene(make_problems, correspond, perturb):
 
 def pack(scene, poses):
     """Pose :math:`(P, H)` as one solution each of :math:`H` samples."""
-    return scene.pack(poses.rotation[:, :, None], poses.translation[:, :, None])
+    return scene.pack(poses.rotation.permute(2, 3, 0, 1), poses.translation.permute(2, 0, 1))
 
 
 def textbook(corr, pose, thresholds):

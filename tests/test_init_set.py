@@ -196,9 +196,27 @@ def test_large_batches_are_solved_in_parts(given, make_problems, monkeypatch):
     assert sizes == [7, 7]
     with torch.no_grad():
         parts = net(*p[:3], **extra)
-    assert sizes[2:] == [3, 2, 2]
+    assert sizes[2:] == ([2, 2, 3] if given else [3, 2, 2])
     assert isinstance(parts.init, Pose)
     near(iter_tensors(parts), iter_tensors(whole), 1e-9)
+
+
+def test_padding_costs_nothing(make_problems):
+    """Problems of about the same size are solved together, without the padding of larger ones."""
+    p = make_problems(n=60, batch=30, outliers=20)
+    counts = torch.tensor([20, 33, 57]).repeat(10)
+    mask = torch.rand(30, 60, generator=torch.Generator().manual_seed(0)).argsort(1) < counts[:, None]
+    net, shapes = solver(), []
+    net.init.register_forward_hook(lambda _module, inputs, _output: shapes.append(inputs[0].weights.shape))
+    with torch.no_grad():
+        whole = net(*p[:3], mask=mask)
+        net.init.pairs_at_once = 400 // torch.get_num_threads()
+        parts = net(*p[:3], mask=mask, weights=mask.double(), confidence=mask.double())
+    assert shapes[0] == (30, 57)
+    assert all(b * n <= 400 for b, n in shapes[1:])
+    assert {n for _, n in shapes[1:]} == {20, 33, 57}
+    near(iter_tensors(parts), iter_tensors(whole), 1e-9)
+    assert (parts.weights[~mask] == 0).all()
 
 
 _FAULTS = """

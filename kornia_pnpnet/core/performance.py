@@ -28,7 +28,6 @@ __all__ = [
     "ranked",
     "repeat_problems",
     "sees_values",
-    "split_batch",
     "take_pairs",
     "unfold_vmap",
 ]
@@ -85,13 +84,6 @@ def repeat_problems(tree: _T, count: int) -> _T:
         return _reversed(last.expand(*last.shape[:-2], count, -1).flatten(-2))
 
     return map_tensors(repeat, tree)
-
-
-def split_batch(tree: _T, count: int) -> list[_T]:
-    """Split every tensor of a tree into parts along the batch."""
-    if count == 1:
-        return [tree]
-    return [map_tensors(lambda x, i=i: x.tensor_split(count)[i], tree) for i in range(count)]
 
 
 def _reversed(x: Tensor) -> Tensor:

@@ -33,9 +33,9 @@ _CONFIDENCE_FEATURES = 2
 _LEAST_CONFIDENCE = 1e-3
 # With repeats: the logarithms of the numbers of pairs with the same pixel and with the same point.
 _REPEAT_FEATURES = 2
-# Points are sorted by a sum of their coordinates with these incommensurable factors, so that equal points are
-# neighbours, and points of a grid, too, have different keys.
-_KEY = 1.0, 0.7548776662, 0.5698402910
+# Points are sorted by their first coordinate plus the others times these factors, so that equal points are neighbours;
+# the factors are irrational, so that the points of a grid have different keys.
+_KEY = 0.7548776662, 0.5698402910
 # Added to the score of padding.
 _ABSENT = -1e9
 # Minimal samples, as ranks of pairs by likelihood. The first six are a Turán system: whichever two of the six likeliest
@@ -117,7 +117,9 @@ class _View:
 @torch.no_grad()
 def _same(points: Tensor, there: Tensor) -> Tensor:
     """Number of pairs of the problem whose point is exactly the same, at least 1; ``points`` (B, N, K), (B, N)."""
-    key = sum(x * factor for x, factor in zip(points.unbind(-1), _KEY, strict=False))
+    key, *others = points.unbind(-1)
+    for x, factor in zip(others, _KEY, strict=False):
+        key = key + factor * x
     order = key.argsort(1)  # equal points are neighbours
     ordered = points.gather(1, order[..., None].expand_as(points))
     new = functional.pad((ordered[:, 1:] != ordered[:, :-1]).any(-1), (1, 0), value=True)

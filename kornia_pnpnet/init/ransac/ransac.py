@@ -111,6 +111,8 @@ class RANSAC(Configured):
         (True, [True, True, True, True])
     """
 
+    #: Pairs per core of a part of a batch. Parts have problems of about the same number of pairs.
+    pairs_at_once = 12_000
     #: The weights say which of the pairs that are not near are inliers.
     weighs_far_pairs = True
 
@@ -121,7 +123,7 @@ class RANSAC(Configured):
         threshold: float = 4.0,
         world_threshold: float = 0.0,
         scorer: str | Scorer = "msac",
-        max_samples: int = 1000,
+        max_samples: int = 10_000,
         min_samples: int = 32,
         confidence: float = 0.999,
         local_candidates: int = 3,

@@ -7,7 +7,9 @@ batch and at any place in the batch. Another sampling rule replaces :class:`Samp
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -80,7 +82,7 @@ def draw_likely(numbers: Tensor, upper: Tensor) -> Tensor:
 class Samples:
     r"""The samples that RANSAC tries, for every problem of a batch.
 
-    When the :math:`N` pairs have at most ``most`` subsets, each subset is a sample once, in an order that ``seed``
+    When a problem has at most ``most`` subsets of its pairs, each subset is a sample once, in an order that ``seed``
     fixes. Otherwise ``most`` samples are drawn from the pairs that have a weight, all equally likely or with
     probabilities in proportion to ``chances``.
 
@@ -91,36 +93,37 @@ class Samples:
         seed: seed of the random numbers, which are the same for every problem.
         chances: at least 0, shape :math:`(B, N)`.
 
+    Attributes:
+        counts: number of pairs that have a weight, int64, shape :math:`(B,)`.
+        totals: number of samples of each problem, int64, shape :math:`(B,)`.
+
     Example:
         >>> samples = Samples(torch.ones(1, 4, dtype=torch.bool), size=3, most=10, seed=0)
-        >>> samples.total, sorted(samples.positions(torch.tensor([0]), 0, 4)[0].tolist())
-        (4, [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]])
+        >>> samples.totals.tolist(), sorted(samples.positions(torch.tensor([0]), 0, 4)[0].tolist())
+        ([4], [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]])
     """
 
     def __init__(self, there: Tensor, *, size: int, most: int, seed: int, chances: Tensor | None = None) -> None:
-        pairs = there.shape[1]
-        generator = torch.Generator().manual_seed(seed)  # on the CPU: the same numbers on every device
+        pairs, device = there.shape[1], there.device
         self.size = size
+        self.seed = seed
         self.counts = there.sum(-1)
         # Positions of the pairs that have a weight, then of the others: a stable sort, but faster.
         rank = torch.where(there, there.cumsum(-1), self.counts[:, None] + (~there).cumsum(-1)) - 1
-        order = torch.arange(pairs, device=there.device).expand_as(rank)
+        order = torch.arange(pairs, device=device).expand_as(rank)
         self._present_first = torch.empty_like(rank).scatter_(1, rank, order)  # (B, N)
-        self.enumerated = math.comb(pairs, size) <= most
-        if self.enumerated:
-            table = torch.combinations(torch.arange(pairs), size)
-            self._table = table[torch.randperm(len(table), generator=generator)].to(there.device)
-        else:
-            self._table = torch.rand(most, size, generator=generator, dtype=torch.float64).to(there.device)
-        self.total = len(self._table)
+        subsets = [math.comb(n, size) for n in range(pairs + 1)]
+        self.totals = torch.tensor([min(n, most) for n in subsets], device=device)[self.counts]
+        self._enumerated = self.counts <= max(n for n in range(pairs + 1) if subsets[n] <= most)
+        self._numbers = None if bool(self._enumerated.all()) else _random_numbers(size, most, seed).to(device)
         self.share: Tensor | None = None
-        if chances is not None and not self.enumerated:
+        if chances is not None and self._numbers is not None:
             share = torch.where(there, chances, 0.0).double()
             self.share = share / share.sum(-1, keepdim=True).clamp(min=torch.finfo(share.dtype).tiny)
             self._upper = self.share.gather(1, self._present_first).cumsum(-1)
 
     def positions(self, problems: Tensor, start: int, stop: int) -> Tensor:
-        r"""Samples ``start`` to ``stop - 1`` of some problems.
+        r"""Samples ``start`` to ``stop - 1`` of some problems; those after the last sample of a problem repeat others.
 
         Args:
             problems: indices of the problems, int64, shape :math:`(P,)`.
@@ -128,14 +131,26 @@ class Samples:
             stop: number after the last sample.
 
         Returns:
-            Positions of pairs, int64, shape :math:`(P, H, s)`. Enumerated samples may hold pairs without a weight.
+            Positions of pairs, int64, shape :math:`(P, H, s)`.
         """
-        table = self._table[start:stop]
-        if self.enumerated:
-            return table.expand(len(problems), -1, -1)
+        enumerated = self._enumerated[problems]
+        if self._numbers is None:
+            return self._present(problems, self._listed(problems, enumerated, start, stop))
+        numbers = self._numbers[start:stop]
         if self.share is not None:
-            return self._present(problems, draw_likely(table, self._upper[problems]))
-        return self._present(problems, draw_subsets(table, self.counts[problems]))
+            ranks = draw_likely(numbers, self._upper[problems])
+        else:
+            ranks = draw_subsets(numbers, self.counts[problems])
+        if bool(enumerated.any()):
+            ranks = torch.where(enumerated[:, None, None], self._listed(problems, enumerated, start, stop), ranks)
+        return self._present(problems, ranks)
+
+    def _listed(self, problems: Tensor, enumerated: Tensor, start: int, stop: int) -> Tensor:
+        """Ranks of the samples of problems that are enumerated, (P, H, s); anything for the others."""
+        counts, kind = self.counts[problems].where(enumerated, self.size).unique(return_inverse=True)
+        tables = [_subsets(int(n), self.size, self.seed) for n in counts]
+        at = torch.arange(start, stop, device="cpu")
+        return torch.stack([table[at % len(table)] for table in tables]).to(problems.device)[kind]
 
     def needed(self, problems: Tensor, inliers: Tensor, confidence: float) -> Tensor:
         r"""Number of samples of which at least one has no outlier, see :func:`samples_needed`.
@@ -148,13 +163,15 @@ class Samples:
         Returns:
             float64 of shape :math:`(P,)`.
         """
+        plain = samples_needed(inliers.sum(-1), self.counts[problems], self.size, confidence)
         if self.share is None:
-            return samples_needed(inliers.sum(-1), self.counts[problems], self.size, confidence)
+            return plain
         # As if all pairs were equally likely, as many as the inliers' mean share says (weighted by the share).
         share = torch.where(inliers, self.share[problems], 0.0)
         mass = share.sum(-1)
         count = mass / share.square().sum(-1).clamp(min=torch.finfo(share.dtype).tiny)
-        return samples_needed(mass * count, count, self.size, confidence)
+        likely = samples_needed(mass * count, count, self.size, confidence)
+        return torch.where(self._enumerated[problems], plain, likely)
 
     def spread(self, problems: Tensor, count: int) -> Tensor:
         r"""Positions of ``count`` pairs spread evenly over the pairs that have a weight, shape :math:`(P, count)`.
@@ -172,6 +189,19 @@ class Samples:
     def _present(self, problems: Tensor, ranks: Tensor) -> Tensor:
         """Positions of pairs from their ranks (P, ...) among the pairs that have a weight."""
         return self._present_first[problems].gather(1, ranks.flatten(1)).view_as(ranks)
+
+
+@lru_cache(maxsize=64)
+def _random_numbers(size: int, most: int, seed: int) -> Tensor:
+    """Uniform numbers in [0, 1), (most, size), on the CPU. NumPy's: ``torch.func.jacfwd`` refuses those of PyTorch."""
+    return torch.from_numpy(np.random.default_rng(seed).random((most, size)))
+
+
+@lru_cache(maxsize=256)
+def _subsets(count: int, size: int, seed: int) -> Tensor:
+    """All subsets of ``count`` items in an order that the seed fixes, (C, size), on the CPU."""
+    table = torch.combinations(torch.arange(max(count, size), device="cpu"), size)
+    return table[torch.from_numpy(np.random.default_rng(seed).permutation(len(table)))]
 
 
 def samples_needed(inliers: Tensor, counts: Tensor, size: int, confidence: float) -> Tensor:

@@ -91,22 +91,21 @@ class Scene(NamedTuple):
         )
 
     def pack(self, rotation: Tensor, translation: Tensor) -> Tensor:
-        r"""Bring poses to the form that :func:`standardised_errors` reads.
+        r"""Bring :math:`H` poses of each problem to the form that :func:`standardised_errors` reads.
 
         Args:
-            rotation: rotations of :math:`S` poses from each of :math:`H` samples, shape :math:`(P, H, S, 3, 3)`.
-            translation: translations, shape :math:`(P, H, S, 3)`.
+            rotation: rotations by components, shape :math:`(3, 3, P, H)`.
+            translation: translations by components, shape :math:`(3, P, H)`.
 
         Returns:
             Transposed 3x4 matrices with the depth multiplied by ``depth_scale``. The poses are in the last dimension,
-            where the arithmetic is fastest, shape :math:`(P, 4, 3, S H)`.
+            where the arithmetic is fastest, shape :math:`(P, 4, 3, H)`.
         """
-        batch, samples, slots = translation.shape[:3]
-        out = self.points.new_empty(batch, 4, 3, slots, samples)
-        out[:, :3] = rotation.permute(0, 4, 3, 2, 1)
-        out[:, 3] = translation.permute(0, 3, 2, 1)
-        out[:, :, 2] *= self.depth_scale[..., None]
-        return out.flatten(3)
+        out = self.points.new_empty(translation.shape[1], 4, 3, translation.shape[2])
+        out[:, :3] = rotation.permute(2, 1, 0, 3)
+        out[:, 3] = translation.movedim(0, 1)
+        out[:, :, 2] *= self.depth_scale
+        return out
 
     def unpack(self, packed: Tensor) -> Tensor:
         """The 3x4 matrices :math:`[R | t]` of packed poses, :math:`(P, 4, 3, H)` to :math:`(P, H, 3, 4)`."""
@@ -136,7 +135,7 @@ def standardised_errors(scene: Scene, packed: Tensor) -> Tensor:
         >>> points = torch.tensor([[[0.0, 0.0, 4.0], [1.0, 0.0, 4.0]]])
         >>> corr = Correspondences(points, torch.zeros(1, 2, 2), torch.ones(1, 2), torch.tensor(100.0))
         >>> scene = Scene.make(corr, Thresholds(torch.tensor([10.0]), torch.tensor([0.0])), torch.float64)
-        >>> standardised_errors(scene, scene.pack(torch.eye(3).view(1, 1, 1, 3, 3), torch.zeros(1, 1, 1, 3)))[0, :, 0]
+        >>> standardised_errors(scene, scene.pack(torch.eye(3).view(3, 3, 1, 1), torch.zeros(3, 1, 1)))[0, :, 0]
         tensor([0.0000, 6.2500], dtype=torch.float64)
     """
     count = packed.shape[-1]

@@ -24,9 +24,10 @@ _T = TypeVar("_T")
 # Poses are compared and improved in this precision, which resolves 1e-4 px at the protocol's focal length of 3400 px.
 _DTYPE = torch.float32
 # Number of pairs that score all poses of a round first, see `_rank`.
-_FIRST_PAIRS = 16
-# Factor between two rankings: the number of poses is divided by it, the number of pairs that score multiplied by it.
-_KEPT_ONE_IN = 4
+_FIRST_PAIRS = 24
+# Between two rankings the number of poses is divided by the first, the number of pairs that score multiplied by the
+# second. With more than 90 % outliers the few pairs that score first have hardly an inlier: more must be kept.
+_KEPT_ONE_IN, _MORE = 2, 4
 # Each round draws at least this share of the samples before it. More: fewer rounds, but more needless samples.
 _GROWTH = 0.5
 # Number of samples that are solved at once, up to multiples: twice the numbers in the longest vector of a processor.
@@ -131,23 +132,23 @@ class Search:
 
         if given is not None and len(active):
             rotation, translation = (x.to(_DTYPE) for x in given)
-            packed = self.scene.pack(rotation[:, :, None], translation[:, :, None])
+            packed = self.scene.pack(rotation.permute(2, 3, 0, 1), translation.permute(2, 0, 1))
             matrices = torch.cat((rotation, translation[..., None]), -1)
             improve(active, self.scene.losses(packed, plan.scorer)[active], matrices[active])
             poses[active] += rotation.shape[1]
             if worth:
                 active = active[needed[active] > worth]
         stop = 0
-        while stop < samples.total and len(active):
-            start, stop = stop, min(samples.total, stop + self._round(stop))
+        while len(active):
+            start, stop = stop, min(int(samples.totals[active].max()), stop + self._round(stop))
             parts = active.split(max(1, plan.chunk_size // (stop - start)))
             tops = [self._best_of_samples(part, start, stop) for part in parts]
             top_losses, top_matrices, tested = (torch.cat(parts) for parts in zip(*tops, strict=True))
             poses[active] += tested
-            drawn[active] = stop
+            drawn[active] = samples.totals[active].clamp(max=stop)
             better = (top_losses[:, 0] < loss[active]).nonzero()[:, 0]
             improve(active[better], top_losses[better], top_matrices[better])
-            active = active[needed[active].clamp(min=plan.min_samples) > stop]
+            active = active[needed[active].clamp(min=plan.min_samples).minimum(samples.totals[active]) > stop]
         return Found(_orthonormal(_pose(matrix.to(self.corr.weights))), loss, poses, drawn)
 
     def _round(self, done: int) -> int:
@@ -169,11 +170,19 @@ class Search:
         img_scale, world_scale = take((self.corr.img_scale, self.corr.world_scale), owners)
         sample = Correspondences(world, img, weights[..., 0], self.corr.focal, img_scale, world_scale)
         solved = self.plan.minimal.hypotheses(sample)
-        solved = solved._replace(valid=solved.valid & (weights[..., 0] > 0).all(-1, keepdim=True))
-        pose, valid = map_tensors(lambda x: x[: batch * count].unflatten(0, (batch, count)), solved)
-        packed = scene.pack(pose.rotation, pose.translation)
-        losses, packed = self._rank(problems, scene, packed, valid.mT.flatten(1))
-        return losses, scene.unpack(packed), valid.sum((1, 2))
+        fresh = torch.arange(start, stop, device=problems.device) < self.samples.totals[problems, None]  # (P, H)
+        valid = solved.valid[: batch * count].unflatten(0, (batch, count)) & fresh[..., None]
+        valid = valid.mT.flatten(1)  # (P, S H)
+        number = valid.sum(1)
+        at, valid = _present_first(valid, _VECTOR)
+        row = at % count + count * torch.arange(batch, device=at.device)[:, None]
+        at = (at // count * len(rows) + row).flatten()
+        # Components first, the layout of p3p's results: each is selected along a row of memory.
+        rotation, translation = (
+            x.movedim((0, 1), (-1, -2)).flatten(-2).index_select(-1, at).unflatten(-1, valid.shape) for x in solved.pose
+        )
+        losses, packed = self._rank(problems, scene, scene.pack(rotation, translation), valid)
+        return losses, scene.unpack(packed), number
 
     def _rank(self, problems: Tensor, scene: Scene, packed: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
         """Losses and poses of the best; of many pairs, a few score all poses first, then more pairs the best poses."""
@@ -182,7 +191,7 @@ class Search:
             some = scene.pairs(self.samples.spread(problems, pairs))
             width = max(width // _KEPT_ONE_IN, self.plan.local_candidates)
             _, packed, valid = self._keep(some, packed, valid, width, ordered=False)
-            pairs *= _KEPT_ONE_IN
+            pairs *= _MORE
         losses, packed, _ = self._keep(scene, packed, valid, self.plan.local_candidates)
         return losses, packed
 
@@ -215,7 +224,7 @@ class Search:
         wide = map_tensors(lambda x: limit * x, thresholds)
         moved = least_squares(corr, start, projection, judge(projection, corr, wide).weights)
         pose = take(moved, slice(len(problems)))
-        packed = scene.pack(pose.rotation[:, None, None], pose.translation[:, None, None])
+        packed = scene.pack(pose.rotation.permute(1, 2, 0)[..., None], pose.translation.mT[..., None])
         new_loss = scene.losses(packed, self.plan.scorer)[:, 0]
         better = (new_loss < loss) & loss.isfinite()  # an invalid pose stays invalid
         new_matrix = torch.cat((pose.rotation, pose.translation[..., None]), -1)
@@ -237,6 +246,18 @@ def full_vectors(rows: Tensor) -> Tensor:
     """Repeat the first row at the end until the number of rows fills a processor's vectors."""
     left_over = -len(rows) % _VECTOR
     return torch.cat((rows, rows[:1].expand(left_over, *rows.shape[1:]))) if left_over else rows
+
+
+def _present_first(present: Tensor, multiple: int) -> tuple[Tensor, Tensor]:
+    """Positions of what is present, (P, K) to (P, W), and which of them are no padding; W: a multiple, as few as do."""
+    number = present.sum(1)
+    width = multiple * -(-int(number.max()) // multiple) or multiple
+    problem, at = present.nonzero(as_tuple=True)
+    first = number.cumsum(0) - number
+    rank = torch.arange(len(at), device=at.device) - first[problem]
+    positions = at.new_zeros(len(present), width)
+    positions[problem, rank] = at
+    return positions, torch.arange(width, device=at.device) < number[:, None]
 
 
 def _pose(matrix: Tensor) -> Pose:
