@@ -264,7 +264,8 @@ def search_on(corr: Correspondences, guess: Guess, plan: Plan = FURTHER) -> Gues
         plan: how to search.
 
     Returns:
-        The guess with the best pose, a constant, in place of the last of its poses.
+        The guess with the best pose alone, a constant. Where a problem was searched, the weights are those of a Cauchy
+        kernel at this pose, whose scale is the limit of an inlier: the network's likelihoods misled there.
 
     Raises:
         ValueCheckError: when the initialiser does not estimate the noise.
@@ -280,8 +281,10 @@ def search_on(corr: Correspondences, guess: Guess, plan: Plan = FURTHER) -> Gues
     chances = chances if trusted is None else chances * trusted
     given = map_tensors(lambda *x: torch.stack(x, 1).detach(), *guess.poses)
     found = Search(plan, corr, thresholds, chances).run(given, worth=plan.min_samples)
-    others = map_tensors(lambda x, y: torch.cat((x[:, :-1], y[:, None]), 1), guess.others, found.pose)
-    return guess._replace(others=others)
+    judged = judge(project(found.pose, problems_last(corr)), corr, thresholds)
+    searched = (found.samples > 0)[:, None]
+    weights = torch.where(searched, 1.0 / (1.0 + judged.errors), guess.weights)
+    return guess._replace(pose=found.pose, others=None, weights=weights)
 
 
 class _Constant(torch.autograd.Function):
