@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -58,7 +59,7 @@ class Ours(Contender):
         solver = solver.float().to(device)
         self.solver: nn.Module = solver
         self.device = device
-        self.only_n = int(spec.partition(":")[0].removeprefix("pnpnet-n")) if spec.startswith("pnpnet-n") else None
+        self.only_n = int(found[1]) if (found := re.match(r"pnpnet-n(\d+)", spec)) else None
         if compiled:
             compile_or_raise(self.solver, **({"whole": True} if whole else {}))
 

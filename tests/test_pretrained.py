@@ -39,7 +39,7 @@ def test_success_on_the_protocols_data(n, dtype):
 
 
 def test_these_are_shipped():
-    assert set(shipped_weights()) == {f"pnpnet-n{n}" for n in FLOORS} | {"pnpnet-set"}
+    assert set(shipped_weights()) == {f"pnpnet-n{n}" for n in FLOORS} | {"pnpnet-n9-paper", "pnpnet-set"}
 
 
 @pytest.mark.parametrize("name", ["no-such-name", "", "a/b/c"])

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from measure import ANY, CHI_SQUARE_95, HERE, OURS, PEERS, RESULTS, ROBUST
+from measure import ANY, CHI_SQUARE_95, HERE, OURS, PAPER, PEERS, RESULTS, ROBUST
 from overview_picture import OverviewRow, plot_overview
 
 from kornia_pnpnet import PnPNet
@@ -257,6 +257,7 @@ def page(
     environment = Environment(loader=loader, undefined=StrictUndefined, autoescape=False, **options)
     return environment.get_template("README.md.jinja").render(
         ours=OURS,
+        paper=PAPER,
         any=ANY,
         shipped_views=PnPNet.from_pretrained(OURS).views,
         made=results["paper"]["environment"],

@@ -44,7 +44,8 @@ themed = rc_context(THEME)  #: Decorator of functions that draw.
 # begins with, up to a hyphen. A bound has no marker.
 # fmt: off
 _LOOKS = {
-    "pnpnet": (BLUE, "o", "-"), "pnpnet-set": (BLUE, "D", "-."), "net": (SKY, "o", "--"),
+    "pnpnet": (BLUE, "o", "-"), "pnpnet-n9-paper": (BROWN, "o", "-"), "pnpnet-paper": (BROWN, "o", "-"),
+    "pnpnet-set": (BLUE, "D", "-."), "net": (SKY, "o", "--"),
     "epnp": (VERMILION, "v", "--"), "epnp-lm": (VERMILION, "v", "-"),
     "reppnp": (GREEN, "^", "--"), "reppnp-lm": (GREEN, "^", "-"), "ransac-epnp-lm": (PINK, "s", "-"),
     "p3p-ransac": (ORANGE, "P", "-"), "p3p-ransac-noise": (ORANGE, "D", "--"), "identity-lm": (BROWN, "X", "-."),

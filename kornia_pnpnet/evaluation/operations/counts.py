@@ -19,10 +19,11 @@ from kornia_pnpnet.solver import PnPNet
 
 __all__ = ["SOLVERS", "complexity_results", "operation_count"]
 
-#: The solvers of figure 1. ``net`` and ``pnpnet`` are networks built for each number of pairs.
+#: The solvers of figure 1. ``net``, ``pnpnet`` and ``pnpnet-paper`` are networks built for each number of pairs.
 SOLVERS = (
     "net",
     "pnpnet",
+    "pnpnet-paper",
     "pnpnet-set",
     "epnp",
     "epnp-lm",
@@ -35,7 +36,7 @@ SOLVERS = (
 
 # Shipped solvers behind the names without n. Their networks are replaced by untrained ones for n pairs: a count depends
 # on the architecture alone.
-_ANY_N = {"net": "net-n9", "pnpnet": "pnpnet-n9"}
+_ANY_N = {"net": "net-n9", "pnpnet": "pnpnet-n9", "pnpnet-paper": "pnpnet-n9-paper"}
 # Problems in a run. RANSAC pads its samples to multiples of 64, so a batch of 64 needs next to no padding.
 _BATCH = 64
 
@@ -45,7 +46,7 @@ def operation_count(solver: str | PnPNet, n: int, *, outliers: int = 0) -> float
 
     Args:
         solver: the solver, or its name as for :func:`~kornia_pnpnet.evaluation.named_solvers.load_solver`. The names
-            ``net`` and ``pnpnet`` stand for networks that are built for ``n`` pairs.
+            ``net``, ``pnpnet`` and ``pnpnet-paper`` stand for networks that are built for ``n`` pairs.
         n: number of pairs, at least 3.
         outliers: number of outliers among them. Only the counts of RANSAC depend on it.
 
