@@ -153,8 +153,9 @@ class PnPNet(nn.Module):
             world_sigma: standard deviation of the noise on each world coordinate, in the unit of ``world_points``;
                 shapes and NaN as for ``img_sigma``.
             confidence: your own belief that a pair is an inlier, in [0, 1], for example a matcher's score, shape
-                :math:`(B, N)`; NaN where unknown. Minimal samples are drawn from likely pairs more often, and a network
-                that was trained with confidences sees them. What they are worth may differ between problems.
+                :math:`(B, N)`; NaN where unknown. :func:`~kornia_pnpnet.confidence.fit_confidence` makes it from raw
+                scores. Minimal samples are drawn from likely pairs more often, and a network that was trained with
+                confidences sees them. What they are worth may differ between problems.
             first_stage_only: return the first guess unrefined, the paper's "Net", at the cost of ``m=0``.
             gradient: ``"ok"`` or ``"always"``; the solver's own when ``None``.
 

@@ -14,7 +14,7 @@ import kornia_pnpnet
 
 REPO = Path(__file__).resolve().parents[1]
 DOCS = REPO / "docs"
-PAGES = [DOCS / "index.md", *sorted((DOCS / "howto").glob("*.md"))]
+PAGES = [DOCS / "index.md", DOCS / "solvers.md", *sorted((DOCS / "howto").glob("*.md"))]
 
 
 @pytest.mark.slow

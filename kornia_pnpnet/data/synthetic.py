@@ -69,7 +69,7 @@ class SyntheticProblems:
         known_noise: share of the problems that come with both sigmas. A third of the other problems come with one of
             them; unknown sigmas are NaN.
         confidence_share: share of the problems that come with confidences, see
-            :func:`~kornia_pnpnet.data.noise.draw_confidence`.
+            ``data.noise.draw_confidence``.
         bunched_share: share of the problems whose inliers are bunched in a part of the image; the points and pixels of
             outliers, but for *near* and *structured* ones, come from the rest of the scene.
         dtype: dtype of the batches; numbers are drawn in float64 and cast.
