@@ -29,8 +29,11 @@ from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.core.files import read_npz
 from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.data.colmap import _find_model
+from kornia_pnpnet.evaluation.bounds import Bound
 from kornia_pnpnet.evaluation.named_solvers import load_solver
 from kornia_pnpnet.evaluation.results import save_results
+from kornia_pnpnet.types import PnPResult, Pose
+from kornia_pnpnet.types import Problems as SolverProblems
 
 Floats = NDArray[np.float64]
 Whole = NDArray[np.int64]
@@ -349,47 +352,71 @@ def read(paths: Sequence[Path]) -> Problems:
 # --- Solvers on problems ----------------------------------------------------------------------------------------------
 
 
+def batches(problems: Problems) -> list[Tensor]:
+    """Indices of problems of one kind with similar numbers of pairs, at most ``BATCH`` of them."""
+    pairs = problems.mask.sum(1)
+    kinds = ((problems.kind == kind).nonzero()[:, 0] for kind in range(len(KINDS)))
+    return [part for at in kinds if len(at) for part in at[pairs[at].argsort()].split(BATCH)]
+
+
+def batch(problems: Problems, at: Tensor, dtype: torch.dtype) -> tuple[SolverProblems, Tensor, Tensor]:
+    """Some of the problems without common padding, the ratios, and the points that became the origins.
+
+    A world far from its origin would lose digits in float32. Padding has the ratio 1.
+    """
+    mask = problems.mask[at]
+    longest = int(mask.sum(1).max())
+    origin = (problems.world[at] * mask[..., None]).sum(1) / mask.sum(1, keepdim=True)
+    world = problems.world[at] - origin[:, None]
+    translation = problems.translation[at] + (problems.rotation[at] @ origin[..., None])[..., 0]
+    made = SolverProblems(
+        world[:, :longest].to(dtype),
+        problems.pixels[at][:, :longest].to(dtype),
+        problems.intrinsics[at].to(dtype),
+        Pose(problems.rotation[at].to(dtype), translation.to(dtype)),
+        problems.inliers[at][:, :longest],
+    )
+    return made, problems.ratio[at].where(mask, 1.0)[:, :longest].to(dtype), origin
+
+
+def call(solver: nn.Module, spec: str, given: SolverProblems, mask: Tensor, ratio: Tensor) -> PnPResult:
+    """Solve a batch; a bound sees the reference poses."""
+    if isinstance(solver, Bound):
+        return solver.solve_with_truth(given)
+    confidence = {"confidence": 1 - ratio} if spec.endswith(CONFIDENCE) else {}
+    return solver(given.world_points, given.img_points, given.intrinsics, mask=mask, **confidence)
+
+
 @torch.no_grad()
 def solve(
     solvers: Mapping[str, nn.Module], problems: Problems, dtype: torch.dtype
-) -> dict[str, tuple[Tensor, Tensor, Tensor, float]]:
-    """Solve all problems with all solvers, which take turns on each batch of problems with similar numbers of pairs.
+) -> dict[str, tuple[Tensor, Tensor, Tensor, Tensor]]:
+    """Solve all problems with all solvers, which take turns on each batch.
 
     Returns:
-        By solver: rotations, translations, ``ok``, and seconds of the processor for all problems.
+        By solver: rotations, translations, ``ok``, and the milliseconds of the processor for each problem, which are
+        the same for all problems of a batch.
     """
-    found = {
-        spec: (torch.zeros_like(problems.rotation), torch.zeros_like(problems.translation), problems.kind > 2)
-        for spec in solvers
-    }
-    times = dict.fromkeys(solvers, 0.0)
-    order = problems.mask.sum(1).argsort()
-    batches = order.split(BATCH)
-    for number, at in enumerate(batches):
-        longest = int(problems.mask[at].sum(1).max())
-        # Centred in float64: a world far from its origin would lose digits in float32.
-        centre = (problems.world[at] * problems.mask[at][..., None]).sum(1) / problems.mask[at].sum(1, keepdim=True)
-        world = (problems.world[at] - centre[:, None])[:, :longest].to(dtype)
-        given = world, problems.pixels[at][:, :longest].to(dtype), problems.intrinsics[at].to(dtype)
-        options = {"mask": problems.mask[at][:, :longest]}
+    found = {}
+    for spec in solvers:
+        empty = torch.zeros_like(problems.rotation), torch.zeros_like(problems.translation)
+        found[spec] = (*empty, torch.zeros_like(problems.counts), torch.zeros_like(problems.kind))
+    parts = batches(problems)
+    for number, at in enumerate(parts):
+        given, ratio, origin = batch(problems, at, dtype)
+        mask = problems.mask[at][:, : ratio.shape[1]]
         for spec, solver in solvers.items():
-            say(f"batch {number + 1} of {len(batches)}: {spec}")
-            confidence = {"confidence": 1 - problems.ratio[at][:, :longest].to(dtype)} if with_ratio(spec) else {}
-            if number == 0:  # not timed: slower
-                solver(*(value[:2] for value in given), **{k: v[:2] for k, v in {**options, **confidence}.items()})
+            say(f"batch {number + 1} of {len(parts)}: {spec}")
+            call(solver, spec, given.map(lambda value: value[:2]), mask[:2], ratio[:2])  # not timed: slower
             start = time.process_time()
-            result = solver(*given, **options, **confidence)
-            times[spec] += time.process_time() - start
-            rotation, translation, ok = found[spec]
+            result = call(solver, spec, given, mask, ratio)
+            milliseconds = 1e3 * (time.process_time() - start) / len(at)
+            rotation, translation, ok, times = found[spec]
             rotation[at] = result.rotation.double()
-            translation[at] = result.translation.double() - (rotation[at] @ centre[..., None])[..., 0]
+            translation[at] = result.translation.double() - (rotation[at] @ origin[..., None])[..., 0]
             ok[at] = result.ok
-    return {spec: (*found[spec], times[spec]) for spec in solvers}
-
-
-def with_ratio(spec: str) -> bool:
-    """Whether a solver gets confidences."""
-    return spec.endswith(CONFIDENCE)
+            times[at] = milliseconds
+    return found
 
 
 def pose_errors(problems: Problems, rotation: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
@@ -430,7 +457,7 @@ def measure(paths: Sequence[Path], specs: Sequence[str], dtype: torch.dtype) -> 
 
     Args:
         paths: files of :func:`make`.
-        specs: solvers as for :func:`load_solver`, with :data:`CONFIDENCE` at the end to pass ``1 - ratio``.
+        specs: solvers and bounds as for :func:`load_solver`, with :data:`CONFIDENCE` at the end to pass ``1 - ratio``.
         dtype: dtype that the solvers get.
 
     Returns:
@@ -444,7 +471,7 @@ def measure(paths: Sequence[Path], specs: Sequence[str], dtype: torch.dtype) -> 
         solved = solve(solvers, problems, dtype)
     chosen = groups(problems)
     rows = []
-    for spec, (rotation, translation, ok, seconds) in solved.items():
+    for spec, (rotation, translation, ok, times) in solved.items():
         angle, distance = pose_errors(problems, rotation, translation)
         right = (angle < RIGHT[0]) & (distance < RIGHT[1])
         far = (angle > FAR[0]) | (distance > FAR[1])
@@ -452,7 +479,7 @@ def measure(paths: Sequence[Path], specs: Sequence[str], dtype: torch.dtype) -> 
             rates = {"success": rate(right[at]), "far": rate(far[at])}
             told = {"ok_of_right": rate(ok[at & right]), "ok_of_far": rate(ok[at & far])}
             row = {"solver": spec, "kind": kind, "group": group, "count": int(at.sum()), **rates, **told}
-            rows.append({**row, "ms_per_problem": 1e3 * seconds / len(problems.kind)})
+            rows.append({**row, "ms_per_problem": float(times[at].mean()) if at.any() else None})
     limits = {"inlier_px": INLIER_PX, "min_inliers": MIN_INLIERS, "right": RIGHT, "far": FAR}
     settings = {"files": [path.name for path in paths], "solvers": list(specs), "dtype": str(dtype), **limits}
     made = {"environment": environment(), "settings": settings, "load_average": [before, load()]}
@@ -506,12 +533,15 @@ def format_table(rows: Sequence[Mapping[str, Any]], kind: str, groups: Sequence[
     def percent(value: float | None) -> str:
         return "–" if value is None else f"{100 * value:.1f}"
 
+    def milliseconds(value: float | None) -> str:
+        return "–" if value is None else f"{value:.2f}"
+
     header = [kind, "ms", *(f"{group} ({numbers[group]['count']})" for group in groups), "ok of right", "ok of far off"]
     lines = []
     for spec, found in table.items():
         told = [percent(found["all"][name]) for name in ("ok_of_right", "ok_of_far")]
         rates = [percent(found[group]["success"]) for group in groups]
-        lines.append([f"`{spec}`", f"{found['all']['ms_per_problem']:.2f}", *rates, *told])
+        lines.append([f"`{spec}`", milliseconds(found["all"]["ms_per_problem"]), *rates, *told])
     return markdown_table(header, lines, pad=True)
 
 
