@@ -353,9 +353,9 @@ def read(paths: Sequence[Path]) -> Problems:
 
 
 def batches(problems: Problems) -> list[Tensor]:
-    """Indices of problems of one kind with similar numbers of pairs, at most ``BATCH`` of them."""
+    """Indices of problems that count, of one kind and with similar numbers of pairs, at most ``BATCH`` of them."""
     pairs = problems.mask.sum(1)
-    kinds = ((problems.kind == kind).nonzero()[:, 0] for kind in range(len(KINDS)))
+    kinds = ((problems.counts & (problems.kind == kind)).nonzero()[:, 0] for kind in range(len(KINDS)))
     return [part for at in kinds if len(at) for part in at[pairs[at].argsort()].split(BATCH)]
 
 
@@ -391,7 +391,7 @@ def call(solver: nn.Module, spec: str, given: SolverProblems, mask: Tensor, rati
 def solve(
     solvers: Mapping[str, nn.Module], problems: Problems, dtype: torch.dtype
 ) -> dict[str, tuple[Tensor, Tensor, Tensor, Tensor]]:
-    """Solve all problems with all solvers, which take turns on each batch.
+    """Solve all problems that count with all solvers, which take turns on each batch.
 
     Returns:
         By solver: rotations, translations, ``ok``, and the milliseconds of the processor for each problem, which are
