@@ -11,7 +11,7 @@ from kornia_pnpnet.core.checks import check_devices, check_whole
 from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.linalg import dot, small_product
 from kornia_pnpnet.core.performance import take_pairs
-from kornia_pnpnet.geometry import align, pixel_variance, project
+from kornia_pnpnet.geometry import align, project
 from kornia_pnpnet.init.ransac import p3p
 from kornia_pnpnet.types import Correspondences, Guess, Noise, Pose
 
@@ -49,6 +49,8 @@ _RING = {36: [(a, b, c) for i in range(25) for a, b, c in [sorted((i, (i + 1) % 
 MOST_JUDGES = 32
 # Variances. Squared residuals of this size halve the score of a pair.
 _JUDGED = 50.0
+# Normalised units. A pose that has the centre of the world nearer than this counts as this near.
+_NEAREST = 0.5
 # Score of a pair whose likelihood is 0, relative to a pair whose likelihood is 1.
 _LEAST_VOTE = 0.5
 
@@ -367,7 +369,11 @@ class SetInit(Configured):
         world, img, vote, *sigmas = (x.permute(1, 2, 0)[..., None, :] for x in pairs.split((3, 2, 1, 1, 1)))
         judges = Correspondences(world, img, vote[..., 0], corr.focal)
         projection = project(every, judges)
-        variance = pixel_variance(projection, Noise(*(x[..., 0] for x in sigmas)), corr.focal)
+        # The variance at the depth of the network's pose: by each pose's own depths, a pose close to the points would
+        # explain most pixels.
+        img, world = (x[..., 0] for x in sigmas)
+        depth = fallback.translation[2, :, None].clamp(min=_NEAREST)  # (B, 1)
+        variance = img.square() + (corr.focal * world / depth).square()
         support = judges.weights / (1.0 + projection.sq_residual / (_JUDGED * variance))
         support = torch.where(projection.in_front, support, 0.0).sum(1)[..., 0]  # (H, B)
         best = torch.where(valid.flatten(0, 1), support, -1.0).max(0)

@@ -42,8 +42,11 @@ __all__ = ["FURTHER", "RANSAC", "search_on"]
 
 # Number of least-squares steps from the best pose, which is near the minimum already.
 _FINAL_STEPS = 2
-# Standard deviations. :func:`search_on` counts nearer pairs as inliers.
-_INLIER = 3.0
+# Standard deviations. :func:`search_on` counts nearer pairs as inliers. Wide: networks estimate too little noise where
+# most pairs are wrong, and more wrong pairs near a wrong pose matter less than right pairs that do not count.
+_INLIER = 10.0
+# Normalised units. A guess that has the centre of the world nearer than this counts as this near.
+_NEAREST = 0.5
 # A pair whose weight or confidence is 0 is drawn this often, relative to a pair where it is 1. Networks mislead more
 # often than callers: where repeated structure or crowds agree, for example.
 _DOUBT, _LEAST_TRUST = 0.5, 0.05
@@ -253,8 +256,10 @@ def search_on(corr: Correspondences, guess: Guess, plan: Plan = FURTHER) -> Gues
     r"""Go on searching where the poses of a guess do not suffice, with samples of likely inliers.
 
     Samples hold pairs in proportion to a half plus half the weight of the guess, times the caller's confidence: weights
-    that mislead then cost some samples, but no pose. An inlier is within three standard deviations of the guess' noise
-    (its mean over the pairs). The best pose of the guess, improved on its inliers, stands for
+    that mislead then cost some samples, but no pose. An inlier is within ten standard deviations of the guess' noise (its
+    mean over the pairs), as far as the noise moves the pixel of a point as far away as the centre of the world in the
+    guess: the same limit for all poses. With a limit by each pose's own depths, a pose close to the points would have
+    most inliers. The best pose of the guess, improved on its inliers, stands for
     ``plan.min_samples`` samples: a problem for which so many suffice at ``plan.confidence`` is not searched. Problems
     that are done leave the batch, and no problem's result depends on the others.
 
@@ -275,7 +280,9 @@ def search_on(corr: Correspondences, guess: Guess, plan: Plan = FURTHER) -> Gues
     corr = corr._replace(noise=None).map(lambda x: x.detach().contiguous())
     there = corr.weights > 0
     share = there / there.sum(-1, keepdim=True).clamp(min=1)
-    thresholds = Thresholds(*(_INLIER * (torch.where(there, x.detach(), 0.0) * share).sum(-1) for x in guess.noise))
+    img, world = (_INLIER * (torch.where(there, x.detach(), 0.0) * share).sum(-1) for x in guess.noise)
+    depth = guess.pose.translation[:, 2].detach().clamp(min=_NEAREST)
+    thresholds = Thresholds(torch.hypot(img, corr.focal * world / depth), torch.zeros_like(world))
     chances = _DOUBT + (1.0 - _DOUBT) * guess.weights.detach()
     trusted = _trusted(corr.confidence)
     chances = chances if trusted is None else chances * trusted
