@@ -24,6 +24,7 @@ __all__ = [
     "Judged",
     "Thresholds",
     "chance_of_inlier",
+    "chance_of_others",
     "explains",
     "has_enough",
     "is_evident",
@@ -35,6 +36,10 @@ __all__ = [
 MAX_ERROR = 1e6
 #: A pose is evident when fewer poses than this are expected to have as many inliers by chance.
 MAX_FALSE_ALARMS = 0.01
+# Pairs. The pixels of this many stand for those of all pairs in :func:`chance_of_others`.
+_MOST_OTHERS = 128
+# Hits. So many by others say nothing: of few pairs, two may be close.
+_FEW_HITS = 4
 # Standard deviations. Pairs further off than this are no evidence for a pose.
 _EVIDENT = 3.5
 # Radii of the disc of the worst inlier. Nearer outliers say nothing about chance: they are pairs that are slightly off,
@@ -105,6 +110,7 @@ def is_evident(projection: Projection, corr: Correspondences) -> Tensor:
     inliers, counts = (judged.weights > 0).sum(-1), (corr.weights > 0).sum(-1)
     chance = chance_of_inlier(corr, thresholds, judged)
     triples = counts * (counts - 1) * (counts - 2) // 6  # any three pairs could have given the pose
+    chance = chance.maximum(chance_of_others(projection, corr, thresholds, judged))
     evident = log_false_alarms(triples, inliers, counts, chance) < math.log(MAX_FALSE_ALARMS)
     return evident & _span_a_plane(corr.world_points, judged.weights > 0)
 
@@ -220,6 +226,40 @@ def chance_of_inlier(corr: Correspondences, thresholds: Thresholds, judged: Judg
     others = ((corr.weights > 0).sum(-1, keepdim=True) - MIN_PAIRS).clamp(min=1)
     by_outliers = within / others * worst / sq_distance.maximum(_REACH**2 * worst)
     return anywhere.maximum(by_outliers.amax(-1)).clamp(max=1.0)
+
+
+def chance_of_others(projection: Projection, corr: Correspondences, thresholds: Thresholds, judged: Judged) -> Tensor:
+    """Share of the pixels of other pairs that are as near to a point's projection as the worst inlier's pixel to its own.
+
+    Pixels are not uniform: many outliers may have the same pixel, and a pose from which all points are seen in a small
+    part of the image finds many pixels there.
+
+    Args:
+        projection: :func:`~kornia_pnpnet.geometry.project` of the pose.
+        corr: normalised correspondences.
+        thresholds: what counts as an inlier.
+        judged: what :func:`judge` returned.
+
+    Returns:
+        At most 1, shape :math:`(B,)`. Of more than 128 pairs, evenly spaced ones stand for all.
+    """
+    there = corr.weights > 0
+    worst = torch.where(judged.weights > 0, judged.errors, 0.0).amax(-1, keepdim=True)
+    limit = (
+        _of_pairs(thresholds.img).square() + (corr.focal * _of_pairs(thresholds.world) * projection.inv_depth).square()
+    )
+    limit = torch.where(projection.in_front & there, worst * limit, -1.0)
+    count = corr.weights.shape[1]
+    step = 1 if exporting() else -(-count // _MOST_OTHERS)
+    u, v = (
+        (corr.focal * x)[:, :, None] - y[:, None, ::step]
+        for x, y in zip(projection.plane_points, corr.img_points.unbind(-1), strict=True)
+    )
+    hits = (torch.addcmul(u * u, v, v) <= limit[..., None]) & there[:, None, ::step]
+    own = torch.arange(count, device=there.device)
+    hits = hits & (own[:, None] != own[::step])
+    tested = there.sum(-1) * there[:, ::step].sum(-1) - there[:, ::step].sum(-1)
+    return (hits.sum((1, 2)) - _FEW_HITS).clamp(min=0) / tested.clamp(min=1)
 
 
 def _of_pairs(threshold: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.linalg import relative
 from kornia_pnpnet.core.performance import problems_last
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.geometry import project
+from kornia_pnpnet.geometry import Projection, project
 from kornia_pnpnet.init.ransac.minimal import MinimalSolver, describe
 from kornia_pnpnet.init.ransac.p3p import P3P
 from kornia_pnpnet.init.ransac.scoring import SCORERS, Scorer
@@ -33,6 +33,7 @@ from kornia_pnpnet.refine.verdict import (
     Judged,
     Thresholds,
     chance_of_inlier,
+    chance_of_others,
     judge,
     log_false_alarms,
 )
@@ -191,7 +192,7 @@ class RANSAC(Configured):
             found = Search(self.plan, detached, thresholds, _trusted(detached.confidence)).run(given)
         pose, judged = self._refine(corr, found.pose, thresholds)
         with torch.no_grad():
-            ok = self._is_evident(found, corr, thresholds, judged)
+            ok = self._is_evident(found, detached, thresholds, judged, project(pose, problems_last(detached)))
         offset = (pose.rotation @ centre[..., None])[..., 0]
         return Guess(Pose(pose.rotation, pose.translation - offset), judged.weights, ok)
 
@@ -222,10 +223,13 @@ class RANSAC(Configured):
         pose, judged = map_tensors(lambda *parts: torch.cat(parts), *results)
         return map_tensors(torch.Tensor.contiguous, pose), judged
 
-    def _is_evident(self, found: Found, corr: Correspondences, thresholds: Thresholds, judged: Judged) -> Tensor:
+    def _is_evident(
+        self, found: Found, corr: Correspondences, thresholds: Thresholds, judged: Judged, projection: Projection
+    ) -> Tensor:
         """Whether a pose has more inliers than chance would give it, (B,)."""
         inliers, counts = (judged.weights > 0).sum(-1), (corr.weights > 0).sum(-1)
         chance = chance_of_inlier(corr, thresholds, judged)
+        chance = chance.maximum(chance_of_others(projection, corr, thresholds, judged))
         # Every number of inliers from 4 to all pairs is another test of the same pose.
         tests = found.poses * (counts - MIN_PAIRS).clamp(min=1)
         rare = log_false_alarms(tests, inliers, counts, chance) < math.log(MAX_FALSE_ALARMS)
@@ -257,9 +261,9 @@ def search_on(corr: Correspondences, guess: Guess, plan: Plan = FURTHER) -> Gues
 
     Samples hold pairs in proportion to a half plus half the weight of the guess, times the caller's confidence: weights
     that mislead then cost some samples, but no pose. An inlier is within ten standard deviations of the guess' noise (its
-    mean over the pairs), as far as the noise moves the pixel of a point as far away as the centre of the world in the
-    guess: the same limit for all poses. With a limit by each pose's own depths, a pose close to the points would have
-    most inliers. The best pose of the guess, improved on its inliers, stands for
+    mean over the pairs). The limit is that of a point as far away as the centre of the world in the guess, for all poses:
+    with a limit by each pose's own depths, a pose close to the points would have most inliers. The best pose of the
+    guess, improved on its inliers, stands for
     ``plan.min_samples`` samples: a problem for which so many suffice at ``plan.confidence`` is not searched. Problems
     that are done leave the batch, and no problem's result depends on the others.
 
