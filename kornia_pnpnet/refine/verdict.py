@@ -229,7 +229,7 @@ def chance_of_inlier(corr: Correspondences, thresholds: Thresholds, judged: Judg
 
 
 def chance_of_others(projection: Projection, corr: Correspondences, thresholds: Thresholds, judged: Judged) -> Tensor:
-    """Share of the pixels of other pairs that are as near to a point's projection as the worst inlier's pixel to its own.
+    """Share of other pairs' pixels that are as near to a point's projection as the worst inlier's pixel to its own.
 
     Pixels are not uniform: many outliers may have the same pixel, and a pose from which all points are seen in a small
     part of the image finds many pixels there.

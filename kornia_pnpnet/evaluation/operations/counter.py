@@ -36,17 +36,19 @@ def _each(names: str, cost: float) -> dict[str, float]:
 # Cost for each entry of the result. The first rows only create, move or view data, change signs or draw random
 # numbers, which costs nothing.
 _ELEMENTWISE: dict[str, float] = {
-    **_each("_to_copy _unsafe_view alias arange cat clone constant_pad_nd copy detach diag_embed", 0),
+    **_each("_local_scalar_dense _to_copy _unsafe_view alias arange cat clone constant_pad_nd copy detach diag_embed", 0),
     **_each("diagonal empty empty_like expand eye fill flip full full_like gather index index_put", 0),
     **_each("index_select lift_fresh masked_select neg new_empty new_full new_ones new_zeros nonzero", 0),
     **_each("ones ones_like permute promote_types rand randperm repeat scalar_tensor scatter select", 0),
     **_each("slice split split_with_sizes squeeze stack t take_pairs transpose unbind unsqueeze view zero", 0),
     **_each("zeros zeros_like", 0),
-    **_each("add rsub sub", ADD),
+    **_each("add rsub scatter_add sub", ADD),
     **_each("mul", MULTIPLY),
-    **_each("div floor_divide reciprocal", DIVIDE),
+    **_each("div floor_divide reciprocal remainder", DIVIDE),
     **_each("sqrt", SQRT),
     **_each("rsqrt", SQRT + DIVIDE),
+    **_each("hypot", SQRT + ADD + 2 * MULTIPLY),
+    **_each("logit", LOG + ADD + DIVIDE),
     **_each("exp expm1", EXP),
     **_each("acos atan2 cos lgamma log log1p sin tanh", LOG),
     **_each("sigmoid", EXP + ADD + DIVIDE),
@@ -116,6 +118,8 @@ def _operations(name: str, call: dict[str, Any], output: Any) -> float:
     if name in _ROWS:
         entries, length = _rows(call)
         return entries // length * _ROWS[name](length)
+    if name == "_unique2":
+        return sort(call["self"].numel())
     if name in ("sort", "topk", "kthvalue"):
         length = call["self"].shape[call["dim"]]
         rows = call["self"].numel() // max(length, 1)

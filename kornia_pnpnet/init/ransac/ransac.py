@@ -260,10 +260,10 @@ def search_on(corr: Correspondences, guess: Guess, plan: Plan = FURTHER) -> Gues
     r"""Go on searching where the poses of a guess do not suffice, with samples of likely inliers.
 
     Samples hold pairs in proportion to a half plus half the weight of the guess, times the caller's confidence: weights
-    that mislead then cost some samples, but no pose. An inlier is within ten standard deviations of the guess' noise (its
-    mean over the pairs). The limit is that of a point as far away as the centre of the world in the guess, for all poses:
-    with a limit by each pose's own depths, a pose close to the points would have most inliers. The best pose of the
-    guess, improved on its inliers, stands for
+    that mislead then cost some samples, but no pose. An inlier is within ten standard deviations of the guess' noise
+    (its mean over the pairs). The limit is that of a point as far away as the centre of the world in the guess, for all
+    poses: with a limit by each pose's own depths, a pose close to the points would have most inliers. The best pose of
+    the guess, improved on its inliers, stands for
     ``plan.min_samples`` samples: a problem for which so many suffice at ``plan.confidence`` is not searched. Problems
     that are done leave the batch, and no problem's result depends on the others.
 
