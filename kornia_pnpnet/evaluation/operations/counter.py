@@ -36,8 +36,8 @@ def _each(names: str, cost: float) -> dict[str, float]:
 # Cost for each entry of the result. The first rows only create, move or view data, change signs or draw random
 # numbers, which costs nothing.
 _ELEMENTWISE: dict[str, float] = {
-    **_each("_local_scalar_dense _to_copy _unsafe_view alias arange cat clone constant_pad_nd copy detach diag_embed", 0),
-    **_each("diagonal empty empty_like expand eye fill flip full full_like gather index index_put", 0),
+    **_each("_local_scalar_dense _to_copy _unsafe_view alias arange cat clone constant_pad_nd copy detach", 0),
+    **_each("diag_embed diagonal empty empty_like expand eye fill flip full full_like gather index index_put", 0),
     **_each("index_select lift_fresh masked_select neg new_empty new_full new_ones new_zeros nonzero", 0),
     **_each("ones ones_like permute promote_types rand randperm repeat scalar_tensor scatter select", 0),
     **_each("slice split split_with_sizes squeeze stack t take_pairs transpose unbind unsqueeze view zero", 0),
@@ -55,7 +55,7 @@ _ELEMENTWISE: dict[str, float] = {
     **_each("addcmul", MULTIPLY + ADD),
     **_each("lerp", 2 * ADD + MULTIPLY),
     **_each("linalg_cross", ADD + 2 * MULTIPLY),
-    **_each("ceil clamp_min eq ge gt le lt maximum minimum ne relu", COMPARE),
+    **_each("ceil clamp_min eq ge gt isnan le lt maximum minimum ne relu", COMPARE),
     **_each("abs copysign nan_to_num sgn sign", 2 * COMPARE),
     **_each("bitwise_and bitwise_not bitwise_or masked_fill where", LOGIC),
 }
