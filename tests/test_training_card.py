@@ -10,7 +10,7 @@ from kornia_pnpnet.pretrained import WEIGHTS_FOLDER, shipped_weights
 from kornia_pnpnet.training.card import write_model_card
 from kornia_pnpnet.training.results import load_run
 
-RESULTS = load_run(WEIGHTS_FOLDER / "pnpnet-set" / "results.json")
+RESULTS = load_run(WEIGHTS_FOLDER / "pnpnet-n9" / "results.json")
 
 
 def card_of(results, folder, name=None):
@@ -42,10 +42,10 @@ def test_a_card_names_no_folder_of_a_machine(override, tmp_path):
 def test_a_card_names_the_run_that_each_run_began_with(tmp_path):
     card = card_of(RESULTS, tmp_path)
     names = [run.name for run in RESULTS.lineage()]
-    assert names == ["pnpnet-set", "set-samples", "set-six", "set-two", "set-three"]
+    assert names == ["pnpnet-n9", "ft-geman_mcclure-m10-n9", "two-views-n9"]
     places = [card.index(f"the weights of {name}") for name in names[:-1]]
     assert places == sorted(places)
-    assert "`init.layers` was 4 and is 3" in card  # the weights were changed in between
+    assert "`views` was 3 and is 2" in card  # the weights were changed in between
 
 
 @pytest.mark.parametrize("name", shipped_weights())
