@@ -268,7 +268,7 @@ def test_solvers_of_any_name_and_options():
     def run(name, values):
         solver = made(lambda: create_solver(name, **values), (*ERRORS, ImportError, FileNotFoundError))
         if solver is not None:
-            number = re.search(r"-n(\d+)$", name)
+            number = re.search(r"-n(\d+)", name)
             problems = SyntheticProblems(n=int(number[1]) if number else 9, batch_size=2, seed=0).batch(0)
             finite(*solver(*problems[:3])[:4])
 
@@ -288,9 +288,9 @@ def test_transforms_of_every_solver_of_ours(name):
     Pixels move along three directions. Where the pose is found from a start that is a constant, derivatives leave out
     what the start would change, which the last iterations nearly forget: hence the tolerance of second derivatives.
     """
-    number = re.search(r"-n(\d+)$", name)
+    number = re.search(r"-n(\d+)", name)
     chosen = {"m": 2} if name.endswith("-lm") or "pnpnet-n" in name else {}
-    chosen |= {"pnpnet-set": {"m": 4}, "ransac-epnp-lm": {"max_samples": 20}}.get(name, {})
+    chosen |= {"pnpnet-set": {"m": 8}, "ransac-epnp-lm": {"max_samples": 20}}.get(name, {})
     p = SyntheticProblems(n=int(number[1]) if number else 8, batch_size=2, seed=3, dtype=torch.float64).batch(0)
     solver = create_solver(name, **chosen).double().requires_grad_(False)
     generator = torch.Generator().manual_seed(0)
