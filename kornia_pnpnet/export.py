@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from kornia_pnpnet.core.checks import check_whole
 from kornia_pnpnet.core.files import atomic_open
 from kornia_pnpnet.data import SyntheticProblems
-from kornia_pnpnet.init import MLPInit
+from kornia_pnpnet.init import RANSAC, MLPInit
 from kornia_pnpnet.solver import PnPNet
 
 __all__ = ["INPUTS", "OUTPUTS", "export_onnx", "export_program"]
@@ -66,6 +66,8 @@ def export_program(solver: PnPNet, n: int | None = None) -> torch.export.Exporte
         >>> dict(zip(OUTPUTS, program.module()(*inputs)))["ok"]
         tensor([False, False, False, False, False])
     """
+    if isinstance(solver.init, RANSAC):
+        raise ValueCheckError("RANSAC cannot be exported: the number of its samples depends on the data.")
     if n is not None:
         check_whole(3, n=n)
     fixed = int(solver.init.config["n"]) if isinstance(solver.init, MLPInit) else n
