@@ -560,7 +560,7 @@ def make_parser() -> argparse.ArgumentParser:
     making.add_argument("folder", type=Path, help="a COLMAP model with its images in images/")
     making.add_argument("out", type=Path, help="the file of problems (.npz)")
     making.add_argument("--features", type=int, default=2000, help="keypoints of an image")
-    making.add_argument("--every", type=int, default=4, help="every so many images, one is a query")
+    making.add_argument("--every", type=int, default=4, help="with 4, every fourth image is a query")
     making.add_argument("--views", type=int, default=6, help="images of the map for each query")
     making.add_argument("--pairs", type=int, default=500, help="largest number of pairs of a problem")
     making.add_argument("--seed", type=int, default=0, help="seed of the subsets of pairs")

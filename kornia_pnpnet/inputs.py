@@ -11,7 +11,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kornia_pnpnet.core.checks import Shapes, check_devices, check_shapes, common_dtype, expand_sigma
-from kornia_pnpnet.core.performance import sees_values
+from kornia_pnpnet.core.performance import present_first, sees_values
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.types import Noise, PnPResult, Pose, camera_matrices
 
@@ -176,9 +176,7 @@ def _without_padding(inputs: Inputs, most: int) -> list[Part]:
     counts = inputs.mask.sum(1)
     if batch * count <= most and int(counts.max()) == count:
         return [Part(inputs)]
-    # Present pairs first, in order.
-    ranks = torch.where(inputs.mask, inputs.mask.cumsum(1), counts[:, None] + (~inputs.mask).cumsum(1)) - 1
-    order = torch.empty_like(ranks).scatter_(1, ranks, torch.arange(count, device=ranks.device).expand_as(ranks))
+    order = present_first(inputs.mask)
     sizes, problems = counts.sort(stable=True)
     parts, stop = [], batch
     while stop:

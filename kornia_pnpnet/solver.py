@@ -70,8 +70,8 @@ class PnPNet(nn.Module):
             :mod:`kornia_pnpnet.init`; ``None`` starts from the identity or from the pose given with the call.
         refine: the refiner; classical :class:`~kornia_pnpnet.refine.RobustWeightedLM` when ``None``.
         normalize: the normalisation; the default centres and scales the world and orders the pairs.
-        effort: ``"fixed"``, or ``"adaptive"``: problems for which the poses of the initialiser do not suffice get more
-            minimal samples, as many as they need (``init.ransac.search_on``), without holding up the others. Needs an
+        effort: ``"fixed"``, or ``"adaptive"``: where the poses of the initialiser do not suffice, a problem gets as
+            many more minimal samples as it needs (``init.ransac.search_on``). Others do not wait for it. Needs an
             initialiser that estimates the noise, :class:`~kornia_pnpnet.init.SetInit`. The samples have no gradient.
             Exported graphs, ``torch.func.vmap`` and the device ``meta`` have the fixed effort.
         gradient: which problems carry a gradient: those that are ``"ok"``, or ``"always"`` every valid problem, to

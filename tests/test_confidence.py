@@ -56,7 +56,7 @@ def test_a_logistic_law_is_found(generator):
     calibration = fit_confidence(scores, inliers, "logistic")
     slope = calibration.logits.diff() / calibration.scores.diff()
     offset = calibration.logits[0] - slope * calibration.scores[0]
-    # About four standard errors, from the Fisher information of this law at so many scores.
+    # About four standard errors of a fit to so many scores, by the Fisher information of this law.
     assert slope.item() == pytest.approx(1.5, abs=0.1)
     assert offset.item() == pytest.approx(-1.0, abs=0.08)
 

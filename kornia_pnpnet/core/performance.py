@@ -24,6 +24,7 @@ __all__ = [
     "fold_vmap",
     "in_order",
     "keep_freed_memory",
+    "present_first",
     "problems_last",
     "ranked",
     "repeat_problems",
@@ -180,6 +181,21 @@ def _network(count: int, rank: int | None) -> list[tuple[int, int, bool, bool]]:
             network.append((i, j, i in wanted, j in wanted))
             wanted |= {i, j}
     return network[::-1]
+
+
+def present_first(present: Tensor) -> Tensor:
+    """Positions of the pairs that are present, then of the others, each in order: a stable sort, but faster.
+
+    Args:
+        present: bool, shape :math:`(B, N)`.
+
+    Example:
+        >>> present_first(torch.tensor([[False, True, True]]))
+        tensor([[1, 2, 0]])
+    """
+    rank = torch.where(present, present.cumsum(-1), present.sum(-1, keepdim=True) + (~present).cumsum(-1)) - 1
+    order = torch.arange(present.shape[1], device=present.device).expand_as(rank)
+    return torch.empty_like(rank).scatter_(1, rank, order)
 
 
 def ascending_order(keys: Tensor) -> Tensor:

@@ -38,7 +38,7 @@ MAX_ERROR = 1e6
 MAX_FALSE_ALARMS = 0.01
 # Pairs. The pixels of this many stand for those of all pairs in :func:`chance_of_others`.
 _MOST_OTHERS = 128
-# Hits. So many by others say nothing: of few pairs, two may be close.
+# Pixels of other pairs near a projection. This many are left out of the count: pixels of right pairs may be close, too.
 _FEW_HITS = 4
 # Standard deviations. Pairs further off than this are no evidence for a pose.
 _EVIDENT = 3.5
@@ -170,9 +170,7 @@ def judge(projection: Projection, corr: Correspondences, thresholds: Thresholds)
         >>> judge(projection, corr, Thresholds(torch.tensor([10.0]), torch.tensor([0.0])))
         Judged(weights=tensor([[1., 0.]]), errors=tensor([[0.0000, 6.2500]]))
     """
-    img, world = map(_of_pairs, thresholds)
-    sq_img = img.square()
-    sq_limit = sq_img + (corr.focal * world * projection.inv_depth).square()
+    sq_img, sq_limit = _of_pairs(thresholds.img).square(), _sq_limits(projection, corr, thresholds)
     errors = projection.sq_residual / sq_limit
     errors = torch.where(projection.in_front, errors, MAX_ERROR)
     inlier = (errors < 1.0) & (corr.weights > 0)
@@ -245,10 +243,7 @@ def chance_of_others(projection: Projection, corr: Correspondences, thresholds: 
     """
     there = corr.weights > 0
     worst = torch.where(judged.weights > 0, judged.errors, 0.0).amax(-1, keepdim=True)
-    limit = (
-        _of_pairs(thresholds.img).square() + (corr.focal * _of_pairs(thresholds.world) * projection.inv_depth).square()
-    )
-    limit = torch.where(projection.in_front & there, worst * limit, -1.0)
+    limit = torch.where(projection.in_front & there, worst * _sq_limits(projection, corr, thresholds), -1.0)
     count = corr.weights.shape[1]
     step = 1 if exporting() else -(-count // _MOST_OTHERS)
     u, v = (
@@ -260,6 +255,12 @@ def chance_of_others(projection: Projection, corr: Correspondences, thresholds: 
     hits = hits & (own[:, None] != own[::step])
     tested = there.sum(-1) * there[:, ::step].sum(-1) - there[:, ::step].sum(-1)
     return (hits.sum((1, 2)) - _FEW_HITS).clamp(min=0) / tested.clamp(min=1)
+
+
+def _sq_limits(projection: Projection, corr: Correspondences, thresholds: Thresholds) -> Tensor:
+    """Largest squared residual of an inlier in square pixels, (B, N)."""
+    img, world = map(_of_pairs, thresholds)
+    return img.square() + (corr.focal * world * projection.inv_depth).square()
 
 
 def _of_pairs(threshold: Tensor) -> Tensor:

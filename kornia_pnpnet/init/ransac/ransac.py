@@ -43,8 +43,8 @@ __all__ = ["FURTHER", "RANSAC", "search_on"]
 
 # Number of least-squares steps from the best pose, which is near the minimum already.
 _FINAL_STEPS = 2
-# Standard deviations. :func:`search_on` counts nearer pairs as inliers. Wide: networks estimate too little noise where
-# most pairs are wrong, and more wrong pairs near a wrong pose matter less than right pairs that do not count.
+# Standard deviations. :func:`search_on` counts nearer pairs as inliers. The limit is wide because networks estimate too
+# little noise where most pairs are wrong: right pairs that do not count cost more than wrong pairs that do.
 _INLIER = 10.0
 # Normalised units. A guess that has the centre of the world nearer than this counts as this near.
 _NEAREST = 0.5
@@ -262,10 +262,11 @@ def search_on(corr: Correspondences, guess: Guess, plan: Plan = FURTHER) -> Gues
     Samples hold pairs in proportion to a half plus half the weight of the guess, times the caller's confidence: weights
     that mislead then cost some samples, but no pose. An inlier is within ten standard deviations of the guess' noise
     (its mean over the pairs). The limit is that of a point as far away as the centre of the world in the guess, for all
-    poses: with a limit by each pose's own depths, a pose close to the points would have most inliers. The best pose of
-    the guess, improved on its inliers, stands for
-    ``plan.min_samples`` samples: a problem for which so many suffice at ``plan.confidence`` is not searched. Problems
-    that are done leave the batch, and no problem's result depends on the others.
+    poses: with a limit by each pose's own depths, a pose close to the points would have most inliers.
+
+    First the best pose of the guess is improved on its inliers. A problem is searched only when, by the number of these
+    inliers, it needs more than ``plan.min_samples`` samples to reach ``plan.confidence``. Problems that are done leave
+    the batch, and no problem's result depends on the others.
 
     Args:
         corr: normalised correspondences of a centred and scaled world.

@@ -13,6 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kornia_pnpnet.core.performance import present_first
+
 __all__ = ["Samples", "draw_likely", "draw_subsets", "samples_needed"]
 
 
@@ -108,10 +110,7 @@ class Samples:
         self.size = size
         self.seed = seed
         self.counts = there.sum(-1)
-        # Positions of the pairs that have a weight, then of the others: a stable sort, but faster.
-        rank = torch.where(there, there.cumsum(-1), self.counts[:, None] + (~there).cumsum(-1)) - 1
-        order = torch.arange(pairs, device=device).expand_as(rank)
-        self._present_first = torch.empty_like(rank).scatter_(1, rank, order)  # (B, N)
+        self._present_first = present_first(there)
         subsets = [math.comb(n, size) for n in range(pairs + 1)]
         self.totals = torch.tensor([min(n, most) for n in subsets], device=device)[self.counts]
         self._enumerated = self.counts <= max(n for n in range(pairs + 1) if subsets[n] <= most)
@@ -166,7 +165,8 @@ class Samples:
         plain = samples_needed(inliers.sum(-1), self.counts[problems], self.size, confidence)
         if self.share is None:
             return plain
-        # As if all pairs were equally likely, as many as the inliers' mean share says (weighted by the share).
+        # The number for equally likely pairs, of which there are as many as the mean share of an inlier goes into 1.
+        # The mean is weighted by the share.
         share = torch.where(inliers, self.share[problems], 0.0)
         mass = share.sum(-1)
         count = mass / share.square().sum(-1).clamp(min=torch.finfo(share.dtype).tiny)

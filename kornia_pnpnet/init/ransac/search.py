@@ -110,8 +110,7 @@ class Search:
         Args:
             given: :math:`S` poses of each problem that compete with those of the samples, :math:`(B, S, 3, 3)` and
                 :math:`(B, S, 3)`, in the frame of the correspondences.
-            worth: number of samples that the given poses stand for. A problem for which so many suffice is not
-                searched.
+            worth: number of samples that the given poses count as. A problem that needs no more is not searched.
         """
         plan, samples = self.plan, self.samples
         batch, count = self.corr.weights.shape
