@@ -22,7 +22,7 @@ from kornia_pnpnet.geometry import NormalEquations, Projection, move, project
 from kornia_pnpnet.refine.kernels import KERNELS, RobustKernel
 from kornia_pnpnet.refine.parameters import BoundedParameter
 from kornia_pnpnet.refine.stages import LMStart, Stage, State
-from kornia_pnpnet.refine.step import LMStep, iterate, robust_weights, solve_damped, sq_standardised, weighted_equations
+from kornia_pnpnet.refine.step import LMStep, iterate, noise_factor, robust_weights, solve_damped, sq_standardised, weighted_equations
 from kornia_pnpnet.refine.verdict import explains, has_enough, is_evident
 from kornia_pnpnet.types import Correspondences, Guess, Noise, Pose, Refinement
 
@@ -312,14 +312,18 @@ class RobustWeightedLM(Configured):
         projection, shape = project(end.pose, start.corr), start.shape[-1]
         sq_residual = sq_standardised(projection, start.corr)
         robust = robust_weights(
-            sq_residual, projection, start.by_residual.weights, self.kernel.weight, shape, start.estimated
+            sq_residual, projection, start.by_residual.weights, self.kernel.weight, shape, start.estimated, corr=start.corr
         )
         weights = torch.where(projection.in_front, start.prior * robust, 0.0)
         cost = self._cost(projection, start.corr, start.prior, shape)
         if start.corr.noise is None:
             believed = explains(projection, start.corr, start.prior)
         else:
-            believed = is_evident(projection, start.guided)
+            seen = start.guided
+            if start.estimated is not None:
+                found = noise_factor(sq_residual, projection, start.corr, start.estimated).sqrt()
+                seen = seen._replace(noise=Noise(*(x * found for x in seen.noise)))
+            believed = is_evident(projection, seen)
             if start.noiseless is not None:
                 believed = torch.where(start.noiseless, explains(projection, start.corr, start.prior), believed)
         in_front = has_enough(projection, start.prior)

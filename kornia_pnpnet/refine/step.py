@@ -182,6 +182,39 @@ def sq_standardised(projection: Projection, corr: Correspondences, sq_residual: 
     return sq_residual if corr.noise is None else sq_residual / pixel_variance(projection, corr.noise, corr.focal)
 
 
+# Variance factors that are compared: powers of four.
+_FACTORS = tuple(4.0**k for k in range(-4, 8))
+_ROUNDS = 2
+
+@torch.no_grad()
+def noise_factor(sq_residual: Tensor, projection: Projection, corr: Correspondences, estimated: Tensor) -> Tensor:
+    """(B, 1)"""
+    there = (corr.weights > 0) & projection.in_front
+    share = (corr.near_weights > 0).to(sq_residual)
+    share = share / share.sum(-1, keepdim=True).clamp(min=1.0)
+    area = torch.zeros_like(sq_residual[:, :1])
+    for x in corr.img_points.unbind(-1):
+        mean = (share * x).sum(-1, keepdim=True)
+        area = area + (share * (x - mean).square()).sum(-1, keepdim=True)
+    area = 6.0 * area + torch.finfo(area.dtype).tiny
+    variance = pixel_variance(projection, corr.noise, corr.focal)
+    out = (2.0 * torch.pi * variance / area).clamp(max=1.0)  # relative to the peak of the inliers' density
+    counts = there.sum(-1, keepdim=True)
+    f = sq_residual.new_tensor(_FACTORS)[:, None, None]
+    dens = (-0.5 * sq_residual / f).exp() / f * there
+    pi = 0.5
+    total = (corr.weights > 0).sum(-1, keepdim=True)
+    for _ in range(_ROUNDS):
+        r = pi * dens / (pi * dens + (1 - pi) * out)
+        pi = (r.sum(-1, keepdim=True) / total).clamp(0.02, 0.98)
+    loglik = ((pi * dens + (1 - pi) * out).log() * (corr.weights > 0)).sum(-1)  # (G, B)
+    k = r.sum(-1)
+    loglik = loglik + 3.0 * f[..., 0].log() * (k / 3.0).clamp(max=1.0)
+    now = loglik[_FACTORS.index(1.0)]
+    best, at = loglik.max(0)
+    return torch.where(estimated[:, 0] & (best > now + _BELIEVED), f[:, 0, 0][at], 1.0)[:, None]
+
+
 def robust_weights(
     sq_residual: Tensor,
     projection: Projection,
@@ -190,6 +223,7 @@ def robust_weights(
     shape: Tensor,
     estimated: Tensor | None,
     narrower: float = 1.0,
+    corr: Correspondences | None = None,
 ) -> Tensor:
     """Robust weights by residuals; where the noise is an estimate, the residuals correct it first.
 
@@ -208,6 +242,9 @@ def robust_weights(
     plain = kernel_weight(sq_residual, shape)
     if estimated is None:
         return plain
+    found = noise_factor(sq_residual, projection, corr, estimated)
+    sq_residual = sq_residual / found
+    plain = kernel_weight(sq_residual, shape)
     within = torch.where(projection.in_front, plain, 0.0)
     factor = _variance_factor(sq_residual, within, weights, estimated)
     return kernel_weight(sq_residual / torch.where(factor < 1.0, narrower * factor, 1.0), shape)
@@ -225,7 +262,7 @@ def _weights(
         return pairs.weights * kernel_weight(projection.sq_residual, shape)
     precision = pixel_variance(projection, pairs.noise, pairs.focal).reciprocal()
     sq_residual = projection.sq_residual * precision
-    robust = robust_weights(sq_residual, projection, pairs.weights, kernel_weight, shape, estimated, NARROWER)
+    robust = robust_weights(sq_residual, projection, pairs.weights, kernel_weight, shape, estimated, NARROWER, pairs)
     return pairs.weights * precision * robust
 
 
