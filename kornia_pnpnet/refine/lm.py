@@ -18,11 +18,18 @@ from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.linalg import relative
 from kornia_pnpnet.core.performance import Compiled, problems_last, repeat_problems
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.geometry import NormalEquations, Projection, move, project
+from kornia_pnpnet.geometry import NormalEquations, Projection, move, pixel_variance, project
 from kornia_pnpnet.refine.kernels import KERNELS, RobustKernel
 from kornia_pnpnet.refine.parameters import BoundedParameter
 from kornia_pnpnet.refine.stages import LMStart, Stage, State
-from kornia_pnpnet.refine.step import LMStep, iterate, noise_factor, robust_weights, solve_damped, sq_standardised, weighted_equations
+from kornia_pnpnet.refine.step import (
+    LMStep,
+    iterate,
+    solve_damped,
+    sq_standardised,
+    variance_factor,
+    weighted_equations,
+)
 from kornia_pnpnet.refine.verdict import explains, has_enough, is_evident
 from kornia_pnpnet.types import Correspondences, Guess, Noise, Pose, Refinement
 
@@ -61,9 +68,10 @@ class RobustWeightedLM(Configured):
 
     *By residual.* The last ``by_residual`` iterations and the choice among several poses ignore the initialiser's
     weights: by then the residuals say better which pairs are outliers. Where the initialiser estimated the noise, and
-    the residuals show that its variance is too large (by a likelihood ratio), :meth:`finish` multiplies the variance by
-    the a posteriori variance factor of the residuals. The iterations multiply by a tenth of that factor, since a
-    narrower kernel separates inliers from outliers better. Noise that the caller gave stays as it is.
+    the residuals show that its variance is too small or too large (by likelihood ratios), :meth:`finish` multiplies the
+    variance by the factor that they show, see :func:`~kornia_pnpnet.refine.step.variance_factor`. Where it is too large
+    the iterations multiply by a tenth of that, since a narrower kernel separates inliers from outliers better. Noise
+    that the caller gave stays as it is.
 
     All operations are per problem: a problem that cannot be solved keeps its pose, reports ``ok=False`` and changes
     no other.
@@ -220,10 +228,12 @@ class RobustWeightedLM(Configured):
         """
         step, damping, shape = (x.unbind() for x in self.hyperparameters(corr.world_points))
         unknown = _is_unknown(corr) if self.by_residual or corr.noise is not None else None
-        estimated = unknown if self.by_residual else None
         noiseless = None if unknown is None or corr.noise is None or guess.noise is not None else unknown[:, 0]
         corr = problems_last(corr._replace(noise=_complete_noise(corr, guess)))
         prior = corr.weights * problems_last(guess.weights)
+        outlier_area = None
+        if self.by_residual and unknown is not None and corr.noise is not None:
+            outlier_area = torch.where(unknown, _outlier_area(corr), 0.0)
         # Steps do not depend on a common factor of the weights; tiny weights must not vanish when multiplied.
         guided = corr._replace(weights=relative(prior, prior), img_scale=None, world_scale=None)
         by_residual = guided
@@ -245,7 +255,7 @@ class RobustWeightedLM(Configured):
             by_residual=by_residual,
             starts=starts,
             rivals=rivals,
-            estimated=None if corr.noise is None else estimated,
+            outlier_area=outlier_area,
             noiseless=noiseless,
             step=step,
             damping=damping,
@@ -267,10 +277,10 @@ class RobustWeightedLM(Configured):
         guided = max(self.m - self.by_residual, explored)
         seen: list[tuple[Correspondences, Tensor | None]] = [(start.starts, None)] * explored
         seen += [(start.guided, None)] * (guided - explored)
-        seen += [(start.by_residual, start.estimated)] * (self.m - guided)
+        seen += [(start.by_residual, start.outlier_area)] * (self.m - guided)
         plan = [
-            Stage(i, partial(self._advance, pairs, start.step[i], start.damping[i], start.shape[i], estimated))
-            for i, (pairs, estimated) in enumerate(seen[:m])
+            Stage(i, partial(self._advance, pairs, start.step[i], start.damping[i], start.shape[i], area))
+            for i, (pairs, area) in enumerate(seen[:m])
         ]
         if start.rivals is not None:
             shape = start.shape[max(self.compared_at - 1, 0)]
@@ -310,20 +320,22 @@ class RobustWeightedLM(Configured):
             See :meth:`forward`.
         """
         projection, shape = project(end.pose, start.corr), start.shape[-1]
-        sq_residual = sq_standardised(projection, start.corr)
-        robust = robust_weights(
-            sq_residual, projection, start.by_residual.weights, self.kernel.weight, shape, start.estimated, corr=start.corr
-        )
-        weights = torch.where(projection.in_front, start.prior * robust, 0.0)
+        sq_residual, judged = sq_standardised(projection, start.corr), start.guided
+        if start.outlier_area is not None:
+            noise = start.corr.noise
+            assert noise is not None
+            precision = pixel_variance(projection, noise, start.corr.focal).reciprocal()
+            seen = sq_residual, precision, projection, start.by_residual.weights
+            factor = variance_factor(*seen, self.kernel.weight, shape, start.outlier_area)
+            sq_residual = sq_residual / factor
+            larger = factor.detach().clamp(min=1.0).sqrt()
+            judged = judged._replace(noise=map_tensors(lambda sigma: larger * sigma, noise))
+        weights = torch.where(projection.in_front, start.prior * self.kernel.weight(sq_residual, shape), 0.0)
         cost = self._cost(projection, start.corr, start.prior, shape)
         if start.corr.noise is None:
             believed = explains(projection, start.corr, start.prior)
         else:
-            seen = start.guided
-            if start.estimated is not None:
-                found = noise_factor(sq_residual, projection, start.corr, start.estimated).sqrt()
-                seen = seen._replace(noise=Noise(*(x * found for x in seen.noise)))
-            believed = is_evident(projection, seen)
+            believed = is_evident(projection, judged)
             if start.noiseless is not None:
                 believed = torch.where(start.noiseless, explains(projection, start.corr, start.prior), believed)
         in_front = has_enough(projection, start.prior)
@@ -350,13 +362,13 @@ class RobustWeightedLM(Configured):
         step: Tensor,
         damping: Tensor,
         shape: Tensor,
-        estimated: Tensor | None,
+        outlier_area: Tensor | None,
         state: State,
     ) -> State:
         """One iteration. With ``reject_worse``, a problem whose cost would rise keeps its pose."""
         damping = damping * state.factor if self.reject_worse else damping
-        pose, solved = self._iterate(pairs, state.pose, step, damping, shape, estimated)
-        if not self.reject_worse or estimated is not None:  # the cost does not know the corrected noise
+        pose, solved = self._iterate(pairs, state.pose, step, damping, shape, outlier_area)
+        if not self.reject_worse or outlier_area is not None:  # the cost does not know the corrected noise
             return State(pose, solved, state.factor)
         new, old = (self._cost(project(x, pairs), pairs, pairs.weights, shape) for x in (pose, state.pose))
         # At a minimum, rounding decides which cost is lower. A refused step has no gradient there: take the step.
@@ -394,7 +406,7 @@ class RobustWeightedLM(Configured):
         matrix is not positive definite the pose is no minimum yet, and the Gauss-Newton matrix replaces it. A second
         step with the same matrix makes second derivatives exact.
         """
-        equations = partial(weighted_equations, estimated=start.estimated, kernel_weight=self.kernel.weight)
+        equations = partial(weighted_equations, outlier_area=start.outlier_area, kernel_weight=self.kernel.weight)
         pairs = start.by_residual
         zero = [torch.zeros_like(start.prior[:, 0]).requires_grad_() for _ in range(6)]
         with torch.enable_grad():
@@ -417,6 +429,17 @@ def _relative_to_mean(weights: Tensor) -> Tensor:
     """Weights over the mean of those that are not 0: unlike the largest weight, the mean has a derivative at ties."""
     mean = weights.sum(-1, keepdim=True) / (weights > 0).sum(-1, keepdim=True).clamp(min=1)
     return weights / torch.where(mean > 0, mean, 1.0)
+
+
+def _outlier_area(corr: Correspondences) -> Tensor:
+    """Area of a square with the variance of the pixels that are near, (B, 1)."""
+    there = (corr.near_weights > 0).to(corr.weights)
+    share = there / there.sum(-1, keepdim=True).clamp(min=1.0)
+    variance = torch.zeros_like(share[:, :1])
+    for pixels in corr.img_points.detach().unbind(-1):
+        mean = (share * pixels).sum(-1, keepdim=True)
+        variance = variance + (share * (pixels - mean).square()).sum(-1, keepdim=True)
+    return 6.0 * variance + torch.finfo(variance.dtype).tiny
 
 
 def _complete_noise(corr: Correspondences, guess: Guess) -> Noise | None:

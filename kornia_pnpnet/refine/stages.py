@@ -26,8 +26,9 @@ class LMStart(NamedTuple):
             their mean, or ``guided`` without such iterations.
         starts: ``guided`` once for each of the :math:`S` poses.
         rivals: the pairs by whose cost the :math:`S` poses compete; ``None`` when :math:`S = 1`.
-        estimated: problems for which the caller gave no sigma, so that the last iterations may correct the
-            initialiser's estimate, bool :math:`(B, 1)`; ``None`` when there are no such iterations.
+        outlier_area: area of the image in which pixels of outliers lie, in square pixels, for problems for which the
+            caller gave no sigma, so that the last iterations may correct the initialiser's estimate; 0 for the others,
+            :math:`(B, 1)`; ``None`` when there are no such iterations.
         noiseless: problems for which neither the caller gave a sigma nor the initialiser an estimate, although the
             caller gave one for others, bool :math:`(B,)`; ``None``: no such problems.
         step: :math:`\gamma` of each iteration, scalars.
@@ -42,7 +43,7 @@ class LMStart(NamedTuple):
     by_residual: Correspondences
     starts: Correspondences
     rivals: Correspondences | None
-    estimated: Tensor | None
+    outlier_area: Tensor | None
     noiseless: Tensor | None
     step: tuple[Tensor, ...]
     damping: tuple[Tensor, ...]

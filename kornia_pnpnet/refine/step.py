@@ -6,6 +6,7 @@ diagonal is D. Marquardt's (1963).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import reduce
 from operator import and_
@@ -26,12 +27,16 @@ from kornia_pnpnet.geometry import (
     project,
     retract_additive,
 )
-from kornia_pnpnet.types import Correspondences, Pose
+from kornia_pnpnet.types import MIN_PAIRS, Correspondences, Pose
 
-__all__ = ["LMStep", "iterate", "lm_step", "robust_weights", "solve_damped", "sq_standardised", "weighted_equations"]
+__all__ = ["LMStep", "iterate", "lm_step", "solve_damped", "sq_standardised", "variance_factor", "weighted_equations"]
 
 # Logarithm of a likelihood ratio. The residuals' own variance factor replaces 1 where it is e³ times as likely.
 _BELIEVED = 3.0
+# Variance factors that are compared before. Noise above the estimate needs them: a kernel that is too narrow hides it.
+_FACTORS = tuple(4.0**k for k in range(8))
+# Rounds of expectation and maximisation for the share of the inliers at each factor; bounds of the share.
+_ROUNDS, _LEAST_SHARE = 2, 0.02
 # The smallest variance factor: residuals of exact data would give 0.
 _LEAST_FACTOR = 1e-4
 # The iterations multiply a variance factor below 1 by this: where the noise is known so well, a kernel of a third of
@@ -60,7 +65,7 @@ def iterate(
     step: Tensor,
     damping: Tensor,
     shape: Tensor,
-    estimated: Tensor | None,
+    outlier_area: Tensor | None,
     *,
     kernel_weight: KernelWeight,
     additive: bool = False,
@@ -73,8 +78,8 @@ def iterate(
         step: :math:`\gamma`, a scalar.
         damping: :math:`\lambda`, a scalar or :math:`(B,)`.
         shape: shape of the kernel, a scalar.
-        estimated: problems whose noise is an estimate that the residuals may correct, bool :math:`(B, 1)`; ``None``:
-            no problem.
+        outlier_area: where the noise is an estimate that the residuals may correct, see
+            :class:`~kornia_pnpnet.refine.stages.LMStart`, :math:`(B, 1)`; ``None``: for no problem.
         kernel_weight: the robust kernel's weight.
         additive: update the rotation vector additively, as in the paper.
 
@@ -82,16 +87,16 @@ def iterate(
         The moved pose and whether the equations could be solved.
     """
     projection = project(pose, pairs)
-    weights = _weights(projection, pairs, kernel_weight, shape, estimated)
+    weights = _weights(projection, pairs, kernel_weight, shape, outlier_area)
     return lm_step(pairs, pose, projection, weights, step, damping, additive=additive)
 
 
 def weighted_equations(
-    pairs: Correspondences, pose: Pose, shape: Tensor, estimated: Tensor | None, kernel_weight: KernelWeight
+    pairs: Correspondences, pose: Pose, shape: Tensor, outlier_area: Tensor | None, kernel_weight: KernelWeight
 ) -> NormalEquations:
     """The normal equations of :func:`iterate` at a pose, before damping."""
     projection = project(pose, pairs)
-    weights = _weights(projection, pairs, kernel_weight, shape, estimated)
+    weights = _weights(projection, pairs, kernel_weight, shape, outlier_area)
     return normal_equations(projection, _relative(weights, projection))
 
 
@@ -182,72 +187,41 @@ def sq_standardised(projection: Projection, corr: Correspondences, sq_residual: 
     return sq_residual if corr.noise is None else sq_residual / pixel_variance(projection, corr.noise, corr.focal)
 
 
-# Variance factors that are compared: powers of four.
-_FACTORS = tuple(4.0**k for k in range(-4, 8))
-_ROUNDS = 2
-
-@torch.no_grad()
-def noise_factor(sq_residual: Tensor, projection: Projection, corr: Correspondences, estimated: Tensor) -> Tensor:
-    """(B, 1)"""
-    there = (corr.weights > 0) & projection.in_front
-    share = (corr.near_weights > 0).to(sq_residual)
-    share = share / share.sum(-1, keepdim=True).clamp(min=1.0)
-    area = torch.zeros_like(sq_residual[:, :1])
-    for x in corr.img_points.unbind(-1):
-        mean = (share * x).sum(-1, keepdim=True)
-        area = area + (share * (x - mean).square()).sum(-1, keepdim=True)
-    area = 6.0 * area + torch.finfo(area.dtype).tiny
-    variance = pixel_variance(projection, corr.noise, corr.focal)
-    out = (2.0 * torch.pi * variance / area).clamp(max=1.0)  # relative to the peak of the inliers' density
-    counts = there.sum(-1, keepdim=True)
-    f = sq_residual.new_tensor(_FACTORS)[:, None, None]
-    dens = (-0.5 * sq_residual / f).exp() / f * there
-    pi = 0.5
-    total = (corr.weights > 0).sum(-1, keepdim=True)
-    for _ in range(_ROUNDS):
-        r = pi * dens / (pi * dens + (1 - pi) * out)
-        pi = (r.sum(-1, keepdim=True) / total).clamp(0.02, 0.98)
-    loglik = ((pi * dens + (1 - pi) * out).log() * (corr.weights > 0)).sum(-1)  # (G, B)
-    k = r.sum(-1)
-    loglik = loglik + 3.0 * f[..., 0].log() * (k / 3.0).clamp(max=1.0)
-    now = loglik[_FACTORS.index(1.0)]
-    best, at = loglik.max(0)
-    return torch.where(estimated[:, 0] & (best > now + _BELIEVED), f[:, 0, 0][at], 1.0)[:, None]
-
-
-def robust_weights(
+def variance_factor(
     sq_residual: Tensor,
+    precision: Tensor,
     projection: Projection,
     weights: Tensor,
     kernel_weight: KernelWeight,
     shape: Tensor,
-    estimated: Tensor | None,
+    outlier_area: Tensor,
     narrower: float = 1.0,
-    corr: Correspondences | None = None,
 ) -> Tensor:
-    """Robust weights by residuals; where the noise is an estimate, the residuals correct it first.
+    r"""Factor by which the residuals say that the variance of the noise differs from its estimate.
+
+    First from above: inliers have Gaussian residuals with the variance times a factor, outliers have pixels anywhere in
+    an area. The factor among powers of 4 with the largest likelihood replaces 1 where it is :math:`e^3` times as
+    likely; the share of inliers is estimated for each, and the three pairs that any pose fits do not count. Then the a
+    posteriori variance factor of the pairs deep within the kernel may lower it.
 
     Args:
         sq_residual: what :func:`sq_standardised` returned, :math:`(B, N)`.
-        projection: the projection that it is of.
+        precision: inverse of the estimated variance of each pixel, :math:`(B, N)`.
+        projection: the projection that the residuals are of.
         weights: weight of each pair before its residual was looked at, at most 1, :math:`(B, N)`.
         kernel_weight: the robust kernel's weight.
         shape: shape of the kernel, a scalar.
-        estimated: see :func:`iterate`.
-        narrower: multiplies variance factors below 1.
+        outlier_area: see :class:`~kornia_pnpnet.refine.stages.LMStart`, :math:`(B, 1)`.
+        narrower: multiplies the factor where the a posteriori variance factor lowers it.
 
     Returns:
-        Shape :math:`(B, N)`.
+        Positive, 1 where the noise is no estimate, shape :math:`(B, 1)`.
     """
-    plain = kernel_weight(sq_residual, shape)
-    if estimated is None:
-        return plain
-    found = noise_factor(sq_residual, projection, corr, estimated)
-    sq_residual = sq_residual / found
-    plain = kernel_weight(sq_residual, shape)
-    within = torch.where(projection.in_front, plain, 0.0)
-    factor = _variance_factor(sq_residual, within, weights, estimated)
-    return kernel_weight(sq_residual / torch.where(factor < 1.0, narrower * factor, 1.0), shape)
+    above = _factor_above(sq_residual, precision, projection.in_front & (weights > 0), weights > 0, outlier_area)
+    sq_residual = sq_residual / above
+    within = torch.where(projection.in_front, kernel_weight(sq_residual, shape), 0.0)
+    below = _factor_below(sq_residual, within, weights, outlier_area > 0)
+    return above * torch.where(below < 1.0, narrower * below, 1.0)
 
 
 def _weights(
@@ -255,15 +229,17 @@ def _weights(
     pairs: Correspondences,
     kernel_weight: KernelWeight,
     shape: Tensor,
-    estimated: Tensor | None,
+    outlier_area: Tensor | None,
 ) -> Tensor:
     """Weight of each pair in the normal equations: prior weight, inverse variance, robust weight."""
     if pairs.noise is None:
         return pairs.weights * kernel_weight(projection.sq_residual, shape)
     precision = pixel_variance(projection, pairs.noise, pairs.focal).reciprocal()
     sq_residual = projection.sq_residual * precision
-    robust = robust_weights(sq_residual, projection, pairs.weights, kernel_weight, shape, estimated, NARROWER, pairs)
-    return pairs.weights * precision * robust
+    if outlier_area is not None:
+        seen = sq_residual, precision, projection, pairs.weights
+        sq_residual = sq_residual / variance_factor(*seen, kernel_weight, shape, outlier_area, NARROWER)
+    return pairs.weights * precision * kernel_weight(sq_residual, shape)
 
 
 def _relative(weights: Tensor, projection: Projection) -> Tensor:
@@ -271,7 +247,28 @@ def _relative(weights: Tensor, projection: Projection) -> Tensor:
     return relative(weights, weights * projection.inv_depth * projection.inv_depth)
 
 
-def _variance_factor(sq_residual: Tensor, kernel_weight: Tensor, weights: Tensor, estimated: Tensor) -> Tensor:
+@torch.no_grad()
+def _factor_above(
+    sq_residual: Tensor, precision: Tensor, in_front: Tensor, there: Tensor, outlier_area: Tensor
+) -> Tensor:
+    """Variance factor of the largest likelihood among those from 1 on, (B, 1), see :func:`variance_factor`."""
+    factors = torch.tensor(_FACTORS, dtype=sq_residual.dtype, device=sq_residual.device)
+    # Densities of a pixel, relative to that of an inlier without a residual whose factor is 1.
+    inlier = torch.exp(sq_residual * (-0.5 / factors)[:, None, None]) * in_front / factors[:, None, None]
+    outlier = (2.0 * math.pi / (precision * outlier_area)).clamp(max=1.0)  # (B, N)
+    count = there.sum(-1, keepdim=True).clamp(min=1)
+    share: Tensor | float = 0.5
+    for _ in range(_ROUNDS):
+        inliers = (share * inlier / (share * inlier + (1.0 - share) * outlier)).sum(-1, keepdim=True)  # (F, B, 1)
+        share = (inliers / count).clamp(_LEAST_SHARE, 1.0 - _LEAST_SHARE)
+    likelihood = torch.where(there, (share * inlier + (1.0 - share) * outlier).log(), 0.0).sum(-1)  # (F, B)
+    likelihood = likelihood + factors.log()[:, None] * inliers[..., 0].clamp(max=MIN_PAIRS)
+    best = likelihood.max(0)
+    believed = (outlier_area[:, 0] > 0) & (best.values > likelihood[0] + _BELIEVED)
+    return torch.where(believed, factors[best.indices], 1.0)[:, None]
+
+
+def _factor_below(sq_residual: Tensor, kernel_weight: Tensor, weights: Tensor, estimated: Tensor) -> Tensor:
     r"""Factor by which the residuals say that the noise's variance is smaller than estimated, at most 1, (B, 1).
 
     The a posteriori variance factor of an adjustment: the weighted sum of squared residuals by the degrees of freedom.

@@ -42,7 +42,10 @@ from kornia_pnpnet.types import MIN_PAIRS, Correspondences, Guess, Pose
 __all__ = ["FURTHER", "RANSAC", "search_on"]
 
 # Number of least-squares steps from the best pose, which is near the minimum already.
-_FINAL_STEPS = 2
+_FINAL_STEPS = 4
+# The scale of the Cauchy kernel of these steps, in standard deviations of the inliers' residuals; the median of the
+# squared residuals of Gaussian noise, in variances of a pixel coordinate; pairs that a pose fits by itself.
+_KERNEL_SCALE, _MEDIAN, _FITTED = 3.4, 2.0 * math.log(2.0), 6
 # Standard deviations. :func:`search_on` counts nearer pairs as inliers. The limit is wide because networks estimate too
 # little noise where most pairs are wrong: right pairs that do not count cost more than wrong pairs that do.
 _INLIER = 10.0
@@ -215,7 +218,8 @@ class RANSAC(Configured):
             with torch.no_grad():
                 inliers = judge(projection, part, limits).weights.detach()
             for _ in range(_FINAL_STEPS):
-                pose = least_squares(part, pose, projection, inliers)
+                weights = inliers * _robust(judge(projection, part, limits), inliers)
+                pose = least_squares(part, pose, projection, weights)
                 projection = project(pose, part)
             with torch.no_grad():
                 judged = map_tensors(torch.Tensor.detach, judge(projection, part, limits))
@@ -236,18 +240,22 @@ class RANSAC(Configured):
         return found.loss.isfinite() & (rare | ((inliers == MIN_PAIRS) & (counts == MIN_PAIRS)))
 
 
+def _robust(judged: Judged, inliers: Tensor) -> Tensor:
+    """Weights of a Cauchy kernel, (B, N): its scale follows the median residual of the inliers, wherever they end.
+
+    Thresholds are wide, and noise has tails: with equal weights, pairs near the threshold would decide the pose.
+    """
+    count = (inliers > 0).sum(-1, keepdim=True)
+    ascending = torch.where(inliers > 0, judged.errors.detach(), torch.inf).sort(-1).values
+    median = ascending.gather(1, (count - 1).clamp(min=0) // 2).clamp(min=torch.finfo(ascending.dtype).eps)
+    # Few inliers lie close to the pose that was fitted to them: their residuals say less than they seem to.
+    free = (count - _FITTED).clamp(min=0) / count.clamp(min=1)
+    sq_scale = _KERNEL_SCALE**2 * median / _MEDIAN
+    return 1.0 / (1.0 + free * judged.errors / sq_scale)
+
+
 #: How :func:`search_on` searches unless told otherwise.
-FURTHER = Plan(
-    minimal=P3P(),
-    scorer=SCORERS["msac"],
-    max_samples=5000,
-    min_samples=32,
-    confidence=0.999,
-    local_candidates=3,
-    local_iterations=2,
-    seed=0,
-    chunk_size=4096,
-)
+FURTHER = RANSAC(P3P()).plan
 
 
 def _trusted(confidence: Tensor | None) -> Tensor | None:

@@ -11,7 +11,7 @@ from kornia_pnpnet.core.performance import problems_last
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import Projection, project
 from kornia_pnpnet.init.ransac.minimal import MinimalSolver
-from kornia_pnpnet.init.ransac.sampling import Samples
+from kornia_pnpnet.init.ransac.sampling import Samples, agreement_of_neighbours
 from kornia_pnpnet.init.ransac.scoring import Scene, Scorer
 from kornia_pnpnet.refine import lm_step
 from kornia_pnpnet.refine.verdict import Thresholds, judge
@@ -36,6 +36,10 @@ _VECTOR = 64
 _DAMPING = 1e-6
 # Thresholds. The first least squares use the pairs up to this limit: the pose of a noisy sample misses some inliers.
 _WIDE = 3.0
+# After this many samples, pairs whose neighbours agree are drawn more often. Finding these takes about as long.
+_PLAIN_SAMPLES = 128
+# A pair without any agreement is drawn this often, relative to one unit of agreement; the exponent is empirical.
+_LEAST_AGREEMENT, _AGREEMENT_POWER = 0.3, 1.5
 #: Number of pairs that are improved together, per sample that is solved together: both need about as much memory.
 PAIRS_PER_SAMPLE = 4
 
@@ -99,8 +103,8 @@ class Search:
         self.corr = corr
         self.low = map_tensors(lambda x: x.to(_DTYPE), (corr, thresholds))
         self.scene = Scene.make(corr, thresholds, _DTYPE)
-        size = plan.minimal.sample_size
-        self.samples = Samples(corr.weights > 0, size=size, most=plan.max_samples, seed=plan.seed, chances=chances)
+        self.chances = chances
+        self.samples = self._samples(chances)
         # The numbers of a pair side by side, so that a sample is gathered pair by pair.
         self.pairs = torch.cat((corr.world_points, corr.img_points, corr.weights[..., None]), -1).flatten(0, 1)
 
@@ -112,22 +116,25 @@ class Search:
                 :math:`(B, S, 3)`, in the frame of the correspondences.
             worth: number of samples that the given poses count as. A problem that needs no more is not searched.
         """
-        plan, samples = self.plan, self.samples
+        plan, totals = self.plan, self.samples.totals
         batch, count = self.corr.weights.shape
         device = self.corr.weights.device
         matrix = torch.eye(3, 4, dtype=_DTYPE, device=device).repeat(batch, 1, 1)
         loss = matrix.new_full((batch,), torch.inf)
         poses, drawn = torch.zeros(2, batch, dtype=torch.long, device=device)
         needed = loss.double()
-        active = (samples.counts >= samples.size).nonzero()[:, 0]
+        active = (self.samples.counts >= self.samples.size).nonzero()[:, 0]
+
+        def expect(at: Tensor) -> None:
+            corr, thresholds = take(self.low, at)
+            judged = judge(project(_pose(matrix[at]), corr), corr, thresholds)
+            needed[at] = self.samples.needed(at, judged.weights > 0, plan.confidence)
 
         def improve(at: Tensor, losses: Tensor, matrices: Tensor) -> None:
             size = max(1, PAIRS_PER_SAMPLE * plan.chunk_size // (count * losses.shape[1]))
             for one, some, part in zip(*(x.split(size) for x in (at, losses, matrices)), strict=True):
                 loss[one], matrix[one] = self._improve(one, some, part)
-                corr, thresholds = take(self.low, one)
-                judged = judge(project(_pose(matrix[one]), corr), corr, thresholds)
-                needed[one] = samples.needed(one, judged.weights > 0, plan.confidence)
+                expect(one)
 
         if given is not None and len(active):
             rotation, translation = (x.to(_DTYPE) for x in given)
@@ -137,18 +144,34 @@ class Search:
             poses[active] += rotation.shape[1]
             if worth:
                 active = active[needed[active] > worth]
-        stop = 0
+        start = stop = 0
         while len(active):
-            start, stop = stop, min(int(samples.totals[active].max()), stop + self._round(stop))
+            if start < _PLAIN_SAMPLES <= stop:
+                self._prefer_agreement(active)
+                expect(active)
+            start, stop = stop, min(int(totals[active].max()), stop + self._round(stop))
             parts = active.split(max(1, plan.chunk_size // (stop - start)))
             tops = [self._best_of_samples(part, start, stop) for part in parts]
             top_losses, top_matrices, tested = (torch.cat(parts) for parts in zip(*tops, strict=True))
             poses[active] += tested
-            drawn[active] = samples.totals[active].clamp(max=stop)
+            drawn[active] = totals[active].clamp(max=stop)
             better = (top_losses[:, 0] < loss[active]).nonzero()[:, 0]
             improve(active[better], top_losses[better], top_matrices[better])
-            active = active[needed[active].clamp(min=plan.min_samples).minimum(samples.totals[active]) > stop]
+            active = active[needed[active].clamp(min=plan.min_samples).minimum(totals[active]) > stop]
         return Found(_orthonormal(_pose(matrix.to(self.corr.weights))), loss, poses, drawn)
+
+    def _prefer_agreement(self, problems: Tensor) -> None:
+        """From now on draw the pairs of some problems in proportion to the agreement of their neighbours, too."""
+        corr, there = self.corr, self.corr.weights > 0
+        agreement = agreement_of_neighbours(*(x[problems] for x in (corr.world_points, corr.img_points, there)))
+        chances = torch.ones_like(corr.weights) if self.chances is None else self.chances.clone()
+        chances[problems] *= (_LEAST_AGREEMENT + agreement) ** _AGREEMENT_POWER
+        self.samples = self._samples(chances)
+
+    def _samples(self, chances: Tensor | None) -> Samples:
+        plan = self.plan
+        there = self.corr.weights > 0
+        return Samples(there, size=plan.minimal.sample_size, most=plan.max_samples, seed=plan.seed, chances=chances)
 
     def _round(self, done: int) -> int:
         """Number of samples of the round after the first ``done`` samples."""
