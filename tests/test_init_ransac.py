@@ -283,4 +283,4 @@ def test_the_gradient_is_that_of_the_result(make_problems, correspond):
         ends = [ransac(corr._replace(**{name: value + s * direction})).pose.translation for s in (step, -step)]
         numeric = ((ends[0] - ends[1]) * probe).sum(-1) / (2 * step)
         analytic = (leaf.grad * direction).flatten(1).sum(-1)
-        torch.testing.assert_close(analytic, numeric, rtol=1e-2, atol=1e-8)
+        torch.testing.assert_close(analytic, numeric, rtol=5e-2, atol=1e-8)

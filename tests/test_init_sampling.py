@@ -8,7 +8,13 @@ import math
 import pytest
 import torch
 
-from kornia_pnpnet.init.ransac.sampling import Samples, draw_likely, draw_subsets, samples_needed
+from kornia_pnpnet.init.ransac.sampling import (
+    Samples,
+    agreement_of_neighbours,
+    draw_likely,
+    draw_subsets,
+    samples_needed,
+)
 
 
 def uniform_numbers(count, size):
@@ -53,6 +59,54 @@ def test_likely_items_are_drawn_more_often_and_none_twice():
         assert abs(seen - expected) < 4 * math.sqrt(expected / draws), order
     assert (subsets != 2).all()
     assert (subsets.sort(-1).values.diff(dim=-1) > 0).all()
+
+
+def surface(generator, count, wrong, *, size=6.0):
+    """Points of a wavy surface and their pixels; those of the ``wrong`` last pairs are anywhere."""
+    flat = size * torch.rand(2, count, 2, generator=generator, dtype=torch.float64)
+    points = torch.cat((flat, 8.0 + flat.sin().sum(-1, keepdim=True)), -1)
+    pixels = points[..., :2] / points[..., 2:]
+    pixels[:, count - wrong :] = (
+        torch.rand(2, wrong, 2, generator=generator, dtype=torch.float64) * pixels.amax(1)[:, None]
+    )
+    return points, pixels, torch.ones(2, count, dtype=torch.bool)
+
+
+def test_neighbours_of_inliers_agree(generator):
+    points, pixels, there = surface(generator, 200, 160)
+    agreement = agreement_of_neighbours(points, pixels, there)
+    likely = agreement.topk(20, dim=1).indices
+    assert (likely < 40).double().mean() > 0.7  # 0.2 by chance
+
+
+def test_agreement_of_neighbours_depends_on_neither_frame_nor_order_nor_padding(generator, random_rotations):
+    points, pixels, there = surface(generator, 90, 40)
+    expected = agreement_of_neighbours(points, pixels, there)
+    c, s = math.cos(0.3), math.sin(0.3)
+    turned = agreement_of_neighbours(
+        7.0 * points @ random_rotations(2).mT + 3.0, 500.0 * pixels @ torch.tensor([[c, s], [-s, c]]).double(), there
+    )
+    torch.testing.assert_close(
+        turned, expected, rtol=0.02, atol=0.02
+    )  # in float32, nearly equal distances change places
+    order = torch.randperm(90, generator=generator)
+    torch.testing.assert_close(agreement_of_neighbours(points[:, order], pixels[:, order], there), expected[:, order])
+    more = (torch.cat((x, torch.zeros_like(x[:, :30])), 1) for x in (points, pixels, there))
+    torch.testing.assert_close(agreement_of_neighbours(*more)[:, :90], expected)
+
+
+def test_repeated_pixels_and_points_are_no_neighbours(generator):
+    points, pixels, there = surface(generator, 60, 60)
+    pixels[:, 40:] = pixels[:, 40:41]  # a crowd
+    points[:, 40:50] = points[:, 40:41] + 1e-3 * torch.rand(2, 10, 3, generator=generator, dtype=torch.float64)
+    crowd = agreement_of_neighbours(points, pixels, there)[:, 41:50]
+    assert crowd.mean() <= agreement_of_neighbours(points, pixels, there)[:, :40].mean() + 0.2
+
+
+def test_agreement_of_many_pairs_needs_few_of_them(generator):
+    points, pixels, there = surface(generator, 2000, 1600)
+    likely = agreement_of_neighbours(points, pixels, there).topk(100, dim=1).indices
+    assert (likely < 400).double().mean() > 0.6
 
 
 def test_equal_chances_are_no_chances(generator):

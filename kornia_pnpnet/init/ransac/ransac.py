@@ -42,10 +42,10 @@ from kornia_pnpnet.types import MIN_PAIRS, Correspondences, Guess, Pose
 __all__ = ["FURTHER", "RANSAC", "search_on"]
 
 # Number of least-squares steps from the best pose, which is near the minimum already.
-_FINAL_STEPS = 4
+_FINAL_STEPS = 6
 # The scale of the Cauchy kernel of these steps, in standard deviations of the inliers' residuals; the median of the
 # squared residuals of Gaussian noise, in variances of a pixel coordinate; pairs that a pose fits by itself.
-_KERNEL_SCALE, _MEDIAN, _FITTED = 3.4, 2.0 * math.log(2.0), 6
+_KERNEL_SCALE, _MEDIAN, _FITTED = 3.4, 2.0 * math.log(2.0), 5
 # Standard deviations. :func:`search_on` counts nearer pairs as inliers. The limit is wide because networks estimate too
 # little noise where most pairs are wrong: right pairs that do not count cost more than wrong pairs that do.
 _INLIER = 10.0
@@ -246,8 +246,10 @@ def _robust(judged: Judged, inliers: Tensor) -> Tensor:
     Thresholds are wide, and noise has tails: with equal weights, pairs near the threshold would decide the pose.
     """
     count = (inliers > 0).sum(-1, keepdim=True)
-    ascending = torch.where(inliers > 0, judged.errors.detach(), torch.inf).sort(-1).values
-    median = ascending.gather(1, (count - 1).clamp(min=0) // 2).clamp(min=torch.finfo(ascending.dtype).eps)
+    ascending = torch.where(inliers > 0, judged.errors, torch.inf).sort(-1).values
+    median = ascending.gather(1, ((count + MIN_PAIRS) // 2).minimum(count - 1).clamp(min=0)).clamp(
+        min=torch.finfo(ascending.dtype).eps
+    )
     # Few inliers lie close to the pose that was fitted to them: their residuals say less than they seem to.
     free = (count - _FITTED).clamp(min=0) / count.clamp(min=1)
     sq_scale = _KERNEL_SCALE**2 * median / _MEDIAN
