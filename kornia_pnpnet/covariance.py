@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from kornia.geometry.camera import PinholeCamera
@@ -11,6 +9,7 @@ from kornia.geometry.liegroup import So3
 from torch import Tensor
 
 from kornia_pnpnet.core.checks import Shapes, check_devices, check_shapes, common_dtype, expand_sigma
+from kornia_pnpnet.core.linalg import symmetric
 from kornia_pnpnet.geometry import normal_equations, pixel_variance, project
 from kornia_pnpnet.types import Correspondences, Noise, Pose, camera_matrices
 
@@ -100,7 +99,7 @@ def pose_covariance(
 
         projection = project(centred_pose, corr)
         variance = pixel_variance(projection, Noise(noise.img / mean_focal, noise.world / spread), unit_focal)
-        information = _symmetric(normal_equations(projection, inlier / variance).hessian)
+        information = symmetric(normal_equations(projection, inlier / variance).hessian)
         inverse, info = torch.linalg.inv_ex(information)
         positive = (inverse.diagonal(dim1=1, dim2=2) > 0).all(-1)
         determined = ((info == 0) & inverse.isfinite().all((1, 2)) & positive)[:, None, None]
@@ -113,9 +112,3 @@ def pose_covariance(
         covariance = back @ torch.where(determined, inverse, 0.0) @ back.mT
         undetermined = covariance.new_full((6,), torch.inf).diag()
         return torch.where(determined, covariance, undetermined).to(dtype)
-
-
-def _symmetric(rows: Sequence[Sequence[Tensor]]) -> Tensor:
-    """The matrices (B, K, K) from the rows of their lower triangles; every entry is of shape (B,)."""
-    size = range(len(rows))
-    return torch.stack([torch.stack([rows[max(i, j)][min(i, j)] for j in size], -1) for i in size], -2)

@@ -321,6 +321,9 @@ class PnPNet(nn.Module):
         status = torch.where(ok, Status.SOLVED.value, torch.where(finite, status, Status.DEGENERATE.value))
         # ONNX Runtime chooses among int64, not among int8.
         status = torch.where(frame.valid, status, frame.status).to(torch.int8)
+        probability = guess.probability if refined.probability is None else refined.probability
+        if probability is not None:
+            probability = torch.where(finite, probability, 0.0)
         live = finite if always else ok
         rotation, translation = _gate_pose(pose, live, finite)
         return PnPResult(
@@ -331,6 +334,7 @@ class PnPNet(nn.Module):
             ok,
             _gate_pose(first, first_ok, first_ok),
             status,
+            probability,
         )
 
     # -- weights on disk ---------------------------------------------------------------------------------------------

@@ -208,6 +208,8 @@ class Guess(NamedTuple):
             no others.
         noise: noise of each pair in the units of the correspondences, where unknown the initialiser's estimate;
             residuals then count in standard deviations. ``None``: the initialiser does not estimate noise.
+        probability: probability that the pose is not far off, shape :math:`(B,)`; ``None``: the initialiser does not
+            estimate it.
     """
 
     pose: Pose
@@ -215,6 +217,7 @@ class Guess(NamedTuple):
     ok: Tensor | None = None
     others: Pose | None = None
     noise: Noise | None = None
+    probability: Tensor | None = None
 
     @property
     def poses(self) -> list[Pose]:
@@ -244,6 +247,8 @@ class Refinement(NamedTuple):
         cost: mean robust loss of the pairs at that pose, shape :math:`(B,)`.
         ok: whether the pose is to be believed, bool, shape :math:`(B,)`.
         in_front: whether at least three pairs with a weight are in front of the camera, bool, shape :math:`(B,)`.
+        probability: probability that the pose is not far off, NaN where the noise is unknown, shape :math:`(B,)`;
+            ``None``: unknown for all problems.
     """
 
     pose: Pose
@@ -251,6 +256,7 @@ class Refinement(NamedTuple):
     cost: Tensor
     ok: Tensor
     in_front: Tensor
+    probability: Tensor | None = None
 
 
 class PnPResult(NamedTuple):
@@ -268,6 +274,10 @@ class PnPResult(NamedTuple):
             initialiser can learn from its failures.
         status: why a problem is not ``ok``: the value of a :class:`Status`, int8, shape :math:`(B,)`. Every solver of
             this package sets it.
+        probability: estimated probability that the pose is not far off, which is within 10 degrees and 30 % of the
+            distance of the points, shape :math:`(B,)`, without gradient. How accurate it is beyond that,
+            :func:`~kornia_pnpnet.covariance.pose_covariance` says. NaN where the solver does not know the noise,
+            ``None`` where it knows it for no problem.
     """
 
     rotation: Tensor
@@ -277,6 +287,7 @@ class PnPResult(NamedTuple):
     ok: Tensor
     init: Pose
     status: Tensor | None = None
+    probability: Tensor | None = None
 
     @property
     def pose(self) -> Pose:

@@ -22,7 +22,9 @@ __all__ = [
     "relative",
     "small_product",
     "solve_leading",
+    "solve_symmetric",
     "substitute",
+    "symmetric",
 ]
 
 # Sweeps of Jacobi's rotations in `eigenvectors`. After two, the median error of an eigenvalue of a random matrix is
@@ -339,3 +341,16 @@ def eigenvectors(matrix: Tensor) -> list[tuple[Tensor, Tensor]]:
         swap = pairs[i][0] > pairs[j][0]
         pairs[i], pairs[j] = torch.where(swap, pairs[j], pairs[i]), torch.where(swap, pairs[i], pairs[j])
     return [(pair[0], pair[1:]) for pair in pairs]
+
+
+def symmetric(rows: Sequence[Sequence[Tensor]]) -> Tensor:
+    """The matrices (B, K, K) from the rows of their lower triangles; every entry is of shape (B,)."""
+    size = range(len(rows))
+    return torch.stack([torch.stack([rows[max(i, j)][min(i, j)] for j in size], -1) for i in size], -2)
+
+
+def solve_symmetric(matrix: Tensor, right: Tensor) -> Tensor:
+    """Solve systems with positive definite matrices (B, 3, 3) by cofactors."""
+    a, b, c = matrix.unbind(1)
+    adjugate = torch.stack((torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)), -1)
+    return (adjugate @ right) / (a * adjugate[..., 0]).sum(-1)[:, None, None]

@@ -9,7 +9,7 @@ from torch.nn import functional
 
 from kornia_pnpnet.core.checks import check_devices, check_whole
 from kornia_pnpnet.core.configured import Configured
-from kornia_pnpnet.core.linalg import dot, small_product
+from kornia_pnpnet.core.linalg import dot, small_product, solve_symmetric
 from kornia_pnpnet.core.performance import take_pairs
 from kornia_pnpnet.geometry import align, project
 from kornia_pnpnet.init.ransac import p3p
@@ -82,7 +82,7 @@ class _View:
         seen = seen - (share * seen).sum(1, keepdim=True)
 
         moment = world.mT @ (share * world) + _RIDGE * torch.eye(3, dtype=world.dtype, device=world.device)
-        affine = _solve_symmetric(moment, world.mT @ (share * seen)).mT  # (B, 2, 3)
+        affine = solve_symmetric(moment, world.mT @ (share * seen)).mT  # (B, 2, 3)
         self.world = _frame(affine)  # (B, 3, 3)
         self.points = world @ self.world.mT  # (B, N, 3)
         residual = seen - world @ affine.mT
@@ -128,13 +128,6 @@ def _same(points: Tensor, there: Tensor) -> Tensor:
     run = new.cumsum(1) - 1
     sizes = torch.zeros_like(there).scatter_add(1, run, there.gather(1, order))
     return torch.empty_like(there).scatter(1, order, sizes.gather(1, run)).clamp(min=1.0)
-
-
-def _solve_symmetric(matrix: Tensor, right: Tensor) -> Tensor:
-    """Solve systems with positive definite matrices (B, 3, 3) by cofactors."""
-    a, b, c = matrix.unbind(1)
-    adjugate = torch.stack((torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)), -1)
-    return (adjugate @ right) / (a * adjugate[..., 0]).sum(-1)[:, None, None]
 
 
 def _frame(affine: Tensor) -> Tensor:

@@ -25,12 +25,13 @@ from kornia_pnpnet.refine.stages import LMStart, Stage, State
 from kornia_pnpnet.refine.step import (
     LMStep,
     iterate,
+    outlier_area,
     solve_damped,
     sq_standardised,
     variance_factor,
     weighted_equations,
 )
-from kornia_pnpnet.refine.verdict import explains, has_enough, is_evident
+from kornia_pnpnet.refine.verdict import believe, explains, has_enough
 from kornia_pnpnet.types import Correspondences, Guess, Noise, Pose, Refinement
 
 __all__ = ["BACKWARDS", "RobustWeightedLM"]
@@ -231,9 +232,9 @@ class RobustWeightedLM(Configured):
         noiseless = None if unknown is None or corr.noise is None or guess.noise is not None else unknown[:, 0]
         corr = problems_last(corr._replace(noise=_complete_noise(corr, guess)))
         prior = corr.weights * problems_last(guess.weights)
-        outlier_area = None
+        area = None
         if self.by_residual and unknown is not None and corr.noise is not None:
-            outlier_area = torch.where(unknown, _outlier_area(corr), 0.0)
+            area = torch.where(unknown, outlier_area(corr), 0.0)
         # Steps do not depend on a common factor of the weights; tiny weights must not vanish when multiplied.
         guided = corr._replace(weights=relative(prior, prior), img_scale=None, world_scale=None)
         by_residual = guided
@@ -255,7 +256,7 @@ class RobustWeightedLM(Configured):
             by_residual=by_residual,
             starts=starts,
             rivals=rivals,
-            outlier_area=outlier_area,
+            outlier_area=area,
             noiseless=noiseless,
             step=step,
             damping=damping,
@@ -332,14 +333,16 @@ class RobustWeightedLM(Configured):
             judged = judged._replace(noise=map_tensors(lambda sigma: larger * sigma, noise))
         weights = torch.where(projection.in_front, start.prior * self.kernel.weight(sq_residual, shape), 0.0)
         cost = self._cost(projection, start.corr, start.prior, shape)
+        probability = None
         if start.corr.noise is None:
-            believed = explains(projection, start.corr, start.prior)
+            ok = explains(projection, start.corr, start.prior)
         else:
-            believed = is_evident(projection, judged)
+            probability, ok = believe(projection, judged)
             if start.noiseless is not None:
-                believed = torch.where(start.noiseless, explains(projection, start.corr, start.prior), believed)
+                ok = torch.where(start.noiseless, explains(projection, start.corr, start.prior), ok)
+                probability = torch.where(start.noiseless, torch.nan, probability)
         in_front = has_enough(projection, start.prior)
-        return Refinement(end.pose, weights, cost, end.solved & believed & in_front, in_front)
+        return Refinement(end.pose, weights, cost, end.solved & ok & in_front, in_front, probability)
 
     def compile(self, mode: str | None = None) -> None:
         """Compile with ``torch.compile``, in place: what is before, in, and after an iteration, each once.
@@ -362,13 +365,13 @@ class RobustWeightedLM(Configured):
         step: Tensor,
         damping: Tensor,
         shape: Tensor,
-        outlier_area: Tensor | None,
+        area: Tensor | None,
         state: State,
     ) -> State:
         """One iteration. With ``reject_worse``, a problem whose cost would rise keeps its pose."""
         damping = damping * state.factor if self.reject_worse else damping
-        pose, solved = self._iterate(pairs, state.pose, step, damping, shape, outlier_area)
-        if not self.reject_worse or outlier_area is not None:  # the cost does not know the corrected noise
+        pose, solved = self._iterate(pairs, state.pose, step, damping, shape, area)
+        if not self.reject_worse or area is not None:  # the cost does not know the corrected noise
             return State(pose, solved, state.factor)
         new, old = (self._cost(project(x, pairs), pairs, pairs.weights, shape) for x in (pose, state.pose))
         # At a minimum, rounding decides which cost is lower. A refused step has no gradient there: take the step.
@@ -429,17 +432,6 @@ def _relative_to_mean(weights: Tensor) -> Tensor:
     """Weights over the mean of those that are not 0: unlike the largest weight, the mean has a derivative at ties."""
     mean = weights.sum(-1, keepdim=True) / (weights > 0).sum(-1, keepdim=True).clamp(min=1)
     return weights / torch.where(mean > 0, mean, 1.0)
-
-
-def _outlier_area(corr: Correspondences) -> Tensor:
-    """Area of a square with the variance of the pixels that are near, (B, 1)."""
-    there = (corr.near_weights > 0).to(corr.weights)
-    share = there / there.sum(-1, keepdim=True).clamp(min=1.0)
-    variance = torch.zeros_like(share[:, :1])
-    for pixels in corr.img_points.detach().unbind(-1):
-        mean = (share * pixels).sum(-1, keepdim=True)
-        variance = variance + (share * (pixels - mean).square()).sum(-1, keepdim=True)
-    return 6.0 * variance + torch.finfo(variance.dtype).tiny
 
 
 def _complete_noise(corr: Correspondences, guess: Guess) -> Noise | None:

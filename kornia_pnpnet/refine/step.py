@@ -29,7 +29,16 @@ from kornia_pnpnet.geometry import (
 )
 from kornia_pnpnet.types import MIN_PAIRS, Correspondences, Pose
 
-__all__ = ["LMStep", "iterate", "lm_step", "solve_damped", "sq_standardised", "variance_factor", "weighted_equations"]
+__all__ = [
+    "LMStep",
+    "iterate",
+    "lm_step",
+    "outlier_area",
+    "solve_damped",
+    "sq_standardised",
+    "variance_factor",
+    "weighted_equations",
+]
 
 # Logarithm of a likelihood ratio. The residuals' own variance factor replaces 1 where it is e³ times as likely.
 _BELIEVED = 3.0
@@ -222,6 +231,17 @@ def variance_factor(
     within = torch.where(projection.in_front, kernel_weight(sq_residual, shape), 0.0)
     below = _factor_below(sq_residual, within, weights, outlier_area > 0)
     return above * torch.where(below < 1.0, narrower * below, 1.0)
+
+
+def outlier_area(corr: Correspondences) -> Tensor:
+    """Area of a square with the variance of the pixels that are near: where pixels of outliers lie, (B, 1)."""
+    there = (corr.near_weights > 0).to(corr.weights)
+    share = there / there.sum(-1, keepdim=True).clamp(min=1.0)
+    variance = torch.zeros_like(share[:, :1])
+    for pixels in corr.img_points.detach().unbind(-1):
+        mean = (share * pixels).sum(-1, keepdim=True)
+        variance = variance + (share * (pixels - mean).square()).sum(-1, keepdim=True)
+    return 6.0 * variance + torch.finfo(variance.dtype).tiny
 
 
 def _weights(

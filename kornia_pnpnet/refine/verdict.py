@@ -13,35 +13,49 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kornia_pnpnet.core.linalg import solve_symmetric, symmetric
 from kornia_pnpnet.core.performance import exporting, in_order
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.geometry import Projection, span_a_plane
+from kornia_pnpnet.geometry import Projection, normal_equations, pixel_variance, span_a_plane
 from kornia_pnpnet.types import MIN_PAIRS, Correspondences
 
 __all__ = [
     "MAX_ERROR",
-    "MAX_FALSE_ALARMS",
+    "EVIDENT",
+    "LEAST_PROBABILITY",
+    "Belief",
     "Judged",
     "Thresholds",
+    "believe",
     "chance_of_inlier",
     "chance_of_others",
     "explains",
     "has_enough",
-    "is_evident",
+    "is_believed",
     "judge",
     "log_false_alarms",
+    "probability",
+    "rotation_sigma",
 ]
 
 #: Largest standardised squared residual; points behind the camera have it.
 MAX_ERROR = 1e6
-#: A pose is evident when fewer poses than this are expected to have as many inliers by chance.
-MAX_FALSE_ALARMS = 0.01
+# A pose is evident when fewer poses than this are expected to have as many inliers by chance.
+_MAX_FALSE_ALARMS = 0.01
+#: A pose is to be believed when it is not far off with at least this probability. Of synthetic problems that the law of
+#: :func:`probability` was not fitted to, 98 % of the right poses keep it, and 9 % of the poses that are far off.
+LEAST_PROBABILITY = 0.93
+# The law of :func:`probability`, fitted by `python docs/results/measure.py --fit-probability`: log-odds when both
+# features are 0, per unit of the logarithm of the false alarms and of the logarithm of the rotation's sigma.
+_LAW = (-3.1697, -0.15391, -1.0801)
+# The features' ranges: beyond them more evidence says nothing more.
+_ALARMS, _LOG_SIGMA = (-20.0, 10.0), (-12.0, 2.0)
 # Pairs. The pixels of this many stand for those of all pairs in :func:`chance_of_others`.
 _MOST_OTHERS = 128
 # Pixels of other pairs near a projection. This many are left out of the count: pixels of right pairs may be close, too.
 _FEW_HITS = 4
-# Standard deviations. Pairs further off than this are no evidence for a pose.
-_EVIDENT = 3.5
+#: Standard deviations. Pairs further off than this are no evidence for a pose.
+EVIDENT = 3.5
 # Radii of the disc of the worst inlier. Nearer outliers say nothing about chance: they are pairs that are slightly off,
 # or inliers where the caller's sigmas are too small. Tuned on synthetic problems (`pnpnet-set`, seed 9101) with sigmas
 # that are half of the noise: ten radii refuse many more right poses, thirty accept more wrong ones.
@@ -93,26 +107,90 @@ def explains(projection: Projection, corr: Correspondences, weights: Tensor) -> 
     return enough & _span_a_plane(corr.world_points.detach(), agree)
 
 
-def is_evident(projection: Projection, corr: Correspondences) -> Tensor:
-    """Tell whether a pose has more inliers than chance would give it, when the noise is known for every pair.
+class Belief(NamedTuple):
+    """What the inliers say of a pose.
+
+    Attributes:
+        probability: see :func:`probability`, shape :math:`(B,)`.
+        ok: whether the pose is to be believed, bool, shape :math:`(B,)`.
+    """
+
+    probability: Tensor
+    ok: Tensor
+
+
+def believe(projection: Projection, corr: Correspondences) -> Belief:
+    """Tell whether a pose is to be believed, when the noise is known for every pair.
+
+    Its inliers must be more than chance would give it and span more than a line, and it must probably not be far off.
 
     Args:
         projection: :func:`~kornia_pnpnet.geometry.project` of the pose.
         corr: normalised correspondences with their noise.
 
     Returns:
-        bool of shape :math:`(B,)`.
+        The probability and the answer, without a gradient.
     """
     projection, corr = map_tensors(torch.Tensor.detach, projection), corr.map(torch.Tensor.detach)
     assert corr.noise is not None
-    thresholds = Thresholds(_EVIDENT * corr.noise.img, _EVIDENT * corr.noise.world)
+    thresholds = Thresholds(EVIDENT * corr.noise.img, EVIDENT * corr.noise.world)
     judged = judge(projection, corr, thresholds)
     inliers, counts = (judged.weights > 0).sum(-1), (corr.weights > 0).sum(-1)
-    chance = chance_of_inlier(corr, thresholds, judged)
     triples = counts * (counts - 1) * (counts - 2) // 6  # any three pairs could have given the pose
+    chance = chance_of_inlier(corr, thresholds, judged)
     chance = chance.maximum(chance_of_others(projection, corr, thresholds, judged))
-    evident = log_false_alarms(triples, inliers, counts, chance) < math.log(MAX_FALSE_ALARMS)
-    return evident & _span_a_plane(corr.world_points, judged.weights > 0)
+    alarms = log_false_alarms(triples, inliers, counts, chance)
+    chances = probability(alarms, rotation_sigma(projection, corr, judged)).to(corr.weights)
+    span = _span_a_plane(corr.world_points, judged.weights > 0)
+    return Belief(torch.where(span, chances, 0.0), span & is_believed(alarms, chances))
+
+
+def is_believed(log_alarms: Tensor, chances: Tensor) -> Tensor:
+    """Whether chance is no explanation, and the pose is probably not far off, bool (B,)."""
+    return (log_alarms < math.log(_MAX_FALSE_ALARMS)) & (chances >= LEAST_PROBABILITY)
+
+
+def probability(log_alarms: Tensor, sigma: Tensor) -> Tensor:
+    r"""Probability that a pose is not far off: within 10 degrees and 30 % of the distance of the points.
+
+    A logistic law of two numbers: how unlikely the inliers are by chance, and how well they determine the rotation.
+    Few inliers in a small part of the space and of the image agree with many poses.
+
+    Args:
+        log_alarms: :func:`log_false_alarms`, shape :math:`(B,)`.
+        sigma: :func:`rotation_sigma`, shape :math:`(B,)`.
+
+    Returns:
+        In (0, 1), shape :math:`(B,)`.
+
+    Example:
+        >>> probability(torch.tensor([-30.0, -30.0, 0.0]), torch.tensor([0.001, 0.3, 0.001]))
+        tensor([0.9994, 0.7701, 0.9865])
+    """
+    offset, by_alarms, by_sigma = _LAW
+    return torch.sigmoid(offset + by_alarms * log_alarms.clamp(*_ALARMS) + by_sigma * sigma.log().clamp(*_LOG_SIGMA))
+
+
+def rotation_sigma(projection: Projection, corr: Correspondences, judged: Judged) -> Tensor:
+    """Standard deviation of the rotation in radians, by the noise of the inliers; infinite where they leave it open.
+
+    Args:
+        projection: :func:`~kornia_pnpnet.geometry.project` of the pose.
+        corr: normalised correspondences with their noise.
+        judged: what :func:`judge` returned.
+
+    Returns:
+        The square root of the trace of the rotation's covariance, float64, shape :math:`(B,)`.
+    """
+    assert corr.noise is not None
+    precision = corr.focal.square() / pixel_variance(projection, corr.noise, corr.focal)
+    rows = normal_equations(projection, torch.where(judged.weights > 0, precision, 0.0)).hessian
+    matrix = symmetric(rows).double()
+    shift = matrix[:, 3:, 3:]
+    left = matrix[:, :3, :3] - matrix[:, :3, 3:] @ solve_symmetric(shift, matrix[:, 3:, :3])  # the shift eliminated
+    eye = torch.eye(3, dtype=left.dtype, device=left.device)
+    variance = solve_symmetric(left, eye.expand_as(left)).diagonal(dim1=1, dim2=2).sum(-1)
+    return torch.where(variance > 0, variance, torch.inf).sqrt()  # NaN, too, is open
 
 
 def _span_a_plane(world_points: Tensor, inliers: Tensor) -> Tensor:

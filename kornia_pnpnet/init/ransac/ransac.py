@@ -29,15 +29,19 @@ from kornia_pnpnet.init.ransac.search import (
     take,
 )
 from kornia_pnpnet.refine.verdict import (
-    MAX_FALSE_ALARMS,
+    EVIDENT,
+    Belief,
     Judged,
     Thresholds,
     chance_of_inlier,
     chance_of_others,
+    is_believed,
     judge,
     log_false_alarms,
+    probability,
+    rotation_sigma,
 )
-from kornia_pnpnet.types import MIN_PAIRS, Correspondences, Guess, Pose
+from kornia_pnpnet.types import MIN_PAIRS, Correspondences, Guess, Noise, Pose
 
 __all__ = ["FURTHER", "RANSAC", "search_on"]
 
@@ -71,7 +75,8 @@ class RANSAC(Configured):
     :math:`f/z` times as much. Least squares weigh an inlier by the inverse of the right hand side.
 
     The guess is ``ok`` when fewer than 0.01 poses with as many inliers are expected by chance, from pairs without any
-    pose behind them (see :func:`~kornia_pnpnet.refine.verdict.log_false_alarms`). A problem of only three pairs is
+    pose behind them (see :func:`~kornia_pnpnet.refine.verdict.log_false_alarms`), and the pose is probably not far off
+    (:func:`~kornia_pnpnet.refine.verdict.probability`). A problem of only three pairs is
     ``ok`` when it has a pose: three pairs hold no evidence.
 
     Where the caller gave a confidence for each pair, samples hold pairs in proportion to it, and fewer samples suffice
@@ -195,9 +200,10 @@ class RANSAC(Configured):
             found = Search(self.plan, detached, thresholds, _trusted(detached.confidence)).run(given)
         pose, judged = self._refine(corr, found.pose, thresholds)
         with torch.no_grad():
-            ok = self._is_evident(found, detached, thresholds, judged, project(pose, problems_last(detached)))
+            believed = self._believe(found, detached, thresholds, judged, project(pose, problems_last(detached)))
         offset = (pose.rotation @ centre[..., None])[..., 0]
-        return Guess(Pose(pose.rotation, pose.translation - offset), judged.weights, ok)
+        moved = Pose(pose.rotation, pose.translation - offset)
+        return Guess(moved, judged.weights, believed.ok, probability=believed.probability)
 
     def _thresholds(self, corr: Correspondences) -> Thresholds:
         """The thresholds in units of the correspondences, (B,) each."""
@@ -227,17 +233,20 @@ class RANSAC(Configured):
         pose, judged = map_tensors(lambda *parts: torch.cat(parts), *results)
         return map_tensors(torch.Tensor.contiguous, pose), judged
 
-    def _is_evident(
+    def _believe(
         self, found: Found, corr: Correspondences, thresholds: Thresholds, judged: Judged, projection: Projection
-    ) -> Tensor:
-        """Whether a pose has more inliers than chance would give it, (B,)."""
+    ) -> Belief:
+        """Whether a pose is to be believed; the noise is such that the thresholds are the limits of evidence."""
         inliers, counts = (judged.weights > 0).sum(-1), (corr.weights > 0).sum(-1)
         chance = chance_of_inlier(corr, thresholds, judged)
         chance = chance.maximum(chance_of_others(projection, corr, thresholds, judged))
         # Every number of inliers from 4 to all pairs is another test of the same pose.
         tests = found.poses * (counts - MIN_PAIRS).clamp(min=1)
-        rare = log_false_alarms(tests, inliers, counts, chance) < math.log(MAX_FALSE_ALARMS)
-        return found.loss.isfinite() & (rare | ((inliers == MIN_PAIRS) & (counts == MIN_PAIRS)))
+        alarms = log_false_alarms(tests, inliers, counts, chance)
+        noise = Noise(*(x[:, None].expand_as(corr.weights) / EVIDENT for x in thresholds))
+        chances = probability(alarms, rotation_sigma(projection, corr._replace(noise=noise), judged)).to(corr.weights)
+        ok = is_believed(alarms, chances) | ((inliers == MIN_PAIRS) & (counts == MIN_PAIRS))
+        return Belief(chances, ok & found.loss.isfinite())
 
 
 def _robust(judged: Judged, inliers: Tensor) -> Tensor:
