@@ -22,11 +22,14 @@ from kornia.geometry.conversions import (
 from kornia.geometry.liegroup import Se3
 from torch import Tensor
 
+from kornia_pnpnet.core.symmetric import Symmetric2, Symmetric3
 from kornia_pnpnet.core.trees import map_tensors
 
 __all__ = ["Correspondences", "Guess", "Hypotheses", "Noise", "PnPResult", "Pose", "Problems", "Refinement", "Status"]
 
 
+#: Focal lengths. Pixels are never known better than this, so that weights stay finite.
+LEAST_NOISE = 1e-6
 #: Pairs that determine a pose up to a few solutions.
 MIN_PAIRS = 3
 
@@ -40,8 +43,8 @@ class Status(IntEnum):
     TOO_FEW_PAIRS = 1
     #: The points lie on a line or coincide, or the pairs do not determine a pose.
     DEGENERATE = 2
-    #: A coordinate, weight or sigma is NaN or infinite, or a weight or sigma is negative, or a confidence is outside of
-    #: [0, 1].
+    #: A coordinate, weight, sigma or covariance is NaN or infinite, a weight or sigma is negative, a covariance is not
+    #: positive semi-definite, or a confidence is outside of [0, 1].
     NOT_FINITE = 3
     #: The intrinsics are not a multiple of ``[[fx, s, cx], [0, fy, cy], [0, 0, 1]]`` with positive ``fx`` and ``fy``.
     CAMERA = 4
@@ -144,15 +147,30 @@ def camera_matrices(intrinsics: Tensor | PinholeCamera) -> Tensor:
 
 
 class Noise(NamedTuple):
-    r"""Standard deviations of the noise of each pair, the same on each coordinate.
+    r"""The noise of each pair: standard deviations, the same on each coordinate, and covariances where there are any.
 
     Attributes:
-        img: standard deviation of the pixel, shape :math:`(B, N)`.
-        world: standard deviation of the world point, shape :math:`(B, N)`.
+        img: standard deviation of the pixel, shape :math:`(B, N)`; with a covariance that of isotropic noise of the
+            same trace, which is what a network sees.
+        world: standard deviation of the world point, as ``img``.
+        img_cov: covariance of the pixel, entries of shape :math:`(B, N)`; ``None``: noise is isotropic.
+        world_cov: covariance of the world point, as ``img_cov``.
     """
 
     img: Tensor
     world: Tensor
+    img_cov: Symmetric2 | None = None
+    world_cov: Symmetric3 | None = None
+
+    @property
+    def sigmas(self) -> Noise:
+        """The standard deviations alone."""
+        return self._replace(img_cov=None, world_cov=None)
+
+    @property
+    def is_isotropic(self) -> bool:
+        """Whether there is no covariance."""
+        return self.img_cov is None and self.world_cov is None
 
 
 class Correspondences(NamedTuple):

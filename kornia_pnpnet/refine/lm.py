@@ -24,7 +24,7 @@ from kornia_pnpnet.refine.parameters import BoundedParameter
 from kornia_pnpnet.refine.stages import LMStart, Stage, State
 from kornia_pnpnet.refine.step import LMStep, iterate, robust_weights, solve_damped, sq_standardised, weighted_equations
 from kornia_pnpnet.refine.verdict import explains, has_enough, is_evident
-from kornia_pnpnet.types import Correspondences, Guess, Noise, Pose, Refinement
+from kornia_pnpnet.types import LEAST_NOISE, Correspondences, Guess, Noise, Pose, Refinement
 
 __all__ = ["BACKWARDS", "RobustWeightedLM"]
 
@@ -34,8 +34,6 @@ BACKWARDS = ("unroll", "truncated", "implicit")
 # Focal lengths. Residuals count up to this size in the cost, and a point behind the camera counts as much, so that it
 # is never cheaper than a point in front of the camera.
 _MAX_RESIDUAL = 2.0
-# Focal lengths. Pixels are never known better than this, so that weights stay finite.
-_LEAST_NOISE = 1e-6
 # Units in the last place. With `reject_worse`, costs and residuals that differ by less count as equal.
 _ROUNDING = 100.0
 # Factors of the damping after a refused and after an accepted step (Marquardt 1963; only with `reject_worse`).
@@ -53,8 +51,9 @@ class RobustWeightedLM(Configured):
 
     *Noise.* Where the noise of each pair is known or estimated, residuals count in standard deviations: a pair weighs
     :math:`1 / \sigma^2` times the robust weight of :math:`\|r\|^2 / \sigma^2`, with the
-    :func:`~kornia_pnpnet.geometry.pixel_variance` :math:`\sigma^2` at the previous estimate. Scales of kernels and the
-    cost then count in standard deviations, too.
+    :func:`~kornia_pnpnet.geometry.pixel_variance` :math:`\sigma^2` at the previous estimate. Where the caller gave
+    covariances, residuals are whitened by the :func:`~kornia_pnpnet.geometry.pixel_covariance` instead. Scales of
+    kernels and the cost then count in standard deviations, too.
 
     *Several poses.* Where a guess has other poses, the first seven tenths of the iterations (rounded down) refine all
     of them. Then the pose of the lowest cost by the kernel of the last of these iterations goes on alone, per problem.
@@ -377,8 +376,7 @@ class RobustWeightedLM(Configured):
     def _cost(self, projection: Projection, corr: Correspondences, prior: Tensor, shape: Tensor) -> Tensor:
         """Mean robust loss over the pairs that have a weight, shape (B,)."""
         most = (_MAX_RESIDUAL * corr.focal).square()
-        sq_pixels = torch.where(projection.in_front, projection.sq_residual.minimum(most), most)
-        sq_residual = sq_standardised(projection, corr, sq_pixels)
+        sq_residual = sq_standardised(projection, corr, most)
         count = (corr.weights > 0).sum(-1).clamp(min=1)
         return (prior * self.kernel.loss(sq_residual, shape)).sum(-1) / count
 
@@ -416,16 +414,20 @@ def _relative_to_mean(weights: Tensor) -> Tensor:
 
 
 def _complete_noise(corr: Correspondences, guess: Guess) -> Noise | None:
-    """The noise of the guess; if it has none, the caller's with 0 for unknown sigmas; ``None`` if neither exists."""
+    """The caller's covariances, the guess's sigmas or else the caller's with 0 where unknown; ``None``: neither."""
     noise = guess.noise
     if noise is None and corr.noise is not None:
         noise = map_tensors(lambda x: x.nan_to_num(0.0), corr.noise)
-    return None if noise is None else noise._replace(img=noise.img.maximum(_LEAST_NOISE * corr.focal))
+    if noise is None:
+        return None
+    given = noise if corr.noise is None else corr.noise  # a guess has no covariances
+    least = noise.img.maximum(LEAST_NOISE * corr.focal)
+    return noise._replace(img=least, img_cov=given.img_cov, world_cov=given.world_cov)
 
 
 def _is_unknown(corr: Correspondences) -> Tensor:
     """Problems of which the caller gave neither sigma for any pair, bool (B, 1)."""
     known = torch.zeros_like(corr.weights[:, :1], dtype=torch.bool)
-    for sigma in corr.noise or ():
+    for sigma in () if corr.noise is None else (corr.noise.img, corr.noise.world):
         known = known | sigma.isfinite().any(1, keepdim=True)
     return ~known

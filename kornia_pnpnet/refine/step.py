@@ -15,6 +15,8 @@ import torch
 from torch import Tensor
 
 from kornia_pnpnet.core.linalg import factorise, relative, substitute
+from kornia_pnpnet.core.symmetric import Symmetric2
+from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import (
     NormalEquations,
     Projection,
@@ -22,6 +24,7 @@ from kornia_pnpnet.geometry import (
     change_tangent,
     move,
     normal_equations,
+    pixel_covariance,
     pixel_variance,
     project,
     retract_additive,
@@ -99,7 +102,7 @@ def lm_step(
     corr: Correspondences,
     pose: Pose,
     projection: Projection,
-    weights: Tensor,
+    weights: Tensor | Symmetric2,
     step: Tensor,
     damping: Tensor,
     *,
@@ -115,8 +118,8 @@ def lm_step(
         corr: normalised correspondences.
         pose: the pose to improve.
         projection: :func:`~kornia_pnpnet.geometry.project` of ``pose``.
-        weights: weight of each pair, :math:`(B, N)`. Points behind the camera do not count. The step does not depend
-            on a common factor.
+        weights: weight of each pair, :math:`(B, N)`, or 2×2 matrices with entries of that shape. Points behind the
+            camera do not count. The step does not depend on a common factor.
         step: :math:`\gamma`, a scalar.
         damping: :math:`\lambda`, a scalar or :math:`(B,)`.
         additive: update the rotation vector additively as in the paper, instead of by the retraction.
@@ -167,19 +170,31 @@ def solve_damped(equations: NormalEquations, damping: Tensor) -> tuple[list[Tens
     return substitute(lower, scaled), reduce(and_, good)
 
 
-def sq_standardised(projection: Projection, corr: Correspondences, sq_residual: Tensor | None = None) -> Tensor:
+def sq_standardised(projection: Projection, corr: Correspondences, most: Tensor | None = None) -> Tensor:
     """Squared residuals in variances of their pixel where the noise is known, else in square pixels.
+
+    Where noise has covariances this is the squared Mahalanobis distance.
 
     Args:
         projection: :func:`~kornia_pnpnet.geometry.project` of a pose.
         corr: normalised correspondences; their noise is known for every pair or for none.
-        sq_residual: squared residuals in square pixels, :math:`(B, N)`; those of ``projection`` when ``None``.
+        most: square pixels, a scalar. Larger squared residuals count as this much, and so does a point behind the
+            camera. With covariances this many square pixels have the mean precision of both coordinates.
 
     Returns:
         Shape :math:`(B, N)`.
     """
-    sq_residual = projection.sq_residual if sq_residual is None else sq_residual
-    return sq_residual if corr.noise is None else sq_residual / pixel_variance(projection, corr.noise, corr.focal)
+    noise, precision = corr.noise, None
+    sq_residual = projection.sq_residual
+    if noise is not None and not noise.is_isotropic:
+        precision = pixel_covariance(projection, noise, corr.focal).inverse()
+        sq_residual = precision.form(*projection.residual)
+        most = None if most is None else 0.5 * most * (precision.uu + precision.vv)
+    if most is not None:
+        sq_residual = torch.where(projection.in_front, sq_residual.minimum(most), most)
+    if noise is None or precision is not None:
+        return sq_residual
+    return sq_residual / pixel_variance(projection, noise, corr.focal)
 
 
 def robust_weights(
@@ -219,19 +234,26 @@ def _weights(
     kernel_weight: KernelWeight,
     shape: Tensor,
     estimated: Tensor | None,
-) -> Tensor:
-    """Weight of each pair in the normal equations: prior weight, inverse variance, robust weight."""
+) -> Tensor | Symmetric2:
+    """Weight of each pair in the normal equations: prior weight, inverse variance or covariance, robust weight."""
     if pairs.noise is None:
         return pairs.weights * kernel_weight(projection.sq_residual, shape)
-    precision = pixel_variance(projection, pairs.noise, pairs.focal).reciprocal()
-    sq_residual = projection.sq_residual * precision
+    precision: Tensor | Symmetric2
+    if pairs.noise.is_isotropic:
+        precision = pixel_variance(projection, pairs.noise, pairs.focal).reciprocal()
+        sq_residual = projection.sq_residual * precision
+    else:
+        precision = pixel_covariance(projection, pairs.noise, pairs.focal).inverse()
+        sq_residual = precision.form(*projection.residual)
     robust = robust_weights(sq_residual, projection, pairs.weights, kernel_weight, shape, estimated, NARROWER)
-    return pairs.weights * precision * robust
+    return map_tensors(lambda x: pairs.weights * x * robust, precision)
 
 
-def _relative(weights: Tensor, projection: Projection) -> Tensor:
+def _relative(weights: Tensor | Symmetric2, projection: Projection) -> Tensor | Symmetric2:
     """Weights relative to the heaviest row of the Jacobian, so that products of tiny weights do not vanish."""
-    return relative(weights, weights * projection.inv_depth * projection.inv_depth)
+    size = weights if isinstance(weights, Tensor) else weights.uu + weights.vv
+    size = size * projection.inv_depth * projection.inv_depth
+    return map_tensors(lambda x: relative(x, size), weights)
 
 
 def _variance_factor(sq_residual: Tensor, kernel_weight: Tensor, weights: Tensor, estimated: Tensor) -> Tensor:

@@ -14,8 +14,9 @@ import torch
 from torch import Tensor
 
 from kornia_pnpnet.core.performance import exporting, in_order
+from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.geometry import Projection, span_a_plane
+from kornia_pnpnet.geometry import Projection, pixel_covariance, span_a_plane
 from kornia_pnpnet.types import MIN_PAIRS, Correspondences
 
 __all__ = [
@@ -105,7 +106,11 @@ def is_evident(projection: Projection, corr: Correspondences) -> Tensor:
     """
     projection, corr = map_tensors(torch.Tensor.detach, projection), corr.map(torch.Tensor.detach)
     assert corr.noise is not None
-    thresholds = Thresholds(_EVIDENT * corr.noise.img, _EVIDENT * corr.noise.world)
+    precision = None
+    if not corr.noise.is_isotropic:
+        covariance = pixel_covariance(projection, corr.noise, corr.focal)
+        precision = map_tensors(lambda x: _EVIDENT**2 * x, covariance).inverse()
+    thresholds = Thresholds(_EVIDENT * corr.noise.img, _EVIDENT * corr.noise.world, precision)
     judged = judge(projection, corr, thresholds)
     inliers, counts = (judged.weights > 0).sum(-1), (corr.weights > 0).sum(-1)
     chance = chance_of_inlier(corr, thresholds, judged)
@@ -130,10 +135,14 @@ class Thresholds(NamedTuple):
     Attributes:
         img: :math:`\tau` in pixels of the normalised camera, shape :math:`(B,)` or :math:`(B, N)`.
         world: :math:`\omega` in units of the normalised world, shape :math:`(B,)` or :math:`(B, N)`.
+        precision: the matrix by which the squared length of a residual is 1 at the threshold, entries :math:`(B, N)`;
+            ``None``: that of :math:`\tau` and :math:`\omega`. A disc of the same area stands for its ellipse where
+            the chance of an inlier is estimated.
     """
 
     img: Tensor
     world: Tensor
+    precision: Symmetric2 | None = None
 
 
 class Judged(NamedTuple):
@@ -172,6 +181,8 @@ def judge(projection: Projection, corr: Correspondences, thresholds: Thresholds)
     """
     sq_img, sq_limit = _of_pairs(thresholds.img).square(), _sq_limits(projection, corr, thresholds)
     errors = projection.sq_residual / sq_limit
+    if thresholds.precision is not None:
+        errors = thresholds.precision.form(*projection.residual)
     errors = torch.where(projection.in_front, errors, MAX_ERROR)
     inlier = (errors < 1.0) & (corr.weights > 0)
     return Judged(torch.where(inlier, sq_img / sq_limit, 0.0), errors)
@@ -259,7 +270,9 @@ def chance_of_others(projection: Projection, corr: Correspondences, thresholds: 
 
 def _sq_limits(projection: Projection, corr: Correspondences, thresholds: Thresholds) -> Tensor:
     """Largest squared residual of an inlier in square pixels, (B, N)."""
-    img, world = map(_of_pairs, thresholds)
+    if thresholds.precision is not None:
+        return thresholds.precision.determinant.rsqrt()
+    img, world = _of_pairs(thresholds.img), _of_pairs(thresholds.world)
     return img.square() + (corr.focal * world * projection.inv_depth).square()
 
 

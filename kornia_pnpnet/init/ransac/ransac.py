@@ -285,7 +285,8 @@ def search_on(corr: Correspondences, guess: Guess, plan: Plan = FURTHER) -> Gues
     corr = corr._replace(noise=None).map(lambda x: x.detach().contiguous())
     there = corr.weights > 0
     share = there / there.sum(-1, keepdim=True).clamp(min=1)
-    img, world = (_INLIER * (torch.where(there, x.detach(), 0.0) * share).sum(-1) for x in guess.noise)
+    sigmas = guess.noise.img, guess.noise.world
+    img, world = (_INLIER * (torch.where(there, x.detach(), 0.0) * share).sum(-1) for x in sigmas)
     depth = guess.pose.translation[:, 2].detach().clamp(min=_NEAREST)
     thresholds = Thresholds(torch.hypot(img, corr.focal * world / depth), torch.zeros_like(world))
     chances = _DOUBT + (1.0 - _DOUBT) * guess.weights.detach()
