@@ -170,28 +170,31 @@ def pixel_variance(projection: Projection, noise: Noise, focal: Tensor) -> Tenso
     return torch.addcmul(noise.img * noise.img, moved * moved, sides)
 
 
-def pixel_covariance(projection: Projection, noise: Noise, focal: Tensor) -> Symmetric2:
+def pixel_covariance(
+    rotation: Tensor, plane_points: Sequence[Tensor], inv_depth: Tensor, noise: Noise, focal: Tensor
+) -> Symmetric2:
     r"""Covariance of a pixel, from the noise of the pixel and of the world point.
 
     It is :math:`\Sigma_\mathrm{img} + J R\,\Sigma_\mathrm{world} R^\top J^\top` with :math:`J` of
     :func:`pixel_variance`. A standard deviation stands for a multiple of the identity.
 
     Args:
-        projection: what :func:`project` returned; of it the rotation, ``plane_points`` and ``inv_depth``, which may
-            have more leading dimensions than the noise.
+        rotation: rotation of the pose, :math:`(*, 3, 3)`.
+        plane_points: :math:`(p, q)`, two tensors :math:`(*, N)`; see :class:`Projection`.
+        inv_depth: :math:`1/z`, shape :math:`(*, N)`.
         noise: noise of each pair.
         focal: the focal length in pixels, a scalar.
 
     Returns:
-        Entries of shape :math:`(B, N)`. Behind the camera they are the covariance of the pixel alone.
+        Entries of shape :math:`(*, N)`. Where the inverse depth is 0 they are the covariance of the pixel alone.
     """
-    p, q = projection.plane_points
-    scale = focal * projection.inv_depth
+    p, q = plane_points
+    scale = focal * inv_depth
     if noise.world_cov is None:
         moved = (scale * noise.world).square()
         uu, uv, vv = torch.addcmul(moved, moved * p, p), moved * p * q, torch.addcmul(moved, moved * q, q)
     else:
-        first, second, third = (row.unbind(-2) for row in projection.rotation[..., None].unbind(-3))
+        first, second, third = (row.unbind(-2) for row in rotation[..., None].unbind(-3))
         a = [scale * torch.addcmul(i, p, k, value=-1) for i, k in zip(first, third, strict=True)]
         b = [scale * torch.addcmul(j, q, k, value=-1) for j, k in zip(second, third, strict=True)]
         of_a, of_b = noise.world_cov.times(a), noise.world_cov.times(b)

@@ -223,7 +223,7 @@ class Normalize(Configured):
             # Scaling an infinite sigma would give gradients of NaN: an invalid problem has no known noise.
             sigmas = map_tensors(lambda sigma: torch.where(has_noise[:, None], sigma, torch.nan), noise.sigmas)
             noise = noise._replace(img=sigmas.img, world=sigmas.world)
-            if not noise.is_isotropic:
+            if noise.covariances:
                 pixel_map = img_scales[0], -camera[1] / camera[0] * img_scales[1], img_scales[1]
                 noise = self._scaled_covariances(noise, (there & has_noise).mT, pixel_map, scale)
             noise = self._apply_to_noise(noise, frame)
@@ -358,8 +358,7 @@ def _is_usable(noise: Noise, there: Tensor) -> Tensor:
     finite and positive semi-definite.
     """
     usable = [((x >= 0) | x.isnan()).all(-1) & ~x.isinf().any(-1) for x in (noise.img, noise.world)]
-    covariances = (x for x in (noise.img_cov, noise.world_cov) if x is not None)
-    return torch.stack([*usable, *((are_semi_definite(x) | ~there).all(-1) for x in covariances)]).all(0)
+    return torch.stack([*usable, *((are_semi_definite(x) | ~there).all(-1) for x in noise.covariances)]).all(0)
 
 
 def _pinhole(camera: Tensor) -> tuple[Tensor, Tensor]:

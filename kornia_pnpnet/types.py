@@ -168,9 +168,9 @@ class Noise(NamedTuple):
         return self._replace(img_cov=None, world_cov=None)
 
     @property
-    def is_isotropic(self) -> bool:
-        """Whether there is no covariance."""
-        return self.img_cov is None and self.world_cov is None
+    def covariances(self) -> list[Symmetric2 | Symmetric3]:
+        """The covariances that there are."""
+        return [x for x in (self.img_cov, self.world_cov) if x is not None]
 
 
 class Correspondences(NamedTuple):
@@ -322,6 +322,10 @@ class Problems(NamedTuple):
             ``img_sigma``.
         confidence: belief that a pair is an inlier, in [0, 1], NaN and ``None`` as for ``img_sigma``, shape
             :math:`(B, N)`.
+        img_cov: covariance of the noise of each pixel, as a solver may know it in place of ``img_sigma``, shape
+            :math:`(B, N, 2, 2)`; ``None``: unknown.
+        world_cov: covariance of the noise of each world point in place of ``world_sigma``, shape
+            :math:`(B, N, 3, 3)`; ``None``: unknown.
     """
 
     world_points: Tensor
@@ -332,6 +336,8 @@ class Problems(NamedTuple):
     img_sigma: Tensor | None = None
     world_sigma: Tensor | None = None
     confidence: Tensor | None = None
+    img_cov: Tensor | None = None
+    world_cov: Tensor | None = None
 
     @property
     def sigmas(self) -> dict[str, Tensor]:
@@ -341,8 +347,9 @@ class Problems(NamedTuple):
 
     @property
     def known(self) -> dict[str, Tensor]:
-        """The known standard deviations and the confidences, as keyword arguments of a solver's call."""
-        return self.sigmas if self.confidence is None else {**self.sigmas, "confidence": self.confidence}
+        """The known noise and the confidences, as keyword arguments of a solver's call."""
+        more = {"img_cov": self.img_cov, "world_cov": self.world_cov, "confidence": self.confidence}
+        return self.sigmas | {name: value for name, value in more.items() if value is not None}
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Problems:
         """Apply a function to every tensor, for example to slice the batch or to move it to another device."""

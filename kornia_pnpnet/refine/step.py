@@ -29,9 +29,18 @@ from kornia_pnpnet.geometry import (
     project,
     retract_additive,
 )
-from kornia_pnpnet.types import Correspondences, Pose
+from kornia_pnpnet.types import Correspondences, Noise, Pose
 
-__all__ = ["LMStep", "iterate", "lm_step", "robust_weights", "solve_damped", "sq_standardised", "weighted_equations"]
+__all__ = [
+    "LMStep",
+    "iterate",
+    "lm_step",
+    "pixel_precision",
+    "robust_weights",
+    "solve_damped",
+    "sq_standardised",
+    "weighted_equations",
+]
 
 # Logarithm of a likelihood ratio. The residuals' own variance factor replaces 1 where it is e³ times as likely.
 _BELIEVED = 3.0
@@ -170,6 +179,23 @@ def solve_damped(equations: NormalEquations, damping: Tensor) -> tuple[list[Tens
     return substitute(lower, scaled), reduce(and_, good)
 
 
+def pixel_precision(projection: Projection, noise: Noise, focal: Tensor) -> Tensor | Symmetric2:
+    """Weight of a pixel by its noise: the inverse of the variance, or of the covariance where there is any.
+
+    Args:
+        projection: :func:`~kornia_pnpnet.geometry.project` of a pose.
+        noise: noise of each pair.
+        focal: the focal length in pixels, a scalar.
+
+    Returns:
+        A number for each pair, :math:`(B, N)`, or a 2×2 matrix with entries of that shape.
+    """
+    if not noise.covariances:
+        return pixel_variance(projection, noise, focal).reciprocal()
+    at = projection.rotation, projection.plane_points, projection.inv_depth
+    return pixel_covariance(*at, noise, focal).inverse()
+
+
 def sq_standardised(projection: Projection, corr: Correspondences, most: Tensor | None = None) -> Tensor:
     """Squared residuals in variances of their pixel where the noise is known, else in square pixels.
 
@@ -184,17 +210,16 @@ def sq_standardised(projection: Projection, corr: Correspondences, most: Tensor 
     Returns:
         Shape :math:`(B, N)`.
     """
-    noise, precision = corr.noise, None
-    sq_residual = projection.sq_residual
-    if noise is not None and not noise.is_isotropic:
-        precision = pixel_covariance(projection, noise, corr.focal).inverse()
+    noise, sq_residual = corr.noise, projection.sq_residual
+    variance = None if noise is None or noise.covariances else pixel_variance(projection, noise, corr.focal)
+    if noise is not None and noise.covariances:
+        precision = pixel_precision(projection, noise, corr.focal)
+        assert isinstance(precision, Symmetric2)
         sq_residual = precision.form(*projection.residual)
         most = None if most is None else 0.5 * most * (precision.uu + precision.vv)
     if most is not None:
         sq_residual = torch.where(projection.in_front, sq_residual.minimum(most), most)
-    if noise is None or precision is not None:
-        return sq_residual
-    return sq_residual / pixel_variance(projection, noise, corr.focal)
+    return sq_residual if variance is None else sq_residual / variance
 
 
 def robust_weights(
@@ -238,12 +263,10 @@ def _weights(
     """Weight of each pair in the normal equations: prior weight, inverse variance or covariance, robust weight."""
     if pairs.noise is None:
         return pairs.weights * kernel_weight(projection.sq_residual, shape)
-    precision: Tensor | Symmetric2
-    if pairs.noise.is_isotropic:
-        precision = pixel_variance(projection, pairs.noise, pairs.focal).reciprocal()
+    precision = pixel_precision(projection, pairs.noise, pairs.focal)
+    if isinstance(precision, Tensor):
         sq_residual = projection.sq_residual * precision
     else:
-        precision = pixel_covariance(projection, pairs.noise, pairs.focal).inverse()
         sq_residual = precision.form(*projection.residual)
     robust = robust_weights(sq_residual, projection, pairs.weights, kernel_weight, shape, estimated, NARROWER)
     return map_tensors(lambda x: pairs.weights * x * robust, precision)

@@ -16,7 +16,8 @@ from torch import Tensor
 from kornia_pnpnet.core.performance import exporting, in_order
 from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.geometry import Projection, pixel_covariance, span_a_plane
+from kornia_pnpnet.geometry import Projection, span_a_plane
+from kornia_pnpnet.refine.step import pixel_precision
 from kornia_pnpnet.types import MIN_PAIRS, Correspondences
 
 __all__ = [
@@ -106,10 +107,9 @@ def is_evident(projection: Projection, corr: Correspondences) -> Tensor:
     """
     projection, corr = map_tensors(torch.Tensor.detach, projection), corr.map(torch.Tensor.detach)
     assert corr.noise is not None
-    precision = None
-    if not corr.noise.is_isotropic:
-        covariance = pixel_covariance(projection, corr.noise, corr.focal)
-        precision = map_tensors(lambda x: _EVIDENT**2 * x, covariance).inverse()
+    precision = pixel_precision(projection, corr.noise, corr.focal) if corr.noise.covariances else None
+    assert not isinstance(precision, Tensor)
+    precision = map_tensors(lambda x: x / _EVIDENT**2, precision)
     thresholds = Thresholds(_EVIDENT * corr.noise.img, _EVIDENT * corr.noise.world, precision)
     judged = judge(projection, corr, thresholds)
     inliers, counts = (judged.weights > 0).sum(-1), (corr.weights > 0).sum(-1)
