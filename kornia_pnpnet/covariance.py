@@ -17,7 +17,7 @@ from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import normal_equations, project
 from kornia_pnpnet.inputs import checked_noise
 from kornia_pnpnet.refine.step import pixel_precision
-from kornia_pnpnet.types import Correspondences, Noise, Pose, camera_matrices
+from kornia_pnpnet.types import LEAST_NOISE, Correspondences, Noise, Pose, camera_matrices
 
 __all__ = ["pose_covariance"]
 
@@ -139,7 +139,7 @@ def _in_unit_frame(noise: Noise, camera: Tensor, mean_focal: Tensor, spread: Ten
     img_cov, world_cov = map_tensors(lambda x: torch.where(used, x, 0.0), (noise.img_cov, noise.world_cov))
     if img_cov is not None:
         fx, fy, skew = (camera[..., i, j].reshape(-1, 1) for i, j in ((0, 0), (1, 1), (0, 1)))
-        img_cov = img_cov.mapped(1.0 / fx, -skew / (fx * fy), 1.0 / fy).at_least(torch.finfo(fx.dtype).tiny)
+        img_cov = img_cov.mapped(1.0 / fx, -skew / (fx * fy), 1.0 / fy).at_least(LEAST_NOISE**2)
     if world_cov is not None:
         world_cov = world_cov.scaled(spread.square().reciprocal())
     return Noise(noise.img / mean_focal, noise.world / spread, img_cov, world_cov)

@@ -386,7 +386,8 @@ class RobustWeightedLM(Configured):
         With :math:`g(\delta) = J^\top W r` at the pose moved by :math:`\delta`, which is 0 at the minimum,
         :math:`d\delta = -(\partial g / \partial \delta)^{-1} dg`: one Newton step whose value is left out. Where the
         matrix is not positive definite the pose is no minimum yet, and the Gauss-Newton matrix replaces it. A second
-        step with the same matrix makes second derivatives exact.
+        step with the same matrix makes second derivatives exact. Covariances turn with the pose, so that the matrix is
+        not quite symmetric: a third step takes most of the difference away.
         """
         equations = partial(weighted_equations, estimated=start.estimated, kernel_weight=self.kernel.weight)
         pairs = start.by_residual
@@ -397,7 +398,7 @@ class RobustWeightedLM(Configured):
                 torch.autograd.grad(entry.sum(), zero[: i + 1], retain_graph=True) for i, entry in enumerate(gradient)
             ]
         around, none = [[x.detach() for x in row] for row in around], torch.zeros_like(shape)
-        for _ in range(2):
+        for _ in range(3 if pairs.noise is not None and pairs.noise.covariances else 2):
             gradient = equations(pairs, pose, shape).gradient
             newton, convex = solve_damped(NormalEquations(hessian, gradient), none)
             gauss_newton, solved = solve_damped(NormalEquations(around, gradient), none)
