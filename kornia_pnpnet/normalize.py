@@ -164,7 +164,7 @@ class Normalize(Configured):
         if padded:
             is_finite = is_finite & ((rows[5] >= 0) & (rows[5] < limit)).all(0)
         if noise is not None:
-            has_noise = _is_usable(noise, there.mT)
+            has_noise = _is_usable(noise, there)
             is_finite = is_finite & has_noise
         if confidence is not None:
             is_probability = ((confidence >= 0) & (confidence <= 1)) | confidence.isnan()
@@ -354,11 +354,11 @@ class Normalize(Configured):
 def _is_usable(noise: Noise, there: Tensor) -> Tensor:
     """Whether the noise of all pairs is possible, bool (B,).
 
-    Standard deviations are finite and not negative, or unknown; covariances of pairs that are there, bool (B, N), are
+    Standard deviations are finite and not negative, or unknown; covariances of pairs that are there, bool (N, B), are
     finite and positive semi-definite.
     """
     usable = [((x >= 0) | x.isnan()).all(-1) & ~x.isinf().any(-1) for x in (noise.img, noise.world)]
-    return torch.stack([*usable, *((are_semi_definite(x) | ~there).all(-1) for x in noise.covariances)]).all(0)
+    return torch.stack([*usable, *((are_semi_definite(x) | ~there.mT).all(-1) for x in noise.covariances)]).all(0)
 
 
 def _pinhole(camera: Tensor) -> tuple[Tensor, Tensor]:

@@ -225,7 +225,8 @@ class Guess(NamedTuple):
         others: more poses to start from, rotations :math:`(B, S, 3, 3)` and translations :math:`(B, S, 3)`; ``None``:
             no others.
         noise: noise of each pair in the units of the correspondences, where unknown the initialiser's estimate;
-            residuals then count in standard deviations. ``None``: the initialiser does not estimate noise.
+            residuals then count in standard deviations. ``None``: the initialiser does not estimate noise. It has no
+            covariances: the refinement takes those of the correspondences.
     """
 
     pose: Pose

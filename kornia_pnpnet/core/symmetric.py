@@ -27,7 +27,7 @@ class Symmetric2(NamedTuple):
 
     @classmethod
     def of(cls, matrix: Tensor) -> Symmetric2:
-        """The symmetric parts of matrices (*, 2, 2)."""
+        """The symmetric parts of matrices (..., 2, 2)."""
         return cls(matrix[..., 0, 0], _mean(matrix, 0, 1), matrix[..., 1, 1])
 
     @property
@@ -87,7 +87,7 @@ class Symmetric3(NamedTuple):
 
     @classmethod
     def of(cls, matrix: Tensor) -> Symmetric3:
-        """The symmetric parts of matrices (*, 3, 3)."""
+        """The symmetric parts of matrices (..., 3, 3)."""
         x, y, z = (matrix[..., i, i] for i in range(3))
         return cls(x, _mean(matrix, 0, 1), _mean(matrix, 0, 2), y, _mean(matrix, 1, 2), z)
 

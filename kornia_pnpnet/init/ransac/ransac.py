@@ -261,8 +261,9 @@ def search_on(corr: Correspondences, guess: Guess, plan: Plan = FURTHER) -> Gues
 
     Samples hold pairs in proportion to a half plus half the weight of the guess, times the caller's confidence: weights
     that mislead then cost some samples, but no pose. An inlier is within ten standard deviations of the guess' noise
-    (its mean over the pairs). The limit is that of a point as far away as the centre of the world in the guess, for all
-    poses: with a limit by each pose's own depths, a pose close to the points would have most inliers.
+    (its mean over the pairs; of noise with covariances the standard deviation of isotropic noise of the same trace).
+    The limit is that of a point as far away as the centre of the world in the guess, for all poses: with a limit by
+    each pose's own depths, a pose close to the points would have most inliers.
 
     First the best pose of the guess is improved on its inliers. A problem is searched only when, by the number of these
     inliers, it needs more than ``plan.min_samples`` samples to reach ``plan.confidence``. Problems that are done leave
