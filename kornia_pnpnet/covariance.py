@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
+from kornia.core.exceptions import ValueCheckError
 from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.liegroup import So3
 from torch import Tensor
 
-from kornia_pnpnet.core.checks import Shapes, check_devices, check_shapes, common_dtype, expand_sigma
+from kornia_pnpnet.core.checks import Shapes, check_devices, check_shapes, common_dtype
 from kornia_pnpnet.core.linalg import symmetric
-from kornia_pnpnet.geometry import normal_equations, pixel_variance, project
-from kornia_pnpnet.types import Correspondences, Noise, Pose, camera_matrices
+from kornia_pnpnet.core.symmetric import are_semi_definite
+from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.geometry import normal_equations, project
+from kornia_pnpnet.inputs import checked_noise
+from kornia_pnpnet.refine.step import pixel_precision
+from kornia_pnpnet.types import LEAST_NOISE, Correspondences, Noise, Pose, camera_matrices
 
 __all__ = ["pose_covariance"]
 
@@ -22,8 +27,10 @@ def pose_covariance(
     img_points: Tensor,
     intrinsics: Tensor | PinholeCamera,
     *,
-    img_sigma: Tensor | float,
-    world_sigma: Tensor | float = 0.0,
+    img_sigma: Tensor | float | None = None,
+    world_sigma: Tensor | float | None = None,
+    img_cov: Tensor | None = None,
+    world_cov: Tensor | None = None,
     weights: Tensor | None = None,
 ) -> Tensor:
     r"""First-order covariance of a pose found by weighted least squares.
@@ -31,7 +38,9 @@ def pose_covariance(
     The covariance is :math:`(\sum_i w_i J_i^\top J_i / \sigma_i^2)^{-1}`. :math:`J_i` is the Jacobian of pixel
     :math:`i` by the tangent :math:`(\omega, v)` of :func:`~kornia_pnpnet.geometry.retract`: when :math:`(R, t)` is the
     true pose, the estimate is about :math:`(\mathrm{cay}(\omega) R,\; t + v)`. :math:`\sigma_i^2` is the
-    :func:`~kornia_pnpnet.geometry.pixel_variance`. The computation runs in float64 and records no gradient.
+    :func:`~kornia_pnpnet.geometry.pixel_variance`. With covariances the covariance is
+    :math:`(\sum_i w_i J_i^\top \Sigma_i^{-1} J_i)^{-1}`, where :math:`\Sigma_i` is the
+    :func:`~kornia_pnpnet.geometry.pixel_covariance`. The computation runs in float64 and records no gradient.
 
     Args:
         pose: the estimated world-to-camera pose, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
@@ -41,19 +50,23 @@ def pose_covariance(
         img_sigma: standard deviation of the noise on each pixel coordinate, in pixels: a number, :math:`(B,)` or
             :math:`(B, N)`.
         world_sigma: standard deviation of the noise on each world coordinate, in the unit of ``world_points``: a
-            number, :math:`(B,)` or :math:`(B, N)`.
+            number, :math:`(B,)` or :math:`(B, N)`. World points are exact without this and ``world_cov``.
+        img_cov: covariance of the noise of each pixel in px², in place of ``img_sigma``, shape :math:`(B, N, 2, 2)`.
+        world_cov: covariance of the noise of each world point, in place of ``world_sigma``, shape
+            :math:`(B, N, 3, 3)`.
         weights: probability that each pair is an inlier, shape :math:`(B, N)`, for example the ``weights`` of a
             result; ``None``: 1 for every pair.
 
     Returns:
         Shape :math:`(B, 6, 6)`, in radians and the unit of the world, float64 when the points, the camera, the weights
-        or the pose are, else float32. Where the pairs do not determine the pose, the
-        diagonal is infinite and all other entries are 0.
+        or the pose are, else float32. Where the pairs do not determine the pose, or a
+        covariance is not positive semi-definite, the diagonal is infinite and all other entries are 0.
 
     Raises:
         ShapeError: when shapes do not match.
         TypeCheckError: when a sigma is neither a number nor a tensor, or a tensor holds booleans or complex numbers.
         DeviceError: when tensors are on different devices.
+        ValueCheckError: without the noise of the pixels, or with both a sigma and a covariance.
 
     Example:
         >>> from kornia_pnpnet.data import SyntheticProblems
@@ -71,16 +84,19 @@ def pose_covariance(
         "rotation of the pose": (pose.rotation, (batch, 3, 3)),
         "translation of the pose": (pose.translation, (batch, 3)),
         "weights": (weights, (batch, count)),
+        "img_cov": (img_cov, (batch, count, 2, 2)),
+        "world_cov": (world_cov, (batch, count, 3, 3)),
     }
     check_shapes(shapes, world_points)
     tensors = {name: tensor for name, (tensor, _) in shapes.items()}
     check_devices(tensors, world_points)
     dtype = common_dtype({"world_points": world_points, **tensors})
-    noise = Noise(
-        expand_sigma("img_sigma", img_sigma, world_points.double()),
-        expand_sigma("world_sigma", world_sigma, world_points.double()),
-    )
+    if img_sigma is None and img_cov is None:
+        raise ValueCheckError("pose_covariance needs the noise of the pixels: img_sigma or img_cov.")
+    world_sigma = 0.0 if world_sigma is None and world_cov is None else world_sigma
     with torch.no_grad():
+        noise = checked_noise(world_points.double(), img_sigma, world_sigma, img_cov, world_cov)
+        assert noise is not None
         points, rotation, camera = world_points.double(), pose.rotation.double(), camera.double()
         inlier = torch.ones_like(noise.img) if weights is None else weights.double()
 
@@ -98,11 +114,14 @@ def pose_covariance(
         corr = Correspondences(offsets / spread[..., None], rays, inlier, unit_focal)
 
         projection = project(centred_pose, corr)
-        variance = pixel_variance(projection, Noise(noise.img / mean_focal, noise.world / spread), unit_focal)
-        information = symmetric(normal_equations(projection, inlier / variance).hessian)
+        sound = [(are_semi_definite(x) | (inlier == 0)).all(1) for x in noise.covariances]
+        noise = _in_unit_frame(noise, camera, mean_focal, spread, inlier != 0)
+        pair_weights = map_tensors(lambda x: inlier * x, pixel_precision(projection, noise, unit_focal))
+        information = symmetric(normal_equations(projection, pair_weights).hessian)
         inverse, info = torch.linalg.inv_ex(information)
         positive = (inverse.diagonal(dim1=1, dim2=2) > 0).all(-1)
-        determined = ((info == 0) & inverse.isfinite().all((1, 2)) & positive)[:, None, None]
+        determined = (info == 0) & inverse.isfinite().all((1, 2)) & positive
+        determined = torch.stack((determined, *sound)).all(0)[:, None, None]
 
         # Back to the given coordinates: omega stays, v = spread * v_centred + (R centroid) x omega.
         eye = torch.eye(3, dtype=torch.float64, device=points.device).expand(batch, 3, 3)
@@ -112,3 +131,14 @@ def pose_covariance(
         covariance = back @ torch.where(determined, inverse, 0.0) @ back.mT
         undetermined = covariance.new_full((6,), torch.inf).diag()
         return torch.where(determined, covariance, undetermined).to(dtype)
+
+
+def _in_unit_frame(noise: Noise, camera: Tensor, mean_focal: Tensor, spread: Tensor, used: Tensor) -> Noise:
+    """Noise in units of focal length and spread; covariances of pairs that are not ``used``, bool (B, N), are 0."""
+    img_cov, world_cov = map_tensors(lambda x: torch.where(used, x, 0.0), (noise.img_cov, noise.world_cov))
+    if img_cov is not None:
+        fx, fy, skew = (camera[..., i, j].reshape(-1, 1) for i, j in ((0, 0), (1, 1), (0, 1)))
+        img_cov = img_cov.mapped(1.0 / fx, -skew / (fx * fy), 1.0 / fy).at_least(LEAST_NOISE**2)
+    if world_cov is not None:
+        world_cov = world_cov.scaled(spread.square().reciprocal())
+    return Noise(noise.img / mean_focal, noise.world / spread, img_cov, world_cov)

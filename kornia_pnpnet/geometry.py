@@ -15,7 +15,9 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix, rotation_
 from kornia.geometry.liegroup import So3
 from torch import Tensor
 
-from kornia_pnpnet.core.linalg import nearest_rotation
+from kornia_pnpnet.core.linalg import dot, nearest_rotation
+from kornia_pnpnet.core.symmetric import Symmetric2
+from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.types import Correspondences, Noise, Pose
 
 __all__ = [
@@ -26,6 +28,7 @@ __all__ = [
     "align",
     "change_tangent",
     "move",
+    "pixel_covariance",
     "pixel_variance",
     "normal_equations",
     "project",
@@ -44,7 +47,7 @@ MIN_DEPTH_RATIO = 1e-3
 
 
 class Projection(NamedTuple):
-    r"""Points projected at a pose, coordinate by coordinate: every tensor has the shape :math:`(B, N)`.
+    r"""Points projected at a pose, coordinate by coordinate: tensors of shape :math:`(B, N)`.
 
     Attributes:
         residual: projection minus measurement in pixels, horizontal and vertical. Where ``in_front`` is false the
@@ -54,6 +57,7 @@ class Projection(NamedTuple):
         plane_points: :math:`(x/z, y/z)`, 0 for points behind the camera.
         inv_depth: :math:`1/z`, 0 for points behind the camera.
         scaled_residual: the residual times the depth.
+        rotation: the rotation of the pose, :math:`(B, 3, 3)`.
     """
 
     residual: tuple[Tensor, Tensor]
@@ -62,6 +66,7 @@ class Projection(NamedTuple):
     plane_points: tuple[Tensor, Tensor]
     inv_depth: Tensor
     scaled_residual: tuple[Tensor, Tensor]
+    rotation: Tensor
 
     @property
     def sq_residual(self) -> Tensor:
@@ -132,7 +137,8 @@ def project(pose: Pose, corr: Correspondences) -> Projection:
     u, v = corr.img_points.unbind(-1)
     scaled = torch.addcmul(corr.focal * x, u, z, value=-1), torch.addcmul(corr.focal * y, v, z, value=-1)
     residual = scaled[0] * inv_depth, scaled[1] * inv_depth
-    return Projection(residual, in_front, (y0, y1, y2), (x * inv_depth, y * inv_depth), inv_depth, scaled)
+    plane_points = x * inv_depth, y * inv_depth
+    return Projection(residual, in_front, (y0, y1, y2), plane_points, inv_depth, scaled, pose.rotation)
 
 
 def pixel_variance(projection: Projection, noise: Noise, focal: Tensor) -> Tensor:
@@ -164,7 +170,41 @@ def pixel_variance(projection: Projection, noise: Noise, focal: Tensor) -> Tenso
     return torch.addcmul(noise.img * noise.img, moved * moved, sides)
 
 
-def normal_equations(projection: Projection, weights: Tensor) -> NormalEquations:
+def pixel_covariance(
+    rotation: Tensor, plane_points: Sequence[Tensor], inv_depth: Tensor, noise: Noise, focal: Tensor
+) -> Symmetric2:
+    r"""Covariance of a pixel, from the noise of the pixel and of the world point.
+
+    It is :math:`\Sigma_\mathrm{img} + J R\,\Sigma_\mathrm{world} R^\top J^\top` with :math:`J` of
+    :func:`pixel_variance`. A standard deviation stands for a multiple of the identity.
+
+    Args:
+        rotation: rotation of the pose, :math:`(*, 3, 3)`.
+        plane_points: :math:`(p, q)`, two tensors :math:`(*, N)`; see :class:`Projection`.
+        inv_depth: :math:`1/z`, shape :math:`(*, N)`.
+        noise: noise of each pair.
+        focal: the focal length in pixels, a scalar.
+
+    Returns:
+        Entries of shape :math:`(*, N)`. Where the inverse depth is 0 they are the covariance of the pixel alone.
+    """
+    p, q = plane_points
+    scale = focal * inv_depth
+    if noise.world_cov is None:
+        moved = (scale * noise.world).square()
+        uu, uv, vv = torch.addcmul(moved, moved * p, p), moved * p * q, torch.addcmul(moved, moved * q, q)
+    else:
+        first, second, third = (row.unbind(-2) for row in rotation[..., None].unbind(-3))
+        a = [scale * torch.addcmul(i, p, k, value=-1) for i, k in zip(first, third, strict=True)]
+        b = [scale * torch.addcmul(j, q, k, value=-1) for j, k in zip(second, third, strict=True)]
+        of_a, of_b = noise.world_cov.times(a), noise.world_cov.times(b)
+        uu, uv, vv = dot(a, of_a), dot(b, of_a), dot(b, of_b)
+    if noise.img_cov is None:
+        return Symmetric2(torch.addcmul(uu, noise.img, noise.img), uv, torch.addcmul(vv, noise.img, noise.img))
+    return Symmetric2(uu + noise.img_cov.uu, uv + noise.img_cov.uv, vv + noise.img_cov.vv)
+
+
+def normal_equations(projection: Projection, weights: Tensor | Symmetric2) -> NormalEquations:
     r"""The normal equations of the residuals by the six pose parameters.
 
     With :math:`y = R x`, :math:`p = x/z`, :math:`q = y/z` of the camera point, and the tangent :math:`(\omega, v)` of
@@ -176,7 +216,8 @@ def normal_equations(projection: Projection, weights: Tensor) -> NormalEquations
 
     Args:
         projection: what :func:`project` returned at the pose.
-        weights: weight of each pair, :math:`(B, N)`. Points behind the camera do not count.
+        weights: weight of each pair, :math:`(B, N)`, or 2×2 matrices with entries of that shape. Points behind the
+            camera do not count.
 
     Returns:
         :math:`J^\top W J` and :math:`J^\top W r` with :math:`J` divided by the focal length and :math:`r` in pixels.
@@ -194,10 +235,13 @@ def normal_equations(projection: Projection, weights: Tensor) -> NormalEquations
         (0.0, 1.0),
         (minus_p, minus_q),
     ]
-    weights = weights * projection.inv_depth * projection.inv_depth
-    total = weights.sum(1)
+    weights = map_tensors(lambda w: w * projection.inv_depth * projection.inv_depth, weights)
+    uu, uv, vv = (weights, 0.0, weights) if isinstance(weights, Tensor) else weights
+    total = uu.sum(1)
     zero = torch.zeros_like(total)
-    weighted: list[_Column] = [(_times(u, weights), _times(v, weights)) for u, v in columns]
+    weighted: list[_Column] = [
+        (_plus(_times(u, uu), _times(v, uv)), _plus(_times(u, uv), _times(v, vv))) for u, v in columns
+    ]
 
     def inner(a: _Column, b: _Column) -> Tensor:
         """Sum over pairs and rows of the products of two columns, (B,)."""
@@ -207,7 +251,7 @@ def normal_equations(projection: Projection, weights: Tensor) -> NormalEquations
         products = [x for x in (_times(a_u, b_u), _times(a_v, b_v)) if type(x) is not float]
         if not products:
             return zero
-        return total if products[0] is weights else products[0].sum(1)
+        return total if products[0] is uu else products[0].sum(1)
 
     # The products of the last column with the two constant ones are its weighted entries.
     hessian = [[inner(weighted[j], columns[i]) for j in range(i + 1)] for i in range(5)]
@@ -222,6 +266,11 @@ def _times(a: Any, b: Any) -> Any:
     if type(b) is float:
         return a if b == 1.0 else 0.0
     return a * b
+
+
+def _plus(a: Any, b: Any) -> Any:
+    """A sum in which a term that is known to be 0 costs nothing."""
+    return b if type(a) is float else a if type(b) is float else a + b
 
 
 def change_tangent(equations: NormalEquations, tangent_map: Tensor) -> NormalEquations:

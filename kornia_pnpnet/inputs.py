@@ -6,12 +6,13 @@ from typing import NamedTuple, TypeVar
 
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
-from kornia.core.exceptions import ShapeError, TypeCheckError
+from kornia.core.exceptions import ShapeError, TypeCheckError, ValueCheckError
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kornia_pnpnet.core.checks import Shapes, check_devices, check_shapes, common_dtype, expand_sigma
 from kornia_pnpnet.core.performance import present_first, sees_values
+from kornia_pnpnet.core.symmetric import Symmetric2, Symmetric3, equivalent_sigma
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.types import Noise, PnPResult, Pose, camera_matrices
 
@@ -19,6 +20,7 @@ __all__ = [
     "Inputs",
     "Part",
     "checked_inputs",
+    "checked_noise",
     "joined",
     "one_batch",
     "restore_leading",
@@ -69,6 +71,8 @@ def checked_inputs(
     init: Pose | None = None,
     img_sigma: Tensor | float | None = None,
     world_sigma: Tensor | float | None = None,
+    img_cov: Tensor | None = None,
+    world_cov: Tensor | None = None,
     confidence: Tensor | None = None,
 ) -> tuple[torch.Size, Inputs]:
     """Check the arguments of a call, and make them one batch of one dtype, see :func:`common_dtype`.
@@ -82,6 +86,7 @@ def checked_inputs(
         ShapeError: for shapes that do not fit each other, or fewer than 3 pairs.
         TypeCheckError: for arguments that are no tensors, or hold booleans or complex numbers.
         DeviceError: for tensors on different devices.
+        ValueCheckError: for both a sigma and a covariance of the pixels, or of the points.
     """
     rotation, translation = (None, None) if init is None else init
     matrices = camera_matrices(intrinsics)
@@ -93,6 +98,8 @@ def checked_inputs(
         "init rotation": rotation,
         "init translation": translation,
         "confidence": confidence,
+        "img_cov": img_cov,
+        "world_cov": world_cov,
     }
     required = ("world_points", "img_points", "intrinsics")
     for name, value in (*tensors.items(), ("mask", mask)):
@@ -114,6 +121,8 @@ def checked_inputs(
         "weights": (weights, (*size, count)),
         "mask": (mask, (*size, count)),
         "confidence": (confidence, (*size, count)),
+        "img_cov": (img_cov, (*size, count, 2, 2)),
+        "world_cov": (world_cov, (*size, count, 3, 3)),
         "intrinsics": (matrices, (3, 3) if matrices.ndim == 2 else (*size, 3, 3)),
         "init rotation": (rotation, (*size, 3, 3)),
         "init translation": (translation, (*size, 3)),
@@ -126,14 +135,41 @@ def checked_inputs(
     check_devices({**tensors, "mask": mask}, world_points)
     sigmas = {"img_sigma": img_sigma, "world_sigma": world_sigma}
     dtype = common_dtype({**tensors, **{name: x for name, x in sigmas.items() if isinstance(x, Tensor)}})
-    noise = None
-    if img_sigma is not None or world_sigma is not None:
-        like = world_points.to(dtype)
-        noise = Noise(*(expand_sigma(name, sigma, like) for name, sigma in sigmas.items()))
+    noise = checked_noise(world_points.to(dtype), img_sigma, world_sigma, img_cov, world_cov)
     cameras = matrices.expand(*size, 3, 3)
     pose = None if init is None else Pose(*init)
     given = Inputs(world_points, img_points, cameras, weights, mask, pose, noise, confidence)
     return size, map_tensors(lambda x: one_batch(x, size, dtype), given)
+
+
+def checked_noise(
+    world_points: Tensor,
+    img_sigma: Tensor | float | None,
+    world_sigma: Tensor | float | None,
+    img_cov: Tensor | None,
+    world_cov: Tensor | None,
+) -> Noise | None:
+    """The noise of every pair in the dtype of the points, from sigmas of any kind or covariances of sound shapes.
+
+    Raises:
+        ShapeError: for a sigma of another shape.
+        TypeCheckError: for a sigma that is no number.
+        ValueCheckError: for both a sigma and a covariance of the pixels, or of the points.
+    """
+    kinds = {"img": (img_sigma, img_cov), "world": (world_sigma, world_cov)}
+    for name, (sigma, cov) in kinds.items():
+        if sigma is not None and cov is not None:
+            raise ValueCheckError(f"Give {name}_sigma or {name}_cov, not both.")
+    if all(x is None for kind in kinds.values() for x in kind):
+        return None
+    img = None if img_cov is None else Symmetric2.of(img_cov.to(world_points.dtype))
+    world = None if world_cov is None else Symmetric3.of(world_cov.to(world_points.dtype))
+    return Noise(
+        expand_sigma("img_sigma", img_sigma, world_points) if img is None else equivalent_sigma(img),
+        expand_sigma("world_sigma", world_sigma, world_points) if world is None else equivalent_sigma(world),
+        img,
+        world,
+    )
 
 
 def one_batch(x: Tensor, size: torch.Size, dtype: torch.dtype) -> Tensor:

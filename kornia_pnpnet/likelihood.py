@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import torch
 from kornia.core.check import KORNIA_CHECK
+from kornia.core.exceptions import ValueCheckError
 from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from kornia.geometry.liegroup import So3
@@ -15,11 +16,11 @@ from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_positive, check_whole
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.geometry import normal_equations, pixel_variance, project, retract
+from kornia_pnpnet.geometry import normal_equations, pixel_covariance, project, retract
 from kornia_pnpnet.inputs import checked_inputs
 from kornia_pnpnet.normalize import Normalize
 from kornia_pnpnet.refine.kernels import KERNELS, RobustKernel
-from kornia_pnpnet.refine.step import iterate
+from kornia_pnpnet.refine.step import iterate, pixel_precision, sq_standardised
 from kornia_pnpnet.types import Correspondences, Pose
 
 __all__ = ["monte_carlo_pose_loss"]
@@ -61,8 +62,10 @@ def monte_carlo_pose_loss(
     weights: Tensor | None = None,
     mask: Tensor | None = None,
     *,
-    img_sigma: Tensor | float,
+    img_sigma: Tensor | float | None = None,
     world_sigma: Tensor | float | None = None,
+    img_cov: Tensor | None = None,
+    world_cov: Tensor | None = None,
     samples: int = 96,
     rounds: int = 2,
     kernel: str = "huber",
@@ -83,7 +86,7 @@ def monte_carlo_pose_loss(
     camera and points. It only matters while the correspondences say little.
 
     Shapes below are those of a batch; any leading dimensions and dtypes are as in a solver's call. Gradients flow to
-    points, pixels, cameras, weights and sigmas, not to the poses. A problem that a solver would
+    points, pixels, cameras, weights, sigmas and covariances, not to the poses. A problem that a solver would
     refuse (NaN, points on a line, no pinhole camera) has the loss 0 without gradient.
 
     Source: H. Chen et al., "EPro-PnP: Generalized End-to-End Probabilistic Perspective-n-Points", CVPR 2022, equations
@@ -100,7 +103,10 @@ def monte_carlo_pose_loss(
         img_sigma: standard deviation of the noise on each pixel coordinate, in pixels: a number, :math:`(B,)` or
             :math:`(B, N)`. A network that predicts it learns from this loss how sure it is.
         world_sigma: standard deviation of the noise on each world coordinate, in the unit of ``world_points``;
-            ``None``: exact points.
+            ``None`` without ``world_cov``: exact points.
+        img_cov: covariance of the noise of each pixel in px², in place of ``img_sigma``, shape :math:`(B, N, 2, 2)`.
+        world_cov: covariance of the noise of each world point, in place of ``world_sigma``, shape
+            :math:`(B, N, 3, 3)`.
         samples: number of poses drawn per problem.
         rounds: number of components that are added one after the other.
         kernel: name of the robust kernel, a key of :data:`~kornia_pnpnet.refine.kernels.KERNELS`.
@@ -114,6 +120,7 @@ def monte_carlo_pose_loss(
         TypeCheckError: for tensors of booleans or complex numbers.
         DeviceError: for tensors on different devices.
         BaseError: for an unknown kernel, a scale that is not positive, or fewer samples than components.
+        ValueCheckError: without the noise of the pixels, or with both a sigma and a covariance.
 
     Example:
         >>> from kornia_pnpnet.data import SyntheticProblems
@@ -131,13 +138,17 @@ def monte_carlo_pose_loss(
     check_positive(scale=scale)
     KORNIA_CHECK(kernel in KERNELS, f"kernel must be one of {sorted(KERNELS)}, got {kernel!r}.")
     numbers = world_points, img_points, intrinsics, weights, mask
-    sigmas = img_sigma, 0.0 if world_sigma is None else world_sigma
-    checked = [checked_inputs(*numbers, pose, *sigmas) for pose in (truth, *others)]
+    if img_sigma is None and img_cov is None:
+        raise ValueCheckError("monte_carlo_pose_loss needs the noise of the pixels: img_sigma or img_cov.")
+    noisy_points = world_sigma is not None or world_cov is not None
+    given_noise = img_sigma, world_sigma if noisy_points else 0.0, img_cov, world_cov
+    checked = [checked_inputs(*numbers, pose, *given_noise) for pose in (truth, *others)]
     size, inputs = checked[0]
     given = [Pose(*x.init) for _, x in checked if x.init is not None]
     assert inputs.noise is not None
     known = inputs.noise.img.isfinite().all(1) & (inputs.noise.img > 0).all(1) & inputs.noise.world.isfinite().all(1)
-    noise = map_tensors(lambda x: torch.where(known[:, None], x, 1.0), inputs.noise)
+    sigmas = map_tensors(lambda x: torch.where(known[:, None], x, 1.0), inputs.noise.sigmas)
+    noise = inputs.noise._replace(img=sigmas.img, world=sigmas.world)
 
     with torch.no_grad():
         _, frame = Normalize(order=False)(*inputs[:5], noise)
@@ -146,7 +157,11 @@ def monte_carlo_pose_loss(
     there = frame.valid[:, None, None] & (corr.weights > 0)[..., None]
     world = torch.where(there, (corr.world_points - frame.centroid[:, None]) * frame.scale[:, None, None], 0.0)
     assert corr.noise is not None
-    corr = corr._replace(world_points=world, noise=corr.noise._replace(world=corr.noise.world * frame.scale[:, None]))
+    world_noise = corr.noise.world * frame.scale[:, None], corr.noise.world_cov
+    if corr.noise.world_cov is not None:
+        world_noise = world_noise[0], corr.noise.world_cov.scaled(frame.scale.square()[:, None])
+    noise = corr.noise._replace(world=world_noise[0], world_cov=world_noise[1])
+    corr = corr._replace(world_points=world, noise=noise)
 
     live = frame.valid & known
     for pose in given:
@@ -157,7 +172,7 @@ def monte_carlo_pose_loss(
         rotation = torch.where(live[:, None, None], pose.rotation.detach(), eye)
         translation = torch.where(live[:, None], pose.translation.detach(), eye[2])
         poses.append(Normalize().apply_to_pose(Pose(rotation, translation), frame))
-    model = _Posterior(corr, *poses[0], KERNELS[kernel], world.new_tensor(scale), world_sigma is not None)
+    model = _Posterior(corr, *poses[0], KERNELS[kernel], world.new_tensor(scale), noisy_points)
     with torch.no_grad():
         drawn, log_proposal = _draw(model._replace(corr=corr.map(torch.Tensor.detach)), poses, samples // count, rounds)
     log_weights = model.log_density(drawn) - log_proposal
@@ -215,26 +230,32 @@ class _Posterior(NamedTuple):
         depth = cam[..., 2].maximum(least)
         plane = cam[..., :2] / depth[..., None]
         behind = (depth - cam[..., 2]) / least
-        sq_residual = (corr.focal * plane - corr.img_points).square().sum(-1) + (corr.focal * behind).square()
+        residual, sq_behind = corr.focal * plane - corr.img_points, (corr.focal * behind).square()
         assert corr.noise is not None
-        variance = corr.noise.img.square()
+        if corr.noise.covariances:
+            at = poses.rotation, plane.unbind(-1), depth.reciprocal()
+            covariance = pixel_covariance(*at, corr.noise, corr.focal)
+            determinant, precision = covariance.determinant, covariance.inverse()
+            sq_residual = precision.form(*residual.unbind(-1)) + 0.5 * sq_behind * (precision.uu + precision.vv)
+        else:
+            variance = corr.noise.img.square()
+            if self.noisy_points:
+                sides = 1.0 + 0.5 * plane.square().sum(-1)
+                variance = variance + (corr.focal * corr.noise.world / depth).square() * sides
+            sq_residual, determinant = (residual.square().sum(-1) + sq_behind) / variance, variance.square()
+        loss = self.kernel.loss(sq_residual, self.shape)
         if self.noisy_points:
-            sides = 1.0 + 0.5 * plane.square().sum(-1)
-            variance = variance + (corr.focal * corr.noise.world / depth).square() * sides
-        loss = self.kernel.loss(sq_residual / variance, self.shape)
-        if self.noisy_points:
-            loss = loss + 2.0 * variance.log()  # of both coordinates
+            loss = loss + determinant.log()
         return 0.5 * (corr.weights * loss).sum(-1)
 
     def component(self, pose: Pose) -> _Component:
         """The t distribution whose precision is that of the normal equations at a pose, with a bounded width."""
         corr, projection = self.corr, project(pose, self.corr)
         assert corr.noise is not None
-        precision = corr.weights / pixel_variance(projection, corr.noise, corr.focal)
-        robust = self.kernel.weight(
-            projection.sq_residual / pixel_variance(projection, corr.noise, corr.focal), self.shape
-        )
-        rows = normal_equations(projection, corr.focal.square() * precision * robust).hessian
+        robust = self.kernel.weight(sq_standardised(projection, corr), self.shape)
+        factor = corr.focal.square() * corr.weights * robust
+        precision = map_tensors(lambda x: factor * x, pixel_precision(projection, corr.noise, corr.focal))
+        rows = normal_equations(projection, precision).hessian
         matrix = torch.stack([torch.stack([rows[max(i, j)][min(i, j)] for j in range(6)], -1) for i in range(6)], -2)
         least = torch.cat((torch.ones_like(self.translation) / _WIDEST_ROTATION**2, self._translation_precision), -1)
         matrix = matrix + torch.diag_embed(least)

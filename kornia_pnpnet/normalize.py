@@ -7,6 +7,7 @@ similarity transforms of the world. Every step has an exact inverse on the pose.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -15,9 +16,10 @@ from torch import Tensor
 from kornia_pnpnet.core.checks import check_positive
 from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.performance import ascending_order, ranked
+from kornia_pnpnet.core.symmetric import are_semi_definite
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.geometry import MIN_DEPTH_RATIO, span_a_plane
-from kornia_pnpnet.types import MIN_PAIRS, Correspondences, Guess, Noise, Pose, Status
+from kornia_pnpnet.types import LEAST_NOISE, MIN_PAIRS, Correspondences, Guess, Noise, Pose, Status
 
 __all__ = ["F_CONST", "VIEWS", "Frame", "Normalize"]
 
@@ -129,7 +131,8 @@ class Normalize(Configured):
             intrinsics: shape :math:`(B, 3, 3)`.
             weights: at least 0, shape :math:`(B, N)`; 1 when ``None``.
             mask: False where a pair is padding, bool, shape :math:`(B, N)`.
-            noise: standard deviations in pixels and in the unit of the world; NaN where unknown.
+            noise: standard deviations in pixels and in the unit of the world, NaN where unknown, or covariances in
+                their squares.
             confidence: the caller's belief that a pair is an inlier, in [0, 1], shape :math:`(B, N)`; NaN where
                 unknown.
 
@@ -161,7 +164,7 @@ class Normalize(Configured):
         if padded:
             is_finite = is_finite & ((rows[5] >= 0) & (rows[5] < limit)).all(0)
         if noise is not None:
-            has_noise = _is_usable(noise)
+            has_noise = _is_usable(noise, there)
             is_finite = is_finite & has_noise
         if confidence is not None:
             is_probability = ((confidence >= 0) & (confidence <= 1)) | confidence.isnan()
@@ -218,7 +221,11 @@ class Normalize(Configured):
         frame = Frame(centroid.mT, scale, horizontal * vertical, order, status)
         if noise is not None:
             # Scaling an infinite sigma would give gradients of NaN: an invalid problem has no known noise.
-            noise = map_tensors(lambda sigma: torch.where(has_noise[:, None], sigma, torch.nan), noise)
+            sigmas = map_tensors(lambda sigma: torch.where(has_noise[:, None], sigma, torch.nan), noise.sigmas)
+            noise = noise._replace(img=sigmas.img, world=sigmas.world)
+            if noise.covariances:
+                pixel_map = img_scales[0], -camera[1] / camera[0] * img_scales[1], img_scales[1]
+                noise = self._scaled_covariances(noise, (there & has_noise).mT, pixel_map, scale)
             noise = self._apply_to_noise(noise, frame)
         if confidence is not None and order is not None:
             confidence = confidence.gather(1, order)
@@ -227,15 +234,27 @@ class Normalize(Configured):
         )
         return corr, frame
 
+    def _scaled_covariances(self, noise: Noise, sound: Tensor, pixel_map: Sequence[Tensor], scale: Tensor) -> Noise:
+        """Covariances in the units of the normalised correspondences, raised above rounding; 0 where not ``sound``.
+
+        Pixels are multiplied by the matrix [[a, b], [0, d]] with the entries of ``pixel_map``, (B,) each.
+        """
+        img_cov, world_cov = map_tensors(lambda x: torch.where(sound, x, 0.0), (noise.img_cov, noise.world_cov))
+        if img_cov is not None:
+            img_cov = img_cov.mapped(*(x[:, None] for x in pixel_map)).at_least((LEAST_NOISE * self.f_const) ** 2)
+        if world_cov is not None:
+            world_cov = world_cov.scaled(scale.square()[:, None])
+        return noise._replace(img_cov=img_cov, world_cov=world_cov)
+
     def _apply_to_noise(self, noise: Noise, frame: Frame) -> Noise:
-        """Standard deviations in the units and the order of the normalised correspondences."""
+        """Standard deviations in the units of the normalised correspondences, and all noise in their order."""
 
         def scaled(sigma: Tensor, scale: Tensor) -> Tensor:
             # Unknown sigmas are NaN. Replace them before scaling, or the gradient of the scale becomes NaN.
-            sigma = torch.where(sigma.isnan(), sigma, sigma.nan_to_num() * scale[:, None])
-            return sigma if frame.order is None else sigma.gather(1, frame.order)
+            return torch.where(sigma.isnan(), sigma, sigma.nan_to_num() * scale[:, None])
 
-        return Noise(scaled(noise.img, frame.img_scale), scaled(noise.world, frame.scale))
+        noise = noise._replace(img=scaled(noise.img, frame.img_scale), world=scaled(noise.world, frame.scale))
+        return noise if frame.order is None else map_tensors(lambda x: x.gather(1, frame.order), noise)
 
     def views(self, corr: Correspondences, count: int) -> Correspondences:
         """Mirror problems: the axes of image and world are exchanged or reversed, both in the same way.
@@ -247,9 +266,11 @@ class Normalize(Configured):
             count: number of views of each problem, at most 8; the first view is the problem itself.
 
         Returns:
-            The correspondences of all problems in the first view, then in the second view, and so on.
+            The correspondences of all problems in the first view, then in the second view, and so on; without
+            covariances, because networks see standard deviations.
         """
-        of_pairs = corr.weights, corr.noise, corr.near, corr.confidence
+        noise = None if corr.noise is None else corr.noise.sigmas
+        of_pairs = corr.weights, noise, corr.near, corr.confidence
         others = [values.mT for values in iter_tensors(of_pairs)]  # (N, B) each
         x, y, z, u, v = (*corr.world_points.permute(2, 1, 0), *corr.img_points.permute(2, 1, 0))
         seen = [torch.stack((*_exchanged(x, y, *view), z, *_exchanged(u, v, *view), *others)) for view in VIEWS[:count]]
@@ -330,10 +351,14 @@ class Normalize(Configured):
         return Guess(self.undo(guess.pose, frame), self.undo_pairs(guess.weights, frame), frame.valid, others, noise)
 
 
-def _is_usable(noise: Noise) -> Tensor:
-    """Whether standard deviations are finite and not negative, or unknown, bool (B,)."""
-    usable = [((x >= 0) | x.isnan()).all(-1) & ~x.isinf().any(-1) for x in noise]
-    return torch.stack(usable).all(0)
+def _is_usable(noise: Noise, there: Tensor) -> Tensor:
+    """Whether the noise of all pairs is possible, bool (B,).
+
+    Standard deviations are finite and not negative, or unknown; covariances of pairs that are there, bool (N, B), are
+    finite and positive semi-definite.
+    """
+    usable = [((x >= 0) | x.isnan()).all(-1) & ~x.isinf().any(-1) for x in (noise.img, noise.world)]
+    return torch.stack([*usable, *((are_semi_definite(x) | ~there.mT).all(-1) for x in noise.covariances)]).all(0)
 
 
 def _pinhole(camera: Tensor) -> tuple[Tensor, Tensor]:

@@ -130,6 +130,8 @@ class PnPNet(nn.Module):
         *,
         img_sigma: Tensor | float | None = None,
         world_sigma: Tensor | float | None = None,
+        img_cov: Tensor | None = None,
+        world_cov: Tensor | None = None,
         confidence: Tensor | None = None,
         first_stage_only: bool = False,
         gradient: str | None = None,
@@ -152,6 +154,10 @@ class PnPNet(nn.Module):
                 the refinement's kernel count in standard deviations.
             world_sigma: standard deviation of the noise on each world coordinate, in the unit of ``world_points``;
                 shapes and NaN as for ``img_sigma``.
+            img_cov: covariance of the noise of each pixel in px², in place of ``img_sigma``, shape
+                :math:`(B, N, 2, 2)`, symmetric and positive semi-definite. Residuals are whitened by it.
+            world_cov: covariance of the noise of each world point, in place of ``world_sigma``, shape
+                :math:`(B, N, 3, 3)`.
             confidence: your own belief that a pair is an inlier, in [0, 1], for example a matcher's score, shape
                 :math:`(B, N)`; NaN where unknown. :func:`~kornia_pnpnet.confidence.fit_confidence` makes it from raw
                 scores. Minimal samples are drawn from likely pairs more often, and a network that was trained with
@@ -170,9 +176,10 @@ class PnPNet(nn.Module):
                 was built for.
             TypeCheckError: for arguments that are no tensors, or hold booleans or complex numbers.
             DeviceError: for tensors on different devices, or on another device than a network of the solver.
+            ValueCheckError: for both a sigma and a covariance of the pixels, or of the points.
         """
-        given = world_points, img_points, intrinsics, weights, mask, init, img_sigma, world_sigma, confidence
-        size, inputs = checked_inputs(*given)
+        given = world_points, img_points, intrinsics, weights, mask, init, img_sigma, world_sigma, img_cov, world_cov
+        size, inputs = checked_inputs(*given, confidence)
         with _in_full_precision(inputs.world_points.device.type):
             always = _checked_gradient(gradient or self.gradient) == "always"
             compiled = isinstance(self._first, Compiled) or isinstance(self._solve, Compiled)
@@ -192,6 +199,8 @@ class PnPNet(nn.Module):
         *,
         img_sigma: Tensor | float | None = None,
         world_sigma: Tensor | float | None = None,
+        img_cov: Tensor | None = None,
+        world_cov: Tensor | None = None,
         confidence: Tensor | None = None,
         first_stage_only: bool = False,
         gradient: str | None = None,
@@ -207,6 +216,8 @@ class PnPNet(nn.Module):
             init: See forward.
             img_sigma: See forward.
             world_sigma: See forward.
+            img_cov: See forward.
+            world_cov: See forward.
             confidence: See forward.
             first_stage_only: See forward.
             gradient: See forward.
@@ -215,8 +226,8 @@ class PnPNet(nn.Module):
             The result, and the guess in the frame, the order and the units of the inputs; its ``ok`` says whether the
             problem is valid.
         """
-        given = world_points, img_points, intrinsics, weights, mask, init, img_sigma, world_sigma, confidence
-        size, inputs = checked_inputs(*given)
+        given = world_points, img_points, intrinsics, weights, mask, init, img_sigma, world_sigma, img_cov, world_cov
+        size, inputs = checked_inputs(*given, confidence)
         with _in_full_precision(inputs.world_points.device.type):
             always = _checked_gradient(gradient or self.gradient) == "always"
             begun, result = self._parts(first_stage_only, always, inputs)
@@ -321,9 +332,8 @@ class PnPNet(nn.Module):
         status = torch.where(ok, Status.SOLVED.value, torch.where(finite, status, Status.DEGENERATE.value))
         # ONNX Runtime chooses among int64, not among int8.
         status = torch.where(frame.valid, status, frame.status).to(torch.int8)
-        probability = guess.probability if refined.probability is None else refined.probability
-        if probability is not None:
-            probability = torch.where(finite, probability, 0.0)
+        chances = guess.probability if refined.probability is None else refined.probability
+        probability = None if chances is None else torch.where(finite, chances, 0.0)
         live = finite if always else ok
         rotation, translation = _gate_pose(pose, live, finite)
         return PnPResult(

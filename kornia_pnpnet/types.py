@@ -22,11 +22,14 @@ from kornia.geometry.conversions import (
 from kornia.geometry.liegroup import Se3
 from torch import Tensor
 
+from kornia_pnpnet.core.symmetric import Symmetric2, Symmetric3
 from kornia_pnpnet.core.trees import map_tensors
 
 __all__ = ["Correspondences", "Guess", "Hypotheses", "Noise", "PnPResult", "Pose", "Problems", "Refinement", "Status"]
 
 
+#: Focal lengths. Pixels are never known better than this, so that weights stay finite.
+LEAST_NOISE = 1e-6
 #: Pairs that determine a pose up to a few solutions.
 MIN_PAIRS = 3
 
@@ -40,8 +43,8 @@ class Status(IntEnum):
     TOO_FEW_PAIRS = 1
     #: The points lie on a line or coincide, or the pairs do not determine a pose.
     DEGENERATE = 2
-    #: A coordinate, weight or sigma is NaN or infinite, or a weight or sigma is negative, or a confidence is outside of
-    #: [0, 1].
+    #: A coordinate, weight, sigma or covariance is NaN or infinite, a weight or sigma is negative, a covariance is not
+    #: positive semi-definite, or a confidence is outside of [0, 1].
     NOT_FINITE = 3
     #: The intrinsics are not a multiple of ``[[fx, s, cx], [0, fy, cy], [0, 0, 1]]`` with positive ``fx`` and ``fy``.
     CAMERA = 4
@@ -144,15 +147,30 @@ def camera_matrices(intrinsics: Tensor | PinholeCamera) -> Tensor:
 
 
 class Noise(NamedTuple):
-    r"""Standard deviations of the noise of each pair, the same on each coordinate.
+    r"""The noise of each pair: standard deviations, the same on each coordinate, and covariances where there are any.
 
     Attributes:
-        img: standard deviation of the pixel, shape :math:`(B, N)`.
-        world: standard deviation of the world point, shape :math:`(B, N)`.
+        img: standard deviation of the pixel, shape :math:`(B, N)`; with a covariance that of isotropic noise of the
+            same trace, which is what a network sees.
+        world: standard deviation of the world point, as ``img``.
+        img_cov: covariance of the pixel, entries of shape :math:`(B, N)`; ``None``: noise is isotropic.
+        world_cov: covariance of the world point, as ``img_cov``.
     """
 
     img: Tensor
     world: Tensor
+    img_cov: Symmetric2 | None = None
+    world_cov: Symmetric3 | None = None
+
+    @property
+    def sigmas(self) -> Noise:
+        """The standard deviations alone."""
+        return self._replace(img_cov=None, world_cov=None)
+
+    @property
+    def covariances(self) -> list[Symmetric2 | Symmetric3]:
+        """The covariances that there are."""
+        return [x for x in (self.img_cov, self.world_cov) if x is not None]
 
 
 class Correspondences(NamedTuple):
@@ -207,7 +225,8 @@ class Guess(NamedTuple):
         others: more poses to start from, rotations :math:`(B, S, 3, 3)` and translations :math:`(B, S, 3)`; ``None``:
             no others.
         noise: noise of each pair in the units of the correspondences, where unknown the initialiser's estimate;
-            residuals then count in standard deviations. ``None``: the initialiser does not estimate noise.
+            residuals then count in standard deviations. ``None``: the initialiser does not estimate noise. It has no
+            covariances: the refinement takes those of the correspondences.
         probability: probability that the pose is not far off, shape :math:`(B,)`; ``None``: the initialiser does not
             estimate it.
     """
@@ -315,6 +334,10 @@ class Problems(NamedTuple):
             ``img_sigma``.
         confidence: belief that a pair is an inlier, in [0, 1], NaN and ``None`` as for ``img_sigma``, shape
             :math:`(B, N)`.
+        img_cov: covariance of the noise of each pixel, as a solver may know it in place of ``img_sigma``, shape
+            :math:`(B, N, 2, 2)`; ``None``: unknown.
+        world_cov: covariance of the noise of each world point in place of ``world_sigma``, shape
+            :math:`(B, N, 3, 3)`; ``None``: unknown.
     """
 
     world_points: Tensor
@@ -325,6 +348,8 @@ class Problems(NamedTuple):
     img_sigma: Tensor | None = None
     world_sigma: Tensor | None = None
     confidence: Tensor | None = None
+    img_cov: Tensor | None = None
+    world_cov: Tensor | None = None
 
     @property
     def sigmas(self) -> dict[str, Tensor]:
@@ -334,8 +359,9 @@ class Problems(NamedTuple):
 
     @property
     def known(self) -> dict[str, Tensor]:
-        """The known standard deviations and the confidences, as keyword arguments of a solver's call."""
-        return self.sigmas if self.confidence is None else {**self.sigmas, "confidence": self.confidence}
+        """The known noise and the confidences, as keyword arguments of a solver's call."""
+        more = {"img_cov": self.img_cov, "world_cov": self.world_cov, "confidence": self.confidence}
+        return self.sigmas | {name: value for name, value in more.items() if value is not None}
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Problems:
         """Apply a function to every tensor, for example to slice the batch or to move it to another device."""

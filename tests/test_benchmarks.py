@@ -26,6 +26,7 @@ contenders, harness, latency, others, page, performance, process, settings, benc
         *("startup", "tasks", "throughput"),
     ),
 )
+uncertainty = importlib.import_module("uncertainty")
 
 
 # -- solvers.py --------------------------------------------------------------------------------------------------------
@@ -381,6 +382,16 @@ def test_compiled_contenders_start_with_an_empty_and_with_a_filled_cache(monkeyp
     assert (cold["measured"], cached["measured"]) == (5.0, 2.0)
     starts[0]["warnings"] = ["There is no compiler"]
     assert startup.targets(starts, []) == []
+
+
+# -- uncertainty.py ----------------------------------------------------------------------------------------------------
+
+
+def test_covariances_bring_errors_close_to_the_bound(monkeypatch):
+    monkeypatch.setattr(uncertainty, "SIZES", ((20, 5),))
+    for row in uncertainty.measure_errors(create_solver(uncertainty.SOLVER).double(), 500):
+        assert all(0.9 < error < 1.1 for error in row["covariances"]), row
+        assert all(error > 1.1 for name in ("sigmas", "nothing", "bound, sigmas") for error in row[name]), row
 
 
 # -- the pages ---------------------------------------------------------------------------------------------------------

@@ -232,7 +232,8 @@ def test_problems_last_changes_only_the_order_of_memory(make_problems, correspon
     # The problem is the fastest index, then the pair.
     assert laid.world_points.stride() == laid.img_points.stride() == (1, 7, 28)
     assert laid.weights.stride() == (1, 7)
-    assert all(x.stride() == (1, 7) for x in iter_tensors(project(pose, laid)))  # arithmetic keeps the layout
+    of_pairs = project(pose, laid)._replace(rotation=None)
+    assert all(x.stride() == (1, 7) for x in iter_tensors(of_pairs))  # arithmetic keeps the layout
 
 
 def several(values, *shape):

@@ -66,6 +66,14 @@ def test_mixed_points_have_their_shares_in_small_batches_too(generator):
         MixedPoints(planes[:2], shares=(1.0,))
 
 
+def test_covariances_are_known_of_all_problems_of_a_mixture_or_of_none():
+    stretched = partial(SyntheticProblems, axis_ratio=3.0, known_noise=1.0)
+    p = MixedProblems([stretched, stretched], batch_size=6, n=4).batch(0)
+    assert (p.img_cov.shape, p.world_cov.shape) == ((6, 4, 2, 2), (6, 4, 3, 3))
+    with pytest.raises(BaseError, match="covariances"):
+        MixedProblems([stretched, SyntheticProblems], batch_size=6, n=4).batch(0)
+
+
 def test_in_a_mixture_sigmas_of_pairs_go_with_those_of_problems():
     sources = [partial(SyntheticProblems, sigma_spread=x, known_noise=1.0) for x in (0.0, 0.5)]
     p = MixedProblems([*sources, SyntheticProblems], batch_size=30, n=4).batch(0)

@@ -99,7 +99,7 @@ def mixture(count=2, shares=None, **values):
 BOUNDS = {"initial": 3.0, "size": 2, "lower": 1.0, "upper": 50.0}
 SAMPLING = {"counts": "iterations seed", "numbers": "threshold confidence", "words": "method"}
 SOURCE = "n batch_size seed"
-NUMBERS = "translation_box translation_sigma max_angle focal half_image known_noise bunched_share"
+NUMBERS = "translation_box translation_sigma max_angle focal half_image known_noise bunched_share axis_ratio"
 NOISES = dict.fromkeys(("img_sigma", "world_sigma", "degrees", "sigma_spread"), ANY | RANGES)
 SHARES = "min_ratio max_ratio mismatch_share near_share structured_share mirrored_share crowd_share structured_angle"
 SHARES += " point_crowd_share"

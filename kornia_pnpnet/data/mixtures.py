@@ -36,7 +36,8 @@ class MixedProblems:
         options: options of all sources.
 
     Raises:
-        BaseError: when the shares do not fit the sources or are not positive.
+        BaseError: when the shares do not fit the sources or are not positive; from ``batch``, when only some sources
+            know covariances.
 
     Example:
         >>> from functools import partial
@@ -81,6 +82,8 @@ class MixedProblems:
         """
         count = len(self.sources)  # no two sources see the same random numbers
         parts = [source.batch(count * index + i) for i, source in enumerate(self.sources)]
+        covariances = {(part.img_cov is None, part.world_cov is None) for part in parts}
+        KORNIA_CHECK(len(covariances) == 1, "All sources of a mixture must know covariances, or none of them.")
         for name in ("img_sigma", "world_sigma", "confidence"):
             parts = _with_known_alike(parts, name)
         problems = map_tensors(lambda *x: torch.cat(x), *parts)

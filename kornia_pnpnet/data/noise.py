@@ -18,17 +18,21 @@ from kornia_pnpnet.data.draws import log_uniform, normal, uniform
 __all__ = [
     "LEAST_DEGREES",
     "MOST_NOISE",
+    "MOST_RATIO",
     "MOST_SPREAD",
     "checked_sigma",
     "draw_confidence",
     "draw_noise",
     "hide_sigmas",
+    "stretched",
 ]
 
 #: Smallest degrees of freedom of the tails: noise stays finite in float32.
 LEAST_DEGREES = 1.0
 #: Largest standard deviation of the logarithm of the pairs' sigmas: noise stays finite in float32.
 MOST_SPREAD = 3.0
+#: Largest ratio of the axes of noise: its covariance keeps digits of the shortest axis in float32.
+MOST_RATIO = 100.0
 #: Standard deviations. A choice: a pair whose pixel has more noise is called an outlier.
 MOST_NOISE = 10.0
 
@@ -99,6 +103,25 @@ def draw_noise(
         sq_length = noise.square().sum(-1, keepdim=True).clamp(min=_LEAST_SQ_LENGTH)
         noise *= (freedom * (sq_length / freedom).expm1() / sq_length).sqrt()
     return noise.mul_(sigmas), sigmas.flatten(0 if not spread else 1)
+
+
+def stretched(noise: Tensor, ratio: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Stretch isotropic noise along random axes, others for each pair.
+
+    Args:
+        noise: shape :math:`(B, N, D)`.
+        ratio: largest over smallest standard deviation. The standard deviations of the axes are a geometric series.
+        generator: source of randomness.
+
+    Returns:
+        The noise, of the same mean variance, and its covariance in units of that variance, :math:`(B, N, D, D)`.
+    """
+    size = noise.shape[-1]
+    axes = ratio ** torch.linspace(0.0, 1.0, size, dtype=noise.dtype, device=noise.device)
+    axes = axes / axes.square().mean().sqrt()
+    turn = torch.linalg.qr(normal((*noise.shape, size), generator)).Q
+    factor = (turn * axes) @ turn.mT
+    return (factor @ noise[..., None])[..., 0], factor @ factor
 
 
 def _of_problems(shape: Sequence[int], value: float | tuple[float, float], generator: torch.Generator) -> Tensor:

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from itertools import count
 
 import torch
+from kornia.core.check import KORNIA_CHECK
 from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_numbers, check_positive, check_whole
@@ -14,11 +15,13 @@ from kornia_pnpnet.data.draws import batch_generator, random_poses, uniform
 from kornia_pnpnet.data.noise import (
     LEAST_DEGREES,
     MOST_NOISE,
+    MOST_RATIO,
     MOST_SPREAD,
     checked_sigma,
     draw_confidence,
     draw_noise,
     hide_sigmas,
+    stretched,
 )
 from kornia_pnpnet.data.outliers import OutlierMix, crowd_leaders, near_offsets, structured_points
 from kornia_pnpnet.data.points import BoxPoints, PointPrior
@@ -66,6 +69,9 @@ class SyntheticProblems:
         sigma_spread: the sigmas of a problem's pairs are log-normal about those of the problem, with this standard
             deviation of the logarithm, at most 3, or a range as for ``degrees``. Known sigmas are then those of each
             pair, shape ``(batch_size, n)``.
+        axis_ratio: largest over smallest standard deviation of the noise of each pixel and of each point, along random
+            axes that differ between pairs. Above 1, ``img_sigma`` and ``world_sigma`` are the root mean square over the
+            axes, at most 100, and known noise is covariances, of all problems or of none.
         known_noise: share of the problems that come with both sigmas. A third of the other problems come with one of
             them; unknown sigmas are NaN.
         confidence_share: share of the problems that come with confidences, see
@@ -102,6 +108,7 @@ class SyntheticProblems:
         world_sigma: float | Sequence[float] = 0.05,
         degrees: float | Sequence[float] = 0.0,
         sigma_spread: float | Sequence[float] = 0.0,
+        axis_ratio: float = 1.0,
         known_noise: float = 0.0,
         confidence_share: float = 0.0,
         bunched_share: float = 0.0,
@@ -132,6 +139,12 @@ class SyntheticProblems:
         self.world_sigma = checked_sigma("world_sigma", world_sigma)
         self.degrees = checked_sigma("degrees", degrees, LEAST_DEGREES)
         self.sigma_spread = checked_sigma("sigma_spread", sigma_spread, 0.0, MOST_SPREAD)
+        check_numbers(1.0, MOST_RATIO, axis_ratio=axis_ratio)
+        KORNIA_CHECK(
+            axis_ratio == 1.0 or known_noise in (0.0, 1.0),
+            f"Covariances are known for all problems or for none, got known_noise={known_noise}.",
+        )
+        self.axis_ratio = axis_ratio
         self.known_noise = known_noise
         self.confidence_share = confidence_share
         self.bunched_share = bunched_share
@@ -169,6 +182,10 @@ class SyntheticProblems:
 
         world_points = (cam_points - pose.translation[:, None]) @ pose.rotation
         noise, world_sigma = draw_noise(world_points.shape, self.world_sigma, generator, spread=self.sigma_spread)
+        covariances = {}
+        if self.axis_ratio > 1.0:
+            noise, shape = stretched(noise, self.axis_ratio, generator)
+            covariances["world_cov"] = shape * world_sigma.reshape(self.batch_size, -1, 1, 1).square()
         world_points += noise
         is_other = draw.mismatch if draw.crowd is None else draw.mismatch | draw.crowd
         seen = torch.where(is_other[..., None], other_points, cam_points)
@@ -186,6 +203,9 @@ class SyntheticProblems:
         noise, img_sigma = draw_noise(
             img_points.shape, self.img_sigma, generator, spread=self.sigma_spread, degrees=self.degrees
         )
+        if self.axis_ratio > 1.0:
+            noise, shape = stretched(noise, self.axis_ratio, generator)
+            covariances["img_cov"] = shape * img_sigma.reshape(self.batch_size, -1, 1, 1).square()
         img_points += noise
         inliers = draw.inliers & ~behind
         if self.degrees:
@@ -203,7 +223,9 @@ class SyntheticProblems:
             world_points = torch.where(of_points, shared[1], world_points)
         known: dict[str, Tensor] = {}
         errors = noise.norm(dim=-1) / img_sigma.reshape(self.batch_size, -1).mean(1, keepdim=True).clamp(min=_TINY)
-        if self.known_noise:
+        if self.known_noise and covariances:
+            known = covariances
+        elif self.known_noise:
             img_sigma, world_sigma = hide_sigmas(img_sigma, world_sigma, self.known_noise, generator)
             known = {"img_sigma": img_sigma, "world_sigma": world_sigma}
         if self.confidence_share:

@@ -88,6 +88,9 @@ class KnownInliersAndNoise(Bound):
     :math:`1 / (\sigma_\mathrm{img}^2 + \sigma_\mathrm{world}^2\,\mathrm{tr}(J_x J_x^\top) / 2)`. Source: the
     protocol's bound *known inliers and noise*.
 
+    Where problems have covariances, residuals are whitened by those of their pairs, and the sigmas below stand for a
+    covariance that is missing: the maximum likelihood estimate on the inliers.
+
     Args:
         img_sigma: standard deviation of each pixel coordinate, in pixels. The default is the protocol's.
         world_sigma: standard deviation of each world coordinate, in the unit of the world. The default is that of the
@@ -109,6 +112,20 @@ class KnownInliersAndNoise(Bound):
         KORNIA_CHECK(img_sigma + world_sigma > 0, "img_sigma and world_sigma must not both be 0.")
         self.img_sigma = img_sigma
         self.world_sigma = world_sigma
+
+    def solve_with_truth(self, problems: Problems) -> PnPResult:
+        """See :meth:`Bound.solve_with_truth`."""
+        if problems.img_cov is None and problems.world_cov is None:
+            return super().solve_with_truth(problems)
+        return self.least_squares(
+            *problems[:3],
+            problems.inliers.to(problems.world_points.dtype),
+            init=problems.pose,
+            img_sigma=self.img_sigma if problems.img_cov is None else None,
+            world_sigma=self.world_sigma if problems.world_cov is None else None,
+            img_cov=problems.img_cov,
+            world_cov=problems.world_cov,
+        )
 
     @torch.no_grad()
     def pair_weights(self, problems: Problems) -> Tensor:

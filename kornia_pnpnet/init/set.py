@@ -107,9 +107,10 @@ class _View:
             no = torch.zeros_like(corr.weights, dtype=torch.bool)
             return [(torch.zeros_like(corr.weights), no)] * 2
         units = corr.focal * self.spread[:, None], torch.ones_like(self.spread[:, None])
-        known = [torch.isfinite(x) for x in corr.noise]
+        sigmas = corr.noise.img, corr.noise.world
+        known = [torch.isfinite(x) for x in sigmas]
         logs = []
-        for sigma, unit, is_known in zip(corr.noise, units, known, strict=True):
+        for sigma, unit, is_known in zip(sigmas, units, known, strict=True):
             # Unknown sigmas are NaN. Replace them before dividing, or the gradient of the unit becomes NaN.
             relative = torch.where(is_known, sigma, 1.0) / torch.where(is_known, unit, 1.0)
             logs.append(relative.clamp(min=_LEAST_NOISE).log())
@@ -204,8 +205,9 @@ class SetInit(Configured):
     The poses of the samples (see :func:`~kornia_pnpnet.init.p3p`) are scored by the 32 likeliest pairs, and the best
     pose is one more hypothesis: a constant without gradient, at a fixed cost.
 
-    The weight of a pair is the estimated probability that it is an inlier. The noise is the ``noise`` of the
-    :class:`~kornia_pnpnet.types.Correspondences` where known, else the network's estimate.
+    The weight of a pair is the estimated probability that it is an inlier. Of noise with covariances the network and
+    the scores of samples see the standard deviation of isotropic noise of the same trace. The noise is the ``noise`` of
+    the :class:`~kornia_pnpnet.types.Correspondences` where known, else the network's estimate.
 
     The design is ours. Distances along rays before a closed-form alignment: J. Hesch and S. Roumeliotis, "A direct
     least-squares method for PnP", ICCV 2011, among many; attention pooled over correspondences: W. Sun et al., "ACNe:
@@ -336,7 +338,7 @@ class SetInit(Configured):
         chances = torch.where(there, right, 0.0)
         # An unlikely pair that agrees may be an inlier after all; padding does not score.
         vote = torch.where(there, _LEAST_VOTE + (1.0 - _LEAST_VOTE) * right, 0.0)
-        img, world = (x.expand(batch, count)[..., None] for x in noise)
+        img, world = (x.expand(batch, count)[..., None] for x in (noise.img, noise.world))
         of_pairs = torch.cat((corr.world_points, corr.img_points, vote[..., None], img, world), -1)  # (B, N, 8)
         if not isinstance(count, int):  # exported for any number of pairs: pad to the number of judges
             more = of_pairs[:, :1] * torch.tensor((1, 1, 1, 1, 1, 0, 1, 1), dtype=vote.dtype, device=vote.device)

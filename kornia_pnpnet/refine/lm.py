@@ -18,21 +18,21 @@ from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.linalg import relative
 from kornia_pnpnet.core.performance import Compiled, problems_last, repeat_problems
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.geometry import NormalEquations, Projection, move, pixel_variance, project
+from kornia_pnpnet.geometry import NormalEquations, Projection, move, project
 from kornia_pnpnet.refine.kernels import KERNELS, RobustKernel
 from kornia_pnpnet.refine.parameters import BoundedParameter
 from kornia_pnpnet.refine.stages import LMStart, Stage, State
 from kornia_pnpnet.refine.step import (
     LMStep,
+    corrected_residuals,
     iterate,
     outlier_area,
     solve_damped,
     sq_standardised,
-    variance_factor,
     weighted_equations,
 )
 from kornia_pnpnet.refine.verdict import believe, explains, has_enough
-from kornia_pnpnet.types import Correspondences, Guess, Noise, Pose, Refinement
+from kornia_pnpnet.types import LEAST_NOISE, Correspondences, Guess, Noise, Pose, Refinement
 
 __all__ = ["BACKWARDS", "RobustWeightedLM"]
 
@@ -42,8 +42,6 @@ BACKWARDS = ("unroll", "truncated", "implicit")
 # Focal lengths. Residuals count up to this size in the cost, and a point behind the camera counts as much, so that it
 # is never cheaper than a point in front of the camera.
 _MAX_RESIDUAL = 2.0
-# Focal lengths. Pixels are never known better than this, so that weights stay finite.
-_LEAST_NOISE = 1e-6
 # Units in the last place. With `reject_worse`, costs and residuals that differ by less count as equal.
 _ROUNDING = 100.0
 # Factors of the damping after a refused and after an accepted step (Marquardt 1963; only with `reject_worse`).
@@ -61,8 +59,9 @@ class RobustWeightedLM(Configured):
 
     *Noise.* Where the noise of each pair is known or estimated, residuals count in standard deviations: a pair weighs
     :math:`1 / \sigma^2` times the robust weight of :math:`\|r\|^2 / \sigma^2`, with the
-    :func:`~kornia_pnpnet.geometry.pixel_variance` :math:`\sigma^2` at the previous estimate. Scales of kernels and the
-    cost then count in standard deviations, too.
+    :func:`~kornia_pnpnet.geometry.pixel_variance` :math:`\sigma^2` at the previous estimate. Where the caller gave
+    covariances, residuals are whitened by the :func:`~kornia_pnpnet.geometry.pixel_covariance` instead. Scales of
+    kernels and the cost then count in standard deviations, too.
 
     *Several poses.* Where a guess has other poses, the first seven tenths of the iterations (rounded down) refine all
     of them. Then the pose of the lowest cost by the kernel of the last of these iterations goes on alone, per problem.
@@ -233,7 +232,7 @@ class RobustWeightedLM(Configured):
         corr = problems_last(corr._replace(noise=_complete_noise(corr, guess)))
         prior = corr.weights * problems_last(guess.weights)
         area = None
-        if self.by_residual and unknown is not None and corr.noise is not None:
+        if self.by_residual and unknown is not None and corr.noise is not None and not corr.noise.covariances:
             area = torch.where(unknown, outlier_area(corr), 0.0)
         # Steps do not depend on a common factor of the weights; tiny weights must not vanish when multiplied.
         guided = corr._replace(weights=relative(prior, prior), img_scale=None, world_scale=None)
@@ -321,23 +320,15 @@ class RobustWeightedLM(Configured):
             See :meth:`forward`.
         """
         projection, shape = project(end.pose, start.corr), start.shape[-1]
-        sq_residual, judged = sq_standardised(projection, start.corr), start.guided
-        if start.outlier_area is not None:
-            noise = start.corr.noise
-            assert noise is not None
-            precision = pixel_variance(projection, noise, start.corr.focal).reciprocal()
-            seen = sq_residual, precision, projection, start.by_residual.weights
-            factor = variance_factor(*seen, self.kernel.weight, shape, start.outlier_area)
-            sq_residual = sq_residual / factor
-            larger = factor.detach().clamp(min=1.0).sqrt()
-            judged = judged._replace(noise=map_tensors(lambda sigma: larger * sigma, noise))
+        pairs = start.corr._replace(weights=start.by_residual.weights)
+        sq_residual, noise = corrected_residuals(projection, pairs, self.kernel.weight, shape, start.outlier_area)
         weights = torch.where(projection.in_front, start.prior * self.kernel.weight(sq_residual, shape), 0.0)
         cost = self._cost(projection, start.corr, start.prior, shape)
         probability = None
         if start.corr.noise is None:
             ok = explains(projection, start.corr, start.prior)
         else:
-            probability, ok = believe(projection, judged)
+            probability, ok = believe(projection, start.guided._replace(noise=noise))
             if start.noiseless is not None:
                 ok = torch.where(start.noiseless, explains(projection, start.corr, start.prior), ok)
                 probability = torch.where(start.noiseless, torch.nan, probability)
@@ -396,8 +387,7 @@ class RobustWeightedLM(Configured):
     def _cost(self, projection: Projection, corr: Correspondences, prior: Tensor, shape: Tensor) -> Tensor:
         """Mean robust loss over the pairs that have a weight, shape (B,)."""
         most = (_MAX_RESIDUAL * corr.focal).square()
-        sq_pixels = torch.where(projection.in_front, projection.sq_residual.minimum(most), most)
-        sq_residual = sq_standardised(projection, corr, sq_pixels)
+        sq_residual = sq_standardised(projection, corr, most)
         count = (corr.weights > 0).sum(-1).clamp(min=1)
         return (prior * self.kernel.loss(sq_residual, shape)).sum(-1) / count
 
@@ -407,7 +397,8 @@ class RobustWeightedLM(Configured):
         With :math:`g(\delta) = J^\top W r` at the pose moved by :math:`\delta`, which is 0 at the minimum,
         :math:`d\delta = -(\partial g / \partial \delta)^{-1} dg`: one Newton step whose value is left out. Where the
         matrix is not positive definite the pose is no minimum yet, and the Gauss-Newton matrix replaces it. A second
-        step with the same matrix makes second derivatives exact.
+        step with the same matrix makes second derivatives exact. Covariances turn with the pose, so that the matrix is
+        not quite symmetric: a third step takes most of the difference away.
         """
         equations = partial(weighted_equations, outlier_area=start.outlier_area, kernel_weight=self.kernel.weight)
         pairs = start.by_residual
@@ -418,7 +409,7 @@ class RobustWeightedLM(Configured):
                 torch.autograd.grad(entry.sum(), zero[: i + 1], retain_graph=True) for i, entry in enumerate(gradient)
             ]
         around, none = [[x.detach() for x in row] for row in around], torch.zeros_like(shape)
-        for _ in range(2):
+        for _ in range(3 if pairs.noise is not None and pairs.noise.covariances else 2):
             gradient = equations(pairs, pose, shape).gradient
             newton, convex = solve_damped(NormalEquations(hessian, gradient), none)
             gauss_newton, solved = solve_damped(NormalEquations(around, gradient), none)
@@ -435,16 +426,20 @@ def _relative_to_mean(weights: Tensor) -> Tensor:
 
 
 def _complete_noise(corr: Correspondences, guess: Guess) -> Noise | None:
-    """The noise of the guess; if it has none, the caller's with 0 for unknown sigmas; ``None`` if neither exists."""
+    """The caller's covariances, the guess's sigmas or else the caller's with 0 where unknown; ``None``: neither."""
     noise = guess.noise
     if noise is None and corr.noise is not None:
         noise = map_tensors(lambda x: x.nan_to_num(0.0), corr.noise)
-    return None if noise is None else noise._replace(img=noise.img.maximum(_LEAST_NOISE * corr.focal))
+    if noise is None:
+        return None
+    given = noise if corr.noise is None else corr.noise  # a guess has no covariances
+    least = noise.img.maximum(LEAST_NOISE * corr.focal)
+    return noise._replace(img=least, img_cov=given.img_cov, world_cov=given.world_cov)
 
 
 def _is_unknown(corr: Correspondences) -> Tensor:
     """Problems of which the caller gave neither sigma for any pair, bool (B, 1)."""
     known = torch.zeros_like(corr.weights[:, :1], dtype=torch.bool)
-    for sigma in corr.noise or ():
+    for sigma in () if corr.noise is None else (corr.noise.img, corr.noise.world):
         known = known | sigma.isfinite().any(1, keepdim=True)
     return ~known

@@ -16,6 +16,8 @@ import torch
 from torch import Tensor
 
 from kornia_pnpnet.core.linalg import factorise, relative, substitute
+from kornia_pnpnet.core.symmetric import Symmetric2
+from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import (
     NormalEquations,
     Projection,
@@ -23,17 +25,20 @@ from kornia_pnpnet.geometry import (
     change_tangent,
     move,
     normal_equations,
+    pixel_covariance,
     pixel_variance,
     project,
     retract_additive,
 )
-from kornia_pnpnet.types import MIN_PAIRS, Correspondences, Pose
+from kornia_pnpnet.types import MIN_PAIRS, Correspondences, Noise, Pose
 
 __all__ = [
     "LMStep",
+    "corrected_residuals",
     "iterate",
     "lm_step",
     "outlier_area",
+    "pixel_precision",
     "solve_damped",
     "sq_standardised",
     "variance_factor",
@@ -113,7 +118,7 @@ def lm_step(
     corr: Correspondences,
     pose: Pose,
     projection: Projection,
-    weights: Tensor,
+    weights: Tensor | Symmetric2,
     step: Tensor,
     damping: Tensor,
     *,
@@ -129,8 +134,8 @@ def lm_step(
         corr: normalised correspondences.
         pose: the pose to improve.
         projection: :func:`~kornia_pnpnet.geometry.project` of ``pose``.
-        weights: weight of each pair, :math:`(B, N)`. Points behind the camera do not count. The step does not depend
-            on a common factor.
+        weights: weight of each pair, :math:`(B, N)`, or 2×2 matrices with entries of that shape. Points behind the
+            camera do not count. The step does not depend on a common factor.
         step: :math:`\gamma`, a scalar.
         damping: :math:`\lambda`, a scalar or :math:`(B,)`.
         additive: update the rotation vector additively as in the paper, instead of by the retraction.
@@ -181,19 +186,47 @@ def solve_damped(equations: NormalEquations, damping: Tensor) -> tuple[list[Tens
     return substitute(lower, scaled), reduce(and_, good)
 
 
-def sq_standardised(projection: Projection, corr: Correspondences, sq_residual: Tensor | None = None) -> Tensor:
+def pixel_precision(projection: Projection, noise: Noise, focal: Tensor) -> Tensor | Symmetric2:
+    """Weight of a pixel by its noise: the inverse of the variance, or of the covariance where there is any.
+
+    Args:
+        projection: :func:`~kornia_pnpnet.geometry.project` of a pose.
+        noise: noise of each pair.
+        focal: the focal length in pixels, a scalar.
+
+    Returns:
+        A number for each pair, :math:`(B, N)`, or a 2×2 matrix with entries of that shape.
+    """
+    if not noise.covariances:
+        return pixel_variance(projection, noise, focal).reciprocal()
+    at = projection.rotation, projection.plane_points, projection.inv_depth
+    return pixel_covariance(*at, noise, focal).inverse()
+
+
+def sq_standardised(projection: Projection, corr: Correspondences, most: Tensor | None = None) -> Tensor:
     """Squared residuals in variances of their pixel where the noise is known, else in square pixels.
+
+    Where noise has covariances this is the squared Mahalanobis distance.
 
     Args:
         projection: :func:`~kornia_pnpnet.geometry.project` of a pose.
         corr: normalised correspondences; their noise is known for every pair or for none.
-        sq_residual: squared residuals in square pixels, :math:`(B, N)`; those of ``projection`` when ``None``.
+        most: square pixels, a scalar. Larger squared residuals count as this much, and so does a point behind the
+            camera. With covariances this many square pixels have the mean precision of both coordinates.
 
     Returns:
         Shape :math:`(B, N)`.
     """
-    sq_residual = projection.sq_residual if sq_residual is None else sq_residual
-    return sq_residual if corr.noise is None else sq_residual / pixel_variance(projection, corr.noise, corr.focal)
+    noise, sq_residual = corr.noise, projection.sq_residual
+    variance = None if noise is None or noise.covariances else pixel_variance(projection, noise, corr.focal)
+    if noise is not None and noise.covariances:
+        precision = pixel_precision(projection, noise, corr.focal)
+        assert isinstance(precision, Symmetric2)
+        sq_residual = precision.form(*projection.residual)
+        most = None if most is None else 0.5 * most * (precision.uu + precision.vv)
+    if most is not None:
+        sq_residual = torch.where(projection.in_front, sq_residual.minimum(most), most)
+    return sq_residual if variance is None else sq_residual / variance
 
 
 def variance_factor(
@@ -233,6 +266,35 @@ def variance_factor(
     return above * torch.where(below < 1.0, narrower * below, 1.0)
 
 
+def corrected_residuals(
+    projection: Projection,
+    pairs: Correspondences,
+    kernel_weight: KernelWeight,
+    shape: Tensor,
+    outlier_area: Tensor | None,
+) -> tuple[Tensor, Noise | None]:
+    """Squared residuals in the variances that they show, and the noise with sigmas no smaller than estimated.
+
+    Args:
+        projection: :func:`~kornia_pnpnet.geometry.project` of a pose.
+        pairs: normalised correspondences, with the weights that :func:`variance_factor` takes.
+        kernel_weight: the robust kernel's weight.
+        shape: shape of the kernel, a scalar.
+        outlier_area: see :func:`iterate`.
+
+    Returns:
+        The residuals, :math:`(B, N)`, and the noise, without gradient of the correction.
+    """
+    sq_residual, noise = sq_standardised(projection, pairs), pairs.noise
+    if outlier_area is None or noise is None:
+        return sq_residual, noise
+    precision = pixel_variance(projection, noise, pairs.focal).reciprocal()
+    seen = sq_residual, precision, projection, pairs.weights
+    factor = variance_factor(*seen, kernel_weight, shape, outlier_area)
+    larger = factor.detach().clamp(min=1.0).sqrt()
+    return sq_residual / factor, map_tensors(lambda sigma: larger * sigma, noise)
+
+
 def outlier_area(corr: Correspondences) -> Tensor:
     """Area of a square with the variance of the pixels that are near: where pixels of outliers lie, (B, 1)."""
     there = (corr.near_weights > 0).to(corr.weights)
@@ -250,21 +312,27 @@ def _weights(
     kernel_weight: KernelWeight,
     shape: Tensor,
     outlier_area: Tensor | None,
-) -> Tensor:
-    """Weight of each pair in the normal equations: prior weight, inverse variance, robust weight."""
+) -> Tensor | Symmetric2:
+    """Weight of each pair in the normal equations: prior weight, inverse variance or covariance, robust weight."""
     if pairs.noise is None:
         return pairs.weights * kernel_weight(projection.sq_residual, shape)
-    precision = pixel_variance(projection, pairs.noise, pairs.focal).reciprocal()
-    sq_residual = projection.sq_residual * precision
-    if outlier_area is not None:
-        seen = sq_residual, precision, projection, pairs.weights
-        sq_residual = sq_residual / variance_factor(*seen, kernel_weight, shape, outlier_area, NARROWER)
-    return pairs.weights * precision * kernel_weight(sq_residual, shape)
+    precision = pixel_precision(projection, pairs.noise, pairs.focal)
+    if isinstance(precision, Tensor):
+        sq_residual = projection.sq_residual * precision
+        if outlier_area is not None:
+            seen = sq_residual, precision, projection, pairs.weights
+            sq_residual = sq_residual / variance_factor(*seen, kernel_weight, shape, outlier_area, NARROWER)
+    else:
+        sq_residual = precision.form(*projection.residual)
+    robust = pairs.weights * kernel_weight(sq_residual, shape)
+    return map_tensors(lambda x: x * robust, precision)
 
 
-def _relative(weights: Tensor, projection: Projection) -> Tensor:
+def _relative(weights: Tensor | Symmetric2, projection: Projection) -> Tensor | Symmetric2:
     """Weights relative to the heaviest row of the Jacobian, so that products of tiny weights do not vanish."""
-    return relative(weights, weights * projection.inv_depth * projection.inv_depth)
+    size = weights if isinstance(weights, Tensor) else weights.uu + weights.vv
+    size = size * projection.inv_depth * projection.inv_depth
+    return map_tensors(lambda x: relative(x, size), weights)
 
 
 @torch.no_grad()

@@ -15,8 +15,10 @@ from torch import Tensor
 
 from kornia_pnpnet.core.linalg import solve_symmetric, symmetric
 from kornia_pnpnet.core.performance import exporting, in_order
+from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.geometry import Projection, normal_equations, pixel_variance, span_a_plane
+from kornia_pnpnet.geometry import Projection, normal_equations, span_a_plane
+from kornia_pnpnet.refine.step import pixel_precision
 from kornia_pnpnet.types import MIN_PAIRS, Correspondences
 
 __all__ = [
@@ -133,7 +135,10 @@ def believe(projection: Projection, corr: Correspondences) -> Belief:
     """
     projection, corr = map_tensors(torch.Tensor.detach, projection), corr.map(torch.Tensor.detach)
     assert corr.noise is not None
-    thresholds = Thresholds(EVIDENT * corr.noise.img, EVIDENT * corr.noise.world)
+    precision = pixel_precision(projection, corr.noise, corr.focal) if corr.noise.covariances else None
+    assert not isinstance(precision, Tensor)
+    precision = map_tensors(lambda x: x / EVIDENT**2, precision)
+    thresholds = Thresholds(EVIDENT * corr.noise.img, EVIDENT * corr.noise.world, precision)
     judged = judge(projection, corr, thresholds)
     inliers, counts = (judged.weights > 0).sum(-1), (corr.weights > 0).sum(-1)
     triples = counts * (counts - 1) * (counts - 2) // 6  # any three pairs could have given the pose
@@ -183,8 +188,9 @@ def rotation_sigma(projection: Projection, corr: Correspondences, judged: Judged
         The square root of the trace of the rotation's covariance, float64, shape :math:`(B,)`.
     """
     assert corr.noise is not None
-    precision = corr.focal.square() / pixel_variance(projection, corr.noise, corr.focal)
-    rows = normal_equations(projection, torch.where(judged.weights > 0, precision, 0.0)).hessian
+    inlier = corr.focal.square() * (judged.weights > 0)
+    weights = map_tensors(lambda x: inlier * x, pixel_precision(projection, corr.noise, corr.focal))
+    rows = normal_equations(projection, weights).hessian
     matrix = symmetric(rows).double()
     shift = matrix[:, 3:, 3:]
     left = matrix[:, :3, :3] - matrix[:, :3, 3:] @ solve_symmetric(shift, matrix[:, 3:, :3])  # the shift eliminated
@@ -208,10 +214,14 @@ class Thresholds(NamedTuple):
     Attributes:
         img: :math:`\tau` in pixels of the normalised camera, shape :math:`(B,)` or :math:`(B, N)`.
         world: :math:`\omega` in units of the normalised world, shape :math:`(B,)` or :math:`(B, N)`.
+        precision: the matrix by which the squared length of a residual is 1 at the threshold, entries :math:`(B, N)`;
+            ``None``: that of :math:`\tau` and :math:`\omega`. A disc of the same area stands for its ellipse where
+            the chance of an inlier is estimated.
     """
 
     img: Tensor
     world: Tensor
+    precision: Symmetric2 | None = None
 
 
 class Judged(NamedTuple):
@@ -250,6 +260,8 @@ def judge(projection: Projection, corr: Correspondences, thresholds: Thresholds)
     """
     sq_img, sq_limit = _of_pairs(thresholds.img).square(), _sq_limits(projection, corr, thresholds)
     errors = projection.sq_residual / sq_limit
+    if thresholds.precision is not None:
+        errors = thresholds.precision.form(*projection.residual)
     errors = torch.where(projection.in_front, errors, MAX_ERROR)
     inlier = (errors < 1.0) & (corr.weights > 0)
     return Judged(torch.where(inlier, sq_img / sq_limit, 0.0), errors)
@@ -337,7 +349,9 @@ def chance_of_others(projection: Projection, corr: Correspondences, thresholds: 
 
 def _sq_limits(projection: Projection, corr: Correspondences, thresholds: Thresholds) -> Tensor:
     """Largest squared residual of an inlier in square pixels, (B, N)."""
-    img, world = map(_of_pairs, thresholds)
+    if thresholds.precision is not None:
+        return thresholds.precision.determinant.rsqrt()
+    img, world = _of_pairs(thresholds.img), _of_pairs(thresholds.world)
     return img.square() + (corr.focal * world * projection.inv_depth).square()
 
 

@@ -243,7 +243,8 @@ class RANSAC(Configured):
         # Every number of inliers from 4 to all pairs is another test of the same pose.
         tests = found.poses * (counts - MIN_PAIRS).clamp(min=1)
         alarms = log_false_alarms(tests, inliers, counts, chance)
-        noise = Noise(*(x[:, None].expand_as(corr.weights) / EVIDENT for x in thresholds))
+        limits = thresholds.img, thresholds.world
+        noise = Noise(*(x[:, None].expand_as(corr.weights) / EVIDENT for x in limits))
         chances = probability(alarms, rotation_sigma(projection, corr._replace(noise=noise), judged)).to(corr.weights)
         ok = is_believed(alarms, chances) | ((inliers == MIN_PAIRS) & (counts == MIN_PAIRS))
         return Belief(chances, ok & found.loss.isfinite())
@@ -280,8 +281,9 @@ def search_on(corr: Correspondences, guess: Guess, plan: Plan = FURTHER) -> Gues
 
     Samples hold pairs in proportion to a half plus half the weight of the guess, times the caller's confidence: weights
     that mislead then cost some samples, but no pose. An inlier is within ten standard deviations of the guess' noise
-    (its mean over the pairs). The limit is that of a point as far away as the centre of the world in the guess, for all
-    poses: with a limit by each pose's own depths, a pose close to the points would have most inliers.
+    (its mean over the pairs; of noise with covariances the standard deviation of isotropic noise of the same trace).
+    The limit is that of a point as far away as the centre of the world in the guess, for all poses: with a limit by
+    each pose's own depths, a pose close to the points would have most inliers.
 
     First the best pose of the guess is improved on its inliers. A problem is searched only when, by the number of these
     inliers, it needs more than ``plan.min_samples`` samples to reach ``plan.confidence``. Problems that are done leave
@@ -304,7 +306,8 @@ def search_on(corr: Correspondences, guess: Guess, plan: Plan = FURTHER) -> Gues
     corr = corr._replace(noise=None).map(lambda x: x.detach().contiguous())
     there = corr.weights > 0
     share = there / there.sum(-1, keepdim=True).clamp(min=1)
-    img, world = (_INLIER * (torch.where(there, x.detach(), 0.0) * share).sum(-1) for x in guess.noise)
+    sigmas = guess.noise.img, guess.noise.world
+    img, world = (_INLIER * (torch.where(there, x.detach(), 0.0) * share).sum(-1) for x in sigmas)
     depth = guess.pose.translation[:, 2].detach().clamp(min=_NEAREST)
     thresholds = Thresholds(torch.hypot(img, corr.focal * world / depth), torch.zeros_like(world))
     chances = _DOUBT + (1.0 - _DOUBT) * guess.weights.detach()

@@ -1,0 +1,152 @@
+"""Symmetric 2×2 and 3×3 matrices, one for each pair, entry by entry: covariances of pixels and of world points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kornia_pnpnet.core.linalg import factorise
+
+__all__ = ["Symmetric2", "Symmetric3", "are_semi_definite", "equivalent_sigma"]
+
+# Units in the last place of the trace. A matrix whose smallest eigenvalue is further below 0 is not semi-definite.
+_ROUNDING = 16.0
+# Units in the last place of the trace. Smaller eigenvalues are raised to this: a determinant keeps no digits of them.
+_LEAST = 64.0
+
+
+class Symmetric2(NamedTuple):
+    """Entries of a symmetric 2×2 matrix for each pair, tensors of one shape."""
+
+    uu: Tensor
+    uv: Tensor
+    vv: Tensor
+
+    @classmethod
+    def of(cls, matrix: Tensor) -> Symmetric2:
+        """The symmetric parts of matrices (..., 2, 2)."""
+        return cls(matrix[..., 0, 0], _mean(matrix, 0, 1), matrix[..., 1, 1])
+
+    @property
+    def diagonal(self) -> tuple[Tensor, ...]:
+        """The entries of the diagonal."""
+        return self.uu, self.vv
+
+    @property
+    def rows(self) -> list[list[Tensor]]:
+        """The rows of the lower triangle."""
+        return [[self.uu], [self.uv, self.vv]]
+
+    @property
+    def determinant(self) -> Tensor:
+        """The determinant of a positive definite matrix, not less than what rounding leaves of it."""
+        product = self.uu * self.vv
+        least = _LEAST * torch.finfo(product.dtype).eps * product.detach()
+        return torch.addcmul(product, self.uv, self.uv, value=-1).maximum(least)
+
+    def form(self, u: Tensor, v: Tensor) -> Tensor:
+        r"""The quadratic form :math:`x^\top A x` of :math:`x = (u, v)`."""
+        cross = torch.addcmul(self.uu * u, self.uv, v, value=2.0)
+        return torch.addcmul(cross * u, self.vv * v, v)
+
+    def inverse(self) -> Symmetric2:
+        """The inverse of a positive definite matrix. Eigenvalues near rounding count as if they were larger.
+
+        Example:
+            >>> Symmetric2(*torch.tensor([2.0, 1.0, 1.0])).inverse()
+            Symmetric2(uu=tensor(1.), uv=tensor(-1.), vv=tensor(2.))
+        """
+        scale = self.determinant.reciprocal()
+        return Symmetric2(self.vv * scale, -self.uv * scale, self.uu * scale)
+
+    def mapped(self, a: Tensor, b: Tensor, d: Tensor) -> Symmetric2:
+        """The covariance of a vector after its product with the matrix [[a, b], [0, d]]."""
+        u, v = a * self.uu + b * self.uv, a * self.uv + b * self.vv
+        return Symmetric2(a * u + b * v, d * v, d * d * self.vv)
+
+    def at_least(self, least: float) -> Symmetric2:
+        """Add a multiple of the identity where the smallest eigenvalue is below ``least``, so that it is not."""
+        uu, uv, vv = (x.detach() for x in self)
+        smallest = 0.5 * (uu + vv) - torch.hypot(0.5 * (uu - vv), uv)
+        more = ((_LEAST * torch.finfo(uu.dtype).eps * (uu + vv)).clamp(min=least) - smallest).clamp(min=0.0)
+        return Symmetric2(self.uu + more, self.uv, self.vv + more)
+
+
+class Symmetric3(NamedTuple):
+    """Entries of a symmetric 3×3 matrix for each pair, tensors of one shape."""
+
+    xx: Tensor
+    xy: Tensor
+    xz: Tensor
+    yy: Tensor
+    yz: Tensor
+    zz: Tensor
+
+    @classmethod
+    def of(cls, matrix: Tensor) -> Symmetric3:
+        """The symmetric parts of matrices (..., 3, 3)."""
+        x, y, z = (matrix[..., i, i] for i in range(3))
+        return cls(x, _mean(matrix, 0, 1), _mean(matrix, 0, 2), y, _mean(matrix, 1, 2), z)
+
+    @property
+    def diagonal(self) -> tuple[Tensor, ...]:
+        """The entries of the diagonal."""
+        return self.xx, self.yy, self.zz
+
+    @property
+    def rows(self) -> list[list[Tensor]]:
+        """The rows of the lower triangle."""
+        return [[self.xx], [self.xy, self.yy], [self.xz, self.yz, self.zz]]
+
+    def scaled(self, factor: Tensor) -> Symmetric3:
+        """The product with a number, plus a multiple of the identity that is above the rounding of the entries."""
+        xx, xy, xz, yy, yz, zz = (factor * x for x in self)
+        more = 2.0 * _ROUNDING * torch.finfo(xx.dtype).eps * (xx + yy + zz).detach()
+        return Symmetric3(xx + more, xy, xz, yy + more, yz, zz + more)
+
+    def times(self, vector: Sequence[Tensor]) -> list[Tensor]:
+        """The product with a vector of three entries."""
+        a, b, c = vector
+        rows = (self.xx, self.xy, self.xz), (self.xy, self.yy, self.yz), (self.xz, self.yz, self.zz)
+        return [torch.addcmul(torch.addcmul(i * a, j, b), k, c) for i, j, k in rows]
+
+
+def _mean(matrix: Tensor, i: int, j: int) -> Tensor:
+    return 0.5 * (matrix[..., i, j] + matrix[..., j, i])
+
+
+def are_semi_definite(matrix: Symmetric2 | Symmetric3) -> Tensor:
+    """Whether matrices are finite and positive semi-definite up to rounding, bool of the entries' shape.
+
+    Example:
+        >>> are_semi_definite(Symmetric2(torch.tensor([1.0, 1.0, 0.0]), torch.tensor([1.0, 2.0, 0.0]), torch.ones(3)))
+        tensor([ True, False,  True])
+    """
+    trace = sum(x.detach() for x in matrix.diagonal)
+    assert isinstance(trace, Tensor)
+    limits = torch.finfo(trace.dtype)
+    scale = torch.where(trace > 0, trace, 1.0).reciprocal()
+    rows = [[x.detach() * scale for x in row] for row in matrix.rows]
+    for row in rows:
+        row[-1] = row[-1] + _ROUNDING * limits.eps
+    good = trace < limits.max**0.25  # products stay finite
+
+    def inverse(k: int, pivot: Tensor) -> Tensor:
+        nonlocal good
+        good = good & (pivot > 0)  # NaN compares false
+        return torch.where(pivot > 0, pivot, 1.0).reciprocal()
+
+    factorise(rows, [trace] * len(rows), inverse)
+    return good
+
+
+def equivalent_sigma(matrix: Symmetric2 | Symmetric3) -> Tensor:
+    """The standard deviation of isotropic noise of the same trace; NaN where the trace is not a sound number."""
+    entries = matrix.diagonal
+    variance = torch.stack(entries).mean(0)
+    positive = (variance > 0) & (variance < torch.inf)  # at 0 the root has an infinite gradient
+    sigma = torch.where(positive, variance, 1.0).sqrt()
+    return torch.where(positive, sigma, torch.where(variance == 0, 0.0, torch.nan))
