@@ -243,8 +243,8 @@ class RANSAC(Configured):
         # Every number of inliers from 4 to all pairs is another test of the same pose.
         tests = found.poses * (counts - MIN_PAIRS).clamp(min=1)
         alarms = log_false_alarms(tests, inliers, counts, chance)
-        limits = thresholds.img, thresholds.world
-        noise = Noise(*(x[:, None].expand_as(corr.weights) / EVIDENT for x in limits))
+        img, world = (x[:, None].expand_as(corr.weights) for x in (thresholds.img, thresholds.world))
+        noise = Noise(img / EVIDENT, world / EVIDENT)
         chances = probability(alarms, rotation_sigma(projection, corr._replace(noise=noise), judged)).to(corr.weights)
         ok = is_believed(alarms, chances) | ((inliers == MIN_PAIRS) & (counts == MIN_PAIRS))
         return Belief(chances, ok & found.loss.isfinite())
