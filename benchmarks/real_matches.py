@@ -6,7 +6,10 @@ others are the map: SIFT keypoints (OpenCV) with points triangulated from the im
 query against one image of the map: each keypoint of the query is matched to its nearest neighbour (kind 1), or only
 where Lowe's ratio test accepts it (kind 0). The reference pose is the model's.
 
-``measure`` solves the problems of such files with solvers by name, all in turns in the same run on one thread.
+``measure`` solves the problems of such files with solvers by name, all in turns in the same run on one thread. A name
+with ``+ratio`` at the end gets 1 - ratio as the confidence of each pair, one with ``+sigma`` gets sigmas of 1 px and 0.
+``--pictures`` draws failures of the first solver: of each scene the far-off pose with the most inliers under the
+reference pose, and of these the three with the most.
 """
 
 from __future__ import annotations
@@ -30,8 +33,10 @@ from kornia_pnpnet.core.files import read_npz
 from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.data.colmap import _find_model
 from kornia_pnpnet.evaluation.bounds import Bound
+from kornia_pnpnet.evaluation.figures.style import BLUE, GREY, ORANGE, WIDTH, make_figure, save
 from kornia_pnpnet.evaluation.named_solvers import load_solver
 from kornia_pnpnet.evaluation.results import save_results
+from kornia_pnpnet.metrics import reliability
 from kornia_pnpnet.types import PnPResult, Pose
 from kornia_pnpnet.types import Problems as SolverProblems
 
@@ -56,8 +61,12 @@ EPIPOLAR_PX, TRIANGULATION_PX, MIN_ANGLE = 2.0, 2.0, 1.5
 # An image of the map can be matched to a query when this share of its points, and at least this number of them, lies
 # inside the query.
 MIN_OVERLAP, MIN_POINTS = 0.25, 30
-# A solver whose name ends with this gets 1 - ratio as the confidence of each pair.
-CONFIDENCE = "+ratio"
+# What a solver is told whose name ends with this: 1 - ratio as the confidence of each pair, or sigmas.
+CONFIDENCE, SIGMAS = "+ratio", "+sigma"
+TOLD_SIGMAS = {"img_sigma": 1.0, "world_sigma": 0.0}
+# Limits of the numbers of pairs by which results are grouped.
+PAIRS = (0, 25, 50, 100, 200, 400, 501)
+PICTURES = 3
 FIELDS = ("world", "pixels", "ratio", "mask", "K", "R", "t", "kind", "error_px")
 
 
@@ -117,6 +126,16 @@ class Problems(NamedTuple):
         """Median depth of the inliers, shape (P,); NaN without an inlier."""
         depth = (self.world @ self.rotation.mT + self.translation[:, None])[..., 2]
         return depth.where(self.inliers, torch.nan).nanmedian(1).values
+
+
+class Solved(NamedTuple):
+    """What a solver found for all problems."""
+
+    rotation: Tensor  # (P, 3, 3)
+    translation: Tensor  # (P, 3)
+    ok: Tensor  # (P,)
+    milliseconds: Tensor  # (P,) of the processor, the same for all problems of a batch
+    probability: Tensor  # (P,) NaN where the solver has none
 
 
 # --- Problems of a scene ----------------------------------------------------------------------------------------------
@@ -383,24 +402,18 @@ def call(solver: nn.Module, spec: str, given: SolverProblems, mask: Tensor, rati
     """Solve a batch; a bound sees the reference poses."""
     if isinstance(solver, Bound):
         return solver.solve_with_truth(given)
-    confidence = {"confidence": 1 - ratio} if spec.endswith(CONFIDENCE) else {}
-    return solver(given.world_points, given.img_points, given.intrinsics, mask=mask, **confidence)
+    told: dict[str, Any] = {"confidence": 1 - ratio} if CONFIDENCE in spec else {}
+    told |= TOLD_SIGMAS if SIGMAS in spec else {}
+    return solver(given.world_points, given.img_points, given.intrinsics, mask=mask, **told)
 
 
 @torch.no_grad()
-def solve(
-    solvers: Mapping[str, nn.Module], problems: Problems, dtype: torch.dtype
-) -> dict[str, tuple[Tensor, Tensor, Tensor, Tensor]]:
-    """Solve all problems that count with all solvers, which take turns on each batch.
-
-    Returns:
-        By solver: rotations, translations, ``ok``, and the milliseconds of the processor for each problem, which are
-        the same for all problems of a batch.
-    """
+def solve(solvers: Mapping[str, nn.Module], problems: Problems, dtype: torch.dtype) -> dict[str, Solved]:
+    """Solve all problems that count with all solvers, which take turns on each batch."""
     found = {}
     for spec in solvers:
-        empty = torch.zeros_like(problems.rotation), torch.zeros_like(problems.translation)
-        found[spec] = (*empty, torch.zeros_like(problems.counts), torch.zeros_like(problems.kind))
+        zeros = [torch.zeros_like(x) for x in (problems.rotation, problems.translation, problems.counts)]
+        found[spec] = Solved(*zeros, *torch.full((2, len(problems.kind)), torch.nan, dtype=torch.float64))
     parts = batches(problems)
     for number, at in enumerate(parts):
         given, ratio, origin = batch(problems, at, dtype)
@@ -411,11 +424,13 @@ def solve(
             start = time.process_time()
             result = call(solver, spec, given, mask, ratio)
             milliseconds = 1e3 * (time.process_time() - start) / len(at)
-            rotation, translation, ok, times = found[spec]
-            rotation[at] = result.rotation.double()
-            translation[at] = result.translation.double() - (rotation[at] @ origin[..., None])[..., 0]
-            ok[at] = result.ok
-            times[at] = milliseconds
+            one = found[spec]
+            one.rotation[at] = result.rotation.double()
+            one.translation[at] = result.translation.double() - (one.rotation[at] @ origin[..., None])[..., 0]
+            one.ok[at] = result.ok
+            one.milliseconds[at] = milliseconds
+            if result.probability is not None:
+                one.probability[at] = result.probability.double()
     return found
 
 
@@ -437,9 +452,17 @@ def groups(problems: Problems) -> dict[tuple[str, str], Tensor]:
         found[title, "all"] = chosen
         for low, high in itertools.pairwise(SHARES):
             found[title, share_title(low, high)] = chosen & (share >= low) & (share < high)
+        count = problems.mask.sum(1)
+        for least, most in itertools.pairwise(PAIRS):
+            found[title, pairs_title(least, most)] = chosen & (count >= least) & (count < most)
         for scene in dict.fromkeys(problems.scene):
             found[title, scene] = chosen & torch.tensor([name == scene for name in problems.scene])
     return found
+
+
+def pairs_title(least: int, most: int) -> str:
+    """Title of a group of numbers of pairs."""
+    return f"{least}–{most - 1} pairs"
 
 
 def share_title(low: float, high: float) -> str:
@@ -452,38 +475,111 @@ def rate(values: Tensor) -> float | None:
     return float(values.double().mean()) if len(values) else None
 
 
-def measure(paths: Sequence[Path], specs: Sequence[str], dtype: torch.dtype) -> dict[str, Any]:
+def measure(
+    paths: Sequence[Path], specs: Sequence[str], dtype: torch.dtype, split: str, pictures: Path | None = None
+) -> dict[str, Any]:
     """Solve the problems of the files.
 
     Args:
         paths: files of :func:`make`.
-        specs: solvers and bounds as for :func:`load_solver`, with :data:`CONFIDENCE` at the end to pass ``1 - ratio``.
+        specs: solvers and bounds as for :func:`load_solver`, with :data:`CONFIDENCE` or :data:`SIGMAS` at the end.
         dtype: dtype that the solvers get.
+        split: whether the scenes were seen while choosing, in words.
+        pictures: folder for pictures of failures.
 
     Returns:
-        ``environment``, ``settings``, ``load_average`` (before and after), ``counts`` and ``rows``: one for each
-        solver, kind and group.
+        ``environment``, ``settings``, ``load_average`` (before and after), ``counts``, ``rows`` (one for each solver,
+        kind and group), ``reliability`` by solver, and ``failures`` in the pictures.
     """
     before = load()
     problems = read(paths)
-    solvers = {spec: load_solver(spec.removesuffix(CONFIDENCE)).to(dtype) for spec in specs}
+    solvers = {spec: load_solver(spec.partition("+")[0]).to(dtype) for spec in specs}
     with threads():
         solved = solve(solvers, problems, dtype)
     chosen = groups(problems)
     rows = []
-    for spec, (rotation, translation, ok, times) in solved.items():
-        angle, distance = pose_errors(problems, rotation, translation)
-        right = (angle < RIGHT[0]) & (distance < RIGHT[1])
-        far = (angle > FAR[0]) | (distance > FAR[1])
+    curves: dict[str, Any] = {}
+    failures: list[dict[str, Any]] = []
+    for spec, one in solved.items():
+        right, far = judge(problems, one)
+        told_chance = problems.counts & one.probability.isfinite()
+        if told_chance.any():
+            curve = reliability(one.probability[told_chance], ~far[told_chance])._asdict()
+            curves[spec] = {name: values.nan_to_num(0.0).tolist() for name, values in curve.items()}
         for (kind, group), at in chosen.items():
             rates = {"success": rate(right[at]), "far": rate(far[at])}
-            told = {"ok_of_right": rate(ok[at & right]), "ok_of_far": rate(ok[at & far])}
+            told = {"ok_of_right": rate(one.ok[at & right]), "ok_of_far": rate(one.ok[at & far])}
             row = {"solver": spec, "kind": kind, "group": group, "count": int(at.sum()), **rates, **told}
-            rows.append({**row, "ms_per_problem": float(times[at].mean()) if at.any() else None})
+            rows.append({**row, "ms_per_problem": float(one.milliseconds[at].mean()) if at.any() else None})
+        if pictures is not None and not failures:
+            failures = [draw_failure(problems, one, at, pictures) for at in worst_failures(problems, far)]
     limits = {"inlier_px": INLIER_PX, "min_inliers": MIN_INLIERS, "right": RIGHT, "far": FAR}
-    settings = {"files": [path.name for path in paths], "solvers": list(specs), "dtype": str(dtype), **limits}
+    settings: dict[str, Any] = {
+        "files": [path.name for path in paths],
+        "split": split,
+        "solvers": list(specs),
+        "dtype": str(dtype),
+    }
+    settings |= {"shares": SHARES, "pairs": PAIRS, "told": TOLD_SIGMAS, **limits}
     made = {"environment": environment(), "settings": settings, "load_average": [before, load()]}
-    return {**made, "counts": describe(problems), "rows": rows}
+    found = {"counts": describe(problems), "rows": rows, "reliability": curves, "failures": failures}
+    return {**made, **found}
+
+
+def judge(problems: Problems, solved: Solved) -> tuple[Tensor, Tensor]:
+    """Which poses are right, and which are far off, bool (P,)."""
+    angle, distance = pose_errors(problems, solved.rotation, solved.translation)
+    return (angle < RIGHT[0]) & (distance < RIGHT[1]), (angle > FAR[0]) | (distance > FAR[1])
+
+
+def worst_failures(problems: Problems, far: Tensor) -> list[int]:
+    """Of each scene the far-off pose with the most inliers under the reference pose, the most first."""
+    inliers = torch.where(problems.counts & far, problems.inliers.sum(1), -1)
+    best: dict[str, int] = {}
+    for at in inliers.argsort(descending=True, stable=True).tolist():
+        if inliers[at] >= 0:
+            best.setdefault(problems.scene[at], at)
+    return sorted(best.values(), key=lambda at: -int(inliers[at]))[:PICTURES]
+
+
+def draw_failure(problems: Problems, solved: Solved, at: int, folder: Path) -> dict[str, Any]:
+    """Draw the pairs of a problem under the reference pose and under a wrong pose, and tell how many fit each.
+
+    The picture has pixels and projections, no photograph.
+    """
+    mask = problems.mask[at]
+    world, pixels = problems.world[at][mask], problems.pixels[at][mask]
+    poses = {
+        "reference pose": (problems.rotation[at], problems.translation[at]),
+        "pose that was found": (solved.rotation[at], solved.translation[at]),
+    }
+    figure = make_figure(WIDTH, 3.1)
+    panels, fits = figure.subplots(1, 2, sharex=True, sharey=True), []
+    for axes, (title, (rotation, translation)) in zip(panels, poses.items(), strict=True):
+        cam = world @ rotation.T + translation
+        image = cam @ problems.intrinsics[at].T
+        seen = image[:, :2] / torch.where(cam[:, 2:] > 0, cam[:, 2:], torch.nan)
+        fit = (seen - pixels).norm(dim=1) < INLIER_PX
+        fits.append(fit)
+        axes.plot(*pixels[~fit].T, ".", color=GREY, markersize=2.5, label="pixels of other pairs")
+        axes.plot(*pixels[fit].T, "o", color=BLUE, markersize=3.5, label=f"pixels within {INLIER_PX:g} px")
+        axes.plot(*seen[fit].T, "+", color=ORANGE, markersize=6, label="their projections")
+        axes.set(title=f"{title}: {int(fit.sum())} of {len(fit)}", aspect="equal")
+    axes.invert_yaxis()
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    name = f"real_failure_{problems.scene[at]}.png"
+    save(figure, folder / name)
+    right, wrong = fits
+    spread = [float(pixels[fit].std(0).norm()) if fit.sum() > 1 else 0.0 for fit in (torch.ones_like(right), wrong)]
+    points = len(torch.unique(world[wrong], dim=0))
+    numbers = {
+        "pairs": len(right),
+        "right": int(right.sum()),
+        "found": int(wrong.sum()),
+        "both": int((right & wrong).sum()),
+    }
+    told = {"ok": bool(solved.ok[at]), "points": points, "spread": spread[1] / spread[0]}
+    return {"picture": name, "scene": problems.scene[at], "kind": KINDS[int(problems.kind[at])], **numbers, **told}
 
 
 def describe(problems: Problems) -> list[dict[str, Any]]:
@@ -566,7 +662,13 @@ def make_parser() -> argparse.ArgumentParser:
     making.add_argument("--seed", type=int, default=0, help="seed of the subsets of pairs")
     measuring = commands.add_parser("measure", help="solve problems")
     measuring.add_argument("problems", type=Path, nargs="+", help="files of `make`")
-    measuring.add_argument("--solvers", nargs="+", required=True, help=f"names; {CONFIDENCE} at the end: confidences")
+    measuring.add_argument(
+        "--solvers", nargs="+", required=True, help=f"names, with {CONFIDENCE} or {SIGMAS} at the end"
+    )
+    measuring.add_argument(
+        "--split", default="", help="whether the scenes were seen while choosing, for the results file"
+    )
+    measuring.add_argument("--pictures", type=Path, help="folder for pictures of failures of the first solver")
     measuring.add_argument("--out", type=Path, help="the results file (.json)")
     measuring.add_argument("--double", action="store_true", help="give the solvers float64")
     counting = commands.add_parser("count", help="number of problems by share of outliers; solves nothing")
@@ -586,7 +688,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     else:
         dtype = torch.float64 if options["double"] else torch.float32
         try:
-            results = measure(options["problems"], options["solvers"], dtype)
+            told = options["split"], options["pictures"]
+            results = measure(options["problems"], options["solvers"], dtype, *told)
         except BaseError as error:
             parser.error(str(error))
         if options["out"]:

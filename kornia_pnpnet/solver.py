@@ -332,8 +332,6 @@ class PnPNet(nn.Module):
         status = torch.where(ok, Status.SOLVED.value, torch.where(finite, status, Status.DEGENERATE.value))
         # ONNX Runtime chooses among int64, not among int8.
         status = torch.where(frame.valid, status, frame.status).to(torch.int8)
-        chances = guess.probability if refined.probability is None else refined.probability
-        probability = None if chances is None else torch.where(finite, chances, 0.0)
         live = finite if always else ok
         rotation, translation = _gate_pose(pose, live, finite)
         return PnPResult(
@@ -344,7 +342,7 @@ class PnPNet(nn.Module):
             ok,
             _gate_pose(first, first_ok, first_ok),
             status,
-            probability,
+            torch.where(finite, refined.probability, 0.0),
         )
 
     # -- weights on disk ---------------------------------------------------------------------------------------------

@@ -227,8 +227,6 @@ class Guess(NamedTuple):
         noise: noise of each pair in the units of the correspondences, where unknown the initialiser's estimate;
             residuals then count in standard deviations. ``None``: the initialiser does not estimate noise. It has no
             covariances: the refinement takes those of the correspondences.
-        probability: probability that the pose is not far off, shape :math:`(B,)`; ``None``: the initialiser does not
-            estimate it.
     """
 
     pose: Pose
@@ -236,7 +234,6 @@ class Guess(NamedTuple):
     ok: Tensor | None = None
     others: Pose | None = None
     noise: Noise | None = None
-    probability: Tensor | None = None
 
     @property
     def poses(self) -> list[Pose]:
@@ -266,8 +263,7 @@ class Refinement(NamedTuple):
         cost: mean robust loss of the pairs at that pose, shape :math:`(B,)`.
         ok: whether the pose is to be believed, bool, shape :math:`(B,)`.
         in_front: whether at least three pairs with a weight are in front of the camera, bool, shape :math:`(B,)`.
-        probability: probability that the pose is not far off, NaN where the noise is unknown, shape :math:`(B,)`;
-            ``None``: unknown for all problems.
+        probability: probability that the pose is not far off, shape :math:`(B,)`.
     """
 
     pose: Pose
@@ -275,7 +271,7 @@ class Refinement(NamedTuple):
     cost: Tensor
     ok: Tensor
     in_front: Tensor
-    probability: Tensor | None = None
+    probability: Tensor
 
 
 class PnPResult(NamedTuple):
@@ -295,8 +291,8 @@ class PnPResult(NamedTuple):
             this package sets it.
         probability: estimated probability that the pose is not far off, which is within 10 degrees and 30 % of the
             distance of the points, shape :math:`(B,)`, without gradient. How accurate it is beyond that,
-            :func:`~kornia_pnpnet.covariance.pose_covariance` says. NaN where the solver does not know the noise,
-            ``None`` where it knows it for no problem.
+            :func:`~kornia_pnpnet.covariance.pose_covariance` says. Where the solver neither knows nor estimates the
+            noise, it is taken from the residuals. Peers do not estimate it: theirs is 1 where ``ok``.
     """
 
     rotation: Tensor

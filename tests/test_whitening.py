@@ -110,7 +110,7 @@ def test_an_isotropic_covariance_is_a_sigma(name, make_problems):
     by_sigma, by_cov = p.img_points.clone().requires_grad_(), p.img_points.clone().requires_grad_()
     told = solver(p.world_points, by_sigma, p.intrinsics, img_sigma=sigma, world_sigma=0.0)
     same = solver(p.world_points, by_cov, p.intrinsics, img_cov=isotropic(sigma, 2), world_sigma=0.0)
-    assert told.ok.double().mean() > 0.6
+    assert told.ok.double().mean() > 0.5
     assert torch.equal(told.ok, same.ok)
     for ours, other in zip(told[:4], same[:4], strict=True):
         torch.testing.assert_close(other[told.ok], ours[told.ok], rtol=1e-6, atol=1e-7)

@@ -34,7 +34,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("step", choices=("measure", "compare", "ship", "render"))
     parser.add_argument(
-        "--only", nargs="+", default=(), choices=(*RESULTS, "honesty", "complexity"), help="for measure: these files"
+        "--only",
+        nargs="+",
+        default=(),
+        choices=(*RESULTS, "honesty", "probability", "complexity"),
+        help="for measure: these files",
     )
     scenes = HERE.parents[2] / "shared" / "data"
     parser.add_argument("--scenes", type=Path, default=scenes, help="folder of the scenes (default: %(default)s)")

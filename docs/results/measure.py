@@ -348,7 +348,7 @@ def measure(scenes: Path, synthetic_count: int, real_count: int, only: Sequence[
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     counts = Counts(scenes, synthetic_count, real_count)
-    wanted = set(only or (*RESULTS, "honesty", "complexity"))
+    wanted = set(only or (*RESULTS, "honesty", "probability", "complexity"))
     if wanted & {"paper", "gaussian_pose", "against_n"}:
         measure_protocol(counts, wanted)
     if "crowd" in wanted:
@@ -365,6 +365,10 @@ def measure(scenes: Path, synthetic_count: int, real_count: int, only: Sequence[
         measure_set_told(counts)
     if "honesty" in wanted:
         measure_honesty(synthetic_count // 2)
+    if "probability" in wanted:
+        from measure_probability import measure_probability  # needs hydra
+
+        write_json(HERE / "probability.json", measure_probability(SEED_TUNE, SEED_REPORT + 60))
     if "complexity" in wanted:
         write_json(HERE / "complexity.json", complexity_results())
 

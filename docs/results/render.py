@@ -12,6 +12,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from measure import ANY, CHI_SQUARE_95, HERE, OURS, PAPER, PEERS, RESULTS, ROBUST
 from overview_picture import OverviewRow, plot_overview
+from real_matches_picture import find_rows, plot_real_matches
 
 from kornia_pnpnet import PnPNet
 from kornia_pnpnet.core.tables import markdown_table
@@ -21,7 +22,18 @@ from kornia_pnpnet.evaluation.results import format_table, load_results
 from kornia_pnpnet.metrics import SuccessRate
 from kornia_pnpnet.pretrained import WEIGHTS_FOLDER, shipped_weights
 
-__all__ = ["Rates", "ablation", "claim", "compared", "overview", "page", "render", "sweep", "with_block"]
+__all__ = [
+    "Rates",
+    "ablation",
+    "claim",
+    "compared",
+    "overview",
+    "page",
+    "real_matches",
+    "render",
+    "sweep",
+    "with_block",
+]
 
 REPOSITORY = HERE.parents[1]
 EXPERIMENTS = REPOSITORY / "conf" / "experiment"
@@ -277,6 +289,83 @@ def page(
     )
 
 
+def real_matches(results: Mapping[str, Any]) -> str:
+    """The page on real matches as Markdown.
+
+    Args:
+        results: what ``benchmarks/real_matches.py measure`` wrote.
+    """
+    settings = results["settings"]
+    kinds = list(dict.fromkeys(row["kind"] for row in results["rows"]))
+    rows = {kind: find_rows(results, kind) for kind in kinds}
+    groups = ["all", *(f"{100 * a:.0f}–{100 * b:.0f} %" for a, b in pairwise(settings["shares"]))]
+
+    def number(value: float | None, factor: float = 100.0) -> str:
+        return "–" if value is None else f"{factor * value:.{1 if factor > 1 else 2}f}"
+
+    tables = {}
+    for kind, found in rows.items():
+        counts = [found[settings["solvers"][0]][group]["count"] for group in groups]
+        header = [f"{kind}: right (%)", "ms", *(f"{g} ({n})" for g, n in zip(groups, counts, strict=True))]
+        header += ["ok of right", "ok of far off"]
+        lines = [
+            [
+                f"`{name}`",
+                number(one["all"]["ms_per_problem"], 1.0),
+                *(number(one[group]["success"]) for group in groups),
+                *(number(one["all"][key]) for key in ("ok_of_right", "ok_of_far")),
+            ]
+            for name, one in found.items()
+        ]
+        tables[kind] = markdown_table(header, lines)
+
+    def total(name: str, key: str) -> float:
+        every = [rows[kind][name]["all"] for kind in kinds]
+        return float(sum(row["count"] * row[key] for row in every) / sum(row["count"] for row in every))
+
+    peers = [name for name in settings["solvers"] if name.startswith("poselib")]
+    peer = max(peers, key=lambda name: total(name, "success"))
+    beside = [
+        (name, 100 * total(name, "success"), 100 * (total(name, "success") - total(peer, "success")), times)
+        for name in settings["solvers"]
+        for times in [total(name, "ms_per_problem") / total(peer, "ms_per_problem")]
+    ]
+    first = settings["solvers"][0]
+    curve = results["reliability"][first]
+    deciles = [
+        (i / 10, (i + 1) / 10, int(count), predicted, observed)
+        for i, (count, predicted, observed) in enumerate(
+            zip(*(curve[key] for key in ("number", "predicted", "observed")), strict=True)
+        )
+        if count
+    ]
+    known = {row["scene"]: row for row in read_summary(HERE / "real_matches_scenes.csv")}
+    lines = []
+    for entry in results["counts"]:
+        facts = known.get(entry["scene"], {})
+        numbers = [str(entry[kind]["counted"]) for kind in kinds]
+        lines.append([entry["scene"], *(facts.get(key, "–") for key in ("shows", "source", "licence")), *numbers])
+    scenes = markdown_table(
+        ["Scene", "shows", "public repository", "licence", *(f"problems, {k}" for k in kinds)], lines
+    )
+    options: dict[str, Any] = {"trim_blocks": True, "lstrip_blocks": True, "keep_trailing_newline": True}
+    environment = Environment(loader=FileSystemLoader(HERE), undefined=StrictUndefined, autoescape=False, **options)
+    raw = rows[kinds[1]][first]["all"]
+    return environment.get_template("real_matches.md.jinja").render(
+        results=results,
+        rows=rows,
+        kinds=kinds,
+        tables=tables,
+        total=sum(rows[kind][first]["all"]["count"] for kind in kinds),
+        peer=peer,
+        beside=beside,
+        first=first,
+        far_count=round(raw["far"] * raw["count"]),
+        deciles=deciles,
+        scenes=scenes,
+    )
+
+
 def overview(results: Mapping[str, Any]) -> tuple[list[OverviewRow], str]:
     """The solvers of the README's picture, the fastest first, and the table below it.
 
@@ -330,6 +419,10 @@ def render() -> None:
     plot_reliability(HERE / "reliability.png", honest["reliability"])
     short_runs = {name: read_summary(HERE / f"{name}.csv") for name in ("ablation", "sweep")}
     (HERE / "README.md").write_text(page(results, complexity, honest, short_runs), encoding="utf-8")
+
+    found = load_results(HERE / "real_matches.json")
+    plot_real_matches(HERE / "real_matches.png", found, [x for x in found["settings"]["solvers"] if "sigma" not in x])
+    (HERE / "real_matches.md").write_text(real_matches(found), encoding="utf-8")
 
     rows, table = overview(json.loads((REPOSITORY / "benchmarks" / "solvers.json").read_text()))
     plot_overview(HERE / "overview.png", rows, outliers="0 to 3 outliers among 9 pairs")

@@ -156,6 +156,7 @@ class PeerSolver(nn.Module):
             torch.from_numpy(ok).to(world_points.device),
             Pose(back(first_rotation), back(first_translation)),
             torch.from_numpy(np.where(ok, Status.SOLVED, status).astype(np.int8)).to(world_points.device),
+            back(ok.astype(np.float64)),
         )
         return restore_leading(size, result)
 

@@ -31,7 +31,7 @@ from kornia_pnpnet.refine.step import (
     sq_standardised,
     weighted_equations,
 )
-from kornia_pnpnet.refine.verdict import believe, explains, has_enough
+from kornia_pnpnet.refine.verdict import believe, explains, has_enough, residual_noise
 from kornia_pnpnet.types import LEAST_NOISE, Correspondences, Guess, Noise, Pose, Refinement
 
 __all__ = ["BACKWARDS", "RobustWeightedLM"]
@@ -324,14 +324,13 @@ class RobustWeightedLM(Configured):
         sq_residual, noise = corrected_residuals(projection, pairs, self.kernel.weight, shape, start.outlier_area)
         weights = torch.where(projection.in_front, start.prior * self.kernel.weight(sq_residual, shape), 0.0)
         cost = self._cost(projection, start.corr, start.prior, shape)
-        probability = None
-        if start.corr.noise is None:
-            ok = explains(projection, start.corr, start.prior)
-        else:
-            probability, ok = believe(projection, start.guided._replace(noise=noise))
-            if start.noiseless is not None:
-                ok = torch.where(start.noiseless, explains(projection, start.corr, start.prior), ok)
-                probability = torch.where(start.noiseless, torch.nan, probability)
+        judged, unknown, law = start.guided, start.noiseless, "sigmas"
+        if noise is None:
+            noise, judged, law = residual_noise(projection, start.corr, start.prior), start.corr, "residuals"
+            unknown = torch.ones_like(end.solved)
+        probability, ok = believe(projection, judged._replace(noise=noise), law)
+        if unknown is not None:
+            ok = torch.where(unknown, explains(projection, start.corr, start.prior), ok)
         in_front = has_enough(projection, start.prior)
         return Refinement(end.pose, weights, cost, end.solved & ok & in_front, in_front, probability)
 

@@ -19,45 +19,47 @@ from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import Projection, normal_equations, span_a_plane
 from kornia_pnpnet.refine.step import pixel_precision
-from kornia_pnpnet.types import MIN_PAIRS, Correspondences
+from kornia_pnpnet.types import LEAST_NOISE, MIN_PAIRS, Correspondences, Noise
 
 __all__ = [
-    "MAX_ERROR",
-    "EVIDENT",
+    "LAWS",
     "LEAST_PROBABILITY",
+    "MAX_ERROR",
+    "MAX_FALSE_ALARMS",
     "Belief",
     "Judged",
     "Thresholds",
     "believe",
     "chance_of_inlier",
     "chance_of_others",
+    "clipped",
     "explains",
     "has_enough",
-    "is_believed",
     "judge",
     "log_false_alarms",
     "probability",
+    "residual_noise",
     "rotation_sigma",
 ]
 
 #: Largest standardised squared residual; points behind the camera have it.
 MAX_ERROR = 1e6
-# A pose is evident when fewer poses than this are expected to have as many inliers by chance.
-_MAX_FALSE_ALARMS = 0.01
+#: A pose is evident when fewer poses than this are expected to have as many inliers by chance.
+MAX_FALSE_ALARMS = 0.01
 #: A pose is to be believed when it is not far off with at least this probability. Of synthetic problems that the law of
-#: :func:`probability` was not fitted to, 98 % of the right poses keep it, and 9 % of the poses that are far off.
+#: :func:`probability` was not fitted to, 98 % of the right poses keep it, and 5 to 7 % of the poses that are far off.
 LEAST_PROBABILITY = 0.93
-# The law of :func:`probability`, fitted by `python docs/results/measure.py --fit-probability`: log-odds when both
-# features are 0, per unit of the logarithm of the false alarms and of the logarithm of the rotation's sigma.
-_LAW = (-3.1697, -0.15391, -1.0801)
-# The features' ranges: beyond them more evidence says nothing more.
+#: The laws of :func:`probability`: the log-odds when both numbers are 0, and their slopes by the logarithms of the
+#: false alarms and of the rotation's sigma; for noise that was told or estimated by a network, and for noise of
+#: :func:`residual_noise`. Fitted by ``python docs/results/make.py measure --only probability``.
+LAWS = {"sigmas": (-3.2501, -0.16608, -1.0784), "residuals": (0.89795, -0.27745, 0.070018)}
 _ALARMS, _LOG_SIGMA = (-20.0, 10.0), (-12.0, 2.0)
 # Pairs. The pixels of this many stand for those of all pairs in :func:`chance_of_others`.
 _MOST_OTHERS = 128
 # Pixels of other pairs near a projection. This many are left out of the count: pixels of right pairs may be close, too.
 _FEW_HITS = 4
-#: Standard deviations. Pairs further off than this are no evidence for a pose.
-EVIDENT = 3.5
+# Standard deviations. Pairs further off than this are no evidence for a pose.
+_EVIDENT = 3.5
 # Radii of the disc of the worst inlier. Nearer outliers say nothing about chance: they are pairs that are slightly off,
 # or inliers where the caller's sigmas are too small. Tuned on synthetic problems (`pnpnet-set`, seed 9101) with sigmas
 # that are half of the noise: ten radii refuse many more right poses, thirty accept more wrong ones.
@@ -121,7 +123,7 @@ class Belief(NamedTuple):
     ok: Tensor
 
 
-def believe(projection: Projection, corr: Correspondences) -> Belief:
+def believe(projection: Projection, corr: Correspondences, law: str = "sigmas") -> Belief:
     """Tell whether a pose is to be believed, when the noise is known for every pair.
 
     Its inliers must be more than chance would give it and span more than a line, and it must probably not be far off.
@@ -129,6 +131,7 @@ def believe(projection: Projection, corr: Correspondences) -> Belief:
     Args:
         projection: :func:`~kornia_pnpnet.geometry.project` of the pose.
         corr: normalised correspondences with their noise.
+        law: one of :data:`LAWS`.
 
     Returns:
         The probability and the answer, without a gradient.
@@ -137,25 +140,21 @@ def believe(projection: Projection, corr: Correspondences) -> Belief:
     assert corr.noise is not None
     precision = pixel_precision(projection, corr.noise, corr.focal) if corr.noise.covariances else None
     assert not isinstance(precision, Tensor)
-    precision = map_tensors(lambda x: x / EVIDENT**2, precision)
-    thresholds = Thresholds(EVIDENT * corr.noise.img, EVIDENT * corr.noise.world, precision)
+    precision = map_tensors(lambda x: x / _EVIDENT**2, precision)
+    thresholds = Thresholds(_EVIDENT * corr.noise.img, _EVIDENT * corr.noise.world, precision)
     judged = judge(projection, corr, thresholds)
     inliers, counts = (judged.weights > 0).sum(-1), (corr.weights > 0).sum(-1)
     triples = counts * (counts - 1) * (counts - 2) // 6  # any three pairs could have given the pose
     chance = chance_of_inlier(corr, thresholds, judged)
     chance = chance.maximum(chance_of_others(projection, corr, thresholds, judged))
     alarms = log_false_alarms(triples, inliers, counts, chance)
-    chances = probability(alarms, rotation_sigma(projection, corr, judged)).to(corr.weights)
+    chances = probability(alarms, rotation_sigma(projection, corr, judged), law).to(corr.weights)
     span = _span_a_plane(corr.world_points, judged.weights > 0)
-    return Belief(torch.where(span, chances, 0.0), span & is_believed(alarms, chances))
+    evident = (alarms < math.log(MAX_FALSE_ALARMS)) & (chances >= LEAST_PROBABILITY)
+    return Belief(torch.where(span, chances, 0.0), span & evident)
 
 
-def is_believed(log_alarms: Tensor, chances: Tensor) -> Tensor:
-    """Whether chance is no explanation, and the pose is probably not far off, bool (B,)."""
-    return (log_alarms < math.log(_MAX_FALSE_ALARMS)) & (chances >= LEAST_PROBABILITY)
-
-
-def probability(log_alarms: Tensor, sigma: Tensor) -> Tensor:
+def probability(log_alarms: Tensor, sigma: Tensor, law: str = "sigmas") -> Tensor:
     r"""Probability that a pose is not far off: within 10 degrees and 30 % of the distance of the points.
 
     A logistic law of two numbers: how unlikely the inliers are by chance, and how well they determine the rotation.
@@ -164,6 +163,7 @@ def probability(log_alarms: Tensor, sigma: Tensor) -> Tensor:
     Args:
         log_alarms: :func:`log_false_alarms`, shape :math:`(B,)`.
         sigma: :func:`rotation_sigma`, shape :math:`(B,)`.
+        law: one of :data:`LAWS`.
 
     Returns:
         In (0, 1), shape :math:`(B,)`.
@@ -172,8 +172,34 @@ def probability(log_alarms: Tensor, sigma: Tensor) -> Tensor:
         >>> probability(torch.tensor([-30.0, -30.0, 0.0]), torch.tensor([0.001, 0.3, 0.001]))
         tensor([0.9994, 0.7701, 0.9865])
     """
-    offset, by_alarms, by_sigma = _LAW
-    return torch.sigmoid(offset + by_alarms * log_alarms.clamp(*_ALARMS) + by_sigma * sigma.log().clamp(*_LOG_SIGMA))
+    alarms, log_sigma = clipped(log_alarms, sigma)
+    offset, by_alarms, by_sigma = LAWS[law]
+    return torch.sigmoid(offset + by_alarms * alarms + by_sigma * log_sigma)
+
+
+def clipped(log_alarms: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
+    """The two numbers of :data:`LAWS`: beyond their ranges more evidence says nothing more."""
+    return log_alarms.clamp(*_ALARMS), sigma.log().clamp(*_LOG_SIGMA)
+
+
+def residual_noise(projection: Projection, corr: Correspondences, weights: Tensor) -> Noise:
+    """The noise of the pixels that the median residual shows, for a :func:`probability` where the noise is unknown.
+
+    Args:
+        projection: :func:`~kornia_pnpnet.geometry.project` of the pose.
+        corr: normalised correspondences.
+        weights: weight of each pair before its residual was looked at, :math:`(B, N)`.
+
+    Returns:
+        The same sigma for all pairs of a problem.
+    """
+    there = (weights > 0) & projection.in_front
+    count = there.sum(-1, keepdim=True)
+    ascending = in_order(torch.where(there, projection.sq_residual, torch.inf).detach().mT[None])[0].mT
+    middle = ((count + MIN_PAIRS) // 2).minimum(count - 1).clamp(min=0)  # any pose fits three pairs
+    variance = ascending.gather(-1, middle) / (2.0 * math.log(2.0))
+    sigma = variance.clamp(max=corr.focal.square()).sqrt().maximum(LEAST_NOISE * corr.focal)
+    return Noise(sigma.expand_as(weights), torch.zeros_like(weights))
 
 
 def rotation_sigma(projection: Projection, corr: Correspondences, judged: Judged) -> Tensor:

@@ -29,19 +29,15 @@ from kornia_pnpnet.init.ransac.search import (
     take,
 )
 from kornia_pnpnet.refine.verdict import (
-    EVIDENT,
-    Belief,
+    MAX_FALSE_ALARMS,
     Judged,
     Thresholds,
     chance_of_inlier,
     chance_of_others,
-    is_believed,
     judge,
     log_false_alarms,
-    probability,
-    rotation_sigma,
 )
-from kornia_pnpnet.types import MIN_PAIRS, Correspondences, Guess, Noise, Pose
+from kornia_pnpnet.types import MIN_PAIRS, Correspondences, Guess, Pose
 
 __all__ = ["FURTHER", "RANSAC", "search_on"]
 
@@ -57,7 +53,7 @@ _INLIER = 10.0
 _NEAREST = 0.5
 # A pair whose weight or confidence is 0 is drawn this often, relative to a pair where it is 1. Networks mislead more
 # often than callers: where repeated structure or crowds agree, for example.
-_DOUBT, _LEAST_TRUST = 0.5, 0.05
+_DOUBT, _LEAST_TRUST = 0.8, 0.05
 
 
 class RANSAC(Configured):
@@ -75,8 +71,7 @@ class RANSAC(Configured):
     :math:`f/z` times as much. Least squares weigh an inlier by the inverse of the right hand side.
 
     The guess is ``ok`` when fewer than 0.01 poses with as many inliers are expected by chance, from pairs without any
-    pose behind them (see :func:`~kornia_pnpnet.refine.verdict.log_false_alarms`), and the pose is probably not far off
-    (:func:`~kornia_pnpnet.refine.verdict.probability`). A problem of only three pairs is
+    pose behind them (see :func:`~kornia_pnpnet.refine.verdict.log_false_alarms`). A problem of only three pairs is
     ``ok`` when it has a pose: three pairs hold no evidence.
 
     Where the caller gave a confidence for each pair, samples hold pairs in proportion to it, and fewer samples suffice
@@ -200,10 +195,9 @@ class RANSAC(Configured):
             found = Search(self.plan, detached, thresholds, _trusted(detached.confidence)).run(given)
         pose, judged = self._refine(corr, found.pose, thresholds)
         with torch.no_grad():
-            believed = self._believe(found, detached, thresholds, judged, project(pose, problems_last(detached)))
+            ok = self._is_evident(found, detached, thresholds, judged, project(pose, problems_last(detached)))
         offset = (pose.rotation @ centre[..., None])[..., 0]
-        moved = Pose(pose.rotation, pose.translation - offset)
-        return Guess(moved, judged.weights, believed.ok, probability=believed.probability)
+        return Guess(Pose(pose.rotation, pose.translation - offset), judged.weights, ok)
 
     def _thresholds(self, corr: Correspondences) -> Thresholds:
         """The thresholds in units of the correspondences, (B,) each."""
@@ -233,21 +227,17 @@ class RANSAC(Configured):
         pose, judged = map_tensors(lambda *parts: torch.cat(parts), *results)
         return map_tensors(torch.Tensor.contiguous, pose), judged
 
-    def _believe(
+    def _is_evident(
         self, found: Found, corr: Correspondences, thresholds: Thresholds, judged: Judged, projection: Projection
-    ) -> Belief:
-        """Whether a pose is to be believed; the noise is such that the thresholds are the limits of evidence."""
+    ) -> Tensor:
+        """Whether a pose has more inliers than chance would give it, (B,)."""
         inliers, counts = (judged.weights > 0).sum(-1), (corr.weights > 0).sum(-1)
         chance = chance_of_inlier(corr, thresholds, judged)
         chance = chance.maximum(chance_of_others(projection, corr, thresholds, judged))
         # Every number of inliers from 4 to all pairs is another test of the same pose.
         tests = found.poses * (counts - MIN_PAIRS).clamp(min=1)
-        alarms = log_false_alarms(tests, inliers, counts, chance)
-        img, world = (x[:, None].expand_as(corr.weights) for x in (thresholds.img, thresholds.world))
-        noise = Noise(img / EVIDENT, world / EVIDENT)
-        chances = probability(alarms, rotation_sigma(projection, corr._replace(noise=noise), judged)).to(corr.weights)
-        ok = is_believed(alarms, chances) | ((inliers == MIN_PAIRS) & (counts == MIN_PAIRS))
-        return Belief(chances, ok & found.loss.isfinite())
+        rare = log_false_alarms(tests, inliers, counts, chance) < math.log(MAX_FALSE_ALARMS)
+        return found.loss.isfinite() & (rare | ((inliers == MIN_PAIRS) & (counts == MIN_PAIRS)))
 
 
 def _robust(judged: Judged, inliers: Tensor) -> Tensor:
@@ -279,11 +269,11 @@ def _trusted(confidence: Tensor | None) -> Tensor | None:
 def search_on(corr: Correspondences, guess: Guess, plan: Plan = FURTHER) -> Guess:
     r"""Go on searching where the poses of a guess do not suffice, with samples of likely inliers.
 
-    Samples hold pairs in proportion to a half plus half the weight of the guess, times the caller's confidence: weights
-    that mislead then cost some samples, but no pose. An inlier is within ten standard deviations of the guess' noise
-    (its mean over the pairs; of noise with covariances the standard deviation of isotropic noise of the same trace).
-    The limit is that of a point as far away as the centre of the world in the guess, for all poses: with a limit by
-    each pose's own depths, a pose close to the points would have most inliers.
+    Samples hold pairs in proportion to 0.8 plus 0.2 times the weight of the guess, times the caller's confidence:
+    weights that mislead then cost some samples, but no pose. An inlier is within ten standard deviations of the guess'
+    noise (its mean over the pairs; of noise with covariances the standard deviation of isotropic noise of the same
+    trace). The limit is that of a point as far away as the centre of the world in the guess, for all poses: with a
+    limit by each pose's own depths, a pose close to the points would have most inliers.
 
     First the best pose of the guess is improved on its inliers. A problem is searched only when, by the number of these
     inliers, it needs more than ``plan.min_samples`` samples to reach ``plan.confidence``. Problems that are done leave

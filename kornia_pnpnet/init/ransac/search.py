@@ -104,7 +104,7 @@ class Search:
         self.low = map_tensors(lambda x: x.to(_DTYPE), (corr, thresholds))
         self.scene = Scene.make(corr, thresholds, _DTYPE)
         self.chances = chances
-        self.samples = self._samples(chances)
+        self.samples = self.plain = self._samples(chances)
         # The numbers of a pair side by side, so that a sample is gathered pair by pair.
         self.pairs = torch.cat((corr.world_points, corr.img_points, corr.weights[..., None]), -1).flatten(0, 1)
 
@@ -128,7 +128,7 @@ class Search:
         def expect(at: Tensor) -> None:
             corr, thresholds = take(self.low, at)
             judged = judge(project(_pose(matrix[at]), corr), corr, thresholds)
-            needed[at] = self.samples.needed(at, judged.weights > 0, plan.confidence)
+            needed[at] = self._needed(at, judged.weights > 0)
 
         def improve(at: Tensor, losses: Tensor, matrices: Tensor) -> None:
             size = max(1, PAIRS_PER_SAMPLE * plan.chunk_size // (count * losses.shape[1]))
@@ -167,6 +167,16 @@ class Search:
         chances = torch.ones_like(corr.weights) if self.chances is None else self.chances.clone()
         chances[problems] *= (_LEAST_AGREEMENT + agreement) ** _AGREEMENT_POWER
         self.samples = self._samples(chances)
+
+    def _needed(self, problems: Tensor, inliers: Tensor) -> Tensor:
+        """Number of samples to draw, (P,); of the numbers with and without agreement the geometric mean.
+
+        Neighbours also agree where structure repeats: such a wrong pose must not end the search too early.
+        """
+        needed = self.samples.needed(problems, inliers, self.plan.confidence)
+        if self.samples is self.plain:
+            return needed
+        return (needed * self.plain.needed(problems, inliers, self.plan.confidence)).sqrt()
 
     def _samples(self, chances: Tensor | None) -> Samples:
         plan = self.plan
