@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import math
+from pathlib import Path
 
 import pytest
 import torch
 
-from kornia_pnpnet import Correspondences
+from kornia_pnpnet import Correspondences, create_solver, pose_errors
+from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.geometry import project, transform
-from kornia_pnpnet.refine.verdict import MAX_ERROR, Judged, Thresholds, chance_of_inlier, judge, log_false_alarms
+from kornia_pnpnet.refine.verdict import LAWS, MAX_ERROR, Judged, Thresholds, chance_of_inlier, judge, log_false_alarms
 
 
 def test_inliers_weigh_by_the_inverse_of_their_threshold(make_problems, correspond):
@@ -79,3 +82,67 @@ def test_false_alarms_by_counting():
     for inliers, count in ((0, 0), (2, 2), (3, 3), (9, 9)):
         for chance in (0.0, 1.0):
             assert log_false_alarms(zero, zero + inliers, zero + count, torch.tensor([chance])).isfinite().all()
+
+
+# --- the probability that a pose is not far off ---------------------------------------------------------------------
+
+
+def of_solver(problems, **told):
+    return create_solver("pnpnet-set")(problems.world_points, problems.img_points, problems.intrinsics, **told)
+
+
+@pytest.mark.parametrize("told", [{}, {"img_sigma": 1.0, "world_sigma": 0.05}], ids=["found", "told"])
+def test_probability_tells_sound_problems_from_random_pixels(told):
+    sound = SyntheticProblems(n=20, batch_size=200, seed=3).batch(0)
+    result = of_solver(sound, **told)
+    assert result.probability.median() > 0.99
+    noise = sound._replace(img_points=sound.img_points.roll(1, 0))  # the pixels of another problem
+    wrong = of_solver(noise, **told)
+    # The law is that of problems most of which have a pose.
+    assert wrong.probability.median() < 0.8
+    assert not wrong.ok.double().mean() > 0.05
+    for found in (result, wrong):
+        assert ((found.probability >= 0) & (found.probability <= 1)).all()
+        assert not found.probability.requires_grad
+
+
+def test_probability_falls_with_the_noise_of_few_pairs():
+    """Of six pairs: the more noise, the wider the poses that fit."""
+    means = []
+    for sigma in (0.3, 10.0, 60.0):
+        problems = SyntheticProblems(n=6, batch_size=300, seed=4, img_sigma=sigma, world_sigma=0.0).batch(0)
+        means.append(of_solver(problems, img_sigma=sigma, world_sigma=0.0).probability.mean().item())
+    assert means[0] > 0.97
+    assert means == sorted(means, reverse=True)
+    assert means[2] < means[0] - 0.1
+
+
+def test_probability_is_observed_as_often():
+    """Problems with many outliers, by the law's own definition of far off."""
+    problems = SyntheticProblems(n=12, batch_size=1500, seed=5, outliers=OutlierMix(max_ratio=0.8)).batch(0)
+    result = of_solver(problems)
+    errors = pose_errors(result.pose, problems.pose)
+    depth = (problems.world_points @ problems.pose.rotation.mT + problems.pose.translation[:, None])[..., 2].median(1)[
+        0
+    ]
+    centres = [-(pose.rotation.mT @ pose.translation[..., None])[..., 0] for pose in (result.pose, problems.pose)]
+    near = (errors.rotation_error_deg <= 10) & ((centres[0] - centres[1]).norm(dim=-1) <= 0.3 * depth)
+    sure = result.probability > 0.9
+    assert near[sure].double().mean() > 0.9
+    assert near[~sure].double().mean() < near[sure].double().mean() - 0.2
+
+
+def test_probability_depends_on_no_unit():
+    problems = SyntheticProblems(n=12, batch_size=50, seed=6, outliers=OutlierMix(count=4), dtype=torch.float64).batch(
+        0
+    )
+    solver = create_solver("pnpnet-set").double()
+    plain = solver(*problems[:3]).probability
+    camera = torch.tensor([[3.0, 0, 7], [0, 3, -2], [0, 0, 1]]).double() @ problems.intrinsics
+    scaled = solver(1e3 * problems.world_points, 3.0 * problems.img_points + torch.tensor([7.0, -2]).double(), camera)
+    torch.testing.assert_close(scaled.probability, plain, rtol=1e-4, atol=1e-4)
+
+
+def test_laws_are_those_of_the_results_file():
+    file = Path(__file__).parents[1] / "docs" / "results" / "probability.json"
+    assert {name: list(law) for name, law in LAWS.items()} == json.loads(file.read_text())["laws"]
