@@ -10,6 +10,8 @@ where Lowe's ratio test accepts it (kind 0). The reference pose is the model's.
 with ``+ratio`` at the end gets 1 - ratio as the confidence of each pair, one with ``+sigma`` gets sigmas of 1 px and 0.
 ``--pictures`` draws failures of the first solver: of each scene the far-off pose with the most inliers under the
 reference pose, and of these the three with the most.
+
+``cost`` times solvers by share of outliers and number of pairs.
 """
 
 from __future__ import annotations
@@ -37,6 +39,7 @@ from kornia_pnpnet.evaluation.figures.style import BLUE, GREY, ORANGE, WIDTH, ma
 from kornia_pnpnet.evaluation.named_solvers import load_solver
 from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.metrics import reliability
+from kornia_pnpnet.peers.base import PeerSolver
 from kornia_pnpnet.types import PnPResult, Pose
 from kornia_pnpnet.types import Problems as SolverProblems
 
@@ -67,6 +70,8 @@ TOLD_SIGMAS = {"img_sigma": 1.0, "world_sigma": 0.0}
 # Limits of the numbers of pairs by which results are grouped.
 PAIRS = (0, 25, 50, 100, 200, 400, 501)
 PICTURES = 3
+# Problems in a batch of `cost`, and problems of a group that has a row.
+COST_BATCH, MIN_GROUP = 250, 20
 FIELDS = ("world", "pixels", "ratio", "mask", "K", "R", "t", "kind", "error_px")
 
 
@@ -399,9 +404,14 @@ def batch(problems: Problems, at: Tensor, dtype: torch.dtype) -> tuple[SolverPro
 
 
 def call(solver: nn.Module, spec: str, given: SolverProblems, mask: Tensor, ratio: Tensor) -> PnPResult:
-    """Solve a batch; a bound sees the reference poses."""
+    """Solve a batch; a bound sees the reference poses, and other libraries told the ratio get the best pairs first."""
     if isinstance(solver, Bound):
         return solver.solve_with_truth(given)
+    if CONFIDENCE in spec and isinstance(solver, PeerSolver):
+        order = ratio.argsort(dim=1, stable=True)
+        rows = torch.arange(len(order))[:, None]
+        given = given._replace(world_points=given.world_points[rows, order], img_points=given.img_points[rows, order])
+        return solver(given.world_points, given.img_points, given.intrinsics, mask=mask.gather(1, order))
     told: dict[str, Any] = {"confidence": 1 - ratio} if CONFIDENCE in spec else {}
     told |= TOLD_SIGMAS if SIGMAS in spec else {}
     return solver(given.world_points, given.img_points, given.intrinsics, mask=mask, **told)
@@ -524,6 +534,42 @@ def measure(
     made = {"environment": environment(), "settings": settings, "load_average": [before, load()]}
     found = {"counts": describe(problems), "rows": rows, "reliability": curves, "failures": failures}
     return {**made, **found}
+
+
+@torch.no_grad()
+def measure_cost(paths: Sequence[Path], specs: Sequence[str], dtype: torch.dtype) -> dict[str, Any]:
+    """Time solvers on the matches without a ratio test, apart for every share of outliers and number of pairs.
+
+    Args:
+        paths: files of :func:`make`.
+        specs: solvers as for :func:`measure`.
+        dtype: dtype that the solvers get.
+
+    Returns:
+        ``environment``, ``settings``, ``load_average`` and ``rows``: the milliseconds of a problem in a batch of a
+        group's problems, repeated in turns.
+    """
+    before, problems = load(), read(paths)
+    solvers = {spec: load_solver(spec.partition("+")[0]).to(dtype) for spec in specs}
+    by_share = [share_title(*limits) for limits in itertools.pairwise(SHARES)]
+    by_pairs = [pairs_title(*limits) for limits in itertools.pairwise(PAIRS)]
+    chosen, rows = groups(problems), []
+    with threads():
+        for group in (*by_share, *by_pairs):
+            at = chosen[KINDS[1], group].nonzero()[:, 0]
+            if len(at) < MIN_GROUP:
+                continue
+            given, ratio, _ = batch(problems, at[torch.arange(COST_BATCH) % len(at)], dtype)
+            mask = problems.mask[at[torch.arange(COST_BATCH) % len(at)]][:, : ratio.shape[1]]
+            for spec, solver in solvers.items():
+                say(f"{group}: {spec}")
+                start = time.process_time()
+                call(solver, spec, given, mask, ratio)
+                milliseconds = 1e3 * (time.process_time() - start) / COST_BATCH
+                rows.append({"solver": spec, "group": group, "ms_per_problem": milliseconds})
+    settings = {"files": [path.name for path in paths], "solvers": list(specs), "batch": COST_BATCH}
+    settings |= {"shares": SHARES, "pairs": PAIRS}
+    return {"environment": environment(), "settings": settings, "load_average": [before, load()], "rows": rows}
 
 
 def judge(problems: Problems, solved: Solved) -> tuple[Tensor, Tensor]:
@@ -671,6 +717,10 @@ def make_parser() -> argparse.ArgumentParser:
     measuring.add_argument("--pictures", type=Path, help="folder for pictures of failures of the first solver")
     measuring.add_argument("--out", type=Path, help="the results file (.json)")
     measuring.add_argument("--double", action="store_true", help="give the solvers float64")
+    timing = commands.add_parser("cost", help="time solvers on groups of problems")
+    timing.add_argument("problems", type=Path, nargs="+", help="files of `make`")
+    timing.add_argument("--solvers", nargs="+", required=True, help="names as for `measure`")
+    timing.add_argument("--out", type=Path, required=True, help="the results file (.json)")
     counting = commands.add_parser("count", help="number of problems by share of outliers; solves nothing")
     counting.add_argument("problems", type=Path, nargs="+", help="files of `make`")
     return parser
@@ -685,6 +735,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(format_counts(describe(make(**options))))
     elif command == "count":
         print(format_counts(describe(read(options["problems"]))))
+    elif command == "cost":
+        save_results(measure_cost(options["problems"], options["solvers"], torch.float32), options["out"])
     else:
         dtype = torch.float64 if options["double"] else torch.float32
         try:

@@ -10,11 +10,14 @@ import sys
 import warnings
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
 
 from kornia_pnpnet import create_solver, pose_errors
+from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 
 FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"
 SOLVERS = ("epnp", "p3p-ransac:max_samples=50", "opencv-epnp", "poselib")
@@ -401,3 +404,56 @@ def test_the_pages_are_rendered_from_their_files():
     results = json.loads((FOLDER / "solvers.json").read_text())
     assert benchmark.page(results) == (FOLDER / "solvers.md").read_text(encoding="utf-8")
     assert page.page(*page.load_parts(FOLDER)) == page.PAGE.read_text(encoding="utf-8")
+
+
+# -- real_matches.py ---------------------------------------------------------------------------------------------------
+
+
+def write_matches(path, seed):
+    """A file of ``make`` with synthetic problems: 4 outliers among 40 with the ratio test, 32 without."""
+    counts, each = (4, 32), 6
+    options = {"n": 40, "batch_size": each, "seed": seed, "world_sigma": 0.0, "dtype": torch.float64}
+    parts = [SyntheticProblems(outliers=OutlierMix(count=count), **options).batch(0) for count in counts]
+    world, pixels, intrinsics, pose, inliers = (
+        map_tensors(lambda *x: torch.cat(x), *column)
+        for column in zip(
+            *((p.world_points, p.img_points, p.intrinsics, p.pose, p.inliers) for p in parts), strict=True
+        )
+    )
+    camera = (world @ pose.rotation.mT + pose.translation[:, None]) @ intrinsics.mT
+    arrays = {"world": world, "pixels": pixels, "ratio": torch.where(inliers, 0.5, 0.9), "mask": inliers | True}
+    arrays |= {"K": intrinsics, "R": pose.rotation, "t": pose.translation}
+    arrays["error_px"] = (camera[..., :2] / camera[..., 2:] - pixels).norm(dim=-1)
+    arrays["kind"] = torch.arange(len(counts)).repeat_interleave(each)
+    np.savez_compressed(path, **{name: value.numpy() for name, value in arrays.items()})
+
+
+def test_real_matches_are_measured_and_failures_drawn(tmp_path):
+    pytest.importorskip("seaborn")
+    pytest.importorskip("poselib")
+    real_matches = importlib.import_module("real_matches")
+    for seed, name in enumerate(("yard", "room")):
+        write_matches(tmp_path / f"{name}.npz", seed)
+    files = [str(tmp_path / f"{name}.npz") for name in ("yard", "room")]
+    specs = ["p3p-ransac:max_samples=3", "p3p-ransac:threshold=8", "p3p-ransac:threshold=8+ratio", "known-inliers"]
+    specs += ["poselib:threshold=8+ratio", "pnpnet-set+sigma"]
+    out = tmp_path / "out.json"
+    real_matches.main(
+        ["measure", *files, "--out", str(out), "--split", "made up", "--pictures", str(tmp_path), "--solvers", *specs]
+    )
+    results = json.loads(out.read_text())
+    rows = {(row["solver"], row["kind"], row["group"]): row for row in results["rows"]}
+    assert results["settings"]["split"] == "made up"
+    for kind in real_matches.KINDS:
+        assert rows[specs[0], kind, "all"]["count"] == 12
+        good = [rows[spec, kind, "all"]["success"] for spec in specs[1:]]
+        assert min(good) > rows[specs[0], kind, "all"]["success"] or min(good) == 1.0
+        for spec in specs:  # the scenes are all problems
+            scenes = [rows[spec, kind, scene]["success"] for scene in ("yard", "room")]
+            assert sum(scenes) / 2 == pytest.approx(rows[spec, kind, "all"]["success"])
+    assert rows[specs[0], real_matches.KINDS[1], "all"]["far"] > 0
+    for failure in results["failures"]:
+        assert failure["right"] == 8
+        assert (tmp_path / failure["picture"]).stat().st_size > 0
+    assert {failure["scene"] for failure in results["failures"]} <= {"yard", "room"}
+    assert sum(results["reliability"][specs[1]]["number"]) == 24

@@ -284,3 +284,17 @@ def test_another_peer_only_solves_one_problem(make_problems):
     assert result.ok.tolist() == [True, False, False, True]
     assert result.translation.tolist() == [[1, 2, 3], [0, 0, 0], [0, 0, 0], [1, 2, -1e4]]
     assert result.cost[3] == 1.0  # every error is truncated at the threshold
+
+
+def test_poselib_samples_the_first_pairs_first(make_problems):
+    """With the inliers in front, a few PROSAC samples suffice where as many uniform ones do not."""
+    problems = make_problems(n=200, batch=10, outliers=190)
+    at = torch.arange(10)[:, None], (~problems.inliers).int().argsort(dim=1, stable=True)
+    ordered = problems._replace(world_points=problems.world_points[at], img_points=problems.img_points[at])
+    few = {"min_iterations": 100, "max_iterations": 100}
+    found = {
+        progressive: success_rate(success(pose_errors(solve(solver, ordered).pose, problems.pose))).rate
+        for progressive in (False, True)
+        for solver in [make("poselib", progressive_sampling=progressive, **few)]
+    }
+    assert found[True] > found[False] + 0.3

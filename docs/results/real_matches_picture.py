@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -21,10 +22,9 @@ from kornia_pnpnet.evaluation.figures.style import (
 
 __all__ = ["find_rows", "plot_real_matches"]
 
-_LEAST = 20  # problems: smaller groups are not drawn
 _LOOKS = {  # the same solver told more has the same colour and another marker and line
     "+ratio": {"marker": "s", "linestyle": "--", "markerfacecolor": "white"},
-    ":effort=adaptive": {"marker": "^"},
+    ":adaptive": {"marker": "^"},
 }
 
 
@@ -38,40 +38,43 @@ def find_rows(results: Mapping[str, Any], kind: str) -> dict[str, dict[str, Mapp
 
 
 @themed
-def plot_real_matches(path: str | Path, results: Mapping[str, Any], solvers: Sequence[str]) -> Path:
+def plot_real_matches(path: str | Path, results: Mapping[str, Any], costs: Mapping[str, Any]) -> Path:
     """Draw success and time against the share of outliers, and time against the number of pairs, of raw matches.
 
     Args:
         path: the picture to write.
         results: what ``benchmarks/real_matches.py measure`` wrote.
-        solvers: names in the order of the legend.
+        costs: what ``benchmarks/real_matches.py cost`` wrote; its solvers are drawn.
 
     Returns:
         The path.
     """
     table = find_rows(results, "no ratio test")
-    styles = solver_styles(solvers)
+    times = {(row["solver"], row["group"]): row["ms_per_problem"] for row in costs["rows"]}
+    solvers = costs["settings"]["solvers"]
+    shown = {name: re.sub(r",?\w+_iterations=\d+|:threshold=\d+|effort=", "", name) for name in solvers}
+    styles = solver_styles(shown.values())
     for name, style in styles.items():
         for part, look in _LOOKS.items():
             style |= look if part in name else {}
-    settings = results["settings"]
+    settings = costs["settings"]
     shares = [
         (f"{100 * a:.0f}–{100 * b:.0f} %", f"{100 * a:.0f}–{100 * b:.0f}") for a, b in pairwise(settings["shares"])
     ]
     pairs = [(f"{a}–{b - 1} pairs", f"{a}–{b - 1}") for a, b in pairwise(settings["pairs"])]
-    panels = (("success", shares, "outliers (%)"), ("ms_per_problem", shares, "outliers (%)"))
-    panels += (("ms_per_problem", pairs, "pairs"),)
-    figure = make_figure(WIDTH, 3.4, "Raw nearest-neighbour matches, " + settings["split"])
-    for axes, (value, groups, label) in zip(figure.subplots(1, len(panels)), panels, strict=True):
-        first = next(iter(table.values()))
-        groups = [(group, title) for group, title in groups if first[group]["count"] >= _LEAST]
+    figure = make_figure(WIDTH, 3.6, "Nearest-neighbour matches without a ratio test")
+    for axes, (value, groups, label) in zip(
+        figure.subplots(1, 3),
+        (("success", shares, "outliers (%)"), ("ms", shares, "outliers (%)"), ("ms", pairs, "pairs")),
+        strict=True,
+    ):
+        there = [(group, title) for group, title in groups if (solvers[0], group) in times]
         for name in solvers:
-            heights = [table[name][group][value] for group, _ in groups]
-            scale = 100 if value == "success" else 1
-            axes.plot(np.arange(len(groups)), scale * np.array(heights, dtype=float), **styles[name])
-        axes.set_xticks(range(len(groups)), [title for _, title in groups], rotation=40, ha="right")
+            heights = [100 * table[name][g]["success"] if value == "success" else times[name, g] for g, _ in there]
+            axes.plot(np.arange(len(there)), heights, **styles[shown[name]])
+        axes.set_xticks(range(len(there)), [title for _, title in there], rotation=40, ha="right")
         axes.set(xlabel=label, title="right poses (%)" if value == "success" else "ms per problem")
-        if value != "success":
+        if value == "ms":
             log_scale(axes, "y")
     draw_legend(figure, styles)
     return save(figure, path)

@@ -289,11 +289,12 @@ def page(
     )
 
 
-def real_matches(results: Mapping[str, Any]) -> str:
+def real_matches(results: Mapping[str, Any], costs: Mapping[str, Any]) -> str:
     """The page on real matches as Markdown.
 
     Args:
         results: what ``benchmarks/real_matches.py measure`` wrote.
+        costs: what ``benchmarks/real_matches.py cost`` wrote.
     """
     settings = results["settings"]
     kinds = list(dict.fromkeys(row["kind"] for row in results["rows"]))
@@ -353,6 +354,7 @@ def real_matches(results: Mapping[str, Any]) -> str:
     raw = rows[kinds[1]][first]["all"]
     return environment.get_template("real_matches.md.jinja").render(
         results=results,
+        costs=costs,
         rows=rows,
         kinds=kinds,
         tables=tables,
@@ -420,9 +422,10 @@ def render() -> None:
     short_runs = {name: read_summary(HERE / f"{name}.csv") for name in ("ablation", "sweep")}
     (HERE / "README.md").write_text(page(results, complexity, honest, short_runs), encoding="utf-8")
 
-    found = load_results(HERE / "real_matches.json")
-    plot_real_matches(HERE / "real_matches.png", found, [x for x in found["settings"]["solvers"] if "sigma" not in x])
-    (HERE / "real_matches.md").write_text(real_matches(found), encoding="utf-8")
+    found = json.loads((HERE / "real_matches.json").read_text())
+    costs = json.loads((HERE / "real_matches_cost.json").read_text())
+    plot_real_matches(HERE / "real_matches.png", found, costs)
+    (HERE / "real_matches.md").write_text(real_matches(found, costs), encoding="utf-8")
 
     rows, table = overview(json.loads((REPOSITORY / "benchmarks" / "solvers.json").read_text()))
     plot_overview(HERE / "overview.png", rows, outliers="0 to 3 outliers among 9 pairs")

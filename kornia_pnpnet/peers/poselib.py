@@ -24,6 +24,7 @@ class PoseLib(RobustPeer):
         min_iterations: smallest number of iterations.
         max_iterations: largest number of iterations. A problem without a pose takes all of them.
         confidence: RANSAC stops when it has drawn an outlier-free sample with this probability, in (0, 1).
+        progressive_sampling: PROSAC: samples of the first pairs come first, so put the best pairs first.
         seed: seed of the samples, the same for each problem.
 
     Raises:
@@ -40,6 +41,7 @@ class PoseLib(RobustPeer):
 
     min_iterations: int
     max_iterations: int
+    progressive_sampling: bool
 
     def __init__(
         self,
@@ -48,6 +50,7 @@ class PoseLib(RobustPeer):
         min_iterations: int = 100,
         max_iterations: int = 10_000,
         confidence: float = 0.9999,
+        progressive_sampling: bool = False,
         seed: int = 0,
     ) -> None:
         super().__init__(
@@ -57,6 +60,7 @@ class PoseLib(RobustPeer):
             min_iterations=min_iterations,
             max_iterations=max_iterations,
         )
+        self.progressive_sampling = bool(progressive_sampling)
         poselib = import_library("poselib", "PoseLib")
         unknown = self._options().keys() - poselib.RansacOptions().keys()
         KORNIA_CHECK(not unknown, f"PoseLib {poselib.__version__} has no options {sorted(unknown)}.")
@@ -68,6 +72,7 @@ class PoseLib(RobustPeer):
             "min_iterations": self.min_iterations,
             "max_iterations": self.max_iterations,
             "success_prob": self.confidence,
+            "progressive_sampling": self.progressive_sampling,
             "seed": self.seed,
         }
 
