@@ -69,7 +69,7 @@ class RobustWeightedLM(Configured):
     *By residual.* The last ``by_residual`` iterations and the choice among several poses ignore the initialiser's
     weights: by then the residuals say better which pairs are outliers. Where the initialiser estimated the noise, and
     the residuals show that its variance is too small or too large (by likelihood ratios), :meth:`finish` multiplies the
-    variance by the factor that they show, see :func:`~kornia_pnpnet.refine.step.variance_factor`. Where it is too large
+    variance by the factor that they show, see ``variance_factor``. Where it is too large
     the iterations multiply by a tenth of that, since a narrower kernel separates inliers from outliers better. Noise
     that the caller gave stays as it is.
 
