@@ -170,7 +170,7 @@ def probability(log_alarms: Tensor, sigma: Tensor, law: str = "sigmas") -> Tenso
 
     Example:
         >>> probability(torch.tensor([-30.0, -30.0, 0.0]), torch.tensor([0.001, 0.3, 0.001]))
-        tensor([0.9994, 0.7701, 0.9865])
+        tensor([0.9995, 0.7974, 0.9852])
     """
     alarms, log_sigma = clipped(log_alarms, sigma)
     offset, by_alarms, by_sigma = LAWS[law]
