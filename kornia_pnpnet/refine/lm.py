@@ -330,7 +330,8 @@ class RobustWeightedLM(Configured):
             unknown = torch.ones_like(end.solved)
         probability, ok = believe(projection, judged._replace(noise=noise), law)
         if unknown is not None:
-            ok = torch.where(unknown, explains(projection, start.corr, start.prior), ok)
+            # Not `where`: ONNX Runtime has none for booleans.
+            ok = (unknown & explains(projection, start.corr, start.prior)) | (~unknown & ok)
         in_front = has_enough(projection, start.prior)
         return Refinement(end.pose, weights, cost, end.solved & ok & in_front, in_front, probability)
 
