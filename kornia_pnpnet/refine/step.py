@@ -7,7 +7,7 @@ diagonal is D. Marquardt's (1963).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import reduce
 from operator import and_
 from typing import NamedTuple, TypeAlias
@@ -49,6 +49,14 @@ __all__ = [
 _BELIEVED = 3.0
 # Variance factors that are compared before. Noise above the estimate needs them: a kernel that is too narrow hides it.
 _FACTORS = tuple(4.0**k for k in range(8))
+# Powers of the confidence that the standard deviation of the noise may be proportional to, and the variance factors at
+# which they are compared: noise of the geometric mean's confidence may be below the estimate.
+_POWERS = (0.0, -1.0, -2.0, -3.0)
+_POWER_FACTORS = tuple(4.0**k for k in range(-5, 8))
+# Lower confidences count as this much, so that the pair keeps some weight.
+_LEAST_CONFIDENCE = 0.05
+# Share of the pairs that are inliers above which the noise may depend on the confidence.
+_MOST = 0.5
 # Rounds of expectation and maximisation for the share of the inliers at each factor; bounds of the share.
 _ROUNDS, _LEAST_SHARE = 2, 0.02
 # The smallest variance factor: residuals of exact data would give 0.
@@ -289,6 +297,10 @@ def corrected_residuals(
     if outlier_area is None or noise is None:
         return sq_residual, noise
     precision = pixel_variance(projection, noise, pairs.focal).reciprocal()
+    if pairs.confidence is not None:
+        worth = _worth_of_confidence(sq_residual, precision, projection, pairs, outlier_area)
+        sq_residual, precision = sq_residual * worth, precision * worth
+        noise = map_tensors(lambda sigma: sigma * worth.rsqrt(), noise)
     seen = sq_residual, precision, projection, pairs.weights
     factor = variance_factor(*seen, kernel_weight, shape, outlier_area)
     larger = factor.detach().clamp(min=1.0).sqrt()
@@ -320,6 +332,9 @@ def _weights(
     if isinstance(precision, Tensor):
         sq_residual = projection.sq_residual * precision
         if outlier_area is not None:
+            if pairs.confidence is not None:
+                worth = _worth_of_confidence(sq_residual, precision, projection, pairs, outlier_area)
+                sq_residual, precision = sq_residual * worth, precision * worth
             seen = sq_residual, precision, projection, pairs.weights
             sq_residual = sq_residual / variance_factor(*seen, kernel_weight, shape, outlier_area, NARROWER)
     else:
@@ -340,9 +355,25 @@ def _factor_above(
     sq_residual: Tensor, precision: Tensor, in_front: Tensor, there: Tensor, outlier_area: Tensor
 ) -> Tensor:
     """Variance factor of the largest likelihood among those from 1 on, (B, 1), see :func:`variance_factor`."""
+    likelihood, _ = _log_likelihoods(sq_residual, precision, in_front, there, outlier_area, _FACTORS)
+    best = likelihood.max(0)
+    believed = (outlier_area[:, 0] > 0) & (best.values > likelihood[0] + _BELIEVED)
     factors = torch.tensor(_FACTORS, dtype=sq_residual.dtype, device=sq_residual.device)
+    return torch.where(believed, factors[best.indices], 1.0)[:, None]
+
+
+def _log_likelihoods(
+    sq_residual: Tensor,
+    precision: Tensor,
+    in_front: Tensor,
+    there: Tensor,
+    outlier_area: Tensor,
+    factors: Sequence[float],
+) -> tuple[Tensor, Tensor]:
+    """Log-likelihood of the residuals at each variance factor and the number of inliers, (F, B) each."""
+    grid = torch.tensor(factors, dtype=sq_residual.dtype, device=sq_residual.device)
     # Densities of a pixel, relative to that of an inlier without a residual whose factor is 1.
-    inlier = torch.exp(sq_residual * (-0.5 / factors)[:, None, None]) * in_front / factors[:, None, None]
+    inlier = torch.exp(sq_residual * (-0.5 / grid)[:, None, None]) * in_front / grid[:, None, None]
     outlier = (2.0 * math.pi / (precision * outlier_area)).clamp(max=1.0)  # (B, N)
     count = there.sum(-1, keepdim=True).clamp(min=1)
     share: Tensor | float = 0.5
@@ -350,10 +381,36 @@ def _factor_above(
         inliers = (share * inlier / (share * inlier + (1.0 - share) * outlier)).sum(-1, keepdim=True)  # (F, B, 1)
         share = (inliers / count).clamp(_LEAST_SHARE, 1.0 - _LEAST_SHARE)
     likelihood = torch.where(there, (share * inlier + (1.0 - share) * outlier).log(), 0.0).sum(-1)  # (F, B)
-    likelihood = likelihood + factors.log()[:, None] * inliers[..., 0].clamp(max=MIN_PAIRS)
-    best = likelihood.max(0)
-    believed = (outlier_area[:, 0] > 0) & (best.values > likelihood[0] + _BELIEVED)
-    return torch.where(believed, factors[best.indices], 1.0)[:, None]
+    return likelihood + grid.log()[:, None] * inliers[..., 0].clamp(max=MIN_PAIRS), inliers[..., 0]
+
+
+@torch.no_grad()
+def _worth_of_confidence(
+    sq_residual: Tensor, precision: Tensor, projection: Projection, pairs: Correspondences, outlier_area: Tensor
+) -> Tensor:
+    r"""Factor of each pair's precision where the residuals say that noise grows as the confidence falls, (B, N).
+
+    The keypoints of a network are often less accurate where it is less sure; a matcher's ratio says nothing of the
+    noise. So the standard deviation may be proportional to a power of the confidence, or independent of it. A power
+    replaces 0 where it is :math:`e^3` times as likely, by the mixture of :func:`variance_factor`, and most of the pairs
+    are inliers: among many outliers, near misses would pass for noisy inliers.
+    """
+    assert pairs.confidence is not None
+    there = pairs.weights > 0
+    known = there & pairs.confidence.isfinite()
+    log = torch.where(known, pairs.confidence.clamp(min=_LEAST_CONFIDENCE).log(), 0.0)
+    log = torch.where(known, log - log.sum(-1, keepdim=True) / known.sum(-1, keepdim=True).clamp(min=1), 0.0)
+    worths = torch.stack([torch.exp(-2.0 * power * log) for power in _POWERS])  # their geometric mean is 1
+    seen = projection.in_front & there, there, outlier_area, _POWER_FACTORS
+    found = [_log_likelihoods(sq_residual * w, precision * w, *seen) for w in worths]
+    likelihoods, inliers = (torch.stack(x) for x in zip(*found, strict=True))  # (K, F, B)
+    factor = likelihoods.max(1)
+    best = factor.values.max(0)  # of the powers, (B,)
+    inliers = inliers.gather(1, factor.indices[:, None])[:, 0].gather(0, best.indices[None])[0]
+    believed = (best.values > factor.values[0] + _BELIEVED) & (inliers > _MOST * there.sum(-1))
+    believed = believed & (outlier_area[:, 0] > 0)
+    index = torch.where(believed, best.indices, 0)[None, :, None]
+    return worths.gather(0, index.expand(1, *log.shape))[0]
 
 
 def _factor_below(sq_residual: Tensor, kernel_weight: Tensor, weights: Tensor, estimated: Tensor) -> Tensor:
