@@ -8,7 +8,7 @@ from .losses import PoseLoss as PoseLoss, SetLoss as SetLoss
 from .metrics import pose_errors as pose_errors, success as success, success_rate as success_rate
 from .normalize import Normalize as Normalize
 from .pretrained import shipped_weights as shipped_weights
-from .refine import RobustWeightedLM as RobustWeightedLM
+from .refine import RobustWeightedLM as RobustWeightedLM, gravity_prior as gravity_prior
 from .registry import create_solver as create_solver, list_solvers as list_solvers, solve_pnp as solve_pnp
 from .solver import PnPNet as PnPNet
 from .types import (
@@ -18,6 +18,7 @@ from .types import (
     Noise as Noise,
     PnPResult as PnPResult,
     Pose as Pose,
+    PosePrior as PosePrior,
     Problems as Problems,
     Refinement as Refinement,
     Status as Status,

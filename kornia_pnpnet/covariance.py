@@ -15,8 +15,9 @@ from kornia_pnpnet.core.symmetric import are_semi_definite
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import normal_equations, project
 from kornia_pnpnet.inputs import checked_noise
+from kornia_pnpnet.refine.prior import add_prior, prior_in_frame
 from kornia_pnpnet.refine.step import pixel_precision
-from kornia_pnpnet.types import LEAST_NOISE, Correspondences, Noise, Pose, camera_matrices
+from kornia_pnpnet.types import LEAST_NOISE, Correspondences, Noise, Pose, PosePrior, camera_matrices
 
 __all__ = ["pose_covariance"]
 
@@ -32,6 +33,7 @@ def pose_covariance(
     img_cov: Tensor | None = None,
     world_cov: Tensor | None = None,
     weights: Tensor | None = None,
+    prior: PosePrior | None = None,
 ) -> Tensor:
     r"""First-order covariance of a pose found by weighted least squares.
 
@@ -40,7 +42,12 @@ def pose_covariance(
     true pose, the estimate is about :math:`(\mathrm{cay}(\omega) R,\; t + v)`. :math:`\sigma_i^2` is the
     :func:`~kornia_pnpnet.geometry.pixel_variance`. With covariances the covariance is
     :math:`(\sum_i w_i J_i^\top \Sigma_i^{-1} J_i)^{-1}`, where :math:`\Sigma_i` is the
-    :func:`~kornia_pnpnet.geometry.pixel_covariance`. The computation runs in float64 and records no gradient.
+    :func:`~kornia_pnpnet.geometry.pixel_covariance`. The computation runs in float64. Gradients flow to the pose, the
+    points, the camera, the noise and the weights.
+
+    A robust kernel gives most inliers a weight below 1, but an M-estimate is hardly less accurate for it (P. Huber,
+    "Robust Statistics", 1981). So :math:`w_i` is the weight over the mean weight of an inlier,
+    :math:`\bar w = \sum_i w_i^2 / \sum_i w_i`, at most 1: a common factor of the weights does not matter.
 
     Args:
         pose: the estimated world-to-camera pose, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
@@ -54,8 +61,10 @@ def pose_covariance(
         img_cov: covariance of the noise of each pixel in px², in place of ``img_sigma``, shape :math:`(B, N, 2, 2)`.
         world_cov: covariance of the noise of each world point, in place of ``world_sigma``, shape
             :math:`(B, N, 3, 3)`.
-        weights: probability that each pair is an inlier, shape :math:`(B, N)`, for example the ``weights`` of a
-            result; ``None``: 1 for every pair.
+        weights: weight of each pair, 0 for outliers, shape :math:`(B, N)`: the ``weights`` of a result. Those of
+            `p3p-ransac` with a ``world_threshold`` also depend on the depth: pass ``(result.weights > 0).double()``.
+            ``None``: 1 for every pair.
+        prior: the prior that the pose was found with; its information adds to that of the pairs.
 
     Returns:
         Shape :math:`(B, 6, 6)`, in radians and the unit of the world, float64 when the points, the camera, the weights
@@ -94,43 +103,58 @@ def pose_covariance(
     if img_sigma is None and img_cov is None:
         raise ValueCheckError("pose_covariance needs the noise of the pixels: img_sigma or img_cov.")
     world_sigma = 0.0 if world_sigma is None and world_cov is None else world_sigma
+    noise = checked_noise(world_points.double(), img_sigma, world_sigma, img_cov, world_cov)
+    assert noise is not None
+    points, rotation, camera = world_points.double(), pose.rotation.double(), camera.double()
+    inlier = torch.ones_like(noise.img) if weights is None else _inlier_probability(weights.double())
+
+    # Coordinates in which the matrix is well conditioned: centroid 0, spread 1, focal length 1.
+    centroid = points.mean(1, keepdim=True)  # (B, 1, 3)
+    offsets = points - centroid
+    spread = offsets.square().sum(-1).mean(1, keepdim=True).sqrt()  # (B, 1)
+    spread = spread.clamp(min=torch.finfo(torch.float64).tiny)
+    rotated_centroid = (rotation @ centroid.mT)[..., 0]  # (B, 3)
+    centred_pose = Pose(rotation, (pose.translation.double() + rotated_centroid) / spread)
+    focals, principal_point = camera.diagonal(dim1=-2, dim2=-1)[..., :2], camera[..., :2, 2]
+    rays = (img_points.double() - principal_point[..., None, :]) / focals[..., None, :]
+    mean_focal = focals.log().mean(-1).exp().reshape(-1, 1)  # (B or 1, 1), geometric mean of fx and fy
+    unit_focal = focals.new_ones(())
+    corr = Correspondences(offsets / spread[..., None], rays, inlier, unit_focal)
+
+    projection = project(centred_pose, corr)
+    sound = [(are_semi_definite(x) | (inlier == 0)).all(1) for x in noise.covariances]
+    noise = _in_unit_frame(noise, camera, mean_focal, spread, inlier != 0)
+    pair_weights = map_tensors(lambda x: inlier * x, pixel_precision(projection, noise, unit_focal))
+    equations = normal_equations(projection, pair_weights)
+    if prior is not None:
+        known = map_tensors(torch.Tensor.double, prior)
+        one = torch.ones_like(spread[:, 0])
+        framed, usable = prior_in_frame(known, centroid[:, 0], spread[:, 0].reciprocal(), one)
+        sound.append(usable)
+        equations = add_prior(equations, framed, centred_pose, one, unit_focal)
+    information = symmetric(equations.hessian)
     with torch.no_grad():
-        noise = checked_noise(world_points.double(), img_sigma, world_sigma, img_cov, world_cov)
-        assert noise is not None
-        points, rotation, camera = world_points.double(), pose.rotation.double(), camera.double()
-        inlier = torch.ones_like(noise.img) if weights is None else weights.double()
-
-        # Coordinates in which the matrix is well conditioned: centroid 0, spread 1, focal length 1.
-        centroid = points.mean(1, keepdim=True)  # (B, 1, 3)
-        offsets = points - centroid
-        spread = offsets.square().sum(-1).mean(1, keepdim=True).sqrt()  # (B, 1)
-        spread = spread.clamp(min=torch.finfo(torch.float64).tiny)
-        rotated_centroid = (rotation @ centroid.mT)[..., 0]  # (B, 3)
-        centred_pose = Pose(rotation, (pose.translation.double() + rotated_centroid) / spread)
-        focals, principal_point = camera.diagonal(dim1=-2, dim2=-1)[..., :2], camera[..., :2, 2]
-        rays = (img_points.double() - principal_point[..., None, :]) / focals[..., None, :]
-        mean_focal = focals.log().mean(-1).exp().reshape(-1, 1)  # (B or 1, 1), geometric mean of fx and fy
-        unit_focal = focals.new_ones(())
-        corr = Correspondences(offsets / spread[..., None], rays, inlier, unit_focal)
-
-        projection = project(centred_pose, corr)
-        sound = [(are_semi_definite(x) | (inlier == 0)).all(1) for x in noise.covariances]
-        noise = _in_unit_frame(noise, camera, mean_focal, spread, inlier != 0)
-        pair_weights = map_tensors(lambda x: inlier * x, pixel_precision(projection, noise, unit_focal))
-        information = symmetric(normal_equations(projection, pair_weights).hessian)
         inverse, info = torch.linalg.inv_ex(information)
         positive = (inverse.diagonal(dim1=1, dim2=2) > 0).all(-1)
         determined = (info == 0) & inverse.isfinite().all((1, 2)) & positive
         determined = torch.stack((determined, *sound)).all(0)[:, None, None]
+    inverse = torch.linalg.inv_ex(torch.where(determined, information, torch.eye(6).to(information))).inverse
 
-        # Back to the given coordinates: omega stays, v = spread * v_centred + (R centroid) x omega.
-        eye = torch.eye(3, dtype=torch.float64, device=points.device).expand(batch, 3, 3)
-        omega_rows = torch.cat((eye, torch.zeros_like(eye)), -1)
-        v_rows = torch.cat((So3.hat(rotated_centroid), spread[..., None] * eye), -1)
-        back = torch.cat((omega_rows, v_rows), 1)  # (B, 6, 6)
-        covariance = back @ torch.where(determined, inverse, 0.0) @ back.mT
-        undetermined = covariance.new_full((6,), torch.inf).diag()
-        return torch.where(determined, covariance, undetermined).to(dtype)
+    # Back to the given coordinates: omega stays, v = spread * v_centred + (R centroid) x omega.
+    eye = torch.eye(3, dtype=torch.float64, device=points.device).expand(batch, 3, 3)
+    omega_rows = torch.cat((eye, torch.zeros_like(eye)), -1)
+    v_rows = torch.cat((So3.hat(rotated_centroid), spread[..., None] * eye), -1)
+    back = torch.cat((omega_rows, v_rows), 1)  # (B, 6, 6)
+    covariance = back @ torch.where(determined, inverse, 0.0) @ back.mT
+    undetermined = covariance.new_full((6,), torch.inf).diag()
+    return torch.where(determined, covariance, undetermined).to(dtype)
+
+
+def _inlier_probability(weights: Tensor) -> Tensor:
+    """Robust weights of inliers vary around their mean: this mean, as the inliers weigh it, and more count as 1."""
+    total = weights.sum(-1, keepdim=True)
+    mean = weights.square().sum(-1, keepdim=True) / torch.where(total > 0, total, 1.0)
+    return (weights / torch.where(mean > 0, mean, 1.0)).clamp(max=1.0)
 
 
 def _in_unit_frame(noise: Noise, camera: Tensor, mean_focal: Tensor, spread: Tensor, used: Tensor) -> Noise:

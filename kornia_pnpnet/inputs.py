@@ -14,7 +14,7 @@ from kornia_pnpnet.core.checks import Shapes, check_devices, check_shapes, commo
 from kornia_pnpnet.core.performance import present_first, sees_values
 from kornia_pnpnet.core.symmetric import Symmetric2, Symmetric3, equivalent_sigma
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.types import Noise, PnPResult, Pose, camera_matrices
+from kornia_pnpnet.types import Noise, PnPResult, Pose, PosePrior, camera_matrices
 
 __all__ = [
     "Inputs",
@@ -44,6 +44,7 @@ class Inputs(NamedTuple):
     init: Pose | None
     noise: Noise | None
     confidence: Tensor | None
+    prior: PosePrior | None = None
 
 
 class Part(NamedTuple):
@@ -74,6 +75,7 @@ def checked_inputs(
     img_cov: Tensor | None = None,
     world_cov: Tensor | None = None,
     confidence: Tensor | None = None,
+    prior: PosePrior | None = None,
 ) -> tuple[torch.Size, Inputs]:
     """Check the arguments of a call, and make them one batch of one dtype, see :func:`common_dtype`.
 
@@ -90,6 +92,7 @@ def checked_inputs(
     """
     rotation, translation = (None, None) if init is None else init
     matrices = camera_matrices(intrinsics)
+    (prior_rotation, prior_translation), information, prior_scale = prior or PosePrior(Pose(None, None), None)  # type: ignore[arg-type]
     tensors = {
         "world_points": world_points,
         "img_points": img_points,
@@ -100,6 +103,10 @@ def checked_inputs(
         "confidence": confidence,
         "img_cov": img_cov,
         "world_cov": world_cov,
+        "prior rotation": prior_rotation,
+        "prior translation": prior_translation,
+        "prior information": information,
+        "prior scale": prior_scale,
     }
     required = ("world_points", "img_points", "intrinsics")
     for name, value in (*tensors.items(), ("mask", mask)):
@@ -126,6 +133,10 @@ def checked_inputs(
         "intrinsics": (matrices, (3, 3) if matrices.ndim == 2 else (*size, 3, 3)),
         "init rotation": (rotation, (*size, 3, 3)),
         "init translation": (translation, (*size, 3)),
+        "prior rotation": (prior_rotation, (*size, 3, 3)),
+        "prior translation": (prior_translation, (*size, 3)),
+        "prior information": (information, (*size, 6, 6)),
+        "prior scale": (prior_scale, size),
     }
     check_shapes(shapes, world_points)
     if count < 3:
@@ -138,7 +149,7 @@ def checked_inputs(
     noise = checked_noise(world_points.to(dtype), img_sigma, world_sigma, img_cov, world_cov)
     cameras = matrices.expand(*size, 3, 3)
     pose = None if init is None else Pose(*init)
-    given = Inputs(world_points, img_points, cameras, weights, mask, pose, noise, confidence)
+    given = Inputs(world_points, img_points, cameras, weights, mask, pose, noise, confidence, prior)
     return size, map_tensors(lambda x: one_batch(x, size, dtype), given)
 
 
@@ -222,11 +233,13 @@ def _without_padding(inputs: Inputs, most: int) -> list[Part]:
         at = problems[start:stop]
         pairs = order[at, :width]
 
-        cameras, init = map_tensors(lambda x, at=at: x[at], (inputs.intrinsics, inputs.init))
-        world, img, _, weights, mask, _, noise, confidence = map_tensors(
-            lambda x, at=at, pairs=pairs: x[at[:, None], pairs], inputs._replace(intrinsics=inputs.mask, init=None)
+        of_problems = inputs.intrinsics, inputs.init, inputs.prior
+        cameras, init, prior = map_tensors(lambda x, at=at: x[at], of_problems)
+        of_pairs = map_tensors(
+            lambda x, at=at, pairs=pairs: x[at[:, None], pairs],
+            inputs._replace(intrinsics=inputs.mask, init=None, prior=None),
         )
-        parts.append(Part(Inputs(world, img, cameras, weights, mask, init, noise, confidence), at, pairs, count))
+        parts.append(Part(of_pairs._replace(intrinsics=cameras, init=init, prior=prior), at, pairs, count))
         stop = start
     return parts
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,7 +14,7 @@ from torch import Tensor, nn
 
 from kornia_pnpnet.core.checks import check_whole
 from kornia_pnpnet.core.linalg import bound_gradient
-from kornia_pnpnet.core.performance import Compiled, sees_values
+from kornia_pnpnet.core.performance import Compiled, in_full_precision, sees_values
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import project
 from kornia_pnpnet.init import RANSAC, EPnP, MLPInit, REPPnP, SetInit
@@ -24,7 +23,8 @@ from kornia_pnpnet.inputs import Inputs, checked_inputs, joined, restore_leading
 from kornia_pnpnet.normalize import VIEWS, Frame, Normalize
 from kornia_pnpnet.pretrained import read_weights, write_weights
 from kornia_pnpnet.refine import LMStart, LMStep, RobustWeightedLM
-from kornia_pnpnet.types import Correspondences, Guess, PnPResult, Pose, Status
+from kornia_pnpnet.refine.prior import prior_in_frame
+from kornia_pnpnet.types import Correspondences, Guess, PnPResult, Pose, PosePrior, Status
 
 __all__ = ["PnPNet"]
 
@@ -133,6 +133,7 @@ class PnPNet(nn.Module):
         img_cov: Tensor | None = None,
         world_cov: Tensor | None = None,
         confidence: Tensor | None = None,
+        prior: PosePrior | None = None,
         first_stage_only: bool = False,
         gradient: str | None = None,
     ) -> PnPResult:
@@ -162,6 +163,9 @@ class PnPNet(nn.Module):
                 :math:`(B, N)`; NaN where unknown. :func:`~kornia_pnpnet.confidence.fit_confidence` makes it from raw
                 scores. Minimal samples are drawn from likely pairs more often, and a network that was trained with
                 confidences sees them. What they are worth may differ between problems.
+            prior: what is known of the pose besides the pairs, such as :func:`~kornia_pnpnet.refine.gravity_prior`: a
+                term of the refinement and of the choice among poses, to which its pose belongs unless ``init`` is
+                given. ``ok`` and ``probability`` are judged by the pairs alone. Unknown noise counts as one pixel.
             first_stage_only: return the first guess unrefined, the paper's "Net", at the cost of ``m=0``.
             gradient: ``"ok"`` or ``"always"``; the solver's own when ``None``.
 
@@ -179,8 +183,8 @@ class PnPNet(nn.Module):
             ValueCheckError: for both a sigma and a covariance of the pixels, or of the points.
         """
         given = world_points, img_points, intrinsics, weights, mask, init, img_sigma, world_sigma, img_cov, world_cov
-        size, inputs = checked_inputs(*given, confidence)
-        with _in_full_precision(inputs.world_points.device.type):
+        size, inputs = checked_inputs(*given, confidence, prior)
+        with in_full_precision(inputs.world_points.device.type):
             always = _checked_gradient(gradient or self.gradient) == "always"
             compiled = isinstance(self._first, Compiled) or isinstance(self._solve, Compiled)
             any_number = not (compiled or isinstance(self.init, MLPInit))
@@ -202,6 +206,7 @@ class PnPNet(nn.Module):
         img_cov: Tensor | None = None,
         world_cov: Tensor | None = None,
         confidence: Tensor | None = None,
+        prior: PosePrior | None = None,
         first_stage_only: bool = False,
         gradient: str | None = None,
     ) -> tuple[PnPResult, Guess]:
@@ -219,16 +224,16 @@ class PnPNet(nn.Module):
             img_cov: See forward.
             world_cov: See forward.
             confidence: See forward.
+            prior: See forward.
             first_stage_only: See forward.
             gradient: See forward.
 
         Returns:
-            The result, and the guess in the frame, the order and the units of the inputs; its ``ok`` says whether the
-            problem is valid.
+            The result, and the guess in the frame, order and units of the inputs; its ``ok``: is the problem valid.
         """
         given = world_points, img_points, intrinsics, weights, mask, init, img_sigma, world_sigma, img_cov, world_cov
-        size, inputs = checked_inputs(*given, confidence)
-        with _in_full_precision(inputs.world_points.device.type):
+        size, inputs = checked_inputs(*given, confidence, prior)
+        with in_full_precision(inputs.world_points.device.type):
             always = _checked_gradient(gradient or self.gradient) == "always"
             begun, result = self._parts(first_stage_only, always, inputs)
             return restore_leading(size, (result, self.normalize.undo_guess(begun.guess, begun.frame)))
@@ -280,11 +285,15 @@ class PnPNet(nn.Module):
 
     def _first_guess(self, views: int, always: bool, inputs: Inputs) -> tuple[Correspondences, Frame, Guess]:
         """Normalise and guess."""
-        world_points, img_points, intrinsics, weights, mask, init, noise, confidence = inputs
+        world_points, img_points, intrinsics, weights, mask, init, noise, confidence, prior = inputs
         corr, frame = self.normalize(world_points, img_points, intrinsics, weights, mask, noise, confidence)
         if always:
             world, img, pair_weights = (bound_gradient(x, _LONGEST_GRADIENT) for x in corr[:3])
             corr = corr._replace(world_points=world, img_points=img, weights=pair_weights)
+        if prior is not None:
+            known, usable = prior_in_frame(prior, frame.centroid, frame.scale, frame.img_scale)
+            corr, init = corr._replace(prior=known), prior.pose if init is None else init
+            frame = frame._replace(status=torch.where(usable, frame.status, Status.NOT_FINITE.value))
         given = self._given(init, world_points, frame) if self.init is None or init is not None else None
         if self.init is None:
             assert given is not None
@@ -439,10 +448,3 @@ def _gate_pose(pose: Pose, ok: Tensor, finite: Tensor) -> Pose:
     """:func:`_gate` for a pose; the identity fills."""
     eye = torch.eye(3, dtype=pose.rotation.dtype, device=pose.rotation.device)
     return Pose(_gate(pose.rotation, ok, finite, eye), _gate(pose.translation, ok, finite, 0.0))
-
-
-def _in_full_precision(device: str) -> AbstractContextManager[Any]:
-    """Disable autocast on devices that have it; ``meta`` does not. In a graph for other programs it has no meaning."""
-    if torch.compiler.is_exporting() or not torch.amp.is_autocast_available(device):
-        return nullcontext()
-    return torch.autocast(device, enabled=False)

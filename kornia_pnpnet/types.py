@@ -25,7 +25,19 @@ from torch import Tensor
 from kornia_pnpnet.core.symmetric import Symmetric2, Symmetric3
 from kornia_pnpnet.core.trees import map_tensors
 
-__all__ = ["Correspondences", "Guess", "Hypotheses", "Noise", "PnPResult", "Pose", "Problems", "Refinement", "Status"]
+__all__ = [
+    "Correspondences",
+    "FramedPrior",
+    "Guess",
+    "Hypotheses",
+    "Noise",
+    "PnPResult",
+    "Pose",
+    "PosePrior",
+    "Problems",
+    "Refinement",
+    "Status",
+]
 
 
 #: Focal lengths. Pixels are never known better than this, so that weights stay finite.
@@ -44,7 +56,7 @@ class Status(IntEnum):
     #: The points lie on a line or coincide, or the pairs do not determine a pose.
     DEGENERATE = 2
     #: A coordinate, weight, sigma or covariance is NaN or infinite, a weight or sigma is negative, a covariance is not
-    #: positive semi-definite, or a confidence is outside of [0, 1].
+    #: positive semi-definite, a confidence is outside of [0, 1], or a prior is impossible.
     NOT_FINITE = 3
     #: The intrinsics are not a multiple of ``[[fx, s, cx], [0, fy, cy], [0, 0, 1]]`` with positive ``fx`` and ``fy``.
     CAMERA = 4
@@ -173,6 +185,52 @@ class Noise(NamedTuple):
         return [x for x in (self.img_cov, self.world_cov) if x is not None]
 
 
+class PosePrior(NamedTuple):
+    r"""What is known of a pose before the pairs are looked at: of the frame before, of gravity, of an odometer.
+
+    With the true pose :math:`(R, t)`, the prior's pose is :math:`(\mathrm{cay}(\omega) R,\; t + v)`, where
+    :math:`(\omega, v)` is Gaussian with the inverse of the information as its covariance: the tangent of
+    :func:`~kornia_pnpnet.covariance.pose_covariance`.
+
+    Attributes:
+        pose: the world-to-camera pose that is expected.
+        information: inverse of the covariance in radians and the unit of the world, positive semi-definite; rows and
+            columns of zeros where nothing is known, shape :math:`(B, 6, 6)`.
+        scale: :math:`c`, shape :math:`(B,)`; ``None``: 3. The squared error :math:`s` in standard deviations weighs
+            :math:`\exp(-2 s / (k c^2))` with :math:`k` known directions (Welsch's kernel), so that a wrong prior does
+            not spoil a pose that the pairs determine. Infinite: least squares.
+    """
+
+    pose: Pose
+    information: Tensor
+    scale: Tensor | None = None
+
+
+class FramedPrior(NamedTuple):
+    """A :class:`PosePrior` in the frame of normalised correspondences.
+
+    Attributes:
+        pose: the expected pose.
+        information: its inverse covariance, shape :math:`(B, 6, 6)`.
+        offset: the centroid of the world in normalised lengths, shape :math:`(B, 3)`: shifts of the pose are those of
+            the caller's world.
+        free: axis in the camera about which turns are open although the other turns are known, else 0,
+            shape :math:`(B, 3)`.
+        sq_scale: squared scale of the robust kernel, in squared standard deviations, shape :math:`(B,)`.
+        rank: number of known directions, shape :math:`(B,)`.
+        pixel: one pixel of the caller, in pixels of the correspondences, shape :math:`(B,)`: the noise where nobody
+            tells it.
+    """
+
+    pose: Pose
+    information: Tensor
+    offset: Tensor
+    free: Tensor
+    sq_scale: Tensor
+    rank: Tensor
+    pixel: Tensor
+
+
 class Correspondences(NamedTuple):
     r"""Normalised 2D-3D correspondences: the input of initialisers and refiners.
 
@@ -192,6 +250,7 @@ class Correspondences(NamedTuple):
             leaves out the pairs with 0 (:attr:`near_weights`): they are bad data or the horizon.
         confidence: the caller's belief that a pair is an inlier, in [0, 1], NaN where unknown, shape :math:`(B, N)`;
             ``None``: all unknown.
+        prior: what is known of the pose besides the pairs; ``None``: nothing.
     """
 
     world_points: Tensor
@@ -203,6 +262,7 @@ class Correspondences(NamedTuple):
     noise: Noise | None = None
     near: Tensor | None = None
     confidence: Tensor | None = None
+    prior: FramedPrior | None = None
 
     @property
     def near_weights(self) -> Tensor:
@@ -281,8 +341,9 @@ class PnPResult(NamedTuple):
         rotation: world-to-camera rotation, shape :math:`(B, 3, 3)`.
         translation: world-to-camera translation in the unit of the world points, shape :math:`(B, 3)`.
         weights: final weight of each pair, in the order in which the pairs were given, shape :math:`(B, N)`.
-        cost: mean robust loss of the pairs, in the kernel's unit (see :mod:`kornia_pnpnet.refine.kernels`), shape
-            :math:`(B,)`. Comparable between problems that the same solver solved.
+        cost: mean robust loss of the pairs, with that of a prior, in the kernel's unit (see
+            :mod:`kornia_pnpnet.refine.kernels`), shape :math:`(B,)`. Comparable between problems that the
+            same solver solved.
         ok: whether the pose is to be believed, bool, shape :math:`(B,)`. Where ``ok`` is false the fields above are
             finite and carry no gradient.
         init: the first guess. It carries a gradient for every valid problem, also where refinement failed, so that an

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import cache
 from typing import Any, Generic, ParamSpec, TypeVar
 
@@ -22,6 +22,7 @@ __all__ = [
     "compiling",
     "exporting",
     "fold_vmap",
+    "in_full_precision",
     "in_order",
     "keep_freed_memory",
     "present_first",
@@ -57,6 +58,13 @@ def sees_values(x: Tensor) -> bool:
             return False
         x = functorch.get_unwrapped(x)
     return not (compiling() or x.device.type == "meta")
+
+
+def in_full_precision(device: str) -> AbstractContextManager[Any]:
+    """Disable autocast on devices that have it; ``meta`` does not. In a graph for other programs it has no meaning."""
+    if torch.compiler.is_exporting() or not torch.amp.is_autocast_available(device):
+        return nullcontext()
+    return torch.autocast(device, enabled=False)
 
 
 # -- memory layouts ----------------------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ from kornia_pnpnet.core.linalg import dot, small_product, solve_symmetric
 from kornia_pnpnet.core.performance import take_pairs
 from kornia_pnpnet.geometry import align, project
 from kornia_pnpnet.init.ransac import p3p
+from kornia_pnpnet.refine.prior import votes
 from kornia_pnpnet.types import Correspondences, Guess, Noise, Pose
 
 __all__ = ["SetInit"]
@@ -371,6 +372,8 @@ class SetInit(Configured):
         variance = img.square() + (corr.focal * world / depth).square()
         support = judges.weights / (1.0 + projection.sq_residual / (_JUDGED * variance))
         support = torch.where(projection.in_front, support, 0.0).sum(1)[..., 0]  # (H, B)
+        if corr.prior is not None:
+            support = support + votes(corr.prior, Pose(rotation.permute(2, 3, 0, 1), translation.permute(1, 2, 0)))
         best = torch.where(valid.flatten(0, 1), support, -1.0).max(0)
         index = best.indices
         rotation = rotation.flatten(0, 1).gather(1, index.expand(9, 1, -1)).view(3, 3, batch)

@@ -8,6 +8,7 @@ to be believed.
 from kornia_pnpnet.refine.kernels import KERNELS, RobustKernel
 from kornia_pnpnet.refine.lm import RobustWeightedLM
 from kornia_pnpnet.refine.parameters import BoundedParameter
+from kornia_pnpnet.refine.prior import gravity_prior
 from kornia_pnpnet.refine.stages import LMStart, Stage, State
 from kornia_pnpnet.refine.step import LMStep, lm_step, solve_damped
 from kornia_pnpnet.refine.verdict import explains
@@ -22,6 +23,7 @@ __all__ = [
     "Stage",
     "State",
     "explains",
+    "gravity_prior",
     "lm_step",
     "solve_damped",
 ]

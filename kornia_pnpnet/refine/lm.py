@@ -21,6 +21,7 @@ from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import NormalEquations, Projection, move, project
 from kornia_pnpnet.refine.kernels import KERNELS, RobustKernel
 from kornia_pnpnet.refine.parameters import BoundedParameter
+from kornia_pnpnet.refine.prior import prior_loss
 from kornia_pnpnet.refine.stages import LMStart, Stage, State
 from kornia_pnpnet.refine.step import (
     LMStep,
@@ -323,7 +324,7 @@ class RobustWeightedLM(Configured):
         pairs = start.corr._replace(weights=start.by_residual.weights)
         sq_residual, noise = corrected_residuals(projection, pairs, self.kernel.weight, shape, start.outlier_area)
         weights = torch.where(projection.in_front, start.prior * self.kernel.weight(sq_residual, shape), 0.0)
-        cost = self._cost(projection, start.corr, start.prior, shape)
+        cost = self._cost(end.pose, projection, start.corr, start.prior, shape)
         judged, unknown, law = start.guided, start.noiseless, "sigmas"
         if noise is None:
             noise, judged, law = residual_noise(projection, start.corr, start.prior), start.corr, "residuals"
@@ -364,7 +365,7 @@ class RobustWeightedLM(Configured):
         pose, solved = self._iterate(pairs, state.pose, step, damping, shape, area)
         if not self.reject_worse or area is not None:  # the cost does not know the corrected noise
             return State(pose, solved, state.factor)
-        new, old = (self._cost(project(x, pairs), pairs, pairs.weights, shape) for x in (pose, state.pose))
+        new, old = (self._cost(x, project(x, pairs), pairs, pairs.weights, shape) for x in (pose, state.pose))
         # At a minimum, rounding decides which cost is lower. A refused step has no gradient there: take the step.
         rounding = _ROUNDING * torch.finfo(new.dtype).eps
         better = new <= old * (1.0 + rounding) + (rounding * pairs.focal).square()
@@ -379,17 +380,21 @@ class RobustWeightedLM(Configured):
         """Keep the pose of the lowest cost of each problem; ``prior`` has as many problems as there are."""
         batch = prior.shape[0]
         pose = map_tensors(torch.Tensor.detach, state.pose)
-        cost = self._cost(project(pose, rivals), rivals, rivals.weights, shape.detach())
+        cost = self._cost(pose, project(pose, rivals), rivals, rivals.weights, shape.detach())
         best = (cost.view(-1, batch) if batch else cost[None]).argmin(0)  # (B,), the first of equals
         index = torch.add(torch.arange(batch, device=best.device), best, alpha=batch)
         return map_tensors(lambda x: x.movedim(0, -1).index_select(-1, index).movedim(-1, 0), state)
 
-    def _cost(self, projection: Projection, corr: Correspondences, prior: Tensor, shape: Tensor) -> Tensor:
-        """Mean robust loss over the pairs that have a weight, shape (B,)."""
+    def _cost(self, pose: Pose, projection: Projection, corr: Correspondences, prior: Tensor, shape: Tensor) -> Tensor:
+        """Mean robust loss over the pairs that have a weight, with that of the prior of the pose, shape (B,)."""
         most = (_MAX_RESIDUAL * corr.focal).square()
         sq_residual = sq_standardised(projection, corr, most)
         count = (corr.weights > 0).sum(-1).clamp(min=1)
-        return (prior * self.kernel.loss(sq_residual, shape)).sum(-1) / count
+        total = (prior * self.kernel.loss(sq_residual, shape)).sum(-1)
+        if corr.prior is not None:
+            unit = corr.prior.pixel.square() if corr.noise is None else 1.0
+            total = total + unit * prior_loss(corr.prior, pose)
+        return total / count
 
     def _attach_gradient(self, start: LMStart, pose: Pose, shape: Tensor) -> Pose:
         r"""Give a converged pose the gradient of a minimum, by the implicit function theorem.

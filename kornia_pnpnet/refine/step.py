@@ -30,7 +30,8 @@ from kornia_pnpnet.geometry import (
     project,
     retract_additive,
 )
-from kornia_pnpnet.types import MIN_PAIRS, Correspondences, Noise, Pose
+from kornia_pnpnet.refine.prior import add_prior
+from kornia_pnpnet.types import MIN_PAIRS, Correspondences, FramedPrior, Noise, Pose
 
 __all__ = [
     "LMStep",
@@ -110,7 +111,7 @@ def iterate(
     """
     projection = project(pose, pairs)
     weights = _weights(projection, pairs, kernel_weight, shape, outlier_area)
-    return lm_step(pairs, pose, projection, weights, step, damping, additive=additive)
+    return lm_step(pairs, pose, projection, weights, step, damping, additive=additive, prior=pairs.prior)
 
 
 def weighted_equations(
@@ -119,7 +120,7 @@ def weighted_equations(
     """The normal equations of :func:`iterate` at a pose, before damping."""
     projection = project(pose, pairs)
     weights = _weights(projection, pairs, kernel_weight, shape, outlier_area)
-    return normal_equations(projection, _relative(weights, projection))
+    return _equations(projection, weights, pose, pairs.prior, pairs.focal)
 
 
 def lm_step(
@@ -131,6 +132,7 @@ def lm_step(
     damping: Tensor,
     *,
     additive: bool = False,
+    prior: FramedPrior | None = None,
 ) -> LMStep:
     r"""Solve the damped normal equations and move the pose.
 
@@ -147,11 +149,12 @@ def lm_step(
         step: :math:`\gamma`, a scalar.
         damping: :math:`\lambda`, a scalar or :math:`(B,)`.
         additive: update the rotation vector additively as in the paper, instead of by the retraction.
+        prior: another term of the cost; the weights are then inverse square pixels.
 
     Returns:
         The moved pose and whether the equations could be solved.
     """
-    equations = normal_equations(projection, _relative(weights, projection))
+    equations = _equations(projection, weights, pose, prior, corr.focal)
     if additive:
         equations = change_tangent(equations, additive_tangent_map(pose))
     delta, solved = solve_damped(equations, damping)
@@ -327,7 +330,8 @@ def _weights(
 ) -> Tensor | Symmetric2:
     """Weight of each pair in the normal equations: prior weight, inverse variance or covariance, robust weight."""
     if pairs.noise is None:
-        return pairs.weights * kernel_weight(projection.sq_residual, shape)
+        robust = pairs.weights * kernel_weight(projection.sq_residual, shape)
+        return robust if pairs.prior is None else robust / pairs.prior.pixel.square()[:, None]
     precision = pixel_precision(projection, pairs.noise, pairs.focal)
     if isinstance(precision, Tensor):
         sq_residual = projection.sq_residual * precision
@@ -336,18 +340,30 @@ def _weights(
                 worth = _worth_of_confidence(sq_residual, precision, projection, pairs, outlier_area)
                 sq_residual, precision = sq_residual * worth, precision * worth
             seen = sq_residual, precision, projection, pairs.weights
-            sq_residual = sq_residual / variance_factor(*seen, kernel_weight, shape, outlier_area, NARROWER)
+            factor = variance_factor(*seen, kernel_weight, shape, outlier_area, NARROWER)
+            sq_residual = sq_residual / factor
+            if pairs.prior is not None:  # a common factor does not matter to the pairs alone
+                precision = precision / factor.clamp(min=1.0)
     else:
         sq_residual = precision.form(*projection.residual)
     robust = pairs.weights * kernel_weight(sq_residual, shape)
     return map_tensors(lambda x: x * robust, precision)
 
 
-def _relative(weights: Tensor | Symmetric2, projection: Projection) -> Tensor | Symmetric2:
-    """Weights relative to the heaviest row of the Jacobian, so that products of tiny weights do not vanish."""
+def _equations(
+    projection: Projection, weights: Tensor | Symmetric2, pose: Pose, prior: FramedPrior | None, focal: Tensor
+) -> NormalEquations:
+    """Normal equations of the pairs and of the prior.
+
+    Weights are relative to the heaviest row of the Jacobian, so that products of tiny weights do not vanish.
+    """
     size = weights if isinstance(weights, Tensor) else weights.uu + weights.vv
     size = size * projection.inv_depth * projection.inv_depth
-    return map_tensors(lambda x: relative(x, size), weights)
+    equations = normal_equations(projection, map_tensors(lambda x: relative(x, size), weights))
+    if prior is None:
+        return equations
+    largest = size.detach().amax(1)
+    return add_prior(equations, prior, pose, torch.where(largest > 0, largest, 1.0), focal)
 
 
 @torch.no_grad()

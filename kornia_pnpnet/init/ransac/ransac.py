@@ -28,6 +28,7 @@ from kornia_pnpnet.init.ransac.search import (
     least_squares,
     take,
 )
+from kornia_pnpnet.refine.prior import recentred
 from kornia_pnpnet.refine.verdict import (
     MAX_FALSE_ALARMS,
     Judged,
@@ -186,6 +187,8 @@ class RANSAC(Configured):
         # Weights relative to the largest weight, so that their unit does not matter.
         weights = relative(corr.weights, corr.weights)
         corr = corr._replace(world_points=corr.world_points - centre[:, None], weights=weights)
+        if corr.prior is not None:
+            corr = corr._replace(prior=recentred(corr.prior, centre))
         with torch.no_grad():
             thresholds = self._thresholds(corr)
             if given is not None:

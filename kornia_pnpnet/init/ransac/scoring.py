@@ -16,8 +16,9 @@ import torch
 from torch import Tensor
 
 from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.refine.prior import votes
 from kornia_pnpnet.refine.verdict import MAX_ERROR, Thresholds
-from kornia_pnpnet.types import Correspondences
+from kornia_pnpnet.types import Correspondences, FramedPrior, Pose
 
 __all__ = ["SCORERS", "Scene", "Scorer", "standardised_errors"]
 
@@ -51,6 +52,7 @@ class Scene(NamedTuple):
         weights: weights of the pairs, shape :math:`(P, 1, N)`.
         depth_scale: :math:`\tau / f`, shape :math:`(P, 1, 1)`.
         sq_world: :math:`\omega^2`, shape :math:`(P, 1, 1)`.
+        prior: what is known of the poses besides the pairs.
     """
 
     points: Tensor
@@ -59,6 +61,7 @@ class Scene(NamedTuple):
     weights: Tensor
     depth_scale: Tensor
     sq_world: Tensor
+    prior: FramedPrior | None = None
 
     @classmethod
     def make(cls, corr: Correspondences, thresholds: Thresholds, dtype: torch.dtype) -> Scene:
@@ -74,6 +77,7 @@ class Scene(NamedTuple):
             corr.weights[:, None].to(dtype),
             (thresholds.img / corr.focal).to(dtype)[:, None, None],
             sq_world.to(dtype)[:, None, None],
+            map_tensors(lambda x: x.to(dtype), corr.prior),
         )
 
     def of(self, problems: Tensor) -> Scene:
@@ -114,8 +118,13 @@ class Scene(NamedTuple):
         return matrices
 
     def losses(self, packed: Tensor, scorer: Scorer) -> Tensor:
-        """Weighted sum of the losses of the pairs at each pose, :math:`(P, 4, 3, H)` to :math:`(P, H)`."""
-        return (self.weights @ scorer(standardised_errors(self, packed)))[:, 0]
+        """Weighted sum of the losses of pairs and prior at each pose, :math:`(P, 4, 3, H)` to :math:`(P, H)`."""
+        losses = (self.weights @ scorer(standardised_errors(self, packed)))[:, 0]
+        if self.prior is None:
+            return losses
+        matrices = self.unpack(packed)
+        prior = map_tensors(lambda x: x[:, None], self.prior)  # for each of H poses
+        return losses + 0.5 * prior.rank - votes(prior, Pose(matrices[..., :3], matrices[..., 3]))
 
 
 def standardised_errors(scene: Scene, packed: Tensor) -> Tensor:
