@@ -111,8 +111,8 @@ def pose_covariance(
     # Coordinates in which the matrix is well conditioned: centroid 0, spread 1, focal length 1.
     centroid = points.mean(1, keepdim=True)  # (B, 1, 3)
     offsets = points - centroid
-    spread = offsets.square().sum(-1).mean(1, keepdim=True).sqrt()  # (B, 1)
-    spread = spread.clamp(min=torch.finfo(torch.float64).tiny)
+    mean_square = offsets.square().sum(-1).mean(1, keepdim=True)  # (B, 1)
+    spread = torch.where(mean_square > 0, mean_square, 1.0).sqrt()
     rotated_centroid = (rotation @ centroid.mT)[..., 0]  # (B, 3)
     centred_pose = Pose(rotation, (pose.translation.double() + rotated_centroid) / spread)
     focals, principal_point = camera.diagonal(dim1=-2, dim2=-1)[..., :2], camera[..., :2, 2]

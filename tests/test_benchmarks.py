@@ -397,6 +397,22 @@ def test_covariances_bring_errors_close_to_the_bound(monkeypatch):
         assert all(error > 1.1 for name in ("sigmas", "nothing", "bound, sigmas") for error in row[name]), row
 
 
+def test_covariances_of_poses_are_right(monkeypatch):
+    monkeypatch.setattr(uncertainty, "CREDIBLE", ((20, 0), (50, 25)))
+    for row in uncertainty.measure_credibility(create_solver(uncertainty.SOLVER).double(), 1500)[:4]:
+        assert 5.6 < row["mean"] < 6.4, row
+        assert 0.935 < row["below"] < 0.97, row
+
+
+def test_page_of_uncertainty_is_written_from_its_file():
+    results = json.loads((FOLDER / "uncertainty.json").read_text())
+    assert uncertainty.page(results) == (FOLDER / "uncertainty.md").read_text(encoding="utf-8")
+    for row in results["covariances"]:
+        assert row["used"] > 0.9
+    for row in results["priors"]:
+        assert row["last pose"] > row["nothing"]
+
+
 # -- the pages ---------------------------------------------------------------------------------------------------------
 
 
