@@ -11,6 +11,10 @@ solve the same problems.
 for 95 % when the covariance is right. Poses that are not ``ok`` or far off (10 degrees or 30 % of the distance) are
 left out.
 
+*Planar targets.* A square of four points, 0.2 units wide, 1 to 2 units away, tilted against the camera's axis, noise
+told: how often the pose, or the pose or one of two alternatives, is right (5 degrees and 5 degrees for each pixel of
+noise, a tenth of the distance), beside the two poses of OpenCV's IPPE.
+
 *Priors.* Success (1 degree, 0.2 units) with what is known of the pose: the direction of gravity or the last pose, right
 or wrong by ten standard deviations more. The bound is least squares on the true inliers with the same prior, from the
 truth.
@@ -46,10 +50,18 @@ from kornia_pnpnet.core.files import write_json
 from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.evaluation.bounds import KnownInliersAndNoise
-from kornia_pnpnet.geometry import retract
-from kornia_pnpnet.types import Problems
+from kornia_pnpnet.geometry import retract, transform
+from kornia_pnpnet.types import Pose, Problems
 
-__all__ = ["main", "measure_credibility", "measure_errors", "measure_priors", "measure_times", "page"]
+__all__ = [
+    "main",
+    "measure_credibility",
+    "measure_errors",
+    "measure_priors",
+    "measure_squares",
+    "measure_times",
+    "page",
+]
 
 SOLVER = "pnpnet-set"
 # Used for nothing else.
@@ -66,6 +78,8 @@ FEW = ((3, 0), (4, 0), (4, 1), (5, 1), (6, 0), (6, 2), (9, 3), (12, 4))
 LIMIT = 12.592
 #: Standard deviations in degrees of gravity and of the last rotation; of the last position, relative to the distance.
 GRAVITY, TURN, SHIFT = 0.5, 1.0, 0.02
+#: Degrees between the normal of a planar target and the camera's axis.
+TILTS = (0.0, 15.0, 30.0, 45.0, 60.0)
 #: Standard deviations by which a wrong prior is off.
 WRONG = 10.0
 # Of a timed batch, as in the table of throughput: problems, pairs, repeats.
@@ -197,6 +211,72 @@ def measure_priors(solver: nn.Module, count: int) -> list[dict[str, Any]]:
     return rows
 
 
+def square(tilt: float, sigma: float, count: int) -> Problems:
+    """Squares of four points under a tilt in degrees, with noise of the pixels."""
+    generator = torch.Generator().manual_seed(SEED + 3)
+    azimuth, roll, x, y, z = torch.rand(5, count, generator=generator, dtype=torch.float64)
+    azimuth, roll = 2.0 * math.pi * azimuth, 2.0 * math.pi * roll
+    zero = torch.zeros_like(roll)
+    axis = torch.stack((azimuth.cos(), azimuth.sin(), zero), -1) * math.radians(tilt)
+    translation = torch.stack((0.4 * x - 0.2, 0.4 * y - 0.2, 1.0 + z), -1)
+    turns = [Pose.from_rvec(v, translation).rotation for v in (axis, torch.stack((zero, zero, roll), -1))]
+    front = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+    pose = Pose(turns[0] @ turns[1] @ front, translation)
+    corners = [[-0.1, -0.1, 0.0], [0.1, -0.1, 0.0], [0.1, 0.1, 0.0], [-0.1, 0.1, 0.0]]
+    world = torch.tensor(corners, dtype=torch.float64).expand(count, 4, 3)
+    camera = torch.tensor([[800.0, 0.0, 320.0], [0.0, 800.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    seen = transform(pose, world) @ camera.mT
+    pixels = seen[..., :2] / seen[..., 2:]
+    pixels = pixels + sigma * torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
+    return Problems(world, pixels, camera.expand(count, 3, 3), pose, torch.ones(count, 4, dtype=torch.bool))
+
+
+def ippe(problems: Problems) -> Pose:
+    """OpenCV's two poses of each problem, (B, 2, 3, 3) and (B, 2, 3)."""
+    import cv2
+
+    found = []
+    for world, img, camera in zip(*(x.numpy() for x in problems[:3]), strict=True):
+        _, turns, shifts, _ = cv2.solvePnPGeneric(world, img[:, None], camera, None, flags=cv2.SOLVEPNP_IPPE)
+        both = [(torch.from_numpy(turns[i % len(turns)]), torch.from_numpy(shifts[i % len(turns)])) for i in (0, 1)]
+        found.append([torch.cat((turn, shift))[:, 0] for turn, shift in both])
+    rows = torch.stack([torch.stack(pair) for pair in found])
+    pose = Pose.from_rvec(rows[..., :3].flatten(0, 1), rows[..., 3:].flatten(0, 1))
+    return Pose(pose.rotation.unflatten(0, (-1, 2)), pose.translation.unflatten(0, (-1, 2)))
+
+
+@torch.no_grad()
+def measure_squares(solver: nn.Module, count: int) -> list[dict[str, Any]]:
+    """How often the right pose of a planar target is the pose, or among the alternatives."""
+    rows = []
+    for tilt in TILTS:
+        for sigma in (0.5, 1.0, 3.0):
+            problems = square(tilt, sigma, count)
+
+            def right(
+                rotation: Tensor, translation: Tensor, truth: Pose = problems.pose, sigma: float = sigma
+            ) -> Tensor:
+                errors, distance = pose_errors(Pose(rotation, translation), truth), truth.translation.norm(dim=-1)
+                return (errors.rotation_error_deg < 5.0 + 5.0 * sigma) & (errors.translation_error < 0.1 * distance)
+
+            result = solver(*problems[:3], img_sigma=sigma, world_sigma=0.0, alternatives=2)
+            others, theirs = result.alternatives, ippe(problems)
+            first, any_right = (right(result.rotation, result.translation) for _ in range(2))
+            for i in (0, 1):
+                any_right |= others.valid[:, i] & right(others.rotation[:, i], others.translation[:, i])
+            of_theirs = [right(theirs.rotation[:, i], theirs.translation[:, i]) for i in (0, 1)]
+            shares = {
+                "pose": first,
+                "pose or alternatives": any_right,
+                "IPPE's first": of_theirs[0],
+                "IPPE's two": of_theirs[0] | of_theirs[1],
+                "problems with alternatives": others.valid.any(1),
+            }
+            row: dict[str, Any] = {"tilt": tilt, "sigma": sigma}
+            rows.append(row | {name: share.double().mean().item() for name, share in shares.items()})
+    return rows
+
+
 @torch.no_grad()
 def measure_times(solver: nn.Module) -> dict[str, float]:
     """Processor time of a problem in µs in float32, medians; what is told takes turns."""
@@ -236,6 +316,11 @@ def page(results: Mapping[str, Any]) -> str:
         [f"{row['n']}", f"{row['outliers']}", *(f"{100 * row[kind]:.1f} %" for kind in kinds)]
         for row in results["priors"]
     ]
+    found = [key for key in results["squares"][0] if key not in ("tilt", "sigma")]
+    squares = [
+        [f"{row['tilt']:.0f}°", f"{row['sigma']:.1f} px", *(f"{100 * row[kind]:.1f} %" for kind in found)]
+        for row in results["squares"]
+    ]
     times = ", ".join(f"{name} {value:.1f}" for name, value in results["us_per_problem"].items())
     return f"""# Uncertainty
 
@@ -264,6 +349,10 @@ Success. Gravity is known to {GRAVITY}°, the last pose to {TURN}° and {100 * S
 by {WRONG:.0f} standard deviations more.
 
 {markdown_table(["n", "Outliers", *kinds], priors)}
+
+## Planar targets
+
+{markdown_table(["Tilt", "Noise", *found], squares)}
 """
 
 
@@ -282,6 +371,7 @@ def main() -> None:
         "rows": measure_errors(solver, arguments.count),
         "covariances": measure_credibility(solver, arguments.count),
         "priors": measure_priors(solver, arguments.count),
+        "squares": measure_squares(solver, arguments.count),
     }
     write_json(arguments.out, results)
     text = page(results)

@@ -12,6 +12,7 @@ from .refine import RobustWeightedLM as RobustWeightedLM, gravity_prior as gravi
 from .registry import create_solver as create_solver, list_solvers as list_solvers, solve_pnp as solve_pnp
 from .solver import PnPNet as PnPNet
 from .types import (
+    Alternatives as Alternatives,
     Correspondences as Correspondences,
     Guess as Guess,
     Hypotheses as Hypotheses,

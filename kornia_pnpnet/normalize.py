@@ -337,14 +337,17 @@ class Normalize(Configured):
         """Bring values of pairs, :math:`(B, N)`, back to the order in which the pairs came."""
         return values if frame.order is None else torch.zeros_like(values).scatter(1, frame.order, values)
 
+    def undo_poses(self, poses: Pose, frame: Frame) -> Pose:
+        """:meth:`undo` for several poses of each problem, :math:`(B, S, 3, 3)` and :math:`(B, S, 3)`."""
+        batch, count = poses.translation.shape[:2]
+        frames = map_tensors(lambda x: x.repeat_interleave(count, 0), frame)
+        found = self.undo(map_tensors(lambda x: x.flatten(0, 1), poses), frames)
+        return map_tensors(lambda x: x.unflatten(0, (batch, count)), found)
+
     def undo_guess(self, guess: Guess, frame: Frame) -> Guess:
         """Express a guess in the frame, the order and the units of the inputs; ``ok``: whether the problem is valid."""
         others, noise = guess.others, guess.noise
-        if others is not None:
-            batch, count = others.translation.shape[:2]
-            frames = map_tensors(lambda x: x.repeat_interleave(count, 0), frame)
-            others = self.undo(map_tensors(lambda x: x.flatten(0, 1), others), frames)
-            others = map_tensors(lambda x: x.unflatten(0, (batch, count)), others)
+        others = None if others is None else self.undo_poses(others, frame)
         if noise is not None:
             noise = Noise(noise.img / frame.img_scale[:, None], noise.world / frame.scale[:, None])
             noise = map_tensors(lambda x: self.undo_pairs(x, frame), noise)

@@ -16,15 +16,15 @@ from kornia_pnpnet.core.checks import check_whole
 from kornia_pnpnet.core.linalg import bound_gradient
 from kornia_pnpnet.core.performance import Compiled, in_full_precision, sees_values
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.geometry import project
 from kornia_pnpnet.init import RANSAC, EPnP, MLPInit, REPPnP, SetInit
+from kornia_pnpnet.init.alternatives import find_alternatives, is_seen
 from kornia_pnpnet.init.ransac import search_on
 from kornia_pnpnet.inputs import Inputs, checked_inputs, joined, restore_leading, split_batch
 from kornia_pnpnet.normalize import VIEWS, Frame, Normalize
 from kornia_pnpnet.pretrained import read_weights, write_weights
 from kornia_pnpnet.refine import LMStart, LMStep, RobustWeightedLM
 from kornia_pnpnet.refine.prior import prior_in_frame
-from kornia_pnpnet.types import Correspondences, Guess, PnPResult, Pose, PosePrior, Status
+from kornia_pnpnet.types import Alternatives, Correspondences, Guess, PnPResult, Pose, PosePrior, Status
 
 __all__ = ["PnPNet"]
 
@@ -35,11 +35,8 @@ _INITIALISERS: dict[str, type[nn.Module]] = {
     "SetInit": SetInit,
 }
 
-
 # Bound of a problem's gradient by normalised coordinates, in which those of a problem that is ok are about 1.
 _LONGEST_GRADIENT = 10.0
-# Focal lengths. A pair that is not near is refined only when some first guess projects it this close to its pixel.
-_SEEN = 0.25
 
 
 class _Begun(NamedTuple):
@@ -136,6 +133,7 @@ class PnPNet(nn.Module):
         prior: PosePrior | None = None,
         first_stage_only: bool = False,
         gradient: str | None = None,
+        alternatives: int = 0,
     ) -> PnPResult:
         r"""Solve a batch of problems.
 
@@ -168,6 +166,8 @@ class PnPNet(nn.Module):
                 given. ``ok`` and ``probability`` are judged by the pairs alone. Unknown noise counts as one pixel.
             first_stage_only: return the first guess unrefined, the paper's "Net", at the cost of ``m=0``.
             gradient: ``"ok"`` or ``"always"``; the solver's own when ``None``.
+            alternatives: largest number of other poses to return that explain the pairs nearly as well. Looking for
+                them costs as much as several solutions.
 
         Returns:
             The :class:`~kornia_pnpnet.types.PnPResult`, in float64 when any input is, else in float32. Gradients flow
@@ -184,12 +184,13 @@ class PnPNet(nn.Module):
         """
         given = world_points, img_points, intrinsics, weights, mask, init, img_sigma, world_sigma, img_cov, world_cov
         size, inputs = checked_inputs(*given, confidence, prior)
+        check_whole(0, alternatives=alternatives)
         with in_full_precision(inputs.world_points.device.type):
             always = _checked_gradient(gradient or self.gradient) == "always"
             compiled = isinstance(self._first, Compiled) or isinstance(self._solve, Compiled)
             any_number = not (compiled or isinstance(self.init, MLPInit))
             parts = split_batch(inputs, getattr(self.init, "pairs_at_once", None), any_number)
-            results = [self._solve(first_stage_only, always, part.inputs) for part in parts]
+            results = [self._solve(first_stage_only, always, part.inputs, alternatives) for part in parts]
         return restore_leading(size, joined(parts, results))
 
     def with_guess(
@@ -263,8 +264,16 @@ class PnPNet(nn.Module):
 
     # -- the parts of a call -------------------------------------------------------------------------------------------
 
-    def _in_parts(self, first_stage_only: bool, always: bool, inputs: Inputs) -> PnPResult:
-        return self._parts(first_stage_only, always, inputs)[1]
+    def _in_parts(self, first_stage_only: bool, always: bool, inputs: Inputs, alternatives: int = 0) -> PnPResult:
+        begun, result = self._parts(first_stage_only, always, inputs)
+        if not alternatives:
+            return result
+        start, frame, guess = begun
+        pose = self.normalize.apply_to_pose(result.pose, frame)
+        found = find_alternatives(self.refine, start.corr, guess, pose, frame.valid, alternatives)
+        poses = self.normalize.undo_poses(Pose(found.rotation, found.translation), frame)
+        translation = torch.where(found.valid[..., None], poses.translation, 0.0)
+        return result._replace(alternatives=found._replace(translation=translation))
 
     def _parts(self, first_stage_only: bool, always: bool, inputs: Inputs) -> tuple[_Begun, PnPResult]:
         """Before the iterations, the iterations, and after them."""
@@ -313,7 +322,7 @@ class PnPNet(nn.Module):
             others = map_tensors(lambda *x: torch.stack(x, 1), *guess.poses[1:], given)
             guess = guess._replace(others=others, ok=None)
         if corr.near is not None and not getattr(self.init, "weighs_far_pairs", False):
-            guess = guess._replace(weights=guess.weights * torch.where(_is_seen(guess, corr), 1.0, corr.near))
+            guess = guess._replace(weights=guess.weights * torch.where(is_seen(guess, corr), 1.0, corr.near))
         return corr, frame, guess
 
     def _given(self, init: Pose | None, world_points: Tensor, frame: Frame) -> Pose:
@@ -342,16 +351,16 @@ class PnPNet(nn.Module):
         # ONNX Runtime chooses among int64, not among int8.
         status = torch.where(frame.valid, status, frame.status).to(torch.int8)
         live = finite if always else ok
-        rotation, translation = _gate_pose(pose, live, finite)
+        pose = _gate_pose(pose, live, finite)
         return PnPResult(
-            rotation,
-            translation,
+            *pose,
             _gate(self.normalize.undo_pairs(refined.weights, frame), live, finite, 0.0),
             _gate(refined.cost, live, finite, torch.finfo(refined.cost.dtype).max ** 0.5),
             ok,
             _gate_pose(first, first_ok, first_ok),
             status,
             torch.where(finite, refined.probability, 0.0),
+            Alternatives.none(pose),
         )
 
     # -- weights on disk ---------------------------------------------------------------------------------------------
@@ -425,15 +434,6 @@ class PnPNet(nn.Module):
 def _checked_gradient(gradient: str) -> str:
     KORNIA_CHECK(gradient in ("ok", "always"), f"gradient must be 'ok' or 'always', got {gradient!r}.")
     return gradient
-
-
-def _is_seen(guess: Guess, corr: Correspondences) -> Tensor:
-    """Whether any pose of a guess sees a pair's point about where its pixel is, bool (B, N)."""
-    seen = []
-    for pose in guess.poses:
-        projection = project(map_tensors(torch.Tensor.detach, pose), corr.map(torch.Tensor.detach))
-        seen.append(projection.in_front & (projection.sq_residual < (_SEEN * corr.focal) ** 2))
-    return torch.stack(seen).any(0)
 
 
 def _gate(value: Tensor, live: Tensor, finite: Tensor, fill: float | Tensor) -> Tensor:

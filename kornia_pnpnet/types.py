@@ -26,6 +26,7 @@ from kornia_pnpnet.core.symmetric import Symmetric2, Symmetric3
 from kornia_pnpnet.core.trees import map_tensors
 
 __all__ = [
+    "Alternatives",
     "Correspondences",
     "FramedPrior",
     "Guess",
@@ -151,7 +152,7 @@ class Pose(NamedTuple):
 
 
 def camera_matrices(intrinsics: Tensor | PinholeCamera) -> Tensor:
-    """Camera matrices (B, 3, 3) or (3, 3) from matrices or from Kornia's camera, whose extrinsics are ignored."""
+    """Camera matrices (B, 3, 3) or (3, 3) from matrices or from Kornia's camera without its extrinsics."""
     if not isinstance(intrinsics, PinholeCamera):
         return intrinsics
     matrices = intrinsics.camera_matrix
@@ -334,6 +335,31 @@ class Refinement(NamedTuple):
     probability: Tensor
 
 
+class Alternatives(NamedTuple):
+    r"""Other poses that explain the pairs nearly as well, without gradient.
+
+    Attributes:
+        rotation: world-to-camera rotations in the order of their costs, shape :math:`(B, S, 3, 3)`.
+        translation: world-to-camera translations, shape :math:`(B, S, 3)`.
+        cost: as :attr:`PnPResult.cost`, of the refinement that compares the poses, shape :math:`(B, S)`.
+        probability: probability of each pose when one of them or the result's pose is right, shape :math:`(B, S)`.
+        valid: which slots hold a pose, the first ones of a problem, bool, shape :math:`(B, S)`.
+    """
+
+    rotation: Tensor
+    translation: Tensor
+    cost: Tensor
+    probability: Tensor
+    valid: Tensor
+
+    @classmethod
+    def none(cls, pose: Pose) -> Alternatives:
+        """No slots, :math:`S = 0`, for the problems of a pose."""
+        empty = pose.translation.detach()[:, :0]  # (B, 0)
+        vectors = empty[..., None].expand(-1, -1, 3)
+        return cls(vectors[..., None].expand(-1, -1, -1, 3), vectors, empty, empty, empty > 0)
+
+
 class PnPResult(NamedTuple):
     r"""The result of every solver.
 
@@ -348,12 +374,11 @@ class PnPResult(NamedTuple):
             finite and carry no gradient.
         init: the first guess. It carries a gradient for every valid problem, also where refinement failed, so that an
             initialiser can learn from its failures.
-        status: why a problem is not ``ok``: the value of a :class:`Status`, int8, shape :math:`(B,)`. Every solver of
-            this package sets it.
+        status: why a problem is not ``ok``: the value of a :class:`Status`, int8, shape :math:`(B,)`.
         probability: estimated probability that the pose is not far off, which is within 10 degrees and 30 % of the
-            distance of the points, shape :math:`(B,)`, without gradient. How accurate it is beyond that,
-            :func:`~kornia_pnpnet.covariance.pose_covariance` says. Where the solver neither knows nor estimates the
-            noise, it is taken from the residuals. Peers do not estimate it: theirs is 1 where ``ok``.
+            distance of the points, shape :math:`(B,)`, without gradient. Where the solver neither knows nor estimates
+            the noise, it is taken from the residuals. Peers do not estimate it: theirs is 1 where ``ok``.
+        alternatives: other poses that explain the pairs nearly as well; no slots where the call did not ask for them.
     """
 
     rotation: Tensor
@@ -364,6 +389,7 @@ class PnPResult(NamedTuple):
     init: Pose
     status: Tensor | None = None
     probability: Tensor | None = None
+    alternatives: Alternatives | None = None
 
     @property
     def pose(self) -> Pose:
@@ -387,8 +413,7 @@ class Problems(NamedTuple):
         inliers: whether the pixel of a pair shows its point, bool, shape :math:`(B, N)`.
         img_sigma: standard deviation of the noise on each pixel coordinate, as a solver may know it: NaN where it is
             unknown, ``None`` where it is unknown for all problems, shape :math:`(B,)` or :math:`(B, N)`.
-        world_sigma: standard deviation of the noise on each world coordinate, NaN, ``None`` and shape as for
-            ``img_sigma``.
+        world_sigma: that of the noise on each world coordinate, with NaN, ``None`` and shape as for ``img_sigma``.
         confidence: belief that a pair is an inlier, in [0, 1], NaN and ``None`` as for ``img_sigma``, shape
             :math:`(B, N)`.
         img_cov: covariance of the noise of each pixel, as a solver may know it in place of ``img_sigma``, shape

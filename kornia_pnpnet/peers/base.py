@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from kornia_pnpnet.core.checks import check_positive, check_whole
 from kornia_pnpnet.inputs import checked_inputs, restore_leading
-from kornia_pnpnet.types import MIN_PAIRS, PnPResult, Pose, Status
+from kornia_pnpnet.types import MIN_PAIRS, Alternatives, PnPResult, Pose, Status
 
 __all__ = ["PeerPose", "PeerSolver"]
 
@@ -148,15 +148,16 @@ class PeerSolver(nn.Module):
         def back(values: np.ndarray) -> Tensor:
             return torch.from_numpy(values).clamp(-largest, largest).to(world_points)
 
+        pose = Pose(back(rotation), back(translation))
         result = PnPResult(
-            back(rotation),
-            back(translation),
+            *pose,
             back(pair_weights),
             back(cost),
             torch.from_numpy(ok).to(world_points.device),
             Pose(back(first_rotation), back(first_translation)),
             torch.from_numpy(np.where(ok, Status.SOLVED, status).astype(np.int8)).to(world_points.device),
             back(ok.astype(np.float64)),
+            Alternatives.none(pose),
         )
         return restore_leading(size, result)
 

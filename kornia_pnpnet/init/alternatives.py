@@ -1,0 +1,166 @@
+"""Other poses that explain the pairs nearly as well: mirror images of planes, other solutions of three pairs."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from kornia_pnpnet.core.performance import repeat_problems
+from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.geometry import project, rotation_angle
+from kornia_pnpnet.init.ransac.p3p import p3p
+from kornia_pnpnet.refine import RobustWeightedLM
+from kornia_pnpnet.refine.verdict import residual_noise
+from kornia_pnpnet.types import Alternatives, Correspondences, Guess, Pose
+
+__all__ = ["find_alternatives", "is_seen"]
+
+# A pose explains the pairs nearly as well when its likelihood is at least this share of the best one's.
+_LIKELY = 1e-3
+# Radians, and shares of the distance of the points: poses that are closer are the same minimum.
+_SAME_TURN, _SAME_SHIFT = 0.035, 0.035
+# Focal lengths. A pair that is not near is refined only when some first guess projects it this close to its pixel.
+_SEEN = 0.25
+# For solvers that do not refine: iterations with a classical kernel.
+_ITERATIONS = 20
+
+
+@torch.no_grad()
+def find_alternatives(
+    refine: RobustWeightedLM, corr: Correspondences, guess: Guess, pose: Pose, valid: Tensor, most: int
+) -> Alternatives:
+    """Refine other starts and keep the minima that differ from the pose, and from each other, and are nearly as likely.
+
+    The starts are the mirror image of the pose about the line of sight to the plane through the points, all poses of
+    three pairs that lie far apart, and the poses of the guess.
+
+    Args:
+        refine: the refinement that found the pose.
+        corr: normalised correspondences.
+        guess: what the refinement started from.
+        pose: the pose that was found.
+        valid: problems that have a pose at all, bool (B,).
+        most: largest number of other poses.
+
+    Returns:
+        The other poses in the frame of the correspondences.
+    """
+    corr, pose = corr.map(torch.Tensor.detach), map_tensors(torch.Tensor.detach, pose)
+    guess = map_tensors(torch.Tensor.detach, guess)
+    weights = corr.weights * guess.weights
+    starts = [pose, _mirrored(pose, corr, weights), *_of_three(corr, weights, pose), *guess.poses]
+    count, batch = len(starts), weights.shape[0]
+    many = repeat_problems(corr, count)
+    tried = Guess(
+        map_tensors(lambda *x: torch.cat(x), *starts),
+        repeat_problems(guess.weights, count),
+        noise=repeat_problems(guess.noise, count),
+    )
+    refine = refine if refine.m else RobustWeightedLM(_ITERATIONS, kernel="cauchy", learnable=False)
+    for _ in range(2):
+        refined = refine(many, tried)
+        tried = tried._replace(pose=refined.pose)
+    ends = map_tensors(lambda x: x.unflatten(0, (count, batch)), refined.pose)  # (S, B, ...)
+    cost = refined.cost.unflatten(0, (count, batch))
+    usable = (refined.in_front & refined.cost.isfinite()).unflatten(0, (count, batch))
+
+    # From costs, which are means over the pairs, to log-likelihoods.
+    unit = (corr.weights > 0).sum(-1) / _unit(corr, guess, Pose(*(x[0] for x in ends)))
+    log_ratio = -0.5 * unit * (cost - cost[0])
+    usable = usable & (log_ratio > torch.tensor(_LIKELY).log())
+    log_ratio, order = torch.where(usable, log_ratio, -torch.inf).sort(dim=0, descending=True, stable=True)
+    cost, usable = cost.gather(0, order), usable.gather(0, order)
+    ends = Pose(*(x.gather(0, order.view(count, batch, *(1,) * (x.ndim - 2)).expand_as(x)) for x in ends))
+    same = [_are_same(ends, Pose(*(x[i] for x in ends)), corr, weights) for i in range(count)]  # (S, B) each
+    valid = usable & valid & ~_are_same(ends, pose, corr, weights)
+    for i in range(1, count):
+        again = (same[i][:i] & valid[:i]).any(0)
+        valid[i] = valid[i] & ~again
+    share = torch.where(valid, log_ratio, -torch.inf).exp()
+    probability = share / (1.0 + share.sum(0))
+
+    position = (~valid).to(torch.int8).sort(dim=0, stable=True).indices[:most]
+    eye = torch.eye(3, dtype=cost.dtype, device=cost.device)
+    chosen = valid.gather(0, position)
+
+    def pick(x: Tensor, fill: Tensor | float) -> Tensor:
+        shape = (*position.shape, *(1,) * (x.ndim - 2))
+        picked = x.gather(0, position.view(shape).expand(-1, -1, *x.shape[2:]))
+        return torch.where(chosen.view(shape), picked, fill).movedim(0, 1)
+
+    largest = torch.finfo(cost.dtype).max ** 0.5
+    picked = pick(ends.rotation, eye), pick(ends.translation, 0.0), pick(cost, largest), pick(probability, 0.0)
+    return Alternatives(*picked, chosen.mT)
+
+
+def _mirrored(pose: Pose, corr: Correspondences, weights: Tensor) -> Pose:
+    """Half a turn about the normal of the plane through the points, then about the line of sight to its middle."""
+    share = weights / weights.sum(-1, keepdim=True).clamp(min=torch.finfo(weights.dtype).tiny)
+    middle = (share[..., None] * corr.world_points).sum(1)
+    centred = corr.world_points - middle[:, None]
+    covariance = centred.mT @ (share[..., None] * centred)
+    normal = torch.linalg.eigh(covariance).eigenvectors[..., 0]
+    seen = (pose.rotation @ middle[..., None])[..., 0] + pose.translation
+    rotation = _half_turn(seen) @ pose.rotation @ _half_turn(normal)
+    return Pose(rotation, seen - (rotation @ middle[..., None])[..., 0])
+
+
+def _half_turn(axis: Tensor) -> Tensor:
+    axis = functional.normalize(axis, dim=-1)
+    return 2.0 * axis[:, :, None] * axis[:, None] - torch.eye(3, dtype=axis.dtype, device=axis.device)
+
+
+def _of_three(corr: Correspondences, weights: Tensor, fallback: Pose) -> list[Pose]:
+    """The four poses of three likely pairs that lie far apart; the fallback where there are fewer."""
+    likely = weights * (weights > 0.5 * weights.amax(1, keepdim=True))
+
+    def farthest(size: Tensor) -> Tensor:
+        return torch.where(likely > 0, size, -1.0).argmax(1, keepdim=True)
+
+    def at(x: Tensor, index: Tensor) -> Tensor:
+        return x.gather(1, index[..., None].expand(-1, -1, x.shape[-1]))
+
+    points = corr.world_points
+    middle = (likely[..., None] * points).sum(1, keepdim=True) / likely.sum(1).clamp(min=1e-30)[:, None, None]
+    first = farthest((points - middle).square().sum(-1))
+    second = farthest((points - at(points, first)).square().sum(-1))
+    side = at(points, second) - at(points, first)
+    third = farthest(torch.linalg.cross(points - at(points, first), side.expand_as(points)).square().sum(-1))
+    index = torch.cat((first, second, third), 1)
+    solutions = p3p(at(points, index), at(corr.img_points, index) / corr.focal)
+    poses = []
+    for i in range(solutions.valid.shape[1]):
+        valid = solutions.valid[:, i]
+        rotation = torch.where(valid[:, None, None], solutions.pose.rotation[:, i], fallback.rotation)
+        poses.append(
+            Pose(rotation, torch.where(valid[:, None], solutions.pose.translation[:, i], fallback.translation))
+        )
+    return poses
+
+
+def _unit(corr: Correspondences, guess: Guess, pose: Pose) -> Tensor:
+    """What a squared residual of one standard deviation costs, (B,)."""
+    if corr.noise is not None or guess.noise is not None:
+        return torch.ones_like(corr.weights[:, 0])
+    noise = residual_noise(project(pose, corr), corr, corr.weights * guess.weights)
+    return noise.img[:, 0].square()
+
+
+def _are_same(poses: Pose, other: Pose, corr: Correspondences, weights: Tensor) -> Tensor:
+    """Which of the poses (S, B, ...) are the other pose (B, ...), bool (S, B)."""
+    share = weights / weights.sum(-1, keepdim=True).clamp(min=torch.finfo(weights.dtype).tiny)
+    middle = (share[..., None] * corr.world_points).sum(1)
+    seen = (poses.rotation @ middle[..., None])[..., 0] + poses.translation
+    there = (other.rotation @ middle[..., None])[..., 0] + other.translation
+    shift = (seen - there).norm(dim=-1) < _SAME_SHIFT * there.norm(dim=-1)
+    return shift & (rotation_angle(poses.rotation, other.rotation.expand_as(poses.rotation)) < _SAME_TURN)
+
+
+def is_seen(guess: Guess, corr: Correspondences) -> Tensor:
+    """Whether any pose of a guess sees a pair's point about where its pixel is, bool (B, N)."""
+    seen = []
+    for pose in guess.poses:
+        projection = project(map_tensors(torch.Tensor.detach, pose), corr.map(torch.Tensor.detach))
+        seen.append(projection.in_front & (projection.sq_residual < (_SEEN * corr.focal) ** 2))
+    return torch.stack(seen).any(0)

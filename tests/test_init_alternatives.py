@@ -1,0 +1,124 @@
+"""Other poses: the mirror image of a plane, the solutions of three pairs; none where there is one minimum."""
+
+import math
+
+import pytest
+import torch
+from kornia.core.exceptions import BaseError
+
+from kornia_pnpnet import Pose, create_solver, p3p, pose_errors
+from kornia_pnpnet.geometry import transform
+
+NAMES = ["pnpnet-set", "epnp-lm", "reppnp-lm", "p3p-ransac"]
+
+
+def boards(generator, batch=60, tilt=40.0, sigma=0.0, dtype=torch.float64):
+    """A board of nine points, tilted, from far away: its mirror image projects to almost the same pixels."""
+    side = torch.linspace(-0.1, 0.1, 3, dtype=dtype)
+    world = torch.cat((torch.cartesian_prod(side, side), torch.zeros(9, 1, dtype=dtype)), 1).expand(batch, 9, 3)
+    azimuth, x, y = torch.rand(3, batch, generator=generator, dtype=dtype)
+    azimuth = 2.0 * math.pi * azimuth
+    axis = torch.stack((azimuth.cos(), azimuth.sin(), 0.0 * azimuth), -1) * math.radians(tilt)
+    pose = Pose.from_rvec(axis, torch.stack((0.5 * x, 0.5 * y, 2.5 + x), -1))
+    camera = torch.tensor([[800.0, 0.0, 320.0], [0.0, 800.0, 240.0], [0.0, 0.0, 1.0]], dtype=dtype)
+    seen = transform(pose, world) @ camera.mT
+    noise = sigma * torch.randn(batch, 9, 2, generator=generator, dtype=dtype)
+    return world, seen[..., :2] / seen[..., 2:] + noise, camera.expand(batch, 3, 3), pose
+
+
+def near(rotation, translation, pose):
+    errors = pose_errors(Pose(rotation, translation), pose)
+    return (errors.rotation_error_deg < 15.0) & (errors.translation_error < 0.3)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_right_pose_of_a_board_is_among_them(name, generator):
+    *given, pose = boards(generator, sigma=0.7)
+    with torch.no_grad():
+        result = create_solver(name)(*given, alternatives=2)
+    first, found = near(result.rotation, result.translation, pose), result.alternatives
+    either = first.clone()
+    for i in (0, 1):
+        either |= found.valid[:, i] & near(found.rotation[:, i], found.translation[:, i], pose)
+    assert either.double().mean() > max(0.9, first.double().mean())
+    assert found.rotation.shape == (60, 2, 3, 3)
+    there = found.valid
+    assert there[:, 0].double().mean() > 0.5
+    assert (there[:, 0] | ~there[:, 1]).all()
+    assert (found.cost[:, 1] >= found.cost[:, 0])[there[:, 1]].all()
+    assert ((found.probability > 0) == there).all()
+    assert (found.probability.sum(1) < 1).all()
+    assert torch.equal(found.rotation[~there], torch.eye(3, dtype=torch.float64).expand(int((~there).sum()), 3, 3))
+    for i in (0, 1):
+        errors = pose_errors(Pose(found.rotation[:, i], found.translation[:, i]), result.pose)
+        assert (errors.rotation_error_deg > 1.9)[there[:, i]].all()
+
+
+def test_the_solutions_of_three_pairs(make_problems):
+    problems = make_problems(n=3, batch=50, noise=False)
+    plane = (problems.img_points - problems.intrinsics[:, None, :2, 2]) / problems.intrinsics[:, None, [0, 1], [0, 1]]
+    every, valid = p3p(problems.world_points, plane)
+    with torch.no_grad():
+        result = create_solver("pnpnet-set")(*problems[:3], alternatives=3)
+    answers = [(result.rotation, result.translation, torch.ones_like(result.ok))]
+    found = result.alternatives
+    answers += [(found.rotation[:, i], found.translation[:, i], found.valid[:, i]) for i in range(3)]
+    seen = torch.zeros_like(valid)
+    for rotation, translation, there in answers:
+        for i in range(4):
+            errors = pose_errors(Pose(every.rotation[:, i], every.translation[:, i]), Pose(rotation, translation))
+            close = (errors.rotation_error_deg < 3.0) & (errors.translation_error < 0.05 * translation.norm(dim=-1))
+            seen[:, i] |= there & close
+    assert (seen | ~valid).double().mean() > 0.95
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_none_where_the_pairs_say_enough(name, make_problems):
+    problems = make_problems(n=50, batch=20)
+    solver = create_solver(name, **({"threshold": 20.0} if name == "p3p-ransac" else {}))
+    with torch.no_grad():
+        expected, result = solver(*problems[:3]), solver(*problems[:3], alternatives=3)
+    assert expected.alternatives.valid.shape == (20, 0)
+    assert not result.alternatives.valid.any()
+    assert torch.equal(result.matrix, expected.matrix)
+
+
+def test_batch_dtype_padding_and_bad_problems(generator):
+    world, img, camera, _ = boards(generator, batch=6, sigma=1.0)
+    solver = create_solver("pnpnet-set")
+    with torch.no_grad():
+        whole = solver(world, img, camera, alternatives=2)
+        one = solver(world[2], img[2], camera[2], alternatives=2)
+        nested = solver(*(x.unflatten(0, (2, 3)) for x in (world, img, camera)), alternatives=2).alternatives
+        mask = torch.ones(6, 12, dtype=torch.bool)
+        mask[:, 9:] = False
+        padded = [torch.nn.functional.pad(x, (0, 0, 0, 3)) for x in (world, img)]
+        masked = solver(*padded, camera, mask=mask, alternatives=2)
+        broken = img.clone()
+        broken[1, 0, 0] = torch.nan
+        bad = solver(world, broken, camera, alternatives=2)
+        single = solver(*(x.float() for x in (world, img, camera)), alternatives=2)
+    for other in (bad, masked):
+        keep = [0, 2, 3, 4, 5]
+        torch.testing.assert_close(
+            other.alternatives.rotation[keep], whole.alternatives.rotation[keep], atol=1e-6, rtol=0
+        )
+    torch.testing.assert_close(one.alternatives.rotation, whole.alternatives.rotation[2], atol=1e-6, rtol=0)
+    assert nested.valid.shape == (2, 3, 2)
+    assert not bad.alternatives.valid[1].any()
+    assert all(x.isfinite().all() for x in bad.alternatives)
+    assert single.alternatives.rotation.dtype == torch.float32
+    assert (single.alternatives.valid == whole.alternatives.valid).double().mean() > 0.8
+    with pytest.raises(BaseError, match="alternatives"):
+        solver(world, img, camera, alternatives=-1)
+
+
+def test_gradients_do_not_change(generator):
+    world, img, camera, _ = boards(generator, batch=4, sigma=1.0)
+    gradients = []
+    for alternatives in (0, 2):
+        pixels = img.clone().requires_grad_()
+        result = create_solver("pnpnet-set")(world, pixels, camera, alternatives=alternatives)
+        gradients.append(torch.autograd.grad(result.translation.sum(), pixels)[0])
+    assert torch.equal(*gradients)
+    assert not result.alternatives.rotation.requires_grad
