@@ -13,7 +13,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
 from kornia_pnpnet.core.checks import check_whole
-from kornia_pnpnet.core.linalg import bound_gradient
+from kornia_pnpnet.core.linalg import bound_gradient, gate
 from kornia_pnpnet.core.performance import Compiled, in_full_precision, sees_values
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.init import RANSAC, EPnP, MLPInit, REPPnP, SetInit
@@ -70,7 +70,8 @@ class PnPNet(nn.Module):
         effort: ``"fixed"``, or ``"adaptive"``: where the poses of the initialiser do not suffice, a problem gets as
             many more minimal samples as it needs (``init.ransac.search_on``). Others do not wait for it. Needs an
             initialiser that estimates the noise, :class:`~kornia_pnpnet.init.SetInit`. The samples have no gradient.
-            Exported graphs, ``torch.func.vmap`` and the device ``meta`` have the fixed effort.
+            ``None``: adaptive with such an initialiser and a refinement in evaluation mode, else fixed. Always fixed:
+            exported graphs, ``compile(whole=True)``, ``torch.func.vmap`` and the device ``meta``.
         gradient: which problems carry a gradient: those that are ``"ok"``, or ``"always"`` every valid problem, to
             train a network that does not predict anything sensible yet. The gradient of each problem to its normalised
             points, pixels and weights is then finite and at most 10 long.
@@ -99,12 +100,12 @@ class PnPNet(nn.Module):
         *,
         views: int = 1,
         gradient: str = "ok",
-        effort: str = "fixed",
+        effort: str | None = None,
     ) -> None:
         super().__init__()
         check_whole(1, len(VIEWS), views=views)
         self.gradient = _checked_gradient(gradient)
-        KORNIA_CHECK(effort in ("fixed", "adaptive"), f"effort must be 'fixed' or 'adaptive', got {effort!r}.")
+        KORNIA_CHECK(effort in (None, "fixed", "adaptive"), f"effort must be 'fixed' or 'adaptive', got {effort!r}.")
         self.effort = effort
         self.views = int(views)
         self.init = init
@@ -251,10 +252,9 @@ class PnPNet(nn.Module):
         Args:
             mode: mode of ``torch.compile``; ``"reduce-overhead"`` captures CUDA graphs.
             whole: compile the solver as one graph, with its iterations one after the other. The first call takes
-                longer; calls of a few problems, which mostly wait for Python, take half the time. The search of
-                ``effort="adaptive"`` is no graph: with it, parts are compiled.
+                longer; calls of a few problems, which mostly wait for Python, take half the time. A search is no
+                graph: the effort is fixed.
         """
-        whole = whole and self.effort == "fixed"
         self._solve = Compiled(self._in_parts, mode) if whole else self._in_parts
         self._first = self._first_guess if whole else Compiled(self._first_guess, mode)
         self._begin = self._guess if whole else Compiled(self._guess, mode)
@@ -278,7 +278,7 @@ class PnPNet(nn.Module):
     def _parts(self, first_stage_only: bool, always: bool, inputs: Inputs) -> tuple[_Begun, PnPResult]:
         """Before the iterations, the iterations, and after them."""
         views = 1 if first_stage_only or self.refine.m == 0 else self.views
-        if self.effort == "fixed" or first_stage_only or not sees_values(inputs.world_points):
+        if first_stage_only or not self._searches(inputs):
             begun = self._begin(views, always, inputs)
         else:
             corr, frame, guess = self._first(views, always, inputs)
@@ -286,6 +286,13 @@ class PnPNet(nn.Module):
             begun = _Begun(self.refine.begin(corr, guess), frame, guess)
         end = self.refine.iterate(begun.start, 0 if first_stage_only else None)
         return begun, self._finish(begun, end, always)
+
+    def _searches(self, inputs: Inputs) -> bool:
+        """Whether the effort is adaptive."""
+        if self.effort == "fixed" or not sees_values(inputs.world_points):
+            return False
+        can = isinstance(self.init, SetInit) and self.refine.m > 0
+        return self.effort == "adaptive" or (can and not self.training)
 
     def _guess(self, views: int, always: bool, inputs: Inputs) -> _Begun:
         """Everything before the first iteration."""
@@ -354,8 +361,8 @@ class PnPNet(nn.Module):
         pose = _gate_pose(pose, live, finite)
         return PnPResult(
             *pose,
-            _gate(self.normalize.undo_pairs(refined.weights, frame), live, finite, 0.0),
-            _gate(refined.cost, live, finite, torch.finfo(refined.cost.dtype).max ** 0.5),
+            gate(self.normalize.undo_pairs(refined.weights, frame), live, finite, 0.0),
+            gate(refined.cost, live, finite, torch.finfo(refined.cost.dtype).max ** 0.5),
             ok,
             _gate_pose(first, first_ok, first_ok),
             status,
@@ -436,15 +443,7 @@ def _checked_gradient(gradient: str) -> str:
     return gradient
 
 
-def _gate(value: Tensor, live: Tensor, finite: Tensor, fill: float | Tensor) -> Tensor:
-    """Keep the gradient of problems that are live, the value of those that are finite, and fill the others."""
-    shape = (-1,) + (1,) * (value.ndim - 1)
-    if torch.is_grad_enabled():  # a tensor that forward mode differentiates does not require a gradient
-        value = torch.where(live.view(shape), value, value.detach())
-    return torch.where(finite.view(shape), value, fill).contiguous()
-
-
 def _gate_pose(pose: Pose, ok: Tensor, finite: Tensor) -> Pose:
-    """:func:`_gate` for a pose; the identity fills."""
+    """:func:`~kornia_pnpnet.core.linalg.gate` for a pose; the identity fills."""
     eye = torch.eye(3, dtype=pose.rotation.dtype, device=pose.rotation.device)
-    return Pose(_gate(pose.rotation, ok, finite, eye), _gate(pose.translation, ok, finite, 0.0))
+    return Pose(gate(pose.rotation, ok, finite, eye), gate(pose.translation, ok, finite, 0.0))

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
@@ -22,7 +23,8 @@ SHORT = ("debug=two_updates", "train.updates=3")
 def swept(experiment):
     """What an experiment runs over: its own sweeper's overrides, one at a time."""
     params = OmegaConf.select(OmegaConf.load(FILES[experiment]), "hydra.sweeper.params") or {}
-    return {key: str(values).split(",") for key, values in params.items()}
+    overrides = OverridesParser.create().parse_overrides([f"{key}={values}" for key, values in params.items()])
+    return {x.key_or_group: list(x.sweep_string_iterator()) for x in overrides}
 
 
 # An experiment alone, and with the first and the last value of each override that its sweeper runs over.

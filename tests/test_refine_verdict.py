@@ -12,7 +12,16 @@ import torch
 from kornia_pnpnet import Correspondences, create_solver, pose_errors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.geometry import project, transform
-from kornia_pnpnet.refine.verdict import LAWS, MAX_ERROR, Judged, Thresholds, chance_of_inlier, judge, log_false_alarms
+from kornia_pnpnet.refine.verdict import (
+    LAWS,
+    LEAST_PROBABILITY,
+    MAX_ERROR,
+    Judged,
+    Thresholds,
+    chance_of_inlier,
+    judge,
+    log_false_alarms,
+)
 
 
 def test_inliers_weigh_by_the_inverse_of_their_threshold(make_problems, correspond):
@@ -87,19 +96,22 @@ def test_false_alarms_by_counting():
 # --- the probability that a pose is not far off ---------------------------------------------------------------------
 
 
-def of_solver(problems, **told):
-    return create_solver("pnpnet-set")(problems.world_points, problems.img_points, problems.intrinsics, **told)
+def of_solver(problems, effort=None, **told):
+    solver = create_solver("pnpnet-set", effort=effort)
+    return solver(problems.world_points, problems.img_points, problems.intrinsics, **told)
 
 
 @pytest.mark.parametrize("told", [{}, {"img_sigma": 1.0, "world_sigma": 0.05}], ids=["found", "told"])
-def test_probability_tells_sound_problems_from_random_pixels(told):
+@pytest.mark.parametrize(("effort", "most"), [("fixed", 0.8), ("adaptive", LEAST_PROBABILITY)])
+def test_probability_tells_sound_problems_from_random_pixels(effort, most, told):
+    """Who searches longer finds better poses by chance, none of which is ``ok``."""
     sound = SyntheticProblems(n=20, batch_size=200, seed=3).batch(0)
-    result = of_solver(sound, **told)
+    result = of_solver(sound, effort, **told)
     assert result.probability.median() > 0.99
     noise = sound._replace(img_points=sound.img_points.roll(1, 0))  # the pixels of another problem
-    wrong = of_solver(noise, **told)
+    wrong = of_solver(noise, effort, **told)
     # The law is that of problems most of which have a pose.
-    assert wrong.probability.median() < 0.8
+    assert wrong.probability.median() < most
     assert not wrong.ok.double().mean() > 0.05
     for found in (result, wrong):
         assert ((found.probability >= 0) & (found.probability <= 1)).all()

@@ -325,6 +325,16 @@ def test_adaptive_effort_finds_poses_among_nine_tenths_of_outliers():
     assert rates["adaptive"] > max(0.95, rates["fixed"] + 0.1), rates
 
 
+def test_effort_is_adaptive_in_inference_and_fixed_in_training():
+    world, pixels, camera = hard_problems(4)[:3]
+    solvers = [create_solver("pnpnet-set", effort=effort) for effort in ("fixed", "adaptive", None)]
+    fixed, adaptive = (solver(world, pixels, camera).translation for solver in solvers[:2])
+    assert not torch.allclose(fixed, adaptive, rtol=1e-3)
+    solver = solvers[2]
+    assert torch.equal(solver(world, pixels, camera).translation, adaptive)
+    assert torch.equal(solver.train()(world, pixels, camera).translation, fixed)
+
+
 def test_adaptive_effort_depends_on_no_other_problem():
     hard = hard_problems(6)
     easy = SyntheticProblems(n=200, batch_size=6, seed=6).batch(0)

@@ -246,7 +246,7 @@ def run(seed: int, updates: int, batches: int) -> tuple[dict[str, Any], dict[str
     """Train both from one start."""
     torch.set_num_threads(1)
     torch.manual_seed(seed)
-    solver = create_solver("pnpnet-set").requires_grad_(False)
+    solver = create_solver("pnpnet-set", effort="fixed").requires_grad_(False)
     start = Keypoints()
     untrained = copy.deepcopy(start)
     found: dict[str, Any] = {"keypoints first": {"curves": train(start, None, seed, range(updates))}}

@@ -49,7 +49,7 @@ def distance_of_dlt(keypoints: Tensor, pixels: Tensor, sigma: Tensor, truth: Pos
 
 def distance_of_pnpnet() -> Loss:
     """The same with this package's solver."""
-    solver = create_solver("pnpnet-set", gradient="always")
+    solver = create_solver("pnpnet-set", gradient="always", effort="fixed")
 
     def loss(keypoints: Tensor, pixels: Tensor, sigma: Tensor, truth: Pose) -> Tensor:
         result = solver(keypoints, pixels, CAMERA, img_sigma=sigma.detach())

@@ -15,9 +15,11 @@ from torch import Tensor
 from kornia_pnpnet.core.performance import compiling
 
 __all__ = [
+    "bound_gradient",
     "dot",
     "eigenvectors",
     "factorise",
+    "gate",
     "nearest_rotation",
     "relative",
     "small_product",
@@ -71,6 +73,21 @@ def bound_gradient(values: Tensor, limit: float) -> Tensor:
     """
     bounded: Tensor = _BoundedGradient.apply(values, limit)  # type: ignore[no-untyped-call]
     return bounded
+
+
+def gate(value: Tensor, live: Tensor, finite: Tensor, fill: float | Tensor) -> Tensor:
+    """Keep the gradient of problems that are live, the value of those that are finite, and fill the others.
+
+    Args:
+        value: shape :math:`(B, *)`.
+        live: bool, shape :math:`(B,)`.
+        finite: bool, shape :math:`(B,)`.
+        fill: a number, or of the shape of one problem.
+    """
+    shape = (-1,) + (1,) * (value.ndim - 1)
+    if torch.is_grad_enabled():  # a tensor that forward mode differentiates does not require a gradient
+        value = torch.where(live.view(shape), value, value.detach())
+    return torch.where(finite.view(shape), value, fill).contiguous()
 
 
 def relative(values: Tensor, size: Tensor) -> Tensor:

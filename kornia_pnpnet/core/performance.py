@@ -52,12 +52,14 @@ def exporting() -> bool:
 
 def sees_values(x: Tensor) -> bool:
     """Whether what happens next may depend on values: not in graphs, in ``torch.func.vmap`` and on the device meta."""
+    if compiling():
+        return False
     functorch = torch._C._functorch
     while functorch.is_functorch_wrapped_tensor(x):
         if functorch.is_batchedtensor(x):
             return False
         x = functorch.get_unwrapped(x)
-    return not (compiling() or x.device.type == "meta")
+    return x.device.type != "meta"
 
 
 def in_full_precision(device: str) -> AbstractContextManager[Any]:

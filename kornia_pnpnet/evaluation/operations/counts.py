@@ -82,6 +82,7 @@ def _solver(spec: str, n: int) -> PnPNet:
         raise ValueCheckError(f"The operations of {spec!r} cannot be counted: it is not a solver in PyTorch.")
     if name in _ANY_N:
         solver.init = MLPInit(n)
+    solver.effort = "fixed"  # the operations of a search depend on the data
     return solver
 
 
