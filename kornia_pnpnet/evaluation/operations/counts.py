@@ -48,7 +48,8 @@ def operation_count(solver: str | PnPNet, n: int, *, outliers: int = 0) -> float
         solver: the solver, or its name as for :func:`~kornia_pnpnet.evaluation.named_solvers.load_solver`. The names
             ``net``, ``pnpnet`` and ``pnpnet-paper`` stand for networks that are built for ``n`` pairs.
         n: number of pairs, at least 3.
-        outliers: number of outliers among them. Only the counts of RANSAC depend on it.
+        outliers: number of outliers among them. Only the counts of RANSAC depend on it: solvers by name have the fixed
+            effort.
 
     Returns:
         Operations weighted by :data:`~kornia_pnpnet.evaluation.operations.costs.OPERATION_COSTS`, the mean over 64
