@@ -10,7 +10,7 @@ from torch.nn import functional
 from kornia_pnpnet.core.checks import check_devices, check_whole
 from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.linalg import dot, small_product, solve_symmetric
-from kornia_pnpnet.core.performance import take_pairs
+from kornia_pnpnet.core.performance import present_first, sees_values, take_pairs
 from kornia_pnpnet.geometry import align, project
 from kornia_pnpnet.init.ransac import p3p
 from kornia_pnpnet.refine.prior import votes
@@ -360,8 +360,15 @@ class SetInit(Configured):
         if len(samples) > 1:  # by the number of pairs without padding, so that padding changes nothing
             enough = [(there.sum(1) >= least).expand(len(group), -1) for least, group in samples.items()]
             valid = valid & torch.cat(enough)
+        valid = valid.flatten(0, 1)  # (H, B)
+        rotation = rotation.flatten(0, 1)  # (9, H, B)
+        if batch and valid.device.type == "cpu" and sees_values(valid):  # most slots hold no pose
+            slots = present_first(valid.mT)[:, : max(int(valid.sum(0).max()), 1)].mT
+            rotation, translation = (x.gather(1, slots.expand(len(x), -1, -1)) for x in (rotation, translation))
+            valid = valid.gather(0, slots)
         # `project` sees hypotheses as the batch and problems as points, so that problems stay last: (H, K, B, 1).
-        every = Pose(rotation.permute(2, 0, 1, 3)[:, :, :, None], translation.permute(1, 0, 2)[:, :, None])
+        matrices = rotation.unflatten(0, (3, 3))
+        every = Pose(matrices.permute(2, 0, 1, 3)[:, :, :, None], translation.permute(1, 0, 2)[:, :, None])
         world, img, vote, *sigmas = (x.permute(1, 2, 0)[..., None, :] for x in pairs.split((3, 2, 1, 1, 1)))
         judges = Correspondences(world, img, vote[..., 0], corr.focal)
         projection = project(every, judges)
@@ -373,10 +380,10 @@ class SetInit(Configured):
         support = judges.weights / (1.0 + projection.sq_residual / (_JUDGED * variance))
         support = torch.where(projection.in_front, support, 0.0).sum(1)[..., 0]  # (H, B)
         if corr.prior is not None:
-            support = support + votes(corr.prior, Pose(rotation.permute(2, 3, 0, 1), translation.permute(1, 2, 0)))
-        best = torch.where(valid.flatten(0, 1), support, -1.0).max(0)
+            support = support + votes(corr.prior, Pose(matrices.permute(2, 3, 0, 1), translation.permute(1, 2, 0)))
+        best = torch.where(valid, support, -1.0).max(0)
         index = best.indices
-        rotation = rotation.flatten(0, 1).gather(1, index.expand(9, 1, -1)).view(3, 3, batch)
+        rotation = rotation.gather(1, index.expand(9, 1, -1)).view(3, 3, batch)
         translation = translation.gather(1, index.expand(3, 1, -1))[:, 0]
         found = best.values > 0.0
         return Pose(*(torch.where(found, x, y) for x, y in zip((rotation, translation), fallback, strict=True)))
