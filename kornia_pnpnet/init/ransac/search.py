@@ -140,8 +140,13 @@ class Search:
             rotation, translation = (x.to(_DTYPE) for x in given)
             packed = self.scene.pack(rotation.permute(2, 3, 0, 1), translation.permute(2, 0, 1))
             matrices = torch.cat((rotation, translation[..., None]), -1)
-            improve(active, self.scene.losses(packed, plan.scorer)[active], matrices[active])
+            losses, matrices = self.scene.losses(packed, plan.scorer)[active], matrices[active]
+            loss[active], best = losses.min(1)
+            matrix[active] = matrices[torch.arange(len(best), device=device), best]
             poses[active] += rotation.shape[1]
+            expect(active)
+            hard = needed[active] > worth
+            improve(active[hard], losses[hard], matrices[hard])
             if worth:
                 active = active[needed[active] > worth]
         start = stop = 0
