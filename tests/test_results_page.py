@@ -30,7 +30,7 @@ def row(rate, *, half=1.0, **columns):
 def test_the_page_is_rendered_from_its_files(render):
     results = {name: render.load_results(FOLDER / f"{name}.json") for name in render.RESULTS}
     files = [json.loads((FOLDER / f"{name}.json").read_text()) for name in ("complexity", "honesty")]
-    runs = {name: render.read_summary(FOLDER / f"{name}.csv") for name in ("ablation", "sweep")}
+    runs = {name: render.read_summary(FOLDER / f"{name}.csv") for name in render.SUMMARIES}
     assert render.page(results, *files, runs) == (FOLDER / "README.md").read_text(encoding="utf-8")
 
 

@@ -9,14 +9,15 @@
 - ``render`` writes ``README.md`` from ``README.md.jinja`` and the results files, all pictures, and the overview in the
   README of the repository. Every number of the page comes from the files.
 
-``ablation.csv`` and ``sweep.csv`` are copies of ``summary.csv`` of these trainings. Each takes less than an hour on one
-core, and continues where it was stopped::
+``ablation.csv``, ``sweep.csv`` and ``capacity.csv`` are copies of ``summary.csv`` of these trainings. Each takes less
+than an hour on one core, and continues where it was stopped::
 
     SHORT="train.updates=4000 validation_size=5000 threads=1 hydra.sweep.dir=outputs/ablation resume=true"
     python train.py -m experiment=recipe $SHORT
     python train.py -m experiment=net_loss_only,identity_start,shared,additive,uncentred $SHORT
     python train.py -m experiment=kernels $SHORT
     python train.py -m experiment=sweep threads=1 hydra.sweep.dir=outputs/sweep resume=true
+    python train.py -m experiment=capacity validation_size=5000 hydra.sweep.dir=outputs/capacity resume=true
 """
 
 from __future__ import annotations

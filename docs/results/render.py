@@ -23,8 +23,10 @@ from kornia_pnpnet.metrics import SuccessRate
 from kornia_pnpnet.pretrained import WEIGHTS_FOLDER, shipped_weights
 
 __all__ = [
+    "SUMMARIES",
     "Rates",
     "ablation",
+    "capacity",
     "claim",
     "compared",
     "overview",
@@ -37,6 +39,8 @@ __all__ = [
 
 REPOSITORY = HERE.parents[1]
 EXPERIMENTS = REPOSITORY / "conf" / "experiment"
+#: Files of short runs, see ``make.py``.
+SUMMARIES = ("ablation", "sweep", "capacity")
 KERNEL = "model.solver.refine.kernel"  # column of a summary
 #: The solvers of the overview: the titles by the names in ``benchmarks/solvers.json``.
 OVERVIEW = {
@@ -216,6 +220,22 @@ def sweep(rows: Sequence[Row]) -> dict[str, Any]:
     return {"updates": updates_of(rows), "table": table, "findings": findings}
 
 
+def capacity(rows: Sequence[Row], shipped: str) -> dict[str, Any]:
+    """Facts of the sizes of the set network: a table, and how each size differs from the ``shipped`` one."""
+    sets = [key.removesuffix("/rate") for key in rows[0] if key.endswith("/rate")]
+    recipe = [row for row in rows if row["run"] == shipped]
+    lines, findings = [], []
+    for row in rows:
+        rates = [f"{percent(row, data)[0]:.1f}" for data in sets]
+        lines.append([f"`{row['run']}`", f"{float(row['us_per_problem']):.0f}", *rates])
+        found = {data: compared([row], recipe, data) for data in sets}
+        apart = ", ".join(f"{data} {text}" for data, text in found.items() if "overlap" not in text)
+        if row not in recipe:
+            findings.append(f"`{row['run']}`: {apart or 'all intervals overlap'}.")
+    table = markdown_table(["Network", "µs", *(f"{data} (%)" for data in sets)], lines)
+    return {"updates": updates_of(rows), "claim": claim("capacity"), "table": table, "findings": findings}
+
+
 # -- the page ----------------------------------------------------------------------------------------------------------
 
 
@@ -261,9 +281,10 @@ def page(
         results: the results files by their names, see ``RESULTS``.
         complexity: operation counts.
         honest: the file of ``measure_honesty``.
-        short_runs: the summaries ``ablation`` and ``sweep``.
+        short_runs: the summaries :data:`SUMMARIES`.
     """
     at_nine = complexity["n"].index(9)
+    any_network: Any = PnPNet.from_pretrained(ANY).init
     loader = FileSystemLoader(HERE)
     options: dict[str, Any] = {"trim_blocks": True, "lstrip_blocks": True, "keep_trailing_newline": True}
     environment = Environment(loader=loader, undefined=StrictUndefined, autoescape=False, **options)
@@ -284,6 +305,7 @@ def page(
         distribution_table=format_table(results["distribution"]),
         ablation=ablation(short_runs["ablation"]),
         sweep=sweep(short_runs["sweep"]),
+        capacity=capacity(short_runs["capacity"], "set-{width}x{layers}x{hidden}".format(**any_network.config)),
         weights=shipped_weights(),
         **{f"{name}_rates": Rates(entry) for name, entry in results.items()},
     )
@@ -419,7 +441,7 @@ def render() -> None:
     plot_sweep(HERE / "sweep_against_n.png", HERE / "sweep.csv", against="n")
     plot_sweep(HERE / "sweep_against_m.png", HERE / "sweep.csv", against="m")
     plot_reliability(HERE / "reliability.png", honest["reliability"])
-    short_runs = {name: read_summary(HERE / f"{name}.csv") for name in ("ablation", "sweep")}
+    short_runs = {name: read_summary(HERE / f"{name}.csv") for name in SUMMARIES}
     (HERE / "README.md").write_text(page(results, complexity, honest, short_runs), encoding="utf-8")
 
     found = json.loads((HERE / "real_matches.json").read_text())
