@@ -2,10 +2,10 @@
 
     python benchmarks/uncertainty.py --out benchmarks/uncertainty.json
 
-*Errors.* The noise of each pixel and of each point has random axes, the largest five times as long as the smallest. A
-solver is told the covariances, the standard deviations of isotropic noise of the same trace, or nothing. Errors are
-medians, relative to those of maximum likelihood on the true inliers with the covariances, started from the truth; all
-solve the same problems.
+*Errors.* The problems of uncertain PnP (Vakhitov et al., arXiv 2107.03890): points and pixels with noise of ten sizes
+and random axes. A solver is told the covariances, the standard deviations of isotropic noise of the same trace, or
+nothing; the solvers of other libraries take neither. Errors are medians, relative to those of maximum likelihood on the
+true inliers with the covariances, started from the truth; all solve the same problems.
 
 *Covariances of poses.* The squared error of a pose by its covariance (Mahalanobis) has the mean 6 and is below 12.59
 for 95 % when the covariance is right. Poses that are not ``ok`` or far off (10 degrees or 30 % of the distance) are
@@ -23,34 +23,25 @@ truth.
 from __future__ import annotations
 
 import argparse
-import math
-import statistics
+import functools
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
+from harness import in_turns, ratio, summary, target, threads
 from kornia.geometry.liegroup import So3
 from torch import Tensor, nn
+from uncertain_problems import GRAVITY, SHIFT, TURN, gravity, last_pose, sigmas_of_same_trace, squares, uncertain_pnp
 
-from kornia_pnpnet import (
-    PnPNet,
-    PnPResult,
-    PosePrior,
-    RobustWeightedLM,
-    create_solver,
-    gravity_prior,
-    pose_covariance,
-    pose_errors,
-    success,
-)
+from kornia_pnpnet import PnPNet, PnPResult, RobustWeightedLM, create_solver, pose_covariance, pose_errors, success
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.core.files import write_json
 from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.evaluation.bounds import KnownInliersAndNoise
-from kornia_pnpnet.geometry import retract, transform
+from kornia_pnpnet.peers import OpenCVPnP, PeerSolver, PoseLib
 from kornia_pnpnet.types import Pose, Problems
 
 __all__ = [
@@ -61,35 +52,36 @@ __all__ = [
     "measure_squares",
     "measure_times",
     "page",
+    "targets",
 ]
 
 SOLVER = "pnpnet-set"
 # Used for nothing else.
 SEED = 20_261_250
 AXIS_RATIO = 5.0
-#: Pairs of a problem, and how many of them are outliers.
-SIZES = ((9, 0), (20, 0), (50, 0), (20, 6), (50, 15), (50, 25))
-#: Standard deviations of pixels and, in metres, of points; the last ones are exact.
-NOISES = {"protocol": (1.0, 0.05), "mixed": (3.0, 0.01), "pixels": (5.0, 0.0)}
+#: Of uncertain PnP: pairs of a problem, and shares of outliers.
+SIZES, SHARES = (10, 30, 50, 110), (0.0, 0.3, 0.5)
+# Pixels. The best of 8, 12, 16, 20, 25, 30 and 40 on problems of uncertain PnP of another seed.
+THRESHOLD = 20.0
+#: Solvers of other libraries. The first two take no outliers.
+PEERS: dict[str, Callable[[], PeerSolver]] = {
+    "EPnP": lambda: OpenCVPnP(method="EPNP"),
+    "SQPnP": lambda: OpenCVPnP(method="SQPNP"),
+    "PoseLib": lambda: PoseLib(threshold=THRESHOLD),
+}
 #: For covariances of poses and for priors: pairs of a problem, and how many of them are outliers.
 CREDIBLE = ((9, 0), (9, 2), (9, 4), (20, 0), (20, 10), (50, 0), (50, 25), (200, 0), (200, 100))
 FEW = ((3, 0), (4, 0), (4, 1), (5, 1), (6, 0), (6, 2), (9, 3), (12, 4))
 #: Below this the squared error of six Gaussian numbers is in 95 % of all cases.
 LIMIT = 12.592
-#: Standard deviations in degrees of gravity and of the last rotation; of the last position, relative to the distance.
-GRAVITY, TURN, SHIFT = 0.5, 1.0, 0.02
 #: Degrees between the normal of a planar target and the camera's axis.
 TILTS = (0.0, 15.0, 30.0, 45.0, 60.0)
 #: Standard deviations by which a wrong prior is off.
 WRONG = 10.0
-# Of a timed batch, as in the table of throughput: problems, pairs, repeats.
-TIMED = (500, 9, 41)
-
-
-def told(problems: Problems, img_sigma: float, world_sigma: float) -> dict[str, dict[str, Any]]:
-    """What a solver may be told of the noise."""
-    sigmas = {"img_sigma": img_sigma, "world_sigma": world_sigma}
-    return {"covariances": problems.known, "sigmas": sigmas, "nothing": {}}
+#: Of timed batches: pairs of a problem; problems; rounds.
+TIMED, BATCH, ROUNDS = (9, 50), 1000, 15
+#: Most that errors may be above those of maximum likelihood, without and with outliers; that covariances may cost.
+MOST_CLEAN, MOST_ROBUST, MOST_TIME = 1.05, 1.10, 1.6
 
 
 def medians(result: PnPResult, problems: Problems) -> Tensor:
@@ -99,29 +91,30 @@ def medians(result: PnPResult, problems: Problems) -> Tensor:
 
 @torch.no_grad()
 def measure_errors(solver: nn.Module, count: int) -> list[dict[str, Any]]:
-    """Median errors relative to the bound, of each noise and size."""
+    """Median errors relative to those of maximum likelihood, of each kind of pixels, size and share of outliers."""
+    bound = KnownInliersAndNoise()
+    peers = {name: make() for name, make in PEERS.items()}
     rows = []
-    for noise, (img_sigma, world_sigma) in NOISES.items():
-        bound = KnownInliersAndNoise(img_sigma=img_sigma, world_sigma=world_sigma)
-        for n, outliers in SIZES:
-            problems = SyntheticProblems(
-                n=n,
-                batch_size=count,
-                seed=SEED,
-                outliers=OutlierMix(count=outliers),
-                axis_ratio=AXIS_RATIO,
-                img_sigma=img_sigma,
-                world_sigma=world_sigma,
-                known_noise=1.0,
-                dtype=torch.float64,
-            ).batch(0)
-            best = medians(bound.solve_with_truth(problems), problems)
-            isotropic = bound.solve_with_truth(problems._replace(img_cov=None, world_cov=None))
-            row: dict[str, Any] = {"noise": noise, "n": n, "outliers": outliers, "bound": best.tolist()}
-            row["bound, sigmas"] = (medians(isotropic, problems) / best).tolist()
-            for name, known in told(problems, img_sigma, world_sigma).items():
-                row[name] = (medians(solver(*problems[:3], **known), problems) / best).tolist()
-            rows.append(row)
+    for turned in (False, True):
+        for n in SIZES:
+            for share in SHARES:
+                problems = uncertain_pnp(n, share, count, turned=turned, seed=SEED)
+                sigmas = sigmas_of_same_trace(problems)
+                round_noise = problems._replace(
+                    img_cov=sigmas["img_sigma"][..., None, None].square() * torch.eye(2, dtype=torch.float64),
+                    world_cov=sigmas["world_sigma"][..., None, None].square() * torch.eye(3, dtype=torch.float64),
+                )
+                answers = {
+                    "covariances": solver(*problems[:3], **problems.known),
+                    "sigmas": solver(*problems[:3], **sigmas),
+                    "nothing": solver(*problems[:3]),
+                    **{name: peer(*problems[:3]) for name, peer in peers.items()},
+                    "bound, sigmas": bound.solve_with_truth(round_noise),
+                }
+                best = medians(bound.solve_with_truth(problems), problems)
+                row = {"pixels": "turned" if turned else "round", "n": n, "outliers": share, "bound": best.tolist()}
+                relative = {name: (medians(x, problems) / best).tolist() for name, x in answers.items()}
+                rows.append(row | relative)
     return rows
 
 
@@ -138,14 +131,15 @@ def squared_errors(result: PnPResult, problems: Problems, covariance: Tensor) ->
 def measure_credibility(solver: nn.Module, count: int) -> list[dict[str, Any]]:
     """How the errors of poses compare with their covariances, of each kind of noise and size."""
     rows = []
-    for noise, ratio, is_told in (("isotropic", 1.0, True), ("covariances", AXIS_RATIO, True), ("unknown", 1.0, False)):
+    kinds = ("isotropic", 1.0, True), ("covariances", AXIS_RATIO, True), ("unknown", 1.0, False)
+    for noise, axis_ratio, is_told in kinds:
         for n, outliers in CREDIBLE:
             problems = SyntheticProblems(
                 n=n,
                 batch_size=count,
                 seed=SEED + 1,
                 outliers=OutlierMix(count=outliers),
-                axis_ratio=ratio,
+                axis_ratio=axis_ratio,
                 known_noise=1.0,
                 dtype=torch.float64,
             ).batch(0)
@@ -159,25 +153,6 @@ def measure_credibility(solver: nn.Module, count: int) -> list[dict[str, Any]]:
             row = {"noise": noise, "n": n, "outliers": outliers, "used": used.double().mean().item()}
             rows.append(row | {"mean": squared.mean().item(), "below": (squared < LIMIT).double().mean().item()})
     return rows
-
-
-def last_pose(problems: Problems, generator: torch.Generator, wrong: float) -> PosePrior:
-    """The pose of the frame before."""
-    distance = problems.pose.translation.norm(dim=-1, keepdim=True)
-    sigma = torch.cat((torch.full_like(distance, math.radians(TURN)).repeat(1, 3), SHIFT * distance.repeat(1, 3)), -1)
-    noise, direction = torch.randn(2, *sigma.shape, generator=generator, dtype=sigma.dtype)
-    error = sigma * (noise + wrong * nn.functional.normalize(direction, dim=-1))
-    return PosePrior(retract(problems.pose, error), torch.diag_embed(sigma**-2))
-
-
-def gravity(problems: Problems, generator: torch.Generator, wrong: float) -> PosePrior:
-    """The direction of gravity, which is any direction in the world."""
-    like, sigma = problems.pose.translation, math.radians(GRAVITY)
-    down, noise, side = torch.randn(3, *like.shape, generator=generator, dtype=like.dtype)
-    down = nn.functional.normalize(down, dim=-1)
-    truth = (problems.pose.rotation @ down[..., None])[..., 0]
-    across = nn.functional.normalize(torch.linalg.cross(truth, side), dim=-1)
-    return gravity_prior(down, truth + torch.linalg.cross(sigma * (noise + wrong * across), truth), sigma)
 
 
 @torch.no_grad()
@@ -211,26 +186,6 @@ def measure_priors(solver: nn.Module, count: int) -> list[dict[str, Any]]:
     return rows
 
 
-def square(tilt: float, sigma: float, count: int) -> Problems:
-    """Squares of four points under a tilt in degrees, with noise of the pixels."""
-    generator = torch.Generator().manual_seed(SEED + 3)
-    azimuth, roll, x, y, z = torch.rand(5, count, generator=generator, dtype=torch.float64)
-    azimuth, roll = 2.0 * math.pi * azimuth, 2.0 * math.pi * roll
-    zero = torch.zeros_like(roll)
-    axis = torch.stack((azimuth.cos(), azimuth.sin(), zero), -1) * math.radians(tilt)
-    translation = torch.stack((0.4 * x - 0.2, 0.4 * y - 0.2, 1.0 + z), -1)
-    turns = [Pose.from_rvec(v, translation).rotation for v in (axis, torch.stack((zero, zero, roll), -1))]
-    front = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
-    pose = Pose(turns[0] @ turns[1] @ front, translation)
-    corners = [[-0.1, -0.1, 0.0], [0.1, -0.1, 0.0], [0.1, 0.1, 0.0], [-0.1, 0.1, 0.0]]
-    world = torch.tensor(corners, dtype=torch.float64).expand(count, 4, 3)
-    camera = torch.tensor([[800.0, 0.0, 320.0], [0.0, 800.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    seen = transform(pose, world) @ camera.mT
-    pixels = seen[..., :2] / seen[..., 2:]
-    pixels = pixels + sigma * torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
-    return Problems(world, pixels, camera.expand(count, 3, 3), pose, torch.ones(count, 4, dtype=torch.bool))
-
-
 def ippe(problems: Problems) -> Pose:
     """OpenCV's two poses of each problem, (B, 2, 3, 3) and (B, 2, 3)."""
     import cv2
@@ -251,7 +206,7 @@ def measure_squares(solver: nn.Module, count: int) -> list[dict[str, Any]]:
     rows = []
     for tilt in TILTS:
         for sigma in (0.5, 1.0, 3.0):
-            problems = square(tilt, sigma, count)
+            problems = squares(tilt, sigma, count, seed=SEED + 3)
 
             def right(
                 rotation: Tensor, translation: Tensor, truth: Pose = problems.pose, sigma: float = sigma
@@ -278,27 +233,65 @@ def measure_squares(solver: nn.Module, count: int) -> list[dict[str, Any]]:
 
 
 @torch.no_grad()
-def measure_times(solver: nn.Module) -> dict[str, float]:
-    """Processor time of a problem in µs in float32, medians; what is told takes turns."""
-    batch, n, repeats = TIMED
-    source = SyntheticProblems(n=n, batch_size=batch, seed=SEED, axis_ratio=AXIS_RATIO, known_noise=1.0)
-    problems = source.batch(0)
-    kinds = told(problems, 1.0, 0.05)
-    seconds: Mapping[str, list[float]] = {name: [] for name in kinds}
-    for _ in range(repeats):
-        for name, known in kinds.items():
+def measure_times(solver: nn.Module) -> list[dict[str, Any]]:
+    """Processor time of a problem in float32 with standard deviations, and with covariances relative to that."""
+    rows = []
+    for n in TIMED:
+        problems = SyntheticProblems(n=n, batch_size=BATCH, seed=SEED, axis_ratio=AXIS_RATIO, known_noise=1.0).batch(0)
+        told: dict[str, dict[str, Any]] = {
+            "sigmas": {"img_sigma": torch.full((BATCH,), 1.0), "world_sigma": torch.full((BATCH,), 0.05)},
+            "covariances": problems.known,
+        }
+
+        def us_per_problem(problems: Problems, known: dict[str, Any]) -> float:
             start = time.process_time()
             solver(*problems[:3], **known)
-            seconds[name].append(time.process_time() - start)
-    return {name: 1e6 * statistics.median(values[1:]) / batch for name, values in seconds.items()}
+            return 1e6 * (time.process_time() - start) / BATCH
+
+        timers = {name: functools.partial(us_per_problem, problems, known) for name, known in told.items()}
+        in_turns(timers, 2)  # to warm up
+        times = {name: summary(rounds) for name, rounds in in_turns(timers, ROUNDS).items()}
+        rows.append({"n": n, **times, "ratio": ratio(times["sigmas"], times["covariances"])})
+    return rows
+
+
+def targets(results: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The largest measurements beside what was wanted."""
+    clean = [max(row["covariances"]) for row in results["rows"] if not row["outliers"]]
+    robust = [max(row["covariances"]) for row in results["rows"] if row["outliers"]]
+    times = [row["ratio"] for row in results["times"]]
+    return [
+        target("Largest error without outliers", max(clean), MOST_CLEAN, unit="", at_most=True),
+        target("Largest error with outliers", max(robust), MOST_ROBUST, unit="", at_most=True),
+        target("Largest time with covariances by time with sigmas", max(times), MOST_TIME, unit="", at_most=True),
+    ]
+
+
+def shares_of(rows: Sequence[Mapping[str, Any]], *keys: str) -> tuple[list[str], list[list[str]]]:
+    """The columns of rows that are shares, without the keys that identify a row, and their cells."""
+    columns = [key for key in rows[0] if key not in keys]
+    return columns, [[f"{100 * row[column]:.1f} %" for column in columns] for row in rows]
 
 
 def page(results: Mapping[str, Any]) -> str:
     """The page of the results."""
-    columns = ("covariances", "sigmas", "nothing", "bound, sigmas")
+    wanted = [
+        [x["what"], f"{x['measured']:.3f}", f"{x['target']:.2f}", "yes" if x["met"] else "no"]
+        for x in results["targets"]
+    ]
+    columns = ("covariances", "sigmas", "nothing", *PEERS, "bound, sigmas")
     errors = [
-        [row["noise"], f"{row['n']}", f"{row['outliers']}", *(" ".join(f"{x:.3f}" for x in row[c]) for c in columns)]
+        [
+            row["pixels"],
+            f"{row['n']}",
+            f"{100 * row['outliers']:.0f} %",
+            *(" ".join(f"{x:.3g}" if x > 10 else f"{x:.3f}" for x in row[c]) for c in columns),
+        ]
         for row in results["rows"]
+    ]
+    times = [
+        [f"{row['n']}", *(f"{row[name]['median_us']:.1f}" for name in ("sigmas", "covariances")), f"{row['ratio']:.2f}"]
+        for row in results["times"]
     ]
     credible = [
         [
@@ -311,30 +304,33 @@ def page(results: Mapping[str, Any]) -> str:
         ]
         for row in results["covariances"]
     ]
-    kinds = [key for key in results["priors"][0] if key not in ("n", "outliers")]
+    kinds, successes = shares_of(results["priors"], "n", "outliers")
     priors = [
-        [f"{row['n']}", f"{row['outliers']}", *(f"{100 * row[kind]:.1f} %" for kind in kinds)]
-        for row in results["priors"]
+        [f"{row['n']}", f"{row['outliers']}", *cells] for row, cells in zip(results["priors"], successes, strict=True)
     ]
-    found = [key for key in results["squares"][0] if key not in ("tilt", "sigma")]
-    squares = [
-        [f"{row['tilt']:.0f}°", f"{row['sigma']:.1f} px", *(f"{100 * row[kind]:.1f} %" for kind in found)]
-        for row in results["squares"]
+    found, right = shares_of(results["squares"], "tilt", "sigma")
+    planar = [
+        [f"{row['tilt']:.0f}°", f"{row['sigma']:.1f} px", *cells]
+        for row, cells in zip(results["squares"], right, strict=True)
     ]
-    times = ", ".join(f"{name} {value:.1f}" for name, value in results["us_per_problem"].items())
     return f"""# Uncertainty
 
 Written by `benchmarks/uncertainty.py`, whose first lines say what is measured; `{results["solver"]}`,
 {results["problems"]} problems in each row.
 
-## Noise that differs between directions
+{markdown_table(["Target", "Measured", "At most", "Met"], wanted)}
 
-Median rotation and translation error, relative to maximum likelihood on the true inliers. *Bound, sigmas*: the same
-with isotropic noise of the same trace.
+## Noise that differs between pairs and directions
 
-{markdown_table(["Noise", "n", "Outliers", *columns], errors)}
+Median rotation and translation error on the problems of uncertain PnP, relative to maximum likelihood on the true
+inliers. *Pixels*: whether their noise is round or has axes. *Bound, sigmas*: maximum likelihood for isotropic noise of
+the same trace.
 
-Processor time of a problem in µs by what is told: {times}.
+{markdown_table(["Pixels", "n", "Outliers", *columns], errors)}
+
+Processor time of a problem in µs (float32, {BATCH} problems at once, one thread), and the median ratio of a round:
+
+{markdown_table(["n", "sigmas", "covariances", "Ratio"], times, align="rrrr")}
 
 ## Is the covariance of the pose right
 
@@ -352,7 +348,7 @@ by {WRONG:.0f} standard deviations more.
 
 ## Planar targets
 
-{markdown_table(["Tilt", "Noise", *found], squares)}
+{markdown_table(["Tilt", "Noise", *found], planar)}
 """
 
 
@@ -362,17 +358,18 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("outputs/bench/uncertainty.json"))
     parser.add_argument("--count", type=int, default=4000, help="problems of each noise and size (default: 4000)")
     arguments = parser.parse_args()
-    torch.set_num_threads(1)
     solver = create_solver(SOLVER).double()
-    results = {
-        "environment": environment(),
-        **{"solver": SOLVER, "seed": SEED, "axis_ratio": AXIS_RATIO, "problems": arguments.count, "noises": NOISES},
-        "us_per_problem": measure_times(create_solver(SOLVER)),
-        "rows": measure_errors(solver, arguments.count),
-        "covariances": measure_credibility(solver, arguments.count),
-        "priors": measure_priors(solver, arguments.count),
-        "squares": measure_squares(solver, arguments.count),
-    }
+    with threads():
+        results = {
+            "environment": environment(),
+            **{"solver": SOLVER, "seed": SEED, "axis_ratio": AXIS_RATIO, "problems": arguments.count},
+            "times": measure_times(create_solver(SOLVER)),
+            "rows": measure_errors(solver, arguments.count),
+            "covariances": measure_credibility(solver, arguments.count),
+            "priors": measure_priors(solver, arguments.count),
+            "squares": measure_squares(solver, arguments.count),
+        }
+    results["targets"] = targets(results)
     write_json(arguments.out, results)
     text = page(results)
     arguments.out.with_suffix(".md").write_text(text, encoding="utf-8")
