@@ -57,7 +57,7 @@ __all__ = [
 
 SOLVER = "pnpnet-set"
 # Used for nothing else.
-SEED = 20_261_250
+SEED = 20_270_925
 AXIS_RATIO = 5.0
 #: Of uncertain PnP: pairs of a problem, and shares of outliers.
 SIZES, SHARES = (10, 30, 50, 110), (0.0, 0.3, 0.5)
@@ -257,14 +257,13 @@ def measure_times(solver: nn.Module) -> list[dict[str, Any]]:
 
 def targets(results: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The largest measurements beside what was wanted."""
-    clean = [max(row["covariances"]) for row in results["rows"] if not row["outliers"]]
-    robust = [max(row["covariances"]) for row in results["rows"] if row["outliers"]]
-    times = [row["ratio"] for row in results["times"]]
-    return [
-        target("Largest error without outliers", max(clean), MOST_CLEAN, unit="", at_most=True),
-        target("Largest error with outliers", max(robust), MOST_ROBUST, unit="", at_most=True),
-        target("Largest time with covariances by time with sigmas", max(times), MOST_TIME, unit="", at_most=True),
-    ]
+    found = []
+    for share in SHARES:
+        worst = max(max(row["covariances"]) for row in results["rows"] if row["outliers"] == share)
+        what = f"Largest relative error with {100 * share:.0f} % outliers"
+        found.append(target(what, worst, MOST_ROBUST if share else MOST_CLEAN, unit="", at_most=True))
+    slowest = max(row["ratio"] for row in results["times"])
+    return [*found, target("Time with covariances by time with sigmas", slowest, MOST_TIME, unit="", at_most=True)]
 
 
 def shares_of(rows: Sequence[Mapping[str, Any]], *keys: str) -> tuple[list[str], list[list[str]]]:
