@@ -123,10 +123,16 @@ def test_gradients(make_problems):
     inputs = [x.clone().requires_grad_() for x in (pose.translation, world, img, sigma, weights)]
     assert torch.autograd.gradcheck(isotropic, inputs, eps=1e-6, atol=1e-6, rtol=1e-3)
 
-    def anisotropic(img_cov):
-        return pose_covariance(pose, world, img, camera, img_cov=0.5 * (img_cov + img_cov.mT))
+    world_cov = 0.04 * torch.diag_embed(torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)).expand(2, 5, 3, 3).clone()
+    information = torch.diag_embed(torch.tensor([1e3, 2e3, 3e3, 4.0, 5.0, 6.0], dtype=torch.float64)).repeat(2, 1, 1)
 
-    assert torch.autograd.gradcheck(anisotropic, [img_cov.requires_grad_()], eps=1e-6, atol=1e-6, rtol=1e-3)
+    def anisotropic(*matrices):
+        img_cov, world_cov, information = (0.5 * (x + x.mT) for x in matrices)
+        prior = PosePrior(pose, information)
+        return pose_covariance(pose, world, img, camera, img_cov=img_cov, world_cov=world_cov, prior=prior)
+
+    inputs = [x.requires_grad_() for x in (img_cov, world_cov, information)]
+    assert torch.autograd.gradcheck(anisotropic, inputs, eps=1e-6, atol=1e-6, rtol=1e-3)
 
     line = world.detach().clone()
     line[0, :, 1:] = 0.0  # the points of the first problem lie on a line through the camera's axis

@@ -192,6 +192,33 @@ def test_covariances_turn_with_the_world(solver):
     torch.testing.assert_close(turned.weights, plain.weights, rtol=0, atol=1e-4)
 
 
+def test_the_covariance_of_a_pose_turns_with_its_frame():
+    p = problems()
+    expected = pose_covariance(p.pose, *p[:3], **covs(p))
+    turn = turn_about((0.3, -1.2, 0.8), 1.0)
+    turned = pose_covariance(
+        Pose(p.pose.rotation @ turn.mT, p.pose.translation),
+        p.world_points @ turn.mT,
+        *p[1:3],
+        img_cov=p.img_cov,
+        world_cov=turn @ p.world_cov @ turn.mT,
+    )
+    torch.testing.assert_close(turned, expected, rtol=1e-6, atol=0)
+    roll = turn_about((0.0, 0.0, 1.0), 0.7)
+    change = CAMERA @ roll @ torch.linalg.inv(CAMERA)  # of homogeneous pixels
+    img = p.img_points @ change[:2, :2].mT + change[:2, 2]
+    rolled = pose_covariance(
+        Pose(roll @ p.pose.rotation, p.pose.translation @ roll.mT),
+        p.world_points,
+        img,
+        p.intrinsics,
+        img_cov=change[:2, :2] @ p.img_cov @ change[:2, :2].mT,
+        world_cov=p.world_cov,
+    )
+    both = torch.block_diag(roll, roll)
+    torch.testing.assert_close(rolled, both @ expected @ both.mT, rtol=1e-6, atol=1e-12)
+
+
 def test_covariances_turn_with_the_image():
     p = problems()
     camera = torch.diag(torch.tensor([900.0, 900.0, 1.0], dtype=DOUBLE)).expand(4, 3, 3)
