@@ -33,7 +33,8 @@ def find_alternatives(
     """Refine other starts and keep the minima that differ from the pose, and from each other, and are nearly as likely.
 
     The starts are the mirror image of the pose about the line of sight to the plane through the points, all poses of
-    three pairs that lie far apart, and the poses of the guess.
+    three pairs that lie far apart, and the poses of the guess. The mirror image is kept unrefined where its refinement
+    ends at the pose: of a plane that is seen almost from the front, it can be nearly as likely and no minimum.
 
     Args:
         refine: the refinement that found the pose.
@@ -49,7 +50,8 @@ def find_alternatives(
     corr, pose = corr.map(torch.Tensor.detach), map_tensors(torch.Tensor.detach, pose)
     guess = map_tensors(torch.Tensor.detach, guess)
     weights = corr.weights * guess.weights
-    starts = [pose, _mirrored(pose, corr, weights), *_of_three(corr, weights, pose), *guess.poses]
+    mirrored = _mirrored(pose, corr, weights)
+    starts = [pose, mirrored, *_of_three(corr, weights, pose), *guess.poses]
     count, batch = len(starts), weights.shape[0]
     many = repeat_problems(corr, count)
     tried = Guess(
@@ -64,6 +66,14 @@ def find_alternatives(
     ends = map_tensors(lambda x: x.unflatten(0, (count, batch)), refined.pose)  # (S, B, ...)
     cost = refined.cost.unflatten(0, (count, batch))
     usable = (refined.in_front & refined.cost.isfinite()).unflatten(0, (count, batch))
+    unrefined = refine(corr, Guess(mirrored, guess.weights, noise=guess.noise), m=0)
+    is_lost = _are_same(Pose(*(x[1:2] for x in ends)), pose, corr, weights)[0]
+    for x, image in zip(
+        (*ends, cost, usable),
+        (*mirrored, unrefined.cost, unrefined.in_front & unrefined.cost.isfinite()),
+        strict=True,
+    ):
+        x[1] = torch.where(is_lost.view(-1, *(1,) * (image.ndim - 1)), image, x[1])
 
     # From costs, which are means over the pairs, to log-likelihoods.
     unit = (corr.weights > 0).sum(-1) / _unit(corr, guess, Pose(*(x[0] for x in ends)))
