@@ -93,23 +93,19 @@ def medians(result: PnPResult, problems: Problems) -> Tensor:
 def measure_errors(solver: nn.Module, count: int) -> list[dict[str, Any]]:
     """Median errors relative to those of maximum likelihood, of each kind of pixels, size and share of outliers."""
     bound = KnownInliersAndNoise()
+    adaptive = create_solver(SOLVER, effort="adaptive").double()
     peers = {name: make() for name, make in PEERS.items()}
     rows = []
     for turned in (False, True):
         for n in SIZES:
             for share in SHARES:
                 problems = uncertain_pnp(n, share, count, turned=turned, seed=SEED)
-                sigmas = sigmas_of_same_trace(problems)
-                round_noise = problems._replace(
-                    img_cov=sigmas["img_sigma"][..., None, None].square() * torch.eye(2, dtype=torch.float64),
-                    world_cov=sigmas["world_sigma"][..., None, None].square() * torch.eye(3, dtype=torch.float64),
-                )
                 answers = {
                     "covariances": solver(*problems[:3], **problems.known),
-                    "sigmas": solver(*problems[:3], **sigmas),
+                    "adaptive": adaptive(*problems[:3], **problems.known),
+                    "sigmas": solver(*problems[:3], **sigmas_of_same_trace(problems)),
                     "nothing": solver(*problems[:3]),
                     **{name: peer(*problems[:3]) for name, peer in peers.items()},
-                    "bound, sigmas": bound.solve_with_truth(round_noise),
                 }
                 best = medians(bound.solve_with_truth(problems), problems)
                 row = {"pixels": "turned" if turned else "round", "n": n, "outliers": share, "bound": best.tolist()}
@@ -278,7 +274,7 @@ def page(results: Mapping[str, Any]) -> str:
         [x["what"], f"{x['measured']:.3f}", f"{x['target']:.2f}", "yes" if x["met"] else "no"]
         for x in results["targets"]
     ]
-    columns = ("covariances", "sigmas", "nothing", *PEERS, "bound, sigmas")
+    columns = ("covariances", "adaptive", "sigmas", "nothing", *PEERS)
     errors = [
         [
             row["pixels"],
@@ -322,8 +318,7 @@ Written by `benchmarks/uncertainty.py`, whose first lines say what is measured; 
 ## Noise that differs between pairs and directions
 
 Median rotation and translation error on the problems of uncertain PnP, relative to maximum likelihood on the true
-inliers. *Pixels*: whether their noise is round or has axes. *Bound, sigmas*: maximum likelihood for isotropic noise of
-the same trace.
+inliers. *Pixels*: whether their noise is round or has axes. *Adaptive*: covariances, with `effort="adaptive"`.
 
 {markdown_table(["Pixels", "n", "Outliers", *columns], errors)}
 
