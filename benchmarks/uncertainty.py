@@ -93,7 +93,6 @@ def medians(result: PnPResult, problems: Problems) -> Tensor:
 def measure_errors(solver: nn.Module, count: int) -> list[dict[str, Any]]:
     """Median errors relative to those of maximum likelihood, of each kind of pixels, size and share of outliers."""
     bound = KnownInliersAndNoise()
-    adaptive = create_solver(SOLVER, effort="adaptive").double()
     peers = {name: make() for name, make in PEERS.items()}
     rows = []
     for turned in (False, True):
@@ -102,7 +101,6 @@ def measure_errors(solver: nn.Module, count: int) -> list[dict[str, Any]]:
                 problems = uncertain_pnp(n, share, count, turned=turned, seed=SEED)
                 answers = {
                     "covariances": solver(*problems[:3], **problems.known),
-                    "adaptive": adaptive(*problems[:3], **problems.known),
                     "sigmas": solver(*problems[:3], **sigmas_of_same_trace(problems)),
                     "nothing": solver(*problems[:3]),
                     **{name: peer(*problems[:3]) for name, peer in peers.items()},
@@ -274,7 +272,7 @@ def page(results: Mapping[str, Any]) -> str:
         [x["what"], f"{x['measured']:.3f}", f"{x['target']:.2f}", "yes" if x["met"] else "no"]
         for x in results["targets"]
     ]
-    columns = ("covariances", "adaptive", "sigmas", "nothing", *PEERS)
+    columns = ("covariances", "sigmas", "nothing", *PEERS)
     errors = [
         [
             row["pixels"],
@@ -318,7 +316,7 @@ Written by `benchmarks/uncertainty.py`, whose first lines say what is measured; 
 ## Noise that differs between pairs and directions
 
 Median rotation and translation error on the problems of uncertain PnP, relative to maximum likelihood on the true
-inliers. *Pixels*: whether their noise is round or has axes. *Adaptive*: covariances, with `effort="adaptive"`.
+inliers. *Pixels*: whether their noise is round or has axes.
 
 {markdown_table(["Pixels", "n", "Outliers", *columns], errors)}
 

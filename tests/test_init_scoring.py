@@ -31,15 +31,19 @@ def textbook(corr, pose, thresholds):
     cam = transform(pose, corr.world_points)
     depth = cam[..., 2]
     sq_residual = (corr.focal * cam[..., :2] / depth[..., None] - corr.img_points).square().sum(-1)
-    sq_limit = thresholds.img[:, None] ** 2 + (corr.focal * thresholds.world[:, None] / depth) ** 2
+    sq_img = thresholds.img.reshape(len(depth), -1) ** 2
+    sq_limit = sq_img + (corr.focal * thresholds.world[:, None] / depth) ** 2
     return torch.where(depth > 0, sq_residual / sq_limit, torch.inf)
 
 
+@pytest.mark.parametrize("of_pairs", [False, True])
 @pytest.mark.parametrize("in_world", [False, True])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_errors_without_division_are_the_textbooks(scene, in_world, dtype):
+def test_errors_without_division_are_the_textbooks(scene, of_pairs, in_world, dtype):
     corr, poses, thresholds = scene
     thresholds = thresholds if in_world else thresholds._replace(world=torch.zeros(7, dtype=torch.float64))
+    if of_pairs:
+        thresholds = thresholds._replace(img=thresholds.img[:, None] * torch.linspace(0.2, 3.0, 9, dtype=torch.float64))
     fast = Scene.make(corr, thresholds, dtype)
     errors = standardised_errors(fast, pack(fast, poses)).double()  # (P, N, H)
     behind = 0

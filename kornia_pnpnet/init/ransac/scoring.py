@@ -52,6 +52,7 @@ class Scene(NamedTuple):
         weights: weights of the pairs, shape :math:`(P, 1, N)`.
         depth_scale: :math:`\tau / f`, shape :math:`(P, 1, 1)`.
         sq_world: :math:`\omega^2`, shape :math:`(P, 1, 1)`.
+        wider: threshold in pixels of each pair relative to :math:`\tau`, shape :math:`(P, N, 1)`; ``None``: 1.
         prior: what is known of the poses besides the pairs.
     """
 
@@ -61,13 +62,18 @@ class Scene(NamedTuple):
     weights: Tensor
     depth_scale: Tensor
     sq_world: Tensor
+    wider: Tensor | None = None
     prior: FramedPrior | None = None
 
     @classmethod
     def make(cls, corr: Correspondences, thresholds: Thresholds, dtype: torch.dtype) -> Scene:
         """Bring correspondences to this form, in a dtype that suffices to compare poses."""
         points = torch.cat((corr.world_points, torch.ones_like(corr.weights)[..., None]), -1)
-        u, v = (corr.img_points / thresholds.img[:, None, None]).to(dtype).split(1, -1)
+        tau, wider = thresholds.img, None
+        if tau.ndim == 2:
+            tau = tau.mean(1)
+            wider = (thresholds.img / tau[:, None])[..., None].to(dtype)
+        u, v = (corr.img_points / tau[:, None, None]).to(dtype).split(1, -1)
         # `tiny` avoids 0/0 for a point in the camera's centre.
         sq_world = thresholds.world.square() + torch.finfo(dtype).tiny
         return cls(
@@ -75,8 +81,9 @@ class Scene(NamedTuple):
             u.contiguous(),
             v.contiguous(),
             corr.weights[:, None].to(dtype),
-            (thresholds.img / corr.focal).to(dtype)[:, None, None],
+            (tau / corr.focal).to(dtype)[:, None, None],
             sq_world.to(dtype)[:, None, None],
+            wider,
             map_tensors(lambda x: x.to(dtype), corr.prior),
         )
 
@@ -92,6 +99,7 @@ class Scene(NamedTuple):
             u=self.u.gather(1, at),
             v=self.v.gather(1, at),
             weights=self.weights.gather(2, at.mT),
+            wider=None if self.wider is None else self.wider.gather(1, at),
         )
 
     def pack(self, rotation: Tensor, translation: Tensor) -> Tensor:
@@ -151,6 +159,7 @@ def standardised_errors(scene: Scene, packed: Tensor) -> Tensor:
     x, y, z = (scene.points @ packed.flatten(2)).split(count, -1)  # (P, N, H) each
     x.addcmul_(scene.u, z, value=-1.0)
     y.addcmul_(scene.v, z, value=-1.0)
-    sq_limit = torch.addcmul(scene.sq_world, z, z)
+    limit = z if scene.wider is None else z * scene.wider
+    sq_limit = torch.addcmul(scene.sq_world, limit, limit)
     sq_distance = x.mul_(x).addcmul_(y, y).add_(z.clamp_(max=0.0), alpha=-_BEHIND)
     return sq_distance.div_(sq_limit).clamp_(max=MAX_ERROR)
