@@ -29,6 +29,7 @@ __all__ = [
     "capacity",
     "claim",
     "compared",
+    "measured_on_matches",
     "overview",
     "page",
     "real_matches",
@@ -311,12 +312,13 @@ def page(
     )
 
 
-def real_matches(results: Mapping[str, Any], costs: Mapping[str, Any]) -> str:
-    """The page on real matches as Markdown.
+def measured_on_matches(results: Mapping[str, Any]) -> dict[str, Any]:
+    """Tables of a file of ``benchmarks/real_matches.py measure``.
 
-    Args:
-        results: what ``benchmarks/real_matches.py measure`` wrote.
-        costs: what ``benchmarks/real_matches.py cost`` wrote.
+    Returns:
+        ``kinds``; ``rows`` by kind, solver and group; ``tables`` by kind; ``peer``, the best PoseLib; ``beside``, each
+        solver beside that: name, success and points ahead in per cent, and the ratio of times; ``total`` of problems;
+        ``scenes``, a table.
     """
     settings = results["settings"]
     kinds = list(dict.fromkeys(row["kind"] for row in results["rows"]))
@@ -353,15 +355,6 @@ def real_matches(results: Mapping[str, Any], costs: Mapping[str, Any]) -> str:
         for name in settings["solvers"]
         for times in [total(name, "ms_per_problem") / total(peer, "ms_per_problem")]
     ]
-    first = settings["solvers"][0]
-    curve = results["reliability"][first]
-    deciles = [
-        (i / 10, (i + 1) / 10, int(count), predicted, observed)
-        for i, (count, predicted, observed) in enumerate(
-            zip(*(curve[key] for key in ("number", "predicted", "observed")), strict=True)
-        )
-        if count
-    ]
     known = {row["scene"]: row for row in read_summary(HERE / "real_matches_scenes.csv")}
     lines = []
     for entry in results["counts"]:
@@ -371,22 +364,41 @@ def real_matches(results: Mapping[str, Any], costs: Mapping[str, Any]) -> str:
     scenes = markdown_table(
         ["Scene", "shows", "public repository", "licence", *(f"problems, {k}" for k in kinds)], lines
     )
+    count = sum(rows[kind][settings["solvers"][0]]["all"]["count"] for kind in kinds)
+    found = {"kinds": kinds, "rows": rows, "tables": tables, "peer": peer, "beside": beside}
+    return {**found, "total": count, "scenes": scenes}
+
+
+def real_matches(results: Mapping[str, Any], costs: Mapping[str, Any], again: Mapping[str, Any]) -> str:
+    """The page on real matches as Markdown.
+
+    Args:
+        results: what ``benchmarks/real_matches.py measure`` wrote.
+        costs: what ``benchmarks/real_matches.py cost`` wrote.
+        again: what ``benchmarks/real_matches.py measure`` wrote of other scenes with a later version.
+    """
+    settings, facts = results["settings"], measured_on_matches(results)
+    first = settings["solvers"][0]
+    curve = results["reliability"][first]
+    deciles = [
+        (i / 10, (i + 1) / 10, int(count), predicted, observed)
+        for i, (count, predicted, observed) in enumerate(
+            zip(*(curve[key] for key in ("number", "predicted", "observed")), strict=True)
+        )
+        if count
+    ]
     options: dict[str, Any] = {"trim_blocks": True, "lstrip_blocks": True, "keep_trailing_newline": True}
     environment = Environment(loader=FileSystemLoader(HERE), undefined=StrictUndefined, autoescape=False, **options)
-    raw = rows[kinds[1]][first]["all"]
+    raw = facts["rows"][facts["kinds"][1]][first]["all"]
     return environment.get_template("real_matches.md.jinja").render(
         results=results,
         costs=costs,
-        rows=rows,
-        kinds=kinds,
-        tables=tables,
-        total=sum(rows[kind][first]["all"]["count"] for kind in kinds),
-        peer=peer,
-        beside=beside,
+        again=again,
+        of_again=measured_on_matches(again),
         first=first,
         far_count=round(raw["far"] * raw["count"]),
         deciles=deciles,
-        scenes=scenes,
+        **facts,
     )
 
 
@@ -447,7 +459,8 @@ def render() -> None:
     found = json.loads((HERE / "real_matches.json").read_text())
     costs = json.loads((HERE / "real_matches_cost.json").read_text())
     plot_real_matches(HERE / "real_matches.png", found, costs)
-    (HERE / "real_matches.md").write_text(real_matches(found, costs), encoding="utf-8")
+    again = json.loads((HERE / "real_matches_again.json").read_text())
+    (HERE / "real_matches.md").write_text(real_matches(found, costs, again), encoding="utf-8")
 
     rows, table = overview(json.loads((REPOSITORY / "benchmarks" / "solvers.json").read_text()))
     plot_overview(HERE / "overview.png", rows, outliers="0 to 3 outliers among 9 pairs")

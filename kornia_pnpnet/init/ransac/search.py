@@ -2,6 +2,7 @@ r"""The rounds of RANSAC: solve samples, keep the best poses, improve these on t
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple, TypeVar
 
 import torch
@@ -23,8 +24,10 @@ _T = TypeVar("_T")
 
 # Poses are compared and improved in this precision, which resolves 1e-4 px at the protocol's focal length of 3400 px.
 _DTYPE = torch.float32
-# Number of pairs that score all poses of a round first, see `_rank`.
-_FIRST_PAIRS = 24
+# Number of pairs that score all poses of a round first, see `_rank`: at least the first, and the second times the cube
+# root of the number of samples before. After k samples in vain at a confidence of 0.999 the share of the inliers is
+# below (7 / k)^(1/3); of 3 over that share, one is an inlier with a probability of 95 %.
+_FIRST_PAIRS, _PAIRS_BY_SAMPLES = 24, 3.0 / 7.0 ** (1 / 3)
 # Between two rankings the number of poses is divided by the first, the number of pairs that score multiplied by the
 # second. With more than 90 % outliers the few pairs that score first have hardly an inlier: more must be kept.
 _KEPT_ONE_IN, _MORE = 2, 4
@@ -218,12 +221,15 @@ class Search:
         rotation, translation = (
             x.movedim((0, 1), (-1, -2)).flatten(-2).index_select(-1, at).unflatten(-1, valid.shape) for x in solved.pose
         )
-        losses, packed = self._rank(problems, scene, scene.pack(rotation, translation), valid)
+        losses, packed = self._rank(problems, scene, scene.pack(rotation, translation), valid, start)
         return losses, scene.unpack(packed), number
 
-    def _rank(self, problems: Tensor, scene: Scene, packed: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-        """Losses and poses of the best; of many pairs, a few score all poses first, then more pairs the best poses."""
-        pairs, width = _FIRST_PAIRS, packed.shape[-1]
+    def _rank(self, problems: Tensor, scene: Scene, packed: Tensor, valid: Tensor, done: int) -> tuple[Tensor, Tensor]:
+        """Losses and poses of the best; of many pairs, a few score all poses first, then more pairs the best poses.
+
+        After many samples in vain the share of the inliers is small, and more pairs are needed to see one of them.
+        """
+        pairs, width = max(_FIRST_PAIRS, math.ceil(_PAIRS_BY_SAMPLES * done ** (1 / 3))), packed.shape[-1]
         while 2 * pairs <= scene.points.shape[1]:
             some = scene.pairs(self.samples.spread(problems, pairs))
             width = max(width // _KEPT_ONE_IN, self.plan.local_candidates)
