@@ -50,8 +50,8 @@ _KERNEL_SCALE, _MEDIAN, _FITTED = 3.4, 2.0 * math.log(2.0), 5
 # Standard deviations. :func:`search_on` counts nearer pairs as inliers. The limit of estimated noise is wide because
 # networks estimate too little noise where most pairs are wrong: right pairs that do not count cost more than wrong
 # pairs that do. That of known noise was tuned on problems of uncertain PnP (`benchmarks/uncertain_problems.py`, seed
-# 777, 10 pairs with 5 outliers): 4 and 10 double the distance to maximum likelihood.
-_INLIER, _KNOWN_INLIER = 10.0, 6.0
+# 777 and 778, 10 pairs with 5 outliers): 4 and 8 lead to larger errors.
+_INLIER, _KNOWN_INLIER = 10.0, 5.0
 # Normalised units. A guess that has the centre of the world nearer than this counts as this near.
 _NEAREST = 0.5
 # A pair whose weight or confidence is 0 is drawn this often, relative to a pair where it is 1. Networks mislead more
@@ -276,7 +276,7 @@ def search_on(corr: Correspondences, guess: Guess, plan: Plan = FURTHER) -> Gues
 
     Samples hold pairs in proportion to 0.8 plus 0.2 times the weight of the guess, times the caller's confidence:
     weights that mislead then cost some samples, but no pose. An inlier is within ten standard deviations of the noise
-    that the guess estimates (its mean over the pairs), or within six of the noise of its pair that the caller gave; of
+    that the guess estimates (its mean over the pairs), or within five of the noise of its pair that the caller gave; of
     noise with covariances the standard deviation of isotropic noise of the same trace. The limit is that of a point as
     far away as the centre of the world in the guess, for all poses: with a limit by each pose's own depths, a pose
     close to the points would have most inliers.
@@ -291,7 +291,7 @@ def search_on(corr: Correspondences, guess: Guess, plan: Plan = FURTHER) -> Gues
         plan: how to search.
 
     Returns:
-        The guess with the best pose alone, a constant. Where a problem was searched, the weights are those of a Cauchy
+        The guess with the best pose, a constant, alone unless there is a prior. Where a problem was searched, the weights are those of a Cauchy
         kernel at this pose, whose scale is the limit of an inlier: the network's likelihoods misled there.
 
     Raises:
@@ -318,7 +318,9 @@ def search_on(corr: Correspondences, guess: Guess, plan: Plan = FURTHER) -> Gues
     judged = judge(project(found.pose, problems_last(corr)), corr, thresholds)
     searched = (found.samples > 0)[:, None]
     weights = torch.where(searched, 1.0 / (1.0 + judged.errors), guess.weights)
-    return guess._replace(pose=found.pose, others=None, weights=weights)
+    # Least squares on pairs alone leave the basin of a prior's pose: with a prior, all poses are refined.
+    others = None if corr.prior is None else guess.others
+    return guess._replace(pose=found.pose, others=others, weights=weights)
 
 
 class _Constant(torch.autograd.Function):
