@@ -282,7 +282,7 @@ class PnPNet(nn.Module):
             begun = self._begin(views, always, inputs)
         else:
             corr, frame, guess = self._first(views, always, inputs)
-            guess = search_on(corr, guess)
+            guess = search_on(corr, guess, keep_others=inputs.init is not None or inputs.prior is not None)
             begun = _Begun(self.refine.begin(corr, guess), frame, guess)
         end = self.refine.iterate(begun.start, 0 if first_stage_only else None)
         return begun, self._finish(begun, end, always)

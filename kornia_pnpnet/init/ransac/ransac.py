@@ -271,7 +271,7 @@ def _trusted(confidence: Tensor | None) -> Tensor | None:
 
 
 @torch.no_grad()
-def search_on(corr: Correspondences, guess: Guess, plan: Plan = FURTHER) -> Guess:
+def search_on(corr: Correspondences, guess: Guess, *, keep_others: bool = False, plan: Plan = FURTHER) -> Guess:
     r"""Go on searching where the poses of a guess do not suffice, with samples of likely inliers.
 
     Samples hold pairs in proportion to 0.8 plus 0.2 times the weight of the guess, times the caller's confidence:
@@ -288,11 +288,13 @@ def search_on(corr: Correspondences, guess: Guess, plan: Plan = FURTHER) -> Gues
     Args:
         corr: normalised correspondences of a centred and scaled world.
         guess: poses, probabilities of being an inlier as weights, and the noise of the pairs.
+        keep_others: whether the guess keeps its other poses. The caller's pose is one of them, and few pairs alone may
+            lead away from it.
         plan: how to search.
 
     Returns:
-        The guess with the best pose, a constant, alone unless there is a prior. Where a problem was searched, the weights are those of a Cauchy
-        kernel at this pose, whose scale is the limit of an inlier: the network's likelihoods misled there.
+        The guess with the best pose, a constant. Where a problem was searched, the weights are those of a Cauchy kernel
+        at this pose, whose scale is the limit of an inlier: the network's likelihoods misled there.
 
     Raises:
         ValueCheckError: when the initialiser does not estimate the noise.
@@ -318,9 +320,7 @@ def search_on(corr: Correspondences, guess: Guess, plan: Plan = FURTHER) -> Gues
     judged = judge(project(found.pose, problems_last(corr)), corr, thresholds)
     searched = (found.samples > 0)[:, None]
     weights = torch.where(searched, 1.0 / (1.0 + judged.errors), guess.weights)
-    # Least squares on pairs alone leave the basin of a prior's pose: with a prior, all poses are refined.
-    others = None if corr.prior is None else guess.others
-    return guess._replace(pose=found.pose, others=others, weights=weights)
+    return guess._replace(pose=found.pose, others=guess.others if keep_others else None, weights=weights)
 
 
 class _Constant(torch.autograd.Function):
