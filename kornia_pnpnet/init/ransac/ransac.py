@@ -307,16 +307,17 @@ def search_on(corr: Correspondences, guess: Guess, *, keep_others: bool = False,
     sigma = torch.hypot(noise.img, corr.focal * noise.world / depth).maximum(LEAST_NOISE * corr.focal)
     if told is None:
         there = (corr.weights > 0).to(sigma)
-        sigma = _INLIER * (sigma * there).sum(-1) / there.sum(-1).clamp(min=1.0)
+        sigma = (sigma * there).sum(-1) / there.sum(-1).clamp(min=1.0)
+        limit = _INLIER * sigma
     else:
         known = told.img.isfinite() & told.world.isfinite()
-        sigma = torch.where(known, _KNOWN_INLIER, _INLIER) * sigma
-    thresholds = Thresholds(sigma, torch.zeros_like(depth[:, 0]))
+        limit = torch.where(known, _KNOWN_INLIER, _INLIER) * sigma
+    thresholds = Thresholds(limit, torch.zeros_like(depth[:, 0]))
     chances = _DOUBT + (1.0 - _DOUBT) * guess.weights.detach()
     trusted = _trusted(corr.confidence)
     chances = chances if trusted is None else chances * trusted
     given = map_tensors(lambda *x: torch.stack(x, 1).detach(), *guess.poses)
-    found = Search(plan, corr, thresholds, chances).run(given, worth=plan.min_samples)
+    found = Search(plan, corr, thresholds, chances, sigma).run(given, worth=plan.min_samples)
     judged = judge(project(found.pose, problems_last(corr)), corr, thresholds)
     searched = (found.samples > 0)[:, None]
     weights = torch.where(searched, 1.0 / (1.0 + judged.errors), guess.weights)

@@ -15,8 +15,8 @@ from kornia_pnpnet.init.ransac.minimal import MinimalSolver
 from kornia_pnpnet.init.ransac.sampling import Samples, agreement_of_neighbours
 from kornia_pnpnet.init.ransac.scoring import Scene, Scorer
 from kornia_pnpnet.refine import lm_step
-from kornia_pnpnet.refine.verdict import Thresholds, judge
-from kornia_pnpnet.types import Correspondences, Pose
+from kornia_pnpnet.refine.verdict import Thresholds, judge, rotation_sigma
+from kornia_pnpnet.types import Correspondences, Noise, Pose
 
 __all__ = ["PAIRS_PER_SAMPLE", "Found", "Plan", "Search", "full_vectors", "least_squares", "take"]
 
@@ -39,6 +39,12 @@ _VECTOR = 64
 _DAMPING = 1e-6
 # Thresholds. The first least squares use the pairs up to this limit: the pose of a noisy sample misses some inliers.
 _WIDE = 3.0
+# Standard deviations in a threshold, unless the noise is known.
+_SIGMAS = 3.0
+# Where the inliers leave the rotation open by more than the first (standard deviation in radians), as those of a flat
+# scene in a narrow field of view do, another pose may have as many: at least this many samples are drawn. Chosen on a
+# scene with a field of view of 13 degrees; half of the angle takes twice the time at 9 pairs.
+_OPEN, _OPEN_SAMPLES = 0.008, 256.0
 # After this many samples, pairs whose neighbours agree are drawn more often. Finding these takes about as long.
 _PLAIN_SAMPLES = 128
 # A pair without any agreement is drawn this often, relative to one unit of agreement; the exponent is empirical.
@@ -85,6 +91,8 @@ class Search:
         corr: normalised correspondences whose world is centred, since the search runs in float32.
         thresholds: thresholds of an inlier, shape :math:`(B,)` each.
         chances: how likely a pair is an inlier, up to a factor, shape :math:`(B, N)`; all the same when ``None``.
+        sigma: standard deviation of the pixels, shape :math:`(B,)` or :math:`(B, N)`; a third of the threshold when
+            ``None``.
 
     Example:
         >>> from kornia_pnpnet.init.ransac.p3p import P3P
@@ -100,11 +108,18 @@ class Search:
     """
 
     def __init__(
-        self, plan: Plan, corr: Correspondences, thresholds: Thresholds, chances: Tensor | None = None
+        self,
+        plan: Plan,
+        corr: Correspondences,
+        thresholds: Thresholds,
+        chances: Tensor | None = None,
+        sigma: Tensor | None = None,
     ) -> None:
         self.plan = plan
         self.corr = corr
         self.low = map_tensors(lambda x: x.to(_DTYPE), (corr, thresholds))
+        sigma = thresholds.img / _SIGMAS if sigma is None else sigma
+        self.sigma = (sigma if sigma.ndim > 1 else sigma[:, None]).to(_DTYPE).expand_as(corr.weights)
         self.scene = Scene.make(corr, thresholds, _DTYPE)
         self.chances = chances
         self.samples = self.plain = self._samples(chances)
@@ -126,12 +141,19 @@ class Search:
         loss = matrix.new_full((batch,), torch.inf)
         poses, drawn = torch.zeros(2, batch, dtype=torch.long, device=device)
         needed = loss.double()
+        least = torch.zeros_like(needed)
         active = (self.samples.counts >= self.samples.size).nonzero()[:, 0]
 
         def expect(at: Tensor) -> None:
-            corr, thresholds = take(self.low, at)
-            judged = judge(project(_pose(matrix[at]), corr), corr, thresholds)
-            needed[at] = self._needed(at, judged.weights > 0)
+            rows = full_vectors(at)
+            corr, thresholds, sigma = take((*self.low, self.sigma), rows)
+            corr = problems_last(corr)
+            projection = project(_pose(matrix[rows]), corr)
+            judged = judge(projection, corr, thresholds)
+            noise = Noise(sigma, torch.zeros_like(sigma))
+            is_open = rotation_sigma(projection, corr._replace(noise=noise), judged) > _OPEN
+            least[at] = least[at].where(~is_open[: len(at)], _OPEN_SAMPLES)
+            needed[at] = self._needed(at, judged.weights[: len(at)] > 0).maximum(least[at])
 
         def improve(at: Tensor, losses: Tensor, matrices: Tensor) -> None:
             size = max(1, PAIRS_PER_SAMPLE * plan.chunk_size // (count * losses.shape[1]))
