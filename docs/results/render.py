@@ -40,6 +40,8 @@ __all__ = [
 
 REPOSITORY = HERE.parents[1]
 EXPERIMENTS = REPOSITORY / "conf" / "experiment"
+#: Files of `benchmarks/real_matches.py measure` on other scenes, the latest last.
+LATER_MATCHES = ("real_matches_again", "real_matches_third")
 #: Files of short runs, see ``make.py``.
 SUMMARIES = ("ablation", "sweep", "capacity")
 KERNEL = "model.solver.refine.kernel"  # column of a summary
@@ -369,13 +371,13 @@ def measured_on_matches(results: Mapping[str, Any]) -> dict[str, Any]:
     return {**found, "total": count, "scenes": scenes}
 
 
-def real_matches(results: Mapping[str, Any], costs: Mapping[str, Any], again: Mapping[str, Any]) -> str:
+def real_matches(results: Mapping[str, Any], costs: Mapping[str, Any], later: Sequence[Mapping[str, Any]]) -> str:
     """The page on real matches as Markdown.
 
     Args:
         results: what ``benchmarks/real_matches.py measure`` wrote.
         costs: what ``benchmarks/real_matches.py cost`` wrote.
-        again: what ``benchmarks/real_matches.py measure`` wrote of other scenes with a later version.
+        later: what ``benchmarks/real_matches.py measure`` wrote of other scenes with later versions.
     """
     settings, facts = results["settings"], measured_on_matches(results)
     first = settings["solvers"][0]
@@ -393,8 +395,7 @@ def real_matches(results: Mapping[str, Any], costs: Mapping[str, Any], again: Ma
     return environment.get_template("real_matches.md.jinja").render(
         results=results,
         costs=costs,
-        again=again,
-        of_again=measured_on_matches(again),
+        later=[{**measured_on_matches(entry), "results": entry} for entry in later],
         first=first,
         far_count=round(raw["far"] * raw["count"]),
         deciles=deciles,
@@ -459,8 +460,8 @@ def render() -> None:
     found = json.loads((HERE / "real_matches.json").read_text())
     costs = json.loads((HERE / "real_matches_cost.json").read_text())
     plot_real_matches(HERE / "real_matches.png", found, costs)
-    again = json.loads((HERE / "real_matches_again.json").read_text())
-    (HERE / "real_matches.md").write_text(real_matches(found, costs, again), encoding="utf-8")
+    later = [json.loads((HERE / f"{name}.json").read_text()) for name in LATER_MATCHES]
+    (HERE / "real_matches.md").write_text(real_matches(found, costs, later), encoding="utf-8")
 
     rows, table = overview(json.loads((REPOSITORY / "benchmarks" / "solvers.json").read_text()))
     plot_overview(HERE / "overview.png", rows, outliers="0 to 3 outliers among 9 pairs")
