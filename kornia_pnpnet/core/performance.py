@@ -25,6 +25,7 @@ __all__ = [
     "in_full_precision",
     "in_order",
     "keep_freed_memory",
+    "package_options",
     "present_first",
     "problems_last",
     "ranked",
@@ -407,3 +408,17 @@ class Compiled(Generic[_P, _T]):
 def _is_worth_checking(guards: Sequence[Any]) -> list[bool]:
     """Skip checks of functions and constants of modules, which do not change: they take time at each call."""
     return [guard.guard_type == "DUPLICATE_INPUT" or not guard.is_global for guard in guards]
+
+
+def package_options(pairs: int | None) -> dict[str, Any]:
+    """Options of AOTInductor for a package of ``pairs`` correspondences per problem (``None``: any number).
+
+    Args:
+        pairs: see :data:`_MANY_PAIRS`.
+    """
+    return {
+        "cpp.vec_isa_ok": True,  # see Compiled
+        # The default is the number of threads of the process that compiles, fixed for ever.
+        "cpp.threads": 1,
+        "pick_loop_orders": pairs is not None and pairs < _MANY_PAIRS,
+    }
