@@ -50,7 +50,8 @@ int main(int argc, char** argv) try {
   const torch::Tensor intrinsics = torch::tensor({fx, 0.f, cx, 0.f, fy, cy, 0.f, 0.f, 1.f}).view({1, 3, 3});
   const torch::Tensor weights = torch::ones({1, pairs.size(0)});  // (1, N), 0 for padding
 
-  // rotation (1, 3, 3), translation (1, 3), pair_weights (1, N), cost (1,), ok (1,)
+  // rotation (1, 3, 3), translation (1, 3), pair_weights (1, N), cost (1,), ok (1,); clone what must outlive the next
+  // call of this thread, which may write over these tensors.
   const std::vector<torch::Tensor> result = solver.run({world_points, img_points, intrinsics, weights});
   const torch::Tensor rotation = result[0].contiguous(), translation = result[1].contiguous();
   std::cout.precision(9);
