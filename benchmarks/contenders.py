@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -104,11 +105,49 @@ class Refinement(Contender):
         return Task(call, lambda: undo(self.refine(corr, guess).pose), problems, waiting(self.device))
 
 
-class Onnx(Contender):
-    """A solver of this package as an ONNX model for nine pairs, under ONNX Runtime, in float32.
+def exported(spec: str, suffix: str, export: Callable[[PnPNet, Path], object]) -> Path:
+    """Export a solver, unless ``outputs/exported`` has it from the present code: exporting takes minutes."""
+    from kornia_pnpnet.evaluation.results import source_digest
 
-    Exporting takes minutes, so ``outputs/onnx`` keeps the models of the present code.
-    """
+    path = HERE.parent / "outputs" / "exported" / f"{spec}-{source_digest()[:16]}{suffix}"
+    if not path.exists():
+        solver = load_solver(spec)
+        assert isinstance(solver, PnPNet)
+        export(solver, path)
+    return path
+
+
+class Packaged(Contender):
+    """A solver of this package for nine pairs, compiled ahead of time for one problem per call, in float32."""
+
+    loops, differentiable = True, False
+    n = 9
+
+    def __init__(self, spec: str) -> None:
+        from kornia_pnpnet.export import export_package, load_package
+
+        self.solver = load_package(
+            exported(spec, ".pt2", lambda solver, path: export_package(solver, path, self.n, batch=1))
+        )
+
+    def takes(self, n: int) -> bool:
+        """The number of pairs of the package."""
+        return n == self.n
+
+    def task(self, problems: Problems, *, backward: bool = False) -> Task:
+        """The calls one after the other."""
+        tensors = float_inputs(problems, "cpu")
+        single = list(zip(*(x.split(1) for x in tensors), strict=True))
+
+        def poses() -> Pose:
+            results = [self.solver(*one) for one in single]
+            return Pose(*(torch.cat(x) for x in list(zip(*results, strict=True))[:2]))
+
+        return Task(lambda: [self.solver(*one) for one in single], poses, problems)
+
+
+class Onnx(Contender):
+    """A solver of this package as an ONNX model for nine pairs, under ONNX Runtime, in float32."""
 
     differentiable = False
     n = 9
@@ -116,15 +155,10 @@ class Onnx(Contender):
     def __init__(self, spec: str) -> None:
         import onnxruntime
 
-        from kornia_pnpnet.evaluation.results import source_digest
         from kornia_pnpnet.export import INPUTS, export_onnx
 
         self.names = INPUTS
-        path = HERE.parent / "outputs" / "onnx" / f"{spec}-{source_digest()[:16]}.onnx"
-        if not path.exists():
-            solver = load_solver(spec)
-            assert isinstance(solver, PnPNet)
-            export_onnx(solver, path, self.n)
+        path = exported(spec, ".onnx", lambda solver, path: export_onnx(solver, path, self.n))
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = torch.get_num_threads()
         options.log_severity_level = 3
@@ -165,6 +199,7 @@ OURS: dict[str, Callable[..., Contender]] = {
 #: All contenders.
 CONTENDERS: dict[str, Callable[..., Contender]] = {
     **OURS,
+    f"{TRAINED} packaged": functools.partial(Packaged, TRAINED),
     f"{TRAINED} ONNX": functools.partial(Onnx, TRAINED),
     f"{ANY} ONNX": functools.partial(Onnx, ANY),
     "opencv-ransac": functools.partial(Peer, "opencv-ransac"),

@@ -12,7 +12,7 @@ import pandas as pd
 from kornia_pnpnet.evaluation.figures import style
 
 # Lines by the end of a name, which says how the solver runs. Without such an end the line is dashed.
-_WAYS = {" compiled": "-", " compiled whole": ":", " ONNX": "-."}
+_WAYS = {" compiled": "-", " compiled whole": ":", " ONNX": "-.", " packaged": ":"}
 _LAST_SHARE = 0.99  # share of the calls drawn; other programs delayed the slowest
 
 

@@ -1,32 +1,64 @@
-"""Export of solvers as graphs for other programs: ``torch.export`` and ONNX."""
+"""Export of solvers for other programs: ``torch.export``, ahead-of-time packages and ONNX."""
 
 from __future__ import annotations
 
 import copy
+import io
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from kornia.core.exceptions import ValueCheckError
 from torch import Tensor, nn
 
-from kornia_pnpnet.core.checks import check_whole
+from kornia_pnpnet.core.checks import check_shapes, check_whole
 from kornia_pnpnet.core.files import atomic_open
+from kornia_pnpnet.core.inlining import INLINE
+from kornia_pnpnet.core.performance import package_options
 from kornia_pnpnet.data import SyntheticProblems
 from kornia_pnpnet.init import RANSAC, MLPInit
 from kornia_pnpnet.solver import PnPNet
 
-__all__ = ["INPUTS", "OUTPUTS", "export_onnx", "export_program"]
+__all__ = [
+    "INPUTS",
+    "OUTPUTS",
+    "ExportedResult",
+    "PackagedSolver",
+    "export_onnx",
+    "export_package",
+    "export_program",
+    "load_package",
+]
+
+
+class ExportedResult(NamedTuple):
+    """What an exported solver returns: fields of :class:`~kornia_pnpnet.types.PnPResult`.
+
+    Attributes:
+        rotation: shape :math:`(B, 3, 3)`.
+        translation: shape :math:`(B, 3)`.
+        pair_weights: the result's ``weights``, shape :math:`(B, N)`. ONNX requires another name than that of the input.
+        cost: shape :math:`(B,)`.
+        ok: bool, shape :math:`(B,)`.
+    """
+
+    rotation: Tensor
+    translation: Tensor
+    pair_weights: Tensor
+    cost: Tensor
+    ok: Tensor
+
 
 #: Names of the inputs of an exported solver, in this order, all float32.
 INPUTS = ("world_points", "img_points", "intrinsics", "weights")
-#: Names of the outputs: fields of :class:`~kornia_pnpnet.types.PnPResult`. ``ok`` is bool. ``pair_weights`` are the
-#: result's ``weights``: ONNX requires another name than that of the input.
-OUTPUTS = ("rotation", "translation", "pair_weights", "cost", "ok")
+#: Names of the outputs: the fields of :class:`ExportedResult`.
+OUTPUTS = ExportedResult._fields
 #: Upper bounds of the dynamic dimensions: torch.export simplifies its guards with finite ranges.
 _MAX_BATCH = 2**20
 _MAX_N = 2**16
+# Metadata of a package: the sizes that it was compiled for.
+_BATCH, _N, _ANY = "pnpnet_batch", "pnpnet_n", "any"
 
 
 class _Graph(nn.Module):
@@ -43,20 +75,22 @@ class _Graph(nn.Module):
         return result.rotation, result.translation, result.weights, result.cost, result.ok
 
 
-def export_program(solver: PnPNet, n: int | None = None) -> torch.export.ExportedProgram:
-    r"""Trace a solver for batches of any size.
+def export_program(solver: PnPNet, n: int | None = None, *, batch: int | None = None) -> torch.export.ExportedProgram:
+    r"""Trace a solver for batches of any size or of one size.
 
     Args:
-        solver: any solver but RANSAC, whose number of iterations depends on the data.
+        solver: any solver but RANSAC, whose number of iterations depends on the data. The program has the fixed effort,
+            whatever the solver's ``effort`` is.
         n: number of correspondences per problem. With ``None`` the n of the network, or any n of at least 4 when the
             network accepts any n.
+        batch: number of problems of each call, which a compiler can specialise for; ``None``: any number.
 
     Returns:
         A program that maps :data:`INPUTS` to :data:`OUTPUTS`. The inputs are world points :math:`(B, N, 3)`, pixels
         :math:`(B, N, 2)`, camera matrices :math:`(B, 3, 3)` and weights :math:`(B, N)`, 0 for padding.
 
     Raises:
-        BaseError: when ``n`` is less than 3 or not the n of the network.
+        BaseError: when ``n`` is less than 3 or not the n of the network, or ``batch`` less than 1.
         ValueCheckError: when the solver cannot be traced.
 
     Example:
@@ -70,30 +104,155 @@ def export_program(solver: PnPNet, n: int | None = None) -> torch.export.Exporte
         raise ValueCheckError("RANSAC cannot be exported: the number of its samples depends on the data.")
     if n is not None:
         check_whole(3, n=n)
-    fixed = int(solver.init.config["n"]) if isinstance(solver.init, MLPInit) else n
+    if batch is not None:
+        check_whole(1, _MAX_BATCH, batch=batch)
+    fixed = _fixed_n(solver, n)
     if n not in (None, fixed):
         raise ValueCheckError(f"The solver's network was built for n = {fixed}, got n = {n!r}.")
-    problems = SyntheticProblems(n=12 if fixed is None else fixed, batch_size=3, seed=0).batch(0)
+    size = 3 if batch is None else int(batch)
+    problems = SyntheticProblems(n=12 if fixed is None else fixed, batch_size=size, seed=0).batch(0)
     weights = torch.ones_like(problems.world_points[..., 0])
     inputs = (problems.world_points, problems.img_points, problems.intrinsics, weights)
-    batch: dict[int, Any] = {0: torch.export.Dim("batch", min=1, max=_MAX_BATCH)}
-    points = batch if fixed is not None else {**batch, 1: torch.export.Dim("pairs", min=4, max=_MAX_N)}
-    shapes = (points, points, batch, points)
+    sizes: dict[int, Any] = {} if batch is not None else {0: torch.export.Dim("batch", min=1, max=_MAX_BATCH)}
+    points = sizes if fixed is not None else {**sizes, 1: torch.export.Dim("pairs", min=4, max=_MAX_N)}
+    shapes = (points, points, sizes, points)
     try:
-        with torch.no_grad():
+        with torch.no_grad(), warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)  # the exporter warns about its own code
             return torch.export.export(_Graph(copy.deepcopy(solver).float().eval()), inputs, dynamic_shapes=shapes)
     except Exception as error:
         reason = " ".join(str(error).split())[:300]
         raise ValueCheckError(f"{type(solver.init).__name__} cannot be exported: {reason}") from error
 
 
-def export_onnx(solver: PnPNet, path: str | Path, n: int | None = None) -> Path:
+def _fixed_n(solver: PnPNet, n: int | None) -> int | None:
+    """The number of pairs of a program; ``None``: any."""
+    return int(solver.init.config["n"]) if isinstance(solver.init, MLPInit) else n
+
+
+def export_package(solver: PnPNet, path: str | Path, n: int | None = None, *, batch: int | None = None) -> Path:
+    """Compile a solver ahead of time with AOTInductor.
+
+    :func:`load_package` loads the package without tracing or compiling, and C++ loads it with libtorch alone. A package
+    runs on CPUs that have the instructions of the one that compiled it (AVX2, AVX-512), on one thread, with the version
+    of PyTorch that made it. Compiling takes minutes and needs a C++ compiler and PyTorch 2.6 or later.
+
+    Args:
+        solver: see :func:`export_program`.
+        path: the file to write, ``.pt2``. An existing file is replaced when the package is complete.
+        n: see :func:`export_program`.
+        batch: see :func:`export_program`. With 1 and a fixed number of correspondences, a problem takes a fraction of
+            the time. Such a package, called without :func:`load_package`, writes each result of a thread over the one
+            before.
+
+    Returns:
+        The path.
+
+    Raises:
+        BaseError: see :func:`export_program`; or when the name does not end in ``.pt2``.
+        ImportError: without a C++ compiler.
+        OSError: when the file cannot be written.
+    """
+    path = Path(path)
+    if path.suffix != ".pt2":
+        raise ValueCheckError(f"The name of a package must end in .pt2, got '{path}'.")
+    from torch._inductor.cpp_builder import get_cpp_compiler
+
+    try:
+        get_cpp_compiler()
+    except RuntimeError as error:
+        raise ImportError(
+            "Ahead-of-time packages need a C++ compiler: install g++ (Debian, Ubuntu: apt install g++) or clang, or"
+            " name yours in the environment variable CXX"
+        ) from error
+    program = export_program(solver, n, batch=batch)
+    pairs = _fixed_n(solver, n)
+    metadata = {_BATCH: str(batch or _ANY), _N: str(pairs or _ANY)}
+    # One problem mostly waits for calls and allocations. For more problems calls take less time.
+    inline = batch == 1 and pairs is not None
+    options = {**package_options(pairs, on_stack=inline), "aot_inductor.metadata": metadata}
+    content = io.BytesIO()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the compiler about itself
+        if inline:
+            program = program.run_decompositions(INLINE)
+        torch._inductor.aoti_compile_and_package(program, package_path=content, inductor_configs=options)
+    with atomic_open(path, "wb") as file:
+        file.write(content.getbuffer())
+    return path
+
+
+class PackagedSolver:
+    r"""A solver that :func:`export_package` compiled. Results have no gradients.
+
+    Calling it computes in float32 on the CPU, whatever dtype, device and memory layout the inputs have.
+
+    Attributes:
+        batch: number of problems of each call; ``None``: any number.
+        n: number of correspondences per problem; ``None``: any number of at least 4.
+    """
+
+    def __init__(self, loader: torch._C._aoti.AOTIModelPackageLoader) -> None:
+        self._run = loader.run
+        metadata = loader.get_metadata()
+        self.batch, self.n = (None if metadata[key] == _ANY else int(metadata[key]) for key in (_BATCH, _N))
+
+    def __call__(
+        self, world_points: Tensor, img_points: Tensor, intrinsics: Tensor, weights: Tensor | None = None
+    ) -> ExportedResult:
+        r"""Solve a batch of problems.
+
+        Args:
+            world_points: shape :math:`(B, N, 3)`.
+            img_points: pixels, shape :math:`(B, N, 2)`.
+            intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`.
+            weights: weight of each pair, 0 for padding, shape :math:`(B, N)`; 1 when ``None``.
+
+        Raises:
+            ShapeError: for other shapes; compiled code would read beyond the end of a tensor.
+        """
+        batch, n = (*world_points.shape, 0, 0)[:2]
+        batch, n = self.batch or batch, self.n or max(n, 4)
+        if weights is None:
+            weights = torch.ones(batch, n)
+        if intrinsics.ndim == 2:
+            intrinsics = intrinsics.expand(batch, 3, 3)
+        shapes = (batch, n, 3), (batch, n, 2), (batch, 3, 3), (batch, n)
+        inputs = world_points, img_points, intrinsics, weights
+        check_shapes(dict(zip(INPUTS, zip(inputs, shapes, strict=True), strict=True)))
+        # Compiled code does not look at dtypes and strides, and may write the next result over this one.
+        results = self._run([x.to("cpu", torch.float32).contiguous() for x in inputs])
+        return ExportedResult(*[x.clone() for x in results])
+
+
+def load_package(path: str | Path) -> PackagedSolver:
+    """Load a solver that :func:`export_package` compiled, without tracing or compiling.
+
+    A package is machine code: load only packages that you trust.
+
+    Raises:
+        OSError: when the file cannot be read.
+        ValueCheckError: when the file is not a package of :func:`export_package`, or of another platform.
+    """
+    with Path(path).open("rb"):
+        pass
+    try:
+        # `torch._inductor.aoti_load_package` is the same, but imports the compiler first, which takes seconds, and
+        # parses the signature in each call.
+        return PackagedSolver(torch._C._aoti.AOTIModelPackageLoader(str(path), "model", False, 1, -1))
+    except (RuntimeError, KeyError, ValueError) as error:
+        reason = " ".join(str(error).split())[:300]
+        raise ValueCheckError(f"'{path}' is not a solver of export_package for this machine: {reason}") from error
+
+
+def export_onnx(solver: PnPNet, path: str | Path, n: int | None = None, *, batch: int | None = None) -> Path:
     """Write a solver as an ONNX model in one file. ONNX Runtime runs the model without PyTorch.
 
     Args:
         solver: see :func:`export_program`.
         path: the file to write. An existing file is replaced when the model is complete.
         n: see :func:`export_program`.
+        batch: see :func:`export_program`.
 
     Returns:
         The path.
@@ -108,7 +267,7 @@ def export_onnx(solver: PnPNet, path: str | Path, n: int | None = None) -> Path:
     except ImportError as error:
         raise ImportError("ONNX needs more packages: pip install 'kornia_pnpnet[onnx]'") from error
     path = Path(path)
-    program = export_program(solver, n)
+    program = export_program(solver, n, batch=batch)
     inputs, outputs = list(INPUTS), list(OUTPUTS)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # the exporter warns about its own code
@@ -119,7 +278,7 @@ def export_onnx(solver: PnPNet, path: str | Path, n: int | None = None) -> Path:
     _simplify(model.model)
     graph = model.model_proto
     batches = {value.type.tensor_type.shape.dim[0].dim_param for value in graph.graph.input}
-    if not batches.isdisjoint({"", *map(str, range(10))}):
+    if batch is None and not batches.isdisjoint({"", *map(str, range(10))}):
         # The exporter replaced the batch size by that of the example inputs.
         raise ValueCheckError(f"{type(solver.init).__name__} cannot be exported to ONNX for batches of any size.")
     with atomic_open(path, "wb") as file:

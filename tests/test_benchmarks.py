@@ -188,7 +188,7 @@ def test_the_coarse_pose_has_the_stated_error(make_problems):
 
 # Exporting takes minutes.
 EAGER = [
-    pytest.param(name, marks=pytest.mark.slow) if "ONNX" in name else name
+    pytest.param(name, marks=pytest.mark.slow) if name.endswith(("ONNX", "packaged")) else name
     for name in contenders.CONTENDERS
     if "compiled" not in name
 ]

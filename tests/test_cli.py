@@ -281,8 +281,17 @@ def test_a_small_file_that_unpacks_to_gigabytes_is_refused(capsys, tmp_path, mon
     assert "more than 0.0 GB: split the file" in refused(capsys, "solve", path, "--intrinsics", CAMERA)
 
 
-def test_export_does_not_overwrite(capsys, tmp_path):
-    path = tmp_path / "model.onnx"
+@pytest.mark.parametrize("name", ["model", "model.pt", "model.so", ".onnx"])
+def test_the_suffix_says_what_is_exported(capsys, tmp_path, name):
+    err = refused(capsys, "export", tmp_path / name)
+    assert ".onnx" in err
+    assert ".pt2" in err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["model.onnx", "model.pt2"])
+def test_export_does_not_overwrite(capsys, tmp_path, name):
+    path = tmp_path / name
     path.write_text("mine")
     assert "pass --overwrite" in refused(capsys, "export", path)
     assert path.read_text() == "mine"

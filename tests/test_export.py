@@ -1,15 +1,28 @@
-"""Exported solvers compute what the layer does, for batches of any size, without PyTorch."""
+"""Exported solvers compute what the layer does, for batches of any size, compiled ahead of time and in ONNX Runtime."""
 
 import math
+import shutil
+import subprocess
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from kornia.core.exceptions import BaseError, ValueCheckError
+from kornia.core.exceptions import BaseError, ShapeError, ValueCheckError
 
 from kornia_pnpnet import PnPNet, RobustWeightedLM, create_solver
 from kornia_pnpnet.cli import main
-from kornia_pnpnet.export import INPUTS, OUTPUTS, export_onnx, export_program
+from kornia_pnpnet.export import (
+    INPUTS,
+    OUTPUTS,
+    PackagedSolver,
+    export_onnx,
+    export_package,
+    export_program,
+    load_package,
+)
+
+CPP = Path(__file__).resolve().parents[1] / "docs" / "examples" / "cpp"
 
 
 def inputs_of(problems, weights=None):
@@ -93,6 +106,9 @@ def test_solvers_that_cannot_be_exported(tmp_path, capsys):
     for n in (0, 1, 2, -1, True, 0.5, 6.0, math.nan, "6"):
         with pytest.raises(BaseError):
             export_program(PnPNet(None, RobustWeightedLM(1)), n)
+    for batch in (0, -1, True, 0.5, "1"):
+        with pytest.raises(BaseError):
+            export_program(PnPNet(None, RobustWeightedLM(1)), 9, batch=batch)
     (tmp_path / "old.onnx").write_bytes(b"old")
     with pytest.raises(ValueCheckError, match="RANSAC"):
         export_onnx(create_solver("p3p-ransac"), tmp_path / "old.onnx", 9)
@@ -101,3 +117,144 @@ def test_solvers_that_cannot_be_exported(tmp_path, capsys):
     assert main(["export", str(tmp_path / "x.onnx"), "--solver", "opencv-ransac"]) == 2
     assert "opencv-ransac" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+# -- ahead-of-time packages --------------------------------------------------------------------------------------------
+
+
+def packaged(folder, solver, n, batch):
+    if shutil.which("g++") is None and shutil.which("clang++") is None:
+        pytest.skip("no C++ compiler")
+    return export_package(solver, folder / f"{batch}.pt2", n, batch=batch)
+
+
+def solve_sizes(path, solver, sizes, make_problems):
+    """Packages get tensors of other dtypes and layouts than they were compiled for, and a broken problem."""
+    package = load_package(path)
+    for count, batch in sizes:
+        problems = make_problems(n=count, batch=batch, outliers=count // 4)
+        world = problems.world_points.clone()
+        world[3:4, 1] = torch.nan
+        inputs = inputs_of(problems._replace(world_points=world))
+        with torch.no_grad():
+            found = package(*inputs)
+        assert found._fields == OUTPUTS
+        near(found, solver, inputs)
+        assert all(x.isfinite().all() for x in found[:4])
+        assert not found.ok[3:4].any()
+        transposed = [x.double().mT.contiguous().mT for x in inputs[:3]]
+        transposed[2] = transposed[2][:1].expand(batch, 3, 3)
+        for ours, again in zip(
+            package(*(x.float().contiguous() for x in transposed)), package(*transposed), strict=True
+        ):
+            assert torch.equal(ours, again)
+    return package
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("batch", "sizes"), [(1, (1,)), (None, (1, 3, 100))])
+def test_packages(batch, sizes, make_problems, tmp_path):
+    solver = PnPNet(None, RobustWeightedLM(1))
+    path = packaged(tmp_path, solver, 9, batch)
+    package = solve_sizes(path, solver, [(9, size) for size in sizes], make_problems)
+    assert (package.n, package.batch) == (9, batch)
+    world, img, intrinsics, weights = inputs_of(make_problems(n=9, batch=2 if batch else 3))
+    wrong = [
+        (world[:, :8], img[:, :8], intrinsics, weights[:, :8]),
+        (world, img[:1], intrinsics),
+        (world[0], img, intrinsics),
+    ]
+    wrong += [(world, img, intrinsics, weights)] if batch else [(world, img, intrinsics[:1])]
+    for inputs in wrong:
+        with pytest.raises(ShapeError):
+            package(*inputs)
+
+
+@pytest.mark.slow
+def test_packages_of_any_number_of_pairs(make_problems, tmp_path):
+    solver = PnPNet(None, RobustWeightedLM(1))
+    package = solve_sizes(
+        packaged(tmp_path, solver, None, None), solver, ((4, 3), (9, 1), (40, 2), (20, 50)), make_problems
+    )
+    assert (package.n, package.batch) == (None, None)
+    with pytest.raises(ShapeError):
+        package(*inputs_of(make_problems(n=3, batch=3)))
+
+
+@pytest.mark.slow
+def test_cpp_example(make_problems, tmp_path):
+    """The C++ program and Python get the same numbers from the same package."""
+    if shutil.which("cmake") is None:
+        pytest.skip("no cmake")
+    path = packaged(tmp_path, PnPNet(None, RobustWeightedLM(1)), 9, 1)
+    prefix = f"-DCMAKE_PREFIX_PATH={torch.utils.cmake_prefix_path}"
+    subprocess.run(["cmake", "-S", CPP, "-B", tmp_path / "build", prefix], check=True)
+    subprocess.run(["cmake", "--build", tmp_path / "build"], check=True)
+
+    problems = make_problems(n=9, batch=1)
+    world, img, intrinsics, _ = inputs_of(problems)
+    rows = torch.cat((world, img), -1)[0].tolist()
+    table = tmp_path / "matches.csv"
+    table.write_text("\n".join(["X,Y,Z,u,v", *(",".join(map(repr, row)) for row in rows)]) + "\n")
+    camera = [repr(intrinsics[0, i, j].item()) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))]
+    command = [tmp_path / "build" / "pnpnet_solve", path, table, *camera]
+    rotation, translation, ok = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+    expected = load_package(path)(world, img, intrinsics)
+    for text, tensor in ((rotation, expected.rotation), (translation, expected.translation)):
+        torch.testing.assert_close(torch.tensor([*map(float, text.split())]), tensor.flatten(), rtol=1e-6, atol=1e-6)
+    assert ok == ("ok" if expected.ok.item() else "not ok")
+
+    table.write_text("\n".join(table.read_text().splitlines()[:-1]))
+    refused = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert refused.returncode == 2
+    assert "n = 9" in refused.stderr
+
+
+def test_packages_that_cannot_be_made(tmp_path, monkeypatch):
+    path = tmp_path / "old.pt2"
+    path.write_bytes(b"old")
+    with pytest.raises(ValueCheckError, match=r"\.pt2"):
+        export_package(PnPNet(None, RobustWeightedLM(1)), tmp_path / "model.so", 9)
+    with pytest.raises(ValueCheckError, match="RANSAC"):
+        export_package(create_solver("p3p-ransac"), path, 9)
+    monkeypatch.setattr("torch._inductor.config.cpp.cxx", ("no-such-compiler",))
+    with pytest.raises(ImportError, match="compiler"):
+        export_package(PnPNet(None, RobustWeightedLM(1)), path, 9)
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_files_that_are_no_packages(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        load_package(tmp_path / "missing.pt2")
+    path = tmp_path / "text.pt2"
+    path.write_text("text")
+    with pytest.raises(ValueCheckError, match="text"):
+        load_package(path)
+
+
+class Loader:
+    """Stands for compiled code: returns its inputs."""
+
+    def get_metadata(self):
+        return {"pnpnet_n": "any", "pnpnet_batch": "any"}
+
+    def run(self, inputs):
+        assert all(x.dtype == torch.float32 and x.is_contiguous() for x in inputs)
+        return [*inputs, inputs[0]]
+
+
+def test_what_compiled_code_gets(make_problems):
+    world, img, intrinsics, weights = inputs_of(make_problems(n=5, batch=2))
+    package = PackagedSolver(Loader())
+    for camera in (intrinsics, intrinsics[:1].expand(2, 3, 3), intrinsics[0]):
+        found = package(world.double(), img.mT.contiguous().mT, camera)
+        for x, expected in zip(found[:4], (world, img, camera.expand(2, 3, 3), weights), strict=True):
+            assert torch.equal(x, expected)
+    for wrong in (
+        (world[:, :3], img[:, :3], intrinsics),
+        (world, img[:1], intrinsics),
+        (world[0], img[0], intrinsics[0]),
+    ):
+        with pytest.raises(ShapeError):
+            package(*wrong)

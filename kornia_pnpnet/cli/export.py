@@ -1,8 +1,10 @@
-"""Write a solver as an ONNX model.
+"""Write a solver as an ONNX model or as a package that is compiled ahead of time.
 
-The model solves batches of any size. ONNX Runtime runs the model without PyTorch.
+The suffix of the file decides. ONNX Runtime runs a model (.onnx) without PyTorch. A package (.pt2) loads without
+compiling, in Python and in C++ with libtorch; it runs on CPUs like the one that compiled it.
 
   pnpnet export pnpnet-set.onnx
+  pnpnet export pnpnet-n9.pt2 --solver pnpnet-n9 --batch 1
 """
 
 from __future__ import annotations
@@ -16,31 +18,36 @@ from kornia_pnpnet.cli.arguments import load_solver_without_truth, whole_number
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``pnpnet export``."""
-    parser.add_argument("file", metavar="ONNX", help="the file to write")
+    parser.add_argument("file", metavar="FILE", help="the file to write, .onnx or .pt2")
     parser.add_argument("--solver", metavar="NAME", default="pnpnet-set", help="default: pnpnet-set")
     parser.add_argument(
         "--n", metavar="N", type=whole_number(1), help="correspondences per problem; default: any number"
     )
+    parser.add_argument("--batch", metavar="B", type=whole_number(1), help="problems per call; default: any number")
     parser.add_argument("--overwrite", action="store_true", help="replace the file")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write the model; print its size, inputs and outputs."""
-    from kornia_pnpnet.export import INPUTS, OUTPUTS, export_onnx
+    """Write the file; print its size, inputs and outputs."""
+    target = Path(arguments.file)
+    if target.suffix not in (".onnx", ".pt2"):
+        raise ValueError(f"'{target}': the file's name must end in .onnx (ONNX) or .pt2 (compiled ahead of time)")
+    from kornia_pnpnet.export import INPUTS, OUTPUTS, export_onnx, export_package
     from kornia_pnpnet.solver import PnPNet
 
     solver = load_solver_without_truth(arguments.solver)
     if not isinstance(solver, PnPNet):
         raise ValueError(f"--solver: {arguments.solver} belongs to another library and cannot be exported")
-    target = Path(arguments.file)
     target.parent.mkdir(parents=True, exist_ok=True)  # an error now, not after minutes
     if target.is_dir():
         raise ValueError(f"'{target}' is a folder")
     if target.exists() and not arguments.overwrite:
         raise ValueError(f"'{target}' exists: pass --overwrite to replace it")
-    print("Tracing and converting; PyTorch's exporter takes a minute or more", flush=True)
+    export = export_onnx if target.suffix == ".onnx" else export_package
+    doing = "converting" if target.suffix == ".onnx" else "compiling"
+    print(f"Tracing and {doing}; PyTorch takes a minute or more", flush=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the exporter about itself
-        path = export_onnx(solver, target, arguments.n)
+        path = export(solver, target, arguments.n, batch=arguments.batch)
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, {', '.join(INPUTS)} -> {', '.join(OUTPUTS)}")
     return 0

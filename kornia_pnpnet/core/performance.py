@@ -25,6 +25,7 @@ __all__ = [
     "in_full_precision",
     "in_order",
     "keep_freed_memory",
+    "package_options",
     "present_first",
     "problems_last",
     "ranked",
@@ -407,3 +408,23 @@ class Compiled(Generic[_P, _T]):
 def _is_worth_checking(guards: Sequence[Any]) -> list[bool]:
     """Skip checks of functions and constants of modules, which do not change: they take time at each call."""
     return [guard.guard_type == "DUPLICATE_INPUT" or not guard.is_global for guard in guards]
+
+
+def package_options(pairs: int | None, *, on_stack: bool) -> dict[str, Any]:
+    """Options of AOTInductor.
+
+    Args:
+        pairs: number of pairs of a problem; ``None``: any number.
+        on_stack: keep tensors on the stack where the graph calls no operator of PyTorch. Compiled functions then return
+            the same tensors from each call in a thread.
+
+    Example:
+        >>> package_options(9, on_stack=False)["cpp.threads"]
+        1
+    """
+    return {
+        "aot_inductor.allow_stack_allocation": on_stack,
+        "cpp.vec_isa_ok": True,  # see Compiled
+        "cpp.threads": 1,  # the number would be that of the process that compiles, whatever the caller's is
+        "pick_loop_orders": pairs is not None and pairs < _MANY_PAIRS,
+    }
