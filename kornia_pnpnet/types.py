@@ -341,7 +341,7 @@ class Alternatives(NamedTuple):
     Attributes:
         rotation: world-to-camera rotations in the order of their costs, shape :math:`(B, S, 3, 3)`.
         translation: world-to-camera translations, shape :math:`(B, S, 3)`.
-        cost: as :attr:`PnPResult.cost`, of the refinement that compares the poses, shape :math:`(B, S)`.
+        cost: as the ``cost`` of a :class:`PnPResult`, of the refinement that compares the poses, shape :math:`(B, S)`.
         probability: probability of each pose when one of them or the result's pose is right, shape :math:`(B, S)`.
         valid: which slots hold a pose, the first ones of a problem, bool, shape :math:`(B, S)`.
     """
