@@ -230,12 +230,12 @@ def capacity(rows: Sequence[Row], shipped: str) -> dict[str, Any]:
     lines, findings = [], []
     for row in rows:
         rates = [f"{percent(row, data)[0]:.1f}" for data in sets]
-        lines.append([f"`{row['run']}`", f"{float(row['us_per_problem']):.0f}", *rates])
+        lines.append([f"`{row['run']}`", *rates])
         found = {data: compared([row], recipe, data) for data in sets}
         apart = ", ".join(f"{data} {text}" for data, text in found.items() if "overlap" not in text)
         if row not in recipe:
             findings.append(f"`{row['run']}`: {apart or 'all intervals overlap'}.")
-    table = markdown_table(["Network", "µs", *(f"{data} (%)" for data in sets)], lines)
+    table = markdown_table(["Network", *(f"{data} (%)" for data in sets)], lines)
     return {"updates": updates_of(rows), "claim": claim("capacity"), "table": table, "findings": findings}
 
 

@@ -48,6 +48,8 @@ _SPREADS = {18: 3, 24: 4, 30: 5}
 _RING = {36: [(a, b, c) for i in range(25) for a, b, c in [sorted((i, (i + 1) % 25, (i + 6) % 25))]]}
 #: Number of top-ranked pairs that score each hypothesis.
 MOST_JUDGES = 32
+# Slots for poses of minimal samples. Of more, those that hold no pose, which most do, are not scored on a CPU.
+_MANY_SLOTS = 64
 # Variances. Squared residuals of this size halve the score of a pair.
 _JUDGED = 50.0
 # Normalised units. A pose that has the centre of the world nearer than this counts as this near.
@@ -362,7 +364,7 @@ class SetInit(Configured):
             valid = valid & torch.cat(enough)
         valid = valid.flatten(0, 1)  # (H, B)
         rotation = rotation.flatten(0, 1)  # (9, H, B)
-        if batch and valid.device.type == "cpu" and sees_values(valid):  # most slots hold no pose
+        if batch and len(valid) > _MANY_SLOTS and valid.device.type == "cpu" and sees_values(valid):
             slots = present_first(valid.mT)[:, : max(int(valid.sum(0).max()), 1)].mT
             rotation, translation = (x.gather(1, slots.expand(len(x), -1, -1)) for x in (rotation, translation))
             valid = valid.gather(0, slots)
