@@ -1,4 +1,4 @@
-"""The likelihood of a pose given its correspondences: a loss for networks whose predictions do not fit any pose yet."""
+"""The likelihood of the true pose: losses that train points, pixels and their noise."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from kornia.geometry.liegroup import So3
 from torch import Tensor
 
-from kornia_pnpnet.core.checks import check_positive, check_whole
+from kornia_pnpnet.core.checks import check_like, check_poses, check_positive, check_shapes, check_whole
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import normal_equations, pixel_covariance, project, retract
 from kornia_pnpnet.inputs import checked_inputs
@@ -23,7 +23,7 @@ from kornia_pnpnet.refine.kernels import KERNELS, RobustKernel
 from kornia_pnpnet.refine.step import iterate, pixel_precision, sq_standardised
 from kornia_pnpnet.types import Correspondences, Pose
 
-__all__ = ["monte_carlo_pose_loss"]
+__all__ = ["gaussian_pose_loss", "monte_carlo_pose_loss"]
 
 # Degrees of freedom of the t distributions: their tails are heavier than those of a likelihood, so that no sample has a
 # very large weight.
@@ -166,12 +166,8 @@ def monte_carlo_pose_loss(
     live = frame.valid & known
     for pose in given:
         live = live & torch.cat((pose.rotation.flatten(1), pose.translation), 1).isfinite().all(1)
-    eye = torch.eye(3, dtype=world.dtype, device=world.device)
-    poses = []
-    for pose in given:
-        rotation = torch.where(live[:, None, None], pose.rotation.detach(), eye)
-        translation = torch.where(live[:, None], pose.translation.detach(), eye[2])
-        poses.append(Normalize().apply_to_pose(Pose(rotation, translation), frame))
+    sound = [_pose_where(live, map_tensors(torch.Tensor.detach, pose)) for pose in given]
+    poses = [Normalize().apply_to_pose(pose, frame) for pose in sound]
     model = _Posterior(corr, *poses[0], KERNELS[kernel], world.new_tensor(scale), noisy_points)
     with torch.no_grad():
         drawn, log_proposal = _draw(model._replace(corr=corr.map(torch.Tensor.detach)), poses, samples // count, rounds)
@@ -179,6 +175,53 @@ def monte_carlo_pose_loss(
     log_total = torch.logsumexp(log_weights, 0) - math.log(len(log_weights))
     log_density = model.log_density(_Samples(*(x[None] for x in poses[0])))[0] - log_total
     return torch.where(live, -log_density - 3.0 * frame.scale.log(), 0.0).reshape(size)
+
+
+def gaussian_pose_loss(truth: Pose, estimate: Pose, covariance: Tensor, ok: Tensor | None = None) -> Tensor:
+    r"""Negative log-likelihood of the true pose under a normal distribution around the estimate.
+
+    The loss is :math:`\tfrac12 (e^\top C^{-1} e + \log\det 2\pi C)` with the tangent :math:`e = (\omega, v)` from the
+    true pose to the estimate, see :func:`~kornia_pnpnet.geometry.retract`. With the
+    :func:`~kornia_pnpnet.covariance.pose_covariance` of a result, gradients reach the noise of pixels and points by
+    both: by the pose, and by how sure the pose is. The loss costs a small part of :func:`monte_carlo_pose_loss`, but
+    knows a single minimum: use it once the solver finds most poses. It grows with the square of the error.
+
+    Args:
+        truth: true world-to-camera poses, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
+        estimate: the ``pose`` of a result, as ``truth``.
+        covariance: its covariance :math:`C`, shape :math:`(B, 6, 6)`.
+        ok: the ``ok`` of the result, bool, shape :math:`(B,)`; ``None``: every pose counts.
+
+    Returns:
+        The loss of each problem in nats, shape :math:`(B,)`, for a density per radian³ and world unit³. It is 0 without
+        gradient where ``ok`` is False, and where the covariance is not finite or not positive definite.
+
+    Raises:
+        ShapeError: when a shape is wrong, or the batches differ.
+        TypeCheckError: when the dtypes differ.
+        DeviceError: when the devices differ.
+
+    Example:
+        >>> pose = Pose(torch.eye(3)[None], torch.zeros(1, 3))
+        >>> gaussian_pose_loss(pose, pose, torch.eye(6)[None])  # 3 log(2 pi)
+        tensor([5.5136])
+    """
+    check_poses(estimate, truth)
+    batch = len(truth.translation)
+    check_shapes({"covariance": (covariance, (batch, 6, 6)), "ok": (ok, (batch,))})
+    check_like({"covariance": covariance}, truth.translation, "the translation of the truth")
+    with torch.no_grad():
+        factor, info = torch.linalg.cholesky_ex(covariance)
+        found = torch.cat((factor.flatten(1), _tangent(estimate, truth)), 1)
+        live = (info == 0) & found.isfinite().all(1)
+        live = live if ok is None else live & ok
+    eye = torch.eye(6, dtype=covariance.dtype, device=covariance.device)
+    factor = torch.linalg.cholesky_ex(torch.where(live[:, None, None], covariance, eye))[0]
+    error = _tangent(_pose_where(live, estimate), _pose_where(live, truth))
+    standardised = torch.linalg.solve_triangular(factor, error[..., None], upper=False)
+    log_determinant = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    loss = 0.5 * standardised.square().sum((1, 2)) + log_determinant + 3.0 * math.log(2.0 * math.pi)
+    return torch.where(live, loss, 0.0)
 
 
 class _Posterior(NamedTuple):
@@ -328,12 +371,24 @@ def _sample(component: _Component, count: int) -> _Samples:
 def _log_density(component: _Component, poses: _Samples) -> Tensor:
     """Logarithm of the density of a component per radian³ and unit³, (S, B)."""
     pose, factor = component
-    turn = poses.rotation @ pose.rotation.mT
-    # The inverse of Cayley's map; half a turn would be infinitely far away.
-    cosine = 1.0 + turn.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True)
-    omega = 2.0 * So3.vee(turn - turn.mT) / cosine.clamp(min=1e-4)
-    tangent = torch.cat((omega, poses.translation - pose.translation), -1)
+    tangent = _tangent(poses, pose)
     sq_distance = (tangent[..., None, :] @ factor)[..., 0, :].square().sum(-1)
     log_determinant = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     # Volume of rotations by volume of Cayley's vectors: 1 / (1 + |omega|² / 4)².
-    return _log_t(sq_distance, 6) + log_determinant + 2.0 * torch.log1p(0.25 * omega.square().sum(-1))
+    return _log_t(sq_distance, 6) + log_determinant + 2.0 * torch.log1p(0.25 * tangent[..., :3].square().sum(-1))
+
+
+def _pose_where(live: Tensor, pose: Pose) -> Pose:
+    """The pose of each problem that is ``live``, bool (B,), and a constant pose for the others."""
+    eye = torch.eye(3, dtype=pose.rotation.dtype, device=pose.rotation.device)
+    rotation = torch.where(live[:, None, None], pose.rotation, eye)
+    return Pose(rotation, torch.where(live[:, None], pose.translation, eye[2]))
+
+
+def _tangent(pose: Pose | _Samples, origin: Pose) -> Tensor:
+    """The inverse of ``retract``: the tangent vectors that move ``origin`` to ``pose``, (..., B, 6)."""
+    turn = pose.rotation @ origin.rotation.mT
+    # The inverse of Cayley's map; half a turn would be infinitely far away.
+    cosine = 1.0 + turn.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True)
+    omega = 2.0 * So3.vee(turn - turn.mT) / cosine.clamp(min=1e-4)
+    return torch.cat((omega, pose.translation - origin.translation), -1)

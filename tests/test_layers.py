@@ -17,7 +17,7 @@ ROOT = Path(kornia_pnpnet.__file__).parent
 LAYERS = (
     ("core", "types"),
     ("geometry", "refine", "data"),
-    ("normalize", "init", "losses", "likelihood", "metrics", "covariance", "confidence", "pretrained", "inputs"),
+    ("normalize", "init", "losses", "likelihood", "metrics", "covariance", "confidence", "pretrained", "inputs", "measurements"),
     ("solver",),
     ("registry", "peers", "__init__"),
     ("training", "evaluation", "export"),

@@ -1,0 +1,169 @@
+"""Pixels and world points with their covariances, from heat maps and from depth: the inputs of a solver."""
+
+from __future__ import annotations
+
+import torch
+from kornia.core.check import KORNIA_CHECK_SHAPE
+from kornia.core.exceptions import TypeCheckError, ValueCheckError
+from kornia.geometry.camera import PinholeCamera
+from kornia.geometry.conversions import convert_points_to_homogeneous
+from kornia.geometry.subpix import spatial_expectation2d, spatial_softmax2d
+from torch import Tensor
+
+from kornia_pnpnet.core.checks import Shapes, check_devices, check_positive, check_shapes, common_dtype, expand_sigma
+from kornia_pnpnet.types import Pose, camera_matrices
+
+__all__ = ["depth_points", "heatmap_keypoints"]
+
+# Squared cells: the variance of a uniform distribution over one cell, per axis.
+_CELL_VARIANCE = 1.0 / 12.0
+
+
+def heatmap_keypoints(
+    heatmaps: Tensor, temperature: Tensor | float = 1.0, *, stride: float = 1.0
+) -> tuple[Tensor, Tensor]:
+    r"""Mean and covariance of heat maps: the keypoints of a soft-argmax, and how far each map spreads.
+
+    The softmax of a map is a density that is constant in each cell. Its mean is Kornia's soft-argmax. Its covariance
+    is that of the cells' centres plus the variance of a cell, 1/12 per axis (Sheppard's correction), so that a map
+    with a single peak has a positive definite covariance.
+
+    The covariance says how far the map spreads. It is the error of the keypoint only when a loss has taught the
+    network so, such as :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss` or
+    :func:`~kornia_pnpnet.likelihood.gaussian_pose_loss`.
+
+    Convention:
+        Pixels are (u, v) with the centre of the top-left pixel at (0, 0), as in Kornia. Add 0.5 where the principal
+        point counts from the corner.
+
+    Source: A. Nibali et al., "Numerical Coordinate Regression with Convolutional Neural Networks", 2018 (DSNT).
+
+    Args:
+        heatmaps: logits, shape :math:`(B, N, H, W)`. Pass the logarithm of maps that are probabilities already.
+        temperature: the logits are divided by it, positive: a number or a tensor that broadcasts to ``heatmaps``.
+        stride: image pixels per cell of the map. Cell 0 covers the first ``stride`` pixels.
+
+    Returns:
+        The pixels, shape :math:`(B, N, 2)`, and their covariances in px², shape :math:`(B, N, 2, 2)`: ``img_points``
+        and ``img_cov`` of a solver. Both are NaN for a map with NaN, so that its problem is not ``ok``.
+
+    Raises:
+        ShapeError: when the maps have no four dimensions.
+        TypeCheckError: for maps of booleans or complex numbers.
+        BaseError: for a temperature that is a number but not positive, or a stride that is not positive.
+
+    Example:
+        >>> heatmaps = torch.full((1, 1, 5, 5), -100.0)
+        >>> heatmaps[..., 2, 1:4] = 0.0  # a short horizontal edge
+        >>> pixels, covariance = heatmap_keypoints(heatmaps)
+        >>> pixels
+        tensor([[[2., 2.]]])
+        >>> covariance
+        tensor([[[[0.7500, 0.0000],
+                  [0.0000, 0.0833]]]])
+    """
+    KORNIA_CHECK_SHAPE(heatmaps, ["B", "N", "H", "W"])
+    check_positive(stride=stride)
+    if not isinstance(temperature, Tensor):
+        check_positive(temperature=temperature)
+    share = spatial_softmax2d(heatmaps.to(common_dtype({"heatmaps": heatmaps})) / temperature)
+    mean = spatial_expectation2d(share, normalized_coordinates=False)  # (B, N, 2), cells
+    height, width = share.shape[-2:]
+    u = torch.arange(width, dtype=share.dtype, device=share.device) - mean[..., :1]  # (B, N, W)
+    v = torch.arange(height, dtype=share.dtype, device=share.device) - mean[..., 1:]  # (B, N, H)
+    uu = (share.sum(-2) * u.square()).sum(-1) + _CELL_VARIANCE
+    vv = (share.sum(-1) * v.square()).sum(-1) + _CELL_VARIANCE
+    uv = (v * (share @ u[..., None])[..., 0]).sum(-1)
+    covariance = torch.stack((uu, uv, uv, vv), -1).unflatten(-1, (2, 2))
+    return stride * mean + 0.5 * (stride - 1.0), stride**2 * covariance
+
+
+def depth_points(
+    img_points: Tensor,
+    depth: Tensor,
+    intrinsics: Tensor | PinholeCamera,
+    pose: Pose,
+    *,
+    depth_sigma: Tensor | float,
+    img_sigma: Tensor | float | None = None,
+    img_cov: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    r"""World points with covariances from pixels with depth, such as the keypoints of an RGB-D image.
+
+    A pixel of depth :math:`d` is the point :math:`x = R^\top (d\,r - t)` with :math:`r = K^{-1} (u, v, 1)^\top`. For
+    independent errors of the pixel and of the depth its covariance is exactly
+    :math:`R^\top ((d^2 + \sigma_d^2)\, A \Sigma A^\top + \sigma_d^2\, r r^\top) R`, where :math:`A` is the derivative
+    of :math:`r` by the pixel and :math:`\Sigma` the covariance of the pixel. First-order transport leaves out the
+    :math:`\sigma_d^2` beside :math:`d^2`.
+
+    Args:
+        img_points: pixels of the camera that measured the depth, shape :math:`(B, N, 2)`.
+        depth: along the camera's z axis, in the unit of the world, shape :math:`(B, N)`.
+        intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or Kornia's cameras.
+        pose: world-to-camera pose of this camera, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
+        depth_sigma: standard deviation of the depth in its unit: a number, :math:`(B,)` or :math:`(B, N)`.
+        img_sigma: standard deviation of each pixel coordinate, as ``depth_sigma``; ``None`` without ``img_cov``: exact
+            pixels.
+        img_cov: covariance of each pixel in px², in place of ``img_sigma``, shape :math:`(B, N, 2, 2)`.
+
+    Returns:
+        The points, shape :math:`(B, N, 3)`, and their covariances in squared units of the world, shape
+        :math:`(B, N, 3, 3)`: ``world_points`` and ``world_cov`` of a solver. Both are NaN, without gradient, where the
+        depth is not positive, a pixel or a depth is not finite, or a sigma is negative. Such a problem is not ``ok``
+        unless the solver's ``mask`` leaves the pair out.
+
+    Raises:
+        ShapeError: when shapes do not match.
+        TypeCheckError: for tensors of booleans or complex numbers, or a sigma that is no number.
+        DeviceError: for tensors on different devices.
+        ValueCheckError: with both ``img_sigma`` and ``img_cov``.
+
+    Example:
+        >>> camera = torch.tensor([[100.0, 0.0, 50.0], [0.0, 100.0, 50.0], [0.0, 0.0, 1.0]])
+        >>> here = Pose(torch.eye(3)[None], torch.zeros(1, 3))
+        >>> pixel, depth = torch.tensor([[[50.0, 50.0]]]), torch.tensor([[2.0]])
+        >>> points, covariance = depth_points(pixel, depth, camera, here, depth_sigma=0.1, img_sigma=1.0)
+        >>> points, covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+        (tensor([[[0., 0., 2.]]]), tensor([[[0.0200, 0.0200, 0.1000]]]))
+    """
+    for name, value in (("img_points", img_points), ("depth", depth)):
+        if not isinstance(value, Tensor):
+            raise TypeCheckError(f"{name} must be a tensor, got {type(value).__name__}.")
+    KORNIA_CHECK_SHAPE(img_points, ["B", "N", "2"])
+    if img_sigma is not None and img_cov is not None:
+        raise ValueCheckError("Give img_sigma or img_cov, not both.")
+    batch, count = img_points.shape[:2]
+    camera = camera_matrices(intrinsics)
+    shapes: Shapes = {
+        "depth": (depth, (batch, count)),
+        "intrinsics": (camera, (3, 3) if camera.ndim == 2 else (batch, 3, 3)),
+        "rotation of the pose": (pose.rotation, (batch, 3, 3)),
+        "translation of the pose": (pose.translation, (batch, 3)),
+        "img_cov": (img_cov, (batch, count, 2, 2)),
+    }
+    check_shapes(shapes)
+    tensors = {name: tensor for name, (tensor, _) in shapes.items()}
+    check_devices(tensors, img_points, "img_points")
+    dtype = common_dtype({"img_points": img_points, **tensors})
+    pixels, depth, camera, rotation, translation = (
+        x.to(dtype) for x in (img_points, depth, camera, pose.rotation, pose.translation)
+    )
+    sigma_depth = expand_sigma("depth_sigma", depth_sigma, pixels)
+    sigma_img = expand_sigma("img_sigma", 0.0 if img_sigma is None else img_sigma, pixels)
+
+    sound = (depth > 0) & depth.isfinite() & pixels.isfinite().all(-1) & (sigma_depth >= 0) & (sigma_img >= 0)
+    depth, sigma_depth, sigma_img = (torch.where(sound, x, 1.0) for x in (depth, sigma_depth, sigma_img))
+    pixels = torch.where(sound[..., None], pixels, 0.0)
+    eye = torch.eye(2, dtype=dtype, device=pixels.device)
+    noise = sigma_img.square()[..., None, None] * eye if img_cov is None else img_cov.to(dtype)
+
+    # Rays of the world's axes: Kornia's unprojection ignores a skew.
+    back = rotation.mT @ torch.linalg.inv_ex(camera).inverse  # (B, 3, 3)
+    rays = convert_points_to_homogeneous(pixels) @ back.mT  # (B, N, 3)
+    points = depth[..., None] * rays - translation[:, None] @ rotation
+    across = back[:, None, :, :2]  # (B, 1, 3, 2)
+    variance = sigma_depth.square()[..., None, None]
+    covariance = (depth.square()[..., None, None] + variance) * (across @ noise @ across.mT)
+    covariance = covariance + variance * rays[..., :, None] * rays[..., None, :]
+    points = torch.where(sound[..., None], points, torch.nan)
+    return points, torch.where(sound[..., None, None], covariance, torch.nan)

@@ -1,0 +1,210 @@
+"""Keypoints of heat maps and points of depth: means and covariances with closed forms, and against samples."""
+
+import pytest
+import torch
+from kornia.core.exceptions import BaseError, ShapeError, TypeCheckError, ValueCheckError
+from kornia.geometry.subpix import spatial_soft_argmax2d
+from torch.autograd import gradcheck
+
+from kornia_pnpnet import Pose, create_solver, depth_points, heatmap_keypoints
+
+DOUBLE = torch.float64
+CAMERA = torch.tensor([[500.0, 3.0, 320.0], [0.0, 450.0, 240.0], [0.0, 0.0, 1.0]], dtype=DOUBLE)
+
+
+def gaussian_logits(mean, covariance, height=48, width=64):
+    """Logits of a normal density on the grid, (height, width)."""
+    v, u = torch.meshgrid(torch.arange(height, dtype=DOUBLE), torch.arange(width, dtype=DOUBLE), indexing="ij")
+    offset = torch.stack((u, v), -1) - mean
+    return -0.5 * (offset @ torch.linalg.inv(covariance) * offset).sum(-1)
+
+
+@pytest.mark.parametrize(("dtype", "atol"), [(torch.float32, 1e-3), (DOUBLE, 1e-6)])
+def test_gaussian_maps_have_their_mean_and_covariance(dtype, atol):
+    """The covariance of a density that is constant in cells: that of the samples and of a cell."""
+    mean = torch.tensor([30.3, 20.6], dtype=DOUBLE)
+    covariance = torch.tensor([[9.0, 3.0], [3.0, 4.0]], dtype=DOUBLE)
+    logits = gaussian_logits(mean, covariance).to(dtype)
+    pixels, found = heatmap_keypoints(logits.expand(2, 3, -1, -1))
+    expected = covariance + torch.eye(2) / 12.0
+    assert pixels.dtype == found.dtype == dtype
+    torch.testing.assert_close(pixels, mean.to(dtype).expand(2, 3, 2), atol=atol, rtol=0.0)
+    torch.testing.assert_close(found, expected.to(dtype).expand(2, 3, 2, 2), atol=atol, rtol=0.0)
+
+
+def test_means_are_kornias_soft_argmax(generator):
+    heatmaps = torch.randn(2, 3, 7, 9, generator=generator, dtype=DOUBLE)
+    pixels, _ = heatmap_keypoints(heatmaps, 0.5)
+    torch.testing.assert_close(pixels, spatial_soft_argmax2d(heatmaps, 0.5, normalized_coordinates=False))
+
+
+def test_shifted_maps_have_shifted_means_and_the_same_covariance(generator):
+    heatmaps = torch.full((1, 4, 20, 30), -1e3, dtype=DOUBLE)
+    heatmaps[..., 3:9, 4:12] = torch.randn(1, 4, 6, 8, generator=generator, dtype=DOUBLE)
+    pixels, covariance = heatmap_keypoints(heatmaps)
+    moved_pixels, moved_covariance = heatmap_keypoints(heatmaps.roll((5, 11), (-2, -1)))
+    torch.testing.assert_close(moved_pixels, pixels + torch.tensor([11.0, 5.0], dtype=DOUBLE))
+    torch.testing.assert_close(moved_covariance, covariance)
+
+
+def test_transposed_maps_swap_u_and_v(generator):
+    heatmaps = torch.randn(1, 4, 6, 9, generator=generator, dtype=DOUBLE)
+    pixels, covariance = heatmap_keypoints(heatmaps)
+    turned_pixels, turned_covariance = heatmap_keypoints(heatmaps.mT)
+    torch.testing.assert_close(turned_pixels, pixels.flip(-1))
+    torch.testing.assert_close(turned_covariance, covariance.flip(-2, -1))
+
+
+def test_a_stride_is_each_cell_as_a_block_of_pixels(generator):
+    """A cell that covers 3 by 3 pixels is the same density as 9 cells of a third of its share."""
+    heatmaps = torch.randn(2, 3, 5, 6, generator=generator, dtype=DOUBLE)
+    blocks = heatmaps.repeat_interleave(3, -1).repeat_interleave(3, -2)
+    torch.testing.assert_close(heatmap_keypoints(heatmaps, stride=3.0), heatmap_keypoints(blocks))
+
+
+def test_a_single_peak_has_the_variance_of_a_pixel():
+    heatmaps = torch.full((1, 1, 5, 5), -torch.inf)
+    heatmaps[..., 3, 1] = 0.0
+    pixels, covariance = heatmap_keypoints(heatmaps)
+    assert pixels.tolist() == [[[1.0, 3.0]]]
+    torch.testing.assert_close(covariance[0, 0], torch.eye(2) / 12.0)
+
+
+def test_gradients_of_heat_maps(generator):
+    heatmaps = torch.randn(1, 2, 4, 5, generator=generator, dtype=DOUBLE, requires_grad=True)
+    temperature = torch.tensor([[[[0.7]], [[1.3]]]], dtype=DOUBLE, requires_grad=True)
+    assert gradcheck(heatmap_keypoints, (heatmaps, temperature))
+
+
+def test_half_precision_is_computed_in_float32(generator):
+    heatmaps = torch.randn(1, 2, 4, 5, generator=generator).half()
+    for half, full in zip(heatmap_keypoints(heatmaps), heatmap_keypoints(heatmaps.float()), strict=True):
+        assert torch.equal(half, full)
+
+
+def test_a_map_with_nan_spoils_its_own_problem_only(make_problems, generator):
+    """Also its gradient."""
+    p = make_problems(n=12, batch=2, noise=False)
+    heatmaps = torch.randn(2, 12, 8, 8, generator=generator, dtype=DOUBLE)
+    heatmaps[1, 3, 0, 0] = torch.nan
+    heatmaps.requires_grad_()
+    offset, covariance = heatmap_keypoints(heatmaps)
+    pixels = p.img_points + 0.1 * (offset - 3.5)
+    result = create_solver("epnp-lm")(p.world_points, pixels, p.intrinsics, img_cov=covariance)
+    assert result.ok.tolist() == [True, False]
+    result.translation.sum().backward()
+    assert heatmaps.grad[0].isfinite().all()
+    assert heatmaps.grad[0].any()
+
+
+def test_errors_of_heat_maps():
+    with pytest.raises(ShapeError):
+        heatmap_keypoints(torch.zeros(2, 4, 4))
+    with pytest.raises(TypeCheckError):
+        heatmap_keypoints(torch.zeros(1, 1, 4, 4, dtype=torch.bool))
+    with pytest.raises(BaseError, match="temperature"):
+        heatmap_keypoints(torch.zeros(1, 1, 4, 4), 0.0)
+    with pytest.raises(BaseError, match="stride"):
+        heatmap_keypoints(torch.zeros(1, 1, 4, 4), stride=0)
+
+
+@pytest.fixture
+def seen(random_rotations, generator):
+    """Points, the pose of a camera, and their pixels and depth in it."""
+    points = torch.randn(2, 7, 3, generator=generator, dtype=DOUBLE)
+    pose = Pose(random_rotations(2), torch.tensor([[0.3, -0.2, 6.0], [0.1, 0.4, 8.0]], dtype=DOUBLE))
+    cam = points @ pose.rotation.mT + pose.translation[:, None]
+    homogeneous = cam @ CAMERA.mT
+    return points, pose, homogeneous[..., :2] / homogeneous[..., 2:], cam[..., 2]
+
+
+def test_exact_measurements_give_exact_points(seen):
+    """Back to the points that were projected, with a skew; zero noise has a zero covariance."""
+    points, pose, pixels, depth = seen
+    found, covariance = depth_points(pixels, depth, CAMERA, pose, depth_sigma=0.0)
+    torch.testing.assert_close(found, points)
+    assert not covariance.any()
+
+
+def test_covariances_of_points_are_those_of_samples(seen, generator):
+    """Also where the depth is so inexact that a first-order transport would be off."""
+    _, pose, pixels, depth = seen
+    sigma = (0.4 * depth[:, :1]).expand(2, 7)
+    factor = torch.tensor([[30.0, 0.0], [20.0, 40.0]], dtype=DOUBLE)
+    img_cov = (factor @ factor.mT).expand(2, 7, 2, 2)
+    points, covariance = depth_points(pixels, depth, CAMERA, pose, depth_sigma=sigma, img_cov=img_cov)
+    drawn_pixels = pixels + torch.randn(40000, *pixels.shape, generator=generator, dtype=DOUBLE) @ factor.mT
+    drawn_depth = depth + sigma * torch.randn(40000, *depth.shape, generator=generator, dtype=DOUBLE)
+    rays = torch.cat((drawn_pixels, torch.ones_like(drawn_pixels[..., :1])), -1) @ torch.linalg.inv(CAMERA).mT
+    drawn = (drawn_depth[..., None] * rays - pose.translation[:, None]) @ pose.rotation
+    offset = drawn - points
+    sampled = torch.einsum("sbni,sbnj->bnij", offset, offset) / len(offset)
+    size = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    torch.testing.assert_close(offset.mean(0) / size, torch.zeros_like(points), atol=0.03, rtol=0.0)
+    correlation = size[..., None] * size[..., None, :]
+    torch.testing.assert_close(sampled / correlation, covariance / correlation, atol=0.05, rtol=0.0)
+
+
+def test_a_sigma_is_a_multiple_of_the_identity(seen):
+    _, pose, pixels, depth = seen
+    img_cov = (4.0 * torch.eye(2, dtype=DOUBLE)).expand(2, 7, 2, 2)
+    one = depth_points(pixels, depth, CAMERA, pose, depth_sigma=0.1, img_sigma=2.0)
+    other = depth_points(pixels, depth, CAMERA, pose, depth_sigma=torch.full((2,), 0.1), img_cov=img_cov)
+    torch.testing.assert_close(one, other)
+
+
+def test_gradients_of_points(seen):
+    _, pose, pixels, depth = seen
+    camera, sigma = CAMERA.clone(), torch.full((1, 2), 0.2, dtype=DOUBLE)
+    img_cov = torch.eye(2, dtype=DOUBLE).expand(1, 2, 2, 2).clone()
+    given = (pixels[:1, :2], depth[:1, :2], camera, pose.rotation[:1], pose.translation[:1], sigma, img_cov)
+    given = tuple(x.clone().requires_grad_() for x in given)
+
+    def points(pixels, depth, camera, rotation, translation, sigma, img_cov):
+        pose = Pose(rotation, translation)
+        return depth_points(pixels, depth, camera, pose, depth_sigma=sigma, img_cov=img_cov)
+
+    assert gradcheck(points, given)
+
+
+def test_missing_depth_is_nan_without_a_gradient_and_can_be_masked(seen):
+    """Pairs without depth fail their problem, unless they are masked; no other problem changes."""
+    _, pose, pixels, depth = seen
+    depth = depth.clone()
+    depth[0, 1], depth[0, 2], depth[0, 3] = 0.0, torch.nan, torch.inf
+    sigma = torch.full((2, 7), 0.01, dtype=DOUBLE)
+    sigma[0, 4] = -1.0
+    for x in (depth, sigma, pixels):
+        x.requires_grad_()
+    points, covariance = depth_points(pixels, depth, CAMERA, pose, depth_sigma=sigma, img_sigma=0.5)
+    good = torch.ones(2, 7, dtype=torch.bool)
+    good[0, 1:5] = False
+    assert torch.equal(points.isfinite().all(-1), good)
+    assert torch.equal(covariance.isfinite().all((-2, -1)), good)
+    other = (pixels.detach() + 0.01, CAMERA)
+    solver = create_solver("epnp-lm")
+    assert solver(points, *other, img_sigma=1.0, world_cov=covariance).ok.tolist() == [False, True]
+    points[good].square().sum().backward()
+    for x in (depth, sigma, pixels):
+        assert x.grad is None or x.grad.isfinite().all()
+    assert not depth.grad[~good].any()
+    points, covariance = depth_points(pixels[1:], depth[1:], CAMERA, Pose(*(x[1:] for x in pose)), depth_sigma=0.01)
+    points = torch.cat((points, torch.full_like(points[:, :1], torch.nan)), 1)
+    covariance = torch.cat((covariance, torch.full_like(covariance[:, :1], torch.nan)), 1)
+    pixels = torch.cat((pixels[1:], pixels[1:, :1]), 1)
+    mask = torch.arange(8)[None] < 7
+    assert solver(points, pixels, CAMERA, mask=mask, img_sigma=1.0, world_cov=covariance).ok.all()
+
+
+def test_float32_and_errors_of_depth(seen):
+    points, pose, pixels, depth = seen
+    single = Pose(*(x.float() for x in pose))
+    found, covariance = depth_points(pixels.float(), depth.float(), CAMERA.float(), single, depth_sigma=0.1)
+    assert found.dtype == covariance.dtype == torch.float32
+    torch.testing.assert_close(found, points.float(), atol=1e-4, rtol=1e-4)
+    with pytest.raises(ShapeError, match="depth"):
+        depth_points(pixels, depth[:, :3], CAMERA, pose, depth_sigma=0.1)
+    with pytest.raises(ValueCheckError, match="not both"):
+        depth_points(pixels, depth, CAMERA, pose, depth_sigma=0.1, img_sigma=1.0, img_cov=torch.zeros(2, 7, 2, 2))
+    with pytest.raises(TypeCheckError, match="depth must be a tensor"):
+        depth_points(pixels, 2.0, CAMERA, pose, depth_sigma=0.1)
