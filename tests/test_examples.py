@@ -58,6 +58,17 @@ def test_images_become_poses_end_to_end(tmp_path):
 
 
 @pytest.mark.slow
+def test_networks_predict_each_kind_of_noise(tmp_path):
+    """A few updates of it."""
+    script = EXAMPLES / "keypoint_pipeline.py"
+    arguments = ["--covariances", "--updates", "40", "--seeds", "1", "--batches", "1", "--out", tmp_path]
+    subprocess.run([sys.executable, script, *arguments], check=True)
+    _, *kinds = json.loads((tmp_path / "keypoint_covariances.json").read_text())["seeds"]["0"].values()
+    assert len(kinds) == 3
+    assert all(0.0 < found["mean_distance"] <= 1.0 for found in kinds)
+
+
+@pytest.mark.slow
 def test_an_incremental_map_registers_its_images(tmp_path):
     subprocess.run([sys.executable, EXAMPLES / "incremental_map.py", "--scenes", "4", "--out", tmp_path], check=True)
     theirs, ours = json.loads((tmp_path / "incremental_map.json").read_text())["runs"].values()
@@ -81,6 +92,17 @@ def test_the_end_to_end_gradient_halves_the_error_for_every_seed():
     for runs in results["seeds"].values():
         for key in ("mean_distance", "median_distance"):
             assert runs["keypoint loss alone"][key] > 2.0 * runs["end to end"][key]
+
+
+def test_predicted_covariances_gain_over_sigmas_for_every_seed():
+    """In the results that the documentation shows; those of the heat maps do not."""
+    results = json.loads((EXAMPLES / "keypoint_covariances.json").read_text())
+    for runs in results["seeds"].values():
+        sigma, covariance, heat_map = (
+            runs[noise]["mean_distance"]
+            for noise in ("standard deviation", "covariance", "covariance of the heat map times a factor")
+        )
+        assert covariance < sigma < heat_map
 
 
 def test_the_tables_of_the_page_are_of_the_results():

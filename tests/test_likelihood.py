@@ -1,20 +1,23 @@
-"""The Monte Carlo pose loss: an integral with known values, and a gradient from the first step."""
+"""Losses of the true pose's likelihood: known values, a gradient from the first step, and noise that they teach."""
 
 import math
 
 import pytest
 import torch
+from kornia.core.exceptions import ShapeError, TypeCheckError
 
 from kornia_pnpnet import (
     PnPNet,
     Pose,
     RobustWeightedLM,
     create_solver,
+    gaussian_pose_loss,
     monte_carlo_pose_loss,
     pose_covariance,
     pose_errors,
 )
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet.geometry import retract
 
 DOUBLE = torch.float64
 
@@ -199,3 +202,113 @@ def test_errors():
         loss_of(p, img_sigma=1.0, samples=3)
     with pytest.raises(Exception, match="rotation"):
         monte_carlo_pose_loss(Pose(p.pose.rotation[:2], p.pose.translation[:2]), [], *inputs(p), img_sigma=1.0)
+
+
+def anisotropic(batch, n=12, seed=0):
+    """Problems whose pixels all have the noise of one covariance, and this covariance."""
+    p = problems(n=n, batch=batch, seed=seed, img_sigma=0.0, world_sigma=0.0)
+    factor = torch.tensor([[6.0, 0.0], [3.0, 1.5]], dtype=DOUBLE)
+    generator = torch.Generator().manual_seed(seed + 1)
+    noise = torch.randn(p.img_points.shape, generator=generator, dtype=DOUBLE) @ factor.mT
+    return p._replace(img_points=p.img_points + noise), factor @ factor.mT
+
+
+def monte_carlo(p, img_cov):
+    return monte_carlo_pose_loss(p.pose, p.pose, *inputs(p), img_cov=img_cov, samples=64, rounds=0)
+
+
+def gaussian(p, img_cov):
+    solver = PnPNet(None, RobustWeightedLM(4, robustness=0.0, damping=1e-6))
+    result = solver(*inputs(p), init=p.pose, img_cov=img_cov)
+    covariance = pose_covariance(result.pose, *inputs(p), img_cov=img_cov)
+    return gaussian_pose_loss(p.pose, result.pose, covariance, result.ok)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("loss_of_covariance", [monte_carlo, gaussian])
+def test_covariances_are_learned_through_poses(loss_of_covariance):
+    """A covariance that begins as a circle converges to that of the noise: its size, its axes and their ratio."""
+    torch.manual_seed(0)
+    entries = torch.tensor([math.log(20.0), 0.0, math.log(20.0)], dtype=DOUBLE, requires_grad=True)
+    optimizer = torch.optim.Adam([entries], lr=0.15)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 60)
+    for index in range(60):
+        p, truth = anisotropic(batch=128, seed=10 * index)
+        one, corner, two = entries
+        factor = torch.stack((one.exp(), torch.zeros_like(one), 10.0 * corner, two.exp())).reshape(2, 2)
+        loss = loss_of_covariance(p, (factor @ factor.mT).expand(128, 12, 2, 2)).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+    learned = (factor @ factor.mT).detach()
+    whitened = torch.linalg.solve(torch.linalg.cholesky(truth), factor.detach())
+    assert torch.linalg.svdvals(whitened).log().abs().max() < 0.1, learned
+
+
+def near(pose, seed=0):
+    """A pose close to another, the tangent to it, and a covariance."""
+    generator = torch.Generator().manual_seed(seed)
+    size = len(pose.translation)
+    delta = 0.3 * torch.randn(size, 6, generator=generator, dtype=DOUBLE)
+    factor = torch.randn(size, 6, 6, generator=generator, dtype=DOUBLE)
+    return retract(pose, delta), delta, factor @ factor.mT + 0.1 * torch.eye(6, dtype=DOUBLE)
+
+
+def test_gaussian_loss_is_the_density_of_the_tangent():
+    p = problems()
+    estimate, delta, covariance = near(p.pose)
+    expected = -torch.distributions.MultivariateNormal(torch.zeros(6, dtype=DOUBLE), covariance).log_prob(delta)
+    torch.testing.assert_close(gaussian_pose_loss(p.pose, estimate, covariance), expected)
+
+
+def test_both_losses_agree_where_the_noise_is_small():
+    """The posterior of a pose is then normal, with the covariance of the pose around the estimate."""
+    p = problems(n=60, world_sigma=0.0)
+    solver = PnPNet(None, RobustWeightedLM(10, robustness=0.0, damping=1e-6))
+    estimate = solver(*inputs(p), init=p.pose, img_sigma=1.0).pose
+    gaussian_loss = gaussian_pose_loss(p.pose, estimate, pose_covariance(estimate, *inputs(p), img_sigma=1.0))
+    loss = loss_of(p, estimate, img_sigma=1.0, samples=2000, kernel="truncated", scale=1e3)
+    torch.testing.assert_close(gaussian_loss, loss, rtol=0.0, atol=0.15)
+
+
+def test_gradients_of_the_gaussian_loss():
+    p = problems(batch=2)
+    estimate, _, covariance = near(p.pose)
+    given = [x.clone().requires_grad_() for x in (*estimate, covariance)]
+
+    def loss(rotation, translation, covariance):
+        return gaussian_pose_loss(p.pose, Pose(rotation, translation), 0.5 * (covariance + covariance.mT))
+
+    assert torch.autograd.gradcheck(loss, given)
+
+
+def test_poses_that_are_not_determined_have_no_gaussian_loss():
+    """Infinite, NaN and indefinite covariances, NaN poses, and poses that are not ok: loss 0, gradient 0."""
+    p = problems(batch=6)
+    estimate, _, covariance = near(p.pose)
+    reference = gaussian_pose_loss(p.pose, estimate, covariance)
+    bad = covariance.clone()
+    bad[1] = torch.full((6,), torch.inf, dtype=DOUBLE).diag()
+    bad[2, 3, 3] = torch.nan
+    bad[3] = -bad[3]
+    translation = estimate.translation.clone()
+    translation[4] = torch.nan
+    ok = torch.tensor([True, True, True, True, True, False])
+    given = [x.requires_grad_() for x in (estimate.rotation.clone(), translation, bad)]
+    loss = gaussian_pose_loss(p.pose, Pose(*given[:2]), bad, ok)
+    loss.sum().backward()
+    assert not loss[1:].any()
+    assert torch.equal(loss[0], reference[0])
+    for x in given:
+        assert x.grad[0].any()
+        assert not x.grad[1:].any()
+
+
+def test_errors_of_the_gaussian_loss():
+    p = problems()
+    estimate, _, covariance = near(p.pose)
+    with pytest.raises(ShapeError, match="covariance"):
+        gaussian_pose_loss(p.pose, estimate, covariance[:2])
+    with pytest.raises(TypeCheckError, match="covariance"):
+        gaussian_pose_loss(p.pose, estimate, covariance.float())

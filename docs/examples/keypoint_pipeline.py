@@ -9,6 +9,12 @@ to end, with the loss of the pose, whose gradient comes through the solver. Two 
 as only a known pose can make them. All are tested with the same solver on images that none saw; it is told how far off
 keypoints may be where a network has learned it, and once not told what the last one says. Writes
 `keypoint_pipeline.json` and pictures to `--out`.
+
+``--covariances`` runs another, shorter experiment. Each image is also blurred along one direction, as by a camera in
+motion, so that a keypoint is less exact along the blur than across it; there are no occluders. Copies of one network
+are trained end to end and by the likelihood of the labels. They predict the noise of each keypoint in three ways: a
+standard deviation; a 2×2 covariance; or a factor of the covariance of the keypoint's heat map. Writes
+`keypoint_covariances.json` to `--out`.
 """
 
 from __future__ import annotations
@@ -23,13 +29,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from kornia.filters import gaussian_blur2d
+from kornia.filters import gaussian_blur2d, motion_blur
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
-from kornia.geometry.subpix import spatial_expectation2d, spatial_softmax2d
+from kornia.geometry.subpix import spatial_softmax2d
 from torch import Tensor, nn
+from torch.distributions import MultivariateNormal
 from torch.nn import functional
 
-from kornia_pnpnet import PnPResult, Pose, create_solver
+from kornia_pnpnet import PnPResult, Pose, create_solver, heatmap_keypoints
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.evaluation.figures.style import BLUE, ORANGE, VERMILION, make_figure, save, themed
 from kornia_pnpnet.evaluation.results import save_results
@@ -52,6 +59,10 @@ FULL = "keypoint loss alone, hidden ones labelled"
 LIKELY, FULL_LIKELY = f"{ALONE}, how far off by likelihood", f"{FULL}, how far off by likelihood"
 # Points of a curve are means of so many updates.
 MEAN_OF = 50
+# The noise of a keypoint, as a network predicts it.
+SIGMA, COVARIANCE, HEAT_MAP = "standard deviation", "covariance", "covariance of the heat map times a factor"
+# Pixels: length of the blur of a camera in motion.
+MOTION = 9
 
 
 class Images(NamedTuple):
@@ -63,15 +74,18 @@ class Images(NamedTuple):
     visible: Tensor
 
 
-def draw(seed: int, index: int, batch: int = BATCH) -> Images:
-    """The images of a batch: the same for the same seed and index."""
+def draw(seed: int, index: int, batch: int = BATCH, *, motion: bool = False) -> Images:
+    """The images of a batch: the same for the same seed and index.
+
+    With ``motion`` each is blurred along a random direction; a smaller turn and no occluders make these images easier.
+    """
     generator = torch.Generator().manual_seed(1_000_003 * seed + index)
 
     def uniform(*shape: int, low: float = 0.0, high: float = 1.0) -> Tensor:
         return low + (high - low) * torch.rand(*shape, generator=generator)
 
     axis = functional.normalize(torch.randn(batch, 3, generator=generator), dim=-1)
-    rotation = axis_angle_to_rotation_matrix(axis * uniform(batch, 1, high=math.radians(75.0)))
+    rotation = axis_angle_to_rotation_matrix(axis * uniform(batch, 1, high=math.radians(30.0 if motion else 75.0)))
     translation = torch.cat((uniform(batch, 2, low=-0.35, high=0.35), uniform(batch, 1, low=2.2, high=3.4)), -1)
     pose = Pose(rotation, translation)
     images, hit = render(pose)
@@ -80,7 +94,7 @@ def draw(seed: int, index: int, batch: int = BATCH) -> Images:
     pixels, visible = project(pose, KEYPOINTS), outside(pose)
     visible &= ((pixels > 0) & (pixels < SIZE - 1)).all(-1)
     row, column = torch.meshgrid(torch.arange(SIZE), torch.arange(SIZE), indexing="ij")
-    for _ in range(3):
+    for _ in range(0 if motion else 3):
         centre, half = uniform(batch, 2, low=8.0, high=SIZE - 8.0), uniform(batch, 2, low=2.0, high=12.0)
         inside = ((row - centre[:, :1, None]).abs() < half[:, :1, None]) & (
             (column - centre[:, 1:, None]).abs() < half[:, 1:, None]
@@ -88,6 +102,8 @@ def draw(seed: int, index: int, batch: int = BATCH) -> Images:
         images = torch.where(inside[:, None], uniform(batch, 3, 1, 1), images)
         visible &= ((pixels.flip(-1) - centre[:, None]).abs() > half[:, None]).any(-1)
     images = gaussian_blur2d(images, (5, 5), uniform(batch, 1, low=0.4, high=1.2).expand(-1, 2))
+    if motion:
+        images = motion_blur(images, MOTION, uniform(batch, high=180.0), torch.zeros(batch))
     images = images + 0.04 * torch.randn(images.shape, generator=generator)
     return Images(images - 0.5, pose, pixels, visible)
 
@@ -132,7 +148,11 @@ def render(pose: Pose) -> tuple[Tensor, Tensor]:
 
 
 class Keypoints(nn.Module):
-    """Pixels (B, 14, 2) of the keypoints, and of each the standard deviation (B, 14), 0.1 to 30 pixels."""
+    """Pixels (B, 14, 2) of the keypoints, and the noise of each.
+
+    The noise is a standard deviation (B, 14), 0.1 to 30 pixels; after :meth:`predict` it may be a covariance
+    (B, 14, 2, 2).
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -146,7 +166,17 @@ class Keypoints(nn.Module):
         self.down = nn.ModuleList([block(3, 24, 5), block(24, 48, 3), block(48, 96, 3), block(96, 96, 3)])
         self.up = nn.ModuleList([block(96 + 96, 64), block(64 + 48, 48), block(48 + 24, 48)])
         self.heads = nn.Conv2d(48, 2 * count, 1)
+        self.noise = SIGMA
         self.to(memory_format=torch.channels_last)  # faster on CPUs
+
+    def predict(self, noise: str) -> Keypoints:
+        """Predict another kind of noise from now on; covariances begin as multiples of the identity."""
+        self.noise = noise
+        if noise == COVARIANCE:
+            self.aspect = nn.Conv2d(48, 2 * len(KEYPOINTS), 1)
+            nn.init.zeros_(self.aspect.weight)
+            nn.init.zeros_(self.aspect.bias)
+        return self
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         x = images.contiguous(memory_format=torch.channels_last)
@@ -157,14 +187,24 @@ class Keypoints(nn.Module):
         for layer, skip in zip(self.up, kept[-2::-1], strict=True):
             x = layer(torch.cat((functional.interpolate(x, scale_factor=2.0), skip), 1))
         heat, off = self.heads(x).chunk(2, 1)  # (B, 14, SIZE / 2, SIZE / 2) each
+        pixels, spread = heatmap_keypoints(heat, stride=2)
         share = spatial_softmax2d(heat)
-        pixels = 2.0 * spatial_expectation2d(share, normalized_coordinates=False) + 0.5
-        return pixels, torch.exp(0.5 + 3.0 * torch.tanh((share * off).sum((-2, -1)) / 3.0))
+        sigma = torch.exp(0.5 + 3.0 * torch.tanh((share * off).sum((-2, -1)) / 3.0))
+        if self.noise == SIGMA:
+            return pixels, sigma
+        variance = sigma.square()[..., None, None]
+        if self.noise == HEAT_MAP:
+            return pixels, variance * spread
+        size, lean = (torch.cat((share, share), 1) * self.aspect(x)).sum((-2, -1)).tanh().chunk(2, 1)
+        none = torch.zeros_like(size)
+        factor = torch.stack((size.exp(), none, 3.0 * lean, (-size).exp()), -1).unflatten(-1, (2, 2))
+        return pixels, variance * factor @ factor.mT  # the determinant is that of the variance alone
 
 
-def solve(solver: nn.Module, pixels: Tensor, sigma: Tensor | None) -> PnPResult:
+def solve(solver: nn.Module, pixels: Tensor, noise: Tensor | None) -> PnPResult:
     """Poses of the box from its keypoints."""
-    result: PnPResult = solver(KEYPOINTS.expand(len(pixels), -1, -1), pixels, CAMERA, img_sigma=sigma)
+    known = {"img_sigma": noise} if noise is None or noise.ndim == 2 else {"img_cov": noise}
+    result: PnPResult = solver(KEYPOINTS.expand(len(pixels), -1, -1), pixels, CAMERA, **known)
     return result
 
 
@@ -172,6 +212,13 @@ def distance(pose: Pose, truth: Pose) -> Tensor:
     """How far the keypoints are from where they should be, the mean over all of them, (B,)."""
     off = KEYPOINTS @ (pose.rotation - truth.rotation).mT + (pose.translation - truth.translation)[:, None]
     return (off.square().sum(-1) + 1e-12).sqrt().mean(-1)
+
+
+def surprise(off: Tensor, noise: Tensor) -> Tensor:
+    """Negative log-likelihood of normal noise, up to a constant, (B, 14)."""
+    if noise.ndim == 2:
+        return 0.5 * off.square().sum(-1) / noise.square() + 2.0 * noise.log()
+    return -MultivariateNormal(torch.zeros(2), noise, validate_args=False).log_prob(off)
 
 
 def train(
@@ -182,6 +229,7 @@ def train(
     *,
     hidden: bool = False,
     likelihood: bool = False,
+    motion: bool = False,
 ) -> dict[str, list[float]]:
     """Go on with the keypoint loss, and with a solver that of the pose; returns curves.
 
@@ -192,18 +240,17 @@ def train(
     optimizer = torch.optim.AdamW(network.parameters(), lr=2e-3, weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 2e-3, total_steps=len(updates), pct_start=0.1)
     for index in updates:
-        problem = draw(seed, index)
-        pixels, sigma = network(problem.images)
+        problem = draw(seed, index, motion=motion)
+        pixels, noise = network(problem.images)
         off = functional.smooth_l1_loss(pixels, problem.pixels, reduction="none").mean(-1)
         labelled = torch.ones_like(problem.visible) if hidden else problem.visible
         keypoint_loss = (off * labelled).sum() / labelled.sum()
         loss, terms = keypoint_loss, [keypoint_loss.item()]
         if likelihood:
-            sq_off = (pixels - problem.pixels).detach().square().sum(-1)
-            surprise = 0.5 * sq_off / sigma.square() + 2.0 * sigma.log()
-            loss = loss + (surprise * labelled).sum() / labelled.sum()
+            likelihood_loss = surprise((pixels - problem.pixels).detach(), noise)
+            loss = loss + (likelihood_loss * labelled).sum() / labelled.sum()
         if solver is not None:
-            result = solve(solver, pixels, sigma)
+            result = solve(solver, pixels, noise)
             error = distance(result.pose, problem.pose)
             counts = result.ok & (error.detach() < 10.0 * MOST)
             # Saturated: a pose that is far off has little to say about pixels.
@@ -222,11 +269,11 @@ def train(
 
 
 @torch.no_grad()
-def test(network: Keypoints, solver: nn.Module, *, told: bool, batches: int) -> dict[str, float]:
+def test(network: Keypoints, solver: nn.Module, *, told: bool, batches: int, motion: bool) -> dict[str, float]:
     """Errors on images of a seed that no training uses."""
     distances, angles, offs = [], [], []
     for index in range(batches):
-        problem = draw(999_983, index)
+        problem = draw(999_983, index, motion=motion)
         pixels, sigma = network(problem.images)
         result = solve(solver, pixels, sigma if told else None)
         distances.append(distance(result.pose, problem.pose))
@@ -257,11 +304,27 @@ def run(seed: int, updates: int, batches: int) -> tuple[dict[str, Any], dict[str
         for first in (0, updates) if labels["hidden"] else (updates,):
             curves = train(network, solver if name == END else None, seed, range(first, first + updates), **labels)
         told = name in (END, LIKELY, FULL_LIKELY)
-        found[name] = {"curves": curves, **test(network, solver, told=told, batches=batches)}
+        found[name] = {"curves": curves, **test(network, solver, told=told, batches=batches, motion=False)}
         distances = ", ".join(f"{key} {found[name][key]:.4f}" for key in ("mean_distance", "median_distance"))
         print(f"seed {seed}, {name}: {distances}", flush=True)
-    found[UNTOLD] = test(networks[END], solver, told=False, batches=batches)
+    found[UNTOLD] = test(networks[END], solver, told=False, batches=batches, motion=False)
     return found, {name: networks[name] for name in (ALONE, END)}
+
+
+def run_covariances(seed: int, updates: int, batches: int) -> dict[str, Any]:
+    """Train networks that predict each kind of noise from one start, on images with motion blur."""
+    torch.set_num_threads(1)
+    torch.manual_seed(seed)
+    solver = create_solver("pnpnet-set").requires_grad_(False)
+    start = Keypoints()
+    found: dict[str, Any] = {"keypoints first": {"curves": train(start, None, seed, range(updates), motion=True)}}
+    for noise in (SIGMA, COVARIANCE, HEAT_MAP):
+        network = copy.deepcopy(start).predict(noise)
+        more = range(updates, updates + updates // 2)
+        curves = train(network, solver, seed, more, likelihood=True, motion=True)
+        found[noise] = {"curves": curves, **test(network, solver, told=True, batches=batches, motion=True)}
+        print(f"seed {seed}, {noise}: mean_distance {found[noise]['mean_distance']:.4f}", flush=True)
+    return found
 
 
 @themed
@@ -322,10 +385,18 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--jobs", type=int, default=1, help="so many seeds at the same time")
     parser.add_argument("--batches", type=int, default=32, help="of test images")
+    parser.add_argument("--covariances", action="store_true", help="compare kinds of noise; end to end half as long")
     parser.add_argument("--out", type=Path, default=Path("outputs/examples"))
     options = parser.parse_args()
     arguments = range(options.seeds), repeat(options.updates), repeat(options.batches)
+    made = {"environment": environment(), "updates": options.updates, "batches": options.batches}
+    options.out.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(options.jobs, multiprocessing.get_context("spawn")) as pool:
+        if options.covariances:
+            found = list(pool.map(run_covariances, *arguments))
+            results = {**made, "seeds": {str(seed): row for seed, row in enumerate(found)}}
+            save_results(results, options.out / "keypoint_covariances.json")
+            return
         runs = list(pool.map(run, *arguments))
     seeds = {str(seed): found for seed, (found, _) in enumerate(runs)}
     times_lower = {
@@ -336,9 +407,7 @@ def main() -> None:
         }
         for name in (ALONE, LIKELY, FULL, FULL_LIKELY)
     }
-    made = {"environment": environment(), "updates": options.updates, "batches": options.batches}
     results = {**made, "times_lower": times_lower, "seeds": seeds}
-    options.out.mkdir(parents=True, exist_ok=True)
     save_results(results, options.out / "keypoint_pipeline.json")
     plot_errors(results, options.out / "keypoint_pipeline.png")
     plot_overlays(runs[-1][1], options.out / "keypoint_pipeline_overlays.png")

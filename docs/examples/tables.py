@@ -13,6 +13,19 @@ from kornia_pnpnet.core.tables import markdown_table
 HERE = Path(__file__).resolve().parent
 
 
+def keypoint_covariances(results: dict[str, Any]) -> str:
+    """Errors of the networks that predict each kind of noise."""
+    seeds = list(results["seeds"].values())
+    lines = []
+    for noise in list(seeds[0])[1:]:  # the first network is the start of all
+        columns = (("mean_distance", 3), ("median_distance", 3), ("mean_rotation_deg", 2), ("mean_keypoint_px", 2))
+        cells = [", ".join(f"{found[noise][key]:.{digits}f}" for found in seeds) for key, digits in columns]
+        lines.append([noise, *cells])
+    header = ["Noise predicted", "mean distance", "median distance", "mean rotation error (°)", "keypoints (px)"]
+    updates = f"{results['updates']} + {results['updates'] // 2} updates"
+    return f"Errors on test images after {updates}, {len(seeds)} seeds:\n\n{markdown_table(header, lines)}"
+
+
 def localisation(results: dict[str, Any]) -> str:
     """Success and errors of each solver."""
     images, unit = results["images"], results["unit"]
@@ -72,7 +85,10 @@ def pose_network(results: dict[str, Any]) -> str:
 
 
 #: The tables of each page.
-PAGES = {"README.md": (localisation, fiducial_board), "clients.md": (incremental_map, pose_network)}
+PAGES = {
+    "README.md": (keypoint_covariances, localisation, fiducial_board),
+    "clients.md": (incremental_map, pose_network),
+}
 
 
 def page(name: str) -> str:
