@@ -98,6 +98,12 @@ def test_onnx(name, sizes, make_problems, tmp_path):
         assert not found[4][3:4].any()
 
 
+def test_onnx_of_one_problem(make_problems, tmp_path):
+    solver = PnPNet(None, RobustWeightedLM(1))
+    inputs = inputs_of(make_problems(n=9, batch=1))
+    near(run_onnx(export_onnx(solver, tmp_path / "one.onnx", 9, batch=1), inputs), solver, inputs)
+
+
 def test_solvers_that_cannot_be_exported(tmp_path, capsys):
     with pytest.raises(ValueCheckError, match="RANSAC"):
         export_program(create_solver("p3p-ransac"), 9)

@@ -59,6 +59,9 @@ int main(int argc, char** argv) try {
   for (int i = 0; i < 3; ++i) std::cout << translation.data_ptr<float>()[i] << (i < 2 ? ' ' : '\n');
   std::cout << (result[4].item<bool>() ? "ok" : "not ok") << std::endl;
   return 0;
+} catch (const c10::Error& error) {
+  std::cerr << "pnpnet_solve: " << error.what_without_backtrace() << '\n';
+  return 2;
 } catch (const std::exception& error) {
   std::cerr << "pnpnet_solve: " << error.what() << '\n';
   return 2;
