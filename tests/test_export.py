@@ -180,7 +180,7 @@ def test_packages(batch, sizes, make_problems, tmp_path):
 def test_packages_of_any_number_of_pairs(make_problems, tmp_path):
     solver = PnPNet(None, RobustWeightedLM(1))
     package = solve_sizes(
-        packaged(tmp_path, solver, None, None), solver, ((4, 3), (9, 1), (40, 2), (20, 50)), make_problems
+        packaged(tmp_path, solver, None, None), solver, ((4, 50), (9, 1), (40, 2), (20, 50)), make_problems
     )
     assert (package.n, package.batch) == (None, None)
     with pytest.raises(ShapeError):
