@@ -180,9 +180,10 @@ def test_packages(batch, sizes, make_problems, tmp_path):
 def test_packages_of_any_number_of_pairs(make_problems, tmp_path):
     solver = PnPNet(None, RobustWeightedLM(1))
     package = solve_sizes(
-        packaged(tmp_path, solver, None, None), solver, ((4, 3), (9, 1), (40, 2), (20, 50)), make_problems
+        packaged(tmp_path, solver, None, None), solver, ((6, 3), (9, 1), (40, 2), (20, 50)), make_problems
     )
     assert (package.n, package.batch) == (None, None)
+    assert package(*inputs_of(make_problems(n=4, batch=3))).translation.isfinite().all()
     with pytest.raises(ShapeError):
         package(*inputs_of(make_problems(n=3, batch=3)))
 
