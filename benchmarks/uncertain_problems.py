@@ -34,8 +34,8 @@ def uncertain_pnp(n: int, share: float, count: int, *, turned: bool, seed: int) 
     """Problems of the protocol of uncertain PnP (Vakhitov et al., CVPR 2021, arXiv 2107.03890, section 4.1).
 
     Points lie in a box in front of a camera of 800 px, their centre is the origin of the world. A tenth of the pairs
-    each has grade 1, 2, ..., 10: the standard deviation along the longest axis is so many pixels and hundredths of a
-    unit. Those of the other axes are uniform between 0 and that; the axes have a random direction.
+    each has grade 1, 2, ..., 10: the standard deviation along the longest axis, in pixels and in hundredths
+    of a unit. Those of the other axes are uniform between 0 and that; the axes have a random direction.
 
     Args:
         n: number of pairs.

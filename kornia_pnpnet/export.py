@@ -79,8 +79,8 @@ def export_program(solver: PnPNet, n: int | None = None, *, batch: int | None = 
     r"""Trace a solver for batches of any size or of one size.
 
     Args:
-        solver: any solver but RANSAC, whose number of iterations depends on the data. The program has the fixed effort,
-            whatever the solver's ``effort`` is.
+        solver: any solver but RANSAC, whose number of iterations depends on the data. The program always has the
+            fixed effort.
         n: number of correspondences per problem. With ``None`` the n of the network, or any n of at least 4 when the
             network accepts any n.
         batch: number of problems of each call, which a compiler can specialise for; ``None``: any number.
@@ -185,7 +185,7 @@ def export_package(solver: PnPNet, path: str | Path, n: int | None = None, *, ba
 class PackagedSolver:
     r"""A solver that :func:`export_package` compiled. Results have no gradients.
 
-    Calling it computes in float32 on the CPU, whatever dtype, device and memory layout the inputs have.
+    Calls compute in float32 on the CPU. Inputs of any dtype, device and memory layout are converted.
 
     Attributes:
         batch: number of problems of each call; ``None``: any number.

@@ -425,6 +425,6 @@ def package_options(pairs: int | None, *, on_stack: bool) -> dict[str, Any]:
     return {
         "aot_inductor.allow_stack_allocation": on_stack,
         "cpp.vec_isa_ok": True,  # see Compiled
-        "cpp.threads": 1,  # the number would be that of the process that compiles, whatever the caller's is
+        "cpp.threads": 1,  # else the number of threads of the process that compiles
         "pick_loop_orders": pairs is not None and pairs < _MANY_PAIRS,
     }

@@ -49,7 +49,7 @@ _FINAL_STEPS = 6
 _KERNEL_SCALE, _MEDIAN, _FITTED = 3.4, 2.0 * math.log(2.0), 5
 # Standard deviations. :func:`search_on` counts nearer pairs as inliers. The limit of estimated noise is wide because
 # networks estimate too little noise where most pairs are wrong: right pairs that do not count cost more than wrong
-# pairs that do. That of known noise was tuned on problems of uncertain PnP (`benchmarks/uncertain_problems.py`, seed
+# pairs that do. That of known noise was tuned on problems of uncertain PnP (`benchmarks/uncertain_problems.py`, seeds
 # 777 and 778, 10 pairs with 5 outliers): 4 and 8 lead to larger errors.
 _INLIER, _KNOWN_INLIER = 10.0, 5.0
 # Normalised units. A guess that has the centre of the world nearer than this counts as this near.
