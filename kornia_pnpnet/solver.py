@@ -17,7 +17,7 @@ from kornia_pnpnet.core.linalg import bound_gradient, gate
 from kornia_pnpnet.core.performance import Compiled, in_full_precision, sees_values
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.init import RANSAC, EPnP, MLPInit, REPPnP, SetInit
-from kornia_pnpnet.init.alternatives import find_alternatives, is_seen
+from kornia_pnpnet.init.alternatives import doubt_mirrored, find_alternatives, is_seen
 from kornia_pnpnet.init.ransac import search_on
 from kornia_pnpnet.inputs import Inputs, checked_inputs, joined, restore_leading, split_batch
 from kornia_pnpnet.normalize import VIEWS, Frame, Normalize
@@ -68,8 +68,8 @@ class PnPNet(nn.Module):
         refine: the refiner; classical :class:`~kornia_pnpnet.refine.RobustWeightedLM` when ``None``.
         normalize: the normalisation; the default centres and scales the world and orders the pairs.
         effort: ``"fixed"``, or ``"adaptive"``: where the poses of the initialiser do not suffice, a problem gets as
-            many more minimal samples as it needs (``init.ransac.search_on``). Others do not wait for it. Needs an
-            initialiser that estimates the noise, :class:`~kornia_pnpnet.init.SetInit`. The samples have no gradient.
+            many more minimal samples as it needs (``init.ransac.search_on``), and a pose whose mirror image fits as
+            well is not ``ok``. Needs an initialiser that estimates the noise, :class:`~kornia_pnpnet.init.SetInit`.
             ``None``: adaptive with such an initialiser and a refinement in evaluation mode, else fixed. Always fixed:
             exported graphs, ``compile(whole=True)``, ``torch.func.vmap`` and the device ``meta``.
         gradient: which problems carry a gradient: those that are ``"ok"``, or ``"always"`` every valid problem, to
@@ -285,7 +285,12 @@ class PnPNet(nn.Module):
             guess = search_on(corr, guess, keep_others=inputs.init is not None or inputs.prior is not None)
             begun = _Begun(self.refine.begin(corr, guess), frame, guess)
         end = self.refine.iterate(begun.start, 0 if first_stage_only else None)
-        return begun, self._finish(begun, end, always)
+        result = self._finish(begun, end, always)
+        if not first_stage_only and self._searches(inputs):
+            start, frame, guess = begun
+            pose = self.normalize.apply_to_pose(result.pose, frame)
+            result = doubt_mirrored(self.refine, start.corr, guess, pose, result, always)
+        return begun, result
 
     def _searches(self, inputs: Inputs) -> bool:
         """Whether the effort is adaptive."""

@@ -54,6 +54,33 @@ def test_the_right_pose_of_a_board_is_among_them(name, generator):
         assert (errors.rotation_error_deg > 1.9)[there[:, i]].all()
 
 
+def test_a_pose_is_not_believed_beside_its_mirror_image(generator):
+    *given, pose = boards(generator, batch=300, sigma=0.7, dtype=torch.float32)
+    believed = {}
+    with torch.no_grad():
+        for effort in ("fixed", "adaptive"):
+            result = create_solver("pnpnet-set", effort=effort)(*given)
+            error = pose_errors(result.pose, pose).rotation_error_deg
+            believed[effort] = result.ok[error > 10.0].double().mean(), result.ok[error < 5.0].double().mean()
+            assert (result.status[~result.ok] != 0).all()
+            assert (result.probability[result.ok] >= 0.93).all()
+    assert believed["fixed"][0] > 0.5
+    assert believed["adaptive"][0] < 0.3
+    assert believed["adaptive"][1] > 0.7
+
+
+def test_a_pose_beside_its_mirror_image_has_no_gradient(generator):
+    world, *given, _ = boards(generator, batch=100, sigma=1.5)
+    world = world.clone().requires_grad_()
+    for gradient in ("ok", "always"):
+        result = create_solver("pnpnet-set", effort="adaptive", gradient=gradient)(world, *given)
+        (slope,) = torch.autograd.grad(result.translation.sum(), world)
+        moved = slope.abs().amax((1, 2)) > 0
+        assert not result.ok.all()
+        assert moved[result.ok].all()
+        assert moved[~result.ok].all() == (gradient == "always")
+
+
 def test_a_board_seen_from_the_front(generator):
     """The mirror image is often no minimum; the tilt is then as uncertain as the image says."""
     *given, pose = boards(generator, batch=200, tilt=8.0, sigma=1.0)

@@ -2,26 +2,37 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 from torch.nn import functional
 
+from kornia_pnpnet.core.linalg import gate
 from kornia_pnpnet.core.performance import repeat_problems
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import project, rotation_angle
 from kornia_pnpnet.init.ransac.p3p import p3p
+from kornia_pnpnet.init.ransac.search import take
 from kornia_pnpnet.refine import RobustWeightedLM
-from kornia_pnpnet.refine.verdict import residual_noise
-from kornia_pnpnet.types import Alternatives, Correspondences, Guess, Pose
+from kornia_pnpnet.refine.verdict import LEAST_PROBABILITY, residual_noise
+from kornia_pnpnet.types import Alternatives, Correspondences, Guess, PnPResult, Pose, Status
 
-__all__ = ["find_alternatives", "is_seen"]
+__all__ = ["doubt_mirrored", "find_alternatives", "is_seen"]
 
 # A pose explains the pairs nearly as well when its likelihood is at least this share of the best one's.
 _LIKELY = 1e-3
+# Logarithm. Poses that are this much likelier than the best one are not compared further.
+_LIKELIER = 30.0
 # Radians, and shares of the distance of the points: poses that are closer are the same minimum.
 _SAME_TURN, _SAME_SHIFT = 0.035, 0.035
 # Focal lengths. A pair that is not near is refined only when some first guess projects it this close to its pixel.
 _SEEN = 0.25
+# Shares of the spread of the pixels. A mirror image that leaves a larger median residual has no minimum nearby that
+# explains as much; of fewer likely inliers than this, any mirror image may have one.
+_NEAR_MIRROR, _FEW_INLIERS = 0.2, 10
+# Radians. A pose that is turned further is far off, see :attr:`~kornia_pnpnet.types.PnPResult.probability`.
+_FAR_TURN = math.radians(10.0)
 # For solvers that do not refine: iterations with a classical kernel.
 _ITERATIONS = 20
 
@@ -77,7 +88,7 @@ def find_alternatives(
 
     # From costs, which are means over the pairs, to log-likelihoods.
     unit = (corr.weights > 0).sum(-1) / _unit(corr, guess, Pose(*(x[0] for x in ends)))
-    log_ratio = -0.5 * unit * (cost - cost[0])
+    log_ratio = (-0.5 * unit * (cost - cost[0])).clamp(max=_LIKELIER)
     usable = usable & (log_ratio > torch.tensor(_LIKELY).log())
     log_ratio, order = torch.where(usable, log_ratio, -torch.inf).sort(dim=0, descending=True, stable=True)
     cost, usable = cost.gather(0, order), usable.gather(0, order)
@@ -102,6 +113,56 @@ def find_alternatives(
     largest = torch.finfo(cost.dtype).max ** 0.5
     picked = pick(ends.rotation, eye), pick(ends.translation, 0.0), pick(cost, largest), pick(probability, 0.0)
     return Alternatives(*picked, chosen.mT)
+
+
+def doubt_mirrored(
+    refine: RobustWeightedLM, corr: Correspondences, guess: Guess, pose: Pose, result: PnPResult, always: bool
+) -> PnPResult:
+    """Do not believe a pose whose mirror image, refined, is far off and explains the pairs nearly as well.
+
+    Args:
+        refine: the refinement that found the pose.
+        corr: normalised correspondences.
+        guess: what the refinement started from.
+        pose: the pose of the result in the frame of the correspondences.
+        result: the result.
+        always: whether gradients flow through poses that are not believed.
+
+    Returns:
+        The result with less probability, and not ``ok`` where it is below the least.
+    """
+    assert result.probability is not None and result.status is not None
+    probability = result.probability * (1.0 - _mirror_probability(refine, corr, guess, pose, result))
+    doubted = result.ok & (probability < LEAST_PROBABILITY)
+    kept = (gate(x, ~doubted | always, torch.ones_like(doubted), 0.0) for x in result[:4])
+    ok, status = result.ok & ~doubted, result.status.masked_fill(doubted, Status.NOT_BELIEVED.value)
+    return PnPResult(*kept, ok, result.init, status, probability, result.alternatives)
+
+
+@torch.no_grad()
+def _mirror_probability(
+    refine: RobustWeightedLM, corr: Correspondences, guess: Guess, pose: Pose, result: PnPResult
+) -> Tensor:
+    """Probability that not the pose is right but its mirror image, where one of them is, (B,); 0 where not ok."""
+    weights = corr.weights * guess.weights
+    share = weights / weights.sum(-1, keepdim=True).clamp(min=torch.finfo(weights.dtype).tiny)
+    middle = (share[..., None] * corr.img_points).sum(1, keepdim=True)
+    spread = (share * (corr.img_points - middle).square().sum(-1)).sum(-1, keepdim=True)
+    mirrored = _mirrored(pose, corr, weights)
+    projection = project(mirrored, corr)
+    near = projection.in_front & (projection.sq_residual < _NEAR_MIRROR**2 * spread)
+    few = (weights > 0.5).sum(-1) < _FEW_INLIERS
+    rows = (result.ok & (few | ((share * near).sum(-1) > 0.5))).nonzero()[:, 0]
+    probability = torch.zeros_like(share[:, 0])
+    if len(rows):
+        start = Guess(mirrored, guess.weights, noise=guess.noise)
+        corr, start, pose, cost = (take(x, rows) for x in (corr, start, pose, result.cost))
+        refined = refine(corr, start)
+        usable = refined.in_front & refined.cost.isfinite()
+        usable &= rotation_angle(refined.pose.rotation, pose.rotation) > _FAR_TURN
+        log_ratio = 0.5 * (corr.weights > 0).sum(-1) / _unit(corr, start, pose) * (cost - refined.cost)
+        probability[rows] = torch.where(usable, log_ratio.sigmoid(), 0.0)
+    return probability
 
 
 def _mirrored(pose: Pose, corr: Correspondences, weights: Tensor) -> Pose:
