@@ -262,8 +262,6 @@ class PnPNet(nn.Module):
         if not whole:
             self.refine.compile(mode)
 
-    # -- the parts of a call -------------------------------------------------------------------------------------------
-
     def _in_parts(self, first_stage_only: bool, always: bool, inputs: Inputs, alternatives: int = 0) -> PnPResult:
         begun, result = self._parts(first_stage_only, always, inputs)
         if not alternatives:
@@ -374,8 +372,6 @@ class PnPNet(nn.Module):
             torch.where(finite, refined.probability, 0.0),
             Alternatives.none(pose),
         )
-
-    # -- weights on disk ---------------------------------------------------------------------------------------------
 
     def config(self) -> dict[str, Any]:
         """The constructor arguments of all parts, as plain data."""

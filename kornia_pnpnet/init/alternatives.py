@@ -131,7 +131,8 @@ def doubt_mirrored(
     Returns:
         The result with less probability, and not ``ok`` where it is below the least.
     """
-    assert result.probability is not None and result.status is not None
+    assert result.probability is not None
+    assert result.status is not None
     probability = result.probability * (1.0 - _mirror_probability(refine, corr, guess, pose, result))
     doubted = result.ok & (probability < LEAST_PROBABILITY)
     kept = (gate(x, ~doubted | always, torch.ones_like(doubted), 0.0) for x in result[:4])
@@ -155,8 +156,8 @@ def _mirror_probability(
     rows = (result.ok & (few | ((share * near).sum(-1) > 0.5))).nonzero()[:, 0]
     probability = torch.zeros_like(share[:, 0])
     if len(rows):
-        start = Guess(mirrored, guess.weights, noise=guess.noise)
-        corr, start, pose, cost = (take(x, rows) for x in (corr, start, pose, result.cost))
+        start = take(Guess(mirrored, guess.weights, noise=guess.noise), rows)
+        corr, pose, cost = take(corr, rows), take(pose, rows), result.cost[rows]
         refined = refine(corr, start)
         usable = refined.in_front & refined.cost.isfinite()
         usable &= rotation_angle(refined.pose.rotation, pose.rotation) > _FAR_TURN
