@@ -135,9 +135,17 @@ def doubt_mirrored(
     assert result.status is not None
     probability = result.probability * (1.0 - _mirror_probability(refine, corr, guess, pose, result))
     doubted = result.ok & (probability < LEAST_PROBABILITY)
-    kept = (gate(x, ~doubted | always, torch.ones_like(doubted), 0.0) for x in result[:4])
-    ok, status = result.ok & ~doubted, result.status.masked_fill(doubted, Status.NOT_BELIEVED.value)
-    return PnPResult(*kept, ok, result.init, status, probability, result.alternatives)
+    live, everywhere = ~doubted | always, torch.ones_like(doubted)
+    rotation, translation, weights, cost = (gate(x, live, everywhere, 0.0) for x in result[:4])
+    return result._replace(
+        rotation=rotation,
+        translation=translation,
+        weights=weights,
+        cost=cost,
+        ok=result.ok & ~doubted,
+        status=result.status.masked_fill(doubted, Status.NOT_BELIEVED.value),
+        probability=probability,
+    )
 
 
 @torch.no_grad()
