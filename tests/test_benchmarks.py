@@ -487,3 +487,36 @@ def test_real_matches_are_measured_and_failures_drawn(tmp_path):
         assert (tmp_path / failure["picture"]).stat().st_size > 0
     assert {failure["scene"] for failure in results["failures"]} <= {"yard", "room"}
     assert sum(results["reliability"][specs[1]]["number"]) == 24
+
+
+# -- keypoints.py ------------------------------------------------------------------------------------------------------
+
+
+def test_keypoints_are_measured_where_they_were_not_seen(tmp_path, monkeypatch):
+    pytest.importorskip("poselib")
+    keypoints = importlib.import_module("keypoints")
+    draw = np.random.default_rng(0)
+    problems = SyntheticProblems(n=12, batch_size=60, seed=3, dtype=torch.float64).batch(0)
+    confidence = draw.uniform(0.2, 1.0, (60, 12))
+    pixels = problems.img_points.numpy() + 2.0 / confidence[..., None] * draw.normal(size=(60, 12, 2))
+    pixels[:, 0] += 200.0  # an outlier that the confidence knows
+    confidence[:, 0] = 0.1
+    shift = np.array([100.0, -50.0, 20.0])  # the world's origin does not matter
+    pose = problems.pose
+    arrays = {"world": problems.world_points.numpy() + shift, "img": pixels, "mask": np.ones((60, 12), bool)}
+    arrays |= {"K": problems.intrinsics.expand(60, 3, 3).numpy(), "R": pose.rotation.numpy()}
+    arrays |= {"t": (pose.translation - pose.rotation @ torch.from_numpy(shift)).numpy(), "confidence": confidence}
+    np.savez(tmp_path / "a.npz", **arrays, seen=np.arange(60) < 30, cluster=np.arange(60) // 2, inlier_px=40.0)
+    (tmp_path / "sources.json").write_text('{"a": "synthetic"}')
+    out = tmp_path / "out.json"
+    given = [str(tmp_path / "a.npz"), "--sources", str(tmp_path / "sources.json"), "--out", str(out)]
+    monkeypatch.setattr(sys, "argv", ["keypoints.py", *given])
+    keypoints.main()
+    (result,) = json.loads(out.read_text())["results"]
+    assert (result["seen"], result["measured"], result["clusters"]) == (30, 30, 15)
+    rows = {row["way"]: row for row in result["rows"]}
+    assert max(row["median"] for row in rows.values()) < 0.1
+    for base in keypoints.BASES:
+        for key, (mean, low, high) in rows["confidence=fitted"]["less"][base].items():
+            assert low <= mean <= high
+            assert mean == pytest.approx(rows["confidence=fitted"][key] - rows[base][key])

@@ -1,0 +1,151 @@
+"""What the confidences of a network's keypoints are worth: ``keypoints.py A.npz B.npz --sources S.json --out O.json``.
+
+Each file holds the problems of one source: ``world`` (P, N, 3), ``img`` (P, N, 2) in undistorted pixels, ``mask``
+(P, N), ``confidence`` (P, N), ``K`` (P, 3, 3), the reference pose ``R`` (P, 3, 3) and ``t`` (P, 3), ``seen`` (P,) for
+problems that may be used for choosing, ``cluster`` (P,), equal for problems that depend on each other, such as those of
+neighbouring frames, and ``inlier_px`` (), the largest reprojection error of an inlier under the reference pose.
+
+Seen problems fit the map of ``fit_confidence`` and the noise, constant and as a power of the confidence; the others are
+measured. PoseLib's threshold is ``inlier_px``; masked, it gets pairs with a fitted confidence above 0.5. The error is
+the rotation error in radians plus the translation error relative to the distance of the points' centre.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from harness import load, threads
+from torch import Tensor, nn
+
+from kornia_pnpnet import create_solver, fit_confidence, pose_errors
+from kornia_pnpnet.core.environment import environment
+from kornia_pnpnet.core.files import read_npz
+from kornia_pnpnet.core.tables import markdown_table
+from kornia_pnpnet.evaluation.results import save_results
+from kornia_pnpnet.types import Pose
+
+FIELDS = ("world", "img", "mask", "confidence", "K", "R", "t", "seen", "cluster")
+# A pose is right below this many degrees and this relative translation error; errors are also averaged up to CAP.
+RIGHT, CAP = (5.0, 0.05), 0.5
+FEWEST = 6  # pairs that PoseLib gets at least, the most confident ones
+# Median and mean logarithm of the length of a two-dimensional residual, relative to its standard deviation.
+MEDIAN, MEAN_LOG = math.sqrt(2 * math.log(2)), 0.5 * (math.log(2) - 0.5772156649)
+# Noise is fitted on errors between these, relative to the largest of an inlier; confidences count as LEAST at least.
+FITTED, LEAST = (0.02, 3.0), 0.05
+BATCH, SAMPLES, SEED = 500, 2000, 0
+BASES = ("weights=c**6", "weights=c**2", "nothing")  # ways that all others are compared to
+EXACT = {"world_sigma": torch.tensor(0.0)}
+
+Problems = dict[str, Tensor]
+Way = tuple[nn.Module, Callable[[Problems], dict[str, Tensor]]]
+
+
+def read(path: Path) -> tuple[Problems, float]:
+    """The problems of a file, with the centre of the points as the origin of the world, and the limit of an inlier."""
+    arrays = read_npz(path, (*FIELDS, "inlier_px"))
+    p = {name: torch.from_numpy(arrays[name]) for name in FIELDS}
+    p["confidence"] = p["confidence"].clamp(0, 1)
+    origin = (p["world"] * p["mask"][..., None]).sum(1) / p["mask"].sum(1, keepdim=True)
+    p["world"], p["t"] = p["world"] - origin[:, None], p["t"] + (p["R"] @ origin[..., None])[..., 0]
+    return p, float(arrays["inlier_px"])
+
+
+def reprojection(p: Problems) -> Tensor:
+    """Reprojection errors under the reference pose, in pixels, (P, N)."""
+    image = (p["world"] @ p["R"].mT + p["t"][:, None]) @ p["K"].mT
+    return (image[..., :2] / image[..., 2:] - p["img"]).norm(dim=-1)
+
+
+@torch.no_grad()
+def solve(p: Problems, way: Way) -> dict[str, Tensor]:
+    """Solve all problems; their errors, also capped, whether the poses are right, and the solver's ``ok``."""
+    parts = []
+    for start in range(0, len(p["world"]), BATCH):
+        q = {name: value[start : start + BATCH] for name, value in p.items()}
+        result = way[0](q["world"], q["img"], q["K"], **{"mask": q["mask"], **way[1](q)})
+        angle, distance = pose_errors(result.pose, Pose(q["R"], q["t"]))
+        shift = distance / q["t"].norm(dim=1)
+        parts.append((angle.deg2rad() + shift, (angle < RIGHT[0]) & (shift < RIGHT[1]), result.ok))
+    error, right, ok = (torch.cat(x).double() for x in zip(*parts, strict=True))
+    return {"error": error, "capped": error.clamp(max=CAP), "right": right, "ok": ok}
+
+
+def ways(seen: Problems, inlier_px: float) -> tuple[dict[str, Way], dict[str, float]]:
+    """Ways to use the confidence, fitted on problems that were seen, and the fitted numbers."""
+    error, used, c = reprojection(seen), seen["mask"], seen["confidence"]
+    calibration = fit_confidence(c, error < inlier_px, mask=used)
+    fitted = used & (error < FITTED[1] * inlier_px) & (error > FITTED[0] * inlier_px)
+    sigma = error[fitted].median() / MEDIAN
+    logs = c[fitted].clamp(min=LEAST).log().numpy(), error[fitted].log().numpy() - MEAN_LOG
+    slope, offset = (float(x) for x in np.polyfit(*logs, 1))
+    scale = math.exp(offset)
+
+    def masked(q: Problems) -> dict[str, Tensor]:
+        best = q["confidence"].where(q["mask"], -1.0).topk(FEWEST).values[:, -1:]
+        return {"mask": q["mask"] & ((calibration(q["confidence"]) > 0.5) | (q["confidence"] >= best))}
+
+    ours, poselib = create_solver("pnpnet-set"), create_solver("poselib", threshold=inlier_px)
+    return {
+        "nothing": (ours, lambda _: {}),
+        "weights=c**6": (ours, lambda q: {"weights": q["confidence"] ** 6}),
+        "weights=c**2": (ours, lambda q: {"weights": q["confidence"] ** 2}),
+        "confidence=c": (ours, lambda q: {"confidence": q["confidence"]}),
+        "confidence=fitted": (ours, lambda q: {"confidence": calibration(q["confidence"])}),
+        "img_sigma=constant": (ours, lambda _: {"img_sigma": sigma, **EXACT}),
+        "img_sigma=power of c": (ours, lambda q: {"img_sigma": scale * q["confidence"].clamp(LEAST) ** slope, **EXACT}),
+        "PoseLib": (poselib, lambda _: {}),
+        "PoseLib, masked": (poselib, masked),
+    }, {"sigma_px": float(sigma), "power": slope, "inlier_px": inlier_px}
+
+
+def interval(difference: Tensor, cluster: Tensor) -> list[float]:
+    """Mean difference and its 95 % interval, by drawing clusters with replacement."""
+    group = cluster.unique(return_inverse=True)[1].numpy()
+    sums, counts = np.bincount(group, difference.numpy()), np.bincount(group)
+    drawn = np.random.default_rng(SEED).integers(len(sums), size=(SAMPLES, len(sums)))
+    means = sums[drawn].sum(1) / counts[drawn].sum(1)
+    return [float(difference.mean()), *(float(x) for x in np.percentile(means, (2.5, 97.5)))]
+
+
+def measure(path: Path) -> dict[str, Any]:
+    """Measure all ways on the problems of a file that were not seen."""
+    p, inlier_px = read(path)
+    seen, new = ({name: value[at] for name, value in p.items()} for at in (p["seen"], ~p["seen"]))
+    found, chosen = ways(seen, inlier_px)
+    scores, rows = {name: solve(new, way) for name, way in found.items()}, []
+    for name, one in scores.items():
+        row = {key: float(value.mean()) for key, value in one.items()} | {"median": float(one["error"].median())}
+        less = {base: {k: interval(v - scores[base][k], new["cluster"]) for k, v in one.items()} for base in BASES}
+        rows.append({"way": name, **row, "less": less})
+    inliers = (reprojection(new) < inlier_px)[new["mask"]].double()
+    counts = {"seen": len(seen["t"]), "measured": len(new["t"]), "clusters": len(new["cluster"].unique())}
+    share = {"pairs": len(inliers) / len(new["t"]), "inliers": float(inliers.mean())}
+    return {"source": path.stem, **counts, **share, "fitted": chosen, "rows": rows}
+
+
+def main() -> None:
+    """Measure, print the tables and write the results."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("problems", type=Path, nargs="+")
+    parser.add_argument("--sources", type=Path, required=True, help="JSON: what each source is, by its file")
+    parser.add_argument("--out", type=Path, required=True)
+    options, before, keys = parser.parse_args(), load(), ("error", "capped", "median", "right", "ok")
+    with threads():
+        found = [measure(path) for path in options.problems]
+    for one in found:
+        print({key: value for key, value in one.items() if key != "rows"})
+        print(markdown_table(("way", *keys), [[r["way"], *(f"{r[k]:.3f}" for k in keys)] for r in one["rows"]]))
+    settings = {"right": RIGHT, "cap": CAP, "samples": SAMPLES, "dtype": "float64"}
+    made = {"environment": environment(), "settings": settings, "load_average": [before, load()]}
+    save_results({**made, "sources": json.loads(options.sources.read_text()), "results": found}, options.out)
+
+
+if __name__ == "__main__":
+    main()
