@@ -279,7 +279,7 @@ class PnPNet(nn.Module):
         if first_stage_only or not self._searches(inputs):
             begun = self._begin(views, always, inputs)
         else:
-            corr, frame, guess = self._first(views, always, inputs)
+            corr, frame, guess = self._first(views, always, inputs, True)
             guess = search_on(corr, guess, keep_others=inputs.init is not None or inputs.prior is not None)
             begun = _Begun(self.refine.begin(corr, guess), frame, guess)
         end = self.refine.iterate(begun.start, 0 if first_stage_only else None)
@@ -299,10 +299,12 @@ class PnPNet(nn.Module):
 
     def _guess(self, views: int, always: bool, inputs: Inputs) -> _Begun:
         """Everything before the first iteration."""
-        corr, frame, guess = self._first_guess(views, always, inputs)
+        corr, frame, guess = self._first_guess(views, always, inputs, False)
         return _Begun(self.refine.begin(corr, guess), frame, guess)
 
-    def _first_guess(self, views: int, always: bool, inputs: Inputs) -> tuple[Correspondences, Frame, Guess]:
+    def _first_guess(
+        self, views: int, always: bool, inputs: Inputs, search_follows: bool
+    ) -> tuple[Correspondences, Frame, Guess]:
         """Normalise and guess."""
         world_points, img_points, intrinsics, weights, mask, init, noise, confidence, prior = inputs
         corr, frame = self.normalize(world_points, img_points, intrinsics, weights, mask, noise, confidence)
@@ -314,16 +316,17 @@ class PnPNet(nn.Module):
             corr, init = corr._replace(prior=known), prior.pose if init is None else init
             frame = frame._replace(status=torch.where(usable, frame.status, Status.NOT_FINITE.value))
         given = self._given(init, world_points, frame) if self.init is None or init is not None else None
+        options = {"search_follows": True} if search_follows and isinstance(self.init, SetInit) else {}
         if self.init is None:
             assert given is not None
             guess = Guess(given, torch.ones_like(corr.weights))
         elif isinstance(self.init, RANSAC):
             guess = self.init(corr, given)
         elif views == 1:
-            guess = self.init(corr)
+            guess = self.init(corr, **options)
         else:
             batch = world_points.shape[0]
-            guess = self.init(self.normalize.views(corr, views))
+            guess = self.init(self.normalize.views(corr, views), **options)
             first, *rest = [x for pose in guess.poses for x in self.normalize.undo_views(pose, views)]
             others = map_tensors(lambda *x: torch.stack(x, 1), *rest)
             # Weights, ok and noise of the first view, whose pairs have the order of the correspondences.

@@ -44,7 +44,8 @@ _ABSENT = -1e9
 _SAMPLES = ((0, 1, 2), (0, 1, 3), (2, 3, 4), (2, 3, 5), (0, 4, 5), (1, 4, 5), (0, 2, 3), (1, 2, 3))
 # From 18, 24 and 30 pairs on, the same samples are drawn again with their ranks multiplied by 3, 4 and 5.
 _SPREADS = {18: 3, 24: 4, 30: 5}
-# From 36 pairs on, 25 further samples: each of the 25 likeliest pairs is in three of them, no two pairs meet twice.
+# From 36 pairs on, 25 further samples: each of the 25 likeliest pairs is in three of them, no two pairs meet twice. A
+# search that follows finds what these would.
 _RING = {36: [(a, b, c) for i in range(25) for a, b, c in [sorted((i, (i + 1) % 25, (i + 6) % 25))]]}
 #: Number of top-ranked pairs that score each hypothesis.
 MOST_JUDGES = 32
@@ -276,11 +277,12 @@ class SetInit(Configured):
                 layer.bias.zero_()
             self.pair.bias[0] = 2.0
 
-    def forward(self, corr: Correspondences) -> Guess:
+    def forward(self, corr: Correspondences, *, search_follows: bool = False) -> Guess:
         """Guess poses, weights and noise.
 
         Args:
             corr: normalised correspondences of a centred and scaled world, of any :math:`N`, in any order.
+            search_follows: draw fewer samples, since what they miss is searched for.
 
         Returns:
             The first hypothesis as the pose and the other hypotheses as others, the best sample last; probabilities of
@@ -311,7 +313,8 @@ class SetInit(Configured):
         translation = small_product(back, translation[:, None])[:, 0]
         noises = self._noise(corr, view, noise)
         if self.samples:
-            sampled = self._sampled(corr, right, noises, Pose(rotation[:, :, 0], translation[:, 0]))
+            fallback = Pose(rotation[:, :, 0], translation[:, 0])
+            sampled = self._sampled(corr, right, noises, fallback, rings=not search_follows)
             rotation, translation = (
                 torch.cat((x, y[..., None, :]), -2) for x, y in zip((rotation, translation), sampled, strict=True)
             )
@@ -319,11 +322,12 @@ class SetInit(Configured):
         others = Pose(*(x[:, 1:] for x in every)) if every.rotation.shape[1] > 1 else None
         return Guess(Pose(*(x[:, 0] for x in every)), right, others=others, noise=noises)
 
-    def triples(self, count: int) -> dict[int, list[tuple[int, int, int]]]:
+    def triples(self, count: int, *, rings: bool = True) -> dict[int, list[tuple[int, int, int]]]:
         """Minimal samples of a problem.
 
         Args:
             count: number of pairs.
+            rings: with the samples of problems of many pairs.
 
         Returns:
             Groups of samples, as ranks of pairs by likelihood, by the least number of pairs of a problem that uses the
@@ -331,10 +335,11 @@ class SetInit(Configured):
         """
         near = [x for x in _SAMPLES[: self.samples] if max(x) < count]
         spread = {least: [(f * i, f * j, f * k) for i, j, k in near] for least, f in _SPREADS.items() if least <= count}
-        return {0: near, **spread, **{least: ring for least, ring in _RING.items() if least <= count}}
+        ring = {least: ring for least, ring in _RING.items() if rings and least <= count}
+        return {0: near, **spread, **ring}
 
     @torch.no_grad()
-    def _sampled(self, corr: Correspondences, right: Tensor, noise: Noise, fallback: Pose) -> Pose:
+    def _sampled(self, corr: Correspondences, right: Tensor, noise: Noise, fallback: Pose, rings: bool) -> Pose:
         """The best pose of the minimal samples by the score of the likeliest pairs; problems last."""
         batch, count = right.shape
         there = corr.near_weights > 0
@@ -349,7 +354,7 @@ class SetInit(Configured):
             chances, count = functional.pad(chances, (0, MOST_JUDGES)), count + MOST_JUDGES
         likely = chances.topk(min(MOST_JUDGES, count)).indices
         pairs = take_pairs(of_pairs, likely)  # (8, K, B)
-        samples = self.triples(count)
+        samples = self.triples(count, rings=rings)
         drawn = [sample for group in samples.values() for sample in group]
         # (6, 3, S B), stacked, not indexed, so that a compiler copies whole rows.
         three = torch.stack([pairs[:6, k] for column in zip(*drawn, strict=True) for k in column], 1)

@@ -262,7 +262,7 @@ def _robust(judged: Judged, inliers: Tensor) -> Tensor:
 
 
 #: How :func:`search_on` searches unless told otherwise.
-FURTHER = RANSAC(P3P()).plan
+FURTHER = RANSAC(P3P(), min_samples=64).plan
 
 
 def _trusted(confidence: Tensor | None) -> Tensor | None:
