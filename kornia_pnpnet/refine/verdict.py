@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from kornia_pnpnet.core.linalg import solve_symmetric, symmetric
-from kornia_pnpnet.core.performance import exporting, in_order
+from kornia_pnpnet.core.performance import exporting, in_order, present_first
 from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import Projection, normal_equations, span_a_plane
@@ -360,16 +360,19 @@ def chance_of_others(projection: Projection, corr: Correspondences, thresholds: 
     there = corr.weights > 0
     worst = torch.where(judged.weights > 0, judged.errors, 0.0).amax(-1, keepdim=True)
     limit = torch.where(projection.in_front & there, worst * _sq_limits(projection, corr, thresholds), -1.0)
-    count = corr.weights.shape[1]
-    step = 1 if exporting() else -(-count // _MOST_OTHERS)
+    pixels, is_other, counts = corr.img_points, there, there.sum(-1)
+    own = others = torch.arange(corr.weights.shape[1], device=there.device)
+    if not exporting() and len(own) > _MOST_OTHERS:  # evenly spaced among those that are no padding
+        first = own[:_MOST_OTHERS]
+        others = present_first(there).gather(1, first.maximum(first * counts[:, None] // _MOST_OTHERS))
+        pixels, is_other = pixels.gather(1, others[..., None].expand(-1, -1, 2)), there.gather(1, others)
     u, v = (
-        (corr.focal * x)[:, :, None] - y[:, None, ::step]
-        for x, y in zip(projection.plane_points, corr.img_points.unbind(-1), strict=True)
+        (corr.focal * x)[:, :, None] - y[:, None]
+        for x, y in zip(projection.plane_points, pixels.unbind(-1), strict=True)
     )
-    hits = (torch.addcmul(u * u, v, v) <= limit[..., None]) & there[:, None, ::step]
-    own = torch.arange(count, device=there.device)
-    hits = hits & (own[:, None] != own[::step])
-    tested = there.sum(-1) * there[:, ::step].sum(-1) - there[:, ::step].sum(-1)
+    hits = (torch.addcmul(u * u, v, v) <= limit[..., None]) & is_other[:, None]
+    hits = hits & (own[:, None] != others[..., None, :])
+    tested = (counts - 1) * is_other.sum(-1)
     return (hits.sum((1, 2)) - _FEW_HITS).clamp(min=0) / tested.clamp(min=1)
 
 
