@@ -203,6 +203,7 @@ CONTENDERS: dict[str, Callable[..., Contender]] = {
     f"{TRAINED} ONNX": functools.partial(Onnx, TRAINED),
     f"{ANY} ONNX": functools.partial(Onnx, ANY),
     "opencv-ransac": functools.partial(Peer, "opencv-ransac"),
+    "kornia-rs": functools.partial(Peer, "kornia-rs"),
     "poselib": functools.partial(Peer, "poselib"),
     "pycolmap": functools.partial(Peer, "pycolmap"),
     "kornia-dlt": KorniaDLT,

@@ -51,10 +51,10 @@ OURS = (
     "pnpnet-n9",
     "pnpnet-set",
 )
-PEERS = ("opencv-epnp", "opencv-sqpnp", "opencv-ransac", "opencv-usac", "poselib", "pycolmap")
+PEERS = ("opencv-epnp", "opencv-sqpnp", "opencv-ransac", "opencv-usac", "kornia-rs", "poselib", "pycolmap")
 # Solvers of the large problems. The paper's RANSAC is not among them: few samples of 7 pairs are free of outliers, so
 # one call of it would take longer than all others together.
-ROBUST = ("p3p-ransac", "pnpnet-set", "opencv-ransac", "opencv-usac", "poselib", "pycolmap")
+ROBUST = ("p3p-ransac", "pnpnet-set", "opencv-ransac", "opencv-usac", "kornia-rs", "poselib", "pycolmap")
 MEMORY_SET = "n = 100, 70 outliers"
 MEMORY_SOLVER, MEMORY_TARGET, MEMORY_RUNS = "p3p-ransac", 2 * 2**30, 5
 

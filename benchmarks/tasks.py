@@ -86,7 +86,7 @@ def _raise_uncompiled(caught: Sequence[warnings.WarningMessage]) -> None:
             raise CannotBeTimedError(str(warning.message))
 
 
-def compile_or_raise(module: nn.Module, **options: bool) -> None:
+def compile_or_raise(module: nn.Module, **options: bool | str) -> None:
     """Call the module's ``compile``.
 
     Raises:

@@ -87,6 +87,7 @@ def _builders() -> dict[str, Callable[..., nn.Module]]:
         "opencv-sqpnp": partial(_peer, "OpenCVPnP", method="SQPNP"),
         "opencv-ransac": partial(_peer, "OpenCVRansac"),
         "opencv-usac": partial(_peer, "OpenCVUsac"),
+        "kornia-rs": partial(_peer, "KorniaRs"),
         "poselib": partial(_peer, "PoseLib"),
         "pycolmap": partial(_peer, "PyColmap"),
     }

@@ -28,12 +28,7 @@ from kornia_pnpnet.types import Alternatives, Correspondences, Guess, PnPResult,
 
 __all__ = ["PnPNet"]
 
-_INITIALISERS: dict[str, type[nn.Module]] = {
-    "EPnP": EPnP,
-    "MLPInit": MLPInit,
-    "REPPnP": REPPnP,
-    "SetInit": SetInit,
-}
+_INITIALISERS: dict[str, type[nn.Module]] = {x.__name__: x for x in (EPnP, MLPInit, REPPnP, SetInit)}
 
 # Bound of a problem's gradient by normalised coordinates, in which those of a problem that is ok are about 1.
 _LONGEST_GRADIENT = 10.0
@@ -188,11 +183,15 @@ class PnPNet(nn.Module):
         check_whole(0, alternatives=alternatives)
         with in_full_precision(inputs.world_points.device.type):
             always = _checked_gradient(gradient or self.gradient) == "always"
-            compiled = isinstance(self._first, Compiled) or isinstance(self._solve, Compiled)
+            compiled = [x for x in (self._solve, self._first, self._begin) if isinstance(x, Compiled)]
             any_number = not (compiled or isinstance(self.init, MLPInit))
+            single = len(inputs.world_points) == 1 and bool(compiled) and not any(x.failed for x in compiled)
+            if compiled:  # a batch of one, and every layout in memory, would be compiled for by itself
+                inputs = map_tensors(lambda x: torch.cat((x, x)) if single else x.contiguous(), inputs)
             parts = split_batch(inputs, getattr(self.init, "pairs_at_once", None), any_number)
             results = [self._solve(first_stage_only, always, part.inputs, alternatives) for part in parts]
-        return restore_leading(size, joined(parts, results))
+            result = joined(parts, results)
+        return restore_leading(size, map_tensors(lambda x: x[:1], result) if single else result)
 
     def with_guess(
         self,
@@ -244,8 +243,8 @@ class PnPNet(nn.Module):
         """Compile with ``torch.compile``, in place: what is before, in, and after an iteration, each once.
 
         The first call then takes some seconds, less where a cache of ``torch.compile`` is on disk; further calls take a
-        fraction of the uncompiled time. The batch may change its size; a batch of one, another number of pairs, another
-        dtype and calls that record gradients are compiled for when they first come. A part that cannot be compiled,
+        fraction of the uncompiled time. The batch may change its size; another number of pairs, another dtype and calls
+        that record gradients are compiled for when they first come. A part that cannot be compiled,
         because there is no C++ compiler or because it is a RANSAC, runs uncompiled after one warning. Copies and saved
         weights of the solver are not compiled.
 

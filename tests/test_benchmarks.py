@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import importlib
+import itertools
 import json
 import statistics
 import sys
@@ -30,6 +31,7 @@ contenders, harness, latency, others, page, performance, process, settings, benc
         *("startup", "tasks", "throughput"),
     ),
 )
+gpu = importlib.import_module("gpu")
 uncertainty = importlib.import_module("uncertainty")
 uncertain_pnp = importlib.import_module("uncertain_problems").uncertain_pnp
 
@@ -387,6 +389,45 @@ def test_compiled_contenders_start_with_an_empty_and_with_a_filled_cache(monkeyp
     assert (cold["measured"], cached["measured"]) == (5.0, 2.0)
     starts[0]["warnings"] = ["There is no compiler"]
     assert startup.targets(starts, []) == []
+
+
+# -- gpu.py ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_the_measurements_for_a_gpu_run_on_a_cpu(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("cv2")
+    monkeypatch.setattr(gpu, "compile_or_raise", lambda solver, **options: None)  # compiling takes minutes
+    few = gpu.QUICK._replace(modes=("eager", "compiled", "captured"), calls=(2,), pairs=(9,))
+    path = tmp_path / "gpu.json"
+    gpu.main(["--device", "cpu", "--out", str(path)], few)
+    results = json.loads(path.read_text())
+    assert {"pnpnet-n9", "pnpnet-set", "p3p-ransac", "epnp"} <= {row["solver"] for row in results["parity"]}
+    for row in results["parity"]:  # the device is the CPU
+        assert row["same_ok"] == 1.0
+        assert row["same_pose"] in (1.0, None)
+        assert row["same_gradient"] in (1.0, None)
+    (row,) = results["graphs"]
+    assert row["modes"]["compiled"]["rotation_difference"] < 1e-6
+    assert "why" in row["modes"]["captured"]
+    points = [(row["contender"], row["mode"], row["batch"]) for row in results["throughput"]]
+    assert points == list(itertools.product(few.contenders, ("forward", "forward+backward"), few.batches))
+    for row in results["throughput"]:
+        assert row["median_us"] == statistics.median(row["rounds_us"])
+        assert 0 < row["work"]["least_bytes"] < row["work"]["bytes"]
+    assert "µs per problem" in capsys.readouterr().out
+
+
+def test_batches_are_halved_until_they_fit():
+    class Small(tasks.Contender):
+        def task(self, problems, *, backward=False):
+            def call():
+                if len(problems.world_points) > 3:
+                    raise torch.cuda.OutOfMemoryError
+
+            return tasks.Task(call, lambda: problems.pose, problems)
+
+    assert gpu.fitting(Small(), settings.draw(9, 10), backward=False)[1] == 3
 
 
 # -- uncertainty.py ----------------------------------------------------------------------------------------------------

@@ -62,7 +62,7 @@ def test_each_part_is_one_graph_and_the_batch_may_change(name, views, whole, gra
     compiled.compile(whole=whole)
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
-        for count in (7, 5, 64):
+        for count in (7, 5, 64, 1):
             inputs = problems(count)[:3]
             assert_same(compiled(*inputs), eager(*inputs), rtol=1e-6, atol=1e-6)
     assert backend.frame_count == graphs  # before, in and after an iteration
@@ -206,6 +206,19 @@ def test_inductor_computes_the_same(whole):
             grads.append([p.grad for p in net.parameters()])
     for a, b in zip(*grads, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_gradients_of_another_batch_size_are_not_compiled_for_again():
+    """PyTorch 2.13 chooses the code of a sum by the number of its addends, 4096 of them or more."""
+    torch.compiler.reset()
+    refine = RobustWeightedLM(1)
+    solver = PnPNet(None, refine).float()
+    solver.compile()
+    for count in (7, 1000, 1):
+        with torch._dynamo.config.patch(error_on_recompile=count != 7):
+            solver(*problems(count, dtype=torch.float32)[:3]).rotation.sum().backward()
+    assert refine.damping.raw.grad.isfinite().all()
 
 
 @pytest.mark.slow

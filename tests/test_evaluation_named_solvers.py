@@ -54,8 +54,15 @@ def test_default_solvers_suit_their_source():
 
 
 def test_missing_packages_are_named_and_left_out(monkeypatch):
-    needed = {"opencv-usac": "OpenCV", "poselib": "PoseLib", "pycolmap": "pycolmap", "p3p-ransac": None, "epnp": None}
+    needed = {
+        "opencv-usac": "OpenCV",
+        "poselib": "PoseLib",
+        "pycolmap": "pycolmap",
+        "kornia-rs": "kornia-rs",
+        "p3p-ransac": None,
+        "epnp": None,
+    }
     assert {name: missing_package(name) for name in needed} == dict.fromkeys(needed)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert {name: missing_package(name) for name in needed} == needed
-    assert not any(name.startswith(("opencv", "poselib", "pycolmap")) for name in default_solvers(9))
+    assert not any(name.startswith(("opencv", "kornia-rs", "poselib", "pycolmap")) for name in default_solvers(9))

@@ -39,6 +39,7 @@ LAYERS = (
 EXTRAS = (
     "cv2",
     "hydra",
+    "kornia_rs",
     "lightning_fabric",
     "matplotlib",
     "omegaconf",
@@ -58,6 +59,7 @@ OWNERS = {
     "seaborn": {"evaluation.figures"},
     "hydra": set(),
     "cv2": {"peers"},
+    "kornia_rs": {"peers"},
     "pycolmap": {"data.colmap", "peers"},
     "poselib": {"peers"},
     "pyarrow": {"cli.shards"},

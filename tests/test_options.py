@@ -29,7 +29,7 @@ from kornia_pnpnet.data import (
     VaryingSize,
 )
 from kornia_pnpnet.init import P3P, RANSAC, EPnP, REPPnP, SubsetSolver
-from kornia_pnpnet.peers import OpenCVPnP, OpenCVRansac, OpenCVUsac, PeerSolver, PoseLib, PyColmap
+from kornia_pnpnet.peers import KorniaRs, OpenCVPnP, OpenCVRansac, OpenCVUsac, PeerSolver, PoseLib, PyColmap
 from kornia_pnpnet.refine import BoundedParameter
 
 PROBLEMS = SyntheticProblems(n=12, batch_size=3, seed=0).batch(0)
@@ -121,6 +121,7 @@ PARTS = {
     "OpenCVPnP": (OpenCVPnP, chosen(words="method")),
     "OpenCVRansac": (OpenCVRansac, chosen(**SAMPLING, flags="refine")),
     "OpenCVUsac": (OpenCVUsac, chosen(**SAMPLING)),
+    "KorniaRs": (KorniaRs, chosen("max_iterations seed", "threshold confidence", words="method")),
     "PoseLib": (PoseLib, chosen("min_iterations max_iterations", "threshold confidence")),
     "PyColmap": (PyColmap, chosen("min_iterations max_iterations", "threshold loss_scale")),
 }
@@ -210,6 +211,7 @@ REFUSED = [
     (OpenCVPnP, {"method": "NOPE"}),
     (OpenCVUsac, {"method": "USAC_FM_8PTS"}),
     (OpenCVUsac, {"method": "SOLVEPNP_EPNP"}),
+    (KorniaRs, {"threshold": math.inf, "max_iterations": 0, "method": "P3P"}),
     (PoseLib, {"threshold": -1.0, "min_iterations": 0}),
     (PyColmap, {"loss_scale": 0.0, "max_iterations": 50}),
     (OutlierMix, {"max_ratio": 1.5, "count": -1, "min_count": -1, "mismatch_share": 2.0}),

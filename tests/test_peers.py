@@ -13,7 +13,7 @@ from kornia.core.exceptions import BaseError
 from kornia_pnpnet import create_solver, pose_errors, success, success_rate
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
-from kornia_pnpnet.peers import OpenCVPnP, OpenCVRansac, OpenCVUsac, PeerPose, PeerSolver, PoseLib, PyColmap
+from kornia_pnpnet.peers import KorniaRs, OpenCVPnP, OpenCVRansac, OpenCVUsac, PeerPose, PeerSolver, PoseLib, PyColmap
 from kornia_pnpnet.types import PnPResult, Problems
 
 pytest.importorskip("cv2")
@@ -24,6 +24,7 @@ PEERS = {
     "opencv-epnp": (partial(OpenCVPnP, method="EPNP"), "cv2"),
     "opencv-ransac": (OpenCVRansac, "cv2"),
     "opencv-usac": (OpenCVUsac, "cv2"),
+    "kornia-rs": (KorniaRs, "kornia_rs.k3d"),
     "poselib": (PoseLib, "poselib"),
     "pycolmap": (PyColmap, "pycolmap"),
 }
@@ -96,6 +97,7 @@ def test_cost_is_the_mean_squared_error_truncated_at_the_threshold(name, make_pr
         ("opencv-epnp", (0.828, 0.205, 0.0)),
         ("opencv-ransac", (0.848, 0.775, 0.674)),
         ("opencv-usac", (0.894, 0.820, 0.701)),
+        ("kornia-rs", (0.808, 0.727, 0.627)),
         ("poselib", (0.852, 0.778, 0.677)),
         ("pycolmap", (0.851, 0.776, 0.675)),
     ],
@@ -191,6 +193,7 @@ def test_too_few_pairs_and_bad_weights_fail_without_an_error(make_problems):
         ("opencv-ransac", {"seed": 3, "iterations": 20, "method": "SQPNP"}),
         ("opencv-usac", {}),
         ("opencv-usac", {"method": "USAC_MAGSAC"}),
+        ("kornia-rs", {"max_iterations": 20}),
         ("poselib", {"min_iterations": 5, "max_iterations": 20}),
         ("pycolmap", {"min_iterations": 5, "max_iterations": 20}),
     ],
@@ -210,6 +213,8 @@ FEW = {"min_iterations": 2, "max_iterations": 4}
 @pytest.mark.parametrize(
     ("name", "one", "other"),
     [
+        ("kornia-rs", {"seed": 0, "max_iterations": 4}, {"seed": 1, "max_iterations": 4}),
+        ("kornia-rs", {"method": "AP3P", "max_iterations": 4}, {"method": "EPnP", "max_iterations": 4}),
         ("poselib", {"seed": 0, **FEW}, {"seed": 1, **FEW}),
         ("pycolmap", {"seed": 0, **FEW}, {"seed": 1, **FEW}),
         ("pycolmap", {"loss_scale": 0.1}, {"loss_scale": 100.0}),
@@ -248,7 +253,7 @@ def test_other_methods_by_name(make_problems):
         assert pose_errors(solve(solver, problems).pose, problems.pose).rotation_error_deg.max() < 1e-3
 
 
-@pytest.mark.parametrize("name", ["opencv-sqpnp", "poselib", "pycolmap"])
+@pytest.mark.parametrize("name", ["opencv-sqpnp", "kornia-rs", "poselib", "pycolmap"])
 def test_without_the_library_the_error_names_the_extra(name, monkeypatch):
     factory, module = PEERS[name]
     monkeypatch.setitem(sys.modules, module, None)

@@ -281,7 +281,9 @@ def test_solvers_of_any_name_and_options():
 
 @pytest.mark.filterwarnings("ignore:There is a performance drop:UserWarning")
 @pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")  # PyTorch's own use of it in forward mode
-@pytest.mark.parametrize("name", [x for x in list_solvers() if not x.startswith(("opencv", "poselib", "pycolmap"))])
+@pytest.mark.parametrize(
+    "name", [x for x in list_solvers() if not x.startswith(("opencv", "kornia-rs", "poselib", "pycolmap"))]
+)
 def test_transforms_of_every_solver_of_ours(name):
     """First derivatives against ``backward``, second against central differences of it, ``vmap`` against a loop.
 

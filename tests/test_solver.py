@@ -504,7 +504,7 @@ def test_a_pose_that_is_not_ok_carries_a_gradient_on_request(name, make_problems
         solver(*p[:3], gradient="never")
 
 
-@pytest.mark.parametrize("name", ["pnpnet-set", "p3p-ransac", "opencv-ransac", "poselib", "pycolmap"])
+@pytest.mark.parametrize("name", ["pnpnet-set", "p3p-ransac", "opencv-ransac", "kornia-rs", "poselib", "pycolmap"])
 def test_any_leading_dimensions(name, make_problems):
     p = make_problems(9, 6)
     try:
@@ -694,7 +694,9 @@ def test_the_first_iterations_of_trained_weights(make_problems):
         assert_same(solver.refine(corr, guess).pose, whole.refine(corr, guess, m=m).pose)
 
 
-@pytest.mark.parametrize("name", [name for name in list_solvers() if not name.startswith(("opencv", "poselib", "pyc"))])
+@pytest.mark.parametrize(
+    "name", [name for name in list_solvers() if not name.startswith(("opencv", "kornia-rs", "poselib", "pyc"))]
+)
 def test_every_solver_of_ours_keeps_the_contract(name, make_problems):
     """Shapes, dtype, and the same result for a problem alone, in any order of the pairs and with padding."""
     n = int(found[1]) if (found := re.search(r"net-n(\d+)", name)) else 9

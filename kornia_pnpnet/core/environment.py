@@ -28,7 +28,7 @@ def environment() -> dict[str, Any]:
     names = ("kornia_pnpnet", "torch", "kornia", "numpy")
     versions = {name: _version(name) for name in names}
     versions["opencv"] = next(filter(None, map(_version, _OPENCV)), None)
-    versions |= {name: _version(name) for name in ("poselib", "pycolmap")}
+    versions |= {name: _version(name) for name in ("kornia_rs", "poselib", "pycolmap")}
     return {
         "versions": versions,
         "python": platform.python_version(),

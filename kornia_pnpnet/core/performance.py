@@ -26,6 +26,7 @@ __all__ = [
     "in_order",
     "keep_freed_memory",
     "package_options",
+    "per_problem",
     "present_first",
     "problems_last",
     "ranked",
@@ -352,6 +353,9 @@ class Compiled(Generic[_P, _T]):
             batch.
         mode: mode of ``torch.compile``.
 
+    Attributes:
+        failed: whether compilation has failed.
+
     Example:
         >>> double = Compiled(lambda x: 2 * x)
         >>> double.function(torch.ones(2))
@@ -369,7 +373,7 @@ class Compiled(Generic[_P, _T]):
             for more in (options, {**options, "pick_loop_orders": False})
         )
         self._compiled = {False: few, True: many}
-        self._failed = False
+        self.failed = False
         self._seen: set[tuple[torch.Size, torch.dtype, int, bool]] = set()
 
     def __reduce__(self) -> tuple[type[Compiled[_P, _T]], tuple[Callable[_P, _T], str | None]]:
@@ -378,7 +382,7 @@ class Compiled(Generic[_P, _T]):
 
     def __call__(self, *args: _P.args, **kwargs: _P.kwargs) -> _T:
         """Call the function."""
-        if self._failed or compiling():
+        if self.failed or compiling():
             return self.function(*args, **kwargs)
         tensors = list(iter_tensors(args))
         first = tensors[0]
@@ -399,10 +403,21 @@ class Compiled(Generic[_P, _T]):
             return result
         except errors as error:
             result = self.function(*args, **kwargs)  # a mistake of the caller raises here as it would anywhere
-            self._failed = True
+            self.failed = True
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             warnings.warn(f"Not compiled, running uncompiled. {reason[:300]}", RuntimeWarning, stacklevel=3)
             return result
+
+
+def per_problem(scalar: Tensor, like: Tensor) -> Tensor:
+    """Expand a scalar to the shape of ``like`` in compiled code; elsewhere, and with a batch, it stays as it is.
+
+    The gradient of the scalar is then summed in float64. Code for a sum in float32 is compiled anew when the number of
+    addends, which grows with the batch, crosses a limit of the CPU compiler of PyTorch 2.13.
+    """
+    if scalar.ndim or not compiling() or exporting() or like.device.type != "cpu":
+        return scalar
+    return scalar.double().expand(like.shape).to(like.dtype)
 
 
 def _is_worth_checking(guards: Sequence[Any]) -> list[bool]:

@@ -39,6 +39,7 @@ _COMPETITORS = (
     "opencv-epnp",
     "opencv-ransac",
     "opencv-usac",
+    "kornia-rs",
     "poselib",
     "pycolmap",
 )
@@ -53,7 +54,12 @@ _SCENE_OPTIONS = dict.fromkeys(
 # percentage point. The other solvers' defaults already suit these data.
 _PRIOR_OPTIONS = dict.fromkeys(("ransac-epnp-lm", "p3p-ransac"), "threshold=5,world_threshold=0.25")
 # Optional packages, by the prefix of the solvers that need them: the module and the package's name.
-_PACKAGES = {"opencv-": ("cv2", "OpenCV"), "poselib": ("poselib", "PoseLib"), "pycolmap": ("pycolmap", "pycolmap")}
+_PACKAGES = {
+    "opencv-": ("cv2", "OpenCV"),
+    "kornia-rs": ("kornia_rs", "kornia-rs"),
+    "poselib": ("poselib", "PoseLib"),
+    "pycolmap": ("pycolmap", "pycolmap"),
+}
 
 
 def load_solver(spec: str) -> nn.Module:

@@ -4,8 +4,9 @@ A library is imported when one of its solvers is made.
 """
 
 from kornia_pnpnet.peers.base import PeerPose, PeerSolver
+from kornia_pnpnet.peers.kornia_rs import KorniaRs
 from kornia_pnpnet.peers.opencv import OpenCVPnP, OpenCVRansac, OpenCVUsac
 from kornia_pnpnet.peers.poselib import PoseLib
 from kornia_pnpnet.peers.pycolmap import PyColmap
 
-__all__ = ["OpenCVPnP", "OpenCVRansac", "OpenCVUsac", "PeerPose", "PeerSolver", "PoseLib", "PyColmap"]
+__all__ = ["KorniaRs", "OpenCVPnP", "OpenCVRansac", "OpenCVUsac", "PeerPose", "PeerSolver", "PoseLib", "PyColmap"]

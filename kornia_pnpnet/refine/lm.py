@@ -16,7 +16,7 @@ from torch import Tensor
 from kornia_pnpnet.core.checks import check_whole
 from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.linalg import relative
-from kornia_pnpnet.core.performance import Compiled, problems_last, repeat_problems
+from kornia_pnpnet.core.performance import Compiled, per_problem, problems_last, repeat_problems
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import NormalEquations, Projection, move, project
 from kornia_pnpnet.refine.kernels import KERNELS, RobustKernel
@@ -320,7 +320,7 @@ class RobustWeightedLM(Configured):
         Returns:
             See :meth:`forward`.
         """
-        projection, shape = project(end.pose, start.corr), start.shape[-1]
+        projection, shape = project(end.pose, start.corr), per_problem(start.shape[-1], start.prior[:, :1])
         pairs = start.corr._replace(weights=start.by_residual.weights)
         sq_residual, noise = corrected_residuals(projection, pairs, self.kernel.weight, shape, start.outlier_area)
         weights = torch.where(projection.in_front, start.prior * self.kernel.weight(sq_residual, shape), 0.0)

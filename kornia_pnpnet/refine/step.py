@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from kornia_pnpnet.core.linalg import factorise, relative, substitute
+from kornia_pnpnet.core.performance import per_problem
 from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import (
@@ -101,14 +102,15 @@ def iterate(
         step: :math:`\gamma`, a scalar.
         damping: :math:`\lambda`, a scalar or :math:`(B,)`.
         shape: shape of the kernel, a scalar.
-        outlier_area: where the noise is an estimate that the residuals may correct, see
-            :class:`~kornia_pnpnet.refine.stages.LMStart`, :math:`(B, 1)`; ``None``: for no problem.
+        outlier_area: see :class:`~kornia_pnpnet.refine.stages.LMStart`, :math:`(B, 1)`; ``None``: for no problem.
         kernel_weight: the robust kernel's weight.
         additive: update the rotation vector additively, as in the paper.
 
     Returns:
         The moved pose and whether the equations could be solved.
     """
+    step, damping = (per_problem(x, pairs.weights[:, 0]) for x in (step, damping))
+    shape = per_problem(shape, pairs.weights[:, :1])
     projection = project(pose, pairs)
     weights = _weights(projection, pairs, kernel_weight, shape, outlier_area)
     return lm_step(pairs, pose, projection, weights, step, damping, additive=additive, prior=pairs.prior)

@@ -51,7 +51,7 @@ _LOOKS = {
     "p3p-ransac": (ORANGE, "P", "-"), "p3p-ransac-noise": (ORANGE, "D", "--"), "identity-lm": (BROWN, "X", "-."),
     "opencv-epnp": ("k", "<", ":"), "opencv-sqpnp": ("k", "<", "-."), "opencv-ransac": ("k", ">", "-"),
     "opencv-ransac-sqpnp": ("k", "*", "-."), "opencv-usac": ("k", ">", "--"), "opencv": ("k", "*", ":"),
-    "poselib": (GREY, "p", "-"), "pycolmap": (GREY, "h", "--"),
+    "kornia-rs": (GREY, "X", ":"), "poselib": (GREY, "p", "-"), "pycolmap": (GREY, "h", "--"),
     "": ("", "", ""),  # all other solvers
     "known-inliers": ("k", "", "-."), "known-inliers-and-noise": ("k", "", ":"),
 }

@@ -1,0 +1,432 @@
+"""Our solvers on a GPU: ``python benchmarks/gpu.py`` writes ``gpu.json``.
+
+README.md beside this file describes the measurements.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import itertools
+import math
+import operator
+import re
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from contenders import OURS
+from harness import HERE, in_turns, load, say, summary
+from settings import N, draw
+from tasks import (
+    CannotBeTimedError,
+    Contender,
+    Task,
+    compile_or_raise,
+    first,
+    float_inputs,
+    gradient,
+    leaves_of,
+    waiting,
+    without_gradient,
+)
+from throughput import BACKWARD, FORWARD
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils.flop_counter import flop_registry
+
+from kornia_pnpnet import PnPNet, create_solver, list_solvers
+from kornia_pnpnet.core.environment import environment
+from kornia_pnpnet.core.tables import markdown_table
+from kornia_pnpnet.core.trees import iter_tensors, map_tensors
+from kornia_pnpnet.evaluation.results import save_results
+from kornia_pnpnet.types import PnPResult, Problems
+
+#: Largest difference of a pose that counts as the same, in radians, and of a gradient, relative to its length.
+LIMITS = {torch.float32: 1e-3, torch.float64: 1e-6}
+_DRAWN = 10_000  # problems; larger batches repeat them
+
+
+class Amount(NamedTuple):
+    """How much is measured.
+
+    Attributes:
+        parity: problems of each solver that both devices solve.
+        graphs: solvers of the comparison of modes.
+        modes: keys of ``MODES``, the first of them is what the others are compared with.
+        calls: batch sizes of that comparison.
+        contenders: names of throughput, from ``contenders.OURS``.
+        batches: batch sizes of throughput.
+        pairs: numbers of pairs of throughput.
+        rounds: calls that are timed.
+        copied: entries of the copy that measures the bandwidth, float32.
+        side: rows of the matrices that measure the rate of arithmetic.
+    """
+
+    parity: int = 1000
+    graphs: tuple[str, ...] = ("pnpnet-n9", "pnpnet-set")
+    modes: tuple[str, ...] = ("eager", "compiled", "reduce-overhead", "captured")
+    calls: tuple[int, ...] = (1, 100, 1000)
+    contenders: tuple[str, ...] = (
+        "pnpnet-n9",
+        "pnpnet-n9 compiled",
+        "pnpnet-set",
+        "pnpnet-set compiled",
+        "epnp-lm",
+        "p3p-ransac",
+    )
+    batches: tuple[int, ...] = (1000, 10_000, 100_000, 1_000_000)
+    pairs: tuple[int, ...] = (9, 50)
+    rounds: int = 5
+    copied: int = 2**28
+    side: int = 8192
+
+
+FULL = Amount()
+#: A few small problems without compiling: does everything run?
+QUICK = Amount(4, ("pnpnet-n9",), ("eager",), (1, 4), ("pnpnet-n9", "epnp-lm"), (4, 8), (9, 12), 3, 2**16, 64)
+
+
+# -- parity ------------------------------------------------------------------------------------------------------------
+
+
+def parity(device: str, count: int) -> Iterator[dict[str, Any]]:
+    """Solve the same problems on the CPU and on the device, with gradients, by every solver of ours.
+
+    Yields:
+        For each solver and dtype ``same_ok``, the share of problems of the same ``ok``, and of those that are ``ok`` on
+        both devices ``same_pose`` and ``same_gradient``, the shares within ``limit``.
+    """
+    for name in list_solvers():
+        try:
+            solver = create_solver(name)
+        except ImportError:  # a solver of another library
+            continue
+        if not isinstance(solver, PnPNet):
+            continue
+        say(f"parity: {name}")
+        found = re.search(r"-n(\d+)", name)
+        problems = draw(int(found[1]) if found else N, count)
+        for dtype, limit in LIMITS.items():
+            (mine, slope), (other, other_slope) = (_solved(solver, problems, place, dtype) for place in ("cpu", device))
+            both = mine.ok & other.ok
+            turned = rotation_difference(mine.rotation, other.rotation)
+            length = torch.maximum(slope.norm(dim=1), other_slope.norm(dim=1)).clamp(min=torch.finfo(dtype).tiny)
+            change = (slope - other_slope).norm(dim=1) / length
+            yield {
+                "solver": name,
+                "dtype": str(dtype).removeprefix("torch."),
+                "limit": limit,
+                "count": count,
+                "both_ok": int(both.sum()),
+                "same_ok": share(mine.ok == other.ok),
+                "same_pose": share(turned[both] <= limit),
+                "same_gradient": share(change[both] <= limit),
+            }
+
+
+def _solved(solver: PnPNet, problems: Problems, device: str, dtype: torch.dtype) -> tuple[PnPResult, Tensor]:
+    """Result and gradient of the poses to points and pixels, (B, 5 N), both on the CPU."""
+    inputs = problems.world_points, problems.img_points, problems.intrinsics
+    world, img, intrinsics = (x.to(device, dtype) for x in inputs)
+    leaves = leaves_of(world, img)
+    result = solver.to(device, dtype)(*leaves, intrinsics)
+    parts = gradient(result.pose, leaves) if result.rotation.requires_grad else (None, None)
+    filled = [torch.zeros_like(leaf) if part is None else part for part, leaf in zip(parts, leaves, strict=True)]
+    on_cpu = result._replace(rotation=result.rotation.detach().cpu(), ok=result.ok.cpu())
+    return on_cpu, torch.cat([x.flatten(1) for x in filled], 1).cpu()
+
+
+def rotation_difference(one: Tensor, other: Tensor) -> Tensor:
+    """Angles between rotations, radians, shape (B,). Exact to the first order, also where the angle is tiny."""
+    return (one - other).flatten(1).norm(dim=1) / math.sqrt(2.0)
+
+
+def share(picked: Tensor) -> float | None:
+    """Share of the entries that are true, ``None`` without entries."""
+    return float(picked.double().mean()) if len(picked) else None
+
+
+# -- CUDA graphs -------------------------------------------------------------------------------------------------------
+
+#: By mode the options of ``solver.compile``; ``None``: not compiled.
+MODES: dict[str, dict[str, str] | None] = {
+    "eager": None,
+    "compiled": {},
+    "reduce-overhead": {"mode": "reduce-overhead"},
+    "captured": None,
+}
+
+
+def solving(mode: str, solver: PnPNet, inputs: Sequence[Tensor]) -> Callable[[], PnPResult]:
+    """The call of a solver in a mode.
+
+    Raises:
+        CannotBeTimedError: when the solver does not compile.
+        RuntimeError: when the call cannot be captured, for example because it waits for the device.
+    """
+    options = MODES[mode]
+    if options is not None:
+        compile_or_raise(solver, **options)
+    call = without_gradient(lambda: solver(*inputs))
+    return captured(call) if mode == "captured" else call
+
+
+def captured(call: Callable[[], PnPResult]) -> Callable[[], PnPResult]:
+    """The call as one CUDA graph, which is captured now and replayed by each call into the same result."""
+    stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        for _ in range(3):  # allocations and handles of libraries must not come into the graph
+            call()
+    torch.cuda.current_stream().wait_stream(stream)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        result = call()
+
+    def replay() -> PnPResult:
+        graph.replay()
+        return result
+
+    return replay
+
+
+def graphs(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
+    """Time a call of each mode, of solvers with a fixed effort.
+
+    Yields:
+        For each solver and batch ``modes``: by mode the times of a call, ``rotation_difference``, the largest angle to
+        the pose of the first mode, and ``same_ok``; or ``why`` the mode is missing.
+    """
+    for name, batch in itertools.product(amount.graphs, amount.calls):
+        torch.compiler.reset()
+        problems = draw(N, batch)
+        inputs = float_inputs(problems, device)
+        tasks: dict[str, Task] = {}
+        modes: dict[str, dict[str, Any]] = {}
+        expected = None
+        for mode in amount.modes:
+            say(f"graphs: {name}, B = {batch}, {mode}")
+            solver = create_solver(name, effort="fixed").to(device, torch.float32)
+            try:
+                call = solving(mode, solver, inputs)  # type: ignore[arg-type]
+                task = _task(call, problems, device)
+                task.warm()
+                result = call()
+            except (CannotBeTimedError, RuntimeError) as error:
+                modes[mode] = {"why": " ".join(str(error).split())[:300]}
+                continue
+            tasks[mode] = task
+            found = result.rotation.clone(), result.ok.clone()  # the next replay overwrites its result
+            expected = found if expected is None else expected
+            difference = rotation_difference(found[0], expected[0])
+            modes[mode] = {"rotation_difference": float(difference.max()), "same_ok": share(found[1] == expected[1])}
+        timers = {mode: functools.partial(_microseconds, task) for mode, task in tasks.items()}
+        for mode, rounds_us in in_turns(timers, amount.rounds).items():
+            modes[mode] |= summary(rounds_us)
+        yield {"solver": name, "batch": batch, "modes": modes}
+
+
+def _microseconds(task: Task) -> float:
+    return 1e6 * task.seconds(10)
+
+
+# -- throughput and floors ---------------------------------------------------------------------------------------------
+
+
+class Work(TorchDispatchMode):
+    """Count the bytes that operations read and write, and floating point operations.
+
+    Views are free. Each operation reads its arguments and writes its results, as without a compiler. Products of
+    matrices count as in PyTorch's own counter, every other operation once for each entry of its results.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]
+        self.bytes = self.flops = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Run an operation and count."""
+        kwargs = kwargs or {}
+        result = func(*args, **kwargs)
+        if not func.is_view:
+            written = list(iter_tensors(result))
+            product = flop_registry.get(func.overloadpacket)
+            self.flops += product(*args, **kwargs, out_val=result) if product else sum(x.numel() for x in written)
+            self.bytes += size_bytes((args, *kwargs.values(), written))
+        return result
+
+
+def size_bytes(tree: object) -> int:
+    """Bytes of the tensors of nested tuples."""
+    return sum(x.numel() * x.element_size() for x in iter_tensors(tree))
+
+
+def machine_rates(device: str, amount: Amount) -> dict[str, float]:
+    """Bytes per second of a copy, read and written, and operations per second of a product of float32 matrices."""
+    source = torch.zeros(amount.copied, device=device)
+    target, matrix = torch.empty_like(source), torch.ones(amount.side, amount.side, device=device)
+    problems = draw(N, 1)  # a task has problems; these are not solved
+
+    def quickest(call: Callable[[], object]) -> float:
+        task = _task(call, problems, device)
+        return min(task.seconds() for _ in range(10))
+
+    copy, product = quickest(lambda: target.copy_(source)), quickest(lambda: matrix @ matrix)
+    return {"bytes_per_s": 2 * size_bytes(source) / copy, "flops_per_s": 2 * amount.side**3 / product}
+
+
+def _task(call: Callable[[], object], problems: Problems, device: str) -> Task:
+    """A task whose poses nobody asks for."""
+    return Task(call, lambda: problems.pose, problems, waiting(device))
+
+
+def in_chunks(contender: Contender, problems: Problems, size: int, *, backward: bool) -> Task:
+    """A task that solves the problems ``size`` at a time."""
+    count = len(problems.world_points)
+    tasks = [
+        contender.task(problems.map(operator.itemgetter(slice(start, start + size))), backward=backward)
+        for start in range(0, count, size)
+    ]
+
+    def call() -> None:
+        for task in tasks:
+            task.call()  # its result is freed before the next chunk
+
+    return Task(call, tasks[0].poses, problems, tasks[0].finish)
+
+
+def fitting(contender: Contender, problems: Problems, *, backward: bool) -> tuple[Task, int]:
+    """A warm task and its chunk, the first of B, B/2, B/4, ... that fits the memory."""
+    size = len(problems.world_points)
+    while True:
+        try:
+            task = in_chunks(contender, problems, size, backward=backward)
+            task.warm()
+            return task, size
+        except torch.cuda.OutOfMemoryError:
+            size = math.ceil(size / 2)
+        torch.cuda.empty_cache()
+
+
+def work(contender: Contender, problems: Problems, *, backward: bool) -> dict[str, float]:
+    """Count what a call that is not compiled does for a problem.
+
+    Returns:
+        ``least_bytes`` of inputs, pose and gradients; ``bytes`` and ``flops`` of :class:`Work`.
+    """
+    task = contender.task(problems, backward=backward)
+    with Work() as counted:
+        task.call()
+    points, pixels, pose = problems.world_points, problems.img_points, problems.pose
+    moved = [*(2 if backward else 1) * [points, pixels], problems.intrinsics, *pose]
+    count = len(points)
+    return {
+        "least_bytes": sum(4 * x.numel() for x in moved) / count,  # float32
+        "bytes": counted.bytes / count,
+        "flops": counted.flops / count,
+    }
+
+
+def measure_throughput(device: str, amount: Amount, rates: dict[str, float]) -> Iterator[dict[str, Any]]:
+    """Time per problem, peak memory, and how far from the floors of the machine.
+
+    Yields:
+        For each contender and point the times of a problem; ``chunk``; ``peak_bytes`` of a call beyond what was
+        allocated before, ``None`` on a CPU; ``work`` of a problem; ``shares`` of the median time: ``floor``, the least
+        possible time (the larger of the times of ``least_bytes`` and ``flops``), and ``traffic``, the time of
+        ``bytes``, above 1 where a compiler has fused operations.
+    """
+    for n, name in itertools.product(amount.pairs, amount.contenders):
+        torch.compiler.reset()
+        contender, plain = (OURS[x](device=device) for x in (name, name.removesuffix(" compiled")))
+        if not contender.takes(n):
+            continue
+        drawn = draw(n, min(_DRAWN, max(amount.batches)))
+        for mode, batch in itertools.product((FORWARD, BACKWARD), amount.batches):
+            say(f"throughput: {name}, n = {n}, B = {batch}, {mode}")
+            place = {"contender": name, "mode": mode, "n": n, "batch": batch}
+            repeats = range(math.ceil(batch / len(drawn.world_points)))
+            problems = first(map_tensors(lambda *x: torch.cat(x), *(drawn for _ in repeats)), batch)
+            try:
+                task, chunk = fitting(contender, problems, backward=mode == BACKWARD)
+            except CannotBeTimedError as error:
+                yield {**place, "why": str(error)}
+                continue
+            each = work(plain, first(problems, 1000), backward=mode == BACKWARD)
+            peak = peak_bytes(task, device)
+            found = summary([1e6 * task.seconds() / batch for _ in range(amount.rounds)])
+            floor_s = max(each["least_bytes"] / rates["bytes_per_s"], each["flops"] / rates["flops_per_s"])
+            traffic_s = each["bytes"] / rates["bytes_per_s"]
+            shares = {key: 1e6 * x / found["median_us"] for key, x in (("floor", floor_s), ("traffic", traffic_s))}
+            yield {**place, "chunk": chunk, "peak_bytes": peak, "work": each, "shares": shares, **found}
+
+
+def peak_bytes(task: Task, device: str) -> int | None:
+    """Most bytes that PyTorch allocates on the GPU during a call, beyond those before it."""
+    if task.finish is None:
+        return None
+    torch.cuda.reset_peak_memory_stats(device)
+    before = torch.cuda.memory_allocated(device)
+    task.seconds()
+    return torch.cuda.max_memory_allocated(device) - before
+
+
+# -- the command -------------------------------------------------------------------------------------------------------
+
+
+def tables(results: dict[str, Any]) -> str:
+    """The results as text."""
+
+    def cells(*values: object) -> list[str]:
+        return ["–" if x is None else f"{x:.3g}" if isinstance(x, float) else str(x) for x in values]
+
+    found = [
+        cells(x["solver"], x["dtype"], x["same_ok"], x["same_pose"], x["same_gradient"]) for x in results["parity"]
+    ]
+    calls = [
+        cells(row["solver"], row["batch"], mode, x.get("median_us"), x.get("rotation_difference"))
+        for row in results["graphs"]
+        for mode, x in row["modes"].items()
+    ]
+    times = [
+        cells(x["contender"], x["mode"], x["n"], x["batch"], x["median_us"], x["peak_bytes"], *x["shares"].values())
+        for x in results["throughput"]
+        if "why" not in x
+    ]
+    return "\n\n".join(
+        (
+            markdown_table(["against the CPU", "dtype", "same ok", "same pose", "same gradient"], found, pad=True),
+            markdown_table(["solver", "B", "mode", "µs per call", "difference"], calls, pad=True),
+            markdown_table(
+                ["solver", "mode", "n", "B", "µs per problem", "peak bytes", "floor", "traffic"], times, pad=True
+            ),
+        )
+    )
+
+
+def main(arguments: Sequence[str] | None = None, amount: Amount | None = None) -> None:
+    """Measure, write the file and print tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--device", default="cuda", help="cuda, or cpu to try the script")
+    parser.add_argument("--quick", action="store_true", help="a few small problems: does everything run?")
+    parser.add_argument("--out", type=Path, default=HERE / "gpu.json", help="the results file")
+    options = parser.parse_args(arguments)
+    amount = amount or (QUICK if options.quick else FULL)
+    before = load()
+    rates = machine_rates(options.device, amount)
+    results = {
+        "environment": environment(),
+        "settings": {"device": options.device, **amount._asdict()},
+        "rates": rates,
+        "parity": list(parity(options.device, amount.parity)),
+        "graphs": list(graphs(options.device, amount)),
+        "throughput": list(measure_throughput(options.device, amount, rates)),
+    }
+    save_results({**results, "load_average": [before, load()]}, options.out)
+    print(tables(results))
+
+
+if __name__ == "__main__":
+    main()
