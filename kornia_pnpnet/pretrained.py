@@ -5,17 +5,21 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
-from kornia.core.exceptions import ValueCheckError
-from torch import Tensor
+from kornia.core.exceptions import BaseError, ValueCheckError
+from torch import Tensor, nn
 
 from kornia_pnpnet.core.files import atomic_open, digest
+from kornia_pnpnet.init import EPnP, MLPInit, REPPnP, SetInit
+from kornia_pnpnet.normalize import Normalize
+from kornia_pnpnet.refine import RobustWeightedLM
 
 __all__ = [
     "CONFIG_NAME",
     "WEIGHTS_FOLDER",
     "WEIGHTS_NAME",
+    "PretrainedMixin",
     "find_weights",
     "read_weights",
     "shipped_weights",
@@ -145,3 +149,80 @@ def find_weights(name_or_folder: str | Path) -> Path:
     except (HfHubHTTPError, OSError, ValueError) as error:
         raise FileNotFoundError(f"{message}; the Hub said: {error}") from error
     return Path(config).parent
+
+
+_INITIALISERS: dict[str, type[nn.Module]] = {x.__name__: x for x in (EPnP, MLPInit, REPPnP, SetInit)}
+
+
+class PretrainedMixin(nn.Module):
+    """A solver as plain data and files, and back: a part of :class:`~kornia_pnpnet.PnPNet`."""
+
+    init: nn.Module | None
+    refine: RobustWeightedLM
+    normalize: Normalize
+    views: int
+
+    def config(self) -> dict[str, Any]:
+        """The constructor arguments of all parts, as plain data."""
+        arguments = getattr(self.init, "config", {})
+        init = None if self.init is None else {"name": type(self.init).__name__, **arguments}
+        parts = {"init": init, "refine": self.refine.config, "normalize": self.normalize.config}
+        return {**parts, "views": self.views}
+
+    @classmethod
+    def from_config(cls, config: dict[str, Any]) -> Self:
+        """Build an untrained solver from what :meth:`config` returned.
+
+        Raises:
+            ValueCheckError: when a part or an argument is unknown.
+        """
+        try:
+            if set(config) != {"init", "refine", "normalize", "views"}:
+                raise KeyError(f"parts {sorted(config)}")
+            init_config = config["init"]
+            init = None
+            if init_config is not None:
+                arguments = {key: value for key, value in init_config.items() if key != "name"}
+                init = _INITIALISERS[init_config["name"]](**arguments)
+            parts = init, RobustWeightedLM(**config["refine"]), Normalize(**config["normalize"])
+            return cls(*parts, views=config["views"])
+        except (BaseError, KeyError, TypeError, AttributeError) as error:
+            raise ValueCheckError(f"Not a configuration of PnPNet: {error!r}.") from error
+
+    def save_pretrained(self, folder: str | Path) -> None:
+        """Write ``config.json`` and ``model.safetensors``.
+
+        Args:
+            folder: destination; created when missing.
+
+        Raises:
+            ValueCheckError: when the initialiser is not one of the package's.
+        """
+        config = self.config()
+        if self.init is not None and config["init"]["name"] not in _INITIALISERS:
+            raise ValueCheckError(f"{config['init']['name']} cannot be saved, only {sorted(_INITIALISERS)} can.")
+        write_weights(folder, config, self.state_dict())
+
+    @classmethod
+    def from_pretrained(cls, name_or_folder: str | Path) -> Self:
+        """Load a trained solver, in evaluation mode.
+
+        Args:
+            name_or_folder: the name of shipped weights (see :func:`~kornia_pnpnet.pretrained.shipped_weights`), which
+                needs no network; a local folder; or a Hugging Face Hub repository id. The first that exists is taken.
+                Nothing is unpickled.
+
+        Returns:
+            The solver in float32 on the CPU.
+
+        Raises:
+            FileNotFoundError: when there is no such name, folder or repository.
+            ValueCheckError: when the files are damaged or of another model.
+        """
+        config, state = read_weights(name_or_folder)
+        model = cls.from_config(config)
+        try:
+            model.load_state_dict(state)
+        except RuntimeError as error:
+            raise ValueCheckError(f"The weights {name_or_folder} belong to another model: {error}") from error
+        return model.eval()

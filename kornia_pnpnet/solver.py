@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from kornia.core.check import KORNIA_CHECK
-from kornia.core.exceptions import BaseError, ValueCheckError
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
@@ -16,19 +14,19 @@ from kornia_pnpnet.core.checks import check_whole
 from kornia_pnpnet.core.linalg import bound_gradient, gate
 from kornia_pnpnet.core.performance import Compiled, in_full_precision, sees_values
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.init import RANSAC, EPnP, MLPInit, REPPnP, SetInit
+from kornia_pnpnet.init import RANSAC, MLPInit, SetInit
 from kornia_pnpnet.init.alternatives import doubt_mirrored, find_alternatives, is_seen
 from kornia_pnpnet.init.ransac import search_on
+from kornia_pnpnet.init.ransac.search import take
 from kornia_pnpnet.inputs import Inputs, checked_inputs, joined, restore_leading, split_batch
 from kornia_pnpnet.normalize import VIEWS, Frame, Normalize
-from kornia_pnpnet.pretrained import read_weights, write_weights
+from kornia_pnpnet.pretrained import PretrainedMixin
 from kornia_pnpnet.refine import LMStart, LMStep, RobustWeightedLM
 from kornia_pnpnet.refine.prior import prior_in_frame
-from kornia_pnpnet.types import Alternatives, Correspondences, Guess, PnPResult, Pose, PosePrior, Status
+from kornia_pnpnet.refine.scale import larger_sigma
+from kornia_pnpnet.types import Alternatives, Correspondences, Guess, Noise, PnPResult, Pose, PosePrior, Status
 
 __all__ = ["PnPNet"]
-
-_INITIALISERS: dict[str, type[nn.Module]] = {x.__name__: x for x in (EPnP, MLPInit, REPPnP, SetInit)}
 
 # Bound of a problem's gradient by normalised coordinates, in which those of a problem that is ok are about 1.
 _LONGEST_GRADIENT = 10.0
@@ -42,7 +40,7 @@ class _Begun(NamedTuple):
     guess: Guess
 
 
-class PnPNet(nn.Module):
+class PnPNet(PretrainedMixin):
     r"""Find the pose of a calibrated camera from 2D-3D correspondences with outliers.
 
     The layer normalises the correspondences, lets ``init`` guess a pose, refines the guess, and expresses the pose in
@@ -287,7 +285,22 @@ class PnPNet(nn.Module):
             start, frame, guess = begun
             pose = self.normalize.apply_to_pose(result.pose, frame)
             result = doubt_mirrored(self.refine, start.corr, guess, pose, result, always)
+            if inputs.noise is None:
+                result = self._with_more_noise(always, inputs, self.normalize.undo_guess(guess, frame).noise, result)
         return begun, result
+
+    def _with_more_noise(self, always: bool, inputs: Inputs, noise: Noise | None, result: PnPResult) -> PnPResult:
+        """Solve once more, with the noise that the residuals show, the problems whose noise was underestimated."""
+        assert noise is not None
+        before = 1.0 if inputs.weights is None else inputs.weights
+        sigma = larger_sigma(*inputs[:3], result.pose, result.weights / before, noise)
+        rows = (sigma > 0).nonzero()[:, 0]
+        if not len(rows):
+            return result
+        shown = sigma[rows, None].expand_as(noise.img[rows])
+        again = take(inputs, rows)._replace(noise=Noise(shown, torch.zeros_like(shown)))
+        solved = self._parts(False, always, again)[1]
+        return map_tensors(lambda x, y: x.index_copy(0, rows, y), result, solved)
 
     def _searches(self, inputs: Inputs) -> bool:
         """Whether the effort is adaptive."""
@@ -374,71 +387,6 @@ class PnPNet(nn.Module):
             torch.where(finite, refined.probability, 0.0),
             Alternatives.none(pose),
         )
-
-    def config(self) -> dict[str, Any]:
-        """The constructor arguments of all parts, as plain data."""
-        arguments = getattr(self.init, "config", {})
-        init = None if self.init is None else {"name": type(self.init).__name__, **arguments}
-        parts = {"init": init, "refine": self.refine.config, "normalize": self.normalize.config}
-        return {**parts, "views": self.views}
-
-    @classmethod
-    def from_config(cls, config: dict[str, Any]) -> PnPNet:
-        """Build an untrained solver from what :meth:`config` returned.
-
-        Raises:
-            ValueCheckError: when a part or an argument is unknown.
-        """
-        try:
-            if set(config) != {"init", "refine", "normalize", "views"}:
-                raise KeyError(f"parts {sorted(config)}")
-            init_config = config["init"]
-            init = None
-            if init_config is not None:
-                arguments = {key: value for key, value in init_config.items() if key != "name"}
-                init = _INITIALISERS[init_config["name"]](**arguments)
-            parts = init, RobustWeightedLM(**config["refine"]), Normalize(**config["normalize"])
-            return cls(*parts, views=config["views"])
-        except (BaseError, KeyError, TypeError, AttributeError) as error:
-            raise ValueCheckError(f"Not a configuration of PnPNet: {error!r}.") from error
-
-    def save_pretrained(self, folder: str | Path) -> None:
-        """Write ``config.json`` and ``model.safetensors``.
-
-        Args:
-            folder: destination; created when missing.
-
-        Raises:
-            ValueCheckError: when the initialiser is not one of the package's.
-        """
-        config = self.config()
-        if self.init is not None and config["init"]["name"] not in _INITIALISERS:
-            raise ValueCheckError(f"{config['init']['name']} cannot be saved, only {sorted(_INITIALISERS)} can.")
-        write_weights(folder, config, self.state_dict())
-
-    @classmethod
-    def from_pretrained(cls, name_or_folder: str | Path) -> PnPNet:
-        """Load a trained solver, in evaluation mode.
-
-        Args:
-            name_or_folder: the name of shipped weights (see :func:`~kornia_pnpnet.pretrained.shipped_weights`), which
-                needs no network; a local folder; or a Hugging Face Hub repository id. The first that exists is taken.
-                Nothing is unpickled.
-
-        Returns:
-            The solver in float32 on the CPU.
-
-        Raises:
-            FileNotFoundError: when there is no such name, folder or repository.
-            ValueCheckError: when the files are damaged or of another model.
-        """
-        config, state = read_weights(name_or_folder)
-        model = cls.from_config(config)
-        try:
-            model.load_state_dict(state)
-        except RuntimeError as error:
-            raise ValueCheckError(f"The weights {name_or_folder} belong to another model: {error}") from error
-        return model.eval()
 
 
 def _checked_gradient(gradient: str) -> str:

@@ -1,0 +1,64 @@
+"""Noise that is much larger than it was taken for."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from kornia_pnpnet.types import Noise, Pose
+
+__all__ = ["larger_sigma"]
+
+# Standard deviations that the residuals show, relative to the estimate. Nearer ones are within the reach of the
+# iterations by residual; from here on these start too far from the minimum.
+_LARGER = 3.0
+# A weight of this share of that before the residual was looked at is an inlier's.
+_INLIER = 0.25
+# Share of the pairs. With fewer inliers the median residual may be that of near misses.
+_MOST_ARE = 0.5
+# The poses of the fit are closer to the pixels than the true pose is.
+_FITTED = 1.1
+# Median of the length of a residual of unit variance in both coordinates.
+_MEDIAN = math.sqrt(2.0 * math.log(2.0))
+
+
+@torch.no_grad()
+def larger_sigma(
+    world_points: Tensor, img_points: Tensor, intrinsics: Tensor, pose: Pose, inlier_weights: Tensor, noise: Noise
+) -> Tensor:
+    """Standard deviation of the pixels that the inliers show, where it is much larger than estimated, else 0.
+
+    Args:
+        world_points: shape :math:`(B, N, 3)`.
+        img_points: pixels, shape :math:`(B, N, 2)`.
+        intrinsics: camera matrices, shape :math:`(B, 3, 3)`.
+        pose: poses of the problems.
+        inlier_weights: final weight of each pair relative to that before its residual was looked at, :math:`(B, N)`.
+        noise: the estimated noise in the units of the points, shape :math:`(B, N)` each.
+
+    Returns:
+        In pixels, shape :math:`(B,)`.
+
+    Example:
+        >>> points = torch.tensor([[[0.0, 0.0, 4.0], [1.0, 0.0, 4.0], [0.0, 1.0, 4.0]]])
+        >>> camera = torch.tensor([[[100.0, 0.0, 0.0], [0.0, 100.0, 0.0], [0.0, 0.0, 1.0]]])
+        >>> pixels = torch.tensor([[[10.0, 0.0], [35.0, 0.0], [10.0, 25.0]]])
+        >>> pose, noise = Pose(torch.eye(3)[None], torch.zeros(1, 3)), Noise(torch.ones(1, 3), torch.zeros(1, 3))
+        >>> larger_sigma(points, pixels, camera, pose, torch.ones(1, 3), noise)
+        tensor([9.3424])
+    """
+    seen = (world_points @ pose.rotation.mT + pose.translation[:, None]) @ intrinsics.mT
+    away = seen[..., 2:].clamp(min=torch.finfo(seen.dtype).eps)
+    residual = (seen[..., :2] / away - img_points).norm(dim=-1)
+    focal = 0.5 * (intrinsics[:, :1, 0] + intrinsics[:, 1:2, 1]) / intrinsics[:, 2:, 2]
+    estimate = torch.hypot(noise.img, focal * noise.world / away[..., 0])
+    inlier = inlier_weights > _INLIER
+
+    def median(values: Tensor) -> Tensor:
+        return torch.where(inlier, values, torch.nan).nanmedian(1).values
+
+    sigma = _FITTED / _MEDIAN * median(residual)
+    many = inlier.sum(1) >= _MOST_ARE * (inlier_weights > 0).sum(1)
+    return torch.where(many & (sigma > _LARGER * median(estimate)), sigma, 0.0).nan_to_num(0.0, posinf=0.0)
