@@ -129,8 +129,9 @@ def _same(points: Tensor, there: Tensor) -> Tensor:
         key = key + factor * x
     order = key.argsort(1)  # equal points are neighbours
     ordered = points.gather(1, order[..., None].expand_as(points))
-    new = functional.pad((ordered[:, 1:] != ordered[:, :-1]).any(-1), (1, 0), value=True)
-    run = new.cumsum(1) - 1
+    # Numbers, not booleans, of which PyTorch 2.13 makes code that does not compile.
+    new = (ordered[:, 1:] != ordered[:, :-1]).long().amax(-1)
+    run = functional.pad(new.cumsum(1), (1, 0))
     sizes = torch.zeros_like(there).scatter_add(1, run, there.gather(1, order))
     return torch.empty_like(there).scatter(1, order, sizes.gather(1, run)).clamp(min=1.0)
 
