@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from unittest import mock
 
 import pytest
 import torch
 
-from kornia_pnpnet import Correspondences, create_solver, pose_errors
+from kornia_pnpnet import Correspondences, Pose, create_solver, pose_errors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.geometry import project, transform
+from kornia_pnpnet.refine import scale
 from kornia_pnpnet.refine.verdict import (
     LAWS,
     LEAST_PROBABILITY,
@@ -19,6 +21,7 @@ from kornia_pnpnet.refine.verdict import (
     Judged,
     Thresholds,
     chance_of_inlier,
+    chance_of_others,
     judge,
     log_false_alarms,
 )
@@ -158,3 +161,37 @@ def test_probability_depends_on_no_unit():
 def test_laws_are_those_of_the_results_file():
     file = Path(__file__).parents[1] / "docs" / "results" / "probability.json"
     assert {name: list(law) for name, law in LAWS.items()} == json.loads(file.read_text())["laws"]
+
+
+def test_padding_does_not_change_the_chance_of_others(generator):
+    """Of many pairs a part is looked at: a part of the pairs that are there."""
+    pixels = torch.randn(1, 40, 2, generator=generator, dtype=torch.float64) * 50.0
+    points = torch.cat((pixels / 100.0, torch.ones(1, 40, 1, dtype=torch.float64)), -1)
+    pose = Pose(torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 3, dtype=torch.float64))
+    thresholds = Thresholds(torch.tensor([20.0], dtype=torch.float64), torch.zeros(1, dtype=torch.float64))
+    chances = []
+    for padding in (0, 300):
+        far = torch.full((1, padding, 2), 1e3, dtype=torch.float64)
+        weights = torch.cat((torch.ones(1, 40), torch.zeros(1, padding)), 1).double()
+        world = torch.cat((points, torch.ones(1, padding, 3, dtype=torch.float64)), 1)
+        corr = Correspondences(world, torch.cat((pixels + 9.0, far), 1), weights, torch.tensor(100.0).double())
+        projection = project(pose, corr)
+        judged = judge(projection, corr, thresholds)
+        chances.append(chance_of_others(projection, corr, thresholds, judged))
+    assert chances[0] > 0
+    assert torch.equal(*chances)
+
+
+def test_noise_that_was_much_underestimated_is_found(make_problems, generator):
+    """Keypoints that are ten times as far off as the network estimates: solved once more, with their noise."""
+    problems = make_problems(400, 20, outliers=4, dtype=torch.float32)
+    pixels = problems.img_points + 30.0 * torch.randn(problems.img_points.shape, generator=generator)
+    solver = create_solver("pnpnet-set")
+    given = problems.world_points, pixels, problems.intrinsics
+    with torch.no_grad():
+        found, told = solver(*given), solver(*given, img_sigma=30.0)
+        with mock.patch.object(scale, "_LARGER", math.inf):
+            once = solver(*given)
+    error = [pose_errors(x.pose, problems.pose).rotation_error_deg.clamp(max=10.0).mean() for x in (found, told, once)]
+    assert error[0] < 1.1 * error[1]
+    assert error[0] < 0.9 * error[2]

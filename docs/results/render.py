@@ -12,6 +12,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from measure import ANY, CHI_SQUARE_95, HERE, OURS, PAPER, PEERS, RESULTS, ROBUST
 from overview_picture import OverviewRow, plot_overview
+from keypoint_tables import keypoint_tables
 from real_matches_picture import find_rows, plot_real_matches
 
 from kornia_pnpnet import PnPNet
@@ -371,13 +372,19 @@ def measured_on_matches(results: Mapping[str, Any]) -> dict[str, Any]:
     return {**found, "total": count, "scenes": scenes}
 
 
-def real_matches(results: Mapping[str, Any], costs: Mapping[str, Any], later: Sequence[Mapping[str, Any]]) -> str:
+def real_matches(
+    results: Mapping[str, Any],
+    costs: Mapping[str, Any],
+    later: Sequence[Mapping[str, Any]],
+    keypoints: Mapping[str, Any],
+) -> str:
     """The page on real matches as Markdown.
 
     Args:
         results: what ``benchmarks/real_matches.py measure`` wrote.
         costs: what ``benchmarks/real_matches.py cost`` wrote.
         later: what ``benchmarks/real_matches.py measure`` wrote of other scenes with later versions.
+        keypoints: what ``benchmarks/keypoints.py`` wrote.
     """
     settings, facts = results["settings"], measured_on_matches(results)
     first = settings["solvers"][0]
@@ -399,6 +406,7 @@ def real_matches(results: Mapping[str, Any], costs: Mapping[str, Any], later: Se
         first=first,
         far_count=round(raw["far"] * raw["count"]),
         deciles=deciles,
+        keypoints=keypoint_tables(keypoints),
         **facts,
     )
 
@@ -461,7 +469,8 @@ def render() -> None:
     costs = json.loads((HERE / "real_matches_cost.json").read_text())
     plot_real_matches(HERE / "real_matches.png", found, costs)
     later = [json.loads((HERE / f"{name}.json").read_text()) for name in LATER_MATCHES]
-    (HERE / "real_matches.md").write_text(real_matches(found, costs, later), encoding="utf-8")
+    keypoints = json.loads((HERE / "keypoints.json").read_text())
+    (HERE / "real_matches.md").write_text(real_matches(found, costs, later, keypoints), encoding="utf-8")
 
     rows, table = overview(json.loads((REPOSITORY / "benchmarks" / "solvers.json").read_text()))
     plot_overview(HERE / "overview.png", rows, outliers="0 to 3 outliers among 9 pairs")
