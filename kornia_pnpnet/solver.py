@@ -293,12 +293,12 @@ class PnPNet(PretrainedMixin):
         """Solve once more, with the noise that the residuals show, the problems whose noise was underestimated."""
         assert noise is not None
         before = 1.0 if inputs.weights is None else inputs.weights
-        sigma = larger_sigma(*inputs[:3], result.pose, result.weights / before, noise)
-        rows = (sigma > 0).nonzero()[:, 0]
+        sigma = larger_sigma(*inputs[:3], result.pose, result.weights / before, noise, inputs.confidence)
+        rows = (sigma[:, 0] > 0).nonzero()[:, 0]
         if not len(rows):
             return result
-        shown = sigma[rows, None].expand_as(noise.img[rows])
-        again = take(inputs, rows)._replace(noise=Noise(shown, torch.zeros_like(shown)))
+        shown = Noise(sigma[rows], torch.zeros_like(sigma[rows]))
+        again = take(inputs, rows)._replace(noise=shown)
         solved = self._parts(False, always, again)[1]
         return map_tensors(lambda x, y: x.index_copy(0, rows, y), result, solved)
 

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from keypoint_tables import keypoint_tables
 from measure import ANY, CHI_SQUARE_95, HERE, OURS, PAPER, PEERS, RESULTS, ROBUST
 from overview_picture import OverviewRow, plot_overview
-from keypoint_tables import keypoint_tables
 from real_matches_picture import find_rows, plot_real_matches
 
 from kornia_pnpnet import PnPNet

@@ -20,15 +20,26 @@ _INLIER = 0.25
 _MOST_ARE = 0.5
 # The poses of the fit are closer to the pixels than the true pose is.
 _FITTED = 1.1
+# With confidences, sigmas fall with this power of them: on keypoints of networks it lies near 1, and more is better
+# where low confidences are outliers. The least confidence counts as this much.
+_POWER, _LEAST_CONFIDENCE = 1.5, 0.05
 # Median of the length of a residual of unit variance in both coordinates.
 _MEDIAN = math.sqrt(2.0 * math.log(2.0))
 
 
 @torch.no_grad()
 def larger_sigma(
-    world_points: Tensor, img_points: Tensor, intrinsics: Tensor, pose: Pose, inlier_weights: Tensor, noise: Noise
+    world_points: Tensor,
+    img_points: Tensor,
+    intrinsics: Tensor,
+    pose: Pose,
+    inlier_weights: Tensor,
+    noise: Noise,
+    confidence: Tensor | None = None,
 ) -> Tensor:
     """Standard deviation of the pixels that the inliers show, where it is much larger than estimated, else 0.
+
+    Where confidences are given, those of a problem differ between its pairs, around the same mean.
 
     Args:
         world_points: shape :math:`(B, N, 3)`.
@@ -37,9 +48,10 @@ def larger_sigma(
         pose: poses of the problems.
         inlier_weights: final weight of each pair relative to that before its residual was looked at, :math:`(B, N)`.
         noise: the estimated noise in the units of the points, shape :math:`(B, N)` each.
+        confidence: the caller's belief in each pair, in [0, 1], shape :math:`(B, N)`; NaN where unknown.
 
     Returns:
-        In pixels, shape :math:`(B,)`.
+        In pixels, shape :math:`(B, N)`.
 
     Example:
         >>> points = torch.tensor([[[0.0, 0.0, 4.0], [1.0, 0.0, 4.0], [0.0, 1.0, 4.0]]])
@@ -47,7 +59,7 @@ def larger_sigma(
         >>> pixels = torch.tensor([[[10.0, 0.0], [35.0, 0.0], [10.0, 25.0]]])
         >>> pose, noise = Pose(torch.eye(3)[None], torch.zeros(1, 3)), Noise(torch.ones(1, 3), torch.zeros(1, 3))
         >>> larger_sigma(points, pixels, camera, pose, torch.ones(1, 3), noise)
-        tensor([9.3424])
+        tensor([[9.3424, 9.3424, 9.3424]])
     """
     seen = (world_points @ pose.rotation.mT + pose.translation[:, None]) @ intrinsics.mT
     away = seen[..., 2:].clamp(min=torch.finfo(seen.dtype).eps)
@@ -61,4 +73,9 @@ def larger_sigma(
 
     sigma = _FITTED / _MEDIAN * median(residual)
     many = inlier.sum(1) >= _MOST_ARE * (inlier_weights > 0).sum(1)
-    return torch.where(many & (sigma > _LARGER * median(estimate)), sigma, 0.0).nan_to_num(0.0, posinf=0.0)
+    sigma = torch.where(many & (sigma > _LARGER * median(estimate)), sigma, 0.0).nan_to_num(0.0, posinf=0.0)[:, None]
+    if confidence is None:
+        return sigma.expand_as(residual)
+    doubt = -confidence.nan_to_num(0.5).clamp(min=_LEAST_CONFIDENCE).log()
+    mean = (inlier * doubt).sum(1, keepdim=True) / inlier.sum(1, keepdim=True).clamp(min=1)
+    return sigma * (_POWER * (doubt - mean)).exp()
