@@ -183,7 +183,7 @@ class PnPNet(PretrainedMixin):
             always = _checked_gradient(gradient or self.gradient) == "always"
             compiled = [x for x in (self._solve, self._first, self._begin) if isinstance(x, Compiled)]
             any_number = not (compiled or isinstance(self.init, MLPInit))
-            single = len(inputs.world_points) == 1 and bool(compiled) and not any(x.failed for x in compiled)
+            single = bool(compiled) and len(inputs.world_points) == 1 and not any(x.failed for x in compiled)
             if compiled:  # a batch of one, and every layout in memory, would be compiled for by itself
                 inputs = map_tensors(lambda x: torch.cat((x, x)) if single else x.contiguous(), inputs)
             parts = split_batch(inputs, getattr(self.init, "pairs_at_once", None), any_number)

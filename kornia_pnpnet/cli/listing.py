@@ -22,6 +22,7 @@ _WHAT = {
     "ransac-epnp-lm": "the paper's RANSAC on samples of seven",
     "identity-lm": "robust LM from the identity, or from a given pose",
     "opencv-": "OpenCV's solver, one problem at a time",
+    "kornia-rs": "kornia-rs's RANSAC, one problem at a time",
     "poselib": "PoseLib's RANSAC, one problem at a time",
     "pycolmap": "COLMAP's RANSAC, one problem at a time",
 }

@@ -15,7 +15,7 @@ from kornia_pnpnet.geometry import project, rotation_angle
 from kornia_pnpnet.init.ransac.p3p import p3p
 from kornia_pnpnet.init.ransac.search import take
 from kornia_pnpnet.refine import RobustWeightedLM
-from kornia_pnpnet.refine.verdict import LEAST_PROBABILITY, residual_noise
+from kornia_pnpnet.refine.verdict import LEAST_PROBABILITY, has_enough, residual_noise
 from kornia_pnpnet.types import Alternatives, Correspondences, Guess, PnPResult, Pose, Status
 
 __all__ = ["doubt_mirrored", "find_alternatives", "is_seen"]
@@ -31,6 +31,8 @@ _SEEN = 0.25
 # Shares of the spread of the pixels. A mirror image that leaves a larger median residual has no minimum nearby that
 # explains as much; of fewer likely inliers than this, any mirror image may have one.
 _NEAR_MIRROR, _FEW_INLIERS = 0.2, 10
+# Iterations after which mirror images are given up whose log-likelihood is this far below that of the pose.
+_FIRST_LOOK, _HOPELESS = 2, -30.0
 # Radians. A pose that is turned further is far off, see :attr:`~kornia_pnpnet.types.PnPResult.probability`.
 _FAR_TURN = math.radians(10.0)
 # For solvers that do not refine: iterations with a classical kernel.
@@ -164,12 +166,18 @@ def _mirror_probability(
     rows = (result.ok & (few | ((share * near).sum(-1) > 0.5))).nonzero()[:, 0]
     probability = torch.zeros_like(share[:, 0])
     if len(rows):
-        start = take(Guess(mirrored, guess.weights, noise=guess.noise), rows)
-        corr, pose, cost = take(corr, rows), take(pose, rows), result.cost[rows]
-        refined = refine(corr, start)
-        usable = refined.in_front & refined.cost.isfinite()
-        usable &= rotation_angle(refined.pose.rotation, pose.rotation) > _FAR_TURN
-        log_ratio = 0.5 * (corr.weights > 0).sum(-1) / _unit(corr, start, pose) * (cost - refined.cost)
+        start = Guess(mirrored, guess.weights, noise=guess.noise)
+        unit = 0.5 * (corr.weights > 0).sum(-1) / _unit(corr, start, pose)
+        for m in (_FIRST_LOOK, refine.m):
+            some, begun = take(corr, rows), refine.begin(take(corr, rows), take(start, rows))
+            end = refine.iterate(begun, m).pose
+            cost = refine.cost(begun, end)
+            log_ratio = torch.where(cost.isfinite(), unit[rows] * (result.cost[rows] - cost), -torch.inf)
+            if m < refine.m:
+                rows = rows[log_ratio > _HOPELESS]
+        usable = has_enough(project(end, some), some.weights) & (
+            rotation_angle(end.rotation, pose.rotation[rows]) > _FAR_TURN
+        )
         probability[rows] = torch.where(usable, log_ratio.sigmoid(), 0.0)
     return probability
 

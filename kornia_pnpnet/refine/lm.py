@@ -22,6 +22,7 @@ from kornia_pnpnet.geometry import NormalEquations, Projection, move, project
 from kornia_pnpnet.refine.kernels import KERNELS, RobustKernel
 from kornia_pnpnet.refine.parameters import BoundedParameter
 from kornia_pnpnet.refine.prior import prior_loss
+from kornia_pnpnet.refine.scale import complete_noise, is_unknown
 from kornia_pnpnet.refine.stages import LMStart, Stage, State
 from kornia_pnpnet.refine.step import (
     LMStep,
@@ -33,7 +34,7 @@ from kornia_pnpnet.refine.step import (
     weighted_equations,
 )
 from kornia_pnpnet.refine.verdict import believe, explains, has_enough, residual_noise
-from kornia_pnpnet.types import LEAST_NOISE, Correspondences, Guess, Noise, Pose, Refinement
+from kornia_pnpnet.types import Correspondences, Guess, Pose, Refinement
 
 __all__ = ["BACKWARDS", "RobustWeightedLM"]
 
@@ -228,9 +229,9 @@ class RobustWeightedLM(Configured):
             What the iterations need.
         """
         step, damping, shape = (x.unbind() for x in self.hyperparameters(corr.world_points))
-        unknown = _is_unknown(corr) if self.by_residual or corr.noise is not None else None
+        unknown = is_unknown(corr) if self.by_residual or corr.noise is not None else None
         noiseless = None if unknown is None or corr.noise is None or guess.noise is not None else unknown[:, 0]
-        corr = problems_last(corr._replace(noise=_complete_noise(corr, guess)))
+        corr = problems_last(corr._replace(noise=complete_noise(corr, guess)))
         prior = corr.weights * problems_last(guess.weights)
         area = None
         if self.by_residual and unknown is not None and corr.noise is not None and not corr.noise.covariances:
@@ -336,6 +337,15 @@ class RobustWeightedLM(Configured):
         in_front = has_enough(projection, start.prior)
         return Refinement(end.pose, weights, cost, end.solved & ok & in_front, in_front, probability)
 
+    def cost(self, start: LMStart, pose: Pose) -> Tensor:
+        """The ``cost`` of :meth:`finish` at any pose, shape :math:`(B,)`.
+
+        Args:
+            start: what :meth:`begin` returned.
+            pose: a pose for each problem in the frame of the correspondences.
+        """
+        return self._cost(pose, project(pose, start.corr), start.corr, start.prior, start.shape[-1])
+
     def compile(self, mode: str | None = None) -> None:
         """Compile with ``torch.compile``, in place: what is before, in, and after an iteration, each once.
 
@@ -348,8 +358,6 @@ class RobustWeightedLM(Configured):
         self._iterate = Compiled(self._iteration, mode)
         self._choose = Compiled(self._best_pose, mode)
         self._finish = Compiled(self.finish, mode)
-
-    # -- stages --------------------------------------------------------------------------------------------------------
 
     def _advance(
         self,
@@ -428,23 +436,3 @@ def _relative_to_mean(weights: Tensor) -> Tensor:
     """Weights over the mean of those that are not 0: unlike the largest weight, the mean has a derivative at ties."""
     mean = weights.sum(-1, keepdim=True) / (weights > 0).sum(-1, keepdim=True).clamp(min=1)
     return weights / torch.where(mean > 0, mean, 1.0)
-
-
-def _complete_noise(corr: Correspondences, guess: Guess) -> Noise | None:
-    """The caller's covariances, the guess's sigmas or else the caller's with 0 where unknown; ``None``: neither."""
-    noise = guess.noise
-    if noise is None and corr.noise is not None:
-        noise = map_tensors(lambda x: x.nan_to_num(0.0), corr.noise)
-    if noise is None:
-        return None
-    given = noise if corr.noise is None else corr.noise  # a guess has no covariances
-    least = noise.img.maximum(LEAST_NOISE * corr.focal)
-    return noise._replace(img=least, img_cov=given.img_cov, world_cov=given.world_cov)
-
-
-def _is_unknown(corr: Correspondences) -> Tensor:
-    """Problems of which the caller gave neither sigma for any pair, bool (B, 1)."""
-    known = torch.zeros_like(corr.weights[:, :1], dtype=torch.bool)
-    for sigma in () if corr.noise is None else (corr.noise.img, corr.noise.world):
-        known = known | sigma.isfinite().any(1, keepdim=True)
-    return ~known

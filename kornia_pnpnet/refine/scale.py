@@ -1,4 +1,4 @@
-"""Noise that is much larger than it was taken for."""
+"""The noise that a refinement starts from, and noise that is much larger than that."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ import math
 import torch
 from torch import Tensor
 
-from kornia_pnpnet.types import Noise, Pose
+from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.types import LEAST_NOISE, Correspondences, Guess, Noise, Pose
 
-__all__ = ["larger_sigma"]
+__all__ = ["complete_noise", "is_unknown", "larger_sigma"]
 
 # Standard deviations that the residuals show, relative to the estimate. Nearer ones are within the reach of the
 # iterations by residual; from here on these start too far from the minimum.
@@ -58,8 +59,8 @@ def larger_sigma(
         >>> camera = torch.tensor([[[100.0, 0.0, 0.0], [0.0, 100.0, 0.0], [0.0, 0.0, 1.0]]])
         >>> pixels = torch.tensor([[[10.0, 0.0], [35.0, 0.0], [10.0, 25.0]]])
         >>> pose, noise = Pose(torch.eye(3)[None], torch.zeros(1, 3)), Noise(torch.ones(1, 3), torch.zeros(1, 3))
-        >>> larger_sigma(points, pixels, camera, pose, torch.ones(1, 3), noise)
-        tensor([[9.3424, 9.3424, 9.3424]])
+        >>> larger_sigma(points, pixels, camera, pose, torch.ones(1, 3), noise).round(decimals=1)
+        tensor([[9.3000, 9.3000, 9.3000]])
     """
     seen = (world_points @ pose.rotation.mT + pose.translation[:, None]) @ intrinsics.mT
     away = seen[..., 2:].clamp(min=torch.finfo(seen.dtype).eps)
@@ -79,3 +80,23 @@ def larger_sigma(
     doubt = -confidence.nan_to_num(0.5).clamp(min=_LEAST_CONFIDENCE).log()
     mean = (inlier * doubt).sum(1, keepdim=True) / inlier.sum(1, keepdim=True).clamp(min=1)
     return sigma * (_POWER * (doubt - mean)).exp()
+
+
+def complete_noise(corr: Correspondences, guess: Guess) -> Noise | None:
+    """The caller's covariances, the guess's sigmas or else the caller's with 0 where unknown; ``None``: neither."""
+    noise = guess.noise
+    if noise is None and corr.noise is not None:
+        noise = map_tensors(lambda x: x.nan_to_num(0.0), corr.noise)
+    if noise is None:
+        return None
+    given = noise if corr.noise is None else corr.noise  # a guess has no covariances
+    least = noise.img.maximum(LEAST_NOISE * corr.focal)
+    return noise._replace(img=least, img_cov=given.img_cov, world_cov=given.world_cov)
+
+
+def is_unknown(corr: Correspondences) -> Tensor:
+    """Problems of which the caller gave neither sigma for any pair, bool (B, 1)."""
+    known = torch.zeros_like(corr.weights[:, :1], dtype=torch.bool)
+    for sigma in () if corr.noise is None else (corr.noise.img, corr.noise.world):
+        known = known | sigma.isfinite().any(1, keepdim=True)
+    return ~known
