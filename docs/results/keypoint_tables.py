@@ -34,7 +34,7 @@ def keypoint_tables(found: Mapping[str, Any]) -> dict[str, Any]:
         differences.append([f"`{way}` less `{base}`", *("{:+.4f} ({:+.4f} to {:+.4f})".format(*x) for x in shown)])
     names = [one["source"] for one in results]
     sources = [
-        [one["source"], one["measured"], f"{one['pairs']:.0f}", f"{100 * one['inliers']:.0f}", _source(found, one)]
+        [one["source"], str(one["measured"]), f"{one['pairs']:.0f}", f"{100 * one['inliers']:.0f}", _source(found, one)]
         for one in results
     ]
     return {
