@@ -16,6 +16,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from torch import Tensor
 
+from kornia_pnpnet import solver as solver_module
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.evaluation.named_solvers import load_solver
 from kornia_pnpnet.metrics import pose_errors, reliability, success_rate
@@ -25,7 +26,7 @@ from kornia_pnpnet.types import PnPResult, Problems
 __all__ = ["measure_probability"]
 
 #: By law the solvers that it is fitted to.
-FITTED = {"sigmas": ("pnpnet-set", "pnpnet-set:effort=adaptive"), "residuals": ("p3p-ransac",)}
+FITTED = {"sigmas": ("pnpnet-set:effort=fixed", "pnpnet-set:effort=adaptive"), "residuals": ("p3p-ransac",)}
 
 
 @torch.no_grad()
@@ -55,11 +56,17 @@ def measure_probability(seed_fit: int, seed_report: int) -> dict[str, Any]:
         problems = instantiate(drawn, _convert_="all").batch(0)
         for name, solver in solvers.items():
             features.clear()
-            with mock.patch.object(verdict, "probability", listen):
+            # While the law is fitted, nothing is solved once more, so that each problem has one row.
+            larger = solver_module.larger_sigma if part == "report" else lambda x, *_: x.new_zeros(x.shape[:2])
+            with (
+                mock.patch.object(verdict, "probability", listen),
+                mock.patch.object(solver_module, "larger_sigma", larger),
+            ):
                 result = solver(problems.world_points, problems.img_points, problems.intrinsics)
             far, right = far_and_right(result, problems)
             columns = far, right, result.ok, result.probability, torch.full_like(result.probability, 1 / len(far))
-            found[name][part].append(torch.cat((torch.cat(features), torch.stack(columns, -1)), -1).double())
+            seen = torch.cat(features) if part == "fit" else torch.zeros(len(far), 2)
+            found[name][part].append(torch.cat((seen, torch.stack(columns, -1)), -1).double())
     tables = {name: {part: torch.cat(rows) for part, rows in parts.items()} for name, parts in found.items()}
     laws = {law: fit_law(torch.cat([tables[name]["fit"] for name in names])) for law, names in FITTED.items()}
     made: dict[str, Any] = {"environment": environment(), "laws": laws}

@@ -42,7 +42,7 @@ __all__ = [
 REPOSITORY = HERE.parents[1]
 EXPERIMENTS = REPOSITORY / "conf" / "experiment"
 #: Files of `benchmarks/real_matches.py measure` on other scenes, the latest last.
-LATER_MATCHES = ("real_matches_again", "real_matches_third")
+LATER_MATCHES = ("real_matches_again", "real_matches_third", "real_matches_fourth")
 #: Files of short runs, see ``make.py``.
 SUMMARIES = ("ablation", "sweep", "capacity")
 KERNEL = "model.solver.refine.kernel"  # column of a summary
