@@ -221,7 +221,7 @@ def test_poselib_and_colmap_random_images(focal, share, name, dtype):
 @pytest.mark.parametrize("n", [6, 20, 100])
 def test_pytorch3d_grid_of_noise_and_scale(n, noise, name, dtype, request):
     """PyTorch3D's test of ``efficient_pnp``: points x noise of plane points x scale; its twin here is OpenCV's EPNP."""
-    open_ = name == "pnpnet-set, told" and (n, noise) == (6, 1e-2)
+    open_ = name.startswith("pnpnet-set") and (n, noise) == (6, 1e-2)
     lost(request, open_, "these pairs leave the rotation open to degrees, so that right poses are not `ok`")
     generator = torch.Generator().manual_seed(n)
     cam, jitter, (axis, shift) = (torch.randn(k, 20, n, 3, generator=generator).double() for k in (1, 1, 2))

@@ -14,7 +14,7 @@ __all__ = ["complete_noise", "is_unknown", "larger_sigma"]
 
 # Standard deviations that the residuals show, relative to the estimate. Nearer ones are within the reach of the
 # iterations by residual; from here on these start too far from the minimum.
-_LARGER = 3.0
+_LARGER = 4.0
 # A weight of this share of that before the residual was looked at is an inlier's.
 _INLIER = 0.25
 # Share of the pairs. With fewer inliers the median residual may be that of near misses.
