@@ -273,7 +273,8 @@ class PnPNet(PretrainedMixin):
     def _parts(self, first_stage_only: bool, always: bool, inputs: Inputs) -> tuple[_Begun, PnPResult]:
         """Before the iterations, the iterations, and after them."""
         views = 1 if first_stage_only or self.refine.m == 0 else self.views
-        if first_stage_only or not self._searches(inputs):
+        searches = not first_stage_only and self._searches(inputs)
+        if not searches:
             begun = self._begin(views, always, inputs)
         else:
             corr, frame, guess = self._first(views, always, inputs, True)
@@ -281,7 +282,7 @@ class PnPNet(PretrainedMixin):
             begun = _Begun(self.refine.begin(corr, guess), frame, guess)
         end = self.refine.iterate(begun.start, 0 if first_stage_only else None)
         result = self._finish(begun, end, always)
-        if not first_stage_only and self._searches(inputs):
+        if searches:
             start, frame, guess = begun
             pose = self.normalize.apply_to_pose(result.pose, frame)
             result = doubt_mirrored(self.refine, start.corr, guess, pose, result, always)

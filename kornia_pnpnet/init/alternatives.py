@@ -156,7 +156,7 @@ def _mirror_probability(
 ) -> Tensor:
     """Probability that not the pose is right but its mirror image, where one of them is, (B,); 0 where not ok."""
     weights = corr.weights * guess.weights
-    share = weights / weights.sum(-1, keepdim=True).clamp(min=torch.finfo(weights.dtype).tiny)
+    share = _shares(weights)
     middle = (share[..., None] * corr.img_points).sum(1, keepdim=True)
     spread = (share * (corr.img_points - middle).square().sum(-1)).sum(-1, keepdim=True)
     mirrored = _mirrored(pose, corr, weights)
@@ -165,26 +165,32 @@ def _mirror_probability(
     few = (weights > 0.5).sum(-1) < _FEW_INLIERS
     rows = (result.ok & (few | ((share * near).sum(-1) > 0.5))).nonzero()[:, 0]
     probability = torch.zeros_like(share[:, 0])
-    if len(rows):
-        start = Guess(mirrored, guess.weights, noise=guess.noise)
-        unit = 0.5 * (corr.weights > 0).sum(-1) / _unit(corr, start, pose)
-        for m in (_FIRST_LOOK, refine.m):
-            some, begun = take(corr, rows), refine.begin(take(corr, rows), take(start, rows))
-            end = refine.iterate(begun, m).pose
-            cost = refine.cost(begun, end)
-            log_ratio = torch.where(cost.isfinite(), unit[rows] * (result.cost[rows] - cost), -torch.inf)
-            if m < refine.m:
-                rows = rows[log_ratio > _HOPELESS]
-        usable = has_enough(project(end, some), some.weights) & (
-            rotation_angle(end.rotation, pose.rotation[rows]) > _FAR_TURN
-        )
-        probability[rows] = torch.where(usable, log_ratio.sigmoid(), 0.0)
+    start = Guess(mirrored, guess.weights, noise=guess.noise)
+    unit = 0.5 * (corr.weights > 0).sum(-1) / _unit(corr, start, pose)
+    for m in (_FIRST_LOOK, refine.m):
+        if not len(rows):
+            return probability
+        some = take(corr, rows)
+        begun = refine.begin(some, take(start, rows))
+        end = refine.iterate(begun, m).pose
+        cost = refine.cost(begun, end)
+        log_ratio = torch.where(cost.isfinite(), unit[rows] * (result.cost[rows] - cost), -torch.inf)
+        if m < refine.m:
+            rows = rows[log_ratio > _HOPELESS]
+    usable = has_enough(project(end, some), some.weights)
+    usable &= rotation_angle(end.rotation, pose.rotation[rows]) > _FAR_TURN
+    probability[rows] = torch.where(usable, log_ratio.sigmoid(), 0.0)
     return probability
+
+
+def _shares(weights: Tensor) -> Tensor:
+    """Weights (B, N) over their sum."""
+    return weights / weights.sum(-1, keepdim=True).clamp(min=torch.finfo(weights.dtype).tiny)
 
 
 def _mirrored(pose: Pose, corr: Correspondences, weights: Tensor) -> Pose:
     """Half a turn about the normal of the plane through the points, then about the line of sight to its middle."""
-    share = weights / weights.sum(-1, keepdim=True).clamp(min=torch.finfo(weights.dtype).tiny)
+    share = _shares(weights)
     middle = (share[..., None] * corr.world_points).sum(1)
     centred = corr.world_points - middle[:, None]
     covariance = centred.mT @ (share[..., None] * centred)
@@ -237,7 +243,7 @@ def _unit(corr: Correspondences, guess: Guess, pose: Pose) -> Tensor:
 
 def _are_same(poses: Pose, other: Pose, corr: Correspondences, weights: Tensor) -> Tensor:
     """Which of the poses (S, B, ...) are the other pose (B, ...), bool (S, B)."""
-    share = weights / weights.sum(-1, keepdim=True).clamp(min=torch.finfo(weights.dtype).tiny)
+    share = _shares(weights)
     middle = (share[..., None] * corr.world_points).sum(1)
     seen = (poses.rotation @ middle[..., None])[..., 0] + poses.translation
     there = (other.rotation @ middle[..., None])[..., 0] + other.translation
