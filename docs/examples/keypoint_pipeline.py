@@ -54,7 +54,7 @@ TEXTURES = 8
 MOST = 0.3
 # The loss of the pose counts this much beside that of the keypoints, in pixels.
 POSE_WEIGHT = 50.0
-ALONE, END, UNTOLD = "keypoint loss alone", "end to end", "end to end, not told how far off"
+ALONE, END, WITHOUT_SIGMA = "keypoint loss alone", "end to end", "end to end, not told how far off"
 FULL = "keypoint loss alone, hidden ones labelled"
 LIKELY, FULL_LIKELY = f"{ALONE}, how far off by likelihood", f"{FULL}, how far off by likelihood"
 # Points of a curve are means of so many updates.
@@ -269,13 +269,13 @@ def train(
 
 
 @torch.no_grad()
-def test(network: Keypoints, solver: nn.Module, *, told: bool, batches: int, motion: bool) -> dict[str, float]:
+def test(network: Keypoints, solver: nn.Module, *, with_sigma: bool, batches: int, motion: bool) -> dict[str, float]:
     """Errors on images of a seed that no training uses."""
     distances, angles, offs = [], [], []
     for index in range(batches):
         problem = draw(999_983, index, motion=motion)
         pixels, sigma = network(problem.images)
-        result = solve(solver, pixels, sigma if told else None)
+        result = solve(solver, pixels, sigma if with_sigma else None)
         distances.append(distance(result.pose, problem.pose))
         angles.append(torch.rad2deg(rotation_angle(result.rotation, problem.pose.rotation)))
         offs.append((pixels - problem.pixels).norm(dim=-1).mean(-1))
@@ -303,11 +303,11 @@ def run(seed: int, updates: int, batches: int) -> tuple[dict[str, Any], dict[str
         labels = {"hidden": name in (FULL, FULL_LIKELY), "likelihood": name in (LIKELY, FULL_LIKELY)}
         for first in (0, updates) if labels["hidden"] else (updates,):
             curves = train(network, solver if name == END else None, seed, range(first, first + updates), **labels)
-        told = name in (END, LIKELY, FULL_LIKELY)
-        found[name] = {"curves": curves, **test(network, solver, told=told, batches=batches, motion=False)}
+        with_sigma = name in (END, LIKELY, FULL_LIKELY)
+        found[name] = {"curves": curves, **test(network, solver, with_sigma=with_sigma, batches=batches, motion=False)}
         distances = ", ".join(f"{key} {found[name][key]:.4f}" for key in ("mean_distance", "median_distance"))
         print(f"seed {seed}, {name}: {distances}", flush=True)
-    found[UNTOLD] = test(networks[END], solver, told=False, batches=batches, motion=False)
+    found[WITHOUT_SIGMA] = test(networks[END], solver, with_sigma=False, batches=batches, motion=False)
     return found, {name: networks[name] for name in (ALONE, END)}
 
 
@@ -322,7 +322,7 @@ def run_covariances(seed: int, updates: int, batches: int) -> dict[str, Any]:
         network = copy.deepcopy(start).predict(noise)
         more = range(updates, updates + updates // 2)
         curves = train(network, solver, seed, more, likelihood=True, motion=True)
-        found[noise] = {"curves": curves, **test(network, solver, told=True, batches=batches, motion=True)}
+        found[noise] = {"curves": curves, **test(network, solver, with_sigma=True, batches=batches, motion=True)}
         print(f"seed {seed}, {noise}: mean_distance {found[noise]['mean_distance']:.4f}", flush=True)
     return found
 
@@ -336,7 +336,7 @@ def plot_errors(results: dict[str, Any], path: Path) -> None:
         LIKELY: ("... and how far off, by likelihood", ORANGE),
         FULL: ("labels of hidden ones, too", VERMILION),
         FULL_LIKELY: ("... and how far off, by likelihood", VERMILION),
-        UNTOLD: ("end to end, how far off not told", BLUE),
+        WITHOUT_SIGMA: ("end to end, how far off not told", BLUE),
         END: ("end to end", BLUE),
     }
     parts = (("mean_distance", "mean distance of keypoints"), ("mean_rotation_deg", "mean rotation error (°)"))
