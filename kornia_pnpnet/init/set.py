@@ -44,8 +44,7 @@ _ABSENT = -1e9
 _SAMPLES = ((0, 1, 2), (0, 1, 3), (2, 3, 4), (2, 3, 5), (0, 4, 5), (1, 4, 5), (0, 2, 3), (1, 2, 3))
 # From 18, 24 and 30 pairs on, the same samples are drawn again with their ranks multiplied by 3, 4 and 5.
 _SPREADS = {18: 3, 24: 4, 30: 5}
-# From 36 pairs on, 25 further samples: each of the 25 likeliest pairs is in three of them, no two pairs meet twice. A
-# search that follows finds what these would.
+# From 36 pairs on, 25 further samples: each of the 25 likeliest pairs is in three of them, no two pairs meet twice.
 _RING = {36: [(a, b, c) for i in range(25) for a, b, c in [sorted((i, (i + 1) % 25, (i + 6) % 25))]]}
 #: Number of top-ranked pairs that score each hypothesis.
 MOST_JUDGES = 32
@@ -176,24 +175,24 @@ class _Block(nn.Module):
             self.out.bias.zero_()
 
     def forward(self, x: Tensor, absent: Tensor) -> Tensor:
-        """Map (B, N, width) to the same shape; ``absent`` is a large negative number for padding, else 0."""
-        width = x.shape[-1]
+        """Map (B, N, width) to the same shape; ``absent`` (B, N) is a large negative number for padding, else 0."""
+        (batch, count, width), heads = x.shape, self.heads
         y = self.norm(x)
-        # A score for each channel, not for each head: a reduction over pairs of fewer numbers than the processor has
-        # lanes compiles to code that synchronises all threads at each problem.
-        scores = self.look.weight[width:].repeat_interleave(width // self.heads, 0)
-        values, scores = functional.linear(y, torch.cat((self.look.weight[:width], scores))).chunk(2, -1)
-        attention = (scores + absent).softmax(1)  # (B, N, width)
-        # Biases are added where there is one row per problem instead of one per pair. The scores need none: the softmax
-        # over pairs cancels it.
-        context = (attention * values).sum(1) + self.look.bias[:width]  # (B, width)
-        hidden = functional.linear(y, self.pair.weight) + (self.all(context) + self.pair.bias)[:, None]
-        return (x + self.out.bias) + functional.linear(functional.relu(hidden), self.out.weight)
+        # The scores need no bias: the softmax over pairs cancels it.
+        attention = (_by_channel(y, self.look.weight[width:]) + absent).softmax(-1)  # (heads, B, N)
+        # Pooling is linear: the values of the means are the means of the values, which a problem has instead of a pair.
+        means = torch.bmm(attention.movedim(0, 1), y)  # (B, heads, width)
+        values = self.look.weight[:width].view(heads, width // heads, width)
+        context = torch.bmm(means.movedim(1, 0), values.mT).movedim(0, 1).flatten(1) + self.look.bias[:width]
+        hidden = functional.linear(y, self.pair.weight)
+        hidden = hidden.add_((self.all(context) + self.pair.bias)[:, None]).relu_()
+        x = (x + self.out.bias).flatten(0, 1)
+        return torch.addmm(x, hidden.flatten(0, 1), self.out.weight.mT).view(batch, count, width)
 
 
 def _by_channel(x: Tensor, weight: Tensor) -> Tensor:
-    """A linear map of (B, N, width) to few channels, each contiguous in memory, which is faster for BLAS."""
-    return (weight @ x.flatten(0, 1).mT).unflatten(1, x.shape[:2]).movedim(0, -1)
+    """A linear map of (B, N, width) to few channels (C, B, N), each contiguous in memory, which is faster for BLAS."""
+    return (weight @ x.flatten(0, 1).mT).unflatten(1, x.shape[:2])
 
 
 class SetInit(Configured):
@@ -297,8 +296,8 @@ class SetInit(Configured):
         dtype = corr.world_points.dtype
         pair, problem = (x.to(dtype) for x in self._run(view.features, view.there))
         starts = self.starts
-        right = torch.sigmoid(pair[..., 0])
-        counts, along = pair[..., 1:].movedim(-1, 0).unflatten(0, (2, starts)).unbind(0)  # (S, B, N) each
+        right = torch.sigmoid(pair[0])
+        counts, along = pair[1:].unflatten(0, (2, starts)).unbind(0)  # (S, B, N) each
         away, noise = problem.split((starts, 2), -1)
         # A point's distance is the distance of the world's centre plus an offset, so that far worlds keep their relief.
         distance = (away.clamp(-6.0, 6.0) - view.log_spread[:, None]).exp().mT[..., None]  # (S, B, 1)
@@ -315,7 +314,7 @@ class SetInit(Configured):
         noises = self._noise(corr, view, noise)
         if self.samples:
             fallback = Pose(rotation[:, :, 0], translation[:, 0])
-            sampled = self._sampled(corr, right, noises, fallback, rings=not search_follows)
+            sampled = self._sampled(corr, right, noises, fallback, search_follows)
             rotation, translation = (
                 torch.cat((x, y[..., None, :]), -2) for x, y in zip((rotation, translation), sampled, strict=True)
             )
@@ -323,24 +322,26 @@ class SetInit(Configured):
         others = Pose(*(x[:, 1:] for x in every)) if every.rotation.shape[1] > 1 else None
         return Guess(Pose(*(x[:, 0] for x in every)), right, others=others, noise=noises)
 
-    def triples(self, count: int, *, rings: bool = True) -> dict[int, list[tuple[int, int, int]]]:
+    def triples(self, count: int, *, search_follows: bool = False) -> dict[int, list[tuple[int, int, int]]]:
         """Minimal samples of a problem.
 
         Args:
             count: number of pairs.
-            rings: with the samples of problems of many pairs.
+            search_follows: only those of the likeliest pairs. A search finds what the others would.
 
         Returns:
             Groups of samples, as ranks of pairs by likelihood, by the least number of pairs of a problem that uses the
             group. Groups that spread over more pairs help where the likeliest pairs are outliers that agree.
         """
         near = [x for x in _SAMPLES[: self.samples] if max(x) < count]
+        if search_follows:
+            return {0: near}
         spread = {least: [(f * i, f * j, f * k) for i, j, k in near] for least, f in _SPREADS.items() if least <= count}
-        ring = {least: ring for least, ring in _RING.items() if rings and least <= count}
+        ring = {least: ring for least, ring in _RING.items() if least <= count}
         return {0: near, **spread, **ring}
 
     @torch.no_grad()
-    def _sampled(self, corr: Correspondences, right: Tensor, noise: Noise, fallback: Pose, rings: bool) -> Pose:
+    def _sampled(self, corr: Correspondences, right: Tensor, noise: Noise, fallback: Pose, search_follows: bool) -> Pose:
         """The best pose of the minimal samples by the score of the likeliest pairs; problems last."""
         batch, count = right.shape
         there = corr.near_weights > 0
@@ -355,7 +356,7 @@ class SetInit(Configured):
             chances, count = functional.pad(chances, (0, MOST_JUDGES)), count + MOST_JUDGES
         likely = chances.topk(min(MOST_JUDGES, count)).indices
         pairs = take_pairs(of_pairs, likely)  # (8, K, B)
-        samples = self.triples(count, rings=rings)
+        samples = self.triples(count, search_follows=search_follows)
         drawn = [sample for group in samples.values() for sample in group]
         # (6, 3, S B), stacked, not indexed, so that a compiler copies whole rows.
         three = torch.stack([pairs[:6, k] for column in zip(*drawn, strict=True) for k in column], 1)
@@ -397,15 +398,15 @@ class SetInit(Configured):
         return Pose(*(torch.where(found, x, y) for x, y in zip((rotation, translation), fallback, strict=True)))
 
     def _run(self, features: Tensor, there: Tensor) -> tuple[Tensor, Tensor]:
-        """The network: outputs for each pair, (B, N, 1 + 2 S), and for each problem, (B, S + 2)."""
+        """The network: outputs for each pair, (1 + 2 S, B, N), and for each problem, (B, S + 2)."""
         x = self.first(features.to(self.first.weight.dtype))
-        absent = torch.where(there > 0, 0.0, _ABSENT).to(x.dtype)[..., None]
+        absent = torch.where(there > 0, 0.0, _ABSENT).to(x.dtype)
         for block in self.blocks:
             x = block(x, absent)
         x = self.norm(x)
-        pair = _by_channel(x, self.pair.weight) + self.pair.bias
-        share = (pair[..., :1] + absent).softmax(1)
-        return pair, self.problem((share * x).sum(1))
+        pair = _by_channel(x, self.pair.weight) + self.pair.bias[:, None, None]
+        share = (pair[0] + absent).softmax(-1)
+        return pair, self.problem(torch.bmm(share[:, None], x)[:, 0])
 
     def _noise(self, corr: Correspondences, view: _View, estimate: Tensor) -> Noise:
         """The known noise, and the network's estimate where unknown."""

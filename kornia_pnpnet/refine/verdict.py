@@ -54,8 +54,8 @@ LEAST_PROBABILITY = 0.93
 #: :func:`residual_noise`. Fitted by ``python docs/results/make.py measure --only probability``.
 LAWS = {"sigmas": (-3.2501, -0.16608, -1.0784), "residuals": (0.89795, -0.27745, 0.070018)}
 _ALARMS, _LOG_SIGMA = (-20.0, 10.0), (-12.0, 2.0)
-# Pairs. The pixels of this many stand for those of all pairs in :func:`chance_of_others`.
-_MOST_OTHERS = 128
+# Pairs. This many stand for all pairs in :func:`chance_of_others`.
+_MOST_OTHERS = 64
 # Pixels of other pairs near a projection. This many are left out of the count: pixels of right pairs may be close, too.
 _FEW_HITS = 4
 # Standard deviations. Pairs further off than this are no evidence for a pose.
@@ -355,25 +355,24 @@ def chance_of_others(projection: Projection, corr: Correspondences, thresholds: 
         judged: what :func:`judge` returned.
 
     Returns:
-        At most 1, shape :math:`(B,)`. Of more than 128 pairs, evenly spaced ones stand for all.
+        At most 1, shape :math:`(B,)`. Of more than 64 pairs, evenly spaced ones stand for all.
     """
     there = corr.weights > 0
     worst = torch.where(judged.weights > 0, judged.errors, 0.0).amax(-1, keepdim=True)
     limit = torch.where(projection.in_front & there, worst * _sq_limits(projection, corr, thresholds), -1.0)
-    pixels, is_other, counts = corr.img_points, there, there.sum(-1)
-    own = others = torch.arange(corr.weights.shape[1], device=there.device)
-    if not exporting() and len(own) > _MOST_OTHERS:  # evenly spaced among those that are no padding
-        first = own[:_MOST_OTHERS]
-        others = present_first(there).gather(1, first.maximum(first * counts[:, None] // _MOST_OTHERS))
-        pixels, is_other = pixels.gather(1, others[..., None].expand(-1, -1, 2)), there.gather(1, others)
-    u, v = (
-        (corr.focal * x)[:, :, None] - y[:, None]
-        for x, y in zip(projection.plane_points, pixels.unbind(-1), strict=True)
-    )
-    hits = (torch.addcmul(u * u, v, v) <= limit[..., None]) & is_other[:, None]
-    hits = hits & (own[:, None] != others[..., None, :])
-    tested = (counts - 1) * is_other.sum(-1)
-    return (hits.sum((1, 2)) - _FEW_HITS).clamp(min=0) / tested.clamp(min=1)
+    pixels = torch.where(there[..., None], corr.img_points, torch.inf)
+    values = torch.cat((corr.focal * torch.stack(projection.plane_points, -1), pixels, limit[..., None]), -1)
+    counts = there.sum(-1)
+    if not exporting() and values.shape[1] > _MOST_OTHERS:  # evenly spaced among those that are no padding
+        first = torch.arange(_MOST_OTHERS, device=there.device)
+        some = present_first(there).gather(1, first.maximum(first * counts[:, None] // _MOST_OTHERS))
+        values = values.gather(1, some[..., None].expand(-1, -1, 5))
+        counts = counts.clamp(max=_MOST_OTHERS)
+    u, v, pixel_u, pixel_v, limit = values.unbind(-1)
+    own = (u - pixel_u).square_().addcmul_(v - pixel_v, v - pixel_v) <= limit
+    u, v = u[:, :, None] - pixel_u[:, None], v[:, :, None] - pixel_v[:, None]
+    hits = (u.square_().addcmul_(v, v) <= limit[..., None]).sum((1, 2)) - own.sum(-1)
+    return (hits - _FEW_HITS).clamp(min=0) / (counts * (counts - 1)).clamp(min=1)
 
 
 def _sq_limits(projection: Projection, corr: Correspondences, thresholds: Thresholds) -> Tensor:
