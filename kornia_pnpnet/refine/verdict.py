@@ -369,9 +369,9 @@ def chance_of_others(projection: Projection, corr: Correspondences, thresholds: 
         values = values.gather(1, some[..., None].expand(-1, -1, 5))
         counts = counts.clamp(max=_MOST_OTHERS)
     u, v, pixel_u, pixel_v, limit = values.unbind(-1)
-    own = (u - pixel_u).square_().addcmul_(v - pixel_v, v - pixel_v) <= limit
     u, v = u[:, :, None] - pixel_u[:, None], v[:, :, None] - pixel_v[:, None]
-    hits = (u.square_().addcmul_(v, v) <= limit[..., None]).sum((1, 2)) - own.sum(-1)
+    near = u.square_().addcmul_(v, v) <= limit[..., None]
+    hits = near.sum((1, 2)) - near.diagonal(dim1=1, dim2=2).sum(-1)
     return (hits - _FEW_HITS).clamp(min=0) / (counts * (counts - 1)).clamp(min=1)
 
 
