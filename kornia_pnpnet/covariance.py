@@ -8,16 +8,17 @@ from kornia.core.exceptions import ValueCheckError
 from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.liegroup import So3
 from torch import Tensor
+from torch.nn import functional
 
-from kornia_pnpnet.core.checks import Shapes, check_devices, check_shapes, common_dtype
+from kornia_pnpnet.core.checks import Shapes, check_devices, check_positive, check_shapes, common_dtype
 from kornia_pnpnet.core.linalg import symmetric
 from kornia_pnpnet.core.symmetric import are_semi_definite
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import normal_equations, project
 from kornia_pnpnet.inputs import checked_noise
-from kornia_pnpnet.refine.prior import add_prior, prior_in_frame
+from kornia_pnpnet.refine.prior import add_focal_prior, add_prior, prior_in_frame
 from kornia_pnpnet.refine.step import pixel_precision
-from kornia_pnpnet.types import LEAST_NOISE, Correspondences, Noise, Pose, PosePrior, camera_matrices
+from kornia_pnpnet.types import LEAST_NOISE, Correspondences, FreeFocal, Noise, Pose, PosePrior, camera_matrices
 
 __all__ = ["pose_covariance"]
 
@@ -34,6 +35,8 @@ def pose_covariance(
     world_cov: Tensor | None = None,
     weights: Tensor | None = None,
     prior: PosePrior | None = None,
+    focal: str = "known",
+    focal_sigma: float | None = None,
 ) -> Tensor:
     r"""First-order covariance of a pose found by weighted least squares.
 
@@ -65,17 +68,22 @@ def pose_covariance(
             `p3p-ransac` with a ``world_threshold`` also depend on the depth: pass ``(result.weights > 0).double()``.
             ``None``: 1 for every pair.
         prior: the prior that the pose was found with; its information adds to that of the pairs.
+        focal: ``"known"``, or ``"unknown"``: the pose was found together with the focal length of the ``intrinsics``,
+            which are then the ``intrinsics`` of the result.
+        focal_sigma: standard deviation of the logarithm of the focal length that was expected, see
+            :class:`~kornia_pnpnet.solver.PnPNet`; its information adds to that of the pairs.
 
     Returns:
-        Shape :math:`(B, 6, 6)`, in radians and the unit of the world, float64 when the points, the camera, the weights
-        or the pose are, else float32. Where the pairs do not determine the pose, or a
-        covariance is not positive semi-definite, the diagonal is infinite and all other entries are 0.
+        Shape :math:`(B, 6, 6)`, with an unknown focal length :math:`(B, 7, 7)`, whose last row and column are of the
+        logarithm of the focal length; in radians and the unit of the world, float64 when the points, the camera, the
+        weights or the pose are, else float32. Where the pairs do not determine the pose, or a covariance is not
+        positive semi-definite, the diagonal is infinite and all other entries are 0.
 
     Raises:
         ShapeError: when shapes do not match.
         TypeCheckError: when a sigma is neither a number nor a tensor, or a tensor holds booleans or complex numbers.
         DeviceError: when tensors are on different devices.
-        ValueCheckError: without the noise of the pixels, or with both a sigma and a covariance.
+        ValueCheckError: without the noise of the pixels, with both a sigma and a covariance, or for another ``focal``.
 
     Example:
         >>> from kornia_pnpnet.data import SyntheticProblems
@@ -100,6 +108,8 @@ def pose_covariance(
     tensors = {name: tensor for name, (tensor, _) in shapes.items()}
     check_devices(tensors, world_points)
     dtype = common_dtype({"world_points": world_points, **tensors})
+    if focal not in ("known", "unknown") or (focal == "known" and focal_sigma is not None):
+        raise ValueCheckError(f"focal must be 'known', or 'unknown' with or without focal_sigma, got {focal!r}.")
     if img_sigma is None and img_cov is None:
         raise ValueCheckError("pose_covariance needs the noise of the pixels: img_sigma or img_cov.")
     world_sigma = 0.0 if world_sigma is None and world_cov is None else world_sigma
@@ -125,7 +135,12 @@ def pose_covariance(
     sound = [(are_semi_definite(x) | (inlier == 0)).all(1) for x in noise.covariances]
     noise = _in_unit_frame(noise, camera, mean_focal, spread, inlier != 0)
     pair_weights = map_tensors(lambda x: inlier * x, pixel_precision(projection, noise, unit_focal))
-    equations = normal_equations(projection, pair_weights)
+    equations = normal_equations(projection, pair_weights, free_focal=focal == "unknown")
+    if focal_sigma is not None:
+        check_positive(focal_sigma=focal_sigma)
+        one = torch.ones_like(spread[:, 0])
+        known_focal = FreeFocal(one, one * focal_sigma**-2, one, one)
+        equations = add_focal_prior(equations, known_focal, one, one)
     if prior is not None:
         known = map_tensors(torch.Tensor.double, prior)
         one = torch.ones_like(spread[:, 0])
@@ -133,20 +148,27 @@ def pose_covariance(
         sound.append(usable)
         equations = add_prior(equations, framed, centred_pose, one, unit_focal)
     information = symmetric(equations.hessian)
+    size = information.shape[-1]
     with torch.no_grad():
         inverse, info = torch.linalg.inv_ex(information)
         positive = (inverse.diagonal(dim1=1, dim2=2) > 0).all(-1)
         determined = (info == 0) & inverse.isfinite().all((1, 2)) & positive
         determined = torch.stack((determined, *sound)).all(0)[:, None, None]
-    inverse = torch.linalg.inv_ex(torch.where(determined, information, torch.eye(6).to(information))).inverse
+    inverse = torch.linalg.inv_ex(torch.where(determined, information, torch.eye(size).to(information))).inverse
 
     # Back to the given coordinates: omega stays, v = spread * v_centred + (R centroid) x omega.
     eye = torch.eye(3, dtype=torch.float64, device=points.device).expand(batch, 3, 3)
     omega_rows = torch.cat((eye, torch.zeros_like(eye)), -1)
     v_rows = torch.cat((So3.hat(rotated_centroid), spread[..., None] * eye), -1)
     back = torch.cat((omega_rows, v_rows), 1)  # (B, 6, 6)
+    if size == 7:  # the depth of the centroid grows with the focal length, see `dolly_zoom`
+        depth = pose.translation[:, 2].double() + rotated_centroid[:, 2]
+        back = functional.pad(back, (0, 1, 0, 1))
+        more = torch.zeros_like(back)
+        more[:, 5, 6], more[:, 6, 6] = depth, 1.0
+        back = back + more
     covariance = back @ torch.where(determined, inverse, 0.0) @ back.mT
-    undetermined = covariance.new_full((6,), torch.inf).diag()
+    undetermined = covariance.new_full((size,), torch.inf).diag()
     return torch.where(determined, covariance, undetermined).to(dtype)
 
 

@@ -14,7 +14,7 @@ from kornia_pnpnet.core.checks import Shapes, check_devices, check_shapes, commo
 from kornia_pnpnet.core.performance import present_first, sees_values
 from kornia_pnpnet.core.symmetric import Symmetric2, Symmetric3, equivalent_sigma
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.types import Noise, PnPResult, Pose, PosePrior, camera_matrices
+from kornia_pnpnet.types import FreeFocal, Noise, PnPResult, Pose, PosePrior, camera_matrices
 
 __all__ = [
     "Inputs",
@@ -34,7 +34,10 @@ _LEAST_PAIRS = 16
 
 
 class Inputs(NamedTuple):
-    """Arguments of a call as one batch in one dtype: a camera per problem, sigmas per pair where any is known."""
+    """Arguments of a call as one batch in one dtype: a camera per problem, sigmas per pair where any is known.
+
+    Where a solver estimates the focal length, ``free_focal`` says in pixels of the caller what is known of it.
+    """
 
     world_points: Tensor
     img_points: Tensor
@@ -45,6 +48,7 @@ class Inputs(NamedTuple):
     noise: Noise | None
     confidence: Tensor | None
     prior: PosePrior | None = None
+    free_focal: FreeFocal | None = None
 
 
 class Part(NamedTuple):

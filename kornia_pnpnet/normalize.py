@@ -57,6 +57,8 @@ class Frame(NamedTuple):
         img_scale: factor of pixels, the geometric mean of both axes, shape :math:`(B,)`.
         order: position in the input of each normalised pair, int64, shape :math:`(B, N)`; ``None``: unchanged.
         status: ``Status.SOLVED`` where the problem can be solved at all, else why not, int64, shape :math:`(B,)`.
+        intrinsics: the camera matrices with a last entry of 1, the identity where they are impossible, shape
+            :math:`(B, 3, 3)`.
     """
 
     centroid: Tensor
@@ -64,6 +66,7 @@ class Frame(NamedTuple):
     img_scale: Tensor
     order: Tensor | None
     status: Tensor
+    intrinsics: Tensor
 
     @property
     def valid(self) -> Tensor:
@@ -218,7 +221,9 @@ class Normalize(Configured):
             is_near = is_near.gather(0, order.mT)
         world_points, img_points, weights = rows.permute(2, 1, 0).split((3, 2, 1), -1)
         horizontal, vertical = img_scales.sqrt()
-        frame = Frame(centroid.mT, scale, horizontal * vertical, order, status)
+        eye = torch.eye(3, dtype=camera.dtype, device=camera.device).view(9, 1)
+        matrices = torch.where(is_camera, camera, eye).mT.unflatten(1, (3, 3))
+        frame = Frame(centroid.mT, scale, horizontal * vertical, order, status, matrices)
         if noise is not None:
             # Scaling an infinite sigma would give gradients of NaN: an invalid problem has no known noise.
             sigmas = map_tensors(lambda sigma: torch.where(has_noise[:, None], sigma, torch.nan), noise.sigmas)

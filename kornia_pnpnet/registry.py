@@ -121,7 +121,8 @@ def create_solver(name: str, **options: Any) -> nn.Module:
             ``epnp-lm`` take the arguments of :class:`~kornia_pnpnet.init.EPnP`, ``reppnp`` and ``reppnp-lm`` of
             :class:`~kornia_pnpnet.init.REPPnP`, ``p3p-ransac`` and ``ransac-epnp-lm`` of
             :class:`~kornia_pnpnet.init.RANSAC`, peers of their class in :mod:`kornia_pnpnet.peers`. All
-            but the peers take ``gradient`` and ``effort``, see :class:`~kornia_pnpnet.solver.PnPNet`.
+            but the peers take ``gradient``, ``effort``, ``focal`` and ``focal_sigma``, see
+            :class:`~kornia_pnpnet.solver.PnPNet`.
 
     Returns:
         The solver as a module in evaluation mode.
@@ -138,7 +139,7 @@ def create_solver(name: str, **options: Any) -> nn.Module:
     builders = _builders()
     if not isinstance(name, str) or name not in builders:
         raise ValueCheckError(f"No solver {name!r}. There are: {', '.join(sorted(builders))}.")
-    ours = {key: options.pop(key) for key in ("effort", "gradient") if key in options}
+    ours = {key: options.pop(key) for key in ("effort", "gradient", "focal", "focal_sigma") if key in options}
     try:
         solver = builders[name](**options).eval()
         if not ours:

@@ -10,12 +10,19 @@ from kornia.core.check import KORNIA_CHECK
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
-from kornia_pnpnet.core.checks import check_whole
+from kornia_pnpnet.core.checks import check_positive, check_whole
 from kornia_pnpnet.core.linalg import bound_gradient, gate
 from kornia_pnpnet.core.performance import Compiled, in_full_precision, sees_values
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.init import RANSAC, MLPInit, SetInit
 from kornia_pnpnet.init.alternatives import doubt_mirrored, find_alternatives, is_seen
+from kornia_pnpnet.init.focal import (
+    finds_focal,
+    free_focal_in_frame,
+    scale_focal,
+    with_found_focal,
+    with_nominal_focal,
+)
 from kornia_pnpnet.init.ransac import search_on
 from kornia_pnpnet.init.ransac.search import take
 from kornia_pnpnet.inputs import Inputs, checked_inputs, joined, restore_leading, split_batch
@@ -72,9 +79,18 @@ class PnPNet(PretrainedMixin):
             (see :meth:`~kornia_pnpnet.normalize.Normalize.views`), which a network answers differently. All guesses are
             refined; after seven tenths of the iterations the best one goes on alone. More views cost more and solve
             more. The number may differ from that of the training.
+        focal: ``"known"``, or ``"unknown"``: the focal length is estimated with the pose and returned in the result's
+            ``intrinsics``. Those of the call then give the principal point, the aspect ratio and the skew relative to
+            the focal length. A first estimate comes from P3P at focal lengths of fields of view from 14 to 118 degrees,
+            without ``focal_sigma``; the refinement has the logarithm of the focal length as a seventh parameter. Where
+            the pairs leave it open by more than 15 % (a plane seen from the front, little depth) the problem is not
+            ``ok``.
+        focal_sigma: standard deviation of the logarithm of the focal length in the intrinsics of a call, for example
+            0.1 for one that is known to about 10 %; ``None``: the focal length in the intrinsics is ignored.
 
     Raises:
-        BaseError: when ``views`` is not an integer from 1 to 8, or ``gradient`` or ``effort`` neither of its values.
+        BaseError: when ``views`` is not an integer from 1 to 8, or ``gradient``, ``effort`` or ``focal`` neither of its
+            values, or ``focal_sigma`` not positive, or given with a known focal length.
 
     Example:
         >>> from kornia_pnpnet.data import SyntheticProblems
@@ -94,12 +110,18 @@ class PnPNet(PretrainedMixin):
         views: int = 1,
         gradient: str = "ok",
         effort: str | None = None,
+        focal: str = "known",
+        focal_sigma: float | None = None,
     ) -> None:
         super().__init__()
         check_whole(1, len(VIEWS), views=views)
         self.gradient = _checked_gradient(gradient)
         KORNIA_CHECK(effort in (None, "fixed", "adaptive"), f"effort must be 'fixed' or 'adaptive', got {effort!r}.")
-        self.effort = effort
+        KORNIA_CHECK(focal in ("known", "unknown"), f"focal must be 'known' or 'unknown', got {focal!r}.")
+        if focal_sigma is not None:
+            check_positive(focal_sigma=focal_sigma)
+            KORNIA_CHECK(focal == "unknown", "focal_sigma is for focal='unknown'.")
+        self.effort, self.focal, self.focal_sigma = effort, focal, focal_sigma
         self.views = int(views)
         self.init = init
         self.refine = RobustWeightedLM(learnable=False) if refine is None else refine
@@ -234,7 +256,7 @@ class PnPNet(PretrainedMixin):
         size, inputs = checked_inputs(*given, confidence, prior)
         with in_full_precision(inputs.world_points.device.type):
             always = _checked_gradient(gradient or self.gradient) == "always"
-            begun, result = self._parts(first_stage_only, always, inputs)
+            begun, _, result = self._parts(first_stage_only, always, inputs)
             return restore_leading(size, (result, self.normalize.undo_guess(begun.guess, begun.frame)))
 
     def compile(self, mode: str | None = None, *, whole: bool = False) -> None:
@@ -260,18 +282,23 @@ class PnPNet(PretrainedMixin):
             self.refine.compile(mode)
 
     def _in_parts(self, first_stage_only: bool, always: bool, inputs: Inputs, alternatives: int = 0) -> PnPResult:
-        begun, result = self._parts(first_stage_only, always, inputs)
+        begun, zoom, result = self._parts(first_stage_only, always, inputs)
         if not alternatives:
             return result
         start, frame, guess = begun
         pose = self.normalize.apply_to_pose(result.pose, frame)
-        found = find_alternatives(self.refine, start.corr, guess, pose, frame.valid, alternatives)
+        corr = start.corr.seen_with(zoom)
+        found = find_alternatives(self.refine, corr, guess, pose, frame.valid, alternatives)
         poses = self.normalize.undo_poses(Pose(found.rotation, found.translation), frame)
         translation = torch.where(found.valid[..., None], poses.translation, 0.0)
         return result._replace(alternatives=found._replace(translation=translation))
 
-    def _parts(self, first_stage_only: bool, always: bool, inputs: Inputs) -> tuple[_Begun, PnPResult]:
+    def _parts(self, first_stage_only: bool, always: bool, inputs: Inputs) -> tuple[_Begun, Tensor | None, PnPResult]:
         """Before the iterations, the iterations, and after them."""
+        given = inputs
+        if self.focal == "unknown":
+            inputs = with_nominal_focal(inputs, self.focal_sigma)
+            inputs = inputs if finds_focal(self.init) else with_found_focal(inputs)
         views = 1 if first_stage_only or self.refine.m == 0 else self.views
         searches = not first_stage_only and self._searches(inputs)
         if not searches:
@@ -285,22 +312,25 @@ class PnPNet(PretrainedMixin):
         if searches:
             start, frame, guess = begun
             pose = self.normalize.apply_to_pose(result.pose, frame)
-            result = doubt_mirrored(self.refine, start.corr, guess, pose, result, always)
+            corr = start.corr.seen_with(end.zoom)
+            result = doubt_mirrored(self.refine, corr, guess, pose, result, always)
             if inputs.noise is None:
-                result = self._with_more_noise(always, inputs, self.normalize.undo_guess(guess, frame).noise, result)
-        return begun, result
+                result = self._with_more_noise(always, given, self.normalize.undo_guess(guess, frame).noise, result)
+        return begun, end.zoom, result
 
     def _with_more_noise(self, always: bool, inputs: Inputs, noise: Noise | None, result: PnPResult) -> PnPResult:
         """Solve once more, with the noise that the residuals show, the problems whose noise was underestimated."""
         assert noise is not None
         before = 1.0 if inputs.weights is None else inputs.weights
-        sigma = larger_sigma(*inputs[:3], result.pose, result.weights / before, noise, inputs.confidence)
+        assert result.intrinsics is not None
+        seen = inputs.world_points, inputs.img_points, result.intrinsics, result.pose
+        sigma = larger_sigma(*seen, result.weights / before, noise, inputs.confidence)
         rows = (sigma[:, 0] > 0).nonzero()[:, 0]
         if not len(rows):
             return result
         shown = Noise(sigma[rows], torch.zeros_like(sigma[rows]))
         again = take(inputs, rows)._replace(noise=shown)
-        solved = self._parts(False, always, again)[1]
+        solved = self._parts(False, always, again)[2]
         return map_tensors(lambda x, y: x.index_copy(0, rows, y), result, solved)
 
     def _searches(self, inputs: Inputs) -> bool:
@@ -319,7 +349,7 @@ class PnPNet(PretrainedMixin):
         self, views: int, always: bool, inputs: Inputs, search_follows: bool
     ) -> tuple[Correspondences, Frame, Guess]:
         """Normalise and guess."""
-        world_points, img_points, intrinsics, weights, mask, init, noise, confidence, prior = inputs
+        world_points, img_points, intrinsics, weights, mask, init, noise, confidence, prior, free_focal = inputs
         corr, frame = self.normalize(world_points, img_points, intrinsics, weights, mask, noise, confidence)
         if always:
             world, img, pair_weights = (bound_gradient(x, _LONGEST_GRADIENT) for x in corr[:3])
@@ -328,6 +358,8 @@ class PnPNet(PretrainedMixin):
             known, usable = prior_in_frame(prior, frame.centroid, frame.scale, frame.img_scale)
             corr, init = corr._replace(prior=known), prior.pose if init is None else init
             frame = frame._replace(status=torch.where(usable, frame.status, Status.NOT_FINITE.value))
+        if free_focal is not None:
+            corr = corr._replace(free_focal=free_focal_in_frame(free_focal, frame))
         given = self._given(init, world_points, frame) if self.init is None or init is not None else None
         options = {"search_follows": True} if search_follows and isinstance(self.init, SetInit) else {}
         if self.init is None:
@@ -371,12 +403,16 @@ class PnPNet(PretrainedMixin):
         # since every entry was multiplied by a coordinate of the centroid.
         finite = frame.valid & (pose.translation.sum(-1) + refined.weights.sum(-1) + refined.cost).isfinite()
         ok = finite & refined.ok if guess.ok is None else finite & refined.ok & guess.ok
+        intrinsics = frame.intrinsics
+        if refined.zoom is not None:
+            intrinsics = scale_focal(intrinsics, torch.where(finite, refined.zoom, 0.0).exp())
         first_ok = frame.valid & first.translation.sum(-1).isfinite()
         status = torch.where(refined.in_front, Status.NOT_BELIEVED.value, Status.BEHIND.value)
         status = torch.where(ok, Status.SOLVED.value, torch.where(finite, status, Status.DEGENERATE.value))
         # ONNX Runtime chooses among int64, not among int8.
         status = torch.where(frame.valid, status, frame.status).to(torch.int8)
         live = finite if always else ok
+        intrinsics = gate(intrinsics, live, torch.ones_like(finite), 0.0)
         pose = _gate_pose(pose, live, finite)
         return PnPResult(
             *pose,
@@ -387,6 +423,7 @@ class PnPNet(PretrainedMixin):
             status,
             torch.where(finite, refined.probability, 0.0),
             Alternatives.none(pose),
+            intrinsics,
         )
 
 

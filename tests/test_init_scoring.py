@@ -8,7 +8,7 @@ import torch
 from kornia_pnpnet import Correspondences, Pose
 from kornia_pnpnet.geometry import project, transform
 from kornia_pnpnet.init.ransac.scoring import Scene, standardised_errors
-from kornia_pnpnet.refine.verdict import MAX_ERROR, Thresholds, judge
+from kornia_pnpnet.refine.inliers import MAX_ERROR, Thresholds, judge
 
 
 @pytest.fixture

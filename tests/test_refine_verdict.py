@@ -14,9 +14,7 @@ from kornia_pnpnet import Correspondences, Pose, create_solver, pose_errors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.geometry import project, transform
 from kornia_pnpnet.refine import scale
-from kornia_pnpnet.refine.verdict import (
-    LAWS,
-    LEAST_PROBABILITY,
+from kornia_pnpnet.refine.inliers import (
     MAX_ERROR,
     Judged,
     Thresholds,
@@ -25,6 +23,7 @@ from kornia_pnpnet.refine.verdict import (
     judge,
     log_false_alarms,
 )
+from kornia_pnpnet.refine.verdict import LAWS, LEAST_PROBABILITY
 
 
 def test_inliers_weigh_by_the_inverse_of_their_threshold(make_problems, correspond):

@@ -158,6 +158,7 @@ class PeerSolver(nn.Module):
             torch.from_numpy(np.where(ok, Status.SOLVED, status).astype(np.int8)).to(world_points.device),
             back(ok.astype(np.float64)),
             Alternatives.none(pose),
+            back(np.where((status == Status.CAMERA)[:, None, None], np.eye(3), cameras)),
         )
         return restore_leading(size, result)
 

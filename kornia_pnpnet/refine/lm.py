@@ -18,22 +18,21 @@ from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.linalg import relative
 from kornia_pnpnet.core.performance import Compiled, per_problem, problems_last, repeat_problems
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.geometry import NormalEquations, Projection, move, project
+from kornia_pnpnet.geometry import Projection, project
+from kornia_pnpnet.refine.implicit import attach_gradient
 from kornia_pnpnet.refine.kernels import KERNELS, RobustKernel
 from kornia_pnpnet.refine.parameters import BoundedParameter
-from kornia_pnpnet.refine.prior import prior_loss
+from kornia_pnpnet.refine.prior import focal_loss, prior_loss
 from kornia_pnpnet.refine.scale import complete_noise, is_unknown
 from kornia_pnpnet.refine.stages import LMStart, Stage, State
 from kornia_pnpnet.refine.step import (
     LMStep,
     corrected_residuals,
     iterate,
-    outlier_area,
-    solve_damped,
     sq_standardised,
-    weighted_equations,
 )
-from kornia_pnpnet.refine.verdict import believe, explains, has_enough, residual_noise
+from kornia_pnpnet.refine.variance import outlier_area
+from kornia_pnpnet.refine.verdict import believe, explains, has_enough, has_focal, residual_noise
 from kornia_pnpnet.types import Correspondences, Guess, Pose, Refinement
 
 __all__ = ["BACKWARDS", "RobustWeightedLM"]
@@ -247,6 +246,10 @@ class RobustWeightedLM(Configured):
         if len(poses) > 1:
             starts = repeat_problems(guided, len(poses))
             rivals = starts._replace(weights=repeat_problems(by_residual.weights, len(poses)))
+        zoom = None
+        if corr.free_focal is not None:
+            first = torch.zeros_like(prior[:, 0]) if guess.zoom is None else guess.zoom
+            zoom = torch.cat((first, *(torch.zeros_like(first) for _ in poses[1:])))
         # Problems last in memory, too: (3, 3, S B) and (3, S B).
         pose = map_tensors(lambda *x: torch.cat([y.movedim(0, -1) for y in x], -1).movedim(-1, 0), *poses)
         return LMStart(
@@ -259,6 +262,7 @@ class RobustWeightedLM(Configured):
             rivals=rivals,
             outlier_area=area,
             noiseless=noiseless,
+            zoom=zoom,
             step=step,
             damping=damping,
             shape=shape,
@@ -303,13 +307,14 @@ class RobustWeightedLM(Configured):
         live = {"unroll": 0, "truncated": max(m - self.last, 0), "implicit": m}[self.backward]
         plan = self.stages(start, m)
         ones = torch.ones_like(start.pose.translation[:, 0])
-        state = State(start.pose, ones.bool(), ones)
+        state = State(start.pose, ones.bool(), ones, start.zoom)
         for stage in plan:
             with torch.set_grad_enabled(torch.is_grad_enabled() and stage.iteration >= live):
                 state = stage.advance(state)
+        end = LMStep(state.pose, state.solved, state.zoom)
         if self.backward == "implicit" and m and torch.is_grad_enabled():
-            return LMStep(self._attach_gradient(start, state.pose, start.shape[m - 1]), state.solved)
-        return LMStep(state.pose, state.solved)
+            return attach_gradient(start, end, start.shape[m - 1], self.kernel.weight)
+        return end
 
     def finish(self, start: LMStart, end: LMStep) -> Refinement:
         """Judge where the iterations ended: everything after the last iteration.
@@ -321,6 +326,7 @@ class RobustWeightedLM(Configured):
         Returns:
             See :meth:`forward`.
         """
+        start = start.zoomed(end.zoom)
         projection, shape = project(end.pose, start.corr), per_problem(start.shape[-1], start.prior[:, :1])
         pairs = start.corr._replace(weights=start.by_residual.weights)
         sq_residual, noise = corrected_residuals(projection, pairs, self.kernel.weight, shape, start.outlier_area)
@@ -335,7 +341,9 @@ class RobustWeightedLM(Configured):
             # Not `where`: ONNX Runtime has none for booleans.
             ok = (unknown & explains(projection, start.corr, start.prior)) | (~unknown & ok)
         in_front = has_enough(projection, start.prior)
-        return Refinement(end.pose, weights, cost, end.solved & ok & in_front, in_front, probability)
+        if end.zoom is not None:
+            ok = ok & has_focal(projection, judged._replace(noise=noise), weights)
+        return Refinement(end.pose, weights, cost, end.solved & ok & in_front, in_front, probability, end.zoom)
 
     def cost(self, start: LMStart, pose: Pose) -> Tensor:
         """The ``cost`` of :meth:`finish` at any pose, shape :math:`(B,)`.
@@ -370,24 +378,29 @@ class RobustWeightedLM(Configured):
     ) -> State:
         """One iteration. With ``reject_worse``, a problem whose cost would rise keeps its pose."""
         damping = damping * state.factor if self.reject_worse else damping
-        pose, solved = self._iterate(pairs, state.pose, step, damping, shape, area)
+        here = pairs.zoomed(state.zoom)
+        pose, solved, change = self._iterate(here, state.pose, step, damping, shape, area)
+        zoom = None if state.zoom is None or change is None else state.zoom + change
         if not self.reject_worse or area is not None:  # the cost does not know the corrected noise
-            return State(pose, solved, state.factor)
-        new, old = (self._cost(x, project(x, pairs), pairs, pairs.weights, shape) for x in (pose, state.pose))
+            return State(pose, solved, state.factor, zoom)
+        at = (pose, pairs.zoomed(zoom)), (state.pose, here)
+        new, old = (self._cost(x, project(x, seen), seen, seen.weights, shape) for x, seen in at)
         # At a minimum, rounding decides which cost is lower. A refused step has no gradient there: take the step.
         rounding = _ROUNDING * torch.finfo(new.dtype).eps
-        better = new <= old * (1.0 + rounding) + (rounding * pairs.focal).square()
+        better = new <= old * (1.0 + rounding) + (rounding * here.focal_of_problem).square()
         factor = torch.where(better, state.factor * _DAMPING_DOWN, state.factor * _DAMPING_UP)
 
         def chosen(new: Tensor, old: Tensor) -> Tensor:
             return torch.where(better.view(-1, *(1,) * (new.ndim - 1)), new, old)
 
-        return State(map_tensors(chosen, pose, state.pose), solved, factor)
+        pose, zoom = map_tensors(chosen, (pose, zoom), (state.pose, state.zoom))
+        return State(pose, solved, factor, zoom)
 
     def _best_pose(self, rivals: Correspondences, prior: Tensor, shape: Tensor, state: State) -> State:
         """Keep the pose of the lowest cost of each problem; ``prior`` has as many problems as there are."""
         batch = prior.shape[0]
-        pose = map_tensors(torch.Tensor.detach, state.pose)
+        pose, zoom = map_tensors(torch.Tensor.detach, (state.pose, state.zoom))
+        rivals = rivals.zoomed(zoom)
         cost = self._cost(pose, project(pose, rivals), rivals, rivals.weights, shape.detach())
         best = (cost.view(-1, batch) if batch else cost[None]).argmin(0)  # (B,), the first of equals
         index = torch.add(torch.arange(batch, device=best.device), best, alpha=batch)
@@ -399,37 +412,13 @@ class RobustWeightedLM(Configured):
         sq_residual = sq_standardised(projection, corr, most)
         count = (corr.weights > 0).sum(-1).clamp(min=1)
         total = (prior * self.kernel.loss(sq_residual, shape)).sum(-1)
+        known = corr.prior or corr.free_focal
+        unit = known.pixel.square() if known is not None and corr.noise is None else 1.0
         if corr.prior is not None:
-            unit = corr.prior.pixel.square() if corr.noise is None else 1.0
             total = total + unit * prior_loss(corr.prior, pose)
+        if corr.free_focal is not None:
+            total = total + unit * focal_loss(corr.free_focal, corr.focal_of_problem)
         return total / count
-
-    def _attach_gradient(self, start: LMStart, pose: Pose, shape: Tensor) -> Pose:
-        r"""Give a converged pose the gradient of a minimum, by the implicit function theorem.
-
-        With :math:`g(\delta) = J^\top W r` at the pose moved by :math:`\delta`, which is 0 at the minimum,
-        :math:`d\delta = -(\partial g / \partial \delta)^{-1} dg`: one Newton step whose value is left out. Where the
-        matrix is not positive definite the pose is no minimum yet, and the Gauss-Newton matrix replaces it. A second
-        step with the same matrix makes second derivatives exact. Covariances turn with the pose, so that the matrix is
-        not quite symmetric: a third step takes most of the difference away.
-        """
-        equations = partial(weighted_equations, outlier_area=start.outlier_area, kernel_weight=self.kernel.weight)
-        pairs = start.by_residual
-        zero = [torch.zeros_like(start.prior[:, 0]).requires_grad_() for _ in range(6)]
-        with torch.enable_grad():
-            around, gradient = equations(pairs.map(torch.Tensor.detach), move(pose, zero), shape.detach())
-            hessian = [
-                torch.autograd.grad(entry.sum(), zero[: i + 1], retain_graph=True) for i, entry in enumerate(gradient)
-            ]
-        around, none = [[x.detach() for x in row] for row in around], torch.zeros_like(shape)
-        for _ in range(3 if pairs.noise is not None and pairs.noise.covariances else 2):
-            gradient = equations(pairs, pose, shape).gradient
-            newton, convex = solve_damped(NormalEquations(hessian, gradient), none)
-            gauss_newton, solved = solve_damped(NormalEquations(around, gradient), none)
-            both = zip(newton, gauss_newton, strict=True)
-            steps = [torch.where(convex, x, torch.where(solved, y, 0.0)) for x, y in both]
-            pose = move(pose, [step.detach() - step for step in steps])
-        return pose
 
 
 def _relative_to_mean(weights: Tensor) -> Tensor:

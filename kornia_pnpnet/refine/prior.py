@@ -11,10 +11,12 @@ from torch import Tensor
 from torch.nn import functional
 
 from kornia_pnpnet.geometry import NormalEquations
-from kornia_pnpnet.types import FramedPrior, Pose, PosePrior
+from kornia_pnpnet.types import FramedPrior, FreeFocal, Pose, PosePrior
 
 __all__ = [
+    "add_focal_prior",
     "add_prior",
+    "focal_loss",
     "gravity_prior",
     "prior_errors",
     "prior_in_frame",
@@ -181,8 +183,31 @@ def add_prior(
     weighted = jacobian.mT @ prior.information
     matrix = (weight / focal)[..., None] * (weighted @ jacobian)
     gradient = weight * (weighted @ error[..., None])[..., 0]
-    rows_of = [[x + matrix[:, i, j] for j, x in enumerate(row)] for i, row in enumerate(equations.hessian)]
-    return NormalEquations(rows_of, [x + gradient[:, i] for i, x in enumerate(equations.gradient)])
+    rows_of = [[x + matrix[:, i, j] for j, x in enumerate(row)] for i, row in enumerate(equations.hessian[:6])]
+    rows_of += [list(row) for row in equations.hessian[6:]]
+    slopes = [x + gradient[:, i] for i, x in enumerate(equations.gradient[:6])]
+    return NormalEquations(rows_of, [*slopes, *equations.gradient[6:]])
+
+
+def add_focal_prior(equations: NormalEquations, free: FreeFocal, unit: Tensor, focal: Tensor) -> NormalEquations:
+    """Add what is known of the focal length to normal equations of seven parameters.
+
+    Args:
+        equations: See add_prior.
+        free: what is known of the focal length.
+        unit: See add_prior.
+        focal: the focal length in pixels, (B,).
+    """
+    weight = free.information / (unit * focal)
+    *rows, last = equations.hessian
+    *gradient, slope = equations.gradient
+    slope = slope + weight * (focal / free.expected).log()
+    return NormalEquations([*rows, [*last[:-1], last[-1] + weight / focal]], [*gradient, slope])
+
+
+def focal_loss(free: FreeFocal, focal: Tensor) -> Tensor:
+    """Squared distance in standard deviations of a focal length (B,) from what is known of it, (B,)."""
+    return free.information * (focal / free.expected).log().square()
 
 
 def _is_usable(prior: PosePrior) -> Tensor:

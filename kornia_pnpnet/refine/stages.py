@@ -31,6 +31,8 @@ class LMStart(NamedTuple):
             :math:`(B, 1)`; ``None`` when there are no such iterations.
         noiseless: problems for which neither the caller gave a sigma nor the initialiser an estimate, although the
             caller gave one for others, bool :math:`(B,)`; ``None``: no such problems.
+        zoom: logarithm of the first focal lengths over those of the correspondences, :math:`(S B)`; ``None``: the focal
+            lengths are known.
         step: :math:`\gamma` of each iteration, scalars.
         damping: :math:`\lambda` of each iteration, scalars.
         shape: shape of the kernel of each iteration, scalars.
@@ -45,17 +47,31 @@ class LMStart(NamedTuple):
     rivals: Correspondences | None
     outlier_area: Tensor | None
     noiseless: Tensor | None
+    zoom: Tensor | None
     step: tuple[Tensor, ...]
     damping: tuple[Tensor, ...]
     shape: tuple[Tensor, ...]
 
+    def zoomed(self, zoom: Tensor | None) -> LMStart:
+        """With other focal lengths, see :meth:`~kornia_pnpnet.types.Correspondences.zoomed`, for one pose a problem."""
+        corr, guided, by_residual = (x.zoomed(zoom) for x in (self.corr, self.guided, self.by_residual))
+        return self._replace(corr=corr, guided=guided, by_residual=by_residual)
+
 
 class State(NamedTuple):
-    """Between two stages: the poses, whether the last equations were solved, and a factor of the damping."""
+    """Between two stages.
+
+    Attributes:
+        pose: the poses.
+        solved: whether the last equations were solved.
+        factor: a factor of the damping.
+        zoom: see :class:`LMStart`.
+    """
 
     pose: Pose
     solved: Tensor
     factor: Tensor
+    zoom: Tensor | None = None
 
 
 class Stage(NamedTuple):

@@ -10,7 +10,7 @@ from torch import nn
 from kornia_pnpnet.core.checks import check_whole
 from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.refine import RobustWeightedLM
-from kornia_pnpnet.types import Correspondences, Hypotheses, Pose
+from kornia_pnpnet.types import Correspondences, FocalHypotheses, Hypotheses, Pose
 
 __all__ = ["MinimalSolver", "SubsetSolver", "describe"]
 
@@ -22,7 +22,7 @@ class MinimalSolver(Protocol):
     def sample_size(self) -> int:
         """Number of pairs in a sample."""
 
-    def hypotheses(self, corr: Correspondences) -> Hypotheses:
+    def hypotheses(self, corr: Correspondences) -> Hypotheses | FocalHypotheses:
         """Return the poses of a batch of samples."""
 
 

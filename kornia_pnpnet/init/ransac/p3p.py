@@ -10,14 +10,15 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
-from kornia_pnpnet.core.checks import check_devices, check_shapes, common_dtype
+from kornia_pnpnet.core.checks import check_devices, check_shapes, check_whole, common_dtype
 from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.linalg import dot
 from kornia_pnpnet.core.performance import compiling, fold_vmap, unfold_vmap
+from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import MIN_DEPTH_RATIO
 from kornia_pnpnet.init.ransac.law_of_cosines import Triple, distances, turn_to_largest, turned
 from kornia_pnpnet.inputs import one_batch, restore_leading
-from kornia_pnpnet.types import Correspondences, Hypotheses, Pose
+from kornia_pnpnet.types import Correspondences, FocalHypotheses, Hypotheses, Pose
 
 __all__ = ["P3P", "p3p"]
 
@@ -233,6 +234,53 @@ def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
     components = components.permute(2, 1, 0)  # (B, 4, 12)
     rotation, translation = components[..., :9].unflatten(-1, (3, 3)), components[..., 9:]
     return restore_leading(size, Hypotheses(Pose(rotation, translation), valid.mT))
+
+
+class P3PFocals(Configured):
+    r"""Minimal solver of three pairs for an unknown focal length: :func:`p3p` at focal lengths on a grid.
+
+    Least squares of all inliers, with the focal length as a parameter, then find what lies between the grid's points.
+
+    Args:
+        steps: number of focal lengths, spread evenly in logarithms over the range of
+            :class:`~kornia_pnpnet.types.FreeFocal`.
+    """
+
+    #: Number of pairs in a sample.
+    sample_size = 3
+
+    def __init__(self, steps: int = 8) -> None:
+        super().__init__(locals())
+        check_whole(1, steps=steps)
+        self.steps = steps
+
+    def hypotheses(self, corr: Correspondences) -> FocalHypotheses:
+        r"""Solve samples of three pairs.
+
+        Args:
+            corr: normalised correspondences with :math:`N = 3` and an unknown focal length. Their weights are ignored.
+
+        Returns:
+            Four slots per sample and focal length, without gradients.
+
+        Raises:
+            ShapeError: when :math:`N` is not 3.
+        """
+        assert corr.free_focal is not None
+        batch = len(corr.weights)
+        at = (torch.arange(self.steps, device=corr.weights.device) + 0.5) * (2.0 / self.steps) - 1.0
+        zoom = at[:, None].to(corr.weights) * corr.free_focal.width  # (F, B)
+        plane = corr.img_points / corr.focal * (-zoom).exp()[..., None, None]  # (F, B, 3, 2)
+        world = corr.world_points.expand(self.steps, -1, -1, -1)
+        pose, valid = p3p(world.flatten(0, 1), plane.flatten(0, 1))
+
+        def slots(x: Tensor) -> Tensor:
+            """Of (F B, 4, ...) the slots of a sample side by side, (B, 4 F, ...); the batch stays last in memory."""
+            last = x.movedim((0, 1), (-1, -2)).unflatten(-1, (self.steps, batch)).flatten(-3, -2)
+            return last.movedim((-1, -2), (0, 1))
+
+        pose = map_tensors(slots, pose)
+        return FocalHypotheses(pose, slots(valid), zoom.repeat(4, 1).mT)
 
 
 class P3P(Configured):

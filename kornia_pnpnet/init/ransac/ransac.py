@@ -17,7 +17,7 @@ from kornia_pnpnet.core.performance import problems_last
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import Projection, project
 from kornia_pnpnet.init.ransac.minimal import MinimalSolver, describe
-from kornia_pnpnet.init.ransac.p3p import P3P
+from kornia_pnpnet.init.ransac.p3p import P3P, P3PFocals
 from kornia_pnpnet.init.ransac.scoring import SCORERS, Scorer
 from kornia_pnpnet.init.ransac.search import (
     PAIRS_PER_SAMPLE,
@@ -28,16 +28,17 @@ from kornia_pnpnet.init.ransac.search import (
     least_squares,
     take,
 )
-from kornia_pnpnet.refine.prior import recentred
-from kornia_pnpnet.refine.verdict import (
+from kornia_pnpnet.refine.inliers import (
     MAX_FALSE_ALARMS,
     Judged,
     Thresholds,
     chance_of_inlier,
     chance_of_others,
+    fitted_pairs,
     judge,
     log_false_alarms,
 )
+from kornia_pnpnet.refine.prior import recentred
 from kornia_pnpnet.types import LEAST_NOISE, MIN_PAIRS, Correspondences, Guess, Pose
 
 __all__ = ["FURTHER", "RANSAC", "search_on"]
@@ -52,6 +53,9 @@ _KERNEL_SCALE, _MEDIAN, _FITTED = 3.4, 2.0 * math.log(2.0), 5
 # pairs that do. That of known noise was tuned on problems of uncertain PnP (`benchmarks/uncertain_problems.py`, seeds
 # 777 and 778, 10 pairs with 5 outliers): 4 and 8 lead to larger errors.
 _INLIER, _KNOWN_INLIER = 10.0, 5.0
+# Residuals at the best focal length on a grid, relative to the median distance of the pixels from the principal point
+# and the range of the grid in logarithms. Tuned on random problems with fields of view of 18 to 100 degrees (seed 6).
+_GRID_RESIDUAL = 0.028
 # Normalised units. A guess that has the centre of the world nearer than this counts as this near.
 _NEAREST = 0.5
 # A pair whose weight or confidence is 0 is drawn this often, relative to a pair where it is 1. Networks mislead more
@@ -74,7 +78,7 @@ class RANSAC(Configured):
     :math:`f/z` times as much. Least squares weigh an inlier by the inverse of the right hand side.
 
     The guess is ``ok`` when fewer than 0.01 poses with as many inliers are expected by chance, from pairs without any
-    pose behind them (see :func:`~kornia_pnpnet.refine.verdict.log_false_alarms`). A problem of only three pairs is
+    pose behind them (see :func:`~kornia_pnpnet.refine.inliers.log_false_alarms`). A problem of only three pairs is
     ``ok`` when it has a pose: three pairs hold no evidence.
 
     Where the caller gave a confidence for each pair, samples hold pairs in proportion to it, and fewer samples suffice
@@ -197,12 +201,18 @@ class RANSAC(Configured):
                 given = given._replace(translation=given.translation + (given.rotation @ centre[..., None])[..., 0])
                 given = map_tensors(lambda x: x.detach()[:, None], given)
             detached = corr.map(torch.Tensor.detach)
-            found = Search(self.plan, detached, thresholds, _trusted(detached.confidence)).run(given)
-        pose, judged = self._refine(corr, found.pose, thresholds)
+            plan, stages = self.plan, [thresholds]
+            if corr.free_focal is not None:
+                plan = plan._replace(minimal=P3PFocals())
+                wide = thresholds.img.maximum(_on_grid(detached))
+                stages = [thresholds._replace(img=wide), thresholds]
+            found = Search(plan, detached, stages[0], _trusted(detached.confidence)).run(given)
+        pose, zoom, judged = self._refine(corr, found, stages)
         with torch.no_grad():
-            ok = self._is_evident(found, detached, thresholds, judged, project(pose, problems_last(detached)))
+            detached = problems_last(detached).zoomed(zoom)
+            ok = self._is_evident(found, detached, thresholds, judged, project(pose, detached))
         offset = (pose.rotation @ centre[..., None])[..., 0]
-        return Guess(Pose(pose.rotation, pose.translation - offset), judged.weights, ok)
+        return Guess(Pose(pose.rotation, pose.translation - offset), judged.weights, ok, zoom=zoom)
 
     def _thresholds(self, corr: Correspondences) -> Thresholds:
         """The thresholds in units of the correspondences, (B,) each."""
@@ -210,27 +220,36 @@ class RANSAC(Configured):
         img, world = (one if scale is None else scale.detach() for scale in (corr.img_scale, corr.world_scale))
         return Thresholds(self.threshold * img, self.world_threshold * world)
 
-    def _refine(self, corr: Correspondences, start: Pose, thresholds: Thresholds) -> tuple[Pose, Judged]:
-        """Improve poses on their inliers, in chunks whose tensors a cache holds; return the inliers afterwards, too."""
+    def _refine(
+        self, corr: Correspondences, found: Found, stages: list[Thresholds]
+    ) -> tuple[Pose, Tensor | None, Judged]:
+        """Improve poses on their inliers, in chunks whose tensors a cache holds; return the inliers afterwards, too.
+
+        The inliers are chosen anew for each entry of ``stages``.
+        """
         size = max(1, PAIRS_PER_SAMPLE * self.chunk_size // corr.weights.shape[1])
         results = []
         for first in range(0, max(1, len(corr.weights)), size):
             last = min(first + size, len(corr.weights))
             at = full_vectors(torch.arange(first, last, device=corr.weights.device))
-            part, pose, limits = take((corr, start, thresholds), at)
-            part = problems_last(part)
+            base, pose, zoom, part_stages = take((corr, found.pose, found.zoom, stages), at)
+            base = problems_last(base)
+            part = base.zoomed(zoom)
             projection = project(pose, part)
-            with torch.no_grad():
-                inliers = judge(projection, part, limits).weights.detach()
-            for _ in range(_FINAL_STEPS):
-                weights = inliers * _robust(judge(projection, part, limits), inliers)
-                pose = least_squares(part, pose, projection, weights)
-                projection = project(pose, part)
+            for limits in part_stages:
+                with torch.no_grad():
+                    inliers = judge(projection, part, limits).weights.detach()
+                for _ in range(_FINAL_STEPS):
+                    weights = inliers * _robust(judge(projection, part, limits), inliers)
+                    step = least_squares(part, pose, projection, weights)
+                    pose, zoom = step.pose, None if zoom is None or step.zoom is None else zoom + step.zoom
+                    part = base.zoomed(zoom)
+                    projection = project(pose, part)
             with torch.no_grad():
                 judged = map_tensors(torch.Tensor.detach, judge(projection, part, limits))
-            results.append(take((pose, judged), slice(last - first)))
-        pose, judged = map_tensors(lambda *parts: torch.cat(parts), *results)
-        return map_tensors(torch.Tensor.contiguous, pose), judged
+            results.append(take((pose, zoom, judged), slice(last - first)))
+        pose, zoom, judged = map_tensors(lambda *parts: torch.cat(parts), *results)
+        return map_tensors(torch.Tensor.contiguous, pose), zoom, judged
 
     def _is_evident(
         self, found: Found, corr: Correspondences, thresholds: Thresholds, judged: Judged, projection: Projection
@@ -241,8 +260,18 @@ class RANSAC(Configured):
         chance = chance.maximum(chance_of_others(projection, corr, thresholds, judged))
         # Every number of inliers from 4 to all pairs is another test of the same pose.
         tests = found.poses * (counts - MIN_PAIRS).clamp(min=1)
-        rare = log_false_alarms(tests, inliers, counts, chance) < math.log(MAX_FALSE_ALARMS)
+        fitted = fitted_pairs(corr)
+        rare = log_false_alarms(tests, inliers, counts, chance, fitted) < math.log(MAX_FALSE_ALARMS)
+        if corr.free_focal is not None:
+            return found.loss.isfinite() & rare
         return found.loss.isfinite() & (rare | ((inliers == MIN_PAIRS) & (counts == MIN_PAIRS)))
+
+
+def _on_grid(corr: Correspondences) -> Tensor:
+    """Threshold of residuals between the focal lengths of a grid, in pixels of the correspondences, (B,)."""
+    assert corr.free_focal is not None
+    away = torch.where(corr.weights > 0, corr.img_points.abs().amax(-1), torch.nan)
+    return _GRID_RESIDUAL * corr.free_focal.width * away.nanmedian(1).values.nan_to_num(0.0)
 
 
 def _robust(judged: Judged, inliers: Tensor) -> Tensor:
@@ -318,10 +347,11 @@ def search_on(corr: Correspondences, guess: Guess, *, keep_others: bool = False,
     chances = chances if trusted is None else chances * trusted
     given = map_tensors(lambda *x: torch.stack(x, 1).detach(), *guess.poses)
     found = Search(plan, corr, thresholds, chances, sigma).run(given, worth=plan.min_samples)
-    judged = judge(project(found.pose, problems_last(corr)), corr, thresholds)
+    judged = judge(project(found.pose, problems_last(corr).zoomed(found.zoom)), corr, thresholds)
     searched = (found.samples > 0)[:, None]
     weights = torch.where(searched, 1.0 / (1.0 + judged.errors), guess.weights)
-    return guess._replace(pose=found.pose, others=guess.others if keep_others else None, weights=weights)
+    others = guess.others if keep_others else None
+    return guess._replace(pose=found.pose, others=others, weights=weights, zoom=found.zoom)
 
 
 class _Constant(torch.autograd.Function):

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.refine.inliers import MAX_ERROR, Thresholds
 from kornia_pnpnet.refine.prior import votes
-from kornia_pnpnet.refine.verdict import MAX_ERROR, Thresholds
 from kornia_pnpnet.types import Correspondences, FramedPrior, Pose
 
 __all__ = ["SCORERS", "Scene", "Scorer", "standardised_errors"]
@@ -146,7 +146,7 @@ def standardised_errors(scene: Scene, packed: Tensor) -> Tensor:
         packed: poses of :meth:`Scene.pack`, shape :math:`(P, 4, 3, H)`.
 
     Returns:
-        At most :data:`~kornia_pnpnet.refine.verdict.MAX_ERROR`, shape :math:`(P, N, H)`.
+        At most :data:`~kornia_pnpnet.refine.inliers.MAX_ERROR`, shape :math:`(P, N, H)`.
 
     Example:
         >>> points = torch.tensor([[[0.0, 0.0, 4.0], [1.0, 0.0, 4.0]]])

@@ -14,9 +14,10 @@ from kornia_pnpnet.geometry import Projection, project
 from kornia_pnpnet.init.ransac.minimal import MinimalSolver
 from kornia_pnpnet.init.ransac.sampling import Samples, agreement_of_neighbours
 from kornia_pnpnet.init.ransac.scoring import Scene, Scorer
-from kornia_pnpnet.refine import lm_step
-from kornia_pnpnet.refine.verdict import Thresholds, judge, rotation_sigma
-from kornia_pnpnet.types import Correspondences, Noise, Pose
+from kornia_pnpnet.refine import LMStep, lm_step
+from kornia_pnpnet.refine.inliers import Thresholds, judge
+from kornia_pnpnet.refine.verdict import rotation_sigma
+from kornia_pnpnet.types import Correspondences, FocalHypotheses, Noise, Pose
 
 __all__ = ["PAIRS_PER_SAMPLE", "Found", "Plan", "Search", "full_vectors", "least_squares", "take"]
 
@@ -75,12 +76,14 @@ class Found(NamedTuple):
         loss: its loss, infinite where there is no pose, shape :math:`(B,)`.
         poses: number of poses that were scored, int64, shape :math:`(B,)`.
         samples: number of samples that were drawn, int64, shape :math:`(B,)`.
+        zoom: logarithm of the focal length over that of the correspondences, shape :math:`(B,)`; ``None``: it is known.
     """
 
     pose: Pose
     loss: Tensor
     poses: Tensor
     samples: Tensor
+    zoom: Tensor | None = None
 
 
 class Search:
@@ -147,12 +150,14 @@ class Search:
         def expect(at: Tensor) -> None:
             rows = full_vectors(at)
             corr, thresholds, sigma = take((*self.low, self.sigma), rows)
-            corr = problems_last(corr)
-            projection = project(_pose(matrix[rows]), corr)
+            pose, zoom = self._camera(matrix[rows])
+            corr = problems_last(corr).zoomed(zoom)
+            projection = project(pose, corr)
             judged = judge(projection, corr, thresholds)
-            noise = Noise(sigma, torch.zeros_like(sigma))
-            is_open = rotation_sigma(projection, corr._replace(noise=noise), judged) > _OPEN
-            least[at] = least[at].where(~is_open[: len(at)], _OPEN_SAMPLES)
+            if corr.free_focal is None:
+                noise = Noise(sigma, torch.zeros_like(sigma))
+                is_open = rotation_sigma(projection, corr._replace(noise=noise), judged) > _OPEN
+                least[at] = least[at].where(~is_open[: len(at)], _OPEN_SAMPLES)
             needed[at] = self._needed(at, judged.weights[: len(at)] > 0).maximum(least[at])
 
         def improve(at: Tensor, losses: Tensor, matrices: Tensor) -> None:
@@ -188,7 +193,16 @@ class Search:
             better = (top_losses[:, 0] < loss[active]).nonzero()[:, 0]
             improve(active[better], top_losses[better], top_matrices[better])
             active = active[needed[active].clamp(min=plan.min_samples).minimum(totals[active]) > stop]
-        return Found(_orthonormal(_pose(matrix.to(self.corr.weights))), loss, poses, drawn)
+        pose, zoom = self._camera(matrix.to(self.corr.weights))
+        return Found(_orthonormal(pose), loss, poses, drawn, zoom)
+
+    def _camera(self, matrix: Tensor) -> tuple[Pose, Tensor | None]:
+        """Pose and zoom from a :func:`_matrix`."""
+        if self.corr.free_focal is None:
+            return Pose(matrix[..., :3], matrix[..., 3]), None
+        scale = matrix[:, 2, :3].norm(dim=-1).clamp(min=torch.finfo(matrix.dtype).eps)
+        matrix = torch.cat((matrix[:, :2], matrix[:, 2:] / scale[:, None, None]), 1)
+        return Pose(matrix[..., :3], matrix[..., 3]), -scale.log()
 
     def _prefer_agreement(self, problems: Tensor) -> None:
         """From now on draw the pairs of some problems in proportion to the agreement of their neighbours, too."""
@@ -229,8 +243,8 @@ class Search:
         values = self.pairs.index_select(0, rows.flatten()).view(-1, size, 6)
         world, img, weights = values.split((3, 2, 1), -1)
         owners = full_vectors(problems.repeat_interleave(count))
-        img_scale, world_scale = take((self.corr.img_scale, self.corr.world_scale), owners)
-        sample = Correspondences(world, img, weights[..., 0], self.corr.focal, img_scale, world_scale)
+        img_scale, world_scale, free = take((self.corr.img_scale, self.corr.world_scale, self.corr.free_focal), owners)
+        sample = Correspondences(world, img, weights[..., 0], self.corr.focal, img_scale, world_scale, free_focal=free)
         solved = self.plan.minimal.hypotheses(sample)
         fresh = torch.arange(start, stop, device=problems.device) < self.samples.totals[problems, None]  # (P, H)
         valid = solved.valid[: batch * count].unflatten(0, (batch, count)) & fresh[..., None]
@@ -240,9 +254,14 @@ class Search:
         row = at % count + count * torch.arange(batch, device=at.device)[:, None]
         at = (at // count * len(rows) + row).flatten()
         # Components first, the layout of p3p's results: each is selected along a row of memory.
-        rotation, translation = (
-            x.movedim((0, 1), (-1, -2)).flatten(-2).index_select(-1, at).unflatten(-1, valid.shape) for x in solved.pose
+        pose, zoom = map_tensors(
+            lambda x: x.movedim((0, 1), (-1, -2)).flatten(-2).index_select(-1, at).unflatten(-1, valid.shape),
+            (solved.pose, solved.zoom if isinstance(solved, FocalHypotheses) else None),
         )
+        rotation, translation = pose
+        if zoom is not None:
+            rotation[2] *= (scale := (-zoom).exp())
+            translation[2] *= scale
         losses, packed = self._rank(problems, scene, scene.pack(rotation, translation), valid, start)
         return losses, scene.unpack(packed), number
 
@@ -283,16 +302,17 @@ class Search:
     def _descend(self, problems: Tensor, loss: Tensor, matrix: Tensor, limit: float) -> tuple[Tensor, Tensor]:
         """Take one step of least squares on the pairs within ``limit`` thresholds, where it lowers the loss."""
         corr, thresholds = take(self.low, full_vectors(problems))
-        corr, start = problems_last(corr), _pose(full_vectors(matrix))
+        start, zoom = self._camera(full_vectors(matrix))
+        corr = problems_last(corr).zoomed(zoom)
         scene = self.scene.of(problems)
         projection = project(start, corr)
         wide = map_tensors(lambda x: limit * x, thresholds)
         moved = least_squares(corr, start, projection, judge(projection, corr, wide).weights)
-        pose = take(moved, slice(len(problems)))
-        packed = scene.pack(pose.rotation.permute(1, 2, 0)[..., None], pose.translation.mT[..., None])
+        pose, zoom = moved.pose, None if zoom is None or moved.zoom is None else zoom + moved.zoom
+        new_matrix = take(_matrix(pose, zoom), slice(len(problems)))
+        packed = scene.pack(new_matrix[..., :3].permute(1, 2, 0)[..., None], new_matrix[..., 3].mT[..., None])
         new_loss = scene.losses(packed, self.plan.scorer)[:, 0]
         better = (new_loss < loss) & loss.isfinite()  # an invalid pose stays invalid
-        new_matrix = torch.cat((pose.rotation, pose.translation[..., None]), -1)
         return torch.where(better, new_loss, loss), torch.where(better[:, None, None], new_matrix, matrix)
 
 
@@ -301,10 +321,13 @@ def take(tree: _T, at: Tensor | slice) -> _T:
     return map_tensors(lambda x: x[at] if x.ndim else x, tree)
 
 
-def least_squares(corr: Correspondences, pose: Pose, projection: Projection, weights: Tensor) -> Pose:
+def least_squares(corr: Correspondences, pose: Pose, projection: Projection, weights: Tensor) -> LMStep:
     """Take one step of least squares with the weights (B, N) times the weights of the pairs."""
     one, damping = corr.weights.new_tensor((1.0, _DAMPING))
-    return lm_step(corr, pose, projection, corr.weights * weights, one, damping).pose
+    weights = corr.weights * weights
+    if corr.free_focal is not None:  # beside a prior, weights are inverse square pixels
+        weights = weights / corr.free_focal.pixel.square()[:, None]
+    return lm_step(corr._replace(prior=None), pose, projection, weights, one, damping)
 
 
 def full_vectors(rows: Tensor) -> Tensor:
@@ -325,9 +348,10 @@ def _present_first(present: Tensor, multiple: int) -> tuple[Tensor, Tensor]:
     return positions, torch.arange(width, device=at.device) < number[:, None]
 
 
-def _pose(matrix: Tensor) -> Pose:
-    """A pose from its 3x4 matrix."""
-    return Pose(matrix[..., :3], matrix[..., 3])
+def _matrix(pose: Pose, zoom: Tensor | None) -> Tensor:
+    r"""The projection matrix :math:`[R | t]` whose last row is divided by the zoom of the focal length."""
+    matrix = torch.cat((pose.rotation, pose.translation[..., None]), -1)
+    return matrix if zoom is None else torch.cat((matrix[:, :2], matrix[:, 2:] * (-zoom).exp()[:, None, None]), 1)
 
 
 def _orthonormal(pose: Pose) -> Pose:

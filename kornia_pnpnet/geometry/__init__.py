@@ -1,0 +1,47 @@
+r"""Projection, residual, Jacobian, retraction and alignment, on kornia's conversions.
+
+Convention: ``x_cam = R x_world + t``; the camera looks along +z; pixels are those of a camera with one focal length
+and the principal point 0 (see :mod:`kornia_pnpnet.normalize`). A point is *in front* when its depth is more than
+:data:`MIN_DEPTH_RATIO` of its distance, a test that does not depend on the unit of the world.
+"""
+
+from kornia_pnpnet.geometry.points import align, span_a_plane
+from kornia_pnpnet.geometry.projection import (
+    MIN_DEPTH_RATIO,
+    NormalEquations,
+    Projection,
+    normal_equations,
+    pixel_covariance,
+    pixel_variance,
+    project,
+    transform,
+)
+from kornia_pnpnet.geometry.tangent import (
+    additive_tangent_map,
+    change_tangent,
+    dolly_zoom,
+    move,
+    retract,
+    retract_additive,
+    rotation_angle,
+)
+
+__all__ = [
+    "MIN_DEPTH_RATIO",
+    "NormalEquations",
+    "Projection",
+    "additive_tangent_map",
+    "align",
+    "change_tangent",
+    "dolly_zoom",
+    "move",
+    "pixel_covariance",
+    "pixel_variance",
+    "normal_equations",
+    "project",
+    "retract",
+    "retract_additive",
+    "rotation_angle",
+    "span_a_plane",
+    "transform",
+]

@@ -1,0 +1,113 @@
+r"""An unknown focal length: where to look for it, and a first estimate of it together with a pose."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from kornia_pnpnet.init.ransac import P3P, RANSAC
+from kornia_pnpnet.inputs import Inputs
+from kornia_pnpnet.normalize import Frame, Normalize
+from kornia_pnpnet.types import FreeFocal, Pose
+
+__all__ = [
+    "find_focal",
+    "finds_focal",
+    "free_focal_in_frame",
+    "scale_focal",
+    "with_found_focal",
+    "with_nominal_focal",
+]
+
+# Half widths of the image: the focal lengths of fields of view from 118 to 14 degrees, which are searched.
+_SHORTEST, _LONGEST = 0.6, 8.0
+# Half the width of a square over the median distance, in the maximum norm, of a point in it from its middle.
+_HALF_WIDTH = math.sqrt(2.0)
+# Standard deviations of an expected focal length that are searched on either side.
+_SEARCHED = 2.0
+# Pixels of a camera whose focal length is in the middle of the range: 0.65 % of half the width of the image. The least
+# threshold of an inlier; near the right focal length on the grid of the search, inliers have larger residuals.
+_THRESHOLD = 10.0
+_FINDER = RANSAC(P3P(), threshold=_THRESHOLD, min_samples=16)
+
+
+def finds_focal(init: object) -> bool:
+    """Whether an initialiser estimates an unknown focal length itself."""
+    return isinstance(init, RANSAC) and isinstance(init.minimal, P3P)
+
+
+def with_nominal_focal(inputs: Inputs, sigma: float | None) -> Inputs:
+    """Give the cameras the focal length in the middle of the range in which theirs is searched.
+
+    The range is that of the caller's focal length and its ``sigma`` where there is one. Otherwise it follows from the
+    size of the image, which is twice the principal point, or what the pixels cover where this is more.
+
+    Args:
+        inputs: the problems.
+        sigma: standard deviation of the logarithm of the focal length in the intrinsics; ``None``: ignore it.
+
+    Returns:
+        The problems with other cameras and ``free_focal``. The aspect ratio of the pixels is kept.
+    """
+    camera = inputs.intrinsics / inputs.intrinsics[:, 2:, 2:]
+    given = (camera[:, 0, 0] * camera[:, 1, 1]).sqrt()  # (B,)
+    if sigma is None:
+        with torch.no_grad():
+            principal_point = camera[:, None, :2, 2]
+            away = (inputs.img_points - principal_point).abs().amax(-1)  # (B, N)
+            for there in (inputs.mask, None if inputs.weights is None else inputs.weights > 0):
+                away = away if there is None else torch.where(there, away, torch.nan)
+            half = (_HALF_WIDTH * away.nanmedian(1).values).maximum(principal_point[:, 0].abs().amax(-1))
+            half = torch.where(half.isfinite() & (half > 0), half, 1.0)
+        nominal = math.sqrt(_SHORTEST * _LONGEST) * half
+        width = torch.full_like(nominal, 0.5 * math.log(_LONGEST / _SHORTEST))
+        known = FreeFocal(nominal, torch.zeros_like(nominal), width, torch.ones_like(nominal))
+    else:
+        nominal = given.detach()
+        width = torch.full_like(nominal, min(_SEARCHED * sigma, 0.5 * math.log(_LONGEST / _SHORTEST)))
+        known = FreeFocal(given, torch.full_like(nominal, sigma**-2), width, torch.ones_like(nominal))
+    return inputs._replace(intrinsics=scale_focal(camera, nominal / given), free_focal=known)
+
+
+def scale_focal(intrinsics: Tensor, factor: Tensor) -> Tensor:
+    """Multiply the focal lengths and the skew of camera matrices (B, 3, 3) by a factor (B,)."""
+    first, rest = intrinsics.split((2, 1), 1)
+    linear, principal_point = first.split((2, 1), 2)
+    return torch.cat((torch.cat((linear * factor[:, None, None], principal_point), 2), rest), 1)
+
+
+def free_focal_in_frame(free: FreeFocal, frame: Frame) -> FreeFocal:
+    """What is known of focal lengths, in the pixels of normalised correspondences."""
+    return free._replace(expected=free.expected * frame.img_scale, pixel=frame.img_scale.detach())
+
+
+@torch.no_grad()
+def find_focal(inputs: Inputs) -> tuple[Pose, Tensor]:
+    """Estimate focal lengths and poses by P3P at focal lengths on a grid, and least squares of the inliers.
+
+    Args:
+        inputs: the problems, with a nominal focal length, see :func:`with_nominal_focal`.
+
+    Returns:
+        The poses in the world of the inputs, and the logarithm of the focal lengths over the nominal ones, (B,).
+    """
+    assert inputs.free_focal is not None
+    normalize = Normalize(order=False)
+    corr, frame = normalize(*inputs[:5], confidence=inputs.confidence)
+    corr = corr._replace(img_scale=None, free_focal=free_focal_in_frame(inputs.free_focal, frame))
+    guess = _FINDER(corr)
+    assert guess.zoom is not None
+    return normalize.undo(guess.pose, frame), torch.where(guess.zoom.isfinite(), guess.zoom, 0.0)
+
+
+def with_found_focal(inputs: Inputs) -> Inputs:
+    """Give the cameras an estimate of their focal length, and the problems a pose to start from unless they have one.
+
+    Args:
+        inputs: See find_focal.
+    """
+    pose, zoom = find_focal(inputs)
+    cameras = scale_focal(inputs.intrinsics, zoom.exp())
+    return inputs._replace(intrinsics=cameras, init=pose if inputs.init is None else inputs.init)

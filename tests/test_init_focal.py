@@ -1,0 +1,251 @@
+"""Unknown focal lengths: found with the pose, differentiable, honest where the pairs leave them open."""
+
+import math
+
+import pytest
+import torch
+from kornia.core.exceptions import BaseError
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+
+from kornia_pnpnet import (
+    Guess,
+    Normalize,
+    PnPNet,
+    Pose,
+    Problems,
+    RobustWeightedLM,
+    create_solver,
+    pose_covariance,
+)
+from kornia_pnpnet.core.trees import iter_tensors, map_tensors
+from kornia_pnpnet.geometry import dolly_zoom, normal_equations, project
+from kornia_pnpnet.geometry import rotation_angle as angle
+from kornia_pnpnet.init.focal import scale_focal
+from kornia_pnpnet.types import FreeFocal
+
+HALF = 500.0  # pixels
+
+
+def draw(n, batch=64, wrong=0, *, seed=0, noise=0.0, spread=0.4, aspect=1.0):
+    """Problems of cameras with fields of view from 18 to 100 degrees; the first pairs are wrong."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(*shape, low=-1.0, high=1.0):
+        return low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+    f = HALF / (0.5 * uniform(batch, low=18.0, high=100.0).deg2rad()).tan()
+    focals = torch.stack((f / math.sqrt(aspect), f * math.sqrt(aspect)), -1)
+    depth = 5.0 * (1.0 + spread * uniform(batch, n))
+    pixels = HALF * uniform(batch, n, 2)
+    cam_points = torch.cat((pixels / focals[:, None] * depth[..., None], depth[..., None]), -1)
+    rotation = axis_angle_to_rotation_matrix(uniform(batch, 3))
+    translation = 3.0 * uniform(batch, 3)
+    world_points = (cam_points - translation[:, None]) @ rotation
+    pixels = pixels + noise * torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
+    inliers = torch.arange(n).expand(batch, n) >= wrong
+    pixels = torch.where(inliers[..., None], pixels, HALF * uniform(batch, n, 2))
+    intrinsics = torch.eye(3, dtype=torch.float64).repeat(batch, 1, 1)
+    intrinsics[:, 0, 0], intrinsics[:, 1, 1], intrinsics[:, :2, 2] = *focals.unbind(-1), HALF
+    return Problems(world_points, pixels + HALF, intrinsics, Pose(rotation, translation), inliers)
+
+
+def withheld(problems, factor=None):
+    """The intrinsics with another focal length."""
+    factor = problems.intrinsics[:, 0, 0].reciprocal() if factor is None else torch.full((len(problems[0]),), factor)
+    return scale_focal(problems.intrinsics, factor.double())
+
+
+def errors(result, problems):
+    """Relative errors of the focal length and of the position, and the rotation's error in radians."""
+    focal = result.intrinsics[:, 0, 0] / problems.intrinsics[:, 0, 0] - 1.0
+    shift = (result.translation - problems.pose.translation).norm(dim=-1) / 5.0
+    return focal.abs(), shift, angle(result.rotation, problems.pose.rotation)
+
+
+@pytest.mark.parametrize("name", ["p3p-ransac", "pnpnet-set", "epnp-lm", "reppnp-lm", "identity-lm"])
+@pytest.mark.parametrize("aspect", [1.0, 1.3])
+def test_exact_pairs_give_focal_length_and_pose(name, aspect):
+    p = draw(12, aspect=aspect)
+    result = create_solver(name, focal="unknown", **({"m": 30} if name.endswith("lm") else {}))(*p[:2], withheld(p))
+    focal, shift, turn = errors(result, p)
+    right = (focal < 1e-3) & (shift < 1e-3) & (turn < 1e-3) & result.ok
+    assert right.double().mean() > 0.95
+    assert torch.allclose(result.intrinsics[:, 1, 1] / result.intrinsics[:, 0, 0], p.intrinsics.new_tensor(aspect))
+
+
+@pytest.mark.parametrize("name", ["p3p-ransac", "pnpnet-set"])
+def test_outliers_are_left_out(name):
+    p = draw(20, wrong=8, noise=1.0, batch=128)
+    result = create_solver(name, focal="unknown")(*p[:2], withheld(p))
+    focal, shift, turn = errors(result, p)
+    right = (focal < 0.05) & (shift < 0.05) & (turn < math.radians(1.0))
+    assert (right & result.ok).double().mean() > 0.97
+    weights = result.weights / result.weights.amax(1, keepdim=True)
+    assert weights[:, :8].mean() < 0.02
+    assert weights[:, 8:].mean() > 0.4
+
+
+@pytest.mark.parametrize("name", ["p3p-ransac", "pnpnet-set"])
+def test_the_given_focal_length_does_not_matter(name):
+    """Nor does one broken problem, padding, or a unit in which the pixels are counted."""
+    p = draw(10, wrong=2, noise=0.5, batch=6)
+    solver = create_solver(name, focal="unknown")
+    first = solver(*p[:2], withheld(p))
+    for given in (withheld(p, 3.0), withheld(p, 1e-3)):
+        torch.testing.assert_close(solver(*p[:2], given).intrinsics, first.intrinsics, rtol=1e-5, atol=1e-5)
+    broken = p.world_points.clone()
+    broken[2, 3] = math.nan
+    result = solver(broken, p.img_points, withheld(p))
+    assert not result.ok[2]
+    assert all(x.isfinite().all() for x in iter_tensors(result) if x.is_floating_point())
+    others = torch.arange(6) != 2
+    torch.testing.assert_close(result.intrinsics[others], first.intrinsics[others], rtol=1e-6, atol=1e-6)
+    mask = torch.arange(12).expand(6, 12) < 10
+    padded = [torch.cat((x, x[:, :2] * math.nan), 1) for x in p[:2]]
+    torch.testing.assert_close(
+        solver(*padded, withheld(p), mask=mask).intrinsics, first.intrinsics, rtol=1e-4, atol=1e-2
+    )
+
+
+@pytest.mark.parametrize("name", ["p3p-ransac", "pnpnet-set"])
+def test_a_plane_seen_from_the_front_is_not_believed(name):
+    """Its distance and the focal length cannot be told apart; with a prior of the focal length they can."""
+    p = draw(20, spread=0.0, noise=1.0)
+    assert not create_solver(name, focal="unknown")(*p[:2], withheld(p)).ok.any()
+    result = create_solver(name, focal="unknown", focal_sigma=0.05)(*p[:3])
+    assert result.ok.double().mean() > 0.9
+    assert (errors(result, p)[0] < 0.1).all()
+    noise = {"img_sigma": 1.0, "focal": "unknown"}
+    open_ = pose_covariance(p.pose, *p[:3], **noise)
+    assert (open_[:, 6, 6] > 0.2**2).all()
+    narrow = pose_covariance(p.pose, *p[:3], **noise, focal_sigma=0.05)
+    assert (narrow[:, 6, 6].sqrt() - 0.05).abs().max() < 0.01
+
+
+def test_the_covariance_has_the_focal_length_last():
+    """Normalised errors are chi-square with 7 degrees of freedom."""
+    p = draw(40, batch=2000, noise=1.0)
+    solver = PnPNet(None, RobustWeightedLM(15, robustness=0.0, damping=1e-6), Normalize(order=False), focal="unknown")
+    result = solver(*p[:2], withheld(p))
+    covariance = pose_covariance(result.pose, *p[:2], result.intrinsics, img_sigma=1.0, focal="unknown")
+    assert covariance.shape == (2000, 7, 7)
+    turn = Pose(result.rotation @ p.pose.rotation.mT, result.translation).rvec
+    log_focal = (result.intrinsics[:, 0, 0] / p.intrinsics[:, 0, 0]).log()[:, None]
+    error = torch.cat((turn, result.translation - p.pose.translation, log_focal), -1)
+    squares = (error * torch.linalg.solve(covariance, error)).sum(-1)
+    assert squares[result.ok].mean().item() == pytest.approx(7.0, rel=0.1)
+    last = log_focal[:, 0].square() / covariance[:, 6, 6]
+    assert last[result.ok].mean().item() == pytest.approx(1.0, rel=0.1)
+
+
+def framed(problems):
+    """Correspondences with a free focal length in the frame of the solver, and the true poses there."""
+    normalize = Normalize(order=False)
+    corr, frame = normalize(*problems[:3])
+    one = torch.ones_like(corr.weights[:, 0])
+    free = FreeFocal(corr.focal * one, 0.0 * one, one, frame.img_scale)
+    return corr._replace(free_focal=free), normalize.apply_to_pose(problems.pose, frame)
+
+
+def test_the_seventh_column_is_the_derivative_of_the_pixels():
+    corr, pose = framed(draw(8, batch=3))
+    zoom = torch.zeros(3, dtype=torch.float64)
+
+    def residual(zoom):
+        return torch.cat(project(dolly_zoom(pose, zoom), corr.zoomed(zoom)).residual, 1)
+
+    column = torch.autograd.functional.jvp(residual, zoom, torch.ones_like(zoom))[1] / corr.focal
+    seen = project(pose, corr)
+    equations = normal_equations(seen, corr.weights, free_focal=True)
+    torch.testing.assert_close(equations.hessian[6][6], column.square().sum(1))
+    shifted = seen._replace(scaled_residual=tuple(torch.ones_like(x) / seen.inv_depth for x in seen.residual))
+    torch.testing.assert_close(normal_equations(shifted, corr.weights, free_focal=True).gradient[6], column.sum(1))
+
+
+@pytest.mark.parametrize("update", ["retraction", "additive"])
+def test_an_exact_focal_length_stays_and_a_wrong_one_is_corrected(update):
+    corr, pose = framed(draw(12, batch=32))
+    refine = RobustWeightedLM(20, robustness=0.0, update=update)
+    here = refine(corr, Guess(pose, torch.ones_like(corr.weights)))
+    assert here.zoom.abs().max() < 1e-9
+    off = torch.linspace(-0.2, 0.2, 32, dtype=torch.float64)
+    found = refine(corr, Guess(dolly_zoom(pose, off), torch.ones_like(corr.weights), zoom=off))
+    assert (found.zoom.abs() < 1e-6).double().mean() > 0.9
+
+
+@pytest.mark.parametrize(("backward", "kernel"), [("unroll", "power"), ("unroll", "cauchy"), ("implicit", "cauchy")])
+def test_gradcheck_to_the_focal_length(backward, kernel):
+    """Through unrolled iterations and through the minimum, with a prior of the focal length."""
+    corr, pose = framed(draw(8, batch=2, noise=1.0))
+    corr = corr._replace(free_focal=corr.free_focal._replace(information=torch.full((2,), 1e2).double()))
+    refine = RobustWeightedLM(5 if backward == "unroll" else 40, kernel=kernel, backward=backward, learnable=False)
+
+    def solve(world_points, img_points, expected):
+        pairs = corr._replace(world_points=world_points, img_points=img_points)
+        pairs = pairs._replace(free_focal=pairs.free_focal._replace(expected=expected))
+        refined = refine(pairs, Guess(pose, torch.ones_like(corr.weights)))
+        return refined.zoom, *refined.pose
+
+    inputs = [x.detach().requires_grad_() for x in (corr.world_points, corr.img_points, corr.free_focal.expected)]
+    # Of the minimum the derivative is exact up to what 40 iterations leave.
+    torch.autograd.gradcheck(solve, inputs, eps=1e-5, atol=2e-4, rtol=1e-3)
+
+
+def test_gradients_flow_through_the_solver():
+    p = draw(12, noise=1.0, batch=8)
+    inputs = [x.clone().requires_grad_() for x in (*p[:2], withheld(p, 1.2))]
+    for name in ("p3p-ransac", "pnpnet-set"):
+        result = create_solver(name, focal="unknown")(*inputs)
+        found = torch.autograd.grad(result.intrinsics[:, 0, 0].log().sum() + result.translation.sum(), inputs)
+        assert all(x.isfinite().all() and (x.flatten(1).abs().amax(1) > 0).all() for x in found)
+        # The focal length that was given is ignored: scaling both of its entries changes nothing.
+        along = (found[2] * inputs[2]).diagonal(dim1=1, dim2=2)[:, :2].sum(1)
+        assert along.abs().max() < 1e-6 * found[2].abs().max() * 1e3
+
+
+def test_a_focal_length_is_learned_from_poses_alone():
+    """The known-focal layer passes gradients to the intrinsics: from poses of known images to the camera."""
+    p = draw(20, noise=0.5, batch=32, seed=3)
+    target = 800.0
+    p = p._replace(img_points=p.img_points)
+    true = torch.tensor([[target, 0.0, HALF], [0.0, target, HALF], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    cam = p.world_points @ p.pose.rotation.mT + p.pose.translation[:, None]
+    pixels = target * cam[..., :2] / cam[..., 2:] + HALF
+    log_focal = torch.tensor(math.log(600.0), dtype=torch.float64, requires_grad=True)
+    solver = create_solver("epnp-lm", gradient="always")
+    optimizer = torch.optim.Adam([log_focal], lr=0.05)
+    unit = true.new_tensor([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 0]])
+    for _ in range(60):
+        intrinsics = unit * log_focal.exp() + true * (1.0 - unit)
+        result = solver(p.world_points, pixels, intrinsics)
+        loss = (result.translation - p.pose.translation).square().sum(-1).clamp(max=10.0).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert log_focal.exp().item() == pytest.approx(target, rel=0.01)
+
+
+def test_options_are_checked():
+    with pytest.raises(BaseError, match="focal must be"):
+        PnPNet(focal="free")
+    with pytest.raises(BaseError, match="focal_sigma"):
+        PnPNet(focal_sigma=0.1)
+    with pytest.raises(BaseError, match="focal_sigma"):
+        PnPNet(focal="unknown", focal_sigma=-1.0)
+    p = draw(6, batch=2)
+    with pytest.raises(BaseError, match="focal"):
+        pose_covariance(p.pose, *p[:3], img_sigma=1.0, focal_sigma=0.1)
+
+
+def test_known_cameras_come_back_as_they_were():
+    p = draw(8, batch=3)
+    for name in ("epnp", "opencv-sqpnp"):
+        torch.testing.assert_close(create_solver(name)(*p[:2], 2.0 * p.intrinsics).intrinsics, p.intrinsics)
+    camera = p.intrinsics.clone()
+    camera[1, 0, 0] = math.nan
+    for name in ("epnp", "opencv-sqpnp"):
+        result = create_solver(name)(*p[:2], camera)
+        assert torch.equal(result.intrinsics[1], torch.eye(3, dtype=torch.float64))
+        assert not result.ok[1]
+    shared = map_tensors(lambda x: x[:2], p)
+    assert create_solver("epnp")(*shared[:2], p.intrinsics[0]).intrinsics.shape == (2, 3, 3)
