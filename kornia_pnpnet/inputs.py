@@ -10,6 +10,7 @@ from kornia.core.exceptions import ShapeError, TypeCheckError, ValueCheckError
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from kornia_pnpnet.cameras import bearing_cameras, check_coefficients, compose, undistort
 from kornia_pnpnet.core.checks import Shapes, check_devices, check_shapes, common_dtype, expand_sigma
 from kornia_pnpnet.core.performance import present_first, sees_values
 from kornia_pnpnet.core.symmetric import Symmetric2, Symmetric3, equivalent_sigma
@@ -21,6 +22,7 @@ __all__ = [
     "Part",
     "checked_inputs",
     "checked_noise",
+    "given_cameras",
     "joined",
     "one_batch",
     "restore_leading",
@@ -36,7 +38,8 @@ _LEAST_PAIRS = 16
 class Inputs(NamedTuple):
     """Arguments of a call as one batch in one dtype: a camera per problem, sigmas per pair where any is known.
 
-    Where a solver estimates the focal length, ``free_focal`` says in pixels of the caller what is known of it.
+    Where a solver estimates the focal length, ``free_focal`` says in pixels of the caller what is known of it. In a rig
+    each pair has a camera, (B, N, 3, 3), and its place in the ``rig``.
     """
 
     world_points: Tensor
@@ -49,6 +52,7 @@ class Inputs(NamedTuple):
     confidence: Tensor | None
     prior: PosePrior | None = None
     free_focal: FreeFocal | None = None
+    rig: Pose | None = None
 
 
 class Part(NamedTuple):
@@ -70,7 +74,7 @@ class Part(NamedTuple):
 def checked_inputs(
     world_points: Tensor,
     img_points: Tensor,
-    intrinsics: Tensor | PinholeCamera,
+    intrinsics: Tensor | PinholeCamera | None,
     weights: Tensor | None = None,
     mask: Tensor | None = None,
     init: Pose | None = None,
@@ -80,8 +84,14 @@ def checked_inputs(
     world_cov: Tensor | None = None,
     confidence: Tensor | None = None,
     prior: PosePrior | None = None,
+    *,
+    dist: Tensor | None = None,
+    fisheye: Tensor | None = None,
+    cam_from_rig: Pose | None = None,
 ) -> tuple[torch.Size, Inputs]:
     """Check the arguments of a call, and make them one batch of one dtype, see :func:`common_dtype`.
+
+    Distorted pixels become those of pinhole cameras, and bearings a rig of cameras that each look at their own point.
 
     Shapes, dtypes and devices are checked; never values, which would stall a GPU and let one problem fail a batch.
 
@@ -95,7 +105,13 @@ def checked_inputs(
         ValueCheckError: for both a sigma and a covariance of the pixels, or of the points.
     """
     rotation, translation = (None, None) if init is None else init
+    is_bearing = isinstance(img_points, Tensor) and img_points.ndim > 1 and img_points.shape[-1] == 3
+    if intrinsics is None and is_bearing:
+        intrinsics = torch.eye(3, dtype=img_points.dtype, device=img_points.device)
+    if intrinsics is None:
+        raise TypeCheckError("intrinsics must be a tensor, got NoneType: only bearings, (B, N, 3), need none.")
     matrices = camera_matrices(intrinsics)
+    rig_rotation, rig_translation = (None, None) if cam_from_rig is None else cam_from_rig
     (prior_rotation, prior_translation), information, prior_scale = prior or PosePrior(Pose(None, None), None)  # type: ignore[arg-type]
     tensors = {
         "world_points": world_points,
@@ -111,6 +127,10 @@ def checked_inputs(
         "prior translation": prior_translation,
         "prior information": information,
         "prior scale": prior_scale,
+        "dist": dist,
+        "fisheye": fisheye,
+        "cam_from_rig rotation": rig_rotation,
+        "cam_from_rig translation": rig_translation,
     }
     required = ("world_points", "img_points", "intrinsics")
     for name, value in (*tensors.items(), ("mask", mask)):
@@ -127,21 +147,32 @@ def checked_inputs(
             actual_shape=tuple(weights.shape),
             expected_shape=(*size, count),
         )
+    check_coefficients(dist, fisheye)
+    if (dist is not None or fisheye is not None) and (is_bearing or cam_from_rig is not None):
+        raise ValueCheckError("dist and fisheye are for pixels of one camera: make bearings of each camera's pixels.")
+    is_rig = is_bearing or cam_from_rig is not None
+    of_pair = is_rig and matrices.ndim == len(size) + 3
+    of_camera = () if matrices.ndim == 2 else (*size, count) if of_pair else size
     shapes: Shapes = {
-        "img_points": (img_points, (*size, count, 2)),
+        "img_points": (img_points, (*size, count, 3 if is_bearing else 2)),
         "weights": (weights, (*size, count)),
         "mask": (mask, (*size, count)),
         "confidence": (confidence, (*size, count)),
         "img_cov": (img_cov, (*size, count, 2, 2)),
         "world_cov": (world_cov, (*size, count, 3, 3)),
-        "intrinsics": (matrices, (3, 3) if matrices.ndim == 2 else (*size, 3, 3)),
+        "intrinsics": (matrices, (*of_camera, 3, 3)),
         "init rotation": (rotation, (*size, 3, 3)),
         "init translation": (translation, (*size, 3)),
         "prior rotation": (prior_rotation, (*size, 3, 3)),
         "prior translation": (prior_translation, (*size, 3)),
         "prior information": (information, (*size, 6, 6)),
         "prior scale": (prior_scale, size),
+        "cam_from_rig rotation": (rig_rotation, (*size, count, 3, 3)),
+        "cam_from_rig translation": (rig_translation, (*size, count, 3)),
     }
+    for name, lens in (("dist", dist), ("fisheye", fisheye)):
+        if lens is not None:
+            shapes[name] = lens, (*(size if lens.ndim > 1 else ()), lens.shape[-1])
     check_shapes(shapes, world_points)
     if count < 3:
         raise ShapeError(f"A pose needs at least 3 pairs, got N = {count}.", actual_shape=tuple(world_points.shape))
@@ -151,10 +182,39 @@ def checked_inputs(
     sigmas = {"img_sigma": img_sigma, "world_sigma": world_sigma}
     dtype = common_dtype({**tensors, **{name: x for name, x in sigmas.items() if isinstance(x, Tensor)}})
     noise = checked_noise(world_points.to(dtype), img_sigma, world_sigma, img_cov, world_cov)
-    cameras = matrices.expand(*size, 3, 3)
+    per_pair = matrices if matrices.ndim == 2 or of_pair else matrices[..., None, :, :]
+    cameras = per_pair.expand(*size, count, 3, 3) if is_rig else matrices.expand(*size, 3, 3)
     pose = None if init is None else Pose(*init)
-    given = Inputs(world_points, img_points, cameras, weights, mask, pose, noise, confidence, prior)
-    return size, map_tensors(lambda x: one_batch(x, size, dtype), given)
+    rig = None if cam_from_rig is None else Pose(*cam_from_rig)
+    given = Inputs(world_points, img_points, cameras, weights, mask, pose, noise, confidence, prior, None, rig)
+    inputs = map_tensors(lambda x: one_batch(x, size, dtype), given)
+    dist, fisheye = (
+        None if x is None else one_batch(x.expand(*size, x.shape[-1]), size, dtype) for x in (dist, fisheye)
+    )
+    if is_bearing:
+        return size, _looking_along(inputs)
+    if dist is None and fisheye is None:
+        return size, inputs
+    pixels, found, noise = undistort(inputs.img_points, inputs.intrinsics, dist, fisheye, inputs.noise)
+    mask = found if inputs.mask is None else found & inputs.mask
+    # Pairs without a pixel are left out; one that is not finite still fails its problem.
+    pixels = torch.where(found[..., None] | inputs.img_points.isfinite(), pixels, inputs.img_points)
+    mask = mask | (~inputs.img_points.isfinite().all(-1) & (True if inputs.mask is None else inputs.mask))
+    return size, inputs._replace(img_points=pixels, mask=mask, noise=noise)
+
+
+def _looking_along(inputs: Inputs) -> Inputs:
+    """Inputs with bearings as those of cameras whose axes are the bearings, with a focal length each and no skew.
+
+    The focal length is the geometric mean of those given: pixels of sigma per radian.
+    """
+    rotation, sound = bearing_cameras(inputs.img_points)
+    axis = torch.where(sound[..., None], inputs.img_points[..., :2] * 0.0, torch.nan)
+    cameras = inputs.intrinsics / inputs.intrinsics[..., 2:, 2:]
+    focal = (cameras[..., 0, 0] * cameras[..., 1, 1]).sqrt()
+    eye = torch.eye(3, dtype=focal.dtype, device=focal.device)
+    cameras = eye * torch.stack((focal, focal, torch.ones_like(focal)), -1)[..., None, :]
+    return inputs._replace(img_points=axis, intrinsics=cameras, rig=compose(rotation, inputs.rig))
 
 
 def checked_noise(
@@ -198,6 +258,15 @@ def restore_leading(size: torch.Size, result: _T) -> _T:
     return result if len(size) == 1 else map_tensors(lambda x: x.reshape((*size, *x.shape[1:])), result)
 
 
+def given_cameras(intrinsics: Tensor | PinholeCamera | None, world_points: Tensor, like: Tensor) -> Tensor:
+    """The cameras of a rig as they were given, expanded to a problem each, or to a pair each."""
+    if intrinsics is None:
+        return torch.eye(3, dtype=like.dtype, device=like.device).expand(*world_points.shape[:-2], 3, 3)
+    matrices = camera_matrices(intrinsics).to(like.dtype)
+    matrices = matrices / matrices[..., 2:, 2:]
+    return matrices.expand(*world_points.shape[:-2], 3, 3) if matrices.ndim == 2 else matrices
+
+
 def split_batch(inputs: Inputs, most: int | None, any_number: bool) -> list[Part]:
     """Split a batch into the parts that are solved one after the other.
 
@@ -237,13 +306,15 @@ def _without_padding(inputs: Inputs, most: int) -> list[Part]:
         at = problems[start:stop]
         pairs = order[at, :width]
 
-        of_problems = inputs.intrinsics, inputs.init, inputs.prior
+        is_rig = inputs.intrinsics.ndim == 4
+        of_problems = None if is_rig else inputs.intrinsics, inputs.init, inputs.prior
         cameras, init, prior = map_tensors(lambda x, at=at: x[at], of_problems)
         of_pairs = map_tensors(
             lambda x, at=at, pairs=pairs: x[at[:, None], pairs],
-            inputs._replace(intrinsics=inputs.mask, init=None, prior=None),
+            inputs._replace(intrinsics=inputs.intrinsics if is_rig else inputs.mask, init=None, prior=None),
         )
-        parts.append(Part(of_pairs._replace(intrinsics=cameras, init=init, prior=prior), at, pairs, count))
+        of_pairs = of_pairs._replace(init=init, prior=prior)
+        parts.append(Part(of_pairs if cameras is None else of_pairs._replace(intrinsics=cameras), at, pairs, count))
         stop = start
     return parts
 

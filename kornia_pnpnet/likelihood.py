@@ -276,7 +276,7 @@ class _Posterior(NamedTuple):
         residual, sq_behind = corr.focal * plane - corr.img_points, (corr.focal * behind).square()
         assert corr.noise is not None
         if corr.noise.covariances:
-            at = poses.rotation, plane.unbind(-1), depth.reciprocal()
+            at = poses.rotation[..., None], plane.unbind(-1), depth.reciprocal()
             covariance = pixel_covariance(*at, corr.noise, corr.focal)
             determinant, precision = covariance.determinant, covariance.inverse()
             sq_residual = precision.form(*residual.unbind(-1)) + 0.5 * sq_behind * (precision.uu + precision.vv)

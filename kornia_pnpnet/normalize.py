@@ -58,7 +58,7 @@ class Frame(NamedTuple):
         order: position in the input of each normalised pair, int64, shape :math:`(B, N)`; ``None``: unchanged.
         status: ``Status.SOLVED`` where the problem can be solved at all, else why not, int64, shape :math:`(B,)`.
         intrinsics: the camera matrices with a last entry of 1, the identity where they are impossible, shape
-            :math:`(B, 3, 3)`.
+            :math:`(B, 3, 3)`, of a rig :math:`(B, N, 3, 3)`.
     """
 
     centroid: Tensor
@@ -125,19 +125,21 @@ class Normalize(Configured):
         mask: Tensor | None = None,
         noise: Noise | None = None,
         confidence: Tensor | None = None,
+        rig: Pose | None = None,
     ) -> tuple[Correspondences, Frame]:
         r"""Normalise a batch.
 
         Args:
             world_points: shape :math:`(B, N, 3)`.
             img_points: pixels, shape :math:`(B, N, 2)`.
-            intrinsics: shape :math:`(B, 3, 3)`.
+            intrinsics: shape :math:`(B, 3, 3)`, or of each pair in a rig, :math:`(B, N, 3, 3)`.
             weights: at least 0, shape :math:`(B, N)`; 1 when ``None``.
             mask: False where a pair is padding, bool, shape :math:`(B, N)`.
             noise: standard deviations in pixels and in the unit of the world, NaN where unknown, or covariances in
                 their squares.
             confidence: the caller's belief that a pair is an inlier, in [0, 1], shape :math:`(B, N)`; NaN where
                 unknown.
+            rig: the camera of each pair in the frame of a rig, :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`.
 
         Returns:
             The normalised correspondences, with the problems last in memory, and the :class:`Frame` that undoes it.
@@ -152,7 +154,10 @@ class Normalize(Configured):
         # of each camera, (9, B), of which fx, fy = [:5:4] and cx, cy = [2:6:3].
         rows = torch.cat((world_points.permute(2, 1, 0), img_points.permute(2, 1, 0), weights.mT[None]))
         zero, one = rows.new_zeros(1, batch), rows.new_ones(1, batch)
-        camera, is_camera = _pinhole(intrinsics.flatten(1).mT.contiguous())
+        # Of a rig the entries of each pair's camera, (9, N, B).
+        cameras = intrinsics.flatten(-2)
+        cameras, is_camera = _pinhole((cameras.mT if intrinsics.ndim == 3 else cameras.permute(2, 1, 0)).contiguous())
+        camera = cameras[:, None] if intrinsics.ndim == 3 else cameras  # (9, 1 or N, B)
 
         # Make inputs safe before computing with them: between this limit and its inverse, squares of squares neither
         # overflow nor vanish. NaN compares false.
@@ -169,6 +174,14 @@ class Normalize(Configured):
         if noise is not None:
             has_noise = _is_usable(noise, there)
             is_finite = is_finite & has_noise
+        if rig is not None:
+            values = torch.cat((rig.rotation.flatten(-2), rig.translation), -1).detach()
+            sound = (values.abs() < limit).all(-1) | ~there.mT  # (B, N)
+            is_finite = is_finite & sound.all(-1)
+            eye = torch.eye(3, dtype=rows.dtype, device=rows.device)
+            rotation = torch.where(sound[..., None, None], rig.rotation, eye)
+            rig = Pose(rotation, torch.where(sound[..., None], rig.translation, 0.0))
+            is_camera = (is_camera | ~there).all(0)
         if confidence is not None:
             is_probability = ((confidence >= 0) & (confidence <= 1)) | confidence.isnan()
             is_finite = is_finite & (is_probability | ~there.mT).all(-1)
@@ -176,10 +189,10 @@ class Normalize(Configured):
         there = there & (is_camera & is_finite) & (size < limit)
         rows = torch.where(there, rows, zero)  # finite, so that products with 0 are 0 from here on
         focal = rows.new_full((), self.f_const)  # made on the device, so that a GPU need not wait for the CPU
-        img_scales = focal / camera[:5:4]  # (2, B)
+        img_scales = focal / camera[:5:4]  # (2, 1 or N, B)
 
         # A pair far off is no reason to refuse the problem: beyond any angle or distance it is an outlier.
-        pixels = (rows[3:5] - camera[2:6:3, None]) * img_scales[:, None]
+        pixels = (rows[3:5] - camera[2:6:3]) * img_scales
         tangent = pixels.detach().abs().amax(0) / self.f_const
         sq_distance, typical = _distances(rows[:3].detach(), there, padded)
         there = there & (tangent <= 1.0 / MIN_DEPTH_RATIO) & (sq_distance <= _LARGEST_DISTANCE**2 * typical)
@@ -221,44 +234,52 @@ class Normalize(Configured):
             is_near = is_near.gather(0, order.mT)
         world_points, img_points, weights = rows.permute(2, 1, 0).split((3, 2, 1), -1)
         horizontal, vertical = img_scales.sqrt()
-        eye = torch.eye(3, dtype=camera.dtype, device=camera.device).view(9, 1)
-        matrices = torch.where(is_camera, camera, eye).mT.unflatten(1, (3, 3))
-        frame = Frame(centroid.mT, scale, horizontal * vertical, order, status, matrices)
+        img_scale = horizontal * vertical  # (1 or N, B)
+        eye = torch.eye(3, dtype=camera.dtype, device=camera.device).view(9, *(1,) * (cameras.ndim - 1))
+        matrices = torch.where(is_camera, cameras, eye)
+        matrices = (matrices.mT if intrinsics.ndim == 3 else matrices.permute(2, 1, 0)).unflatten(-1, (3, 3))
+        mean_scale = (img_scale * is_there).sum(0) / is_there.sum(0).clamp(min=1.0) if rig is not None else img_scale[0]
+        frame = Frame(centroid.mT, scale, mean_scale, order, status, matrices)
         if noise is not None:
             # Scaling an infinite sigma would give gradients of NaN: an invalid problem has no known noise.
             sigmas = map_tensors(lambda sigma: torch.where(has_noise[:, None], sigma, torch.nan), noise.sigmas)
             noise = noise._replace(img=sigmas.img, world=sigmas.world)
             if noise.covariances:
-                pixel_map = img_scales[0], -camera[1] / camera[0] * img_scales[1], img_scales[1]
+                pixel_map = [x.mT for x in (img_scales[0], -camera[1] / camera[0] * img_scales[1], img_scales[1])]
                 noise = self._scaled_covariances(noise, (there & has_noise).mT, pixel_map, scale)
-            noise = self._apply_to_noise(noise, frame)
+            noise = self._apply_to_noise(noise, frame, img_scale.mT)
         if confidence is not None and order is not None:
             confidence = confidence.gather(1, order)
+        if rig is not None:
+            rig = Pose(rig.rotation, rig.translation * scale[:, None, None])
+            if order is not None:
+                rotation = rig.rotation.gather(1, order[..., None, None].expand_as(rig.rotation))
+                rig = Pose(rotation, rig.translation.gather(1, order[..., None].expand_as(rig.translation)))
         corr = Correspondences(
             world_points, img_points, weights[..., 0], focal, frame.img_scale, scale, noise, is_near.mT, confidence
         )
-        return corr, frame
+        return corr._replace(rig=rig), frame
 
     def _scaled_covariances(self, noise: Noise, sound: Tensor, pixel_map: Sequence[Tensor], scale: Tensor) -> Noise:
         """Covariances in the units of the normalised correspondences, raised above rounding; 0 where not ``sound``.
 
-        Pixels are multiplied by the matrix [[a, b], [0, d]] with the entries of ``pixel_map``, (B,) each.
+        Pixels are multiplied by the matrix [[a, b], [0, d]] with the entries of ``pixel_map``, (B, 1) or (B, N) each.
         """
         img_cov, world_cov = map_tensors(lambda x: torch.where(sound, x, 0.0), (noise.img_cov, noise.world_cov))
         if img_cov is not None:
-            img_cov = img_cov.mapped(*(x[:, None] for x in pixel_map)).at_least((LEAST_NOISE * self.f_const) ** 2)
+            img_cov = img_cov.mapped(*pixel_map).at_least((LEAST_NOISE * self.f_const) ** 2)
         if world_cov is not None:
             world_cov = world_cov.scaled(scale.square()[:, None])
         return noise._replace(img_cov=img_cov, world_cov=world_cov)
 
-    def _apply_to_noise(self, noise: Noise, frame: Frame) -> Noise:
+    def _apply_to_noise(self, noise: Noise, frame: Frame, img_scale: Tensor) -> Noise:
         """Standard deviations in the units of the normalised correspondences, and all noise in their order."""
 
         def scaled(sigma: Tensor, scale: Tensor) -> Tensor:
             # Unknown sigmas are NaN. Replace them before scaling, or the gradient of the scale becomes NaN.
-            return torch.where(sigma.isnan(), sigma, sigma.nan_to_num() * scale[:, None])
+            return torch.where(sigma.isnan(), sigma, sigma.nan_to_num() * scale)
 
-        noise = noise._replace(img=scaled(noise.img, frame.img_scale), world=scaled(noise.world, frame.scale))
+        noise = noise._replace(img=scaled(noise.img, img_scale), world=scaled(noise.world, frame.scale[:, None]))
         return noise if frame.order is None else map_tensors(lambda x: x.gather(1, frame.order), noise)
 
     def views(self, corr: Correspondences, count: int) -> Correspondences:

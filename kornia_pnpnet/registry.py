@@ -163,6 +163,9 @@ def solve_pnp(
     intrinsics: Tensor | PinholeCamera,
     weights: Tensor | None = None,
     solver: str | nn.Module = "pnpnet-set",
+    *,
+    dist: Tensor | None = None,
+    fisheye: Tensor | None = None,
 ) -> Tensor:
     r"""Find world-to-camera matrices, with the signature of :func:`kornia.geometry.solve_pnp_dlt`, despite outliers.
 
@@ -175,6 +178,9 @@ def solve_pnp(
         intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or Kornia's cameras.
         weights: weight of each pair, at least 0, shape :math:`(B, N)`; 1 when ``None``.
         solver: one of :func:`list_solvers`, or a module with the same signature. A named solver is built once.
+        dist: distortion of the camera, 4, 5, 8, 12 or 14 coefficients of Kornia and OpenCV, shape :math:`(B, D)` or
+            :math:`(D,)`; solvers of other libraries take none.
+        fisheye: the four coefficients of ``cv2.fisheye``, in place of ``dist``.
 
     Returns:
         :math:`[R\,|\,t]` with ``x_cam = R x_world + t``, shape :math:`(B, 3, 4)`, float64 when any input is, else
@@ -194,5 +200,6 @@ def solve_pnp(
     if isinstance(solver, str):
         device = world_points.device if isinstance(world_points, Tensor) else torch.device("cpu")
         solver = _frozen(solver, device)
-    result = solver(world_points, img_points, intrinsics, weights)
+    lens = {name: x for name, x in (("dist", dist), ("fisheye", fisheye)) if x is not None}
+    result = solver(world_points, img_points, intrinsics, weights, **lens)
     return torch.where(result.ok[..., None, None], result.matrix[..., :3, :], torch.nan)

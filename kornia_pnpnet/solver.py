@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from kornia.core.check import KORNIA_CHECK
+from kornia.core.exceptions import ValueCheckError
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
 from kornia_pnpnet.core.checks import check_positive, check_whole
 from kornia_pnpnet.core.linalg import bound_gradient, gate
 from kornia_pnpnet.core.performance import Compiled, in_full_precision, sees_values
-from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.core.trees import map_tensors, take
 from kornia_pnpnet.init import RANSAC, MLPInit, SetInit
 from kornia_pnpnet.init.alternatives import doubt_mirrored, find_alternatives, is_seen
 from kornia_pnpnet.init.focal import (
@@ -24,8 +25,8 @@ from kornia_pnpnet.init.focal import (
     with_nominal_focal,
 )
 from kornia_pnpnet.init.ransac import search_on
-from kornia_pnpnet.init.ransac.search import take
-from kornia_pnpnet.inputs import Inputs, checked_inputs, joined, restore_leading, split_batch
+from kornia_pnpnet.init.rig import guess_of_rig
+from kornia_pnpnet.inputs import Inputs, checked_inputs, given_cameras, joined, restore_leading, split_batch
 from kornia_pnpnet.normalize import VIEWS, Frame, Normalize
 from kornia_pnpnet.pretrained import PretrainedMixin
 from kornia_pnpnet.refine import LMStart, LMStep, RobustWeightedLM
@@ -136,7 +137,7 @@ class PnPNet(PretrainedMixin):
         self,
         world_points: Tensor,
         img_points: Tensor,
-        intrinsics: Tensor | PinholeCamera,
+        intrinsics: Tensor | PinholeCamera | None,
         weights: Tensor | None = None,
         mask: Tensor | None = None,
         init: Pose | None = None,
@@ -147,6 +148,9 @@ class PnPNet(PretrainedMixin):
         world_cov: Tensor | None = None,
         confidence: Tensor | None = None,
         prior: PosePrior | None = None,
+        dist: Tensor | None = None,
+        fisheye: Tensor | None = None,
+        cam_from_rig: Pose | None = None,
         first_stage_only: bool = False,
         gradient: str | None = None,
         alternatives: int = 0,
@@ -156,9 +160,12 @@ class PnPNet(PretrainedMixin):
         Args:
             world_points: shape :math:`(B, N, 3)`, any unit, floats or integers. Any leading dimensions may stand in
                 place of :math:`B`, in all arguments and in the result; a single problem has none.
-            img_points: pixels, shape :math:`(B, N, 2)`.
+            img_points: pixels, shape :math:`(B, N, 2)`; or bearings, directions in the camera's frame of any length, as
+                those of :func:`~kornia_pnpnet.cameras.bearings`, shape :math:`(B, N, 3)`.
             intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or Kornia's cameras, whose
-                extrinsics are ignored.
+                extrinsics are ignored; in a rig also one for each pair, :math:`(B, N, 3, 3)`. Bearings need none:
+                they take the focal length as pixels per radian for what is told in pixels (``img_sigma``, thresholds),
+                which without intrinsics is told in radians.
             weights: weight of each pair, the same for u and v, at least 0, shape :math:`(B, N)`; 1 when ``None``.
             mask: False where a pair is padding, bool, shape :math:`(B, N)`. The numbers of padding do not matter.
             init: a world-to-camera pose, for example of the frame before, :math:`(B, 3, 3)` and :math:`(B, 3)`. It
@@ -180,6 +187,14 @@ class PnPNet(PretrainedMixin):
             prior: what is known of the pose besides the pairs, such as :func:`~kornia_pnpnet.refine.gravity_prior`: a
                 term of the refinement and of the choice among poses, to which its pose belongs unless ``init`` is
                 given. ``ok`` and ``probability`` are judged by the pairs alone. Unknown noise counts as one pixel.
+            dist: distortion of the camera as Kornia and OpenCV have it, 4, 5, 8, 12 or 14 coefficients, shape
+                :math:`(B, D)` or :math:`(D,)`. Pixels are undistorted once, and their noise with them. Pairs beyond
+                what the coefficients can show are left out.
+            fisheye: the four coefficients of ``cv2.fisheye``, in place of ``dist``, shape :math:`(B, 4)` or
+                :math:`(4,)`. Pixels more than 85 degrees off the axis are left out; bearings keep them.
+            cam_from_rig: several cameras with one pose, that of their rig, which is the pose of the result: the camera
+                that sees each pair, as a transform from the rig to the camera, :math:`(B, N, 3, 3)` and
+                :math:`(B, N, 3)`.
             first_stage_only: return the first guess unrefined, the paper's "Net", at the cost of ``m=0``.
             gradient: ``"ok"`` or ``"always"``; the solver's own when ``None``.
             alternatives: largest number of other poses to return that explain the pairs nearly as well. Looking for
@@ -196,11 +211,13 @@ class PnPNet(PretrainedMixin):
                 was built for.
             TypeCheckError: for arguments that are no tensors, or hold booleans or complex numbers.
             DeviceError: for tensors on different devices, or on another device than a network of the solver.
-            ValueCheckError: for both a sigma and a covariance of the pixels, or of the points.
+            ValueCheckError: for both a sigma and a covariance of the pixels, or of the points; for arguments that
+                cannot be combined (an unknown focal length with distortion or a rig, a rig with alternatives).
         """
         given = world_points, img_points, intrinsics, weights, mask, init, img_sigma, world_sigma, img_cov, world_cov
-        size, inputs = checked_inputs(*given, confidence, prior)
+        size, inputs = checked_inputs(*given, confidence, prior, dist=dist, fisheye=fisheye, cam_from_rig=cam_from_rig)
         check_whole(0, alternatives=alternatives)
+        self._check_cameras(inputs, dist is not None or fisheye is not None, alternatives)
         with in_full_precision(inputs.world_points.device.type):
             always = _checked_gradient(gradient or self.gradient) == "always"
             compiled = [x for x in (self._solve, self._first, self._begin) if isinstance(x, Compiled)]
@@ -211,49 +228,26 @@ class PnPNet(PretrainedMixin):
             parts = split_batch(inputs, getattr(self.init, "pairs_at_once", None), any_number)
             results = [self._solve(first_stage_only, always, part.inputs, alternatives) for part in parts]
             result = joined(parts, results)
-        return restore_leading(size, map_tensors(lambda x: x[:1], result) if single else result)
+        result = restore_leading(size, map_tensors(lambda x: x[:1], result) if single else result)
+        if inputs.rig is not None:
+            result = result._replace(intrinsics=given_cameras(intrinsics, world_points, result.translation))
+        return result
 
     def with_guess(
-        self,
-        world_points: Tensor,
-        img_points: Tensor,
-        intrinsics: Tensor | PinholeCamera,
-        weights: Tensor | None = None,
-        mask: Tensor | None = None,
-        init: Pose | None = None,
-        *,
-        img_sigma: Tensor | float | None = None,
-        world_sigma: Tensor | float | None = None,
-        img_cov: Tensor | None = None,
-        world_cov: Tensor | None = None,
-        confidence: Tensor | None = None,
-        prior: PosePrior | None = None,
-        first_stage_only: bool = False,
-        gradient: str | None = None,
+        self, *args: Any, first_stage_only: bool = False, gradient: str | None = None, **options: Any
     ) -> tuple[PnPResult, Guess]:
         """Solve a batch and return the whole first guess as well (poses, weights and noise), to train it.
 
         Args:
-            world_points: See forward.
-            img_points: See forward.
-            intrinsics: See forward.
-            weights: See forward.
-            mask: See forward.
-            init: See forward.
-            img_sigma: See forward.
-            world_sigma: See forward.
-            img_cov: See forward.
-            world_cov: See forward.
-            confidence: See forward.
-            prior: See forward.
+            args: See forward.
             first_stage_only: See forward.
             gradient: See forward.
+            options: the other arguments of ``forward``, except ``alternatives``.
 
         Returns:
             The result, and the guess in the frame, order and units of the inputs; its ``ok``: is the problem valid.
         """
-        given = world_points, img_points, intrinsics, weights, mask, init, img_sigma, world_sigma, img_cov, world_cov
-        size, inputs = checked_inputs(*given, confidence, prior)
+        size, inputs = checked_inputs(*args, **options)
         with in_full_precision(inputs.world_points.device.type):
             always = _checked_gradient(gradient or self.gradient) == "always"
             begun, _, result = self._parts(first_stage_only, always, inputs)
@@ -281,6 +275,14 @@ class PnPNet(PretrainedMixin):
         if not whole:
             self.refine.compile(mode)
 
+    def _check_cameras(self, inputs: Inputs, distorted: bool, alternatives: int) -> None:
+        """Refuse what cannot be combined."""
+        rig = inputs.rig is not None
+        if self.focal == "unknown" and (rig or distorted):
+            raise ValueCheckError("focal='unknown' takes pixels of one camera without distortion.")
+        if rig and (alternatives or self.init is None):
+            raise ValueCheckError("A rig or bearings have no alternatives, and need a solver with an initialiser.")
+
     def _in_parts(self, first_stage_only: bool, always: bool, inputs: Inputs, alternatives: int = 0) -> PnPResult:
         begun, zoom, result = self._parts(first_stage_only, always, inputs)
         if not alternatives:
@@ -296,6 +298,10 @@ class PnPNet(PretrainedMixin):
     def _parts(self, first_stage_only: bool, always: bool, inputs: Inputs) -> tuple[_Begun, Tensor | None, PnPResult]:
         """Before the iterations, the iterations, and after them."""
         given = inputs
+        if inputs.rig is not None:
+            begun = self._begin(1, always, inputs)
+            end = self.refine.iterate(begun.start, 0 if first_stage_only else None)
+            return begun, None, self._finish(begun, end, always)
         if self.focal == "unknown":
             inputs = with_nominal_focal(inputs, self.focal_sigma)
             inputs = inputs if finds_focal(self.init) else with_found_focal(inputs)
@@ -349,8 +355,8 @@ class PnPNet(PretrainedMixin):
         self, views: int, always: bool, inputs: Inputs, search_follows: bool
     ) -> tuple[Correspondences, Frame, Guess]:
         """Normalise and guess."""
-        world_points, img_points, intrinsics, weights, mask, init, noise, confidence, prior, free_focal = inputs
-        corr, frame = self.normalize(world_points, img_points, intrinsics, weights, mask, noise, confidence)
+        world_points, img_points, intrinsics, weights, mask, init, noise, confidence, prior, free_focal, rig = inputs
+        corr, frame = self.normalize(world_points, img_points, intrinsics, weights, mask, noise, confidence, rig)
         if always:
             world, img, pair_weights = (bound_gradient(x, _LONGEST_GRADIENT) for x in corr[:3])
             corr = corr._replace(world_points=world, img_points=img, weights=pair_weights)
@@ -365,6 +371,8 @@ class PnPNet(PretrainedMixin):
         if self.init is None:
             assert given is not None
             guess = Guess(given, torch.ones_like(corr.weights))
+        elif rig is not None and not isinstance(self.init, RANSAC):
+            guess = guess_of_rig(corr, given, with_noise=isinstance(self.init, SetInit))
         elif isinstance(self.init, RANSAC):
             guess = self.init(corr, given)
         elif views == 1:
@@ -412,7 +420,7 @@ class PnPNet(PretrainedMixin):
         # ONNX Runtime chooses among int64, not among int8.
         status = torch.where(frame.valid, status, frame.status).to(torch.int8)
         live = finite if always else ok
-        intrinsics = gate(intrinsics, live, torch.ones_like(finite), 0.0)
+        cameras = None if frame.intrinsics.ndim > 3 else gate(intrinsics, live, torch.ones_like(finite), 0.0)
         pose = _gate_pose(pose, live, finite)
         return PnPResult(
             *pose,
@@ -423,7 +431,7 @@ class PnPNet(PretrainedMixin):
             status,
             torch.where(finite, refined.probability, 0.0),
             Alternatives.none(pose),
-            intrinsics,
+            cameras,
         )
 
 

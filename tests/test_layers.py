@@ -18,6 +18,7 @@ LAYERS = (
     ("core", "types"),
     ("geometry", "refine", "data"),
     (
+        "cameras",
         "normalize",
         "init",
         "losses",

@@ -19,6 +19,7 @@ __all__ = [
     "ImageCorrespondences",
     "InputError",
     "camera_matrix",
+    "colmap_camera",
     "check_camera",
     "check_points_present",
     "check_shapes",
@@ -63,6 +64,17 @@ def camera_matrix(text: str) -> Tensor:
         raise InputError("--intrinsics", f"expected four numbers fx,fy,cx,cy, got {text!r}") from None
     matrix = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
     return check_camera(matrix, "--intrinsics")
+
+
+def colmap_camera(text: str, img_points: Tensor) -> tuple[Tensor, Tensor]:
+    """Undistort pixels (N, 2) by ``MODEL,width,height,params...``, see :func:`~kornia_pnpnet.data.colmap.undistort`."""
+    from kornia_pnpnet.data.colmap import undistort
+
+    try:
+        matrix, pixels = undistort(text, img_points)
+    except ValueError as error:
+        raise InputError("--camera", str(error)) from None
+    return check_camera(matrix, "--camera"), pixels
 
 
 def check_camera(matrix: Tensor, source: str | Path) -> Tensor:

@@ -4,6 +4,10 @@ The pose of one image is printed as JSON: x_cam = R x_world + t.
 
   pnpnet solve matches.csv --intrinsics 3400,3400,3024,2016 --plot pose.png
 
+With an unknown focal length only the principal point counts, which is mostly the middle of the image:
+
+  pnpnet solve matches.csv --focal unknown --intrinsics 1,1,3024,2016
+
 With --batch, files of many problems are solved in bounded memory and their poses are written to files. The same command
 continues where it was stopped. The files, called shards, are NPZ files with world_points (B, N, 3), img_points
 (B, N, 2) and optionally weights, intrinsics, img_sigma and world_sigma, or Parquet files with columns of these names
@@ -21,7 +25,7 @@ import json
 import math
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from kornia_pnpnet.cli.arguments import (
     existing_path,
@@ -32,7 +36,7 @@ from kornia_pnpnet.cli.arguments import (
 )
 
 if TYPE_CHECKING:
-    from torch import Tensor
+    from torch import Tensor, nn
 
 _DEFAULT = "pnpnet-set"
 _ADVICE = {
@@ -58,6 +62,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--intrinsics", metavar="fx,fy,cx,cy", help="the camera in pixels; replaces the intrinsics of an NPZ file"
+    )
+    parser.add_argument(
+        "--camera",
+        metavar="MODEL,w,h,PARAMS",
+        help="a distorted camera as in COLMAP's cameras.txt, in place of --intrinsics, for example "
+        "SIMPLE_RADIAL,1920,1080,1500,960,540,-0.02; errors are those of undistorted pixels",
+    )
+    parser.add_argument(
+        "--focal",
+        metavar="known|unknown|SIGMA",
+        type=_focal,
+        help="estimate the focal length; SIGMA: that of the intrinsics is right up to this share, such as 0.1",
     )
     parser.add_argument(
         "--solver",
@@ -87,9 +103,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _focal(text: str) -> dict[str, Any]:
+    """Options of a solver from ``--focal``."""
+    if text in ("known", "unknown"):
+        return {"focal": text}
+    return {"focal": "unknown", "focal_sigma": positive_float(text)}
+
+
+def _load_solver(arguments: argparse.Namespace) -> nn.Module:
+    from kornia_pnpnet.solver import PnPNet
+
+    solver = load_solver_without_truth(arguments.solver)
+    if not arguments.focal:
+        return solver
+    if not isinstance(solver, PnPNet):
+        raise ValueError(f"--focal: {arguments.solver} does not estimate focal lengths")
+    options: dict[str, Any] = {"views": solver.views, "gradient": solver.gradient, "effort": solver.effort}
+    return PnPNet(solver.init, solver.refine, solver.normalize, **options, **arguments.focal).eval()
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Solve one image or, with ``--batch``, shards."""
     from kornia_pnpnet.cli.correspondence_files import camera_matrix
+
+    if arguments.camera and (arguments.intrinsics or arguments.focal or arguments.batch):
+        raise ValueError("--camera stands alone: without --intrinsics, --focal and --batch")
 
     camera = camera_matrix(arguments.intrinsics) if arguments.intrinsics else None
     if arguments.batch:
@@ -107,7 +145,7 @@ def _solve_batch(arguments: argparse.Namespace, camera: Tensor | None) -> int:
     name, out = arguments.solver, arguments.out or "outputs/poses"
     try:
         report = solve_shards(
-            load_solver_without_truth(name),
+            _load_solver(arguments),
             arguments.file,
             out,
             name=name,
@@ -136,22 +174,29 @@ def _solve_image(arguments: argparse.Namespace, camera: Tensor | None) -> int:
     from kornia.geometry.conversions import rotation_matrix_to_quaternion
 
     from kornia_pnpnet import Status
-    from kornia_pnpnet.cli.correspondence_files import InputError, read_correspondences
+    from kornia_pnpnet.cli.correspondence_files import InputError, colmap_camera, read_correspondences
     from kornia_pnpnet.cli.reprojection import reproject
 
     (path,) = arguments.file
     matches = read_correspondences(path)
     camera = matches.intrinsics if camera is None else camera
+    weights = matches.weights
+    if arguments.camera:
+        camera, pixels = colmap_camera(arguments.camera, matches.img_points)
+        there = pixels.isfinite().all(-1)
+        weights = there.to(pixels) if weights is None else torch.where(there, weights, 0.0)
+        matches = matches._replace(img_points=torch.where(there[:, None], pixels, camera[:2, 2]))
     if camera is None:
         raise InputError(path, "the file has no intrinsics: pass --intrinsics fx,fy,cx,cy")
     count = len(matches.world_points)
     name = arguments.solver
     if arguments.plot and Path(arguments.plot).exists() and not arguments.overwrite:
         raise ValueError(f"'{arguments.plot}' exists: pass --overwrite to replace it")
-    solver = load_solver_without_truth(name)
-    weights = None if matches.weights is None else matches.weights[None]
+    solver = _load_solver(arguments)
+    weights = None if weights is None else weights[None]
     with torch.no_grad():
         result = solver(matches.world_points[None], matches.img_points[None], camera[None], weights)
+    camera = result.intrinsics[0]
     found = reproject(matches.world_points, matches.img_points, camera, result.pose, arguments.threshold)
     ok, status = bool(result.ok), Status(int(result.status))
     rejected = found.rejected if ok else torch.ones_like(found.rejected)  # without a pose no pair is accepted
@@ -164,6 +209,7 @@ def _solve_image(arguments: argparse.Namespace, camera: Tensor | None) -> int:
         "rotation": result.rotation[0].tolist(),
         "translation": result.translation[0].tolist(),
         "quaternion_wxyz": rotation_matrix_to_quaternion(result.rotation)[0].tolist(),
+        "intrinsics": camera.tolist(),
         "cost": result.cost.item(),
         "rejected_above_px": found.limit_px,
         "pairs": [

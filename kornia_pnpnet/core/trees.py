@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 from torch import Tensor
 
-__all__ = ["iter_tensors", "map_tensors"]
+__all__ = ["iter_tensors", "map_tensors", "take"]
 
 _T = TypeVar("_T")
 
@@ -34,6 +34,11 @@ def map_tensors(function: Callable[..., Any], tree: _T, *others: _T) -> _T:
         return function(tree, *others)
     parts = (map_tensors(function, *entries) for entries in zip(tree, *others, strict=True))  # type: ignore[call-overload]
     return type(tree)(*parts) if hasattr(tree, "_fields") else type(tree)(parts)  # type: ignore[call-arg]
+
+
+def take(tree: _T, at: Tensor | slice) -> _T:
+    """Select problems from every tensor of a tree that has a batch."""
+    return map_tensors(lambda x: x[at] if x.ndim else x, tree)
 
 
 def iter_tensors(tree: Any) -> Iterator[Tensor]:

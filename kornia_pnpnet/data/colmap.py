@@ -13,7 +13,7 @@ from torch import Tensor
 from kornia_pnpnet.core.files import read_npz
 from kornia_pnpnet.data.scenes import Scene, View
 
-__all__ = ["load_colmap", "load_matches", "load_scene"]
+__all__ = ["load_colmap", "load_matches", "load_scene", "undistort"]
 
 # Folders of a model below the user's folder: the folder itself, ETH3D's layout, COLMAP's layout.
 _MODEL_FOLDERS = (".", "dslr_calibration_undistorted", "sparse/0", "sparse")
@@ -118,6 +118,37 @@ def load_matches(path: str | Path, *, metric: bool = True, min_points: int = 10,
     if not views:
         raise ValueError(f"the file of matches '{path}' has no images")
     return _scene(path, path.stem, views, min_points, metric)
+
+
+def undistort(camera: str, img_points: Tensor) -> tuple[Tensor, Tensor]:
+    """Undistort pixels by any camera model that ``pycolmap`` knows.
+
+    Args:
+        camera: ``MODEL,width,height,params...``, a line of COLMAP's ``cameras.txt`` without its number.
+        img_points: pixels in the convention of the camera, shape (N, 2).
+
+    Returns:
+        The pinhole camera of the same focal length and principal point, (3, 3), and its pixels, float64; NaN where a
+        pixel has none.
+
+    Raises:
+        ImportError: if ``pycolmap`` is missing.
+        ValueError: for an unknown model or other numbers than the model has.
+    """
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise ImportError("COLMAP's cameras need pycolmap: pip install 'kornia_pnpnet[eval]'") from error
+    model, *numbers = (part.strip() for part in camera.replace(" ", ",").split(",") if part.strip())
+    try:
+        width, height, *parameters = map(float, numbers)
+        lens = pycolmap.Camera(model=model.upper(), width=int(width), height=int(height), params=parameters)
+        plane = np.asarray(lens.cam_from_img(img_points.double().numpy()))
+        matrix = torch.tensor(lens.calibration_matrix())
+    except (ValueError, RuntimeError, IndexError, AttributeError, TypeError) as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(f"expected MODEL,width,height,params of COLMAP, got {camera!r}: {reason}") from error
+    return matrix, torch.tensor(plane) @ matrix[:2, :2].mT + matrix[:2, 2]
 
 
 def _scene(path: Path, name: str, views: list[View], min_points: int, metric: bool) -> Scene:

@@ -42,7 +42,9 @@ class Projection(NamedTuple):
         plane_points: :math:`(x/z, y/z)`, 0 for points behind the camera.
         inv_depth: :math:`1/z`, 0 for points behind the camera.
         scaled_residual: the residual times the depth.
-        rotation: the rotation of the pose, :math:`(B, 3, 3)`.
+        rotation: rotation from the world to the camera, :math:`(B, 3, 3, 1)`, in a rig that of each pair's camera,
+            :math:`(B, 3, 3, N)`.
+        rig: rotation from the rig to the camera of each pair, :math:`(B, 3, 3, N)`; ``None``: the pose is the camera's.
     """
 
     residual: tuple[Tensor, Tensor]
@@ -52,6 +54,7 @@ class Projection(NamedTuple):
     inv_depth: Tensor
     scaled_residual: tuple[Tensor, Tensor]
     rotation: Tensor
+    rig: Tensor | None = None
 
     @property
     def sq_residual(self) -> Tensor:
@@ -112,7 +115,19 @@ def project(pose: Pose, corr: Correspondences) -> Projection:
     a, b, c = corr.world_points.unbind(-1)  # (B, N) each, and the pose (B, 1) each
     matrix = [row.unbind(1) for row in pose.rotation[..., None].unbind(1)]
     y0, y1, y2 = (torch.addcmul(torch.addcmul(i * a, j, b), k, c) for i, j, k in matrix)
-    x, y, z = (r + t for r, t in zip((y0, y1, y2), pose.translation[..., None].unbind(1), strict=True))
+    t0, t1, t2 = pose.translation[..., None].unbind(1)
+    rotation, to_camera = pose.rotation[..., None], None
+    if corr.rig is not None:
+        to_camera = corr.rig.rotation.movedim(1, -1)  # (B, 3, 3, N)
+        shift = corr.rig.translation.unbind(-1)
+        cameras = [row.unbind(1) for row in to_camera.unbind(1)]
+        y0, y1, y2 = [torch.addcmul(torch.addcmul(i * y0, j, y1), k, y2) for i, j, k in cameras]
+        t0, t1, t2 = [
+            torch.addcmul(torch.addcmul(torch.addcmul(s, i, t0), j, t1), k, t2)
+            for (i, j, k), s in zip(cameras, shift, strict=True)
+        ]
+        rotation = (to_camera[:, :, :, None] * rotation[:, None]).sum(2)
+    x, y, z = (r + t for r, t in zip((y0, y1, y2), (t0, t1, t2), strict=True))
     # z |z| > ratio² |x|² tests the sign and the ratio at once, without a square root, whose gradient is infinite at 0.
     margin = z * z.abs()
     for coordinate in (x, y, z):
@@ -123,7 +138,7 @@ def project(pose: Pose, corr: Correspondences) -> Projection:
     scaled = torch.addcmul(corr.focal * x, u, z, value=-1), torch.addcmul(corr.focal * y, v, z, value=-1)
     residual = scaled[0] * inv_depth, scaled[1] * inv_depth
     plane_points = x * inv_depth, y * inv_depth
-    return Projection(residual, in_front, (y0, y1, y2), plane_points, inv_depth, scaled, pose.rotation)
+    return Projection(residual, in_front, (y0, y1, y2), plane_points, inv_depth, scaled, rotation, to_camera)
 
 
 def pixel_variance(projection: Projection, noise: Noise, focal: Tensor) -> Tensor:
@@ -164,7 +179,7 @@ def pixel_covariance(
     :func:`pixel_variance`. A standard deviation stands for a multiple of the identity.
 
     Args:
-        rotation: rotation of the pose, :math:`(*, 3, 3)`.
+        rotation: rotation from the world to the camera, :math:`(*, 3, 3, 1)` or :math:`(*, 3, 3, N)`.
         plane_points: :math:`(p, q)`, two tensors :math:`(*, N)`; see :class:`Projection`.
         inv_depth: :math:`1/z`, shape :math:`(*, N)`.
         noise: noise of each pair.
@@ -179,7 +194,7 @@ def pixel_covariance(
         moved = (scale * noise.world).square()
         uu, uv, vv = torch.addcmul(moved, moved * p, p), moved * p * q, torch.addcmul(moved, moved * q, q)
     else:
-        first, second, third = (row.unbind(-2) for row in rotation[..., None].unbind(-3))
+        first, second, third = (row.unbind(-2) for row in rotation.unbind(-3))
         a = [scale * torch.addcmul(i, p, k, value=-1) for i, k in zip(first, third, strict=True)]
         b = [scale * torch.addcmul(j, q, k, value=-1) for j, k in zip(second, third, strict=True)]
         of_a, of_b = noise.world_cov.times(a), noise.world_cov.times(b)
@@ -201,7 +216,8 @@ def normal_equations(
         -p y_2 & y_3 + p y_1 & -y_2 & 1 & 0 & -p \\
         -y_3 - q y_2 & q y_1 & y_1 & 0 & 1 & -q \end{pmatrix}.
 
-    The seventh parameter is that of :func:`dolly_zoom`, with the column :math:`\tfrac1z (p y_3, q y_3)^\top`.
+    In a rig the Jacobian of each camera is turned into the axes of the rig. The seventh parameter is that of
+    :func:`dolly_zoom`, with the column :math:`\tfrac1z (p y_3, q y_3)^\top`.
 
     Args:
         projection: what :func:`project` returned at the pose.
@@ -227,6 +243,8 @@ def normal_equations(
     ]
     if free_focal:
         columns.append((p * y3, q * y3))
+    if projection.rig is not None:
+        columns = _of_rig(columns, projection.rig) + columns[6:]
     weights = map_tensors(lambda w: w * projection.inv_depth * projection.inv_depth, weights)
     uu, uv, vv = (weights, 0.0, weights) if isinstance(weights, Tensor) else weights
     total = uu.sum(1)
@@ -249,6 +267,23 @@ def normal_equations(
     hessian = [[inner(weighted[j], columns[i]) for j in range(i + 1)] for i in range(5)]
     hessian += [[inner(weighted[i], columns[j]) for j in range(i + 1)] for i in range(5, len(columns))]
     return NormalEquations(hessian, [inner(column, projection.scaled_residual) for column in weighted])
+
+
+def _of_rig(columns: list[_Column], to_camera: Tensor) -> list[_Column]:
+    r"""Columns by the tangent of the rig's pose from those by the tangents of the cameras' poses.
+
+    A turn and a shift of the rig are a turn and a shift of each camera, expressed in the camera's axes.
+    """
+    cameras = [row.unbind(1) for row in to_camera.unbind(1)]  # (B, N) each
+    turned: list[_Column] = []
+    for block in (columns[:3], columns[3:6]):
+        for k in range(3):
+            entries = []
+            for row in range(2):
+                terms = [_times(cameras[j][k], block[j][row]) for j in range(3)]
+                entries.append(_plus(_plus(terms[0], terms[1]), terms[2]))
+            turned.append((entries[0], entries[1]))
+    return turned
 
 
 def _times(a: Any, b: Any) -> Any:

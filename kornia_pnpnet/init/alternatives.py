@@ -10,10 +10,9 @@ from torch.nn import functional
 
 from kornia_pnpnet.core.linalg import gate
 from kornia_pnpnet.core.performance import repeat_problems
-from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.core.trees import map_tensors, take
 from kornia_pnpnet.geometry import project, rotation_angle
 from kornia_pnpnet.init.ransac.p3p import p3p
-from kornia_pnpnet.init.ransac.search import take
 from kornia_pnpnet.refine import RobustWeightedLM
 from kornia_pnpnet.refine.verdict import LEAST_PROBABILITY, has_enough, residual_noise
 from kornia_pnpnet.types import Alternatives, Correspondences, Guess, PnPResult, Pose, Status

@@ -140,10 +140,13 @@ def chance_of_inlier(corr: Correspondences, thresholds: Thresholds, judged: Judg
         tensor([78.5398])
     """
     there, inlier = corr.weights[..., None] > 0, judged.weights > 0
-    high = torch.where(there, corr.img_points, -torch.inf).amax(1)
-    low = torch.where(there, corr.img_points, torch.inf).amin(1)
+    high = torch.where(there, corr.places, -torch.inf).amax(1)
+    low = torch.where(there, corr.places, torch.inf).amin(1)
     eps = torch.finfo(high.dtype).eps  # a perfect fit of pixels that all coincide is no evidence
-    sides = (high - low).clamp(min=eps)[:, None]  # (B, 1, 2)
+    sides = (high - low).clamp(min=eps)  # (B, 2), of the rays in a rig (B, 3)
+    if corr.rig is not None:
+        sides = sides.sort(-1).values[:, 1:]
+    sides = sides[:, None]
     worst = torch.where(inlier, judged.errors, 0.0).amax(-1, keepdim=True).clamp(min=eps)
     sq_radius = worst * _of_pairs(thresholds.img).square() / torch.where(inlier, judged.weights, 1.0)
     strips = 2.0 * sq_radius.sqrt()[..., None] / sides  # (B, N, 2)
@@ -175,18 +178,23 @@ def chance_of_others(projection: Projection, corr: Correspondences, thresholds: 
     there = corr.weights > 0
     worst = torch.where(judged.weights > 0, judged.errors, 0.0).amax(-1, keepdim=True)
     limit = torch.where(projection.in_front & there, worst * _sq_limits(projection, corr, thresholds), -1.0)
-    pixels = torch.where(there[..., None], corr.img_points, torch.inf)
-    seen = torch.stack([corr.focal * x for x in projection.plane_points], -1)
+    pixels = torch.where(there[..., None], corr.places, torch.inf)
+    seen = torch.stack(projection.plane_points, -1)
+    seen = corr.focal[..., None] * seen if corr.rig is None else corr.rays(seen)
     values = torch.cat((seen, pixels, limit[..., None]), -1)
     counts = there.sum(-1)
     if not exporting() and values.shape[1] > _MOST_OTHERS:  # evenly spaced among those that are no padding
         first = torch.arange(_MOST_OTHERS, device=there.device)
         some = present_first(there).gather(1, first.maximum(first * counts[:, None] // _MOST_OTHERS))
-        values = values.gather(1, some[..., None].expand(-1, -1, 5))
+        values = values.gather(1, some[..., None].expand(-1, -1, values.shape[-1]))
         counts = counts.clamp(max=_MOST_OTHERS)
-    u, v, pixel_u, pixel_v, limit = values.unbind(-1)
-    u, v = u[:, :, None] - pixel_u[:, None], v[:, :, None] - pixel_v[:, None]
-    near = u.square_().addcmul_(v, v) <= limit[..., None]
+    *both, limit = values.unbind(-1)
+    size = len(both) // 2
+    first, *others = (x[:, :, None] - y[:, None] for x, y in zip(both[:size], both[size:], strict=True))
+    sq_distance = first.square_()
+    for other in others:
+        sq_distance.addcmul_(other, other)
+    near = sq_distance <= limit[..., None]
     hits = near.sum((1, 2)) - near.diagonal(dim1=1, dim2=2).sum(-1)
     return (hits - _FEW_HITS).clamp(min=0) / (counts * (counts - 1)).clamp(min=1)
 

@@ -80,7 +80,7 @@ def outlier_area(corr: Correspondences) -> Tensor:
     there = (corr.near_weights > 0).to(corr.weights)
     share = there / there.sum(-1, keepdim=True).clamp(min=1.0)
     variance = torch.zeros_like(share[:, :1])
-    for pixels in corr.img_points.detach().unbind(-1):
+    for pixels in corr.places.detach().unbind(-1):
         mean = (share * pixels).sum(-1, keepdim=True)
         variance = variance + (share * (pixels - mean).square()).sum(-1, keepdim=True)
     return 6.0 * variance + torch.finfo(variance.dtype).tiny

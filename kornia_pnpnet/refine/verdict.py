@@ -84,7 +84,7 @@ def explains(projection: Projection, corr: Correspondences, weights: Tensor) -> 
     there = weights > 0
     share = weights / weights.sum(-1, keepdim=True).clamp(min=torch.finfo(weights.dtype).tiny)  # (B, N)
     spread = torch.zeros_like(share)
-    for pixels in corr.img_points.detach().unbind(-1):
+    for pixels in corr.places.detach().unbind(-1):
         centred = pixels - (share * pixels).sum(-1, keepdim=True)
         spread = torch.addcmul(spread, centred, centred)
     ascending, order = spread.sort(-1)

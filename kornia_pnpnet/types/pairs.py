@@ -77,6 +77,8 @@ class Correspondences(NamedTuple):
             ``None``: all unknown.
         prior: what is known of the pose besides the pairs; ``None``: nothing.
         free_focal: what is known of the focal length besides the pairs; ``None``: it is known.
+        rig: the camera of each pair in a rig, from the rig's frame to the camera's, :math:`(B, N, 3, 3)` and
+            :math:`(B, N, 3)`; the pose is that of the rig. ``None``: one camera, whose frame is that of the pose.
     """
 
     world_points: Tensor
@@ -90,6 +92,22 @@ class Correspondences(NamedTuple):
     confidence: Tensor | None = None
     prior: FramedPrior | None = None
     free_focal: FreeFocal | None = None
+    rig: Pose | None = None
+
+    @property
+    def places(self) -> Tensor:
+        """Where in the image each pair is seen: its pixel, in a rig a ray times the focal length.
+
+        Shape :math:`(B, N, 2)` or, in the frame of the rig, :math:`(B, N, 3)`.
+        """
+        return self.img_points if self.rig is None else self.rays(self.img_points / self.focal)
+
+    def rays(self, plane_points: Tensor) -> Tensor:
+        """Rays of points in the cameras' planes, as long as the focal length, in the frame of a rig, (B, N, 3)."""
+        assert self.rig is not None
+        rays = torch.cat((plane_points, torch.ones_like(plane_points[..., :1])), -1)
+        rays = self.focal * torch.nn.functional.normalize(rays, dim=-1)
+        return (self.rig.rotation * rays[..., None]).sum(-2)
 
     @property
     def focal_of_problem(self) -> Tensor:

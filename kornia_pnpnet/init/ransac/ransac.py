@@ -14,10 +14,11 @@ from kornia_pnpnet.core.checks import check_numbers, check_positive, check_whole
 from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.linalg import relative
 from kornia_pnpnet.core.performance import problems_last
-from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.core.trees import map_tensors, take
 from kornia_pnpnet.geometry import Projection, project
 from kornia_pnpnet.init.ransac.minimal import MinimalSolver, describe
 from kornia_pnpnet.init.ransac.p3p import P3P, P3PFocals
+from kornia_pnpnet.init.ransac.rig import P3PRig, is_central
 from kornia_pnpnet.init.ransac.scoring import SCORERS, Scorer
 from kornia_pnpnet.init.ransac.search import (
     PAIRS_PER_SAMPLE,
@@ -26,7 +27,6 @@ from kornia_pnpnet.init.ransac.search import (
     Search,
     full_vectors,
     least_squares,
-    take,
 )
 from kornia_pnpnet.refine.inliers import (
     MAX_FALSE_ALARMS,
@@ -206,6 +206,8 @@ class RANSAC(Configured):
                 plan = plan._replace(minimal=P3PFocals())
                 wide = thresholds.img.maximum(_on_grid(detached))
                 stages = [thresholds._replace(img=wide), thresholds]
+            if detached.rig is not None:
+                plan = plan._replace(minimal=P3PRig(0 if is_central(detached.rig) else P3PRig().steps))
             found = Search(plan, detached, stages[0], _trusted(detached.confidence)).run(given)
         pose, zoom, judged = self._refine(corr, found, stages)
         with torch.no_grad():

@@ -54,6 +54,9 @@ class Scene(NamedTuple):
         sq_world: :math:`\omega^2`, shape :math:`(P, 1, 1)`.
         wider: threshold in pixels of each pair relative to :math:`\tau`, shape :math:`(P, N, 1)`; ``None``: 1.
         prior: what is known of the poses besides the pairs.
+        rows: in a rig, what gives the three numerators of the residual as products with the twelve entries of a pose,
+            shape :math:`(P, 3 N, 12)`; ``None``: one camera.
+        shifts: the same for poses whose entries are all 0, shape :math:`(P, 3 N, 1)`.
     """
 
     points: Tensor
@@ -64,6 +67,8 @@ class Scene(NamedTuple):
     sq_world: Tensor
     wider: Tensor | None = None
     prior: FramedPrior | None = None
+    rows: Tensor | None = None
+    shifts: Tensor | None = None
 
     @classmethod
     def make(cls, corr: Correspondences, thresholds: Thresholds, dtype: torch.dtype) -> Scene:
@@ -76,6 +81,7 @@ class Scene(NamedTuple):
         u, v = (corr.img_points / tau[:, None, None]).to(dtype).split(1, -1)
         # `tiny` avoids 0/0 for a point in the camera's centre.
         sq_world = thresholds.world.square() + torch.finfo(dtype).tiny
+        rows, shifts = (None, None) if corr.rig is None else _rows_of_rig(corr, points, tau)
         return cls(
             points.to(dtype),
             u.contiguous(),
@@ -85,6 +91,7 @@ class Scene(NamedTuple):
             sq_world.to(dtype)[:, None, None],
             wider,
             map_tensors(lambda x: x.to(dtype), corr.prior),
+            *map_tensors(lambda x: x.to(dtype), (rows, shifts)),
         )
 
     def of(self, problems: Tensor) -> Scene:
@@ -94,7 +101,13 @@ class Scene(NamedTuple):
     def pairs(self, positions: Tensor) -> Scene:
         """Select pairs of each problem, :math:`(P, n)`."""
         at = positions[..., None]
+        rows, shifts = self.rows, self.shifts
+        if rows is not None and shifts is not None:
+            three = torch.cat([at + i * self.points.shape[1] for i in range(3)], 1)
+            rows, shifts = rows.gather(1, three.expand(-1, -1, 12)), shifts.gather(1, three)
         return self._replace(
+            rows=rows,
+            shifts=shifts,
             points=self.points.gather(1, at.expand(-1, -1, 4)),
             u=self.u.gather(1, at),
             v=self.v.gather(1, at),
@@ -116,13 +129,15 @@ class Scene(NamedTuple):
         out = self.points.new_empty(translation.shape[1], 4, 3, translation.shape[2])
         out[:, :3] = rotation.permute(2, 1, 0, 3)
         out[:, 3] = translation.movedim(0, 1)
-        out[:, :, 2] *= self.depth_scale
+        if self.rows is None:
+            out[:, :, 2] *= self.depth_scale
         return out
 
     def unpack(self, packed: Tensor) -> Tensor:
         """The 3x4 matrices :math:`[R | t]` of packed poses, :math:`(P, 4, 3, H)` to :math:`(P, H, 3, 4)`."""
         matrices = packed.permute(0, 3, 2, 1).contiguous()
-        matrices[:, :, 2] /= self.depth_scale
+        if self.rows is None:
+            matrices[:, :, 2] /= self.depth_scale
         return matrices
 
     def losses(self, packed: Tensor, scorer: Scorer) -> Tensor:
@@ -133,6 +148,19 @@ class Scene(NamedTuple):
         matrices = self.unpack(packed)
         prior = map_tensors(lambda x: x[:, None], self.prior)  # for each of H poses
         return losses + 0.5 * prior.rank - votes(prior, Pose(matrices[..., :3], matrices[..., 3]))
+
+
+def _rows_of_rig(corr: Correspondences, points: Tensor, tau: Tensor) -> tuple[Tensor, Tensor]:
+    """``rows`` and ``shifts`` of a :class:`Scene`; the depth is multiplied by ``depth_scale``."""
+    assert corr.rig is not None
+    rotation, translation = corr.rig
+    first, second, third = rotation.unbind(2)  # (B, N, 3)
+    x, y, z = translation.unbind(2)
+    u, v = (corr.img_points / corr.focal).unbind(-1)
+    scale = (tau / corr.focal)[:, None]
+    directions = [first - u[..., None] * third, second - v[..., None] * third, scale[..., None] * third]
+    rows = torch.cat([points[..., :, None] * d[..., None, :] for d in directions], 1).flatten(2)
+    return rows, torch.cat((x - u * z, y - v * z, scale * z), 1)[..., None]
 
 
 def standardised_errors(scene: Scene, packed: Tensor) -> Tensor:
@@ -156,9 +184,12 @@ def standardised_errors(scene: Scene, packed: Tensor) -> Tensor:
         tensor([0.0000, 6.2500], dtype=torch.float64)
     """
     count = packed.shape[-1]
-    x, y, z = (scene.points @ packed.flatten(2)).split(count, -1)  # (P, N, H) each
-    x.addcmul_(scene.u, z, value=-1.0)
-    y.addcmul_(scene.v, z, value=-1.0)
+    if scene.rows is not None and scene.shifts is not None:
+        x, y, z = torch.baddbmm(scene.shifts, scene.rows, packed.flatten(1, 2)).chunk(3, 1)
+    else:
+        x, y, z = (scene.points @ packed.flatten(2)).split(count, -1)  # (P, N, H) each
+        x.addcmul_(scene.u, z, value=-1.0)
+        y.addcmul_(scene.v, z, value=-1.0)
     limit = z if scene.wider is None else z * scene.wider
     sq_limit = torch.addcmul(scene.sq_world, limit, limit)
     sq_distance = x.mul_(x).addcmul_(y, y).add_(z.clamp_(max=0.0), alpha=-_BEHIND)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kornia_pnpnet.core.performance import problems_last
-from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.core.trees import map_tensors, take
 from kornia_pnpnet.geometry import Projection, project
 from kornia_pnpnet.init.ransac.minimal import MinimalSolver
 from kornia_pnpnet.init.ransac.sampling import Samples, agreement_of_neighbours
@@ -19,7 +19,7 @@ from kornia_pnpnet.refine.inliers import Thresholds, judge
 from kornia_pnpnet.refine.verdict import rotation_sigma
 from kornia_pnpnet.types import Correspondences, FocalHypotheses, Noise, Pose
 
-__all__ = ["PAIRS_PER_SAMPLE", "Found", "Plan", "Search", "full_vectors", "least_squares", "take"]
+__all__ = ["PAIRS_PER_SAMPLE", "Found", "Plan", "Search", "full_vectors", "least_squares"]
 
 _T = TypeVar("_T")
 
@@ -127,7 +127,10 @@ class Search:
         self.chances = chances
         self.samples = self.plain = self._samples(chances)
         # The numbers of a pair side by side, so that a sample is gathered pair by pair.
-        self.pairs = torch.cat((corr.world_points, corr.img_points, corr.weights[..., None]), -1).flatten(0, 1)
+        values = [corr.world_points, corr.img_points, corr.weights[..., None]]
+        if corr.rig is not None:
+            values += [corr.rig.rotation.flatten(2), corr.rig.translation]
+        self.pairs = torch.cat(values, -1).flatten(0, 1)
 
     def run(self, given: Pose | None = None, worth: int = 0) -> Found:
         """Search until every problem has a sample without an outlier at the confidence, or all its samples.
@@ -181,7 +184,7 @@ class Search:
                 active = active[needed[active] > worth]
         start = stop = 0
         while len(active):
-            if start < _PLAIN_SAMPLES <= stop:
+            if start < _PLAIN_SAMPLES <= stop and self.corr.rig is None:
                 self._prefer_agreement(active)
                 expect(active)
             start, stop = stop, min(int(totals[active].max()), stop + self._round(stop))
@@ -240,11 +243,13 @@ class Search:
         # Some arithmetic rounds differently in the remainder of a processor's vectors. With full vectors a sample has
         # the same poses at any place in the batch.
         rows = full_vectors(rows)
-        values = self.pairs.index_select(0, rows.flatten()).view(-1, size, 6)
-        world, img, weights = values.split((3, 2, 1), -1)
+        values = self.pairs.index_select(0, rows.flatten()).view(-1, size, self.pairs.shape[1])
+        world, img, weights, rig = values.split((3, 2, 1, values.shape[-1] - 6), -1)
         owners = full_vectors(problems.repeat_interleave(count))
         img_scale, world_scale, free = take((self.corr.img_scale, self.corr.world_scale, self.corr.free_focal), owners)
         sample = Correspondences(world, img, weights[..., 0], self.corr.focal, img_scale, world_scale, free_focal=free)
+        if self.corr.rig is not None:
+            sample = sample._replace(rig=Pose(rig[..., :9].unflatten(-1, (3, 3)), rig[..., 9:]))
         solved = self.plan.minimal.hypotheses(sample)
         fresh = torch.arange(start, stop, device=problems.device) < self.samples.totals[problems, None]  # (P, H)
         valid = solved.valid[: batch * count].unflatten(0, (batch, count)) & fresh[..., None]
@@ -314,11 +319,6 @@ class Search:
         new_loss = scene.losses(packed, self.plan.scorer)[:, 0]
         better = (new_loss < loss) & loss.isfinite()  # an invalid pose stays invalid
         return torch.where(better, new_loss, loss), torch.where(better[:, None, None], new_matrix, matrix)
-
-
-def take(tree: _T, at: Tensor | slice) -> _T:
-    """Select problems from every tensor of a tree that has a batch."""
-    return map_tensors(lambda x: x[at] if x.ndim else x, tree)
 
 
 def least_squares(corr: Correspondences, pose: Pose, projection: Projection, weights: Tensor) -> LMStep:

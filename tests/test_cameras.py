@@ -1,0 +1,346 @@
+"""Distorted pixels, fisheyes, bearings in every direction, and rigs of several cameras with one pose."""
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from kornia.core.exceptions import BaseError
+from kornia.geometry.calibration import distort_points
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+from torch.nn import functional
+
+from kornia_pnpnet import Normalize, PnPNet, Pose, RobustWeightedLM, create_solver, solve_pnp
+from kornia_pnpnet.cameras import bearing_cameras, bearings, undistort
+from kornia_pnpnet.core.trees import iter_tensors, map_tensors
+from kornia_pnpnet.geometry import project, retract
+from kornia_pnpnet.geometry import rotation_angle as angle
+from kornia_pnpnet.refine.step import pixel_precision
+from kornia_pnpnet.types import Noise
+
+DIST = {
+    4: [-0.2, 0.05, 0.001, -0.002],
+    5: [-0.2, 0.05, 0.001, -0.002, 0.01],
+    8: [-0.2, 0.05, 0.001, -0.002, 0.01, 0.05, 0.01, 0.002],
+    12: [-0.2, 0.05, 0.001, -0.002, 0.01, 0.05, 0.01, 0.002, 0.001, -0.001, 0.002, 0.0005],
+    14: [-0.2, 0.05, 0.001, -0.002, 0.01, 0.05, 0.01, 0.002, 0.001, -0.001, 0.002, 0.0005, 0.01, -0.02],
+}
+FISHEYE = [0.05, -0.01, 0.002, -0.0005]
+CAMERA = torch.tensor([[400.0, 0.0, 320.0], [0.0, 420.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+
+
+@pytest.fixture
+def uniform():
+    generator = torch.Generator().manual_seed(0)
+    return lambda *shape, low=-1.0, high=1.0: (
+        low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)
+    )
+
+
+def poses(uniform, batch):
+    return Pose(axis_angle_to_rotation_matrix(uniform(batch, 3)), 2.0 * uniform(batch, 3))
+
+
+def to_world(cam_points, pose):
+    return (cam_points - pose.translation[:, None]) @ pose.rotation
+
+
+def seen(uniform, batch, n):
+    """World points, undistorted pixels and poses of the camera."""
+    pixels = torch.stack((uniform(batch, n, low=20, high=620), uniform(batch, n, low=20, high=460)), -1)
+    rays = functional.pad(pixels, (0, 1), value=1.0) @ torch.linalg.inv(CAMERA).mT
+    pose = poses(uniform, batch)
+    return to_world(rays * uniform(batch, n, 1, low=3.0, high=7.0), pose), pixels, pose
+
+
+def right(result, pose, degrees=0.01, shift=0.001):
+    turned = torch.rad2deg(angle(result.rotation.double(), pose.rotation))
+    moved = (result.translation - pose.translation).norm(dim=-1)
+    return (turned < degrees) & (moved < shift) & result.ok
+
+
+@pytest.mark.parametrize("number", DIST)
+def test_undistorted_pixels_are_distorted_back(number, uniform):
+    _, pixels, _ = seen(uniform, 3, 50)
+    dist = torch.tensor(DIST[number], dtype=torch.float64).expand(3, -1)
+    distorted = distort_points(pixels, CAMERA.expand(3, 3, 3), dist)
+    found, there, _ = undistort(distorted, CAMERA.expand(3, 3, 3), dist, None, None)
+    assert there.all()
+    torch.testing.assert_close(found, pixels, rtol=0, atol=1e-8)
+
+
+def test_fisheyes_agree_with_opencv(uniform):
+    """Pixels in the plane, and directions beyond it."""
+    _, pixels, _ = seen(uniform, 1, 50)
+    k = np.array(FISHEYE)
+    plane = (pixels[0] - CAMERA[:2, 2]) / CAMERA.diagonal()[:2]
+    distorted = torch.from_numpy(cv2.fisheye.distortPoints(plane[:, None].numpy(), CAMERA.numpy(), k)).mT.mT[:, 0]
+    fisheye = torch.tensor(FISHEYE, dtype=torch.float64)
+    found, there, _ = undistort(distorted[None], CAMERA[None], None, fisheye[None], None)
+    assert there.all()
+    torch.testing.assert_close(found, pixels, rtol=0, atol=1e-6)
+    rays = bearings(distorted[None], CAMERA, fisheye=fisheye)
+    torch.testing.assert_close(rays[..., :2] / rays[..., 2:], plane[None], rtol=0, atol=1e-8)
+
+
+def test_where_there_is_no_pixel(uniform):
+    """Beyond the turning point of a polynomial, and beside a pinhole camera's plane; the rest of the problem stays."""
+    dist = torch.tensor([[-0.3, 0.0, 0.0, 0.0]], dtype=torch.float64)
+    far = torch.tensor([[[320.0, 240.0], [320.0 + 400.0 * 0.9, 240.0]]], dtype=torch.float64)
+    _, there, _ = undistort(far, CAMERA[None], dist, None, None)
+    assert there.tolist() == [[True, False]]
+    wide = torch.tensor([[[320.0, 240.0], [320.0 + 400.0 * 2.0, 240.0]]], dtype=torch.float64)  # 115 degrees
+    _, there, _ = undistort(wide, CAMERA[None], None, torch.zeros(1, 4, dtype=torch.float64), None)
+    assert there.tolist() == [[True, False]]
+    points, pixels, pose = seen(uniform, 4, 12)
+    dist = torch.tensor([-0.3, 0.0, 0.0, 0.0], dtype=torch.float64)
+    distorted = distort_points(pixels, CAMERA.expand(4, 3, 3), dist.expand(4, -1))
+    distorted[:, 0] = 5000.0
+    result = create_solver("pnpnet-set")(points, distorted, CAMERA, dist=dist)
+    assert right(result, pose).all()
+    assert (result.weights[:, 0] == 0).all()
+    distorted[1, 3] = math.nan
+    result = create_solver("pnpnet-set")(points, distorted, CAMERA, dist=dist)
+    assert result.ok.tolist() == [True, False, True, True]
+
+
+@pytest.mark.parametrize("name", ["pnpnet-set", "p3p-ransac", "epnp-lm"])
+@pytest.mark.parametrize("lens", ["dist", "fisheye"])
+def test_distorted_pixels_are_solved(name, lens, uniform):
+    points, pixels, pose = seen(uniform, 8, 12)
+    if lens == "dist":
+        given = torch.tensor(DIST[5], dtype=torch.float64)
+        distorted = distort_points(pixels, CAMERA.expand(8, 3, 3), given.expand(8, -1))
+    else:
+        given = torch.tensor(FISHEYE, dtype=torch.float64)
+        plane = (pixels - CAMERA[:2, 2]) / CAMERA.diagonal()[:2]
+        distorted = cv2.fisheye.distortPoints(plane.reshape(-1, 1, 2).numpy(), CAMERA.numpy(), np.array(FISHEYE))
+        distorted = torch.from_numpy(distorted).reshape_as(pixels)
+    solver = create_solver(name)
+    assert right(solver(points, distorted, CAMERA, **{lens: given}), pose, 0.1, 0.01).all()
+    assert right(solver(points, distorted, CAMERA, **{lens: given.expand(8, -1)}), pose, 0.1, 0.01).all()
+    one = solver(points[0], distorted[0], CAMERA, **{lens: given})
+    torch.testing.assert_close(one.rotation, solver(points[:1], distorted[:1], CAMERA, **{lens: given}).rotation[0])
+
+
+def test_the_noise_goes_through_the_lens(uniform):
+    """As the differences of undistorted pixels; the equivalent sigma has the same mean square."""
+    _, pixels, _ = seen(uniform, 2, 9)
+    dist = torch.tensor(DIST[14], dtype=torch.float64).expand(2, -1)
+    camera = CAMERA.expand(2, 3, 3)
+    step = 1e-4
+    columns = []
+    for axis in torch.eye(2, dtype=torch.float64):
+        both = [undistort(pixels + s * step * axis, camera, dist, None, None)[0] for s in (1.0, -1.0)]
+        columns.append((both[0] - both[1]) / (2 * step))
+    jacobian = torch.stack(columns, -1)
+    cov = torch.tensor([[2.0, 0.5], [0.5, 1.0]], dtype=torch.float64)
+    from kornia_pnpnet.core.symmetric import Symmetric2
+
+    one = torch.ones(2, 9, dtype=torch.float64)
+    noise = Noise(one, one, Symmetric2.of(cov.expand(2, 9, 2, 2)))
+    _, _, found = undistort(pixels, camera, dist, None, noise)
+    expected = Symmetric2.of(jacobian @ cov @ jacobian.mT)
+    torch.testing.assert_close(tuple(found.img_cov), tuple(expected), rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(found.img, (0.5 * jacobian.square().sum((-1, -2))).sqrt(), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("lens", ["dist", "fisheye"])
+def test_gradcheck_of_the_lens(lens, uniform):
+    _, pixels, _ = seen(uniform, 1, 4)
+    given = torch.tensor([DIST[8] if lens == "dist" else FISHEYE], dtype=torch.float64)
+
+    def solve(pixels, camera, given):
+        both = (given, None) if lens == "dist" else (None, given)
+        return undistort(pixels, camera, *both, None)[0]
+
+    inputs = [x.clone().requires_grad_() for x in (pixels, CAMERA[None], given)]
+    mask = torch.tensor([[1.0, 0, 1], [0, 1, 1], [0, 0, 0]], dtype=torch.float64)  # of a camera: its free entries
+
+    def by_entries(pixels, camera, given):
+        return solve(pixels, camera * mask + CAMERA * (1 - mask), given)
+
+    assert torch.autograd.gradcheck(by_entries, inputs, eps=1e-5, atol=1e-4, rtol=1e-4)
+
+
+def test_solve_pnp_takes_a_lens(uniform):
+    points, pixels, pose = seen(uniform, 2, 12)
+    dist = torch.tensor(DIST[4], dtype=torch.float64)
+    distorted = distort_points(pixels, CAMERA.expand(2, 3, 3), dist.expand(2, -1))
+    torch.testing.assert_close(solve_pnp(points, distorted, CAMERA, dist=dist), pose.matrix[:, :3], rtol=0, atol=1e-4)
+
+
+def test_bearing_cameras_look_along(uniform):
+    rays = torch.cat((uniform(1, 100, 3), torch.eye(3)[None].double(), -torch.eye(3)[None].double()), 1)
+    rotation, sound = bearing_cameras(rays)
+    assert sound.all()
+    along = (rotation @ functional.normalize(rays, dim=-1)[..., None])[..., 0]
+    torch.testing.assert_close(along, torch.tensor([0.0, 0, 1]).double().expand_as(along))
+    torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3).double().expand_as(rotation))
+    assert (torch.linalg.det(rotation) > 0.99).all()
+    _, sound = bearing_cameras(torch.tensor([[[0.0, 0, 0], [math.nan, 0, 1]]]))
+    assert not sound.any()
+
+
+def everywhere(uniform, batch, n, wrong=0):
+    """Points all around, bearings and poses; the first bearings are wrong."""
+    cam_points = functional.normalize(uniform(batch, n, 3), dim=-1) * uniform(batch, n, 1, low=3.0, high=7.0)
+    pose = poses(uniform, batch)
+    rays = functional.normalize(cam_points, dim=-1)
+    rays[:, :wrong] = functional.normalize(uniform(batch, wrong, 3), dim=-1)
+    return to_world(cam_points, pose), rays, pose
+
+
+@pytest.mark.parametrize("name", ["pnpnet-set", "p3p-ransac", "epnp-lm"])
+def test_bearings_in_every_direction(name, uniform):
+    points, rays, pose = everywhere(uniform, 32, 20, 0 if name == "epnp-lm" else 6)
+    options = {"threshold": 0.01} if name == "p3p-ransac" else {}  # without intrinsics in radians
+    result = create_solver(name, **options)(points, 3.0 * rays, None)
+    assert right(result, pose, 0.05, 0.01).double().mean() > 0.9
+    assert torch.equal(result.intrinsics, torch.eye(3, dtype=torch.float64).expand(32, 3, 3))
+    if name != "epnp-lm":
+        assert result.weights[:, :6].mean() < 0.05 * result.weights[:, 6:].mean()
+    told = create_solver(name)(points, rays, CAMERA, img_sigma=0.5)
+    assert right(told, pose, 0.05, 0.01).double().mean() > 0.9
+
+
+def test_a_pixel_and_its_bearing_are_the_same(uniform):
+    points, pixels, pose = seen(uniform, 4, 15)
+    rays = bearings(pixels, CAMERA)
+    result = create_solver("pnpnet-set")(points, rays, CAMERA)
+    assert right(result, pose, 0.05, 0.01).all()
+
+
+def rig(uniform, batch, n, cameras, base, wrong=0, noise=0.0):
+    """Points, pixels, intrinsics of pairs, places in the rig, and poses of the rig."""
+    yaw = torch.arange(cameras, dtype=torch.float64) * (2 * math.pi / cameras)
+    rotation = axis_angle_to_rotation_matrix(torch.stack((0 * yaw, yaw, 0 * yaw), -1))
+    centres = base * 5.0 * functional.normalize(uniform(cameras, 3), dim=-1)
+    at = torch.arange(n) % cameras
+    places = Pose(rotation, -(rotation @ centres[..., None])[..., 0])
+    places = map_tensors(lambda x: x[at].expand(batch, *x[at].shape).contiguous(), places)
+    focal = 300.0 + 100.0 * at
+    intrinsics = torch.eye(3, dtype=torch.float64).repeat(batch, n, 1, 1)
+    intrinsics[..., 0, 0], intrinsics[..., 1, 1], intrinsics[..., :2, 2] = focal, focal, 320.0
+    pixels = uniform(batch, n, 2, low=0.0, high=640.0)
+    depth = 5.0 * (1.0 + 0.4 * uniform(batch, n, 1))
+    cam_points = torch.cat(((pixels - 320.0) / focal[:, None] * depth, depth), -1)
+    rig_points = (places.rotation.mT @ (cam_points - places.translation)[..., None])[..., 0]
+    pose = poses(uniform, batch)
+    pixels = pixels + noise * torch.randn(pixels.shape, generator=torch.Generator().manual_seed(1)).double()
+    pixels[:, :wrong] = uniform(batch, wrong, 2, low=0.0, high=640.0)
+    return to_world(rig_points, pose), pixels, intrinsics, places, pose
+
+
+@pytest.mark.parametrize("name", ["pnpnet-set", "p3p-ransac", "reppnp-lm"])
+@pytest.mark.parametrize("cameras", [3, 6])
+@pytest.mark.parametrize("base", [0.02, 0.5])
+def test_rigs(name, cameras, base, uniform):
+    wrong = 0 if name == "reppnp-lm" else 6
+    points, pixels, intrinsics, places, pose = rig(uniform, 32, 24, cameras, base, wrong)
+    solver = create_solver(name)
+    result = solver(points, pixels, intrinsics, cam_from_rig=places)
+    assert right(result, pose, 0.05, 0.01).double().mean() > 0.95
+    torch.testing.assert_close(result.intrinsics, intrinsics)
+    # A mask stands for pairs that a camera does not see; one problem is like that problem in its batch.
+    mask = torch.ones(32, 28, dtype=torch.bool)
+    mask[:, 24:] = False
+    more = [torch.cat((x, x[:, :4] * math.nan), 1) for x in (points, pixels, intrinsics, *places)]
+    padded = solver(*more[:3], mask=mask, cam_from_rig=Pose(*more[3:]))
+    assert right(padded, pose, 0.05, 0.01).double().mean() > 0.95
+    one = solver(points[3], pixels[3], intrinsics[3], cam_from_rig=map_tensors(lambda x: x[3], places))
+    torch.testing.assert_close(one.rotation, result.rotation[3], rtol=0, atol=1e-5)
+
+
+def test_a_broken_rig_fails_alone(uniform):
+    points, pixels, intrinsics, places, pose = rig(uniform, 4, 12, 3, 0.1)
+    places.translation[1, 2, 0] = math.nan
+    intrinsics[2, 5, 0, 0] = -1.0
+    result = create_solver("pnpnet-set")(points, pixels, intrinsics, cam_from_rig=places)
+    assert result.ok.tolist() == [True, False, False, True]
+    assert all(x.isfinite().all() for x in iter_tensors(result[:5]) if x.is_floating_point())
+    assert right(result, pose)[[0, 3]].all()
+
+
+def framed_rig(uniform, **options):
+    points, pixels, intrinsics, places, pose = rig(uniform, 2, 9, 3, 0.3, **options)
+    normalize = Normalize(order=False)
+    corr, frame = normalize(points, pixels, intrinsics, rig=places)
+    return corr, normalize.apply_to_pose(pose, frame)
+
+
+def test_the_jacobian_of_a_rig(uniform):
+    """Normal equations of a residual r are J^T J and J^T r by the tangent of the rig's pose."""
+    corr, pose = framed_rig(uniform, noise=1.0)
+    zero = torch.zeros(2, 6, dtype=torch.float64)
+
+    def residual(delta):
+        return torch.cat(project(retract(pose, delta), corr).residual, 1)
+
+    jacobian = torch.autograd.functional.jacobian(lambda d: residual(d).sum(0), zero).movedim(0, 1) / corr.focal
+    from kornia_pnpnet.geometry import normal_equations
+
+    hessian, gradient = normal_equations(project(pose, corr), corr.weights)
+    expected = jacobian.mT @ jacobian
+    for i in range(6):
+        torch.testing.assert_close(gradient[i], (jacobian.mT @ residual(zero)[..., None])[:, i, 0])
+        for j in range(i + 1):
+            torch.testing.assert_close(hessian[i][j], expected[:, i, j])
+
+
+def test_covariances_of_the_world_turn_with_each_camera(uniform):
+    """A covariance that is a multiple of the identity is a sigma, in a rig, too."""
+    from kornia_pnpnet.core.symmetric import Symmetric3
+
+    corr, pose = framed_rig(uniform)
+    one = torch.ones_like(corr.weights)
+    world = Symmetric3.of(0.04 * torch.eye(3, dtype=torch.float64).expand(2, 9, 3, 3))
+    seen_ = project(pose, corr)
+    both = [pixel_precision(seen_, Noise(one, 0.2 * one, None, cov), corr.focal) for cov in (world, None)]
+    torch.testing.assert_close(0.5 * (1 / both[0].inverse().uu + 1 / both[0].inverse().vv) > 0, one > 0)
+    mean = both[0].inverse()
+    torch.testing.assert_close(0.5 * (mean.uu + mean.vv), 1.0 / both[1], rtol=1e-6, atol=0)
+
+
+def test_gradcheck_to_the_pose_of_a_rig(uniform):
+    corr, pose = framed_rig(uniform, noise=1.0)
+    refine = RobustWeightedLM(3, kernel="cauchy", learnable=False)
+    from kornia_pnpnet import Guess
+
+    def solve(world_points, img_points, rotation, translation):
+        pairs = corr._replace(world_points=world_points, img_points=img_points, rig=Pose(rotation, translation))
+        return tuple(refine(pairs, Guess(pose, torch.ones_like(corr.weights))).pose)
+
+    inputs = [x.detach().requires_grad_() for x in (corr.world_points, corr.img_points, *corr.rig)]
+    assert torch.autograd.gradcheck(solve, inputs, eps=1e-6, atol=1e-4, rtol=1e-3)
+
+
+def test_gradients_flow_through_the_solver_of_a_rig(uniform):
+    points, pixels, intrinsics, places, _ = rig(uniform, 4, 12, 3, 0.1, noise=1.0)
+    inputs = [x.clone().requires_grad_() for x in (points, pixels, intrinsics, *places)]
+    result = create_solver("pnpnet-set")(*inputs[:3], cam_from_rig=Pose(*inputs[3:]))
+    found = torch.autograd.grad(result.translation.sum() + result.rotation.sum(), inputs)
+    assert all(x.isfinite().all() and x.abs().max() > 0 for x in found)
+
+
+def test_what_cannot_be_combined_is_refused(uniform):
+    points, pixels, intrinsics, places, _ = rig(uniform, 2, 8, 2, 0.1)
+    solver = create_solver("pnpnet-set")
+    dist = torch.zeros(4, dtype=torch.float64)
+    with pytest.raises(BaseError, match="intrinsics"):
+        solver(points, pixels, intrinsics)
+    with pytest.raises(BaseError, match="bearings"):
+        solver(points, pixels, intrinsics, cam_from_rig=places, dist=dist)
+    with pytest.raises(BaseError, match="coefficients"):
+        solver(points, pixels, CAMERA, dist=torch.zeros(6).double())
+    with pytest.raises(BaseError, match="not both"):
+        solver(points, pixels, CAMERA, dist=dist, fisheye=dist)
+    with pytest.raises(BaseError, match="unknown"):
+        create_solver("pnpnet-set", focal="unknown")(points, pixels, CAMERA, dist=dist)
+    with pytest.raises(BaseError, match="alternatives"):
+        solver(points, pixels, intrinsics, cam_from_rig=places, alternatives=1)
+    with pytest.raises(BaseError, match="initialiser"):
+        PnPNet()(points, pixels, intrinsics, cam_from_rig=places)
+    with pytest.raises(BaseError, match="intrinsics"):
+        solver(points, pixels, None)
