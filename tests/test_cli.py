@@ -622,3 +622,30 @@ def test_rejection_limit_ignores_errors_that_are_not_finite():
     errors = torch.tensor([10.0, 20.0, 30.0, math.inf, math.nan])
     assert rejection_limit(errors) == pytest.approx(3 * 1.4826 * 20)
     assert rejection_limit(errors[3:]) == 3.0
+
+
+def test_solve_estimates_the_focal_length(capsys, csv_file):
+    got = answer(capsys, csv_file, "--focal", "unknown", "--intrinsics", "1,1.0125,320,240")
+    assert got["ok"]
+    assert got["intrinsics"][0][0] == pytest.approx(800, rel=0.02)
+    assert got["intrinsics"][1][1] == pytest.approx(1.0125 * got["intrinsics"][0][0])
+    told = answer(capsys, csv_file, "--focal", "0.1", "--intrinsics", "780,790,320,240")
+    assert told["intrinsics"][0][0] == pytest.approx(800, rel=0.02)
+    assert answer(capsys, csv_file, "--focal", "known", "--intrinsics", CAMERA)["intrinsics"] == K.tolist()
+    for focal in ("free", "-1", "nan"):
+        with pytest.raises(SystemExit):
+            main(["solve", str(csv_file), "--intrinsics", CAMERA, f"--focal={focal}"])
+    err = refused(capsys, "solve", csv_file, "--intrinsics", CAMERA, "--focal", "unknown", "--solver", "poselib")
+    assert "does not estimate focal lengths" in err
+
+
+def test_solve_takes_cameras_of_colmap(capsys, csv_file):
+    plain = answer(capsys, csv_file, "--intrinsics", CAMERA)
+    pinhole = answer(capsys, csv_file, "--camera", "PINHOLE,640,480,800,810,320,240")
+    assert pinhole["translation"] == pytest.approx(plain["translation"], abs=1e-6)
+    radial = answer(capsys, csv_file, "--camera", "RADIAL,640,480,800,320,240,-0.05,0.01")
+    assert radial["intrinsics"][0][0] == 800
+    assert radial["translation"] != plain["translation"]
+    assert "--camera: expected MODEL" in refused(capsys, "solve", csv_file, "--camera", "PINHOLE,640,480,800")
+    err = refused(capsys, "solve", csv_file, "--camera", "PINHOLE,640,480,800,810,320,240", "--intrinsics", CAMERA)
+    assert "--camera stands alone" in err

@@ -14,6 +14,7 @@ from strategies import damage, finite, many, names_the_file
 from torch.testing import assert_close
 
 from kornia_pnpnet.data import OutlierMix, SceneProblems, load_colmap, load_matches, load_scene
+from kornia_pnpnet.data.colmap import undistort
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason=f"needs the real data in {SHARED}")
@@ -352,3 +353,27 @@ def test_real_matches(name, mismatches):
     assert_close(wrong, mismatches, rtol=0, atol=1e-3)
     problems = SceneProblems(scene, batch_size=2000).batch(0)
     assert 0.5 * mismatches < (~problems.inliers).double().mean() < 2 * mismatches
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        "SIMPLE_RADIAL,640,480,500,320,240,-0.1",
+        "OPENCV 640 480 500 510 320 240 -0.1 0.01 0.001 0.002",
+        "OPENCV_FISHEYE,640,480,500,510,320,240,0.01,0.002,0,0",
+    ],
+)
+def test_any_camera_is_undistorted(camera, pycolmap):
+    pixels = torch.tensor([[320.0, 240.0], [400.0, 300.0], [20.0, 40.0]], dtype=torch.float64)
+    matrix, found = undistort(camera, pixels)
+    model, width, height, *parameters = camera.replace(" ", ",").split(",")
+    lens = pycolmap.Camera(model=model, width=int(width), height=int(height), params=list(map(float, parameters)))
+    rays = torch.cat(((found - matrix[:2, 2]) / matrix.diagonal()[:2], torch.ones(3, 1)), 1)
+    torch.testing.assert_close(torch.tensor(lens.img_from_cam(rays.numpy())), pixels, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("camera", ["FOO,640,480,500", "PINHOLE,640,480,500", "PINHOLE,a,b", ""])
+@pytest.mark.usefixtures("pycolmap")
+def test_other_cameras_are_refused(camera):
+    with pytest.raises(ValueError, match="MODEL,width,height"):
+        undistort(camera, torch.zeros(2, 2))

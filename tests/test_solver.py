@@ -119,7 +119,7 @@ def bad_calls(p):
     return {
         "world_2d": ((world[0], pixels, K), {}, ShapeError, r"img_points.*\(9, 2\)"),
         "world_of_4": ((torch.cat((world, world[..., :1]), -1), pixels, K), {}, ShapeError, r"4"),
-        "pixels_of_3": ((world, world, K), {}, ShapeError, r"3"),
+        "pixels_of_4": ((world, torch.cat((pixels, pixels), -1), K), {}, ShapeError, r"img_points.*\(7, 9, 4\)"),
         "other_batch": ((world, pixels[:6], K), {}, ShapeError, r"img_points.*\(7, 9, 2\).*\(6, 9, 2\)"),
         "other_n": ((world, pixels[:, :8], K), {}, ShapeError, r"img_points.*\(7, 9, 2\).*\(7, 8, 2\)"),
         "K_of_other_batch": ((world, pixels, K[:6]), {}, ShapeError, r"intrinsics.*\(7, 3, 3\).*\(6, 3, 3\)"),

@@ -6,6 +6,7 @@
 processes. A new data source is one more class with ``batch_size`` and ``batch(index)``.
 """
 
+from kornia_pnpnet.data.cameras import CameraProblems
 from kornia_pnpnet.data.colmap import load_colmap, load_matches, load_scene
 from kornia_pnpnet.data.mixtures import MixedPoints, MixedProblems, VaryingSize
 from kornia_pnpnet.data.outliers import OutlierDraw, OutlierMix
@@ -23,6 +24,7 @@ from kornia_pnpnet.data.synthetic import SyntheticProblems
 
 __all__ = [
     "BoxPoints",
+    "CameraProblems",
     "DrivePoints",
     "FacadePoints",
     "MixedPoints",

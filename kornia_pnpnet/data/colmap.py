@@ -139,10 +139,12 @@ def undistort(camera: str, img_points: Tensor) -> tuple[Tensor, Tensor]:
         import pycolmap
     except ImportError as error:
         raise ImportError("COLMAP's cameras need pycolmap: pip install 'kornia_pnpnet[eval]'") from error
-    model, *numbers = (part.strip() for part in camera.replace(" ", ",").split(",") if part.strip())
     try:
+        model, *numbers = (part for part in camera.replace(" ", ",").split(",") if part)
         width, height, *parameters = map(float, numbers)
         lens = pycolmap.Camera(model=model.upper(), width=int(width), height=int(height), params=parameters)
+        if not lens.verify_params():
+            raise ValueError(f"{lens.model_name} has the parameters {lens.params_info}")
         plane = np.asarray(lens.cam_from_img(img_points.double().numpy()))
         matrix = torch.tensor(lens.calibration_matrix())
     except (ValueError, RuntimeError, IndexError, AttributeError, TypeError) as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from itertools import count
+from typing import Any
 
 import torch
 from kornia.core.check import KORNIA_CHECK
@@ -221,7 +222,7 @@ class SyntheticProblems:
             shared = img_points.take_along_dim(leader, 1), world_points.take_along_dim(leader, 1)
             img_points = torch.where(of_pixels & ~of_points, shared[0], img_points)
             world_points = torch.where(of_points, shared[1], world_points)
-        known: dict[str, Tensor] = {}
+        known: dict[str, Any] = {}
         errors = noise.norm(dim=-1) / img_sigma.reshape(self.batch_size, -1).mean(1, keepdim=True).clamp(min=_TINY)
         if self.known_noise and covariances:
             known = covariances

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from kornia.core.check import KORNIA_CHECK
+from kornia.core.exceptions import ShapeError
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
@@ -115,6 +116,12 @@ class PeerSolver(nn.Module):
             DeviceError: for tensors on different devices.
         """
         size, inputs = checked_inputs(world_points, img_points, intrinsics, weights, mask)
+        if inputs.rig is not None:
+            raise ShapeError(
+                f"Solvers of other libraries take pixels (B, N, 2), got the shape {tuple(img_points.shape)}.",
+                actual_shape=tuple(img_points.shape),
+                expected_shape=["B", "N", "2"],
+            )
         world_points, img_points, intrinsics, weights, mask = inputs[:5]
         batch, count = world_points.shape[:2]
         world, img, cameras = (x.detach().cpu().double().numpy() for x in (world_points, img_points, intrinsics))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
@@ -123,6 +123,8 @@ class Problems(NamedTuple):
             :math:`(B, N, 2, 2)`; ``None``: unknown.
         world_cov: covariance of the noise of each world point in place of ``world_sigma``, shape
             :math:`(B, N, 3, 3)`; ``None``: unknown.
+        cam_from_rig: the camera of each pair in a rig, :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`, with intrinsics of
+            the shape :math:`(B, N, 3, 3)`; the pose is that of the rig. ``None``: one camera.
     """
 
     world_points: Tensor
@@ -135,6 +137,7 @@ class Problems(NamedTuple):
     confidence: Tensor | None = None
     img_cov: Tensor | None = None
     world_cov: Tensor | None = None
+    cam_from_rig: Pose | None = None
 
     @property
     def sigmas(self) -> dict[str, Tensor]:
@@ -143,10 +146,11 @@ class Problems(NamedTuple):
         return {name: sigma for name, sigma in sigmas.items() if sigma is not None}
 
     @property
-    def known(self) -> dict[str, Tensor]:
-        """The known noise and the confidences, as keyword arguments of a solver's call."""
+    def known(self) -> dict[str, Any]:
+        """The known noise, the confidences and the rig, as keyword arguments of a solver's call."""
         more = {"img_cov": self.img_cov, "world_cov": self.world_cov, "confidence": self.confidence}
-        return self.sigmas | {name: value for name, value in more.items() if value is not None}
+        known = {**more, "cam_from_rig": self.cam_from_rig}
+        return {**self.sigmas, **{name: value for name, value in known.items() if value is not None}}
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Problems:
         """Apply a function to every tensor, for example to slice the batch or to move it to another device."""

@@ -1,0 +1,64 @@
+"""Problems of many cameras by their own geometry."""
+
+import pytest
+import torch
+from data_helpers import assert_uniform, reprojection, same
+from kornia.core.exceptions import BaseError
+
+from kornia_pnpnet.data import CameraProblems
+
+
+def draw(**options):
+    return CameraProblems(**{"n": 8, "batch_size": 4000, "seed": 3, "dtype": torch.float64, **options}).batch(0)
+
+
+def test_pixels_show_their_points():
+    problems = draw(img_sigma=0.0)
+    assert reprojection(problems).abs().max() < 1e-6
+    cam = problems.world_points @ problems.pose.rotation.mT + problems.pose.translation[:, None]
+    assert (cam[..., 2] > 0).all()
+
+
+def test_fields_of_view_are_uniform():
+    problems = draw(field_of_view=(30.0, 90.0))
+    angle = 2.0 * torch.atan(1000.0 / problems.intrinsics[:, 0, 0])
+    assert_uniform(angle.rad2deg(), 30.0, 90.0)
+
+
+def test_outliers_are_as_many_as_asked_for():
+    problems = draw(n=10, outlier_share=0.3, img_sigma=0.0)
+    assert (problems.inliers.sum(1) == 7).all()
+    error = reprojection(problems).norm(dim=-1)
+    assert error[problems.inliers].max() < 1e-6
+    assert (error[~problems.inliers] > 1.0).double().mean() > 0.99
+    assert problems.inliers.double().mean(0).std() < 0.03  # any place
+
+
+def test_rigs():
+    problems = draw(cameras=3, baseline=0.2, img_sigma=0.0, batch_size=50)
+    rotation, translation = problems.cam_from_rig
+    rig = problems.world_points @ problems.pose.rotation.mT + problems.pose.translation[:, None]
+    cam = (rotation @ rig[..., None])[..., 0] + translation
+    seen = (problems.intrinsics @ cam[..., None])[..., 0]
+    torch.testing.assert_close(seen[..., :2] / seen[..., 2:], problems.img_points)
+    assert torch.equal(rotation[:, 0], rotation[:, 3])
+    assert not torch.equal(rotation[:, 0], rotation[:, 1])
+    centres = -(rotation.mT @ translation[..., None])[..., 0].norm(dim=-1)
+    assert (centres.amax(1) / centres.amin(1) - 1).abs().max() < 1e-9
+    assert "cam_from_rig" in problems.known
+
+
+def test_batches_are_reproducible():
+    source = CameraProblems(n=5, batch_size=3, cameras=2)
+    assert same(source.batch(1), source.batch(1))
+    assert not torch.equal(source.batch(0).world_points, source.batch(1).world_points)
+    assert same(next(iter(source)), source.batch(0))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"n": 0}, {"field_of_view": (90.0, 30.0)}, {"field_of_view": (0.0, 30.0)}, {"outlier_share": 2.0}, {"cameras": 0}],
+)
+def test_bad_options(options):
+    with pytest.raises(BaseError):
+        CameraProblems(**options)
