@@ -249,3 +249,22 @@ def test_known_cameras_come_back_as_they_were():
         assert not result.ok[1]
     shared = map_tensors(lambda x: x[:2], p)
     assert create_solver("epnp")(*shared[:2], p.intrinsics[0]).intrinsics.shape == (2, 3, 3)
+
+
+@pytest.mark.slow
+def test_compiled_is_like_eager():
+    """All but the search for the first focal length is compiled."""
+    p = draw(12, noise=1.0, batch=6)
+    solver = PnPNet(None, RobustWeightedLM(2, kernel="cauchy", learnable=False), focal="unknown")
+    expected = solver(*p[:2], withheld(p))
+    solver.compile()
+    found = solver(*p[:2], withheld(p))
+    torch.testing.assert_close(found.intrinsics, expected.intrinsics, rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(found.translation, expected.translation, rtol=1e-6, atol=1e-6)
+
+
+def test_export_says_why_not(tmp_path):
+    from kornia_pnpnet.export import export_onnx
+
+    with pytest.raises(BaseError, match="unknown focal length"):
+        export_onnx(create_solver("pnpnet-set", focal="unknown"), tmp_path / "a.onnx")

@@ -249,7 +249,7 @@ class P3PFocals(Configured):
     #: Number of pairs in a sample.
     sample_size = 3
 
-    def __init__(self, steps: int = 8) -> None:
+    def __init__(self, steps: int = 12) -> None:
         super().__init__(locals())
         check_whole(1, steps=steps)
         self.steps = steps

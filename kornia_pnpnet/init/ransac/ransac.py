@@ -55,7 +55,7 @@ _KERNEL_SCALE, _MEDIAN, _FITTED = 3.4, 2.0 * math.log(2.0), 5
 _INLIER, _KNOWN_INLIER = 10.0, 5.0
 # Residuals at the best focal length on a grid, relative to the median distance of the pixels from the principal point
 # and the range of the grid in logarithms. Tuned on random problems with fields of view of 18 to 100 degrees (seed 6).
-_GRID_RESIDUAL = 0.028
+_GRID_RESIDUAL = 0.04
 # Normalised units. A guess that has the centre of the world nearer than this counts as this near.
 _NEAREST = 0.5
 # A pair whose weight or confidence is 0 is drawn this often, relative to a pair where it is 1. Networks mislead more
