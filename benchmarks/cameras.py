@@ -67,7 +67,7 @@ class Found(NamedTuple):
     pose: Pose
     focal: Tensor
     ok: Tensor
-    us: float
+    us: float | None
 
 
 def withheld(problems: Problems) -> Tensor:
@@ -97,7 +97,7 @@ def oracle(problems: Problems) -> Found:
     solver = PnPNet(None, refine, Normalize(order=False), focal="unknown", focal_sigma=_OPEN)
     with threads(), torch.no_grad():
         result = solver(*problems[:3], problems.inliers.double(), init=problems.pose)
-    return Found(result.pose, result.intrinsics[:, 0, 0], result.ok, float("nan"))
+    return Found(result.pose, result.intrinsics[:, 0, 0], result.ok, None)
 
 
 def one_by_one(solve: Callable[..., tuple[np.ndarray, np.ndarray, float] | None], problems: Problems) -> Found:
@@ -220,7 +220,7 @@ def measure_real(data: Path) -> list[dict[str, Any]]:
             found["opencv, 21 focals"] = one_by_one(opencv_focals, problems)
             for solver, answer in found.items():
                 solved.setdefault(solver, []).append({**errors(answer, problems), "ok": answer.ok})
-                spent[solver] = spent.get(solver, 0.0) + answer.us
+                spent[solver] = spent.get(solver, 0.0) + (answer.us or 0.0)
         for solver, found_errors in solved.items():
             all_ = {key: torch.cat([x[key] for x in found_errors]) for key in found_errors[0]}
             right = (all_["rotation_deg"] < 1.0) & (all_["position"] < 0.01)
@@ -407,7 +407,7 @@ def _table(rows: Sequence[Mapping[str, Any]], keys: Sequence[str], names: Sequen
         shown = [f"{x:.0%}" if key == "share" else f"{x:g}" for key, x in zip(keys, cell, strict=True)]
         for name in names:
             one = found[name]
-            time_us = "" if np.isnan(one["us"]) else f" · {one['us']:,.0f}"
+            time_us = "" if one["us"] is None else f" · {one['us']:,.0f}"
             shown.append(f"{100 * one['success']:.1f}{time_us}")
         body.append(shown)
     return markdown_table([*titles, *names], body)

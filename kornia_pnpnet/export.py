@@ -103,9 +103,7 @@ def export_program(solver: PnPNet, n: int | None = None, *, batch: int | None = 
     if isinstance(solver.init, RANSAC):
         raise ValueCheckError("RANSAC cannot be exported: the number of its samples depends on the data.")
     if solver.focal == "unknown":
-        raise ValueCheckError(
-            "A solver with an unknown focal length cannot be exported: its search depends on the data."
-        )
+        raise ValueCheckError("With an unknown focal length nothing can be exported: the search depends on the data.")
     if n is not None:
         check_whole(3, n=n)
     if batch is not None:

@@ -561,3 +561,31 @@ def test_keypoints_are_measured_where_they_were_not_seen(tmp_path, monkeypatch):
         for key, (mean, low, high) in rows["confidence=fitted"]["less"][base].items():
             assert low <= mean <= high
             assert mean == pytest.approx(rows["confidence=fitted"][key] - rows[base][key])
+
+
+# -- cameras.py --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def cameras():
+    for module in ("cv2", "poselib", "pycolmap"):
+        pytest.importorskip(module)
+    return importlib.import_module("cameras")
+
+
+def test_cameras_are_measured_beside_the_peers(cameras, monkeypatch):
+    for name, value in (("RIGS", (3,)), ("BASELINES", (0.1,)), ("FEW", 8)):
+        monkeypatch.setattr(cameras, name, value)
+    found = {row["solver"]: row for row in cameras.measure_focal(32, (12,), (0.25,))}
+    assert set(found) == {*cameras.OURS, "pycolmap", "opencv, 21 focals", "oracle"}
+    assert all(row["success"] > 0.9 for name, row in found.items() if not name.startswith("opencv"))
+    rigs = cameras.measure_rigs(32, ((12, 0.25),))
+    assert all(row["success"] > 0.9 for row in rigs)
+    assert len(rigs) == 4
+    cell = cameras.measure_cell(4, 100)
+    assert all(row["median_focal"] < 0.01 for row in cell)
+
+
+def test_page_of_cameras_is_written_from_its_file(cameras):
+    results = json.loads((FOLDER / "cameras.json").read_text())
+    assert cameras.page(results) == (FOLDER / "cameras.md").read_text(encoding="utf-8")

@@ -18,7 +18,7 @@ from kornia_pnpnet import (
     pose_covariance,
 )
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
-from kornia_pnpnet.geometry import dolly_zoom, normal_equations, project
+from kornia_pnpnet.geometry import dolly_zoom, normal_equations, project, retract
 from kornia_pnpnet.geometry import rotation_angle as angle
 from kornia_pnpnet.init.focal import scale_focal
 from kornia_pnpnet.types import FreeFocal
@@ -189,6 +189,30 @@ def test_gradcheck_to_the_focal_length(backward, kernel):
     inputs = [x.detach().requires_grad_() for x in (corr.world_points, corr.img_points, corr.free_focal.expected)]
     # Of the minimum the derivative is exact up to what 40 iterations leave.
     torch.autograd.gradcheck(solve, inputs, eps=1e-5, atol=2e-4, rtol=1e-3)
+
+
+def test_a_prior_of_the_pose_leaves_its_minimum():
+    """Gradients of all terms of the cost vanish where the refinement ends, by the pose and by the focal length."""
+    from kornia_pnpnet.refine.prior import focal_loss, prior_in_frame, prior_loss
+    from kornia_pnpnet.types import PosePrior
+
+    p = draw(8, batch=3, noise=1.0)
+    corr, pose = framed(p)
+    known = PosePrior(pose, torch.diag(torch.tensor([1e4] * 3 + [1e3] * 3)).double().expand(3, 6, 6))
+    one = torch.ones(3, dtype=torch.float64)
+    prior, _ = prior_in_frame(known, torch.zeros(3, 3).double(), one, corr.free_focal.pixel)
+    corr = corr._replace(prior=prior._replace(sq_scale=torch.full_like(one, math.inf)))
+    corr = corr._replace(free_focal=corr.free_focal._replace(information=1e2 * one))
+    end = RobustWeightedLM(30, robustness=0.0)(corr, Guess(pose, torch.ones_like(corr.weights)))
+    delta = torch.zeros(3, 7, dtype=torch.float64, requires_grad=True)
+    moved = dolly_zoom(retract(end.pose, delta[:, :6]), delta[:, 6])
+    seen = corr.zoomed(end.zoom + delta[:, 6])
+    pixel = corr.free_focal.pixel
+    pairs = project(moved, seen).sq_residual.sum(1) / pixel.square()
+    cost = pairs + prior_loss(corr.prior, moved) + focal_loss(corr.free_focal, seen.focal[:, 0])
+    slope = torch.autograd.grad(cost.sum(), delta)[0]
+    curvature = 1e4  # of the prior, the least of all terms
+    assert (slope.abs() / curvature).max() < 1e-4
 
 
 def test_gradients_flow_through_the_solver():

@@ -164,7 +164,7 @@ def add_prior(
         prior: the prior.
         pose: the pose.
         unit: what a weight of 1 in the equations stands for, in inverse square pixels, (B,).
-        focal: the focal length in pixels.
+        focal: the focal length in pixels, a scalar or (B,).
     """
     error, square = prior_errors(prior, pose)
     half = 0.5 * error[:, :3]
@@ -181,12 +181,15 @@ def add_prior(
     robust = torch.exp(-square / prior.sq_scale)
     weight = (robust / (unit * focal))[:, None]
     weighted = jacobian.mT @ prior.information
-    matrix = (weight / focal)[..., None] * (weighted @ jacobian)
+    matrix = (weight / focal[..., None])[..., None] * (weighted @ jacobian)
     gradient = weight * (weighted @ error[..., None])[..., 0]
-    rows_of = [[x + matrix[:, i, j] for j, x in enumerate(row)] for i, row in enumerate(equations.hessian[:6])]
-    rows_of += [list(row) for row in equations.hessian[6:]]
-    slopes = [x + gradient[:, i] for i, x in enumerate(equations.gradient[:6])]
-    return NormalEquations(rows_of, [*slopes, *equations.gradient[6:]])
+    if len(equations.gradient) == 7:  # a zoom moves the camera along its axis, see `dolly_zoom`
+        depth = pose.translation[:, 2, None]
+        matrix = torch.cat((matrix, depth[..., None] * matrix[:, 5:6]), 1)
+        matrix = torch.cat((matrix, depth[..., None] * matrix[:, :, 5:6]), 2)
+        gradient = torch.cat((gradient, depth * gradient[:, 5:6]), 1)
+    rows_of = [[x + matrix[:, i, j] for j, x in enumerate(row)] for i, row in enumerate(equations.hessian)]
+    return NormalEquations(rows_of, [x + gradient[:, i] for i, x in enumerate(equations.gradient)])
 
 
 def add_focal_prior(equations: NormalEquations, free: FreeFocal, unit: Tensor, focal: Tensor) -> NormalEquations:

@@ -35,7 +35,7 @@ class P3PRig(Configured):
     #: Number of pairs in a sample.
     sample_size = 3
 
-    def __init__(self, steps: int = 5) -> None:
+    def __init__(self, steps: int = 8) -> None:
         super().__init__(locals())
         check_whole(0, steps=steps)
         self.steps = steps
