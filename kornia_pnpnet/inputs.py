@@ -27,6 +27,7 @@ __all__ = [
     "one_batch",
     "restore_leading",
     "split_batch",
+    "with_undistorted",
 ]
 
 _T = TypeVar("_T")
@@ -195,12 +196,18 @@ def checked_inputs(
         return size, _looking_along(inputs)
     if dist is None and fisheye is None:
         return size, inputs
+    return size, with_undistorted(inputs, dist, fisheye)
+
+
+def with_undistorted(inputs: Inputs, dist: Tensor | None, fisheye: Tensor | None) -> Inputs:
+    """Inputs with the pixels of pinhole cameras, see :func:`~kornia_pnpnet.cameras.undistort`.
+
+    Pairs without such a pixel are left out; one that is not finite still fails its problem.
+    """
     pixels, found, noise = undistort(inputs.img_points, inputs.intrinsics, dist, fisheye, inputs.noise)
-    mask = found if inputs.mask is None else found & inputs.mask
-    # Pairs without a pixel are left out; one that is not finite still fails its problem.
-    pixels = torch.where(found[..., None] | inputs.img_points.isfinite(), pixels, inputs.img_points)
-    mask = mask | (~inputs.img_points.isfinite().all(-1) & (True if inputs.mask is None else inputs.mask))
-    return size, inputs._replace(img_points=pixels, mask=mask, noise=noise)
+    broken = ~inputs.img_points.isfinite().all(-1)
+    mask = found | broken if inputs.mask is None else (found | broken) & inputs.mask
+    return inputs._replace(img_points=torch.where(broken[..., None], inputs.img_points, pixels), mask=mask, noise=noise)
 
 
 def _looking_along(inputs: Inputs) -> Inputs:

@@ -21,6 +21,8 @@ __all__ = ["create_solver", "list_solvers", "solve_pnp"]
 
 # Iterations of the classical robust LM: from a pose that is nearly right, and from the identity.
 _FEW, _MANY = 10, 30
+# Options of every solver of ours.
+_OURS = ("effort", "gradient", "focal", "focal_sigma", "radial")
 # The paper's RANSAC: EPnP-LM on samples of 7 of the pairs.
 _PAPERS_SAMPLE = 7
 
@@ -121,7 +123,7 @@ def create_solver(name: str, **options: Any) -> nn.Module:
             ``epnp-lm`` take the arguments of :class:`~kornia_pnpnet.init.EPnP`, ``reppnp`` and ``reppnp-lm`` of
             :class:`~kornia_pnpnet.init.REPPnP`, ``p3p-ransac`` and ``ransac-epnp-lm`` of
             :class:`~kornia_pnpnet.init.RANSAC`, peers of their class in :mod:`kornia_pnpnet.peers`. All
-            but the peers take ``gradient``, ``effort``, ``focal`` and ``focal_sigma``, see
+            but the peers take ``gradient``, ``effort``, ``focal``, ``focal_sigma`` and ``radial``, see
             :class:`~kornia_pnpnet.solver.PnPNet`.
 
     Returns:
@@ -139,7 +141,7 @@ def create_solver(name: str, **options: Any) -> nn.Module:
     builders = _builders()
     if not isinstance(name, str) or name not in builders:
         raise ValueCheckError(f"No solver {name!r}. There are: {', '.join(sorted(builders))}.")
-    ours = {key: options.pop(key) for key in ("effort", "gradient", "focal", "focal_sigma") if key in options}
+    ours = {key: options.pop(key) for key in _OURS if key in options}
     try:
         solver = builders[name](**options).eval()
         if not ours:

@@ -15,6 +15,7 @@ from kornia_pnpnet.core.checks import check_positive, check_whole
 from kornia_pnpnet.core.linalg import bound_gradient, gate
 from kornia_pnpnet.core.performance import Compiled, in_full_precision, sees_values
 from kornia_pnpnet.core.trees import map_tensors, take
+from kornia_pnpnet.geometry import gate_pose
 from kornia_pnpnet.init import RANSAC, MLPInit, SetInit
 from kornia_pnpnet.init.alternatives import doubt_mirrored, find_alternatives, is_seen
 from kornia_pnpnet.init.focal import (
@@ -78,8 +79,7 @@ class PnPNet(PretrainedMixin):
             points, pixels and weights is then finite and at most 10 long.
         views: number of guesses for each problem, 1 to 8: one of the problem itself and others of its mirror images
             (see :meth:`~kornia_pnpnet.normalize.Normalize.views`), which a network answers differently. All guesses are
-            refined; after seven tenths of the iterations the best one goes on alone. More views cost more and solve
-            more. The number may differ from that of the training.
+            refined; after seven tenths of the iterations the best one goes on alone. More views cost and solve more.
         focal: ``"known"``, or ``"unknown"``: the focal length is estimated with the pose and returned in the result's
             ``intrinsics``. Those of the call then give the principal point, the aspect ratio and the skew relative to
             the focal length. A first estimate comes from P3P at focal lengths of fields of view from 14 to 118 degrees,
@@ -88,6 +88,8 @@ class PnPNet(PretrainedMixin):
             ``ok``.
         focal_sigma: standard deviation of the logarithm of the focal length in the intrinsics of a call, for example
             0.1 for one that is known to about 10 %; ``None``: the focal length in the intrinsics is ignored.
+        radial: number of coefficients of radial distortion, 0 to 2, that are estimated with an unknown focal length,
+            before the refinement; the result has them as ``dist``, without gradient.
 
     Raises:
         BaseError: when ``views`` is not an integer from 1 to 8, or ``gradient``, ``effort`` or ``focal`` neither of its
@@ -113,6 +115,7 @@ class PnPNet(PretrainedMixin):
         effort: str | None = None,
         focal: str = "known",
         focal_sigma: float | None = None,
+        radial: int = 0,
     ) -> None:
         super().__init__()
         check_whole(1, len(VIEWS), views=views)
@@ -121,7 +124,10 @@ class PnPNet(PretrainedMixin):
         KORNIA_CHECK(focal in ("known", "unknown"), f"focal must be 'known' or 'unknown', got {focal!r}.")
         if focal_sigma is not None:
             check_positive(focal_sigma=focal_sigma)
-            KORNIA_CHECK(focal == "unknown", "focal_sigma is for focal='unknown'.")
+        check_whole(0, 2, radial=radial)
+        fits = focal == "unknown" or (focal_sigma is None and not radial)
+        KORNIA_CHECK(fits, "focal_sigma and radial are for focal='unknown'.")
+        self.radial = int(radial)
         self.effort, self.focal, self.focal_sigma = effort, focal, focal_sigma
         self.views = int(views)
         self.init = init
@@ -297,14 +303,15 @@ class PnPNet(PretrainedMixin):
 
     def _parts(self, first_stage_only: bool, always: bool, inputs: Inputs) -> tuple[_Begun, Tensor | None, PnPResult]:
         """Before the iterations, the iterations, and after them."""
-        given = inputs
+        given, dist = inputs, None
         if inputs.rig is not None:
             begun = self._begin(1, always, inputs)
             end = self.refine.iterate(begun.start, 0 if first_stage_only else None)
             return begun, None, self._finish(begun, end, always)
         if self.focal == "unknown":
             inputs = with_nominal_focal(inputs, self.focal_sigma)
-            inputs = inputs if finds_focal(self.init) else with_found_focal(inputs)
+            if self.radial or not finds_focal(self.init):
+                inputs, dist = with_found_focal(inputs, self.radial)
         views = 1 if first_stage_only or self.refine.m == 0 else self.views
         searches = not first_stage_only and self._searches(inputs)
         if not searches:
@@ -314,17 +321,20 @@ class PnPNet(PretrainedMixin):
             guess = search_on(corr, guess, keep_others=inputs.init is not None or inputs.prior is not None)
             begun = _Begun(self.refine.begin(corr, guess), frame, guess)
         end = self.refine.iterate(begun.start, 0 if first_stage_only else None)
-        result = self._finish(begun, end, always)
+        result = self._finish(begun, end, always)._replace(dist=dist)
         if searches:
             start, frame, guess = begun
             pose = self.normalize.apply_to_pose(result.pose, frame)
             corr = start.corr.seen_with(end.zoom)
             result = doubt_mirrored(self.refine, corr, guess, pose, result, always)
             if inputs.noise is None:
-                result = self._with_more_noise(always, given, self.normalize.undo_guess(guess, frame).noise, result)
+                noise = self.normalize.undo_guess(guess, frame).noise
+                result = self._with_more_noise(always, given, inputs, noise, result)
         return begun, end.zoom, result
 
-    def _with_more_noise(self, always: bool, inputs: Inputs, noise: Noise | None, result: PnPResult) -> PnPResult:
+    def _with_more_noise(
+        self, always: bool, given: Inputs, inputs: Inputs, noise: Noise | None, result: PnPResult
+    ) -> PnPResult:
         """Solve once more, with the noise that the residuals show, the problems whose noise was underestimated."""
         assert noise is not None
         before = 1.0 if inputs.weights is None else inputs.weights
@@ -335,7 +345,7 @@ class PnPNet(PretrainedMixin):
         if not len(rows):
             return result
         shown = Noise(sigma[rows], torch.zeros_like(sigma[rows]))
-        again = take(inputs, rows)._replace(noise=shown)
+        again = take(given, rows)._replace(noise=shown)
         solved = self._parts(False, always, again)[2]
         return map_tensors(lambda x, y: x.index_copy(0, rows, y), result, solved)
 
@@ -399,7 +409,7 @@ class PnPNet(PretrainedMixin):
             init = Pose(eye, world_points.new_zeros(batch, 3))
         limit = torch.finfo(world_points.dtype).max ** 0.25  # as for points: below it, squares of squares are finite
         usable = frame.valid & (torch.cat((init.rotation.flatten(1), init.translation), 1).abs().amax(-1) < limit)
-        return self.normalize.apply_to_pose(_gate_pose(init, usable, usable), frame)
+        return self.normalize.apply_to_pose(gate_pose(init, usable, usable), frame)
 
     def _result(self, begun: _Begun, end: LMStep, always: bool) -> PnPResult:
         """Everything after the last iteration."""
@@ -421,13 +431,13 @@ class PnPNet(PretrainedMixin):
         status = torch.where(frame.valid, status, frame.status).to(torch.int8)
         live = finite if always else ok
         cameras = None if frame.intrinsics.ndim > 3 else gate(intrinsics, live, torch.ones_like(finite), 0.0)
-        pose = _gate_pose(pose, live, finite)
+        pose = gate_pose(pose, live, finite)
         return PnPResult(
             *pose,
             gate(self.normalize.undo_pairs(refined.weights, frame), live, finite, 0.0),
             gate(refined.cost, live, finite, torch.finfo(refined.cost.dtype).max ** 0.5),
             ok,
-            _gate_pose(first, first_ok, first_ok),
+            gate_pose(first, first_ok, first_ok),
             status,
             torch.where(finite, refined.probability, 0.0),
             Alternatives.none(pose),
@@ -438,9 +448,3 @@ class PnPNet(PretrainedMixin):
 def _checked_gradient(gradient: str) -> str:
     KORNIA_CHECK(gradient in ("ok", "always"), f"gradient must be 'ok' or 'always', got {gradient!r}.")
     return gradient
-
-
-def _gate_pose(pose: Pose, ok: Tensor, finite: Tensor) -> Pose:
-    """:func:`~kornia_pnpnet.core.linalg.gate` for a pose; the identity fills."""
-    eye = torch.eye(3, dtype=pose.rotation.dtype, device=pose.rotation.device)
-    return Pose(gate(pose.rotation, ok, finite, eye), gate(pose.translation, ok, finite, 0.0))

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from kornia.core.exceptions import BaseError
+from kornia.geometry.calibration import distort_points
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
 from kornia_pnpnet import (
@@ -21,19 +22,20 @@ from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.geometry import dolly_zoom, normal_equations, project, retract
 from kornia_pnpnet.geometry import rotation_angle as angle
 from kornia_pnpnet.init.focal import scale_focal
+from kornia_pnpnet.refine.radial import _distorted
 from kornia_pnpnet.types import FreeFocal
 
 HALF = 500.0  # pixels
 
 
-def draw(n, batch=64, wrong=0, *, seed=0, noise=0.0, spread=0.4, aspect=1.0):
+def draw(n, batch=64, wrong=0, *, seed=0, noise=0.0, spread=0.4, aspect=1.0, fov=(18.0, 100.0)):
     """Problems of cameras with fields of view from 18 to 100 degrees; the first pairs are wrong."""
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(*shape, low=-1.0, high=1.0):
         return low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)
 
-    f = HALF / (0.5 * uniform(batch, low=18.0, high=100.0).deg2rad()).tan()
+    f = HALF / (0.5 * uniform(batch, low=fov[0], high=fov[1]).deg2rad()).tan()
     focals = torch.stack((f / math.sqrt(aspect), f * math.sqrt(aspect)), -1)
     depth = 5.0 * (1.0 + spread * uniform(batch, n))
     pixels = HALF * uniform(batch, n, 2)
@@ -292,3 +294,45 @@ def test_export_says_why_not(tmp_path):
 
     with pytest.raises(BaseError, match="unknown focal length"):
         export_onnx(create_solver("pnpnet-set", focal="unknown"), tmp_path / "a.onnx")
+
+
+@pytest.mark.parametrize("name", ["pnpnet-set", "p3p-ransac", "reppnp-lm"])
+@pytest.mark.parametrize("radial", [1, 2])
+def test_radial_distortion_is_estimated_with_the_focal_length(name, radial):
+    wrong = 0 if name == "reppnp-lm" else 8
+    p = draw(40, wrong=0, batch=32, fov=(40.0, 90.0))
+    dist = torch.tensor([-0.2, 0.03 * (radial - 1), 0.0, 0.0], dtype=torch.float64)
+    pixels = distort_points(p.img_points, p.intrinsics, dist.expand(32, -1))
+    pixels = pixels + 0.5 * torch.randn(pixels.shape, generator=torch.Generator().manual_seed(0)).double()
+    pixels[:, :wrong] = pixels[:, :wrong].flip(1) + 100.0
+    without = create_solver(name, focal="unknown")(p.world_points, pixels, withheld(p))
+    assert (errors(without, p)[0] > 0.02).double().mean() > 0.5
+    assert without.dist is None
+    result = create_solver(name, focal="unknown", radial=radial)(p.world_points, pixels, withheld(p))
+    focal, shift, turn = errors(result, p)
+    right = (focal < 0.02) & (shift < 0.02) & (turn < math.radians(0.5)) & result.ok
+    assert right.double().mean() > 0.9
+    assert (result.dist - dist)[:, 0].abs().median() < 0.02
+    known = create_solver(name)(p.world_points, pixels, result.intrinsics, dist=result.dist)
+    torch.testing.assert_close(known.rotation, result.rotation, rtol=0, atol=0.01)
+
+
+def test_the_jacobian_of_radial_distortion():
+    corr, pose = framed(draw(9, batch=2, noise=1.0))
+    given = torch.tensor([[0.1, -0.05], [-0.2, 0.03]], dtype=torch.float64)
+
+    def residual(delta):
+        moved = dolly_zoom(retract(pose, delta[:, :6]), delta[:, 6])
+        pairs = corr.zoomed(delta[:, 6])
+        return torch.cat(_distorted(project(moved, pairs), pairs, given + delta[:, 7:])[0].residual, 1)
+
+    zero = torch.zeros(2, 9, dtype=torch.float64)
+    jacobian = torch.autograd.functional.jacobian(lambda d: residual(d).sum(0), zero).movedim(0, 1) / corr.focal
+    pairs = corr.zoomed(zero[:, 0])
+    seen, terms = _distorted(project(pose, pairs), pairs, given)
+    hessian, gradient = normal_equations(seen, corr.weights, free_focal=True, radial=terms)
+    expected, right_side = jacobian.mT @ jacobian, (jacobian.mT @ residual(zero)[..., None])[..., 0]
+    for i in range(9):
+        torch.testing.assert_close(gradient[i], right_side[:, i])
+        for j in range(i + 1):
+            torch.testing.assert_close(hessian[i][j], expected[:, i, j])

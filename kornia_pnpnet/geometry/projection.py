@@ -17,6 +17,7 @@ __all__ = [
     "MIN_DEPTH_RATIO",
     "NormalEquations",
     "Projection",
+    "RadialTerms",
     "normal_equations",
     "pixel_covariance",
     "pixel_variance",
@@ -73,6 +74,22 @@ class NormalEquations(NamedTuple):
 
     hessian: Sequence[Sequence[Tensor]]
     gradient: Sequence[Tensor]
+
+
+class RadialTerms(NamedTuple):
+    r"""Radial distortion of the points of a projection, :math:`d = 1 + k_1 \rho^2 + k_2 \rho^4`.
+
+    Attributes:
+        stretch: :math:`d`, shape :math:`(B, N)`.
+        slope: twice the derivative of :math:`d` by :math:`\rho^2 = p^2 + q^2`, shape :math:`(B, N)`.
+        depth: :math:`z`, any positive number for points behind the camera, shape :math:`(B, N)`.
+        terms: number of coefficients.
+    """
+
+    stretch: Tensor
+    slope: Tensor
+    depth: Tensor
+    terms: int
 
 
 def transform(pose: Pose, world_points: Tensor) -> Tensor:
@@ -205,7 +222,11 @@ def pixel_covariance(
 
 
 def normal_equations(
-    projection: Projection, weights: Tensor | Symmetric2, *, free_focal: bool = False
+    projection: Projection,
+    weights: Tensor | Symmetric2,
+    *,
+    free_focal: bool = False,
+    radial: RadialTerms | None = None,
 ) -> NormalEquations:
     r"""The normal equations of the residuals by the six pose parameters, and by the focal length where it is unknown.
 
@@ -222,6 +243,7 @@ def normal_equations(
     Args:
         projection: what :func:`project` returned at the pose.
         free_focal: whether there is a seventh parameter.
+        radial: radial distortion, whose coefficients are the last parameters.
         weights: weight of each pair, :math:`(B, N)`, or 2×2 matrices with entries of that shape. Points behind the
             camera do not count.
 
@@ -243,6 +265,14 @@ def normal_equations(
     ]
     if free_focal:
         columns.append((p * y3, q * y3))
+    if radial is not None:
+        columns = [_distorted(column, radial, p, q) for column in columns]
+        square = torch.addcmul(p * p, q, q)
+        if free_focal:  # the focal length stretches the distorted pixel, the dolly moves the point
+            moved = radial.stretch * y3 - radial.slope * square * (radial.depth - y3)
+            columns[6] = p * moved, q * moved
+        powers = [radial.depth * square ** (k + 1) for k in range(radial.terms)]
+        columns += [(p * x, q * x) for x in powers]
     if projection.rig is not None:
         columns = _of_rig(columns, projection.rig) + columns[6:]
     weights = map_tensors(lambda w: w * projection.inv_depth * projection.inv_depth, weights)
@@ -267,6 +297,13 @@ def normal_equations(
     hessian = [[inner(weighted[j], columns[i]) for j in range(i + 1)] for i in range(5)]
     hessian += [[inner(weighted[i], columns[j]) for j in range(i + 1)] for i in range(5, len(columns))]
     return NormalEquations(hessian, [inner(column, projection.scaled_residual) for column in weighted])
+
+
+def _distorted(column: _Column, radial: RadialTerms, p: Tensor, q: Tensor) -> _Column:
+    """A column for pixels after radial distortion, whose derivative is d I + 2 d' (p, q) (p, q)^T."""
+    u, v = column
+    along = radial.slope * _plus(_times(p, u), _times(q, v))
+    return _plus(_times(radial.stretch, u), along * p), _plus(_times(radial.stretch, v), along * q)
 
 
 def _of_rig(columns: list[_Column], to_camera: Tensor) -> list[_Column]:

@@ -9,6 +9,7 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix, rotation_
 from kornia.geometry.liegroup import So3
 from torch import Tensor
 
+from kornia_pnpnet.core.linalg import gate
 from kornia_pnpnet.geometry.projection import NormalEquations
 from kornia_pnpnet.types import Pose
 
@@ -16,6 +17,7 @@ __all__ = [
     "additive_tangent_map",
     "change_tangent",
     "dolly_zoom",
+    "gate_pose",
     "move",
     "retract",
     "retract_additive",
@@ -156,3 +158,9 @@ def rotation_angle(rotation_a: Tensor, rotation_b: Tensor) -> Tensor:
     sine = 0.5 * So3.vee(diff - diff.mT).norm(dim=-1)
     cosine = 0.5 * (diff.diagonal(dim1=-2, dim2=-1).sum(-1) - 1.0)
     return torch.atan2(sine, cosine)
+
+
+def gate_pose(pose: Pose, ok: Tensor, finite: Tensor) -> Pose:
+    """:func:`~kornia_pnpnet.core.linalg.gate` for a pose; the identity fills."""
+    eye = torch.eye(3, dtype=pose.rotation.dtype, device=pose.rotation.device)
+    return Pose(gate(pose.rotation, ok, finite, eye), gate(pose.translation, ok, finite, 0.0))

@@ -6,10 +6,12 @@ import math
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from kornia_pnpnet.init.ransac import P3P, RANSAC
-from kornia_pnpnet.inputs import Inputs
+from kornia_pnpnet.inputs import Inputs, with_undistorted
 from kornia_pnpnet.normalize import Frame, Normalize
+from kornia_pnpnet.refine.radial import estimate_radial
 from kornia_pnpnet.types import FreeFocal, Pose
 
 __all__ = [
@@ -102,12 +104,31 @@ def find_focal(inputs: Inputs) -> tuple[Pose, Tensor]:
     return normalize.undo(guess.pose, frame), torch.where(guess.zoom.isfinite(), guess.zoom, 0.0)
 
 
-def with_found_focal(inputs: Inputs) -> Inputs:
+def with_found_focal(inputs: Inputs, radial: int = 0) -> tuple[Inputs, Tensor | None]:
     """Give the cameras an estimate of their focal length, and the problems a pose to start from unless they have one.
 
     Args:
         inputs: See find_focal.
+        radial: number of coefficients of radial distortion to estimate, too.
+
+    Returns:
+        The problems, their pixels undistorted where ``radial`` is not 0; the coefficients (k1, k2, 0, 0), (B, 4).
     """
     pose, zoom = find_focal(inputs)
-    cameras = scale_focal(inputs.intrinsics, zoom.exp())
-    return inputs._replace(intrinsics=cameras, init=pose if inputs.init is None else inputs.init)
+    cameras, dist = scale_focal(inputs.intrinsics, zoom.exp()), None
+    if radial:
+        normalize = Normalize(order=False)
+        with torch.no_grad():
+            corr, frame = normalize(*inputs._replace(intrinsics=cameras)[:5])
+            found = estimate_radial(corr, normalize.apply_to_pose(pose, frame), radial)
+            finite = frame.valid & (found.pose.translation.sum(-1) + found.zoom + found.coefficients.sum(-1)).isfinite()
+            better = normalize.undo(found.pose, frame)
+            pose = Pose(
+                torch.where(finite[:, None, None], better.rotation, pose.rotation),
+                torch.where(finite[:, None], better.translation, pose.translation),
+            )
+            zoom = torch.where(finite, found.zoom, 0.0)
+            dist = functional.pad(torch.where(finite[:, None], found.coefficients, 0.0), (0, 4 - radial))
+        cameras = scale_focal(cameras, zoom.exp())
+        inputs = with_undistorted(inputs._replace(intrinsics=cameras), dist, None)
+    return inputs._replace(intrinsics=cameras, init=pose if inputs.init is None else inputs.init), dist
