@@ -20,6 +20,7 @@ from kornia_pnpnet.types import FreeFocal, Noise, PnPResult, Pose, PosePrior, ca
 __all__ = [
     "Inputs",
     "Part",
+    "check_cameras",
     "checked_inputs",
     "checked_noise",
     "given_cameras",
@@ -208,6 +209,19 @@ def with_undistorted(inputs: Inputs, dist: Tensor | None, fisheye: Tensor | None
     broken = ~inputs.img_points.isfinite().all(-1)
     mask = found | broken if inputs.mask is None else (found | broken) & inputs.mask
     return inputs._replace(img_points=torch.where(broken[..., None], inputs.img_points, pixels), mask=mask, noise=noise)
+
+
+def check_cameras(inputs: Inputs, focal: str, *, distorted: bool, alternatives: int, init: object) -> None:
+    """Refuse arguments that cannot be combined: an unknown focal length, distortion, rigs and alternatives.
+
+    Raises:
+        ValueCheckError: for such arguments.
+    """
+    rig = inputs.rig is not None
+    if focal == "unknown" and (rig or distorted):
+        raise ValueCheckError("focal='unknown' takes pixels of one camera without dist and fisheye.")
+    if rig and (alternatives or init is None):
+        raise ValueCheckError("A rig or bearings have no alternatives, and need a solver with an initialiser.")
 
 
 def _looking_along(inputs: Inputs) -> Inputs:

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import torch
 from kornia.core.check import KORNIA_CHECK
-from kornia.core.exceptions import ValueCheckError
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
@@ -27,7 +26,15 @@ from kornia_pnpnet.init.focal import (
 )
 from kornia_pnpnet.init.ransac import search_on
 from kornia_pnpnet.init.rig import guess_of_rig
-from kornia_pnpnet.inputs import Inputs, checked_inputs, given_cameras, joined, restore_leading, split_batch
+from kornia_pnpnet.inputs import (
+    Inputs,
+    check_cameras,
+    checked_inputs,
+    given_cameras,
+    joined,
+    restore_leading,
+    split_batch,
+)
 from kornia_pnpnet.normalize import VIEWS, Frame, Normalize
 from kornia_pnpnet.pretrained import PretrainedMixin
 from kornia_pnpnet.refine import LMStart, LMStep, RobustWeightedLM
@@ -79,13 +86,12 @@ class PnPNet(PretrainedMixin):
             points, pixels and weights is then finite and at most 10 long.
         views: number of guesses for each problem, 1 to 8: one of the problem itself and others of its mirror images
             (see :meth:`~kornia_pnpnet.normalize.Normalize.views`), which a network answers differently. All guesses are
-            refined; after seven tenths of the iterations the best one goes on alone. More views cost and solve more.
+            refined; after seven tenths of the iterations the best one goes on alone.
         focal: ``"known"``, or ``"unknown"``: the focal length is estimated with the pose and returned in the result's
             ``intrinsics``. Those of the call then give the principal point, the aspect ratio and the skew relative to
-            the focal length. A first estimate comes from P3P at focal lengths of fields of view from 14 to 118 degrees,
-            without ``focal_sigma``; the refinement has the logarithm of the focal length as a seventh parameter. Where
-            the pairs leave it open by more than 15 % (a plane seen from the front, little depth) the problem is not
-            ``ok``.
+            the focal length. A first estimate comes from P3P at focal lengths of fields of view from 14 to 118 degrees;
+            the refinement has the logarithm of the focal length as a seventh parameter. Where the pairs leave it open
+            by more than 15 % (a plane seen from the front, little depth) the problem is not ``ok``.
         focal_sigma: standard deviation of the logarithm of the focal length in the intrinsics of a call, for example
             0.1 for one that is known to about 10 %; ``None``: the focal length in the intrinsics is ignored.
         radial: number of coefficients of radial distortion, 0 to 2, that are estimated with an unknown focal length,
@@ -127,13 +133,12 @@ class PnPNet(PretrainedMixin):
         check_whole(0, 2, radial=radial)
         fits = focal == "unknown" or (focal_sigma is None and not radial)
         KORNIA_CHECK(fits, "focal_sigma and radial are for focal='unknown'.")
-        self.radial = int(radial)
-        self.effort, self.focal, self.focal_sigma = effort, focal, focal_sigma
+        self.effort, self.focal, self.focal_sigma, self.radial = effort, focal, focal_sigma, int(radial)
         self.views = int(views)
         self.init = init
         self.refine = RobustWeightedLM(learnable=False) if refine is None else refine
         self.normalize = Normalize() if normalize is None else normalize
-        # What runs: these functions, or what `compile` made of them.
+        # What runs, or what `compile` made of it.
         self._solve: Callable[..., PnPResult] = self._in_parts
         self._first: Callable[..., tuple[Correspondences, Frame, Guess]] = self._first_guess
         self._begin: Callable[..., _Begun] = self._guess
@@ -174,9 +179,8 @@ class PnPNet(PretrainedMixin):
                 which without intrinsics is told in radians.
             weights: weight of each pair, the same for u and v, at least 0, shape :math:`(B, N)`; 1 when ``None``.
             mask: False where a pair is padding, bool, shape :math:`(B, N)`. The numbers of padding do not matter.
-            init: a world-to-camera pose, for example of the frame before, :math:`(B, 3, 3)` and :math:`(B, 3)`. It
-                competes with the poses of the initialiser and is refined as they are. Without an initialiser the
-                refinement starts from it.
+            init: a world-to-camera pose, :math:`(B, 3, 3)` and :math:`(B, 3)`. It competes with the poses of the
+                initialiser and is refined as they are; without an initialiser the refinement starts from it.
             img_sigma: standard deviation of the noise on each pixel coordinate, a number, :math:`(B,)` or
                 :math:`(B, N)`, at least 0; NaN where unknown. With this or ``world_sigma``, residuals and the scales of
                 the refinement's kernel count in standard deviations.
@@ -198,13 +202,12 @@ class PnPNet(PretrainedMixin):
                 what the coefficients can show are left out.
             fisheye: the four coefficients of ``cv2.fisheye``, in place of ``dist``, shape :math:`(B, 4)` or
                 :math:`(4,)`. Pixels more than 85 degrees off the axis are left out; bearings keep them.
-            cam_from_rig: several cameras with one pose, that of their rig, which is the pose of the result: the camera
-                that sees each pair, as a transform from the rig to the camera, :math:`(B, N, 3, 3)` and
-                :math:`(B, N, 3)`.
+            cam_from_rig: for several cameras with one pose, that of their rig: the transform from the rig to the camera
+                that sees each pair, :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`.
             first_stage_only: return the first guess unrefined, the paper's "Net", at the cost of ``m=0``.
             gradient: ``"ok"`` or ``"always"``; the solver's own when ``None``.
-            alternatives: largest number of other poses to return that explain the pairs nearly as well. Looking for
-                them costs as much as several solutions.
+            alternatives: largest number of other poses to return that explain the pairs nearly as well; they cost as
+                much as several solutions.
 
         Returns:
             The :class:`~kornia_pnpnet.types.PnPResult`, in float64 when any input is, else in float32. Gradients flow
@@ -223,7 +226,8 @@ class PnPNet(PretrainedMixin):
         given = world_points, img_points, intrinsics, weights, mask, init, img_sigma, world_sigma, img_cov, world_cov
         size, inputs = checked_inputs(*given, confidence, prior, dist=dist, fisheye=fisheye, cam_from_rig=cam_from_rig)
         check_whole(0, alternatives=alternatives)
-        self._check_cameras(inputs, dist is not None or fisheye is not None, alternatives)
+        distorted = dist is not None or fisheye is not None
+        check_cameras(inputs, self.focal, distorted=distorted, alternatives=alternatives, init=self.init)
         with in_full_precision(inputs.world_points.device.type):
             always = _checked_gradient(gradient or self.gradient) == "always"
             compiled = [x for x in (self._solve, self._first, self._begin) if isinstance(x, Compiled)]
@@ -281,14 +285,6 @@ class PnPNet(PretrainedMixin):
         if not whole:
             self.refine.compile(mode)
 
-    def _check_cameras(self, inputs: Inputs, distorted: bool, alternatives: int) -> None:
-        """Refuse what cannot be combined."""
-        rig = inputs.rig is not None
-        if self.focal == "unknown" and (rig or distorted):
-            raise ValueCheckError("focal='unknown' takes pixels of one camera without distortion.")
-        if rig and (alternatives or self.init is None):
-            raise ValueCheckError("A rig or bearings have no alternatives, and need a solver with an initialiser.")
-
     def _in_parts(self, first_stage_only: bool, always: bool, inputs: Inputs, alternatives: int = 0) -> PnPResult:
         begun, zoom, result = self._parts(first_stage_only, always, inputs)
         if not alternatives:
@@ -318,10 +314,13 @@ class PnPNet(PretrainedMixin):
             begun = self._begin(views, always, inputs)
         else:
             corr, frame, guess = self._first(views, always, inputs, True)
-            guess = search_on(corr, guess, keep_others=inputs.init is not None or inputs.prior is not None)
+            if self.focal == "known":  # or else a search has given the pose
+                guess = search_on(corr, guess, keep_others=inputs.init is not None or inputs.prior is not None)
             begun = _Begun(self.refine.begin(corr, guess), frame, guess)
         end = self.refine.iterate(begun.start, 0 if first_stage_only else None)
-        result = self._finish(begun, end, always)._replace(dist=dist)
+        result = self._finish(begun, end, always)
+        if dist is not None:
+            result = result._replace(dist=dist)
         if searches:
             start, frame, guess = begun
             pose = self.normalize.apply_to_pose(result.pose, frame)
@@ -442,6 +441,7 @@ class PnPNet(PretrainedMixin):
             torch.where(finite, refined.probability, 0.0),
             Alternatives.none(pose),
             cameras,
+            pose.translation.new_zeros(len(pose.translation), 4),
         )
 
 

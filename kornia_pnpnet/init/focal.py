@@ -32,7 +32,7 @@ _SEARCHED = 2.0
 # Pixels of a camera whose focal length is in the middle of the range: 0.65 % of half the width of the image. The least
 # threshold of an inlier; near the right focal length on the grid of the search, inliers have larger residuals.
 _THRESHOLD = 10.0
-_FINDER = RANSAC(P3P(), threshold=_THRESHOLD, min_samples=16)
+_FINDER = RANSAC(P3P(), threshold=_THRESHOLD, min_samples=16, confidence=0.99)
 
 
 def finds_focal(init: object) -> bool:

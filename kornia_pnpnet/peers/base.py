@@ -166,6 +166,7 @@ class PeerSolver(nn.Module):
             back(ok.astype(np.float64)),
             Alternatives.none(pose),
             back(np.where((status == Status.CAMERA)[:, None, None], np.eye(3), cameras)),
+            back(np.zeros((batch, 4))),
         )
         return restore_leading(size, result)
 

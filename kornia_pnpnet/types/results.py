@@ -81,7 +81,7 @@ class PnPResult(NamedTuple):
         alternatives: other poses that explain the pairs nearly as well; no slots where the call did not ask for them.
         intrinsics: the camera matrices that the poses go with, with a last entry of 1, shape :math:`(B, 3, 3)`. With an
             unknown focal length they hold its estimate. The identity for a problem whose camera is impossible.
-        dist: the estimated distortion (k1, k2, 0, 0), shape :math:`(B, 4)`; ``None``: not estimated.
+        dist: the estimated distortion (k1, k2, 0, 0), shape :math:`(B, 4)`; 0 where it was not estimated.
     """
 
     rotation: Tensor
