@@ -441,7 +441,7 @@ class PnPNet(PretrainedMixin):
             torch.where(finite, refined.probability, 0.0),
             Alternatives.none(pose),
             cameras,
-            pose.translation.new_zeros(len(pose.translation), 4),
+            torch.zeros_like(pose.translation[:, :1]).expand(-1, 4),
         )
 
 
