@@ -12,7 +12,7 @@ from torch import Tensor
 from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.types import Noise, Pose
 
-__all__ = ["bearing_cameras", "bearings", "undistort"]
+__all__ = ["bearing_cameras", "bearings", "check_coefficients", "compose", "undistort"]
 
 # Numbers of coefficients of Kornia and OpenCV.
 _COEFFICIENTS = (4, 5, 8, 12, 14)

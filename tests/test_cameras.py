@@ -11,10 +11,11 @@ from kornia.geometry.calibration import distort_points
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch.nn import functional
 
-from kornia_pnpnet import Normalize, PnPNet, Pose, RobustWeightedLM, create_solver, solve_pnp
+from kornia_pnpnet import Guess, Normalize, PnPNet, Pose, RobustWeightedLM, create_solver, solve_pnp
 from kornia_pnpnet.cameras import bearing_cameras, bearings, undistort
+from kornia_pnpnet.core.symmetric import Symmetric2, Symmetric3
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
-from kornia_pnpnet.geometry import project, retract
+from kornia_pnpnet.geometry import normal_equations, project, retract
 from kornia_pnpnet.geometry import rotation_angle as angle
 from kornia_pnpnet.refine.step import pixel_precision
 from kornia_pnpnet.types import Noise
@@ -136,8 +137,6 @@ def test_the_noise_goes_through_the_lens(uniform):
         columns.append((both[0] - both[1]) / (2 * step))
     jacobian = torch.stack(columns, -1)
     cov = torch.tensor([[2.0, 0.5], [0.5, 1.0]], dtype=torch.float64)
-    from kornia_pnpnet.core.symmetric import Symmetric2
-
     one = torch.ones(2, 9, dtype=torch.float64)
     noise = Noise(one, one, Symmetric2.of(cov.expand(2, 9, 2, 2)))
     _, _, found = undistort(pixels, camera, dist, None, noise)
@@ -279,8 +278,6 @@ def test_the_jacobian_of_a_rig(uniform):
         return torch.cat(project(retract(pose, delta), corr).residual, 1)
 
     jacobian = torch.autograd.functional.jacobian(lambda d: residual(d).sum(0), zero).movedim(0, 1) / corr.focal
-    from kornia_pnpnet.geometry import normal_equations
-
     hessian, gradient = normal_equations(project(pose, corr), corr.weights)
     expected = jacobian.mT @ jacobian
     for i in range(6):
@@ -291,8 +288,6 @@ def test_the_jacobian_of_a_rig(uniform):
 
 def test_covariances_of_the_world_turn_with_each_camera(uniform):
     """A covariance that is a multiple of the identity is a sigma, in a rig, too."""
-    from kornia_pnpnet.core.symmetric import Symmetric3
-
     corr, pose = framed_rig(uniform)
     one = torch.ones_like(corr.weights)
     world = Symmetric3.of(0.04 * torch.eye(3, dtype=torch.float64).expand(2, 9, 3, 3))
@@ -306,7 +301,6 @@ def test_covariances_of_the_world_turn_with_each_camera(uniform):
 def test_gradcheck_to_the_pose_of_a_rig(uniform):
     corr, pose = framed_rig(uniform, noise=1.0)
     refine = RobustWeightedLM(3, kernel="cauchy", learnable=False)
-    from kornia_pnpnet import Guess
 
     def solve(world_points, img_points, rotation, translation):
         pairs = corr._replace(world_points=world_points, img_points=img_points, rig=Pose(rotation, translation))

@@ -19,11 +19,13 @@ from kornia_pnpnet import (
     pose_covariance,
 )
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
+from kornia_pnpnet.export import export_onnx
 from kornia_pnpnet.geometry import dolly_zoom, normal_equations, project, retract
 from kornia_pnpnet.geometry import rotation_angle as angle
 from kornia_pnpnet.init.focal import scale_focal
+from kornia_pnpnet.refine.prior import focal_loss, prior_in_frame, prior_loss
 from kornia_pnpnet.refine.radial import _distorted
-from kornia_pnpnet.types import FreeFocal
+from kornia_pnpnet.types import FreeFocal, PosePrior
 
 HALF = 500.0  # pixels
 
@@ -195,9 +197,6 @@ def test_gradcheck_to_the_focal_length(backward, kernel):
 
 def test_a_prior_of_the_pose_leaves_its_minimum():
     """Gradients of all terms of the cost vanish where the refinement ends, by the pose and by the focal length."""
-    from kornia_pnpnet.refine.prior import focal_loss, prior_in_frame, prior_loss
-    from kornia_pnpnet.types import PosePrior
-
     p = draw(8, batch=3, noise=1.0)
     corr, pose = framed(p)
     known = PosePrior(pose, torch.diag(torch.tensor([1e4] * 3 + [1e3] * 3)).double().expand(3, 6, 6))
@@ -290,8 +289,6 @@ def test_compiled_is_like_eager():
 
 
 def test_export_says_why_not(tmp_path):
-    from kornia_pnpnet.export import export_onnx
-
     with pytest.raises(BaseError, match="unknown focal length"):
         export_onnx(create_solver("pnpnet-set", focal="unknown"), tmp_path / "a.onnx")
 
