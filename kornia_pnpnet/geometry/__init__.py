@@ -2,7 +2,7 @@ r"""Projection, residual, Jacobian, retraction and alignment, on kornia's conver
 
 Convention: ``x_cam = R x_world + t``; the camera looks along +z; pixels are those of a camera with one focal length
 and the principal point 0 (see :mod:`kornia_pnpnet.normalize`). A point is *in front* when its depth is more than
-:data:`MIN_DEPTH_RATIO` of its distance, a test that does not depend on the unit of the world.
+``MIN_DEPTH_RATIO`` of its distance, a test that does not depend on the unit of the world.
 """
 
 from kornia_pnpnet.geometry.points import align, span_a_plane

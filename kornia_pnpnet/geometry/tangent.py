@@ -161,6 +161,6 @@ def rotation_angle(rotation_a: Tensor, rotation_b: Tensor) -> Tensor:
 
 
 def gate_pose(pose: Pose, ok: Tensor, finite: Tensor) -> Pose:
-    """:func:`~kornia_pnpnet.core.linalg.gate` for a pose; the identity fills."""
+    """``core.linalg.gate`` for a pose; the identity fills."""
     eye = torch.eye(3, dtype=pose.rotation.dtype, device=pose.rotation.device)
     return Pose(gate(pose.rotation, ok, finite, eye), gate(pose.translation, ok, finite, 0.0))

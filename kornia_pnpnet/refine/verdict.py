@@ -150,7 +150,7 @@ def probability(log_alarms: Tensor, sigma: Tensor, law: str = "sigmas") -> Tenso
     Few inliers in a small part of the space and of the image agree with many poses.
 
     Args:
-        log_alarms: :func:`log_false_alarms`, shape :math:`(B,)`.
+        log_alarms: :func:`~kornia_pnpnet.refine.inliers.log_false_alarms`, shape :math:`(B,)`.
         sigma: :func:`rotation_sigma`, shape :math:`(B,)`.
         law: one of :data:`LAWS`.
 
@@ -197,7 +197,7 @@ def rotation_sigma(projection: Projection, corr: Correspondences, judged: Judged
     Args:
         projection: :func:`~kornia_pnpnet.geometry.project` of the pose.
         corr: normalised correspondences with their noise.
-        judged: what :func:`judge` returned.
+        judged: what :func:`~kornia_pnpnet.refine.inliers.judge` returned.
 
     Returns:
         The square root of the trace of the rotation's covariance, float64, shape :math:`(B,)`.

@@ -201,7 +201,7 @@ def find_results(weights: str | Path) -> RunResults | None:
     """Find the results of the run that trained some weights.
 
     Args:
-        weights: what :meth:`~kornia_pnpnet.solver.PnPNet.from_pretrained` takes.
+        weights: what ``PnPNet.from_pretrained`` takes.
 
     Returns:
         The results, or ``None`` when there is no results file beside the weights or, for a folder named ``weights``,

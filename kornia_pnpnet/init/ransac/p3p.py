@@ -206,7 +206,7 @@ def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
         Four slots per problem, in float64 when an argument is, else in float32. A slot is valid when its pose is a
         solution with all three points in front of the camera. A double solution fills one slot. Invalid slots are
         finite. No slot is valid for points on a line, which have no pose or infinitely many, for NaN and infinity, and
-        where a point is further off the axis than :data:`~kornia_pnpnet.geometry.MIN_DEPTH_RATIO` allows.
+        where a point is further off the axis than ``kornia_pnpnet.geometry.MIN_DEPTH_RATIO`` allows.
 
     Raises:
         ShapeError: when a tensor has another shape, or the batches differ.
