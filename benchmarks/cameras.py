@@ -145,7 +145,7 @@ def opencv_focals(world: np.ndarray, img: np.ndarray, intrinsics: np.ndarray, _:
 
 
 def distances(problems: Problems) -> Tensor:
-    """Mean depths of the true pose, (B,)."""
+    """Median distances of the points from the true camera or rig, (B,)."""
     cam = problems.world_points @ problems.pose.rotation.mT + problems.pose.translation[:, None]
     return cam.norm(dim=-1).median(1).values
 
@@ -161,7 +161,7 @@ def errors(found: Found, problems: Problems) -> dict[str, Tensor]:
 
 
 def row(found: Found, problems: Problems, *, position: float = 0.05, focal: float = 0.05) -> dict[str, Any]:
-    """Success, its part that is ``ok``, poses that are ``ok`` and wrong, medians of the errors, and the time."""
+    """Success, the share of poses that are ``ok`` and wrong, medians of the errors, and the time."""
     error = errors(found, problems)
     right = (error["rotation_deg"] < 1.0) & (error["position"] < position) & (error["focal"] < focal)
     medians = {f"median_{name}": x.median().item() for name, x in error.items()}
@@ -203,6 +203,7 @@ def measure_cell(count: int, n: int = CELL) -> list[dict[str, Any]]:
 def measure_real(data: Path) -> list[dict[str, Any]]:
     """Raw matches of an image with one other image, the focal length withheld."""
     raw = np.load(data / "raw" / "by_image.npz")
+    solvers = {name: create_solver(name, focal="unknown") for name in OURS}
     enough = ((raw["error_px"] < 4.0) & raw["M"]).sum(1) >= 8
     rows = []
     for kind, name in ((0, "ratio test"), (1, "no ratio test")):
@@ -215,7 +216,7 @@ def measure_real(data: Path) -> list[dict[str, Any]]:
             world, img, intrinsics = (torch.from_numpy(x).double()[None] for x in parts)
             pose = Pose(*(torch.from_numpy(raw[key][i]).double()[None] for key in ("R", "t")))
             problems = Problems(world, img, intrinsics, pose, torch.ones(1, int(there.sum()), dtype=torch.bool))
-            found = {name: ours(solver, problems) for name, solver in _real_solvers().items()}
+            found = {name: ours(solver, problems) for name, solver in solvers.items()}
             found["pycolmap"] = one_by_one(colmap_focal, problems)
             found["opencv, 21 focals"] = one_by_one(opencv_focals, problems)
             for solver, answer in found.items():
@@ -239,15 +240,6 @@ def measure_real(data: Path) -> list[dict[str, Any]]:
                 }
             )
     return rows
-
-
-def _real_solvers() -> dict[str, nn.Module]:
-    if not _REAL:
-        _REAL.update({name: create_solver(name, focal="unknown") for name in OURS})
-    return _REAL
-
-
-_REAL: dict[str, nn.Module] = {}
 
 
 def poselib_rig(problems: Problems, cameras: int) -> Found:

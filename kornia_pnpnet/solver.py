@@ -174,9 +174,9 @@ class PnPNet(PretrainedMixin):
             img_points: pixels, shape :math:`(B, N, 2)`; or bearings, directions in the camera's frame of any length, as
                 those of :func:`~kornia_pnpnet.cameras.bearings`, shape :math:`(B, N, 3)`.
             intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or Kornia's cameras, whose
-                extrinsics are ignored; in a rig also one for each pair, :math:`(B, N, 3, 3)`. Bearings need none:
-                they take the focal length as pixels per radian for what is told in pixels (``img_sigma``, thresholds),
-                which without intrinsics is told in radians.
+                extrinsics are ignored; in a rig also one for each pair, :math:`(B, N, 3, 3)`. Bearings need none.
+                With intrinsics, the ``img_sigma`` and thresholds of bearings are in pixels, and a radian is as many
+                pixels as the focal length; without intrinsics they are in radians.
             weights: weight of each pair, the same for u and v, at least 0, shape :math:`(B, N)`; 1 when ``None``.
             mask: False where a pair is padding, bool, shape :math:`(B, N)`. The numbers of padding do not matter.
             init: a world-to-camera pose, :math:`(B, 3, 3)` and :math:`(B, 3)`. It competes with the poses of the
@@ -300,10 +300,6 @@ class PnPNet(PretrainedMixin):
     def _parts(self, first_stage_only: bool, always: bool, inputs: Inputs) -> tuple[_Begun, Tensor | None, PnPResult]:
         """Before the iterations, the iterations, and after them."""
         given, dist = inputs, None
-        if inputs.rig is not None:
-            begun = self._begin(1, always, inputs)
-            end = self.refine.iterate(begun.start, 0 if first_stage_only else None)
-            return begun, None, self._finish(begun, end, always)
         if self.focal == "unknown":
             inputs = with_nominal_focal(inputs, self.focal_sigma)
             if self.radial or not finds_focal(self.init):
@@ -350,7 +346,7 @@ class PnPNet(PretrainedMixin):
 
     def _searches(self, inputs: Inputs) -> bool:
         """Whether the effort is adaptive."""
-        if self.effort == "fixed" or not sees_values(inputs.world_points):
+        if self.effort == "fixed" or inputs.rig is not None or not sees_values(inputs.world_points):
             return False
         can = isinstance(self.init, SetInit) and self.refine.m > 0
         return self.effort == "adaptive" or (can and not self.training)

@@ -145,12 +145,19 @@ def undistort(camera: str, img_points: Tensor) -> tuple[Tensor, Tensor]:
         lens = pycolmap.Camera(model=model.upper(), width=int(width), height=int(height), params=parameters)
         if not lens.verify_params():
             raise ValueError(f"{lens.model_name} has the parameters {lens.params_info}")
-        plane = np.asarray(lens.cam_from_img(img_points.double().numpy()))
-        matrix = torch.tensor(lens.calibration_matrix())
+        matrix, pixels = _pinhole(lens, img_points.double().numpy())
     except (ValueError, RuntimeError, IndexError, AttributeError, TypeError) as error:
         reason = " ".join(str(error).split())
         raise ValueError(f"expected MODEL,width,height,params of COLMAP, got {camera!r}: {reason}") from error
-    return matrix, torch.tensor(plane) @ matrix[:2, :2].mT + matrix[:2, 2]
+    return torch.tensor(matrix), torch.tensor(pixels)
+
+
+def _pinhole(camera: Any, distorted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The pinhole camera (3, 3) like a ``pycolmap.Camera``, and its pixels (M, 2); NaN where there are none."""
+    intrinsics = camera.calibration_matrix()
+    plane = camera.cam_from_img(distorted)  # (M, 2), nan where the lens model has no inverse
+    with np.errstate(invalid="ignore"):  # infinite where a focal length is 0
+        return intrinsics, plane @ intrinsics[:2, :2].T + intrinsics[:2, 2]
 
 
 def _scene(path: Path, name: str, views: list[View], min_points: int, metric: bool) -> Scene:
@@ -193,11 +200,7 @@ def _colmap_view(image: Any, world_points: Mapping[int, np.ndarray]) -> View:
     distorted = np.array([observed[i].xy for i in first], dtype=np.float64).reshape(-1, 2)
     points = np.array([world_points[int(i)] for i in ids], dtype=np.float64).reshape(-1, 3)
     world_to_cam = image.cam_from_world().matrix()  # (3, 4)
-    intrinsics = camera.calibration_matrix()
-
-    plane = camera.cam_from_img(distorted)  # (M, 2), nan where the lens model has no inverse
-    with np.errstate(invalid="ignore"):  # infinite where a focal length is 0
-        pixels = plane @ intrinsics[:2, :2].T + intrinsics[:2, 2]
+    intrinsics, pixels = _pinhole(camera, distorted)
     depth = points @ world_to_cam[2, :3] + world_to_cam[2, 3]
     # `~(depth <= 0)`, so that a pose that is not finite reaches the check in View.
     seen = np.isfinite(pixels).all(axis=1) & ~(depth <= 0)

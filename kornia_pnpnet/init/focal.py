@@ -25,6 +25,8 @@ __all__ = [
 
 # Half widths of the image: the focal lengths of fields of view from 118 to 14 degrees, which are searched.
 _SHORTEST, _LONGEST = 0.6, 8.0
+# Half of this range in logarithms.
+_WIDTH = 0.5 * math.log(_LONGEST / _SHORTEST)
 # Half the width of a square over the median distance, in the maximum norm, of a point in it from its middle.
 _HALF_WIDTH = math.sqrt(2.0)
 # Standard deviations of an expected focal length that are searched on either side.
@@ -64,11 +66,11 @@ def with_nominal_focal(inputs: Inputs, sigma: float | None) -> Inputs:
             half = (_HALF_WIDTH * away.nanmedian(1).values).maximum(principal_point[:, 0].abs().amax(-1))
             half = torch.where(half.isfinite() & (half > 0), half, 1.0)
         nominal = math.sqrt(_SHORTEST * _LONGEST) * half
-        width = torch.full_like(nominal, 0.5 * math.log(_LONGEST / _SHORTEST))
+        width = torch.full_like(nominal, _WIDTH)
         known = FreeFocal(nominal, torch.zeros_like(nominal), width, torch.ones_like(nominal))
     else:
         nominal = given.detach()
-        width = torch.full_like(nominal, min(_SEARCHED * sigma, 0.5 * math.log(_LONGEST / _SHORTEST)))
+        width = torch.full_like(nominal, min(_SEARCHED * sigma, _WIDTH))
         known = FreeFocal(given, torch.full_like(nominal, sigma**-2), width, torch.ones_like(nominal))
     return inputs._replace(intrinsics=scale_focal(camera, nominal / given), free_focal=known)
 

@@ -379,8 +379,8 @@ class RobustWeightedLM(Configured):
         """One iteration. With ``reject_worse``, a problem whose cost would rise keeps its pose."""
         damping = damping * state.factor if self.reject_worse else damping
         here = pairs.zoomed(state.zoom)
-        pose, solved, change = self._iterate(here, state.pose, step, damping, shape, area)
-        zoom = None if state.zoom is None or change is None else state.zoom + change
+        moved = self._iterate(here, state.pose, step, damping, shape, area)
+        pose, solved, zoom = moved.pose, moved.solved, moved.zoom_after(state.zoom)
         if not self.reject_worse or area is not None:  # the cost does not know the corrected noise
             return State(pose, solved, state.factor, zoom)
         at = (pose, pairs.zoomed(zoom)), (state.pose, here)

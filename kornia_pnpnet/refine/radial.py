@@ -97,13 +97,13 @@ def estimate_radial(corr: Correspondences, pose: Pose, terms: int) -> Radial:
 
 
 def _scale(sq_residual: Tensor, focal: Tensor, limit: float) -> Tensor:
-    """Scale of the kernel in pixels, (B, 1): the limit, or what the residuals within it show where this is less."""
-    wide = (limit * focal).clamp(min=0.0)
+    """Scale of the kernel in pixels, (B, 1): the limit, or what the residuals around it show where this is more."""
+    wide = limit * focal
     ascending = torch.where(sq_residual <= (_KERNEL_SCALE * wide).square(), sq_residual, torch.inf).sort(1).values
     count = ascending.isfinite().sum(1, keepdim=True)
     middle = ((count + MIN_PAIRS + 1) // 2).minimum(count - 1).clamp(min=0)
     sigma = (ascending.gather(1, middle) / _MEDIAN).sqrt().nan_to_num(posinf=0.0)
-    return (_KERNEL_SCALE * sigma).maximum(wide).clamp(min=0.0).maximum(_LEAST * focal)
+    return (_KERNEL_SCALE * sigma).maximum(wide).maximum(_LEAST * focal)
 
 
 def _distorted(projection: Projection, corr: Correspondences, coefficients: Tensor) -> tuple[Projection, RadialTerms]:

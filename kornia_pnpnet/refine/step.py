@@ -62,6 +62,10 @@ class LMStep(NamedTuple):
     solved: Tensor
     zoom: Tensor | None = None
 
+    def zoom_after(self, before: Tensor | None) -> Tensor | None:
+        """The logarithm of the focal length after the step, from that before; ``None``: the focal length is known."""
+        return None if before is None or self.zoom is None else before + self.zoom
+
 
 def iterate(
     pairs: Correspondences,

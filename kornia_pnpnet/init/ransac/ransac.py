@@ -207,7 +207,7 @@ class RANSAC(Configured):
                 wide = thresholds.img.maximum(_on_grid(detached))
                 stages = [thresholds._replace(img=wide), thresholds]
             if detached.rig is not None:
-                plan = plan._replace(minimal=P3PRig(0 if is_central(detached.rig) else P3PRig().steps))
+                plan = plan._replace(minimal=P3PRig(0) if is_central(detached.rig) else P3PRig())
             found = Search(plan, detached, stages[0], _trusted(detached.confidence)).run(given)
         pose, zoom, judged = self._refine(corr, found, stages)
         with torch.no_grad():
@@ -244,7 +244,7 @@ class RANSAC(Configured):
                 for _ in range(_FINAL_STEPS):
                     weights = inliers * _robust(judge(projection, part, limits), inliers)
                     step = least_squares(part, pose, projection, weights)
-                    pose, zoom = step.pose, None if zoom is None or step.zoom is None else zoom + step.zoom
+                    pose, zoom = step.pose, step.zoom_after(zoom)
                     part = base.zoomed(zoom)
                     projection = project(pose, part)
             with torch.no_grad():

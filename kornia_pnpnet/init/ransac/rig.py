@@ -12,13 +12,10 @@ from kornia_pnpnet.core.performance import problems_last
 from kornia_pnpnet.core.trees import map_tensors, take
 from kornia_pnpnet.geometry import project
 from kornia_pnpnet.init.ransac.p3p import p3p
-from kornia_pnpnet.refine import lm_step
+from kornia_pnpnet.init.ransac.search import least_squares
 from kornia_pnpnet.types import Correspondences, Hypotheses, Pose
 
 __all__ = ["P3PRig", "is_central"]
-
-# Relative damping of Newton's steps, next to none.
-_DAMPING = 1e-6
 
 
 class P3PRig(Configured):
@@ -68,7 +65,10 @@ class P3PRig(Configured):
         found = map_tensors(lambda x: x.transpose(0, 1)[slot, at], solved.pose)
         pose = Pose(back @ found.rotation, (back @ found.translation[..., None])[..., 0] + centre[at])
         if self.steps:
-            pose = _newton(problems_last(take(corr, at)), pose, self.steps)
+            pairs = problems_last(take(corr, at))
+            pairs = pairs._replace(weights=torch.ones_like(pairs.weights))  # three pairs have exact solutions
+            for _ in range(self.steps):
+                pose = least_squares(pairs, pose, project(pose, pairs), pairs.weights).pose
         finite = pose.rotation.isfinite().all(-1).all(-1) & pose.translation.isfinite().all(-1)
         slot, at, pose = slot[finite], at[finite], map_tensors(lambda x: x[finite], pose)
         rotation = torch.eye(3, dtype=rays.dtype, device=rays.device).repeat(4, batch, 1, 1)
@@ -80,12 +80,3 @@ class P3PRig(Configured):
 def is_central(rig: Pose) -> bool:
     """Whether all centres are the rig's origin, as those of bearings."""
     return not bool(rig.translation.any())
-
-
-def _newton(corr: Correspondences, pose: Pose, steps: int) -> Pose:
-    """Steps of least squares with equal weights on samples of three pairs, which have exact solutions."""
-    one, damping = corr.weights.new_tensor((1.0, _DAMPING))
-    ones = torch.ones_like(corr.weights)
-    for _ in range(steps):
-        pose = lm_step(corr, pose, project(pose, corr), ones, one, damping).pose
-    return pose

@@ -313,8 +313,7 @@ class Search:
         projection = project(start, corr)
         wide = map_tensors(lambda x: limit * x, thresholds)
         moved = least_squares(corr, start, projection, judge(projection, corr, wide).weights)
-        pose, zoom = moved.pose, None if zoom is None or moved.zoom is None else zoom + moved.zoom
-        new_matrix = take(_matrix(pose, zoom), slice(len(problems)))
+        new_matrix = take(_matrix(moved.pose, moved.zoom_after(zoom)), slice(len(problems)))
         packed = scene.pack(new_matrix[..., :3].permute(1, 2, 0)[..., None], new_matrix[..., 3].mT[..., None])
         new_loss = scene.losses(packed, self.plan.scorer)[:, 0]
         better = (new_loss < loss) & loss.isfinite()  # an invalid pose stays invalid
