@@ -17,12 +17,13 @@ from kornia_pnpnet.core.files import atomic_open
 from kornia_pnpnet.core.inlining import INLINE
 from kornia_pnpnet.core.performance import package_options
 from kornia_pnpnet.data import SyntheticProblems
-from kornia_pnpnet.init import RANSAC, MLPInit
+from kornia_pnpnet.init import RANSAC, MLPInit, SetInit
 from kornia_pnpnet.solver import PnPNet
 
 __all__ = [
     "INPUTS",
     "OUTPUTS",
+    "ExportedCamera",
     "ExportedResult",
     "PackagedSolver",
     "export_onnx",
@@ -50,9 +51,29 @@ class ExportedResult(NamedTuple):
     ok: Tensor
 
 
+class ExportedCamera(NamedTuple):
+    """What an exported solver returns that estimates the focal length.
+
+    Attributes:
+        rotation: See ExportedResult.
+        translation: See ExportedResult.
+        pair_weights: See ExportedResult.
+        cost: See ExportedResult.
+        ok: See ExportedResult.
+        camera: the result's ``intrinsics``, shape :math:`(B, 3, 3)`.
+    """
+
+    rotation: Tensor
+    translation: Tensor
+    pair_weights: Tensor
+    cost: Tensor
+    ok: Tensor
+    camera: Tensor
+
+
 #: Names of the inputs of an exported solver, in this order, all float32.
 INPUTS = ("world_points", "img_points", "intrinsics", "weights")
-#: Names of the outputs: the fields of :class:`ExportedResult`.
+#: Names of the outputs with known focal lengths: the fields of :class:`ExportedResult`.
 OUTPUTS = ExportedResult._fields
 #: Upper bounds of the dynamic dimensions: torch.export simplifies its guards with finite ranges.
 _MAX_BATCH = 2**20
@@ -72,7 +93,8 @@ class _Graph(nn.Module):
         self, world_points: Tensor, img_points: Tensor, intrinsics: Tensor, weights: Tensor
     ) -> tuple[Tensor, ...]:
         result = self.solver(world_points, img_points, intrinsics, weights)
-        return result.rotation, result.translation, result.weights, result.cost, result.ok
+        outputs = result.rotation, result.translation, result.weights, result.cost, result.ok
+        return outputs if self.solver.focal == "known" else (*outputs, result.intrinsics)
 
 
 def export_program(solver: PnPNet, n: int | None = None, *, batch: int | None = None) -> torch.export.ExportedProgram:
@@ -86,7 +108,8 @@ def export_program(solver: PnPNet, n: int | None = None, *, batch: int | None = 
         batch: number of problems of each call, which a compiler can specialise for; ``None``: any number.
 
     Returns:
-        A program that maps :data:`INPUTS` to :data:`OUTPUTS`. The inputs are world points :math:`(B, N, 3)`, pixels
+        A program that maps :data:`INPUTS` to the fields of :class:`ExportedResult`, with an unknown focal length to
+        those of :class:`ExportedCamera`. The inputs are world points :math:`(B, N, 3)`, pixels
         :math:`(B, N, 2)`, camera matrices :math:`(B, 3, 3)` and weights :math:`(B, N)`, 0 for padding.
 
     Raises:
@@ -102,8 +125,11 @@ def export_program(solver: PnPNet, n: int | None = None, *, batch: int | None = 
     """
     if isinstance(solver.init, RANSAC):
         raise ValueCheckError("RANSAC cannot be exported: the number of its samples depends on the data.")
-    if solver.focal == "unknown":
-        raise ValueCheckError("With an unknown focal length nothing can be exported: the search depends on the data.")
+    if solver.focal == "unknown" and (solver.radial or not isinstance(solver.init, SetInit)):
+        raise ValueCheckError(
+            "With an unknown focal length only a solver with SetInit and without radial distortion can be exported:"
+            " others search, and the search depends on the data."
+        )
     if n is not None:
         check_whole(3, n=n)
     if batch is not None:
@@ -201,7 +227,7 @@ class PackagedSolver:
 
     def __call__(
         self, world_points: Tensor, img_points: Tensor, intrinsics: Tensor, weights: Tensor | None = None
-    ) -> ExportedResult:
+    ) -> ExportedResult | ExportedCamera:
         r"""Solve a batch of problems.
 
         Args:
@@ -224,7 +250,7 @@ class PackagedSolver:
         check_shapes(dict(zip(INPUTS, zip(inputs, shapes, strict=True), strict=True)))
         # Compiled code does not look at dtypes and strides, and may write the next result over this one.
         results = self._run([x.to("cpu", torch.float32).contiguous() for x in inputs])
-        return ExportedResult(*[x.clone() for x in results])
+        return (ExportedResult if len(results) == len(OUTPUTS) else ExportedCamera)(*[x.clone() for x in results])
 
 
 def load_package(path: str | Path) -> PackagedSolver:
@@ -270,7 +296,7 @@ def export_onnx(solver: PnPNet, path: str | Path, n: int | None = None, *, batch
         raise ImportError("ONNX needs more packages: pip install 'kornia_pnpnet[onnx]'") from error
     path = Path(path)
     program = export_program(solver, n, batch=batch)
-    inputs, outputs = list(INPUTS), list(OUTPUTS)
+    inputs, outputs = list(INPUTS), [*(OUTPUTS if solver.focal == "known" else ExportedCamera._fields)]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # the exporter warns about its own code
         model = torch.onnx.export(

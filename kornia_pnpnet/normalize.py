@@ -18,7 +18,7 @@ from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.performance import ascending_order, ranked
 from kornia_pnpnet.core.symmetric import are_semi_definite
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
-from kornia_pnpnet.geometry import MIN_DEPTH_RATIO, span_a_plane
+from kornia_pnpnet.geometry import MIN_DEPTH_RATIO, gate_pose, span_a_plane
 from kornia_pnpnet.types import LEAST_NOISE, MIN_PAIRS, Correspondences, Guess, Noise, Pose, Status
 
 __all__ = ["F_CONST", "VIEWS", "Frame", "Normalize"]
@@ -344,6 +344,14 @@ class Normalize(Configured):
         rotation, translation = pose
         offset = (rotation * frame.centroid[:, None]).sum(-1)
         return Pose(rotation, translation / frame.scale[:, None] - offset)
+
+    def start_pose(self, init: Pose | None, frame: Frame) -> Pose:
+        """A caller's pose in the frame of the correspondences; the identity for ``None`` and where it is not finite."""
+        eye = torch.eye(3, dtype=frame.scale.dtype, device=frame.scale.device).expand(len(frame.scale), 3, 3)
+        init = Pose(eye, torch.zeros_like(frame.centroid)) if init is None else init
+        limit = torch.finfo(eye.dtype).max ** 0.25  # as for points: below it, squares of squares are finite
+        usable = frame.valid & (torch.cat((init.rotation.flatten(1), init.translation), 1).abs().amax(-1) < limit)
+        return self.apply_to_pose(gate_pose(init, usable, usable), frame)
 
     def apply_to_pose(self, pose: Pose, frame: Frame) -> Pose:
         r"""Express a pose of the original world in the normalised one, the inverse of :meth:`undo`.

@@ -13,13 +13,15 @@ from torch import Tensor, nn
 from kornia_pnpnet.core.checks import check_positive, check_whole
 from kornia_pnpnet.core.linalg import bound_gradient, gate
 from kornia_pnpnet.core.performance import Compiled, in_full_precision, sees_values
-from kornia_pnpnet.core.trees import map_tensors, take
+from kornia_pnpnet.core.trees import map_tensors, put, take
 from kornia_pnpnet.geometry import gate_pose
 from kornia_pnpnet.init import RANSAC, MLPInit, SetInit
 from kornia_pnpnet.init.alternatives import doubt_mirrored, find_alternatives, is_seen
 from kornia_pnpnet.init.focal import (
     finds_focal,
     free_focal_in_frame,
+    guesses_focal,
+    is_doubtful,
     scale_focal,
     with_found_focal,
     with_nominal_focal,
@@ -89,9 +91,9 @@ class PnPNet(PretrainedMixin):
             refined; after seven tenths of the iterations the best one goes on alone.
         focal: ``"known"``, or ``"unknown"``: the focal length is estimated with the pose and returned in the result's
             ``intrinsics``. Those of the call then give the principal point, the aspect ratio and the skew relative to
-            the focal length. A first estimate comes from P3P at focal lengths of fields of view from 14 to 118 degrees;
-            the refinement has the logarithm of the focal length as a seventh parameter. Where the pairs leave it open
-            by more than 15 % (a plane seen from the front, little depth) the problem is not ``ok``.
+            the focal length. The logarithm of the focal length is a seventh parameter of the refinement. Its start is
+            nominal with ``SetInit``; where that does not suffice, and with other initialisers, P3P at twelve focal
+            lengths finds one. Where the pairs leave it open by more than 15 % the problem is not ``ok``.
         focal_sigma: standard deviation of the logarithm of the focal length in the intrinsics of a call, for example
             0.1 for one that is known to about 10 %; ``None``: the focal length in the intrinsics is ignored.
         radial: number of coefficients of radial distortion, 0 to 2, that are estimated with an unknown focal length,
@@ -299,10 +301,11 @@ class PnPNet(PretrainedMixin):
 
     def _parts(self, first_stage_only: bool, always: bool, inputs: Inputs) -> tuple[_Begun, Tensor | None, PnPResult]:
         """Before the iterations, the iterations, and after them."""
-        given, dist = inputs, None
-        if self.focal == "unknown":
+        given, dist, guessed = inputs, None, False
+        if self.focal == "unknown" and inputs.free_focal is None:
             inputs = with_nominal_focal(inputs, self.focal_sigma)
-            if self.radial or not finds_focal(self.init):
+            guessed = not self.radial and guesses_focal(self.init, inputs)
+            if not guessed and (self.radial or not finds_focal(self.init)):
                 inputs, dist = with_found_focal(inputs, self.radial)
         views = 1 if first_stage_only or self.refine.m == 0 else self.views
         searches = not first_stage_only and self._searches(inputs)
@@ -322,10 +325,21 @@ class PnPNet(PretrainedMixin):
             pose = self.normalize.apply_to_pose(result.pose, frame)
             corr = start.corr.seen_with(end.zoom)
             result = doubt_mirrored(self.refine, corr, guess, pose, result, always)
+            if guessed:
+                result = self._with_searched_focal(always, inputs, result)
             if inputs.noise is None:
                 noise = self.normalize.undo_guess(guess, frame).noise
                 result = self._with_more_noise(always, given, inputs, noise, result)
         return begun, end.zoom, result
+
+    def _with_searched_focal(self, always: bool, inputs: Inputs, result: PnPResult) -> PnPResult:
+        """Solve once more, with a searched focal length, the problems whose solution is not convincing."""
+        rows = is_doubtful(result).nonzero()[:, 0]
+        if not len(rows):
+            return result
+        solved = self._parts(False, always, with_found_focal(take(inputs, rows))[0])[2]
+        better = solved.ok | ~result.ok[rows]
+        return put(result, rows[better], take(solved, better))
 
     def _with_more_noise(
         self, always: bool, given: Inputs, inputs: Inputs, noise: Noise | None, result: PnPResult
@@ -342,7 +356,7 @@ class PnPNet(PretrainedMixin):
         shown = Noise(sigma[rows], torch.zeros_like(sigma[rows]))
         again = take(given, rows)._replace(noise=shown)
         solved = self._parts(False, always, again)[2]
-        return map_tensors(lambda x, y: x.index_copy(0, rows, y), result, solved)
+        return put(result, rows, solved)
 
     def _searches(self, inputs: Inputs) -> bool:
         """Whether the effort is adaptive."""
@@ -371,7 +385,7 @@ class PnPNet(PretrainedMixin):
             frame = frame._replace(status=torch.where(usable, frame.status, Status.NOT_FINITE.value))
         if free_focal is not None:
             corr = corr._replace(free_focal=free_focal_in_frame(free_focal, frame))
-        given = self._given(init, world_points, frame) if self.init is None or init is not None else None
+        given = self.normalize.start_pose(init, frame) if self.init is None or init is not None else None
         options = {"search_follows": True} if search_follows and isinstance(self.init, SetInit) else {}
         if self.init is None:
             assert given is not None
@@ -395,16 +409,6 @@ class PnPNet(PretrainedMixin):
         if corr.near is not None and not getattr(self.init, "weighs_far_pairs", False):
             guess = guess._replace(weights=guess.weights * torch.where(is_seen(guess, corr), 1.0, corr.near))
         return corr, frame, guess
-
-    def _given(self, init: Pose | None, world_points: Tensor, frame: Frame) -> Pose:
-        """A pose given by the caller (or the identity) in the normalised frame."""
-        batch = world_points.shape[0]
-        if init is None:
-            eye = torch.eye(3, dtype=world_points.dtype, device=world_points.device).expand(batch, 3, 3)
-            init = Pose(eye, world_points.new_zeros(batch, 3))
-        limit = torch.finfo(world_points.dtype).max ** 0.25  # as for points: below it, squares of squares are finite
-        usable = frame.valid & (torch.cat((init.rotation.flatten(1), init.translation), 1).abs().amax(-1) < limit)
-        return self.normalize.apply_to_pose(gate_pose(init, usable, usable), frame)
 
     def _result(self, begun: _Begun, end: LMStep, always: bool) -> PnPResult:
         """Everything after the last iteration."""

@@ -19,7 +19,7 @@ from kornia_pnpnet import (
     pose_covariance,
 )
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
-from kornia_pnpnet.export import export_onnx
+from kornia_pnpnet.export import export_program
 from kornia_pnpnet.geometry import dolly_zoom, normal_equations, project, retract
 from kornia_pnpnet.geometry import rotation_angle as angle
 from kornia_pnpnet.init.focal import scale_focal
@@ -288,9 +288,24 @@ def test_compiled_is_like_eager():
     torch.testing.assert_close(found.translation, expected.translation, rtol=1e-6, atol=1e-6)
 
 
-def test_export_says_why_not(tmp_path):
-    with pytest.raises(BaseError, match="unknown focal length"):
-        export_onnx(create_solver("pnpnet-set", focal="unknown"), tmp_path / "a.onnx")
+@pytest.mark.parametrize(("name", "radial"), [("p3p-ransac", 0), ("epnp-lm", 0), ("pnpnet-set", 1)])
+def test_a_search_cannot_be_exported(name, radial):
+    with pytest.raises(BaseError, match="depends on the data"):
+        export_program(create_solver(name, focal="unknown", radial=radial))
+
+
+def test_the_search_helps_where_the_network_does_not_suffice():
+    """With the fixed effort a network guesses with one nominal focal length, otherwise doubtful ones are searched."""
+    p = draw(12, wrong=6, noise=1.0, batch=256)
+    right = {}
+    for effort in ("fixed", "adaptive"):
+        result = create_solver("pnpnet-set", focal="unknown", effort=effort)(*p[:2], withheld(p))
+        focal, shift, turn = errors(result, p)
+        right[effort] = (focal < 0.05) & (shift < 0.05) & (turn < math.radians(1.0))
+        assert (result.ok & ~right[effort]).double().mean() < 0.03
+    assert right["fixed"].double().mean() > 0.7
+    assert right["adaptive"].double().mean() > 0.96
+    assert not (right["fixed"] & ~right["adaptive"]).any()
 
 
 @pytest.mark.parametrize("name", ["pnpnet-set", "p3p-ransac", "reppnp-lm"])

@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
     target = Path(arguments.file)
     if target.suffix not in (".onnx", ".pt2"):
         raise ValueError(f"'{target}': the file's name must end in .onnx (ONNX) or .pt2 (compiled ahead of time)")
-    from kornia_pnpnet.export import INPUTS, OUTPUTS, export_onnx, export_package
+    from kornia_pnpnet.export import INPUTS, OUTPUTS, ExportedCamera, export_onnx, export_package
     from kornia_pnpnet.solver import PnPNet
 
     solver = load_solver_without_truth(arguments.solver)
@@ -49,5 +49,6 @@ def run(arguments: argparse.Namespace) -> int:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the exporter about itself
         path = export(solver, target, arguments.n, batch=arguments.batch)
-    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, {', '.join(INPUTS)} -> {', '.join(OUTPUTS)}")
+    outputs = OUTPUTS if solver.focal == "known" else ExportedCamera._fields
+    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, {', '.join(INPUTS)} -> {', '.join(outputs)}")
     return 0

@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 from torch import Tensor
 
-__all__ = ["iter_tensors", "map_tensors", "take"]
+__all__ = ["iter_tensors", "map_tensors", "put", "take"]
 
 _T = TypeVar("_T")
 
@@ -39,6 +39,11 @@ def map_tensors(function: Callable[..., Any], tree: _T, *others: _T) -> _T:
 def take(tree: _T, at: Tensor | slice) -> _T:
     """Select problems from every tensor of a tree that has a batch."""
     return map_tensors(lambda x: x[at] if x.ndim else x, tree)
+
+
+def put(tree: _T, at: Tensor, rows: _T) -> _T:
+    """Replace the problems at some indices in every tensor of a tree."""
+    return map_tensors(lambda x, new: x.index_copy(0, at, new), tree, rows)
 
 
 def iter_tensors(tree: Any) -> Iterator[Tensor]:
