@@ -3,27 +3,29 @@ r"""Minimal solver of three pairs that several cameras of a rig see, or one came
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 from torch.nn import functional
 
 from kornia_pnpnet.cameras import bearing_cameras
 from kornia_pnpnet.core.checks import check_whole
 from kornia_pnpnet.core.configured import Configured
-from kornia_pnpnet.core.performance import problems_last
-from kornia_pnpnet.core.trees import map_tensors, take
-from kornia_pnpnet.geometry import project
+from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.init.ransac.p3p import p3p
-from kornia_pnpnet.init.ransac.search import least_squares
 from kornia_pnpnet.types import Correspondences, Hypotheses, Pose
 
 __all__ = ["P3PRig", "is_central"]
+
+# Relative error of the squared sides of a triangle up to which a pose is a solution.
+_EXACT = 1e-3
 
 
 class P3PRig(Configured):
     r"""Minimal solver of three pairs of a rig: the central approximation, then Newton's method on the exact equations.
 
     The central approximation lets all rays meet at the mean of the cameras' centres; :func:`p3p` solves it. From its
-    up to four poses Newton's method finds poses of the exact problem, of which there are up to eight (D. Nistér,
-    "A minimal solution to the generalised 3-point pose problem", CVPR 2004).
+    up to four poses Newton's method finds the distances along the rays at which the points have the distances of the
+    world from each other. The exact problem has up to eight poses (D. Nistér, "A minimal solution to the generalised
+    3-point pose problem", CVPR 2004).
 
     Args:
         steps: number of Newton's steps; 0 where all centres coincide.
@@ -53,7 +55,7 @@ class P3PRig(Configured):
         assert corr.rig is not None
         batch = len(corr.weights)
         rays = functional.normalize(corr.places, dim=-1)  # (B, 3, 3) in the frame of the rig
-        centre = -(corr.rig.rotation * corr.rig.translation[..., None]).sum(-2).mean(1)  # (B, 3)
+        centres = -(corr.rig.rotation * corr.rig.translation[..., None]).sum(-2)  # (B, 3, 3)
         turn, _ = bearing_cameras(rays.sum(1, keepdim=True))
         turn = turn[:, 0]
         seen = rays @ turn.mT
@@ -63,18 +65,66 @@ class P3PRig(Configured):
         slot, at = solved.valid.mT.nonzero(as_tuple=True)  # the batch stays last in memory
         back = turn[at].mT
         found = map_tensors(lambda x: x.transpose(0, 1)[slot, at], solved.pose)
-        pose = Pose(back @ found.rotation, (back @ found.translation[..., None])[..., 0] + centre[at])
         if self.steps:
-            pairs = problems_last(take(corr, at))
-            pairs = pairs._replace(weights=torch.ones_like(pairs.weights))  # three pairs have exact solutions
-            for _ in range(self.steps):
-                pose = least_squares(pairs, pose, project(pose, pairs), pairs.weights).pose
-        finite = pose.rotation.isfinite().all(-1).all(-1) & pose.translation.isfinite().all(-1)
+            world = corr.world_points[at]
+            cam = world @ found.rotation.mT + found.translation[:, None]
+            # From the points of the central approximation to those nearest on the rays.
+            away = ((centres.mean(1, keepdim=True) - centres) * rays).sum(-1)
+            ranges = (cam * seen[at]).sum(-1) + away[at]
+            # Problems last, before them pairs and coordinates: (3, 3, M).
+            world, at_rays, at_centres = (x.permute(1, 2, 0).contiguous() for x in (world, rays[at], centres[at]))
+            pose, finite = _newton(world, at_rays, at_centres, ranges.mT.contiguous(), self.steps)
+        else:
+            pose = Pose(back @ found.rotation, (back @ found.translation[..., None])[..., 0])
+            finite = torch.ones_like(at, dtype=torch.bool)
         slot, at, pose = slot[finite], at[finite], map_tensors(lambda x: x[finite], pose)
         rotation = torch.eye(3, dtype=rays.dtype, device=rays.device).repeat(4, batch, 1, 1)
         translation, valid = rays.new_zeros(4, batch, 3), torch.zeros_like(solved.valid.mT)
         rotation[slot, at], translation[slot, at], valid[slot, at] = *pose, True
         return Hypotheses(Pose(rotation.transpose(0, 1), translation.transpose(0, 1)), valid.mT)
+
+
+def _newton(world_points: Tensor, rays: Tensor, centres: Tensor, ranges: Tensor, steps: int) -> tuple[Pose, Tensor]:
+    r"""Find the distances along three rays at which the points have the distances of the world from each other.
+
+    Three equations :math:`\|c_i + d_i r_i - c_j - d_j r_j\|^2 = \|x_i - x_j\|^2` for three distances.
+
+    Args:
+        world_points: of each pair, :math:`(3, 3, M)`, like ``rays`` and ``centres``.
+        rays: of length 1.
+        centres: where the rays start.
+        ranges: first distances, :math:`(3, M)`.
+        steps: number of steps.
+
+    Returns:
+        :math:`M` poses, and whether they are exact and all distances positive.
+    """
+    first, second = (0, 0, 1), (1, 2, 2)
+    sides = (world_points[list(first)] - world_points[list(second)]).square().sum(1)  # (3, M)
+
+    def edges() -> tuple[Tensor, Tensor]:
+        points = centres + ranges[:, None] * rays
+        edge = points[list(first)] - points[list(second)]  # (3, 3, M)
+        return edge, 0.5 * (sides - edge.square().sum(1))
+
+    for _ in range(steps):
+        edge, (g, h, k) = edges()
+        # The Jacobian is [[a, -b, 0], [c, 0, -d], [0, e, -f]]: Cramer's rule.
+        (a, c, e), (b, d, f) = ((edge * rays[list(at)]).sum(1) for at in (first, second))
+        both = d * k - f * h
+        steps_by_det = torch.stack((g * d * e + b * both, a * both + g * c * f, b * c * k + e * (g * c - a * h)))
+        ranges = ranges + steps_by_det / (a * d * e - b * c * f)
+    edge, gap = edges()
+    exact = (gap.abs() < _EXACT * sides).all(0) & (ranges > 0).all(0)
+    # The rotation maps one triple of edges to the other: two sides of the triangle and its normal.
+    cam = [-edge[0], -edge[1], torch.linalg.cross(edge[0], edge[1], dim=0)]
+    world = [world_points[1] - world_points[0], world_points[2] - world_points[0]]
+    normal = torch.linalg.cross(*world, dim=0)
+    dual = torch.linalg.cross(world[1], normal, dim=0), torch.linalg.cross(normal, world[0], dim=0), normal
+    rotation = sum(x[:, None] * (y / normal.square().sum(0)) for x, y in zip(cam, dual, strict=True))
+    translation = centres[0] + ranges[0] * rays[0] - (rotation * world_points[0]).sum(1)
+    pose = Pose(rotation.movedim(-1, 0), translation.mT)
+    return pose, exact & translation.isfinite().all(0)
 
 
 def is_central(rig: Pose) -> bool:
