@@ -220,8 +220,8 @@ def check_cameras(inputs: Inputs, focal: str, *, distorted: bool, alternatives: 
     rig = inputs.rig is not None
     if focal == "unknown" and (rig or distorted):
         raise ValueCheckError("focal='unknown' takes pixels of one camera without dist and fisheye.")
-    if rig and (alternatives or init is None):
-        raise ValueCheckError("A rig or bearings have no alternatives, and need a solver with an initialiser.")
+    if rig and (alternatives or (init is None and inputs.init is None)):
+        raise ValueCheckError("A rig or bearings have no alternatives, and need an initialiser or `init`.")
 
 
 def _looking_along(inputs: Inputs) -> Inputs:

@@ -258,10 +258,10 @@ def _cross_entropy(weights: Tensor, inliers: Tensor) -> Tensor:
 
 def _negative_log_likelihood(noise: Noise, problems: Problems) -> Tensor:
     """Negative log-likelihood of the residuals at the true pose up to a constant, mean over the inliers, (B,)."""
-    cam = transform(problems.pose, problems.world_points)
+    cam = problems.true_cam_points
     z = torch.where(problems.inliers, cam[..., 2], 1.0)
-    focal = problems.intrinsics.diagonal(dim1=1, dim2=2)[:, None, :2]
-    centre = problems.intrinsics[:, None, :2, 2]
+    focal = problems.pair_intrinsics.diagonal(dim1=-2, dim2=-1)[..., :2]
+    centre = problems.pair_intrinsics[..., :2, 2]
     plane = cam[..., :2] / z[..., None]
     sq_residual = (focal * plane + centre - problems.img_points).square().sum(-1)
     moved = focal.mean(-1) * noise.world / z

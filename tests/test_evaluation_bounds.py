@@ -10,10 +10,10 @@ from kornia.core.exceptions import BaseError
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from strategies import SOLVERS, batches, check, many, poses
 
-from kornia_pnpnet import Pose, pose_errors, success
-from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet import Pose, create_solver, pose_errors, success
+from kornia_pnpnet.data import CameraProblems, OutlierMix, SyntheticProblems
 from kornia_pnpnet.evaluation.bounds import KnownInliers, KnownInliersAndNoise
-from kornia_pnpnet.evaluation.comparison import SeesTruth
+from kornia_pnpnet.evaluation.comparison import EvaluationData, SeesTruth, evaluate
 from kornia_pnpnet.types import Problems
 
 BOUNDS = (KnownInliers, KnownInliersAndNoise)
@@ -23,6 +23,16 @@ def pixels(rotation, translation, world_points, intrinsics):
     """One problem: (N, 3) -> (N, 2)."""
     projected = (world_points @ rotation.mT + translation) @ intrinsics.mT
     return projected[:, :2] / projected[:, 2:]
+
+
+@pytest.mark.parametrize("bound", BOUNDS)
+def test_bounds_of_rigs(bound):
+    problems = CameraProblems(n=12, batch_size=50, seed=3, outlier_share=0.25, cameras=3, dtype=torch.float64).batch(0)
+    bound = bound()
+    assert torch.equal(bound.pair_weights(problems) > 0, problems.inliers)
+    for solver in (bound, create_solver("pnpnet-set")):
+        results = evaluate({"solver": solver}, {"rigs": EvaluationData(problems)}, repeats=1)
+        assert results["rows"][0]["success"]["rate"] > 0.9
 
 
 def rate(bound, problems):

@@ -28,7 +28,7 @@ def swept(experiment):
 
 
 # An experiment alone, and with the first and the last value of each override that its sweeper runs over.
-CASES = [(name, ()) for name in FILES]
+CASES = [(name, ()) for name in FILES] + [("set", ("data=rigs", "model.n=12"))]
 CASES += [
     (name, (f"{key}={value}",))
     for name in FILES

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_numbers
 from kornia_pnpnet.core.configured import Configured
-from kornia_pnpnet.geometry import transform
 from kornia_pnpnet.refine import RobustWeightedLM
 from kornia_pnpnet.solver import PnPNet
 from kornia_pnpnet.types import PnPResult, Problems
@@ -55,6 +54,7 @@ class Bound(Configured):
             problems.intrinsics,
             self.pair_weights(problems),
             init=problems.pose,
+            cam_from_rig=problems.cam_from_rig,
         )
 
 
@@ -125,6 +125,7 @@ class KnownInliersAndNoise(Bound):
             world_sigma=self.world_sigma if problems.world_cov is None else None,
             img_cov=problems.img_cov,
             world_cov=problems.world_cov,
+            cam_from_rig=problems.cam_from_rig,
         )
 
     @torch.no_grad()
@@ -133,11 +134,11 @@ class KnownInliersAndNoise(Bound):
 
         The weights carry no gradient, because the gradient of a NaN point would reach all other points.
         """
-        cam_points = transform(problems.pose, problems.world_points)  # (B, N, 3)
+        cam_points = problems.true_cam_points
         depth = cam_points[..., 2:]
         depth = torch.where(depth > 0, depth, 1.0)  # pairs behind the camera have no weight in the solver
         plane_points = cam_points[..., :2] / depth
-        focal = problems.intrinsics.diagonal(dim1=-2, dim2=-1)[:, None, :2]
+        focal = problems.pair_intrinsics.diagonal(dim1=-2, dim2=-1)[..., :2]
         # J_x = (f / z) [1, 0, -p; 0, 1, -q] R; the rotation cancels in the trace.
         trace = ((focal / depth).square() * (1.0 + plane_points.square())).sum(-1)  # (B, N)
         variance = self.img_sigma**2 + self.world_sigma**2 * trace / 2.0

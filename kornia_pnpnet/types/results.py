@@ -113,7 +113,7 @@ class Problems(NamedTuple):
     Attributes:
         world_points: shape :math:`(B, N, 3)`.
         img_points: pixels, shape :math:`(B, N, 2)`.
-        intrinsics: camera matrices, shape :math:`(B, 3, 3)`.
+        intrinsics: camera matrices, shape :math:`(B, 3, 3)`, in a rig :math:`(B, N, 3, 3)`.
         pose: the true world-to-camera pose.
         inliers: whether the pixel of a pair shows its point, bool, shape :math:`(B, N)`.
         img_sigma: standard deviation of the noise on each pixel coordinate, as a solver may know it: NaN where it is
@@ -153,6 +153,19 @@ class Problems(NamedTuple):
         more = {"img_cov": self.img_cov, "world_cov": self.world_cov, "confidence": self.confidence}
         known = {**more, "cam_from_rig": self.cam_from_rig}
         return {**self.sigmas, **{name: value for name, value in known.items() if value is not None}}
+
+    @property
+    def true_cam_points(self) -> Tensor:
+        """The points in the frame of the camera that sees them, by the true poses, shape :math:`(B, N, 3)`."""
+        points = self.world_points @ self.pose.rotation.mT + self.pose.translation[:, None]
+        if self.cam_from_rig is None:
+            return points
+        return (self.cam_from_rig.rotation @ points[..., None])[..., 0] + self.cam_from_rig.translation
+
+    @property
+    def pair_intrinsics(self) -> Tensor:
+        """The camera matrix of each pair, shape :math:`(B, N, 3, 3)`, without a rig :math:`(B, 1, 3, 3)`."""
+        return self.intrinsics[:, None] if self.cam_from_rig is None else self.intrinsics
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Problems:
         """Apply a function to every tensor, for example to slice the batch or to move it to another device."""
