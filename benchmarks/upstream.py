@@ -9,7 +9,8 @@ iterations) has the same threshold as the patch, 3 px, and refines on its inlier
 *Descent.* 40 steps of Adam on the pixels through a solver, as in training: 12 pairs with 5 px of noise. The loss is the
 squared chordal distance of the rotations plus the squared error of the position in median distances.
 
-The patched function runs in float32 in calls of 100 problems, OpenCV problem by problem. Times are CPU time of one thread.
+The patched function runs in float32 in calls of 100 problems, OpenCV problem by problem. Times are CPU times of one
+thread.
 """
 
 from __future__ import annotations
@@ -22,7 +23,6 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -64,15 +64,15 @@ def patched() -> Callable[..., tuple[Tensor, Tensor]]:
         assert spec.loader is not None
         module = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)
-    return module.solve_pnp_robust  # type: ignore[no-any-return]
+    return module.solve_pnp_robust
 
 
-def _dlt(*inputs: Tensor) -> Tensor:
+def _dlt(world_points: Tensor, img_points: Tensor, intrinsics: Tensor) -> Tensor:
     """``solve_pnp_dlt``, which raises for the whole batch: no problem of the batch is solved then."""
     try:
-        return solve_pnp_dlt(*inputs)
+        return solve_pnp_dlt(world_points, img_points, intrinsics)
     except AssertionError:
-        return torch.zeros(len(inputs[0]), 3, 4)
+        return torch.zeros(len(world_points), 3, 4)
 
 
 def _opencv(*inputs: Tensor) -> Tensor:
@@ -140,7 +140,7 @@ def measure_descent(count: int, shares: Sequence[float] = (0.0, 0.25)) -> list[d
     robust = patched()
     solvers: dict[str, Solve] = {
         "solve_pnp_robust": lambda *x: robust(*x, inl_th=4 * THRESHOLD)[0],
-        "solve_pnp_dlt": partial(solve_pnp_dlt),
+        "solve_pnp_dlt": _dlt,
     }
     rows = []
     for k, share in enumerate(shares):
