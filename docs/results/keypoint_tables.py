@@ -40,7 +40,7 @@ def keypoint_tables(found: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "errors": markdown_table(("pnpnet-set with", *names), errors),
         "differences": markdown_table(("error, at most 0.5", *names), differences),
-        "sources": markdown_table(("keypoints", "problems", "pairs", "inliers (%)", "source"), sources),
+        "sources": markdown_table(("keypoints", "problems", "pairs", "inliers (%)", "source"), sources, align="lrrrl"),
         "right": found["settings"]["right"],
     }
 

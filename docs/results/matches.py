@@ -229,7 +229,7 @@ def page_facts(
     raw = find_rows(first, kinds[1])[solver]["all"]
     return {
         "first": first,
-        "solver": title(solver, first["settings"]),
+        "solver": title(solver, first["settings"]).replace(f", {SCORES}", f" with {SCORES}"),
         "raw": raw,
         "far_count": round(raw["far"] * raw["count"]),
         "costs": costs,
