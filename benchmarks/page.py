@@ -30,6 +30,8 @@ WAYS = (
     ("one problem at a time: a robot, a service, C++", "`pnpnet export x.pt2`: packaged", " packaged"),
     ("no PyTorch on the machine", "`pnpnet export x.onnx`", " ONNX"),
 )
+#: Contenders that the pictures also show.
+DRAWN = ("p3p-ransac", "kornia-dlt", "pypose-parts")
 #: Other libraries.
 PEERS = ("poselib", "pycolmap", "opencv-ransac", "kornia-rs")
 
@@ -125,6 +127,11 @@ def libraries_table(results: Mapping[str, Mapping[str, Any]], batch: int) -> str
 def whole_solvers(rows: Mapping[str, Row]) -> list[str]:
     """The contenders of ours that users call: as shipped, in any way."""
     return [name for name in rows if name.partition(" ")[0] in (TRAINED, ANY)]
+
+
+def is_drawn(name: str) -> bool:
+    """Whether the pictures show a contender: solvers of ours that users call, and other libraries at their best."""
+    return name.partition(" ")[0] in (TRAINED, ANY) or name in (*PEERS, *DRAWN)
 
 
 def leaders(results: Mapping[str, Mapping[str, Any]], batch: int) -> list[str]:
@@ -274,8 +281,7 @@ def render(folder: Path, path: Path) -> None:
     from pictures import plot_latency, plot_times  # needs matplotlib
 
     results, gpu = load_parts(folder)
-    # Names with an @ are earlier versions of the package: the pictures leave them out.
-    rows = [row for row in results["throughput"]["rows"] if row["threads"] == 1 and "@" not in row["contender"]]
+    rows = [row for row in results["throughput"]["rows"] if row["threads"] == 1 and is_drawn(row["contender"])]
     pictures, size = path.parent / path.stem, results["throughput"]["settings"]["problems"]
     batches = {mode: [row for row in rows if (row["mode"], row["n"]) == (mode, N)] for mode in (FORWARD, BACKWARD)}
     pairs = [row for row in rows if row["mode"] == FORWARD and (row["batch"] == size or row["n"] != N)]
@@ -283,7 +289,7 @@ def render(folder: Path, path: Path) -> None:
     fewer = "".join(f" ({b} at n = {n})" for n, b in sorted({(x["n"], x["batch"]) for x in pairs}) if b < size)
     title = f"B = {size}{fewer}, a third of the pairs mismatched, one thread"
     plot_times(pictures / "pairs.png", title, {FORWARD: pairs}, against="n", label="pairs n")
-    alone = [row for row in results["latency"]["rows"] if row["threads"] == 1]
+    alone = [row for row in results["latency"]["rows"] if row["threads"] == 1 and is_drawn(row["contender"])]
     plot_latency(pictures / "latency.png", "One problem at a time, n = 9, 0 to 3 wrong pairs, one thread", alone)
     with atomic_open(path, encoding="utf-8") as file:
         file.write(page(results, gpu))
