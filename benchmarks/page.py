@@ -11,7 +11,7 @@ from contenders import ANY, ONE, PLAIN, TRAINED
 from harness import HERE
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from settings import N
-from startup import EAGER
+from startup import CACHED, COLD, EAGER
 from tasks import COARSE_ANGLE_DEG, COARSE_SHIFT, ITERATIONS
 from throughput import BACKWARD, FORWARD
 
@@ -22,6 +22,18 @@ from kornia_pnpnet.metrics import SuccessRate
 
 PAGE = HERE.parent / "docs" / "performance.md"
 PARTS = ("throughput", "latency", "startup")
+
+#: Who calls a solver in which way, and how the names of such contenders end.
+WAYS = (
+    ("a notebook, or batches of any size", "`solver(...)`: eager", ""),
+    ("one solver in a loop for minutes", "`solver.compile()`", " compiled"),
+    ("one problem at a time: a robot, a service, C++", "`pnpnet export x.pt2`: packaged", " packaged"),
+    ("no PyTorch on the machine", "`pnpnet export x.onnx`", " ONNX"),
+)
+#: Contenders that the pictures also show.
+DRAWN = ("p3p-ransac", "kornia-dlt", "pypose-parts")
+#: Other libraries.
+PEERS = ("poselib", "pycolmap", "opencv-ransac", "kornia-rs")
 
 Row = Mapping[str, Any]
 
@@ -39,6 +51,100 @@ def percent(rate: Mapping[str, Any]) -> str:
 def matching(rows: Iterable[Row], **wanted: Any) -> dict[str, Row]:
     """Rows with these values, by contender."""
     return {row["contender"]: row for row in rows if all(row[key] == value for key, value in wanted.items())}
+
+
+def ways_table(results: Mapping[str, Mapping[str, Any]], batch: int) -> str:
+    """When to call a solver in which way, and what that costs; in each cell ``TRAINED`` and ``ANY``."""
+    alone, many = latency_rows(results), batch_rows(results, batch)
+    lines = []
+    for who, call, way in WAYS:
+        names = [f"{solver}{way}" for solver in (TRAINED, ANY)]
+        times = [
+            [three_digits(rows[name]["median_us"] / scale) if name in rows else "–" for name in names]
+            for rows, scale in ((alone, 1e3), (many, 1.0))
+        ]
+        firsts = [three_digits(first) if (first := first_call(results, name)) else "–" for name in names]
+        lines.append((who, call, *(" · ".join(cells) for cells in (*times, firsts))))
+    head = ("You have", "Use", "one problem (ms)", f"each of {batch} (µs)", "first call (s)")
+    return markdown_table(head, lines, align="llrrr")
+
+
+def latency_rows(results: Mapping[str, Mapping[str, Any]]) -> dict[str, Row]:
+    """The times of single problems on one thread, by contender."""
+    return matching(results["latency"]["rows"], threads=1)
+
+
+def batch_rows(results: Mapping[str, Mapping[str, Any]], batch: int) -> dict[str, Row]:
+    """The times of batches of ``N`` pairs on one thread without gradients, by contender."""
+    return matching(results["throughput"]["rows"], threads=1, mode=FORWARD, n=N, batch=batch)
+
+
+def first_call(results: Mapping[str, Mapping[str, Any]], name: str, cache: str | None = None) -> float | None:
+    """Seconds to make a solver and call it once, without gradients: uncompiled, or with this cache (default: cold)."""
+    wanted = cache or (COLD if "compiled" in name else EAGER)
+    for entry in results["startup"]["starts"]:
+        if (entry["contender"], entry["backward"], entry["cache"]) == (name, False, wanted):
+            return float(entry["make_s"] + entry["calls"][0]["first_s"])
+    return None
+
+
+def compiling_pays(results: Mapping[str, Mapping[str, Any]], batch: int) -> list[str]:
+    """For each solver, how much faster it is compiled, and after how many problems that has paid for the compiler."""
+    alone, many = latency_rows(results), batch_rows(results, batch)
+    found = []
+    for name in (TRAINED, ANY):
+        compiled = f"{name} compiled"
+        seconds = first_call(results, compiled)
+        if seconds is None or not all(key in rows for key in (name, compiled) for rows in (alone, many)):
+            continue
+        parts = []
+        for rows, what in ((many, f"in batches of {batch}"), (alone, "one at a time")):
+            slow, fast = rows[name]["median_us"], rows[compiled]["median_us"]
+            pays = f"pays after {rounded(1e6 * seconds / (slow - fast))} problems" if fast < slow else "never pays"
+            parts.append(f"{slow / fast:.1f} times as fast {what} ({pays})")
+        found.append(f"`{name}` compiled is {' and '.join(parts)}.")
+    return found
+
+
+def rounded(count: float) -> str:
+    """A number of problems with two digits."""
+    step = 10 ** max(0, len(f"{count:.0f}") - 2)
+    return f"{round(count / step) * step:,}"
+
+
+def libraries_table(results: Mapping[str, Mapping[str, Any]], batch: int) -> str:
+    """Whole solvers of ours and of other libraries: one problem at a time, and batches."""
+    alone, many = latency_rows(results), batch_rows(results, batch)
+    lines = []
+    for name in (*whole_solvers(alone), *(peer for peer in PEERS if peer in alone)):
+        times = [three_digits(alone[name]["median_us"] / 1e3), "–"]
+        if name in many:
+            times[1] = three_digits(many[name]["median_us"])
+        lines.append((f"`{name}`", *times, percent(alone[name]["success"])))
+    return markdown_table(("Solver", "one problem (ms)", f"each of {batch} (µs)", "success, one problem (%)"), lines)
+
+
+def whole_solvers(rows: Mapping[str, Row]) -> list[str]:
+    """The contenders of ours that users call: as shipped, in any way."""
+    return [name for name in rows if name.partition(" ")[0] in (TRAINED, ANY)]
+
+
+def is_drawn(name: str) -> bool:
+    """Whether the pictures show a contender: solvers of ours that users call, and other libraries at their best."""
+    return name.partition(" ")[0] in (TRAINED, ANY) or name in (*PEERS, *DRAWN)
+
+
+def leaders(results: Mapping[str, Mapping[str, Any]], batch: int) -> list[str]:
+    """For one problem and for batches, the fastest of ours and of the other libraries."""
+    found = []
+    for what, rows in (("One problem at a time", latency_rows(results)), ("Batches", batch_rows(results, batch))):
+        sides = whole_solvers(rows), [name for name in PEERS if name in rows]
+        if all(sides):
+            ours, theirs = (min(side, key=lambda name: rows[name]["median_us"]) for side in sides)
+            ratio = rows[theirs]["median_us"] / rows[ours]["median_us"]
+            fastest, other = (ours, theirs) if ratio > 1 else (theirs, ours)
+            found.append(f"{what}: `{fastest}` is fastest, {max(ratio, 1 / ratio):.1f} times as fast as `{other}`.")
+    return found
 
 
 def targets_table(results: Mapping[str, Mapping[str, Any]]) -> str:
@@ -134,6 +240,8 @@ def page(results: Mapping[str, Mapping[str, Any]], gpu: Mapping[str, Any] | None
         gpu: the results file of the throughput on a GPU.
     """
     settings, shipped = results["throughput"]["settings"], PnPNet.from_pretrained(TRAINED)
+    batch = settings["problems"]
+    targets = [entry for part in PARTS for entry in results[part]["targets"]]
     sizes = [entry["calls"][1:] for entry in results["startup"]["starts"] if len(entry["calls"]) > 1]
     options: dict[str, Any] = {"trim_blocks": True, "keep_trailing_newline": True, "undefined": StrictUndefined}
     environment = Environment(loader=FileSystemLoader(HERE), autoescape=False, **options)
@@ -144,8 +252,14 @@ def page(results: Mapping[str, Mapping[str, Any]], gpu: Mapping[str, Any] | None
         made=results["throughput"]["environment"],
         results=results,
         settings=settings,
+        ways=ways_table(results, batch),
+        cached=[(name, first_call(results, f"{name} compiled", CACHED)) for name in (TRAINED, ANY)],
+        pays=compiling_pays(results, batch),
+        libraries=libraries_table(results, batch),
+        leaders=leaders(results, batch),
+        met=(sum(entry["met"] for entry in targets), len(targets)),
         targets=targets_table(results),
-        throughput=throughput_table(results["throughput"], settings["problems"]),
+        throughput=throughput_table(results["throughput"], batch),
         latency=latency_table(results["latency"]),
         sizes=[call["batch"] for call in sizes[0]] if sizes else [],
         startup=startup_table(results["startup"]),
@@ -167,8 +281,7 @@ def render(folder: Path, path: Path) -> None:
     from pictures import plot_latency, plot_times  # needs matplotlib
 
     results, gpu = load_parts(folder)
-    # Names with an @ are earlier versions of the package: the pictures leave them out.
-    rows = [row for row in results["throughput"]["rows"] if row["threads"] == 1 and "@" not in row["contender"]]
+    rows = [row for row in results["throughput"]["rows"] if row["threads"] == 1 and is_drawn(row["contender"])]
     pictures, size = path.parent / path.stem, results["throughput"]["settings"]["problems"]
     batches = {mode: [row for row in rows if (row["mode"], row["n"]) == (mode, N)] for mode in (FORWARD, BACKWARD)}
     pairs = [row for row in rows if row["mode"] == FORWARD and (row["batch"] == size or row["n"] != N)]
@@ -176,7 +289,7 @@ def render(folder: Path, path: Path) -> None:
     fewer = "".join(f" ({b} at n = {n})" for n, b in sorted({(x["n"], x["batch"]) for x in pairs}) if b < size)
     title = f"B = {size}{fewer}, a third of the pairs mismatched, one thread"
     plot_times(pictures / "pairs.png", title, {FORWARD: pairs}, against="n", label="pairs n")
-    alone = [row for row in results["latency"]["rows"] if row["threads"] == 1]
+    alone = [row for row in results["latency"]["rows"] if row["threads"] == 1 and is_drawn(row["contender"])]
     plot_latency(pictures / "latency.png", "One problem at a time, n = 9, 0 to 3 wrong pairs, one thread", alone)
     with atomic_open(path, encoding="utf-8") as file:
         file.write(page(results, gpu))

@@ -1,6 +1,9 @@
 """The documentation: its Python runs, the site builds without warnings, its links lead to pages and sections."""
 
+import html
+import json
 import re
+import shutil
 import subprocess
 import sys
 import zlib
@@ -14,6 +17,29 @@ import kornia_pnpnet
 
 REPO = Path(__file__).resolve().parents[1]
 DOCS = REPO / "docs"
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+CHROMIUM_OPTIONS = (
+    *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync"),
+    *("--disable-background-networking", "--disable-component-update", "--allow-file-access-from-files", "--dump-dom"),
+)
+# Opens what is folded on every page, and lists pages that are wider than their frame, and what is cut without a hint.
+FIND_WIDE = """
+addEventListener("load", () => {
+  const wide = [];
+  for (const frame of document.querySelectorAll("iframe")) {
+    const page = frame.contentDocument, root = page.documentElement, name = frame.getAttribute("src");
+    for (const folded of page.querySelectorAll("details")) folded.open = true;
+    frame.contentWindow.mark();
+    if (root.scrollWidth > root.clientWidth) wide.push(`${name}: ${root.scrollWidth} px`);
+    for (const box of page.querySelectorAll("article *")) {
+      const hides = frame.contentWindow.getComputedStyle(box).overflowX !== "visible";
+      if (hides && box.clientWidth && box.scrollWidth > box.clientWidth + 1 && !box.classList.contains("scrolls"))
+        wide.push(`${name}: ${box.textContent.slice(0, 60)}`);
+    }
+  }
+  document.body.textContent = JSON.stringify(wide);
+});
+"""
 PAGES = [DOCS / "index.md", DOCS / "solvers.md", *sorted((DOCS / "howto").glob("*.md"))]
 
 
@@ -75,3 +101,16 @@ def test_every_public_name_is_in_the_reference(site):
     lines = zlib.decompress((site / "objects.inv").read_bytes().split(b"\n", 4)[4]).decode().splitlines()
     documented = {line.split()[0].rpartition(".")[2] for line in lines}
     assert {*kornia_pnpnet.__all__} - documented <= {"__version__"}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium")
+@pytest.mark.parametrize("width", [390, 1280])
+def test_pages_fit_into_the_window_and_wide_tables_say_that_they_scroll(site, tmp_path, width):
+    pages = [page.as_uri() for page in site.rglob("*.html") if "_modules" not in page.parts]
+    frames = "".join(f'<iframe src="{page}" width="{width}" height="800"></iframe>' for page in pages)
+    everything = tmp_path / "all.html"
+    everything.write_text(f"<meta charset=utf-8><body>{frames}<script>{FIND_WIDE}</script></body>")
+    command = [CHROMIUM, *CHROMIUM_OPTIONS, f"--user-data-dir={tmp_path / 'profile'}", everything.as_uri()]
+    dumped = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300).stdout
+    assert json.loads(html.unescape(re.search(r"<body>(.*)</body>", dumped, flags=re.S)[1])) == []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import json
 from pathlib import Path
 
 import pytest
@@ -15,10 +14,25 @@ FOLDER = REPO / "docs" / "results"
 
 
 @pytest.fixture(scope="module")
-def render():
+def modules():
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(FOLDER)
-        yield importlib.import_module("render")
+        yield {name: importlib.import_module(name) for name in ("render", "matches", "short_runs")}
+
+
+@pytest.fixture(scope="module")
+def render(modules):
+    return modules["render"]
+
+
+@pytest.fixture(scope="module")
+def matches(modules):
+    return modules["matches"]
+
+
+@pytest.fixture(scope="module")
+def short_runs(modules):
+    return modules["short_runs"]
 
 
 def row(rate, *, half=1.0, **columns):
@@ -27,30 +41,70 @@ def row(rate, *, half=1.0, **columns):
     return {"update": "4000", "us_per_problem": "12.3", **columns, **shares}
 
 
-def test_the_page_is_rendered_from_its_files(render):
+def test_the_pages_are_rendered_from_their_files(render):
     results = {name: render.load_results(FOLDER / f"{name}.json") for name in render.RESULTS}
-    files = [json.loads((FOLDER / f"{name}.json").read_text()) for name in ("complexity", "honesty")]
     runs = {name: render.read_summary(FOLDER / f"{name}.csv") for name in render.SUMMARIES}
-    assert render.page(results, *files, runs) == (FOLDER / "README.md").read_text(encoding="utf-8")
+    benchmark, matches = render.load("solvers", REPO / "benchmarks"), [render.load(name) for name in render.MATCHES]
+    text = render.page(results, render.load("complexity"), render.load("honesty"), runs, benchmark, matches)
+    assert text == (FOLDER / "README.md").read_text(encoding="utf-8")
+    text = render.real_matches(matches, render.load("real_matches_cost"), render.load("keypoints"))
+    assert text == (FOLDER / "real_matches.md").read_text(encoding="utf-8")
+    for page in render.OVERVIEW_PAGES:
+        text = page.read_text(encoding="utf-8")
+        assert render.with_block(text, render.overview_of(page, matches)) == text
 
 
-def test_the_overview_has_the_numbers_of_its_file_between_the_lines_of_the_readme(render):
-    results = json.loads((REPO / "benchmarks" / "solvers.json").read_text())
-    rows, table = render.overview(results)
-    assert [row.ours for row in rows].count(True) == 1
-    assert [row.us_per_problem for row in rows] == sorted(row.us_per_problem for row in rows)
-    for entry in rows:
-        numbers = [f"{100 * rate.rate:.1f} %" for rate in (entry.without_outliers, entry.with_outliers)]
-        (line,) = (line for line in table.splitlines() if entry.name in line)
-        assert all(number in line for number in (*numbers, f"{entry.us_per_problem:.0f}"))
+def test_a_block_stands_between_its_lines(render):
     text = f"before\n{render.BEGIN}\nold\n{render.END}\nafter\n"
-    replaced = render.with_block(text, table)
-    assert replaced == render.with_block(replaced, table) == text.replace("old", table)
+    replaced = render.with_block(text, "new")
+    assert replaced == render.with_block(replaced, "new") == text.replace("old", "new")
     with pytest.raises(ValueError, match="overview:begin"):
-        render.with_block("before", table)
+        render.with_block("before", "new")
 
 
-def test_runs_are_apart_only_when_all_their_intervals_are(render):
+def matches_file(solvers, counts=(100, 300)):
+    """A file of real matches: success in per cent and milliseconds of each solver, for two kinds of matches."""
+    rows = [
+        {"solver": name, "kind": kind, "group": "all", "count": count, "success": rate / 100, "ms_per_problem": ms}
+        for name, (*rates, ms) in solvers.items()
+        for kind, count, rate in zip(("few", "many"), counts, rates, strict=True)
+    ]
+    return {"rows": rows, "settings": {"solvers": list(solvers)}}
+
+
+def test_measurements_are_pooled_by_the_number_of_problems_and_by_what_the_solver_did(matches):
+    peer = "poselib:threshold=6"
+    first = {"pnpnet-set:effort=adaptive": (90, 80, 2.0), "pnpnet-set": (80, 60, 1.0), peer: (70, 70, 4.0)}
+    second = {"pnpnet-set": (70, 60, 4.0), "pnpnet-set:effort=fixed": (60, 40, 1.0), peer: (70, 70, 8.0)}
+    pooled = matches.pool([matches_file(first), matches_file(second, (300, 100))])
+    adaptive, fixed, other = pooled.values()  # in the order of the first file
+    assert [adaptive[kind].success.rate for kind in ("few", "many", "all")] == [0.75, 0.75, 0.75]
+    assert [fixed[kind].success.rate for kind in ("few", "many")] == [0.65, 0.55]
+    assert (adaptive["all"].ms, fixed["few"].ms, other["all"].ms) == (3.0, 1.0, 6.0)
+    assert adaptive["all"].success.total == 800
+    assert matches.points_ahead(pooled) == pytest.approx(0.05)
+
+
+def test_a_solver_that_one_file_lacks_is_not_pooled(matches):
+    both, one = {"pnpnet-set": (50, 50, 1.0)}, {"pnpnet-set": (50, 50, 1.0), "pycolmap:threshold=8": (50, 50, 1.0)}
+    assert len(matches.pool([matches_file(both), matches_file(one)])) == 1
+
+
+def test_a_solver_is_ahead_or_behind_only_when_intervals_are_apart(render):
+    def entry(data, solver, rate):
+        success = {"rate": rate, "low": rate - 0.01, "high": rate + 0.01}
+        return {"data": data, "solver": solver, "success": success, "us_per_problem": 1.0}
+
+    shares = {"won": (0.9, 0.8), "lost": (0.7, 0.8), "even": (0.8, 0.81)}
+    rows = [entry(data, name, rate) for data, pair in shares.items() for name, rate in zip("ab", pair, strict=True)]
+    rates = render.Rates({"rows": rows, "data": list(shares), "solvers": ["a", "b"]})
+    standing = render.compare_all([rates], "a", ["b"])
+    assert (standing.ahead, standing.overlapping) == (["won"], ["even"])
+    assert standing.behind == {"lost": ("b", pytest.approx(10.0))}
+    assert rates.best("lost", ["a", "b"]) == "b"
+
+
+def test_runs_are_apart_only_when_all_their_intervals_are(short_runs):
     for rates, others, difference, verdict in (
         ([75.0], [70.0], "+5.0", "above"),
         ([65.0], [70.0], "-5.0", "below"),
@@ -58,18 +112,19 @@ def test_runs_are_apart_only_when_all_their_intervals_are(render):
         ([75.0], [70.0, 74.0], "+3.0", "overlap"),  # one seed of the others comes near
         ([75.0, 71.0], [70.0], "+3.0", "overlap"),
     ):
-        found = render.compared([row(rate) for rate in rates], [row(rate) for rate in others], "none")
+        found = short_runs.compared([row(rate) for rate in rates], [row(rate) for rate in others], "none")
         assert found.startswith(difference)
         assert verdict in found
 
 
-def test_ablations_stand_beside_the_recipe(render):
+def test_ablations_stand_beside_the_recipe(short_runs):
     seeds = [row(rate, experiment="recipe", seed=f"{seed}") for seed, rate in enumerate((80.0, 81.5))]
-    kernels = [row(rate, experiment="kernels", **{render.KERNEL: k}) for k, rate in (("huber", 70), ("cauchy", 81))]
-    facts = render.ablation([*kernels, *seeds, row(90.0, experiment="shared", seed="", **{render.KERNEL: ""})])
+    kernels = [row(rate, experiment="kernels", **{short_runs.KERNEL: k}) for k, rate in (("huber", 70), ("cauchy", 81))]
+    facts = short_runs.ablation([*kernels, *seeds, row(90.0, experiment="shared", seed="", **{short_runs.KERNEL: ""})])
     assert (facts["seeds"], facts["spread"]) == (2, pytest.approx(1.5))
     assert "| `recipe seed=1` | 81.5 [80.5, 82.5] | 81.5 [80.5, 82.5] |" in facts["table"]
     by_name = {finding["experiment"]: finding["found"] for finding in facts["findings"]}
     assert by_name["kernels"]["huber"].startswith("none -10.8 points (below)")
     assert by_name["kernels"]["cauchy"].startswith("none +0.2 points (intervals overlap)")
     assert by_name["shared"][""].startswith("none +9.2 points (above)")
+    assert list(facts["verdicts"].values()) == [["`shared`"], ["`kernels huber`"], ["`kernels cauchy`"]]

@@ -28,10 +28,13 @@ def keypoint_tables(found: Mapping[str, Any]) -> dict[str, Any]:
     by_way = [{row["way"]: row for row in one["rows"]} for one in results]
     cells = [[f"{r[w]['error']:.3f}, {100 * r[w]['right']:.1f}, {100 * r[w]['ok']:.0f}" for r in by_way] for w in ways]
     errors = [[f"`{way}`", *row] for way, row in zip(ways, cells, strict=True)]
-    differences = []
-    for way, base in _PAIRS:
-        shown = [r[way]["less"][base]["capped"] for r in by_way]
-        differences.append([f"`{way}` less `{base}`", *("{:+.4f} ({:+.4f} to {:+.4f})".format(*x) for x in shown)])
+    differences = [
+        [
+            one["source"],
+            *("{:+.4f} ({:+.4f} to {:+.4f})".format(*r[way]["less"][base]["capped"]) for way, base in _PAIRS),
+        ]
+        for one, r in zip(results, by_way, strict=True)
+    ]
     names = [one["source"] for one in results]
     sources = [
         [one["source"], str(one["measured"]), f"{one['pairs']:.0f}", f"{100 * one['inliers']:.0f}", _source(found, one)]
@@ -39,8 +42,10 @@ def keypoint_tables(found: Mapping[str, Any]) -> dict[str, Any]:
     ]
     return {
         "errors": markdown_table(("pnpnet-set with", *names), errors),
-        "differences": markdown_table(("error, at most 0.5", *names), differences),
-        "sources": markdown_table(("keypoints", "problems", "pairs", "inliers (%)", "source"), sources),
+        "differences": markdown_table(
+            ("error, at most 0.5", *(f"`{way}` less `{base}`" for way, base in _PAIRS)), differences
+        ),
+        "sources": markdown_table(("keypoints", "problems", "pairs", "inliers (%)", "source"), sources, align="lrrrl"),
         "right": found["settings"]["right"],
     }
 

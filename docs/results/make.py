@@ -6,8 +6,8 @@
 - ``compare`` solves the scenes with two trained networks (``--runs``: two folders of ``train.py``) and writes
   ``distribution.json``.
 - ``ship`` puts the weights of a training into the package (``--runs``: the folders of its runs, in their order).
-- ``render`` writes ``README.md`` from ``README.md.jinja`` and the results files, all pictures, and the overview in the
-  README of the repository. Every number of the page comes from the files.
+- ``render`` writes ``README.md`` and ``real_matches.md`` from their templates and the results files, all pictures, and
+  the overview in the README of the repository and on the home page. Every number comes from the files.
 
 ``ablation.csv``, ``sweep.csv`` and ``capacity.csv`` are copies of ``summary.csv`` of these trainings. Each takes less
 than an hour on one core, and continues where it was stopped::

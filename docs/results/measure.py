@@ -332,9 +332,10 @@ def measure_honesty(count: int) -> None:
 
 def covariance_check(solver: PnPNet, problems: Problems) -> dict[str, Any]:
     """Squared pose errors relative to the covariance: their mean, and the share below the 95 % quantile."""
-    result = solve(solver, problems, **problems.sigmas)
+    sigmas: dict[str, Any] = problems.sigmas
+    result = solve(solver, problems, **sigmas)
     pairs = (problems.world_points, problems.img_points, problems.intrinsics)
-    covariance = pose_covariance(result.pose, *pairs, **problems.sigmas, weights=result.weights)
+    covariance = pose_covariance(result.pose, *pairs, **sigmas, weights=result.weights)
     turn = rotation_matrix_to_axis_angle(result.rotation @ problems.pose.rotation.mT)
     error = torch.cat((turn, result.translation - problems.pose.translation), -1)  # (B, 6)
     squares = (error * torch.linalg.solve(covariance, error)).sum(-1)

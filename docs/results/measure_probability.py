@@ -21,6 +21,7 @@ from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.evaluation.named_solvers import load_solver
 from kornia_pnpnet.metrics import pose_errors, reliability, success_rate
 from kornia_pnpnet.refine import verdict
+from kornia_pnpnet.refine.scale import larger_sigma
 from kornia_pnpnet.types import PnPResult, Problems
 
 __all__ = ["measure_probability"]
@@ -41,7 +42,8 @@ def measure_probability(seed_fit: int, seed_report: int) -> dict[str, Any]:
     conf = str(Path(__file__).resolve().parents[2] / "conf")
     with initialize_config_dir(conf, version_base=None):
         config = compose("train", overrides=["experiment=set"]).data.validation
-    matches, protocol = (OmegaConf.to_container(config[name], resolve=True) for name in ("matches_50", "uniform"))
+    matches: Any = OmegaConf.to_container(config.matches_50, resolve=True)
+    protocol: Any = OmegaConf.to_container(config.uniform, resolve=True)
     sizes = [(matches, n) for n in (5, 6, 7, 9, 12, 24, 50, 120, 250)] + [(protocol, n) for n in (6, 9, 20)]
     solvers = {name: load_solver(name) for names in FITTED.values() for name in names}
     found: dict[str, dict[str, list[Tensor]]] = {name: {"fit": [], "report": []} for name in solvers}
@@ -57,7 +59,7 @@ def measure_probability(seed_fit: int, seed_report: int) -> dict[str, Any]:
         for name, solver in solvers.items():
             features.clear()
             # While the law is fitted, nothing is solved once more, so that each problem has one row.
-            larger = solver_module.larger_sigma if part == "report" else lambda x, *_: x.new_zeros(x.shape[:2])
+            larger = larger_sigma if part == "report" else lambda x, *_: x.new_zeros(x.shape[:2])
             with (
                 mock.patch.object(verdict, "probability", listen),
                 mock.patch.object(solver_module, "larger_sigma", larger),

@@ -1,0 +1,16 @@
+// Mark tables, formulas and outputs that are wider than the page, see pages.css.
+const NARROW = 0.45; // share of the width that a first column may take and stay in sight
+
+function mark() {
+  for (const box of document.querySelectorAll(".table-wrapper, .math-wrapper, pre, .cell_output .output")) {
+    box.classList.remove("scrolls"); // the hint itself changes the width
+    const scrolls = box.scrollWidth > box.clientWidth + 1 && getComputedStyle(box).overflowX !== "visible";
+    const first = box.querySelector("tr > :first-child");
+    box.classList.toggle("scrolls", scrolls);
+    box.classList.toggle("keeps-first", scrolls && first !== null && first.offsetWidth < NARROW * box.clientWidth);
+  }
+}
+
+addEventListener("load", mark);
+addEventListener("resize", mark);
+document.addEventListener("toggle", mark, true); // a folded table has no width

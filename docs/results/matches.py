@@ -1,0 +1,243 @@
+"""The page on real matches and the overview of the home page, from what ``benchmarks/real_matches.py`` wrote."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import torch
+from keypoint_tables import keypoint_tables
+from measure import ANY, HERE
+from real_matches_picture import find_rows
+from short_runs import read_summary
+
+from kornia_pnpnet.core.tables import markdown_table
+from kornia_pnpnet.metrics import SuccessRate, success_rate
+
+__all__ = ["MATCHES", "Pooled", "facts", "overview", "pool", "title"]
+
+#: Files of ``benchmarks/real_matches.py measure``, each on scenes that no solver had seen, the latest last.
+MATCHES = ("real_matches", "real_matches_again", "real_matches_third", "real_matches_fourth")
+SCORES = "scores"  # what the title of a solver ends with that got a score for each pair
+_TITLES = {"poselib": "PoseLib", "opencv-usac": "OpenCV USAC", "known-inliers": "inliers known"}
+_TOLD = {"": "", "ratio": SCORES, "sigma": "noise known"}
+
+
+def title(solver: str, settings: Mapping[str, Any]) -> str:
+    """The name of a solver for tables.
+
+    The first file was measured when the fixed effort was the default of ``pnpnet-set``: it names the adaptive one.
+    """
+    spec, _, told = solver.partition("+")
+    name, _, options = spec.partition(":")
+    parts = [_TITLES.get(name, name if name == "pycolmap" else f"`{name}`")]
+    if name == ANY:
+        fixed_by_default = any("effort=adaptive" in other for other in settings["solvers"])
+        fixed = "effort=fixed" in options or (fixed_by_default and not options)
+        parts += ["fixed effort"] if fixed else []
+    parts += [f"{pixels} px" for pixels in re.findall(r"threshold=(\d+)", options)]
+    return ", ".join(filter(None, (*parts, _TOLD[told])))
+
+
+class Pooled(NamedTuple):
+    """One solver on the problems of one kind of several files: success, and milliseconds per problem."""
+
+    success: SuccessRate
+    ms: float
+
+
+def pool(files: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Pooled]]:
+    """The solvers that all files have, by title and kind of matches; over both kinds together as ``all``."""
+    sums: dict[str, dict[str, list[float]]] = {}
+    measured: dict[str, set[int]] = {}
+    for number, results in enumerate(files):
+        for row in results["rows"]:
+            if row["group"] == "all":
+                name = title(row["solver"], results["settings"])
+                measured.setdefault(name, set()).add(number)
+                for kind in (row["kind"], "all"):
+                    total = sums.setdefault(name, {}).setdefault(kind, [0, 0, 0.0])
+                    for i, factor in enumerate((1.0, row["success"], row["ms_per_problem"])):
+                        total[i] += row["count"] * factor
+    return {
+        name: {
+            kind: Pooled(success_rate(torch.arange(round(count)) < round(right)), ms / count)
+            for kind, (count, right, ms) in kinds.items()
+        }
+        for name, kinds in sums.items()
+        if len(measured[name]) == len(files)
+    }
+
+
+def best_peer(pooled: Mapping[str, Mapping[str, Pooled]], kind: str = "all") -> str:
+    """The PoseLib with the highest success."""
+    peers = [name for name in pooled if name.startswith("PoseLib")]
+    return max(peers, key=lambda name: pooled[name][kind].success.rate)
+
+
+def overview(files: Sequence[Mapping[str, Any]], link: str) -> str:
+    """The table of the home page and of the README: the solvers on the real matches of all files.
+
+    Args:
+        files: the files of :data:`MATCHES`.
+        link: where the page on real matches is, from the page that shows the table.
+    """
+    pooled = pool(files)
+    kinds = [kind for kind in pooled[f"`{ANY}`"] if kind != "all"]
+    ours = [f"`{ANY}`", f"`{ANY}`, {SCORES}"]
+    others = [name for name in pooled if name[0] != "`" and name != _TITLES["known-inliers"]]
+    plain = best_peer({name: kinds for name, kinds in pooled.items() if not name.endswith(SCORES)})
+    told = best_peer({name: kinds for name, kinds in pooled.items() if name.endswith(SCORES)})
+    shown = [name for name in others if not name.startswith("PoseLib") or name in (plain, told)]
+    rows = [*ours, *sorted(shown, key=lambda name: -pooled[name]["all"].success.rate)]
+    lines = []
+    for name in rows:
+        cells = [name.replace(f", {SCORES}", f" with {SCORES}")]
+        for kind in kinds:
+            cells += [f"{100 * pooled[name][kind].success.rate:.1f} %", f"{1e3 * pooled[name][kind].ms:.0f}"]
+        lines.append([f"**{cell}**" if name in ours else cell for cell in cells])
+    short = {"ratio test": "filtered", "no ratio test": "raw"}
+    header = ["Solver", *(text for kind in kinds for text in (f"{short[kind]}: right", "µs"))]
+    scenes = sum(len(results["counts"]) for results in files)
+    reach = max(half(pooled[name][kind].success) for name in rows for kind in kinds)
+    right = files[0]["settings"]["right"]
+    base = pooled[ours[0]]
+    ahead = []
+    for kind in kinds:
+        for what, better in (
+            ("more often right", [name for name in shown if pooled[name][kind].success.rate > base[kind].success.rate]),
+            ("faster", [name for name in shown if pooled[name][kind].ms < base[kind].ms]),
+        ):
+            names = dict.fromkeys(name.partition(",")[0] for name in better)
+            ahead += [f"{' and '.join(names)} {what} on {short[kind]} matches"] if names else []
+    steps = [100 * points_ahead(pool([results])) for results in files]
+    notes = (
+        f"{base['all'].success.total} problems of {scenes} public scenes that no solver had seen: SIFT matches after a "
+        f"ratio test (*filtered*) or without (*raw*). Right: within {right[0]:g}° and {100 * right[1]:g} % of the "
+        f"distance; 95 % intervals: at most ±{reach:.1f} points. One thread, {files[0]['environment']['cpu']}. "
+        f"**Where others are ahead** of `{ANY}`: {'; '.join(ahead) or 'nowhere'}. In the {len(files)} measurements "
+        f"`{ANY}` was {min(steps):+.1f} to {max(steps):+.1f} points ahead of the best PoseLib. "
+        f"[All measurements]({link})."
+    )
+    return f"{markdown_table(header, lines)}\n\n{notes}"
+
+
+def points_ahead(pooled: Mapping[str, Mapping[str, Pooled]], ours: str = f"`{ANY}`") -> float:
+    """Difference of the success of one of our solvers and of the best PoseLib."""
+    return pooled[ours]["all"].success.rate - pooled[best_peer(pooled)]["all"].success.rate
+
+
+def half(success: SuccessRate) -> float:
+    """The larger distance in points from a rate to the ends of its interval."""
+    return 100 * max(success.rate - success.low, success.high - success.rate)
+
+
+def percent(value: float | None) -> str:
+    """A share in per cent, without the sign."""
+    return "–" if value is None else f"{100 * value:.1f}"
+
+
+def group_table(results: Mapping[str, Any], kind: str) -> str:
+    """Success by share of outliers of one kind of matches, time, and the share of ``ok``."""
+    settings, found = results["settings"], find_rows(results, kind)
+    groups = ["all", *(f"{100 * a:.0f}–{100 * b:.0f} %" for a, b in pairwise(settings["shares"]))]
+    counts = [found[settings["solvers"][0]][group]["count"] for group in groups]
+    header = [f"{kind}: right (%)", "ms", *(f"{g} ({n})" for g, n in zip(groups, counts, strict=True))]
+    lines = []
+    for name, one in found.items():
+        every = one["all"]
+        ok = [percent(every[key]) for key in ("ok_of_right", "ok_of_far")]
+        shares = [percent(one[group]["success"]) for group in groups]
+        lines.append([title(name, settings), f"{every['ms_per_problem']:.2f}", *shares, *ok])
+    return markdown_table([*header, "ok of right", "ok of far off"], lines)
+
+
+def facts(results: Mapping[str, Any]) -> dict[str, Any]:
+    """Tables of one file of ``benchmarks/real_matches.py measure``.
+
+    Returns:
+        ``tables`` by kind; ``scenes``, a table; ``total`` number of problems; ``results``, the file.
+    """
+    kinds = list(dict.fromkeys(row["kind"] for row in results["rows"]))
+    known = {row["scene"]: row for row in read_summary(HERE / "real_matches_scenes.csv")}
+    lines = []
+    for entry in results["counts"]:
+        about = known.get(entry["scene"], {})
+        numbers = [str(entry[kind]["counted"]) for kind in kinds]
+        lines.append([entry["scene"], *(about.get(key, "–") for key in ("shows", "source", "licence")), *numbers])
+    header = ["Scene", "shows", "public repository", "licence", *(f"problems, {kind}" for kind in kinds)]
+    return {
+        "tables": {kind: group_table(results, kind) for kind in kinds},
+        "scenes": markdown_table(header, lines, align="llll" + "r" * len(kinds)),
+        "total": sum(entry[kind]["counted"] for entry in results["counts"] for kind in kinds),
+        "results": results,
+    }
+
+
+def pooled_table(files: Sequence[Mapping[str, Any]]) -> str:
+    """All solvers that every file has, both kinds, beside the best PoseLib."""
+    pooled = pool(files)
+    peer = best_peer(pooled)
+    kinds = [kind for kind in pooled[peer] if kind != "all"]
+    lines = []
+    for name, one in sorted(pooled.items(), key=lambda item: -item[1]["all"].success.rate):
+        rates = [f"{100 * one[kind].success.rate:.1f}" for kind in (*kinds, "all")]
+        times = [f"{one[kind].ms:.2f}" for kind in kinds]
+        lines.append([name, *rates, *times, f"{one['all'].ms / pooled[peer]['all'].ms:.2f}"])
+    header = ["Right (%)", *kinds, "both", *(f"ms, {kind}" for kind in kinds), f"time / {peer}"]
+    return markdown_table(header, lines)
+
+
+def measurements_table(files: Iterable[Mapping[str, Any]]) -> str:
+    """Each file by itself: how far ``pnpnet-set`` is ahead of the PoseLib that is best on its problems."""
+    lines = []
+    for results in files:
+        pooled = pool([results])
+        peer = best_peer(pooled)
+        base = pooled[peer]["all"]
+        cells = [f"{100 * points_ahead(pooled, name):+.1f}" for name in (f"`{ANY}`", f"`{ANY}`, {SCORES}")]
+        ratio = pooled[f"`{ANY}`"]["all"].ms / base.ms
+        date, scenes = results["environment"]["date"][:10], len(results["counts"])
+        lines.append([date, f"{scenes}", f"{base.success.total}", peer, *cells, f"{ratio:.2f}"])
+    header = ["Measured", "scenes", "problems", "best PoseLib", f"`{ANY}` ahead (points)", "with scores", "time ratio"]
+    return markdown_table(header, lines, align="lrrlrrr")
+
+
+def page_facts(
+    files: Sequence[Mapping[str, Any]], costs: Mapping[str, Any], keypoints: Mapping[str, Any]
+) -> dict[str, Any]:
+    """What the template of the page on real matches needs.
+
+    Args:
+        files: the files of :data:`MATCHES`.
+        costs: what ``benchmarks/real_matches.py cost`` wrote.
+        keypoints: what ``benchmarks/keypoints.py`` wrote.
+    """
+    first = files[0]
+    solver = first["settings"]["solvers"][0]
+    curve = first["reliability"][solver]
+    deciles = [
+        [f"{i / 10:.1f} to {(i + 1) / 10:.1f}", f"{count:.0f}", percent(predicted), percent(observed)]
+        for i, (count, predicted, observed) in enumerate(
+            zip(*(curve[key] for key in ("number", "predicted", "observed")), strict=True)
+        )
+        if count
+    ]
+    kinds = list(dict.fromkeys(row["kind"] for row in first["rows"]))
+    raw = find_rows(first, kinds[1])[solver]["all"]
+    return {
+        "first": first,
+        "solver": title(solver, first["settings"]).replace(f", {SCORES}", f" with {SCORES}"),
+        "raw": raw,
+        "far_count": round(raw["far"] * raw["count"]),
+        "costs": costs,
+        "pooled": pooled_table(files),
+        "measurements": measurements_table(files),
+        "total": sum(facts(results)["total"] for results in files),
+        "scene_count": sum(len(results["counts"]) for results in files),
+        "files": [{"name": name, **facts(results)} for name, results in zip(MATCHES, files, strict=True)],
+        "deciles": markdown_table(["predicted", "problems", "predicted mean (%)", "not far off (%)"], deciles),
+        "keypoints": keypoint_tables(keypoints),
+    }

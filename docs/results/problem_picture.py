@@ -1,0 +1,112 @@
+"""The picture of the home page: a synthetic house, the pairs that ``pnpnet-set`` rejects, and the pose it finds."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import torch
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix, convert_points_from_homogeneous
+from torch import Tensor
+
+from kornia_pnpnet import Pose, create_solver, pose_errors
+from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet.evaluation.figures.style import BLUE, GREY, VERMILION, WIDTH, make_figure, save, themed
+
+__all__ = ["plot_problem"]
+
+_PAIRS, _OUTLIERS, _SEED = 48, 20, 3
+_KEPT = 0.5  # weights above this count as inliers, as on the page about OpenCV
+_HALF_VIEW = 0.31  # tangent of half the field of view that is drawn
+_CAMERA = 4.0  # metres; length of a drawn camera
+_VIEWPOINT = {"elev": 20.0, "azim": -60.0}  # degrees
+
+# A house, 8 m by 6 m and 7 m high, with a gable roof: x to the right, y down, z away; corners in metres.
+_CORNERS = torch.tensor(
+    [[x, y, z] for y in (0.0, -4.0) for x, z in ((-4.0, -3.0), (4.0, -3.0), (4.0, 3.0), (-4.0, 3.0))]
+    + [[-4.0, -7.0, 0.0], [4.0, -7.0, 0.0]],
+    dtype=torch.float64,
+)
+_BOX = [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)]
+_EDGES = torch.tensor([*_BOX, (4, 8), (7, 8), (5, 9), (6, 9), (8, 9)])
+_PLACE = torch.tensor([0.0, 3.2, 21.0], dtype=torch.float64)  # metres; the house in the camera's frame
+_TURNS = ((0.2, 0.0, 0.0), (0.0, 0.65, 0.0))  # radians; the camera looks down, and at a corner
+
+
+def _in_camera(points: Tensor) -> Tensor:
+    """Points of the house (..., 3) in the camera's frame."""
+    down, around = axis_angle_to_rotation_matrix(torch.tensor(_TURNS, dtype=points.dtype))
+    return points @ (down @ around).mT + _PLACE
+
+
+class _HousePoints:
+    """Points on the edges of the house, see :class:`kornia_pnpnet.data.PointPrior`."""
+
+    def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
+        edges = _CORNERS[_EDGES[torch.randint(len(_EDGES), (batch_size, n), generator=generator)]]  # (B, n, 2, 3)
+        along = torch.rand((batch_size, n, 1), generator=generator, dtype=torch.float64)
+        return _in_camera(torch.lerp(edges[..., 0, :], edges[..., 1, :], along))
+
+
+def _frustum(pose: Pose) -> Tensor:
+    """A camera in the world as one line, shape (11, 3)."""
+    side = _HALF_VIEW * _CAMERA
+    a, b, c, d = ((x, y, _CAMERA) for x, y in ((-side, -side), (side, -side), (side, side), (-side, side)))
+    centre = (0.0, 0.0, 0.0)
+    line = torch.tensor([centre, a, b, centre, c, d, centre, a, d, c, b], dtype=pose.translation.dtype)
+    return (line - pose.translation[0]) @ pose.rotation[0]
+
+
+@themed
+def plot_problem(path: str | Path) -> Path:
+    """Draw the pairs in the image, kept and rejected, and the points in space with the camera that was found.
+
+    Returns:
+        The path.
+    """
+    outliers = OutlierMix(count=_OUTLIERS, mismatch_share=1.0)
+    source = SyntheticProblems(n=_PAIRS, batch_size=1, seed=_SEED, points=_HousePoints(), outliers=outliers)
+    problem = source.batch(0)
+    with torch.no_grad():
+        result = create_solver("pnpnet-set")(problem.world_points, problem.img_points, problem.intrinsics)
+    errors, kept = pose_errors(result.pose, problem.pose), result.weights[0] > _KEPT
+    world, truth = problem.world_points[0], problem.pose
+    house = (_in_camera(_CORNERS).to(world) - truth.translation[0]) @ truth.rotation[0]
+
+    def seen(points: Tensor) -> Tensor:
+        in_camera = points @ result.rotation[0].mT + result.translation[0]
+        return convert_points_from_homogeneous(in_camera @ problem.intrinsics[0].mT)
+
+    def upright(points: Tensor) -> Tensor:
+        in_camera = points @ truth.rotation[0].mT + truth.translation[0]
+        return in_camera[..., [0, 2, 1]] * in_camera.new_tensor([1.0, 1.0, -1.0])
+
+    figure = make_figure(WIDTH, 3.3)
+    image, space = figure.add_subplot(1, 2, 1), figure.add_subplot(1, 2, 2, projection="3d")
+    pixels, projected, edge = problem.img_points[0], seen(world), _HALF_VIEW * problem.intrinsics[0, 0, 0].item()
+    for ends in seen(house)[_EDGES]:
+        image.plot(*ends.T, color=GREY, linewidth=1.0)
+    for start, end in zip(pixels[~kept], projected[~kept], strict=True):
+        image.plot(*torch.stack((start, end)).T, color=VERMILION, linewidth=0.8, alpha=0.45)
+    image.plot(*pixels[kept].T, "o", color=BLUE, markersize=5.5)
+    image.plot(*pixels[~kept].T, "x", color=VERMILION, markersize=7.5, markeredgewidth=2.2)
+    image.set(xlim=(-edge, edge), ylim=(edge, -edge), aspect="equal", xticks=(), yticks=())
+    for spine in image.spines.values():
+        spine.set(visible=True, color=GREY)
+    image.set_title(f"{len(kept)} pairs: {kept.sum()} kept, {(~kept).sum()} rejected", fontsize=11)
+
+    for ends in upright(house)[_EDGES]:
+        space.plot(*ends.T, color=GREY, linewidth=1.0)
+    space.plot(*upright(world[kept]).T, "o", color=BLUE, markersize=4.5)
+    space.plot(*upright(world[~kept]).T, "x", color=VERMILION, markersize=5.5, markeredgewidth=1.8)
+    space.plot(*upright(_frustum(truth)).T, color=GREY, linewidth=5.0)
+    space.plot(*upright(_frustum(result.pose)).T, color="black", linewidth=1.5)
+    drawn = upright(torch.cat((world, _frustum(truth))))
+    low, high = drawn.amin(0), drawn.amax(0)
+    space.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    space.set_box_aspect((high - low).tolist(), zoom=1.45)
+    space.set_axis_off()
+    space.view_init(**_VIEWPOINT)
+    angle, shift = errors.rotation_error_deg.item(), 100.0 * errors.translation_error.item()
+    space.set_title(f"pose: {angle:.2f}° and {math.ceil(shift)} cm from the truth", fontsize=11)
+    return save(figure, path)
