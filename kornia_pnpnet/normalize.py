@@ -347,7 +347,7 @@ class Normalize(Configured):
 
     def start_pose(self, init: Pose | None, frame: Frame) -> Pose:
         """A caller's pose in the frame of the correspondences; the identity for ``None`` and where it is not finite."""
-        eye = torch.eye(3, dtype=frame.scale.dtype, device=frame.scale.device).expand(len(frame.scale), 3, 3)
+        eye = torch.eye(3, dtype=frame.scale.dtype, device=frame.scale.device).expand(frame.scale.shape[0], 3, 3)
         init = Pose(eye, torch.zeros_like(frame.centroid)) if init is None else init
         limit = torch.finfo(eye.dtype).max ** 0.25  # as for points: below it, squares of squares are finite
         usable = frame.valid & (torch.cat((init.rotation.flatten(1), init.translation), 1).abs().amax(-1) < limit)
