@@ -44,8 +44,9 @@ def row(rate, *, half=1.0, **columns):
 def test_the_pages_are_rendered_from_their_files(render):
     results = {name: render.load_results(FOLDER / f"{name}.json") for name in render.RESULTS}
     runs = {name: render.read_summary(FOLDER / f"{name}.csv") for name in render.SUMMARIES}
-    benchmark, matches = render.load("solvers", REPO / "benchmarks"), [render.load(name) for name in render.MATCHES]
-    text = render.page(results, render.load("complexity"), render.load("honesty"), runs, benchmark, matches)
+    benchmark, cameras = (render.load(name, REPO / "benchmarks") for name in ("solvers", "cameras"))
+    matches = [render.load(name) for name in render.MATCHES]
+    text = render.page(results, render.load("complexity"), render.load("honesty"), runs, benchmark, matches, cameras)
     assert text == (FOLDER / "README.md").read_text(encoding="utf-8")
     text = render.real_matches(matches, render.load("real_matches_cost"), render.load("keypoints"))
     assert text == (FOLDER / "real_matches.md").read_text(encoding="utf-8")

@@ -64,6 +64,36 @@ def summary(benchmark: Mapping[str, Any]) -> str:
     return markdown_table(["Solver", *header], [line for _, line in found])
 
 
+def unknown_focal(measured: Mapping[str, Any]) -> str:
+    """Success and time on real matches without the focal length.
+
+    Args:
+        measured: ``benchmarks/cameras.json``.
+    """
+    solvers: dict[str, list[str]] = {}
+    for row in measured["real"]:
+        cells = [f"{100 * row['success']:.1f}", f"{100 * row['far_but_ok']:.1f}", f"{row['us'] / 1000:.1f}"]
+        solvers.setdefault(f"`{row['solver']}`", []).extend(cells)
+    kinds = dict.fromkeys(row["kind"] for row in measured["real"])
+    header = [text for kind in kinds for text in (f"{kind}: solved (%)", "far, believed (%)", "ms")]
+    return markdown_table(["Solver", *header], [[name, *cells] for name, cells in solvers.items()])
+
+
+def rigs(measured: Mapping[str, Any]) -> dict[str, float]:
+    """Least success on rigs and the range of times as fast as PoseLib. The argument is that of `unknown_focal`."""
+    cells: dict[tuple[Any, ...], dict[str, Any]] = {}
+    for row in measured["rigs"]:
+        cells.setdefault((row["cameras"], row["baseline"], row["n"], row["share"]), {})[row["solver"]] = row
+    ratios = [found["PoseLib"]["us"] / found[ANY]["us"] for found in cells.values()]
+    success = [{name: 100 * found[name]["success"] for name in (ANY, "PoseLib")} for found in cells.values()]
+    return {
+        "slowest": min(ratios),
+        "fastest": max(ratios),
+        "least": min(x[ANY] for x in success),
+        "least_poselib": min(x["PoseLib"] for x in success),
+    }
+
+
 def honesty(found: Mapping[str, Any]) -> dict[str, Any]:
     """How many answers are ``ok``, how well weights are calibrated, and how well covariances fit."""
     names = list(dict.fromkeys(name for rates in found["ok"].values() for name in rates))
@@ -94,6 +124,7 @@ def page(
     short_runs: Mapping[str, Sequence[Row]],
     benchmark: Mapping[str, Any],
     matches: Sequence[Mapping[str, Any]],
+    cameras: Mapping[str, Any],
 ) -> str:
     """The results page as Markdown.
 
@@ -104,6 +135,7 @@ def page(
         short_runs: the summaries :data:`SUMMARIES`.
         benchmark: ``benchmarks/solvers.json``.
         matches: the files :data:`matches.MATCHES`.
+        cameras: ``benchmarks/cameras.json``.
     """
     at_nine = complexity["n"].index(9)
     any_network: Any = PnPNet.from_pretrained(ANY).init
@@ -121,6 +153,8 @@ def page(
         overview=overview(matches, "real_matches.md"),
         summary=summary(benchmark),
         benchmark=benchmark,
+        unknown_focal=unknown_focal(cameras),
+        rigs=rigs(cameras),
         beside_robust=compare_all((rates["set"], rates["set_real"]), ANY, ROBUST),
         beside_peers=compare_all((rates["set"], rates["set_real"]), ANY, PEERS),
         ours_beside_peers=compare_all((rates["paper"], rates["gaussian_pose"], rates["real"]), OURS, PEERS),
@@ -183,8 +217,8 @@ def write_pages(
 ) -> None:
     """Write the pages and the overviews."""
     short_runs = {name: read_summary(HERE / f"{name}.csv") for name in SUMMARIES}
-    benchmark = load("solvers", REPOSITORY / "benchmarks")
-    text = page(results, complexity, honest, short_runs, benchmark, matches)
+    benchmark, cameras = (load(name, REPOSITORY / "benchmarks") for name in ("solvers", "cameras"))
+    text = page(results, complexity, honest, short_runs, benchmark, matches, cameras)
     (HERE / "README.md").write_text(text, encoding="utf-8")
     text = real_matches(matches, load("real_matches_cost"), load("keypoints"))
     (HERE / "real_matches.md").write_text(text, encoding="utf-8")
