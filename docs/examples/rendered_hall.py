@@ -1,6 +1,6 @@
 """A hall with textured walls and boxes, rendered with known poses: the images of ``localiser.py`` and ``tracking.py``.
 
-Posters hang on the walls several times and three boxes look alike, so that some matches between images are wrong.
+Wallpaper and floor repeat a few tiles and three boxes look alike, so that many matches between images are wrong.
 The world is in metres, its z axis points up. A pose is world-to-camera, pixels are COLMAP's (the centre of the first
 pixel is (0.5, 0.5)).
 """
@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -48,38 +48,43 @@ class Plane(NamedTuple):
     texture: NDArray[np.uint8]
 
 
-def make_texture(rng: np.random.Generator, width: float, height: float) -> NDArray[np.uint8]:
-    """Shapes of all sizes on a rectangle of so many metres."""
-    columns, rows = round(width * TEXELS), round(height * TEXELS)
-    drawn = np.full((rows, columns), int(rng.integers(90, 170)), np.uint8)
-    for _ in range(round(90 * width * height)):
+def draw_shapes(drawn: NDArray[np.uint8], rng: np.random.Generator, density: float, largest: int) -> None:
+    """Draw so many ellipses and rectangles on a square metre, of up to so many texels."""
+    rows, columns = drawn.shape
+    for _ in range(round(density * rows * columns / TEXELS**2)):
         x, y = int(rng.integers(columns)), int(rng.integers(rows))
-        across, high = (int(s) for s in rng.integers(3, 40, 2))
+        across, high = (int(s) for s in rng.integers(3, largest, 2))
         shade = int(rng.integers(256))
         if rng.random() < 0.5:
             cv2.ellipse(drawn, (x, y), (across, high), float(rng.uniform(0, 180)), 0, 360, shade, -1)
         else:
             cv2.rectangle(drawn, (x, y), (x + across, y + high), shade, -1)
+
+
+def make_texture(rng: np.random.Generator, width: float, height: float, tiles: Sequence[Any] = ()) -> NDArray[np.uint8]:
+    """A rectangle of so many metres: shapes of all sizes, or tiles in a random order and a few shapes."""
+    rows, columns = round(height * TEXELS), round(width * TEXELS)
+    drawn = np.full((rows, columns), int(rng.integers(90, 170)), np.uint8)
+    if tiles:
+        step = len(tiles[0])
+        order = rng.integers(len(tiles), size=(-(-rows // step), -(-columns // step)))
+        drawn = np.block([[tiles[k] for k in row] for row in order])[:rows, :columns].copy()
+    draw_shapes(drawn, rng, *((6.0, 25) if tiles else (90.0, 40)))
     return cv2.GaussianBlur(drawn, (0, 0), 0.8)
 
 
 def make_hall(seed: int = 0) -> list[Plane]:
-    """Floor, four walls with posters, and eight boxes."""
+    """A tiled floor, four papered walls, and eight boxes."""
     rng = np.random.default_rng(seed)
     x, y, z = np.eye(3)
-    posters = [make_texture(rng, 1.0, 1.4) for _ in range(3)]
-    planes = [Plane(np.zeros(3), x, y, make_texture(rng, SIZE[0], SIZE[1]))]
+    floor, paper = ([make_texture(rng, size, size) for _ in range(4)] for size in (0.5, 1.0))
+    planes = [Plane(np.zeros(3), x, y, make_texture(rng, SIZE[0], SIZE[1], floor))]
     for corner, along in ((0 * x, x), (SIZE[0] * x, y), (SIZE * [1, 1, 0], -x), (SIZE[1] * y, -y)):
-        length = float(abs(along @ SIZE))
-        wall = make_texture(rng, length, SIZE[2])
-        for place in np.arange(0.6, length - 1.2, 2.0):
-            poster = posters[int(rng.integers(3))]
-            row, column = round(1.2 * TEXELS), round(place * TEXELS)
-            wall[row : row + poster.shape[0], column : column + poster.shape[1]] = poster
-        planes.append(Plane(corner, along, z, wall))
+        planes.append(Plane(corner, along, z, make_texture(rng, float(abs(along @ SIZE)), SIZE[2], paper)))
     twin = [make_texture(rng, 0.8, 0.8) for _ in range(5)]
     for i in range(8):
-        place = np.array([2.0 + 2.6 * (i % 4), 2.5 + 4.0 * (i // 4), 0.0]) + [*rng.uniform(-0.5, 0.5, 2), 0.0]
+        place = np.array([2.0 + 2.6 * (i % 4), 2.5 + 4.0 * (i // 4), 0.0])
+        place[:2] += rng.uniform(-0.5, 0.5, 2)
         size = rng.uniform(0.6, 1.2, 3) if i % 3 else np.full(3, 0.8)  # boxes 0, 3 and 6 look alike
         turn = rng.uniform(0.0, math.pi)
         a, b = np.array([math.cos(turn), math.sin(turn), 0.0]), np.array([-math.sin(turn), math.cos(turn), 0.0])
@@ -121,8 +126,10 @@ def photograph(hall: list[Plane], rotation: Floats, translation: Floats) -> View
         place = [x[seen][:, None] * np.float32(TEXELS) - np.float32(0.5) for x in (a, b)]
         if len(place[0]):
             blocks = [np.array_split(x, math.ceil(len(x) / 32_000)) for x in place]  # OpenCV's limit of rows
-            colours = [cv2.remap(texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-                       for u, v in zip(*blocks, strict=True)]
+            colours = [
+                cv2.remap(texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+                for u, v in zip(*blocks, strict=True)
+            ]
             image[seen], nearest[seen] = np.concatenate(colours)[:, 0], depth[seen]
     small = cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
     corners = nearest.reshape(HEIGHT, SUPERSAMPLING, WIDTH, SUPERSAMPLING)
@@ -159,10 +166,10 @@ def query_views(hall: list[Plane], count: int, seed: int = 2) -> Iterator[View]:
         turn = rng.uniform(0.0, 2.0 * math.pi)
         target = centre + 4.0 * np.array([math.cos(turn), math.sin(turn), rng.uniform(-0.35, 0.1)])
         view = photograph(hall, *look_at(centre, target))
-        yield expose(view, rng, blur=rng.uniform(0.5, 2.0), noise=rng.uniform(2.0, 12.0), gain=rng.uniform(0.3, 1.0))
+        yield expose(view, rng, blur=rng.uniform(0.5, 2.5), noise=rng.uniform(2.0, 16.0), gain=rng.uniform(0.2, 1.0))
 
 
-def make_scene(folder: Path, references: int = 40, queries: int = 60, seed: int = 0) -> Path:
+def make_scene(folder: Path, references: int = 20, queries: int = 60, seed: int = 0) -> Path:
     """Write a folder of images and a COLMAP text model of them, as COLMAP leaves it: `images` and `sparse`.
 
     The model's points are triangulated from SIFT matches of the reference images; the queries only have poses.
