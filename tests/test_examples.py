@@ -72,7 +72,7 @@ def test_disk_and_lightglue_fit_the_localiser(monkeypatch):
     pose = Pose(torch.eye(3).double(), torch.zeros(3).double())
     pixels = lafs[0, :, :, 2].double()
     points = torch.cat((pixels, torch.ones_like(pixels[:, :1])), 1)
-    photo = localiser.Photo("", image, torch.eye(3).double(), pose, lafs, descriptors, pixels, points)
+    photo = localiser.Photo("", (90, 120), torch.eye(3).double(), pose, lafs, descriptors, pixels, points)
     found = localiser.match(photo, [photo, photo], detector)
     assert len(found.scores) == 2 * len(pixels)
     assert (localiser.errors_px(found, photo) == 0).all()

@@ -47,6 +47,7 @@ from kornia_pnpnet.evaluation.figures.style import BLUE, make_figure, save, them
 from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.geometry import rotation_angle
 
+LONGEST = 1600  # pixels; larger images are shrunk for the features
 EVERY = 5  # every fifth image of a model is a query
 REFERENCES = 5  # images of the map that a query is matched with
 VOTERS = 256  # features of a query that choose them
@@ -74,7 +75,7 @@ class Photo(NamedTuple):
     """An image, its features and its pose."""
 
     name: str
-    image: Tensor  # (1, 3, H, W), 0 to 1
+    shape: tuple[int, int]  # height and width of the image in which features were found
     intrinsics: Tensor  # (3, 3)
     pose: Pose  # (3, 3), (3,): of the model
     lafs: Tensor  # (1, M, 2, 3)
@@ -125,16 +126,24 @@ class DiskLightGlue:
     def match(self, query: Photo, reference: Photo) -> tuple[Tensor, Tensor]:
         """See Detector."""
         lafs = query.lafs, reference.lafs
-        sizes = query.image.shape[-2:], reference.image.shape[-2:]
-        scores, pairs = self.matcher(query.descriptors, reference.descriptors, *lafs, *sizes)
+        scores, pairs = self.matcher(query.descriptors, reference.descriptors, *lafs, query.shape, reference.shape)
         return scores[:, 0], pairs
 
 
 DETECTORS = {"sift": Sift, "disk": DiskLightGlue}
 
 
+def read_image(path: Path) -> tuple[np.ndarray, float]:
+    """An image (H, W, 3), shrunk to at most so many pixels, and the factor."""
+    picture = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
+    if picture is None:
+        raise SystemExit(f"no image {path}")
+    scale = min(1.0, LONGEST / max(picture.shape))
+    return cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), scale
+
+
 def read_photo(image: pycolmap.Image, world: dict[int, np.ndarray], folder: Path, detector: Detector) -> Photo:
-    """Read an image of a model and find its features.
+    """Find the features of an image of a model.
 
     Args:
         image: of the model.
@@ -142,24 +151,22 @@ def read_photo(image: pycolmap.Image, world: dict[int, np.ndarray], folder: Path
         folder: the folder of the images.
         detector: finds the features.
     """
-    picture = cv2.imread(str(folder / image.name), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
-    if picture is None:
-        raise SystemExit(f"no image {folder / image.name}")
-    tensor = torch.from_numpy(picture).permute(2, 0, 1)[None].float() / 255.0
-    lafs, descriptors = detector.detect(tensor)
-    pixels = get_laf_center(lafs)[0].double() + 0.5  # COLMAP's first pixel has its middle at (0.5, 0.5)
+    picture, scale = read_image(folder / image.name)
+    lafs, descriptors = detector.detect(torch.from_numpy(picture).permute(2, 0, 1)[None].float() / 255.0)
+    # COLMAP's first pixel has its middle at (0.5, 0.5).
+    pixels = (get_laf_center(lafs)[0].double() + 0.5) / scale
     points = torch.full((len(pixels), 3), torch.nan, dtype=torch.float64)
     seen = [x for x in image.points2D if x.has_point3D() and x.point3D_id in world]
     if seen:
         observed = torch.from_numpy(np.array([x.xy for x in seen]))
         distance, nearest = torch.cdist(pixels, observed).min(1)
-        known = distance < SNAP_PX
+        known = distance < SNAP_PX / scale
         points[known] = torch.from_numpy(np.array([world[x.point3D_id] for x in seen]))[nearest[known]]
     intrinsics = torch.from_numpy(image.camera.calibration_matrix())
     pixels = torch.from_numpy(image.camera.cam_from_img(pixels.numpy())) @ intrinsics[:2, :2].mT + intrinsics[:2, 2]
     matrix = torch.from_numpy(image.cam_from_world().matrix())
     pose = Pose(matrix[:, :3], matrix[:, 3])
-    return Photo(image.name, tensor, intrinsics, pose, lafs, descriptors, pixels, points)
+    return Photo(image.name, picture.shape[:2], intrinsics, pose, lafs, descriptors, pixels, points)
 
 
 def most_alike(query: Photo, references: Sequence[Photo]) -> list[Photo]:
@@ -262,12 +269,12 @@ def summary(errors: Sequence[dict[str, Any] | None], ms: float) -> dict[str, Any
 
 def run(
     images: Path, model: pycolmap.Reconstruction, detector: Detector, *, batch: int, metre: float
-) -> tuple[dict[str, Any], list[tuple[Photo, Matches, Tensor, dict[str, Any]]]]:
+) -> tuple[dict[str, Any], list[tuple[Matches, Tensor, dict[str, Any]]]]:
     """Localise the queries of a model.
 
     Returns:
-        The results, and of each query what the picture needs: the photo, its matches, which of them the solver kept,
-        and its row of the results.
+        The results, and of each query what the picture needs: its pairs, which of them the solver kept, and its row of
+        the results.
     """
     seconds: dict[str, float] = {}
     clock = time.process_time()
@@ -284,6 +291,8 @@ def run(
     names = {x.name for x in queried}
     world = {number: point.xyz for number, point in model.points3D.items()}
     references = [read_photo(x, world, images, detector) for x in pointed if x.name not in names]
+    if not (queried and references):
+        raise SystemExit("too few images of the model have a pose and points")
     calibration = fit_scores(references, detector)
     solver = create_solver("pnpnet-set")
     lap("map")
@@ -320,7 +329,7 @@ def run(
         row["outliers_of_all"] = (errors_px(matched[i], photo) > INLIER_PX).double().mean().item()
         row |= {name: pose_error(found[i], photo.pose, metre) for name, found in poses.items()}
         rows.append(row)
-        drawn.append((photo, kept[i], weights[i][: len(error)] > 0.5, row))
+        drawn.append((kept[i], weights[i][: len(error)] > 0.5, row))
     ms = {stage: 1000.0 * x / len(photos) for stage, x in seconds.items()}
     stages = {stage: ms[stage] for stage in ("features", "retrieval", "matching", "confidence")}
     solvers = {name: summary([row[name] for row in rows], ms[name]) for name in poses}
@@ -329,13 +338,14 @@ def run(
 
 
 @themed
-def draw(drawn: Sequence[tuple[Photo, Matches, Tensor, dict[str, Any]]], path: Path) -> None:
+def draw(drawn: Sequence[tuple[Matches, Tensor, dict[str, Any]]], images: Path, path: Path) -> None:
     """Draw the pairs that the solver kept, on queries with few, some and many outliers."""
-    ranked = sorted(drawn, key=lambda x: x[3]["outliers"])
+    ranked = sorted(drawn, key=lambda x: x[2]["outliers"])
     figure = make_figure(7.2, 2.3)
     places = (len(ranked) // 2, 9 * len(ranked) // 10, -1)
-    for axes, (photo, matches, inlier, row) in zip(figure.subplots(1, 3), [ranked[i] for i in places], strict=True):
-        axes.imshow(photo.image[0].permute(1, 2, 0).numpy())
+    for axes, (matches, inlier, row) in zip(figure.subplots(1, 3), [ranked[i] for i in places], strict=True):
+        picture, scale = read_image(images / row["image"])
+        axes.imshow(picture, extent=(0, picture.shape[1] / scale, picture.shape[0] / scale, 0))
         axes.scatter(*matches.img_points[~inlier].mT, s=5, color="red", marker="x", linewidths=0.5)
         axes.scatter(*matches.img_points[inlier].mT, s=4, color=BLUE)
         axes.set_axis_off()
@@ -368,10 +378,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         detector = DETECTORS[options.features](options.count)
         model = pycolmap.Reconstruction(str(folder))
         found, drawn = run(images, model, detector, batch=options.batch, metre=options.metre)
+        options.out.mkdir(parents=True, exist_ok=True)
+        draw(drawn, images, options.out / "localiser.png")
     results = {"environment": environment(), "features": options.features, "count": options.count, **found}
-    options.out.mkdir(parents=True, exist_ok=True)
     save_results(results, options.out / "localiser.json")
-    draw(drawn, options.out / "localiser.png")
     for name, x in results["solvers"].items():
         recall = ", ".join(f"{100 * share:.0f} %" for share in x["recall"])
         print(f"{name}: recall {recall}, {x['ms']:.1f} ms for a query")

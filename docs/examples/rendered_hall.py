@@ -25,6 +25,7 @@ DOWN = np.array([0.0, 0.0, -1.0])  # gravity
 SIZE = np.array([12.0, 9.0, 4.0])  # of the hall, in metres
 TEXELS = 100  # of a texture on a metre
 SUPERSAMPLING = 2  # rays across a pixel
+MAX_DEPTH = 8.0  # metres, of the depth images
 # Points of the map: features of the images that make it, Lowe's ratio, smallest angle between rays, largest error of
 # a ray, both in degrees.
 FEATURES, RATIO, MIN_ANGLE, MAX_ERROR = 1500, 0.8, 1.5, 0.25
@@ -191,7 +192,15 @@ def make_scene(folder: Path, references: int = 20, queries: int = 60, seed: int 
     return folder
 
 
-def write_sequence(folder: Path, frames: int = 150, seed: int = 3) -> Path:
+def depth_sigma(depth: Any) -> Any:
+    """Standard deviation of a depth camera's noise in metres, at depths in metres.
+
+    C. Nguyen, S. Izadi and D. Lovell, "Modeling Kinect Sensor Noise for Improved 3D Reconstruction and Tracking", 2012.
+    """
+    return 0.0012 + 0.0019 * (depth - 0.4) ** 2
+
+
+def write_sequence(folder: Path, frames: int = 100, seed: int = 3) -> Path:
     """Write an RGB-D sequence of a camera carried around a corner of the hall, in the format of the TUM benchmark.
 
     The camera walks at 0.8 m/s, 30 frames per second, and shakes.
@@ -213,7 +222,9 @@ def write_sequence(folder: Path, frames: int = 150, seed: int = 3) -> Path:
         ahead = turn + math.pi + 0.4 * math.sin(0.9 * time)
         target = centre + 4.0 * np.array([math.cos(ahead), math.sin(ahead), -0.1 + 0.03 * math.sin(9.0 * time)])
         view = expose(photograph(hall, *look_at(centre, target)), rng, blur=1.0, noise=5.0, gain=0.8)
-        depth = np.where(np.isfinite(view.depth), view.depth * 5000.0, 0.0).round().astype(np.uint16)
+        near = np.where(view.depth < MAX_DEPTH, view.depth, 0.0)
+        noise = depth_sigma(near) * rng.normal(size=near.shape)
+        depth = np.where(near > 0, (near + noise) * 5000.0, 0.0).round().astype(np.uint16)
         for kind, image in (("rgb", view.image), ("depth", depth)):
             cv2.imwrite(str(folder / kind / f"{i:04}.png"), image)
             lines[kind].append(f"{time:.4f} {kind}/{i:04}.png")

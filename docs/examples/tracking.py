@@ -35,16 +35,17 @@ from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.geometry import rotation_angle
 
 KEYFRAME = 15  # frames from one keyframe to the next
-PAIRS = (4, 6, 10, 30, 100)  # matches of a frame that the solver gets
+PAIRS = (3, 4, 6, 10, 30, 100)  # matches of a frame that the solver gets
+DRAWN = 6  # pairs of the paths in the picture
 FREIBURG1 = (517.3, 516.5, 319.1, 255.8)  # pixels; the principal point from the corner of the first pixel
 DEPTH_UNIT = 5000.0  # of the depth images, per metre
 MOST_LAG = 0.02  # seconds between an image and its depth or its pose
 # How far a hand-held camera moves in one frame at 30 frames per second, standard deviations: radians, metres.
-MOTION = (math.radians(1.5), 0.04)
+MOTION = (math.radians(1.0), 0.04)
 GRAVITY = math.radians(0.5)  # standard deviation of the accelerometer's direction
-NOISE = {"img_sigma": 1.0, "world_sigma": 0.01}  # pixels; metres, of the depth
+PIXEL = 0.5  # standard deviation of a keypoint, pixels
 RIGHT = (0.05, 1.0)  # a frame is right within 5 cm and 1 degree
-VARIANTS = ("no prior", "last pose", "last pose and gravity", "refinement alone, last pose and gravity")
+VARIANTS = ("no prior", "last pose", "last pose and gravity", "refinement alone, both priors")
 
 
 class Frame(NamedTuple):
@@ -53,6 +54,7 @@ class Frame(NamedTuple):
     pose: Pose  # (3, 3), (3,): the true one
     down: Tensor  # (3,) direction of gravity in the camera, measured
     matches: Matches  # in a random order
+    covariances: Tensor  # (N, 3, 3) of their world points, because the depth is noisy
 
 
 def read_table(path: Path) -> dict[float, list[str]]:
@@ -80,14 +82,13 @@ def read_frame(image: Path, depth: Path, pose: Pose, intrinsics: Tensor, detecto
     """A frame with its features and their points in the world, NaN without depth."""
     picture = cv2.imread(str(image), cv2.IMREAD_COLOR_RGB)
     metres = cv2.imread(str(depth), cv2.IMREAD_UNCHANGED).astype(np.float64) / DEPTH_UNIT
-    tensor = torch.from_numpy(picture).permute(2, 0, 1)[None].float() / 255.0
-    lafs, descriptors = detector.detect(tensor)
+    lafs, descriptors = detector.detect(torch.from_numpy(picture).permute(2, 0, 1)[None].float() / 255.0)
     pixels = lafs[0, :, :, 2].double()
     columns, rows = pixels.round().long().T
     far = torch.from_numpy(metres)[rows.clamp(0, len(metres) - 1), columns.clamp(0, metres.shape[1] - 1)]
     rays = torch.cat((pixels + 0.5, torch.ones_like(pixels[:, :1])), 1) @ intrinsics.inverse().mT
     points = (torch.where(far > 0, far, torch.nan)[:, None] * rays - pose.translation) @ pose.rotation
-    return Photo(image.name, tensor, intrinsics, pose, lafs, descriptors, pixels + 0.5, points)
+    return Photo(image.name, metres.shape, intrinsics, pose, lafs, descriptors, pixels + 0.5, points)
 
 
 def read_frames(folder: Path, intrinsics: Tensor, seed: int = 0) -> tuple[list[Frame], dict[str, float]]:
@@ -110,8 +111,17 @@ def read_frames(folder: Path, intrinsics: Tensor, seed: int = 0) -> tuple[list[F
         order = likely[torch.randperm(len(likely), generator=generator)]
         tilt = GRAVITY * torch.randn(1, 3, generator=generator, dtype=torch.float64)
         felt = axis_angle_to_rotation_matrix(tilt)[0] @ pose.rotation @ down
-        frames.append(Frame(pose, felt, Matches(*(x[order] for x in matches))))
+        matches = Matches(*(x[order] for x in matches))
+        frames.append(Frame(pose, felt, matches, depth_covariances(matches.world_points, keyframe.pose)))
     return frames, {stage: 1000.0 * x / len(frames) for stage, x in seconds.items()}
+
+
+def depth_covariances(points: Tensor, camera: Pose) -> Tensor:
+    """Covariances (N, 3, 3) of points (N, 3) that a depth camera saw: its noise is along the rays."""
+    cam_points = points @ camera.rotation.mT + camera.translation
+    depth = cam_points[:, 2:]
+    error = rendered_hall.depth_sigma(depth) / depth * cam_points @ camera.rotation
+    return error[:, :, None] * error[:, None]
 
 
 def motion_prior(last: Pose, frames: int) -> PosePrior:
@@ -135,6 +145,11 @@ def with_gravity(prior: PosePrior, down: Tensor) -> PosePrior:
     return PosePrior(pose, prior.information + gravity_prior(world_down[None], down[None], GRAVITY).information)
 
 
+def place(pose: Pose) -> list[float]:
+    """Where a camera is, to a tenth of a millimetre."""
+    return [round(x, 4) for x in (-(pose.rotation.mT @ pose.translation)).tolist()]
+
+
 def moved(first: Pose, second: Pose) -> tuple[float, float]:
     """Distance of two cameras in metres and angle between them in degrees."""
     centres = [pose.rotation.mT @ pose.translation for pose in (first, second)]
@@ -143,7 +158,7 @@ def moved(first: Pose, second: Pose) -> tuple[float, float]:
 
 
 def track(
-    frames: Sequence[Frame], intrinsics: Tensor, solver: nn.Module, pairs: int, prior: Callable[..., PosePrior | None]
+    frames: Sequence[Frame], intrinsics: Tensor, solver: nn.Module, prior: Callable[..., PosePrior | None], pairs: int
 ) -> dict[str, Any]:
     """Track all frames with the first so many of their matches.
 
@@ -154,16 +169,16 @@ def track(
         frames: of a sequence.
         intrinsics: camera matrix (3, 3).
         solver: finds each pose.
-        pairs: largest number of matches of a frame.
         prior: makes the prior of a frame from the last pose, the number of frames since then, and the frame.
+        pairs: largest number of matches of a frame.
     """
     last, since, path, errors, seconds = frames[0].pose, 1, [], [], []
     for frame in frames:
-        world, img = (x[:pairs][None] for x in frame.matches[:2])
+        world, img, noise = (x[:pairs][None] for x in (*frame.matches[:2], frame.covariances))
         start = time.process_time()
         known = prior(last, since, frame)
         with torch.no_grad():
-            result = solver(world, img, intrinsics, prior=known, **NOISE)
+            result = solver(world, img, intrinsics, img_sigma=PIXEL, world_cov=noise, prior=known)
         seconds.append(time.process_time() - start)
         pose = Pose(result.rotation[0], result.translation[0])
         metres, degrees = moved(pose, last)
@@ -172,7 +187,7 @@ def track(
             last, since = pose, 1
         else:
             since += 1
-        path.append((-(last.rotation.mT @ last.translation)).tolist())
+        path.append(place(last))
         errors.append(moved(last, frame.pose))
     metres, degrees = np.array(errors).T
     return {
@@ -189,24 +204,26 @@ def run(folder: Path, intrinsics: Tensor) -> dict[str, Any]:
     """Track a sequence with each number of pairs, with and without priors."""
     frames, stages = read_frames(folder, intrinsics)
     solver = create_solver("pnpnet-set")
-    refiner = PnPNet(None, RobustWeightedLM(m=10))
-    priors: tuple[Callable[..., PosePrior | None], ...] = (
-        lambda last, since, frame: None,
-        lambda last, since, frame: motion_prior(last, since),
-        lambda last, since, frame: with_gravity(motion_prior(last, since), frame.down),
-    )
-    ways = dict(
-        zip(
-            VARIANTS, ((solver, priors[0]), (solver, priors[1]), (solver, priors[2]), (refiner, priors[2])), strict=True
-        )
-    )
-    for network, prior in ways.values():
-        track(frames[:2], intrinsics, network, PAIRS[-1], prior)  # the first call of a process takes longer
-    runs = {
-        str(pairs): {name: track(frames, intrinsics, network, pairs, prior) for name, (network, prior) in ways.items()}
-        for pairs in PAIRS
-    }
-    true = [(-(frame.pose.rotation.mT @ frame.pose.translation)).tolist() for frame in frames]
+    refiner = PnPNet(None, RobustWeightedLM(m=4))  # the last pose is near: few iterations suffice
+
+    def from_last(last: Pose, since: int, frame: Frame) -> PosePrior:
+        return motion_prior(last, since)
+
+    def from_both(last: Pose, since: int, frame: Frame) -> PosePrior:
+        return with_gravity(motion_prior(last, since), frame.down)
+
+    ways = ((solver, lambda *_: None), (solver, from_last), (solver, from_both), (refiner, from_both))
+    for way in ways:
+        track(frames[:2], intrinsics, *way, PAIRS[-1])  # the first call of a process takes longer
+    runs: dict[str, dict[str, Any]] = {}
+    for pairs in PAIRS:
+        runs[str(pairs)] = {
+            name: track(frames, intrinsics, *way, pairs) for name, way in zip(VARIANTS, ways, strict=True)
+        }
+        if pairs != DRAWN:
+            for row in runs[str(pairs)].values():
+                del row["path"]
+    true = [place(frame.pose) for frame in frames]
     return {"frames": len(frames), "right": RIGHT, "stages_ms": stages, "path": true, "runs": runs}
 
 
@@ -216,7 +233,7 @@ def draw(results: dict[str, Any], path: Path) -> None:
     figure = make_figure(7.2, 2.8)
     above, curves = figure.subplots(1, 2)
     colours = dict(zip(VARIANTS, (ORANGE, GREEN, BLUE, VERMILION), strict=True))
-    few = str(PAIRS[1])
+    few = str(DRAWN)
     for name in VARIANTS[:1] + VARIANTS[2:3]:
         above.plot(*np.array(results["runs"][few][name]["path"]).T[:2], color=colours[name], linewidth=1.0)
     above.plot(*np.array(results["path"]).T[:2], color="black", linewidth=0.8, linestyle=":")
@@ -241,7 +258,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--intrinsics", type=float, nargs=4, help=f"fx fy cx cy in pixels (default: of freiburg1, {FREIBURG1})"
     )
-    parser.add_argument("--frames", type=int, default=150, help="of the sequence that is rendered")
+    parser.add_argument("--frames", type=int, default=100, help="of the sequence that is rendered")
     parser.add_argument("--out", type=Path, default=Path("outputs/examples"))
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)  # times are those of one thread
