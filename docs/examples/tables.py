@@ -39,7 +39,7 @@ def localiser(results: dict[str, Any]) -> str:
     counts = f"{len(images)} queries, {settings['references']} images of the map"
     outliers = f"Of all matches of a query {many:.0f} % are outliers, of the {settings['pairs']} likeliest {few:.0f} %"
     caption = f"{counts}. {outliers} (medians). Share of the queries within limits:"
-    stages = ", ".join(f"{stage} {ms:.0f} ms" for stage, ms in results["stages_ms"].items())
+    stages = ", ".join(f"{stage} {ms:.1f} ms" for stage, ms in results["stages_ms"].items())
     cpu = results["environment"]["cpu"]
     return f"{caption}\n\n{table}\n\nBefore the solver each query takes: {stages}. Times are of one thread of {cpu}."
 
