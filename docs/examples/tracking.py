@@ -3,7 +3,8 @@
 FOLDER is an RGB-D sequence of the TUM benchmark (``rgb.txt``, ``depth.txt``, ``groundtruth.txt``). Every fifteenth
 frame is a keyframe: its features have points from its depth and its true pose. Each frame is matched with the last
 keyframe, and some of the matches go to the solver: alone, with the last pose as ``prior``, and with gravity, too. The
-direction of gravity is that of the true pose with noise of half a degree, as of an accelerometer.
+direction of gravity is that of the true pose with noise of half a degree, as of an accelerometer; the z axis of the
+world points up, as in the benchmark.
 
 Without ``--sequence`` a walk through a hall is rendered first (``rendered_hall.py``). Writes ``tracking.json`` and
 ``tracking.png``.
