@@ -244,14 +244,12 @@ def test_pytorch3ds_solution_has_the_axes_of_the_page(package):
     assert ours < 1.0
 
 
-@pytest.mark.slow
 @against("kornia")
 def test_matches_of_kornias_matcher_make_one_batch(package):
     page = snippet("howto/kornia.md")
     moved = torch.tensor([-0.2, 0.0, 0.0]).expand(2, 3)
-    names = "points", "pixels1", "camera", "mask", "confidence"
-    points, pixels, camera, mask, confidence = (page[name] for name in names)
+    points, pixels, camera = (page[name] for name in ("points", "pixels1", "camera"))
     with torch.no_grad():
-        result = page["solver"](points, pixels, camera, mask=mask, confidence=confidence)
+        result = page["solver"](points, pixels, camera, **page["known"])
     assert result.ok.all()
     assert torch.allclose(result.translation, moved, atol=0.005)
