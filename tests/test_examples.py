@@ -7,6 +7,9 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
+
+from kornia_pnpnet import Pose
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "docs" / "examples"
 
@@ -33,14 +36,62 @@ def test_a_boards_mislabelled_corners_do_not_matter(tmp_path):
 
 
 @pytest.mark.slow
-def test_photos_of_a_scene_are_localised(tmp_path):
-    subprocess.run([sys.executable, EXAMPLES / "localisation.py", "--out", tmp_path], check=True)
-    results = json.loads((tmp_path / "localisation.json").read_text())
-    assert (tmp_path / "localisation.png").stat().st_size > 0
-    ours, theirs = results["solvers"].values()
-    assert ours["within_1_deg_and_limit"] == len(results["images"]) == 12
-    assert ours["median_centre"] < theirs["median_centre"]
-    assert all(row["wrong"] > 0.1 for row in results["images"])
+@pytest.mark.parametrize(
+    ("references", "queries"), [(14, 4), (15, 0)], ids=["images without points", "held-out images"]
+)
+def test_queries_of_a_folder_and_a_model_are_localised(tmp_path, monkeypatch, references, queries):
+    """The queries are the images without points, or every fifth image where all have points."""
+    monkeypatch.syspath_prepend(EXAMPLES)
+    import rendered_hall
+
+    scene = rendered_hall.make_scene(tmp_path / "hall", references, queries)
+    arguments = ["--images", scene / "images", "--model", scene / "sparse", "--out", tmp_path]
+    subprocess.run([sys.executable, EXAMPLES / "localiser.py", *arguments], check=True)
+    results = json.loads((tmp_path / "localiser.json").read_text())
+    assert (tmp_path / "localiser.png").stat().st_size > 0
+    assert len(results["images"]) == (queries or references // 5)
+    ours, *theirs = results["solvers"].values()
+    assert ours["recall"][1] == 1.0  # 0.25 m, 2 degrees
+    assert all(ours["recall"][1] >= x["recall"][1] for x in theirs)
+    assert all(row["outliers"] < row["outliers_of_all"] for row in results["images"])
+
+
+def test_disk_and_lightglue_fit_the_localiser(monkeypatch):
+    """An untrained network and a matcher of nearest neighbours, because the weights would be downloaded."""
+    monkeypatch.syspath_prepend(EXAMPLES)
+    import localiser
+    from kornia.feature import match_mnn
+
+    monkeypatch.setattr(localiser.DISK, "from_pretrained", lambda checkpoint: localiser.DISK().eval())
+    monkeypatch.setattr(localiser, "LightGlueMatcher", lambda name: lambda a, b, *lafs_and_sizes: match_mnn(a, b))
+    detector = localiser.DiskLightGlue(50)
+    image = torch.rand(1, 3, 90, 120)
+    with torch.no_grad():
+        lafs, descriptors = detector.detect(image)
+    assert 0 < len(descriptors) <= 50
+    pose = Pose(torch.eye(3).double(), torch.zeros(3).double())
+    pixels = lafs[0, :, :, 2].double()
+    points = torch.cat((pixels, torch.ones_like(pixels[:, :1])), 1)
+    photo = localiser.Photo("", (90, 120), torch.eye(3).double(), pose, lafs, descriptors, pixels, points)
+    found = localiser.match(photo, [photo, photo], detector)
+    assert len(found.scores) == 2 * len(pixels)
+    assert (localiser.errors_px(found, photo) == 0).all()
+
+
+@pytest.mark.slow
+def test_priors_help_to_track_with_few_pairs(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(EXAMPLES)
+    import rendered_hall
+
+    sequence = rendered_hall.write_sequence(tmp_path / "walk", 30)
+    arguments = ["--sequence", sequence, "--intrinsics", "500", "500", "320", "240", "--out", tmp_path]
+    subprocess.run([sys.executable, EXAMPLES / "tracking.py", *arguments], check=True)
+    results = json.loads((tmp_path / "tracking.json").read_text())
+    assert (tmp_path / "tracking.png").stat().st_size > 0
+    assert results["frames"] == 28
+    assert all(run["right"] == 1.0 for run in results["runs"]["100"].values())
+    alone, *known = (run["right"] for run in results["runs"]["4"].values())
+    assert all(right > alone for right in known)
 
 
 @pytest.mark.slow

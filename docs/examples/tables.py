@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -26,22 +25,38 @@ def keypoint_covariances(results: dict[str, Any]) -> str:
     return f"Errors on test images after {updates}, {len(seeds)} seeds:\n\n{markdown_table(header, lines)}"
 
 
-def localisation(results: dict[str, Any]) -> str:
-    """Success and errors of each solver."""
-    images, unit = results["images"], results["unit"]
-    wrong = [row["wrong"] for row in images]
+def localiser(results: dict[str, Any]) -> str:
+    """Recall, errors and time of each solver, and the time of the stages before."""
+    settings, images = results["settings"], results["images"]
+    limits = [f"{near:g} m, {turn:g}°" for near, turn in results["limits"]]
     lines = []
     for name, found in results["solvers"].items():
-        turns, centres = (
-            [row[name][key] if row[name] else math.inf for row in images] for key in ("rotation_deg", "centre")
-        )
-        turn = f"{median(turns):.3f}° ({max(turns):.3f}°)"
-        centre = f"{median(centres):.4f} {unit} ({max(centres):.4f} {unit})"
-        lines.append([f"`{name}`", f"{found['within_1_deg_and_limit']}", turn, centre])
-    within = f"images within 1° and {results['limit']} {unit}"
-    header = ["Solver", within, "rotation, median (largest) error", "camera centre, median (largest) error"]
-    share = f"{100 * min(wrong):.0f} % to {100 * max(wrong):.0f} %"
-    return f"{share} of the matches of an image are outliers ({len(images)} images):\n\n{markdown_table(header, lines)}"
+        recall = [f"{100 * share:.0f} %" for share in found["recall"]]
+        error = f"{100 * found['median']['metres']:.1f} cm, {found['median']['degrees']:.2f}°"
+        lines.append([name.replace("pnpnet-set", "`pnpnet-set`"), *recall, error, f"{found['ms']:.1f}"])
+    table = markdown_table(["Solver", *limits, "median error", "ms per query"], lines)
+    few, many = (100 * median(row[key] for row in images) for key in ("outliers", "outliers_of_all"))
+    counts = f"{len(images)} queries, {settings['references']} images of the map"
+    outliers = f"Of all matches of a query {many:.0f} % are outliers, of the {settings['pairs']} likeliest {few:.0f} %"
+    caption = f"{counts}. {outliers} (medians). Share of the queries within limits:"
+    stages = ", ".join(f"{stage} {ms:.1f} ms" for stage, ms in results["stages_ms"].items())
+    cpu = results["environment"]["cpu"]
+    return f"{caption}\n\n{table}\n\nBefore the solver each query takes: {stages}. Times are of one thread of {cpu}."
+
+
+def tracking(results: dict[str, Any]) -> str:
+    """Frames that are right and time per frame, by the number of pairs, with and without priors."""
+    lines = []
+    for pairs, ways in results["runs"].items():
+        lines.append([pairs, *(f"{100 * x['right']:.0f} %, {100 * x['rmse_m']:.1f} cm" for x in ways.values())])
+    times = [median(ways[name]["ms"] for ways in results["runs"].values()) for name in results["runs"][pairs]]
+    lines.append(["ms per frame", *(f"{ms:.1f}" for ms in times)])
+    near, turn = results["right"]
+    right = f"{results['frames']} frames. Share of the frames within {100 * near:.0f} cm and {turn:g}°"
+    caption = f"{right}, and root mean square error of the path"
+    stages = " and ".join(f"{stage} {ms:.0f} ms" for stage, ms in results["stages_ms"].items())
+    table = markdown_table(["Pairs per frame", *ways], lines)
+    return f"{caption}:\n\n{table}\n\nBefore the solver each frame takes: {stages}."
 
 
 def fiducial_board(results: dict[str, Any]) -> str:
@@ -86,7 +101,7 @@ def pose_network(results: dict[str, Any]) -> str:
 
 #: The tables of each page.
 PAGES = {
-    "README.md": (keypoint_covariances, localisation, fiducial_board),
+    "README.md": (localiser, tracking, keypoint_covariances, fiducial_board),
     "clients.md": (incremental_map, pose_network),
 }
 

@@ -1,0 +1,391 @@
+"""Localise photos in a COLMAP model: ``python docs/examples/localiser.py --images FOLDER --model FOLDER``.
+
+Every fifth image of the model is a query whose observations are ignored, the others are the map. Kornia finds features
+in all images; a feature of the map that lies on an observation of the model gets its point. Each query is matched with
+the images of the map that look most like it. The scores of the matches become confidences, and ``pnpnet-set`` solves
+the queries in batches, from the likeliest pairs of each. COLMAP's estimator (pycolmap) gets the same pairs, those that
+pass the ratio test, and all matches, one query after the other.
+
+The confidences are fitted on images of the map: they are matched with the rest of the map, and the poses of the model
+tell which matches are inliers.
+
+Without ``--images`` and ``--model`` a hall is rendered first (``rendered_hall.py``). ``--features disk`` takes Kornia's
+DISK and LightGlue, whose weights Kornia downloads unless they are in the cache of ``torch.hub``. Writes
+``localiser.json`` with all poses and errors, and the picture ``localiser.png``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import cv2
+import numpy as np
+import pycolmap
+import rendered_hall
+import torch
+from kornia.feature import (
+    DISK,
+    LightGlueMatcher,
+    SIFTFeatureScaleSpace,
+    get_laf_center,
+    laf_from_center_scale_ori,
+    laf_is_filled,
+    match_snn,
+)
+from torch import Tensor, nn
+from torch.nn.utils.rnn import pad_sequence
+
+from kornia_pnpnet import PnPResult, Pose, create_solver
+from kornia_pnpnet.confidence import Calibration, fit_confidence
+from kornia_pnpnet.core.environment import environment
+from kornia_pnpnet.evaluation.figures.style import BLUE, make_figure, save, themed
+from kornia_pnpnet.evaluation.results import save_results
+from kornia_pnpnet.geometry import rotation_angle
+
+LONGEST = 1600  # pixels; larger images are shrunk for the features
+EVERY = 5  # every fifth image of a model is a query
+REFERENCES = 5  # images of the map that a query is matched with
+VOTERS = 256  # features of a query that choose them
+SNAP_PX = 2.0  # largest distance of a feature to the observation whose point it gets
+INLIER_PX = 8.0  # largest reprojection error of an inlier, for the confidences and the picture
+MOST_PAIRS = 200  # the likeliest pairs of a query that are solved
+RATIO_TEST = 0.8  # Lowe's value
+OURS = "pnpnet-set, likeliest pairs"
+# The usual limits of visual localisation (T. Sattler et al., "Benchmarking 6DOF Outdoor Visual Localization in Changing
+# Conditions", CVPR 2018) and a finer one: distance of the camera in metres, rotation in degrees.
+LIMITS = ((0.05, 0.5), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
+
+
+class Detector(Protocol):
+    """Finds and matches features."""
+
+    def detect(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Local affine frames (1, M, 2, 3) and descriptors (M, D) of an image (1, 3, H, W)."""
+
+    def match(self, query: Photo, reference: Photo) -> tuple[Tensor, Tensor]:
+        """Scores (K,) of matches, and the numbers (K, 2) of their features in both images."""
+
+
+class Photo(NamedTuple):
+    """An image, its features and its pose."""
+
+    name: str
+    shape: tuple[int, int]  # height and width of the image in which features were found
+    intrinsics: Tensor  # (3, 3)
+    pose: Pose  # (3, 3), (3,): of the model
+    lafs: Tensor  # (1, M, 2, 3)
+    descriptors: Tensor  # (M, D)
+    pixels: Tensor  # (M, 2), undistorted
+    points: Tensor  # (M, 3), NaN where a feature has no point
+
+
+class Matches(NamedTuple):
+    """Pairs of one query with the map."""
+
+    world_points: Tensor  # (N, 3)
+    img_points: Tensor  # (N, 2)
+    scores: Tensor  # (N,)
+
+
+class Sift:
+    """Kornia's SIFT; the score of a match is the ratio of the distances to the nearest two features."""
+
+    def __init__(self, count: int) -> None:
+        self.network = SIFTFeatureScaleSpace(count, descriptor_backend="pyramid")
+
+    def detect(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """See Detector."""
+        lafs, _, descriptors = self.network(image.mean(1, keepdim=True))
+        filled = laf_is_filled(lafs)[0]
+        return lafs[:, filled], descriptors[0, filled]
+
+    def match(self, query: Photo, reference: Photo) -> tuple[Tensor, Tensor]:
+        """See Detector."""
+        ratios, pairs = match_snn(query.descriptors, reference.descriptors, th=1.0)
+        return ratios[:, 0], pairs
+
+
+class DiskLightGlue:
+    """Kornia's DISK and LightGlue; their weights are downloaded unless they are at hand."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+        self.network = DISK.from_pretrained("depth")
+        self.matcher = LightGlueMatcher("disk")
+
+    def detect(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """See Detector."""
+        found = self.network(image, self.count, pad_if_not_divisible=True)[0]
+        return laf_from_center_scale_ori(found.keypoints[None]), found.descriptors
+
+    def match(self, query: Photo, reference: Photo) -> tuple[Tensor, Tensor]:
+        """See Detector."""
+        lafs = query.lafs, reference.lafs
+        scores, pairs = self.matcher(query.descriptors, reference.descriptors, *lafs, query.shape, reference.shape)
+        return scores[:, 0], pairs
+
+
+DETECTORS = {"sift": Sift, "disk": DiskLightGlue}
+
+
+def read_image(path: Path) -> tuple[np.ndarray, float]:
+    """An image (H, W, 3), shrunk to at most so many pixels, and the factor."""
+    picture = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
+    if picture is None:
+        raise SystemExit(f"no image {path}")
+    scale = min(1.0, LONGEST / max(picture.shape))
+    return cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), scale
+
+
+def read_photo(image: pycolmap.Image, world: dict[int, np.ndarray], folder: Path, detector: Detector) -> Photo:
+    """Find the features of an image of a model.
+
+    Args:
+        image: of the model.
+        world: the points by number; empty for a query.
+        folder: the folder of the images.
+        detector: finds the features.
+    """
+    picture, scale = read_image(folder / image.name)
+    lafs, descriptors = detector.detect(torch.from_numpy(picture).permute(2, 0, 1)[None].float() / 255.0)
+    # COLMAP's first pixel has its middle at (0.5, 0.5).
+    pixels = (get_laf_center(lafs)[0].double() + 0.5) / scale
+    points = torch.full((len(pixels), 3), torch.nan, dtype=torch.float64)
+    seen = [x for x in image.points2D if x.has_point3D() and x.point3D_id in world]
+    if seen:
+        observed = torch.from_numpy(np.array([x.xy for x in seen]))
+        distance, nearest = torch.cdist(pixels, observed).min(1)
+        known = distance < SNAP_PX / scale
+        points[known] = torch.from_numpy(np.array([world[x.point3D_id] for x in seen]))[nearest[known]]
+    intrinsics = torch.from_numpy(image.camera.calibration_matrix())
+    pixels = torch.from_numpy(image.camera.cam_from_img(pixels.numpy())) @ intrinsics[:2, :2].mT + intrinsics[:2, 2]
+    matrix = torch.from_numpy(image.cam_from_world().matrix())
+    pose = Pose(matrix[:, :3], matrix[:, 3])
+    return Photo(image.name, picture.shape[:2], intrinsics, pose, lafs, descriptors, pixels, points)
+
+
+def most_alike(query: Photo, references: Sequence[Photo]) -> list[Photo]:
+    """The images of the map with most nearest neighbours of the query's strongest features."""
+    owner = torch.repeat_interleave(torch.tensor([len(x.descriptors) for x in references]))
+    nearest = torch.cdist(query.descriptors[:VOTERS], torch.cat([x.descriptors for x in references])).argmin(1)
+    votes = owner[nearest].bincount(minlength=len(references))
+    return [references[i] for i in votes.argsort(descending=True)[:REFERENCES]]
+
+
+def match(query: Photo, references: Sequence[Photo], detector: Detector) -> Matches:
+    """Match a query with images of the map; a feature may have several points."""
+    found = []
+    for reference in references:
+        scores, pairs = detector.match(query, reference)
+        points = reference.points[pairs[:, 1]]
+        known = points.isfinite().all(1) & query.pixels[pairs[:, 0]].isfinite().all(1)
+        found.append(Matches(points[known], query.pixels[pairs[known, 0]], scores[known].double()))
+    return Matches(*(torch.cat(x) for x in zip(*found, strict=True)))
+
+
+def errors_px(matches: Matches, photo: Photo) -> Tensor:
+    """Reprojection errors (N,) of matches under the pose of the model, infinite behind the camera."""
+    cam_points = matches.world_points @ photo.pose.rotation.mT + photo.pose.translation
+    projected = cam_points @ photo.intrinsics.mT
+    error = (projected[:, :2] / projected[:, 2:] - matches.img_points).norm(dim=1)
+    return torch.where(cam_points[:, 2] > 0, error, torch.inf)
+
+
+def fit_scores(references: Sequence[Photo], detector: Detector) -> Calibration:
+    """Fit confidences on every fourth image of the map, matched with the rest of the map."""
+    scores, inliers = [], []
+    for i in range(0, len(references), 4):
+        others = [x for j, x in enumerate(references) if j != i]
+        matches = match(references[i], most_alike(references[i], others), detector)
+        scores.append(matches.scores)
+        inliers.append(errors_px(matches, references[i]) < INLIER_PX)
+    return fit_confidence(torch.cat(scores), torch.cat(inliers))
+
+
+def choose(matches: Matches, calibration: Calibration) -> tuple[Matches, Tensor]:
+    """The likeliest pairs of a query, and their confidences."""
+    confidence = calibration(matches.scores)
+    top = confidence.topk(min(MOST_PAIRS, len(confidence))).indices
+    return Matches(*(x[top] for x in matches)), confidence[top]
+
+
+def solve(
+    solver: nn.Module, photos: Sequence[Photo], matches: Sequence[Matches], confidences: Sequence[Tensor]
+) -> PnPResult:
+    """Solve a batch of queries with one call."""
+    world, img, confidence = (
+        pad_sequence(list(x), batch_first=True)
+        for x in ([m.world_points for m in matches], [m.img_points for m in matches], confidences)
+    )
+    mask = pad_sequence([torch.ones_like(c, dtype=torch.bool) for c in confidences], batch_first=True)
+    intrinsics = torch.stack([photo.intrinsics for photo in photos])
+    with torch.no_grad():
+        result: PnPResult = solver(world, img, intrinsics, mask=mask, confidence=confidence)
+    return result
+
+
+def believed(result: PnPResult) -> list[Pose | None]:
+    """The pose of each problem, None where it is not ok."""
+    return [Pose(*x) if ok else None for *x, ok in zip(*result.pose, result.ok, strict=True)]
+
+
+def solve_by_colmap(photo: Photo, matches: Matches) -> Pose | None:
+    """COLMAP's estimator as hloc calls it: a threshold of 12 px, all else as it comes."""
+    (fx, _, cx), (_, fy, cy), _ = photo.intrinsics.tolist()
+    camera = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=[fx, fy, cx, cy])
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.ransac.max_error = 12.0
+    options.ransac.random_seed = 0
+    found = pycolmap.estimate_and_refine_absolute_pose(
+        matches.img_points.numpy(), matches.world_points.numpy(), camera, options
+    )
+    if found is None:
+        return None
+    matrix = torch.from_numpy(found["cam_from_world"].matrix())
+    return Pose(matrix[:, :3], matrix[:, 3])
+
+
+def pose_error(found: Pose | None, truth: Pose, metre: float) -> dict[str, Any] | None:
+    """Distance of the cameras in metres and angle of the rotations in degrees; None without a pose."""
+    if found is None:
+        return None
+    centres = [-(pose.rotation.mT @ pose.translation) for pose in (found, truth)]
+    angle = torch.rad2deg(rotation_angle(found.rotation, truth.rotation)).item()
+    return {"metres": (centres[0] - centres[1]).norm().item() * metre, "degrees": angle}
+
+
+def summary(errors: Sequence[dict[str, Any] | None], ms: float) -> dict[str, Any]:
+    """Recall at each limit, median errors of the poses found, and milliseconds of the processor for each query."""
+    found = [x for x in errors if x]
+    recall = [sum(x["metres"] < near and x["degrees"] < turn for x in found) / len(errors) for near, turn in LIMITS]
+    medians = {key: float(np.median([x[key] for x in found])) if found else None for key in ("metres", "degrees")}
+    return {"recall": recall, "median": medians, "ms": ms}
+
+
+def run(
+    images: Path, model: pycolmap.Reconstruction, detector: Detector, *, batch: int, metre: float
+) -> tuple[dict[str, Any], list[tuple[Matches, Tensor, dict[str, Any]]]]:
+    """Localise the queries of a model.
+
+    Returns:
+        The results, and of each query what the picture needs: its pairs, which of them the solver kept, and its row of
+        the results.
+    """
+    seconds: dict[str, float] = {}
+    clock = time.process_time()
+
+    def lap(stage: str) -> None:
+        nonlocal clock
+        now = time.process_time()
+        seconds[stage], clock = now - clock, now
+
+    posed = sorted((x for x in model.images.values() if x.has_pose), key=lambda x: x.name)
+    pointed = [x for x in posed if x.num_points3D]
+    # A model may have images with poses and without points, as the hall that is rendered: these are the queries.
+    queried = [x for x in posed if not x.num_points3D] or pointed[EVERY // 2 :: EVERY]
+    names = {x.name for x in queried}
+    world = {number: point.xyz for number, point in model.points3D.items()}
+    references = [read_photo(x, world, images, detector) for x in pointed if x.name not in names]
+    if not (queried and references):
+        raise SystemExit("too few images of the model have a pose and points")
+    calibration = fit_scores(references, detector)
+    solver = create_solver("pnpnet-set")
+    lap("map")
+    photos = [read_photo(x, {}, images, detector) for x in queried]
+    lap("features")
+    alike = [most_alike(x, references) for x in photos]
+    lap("retrieval")
+    matched = [match(x, others, detector) for x, others in zip(photos, alike, strict=True)]
+    lap("matching")
+    chosen = [choose(x, calibration) for x in matched]
+    lap("confidence")
+    kept, confidences = (list(x) for x in zip(*chosen, strict=True))
+    groups = [slice(i, i + batch) for i in range(0, len(photos), batch)]
+    solve(solver, photos[:1], kept[:1], confidences[:1])  # the first call of a process takes longer
+    lap("preparation")
+    results = [solve(solver, photos[x], kept[x], confidences[x]) for x in groups]
+    lap(OURS)
+    poses: dict[str, list[Pose | None]] = {OURS: [pose for result in results for pose in believed(result)]}
+    theirs = {"pycolmap, the same pairs": kept}
+    if isinstance(detector, Sift):
+        theirs["pycolmap, ratio test"] = [Matches(*(x[m.scores < RATIO_TEST] for x in m)) for m in matched]
+    theirs["pycolmap, all matches"] = matched
+    for name, pairs in theirs.items():
+        clock = time.process_time()
+        poses[name] = [solve_by_colmap(x, matches) for x, matches in zip(photos, pairs, strict=True)]
+        lap(name)
+
+    weights = [w for result in results for w in result.weights]
+    rows, drawn = [], []
+    for i, photo in enumerate(photos):
+        error = errors_px(kept[i], photo)
+        row: dict[str, Any] = {"image": photo.name, "matches": len(matched[i].scores), "pairs": len(error)}
+        row["outliers"] = (error > INLIER_PX).double().mean().item()
+        row["outliers_of_all"] = (errors_px(matched[i], photo) > INLIER_PX).double().mean().item()
+        row |= {name: pose_error(found[i], photo.pose, metre) for name, found in poses.items()}
+        rows.append(row)
+        drawn.append((kept[i], weights[i][: len(error)] > 0.5, row))
+    ms = {stage: 1000.0 * x / len(photos) for stage, x in seconds.items()}
+    stages = {stage: ms[stage] for stage in ("features", "retrieval", "matching", "confidence")}
+    solvers = {name: summary([row[name] for row in rows], ms[name]) for name in poses}
+    settings = {"references": len(references), "matched_with": REFERENCES, "pairs": MOST_PAIRS, "batch": batch}
+    return {"settings": settings, "limits": LIMITS, "images": rows, "stages_ms": stages, "solvers": solvers}, drawn
+
+
+@themed
+def draw(drawn: Sequence[tuple[Matches, Tensor, dict[str, Any]]], images: Path, path: Path) -> None:
+    """Draw the pairs that the solver kept, on queries with few, some and many outliers."""
+    ranked = sorted(drawn, key=lambda x: x[2]["outliers"])
+    figure = make_figure(7.2, 2.3)
+    places = (len(ranked) // 2, 9 * len(ranked) // 10, -1)
+    for axes, (matches, inlier, row) in zip(figure.subplots(1, 3), [ranked[i] for i in places], strict=True):
+        picture, scale = read_image(images / row["image"])
+        axes.imshow(picture, extent=(0, picture.shape[1] / scale, picture.shape[0] / scale, 0))
+        axes.scatter(*matches.img_points[~inlier].mT, s=5, color="red", marker="x", linewidths=0.5)
+        axes.scatter(*matches.img_points[inlier].mT, s=4, color=BLUE)
+        axes.set_axis_off()
+        error = row[OURS]
+        off = f"{100 * error['metres']:.1f} cm off" if error else "no pose"
+        axes.set_title(f"{100 * row['outliers']:.0f} % outliers: {off}", fontsize=8)
+    save(figure, path)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Localise, write the results and draw."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--images", type=Path, help="folder of the images")
+    parser.add_argument("--model", type=Path, help="folder of the COLMAP model, text or binary")
+    parser.add_argument("--metre", type=float, default=1.0, help="metres in a unit of the model")
+    parser.add_argument("--features", choices=DETECTORS, default="sift")
+    parser.add_argument("--count", type=int, default=1500, help="features of an image")
+    parser.add_argument("--batch", type=int, default=64, help="queries that are solved in one call")
+    parser.add_argument("--rendered", type=int, nargs=2, default=(20, 60), help="images of the map and queries")
+    parser.add_argument("--out", type=Path, default=Path("outputs/examples"))
+    options = parser.parse_args(arguments)
+    if (options.images is None) != (options.model is None):
+        parser.error("--images and --model belong together")
+    torch.set_num_threads(1)  # times are those of one thread
+    with tempfile.TemporaryDirectory() as temporary:
+        images, folder = options.images, options.model
+        if images is None:
+            scene = rendered_hall.make_scene(Path(temporary) / "hall", *options.rendered)
+            images, folder = scene / "images", scene / "sparse"
+        detector = DETECTORS[options.features](options.count)
+        model = pycolmap.Reconstruction(str(folder))
+        found, drawn = run(images, model, detector, batch=options.batch, metre=options.metre)
+        options.out.mkdir(parents=True, exist_ok=True)
+        draw(drawn, images, options.out / "localiser.png")
+    results = {"environment": environment(), "features": options.features, "count": options.count, **found}
+    save_results(results, options.out / "localiser.json")
+    for name, x in results["solvers"].items():
+        recall = ", ".join(f"{100 * share:.0f} %" for share in x["recall"])
+        print(f"{name}: recall {recall}, {x['ms']:.1f} ms for a query")
+
+
+if __name__ == "__main__":
+    main()

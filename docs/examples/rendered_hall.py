@@ -1,0 +1,301 @@
+"""A hall with textured walls and boxes, rendered with known poses: the images of ``localiser.py`` and ``tracking.py``.
+
+Wallpaper and floor repeat a few tiles and three boxes look alike, so that many matches between images are wrong.
+The world is in metres, its z axis points up. A pose is world-to-camera, pixels are COLMAP's (the centre of the first
+pixel is (0.5, 0.5)).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+WIDTH, HEIGHT, FOCAL = 640, 480, 500.0
+INTRINSICS = np.array([[FOCAL, 0.0, WIDTH / 2], [0.0, FOCAL, HEIGHT / 2], [0.0, 0.0, 1.0]])
+DOWN = np.array([0.0, 0.0, -1.0])  # gravity
+SIZE = np.array([12.0, 9.0, 4.0])  # of the hall, in metres
+TEXELS = 100  # of a texture on a metre
+SUPERSAMPLING = 2  # rays across a pixel
+MAX_DEPTH = 8.0  # metres, of the depth images
+# Points of the map: features of the images that make it, Lowe's ratio, smallest angle between rays, largest error of
+# a ray, both in degrees.
+FEATURES, RATIO, MIN_ANGLE, MAX_ERROR = 1500, 0.8, 1.5, 0.25
+
+
+class View(NamedTuple):
+    """What one camera sees."""
+
+    rotation: Floats  # (3, 3)
+    translation: Floats  # (3,)
+    image: NDArray[np.uint8]  # (HEIGHT, WIDTH)
+    depth: NDArray[np.float32]  # (HEIGHT, WIDTH), metres along the optical axis, infinite where nothing is
+
+
+class Plane(NamedTuple):
+    """A textured rectangle."""
+
+    corner: Floats  # (3,)
+    along: Floats  # (3,) unit vector of the texture's columns
+    up: Floats  # (3,) unit vector of the texture's rows
+    texture: NDArray[np.uint8]
+
+
+def draw_shapes(drawn: NDArray[np.uint8], rng: np.random.Generator, density: float, largest: int) -> None:
+    """Draw so many ellipses and rectangles on a square metre, of up to so many texels."""
+    rows, columns = drawn.shape
+    for _ in range(round(density * rows * columns / TEXELS**2)):
+        x, y = int(rng.integers(columns)), int(rng.integers(rows))
+        across, high = (int(s) for s in rng.integers(3, largest, 2))
+        shade = int(rng.integers(256))
+        if rng.random() < 0.5:
+            cv2.ellipse(drawn, (x, y), (across, high), float(rng.uniform(0, 180)), 0, 360, shade, -1)
+        else:
+            cv2.rectangle(drawn, (x, y), (x + across, y + high), shade, -1)
+
+
+def make_texture(rng: np.random.Generator, width: float, height: float, tiles: Sequence[Any] = ()) -> NDArray[np.uint8]:
+    """A rectangle of so many metres: shapes of all sizes, or tiles in a random order and a few shapes."""
+    rows, columns = round(height * TEXELS), round(width * TEXELS)
+    drawn = np.full((rows, columns), int(rng.integers(90, 170)), np.uint8)
+    if tiles:
+        step = len(tiles[0])
+        order = rng.integers(len(tiles), size=(-(-rows // step), -(-columns // step)))
+        drawn = np.block([[tiles[k] for k in row] for row in order])[:rows, :columns].copy()
+    draw_shapes(drawn, rng, *((6.0, 25) if tiles else (90.0, 40)))
+    return cv2.GaussianBlur(drawn, (0, 0), 0.8)
+
+
+def make_hall(seed: int = 0) -> list[Plane]:
+    """A tiled floor, four papered walls, and eight boxes."""
+    rng = np.random.default_rng(seed)
+    x, y, z = np.eye(3)
+    floor, paper = ([make_texture(rng, size, size) for _ in range(4)] for size in (0.5, 1.0))
+    planes = [Plane(np.zeros(3), x, y, make_texture(rng, SIZE[0], SIZE[1], floor))]
+    for corner, along in ((0 * x, x), (SIZE[0] * x, y), (SIZE * [1, 1, 0], -x), (SIZE[1] * y, -y)):
+        planes.append(Plane(corner, along, z, make_texture(rng, float(abs(along @ SIZE)), SIZE[2], paper)))
+    twin = [make_texture(rng, 0.8, 0.8) for _ in range(5)]
+    for i in range(8):
+        place = np.array([2.0 + 2.6 * (i % 4), 2.5 + 4.0 * (i // 4), 0.0])
+        place[:2] += rng.uniform(-0.5, 0.5, 2)
+        size = rng.uniform(0.6, 1.2, 3) if i % 3 else np.full(3, 0.8)  # boxes 0, 3 and 6 look alike
+        turn = rng.uniform(0.0, math.pi)
+        a, b = np.array([math.cos(turn), math.sin(turn), 0.0]), np.array([-math.sin(turn), math.cos(turn), 0.0])
+        sides = [(place, a, z, 0, 2), (place + a * size[0], b, z, 1, 2), (place, b, z, 1, 2)]
+        sides += [(place + b * size[1], a, z, 0, 2), (place + z * size[2], a, b, 0, 1)]
+        for j, (corner, along, up, wide, high) in enumerate(sides):
+            texture = make_texture(rng, size[wide], size[high]) if i % 3 else twin[j]
+            planes.append(Plane(corner, along, up, texture))
+    return planes
+
+
+def look_at(centre: Floats, target: Floats) -> tuple[Floats, Floats]:
+    """The pose of a level camera that looks from a place to a target: rotation (3, 3), translation (3,)."""
+    forward = (target - centre) / np.linalg.norm(target - centre)
+    right = np.cross(DOWN, forward)
+    right /= np.linalg.norm(right)
+    rotation = np.stack((right, np.cross(forward, right), forward))
+    return rotation, -rotation @ centre
+
+
+def photograph(hall: list[Plane], rotation: Floats, translation: Floats) -> View:
+    """Render one image by casting rays, and the smallest depth in each pixel."""
+    size = np.array([WIDTH, HEIGHT]) * SUPERSAMPLING
+    columns, rows = np.meshgrid(*((np.arange(n) + 0.5) / SUPERSAMPLING for n in size))
+    rays = np.stack((columns, rows, np.ones_like(rows)), -1) @ np.linalg.inv(INTRINSICS).T @ rotation  # depth 1
+    rays = rays.astype(np.float32)
+    centre = -rotation.T @ translation
+    nearest = np.full(rays.shape[:2], np.inf, np.float32)
+    image = np.zeros(rays.shape[:2], np.uint8)
+    for corner, along, up, texture in hall:
+        normal = np.cross(along, up)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            depth = np.float32((corner - centre) @ normal) / (rays @ normal.astype(np.float32))
+            a, b = (
+                depth * (rays @ axis.astype(np.float32)) + np.float32((centre - corner) @ axis) for axis in (along, up)
+            )
+        high, wide = texture.shape
+        seen = (depth > 0.05) & (depth < nearest) & (a >= 0) & (b >= 0) & (a * TEXELS < wide) & (b * TEXELS < high)
+        place = [x[seen][:, None] * np.float32(TEXELS) - np.float32(0.5) for x in (a, b)]
+        if len(place[0]):
+            blocks = [np.array_split(x, math.ceil(len(x) / 32_000)) for x in place]  # OpenCV's limit of rows
+            colours = [
+                cv2.remap(texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+                for u, v in zip(*blocks, strict=True)
+            ]
+            image[seen], nearest[seen] = np.concatenate(colours)[:, 0], depth[seen]
+    small = cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
+    corners = nearest.reshape(HEIGHT, SUPERSAMPLING, WIDTH, SUPERSAMPLING)
+    return View(rotation, translation, small, corners.min((1, 3)))
+
+
+def expose(view: View, rng: np.random.Generator, *, blur: float, noise: float, gain: float) -> View:
+    """The view as a camera takes it: blurred (pixels), brighter or darker, with noise (grey levels)."""
+    image = cv2.GaussianBlur(view.image, (0, 0), blur).astype(np.float64)
+    image = 128.0 + gain * (image - 128.0) + rng.normal(0.0, noise, image.shape)
+    return view._replace(image=image.clip(0, 255).astype(np.uint8))
+
+
+def reference_views(hall: list[Plane], count: int, seed: int = 1) -> list[View]:
+    """Sharp images from a round through the hall, each to the far side."""
+    rng = np.random.default_rng(seed)
+    views = []
+    for i in range(count):
+        turn = 2.0 * math.pi * i / count
+        round_trip = np.array([math.cos(turn), math.sin(turn), 0.0])
+        centre = SIZE * [0.5, 0.5, 0.0] + round_trip * [4.2, 3.0, 0.0] + [0.0, 0.0, rng.uniform(1.5, 2.0)]
+        across = turn + math.pi + math.radians(50.0) * (-1.0) ** i
+        target = centre + 4.0 * np.array([math.cos(across), math.sin(across), rng.uniform(-0.25, 0.0)])
+        view = photograph(hall, *look_at(centre, target))
+        views.append(expose(view, rng, blur=0.6, noise=2.0, gain=1.0))
+    return views
+
+
+def query_views(hall: list[Plane], count: int, seed: int = 2) -> Iterator[View]:
+    """Images from anywhere in the hall to anywhere, some of them blurred, dark or noisy."""
+    rng = np.random.default_rng(seed)
+    for _ in range(count):
+        centre = rng.uniform([1.0, 1.0, 1.4], [*(SIZE[:2] - 1.0), 2.2])
+        turn = rng.uniform(0.0, 2.0 * math.pi)
+        target = centre + 4.0 * np.array([math.cos(turn), math.sin(turn), rng.uniform(-0.35, 0.1)])
+        view = photograph(hall, *look_at(centre, target))
+        yield expose(view, rng, blur=rng.uniform(0.5, 2.5), noise=rng.uniform(2.0, 16.0), gain=rng.uniform(0.2, 1.0))
+
+
+def make_scene(folder: Path, references: int = 20, queries: int = 60, seed: int = 0) -> Path:
+    """Write a folder of images and a COLMAP text model of them, as COLMAP leaves it: `images` and `sparse`.
+
+    The model's points are triangulated from SIFT matches of the reference images; the queries only have poses.
+
+    Args:
+        folder: the folder to write.
+        references: number of images that make the points, `reference00.png` and so on.
+        queries: number of images that see them, `query00.png` and so on.
+        seed: seed of the hall.
+    """
+    hall = make_hall(seed)
+    views = {f"reference{i:02}.png": view for i, view in enumerate(reference_views(hall, references))}
+    keypoints, points, tracks = triangulate(list(views.values()))
+    views |= {f"query{i:02}.png": view for i, view in enumerate(query_views(hall, queries))}
+    (folder / "images").mkdir(parents=True)
+    for name, view in views.items():
+        cv2.imwrite(str(folder / "images" / name), view.image)
+    write_model(folder / "sparse", views, keypoints, points, tracks)
+    return folder
+
+
+def depth_sigma(depth: Any) -> Any:
+    """Standard deviation of a depth camera's noise in metres, at depths in metres.
+
+    C. Nguyen, S. Izadi and D. Lovell, "Modeling Kinect Sensor Noise for Improved 3D Reconstruction and Tracking", 2012.
+    """
+    return 0.0012 + 0.0019 * (depth - 0.4) ** 2
+
+
+def write_sequence(folder: Path, frames: int = 100, seed: int = 3) -> Path:
+    """Write an RGB-D sequence of a camera carried around a corner of the hall, in the format of the TUM benchmark.
+
+    The camera walks at 0.8 m/s, 30 frames per second, and shakes.
+
+    Args:
+        folder: the folder to write: `rgb`, `depth` (16 bits, 5000 per metre), `rgb.txt`, `depth.txt`,
+            `groundtruth.txt`.
+        frames: number of images.
+        seed: seed of the hall and the noise.
+    """
+    hall, rng = make_hall(0), np.random.default_rng(seed)
+    lines: dict[str, list[str]] = {"rgb": [], "depth": [], "groundtruth": []}
+    for kind in ("rgb", "depth"):
+        (folder / kind).mkdir(parents=True)
+    for i in range(frames):
+        time, turn = i / 30.0, 0.8 * i / 30.0 / 3.2  # on a circle of 3.2 m
+        centre = np.array([6.0 + 3.2 * math.cos(turn), 4.5 + 3.2 * math.sin(turn), 1.6])
+        centre += 0.03 * np.sin(time * np.array([5.0, 7.0, 11.0]))
+        ahead = turn + math.pi + 0.4 * math.sin(0.9 * time)
+        target = centre + 4.0 * np.array([math.cos(ahead), math.sin(ahead), -0.1 + 0.03 * math.sin(9.0 * time)])
+        view = expose(photograph(hall, *look_at(centre, target)), rng, blur=1.0, noise=5.0, gain=0.8)
+        near = np.where(view.depth < MAX_DEPTH, view.depth, 0.0)
+        noise = depth_sigma(near) * rng.normal(size=near.shape)
+        depth = np.where(near > 0, (near + noise) * 5000.0, 0.0).round().astype(np.uint16)
+        for kind, image in (("rgb", view.image), ("depth", depth)):
+            cv2.imwrite(str(folder / kind / f"{i:04}.png"), image)
+            lines[kind].append(f"{time:.4f} {kind}/{i:04}.png")
+        place = pycolmap.Rigid3d(np.column_stack((view.rotation.T, centre)))
+        lines["groundtruth"].append(" ".join(map(str, (f"{time:.4f}", *centre, *place.rotation.quat))))
+    for kind, rows in lines.items():
+        (folder / f"{kind}.txt").write_text("\n".join(rows) + "\n")
+    return folder
+
+
+def triangulate(views: list[View]) -> tuple[list[Floats], list[Floats], list[dict[int, int]]]:
+    """Points from the SIFT matches of views with known poses.
+
+    Returns:
+        The keypoints (K, 2) of each view, the points (3,), and the track of each point: the number of its keypoint by
+        view.
+    """
+    sift = cv2.SIFT_create(nfeatures=FEATURES, enable_precise_upscale=True)
+    found = [sift.detectAndCompute(view.image, None) for view in views]
+    keypoints = [np.array([x.pt for x in points], dtype=np.float64) + 0.5 for points, _ in found]
+    matcher = cv2.BFMatcher(cv2.NORM_L2)
+    parent: dict[tuple[int, int], tuple[int, int]] = {}
+
+    def root(node: tuple[int, int]) -> tuple[int, int]:
+        while parent.setdefault(node, node) != node:
+            node = parent[node]
+        return node
+
+    for i, j in itertools.combinations(range(len(views)), 2):
+        back = {x.queryIdx: x.trainIdx for x in matcher.match(found[j][1], found[i][1])}
+        for first, second in matcher.knnMatch(found[i][1], found[j][1], k=2):
+            if first.distance < RATIO * second.distance and back[first.trainIdx] == first.queryIdx:
+                parent[root((i, first.queryIdx))] = root((j, first.trainIdx))
+    groups: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for node in list(parent):
+        groups.setdefault(root(node), []).append(node)
+    camera = pycolmap.Camera(model="PINHOLE", width=WIDTH, height=HEIGHT, params=[FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2])
+    poses = [pycolmap.Rigid3d(np.column_stack((view.rotation, view.translation))) for view in views]
+    options = pycolmap.EstimateTriangulationOptions(min_tri_angle=math.radians(MIN_ANGLE))
+    options.ransac.max_error = math.radians(MAX_ERROR)
+    options.ransac.random_seed = 0
+    points, tracks = [], []
+    for group in groups.values():
+        pixels = np.array([keypoints[view][feature] for view, feature in group])
+        seen_by = [view for view, _ in group]
+        made = pycolmap.estimate_triangulation(pixels, [poses[i] for i in seen_by], [camera] * len(group), options)
+        track = {} if made is None else dict(x for x, fits in zip(group, made["inliers"], strict=True) if fits)
+        if len(track) >= 2:
+            points.append(made["xyz"])
+            tracks.append(track)
+    return keypoints, points, tracks
+
+
+def write_model(
+    folder: Path, views: dict[str, View], keypoints: list[Floats], points: list[Floats], tracks: list[dict[int, int]]
+) -> None:
+    """Write a COLMAP model as text. The first views have keypoints, the others only poses."""
+    folder.mkdir(parents=True)
+    camera = f"1 PINHOLE {WIDTH} {HEIGHT} {FOCAL} {FOCAL} {WIDTH / 2} {HEIGHT / 2}\n"
+    (folder / "cameras.txt").write_text(camera)
+    point_of = {(view, feature): i + 1 for i, track in enumerate(tracks) for view, feature in track.items()}
+    lines = []
+    for i, (name, view) in enumerate(views.items()):
+        pose = pycolmap.Rigid3d(np.column_stack((view.rotation, view.translation)))
+        x, y, z, w = pose.rotation.quat
+        numbers = " ".join(map(str, (w, x, y, z, *pose.translation)))
+        seen = enumerate(keypoints[i] if i < len(keypoints) else [])
+        lines += [f"{i + 1} {numbers} 1 {name}", " ".join(f"{u} {v} {point_of.get((i, j), -1)}" for j, (u, v) in seen)]
+    (folder / "images.txt").write_text("\n".join(lines) + "\n")
+    rows = []
+    for i, (point, track) in enumerate(zip(points, tracks, strict=True)):
+        seen_by = " ".join(f"{view + 1} {feature}" for view, feature in track.items())
+        rows.append(f"{i + 1} {point[0]} {point[1]} {point[2]} 128 128 128 0 {seen_by}")
+    (folder / "points3D.txt").write_text("\n".join(rows) + "\n")
