@@ -36,7 +36,8 @@ def with_outputs(text: str) -> str:
 
 
 if __name__ == "__main__":
-    for page in [Path(name).resolve() for name in sys.argv[1:]] or sorted((HERE / "howto").glob("*.md")):
+    named = [Path(name).resolve() for name in sys.argv[1:]]
+    for page in named or [HERE / "conventions.md", *sorted((HERE / "howto").glob("*.md"))]:
         with tempfile.TemporaryDirectory() as folder:
             os.chdir(folder)
             page.write_text(with_outputs(page.read_text()))

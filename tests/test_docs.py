@@ -41,7 +41,7 @@ addEventListener("load", () => {
   document.body.textContent = JSON.stringify(wide);
 });
 """
-PAGES = [DOCS / "index.md", DOCS / "solvers.md", *sorted((DOCS / "howto").glob("*.md"))]
+PAGES = [*(DOCS / f"{name}.md" for name in ("index", "solvers", "conventions")), *sorted((DOCS / "howto").glob("*.md"))]
 COMPILE = {"compile", "export"}
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 
