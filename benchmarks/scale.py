@@ -72,8 +72,11 @@ def run(command: list[str], kill_at: tuple[Path, int, str] | None = None) -> dic
     """
     say(" ".join(command[-8:]))
     start = time.perf_counter()
-    killed, peak, cpu = None, 0, {}
-    with subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1"}, stdout=sys.stderr) as process:
+    killed, peak = None, 0
+    cpu: dict[int, float] = {}
+    with subprocess.Popen(
+        command, env={**os.environ, "OMP_NUM_THREADS": "1", "RAY_ADDRESS": "local"}, stdout=sys.stderr
+    ) as process:
         while process.poll() is None:
             time.sleep(PERIOD)
             family = processes(process.pid)
@@ -178,9 +181,8 @@ def size(folder: Path) -> int:
 def measure(problems: int, solver: str, batch: int, folder: Path) -> dict[str, Any]:
     """Draw the problems, and solve them in all ways."""
     draw(folder / "problems", problems)
-    for path in folder.iterdir():
-        if path.name != "problems":
-            shutil.rmtree(path)
+    for name in ("loop", "one", "two", "killed", "again", "again.done"):
+        shutil.rmtree(folder / name, ignore_errors=True)
     same = ["--solver", solver, "--batch-size", str(batch)]
     source = str(folder / "problems")
 
