@@ -20,6 +20,20 @@ from kornia_pnpnet.cli.shards import solve_shards  # noqa: E402
 NAMES = ("world_points", "img_points", "intrinsics")
 
 
+class Stopped(Solve):
+    """Stopped by the user after some tables."""
+
+    def __init__(self, name, after):
+        super().__init__(name)
+        self.left = after
+
+    def __call__(self, part):
+        if not self.left:
+            raise KeyboardInterrupt
+        self.left -= 1
+        return super().__call__(part)
+
+
 @pytest.fixture
 def solve():
     return Solve("reppnp")
@@ -58,14 +72,13 @@ def test_a_shard_is_read_in_batches_and_keeps_other_columns(shards, tmp_path, ma
     problems = pa.concat_tables([table(p) for p in drawn] + [table(make_problems(n=6, batch=2, dtype=torch.float32))])
     parquet.write_table(problems.append_column("id", pa.array(range(23))), tmp_path / "x.parquet")
     batches = []
-    solve = Solve("epnp-lm")
 
-    def watched(part):
-        batches.append(len(part))
-        return solve(part)
+    class Watched(Solve):
+        def __call__(self, part):
+            batches.append(len(part))
+            return super().__call__(part)
 
-    watched.solver = solve.solver
-    solve_shards(watched, [tmp_path / "x.parquet"], tmp_path / "out", name="epnp-lm", batch=5)
+    solve_shards(Watched("epnp-lm"), [tmp_path / "x.parquet"], tmp_path / "out", name="epnp-lm", batch=5)
     found = parquet.read_table(tmp_path / "out" / "x.parquet")
     assert batches == [5, 5, 5, 5, 3]
     assert found.column_names == ["id", *OUTPUTS]
@@ -75,15 +88,8 @@ def test_a_shard_is_read_in_batches_and_keeps_other_columns(shards, tmp_path, ma
 def test_it_goes_on_with_the_first_shard_without_a_result(shards, solve, tmp_path):
     folder, _ = shards
     out = tmp_path / "out"
-    calls = []
-
-    def stopped(shard, *_):
-        calls.append(shard.name)
-        if len(calls) == 2:
-            raise KeyboardInterrupt
-
     with pytest.raises(KeyboardInterrupt):
-        solve_shards(solve, [folder], out, name="reppnp", watch=stopped)
+        solve_shards(Stopped("reppnp", after=2), [folder], out, name="reppnp")
     assert sorted(x.name for x in out.iterdir()) == ["part0.parquet", "part1.parquet"]
     before = (out / "part0.parquet").stat().st_mtime_ns
     assert solve_shards(solve, [folder], out, name="reppnp")[2:] == (1, 2, [])
@@ -102,11 +108,8 @@ def test_results_of_another_solver_are_not_taken_for_its_own(shards, solve, tmp_
     with pytest.raises(InputError, match="reppnp"):  # of this name, but with other parameters
         solve_shards(other, [folder], out, name="reppnp")
 
-    def stopped(*_):
-        raise KeyboardInterrupt
-
     with pytest.raises(KeyboardInterrupt):
-        solve_shards(other, [folder], out, name="pnpnet-n9", overwrite=True, watch=stopped)
+        solve_shards(Stopped("pnpnet-n9", after=1), [folder], out, name="pnpnet-n9", overwrite=True)
     with pytest.raises(InputError, match="part1"):
         solve_shards(other, [folder], out, name="pnpnet-n9")
     assert solve_shards(other, [folder], out, name="pnpnet-n9", overwrite=True).shards == 3

@@ -110,8 +110,8 @@ def test_a_killed_worker_loses_nothing(start, tmp_path):
 def test_a_stopped_run_goes_on_where_it_was(start, tmp_path):
     (tmp_path / "wait").touch()
     process = start("id")
-    results, deadline = tmp_path / "out", time.monotonic() + 300
-    while not [path for path in results.glob("*.parquet") if path.stat().st_size] and time.monotonic() < deadline:
+    done, deadline = tmp_path / "out.done", time.monotonic() + 300
+    while not [path for path in done.glob("*.parquet") if "pending" not in path.name] and time.monotonic() < deadline:
         assert process.poll() is None
         time.sleep(0.2)
     process.kill()
@@ -122,6 +122,6 @@ def test_a_stopped_run_goes_on_where_it_was(start, tmp_path):
     assert start("id").wait(300) == 0
     assert 0 < rows_of_calls(tmp_path) < FILES * ROWS
     check_results(tmp_path)
-    before = sorted(path.name for path in results.iterdir())
+    before = sorted(path.name for path in (tmp_path / "out").iterdir())
     assert start("id").wait(300) == 0  # nothing is left to do
-    assert sorted(path.name for path in results.iterdir()) == before
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == before

@@ -18,7 +18,7 @@ from pyarrow import compute, parquet
 
 from kornia_pnpnet.arrow import INPUTS, Solve, list_column
 from kornia_pnpnet.cli.correspondence_files import InputError, read_arrays
-from kornia_pnpnet.core.files import atomic_open, digest, npz_shapes
+from kornia_pnpnet.core.files import atomic_open, digest
 
 __all__ = ["SUFFIXES", "ShardReport", "solve_shards"]
 
@@ -57,7 +57,6 @@ def solve_shards(
     name: str,
     batch: int = 10_000,
     overwrite: bool = False,
-    watch: Callable[[Path, int, int], None] = lambda path, solved, count: None,
     progress: bool = False,
 ) -> ShardReport:
     r"""Solve shards of problems one after the other, and write the results of ``part.*`` to ``part.parquet``.
@@ -77,7 +76,6 @@ def solve_shards(
         name: name of the solver. Results files store it with the digest of the solver's parameters.
         batch: number of problems solved at once.
         overwrite: also solve the shards that have results.
-        watch: called after each shard with its path, the number of solved problems and the number of problems.
         progress: show a progress bar with the rate on stderr, where stderr is a terminal and tqdm is installed.
 
     Returns:
@@ -104,7 +102,6 @@ def solve_shards(
                 failed.append(str(error))
                 continue
             solved, problems = solved + ok, problems + count
-            watch(shard, ok, count)
     return ShardReport(solved, problems, len(waiting) - len(failed), len(targets) - len(waiting), failed)
 
 
@@ -143,11 +140,9 @@ def _bar(shards: Iterable[Path], shown: bool) -> Iterator[Callable[[int], object
         return
     from tqdm import tqdm
 
-    total = 0
-    for shard in shards:
-        with suppress(ValueError, OSError, pa.ArrowException):  # reported when the shard's turn comes
-            rows = shard.suffix == ".parquet" and parquet.read_metadata(shard).num_rows
-            total += rows or npz_shapes(shard, INPUTS)["world_points"][0]
+    total = None  # of NPZ files, and where a file cannot be read
+    with suppress(OSError, pa.ArrowException):
+        total = sum(parquet.read_metadata(shard).num_rows for shard in shards)
     with tqdm(total=total, unit="problem", unit_scale=True) as bar:
         yield bar.update
 

@@ -152,7 +152,6 @@ def _solve_batch(arguments: argparse.Namespace, camera: Tensor | None) -> int:
             name=name,
             batch=arguments.batch_size,
             overwrite=arguments.overwrite,
-            watch=lambda shard, solved, count: print(f"{shard}: {solved} of {count} solved", flush=True),
             progress=True,
         )
     except KeyboardInterrupt:
