@@ -55,7 +55,7 @@ def solve(
         batch_format="pyarrow",
         batch_size=batch,
         compute=ActorPoolStrategy(size=workers),
-        num_cpus=0.5,  # workers that take every core leave none to the tasks that read, and Ray waits forever
+        num_cpus=0,  # Ray would wait forever if workers took all cores and left none to the tasks that read
     )
     poses.write_parquet(out, mode=SaveMode.APPEND if id_column else SaveMode.ERROR)
 
