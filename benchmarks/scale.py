@@ -1,8 +1,9 @@
 """Very many problems with Ray Data beside a plain loop: ``python benchmarks/scale.py --problems 10000000``.
 
 Draws problems of nine pairs into Parquet files. Solves them with ``pnpnet solve --batch`` and with
-``docs/examples/ray_data.py``: one worker, two workers, two workers of which one is killed, and a run that is killed as
-a whole and repeated. Compares the results with those of the loop, problem by problem. Writes ``scale.json``.
+``docs/examples/ray_data.py``: a few problems (what the start costs), one worker, two workers, two workers of which one
+is killed, and a run that is killed as a whole and repeated. Compares the results with those of the loop, problem by
+problem. Writes ``scale.json``.
 """
 
 from __future__ import annotations
@@ -34,6 +35,8 @@ COMMAND = [sys.executable, "-c", "import sys; from kornia_pnpnet.cli import main
 PAIRS, OUTLIERS = 9, 2
 #: Largest number of problems in a file.
 FILE = 250_000
+#: Problems of a run that is little more than the start of Ray.
+FEW = 1000
 #: Seconds between two looks at the memory.
 PERIOD = 0.5
 #: The title of a worker's process.
@@ -180,16 +183,18 @@ def size(folder: Path) -> int:
 
 def measure(problems: int, solver: str, batch: int, folder: Path) -> dict[str, Any]:
     """Draw the problems, and solve them in all ways."""
+    draw(folder / "few", FEW)
     draw(folder / "problems", problems)
-    for name in ("loop", "one", "two", "killed", "again", "again.done"):
+    for name in ("start", "loop", "one", "two", "killed", "again", "again.done"):
         shutil.rmtree(folder / name, ignore_errors=True)
     same = ["--solver", solver, "--batch-size", str(batch)]
     source = str(folder / "problems")
 
-    def ray(name: str, workers: int, *more: str) -> list[str]:
+    def ray(name: str, workers: int, *more: str, source: str = source) -> list[str]:
         return [sys.executable, str(EXAMPLE), source, str(folder / name), *same, "--workers", str(workers), *more]
 
-    runs = {"loop": run([*COMMAND, source, "--out", str(folder / "loop"), *same])}
+    runs = {"start": run(ray("start", 2, source=str(folder / "few")))}
+    runs["loop"] = run([*COMMAND, source, "--out", str(folder / "loop"), *same])
     runs["one"] = run(ray("one", 1))
     runs["two"] = run(ray("two", 2))
     runs["killed"] = run(ray("killed", 2), (folder / "killed", problems // 3, WORKER))
