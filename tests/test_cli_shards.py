@@ -1,6 +1,5 @@
-"""Shards of problems: the poses are those of a call, each shard is solved once, also after an interruption."""
+"""Shards of problems: each is solved once, also after an interruption, and its results say of which solver they are."""
 
-import json
 import os
 import subprocess
 import sys
@@ -12,86 +11,114 @@ import torch
 from kornia_pnpnet import create_solver
 from kornia_pnpnet.cli import main
 from kornia_pnpnet.cli.correspondence_files import InputError
-from kornia_pnpnet.cli.shards import MANIFEST, solve_shards
+
+pa = pytest.importorskip("pyarrow")
+parquet = pytest.importorskip("pyarrow.parquet")
+from kornia_pnpnet.arrow import OUTPUTS, Solve, list_column  # noqa: E402
+from kornia_pnpnet.cli.shards import solve_shards  # noqa: E402
 
 NAMES = ("world_points", "img_points", "intrinsics")
 
 
+class Stopped(Solve):
+    """Stopped by the user after some tables."""
+
+    def __init__(self, name, after):
+        super().__init__(name)
+        self.left = after
+
+    def __call__(self, part):
+        if not self.left:
+            raise KeyboardInterrupt
+        self.left -= 1
+        return super().__call__(part)
+
+
 @pytest.fixture
-def solver():
-    return create_solver("reppnp")
+def solve():
+    return Solve("reppnp")
 
 
 def arrays(problems):
     return {name: getattr(problems, name).numpy() for name in NAMES}
 
 
+def table(problems):
+    return pa.table({name: list_column(array) for name, array in arrays(problems).items()})
+
+
 @pytest.fixture
 def shards(tmp_path, make_problems):
-    """Three shards of problems and the problems."""
+    """Two NPZ files and a Parquet file of problems, and the problems."""
     folder = tmp_path / "shards"
     folder.mkdir()
     drawn = [make_problems(n=9, batch=7, outliers=1, seed=i, dtype=torch.float32) for i in range(3)]
-    for i, problems in enumerate(drawn):
+    for i, problems in enumerate(drawn[:2]):
         np.savez(folder / f"part{i}.npz", **arrays(problems))
+    parquet.write_table(table(drawn[2]), folder / "part2.parquet")
     return folder, drawn
 
 
-def test_poses_are_those_of_a_call(shards, solver, tmp_path):
+def test_results_are_those_of_the_tables(shards, solve, tmp_path):
     folder, drawn = shards
-    report = solve_shards(solver, [folder], tmp_path / "out", name="reppnp", batch=3)
-    assert report == (sum(int(solver(*p[:3]).ok.sum()) for p in drawn), 21, 3, 0, [])
+    report = solve_shards(solve, [folder], tmp_path / "out", name="reppnp", batch=7)
+    assert report == (sum(int(solve.solver(*p[:3]).ok.sum()) for p in drawn), 21, 3, 0, [])
     for i, problems in enumerate(drawn):
-        expected = solver(*problems[:3])
-        with np.load(tmp_path / "out" / f"part{i}.npz") as found:
-            assert set(found.files) == {"rotation", "translation", "weights", "cost", "ok"}
-            assert found["ok"].tolist() == expected.ok.tolist()
-            np.testing.assert_allclose(found["translation"], expected.translation, rtol=1e-4)
-            assert found["weights"].dtype == np.float32
+        assert parquet.read_table(tmp_path / "out" / f"part{i}.parquet") == solve(table(problems))
 
 
-def test_it_goes_on_with_the_first_shard_without_a_result(shards, solver, tmp_path, monkeypatch):
+def test_a_shard_is_read_in_batches_and_keeps_other_columns(shards, tmp_path, make_problems):
+    _, drawn = shards
+    problems = pa.concat_tables([table(p) for p in drawn] + [table(make_problems(n=6, batch=2, dtype=torch.float32))])
+    parquet.write_table(problems.append_column("id", pa.array(range(23))), tmp_path / "x.parquet")
+    batches = []
+
+    class Watched(Solve):
+        def __call__(self, part):
+            batches.append(len(part))
+            return super().__call__(part)
+
+    solve_shards(Watched("epnp-lm"), [tmp_path / "x.parquet"], tmp_path / "out", name="epnp-lm", batch=5)
+    found = parquet.read_table(tmp_path / "out" / "x.parquet")
+    assert batches == [5, 5, 5, 5, 3]
+    assert found.column_names == ["id", *OUTPUTS]
+    assert found["id"].to_pylist() == [*range(23)]
+
+
+def test_it_goes_on_with_the_first_shard_without_a_result(shards, solve, tmp_path):
     folder, _ = shards
     out = tmp_path / "out"
-    calls = []
+    with pytest.raises(KeyboardInterrupt):
+        solve_shards(Stopped("reppnp", after=2), [folder], out, name="reppnp")
+    assert sorted(x.name for x in out.iterdir()) == ["part0.parquet", "part1.parquet"]
+    before = (out / "part0.parquet").stat().st_mtime_ns
+    assert solve_shards(solve, [folder], out, name="reppnp")[2:] == (1, 2, [])
+    assert (out / "part0.parquet").stat().st_mtime_ns == before
+    assert solve_shards(solve, [folder], out, name="reppnp", overwrite=True).shards == 3
+    assert (out / "part0.parquet").stat().st_mtime_ns > before
 
-    def stopped(shard, *_):
-        calls.append(shard.name)
-        if len(calls) == 2:
-            raise KeyboardInterrupt
+
+def test_results_of_another_solver_are_not_taken_for_its_own(shards, solve, tmp_path):
+    folder, _ = shards
+    out = tmp_path / "out"
+    solve_shards(solve, [folder], out, name="reppnp")
+    other = Solve("pnpnet-n9")
+    with pytest.raises(InputError, match="pnpnet-n9"):
+        solve_shards(other, [folder], out, name="pnpnet-n9")
+    with pytest.raises(InputError, match="reppnp"):  # of this name, but with other parameters
+        solve_shards(other, [folder], out, name="reppnp")
 
     with pytest.raises(KeyboardInterrupt):
-        solve_shards(solver, [folder], out, name="reppnp", watch=stopped)
-    assert sorted(x.name for x in out.iterdir()) == [MANIFEST, "part0.npz", "part1.npz"]
-    before = (out / "part0.npz").stat().st_mtime_ns
-    assert solve_shards(solver, [folder], out, name="reppnp")[2:] == (1, 2, [])
-    assert (out / "part0.npz").stat().st_mtime_ns == before
-    assert solve_shards(solver, [folder], out, name="reppnp", overwrite=True).shards == 3
-    assert (out / "part0.npz").stat().st_mtime_ns > before
+        solve_shards(Stopped("pnpnet-n9", after=1), [folder], out, name="pnpnet-n9", overwrite=True)
+    with pytest.raises(InputError, match="part1"):
+        solve_shards(other, [folder], out, name="pnpnet-n9")
+    assert solve_shards(other, [folder], out, name="pnpnet-n9", overwrite=True).shards == 3
+    (out / "part0.parquet").write_bytes(b"{")
+    with pytest.raises(InputError, match="part0"):
+        solve_shards(other, [folder], out, name="pnpnet-n9")
 
 
-def test_another_solver_does_not_go_on_in_the_same_folder(shards, solver, tmp_path):
-    folder, _ = shards
-    solve_shards(solver, [folder], tmp_path / "out", name="reppnp")
-    with pytest.raises(InputError, match="pnpnet-n9"):
-        solve_shards(create_solver("pnpnet-n9"), [folder], tmp_path / "out", name="pnpnet-n9")
-    one = next(folder.iterdir())
-    with pytest.raises(InputError, match="all of them"):
-        solve_shards(create_solver("pnpnet-n9"), [one], tmp_path / "out", name="pnpnet-n9", overwrite=True)
-
-    def stopped(*_):
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):  # the results left in the folder are by one solver
-        solve_shards(create_solver("epnp"), [folder], tmp_path / "out", name="epnp", overwrite=True, watch=stopped)
-    assert len(list((tmp_path / "out").glob("*.npz"))) == 1
-    assert solve_shards(solver, [folder], tmp_path / "out", name="reppnp", overwrite=True).shards == 3
-    (tmp_path / "out" / MANIFEST).write_text("{")
-    with pytest.raises(InputError, match="reppnp"):
-        solve_shards(solver, [folder], tmp_path / "out", name="reppnp")
-
-
-def test_a_shard_that_cannot_be_read_stops_no_other(shards, solver, tmp_path):
+def test_a_shard_that_cannot_be_read_stops_no_other(shards, solve, tmp_path):
     folder, drawn = shards
     good = arrays(drawn[0])
     (folder / "a.npz").write_bytes(b"PK\x03\x04 nothing")
@@ -99,90 +126,45 @@ def test_a_shard_that_cannot_be_read_stops_no_other(shards, solver, tmp_path):
     np.savez(folder / "c.npz", **{**good, "img_points": good["img_points"][:5]})
     np.savez(folder / "d.npz", **{**good, "world_points": good["world_points"].astype(object)})
     np.savez(folder / "e.npz", world_points=good["world_points"], img_points=good["img_points"])
-    report = solve_shards(solver, [folder], tmp_path / "out", name="reppnp")
+    np.savez(folder / "f.npz", **{**good, "world_points": good["world_points"].swapaxes(1, 2)})
+    (folder / "g.parquet").write_bytes(b"PAR1")
+    parquet.write_table(table(drawn[0]).drop_columns("intrinsics"), folder / "h.parquet")
+    report = solve_shards(solve, [folder], tmp_path / "out", name="reppnp")
     assert report.shards == 3
-    for name, why in zip(
-        "abcde", ("not an NPZ", "no array img_points", "of the shape", "not an NPZ", "pass --intrinsics"), strict=True
-    ):
-        (line,) = (x for x in report.failed if f"/{name}.npz" in x)
-        assert why in line
-    assert sorted(x.name for x in (tmp_path / "out").iterdir())[1:] == ["part0.npz", "part1.npz", "part2.npz"]
+    assert len(report.failed) == 8
+    for name, line in zip("abcdefgh", report.failed, strict=True):
+        assert f"/{name}." in line
+    assert sorted(x.stem for x in (tmp_path / "out").iterdir()) == ["part0", "part1", "part2"]
 
 
-def test_one_bad_problem_is_not_ok_and_no_more(shards, solver, tmp_path):
-    folder, drawn = shards
-    broken = arrays(drawn[0])
-    broken["world_points"] = broken["world_points"].copy()
-    broken["world_points"][2, 3] = np.nan
-    np.savez(folder / "part0.npz", **broken)
-    solve_shards(solver, [folder / "part0.npz"], tmp_path / "out", name="reppnp")
-    with np.load(tmp_path / "out" / "part0.npz") as found:
-        assert not found["ok"][2]
-        assert found["ok"].sum() >= 5
-        assert np.isfinite(found["rotation"]).all()
-
-
-def test_weights_noise_and_a_shared_camera(make_problems, tmp_path):
+def test_weights_noise_and_a_shared_camera_in_arrays(make_problems, tmp_path):
     p = make_problems(n=9, batch=5, dtype=torch.float32)
     weights = torch.ones(5, 9)
     weights[:, 7:] = 0.0
-    np.savez(tmp_path / "x.npz", **arrays(p) | {"weights": weights.numpy(), "img_sigma": np.array(1.0)})
+    of_all = {"img_sigma": np.array(1.0), "intrinsics": p.intrinsics[0].numpy()}
+    np.savez(tmp_path / "x.npz", **arrays(p) | {"weights": weights.numpy()} | of_all)
     solver = create_solver("pnpnet-set")
-    solve_shards(solver, [tmp_path / "x.npz"], tmp_path / "out", name="pnpnet-set")
+    solve_shards(Solve(solver), [tmp_path / "x.npz"], tmp_path / "out", name="pnpnet-set")
     with torch.no_grad():
         expected = solver(*p[:3], weights=weights, img_sigma=1.0)
-    with np.load(tmp_path / "out" / "x.npz") as found:
-        np.testing.assert_allclose(found["rotation"], expected.rotation, atol=1e-5)
-        assert (found["weights"][:, 7:] == 0).all()
-    two = arrays(p)
-    camera = torch.from_numpy(two.pop("intrinsics"))[0]
-    np.savez(tmp_path / "y.npz", **two)
-    assert solve_shards(solver, [tmp_path / "y.npz"], tmp_path / "z", name="pnpnet-set", intrinsics=camera).shards == 1
+    found = parquet.read_table(tmp_path / "out" / "x.parquet")
+    np.testing.assert_allclose(found["rotation"].to_pylist(), expected.rotation.flatten(1), atol=1e-5)
 
 
-@pytest.mark.parametrize("nested", [False, True])
-def test_parquet_with_numbers_of_pairs_that_differ(nested, make_problems, tmp_path):
-    pyarrow = pytest.importorskip("pyarrow")
-    parquet = pytest.importorskip("pyarrow.parquet")
-    drawn = [make_problems(n=n, batch=1, dtype=torch.float32) for n in (6, 12, 9, 30)]
-    rows = [{name: (x[0] if nested else x[0].flatten()).tolist() for name, x in arrays(p).items()} for p in drawn]
-    parquet.write_table(pyarrow.Table.from_pylist(rows), tmp_path / "x.parquet")
-    solver = create_solver("pnpnet-set")
-    report = solve_shards(solver, [tmp_path / "x.parquet"], tmp_path / "out", name="pnpnet-set", batch=3)
-    assert report[1:] == (4, 1, 0, [])
-    found = parquet.read_table(tmp_path / "out" / "x.parquet").to_pylist()
-    for row, p in zip(found, drawn, strict=True):
-        with torch.no_grad():
-            alone = solver(*p[:3])
-        np.testing.assert_allclose(row["translation"], alone.translation[0], rtol=1e-3)
-        assert len(row["weights"]) == p.world_points.shape[1]
-        assert row["ok"] == alone.ok.item()
-    rows[1]["img_points"] = rows[1]["img_points"][:-1]
-    parquet.write_table(pyarrow.Table.from_pylist(rows), tmp_path / "bad.parquet")
-    (tmp_path / "no.parquet").write_bytes(b"PAR1")
-    report = solve_shards(
-        solver, [tmp_path / "bad.parquet", tmp_path / "no.parquet"], tmp_path / "out", name="pnpnet-set"
-    )
-    assert f"row 1: img_points must have 24 numbers, got {22 if nested else 23}" in report.failed[0]
-    assert "not a Parquet file" in report.failed[1]
-    assert not (tmp_path / "out" / "bad.parquet").exists()
-
-
-def test_sources_that_are_no_shards(shards, solver, tmp_path):
+def test_sources_that_are_no_shards(shards, solve, tmp_path):
     folder, drawn = shards
     (tmp_path / "empty").mkdir()
-    np.savez(tmp_path / "part0.npz", **arrays(drawn[0]))
-    for sources, why in (
-        ([tmp_path / "empty"], "no .npz or .parquet file"),
-        ([tmp_path / "x.npz"], "no such file"),
-        ([tmp_path / "x.txt"], "must end in"),
-        ([folder, tmp_path / "part0.npz"], "same name"),
-        ([folder], None),
+    np.savez(tmp_path / "part2.npz", **arrays(drawn[0]))
+    for sources, out, why in (
+        ([tmp_path / "empty"], "out", "no .npz or .parquet file"),
+        ([tmp_path / "x.npz"], "out", "no such file"),
+        ([tmp_path / "x.txt"], "out", "must end in"),
+        ([folder, tmp_path / "part2.npz"], "out", "would have the name"),
+        ([folder], folder, "another folder"),
     ):
-        out = folder if why is None else tmp_path / "out"
         before = {x.name: x.read_bytes() for x in folder.iterdir()}
-        with pytest.raises(InputError, match=why or "overwrite the shard"):
-            solve_shards(solver, sources, out, name="reppnp", overwrite=True)
+        with pytest.raises(InputError, match=why):
+            solve_shards(solve, sources, tmp_path / out, name="reppnp", overwrite=True)
         assert {x.name: x.read_bytes() for x in folder.iterdir()} == before
 
 
@@ -193,7 +175,6 @@ def test_the_command(shards, tmp_path, capsys):
     assert "of 21 problems in 3 shards solved" in capsys.readouterr().out
     assert main(command) == 0
     assert "3 shards had been solved before" in capsys.readouterr().out
-    assert json.loads((tmp_path / "out" / MANIFEST).read_text())["solver"] == "reppnp"
     (folder / "z.npz").write_bytes(b"")
     assert main(command) == 2
     assert "z.npz" in capsys.readouterr().err
@@ -228,8 +209,8 @@ def peak_memory(folder, count):
 @pytest.mark.parametrize("kind", ["shards", "Parquet", "Parquet in row groups"])
 def test_memory_does_not_grow_with_the_data(kind, make_problems, tmp_path):
     """Ten times the data, 160 MB: in shards, in one Parquet file that is one row group, in one that has many."""
-    one = arrays(make_problems(n=40, batch=10_000, dtype=torch.float32))
-    np.savez(tmp_path / "one.npz", **one)
+    problems = make_problems(n=40, batch=10_000, dtype=torch.float32)
+    np.savez(tmp_path / "one.npz", **arrays(problems))
     rows = 1000 if kind == "Parquet in row groups" else 200_000
     peaks = []
     for times in (2, 20):
@@ -239,9 +220,7 @@ def test_memory_does_not_grow_with_the_data(kind, make_problems, tmp_path):
             for i in range(times):
                 (folder / f"{i}.npz").symlink_to(tmp_path / "one.npz")
         else:
-            pyarrow = pytest.importorskip("pyarrow")
-            parquet = pytest.importorskip("pyarrow.parquet")
-            table = pyarrow.table({key: [*x.reshape(10_000, -1)] for key, x in one.items()})
-            parquet.write_table(pyarrow.concat_tables(times * [table]), folder / "x.parquet", row_group_size=rows)
+            many = pa.concat_tables(times * [table(problems)])
+            parquet.write_table(many, folder / "x.parquet", row_group_size=rows)
         peaks.append(peak_memory(folder, times * 10_000))
     assert peaks[1] < 1.1 * peaks[0]

@@ -18,9 +18,8 @@ from hypothesis import strategies as st
 from kornia.core.exceptions import ValueCheckError
 from strategies import damage, many
 
-from kornia_pnpnet import MLPInit, PnPNet, PoseLoss, RobustWeightedLM, create_solver
+from kornia_pnpnet import MLPInit, PnPNet, PoseLoss, RobustWeightedLM
 from kornia_pnpnet.cli import main
-from kornia_pnpnet.cli.shards import MANIFEST, solve_shards
 from kornia_pnpnet.data import SyntheticProblems
 from kornia_pnpnet.training import TrainSettings, fit
 from kornia_pnpnet.training.checkpoint import CHECKPOINT_NAME, HISTORY_NAME, save_checkpoint
@@ -149,23 +148,21 @@ def arrays_of(source):
 
 def _shards_on_a_full_disk(source, out):
     resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
-    try:
-        solve_shards(create_solver("epnp"), [source], out, name="epnp")
-    except OSError:
-        sys.exit(3)
+    sys.exit(main(["solve", "--batch", "--solver", "epnp", "--out", str(out), str(source)]))
 
 
-def test_shards_on_a_full_disk_are_whole_or_missing(tmp_path):
+def test_shards_on_a_full_disk_are_whole_or_missing(tmp_path, capsys):
+    pytest.importorskip("pyarrow")
     source, out = tmp_path / "in", tmp_path / "out"
     source.mkdir()
     for name, count in (("a", 10), ("b", 1000), ("c", 10)):
         np.savez(source / f"{name}.npz", **arrays_of(SyntheticProblems(n=6, batch_size=count, seed=0)))
     process = in_a_process(_shards_on_a_full_disk, source, out)
     process.join()
-    assert process.exitcode == 3
-    assert {path.name for path in out.iterdir()} == {"manifest.json", "a.npz"}
-    report = solve_shards(create_solver("epnp"), [source], out, name="epnp")
-    assert (report.shards, report.kept) == (2, 1)
+    assert process.exitcode == 2
+    assert {path.name for path in out.iterdir()} == {"a.parquet"}
+    assert main(["solve", "--batch", "--solver", "epnp", "--out", str(out), str(source)]) == 0
+    assert "in 2 shards solved; 1 shards had been solved before" in capsys.readouterr().out
 
 
 def _solve_batch(source, out):
@@ -181,23 +178,18 @@ def test_kill_9_at_any_moment_loses_no_results(tmp_path):
     source.mkdir()
     for i in range(20):
         arrays = arrays_of(SyntheticProblems(n=6, batch_size=1000, seed=i))
-        np.savez(source / f"{i:02}.npz", **arrays)
         if i % 4 == 0:
             lists = {key: [*x.reshape(1000, -1)] for key, x in arrays.items()}
             parquet.write_table(pyarrow.table(lists), source / f"{i:02}.parquet")
-
-    def read(path):
-        if path.suffix == ".parquet":
-            return parquet.read_table(path).to_pydict()
-        with np.load(path) as file:
-            return {key: file[key].tolist() for key in file.files}
+        else:
+            np.savez(source / f"{i:02}.npz", **arrays)
 
     began = time.monotonic()
     process = in_a_process(_solve_batch, source, whole)
     process.join()
     took = time.monotonic() - began
     assert process.exitcode == 0
-    names = {path.name for path in source.iterdir()}
+    names = {f"{path.stem}.parquet" for path in source.iterdir()}
     chance = random.Random(0)
     killed, amid, run = 0, 0, 0
     while killed < KILLS:
@@ -216,8 +208,8 @@ def test_kill_9_at_any_moment_loses_no_results(tmp_path):
                 assert process.exitcode == -signal.SIGKILL
                 killed += 1
                 amid += 0 < len(made) < len(names)
-        assert {path.name for path in out.iterdir() if path.suffix != ".tmp"} == {MANIFEST, *names}
-        assert all(read(out / name) == read(whole / name) for name in names)
+        assert {path.name for path in out.iterdir() if path.suffix != ".tmp"} == names
+        assert all(parquet.read_table(out / name) == parquet.read_table(whole / name) for name in names)
     assert amid >= 3  # else the moments say nothing
 
 

@@ -32,7 +32,7 @@ LAYERS = (
     ),
     ("solver",),
     ("registry", "peers", "__init__"),
-    ("training", "evaluation", "export"),
+    ("training", "evaluation", "export", "arrow"),
     ("cli",),
 )
 
@@ -49,6 +49,7 @@ EXTRAS = (
     "pyarrow",
     "pycolmap",
     "pydantic",
+    "ray",
     "seaborn",
     "tensorboard",
 )
@@ -63,7 +64,8 @@ OWNERS = {
     "kornia_rs": {"peers"},
     "pycolmap": {"data.colmap", "peers"},
     "poselib": {"peers"},
-    "pyarrow": {"cli.shards"},
+    "pyarrow": {"arrow", "cli.shards"},
+    "ray": set(),
     "pydantic": {"core.schema", "evaluation.forms"},
     "onnx_ir": {"export"},
     "onnxscript": {"export"},

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,8 +21,6 @@ __all__ = [
     "camera_matrix",
     "colmap_camera",
     "check_camera",
-    "check_points_present",
-    "check_shapes",
     "read_arrays",
     "read_correspondences",
 ]
@@ -146,8 +144,10 @@ def _read_npz(path: Path) -> ImageCorrespondences:
     arrays = read_arrays(path, ("world_points", "img_points", "weights", "intrinsics"))
     count = len(arrays["world_points"]) if arrays["world_points"].ndim else 0
     shapes = {"world_points": (count, 3), "img_points": (count, 2), "weights": (count,), "intrinsics": (3, 3)}
-    check_shapes(path, arrays, {name: (shape,) for name, shape in shapes.items()})
     for name, array in arrays.items():
+        if array.dtype.kind not in "fiub" or array.shape != shapes[name]:
+            got = f"{array.dtype} of {array.shape}"
+            raise InputError(path, f"{name} must hold numbers of the shape {shapes[name]}, got {got}")
         bad = ~np.isfinite(array) | ((name == "weights") & (array < 0))
         if bad.any():
             wanted = "finite and at least 0" if name == "weights" else "finite"
@@ -164,21 +164,7 @@ def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
         arrays = read_npz(path, names)
     except ValueError as error:
         raise InputError(path, str(error)) from None
-    check_points_present(path, arrays, "array")
-    return arrays
-
-
-def check_points_present(path: Path, names: Collection[str], kind: str) -> None:
-    """Raise an :class:`InputError` when ``world_points`` or ``img_points``, an "array" or "column", is missing."""
     for name in ("world_points", "img_points"):
-        if name not in names:
-            raise InputError(path, f"no {kind} {name}")
-
-
-def check_shapes(path: Path, arrays: Mapping[str, np.ndarray], shapes: Mapping[str, Sequence[tuple[int, ...]]]) -> None:
-    """Raise an :class:`InputError` when an array holds no numbers or has none of the shapes allowed for its name."""
-    for name, array in arrays.items():
-        if array.dtype.kind not in "fiub" or array.shape not in shapes[name]:
-            wanted = " or ".join(map(str, shapes[name]))
-            got = f"{array.dtype} of {array.shape}"
-            raise InputError(path, f"{name} must hold numbers of the shape {wanted}, got {got}")
+        if name not in arrays:
+            raise InputError(path, f"no array {name}")
+    return arrays

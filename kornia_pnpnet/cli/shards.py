@@ -1,38 +1,34 @@
-"""Many problems from files, solved in bounded memory: ``pnpnet solve --batch``."""
+"""Files of many problems, solved one after the other in bounded memory: ``pnpnet solve --batch``."""
 
 from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import torch
+import pyarrow as pa
 from kornia.core.exceptions import BaseError
-from torch import Tensor, nn
+from pyarrow import compute, parquet
 
-from kornia_pnpnet.cli.correspondence_files import (
-    InputError,
-    check_camera,
-    check_points_present,
-    check_shapes,
-    read_arrays,
-)
-from kornia_pnpnet.core.files import atomic_open, check_size, digest, npz_shapes, write_json
-from kornia_pnpnet.types import PnPResult
+from kornia_pnpnet.arrow import INPUTS, Solve, list_column
+from kornia_pnpnet.cli.correspondence_files import InputError, read_arrays
+from kornia_pnpnet.core.files import atomic_open, digest
 
-__all__ = ["MANIFEST", "SUFFIXES", "ShardReport", "solve_shards"]
+__all__ = ["SUFFIXES", "ShardReport", "solve_shards"]
 
-#: Formats of shards. The results of a shard have its name and format.
+#: Formats of shards.
 SUFFIXES = (".npz", ".parquet")
-#: File in a folder of results with the name and the digest of the solver.
-MANIFEST = "manifest.json"
-_INPUTS = ("world_points", "img_points", "intrinsics", "weights", "img_sigma", "world_sigma")
-_OUTPUTS = ("rotation", "translation", "weights", "cost", "ok")
+
+# Metadata of a results file: the name of the solver and the digest of its parameters.
+_SOLVER = b"kornia_pnpnet.solver"
+# Numbers of a Parquet file that are read at once, 256 MB in float64: where problems are large, a batch has fewer.
+_NUMBERS_AT_ONCE = 2**25
 
 
 class ShardReport(NamedTuple):
@@ -54,99 +50,62 @@ class ShardReport(NamedTuple):
 
 
 def solve_shards(
-    solver: nn.Module,
+    solve: Solve,
     sources: Sequence[str | Path],
     out: str | Path,
     *,
     name: str,
-    intrinsics: Tensor | None = None,
     batch: int = 10_000,
     overwrite: bool = False,
-    watch: Callable[[Path, int, int], None] = lambda path, solved, count: None,
     progress: bool = False,
 ) -> ShardReport:
-    r"""Solve shards of problems one after the other, and write the results of each shard to a file of its name.
+    r"""Solve shards of problems one after the other, and write the results of ``part.*`` to ``part.parquet``.
 
-    A shard is an NPZ file with ``world_points`` (B, N, 3), ``img_points`` (B, N, 2) and optionally ``intrinsics``
-    (3, 3) or (B, 3, 3), ``weights`` (B, N) with 0 for padding, and the standard deviations ``img_sigma`` in pixels and
-    ``world_sigma`` in the unit of the world, each a number, (B,) or (B, N). Or a shard is a Parquet file with columns
-    of these names and one problem per row: each cell is the flat list of the problem's numbers in row-major order, and
-    N may differ between rows. The results are ``rotation``, ``translation``, ``weights``, ``cost`` and ``ok`` in the
-    format of the shard, in float32. An NPZ file is read as a whole, a Parquet file ``batch`` rows at a time.
+    A shard is a Parquet file with one problem per row and the columns of :class:`~kornia_pnpnet.arrow.Solve`. Or it is
+    an NPZ file with ``world_points`` (B, N, 3), ``img_points`` (B, N, 2) and optionally ``intrinsics`` (3, 3) or
+    (B, 3, 3), ``weights`` (B, N), and ``img_sigma`` and ``world_sigma``, each a number, (B,) or (B, N). A Parquet file
+    is read ``batch`` rows at a time, an NPZ file as a whole.
 
-    A file of results gets its name when it is complete, so a run that was stopped can be repeated: shards with results
-    are skipped. A shard that cannot be read, or whose numbers would need more memory than
-    ``core.files.MOST_BYTES`` at once, is reported and the other shards are solved.
+    A results file gets its name when it is complete, so a run that was stopped can be repeated: shards with results
+    are skipped. A shard that cannot be read is reported, and the other shards are solved.
 
     Args:
-        solver: any solver.
+        solve: the solver.
         sources: shards, or folders of shards.
-        out: folder of the results. Two shards of the same name cannot both be written there.
-        name: name of the solver. The folder stores it, and results of another solver are not mixed with these.
-        intrinsics: camera matrix of shape :math:`(3, 3)` for shards without intrinsics.
+        out: folder of the results, another one than those of the shards.
+        name: name of the solver. Results files store it with the digest of the solver's parameters.
         batch: number of problems solved at once.
         overwrite: also solve the shards that have results.
-        watch: called after each shard with its path, the number of solved problems and the number of problems.
         progress: show a progress bar with the rate on stderr, where stderr is a terminal and tqdm is installed.
 
     Returns:
         The :class:`ShardReport`.
 
     Raises:
-        InputError: when there is no shard, two shards have the same name, or ``out`` holds the shards themselves or
-            results of another solver.
-        ImportError: for Parquet without the extra ``shards``.
+        InputError: when there is no shard, two results would have the same name, ``out`` holds the shards themselves,
+            or a shard has results of another solver.
         OSError: when the results cannot be written.
     """
-    shards = _find(sources)
-    out = Path(out)
-    for shard in shards:
-        if shard.resolve() == (out / shard.name).resolve():
-            raise InputError(shard, "the results would overwrite the shard: choose another folder")
-    _claim(out, name, solver, {shard.name for shard in shards} if overwrite else set())
-    waiting = [shard for shard in shards if overwrite or not (out / shard.name).exists()]
-    solved = problems = done = 0
-    failed = []
-    with _bar(waiting, batch, progress) as advance:
-        for shard in waiting:
-            solve = _solve_npz if shard.suffix == ".npz" else _solve_parquet
+    targets = {Path(out) / f"{shard.stem}.parquet": shard for shard in _find(sources, Path(out))}
+    state = sorted(solve.solver.state_dict().items())
+    mark = json.dumps({"name": name, "parameters": digest(*(part for item in state for part in item))}).encode()
+    waiting = {target: shard for target, shard in targets.items() if overwrite or not target.exists()}
+    for target in targets:
+        if target not in waiting and _solver_of(target) != mark:
+            raise InputError(target, f"not of this {name}: choose another folder, or replace it with --overwrite")
+    solved, problems, failed = 0, 0, []
+    with _bar(waiting.values(), progress) as advance:
+        for target, shard in waiting.items():
             try:
-                ok, count = solve(solver, shard, out / shard.name, intrinsics, batch, advance)
+                ok, count = _solve_shard(solve, shard, target, mark, batch, advance)
             except InputError as error:
                 failed.append(str(error))
                 continue
-            solved, problems, done = solved + ok, problems + count, done + 1
-            watch(shard, ok, count)
-    return ShardReport(solved, problems, done, len(shards) - len(waiting), failed)
+            solved, problems = solved + ok, problems + count
+    return ShardReport(solved, problems, len(waiting) - len(failed), len(targets) - len(waiting), failed)
 
 
-@contextmanager
-def _bar(shards: Sequence[Path], batch: int, shown: bool) -> Iterator[Callable[[int], object]]:
-    """A progress bar over the problems of shards; yields what advances it by a number of problems."""
-    if not shown or not sys.stderr.isatty() or find_spec("tqdm") is None:
-        yield lambda count: None
-        return
-    from tqdm import tqdm
-
-    total = 0
-    for shard in shards:
-        with suppress(InputError, ImportError):  # reported when the shard's turn comes
-            total += _count(shard, batch)
-    with tqdm(total=total, unit="problem", unit_scale=True) as bar:
-        yield bar.update
-
-
-def _count(shard: Path, batch: int) -> int:
-    """Number of problems of a shard, from its header; an :class:`InputError` for one that needs too much memory."""
-    if shard.suffix == ".npz":
-        try:
-            return (npz_shapes(shard, _INPUTS).get("world_points") or (0,))[0]
-        except ValueError as error:
-            raise InputError(shard, str(error)) from None
-    return _open_parquet(shard, batch).metadata.num_rows
-
-
-def _find(sources: Sequence[str | Path]) -> list[Path]:
+def _find(sources: Sequence[str | Path], out: Path) -> list[Path]:
     """All shards in the order of the sources, those of a folder by name."""
     shards: dict[str, Path] = {}
     for source in map(Path, sources):
@@ -158,177 +117,91 @@ def _find(sources: Sequence[str | Path]) -> list[Path]:
                 raise InputError(shard, f"the name of a shard must end in {' or '.join(SUFFIXES)}")
             if not shard.is_file():
                 raise InputError(shard, "no such file")
-            if shards.setdefault(shard.name, shard) != shard:
-                raise InputError(shard, f"{shards[shard.name]} has the same name, so the results would collide")
+            if shard.resolve().parent == out.resolve():
+                raise InputError(shard, "the results would lie among the shards: choose another folder")
+            if shards.setdefault(shard.stem, shard) != shard:
+                raise InputError(shard, f"its results would have the name of those of {shards[shard.stem]}")
     return list(shards.values())
 
 
-def _claim(out: Path, name: str, solver: nn.Module, replaced: set[str]) -> None:
-    """Write the manifest of this solver; refuse a folder with results of another solver that are not replaced."""
-    state = sorted(solver.state_dict().items())
-    manifest = {"solver": name, "parameters": digest(*(part for item in state for part in item))}
-    path = out / MANIFEST
-    if path.exists():
-        try:
-            found = json.loads(path.read_text())
-        except ValueError:
-            found = None
-        if found != manifest:
-            results = [x for x in out.iterdir() if x.suffix in SUFFIXES]
-            if not {x.name for x in results} <= replaced:
-                how = "--overwrite all of them" if replaced else "--overwrite"
-                raise InputError(path, f"the folder has results of another solver than this {name}: change it or {how}")
-            for result in results:  # before the manifest: a run stopped in between must not mix two solvers
-                result.unlink()
-    write_json(path, manifest)
+def _solver_of(target: Path) -> bytes | None:
+    """What a results file says of its solver; ``None`` when it is no results file."""
+    try:
+        return (parquet.read_schema(target).metadata or {}).get(_SOLVER)
+    except (pa.ArrowException, OSError):
+        return None
 
 
-def _solve_npz(
-    solver: nn.Module,
-    shard: Path,
-    target: Path,
-    intrinsics: Tensor | None,
-    batch: int,
-    advance: Callable[[int], object],
+@contextmanager
+def _bar(shards: Iterable[Path], shown: bool) -> Iterator[Callable[[int], object]]:
+    """A progress bar over the problems of shards; yields what advances it by a number of problems."""
+    if not shown or not sys.stderr.isatty() or find_spec("tqdm") is None:
+        yield lambda count: None
+        return
+    from tqdm import tqdm
+
+    total = None  # of NPZ files, and where a file cannot be read
+    with suppress(OSError, pa.ArrowException):
+        total = sum(parquet.read_metadata(shard).num_rows for shard in shards)
+    with tqdm(total=total, unit="problem", unit_scale=True) as bar:
+        yield bar.update
+
+
+def _solve_shard(
+    solve: Solve, shard: Path, target: Path, mark: bytes, batch: int, advance: Callable[[int], object]
 ) -> tuple[int, int]:
-    """Solve an NPZ shard; return the number of solved problems and of all problems."""
-    tensors = _tensors(shard, read_arrays(shard, _INPUTS), intrinsics)
-    results = []
-    for result in _solve(solver, shard, tensors, batch):
-        results.append(result)
-        advance(len(result.ok))
-    outputs = {key: np.concatenate([getattr(x, key).numpy() for x in results]) for key in _OUTPUTS}
-    with atomic_open(target, "wb") as file:
-        np.savez(file, allow_pickle=False, **outputs)
-    return int(outputs["ok"].sum()), len(outputs["ok"])
+    """Solve a shard; return the number of solved problems and of all problems."""
 
+    def solved_tables() -> Iterator[pa.Table]:
+        for table in _tables(shard, batch):
+            try:
+                yield solve(table)
+            except (BaseError, TypeError, pa.ArrowException) as error:  # a column is missing or not for this solver
+                raise InputError(shard, str(error)) from None
 
-def _tensors(source: Path, arrays: dict[str, np.ndarray], intrinsics: Tensor | None) -> dict[str, Tensor]:
-    """Checked inputs in float32. Values may be NaN or infinite: the solver then marks their problem as not ok."""
-    shape = arrays["world_points"].shape
-    if len(shape) != 3 or shape[2] != 3 or shape[1] < 3:
-        raise InputError(source, f"world_points must have the shape (B, N, 3) with N at least 3, got {shape}")
-    count, n = shape[:2]
-    sigmas: list[tuple[int, ...]] = [(), (count,), (count, n)]
-    shapes: dict[str, list[tuple[int, ...]]] = {
-        "world_points": [shape],
-        "img_points": [(count, n, 2)],
-        "intrinsics": [(3, 3), (count, 3, 3)],
-        "weights": [(count, n)],
-        "img_sigma": sigmas,
-        "world_sigma": sigmas,
-    }
-    check_shapes(source, arrays, shapes)
-    tensors = {key: torch.from_numpy(array.astype(np.float32)) for key, array in arrays.items()}
-    if "intrinsics" not in tensors:
-        if intrinsics is None:
-            raise InputError(source, "the file has no intrinsics: pass --intrinsics fx,fy,cx,cy")
-        tensors["intrinsics"] = intrinsics.float()
-    if tensors["intrinsics"].ndim == 2:
-        tensors["intrinsics"] = check_camera(tensors["intrinsics"], source).expand(count, 3, 3)
-    return tensors
-
-
-def _solve(solver: nn.Module, source: Path, tensors: dict[str, Tensor], batch: int) -> Iterator[PnPResult]:
-    """Solve ``batch`` problems at a time."""
-    for start in range(0, max(len(tensors["world_points"]), 1), batch):
-        part = {key: value[start : start + batch] if value.ndim else value for key, value in tensors.items()}
-        try:
-            with torch.no_grad():
-                yield solver(**part)
-        except (BaseError, TypeError) as error:  # for example another number of correspondences than the network's
-            raise InputError(source, str(error)) from None
-
-
-def _open_parquet(shard: Path, batch: int) -> Any:
-    """Open a Parquet shard; an :class:`InputError` when ``batch`` rows need too much memory."""
-    try:
-        from pyarrow import parquet
-    except ImportError as error:
-        raise ImportError("Parquet needs one more package: pip install 'kornia_pnpnet[shards]'") from error
-    try:
-        # With pre_buffer Arrow reads ahead to the end of the file, and without buffer_size a row group at once.
-        file = parquet.ParquetFile(shard, pre_buffer=False, buffer_size=1 << 20)
-        groups = [file.metadata.row_group(i) for i in range(file.metadata.num_row_groups)]
-        values = [(sum(x.column(j).num_values for j in range(x.num_columns)), x.num_rows) for x in groups]
-    except Exception as error:  # Arrow raises half a dozen types of errors for broken files
-        raise InputError(shard, f"not a Parquet file of lists of numbers: {error}") from None
-    most = max((count * min(batch, rows) // max(rows, 1) for count, rows in values), default=0)
-    try:
-        check_size(8 * most, "choose a smaller --batch-size, or split the file")
-    except ValueError as error:
-        raise InputError(shard, str(error)) from None
-    return file
-
-
-def _solve_parquet(
-    solver: nn.Module,
-    shard: Path,
-    target: Path,
-    intrinsics: Tensor | None,
-    batch: int,
-    advance: Callable[[int], object],
-) -> tuple[int, int]:
-    """Solve a Parquet shard; return the number of solved problems and of all problems."""
-    rows = _open_parquet(shard, batch)
-    import pyarrow
-    from pyarrow import parquet
-
-    def read() -> Iterator[dict[str, list[Any]]]:
-        try:
-            columns = [key for key in _INPUTS if key in rows.schema_arrow.names]
-            for table in rows.iter_batches(batch, columns=columns):
-                yield table.to_pydict()
-        except Exception as error:
-            raise InputError(shard, f"not a Parquet file of lists of numbers: {error}") from None
-
-    types = dict.fromkeys(_OUTPUTS, pyarrow.list_(pyarrow.float32()))
-    schema = pyarrow.schema(types | {"cost": pyarrow.float32(), "ok": pyarrow.bool_()})
+    results = solved_tables()
+    first = next(results)
     solved = count = 0
+    schema = first.schema.with_metadata({_SOLVER: mark})
     with atomic_open(target, "wb") as file, parquet.ParquetWriter(file, schema) as writer:
-        for columns in read():
-            arrays, sizes = _padded(shard, columns)
-            (result,) = _solve(solver, shard, _tensors(shard, arrays, intrinsics), batch)
-            outputs: dict[str, Any] = {key: [*getattr(result, key).flatten(1).numpy()] for key in _OUTPUTS[:2]}
-            outputs["weights"] = [x[:size] for x, size in zip(result.weights.numpy(), sizes, strict=True)]
-            outputs |= {"cost": result.cost.numpy(), "ok": result.ok.numpy()}
-            writer.write_table(pyarrow.table(outputs, schema=schema))
-            solved, count = solved + int(result.ok.sum()), count + len(sizes)
-            advance(len(sizes))
+        for result in chain([first], results):
+            writer.write_table(result)
+            solved, count = solved + (compute.sum(result["ok"]).as_py() or 0), count + len(result)
+            advance(len(result))
     return solved, count
 
 
-def _padded(source: Path, columns: dict[str, list[Any]]) -> tuple[dict[str, np.ndarray], list[int]]:
-    """Arrays of rows of different lengths, padded with weight 0, and the number of correspondences of each row."""
-    check_points_present(source, columns, "column")
-    try:  # rows may be nested lists, as `.tolist()` makes them
-        columns = {key: [np.ravel(x) if isinstance(x, list) else x for x in values] for key, values in columns.items()}
-    except ValueError as error:
-        raise InputError(source, f"lists of different lengths: {error}") from None
-    sizes = [0 if x is None else len(x) // 3 for x in columns["world_points"]]
-    columns = {"weights": [[1.0] * size for size in sizes], **columns}
-    shapes = {"world_points": (3,), "img_points": (2,), "weights": (), "img_sigma": (), "world_sigma": ()}
-    arrays: dict[str, np.ndarray] = {}
-    for key, values in columns.items():
+def _tables(shard: Path, batch: int) -> Iterator[pa.Table]:
+    """Tables of at most ``batch`` problems of a shard, at least one table."""
+    if shard.suffix == ".npz":
+        yield from _tables_of_arrays(shard, batch)
+        return
+    try:
+        # With pre_buffer Arrow reads ahead to the end of the file, and without buffer_size a row group at once.
+        with parquet.ParquetFile(shard, pre_buffer=False, buffer_size=1 << 20) as file:
+            groups = [file.metadata.row_group(i) for i in range(file.metadata.num_row_groups)]
+            numbers = [sum(x.column(i).num_values for i in range(x.num_columns)) // max(x.num_rows, 1) for x in groups]
+            rows = min(batch, max(_NUMBERS_AT_ONCE // max([*numbers, 1]), 1))
+            if not file.metadata.num_rows:
+                yield file.schema_arrow.empty_table()
+            for part in file.iter_batches(rows):
+                yield pa.Table.from_batches([part])
+    except Exception as error:  # Arrow raises half a dozen types of errors for broken files
+        raise InputError(shard, f"not a Parquet file of problems: {error}") from None
+
+
+def _tables_of_arrays(shard: Path, batch: int) -> Iterator[pa.Table]:
+    """Tables of the problems of an NPZ file."""
+    arrays = read_arrays(shard, INPUTS)
+    for name, size in (("world_points", 3), ("img_points", 2)):
+        if arrays[name].ndim != 3 or arrays[name].shape[2] != size:
+            raise InputError(shard, f"{name} must be of the shape (B, N, {size}), got {arrays[name].shape}")
+    count = len(arrays["world_points"])
+    for name, shape in (("intrinsics", (3, 3)), ("img_sigma", ()), ("world_sigma", ())):
+        if name in arrays and arrays[name].shape == shape:  # of all problems
+            arrays[name] = np.broadcast_to(arrays[name], (count, *shape))
+    for start in range(0, max(count, 1), batch):
         try:
-            if key == "intrinsics":
-                arrays[key] = np.array(values, dtype=np.float64).reshape(-1, 3, 3)
-            elif np.ndim(values[0]) == 0:
-                arrays[key] = np.array(values, dtype=np.float64)
-            else:
-                arrays[key] = _pad(source, key, values, sizes, shapes[key])
-        except (ValueError, TypeError) as error:
-            raise error if isinstance(error, InputError) else InputError(source, f"{key}: {error}") from None
-    return arrays, sizes
-
-
-def _pad(source: Path, key: str, values: list[Any], sizes: list[int], shape: tuple[int, ...]) -> np.ndarray:
-    """One array of a list of numbers per row; padded sigmas are NaN, which means unknown."""
-    array = np.full((len(sizes), max([*sizes, 3]), *shape), np.nan if key.endswith("_sigma") else 0.0)
-    for row, (value, size) in enumerate(zip(values, sizes, strict=True)):
-        wanted = array[row, :size].size
-        if value is None or len(value) != wanted:
-            got = "nothing" if value is None else f"{len(value)} numbers"
-            raise InputError(source, f"row {row}: {key} must have {wanted} numbers, got {got}")
-        array[row, :size] = np.reshape(value, (size, *shape))
-    return array
+            yield pa.table({name: list_column(array[start : start + batch]) for name, array in arrays.items()})
+        except (TypeError, pa.ArrowException) as error:
+            raise InputError(shard, f"the arrays are not of {count} problems each: {error}") from None

@@ -11,7 +11,7 @@ With an unknown focal length only the principal point counts, which is mostly th
 With --batch, files of many problems are solved in bounded memory and their poses are written to files. The same command
 continues where it was stopped. The files, called shards, are NPZ files with world_points (B, N, 3), img_points
 (B, N, 2) and optionally weights, intrinsics, img_sigma and world_sigma, or Parquet files with columns of these names
-and one problem per row.
+and one problem per row. Results are Parquet files.
 
   pnpnet solve --batch shards/ --out poses/
 
@@ -138,6 +138,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _solve_batch(arguments: argparse.Namespace, camera: Tensor | None) -> int:
+    from kornia_pnpnet.arrow import Solve
     from kornia_pnpnet.cli.shards import solve_shards
 
     if arguments.plot or arguments.threshold:
@@ -145,14 +146,12 @@ def _solve_batch(arguments: argparse.Namespace, camera: Tensor | None) -> int:
     name, out = arguments.solver, arguments.out or "outputs/poses"
     try:
         report = solve_shards(
-            _load_solver(arguments),
+            Solve(_load_solver(arguments), intrinsics=camera),
             arguments.file,
             out,
             name=name,
-            intrinsics=camera,
             batch=arguments.batch_size,
             overwrite=arguments.overwrite,
-            watch=lambda shard, solved, count: print(f"{shard}: {solved} of {count} solved", flush=True),
             progress=True,
         )
     except KeyboardInterrupt:

@@ -1,0 +1,233 @@
+"""Very many problems with Ray Data beside a plain loop: ``python benchmarks/scale.py --problems 10000000``.
+
+Draws problems of nine pairs into Parquet files. Solves them with ``pnpnet solve --batch`` and with
+``docs/examples/ray_data.py``: a few problems (what the start costs), one worker, two workers, two workers of which one
+is killed, and a run that is killed as a whole and repeated. Compares the results with those of the loop, problem by
+problem. Writes ``scale.json``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from harness import HERE, load, say
+from pyarrow import dataset, parquet
+
+from kornia_pnpnet.arrow import list_column
+from kornia_pnpnet.core.environment import environment
+from kornia_pnpnet.core.files import write_json
+from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+
+EXAMPLE = HERE.parent / "docs" / "examples" / "ray_data.py"
+COMMAND = [sys.executable, "-c", "import sys; from kornia_pnpnet.cli import main; sys.exit(main())", "solve", "--batch"]
+PAIRS, OUTLIERS = 9, 2
+#: Largest number of problems in a file.
+FILE = 250_000
+#: Problems of a run that is little more than the start of Ray.
+FEW = 1000
+#: Seconds between two looks at the memory.
+PERIOD = 0.5
+#: The title of a worker's process.
+WORKER = "MapBatches(Solve)"
+#: The largest distances from a pose of the loop that count as rounding: entries of the rotation, and metres.
+ROUNDING = 1e-3
+
+
+def draw(folder: Path, problems: int) -> None:
+    """Write problems with an ``id`` to Parquet files, unless they are there."""
+    done = folder / "done"
+    if done.exists() and done.read_text() == str(problems):
+        return
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    for i, start in enumerate(range(0, problems, FILE)):
+        count = min(FILE, problems - start)
+        source = SyntheticProblems(n=PAIRS, batch_size=count, seed=20_261_125, outliers=OutlierMix(count=OUTLIERS))
+        drawn = dict(zip(("world_points", "img_points", "intrinsics"), source.batch(i)[:3], strict=True))
+        lists = {name: list_column(x.float().numpy()) for name, x in drawn.items()}
+        parquet.write_table(pa.table({"id": np.arange(start, start + count), **lists}), folder / f"{i:05}.parquet")
+    done.write_text(str(problems))
+
+
+def run(command: list[str], kill_at: tuple[Path, int, str] | None = None) -> dict[str, Any]:
+    """Run a command with one thread in each process.
+
+    Args:
+        command: the command.
+        kill_at: kill processes once the folder has results of so many problems: the first process with this in its
+            title, or all processes of the command for an empty title.
+
+    Returns:
+        ``wall_s``; ``cpu_s`` and ``peak_bytes`` of all processes together; ``killed_at``, the number of problems with
+        results when processes were killed, or ``None``; the ``load`` of the machine at the end.
+    """
+    say(" ".join(command[-8:]))
+    start = time.perf_counter()
+    killed, peak = None, 0
+    cpu: dict[int, float] = {}
+    with subprocess.Popen(
+        command, env={**os.environ, "OMP_NUM_THREADS": "1", "RAY_ADDRESS": "local"}, stdout=sys.stderr
+    ) as process:
+        while process.poll() is None:
+            time.sleep(PERIOD)
+            family = processes(process.pid)
+            peak = max(peak, sum(map(memory, family)))
+            cpu.update((pid, cpu_seconds(pid) or cpu.get(pid, 0.0)) for pid in family)
+            if kill_at and killed is None and rows(kill_at[0]) >= kill_at[1]:
+                killed = rows(kill_at[0])
+                victims = [pid for pid in family if kill_at[2] in title_of(pid)]
+                for pid in victims[:1] if kill_at[2] else victims:
+                    os.kill(pid, signal.SIGKILL)
+        wall = time.perf_counter() - start
+    if kill_at and killed is None:
+        raise RuntimeError("the command ended before a process could be killed")
+    if process.returncode and not (kill_at and not kill_at[2]):
+        raise RuntimeError(f"{' '.join(command)} failed")
+    return {"wall_s": wall, "cpu_s": sum(cpu.values()), "peak_bytes": peak, "killed_at": killed, "load": load()}
+
+
+def rows(folder: Path) -> int:
+    """Number of problems in the results files that are complete."""
+    count = 0
+    for path in folder.glob("*.parquet"):
+        with suppress(pa.ArrowException, OSError):
+            count += parquet.read_metadata(path).num_rows
+    return count
+
+
+def processes(root: int) -> list[int]:
+    """A process and all that it started, directly or not."""
+    children: dict[int, list[int]] = {}
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            parent = int(path.read_text().rpartition(")")[2].split()[1])
+        except OSError:  # the process has ended
+            continue
+        children.setdefault(parent, []).append(int(path.parent.name))
+    found = [root]
+    for pid in found:
+        found += children.get(pid, [])
+    return found
+
+
+def memory(pid: int) -> int:
+    """Bytes of a process; memory that processes share is divided among them."""
+    try:
+        lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    except OSError:
+        return 0
+    return 1024 * next((int(line.split()[1]) for line in lines if line.startswith("Pss:")), 0)
+
+
+def cpu_seconds(pid: int) -> float:
+    """Seconds that a process has computed; 0 when it has ended."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def title_of(pid: int) -> str:
+    """The title of a process."""
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_text()
+    except OSError:
+        return ""
+
+
+def read(folder: Path) -> dict[str, np.ndarray]:
+    """Results in the order of their ids, (B, …)."""
+    table = dataset.dataset(folder, format="parquet").to_table(columns=["id", "rotation", "translation", "ok"])
+    columns = {name: table[name].combine_chunks() for name in table.column_names}
+    ids = columns["id"].to_numpy()
+    order = ids.argsort(kind="stable")
+    poses = {name: columns[name].flatten().to_numpy().reshape(len(ids), -1)[order] for name in columns if name in POSE}
+    return {"id": ids[order], "ok": columns["ok"].to_numpy(zero_copy_only=False)[order], **poses}
+
+
+POSE = ("rotation", "translation")
+
+
+def compare(expected: dict[str, np.ndarray], folder: Path) -> dict[str, int]:
+    """Counts of problems that are lost, twice there, or have another result."""
+    found = read(folder)
+    ids, first = np.unique(found["id"], return_index=True)
+    lost = len(expected["id"]) - len(ids)
+    counts = {"lost": lost, "twice": len(found["id"]) - len(ids)}
+    at = np.searchsorted(expected["id"], ids)
+    apart = [np.abs(found[name][first] - expected[name][at]).max(1) for name in POSE]
+    both = found["ok"][first] & expected["ok"][at]
+    counts["other_ok"] = int((found["ok"][first] != expected["ok"][at]).sum())
+    counts["same_bits"] = int((np.maximum(*apart) == 0).sum())
+    counts["beyond_rounding"] = int((both & (np.maximum(*apart) > ROUNDING)).sum())
+    return counts
+
+
+def size(folder: Path) -> int:
+    """Bytes of the Parquet files of a folder."""
+    return sum(path.stat().st_size for path in folder.glob("*.parquet"))
+
+
+def measure(problems: int, solver: str, batch: int, folder: Path) -> dict[str, Any]:
+    """Draw the problems, and solve them in all ways."""
+    draw(folder / "few", FEW)
+    draw(folder / "problems", problems)
+    for name in ("start", "loop", "one", "two", "killed", "again", "again.done"):
+        shutil.rmtree(folder / name, ignore_errors=True)
+    same = ["--solver", solver, "--batch-size", str(batch)]
+    source = str(folder / "problems")
+
+    def ray(name: str, workers: int, *more: str, source: str = source) -> list[str]:
+        return [sys.executable, str(EXAMPLE), source, str(folder / name), *same, "--workers", str(workers), *more]
+
+    runs = {"start": run(ray("start", 2, source=str(folder / "few")))}
+    runs["loop"] = run([*COMMAND, source, "--out", str(folder / "loop"), *same])
+    runs["one"] = run(ray("one", 1))
+    runs["two"] = run(ray("two", 2))
+    runs["killed"] = run(ray("killed", 2), (folder / "killed", problems // 3, WORKER))
+    runs["stopped"] = run(ray("again", 2, "--id", "id"), (folder / "again", problems // 3, ""))
+    runs["again"] = run(ray("again", 2, "--id", "id"))
+    expected = read(folder / "loop")
+    return {
+        "problems": problems,
+        "pairs": PAIRS,
+        "solver": solver,
+        "batch": batch,
+        "cores": os.cpu_count(),
+        "ok": int(expected["ok"].sum()),
+        "problem_bytes": size(folder / "problems"),
+        "result_bytes": size(folder / "loop"),
+        "runs": runs,
+        "differences": {name: compare(expected, folder / name) for name in ("one", "two", "killed", "again")},
+    }
+
+
+def main() -> None:
+    """Measure, and write the results."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--problems", type=int, default=1_000_000)
+    parser.add_argument("--solver", default="pnpnet-n9")
+    parser.add_argument("--batch-size", type=int, default=10_000)
+    parser.add_argument("--folder", type=Path, default=Path("outputs/scale"), help="of the problems and the results")
+    parser.add_argument("--out", type=Path, default=HERE / "scale.json")
+    options = parser.parse_args()
+    found = measure(options.problems, options.solver, options.batch_size, options.folder)
+    versions = {name: metadata.version(name) for name in ("ray", "pyarrow")}
+    write_json(options.out, {"environment": environment(), "versions": versions, **found})
+
+
+if __name__ == "__main__":
+    main()

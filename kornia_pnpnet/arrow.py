@@ -1,0 +1,199 @@
+"""Tables of problems in the format of Apache Arrow: a batch in, a batch out, for Ray Data and other engines."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+import torch
+from kornia.core.check import KORNIA_CHECK_SHAPE
+from kornia.core.exceptions import ShapeError, TypeCheckError, ValueCheckError
+from torch import Tensor, nn
+
+from kornia_pnpnet.registry import create_solver
+from kornia_pnpnet.types import Status
+
+try:
+    import pyarrow as pa
+    from pyarrow import compute
+except ImportError as error:
+    raise ImportError("tables need one more package: pip install 'kornia_pnpnet[shards]'") from error
+
+__all__ = ["INPUTS", "OUTPUTS", "Solve", "list_column"]
+
+#: Columns that :class:`Solve` reads.
+INPUTS = ("world_points", "img_points", "intrinsics", "weights", "img_sigma", "world_sigma")
+#: Columns that :class:`Solve` writes.
+OUTPUTS = ("rotation", "translation", "weights", "cost", "ok", "status")
+
+# Numbers of a cell for each pair. A cell of intrinsics has 9 numbers.
+_PER_PAIR = {"world_points": 3, "img_points": 2, "weights": 1, "img_sigma": 1, "world_sigma": 1}
+# Names of the values of Status, and of rows that no solver saw.
+_STATUS_NAMES = pa.array([*(status.name.lower() for status in Status), "malformed"])
+# Pairs. Problems with this number or more are padded, so that those with similar numbers are solved together.
+_PADDED_FROM = 16
+
+
+class Solve:
+    r"""Map a table of problems to a table of poses: a function of batches for Ray Data and other engines.
+
+    A row is a problem. Each cell holds the numbers of its problem as one list in row-major order. The number of pairs N
+    may differ between rows. The columns are
+
+    - ``world_points`` (3N numbers) and ``img_points`` (2N numbers, pixels),
+    - optionally ``intrinsics`` (9 numbers), ``weights`` (N numbers), and the standard deviations ``img_sigma`` in
+      pixels and ``world_sigma`` in the unit of the world (N numbers or one number; NaN: unknown).
+
+    The result has the columns ``rotation`` (9 numbers), ``translation`` (3), ``weights`` (N), ``cost``, ``ok`` and
+    ``status``, the name of a :class:`~kornia_pnpnet.types.Status` in lower case. It also has the columns of the table
+    with other names, for example an ``id``. Rows keep their order, and numbers are float32.
+
+    A bad row raises nothing: its ``ok`` is false and its pose is the identity. Its status is ``malformed`` when a list
+    is missing or has the wrong length, or when the solver is for another number of pairs. Rows do not change each
+    other's results beyond rounding.
+
+    Args:
+        solver: a name of :func:`~kornia_pnpnet.registry.list_solvers`, or a solver.
+        intrinsics: camera matrix for tables without ``intrinsics``, shape :math:`(3, 3)`.
+        options: options of the named solver, see :func:`~kornia_pnpnet.registry.create_solver`.
+
+    Raises:
+        BaseError: for an unknown solver or option, or another shape of ``intrinsics``.
+
+    Example:
+        >>> from kornia_pnpnet.data import SyntheticProblems
+        >>> problems = SyntheticProblems(n=9, batch_size=2, seed=0).batch(0)
+        >>> names = "world_points", "img_points", "intrinsics"
+        >>> columns = {name: list_column(x.numpy()) for name, x in zip(names, problems)}
+        >>> poses = Solve("epnp-lm")(pa.table({"id": [7, 8], **columns}))
+        >>> poses["id"].to_pylist(), poses["ok"].to_pylist()
+        ([7, 8], [True, True])
+    """
+
+    #: Number of pairs, with padding, in one call of the solver. It bounds the memory beside that of the tables.
+    pairs_at_once = 2**17
+
+    def __init__(
+        self, solver: str | nn.Module = "pnpnet-set", *, intrinsics: Tensor | None = None, **options: Any
+    ) -> None:
+        if intrinsics is not None:
+            KORNIA_CHECK_SHAPE(intrinsics, ["3", "3"])
+            intrinsics = intrinsics.float()
+        self.solver = create_solver(solver, **options) if isinstance(solver, str) else solver
+        self.intrinsics = intrinsics
+
+    def __call__(self, table: pa.Table) -> pa.Table:
+        """Solve the problems of a table.
+
+        Args:
+            table: one problem per row, see the class.
+
+        Returns:
+            The table of the results, one row per problem.
+
+        Raises:
+            ValueCheckError: when a column is missing.
+            TypeCheckError: when a column holds no numbers.
+        """
+        for name in INPUTS[: 3 if self.intrinsics is None else 2]:
+            if name not in table.column_names:
+                raise ValueCheckError(f"no {name}")
+        cells = {name: _Cells(name, table[name]) for name in INPUTS if name in table.column_names}
+        counts = cells["world_points"].sizes // 3  # (rows,)
+        fits = (counts >= 3) & np.logical_and.reduce([x.fit(counts) for x in cells.values()])
+        values: dict[str, np.ndarray] = {
+            "rotation": np.tile(np.eye(3, dtype=np.float32), (len(counts), 1, 1)),
+            "translation": np.zeros((len(counts), 3), dtype=np.float32),
+            "cost": np.full(len(counts), np.finfo(np.float32).max ** 0.5, dtype=np.float32),  # as without a pose
+            "ok": np.zeros(len(counts), dtype=bool),
+            "status": np.full(len(counts), len(_STATUS_NAMES) - 1, dtype=np.int8),
+        }
+        ends = np.append(0, counts.cumsum())
+        weights = np.zeros(ends[-1], dtype=np.float32)
+        for rows, width in _groups(counts, fits, self.pairs_at_once):
+            there = np.arange(width) < counts[rows, None]  # (R, width), false for padding
+            taken = {name: torch.from_numpy(x.take(rows, width)) for name, x in cells.items()}
+            inputs: dict[str, Any] = {"intrinsics": self.intrinsics, **taken}
+            with torch.no_grad(), suppress(ShapeError):  # the solver is for another number of pairs
+                result = self.solver(**inputs, mask=None if there.all() else torch.from_numpy(there))
+                for name, array in values.items():
+                    array[rows] = getattr(result, name).numpy()
+                weights[(ends[rows, None] + np.arange(width))[there]] = result.weights.numpy()[there]
+        lists = {name: list_column(values[name]) for name in OUTPUTS[:2]}
+        lists["weights"] = pa.ListArray.from_arrays(pa.array(ends, pa.int32()), weights)
+        status = _STATUS_NAMES.take(pa.array(values["status"]))
+        results = {**lists, "cost": pa.array(values["cost"]), "ok": pa.array(values["ok"]), "status": status}
+        return pa.table({name: table[name] for name in table.column_names if name not in INPUTS + OUTPUTS} | results)
+
+
+def list_column(values: np.ndarray) -> pa.Array:
+    r"""Make a column of lists, one list for each problem.
+
+    Args:
+        values: numbers of :math:`B` problems, shape :math:`(B, …)`.
+
+    Example:
+        >>> list_column(np.eye(2)).to_pylist()
+        [[1.0, 0.0], [0.0, 1.0]]
+    """
+    size = math.prod(values.shape[1:])
+    return pa.ListArray.from_arrays(pa.array(np.arange(len(values) + 1) * size, pa.int32()), values.reshape(-1))
+
+
+class _Cells:
+    """The numbers of a column of lists.
+
+    Attributes:
+        values: numbers of all rows one after the other, NaN where one is missing, float32.
+        starts: position of the first number of each row.
+        sizes: count of the numbers of each row; 0 where the list is missing.
+    """
+
+    def __init__(self, name: str, column: pa.ChunkedArray) -> None:
+        array = column.combine_chunks()
+        ends = np.arange(len(array) + 1)
+        while _is_list(array.type):  # a list may be nested, as `.tolist()` makes it
+            sizes = compute.list_value_length(array).fill_null(0).to_numpy(zero_copy_only=False)
+            ends = np.append(0, sizes.cumsum())[ends]
+            array = compute.list_flatten(array)
+        kinds = pa.types.is_integer, pa.types.is_floating, pa.types.is_null
+        if not any(is_kind(array.type) for is_kind in kinds):
+            raise TypeCheckError(f"the column {name} must hold lists of numbers, got {column.type}")
+        self.values = array.cast(pa.float32(), safe=False).to_numpy(zero_copy_only=False)
+        self.starts, self.sizes = ends[:-1], np.diff(ends)
+        self._name = name
+
+    def fit(self, counts: np.ndarray) -> np.ndarray:
+        """Whether each cell has as many numbers as its problem needs."""
+        if self._name == "intrinsics":
+            return self.sizes == 9
+        right = self.sizes == _PER_PAIR[self._name] * counts
+        return right | (self.sizes == 1) if self._name.endswith("_sigma") else right
+
+    def take(self, rows: np.ndarray, width: int) -> np.ndarray:
+        """The cells of some rows, padded to ``width`` pairs: the last number of a cell is repeated."""
+        size = 9 if self._name == "intrinsics" else _PER_PAIR[self._name] * width
+        within = np.minimum(np.arange(size), self.sizes[rows, None] - 1)
+        shapes = {"world_points": (width, 3), "img_points": (width, 2), "intrinsics": (3, 3)}
+        return self.values[self.starts[rows, None] + within].reshape(len(rows), *shapes.get(self._name, (width,)))
+
+
+def _is_list(kind: pa.DataType) -> bool:
+    return pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
+
+
+def _groups(counts: np.ndarray, fits: np.ndarray, most: int) -> Iterator[tuple[np.ndarray, int]]:
+    """Rows that are solved in one call, and the number of pairs to which they are padded.
+
+    That number depends on the row alone, so that the result does, too: the number of pairs below 16, and from there on
+    the next of 16, 20, 24, 28, 32, 40, 48, ..., which is at most a quarter more.
+    """
+    step = 2 ** (np.log2(counts.clip(_PADDED_FROM)).astype(int) - 2)
+    widths = np.where(counts < _PADDED_FROM, counts, -(-counts // step) * step)
+    for width in np.unique(widths[fits]):
+        rows = np.flatnonzero(fits & (widths == width))
+        for part in np.array_split(rows, -(-len(rows) * width // most)):
+            yield part, int(width)
