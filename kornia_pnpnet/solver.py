@@ -18,6 +18,7 @@ from kornia_pnpnet.geometry import gate_pose
 from kornia_pnpnet.init import RANSAC, MLPInit, SetInit
 from kornia_pnpnet.init.alternatives import doubt_mirrored, find_alternatives, is_seen
 from kornia_pnpnet.init.focal import (
+    MORE_ITERATIONS,
     finds_focal,
     free_focal_in_frame,
     guesses_focal,
@@ -91,9 +92,8 @@ class PnPNet(PretrainedMixin):
             refined; after seven tenths of the iterations the best one goes on alone.
         focal: ``"known"``, or ``"unknown"``: the focal length is estimated with the pose and returned in the result's
             ``intrinsics``. Those of the call then give the principal point, the aspect ratio and the skew relative to
-            the focal length. The logarithm of the focal length is a seventh parameter of the refinement. Its start is
-            nominal with ``SetInit``; where that does not suffice, and with other initialisers, P3P at twelve focal
-            lengths finds one. Where the pairs leave it open by more than 15 % the problem is not ``ok``.
+            the focal length. The refinement starts from a nominal focal length with ``SetInit``; where that does not
+            suffice, and with other initialisers, from one that P3P finds. If it stays open by over 15 %: not ``ok``.
         focal_sigma: standard deviation of the logarithm of the focal length in the intrinsics of a call, for example
             0.1 for one that is known to about 10 %; ``None``: the focal length in the intrinsics is ignored.
         radial: number of coefficients of radial distortion, 0 to 2, that are estimated with an unknown focal length,
@@ -316,7 +316,7 @@ class PnPNet(PretrainedMixin):
             if self.focal == "known":  # or else a search has given the pose
                 guess = search_on(corr, guess, keep_others=inputs.init is not None or inputs.prior is not None)
             begun = _Begun(self.refine.begin(corr, guess), frame, guess)
-        end = self.refine.iterate(begun.start, 0 if first_stage_only else None)
+        end = self.refine.iterate(begun.start, 0 if first_stage_only else None, more=MORE_ITERATIONS if guessed else 0)
         result = self._finish(begun, end, always)
         if dist is not None:
             result = result._replace(dist=dist)

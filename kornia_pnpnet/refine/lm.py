@@ -268,12 +268,13 @@ class RobustWeightedLM(Configured):
             shape=shape,
         )
 
-    def stages(self, start: LMStart, m: int) -> list[Stage]:
+    def stages(self, start: LMStart, m: int, more: int = 0) -> list[Stage]:
         """Plan the first ``m`` iterations: the pairs, weights, noise and hyperparameters that each of them sees.
 
         Args:
             start: what :meth:`begin` returned.
             m: number of iterations.
+            more: number of further iterations like the last one.
 
         Returns:
             The stages in order: iterations on all poses of the guess, the choice of one pose per problem, iterations
@@ -288,24 +289,27 @@ class RobustWeightedLM(Configured):
             Stage(i, partial(self._advance, pairs, start.step[i], start.damping[i], start.shape[i], area))
             for i, (pairs, area) in enumerate(seen[:m])
         ]
+        plan += [plan[-1]._replace(iteration=m + i) for i in range(more)]
         if start.rivals is not None:
             shape = start.shape[max(self.compared_at - 1, 0)]
             plan.insert(explored, Stage(explored, partial(self._choose, start.rivals, start.prior, shape)))
         return plan
 
-    def iterate(self, start: LMStart, m: int | None = None) -> LMStep:
+    def iterate(self, start: LMStart, m: int | None = None, *, more: int = 0) -> LMStep:
         """Run the iterations.
 
         Args:
             start: what :meth:`begin` returned.
             m: stop after this many iterations; run all of them when ``None``.
+            more: number of further iterations like the last one.
 
         Returns:
             The last pose, and whether the last equations could be solved.
         """
         m = self.m if m is None else min(m, self.m)
-        live = {"unroll": 0, "truncated": max(m - self.last, 0), "implicit": m}[self.backward]
-        plan = self.stages(start, m)
+        more = more if m else 0
+        live = {"unroll": 0, "truncated": max(m + more - self.last, 0), "implicit": m + more}[self.backward]
+        plan = self.stages(start, m, more)
         ones = torch.ones_like(start.pose.translation[:, 0])
         state = State(start.pose, ones.bool(), ones, start.zoom)
         for stage in plan:
