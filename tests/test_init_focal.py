@@ -177,7 +177,10 @@ def test_an_exact_focal_length_stays_and_a_wrong_one_is_corrected(update):
     assert (found.zoom.abs() < 1e-6).double().mean() > 0.9
 
 
-@pytest.mark.parametrize(("backward", "kernel"), [("unroll", "power"), ("unroll", "cauchy"), ("implicit", "cauchy")])
+@pytest.mark.parametrize(
+    ("backward", "kernel"),
+    [("unroll", "power"), ("unroll", "cauchy"), pytest.param("implicit", "cauchy", marks=pytest.mark.slow)],
+)
 def test_gradcheck_to_the_focal_length(backward, kernel):
     """Through unrolled iterations and through the minimum, with a prior of the focal length."""
     corr, pose = framed(draw(8, batch=2, noise=1.0))
