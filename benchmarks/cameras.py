@@ -185,6 +185,16 @@ def row(found: Found, problems: Problems, *, position: float = 0.05, focal: floa
     }
 
 
+def rows_of_all(solvers: Mapping[str, nn.Module], problems: Problems, some: int) -> list[dict[str, Any]]:
+    """Rows of our solvers, of pycolmap on the first ``some`` problems, of OpenCV on fewer, and of the oracle."""
+    few, fewer = (take(problems, slice(number)) for number in (some, FEW // 2))
+    found = {name: row(ours(solver, problems), problems) for name, solver in solvers.items()}
+    found["pycolmap"] = row(one_by_one(colmap_focal, few), few)
+    found["opencv, 21 focals"] = row(one_by_one(opencv_focals, fewer), fewer)
+    found["oracle"] = row(oracle(problems), problems)
+    return [{"solver": name, **measured} for name, measured in found.items()]
+
+
 def measure_focal(count: int, sizes: Sequence[int] = SIZES, shares: Sequence[float] = SHARES) -> list[dict[str, Any]]:
     """Success and time of all solvers by number of pairs and share of outliers."""
     solvers = {name: create_solver(name, focal="unknown") for name in OURS}
@@ -194,13 +204,7 @@ def measure_focal(count: int, sizes: Sequence[int] = SIZES, shares: Sequence[flo
         source = CameraProblems(n=n, batch_size=count, seed=SEED + k, outlier_share=share, dtype=torch.float64)
         problems = source.batch(0)
         some = FEW if share > 0.25 else count
-        few = take(problems, slice(some))
-        cell = {"n": n, "share": share}
-        rows += [{**cell, "solver": name, **row(ours(s, problems), problems)} for name, s in solvers.items()]
-        rows.append({**cell, "solver": "pycolmap", **row(one_by_one(colmap_focal, few), few)})
-        fewer = take(problems, slice(FEW // 2))
-        rows.append({**cell, "solver": "opencv, 21 focals", **row(one_by_one(opencv_focals, fewer), fewer)})
-        rows.append({**cell, "solver": "oracle", **row(oracle(problems), problems)})
+        rows += [{"n": n, "share": share, **found} for found in rows_of_all(solvers, problems, some)]
     return rows
 
 
@@ -262,13 +266,8 @@ def measure_scenes(data: Path, count: int) -> list[dict[str, Any]]:
         mix = OutlierMix(count=outliers)
         options: dict[str, Any] = {"n": SCENE_N, "batch_size": count, "seed": SEED + 300 + k, "num_spares": SCENE_N}
         problems = SceneProblems(load_scene(data / folder), **options, outliers=mix).batch(0)
-        few = take(problems, slice(FEW))
         cell = {"scene": folder.split("/")[1], "outliers": outliers}
-        rows += [{**cell, "solver": name, **row(ours(s, problems), problems)} for name, s in solvers.items()]
-        rows.append({**cell, "solver": "pycolmap", **row(one_by_one(colmap_focal, few), few)})
-        fewer = take(problems, slice(FEW // 2))
-        rows.append({**cell, "solver": "opencv, 21 focals", **row(one_by_one(opencv_focals, fewer), fewer)})
-        rows.append({**cell, "solver": "oracle", **row(oracle(problems), problems)})
+        rows += [{**cell, **found} for found in rows_of_all(solvers, problems, FEW)]
     return rows
 
 
