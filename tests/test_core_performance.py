@@ -53,7 +53,8 @@ def assert_same(result, expected, **tolerance):
         ("pnpnet-n9", 3, False, 4),  # the fourth is the choice among the starts
         ("pnpnet-n9", 3, True, 1),
         *(pytest.param(name, 1, False, 3, marks=pytest.mark.slow) for name in ("pnpnet-n9", "epnp-lm", "reppnp-lm")),
-        pytest.param("pnpnet-set", 1, False, 4, marks=pytest.mark.slow),
+        # Two more for problems that are solved again, with the noise that their residuals show.
+        pytest.param("pnpnet-set", 1, False, 6, marks=pytest.mark.slow),
     ],
 )
 def test_each_part_is_one_graph_and_the_batch_may_change(name, views, whole, graphs, backend):
