@@ -14,8 +14,8 @@ from the true pose and focal length.
 focal length withheld; solved within 1 degree and 1 % of the median depth. Nothing was tuned on them with an unknown
 focal length; with a known one they have been looked at.
 
-*Scenes.* Problems of 20 pairs of five reconstructed scenes, the focal length withheld; wrong pairs have pixels of other
-points or anywhere in the image. The scenes have been looked at with a known focal length only.
+*Scenes.* Problems of 20 pairs of five reconstructed scenes, without the focal length. The pixel of an outlier is
+that of another point, or anywhere in the image. No solver was tuned on the scenes without the focal length.
 
 *Rigs.* Three and six cameras that look in all directions; solved within 1 degree and 5 % of the distance. PoseLib's and
 pycolmap's generalised absolute pose with a threshold of 10 px, ours with their defaults.

@@ -313,7 +313,7 @@ class PnPNet(PretrainedMixin):
             begun = self._begin(views, always, inputs)
         else:
             corr, frame, guess = self._first(views, always, inputs, True)
-            if self.focal == "known":  # or else a search has given the pose
+            if self.focal == "known":  # an unknown focal length has a search of its own
                 guess = search_on(corr, guess, keep_others=inputs.init is not None or inputs.prior is not None)
             begun = _Begun(self.refine.begin(corr, guess), frame, guess)
         end = self.refine.iterate(begun.start, 0 if first_stage_only else None, more=MORE_ITERATIONS if guessed else 0)

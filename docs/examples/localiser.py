@@ -134,7 +134,7 @@ DETECTORS = {"sift": Sift, "disk": DiskLightGlue}
 
 
 def read_image(path: Path) -> tuple[np.ndarray, float]:
-    """An image (H, W, 3), shrunk to at most so many pixels, and the factor."""
+    """An image (H, W, 3), shrunk to at most this number of pixels, and the factor."""
     picture = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
     if picture is None:
         raise SystemExit(f"no image {path}")

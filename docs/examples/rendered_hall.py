@@ -50,7 +50,7 @@ class Plane(NamedTuple):
 
 
 def draw_shapes(drawn: NDArray[np.uint8], rng: np.random.Generator, density: float, largest: int) -> None:
-    """Draw so many ellipses and rectangles on a square metre, of up to so many texels."""
+    """Draw ellipses and rectangles: their number on a square metre, and their largest size in texels."""
     rows, columns = drawn.shape
     for _ in range(round(density * rows * columns / TEXELS**2)):
         x, y = int(rng.integers(columns)), int(rng.integers(rows))
@@ -63,7 +63,7 @@ def draw_shapes(drawn: NDArray[np.uint8], rng: np.random.Generator, density: flo
 
 
 def make_texture(rng: np.random.Generator, width: float, height: float, tiles: Sequence[Any] = ()) -> NDArray[np.uint8]:
-    """A rectangle of so many metres: shapes of all sizes, or tiles in a random order and a few shapes."""
+    """A rectangle with sides in metres: shapes of all sizes, or tiles in a random order and a few shapes."""
     rows, columns = round(height * TEXELS), round(width * TEXELS)
     drawn = np.full((rows, columns), int(rng.integers(90, 170)), np.uint8)
     if tiles:

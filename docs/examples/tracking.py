@@ -161,7 +161,7 @@ def moved(first: Pose, second: Pose) -> tuple[float, float]:
 def track(
     frames: Sequence[Frame], intrinsics: Tensor, solver: nn.Module, prior: Callable[..., PosePrior | None], pairs: int
 ) -> dict[str, Any]:
-    """Track all frames with the first so many of their matches.
+    """Track all frames with the first matches of each frame.
 
     A pose is taken when the solver believes it (``ok``), with a prior also when the camera can have moved there. Else
     the frame keeps the last pose. The camera starts at a known place.
