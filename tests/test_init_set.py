@@ -12,9 +12,11 @@ import torch
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
 from kornia_pnpnet import Normalize, PnPNet, Pose, RobustWeightedLM, SetInit, SetLoss, pose_errors, success
-from kornia_pnpnet.core.trees import iter_tensors
+from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
-from kornia_pnpnet.init.set import _same
+from kornia_pnpnet.init.set import _ENOUGH, _some_of
+from kornia_pnpnet.init.view import _same
+from kornia_pnpnet.types import Noise
 
 NOISE = {"img_sigma": 1.0, "world_sigma": 0.05}
 
@@ -246,3 +248,57 @@ def test_memory_of_a_call_serves_the_next():
     plain = {key: value for key, value in os.environ.items() if not key.startswith(("MALLOC_", "LD_PRELOAD", "GLIBC"))}
     done = subprocess.run([sys.executable, "-c", _FAULTS], capture_output=True, text=True, check=True, env=plain)
     assert int(done.stdout) < 2000
+
+
+def test_where_a_search_follows_the_network_sees_some_pairs_and_the_others_get_weights(make_problems):
+    """Guess and noise are those of a problem of these pairs alone; sigmas and confidences stay with their pairs."""
+    n = 3 * _ENOUGH
+    p = make_problems(n=n, batch=50, outliers=n // 3)
+    generator = torch.Generator().manual_seed(2)
+    mask = torch.rand(50, n, generator=generator) > 0.3
+    sigma = 0.5 + torch.rand(50, n, generator=generator, dtype=torch.float64)
+    pretrained = PnPNet.from_pretrained("pnpnet-set").double().eval()
+    net, normalize = pretrained.init, Normalize(order=False)
+    noise = Noise(sigma, torch.full_like(sigma, torch.nan))
+    confidence = torch.rand(50, n, generator=generator, dtype=torch.float64)
+    corr = normalize(*p[:3], mask=mask, noise=noise, confidence=confidence)[0]
+    guess = net(corr, search_follows=True)
+    index = _some_of(mask, _ENOUGH)
+    assert mask.gather(1, index).all()
+    assert (index.sort(1).values.diff(dim=1) > 0).all()
+    fewer = corr._replace(
+        **{name: getattr(corr, name).gather(1, index) for name in ("weights", "near", "confidence")},
+        world_points=corr.world_points.gather(1, index[..., None].expand(-1, -1, 3)),
+        img_points=corr.img_points.gather(1, index[..., None].expand(-1, -1, 2)),
+        noise=map_tensors(lambda x: x.gather(1, index), corr.noise),
+    )
+    alone = net(fewer, search_follows=True)
+    near(guess.pose, alone.pose)
+    near(guess.others, alone.others)
+    near([guess.weights.gather(1, index), guess.noise.img.gather(1, index)], [alone.weights, alone.noise.img])
+    unseen = torch.ones_like(mask).scatter(1, index, False) & mask
+    right = guess.weights[unseen & p.inliers] > 0.5
+    wrong = guess.weights[unseen & ~p.inliers] > 0.5
+    assert right.double().mean() > 0.75
+    assert wrong.double().mean() < 0.2
+
+
+def test_pairs_that_are_seen_are_spread_over_those_that_are_there():
+    counts = torch.tensor([1000, 40, 500, *range(_ENOUGH, 3 * _ENOUGH)])
+    there = torch.arange(1000) >= 1000 - counts[:, None]
+    there[1] = there[1].flip(0)
+    index = _some_of(there, _ENOUGH)
+    assert (index.sort(1).values.diff(dim=1) > 0).all()
+    for row, first, last in ((0, 0, 1000), (2, 500, 1000)):
+        counts = torch.histc(index[row].double(), 4, first, last)
+        assert counts.tolist() == [_ENOUGH / 4] * 4
+        assert abs((index[row] % 2).double().mean() - 0.5) < 0.1  # no stride that meets only even positions
+    assert set(range(40)) <= set(index[1].tolist())
+
+
+def test_padding_changes_nothing_where_the_network_sees_some_pairs(make_problems):
+    p = make_problems(n=100, batch=20, outliers=40)
+    padded = [torch.nn.functional.pad(x, (0, 0, 0, 30)) for x in p[:2]]
+    mask = torch.arange(130).expand(20, 130) < 100
+    net = PnPNet.from_pretrained("pnpnet-set").double().eval()
+    near(net(*padded, p.intrinsics, mask=mask).pose, net(*p[:3]).pose)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import torch
 from kornia.core.check import KORNIA_CHECK
 from torch import Tensor, nn
@@ -9,34 +11,27 @@ from torch.nn import functional
 
 from kornia_pnpnet.core.checks import check_devices, check_whole
 from kornia_pnpnet.core.configured import Configured
-from kornia_pnpnet.core.linalg import dot, small_product, solve_symmetric
-from kornia_pnpnet.core.performance import present_first, sees_values, take_pairs
+from kornia_pnpnet.core.linalg import small_product
+from kornia_pnpnet.core.performance import compiling, present_first, problems_last, sees_values, take_pairs
+from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import align, project
 from kornia_pnpnet.init.ransac import p3p
+from kornia_pnpnet.init.view import LEAST_NOISE, LOG_NOISE, View, repeats
 from kornia_pnpnet.refine.prior import votes
 from kornia_pnpnet.types import Correspondences, Guess, Noise, Pose
 
 __all__ = ["SetInit"]
 
-# Ridge of the affine camera, relative to the mean square of the world points. It makes the fit unique for planar
-# points.
-_RIDGE = 0.02
-# Features are clipped at this many times the spread of their kind, so that a wild pair does not dominate the network.
-_MOST = 8.0
-# Centre of the logarithm of the estimated noise, relative to the spread of the pixels and of the world.
-_LOG_NOISE = -5.0
-# Noise of less than this share of the spread counts as this share: scores divide by the variance.
-_LEAST_NOISE = 1e-6
+_T = TypeVar("_T")
+
 # Numbers per pair: 3 of the world, 2 of the image, 2 of the residual, 3 of the problem, 2 of the noise, 2 flags.
 _FEATURES = 14
-# With confidences: their logit and a flag more. Confidences are clipped to this distance from 0 and from 1.
+# With confidences: their logit and a flag more.
 _CONFIDENCE_FEATURES = 2
-_LEAST_CONFIDENCE = 1e-3
 # With repeats: the logarithms of the numbers of pairs with the same pixel and with the same point.
 _REPEAT_FEATURES = 2
-# Points are sorted by their first coordinate plus the others times these factors, so that equal points are neighbours;
-# the factors are irrational, so that the points of a grid have different keys.
-_KEY = 0.7548776662, 0.5698402910
+# Pairs. The softmax of PyTorch 2.13 takes its slow way through rows of fewer numbers.
+_SHORT = 16
 # Added to the score of padding.
 _ABSENT = -1e9
 # Minimal samples, as ranks of pairs by likelihood. The first six are a Turán system: whichever two of the six likeliest
@@ -56,107 +51,49 @@ _JUDGED = 50.0
 _NEAREST = 0.5
 # Score of a pair whose likelihood is 0, relative to a pair whose likelihood is 1.
 _LEAST_VOTE = 0.5
+# Pairs. The network sees at most this many where a search follows, which sees all of them. On real matches (the file
+# `raw/by_image.npz` that docs/results describe) and random ones of up to 1000 pairs, 32 to 96 succeed as often as all.
+_ENOUGH = 48
+# Fractional parts of its multiples are spread evenly over the unit interval.
+_GOLDEN = 0.6180339887
 
 
-class _View:
-    r"""The network's input: invariant to rotations of world and camera and to their units.
+def _taken(tree: _T, index: Tensor | None) -> _T:
+    """Some pairs, at the positions (B, K), of tensors (B, N, ...) with N > K; other tensors as they are."""
+    if index is None:
+        return tree
+    most = index.shape[1]
 
-    The camera is rotated so that the mean of the rays is its axis, and zoomed until the spread of the rays is 1. The
-    world, already centred and scaled, is rotated to the axes of the affine camera that fits the pairs best (by ridge
-    regression).
-    """
+    def take(x: Tensor) -> Tensor:
+        if x.ndim < 2 or x.shape[1] <= most:
+            return x
+        return x.gather(1, index if x.ndim == 2 else index[..., None].expand(-1, -1, x.shape[2]))
 
-    def __init__(self, corr: Correspondences, confidence: bool = False, repeats: bool = False) -> None:
-        world = corr.world_points.contiguous()
-        there = (corr.near_weights > 0).to(world.dtype)
-        share = (there / there.sum(1, keepdim=True).clamp(min=1.0))[..., None]  # (B, N, 1)
-        plane = corr.img_points / corr.focal
-        rays = functional.normalize(torch.cat((plane, torch.ones_like(plane[..., :1])), -1), dim=-1)
-        mean = torch.stack([(share[..., 0] * ray).sum(1) for ray in rays.unbind(-1)], -1)
-        x, y, z = functional.normalize(mean, dim=-1).unbind(-1)  # z > 0
-        k = (1.0 + z).reciprocal()
-        rows = (1.0 - k * x * x, -k * x * y, -x, -k * x * y, 1.0 - k * y * y, -y, x, y, z)
-        self.there = there
-        self.camera = torch.stack(rows, -1).unflatten(-1, (3, 3))  # (B, 3, 3), the smallest such rotation
-        self.rays = rays @ self.camera.mT  # (B, N, 3)
-        tiny = 1e-12
-        self.spread = ((share * self.rays[..., :2].square()).sum((1, 2)) + tiny).sqrt()  # (B,)
-        seen = self.rays[..., :2] / self.spread[:, None, None]
-        seen = seen - (share * seen).sum(1, keepdim=True)
-
-        moment = world.mT @ (share * world) + _RIDGE * torch.eye(3, dtype=world.dtype, device=world.device)
-        affine = solve_symmetric(moment, world.mT @ (share * seen)).mT  # (B, 2, 3)
-        self.world = _frame(affine)  # (B, 3, 3)
-        self.points = world @ self.world.mT  # (B, N, 3)
-        residual = seen - world @ affine.mT
-        sizes = 0.5 * (affine.square().sum(-1) + 1e-3).log()  # (B, 2)
-        self.log_spread = self.spread.log()
-        problem = torch.cat((self.log_spread[:, None], sizes), -1)[:, None].expand(-1, world.shape[1], -1)
-        self.known = self._known(corr)
-        noise = [torch.where(known, log - _LOG_NOISE, 0.0) for log, known in self.known]
-        flags = [known.to(world.dtype) for _, known in self.known]
-        if confidence:
-            given = torch.full_like(corr.weights, torch.nan) if corr.confidence is None else corr.confidence
-            believed = given.nan_to_num(0.5).clamp(_LEAST_CONFIDENCE, 1.0 - _LEAST_CONFIDENCE)
-            flags += [believed.logit(), (~given.isnan()).to(world.dtype)]
-        if repeats:
-            flags += [_same(corr.img_points, there).log(), _same(corr.world_points, there).log()]
-        parts = self.points, seen, residual, problem, *(x[..., None] for x in (*noise, *flags))
-        self.features = torch.cat(parts, -1).clamp(-_MOST, _MOST)
-
-    def _known(self, corr: Correspondences) -> list[tuple[Tensor, Tensor]]:
-        """Logarithms of the noise of pixels and of points relative to their spread, and whether the noise is known."""
-        if corr.noise is None:
-            no = torch.zeros_like(corr.weights, dtype=torch.bool)
-            return [(torch.zeros_like(corr.weights), no)] * 2
-        units = corr.focal * self.spread[:, None], torch.ones_like(self.spread[:, None])
-        sigmas = corr.noise.img, corr.noise.world
-        known = [torch.isfinite(x) for x in sigmas]
-        logs = []
-        for sigma, unit, is_known in zip(sigmas, units, known, strict=True):
-            # Unknown sigmas are NaN. Replace them before dividing, or the gradient of the unit becomes NaN.
-            relative = torch.where(is_known, sigma, 1.0) / torch.where(is_known, unit, 1.0)
-            logs.append(relative.clamp(min=_LEAST_NOISE).log())
-        return list(zip(logs, known, strict=True))
+    return map_tensors(take, tree)
 
 
 @torch.no_grad()
-def _same(points: Tensor, there: Tensor) -> Tensor:
-    """Number of pairs of the problem whose point is exactly the same, at least 1; ``points`` (B, N, K), (B, N)."""
-    key, *others = points.unbind(-1)
-    for x, factor in zip(others, _KEY, strict=False):
-        key = key + factor * x
-    order = key.argsort(1)  # equal points are neighbours
-    ordered = points.gather(1, order[..., None].expand_as(points))
-    # Numbers, not booleans, of which PyTorch 2.13 makes code that does not compile.
-    new = (ordered[:, 1:] != ordered[:, :-1]).long().amax(-1)
-    run = functional.pad(new.cumsum(1), (1, 0))
-    sizes = torch.zeros_like(there).scatter_add(1, run, there.gather(1, order))
-    return torch.empty_like(there).scatter(1, order, sizes.gather(1, run)).clamp(min=1.0)
+def _some_of(present: Tensor, count: int) -> Tensor:
+    """Positions (B, count) of pairs that are present, evenly spread over these, or of all of them where they are fewer.
+
+    Multiples of the golden ratio shift the positions, so that no pattern in the order of the pairs is met again: by so
+    much that no two positions are the same.
+    """
+    steps = torch.arange(count, dtype=torch.float64, device=present.device)
+    total = present.sum(1, keepdim=True).clamp(min=count)
+    most = ((1.0 - count / total) / (1.0 - _GOLDEN)).clamp(max=1.0)
+    spread = (steps + most * ((_GOLDEN * steps) % 1.0)) * (total / count)
+    return present_first(present).gather(1, spread.long())
 
 
-def _frame(affine: Tensor) -> Tensor:
-    """The rotation whose first two rows are nearest the rows of an affine camera (B, 2, 3); any rotation if it is 0."""
-    p, q = affine.unbind(1)
-    pp, pq, qq = dot(p.unbind(-1), p.unbind(-1)), dot(p.unbind(-1), q.unbind(-1)), dot(q.unbind(-1), q.unbind(-1))
-    # The inverse square root of [[pp, pq], [pq, qq]], up to a factor: (S + sqrt(det S) I)^-1.
-    ridge = 1e-3 * (pp + qq) + 1e-6
-    root = ((pp + ridge) * (qq + ridge) - pq * pq).clamp(min=1e-12).sqrt()
-    u = (qq + ridge + root)[:, None] * p - pq[:, None] * q
-    axis = torch.eye(3, dtype=u.dtype, device=u.device)[0]
-    u = functional.normalize(u + 1e-6 * axis, dim=-1)
-    v = (pp + ridge + root)[:, None] * q - pq[:, None] * p
-    v = v - (u * v).sum(-1, keepdim=True) * u + 1e-6 * _orthogonal(u)
-    v = functional.normalize(v, dim=-1)
-    return torch.stack((u, v, torch.linalg.cross(u, v)), 1)
-
-
-def _orthogonal(unit: Tensor) -> Tensor:
-    """A unit vector orthogonal to each, (B, 3)."""
-    x, y, z = unit.unbind(-1)
-    sign = torch.where(z < 0, -1.0, 1.0)
-    a = -(sign + z).reciprocal()
-    return torch.stack((1.0 + sign * x * x * a, sign * x * y * a, -sign * x), -1)
+@torch.no_grad()
+def _agreement(corr: Correspondences, noise: Noise, pose: Pose) -> Tensor:
+    """How well each pair agrees with a pose, in [0, 1], (B, N)."""
+    projection = project(pose, problems_last(corr))
+    depth = pose.translation[:, 2:].clamp(min=_NEAREST)  # (B, 1), as in the score of a sample
+    variance = noise.img.square() + (corr.focal * noise.world / depth).square()
+    agreement = 1.0 / (1.0 + projection.sq_residual / (_JUDGED * variance))
+    return torch.where(projection.in_front, agreement, 0.0).contiguous()
 
 
 class _Block(nn.Module):
@@ -179,7 +116,7 @@ class _Block(nn.Module):
         (batch, count, width), heads = x.shape, self.heads
         y = self.norm(x)
         # The scores need no bias: the softmax over pairs cancels it.
-        attention = (_by_channel(y, self.look.weight[width:]) + absent).softmax(-1)  # (heads, B, N)
+        attention = _softmax(_by_channel(y, self.look.weight[width:]) + absent)  # (heads, B, N)
         # Pooling is linear: the values of the means are the means of the values, which a problem has instead of a pair.
         means = torch.bmm(attention.movedim(0, 1), y)  # (B, heads, width)
         values = self.look.weight[:width].view(heads, width // heads, width)
@@ -188,6 +125,13 @@ class _Block(nn.Module):
         hidden = hidden.add_((self.all(context) + self.pair.bias)[:, None]).relu_()
         x = (x + self.out.bias).flatten(0, 1)
         return torch.addmm(x, hidden.flatten(0, 1), self.out.weight.mT).view(batch, count, width)
+
+
+def _softmax(scores: Tensor) -> Tensor:
+    """Softmax over the pairs of (C, B, N). Of rows shorter than a processor's vectors, a column takes a tenth."""
+    if compiling() or scores.shape[-1] >= _SHORT:
+        return scores.softmax(-1)
+    return scores.mT.contiguous().softmax(1).mT
 
 
 def _by_channel(x: Tensor, weight: Tensor) -> Tensor:
@@ -239,7 +183,7 @@ class SetInit(Configured):
     """
 
     #: Pairs per core whose temporaries stay in its caches. A solver splits larger batches where gradients allow it.
-    pairs_at_once = 12_000
+    pairs_at_once = 24_000
     #: The weights say which of the pairs that are not near are inliers.
     weighs_far_pairs = True
 
@@ -282,7 +226,9 @@ class SetInit(Configured):
 
         Args:
             corr: normalised correspondences of a centred and scaled world, of any :math:`N`, in any order.
-            search_follows: draw fewer samples, since what they miss is searched for.
+            search_follows: look at 48 pairs at most, evenly spread over all, and draw fewer samples: what they miss is
+                searched for among all pairs. The weights of the other pairs say how well they agree with the best
+                sample.
 
         Returns:
             The first hypothesis as the pose and the other hypotheses as others, the best sample last; probabilities of
@@ -292,7 +238,12 @@ class SetInit(Configured):
             DeviceError: when the correspondences and the network are on different devices.
         """
         check_devices({"world_points": corr.world_points}, self.pair.bias, "the network")
-        view = _View(corr, self.confidence, self.repeats)
+        given, index = corr, None
+        counts = repeats(corr) if self.repeats else None
+        if search_follows and corr.weights.shape[1] > _ENOUGH:
+            index = _some_of(corr.near_weights > 0, _ENOUGH)
+            corr, counts = _taken((corr, counts), index)
+        view = View(corr, self.confidence, counts)
         dtype = corr.world_points.dtype
         pair, problem = (x.to(dtype) for x in self._run(view.features, view.there))
         starts = self.starts
@@ -311,15 +262,17 @@ class SetInit(Configured):
         back = view.camera.permute(2, 1, 0)[:, :, None]
         rotation = small_product(small_product(back, rotation), view.world.permute(1, 2, 0)[:, :, None])
         translation = small_product(back, translation[:, None])[:, 0]
-        noises = self._noise(corr, view, noise)
+        noises = self._noise(given, view.spread, noise)
         if self.samples:
             fallback = Pose(rotation[:, :, 0], translation[:, 0])
-            sampled = self._sampled(corr, right, noises, fallback, search_follows)
+            sampled = self._sampled(corr, right, _taken(noises, index), fallback, search_follows)
             rotation, translation = (
                 torch.cat((x, y[..., None, :]), -2) for x, y in zip((rotation, translation), sampled, strict=True)
             )
         every = Pose(rotation.permute(3, 2, 0, 1), translation.permute(2, 1, 0))  # (B, S, 3, 3) and (B, S, 3)
         others = Pose(*(x[:, 1:] for x in every)) if every.rotation.shape[1] > 1 else None
+        if index is not None:
+            right = _agreement(given, noises, Pose(*(x[:, -1] for x in every))).scatter(1, index, right)
         return Guess(Pose(*(x[:, 0] for x in every)), right, others=others, noise=noises)
 
     def triples(self, count: int, *, search_follows: bool = False) -> dict[int, list[tuple[int, int, int]]]:
@@ -407,14 +360,17 @@ class SetInit(Configured):
             x = block(x, absent)
         x = self.norm(x)
         pair = _by_channel(x, self.pair.weight) + self.pair.bias[:, None, None]
-        share = (pair[0] + absent).softmax(-1)
+        share = _softmax(pair[:1] + absent)[0]
         return pair, self.problem(torch.bmm(share[:, None], x)[:, 0])
 
-    def _noise(self, corr: Correspondences, view: _View, estimate: Tensor) -> Noise:
+    def _noise(self, corr: Correspondences, spread: Tensor, estimate: Tensor) -> Noise:
         """The known noise, and the network's estimate where unknown."""
-        units = (corr.focal * view.spread)[:, None], torch.ones_like(view.spread)[:, None]
+        units = (corr.focal * spread)[:, None], torch.ones_like(spread)[:, None]
+        told = (None, None) if corr.noise is None else (corr.noise.img, corr.noise.world)
         pairs = []
-        for i, ((log, known), unit) in enumerate(zip(view.known, units, strict=True)):
-            guessed = _LOG_NOISE + 3.0 * torch.tanh(estimate[:, i : i + 1])
-            pairs.append(torch.where(known, log, guessed).exp() * unit)
-        return Noise(*pairs)
+        for i, (sigma, unit) in enumerate(zip(told, units, strict=True)):
+            guessed = (LOG_NOISE + 3.0 * torch.tanh(estimate[:, i : i + 1])).exp() * unit
+            known = guessed if sigma is None else torch.where(sigma.isfinite(), sigma, guessed)
+            pairs.append(known.maximum(LEAST_NOISE * unit).expand_as(corr.weights))
+        img, world = pairs
+        return Noise(img, world)

@@ -126,7 +126,7 @@ class RANSAC(Configured):
     """
 
     #: Pairs per core of a part of a batch. Parts have problems of about the same number of pairs.
-    pairs_at_once = 12_000
+    pairs_at_once = 24_000
     #: The weights say which of the pairs that are not near are inliers.
     weighs_far_pairs = True
 

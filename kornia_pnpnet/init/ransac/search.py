@@ -47,7 +47,7 @@ _SIGMAS = 3.0
 # scene with a field of view of 13 degrees; half of the angle takes twice the time at 9 pairs.
 _OPEN, _OPEN_SAMPLES = 0.008, 256.0
 # After this many samples, pairs whose neighbours agree are drawn more often. Finding these takes about as long.
-_PLAIN_SAMPLES = 128
+_PLAIN_SAMPLES = 256
 # A pair without any agreement is drawn this often, relative to one unit of agreement; the exponent is empirical.
 _LEAST_AGREEMENT, _AGREEMENT_POWER = 0.3, 1.5
 #: Number of pairs that are improved together, per sample that is solved together: both need about as much memory.
