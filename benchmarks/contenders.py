@@ -200,6 +200,7 @@ OURS: dict[str, Callable[..., Contender]] = {
 CONTENDERS: dict[str, Callable[..., Contender]] = {
     **OURS,
     f"{TRAINED} packaged": functools.partial(Packaged, TRAINED),
+    f"{ANY} packaged": functools.partial(Packaged, ANY),
     f"{TRAINED} ONNX": functools.partial(Onnx, TRAINED),
     f"{ANY} ONNX": functools.partial(Onnx, ANY),
     "opencv-ransac": functools.partial(Peer, "opencv-ransac"),
