@@ -19,6 +19,7 @@ from kornia_pnpnet.init import RANSAC, MLPInit, SetInit
 from kornia_pnpnet.init.alternatives import doubt_mirrored, find_alternatives, is_seen
 from kornia_pnpnet.init.focal import (
     MORE_ITERATIONS,
+    as_dist,
     finds_focal,
     free_focal_in_frame,
     guesses_focal,
@@ -26,6 +27,7 @@ from kornia_pnpnet.init.focal import (
     scale_focal,
     with_found_focal,
     with_nominal_focal,
+    with_radial,
 )
 from kornia_pnpnet.init.ransac import search_on
 from kornia_pnpnet.init.rig import guess_of_rig
@@ -301,12 +303,12 @@ class PnPNet(PretrainedMixin):
 
     def _parts(self, first_stage_only: bool, always: bool, inputs: Inputs) -> tuple[_Begun, Tensor | None, PnPResult]:
         """Before the iterations, the iterations, and after them."""
-        given, dist, guessed = inputs, None, False
+        given, radial, guessed = inputs, None, False
         if self.focal == "unknown" and inputs.free_focal is None:
             inputs = with_nominal_focal(inputs, self.focal_sigma)
             guessed = not self.radial and guesses_focal(self.init, inputs)
             if not guessed and (self.radial or not finds_focal(self.init)):
-                inputs, dist = with_found_focal(inputs, self.radial)
+                inputs, radial = with_found_focal(inputs, self.radial)
         views = 1 if first_stage_only or self.refine.m == 0 else self.views
         searches = not first_stage_only and self._searches(inputs)
         if not searches:
@@ -316,10 +318,14 @@ class PnPNet(PretrainedMixin):
             if self.focal == "known":  # an unknown focal length has a search of its own
                 guess = search_on(corr, guess, keep_others=inputs.init is not None or inputs.prior is not None)
             begun = _Begun(self.refine.begin(corr, guess), frame, guess)
-        end = self.refine.iterate(begun.start, 0 if first_stage_only else None, more=MORE_ITERATIONS if guessed else 0)
+        together = radial is not None and not first_stage_only and (self.refine.m > 0 or isinstance(self.init, RANSAC))
+        with torch.set_grad_enabled(torch.is_grad_enabled() and not together):
+            m, more = 0 if first_stage_only else None, MORE_ITERATIONS if guessed else 0
+            end = self.refine.iterate(begun.start, m, more=more)
+        if radial is not None:
+            start, end = with_radial(self.refine, begun.start, end, radial, together)
+            begun = begun._replace(start=start)
         result = self._finish(begun, end, always)
-        if dist is not None:
-            result = result._replace(dist=dist)
         if searches:
             start, frame, guess = begun
             pose = self.normalize.apply_to_pose(result.pose, frame)
@@ -431,6 +437,7 @@ class PnPNet(PretrainedMixin):
         live = finite if always else ok
         cameras = None if frame.intrinsics.ndim > 3 else gate(intrinsics, live, torch.ones_like(finite), 0.0)
         pose = gate_pose(pose, live, finite)
+        none = torch.zeros_like(pose.translation[:, :1]).expand(-1, 4)
         return PnPResult(
             *pose,
             gate(self.normalize.undo_pairs(refined.weights, frame), live, finite, 0.0),
@@ -441,7 +448,7 @@ class PnPNet(PretrainedMixin):
             torch.where(finite, refined.probability, 0.0),
             Alternatives.none(pose),
             cameras,
-            torch.zeros_like(pose.translation[:, :1]).expand(-1, 4),
+            none if end.radial is None else gate(as_dist(end.radial), live, finite, 0.0),
         )
 
 

@@ -20,11 +20,10 @@ from kornia_pnpnet import (
 )
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.export import export_program
-from kornia_pnpnet.geometry import dolly_zoom, normal_equations, project, retract
+from kornia_pnpnet.geometry import distort, dolly_zoom, normal_equations, project, retract
 from kornia_pnpnet.geometry import rotation_angle as angle
 from kornia_pnpnet.init.focal import scale_focal
 from kornia_pnpnet.refine.prior import focal_loss, prior_in_frame, prior_loss
-from kornia_pnpnet.refine.radial import _distorted
 from kornia_pnpnet.types import FreeFocal, PosePrior
 
 HALF = 500.0  # pixels
@@ -339,12 +338,12 @@ def test_the_jacobian_of_radial_distortion():
     def residual(delta):
         moved = dolly_zoom(retract(pose, delta[:, :6]), delta[:, 6])
         pairs = corr.zoomed(delta[:, 6])
-        return torch.cat(_distorted(project(moved, pairs), pairs, given + delta[:, 7:])[0].residual, 1)
+        return torch.cat(distort(project(moved, pairs), pairs, given + delta[:, 7:])[0].residual, 1)
 
     zero = torch.zeros(2, 9, dtype=torch.float64)
     jacobian = torch.autograd.functional.jacobian(lambda d: residual(d).sum(0), zero).movedim(0, 1) / corr.focal
     pairs = corr.zoomed(zero[:, 0])
-    seen, terms = _distorted(project(pose, pairs), pairs, given)
+    seen, terms = distort(project(pose, pairs), pairs, given)
     hessian, gradient = normal_equations(seen, corr.weights, free_focal=True, radial=terms)
     expected, right_side = jacobian.mT @ jacobian, (jacobian.mT @ residual(zero)[..., None])[..., 0]
     for i in range(9):
