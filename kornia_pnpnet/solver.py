@@ -19,15 +19,14 @@ from kornia_pnpnet.init import RANSAC, MLPInit, SetInit
 from kornia_pnpnet.init.alternatives import doubt_mirrored, find_alternatives, is_seen
 from kornia_pnpnet.init.focal import (
     MORE_ITERATIONS,
-    as_dist,
     finds_focal,
     free_focal_in_frame,
     guesses_focal,
     is_doubtful,
+    iterate_with_radial,
     scale_focal,
     with_found_focal,
     with_nominal_focal,
-    with_radial,
 )
 from kornia_pnpnet.init.ransac import search_on
 from kornia_pnpnet.init.rig import guess_of_rig
@@ -98,8 +97,8 @@ class PnPNet(PretrainedMixin):
             suffice, and with other initialisers, from one that P3P finds. If it stays open by over 15 %: not ``ok``.
         focal_sigma: standard deviation of the logarithm of the focal length in the intrinsics of a call, for example
             0.1 for one that is known to about 10 %; ``None``: the focal length in the intrinsics is ignored.
-        radial: number of coefficients of radial distortion, 0 to 2, that are estimated with an unknown focal length,
-            before the refinement; the result has them as ``dist``, without gradient.
+        radial: number of coefficients of radial distortion, 0 to 2, estimated with an unknown focal length: before the
+            refinement, and together with the pose after it. The result has them as ``dist``, with gradients.
 
     Raises:
         BaseError: when ``views`` is not an integer from 1 to 8, or ``gradient``, ``effort`` or ``focal`` neither of its
@@ -215,7 +214,7 @@ class PnPNet(PretrainedMixin):
 
         Returns:
             The :class:`~kornia_pnpnet.types.PnPResult`, in float64 when any input is, else in float32. Gradients flow
-            through rotation, translation, weights and cost of the problems that are ``ok``, and through the first guess
+            through pose, intrinsics, dist, weights and cost of the problems that are ``ok``, and through the first guess
             of every valid problem. A problem that cannot be solved has the identity as its pose and a cost of the
             square root of the dtype's largest number.
 
@@ -318,13 +317,9 @@ class PnPNet(PretrainedMixin):
             if self.focal == "known":  # an unknown focal length has a search of its own
                 guess = search_on(corr, guess, keep_others=inputs.init is not None or inputs.prior is not None)
             begun = _Begun(self.refine.begin(corr, guess), frame, guess)
-        together = radial is not None and not first_stage_only and (self.refine.m > 0 or isinstance(self.init, RANSAC))
-        with torch.set_grad_enabled(torch.is_grad_enabled() and not together):
-            m, more = 0 if first_stage_only else None, MORE_ITERATIONS if guessed else 0
-            end = self.refine.iterate(begun.start, m, more=more)
-        if radial is not None:
-            start, end = with_radial(self.refine, begun.start, end, radial, together)
-            begun = begun._replace(start=start)
+        m, more = 0 if first_stage_only else None, MORE_ITERATIONS if guessed else 0
+        start, end = iterate_with_radial(self.refine, begun.start, radial, m, more)
+        begun = begun._replace(start=start)
         result = self._finish(begun, end, always)
         if searches:
             start, frame, guess = begun
@@ -334,8 +329,8 @@ class PnPNet(PretrainedMixin):
             if guessed:
                 result = self._with_searched_focal(always, inputs, result)
             if inputs.noise is None:
-                noise = self.normalize.undo_guess(guess, frame).noise
-                result = self._with_more_noise(always, given, inputs, noise, result)
+                estimate = self.normalize.undo_guess(guess, frame).noise
+                result = self._with_more_noise(always, given, inputs, estimate, result)
         return begun, end.zoom, result
 
     def _with_searched_focal(self, always: bool, inputs: Inputs, result: PnPResult) -> PnPResult:
@@ -359,10 +354,8 @@ class PnPNet(PretrainedMixin):
         rows = (sigma[:, 0] > 0).nonzero()[:, 0]
         if not len(rows):
             return result
-        shown = Noise(sigma[rows], torch.zeros_like(sigma[rows]))
-        again = take(given, rows)._replace(noise=shown)
-        solved = self._parts(False, always, again)[2]
-        return put(result, rows, solved)
+        again = take(given, rows)._replace(noise=Noise(sigma[rows], torch.zeros_like(sigma[rows])))
+        return put(result, rows, self._parts(False, always, again)[2])
 
     def _searches(self, inputs: Inputs) -> bool:
         """Whether the effort is adaptive."""
@@ -448,7 +441,7 @@ class PnPNet(PretrainedMixin):
             torch.where(finite, refined.probability, 0.0),
             Alternatives.none(pose),
             cameras,
-            none if end.radial is None else gate(as_dist(end.radial), live, finite, 0.0),
+            none if end.radial is None else gate(end.radial, live, finite, 0.0),
         )
 
 

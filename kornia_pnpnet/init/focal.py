@@ -20,15 +20,14 @@ from kornia_pnpnet.types import Correspondences, FreeFocal, PnPResult, Pose
 
 __all__ = [
     "MORE_ITERATIONS",
-    "as_dist",
     "find_focal",
     "finds_focal",
     "free_focal_in_frame",
     "guesses_focal",
     "is_doubtful",
+    "iterate_with_radial",
     "scale_focal",
     "with_found_focal",
-    "with_radial",
     "with_nominal_focal",
 ]
 
@@ -164,46 +163,52 @@ def with_found_focal(inputs: Inputs, radial: int = 0) -> tuple[Inputs, Tensor | 
             zoom = torch.where(finite, found.zoom, 0.0)
             coefficients = torch.where(finite[:, None], found.radial, 0.0)
         cameras = scale_focal(cameras, zoom.exp())
-        inputs = with_undistorted(inputs._replace(intrinsics=cameras), as_dist(coefficients), None)
+        inputs = with_undistorted(inputs._replace(intrinsics=cameras), _as_dist(coefficients), None)
     return inputs._replace(intrinsics=cameras, init=pose if inputs.init is None else inputs.init), coefficients
 
 
-def with_radial(
-    refine: RobustWeightedLM, start: LMStart, end: LMStep, coefficients: Tensor, together: bool
+def iterate_with_radial(
+    refine: RobustWeightedLM, start: LMStart, coefficients: Tensor | None, m: int | None, more: int = 0
 ) -> tuple[LMStart, LMStep]:
-    """Go on from where a refinement of undistorted pixels ended, with their distortion as further parameters.
+    """Run the iterations, then refine the distortion of the pixels together with the pose and the focal length.
 
     Args:
         refine: the refinement.
-        start: what it started from.
-        end: where it ended.
-        coefficients: the distortion that was taken away from its pixels, (B, K), a constant.
-        together: whether to refine the distortion with the pose and the focal length.
+        start: what it starts from, with undistorted pixels.
+        coefficients: their distortion, (B, K), a constant; ``None``: there is none, and none is sought.
+        m: See RobustWeightedLM.iterate. With 0 the guess stays as it is, and so does the distortion.
+        more: See RobustWeightedLM.iterate.
 
     Returns:
-        The start with the pixels of the distortion that was found, and the end with that distortion.
+        The start with the pixels of the distortion that was found, and the end with that distortion, (B, 4).
     """
+    if coefficients is None:
+        return start, refine.iterate(start, m, more=more)
+    with torch.set_grad_enabled(torch.is_grad_enabled() and m == 0):  # the gradient is that of the last minimum
+        end = refine.iterate(start, m)
     assert end.zoom is not None
-    end = end._replace(radial=rescaled(coefficients, end.zoom))
-    if not together:
-        return start, end
+    radial = rescaled(coefficients, end.zoom)
+    if m == 0:
+        return start, end._replace(radial=_as_dist(radial))
     seen = distorted(start.corr, coefficients)
     pairs = start.by_residual._replace(img_points=seen.img_points, noise=seen.noise)
-    end = refine_radial(start._replace(by_residual=pairs), end, refine.kernel.weight)
+    end = refine_radial(start._replace(by_residual=pairs), end._replace(radial=radial), refine.kernel.weight)
     assert end.zoom is not None
     assert end.radial is not None
     focal = start.corr.focal * end.zoom.exp()
     camera = torch.stack((focal, focal, torch.ones_like(focal)), -1).diag_embed()
-    pixels, found, noise = undistort(seen.img_points, camera, as_dist(end.radial), None, seen.noise)
+    dist = _as_dist(end.radial)
+    pixels, found, noise = undistort(seen.img_points, camera, dist, None, seen.noise)
 
     def changed(corr: Correspondences) -> Correspondences:
         return corr._replace(img_points=pixels, noise=noise, weights=torch.where(found, corr.weights, 0.0))
 
     corr, guided, by_residual = (changed(x) for x in (start.corr, start.guided, start.by_residual))
     prior = torch.where(found, start.prior, 0.0)
-    return start._replace(corr=corr, guided=guided, by_residual=by_residual, prior=prior), end
+    start = start._replace(corr=corr, guided=guided, by_residual=by_residual, prior=prior)
+    return start, end._replace(radial=dist)
 
 
-def as_dist(coefficients: Tensor) -> Tensor:
+def _as_dist(coefficients: Tensor) -> Tensor:
     """Coefficients (B, K) of radial distortion as (k1, k2, 0, 0), (B, 4)."""
     return functional.pad(coefficients, (0, 4 - coefficients.shape[1]))

@@ -215,9 +215,7 @@ def add_focal_prior(equations: NormalEquations, free: FreeFocal, unit: Tensor, f
     return NormalEquations(rows, slopes)
 
 
-def add_radial_prior(
-    equations: NormalEquations, coefficients: Tensor, unit: Tensor, focal: Tensor
-) -> NormalEquations:
+def add_radial_prior(equations: NormalEquations, coefficients: Tensor, unit: Tensor, focal: Tensor) -> NormalEquations:
     """Add to normal equations that coefficients of radial distortion, their parameters from the eighth on, are small.
 
     Args:

@@ -28,7 +28,7 @@ _WIDE = 0.07
 # From step to step this limit shrinks by this factor, down to the scale of the residuals.
 _SHRINK = 0.6
 # Number of steps of the first estimate, and of the refinement after it.
-_STEPS, _MORE_STEPS = 14, 5
+_STEPS, _MORE_STEPS = 14, 6
 # Scale of Cauchy's kernel in standard deviations, and the median of squared residuals in variances of a coordinate.
 _KERNEL_SCALE, _MEDIAN = 3.4, 2.0 * math.log(2.0)
 # Focal lengths. The scale of the residuals is at least this.
