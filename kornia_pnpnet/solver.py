@@ -214,7 +214,7 @@ class PnPNet(PretrainedMixin):
 
         Returns:
             The :class:`~kornia_pnpnet.types.PnPResult`, in float64 when any input is, else in float32. Gradients flow
-            through pose, intrinsics, dist, weights and cost of the problems that are ``ok``, and through the first guess
+            through pose, intrinsics, dist, weights and cost of problems that are ``ok``, and through the first guess
             of every valid problem. A problem that cannot be solved has the identity as its pose and a cost of the
             square root of the dtype's largest number.
 
