@@ -357,6 +357,19 @@ def test_gradcheck_to_radial_distortion(radial):
     assert torch.autograd.gradcheck(solve, inputs, eps=1e-5, atol=1e-6, rtol=1e-4, fast_mode=True)
 
 
+@pytest.mark.slow
+def test_second_derivatives_of_radial_distortion():
+    p, pixels, _ = seen_through_a_lens(1, n=10, batch=1, fov=(60.0, 80.0))
+    solver, camera = create_solver("p3p-ransac", focal="unknown", radial=1), withheld(p)
+
+    def solve(*pairs):
+        result = solver(*pairs, camera)
+        return result.translation, result.dist[:, :1]
+
+    inputs = [x.clone().requires_grad_() for x in (p.world_points, pixels)]
+    assert torch.autograd.gradgradcheck(solve, inputs, eps=1e-4, atol=1e-5, rtol=1e-2, fast_mode=True)
+
+
 def test_radial_distortion_is_a_minimum_as_accurate_as_the_noise_allows():
     """A further Gauss-Newton step is short, and normalised errors are chi-square with 8 degrees of freedom."""
     batch = 400
