@@ -165,8 +165,8 @@ def _to_plane(img_points: Tensor, camera: Tensor) -> Tensor:
 def _invert(function: Callable[[Tensor], Tensor], target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Points (B, N, 2) that a map takes to the target, the Jacobian of the inverse, and where there is a solution.
 
-    A step of Newton's is as long as half of the target's distance at most. The last step carries the gradient, to the
-    target and to what the function depends on.
+    A step of Newton's is as long as half of the target's distance at most. The last two steps carry the gradient, to
+    the target and to what the function depends on; the second of them makes second derivatives exact.
     """
     fixed = target.detach()
     point = fixed
@@ -185,8 +185,10 @@ def _invert(function: Callable[[Tensor], Tensor], target: Tensor) -> tuple[Tenso
         safe = torch.where(found[..., None], point, 0.0)
         inverse = torch.linalg.inv_ex(torch.where(found[..., None, None], jacobian, torch.eye(2).to(jacobian))).inverse
     wanted = torch.where(found[..., None], target, 0.0)
-    value = torch.where(found[..., None], function(safe), 0.0)
-    return safe + (inverse @ (wanted - value)[..., None])[..., 0], inverse, found
+    for _ in range(2):
+        value = torch.where(found[..., None], function(safe), 0.0)
+        safe = safe + (inverse @ (wanted - value)[..., None])[..., 0]
+    return safe, inverse, found
 
 
 def _with_jacobian(function: Callable[[Tensor], Tensor], point: Tensor) -> tuple[Tensor, Tensor]:
@@ -239,8 +241,10 @@ def _fisheye_angle(plane: Tensor, fisheye: Tensor) -> tuple[Tensor, Tensor, Tens
         found = ((radius - value).abs() < limit * (1.0 + radius)) & (slope > 0)
         angle = torch.where(found, angle, 0.0)
         slope = torch.where(found, slope, 1.0)
-    value = torch.where(found, distorted(angle)[0], 0.0)
-    return angle + (torch.where(found, radius, 0.0) - value) / slope, unit, found[..., 0]
+    wanted = torch.where(found, radius, 0.0)
+    for _ in range(2):  # as in `_invert`
+        angle = angle + (wanted - torch.where(found, distorted(angle)[0], 0.0)) / slope
+    return angle, unit, found[..., 0]
 
 
 def _undistort_fisheye(plane: Tensor, fisheye: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -23,6 +23,7 @@ from kornia_pnpnet.init.focal import (
     free_focal_in_frame,
     guesses_focal,
     is_doubtful,
+    iterate_with_radial,
     scale_focal,
     with_found_focal,
     with_nominal_focal,
@@ -96,8 +97,8 @@ class PnPNet(PretrainedMixin):
             suffice, and with other initialisers, from one that P3P finds. If it stays open by over 15 %: not ``ok``.
         focal_sigma: standard deviation of the logarithm of the focal length in the intrinsics of a call, for example
             0.1 for one that is known to about 10 %; ``None``: the focal length in the intrinsics is ignored.
-        radial: number of coefficients of radial distortion, 0 to 2, that are estimated with an unknown focal length,
-            before the refinement; the result has them as ``dist``, without gradient.
+        radial: number of coefficients of radial distortion, 0 to 2, estimated with an unknown focal length: before the
+            refinement, and together with the pose after it. The result has them as ``dist``, with gradients.
 
     Raises:
         BaseError: when ``views`` is not an integer from 1 to 8, or ``gradient``, ``effort`` or ``focal`` neither of its
@@ -213,7 +214,7 @@ class PnPNet(PretrainedMixin):
 
         Returns:
             The :class:`~kornia_pnpnet.types.PnPResult`, in float64 when any input is, else in float32. Gradients flow
-            through rotation, translation, weights and cost of the problems that are ``ok``, and through the first guess
+            through pose, intrinsics, dist, weights and cost of problems that are ``ok``, and through the first guess
             of every valid problem. A problem that cannot be solved has the identity as its pose and a cost of the
             square root of the dtype's largest number.
 
@@ -301,12 +302,12 @@ class PnPNet(PretrainedMixin):
 
     def _parts(self, first_stage_only: bool, always: bool, inputs: Inputs) -> tuple[_Begun, Tensor | None, PnPResult]:
         """Before the iterations, the iterations, and after them."""
-        given, dist, guessed = inputs, None, False
+        given, radial, guessed = inputs, None, False
         if self.focal == "unknown" and inputs.free_focal is None:
             inputs = with_nominal_focal(inputs, self.focal_sigma)
             guessed = not self.radial and guesses_focal(self.init, inputs)
             if not guessed and (self.radial or not finds_focal(self.init)):
-                inputs, dist = with_found_focal(inputs, self.radial)
+                inputs, radial = with_found_focal(inputs, self.radial)
         views = 1 if first_stage_only or self.refine.m == 0 else self.views
         searches = not first_stage_only and self._searches(inputs)
         if not searches:
@@ -316,10 +317,10 @@ class PnPNet(PretrainedMixin):
             if self.focal == "known":  # an unknown focal length has a search of its own
                 guess = search_on(corr, guess, keep_others=inputs.init is not None or inputs.prior is not None)
             begun = _Begun(self.refine.begin(corr, guess), frame, guess)
-        end = self.refine.iterate(begun.start, 0 if first_stage_only else None, more=MORE_ITERATIONS if guessed else 0)
+        m, more = 0 if first_stage_only else None, MORE_ITERATIONS if guessed else 0
+        start, end = iterate_with_radial(self.refine, begun.start, radial, m, more)
+        begun = begun._replace(start=start)
         result = self._finish(begun, end, always)
-        if dist is not None:
-            result = result._replace(dist=dist)
         if searches:
             start, frame, guess = begun
             pose = self.normalize.apply_to_pose(result.pose, frame)
@@ -328,8 +329,8 @@ class PnPNet(PretrainedMixin):
             if guessed:
                 result = self._with_searched_focal(always, inputs, result)
             if inputs.noise is None:
-                noise = self.normalize.undo_guess(guess, frame).noise
-                result = self._with_more_noise(always, given, inputs, noise, result)
+                estimate = self.normalize.undo_guess(guess, frame).noise
+                result = self._with_more_noise(always, given, inputs, estimate, result)
         return begun, end.zoom, result
 
     def _with_searched_focal(self, always: bool, inputs: Inputs, result: PnPResult) -> PnPResult:
@@ -353,10 +354,8 @@ class PnPNet(PretrainedMixin):
         rows = (sigma[:, 0] > 0).nonzero()[:, 0]
         if not len(rows):
             return result
-        shown = Noise(sigma[rows], torch.zeros_like(sigma[rows]))
-        again = take(given, rows)._replace(noise=shown)
-        solved = self._parts(False, always, again)[2]
-        return put(result, rows, solved)
+        again = take(given, rows)._replace(noise=Noise(sigma[rows], torch.zeros_like(sigma[rows])))
+        return put(result, rows, self._parts(False, always, again)[2])
 
     def _searches(self, inputs: Inputs) -> bool:
         """Whether the effort is adaptive."""
@@ -431,6 +430,7 @@ class PnPNet(PretrainedMixin):
         live = finite if always else ok
         cameras = None if frame.intrinsics.ndim > 3 else gate(intrinsics, live, torch.ones_like(finite), 0.0)
         pose = gate_pose(pose, live, finite)
+        none = torch.zeros_like(pose.translation[:, :1]).expand(-1, 4)
         return PnPResult(
             *pose,
             gate(self.normalize.undo_pairs(refined.weights, frame), live, finite, 0.0),
@@ -441,7 +441,7 @@ class PnPNet(PretrainedMixin):
             torch.where(finite, refined.probability, 0.0),
             Alternatives.none(pose),
             cameras,
-            torch.zeros_like(pose.translation[:, :1]).expand(-1, 4),
+            none if end.radial is None else gate(end.radial, live, finite, 0.0),
         )
 
 

@@ -161,6 +161,19 @@ def test_gradcheck_of_the_lens(lens, uniform):
         return solve(pixels, camera * mask + CAMERA * (1 - mask), given)
 
     assert torch.autograd.gradcheck(by_entries, inputs, eps=1e-5, atol=1e-4, rtol=1e-4)
+    assert torch.autograd.gradgradcheck(by_entries, inputs, eps=1e-5, atol=1e-3, rtol=1e-4)
+
+
+@pytest.mark.parametrize("lens", ["dist", "fisheye"])
+def test_gradcheck_of_a_pose_to_the_lens(lens, uniform):
+    points, pixels, _ = seen(uniform, 1, 6)
+    given = torch.tensor([DIST[4] if lens == "dist" else FISHEYE], dtype=torch.float64).requires_grad_()
+    solver = create_solver("epnp-lm", gradient="always")
+
+    def solve(given):
+        return tuple(solver(points, pixels, CAMERA, **{lens: given}).pose)
+
+    assert torch.autograd.gradcheck(solve, [given], eps=1e-6, atol=1e-4, rtol=1e-3)
 
 
 def test_solve_pnp_takes_a_lens(uniform):

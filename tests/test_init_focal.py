@@ -18,14 +18,16 @@ from kornia_pnpnet import (
     create_solver,
     pose_covariance,
 )
+from kornia_pnpnet.cameras import undistort
+from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.export import export_program
-from kornia_pnpnet.geometry import dolly_zoom, normal_equations, project, retract
+from kornia_pnpnet.geometry import distort, dolly_zoom, normal_equations, project, retract
 from kornia_pnpnet.geometry import rotation_angle as angle
 from kornia_pnpnet.init.focal import scale_focal
 from kornia_pnpnet.refine.prior import focal_loss, prior_in_frame, prior_loss
-from kornia_pnpnet.refine.radial import _distorted
-from kornia_pnpnet.types import FreeFocal, PosePrior
+from kornia_pnpnet.refine.radial import distorted
+from kornia_pnpnet.types import FreeFocal, Noise, PosePrior
 
 HALF = 500.0  # pixels
 
@@ -311,14 +313,19 @@ def test_the_search_helps_where_the_network_does_not_suffice():
     assert not (right["fixed"] & ~right["adaptive"]).any()
 
 
+def seen_through_a_lens(radial, *, noise=0.5, seed=0, **options):
+    """Problems, their distorted pixels and the coefficients."""
+    p = draw(seed=seed, **options)
+    dist = torch.tensor([-0.2, 0.03 * (radial - 1), 0.0, 0.0], dtype=torch.float64).expand(len(p.inliers), -1)
+    pixels = distort_points(p.img_points, p.intrinsics, dist)
+    return p, pixels + noise * torch.randn(pixels.shape, generator=torch.Generator().manual_seed(seed)).double(), dist
+
+
 @pytest.mark.parametrize("name", ["pnpnet-set", "p3p-ransac", "reppnp-lm"])
 @pytest.mark.parametrize("radial", [1, 2])
 def test_radial_distortion_is_estimated_with_the_focal_length(name, radial):
     wrong = 0 if name == "reppnp-lm" else 8
-    p = draw(40, wrong=0, batch=32, fov=(40.0, 90.0))
-    dist = torch.tensor([-0.2, 0.03 * (radial - 1), 0.0, 0.0], dtype=torch.float64)
-    pixels = distort_points(p.img_points, p.intrinsics, dist.expand(32, -1))
-    pixels = pixels + 0.5 * torch.randn(pixels.shape, generator=torch.Generator().manual_seed(0)).double()
+    p, pixels, dist = seen_through_a_lens(radial, n=40, batch=32, fov=(40.0, 90.0))
     pixels[:, :wrong] = pixels[:, :wrong].flip(1) + 100.0
     without = create_solver(name, focal="unknown")(p.world_points, pixels, withheld(p))
     assert (errors(without, p)[0] > 0.02).double().mean() > 0.5
@@ -332,6 +339,108 @@ def test_radial_distortion_is_estimated_with_the_focal_length(name, radial):
     torch.testing.assert_close(known.rotation, result.rotation, rtol=0, atol=0.01)
 
 
+@pytest.mark.parametrize("radial", [1, 2])
+def test_gradcheck_to_radial_distortion(radial):
+    """The gradient of pose, focal length and distortion to points, pixels and weights of two pairs."""
+    p, pixels, _ = seen_through_a_lens(radial, n=10, batch=1, fov=(60.0, 80.0))
+    solver, camera = create_solver("p3p-ransac", focal="unknown", radial=radial), withheld(p)
+
+    def solve(*some):
+        of_pairs = p.world_points, pixels, torch.ones_like(pixels[..., 0])
+        points, seen, weights = (torch.cat((x, y[:, 2:]), 1) for x, y in zip(some, of_pairs, strict=True))
+        result = solver(points, seen, camera, weights)
+        assert result.ok.all()
+        return result.rotation, result.translation, result.intrinsics[:, 0, 0].log(), result.dist[:, :radial]
+
+    inputs = [p.world_points[:, :2], pixels[:, :2], torch.full((1, 2), 0.5, dtype=torch.float64)]
+    inputs = [x.clone().requires_grad_() for x in inputs]
+    assert torch.autograd.gradcheck(solve, inputs, eps=1e-5, atol=1e-6, rtol=1e-4, fast_mode=True)
+
+
+@pytest.mark.slow
+def test_second_derivatives_of_radial_distortion():
+    p, pixels, _ = seen_through_a_lens(1, n=10, batch=1, fov=(60.0, 80.0))
+    solver, camera = create_solver("p3p-ransac", focal="unknown", radial=1), withheld(p)
+
+    def solve(*pairs):
+        result = solver(*pairs, camera)
+        return result.translation, result.dist[:, :1]
+
+    inputs = [x.clone().requires_grad_() for x in (p.world_points, pixels)]
+    assert torch.autograd.gradgradcheck(solve, inputs, eps=1e-4, atol=1e-5, rtol=1e-2, fast_mode=True)
+
+
+def test_radial_distortion_is_a_minimum_as_accurate_as_the_noise_allows():
+    """A further Gauss-Newton step is short, and normalised errors are chi-square with 8 degrees of freedom."""
+    batch = 400
+    p, pixels, dist = seen_through_a_lens(1, n=40, batch=batch, noise=1.0, fov=(50.0, 75.0))
+    solver = PnPNet(None, RobustWeightedLM(15, robustness=0.0), Normalize(order=False), focal="unknown", radial=1)
+    result = solver(p.world_points, pixels, withheld(p))
+
+    def residual(delta):
+        pose = retract(result.pose, delta[:, :6])
+        camera = scale_focal(result.intrinsics, delta[:, 6].exp())
+        cam_points = p.world_points @ pose.rotation.mT + pose.translation[:, None]
+        seen = cam_points @ camera.mT
+        lens = result.dist + torch.nn.functional.pad(delta[:, 7:], (0, 3))
+        return (distort_points(seen[..., :2] / seen[..., 2:], camera, lens) - pixels).flatten(1)
+
+    zero = torch.zeros(batch, 8, dtype=torch.float64)
+    units = torch.eye(8, dtype=torch.float64)
+    columns = [torch.autograd.functional.jvp(residual, zero, unit.expand(batch, 8))[1] for unit in units]
+    jacobian = torch.stack(columns, -1)
+    information = jacobian.mT @ jacobian
+    step = torch.linalg.solve(information, (jacobian.mT @ residual(zero)[..., None])[..., 0])
+    turn = Pose(p.pose.rotation @ result.rotation.mT, result.translation).rvec
+    log_focal = (p.intrinsics[:, 0, 0] / result.intrinsics[:, 0, 0]).log()[:, None]
+    error = torch.cat((turn, p.pose.translation - result.translation, log_focal, (dist - result.dist)[:, :1]), -1)
+    of_step, of_error = ((x * (information @ x[..., None])[..., 0]).sum(-1)[result.ok] for x in (step, error))
+    assert of_step.max() < 0.01  # the prior of the coefficient
+    assert of_error.mean().item() == pytest.approx(8.0, rel=0.1)
+
+
+def test_a_broken_problem_leaves_the_distortion_of_the_others():
+    p, pixels, _ = seen_through_a_lens(1, n=16, batch=4, fov=(50.0, 90.0))
+    solver = create_solver("p3p-ransac", focal="unknown", radial=1)
+    first = solver(p.world_points, pixels, withheld(p))
+    broken, line = p.world_points.clone(), p.world_points[2, :1] + torch.arange(16)[:, None].double()
+    broken[1, 3], broken[2] = math.nan, line
+    inputs = [broken.requires_grad_(), pixels.clone().requires_grad_()]
+    result = solver(*inputs, withheld(p))
+    assert result.ok.tolist() == [True, False, False, True]
+    assert all(x.isfinite().all() for x in iter_tensors(result) if x.is_floating_point())
+    for x, y in zip(result, first, strict=True):
+        torch.testing.assert_close(map_tensors(lambda x: x[::3], x), map_tensors(lambda x: x[::3], y))
+    total = sum(x.sum() for x in (result.rotation, result.translation, result.weights, result.cost, result.dist))
+    for gradient in torch.autograd.grad(total + result.intrinsics.sum(), inputs):
+        assert gradient.isfinite().all()
+        assert gradient.flatten(1).abs().amax(1).bool().tolist() == [True, False, False, True]
+
+
+def test_a_first_guess_keeps_the_first_distortion():
+    p, pixels, dist = seen_through_a_lens(1, n=16, batch=8, fov=(50.0, 90.0))
+    solver = create_solver("p3p-ransac", focal="unknown", radial=1)
+    result = solver(p.world_points, pixels, withheld(p), first_stage_only=True)
+    assert 0 < (result.dist - dist).abs().max() < 0.1
+    assert (result.dist != solver(p.world_points, pixels, withheld(p)).dist)[:, 0].all()
+
+
+def test_pixels_and_their_noise_are_distorted_back():
+    corr, _ = framed(draw(9, batch=2))
+    given = torch.tensor([[-0.1, 0.02], [0.2, -0.03]], dtype=torch.float64)
+    sigma = torch.linspace(1.0, 2.0, 18, dtype=torch.float64).view(2, 9)
+    noise = Noise(sigma, sigma, Symmetric2(sigma, 0.3 * sigma.flip(1), 2.0 * sigma))
+    corr = corr._replace(noise=noise)
+    back = distorted(corr, given)
+    assert (back.img_points - corr.img_points).abs().max() > 1.0
+    camera = torch.stack((corr.focal, corr.focal, torch.ones_like(corr.focal))).diag().expand(2, 3, 3)
+    lens = torch.nn.functional.pad(given, (0, 2))
+    pixels, found, again = undistort(back.img_points, camera, lens, None, back.noise)
+    assert found.all()
+    torch.testing.assert_close(pixels, corr.img_points, rtol=0, atol=1e-6)
+    torch.testing.assert_close(tuple(iter_tensors(again)), tuple(iter_tensors(noise)), rtol=1e-5, atol=1e-5)
+
+
 def test_the_jacobian_of_radial_distortion():
     corr, pose = framed(draw(9, batch=2, noise=1.0))
     given = torch.tensor([[0.1, -0.05], [-0.2, 0.03]], dtype=torch.float64)
@@ -339,12 +448,12 @@ def test_the_jacobian_of_radial_distortion():
     def residual(delta):
         moved = dolly_zoom(retract(pose, delta[:, :6]), delta[:, 6])
         pairs = corr.zoomed(delta[:, 6])
-        return torch.cat(_distorted(project(moved, pairs), pairs, given + delta[:, 7:])[0].residual, 1)
+        return torch.cat(distort(project(moved, pairs), pairs, given + delta[:, 7:])[0].residual, 1)
 
     zero = torch.zeros(2, 9, dtype=torch.float64)
     jacobian = torch.autograd.functional.jacobian(lambda d: residual(d).sum(0), zero).movedim(0, 1) / corr.focal
     pairs = corr.zoomed(zero[:, 0])
-    seen, terms = _distorted(project(pose, pairs), pairs, given)
+    seen, terms = distort(project(pose, pairs), pairs, given)
     hessian, gradient = normal_equations(seen, corr.weights, free_focal=True, radial=terms)
     expected, right_side = jacobian.mT @ jacobian, (jacobian.mT @ residual(zero)[..., None])[..., 0]
     for i in range(9):

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import KINDS, are_rotations, correspondences, finite, gradients_are_finite, many, options, poses
 
-from kornia_pnpnet import Correspondences, Guess, Noise, PnPNet, Pose, RobustWeightedLM, pose_errors
+from kornia_pnpnet import Correspondences, Guess, Noise, Normalize, PnPNet, Pose, RobustWeightedLM, pose_errors
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.geometry import NormalEquations, project, retract, retract_additive
 from kornia_pnpnet.refine import KERNELS, explains, lm_step, solve_damped
@@ -632,6 +632,23 @@ def test_implicit_gradients_are_those_of_unrolling_to_the_minimum(kernel, gradie
     assert implicit[-1].any()
     # The start, the step length and the damping do not move a minimum.
     assert not any(x.any() for x in implicit[3:6])
+
+
+def test_implicit_gradients_do_not_depend_on_the_unit_of_pixels(make_problems, perturb):
+    """Nor where the pose is no minimum, and the Gauss-Newton matrix replaces that of Newton."""
+    p = make_problems(n=8, batch=16).map(lambda x: x.double() if x.is_floating_point() else x)
+    start = perturb(p.pose, angle=0.3)
+    gradients = []
+    for focal in (30.0, 3000.0):
+        normalize = Normalize(f_const=focal, order=False)
+        corr, frame = normalize(*p[:3])
+        rays = (corr.img_points / focal).detach().requires_grad_()
+        refine = RobustWeightedLM(1, kernel="cauchy", robustness=0.005 * focal, backward="implicit").double()
+        guess = Guess(normalize.apply_to_pose(start, frame), torch.ones_like(corr.weights))
+        refined = refine(corr._replace(img_points=focal * rays), guess)
+        gradients.append(torch.autograd.grad(refined.pose.translation.sum(), rays)[0])
+    # The scale of the kernel is stored in float32.
+    torch.testing.assert_close(gradients[0], gradients[1], rtol=1e-3, atol=1e-5)
 
 
 def test_implicit_second_derivatives_are_those_of_unrolling_to_the_minimum(make_problems, perturb):

@@ -62,10 +62,12 @@ class Symmetric2(NamedTuple):
         scale = self.determinant.reciprocal()
         return Symmetric2(self.vv * scale, -self.uv * scale, self.uu * scale)
 
-    def mapped(self, a: Tensor, b: Tensor, d: Tensor) -> Symmetric2:
-        """The covariance of a vector after its product with the matrix [[a, b], [0, d]]."""
+    def mapped(self, a: Tensor, b: Tensor, d: Tensor, c: Tensor | None = None) -> Symmetric2:
+        """The covariance of a vector after its product with the matrix [[a, b], [c, d]]; ``None``: c is 0."""
         u, v = a * self.uu + b * self.uv, a * self.uv + b * self.vv
-        return Symmetric2(a * u + b * v, d * v, d * d * self.vv)
+        if c is None:
+            return Symmetric2(a * u + b * v, d * v, d * d * self.vv)
+        return Symmetric2(a * u + b * v, c * u + d * v, c * (c * self.uu + 2.0 * d * self.uv) + d * d * self.vv)
 
     def at_least(self, least: float) -> Symmetric2:
         """Add a multiple of the identity where the smallest eigenvalue is below ``least``, so that it is not."""

@@ -11,10 +11,12 @@ from kornia_pnpnet.geometry.projection import (
     NormalEquations,
     Projection,
     RadialTerms,
+    distort,
     normal_equations,
     pixel_covariance,
     pixel_variance,
     project,
+    radial_stretch,
     transform,
 )
 from kornia_pnpnet.geometry.tangent import (
@@ -36,6 +38,7 @@ __all__ = [
     "additive_tangent_map",
     "align",
     "change_tangent",
+    "distort",
     "dolly_zoom",
     "gate_pose",
     "move",
@@ -43,6 +46,7 @@ __all__ = [
     "pixel_variance",
     "normal_equations",
     "project",
+    "radial_stretch",
     "retract",
     "retract_additive",
     "rotation_angle",

@@ -18,10 +18,12 @@ __all__ = [
     "NormalEquations",
     "Projection",
     "RadialTerms",
+    "distort",
     "normal_equations",
     "pixel_covariance",
     "pixel_variance",
     "project",
+    "radial_stretch",
     "transform",
 ]
 
@@ -156,6 +158,50 @@ def project(pose: Pose, corr: Correspondences) -> Projection:
     residual = scaled[0] * inv_depth, scaled[1] * inv_depth
     plane_points = x * inv_depth, y * inv_depth
     return Projection(residual, in_front, (y0, y1, y2), plane_points, inv_depth, scaled, rotation, to_camera)
+
+
+def radial_stretch(p: Tensor, q: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
+    """The ``stretch`` and the ``slope`` of :class:`RadialTerms` at points (B, N) of the plane z = 1.
+
+    Args:
+        p: horizontal coordinate, shape :math:`(B, N)`.
+        q: vertical coordinate, shape :math:`(B, N)`.
+        coefficients: :math:`k_1` and, with two, :math:`k_2`, shape :math:`(B, K)`.
+    """
+    square = torch.addcmul(p * p, q, q)
+    stretch, slope = torch.ones_like(square), torch.zeros_like(square)
+    for k, coefficient in enumerate(coefficients[..., None].unbind(1)):
+        stretch = stretch + coefficient * square ** (k + 1)
+        slope = slope + 2.0 * (k + 1) * coefficient * square**k
+    return stretch, slope
+
+
+def distort(projection: Projection, corr: Correspondences, coefficients: Tensor) -> tuple[Projection, RadialTerms]:
+    r"""Compare distorted projections :math:`f d (p, q)` with distorted pixels.
+
+    Args:
+        projection: what :func:`project` returned.
+        corr: the correspondences, their pixels distorted.
+        coefficients: See radial_stretch.
+
+    Returns:
+        The projection with the residuals of distorted pixels, and what :func:`normal_equations` needs beside it.
+
+    Example:
+        >>> points = torch.tensor([[[1.0, 2.0, 4.0]]])
+        >>> corr = Correspondences(points, torch.zeros(1, 1, 2), torch.ones(1, 1), torch.tensor(100.0))
+        >>> projection = project(Pose(torch.eye(3)[None], torch.zeros(1, 3)), corr)
+        >>> distort(projection, corr, torch.tensor([[0.32]]))[0].residual
+        (tensor([[27.5000]]), tensor([[55.]]))
+    """
+    p, q = projection.plane_points
+    stretch, slope = radial_stretch(p, q, coefficients)
+    u, v = corr.img_points.unbind(-1)
+    residual = corr.focal * stretch * p - u, corr.focal * stretch * q - v
+    depth = torch.where(projection.in_front, projection.inv_depth, 1.0).reciprocal()
+    scaled = residual[0] * depth, residual[1] * depth
+    terms = RadialTerms(stretch, slope, depth, coefficients.shape[1])
+    return projection._replace(residual=residual, scaled_residual=scaled), terms
 
 
 def pixel_variance(projection: Projection, noise: Noise, focal: Tensor) -> Tensor:

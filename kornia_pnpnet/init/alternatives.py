@@ -137,12 +137,10 @@ def doubt_mirrored(
     probability = result.probability * (1.0 - _mirror_probability(refine, corr, guess, pose, result))
     doubted = result.ok & (probability < LEAST_PROBABILITY)
     live, everywhere = ~doubted | always, torch.ones_like(doubted)
-    rotation, translation, weights, cost = (gate(x, live, everywhere, 0.0) for x in result[:4])
+    with_gradient = ("rotation", "translation", "weights", "cost", "intrinsics", "dist")
+    gated = map_tensors(lambda x: gate(x, live, everywhere, 0.0), [getattr(result, name) for name in with_gradient])
     return result._replace(
-        rotation=rotation,
-        translation=translation,
-        weights=weights,
-        cost=cost,
+        **dict(zip(with_gradient, gated, strict=True)),
         ok=result.ok & ~doubted,
         status=result.status.masked_fill(doubted, Status.NOT_BELIEVED.value),
         probability=probability,

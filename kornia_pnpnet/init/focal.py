@@ -8,13 +8,15 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from kornia_pnpnet.cameras import undistort
 from kornia_pnpnet.core.performance import ranked
 from kornia_pnpnet.init.ransac import P3P, RANSAC
 from kornia_pnpnet.init.set import SetInit
 from kornia_pnpnet.inputs import Inputs, with_undistorted
 from kornia_pnpnet.normalize import Frame, Normalize
-from kornia_pnpnet.refine.radial import estimate_radial
-from kornia_pnpnet.types import FreeFocal, PnPResult, Pose
+from kornia_pnpnet.refine import LMStart, LMStep, RobustWeightedLM
+from kornia_pnpnet.refine.radial import distorted, estimate_radial, refine_radial, rescaled
+from kornia_pnpnet.types import Correspondences, FreeFocal, PnPResult, Pose
 
 __all__ = [
     "MORE_ITERATIONS",
@@ -23,6 +25,7 @@ __all__ = [
     "free_focal_in_frame",
     "guesses_focal",
     "is_doubtful",
+    "iterate_with_radial",
     "scale_focal",
     "with_found_focal",
     "with_nominal_focal",
@@ -140,23 +143,72 @@ def with_found_focal(inputs: Inputs, radial: int = 0) -> tuple[Inputs, Tensor | 
         radial: number of coefficients of radial distortion to estimate, too.
 
     Returns:
-        The problems, their pixels undistorted where ``radial`` is not 0; the coefficients (k1, k2, 0, 0), (B, 4).
+        The problems, their pixels undistorted where ``radial`` is not 0; the coefficients, (B, radial), then.
     """
     pose, zoom = find_focal(inputs)
-    cameras, dist = scale_focal(inputs.intrinsics, zoom.exp()), None
+    cameras, coefficients = scale_focal(inputs.intrinsics, zoom.exp()), None
     if radial:
         normalize = Normalize(order=False)
         with torch.no_grad():
             corr, frame = normalize(*inputs._replace(intrinsics=cameras)[:5])
             found = estimate_radial(corr, normalize.apply_to_pose(pose, frame), radial)
-            finite = frame.valid & (found.pose.translation.sum(-1) + found.zoom + found.coefficients.sum(-1)).isfinite()
+            assert found.zoom is not None
+            assert found.radial is not None
+            finite = frame.valid & (found.pose.translation.sum(-1) + found.zoom + found.radial.sum(-1)).isfinite()
             better = normalize.undo(found.pose, frame)
             pose = Pose(
                 torch.where(finite[:, None, None], better.rotation, pose.rotation),
                 torch.where(finite[:, None], better.translation, pose.translation),
             )
             zoom = torch.where(finite, found.zoom, 0.0)
-            dist = functional.pad(torch.where(finite[:, None], found.coefficients, 0.0), (0, 4 - radial))
+            coefficients = torch.where(finite[:, None], found.radial, 0.0)
         cameras = scale_focal(cameras, zoom.exp())
-        inputs = with_undistorted(inputs._replace(intrinsics=cameras), dist, None)
-    return inputs._replace(intrinsics=cameras, init=pose if inputs.init is None else inputs.init), dist
+        inputs = with_undistorted(inputs._replace(intrinsics=cameras), _as_dist(coefficients), None)
+    return inputs._replace(intrinsics=cameras, init=pose if inputs.init is None else inputs.init), coefficients
+
+
+def iterate_with_radial(
+    refine: RobustWeightedLM, start: LMStart, coefficients: Tensor | None, m: int | None, more: int = 0
+) -> tuple[LMStart, LMStep]:
+    """Run the iterations, then refine the distortion of the pixels together with the pose and the focal length.
+
+    Args:
+        refine: the refinement.
+        start: what it starts from, with undistorted pixels.
+        coefficients: their distortion, (B, K), a constant; ``None``: there is none, and none is sought.
+        m: See RobustWeightedLM.iterate. With 0 the guess stays as it is, and so does the distortion.
+        more: See RobustWeightedLM.iterate.
+
+    Returns:
+        The start with the pixels of the distortion that was found, and the end with that distortion, (B, 4).
+    """
+    if coefficients is None:
+        return start, refine.iterate(start, m, more=more)
+    with torch.set_grad_enabled(torch.is_grad_enabled() and m == 0):  # the gradient is that of the last minimum
+        end = refine.iterate(start, m)
+    assert end.zoom is not None
+    radial = rescaled(coefficients, end.zoom)
+    if m == 0:
+        return start, end._replace(radial=_as_dist(radial))
+    seen = distorted(start.corr, coefficients)
+    pairs = start.by_residual._replace(img_points=seen.img_points, noise=seen.noise)
+    end = refine_radial(start._replace(by_residual=pairs), end._replace(radial=radial), refine.kernel.weight)
+    assert end.zoom is not None
+    assert end.radial is not None
+    focal = start.corr.focal * end.zoom.exp()
+    camera = torch.stack((focal, focal, torch.ones_like(focal)), -1).diag_embed()
+    dist = _as_dist(end.radial)
+    pixels, found, noise = undistort(seen.img_points, camera, dist, None, seen.noise)
+
+    def changed(corr: Correspondences) -> Correspondences:
+        return corr._replace(img_points=pixels, noise=noise, weights=torch.where(found, corr.weights, 0.0))
+
+    corr, guided, by_residual = (changed(x) for x in (start.corr, start.guided, start.by_residual))
+    prior = torch.where(found, start.prior, 0.0)
+    start = start._replace(corr=corr, guided=guided, by_residual=by_residual, prior=prior)
+    return start, end._replace(radial=dist)
+
+
+def _as_dist(coefficients: Tensor) -> Tensor:
+    """Coefficients (B, K) of radial distortion as (k1, k2, 0, 0), (B, 4)."""
+    return functional.pad(coefficients, (0, 4 - coefficients.shape[1]))

@@ -94,7 +94,8 @@ class RobustWeightedLM(Configured):
         backward: how gradients pass. ``"unroll"``: through all iterations. ``"truncated"``: through the ``last``
             iterations; the pose before them is a constant. ``"implicit"``: by the implicit function theorem, as
             through a minimum, at a memory that does not grow with ``m``; exact once the iterations have converged.
-            Step, damping and the first guess then have no gradient.
+            Step, damping and the first guess then have no gradient. A solver that estimates radial distortion always
+            takes this way: the minimum is then one of the distortion, too.
         last: number of iterations that ``"truncated"`` passes through.
         compared_at: number of iterations before the choice among several poses; seven tenths of ``m`` when ``None``.
 

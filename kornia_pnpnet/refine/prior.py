@@ -16,6 +16,7 @@ from kornia_pnpnet.types import FramedPrior, FreeFocal, Pose, PosePrior
 __all__ = [
     "add_focal_prior",
     "add_prior",
+    "add_radial_prior",
     "focal_loss",
     "gravity_prior",
     "prior_errors",
@@ -31,6 +32,9 @@ _KNOWN = 1e-5
 _SCALE = 3.0
 # Rotations further off count as this far (1 + the cosine of the angle).
 _LEAST_DENOMINATOR = 1e-4
+# Standard deviation of a coefficient of radial distortion before any pair is looked at; it keeps those that no pair
+# determines near 0.
+_RADIAL = 0.15
 
 
 def gravity_prior(world_down: Tensor, cam_down: Tensor, sigma: Tensor | float) -> PosePrior:
@@ -183,17 +187,20 @@ def add_prior(
     weighted = jacobian.mT @ prior.information
     matrix = (weight / focal[..., None])[..., None] * (weighted @ jacobian)
     gradient = weight * (weighted @ error[..., None])[..., 0]
-    if len(equations.gradient) == 7:  # a zoom moves the camera along its axis, see `dolly_zoom`
+    if len(equations.gradient) > 6:  # a zoom moves the camera along its axis, see `dolly_zoom`
         depth = pose.translation[:, 2, None]
         matrix = torch.cat((matrix, depth[..., None] * matrix[:, 5:6]), 1)
         matrix = torch.cat((matrix, depth[..., None] * matrix[:, :, 5:6]), 2)
         gradient = torch.cat((gradient, depth * gradient[:, 5:6]), 1)
-    rows_of = [[x + matrix[:, i, j] for j, x in enumerate(row)] for i, row in enumerate(equations.hessian)]
-    return NormalEquations(rows_of, [x + gradient[:, i] for i, x in enumerate(equations.gradient)])
+    rows_of, slopes = [list(x) for x in equations.hessian], list(equations.gradient)
+    for i, row in enumerate(rows_of[: gradient.shape[1]]):  # distortion, the parameters after these, has no part in it
+        rows_of[i] = [x + matrix[:, i, j] for j, x in enumerate(row)]
+        slopes[i] = slopes[i] + gradient[:, i]
+    return NormalEquations(rows_of, slopes)
 
 
 def add_focal_prior(equations: NormalEquations, free: FreeFocal, unit: Tensor, focal: Tensor) -> NormalEquations:
-    """Add what is known of the focal length to normal equations of seven parameters.
+    """Add what is known of the focal length, the seventh parameter, to normal equations.
 
     Args:
         equations: See add_prior.
@@ -202,10 +209,27 @@ def add_focal_prior(equations: NormalEquations, free: FreeFocal, unit: Tensor, f
         focal: the focal length in pixels, (B,).
     """
     weight = free.information / (unit * focal)
-    *rows, last = equations.hessian
-    *gradient, slope = equations.gradient
-    slope = slope + weight * (focal / free.expected).log()
-    return NormalEquations([*rows, [*last[:-1], last[-1] + weight / focal]], [*gradient, slope])
+    rows, slopes = [list(x) for x in equations.hessian], list(equations.gradient)
+    rows[6][6] = rows[6][6] + weight / focal
+    slopes[6] = slopes[6] + weight * (focal / free.expected).log()
+    return NormalEquations(rows, slopes)
+
+
+def add_radial_prior(equations: NormalEquations, coefficients: Tensor, unit: Tensor, focal: Tensor) -> NormalEquations:
+    """Add to normal equations that coefficients of radial distortion, their parameters from the eighth on, are small.
+
+    Args:
+        equations: See add_prior.
+        coefficients: shape (B, K).
+        unit: See add_prior.
+        focal: the focal length in pixels, a scalar or (B,).
+    """
+    weight = 1.0 / (_RADIAL**2 * unit * focal)
+    rows, slopes = [list(x) for x in equations.hessian], list(equations.gradient)
+    for k, coefficient in enumerate(coefficients.unbind(1), 7):
+        rows[k][k] = rows[k][k] + weight / focal
+        slopes[k] = slopes[k] + weight * coefficient
+    return NormalEquations(rows, slopes)
 
 
 def focal_loss(free: FreeFocal, focal: Tensor) -> Tensor:

@@ -1,66 +1,49 @@
-r"""Radial distortion with pose and focal length, by robust least squares from a pose that was found without it."""
+r"""Radial distortion with pose and focal length: a first estimate, and least squares with the weights of a refinement.
+
+The pixel of a point is :math:`f (1 + k_1 \rho^2 + k_2 \rho^4) (p, q)` with :math:`\rho^2 = p^2 + q^2`, the model of
+Kornia and OpenCV.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from kornia_pnpnet.geometry import (
-    NormalEquations,
-    Projection,
-    RadialTerms,
-    dolly_zoom,
-    move,
-    normal_equations,
-    project,
-)
-from kornia_pnpnet.refine.step import solve_damped
+from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.geometry import NormalEquations, distort, normal_equations, project, radial_stretch
+from kornia_pnpnet.refine.implicit import attach_gradient
+from kornia_pnpnet.refine.prior import add_radial_prior
+from kornia_pnpnet.refine.stages import LMStart
+from kornia_pnpnet.refine.step import LMStep, solve_damped, weighted_equations
+from kornia_pnpnet.refine.variance import KernelWeight
 from kornia_pnpnet.types import MIN_PAIRS, Correspondences, Pose
 
-__all__ = ["Radial", "estimate_radial"]
+__all__ = ["distorted", "estimate_radial", "refine_radial", "rescaled"]
 
 # Focal lengths. Pairs with a smaller residual count in the first steps, before distortion is known: 0.2 times the cube
 # of a tangent of 0.7 is 0.07.
 _WIDE = 0.07
 # From step to step this limit shrinks by this factor, down to the scale of the residuals.
 _SHRINK = 0.6
-# Number of steps.
-_STEPS = 14
+# Number of steps of the first estimate, and of the refinement after it.
+_STEPS, _MORE_STEPS = 14, 6
 # Scale of Cauchy's kernel in standard deviations, and the median of squared residuals in variances of a coordinate.
 _KERNEL_SCALE, _MEDIAN = 3.4, 2.0 * math.log(2.0)
 # Focal lengths. The scale of the residuals is at least this.
 _LEAST = 1e-5
-# Standard deviation of a coefficient before any pair is looked at; it keeps those that no pair determines near 0.
-_PRIOR = 0.5
-# Largest step of a coefficient.
-_LARGEST = 0.3
+# Largest step of a coefficient, and of any other parameter.
+_LARGEST, _LARGEST_OTHER = 0.3, 1.0
 _DAMPING = 1e-6
 
 
-class Radial(NamedTuple):
-    r"""Pose, focal length and distortion.
-
-    Attributes:
-        pose: the pose.
-        zoom: logarithm of the focal length over that of the correspondences, :math:`(B,)`.
-        coefficients: :math:`k_1` and, where asked for, :math:`k_2`, :math:`(B, K)`.
-    """
-
-    pose: Pose
-    zoom: Tensor
-    coefficients: Tensor
-
-
 @torch.no_grad()
-def estimate_radial(corr: Correspondences, pose: Pose, terms: int) -> Radial:
+def estimate_radial(corr: Correspondences, pose: Pose, terms: int) -> LMStep:
     r"""Estimate radial distortion with the pose and the focal length.
 
-    The pixel of a point is :math:`f (1 + k_1 \rho^2 + k_2 \rho^4) (p, q)` with :math:`\rho^2 = p^2 + q^2`, the model of
-    Kornia and OpenCV. Gauss-Newton steps weigh the pairs by Cauchy's kernel; its scale first is that of what distortion
-    does at the edge of an image, and shrinks to the median residual.
+    Gauss-Newton steps weigh the pairs by Cauchy's kernel; its scale first is that of what distortion does at the edge
+    of an image, and shrinks to the median residual.
 
     Args:
         corr: normalised correspondences, their focal length an estimate of the true one.
@@ -68,32 +51,80 @@ def estimate_radial(corr: Correspondences, pose: Pose, terms: int) -> Radial:
         terms: number of coefficients, 1 or 2.
 
     Returns:
-        The estimate, a constant.
+        The estimate, a constant; its ``zoom`` is the logarithm of the focal length over that of the correspondences.
     """
-    coefficients = torch.zeros_like(corr.weights[:, :terms])
-    zoom = torch.zeros_like(corr.weights[:, 0])
+    zero = torch.zeros_like(corr.weights[:, 0])
+    at = LMStep(pose, zero == 0, zero, torch.zeros_like(corr.weights[:, :terms]))
     there = corr.weights > 0
     limit = _WIDE
     for _ in range(_STEPS):
-        pairs = corr.zoomed(zoom)
-        seen, inner = _distorted(project(pose, pairs), pairs, coefficients)
+        assert at.radial is not None
+        pairs = corr.zoomed(at.zoom)
+        seen, inner = distort(project(at.pose, pairs), pairs, at.radial)
         sq_residual = torch.where(seen.in_front & there, seen.sq_residual, torch.inf)
         scale = _scale(sq_residual, pairs.focal, limit)
         weights = torch.where(seen.in_front & there, corr.weights / (1.0 + sq_residual / scale.square()), 0.0)
         equations = normal_equations(seen, weights, free_focal=True, radial=inner)
-        rows, slopes = [list(x) for x in equations.hessian], list(equations.gradient)
-        # The prior of the coefficients, in the unit of the equations: residuals of one scale.
-        unit = (scale[:, 0] / pairs.focal_of_problem).square() / _PRIOR**2
-        for k in range(terms):
-            rows[7 + k][7 + k] = rows[7 + k][7 + k] + unit
-            slopes[7 + k] = slopes[7 + k] + unit * pairs.focal_of_problem * coefficients[:, k]
-        delta, solved = solve_damped(NormalEquations(rows, slopes), torch.full_like(zoom, _DAMPING))
-        factor = -solved.to(zoom) / pairs.focal_of_problem
-        delta = [(factor * x).clamp(-1.0, 1.0) for x in delta]
-        pose, zoom = dolly_zoom(move(pose, delta[:6]), delta[6]), zoom + delta[6]
-        coefficients = coefficients + torch.stack(delta[7:], -1).clamp(-_LARGEST, _LARGEST)
+        unit = (_KERNEL_SCALE / scale[:, 0]).square()
+        equations = add_radial_prior(equations, at.radial, unit, pairs.focal_of_problem)
+        at = _stepped(at, equations, pairs.focal_of_problem)
         limit *= _SHRINK
-    return Radial(pose, zoom, coefficients)
+    return at
+
+
+def refine_radial(start: LMStart, end: LMStep, kernel_weight: KernelWeight) -> LMStep:
+    """Refine distortion, pose and focal length together, with the weights and the noise of the last iterations.
+
+    Args:
+        start: the correspondences of the refinement, their pixels distorted.
+        end: where its iterations ended, with coefficients of distortion.
+        kernel_weight: the robust kernel's weight.
+
+    Returns:
+        The minimum, with the gradient of a minimum, see :func:`~kornia_pnpnet.refine.implicit.attach_gradient`. Where
+        it is not finite, the values that were given.
+    """
+    first = map_tensors(torch.Tensor.detach, end)
+    at, shape = first, start.shape[-1]
+    with torch.no_grad():
+        for _ in range(_MORE_STEPS):
+            equations = weighted_equations(start.by_residual, at, shape, start.outlier_area, kernel_weight)
+            at = _stepped(at, equations, start.by_residual.zoomed(at.zoom).focal_of_problem)
+        assert at.zoom is not None
+        assert at.radial is not None
+        finite = (at.pose.rotation.sum((1, 2)) + at.pose.translation.sum(1) + at.zoom + at.radial.sum(1)).isfinite()
+        at = map_tensors(lambda x, y: torch.where(finite.view(-1, *(1,) * (x.ndim - 1)), x, y), at, first)
+    return attach_gradient(start, at, shape, kernel_weight) if torch.is_grad_enabled() else at
+
+
+def rescaled(coefficients: Tensor, zoom: Tensor) -> Tensor:
+    """Coefficients (B, K) of the same distortion for a focal length that is larger by the exponential of ``zoom``."""
+    powers = torch.arange(2, 2 * coefficients.shape[1] + 2, 2, dtype=zoom.dtype, device=zoom.device)
+    return coefficients * (powers * zoom[:, None]).exp()
+
+
+def distorted(corr: Correspondences, coefficients: Tensor) -> Correspondences:
+    """Correspondences whose pixels, and their noise, are those before distortion (B, K) was taken away."""
+    p, q = (corr.img_points / corr.focal).unbind(-1)
+    stretch, slope = radial_stretch(p, q, coefficients)
+    noise = corr.noise
+    if noise is not None:
+        with torch.no_grad():
+            along = stretch + slope * torch.addcmul(p * p, q, q)
+            growth = (0.5 * (stretch**-2 + along**-2)).sqrt()  # of a standard deviation, see `cameras.undistort`
+            turned = stretch + slope * p * p, slope * p * q, stretch + slope * q * q, slope * p * q
+        cov = None if noise.img_cov is None else noise.img_cov.mapped(*turned)
+        noise = noise._replace(img=noise.img / growth, img_cov=cov)
+    return corr._replace(img_points=stretch[..., None] * corr.img_points, noise=noise)
+
+
+def _stepped(at: LMStep, equations: NormalEquations, focal: Tensor) -> LMStep:
+    """After a step of bounded length."""
+    delta, solved = solve_damped(equations, torch.full_like(equations.gradient[0], _DAMPING))
+    factor = -solved.to(delta[0]) / focal
+    limits = [_LARGEST_OTHER] * 7 + [_LARGEST] * (len(delta) - 7)
+    delta = [(factor * x).clamp(-limit, limit) for x, limit in zip(delta, limits, strict=True)]
+    return at.moved(delta)
 
 
 def _scale(sq_residual: Tensor, focal: Tensor, limit: float) -> Tensor:
@@ -104,19 +135,3 @@ def _scale(sq_residual: Tensor, focal: Tensor, limit: float) -> Tensor:
     middle = ((count + MIN_PAIRS + 1) // 2).minimum(count - 1).clamp(min=0)
     sigma = (ascending.gather(1, middle) / _MEDIAN).sqrt().nan_to_num(posinf=0.0)
     return (_KERNEL_SCALE * sigma).maximum(wide).maximum(_LEAST * focal)
-
-
-def _distorted(projection: Projection, corr: Correspondences, coefficients: Tensor) -> tuple[Projection, RadialTerms]:
-    """The projection with distorted pixels, and what their Jacobian needs."""
-    p, q = projection.plane_points
-    square = torch.addcmul(p * p, q, q)
-    stretch, slope = torch.ones_like(square), torch.zeros_like(square)
-    for k, coefficient in enumerate(coefficients[..., None].unbind(1)):
-        stretch = stretch + coefficient * square ** (k + 1)
-        slope = slope + 2.0 * (k + 1) * coefficient * square**k
-    u, v = corr.img_points.unbind(-1)
-    residual = corr.focal * stretch * p - u, corr.focal * stretch * q - v
-    depth = torch.where(projection.in_front, projection.inv_depth, 1.0).reciprocal()
-    scaled = residual[0] * depth, residual[1] * depth
-    terms = RadialTerms(stretch, slope, depth, coefficients.shape[1])
-    return projection._replace(residual=residual, scaled_residual=scaled), terms

@@ -20,8 +20,10 @@ from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import (
     NormalEquations,
     Projection,
+    RadialTerms,
     additive_tangent_map,
     change_tangent,
+    distort,
     dolly_zoom,
     move,
     normal_equations,
@@ -30,7 +32,7 @@ from kornia_pnpnet.geometry import (
     project,
     retract_additive,
 )
-from kornia_pnpnet.refine.prior import add_focal_prior, add_prior
+from kornia_pnpnet.refine.prior import add_focal_prior, add_prior, add_radial_prior
 from kornia_pnpnet.refine.variance import NARROWER, KernelWeight, variance_factor, worth_of_confidence
 from kornia_pnpnet.types import Correspondences, Noise, Pose
 
@@ -56,15 +58,26 @@ class LMStep(NamedTuple):
         pose: the pose after the step.
         solved: whether the damped normal equations could be solved (if not, the step is zero), bool, :math:`(B,)`.
         zoom: change of the logarithm of the focal length, :math:`(B,)`; ``None``: the focal length is known.
+        radial: coefficients of radial distortion, :math:`(B, K)`; ``None``: none are estimated.
     """
 
     pose: Pose
     solved: Tensor
     zoom: Tensor | None = None
+    radial: Tensor | None = None
 
     def zoom_after(self, before: Tensor | None) -> Tensor | None:
         """The logarithm of the focal length after the step, from that before; ``None``: the focal length is known."""
         return None if before is None or self.zoom is None else before + self.zoom
+
+    def moved(self, delta: list[Tensor]) -> LMStep:
+        """Moved by the entries of a tangent vector: of the pose, the focal length and the coefficients."""
+        pose, zoom, radial = move(self.pose, delta[:6]), self.zoom, self.radial
+        if zoom is not None:
+            pose, zoom = dolly_zoom(pose, delta[6]), zoom + delta[6]
+        if radial is not None:
+            radial = radial + torch.stack(delta[7:], -1)
+        return LMStep(pose, self.solved, zoom, radial)
 
 
 def iterate(
@@ -101,12 +114,15 @@ def iterate(
 
 
 def weighted_equations(
-    pairs: Correspondences, pose: Pose, shape: Tensor, outlier_area: Tensor | None, kernel_weight: KernelWeight
+    pairs: Correspondences, at: LMStep, shape: Tensor, outlier_area: Tensor | None, kernel_weight: KernelWeight
 ) -> NormalEquations:
-    """The normal equations of :func:`iterate` at a pose, before damping."""
-    projection = project(pose, pairs)
-    weights = _weights(projection, pairs, kernel_weight, shape, outlier_area)
-    return _equations(projection, weights, pose, pairs)
+    """The normal equations of :func:`iterate` before damping, with ``at.radial`` those of distorted pixels."""
+    pairs = pairs.zoomed(at.zoom)
+    projection, terms, narrower = project(at.pose, pairs), None, NARROWER
+    if at.radial is not None:  # the outliers are known by then, and a wider kernel is more accurate
+        (projection, terms), narrower = distort(projection, pairs, at.radial), 1.0
+    weights = _weights(projection, pairs, kernel_weight, shape, outlier_area, narrower)
+    return _equations(projection, weights, at.pose, pairs, terms, at.radial)
 
 
 def lm_step(
@@ -268,6 +284,7 @@ def _weights(
     kernel_weight: KernelWeight,
     shape: Tensor,
     outlier_area: Tensor | None,
+    narrower: float = NARROWER,
 ) -> Tensor | Symmetric2:
     """Weight of each pair in the normal equations: prior weight, inverse variance or covariance, robust weight."""
     if pairs.noise is None:
@@ -282,7 +299,7 @@ def _weights(
                 worth = worth_of_confidence(sq_residual, precision, projection, pairs, outlier_area)
                 sq_residual, precision = sq_residual * worth, precision * worth
             seen = sq_residual, precision, projection, pairs.weights
-            factor = variance_factor(*seen, kernel_weight, shape, outlier_area, NARROWER)
+            factor = variance_factor(*seen, kernel_weight, shape, outlier_area, narrower)
             sq_residual = sq_residual / factor
             if pairs.prior or pairs.free_focal:  # a common factor does not matter to the pairs alone
                 precision = precision / factor.clamp(min=1.0)
@@ -293,7 +310,12 @@ def _weights(
 
 
 def _equations(
-    projection: Projection, weights: Tensor | Symmetric2, pose: Pose, corr: Correspondences
+    projection: Projection,
+    weights: Tensor | Symmetric2,
+    pose: Pose,
+    corr: Correspondences,
+    terms: RadialTerms | None = None,
+    radial: Tensor | None = None,
 ) -> NormalEquations:
     """Normal equations of the pairs and of the priors.
 
@@ -303,11 +325,13 @@ def _equations(
     size = weights if isinstance(weights, Tensor) else weights.uu + weights.vv
     size = size * projection.inv_depth * projection.inv_depth
     weights = map_tensors(lambda x: relative(x, size), weights)
-    equations = normal_equations(projection, weights, free_focal=free_focal is not None)
+    equations = normal_equations(projection, weights, free_focal=free_focal is not None, radial=terms)
     if prior is None and free_focal is None:
         return equations
     largest = size.detach().amax(1)
     unit = torch.where(largest > 0, largest, 1.0)
+    if radial is not None:
+        equations = add_radial_prior(equations, radial, unit, focal)
     if free_focal is not None:
         equations = add_focal_prior(equations, free_focal, unit, focal)
     return equations if prior is None else add_prior(equations, prior, pose, unit, focal)

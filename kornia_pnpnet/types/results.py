@@ -70,8 +70,8 @@ class PnPResult(NamedTuple):
         cost: mean robust loss of the pairs, with that of a prior, in the kernel's unit (see
             :mod:`kornia_pnpnet.refine.kernels`), shape :math:`(B,)`. Comparable between problems that the
             same solver solved.
-        ok: whether the pose is to be believed, bool, shape :math:`(B,)`. Where ``ok`` is false the fields above are
-            finite and carry no gradient.
+        ok: whether the pose is to be believed, bool, shape :math:`(B,)`. Where ``ok`` is false the fields above, the
+            ``intrinsics`` and ``dist`` are finite and carry no gradient.
         init: the first guess. It carries a gradient for every valid problem, also where refinement failed, so that an
             initialiser can learn from its failures.
         status: why a problem is not ``ok``: the value of a :class:`Status`, int8, shape :math:`(B,)`.
@@ -81,7 +81,8 @@ class PnPResult(NamedTuple):
         alternatives: other poses that explain the pairs nearly as well; no slots where the call did not ask for them.
         intrinsics: the camera matrices that the poses go with, with a last entry of 1, shape :math:`(B, 3, 3)`. With an
             unknown focal length they hold its estimate. The identity for a problem whose camera is impossible.
-        dist: the estimated distortion (k1, k2, 0, 0), shape :math:`(B, 4)`; 0 where it was not estimated.
+        dist: the estimated distortion (k1, k2, 0, 0), which goes with the ``intrinsics``, shape :math:`(B, 4)`; 0 where
+            it was not estimated.
     """
 
     rotation: Tensor
