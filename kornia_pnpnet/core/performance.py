@@ -376,7 +376,7 @@ class Compiled(Generic[_P, _T]):
         )
         self._compiled = {False: few, True: many}
         self.failed = False
-        self._seen: set[tuple[torch.Size, torch.dtype, bool, tuple[bool, ...]]] = set()
+        self._seen: set[tuple[torch.Size, torch.dtype, int, bool]] = set()
 
     def __reduce__(self) -> tuple[type[Compiled[_P, _T]], tuple[Callable[_P, _T], str | None]]:
         """Copies and other processes compile for themselves."""
@@ -388,7 +388,7 @@ class Compiled(Generic[_P, _T]):
             return self.function(*args, **kwargs)
         tensors = list(iter_tensors(args))
         first = tensors[0]
-        kind = first.shape, first.dtype, torch.is_grad_enabled(), tuple(x.requires_grad for x in tensors)
+        kind = first.shape, first.dtype, len(tensors), torch.is_grad_enabled()
         compiled = self._compiled[first.ndim > 1 and first.shape[1] >= _MANY_PAIRS]
         errors = torch._dynamo.exc.TorchDynamoException, torch._inductor.exc.InductorError
         if kind in self._seen:
