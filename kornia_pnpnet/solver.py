@@ -391,7 +391,7 @@ class PnPNet(PretrainedMixin):
             assert given is not None
             guess = Guess(given, torch.ones_like(corr.weights))
         elif rig is not None and not isinstance(self.init, RANSAC):
-            guess = guess_of_rig(corr, given, with_noise=isinstance(self.init, SetInit))
+            guess = guess_of_rig(corr, given, with_noise=isinstance(self.init, SetInit), fixed=self.effort == "fixed")
         elif isinstance(self.init, RANSAC):
             guess = self.init(corr, given)
         elif views == 1:

@@ -9,6 +9,7 @@ from torch.nn import functional
 from kornia_pnpnet.cameras import bearing_cameras
 from kornia_pnpnet.core.checks import check_whole
 from kornia_pnpnet.core.configured import Configured
+from kornia_pnpnet.core.performance import sees_values
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.init.ransac.p3p import p3p
 from kornia_pnpnet.types import Correspondences, Hypotheses, Pose
@@ -53,7 +54,7 @@ class P3PRig(Configured):
             ShapeError: when :math:`N` is not 3.
         """
         assert corr.rig is not None
-        batch = len(corr.weights)
+        batch = corr.weights.shape[0]
         rays = functional.normalize(corr.places, dim=-1)  # (B, 3, 3) in the frame of the rig
         centres = -(corr.rig.rotation * corr.rig.translation[..., None]).sum(-2)  # (B, 3, 3)
         turn, _ = bearing_cameras(rays.sum(1, keepdim=True))
@@ -62,26 +63,39 @@ class P3PRig(Configured):
         ahead = seen[..., 2:]
         plane = torch.where(ahead > 0, seen[..., :2] / ahead, torch.inf)
         solved = p3p(corr.world_points, plane)
-        slot, at = solved.valid.mT.nonzero(as_tuple=True)  # the batch stays last in memory
-        back = turn[at].mT
-        found = map_tensors(lambda x: x.transpose(0, 1)[slot, at], solved.pose)
-        if self.steps:
-            world = corr.world_points[at]
-            cam = world @ found.rotation.mT + found.translation[:, None]
-            # From the points of the central approximation to those nearest on the rays.
-            away = ((centres.mean(1, keepdim=True) - centres) * rays).sum(-1)
-            ranges = (cam * seen[at]).sum(-1) + away[at]
-            # Problems last, before them pairs and coordinates: (3, 3, M).
-            world, at_rays, at_centres = (x.permute(1, 2, 0).contiguous() for x in (world, rays[at], centres[at]))
-            pose, finite = _newton(world, at_rays, at_centres, ranges.mT.contiguous(), self.steps)
+        away = ((centres.mean(1, keepdim=True) - centres) * rays).sum(-1)
+        of_sample = corr.world_points, rays, centres, turn, seen, away
+        eye = torch.eye(3, dtype=rays.dtype, device=rays.device)
+        if not sees_values(rays):  # a graph: slots without a solution, too
+            found = map_tensors(lambda x: x.transpose(0, 1).flatten(0, 1), solved.pose)
+            pose, exact = self._exact(found, *(x.expand(4, *x.shape).flatten(0, 1) for x in of_sample))
+            valid = solved.valid.mT.flatten() & exact
+            rotation = torch.where(valid[:, None, None], pose.rotation, eye)
+            translation = torch.where(valid[:, None], pose.translation, 0.0)
+            rotation, translation, valid = (x.unflatten(0, (4, batch)) for x in (rotation, translation, valid))
         else:
-            pose = Pose(back @ found.rotation, (back @ found.translation[..., None])[..., 0])
-            finite = torch.ones_like(at, dtype=torch.bool)
-        slot, at, pose = slot[finite], at[finite], map_tensors(lambda x: x[finite], pose)
-        rotation = torch.eye(3, dtype=rays.dtype, device=rays.device).repeat(4, batch, 1, 1)
-        translation, valid = rays.new_zeros(4, batch, 3), torch.zeros_like(solved.valid.mT)
-        rotation[slot, at], translation[slot, at], valid[slot, at] = *pose, True
+            slot, at = solved.valid.mT.nonzero(as_tuple=True)  # the batch stays last in memory
+            found = map_tensors(lambda x: x.transpose(0, 1)[slot, at], solved.pose)
+            pose, exact = self._exact(found, *(x[at] for x in of_sample))
+            slot, at, pose = slot[exact], at[exact], map_tensors(lambda x: x[exact], pose)
+            rotation, translation = eye.repeat(4, batch, 1, 1), rays.new_zeros(4, batch, 3)
+            valid = torch.zeros_like(solved.valid.mT)
+            rotation[slot, at], translation[slot, at], valid[slot, at] = *pose, True
         return Hypotheses(Pose(rotation.transpose(0, 1), translation.transpose(0, 1)), valid.mT)
+
+    def _exact(
+        self, found: Pose, world: Tensor, rays: Tensor, centres: Tensor, turn: Tensor, seen: Tensor, away: Tensor
+    ) -> tuple[Pose, Tensor]:
+        """From poses of the central approximation, (M, 3, 3) and (M, 3), to exact ones, and whether they are exact."""
+        if not self.steps:
+            pose = Pose(turn.mT @ found.rotation, (turn.mT @ found.translation[..., None])[..., 0])
+            return pose, torch.ones_like(found.translation[:, 0], dtype=torch.bool)
+        # From the points of the central approximation to those nearest on the rays.
+        cam = world @ found.rotation.mT + found.translation[:, None]
+        ranges = (cam * seen).sum(-1) + away
+        # Problems last, before them pairs and coordinates: (3, 3, M).
+        world, rays, centres = (x.permute(1, 2, 0).contiguous() for x in (world, rays, centres))
+        return _newton(world, rays, centres, ranges.mT.contiguous(), self.steps)
 
 
 def _newton(world_points: Tensor, rays: Tensor, centres: Tensor, ranges: Tensor, steps: int) -> tuple[Pose, Tensor]:
