@@ -70,16 +70,16 @@ def guess_of_rig(corr: Correspondences, given: Pose | None, *, with_noise: bool,
 
 def _best_of_samples(corr: Correspondences) -> Guess:
     """The best pose of a fixed number of minimal samples, improved on its inliers, with weights of the inliers."""
-    assert corr.rig is not None
-    batch, count = corr.weights.shape
+    rig, (batch, count) = corr.rig, corr.weights.shape
+    assert rig is not None
     corr = corr._replace(weights=relative(corr.weights, corr.weights), noise=None)
     counts, order = (corr.weights > 0).sum(1), present_first(corr.weights > 0)
     # Judges are spread evenly over the pairs that have a weight; fewer pairs judge once each.
     turn = torch.arange(_JUDGES, device=order.device)
     judges = turn.maximum(turn * counts[:, None] // _JUDGES).clamp(max=count - 1)
     at = torch.cat((_samples(corr, order, counts), order.gather(1, judges)), 1)
-    values = (corr.world_points, corr.img_points, corr.weights[..., None], corr.rig.rotation.flatten(2))
-    pairs = take_pairs(torch.cat((*values, corr.rig.translation), -1), at)  # (18, 3 S + J, B)
+    values = (corr.world_points, corr.img_points, corr.weights[..., None], rig.rotation.flatten(2))
+    pairs = take_pairs(torch.cat((*values, rig.translation), -1), at)  # (18, 3 S + J, B)
     samples, judges = pairs.split((3 * _SOLVED, _JUDGES), 1)
     pose, valid = P3PRig().hypotheses(_unpacked(samples.unflatten(1, (3, _SOLVED)).flatten(2), corr.focal))
 
@@ -93,13 +93,13 @@ def _best_of_samples(corr: Correspondences) -> Guess:
     best = scene.losses(packed, SCORERS["msac"]).masked_fill(~valid, torch.inf).argmin(1)
     matrix = packed.gather(3, best[:, None, None, None].expand(-1, 4, 3, -1))[..., 0]
 
-    pose, pairs = Pose(matrix[:, :3].mT, matrix[:, 3]), problems_last(corr)
-    projection = project(pose, pairs)
+    pose, corr = Pose(matrix[:, :3].mT, matrix[:, 3]), problems_last(corr)
+    projection = project(pose, corr)
     for limit in _LIMITS:
-        inliers = judge(projection, pairs, thresholds._replace(img=limit * thresholds.img)).weights
-        pose = least_squares(pairs, pose, projection, inliers).pose
-        projection = project(pose, pairs)
-    return Guess(pose, judge(projection, pairs, thresholds).weights)
+        inliers = judge(projection, corr, thresholds._replace(img=limit * thresholds.img)).weights
+        pose = least_squares(corr, pose, projection, inliers).pose
+        projection = project(pose, corr)
+    return Guess(pose, judge(projection, corr, thresholds).weights)
 
 
 def _samples(corr: Correspondences, order: Tensor, counts: Tensor) -> Tensor:
