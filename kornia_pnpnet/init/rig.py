@@ -24,9 +24,9 @@ __all__ = ["guess_of_rig"]
 # Focal lengths. Threshold of an inlier: ten times the noise of a pixel at a focal length of 1000 pixels.
 _THRESHOLD = 0.01
 _FINDER = RANSAC(P3P(), threshold=_THRESHOLD * F_CONST)
-# Number of samples of a fixed effort that are drawn, and of those that are solved: of three cameras that look in all
-# directions, P3PRig solves every second sample. Chosen on `CameraProblems` with seed 77002.
-_DRAWN, _SOLVED = 256, 128
+# Number of samples of a fixed effort, and of draws for each, of which the first that P3PRig can solve is the sample: of
+# three cameras that look in all directions it can solve every second draw. Chosen on `CameraProblems` with seed 77002.
+_SAMPLES, _DRAWS = 128, 4
 # Number of pairs that score each pose of a fixed effort.
 _JUDGES = 32
 # Thresholds. A fixed effort improves the best pose on the pairs up to these limits, one after the other.
@@ -77,19 +77,19 @@ def _best_of_samples(corr: Correspondences) -> Guess:
     # Judges are spread evenly over the pairs that have a weight; fewer pairs judge once each.
     turn = torch.arange(_JUDGES, device=order.device)
     judges = turn.maximum(turn * counts[:, None] // _JUDGES).clamp(max=count - 1)
-    at = torch.cat((_samples(corr, order, counts), order.gather(1, judges)), 1)
+    at = torch.cat((_draw(corr, order, counts), order.gather(1, judges)), 1)
     values = (corr.world_points, corr.img_points, corr.weights[..., None], rig.rotation.flatten(2))
     pairs = take_pairs(torch.cat((*values, rig.translation), -1), at)  # (18, 3 S + J, B)
-    samples, judges = pairs.split((3 * _SOLVED, _JUDGES), 1)
-    pose, valid = P3PRig().hypotheses(_unpacked(samples.unflatten(1, (3, _SOLVED)).flatten(2), corr.focal))
+    samples, judges = pairs.split((3 * _SAMPLES, _JUDGES), 1)
+    pose, valid = P3PRig().hypotheses(_unpacked(samples.unflatten(1, (3, _SAMPLES)).flatten(2), corr.focal))
 
     jury = _unpacked(judges, corr.focal)._replace(prior=corr.prior)
     jury = jury._replace(weights=torch.where(turn < counts[:, None], jury.weights, 0.0))
     thresholds = Thresholds((_THRESHOLD * corr.focal).expand(batch), torch.zeros_like(corr.weights[:, 0]))
     scene = Scene.make(jury, thresholds, jury.weights.dtype)
     packed = torch.cat((pose.rotation.mT, pose.translation[..., None, :]), -2)  # (S B, 4, 4, 3)
-    packed = packed.unflatten(0, (_SOLVED, batch)).permute(1, 3, 4, 0, 2).flatten(3)  # (B, 4, 3, S 4)
-    valid = valid.unflatten(0, (_SOLVED, batch)).movedim(0, 1).flatten(1)
+    packed = packed.unflatten(0, (_SAMPLES, batch)).permute(1, 3, 4, 0, 2).flatten(3)  # (B, 4, 3, S 4)
+    valid = valid.unflatten(0, (_SAMPLES, batch)).movedim(0, 1).flatten(1)
     best = scene.losses(packed, SCORERS["msac"]).masked_fill(~valid, torch.inf).argmin(1)
     matrix = packed.gather(3, best[:, None, None, None].expand(-1, 4, 3, -1))[..., 0]
 
@@ -102,22 +102,22 @@ def _best_of_samples(corr: Correspondences) -> Guess:
     return Guess(pose, judge(projection, corr, thresholds).weights)
 
 
-def _samples(corr: Correspondences, order: Tensor, counts: Tensor) -> Tensor:
-    """Positions of the pairs of the samples that are solved, (B, 3 S): first pairs, second pairs, third pairs.
+def _draw(corr: Correspondences, order: Tensor, counts: Tensor) -> Tensor:
+    """Positions of the pairs of the samples, (B, 3 S): first pairs, second pairs, third pairs.
 
     Args:
         corr: normalised correspondences of a rig.
         order: positions of the pairs, those that have a weight first, (B, N).
         counts: number of pairs that have a weight, (B,).
     """
-    turn = torch.arange(_DRAWN, device=order.device)
-    numbers = torch.stack([(turn + 1.0).double() * _ROOT**-k for k in (1, 2, 3)], -1)
-    ranks = draw_subsets(numbers - numbers.floor(), counts).mT  # (B, 3, D)
-    drawn = order.gather(1, ranks.flatten(1))
-    rays = take_pairs(corr.places, drawn).unflatten(1, (3, _DRAWN))  # (3, 3, D, B)
-    ahead = (rays * rays.sum(1, keepdim=True)).sum(0).amin(0).mT > 0  # samples that P3PRig solves come first
-    first = torch.where(ahead, turn, _DRAWN + turn).topk(_SOLVED, largest=False).indices
-    return drawn.unflatten(1, (3, _DRAWN)).gather(2, first[:, None].expand(-1, 3, -1)).flatten(1)
+    numbers = torch.arange(1, _DRAWS * _SAMPLES + 1, dtype=torch.float64, device=order.device)
+    numbers = torch.stack([numbers * _ROOT**-k for k in (1, 2, 3)], -1)
+    drawn = draw_subsets(numbers - numbers.floor(), counts).mT  # (B, 3, D S)
+    drawn = order.gather(1, drawn.flatten(1))
+    rays = take_pairs(corr.places, drawn).unflatten(1, (3, _DRAWS, _SAMPLES))  # (3, 3, D, S, B)
+    ahead = (rays * rays.sum(1, keepdim=True)).sum(0).amin(0) > 0  # what P3PRig can solve, (D, S, B)
+    first = ahead.long().argmax(0).mT[:, None, None].expand(-1, 3, -1, -1)
+    return drawn.unflatten(1, (3, _DRAWS, _SAMPLES)).gather(2, first).flatten(1)
 
 
 def _unpacked(pairs: Tensor, focal: Tensor) -> Correspondences:
