@@ -65,7 +65,6 @@ _aten = torch.ops.aten
 #: Decompositions for ``ExportedProgram.run_decompositions``. Sizes that are not static or too large stay as they are.
 INLINE: dict[Any, Callable[..., Any]] = {
     _aten.addmm.default: _addmm,
-    _aten.baddbmm.default: _addmm,
     _aten.bmm.default: _matmul,
     _aten.cumsum.default: _cumsum,
     _aten.linear.default: _linear,
