@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from kornia_pnpnet.core.linalg import relative
-from kornia_pnpnet.core.performance import present_first, problems_last, sees_values, take_pairs
+from kornia_pnpnet.core.performance import present_first, problems_last, repeat_problems, sees_values, take_pairs
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import project
 from kornia_pnpnet.init.ransac import P3P, RANSAC
@@ -29,7 +29,9 @@ _FINDER = RANSAC(P3P(), threshold=_THRESHOLD * F_CONST)
 _SAMPLES, _DRAWS = 128, 4
 # Number of pairs that score each pose of a fixed effort.
 _JUDGES = 32
-# Thresholds. A fixed effort improves the best pose on the pairs up to these limits, one after the other.
+# Number of best poses that a fixed effort improves, and the limits up to which pairs count there, in thresholds: one step
+# of least squares each.
+_IMPROVED = 3
 _LIMITS = (3.0, 1.0)
 # The root of x^4 = x + 1. Multiples of its negative powers, modulo 1, fill the unit cube evenly (M. Roberts, "The
 # unreasonable effectiveness of quasirandom sequences", 2018).
@@ -69,7 +71,7 @@ def guess_of_rig(corr: Correspondences, given: Pose | None, *, with_noise: bool,
 
 
 def _best_of_samples(corr: Correspondences) -> Guess:
-    """The best pose of a fixed number of minimal samples, improved on its inliers, with weights of the inliers."""
+    """The best pose of a fixed number of minimal samples, improved on its inliers, and weights of the inliers."""
     rig, (batch, count) = corr.rig, corr.weights.shape
     assert rig is not None
     corr = corr._replace(weights=relative(corr.weights, corr.weights), noise=None)
@@ -90,16 +92,20 @@ def _best_of_samples(corr: Correspondences) -> Guess:
     packed = torch.cat((pose.rotation.mT, pose.translation[..., None, :]), -2)  # (S B, 4, 4, 3)
     packed = packed.unflatten(0, (_SAMPLES, batch)).permute(1, 3, 4, 0, 2).flatten(3)  # (B, 4, 3, S 4)
     valid = valid.unflatten(0, (_SAMPLES, batch)).movedim(0, 1).flatten(1)
-    best = scene.losses(packed, SCORERS["msac"]).masked_fill(~valid, torch.inf).argmin(1)
-    matrix = packed.gather(3, best[:, None, None, None].expand(-1, 4, 3, -1))[..., 0]
-
-    pose, corr = Pose(matrix[:, :3].mT, matrix[:, 3]), problems_last(corr)
-    projection = project(pose, corr)
+    losses = scene.losses(packed, SCORERS["msac"]).masked_fill(~valid, torch.inf)
+    best = losses.topk(_IMPROVED, largest=False).indices[:, None, None].expand(-1, 4, 3, -1)
+    matrix = packed.gather(3, best).permute(3, 0, 2, 1).flatten(0, 1)  # (K B, 3, 4)
+    pose, pairs = Pose(matrix[..., :3], matrix[..., 3]), repeat_problems(corr, _IMPROVED)
+    limits = map_tensors(lambda x: x.repeat(_IMPROVED), thresholds)
+    projection = project(pose, pairs)
     for limit in _LIMITS:
-        inliers = judge(projection, corr, thresholds._replace(img=limit * thresholds.img)).weights
-        pose = least_squares(corr, pose, projection, inliers).pose
-        projection = project(pose, corr)
-    return Guess(pose, judge(projection, corr, thresholds).weights)
+        inliers = judge(projection, pairs, limits._replace(img=limit * limits.img)).weights
+        pose = least_squares(pairs, pose, projection, inliers).pose
+        projection = project(pose, pairs)
+    judged = judge(projection, pairs, limits)
+    loss = (pairs.weights * SCORERS["msac"](judged.errors)).sum(1)
+    at = loss.unflatten(0, (_IMPROVED, batch)).argmin(0) * batch + torch.arange(batch, device=loss.device)
+    return Guess(map_tensors(lambda x: x[at], pose), judged.weights[at])
 
 
 def _draw(corr: Correspondences, order: Tensor, counts: Tensor) -> Tensor:
