@@ -29,10 +29,9 @@ _FINDER = RANSAC(P3P(), threshold=_THRESHOLD * F_CONST)
 _SAMPLES, _DRAWS = 128, 4
 # Number of pairs that score each pose of a fixed effort.
 _JUDGES = 32
-# Number of best poses that a fixed effort improves, and the limits up to which pairs count there, in thresholds: one step
-# of least squares each.
-_IMPROVED = 3
-_LIMITS = (3.0, 1.0)
+# Number of best poses that a fixed effort improves, by one step of least squares on the pairs up to each limit in
+# thresholds.
+_IMPROVED, _LIMITS = 3, (3.0, 1.0)
 # The root of x^4 = x + 1. Multiples of its negative powers, modulo 1, fill the unit cube evenly (M. Roberts, "The
 # unreasonable effectiveness of quasirandom sequences", 2018).
 _ROOT = 1.2207440846057596
@@ -95,15 +94,15 @@ def _best_of_samples(corr: Correspondences) -> Guess:
     losses = scene.losses(packed, SCORERS["msac"]).masked_fill(~valid, torch.inf)
     best = losses.topk(_IMPROVED, largest=False).indices[:, None, None].expand(-1, 4, 3, -1)
     matrix = packed.gather(3, best).permute(3, 0, 2, 1).flatten(0, 1)  # (K B, 3, 4)
-    pose, pairs = Pose(matrix[..., :3], matrix[..., 3]), repeat_problems(corr, _IMPROVED)
+    pose, repeated = Pose(matrix[..., :3], matrix[..., 3]), repeat_problems(corr, _IMPROVED)
     limits = map_tensors(lambda x: x.repeat(_IMPROVED), thresholds)
-    projection = project(pose, pairs)
+    projection = project(pose, repeated)
     for limit in _LIMITS:
-        inliers = judge(projection, pairs, limits._replace(img=limit * limits.img)).weights
-        pose = least_squares(pairs, pose, projection, inliers).pose
-        projection = project(pose, pairs)
-    judged = judge(projection, pairs, limits)
-    loss = (pairs.weights * SCORERS["msac"](judged.errors)).sum(1)
+        inliers = judge(projection, repeated, limits._replace(img=limit * limits.img)).weights
+        pose = least_squares(repeated, pose, projection, inliers).pose
+        projection = project(pose, repeated)
+    judged = judge(projection, repeated, limits)
+    loss = (repeated.weights * SCORERS["msac"](judged.errors)).sum(1)
     at = loss.unflatten(0, (_IMPROVED, batch)).argmin(0) * batch + torch.arange(batch, device=loss.device)
     return Guess(map_tensors(lambda x: x[at], pose), judged.weights[at])
 
