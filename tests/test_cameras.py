@@ -255,7 +255,7 @@ def test_rigs(name, cameras, base, uniform):
 @pytest.mark.parametrize("cameras", [3, 6])
 @pytest.mark.parametrize("wrong", [0, 5])
 def test_rigs_at_a_fixed_effort(cameras, wrong, uniform):
-    """Of 12 pairs with 5 wrong ones RANSAC solves all."""
+    """The bound is far below what other seeds gave, which is what RANSAC gives."""
     points, pixels, intrinsics, places, pose = rig(uniform, 128, 12, cameras, 0.5, wrong)
     solver = create_solver("pnpnet-set", effort="fixed")
     result = solver(points, pixels, intrinsics, cam_from_rig=places)

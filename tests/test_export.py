@@ -166,6 +166,8 @@ def test_solvers_that_cannot_be_exported(tmp_path, capsys):
     (tmp_path / "old.onnx").unlink()
     assert main(["export", str(tmp_path / "x.onnx"), "--solver", "opencv-ransac"]) == 2
     assert "opencv-ransac" in capsys.readouterr().err
+    assert main(["export", str(tmp_path / "x.onnx"), "--solver", "identity-lm", "--rig"]) == 2
+    assert "rigs" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
