@@ -16,13 +16,15 @@ from kornia_pnpnet.core.checks import check_shapes, check_whole
 from kornia_pnpnet.core.files import atomic_open
 from kornia_pnpnet.core.inlining import INLINE
 from kornia_pnpnet.core.performance import package_options
-from kornia_pnpnet.data import SyntheticProblems
+from kornia_pnpnet.data import CameraProblems, SyntheticProblems
 from kornia_pnpnet.init import RANSAC, MLPInit, SetInit
 from kornia_pnpnet.solver import PnPNet
+from kornia_pnpnet.types import Pose
 
 __all__ = [
     "INPUTS",
     "OUTPUTS",
+    "RIG_INPUTS",
     "ExportedCamera",
     "ExportedResult",
     "PackagedSolver",
@@ -73,13 +75,15 @@ class ExportedCamera(NamedTuple):
 
 #: Names of the inputs of an exported solver, in this order, all float32.
 INPUTS = ("world_points", "img_points", "intrinsics", "weights")
+#: Names of the inputs of a solver that was exported for rigs, in this order, all float32.
+RIG_INPUTS = (*INPUTS, "rig_rotation", "rig_translation")
 #: Names of the outputs with known focal lengths: the fields of :class:`ExportedResult`.
 OUTPUTS = ExportedResult._fields
 #: Upper bounds of the dynamic dimensions: torch.export simplifies its guards with finite ranges.
 _MAX_BATCH = 2**20
 _MAX_N = 2**16
-# Metadata of a package: the sizes that it was compiled for.
-_BATCH, _N, _ANY = "pnpnet_batch", "pnpnet_n", "any"
+# Metadata of a package: the sizes that it was compiled for, and whether it solves rigs.
+_BATCH, _N, _ANY, _RIG = "pnpnet_batch", "pnpnet_n", "any", "pnpnet_rig"
 
 
 class _Graph(nn.Module):
@@ -90,14 +94,17 @@ class _Graph(nn.Module):
         self.solver = solver
 
     def forward(
-        self, world_points: Tensor, img_points: Tensor, intrinsics: Tensor, weights: Tensor
+        self, world_points: Tensor, img_points: Tensor, intrinsics: Tensor, weights: Tensor, *rig: Tensor
     ) -> tuple[Tensor, ...]:
-        result = self.solver(world_points, img_points, intrinsics, weights)
+        cam_from_rig = Pose(*rig) if rig else None
+        result = self.solver(world_points, img_points, intrinsics, weights, cam_from_rig=cam_from_rig)
         outputs = result.rotation, result.translation, result.weights, result.cost, result.ok
         return outputs if self.solver.focal == "known" else (*outputs, result.intrinsics)
 
 
-def export_program(solver: PnPNet, n: int | None = None, *, batch: int | None = None) -> torch.export.ExportedProgram:
+def export_program(
+    solver: PnPNet, n: int | None = None, *, batch: int | None = None, rig: bool = False
+) -> torch.export.ExportedProgram:
     r"""Trace a solver for batches of any size or of one size.
 
     Args:
@@ -106,15 +113,19 @@ def export_program(solver: PnPNet, n: int | None = None, *, batch: int | None = 
         n: number of correspondences per problem. With ``None`` the n of the network, or any n of at least 4 when the
             network accepts any n.
         batch: number of problems of each call, which a compiler can specialise for; ``None``: any number.
+        rig: export for rigs: several cameras with one pose.
 
     Returns:
         A program that maps :data:`INPUTS` to the fields of :class:`ExportedResult`, with an unknown focal length to
         those of :class:`ExportedCamera`. The inputs are world points :math:`(B, N, 3)`, pixels
-        :math:`(B, N, 2)`, camera matrices :math:`(B, 3, 3)` and weights :math:`(B, N)`, 0 for padding.
+        :math:`(B, N, 2)`, camera matrices :math:`(B, 3, 3)` and weights :math:`(B, N)`, 0 for padding. For rigs the
+        inputs are :data:`RIG_INPUTS`: camera matrices :math:`(B, N, 3, 3)`, and the transform from the rig to the
+        camera of each pair, :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`.
 
     Raises:
         BaseError: when ``n`` is less than 3 or not the n of the network, or ``batch`` less than 1.
-        ValueCheckError: when the solver cannot be traced.
+        ValueCheckError: when the solver cannot be traced, or ``rig`` is given with an unknown focal length or without
+            an initialiser.
 
     Example:
         >>> from kornia_pnpnet import RobustWeightedLM
@@ -130,6 +141,8 @@ def export_program(solver: PnPNet, n: int | None = None, *, batch: int | None = 
             "With an unknown focal length only a solver with SetInit and without radial distortion can be exported:"
             " others search, and the search depends on the data."
         )
+    if rig and (solver.focal == "unknown" or solver.init is None):
+        raise ValueCheckError("For rigs a solver needs an initialiser and known focal lengths.")
     if n is not None:
         check_whole(3, n=n)
     if batch is not None:
@@ -138,12 +151,14 @@ def export_program(solver: PnPNet, n: int | None = None, *, batch: int | None = 
     if n not in (None, fixed):
         raise ValueCheckError(f"The solver's network was built for n = {fixed}, got n = {n!r}.")
     size = 3 if batch is None else int(batch)
-    problems = SyntheticProblems(n=12 if fixed is None else fixed, batch_size=size, seed=0).batch(0)
+    pairs = 12 if fixed is None else fixed
+    data = CameraProblems(n=pairs, batch_size=size, cameras=3) if rig else SyntheticProblems(n=pairs, batch_size=size)
+    problems = data.batch(0)
     weights = torch.ones_like(problems.world_points[..., 0])
-    inputs = (problems.world_points, problems.img_points, problems.intrinsics, weights)
+    inputs = (problems.world_points, problems.img_points, problems.intrinsics, weights, *(problems.cam_from_rig or ()))
     sizes: dict[int, Any] = {} if batch is not None else {0: torch.export.Dim("batch", min=1, max=_MAX_BATCH)}
     points = sizes if fixed is not None else {**sizes, 1: torch.export.Dim("pairs", min=4, max=_MAX_N)}
-    shapes = (points, points, sizes, points)
+    shapes = (points, points, points if rig else sizes, points, *((points, points),) * rig)
     try:
         with torch.no_grad(), warnings.catch_warnings():
             warnings.simplefilter("ignore", FutureWarning)  # the exporter warns about its own code
@@ -158,7 +173,9 @@ def _fixed_n(solver: PnPNet, n: int | None) -> int | None:
     return int(solver.init.config["n"]) if isinstance(solver.init, MLPInit) else n
 
 
-def export_package(solver: PnPNet, path: str | Path, n: int | None = None, *, batch: int | None = None) -> Path:
+def export_package(
+    solver: PnPNet, path: str | Path, n: int | None = None, *, batch: int | None = None, rig: bool = False
+) -> Path:
     """Compile a solver ahead of time with AOTInductor.
 
     :func:`load_package` loads the package without tracing or compiling, and C++ loads it with libtorch alone. A package
@@ -172,6 +189,7 @@ def export_package(solver: PnPNet, path: str | Path, n: int | None = None, *, ba
         batch: see :func:`export_program`. With 1 and a fixed number of correspondences, a problem takes a fraction of
             the time. Such a package, called without :func:`load_package`, writes each result of a thread over the one
             before.
+        rig: see :func:`export_program`.
 
     Returns:
         The path.
@@ -193,9 +211,9 @@ def export_package(solver: PnPNet, path: str | Path, n: int | None = None, *, ba
             "Ahead-of-time packages need a C++ compiler: install g++ (Debian, Ubuntu: apt install g++) or clang, or"
             " name yours in the environment variable CXX"
         ) from error
-    program = export_program(solver, n, batch=batch)
+    program = export_program(solver, n, batch=batch, rig=rig)
     pairs = _fixed_n(solver, n)
-    metadata = {_BATCH: str(batch or _ANY), _N: str(pairs or _ANY)}
+    metadata = {_BATCH: str(batch or _ANY), _N: str(pairs or _ANY), _RIG: str(rig)}
     # One problem mostly waits for calls and allocations. For more problems calls take less time.
     inline = batch == 1 and pairs is not None
     options = {**package_options(pairs, on_stack=inline), "aot_inductor.metadata": metadata}
@@ -218,36 +236,50 @@ class PackagedSolver:
     Attributes:
         batch: number of problems of each call; ``None``: any number.
         n: number of correspondences per problem; ``None``: any number of at least 4.
+        rig: whether problems are those of rigs.
     """
 
     def __init__(self, loader: torch._C._aoti.AOTIModelPackageLoader) -> None:
         self._run = loader.run
         metadata = loader.get_metadata()
         self.batch, self.n = (None if metadata[key] == _ANY else int(metadata[key]) for key in (_BATCH, _N))
+        self.rig = metadata.get(_RIG) == str(True)
 
     def __call__(
-        self, world_points: Tensor, img_points: Tensor, intrinsics: Tensor, weights: Tensor | None = None
+        self,
+        world_points: Tensor,
+        img_points: Tensor,
+        intrinsics: Tensor,
+        weights: Tensor | None = None,
+        *,
+        cam_from_rig: Pose | None = None,
     ) -> ExportedResult | ExportedCamera:
         r"""Solve a batch of problems.
 
         Args:
             world_points: shape :math:`(B, N, 3)`.
             img_points: pixels, shape :math:`(B, N, 2)`.
-            intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`.
+            intrinsics: camera matrices, shape :math:`(B, 3, 3)`, in rigs :math:`(B, N, 3, 3)`; or :math:`(3, 3)`.
             weights: weight of each pair, 0 for padding, shape :math:`(B, N)`; 1 when ``None``.
+            cam_from_rig: the transform from the rig to the camera that sees each pair, :math:`(B, N, 3, 3)` and
+                :math:`(B, N, 3)`, in a package for rigs and only there.
 
         Raises:
             ShapeError: for other shapes; compiled code would read beyond the end of a tensor.
+            ValueCheckError: for a rig without a package for rigs, or the other way round.
         """
+        if self.rig != (cam_from_rig is not None):
+            raise ValueCheckError(f"This package {'needs' if self.rig else 'does not take'} cam_from_rig.")
         batch, n = (*world_points.shape, 0, 0)[:2]
         batch, n = self.batch or batch, self.n or max(n, 4)
         if weights is None:
             weights = torch.ones(batch, n)
+        cameras = (batch, n, 3, 3) if self.rig else (batch, 3, 3)
         if intrinsics.ndim == 2:
-            intrinsics = intrinsics.expand(batch, 3, 3)
-        shapes = (batch, n, 3), (batch, n, 2), (batch, 3, 3), (batch, n)
-        inputs = world_points, img_points, intrinsics, weights
-        check_shapes(dict(zip(INPUTS, zip(inputs, shapes, strict=True), strict=True)))
+            intrinsics = intrinsics.expand(cameras)
+        shapes = (batch, n, 3), (batch, n, 2), cameras, (batch, n), (batch, n, 3, 3), (batch, n, 3)
+        inputs = world_points, img_points, intrinsics, weights, *(cam_from_rig or ())
+        check_shapes(dict(zip(RIG_INPUTS, zip(inputs, shapes, strict=False), strict=False)))
         # Compiled code does not look at dtypes and strides, and may write the next result over this one.
         results = self._run([x.to("cpu", torch.float32).contiguous() for x in inputs])
         return (ExportedResult if len(results) == len(OUTPUTS) else ExportedCamera)(*[x.clone() for x in results])
@@ -273,7 +305,9 @@ def load_package(path: str | Path) -> PackagedSolver:
         raise ValueCheckError(f"'{path}' is not a solver of export_package for this machine: {reason}") from error
 
 
-def export_onnx(solver: PnPNet, path: str | Path, n: int | None = None, *, batch: int | None = None) -> Path:
+def export_onnx(
+    solver: PnPNet, path: str | Path, n: int | None = None, *, batch: int | None = None, rig: bool = False
+) -> Path:
     """Write a solver as an ONNX model in one file. ONNX Runtime runs the model without PyTorch.
 
     Args:
@@ -281,6 +315,7 @@ def export_onnx(solver: PnPNet, path: str | Path, n: int | None = None, *, batch
         path: the file to write. An existing file is replaced when the model is complete.
         n: see :func:`export_program`.
         batch: see :func:`export_program`.
+        rig: see :func:`export_program`.
 
     Returns:
         The path.
@@ -295,8 +330,11 @@ def export_onnx(solver: PnPNet, path: str | Path, n: int | None = None, *, batch
     except ImportError as error:
         raise ImportError("ONNX needs more packages: pip install 'kornia_pnpnet[onnx]'") from error
     path = Path(path)
-    program = export_program(solver, n, batch=batch)
-    inputs, outputs = list(INPUTS), [*(OUTPUTS if solver.focal == "known" else ExportedCamera._fields)]
+    program = export_program(solver, n, batch=batch, rig=rig)
+    inputs, outputs = (
+        list(RIG_INPUTS if rig else INPUTS),
+        [*(OUTPUTS if solver.focal == "known" else ExportedCamera._fields)],
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # the exporter warns about its own code
         model = torch.onnx.export(

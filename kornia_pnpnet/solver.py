@@ -84,7 +84,8 @@ class PnPNet(PretrainedMixin):
             many more minimal samples as it needs (``init.ransac.search_on``), and a pose whose mirror image fits as
             well is not ``ok``. Needs an initialiser that estimates the noise, :class:`~kornia_pnpnet.init.SetInit`.
             ``None``: adaptive with such an initialiser and a refinement in evaluation mode, else fixed. Always fixed:
-            exported graphs, ``compile(whole=True)``, ``torch.func.vmap`` and the device ``meta``.
+            exported graphs, ``compile(whole=True)``, ``torch.func.vmap`` and the device ``meta``. Rigs and bearings:
+            RANSAC, unless the effort is ``"fixed"`` or the solver is compiled.
         gradient: which problems carry a gradient: those that are ``"ok"``, or ``"always"`` every valid problem, to
             train a network that does not predict anything sensible yet. The gradient of each problem to its normalised
             points, pixels and weights is then finite and at most 10 long.
@@ -271,9 +272,8 @@ class PnPNet(PretrainedMixin):
 
         The first call then takes some seconds, less where a cache of ``torch.compile`` is on disk; further calls take a
         fraction of the uncompiled time. The batch may change its size; another number of pairs, another dtype and calls
-        that record gradients are compiled for when they first come. A part that cannot be compiled,
-        because there is no C++ compiler or because it is a RANSAC, runs uncompiled after one warning. Copies and saved
-        weights of the solver are not compiled.
+        that record gradients are compiled for when they first come. What cannot be compiled, without a C++ compiler or
+        because it is a RANSAC, runs uncompiled after one warning. Copies and saved weights are not compiled.
 
         Args:
             mode: mode of ``torch.compile``; ``"reduce-overhead"`` captures CUDA graphs.
@@ -390,7 +390,7 @@ class PnPNet(PretrainedMixin):
             assert given is not None
             guess = Guess(given, torch.ones_like(corr.weights))
         elif rig is not None and not isinstance(self.init, RANSAC):
-            guess = guess_of_rig(corr, given, with_noise=isinstance(self.init, SetInit))
+            guess = guess_of_rig(corr, given, with_noise=isinstance(self.init, SetInit), fixed=self.effort == "fixed")
         elif isinstance(self.init, RANSAC):
             guess = self.init(corr, given)
         elif views == 1:

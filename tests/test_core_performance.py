@@ -14,7 +14,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from kornia_pnpnet import MLPInit, PnPNet, Pose, RobustWeightedLM, create_solver
 from kornia_pnpnet.core.performance import Compiled, ascending_order, in_order, problems_last, ranked
 from kornia_pnpnet.core.trees import iter_tensors
-from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet.data import CameraProblems, OutlierMix, SyntheticProblems
 from kornia_pnpnet.geometry import project
 from kornia_pnpnet.types import PnPResult
 
@@ -114,6 +114,21 @@ def test_what_cannot_be_captured_runs_as_it_is_with_one_warning(backend):
             second = compiled(*inputs)
         for result in (first, second):
             assert_same(result, eager(*inputs), rtol=0, atol=0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("whole", "graphs"), [(False, 3), (True, 1)])
+def test_rigs_are_graphs(whole, graphs, backend):
+    eager, compiled = create_solver("pnpnet-set", m=2, effort="fixed"), create_solver("pnpnet-set", m=2)
+    compiled.compile(whole=whole)
+    with torch.no_grad(), warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        for count in (7, 64, 1):
+            data = CameraProblems(n=12, batch_size=count, seed=5, outlier_share=0.25, cameras=3, dtype=torch.float64)
+            rigs = data.batch(0)
+            results = [solver(*rigs[:3], cam_from_rig=rigs.cam_from_rig) for solver in (compiled, eager)]
+            assert_same(*results, rtol=1e-6, atol=1e-6)
+    assert backend.frame_count == graphs
 
 
 def test_without_a_compiler_it_runs_as_it_is(monkeypatch):

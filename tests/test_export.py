@@ -10,12 +10,12 @@ import pytest
 import torch
 from kornia.core.exceptions import BaseError, ShapeError, ValueCheckError
 
-from kornia_pnpnet import PnPNet, RobustWeightedLM, create_solver
+from kornia_pnpnet import PnPNet, Pose, RobustWeightedLM, SetInit, create_solver
 from kornia_pnpnet.cli import main
 from kornia_pnpnet.data import CameraProblems
 from kornia_pnpnet.export import (
-    INPUTS,
     OUTPUTS,
+    RIG_INPUTS,
     PackagedSolver,
     export_onnx,
     export_package,
@@ -31,18 +31,25 @@ def inputs_of(problems, weights=None):
     return tuple(x.float() for x in (problems.world_points, problems.img_points, problems.intrinsics, weights))
 
 
+def rigs(n, batch, outlier_share=0.25):
+    """Inputs of a solver for rigs."""
+    data = CameraProblems(n=n, batch_size=batch, seed=5, cameras=3, outlier_share=outlier_share)
+    problems = data.batch(0)
+    return *inputs_of(problems), *problems.cam_from_rig
+
+
 def near(found, solver, inputs):
     """Equal within 1e-4 of the scene's size; a problem on the edge of two minima may end in either."""
     with torch.no_grad(), pytest.MonkeyPatch.context() as patch:
         patch.setattr(solver, "effort", "fixed")  # as that of a graph
-        expected = solver(*inputs)
+        expected = solver(*inputs[:4], cam_from_rig=Pose(*inputs[4:]) if inputs[4:] else None)
     rotation, translation, weights, cost, ok = (torch.as_tensor(x) for x in found)
     size = expected.translation.norm(dim=-1).clamp(min=1e-6)  # 0 where not ok
     off = (translation - expected.translation).norm(dim=-1) / size + (rotation - expected.rotation).abs().amax((1, 2))
     assert (off < 1e-4).float().mean() >= 0.98
     assert off.median() < 1e-5
     same = off < 1e-4
-    torch.testing.assert_close(weights[same], expected.weights[same], rtol=0, atol=2e-2)
+    torch.testing.assert_close(weights[same], expected.weights[same], rtol=1e-2, atol=2e-2)
     assert (ok == expected.ok).float().mean() >= 0.98
     assert cost.isfinite().all()
 
@@ -68,12 +75,20 @@ def test_programs(name, n, counts, make_problems):
             near(program.module()(*inputs), solver, inputs)
 
 
+@pytest.mark.slow
+def test_programs_of_rigs():
+    solver = create_solver("pnpnet-set")
+    program = export_program(solver, rig=True)
+    for n, batch in ((4, 3), (12, 1), (12, 50), (70, 10)):
+        near(program.module()(*rigs(n, batch)), solver, rigs(n, batch))
+
+
 def run_onnx(path, inputs):
     runtime = pytest.importorskip("onnxruntime")
     session = runtime.InferenceSession(path, providers=["CPUExecutionProvider"])
-    assert tuple(x.name for x in session.get_inputs()) == INPUTS
+    assert tuple(x.name for x in session.get_inputs()) == RIG_INPUTS[: len(inputs)]
     assert tuple(x.name for x in session.get_outputs())[:5] == OUTPUTS
-    return session.run(None, {name: x.numpy() for name, x in zip(INPUTS, inputs, strict=True)})
+    return session.run(None, {name: x.numpy() for name, x in zip(RIG_INPUTS, inputs, strict=False)})
 
 
 @pytest.mark.parametrize(
@@ -98,6 +113,14 @@ def test_onnx(name, sizes, make_problems, tmp_path):
         near(found, solver, inputs)
         assert all(np.isfinite(x).all() for x in found[:4])
         assert not found[4][3:4].any()
+
+
+@pytest.mark.slow
+def test_onnx_of_rigs(tmp_path):
+    solver = PnPNet(SetInit(), RobustWeightedLM(2))
+    path = export_onnx(solver, tmp_path / "model.onnx", rig=True)
+    for n, batch in ((5, 3), (12, 1), (12, 50), (70, 10)):
+        near(run_onnx(path, rigs(n, batch)), solver, rigs(n, batch))
 
 
 @pytest.mark.slow
@@ -133,6 +156,9 @@ def test_solvers_that_cannot_be_exported(tmp_path, capsys):
     for batch in (0, -1, True, 0.5, "1"):
         with pytest.raises(BaseError):
             export_program(PnPNet(None, RobustWeightedLM(1)), 9, batch=batch)
+    for solver in (PnPNet(None, RobustWeightedLM(1)), create_solver("pnpnet-set", focal="unknown")):
+        with pytest.raises(ValueCheckError, match="rig"):
+            export_program(solver, rig=True)
     (tmp_path / "old.onnx").write_bytes(b"old")
     with pytest.raises(ValueCheckError, match="RANSAC"):
         export_onnx(create_solver("p3p-ransac"), tmp_path / "old.onnx", 9)
@@ -140,6 +166,8 @@ def test_solvers_that_cannot_be_exported(tmp_path, capsys):
     (tmp_path / "old.onnx").unlink()
     assert main(["export", str(tmp_path / "x.onnx"), "--solver", "opencv-ransac"]) == 2
     assert "opencv-ransac" in capsys.readouterr().err
+    assert main(["export", str(tmp_path / "x.onnx"), "--solver", "identity-lm", "--rig"]) == 2
+    assert "rigs" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
@@ -207,6 +235,17 @@ def test_packages_of_any_number_of_pairs(make_problems, tmp_path):
 
 
 @pytest.mark.slow
+def test_packages_of_rigs(tmp_path):
+    solver = PnPNet(SetInit(), RobustWeightedLM(1))
+    if shutil.which("g++") is None and shutil.which("clang++") is None:
+        pytest.skip("no C++ compiler")
+    package = load_package(export_package(solver, tmp_path / "rig.pt2", 12, rig=True))
+    for batch in (1, 50):
+        inputs = rigs(12, batch)
+        near(package(*inputs[:4], cam_from_rig=Pose(*inputs[4:])), solver, inputs)
+
+
+@pytest.mark.slow
 def test_cpp_example(make_problems, tmp_path):
     """The C++ program and Python get the same numbers from the same package."""
     if shutil.which("cmake") is None:
@@ -261,12 +300,15 @@ def test_files_that_are_no_packages(tmp_path):
 class Loader:
     """Stands for compiled code: returns its inputs."""
 
+    def __init__(self, rig=False):
+        self.rig = rig
+
     def get_metadata(self):
-        return {"pnpnet_n": "any", "pnpnet_batch": "any"}
+        return {"pnpnet_n": "any", "pnpnet_batch": "any", "pnpnet_rig": str(self.rig)}
 
     def run(self, inputs):
         assert all(x.dtype == torch.float32 and x.is_contiguous() for x in inputs)
-        return [*inputs, inputs[0]]
+        return [*inputs, *[inputs[0]] * (5 - len(inputs))]
 
 
 def test_what_compiled_code_gets(make_problems):
@@ -283,3 +325,17 @@ def test_what_compiled_code_gets(make_problems):
     ):
         with pytest.raises(ShapeError):
             package(*wrong)
+
+
+def test_what_compiled_code_of_rigs_gets():
+    inputs, package = rigs(5, 2), PackagedSolver(Loader(rig=True))
+    world, img, intrinsics, _, *rig = inputs
+    found = package(world.double(), img, intrinsics, cam_from_rig=Pose(*rig))
+    assert all(torch.equal(x, y) for x, y in zip(found, inputs, strict=True))
+    with pytest.raises(ValueCheckError, match="cam_from_rig"):
+        package(world, img, intrinsics)
+    with pytest.raises(ValueCheckError, match="cam_from_rig"):
+        PackagedSolver(Loader())(world, img, intrinsics[:, 0], cam_from_rig=Pose(*rig))
+    for wrong in ((intrinsics[:, 0], rig), (intrinsics, (rig[0][:, :4], rig[1])), (intrinsics, (rig[0], rig[1][0]))):
+        with pytest.raises(ShapeError):
+            package(world, img, wrong[0], cam_from_rig=Pose(*wrong[1]))

@@ -5,6 +5,7 @@ compiling, in Python and in C++ with libtorch; it runs on CPUs like the one that
 
   pnpnet export pnpnet-set.onnx
   pnpnet export pnpnet-n9.pt2 --solver pnpnet-n9 --batch 1
+  pnpnet export rig.onnx --rig
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--n", metavar="N", type=whole_number(1), help="correspondences per problem; default: any number"
     )
     parser.add_argument("--batch", metavar="B", type=whole_number(1), help="problems per call; default: any number")
+    parser.add_argument("--rig", action="store_true", help="for rigs: several cameras with one pose")
     parser.add_argument("--overwrite", action="store_true", help="replace the file")
 
 
@@ -32,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
     target = Path(arguments.file)
     if target.suffix not in (".onnx", ".pt2"):
         raise ValueError(f"'{target}': the file's name must end in .onnx (ONNX) or .pt2 (compiled ahead of time)")
-    from kornia_pnpnet.export import INPUTS, OUTPUTS, ExportedCamera, export_onnx, export_package
+    from kornia_pnpnet.export import INPUTS, OUTPUTS, RIG_INPUTS, ExportedCamera, export_onnx, export_package
     from kornia_pnpnet.solver import PnPNet
 
     solver = load_solver_without_truth(arguments.solver)
@@ -48,7 +50,8 @@ def run(arguments: argparse.Namespace) -> int:
     print(f"Tracing and {doing}; PyTorch takes a minute or more", flush=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the exporter about itself
-        path = export(solver, target, arguments.n, batch=arguments.batch)
+        path = export(solver, target, arguments.n, batch=arguments.batch, rig=arguments.rig)
     outputs = OUTPUTS if solver.focal == "known" else ExportedCamera._fields
-    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, {', '.join(INPUTS)} -> {', '.join(outputs)}")
+    inputs = RIG_INPUTS if arguments.rig else INPUTS
+    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, {', '.join(inputs)} -> {', '.join(outputs)}")
     return 0

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from kornia_pnpnet.cameras import bearing_cameras
 from kornia_pnpnet.core.checks import check_whole
 from kornia_pnpnet.core.configured import Configured
+from kornia_pnpnet.core.linalg import small_product
+from kornia_pnpnet.core.performance import sees_values
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.init.ransac.p3p import p3p
 from kornia_pnpnet.types import Correspondences, Hypotheses, Pose
@@ -53,35 +54,52 @@ class P3PRig(Configured):
             ShapeError: when :math:`N` is not 3.
         """
         assert corr.rig is not None
-        batch = len(corr.weights)
-        rays = functional.normalize(corr.places, dim=-1)  # (B, 3, 3) in the frame of the rig
-        centres = -(corr.rig.rotation * corr.rig.translation[..., None]).sum(-2)  # (B, 3, 3)
-        turn, _ = bearing_cameras(rays.sum(1, keepdim=True))
-        turn = turn[:, 0]
-        seen = rays @ turn.mT
-        ahead = seen[..., 2:]
-        plane = torch.where(ahead > 0, seen[..., :2] / ahead, torch.inf)
-        solved = p3p(corr.world_points, plane)
-        slot, at = solved.valid.mT.nonzero(as_tuple=True)  # the batch stays last in memory
-        back = turn[at].mT
-        found = map_tensors(lambda x: x.transpose(0, 1)[slot, at], solved.pose)
-        if self.steps:
-            world = corr.world_points[at]
-            cam = world @ found.rotation.mT + found.translation[:, None]
-            # From the points of the central approximation to those nearest on the rays.
-            away = ((centres.mean(1, keepdim=True) - centres) * rays).sum(-1)
-            ranges = (cam * seen[at]).sum(-1) + away[at]
-            # Problems last, before them pairs and coordinates: (3, 3, M).
-            world, at_rays, at_centres = (x.permute(1, 2, 0).contiguous() for x in (world, rays[at], centres[at]))
-            pose, finite = _newton(world, at_rays, at_centres, ranges.mT.contiguous(), self.steps)
+        batch = corr.weights.shape[0]
+        # Problems last, before them pairs and coordinates: (3, 3, B).
+        world, rays, back = (x.permute(1, 2, 0) for x in (corr.world_points, corr.places, corr.rig.translation))
+        rays = rays / rays.square().sum(1, keepdim=True).sqrt()  # in the frame of the rig
+        centres = -(corr.rig.rotation.permute(1, 2, 3, 0) * back[:, :, None]).sum(1)
+        turn = bearing_cameras(rays.sum(0).mT[:, None])[0][:, 0].permute(1, 2, 0)
+        seen = small_product(rays, turn.transpose(0, 1))
+        ahead = seen[:, 2:]
+        plane = torch.where(ahead > 0, seen[:, :2] / ahead, torch.inf)
+        solved = p3p(corr.world_points, plane.permute(2, 0, 1))
+        away = ((centres.mean(0) - centres) * rays).sum(1)
+        of_sample = world, rays, centres, turn, seen, away
+        found = map_tensors(lambda x: x.movedim((0, 1), (-1, -2)), solved.pose)  # (3, 3, 4, B) and (3, 4, B)
+        eye = torch.eye(3, dtype=rays.dtype, device=rays.device)
+        if not sees_values(rays):  # a graph: slots without a solution, too
+            found = map_tensors(lambda x: x.flatten(-2), found)
+            every = [x[..., None, :].expand(*x.shape[:-1], 4, batch).flatten(-2) for x in of_sample]
+            pose, exact = self._exact(found, *every)
+            valid = solved.valid.mT.flatten() & exact
+            rotation = torch.where(valid[:, None, None], pose.rotation, eye)
+            translation = torch.where(valid[:, None], pose.translation, 0.0)
+            rotation, translation, valid = (x.unflatten(0, (4, batch)) for x in (rotation, translation, valid))
         else:
-            pose = Pose(back @ found.rotation, (back @ found.translation[..., None])[..., 0])
-            finite = torch.ones_like(at, dtype=torch.bool)
-        slot, at, pose = slot[finite], at[finite], map_tensors(lambda x: x[finite], pose)
-        rotation = torch.eye(3, dtype=rays.dtype, device=rays.device).repeat(4, batch, 1, 1)
-        translation, valid = rays.new_zeros(4, batch, 3), torch.zeros_like(solved.valid.mT)
-        rotation[slot, at], translation[slot, at], valid[slot, at] = *pose, True
+            slot, at = solved.valid.mT.nonzero(as_tuple=True)
+            found = map_tensors(lambda x: x[..., slot, at], found)
+            pose, exact = self._exact(found, *(x[..., at] for x in of_sample))
+            slot, at, pose = slot[exact], at[exact], map_tensors(lambda x: x[exact], pose)
+            rotation, translation = eye.repeat(4, batch, 1, 1), rays.new_zeros(4, batch, 3)
+            valid = torch.zeros_like(solved.valid.mT)
+            rotation[slot, at], translation[slot, at], valid[slot, at] = *pose, True
         return Hypotheses(Pose(rotation.transpose(0, 1), translation.transpose(0, 1)), valid.mT)
+
+    def _exact(
+        self, found: Pose, world: Tensor, rays: Tensor, centres: Tensor, turn: Tensor, seen: Tensor, away: Tensor
+    ) -> tuple[Pose, Tensor]:
+        """From M poses of the central approximation, problems last, to exact ones, and whether they are exact."""
+        rotation, translation = found
+        if not self.steps:
+            back = turn.transpose(0, 1)
+            rotation, translation = small_product(back, rotation), small_product(back, translation[:, None])[:, 0]
+            return Pose(rotation.movedim(-1, 0), translation.mT), torch.ones_like(translation[0], dtype=torch.bool)
+        # From the points of the central approximation to those nearest on the rays.
+        cam = small_product(world, rotation.transpose(0, 1)) + translation
+        ranges = (cam * seen).sum(1) + away
+        world, rays, centres, ranges = (x.contiguous() for x in (world, rays, centres, ranges))
+        return _newton(world, rays, centres, ranges, self.steps)
 
 
 def _newton(world_points: Tensor, rays: Tensor, centres: Tensor, ranges: Tensor, steps: int) -> tuple[Pose, Tensor]:
