@@ -22,6 +22,10 @@ UV_OPTIONS = --index-strategy unsafe-best-match $$($(PY) -m pip config list | \
 	sed -n "s/\\\\n/ /g; s/^[^.]*\.\(index-url\|extra-index-url\|find-links\)='\(.*\)'/\1 \2/p" | \
 	while read -r option values; do for value in $$values; do echo "--$$option $$value"; done; done)
 
+# Python keeps what it compiled, even where the environment says not to: every process of the tests, those that the tests
+# start included, would otherwise compile some 2800 modules anew, which takes 5 s.
+unexport PYTHONDONTWRITEBYTECODE
+
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .PHONY: help install demo bench test test-all docs lint clean FORCE

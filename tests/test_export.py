@@ -92,17 +92,18 @@ def run_onnx(path, inputs):
 
 
 @pytest.mark.parametrize(
-    ("name", "sizes"),
+    ("name", "fixed", "sizes"),
     [
-        ("one iteration", ((9, 3),)),
-        pytest.param("pnpnet-n9", ((9, 1), (9, 3), (9, 100)), marks=pytest.mark.slow),
-        pytest.param("pnpnet-set", ((4, 3), (9, 1), (9, 50), (20, 50), (100, 20)), marks=pytest.mark.slow),
+        ("one iteration", 4, ((9, 4),)),
+        pytest.param("one iteration", None, ((9, 4),), marks=pytest.mark.slow),
+        pytest.param("pnpnet-n9", None, ((9, 1), (9, 3), (9, 100)), marks=pytest.mark.slow),
+        pytest.param("pnpnet-set", None, ((4, 3), (9, 1), (9, 50), (20, 50), (100, 20)), marks=pytest.mark.slow),
     ],
 )
-def test_onnx(name, sizes, make_problems, tmp_path):
+def test_onnx(name, fixed, sizes, make_problems, tmp_path):
     """Batches of any size, with padding where any number of correspondences is allowed, and with a broken problem."""
     solver = PnPNet(None, RobustWeightedLM(1)) if name == "one iteration" else create_solver(name)
-    path = export_onnx(solver, tmp_path / "model.onnx", 9 if name == "one iteration" else None)
+    path = export_onnx(solver, tmp_path / "model.onnx", 9 if name == "one iteration" else None, batch=fixed)
     for count, batch in sizes:
         problems = make_problems(n=count, batch=batch, outliers=count // 4)
         world, weights = problems.world_points.clone(), torch.ones_like(problems.world_points[..., 0])
@@ -139,6 +140,7 @@ def test_onnx_of_an_unknown_focal_length(tmp_path):
         torch.testing.assert_close(torch.from_numpy(camera), solver(*inputs).intrinsics, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_onnx_of_one_problem(make_problems, tmp_path):
     solver = PnPNet(None, RobustWeightedLM(1))
     inputs = inputs_of(make_problems(n=9, batch=1))

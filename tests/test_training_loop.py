@@ -242,43 +242,50 @@ DDP_SCRIPT = """
 import sys, torch
 sys.path.insert(0, {tests!r})
 from lightning_fabric import Fabric
-from test_training_loop import make_parts
+from test_training_loop import make_double
 from kornia_pnpnet.training import fit
-torch.set_num_threads(1)
-fabric = Fabric(accelerator="cpu", devices={devices}, strategy={strategy!r})
-fabric.launch()
-parts = make_parts()
-parts["model"].double()
-parts["data"].dtype = torch.float64
-parts["validation"] = {{}}
-fit(folder={folder!r}, fabric=fabric, **parts)
-if fabric.is_global_zero:
-    torch.save(parts["model"].state_dict(), {out!r})
+
+def train(fabric):
+    torch.set_num_threads(1)
+    parts = make_double()
+    fit(folder={folder!r}, fabric=fabric, **parts)
+    if fabric.is_global_zero:
+        torch.save(parts["model"].state_dict(), {out!r})
+
+fabric = Fabric(accelerator="cpu", devices=2, strategy={strategy!r})
+if {strategy!r} == "ddp":
+    fabric.launch()
+    train(fabric)
+else:
+    fabric.launch(train)
 """
 
 
-def test_two_processes_equal_one(tmp_path):
+def make_double():
+    parts = make_parts()
+    parts["model"].double()
+    parts["data"].dtype = torch.float64
+    return {**parts, "validation": {}}
+
+
+# A second process that is forked imports nothing anew.
+@pytest.mark.parametrize("strategy", ["ddp_fork", pytest.param("ddp", marks=pytest.mark.slow)])
+def test_two_processes_equal_one(strategy, tmp_path):
     """Two CPU processes with gloo share the batch of one and arrive at the same weights."""
-    states = []
-    for devices, strategy in ((1, "auto"), (2, "ddp")):
-        script, out = tmp_path / f"run{devices}.py", tmp_path / f"{devices}.pt"
-        script.write_text(
-            DDP_SCRIPT.format(
-                tests=str(REPO / "tests"),
-                devices=devices,
-                strategy=strategy,
-                folder=str(tmp_path / str(devices)),
-                out=str(out),
-            )
-        )
-        done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=240, check=False)
-        assert done.returncode == 0, done.stderr
-        states.append(torch.load(out, weights_only=True))
+    one = make_double()
+    start = {name: value.clone() for name, value in one["model"].state_dict().items()}
+    fit(folder=tmp_path / "one", **one)
+
+    script, out = tmp_path / "run.py", tmp_path / "two.pt"
+    folder = str(tmp_path / "two")
+    script.write_text(DDP_SCRIPT.format(tests=str(REPO / "tests"), strategy=strategy, folder=folder, out=str(out)))
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=240, check=False)
+    assert done.returncode == 0, done.stderr
     assert "distributed_backend=gloo" in done.stderr
-    for name, value in states[0].items():
-        torch.testing.assert_close(states[1][name], value, rtol=0, atol=1e-9)
-    start = make_parts()["model"].double().state_dict()
-    assert any(not torch.equal(states[0][name], start[name]) for name in start)
+    two = torch.load(out, weights_only=True)
+    for name, value in one["model"].state_dict().items():
+        torch.testing.assert_close(two[name], value, rtol=0, atol=1e-9)
+    assert any(not torch.equal(two[name], start[name]) for name in start)
 
 
 def test_validation_has_its_own_interval(tmp_path):
