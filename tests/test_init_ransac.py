@@ -284,3 +284,12 @@ def test_the_gradient_is_that_of_the_result(make_problems, correspond):
         numeric = ((ends[0] - ends[1]) * probe).sum(-1) / (2 * step)
         analytic = (leaf.grad * direction).flatten(1).sum(-1)
         torch.testing.assert_close(analytic, numeric, rtol=5e-2, atol=1e-8)
+
+
+def test_without_final_steps_the_pose_is_a_constant(make_problems, correspond):
+    corr, truth = correspond(make_problems(20, 5, outliers=5, noise=False))
+    img_points = corr.img_points.clone().requires_grad_()
+    for steps, learns in ((0, False), (1, True)):
+        guess = RANSAC(P3P(), threshold=1.0, final_steps=steps)(corr._replace(img_points=img_points))
+        assert guess.pose.rotation.requires_grad is learns
+        assert pose_errors(guess.pose, truth).rotation_error_deg.max() < 0.01

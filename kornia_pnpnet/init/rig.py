@@ -23,7 +23,7 @@ __all__ = ["guess_of_rig"]
 
 # Focal lengths. Threshold of an inlier: ten times the noise of a pixel at a focal length of 1000 pixels.
 _THRESHOLD = 0.01
-_FINDER = RANSAC(P3P(), threshold=_THRESHOLD * F_CONST)
+_FINDER = RANSAC(P3P(), threshold=_THRESHOLD * F_CONST, final_steps=0)
 # Number of samples of a fixed effort, and of draws for each, of which the first that P3PRig can solve is the sample: of
 # three cameras that look in all directions it can solve every second draw. Chosen on `CameraProblems` with seed 77002.
 _SAMPLES, _DRAWS = 128, 4

@@ -43,8 +43,6 @@ from kornia_pnpnet.types import LEAST_NOISE, MIN_PAIRS, Correspondences, Guess, 
 
 __all__ = ["FURTHER", "RANSAC", "search_on"]
 
-# Number of least-squares steps from the best pose, which is near the minimum already.
-_FINAL_STEPS = 6
 # The scale of the Cauchy kernel of these steps, in standard deviations of the inliers' residuals; the median of the
 # squared residuals of Gaussian noise, in variances of a pixel coordinate; pairs that a pose fits by itself.
 _KERNEL_SCALE, _MEDIAN, _FITTED = 3.4, 2.0 * math.log(2.0), 5
@@ -106,6 +104,8 @@ class RANSAC(Configured):
         local_candidates: number of best poses of a round that are improved.
         local_iterations: number of times that a pose is improved on its current inliers; the first time on the pairs
             within three times the thresholds.
+        final_steps: number of least-squares steps from the best pose, which is near the minimum already. They carry the
+            gradient; with 0 the pose is a constant, which is enough where a refinement follows.
         seed: seed of the random numbers.
         chunk_size: number of samples that are solved and scored together. It bounds the memory; a processor's cache
             should hold the tensors of a chunk.
@@ -142,6 +142,7 @@ class RANSAC(Configured):
         confidence: float = 0.999,
         local_candidates: int = 3,
         local_iterations: int = 2,
+        final_steps: int = 6,
         seed: int = 0,
         chunk_size: int = 4096,
     ) -> None:
@@ -150,6 +151,7 @@ class RANSAC(Configured):
         check_whole(1, local_candidates=local_candidates, local_iterations=local_iterations)
         check_whole(0, 2**63 - 1, seed=seed)
         check_positive(threshold=threshold)
+        check_whole(0, final_steps=final_steps)
         check_numbers(0.0, world_threshold=world_threshold)
         KORNIA_CHECK(0 < confidence < 1, f"confidence must lie in (0, 1), got {confidence}.")
         KORNIA_CHECK(callable(scorer) or scorer in SCORERS, f"scorer must be one of {sorted(SCORERS)}, got {scorer!r}.")
@@ -158,6 +160,7 @@ class RANSAC(Configured):
         self.minimal = minimal
         self.threshold = threshold
         self.world_threshold = world_threshold
+        self.final_steps = final_steps
         self.chunk_size = chunk_size
         options = {name: self.config[name] for name in Plan._fields}
         options.update(minimal=minimal, scorer=scorer if callable(scorer) else SCORERS[scorer])
@@ -241,7 +244,7 @@ class RANSAC(Configured):
             for limits in part_stages:
                 with torch.no_grad():
                     inliers = judge(projection, part, limits).weights.detach()
-                for _ in range(_FINAL_STEPS):
+                for _ in range(self.final_steps):
                     weights = inliers * _robust(judge(projection, part, limits), inliers)
                     step = least_squares(part, pose, projection, weights)
                     pose, zoom = step.pose, step.zoom_after(zoom)
