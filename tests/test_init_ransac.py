@@ -239,11 +239,11 @@ def test_options_decide_how_many_samples_are_drawn(found, make_problems, corresp
 
 def test_sound_problems_are_ok_and_pixels_of_no_pose_are_not(make_problems):
     for n, outliers in ((3, 0), (4, 0), (5, 0), (9, 3), (40, 28)):
-        problems = make_problems(n, 200, outliers=outliers)
+        problems = make_problems(n, 100, outliers=outliers)
         assert solve(solver(**PROTOCOL), problems).ok.double().mean() > 0.97
     for n in (4, 5, 9, 40):
         mix = OutlierMix(count=n, mismatch_share=0.0)
-        problems = SyntheticProblems(n=n, batch_size=300, outliers=mix, dtype=torch.float64).batch(0)
+        problems = SyntheticProblems(n=n, batch_size=100, outliers=mix, dtype=torch.float64).batch(0)
         for options in (PROTOCOL, {"threshold": 4.0}):
             assert solve(solver(**options), problems).ok.double().mean() <= 0.01
 

@@ -204,7 +204,7 @@ def test_schedules():
 
 
 def test_learning_lowers_the_loss(tmp_path):
-    parts = make_parts(updates=400, log_every=50, validate_every=50, checkpoint_every=400)
+    parts = make_parts(updates=200, log_every=25, validate_every=25, checkpoint_every=200)
     parts["data"] = SyntheticProblems(n=6, batch_size=128, seed=3)
     fit(folder=tmp_path, **parts)
     rows = read_history(tmp_path)
