@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -84,6 +85,7 @@ def modules():
 MODULES = modules()
 
 
+@cache
 def imports(path):
     """Full names of all that a file imports, at its top or inside functions."""
     found = []
