@@ -204,8 +204,10 @@ def tensors_of(case):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:There is a performance drop:UserWarning")
 @pytest.mark.parametrize("name", GRAPHS)
-def test_vmap_is_a_larger_batch(name):
+def test_vmap_is_a_larger_batch(name, monkeypatch):
+    """With the fixed effort, the only one of vmap."""
     solver = SOLVERS[name]
+    monkeypatch.setattr(solver, "effort", "fixed")
 
     @many(15)
     @given(batches(9 if name.endswith("-n9") else None))
