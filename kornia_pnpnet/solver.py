@@ -273,7 +273,7 @@ class PnPNet(PretrainedMixin):
         The first call then takes some seconds, less where a cache of ``torch.compile`` is on disk; further calls take a
         fraction of the uncompiled time. The batch may change its size; another number of pairs, another dtype and calls
         that record gradients are compiled for when they first come. What cannot be compiled, without a C++ compiler or
-        because it is a RANSAC, runs uncompiled after one warning. Copies and saved weights are not compiled.
+        because it is a RANSAC, runs uncompiled after one warning. Copies compile for themselves.
 
         Args:
             mode: mode of ``torch.compile``; ``"reduce-overhead"`` captures CUDA graphs.

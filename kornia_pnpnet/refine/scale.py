@@ -19,6 +19,9 @@ _LARGER = 4.0
 _INLIER = 0.25
 # Share of the pairs. With fewer inliers the median residual may be that of near misses.
 _MOST_ARE = 0.5
+# Inliers. The residuals of fewer say little of a pose that was fitted to them: solved again with the noise that they
+# show, problems of 6 to 9 pairs are right as often as before (seeds 3117 and 3120 of SyntheticProblems).
+_FEWEST = 7
 # The poses of the fit are closer to the pixels than the true pose is.
 _FITTED = 1.1
 # With confidences, sigmas fall with this power of them: on keypoints of networks it lies near 1, and more is better
@@ -55,12 +58,12 @@ def larger_sigma(
         In pixels, shape :math:`(B, N)`.
 
     Example:
-        >>> points = torch.tensor([[[0.0, 0.0, 4.0], [1.0, 0.0, 4.0], [0.0, 1.0, 4.0]]])
+        >>> points = torch.tensor([[[0.0, 0.0, 4.0], [1.0, 0.0, 4.0], [0.0, 1.0, 4.0]]]).repeat(1, 3, 1)
         >>> camera = torch.tensor([[[100.0, 0.0, 0.0], [0.0, 100.0, 0.0], [0.0, 0.0, 1.0]]])
-        >>> pixels = torch.tensor([[[10.0, 0.0], [35.0, 0.0], [10.0, 25.0]]])
-        >>> pose, noise = Pose(torch.eye(3)[None], torch.zeros(1, 3)), Noise(torch.ones(1, 3), torch.zeros(1, 3))
-        >>> larger_sigma(points, pixels, camera, pose, torch.ones(1, 3), noise).round(decimals=1)
-        tensor([[9.3000, 9.3000, 9.3000]])
+        >>> pixels = torch.tensor([[[10.0, 0.0], [35.0, 0.0], [10.0, 25.0]]]).repeat(1, 3, 1)
+        >>> pose, noise = Pose(torch.eye(3)[None], torch.zeros(1, 3)), Noise(torch.ones(1, 9), torch.zeros(1, 9))
+        >>> larger_sigma(points, pixels, camera, pose, torch.ones(1, 9), noise)[0, :3].round(decimals=1)
+        tensor([9.3000, 9.3000, 9.3000])
     """
     seen = (world_points @ pose.rotation.mT + pose.translation[:, None]) @ intrinsics.mT
     away = seen[..., 2:].clamp(min=torch.finfo(seen.dtype).eps)
@@ -73,7 +76,7 @@ def larger_sigma(
         return torch.where(inlier, values, torch.nan).nanmedian(1).values
 
     sigma = _FITTED / _MEDIAN * median(residual)
-    many = inlier.sum(1) >= _MOST_ARE * (inlier_weights > 0).sum(1)
+    many = inlier.sum(1) >= (_MOST_ARE * (inlier_weights > 0).sum(1)).clamp(min=_FEWEST)
     sigma = torch.where(many & (sigma > _LARGER * median(estimate)), sigma, 0.0).nan_to_num(0.0, posinf=0.0)[:, None]
     if confidence is None:
         return sigma.expand_as(residual)
