@@ -37,8 +37,8 @@ def _each(names: str, cost: float) -> dict[str, float]:
 # numbers, which costs nothing.
 _ELEMENTWISE: dict[str, float] = {
     **_each("_local_scalar_dense _to_copy _unsafe_view alias arange cat clone constant_pad_nd copy detach", 0),
-    **_each("diag_embed diagonal empty empty_like expand eye fill flip full full_like gather index index_put", 0),
-    **_each("index_select lift_fresh masked_select neg new_empty new_full new_ones new_zeros nonzero", 0),
+    **_each("diag_embed diagonal empty empty_like expand eye fill flip full full_like gather index index_copy", 0),
+    **_each("index_put index_select lift_fresh masked_select neg new_empty new_full new_ones new_zeros nonzero", 0),
     **_each("ones ones_like permute promote_types rand randperm repeat scalar_tensor scatter select", 0),
     **_each("slice split split_with_sizes squeeze stack t take_pairs transpose unbind unsqueeze view zero", 0),
     **_each("zeros zeros_like", 0),
@@ -55,9 +55,9 @@ _ELEMENTWISE: dict[str, float] = {
     **_each("addcmul", MULTIPLY + ADD),
     **_each("lerp", 2 * ADD + MULTIPLY),
     **_each("linalg_cross", ADD + 2 * MULTIPLY),
-    **_each("ceil clamp_min eq ge gt isnan le lt maximum minimum ne relu", COMPARE),
+    **_each("ceil clamp_min eq ge gt isinf isnan le lt maximum minimum ne relu", COMPARE),
     **_each("abs copysign nan_to_num sgn sign", 2 * COMPARE),
-    **_each("bitwise_and bitwise_not bitwise_or masked_fill where", LOGIC),
+    **_each("bitwise_and bitwise_not bitwise_or logical_or masked_fill where", LOGIC),
 }
 
 # Cost for each input entry of a reduction, except for the first entry of each result.
@@ -80,10 +80,14 @@ _ROWS: dict[str, Callable[[int], float]] = {
 # Cost for one matrix of the batch, by the shapes of the input matrices.
 _MATRIX: dict[str, Callable[..., float]] = {
     "mm": lambda first, second: matmul(first[0], first[1], second[1]),
+    "mv": lambda first, second: matmul(first[0], first[1], 1),
     "bmm": lambda first, second: matmul(first[0], first[1], second[1]),
     "addmm": lambda bias, first, second: matmul(first[0], first[1], second[1]) + first[0] * second[1] * ADD,
     "linalg_cholesky_ex": lambda matrix: cholesky(matrix[0]),
     "linalg_inv_ex": lambda matrix: solve(matrix[0], matrix[0]),
+    # Tridiagonal form and QR iterations with eigenvectors: about 9 n^3, half of them products. Source: G. Golub and C.
+    # Van Loan, "Matrix Computations", 4th edition, section 8.3.
+    "_linalg_eigh": lambda matrix: 4.5 * matrix[0] ** 3 * (ADD + MULTIPLY),
 }
 
 
@@ -110,7 +114,7 @@ def _operations(name: str, call: dict[str, Any], output: Any) -> float:
         return result.numel() * sum(call[bound] is not None for bound in ("min", "max")) * COMPARE
     if name in _MATRIX:
         tensors = [value for value in call.values() if isinstance(value, Tensor)]
-        return math.prod(result.shape[:-2]) * _MATRIX[name](*(tensor.shape[-2:] for tensor in tensors))
+        return math.prod(tensors[0].shape[:-2]) * _MATRIX[name](*(tensor.shape[-2:] for tensor in tensors))
     if name in _REDUCTIONS:
         entries = call["self"].numel()
         results = entries // call["self"].shape[call["dim"]] if name == "cumsum" else result.numel()
@@ -118,6 +122,14 @@ def _operations(name: str, call: dict[str, Any], output: Any) -> float:
     if name in _ROWS:
         entries, length = _rows(call)
         return entries // length * _ROWS[name](length)
+    if name == "mean":
+        return (call["self"].numel() - result.numel()) * ADD + result.numel() * DIVIDE
+    if name == "searchsorted":  # by bisection
+        return result.numel() * (call["sorted_sequence"].shape[-1] + 1).bit_length() * COMPARE
+    if name == "nanmedian":
+        length = call["self"].shape[call["dim"]] if "dim" in call else call["self"].numel()
+        rows = call["self"].numel() // max(length, 1)
+        return rows * (length * COMPARE + smallest(length, (length + 1) // 2))
     if name == "_unique2":
         return sort(call["self"].numel())
     if name in ("sort", "topk", "kthvalue"):
