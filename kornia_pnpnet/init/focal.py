@@ -31,8 +31,8 @@ __all__ = [
     "with_nominal_focal",
 ]
 
-#: Further iterations from the nominal focal length: the least that converge with 1000 pairs. With 2, 4 and 8 of them the
-#: median error of the focal length is 0.037, 0.029 and 0.030 % (CameraProblems, seeds 4321 and 4322, half outliers).
+#: Further iterations from the nominal focal length: the least that converge with 1000 pairs. With 2, 4 and 8 of them
+#: the median error of the focal length is 0.037, 0.029 and 0.030 % (CameraProblems, seeds 4321, 4322, half outliers).
 MORE_ITERATIONS = 4
 # Half widths of the image: the focal lengths of fields of view from 118 to 14 degrees, which are searched.
 _SHORTEST, _LONGEST = 0.6, 8.0
