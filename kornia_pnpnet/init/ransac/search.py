@@ -16,7 +16,7 @@ from kornia_pnpnet.init.ransac.sampling import Samples, agreement_of_neighbours
 from kornia_pnpnet.init.ransac.scoring import Scene, Scorer
 from kornia_pnpnet.refine import LMStep, lm_step
 from kornia_pnpnet.refine.inliers import Thresholds, judge
-from kornia_pnpnet.refine.verdict import rotation_sigma
+from kornia_pnpnet.refine.verdict import residual_noise, rotation_sigma
 from kornia_pnpnet.types import Correspondences, FocalHypotheses, Noise, Pose
 
 __all__ = ["PAIRS_PER_SAMPLE", "Found", "Plan", "Search", "full_vectors", "least_squares"]
@@ -40,8 +40,6 @@ _VECTOR = 64
 _DAMPING = 1e-6
 # Thresholds. The first least squares use the pairs up to this limit: the pose of a noisy sample misses some inliers.
 _WIDE = 3.0
-# Standard deviations in a threshold, unless the noise is known.
-_SIGMAS = 3.0
 # Where the inliers leave the rotation open by more than the first (standard deviation in radians), as those of a flat
 # scene in a narrow field of view do, another pose may have as many: at least this many samples are drawn. Chosen on a
 # scene with a field of view of 13 degrees; half of the angle takes twice the time at 9 pairs.
@@ -94,8 +92,8 @@ class Search:
         corr: normalised correspondences whose world is centred, since the search runs in float32.
         thresholds: thresholds of an inlier, shape :math:`(B,)` each.
         chances: how likely a pair is an inlier, up to a factor, shape :math:`(B, N)`; all the same when ``None``.
-        sigma: standard deviation of the pixels, shape :math:`(B,)` or :math:`(B, N)`; a third of the threshold when
-            ``None``.
+        sigma: standard deviation of the pixels, shape :math:`(B,)` or :math:`(B, N)`; as the residuals of the inliers
+            show it when ``None``.
 
     Example:
         >>> from kornia_pnpnet.init.ransac.p3p import P3P
@@ -121,8 +119,9 @@ class Search:
         self.plan = plan
         self.corr = corr
         self.low = map_tensors(lambda x: x.to(_DTYPE), (corr, thresholds))
-        sigma = thresholds.img / _SIGMAS if sigma is None else sigma
-        self.sigma = (sigma if sigma.ndim > 1 else sigma[:, None]).to(_DTYPE).expand_as(corr.weights)
+        if sigma is not None:
+            sigma = (sigma if sigma.ndim > 1 else sigma[:, None]).to(_DTYPE).expand_as(corr.weights)
+        self.sigma = sigma
         self.scene = Scene.make(corr, thresholds, _DTYPE)
         self.chances = chances
         self.samples = self.plain = self._samples(chances)
@@ -158,7 +157,8 @@ class Search:
             projection = project(pose, corr)
             judged = judge(projection, corr, thresholds)
             if corr.free_focal is None:
-                noise = Noise(sigma, torch.zeros_like(sigma))
+                told = None if sigma is None else Noise(sigma, torch.zeros_like(sigma))
+                noise = told or residual_noise(projection, corr, judged.weights)
                 is_open = rotation_sigma(projection, corr._replace(noise=noise), judged) > _OPEN
                 least[at] = least[at].where(~is_open[: len(at)], _OPEN_SAMPLES)
             needed[at] = self._needed(at, judged.weights[: len(at)] > 0).maximum(least[at])
