@@ -131,7 +131,7 @@ def _softmax(scores: Tensor) -> Tensor:
     """Softmax over the pairs of (C, B, N). Of rows shorter than a processor's vectors, a column takes a tenth."""
     if compiling() or scores.shape[-1] >= _SHORT:
         return scores.softmax(-1)
-    return scores.mT.contiguous().softmax(1).mT
+    return scores.mT.contiguous().softmax(1).mT.contiguous()  # `bmm` takes other layouts row by row
 
 
 def _by_channel(x: Tensor, weight: Tensor) -> Tensor:

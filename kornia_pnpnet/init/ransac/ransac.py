@@ -236,7 +236,7 @@ class RANSAC(Configured):
         results = []
         for first in range(0, max(1, len(corr.weights)), size):
             last = min(first + size, len(corr.weights))
-            at = full_vectors(torch.arange(first, last, device=corr.weights.device))
+            at = full_vectors(torch.arange(first, last, device=corr.weights.device), corr.weights.shape[1])
             base, pose, zoom, part_stages = take((corr, found.pose, found.zoom, stages), at)
             base = problems_last(base)
             part = base.zoomed(zoom)

@@ -150,7 +150,7 @@ class Search:
         active = (self.samples.counts >= self.samples.size).nonzero()[:, 0]
 
         def expect(at: Tensor) -> None:
-            rows = full_vectors(at)
+            rows = full_vectors(at, count)
             corr, thresholds, sigma = take((*self.low, self.sigma), rows)
             pose, zoom = self._camera(matrix[rows])
             corr = problems_last(corr).zoomed(zoom)
@@ -240,8 +240,6 @@ class Search:
         positions = self.samples.positions(problems, start, stop)  # (P, H, s)
         batch, count, size = positions.shape
         rows = (positions + problems[:, None, None] * self.corr.weights.shape[1]).flatten(0, 1)  # (P H, s)
-        # Some arithmetic rounds differently in the remainder of a processor's vectors. With full vectors a sample has
-        # the same poses at any place in the batch.
         rows = full_vectors(rows)
         values = self.pairs.index_select(0, rows.flatten()).view(-1, size, self.pairs.shape[1])
         world, img, weights, rig = values.split((3, 2, 1, values.shape[-1] - 6), -1)
@@ -306,8 +304,9 @@ class Search:
 
     def _descend(self, problems: Tensor, loss: Tensor, matrix: Tensor, limit: float) -> tuple[Tensor, Tensor]:
         """Take one step of least squares on the pairs within ``limit`` thresholds, where it lowers the loss."""
-        corr, thresholds = take(self.low, full_vectors(problems))
-        start, zoom = self._camera(full_vectors(matrix))
+        count = self.corr.weights.shape[1]
+        corr, thresholds = take(self.low, full_vectors(problems, count))
+        start, zoom = self._camera(full_vectors(matrix, count))
         corr = problems_last(corr).zoomed(zoom)
         scene = self.scene.of(problems)
         projection = project(start, corr)
@@ -329,9 +328,13 @@ def least_squares(corr: Correspondences, pose: Pose, projection: Projection, wei
     return lm_step(corr._replace(prior=None), pose, projection, weights, one, damping)
 
 
-def full_vectors(rows: Tensor) -> Tensor:
-    """Repeat the first row at the end until the number of rows fills a processor's vectors."""
-    left_over = -len(rows) % _VECTOR
+def full_vectors(rows: Tensor, pairs: int = 1) -> Tensor:
+    """Repeat the first row at the end until the rows fill a processor's vectors; not where each has many pairs.
+
+    Some arithmetic rounds differently in the remainder of the vectors. With full vectors a sample has the same poses at
+    any place in the batch. Sums over many pairs may round differently: there, more rows would take more time.
+    """
+    left_over = -len(rows) % _VECTOR if pairs <= _VECTOR else 0
     return torch.cat((rows, rows[:1].expand(left_over, *rows.shape[1:]))) if left_over else rows
 
 
