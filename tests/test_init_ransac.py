@@ -202,8 +202,8 @@ def test_chunks_do_not_matter(make_problems, correspond):
 @pytest.mark.parametrize(("n", "batch"), [(9, 300), (1000, 3)])
 def test_a_chunk_bounds_the_samples_that_are_solved_together(n, batch, make_problems, correspond):
     minimal = Counting()
-    RANSAC(minimal, **PROTOCOL, chunk_size=200)(correspond(make_problems(n, batch, outliers=n // 2))[0])
-    assert max(minimal.sizes) <= 200
+    RANSAC(minimal, **PROTOCOL, chunk_size=256)(correspond(make_problems(n, batch, outliers=n // 2))[0])
+    assert max(minimal.sizes) <= 256
     assert len(minimal.sizes) > 1
 
 

@@ -34,6 +34,8 @@ _FIRST_PAIRS, _PAIRS_BY_SAMPLES = 24, 3.0 / 7.0 ** (1 / 3)
 _KEPT_ONE_IN, _MORE = 2, 4
 # Each round draws at least this share of the samples before it. More: fewer rounds, but more needless samples.
 _GROWTH = 0.5
+# A round is longer by this factor where all samples are drawn then.
+_FEW_LEFT = 1.5
 # Number of samples that are solved at once, up to multiples: twice the numbers in the longest vector of a processor.
 _VECTOR = 64
 # Relative damping of least squares: next to none, since the start is close to the minimum.
@@ -165,6 +167,8 @@ class Search:
 
         def improve(at: Tensor, losses: Tensor, matrices: Tensor) -> None:
             size = max(1, PAIRS_PER_SAMPLE * plan.chunk_size // (count * losses.shape[1]))
+            if not len(at):
+                return
             for one, some, part in zip(*(x.split(size) for x in (at, losses, matrices)), strict=True):
                 loss[one], matrix[one] = self._improve(one, some, part)
                 expect(one)
@@ -187,7 +191,7 @@ class Search:
             if start < _PLAIN_SAMPLES <= stop and self.corr.rig is None:
                 self._prefer_agreement(active)
                 expect(active)
-            start, stop = stop, min(int(totals[active].max()), stop + self._round(stop))
+            start, stop = stop, self._end_of_round(stop, int(totals[active].max()))
             parts = active.split(max(1, plan.chunk_size // (stop - start)))
             tops = [self._best_of_samples(part, start, stop) for part in parts]
             top_losses, top_matrices, tested = (torch.cat(parts) for parts in zip(*tops, strict=True))
@@ -230,9 +234,10 @@ class Search:
         there = self.corr.weights > 0
         return Samples(there, size=plan.minimal.sample_size, most=plan.max_samples, seed=plan.seed, chances=chances)
 
-    def _round(self, done: int) -> int:
-        """Number of samples of the round after the first ``done`` samples."""
-        return min(max(self.plan.min_samples, int(_GROWTH * done)), self.plan.chunk_size)
+    def _end_of_round(self, done: int, total: int) -> int:
+        """Number of samples after the next round; few that would be left go with it."""
+        size = min(max(self.plan.min_samples, int(_GROWTH * done)), self.plan.chunk_size)
+        return total if done + size * _FEW_LEFT >= total and total - done <= self.plan.chunk_size else done + size
 
     def _best_of_samples(self, problems: Tensor, start: int, stop: int) -> tuple[Tensor, Tensor, Tensor]:
         """Losses (P, K), ascending, and matrices (P, K, 3, 4) of the best poses; number of poses of the samples."""
