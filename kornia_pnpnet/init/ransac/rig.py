@@ -9,7 +9,7 @@ from kornia_pnpnet.cameras import bearing_cameras
 from kornia_pnpnet.core.checks import check_whole
 from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.linalg import small_product
-from kornia_pnpnet.core.performance import sees_values
+from kornia_pnpnet.core.performance import problems_last, sees_values
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.init.ransac.p3p import p3p
 from kornia_pnpnet.types import Correspondences, Hypotheses, Pose
@@ -53,6 +53,7 @@ class P3PRig(Configured):
         Raises:
             ShapeError: when :math:`N` is not 3.
         """
+        corr = problems_last(corr)
         assert corr.rig is not None
         batch = corr.weights.shape[0]
         # Problems last, before them pairs and coordinates: (3, 3, B).
@@ -77,13 +78,16 @@ class P3PRig(Configured):
             translation = torch.where(valid[:, None], pose.translation, 0.0)
             rotation, translation, valid = (x.unflatten(0, (4, batch)) for x in (rotation, translation, valid))
         else:
-            slot, at = solved.valid.mT.nonzero(as_tuple=True)
-            found = map_tensors(lambda x: x[..., slot, at], found)
-            pose, exact = self._exact(found, *(x[..., at] for x in of_sample))
-            slot, at, pose = slot[exact], at[exact], map_tensors(lambda x: x[exact], pose)
-            rotation, translation = eye.repeat(4, batch, 1, 1), rays.new_zeros(4, batch, 3)
-            valid = torch.zeros_like(solved.valid.mT)
-            rotation[slot, at], translation[slot, at], valid[slot, at] = *pose, True
+            slots = solved.valid.mT.flatten().nonzero()[:, 0]
+            at = slots % batch
+            # Along rows of memory: indices of all dimensions at once would take as long as all of Newton's steps.
+            found = map_tensors(lambda x: x.flatten(-2).index_select(-1, slots), found)
+            pose, exact = self._exact(found, *(x.contiguous().index_select(-1, at) for x in of_sample))
+            valid = torch.zeros_like(solved.valid.mT).flatten().index_copy_(0, slots, exact).view(4, batch)
+            rotation = eye[..., None].repeat(1, 1, 4 * batch).index_copy_(-1, slots, pose.rotation.movedim(0, -1))
+            translation = rays.new_zeros(3, 4 * batch).index_copy_(-1, slots, pose.translation.mT)
+            pose = Pose(rotation.movedim(-1, 0), translation.mT)
+            rotation, translation = (x.unflatten(0, (4, batch)) for x in pose)
         return Hypotheses(Pose(rotation.transpose(0, 1), translation.transpose(0, 1)), valid.mT)
 
     def _exact(
