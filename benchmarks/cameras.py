@@ -51,7 +51,7 @@ from kornia_pnpnet.types import Pose, Problems
 __all__ = ["main", "measure_cell", "measure_focal", "measure_real", "measure_rigs", "measure_scenes", "page", "targets"]
 
 # Used for nothing else. The grid of focal lengths and its threshold were chosen on seed 6 of another generator.
-SEED = 20_301_125
+SEED = 20_301_126
 OURS = ("pnpnet-set", "p3p-ransac")
 SIZES, SHARES = (6, 12, 30, 100), (0.0, 0.25, 0.5, 0.8)
 CELL = 1000

@@ -313,7 +313,7 @@ class PnPNet(PretrainedMixin):
         if not searches:
             begun = self._begin(views, always, inputs)
         else:
-            corr, frame, guess = self._first(views, always, inputs, True)
+            corr, frame, guess = self._first(views, always, inputs, self.focal == "known")
             if self.focal == "known":  # an unknown focal length has a search of its own
                 guess = search_on(corr, guess, keep_others=inputs.init is not None or inputs.prior is not None)
             begun = _Begun(self.refine.begin(corr, guess), frame, guess)
