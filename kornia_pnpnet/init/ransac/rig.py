@@ -67,27 +67,24 @@ class P3PRig(Configured):
         solved = p3p(corr.world_points, plane.permute(2, 0, 1))
         away = ((centres.mean(0) - centres) * rays).sum(1)
         of_sample = world, rays, centres, turn, seen, away
-        found = map_tensors(lambda x: x.movedim((0, 1), (-1, -2)), solved.pose)  # (3, 3, 4, B) and (3, 4, B)
-        eye = torch.eye(3, dtype=rays.dtype, device=rays.device)
-        if not sees_values(rays):  # a graph: slots without a solution, too
-            found = map_tensors(lambda x: x.flatten(-2), found)
+        found = map_tensors(lambda x: x.movedim((0, 1), (-1, -2)).flatten(-2), solved.pose)  # (3, 3, 4 B) and (3, 4 B)
+        valid, eye = solved.valid.mT.flatten(), torch.eye(3, dtype=rays.dtype, device=rays.device)
+        slots = valid.nonzero()[:, 0] if sees_values(rays) else None
+        if slots is None:  # a graph: slots without a solution, too
             every = [x[..., None, :].expand(*x.shape[:-1], 4, batch).flatten(-2) for x in of_sample]
             pose, exact = self._exact(found, *every)
-            valid = solved.valid.mT.flatten() & exact
-            rotation = torch.where(valid[:, None, None], pose.rotation, eye)
-            translation = torch.where(valid[:, None], pose.translation, 0.0)
-            rotation, translation, valid = (x.unflatten(0, (4, batch)) for x in (rotation, translation, valid))
-        else:
-            slots = solved.valid.mT.flatten().nonzero()[:, 0]
-            at = slots % batch
-            # Along rows of memory: indices of all dimensions at once would take as long as all of Newton's steps.
-            found = map_tensors(lambda x: x.flatten(-2).index_select(-1, slots), found)
-            pose, exact = self._exact(found, *(x.contiguous().index_select(-1, at) for x in of_sample))
-            valid = torch.zeros_like(solved.valid.mT).flatten().index_copy_(0, slots, exact).view(4, batch)
-            rotation = eye[..., None].repeat(1, 1, 4 * batch).index_copy_(-1, slots, pose.rotation.movedim(0, -1))
-            translation = rays.new_zeros(3, 4 * batch).index_copy_(-1, slots, pose.translation.mT)
-            pose = Pose(rotation.movedim(-1, 0), translation.mT)
-            rotation, translation = (x.unflatten(0, (4, batch)) for x in pose)
+            exact = exact & valid
+        else:  # along rows of memory
+            found = map_tensors(lambda x: x.index_select(-1, slots), found)
+            pose, exact = self._exact(found, *(x.contiguous().index_select(-1, slots % batch) for x in of_sample))
+        rotation = torch.where(exact[:, None, None], pose.rotation, eye)
+        translation = torch.where(exact[:, None], pose.translation, 0.0)
+        if slots is not None:
+            none = eye[..., None].repeat(1, 1, 4 * batch)
+            rotation = none.index_copy_(-1, slots, rotation.movedim(0, -1)).movedim(-1, 0)
+            translation = rays.new_zeros(3, 4 * batch).index_copy_(-1, slots, translation.mT).mT
+            exact = torch.zeros_like(valid).index_copy_(0, slots, exact)
+        rotation, translation, valid = (x.unflatten(0, (4, batch)) for x in (rotation, translation, exact))
         return Hypotheses(Pose(rotation.transpose(0, 1), translation.transpose(0, 1)), valid.mT)
 
     def _exact(

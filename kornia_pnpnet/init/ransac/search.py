@@ -34,7 +34,7 @@ _FIRST_PAIRS, _PAIRS_BY_SAMPLES = 24, 3.0 / 7.0 ** (1 / 3)
 _KEPT_ONE_IN, _MORE = 2, 4
 # Each round draws at least this share of the samples before it. More: fewer rounds, but more needless samples.
 _GROWTH = 0.5
-# A round is longer by this factor where all samples are drawn then.
+# Where no more than this many rounds are left, one round draws them all.
 _FEW_LEFT = 1.5
 # Number of samples that are solved at once, up to multiples: twice the numbers in the longest vector of a processor.
 _VECTOR = 64
@@ -166,9 +166,9 @@ class Search:
             needed[at] = self._needed(at, judged.weights[: len(at)] > 0).maximum(least[at])
 
         def improve(at: Tensor, losses: Tensor, matrices: Tensor) -> None:
-            size = max(1, PAIRS_PER_SAMPLE * plan.chunk_size // (count * losses.shape[1]))
             if not len(at):
                 return
+            size = max(1, PAIRS_PER_SAMPLE * plan.chunk_size // (count * losses.shape[1]))
             for one, some, part in zip(*(x.split(size) for x in (at, losses, matrices)), strict=True):
                 loss[one], matrix[one] = self._improve(one, some, part)
                 expect(one)
