@@ -116,7 +116,7 @@ def test_a_stopped_run_goes_on_where_it_was(start, tmp_path):
         assert process.poll() is None
         time.sleep(0.2)
     process.send_signal(signal.SIGINT)
-    assert process.wait(60) != 0
+    assert process.wait(300) != 0  # Ray waits half a minute and more for its workers, longer on a busy machine
     (tmp_path / "wait").unlink()
     for path in (tmp_path / "calls").iterdir():
         path.unlink()
