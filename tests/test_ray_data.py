@@ -21,9 +21,11 @@ from kornia_pnpnet.arrow import Solve, list_column  # noqa: E402
 pytestmark = pytest.mark.slow
 EXAMPLES = Path(__file__).resolve().parents[1] / "docs" / "examples"
 FILES, ROWS, BATCH = 6, 1000, 500
+DEADLINE = 1200  # seconds; starting Ray takes minutes on a busy machine
 
 #: Runs the example on two nodes with one core each.
 SCRIPT = f"""
+import signal
 import sys
 
 import ray
@@ -31,6 +33,7 @@ import ray_data
 from ray.cluster_utils import Cluster
 from workers import Watched
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 ray_data.BLOCK = 50_000  # bytes
 cluster = Cluster(initialize_head=True, head_node_args={{"num_cpus": 1}})
 cluster.add_node(num_cpus=1)
@@ -84,7 +87,15 @@ def start(tmp_path):
     paths = os.pathsep.join([str(tmp_path), str(EXAMPLES), os.environ.get("PYTHONPATH", "")])
     variables = {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1", "RAY_USAGE_STATS_ENABLED": "0"}
     command = [sys.executable, "-c", SCRIPT, str(tmp_path / "in"), str(tmp_path / "out")]
-    return lambda *more: subprocess.Popen([*command, *more], env=variables, cwd=tmp_path)
+    processes = []
+
+    def run(*more):
+        processes.append(subprocess.Popen([*command, *more], env=variables, cwd=tmp_path))
+        return processes[-1]
+
+    yield run
+    for process in processes:
+        process.kill()
 
 
 def rows_of_calls(folder):
@@ -103,7 +114,7 @@ def check_results(folder):
 
 def test_a_killed_worker_loses_nothing(start, tmp_path):
     (tmp_path / "die").touch()
-    assert start().wait(300) == 0
+    assert start().wait(DEADLINE) == 0
     assert (tmp_path / "died").exists()
     check_results(tmp_path)
 
@@ -111,18 +122,18 @@ def test_a_killed_worker_loses_nothing(start, tmp_path):
 def test_a_stopped_run_goes_on_where_it_was(start, tmp_path):
     (tmp_path / "wait").touch()
     process = start("id")
-    done, deadline = tmp_path / "out.done", time.monotonic() + 300
+    done, deadline = tmp_path / "out.done", time.monotonic() + DEADLINE
     while not [path for path in done.glob("*.parquet") if "pending" not in path.name] and time.monotonic() < deadline:
         assert process.poll() is None
         time.sleep(0.2)
     process.send_signal(signal.SIGINT)
-    assert process.wait(300) != 0  # Ray waits half a minute and more for its workers, longer on a busy machine
+    assert process.wait(DEADLINE) != 0
     (tmp_path / "wait").unlink()
     for path in (tmp_path / "calls").iterdir():
         path.unlink()
-    assert start("id").wait(300) == 0
+    assert start("id").wait(DEADLINE) == 0
     assert 0 < rows_of_calls(tmp_path) < FILES * ROWS
     check_results(tmp_path)
     before = sorted(path.name for path in (tmp_path / "out").iterdir())
-    assert start("id").wait(300) == 0  # nothing is left to do
+    assert start("id").wait(DEADLINE) == 0  # nothing is left to do
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == before

@@ -32,7 +32,7 @@ SMALL = "debug=two_updates", "threads=1"
 def run(*arguments):
     """``train.py`` in a process of its own, which imports everything anew."""
     command = [sys.executable, str(REPO / "train.py"), *arguments, *SMALL]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=1200, check=False)
     assert done.returncode == 0, done.stderr
 
 
