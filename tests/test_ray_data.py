@@ -96,6 +96,7 @@ def start(tmp_path):
     yield run
     for process in processes:
         process.kill()
+        process.wait()
 
 
 def rows_of_calls(folder):
