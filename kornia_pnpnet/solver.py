@@ -313,10 +313,8 @@ class PnPNet(PretrainedMixin):
         if not searches:
             begun = self._begin(views, always, inputs)
         else:
-            known = self.focal == "known"
-            # Pairs with confidences are matches of images, where seeing all of them makes poses more exact.
-            corr, frame, guess = self._first(views, always, inputs, known and inputs.confidence is None)
-            if known:  # an unknown focal length has a search of its own
+            corr, frame, guess = self._first(views, always, inputs, self.focal == "known" and inputs.confidence is None)
+            if self.focal == "known":  # an unknown focal length has a search of its own
                 guess = search_on(corr, guess, keep_others=inputs.init is not None or inputs.prior is not None)
             begun = _Begun(self.refine.begin(corr, guess), frame, guess)
         m, more = 0 if first_stage_only else None, MORE_ITERATIONS if guessed else 0
