@@ -582,7 +582,7 @@ def test_the_command_as_a_process(csv_file):
     code = "import sys; from kornia_pnpnet.cli import main; sys.exit(main())"
     arguments = ["solve", str(csv_file), "--intrinsics", CAMERA, "--solver", "identity-lm"]
     command = [sys.executable, "-W", "error", "-c", code, *arguments]
-    solved = subprocess.run(command, capture_output=True, text=True, check=True, timeout=1200)
+    solved = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
     assert json.loads(solved.stdout)["ok"]
     assert solved.stderr == ""
 

@@ -61,7 +61,7 @@ print("end")
 
 
 def test_a_stream_that_is_left_open_does_not_keep_the_process():
-    done = subprocess.run([sys.executable, "-c", LEFT_OPEN], capture_output=True, text=True, timeout=1200, check=True)
+    done = subprocess.run([sys.executable, "-c", LEFT_OPEN], capture_output=True, text=True, timeout=120, check=True)
     assert done.stdout == "end\n"
 
 
@@ -106,5 +106,5 @@ def test_spawned_processes_draw_the_same(tmp_path):
     """As on systems that cannot fork."""
     script = tmp_path / "spawned.py"
     script.write_text(SPAWNED)
-    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=1200, check=False)
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=240, check=False)
     assert (done.returncode, done.stdout) == (0, "batches 12\n"), done.stderr

@@ -117,5 +117,5 @@ def test_pages_fit_into_the_window_and_wide_tables_say_that_they_scroll(site, tm
     everything = tmp_path / "all.html"
     everything.write_text(f"<meta charset=utf-8><body>{frames}<script>{FIND_WIDE}</script></body>")
     command = [CHROMIUM, *CHROMIUM_OPTIONS, f"--user-data-dir={tmp_path / 'profile'}", everything.as_uri()]
-    dumped = subprocess.run(command, capture_output=True, text=True, check=True, timeout=1200).stdout
+    dumped = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300).stdout
     assert json.loads(html.unescape(re.search(r"<body>(.*)</body>", dumped, flags=re.S)[1])) == []
