@@ -8,9 +8,11 @@ from __future__ import annotations
 import argparse
 import functools
 import itertools
+import json
 import math
 import operator
 import re
+import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -60,6 +62,7 @@ class Amount(NamedTuple):
         batches: batch sizes of throughput.
         pairs: numbers of pairs of throughput.
         rounds: calls that are timed.
+        call_s: seconds that a call may take; larger batches are left out.
         copied: entries of the copy that measures the bandwidth, float32.
         side: rows of the matrices that measure the rate of arithmetic.
     """
@@ -79,13 +82,14 @@ class Amount(NamedTuple):
     batches: tuple[int, ...] = (1000, 10_000, 100_000, 1_000_000)
     pairs: tuple[int, ...] = (9, 50)
     rounds: int = 5
+    call_s: float = 10.0
     copied: int = 2**28
     side: int = 8192
 
 
 FULL = Amount()
 #: A few small problems without compiling: does everything run?
-QUICK = Amount(4, ("pnpnet-n9",), ("eager",), (1, 4), ("pnpnet-n9", "epnp-lm"), (4, 8), (9, 12), 3, 2**16, 64)
+QUICK = Amount(4, ("pnpnet-n9",), ("eager",), (1, 4), ("pnpnet-n9", "epnp-lm"), (4, 8), (9, 12), 3, 10.0, 2**16, 64)
 
 
 # -- parity ------------------------------------------------------------------------------------------------------------
@@ -96,7 +100,7 @@ def parity(device: str, count: int) -> Iterator[dict[str, Any]]:
 
     Yields:
         For each solver and dtype ``same_ok``, the share of problems of the same ``ok``, and of those that are ``ok`` on
-        both devices ``same_pose`` and ``same_gradient``, the shares within ``limit``.
+        both devices ``same_pose`` and ``same_gradient``, the shares within ``limit``; or ``why`` a solver fails.
     """
     for name in list_solvers():
         try:
@@ -106,19 +110,22 @@ def parity(device: str, count: int) -> Iterator[dict[str, Any]]:
         if not isinstance(solver, PnPNet):
             continue
         say(f"parity: {name}")
-        found = re.search(r"-n(\d+)", name)
-        problems = draw(int(found[1]) if found else N, count)
+        fixed = re.search(r"-n(\d+)", name)
+        problems = draw(int(fixed[1]) if fixed else N, count)
         for dtype, limit in LIMITS.items():
-            (mine, slope), (other, other_slope) = (_solved(solver, problems, place, dtype) for place in ("cpu", device))
+            case = {"solver": name, "dtype": str(dtype).removeprefix("torch."), "limit": limit, "count": count}
+            try:
+                found = [_solved(solver, problems, place, dtype) for place in ("cpu", device)]
+            except RuntimeError as error:
+                yield {**case, "why": reason(error)}
+                continue
+            (mine, slope), (other, other_slope) = found
             both = mine.ok & other.ok
             turned = rotation_difference(mine.rotation, other.rotation)
             length = torch.maximum(slope.norm(dim=1), other_slope.norm(dim=1)).clamp(min=torch.finfo(dtype).tiny)
             change = (slope - other_slope).norm(dim=1) / length
             yield {
-                "solver": name,
-                "dtype": str(dtype).removeprefix("torch."),
-                "limit": limit,
-                "count": count,
+                **case,
                 "both_ok": int(both.sum()),
                 "same_ok": share(mine.ok == other.ok),
                 "same_pose": share(turned[both] <= limit),
@@ -136,6 +143,11 @@ def _solved(solver: PnPNet, problems: Problems, device: str, dtype: torch.dtype)
     filled = [torch.zeros_like(leaf) if part is None else part for part, leaf in zip(parts, leaves, strict=True)]
     on_cpu = result._replace(rotation=result.rotation.detach().cpu(), ok=result.ok.cpu())
     return on_cpu, torch.cat([x.flatten(1) for x in filled], 1).cpu()
+
+
+def reason(error: Exception) -> str:
+    """The start of an error's message, in one line."""
+    return " ".join(f"{type(error).__name__}: {error}".split())[:300]
 
 
 def rotation_difference(one: Tensor, other: Tensor) -> Tensor:
@@ -157,20 +169,6 @@ MODES: dict[str, dict[str, str] | None] = {
     "reduce-overhead": {"mode": "reduce-overhead"},
     "captured": None,
 }
-
-
-def solving(mode: str, solver: PnPNet, inputs: Sequence[Tensor]) -> Callable[[], PnPResult]:
-    """The call of a solver in a mode.
-
-    Raises:
-        CannotBeTimedError: when the solver does not compile.
-        RuntimeError: when the call cannot be captured, for example because it waits for the device.
-    """
-    options = MODES[mode]
-    if options is not None:
-        compile_or_raise(solver, **options)
-    call = without_gradient(lambda: solver(*inputs))
-    return captured(call) if mode == "captured" else call
 
 
 def captured(call: Callable[[], PnPResult]) -> Callable[[], PnPResult]:
@@ -199,33 +197,46 @@ def graphs(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
         For each solver and batch ``modes``: by mode the times of a call, ``rotation_difference``, the largest angle to
         the pose of the first mode, and ``same_ok``; or ``why`` the mode is missing.
     """
-    for name, batch in itertools.product(amount.graphs, amount.calls):
+    for name in amount.graphs:
+        say(f"graphs: {name}")
         torch.compiler.reset()
-        problems = draw(N, batch)
-        inputs = float_inputs(problems, device)
-        tasks: dict[str, Task] = {}
-        modes: dict[str, dict[str, Any]] = {}
-        expected = None
-        for mode in amount.modes:
-            say(f"graphs: {name}, B = {batch}, {mode}")
-            solver = create_solver(name, effort="fixed").to(device, torch.float32)
-            try:
-                call = solving(mode, solver, inputs)  # type: ignore[arg-type]
-                task = _task(call, problems, device)
-                task.warm()
-                result = call()
-            except (CannotBeTimedError, RuntimeError) as error:
-                modes[mode] = {"why": " ".join(str(error).split())[:300]}
-                continue
-            tasks[mode] = task
-            found = result.rotation.clone(), result.ok.clone()  # the next replay overwrites its result
-            expected = found if expected is None else expected
-            difference = rotation_difference(found[0], expected[0])
-            modes[mode] = {"rotation_difference": float(difference.max()), "same_ok": share(found[1] == expected[1])}
-        timers = {mode: functools.partial(_microseconds, task) for mode, task in tasks.items()}
-        for mode, rounds_us in in_turns(timers, amount.rounds).items():
-            modes[mode] |= summary(rounds_us)
-        yield {"solver": name, "batch": batch, "modes": modes}
+        solvers = {mode: create_solver(name, effort="fixed").to(device, torch.float32) for mode in amount.modes}
+        for mode, solver in solvers.items():
+            if (options := MODES[mode]) is not None:
+                compile_or_raise(solver, **options)  # type: ignore[arg-type]
+        for batch in amount.calls:
+            yield {"solver": name, "batch": batch, "modes": _modes(solvers, batch, device, amount.rounds)}  # type: ignore
+
+
+def _modes(solvers: dict[str, PnPNet], batch: int, device: str, rounds: int) -> dict[str, dict[str, Any]]:
+    problems = draw(N, batch)
+    inputs = float_inputs(problems, device)
+    tasks: dict[str, Task] = {}
+    modes: dict[str, dict[str, Any]] = {}
+    expected = None
+    for mode, solver in solvers.items():
+        say(f"graphs: B = {batch}, {mode}")
+        try:
+            call = without_gradient(functools.partial(solver, *inputs))
+            call = captured(call) if mode == "captured" else call
+            task = _task(call, problems, device)
+            start = time.perf_counter()
+            task.warm()
+            result = call()
+        except (CannotBeTimedError, RuntimeError) as error:
+            modes[mode] = {"why": reason(error)}
+            continue
+        warm_s = time.perf_counter() - start
+        tasks[mode] = task
+        found = result.rotation.clone(), result.ok.clone()  # the next replay overwrites its result
+        expected = found if expected is None else expected
+        difference = rotation_difference(found[0], expected[0])
+        same_ok = share(found[1] == expected[1])
+        modes[mode] = {"rotation_difference": float(difference.max()), "same_ok": same_ok, "warm_s": warm_s}
+    timers = {mode: functools.partial(_microseconds, task) for mode, task in tasks.items()}
+    for mode, rounds_us in in_turns(timers, rounds).items():
+        modes[mode] |= summary(rounds_us)
+    return modes
 
 
 def _microseconds(task: Task) -> float:
@@ -329,34 +340,44 @@ def work(contender: Contender, problems: Problems, *, backward: bool) -> dict[st
     }
 
 
-def measure_throughput(device: str, amount: Amount, rates: dict[str, float]) -> Iterator[dict[str, Any]]:
+def measure_throughput(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
     """Time per problem, peak memory, and how far from the floors of the machine.
 
     Yields:
-        For each contender and point the times of a problem; ``chunk``; ``peak_bytes`` of a call beyond what was
-        allocated before, ``None`` on a CPU; ``work`` of a problem; ``shares`` of the median time: ``floor``, the least
-        possible time (the larger of the times of ``least_bytes`` and ``flops``), and ``traffic``, the time of
-        ``bytes``, above 1 where a compiler has fused operations.
+        The rates of the machine. Then for each contender and point the times of a problem; ``chunk``; ``peak_bytes`` of
+        a call beyond what was allocated before, ``None`` on a CPU; ``work`` of a problem; ``warm_s``, seconds of the
+        first two calls; ``shares`` of the median time: ``floor``, the least possible time (the larger of the times of
+        ``least_bytes`` and ``flops``), and ``traffic``, the time of ``bytes``, above 1 where a compiler has fused
+        operations; or ``why`` a point is missing.
     """
-    for n, name in itertools.product(amount.pairs, amount.contenders):
+    rates = machine_rates(device, amount)
+    yield rates
+    for name, n in itertools.product(amount.contenders, amount.pairs):
         torch.compiler.reset()
         contender, plain = (OURS[x](device=device) for x in (name, name.removesuffix(" compiled")))
         if not contender.takes(n):
             continue
         drawn = draw(n, min(_DRAWN, max(amount.batches)))
+        known: dict[str, float] = {}  # seconds of a problem in the last batch
         for mode, batch in itertools.product((FORWARD, BACKWARD), amount.batches):
             say(f"throughput: {name}, n = {n}, B = {batch}, {mode}")
-            place = {"contender": name, "mode": mode, "n": n, "batch": batch}
+            place: dict[str, Any] = {"contender": name, "mode": mode, "n": n, "batch": batch}
+            if (expected_s := known.get(mode, 0.0) * batch) > amount.call_s:
+                yield {**place, "why": f"a call would take about {expected_s:.0f} s"}
+                continue
             repeats = range(math.ceil(batch / len(drawn.world_points)))
             problems = first(map_tensors(lambda *x: torch.cat(x), *(drawn for _ in repeats)), batch)
+            start = time.perf_counter()
             try:
                 task, chunk = fitting(contender, problems, backward=mode == BACKWARD)
-            except CannotBeTimedError as error:
-                yield {**place, "why": str(error)}
+            except (CannotBeTimedError, RuntimeError) as error:
+                yield {**place, "why": reason(error)}
                 continue
+            place["warm_s"] = time.perf_counter() - start
             each = work(plain, first(problems, 1000), backward=mode == BACKWARD)
             peak = peak_bytes(task, device)
             found = summary([1e6 * task.seconds() / batch for _ in range(amount.rounds)])
+            known[mode] = found["median_us"] / 1e6
             floor_s = max(each["least_bytes"] / rates["bytes_per_s"], each["flops"] / rates["flops_per_s"])
             traffic_s = each["bytes"] / rates["bytes_per_s"]
             shares = {key: 1e6 * x / found["median_us"] for key, x in (("floor", floor_s), ("traffic", traffic_s))}
@@ -376,55 +397,66 @@ def peak_bytes(task: Task, device: str) -> int | None:
 # -- the command -------------------------------------------------------------------------------------------------------
 
 
+PARTS: dict[str, Callable[[str, Amount], Iterator[dict[str, Any]]]] = {
+    "parity": parity,
+    "graphs": graphs,
+    "throughput": measure_throughput,
+}
+
+
 def tables(results: dict[str, Any]) -> str:
     """The results as text."""
 
     def cells(*values: object) -> list[str]:
         return ["–" if x is None else f"{x:.3g}" if isinstance(x, float) else str(x) for x in values]
 
-    found = [
-        cells(x["solver"], x["dtype"], x["same_ok"], x["same_pose"], x["same_gradient"]) for x in results["parity"]
-    ]
+    def rows(part: str) -> list[dict[str, Any]]:
+        return list(results.get(part, {"rows": []})["rows"])
+
+    shares = ("same_ok", "same_pose", "same_gradient", "why")
+    found = [cells(x["solver"], x["dtype"], *map(x.get, shares)) for x in rows("parity")]
     calls = [
-        cells(row["solver"], row["batch"], mode, x.get("median_us"), x.get("rotation_difference"))
-        for row in results["graphs"]
+        cells(row["solver"], row["batch"], mode, *map(x.get, ("median_us", "rotation_difference", "warm_s", "why")))
+        for row in rows("graphs")
         for mode, x in row["modes"].items()
     ]
+    place, measured = ("contender", "mode", "n", "batch"), ("median_us", "peak_bytes", "chunk", "warm_s", "why")
     times = [
-        cells(x["contender"], x["mode"], x["n"], x["batch"], x["median_us"], x["peak_bytes"], *x["shares"].values())
-        for x in results["throughput"]
-        if "why" not in x
+        cells(*map(x.get, place), *map(x.get, measured), *x.get("shares", {}).values()) for x in rows("throughput")[1:]
     ]
-    return "\n\n".join(
-        (
-            markdown_table(["against the CPU", "dtype", "same ok", "same pose", "same gradient"], found, pad=True),
-            markdown_table(["solver", "B", "mode", "µs per call", "difference"], calls, pad=True),
-            markdown_table(
-                ["solver", "mode", "n", "B", "µs per problem", "peak bytes", "floor", "traffic"], times, pad=True
-            ),
-        )
-    )
+    made = {
+        "parity": ["against the CPU", "dtype", "same ok", "same pose", "same gradient", "why not"],
+        "graphs": ["solver", "B", "mode", "µs per call", "difference", "warm-up s", "why not"],
+        "throughput": ["solver", "mode", "n", "B", "µs per problem", "peak bytes", "chunk", "warm-up s", "why not"],
+    }
+    filled = {"parity": found, "graphs": calls, "throughput": times}
+    made["throughput"] += ["floor", "traffic"]
+    full = {part: [[*row, *["–"] * (len(made[part]) - len(row))] for row in lines] for part, lines in filled.items()}
+    return "\n\n".join(markdown_table(made[part], full[part], pad=True) for part in PARTS if full[part])
 
 
 def main(arguments: Sequence[str] | None = None, amount: Amount | None = None) -> None:
-    """Measure, write the file and print tables."""
+    """Measure, write each row into the file as soon as it is known, and print tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--device", default="cuda", help="cuda, or cpu to try the script")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), help="the others stay in the file")
+    parser.add_argument("--solvers", nargs="+", help="of graphs and throughput; all when left out")
     parser.add_argument("--quick", action="store_true", help="a few small problems: does everything run?")
     parser.add_argument("--out", type=Path, default=HERE / "gpu.json", help="the results file")
     options = parser.parse_args(arguments)
     amount = amount or (QUICK if options.quick else FULL)
-    before = load()
-    rates = machine_rates(options.device, amount)
-    results = {
-        "environment": environment(),
-        "settings": {"device": options.device, **amount._asdict()},
-        "rates": rates,
-        "parity": list(parity(options.device, amount.parity)),
-        "graphs": list(graphs(options.device, amount)),
-        "throughput": list(measure_throughput(options.device, amount, rates)),
-    }
-    save_results({**results, "load_average": [before, load()]}, options.out)
+    if options.solvers:
+        amount = amount._replace(
+            graphs=tuple(x for x in amount.graphs if x in options.solvers),
+            contenders=tuple(x for x in amount.contenders if x in options.solvers),
+        )
+    results = json.loads(options.out.read_text()) if options.out.exists() else {}
+    for part in options.parts:
+        made_with = {"environment": environment(), "settings": {"device": options.device, **amount._asdict()}}
+        results[part] = {**made_with, "load_average": load(), "rows": []}
+        for row in PARTS[part](options.device, amount):
+            results[part]["rows"].append(row)
+            save_results(results, options.out)
     print(tables(results))
 
 
