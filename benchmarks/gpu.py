@@ -95,7 +95,7 @@ QUICK = Amount(4, ("pnpnet-n9",), ("eager",), (1, 4), ("pnpnet-n9", "epnp-lm"), 
 # -- parity ------------------------------------------------------------------------------------------------------------
 
 
-def parity(device: str, count: int) -> Iterator[dict[str, Any]]:
+def parity(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
     """Solve the same problems on the CPU and on the device, with gradients, by every solver of ours.
 
     Yields:
@@ -111,9 +111,9 @@ def parity(device: str, count: int) -> Iterator[dict[str, Any]]:
             continue
         say(f"parity: {name}")
         fixed = re.search(r"-n(\d+)", name)
-        problems = draw(int(fixed[1]) if fixed else N, count)
+        problems = draw(int(fixed[1]) if fixed else N, amount.parity)
         for dtype, limit in LIMITS.items():
-            case = {"solver": name, "dtype": str(dtype).removeprefix("torch."), "limit": limit, "count": count}
+            case = {"solver": name, "dtype": str(dtype).removeprefix("torch."), "limit": limit, "count": amount.parity}
             try:
                 found = [_solved(solver, problems, place, dtype) for place in ("cpu", device)]
             except RuntimeError as error:
@@ -205,7 +205,7 @@ def graphs(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
             if (options := MODES[mode]) is not None:
                 compile_or_raise(solver, **options)  # type: ignore[arg-type]
         for batch in amount.calls:
-            yield {"solver": name, "batch": batch, "modes": _modes(solvers, batch, device, amount.rounds)}  # type: ignore
+            yield {"solver": name, "batch": batch, "modes": _modes(solvers, batch, device, amount.rounds)}  # type: ignore[arg-type]
 
 
 def _modes(solvers: dict[str, PnPNet], batch: int, device: str, rounds: int) -> dict[str, dict[str, Any]]:

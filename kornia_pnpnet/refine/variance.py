@@ -3,7 +3,7 @@ r"""How much larger or smaller the noise is than its estimate, by the residuals 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TypeAlias
 
 import torch
@@ -16,12 +16,13 @@ __all__ = ["NARROWER", "KernelWeight", "outlier_area", "variance_factor", "worth
 
 # Logarithm of a likelihood ratio. The residuals' own variance factor replaces 1 where it is e³ times as likely.
 _BELIEVED = 3.0
-# Variance factors that are compared before. Noise above the estimate needs them: a kernel that is too narrow hides it.
-_FACTORS = tuple(4.0**k for k in range(8))
+# Exponents of 4: variance factors that are compared before. Noise above the estimate needs them: a kernel that is too
+# narrow hides it.
+_FACTORS = range(8)
 # Powers of the confidence that the standard deviation of the noise may be proportional to, and the variance factors at
 # which they are compared: noise of the geometric mean's confidence may be below the estimate.
 _POWERS = (0.0, -1.0, -2.0, -3.0)
-_POWER_FACTORS = tuple(4.0**k for k in range(-5, 8))
+_POWER_FACTORS = range(-5, 8)
 # Lower confidences count as this much, so that the pair keeps some weight.
 _LEAST_CONFIDENCE = 0.05
 # Share of the pairs that are inliers above which the noise may depend on the confidence.
@@ -94,8 +95,12 @@ def _factor_above(
     likelihood, _ = _log_likelihoods(sq_residual, precision, in_front, there, outlier_area, _FACTORS)
     best = likelihood.max(0)
     believed = (outlier_area[:, 0] > 0) & (best.values > likelihood[0] + _BELIEVED)
-    factors = torch.tensor(_FACTORS, dtype=sq_residual.dtype, device=sq_residual.device)
-    return torch.where(believed, factors[best.indices], 1.0)[:, None]
+    return torch.where(believed, _powers_of_4(_FACTORS, sq_residual)[best.indices], 1.0)[:, None]
+
+
+def _powers_of_4(exponents: range, like: Tensor) -> Tensor:
+    """Powers (F,), made on the device: a copy from the CPU cannot be captured in a CUDA graph."""
+    return 4.0 ** torch.arange(exponents.start, exponents.stop, dtype=like.dtype, device=like.device)
 
 
 def _log_likelihoods(
@@ -104,10 +109,10 @@ def _log_likelihoods(
     in_front: Tensor,
     there: Tensor,
     outlier_area: Tensor,
-    factors: Sequence[float],
+    exponents: range,
 ) -> tuple[Tensor, Tensor]:
     """Log-likelihood of the residuals at each variance factor and the number of inliers, (F, B) each."""
-    grid = torch.tensor(factors, dtype=sq_residual.dtype, device=sq_residual.device)
+    grid = _powers_of_4(exponents, sq_residual)
     # Densities of a pixel, relative to that of an inlier without a residual whose factor is 1.
     inlier = torch.exp(sq_residual * (-0.5 / grid)[:, None, None]) * in_front / grid[:, None, None]
     outlier = (2.0 * math.pi / (precision * outlier_area)).clamp(max=1.0)  # (B, N)

@@ -17,6 +17,7 @@ from kornia_pnpnet.core.performance import compiling, fold_vmap, unfold_vmap
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import MIN_DEPTH_RATIO
 from kornia_pnpnet.init.ransac.law_of_cosines import Triple, distances, turn_to_largest, turned
+from kornia_pnpnet.init.ransac.sampling import kept_at_once
 from kornia_pnpnet.inputs import one_batch, restore_leading
 from kornia_pnpnet.types import Correspondences, FocalHypotheses, Hypotheses, Pose
 
@@ -150,7 +151,7 @@ def _solve(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Tensor]:
         return torch.stack(entries).flatten(1, 2), found.flatten(0, 1)
     out = world_points.new_empty(12, 2, 2, batch)
     valid = torch.empty(2, 2, batch, dtype=torch.bool, device=world_points.device)
-    chunk = _CHUNK_BYTES // world_points.element_size()
+    chunk = kept_at_once(_CHUNK_BYTES, world_points) // world_points.element_size()
     with torch.inference_mode():  # an eighth faster than `no_grad`; the results were made outside
         for start in range(0, batch, chunk):
             part = slice(start, start + chunk)

@@ -19,6 +19,7 @@ from kornia_pnpnet.geometry import Projection, project
 from kornia_pnpnet.init.ransac.minimal import MinimalSolver, describe
 from kornia_pnpnet.init.ransac.p3p import P3P, P3PFocals
 from kornia_pnpnet.init.ransac.rig import P3PRig, is_central
+from kornia_pnpnet.init.ransac.sampling import kept_at_once
 from kornia_pnpnet.init.ransac.scoring import SCORERS, Scorer
 from kornia_pnpnet.init.ransac.search import (
     PAIRS_PER_SAMPLE,
@@ -232,7 +233,7 @@ class RANSAC(Configured):
 
         The inliers are chosen anew for each entry of ``stages``.
         """
-        size = max(1, PAIRS_PER_SAMPLE * self.chunk_size // corr.weights.shape[1])
+        size = max(1, kept_at_once(PAIRS_PER_SAMPLE * self.chunk_size, corr.weights) // corr.weights.shape[1])
         results = []
         for first in range(0, max(1, len(corr.weights)), size):
             last = min(first + size, len(corr.weights))

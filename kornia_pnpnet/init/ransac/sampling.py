@@ -16,7 +16,7 @@ from torch import Tensor
 
 from kornia_pnpnet.core.performance import present_first
 
-__all__ = ["Samples", "agreement_of_neighbours", "draw_likely", "draw_subsets", "samples_needed"]
+__all__ = ["Samples", "agreement_of_neighbours", "draw_likely", "draw_subsets", "kept_at_once", "samples_needed"]
 
 # Nearest neighbours of a pair that are compared.
 _NEIGHBOURS = 16
@@ -26,6 +26,15 @@ _CANDIDATES = 512
 _INFINITE = 0x7F800000
 # Numbers of a block of distances, so that a processor's cache holds it.
 _BLOCK = 2**18
+
+
+# A graphics processor is slow at many small operations, and its memory holds what a CPU core's caches do not.
+_DEVICE_HOLDS = 64
+
+
+def kept_at_once(count: int, like: Tensor) -> int:
+    """How much is computed at once: ``count``, what the caches of a CPU's core hold, or 64 times as much elsewhere."""
+    return count if like.device.type == "cpu" else _DEVICE_HOLDS * count
 
 
 def draw_subsets(numbers: Tensor, counts: Tensor) -> Tensor:
@@ -126,8 +135,9 @@ def agreement_of_neighbours(world_points: Tensor, img_points: Tensor, there: Ten
     absent = (order >= counts)[:, None]
     world_points, img_points = world_points.float(), img_points.float()
     out = torch.empty_like(there, dtype=torch.float32)
-    rows = torch.arange(there.shape[1], device=there.device).split(max(1, _BLOCK // width))
-    problems = torch.arange(len(there), device=there.device).split(max(1, _BLOCK // (width * there.shape[1])))
+    block = kept_at_once(_BLOCK, there)
+    rows = torch.arange(there.shape[1], device=there.device).split(max(1, block // width))
+    problems = torch.arange(len(there), device=there.device).split(max(1, block // (width * there.shape[1])))
     for some, here in itertools.product(problems, rows):
         both = [_sq_distances(x[some][:, here], x[some[:, None], at[some]]) for x in (world_points, img_points)]
         no = (both[0] == 0).logical_or_(both[1] == 0).logical_or_(absent[some])
@@ -182,6 +192,11 @@ class Samples:
         subsets = [math.comb(n, size) for n in range(pairs + 1)]
         self.totals = torch.tensor([min(n, most) for n in subsets], device=device)[self.counts]
         self._enumerated = self.counts <= max(n for n in range(pairs + 1) if subsets[n] <= most)
+        kinds, self._kinds = self.counts.where(self._enumerated, size).unique(return_inverse=True)
+        tables = [_subsets(n, size, seed) for n in kinds.tolist()] or [_subsets(size, size, seed)]
+        self._table = torch.cat(tables).to(device)
+        self._lengths = torch.tensor([len(table) for table in tables], device=device)
+        self._firsts = self._lengths.cumsum(0) - self._lengths
         self._numbers = None if bool(self._enumerated.all()) else _random_numbers(size, most, seed).to(device)
         self.share: Tensor | None = None
         if chances is not None and self._numbers is not None:
@@ -202,22 +217,21 @@ class Samples:
         """
         enumerated = self._enumerated[problems]
         if self._numbers is None:
-            return self._present(problems, self._listed(problems, enumerated, start, stop))
+            return self._present(problems, self._listed(problems, start, stop))
         numbers = self._numbers[start:stop]
         if self.share is not None:
             ranks = draw_likely(numbers, self._upper[problems])
         else:
             ranks = draw_subsets(numbers, self.counts[problems])
         if bool(enumerated.any()):
-            ranks = torch.where(enumerated[:, None, None], self._listed(problems, enumerated, start, stop), ranks)
+            ranks = torch.where(enumerated[:, None, None], self._listed(problems, start, stop), ranks)
         return self._present(problems, ranks)
 
-    def _listed(self, problems: Tensor, enumerated: Tensor, start: int, stop: int) -> Tensor:
+    def _listed(self, problems: Tensor, start: int, stop: int) -> Tensor:
         """Ranks of the samples of problems that are enumerated, (P, H, s); anything for the others."""
-        counts, kind = self.counts[problems].where(enumerated, self.size).unique(return_inverse=True)
-        tables = [_subsets(int(n), self.size, self.seed) for n in counts]
-        at = torch.arange(start, stop, device="cpu")
-        return torch.stack([table[at % len(table)] for table in tables]).to(problems.device)[kind]
+        kind = self._kinds[problems]
+        number = torch.arange(start, stop, device=problems.device) % self._lengths[kind, None]
+        return self._table[self._firsts[kind, None] + number]
 
     def needed(self, problems: Tensor, inliers: Tensor, confidence: float) -> Tensor:
         r"""Number of samples of which at least one has no outlier, see :func:`samples_needed`.

@@ -12,7 +12,7 @@ from kornia_pnpnet.core.performance import problems_last
 from kornia_pnpnet.core.trees import map_tensors, take
 from kornia_pnpnet.geometry import Projection, project
 from kornia_pnpnet.init.ransac.minimal import MinimalSolver
-from kornia_pnpnet.init.ransac.sampling import Samples, agreement_of_neighbours
+from kornia_pnpnet.init.ransac.sampling import Samples, agreement_of_neighbours, kept_at_once
 from kornia_pnpnet.init.ransac.scoring import Scene, Scorer
 from kornia_pnpnet.refine import LMStep, lm_step
 from kornia_pnpnet.refine.inliers import Thresholds, judge
@@ -168,7 +168,7 @@ class Search:
         def improve(at: Tensor, losses: Tensor, matrices: Tensor) -> None:
             if not len(at):
                 return
-            size = max(1, PAIRS_PER_SAMPLE * plan.chunk_size // (count * losses.shape[1]))
+            size = max(1, kept_at_once(PAIRS_PER_SAMPLE * plan.chunk_size, at) // (count * losses.shape[1]))
             for one, some, part in zip(*(x.split(size) for x in (at, losses, matrices)), strict=True):
                 loss[one], matrix[one] = self._improve(one, some, part)
                 expect(one)
@@ -192,7 +192,7 @@ class Search:
                 self._prefer_agreement(active)
                 expect(active)
             start, stop = stop, self._end_of_round(stop, int(totals[active].max()))
-            parts = active.split(max(1, plan.chunk_size // (stop - start)))
+            parts = active.split(max(1, kept_at_once(plan.chunk_size, active) // (stop - start)))
             tops = [self._best_of_samples(part, start, stop) for part in parts]
             top_losses, top_matrices, tested = (torch.cat(parts) for parts in zip(*tops, strict=True))
             poses[active] += tested
@@ -326,7 +326,7 @@ class Search:
 
 def least_squares(corr: Correspondences, pose: Pose, projection: Projection, weights: Tensor) -> LMStep:
     """Take one step of least squares with the weights (B, N) times the weights of the pairs."""
-    one, damping = corr.weights.new_tensor((1.0, _DAMPING))
+    one, damping = corr.weights.new_ones(()), corr.weights.new_full((), _DAMPING)
     weights = corr.weights * weights
     if corr.free_focal is not None:  # beside a prior, weights are inverse square pixels
         weights = weights / corr.free_focal.pixel.square()[:, None]
