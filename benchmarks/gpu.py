@@ -38,12 +38,12 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import flop_registry
 
-from kornia_pnpnet import PnPNet, create_solver, list_solvers
+from kornia_pnpnet import PnPNet, create_solver, list_solvers, pose_errors, success
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.evaluation.results import save_results
-from kornia_pnpnet.types import PnPResult, Problems
+from kornia_pnpnet.types import PnPResult, Pose, Problems
 
 #: Largest difference of a pose that counts as the same, in radians, and of a gradient, relative to its length.
 LIMITS = {torch.float32: 1e-3, torch.float64: 1e-6}
@@ -99,8 +99,9 @@ def parity(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
     """Solve the same problems on the CPU and on the device, with gradients, by every solver of ours.
 
     Yields:
-        For each solver and dtype ``same_ok``, the share of problems of the same ``ok``, and of those that are ``ok`` on
-        both devices ``same_pose`` and ``same_gradient``, the shares within ``limit``; or ``why`` a solver fails.
+        For each solver and dtype ``success`` on the CPU and on the device; ``same_ok``, the share of problems of the
+        same ``ok``; of those that are ``ok`` on both ``same_pose`` and ``same_gradient``, the shares within ``limit``;
+        or ``why`` a solver fails.
     """
     for name in list_solvers():
         try:
@@ -119,13 +120,14 @@ def parity(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
             except RuntimeError as error:
                 yield {**case, "why": reason(error)}
                 continue
-            (mine, slope), (other, other_slope) = found
+            (mine, slope, *_), (other, other_slope, *_) = found
             both = mine.ok & other.ok
             turned = rotation_difference(mine.rotation, other.rotation)
             length = torch.maximum(slope.norm(dim=1), other_slope.norm(dim=1)).clamp(min=torch.finfo(dtype).tiny)
             change = (slope - other_slope).norm(dim=1) / length
             yield {
                 **case,
+                "success": [rate for *_, rate in found],  # on the CPU and on the device
                 "both_ok": int(both.sum()),
                 "same_ok": share(mine.ok == other.ok),
                 "same_pose": share(turned[both] <= limit),
@@ -133,16 +135,18 @@ def parity(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
             }
 
 
-def _solved(solver: PnPNet, problems: Problems, device: str, dtype: torch.dtype) -> tuple[PnPResult, Tensor]:
-    """Result and gradient of the poses to points and pixels, (B, 5 N), both on the CPU."""
+def _solved(solver: PnPNet, problems: Problems, device: str, dtype: torch.dtype) -> tuple[PnPResult, Tensor, float]:
+    """Result, gradient of the poses to points and pixels, (B, 5 N), both on the CPU, and the rate of success."""
     inputs = problems.world_points, problems.img_points, problems.intrinsics
     world, img, intrinsics = (x.to(device, dtype) for x in inputs)
     leaves = leaves_of(world, img)
     result = solver.to(device, dtype)(*leaves, intrinsics)
     parts = gradient(result.pose, leaves) if result.rotation.requires_grad else (None, None)
     filled = [torch.zeros_like(leaf) if part is None else part for part, leaf in zip(parts, leaves, strict=True)]
-    on_cpu = result._replace(rotation=result.rotation.detach().cpu(), ok=result.ok.cpu())
-    return on_cpu, torch.cat([x.flatten(1) for x in filled], 1).cpu()
+    rotation, translation = (x.detach().cpu() for x in result.pose)
+    solved = success(pose_errors(Pose(rotation.double(), translation.double()), problems.pose))
+    on_cpu = result._replace(rotation=rotation, ok=result.ok.cpu())
+    return on_cpu, torch.cat([x.flatten(1) for x in filled], 1).cpu(), float(solved.double().mean())
 
 
 def reason(error: Exception) -> str:
@@ -203,7 +207,7 @@ def graphs(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
         solvers = {mode: create_solver(name, effort="fixed").to(device, torch.float32) for mode in amount.modes}
         for mode, solver in solvers.items():
             if (options := MODES[mode]) is not None:
-                compile_or_raise(solver, **options)  # type: ignore[arg-type]
+                compile_or_raise(solver, **options)
         for batch in amount.calls:
             yield {"solver": name, "batch": batch, "modes": _modes(solvers, batch, device, amount.rounds)}  # type: ignore[arg-type]
 
@@ -414,7 +418,9 @@ def tables(results: dict[str, Any]) -> str:
         return list(results.get(part, {"rows": []})["rows"])
 
     shares = ("same_ok", "same_pose", "same_gradient", "why")
-    found = [cells(x["solver"], x["dtype"], *map(x.get, shares)) for x in rows("parity")]
+    found = [
+        cells(x["solver"], x["dtype"], *x.get("success", (None, None)), *map(x.get, shares)) for x in rows("parity")
+    ]
     calls = [
         cells(row["solver"], row["batch"], mode, *map(x.get, ("median_us", "rotation_difference", "warm_s", "why")))
         for row in rows("graphs")
@@ -425,7 +431,7 @@ def tables(results: dict[str, Any]) -> str:
         cells(*map(x.get, place), *map(x.get, measured), *x.get("shares", {}).values()) for x in rows("throughput")[1:]
     ]
     made = {
-        "parity": ["against the CPU", "dtype", "same ok", "same pose", "same gradient", "why not"],
+        "parity": ["against the CPU", "dtype", "success", "there", "same ok", "same pose", "same gradient", "why not"],
         "graphs": ["solver", "B", "mode", "µs per call", "difference", "warm-up s", "why not"],
         "throughput": ["solver", "mode", "n", "B", "µs per problem", "peak bytes", "chunk", "warm-up s", "why not"],
     }

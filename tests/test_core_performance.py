@@ -141,14 +141,29 @@ def test_rigs_are_graphs(whole, graphs, backend):
     assert backend.frame_count == graphs
 
 
-def test_without_a_compiler_it_runs_as_it_is(monkeypatch):
-    torch.compiler.reset()
-    compile_ = torch.compile
-
+def fails_in_the_backend(function):
     def broken(graph, inputs):
         raise RuntimeError("no compiler here")
 
-    monkeypatch.setattr(torch, "compile", lambda f, **options: compile_(f, fullgraph=True, backend=broken))
+    return torch_compile(function, fullgraph=True, backend=broken)
+
+
+def fails_in_dynamo(function):
+    """As Dynamo 2.11 does with our code."""
+
+    def compiled(*args):
+        raise AssertionError("no compiler here")
+
+    return compiled
+
+
+torch_compile = torch.compile
+
+
+@pytest.mark.parametrize("broken", [fails_in_the_backend, fails_in_dynamo])
+def test_without_a_compiler_it_runs_as_it_is(broken, monkeypatch):
+    torch.compiler.reset()
+    monkeypatch.setattr(torch, "compile", lambda function, **options: broken(function))
     twice = Compiled(lambda x: 2 * x)
     with pytest.warns(RuntimeWarning, match="no compiler here") as caught:
         assert torch.equal(twice(torch.ones(3)), 2 * torch.ones(3))

@@ -384,6 +384,18 @@ def test_confidence_guides_the_samples(generator):
     assert rates[1] > rates[0] + 0.1, rates
 
 
+def test_with_a_confidence_the_network_sees_all_pairs(generator):
+    """Otherwise it sees 48 of them, and a search finds what they miss; the caller's likely pairs may be among these."""
+    problems = hard_problems(100)
+    solver = create_solver("pnpnet-set")
+    seen = []
+    solver.init.register_forward_pre_hook(lambda _, args, kwargs: seen.append(kwargs), with_kwargs=True)
+    with torch.no_grad():
+        for confidence in (None, believed(problems, generator)):
+            solver(*problems[:3], confidence=confidence)
+    assert [kwargs.get("search_follows", False) for kwargs in seen] == [True, False]
+
+
 def test_a_bad_confidence_costs_its_own_problem_alone():
     problems = SyntheticProblems(n=12, batch_size=5, seed=2, world_sigma=0.0, dtype=torch.float64).batch(0)
     confidence = torch.rand(problems.inliers.shape, dtype=torch.float64)

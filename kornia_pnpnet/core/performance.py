@@ -5,6 +5,7 @@ Nothing here changes a result. Each part says what it buys; times are of PyTorch
 
 from __future__ import annotations
 
+import inspect
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
@@ -332,8 +333,10 @@ def keep_freed_memory() -> None:
 
 # -- compilation -------------------------------------------------------------------------------------------------------
 
-# Each solver counts its own compilations: numbers of pairs, dtypes, with and without gradients.
+# Each solver counts its own compilations: numbers of pairs, dtypes, with and without gradients. PyTorch before 2.13
+# cannot: there it is eight for all solvers together.
 _LIMITS: dict[str, Any] = {"recompile_limit": 64, "isolate_recompiles": True}
+_LIMITS = _LIMITS if "isolate_recompiles" in inspect.signature(torch.compile).parameters else {}
 
 # Pairs. From this number on, the loop order that the CPU compiler of PyTorch 2.13 chooses can give wrong results where
 # a problem has more pairs than the batch has problems (it transposes vectors of 16 numbers). The given order is then
@@ -390,9 +393,8 @@ class Compiled(Generic[_P, _T]):
         first = tensors[0]
         kind = first.shape, first.dtype, len(tensors), torch.is_grad_enabled()
         compiled = self._compiled[first.ndim > 1 and first.shape[1] >= _MANY_PAIRS]
-        errors = torch._dynamo.exc.TorchDynamoException, torch._inductor.exc.InductorError
         if kind in self._seen:
-            with suppress(*errors):  # recompiling may warn, and warnings may be errors here: try again without them
+            with suppress(Exception):  # recompiling may warn, and warnings may be errors here: try again without them
                 return compiled(*args, **kwargs)
         try:
             for tensor in tensors:
@@ -403,7 +405,7 @@ class Compiled(Generic[_P, _T]):
                 result = compiled(*args, **kwargs)
             self._seen.add(kind)
             return result
-        except errors as error:
+        except Exception as error:  # the compiler's are of many types
             result = self.function(*args, **kwargs)  # a mistake of the caller raises here as it would anywhere
             self.failed = True
             reason = " ".join(f"{type(error).__name__}: {error}".split())

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from kornia_pnpnet.core.linalg import gate
+from kornia_pnpnet.core.linalg import eigenvectors, gate
 from kornia_pnpnet.core.performance import repeat_problems
 from kornia_pnpnet.core.trees import map_tensors, take
 from kornia_pnpnet.geometry import project, rotation_angle
@@ -191,7 +191,7 @@ def _mirrored(pose: Pose, corr: Correspondences, weights: Tensor) -> Pose:
     middle = (share[..., None] * corr.world_points).sum(1)
     centred = corr.world_points - middle[:, None]
     covariance = centred.mT @ (share[..., None] * centred)
-    normal = torch.linalg.eigh(covariance).eigenvectors[..., 0]
+    normal = eigenvectors(covariance.permute(1, 2, 0))[0][1].mT  # LAPACK takes longer, and cuSOLVER fails for many
     seen = (pose.rotation @ middle[..., None])[..., 0] + pose.translation
     rotation = _half_turn(seen) @ pose.rotation @ _half_turn(normal)
     return Pose(rotation, seen - (rotation @ middle[..., None])[..., 0])

@@ -10,6 +10,7 @@ from kornia.geometry.liegroup import So3
 from torch import Tensor
 from torch.nn import functional
 
+from kornia_pnpnet.core.performance import compiling
 from kornia_pnpnet.geometry import NormalEquations
 from kornia_pnpnet.types import FramedPrior, FreeFocal, Pose, PosePrior
 
@@ -35,6 +36,8 @@ _LEAST_DENOMINATOR = 1e-4
 # Standard deviation of a coefficient of radial distortion before any pair is looked at; it keeps those that no pair
 # determines near 0.
 _RADIAL = 0.15
+# Matrices whose eigenvalues a graphics processor finds at once.
+_MOST_MATRICES = 10_000
 
 
 def gravity_prior(world_down: Tensor, cam_down: Tensor, sigma: Tensor | float) -> PosePrior:
@@ -250,7 +253,7 @@ def _is_usable(prior: PosePrior) -> Tensor:
 
 def _open_axis(information: Tensor) -> Tensor:
     """The axis (B, 3) about which turns are open where both other axes are known, else 0."""
-    eigenvalues = torch.linalg.eigvalsh(information.detach().double())
+    eigenvalues = _eigenvalues(information.detach().double())
     least, middle, largest = eigenvalues.unbind(-1)
     is_open = (least < _KNOWN * largest) & (middle > _KNOWN * largest)
     # The columns of the adjugate are multiples of the axis; eigenvectors of equal eigenvalues have no derivative.
@@ -271,4 +274,10 @@ def _correlations(information: Tensor) -> tuple[Tensor, Tensor]:
     scaled = scaled.nan_to_num(math.inf)
     off = (scaled - scaled.mT).abs().amax((1, 2))
     bounded = torch.where(scaled.isfinite().all((1, 2))[:, None, None], scaled, 0.0)
-    return torch.linalg.eigvalsh(bounded), off < 1e-3
+    return _eigenvalues(bounded), off < 1e-3
+
+
+def _eigenvalues(matrix: Tensor) -> Tensor:
+    """Eigenvalues of symmetric matrices, ascending. cuSOLVER fails for a hundred thousand of them at once."""
+    whole = matrix.device.type == "cpu" or compiling()
+    return torch.cat([torch.linalg.eigvalsh(part) for part in ([matrix] if whole else matrix.split(_MOST_MATRICES))])
