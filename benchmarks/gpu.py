@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from contenders import OURS
+from contenders import CONTENDERS, OURS
 from harness import HERE, in_turns, load, say, summary
 from settings import N, draw
 from tasks import (
@@ -78,6 +78,7 @@ class Amount(NamedTuple):
         "pnpnet-set compiled",
         "epnp-lm",
         "p3p-ransac",
+        "poselib",
     )
     batches: tuple[int, ...] = (1000, 10_000, 100_000, 1_000_000)
     pairs: tuple[int, ...] = (9, 50)
@@ -209,7 +210,10 @@ def graphs(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
             if (options := MODES[mode]) is not None:
                 compile_or_raise(solver, **options)
         for batch in amount.calls:
-            yield {"solver": name, "batch": batch, "modes": _modes(solvers, batch, device, amount.rounds)}  # type: ignore[arg-type]
+            modes = _modes(solvers, batch, device, amount.rounds)  # type: ignore[arg-type]
+            yield {"solver": name, "batch": batch, "modes": modes}
+            for mode in [mode for mode, found in modes.items() if "why" in found]:
+                del solvers[mode]  # a solver that has failed to compile runs uncompiled from now on
 
 
 def _modes(solvers: dict[str, PnPNet], batch: int, device: str, rounds: int) -> dict[str, dict[str, Any]]:
@@ -355,9 +359,12 @@ def measure_throughput(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
         operations; or ``why`` a point is missing.
     """
     rates = machine_rates(device, amount)
-    yield rates
+    yield {"rates": rates}
     for name, n in itertools.product(amount.contenders, amount.pairs):
         torch.compiler.reset()
+        if name not in OURS:  # on the CPU, one problem after the other
+            yield _looped(name, n, amount)
+            continue
         contender, plain = (OURS[x](device=device) for x in (name, name.removesuffix(" compiled")))
         if not contender.takes(n):
             continue
@@ -374,7 +381,10 @@ def measure_throughput(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
             start = time.perf_counter()
             try:
                 task, chunk = fitting(contender, problems, backward=mode == BACKWARD)
-            except (CannotBeTimedError, RuntimeError) as error:
+            except CannotBeTimedError as error:
+                yield {**place, "why": reason(error)}
+                break  # it has failed to compile, and runs uncompiled from now on
+            except RuntimeError as error:
                 yield {**place, "why": reason(error)}
                 continue
             place["warm_s"] = time.perf_counter() - start
@@ -385,7 +395,20 @@ def measure_throughput(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
             floor_s = max(each["least_bytes"] / rates["bytes_per_s"], each["flops"] / rates["flops_per_s"])
             traffic_s = each["bytes"] / rates["bytes_per_s"]
             shares = {key: 1e6 * x / found["median_us"] for key, x in (("floor", floor_s), ("traffic", traffic_s))}
-            yield {**place, "chunk": chunk, "peak_bytes": peak, "work": each, "shares": shares, **found}
+            place |= {"chunk": chunk, "peak_bytes": peak}
+            if batch == amount.batches[0]:
+                place["success"] = task.success().rate
+            yield {**place, "work": each, "shares": shares, **found}
+
+
+def _looped(name: str, n: int, amount: Amount) -> dict[str, Any]:
+    problems = draw(n, amount.batches[0])
+    say(f"throughput: {name}, n = {n}")
+    task = CONTENDERS[name]().task(problems)
+    task.warm()
+    times = summary([1e6 * task.seconds() / amount.batches[0] for _ in range(amount.rounds)])
+    place = {"contender": name, "mode": FORWARD, "n": n, "batch": amount.batches[0]}
+    return {**place, "success": task.success().rate, **times}
 
 
 def peak_bytes(task: Task, device: str) -> int | None:
@@ -428,7 +451,9 @@ def tables(results: dict[str, Any]) -> str:
     ]
     place, measured = ("contender", "mode", "n", "batch"), ("median_us", "peak_bytes", "chunk", "warm_s", "why")
     times = [
-        cells(*map(x.get, place), *map(x.get, measured), *x.get("shares", {}).values()) for x in rows("throughput")[1:]
+        cells(*map(x.get, place), *map(x.get, measured), *x.get("shares", {}).values())
+        for x in rows("throughput")
+        if "contender" in x
     ]
     made = {
         "parity": ["against the CPU", "dtype", "success", "there", "same ok", "same pose", "same gradient", "why not"],
@@ -441,12 +466,22 @@ def tables(results: dict[str, Any]) -> str:
     return "\n\n".join(markdown_table(made[part], full[part], pad=True) for part in PARTS if full[part])
 
 
+def _solver(row: dict[str, Any]) -> str | None:
+    return row.get("solver", row.get("contender"))
+
+
+def _is_same_machine(made_with: dict[str, Any]) -> bool:
+    return all(made_with[key] == environment()[key] for key in ("versions", "cpu", "gpu", "commit"))
+
+
 def main(arguments: Sequence[str] | None = None, amount: Amount | None = None) -> None:
     """Measure, write each row into the file as soon as it is known, and print tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--device", default="cuda", help="cuda, or cpu to try the script")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), help="the others stay in the file")
-    parser.add_argument("--solvers", nargs="+", help="of graphs and throughput; all when left out")
+    parser.add_argument(
+        "--solvers", nargs="+", help="of graphs and throughput, all when left out; the others stay in the file"
+    )
     parser.add_argument("--quick", action="store_true", help="a few small problems: does everything run?")
     parser.add_argument("--out", type=Path, default=HERE / "gpu.json", help="the results file")
     options = parser.parse_args(arguments)
@@ -458,8 +493,12 @@ def main(arguments: Sequence[str] | None = None, amount: Amount | None = None) -
         )
     results = json.loads(options.out.read_text()) if options.out.exists() else {}
     for part in options.parts:
-        made_with = {"environment": environment(), "settings": {"device": options.device, **amount._asdict()}}
-        results[part] = {**made_with, "load_average": load(), "rows": []}
+        kept = []
+        if options.solvers and part in results and _is_same_machine(results[part]["environment"]):
+            kept = [row for row in results[part]["rows"] if _solver(row) not in (None, *options.solvers)]
+        settings = {"device": options.device, **amount._asdict()}
+        made_with = {"environment": environment(), "settings": settings, "load_average": load()}
+        results[part] = {**made_with, "rows": kept}
         for row in PARTS[part](options.device, amount):
             results[part]["rows"].append(row)
             save_results(results, options.out)

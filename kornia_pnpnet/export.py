@@ -13,9 +13,9 @@ from kornia.core.exceptions import ValueCheckError
 from torch import Tensor, nn
 
 from kornia_pnpnet.core.checks import check_shapes, check_whole
+from kornia_pnpnet.core.compilation import package_options
 from kornia_pnpnet.core.files import atomic_open
 from kornia_pnpnet.core.inlining import INLINE
-from kornia_pnpnet.core.performance import package_options
 from kornia_pnpnet.data import CameraProblems, SyntheticProblems
 from kornia_pnpnet.init import RANSAC, MLPInit, SetInit
 from kornia_pnpnet.solver import PnPNet

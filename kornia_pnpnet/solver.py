@@ -11,8 +11,9 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
 from kornia_pnpnet.core.checks import check_positive, check_whole
+from kornia_pnpnet.core.compilation import Compiled
 from kornia_pnpnet.core.linalg import bound_gradient, gate
-from kornia_pnpnet.core.performance import Compiled, in_full_precision, sees_values
+from kornia_pnpnet.core.performance import in_full_precision, sees_values
 from kornia_pnpnet.core.trees import map_tensors, put, take
 from kornia_pnpnet.geometry import gate_pose
 from kornia_pnpnet.init import RANSAC, MLPInit, SetInit
@@ -419,9 +420,8 @@ class PnPNet(PretrainedMixin):
         # since every entry was multiplied by a coordinate of the centroid.
         finite = frame.valid & (pose.translation.sum(-1) + refined.weights.sum(-1) + refined.cost).isfinite()
         ok = finite & refined.ok if guess.ok is None else finite & refined.ok & guess.ok
-        intrinsics = frame.intrinsics
-        if refined.zoom is not None:
-            intrinsics = scale_focal(intrinsics, torch.where(finite, refined.zoom, 0.0).exp())
+        zoom = None if refined.zoom is None else torch.where(finite, refined.zoom, 0.0).exp()
+        intrinsics = frame.intrinsics if zoom is None else scale_focal(frame.intrinsics, zoom)
         first_ok = frame.valid & first.translation.sum(-1).isfinite()
         status = torch.where(refined.in_front, Status.NOT_BELIEVED.value, Status.BEHIND.value)
         status = torch.where(ok, Status.SOLVED.value, torch.where(finite, status, Status.DEGENERATE.value))

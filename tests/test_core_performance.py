@@ -12,7 +12,8 @@ from torch._dynamo.testing import CompileCounter
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from kornia_pnpnet import MLPInit, PnPNet, Pose, RobustWeightedLM, create_solver
-from kornia_pnpnet.core.performance import Compiled, ascending_order, in_order, problems_last, ranked
+from kornia_pnpnet.core.compilation import Compiled
+from kornia_pnpnet.core.performance import ascending_order, in_order, problems_last, ranked
 from kornia_pnpnet.core.trees import iter_tensors
 from kornia_pnpnet.data import CameraProblems, OutlierMix, SyntheticProblems
 from kornia_pnpnet.geometry import project

@@ -8,6 +8,8 @@ depth :math:`z`. The ratio of the two sides is the *standardised* squared residu
 from __future__ import annotations
 
 import math
+from functools import reduce
+from operator import mul
 from typing import NamedTuple
 
 import torch
@@ -256,5 +258,5 @@ def _log_factorial(x: Tensor) -> Tensor:
     y = x + 9.0
     inv, sq = y.reciprocal(), y.reciprocal().square()
     series = inv * (1 / 12 - sq * (1 / 360 - sq * (1 / 1260 - sq / 1680)))
-    factors = math.prod(x + i for i in range(1, 9))
+    factors = reduce(mul, [x + i for i in range(1, 9)])
     return (y - 0.5) * y.log() - y + 0.5 * math.log(2.0 * math.pi) + series - torch.as_tensor(factors).log()

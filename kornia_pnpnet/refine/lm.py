@@ -14,9 +14,10 @@ from kornia.core.check import KORNIA_CHECK
 from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_whole
+from kornia_pnpnet.core.compilation import Compiled, per_problem
 from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.linalg import relative
-from kornia_pnpnet.core.performance import Compiled, per_problem, problems_last, repeat_problems
+from kornia_pnpnet.core.performance import problems_last, repeat_problems
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import Projection, project
 from kornia_pnpnet.refine.implicit import attach_gradient

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kornia_pnpnet.core.compilation import per_problem
 from kornia_pnpnet.core.linalg import factorise, relative, substitute
-from kornia_pnpnet.core.performance import per_problem
 from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import (
