@@ -211,14 +211,54 @@ def memory_table(results: Mapping[str, Any]) -> str:
     return markdown_table(("Contender", "forward (MiB)", "forward+backward (MiB)"), lines)
 
 
-def gpu_table(results: Mapping[str, Any]) -> str:
-    """The best batch size of each contender on a GPU."""
-    rows = [row for row in results["rows"] if (row["threads"], row["n"], row["mode"]) == (1, N, FORWARD)]
+def of_hundred(share: float) -> str:
+    """A share in percent, without the sign."""
+    return f"{100 * share:.1f}"
+
+
+def gpu_section(results: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    """What the page says of a GPU, from the file of ``gpu.py``."""
+    if results is None:
+        return None
+    rows = [row for row in results["throughput"]["rows"] if "median_us" in row]
+    loops = {row["n"]: row for row in rows if row["contender"] == "poselib"}
+    batches = results["throughput"]["settings"]["batches"]
     lines = []
-    for name in dict.fromkeys(row["contender"] for row in rows):
-        best = min((row for row in rows if row["contender"] == name), key=lambda row: row["median_us"])
-        lines.append((f"`{name}`", f"{best['batch']}", f"{1e6 / best['median_us']:.2e}", percent(best["success"])))
-    return markdown_table(("Contender", "best batch", "problems a second", "success (%)"), lines)
+    for name, n, mode in dict.fromkeys((row["contender"], row["n"], row["mode"]) for row in rows if "work" in row):
+        found = {row["batch"]: row for row in rows if (row["contender"], row["n"], row["mode"]) == (name, n, mode)}
+        best = min(found.values(), key=lambda row: row["median_us"])
+        times = [
+            three_digits(found[b]["median_us"]) if b in found else "–"
+            for b in results["throughput"]["settings"]["batches"]
+        ]
+        faster = loops[n]["median_us"] / best["median_us"]
+        limits = [of_hundred(best["shares"][key]) for key in ("floor", "traffic")]
+        lines.append((f"`{name}`", mode, f"{n}", *times, f"{faster:.0f}", *limits))
+    sizes = [f"B = {batch}" for batch in batches]
+    heads = ("Contender", "mode", "n", *sizes, "times as fast as PoseLib", "floor (%)", "traffic (%)")
+    calls = [
+        (f"`{row['solver']}`", mode, f"{row['batch']}", three_digits(1e-3 * found["median_us"]))
+        for row in results["graphs"]["rows"]
+        for mode, found in row["modes"].items()
+        if "median_us" in found
+    ]
+    shares = ("same_ok", "same_pose", "same_gradient")
+    parity = [
+        (f"`{row['solver']}`", row["dtype"], *map(of_hundred, (*row["success"], *(row[key] for key in shares))))
+        for row in results["parity"]["rows"]
+        if "why" not in row and None not in [row[key] for key in shares]
+    ]
+    return {
+        "made": results["throughput"]["environment"],
+        "poselib": {"us": loops[N]["median_us"], "n": N},
+        "count": results["parity"]["settings"]["parity"],
+        "throughput": markdown_table(heads, lines),
+        "graphs": markdown_table(("Solver", "mode", "problems", "a call (ms)"), calls),
+        "parity": markdown_table(
+            ("Solver", "dtype", "success, CPU (%)", "GPU (%)", "same ok (%)", "same pose (%)", "same gradient (%)"),
+            parity,
+        ),
+    }
 
 
 def skipped_reasons(results: Mapping[str, Mapping[str, Any]]) -> list[str]:
@@ -237,7 +277,7 @@ def page(results: Mapping[str, Mapping[str, Any]], gpu: Mapping[str, Any] | None
 
     Args:
         results: the results files by their names in ``PARTS``.
-        gpu: the results file of the throughput on a GPU.
+        gpu: the results file of ``gpu.py``.
     """
     settings, shipped = results["throughput"]["settings"], PnPNet.from_pretrained(TRAINED)
     batch = settings["problems"]
@@ -264,7 +304,7 @@ def page(results: Mapping[str, Mapping[str, Any]], gpu: Mapping[str, Any] | None
         sizes=[call["batch"] for call in sizes[0]] if sizes else [],
         startup=startup_table(results["startup"]),
         memory=memory_table(results["startup"]),
-        gpu=None if gpu is None else {"name": gpu["environment"]["gpu"], "table": gpu_table(gpu)},
+        gpu=gpu_section(gpu),
         skipped=skipped_reasons(results),
     )
 
@@ -272,7 +312,7 @@ def page(results: Mapping[str, Mapping[str, Any]], gpu: Mapping[str, Any] | None
 def load_parts(folder: Path) -> tuple[dict[str, Any], dict[str, Any] | None]:
     """The results files, and the results file of a GPU when there is one."""
     results = {part: json.loads((folder / f"{part}.json").read_text(encoding="utf-8")) for part in PARTS}
-    gpu = folder / "throughput_cuda.json"
+    gpu = folder / "gpu.json"
     return results, json.loads(gpu.read_text(encoding="utf-8")) if gpu.exists() else None
 
 

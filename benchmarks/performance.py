@@ -57,7 +57,6 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("step", nargs="?", choices=("measure", "render"), default="measure")
     parser.add_argument("--parts", nargs="+", choices=page.PARTS, default=page.PARTS, help="for measure: only these")
     parser.add_argument("--contenders", nargs="+", help="for measure: only these")
-    parser.add_argument("--device", default="cpu", help="device of our solvers: cpu, cuda")
     parser.add_argument("--quick", action="store_true", help="a few small problems: does everything run?")
     parser.add_argument("--results", type=Path, default=HERE, help="folder of the results files")
     parser.add_argument("--page", type=Path, default=page.PAGE, help="for render: the page to write")
@@ -77,10 +76,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         page.render(options.results, options.page)
         return
     contenders = tuple(options.contenders) if options.contenders else None
-    settings = (QUICK if options.quick else FULL)._replace(contenders=contenders, device=options.device)
+    settings = (QUICK if options.quick else FULL)._replace(contenders=contenders)
     for part in options.parts:
-        kind = options.device.partition(":")[0]
-        path = options.results / (f"{part}.json" if kind == "cpu" else f"{part}_{kind}.json")
+        path = options.results / f"{part}.json"
         save_results(measure_part(part, settings), path)
         say(f"wrote {path}")
 

@@ -22,7 +22,7 @@ def main(request: dict[str, Any]) -> dict[str, Any]:
 
     Args:
         request: ``contender``; ``backward``; ``batches``, batch sizes that are called twice each, in this order;
-            ``memory_batch``, the batch size of the memory measurement, 0 for none; ``device``.
+            ``memory_batch``, the batch size of the memory measurement, 0 for none.
 
     Returns:
         ``contender``, ``backward``; ``torch_s``, ``package_s`` (without PyTorch), ``make_s``; ``calls``, for each batch
@@ -37,13 +37,12 @@ def main(request: dict[str, Any]) -> dict[str, Any]:
     import kornia_pnpnet  # noqa: F401
 
     package_s = time.perf_counter() - start
-    from contenders import CONTENDERS, OURS
+    from contenders import CONTENDERS
     from harness import peak_bytes, threads
     from settings import N, draw
 
-    options = {"device": request["device"]} if request["contender"] in OURS else {}
     start = time.perf_counter()
-    contender = CONTENDERS[request["contender"]](**options)
+    contender = CONTENDERS[request["contender"]]()
     make_s = time.perf_counter() - start
     calls: list[dict[str, float]] = []
     memory = None

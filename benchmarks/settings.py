@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import torch
-from contenders import CONTENDERS, ONE_THREAD, OURS
+from contenders import CONTENDERS, ONE_THREAD
 from harness import say
 from tasks import CannotBeTimedError, Contender
 
@@ -24,7 +24,6 @@ class Settings(NamedTuple):
 
     Attributes:
         contenders: names; ``None``: all.
-        device: of the solvers of ours; the others run on the CPU.
         problems: number of problems that success is counted on, and batch size of the rows with other numbers of pairs.
         batches: batch sizes at 9 pairs.
         pairs: numbers of pairs.
@@ -39,7 +38,6 @@ class Settings(NamedTuple):
     """
 
     contenders: tuple[str, ...] | None = None
-    device: str = "cpu"
     problems: int = 1000
     batches: tuple[int, ...] = (1, 10, 100, 1000, 10_000, 100_000)
     pairs: tuple[int, ...] = (6, 9, 20, 100, 1000)
@@ -82,7 +80,7 @@ def make_contenders(settings: Settings, *, count: int = 1) -> tuple[dict[str, Co
     """Make the contenders that are asked for.
 
     Args:
-        settings: names and device.
+        settings: names.
         count: number of threads; some contenders are measured on one thread only.
 
     Returns:
@@ -97,7 +95,7 @@ def make_contenders(settings: Settings, *, count: int = 1) -> tuple[dict[str, Co
             skipped.append({"contender": name, "why": "measured on one thread only"})
             continue
         try:
-            made[name] = make(**({"device": settings.device} if name in OURS else {}))
+            made[name] = make()
         except (ImportError, CannotBeTimedError) as error:
             skipped.append({"contender": name, "why": str(error)})
             say(f"skipped: {name}: {error}")

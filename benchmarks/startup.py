@@ -38,7 +38,7 @@ def measure_startup(settings: Settings) -> dict[str, Any]:
             say(f"cold start: {name}{', backward' if backward else ''}")
             # A loop needs the memory of one problem.
             batch = 0 if contender.loops else settings.memory_batch
-            request = {"contender": name, "backward": backward, "device": settings.device, "memory_batch": batch}
+            request = {"contender": name, "backward": backward, "memory_batch": batch}
             starts += start(request, settings)
     imports = [import_seconds() for _ in range(_IMPORTS)]
     return {"starts": starts, "imports_s": imports, "skipped": skipped, "targets": targets(starts, imports)}

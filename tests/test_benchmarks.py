@@ -363,7 +363,7 @@ def test_targets_of_latency():
 
 
 def test_a_large_call_shows_in_the_memory_of_its_process():
-    request = {"contender": "refinement", "backward": True, "device": "cpu", "batches": [2], "memory_batch": 5000}
+    request = {"contender": "refinement", "backward": True, "batches": [2], "memory_batch": 5000}
     found = harness.run_child(FOLDER / "process.py", json.dumps(request), OMP_NUM_THREADS="1")
     memory = found["memory"]
     assert memory["peak_bytes"] - memory["before_bytes"] > 5000 * 9 * 5 * 4  # the gradients alone
@@ -398,24 +398,42 @@ def test_compiled_contenders_start_with_an_empty_and_with_a_filled_cache(monkeyp
 def test_the_measurements_for_a_gpu_run_on_a_cpu(tmp_path, monkeypatch, capsys):
     pytest.importorskip("cv2")
     monkeypatch.setattr(gpu, "compile_or_raise", lambda solver, **options: None)  # compiling takes minutes
-    few = gpu.QUICK._replace(modes=("eager", "compiled", "captured"), calls=(2,), pairs=(9,))
+    contenders = (*gpu.QUICK.contenders, "opencv-ransac")
+    few = gpu.QUICK._replace(modes=("eager", "compiled", "captured"), calls=(2,), pairs=(9,), contenders=contenders)
     path = tmp_path / "gpu.json"
-    gpu.main(["--device", "cpu", "--out", str(path)], few)
-    results = json.loads(path.read_text())
+    to_file = ["--device", "cpu", "--out", str(path)]
+    gpu.main(to_file, few)
+    results = {part: found["rows"] for part, found in json.loads(path.read_text()).items()}
     assert {"pnpnet-n9", "pnpnet-set", "p3p-ransac", "epnp"} <= {row["solver"] for row in results["parity"]}
     for row in results["parity"]:  # the device is the CPU
         assert row["same_ok"] == 1.0
         assert row["same_pose"] in (1.0, None)
         assert row["same_gradient"] in (1.0, None)
+        assert row["success"][0] == row["success"][1]
     (row,) = results["graphs"]
     assert row["modes"]["compiled"]["rotation_difference"] < 1e-6
     assert "why" in row["modes"]["captured"]
-    points = [(row["contender"], row["mode"], row["batch"]) for row in results["throughput"]]
-    assert points == list(itertools.product(few.contenders, ("forward", "forward+backward"), few.batches))
-    for row in results["throughput"]:
+    rates, *ours, loop = results["throughput"]
+    assert rates["rates"]["bytes_per_s"] > 0
+    points = [(row["contender"], row["mode"], row["batch"]) for row in ours]
+    assert points == list(itertools.product(gpu.QUICK.contenders, ("forward", "forward+backward"), few.batches))
+    for row in ours:
         assert row["median_us"] == statistics.median(row["rounds_us"])
         assert 0 < row["work"]["least_bytes"] < row["work"]["bytes"]
+    assert (loop["contender"], loop["batch"]) == ("opencv-ransac", few.batches[0])
     assert "µs per problem" in capsys.readouterr().out
+    gpu.main([*to_file, "--parts", "throughput", "--solvers", "epnp-lm"], few)  # measured again, the others stay
+    again = json.loads(path.read_text())["throughput"]["rows"]
+    assert sorted(row.get("contender", "") for row in again) == sorted(["", *(x[0] for x in points), "opencv-ransac"])
+    gpu.main([*to_file, "--parts", "graphs"], few._replace(modes=("captured",)))
+    assert json.loads(path.read_text())["throughput"]["rows"] == again
+
+
+def test_the_gpu_is_on_the_page():
+    made = page.gpu_section(json.loads((FOLDER / "gpu.json").read_text()))
+    assert made["poselib"]["us"] > 0
+    assert "| `pnpnet-set` | forward |" in made["throughput"]
+    assert page.gpu_section(None) is None
 
 
 def test_batches_are_halved_until_they_fit():

@@ -248,7 +248,7 @@ def test_compiled_solvers_take_anything(name, monkeypatch):
     solver = copy.deepcopy(SOLVERS[name])
     solver.compile()
 
-    @many(8, times=1)
+    @many(5, times=1)
     @given(batches(9))
     def run(case):
         with warnings.catch_warnings():
