@@ -223,7 +223,7 @@ def gpu_section(results: Mapping[str, Any] | None) -> dict[str, Any] | None:
     rows = [row for row in results["throughput"]["rows"] if "median_us" in row]
     loops = {row["n"]: row for row in rows if row["contender"] == "poselib"}
     batches = results["throughput"]["settings"]["batches"]
-    lines = []
+    lines, quickest = [], {}
     for name, n, mode in dict.fromkeys((row["contender"], row["n"], row["mode"]) for row in rows if "work" in row):
         found = {row["batch"]: row for row in rows if (row["contender"], row["n"], row["mode"]) == (name, n, mode)}
         best = min(found.values(), key=lambda row: row["median_us"])
@@ -233,9 +233,13 @@ def gpu_section(results: Mapping[str, Any] | None) -> dict[str, Any] | None:
         ]
         faster = loops[n]["median_us"] / best["median_us"]
         limits = [of_hundred(best["shares"][key]) for key in ("floor", "traffic")]
-        lines.append((f"`{name}`", mode, f"{n}", *times, f"{faster:.0f}", *limits))
+        memory = three_digits(best["peak_bytes"] / best["batch"] / 1024)
+        lines.append((f"`{name}`", mode, f"{n}", *times, f"{faster:.0f}", memory, *limits))
+        if (n, mode) == (N, FORWARD):
+            quickest[name] = three_digits(best["median_us"]), f"{faster:.0f}"
     sizes = [f"B = {batch}" for batch in batches]
-    heads = ("Contender", "mode", "n", *sizes, "times as fast as PoseLib", "floor (%)", "traffic (%)")
+    measured = "times as fast as PoseLib", "memory (KiB a problem)", "floor (%)", "traffic (%)"
+    heads = ("Contender", "mode", "n", *sizes, *measured)
     calls = [
         (f"`{row['solver']}`", mode, f"{row['batch']}", three_digits(1e-3 * found["median_us"]))
         for row in results["graphs"]["rows"]
@@ -252,6 +256,7 @@ def gpu_section(results: Mapping[str, Any] | None) -> dict[str, Any] | None:
         "made": results["throughput"]["environment"],
         "poselib": {"us": loops[N]["median_us"], "n": N},
         "count": results["parity"]["settings"]["parity"],
+        "best": [(name, *quickest[name]) for name in (TRAINED, ANY)],
         "throughput": markdown_table(heads, lines),
         "graphs": markdown_table(("Solver", "mode", "problems", "a call (ms)"), calls),
         "parity": markdown_table(
