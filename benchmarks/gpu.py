@@ -58,7 +58,7 @@ class Amount(NamedTuple):
         graphs: solvers of the comparison of modes.
         modes: keys of ``MODES``, the first of them is what the others are compared with.
         calls: batch sizes of that comparison.
-        contenders: names of throughput, from ``contenders.OURS``.
+        contenders: names of throughput, from ``contenders.CONTENDERS``.
         batches: batch sizes of throughput.
         pairs: numbers of pairs of throughput.
         rounds: calls that are timed.
@@ -200,7 +200,8 @@ def graphs(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
 
     Yields:
         For each solver and batch ``modes``: by mode the times of a call, ``rotation_difference``, the largest angle to
-        the pose of the first mode, and ``same_ok``; or ``why`` the mode is missing.
+        the pose of the first mode, ``same_ok``, and ``warm_s``, the seconds of the first calls, which may compile; or
+        ``why`` the mode is missing.
     """
     for name in amount.graphs:
         say(f"graphs: {name}")
@@ -369,11 +370,11 @@ def measure_throughput(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
         if not contender.takes(n):
             continue
         drawn = draw(n, min(_DRAWN, max(amount.batches)))
-        known: dict[str, float] = {}  # seconds of a problem in the last batch
+        known: dict[str, list[tuple[int, float]]] = {FORWARD: [], BACKWARD: []}  # batches and seconds of a call
         for mode, batch in itertools.product((FORWARD, BACKWARD), amount.batches):
             say(f"throughput: {name}, n = {n}, B = {batch}, {mode}")
             place: dict[str, Any] = {"contender": name, "mode": mode, "n": n, "batch": batch}
-            if (expected_s := known.get(mode, 0.0) * batch) > amount.call_s:
+            if (expected_s := _expected_s(known[mode], batch)) > amount.call_s:
                 yield {**place, "why": f"a call would take about {expected_s:.0f} s"}
                 continue
             repeats = range(math.ceil(batch / len(drawn.world_points)))
@@ -391,7 +392,7 @@ def measure_throughput(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
             each = work(plain, first(problems, 1000), backward=mode == BACKWARD)
             peak = peak_bytes(task, device)
             found = summary([1e6 * task.seconds() / batch for _ in range(amount.rounds)])
-            known[mode] = found["median_us"] / 1e6
+            known[mode].append((batch, found["median_us"] * batch / 1e6))
             floor_s = max(each["least_bytes"] / rates["bytes_per_s"], each["flops"] / rates["flops_per_s"])
             traffic_s = each["bytes"] / rates["bytes_per_s"]
             shares = {key: 1e6 * x / found["median_us"] for key, x in (("floor", floor_s), ("traffic", traffic_s))}
@@ -399,6 +400,14 @@ def measure_throughput(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
             if batch == amount.batches[0]:
                 place["success"] = task.success().rate
             yield {**place, "work": each, "shares": shares, **found}
+
+
+def _expected_s(known: list[tuple[int, float]], batch: int) -> float:
+    """Seconds of a call, on the line through the last two: small batches wait for the launches of kernels."""
+    if len(known) < 2:
+        return known[0][1] if known else 0.0
+    (small, one), (large, other) = known[-2:]
+    return other + max(other - one, 0.0) * (batch - large) / (large - small)
 
 
 def _looped(name: str, n: int, amount: Amount) -> dict[str, Any]:
@@ -451,9 +460,7 @@ def tables(results: dict[str, Any]) -> str:
     ]
     place, measured = ("contender", "mode", "n", "batch"), ("median_us", "peak_bytes", "chunk", "warm_s", "why")
     times = [
-        cells(*map(x.get, place), *map(x.get, measured), *x.get("shares", {}).values())
-        for x in rows("throughput")
-        if "contender" in x
+        cells(*map(x.get, place), *map(x.get, measured), *x.get("shares", {}).values()) for x in rows("throughput")
     ]
     made = {
         "parity": ["against the CPU", "dtype", "success", "there", "same ok", "same pose", "same gradient", "why not"],
@@ -466,41 +473,35 @@ def tables(results: dict[str, Any]) -> str:
     return "\n\n".join(markdown_table(made[part], full[part], pad=True) for part in PARTS if full[part])
 
 
-def _solver(row: dict[str, Any]) -> str | None:
-    return row.get("solver", row.get("contender"))
-
-
-def _is_same_machine(made_with: dict[str, Any]) -> bool:
-    return all(made_with[key] == environment()[key] for key in ("versions", "cpu", "gpu", "commit"))
-
-
 def main(arguments: Sequence[str] | None = None, amount: Amount | None = None) -> None:
     """Measure, write each row into the file as soon as it is known, and print tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--device", default="cuda", help="cuda, or cpu to try the script")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), help="the others stay in the file")
-    parser.add_argument(
-        "--solvers", nargs="+", help="of graphs and throughput, all when left out; the others stay in the file"
-    )
+    parser.add_argument("--solvers", nargs="+", help="only these of graphs and throughput; the others stay in the file")
     parser.add_argument("--quick", action="store_true", help="a few small problems: does everything run?")
     parser.add_argument("--out", type=Path, default=HERE / "gpu.json", help="the results file")
     options = parser.parse_args(arguments)
     amount = amount or (QUICK if options.quick else FULL)
     if options.solvers:
-        amount = amount._replace(
-            graphs=tuple(x for x in amount.graphs if x in options.solvers),
-            contenders=tuple(x for x in amount.contenders if x in options.solvers),
-        )
+        if unknown := set(options.solvers) - {*amount.graphs, *amount.contenders}:
+            parser.error(f"not measured here: {', '.join(sorted(unknown))}")
+        graphs, contenders = ([x for x in of if x in options.solvers] for of in (amount.graphs, amount.contenders))
+        amount = amount._replace(graphs=tuple(graphs), contenders=tuple(contenders))
     results = json.loads(options.out.read_text()) if options.out.exists() else {}
+    made_with = environment()
     for part in options.parts:
-        kept = []
-        if options.solvers and part in results and _is_same_machine(results[part]["environment"]):
-            kept = [row for row in results[part]["rows"] if _solver(row) not in (None, *options.solvers)]
+        old = results.get(part, {"environment": {}, "rows": []})
+        same = all(old["environment"].get(key) == made_with[key] for key in ("versions", "cpu", "gpu", "commit"))
+        others = [x for x in old["rows"] if x.get("solver", x.get("contender")) not in (options.solvers or [])]
         settings = {"device": options.device, **amount._asdict()}
-        made_with = {"environment": environment(), "settings": settings, "load_average": load()}
-        results[part] = {**made_with, "rows": kept}
+        results[part] = {"environment": made_with, "settings": settings, "load_average": load()}
+        results[part]["rows"] = rows = others if options.solvers and part != "parity" and same else []
         for row in PARTS[part](options.device, amount):
-            results[part]["rows"].append(row)
+            if "rates" in row:
+                results[part] |= row
+            else:
+                rows.append(row)
             save_results(results, options.out)
     print(tables(results))
 

@@ -227,10 +227,7 @@ def gpu_section(results: Mapping[str, Any] | None) -> dict[str, Any] | None:
     for name, n, mode in dict.fromkeys((row["contender"], row["n"], row["mode"]) for row in rows if "work" in row):
         found = {row["batch"]: row for row in rows if (row["contender"], row["n"], row["mode"]) == (name, n, mode)}
         best = min(found.values(), key=lambda row: row["median_us"])
-        times = [
-            three_digits(found[b]["median_us"]) if b in found else "–"
-            for b in results["throughput"]["settings"]["batches"]
-        ]
+        times = [three_digits(found[batch]["median_us"]) if batch in found else "–" for batch in batches]
         faster = loops[n]["median_us"] / best["median_us"]
         limits = [of_hundred(best["shares"][key]) for key in ("floor", "traffic")]
         memory = three_digits(best["peak_bytes"] / best["batch"] / 1024)

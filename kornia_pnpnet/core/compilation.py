@@ -59,14 +59,13 @@ class Compiled(Generic[_P, _T]):
         options = {**torch._inductor.list_mode_options(mode or "default"), "cpp.vec_isa_ok": True}
         options["cpp.enable_loop_tail_vec"] = False
         options["guard_filter_fn"] = _is_worth_checking
-        few, many = (
-            torch.compile(function if _LIMITS else self._leaves, fullgraph=True, options=more, **_LIMITS)
-            for more in (options, {**options, "pick_loop_orders": False})
-        )
+        few, many = (self._compile(more) for more in (options, {**options, "pick_loop_orders": False}))
         self._compiled = {False: few, True: many}
         self.failed = False
         self._seen: set[tuple[torch.Size, torch.dtype, int, bool]] = set()
         self._like: dict[Any, _T] = {}
+        # The next replay of a CUDA graph overwrites the results of the last one.
+        self._copies = bool(options.get("triton.cudagraphs"))
 
     def __reduce__(self) -> tuple[type[Compiled[_P, _T]], tuple[Callable[_P, _T], str | None]]:
         """Copies and other processes compile for themselves."""
@@ -92,6 +91,8 @@ class Compiled(Generic[_P, _T]):
                 result = self._run(compiled, *args, **kwargs)
             self._seen.add(kind)
             return result
+        except torch.cuda.OutOfMemoryError:
+            raise
         except Exception as error:  # the compiler's are of many types
             result = self.function(*args, **kwargs)  # a mistake of the caller raises here as it would anywhere
             self.failed = True
@@ -99,25 +100,37 @@ class Compiled(Generic[_P, _T]):
             warnings.warn(f"Not compiled, running uncompiled. {reason[:300]}", RuntimeWarning, stacklevel=3)
             return result
 
+    def _compile(self, options: dict[str, Any]) -> Callable[..., Any]:
+        target = self.function if _LIMITS else self._leaves
+        try:
+            return torch.compile(target, fullgraph=True, options=options, **_LIMITS)
+        except RuntimeError:  # PyTorch before 2.8 does not know all of the options
+            return torch.compile(target, fullgraph=True, mode=self.mode)
+
     def _run(self, compiled: Callable[..., Any], *args: _P.args, **kwargs: _P.kwargs) -> _T:
         """Call the compiled function. A compiler before PyTorch 2.13 returns tensors: some named tuples it cannot."""
         result = compiled(*args, **kwargs)
         if not _LIMITS:
-            leaves = iter(result)
-            result = map_tensors(lambda _: next(leaves), self._structure(*args, **kwargs))
-        # The next replay of a CUDA graph overwrites the results of the last one.
-        return map_tensors(torch.clone, result) if self.mode == "reduce-overhead" else result
+            like = self._structure(*args, **kwargs)
+            leaves = dict(enumerate(result))
+            result = map_tensors(lambda _: leaves.pop(min(leaves)), like)
+            assert not leaves
+        return map_tensors(torch.clone, result) if self._copies else result
 
     def _structure(self, *args: _P.args, **kwargs: _P.kwargs) -> _T:
         """What the function returns, of empty tensors."""
-        values = *args, *kwargs.values()
-        key = torch.is_grad_enabled(), len(list(iter_tensors(values))), *(x for x in values if isinstance(x, int))
+        key = torch.is_grad_enabled(), _kinds((args, *kwargs.items()))
         if key not in self._like:
             self._like[key] = map_tensors(lambda x: x.new_empty(()), self.function(*args, **kwargs))
         return self._like[key]
 
     def _leaves(self, *args: _P.args, **kwargs: _P.kwargs) -> list[Tensor]:
         return list(iter_tensors(self.function(*args, **kwargs)))
+
+
+def _kinds(x: Any) -> Any:
+    """Nested tuples with the type of each tensor in its place."""
+    return tuple(map(_kinds, x)) if isinstance(x, (tuple, list)) else type(x) if isinstance(x, Tensor) else x
 
 
 def per_problem(scalar: Tensor, like: Tensor) -> Tensor:

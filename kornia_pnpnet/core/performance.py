@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -32,7 +32,6 @@ __all__ = [
     "unfold_vmap",
 ]
 
-_P = ParamSpec("_P")
 _T = TypeVar("_T")
 
 # -- switches ----------------------------------------------------------------------------------------------------------

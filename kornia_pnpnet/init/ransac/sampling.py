@@ -186,7 +186,6 @@ class Samples:
     def __init__(self, there: Tensor, *, size: int, most: int, seed: int, chances: Tensor | None = None) -> None:
         pairs, device = there.shape[1], there.device
         self.size = size
-        self.seed = seed
         self.counts = there.sum(-1)
         self._present_first = present_first(there)
         subsets = [math.comb(n, size) for n in range(pairs + 1)]
