@@ -20,7 +20,7 @@ _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
 # Each solver counts its own compilations: numbers of pairs, dtypes, with and without gradients. PyTorch before 2.13
-# cannot: there it is eight for all solvers together.
+# cannot: there all solvers count together.
 _LIMITS: dict[str, Any] = {"recompile_limit": 64, "isolate_recompiles": True}
 _LIMITS = _LIMITS if "isolate_recompiles" in inspect.signature(torch.compile).parameters else {}
 
@@ -109,10 +109,12 @@ class Compiled(Generic[_P, _T]):
 
     def _run(self, compiled: Callable[..., Any], *args: _P.args, **kwargs: _P.kwargs) -> _T:
         """Call the compiled function. A compiler before PyTorch 2.13 returns tensors: some named tuples it cannot."""
-        result = compiled(*args, **kwargs)
-        if not _LIMITS:
+        if _LIMITS:
+            result = compiled(*args, **kwargs)
+        else:
             like = self._structure(*args, **kwargs)
-            leaves = dict(enumerate(result))
+            with torch._dynamo.config.patch(cache_size_limit=64):  # all share the code of `_leaves`
+                leaves = dict(enumerate(compiled(*args, **kwargs)))
             result = map_tensors(lambda _: leaves.pop(min(leaves)), like)
             assert not leaves
         return map_tensors(torch.clone, result) if self._copies else result
