@@ -111,7 +111,7 @@ def test_run_writes_results_and_resumes(tmp_path, train):
     assert again.value.code == 1
     assert "resume=true" in (tmp_path / "train.log").read_text()
     train(f"hydra.run.dir={tmp_path}", "train.updates=1", "resume=true")
-    assert (tmp_path / "train.log").read_text().count("1 updates") == 2
+    assert (tmp_path / "train.log").read_text().count("1 updates, ") == 2
 
 
 def test_run_starts_from_weights(tmp_path, train):
