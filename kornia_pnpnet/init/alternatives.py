@@ -191,7 +191,10 @@ def _mirrored(pose: Pose, corr: Correspondences, weights: Tensor) -> Pose:
     middle = (share[..., None] * corr.world_points).sum(1)
     centred = corr.world_points - middle[:, None]
     covariance = centred.mT @ (share[..., None] * centred)
-    normal = eigenvectors(covariance.permute(1, 2, 0))[0][1].mT  # LAPACK takes longer, and cuSOLVER fails for many
+    if covariance.device.type == "cpu":
+        normal = torch.linalg.eigh(covariance).eigenvectors[..., 0]
+    else:  # cuSOLVER takes 250 KiB for each, and fails for a hundred thousand
+        normal = eigenvectors(covariance.permute(1, 2, 0))[0][1].mT
     seen = (pose.rotation @ middle[..., None])[..., 0] + pose.translation
     rotation = _half_turn(seen) @ pose.rotation @ _half_turn(normal)
     return Pose(rotation, seen - (rotation @ middle[..., None])[..., 0])
