@@ -2,7 +2,7 @@
 
 from .confidence import Calibration as Calibration, fit_confidence as fit_confidence
 from .covariance import pose_covariance as pose_covariance
-from .init import MLPInit as MLPInit, SetInit as SetInit, p3p as p3p
+
 from .likelihood import (
     gaussian_pose_loss as gaussian_pose_loss,
     monte_carlo_pose_loss as monte_carlo_pose_loss,

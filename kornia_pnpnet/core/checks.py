@@ -12,14 +12,11 @@ from kornia.core.check import KORNIA_CHECK
 from kornia.core.exceptions import DeviceError, ShapeError, TypeCheckError
 from torch import Tensor
 
-from kornia_pnpnet.types import Pose
-
 __all__ = [
     "Shapes",
     "check_devices",
     "check_like",
     "check_numbers",
-    "check_poses",
     "check_positive",
     "check_ranges",
     "check_shapes",
@@ -121,20 +118,6 @@ def common_dtype(tensors: Mapping[str, Tensor | None]) -> torch.dtype:
         if dtype == torch.bool or dtype.is_complex:
             raise TypeCheckError(f"{name} must hold floats or integers, got {dtype}.")
     return torch.float64 if torch.float64 in given.values() else torch.float32
-
-
-def check_poses(estimate: Pose, truth: Pose) -> None:
-    """Check that two batches of poses match exactly. Broadcasting would compare poses of different problems."""
-    batch = tuple(estimate.translation.shape[:-1])
-    shapes: Shapes = {
-        "The rotation of the estimate": (estimate.rotation, (*batch, 3, 3)),
-        "The translation of the estimate": (estimate.translation, (*batch, 3)),
-        "The rotation of the truth": (truth.rotation, (*batch, 3, 3)),
-        "The translation of the truth": (truth.translation, (*batch, 3)),
-    }
-    check_shapes(shapes)
-    tensors = {name: tensor for name, (tensor, _) in shapes.items()}
-    check_like(tensors, truth.translation, "the translation of the truth")
 
 
 def expand_sigma(name: str, sigma: Tensor | float | None, world_points: Tensor) -> Tensor:

@@ -7,12 +7,14 @@ microsecond and its operands stay in the cache; a thousand calls of LAPACK take 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import reduce
+from operator import and_
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from kornia_pnpnet.core.performance import compiling
+from kornia_pnpnet.core.performance import are_few, compiling
 
 __all__ = [
     "bound_gradient",
@@ -24,6 +26,7 @@ __all__ = [
     "relative",
     "small_product",
     "solve_leading",
+    "solve_positive",
     "solve_symmetric",
     "substitute",
     "symmetric",
@@ -32,6 +35,8 @@ __all__ = [
 # Sweeps of Jacobi's rotations in `eigenvectors`. After two, the median error of an eigenvalue of a random matrix is
 # below 1e-9 of the matrix's norm (tests/test_core_linalg.py).
 _SWEEPS = 2
+# Units in the last place of the diagonal. A pivot below this is rounding.
+_PIVOT = 10.0
 
 
 def dot(a: Iterable[Tensor], b: Iterable[Tensor]) -> Tensor:
@@ -320,6 +325,50 @@ def substitute(lower: Mapping[tuple[int, int], Tensor], scaled: Iterable[Tensor]
         for k in range(i):
             solution[k] = torch.addcmul(solution[k], lower[i, k], solution[i], value=-1)
     return solution
+
+
+def solve_positive(matrix: Tensor, right: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Solve :math:`(H + \lambda\,\mathrm{diag}(H))\,x = g` for positive semi-definite matrices, with a verdict on each.
+
+    Few systems are solved by LAPACK; many, and those of a graph, by an LDLᵀ factorisation written out entry by entry: it
+    exports, it compiles to one loop, and it takes half the time for 1000 systems (LAPACK a seventh for one).
+
+    Args:
+        matrix: :math:`H`, shape :math:`(K, K, B)`.
+        right: :math:`g`, shape :math:`(K, B)`.
+        damping: :math:`\lambda \ge 0`, a scalar or :math:`(B,)`.
+
+    Returns:
+        The solutions, shape :math:`(K, B)`, and whether there is a solution, bool :math:`(B,)`: whether all pivots are
+        above rounding, a test that does not depend on units. Values and gradients are finite everywhere.
+
+    Example:
+        >>> matrix, right = torch.tensor([[4.0, 0.0], [0.0, 4.0]])[..., None], torch.tensor([[8.0], [4.0]])
+        >>> solve_positive(matrix, right, torch.tensor(1.0))
+        (tensor([[1.0000],
+                [0.5000]]), tensor([True]))
+    """
+    size, limits = len(right), torch.finfo(right.dtype)
+    diagonal = matrix.diagonal().mT * (1.0 + damping)  # (K, B)
+    if not are_few(right):
+        rows = [[*row[:i], diagonal[i]] for i, row in enumerate(matrix.unbind())]
+        smallest, infinite = torch.full_like(diagonal[0], limits.tiny), torch.full_like(diagonal[0], torch.inf)
+        good: list[Tensor] = []
+
+        def inverse(k: int, pivot: Tensor) -> Tensor:
+            good.append(torch.add(pivot, diagonal[k], alpha=-_PIVOT * limits.eps) > smallest)
+            return torch.where(good[-1], pivot, infinite).reciprocal()
+
+        lower, scaled = factorise(rows, list(right.unbind()), inverse)
+        return torch.stack(substitute(lower, scaled)), reduce(and_, good)
+    damped = matrix.permute(2, 0, 1).clone()
+    damped.diagonal(dim1=1, dim2=2).copy_(diagonal.mT)
+    factor, info = torch.linalg.cholesky_ex(damped.detach())
+    pivots = factor.diagonal(dim1=1, dim2=2).square() - _PIVOT * limits.eps * diagonal.mT
+    solved = (pivots > limits.tiny).all(1) & (info == 0)  # NaN compares false
+    safe = torch.where(solved[:, None, None], damped, torch.eye(size, dtype=right.dtype, device=right.device))
+    solution = torch.cholesky_solve(right.mT[..., None], torch.linalg.cholesky_ex(safe).L)
+    return solution[..., 0].mT, solved
 
 
 def eigenvectors(matrix: Tensor) -> list[tuple[Tensor, Tensor]]:

@@ -16,6 +16,7 @@ from torch import Tensor
 from kornia_pnpnet.core.trees import map_tensors
 
 __all__ = [
+    "are_few",
     "ascending_order",
     "compiling",
     "exporting",
@@ -64,6 +65,16 @@ def in_full_precision(device: str) -> AbstractContextManager[Any]:
     if torch.compiler.is_exporting() or not torch.amp.is_autocast_available(device):
         return nullcontext()
     return torch.autocast(device, enabled=False)
+
+
+# Numbers. Up to here an operation on a processor takes about as long as its call: few operations on larger tensors that
+# repeat some work take less time than many operations on small ones.
+_FEW_NUMBERS = 4096
+
+
+def are_few(x: Tensor) -> bool:
+    """Whether calls, not arithmetic, take the time of operations on a tensor: uncompiled, on a CPU, and small."""
+    return not compiling() and x.device.type == "cpu" and x.numel() <= _FEW_NUMBERS
 
 
 # -- memory layouts ----------------------------------------------------------------------------------------------------

@@ -11,13 +11,13 @@ from torch import Tensor
 from kornia_pnpnet.core.performance import problems_last
 from kornia_pnpnet.core.trees import map_tensors, take
 from kornia_pnpnet.geometry import Projection, project
-from kornia_pnpnet.init.ransac.minimal import MinimalSolver
-from kornia_pnpnet.init.ransac.sampling import Samples, agreement_of_neighbours, kept_at_once
-from kornia_pnpnet.init.ransac.scoring import Scene, Scorer
+from kornia_pnpnet.propose.minimal import MinimalSolver
+from kornia_pnpnet.propose.sampling import Samples, agreement_of_neighbours, kept_at_once
+from kornia_pnpnet.propose.scoring import Scene, Scorer
 from kornia_pnpnet.refine import LMStep, lm_step
-from kornia_pnpnet.refine.inliers import Thresholds, judge
-from kornia_pnpnet.refine.verdict import residual_noise, rotation_sigma
-from kornia_pnpnet.types import Correspondences, FocalHypotheses, Noise, Pose
+from kornia_pnpnet.judge.inliers import Thresholds, judge
+from kornia_pnpnet.judge.belief import residual_noise, rotation_sigma
+from kornia_pnpnet.types import Problem, Hypotheses, Noise, Pose
 
 __all__ = ["PAIRS_PER_SAMPLE", "Found", "Plan", "Search", "full_vectors", "least_squares"]
 
@@ -55,7 +55,7 @@ PAIRS_PER_SAMPLE = 4
 
 
 class Plan(NamedTuple):
-    """How to search, see the arguments of :class:`~kornia_pnpnet.init.ransac.ransac.RANSAC`."""
+    """How to search, see the arguments of :class:`~kornia_pnpnet.propose.ransac.RANSAC`."""
 
     minimal: MinimalSolver
     scorer: Scorer
@@ -98,12 +98,12 @@ class Search:
             show it when ``None``.
 
     Example:
-        >>> from kornia_pnpnet.init.ransac.p3p import P3P
-        >>> from kornia_pnpnet.init.ransac.scoring import SCORERS
+        >>> from kornia_pnpnet.propose.p3p import P3P
+        >>> from kornia_pnpnet.propose.scoring import SCORERS
         >>> points = torch.rand(1, 6, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
         >>> cam_points = points + torch.tensor([0.0, 0.0, 5.0], dtype=torch.float64)
         >>> pixels = 100.0 * cam_points[..., :2] / cam_points[..., 2:]
-        >>> corr = Correspondences(points, pixels, torch.ones_like(pixels[..., 0]), pixels.new_tensor(100.0))
+        >>> corr = Problem(points, pixels, torch.ones_like(pixels[..., 0]), pixels.new_tensor(100.0))
         >>> plan = Plan(P3P(), SCORERS["msac"], 100, 32, 0.999, 2, 2, 0, 4096)
         >>> found = Search(plan, corr, Thresholds(pixels.new_tensor([1.0]), pixels.new_tensor([0.0]))).run()
         >>> round(found.pose.translation[0, 2].item(), 3), found.samples
@@ -113,7 +113,7 @@ class Search:
     def __init__(
         self,
         plan: Plan,
-        corr: Correspondences,
+        corr: Problem,
         thresholds: Thresholds,
         chances: Tensor | None = None,
         sigma: Tensor | None = None,
@@ -250,7 +250,7 @@ class Search:
         world, img, weights, rig = values.split((3, 2, 1, values.shape[-1] - 6), -1)
         owners = full_vectors(problems.repeat_interleave(count))
         img_scale, world_scale, free = take((self.corr.img_scale, self.corr.world_scale, self.corr.free_focal), owners)
-        sample = Correspondences(world, img, weights[..., 0], self.corr.focal, img_scale, world_scale, free_focal=free)
+        sample = Problem(world, img, weights[..., 0], self.corr.focal, img_scale, world_scale, free_focal=free)
         if self.corr.rig is not None:
             sample = sample._replace(rig=Pose(rig[..., :9].unflatten(-1, (3, 3)), rig[..., 9:]))
         solved = self.plan.minimal.hypotheses(sample)
@@ -264,7 +264,7 @@ class Search:
         # Components first, the layout of p3p's results: each is selected along a row of memory.
         pose, zoom = map_tensors(
             lambda x: x.movedim((0, 1), (-1, -2)).flatten(-2).index_select(-1, at).unflatten(-1, valid.shape),
-            (solved.pose, solved.zoom if isinstance(solved, FocalHypotheses) else None),
+            (solved.pose, solved.zoom if isinstance(solved, Hypotheses) else None),
         )
         rotation, translation = pose
         if zoom is not None:
@@ -324,7 +324,7 @@ class Search:
         return torch.where(better, new_loss, loss), torch.where(better[:, None, None], new_matrix, matrix)
 
 
-def least_squares(corr: Correspondences, pose: Pose, projection: Projection, weights: Tensor) -> LMStep:
+def least_squares(corr: Problem, pose: Pose, projection: Projection, weights: Tensor) -> LMStep:
     """Take one step of least squares with the weights (B, N) times the weights of the pairs."""
     one, damping = corr.weights.new_ones(()), corr.weights.new_full((), _DAMPING)
     weights = corr.weights * weights

@@ -16,10 +16,10 @@ from kornia_pnpnet.core.linalg import dot
 from kornia_pnpnet.core.performance import compiling, fold_vmap, unfold_vmap
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import MIN_DEPTH_RATIO
-from kornia_pnpnet.init.ransac.law_of_cosines import Triple, distances, turn_to_largest, turned
-from kornia_pnpnet.init.ransac.sampling import kept_at_once
+from kornia_pnpnet.propose.law_of_cosines import Triple, distances, turn_to_largest, turned
+from kornia_pnpnet.propose.sampling import kept_at_once
 from kornia_pnpnet.inputs import one_batch, restore_leading
-from kornia_pnpnet.types import Correspondences, FocalHypotheses, Hypotheses, Pose
+from kornia_pnpnet.types import Problem, Hypotheses, Hypotheses, Pose
 
 __all__ = ["P3P", "p3p"]
 
@@ -187,7 +187,7 @@ def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
     r"""Find all poses that project three world points exactly onto three image points, for a batch of problems.
 
     Use this function when there are exactly three pairs. A solver answers with one pose, which most solvers do not
-    believe (:attr:`~kornia_pnpnet.types.Status.NOT_BELIEVED`), because no fourth pair confirms it.
+    believe (:attr:`~kornia_pnpnet.result.Status.NOT_BELIEVED`), because no fourth pair confirms it.
 
     Convention: ``x_cam = R x_world + t``, the camera looks along +z.
 
@@ -255,7 +255,7 @@ class P3PFocals(Configured):
         check_whole(1, steps=steps)
         self.steps = steps
 
-    def hypotheses(self, corr: Correspondences) -> FocalHypotheses:
+    def hypotheses(self, corr: Problem) -> Hypotheses:
         r"""Solve samples of three pairs.
 
         Args:
@@ -281,14 +281,14 @@ class P3PFocals(Configured):
             return last.movedim((-1, -2), (0, 1))
 
         pose = map_tensors(slots, pose)
-        return FocalHypotheses(pose, slots(valid), zoom.repeat(4, 1).mT)
+        return Hypotheses(pose, slots(valid), zoom.repeat(4, 1).mT)
 
 
 class P3P(Configured):
-    r"""Minimal solver of three pairs for :class:`~kornia_pnpnet.init.RANSAC`: :func:`p3p` as a module.
+    r"""Minimal solver of three pairs for :class:`~kornia_pnpnet.propose.RANSAC`: :func:`p3p` as a module.
 
     Example:
-        >>> corr = Correspondences(torch.randn(7, 3, 3), torch.randn(7, 3, 2), torch.ones(7, 3), torch.tensor(1.0))
+        >>> corr = Problem(torch.randn(7, 3, 3), torch.randn(7, 3, 2), torch.ones(7, 3), torch.tensor(1.0))
         >>> P3P().hypotheses(corr).pose.rotation.shape
         torch.Size([7, 4, 3, 3])
     """
@@ -299,7 +299,7 @@ class P3P(Configured):
     def __init__(self) -> None:
         super().__init__(locals())
 
-    def hypotheses(self, corr: Correspondences) -> Hypotheses:
+    def hypotheses(self, corr: Problem) -> Hypotheses:
         r"""Solve samples of three pairs.
 
         Args:

@@ -257,7 +257,7 @@ class Samples:
     def spread(self, problems: Tensor, count: int) -> Tensor:
         r"""Positions of ``count`` pairs spread evenly over the pairs that have a weight, shape :math:`(P, count)`.
 
-        Pairs that :class:`~kornia_pnpnet.normalize.Normalize` has ordered are then spread over the image. Where pairs
+        Pairs that :class:`~kornia_pnpnet.frame.Normalize` has ordered are then spread over the image. Where pairs
         are unequally likely, likely ones come more often.
         """
         middle = 2 * torch.arange(count, device=problems.device) + 1

@@ -1,6 +1,6 @@
 r"""EPnP's equations in the four depths of the control points, with the problems in the last dimension.
 
-With orthonormal coordinates (see :mod:`~kornia_pnpnet.init.epnp.control_points`) the equations
+With orthonormal coordinates (see :mod:`~kornia_pnpnet.propose.epnp.control_points`) the equations
 :math:`\sum_j a_{ij} (x_j - u_i z_j) = 0`, and the same with :math:`y` and :math:`v`, are solved for x and y in closed
 form: :math:`x = P z` with :math:`P = \sum_i w_i u_i a_i a_i^\top`, and :math:`y = Q z` with :math:`v_i` instead of
 :math:`u_i`. The remaining algebraic error :math:`z^\top K z` has 4 unknowns where the paper's :math:`M^\top M` has 12,
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from kornia_pnpnet.core.linalg import dot, eigenvectors, small_product, solve_leading
 from kornia_pnpnet.geometry import NormalEquations
-from kornia_pnpnet.init.epnp.control_points import ControlPoints
+from kornia_pnpnet.propose.epnp.control_points import ControlPoints
 from kornia_pnpnet.refine import solve_damped
 
 __all__ = [

@@ -10,19 +10,19 @@ from torch import nn
 from kornia_pnpnet.core.checks import check_whole
 from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.refine import RobustWeightedLM
-from kornia_pnpnet.types import Correspondences, FocalHypotheses, Hypotheses, Pose
+from kornia_pnpnet.types import Problem, Hypotheses, Hypotheses, Pose
 
 __all__ = ["MinimalSolver", "SubsetSolver", "describe"]
 
 
 class MinimalSolver(Protocol):
-    """Solves samples of ``sample_size`` pairs each, for example :class:`~kornia_pnpnet.init.P3P`."""
+    """Solves samples of ``sample_size`` pairs each, for example :class:`~kornia_pnpnet.propose.P3P`."""
 
     @property
     def sample_size(self) -> int:
         """Number of pairs in a sample."""
 
-    def hypotheses(self, corr: Correspondences) -> Hypotheses | FocalHypotheses:
+    def hypotheses(self, corr: Problem) -> Hypotheses | Hypotheses:
         """Return the poses of a batch of samples."""
 
 
@@ -30,7 +30,7 @@ class SubsetSolver(Configured):
     r"""A solver of samples made of an initialiser, for example the paper's "EPnP-LM on subsets of 7".
 
     Args:
-        init: maps :class:`~kornia_pnpnet.types.Correspondences` to a :class:`~kornia_pnpnet.types.Guess`.
+        init: maps :class:`~kornia_pnpnet.problem.Problem` to a :class:`~kornia_pnpnet.problem.Starts`.
         refine: refines the guess; ``None``: the guess is the solution.
         size: number of pairs in a sample.
 
@@ -38,9 +38,9 @@ class SubsetSolver(Configured):
         BaseError: when ``size`` is less than 3.
 
     Example:
-        >>> from kornia_pnpnet.init.mlp import MLPInit
+        >>> from kornia_pnpnet.propose.mlp import MLPInit
         >>> solver = SubsetSolver(MLPInit(n=7), RobustWeightedLM(m=5, learnable=False), size=7)
-        >>> corr = Correspondences(torch.randn(2, 7, 3), torch.randn(2, 7, 2), torch.ones(2, 7), torch.tensor(3400.0))
+        >>> corr = Problem(torch.randn(2, 7, 3), torch.randn(2, 7, 2), torch.ones(2, 7), torch.tensor(3400.0))
         >>> solver.hypotheses(corr).pose.rotation.shape
         torch.Size([2, 1, 3, 3])
     """
@@ -53,7 +53,7 @@ class SubsetSolver(Configured):
         self.refine = refine
         self.sample_size = size
 
-    def hypotheses(self, corr: Correspondences) -> Hypotheses:
+    def hypotheses(self, corr: Problem) -> Hypotheses:
         r"""Solve samples.
 
         Args:

@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from kornia_pnpnet.core.linalg import dot, solve_symmetric
-from kornia_pnpnet.types import Correspondences
+from kornia_pnpnet.types import Problem
 
 __all__ = ["LEAST_NOISE", "LOG_NOISE", "View", "repeats"]
 
@@ -35,9 +35,9 @@ class View:
     regression).
     """
 
-    def __init__(self, corr: Correspondences, confidence: bool, repeats: Tensor | None) -> None:
+    def __init__(self, corr: Problem, confidence: bool, repeats: Tensor | None) -> None:
         world = corr.world_points.contiguous()
-        there = (corr.near_weights > 0).to(world.dtype)
+        there = (corr.usual_weights > 0).to(world.dtype)
         share = (there / there.sum(1, keepdim=True).clamp(min=1.0))[..., None]  # (B, N, 1)
         plane = corr.img_points / corr.focal
         rays = functional.normalize(torch.cat((plane, torch.ones_like(plane[..., :1])), -1), dim=-1)
@@ -73,7 +73,7 @@ class View:
         parts = self.points, seen, residual, problem, *(x[..., None] for x in (*noise, *flags))
         self.features = torch.cat(parts, -1).clamp(-_MOST, _MOST)
 
-    def _known(self, corr: Correspondences) -> list[tuple[Tensor, Tensor]]:
+    def _known(self, corr: Problem) -> list[tuple[Tensor, Tensor]]:
         """Logarithms of the noise of pixels and of points relative to their spread, and whether the noise is known."""
         if corr.noise is None:
             no = torch.zeros_like(corr.weights, dtype=torch.bool)
@@ -90,9 +90,9 @@ class View:
 
 
 @torch.no_grad()
-def repeats(corr: Correspondences) -> Tensor:
+def repeats(corr: Problem) -> Tensor:
     """Logarithms of the numbers of pairs with the same pixel and with the same point, (B, N, 2)."""
-    there = (corr.near_weights > 0).to(corr.weights)
+    there = (corr.usual_weights > 0).to(corr.weights)
     return torch.stack([_same(x, there).log() for x in (corr.img_points, corr.world_points)], -1)
 
 

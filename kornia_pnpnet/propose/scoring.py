@@ -1,7 +1,7 @@
 r"""Scores of thousands of poses per problem at once, and the rules that turn residuals into losses.
 
 A new scoring rule is one entry of :data:`SCORERS`. The *standardised* squared residual :math:`e` of a pair is its
-squared residual over the squared threshold, see :mod:`kornia_pnpnet.refine.verdict`. With both multiplied by
+squared residual over the squared threshold, see :mod:`kornia_pnpnet.judge.belief`. With both multiplied by
 :math:`(z/f)^2` there is no division by the depth, and the projection is one matrix product:
 
 .. math:: e = \frac{(x - z\,b_u/f)^2 + (y - z\,b_v/f)^2}{(z \tau / f)^2 + \omega^2}
@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.refine.inliers import MAX_ERROR, Thresholds
+from kornia_pnpnet.judge.inliers import MAX_ERROR, Thresholds
 from kornia_pnpnet.refine.prior import votes
-from kornia_pnpnet.types import Correspondences, FramedPrior, Pose
+from kornia_pnpnet.types import Problem, FramedPrior, Pose
 
 __all__ = ["SCORERS", "Scene", "Scorer", "standardised_errors"]
 
@@ -71,7 +71,7 @@ class Scene(NamedTuple):
     shifts: Tensor | None = None
 
     @classmethod
-    def make(cls, corr: Correspondences, thresholds: Thresholds, dtype: torch.dtype) -> Scene:
+    def make(cls, corr: Problem, thresholds: Thresholds, dtype: torch.dtype) -> Scene:
         """Bring correspondences to this form, in a dtype that suffices to compare poses."""
         points = torch.cat((corr.world_points, torch.ones_like(corr.weights)[..., None]), -1)
         tau, wider = thresholds.img, None
@@ -150,7 +150,7 @@ class Scene(NamedTuple):
         return losses + 0.5 * prior.rank - votes(prior, Pose(matrices[..., :3], matrices[..., 3]))
 
 
-def _rows_of_rig(corr: Correspondences, points: Tensor, tau: Tensor) -> tuple[Tensor, Tensor]:
+def _rows_of_rig(corr: Problem, points: Tensor, tau: Tensor) -> tuple[Tensor, Tensor]:
     """``rows`` and ``shifts`` of a :class:`Scene`; the depth is multiplied by ``depth_scale``."""
     assert corr.rig is not None
     rotation, translation = corr.rig
@@ -174,11 +174,11 @@ def standardised_errors(scene: Scene, packed: Tensor) -> Tensor:
         packed: poses of :meth:`Scene.pack`, shape :math:`(P, 4, 3, H)`.
 
     Returns:
-        At most :data:`~kornia_pnpnet.refine.inliers.MAX_ERROR`, shape :math:`(P, N, H)`.
+        At most :data:`~kornia_pnpnet.judge.inliers.MAX_ERROR`, shape :math:`(P, N, H)`.
 
     Example:
         >>> points = torch.tensor([[[0.0, 0.0, 4.0], [1.0, 0.0, 4.0]]])
-        >>> corr = Correspondences(points, torch.zeros(1, 2, 2), torch.ones(1, 2), torch.tensor(100.0))
+        >>> corr = Problem(points, torch.zeros(1, 2, 2), torch.ones(1, 2), torch.tensor(100.0))
         >>> scene = Scene.make(corr, Thresholds(torch.tensor([10.0]), torch.tensor([0.0])), torch.float64)
         >>> standardised_errors(scene, scene.pack(torch.eye(3).view(3, 3, 1, 1), torch.zeros(3, 1, 1)))[0, :, 0]
         tensor([0.0000, 6.2500], dtype=torch.float64)

@@ -10,13 +10,13 @@ from torch.nn import functional
 
 from kornia_pnpnet.cameras import undistort
 from kornia_pnpnet.core.performance import ranked
-from kornia_pnpnet.init.ransac import P3P, RANSAC
-from kornia_pnpnet.init.set import SetInit
+from kornia_pnpnet.propose import P3P, RANSAC
+from kornia_pnpnet.propose.set import SetInit
 from kornia_pnpnet.inputs import Inputs, with_undistorted
-from kornia_pnpnet.normalize import Frame, Normalize
+from kornia_pnpnet.frame import Frame, Normalize
 from kornia_pnpnet.refine import LMStart, LMStep, RobustWeightedLM
 from kornia_pnpnet.refine.radial import distorted, estimate_radial, refine_radial, rescaled
-from kornia_pnpnet.types import Correspondences, FreeFocal, PnPResult, Pose
+from kornia_pnpnet.types import Problem, FreeFocal, PnPResult, Pose
 
 __all__ = [
     "MORE_ITERATIONS",
@@ -201,7 +201,7 @@ def iterate_with_radial(
     dist = _as_dist(end.radial)
     pixels, found, noise = undistort(seen.img_points, camera, dist, None, seen.noise)
 
-    def changed(corr: Correspondences) -> Correspondences:
+    def changed(corr: Problem) -> Problem:
         return corr._replace(img_points=pixels, noise=noise, weights=torch.where(found, corr.weights, 0.0))
 
     corr, guided, by_residual = (changed(x) for x in (start.corr, start.guided, start.by_residual))

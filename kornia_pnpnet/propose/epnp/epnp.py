@@ -10,8 +10,8 @@ from torch import Tensor
 from kornia_pnpnet.core.checks import check_numbers, check_whole
 from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.linalg import dot, nearest_rotation, small_product
-from kornia_pnpnet.init.epnp.control_points import ControlPoints, control_points
-from kornia_pnpnet.init.epnp.depths import (
+from kornia_pnpnet.propose.epnp.control_points import ControlPoints, control_points
+from kornia_pnpnet.propose.epnp.depths import (
     DepthSystem,
     attach_gradient,
     control_points_in_camera,
@@ -19,7 +19,7 @@ from kornia_pnpnet.init.epnp.depths import (
     four_cases,
     minimize,
 )
-from kornia_pnpnet.types import Correspondences, Guess, Pose
+from kornia_pnpnet.types import Problem, Starts, Pose
 
 __all__ = ["EPnP", "best_case"]
 
@@ -45,7 +45,7 @@ class EPnP(Configured):
     Source: V. Lepetit, F. Moreno-Noguer and P. Fua, "EPnP: An Accurate O(n) Solution to the PnP Problem", IJCV 2009.
     Our changes are for accuracy, for speed, and to avoid eigenvectors of equal eigenvalues:
 
-    - Two thirds of the 12 unknowns are eliminated (``kornia_pnpnet.init.epnp.depths``); the depths of the control
+    - Two thirds of the 12 unknowns are eliminated (``kornia_pnpnet.propose.epnp.depths``); the depths of the control
       points remain. The null vectors are ordered by their algebraic error at equal depth of the centroid instead of
       equal length. Where fewer than six pairs leave several null vectors, the vectors along the world's longest
       extents come first.
@@ -91,7 +91,7 @@ class EPnP(Configured):
         self.iterations = iterations
         self.algebraic_weight = algebraic_weight
 
-    def forward(self, corr: Correspondences) -> Guess:
+    def forward(self, corr: Problem) -> Starts:
         r"""Find the pose.
 
         Args:
@@ -100,7 +100,7 @@ class EPnP(Configured):
         Returns:
             The pose, weights of 1, and ``ok``. Where ``ok`` is false the pose is finite.
         """
-        corr = corr._replace(weights=corr.near_weights)
+        corr = corr._replace(weights=corr.usual_weights)
         control = control_points(corr)
         plane_points = (corr.img_points.permute(2, 1, 0) / corr.focal).contiguous()  # (2, N, B)
         system = depth_system(control, plane_points)
@@ -124,7 +124,7 @@ class EPnP(Configured):
         ok = solved & unique & (there.sum(0) >= _MIN_PAIRS)
         ok = ok & ((there & (depth > 0)).sum(0) >= _MIN_IN_FRONT)
         pose = Pose(rotation.permute(2, 0, 1).contiguous(), translation.mT.contiguous())
-        return Guess(pose, torch.ones_like(corr.weights), ok)
+        return Starts(pose, torch.ones_like(corr.weights), ok)
 
     def _depths(
         self, system: DepthSystem, control: ControlPoints, plane_points: Tensor, vectors: Tensor

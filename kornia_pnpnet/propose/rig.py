@@ -9,15 +9,15 @@ from kornia_pnpnet.core.linalg import relative
 from kornia_pnpnet.core.performance import present_first, problems_last, repeat_problems, sees_values, take_pairs
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import project
-from kornia_pnpnet.init.ransac import P3P, RANSAC
-from kornia_pnpnet.init.ransac.rig import P3PRig
-from kornia_pnpnet.init.ransac.sampling import draw_subsets
-from kornia_pnpnet.init.ransac.scoring import SCORERS, Scene
-from kornia_pnpnet.init.ransac.search import least_squares
-from kornia_pnpnet.normalize import F_CONST
-from kornia_pnpnet.refine.inliers import Thresholds, judge
-from kornia_pnpnet.refine.verdict import residual_noise
-from kornia_pnpnet.types import Correspondences, Guess, Pose
+from kornia_pnpnet.propose import P3P, RANSAC
+from kornia_pnpnet.propose.p3p_rig import P3PRig
+from kornia_pnpnet.propose.sampling import draw_subsets
+from kornia_pnpnet.propose.scoring import SCORERS, Scene
+from kornia_pnpnet.propose.search import least_squares
+from kornia_pnpnet.frame import F_CONST
+from kornia_pnpnet.judge.inliers import Thresholds, judge
+from kornia_pnpnet.judge.belief import residual_noise
+from kornia_pnpnet.types import Problem, Starts, Pose
 
 __all__ = ["guess_of_rig"]
 
@@ -37,7 +37,7 @@ _IMPROVED, _LIMITS = 3, (3.0, 1.0)
 _ROOT = 1.2207440846057596
 
 
-def guess_of_rig(corr: Correspondences, given: Pose | None, *, with_noise: bool, fixed: bool = False) -> Guess:
+def guess_of_rig(corr: Problem, given: Pose | None, *, with_noise: bool, fixed: bool = False) -> Starts:
     """Find the pose of a rig, its inliers and their noise.
 
     Args:
@@ -69,7 +69,7 @@ def guess_of_rig(corr: Correspondences, given: Pose | None, *, with_noise: bool,
     return guess._replace(ok=None, noise=noise, weights=(guess.weights > 0).to(guess.weights))
 
 
-def _best_of_samples(corr: Correspondences) -> Guess:
+def _best_of_samples(corr: Problem) -> Starts:
     """The best pose of a fixed number of minimal samples, improved on its inliers, and weights of the inliers."""
     rig, (batch, count) = corr.rig, corr.weights.shape
     assert rig is not None
@@ -104,10 +104,10 @@ def _best_of_samples(corr: Correspondences) -> Guess:
     judged = judge(projection, repeated, limits)
     loss = (repeated.weights * SCORERS["msac"](judged.errors)).sum(1)
     at = loss.unflatten(0, (_IMPROVED, batch)).argmin(0) * batch + torch.arange(batch, device=loss.device)
-    return Guess(map_tensors(lambda x: x[at], pose), judged.weights[at])
+    return Starts(map_tensors(lambda x: x[at], pose), judged.weights[at])
 
 
-def _draw(corr: Correspondences, order: Tensor, counts: Tensor) -> Tensor:
+def _draw(corr: Problem, order: Tensor, counts: Tensor) -> Tensor:
     """Positions of the pairs of the samples, (B, 3 S): first pairs, second pairs, third pairs.
 
     Args:
@@ -125,8 +125,8 @@ def _draw(corr: Correspondences, order: Tensor, counts: Tensor) -> Tensor:
     return drawn.unflatten(1, (3, _DRAWS, _SAMPLES)).gather(2, first).flatten(1)
 
 
-def _unpacked(pairs: Tensor, focal: Tensor) -> Correspondences:
-    """Correspondences from the numbers of their pairs, (18, N, B)."""
+def _unpacked(pairs: Tensor, focal: Tensor) -> Problem:
+    """Problem from the numbers of their pairs, (18, N, B)."""
     world, img, weights, rotation, translation = pairs.permute(2, 1, 0).split((3, 2, 1, 9, 3), -1)
     rig = Pose(rotation.unflatten(-1, (3, 3)), translation)
-    return Correspondences(world, img, weights[..., 0], focal, rig=rig)
+    return Problem(world, img, weights[..., 0], focal, rig=rig)

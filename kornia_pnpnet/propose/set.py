@@ -15,10 +15,10 @@ from kornia_pnpnet.core.linalg import small_product
 from kornia_pnpnet.core.performance import compiling, present_first, problems_last, sees_values, take_pairs
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import align, project
-from kornia_pnpnet.init.ransac import p3p
-from kornia_pnpnet.init.view import LEAST_NOISE, LOG_NOISE, View, repeats
+from kornia_pnpnet.propose import p3p
+from kornia_pnpnet.propose.view import LEAST_NOISE, LOG_NOISE, View, repeats
 from kornia_pnpnet.refine.prior import votes
-from kornia_pnpnet.types import Correspondences, Guess, Noise, Pose
+from kornia_pnpnet.types import Problem, Starts, Noise, Pose
 
 __all__ = ["SetInit"]
 
@@ -87,7 +87,7 @@ def _some_of(present: Tensor, count: int) -> Tensor:
 
 
 @torch.no_grad()
-def _agreement(corr: Correspondences, noise: Noise, pose: Pose) -> Tensor:
+def _agreement(corr: Problem, noise: Noise, pose: Pose) -> Tensor:
     """How well each pair agrees with a pose, in [0, 1], (B, N)."""
     projection = project(pose, problems_last(corr))
     depth = pose.translation[:, 2:].clamp(min=_NEAREST)  # (B, 1), as in the score of a sample
@@ -150,12 +150,12 @@ class SetInit(Configured):
     network runs in the dtype of its weights, everything around it in the dtype of the correspondences.
 
     The likeliest pairs also form ``samples`` minimal samples of three, and more samples where there are more pairs.
-    The poses of the samples (see :func:`~kornia_pnpnet.init.p3p`) are scored by the 32 likeliest pairs, and the best
+    The poses of the samples (see :func:`~kornia_pnpnet.propose.p3p`) are scored by the 32 likeliest pairs, and the best
     pose is one more hypothesis: a constant without gradient, at a fixed cost.
 
     The weight of a pair is the estimated probability that it is an inlier. Of noise with covariances the network and
     the scores of samples see the standard deviation of isotropic noise of the same trace. The noise is the ``noise`` of
-    the :class:`~kornia_pnpnet.types.Correspondences` where known, else the network's estimate.
+    the :class:`~kornia_pnpnet.problem.Problem` where known, else the network's estimate.
 
     The design is ours. Distances along rays before a closed-form alignment: J. Hesch and S. Roumeliotis, "A direct
     least-squares method for PnP", ICCV 2011, among many; attention pooled over correspondences: W. Sun et al., "ACNe:
@@ -176,7 +176,7 @@ class SetInit(Configured):
         BaseError: for numbers out of range, or when ``heads`` does not divide ``width``.
 
     Example:
-        >>> corr = Correspondences(torch.randn(2, 7, 3), torch.randn(2, 7, 2), torch.ones(2, 7), torch.tensor(3400.0))
+        >>> corr = Problem(torch.randn(2, 7, 3), torch.randn(2, 7, 2), torch.ones(2, 7), torch.tensor(3400.0))
         >>> guess = SetInit(starts=3)(corr)
         >>> guess.pose.rotation.shape, guess.others.translation.shape, guess.weights.shape
         (torch.Size([2, 3, 3]), torch.Size([2, 3, 3]), torch.Size([2, 7]))
@@ -221,8 +221,8 @@ class SetInit(Configured):
                 layer.bias.zero_()
             self.pair.bias[0] = 2.0
 
-    def forward(self, corr: Correspondences, *, search_follows: bool = False) -> Guess:
-        """Guess poses, weights and noise.
+    def forward(self, corr: Problem, *, search_follows: bool = False) -> Starts:
+        """Starts poses, weights and noise.
 
         Args:
             corr: normalised correspondences of a centred and scaled world, of any :math:`N`, in any order.
@@ -241,7 +241,7 @@ class SetInit(Configured):
         given, index = corr, None
         counts = repeats(corr) if self.repeats else None
         if search_follows and corr.weights.shape[1] > _ENOUGH:
-            index = _some_of(corr.near_weights > 0, _ENOUGH)
+            index = _some_of(corr.usual_weights > 0, _ENOUGH)
             corr, counts = _taken((corr, counts), index)
         view = View(corr, self.confidence, counts)
         dtype = corr.world_points.dtype
@@ -273,7 +273,7 @@ class SetInit(Configured):
         others = Pose(*(x[:, 1:] for x in every)) if every.rotation.shape[1] > 1 else None
         if index is not None:
             right = _agreement(given, noises, Pose(*(x[:, -1] for x in every))).scatter(1, index, right)
-        return Guess(Pose(*(x[:, 0] for x in every)), right, others=others, noise=noises)
+        return Starts(Pose(*(x[:, 0] for x in every)), right, others=others, noise=noises)
 
     def triples(self, count: int, *, search_follows: bool = False) -> dict[int, list[tuple[int, int, int]]]:
         """Minimal samples of a problem.
@@ -295,11 +295,11 @@ class SetInit(Configured):
 
     @torch.no_grad()
     def _sampled(
-        self, corr: Correspondences, right: Tensor, noise: Noise, fallback: Pose, search_follows: bool
+        self, corr: Problem, right: Tensor, noise: Noise, fallback: Pose, search_follows: bool
     ) -> Pose:
         """The best pose of the minimal samples by the score of the likeliest pairs; problems last."""
         batch, count = right.shape
-        there = corr.near_weights > 0
+        there = corr.usual_weights > 0
         chances = torch.where(there, right, 0.0)
         # An unlikely pair that agrees may be an inlier after all; padding does not score.
         vote = torch.where(there, _LEAST_VOTE + (1.0 - _LEAST_VOTE) * right, 0.0)
@@ -334,7 +334,7 @@ class SetInit(Configured):
         matrices = rotation.unflatten(0, (3, 3))
         every = Pose(matrices.permute(2, 0, 1, 3)[:, :, :, None], translation.permute(1, 0, 2)[:, :, None])
         world, img, vote, *sigmas = (x.permute(1, 2, 0)[..., None, :] for x in pairs.split((3, 2, 1, 1, 1)))
-        judges = Correspondences(world, img, vote[..., 0], corr.focal)
+        judges = Problem(world, img, vote[..., 0], corr.focal)
         projection = project(every, judges)
         # The variance at the depth of the network's pose: by each pose's own depths, a pose close to the points would
         # explain most pixels.
@@ -363,7 +363,7 @@ class SetInit(Configured):
         share = _softmax(pair[:1] + absent)[0]
         return pair, self.problem(torch.bmm(share[:, None], x)[:, 0])
 
-    def _noise(self, corr: Correspondences, spread: Tensor, estimate: Tensor) -> Noise:
+    def _noise(self, corr: Problem, spread: Tensor, estimate: Tensor) -> Noise:
         """The known noise, and the network's estimate where unknown."""
         units = (corr.focal * spread)[:, None], torch.ones_like(spread)[:, None]
         told = (None, None) if corr.noise is None else (corr.noise.img, corr.noise.world)

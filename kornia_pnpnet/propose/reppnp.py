@@ -16,8 +16,8 @@ from torch import Tensor
 from kornia_pnpnet.core.checks import check_numbers, check_whole
 from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.geometry import align, retract
-from kornia_pnpnet.init.epnp.control_points import ControlPoints, control_points
-from kornia_pnpnet.types import Correspondences, Guess, Pose
+from kornia_pnpnet.propose.epnp.control_points import ControlPoints, control_points
+from kornia_pnpnet.types import Problem, Starts, Pose
 
 __all__ = ["REPPnP"]
 
@@ -113,8 +113,8 @@ class REPPnP(Configured):
         self.rigid_iterations = rigid_iterations
         self.refine_iterations = refine_iterations
 
-    def forward(self, corr: Correspondences) -> Guess:
-        r"""Guess the pose and the inliers.
+    def forward(self, corr: Problem) -> Starts:
+        r"""Starts the pose and the inliers.
 
         Args:
             corr: normalised correspondences, with any frame and unit of the world.
@@ -124,7 +124,7 @@ class REPPnP(Configured):
             for points on a line, for equations that do not determine a pose, and for a pose with the centroid of the
             points behind the camera.
         """
-        corr = corr._replace(weights=corr.near_weights)
+        corr = corr._replace(weights=corr.usual_weights)
         with torch.no_grad():
             control = control_points(corr)
         pairs, radius = _own_frame(corr, control)
@@ -138,8 +138,8 @@ class REPPnP(Configured):
         ok = ok & (pose.translation[:, 2] > 0)
         offset = (pose.rotation @ control.points[:, 0, :, None])[..., 0]
         pose = Pose(pose.rotation, pose.translation * radius[:, None] - offset)
-        kept = kept if corr.near is None else kept | (corr.near == 0)  # the solver decides about them
-        return Guess(pose, kept.to(corr.weights.dtype), ok)
+        kept = kept if corr.usual is None else kept | (corr.usual == 0)  # the solver decides about them
+        return Starts(pose, kept.to(corr.weights.dtype), ok)
 
     def _select(self, pairs: _Pairs) -> tuple[Tensor, Pose]:
         """The kept pairs, bool (B, N), and a pose that fits these pairs, in the frame of :class:`_Pairs`."""
@@ -189,7 +189,7 @@ class _Null(NamedTuple):
     inverse_depths: Tensor  # inverse normal matrix of the depths of the control vectors, (B, 3, 3)
 
 
-def _own_frame(corr: Correspondences, control: ControlPoints) -> tuple[_Pairs, Tensor]:
+def _own_frame(corr: Problem, control: ControlPoints) -> tuple[_Pairs, Tensor]:
     """The pairs in the frame of :class:`_Pairs`, and the root mean square radius (B,) before."""
     mean_square = control.points[:, 1:].square().sum((1, 2))
     radius = torch.where(control.ok, mean_square, 1.0).sqrt()

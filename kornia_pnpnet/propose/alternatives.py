@@ -12,10 +12,10 @@ from kornia_pnpnet.core.linalg import eigenvectors, gate
 from kornia_pnpnet.core.performance import repeat_problems
 from kornia_pnpnet.core.trees import map_tensors, take
 from kornia_pnpnet.geometry import project, rotation_angle
-from kornia_pnpnet.init.ransac.p3p import p3p
+from kornia_pnpnet.propose.p3p import p3p
 from kornia_pnpnet.refine import RobustWeightedLM
-from kornia_pnpnet.refine.verdict import LEAST_PROBABILITY, has_enough, residual_noise
-from kornia_pnpnet.types import Alternatives, Correspondences, Guess, PnPResult, Pose, Status
+from kornia_pnpnet.judge.belief import LEAST_PROBABILITY, has_enough, residual_noise
+from kornia_pnpnet.types import Alternatives, Problem, Starts, PnPResult, Pose, Status
 
 __all__ = ["doubt_mirrored", "find_alternatives", "is_seen"]
 
@@ -32,7 +32,7 @@ _SEEN = 0.25
 _NEAR_MIRROR, _FEW_INLIERS = 0.2, 10
 # Iterations after which mirror images are given up whose log-likelihood is this far below that of the pose.
 _FIRST_LOOK, _HOPELESS = 2, -30.0
-# Radians. A pose that is turned further is far off, see :attr:`~kornia_pnpnet.types.PnPResult.probability`.
+# Radians. A pose that is turned further is far off, see :attr:`~kornia_pnpnet.result.PnPResult.probability`.
 _FAR_TURN = math.radians(10.0)
 # For solvers that do not refine: iterations with a classical kernel.
 _ITERATIONS = 20
@@ -40,7 +40,7 @@ _ITERATIONS = 20
 
 @torch.no_grad()
 def find_alternatives(
-    refine: RobustWeightedLM, corr: Correspondences, guess: Guess, pose: Pose, valid: Tensor, most: int
+    refine: RobustWeightedLM, corr: Problem, guess: Starts, pose: Pose, valid: Tensor, most: int
 ) -> Alternatives:
     """Refine other starts and keep the minima that differ from the pose, and from each other, and are nearly as likely.
 
@@ -66,7 +66,7 @@ def find_alternatives(
     starts = [pose, mirrored, *_of_three(corr, weights, pose), *guess.poses]
     count, batch = len(starts), weights.shape[0]
     many = repeat_problems(corr, count)
-    tried = Guess(
+    tried = Starts(
         map_tensors(lambda *x: torch.cat(x), *starts),
         repeat_problems(guess.weights, count),
         noise=repeat_problems(guess.noise, count),
@@ -78,7 +78,7 @@ def find_alternatives(
     ends = map_tensors(lambda x: x.unflatten(0, (count, batch)), refined.pose)  # (S, B, ...)
     cost = refined.cost.unflatten(0, (count, batch))
     usable = (refined.in_front & refined.cost.isfinite()).unflatten(0, (count, batch))
-    unrefined = refine(corr, Guess(mirrored, guess.weights, noise=guess.noise), m=0)
+    unrefined = refine(corr, Starts(mirrored, guess.weights, noise=guess.noise), m=0)
     is_lost = _are_same(Pose(*(x[1:2] for x in ends)), pose, corr, weights)[0]
     for x, image in zip(
         (*ends, cost, usable),
@@ -117,7 +117,7 @@ def find_alternatives(
 
 
 def doubt_mirrored(
-    refine: RobustWeightedLM, corr: Correspondences, guess: Guess, pose: Pose, result: PnPResult, always: bool
+    refine: RobustWeightedLM, corr: Problem, guess: Starts, pose: Pose, result: PnPResult, always: bool
 ) -> PnPResult:
     """Do not believe a pose whose mirror image, refined, is far off and explains the pairs nearly as well.
 
@@ -149,7 +149,7 @@ def doubt_mirrored(
 
 @torch.no_grad()
 def _mirror_probability(
-    refine: RobustWeightedLM, corr: Correspondences, guess: Guess, pose: Pose, result: PnPResult
+    refine: RobustWeightedLM, corr: Problem, guess: Starts, pose: Pose, result: PnPResult
 ) -> Tensor:
     """Probability that not the pose is right but its mirror image, where one of them is, (B,); 0 where not ok."""
     weights = corr.weights * guess.weights
@@ -162,7 +162,7 @@ def _mirror_probability(
     few = (weights > 0.5).sum(-1) < _FEW_INLIERS
     rows = (result.ok & (few | ((share * near).sum(-1) > 0.5))).nonzero()[:, 0]
     probability = torch.zeros_like(share[:, 0])
-    start = Guess(mirrored, guess.weights, noise=guess.noise)
+    start = Starts(mirrored, guess.weights, noise=guess.noise)
     unit = 0.5 * (corr.weights > 0).sum(-1) / _unit(corr, start, pose)
     for m in (_FIRST_LOOK, refine.m):
         if not len(rows):
@@ -185,7 +185,7 @@ def _shares(weights: Tensor) -> Tensor:
     return weights / weights.sum(-1, keepdim=True).clamp(min=torch.finfo(weights.dtype).tiny)
 
 
-def _mirrored(pose: Pose, corr: Correspondences, weights: Tensor) -> Pose:
+def _mirrored(pose: Pose, corr: Problem, weights: Tensor) -> Pose:
     """Half a turn about the normal of the plane through the points, then about the line of sight to its middle."""
     share = _shares(weights)
     middle = (share[..., None] * corr.world_points).sum(1)
@@ -205,7 +205,7 @@ def _half_turn(axis: Tensor) -> Tensor:
     return 2.0 * axis[:, :, None] * axis[:, None] - torch.eye(3, dtype=axis.dtype, device=axis.device)
 
 
-def _of_three(corr: Correspondences, weights: Tensor, fallback: Pose) -> list[Pose]:
+def _of_three(corr: Problem, weights: Tensor, fallback: Pose) -> list[Pose]:
     """The four poses of three likely pairs that lie far apart; the fallback where there are fewer."""
     likely = weights * (weights > 0.5 * weights.amax(1, keepdim=True))
 
@@ -233,7 +233,7 @@ def _of_three(corr: Correspondences, weights: Tensor, fallback: Pose) -> list[Po
     return poses
 
 
-def _unit(corr: Correspondences, guess: Guess, pose: Pose) -> Tensor:
+def _unit(corr: Problem, guess: Starts, pose: Pose) -> Tensor:
     """What a squared residual of one standard deviation costs, (B,)."""
     if corr.noise is not None or guess.noise is not None:
         return torch.ones_like(corr.weights[:, 0])
@@ -241,7 +241,7 @@ def _unit(corr: Correspondences, guess: Guess, pose: Pose) -> Tensor:
     return noise.img[:, 0].square()
 
 
-def _are_same(poses: Pose, other: Pose, corr: Correspondences, weights: Tensor) -> Tensor:
+def _are_same(poses: Pose, other: Pose, corr: Problem, weights: Tensor) -> Tensor:
     """Which of the poses (S, B, ...) are the other pose (B, ...), bool (S, B)."""
     share = _shares(weights)
     middle = (share[..., None] * corr.world_points).sum(1)
@@ -251,7 +251,7 @@ def _are_same(poses: Pose, other: Pose, corr: Correspondences, weights: Tensor) 
     return shift & (rotation_angle(poses.rotation, other.rotation.expand_as(poses.rotation)) < _SAME_TURN)
 
 
-def is_seen(guess: Guess, corr: Correspondences) -> Tensor:
+def is_seen(guess: Starts, corr: Problem) -> Tensor:
     """Whether any pose of a guess sees a pair's point about where its pixel is, bool (B, N)."""
     seen = []
     for pose in guess.poses:

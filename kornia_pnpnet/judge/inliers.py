@@ -18,7 +18,7 @@ from torch import Tensor
 from kornia_pnpnet.core.performance import exporting, in_order, present_first
 from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.geometry import Projection
-from kornia_pnpnet.types import MIN_PAIRS, Correspondences
+from kornia_pnpnet.types import MIN_PAIRS, Problem
 
 __all__ = [
     "MAX_ERROR",
@@ -46,7 +46,7 @@ _FEW_HITS = 4
 _REACH = 20.0
 
 
-def fitted_pairs(corr: Correspondences) -> int:
+def fitted_pairs(corr: Problem) -> int:
     """Pairs that nearly any pose fits: three, or four where the focal length is unknown."""
     return MIN_PAIRS if corr.free_focal is None else MIN_PAIRS + 1
 
@@ -81,7 +81,7 @@ class Judged(NamedTuple):
     errors: Tensor
 
 
-def judge(projection: Projection, corr: Correspondences, thresholds: Thresholds) -> Judged:
+def judge(projection: Projection, corr: Problem, thresholds: Thresholds) -> Judged:
     """Tell which pairs are inliers of a pose, and how precise the inliers are.
 
     Args:
@@ -96,7 +96,7 @@ def judge(projection: Projection, corr: Correspondences, thresholds: Thresholds)
         >>> from kornia_pnpnet.geometry import project
         >>> from kornia_pnpnet.types import Pose
         >>> points = torch.tensor([[[0.0, 0.0, 4.0], [1.0, 0.0, 4.0]]])
-        >>> corr = Correspondences(points, torch.zeros(1, 2, 2), torch.ones(1, 2), torch.tensor(100.0))
+        >>> corr = Problem(points, torch.zeros(1, 2, 2), torch.ones(1, 2), torch.tensor(100.0))
         >>> projection = project(Pose(torch.eye(3)[None], torch.zeros(1, 3)), corr)
         >>> judge(projection, corr, Thresholds(torch.tensor([10.0]), torch.tensor([0.0])))
         Judged(weights=tensor([[1., 0.]]), errors=tensor([[0.0000, 6.2500]]))
@@ -110,7 +110,7 @@ def judge(projection: Projection, corr: Correspondences, thresholds: Thresholds)
     return Judged(torch.where(inlier, sq_img / sq_limit, 0.0), errors)
 
 
-def chance_of_inlier(corr: Correspondences, thresholds: Thresholds, judged: Judged) -> Tensor:
+def chance_of_inlier(corr: Problem, thresholds: Thresholds, judged: Judged) -> Tensor:
     r"""Probability that an outlier fits by chance, as well as the worst inlier does.
 
     The larger of two estimates is returned: one from the image, one from the outliers.
@@ -136,7 +136,7 @@ def chance_of_inlier(corr: Correspondences, thresholds: Thresholds, judged: Judg
 
     Example:
         >>> pixels = torch.tensor([[[0.0, 0.0], [400.0, 0.0], [0.0, 200.0]]])
-        >>> corr = Correspondences(torch.zeros(1, 3, 3), pixels, torch.ones(1, 3), torch.tensor(100.0))
+        >>> corr = Problem(torch.zeros(1, 3, 3), pixels, torch.ones(1, 3), torch.tensor(100.0))
         >>> judged = Judged(torch.ones(1, 3), torch.tensor([[0.0, 0.1, 0.25]]))  # the worst is 5 px off
         >>> chance_of_inlier(corr, Thresholds(torch.tensor([10.0]), torch.tensor([0.0])), judged) * 400 * 200
         tensor([78.5398])
@@ -162,7 +162,7 @@ def chance_of_inlier(corr: Correspondences, thresholds: Thresholds, judged: Judg
     return anywhere.maximum(by_outliers.amax(-1)).clamp(max=1.0)
 
 
-def chance_of_others(projection: Projection, corr: Correspondences, thresholds: Thresholds, judged: Judged) -> Tensor:
+def chance_of_others(projection: Projection, corr: Problem, thresholds: Thresholds, judged: Judged) -> Tensor:
     """Share of other pairs' pixels that are as near to a point's projection as the worst inlier's pixel to its own.
 
     Pixels are not uniform: many outliers may have the same pixel, and a pose from which all points are seen in a small
@@ -237,7 +237,7 @@ def log_false_alarms(
     return tested.clamp(min=1).double().log() + ways + extra * chance.double().clamp(min=tiny).log()
 
 
-def _sq_limits(projection: Projection, corr: Correspondences, thresholds: Thresholds) -> Tensor:
+def _sq_limits(projection: Projection, corr: Problem, thresholds: Thresholds) -> Tensor:
     """Largest squared residual of an inlier in square pixels, (B, N)."""
     if thresholds.precision is not None:
         return thresholds.precision.determinant.rsqrt()

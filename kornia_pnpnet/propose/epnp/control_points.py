@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_pnpnet.types import Correspondences
+from kornia_pnpnet.types import Problem
 
 __all__ = ["ControlPoints", "control_points"]
 
@@ -44,7 +44,7 @@ class ControlPoints(NamedTuple):
     ok: Tensor
 
 
-def control_points(corr: Correspondences) -> ControlPoints:
+def control_points(corr: Problem) -> ControlPoints:
     r"""Choose the control points by weighted Gram-Schmidt on the coordinates of the world points.
 
     The axis along which the points spread most comes first and is projected out of the other axes, and so on. The
@@ -62,7 +62,7 @@ def control_points(corr: Correspondences) -> ControlPoints:
 
     Example:
         >>> world = torch.tensor([[[4.0, 0, 0], [-4, 0, 0], [0, 2, 0], [0, -2, 0]]])
-        >>> corr = Correspondences(world, torch.zeros(1, 4, 2), torch.ones(1, 4), torch.tensor(1.0))
+        >>> corr = Problem(world, torch.zeros(1, 4, 2), torch.ones(1, 4), torch.tensor(1.0))
         >>> control = control_points(corr)
         >>> control.planar, torch.allclose(control.coordinates @ control.points, world)
         (tensor([True]), True)

@@ -16,12 +16,12 @@ from kornia_pnpnet.core.linalg import relative
 from kornia_pnpnet.core.performance import problems_last
 from kornia_pnpnet.core.trees import map_tensors, take
 from kornia_pnpnet.geometry import Projection, project
-from kornia_pnpnet.init.ransac.minimal import MinimalSolver, describe
-from kornia_pnpnet.init.ransac.p3p import P3P, P3PFocals
-from kornia_pnpnet.init.ransac.rig import P3PRig, is_central
-from kornia_pnpnet.init.ransac.sampling import kept_at_once
-from kornia_pnpnet.init.ransac.scoring import SCORERS, Scorer
-from kornia_pnpnet.init.ransac.search import (
+from kornia_pnpnet.propose.minimal import MinimalSolver, describe
+from kornia_pnpnet.propose.p3p import P3P, P3PFocals
+from kornia_pnpnet.propose.p3p_rig import P3PRig, is_central
+from kornia_pnpnet.propose.sampling import kept_at_once
+from kornia_pnpnet.propose.scoring import SCORERS, Scorer
+from kornia_pnpnet.propose.search import (
     PAIRS_PER_SAMPLE,
     Found,
     Plan,
@@ -29,7 +29,7 @@ from kornia_pnpnet.init.ransac.search import (
     full_vectors,
     least_squares,
 )
-from kornia_pnpnet.refine.inliers import (
+from kornia_pnpnet.judge.inliers import (
     MAX_FALSE_ALARMS,
     Judged,
     Thresholds,
@@ -40,7 +40,7 @@ from kornia_pnpnet.refine.inliers import (
     log_false_alarms,
 )
 from kornia_pnpnet.refine.prior import recentred
-from kornia_pnpnet.types import LEAST_NOISE, MIN_PAIRS, Correspondences, Guess, Pose
+from kornia_pnpnet.types import LEAST_NOISE, MIN_PAIRS, Problem, Starts, Pose
 
 __all__ = ["FURTHER", "RANSAC", "search_on"]
 
@@ -77,7 +77,7 @@ class RANSAC(Configured):
     :math:`f/z` times as much. Least squares weigh an inlier by the inverse of the right hand side.
 
     The guess is ``ok`` when fewer than 0.01 poses with as many inliers are expected by chance, from pairs without any
-    pose behind them (see :func:`~kornia_pnpnet.refine.inliers.log_false_alarms`). A problem of only three pairs is
+    pose behind them (see :func:`~kornia_pnpnet.judge.inliers.log_false_alarms`). A problem of only three pairs is
     ``ok`` when it has a pose: three pairs hold no evidence.
 
     Where the caller gave a confidence for each pair, samples hold pairs in proportion to it, and fewer samples suffice
@@ -91,8 +91,8 @@ class RANSAC(Configured):
     in D. Nistér, "Preemptive RANSAC for live structure and motion estimation", ICCV 2003.
 
     Args:
-        minimal: solver of samples, for example :class:`~kornia_pnpnet.init.P3P` or
-            :class:`~kornia_pnpnet.init.SubsetSolver`.
+        minimal: solver of samples, for example :class:`~kornia_pnpnet.propose.P3P` or
+            :class:`~kornia_pnpnet.propose.SubsetSolver`.
         threshold: :math:`\tau` in pixels of the user's camera.
         world_threshold: :math:`\omega` in the unit of the user's world.
         scorer: ``"msac"``, the truncated squares; ``"inliers"``, the number of outliers; or any function from squared
@@ -117,7 +117,7 @@ class RANSAC(Configured):
     Example:
         >>> from kornia_pnpnet import PnPNet, RobustWeightedLM
         >>> from kornia_pnpnet.data import OutlierMix, SyntheticProblems
-        >>> from kornia_pnpnet.init.ransac.p3p import P3P
+        >>> from kornia_pnpnet.propose.p3p import P3P
         >>> problems = SyntheticProblems(n=9, batch_size=4, seed=0, outliers=OutlierMix(count=2)).batch(0)
         >>> ransac = RANSAC(P3P(), threshold=6.0, world_threshold=0.3)
         >>> solver = PnPNet(ransac, RobustWeightedLM(m=0, robustness=0))
@@ -167,7 +167,7 @@ class RANSAC(Configured):
         options.update(minimal=minimal, scorer=scorer if callable(scorer) else SCORERS[scorer])
         self.plan = Plan(**options)
 
-    def forward(self, corr: Correspondences, given: Pose | None = None) -> Guess:
+    def forward(self, corr: Problem, given: Pose | None = None) -> Starts:
         r"""Find the poses.
 
         Args:
@@ -191,7 +191,7 @@ class RANSAC(Configured):
         # Contiguous, so that a sum over pairs rounds alike at every place in the batch; the noise is not used.
         corr = corr._replace(noise=None).map(torch.Tensor.contiguous)
         with torch.no_grad():
-            share = (corr.near_weights > 0).to(corr.weights)
+            share = (corr.usual_weights > 0).to(corr.weights)
             share = share / share.sum(-1, keepdim=True).clamp(min=1.0)
             centre = (share[..., None] * _constant(*corr[:3])).sum(1)  # (B, 3)
         # Weights relative to the largest weight, so that their unit does not matter.
@@ -218,16 +218,16 @@ class RANSAC(Configured):
             detached = problems_last(detached).zoomed(zoom)
             ok = self._is_evident(found, detached, thresholds, judged, project(pose, detached))
         offset = (pose.rotation @ centre[..., None])[..., 0]
-        return Guess(Pose(pose.rotation, pose.translation - offset), judged.weights, ok, zoom=zoom)
+        return Starts(Pose(pose.rotation, pose.translation - offset), judged.weights, ok, zoom=zoom)
 
-    def _thresholds(self, corr: Correspondences) -> Thresholds:
+    def _thresholds(self, corr: Problem) -> Thresholds:
         """The thresholds in units of the correspondences, (B,) each."""
         one = torch.ones_like(corr.weights[:, 0])
         img, world = (one if scale is None else scale.detach() for scale in (corr.img_scale, corr.world_scale))
         return Thresholds(self.threshold * img, self.world_threshold * world)
 
     def _refine(
-        self, corr: Correspondences, found: Found, stages: list[Thresholds]
+        self, corr: Problem, found: Found, stages: list[Thresholds]
     ) -> tuple[Pose, Tensor | None, Judged]:
         """Improve poses on their inliers, in chunks whose tensors a cache holds; return the inliers afterwards, too.
 
@@ -258,7 +258,7 @@ class RANSAC(Configured):
         return map_tensors(torch.Tensor.contiguous, pose), zoom, judged
 
     def _is_evident(
-        self, found: Found, corr: Correspondences, thresholds: Thresholds, judged: Judged, projection: Projection
+        self, found: Found, corr: Problem, thresholds: Thresholds, judged: Judged, projection: Projection
     ) -> Tensor:
         """Whether a pose has more inliers than chance would give it, (B,)."""
         inliers, counts = (judged.weights > 0).sum(-1), (corr.weights > 0).sum(-1)
@@ -273,7 +273,7 @@ class RANSAC(Configured):
         return found.loss.isfinite() & (rare | ((inliers == MIN_PAIRS) & (counts == MIN_PAIRS)))
 
 
-def _on_grid(corr: Correspondences) -> Tensor:
+def _on_grid(corr: Problem) -> Tensor:
     """Threshold of residuals between the focal lengths of a grid, in pixels of the correspondences, (B,)."""
     assert corr.free_focal is not None
     away = torch.where(corr.weights > 0, corr.img_points.abs().amax(-1), torch.nan)
@@ -306,7 +306,7 @@ def _trusted(confidence: Tensor | None) -> Tensor | None:
 
 
 @torch.no_grad()
-def search_on(corr: Correspondences, guess: Guess, *, keep_others: bool = False, plan: Plan = FURTHER) -> Guess:
+def search_on(corr: Problem, guess: Starts, *, keep_others: bool = False, plan: Plan = FURTHER) -> Starts:
     r"""Go on searching where the poses of a guess do not suffice, with samples of likely inliers.
 
     Samples hold pairs in proportion to 0.8 plus 0.2 times the weight of the guess, times the caller's confidence:

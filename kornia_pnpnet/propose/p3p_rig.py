@@ -11,8 +11,8 @@ from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.linalg import small_product
 from kornia_pnpnet.core.performance import problems_last, sees_values
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.init.ransac.p3p import p3p
-from kornia_pnpnet.types import Correspondences, Hypotheses, Pose
+from kornia_pnpnet.propose.p3p import p3p
+from kornia_pnpnet.types import Problem, Hypotheses, Pose
 
 __all__ = ["P3PRig", "is_central"]
 
@@ -40,7 +40,7 @@ class P3PRig(Configured):
         check_whole(0, steps=steps)
         self.steps = steps
 
-    def hypotheses(self, corr: Correspondences) -> Hypotheses:
+    def hypotheses(self, corr: Problem) -> Hypotheses:
         r"""Solve samples of three pairs.
 
         Args:

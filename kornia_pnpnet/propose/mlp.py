@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from kornia_pnpnet.core.checks import check_devices, check_positive, check_whole
 from kornia_pnpnet.core.configured import Configured
-from kornia_pnpnet.types import Correspondences, Guess, Pose
+from kornia_pnpnet.types import Problem, Starts, Pose
 
 __all__ = ["MLPInit", "rotation_about"]
 
@@ -86,7 +86,7 @@ class MLPInit(Configured):
         BaseError: when ``n`` is less than 3, or a scale is not a positive number.
 
     Example:
-        >>> corr = Correspondences(torch.randn(2, 9, 3), torch.randn(2, 9, 2), torch.ones(2, 9), torch.tensor(3400.0))
+        >>> corr = Problem(torch.randn(2, 9, 3), torch.randn(2, 9, 2), torch.ones(2, 9), torch.tensor(3400.0))
         >>> guess = MLPInit(n=9)(corr)
         >>> guess.pose.rotation.shape, guess.pose.translation.shape
         (torch.Size([2, 3, 3]), torch.Size([2, 3]))
@@ -107,8 +107,8 @@ class MLPInit(Configured):
         self.rotation = nn.Sequential(*_relu_layers(branch), nn.Linear(2 * n, 4))
         self.translation = nn.Sequential(*_relu_layers(branch), nn.Linear(2 * n, 3))
 
-    def forward(self, corr: Correspondences) -> Guess:
-        r"""Guess the pose.
+    def forward(self, corr: Problem) -> Starts:
+        r"""Starts the pose.
 
         Args:
             corr: normalised correspondences with :math:`N` = ``n``, ordered by their pixels. A pair without
@@ -131,12 +131,12 @@ class MLPInit(Configured):
         check_devices({"world_points": corr.world_points}, next(self.parameters()), "the network")
         # One column per problem: x, y, z, u, v of the first pair, then of the next, which is their order in memory.
         world_points, img_points = corr.world_points / self.world_scale, corr.img_points / self.img_scale
-        if corr.near is not None:
-            world_points, img_points = (x * corr.near[..., None] for x in (world_points, img_points))
+        if corr.usual is not None:
+            world_points, img_points = (x * corr.usual[..., None] for x in (world_points, img_points))
         features = torch.cat((world_points.permute(1, 2, 0), img_points.permute(1, 2, 0)), 1).flatten(0, 1)  # (5n, B)
         hidden = _run(self.shared, features)  # (3n, B)
         axis, angle = _run(self.rotation, hidden).split((3, 1))
         rotation = rotation_about(axis, angle[0])
         translation = _run(self.translation, hidden).mT
         pose = Pose(rotation.to(features.dtype), translation.to(features.dtype))
-        return Guess(pose, torch.ones_like(corr.weights) if corr.near is None else corr.near)
+        return Starts(pose, torch.ones_like(corr.weights) if corr.usual is None else corr.usual)

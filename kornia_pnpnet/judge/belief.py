@@ -12,7 +12,7 @@ from kornia_pnpnet.core.linalg import factorise, solve_symmetric, symmetric
 from kornia_pnpnet.core.performance import in_order
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import Projection, normal_equations, span_a_plane
-from kornia_pnpnet.refine.inliers import (
+from kornia_pnpnet.judge.inliers import (
     MAX_FALSE_ALARMS,
     Judged,
     Thresholds,
@@ -23,7 +23,7 @@ from kornia_pnpnet.refine.inliers import (
     log_false_alarms,
 )
 from kornia_pnpnet.refine.step import pixel_precision
-from kornia_pnpnet.types import LEAST_NOISE, MIN_PAIRS, Correspondences, Noise
+from kornia_pnpnet.types import LEAST_NOISE, MIN_PAIRS, Problem, Noise
 
 __all__ = [
     "LAWS",
@@ -64,7 +64,7 @@ def has_enough(projection: Projection, weights: Tensor) -> Tensor:
     return (projection.in_front & (weights > 0)).sum(-1) >= MIN_PAIRS
 
 
-def explains(projection: Projection, corr: Correspondences, weights: Tensor) -> Tensor:
+def explains(projection: Projection, corr: Problem, weights: Tensor) -> Tensor:
     r"""Tell whether a pose explains the pixels, when the noise is unknown.
 
     A pose explains the pixels when the residual that 60 % of the pairs (by weight) stay below is less than a fifth of
@@ -110,7 +110,7 @@ class Belief(NamedTuple):
     ok: Tensor
 
 
-def believe(projection: Projection, corr: Correspondences, law: str = "sigmas") -> Belief:
+def believe(projection: Projection, corr: Problem, law: str = "sigmas") -> Belief:
     """Tell whether a pose is to be believed, when the noise is known for every pair.
 
     Its inliers must be more than chance would give it and span more than a line, and it must probably not be far off.
@@ -150,7 +150,7 @@ def probability(log_alarms: Tensor, sigma: Tensor, law: str = "sigmas") -> Tenso
     Few inliers in a small part of the space and of the image agree with many poses.
 
     Args:
-        log_alarms: :func:`~kornia_pnpnet.refine.inliers.log_false_alarms`, shape :math:`(B,)`.
+        log_alarms: :func:`~kornia_pnpnet.judge.inliers.log_false_alarms`, shape :math:`(B,)`.
         sigma: :func:`rotation_sigma`, shape :math:`(B,)`.
         law: one of :data:`LAWS`.
 
@@ -171,7 +171,7 @@ def clipped(log_alarms: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
     return log_alarms.clamp(*_ALARMS), sigma.log().clamp(*_LOG_SIGMA)
 
 
-def residual_noise(projection: Projection, corr: Correspondences, weights: Tensor) -> Noise:
+def residual_noise(projection: Projection, corr: Problem, weights: Tensor) -> Noise:
     """The noise of the pixels that the median residual shows, for a :func:`probability` where the noise is unknown.
 
     Args:
@@ -191,13 +191,13 @@ def residual_noise(projection: Projection, corr: Correspondences, weights: Tenso
     return Noise(sigma.expand_as(weights), torch.zeros_like(weights))
 
 
-def rotation_sigma(projection: Projection, corr: Correspondences, judged: Judged) -> Tensor:
+def rotation_sigma(projection: Projection, corr: Problem, judged: Judged) -> Tensor:
     """Standard deviation of the rotation in radians, by the noise of the inliers; infinite where they leave it open.
 
     Args:
         projection: :func:`~kornia_pnpnet.geometry.project` of the pose.
         corr: normalised correspondences with their noise.
-        judged: what :func:`~kornia_pnpnet.refine.inliers.judge` returned.
+        judged: what :func:`~kornia_pnpnet.judge.inliers.judge` returned.
 
     Returns:
         The square root of the trace of the rotation's covariance, float64, shape :math:`(B,)`.
@@ -214,7 +214,7 @@ def rotation_sigma(projection: Projection, corr: Correspondences, judged: Judged
     return torch.where(variance > 0, variance, torch.inf).sqrt()  # NaN, too, is open
 
 
-def has_focal(projection: Projection, corr: Correspondences, weights: Tensor) -> Tensor:
+def has_focal(projection: Projection, corr: Problem, weights: Tensor) -> Tensor:
     """Whether the pairs determine an unknown focal length, to 15 % in standard deviations, bool (B,).
 
     Two standard deviations are then the 30 % of the distance beyond which a pose is far off.

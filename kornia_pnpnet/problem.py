@@ -1,0 +1,244 @@
+"""What a solver works on: the pairs of a batch in its own frame, their noise, and the poses from which it starts.
+
+Tensors of pairs have the shapes ``(B, N)`` and ``(B, N, C)``; in memory the problems come last, see
+:func:`~kornia_pnpnet.core.performance.problems_last`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from kornia_pnpnet.core.symmetric import Symmetric2, Symmetric3
+from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.result import Pose
+
+__all__ = ["LEAST_NOISE", "MIN_PAIRS", "Hypotheses", "Noise", "Problem", "Starts", "State", "Term"]
+
+#: Focal lengths. Pixels are never known better than this, so that weights stay finite.
+LEAST_NOISE = 1e-6
+#: Pairs that determine a pose up to a few solutions.
+MIN_PAIRS = 3
+
+
+class State(NamedTuple):
+    r"""What a refinement estimates.
+
+    Attributes:
+        pose: world-to-camera poses.
+        camera: unknown parameters of the camera, shape :math:`(B, K)`: none for a known camera; the logarithm of the
+            focal length over that of the problem; then the coefficients :math:`k_1, k_2` of radial distortion.
+    """
+
+    pose: Pose
+    camera: Tensor
+
+    @classmethod
+    def of(cls, pose: Pose) -> State:
+        """Poses of known cameras."""
+        return cls(pose, pose.translation[:, :0])
+
+    @property
+    def zoom(self) -> Tensor:
+        """Logarithm of the focal length over that of the problem, shape :math:`(B, 1)`, or 0 wide when it is known."""
+        return self.camera[:, :1]
+
+    @property
+    def radial(self) -> Tensor:
+        """Coefficients of radial distortion, shape :math:`(B, 0)` to :math:`(B, 2)`."""
+        return self.camera[:, 1:]
+
+
+class Noise(NamedTuple):
+    r"""The noise of each pair: standard deviations, the same on each coordinate, and covariances where there are any.
+
+    Attributes:
+        img: standard deviation of the pixel, NaN where unknown, shape :math:`(B, N)`. Beside a covariance: of isotropic
+            noise of the same trace, which is what a network sees.
+        world: standard deviation of the world point, as ``img``.
+        img_cov: covariance of the pixel, entries of shape :math:`(B, N)`; ``None``: the noise is isotropic.
+        world_cov: covariance of the world point, as ``img_cov``.
+    """
+
+    img: Tensor
+    world: Tensor
+    img_cov: Symmetric2 | None = None
+    world_cov: Symmetric3 | None = None
+
+    @property
+    def sigmas(self) -> Noise:
+        """The standard deviations alone."""
+        return self._replace(img_cov=None, world_cov=None)
+
+    @property
+    def covariances(self) -> list[Symmetric2 | Symmetric3]:
+        """The covariances that there are."""
+        return [x for x in (self.img_cov, self.world_cov) if x is not None]
+
+
+class Linear(NamedTuple):
+    r"""A term near a state: half of its loss is about :math:`\tfrac12 w (r + J \delta)^\top \Omega (r + J \delta)`.
+
+    Attributes:
+        residual: :math:`r`, shape :math:`(B, D)`.
+        jacobian: :math:`J` by the tangent of :meth:`~kornia_pnpnet.refine.residual.moved`, shape :math:`(B, D, 6 + K)`.
+        information: :math:`\Omega`, shape :math:`(B, D, D)`.
+        weight: robust weight :math:`w`, shape :math:`(B,)`.
+    """
+
+    residual: Tensor
+    jacobian: Tensor
+    information: Tensor
+    weight: Tensor
+
+
+class Term(Protocol):
+    """What is known besides the pairs: a tuple of tensors whose first dimension is the batch."""
+
+    def linearise(self, state: State) -> Linear:
+        """The term near a state."""
+
+    def loss(self, state: State) -> Tensor:
+        """Robust loss in squared standard deviations, shape (B,)."""
+
+    def disagreement(self, pose: Pose) -> Tensor:
+        """Loss of poses in pairs, beside those of inliers that fit and outliers; at least 0, the shape of the batch."""
+
+
+class Problem(NamedTuple):
+    r"""A batch of problems in the solver's frame; made by :class:`~kornia_pnpnet.frame.Normalize`.
+
+    Attributes:
+        world_points: points of the (possibly centred and scaled) world, shape :math:`(B, N, 3)`.
+        img_points: pixels of a camera with the focal length ``focal`` and the principal point 0,
+            shape :math:`(B, N, 2)`.
+        weights: weight of each pair, at least 0; 0 means that the pair is padding, shape :math:`(B, N)`.
+        focal: the focal length in pixels that all pairs share, a scalar.
+        img_scale: pixels of ``img_points`` per pixel of the caller, shape :math:`(B,)`.
+        world_scale: lengths of ``world_points`` per unit of the caller's world, shape :math:`(B,)`.
+        usual: 1 for pairs of normal scale; 0 for points that are many times as far from the others as these are from
+            each other, and for pixels at extreme angles, shape :math:`(B, N)`. Initialisers that are not robust use
+            :attr:`usual_weights`: other pairs are bad data or the horizon.
+        noise: noise of each pair in the units of ``img_points`` and ``world_points``, NaN where unknown; ``None``: all
+            unknown.
+        confidence: the caller's belief that a pair is an inlier, in [0, 1], NaN where unknown, shape :math:`(B, N)`;
+            ``None``: all unknown.
+        rig: the camera of each pair, from the frame of the pose to the camera's, :math:`(B, N, 3, 3)` and
+            :math:`(B, N, 3)`; ``None``: one camera, whose frame is that of the pose.
+        prior: what is known of the pose besides the pairs; ``None``: nothing.
+        free_focal: what is known of the focal length besides the pairs; ``None``: the focal length is ``focal``.
+    """
+
+    world_points: Tensor
+    img_points: Tensor
+    weights: Tensor
+    focal: Tensor
+    img_scale: Tensor
+    world_scale: Tensor
+    usual: Tensor
+    noise: Noise | None = None
+    confidence: Tensor | None = None
+    rig: Pose | None = None
+    prior: Any = None
+    free_focal: Any = None
+
+    @classmethod
+    def of(cls, world_points: Tensor, img_points: Tensor, focal: Tensor | float = 1.0, **more: Any) -> Problem:
+        """A problem of its own frame: all weights are 1 and all scales are 1 unless given."""
+        one = torch.ones_like(world_points[..., 0])
+        given = {"weights": one, "usual": one, "img_scale": one[:, 0], "world_scale": one[:, 0], **more}
+        return cls(world_points, img_points, focal=torch.as_tensor(focal).to(one), **given)
+
+    @property
+    def terms(self) -> Iterator[Term]:
+        """What is known besides the pairs."""
+        return (term for term in (self.prior, self.free_focal) if term is not None)
+
+    @property
+    def usual_weights(self) -> Tensor:
+        """The weights, 0 for pairs that are not of normal scale, shape :math:`(B, N)`."""
+        return self.weights * self.usual
+
+    @property
+    def places(self) -> Tensor:
+        """Where each pair is seen: its pixel, in a rig the ray in the frame of the rig times the focal length.
+
+        Shape :math:`(B, N, 2)` or :math:`(B, N, 3)`.
+        """
+        return self.img_points if self.rig is None else self.rays(self.img_points / self.focal)
+
+    def rays(self, plane_points: Tensor) -> Tensor:
+        """Rays of points in the planes of a rig's cameras, as long as the focal length, in its frame, (B, N, 3)."""
+        assert self.rig is not None
+        rays = torch.cat((plane_points, torch.ones_like(plane_points[..., :1])), -1)
+        rays = self.focal * torch.nn.functional.normalize(rays, dim=-1)
+        return (self.rig.rotation * rays[..., None]).sum(-2)
+
+    def seen_with(self, zoom: Tensor) -> Problem:
+        """The same pairs with a known focal length, larger by the exponential of ``zoom``, (B, 1) or (B, 0).
+
+        Pixels and their noise are divided instead of the focal length being multiplied.
+        """
+        if not zoom.shape[1]:
+            return self
+        factor = (-zoom).exp()
+        noise = self.noise
+        if noise is not None:
+            cov = None if noise.img_cov is None else noise.img_cov.mapped(factor, torch.zeros_like(factor), factor)
+            noise = noise._replace(img=noise.img * factor, img_cov=cov)
+        pixels, scale = self.img_points * factor[..., None], self.img_scale * factor[:, 0]
+        return self._replace(img_points=pixels, noise=noise, img_scale=scale, free_focal=None)
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Problem:
+        """Apply a function to every tensor."""
+        return map_tensors(function, self)
+
+
+class Starts(NamedTuple):
+    r"""What an initialiser returns: poses to refine, and what it thinks of the pairs.
+
+    Attributes:
+        pose: a coarse pose in the frame of the :class:`Problem`.
+        weights: a factor for the weight of each pair, at least 0, shape :math:`(B, N)`.
+        ok: whether there is a pose at all (degenerate pairs may have none), bool, shape :math:`(B,)`; ``None``: always.
+        others: more poses, rotations :math:`(B, S, 3, 3)` and translations :math:`(B, S, 3)`; ``None``: no others.
+        noise: noise of each pair in the units of the problem, where unknown the initialiser's estimate, without
+            covariances; residuals then count in standard deviations. ``None``: the initialiser does not estimate noise.
+        camera: first parameters of the camera for every pose, see :class:`State`; ``None``: zeros.
+    """
+
+    pose: Pose
+    weights: Tensor
+    ok: Tensor | None = None
+    others: Pose | None = None
+    noise: Noise | None = None
+    camera: Tensor | None = None
+
+    @property
+    def poses(self) -> list[Pose]:
+        """The pose and the others, each of rotations :math:`(B, 3, 3)` and translations :math:`(B, 3)`."""
+        others = () if self.others is None else map(Pose, *(x.unbind(1) for x in self.others))
+        return [self.pose, *others]
+
+    def with_others(self, *more: Pose) -> Starts:
+        """With more poses."""
+        every = [*self.poses[1:], *more]
+        return self._replace(others=map_tensors(lambda *x: torch.stack(x, 1), *every)) if every else self
+
+
+class Hypotheses(NamedTuple):
+    r"""Up to :math:`S` poses for each sample: what a minimal solver returns.
+
+    Attributes:
+        pose: rotations :math:`(B, S, 3, 3)` and translations :math:`(B, S, 3)` in the frame of the sample.
+        valid: which slots hold a solution, bool, shape :math:`(B, S)`. The other slots are finite.
+        zoom: logarithm of the focal length of each slot over that of the problem, shape :math:`(B, S)`; ``None``: the
+            focal length is known.
+    """
+
+    pose: Pose
+    valid: Tensor
+    zoom: Tensor | None = None

@@ -1,0 +1,457 @@
+r"""The one residual: projection, its Jacobian, normal equations, and how a state moves.
+
+Convention: ``x_cam = R x_world + t``; the camera looks along +z; pixels are those of a camera with one focal length and
+the principal point 0. A point is *in front* when its depth is more than ``MIN_DEPTH_RATIO`` of its distance, a test
+that does not depend on the unit of the world.
+
+Arrays of this module have the problems in the last dimension: coordinates, pairs, problems. An operation on all pairs
+then runs over long rows of memory however few pairs a problem has. Kornia's ``transform_points`` and ``project_points``
+compute the same projection (``tests/test_kornia_contract.py``) but neither residual nor Jacobian, and they take three
+times as long for 1000 problems of 9 pairs (batch first).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, TypeAlias
+
+import torch
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix, rotation_matrix_to_axis_angle
+from kornia.geometry.liegroup import So3
+from torch import Tensor
+
+from kornia_pnpnet.core.linalg import dot, solve_positive
+from kornia_pnpnet.core.performance import are_few
+from kornia_pnpnet.core.symmetric import Symmetric2
+from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.problem import Noise, Problem, State
+from kornia_pnpnet.result import Pose
+
+__all__ = [
+    "MIN_DEPTH_RATIO",
+    "NormalEquations",
+    "Projection",
+    "change_tangent",
+    "lm_step",
+    "moved",
+    "normal_equations",
+    "pixel_covariance",
+    "pixel_variance",
+    "project",
+    "retract",
+    "rotation_angle",
+]
+
+#: A point with ``z <= MIN_DEPTH_RATIO * |x|`` counts as behind the camera. It bounds ``|x / z|`` by 1000.
+MIN_DEPTH_RATIO = 1e-3
+# Largest change of the logarithm of the focal length in one step, so that its exponential cannot overflow, and of a
+# coefficient of distortion.
+_LARGEST_ZOOM, _LARGEST_RADIAL = 1.0, 0.3
+
+# Two rows of a column of the Jacobian; an entry that is the same for all pairs is a plain number.
+_Column: TypeAlias = tuple[Any, Any]
+
+
+class Projection(NamedTuple):
+    r"""Points projected at a state and compared with their pixels. The problems are the last dimension.
+
+    Attributes:
+        residual: projection minus measurement in pixels, shape :math:`(2, N, B)`. Where ``front`` is false the residual
+            is finite but meaningless.
+        front: whether the point is in front of the camera, bool, shape :math:`(N, B)`.
+        rotated: the points in the axes of the pose before translation, :math:`y = R x`, shape :math:`(3, N, B)`.
+        plane: :math:`(p, q) = (x/z, y/z)`, 0 for points behind the camera, shape :math:`(2, N, B)`.
+        inv_depth: :math:`1/z`, 0 for points behind the camera, shape :math:`(N, B)`.
+        scaled: the residual times the depth, shape :math:`(2, N, B)`.
+        focal: the focal length in pixels, a scalar or of shape :math:`(B,)`.
+        state: the state.
+        stretch: :math:`d = 1 + k_1 \rho^2 + k_2 \rho^4` with :math:`\rho^2 = p^2 + q^2`, shape :math:`(N, B)`;
+            ``None``: there is no distortion.
+        slope: twice the derivative of :math:`d` by :math:`\rho^2`, as ``stretch``.
+    """
+
+    residual: Tensor
+    front: Tensor
+    rotated: Tensor
+    plane: Tensor
+    inv_depth: Tensor
+    scaled: Tensor
+    focal: Tensor
+    state: State
+    stretch: Tensor | None = None
+    slope: Tensor | None = None
+
+    @property
+    def sq_residual(self) -> Tensor:
+        """Squared length of the residual in square pixels, shape :math:`(B, N)`."""
+        u, v = self.residual.unbind()
+        return torch.addcmul(u * u, v, v).mT
+
+    @property
+    def in_front(self) -> Tensor:
+        """Whether the point is in front of the camera, bool, shape :math:`(B, N)`."""
+        return self.front.mT
+
+
+class NormalEquations(NamedTuple):
+    r"""A Gauss-Newton system before damping, with the Jacobian divided by the focal length.
+
+    Attributes:
+        matrix: :math:`J^\top W J`, shape :math:`(6 + K, 6 + K, B)`.
+        gradient: :math:`J^\top W r`, shape :math:`(6 + K, B)`.
+    """
+
+    matrix: Tensor
+    gradient: Tensor
+
+
+def project(state: State, problem: Problem) -> Projection:
+    r"""Project the points of a problem and compare them with their pixels.
+
+    The depth of points behind the camera is replaced *before* the division, so that neither values nor gradients can
+    overflow.
+
+    Args:
+        state: poses in the frame of the problem, and what is unknown of the cameras.
+        problem: the problem.
+
+    Returns:
+        The :class:`Projection`; its residual is :math:`f d (p, q) - b` in pixels.
+
+    Example:
+        >>> problem = Problem.of(torch.tensor([[[1.0, 2.0, 4.0]]]), torch.zeros(1, 1, 2), 100.0)
+        >>> project(State.of(Pose(torch.eye(3)[None], torch.zeros(1, 3))), problem).residual.flatten()
+        tensor([25., 50.])
+    """
+    a, b, c = problem.world_points.permute(2, 1, 0).unbind()  # (N, B) each
+    i, j, k = state.pose.rotation.permute(2, 1, 0)[:, :, None].unbind()  # columns, (3, 1, B) each
+    rotated = torch.addcmul(torch.addcmul(i * a, j, b), k, c)  # (3, N, B)
+    points = rotated + state.pose.translation.mT[:, None]
+    if problem.rig is not None:
+        i, j, k = problem.rig.rotation.permute(3, 2, 1, 0).unbind()  # columns, (3, N, B) each
+        x, y, z = points.unbind()
+        shift = problem.rig.translation.permute(2, 1, 0)
+        points = torch.addcmul(torch.addcmul(torch.addcmul(shift, i, x), j, y), k, z)
+    z = points[2]
+    # z |z| > ratio² |x|² tests the sign and the ratio at once, without a square root, whose gradient is infinite at 0.
+    front = torch.add(z * z.abs(), points.square().sum(0), alpha=-MIN_DEPTH_RATIO * MIN_DEPTH_RATIO) > 0
+    inv_depth = torch.where(front, z, torch.inf).reciprocal()
+    img = problem.img_points.permute(2, 1, 0)
+    focal = problem.focal * state.camera[:, 0].exp() if state.camera.shape[1] else problem.focal
+    across = points[:2]
+    plane = across * inv_depth
+    if state.camera.shape[1] < 2:
+        scaled = torch.addcmul(focal * across, img, z, value=-1)
+        return Projection(scaled * inv_depth, front, rotated, plane, inv_depth, scaled, focal, state)
+    square = plane.square().sum(0)
+    stretch, slope = torch.ones_like(square), torch.zeros_like(square)
+    for power, coefficient in enumerate(state.radial.unbind(1)):
+        stretch = stretch + coefficient * square ** (power + 1)
+        slope = slope + 2.0 * (power + 1) * coefficient * square**power
+    residual = focal * stretch * plane - img
+    scaled = residual * torch.where(front, z, 1.0)
+    return Projection(residual, front, rotated, plane, inv_depth, scaled, focal, state, stretch, slope)
+
+
+def pixel_variance(projection: Projection, noise: Noise) -> Tensor:
+    r"""Variance of a pixel coordinate, from the noise of the pixel and of the world point.
+
+    A shift of the point by :math:`d` moves its pixel by :math:`J d` with :math:`J = \tfrac fz [I_2 \mid -(p, q)^\top]`.
+    The mean over both coordinates is returned:
+    :math:`\sigma_\mathrm{img}^2 + \sigma_\mathrm{world}^2 \, \mathrm{tr}(J J^\top) / 2`, where the trace is
+    :math:`(f/z)^2 (2 + p^2 + q^2)`.
+
+    Args:
+        projection: what :func:`project` returned.
+        noise: standard deviations.
+
+    Returns:
+        Shape :math:`(B, N)`. Behind the camera it is the variance of the pixel alone.
+
+    Example:
+        >>> problem = Problem.of(torch.tensor([[[0.0, 0.0, 4.0]]]), torch.zeros(1, 1, 2), 100.0)
+        >>> projection = project(State.of(Pose(torch.eye(3)[None], torch.zeros(1, 3))), problem)
+        >>> pixel_variance(projection, Noise(torch.tensor([[3.0]]), torch.tensor([[0.04]])))
+        tensor([[10.]])
+    """
+    p, q = projection.plane.unbind()
+    moved = projection.focal * noise.world.mT * projection.inv_depth
+    sides = torch.addcmul(torch.addcmul(torch.ones_like(p), p, p, value=0.5), q, q, value=0.5)
+    return torch.addcmul(noise.img * noise.img, (moved * moved).mT, sides.mT)
+
+
+def pixel_covariance(projection: Projection, problem: Problem, noise: Noise) -> Symmetric2:
+    r"""Covariance of a pixel, from the noise of the pixel and of the world point.
+
+    It is :math:`\Sigma_\mathrm{img} + J R\,\Sigma_\mathrm{world} R^\top J^\top` with :math:`J` of
+    :func:`pixel_variance`. A standard deviation stands for a multiple of the identity.
+
+    Args:
+        projection: what :func:`project` returned.
+        problem: its problem.
+        noise: noise of each pair.
+
+    Returns:
+        Entries of shape :math:`(B, N)`. Behind the camera they are the covariance of the pixel alone.
+    """
+    p, q = (x.mT for x in projection.plane.unbind())
+    scale = (projection.focal * projection.inv_depth).mT
+    if noise.world_cov is None:
+        moved = (scale * noise.world).square()
+        uu, uv, vv = torch.addcmul(moved, moved * p, p), moved * p * q, torch.addcmul(moved, moved * q, q)
+    else:
+        rotation = projection.state.pose.rotation[:, None]  # (B, 1, 3, 3)
+        rotation = rotation if problem.rig is None else problem.rig.rotation @ rotation
+        first, second, third = (row.unbind(-1) for row in rotation.unbind(-2))
+        a = [scale * torch.addcmul(i, p, k, value=-1) for i, k in zip(first, third, strict=True)]
+        b = [scale * torch.addcmul(j, q, k, value=-1) for j, k in zip(second, third, strict=True)]
+        of_a, of_b = noise.world_cov.times(a), noise.world_cov.times(b)
+        uu, uv, vv = dot(a, of_a), dot(b, of_a), dot(b, of_b)
+    if noise.img_cov is None:
+        return Symmetric2(torch.addcmul(uu, noise.img, noise.img), uv, torch.addcmul(vv, noise.img, noise.img))
+    return Symmetric2(uu + noise.img_cov.uu, uv + noise.img_cov.uv, vv + noise.img_cov.vv)
+
+
+def normal_equations(projection: Projection, problem: Problem, weights: Tensor | Symmetric2) -> NormalEquations:
+    r"""The normal equations of the residuals by the pose and by the unknown parameters of the camera.
+
+    With :math:`y = R x`, and the rows :math:`e` of :math:`z` times the derivative of :math:`(p, q)` by a point in the
+    frame of the pose, a column of :math:`z J / f` is :math:`y \times e` for a turn and :math:`e` for a shift. For one
+    camera :math:`e = (1, 0, -p), (0, 1, -q)`. The parameters of the camera are those of :func:`moved`.
+
+    Args:
+        projection: what :func:`project` returned.
+        problem: its problem.
+        weights: weight of each pair, :math:`(B, N)`, or 2x2 matrices with entries of that shape. Points behind the
+            camera do not count.
+
+    Returns:
+        The equations, with :math:`J` divided by the focal length and :math:`r` in pixels.
+    """
+    columns = _columns(projection, problem)
+    sq_inverse = (projection.inv_depth * projection.inv_depth).mT
+    weights = map_tensors(lambda w: (w * sq_inverse).mT, weights)
+    if are_few(projection.inv_depth):
+        return _stacked_equations(columns, projection.scaled, weights)
+    return _entrywise_equations(columns, projection.scaled.unbind(), weights)
+
+
+def _columns(projection: Projection, problem: Problem) -> list[_Column]:
+    """The columns of z J / f: an entry in the row of u and one in the row of v, (N, B) each."""
+    y1, y2, y3 = projection.rotated.unbind()
+    p, q = projection.plane.unbind()
+    minus_p, minus_q = (-projection.plane).unbind()
+    if problem.rig is None:
+        columns: list[_Column] = [
+            (minus_p * y2, torch.addcmul(-y3, minus_q, y2)),
+            (torch.addcmul(y3, p, y1), q * y1),
+            (-y2, y1),
+            (1.0, 0.0),
+            (0.0, 1.0),
+            (minus_p, minus_q),
+        ]
+    else:
+        i, j, k = problem.rig.rotation.permute(2, 3, 1, 0).unbind()  # rows, (3, N, B) each
+        rows = torch.addcmul(i, minus_p, k), torch.addcmul(j, minus_q, k)
+        turns = [torch.linalg.cross(projection.rotated, row, dim=0) for row in rows]
+        columns = [*zip(*(x.unbind() for x in turns), strict=True), *zip(*(x.unbind() for x in rows), strict=True)]
+    unknown = projection.state.camera.shape[1]
+    if not unknown:
+        return columns
+    if projection.stretch is None or projection.slope is None:
+        return [*columns, (p * y3, q * y3)]  # the focal length grows, and the depth of the origin with it
+    stretch, slope = projection.stretch, projection.slope
+    # The derivative of the distorted by the undistorted point is d I + 2 d' (p, q) (p, q)^T.
+    along = [slope * _plus(_times(p, u), _times(q, v)) for u, v in columns]
+    columns = [
+        (_plus(_times(stretch, u), x * p), _plus(_times(stretch, v), x * q))
+        for (u, v), x in zip(columns, along, strict=True)
+    ]
+    depth = torch.where(projection.front, projection.inv_depth, 1.0).reciprocal()
+    square = torch.addcmul(p * p, q, q)
+    zoomed = stretch * y3 - slope * square * (depth - y3)
+    powers = [depth * square ** (power + 1) for power in range(unknown - 1)]
+    return [*columns, *((p * x, q * x) for x in (zoomed, *powers))]
+
+
+def _stacked_equations(columns: list[_Column], scaled: Tensor, weights: Tensor | Symmetric2) -> NormalEquations:
+    """All products at once: few calls, for few pairs."""
+    size, zero = len(columns), torch.zeros_like(scaled[0])
+    one = zero + 1.0
+    entries = [(one if x == 1.0 else zero) if type(x) is float else x for column in columns for x in column]
+    jacobian = torch.stack([*entries, *scaled.unbind()]).unflatten(0, (size + 1, 2))  # (K + 1, 2, N, B)
+    if isinstance(weights, Tensor):
+        weighted = jacobian[:size] * weights
+    else:
+        u, v = jacobian[:size].unbind(1)
+        uu, uv, vv = weights
+        weighted = torch.stack((uu * u + uv * v, uv * u + vv * v), 1)
+    products = (weighted.flatten(1, 2)[:, None] * jacobian.flatten(1, 2)).sum(2)  # (K, K + 1, B)
+    return NormalEquations(products[:, :size], products[:, size])
+
+
+def _entrywise_equations(
+    columns: list[_Column], scaled: tuple[Tensor, ...], weights: Tensor | Symmetric2
+) -> NormalEquations:
+    """Entry by entry: temporaries of (N, B) stay in a processor's cache, and a compiler keeps them in registers."""
+    uu, uv, vv = (weights, 0.0, weights) if isinstance(weights, Tensor) else weights
+    total = uu.sum(0)
+    zero = torch.zeros_like(total)
+    weighted = [(_plus(_times(u, uu), _times(v, uv)), _plus(_times(u, uv), _times(v, vv))) for u, v in columns]
+
+    def inner(a: _Column, b: _Column) -> Tensor:
+        """Sum over pairs and rows of the products of two columns, (B,)."""
+        (a_u, a_v), (b_u, b_v) = a, b
+        if type(a_u) is type(a_v) is type(b_u) is type(b_v):
+            return torch.addcmul(a_u * b_u, a_v, b_v).sum(0)
+        products = [x for x in (_times(a_u, b_u), _times(a_v, b_v)) if type(x) is not float]
+        if not products:
+            return zero
+        return total if products[0] is uu else products[0].sum(0)
+
+    # The products of a column with the two constant ones are its weighted entries.
+    size = range(len(columns))
+    lower = {
+        (i, j): inner(weighted[j], columns[i]) if i < 5 else inner(weighted[i], columns[j])
+        for i in size
+        for j in size[: i + 1]
+    }
+    matrix = torch.stack([lower[max(i, j), min(i, j)] for i in size for j in size]).unflatten(0, (len(size), len(size)))
+    return NormalEquations(matrix, torch.stack([inner(column, scaled) for column in weighted]))
+
+
+def _times(a: Any, b: Any) -> Any:
+    """A product in which a factor that is known to be 0 or 1 costs nothing."""
+    if type(a) is float:
+        return b if a == 1.0 else 0.0
+    if type(b) is float:
+        return a if b == 1.0 else 0.0
+    return a * b
+
+
+def _plus(a: Any, b: Any) -> Any:
+    """A sum in which a term that is known to be 0 costs nothing."""
+    return b if type(a) is float else a if type(b) is float else a + b
+
+
+def lm_step(
+    equations: NormalEquations, state: State, focal: Tensor, step: Tensor, damping: Tensor, *, additive: bool = False
+) -> tuple[State, Tensor]:
+    r"""Solve the damped normal equations and move the state.
+
+    .. math:: \beta \leftarrow \beta - \gamma\,(J^\top W J + \lambda\,\mathrm{diag}(J^\top W J))^{-1} J^\top W r
+
+    with :math:`r` projection minus measurement, so that the step that reduces the residual is the negative one. The
+    step does not depend on a common factor of the weights.
+
+    Source: R. Sheffer and A. Wiesel, "PnP-Net: A hybrid Perspective-n-Point Network", 2020, section 3; the damping by
+    the diagonal is D. Marquardt's (1963).
+
+    Args:
+        equations: at the state.
+        state: the state to improve.
+        focal: the focal length in pixels, a scalar or of shape :math:`(B,)`.
+        step: :math:`\gamma`, a scalar.
+        damping: :math:`\lambda`, a scalar or of shape :math:`(B,)`.
+        additive: update the rotation vector additively as in the paper, instead of by the retraction.
+
+    Returns:
+        The moved state, and whether the equations could be solved (if not, the state stays), bool, shape :math:`(B,)`.
+    """
+    if additive:
+        equations = change_tangent(equations, So3.left_jacobian(rotation_matrix_to_axis_angle(state.pose.rotation)))
+    delta, solved = solve_positive(equations.matrix, equations.gradient, damping)
+    delta = delta * (solved * (-step / focal))
+    if not additive:
+        return moved(state, delta), solved
+    rotation_vector = rotation_matrix_to_axis_angle(state.pose.rotation) + delta[:3].mT
+    pose = state.pose._replace(rotation=axis_angle_to_rotation_matrix(rotation_vector))
+    return moved(State(pose, state.camera), torch.cat((torch.zeros_like(delta[:3]), delta[3:]))), solved
+
+
+def change_tangent(equations: NormalEquations, tangent_map: Tensor) -> NormalEquations:
+    r"""Express normal equations in other rotation parameters.
+
+    Args:
+        equations: by the tangent :math:`(\omega, v, …)`.
+        tangent_map: derivative of :math:`\omega` by the other parameters, :math:`(B, 3, 3)`; for an additive update of
+            the rotation vector the left Jacobian of SO(3).
+
+    Returns:
+        The equations by the other parameters.
+    """
+    size = len(equations.gradient)
+    whole = torch.eye(size, dtype=tangent_map.dtype, device=tangent_map.device).repeat(len(tangent_map), 1, 1)
+    whole[:, :3, :3] = tangent_map
+    matrix = whole.mT @ equations.matrix.permute(2, 0, 1) @ whole
+    return NormalEquations(matrix.permute(1, 2, 0), (whole.mT @ equations.gradient.mT[..., None])[..., 0].mT)
+
+
+def moved(state: State, delta: Tensor) -> State:
+    r"""Move a state along a tangent vector, shape :math:`(6 + K, B)`.
+
+    The pose moves by :func:`retract`. A larger focal length moves the camera away as in a dolly zoom: the origin, which
+    is the centroid of a centred world, keeps its pixel and the scale at which it is seen. A change of the focal length
+    and a shift along the axis, which look alike from far away, are then well separated parameters.
+    """
+    pose = retract(state.pose, delta[:6].mT)
+    if not state.camera.shape[1]:
+        return State(pose, state.camera)
+    zoom, radial = delta[6].clamp(-_LARGEST_ZOOM, _LARGEST_ZOOM), delta[7:].clamp(-_LARGEST_RADIAL, _LARGEST_RADIAL)
+    x, y, z = pose.translation.unbind(-1)
+    translation = torch.stack((x, y, z * zoom.exp())).mT
+    return State(pose._replace(translation=translation), state.camera + torch.cat((zoom[None], radial)).mT)
+
+
+def retract(pose: Pose, delta: Tensor) -> Pose:
+    r"""Move a pose along a tangent vector, :math:`(\mathrm{cay}(\omega) R,\; t + v)`.
+
+    Rotation and translation move independently. With a centred world a rotation then leaves the centroid in place, so
+    that both stay well separated in the normal equations at any distance of the points. The rotation is Cayley's,
+    :math:`\mathrm{cay}(\omega) = (I - \tfrac12[\omega]_\times)^{-1}(I + \tfrac12[\omega]_\times)`, which agrees with
+    the exponential to second order, rotates by :math:`2 \arctan(|\omega|/2)`, at most half a turn, and needs neither
+    trigonometry nor a branch at 0.
+
+    Args:
+        pose: rotation :math:`(B, 3, 3)`, translation :math:`(B, 3)`.
+        delta: :math:`(\omega, v)`, radians and world units, shape :math:`(B, 6)`.
+
+    Returns:
+        The moved pose.
+
+    Example:
+        >>> pose = Pose(torch.eye(3)[None], torch.zeros(1, 3))
+        >>> retract(pose, torch.tensor([[0.0, 0.0, 0.0, 1.0, 2.0, 3.0]])).translation
+        tensor([[1., 2., 3.]])
+    """
+    turn, shift = delta.mT.split(3)
+    half = (0.5 * turn)[:, None]  # (3, 1, B)
+    rotation = pose.rotation.permute(1, 2, 0)
+    once = torch.linalg.cross(half, rotation, dim=0)
+    twice = once + torch.linalg.cross(half, once, dim=0)
+    factor = 2.0 / (1.0 + half.square().sum(0))
+    return Pose(torch.addcmul(rotation, factor, twice).permute(2, 0, 1), pose.translation + shift.mT)
+
+
+def rotation_angle(rotation_a: Tensor, rotation_b: Tensor) -> Tensor:
+    r"""Angle between two rotations.
+
+    :math:`\mathrm{atan2}(\|\tfrac12 \mathrm{vee}(D - D^\top)\|, \tfrac12(\mathrm{tr} D - 1))` of
+    :math:`D = A B^\top`, which equals :math:`\arccos((\mathrm{tr} D - 1)/2)` but keeps its digits near 0, where the
+    arc cosine loses half of them. Not differentiable at exactly 0; use :mod:`kornia_pnpnet.losses` to train.
+
+    Args:
+        rotation_a: shape :math:`(*, 3, 3)`.
+        rotation_b: shape :math:`(*, 3, 3)`.
+
+    Returns:
+        The angle in radians, in [0, π], shape :math:`(*)`.
+
+    Example:
+        >>> quarter = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        >>> torch.rad2deg(rotation_angle(quarter, torch.eye(3)))
+        tensor(90.)
+    """
+    diff = rotation_a @ rotation_b.mT
+    sine = 0.5 * So3.vee(diff - diff.mT).norm(dim=-1)
+    cosine = 0.5 * (diff.diagonal(dim1=-2, dim2=-1).sum(-1) - 1.0)
+    return torch.atan2(sine, cosine)
