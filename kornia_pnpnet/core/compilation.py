@@ -14,7 +14,7 @@ from torch import Tensor
 from kornia_pnpnet.core.performance import compiling, exporting
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 
-__all__ = ["Compiled", "package_options", "per_problem"]
+__all__ = ["Compiled", "Runner", "package_options", "per_problem"]
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
@@ -128,6 +128,41 @@ class Compiled(Generic[_P, _T]):
 
     def _leaves(self, *args: _P.args, **kwargs: _P.kwargs) -> list[Tensor]:
         return list(iter_tensors(self.function(*args, **kwargs)))
+
+
+class Runner:
+    """Calls functions as they are, or compiled: what may be compiled is visible where it is called.
+
+    Args:
+        compiled: whether functions are compiled when they are first called.
+        mode: mode of ``torch.compile``.
+
+    Example:
+        >>> Runner()(torch.add, torch.ones(1), torch.ones(1))
+        tensor([2.])
+    """
+
+    def __init__(self, compiled: bool = False, mode: str | None = None) -> None:
+        self.compiled, self.mode = compiled, mode
+        self._functions: dict[str, Compiled[..., Any]] = {}
+
+    def __reduce__(self) -> tuple[type[Runner], tuple[bool, str | None]]:
+        """Copies and other processes compile for themselves."""
+        return type(self), (self.compiled, self.mode)
+
+    def __call__(self, function: Callable[..., _T], *args: Any) -> _T:
+        """Call a function of batches."""
+        if not self.compiled:
+            return function(*args)
+        name = function.__qualname__
+        if name not in self._functions:
+            self._functions[name] = Compiled(function, self.mode)
+        return self._functions[name](*args)
+
+    @property
+    def failed(self) -> bool:
+        """Whether some function could not be compiled."""
+        return any(x.failed for x in self._functions.values())
 
 
 def _kinds(x: Any) -> Any:

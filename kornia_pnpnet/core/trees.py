@@ -17,7 +17,7 @@ def map_tensors(function: Callable[..., Any], tree: _T, *others: _T) -> _T:
 
     Args:
         function: receives the tensors at the same place of all trees.
-        tree: a tensor, ``None``, or a (named) tuple or list of trees. ``None`` stays ``None``.
+        tree: a tensor, or a (named) tuple or list of trees. Everything else, such as ``None``, stays as it is.
         others: more trees of the same structure.
 
     Returns:
@@ -28,10 +28,10 @@ def map_tensors(function: Callable[..., Any], tree: _T, *others: _T) -> _T:
         >>> map_tensors(torch.add, (torch.ones(2), None), (torch.ones(2), None))
         (tensor([2., 2.]), None)
     """
-    if tree is None:
-        return tree
     if isinstance(tree, Tensor):
         return function(tree, *others)
+    if not isinstance(tree, (tuple, list)):
+        return tree
     parts = (map_tensors(function, *entries) for entries in zip(tree, *others, strict=True))  # type: ignore[call-overload]
     return type(tree)(*parts) if hasattr(tree, "_fields") else type(tree)(parts)  # type: ignore[call-arg]
 

@@ -8,22 +8,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_pnpnet.core.linalg import factorise, solve_symmetric, symmetric
+from kornia_pnpnet.core.linalg import solve_symmetric, span_a_plane
 from kornia_pnpnet.core.performance import in_order
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.geometry import Projection, normal_equations, span_a_plane
-from kornia_pnpnet.judge.inliers import (
-    MAX_FALSE_ALARMS,
-    Judged,
-    Thresholds,
-    chance_of_inlier,
-    chance_of_others,
-    fitted_pairs,
-    judge,
-    log_false_alarms,
-)
-from kornia_pnpnet.refine.step import pixel_precision
-from kornia_pnpnet.types import LEAST_NOISE, MIN_PAIRS, Problem, Noise
+from kornia_pnpnet.judge.inliers import MAX_FALSE_ALARMS, Judged, Thresholds, judge, log_false_alarms
+from kornia_pnpnet.problem import LEAST_NOISE, MIN_PAIRS, Noise, Problem
+from kornia_pnpnet.refine.information import pixel_precision
+from kornia_pnpnet.refine.residual import Projection, normal_equations
 
 __all__ = [
     "LAWS",
@@ -43,7 +34,7 @@ __all__ = [
 #: :func:`probability` was not fitted to, 98 % of the right poses keep it, and 5 to 7 % of the poses that are far off.
 LEAST_PROBABILITY = 0.93
 #: The laws of :func:`probability`: the log-odds when both numbers are 0, and their slopes by the logarithms of the
-#: false alarms and of the rotation's sigma; for noise that was told or estimated by a network, and for noise of
+#: false alarms and of the rotation's sigma; for noise that was given or estimated by a network, and for noise of
 #: :func:`residual_noise`. Fitted by ``python docs/results/make.py measure --only probability``.
 LAWS = {"sigmas": (-3.2501, -0.16608, -1.0784), "residuals": (0.89795, -0.27745, 0.070018)}
 _ALARMS, _LOG_SIGMA = (-20.0, 10.0), (-12.0, 2.0)
@@ -64,7 +55,7 @@ def has_enough(projection: Projection, weights: Tensor) -> Tensor:
     return (projection.in_front & (weights > 0)).sum(-1) >= MIN_PAIRS
 
 
-def explains(projection: Projection, corr: Problem, weights: Tensor) -> Tensor:
+def explains(projection: Projection, problem: Problem, weights: Tensor) -> Tensor:
     r"""Tell whether a pose explains the pixels, when the noise is unknown.
 
     A pose explains the pixels when the residual that 60 % of the pairs (by weight) stay below is less than a fifth of
@@ -73,8 +64,8 @@ def explains(projection: Projection, corr: Problem, weights: Tensor) -> Tensor:
     agree (of three pairs all three), and their points must span more than a line.
 
     Args:
-        projection: :func:`~kornia_pnpnet.geometry.project` of the pose.
-        corr: normalised correspondences.
+        projection: the points at the pose.
+        problem: the problem.
         weights: weight of each pair before its residual was looked at, :math:`(B, N)`.
 
     Returns:
@@ -83,10 +74,8 @@ def explains(projection: Projection, corr: Problem, weights: Tensor) -> Tensor:
     weights = weights.detach()
     there = weights > 0
     share = weights / weights.sum(-1, keepdim=True).clamp(min=torch.finfo(weights.dtype).tiny)  # (B, N)
-    spread = torch.zeros_like(share)
-    for pixels in corr.places.detach().unbind(-1):
-        centred = pixels - (share * pixels).sum(-1, keepdim=True)
-        spread = torch.addcmul(spread, centred, centred)
+    places = problem.places.detach()
+    spread = (places - (share[..., None] * places).sum(1, keepdim=True)).square().sum(-1)
     ascending, order = spread.sort(-1)
     position = (share.gather(-1, order).cumsum(-1) < _EXPLAINED_SHARE).sum(-1, keepdim=True)
     limit = _EXPLAINED_RESIDUAL**2 * ascending.gather(-1, position.clamp(max=ascending.shape[-1] - 1))
@@ -95,7 +84,7 @@ def explains(projection: Projection, corr: Problem, weights: Tensor) -> Tensor:
     # Any three pairs have a pose that explains them: of more pairs, a fourth has to agree.
     agree = explained & there
     enough = enough & (agree.sum(-1) >= there.sum(-1).clamp(MIN_PAIRS, MIN_PAIRS + 1))
-    return enough & _span_a_plane(corr.world_points.detach(), agree)
+    return enough & _span_a_plane(problem.world_points.detach(), agree)
 
 
 class Belief(NamedTuple):
@@ -110,41 +99,39 @@ class Belief(NamedTuple):
     ok: Tensor
 
 
-def believe(projection: Projection, corr: Problem, law: str = "sigmas") -> Belief:
+def believe(projection: Projection, problem: Problem, noise: Noise, law: str = "sigmas") -> Belief:
     """Tell whether a pose is to be believed, when the noise is known for every pair.
 
     Its inliers must be more than chance would give it and span more than a line, and it must probably not be far off.
 
     Args:
-        projection: :func:`~kornia_pnpnet.geometry.project` of the pose.
-        corr: normalised correspondences with their noise.
+        projection: the points at the pose.
+        problem: the problem.
+        noise: the noise of every pair.
         law: one of :data:`LAWS`.
 
     Returns:
         The probability and the answer, without a gradient.
     """
-    projection, corr = map_tensors(torch.Tensor.detach, projection), corr.map(torch.Tensor.detach)
-    assert corr.noise is not None
-    precision = pixel_precision(projection, corr.noise, corr.focal) if corr.noise.covariances else None
+    projection, problem, noise = map_tensors(torch.Tensor.detach, (projection, problem, noise))
+    precision = pixel_precision(projection, problem, noise) if noise.covariances else None
     assert not isinstance(precision, Tensor)
     precision = map_tensors(lambda x: x / _EVIDENT**2, precision)
-    thresholds = Thresholds(_EVIDENT * corr.noise.img, _EVIDENT * corr.noise.world, precision)
-    judged = judge(projection, corr, thresholds)
-    inliers, counts = (judged.weights > 0).sum(-1), (corr.weights > 0).sum(-1)
+    thresholds = Thresholds(_EVIDENT * noise.img, _EVIDENT * noise.world, precision)
+    judged = judge(projection, problem, thresholds)
+    counts = (problem.weights > 0).sum(-1)
     samples = counts * (counts - 1) * (counts - 2) // 6  # any three pairs could have given the pose
-    if corr.free_focal is not None:
+    if problem.free_focal is not None:
         samples = samples * (counts - 3).clamp(min=1) // 4
-    chance = chance_of_inlier(corr, thresholds, judged)
-    chance = chance.maximum(chance_of_others(projection, corr, thresholds, judged))
-    alarms = log_false_alarms(samples, inliers, counts, chance, fitted_pairs(corr))
-    chances = probability(alarms, rotation_sigma(projection, corr, judged), law).to(corr.weights)
-    span = _span_a_plane(corr.world_points, judged.weights > 0)
+    alarms = log_false_alarms(samples, projection, problem, thresholds, judged)
+    chances = probability(alarms, rotation_sigma(projection, problem, noise, judged), law).to(problem.weights)
+    span = _span_a_plane(problem.world_points, judged.weights > 0)
     evident = (alarms < math.log(MAX_FALSE_ALARMS)) & (chances >= LEAST_PROBABILITY)
     return Belief(torch.where(span, chances, 0.0), span & evident)
 
 
 def probability(log_alarms: Tensor, sigma: Tensor, law: str = "sigmas") -> Tensor:
-    r"""Probability that a pose is not far off: within 10 degrees and 30 % of the distance of the points.
+    r"""Probability that a pose is within 10 degrees and 30 % of the distance of the points.
 
     A logistic law of two numbers: how unlikely the inliers are by chance, and how well they determine the rotation.
     Few inliers in a small part of the space and of the image agree with many poses.
@@ -171,12 +158,12 @@ def clipped(log_alarms: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
     return log_alarms.clamp(*_ALARMS), sigma.log().clamp(*_LOG_SIGMA)
 
 
-def residual_noise(projection: Projection, corr: Problem, weights: Tensor) -> Noise:
-    """The noise of the pixels that the median residual shows, for a :func:`probability` where the noise is unknown.
+def residual_noise(projection: Projection, problem: Problem, weights: Tensor) -> Noise:
+    """The noise of the pixels that the median residual shows.
 
     Args:
-        projection: :func:`~kornia_pnpnet.geometry.project` of the pose.
-        corr: normalised correspondences.
+        projection: the points at the pose.
+        problem: the problem.
         weights: weight of each pair before its residual was looked at, :math:`(B, N)`.
 
     Returns:
@@ -187,61 +174,55 @@ def residual_noise(projection: Projection, corr: Problem, weights: Tensor) -> No
     ascending = in_order(torch.where(there, projection.sq_residual, torch.inf).detach().mT[None])[0].mT
     middle = ((count + MIN_PAIRS) // 2).minimum(count - 1).clamp(min=0)  # any pose fits three pairs
     variance = ascending.gather(-1, middle) / (2.0 * math.log(2.0))
-    sigma = variance.clamp(max=corr.focal.square()).sqrt().maximum(LEAST_NOISE * corr.focal)
+    focal = projection.focal.detach().reshape(-1, 1)
+    sigma = variance.minimum(focal.square()).sqrt().maximum(LEAST_NOISE * focal)
     return Noise(sigma.expand_as(weights), torch.zeros_like(weights))
 
 
-def rotation_sigma(projection: Projection, corr: Problem, judged: Judged) -> Tensor:
+def rotation_sigma(projection: Projection, problem: Problem, noise: Noise, judged: Judged) -> Tensor:
     """Standard deviation of the rotation in radians, by the noise of the inliers; infinite where they leave it open.
 
     Args:
-        projection: :func:`~kornia_pnpnet.geometry.project` of the pose.
-        corr: normalised correspondences with their noise.
+        projection: the points at the pose.
+        problem: the problem.
+        noise: the noise of every pair.
         judged: what :func:`~kornia_pnpnet.judge.inliers.judge` returned.
 
     Returns:
         The square root of the trace of the rotation's covariance, float64, shape :math:`(B,)`.
     """
-    assert corr.noise is not None
-    inlier = corr.focal.square() * (judged.weights > 0)
-    weights = map_tensors(lambda x: inlier * x, pixel_precision(projection, corr.noise, corr.focal))
-    rows = normal_equations(projection, weights).hessian
-    matrix = symmetric(rows).double()
-    shift = matrix[:, 3:, 3:]
-    left = matrix[:, :3, :3] - matrix[:, :3, 3:] @ solve_symmetric(shift, matrix[:, 3:, :3])  # the shift eliminated
+    inlier = problem.focal.square() * (judged.weights > 0)
+    weights = map_tensors(lambda x: inlier * x, pixel_precision(projection, problem, noise))
+    matrix = normal_equations(projection, problem, weights).matrix[:6, :6].permute(2, 0, 1).double()
+    turn, cross, shift = matrix[:, :3, :3], matrix[:, 3:, :3], matrix[:, 3:, 3:]
+    left = turn - cross.mT @ solve_symmetric(shift, cross)  # the shift eliminated
     eye = torch.eye(3, dtype=left.dtype, device=left.device)
     variance = solve_symmetric(left, eye.expand_as(left)).diagonal(dim1=1, dim2=2).sum(-1)
     return torch.where(variance > 0, variance, torch.inf).sqrt()  # NaN, too, is open
 
 
-def has_focal(projection: Projection, corr: Problem, weights: Tensor) -> Tensor:
+def has_focal(projection: Projection, problem: Problem, noise: Noise, weights: Tensor) -> Tensor:
     """Whether the pairs determine an unknown focal length, to 15 % in standard deviations, bool (B,).
 
     Two standard deviations are then the 30 % of the distance beyond which a pose is far off.
 
     Args:
-        projection: :func:`~kornia_pnpnet.geometry.project` of the pose.
-        corr: normalised correspondences with their noise.
+        projection: the points at the pose.
+        problem: the problem.
+        noise: the noise of every pair.
         weights: final weight of each pair, :math:`(B, N)`.
     """
-    projection, corr = map_tensors(torch.Tensor.detach, projection), corr.map(torch.Tensor.detach)
-    assert corr.noise is not None
-    assert corr.free_focal is not None
+    projection, problem, noise = map_tensors(torch.Tensor.detach, (projection, problem, noise))
     weights = weights.detach()
     tiny = torch.finfo(weights.dtype).tiny
-    share = corr.focal.square() * (weights / weights.amax(1, keepdim=True).clamp(min=tiny))
-    precision = map_tensors(lambda x: share * x, pixel_precision(projection, corr.noise, corr.focal))
-    rows = normal_equations(projection, precision, free_focal=True).hessian
-    pivots: list[Tensor] = []
-
-    def inverse(k: int, pivot: Tensor) -> Tensor:
-        pivots.append(pivot)
-        return torch.where(pivot > tiny, pivot, torch.inf).reciprocal()
-
-    double = [[x.double() for x in row] for row in rows]
-    factorise(double, [torch.zeros_like(x) for x in double[-1]], inverse)
-    # The last pivot is the information of the last parameter when all others are unknown.
-    return pivots[-1] + corr.free_focal.information > _OPEN_FOCAL**-2
+    share = projection.focal.square().reshape(-1, 1) * (weights / weights.amax(1, keepdim=True).clamp(min=tiny))
+    precision = map_tensors(lambda x: share * x, pixel_precision(projection, problem, noise))
+    matrix = normal_equations(projection, problem, precision).matrix.permute(2, 0, 1).double()
+    camera, cross, pose = matrix[:, 6:7, 6:7], matrix[:, :6, 6:7], matrix[:, :6, :6]
+    solved, info = torch.linalg.solve_ex(pose, cross)
+    # The information of the focal length when the pose is unknown.
+    information = (camera - cross.mT @ solved)[:, 0, 0]
+    return (info == 0) & (information + problem.free_focal.information > _OPEN_FOCAL**-2)
 
 
 def _span_a_plane(world_points: Tensor, inliers: Tensor) -> Tensor:

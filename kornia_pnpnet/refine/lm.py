@@ -1,45 +1,41 @@
-r"""The refiner: a list of stages of robust weighted Levenberg-Marquardt with learned hyperparameters, and its verdict.
-
-:mod:`~kornia_pnpnet.refine.step` has one iteration as pure functions; :class:`RobustWeightedLM` owns the parameters and
-the loop.
-"""
+r"""The refinement: stages of robust weighted Levenberg-Marquardt iterations with learned hyperparameters."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
+from typing import NamedTuple
 
 import torch
 from kornia.core.check import KORNIA_CHECK
+from kornia.core.exceptions import ValueCheckError
 from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_whole
-from kornia_pnpnet.core.compilation import Compiled, per_problem
+from kornia_pnpnet.core.compilation import Runner, per_problem
 from kornia_pnpnet.core.configured import Configured
-from kornia_pnpnet.core.linalg import relative
+from kornia_pnpnet.core.linalg import relative, solve_positive
 from kornia_pnpnet.core.performance import problems_last, repeat_problems
+from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.geometry import Projection, project
-from kornia_pnpnet.refine.implicit import attach_gradient
-from kornia_pnpnet.refine.kernels import KERNELS, RobustKernel
-from kornia_pnpnet.refine.parameters import BoundedParameter
-from kornia_pnpnet.refine.prior import focal_loss, prior_loss
-from kornia_pnpnet.refine.scale import complete_noise, is_unknown
-from kornia_pnpnet.refine.stages import LMStart, Stage, State
-from kornia_pnpnet.refine.step import (
-    LMStep,
-    corrected_residuals,
-    iterate,
+from kornia_pnpnet.judge.belief import believe, explains, has_enough, has_focal, residual_noise
+from kornia_pnpnet.problem import Problem, Starts, State
+from kornia_pnpnet.refine.information import (
+    NARROWER,
+    complete_noise,
+    information,
+    is_unknown,
+    outlier_area,
     sq_standardised,
 )
-from kornia_pnpnet.refine.variance import outlier_area
-from kornia_pnpnet.refine.verdict import believe, explains, has_enough, has_focal, residual_noise
-from kornia_pnpnet.types import Correspondences, Guess, Pose, Refinement
+from kornia_pnpnet.refine.kernels import KERNELS, RobustKernel
+from kornia_pnpnet.refine.parameters import BoundedParameter
+from kornia_pnpnet.refine.residual import NormalEquations, Projection, lm_step, moved, normal_equations, project
+from kornia_pnpnet.refine.terms import add_term
+from kornia_pnpnet.result import Pose
 
-__all__ = ["BACKWARDS", "RobustWeightedLM"]
+__all__ = ["BACKWARDS", "Plan", "Refinement", "RobustWeightedLM"]
 
 #: How gradients pass through a refinement, see :class:`RobustWeightedLM`.
-BACKWARDS = ("unroll", "truncated", "implicit")
+BACKWARDS = ("unroll", "implicit")
 
 # Focal lengths. Residuals count up to this size in the cost, and a point behind the camera counts as much, so that it
 # is never cheaper than a point in front of the camera.
@@ -50,36 +46,108 @@ _ROUNDING = 100.0
 _DAMPING_UP, _DAMPING_DOWN = 10.0, 0.3
 
 
+class Plan(NamedTuple):
+    r"""Everything that the iterations of a refinement need, made before the first of them.
+
+    Attributes:
+        problem: the problem, problems last in memory, with the weights of the caller; its noise is known for every
+            pair, or ``None``.
+        prior: weight of each pair without the robust factor, for cost and judgement: the caller's times the
+            initialiser's, or the caller's alone when there are iterations by residual, :math:`(B, N)`.
+        guided: weights of caller and initialiser, relative to the largest, :math:`(B, N)`.
+        by_residual: the weights of the last iterations: those of the caller alone, relative to their mean, or
+            ``guided`` without such iterations, :math:`(B, N)`.
+        state: the first states of :math:`S B` refinements: one of every problem, then the next of every problem.
+        area: area of the image in which pixels of outliers lie, in square pixels, for problems for which the caller
+            gave no sigma, so that the last iterations may correct the initialiser's estimate; 0 for the others,
+            :math:`(B, 1)`; ``None`` when there are no such iterations.
+        noiseless: problems for which neither the caller gave a sigma nor the initialiser an estimate, although the
+            caller gave one for others, bool :math:`(B,)`; ``None``: no such problems.
+        step: :math:`\gamma` of each iteration, scalars.
+        damping: :math:`\lambda` of each iteration, scalars.
+        shape: shape of the kernel of each iteration, scalars.
+    """
+
+    problem: Problem
+    prior: Tensor
+    guided: Tensor
+    by_residual: Tensor
+    state: State
+    area: Tensor | None
+    noiseless: Tensor | None
+    step: tuple[Tensor, ...]
+    damping: tuple[Tensor, ...]
+    shape: tuple[Tensor, ...]
+
+
+class Progress(NamedTuple):
+    """Between two iterations.
+
+    Attributes:
+        state: the states.
+        solved: whether the last equations were solved, bool (S B,).
+        factor: a factor of the damping, (S B,).
+    """
+
+    state: State
+    solved: Tensor
+    factor: Tensor
+
+
+class Refinement(NamedTuple):
+    r"""A refined pose: what a refiner returns.
+
+    Attributes:
+        state: the refined pose in the frame of the problem, and the camera that goes with it.
+        weights: the weight of each pair at that pose, shape :math:`(B, N)`.
+        cost: mean robust loss of the pairs at that pose, shape :math:`(B,)`.
+        ok: whether the pose is to be believed, bool, shape :math:`(B,)`.
+        in_front: whether at least three pairs with a weight are in front of the camera, bool, shape :math:`(B,)`.
+        probability: probability that the pose is not far off, shape :math:`(B,)`.
+    """
+
+    state: State
+    weights: Tensor
+    cost: Tensor
+    ok: Tensor
+    in_front: Tensor
+    probability: Tensor
+
+    @property
+    def pose(self) -> Pose:
+        """The refined pose."""
+        return self.state.pose
+
+
 class RobustWeightedLM(Configured):
     r"""Refine poses by ``m`` unrolled iterations of robust weighted Levenberg-Marquardt.
 
-    Each iteration weighs a pair by the product of the weight that came with the correspondences, the initialiser's
-    weight, and the robust weight of its residual at the previous estimate, and takes one
-    :func:`~kornia_pnpnet.refine.lm_step`. Step :math:`\gamma`, damping :math:`\lambda` and robustness (the shape of
-    the kernel, :math:`\alpha` for ``power``) are learned, by default one set per iteration. At their initial values
-    this is the classical method.
+    Each iteration weighs a pair by the product of the weight that came with the problem, the initialiser's weight, and
+    the robust weight of its residual at the previous estimate, and takes one
+    :func:`~kornia_pnpnet.refine.residual.lm_step`. Step :math:`\gamma`, damping :math:`\lambda` and robustness (the
+    shape of the kernel, :math:`\alpha` for ``power``) are learned, by default one set per iteration. At their initial
+    values this is the classical method.
 
     *Noise.* Where the noise of each pair is known or estimated, residuals count in standard deviations: a pair weighs
     :math:`1 / \sigma^2` times the robust weight of :math:`\|r\|^2 / \sigma^2`, with the
-    :func:`~kornia_pnpnet.geometry.pixel_variance` :math:`\sigma^2` at the previous estimate. Where the caller gave
-    covariances, residuals are whitened by the :func:`~kornia_pnpnet.geometry.pixel_covariance` instead. Scales of
-    kernels and the cost then count in standard deviations, too.
+    :func:`~kornia_pnpnet.refine.residual.pixel_variance` :math:`\sigma^2` at the previous estimate. Where the caller
+    gave covariances, residuals are whitened by the :func:`~kornia_pnpnet.refine.residual.pixel_covariance` instead.
+    Scales of kernels and the cost then count in standard deviations, too.
 
-    *Several poses.* Where a guess has other poses, the first seven tenths of the iterations (rounded down) refine all
-    of them. Then the pose of the lowest cost by the kernel of the last of these iterations goes on alone, per problem.
+    *Several poses.* Where an initialiser returns several poses, the first seven tenths of the iterations (rounded down)
+    refine all of them. Then the pose of the lowest cost by the kernel of the last of these iterations goes on alone.
 
     *By residual.* The last ``by_residual`` iterations and the choice among several poses ignore the initialiser's
     weights: by then the residuals say better which pairs are outliers. Where the initialiser estimated the noise, and
-    the residuals show that its variance is too small or too large (by likelihood ratios), :meth:`finish` multiplies the
-    variance by the factor that they show, see ``variance_factor``. Where it is too large
-    the iterations multiply by a tenth of that, since a narrower kernel separates inliers from outliers better. Noise
-    that the caller gave stays as it is.
+    the residuals show that its variance is too small or too large (by likelihood ratios), :meth:`judge` multiplies the
+    variance by the factor that they show. Where it is too large the iterations multiply by a tenth of that factor,
+    since a narrower kernel separates inliers from outliers better. Noise that the caller gave stays as it is.
 
     All operations are per problem: a problem that cannot be solved keeps its pose, reports ``ok=False`` and changes
     no other.
 
     Args:
-        m: number of iterations; 0 leaves the guess as it is and only judges it.
+        m: number of iterations; 0 leaves the poses as they are and only judges the first.
         kernel: name of the robust kernel, a key of :data:`~kornia_pnpnet.refine.kernels.KERNELS`.
         step: initial :math:`\gamma`, in [0, 2].
         damping: initial :math:`\lambda`, in [1e-8, 100].
@@ -87,29 +155,26 @@ class RobustWeightedLM(Configured):
         shared: learn one set for all iterations instead of one each.
         update: ``"retraction"`` on the rotation group, or the paper's ``"additive"`` on the rotation vector.
         reject_worse: refuse, per problem, a step that raises the cost, and raise the damping tenfold after it. From a
-            start far away the iterations diverge otherwise; from a good guess they take the same steps, and are faster
+            start far away the iterations diverge otherwise; from a good start they take the same steps, and are faster
             without.
         by_residual: number of final iterations that ignore the initialiser's weights, at most those after the choice
-            among several poses.
+            among several poses. Needs a kernel whose weights are at most 1, which those of ``power`` are not.
         learnable: whether the hyperparameters are trained.
-        backward: how gradients pass. ``"unroll"``: through all iterations. ``"truncated"``: through the ``last``
-            iterations; the pose before them is a constant. ``"implicit"``: by the implicit function theorem, as
-            through a minimum, at a memory that does not grow with ``m``; exact once the iterations have converged.
-            Step, damping and the first guess then have no gradient. A solver that estimates radial distortion always
-            takes this way: the minimum is then one of the distortion, too.
-        last: number of iterations that ``"truncated"`` passes through.
-        compared_at: number of iterations before the choice among several poses; seven tenths of ``m`` when ``None``.
+        backward: how gradients pass. ``"unroll"``: through all iterations. ``"implicit"``: by the implicit function
+            theorem, as through a minimum, at a memory that does not grow with ``m``; exact once the iterations have
+            converged. Step, damping and the first poses then have no gradient.
 
     Raises:
         BaseError: for an unknown kernel or update, a negative ``m``, or an initial value out of its bounds.
+        ValueCheckError: for ``by_residual`` with a kernel whose weights exceed 1.
 
     Example:
+        >>> from kornia_pnpnet import Normalize
         >>> from kornia_pnpnet.data import SyntheticProblems
-        >>> from kornia_pnpnet.normalize import Normalize
         >>> problems = SyntheticProblems(n=9, batch_size=2, seed=0, world_sigma=0.0, img_sigma=0.0).batch(0)
         >>> normalize = Normalize(center=False, scale=False, order=False)
-        >>> corr, frame = normalize(problems.world_points, problems.img_points, problems.intrinsics)
-        >>> refined = RobustWeightedLM(m=5)(corr, Guess(problems.pose, torch.ones_like(corr.weights)))
+        >>> problem, frame = normalize(problems.world_points, problems.img_points, problems.intrinsics)
+        >>> refined = RobustWeightedLM(m=5)(problem, Starts(problems.pose, torch.ones_like(problem.weights)))
         >>> refined.ok
         tensor([True, True])
     """
@@ -128,41 +193,28 @@ class RobustWeightedLM(Configured):
         by_residual: int = 0,
         learnable: bool = True,
         backward: str = "unroll",
-        last: int = 1,
-        compared_at: int | None = None,
     ) -> None:
         super().__init__(locals())
         check_whole(0, m=m, by_residual=by_residual)
-        check_whole(1, last=last)
         KORNIA_CHECK(kernel in KERNELS, f"kernel must be one of {sorted(KERNELS)}, got {kernel!r}.")
         KORNIA_CHECK(update in ("retraction", "additive"), f"update must be retraction or additive, got {update!r}.")
         KORNIA_CHECK(backward in BACKWARDS, f"backward must be one of {BACKWARDS}, got {backward!r}.")
-        self.m = m
-        check_whole(0, m, **({} if compared_at is None else {"compared_at": compared_at}))
-        self.compared_at = 7 * m // 10 if compared_at is None else compared_at
-        self.by_residual = min(by_residual, m - self.compared_at)
-        self.backward = backward
-        self.last = last
         self.kernel: RobustKernel = KERNELS[kernel]
+        if by_residual and not self.kernel.bounded:
+            raise ValueCheckError(f"by_residual needs a kernel whose weights are at most 1: not {kernel!r}.")
+        self.m = m
+        self.explored = 7 * m // 10
+        self.by_residual = min(by_residual, m - self.explored)
+        self.additive = update == "additive"
+        self.backward = backward
         self.reject_worse = reject_worse
         size = 1 if shared or m == 0 else m
         shape = self.kernel.default if robustness is None else robustness
         self.step = BoundedParameter(step, size=size, lower=0.0, upper=2.0)
         self.damping = BoundedParameter(damping, size=size, lower=1e-8, upper=1e2, logarithmic=True)
-        self.robustness = BoundedParameter(
-            shape,
-            size=size,
-            lower=self.kernel.lower,
-            upper=self.kernel.upper,
-            logarithmic=self.kernel.logarithmic,
-        )
+        bounds = {"lower": self.kernel.lower, "upper": self.kernel.upper}
+        self.robustness = BoundedParameter(shape, size=size, **bounds, logarithmic=self.kernel.logarithmic)
         self.requires_grad_(learnable and m > 0)
-        self._iteration = partial(iterate, kernel_weight=self.kernel.weight, additive=update == "additive")
-        # What runs: these functions, or what `compile` made of them.
-        self._begin: Callable[..., LMStart] = self.begin
-        self._iterate: Callable[..., LMStep] = self._iteration
-        self._choose: Callable[..., State] = self._best_pose
-        self._finish: Callable[..., Refinement] = self.finish
 
     def hyperparameters(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         r"""Return :math:`\gamma`, :math:`\lambda` and the kernel's shape for each iteration.
@@ -181,11 +233,8 @@ class RobustWeightedLM(Configured):
         """A copy with another number of iterations, its hyperparameters included.
 
         Args:
-            m: number of iterations. Fewer: the first of them, and the same share before the choice among several poses.
-                More: the last iteration is repeated, so that poses converge further.
-
-        Returns:
-            The refiner, not compiled.
+            m: number of iterations. Fewer: the first of them. More: the last iteration is repeated, so that poses
+                converge further.
 
         Example:
             >>> refine = RobustWeightedLM(m=5).with_iterations(20)
@@ -193,238 +242,214 @@ class RobustWeightedLM(Configured):
             (20, torch.Size([20]))
         """
         check_whole(0, m=m)
-        more = m - self.m
-        config = {**self.config, "m": m, "by_residual": max(self.by_residual + more, 0)}
-        config["compared_at"] = self.compared_at if more > 0 else None
-        refine = RobustWeightedLM(**config)
+        refine = RobustWeightedLM(**{**self.config, "m": m, "by_residual": max(self.by_residual + m - self.m, 0)})
         for name, parameter in refine.named_parameters():
             trained = self.get_parameter(name).detach()
             parameter.data = trained[torch.arange(len(parameter)).clamp(max=len(trained) - 1)]
         return refine
 
-    def forward(self, corr: Correspondences, guess: Guess, *, m: int | None = None) -> Refinement:
-        r"""Refine a guess.
+    def forward(
+        self, problem: Problem, starts: Starts, *, m: int | None = None, more: int = 0, run: Runner = Runner()
+    ) -> Refinement:
+        r"""Refine poses.
 
         Args:
-            corr: normalised correspondences of :math:`B` problems with :math:`N` pairs each.
-            guess: poses in the frame of ``corr`` and a factor for the weight of each pair.
-            m: stop after this many iterations; run all of them when ``None``.
+            problem: :math:`B` problems with :math:`N` pairs each.
+            starts: poses in the frame of the problem and a factor for the weight of each pair.
+            m: stop after this number of iterations; run all of them when ``None``.
+            more: number of further iterations like the last one.
+            run: runs each part, compiled or not.
 
         Returns:
             The refined poses, the weights and the cost at these poses with the kernel of the last iteration, and
             ``ok``: whether the last equations could be solved and the pose is to be believed. With unknown noise it
             has to explain the pixels better than a single point would; with known noise it has to have more inliers
-            than chance would give it (see :mod:`kornia_pnpnet.refine.verdict`).
+            than chance would give it (see :mod:`kornia_pnpnet.judge.belief`).
         """
-        start = self._begin(corr, guess)
-        return self._finish(start, self.iterate(start, m))
+        plan = run(self.begin, problem, starts)
+        state, solved = self.iterate(plan, m, more=more, run=run)
+        return run(self.judge, plan, state, solved)
 
-    def begin(self, corr: Correspondences, guess: Guess) -> LMStart:
-        """Prepare a refinement: everything before the first iteration.
-
-        Args:
-            corr: normalised correspondences of :math:`B` problems with :math:`N` pairs each.
-            guess: poses in the frame of ``corr`` and a factor for the weight of each pair.
-
-        Returns:
-            What the iterations need.
-        """
-        step, damping, shape = (x.unbind() for x in self.hyperparameters(corr.world_points))
-        unknown = is_unknown(corr) if self.by_residual or corr.noise is not None else None
-        noiseless = None if unknown is None or corr.noise is None or guess.noise is not None else unknown[:, 0]
-        corr = problems_last(corr._replace(noise=complete_noise(corr, guess)))
-        prior = corr.weights * problems_last(guess.weights)
+    def begin(self, problem: Problem, starts: Starts) -> Plan:
+        """Prepare a refinement: everything before the first iteration. For the arguments see :meth:`forward`."""
+        step, damping, shape = (x.unbind() for x in self.hyperparameters(problem.world_points))
+        unknown = is_unknown(problem) if self.by_residual or problem.noise is not None else None
+        noiseless = None if unknown is None or problem.noise is None or starts.noise is not None else unknown[:, 0]
+        problem = problems_last(problem._replace(noise=complete_noise(problem, starts)))
+        prior = problem.weights * problems_last(starts.weights)
         area = None
-        if self.by_residual and unknown is not None and corr.noise is not None and not corr.noise.covariances:
-            area = torch.where(unknown, outlier_area(corr), 0.0)
+        if self.by_residual and unknown is not None and problem.noise is not None and not problem.noise.covariances:
+            area = torch.where(unknown, outlier_area(problem), 0.0)
         # Steps do not depend on a common factor of the weights; tiny weights must not vanish when multiplied.
-        guided = corr._replace(weights=relative(prior, prior), img_scale=None, world_scale=None)
-        by_residual = guided
+        guided = by_residual = relative(prior, prior)
         if self.by_residual:
-            by_residual = guided._replace(weights=_relative_to_mean(corr.weights))
-            prior = corr.weights
-        poses = guess.poses
-        starts, rivals = guided, None
-        if len(poses) > 1:
-            starts = repeat_problems(guided, len(poses))
-            rivals = starts._replace(weights=repeat_problems(by_residual.weights, len(poses)))
-        zoom = None
-        if corr.free_focal is not None:
-            first = torch.zeros_like(prior[:, 0]) if guess.zoom is None else guess.zoom
-            zoom = torch.cat((first, *(torch.zeros_like(first) for _ in poses[1:])))
+            by_residual, prior = _relative_to_mean(problem.weights), problem.weights
+        poses = starts.poses
         # Problems last in memory, too: (3, 3, S B) and (3, S B).
         pose = map_tensors(lambda *x: torch.cat([y.movedim(0, -1) for y in x], -1).movedim(-1, 0), *poses)
-        return LMStart(
-            corr=corr,
-            prior=prior,
-            pose=pose,
-            guided=guided,
-            by_residual=by_residual,
-            starts=starts,
-            rivals=rivals,
-            outlier_area=area,
-            noiseless=noiseless,
-            zoom=zoom,
-            step=step,
-            damping=damping,
-            shape=shape,
+        camera = pose.translation[:, : 0 if problem.free_focal is None else 1] * 0.0
+        if starts.camera is not None:
+            camera = starts.camera.repeat(len(poses), 1)
+        return Plan(
+            problem, prior, guided, by_residual, State(pose, camera), area, noiseless, step, damping, shape
         )
 
-    def stages(self, start: LMStart, m: int, more: int = 0) -> list[Stage]:
-        """Plan the first ``m`` iterations: the pairs, weights, noise and hyperparameters that each of them sees.
+    def iterate(
+        self, plan: Plan, m: int | None = None, *, more: int = 0, run: Runner = Runner()
+    ) -> tuple[State, Tensor]:
+        """Run the iterations: on all poses of a problem, then on the best pose of each, the last by residual.
 
         Args:
-            start: what :meth:`begin` returned.
-            m: number of iterations.
-            more: number of further iterations like the last one.
+            plan: what :meth:`begin` returned.
+            m: See forward.
+            more: See forward.
+            run: See forward.
 
         Returns:
-            The stages in order: iterations on all poses of the guess, the choice of one pose per problem, iterations
-            with the initialiser's weights, and iterations by residual. Stages that have nothing to do are left out.
-        """
-        explored = 0 if start.rivals is None else min(self.compared_at, m)
-        guided = max(self.m - self.by_residual, explored)
-        seen: list[tuple[Correspondences, Tensor | None]] = [(start.starts, None)] * explored
-        seen += [(start.guided, None)] * (guided - explored)
-        seen += [(start.by_residual, start.outlier_area)] * (self.m - guided)
-        plan = [
-            Stage(i, partial(self._advance, pairs, start.step[i], start.damping[i], start.shape[i], area))
-            for i, (pairs, area) in enumerate(seen[:m])
-        ]
-        plan += [plan[-1]._replace(iteration=m + i) for i in range(more)]
-        if start.rivals is not None:
-            shape = start.shape[max(self.compared_at - 1, 0)]
-            plan.insert(explored, Stage(explored, partial(self._choose, start.rivals, start.prior, shape)))
-        return plan
-
-    def iterate(self, start: LMStart, m: int | None = None, *, more: int = 0) -> LMStep:
-        """Run the iterations.
-
-        Args:
-            start: what :meth:`begin` returned.
-            m: stop after this many iterations; run all of them when ``None``.
-            more: number of further iterations like the last one.
-
-        Returns:
-            The last pose, and whether the last equations could be solved.
+            The last state, and whether the last equations could be solved.
         """
         m = self.m if m is None else min(m, self.m)
-        more = more if m else 0
-        live = {"unroll": 0, "truncated": max(m + more - self.last, 0), "implicit": m + more}[self.backward]
-        plan = self.stages(start, m, more)
-        ones = torch.ones_like(start.pose.translation[:, 0])
-        state = State(start.pose, ones.bool(), ones, start.zoom)
-        for stage in plan:
-            with torch.set_grad_enabled(torch.is_grad_enabled() and stage.iteration >= live):
-                state = stage.advance(state)
-        end = LMStep(state.pose, state.solved, state.zoom)
+        problem, count = plan.problem, len(plan.state.camera) // max(len(plan.prior), 1)
+        hyperparameters = list(zip(plan.step, plan.damping, plan.shape, strict=True))[:m]
+        hyperparameters += hyperparameters[-1:] * more
+        guided, by_residual = (problem._replace(weights=x) for x in (plan.guided, plan.by_residual))
+        ones = torch.ones_like(plan.state.pose.translation[:, 0])
+        now = Progress(plan.state, ones > 0, ones)
+        explored = 0
+        with torch.set_grad_enabled(torch.is_grad_enabled() and self.backward == "unroll"):
+            if count > 1:
+                explored = min(self.explored, m)
+                several = repeat_problems(guided, count)
+                for each in hyperparameters[:explored]:
+                    now = run(self._iteration, several, now, *each, None)
+                rivals = several._replace(weights=repeat_problems(plan.by_residual, count))
+                now = run(self._best, rivals, plan.prior, plan.shape[max(self.explored - 1, 0)], now)
+            switch = max(self.m - self.by_residual, explored)
+            for each in hyperparameters[explored:switch]:
+                now = run(self._iteration, guided, now, *each, None)
+            for each in hyperparameters[switch:]:
+                now = run(self._iteration, by_residual, now, *each, plan.area)
         if self.backward == "implicit" and m and torch.is_grad_enabled():
-            return attach_gradient(start, end, start.shape[m - 1], self.kernel.weight)
-        return end
+            return self._with_gradient(by_residual, now.state, plan.shape[m - 1], plan.area), now.solved
+        return now.state, now.solved
 
-    def finish(self, start: LMStart, end: LMStep) -> Refinement:
+    def judge(self, plan: Plan, state: State, solved: Tensor) -> Refinement:
         """Judge where the iterations ended: everything after the last iteration.
 
         Args:
-            start: what :meth:`begin` returned.
-            end: what :meth:`iterate` returned.
-
-        Returns:
-            See :meth:`forward`.
+            plan: what :meth:`begin` returned.
+            state: where the iterations ended.
+            solved: whether the last equations could be solved, bool :math:`(B,)`.
         """
-        start = start.zoomed(end.zoom)
-        projection, shape = project(end.pose, start.corr), per_problem(start.shape[-1], start.prior[:, :1])
-        pairs = start.corr._replace(weights=start.by_residual.weights)
-        sq_residual, noise = corrected_residuals(projection, pairs, self.kernel.weight, shape, start.outlier_area)
-        weights = torch.where(projection.in_front, start.prior * self.kernel.weight(sq_residual, shape), 0.0)
-        cost = self._cost(end.pose, projection, start.corr, start.prior, shape)
-        judged, unknown, law = start.guided, start.noiseless, "sigmas"
+        projection, shape = project(state, plan.problem), per_problem(plan.shape[-1], plan.prior[:, :1])
+        seen = plan.problem._replace(weights=plan.by_residual)
+        sq_residual, _, noise = information(projection, seen, self.kernel.weight, shape, plan.area)
+        weights = torch.where(projection.in_front, plan.prior * self.kernel.weight(sq_residual, shape), 0.0)
+        cost = self._cost(projection, plan.problem, plan.prior, shape)
+        judged, unknown, law = plan.problem._replace(weights=plan.guided), plan.noiseless, "sigmas"
         if noise is None:
-            noise, judged, law = residual_noise(projection, start.corr, start.prior), start.corr, "residuals"
-            unknown = torch.ones_like(end.solved)
-        probability, ok = believe(projection, judged._replace(noise=noise), law)
+            noise, judged, law = residual_noise(projection, plan.problem, plan.prior), plan.problem, "residuals"
+            unknown = torch.ones_like(solved)
+        probability, ok = believe(projection, judged, noise, law)
         if unknown is not None:
             # Not `where`: ONNX Runtime has none for booleans.
-            ok = (unknown & explains(projection, start.corr, start.prior)) | (~unknown & ok)
-        in_front = has_enough(projection, start.prior)
-        if end.zoom is not None:
-            ok = ok & has_focal(projection, judged._replace(noise=noise), weights)
-        return Refinement(end.pose, weights, cost, end.solved & ok & in_front, in_front, probability, end.zoom)
+            ok = (unknown & explains(projection, plan.problem, plan.prior)) | (~unknown & ok)
+        in_front = has_enough(projection, plan.prior)
+        if state.camera.shape[1]:
+            ok = ok & has_focal(projection, judged, noise, weights)
+        return Refinement(state, weights, cost, solved & ok & in_front, in_front, probability)
 
-    def cost(self, start: LMStart, pose: Pose) -> Tensor:
-        """The ``cost`` of :meth:`finish` at any pose, shape :math:`(B,)`.
+    def cost(self, plan: Plan, state: State) -> Tensor:
+        """The ``cost`` of :meth:`judge` at any state, shape :math:`(B,)`."""
+        return self._cost(project(state, plan.problem), plan.problem, plan.prior, plan.shape[-1])
 
-        Args:
-            start: what :meth:`begin` returned.
-            pose: a pose for each problem in the frame of the correspondences.
-        """
-        return self._cost(pose, project(pose, start.corr), start.corr, start.prior, start.shape[-1])
-
-    def compile(self, mode: str | None = None) -> None:
-        """Compile with ``torch.compile``, in place: what is before, in, and after an iteration, each once.
-
-        The first call takes seconds, further calls a fraction of the uncompiled time. The batch may change its size.
-
-        Args:
-            mode: mode of ``torch.compile``.
-        """
-        self._begin = Compiled(self.begin, mode)
-        self._iterate = Compiled(self._iteration, mode)
-        self._choose = Compiled(self._best_pose, mode)
-        self._finish = Compiled(self.finish, mode)
-
-    def _advance(
-        self,
-        pairs: Correspondences,
-        step: Tensor,
-        damping: Tensor,
-        shape: Tensor,
-        area: Tensor | None,
-        state: State,
-    ) -> State:
-        """One iteration. With ``reject_worse``, a problem whose cost would rise keeps its pose."""
-        damping = damping * state.factor if self.reject_worse else damping
-        here = pairs.zoomed(state.zoom)
-        moved = self._iterate(here, state.pose, step, damping, shape, area)
-        pose, solved, zoom = moved.pose, moved.solved, moved.zoom_after(state.zoom)
+    def _iteration(
+        self, problem: Problem, now: Progress, step: Tensor, damping: Tensor, shape: Tensor, area: Tensor | None
+    ) -> Progress:
+        """One iteration. With ``reject_worse``, a problem whose cost would rise keeps its state."""
+        step, damping = (per_problem(x, problem.weights[:, 0]) for x in (step, damping))
+        shape = per_problem(shape, problem.weights[:, :1])
+        damping = damping * now.factor if self.reject_worse else damping
+        projection = project(now.state, problem)
+        equations = self._equations(projection, problem, shape, area, NARROWER)
+        state, solved = lm_step(equations, now.state, projection.focal, step, damping, additive=self.additive)
         if not self.reject_worse or area is not None:  # the cost does not know the corrected noise
-            return State(pose, solved, state.factor, zoom)
-        at = (pose, pairs.zoomed(zoom)), (state.pose, here)
-        new, old = (self._cost(x, project(x, seen), seen, seen.weights, shape) for x, seen in at)
+            return Progress(state, solved, now.factor)
+        new = self._cost(project(state, problem), problem, problem.weights, shape)
+        old = self._cost(projection, problem, problem.weights, shape)
         # At a minimum, rounding decides which cost is lower. A refused step has no gradient there: take the step.
         rounding = _ROUNDING * torch.finfo(new.dtype).eps
-        better = new <= old * (1.0 + rounding) + (rounding * here.focal_of_problem).square()
-        factor = torch.where(better, state.factor * _DAMPING_DOWN, state.factor * _DAMPING_UP)
+        better = new <= old * (1.0 + rounding) + (rounding * projection.focal).square()
+        factor = torch.where(better, now.factor * _DAMPING_DOWN, now.factor * _DAMPING_UP)
+        kept = map_tensors(
+            lambda x, y: torch.where(better.view(-1, *(1,) * (x.ndim - 1)), x, y), state, now.state
+        )
+        return Progress(kept, solved, factor)
 
-        def chosen(new: Tensor, old: Tensor) -> Tensor:
-            return torch.where(better.view(-1, *(1,) * (new.ndim - 1)), new, old)
+    def _equations(
+        self, projection: Projection, problem: Problem, shape: Tensor, area: Tensor | None, narrower: float = 1.0
+    ) -> NormalEquations:
+        """Normal equations of the pairs, weighted and whitened, and of the terms.
 
-        pose, zoom = map_tensors(chosen, (pose, zoom), (state.pose, state.zoom))
-        return State(pose, solved, factor, zoom)
+        Weights are relative to the heaviest row of the Jacobian, so that products of tiny weights do not vanish.
+        """
+        sq_residual, precision, _ = information(projection, problem, self.kernel.weight, shape, area, narrower)
+        robust = problem.weights * self.kernel.weight(sq_residual, shape)
+        weights = map_tensors(lambda x: x * robust, precision)
+        size = weights.uu + weights.vv if isinstance(weights, Symmetric2) else weights
+        largest = (size * projection.inv_depth.mT.square()).detach().amax(1, keepdim=True)
+        unit = torch.where(largest > 0, largest, 1.0)
+        equations = normal_equations(projection, problem, map_tensors(lambda x: x / unit, weights))
+        for term in problem.terms:
+            equations = add_term(equations, term.linearise(projection.state), unit[:, 0], projection.focal)
+        return equations
 
-    def _best_pose(self, rivals: Correspondences, prior: Tensor, shape: Tensor, state: State) -> State:
-        """Keep the pose of the lowest cost of each problem; ``prior`` has as many problems as there are."""
+    def _best(self, rivals: Problem, prior: Tensor, shape: Tensor, now: Progress) -> Progress:
+        """Keep the state of the lowest cost of each problem; ``prior`` has as many problems as there are."""
         batch = prior.shape[0]
-        pose, zoom = map_tensors(torch.Tensor.detach, (state.pose, state.zoom))
-        rivals = rivals.zoomed(zoom)
-        cost = self._cost(pose, project(pose, rivals), rivals, rivals.weights, shape.detach())
+        projection = project(map_tensors(torch.Tensor.detach, now.state), rivals)
+        cost = self._cost(projection, rivals, rivals.weights, shape.detach())
         best = (cost.view(-1, batch) if batch else cost[None]).argmin(0)  # (B,), the first of equals
         index = torch.add(torch.arange(batch, device=best.device), best, alpha=batch)
-        return map_tensors(lambda x: x.movedim(0, -1).index_select(-1, index).movedim(-1, 0), state)
+        return map_tensors(lambda x: x.movedim(0, -1).index_select(-1, index).movedim(-1, 0), now)
 
-    def _cost(self, pose: Pose, projection: Projection, corr: Correspondences, prior: Tensor, shape: Tensor) -> Tensor:
-        """Mean robust loss over the pairs that have a weight, with that of the prior of the pose, shape (B,)."""
-        most = (_MAX_RESIDUAL * corr.focal).square()
-        sq_residual = sq_standardised(projection, corr, most)
-        count = (corr.weights > 0).sum(-1).clamp(min=1)
-        total = (prior * self.kernel.loss(sq_residual, shape)).sum(-1)
-        known = corr.prior or corr.free_focal
-        unit = known.pixel.square() if known is not None and corr.noise is None else 1.0
-        if corr.prior is not None:
-            total = total + unit * prior_loss(corr.prior, pose)
-        if corr.free_focal is not None:
-            total = total + unit * focal_loss(corr.free_focal, corr.focal_of_problem)
+    def _cost(self, projection: Projection, problem: Problem, prior: Tensor, shape: Tensor) -> Tensor:
+        """Mean robust loss over the pairs that have a weight, with that of the terms, shape (B,)."""
+        most = (_MAX_RESIDUAL * projection.focal).square().reshape(-1, 1)
+        count = (problem.weights > 0).sum(-1).clamp(min=1)
+        total = (prior * self.kernel.loss(sq_standardised(projection, problem, most), shape)).sum(-1)
+        unit = problem.img_scale.square() if problem.noise is None else 1.0  # unknown noise counts as a pixel
+        for term in problem.terms:
+            total = total + unit * term.loss(projection.state)
         return total / count
+
+    def _with_gradient(self, problem: Problem, state: State, shape: Tensor, area: Tensor | None) -> State:
+        r"""Give a converged state the gradient of a minimum, by the implicit function theorem.
+
+        With :math:`g(\delta) = J^\top W r` at the state moved by :math:`\delta`, which is 0 at the minimum,
+        :math:`d\delta = -(\partial g / \partial \delta)^{-1} dg`: one Newton step whose value is left out. Where the
+        matrix is not positive definite the state is no minimum yet, and the Gauss-Newton matrix replaces it. A second
+        step with the same matrix makes second derivatives exact. Covariances turn with the pose, so that the matrix is
+        not quite symmetric: a third step takes most of the difference away.
+        """
+
+        def equations(problem: Problem, at: State, shape: Tensor) -> NormalEquations:
+            return self._equations(project(at, problem), problem, shape, area, NARROWER)
+
+        zero = torch.zeros_like(state.pose.translation[:1, 0]).expand(6 + state.camera.shape[1], len(state.camera))
+        zero = zero.clone().requires_grad_()
+        with torch.enable_grad():
+            fixed, slope = equations(problem.map(torch.Tensor.detach), moved(state, zero), shape.detach())
+            hessian = [torch.autograd.grad(x.sum(), zero, retain_graph=True)[0] for x in slope]
+        matrix, around, none = torch.stack(hessian), fixed.detach(), torch.zeros_like(shape)
+        focal = project(state, problem).focal.detach()
+        for _ in range(3 if problem.noise is not None and problem.noise.covariances else 2):
+            gradient = equations(problem, state, shape).gradient
+            newton, convex = solve_positive(matrix, gradient, none)
+            gauss_newton, solved = solve_positive(around, gradient, none)
+            delta = torch.where(convex, newton, torch.where(solved, gauss_newton / focal, 0.0))
+            state = moved(state, delta.detach() - delta)
+        return state
 
 
 def _relative_to_mean(weights: Tensor) -> Tensor:

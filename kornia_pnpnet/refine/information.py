@@ -1,0 +1,253 @@
+r"""The one place where noise becomes information: the precision of each pixel, and what the residuals say of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple, TypeAlias
+
+import torch
+from torch import Tensor
+
+from kornia_pnpnet.core.symmetric import Symmetric2
+from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.problem import LEAST_NOISE, MIN_PAIRS, Noise, Problem, Starts
+from kornia_pnpnet.refine.residual import Projection, pixel_covariance, pixel_variance
+
+__all__ = [
+    "NARROWER",
+    "Information",
+    "KernelWeight",
+    "complete_noise",
+    "information",
+    "is_unknown",
+    "outlier_area",
+    "pixel_precision",
+    "sq_standardised",
+]
+
+# Logarithm of a likelihood ratio. The residuals' own variance factor replaces 1 where it is e³ times as likely.
+_BELIEVED = 3.0
+# Exponents of 4: variance factors that are compared before. Noise above the estimate needs them: a kernel that is too
+# narrow hides it.
+_FACTORS = range(8)
+# Powers of the confidence that the standard deviation of the noise may be proportional to, and the variance factors at
+# which they are compared: noise of the geometric mean's confidence may be below the estimate.
+_POWERS = (0.0, -1.0, -2.0, -3.0)
+_POWER_FACTORS = range(-5, 8)
+# Lower confidences count as this much, so that the pair keeps some weight.
+_LEAST_CONFIDENCE = 0.05
+# Share of the pairs that are inliers above which the noise may depend on the confidence.
+_MOST = 0.5
+# Rounds of expectation and maximisation for the share of the inliers at each factor; bounds of the share.
+_ROUNDS, _LEAST_SHARE = 2, 0.02
+# The smallest variance factor: residuals of exact data would give 0.
+_LEAST_FACTOR = 1e-4
+#: The iterations multiply a variance factor below 1 by this: where the noise is known so well, a kernel of a third of
+#: the width separates inliers from near misses better. Tuned with the weights of `pnpnet-set`, on synthetic problems.
+NARROWER = 0.1
+
+#: Robust weight by squared residual and shape, see :class:`~kornia_pnpnet.refine.kernels.RobustKernel`.
+KernelWeight: TypeAlias = Callable[[Tensor, Tensor], Tensor]
+
+
+class Information(NamedTuple):
+    """Residuals in the unit of the robust kernel, and the information of the pixels.
+
+    Attributes:
+        sq_residual: squared residuals in variances, in square pixels where no noise is known, shape (B, N).
+        precision: inverse variance of a pixel, (B, N) or (B, 1), or the inverse of its covariance.
+        noise: the noise with sigmas no smaller than given or estimated; ``None``: no noise is known.
+    """
+
+    sq_residual: Tensor
+    precision: Tensor | Symmetric2
+    noise: Noise | None
+
+
+def complete_noise(problem: Problem, starts: Starts) -> Noise | None:
+    """The caller's covariances, the initialiser's sigmas or else the caller's with 0 where unknown; ``None``: neither."""
+    noise = starts.noise
+    if noise is None and problem.noise is not None:
+        noise = map_tensors(lambda x: x.nan_to_num(0.0), problem.noise)
+    if noise is None:
+        return None
+    given = noise if problem.noise is None else problem.noise  # an initialiser estimates no covariances
+    least = noise.img.maximum(LEAST_NOISE * problem.focal)
+    return noise._replace(img=least, img_cov=given.img_cov, world_cov=given.world_cov)
+
+
+def is_unknown(problem: Problem) -> Tensor:
+    """Problems of which the caller gave neither sigma for any pair, bool (B, 1)."""
+    known = torch.zeros_like(problem.weights[:, :1], dtype=torch.bool)
+    for sigma in () if problem.noise is None else problem.noise.sigmas[:2]:
+        known = known | sigma.isfinite().any(1, keepdim=True)
+    return ~known
+
+
+def pixel_precision(projection: Projection, problem: Problem, noise: Noise) -> Tensor | Symmetric2:
+    """Inverse of the variance of each pixel, (B, N), or of the covariance where there is any."""
+    if not noise.covariances:
+        return pixel_variance(projection, noise).reciprocal()
+    return pixel_covariance(projection, problem, noise).inverse()
+
+
+def sq_standardised(projection: Projection, problem: Problem, most: Tensor) -> Tensor:
+    """Squared residuals in variances of their pixel where the noise is known, else in square pixels, bounded.
+
+    Args:
+        projection: the points at a state.
+        problem: the problem; its noise is known for every pair or for none.
+        most: square pixels, a scalar or (B, 1). Larger squared residuals count as this much, and so does a point behind
+            the camera. With covariances these square pixels have the mean precision of both coordinates.
+
+    Returns:
+        Shape :math:`(B, N)`.
+    """
+    if problem.noise is None or not problem.noise.covariances:
+        sq_residual = torch.where(projection.in_front, projection.sq_residual.minimum(most), most)
+        return sq_residual if problem.noise is None else sq_residual / pixel_variance(projection, problem.noise)
+    precision = pixel_precision(projection, problem, problem.noise)
+    assert isinstance(precision, Symmetric2)
+    most = 0.5 * most * (precision.uu + precision.vv)
+    return torch.where(projection.in_front, precision.form(*projection.residual.mT.unbind()).minimum(most), most)
+
+
+def information(
+    projection: Projection,
+    problem: Problem,
+    kernel_weight: KernelWeight,
+    shape: Tensor,
+    outlier_area: Tensor | None,
+    narrower: float = 1.0,
+) -> Information:
+    """What the pairs say at a state, by the noise that was given or estimated, and by the residuals themselves.
+
+    Args:
+        projection: the points at the state.
+        problem: the problem; its noise is known for every pair or for none, its weights are at most about 1.
+        kernel_weight: the robust kernel's weight.
+        shape: shape of the kernel.
+        outlier_area: see :func:`outlier_area`, 0 where the caller gave the noise, (B, 1); ``None``: estimated noise is
+            not corrected.
+        narrower: multiplies a variance factor below 1.
+    """
+    sq_residual, noise = projection.sq_residual, problem.noise
+    if noise is None:  # unknown noise counts as one pixel of the caller
+        return Information(sq_residual, problem.img_scale.square().reciprocal()[:, None], None)
+    precision = pixel_precision(projection, problem, noise)
+    if not isinstance(precision, Tensor):
+        return Information(precision.form(*projection.residual.mT.unbind()), precision, noise)
+    sq_residual = sq_residual * precision
+    if outlier_area is None:
+        return Information(sq_residual, precision, noise)
+    if problem.confidence is not None:
+        factor = _information_factor(sq_residual, precision, projection, problem, outlier_area)
+        sq_residual, precision = sq_residual * factor, precision * factor
+        noise = map_tensors(lambda sigma: sigma * factor.rsqrt(), noise)
+    seen = sq_residual, precision, projection, problem.weights
+    variance = _variance_factor(*seen, kernel_weight, shape, outlier_area, narrower)
+    larger = variance.detach().clamp(min=1.0)
+    noise = map_tensors(lambda sigma: larger.sqrt() * sigma, noise)
+    return Information(sq_residual / variance, precision / larger, noise)
+
+
+def outlier_area(problem: Problem) -> Tensor:
+    """Area of a square with the variance of the usual pixels, in which pixels of outliers lie, in square pixels, (B, 1)."""
+    there = (problem.usual_weights > 0).to(problem.weights)[..., None]
+    share = there / there.sum(1, keepdim=True).clamp(min=1.0)
+    places = problem.places.detach()
+    variance = (share * (places - (share * places).sum(1, keepdim=True)).square()).sum((1, 2))[:, None]
+    return 6.0 * variance + torch.finfo(variance.dtype).tiny
+
+
+def _variance_factor(
+    sq_residual: Tensor,
+    precision: Tensor,
+    projection: Projection,
+    weights: Tensor,
+    kernel_weight: KernelWeight,
+    shape: Tensor,
+    outlier_area: Tensor,
+    narrower: float,
+) -> Tensor:
+    r"""Factor by which the residuals say that the variance of the noise differs from its estimate, (B, 1).
+
+    First from above: inliers have Gaussian residuals with the variance times a factor, outliers have pixels anywhere in
+    an area. The factor among powers of 4 with the largest likelihood replaces 1 where it is :math:`e^3` times as
+    likely; the share of inliers is estimated for each, and the three pairs that any pose fits do not count. Then the a
+    posteriori variance factor of an adjustment may lower it: the weighted sum of squared residuals by the degrees of
+    freedom, of the pairs deep within the kernel, where its likelihood ratio against 1 is beyond chance.
+    """
+    there = weights > 0
+    with torch.no_grad():
+        likelihood, _ = _log_likelihoods(
+            sq_residual, precision, projection.in_front & there, there, outlier_area, _FACTORS
+        )
+        best = likelihood.max(0)
+        believed = (outlier_area[:, 0] > 0) & (best.values > likelihood[0] + _BELIEVED)
+        above = torch.where(believed, _powers_of_4(_FACTORS, sq_residual)[best.indices], 1.0)[:, None]
+    sq_residual = sq_residual / above
+    within = torch.where(projection.in_front, kernel_weight(sq_residual, shape), 0.0)
+    deep = weights * within.square().square()
+    freedom = (2.0 * deep.sum(-1, keepdim=True) - 6.0).clamp(min=1.0)
+    below = ((deep * sq_residual).sum(-1, keepdim=True) / freedom).clamp(min=_LEAST_FACTOR)
+    log_ratio = 0.5 * freedom * (below - 1.0 - below.log())
+    lowered = (outlier_area > 0) & (below < 1.0) & (log_ratio > _BELIEVED)
+    return above * torch.where(lowered, narrower * below, 1.0)
+
+
+def _powers_of_4(exponents: range, like: Tensor) -> Tensor:
+    """Powers (F,), made on the device: a copy from the CPU cannot be captured in a CUDA graph."""
+    return 4.0 ** torch.arange(exponents.start, exponents.stop, dtype=like.dtype, device=like.device)
+
+
+def _log_likelihoods(
+    sq_residual: Tensor,
+    precision: Tensor,
+    in_front: Tensor,
+    there: Tensor,
+    outlier_area: Tensor,
+    exponents: range,
+) -> tuple[Tensor, Tensor]:
+    """Log-likelihood of the residuals at each variance factor and the number of inliers, (F, B) each."""
+    grid = _powers_of_4(exponents, sq_residual)
+    # Densities of a pixel, relative to that of an inlier without a residual whose factor is 1.
+    inlier = torch.exp(sq_residual * (-0.5 / grid)[:, None, None]) * in_front / grid[:, None, None]
+    outlier = (2.0 * math.pi / (precision * outlier_area)).clamp(max=1.0)  # (B, N)
+    count = there.sum(-1, keepdim=True).clamp(min=1)
+    share: Tensor | float = 0.5
+    for _ in range(_ROUNDS):
+        inliers = (share * inlier / (share * inlier + (1.0 - share) * outlier)).sum(-1, keepdim=True)  # (F, B, 1)
+        share = (inliers / count).clamp(_LEAST_SHARE, 1.0 - _LEAST_SHARE)
+    likelihood = torch.where(there, (share * inlier + (1.0 - share) * outlier).log(), 0.0).sum(-1)  # (F, B)
+    return likelihood + grid.log()[:, None] * inliers[..., 0].clamp(max=MIN_PAIRS), inliers[..., 0]
+
+
+@torch.no_grad()
+def _information_factor(
+    sq_residual: Tensor, precision: Tensor, projection: Projection, problem: Problem, outlier_area: Tensor
+) -> Tensor:
+    r"""Factor of each pair's precision where the residuals say that noise grows as the confidence falls, (B, N).
+
+    The keypoints of a network are often less accurate where it is less sure; a matcher's ratio says nothing of the
+    noise. So the standard deviation may be proportional to a power of the confidence, or independent of it. A power
+    replaces 0 where it is :math:`e^3` times as likely, by the mixture of :func:`_log_likelihoods`, and most of the pairs
+    are inliers: among many outliers, near misses would pass for noisy inliers.
+    """
+    assert problem.confidence is not None
+    there = problem.weights > 0
+    known = there & problem.confidence.isfinite()
+    log = torch.where(known, problem.confidence.clamp(min=_LEAST_CONFIDENCE).log(), 0.0)
+    log = torch.where(known, log - log.sum(-1, keepdim=True) / known.sum(-1, keepdim=True).clamp(min=1), 0.0)
+    factors = torch.stack([torch.exp(-2.0 * power * log) for power in _POWERS])  # their geometric mean is 1
+    seen = projection.in_front & there, there, outlier_area, _POWER_FACTORS
+    found = [_log_likelihoods(sq_residual * x, precision * x, *seen) for x in factors]
+    likelihoods, inliers = (torch.stack(x) for x in zip(*found, strict=True))  # (K, F, B)
+    variance = likelihoods.max(1)
+    best = variance.values.max(0)  # of the powers, (B,)
+    inliers = inliers.gather(1, variance.indices[:, None])[:, 0].gather(0, best.indices[None])[0]
+    believed = (best.values > variance.values[0] + _BELIEVED) & (inliers > _MOST * there.sum(-1))
+    believed = believed & (outlier_area[:, 0] > 0)
+    index = torch.where(believed, best.indices, 0)[None, :, None]
+    return factors.gather(0, index.expand(1, *log.shape))[0]

@@ -1,0 +1,278 @@
+r"""What is known besides the pairs: priors of the pose and of the camera, each a :class:`~kornia_pnpnet.problem.Term`.
+
+A new prior is one class with ``linearise`` and ``loss``.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from kornia.core.check import KORNIA_CHECK, KORNIA_CHECK_SHAPE
+from kornia.geometry.liegroup import So3
+from torch import Tensor
+from torch.nn import functional
+
+from kornia_pnpnet.core.performance import compiling
+from kornia_pnpnet.problem import Linear, State
+from kornia_pnpnet.refine.residual import NormalEquations
+from kornia_pnpnet.result import Pose, PosePrior
+
+__all__ = ["CameraTerm", "PoseTerm", "add_term", "gravity_prior"]
+
+# Eigenvalues of an information below this share count as 0: nothing is known in that direction.
+_KNOWN = 1e-5
+# Standard deviations: scale of the robust kernel unless the caller gave one.
+_SCALE = 3.0
+# Rotations further off count as this far (1 + the cosine of the angle).
+_LEAST_DENOMINATOR = 1e-4
+# Standard deviation of a coefficient of radial distortion before any pair is looked at; it keeps those that no pair
+# determines near 0.
+_RADIAL = 0.15
+# Matrices whose eigenvalues a graphics processor finds at once.
+_MOST_MATRICES = 10_000
+
+
+def gravity_prior(world_down: Tensor, cam_down: Tensor, sigma: Tensor | float) -> PosePrior:
+    r"""A prior of the direction of gravity, as an accelerometer measures it; heading and position stay open.
+
+    Args:
+        world_down: direction of gravity in the world, of any length but 0, shape :math:`(B, 3)`.
+        cam_down: the same direction in the camera's axes (+z forward), as measured, shape :math:`(B, 3)`.
+        sigma: standard deviation of the measured direction about each axis across it, in radians, a number or
+            :math:`(B,)`.
+
+    Returns:
+        The prior. The rotation of its pose is one of those that turn ``world_down`` to ``cam_down``. Gradients flow to
+        the directions and to sigma.
+
+    Raises:
+        ShapeError: when the directions are not :math:`(B, 3)`.
+        BaseError: when sigma is a number that is not positive.
+
+    Example:
+        >>> down = torch.tensor([[0.0, 0.0, -1.0]])  # the world's z axis points up
+        >>> prior = gravity_prior(down, torch.tensor([[0.0, 1.0, 0.0]]), sigma=0.01)  # the camera is level
+        >>> prior.information.diagonal(dim1=1, dim2=2).round()
+        tensor([[10000.,     0., 10000.,     0.,     0.,     0.]])
+    """
+    KORNIA_CHECK_SHAPE(world_down, ["B", "3"])
+    KORNIA_CHECK_SHAPE(cam_down, ["B", "3"])
+    KORNIA_CHECK(isinstance(sigma, Tensor) or sigma > 0, f"sigma must be positive, got {sigma}.")
+    a, b = (functional.normalize(x, dim=-1) for x in (world_down, cam_down))
+    eye = torch.eye(3, dtype=b.dtype, device=b.device)
+    # Half a turn about the middle of both directions; about any axis across them where they are opposite.
+    across = torch.linalg.cross(a, eye[a.detach().abs().argmin(-1)])
+    opposite = ((a + b).detach().square().sum(-1, keepdim=True)) < torch.finfo(b.dtype).eps
+    middle = functional.normalize(torch.where(opposite, across, a + b), dim=-1)
+    rotation = 2.0 * middle[:, :, None] * middle[:, None] - eye
+    precision = torch.as_tensor(sigma, dtype=b.dtype, device=b.device).expand(b.shape[:1]).square().reciprocal()
+    known = precision[:, None, None] * (eye - b[:, :, None] * b[:, None])
+    information = functional.pad(known, (0, 3, 0, 3))
+    return PosePrior(Pose(rotation, torch.zeros_like(b)), information)
+
+
+def add_term(equations: NormalEquations, linear: Linear, unit: Tensor, focal: Tensor) -> NormalEquations:
+    r"""Add a term to the normal equations of the pairs.
+
+    Args:
+        equations: of the pairs at a state, with the Jacobian divided by the focal length.
+        linear: the term at the same state.
+        unit: what a weight of 1 in the equations stands for, in inverse square pixels, (B,).
+        focal: the focal length in pixels, a scalar or (B,).
+    """
+    weighted = linear.jacobian.mT @ linear.information  # (B, 6 + K, D)
+    weight = linear.weight / (unit * focal)
+    matrix = (weighted @ linear.jacobian).permute(1, 2, 0) * (weight / focal)
+    gradient = (weighted @ linear.residual[..., None])[..., 0].mT * weight
+    return NormalEquations(equations.matrix + matrix, equations.gradient + gradient)
+
+
+class CameraTerm(NamedTuple):
+    """What is known of an unknown focal length and of radial distortion, in the unit of a problem.
+
+    Attributes:
+        expected: the focal length that the caller expects, in pixels, shape :math:`(B,)`.
+        information: inverse variance of the logarithm of the expected focal length; 0: nothing is known, shape
+            :math:`(B,)`.
+        width: the focal length is searched within this distance of that of the problem, in logarithms, shape
+            :math:`(B,)`.
+        focal: the focal length of the problem in pixels, shape :math:`(B,)`.
+    """
+
+    expected: Tensor
+    information: Tensor
+    width: Tensor
+    focal: Tensor
+
+    def linearise(self, state: State) -> Linear:
+        """Distance of log f from its expectation, and the coefficients of distortion, which are small."""
+        batch, count = state.camera.shape
+        offset = (self.focal / self.expected).log()
+        residual = torch.cat((state.zoom + offset[:, None], state.radial), 1)
+        eye = torch.eye(count, dtype=residual.dtype, device=residual.device).expand(batch, count, count)
+        known = torch.cat((self.information[:, None], torch.full_like(state.radial, _RADIAL**-2)), 1)
+        return Linear(residual, functional.pad(eye, (6, 0)), eye * known[:, None], torch.ones_like(offset))
+
+    def loss(self, state: State) -> Tensor:
+        """Squared standard deviations, (B,)."""
+        linear = self.linearise(state)
+        return (linear.information.diagonal(dim1=1, dim2=2) * linear.residual.square()).sum(1)
+
+    def disagreement(self, pose: Pose) -> Tensor:
+        """A focal length says nothing of a pose."""
+        return torch.zeros_like(pose.translation[..., 0])
+
+
+class PoseTerm(NamedTuple):
+    """A :class:`~kornia_pnpnet.result.PosePrior` in the frame of a problem.
+
+    Attributes:
+        pose: the expected pose.
+        information: its inverse covariance, shape :math:`(B, 6, 6)`.
+        offset: the centroid of the world in lengths of the problem, shape :math:`(B, 3)`: shifts of the pose are those
+            of the caller's world.
+        free: axis in the camera about which turns are open although the other turns are known, else 0,
+            shape :math:`(B, 3)`.
+        sq_scale: squared scale of the robust kernel, in squared standard deviations, shape :math:`(B,)`.
+        rank: number of known directions, shape :math:`(B,)`.
+    """
+
+    pose: Pose
+    information: Tensor
+    offset: Tensor
+    free: Tensor
+    sq_scale: Tensor
+    rank: Tensor
+
+    @classmethod
+    def of(cls, prior: PosePrior, centroid: Tensor, scale: Tensor) -> tuple[PoseTerm, Tensor]:
+        """Express a prior in the frame of a problem.
+
+        Args:
+            prior: in the world of the caller.
+            centroid: the world point that became the origin, (B, 3).
+            scale: factor of world lengths, (B,).
+
+        Returns:
+            The term, and whether the prior is possible, bool (B,): finite, its information symmetric and positive
+            semi-definite. An impossible prior says nothing.
+        """
+        usable = _is_usable(prior)
+        eye = torch.eye(3, dtype=centroid.dtype, device=centroid.device)
+        rotation = torch.where(usable[:, None, None], prior.pose.rotation, eye)
+        translation = torch.where(usable[:, None], prior.pose.translation, 0.0)
+        information = torch.where(usable[:, None, None], prior.information, 0.0)
+        offset = centroid * scale[:, None]
+        moved = translation * scale[:, None] + (rotation * offset[:, None]).sum(-1)
+        lengths = torch.cat((torch.ones_like(centroid), scale.reciprocal()[:, None].expand(-1, 3)), -1)
+        information = information * lengths[:, :, None] * lengths[:, None]
+        rank = (_correlations(information)[0] > _KNOWN).sum(-1).to(centroid)
+        widest = torch.full_like(scale, _SCALE) if prior.scale is None else torch.where(usable, prior.scale, _SCALE)
+        sq_scale = 0.5 * widest.square() * rank.clamp(min=1.0)
+        return cls(Pose(rotation, moved), information, offset, _open_axis(information[:, :3, :3]), sq_scale, rank), usable
+
+    def recentred(self, centre: Tensor) -> PoseTerm:
+        """The prior where a world point (B, 3) becomes the origin."""
+        rotation, translation = self.pose
+        pose = Pose(rotation, translation + (rotation @ centre[..., None])[..., 0])
+        return self._replace(pose=pose, offset=self.offset + centre)
+
+    def errors(self, pose: Pose) -> tuple[Tensor, Tensor]:
+        r"""The tangent vector from poses to the prior's pose, and its squared Mahalanobis length.
+
+        Args:
+            pose: poses, :math:`(B, 3, 3)` and :math:`(B, 3)`.
+
+        Returns:
+            :math:`(\omega, v)` of :func:`~kornia_pnpnet.refine.residual.retract`, :math:`(B, 6)`, where turns about an
+            axis of which the prior knows nothing are left out; the squared length, :math:`(B,)`.
+        """
+        turn = self.pose.rotation @ pose.rotation.mT
+        # Where the information leaves turns about an axis open, the nearest of all poses that it allows. There the error
+        # has no derivative by this angle.
+        free, fixed = self.free, turn.detach()
+        along = fixed.diagonal(dim1=-2, dim2=-1).sum(-1) - (free * (fixed @ free[..., None])[..., 0]).sum(-1)
+        around = -(free * So3.vee(fixed - fixed.mT)).sum(-1)
+        length = torch.hypot(along, around)
+        sound = length > torch.finfo(length.dtype).eps
+        length = torch.where(sound, length, 1.0)
+        cosine, sine = torch.where(sound, along / length, 1.0), torch.where(sound, around / length, 0.0)
+        axis = So3.hat(free.flatten(0, -2)).unflatten(0, free.shape[:-1])
+        turn = turn + sine[..., None, None] * (axis @ turn) + (1.0 - cosine)[..., None, None] * (axis @ (axis @ turn))
+        trace = turn.diagonal(dim1=-2, dim2=-1).sum(-1)
+        omega = 2.0 * So3.vee(turn - turn.mT) / (1.0 + trace).clamp(min=_LEAST_DENOMINATOR)[..., None]
+        shift = self.pose.translation - pose.translation
+        shift = shift + ((pose.rotation - self.pose.rotation) * self.offset[..., None, :]).sum(-1)
+        error = torch.cat((omega, shift), -1)
+        return error, ((self.information * error[..., None, :]).sum(-1) * error).sum(-1)
+
+    def linearise(self, state: State) -> Linear:
+        """The tangent vector to the expected pose, and its Jacobian."""
+        error, square = self.errors(state.pose)
+        half = 0.5 * error[:, :3]
+        eye = torch.eye(3, dtype=error.dtype, device=error.device)
+        turned = (state.pose.rotation * self.offset[:, None]).sum(-1)
+        rows = eye + So3.hat(half) + half[:, :, None] * half[:, None]
+        by_turn = torch.cat((-rows, -So3.hat(turned)), 1)
+        by_shift = torch.cat((torch.zeros_like(rows), -eye.expand_as(rows)), 1)
+        columns = [by_turn, by_shift]
+        if state.camera.shape[1]:  # a zoom moves the camera along its axis
+            columns += [state.pose.translation[:, 2:, None] * by_shift[..., 2:]]
+            columns += [torch.zeros_like(state.radial)[:, None].expand(-1, 6, -1)]
+        return Linear(error, torch.cat(columns, 2), self.information, torch.exp(-square / self.sq_scale))
+
+    def loss(self, state: State) -> Tensor:
+        """Robust loss (Welsch) in squared standard deviations, (B,): at most the squared scale of the kernel."""
+        square = self.errors(state.pose)[1]
+        scale = torch.where(self.sq_scale.isinf(), 1.0, self.sq_scale)
+        return torch.where(self.sq_scale.isinf(), square, -scale * torch.expm1(-square / scale))
+
+    def disagreement(self, pose: Pose) -> Tensor:
+        """Loss of poses in pairs: a prior of two known directions counts as one pair."""
+        scale = torch.where(self.sq_scale.isinf(), _SCALE**2 * self.rank.clamp(min=1.0), self.sq_scale)
+        return -0.5 * self.rank * torch.expm1(-self.errors(pose)[1] / scale)
+
+
+def _is_usable(prior: PosePrior) -> Tensor:
+    """Whether the numbers are finite and the information is symmetric and positive semi-definite, bool (B,)."""
+    numbers = [prior.pose.rotation, prior.pose.translation, prior.information]
+    limit = torch.finfo(prior.information.dtype).max ** 0.25
+    fine = torch.stack([(x.detach().flatten(1).abs() < limit).all(1) for x in numbers]).all(0)
+    if prior.scale is not None:
+        fine = fine & (prior.scale > 0)
+    known, symmetric = _correlations(torch.where(fine[:, None, None], prior.information.detach(), 0.0))
+    return fine & symmetric & (known[:, 0] > -1e3 * torch.finfo(prior.information.dtype).eps)
+
+
+def _open_axis(information: Tensor) -> Tensor:
+    """The axis (B, 3) about which turns are open where both other axes are known, else 0."""
+    eigenvalues = _eigenvalues(information.detach().double())
+    least, middle, largest = eigenvalues.unbind(-1)
+    is_open = (least < _KNOWN * largest) & (middle > _KNOWN * largest)
+    # The columns of the adjugate are multiples of the axis; eigenvectors of equal eigenvalues have no derivative.
+    scaled = information / torch.where(largest > 0, largest, 1.0).to(information)[:, None, None]
+    first, second, third = scaled.unbind(1)
+    pairs = ((second, third), (third, first), (first, second))
+    products = torch.stack([torch.linalg.cross(a, b) for a, b in pairs], 1)  # (B, 3, 3)
+    longest = products.detach().square().sum(-1).argmax(1)[:, None, None].expand(-1, 1, 3)
+    axis = torch.where(is_open[:, None], products.gather(1, longest)[:, 0], 1.0)
+    return torch.where(is_open[:, None], functional.normalize(axis, dim=-1), 0.0)
+
+
+def _correlations(information: Tensor) -> tuple[Tensor, Tensor]:
+    """Eigenvalues (B, 6), ascending, of an information scaled to a unit diagonal; whether it is symmetric, (B,)."""
+    diagonal = information.detach().double().diagonal(dim1=1, dim2=2)
+    size = torch.where(diagonal > 0, diagonal, 1.0).rsqrt()
+    scaled = information.detach().double() * size[:, :, None] * size[:, None]
+    scaled = scaled.nan_to_num(math.inf)
+    off = (scaled - scaled.mT).abs().amax((1, 2))
+    bounded = torch.where(scaled.isfinite().all((1, 2))[:, None, None], scaled, 0.0)
+    return _eigenvalues(bounded), off < 1e-3
+
+
+def _eigenvalues(matrix: Tensor) -> Tensor:
+    """Eigenvalues of symmetric matrices, ascending. cuSOLVER fails for a hundred thousand of them at once."""
+    whole = matrix.device.type == "cpu" or compiling()
+    return torch.cat([torch.linalg.eigvalsh(part) for part in ([matrix] if whole else matrix.split(_MOST_MATRICES))])
