@@ -1,8 +1,8 @@
-"""The arguments of a solver's call: what they may be, and what they become."""
+"""The arguments of a solver's call: one table of what they may be, and what they become."""
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
@@ -14,13 +14,14 @@ from kornia_pnpnet.cameras import bearing_cameras, check_coefficients, compose, 
 from kornia_pnpnet.core.checks import Shapes, check_devices, check_shapes, common_dtype, expand_sigma
 from kornia_pnpnet.core.performance import present_first, sees_values
 from kornia_pnpnet.core.symmetric import Symmetric2, Symmetric3, equivalent_sigma
-from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.types import FreeFocal, Noise, PnPResult, Pose, PosePrior, camera_matrices
+from kornia_pnpnet.core.trees import map_tensors, take
+from kornia_pnpnet.problem import MIN_PAIRS, Noise
+from kornia_pnpnet.refine.terms import CameraTerm
+from kornia_pnpnet.result import PnPResult, Pose, PosePrior, camera_matrices
 
 __all__ = [
     "Inputs",
     "Part",
-    "check_cameras",
     "checked_inputs",
     "checked_noise",
     "given_cameras",
@@ -35,26 +36,45 @@ _T = TypeVar("_T")
 
 # Pairs. Problems are not cut to less, so that no solver sees too few.
 _LEAST_PAIRS = 16
+#: The tensors of a call, by their names in error messages: whether they have an entry for each pair (N) or for each
+#: problem, and the shape of an entry. Those of cameras and lenses depend on more.
+_ENTRIES: dict[str, tuple[bool, tuple[int, ...]]] = {
+    "weights": (True, ()),
+    "mask": (True, ()),
+    "confidence": (True, ()),
+    "img_cov": (True, (2, 2)),
+    "world_cov": (True, (3, 3)),
+    "init rotation": (False, (3, 3)),
+    "init translation": (False, (3,)),
+    "prior rotation": (False, (3, 3)),
+    "prior translation": (False, (3,)),
+    "prior information": (False, (6, 6)),
+    "prior scale": (False, ()),
+    "cam_from_rig rotation": (True, (3, 3)),
+    "cam_from_rig translation": (True, (3,)),
+}
 
 
 class Inputs(NamedTuple):
     """Arguments of a call as one batch in one dtype: a camera per problem, sigmas per pair where any is known.
 
-    Where a solver estimates the focal length, ``free_focal`` says in pixels of the caller what is known of it. In a rig
-    each pair has a camera, (B, N, 3, 3), and its place in the ``rig``.
+    Where a solver estimates the focal length, ``free_focal`` says in pixels of the caller what is known of it, and
+    ``radial`` holds the coefficients of the distortion that was taken from the pixels. In a rig each pair has a camera,
+    (B, N, 3, 3), and its place in the ``rig``.
     """
 
     world_points: Tensor
     img_points: Tensor
     intrinsics: Tensor
-    weights: Tensor | None
-    mask: Tensor | None
-    init: Pose | None
-    noise: Noise | None
-    confidence: Tensor | None
+    weights: Tensor | None = None
+    mask: Tensor | None = None
+    init: Pose | None = None
+    noise: Noise | None = None
+    confidence: Tensor | None = None
     prior: PosePrior | None = None
-    free_focal: FreeFocal | None = None
     rig: Pose | None = None
+    free_focal: CameraTerm | None = None
+    radial: Tensor | None = None
 
 
 class Part(NamedTuple):
@@ -80,22 +100,22 @@ def checked_inputs(
     weights: Tensor | None = None,
     mask: Tensor | None = None,
     init: Pose | None = None,
+    *,
     img_sigma: Tensor | float | None = None,
     world_sigma: Tensor | float | None = None,
     img_cov: Tensor | None = None,
     world_cov: Tensor | None = None,
     confidence: Tensor | None = None,
     prior: PosePrior | None = None,
-    *,
     dist: Tensor | None = None,
     fisheye: Tensor | None = None,
     cam_from_rig: Pose | None = None,
 ) -> tuple[torch.Size, Inputs]:
     """Check the arguments of a call, and make them one batch of one dtype, see :func:`common_dtype`.
 
-    Distorted pixels become those of pinhole cameras, and bearings a rig of cameras that each look at their own point.
-
-    Shapes, dtypes and devices are checked; never values, which would stall a GPU and let one problem fail a batch.
+    For the arguments see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`. Distorted pixels become those of
+    pinhole cameras, and bearings a rig of cameras that each look at their own point. Shapes, dtypes and devices are
+    checked; never values, which would stall a GPU and let one problem fail a batch.
 
     Returns:
         The leading dimensions of ``world_points``, none for a single problem, and the inputs with one batch dimension.
@@ -106,42 +126,30 @@ def checked_inputs(
         DeviceError: for tensors on different devices.
         ValueCheckError: for both a sigma and a covariance of the pixels, or of the points.
     """
-    rotation, translation = (None, None) if init is None else init
     is_bearing = isinstance(img_points, Tensor) and img_points.ndim > 1 and img_points.shape[-1] == 3
     if intrinsics is None and is_bearing:
         intrinsics = torch.eye(3, dtype=img_points.dtype, device=img_points.device)
     if intrinsics is None:
-        raise TypeCheckError("intrinsics must be a tensor, got NoneType: only bearings, (B, N, 3), need none.")
+        raise TypeCheckError(
+            "intrinsics must be a tensor, got NoneType: only bearings (B, N, 3) may omit it, pixels (B, N, 2) need it."
+        )
     matrices = camera_matrices(intrinsics)
-    rig_rotation, rig_translation = (None, None) if cam_from_rig is None else cam_from_rig
-    (prior_rotation, prior_translation), information, prior_scale = prior or PosePrior(Pose(None, None), None)  # type: ignore[arg-type]
-    tensors = {
-        "world_points": world_points,
-        "img_points": img_points,
-        "intrinsics": matrices,
-        "weights": weights,
-        "init rotation": rotation,
-        "init translation": translation,
-        "confidence": confidence,
-        "img_cov": img_cov,
-        "world_cov": world_cov,
-        "prior rotation": prior_rotation,
-        "prior translation": prior_translation,
-        "prior information": information,
-        "prior scale": prior_scale,
-        "dist": dist,
-        "fisheye": fisheye,
-        "cam_from_rig rotation": rig_rotation,
-        "cam_from_rig translation": rig_translation,
-    }
-    required = ("world_points", "img_points", "intrinsics")
-    for name, value in (*tensors.items(), ("mask", mask)):
-        if not isinstance(value, Tensor) and (name in required or value is not None):
+    tensors: dict[str, Any] = {"world_points": world_points, "img_points": img_points, "intrinsics": matrices}
+    optional: dict[str, Any] = {"weights": weights, "mask": mask, "confidence": confidence}
+    optional |= {"img_cov": img_cov, "world_cov": world_cov, "dist": dist, "fisheye": fisheye}
+    for name, pose in (("init", init), ("prior", prior and prior.pose), ("cam_from_rig", cam_from_rig)):
+        rotation, translation = (None, None) if pose is None else pose
+        optional |= {f"{name} rotation": rotation, f"{name} translation": translation}
+    if prior is not None:
+        optional |= {"prior information": prior.information, "prior scale": prior.scale}
+    tensors |= {name: x for name, x in optional.items() if x is not None}
+    for name, value in tensors.items():
+        if not isinstance(value, Tensor):
             raise TypeCheckError(f"{name} must be a tensor, got {type(value).__name__}.")
     KORNIA_CHECK_SHAPE(world_points, ["*", "N", "3"])
     size, count = world_points.shape[:-2], world_points.shape[-2]
     if isinstance(intrinsics, PinholeCamera) and len(matrices) == size.numel():  # Kornia's cameras are one batch
-        matrices = matrices.reshape(*size, 3, 3)
+        tensors["intrinsics"] = matrices = matrices.reshape(*size, 3, 3)
     if weights is not None and weights.shape == (*size, count, 2):
         raise ShapeError(
             f"weights must have the shape {(*size, count)}, one for each pair, not one for each of u and v: "
@@ -150,92 +158,41 @@ def checked_inputs(
             expected_shape=(*size, count),
         )
     check_coefficients(dist, fisheye)
-    if (dist is not None or fisheye is not None) and (is_bearing or cam_from_rig is not None):
-        raise ValueCheckError("dist and fisheye are for pixels of one camera: make bearings of each camera's pixels.")
     is_rig = is_bearing or cam_from_rig is not None
+    if (dist is not None or fisheye is not None) and is_rig:
+        raise ValueCheckError("dist and fisheye are for pixels of one camera: make bearings of each camera's pixels.")
     of_pair = is_rig and matrices.ndim == len(size) + 3
     of_camera = () if matrices.ndim == 2 else (*size, count) if of_pair else size
     shapes: Shapes = {
         "img_points": (img_points, (*size, count, 3 if is_bearing else 2)),
-        "weights": (weights, (*size, count)),
-        "mask": (mask, (*size, count)),
-        "confidence": (confidence, (*size, count)),
-        "img_cov": (img_cov, (*size, count, 2, 2)),
-        "world_cov": (world_cov, (*size, count, 3, 3)),
         "intrinsics": (matrices, (*of_camera, 3, 3)),
-        "init rotation": (rotation, (*size, 3, 3)),
-        "init translation": (translation, (*size, 3)),
-        "prior rotation": (prior_rotation, (*size, 3, 3)),
-        "prior translation": (prior_translation, (*size, 3)),
-        "prior information": (information, (*size, 6, 6)),
-        "prior scale": (prior_scale, size),
-        "cam_from_rig rotation": (rig_rotation, (*size, count, 3, 3)),
-        "cam_from_rig translation": (rig_translation, (*size, count, 3)),
     }
+    for name, (each_pair, entry) in _ENTRIES.items():
+        shapes[name] = tensors.get(name), (*size, *((count,) if each_pair else ()), *entry)
     for name, lens in (("dist", dist), ("fisheye", fisheye)):
         if lens is not None:
             shapes[name] = lens, (*(size if lens.ndim > 1 else ()), lens.shape[-1])
     check_shapes(shapes, world_points)
-    if count < 3:
+    if count < MIN_PAIRS:
         raise ShapeError(f"A pose needs at least 3 pairs, got N = {count}.", actual_shape=tuple(world_points.shape))
     if mask is not None and mask.dtype != torch.bool:
         raise TypeCheckError(f"mask must be bool, got {mask.dtype}.")
-    check_devices({**tensors, "mask": mask}, world_points)
+    check_devices(tensors, world_points)
     sigmas = {"img_sigma": img_sigma, "world_sigma": world_sigma}
-    dtype = common_dtype({**tensors, **{name: x for name, x in sigmas.items() if isinstance(x, Tensor)}})
+    numbers = {**tensors, **{name: x for name, x in sigmas.items() if isinstance(x, Tensor)}}
+    dtype = common_dtype({name: x for name, x in numbers.items() if name != "mask"})
     noise = checked_noise(world_points.to(dtype), img_sigma, world_sigma, img_cov, world_cov)
     per_pair = matrices if matrices.ndim == 2 or of_pair else matrices[..., None, :, :]
     cameras = per_pair.expand(*size, count, 3, 3) if is_rig else matrices.expand(*size, 3, 3)
-    pose = None if init is None else Pose(*init)
-    rig = None if cam_from_rig is None else Pose(*cam_from_rig)
-    given = Inputs(world_points, img_points, cameras, weights, mask, pose, noise, confidence, prior, None, rig)
-    inputs = map_tensors(lambda x: one_batch(x, size, dtype), given)
+    init, rig = (None if pose is None else Pose(*pose) for pose in (init, cam_from_rig))
+    inputs = Inputs(world_points, img_points, cameras, weights, mask, init, noise, confidence, prior, rig)
+    inputs = map_tensors(lambda x: one_batch(x, size, dtype), inputs)
     dist, fisheye = (
         None if x is None else one_batch(x.expand(*size, x.shape[-1]), size, dtype) for x in (dist, fisheye)
     )
     if is_bearing:
         return size, _looking_along(inputs)
-    if dist is None and fisheye is None:
-        return size, inputs
-    return size, with_undistorted(inputs, dist, fisheye)
-
-
-def with_undistorted(inputs: Inputs, dist: Tensor | None, fisheye: Tensor | None) -> Inputs:
-    """Inputs with the pixels of pinhole cameras, see :func:`~kornia_pnpnet.cameras.undistort`.
-
-    Pairs without such a pixel are left out; one that is not finite still fails its problem.
-    """
-    pixels, found, noise = undistort(inputs.img_points, inputs.intrinsics, dist, fisheye, inputs.noise)
-    broken = ~inputs.img_points.isfinite().all(-1)
-    mask = found | broken if inputs.mask is None else (found | broken) & inputs.mask
-    return inputs._replace(img_points=torch.where(broken[..., None], inputs.img_points, pixels), mask=mask, noise=noise)
-
-
-def check_cameras(inputs: Inputs, focal: str, *, distorted: bool, alternatives: int, init: object) -> None:
-    """Refuse arguments that cannot be combined: an unknown focal length, distortion, rigs and alternatives.
-
-    Raises:
-        ValueCheckError: for such arguments.
-    """
-    rig = inputs.rig is not None
-    if focal == "unknown" and (rig or distorted):
-        raise ValueCheckError("focal='unknown' takes pixels of one camera without dist and fisheye.")
-    if rig and (alternatives or (init is None and inputs.init is None)):
-        raise ValueCheckError("A rig or bearings have no alternatives, and need an initialiser or `init`.")
-
-
-def _looking_along(inputs: Inputs) -> Inputs:
-    """Inputs with bearings as those of cameras whose axes are the bearings, with a focal length each and no skew.
-
-    The focal length is the geometric mean of those given: pixels of sigma per radian.
-    """
-    rotation, sound = bearing_cameras(inputs.img_points)
-    axis = torch.where(sound[..., None], inputs.img_points[..., :2] * 0.0, torch.nan)
-    cameras = inputs.intrinsics / inputs.intrinsics[..., 2:, 2:]
-    focal = (cameras[..., 0, 0] * cameras[..., 1, 1]).sqrt()
-    eye = torch.eye(3, dtype=focal.dtype, device=focal.device)
-    cameras = eye * torch.stack((focal, focal, torch.ones_like(focal)), -1)[..., None, :]
-    return inputs._replace(img_points=axis, intrinsics=cameras, rig=compose(rotation, inputs.rig))
+    return size, inputs if dist is None and fisheye is None else with_undistorted(inputs, dist, fisheye)
 
 
 def checked_noise(
@@ -266,6 +223,30 @@ def checked_noise(
         img,
         world,
     )
+
+
+def with_undistorted(inputs: Inputs, dist: Tensor | None, fisheye: Tensor | None) -> Inputs:
+    """Inputs with the pixels of pinhole cameras, see :func:`~kornia_pnpnet.cameras.undistort`.
+
+    Pairs without such a pixel are left out; one that is not finite still fails its problem.
+    """
+    pixels, found, noise = undistort(inputs.img_points, inputs.intrinsics, dist, fisheye, inputs.noise)
+    broken = ~inputs.img_points.isfinite().all(-1)
+    mask = found | broken if inputs.mask is None else (found | broken) & inputs.mask
+    return inputs._replace(img_points=torch.where(broken[..., None], inputs.img_points, pixels), mask=mask, noise=noise)
+
+
+def _looking_along(inputs: Inputs) -> Inputs:
+    """Inputs with bearings as those of cameras whose axes are the bearings, with a focal length each and no skew.
+
+    The focal length is the geometric mean of those given: pixels of sigma per radian.
+    """
+    rotation, sound = bearing_cameras(inputs.img_points)
+    axis = torch.where(sound[..., None], inputs.img_points[..., :2] * 0.0, torch.nan)
+    cameras = inputs.intrinsics / inputs.intrinsics[..., 2:, 2:]
+    focal = (cameras[..., 0, 0] * cameras[..., 1, 1]).sqrt()
+    cameras = torch.stack((focal, focal, torch.ones_like(focal)), -1).diag_embed()
+    return inputs._replace(img_points=axis, intrinsics=cameras, rig=compose(rotation, inputs.rig))
 
 
 def one_batch(x: Tensor, size: torch.Size, dtype: torch.dtype) -> Tensor:
@@ -326,16 +307,13 @@ def _without_padding(inputs: Inputs, most: int) -> list[Part]:
         start = 0 if start == 1 else start
         at = problems[start:stop]
         pairs = order[at, :width]
-
-        is_rig = inputs.intrinsics.ndim == 4
-        of_problems = None if is_rig else inputs.intrinsics, inputs.init, inputs.prior
-        cameras, init, prior = map_tensors(lambda x, at=at: x[at], of_problems)
-        of_pairs = map_tensors(
-            lambda x, at=at, pairs=pairs: x[at[:, None], pairs],
-            inputs._replace(intrinsics=inputs.intrinsics if is_rig else inputs.mask, init=None, prior=None),
-        )
-        of_pairs = of_pairs._replace(init=init, prior=prior)
-        parts.append(Part(of_pairs if cameras is None else of_pairs._replace(intrinsics=cameras), at, pairs, count))
+        of_problem: dict[str, Any] = {"init": inputs.init, "prior": inputs.prior}
+        if inputs.rig is None:
+            of_problem["intrinsics"] = inputs.intrinsics
+        without = inputs._replace(**dict.fromkeys(of_problem))
+        some = map_tensors(lambda x, at=at, pairs=pairs: x[at[:, None], pairs], without)
+        some = some._replace(**{name: take(tree, at) for name, tree in of_problem.items()})
+        parts.append(Part(some, at, pairs, count))
         stop = start
     return parts
 

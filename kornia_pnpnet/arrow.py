@@ -14,7 +14,7 @@ from kornia.core.exceptions import ShapeError, TypeCheckError, ValueCheckError
 from torch import Tensor, nn
 
 from kornia_pnpnet.registry import create_solver
-from kornia_pnpnet.types import Status
+from kornia_pnpnet.result import Status
 
 try:
     import pyarrow as pa
@@ -48,7 +48,7 @@ class Solve:
       pixels and ``world_sigma`` in the unit of the world (N numbers or one number; NaN: unknown).
 
     The result has the columns ``rotation`` (9 numbers), ``translation`` (3), ``weights`` (N), ``cost``, ``ok`` and
-    ``status``, the name of a :class:`~kornia_pnpnet.types.Status` in lower case. It also has the columns of the table
+    ``status``, the name of a :class:`~kornia_pnpnet.result.Status` in lower case. It also has the columns of the table
     with other names, for example an ``id``. Rows keep their order, and numbers are float32.
 
     A bad row raises nothing: its ``ok`` is false and its pose is the identity. Its status is ``malformed`` when a list

@@ -10,7 +10,8 @@ from kornia.geometry.calibration import distort_points
 from torch import Tensor
 
 from kornia_pnpnet.core.symmetric import Symmetric2
-from kornia_pnpnet.types import Noise, Pose
+from kornia_pnpnet.problem import Noise
+from kornia_pnpnet.result import Pose
 
 __all__ = ["bearing_cameras", "bearings", "check_coefficients", "compose", "undistort"]
 

@@ -10,15 +10,15 @@ from kornia.geometry.liegroup import So3
 from torch import Tensor
 from torch.nn import functional
 
+from kornia_pnpnet.arguments import checked_noise
 from kornia_pnpnet.core.checks import Shapes, check_devices, check_positive, check_shapes, common_dtype
-from kornia_pnpnet.core.linalg import symmetric
 from kornia_pnpnet.core.symmetric import are_semi_definite
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.geometry import normal_equations, project
-from kornia_pnpnet.inputs import checked_noise
-from kornia_pnpnet.refine.prior import add_focal_prior, add_prior, prior_in_frame
-from kornia_pnpnet.refine.step import pixel_precision
-from kornia_pnpnet.types import LEAST_NOISE, Correspondences, FreeFocal, Noise, Pose, PosePrior, camera_matrices
+from kornia_pnpnet.problem import LEAST_NOISE, Noise, Problem, State
+from kornia_pnpnet.refine.information import pixel_precision
+from kornia_pnpnet.refine.residual import normal_equations, project
+from kornia_pnpnet.refine.terms import CameraTerm, PoseTerm, add_term
+from kornia_pnpnet.result import Pose, PosePrior, camera_matrices
 
 __all__ = ["pose_covariance"]
 
@@ -41,11 +41,11 @@ def pose_covariance(
     r"""First-order covariance of a pose found by weighted least squares.
 
     The covariance is :math:`(\sum_i w_i J_i^\top J_i / \sigma_i^2)^{-1}`. :math:`J_i` is the Jacobian of pixel
-    :math:`i` by the tangent :math:`(\omega, v)` of :func:`~kornia_pnpnet.geometry.retract`: when :math:`(R, t)` is the
+    :math:`i` by the tangent :math:`(\omega, v)` of :func:`~kornia_pnpnet.refine.residual.retract`: when :math:`(R, t)` is the
     true pose, the estimate is about :math:`(\mathrm{cay}(\omega) R,\; t + v)`. :math:`\sigma_i^2` is the
-    :func:`~kornia_pnpnet.geometry.pixel_variance`. With covariances the covariance is
+    :func:`~kornia_pnpnet.refine.residual.pixel_variance`. With covariances the covariance is
     :math:`(\sum_i w_i J_i^\top \Sigma_i^{-1} J_i)^{-1}`, where :math:`\Sigma_i` is the
-    :func:`~kornia_pnpnet.geometry.pixel_covariance`. The computation runs in float64. Gradients flow to the pose, the
+    :func:`~kornia_pnpnet.refine.residual.pixel_covariance`. The computation runs in float64. Gradients flow to the pose, the
     points, the camera, the noise and the weights.
 
     A robust kernel gives most inliers a weight below 1, but an M-estimate is hardly less accurate for it (P. Huber,
@@ -128,26 +128,24 @@ def pose_covariance(
     focals, principal_point = camera.diagonal(dim1=-2, dim2=-1)[..., :2], camera[..., :2, 2]
     rays = (img_points.double() - principal_point[..., None, :]) / focals[..., None, :]
     mean_focal = focals.log().mean(-1).exp().reshape(-1, 1)  # (B or 1, 1), geometric mean of fx and fy
-    unit_focal = focals.new_ones(())
-    corr = Correspondences(offsets / spread[..., None], rays, inlier, unit_focal)
+    one = torch.ones_like(spread[:, 0])
+    problem = Problem.of(offsets / spread[..., None], rays, weights=inlier)
+    state = State(centred_pose, one.new_zeros(batch, 0 if focal == "known" else 1))
 
-    projection = project(centred_pose, corr)
+    projection = project(state, problem)
     sound = [(are_semi_definite(x) | (inlier == 0)).all(1) for x in noise.covariances]
     noise = _in_unit_frame(noise, camera, mean_focal, spread, inlier != 0)
-    pair_weights = map_tensors(lambda x: inlier * x, pixel_precision(projection, noise, unit_focal))
-    equations = normal_equations(projection, pair_weights, free_focal=focal == "unknown")
+    pair_weights = map_tensors(lambda x: inlier * x, pixel_precision(projection, problem, noise))
+    equations = normal_equations(projection, problem, pair_weights)
     if focal_sigma is not None:
         check_positive(focal_sigma=focal_sigma)
-        one = torch.ones_like(spread[:, 0])
-        known_focal = FreeFocal(one, one * focal_sigma**-2, one, one)
-        equations = add_focal_prior(equations, known_focal, one, one)
+        term = CameraTerm(one, one * focal_sigma**-2, one, one)
+        equations = add_term(equations, term.linearise(state), one, problem.focal)
     if prior is not None:
-        known = map_tensors(torch.Tensor.double, prior)
-        one = torch.ones_like(spread[:, 0])
-        framed, usable = prior_in_frame(known, centroid[:, 0], spread[:, 0].reciprocal(), one)
+        framed, usable = PoseTerm.of(map_tensors(torch.Tensor.double, prior), centroid[:, 0], spread[:, 0].reciprocal())
         sound.append(usable)
-        equations = add_prior(equations, framed, centred_pose, one, unit_focal)
-    information = symmetric(equations.hessian)
+        equations = add_term(equations, framed.linearise(state), one, problem.focal)
+    information = equations.matrix.permute(2, 0, 1)
     size = information.shape[-1]
     with torch.no_grad():
         inverse, info = torch.linalg.inv_ex(information)
@@ -161,7 +159,7 @@ def pose_covariance(
     omega_rows = torch.cat((eye, torch.zeros_like(eye)), -1)
     v_rows = torch.cat((So3.hat(rotated_centroid), spread[..., None] * eye), -1)
     back = torch.cat((omega_rows, v_rows), 1)  # (B, 6, 6)
-    if size == 7:  # the depth of the centroid grows with the focal length, see `dolly_zoom`
+    if size == 7:  # the depth of the centroid grows with the focal length, see `moved`
         depth = pose.translation[:, 2].double() + rotated_centroid[:, 2]
         back = functional.pad(back, (0, 1, 0, 1))
         more = torch.zeros_like(back)

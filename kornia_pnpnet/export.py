@@ -17,9 +17,9 @@ from kornia_pnpnet.core.compilation import package_options
 from kornia_pnpnet.core.files import atomic_open
 from kornia_pnpnet.core.inlining import INLINE
 from kornia_pnpnet.data import CameraProblems, SyntheticProblems
-from kornia_pnpnet.init import RANSAC, MLPInit, SetInit
+from kornia_pnpnet.propose.initialiser import trait
+from kornia_pnpnet.result import Pose
 from kornia_pnpnet.solver import PnPNet
-from kornia_pnpnet.types import Pose
 
 __all__ = [
     "INPUTS",
@@ -36,7 +36,7 @@ __all__ = [
 
 
 class ExportedResult(NamedTuple):
-    """What an exported solver returns: fields of :class:`~kornia_pnpnet.types.PnPResult`.
+    """What an exported solver returns: fields of :class:`~kornia_pnpnet.result.PnPResult`.
 
     Attributes:
         rotation: shape :math:`(B, 3, 3)`.
@@ -128,15 +128,15 @@ def export_program(
             an initialiser.
 
     Example:
-        >>> from kornia_pnpnet import RobustWeightedLM
+        >>> from kornia_pnpnet import MLPInit, RobustWeightedLM
         >>> program = export_program(PnPNet(MLPInit(n=6), RobustWeightedLM(m=1)))
         >>> inputs = torch.ones(5, 6, 3), torch.ones(5, 6, 2), torch.eye(3).expand(5, 3, 3), torch.ones(5, 6)
         >>> dict(zip(OUTPUTS, program.module()(*inputs)))["ok"]
         tensor([False, False, False, False, False])
     """
-    if isinstance(solver.init, RANSAC):
+    if trait(solver.init, "takes_given"):
         raise ValueCheckError("RANSAC cannot be exported: the number of its samples depends on the data.")
-    if solver.focal == "unknown" and (solver.radial or not isinstance(solver.init, SetInit)):
+    if solver.focal == "unknown" and (solver.radial or not trait(solver.init, "estimates_noise")):
         raise ValueCheckError(
             "With an unknown focal length only a solver with SetInit and without radial distortion can be exported:"
             " others search, and the search depends on the data."
@@ -170,7 +170,7 @@ def export_program(
 
 def _fixed_n(solver: PnPNet, n: int | None) -> int | None:
     """The number of pairs of a program; ``None``: any."""
-    return int(solver.init.config["n"]) if isinstance(solver.init, MLPInit) else n
+    return int(solver.init.config["n"]) if solver.init is not None and trait(solver.init, "fixed_pairs") else n
 
 
 def export_package(

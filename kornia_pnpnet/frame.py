@@ -15,29 +15,18 @@ from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_positive
 from kornia_pnpnet.core.configured import Configured
+from kornia_pnpnet.core.linalg import span_a_plane
 from kornia_pnpnet.core.performance import ascending_order, ranked
 from kornia_pnpnet.core.symmetric import are_semi_definite
-from kornia_pnpnet.core.trees import iter_tensors, map_tensors
-from kornia_pnpnet.geometry import MIN_DEPTH_RATIO, gate_pose, span_a_plane
-from kornia_pnpnet.types import LEAST_NOISE, MIN_PAIRS, Correspondences, Guess, Noise, Pose, Status
+from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.problem import LEAST_NOISE, MIN_PAIRS, Noise, Problem, Starts
+from kornia_pnpnet.refine.residual import MIN_DEPTH_RATIO
+from kornia_pnpnet.result import Pose, Status, gate_pose
 
-__all__ = ["F_CONST", "VIEWS", "Frame", "Normalize"]
+__all__ = ["F_CONST", "Frame", "Normalize"]
 
 #: Focal length of the normalised camera in pixels (the cameras of ETH3D have 3400 to 3430).
 F_CONST = 3400.0
-#: The symmetries of a square image, as three flags: exchange x and y, then reverse x, then reverse y.
-VIEWS = (
-    (False, False, False),
-    (True, False, False),
-    (False, True, True),
-    (True, True, True),
-    (False, True, False),
-    (False, False, True),
-    (True, True, False),
-    (True, False, True),
-)
-
-
 # Typical distances from the median of the points. Beyond this a pair does not count for centre and scale.
 _FAR = 5.0
 # The same with fewer pairs than this: few pairs say little about what is typical.
@@ -73,6 +62,41 @@ class Frame(NamedTuple):
         """Whether the problem can be solved at all, bool, shape :math:`(B,)`."""
         return self.status == Status.SOLVED.value
 
+    def apply(self, pose: Pose) -> Pose:
+        r"""Express a pose of the caller's world in the frame of the problem: :math:`(R,\; s (t + R c))`."""
+        offset = (pose.rotation * self.centroid[:, None]).sum(-1)
+        return Pose(pose.rotation, (pose.translation + offset) * self.scale[:, None])
+
+    def undo(self, pose: Pose) -> Pose:
+        r"""Express a pose in the caller's world, the inverse of :meth:`apply`: :math:`(R,\; t / s - R c)`.
+
+        There may be several poses of each problem, :math:`(B, S, 3, 3)` and :math:`(B, S, 3)`.
+        """
+        more = (1,) * (pose.translation.ndim - 2)
+        offset = (pose.rotation * self.centroid.view(-1, *more, 1, 3)).sum(-1)
+        return Pose(pose.rotation, pose.translation / self.scale.view(-1, *more, 1) - offset)
+
+    def undo_pairs(self, values: Tensor) -> Tensor:
+        """Bring values of pairs, :math:`(B, N)`, back to the order in which the pairs came."""
+        return values if self.order is None else torch.zeros_like(values).scatter(1, self.order, values)
+
+    def undo_starts(self, starts: Starts) -> Starts:
+        """Express starts in the frame, order and units of the inputs; ``ok``: whether the problem is valid."""
+        noise = starts.noise
+        if noise is not None:
+            noise = Noise(noise.img / self.img_scale[:, None], noise.world / self.scale[:, None])
+            noise = map_tensors(self.undo_pairs, noise)
+        others = None if starts.others is None else self.undo(starts.others)
+        return Starts(self.undo(starts.pose), self.undo_pairs(starts.weights), self.valid, others, noise)
+
+    def start(self, init: Pose | None) -> Pose:
+        """A caller's pose in the frame of the problem; the identity for ``None`` and where it is not finite."""
+        eye = torch.eye(3, dtype=self.scale.dtype, device=self.scale.device).expand(self.scale.shape[0], 3, 3)
+        init = Pose(eye, torch.zeros_like(self.centroid)) if init is None else init
+        limit = torch.finfo(eye.dtype).max ** 0.25  # as for points: below it, squares of squares are finite
+        usable = self.valid & (torch.cat((init.rotation.flatten(1), init.translation), 1).abs().amax(-1) < limit)
+        return self.apply(gate_pose(init, usable, usable))
+
 
 class Normalize(Configured):
     r"""Normalise cameras, order and world frame.
@@ -82,9 +106,9 @@ class Normalize(Configured):
     coincide. The inputs of invalid problems are replaced by zeros, which keeps all later values and gradients finite. A
     pair without weight is padding: its numbers do not matter.
 
-    Bad triangulations and bad detections do not spoil the frame: centroid and scale are those of the pairs that are
-    *near*, at most five times as far from the median of the points as two thirds of them, and less than 85° off the
-    camera's axis. Pairs a million times as far, or too close to 90° to be seen, are outliers and lose their weight.
+    Bad triangulations and bad detections do not spoil the frame: centroid and scale are those of the *usual* pairs.
+    These are at most five times as far from the median of the points as two thirds of the pairs, and less than 85° off
+    the camera's axis. Pairs a million times as far, or too close to 90° to be seen, are outliers and lose their weight.
 
     Args:
         f_const: focal length of the normalised camera in pixels.
@@ -101,8 +125,8 @@ class Normalize(Configured):
         >>> world = torch.tensor([[[0.0, 0, 2], [2, 0, 2], [0, 2, 2], [2, 2, 2]]])
         >>> pixels = torch.tensor([[[320.0, 240], [420, 240], [320, 340], [420, 340]]])
         >>> K = torch.tensor([[[100.0, 0, 320], [0, 100, 240], [0, 0, 1]]])
-        >>> corr, frame = normalize(world, pixels, K)
-        >>> frame.centroid, corr.img_points[0, 3]
+        >>> problem, frame = normalize(world, pixels, K)
+        >>> frame.centroid, problem.img_points[0, 3]
         (tensor([[1., 1., 2.]]), tensor([3400., 3400.]))
     """
 
@@ -126,7 +150,7 @@ class Normalize(Configured):
         noise: Noise | None = None,
         confidence: Tensor | None = None,
         rig: Pose | None = None,
-    ) -> tuple[Correspondences, Frame]:
+    ) -> tuple[Problem, Frame]:
         r"""Normalise a batch.
 
         Args:
@@ -142,7 +166,7 @@ class Normalize(Configured):
             rig: the camera of each pair in the frame of a rig, :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`.
 
         Returns:
-            The normalised correspondences, with the problems last in memory, and the :class:`Frame` that undoes it.
+            The problem in its frame, with the problems last in memory, and the :class:`Frame` that undoes it.
         """
         batch, count = world_points.shape[:2]
         padded = weights is not None or mask is not None
@@ -199,17 +223,17 @@ class Normalize(Configured):
         number = there.sum(0)
         far = torch.where(number < _MANY, _FAR_OF_FEW**2, _FAR**2) * typical
         seen = there & (tangent <= _FAR_ANGLE)
-        near = (seen | (there & (seen.sum(0) <= MIN_PAIRS))) & (sq_distance <= far)  # a wide angle may be right
-        is_near, is_there = near.to(rows.dtype), there.to(rows.dtype)
+        usual = (seen | (there & (seen.sum(0) <= MIN_PAIRS))) & (sq_distance <= far)  # a wide angle may be right
+        is_usual, is_there = usual.to(rows.dtype), there.to(rows.dtype)
 
-        # Centre and scale by the pairs that are near.
-        share = is_near.sum(0).clamp(min=1.0).reciprocal()
-        near_points = rows[:3] * is_near
-        mean = near_points.sum(1) * share
-        centred = torch.addcmul(near_points, mean[:, None], is_near, value=-1)
-        largest = near_points.detach().abs().amax((0, 1))
+        # Centre and scale by the pairs of normal scale.
+        share = is_usual.sum(0).clamp(min=1.0).reciprocal()
+        usual_points = rows[:3] * is_usual
+        mean = usual_points.sum(1) * share
+        centred = torch.addcmul(usual_points, mean[:, None], is_usual, value=-1)
+        largest = usual_points.detach().abs().amax((0, 1))
         spread_out = span_a_plane(centred.detach(), share, largest) & (largest > 1.0 / limit)
-        mean_square = (centred if self.center else near_points).square().sum((0, 1)) * share
+        mean_square = (centred if self.center else usual_points).square().sum((0, 1)) * share
         scale = torch.where(spread_out, mean_square, one[0]).rsqrt() if self.scale else one[0]
         centroid = mean if self.center else zero.expand(3, batch)
 
@@ -229,9 +253,9 @@ class Normalize(Configured):
 
         order = None
         if self.order:
-            order = ascending_order(torch.where(near, rows[3:5].detach(), torch.inf))
+            order = ascending_order(torch.where(usual, rows[3:5].detach(), torch.inf))
             rows = rows.gather(1, order.mT.expand(6, -1, -1))
-            is_near = is_near.gather(0, order.mT)
+            is_usual = is_usual.gather(0, order.mT)
         world_points, img_points, weights = rows.permute(2, 1, 0).split((3, 2, 1), -1)
         horizontal, vertical = img_scales.sqrt()
         img_scale = horizontal * vertical  # (1 or N, B)
@@ -255,13 +279,11 @@ class Normalize(Configured):
             if order is not None:
                 rotation = rig.rotation.gather(1, order[..., None, None].expand_as(rig.rotation))
                 rig = Pose(rotation, rig.translation.gather(1, order[..., None].expand_as(rig.translation)))
-        corr = Correspondences(
-            world_points, img_points, weights[..., 0], focal, frame.img_scale, scale, noise, is_near.mT, confidence
-        )
-        return corr._replace(rig=rig), frame
+        scales = mean_scale, scale, is_usual.mT
+        return Problem(world_points, img_points, weights[..., 0], focal, *scales, noise, confidence, rig), frame
 
     def _scaled_covariances(self, noise: Noise, sound: Tensor, pixel_map: Sequence[Tensor], scale: Tensor) -> Noise:
-        """Covariances in the units of the normalised correspondences, raised above rounding; 0 where not ``sound``.
+        """Covariances in the units of the problem, raised above rounding; 0 where not ``sound``.
 
         Pixels are multiplied by the matrix [[a, b], [0, d]] with the entries of ``pixel_map``, (B, 1) or (B, N) each.
         """
@@ -273,7 +295,7 @@ class Normalize(Configured):
         return noise._replace(img_cov=img_cov, world_cov=world_cov)
 
     def _apply_to_noise(self, noise: Noise, frame: Frame, img_scale: Tensor) -> Noise:
-        """Standard deviations in the units of the normalised correspondences, and all noise in their order."""
+        """Standard deviations in the units of the problem, and all noise in their order."""
 
         def scaled(sigma: Tensor, scale: Tensor) -> Tensor:
             # Unknown sigmas are NaN. Replace them before scaling, or the gradient of the scale becomes NaN.
@@ -281,111 +303,6 @@ class Normalize(Configured):
 
         noise = noise._replace(img=scaled(noise.img, img_scale), world=scaled(noise.world, frame.scale[:, None]))
         return noise if frame.order is None else map_tensors(lambda x: x.gather(1, frame.order), noise)
-
-    def views(self, corr: Correspondences, count: int) -> Correspondences:
-        """Mirror problems: the axes of image and world are exchanged or reversed, both in the same way.
-
-        The distribution of random problems does not change, but a network answers each mirrored problem differently.
-
-        Args:
-            corr: normalised correspondences of :math:`B` problems.
-            count: number of views of each problem, at most 8; the first view is the problem itself.
-
-        Returns:
-            The correspondences of all problems in the first view, then in the second view, and so on; without
-            covariances, because networks see standard deviations.
-        """
-        noise = None if corr.noise is None else corr.noise.sigmas
-        of_pairs = corr.weights, noise, corr.near, corr.confidence
-        others = [values.mT for values in iter_tensors(of_pairs)]  # (N, B) each
-        x, y, z, u, v = (*corr.world_points.permute(2, 1, 0), *corr.img_points.permute(2, 1, 0))
-        seen = [torch.stack((*_exchanged(x, y, *view), z, *_exchanged(u, v, *view), *others)) for view in VIEWS[:count]]
-        if self.order:
-            there = (corr.near_weights != 0).mT
-            keys = torch.cat([torch.where(there, view[3:5].detach(), torch.inf) for view in seen[1:]], -1)
-            order = ascending_order(keys)  # (B * (count - 1), N)
-            seen = [seen[0], torch.cat(seen[1:], -1).gather(1, order.mT.expand(5 + len(others), -1, -1))]
-        rows = torch.cat(seen, -1)
-        world_points, img_points = rows[:5].permute(2, 1, 0).split((3, 2), -1)
-        rest = iter(rows[5:].mT)
-        weights, noise, near, confidence = map_tensors(lambda _: next(rest), of_pairs)
-        return Correspondences(
-            world_points, img_points, weights, corr.focal, noise=noise, near=near, confidence=confidence
-        )
-
-    def undo_views(self, pose: Pose, count: int) -> list[Pose]:
-        """Express poses of :meth:`views` for the problems themselves.
-
-        Args:
-            pose: poses of all views.
-            count: number of views.
-
-        Returns:
-            The poses from each view, the first view first.
-        """
-        seen = []
-        matrices, vectors = (x.movedim(0, -1).unflatten(-1, (count, -1)).unbind(-2) for x in pose)
-        for view, matrix, vector in zip(VIEWS, matrices, vectors, strict=False):  # (3, 3, B), (3, B)
-            for axis in (0, 1):
-                matrix = _axes_back(matrix, axis, view)
-            seen.append(Pose(matrix.movedim(-1, 0), _axes_back(vector, 0, view).movedim(-1, 0)))
-        return seen
-
-    def undo(self, pose: Pose, frame: Frame) -> Pose:
-        r"""Express a pose of the normalised world in the original one.
-
-        Args:
-            pose: world-to-camera pose of the centred and scaled world.
-            frame: what :meth:`forward` returned.
-
-        Returns:
-            The pose of the original world: :math:`(R,\; t / s - R c)`.
-        """
-        rotation, translation = pose
-        offset = (rotation * frame.centroid[:, None]).sum(-1)
-        return Pose(rotation, translation / frame.scale[:, None] - offset)
-
-    def start_pose(self, init: Pose | None, frame: Frame) -> Pose:
-        """A caller's pose in the frame of the correspondences; the identity for ``None`` and where it is not finite."""
-        eye = torch.eye(3, dtype=frame.scale.dtype, device=frame.scale.device).expand(frame.scale.shape[0], 3, 3)
-        init = Pose(eye, torch.zeros_like(frame.centroid)) if init is None else init
-        limit = torch.finfo(eye.dtype).max ** 0.25  # as for points: below it, squares of squares are finite
-        usable = frame.valid & (torch.cat((init.rotation.flatten(1), init.translation), 1).abs().amax(-1) < limit)
-        return self.apply_to_pose(gate_pose(init, usable, usable), frame)
-
-    def apply_to_pose(self, pose: Pose, frame: Frame) -> Pose:
-        r"""Express a pose of the original world in the normalised one, the inverse of :meth:`undo`.
-
-        Args:
-            pose: world-to-camera pose of the original world.
-            frame: what :meth:`forward` returned.
-
-        Returns:
-            The pose of the centred and scaled world: :math:`(R,\; s (t + R c))`.
-        """
-        rotation, translation = pose
-        offset = (rotation * frame.centroid[:, None]).sum(-1)
-        return Pose(rotation, (translation + offset) * frame.scale[:, None])
-
-    def undo_pairs(self, values: Tensor, frame: Frame) -> Tensor:
-        """Bring values of pairs, :math:`(B, N)`, back to the order in which the pairs came."""
-        return values if frame.order is None else torch.zeros_like(values).scatter(1, frame.order, values)
-
-    def undo_poses(self, poses: Pose, frame: Frame) -> Pose:
-        """:meth:`undo` for several poses of each problem, :math:`(B, S, 3, 3)` and :math:`(B, S, 3)`."""
-        batch, count = poses.translation.shape[:2]
-        frames = map_tensors(lambda x: x.repeat_interleave(count, 0), frame)
-        found = self.undo(map_tensors(lambda x: x.flatten(0, 1), poses), frames)
-        return map_tensors(lambda x: x.unflatten(0, (batch, count)), found)
-
-    def undo_guess(self, guess: Guess, frame: Frame) -> Guess:
-        """Express a guess in the frame, the order and the units of the inputs; ``ok``: whether the problem is valid."""
-        others, noise = guess.others, guess.noise
-        others = None if others is None else self.undo_poses(others, frame)
-        if noise is not None:
-            noise = Noise(noise.img / frame.img_scale[:, None], noise.world / frame.scale[:, None])
-            noise = map_tensors(lambda x: self.undo_pairs(x, frame), noise)
-        return Guess(self.undo(guess.pose, frame), self.undo_pairs(guess.weights, frame), frame.valid, others, noise)
 
 
 def _is_usable(noise: Noise, there: Tensor) -> Tensor:
@@ -426,17 +343,3 @@ def _distances(points: Tensor, there: Tensor, padded: bool) -> tuple[Tensor, Ten
     sq_distance = (points - middle[:, None]).square().sum(0)
     typical = ranked(sq_distance[None], 2 * counts // 3)[0]
     return sq_distance, typical.masked_fill(typical == 0, torch.inf)
-
-
-def _exchanged(x: Tensor, y: Tensor, swap: bool, reverse_x: bool, reverse_y: bool) -> tuple[Tensor, Tensor]:
-    """Two coordinates of a mirrored view."""
-    x, y = (y, x) if swap else (x, y)
-    return -x if reverse_x else x, -y if reverse_y else y
-
-
-def _axes_back(entries: Tensor, axis: int, view: tuple[bool, bool, bool]) -> Tensor:
-    """Undo a mirrored view along one axis of three coordinates."""
-    swap, reverse_x, reverse_y = view
-    x, y, z = entries.unbind(axis)
-    x, y = -x if reverse_x else x, -y if reverse_y else y
-    return torch.stack((y, x, z) if swap else (x, y, z), axis)

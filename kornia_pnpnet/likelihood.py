@@ -14,14 +14,15 @@ from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from kornia.geometry.liegroup import So3
 from torch import Tensor
 
-from kornia_pnpnet.core.checks import check_like, check_poses, check_positive, check_shapes, check_whole
+from kornia_pnpnet.core.checks import check_like, check_positive, check_shapes, check_whole
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.geometry import normal_equations, pixel_covariance, project, retract
-from kornia_pnpnet.inputs import checked_inputs
-from kornia_pnpnet.normalize import Normalize
+from kornia_pnpnet.refine.residual import normal_equations, pixel_covariance, project, retract
+from kornia_pnpnet.arguments import checked_inputs
+from kornia_pnpnet.frame import Normalize
 from kornia_pnpnet.refine.kernels import KERNELS, RobustKernel
 from kornia_pnpnet.refine.step import iterate, pixel_precision, sq_standardised
-from kornia_pnpnet.types import Correspondences, Pose
+from kornia_pnpnet.problem import Problem
+from kornia_pnpnet.result import Pose, check_poses
 
 __all__ = ["gaussian_pose_loss", "monte_carlo_pose_loss"]
 
@@ -181,7 +182,7 @@ def gaussian_pose_loss(truth: Pose, estimate: Pose, covariance: Tensor, ok: Tens
     r"""Negative log-likelihood of the true pose under a normal distribution around the estimate.
 
     The loss is :math:`\tfrac12 (e^\top C^{-1} e + \log\det 2\pi C)` with the tangent :math:`e = (\omega, v)` from the
-    true pose to the estimate, see :func:`~kornia_pnpnet.geometry.retract`. With the
+    true pose to the estimate, see :func:`~kornia_pnpnet.refine.residual.retract`. With the
     :func:`~kornia_pnpnet.covariance.pose_covariance` of a result, gradients reach the noise of pixels and points by
     both: by the pose, and by how sure the pose is. The loss costs a small part of :func:`monte_carlo_pose_loss`, but
     knows a single minimum: use it once the solver finds most poses. It grows with the square of the error.
@@ -236,7 +237,7 @@ class _Posterior(NamedTuple):
         noisy_points: whether world points have noise, so that the variance of a pixel depends on the pose.
     """
 
-    corr: Correspondences
+    corr: Problem
     rotation: Tensor
     translation: Tensor
     kernel: RobustKernel

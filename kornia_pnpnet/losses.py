@@ -8,10 +8,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from kornia_pnpnet.core.checks import check_numbers, check_poses, check_positive, check_whole
+from kornia_pnpnet.core.checks import check_numbers, check_positive, check_whole
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.geometry import transform
-from kornia_pnpnet.types import Guess, Noise, PnPResult, Pose, Problems
+from kornia_pnpnet.problem import Noise, Starts
+from kornia_pnpnet.result import PnPResult, Pose, Problems, check_poses
 
 __all__ = ["LossTerms", "PoseLoss", "SetLoss", "pose_distances"]
 
@@ -210,14 +211,14 @@ class SetLoss(nn.Module):
         self.rotation_unit = 2.0**0.5 * math.radians(rotation_unit)  # as a chordal distance
         self.translation_unit = translation_unit
 
-    def forward(self, result: PnPResult, problems: Problems, ramp: float, guess: Guess) -> LossTerms:
+    def forward(self, result: PnPResult, problems: Problems, ramp: float, guess: Starts) -> LossTerms:
         """Compare a solver's result with the truth.
 
         Args:
             result: see :meth:`PoseLoss.forward`.
             problems: see :meth:`PoseLoss.forward`.
             ramp: see :meth:`PoseLoss.forward`.
-            guess: the first guess of the result, see :meth:`~kornia_pnpnet.solver.PnPNet.with_guess`.
+            guess: the first guess of the result, see :meth:`~kornia_pnpnet.solver.PnPNet.with_starts`.
 
         Returns:
             The loss and its terms, means over the batch.

@@ -11,7 +11,7 @@ from kornia.geometry.subpix import spatial_expectation2d, spatial_softmax2d
 from torch import Tensor
 
 from kornia_pnpnet.core.checks import Shapes, check_devices, check_positive, check_shapes, common_dtype, expand_sigma
-from kornia_pnpnet.types import Pose, camera_matrices
+from kornia_pnpnet.result import Pose, camera_matrices
 
 __all__ = ["depth_points", "heatmap_keypoints"]
 

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_pnpnet.core.checks import check_devices, check_poses, check_whole
-from kornia_pnpnet.geometry import rotation_angle
-from kornia_pnpnet.types import Pose
+from kornia_pnpnet.core.checks import check_devices, check_whole
+from kornia_pnpnet.refine.residual import rotation_angle
+from kornia_pnpnet.result import Pose, check_poses
 
 __all__ = ["PoseErrors", "Reliability", "SuccessRate", "pose_errors", "reliability", "success", "success_rate"]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,9 +12,12 @@ from kornia.core.exceptions import BaseError, ValueCheckError
 from torch import Tensor, nn
 
 from kornia_pnpnet.core.files import atomic_open, digest
-from kornia_pnpnet.init import EPnP, MLPInit, REPPnP, SetInit
-from kornia_pnpnet.normalize import Normalize
-from kornia_pnpnet.refine import RobustWeightedLM
+from kornia_pnpnet.frame import Normalize
+from kornia_pnpnet.propose.epnp import EPnP
+from kornia_pnpnet.propose.mlp import MLPInit
+from kornia_pnpnet.propose.reppnp import REPPnP
+from kornia_pnpnet.propose.set import SetInit
+from kornia_pnpnet.refine.lm import RobustWeightedLM
 
 __all__ = [
     "CONFIG_NAME",
@@ -160,33 +164,47 @@ class PretrainedMixin(nn.Module):
     init: nn.Module | None
     refine: RobustWeightedLM
     normalize: Normalize
-    views: int
+
+    @classmethod
+    def option_names(cls) -> list[str]:
+        """Names of a solver's options: the arguments of its constructor that can only be given by name."""
+        parameters = inspect.signature(cls.__init__).parameters.values()
+        return [x.name for x in parameters if x.kind is inspect.Parameter.KEYWORD_ONLY]
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """The options of this solver, as the arguments of its constructor."""
+        return {name: getattr(self, name) for name in self.option_names()}
+
+    def extra_repr(self) -> str:
+        """Show the options."""
+        return ", ".join(f"{name}={value!r}" for name, value in self.options.items())
+
+    def with_options(self, *, refine: RobustWeightedLM | None = None, **options: Any) -> Self:
+        """The same solver with another refinement and other options."""
+        return type(self)(self.init, refine or self.refine, self.normalize, **{**self.options, **options})
 
     def config(self) -> dict[str, Any]:
-        """The constructor arguments of all parts, as plain data."""
+        """The constructor arguments of all parts and the options, as plain data."""
         arguments = getattr(self.init, "config", {})
         init = None if self.init is None else {"name": type(self.init).__name__, **arguments}
-        parts = {"init": init, "refine": self.refine.config, "normalize": self.normalize.config}
-        return {**parts, "views": self.views}
+        return {"init": init, "refine": self.refine.config, "normalize": self.normalize.config, **self.options}
 
     @classmethod
     def from_config(cls, config: dict[str, Any]) -> Self:
-        """Build an untrained solver from what :meth:`config` returned.
+        """Build an untrained solver from what :meth:`config` returned; options that are not in it have their defaults.
 
         Raises:
             ValueCheckError: when a part or an argument is unknown.
         """
         try:
-            if set(config) != {"init", "refine", "normalize", "views"}:
-                raise KeyError(f"parts {sorted(config)}")
-            init_config = config["init"]
-            init = None
-            if init_config is not None:
-                arguments = {key: value for key, value in init_config.items() if key != "name"}
-                init = _INITIALISERS[init_config["name"]](**arguments)
-            parts = init, RobustWeightedLM(**config["refine"]), Normalize(**config["normalize"])
-            return cls(*parts, views=config["views"])
-        except (BaseError, KeyError, TypeError, AttributeError) as error:
+            options = dict(config)
+            init, refine, normalize = (options.pop(part) for part in ("init", "refine", "normalize"))
+            if init is not None:
+                arguments = dict(init)
+                init = _INITIALISERS[arguments.pop("name")](**arguments)
+            return cls(init, RobustWeightedLM(**refine), Normalize(**normalize), **options)
+        except (BaseError, KeyError, TypeError, ValueError, AttributeError) as error:
             raise ValueCheckError(f"Not a configuration of PnPNet: {error!r}.") from error
 
     def save_pretrained(self, folder: str | Path) -> None:

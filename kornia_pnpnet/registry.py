@@ -11,27 +11,28 @@ from kornia.core.exceptions import ValueCheckError
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
-from kornia_pnpnet.init import P3P, RANSAC, EPnP, REPPnP, SubsetSolver
-from kornia_pnpnet.normalize import Normalize
+from kornia_pnpnet.frame import Normalize
 from kornia_pnpnet.pretrained import shipped_weights
-from kornia_pnpnet.refine import RobustWeightedLM
+from kornia_pnpnet.propose.epnp import EPnP
+from kornia_pnpnet.propose.minimal import SubsetSolver
+from kornia_pnpnet.propose.p3p import P3P
+from kornia_pnpnet.propose.ransac import RANSAC
+from kornia_pnpnet.propose.reppnp import REPPnP
+from kornia_pnpnet.refine.lm import RobustWeightedLM
 from kornia_pnpnet.solver import PnPNet
 
 __all__ = ["create_solver", "list_solvers", "solve_pnp"]
 
 # Iterations of the classical robust LM: from a pose that is nearly right, and from the identity.
 _FEW, _MANY = 10, 30
-# Options of every solver of ours.
-_OURS = ("effort", "gradient", "focal", "focal_sigma", "radial")
 # The paper's RANSAC: EPnP-LM on samples of 7 of the pairs.
 _PAPERS_SAMPLE = 7
 
 
-def _trained(weights: str, m: int | None = None, views: int | None = None) -> PnPNet:
+def _trained(weights: str, m: int | None = None) -> PnPNet:
     """Shipped weights with ``m`` iterations (0: the network alone, the paper's "Net")."""
     solver = PnPNet.from_pretrained(weights)
-    refine = solver.refine if m is None else solver.refine.with_iterations(m)
-    return PnPNet(solver.init, refine, solver.normalize, views=solver.views if views is None else views)
+    return solver if m is None else solver.with_options(refine=solver.refine.with_iterations(m))
 
 
 def _judged(init: nn.Module, *, order: bool = True) -> PnPNet:
@@ -113,18 +114,16 @@ def create_solver(name: str, **options: Any) -> nn.Module:
     """Build a solver.
 
     Every solver is called as ``solver(world_points, img_points, intrinsics, weights=None, mask=None)`` and returns a
-    :class:`~kornia_pnpnet.types.PnPResult`.
+    :class:`~kornia_pnpnet.result.PnPResult`.
 
     Args:
         name: one of :func:`list_solvers`.
         options: options of that solver. ``identity-lm``, every ``-lm`` and trained weights take ``m``, the number of
-            iterations (see :meth:`~kornia_pnpnet.refine.RobustWeightedLM.with_iterations`); trained weights take
-            ``views``, the number of guesses per problem (see :class:`~kornia_pnpnet.solver.PnPNet`); ``epnp`` and
-            ``epnp-lm`` take the arguments of :class:`~kornia_pnpnet.init.EPnP`, ``reppnp`` and ``reppnp-lm`` of
-            :class:`~kornia_pnpnet.init.REPPnP`, ``p3p-ransac`` and ``ransac-epnp-lm`` of
-            :class:`~kornia_pnpnet.init.RANSAC`, peers of their class in :mod:`kornia_pnpnet.peers`. All
-            but the peers take ``gradient``, ``effort``, ``focal``, ``focal_sigma`` and ``radial``, see
-            :class:`~kornia_pnpnet.solver.PnPNet`.
+            iterations (see :meth:`~kornia_pnpnet.RobustWeightedLM.with_iterations`); ``epnp`` and ``epnp-lm`` take the
+            arguments of :class:`~kornia_pnpnet.propose.epnp.EPnP`, ``reppnp`` and ``reppnp-lm`` of
+            :class:`~kornia_pnpnet.propose.reppnp.REPPnP`, ``p3p-ransac`` and ``ransac-epnp-lm`` of
+            :class:`~kornia_pnpnet.propose.ransac.RANSAC`, peers of their class in :mod:`kornia_pnpnet.peers`. All
+            but the peers take the options of :class:`~kornia_pnpnet.solver.PnPNet`.
 
     Returns:
         The solver as a module in evaluation mode.
@@ -141,14 +140,14 @@ def create_solver(name: str, **options: Any) -> nn.Module:
     builders = _builders()
     if not isinstance(name, str) or name not in builders:
         raise ValueCheckError(f"No solver {name!r}. There are: {', '.join(sorted(builders))}.")
-    ours = {key: options.pop(key) for key in _OURS if key in options}
+    ours = {key: options.pop(key) for key in PnPNet.option_names() if key in options}
     try:
         solver = builders[name](**options).eval()
         if not ours:
             return solver
         if not isinstance(solver, PnPNet):
             raise TypeError(f"{' and '.join(ours)}: for solvers of this package only")
-        return PnPNet(solver.init, solver.refine, solver.normalize, views=solver.views, **ours).eval()
+        return solver.with_options(**ours).eval()
     except TypeError as error:
         raise ValueCheckError(f"Solver {name!r} does not take these options: {error}.") from error
 

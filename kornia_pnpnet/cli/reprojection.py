@@ -9,7 +9,7 @@ from kornia.geometry.conversions import convert_points_from_homogeneous
 from torch import Tensor
 
 from kornia_pnpnet.geometry import transform
-from kornia_pnpnet.types import Pose
+from kornia_pnpnet.result import Pose
 
 __all__ = ["Reprojection", "rejection_limit", "reproject"]
 

@@ -15,7 +15,7 @@ from torch.nn import functional
 from kornia_pnpnet.core.checks import check_numbers, check_positive, check_whole
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.data.draws import batch_generator, log_uniform, normal, random_poses, uniform
-from kornia_pnpnet.types import Pose, Problems
+from kornia_pnpnet.result import Pose, Problems
 
 __all__ = ["CameraProblems"]
 

@@ -10,7 +10,7 @@ import torch
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
-from kornia_pnpnet.types import Pose
+from kornia_pnpnet.result import Pose
 
 __all__ = ["batch_generator", "log_uniform", "normal", "random_poses", "uniform"]
 

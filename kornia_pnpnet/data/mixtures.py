@@ -16,7 +16,7 @@ from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.data.draws import batch_generator, uniform
 from kornia_pnpnet.data.points import PointPrior
 from kornia_pnpnet.data.synthetic import SyntheticProblems
-from kornia_pnpnet.types import Problems
+from kornia_pnpnet.result import Problems
 
 __all__ = ["MixedPoints", "MixedProblems", "VaryingSize"]
 

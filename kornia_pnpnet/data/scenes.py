@@ -18,7 +18,7 @@ from torch import Tensor
 from kornia_pnpnet.core.checks import check_numbers, check_whole
 from kornia_pnpnet.data.draws import batch_generator, random_poses, uniform
 from kornia_pnpnet.data.outliers import OutlierMix
-from kornia_pnpnet.types import Pose, Problems
+from kornia_pnpnet.result import Pose, Problems
 
 __all__ = ["Scene", "SceneProblems", "View"]
 

@@ -26,7 +26,7 @@ from kornia_pnpnet.data.noise import (
 )
 from kornia_pnpnet.data.outliers import OutlierMix, crowd_leaders, near_offsets, structured_points
 from kornia_pnpnet.data.points import BoxPoints, PointPrior
-from kornia_pnpnet.types import Problems
+from kornia_pnpnet.result import Problems
 
 __all__ = ["SyntheticProblems"]
 

@@ -21,7 +21,7 @@ from kornia_pnpnet.data.stream import ProblemSource
 from kornia_pnpnet.evaluation.results import FORMAT, resume, save_results, source_digest
 from kornia_pnpnet.metrics import PoseErrors, pose_errors, success, success_rate
 from kornia_pnpnet.solver import PnPNet
-from kornia_pnpnet.types import PnPResult, Pose, Problems
+from kornia_pnpnet.result import PnPResult, Pose, Problems
 
 __all__ = ["EvaluationData", "SeesTruth", "draw_problems", "evaluate"]
 
@@ -107,7 +107,7 @@ def evaluate(
         solvers: by name, each called as ``solver(world_points, img_points, intrinsics)`` in evaluation mode, without
             gradients. A bound (see :class:`SeesTruth`) also gets the true poses and inliers. A
             :class:`~kornia_pnpnet.solver.PnPNet` gets the noise level where the problems have it
-            (:attr:`~kornia_pnpnet.types.Problems.known`).
+            (:attr:`~kornia_pnpnet.result.Problems.known`).
         data: problems by name. Each set is solved on its own device and in its own dtype.
         path: the results file to write and to continue; none when ``None``.
         overwrite: start anew and replace the file at ``path``.

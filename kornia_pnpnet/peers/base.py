@@ -16,8 +16,9 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
 from kornia_pnpnet.core.checks import check_positive, check_whole
-from kornia_pnpnet.inputs import checked_inputs, restore_leading
-from kornia_pnpnet.types import MIN_PAIRS, Alternatives, PnPResult, Pose, Status
+from kornia_pnpnet.arguments import checked_inputs, restore_leading
+from kornia_pnpnet.problem import MIN_PAIRS
+from kornia_pnpnet.result import Alternatives, PnPResult, Pose, Status
 
 __all__ = ["PeerPose", "PeerSolver"]
 
@@ -106,7 +107,7 @@ class PeerSolver(nn.Module):
             mask: False where a pair is padding, bool, shape :math:`(B, N)`.
 
         Returns:
-            The :class:`~kornia_pnpnet.types.PnPResult` on the device of the input, without gradients; float64 when any
+            The :class:`~kornia_pnpnet.result.PnPResult` on the device of the input, without gradients; float64 when any
             input is, else float32. Its weights are 1 for the inliers that the peer reports, else 0; its cost is the
             mean over the pairs of the squared reprojection error in px², truncated at the squared threshold.
 

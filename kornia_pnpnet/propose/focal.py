@@ -1,4 +1,4 @@
-r"""An unknown focal length: where to look for it, and a first estimate of it together with a pose."""
+r"""An unknown focal length: the range in which it is searched, and a first estimate of it together with a pose."""
 
 from __future__ import annotations
 
@@ -8,32 +8,20 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from kornia_pnpnet.cameras import undistort
+from kornia_pnpnet.arguments import Inputs, with_undistorted
+from kornia_pnpnet.core.linalg import solve_positive
 from kornia_pnpnet.core.performance import ranked
-from kornia_pnpnet.propose import P3P, RANSAC
-from kornia_pnpnet.propose.set import SetInit
-from kornia_pnpnet.inputs import Inputs, with_undistorted
-from kornia_pnpnet.frame import Frame, Normalize
-from kornia_pnpnet.refine import LMStart, LMStep, RobustWeightedLM
-from kornia_pnpnet.refine.radial import distorted, estimate_radial, refine_radial, rescaled
-from kornia_pnpnet.types import Problem, FreeFocal, PnPResult, Pose
+from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.frame import Normalize
+from kornia_pnpnet.problem import MIN_PAIRS, Problem, State
+from kornia_pnpnet.propose.p3p import P3P
+from kornia_pnpnet.propose.ransac import RANSAC
+from kornia_pnpnet.refine.residual import moved, normal_equations, project
+from kornia_pnpnet.refine.terms import CameraTerm, add_term
+from kornia_pnpnet.result import Pose
 
-__all__ = [
-    "MORE_ITERATIONS",
-    "find_focal",
-    "finds_focal",
-    "free_focal_in_frame",
-    "guesses_focal",
-    "is_doubtful",
-    "iterate_with_radial",
-    "scale_focal",
-    "with_found_focal",
-    "with_nominal_focal",
-]
+__all__ = ["as_dist", "distorted", "scale_focal", "with_found_focal", "with_nominal_focal"]
 
-#: Further iterations from the nominal focal length: the least that converge with 1000 pairs. With 2, 4 and 8 of them
-#: the median error of the focal length is 0.037, 0.029 and 0.030 % (CameraProblems, seeds 4321, 4322, half outliers).
-MORE_ITERATIONS = 4
 # Half widths of the image: the focal lengths of fields of view from 118 to 14 degrees, which are searched.
 _SHORTEST, _LONGEST = 0.6, 8.0
 # Half of this range in logarithms.
@@ -45,29 +33,17 @@ _SEARCHED = 2.0
 # Pixels of a camera whose focal length is in the middle of the range: 0.65 % of half the width of the image. The least
 # threshold of an inlier; near the right focal length on the grid of the search, inliers have larger residuals.
 _THRESHOLD = 10.0
-# Least probability of a pose that started with the nominal focal length. Of problems with 50 % outliers (n = 12, seeds
-# 7700 to 7709 of CameraProblems), 0.4 to 0.6 % have more and are wrong, as are 0.6 % of those of the oracle.
-_CONVINCING = 0.97
 _FINDER = RANSAC(P3P(), threshold=_THRESHOLD, min_samples=16, confidence=0.99)
 
-
-def finds_focal(init: object) -> bool:
-    """Whether an initialiser estimates an unknown focal length itself."""
-    return isinstance(init, RANSAC) and isinstance(init.minimal, P3P)
-
-
-def guesses_focal(init: object, inputs: Inputs) -> bool:
-    """Whether the refinement can correct a nominal focal length.
-
-    The poses of a network with a nominal focal length are near enough. A caller's pose does not fit the focal length.
-    """
-    return isinstance(init, SetInit) and inputs.init is None and inputs.prior is None
-
-
-def is_doubtful(result: PnPResult) -> Tensor:
-    """Whether a solution that started with the nominal focal length is not convincing, bool (B,)."""
-    assert result.probability is not None
-    return ~result.ok | (result.probability < _CONVINCING)
+# Focal lengths. Pairs with a smaller residual count in the first steps, before distortion is known: 0.2 times the cube
+# of a tangent of 0.7 is 0.07. From step to step the limit shrinks by a factor, down to the scale of the residuals.
+_WIDE, _SHRINK = 0.07, 0.6
+# Steps of the first estimate of distortion, and their damping.
+_STEPS, _DAMPING = 14, 1e-6
+# Scale of Cauchy's kernel in standard deviations, and the median of squared residuals in variances of a coordinate.
+_KERNEL_SCALE, _MEDIAN = 3.4, 2.0 * math.log(2.0)
+# Focal lengths. The scale of the residuals is at least this.
+_LEAST = 1e-5
 
 
 def with_nominal_focal(inputs: Inputs, sigma: float | None) -> Inputs:
@@ -95,13 +71,12 @@ def with_nominal_focal(inputs: Inputs, sigma: float | None) -> Inputs:
             median = ranked(torch.where(there, away, torch.inf).mT[None], (there.sum(1) - 1) // 2)[0]
             half = (_HALF_WIDTH * median).maximum(principal_point[:, 0].abs().amax(-1))
             half = torch.where(half.isfinite() & (half > 0), half, 1.0)
-        nominal = math.sqrt(_SHORTEST * _LONGEST) * half
-        width = torch.full_like(nominal, _WIDTH)
-        known = FreeFocal(nominal, torch.zeros_like(nominal), width, torch.ones_like(nominal))
+        nominal = expected = math.sqrt(_SHORTEST * _LONGEST) * half
+        width, precision = _WIDTH, 0.0
     else:
-        nominal = given.detach()
-        width = torch.full_like(nominal, min(_SEARCHED * sigma, _WIDTH))
-        known = FreeFocal(given, torch.full_like(nominal, sigma**-2), width, torch.ones_like(nominal))
+        nominal, expected = given.detach(), given
+        width, precision = min(_SEARCHED * sigma, _WIDTH), sigma**-2
+    known = CameraTerm(expected, torch.full_like(nominal, precision), torch.full_like(nominal, width), nominal)
     return inputs._replace(intrinsics=scale_focal(camera, nominal / given), free_focal=known)
 
 
@@ -112,104 +87,107 @@ def scale_focal(intrinsics: Tensor, factor: Tensor) -> Tensor:
     return torch.cat((torch.cat((linear * factor[:, None, None], principal_point), 2), rest), 1)
 
 
-def free_focal_in_frame(free: FreeFocal, frame: Frame) -> FreeFocal:
-    """What is known of focal lengths, in the pixels of normalised correspondences."""
-    return free._replace(expected=free.expected * frame.img_scale, pixel=frame.img_scale.detach())
+def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
+    """Give the cameras an estimate of their focal length, and the problems a pose to start from unless they have one.
 
-
-@torch.no_grad()
-def find_focal(inputs: Inputs) -> tuple[Pose, Tensor]:
-    """Estimate focal lengths and poses by P3P at focal lengths on a grid, and least squares of the inliers.
+    P3P at focal lengths on a grid, and least squares of the inliers, find both.
 
     Args:
         inputs: the problems, with a nominal focal length, see :func:`with_nominal_focal`.
-
-    Returns:
-        The poses in the world of the inputs, and the logarithm of the focal lengths over the nominal ones, (B,).
-    """
-    assert inputs.free_focal is not None
-    normalize = Normalize(order=False)
-    corr, frame = normalize(*inputs[:5], confidence=inputs.confidence)
-    corr = corr._replace(img_scale=None, free_focal=free_focal_in_frame(inputs.free_focal, frame))
-    guess = _FINDER(corr)
-    assert guess.zoom is not None
-    return normalize.undo(guess.pose, frame), torch.where(guess.zoom.isfinite(), guess.zoom, 0.0)
-
-
-def with_found_focal(inputs: Inputs, radial: int = 0) -> tuple[Inputs, Tensor | None]:
-    """Give the cameras an estimate of their focal length, and the problems a pose to start from unless they have one.
-
-    Args:
-        inputs: See find_focal.
         radial: number of coefficients of radial distortion to estimate, too.
 
     Returns:
-        The problems, their pixels undistorted where ``radial`` is not 0; the coefficients, (B, radial), then.
+        The problems; where ``radial`` is not 0, with undistorted pixels and the coefficients.
     """
-    pose, zoom = find_focal(inputs)
-    cameras, coefficients = scale_focal(inputs.intrinsics, zoom.exp()), None
+    assert inputs.free_focal is not None
+    normalize = Normalize(order=False)
+    with torch.no_grad():
+        problem, frame = normalize(*inputs[:5], confidence=inputs.confidence)
+        one = torch.ones_like(problem.img_scale)
+        found = _FINDER(problem._replace(img_scale=one, free_focal=inputs.free_focal.scaled(frame.img_scale)))
+        assert found.camera is not None
+        zoom = torch.where(found.camera[:, 0].isfinite(), found.camera[:, 0], 0.0)
+    pose = frame.undo(found.pose)
+    inputs = _zoomed(inputs, zoom)
     if radial:
-        normalize = Normalize(order=False)
         with torch.no_grad():
-            corr, frame = normalize(*inputs._replace(intrinsics=cameras)[:5])
-            found = estimate_radial(corr, normalize.apply_to_pose(pose, frame), radial)
-            assert found.zoom is not None
-            assert found.radial is not None
-            finite = frame.valid & (found.pose.translation.sum(-1) + found.zoom + found.radial.sum(-1)).isfinite()
-            better = normalize.undo(found.pose, frame)
+            problem, frame = normalize(*inputs[:5])
+            assert inputs.free_focal is not None
+            problem = problem._replace(free_focal=inputs.free_focal.scaled(frame.img_scale))
+            at = _with_distortion(problem, frame.apply(pose), radial)
+            finite = frame.valid & (at.pose.translation.sum(-1) + at.camera.sum(-1)).isfinite()
+            better = frame.undo(at.pose)
             pose = Pose(
                 torch.where(finite[:, None, None], better.rotation, pose.rotation),
                 torch.where(finite[:, None], better.translation, pose.translation),
             )
-            zoom = torch.where(finite, found.zoom, 0.0)
-            coefficients = torch.where(finite[:, None], found.radial, 0.0)
-        cameras = scale_focal(cameras, zoom.exp())
-        inputs = with_undistorted(inputs._replace(intrinsics=cameras), _as_dist(coefficients), None)
-    return inputs._replace(intrinsics=cameras, init=pose if inputs.init is None else inputs.init), coefficients
+            camera = torch.where(finite[:, None], at.camera, 0.0)
+        inputs = _zoomed(inputs, camera[:, 0])
+        inputs = with_undistorted(inputs, as_dist(camera[:, 1:]), None)._replace(radial=camera[:, 1:])
+    return inputs._replace(init=pose if inputs.init is None else inputs.init)
 
 
-def iterate_with_radial(
-    refine: RobustWeightedLM, start: LMStart, coefficients: Tensor | None, m: int | None, more: int = 0
-) -> tuple[LMStart, LMStep]:
-    """Run the iterations, then refine the distortion of the pixels together with the pose and the focal length.
-
-    Args:
-        refine: the refinement.
-        start: what it starts from, with undistorted pixels.
-        coefficients: their distortion, (B, K), a constant; ``None``: there is none, and none is sought.
-        m: See RobustWeightedLM.iterate. With 0 the guess stays as it is, and so does the distortion.
-        more: See RobustWeightedLM.iterate.
-
-    Returns:
-        The start with the pixels of the distortion that was found, and the end with that distortion, (B, 4).
-    """
-    if coefficients is None:
-        return start, refine.iterate(start, m, more=more)
-    with torch.set_grad_enabled(torch.is_grad_enabled() and m == 0):  # the gradient is that of the last minimum
-        end = refine.iterate(start, m)
-    assert end.zoom is not None
-    radial = rescaled(coefficients, end.zoom)
-    if m == 0:
-        return start, end._replace(radial=_as_dist(radial))
-    seen = distorted(start.corr, coefficients)
-    pairs = start.by_residual._replace(img_points=seen.img_points, noise=seen.noise)
-    end = refine_radial(start._replace(by_residual=pairs), end._replace(radial=radial), refine.kernel.weight)
-    assert end.zoom is not None
-    assert end.radial is not None
-    focal = start.corr.focal * end.zoom.exp()
-    camera = torch.stack((focal, focal, torch.ones_like(focal)), -1).diag_embed()
-    dist = _as_dist(end.radial)
-    pixels, found, noise = undistort(seen.img_points, camera, dist, None, seen.noise)
-
-    def changed(corr: Problem) -> Problem:
-        return corr._replace(img_points=pixels, noise=noise, weights=torch.where(found, corr.weights, 0.0))
-
-    corr, guided, by_residual = (changed(x) for x in (start.corr, start.guided, start.by_residual))
-    prior = torch.where(found, start.prior, 0.0)
-    start = start._replace(corr=corr, guided=guided, by_residual=by_residual, prior=prior)
-    return start, end._replace(radial=dist)
+def _zoomed(inputs: Inputs, zoom: Tensor) -> Inputs:
+    """Inputs whose cameras have a longer focal length, by the exponential of ``zoom`` (B,)."""
+    assert inputs.free_focal is not None
+    known = inputs.free_focal._replace(focal=inputs.free_focal.focal * zoom.exp())
+    return inputs._replace(intrinsics=scale_focal(inputs.intrinsics, zoom.exp()), free_focal=known)
 
 
-def _as_dist(coefficients: Tensor) -> Tensor:
+def distorted(problem: Problem, coefficients: Tensor) -> Problem:
+    """A problem whose pixels, and their noise, are those before distortion (B, K) was taken away."""
+    p, q = (problem.img_points / problem.focal).unbind(-1)
+    square = torch.addcmul(p * p, q, q)
+    stretch, slope = torch.ones_like(square), torch.zeros_like(square)
+    for power, k in enumerate(coefficients.unbind(1)):
+        stretch = stretch + k[:, None] * square ** (power + 1)
+        slope = slope + 2.0 * (power + 1) * k[:, None] * square**power
+    noise = problem.noise
+    if noise is not None:
+        with torch.no_grad():
+            along = stretch + slope * square
+            growth = (0.5 * (stretch**-2 + along**-2)).sqrt()  # of a standard deviation, see `cameras.undistort`
+            turned = stretch + slope * p * p, slope * p * q, stretch + slope * q * q, slope * p * q
+        cov = None if noise.img_cov is None else noise.img_cov.mapped(*turned)
+        noise = noise._replace(img=noise.img / growth, img_cov=cov)
+    return problem._replace(img_points=stretch[..., None] * problem.img_points, noise=noise)
+
+
+def as_dist(coefficients: Tensor) -> Tensor:
     """Coefficients (B, K) of radial distortion as (k1, k2, 0, 0), (B, 4)."""
     return functional.pad(coefficients, (0, 4 - coefficients.shape[1]))
+
+
+def _with_distortion(problem: Problem, pose: Pose, radial: int) -> State:
+    r"""Estimate radial distortion with the pose and the focal length.
+
+    Gauss-Newton steps weigh the pairs by Cauchy's kernel; its scale first is that of what distortion does at the edge
+    of an image, and shrinks to the median residual.
+    """
+    state = State(pose, problem.weights.new_zeros(len(problem.weights), 1 + radial))
+    there, limit = problem.weights > 0, _WIDE
+    for _ in range(_STEPS):
+        projection = project(state, problem)
+        seen = projection.in_front & there
+        sq_residual = torch.where(seen, projection.sq_residual, torch.inf)
+        scale = _scale(sq_residual, projection.focal[:, None], limit)
+        weights = torch.where(seen, problem.weights / (1.0 + sq_residual / scale.square()), 0.0)
+        equations = normal_equations(projection, problem, weights)
+        # The distortion is small; what is known of the focal length is left to the refinement.
+        known = problem.free_focal._replace(information=torch.zeros_like(problem.img_scale))
+        unit = (_KERNEL_SCALE / scale[:, 0]).square()
+        equations = add_term(equations, known.linearise(state), unit, projection.focal)
+        delta, solved = solve_positive(equations.matrix, equations.gradient, torch.full_like(unit, _DAMPING))
+        state = moved(state, (-solved.to(delta) / projection.focal * delta).clamp(-1.0, 1.0))
+        limit *= _SHRINK
+    return state
+
+
+def _scale(sq_residual: Tensor, focal: Tensor, limit: float) -> Tensor:
+    """Scale of the kernel in pixels, (B, 1): the limit, or what the residuals around it show where this is more."""
+    wide = limit * focal
+    ascending = torch.where(sq_residual <= (_KERNEL_SCALE * wide).square(), sq_residual, torch.inf).sort(1).values
+    count = ascending.isfinite().sum(1, keepdim=True)
+    middle = ((count + MIN_PAIRS + 1) // 2).minimum(count - 1).clamp(min=0)
+    sigma = (ascending.gather(1, middle) / _MEDIAN).sqrt().nan_to_num(posinf=0.0)
+    return (_KERNEL_SCALE * sigma).maximum(wide).maximum(_LEAST * focal)

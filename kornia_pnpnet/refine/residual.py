@@ -31,6 +31,7 @@ __all__ = [
     "NormalEquations",
     "Projection",
     "change_tangent",
+    "covariance_at",
     "lm_step",
     "moved",
     "normal_equations",
@@ -193,14 +194,26 @@ def pixel_covariance(projection: Projection, problem: Problem, noise: Noise) -> 
     Returns:
         Entries of shape :math:`(B, N)`. Behind the camera they are the covariance of the pixel alone.
     """
+    rotation = projection.state.pose.rotation[:, None]
+    rotation = rotation if problem.rig is None else problem.rig.rotation @ rotation
     p, q = (x.mT for x in projection.plane.unbind())
-    scale = (projection.focal * projection.inv_depth).mT
+    return covariance_at(rotation, p, q, (projection.focal * projection.inv_depth).mT, noise)
+
+
+def covariance_at(rotation: Tensor, p: Tensor, q: Tensor, scale: Tensor, noise: Noise) -> Symmetric2:
+    """:func:`pixel_covariance` at any points of the plane z = 1.
+
+    Args:
+        rotation: rotation from the world to the camera, :math:`(*, 1, 3, 3)` or :math:`(*, N, 3, 3)`.
+        p: horizontal coordinate, shape :math:`(*, N)`.
+        q: vertical coordinate, shape :math:`(*, N)`.
+        scale: focal length over depth, shape :math:`(*, N)`.
+        noise: noise of each pair.
+    """
     if noise.world_cov is None:
         moved = (scale * noise.world).square()
         uu, uv, vv = torch.addcmul(moved, moved * p, p), moved * p * q, torch.addcmul(moved, moved * q, q)
     else:
-        rotation = projection.state.pose.rotation[:, None]  # (B, 1, 3, 3)
-        rotation = rotation if problem.rig is None else problem.rig.rotation @ rotation
         first, second, third = (row.unbind(-1) for row in rotation.unbind(-2))
         a = [scale * torch.addcmul(i, p, k, value=-1) for i, k in zip(first, third, strict=True)]
         b = [scale * torch.addcmul(j, q, k, value=-1) for j, k in zip(second, third, strict=True)]

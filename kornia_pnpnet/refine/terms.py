@@ -106,6 +106,10 @@ class CameraTerm(NamedTuple):
     width: Tensor
     focal: Tensor
 
+    def scaled(self, pixels: Tensor) -> CameraTerm:
+        """In other pixels, (B,): of the problem in place of the caller's."""
+        return self._replace(expected=self.expected * pixels, focal=self.focal * pixels)
+
     def linearise(self, state: State) -> Linear:
         """Distance of log f from its expectation, and the coefficients of distortion, which are small."""
         batch, count = state.camera.shape

@@ -18,7 +18,7 @@ from kornia_pnpnet.pretrained import find_weights
 from kornia_pnpnet.solver import PnPNet
 from kornia_pnpnet.training.run import FitReport
 from kornia_pnpnet.training.validation import ValidationResult, validate
-from kornia_pnpnet.types import Problems
+from kornia_pnpnet.result import Problems
 
 __all__ = ["RESULTS_NAME", "Learned", "RunResults", "find_results", "load_run", "run_results"]
 

@@ -29,7 +29,7 @@ from kornia_pnpnet.training.checkpoint import (
 )
 from kornia_pnpnet.training.settings import TrainSettings
 from kornia_pnpnet.training.validation import CURVES, validate
-from kornia_pnpnet.types import Problems
+from kornia_pnpnet.result import Problems
 
 __all__ = ["FitReport", "Run", "describe_shares"]
 
@@ -117,7 +117,7 @@ class Run:
         self.parameters = [p for params, _ in trained for p in params]
         self.optimizer = torch.optim.Adam(groups, fused=True)
         self.solver, self.fabric_optimizer = fabric.setup(model, self.optimizer)
-        self.solver.mark_forward_method("with_guess")
+        self.solver.mark_forward_method("with_starts")
         if state is not None:  # after the parameters are on their device, so that Adam's state follows them
             for group in state["optimizer"]["param_groups"]:
                 group["fused"] = True  # changes how a step is computed, not its result
@@ -142,7 +142,7 @@ class Run:
         inputs = problems.world_points, problems.img_points, problems.intrinsics
         options = {**problems.known, "first_stage_only": ramp == 0.0}
         if isinstance(self.loss, SetLoss):
-            result, guess = self.solver.with_guess(*inputs, **options)
+            result, guess = self.solver.with_starts(*inputs, **options)
             return self.loss(result, problems, ramp, guess)
         return self.loss(self.solver(*inputs, **options), problems, ramp)
 

@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from kornia_pnpnet.metrics import SuccessRate, pose_errors, success, success_rate
-from kornia_pnpnet.types import Problems
+from kornia_pnpnet.result import Problems
 
 __all__ = ["CURVES", "ValidationResult", "validate"]
 

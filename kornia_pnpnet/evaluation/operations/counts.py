@@ -14,7 +14,8 @@ from kornia_pnpnet.evaluation.named_solvers import load_solver
 from kornia_pnpnet.evaluation.operations.costs import OPERATION_COSTS
 from kornia_pnpnet.evaluation.operations.counter import count_per_problem
 from kornia_pnpnet.evaluation.results import FORMAT
-from kornia_pnpnet.init import RANSAC, MLPInit
+from kornia_pnpnet.propose.mlp import MLPInit
+from kornia_pnpnet.propose.ransac import RANSAC
 from kornia_pnpnet.solver import PnPNet
 
 __all__ = ["SOLVERS", "complexity_results", "operation_count"]

@@ -1,0 +1,97 @@
+"""Views: a network answers the mirror images of a problem differently, and each answer is a pose to start from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from kornia_pnpnet.core.performance import ascending_order
+from kornia_pnpnet.core.trees import iter_tensors, map_tensors
+from kornia_pnpnet.problem import Problem, Starts
+from kornia_pnpnet.result import Pose
+
+__all__ = ["VIEWS", "from_views"]
+
+#: The symmetries of a square image, as three flags: exchange x and y, then reverse x, then reverse y.
+VIEWS = (
+    (False, False, False),
+    (True, False, False),
+    (False, True, True),
+    (True, True, True),
+    (False, True, False),
+    (False, False, True),
+    (True, True, False),
+    (True, False, True),
+)
+
+
+def from_views(init: Callable[[Problem], Starts], problem: Problem, count: int, order: bool) -> Starts:
+    """Start from the poses that an initialiser proposes for a problem and for its mirror images.
+
+    The axes of image and world are exchanged or reversed, both in the same way: the distribution of random problems
+    does not change.
+
+    Args:
+        init: the initialiser.
+        problem: :math:`B` problems.
+        count: number of views of each problem, 1 to 8; the first view is the problem itself.
+        order: whether the initialiser needs the pairs in the order of their pixels.
+
+    Returns:
+        The starts of the first view, with the poses from the other views.
+    """
+    if count == 1:
+        return init(problem)
+    batch = len(problem.weights)
+    starts = init(_views(problem, count, order))
+    _, *others = [x for pose in starts.poses for x in _undone(pose, count)]
+    # Weights, ok and noise of the first view, whose pairs have the order of the problem.
+    first: Starts = map_tensors(lambda x: x[:batch], starts._replace(others=None))
+    return first.with_others(*others)
+
+
+def _views(problem: Problem, count: int, order: bool) -> Problem:
+    """All problems in the first view, then in the second view, and so on; without covariances and terms."""
+    noise = None if problem.noise is None else problem.noise.sigmas
+    of_pairs = problem.weights, problem.usual, noise, problem.confidence
+    others = [values.mT for values in iter_tensors(of_pairs)]  # (N, B) each
+    x, y, z, u, v = (*problem.world_points.permute(2, 1, 0), *problem.img_points.permute(2, 1, 0))
+    seen = [torch.stack((*_exchanged(x, y, *view), z, *_exchanged(u, v, *view), *others)) for view in VIEWS[:count]]
+    if order:
+        there = (problem.usual_weights != 0).mT
+        keys = torch.cat([torch.where(there, view[3:5].detach(), torch.inf) for view in seen[1:]], -1)
+        at = ascending_order(keys)  # (B * (count - 1), N)
+        seen = [seen[0], torch.cat(seen[1:], -1).gather(1, at.mT.expand(5 + len(others), -1, -1))]
+    rows = torch.cat(seen, -1)
+    world_points, img_points = rows[:5].permute(2, 1, 0).split((3, 2), -1)
+    rest = iter(rows[5:].mT)
+    weights, usual, noise, confidence = map_tensors(lambda _: next(rest), of_pairs)
+    scales = problem.img_scale.repeat(count), problem.world_scale.repeat(count), usual
+    return Problem(world_points, img_points, weights, problem.focal, *scales, noise, confidence)
+
+
+def _undone(pose: Pose, count: int) -> list[Pose]:
+    """Poses of the problems themselves from the poses of their views, the first view first."""
+    poses = []
+    matrices, vectors = (x.movedim(0, -1).unflatten(-1, (count, -1)).unbind(-2) for x in pose)
+    for view, matrix, vector in zip(VIEWS, matrices, vectors, strict=False):  # (3, 3, B), (3, B)
+        for axis in (0, 1):
+            matrix = _axes_back(matrix, axis, view)
+        poses.append(Pose(matrix.movedim(-1, 0), _axes_back(vector, 0, view).movedim(-1, 0)))
+    return poses
+
+
+def _exchanged(x: Tensor, y: Tensor, swap: bool, reverse_x: bool, reverse_y: bool) -> tuple[Tensor, Tensor]:
+    """Two coordinates of a mirrored view."""
+    x, y = (y, x) if swap else (x, y)
+    return -x if reverse_x else x, -y if reverse_y else y
+
+
+def _axes_back(entries: Tensor, axis: int, view: tuple[bool, bool, bool]) -> Tensor:
+    """Undo a mirrored view along one axis of three coordinates."""
+    swap, reverse_x, reverse_y = view
+    x, y, z = entries.unbind(axis)
+    x, y = -x if reverse_x else x, -y if reverse_y else y
+    return torch.stack((y, x, z) if swap else (x, y, z), axis)
