@@ -5,7 +5,6 @@ and the principal point 0 (see :mod:`kornia_pnpnet.normalize`). A point is *in f
 ``MIN_DEPTH_RATIO`` of its distance, a test that does not depend on the unit of the world.
 """
 
-from kornia_pnpnet.geometry.points import align, span_a_plane
 from kornia_pnpnet.geometry.projection import (
     MIN_DEPTH_RATIO,
     NormalEquations,
