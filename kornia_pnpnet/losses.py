@@ -6,11 +6,12 @@ import math
 from typing import NamedTuple
 
 import torch
+from kornia.geometry.linalg import transform_points
 from torch import Tensor, nn
 
 from kornia_pnpnet.core.checks import check_numbers, check_positive, check_whole
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.geometry import transform
+
 from kornia_pnpnet.problem import Noise, Starts
 from kornia_pnpnet.result import PnPResult, Pose, Problems, check_poses
 
@@ -229,7 +230,7 @@ class SetLoss(nn.Module):
         for pose in (result.pose, result.init):
             check_poses(pose, problems.pose)
         centre = problems.world_points.mean(1)
-        distance = transform(problems.pose, centre[:, None])[:, 0].norm(dim=-1)
+        distance = transform_points(problems.pose.matrix, centre[:, None])[:, 0].norm(dim=-1)
 
         every = [_distances(pose, problems.pose, centre) for pose in guess.poses[: self.starts]]
         rotations, translations = (torch.stack(x, 1) for x in zip(*every, strict=True))  # (B, S) each

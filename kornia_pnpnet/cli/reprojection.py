@@ -6,9 +6,10 @@ from typing import NamedTuple
 
 import torch
 from kornia.geometry.conversions import convert_points_from_homogeneous
+from kornia.geometry.linalg import transform_points
 from torch import Tensor
 
-from kornia_pnpnet.geometry import transform
+
 from kornia_pnpnet.result import Pose
 
 __all__ = ["Reprojection", "rejection_limit", "reproject"]
@@ -42,7 +43,7 @@ def reproject(
 
     The pose has a batch of 1. Errors above ``limit_px`` are rejected, or above the :func:`rejection_limit`.
     """
-    cam_points = transform(pose, world_points[None])[0]
+    cam_points = transform_points(pose.matrix, world_points[None])[0]
     in_front = cam_points[:, 2:] > 0
     pixels = convert_points_from_homogeneous(torch.where(in_front, cam_points, 1.0) @ intrinsics.mT, eps=0.0)
     pixels = torch.where(in_front, pixels, torch.nan)

@@ -17,6 +17,7 @@ from torch import Tensor
 from kornia_pnpnet.core.performance import are_few, compiling
 
 __all__ = [
+    "align",
     "bound_gradient",
     "dot",
     "eigenvectors",
@@ -28,6 +29,7 @@ __all__ = [
     "solve_leading",
     "solve_positive",
     "solve_symmetric",
+    "span_a_plane",
     "substitute",
     "symmetric",
 ]
@@ -37,6 +39,8 @@ __all__ = [
 _SWEEPS = 2
 # Units in the last place of the diagonal. A pivot below this is rounding.
 _PIVOT = 10.0
+# Matrices. LAPACK decomposes up to this number in the time of the calls of the closed form (Xeon, one thread).
+_MOST_BY_LAPACK = 128
 
 
 def dot(a: Iterable[Tensor], b: Iterable[Tensor]) -> Tensor:
@@ -140,45 +144,68 @@ def _turn(a: Tensor, b: Tensor) -> Tensor:
     return torch.stack([product[j, i] - product[i, j] for i, j in ((1, 2), (2, 0), (0, 1))])
 
 
+def _rotation_by_svd(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """:func:`nearest_rotation` by LAPACK, without gradient."""
+    limits = torch.finfo(matrix.dtype)
+    flat = matrix.flatten(2).permute(2, 0, 1)
+    size = torch.linalg.vector_norm(flat, torch.inf, (1, 2), keepdim=True)  # (B, 1, 1)
+    sound = size.clamp(limits.tiny**0.5, limits.max) == size  # LAPACK raises for NaN
+    left, values, right = torch.linalg.svd(torch.where(sound, flat, 0.0))
+    rotation = torch.bmm(left, right)
+    proper = torch.linalg.det(rotation)[:, None, None]  # 1 or -1
+    rotation = torch.baddbmm(rotation, left[..., 2:] * (proper - 1.0), right[:, 2:])
+    first, second, third = values[..., None, None].unbind(1)
+    third = third * proper
+    unique = sound & (second + third > limits.eps**0.75 * (first + second * third / first))
+    rotation = torch.where(unique, rotation, torch.eye(3, dtype=matrix.dtype, device=matrix.device))
+    return rotation.permute(1, 2, 0).reshape(matrix.shape), unique.reshape(matrix.shape[2:])
+
+
+def _rotation_in_closed_form(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """:func:`nearest_rotation` entry by entry, without gradient."""
+    eps = torch.finfo(matrix.dtype).eps
+    size = matrix.abs().amax((0, 1))
+    nonzero = size > torch.finfo(matrix.dtype).tiny ** 0.5  # below, the gradient would overflow
+    scaled = torch.where(nonzero, matrix, 0.0) / torch.where(nonzero, size, 1.0)
+    # The largest singular value: the squares of all three are the roots of x³ - 3 mean x² + minors x - det².
+    cofactors = _cofactors(scaled)
+    determinant = (scaled[0] * cofactors[0]).sum(0)
+    mean = scaled.square().sum((0, 1)) / 3.0
+    minors = cofactors.square().sum((0, 1))
+    radius = (mean * mean - minors / 3.0).clamp(min=eps * eps).sqrt()
+    cosine = (mean * (mean * mean - 0.5 * minors) + 0.5 * determinant * determinant) / radius**3
+    largest = (mean + 2.0 * radius * (cosine.clamp(-1.0, 1.0).acos() / 3.0).cos()).sqrt()
+    # The stack makes a compiler compute these values once. Otherwise it repeats them for each of the nine entries.
+    largest, determinant = torch.stack((largest, determinant))
+    # With singular values s₁ ≥ s₂ ≥ |s₃|, the last with the sign of the determinant, the matrix plus its cofactors
+    # over s₁ has the same singular vectors and the values first = s₁ + s₂s₃/s₁ and, twice, second = s₂ + s₃, all
+    # positive. Of two distinct values the inverse square root is a polynomial of degree 1.
+    upright = scaled + cofactors / largest
+    first = largest + determinant / (largest * largest)
+    square = first * first
+    minors = _cofactors(upright).square().sum((0, 1))  # 2 first² second² + second⁴
+    second = (minors / (square + torch.addcmul(minors, square, square).sqrt())).sqrt()
+    unique = second > eps**0.75 * first  # Newton-Schulz below converges from here
+    second = torch.where(unique, second, 1.0)
+    constant = second.reciprocal() + second / (first * (first + second))
+    linear = -(first * second * (first + second)).reciprocal()
+    constant, linear = torch.stack((constant, linear))
+    eye = torch.eye(3, dtype=matrix.dtype, device=matrix.device).view(3, 3, *(1,) * (matrix.ndim - 2))
+    gram = small_product(upright.transpose(0, 1), upright)
+    rotation = small_product(upright, torch.addcmul(constant * eye, linear, gram))
+    for _ in range(2):  # Newton-Schulz removes the deviation from orthogonality that rounding left
+        gram = small_product(rotation.transpose(0, 1), rotation)
+        rotation = small_product(rotation, 1.5 * eye - 0.5 * gram)
+    return torch.where(unique, rotation, eye), unique
+
+
 class _NearestRotation(torch.autograd.Function):
     generate_vmap_rule = True
 
     @staticmethod
     def forward(matrix: Tensor) -> tuple[Tensor, Tensor]:
-        eps = torch.finfo(matrix.dtype).eps
-        size = matrix.abs().amax((0, 1))
-        nonzero = size > torch.finfo(matrix.dtype).tiny ** 0.5  # below, the gradient would overflow
-        scaled = torch.where(nonzero, matrix, 0.0) / torch.where(nonzero, size, 1.0)
-        # The largest singular value: the squares of all three are the roots of x³ - 3 mean x² + minors x - det².
-        cofactors = _cofactors(scaled)
-        determinant = (scaled[0] * cofactors[0]).sum(0)
-        mean = scaled.square().sum((0, 1)) / 3.0
-        minors = cofactors.square().sum((0, 1))
-        radius = (mean * mean - minors / 3.0).clamp(min=eps * eps).sqrt()
-        cosine = (mean * (mean * mean - 0.5 * minors) + 0.5 * determinant * determinant) / radius**3
-        largest = (mean + 2.0 * radius * (cosine.clamp(-1.0, 1.0).acos() / 3.0).cos()).sqrt()
-        # The stack makes a compiler compute these values once. Otherwise it repeats them for each of the nine entries.
-        largest, determinant = torch.stack((largest, determinant))
-        # With singular values s₁ ≥ s₂ ≥ |s₃|, the last with the sign of the determinant, the matrix plus its cofactors
-        # over s₁ has the same singular vectors and the values first = s₁ + s₂s₃/s₁ and, twice, second = s₂ + s₃, all
-        # positive. Of two distinct values the inverse square root is a polynomial of degree 1.
-        upright = scaled + cofactors / largest
-        first = largest + determinant / (largest * largest)
-        square = first * first
-        minors = _cofactors(upright).square().sum((0, 1))  # 2 first² second² + second⁴
-        second = (minors / (square + torch.addcmul(minors, square, square).sqrt())).sqrt()
-        unique = second > eps**0.75 * first  # Newton-Schulz below converges from here
-        second = torch.where(unique, second, 1.0)
-        constant = second.reciprocal() + second / (first * (first + second))
-        linear = -(first * second * (first + second)).reciprocal()
-        constant, linear = torch.stack((constant, linear))
-        eye = torch.eye(3, dtype=matrix.dtype, device=matrix.device).view(3, 3, *(1,) * (matrix.ndim - 2))
-        gram = small_product(upright.transpose(0, 1), upright)
-        rotation = small_product(upright, torch.addcmul(constant * eye, linear, gram))
-        for _ in range(2):  # Newton-Schulz removes the deviation from orthogonality that rounding left
-            gram = small_product(rotation.transpose(0, 1), rotation)
-            rotation = small_product(rotation, 1.5 * eye - 0.5 * gram)
-        return torch.where(unique, rotation, eye), unique
+        few = are_few(matrix) and matrix.numel() <= 9 * _MOST_BY_LAPACK
+        return _rotation_by_svd(matrix) if few else _rotation_in_closed_form(matrix)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor], output: tuple[Tensor, Tensor]) -> None:
@@ -247,6 +274,58 @@ def nearest_rotation(matrix: Tensor) -> tuple[Tensor, Tensor]:
     function = _NearestRotation if compiling() else _NearestRotationForward
     rotation, unique = function.apply(matrix)  # type: ignore[no-untyped-call]
     return rotation, unique
+
+
+def align(source: Tensor, target: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    r"""Find the rigid motion and the scale that move points onto other points, by weighted least squares.
+
+    Source: S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991.
+
+    Args:
+        source: points :math:`x`, shape :math:`(B, K, 3)`.
+        target: points :math:`y`, shape :math:`(B, K, 3)`.
+        weights: at least 0, shape :math:`(B, K)`.
+
+    Returns:
+        The rotation :math:`R`, shape :math:`(B, 3, 3)`, the translation :math:`t`, shape :math:`(B, 3)`, and the scale
+        :math:`s`, shape :math:`(B,)`. The best rigid motion is :math:`R x + t`, the best similarity
+        :math:`s R (x - \bar x) + \bar y`, where the bars are weighted means.
+
+    Example:
+        >>> points = torch.tensor([[[0.0, 0, 0], [2, 0, 0], [0, 2, 0], [0, 0, 2]]])
+        >>> rotation, translation, scale = align(points, 3.0 * points + 1.0, torch.ones(1, 4))
+        >>> translation, scale
+        (tensor([[2., 2., 2.]]), tensor([3.]))
+    """
+    total = weights.sum(-1, keepdim=True)
+    share = (weights / (total + (total == 0)))[..., None]
+    source_mean, target_mean = (share * source).sum(1), (share * target).sum(1)
+    centred = source - source_mean[:, None]
+    weighted = share * centred
+    covariance = torch.bmm((target - target_mean[:, None]).mT, weighted)  # (B, 3, 3)
+    rotation = nearest_rotation(covariance.permute(1, 2, 0))[0].permute(2, 0, 1).contiguous()
+    mean_square = (weighted * centred).sum((1, 2))
+    scale = (rotation * covariance).sum((1, 2)) / (mean_square + (mean_square == 0))
+    return rotation, target_mean - torch.bmm(rotation, source_mean[..., None])[..., 0], scale
+
+
+def span_a_plane(centred: Tensor, share: Tensor, size: Tensor) -> Tensor:
+    """Whether points span more than a line, so that there are at least three.
+
+    Args:
+        centred: the points minus their mean, 0 for padding, (3, N, B).
+        share: one over the number of points, (B,).
+        size: the largest coordinate before the points were centred, (B,). Where it is 0 or NaN the result is false.
+
+    Returns:
+        bool of shape (B,).
+    """
+    # The second largest variance is about the sum of the principal minors of the covariance, (trace² - sum of squares)
+    # / 2, over the trace. For points on a line only rounding remains.
+    eps = torch.finfo(centred.dtype).eps
+    covariance = (centred[:, None] * centred).sum(2) * (share / (size * size))  # (3, 3, B) in the unit of the size
+    trace = covariance.diagonal().sum(-1)
+    return ((1.0 - 16.0 * eps) * trace - 2.0 * (64.0 * eps) ** 2) * trace > covariance.square().sum((0, 1))
 
 
 def solve_leading(

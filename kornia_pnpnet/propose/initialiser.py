@@ -1,0 +1,51 @@
+"""The base of all initialisers, and what distinguishes them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import nn
+
+from kornia_pnpnet.core.configured import Configured
+from kornia_pnpnet.problem import Problem, Starts
+
+__all__ = ["Initialiser", "trait"]
+
+
+class Initialiser(Configured):
+    """A module that maps a :class:`~kornia_pnpnet.problem.Problem` to :class:`~kornia_pnpnet.problem.Starts`.
+
+    Any module with such a ``forward`` is an initialiser; a trait that it does not have is that of this class.
+
+    Attributes:
+        pairs_at_once: pairs per core whose temporaries stay in its caches. A solver splits larger batches where
+            gradients allow it. ``None``: the whole batch.
+        fixed_pairs: whether it takes a fixed number of pairs, ``config["n"]``.
+        takes_given: whether it lets a given pose compete itself: ``forward(problem, given)``.
+        takes_rigs: whether it solves rigs.
+        finds_focal: whether it estimates an unknown focal length.
+        estimates_noise: whether it returns several poses and the noise, so that a search may follow:
+            ``forward(problem, search_follows=True)``.
+        weighs_unusual: whether its weights say which of the pairs that are not of normal scale are inliers.
+    """
+
+    pairs_at_once: int | None = None
+    fixed_pairs: bool = False
+    takes_given: bool = False
+    takes_rigs: bool = False
+    finds_focal: bool = False
+    estimates_noise: bool = False
+    weighs_unusual: bool = False
+
+    def forward(self, problem: Problem) -> Starts:
+        """Propose poses.
+
+        Args:
+            problem: the problem in the solver's frame.
+        """
+        raise NotImplementedError
+
+
+def trait(init: nn.Module | None, name: str) -> Any:
+    """A trait of any initialiser, see :class:`Initialiser`."""
+    return getattr(init, name, getattr(Initialiser, name))
