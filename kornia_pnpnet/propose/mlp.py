@@ -9,8 +9,9 @@ from kornia.core.exceptions import ShapeError
 from torch import Tensor, nn
 
 from kornia_pnpnet.core.checks import check_devices, check_positive, check_whole
-from kornia_pnpnet.core.configured import Configured
-from kornia_pnpnet.types import Problem, Starts, Pose
+from kornia_pnpnet.problem import Problem, Starts
+from kornia_pnpnet.propose.initialiser import Initialiser
+from kornia_pnpnet.result import Pose
 
 __all__ = ["MLPInit", "rotation_about"]
 
@@ -42,15 +43,7 @@ def _run(layers: nn.Sequential, hidden: Tensor) -> Tensor:
 
 
 def rotation_about(axis: Tensor, angle: Tensor) -> Tensor:
-    r"""Rotations about unnormalised axes.
-
-    Args:
-        axis: axes :math:`s` as columns, shape :math:`(3, B)`.
-        angle: angles :math:`\theta` in radians, shape :math:`(B)`.
-
-    Returns:
-        :math:`\exp(\theta [s / \|s\|]_\times)`, shape :math:`(B, 3, 3)`.
-    """
+    """Rotations about axes (3, B) of any length other than 0 by angles (B,) in radians, (B, 3, 3)."""
     limits = torch.finfo(axis.dtype)
     # The floor under the root keeps the gradient finite where the network returns zeros.
     vector = axis * (angle * ((axis * axis).sum(0) + limits.eps).rsqrt())
@@ -66,7 +59,7 @@ def rotation_about(axis: Tensor, angle: Tensor) -> Tensor:
     return torch.stack((*first, *second, *third)).unflatten(0, (3, 3)).permute(2, 0, 1)
 
 
-class MLPInit(Configured):
+class MLPInit(Initialiser):
     r"""Stage 1 of PnP-Net: a small multilayer perceptron for exactly ``n`` ordered pairs.
 
     The 5n coordinates pass through shared ReLU layers of 20n, 5n and 3n units. A rotation branch and a translation
@@ -75,7 +68,7 @@ class MLPInit(Configured):
     numbers. All pairs have the weight 1.
 
     Source: Sheffer and Wiesel 2020, figure 2. The scales of the input are ours: they bring world and image coordinates
-    to the order of 1. The network computes in the wider of its own dtype and the dtype of the correspondences.
+    to the order of 1. The network computes in the wider of its own dtype and the dtype of the problem.
 
     Args:
         n: number of pairs.
@@ -86,14 +79,13 @@ class MLPInit(Configured):
         BaseError: when ``n`` is less than 3, or a scale is not a positive number.
 
     Example:
-        >>> corr = Problem(torch.randn(2, 9, 3), torch.randn(2, 9, 2), torch.ones(2, 9), torch.tensor(3400.0))
-        >>> guess = MLPInit(n=9)(corr)
-        >>> guess.pose.rotation.shape, guess.pose.translation.shape
+        >>> starts = MLPInit(n=9)(Problem.of(torch.randn(2, 9, 3), torch.randn(2, 9, 2), 3400.0))
+        >>> starts.pose.rotation.shape, starts.pose.translation.shape
         (torch.Size([2, 3, 3]), torch.Size([2, 3]))
     """
 
-    #: The pairs that are not near have a weight of 0.
-    weighs_far_pairs = True
+    fixed_pairs = True
+    weighs_unusual = True  # they have a weight of 0
 
     def __init__(self, n: int, *, world_scale: float = 1.0, img_scale: float = 1000.0) -> None:
         super().__init__(locals())
@@ -107,36 +99,35 @@ class MLPInit(Configured):
         self.rotation = nn.Sequential(*_relu_layers(branch), nn.Linear(2 * n, 4))
         self.translation = nn.Sequential(*_relu_layers(branch), nn.Linear(2 * n, 3))
 
-    def forward(self, corr: Problem) -> Starts:
-        r"""Starts the pose.
+    def forward(self, problem: Problem) -> Starts:
+        r"""Find a coarse pose.
 
         Args:
-            corr: normalised correspondences with :math:`N` = ``n``, ordered by their pixels. A pair without
-                weight or not near enters as zeros; the network was not trained on such pairs.
+            problem: ``n`` pairs, ordered by their pixels. Pairs that are not of normal scale enter as zeros; the
+                network was not trained on such pairs.
 
         Returns:
-            The coarse pose, and weights of 1, or 0 for pairs that are not near.
+            The coarse pose, and weights of 1, or 0 for pairs that are not of normal scale.
 
         Raises:
-            ShapeError: when :math:`N` is not ``n``.
-            DeviceError: when the correspondences and the network are on different devices.
+            ShapeError: when the number of pairs is not ``n``.
+            DeviceError: when the problem and the network are on different devices.
         """
-        count = corr.world_points.shape[1]
+        count = problem.world_points.shape[1]
         if count != self.n:
             raise ShapeError(
                 f"This network was built for n = {self.n} pairs, got N = {count}. Use a model for {count} pairs.",
-                actual_shape=tuple(corr.world_points.shape),
+                actual_shape=tuple(problem.world_points.shape),
                 expected_shape=["B", str(self.n), "3"],
             )
-        check_devices({"world_points": corr.world_points}, next(self.parameters()), "the network")
+        check_devices({"world_points": problem.world_points}, next(self.parameters()), "the network")
         # One column per problem: x, y, z, u, v of the first pair, then of the next, which is their order in memory.
-        world_points, img_points = corr.world_points / self.world_scale, corr.img_points / self.img_scale
-        if corr.usual is not None:
-            world_points, img_points = (x * corr.usual[..., None] for x in (world_points, img_points))
-        features = torch.cat((world_points.permute(1, 2, 0), img_points.permute(1, 2, 0)), 1).flatten(0, 1)  # (5n, B)
+        coordinates = problem.world_points / self.world_scale, problem.img_points / self.img_scale
+        usual = problem.usual[..., None]
+        features = torch.cat([(x * usual).permute(1, 2, 0) for x in coordinates], 1).flatten(0, 1)  # (5n, B)
         hidden = _run(self.shared, features)  # (3n, B)
         axis, angle = _run(self.rotation, hidden).split((3, 1))
         rotation = rotation_about(axis, angle[0])
         translation = _run(self.translation, hidden).mT
         pose = Pose(rotation.to(features.dtype), translation.to(features.dtype))
-        return Starts(pose, torch.ones_like(corr.weights) if corr.usual is None else corr.usual)
+        return Starts(pose, problem.usual)

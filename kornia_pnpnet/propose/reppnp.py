@@ -14,10 +14,12 @@ from kornia.core.check import KORNIA_CHECK
 from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_numbers, check_whole
-from kornia_pnpnet.core.configured import Configured
-from kornia_pnpnet.geometry import align, retract
-from kornia_pnpnet.propose.epnp.control_points import ControlPoints, control_points
-from kornia_pnpnet.types import Problem, Starts, Pose
+from kornia_pnpnet.core.linalg import align
+from kornia_pnpnet.problem import Problem, Starts
+from kornia_pnpnet.propose.control_points import ControlPoints, control_points
+from kornia_pnpnet.propose.initialiser import Initialiser
+from kornia_pnpnet.refine.residual import retract
+from kornia_pnpnet.result import Pose
 
 __all__ = ["REPPnP"]
 
@@ -37,7 +39,7 @@ _FINAL_DEPTH_PRIOR = 1e-5
 _LEVERAGE_RIDGE = 1e-6
 
 
-class REPPnP(Configured):
+class REPPnP(Initialiser):
     r"""Null space of the projection equations, algebraic outlier rejection, and the pose of the remaining pairs.
 
     At first all pairs are kept. Each iteration finds the null vector of the kept pairs, and then keeps the pairs whose
@@ -48,22 +50,17 @@ class REPPnP(Configured):
     Source: L. Ferraz, X. Binefa and F. Moreno-Noguer, "Very Fast Solution to the PnP Problem with Algebraic Outlier
     Rejection", CVPR 2014. Our changes are for success on the protocol's problems and for batches:
 
-    - The null vector has the least error among the vectors with the centroid at depth 1, instead of the vectors of
-      length 1. It solves a linear system instead of an eigenproblem, has the right sign, and does not depend on the
-      control points, the frame of the world or the unit.
-    - During outlier rejection, a small ridge keeps the depths of the control points close to the depth of the
-      centroid. The fit can then bend less to outliers, and a view too narrow to show depth is fitted by weak
-      perspective.
-    - Pairs are compared by their leave-one-out error, :math:`e^\top (1 \mp w H)^{-1} e` with the leverage :math:`H` of
-      the pair (for a rejected pair, the error when it is added). A single outlier among few pairs bends the fit to
-      itself, so that its plain error is small.
+    - The null vector has the least error among the vectors with the centroid at depth 1, instead of length 1: it solves
+      a linear system, has the right sign, and does not depend on the control points, the frame or the unit.
+    - During rejection a small ridge keeps the depths of the control points close to the centroid's. The fit then bends
+      less to outliers, and weak perspective fits a view that is too narrow to show depth.
+    - Pairs are compared by their leave-one-out error, because a single outlier among few pairs bends the fit to itself.
     - The quantile is the median instead of 25 %, and at least 7 pairs are kept: a quarter of 20 pairs does not
       determine a null vector.
     - The same loop then continues with rigid control points and one Gauss-Newton step of their algebraic error per
       iteration: with 6 unknowns instead of 11, fewer pairs suffice to find the outliers.
-    - The pose minimises the algebraic error over rigid motions by Gauss-Newton, which weighs every direction by its
-      error. The paper alternates between the span of four null vectors, in which no direction has a cost, and the rigid
-      control points.
+    - The pose minimises the algebraic error over rigid motions by Gauss-Newton. The paper alternates between the span
+      of four null vectors, in which no direction has a cost, and the rigid control points.
     - Both loops have a fixed length; the paper's loop stops when the quantile no longer falls.
 
     Gradients: the selection is piecewise constant, and the last Gauss-Newton steps start from a detached pose. Close to
@@ -84,9 +81,9 @@ class REPPnP(Configured):
         >>> from kornia_pnpnet import Normalize
         >>> from kornia_pnpnet.data import OutlierMix, SyntheticProblems
         >>> problems = SyntheticProblems(n=20, batch_size=2, seed=0, outliers=OutlierMix(count=5)).batch(0)
-        >>> corr, _ = Normalize(order=False)(*problems[:3])
-        >>> guess = REPPnP()(corr)
-        >>> guess.ok, (guess.weights > 0).eq(problems.inliers).all()
+        >>> problem, _ = Normalize(order=False)(*problems[:3])
+        >>> starts = REPPnP()(problem)
+        >>> starts.ok, (starts.weights > 0).eq(problems.inliers).all()
         (tensor([True, True]), tensor(True))
     """
 
@@ -113,21 +110,21 @@ class REPPnP(Configured):
         self.rigid_iterations = rigid_iterations
         self.refine_iterations = refine_iterations
 
-    def forward(self, corr: Problem) -> Starts:
-        r"""Starts the pose and the inliers.
+    def forward(self, problem: Problem) -> Starts:
+        r"""Find the pose and the inliers.
 
         Args:
-            corr: normalised correspondences, with any frame and unit of the world.
+            problem: the problem in the solver's frame.
 
         Returns:
             The pose; as weights 1 for the kept pairs and 0 for the outliers; and ``ok``, false for fewer than 4 pairs,
             for points on a line, for equations that do not determine a pose, and for a pose with the centroid of the
             points behind the camera.
         """
-        corr = corr._replace(weights=corr.usual_weights)
+        problem = problem._replace(weights=problem.usual_weights)
         with torch.no_grad():
-            control = control_points(corr)
-        pairs, radius = _own_frame(corr, control)
+            control = control_points(problem)
+        pairs, radius = _own_frame(problem, control)
         with torch.no_grad():
             kept, pose = self._select(pairs)
         ok = control.ok & (pairs.there.sum(-1) >= _MIN_PAIRS)
@@ -138,8 +135,8 @@ class REPPnP(Configured):
         ok = ok & (pose.translation[:, 2] > 0)
         offset = (pose.rotation @ control.points[:, 0, :, None])[..., 0]
         pose = Pose(pose.rotation, pose.translation * radius[:, None] - offset)
-        kept = kept if corr.usual is None else kept | (corr.usual == 0)  # the solver decides about them
-        return Starts(pose, kept.to(corr.weights.dtype), ok)
+        kept = kept | (problem.usual == 0)  # the solver decides about pairs that are not of normal scale
+        return Starts(pose, kept.to(problem.weights.dtype), ok)
 
     def _select(self, pairs: _Pairs) -> tuple[Tensor, Pose]:
         """The kept pairs, bool (B, N), and a pose that fits these pairs, in the frame of :class:`_Pairs`."""
@@ -189,18 +186,18 @@ class _Null(NamedTuple):
     inverse_depths: Tensor  # inverse normal matrix of the depths of the control vectors, (B, 3, 3)
 
 
-def _own_frame(corr: Problem, control: ControlPoints) -> tuple[_Pairs, Tensor]:
+def _own_frame(problem: Problem, control: ControlPoints) -> tuple[_Pairs, Tensor]:
     """The pairs in the frame of :class:`_Pairs`, and the root mean square radius (B,) before."""
     mean_square = control.points[:, 1:].square().sum((1, 2))
     radius = torch.where(control.ok, mean_square, 1.0).sqrt()
-    world = (corr.world_points.mT - control.points[:, 0, :, None]) / radius[:, None, None]
-    u, v = (corr.img_points / corr.focal).unbind(-1)
+    world = (problem.world_points.mT - control.points[:, 0, :, None]) / radius[:, None, None]
+    u, v = (problem.img_points / problem.focal).unbind(-1)
     # No gradient through the frame and the sum of weights: the pose depends on neither.
-    total = corr.weights.detach().sum(-1, keepdim=True)
-    weights = corr.weights / torch.where(total > 0, total, 1.0)
+    total = problem.weights.detach().sum(-1, keepdim=True)
+    weights = problem.weights / torch.where(total > 0, total, 1.0)
     mean_u, mean_v = ((control.weights * x).sum(-1, keepdim=True) for x in (u, v))
     coordinates = control.coordinates.mT.contiguous()
-    return _Pairs(coordinates, world, u, v, mean_u, mean_v, weights, corr.weights > 0), radius
+    return _Pairs(coordinates, world, u, v, mean_u, mean_v, weights, problem.weights > 0), radius
 
 
 def _features(pairs: _Pairs) -> Tensor:
@@ -257,9 +254,9 @@ def _aligned(pairs: _Pairs, null: _Null, kept: Tensor) -> Pose:
     x, y, z = null.control.unbind(-1)
     control = torch.stack((x + pairs.mean_u * z, y + pairs.mean_v * z, z), -1)  # (B, 4, 3)
     cam_points = pairs.coordinates.mT @ control
-    pose, scale = align(pairs.world.mT, cam_points, torch.where(kept, pairs.weights, 0.0))
+    rotation, _, scale = align(pairs.world.mT, cam_points, torch.where(kept, pairs.weights, 0.0))
     large = scale > torch.finfo(scale.dtype).eps ** 0.5
-    return Pose(pose.rotation, control[:, 0] / torch.where(large, scale, 1.0)[:, None])
+    return Pose(rotation, control[:, 0] / torch.where(large, scale, 1.0)[:, None])
 
 
 def _linearize(pairs: _Pairs, pose: Pose) -> Tensor:
@@ -291,7 +288,7 @@ def _normal_matrix(rows: Tensor, weights: Tensor, kept: Tensor) -> Tensor:
 
 
 def _step(pose: Pose, normal: Tensor) -> Pose:
-    """Take one Gauss-Newton step."""
+    """Take a Gauss-Newton step."""
     return retract(pose, -(_inverse(normal[..., :6]) @ normal[..., 6:])[..., 0])
 
 

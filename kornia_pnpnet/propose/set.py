@@ -294,9 +294,7 @@ class SetInit(Configured):
         return {0: near, **spread, **ring}
 
     @torch.no_grad()
-    def _sampled(
-        self, corr: Problem, right: Tensor, noise: Noise, fallback: Pose, search_follows: bool
-    ) -> Pose:
+    def _sampled(self, corr: Problem, right: Tensor, noise: Noise, fallback: Pose, search_follows: bool) -> Pose:
         """The best pose of the minimal samples by the score of the likeliest pairs; problems last."""
         batch, count = right.shape
         there = corr.usual_weights > 0

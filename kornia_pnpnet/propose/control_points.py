@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_pnpnet.types import Problem
+from kornia_pnpnet.problem import Problem
 
 __all__ = ["ControlPoints", "control_points"]
 
@@ -25,7 +25,7 @@ _PLANAR_RATIO = 1e-3
 class ControlPoints(NamedTuple):
     r"""Control points and the coordinates of the world points.
 
-    In memory the problems are the last dimension, see :func:`control_points`.
+    In memory the problems are the last dimension: elementwise operations are then several times faster.
 
     Attributes:
         points: the centroid and three vectors from the centroid, shape :math:`(B, 4, 3)`. The vectors are a square
@@ -44,33 +44,26 @@ class ControlPoints(NamedTuple):
     ok: Tensor
 
 
-def control_points(corr: Problem) -> ControlPoints:
+def control_points(problem: Problem) -> ControlPoints:
     r"""Choose the control points by weighted Gram-Schmidt on the coordinates of the world points.
 
     The axis along which the points spread most comes first and is projected out of the other axes, and so on. The
     principal directions of the paper differ only by an orthogonal transform of :math:`c_1, c_2, c_3`; they cost an
     eigendecomposition and have no gradient where two extents are equal.
 
-    Results are views of tensors with the problems in the last dimension, on which elementwise operations are several
-    times faster.
-
     Args:
-        corr: normalised correspondences. Pairs with the weight 0 are ignored.
-
-    Returns:
-        The :class:`ControlPoints`.
+        problem: the problem. Pairs with the weight 0 are ignored.
 
     Example:
         >>> world = torch.tensor([[[4.0, 0, 0], [-4, 0, 0], [0, 2, 0], [0, -2, 0]]])
-        >>> corr = Problem(world, torch.zeros(1, 4, 2), torch.ones(1, 4), torch.tensor(1.0))
-        >>> control = control_points(corr)
+        >>> control = control_points(Problem.of(world, torch.zeros(1, 4, 2)))
         >>> control.planar, torch.allclose(control.coordinates @ control.points, world)
         (tensor([True]), True)
     """
-    weights = corr.weights.mT.contiguous()  # (N, B)
+    weights = problem.weights.mT.contiguous()  # (N, B)
     total = weights.sum(0)
     weights = weights / torch.where(total > 0, total, 1.0)
-    world = corr.world_points.permute(2, 1, 0).contiguous()  # (3, N, B)
+    world = problem.world_points.permute(2, 1, 0).contiguous()  # (3, N, B)
     centroid = (world * weights).sum(1)  # (3, B)
     rest = world - centroid[:, None]
     # An axis below its limit is rounding. The first limit is absolute, the others are relative to the previous extent.
