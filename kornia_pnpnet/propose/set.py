@@ -10,15 +10,15 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from kornia_pnpnet.core.checks import check_devices, check_whole
-from kornia_pnpnet.core.configured import Configured
-from kornia_pnpnet.core.linalg import small_product
+from kornia_pnpnet.core.linalg import align
 from kornia_pnpnet.core.performance import compiling, present_first, problems_last, sees_values, take_pairs
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.geometry import align, project
-from kornia_pnpnet.propose import p3p
+from kornia_pnpnet.problem import Noise, Problem, Starts, State
+from kornia_pnpnet.propose.initialiser import Initialiser
+from kornia_pnpnet.propose.p3p import p3p
 from kornia_pnpnet.propose.view import LEAST_NOISE, LOG_NOISE, View, repeats
-from kornia_pnpnet.refine.prior import votes
-from kornia_pnpnet.types import Problem, Starts, Noise, Pose
+from kornia_pnpnet.refine.residual import MIN_DEPTH_RATIO, project
+from kornia_pnpnet.result import Pose
 
 __all__ = ["SetInit"]
 
@@ -43,7 +43,7 @@ _SPREADS = {18: 3, 24: 4, 30: 5}
 _RING = {36: [(a, b, c) for i in range(25) for a, b, c in [sorted((i, (i + 1) % 25, (i + 6) % 25))]]}
 #: Number of top-ranked pairs that score each hypothesis.
 MOST_JUDGES = 32
-# Slots for poses of minimal samples. Of more, those that hold no pose, which most do, are not scored on a CPU.
+# Slots for poses of minimal samples. With more slots than this, empty slots are removed before scoring (CPU only).
 _MANY_SLOTS = 64
 # Variances. Squared residuals of this size halve the score of a pair.
 _JUDGED = 50.0
@@ -51,21 +51,18 @@ _JUDGED = 50.0
 _NEAREST = 0.5
 # Score of a pair whose likelihood is 0, relative to a pair whose likelihood is 1.
 _LEAST_VOTE = 0.5
-# Pairs. The network sees at most this many where a search follows, which sees all of them. On real matches (the file
+# Pairs. Before a search the network sees at most 48 pairs; the search uses all pairs. On real matches (the file
 # `raw/by_image.npz` that docs/results describe) and random ones of up to 1000 pairs, 32 to 96 succeed as often as all.
 _ENOUGH = 48
 # Fractional parts of its multiples are spread evenly over the unit interval.
 _GOLDEN = 0.6180339887
 
 
-def _taken(tree: _T, index: Tensor | None) -> _T:
-    """Some pairs, at the positions (B, K), of tensors (B, N, ...) with N > K; other tensors as they are."""
-    if index is None:
-        return tree
-    most = index.shape[1]
+def _taken(tree: _T, index: Tensor) -> _T:
+    """Some pairs, at the positions (B, K), of all tensors (B, N, ...) of pairs; other tensors as they are."""
 
     def take(x: Tensor) -> Tensor:
-        if x.ndim < 2 or x.shape[1] <= most:
+        if x.ndim < 2 or x.shape[1] <= index.shape[1]:
             return x
         return x.gather(1, index if x.ndim == 2 else index[..., None].expand(-1, -1, x.shape[2]))
 
@@ -76,8 +73,8 @@ def _taken(tree: _T, index: Tensor | None) -> _T:
 def _some_of(present: Tensor, count: int) -> Tensor:
     """Positions (B, count) of pairs that are present, evenly spread over these, or of all of them where they are fewer.
 
-    Multiples of the golden ratio shift the positions, so that no pattern in the order of the pairs is met again: by so
-    much that no two positions are the same.
+    Multiples of the golden ratio shift the positions, so that a pattern in the order of the pairs is not repeated; the
+    shifts are small enough that no position occurs twice.
     """
     steps = torch.arange(count, dtype=torch.float64, device=present.device)
     total = present.sum(1, keepdim=True).clamp(min=count)
@@ -87,13 +84,33 @@ def _some_of(present: Tensor, count: int) -> Tensor:
 
 
 @torch.no_grad()
-def _agreement(corr: Problem, noise: Noise, pose: Pose) -> Tensor:
+def _agreement(problem: Problem, noise: Noise, pose: Pose) -> Tensor:
     """How well each pair agrees with a pose, in [0, 1], (B, N)."""
-    projection = project(pose, problems_last(corr))
-    depth = pose.translation[:, 2:].clamp(min=_NEAREST)  # (B, 1), as in the score of a sample
-    variance = noise.img.square() + (corr.focal * noise.world / depth).square()
+    projection = project(State.of(pose), problems_last(problem))
+    variance = _variance(noise.img, noise.world, problem.focal, pose.translation[:, 2:])
     agreement = 1.0 / (1.0 + projection.sq_residual / (_JUDGED * variance))
     return torch.where(projection.in_front, agreement, 0.0).contiguous()
+
+
+def _variance(img: Tensor, world: Tensor, focal: Tensor, depth: Tensor) -> Tensor:
+    """Variance of pixels whose points are all at the depth of the centre of the world."""
+    return img.square() + (focal * world / depth.clamp(min=_NEAREST)).square()
+
+
+def _support(rotation: Tensor, translation: Tensor, judges: Tensor) -> Tensor:
+    """Scores (H, B) of poses (3, 3, H, B) and (3, H, B) by pairs (7, K, B): points, pixels, votes, 1 / variances.
+
+    Pixels and variances are over the focal length and its square.
+    """
+    a, b, c, u, v, vote, precision = judges.unbind()  # (K, B) each
+    points = torch.addcmul(translation[:, :, None], rotation[:, 0, :, None], a)  # (3, H, K, B)
+    x, y, z = points.addcmul_(rotation[:, 1, :, None], b).addcmul_(rotation[:, 2, :, None], c).unbind()
+    across = torch.addcmul(x * x, y, y)
+    front = (z * z.abs()).mul_(1.0 - MIN_DEPTH_RATIO**2) > MIN_DEPTH_RATIO**2 * across
+    inverse = z.reciprocal()
+    x, y = torch.addcmul(-u, x, inverse), torch.addcmul(-v, y, inverse)
+    score = torch.addcmul(x * x, y, y).mul_(precision).add_(1.0).reciprocal_().mul_(vote)
+    return torch.where(front, score, 0.0).sum(1)
 
 
 class _Block(nn.Module):
@@ -139,7 +156,7 @@ def _by_channel(x: Tensor, weight: Tensor) -> Tensor:
     return (weight @ x.flatten(0, 1).mT).unflatten(1, x.shape[:2])
 
 
-class SetInit(Configured):
+class SetInit(Initialiser):
     r"""A small network over the set of pairs: several coarse poses, a weight for each pair, and the noise.
 
     Each pair passes residual layers that see all pairs through pooled attention: the cost is linear in the number of
@@ -176,16 +193,15 @@ class SetInit(Configured):
         BaseError: for numbers out of range, or when ``heads`` does not divide ``width``.
 
     Example:
-        >>> corr = Problem(torch.randn(2, 7, 3), torch.randn(2, 7, 2), torch.ones(2, 7), torch.tensor(3400.0))
-        >>> guess = SetInit(starts=3)(corr)
-        >>> guess.pose.rotation.shape, guess.others.translation.shape, guess.weights.shape
+        >>> problem = Problem.of(torch.randn(2, 7, 3), torch.randn(2, 7, 2), 3400.0)
+        >>> starts = SetInit(starts=3)(problem)
+        >>> starts.pose.rotation.shape, starts.others.translation.shape, starts.weights.shape
         (torch.Size([2, 3, 3]), torch.Size([2, 3, 3]), torch.Size([2, 7]))
     """
 
-    #: Pairs per core whose temporaries stay in its caches. A solver splits larger batches where gradients allow it.
     pairs_at_once = 24_000
-    #: The weights say which of the pairs that are not near are inliers.
-    weighs_far_pairs = True
+    estimates_noise = True
+    weighs_unusual = True
 
     def __init__(
         self,
@@ -221,66 +237,63 @@ class SetInit(Configured):
                 layer.bias.zero_()
             self.pair.bias[0] = 2.0
 
-    def forward(self, corr: Problem, *, search_follows: bool = False) -> Starts:
-        """Starts poses, weights and noise.
+    def forward(self, problem: Problem, *, search_follows: bool = False) -> Starts:
+        """Find poses, weights and noise.
 
         Args:
-            corr: normalised correspondences of a centred and scaled world, of any :math:`N`, in any order.
-            search_follows: look at 48 pairs at most, evenly spread over all, and draw fewer samples: what they miss is
-                searched for among all pairs. The weights of the other pairs say how well they agree with the best
-                sample.
+            problem: pairs in any order, of a centred and scaled world.
+            search_follows: look at 48 pairs at most, evenly spread over all, and draw fewer samples, because a search
+                among all pairs follows. The weights of the other pairs say how well they agree with the best sample.
 
         Returns:
             The first hypothesis as the pose and the other hypotheses as others, the best sample last; probabilities of
             being an inlier as weights; the noise of each pair.
 
         Raises:
-            DeviceError: when the correspondences and the network are on different devices.
+            DeviceError: when the problem and the network are on different devices.
         """
-        check_devices({"world_points": corr.world_points}, self.pair.bias, "the network")
-        given, index = corr, None
-        counts = repeats(corr) if self.repeats else None
-        if search_follows and corr.weights.shape[1] > _ENOUGH:
-            index = _some_of(corr.usual_weights > 0, _ENOUGH)
-            corr, counts = _taken((corr, counts), index)
-        view = View(corr, self.confidence, counts)
-        dtype = corr.world_points.dtype
-        pair, problem = (x.to(dtype) for x in self._run(view.features, view.there))
+        check_devices({"world_points": problem.world_points}, self.pair.bias, "the network")
+        given, index = problem, None
+        same = repeats(problem) if self.repeats else None
+        if search_follows and problem.weights.shape[1] > _ENOUGH:
+            index = _some_of(problem.usual_weights > 0, _ENOUGH)
+            problem, same = _taken((problem, same), index)
+        view = View(problem, self.confidence, same)
+        dtype = problem.world_points.dtype
+        of_pairs, of_problem = (x.to(dtype) for x in self._run(view.features, view.there))
         starts = self.starts
-        right = torch.sigmoid(pair[0])
-        counts, along = pair[1:].unflatten(0, (2, starts)).unbind(0)  # (S, B, N) each
-        away, noise = problem.split((starts, 2), -1)
+        right = torch.sigmoid(of_pairs[0])
+        counts, along = of_pairs[1:].split(starts)  # (S, B, N) each
+        away, noise = of_problem.split((starts, 2), -1)
         # A point's distance is the distance of the world's centre plus an offset, so that far worlds keep their relief.
-        distance = (away.clamp(-6.0, 6.0) - view.log_spread[:, None]).exp().mT[..., None]  # (S, B, 1)
-        relief = (view.points[..., 2] + 3.0 * along) / distance
+        distance = (away.clamp(-6.0, 6.0) - view.log_spread).exp().mT[..., None]  # (S, B, 1)
+        relief = torch.add(view.points[..., 2], along, alpha=3.0) / distance
         ranges = distance * relief.clamp(-3.0, 3.0).exp()
-        counts = (right * torch.exp(3.0 * torch.tanh(counts)) + 1e-6) * view.there
+        counts = torch.addcmul(view.there * 1e-6, right * view.there, (3.0 * counts.tanh()).exp())
         source = view.points.expand(starts, -1, -1, -1).flatten(0, 1)
-        pose, _ = align(source, (ranges[..., None] * view.rays).flatten(0, 1), counts.flatten(0, 1))
-        # Problems last, after the hypotheses: (3, 3, S, B) and (3, S, B).
-        rotation, translation = (x.movedim(0, -1).unflatten(-1, (starts, right.shape[0])) for x in pose)
-        back = view.camera.permute(2, 1, 0)[:, :, None]
-        rotation = small_product(small_product(back, rotation), view.world.permute(1, 2, 0)[:, :, None])
-        translation = small_product(back, translation[:, None])[:, 0]
+        rotation, translation, _ = align(source, (ranges[..., None] * view.rays).flatten(0, 1), counts.flatten(0, 1))
+        back = view.camera.mT.repeat(starts, 1, 1)  # from the view's frames to the problem's
+        rotation = torch.bmm(torch.bmm(back, rotation), view.world.repeat(starts, 1, 1)).unflatten(0, (starts, -1))
+        translation = torch.bmm(back, translation[..., None]).view(starts, -1, 3)
         noises = self._noise(given, view.spread, noise)
         if self.samples:
-            fallback = Pose(rotation[:, :, 0], translation[:, 0])
-            sampled = self._sampled(corr, right, _taken(noises, index), fallback, search_follows)
-            rotation, translation = (
-                torch.cat((x, y[..., None, :]), -2) for x, y in zip((rotation, translation), sampled, strict=True)
-            )
-        every = Pose(rotation.permute(3, 2, 0, 1), translation.permute(2, 1, 0))  # (B, S, 3, 3) and (B, S, 3)
-        others = Pose(*(x[:, 1:] for x in every)) if every.rotation.shape[1] > 1 else None
+            fallback = Pose(rotation[0], translation[0])
+            seen = noises if index is None else _taken(noises, index)
+            sampled = self._sampled(problem, right, seen, fallback, search_follows)
+            rotation, translation = torch.cat((rotation, sampled[0][None])), torch.cat((translation, sampled[1][None]))
         if index is not None:
-            right = _agreement(given, noises, Pose(*(x[:, -1] for x in every))).scatter(1, index, right)
-        return Starts(Pose(*(x[:, 0] for x in every)), right, others=others, noise=noises)
+            best = Pose(rotation[-1], translation[-1])
+            right = _agreement(given, noises, best).scatter(1, index, right)
+        every = Pose(rotation.transpose(0, 1), translation.transpose(0, 1))  # (B, S, 3, 3) and (B, S, 3)
+        others = Pose(every.rotation[:, 1:], every.translation[:, 1:]) if len(rotation) > 1 else None
+        return Starts(Pose(rotation[0], translation[0]), right, others=others, noise=noises)
 
     def triples(self, count: int, *, search_follows: bool = False) -> dict[int, list[tuple[int, int, int]]]:
         """Minimal samples of a problem.
 
         Args:
             count: number of pairs.
-            search_follows: only those of the likeliest pairs. A search finds what the others would.
+            search_follows: only samples of the likeliest pairs, because a search draws the others.
 
         Returns:
             Groups of samples, as ranks of pairs by likelihood, by the least number of pairs of a problem that uses the
@@ -294,61 +307,58 @@ class SetInit(Configured):
         return {0: near, **spread, **ring}
 
     @torch.no_grad()
-    def _sampled(self, corr: Problem, right: Tensor, noise: Noise, fallback: Pose, search_follows: bool) -> Pose:
-        """The best pose of the minimal samples by the score of the likeliest pairs; problems last."""
+    def _sampled(
+        self, problem: Problem, right: Tensor, noise: Noise, fallback: Pose, search_follows: bool
+    ) -> tuple[Tensor, Tensor]:
+        """Rotations and translations of the best minimal samples by the score of the likeliest pairs."""
         batch, count = right.shape
-        there = corr.usual_weights > 0
+        there = problem.usual_weights > 0
         chances = torch.where(there, right, 0.0)
         # An unlikely pair that agrees may be an inlier after all; padding does not score.
-        vote = torch.where(there, _LEAST_VOTE + (1.0 - _LEAST_VOTE) * right, 0.0)
-        img, world = (x.expand(batch, count)[..., None] for x in (noise.img, noise.world))
-        of_pairs = torch.cat((corr.world_points, corr.img_points, vote[..., None], img, world), -1)  # (B, N, 8)
+        vote = torch.add(_LEAST_VOTE * there, chances, alpha=1.0 - _LEAST_VOTE)
+        # The variance is at the depth of the network's pose: by each pose's own depths, a pose close
+        # to the points would explain most pixels.
+        variance = _variance(noise.img, noise.world, problem.focal, fallback.translation[:, 2:])
+        rest = torch.stack((vote, problem.focal.square() / (_JUDGED * variance)), -1)
+        of_pairs = torch.cat((problem.world_points, problem.img_points / problem.focal, rest), -1)  # (B, N, 7)
         if not isinstance(count, int):  # exported for any number of pairs: pad to the number of judges
-            more = of_pairs[:, :1] * torch.tensor((1, 1, 1, 1, 1, 0, 1, 1), dtype=vote.dtype, device=vote.device)
+            more = of_pairs[:, :1] * torch.tensor((1, 1, 1, 1, 1, 0, 1), dtype=vote.dtype, device=vote.device)
             of_pairs = torch.cat((of_pairs, more.expand(-1, MOST_JUDGES, -1)), 1)
             chances, count = functional.pad(chances, (0, MOST_JUDGES)), count + MOST_JUDGES
         likely = chances.topk(min(MOST_JUDGES, count)).indices
-        pairs = take_pairs(of_pairs, likely)  # (8, K, B)
+        pairs = take_pairs(of_pairs, likely)  # (7, K, B)
         samples = self.triples(count, search_follows=search_follows)
         drawn = [sample for group in samples.values() for sample in group]
-        # (6, 3, S B), stacked, not indexed, so that a compiler copies whole rows.
-        three = torch.stack([pairs[:6, k] for column in zip(*drawn, strict=True) for k in column], 1)
-        three = three.unflatten(1, (3, len(drawn))).flatten(2)
-        pose, valid = p3p(three[:3].permute(2, 1, 0), three[3:5].permute(2, 1, 0) / corr.focal)
+        if compiling():  # stacked, so that a compiler copies whole rows
+            three = torch.stack([pairs[:6, k] for column in zip(*drawn, strict=True) for k in column], 1)
+        else:
+            three = pairs[:6].index_select(1, torch.tensor(drawn, device=pairs.device).mT.flatten())
+        three = three.unflatten(1, (3, len(drawn))).flatten(2)  # (6, 3, S B)
+        pose, valid = p3p(three[:3].permute(2, 1, 0), three[3:5].permute(2, 1, 0))[:2]
         # Components first, then the four solutions and the samples, problems last: the layout of p3p's results.
         each = len(drawn), batch
         rotation, translation = (x.movedim((0, 1), (-1, -2)).unflatten(-1, each).flatten(-3, -2) for x in pose)
+        rotation = rotation.flatten(0, 1)  # (9, H, B)
         valid = (valid.mT & (three[5] > 0).all(0)).unflatten(-1, each)  # (4, S, B)
         if len(samples) > 1:  # by the number of pairs without padding, so that padding changes nothing
             enough = [(there.sum(1) >= least).expand(len(group), -1) for least, group in samples.items()]
             valid = valid & torch.cat(enough)
         valid = valid.flatten(0, 1)  # (H, B)
-        rotation = rotation.flatten(0, 1)  # (9, H, B)
         if batch and len(valid) > _MANY_SLOTS and valid.device.type == "cpu" and sees_values(valid):
             slots = present_first(valid.mT)[:, : max(int(valid.sum(0).max()), 1)].mT
             rotation, translation = (x.gather(1, slots.expand(len(x), -1, -1)) for x in (rotation, translation))
             valid = valid.gather(0, slots)
-        # `project` sees hypotheses as the batch and problems as points, so that problems stay last: (H, K, B, 1).
         matrices = rotation.unflatten(0, (3, 3))
-        every = Pose(matrices.permute(2, 0, 1, 3)[:, :, :, None], translation.permute(1, 0, 2)[:, :, None])
-        world, img, vote, *sigmas = (x.permute(1, 2, 0)[..., None, :] for x in pairs.split((3, 2, 1, 1, 1)))
-        judges = Problem(world, img, vote[..., 0], corr.focal)
-        projection = project(every, judges)
-        # The variance at the depth of the network's pose: by each pose's own depths, a pose close to the points would
-        # explain most pixels.
-        img, world = (x[..., 0] for x in sigmas)
-        depth = fallback.translation[2, :, None].clamp(min=_NEAREST)  # (B, 1)
-        variance = img.square() + (corr.focal * world / depth).square()
-        support = judges.weights / (1.0 + projection.sq_residual / (_JUDGED * variance))
-        support = torch.where(projection.in_front, support, 0.0).sum(1)[..., 0]  # (H, B)
-        if corr.prior is not None:
-            support = support + votes(corr.prior, Pose(matrices.permute(2, 3, 0, 1), translation.permute(1, 2, 0)))
-        best = torch.where(valid, support, -1.0).max(0)
-        index = best.indices
-        rotation = rotation.gather(1, index.expand(9, 1, -1)).view(3, 3, batch)
-        translation = translation.gather(1, index.expand(3, 1, -1))[:, 0]
-        found = best.values > 0.0
-        return Pose(*(torch.where(found, x, y) for x, y in zip((rotation, translation), fallback, strict=True)))
+        support = _support(matrices, translation, pairs)
+        valid = valid & (support > 0)
+        if problem.prior is not None:
+            poses = Pose(matrices.permute(2, 3, 0, 1), translation.permute(1, 2, 0))  # (H, B, ...)
+            support = support - problem.prior.disagreement(poses)
+        best = torch.where(valid, support, -torch.inf).max(0)
+        every = torch.cat((rotation, translation)).gather(1, best.indices.expand(12, 1, -1))[:, 0].mT  # (B, 12)
+        found = (best.values > -torch.inf)[:, None]
+        every = torch.where(found, every, torch.cat((fallback.rotation.flatten(1), fallback.translation), 1))
+        return every[:, :9].unflatten(1, (3, 3)), every[:, 9:]
 
     def _run(self, features: Tensor, there: Tensor) -> tuple[Tensor, Tensor]:
         """The network: outputs for each pair, (1 + 2 S, B, N), and for each problem, (B, S + 2)."""
@@ -361,14 +371,11 @@ class SetInit(Configured):
         share = _softmax(pair[:1] + absent)[0]
         return pair, self.problem(torch.bmm(share[:, None], x)[:, 0])
 
-    def _noise(self, corr: Problem, spread: Tensor, estimate: Tensor) -> Noise:
-        """The known noise, and the network's estimate where unknown."""
-        units = (corr.focal * spread)[:, None], torch.ones_like(spread)[:, None]
-        told = (None, None) if corr.noise is None else (corr.noise.img, corr.noise.world)
-        pairs = []
-        for i, (sigma, unit) in enumerate(zip(told, units, strict=True)):
-            guessed = (LOG_NOISE + 3.0 * torch.tanh(estimate[:, i : i + 1])).exp() * unit
-            known = guessed if sigma is None else torch.where(sigma.isfinite(), sigma, guessed)
-            pairs.append(known.maximum(LEAST_NOISE * unit).expand_as(corr.weights))
-        img, world = pairs
-        return Noise(img, world)
+    def _noise(self, problem: Problem, spread: Tensor, estimate: Tensor) -> Noise:
+        """The known noise, and the network's estimate where it is unknown."""
+        unit = torch.cat((problem.focal * spread, torch.ones_like(spread)), -1)  # (B, 2)
+        guessed = ((LOG_NOISE + 3.0 * estimate.tanh()).exp() * unit)[:, None].expand(*problem.weights.shape, 2)
+        if problem.noise is not None:
+            known = torch.stack((problem.noise.img, problem.noise.world), -1)
+            guessed = torch.where(known.isfinite(), known, guessed)
+        return Noise(*guessed.maximum(LEAST_NOISE * unit[:, None]).unbind(-1))
