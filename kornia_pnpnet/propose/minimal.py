@@ -9,8 +9,9 @@ from torch import nn
 
 from kornia_pnpnet.core.checks import check_whole
 from kornia_pnpnet.core.configured import Configured
-from kornia_pnpnet.refine import RobustWeightedLM
-from kornia_pnpnet.types import Problem, Hypotheses, Hypotheses, Pose
+from kornia_pnpnet.problem import Hypotheses, Problem
+from kornia_pnpnet.refine.lm import RobustWeightedLM
+from kornia_pnpnet.result import Pose
 
 __all__ = ["MinimalSolver", "SubsetSolver", "describe"]
 
@@ -22,16 +23,16 @@ class MinimalSolver(Protocol):
     def sample_size(self) -> int:
         """Number of pairs in a sample."""
 
-    def hypotheses(self, corr: Problem) -> Hypotheses | Hypotheses:
-        """Return the poses of a batch of samples."""
+    def hypotheses(self, problem: Problem) -> Hypotheses:
+        """The poses of a batch of samples: normalised, with :math:`N` = ``sample_size``. Their weights do not count."""
 
 
 class SubsetSolver(Configured):
     r"""A solver of samples made of an initialiser, for example the paper's "EPnP-LM on subsets of 7".
 
     Args:
-        init: maps :class:`~kornia_pnpnet.problem.Problem` to a :class:`~kornia_pnpnet.problem.Starts`.
-        refine: refines the guess; ``None``: the guess is the solution.
+        init: maps :class:`~kornia_pnpnet.problem.Problem` to :class:`~kornia_pnpnet.problem.Starts`.
+        refine: refines the poses; ``None``: the first poses are the solutions.
         size: number of pairs in a sample.
 
     Raises:
@@ -40,8 +41,7 @@ class SubsetSolver(Configured):
     Example:
         >>> from kornia_pnpnet.propose.mlp import MLPInit
         >>> solver = SubsetSolver(MLPInit(n=7), RobustWeightedLM(m=5, learnable=False), size=7)
-        >>> corr = Problem(torch.randn(2, 7, 3), torch.randn(2, 7, 2), torch.ones(2, 7), torch.tensor(3400.0))
-        >>> solver.hypotheses(corr).pose.rotation.shape
+        >>> solver.hypotheses(Problem.of(torch.randn(2, 7, 3), torch.randn(2, 7, 2), 3400.0)).pose.rotation.shape
         torch.Size([2, 1, 3, 3])
     """
 
@@ -53,22 +53,15 @@ class SubsetSolver(Configured):
         self.refine = refine
         self.sample_size = size
 
-    def hypotheses(self, corr: Problem) -> Hypotheses:
-        r"""Solve samples.
-
-        Args:
-            corr: normalised correspondences of samples; :math:`N` is ``size``.
-
-        Returns:
-            One pose per sample, valid where the initialiser has a guess and the pose is finite.
-        """
-        guess = self.init(corr)
-        pose = guess.pose if self.refine is None else self.refine(corr, guess).pose
+    def hypotheses(self, problem: Problem) -> Hypotheses:
+        """One pose per sample, valid where the initialiser has one and the pose is finite."""
+        starts = self.init(problem)
+        pose = starts.pose if self.refine is None else self.refine(problem, starts).pose
         valid = pose.rotation.isfinite().flatten(1).all(-1) & pose.translation.isfinite().all(-1)
         eye = torch.eye(3, dtype=pose.rotation.dtype, device=pose.rotation.device)
         rotation = torch.where(valid[:, None, None], pose.rotation, eye)
         translation = torch.where(valid[:, None], pose.translation, 0.0)
-        valid = valid if guess.ok is None else valid & guess.ok
+        valid = valid if starts.ok is None else valid & starts.ok
         return Hypotheses(Pose(rotation[:, None], translation[:, None]), valid[:, None])
 
 

@@ -10,16 +10,16 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
-from kornia_pnpnet.core.checks import check_devices, check_shapes, check_whole, common_dtype
+from kornia_pnpnet.core.checks import check_devices, check_shapes, common_dtype
 from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.linalg import dot
 from kornia_pnpnet.core.performance import compiling, fold_vmap, unfold_vmap
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.geometry import MIN_DEPTH_RATIO
+from kornia_pnpnet.problem import Hypotheses, Problem
 from kornia_pnpnet.propose.law_of_cosines import Triple, distances, turn_to_largest, turned
 from kornia_pnpnet.propose.sampling import kept_at_once
-from kornia_pnpnet.inputs import one_batch, restore_leading
-from kornia_pnpnet.types import Problem, Hypotheses, Hypotheses, Pose
+from kornia_pnpnet.refine.residual import MIN_DEPTH_RATIO
+from kornia_pnpnet.result import Pose
 
 __all__ = ["P3P", "p3p"]
 
@@ -34,6 +34,8 @@ _ERROR_POWER = 2 / 3
 _LARGEST_ERROR = 0.01
 # Machine epsilons of the coordinates and the longest edge. A triangle less high than this is a line.
 _LINE = 32.0
+# Number of focal lengths on the grid for an unknown one.
+_FOCALS = 12
 # Longest edges, times the machine epsilon to the power `_ERROR_POWER`. A camera closer to a point than this is no
 # solution: rounding would decide in which direction it sees the point.
 _CLOSE = 64.0
@@ -195,7 +197,7 @@ def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
     batch is the last dimension, which suits arithmetic over many poses.
 
     Source: M. Persson and K. Nordberg, "Lambda Twist", ECCV 2018; Y. Ding et al., "Revisiting the P3P Problem", CVPR
-    2023; details in ``init/ransac/law_of_cosines.py``.
+    2023; details in :mod:`kornia_pnpnet.propose.law_of_cosines`.
 
     Args:
         world_points: points in any unit, shape :math:`(B, 3, 3)`. Any leading dimensions may stand in place of
@@ -207,7 +209,7 @@ def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
         Four slots per problem, in float64 when an argument is, else in float32. A slot is valid when its pose is a
         solution with all three points in front of the camera. A double solution fills one slot. Invalid slots are
         finite. No slot is valid for points on a line, which have no pose or infinitely many, for NaN and infinity, and
-        where a point is further off the axis than ``kornia_pnpnet.geometry.MIN_DEPTH_RATIO`` allows.
+        where a point is further off the axis than ``MIN_DEPTH_RATIO`` of :mod:`kornia_pnpnet.refine.residual` allows.
 
     Raises:
         ShapeError: when a tensor has another shape, or the batches differ.
@@ -231,65 +233,22 @@ def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
     check_devices({"plane_points": plane_points}, world_points)
     dtype = common_dtype({"world_points": world_points, "plane_points": plane_points})
     solve = _solve if compiling() else _Solve.apply
-    components, valid = solve(*(one_batch(x.detach(), size, dtype) for x in (world_points, plane_points)))
-    components = components.permute(2, 1, 0)  # (B, 4, 12)
-    rotation, translation = components[..., :9].unflatten(-1, (3, 3)), components[..., 9:]
-    return restore_leading(size, Hypotheses(Pose(rotation, translation), valid.mT))
-
-
-class P3PFocals(Configured):
-    r"""Minimal solver of three pairs for an unknown focal length: :func:`p3p` at focal lengths on a grid.
-
-    Least squares of all inliers, with the focal length as a parameter, then find what lies between the grid's points.
-
-    Args:
-        steps: number of focal lengths, spread evenly in logarithms over the range of
-            :class:`~kornia_pnpnet.types.FreeFocal`.
-    """
-
-    #: Number of pairs in a sample.
-    sample_size = 3
-
-    def __init__(self, steps: int = 12) -> None:
-        super().__init__(locals())
-        check_whole(1, steps=steps)
-        self.steps = steps
-
-    def hypotheses(self, corr: Problem) -> Hypotheses:
-        r"""Solve samples of three pairs.
-
-        Args:
-            corr: normalised correspondences with :math:`N = 3` and an unknown focal length. Their weights are ignored.
-
-        Returns:
-            Four slots per sample and focal length, without gradients.
-
-        Raises:
-            ShapeError: when :math:`N` is not 3.
-        """
-        assert corr.free_focal is not None
-        batch = len(corr.weights)
-        at = (torch.arange(self.steps, device=corr.weights.device) + 0.5) * (2.0 / self.steps) - 1.0
-        zoom = at[:, None].to(corr.weights) * corr.free_focal.width  # (F, B)
-        plane = corr.img_points / corr.focal * (-zoom).exp()[..., None, None]  # (F, B, 3, 2)
-        world = corr.world_points.expand(self.steps, -1, -1, -1)
-        pose, valid = p3p(world.flatten(0, 1), plane.flatten(0, 1))
-
-        def slots(x: Tensor) -> Tensor:
-            """Of (F B, 4, ...) the slots of a sample side by side, (B, 4 F, ...); the batch stays last in memory."""
-            last = x.movedim((0, 1), (-1, -2)).unflatten(-1, (self.steps, batch)).flatten(-3, -2)
-            return last.movedim((-1, -2), (0, 1))
-
-        pose = map_tensors(slots, pose)
-        return Hypotheses(pose, slots(valid), zoom.repeat(4, 1).mT)
+    components, valid = solve(*(x.detach().to(dtype).reshape(-1, *x.shape[-2:]) for x in (world_points, plane_points)))
+    components = components.permute(2, 1, 0).reshape(*size, 4, 12)
+    pose = Pose(components[..., :9].unflatten(-1, (3, 3)), components[..., 9:])
+    return Hypotheses(pose, valid.mT.reshape(*size, 4))
 
 
 class P3P(Configured):
     r"""Minimal solver of three pairs for :class:`~kornia_pnpnet.propose.RANSAC`: :func:`p3p` as a module.
 
+    With an unknown focal length :func:`p3p` solves each sample at focal lengths on a grid, spread evenly in logarithms
+    over the range of :class:`~kornia_pnpnet.refine.terms.CameraTerm`. Least squares of all inliers, with the focal
+    length as a parameter, then find what lies between the points of the grid.
+
     Example:
-        >>> corr = Problem(torch.randn(7, 3, 3), torch.randn(7, 3, 2), torch.ones(7, 3), torch.tensor(1.0))
-        >>> P3P().hypotheses(corr).pose.rotation.shape
+        >>> problem = Problem.of(torch.randn(7, 3, 3), torch.randn(7, 3, 2))
+        >>> P3P().hypotheses(problem).pose.rotation.shape
         torch.Size([7, 4, 3, 3])
     """
 
@@ -299,16 +258,31 @@ class P3P(Configured):
     def __init__(self) -> None:
         super().__init__(locals())
 
-    def hypotheses(self, corr: Problem) -> Hypotheses:
+    def hypotheses(self, problem: Problem) -> Hypotheses:
         r"""Solve samples of three pairs.
 
         Args:
-            corr: normalised correspondences with :math:`N = 3`. Their weights are ignored.
+            problem: samples, :math:`N = 3`. Their weights are ignored.
 
         Returns:
-            Four slots per sample, without gradients.
+            Four slots per sample and focal length, without gradients.
 
         Raises:
             ShapeError: when :math:`N` is not 3.
         """
-        return p3p(corr.world_points, corr.img_points / corr.focal)
+        plane = problem.img_points / problem.focal
+        if problem.free_focal is None:
+            return p3p(problem.world_points, plane)
+        batch = len(plane)
+        at = (torch.arange(_FOCALS, device=plane.device) + 0.5) * (2.0 / _FOCALS) - 1.0
+        zoom = at[:, None].to(plane) * problem.free_focal.width  # (F, B)
+        world = problem.world_points.expand(_FOCALS, -1, -1, -1)
+        solved = p3p(world, plane * (-zoom).exp()[..., None, None])
+
+        def slots(x: Tensor) -> Tensor:
+            """Of (F, B, 4, ...) the slots of a sample side by side, (B, 4 F, ...); the batch stays last in memory."""
+            last = x.movedim((0, 1, 2), (-2, -1, -3)).flatten(-3, -2)
+            return last.movedim((-1, -2), (0, 1))
+
+        pose, valid = map_tensors(slots, (solved.pose, solved.valid))
+        return Hypotheses(pose, valid, zoom.repeat(4, 1).mT)

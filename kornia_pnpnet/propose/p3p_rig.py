@@ -11,8 +11,9 @@ from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.linalg import small_product
 from kornia_pnpnet.core.performance import problems_last, sees_values
 from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.problem import Hypotheses, Problem
 from kornia_pnpnet.propose.p3p import p3p
-from kornia_pnpnet.types import Problem, Hypotheses, Pose
+from kornia_pnpnet.result import Pose
 
 __all__ = ["P3PRig", "is_central"]
 
@@ -40,11 +41,11 @@ class P3PRig(Configured):
         check_whole(0, steps=steps)
         self.steps = steps
 
-    def hypotheses(self, corr: Problem) -> Hypotheses:
+    def hypotheses(self, problem: Problem) -> Hypotheses:
         r"""Solve samples of three pairs.
 
         Args:
-            corr: normalised correspondences of a rig with :math:`N = 3`. Their weights are ignored.
+            problem: normalised correspondences of a rig with :math:`N = 3`. Their weights are ignored.
 
         Returns:
             Four slots per sample, without gradients. Samples whose rays are more than 90 degrees from their mean have
@@ -53,18 +54,18 @@ class P3PRig(Configured):
         Raises:
             ShapeError: when :math:`N` is not 3.
         """
-        corr = problems_last(corr)
-        assert corr.rig is not None
-        batch = corr.weights.shape[0]
+        problem = problems_last(problem)
+        assert problem.rig is not None
+        batch = problem.weights.shape[0]
         # Problems last, before them pairs and coordinates: (3, 3, B).
-        world, rays, back = (x.permute(1, 2, 0) for x in (corr.world_points, corr.places, corr.rig.translation))
+        world, rays, back = (x.permute(1, 2, 0) for x in (problem.world_points, problem.places, problem.rig.translation))
         rays = rays / rays.square().sum(1, keepdim=True).sqrt()  # in the frame of the rig
-        centres = -(corr.rig.rotation.permute(1, 2, 3, 0) * back[:, :, None]).sum(1)
+        centres = -(problem.rig.rotation.permute(1, 2, 3, 0) * back[:, :, None]).sum(1)
         turn = bearing_cameras(rays.sum(0).mT[:, None])[0][:, 0].permute(1, 2, 0)
         seen = small_product(rays, turn.transpose(0, 1))
         ahead = seen[:, 2:]
         plane = torch.where(ahead > 0, seen[:, :2] / ahead, torch.inf)
-        solved = p3p(corr.world_points, plane.permute(2, 0, 1))
+        solved = p3p(problem.world_points, plane.permute(2, 0, 1))
         away = ((centres.mean(0) - centres) * rays).sum(1)
         of_sample = world, rays, centres, turn, seen, away
         found = map_tensors(lambda x: x.movedim((0, 1), (-1, -2)).flatten(-2), solved.pose)  # (3, 3, 4 B) and (3, 4 B)
