@@ -20,7 +20,7 @@ from kornia_pnpnet.propose.search import least_squares, pack_pairs, unpack_pairs
 from kornia_pnpnet.refine.residual import project
 from kornia_pnpnet.result import Pose
 
-__all__ = ["guess_of_rig"]
+__all__ = ["starts_of_rig"]
 
 # Focal lengths. Threshold of an inlier: ten times the noise of a pixel at a focal length of 1000 pixels.
 _THRESHOLD = 0.01
@@ -39,7 +39,7 @@ _ROOT = 1.2207440846057596
 
 
 @torch.no_grad()
-def guess_of_rig(problem: Problem, given: Pose | None, *, with_noise: bool, fixed: bool = False) -> Starts:
+def starts_of_rig(problem: Problem, given: Pose | None, *, with_noise: bool, fixed: bool = False) -> Starts:
     """Find the pose of a rig, its inliers and their noise.
 
     Args:
