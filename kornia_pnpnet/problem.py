@@ -154,8 +154,8 @@ class Problem(NamedTuple):
 
     @property
     def terms(self) -> Iterator[Term]:
-        """What is known besides the pairs."""
-        return (term for term in (self.prior, self.free_focal) if term is not None)
+        """What is known besides the pairs; an unknown focal length of which nothing is known is no term."""
+        return (term for term in (self.prior, self.free_focal) if term is not None and term.information is not None)
 
     @property
     def usual_weights(self) -> Tensor:

@@ -419,7 +419,7 @@ def solve_positive(matrix: Tensor, right: Tensor, damping: Tensor) -> tuple[Tens
 
     Returns:
         The solutions, shape :math:`(K, B)`, and whether there is a solution, bool :math:`(B,)`: whether all pivots are
-        above rounding, a test that does not depend on units. Values and gradients are finite everywhere.
+        above rounding, a test that does not depend on units. Without a solution it is 0, and gradients are finite.
 
     Example:
         >>> matrix, right = torch.tensor([[4.0, 0.0], [0.0, 4.0]])[..., None], torch.tensor([[8.0], [4.0]])
@@ -427,10 +427,12 @@ def solve_positive(matrix: Tensor, right: Tensor, damping: Tensor) -> tuple[Tens
         (tensor([[1.0000],
                 [0.5000]]), tensor([True]))
     """
-    size, limits = len(right), torch.finfo(right.dtype)
-    diagonal = matrix.diagonal().mT * (1.0 + damping)  # (K, B)
+    limits = torch.finfo(right.dtype)
+    eye = torch.eye(len(right), dtype=right.dtype, device=right.device)
+    damped = torch.addcmul(matrix, matrix, eye[..., None] * damping)
     if not are_few(right):
-        rows = [[*row[:i], diagonal[i]] for i, row in enumerate(matrix.unbind())]
+        rows = [[*row[: i + 1]] for i, row in enumerate(damped.unbind())]
+        diagonal = [row[-1] for row in rows]
         smallest, infinite = torch.full_like(diagonal[0], limits.tiny), torch.full_like(diagonal[0], torch.inf)
         good: list[Tensor] = []
 
@@ -439,15 +441,16 @@ def solve_positive(matrix: Tensor, right: Tensor, damping: Tensor) -> tuple[Tens
             return torch.where(good[-1], pivot, infinite).reciprocal()
 
         lower, scaled = factorise(rows, list(right.unbind()), inverse)
-        return torch.stack(substitute(lower, scaled)), reduce(and_, good)
-    damped = matrix.permute(2, 0, 1).clone()
-    damped.diagonal(dim1=1, dim2=2).copy_(diagonal.mT)
-    factor, info = torch.linalg.cholesky_ex(damped.detach())
-    pivots = factor.diagonal(dim1=1, dim2=2).square() - _PIVOT * limits.eps * diagonal.mT
+        solved = reduce(and_, good)
+        return torch.stack(substitute(lower, scaled)) * solved, solved
+    batched = damped.permute(2, 0, 1)
+    factor, info = torch.linalg.cholesky_ex(batched.detach())
+    pivots = factor.diagonal(dim1=1, dim2=2).square().add(damped.detach().diagonal(), alpha=-_PIVOT * limits.eps)
     solved = (pivots > limits.tiny).all(1) & (info == 0)  # NaN compares false
-    safe = torch.where(solved[:, None, None], damped, torch.eye(size, dtype=right.dtype, device=right.device))
-    solution = torch.cholesky_solve(right.mT[..., None], torch.linalg.cholesky_ex(safe).L)
-    return solution[..., 0].mT, solved
+    if batched.requires_grad:  # a factorisation that failed would have gradients of NaN
+        factor = torch.linalg.cholesky_ex(torch.where(solved[:, None, None], batched, eye)).L
+    solution = torch.cholesky_solve(right.mT[..., None], factor)[..., 0].mT
+    return torch.where(solved, solution, 0.0), solved
 
 
 def eigenvectors(matrix: Tensor) -> list[tuple[Tensor, Tensor]]:
@@ -495,7 +498,9 @@ def symmetric(rows: Sequence[Sequence[Tensor]]) -> Tensor:
 
 
 def solve_symmetric(matrix: Tensor, right: Tensor) -> Tensor:
-    """Solve systems with positive definite matrices (B, 3, 3) by cofactors."""
+    """Solve systems with positive definite matrices (B, 3, 3): few by LAPACK, many by cofactors."""
+    if are_few(matrix):
+        return torch.linalg.solve_ex(matrix, right).result
     a, b, c = matrix.unbind(1)
     adjugate = torch.stack((torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)), -1)
     return (adjugate @ right) / (a * adjugate[..., 0]).sum(-1)[:, None, None]

@@ -222,7 +222,9 @@ def has_focal(projection: Projection, problem: Problem, noise: Noise, weights: T
     solved, info = torch.linalg.solve_ex(pose, cross)
     # The information of the focal length when the pose is unknown.
     information = (camera - cross.mT @ solved)[:, 0, 0]
-    return (info == 0) & (information + problem.free_focal.information > _OPEN_FOCAL**-2)
+    known = problem.free_focal.information
+    information = information if known is None else information + known
+    return (info == 0) & (information > _OPEN_FOCAL**-2)
 
 
 def _span_a_plane(world_points: Tensor, inliers: Tensor) -> Tensor:

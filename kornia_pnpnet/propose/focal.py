@@ -72,11 +72,12 @@ def with_nominal_focal(inputs: Inputs, sigma: float | None) -> Inputs:
             half = (_HALF_WIDTH * median).maximum(principal_point[:, 0].abs().amax(-1))
             half = torch.where(half.isfinite() & (half > 0), half, 1.0)
         nominal = expected = math.sqrt(_SHORTEST * _LONGEST) * half
-        width, precision = _WIDTH, 0.0
+        width, precision = _WIDTH, None
     else:
         nominal, expected = given.detach(), given
         width, precision = min(_SEARCHED * sigma, _WIDTH), sigma**-2
-    known = CameraTerm(expected, torch.full_like(nominal, precision), torch.full_like(nominal, width), nominal)
+    information = None if precision is None else torch.full_like(nominal, precision)
+    known = CameraTerm(expected, information, torch.full_like(nominal, width), nominal)
     return inputs._replace(intrinsics=scale_focal(camera, nominal / given), free_focal=known)
 
 
@@ -110,6 +111,8 @@ def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
     pose = frame.undo(found.pose)
     inputs = _zoomed(inputs, zoom)
     if radial:
+        if inputs.free_focal.information is None:  # coefficients are small also where nothing is known of f
+            inputs = inputs._replace(free_focal=inputs.free_focal._replace(information=torch.zeros_like(zoom)))
         with torch.no_grad():
             problem, frame = normalize(*inputs[:5])
             assert inputs.free_focal is not None

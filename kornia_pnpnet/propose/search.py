@@ -306,9 +306,9 @@ def least_squares(problem: Problem, projection: Projection, weights: Tensor) -> 
     """Take one step of least squares with the weights (B, N) times the weights of the pairs."""
     weights = problem.weights * weights
     equations = normal_equations(projection, problem, weights)
-    if problem.free_focal is not None:  # a residual of a pixel of the caller counts as one standard deviation
-        linear = problem.free_focal.linearise(projection.state)
-        equations = add_term(equations, linear, problem.img_scale.square().reciprocal(), projection.focal)
+    for term in problem._replace(prior=None).terms:  # a residual of a pixel of the caller is a standard deviation
+        unit = problem.img_scale.square().reciprocal()
+        equations = add_term(equations, term.linearise(projection.state), unit, projection.focal)
     one, damping = weights.new_ones(()), weights.new_full((), _DAMPING)
     return lm_step(equations, projection.state, projection.focal, one, damping)[0]
 

@@ -373,7 +373,7 @@ def lm_step(
     if additive:
         equations = change_tangent(equations, So3.left_jacobian(rotation_matrix_to_axis_angle(state.pose.rotation)))
     delta, solved = solve_positive(equations.matrix, equations.gradient, damping)
-    delta = delta * (solved * (-step / focal))
+    delta = delta * (-step / focal)
     if not additive:
         return moved(state, delta), solved
     rotation_vector = rotation_matrix_to_axis_angle(state.pose.rotation) + delta[:3].mT
@@ -406,9 +406,9 @@ def moved(state: State, delta: Tensor) -> State:
     is the centroid of a centred world, keeps its pixel and the scale at which it is seen. A change of the focal length
     and a shift along the axis, which look alike from far away, are then well separated parameters.
     """
-    pose = retract(state.pose, delta[:6].mT)
     if not state.camera.shape[1]:
-        return State(pose, state.camera)
+        return State(retract(state.pose, delta.mT), state.camera)
+    pose = retract(state.pose, delta[:6].mT)
     zoom, radial = delta[6].clamp(-_LARGEST_ZOOM, _LARGEST_ZOOM), delta[7:].clamp(-_LARGEST_RADIAL, _LARGEST_RADIAL)
     x, y, z = pose.translation.unbind(-1)
     translation = torch.stack((x, y, z * zoom.exp())).mT

@@ -82,10 +82,10 @@ def add_term(equations: NormalEquations, linear: Linear, unit: Tensor, focal: Te
         unit: what a weight of 1 in the equations stands for, in inverse square pixels, (B,).
         focal: the focal length in pixels, a scalar or (B,).
     """
-    weighted = linear.jacobian.mT @ linear.information  # (B, 6 + K, D)
+    weighted = torch.bmm(linear.jacobian.mT, linear.information)  # (B, 6 + K, D)
     weight = linear.weight / (unit * focal)
-    matrix = (weighted @ linear.jacobian).permute(1, 2, 0) * (weight / focal)
-    gradient = (weighted @ linear.residual[..., None])[..., 0].mT * weight
+    matrix = torch.bmm(weighted, linear.jacobian).permute(1, 2, 0) * (weight / focal)
+    gradient = torch.bmm(weighted, linear.residual[..., None])[..., 0].mT * weight
     return NormalEquations(equations.matrix + matrix, equations.gradient + gradient)
 
 
@@ -94,15 +94,15 @@ class CameraTerm(NamedTuple):
 
     Attributes:
         expected: the focal length that the caller expects, in pixels, shape :math:`(B,)`.
-        information: inverse variance of the logarithm of the expected focal length; 0: nothing is known, shape
-            :math:`(B,)`.
+        information: inverse variance of the logarithm of the expected focal length, shape :math:`(B,)`; ``None``:
+            nothing is known of the camera.
         width: the focal length is searched within this distance of that of the problem, in logarithms, shape
             :math:`(B,)`.
         focal: the focal length of the problem in pixels, shape :math:`(B,)`.
     """
 
     expected: Tensor
-    information: Tensor
+    information: Tensor | None
     width: Tensor
     focal: Tensor
 
@@ -112,6 +112,7 @@ class CameraTerm(NamedTuple):
 
     def linearise(self, state: State) -> Linear:
         """Distance of log f from its expectation, and the coefficients of distortion, which are small."""
+        assert self.information is not None
         batch, count = state.camera.shape
         offset = (self.focal / self.expected).log()
         residual = torch.cat((state.zoom + offset[:, None], state.radial), 1)
