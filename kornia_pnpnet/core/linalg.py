@@ -407,10 +407,10 @@ def substitute(lower: Mapping[tuple[int, int], Tensor], scaled: Iterable[Tensor]
 
 
 def solve_positive(matrix: Tensor, right: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Solve :math:`(H + \lambda\,\mathrm{diag}(H))\,x = g` for positive semi-definite matrices, with a verdict on each.
+    r"""Solve :math:`(H + \lambda\,\mathrm{diag}(H))\,x = g` for positive semi-definite matrices.
 
-    Few systems are solved by LAPACK; many, and those of a graph, by an LDLᵀ factorisation written out entry by entry: it
-    exports, it compiles to one loop, and it takes half the time for 1000 systems (LAPACK a seventh for one).
+    LAPACK solves few systems. An LDLᵀ factorisation written out entry by entry solves many systems and those of a
+    graph: it exports, it compiles to one loop, and it takes half the time for 1000 systems (LAPACK a seventh for one).
 
     Args:
         matrix: :math:`H`, shape :math:`(K, K, B)`.
