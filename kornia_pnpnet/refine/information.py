@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import torch
 from torch import Tensor
@@ -16,9 +16,9 @@ from kornia_pnpnet.refine.residual import Projection, pixel_covariance, pixel_va
 
 __all__ = [
     "NARROWER",
-    "Information",
     "KernelWeight",
     "complete_noise",
+    "corrected_noise",
     "information",
     "is_unknown",
     "larger_sigma",
@@ -66,20 +66,6 @@ _MEDIAN = math.sqrt(2.0 * math.log(2.0))
 
 #: Robust weight by squared residual and shape, see :class:`~kornia_pnpnet.refine.kernels.RobustKernel`.
 KernelWeight: TypeAlias = Callable[[Tensor, Tensor], Tensor]
-
-
-class Information(NamedTuple):
-    """Residuals in the unit of the robust kernel, and the information of the pixels.
-
-    Attributes:
-        sq_residual: squared residuals in variances, in square pixels where no noise is known, shape (B, N).
-        precision: inverse variance of a pixel, (B, N) or (B, 1), or the inverse of its covariance.
-        noise: the noise with sigmas no smaller than given or estimated; ``None``: no noise is known.
-    """
-
-    sq_residual: Tensor
-    precision: Tensor | Symmetric2
-    noise: Noise | None
 
 
 def complete_noise(problem: Problem, starts: Starts) -> Noise | None:
@@ -130,43 +116,59 @@ def sq_standardised(projection: Projection, problem: Problem, most: Tensor) -> T
     return torch.where(projection.in_front, precision.form(*projection.residual.mT.unbind()).minimum(most), most)
 
 
-def information(
+def information(projection: Projection, problem: Problem) -> tuple[Tensor, Tensor | Symmetric2]:
+    """Squared residuals in the unit of the robust kernel, and the information of the pixels.
+
+    Args:
+        projection: the points at a state.
+        problem: the problem; its noise is known for every pair or for none.
+
+    Returns:
+        Squared residuals in variances, in square pixels where no noise is known, (B, N); the inverse variance of a
+        pixel, (B, N) or (B, 1), or the inverse of its covariance.
+    """
+    if problem.noise is None:  # unknown noise counts as one pixel of the caller
+        return projection.sq_residual, problem.img_scale.square().reciprocal()[:, None]
+    precision = pixel_precision(projection, problem, problem.noise)
+    if isinstance(precision, Tensor):
+        return projection.sq_residual * precision, precision
+    return precision.form(*projection.residual.mT.unbind()), precision
+
+
+def corrected_noise(
     projection: Projection,
     problem: Problem,
     kernel_weight: KernelWeight,
     shape: Tensor,
-    outlier_area: Tensor | None,
+    outlier_area: Tensor,
     narrower: float = 1.0,
-) -> Information:
-    """What the pairs say at a state, by the noise that was given or estimated, and by the residuals themselves.
+) -> tuple[Noise, Tensor]:
+    """The noise that the residuals show, where an initialiser estimated it.
 
     Args:
-        projection: the points at the state.
-        problem: the problem; its noise is known for every pair or for none, its weights are at most about 1.
-        kernel_weight: the robust kernel's weight.
-        shape: shape of the kernel.
-        outlier_area: see :func:`outlier_area`, 0 where the caller gave the noise, (B, 1); ``None``: estimated noise is
-            not corrected.
+        projection: the points at a state.
+        problem: the problem; its noise is known for every pair, its weights are at most about 1.
+        kernel_weight: the robust kernel's weight, at most 1.
+        shape: shape of the kernel, a scale.
+        outlier_area: see :func:`outlier_area`, 0 where the caller gave the noise, (B, 1).
         narrower: multiplies a variance factor below 1.
+
+    Returns:
+        The noise, with sigmas no smaller than estimated, and a factor for the shape of the kernel, at most 1, (B, 1):
+        smaller noise only makes the kernel narrower.
     """
-    sq_residual, noise = projection.sq_residual, problem.noise
-    if noise is None:  # unknown noise counts as one pixel of the caller
-        return Information(sq_residual, problem.img_scale.square().reciprocal()[:, None], None)
-    precision = pixel_precision(projection, problem, noise)
-    if not isinstance(precision, Tensor):
-        return Information(precision.form(*projection.residual.mT.unbind()), precision, noise)
-    sq_residual = sq_residual * precision
-    if outlier_area is None:
-        return Information(sq_residual, precision, noise)
+    noise = problem.noise
+    assert noise is not None
+    sq_residual, precision = information(projection, problem)
+    assert isinstance(precision, Tensor)
     if problem.confidence is not None:
         factor = _information_factor(sq_residual, precision, projection, problem, outlier_area)
         sq_residual, precision = sq_residual * factor, precision * factor
         noise = map_tensors(lambda sigma: sigma * factor.rsqrt(), noise)
     seen = sq_residual, precision, projection, problem.weights
     variance = _variance_factor(*seen, kernel_weight, shape, outlier_area, narrower)
-    larger = variance.detach().clamp(min=1.0)
-    noise = map_tensors(lambda sigma: larger.sqrt() * sigma, noise)
-    return Information(sq_residual / variance, precision / larger, noise)
+    larger = variance.detach().clamp(min=1.0).sqrt()
+    return map_tensors(lambda sigma: larger * sigma, noise), variance.clamp(max=1.0).sqrt()
 
 
 @torch.no_grad()

@@ -17,10 +17,11 @@ from kornia_pnpnet.core.performance import problems_last, repeat_problems
 from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.judge.belief import believe, explains, has_enough, has_focal, residual_noise
-from kornia_pnpnet.problem import Problem, Starts, State
+from kornia_pnpnet.problem import Noise, Problem, Starts, State
 from kornia_pnpnet.refine.information import (
     NARROWER,
     complete_noise,
+    corrected_noise,
     information,
     is_unknown,
     outlier_area,
@@ -314,23 +315,29 @@ class RobustWeightedLM(Configured):
         hyperparameters += hyperparameters[-1:] * more
         guided, by_residual = (problem._replace(weights=x) for x in (plan.guided, plan.by_residual))
         ones = torch.ones_like(plan.state.pose.translation[:, 0])
-        now = Progress(plan.state, ones > 0, ones)
+        now, narrower = Progress(plan.state, ones > 0, ones), None
         explored = 0
         with torch.set_grad_enabled(torch.is_grad_enabled() and self.backward == "unroll"):
             if count > 1:
                 explored = min(self.explored, m)
                 several = repeat_problems(guided, count)
                 for each in hyperparameters[:explored]:
-                    now = run(self._iteration, several, now, *each, None)
+                    now = run(self._iteration, several, now, *each)
                 rivals = several._replace(weights=repeat_problems(plan.by_residual, count))
                 now = run(self._best, rivals, plan.prior, plan.shape[max(self.explored - 1, 0)], now)
             switch = max(self.m - self.by_residual, explored)
             for each in hyperparameters[explored:switch]:
-                now = run(self._iteration, guided, now, *each, None)
-            for each in hyperparameters[switch:]:
-                now = run(self._iteration, by_residual, now, *each, plan.area)
+                now = run(self._iteration, guided, now, *each)
+            if hyperparameters[switch:] and plan.area is not None:
+                shape = hyperparameters[switch][2]
+                noise, narrower = run(self._correct, by_residual, now.state, shape, plan.area, NARROWER)
+                by_residual = by_residual._replace(noise=noise)
+            for step, damping, shape in hyperparameters[switch:]:
+                shape = shape if narrower is None else shape * narrower
+                now = run(self._iteration, by_residual, now, step, damping, shape)
         if self.backward == "implicit" and m and torch.is_grad_enabled():
-            return self._with_gradient(by_residual, now.state, plan.shape[m - 1], plan.area), now.solved
+            shape = plan.shape[m - 1] if narrower is None else plan.shape[m - 1] * narrower
+            return self._with_gradient(by_residual, now.state, shape), now.solved
         return now.state, now.solved
 
     def judge(self, plan: Plan, state: State, solved: Tensor) -> Refinement:
@@ -342,10 +349,13 @@ class RobustWeightedLM(Configured):
             solved: whether the last equations could be solved, bool :math:`(B,)`.
         """
         projection, shape = project(state, plan.problem), per_problem(plan.shape[-1], plan.prior[:, :1])
-        seen = plan.problem._replace(weights=plan.by_residual)
-        sq_residual, _, noise = information(projection, seen, self.kernel.weight, shape, plan.area)
-        weights = torch.where(projection.in_front, plan.prior * self.kernel.weight(sq_residual, shape), 0.0)
         cost = self._cost(projection, plan.problem, plan.prior, shape)
+        seen, noise = plan.problem._replace(weights=plan.by_residual), plan.problem.noise
+        if plan.area is not None:
+            noise, narrower = corrected_noise(projection, seen, self.kernel.weight, shape, plan.area)
+            shape = shape * narrower
+        sq_residual, _ = information(projection, seen._replace(noise=noise))
+        weights = torch.where(projection.in_front, plan.prior * self.kernel.weight(sq_residual, shape), 0.0)
         judged, unknown, law = plan.problem._replace(weights=plan.guided), plan.noiseless, "sigmas"
         if noise is None:
             noise, judged, law = residual_noise(projection, plan.problem, plan.prior), plan.problem, "residuals"
@@ -363,17 +373,22 @@ class RobustWeightedLM(Configured):
         """The ``cost`` of :meth:`judge` at any state, shape :math:`(B,)`."""
         return self._cost(project(state, plan.problem), plan.problem, plan.prior, plan.shape[-1])
 
-    def _iteration(
-        self, problem: Problem, now: Progress, step: Tensor, damping: Tensor, shape: Tensor, area: Tensor | None
-    ) -> Progress:
+    def _correct(
+        self, problem: Problem, state: State, shape: Tensor, area: Tensor, narrower: float
+    ) -> tuple[Noise, Tensor]:
+        """The noise of a stage, from the residuals before it, and a factor of the kernel's shape."""
+        shape = per_problem(shape, problem.weights[:, :1])
+        return corrected_noise(project(state, problem), problem, self.kernel.weight, shape, area, narrower)
+
+    def _iteration(self, problem: Problem, now: Progress, step: Tensor, damping: Tensor, shape: Tensor) -> Progress:
         """One iteration. With ``reject_worse``, a problem whose cost would rise keeps its state."""
         step, damping = (per_problem(x, problem.weights[:, 0]) for x in (step, damping))
         shape = per_problem(shape, problem.weights[:, :1])
         damping = damping * now.factor if self.reject_worse else damping
         projection = project(now.state, problem)
-        equations = self._equations(projection, problem, shape, area, NARROWER)
+        equations = self._equations(projection, problem, shape)
         state, solved = lm_step(equations, now.state, projection.focal, step, damping, additive=self.additive)
-        if not self.reject_worse or area is not None:  # the cost does not know the corrected noise
+        if not self.reject_worse:
             return Progress(state, solved, now.factor)
         new = self._cost(project(state, problem), problem, problem.weights, shape)
         old = self._cost(projection, problem, problem.weights, shape)
@@ -386,14 +401,12 @@ class RobustWeightedLM(Configured):
         )
         return Progress(kept, solved, factor)
 
-    def _equations(
-        self, projection: Projection, problem: Problem, shape: Tensor, area: Tensor | None, narrower: float = 1.0
-    ) -> NormalEquations:
+    def _equations(self, projection: Projection, problem: Problem, shape: Tensor) -> NormalEquations:
         """Normal equations of the pairs, weighted and whitened, and of the terms.
 
         Weights are relative to the heaviest row of the Jacobian, so that products of tiny weights do not vanish.
         """
-        sq_residual, precision, _ = information(projection, problem, self.kernel.weight, shape, area, narrower)
+        sq_residual, precision = information(projection, problem)
         robust = problem.weights * self.kernel.weight(sq_residual, shape)
         weights = map_tensors(lambda x: x * robust, precision)
         size = weights.uu + weights.vv if isinstance(weights, Symmetric2) else weights
@@ -423,7 +436,7 @@ class RobustWeightedLM(Configured):
             total = total + unit * term.loss(projection.state)
         return total / count
 
-    def _with_gradient(self, problem: Problem, state: State, shape: Tensor, area: Tensor | None) -> State:
+    def _with_gradient(self, problem: Problem, state: State, shape: Tensor) -> State:
         r"""Give a converged state the gradient of a minimum, by the implicit function theorem.
 
         With :math:`g(\delta) = J^\top W r` at the state moved by :math:`\delta`, which is 0 at the minimum,
@@ -434,7 +447,7 @@ class RobustWeightedLM(Configured):
         """
 
         def equations(problem: Problem, at: State, shape: Tensor) -> NormalEquations:
-            return self._equations(project(at, problem), problem, shape, area, NARROWER)
+            return self._equations(project(at, problem), problem, shape)
 
         zero = torch.zeros_like(state.pose.translation[:1, 0]).expand(6 + state.camera.shape[1], len(state.camera))
         zero = zero.clone().requires_grad_()
