@@ -46,7 +46,7 @@ from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.core.trees import map_tensors, take
 from kornia_pnpnet.data import CameraProblems, OutlierMix, SceneProblems, load_scene
 from kornia_pnpnet.init.focal import scale_focal
-from kornia_pnpnet.types import Pose, Problems
+from kornia_pnpnet.result import Pose, Problems
 
 __all__ = ["main", "measure_cell", "measure_focal", "measure_real", "measure_rigs", "measure_scenes", "page", "targets"]
 

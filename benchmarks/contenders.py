@@ -27,7 +27,7 @@ from torch import nn
 
 from kornia_pnpnet import PnPNet, RobustWeightedLM
 from kornia_pnpnet.evaluation.named_solvers import load_solver
-from kornia_pnpnet.types import Pose, Problems
+from kornia_pnpnet.result import Pose, Problems
 
 #: The paper's solver as it is shipped, and the solver for any number of pairs.
 TRAINED, ANY = "pnpnet-n9", "pnpnet-set"

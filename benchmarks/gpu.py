@@ -43,7 +43,7 @@ from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.evaluation.results import save_results
-from kornia_pnpnet.types import PnPResult, Pose, Problems
+from kornia_pnpnet.result import PnPResult, Pose, Problems
 
 #: Largest difference of a pose that counts as the same, in radians, and of a gradient, relative to its length.
 LIMITS = {torch.float32: 1e-3, torch.float64: 1e-6}

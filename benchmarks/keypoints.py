@@ -29,7 +29,7 @@ from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.core.files import read_npz
 from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.evaluation.results import save_results
-from kornia_pnpnet.types import Pose
+from kornia_pnpnet.result import Pose
 
 FIELDS = ("world", "img", "mask", "confidence", "K", "R", "t", "seen", "cluster")
 # A pose is right below this many degrees and this relative translation error; errors are also averaged up to CAP.

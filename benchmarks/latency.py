@@ -12,7 +12,7 @@ from settings import N, Settings, draw, make_contenders
 from tasks import CannotBeTimedError, Contender, Task, first
 
 from kornia_pnpnet.data import OutlierMix
-from kornia_pnpnet.types import Problems
+from kornia_pnpnet.result import Problems
 
 #: Number of quantiles of a distribution in the file, besides the smallest value.
 QUANTILE_STEPS = 200

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from kornia_pnpnet.evaluation.named_solvers import load_solver
 from kornia_pnpnet.peers import PeerSolver
-from kornia_pnpnet.types import Pose, Problems
+from kornia_pnpnet.result import Pose, Problems
 
 _PYPOSE_DELTA = 10.0 / 3400.0  # scale of the kernel: 10 px, in focal lengths of the protocol's camera
 _PYPOSE_DAMPING = 1e-3  # the damping of our classical refinement

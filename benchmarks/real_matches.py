@@ -40,8 +40,8 @@ from kornia_pnpnet.evaluation.named_solvers import load_solver
 from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.metrics import reliability
 from kornia_pnpnet.peers.base import PeerSolver
-from kornia_pnpnet.types import PnPResult, Pose
-from kornia_pnpnet.types import Problems as SolverProblems
+from kornia_pnpnet.result import PnPResult, Pose
+from kornia_pnpnet.result import Problems as SolverProblems
 
 Floats = NDArray[np.float64]
 Whole = NDArray[np.int64]

@@ -11,7 +11,7 @@ from tasks import CannotBeTimedError, Contender
 
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.evaluation import draw_problems
-from kornia_pnpnet.types import Problems
+from kornia_pnpnet.result import Problems
 
 #: Number of pairs unless a row says otherwise.
 N = 9

@@ -27,7 +27,7 @@ from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.evaluation import draw_problems
 from kornia_pnpnet.evaluation.named_solvers import load_solver
 from kornia_pnpnet.evaluation.results import save_results
-from kornia_pnpnet.types import Problems
+from kornia_pnpnet.result import Problems
 
 # Seed of the problems. No training or tuning used it.
 SEED = 20_270_300

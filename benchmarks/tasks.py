@@ -16,9 +16,10 @@ from harness import seconds
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor, nn
 
-from kornia_pnpnet import Guess, Normalize, pose_errors, success, success_rate
+from kornia_pnpnet import Starts, Normalize, pose_errors, success, success_rate
 from kornia_pnpnet.metrics import SuccessRate
-from kornia_pnpnet.types import Correspondences, Pose, Problems
+from kornia_pnpnet.problem import Problem
+from kornia_pnpnet.result import Pose, Problems
 
 # Errors of the pose that refinements start from, about those of the network's guess: the angle, and the distance as a
 # share of the distance to the points.
@@ -167,10 +168,10 @@ def coarse_pose(problems: Problems, seed: int = 0) -> Pose:
     return Pose(turned, (camera_centre - turned @ centre)[..., 0] + shift)
 
 
-def normalized(problems: Problems, device: str) -> tuple[Correspondences, Guess, Callable[[Pose], Pose]]:
+def normalized(problems: Problems, device: str) -> tuple[Problem, Starts, Callable[[Pose], Pose]]:
     """Normalised pairs, the coarse pose in their frame, and the function that undoes normalisation for a pose."""
     normalize = Normalize(order=False)
     with torch.no_grad():
         corr, frame = normalize(*float_inputs(problems, device))
         start = normalize.apply_to_pose(Pose(*(x.to(corr.world_points) for x in coarse_pose(problems))), frame)
-    return corr, Guess(start, torch.ones_like(corr.weights)), lambda pose: normalize.undo(pose, frame)
+    return corr, Starts(start, torch.ones_like(corr.weights)), lambda pose: normalize.undo(pose, frame)

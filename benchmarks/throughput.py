@@ -12,7 +12,7 @@ from harness import in_turns, ratio, say, summary, target, threads
 from settings import N, Settings, draw, make_contenders
 from tasks import CannotBeTimedError, Contender, Task, first
 
-from kornia_pnpnet.types import Problems
+from kornia_pnpnet.result import Problems
 
 FORWARD, BACKWARD = "forward", "forward+backward"
 _PROBE = 10  # problems of the first call of a loop

@@ -10,8 +10,9 @@ from torch import Tensor, nn
 from kornia_pnpnet import PosePrior, gravity_prior
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.data.points import BoxPoints
-from kornia_pnpnet.geometry import retract, transform
-from kornia_pnpnet.types import Pose, Problems
+from kornia_pnpnet.geometry import transform
+from kornia_pnpnet.refine.residual import retract
+from kornia_pnpnet.result import Pose, Problems
 
 __all__ = [
     "GRAVITY",

@@ -42,7 +42,7 @@ from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.evaluation.bounds import KnownInliersAndNoise
 from kornia_pnpnet.peers import OpenCVPnP, PeerSolver, PoseLib
-from kornia_pnpnet.types import Pose, Problems
+from kornia_pnpnet.result import Pose, Problems
 
 __all__ = [
     "main",

@@ -37,7 +37,7 @@ from kornia_pnpnet.core.files import write_json
 from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.data import CameraProblems
 from kornia_pnpnet.peers import OpenCVRansac
-from kornia_pnpnet.types import Pose, Problems
+from kornia_pnpnet.result import Pose, Problems
 
 __all__ = ["main", "measure_batches", "measure_descent", "measure_success", "page", "patched"]
 

@@ -11,9 +11,9 @@ import torch
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
-from kornia_pnpnet import Correspondences, Normalize, Pose, Problems
+from kornia_pnpnet import Problem, Normalize, Pose, Problems
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
-from kornia_pnpnet.geometry import retract
+from kornia_pnpnet.refine.residual import retract
 
 if TYPE_CHECKING:
     from kornia_pnpnet.training import FitReport
@@ -62,10 +62,10 @@ def make_problems() -> Callable[..., Problems]:
 
 
 @pytest.fixture
-def correspond() -> Callable[[Problems], tuple[Correspondences, Pose]]:
+def correspond() -> Callable[[Problems], tuple[Problem, Pose]]:
     """Normalised correspondences (centred, scaled, unordered) of some problems, and the true pose in their frame."""
 
-    def make(problems: Problems) -> tuple[Correspondences, Pose]:
+    def make(problems: Problems) -> tuple[Problem, Pose]:
         normalize = Normalize(order=False)
         corr, frame = normalize(problems.world_points, problems.img_points, problems.intrinsics)
         return corr, normalize.apply_to_pose(problems.pose, frame)

@@ -16,7 +16,7 @@ from kornia_pnpnet.cli import main
 from kornia_pnpnet.data import SyntheticProblems
 from kornia_pnpnet.refine.kernels import KERNELS
 from kornia_pnpnet.refine.lm import BACKWARDS
-from kornia_pnpnet.types import Noise
+from kornia_pnpnet.problem import Noise
 
 SOLVERS = {
     name: create_solver(name)

@@ -11,14 +11,14 @@ from kornia.geometry.calibration import distort_points
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch.nn import functional
 
-from kornia_pnpnet import Guess, Normalize, PnPNet, Pose, RobustWeightedLM, create_solver, solve_pnp
+from kornia_pnpnet import Starts, Normalize, PnPNet, Pose, RobustWeightedLM, create_solver, solve_pnp
 from kornia_pnpnet.cameras import bearing_cameras, bearings, undistort
 from kornia_pnpnet.core.symmetric import Symmetric2, Symmetric3
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
-from kornia_pnpnet.geometry import normal_equations, project, retract
-from kornia_pnpnet.geometry import rotation_angle as angle
+from kornia_pnpnet.refine.residual import normal_equations, project, retract
+from kornia_pnpnet.refine.residual import rotation_angle as angle
 from kornia_pnpnet.refine.step import pixel_precision
-from kornia_pnpnet.types import Noise
+from kornia_pnpnet.problem import Noise
 
 DIST = {
     4: [-0.2, 0.05, 0.001, -0.002],
@@ -351,7 +351,7 @@ def test_gradcheck_to_the_pose_of_a_rig(uniform):
 
     def solve(world_points, img_points, rotation, translation):
         pairs = corr._replace(world_points=world_points, img_points=img_points, rig=Pose(rotation, translation))
-        return tuple(refine(pairs, Guess(pose, torch.ones_like(corr.weights))).pose)
+        return tuple(refine(pairs, Starts(pose, torch.ones_like(corr.weights))).pose)
 
     inputs = [x.detach().requires_grad_() for x in (corr.world_points, corr.img_points, *corr.rig)]
     assert torch.autograd.gradcheck(solve, inputs, eps=1e-6, atol=1e-7, rtol=1e-3, fast_mode=True)

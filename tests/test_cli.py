@@ -24,7 +24,7 @@ from kornia_pnpnet.core import files
 from kornia_pnpnet.evaluation.named_solvers import BOUNDS, default_solvers
 from kornia_pnpnet.evaluation.problem_sets import PRIORS
 from kornia_pnpnet.evaluation.results import load_results
-from kornia_pnpnet.types import Pose
+from kornia_pnpnet.result import Pose
 
 CAMERA = "800,810,320,240"
 K = torch.tensor([[800.0, 0, 320], [0, 810, 240], [0, 0, 1]], dtype=torch.float64)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from kornia_pnpnet.core.linalg import eigenvectors, factorise, nearest_rotation, solve_leading, substitute
-from kornia_pnpnet.geometry import rotation_angle
+from kornia_pnpnet.refine.residual import rotation_angle
 
 # --- the nearest rotation -------------------------------------------------------------------------------------------
 

@@ -18,8 +18,8 @@ from kornia_pnpnet.core.compilation import Compiled
 from kornia_pnpnet.core.performance import ascending_order, in_order, problems_last, ranked
 from kornia_pnpnet.core.trees import iter_tensors
 from kornia_pnpnet.data import CameraProblems, OutlierMix, SyntheticProblems
-from kornia_pnpnet.geometry import project
-from kornia_pnpnet.types import PnPResult
+from kornia_pnpnet.refine.residual import project
+from kornia_pnpnet.result import PnPResult
 
 # torch.compile makes an instance of an autograd function while it looks into it.
 pytestmark = pytest.mark.filterwarnings("ignore:.*should not be instantiated:DeprecationWarning")

@@ -17,7 +17,7 @@ import torch
 
 from kornia_pnpnet import Pose, pose_errors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
-from kornia_pnpnet.geometry import rotation_angle
+from kornia_pnpnet.refine.residual import rotation_angle
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 INSTALL = {

@@ -14,7 +14,7 @@ from kornia_pnpnet import Pose, create_solver, pose_errors, success
 from kornia_pnpnet.data import CameraProblems, OutlierMix, SyntheticProblems
 from kornia_pnpnet.evaluation.bounds import KnownInliers, KnownInliersAndNoise
 from kornia_pnpnet.evaluation.comparison import EvaluationData, SeesTruth, evaluate
-from kornia_pnpnet.types import Problems
+from kornia_pnpnet.result import Problems
 
 BOUNDS = (KnownInliers, KnownInliersAndNoise)
 

@@ -18,7 +18,7 @@ from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.evaluation.comparison import EvaluationData, SeesTruth, draw_problems, evaluate
 from kornia_pnpnet.evaluation.results import format_table, load_results, row_errors, save_results
-from kornia_pnpnet.types import PnPResult, Pose
+from kornia_pnpnet.result import PnPResult, Pose
 
 
 @pytest.fixture(autouse=True)

@@ -16,7 +16,7 @@ from kornia_pnpnet.evaluation.operations import (
     count_per_problem,
     operation_count,
 )
-from kornia_pnpnet.init import MLPInit
+from kornia_pnpnet.propose.mlp import MLPInit
 
 
 @pytest.mark.parametrize("n", [6, 20])

@@ -15,7 +15,7 @@ import kornia_pnpnet.evaluation.problem_sets
 from kornia_pnpnet.core.trees import iter_tensors
 from kornia_pnpnet.data import OutlierMix, Scene, SceneProblems, SlabPoints, SyntheticProblems, View
 from kornia_pnpnet.evaluation.problem_sets import PRIORS, evaluation_sets
-from kornia_pnpnet.geometry import rotation_angle
+from kornia_pnpnet.refine.residual import rotation_angle
 
 CONF = Path(__file__).resolve().parents[1] / "conf" / "data"
 

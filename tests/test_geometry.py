@@ -13,21 +13,20 @@ from kornia.geometry.camera.perspective import project_points
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from strategies import are_rotations, correspondences, finite, gradients_are_finite, many, poses
 
-from kornia_pnpnet import Correspondences, Noise, Pose
+from kornia_pnpnet import Problem, Noise, Pose
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
-from kornia_pnpnet.geometry import (
+from kornia_pnpnet.geometry import additive_tangent_map, change_tangent, retract_additive, transform
+from kornia_pnpnet.refine.residual import (
     MIN_DEPTH_RATIO,
-    additive_tangent_map,
-    change_tangent,
     normal_equations,
     pixel_variance,
     project,
     retract,
-    retract_additive,
     rotation_angle,
-    transform,
 )
-from kornia_pnpnet.refine import explains, lm_step, solve_damped
+from kornia_pnpnet.core.linalg import solve_positive
+from kornia_pnpnet.judge.belief import explains
+from kornia_pnpnet.refine.residual import lm_step
 
 DTYPES = (torch.float32, torch.float64)
 FOCAL = torch.tensor(3400.0, dtype=torch.float64)
@@ -44,7 +43,7 @@ def random_scene(n, rotation, *, batch=7, shift=0.0, seed=0):
     pose = Pose(rotation, 12.5 * uniform(batch, 3) + shift)
     world_points = (cam_points - pose.translation[:, None]) @ pose.rotation
     pixels = FOCAL * cam_points[..., :2] / cam_points[..., 2:] + 50 * uniform(batch, n, 2)
-    return Correspondences(world_points, pixels, torch.ones(batch, n, dtype=torch.float64), FOCAL), pose
+    return Problem(world_points, pixels, torch.ones(batch, n, dtype=torch.float64), FOCAL), pose
 
 
 def per_problem_jacobian(function, at):
@@ -217,7 +216,7 @@ def test_points_behind_the_camera_do_not_count(point, dtype):
     front = torch.tensor([[1.0, 2, 10], [-4, 3, 20], [5, -6, 30], [3, 3, 7]], dtype=dtype)
     world = torch.cat((front, torch.tensor([point], dtype=dtype)))[None].requires_grad_()
     pixels = torch.full((1, 5, 2), 100.0, dtype=dtype, requires_grad=True)
-    corr = Correspondences(world, pixels, torch.ones(1, 5, dtype=dtype), FOCAL.to(dtype))
+    corr = Problem(world, pixels, torch.ones(1, 5, dtype=dtype), FOCAL.to(dtype))
     pose = Pose(torch.eye(3, dtype=dtype)[None].requires_grad_(), torch.zeros(1, 3, dtype=dtype, requires_grad=True))
 
     projection = project(pose, corr)
@@ -237,7 +236,7 @@ def test_points_behind_the_camera_do_not_count(point, dtype):
     assert not pixels.grad[0, 4].any()
 
     # The step that the points in front would have taken alone, but for the order in which sums are rounded.
-    alone = Correspondences(world[:, :4], pixels[:, :4], corr.weights[:, :4], corr.focal)
+    alone = Problem(world[:, :4], pixels[:, :4], corr.weights[:, :4], corr.focal)
     without = lm_step(alone, pose, project(pose, alone), alone.weights, one, 1e-3 * one)
     rtol = 1e-4 if dtype == torch.float32 else 1e-12
     torch.testing.assert_close(step.pose.matrix, without.pose.matrix, rtol=rtol, atol=0)
@@ -248,7 +247,7 @@ def test_all_points_at_the_camera_centre_are_finite(dtype):
     points = torch.zeros(1, 4, 3, dtype=dtype, requires_grad=True)
     translation = torch.zeros(1, 3, dtype=dtype, requires_grad=True)
     pose = Pose(torch.eye(3, dtype=dtype)[None], translation)
-    corr = Correspondences(points, torch.zeros(1, 4, 2).to(dtype), torch.ones(1, 4).to(dtype), FOCAL.to(dtype))
+    corr = Problem(points, torch.zeros(1, 4, 2).to(dtype), torch.ones(1, 4).to(dtype), FOCAL.to(dtype))
     matrix, right_side = normal_matrices(pose, corr, corr.weights)
     assert not matrix.any()
     assert not right_side.any()
@@ -262,7 +261,7 @@ def test_in_front_does_not_depend_on_the_unit(dtype):
     point = torch.tensor([[[1.0, 1.0, 1e-3], [1.0, 1.0, 2e-3], [0.3, 0.1, 1.0], [0.0, 0.0, -1.0]]], dtype=dtype)
     pose = Pose(torch.eye(3, dtype=dtype)[None], torch.zeros(1, 3, dtype=dtype))
     for unit in (1e-6, 1.0, 1e6):
-        corr = Correspondences(
+        corr = Problem(
             point * unit, torch.zeros(1, 4, 2).to(dtype), torch.ones(1, 4).to(dtype), FOCAL.to(dtype)
         )
         assert project(pose, corr).in_front.tolist() == [[False, True, True, False]]
@@ -275,7 +274,7 @@ def test_pixel_variance_is_that_of_the_pixel(make_problems):
     moved = p.world_points + 0.05 * torch.randn(100_000, 5, 3, generator=generator, dtype=torch.float64)
     off = 2.0 * torch.randn(100_000, 5, 2, generator=generator, dtype=torch.float64)
     count = torch.ones(1, 5, dtype=torch.float64)
-    corr = Correspondences(p.world_points, p.img_points, count, p.intrinsics[0, 0, 0])
+    corr = Problem(p.world_points, p.img_points, count, p.intrinsics[0, 0, 0])
     noise = Noise(2.0 * count, 0.05 * count)
     variance = pixel_variance(project(p.pose, corr), noise, corr.focal)
     cam = transform(Pose(*(x.expand(100_000, *x.shape[1:]) for x in p.pose)), moved)
@@ -299,7 +298,7 @@ def test_the_calculus_takes_anything(case, data):
         assert (pixel_variance(projection, corr.noise, corr.focal) > 0).all()
     equations = normal_equations(projection, corr.weights)
     damping = torch.tensor(10.0 ** data.draw(st.integers(-8, 2)), dtype=dtype)
-    delta, solved = solve_damped(equations, damping)
+    delta, solved = solve_positive(equations, damping)
     assert solved.shape == (batch,)
     finite([x[solved] for x in delta])
     explains(projection, corr, corr.weights)

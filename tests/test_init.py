@@ -7,7 +7,11 @@ from hypothesis import strategies as st
 from strategies import are_rotations, correspondences, finite, gradients_are_finite, many, numbers
 
 from kornia_pnpnet import MLPInit, SetInit
-from kornia_pnpnet.init import P3P, RANSAC, EPnP, REPPnP, SubsetSolver, p3p
+from kornia_pnpnet.propose.epnp import EPnP
+from kornia_pnpnet.propose.minimal import SubsetSolver
+from kornia_pnpnet.propose.p3p import P3P, p3p
+from kornia_pnpnet.propose.ransac import RANSAC
+from kornia_pnpnet.propose.reppnp import REPPnP
 
 INITIALISERS = {
     "EPnP": EPnP(),

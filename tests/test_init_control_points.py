@@ -5,14 +5,14 @@ from __future__ import annotations
 import pytest
 import torch
 
-from kornia_pnpnet import Correspondences
-from kornia_pnpnet.geometry import align
+from kornia_pnpnet import Problem
+from kornia_pnpnet.core.linalg import align
 from kornia_pnpnet.init.epnp.control_points import control_points
 
 
 def correspondences(world, weights=None):
     weights = torch.ones_like(world[..., 0]) if weights is None else weights
-    return Correspondences(world, torch.zeros_like(world[..., :2]), weights, torch.ones((), dtype=world.dtype))
+    return Problem(world, torch.zeros_like(world[..., :2]), weights, torch.ones((), dtype=world.dtype))
 
 
 @pytest.fixture

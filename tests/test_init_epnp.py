@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 
-from kornia_pnpnet import Correspondences, Normalize, PnPNet, Pose, RobustWeightedLM
+from kornia_pnpnet import Problem, Normalize, PnPNet, Pose, RobustWeightedLM
 from kornia_pnpnet.data import SyntheticProblems
 from kornia_pnpnet.geometry import transform
 from kornia_pnpnet.init.epnp.control_points import control_points
 from kornia_pnpnet.init.epnp.depths import depth_system, four_cases, minimize
-from kornia_pnpnet.init.epnp.epnp import EPnP
+from kornia_pnpnet.propose.epnp import EPnP
 from kornia_pnpnet.metrics import pose_errors, success
 
 DTYPES = (torch.float32, torch.float64)
@@ -139,7 +139,7 @@ def test_fewer_than_three_pairs_in_front_are_not_ok():
     world = torch.randn(5000, 4, 3, generator=generator, dtype=torch.float64)
     img = 3400.0 * torch.randn(5000, 4, 2, generator=generator, dtype=torch.float64)
     focal = torch.tensor(3400.0, dtype=torch.float64)
-    guess = EPnP()(Correspondences(world, img, torch.ones(5000, 4, dtype=torch.float64), focal))
+    guess = EPnP()(Problem(world, img, torch.ones(5000, 4, dtype=torch.float64), focal))
     in_front = (transform(guess.pose, world)[..., 2] > 0).sum(-1)
     assert (in_front < 3).any()
     assert not guess.ok[in_front < 3].any()
@@ -170,10 +170,10 @@ SQUARE = torch.tensor([[[-1, -1], [1, -1], [-1, 1], [1, 1], [2, 0], [-2, 0]]], d
 
 
 def parallel_plane(plane):
-    """Correspondences of a plane parallel to the image at the distance 4, with a gradient in the pixels."""
+    """Problem of a plane parallel to the image at the distance 4, with a gradient in the pixels."""
     world = torch.cat((plane, torch.zeros_like(plane[..., :1])), -1)
     pixels = (plane / 4.0).requires_grad_()
-    return Correspondences(world, pixels, torch.ones_like(world[..., 0]), torch.ones((), dtype=plane.dtype))
+    return Problem(world, pixels, torch.ones_like(world[..., 0]), torch.ones((), dtype=plane.dtype))
 
 
 @pytest.mark.parametrize("plane", [SQUARE, SQUARE[:, :4], SQUARE + 0.1 * SQUARE.square()], ids=["six", "four", "odd"])

@@ -9,7 +9,7 @@ from kornia.geometry.calibration import distort_points
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
 from kornia_pnpnet import (
-    Guess,
+    Starts,
     Normalize,
     PnPNet,
     Pose,
@@ -22,12 +22,15 @@ from kornia_pnpnet.cameras import undistort
 from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.export import export_program
-from kornia_pnpnet.geometry import distort, dolly_zoom, normal_equations, project, retract
-from kornia_pnpnet.geometry import rotation_angle as angle
+from kornia_pnpnet.geometry import distort, dolly_zoom
+from kornia_pnpnet.refine.residual import normal_equations, project, retract
+from kornia_pnpnet.refine.residual import rotation_angle as angle
 from kornia_pnpnet.init.focal import scale_focal
 from kornia_pnpnet.refine.prior import focal_loss, prior_in_frame, prior_loss
 from kornia_pnpnet.refine.radial import distorted
-from kornia_pnpnet.types import FreeFocal, Noise, PosePrior
+from kornia_pnpnet.problem import Noise
+from kornia_pnpnet.refine.terms import CameraTerm
+from kornia_pnpnet.result import PosePrior
 
 HALF = 500.0  # pixels
 
@@ -145,11 +148,11 @@ def test_the_covariance_has_the_focal_length_last():
 
 
 def framed(problems):
-    """Correspondences with a free focal length in the frame of the solver, and the true poses there."""
+    """Problem with a free focal length in the frame of the solver, and the true poses there."""
     normalize = Normalize(order=False)
     corr, frame = normalize(*problems[:3])
     one = torch.ones_like(corr.weights[:, 0])
-    free = FreeFocal(corr.focal * one, 0.0 * one, one, frame.img_scale)
+    free = CameraTerm(corr.focal * one, 0.0 * one, one, frame.img_scale)
     return corr._replace(free_focal=free), normalize.apply_to_pose(problems.pose, frame)
 
 
@@ -172,10 +175,10 @@ def test_the_seventh_column_is_the_derivative_of_the_pixels():
 def test_an_exact_focal_length_stays_and_a_wrong_one_is_corrected(update):
     corr, pose = framed(draw(12, batch=32))
     refine = RobustWeightedLM(20, robustness=0.0, update=update)
-    here = refine(corr, Guess(pose, torch.ones_like(corr.weights)))
+    here = refine(corr, Starts(pose, torch.ones_like(corr.weights)))
     assert here.zoom.abs().max() < 1e-9
     off = torch.linspace(-0.2, 0.2, 32, dtype=torch.float64)
-    found = refine(corr, Guess(dolly_zoom(pose, off), torch.ones_like(corr.weights), zoom=off))
+    found = refine(corr, Starts(dolly_zoom(pose, off), torch.ones_like(corr.weights), zoom=off))
     assert (found.zoom.abs() < 1e-6).double().mean() > 0.9
 
 
@@ -192,7 +195,7 @@ def test_gradcheck_to_the_focal_length(backward, kernel):
     def solve(world_points, img_points, expected):
         pairs = corr._replace(world_points=world_points, img_points=img_points)
         pairs = pairs._replace(free_focal=pairs.free_focal._replace(expected=expected))
-        refined = refine(pairs, Guess(pose, torch.ones_like(corr.weights)))
+        refined = refine(pairs, Starts(pose, torch.ones_like(corr.weights)))
         return refined.zoom, *refined.pose
 
     inputs = [x.detach().requires_grad_() for x in (corr.world_points, corr.img_points, corr.free_focal.expected)]
@@ -209,7 +212,7 @@ def test_a_prior_of_the_pose_leaves_its_minimum():
     prior, _ = prior_in_frame(known, torch.zeros(3, 3).double(), one, corr.free_focal.pixel)
     corr = corr._replace(prior=prior._replace(sq_scale=torch.full_like(one, math.inf)))
     corr = corr._replace(free_focal=corr.free_focal._replace(information=1e2 * one))
-    end = RobustWeightedLM(30, robustness=0.0)(corr, Guess(pose, torch.ones_like(corr.weights)))
+    end = RobustWeightedLM(30, robustness=0.0)(corr, Starts(pose, torch.ones_like(corr.weights)))
     delta = torch.zeros(3, 7, dtype=torch.float64, requires_grad=True)
     moved = dolly_zoom(retract(end.pose, delta[:, :6]), delta[:, 6])
     seen = corr.zoomed(end.zoom + delta[:, 6])

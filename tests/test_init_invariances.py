@@ -6,8 +6,9 @@ import pytest
 import torch
 from init_helpers import assert_same, change, flattened
 
-from kornia_pnpnet import Correspondences, Pose, pose_errors
-from kornia_pnpnet.init import EPnP, REPPnP
+from kornia_pnpnet import Problem, Pose, pose_errors
+from kornia_pnpnet.propose.epnp import EPnP
+from kornia_pnpnet.propose.reppnp import REPPnP
 
 INITIALISERS = {"EPnP": EPnP(), "EPPnP": REPPnP(reject_outliers=False), "REPPnP": REPPnP()}
 
@@ -94,5 +95,5 @@ def test_problems_without_a_pose_are_not_ok(init, dtype, make_problems, correspo
         guess = init(spoilt)
         assert not guess.ok.any()
         assert all(x.isfinite().all() for x in (*guess.pose, guess.weights))
-    empty = Correspondences(torch.zeros(0, 9, 3), torch.zeros(0, 9, 2), torch.zeros(0, 9), torch.tensor(3400.0))
+    empty = Problem(torch.zeros(0, 9, 3), torch.zeros(0, 9, 2), torch.zeros(0, 9), torch.tensor(3400.0))
     assert init(empty).pose.matrix.shape == (0, 4, 4)

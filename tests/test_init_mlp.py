@@ -8,7 +8,7 @@ from kornia.core.exceptions import BaseError, ShapeError
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import nn
 
-from kornia_pnpnet import Correspondences, MLPInit
+from kornia_pnpnet import Problem, MLPInit
 from kornia_pnpnet.init.mlp import rotation_about
 
 
@@ -16,7 +16,7 @@ def correspondences(n, batch=5, dtype=torch.float32, seed=0):
     generator = torch.Generator().manual_seed(seed)
     world = torch.randn(batch, n, 3, generator=generator, dtype=torch.float64).to(dtype)
     pixels = 1000 * torch.randn(batch, n, 2, generator=generator, dtype=torch.float64).to(dtype)
-    return Correspondences(world, pixels, torch.ones(batch, n, dtype=dtype), torch.tensor(3400.0, dtype=dtype))
+    return Problem(world, pixels, torch.ones(batch, n, dtype=dtype), torch.tensor(3400.0, dtype=dtype))
 
 
 def sizes(module):

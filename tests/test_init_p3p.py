@@ -10,10 +10,10 @@ import torch
 from kornia.core.exceptions import ShapeError, TypeCheckError
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix, normalize_points_with_intrinsics
 
-from kornia_pnpnet import Correspondences, Pose, Status, create_solver
+from kornia_pnpnet import Problem, Pose, Status, create_solver
 from kornia_pnpnet.data import SyntheticProblems
-from kornia_pnpnet.init import P3P, p3p
-from kornia_pnpnet.types import Hypotheses
+from kornia_pnpnet.propose.p3p import P3P, p3p
+from kornia_pnpnet.problem import Hypotheses
 
 DTYPES = (torch.float64, torch.float32)
 NEAR = 1e-6
@@ -238,7 +238,7 @@ def test_the_module_reads_normalised_correspondences():
     world_points, plane_points, _ = wide(50)
     focal = torch.tensor(3400.0, dtype=torch.float64)
     solver = P3P()
-    corr = Correspondences(world_points, focal * plane_points, torch.zeros(50, 3, dtype=torch.float64), focal)
+    corr = Problem(world_points, focal * plane_points, torch.zeros(50, 3, dtype=torch.float64), focal)
     assert_same_solutions(solver.hypotheses(corr), p3p(world_points, plane_points))
     assert P3P(**solver.config).sample_size == 3
 

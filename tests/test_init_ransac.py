@@ -12,7 +12,10 @@ from kornia_pnpnet import PnPNet, RobustWeightedLM, pose_errors, success
 from kornia_pnpnet.core.trees import map_tensors, take
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.geometry import transform
-from kornia_pnpnet.init import P3P, RANSAC, EPnP, SubsetSolver
+from kornia_pnpnet.propose.epnp import EPnP
+from kornia_pnpnet.propose.minimal import SubsetSolver
+from kornia_pnpnet.propose.p3p import P3P
+from kornia_pnpnet.propose.ransac import RANSAC
 from kornia_pnpnet.init.ransac.search import Search
 
 #: Thresholds for the noise of the protocol: 1 px and 0.05 m.

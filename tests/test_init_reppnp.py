@@ -6,10 +6,10 @@ import pytest
 import torch
 from init_helpers import assert_same, change, flattened
 
-from kornia_pnpnet import Correspondences, Normalize, Pose
+from kornia_pnpnet import Problem, Normalize, Pose
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.geometry import transform
-from kornia_pnpnet.init.reppnp import REPPnP
+from kornia_pnpnet.propose.reppnp import REPPnP
 from kornia_pnpnet.metrics import pose_errors, success
 
 
@@ -50,7 +50,7 @@ def test_a_view_through_a_telephoto_lens(dtype, max_error_deg, thickness, random
     pixels = 3400.0 * cam_points[..., :2] / cam_points[..., 2:]
     pixels[:, [2, 5, 11], 0] += 40.0  # more than a radius
     focal = torch.tensor(3400.0, dtype=dtype)
-    guess = REPPnP()(Correspondences(world.to(dtype), pixels.to(dtype), torch.ones(100, 20, dtype=dtype), focal))
+    guess = REPPnP()(Problem(world.to(dtype), pixels.to(dtype), torch.ones(100, 20, dtype=dtype), focal))
     errors = pose_errors(Pose(*(x.double() for x in guess.pose)), truth)
     right = guess.ok & (errors.rotation_error_deg < max_error_deg)
     assert right.double().mean() > 0.95
@@ -87,7 +87,7 @@ def test_gradcheck(reject_outliers, planar, make_problems, correspond):
 
     # All inputs near 1, so that one difference step suits all.
     def run(world, pixels, weights, focal):
-        guess = model(Correspondences(world, 1000.0 * pixels, weights, 1000.0 * focal))
+        guess = model(Problem(world, 1000.0 * pixels, weights, 1000.0 * focal))
         assert torch.equal(guess.weights, first.weights)
         return tuple(guess.pose)
 

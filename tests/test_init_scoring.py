@@ -5,15 +5,16 @@ from __future__ import annotations
 import pytest
 import torch
 
-from kornia_pnpnet import Correspondences, Pose
-from kornia_pnpnet.geometry import project, transform
+from kornia_pnpnet import Problem, Pose
+from kornia_pnpnet.geometry import transform
+from kornia_pnpnet.refine.residual import project
 from kornia_pnpnet.init.ransac.scoring import Scene, standardised_errors
-from kornia_pnpnet.refine.inliers import MAX_ERROR, Thresholds, judge
+from kornia_pnpnet.judge.inliers import MAX_ERROR, Thresholds, judge
 
 
 @pytest.fixture
 def scene(make_problems, correspond, perturb):
-    """Correspondences, ten poses of each problem that see most points, and thresholds."""
+    """Problem, ten poses of each problem that see most points, and thresholds."""
     corr, truth = correspond(make_problems(9, 7, outliers=2))
     poses = [perturb(truth, angle=0.3 * i, shift=0.4 * i, seed=i) for i in range(10)]
     stacked = Pose(torch.stack([p.rotation for p in poses], 1), torch.stack([p.translation for p in poses], 1))
@@ -65,7 +66,7 @@ def test_points_behind_the_camera_and_in_its_centre(scene):
     back = Pose(poses.rotation, poses.translation - torch.tensor([0.0, 0.0, 1e4], dtype=torch.float64))
     fast = Scene.make(corr, thresholds, torch.float32)
     assert (standardised_errors(fast, pack(fast, back)) == MAX_ERROR).all()
-    corr = Correspondences(torch.zeros(1, 4, 3), torch.ones(1, 4, 2), torch.ones(1, 4), torch.tensor(100.0))
+    corr = Problem(torch.zeros(1, 4, 3), torch.ones(1, 4, 2), torch.ones(1, 4), torch.tensor(100.0))
     fast = Scene.make(corr, Thresholds(torch.ones(1), torch.zeros(1)), torch.float32)
     pose = Pose(torch.eye(3)[None, None], torch.zeros(1, 1, 3))
     assert standardised_errors(fast, pack(fast, pose)).isfinite().all()

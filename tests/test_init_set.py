@@ -16,7 +16,7 @@ from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.init.set import _ENOUGH, _some_of
 from kornia_pnpnet.init.view import _same
-from kornia_pnpnet.types import Noise
+from kornia_pnpnet.problem import Noise
 
 NOISE = {"img_sigma": 1.0, "world_sigma": 0.05}
 
@@ -92,7 +92,7 @@ def test_samples_of_inliers_have_the_true_pose(n, outliers):
     options = {"n": n, "batch_size": 50, "seed": 1, "max_angle": math.pi, "dtype": torch.float64}
     mix = OutlierMix(count=outliers)
     p = SyntheticProblems(img_sigma=0.0, world_sigma=0.0, outliers=mix, **options).batch(0)
-    _, guess = solver().with_guess(*p[:3], mask=p.inliers, img_sigma=0.1, world_sigma=0.001)
+    _, guess = solver().with_starts(*p[:3], mask=p.inliers, img_sigma=0.1, world_sigma=0.001)
     sampled = Pose(guess.others.rotation[:, -1], guess.others.translation[:, -1])
     assert success(pose_errors(sampled, p.pose), 0.01, 0.01).double().mean() > 0.95
 
@@ -102,8 +102,8 @@ def test_padding_makes_and_judges_no_sample(make_problems, n, there):
     p = make_problems(n=n, batch=200, outliers=n // 3)
     mask = torch.arange(n).expand(200, n) < there
     net = solver()
-    padded = net.with_guess(*p[:3], mask=mask, **NOISE)[1]
-    alone = net.with_guess(p.world_points[:, :there], p.img_points[:, :there], p.intrinsics, **NOISE)[1]
+    padded = net.with_starts(*p[:3], mask=mask, **NOISE)[1]
+    alone = net.with_starts(p.world_points[:, :there], p.img_points[:, :there], p.intrinsics, **NOISE)[1]
     near(padded.others, alone.others)
 
 
@@ -140,15 +140,15 @@ def test_known_noise_is_used_as_it_is_and_unknown_noise_is_estimated(make_proble
     p = make_problems(n=9, batch=4)
     net = solver()
     sigma = torch.tensor([0.5, torch.nan, 2.0, torch.nan], dtype=torch.float64)
-    noise = net.with_guess(*p[:3], img_sigma=sigma)[1].noise
+    noise = net.with_starts(*p[:3], img_sigma=sigma)[1].noise
     known = ~sigma.isnan()
     torch.testing.assert_close(noise.img[known], sigma[known, None].expand(-1, 9))
-    estimated = net.with_guess(*p[:3])[1].noise
+    estimated = net.with_starts(*p[:3])[1].noise
     assert noise.img.isfinite().all()
     assert ((noise.world > 0) & noise.world.isfinite()).all()
     torch.testing.assert_close(noise.img[~known], estimated.img[~known])
     of_pairs = torch.rand(4, 9, dtype=torch.float64) + 0.1
-    torch.testing.assert_close(net.with_guess(*p[:3], world_sigma=of_pairs)[1].noise.world, of_pairs)
+    torch.testing.assert_close(net.with_starts(*p[:3], world_sigma=of_pairs)[1].noise.world, of_pairs)
 
 
 def test_it_learns():
@@ -168,7 +168,7 @@ def test_it_learns():
     for i in range(100):
         p = data.batch(i)
         optimizer.zero_grad()
-        result, guess = net.with_guess(*p[:3], **p.sigmas)
+        result, guess = net.with_starts(*p[:3], **p.sigmas)
         loss(result, p, 1.0, guess).total.backward()
         torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
         optimizer.step()
@@ -251,7 +251,7 @@ def test_memory_of_a_call_serves_the_next():
 
 
 def test_where_a_search_follows_the_network_sees_some_pairs_and_the_others_get_weights(make_problems):
-    """Guess and noise are those of a problem of these pairs alone; sigmas and confidences stay with their pairs."""
+    """Starts and noise are those of a problem of these pairs alone; sigmas and confidences stay with their pairs."""
     n = 3 * _ENOUGH
     p = make_problems(n=n, batch=50, outliers=n // 3)
     generator = torch.Generator().manual_seed(2)

@@ -37,7 +37,7 @@ def test_covariances_and_first_guesses_take_cameras(make_problems):
     known = {"img_sigma": 1.0}
     expected = pose_covariance(p.pose, *p[:3], **known)
     assert pose_covariance(p.pose, *p[:2], cameras(p.intrinsics), **known).equal(expected)
-    result, _ = PnPNet(None).with_guess(*p[:2], cameras(p.intrinsics), init=p.pose)
+    result, _ = PnPNet(None).with_starts(*p[:2], cameras(p.intrinsics), init=p.pose)
     assert result.matrix.equal(PnPNet(None)(*p[:3], init=p.pose).matrix)
 
 

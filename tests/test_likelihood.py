@@ -17,7 +17,7 @@ from kornia_pnpnet import (
     pose_errors,
 )
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
-from kornia_pnpnet.geometry import retract
+from kornia_pnpnet.refine.residual import retract
 
 DOUBLE = torch.float64
 

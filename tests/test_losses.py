@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from strategies import batches, finite, gradients_are_finite, many
 
-from kornia_pnpnet import Guess, Noise, PnPResult, Pose, PoseLoss, SetLoss, create_solver
+from kornia_pnpnet import Starts, Noise, PnPResult, Pose, PoseLoss, SetLoss, create_solver
 from kornia_pnpnet.data import SyntheticProblems
 from kornia_pnpnet.losses import pose_distances
 
@@ -102,7 +102,7 @@ def terms_of(loss, problems, refined, hypotheses, noise=None, weights=None, ramp
     stacked = Pose(*(torch.stack(parts, 1) for parts in zip(*others, strict=True))) if others else None
     weights = problems.inliers.double() if weights is None else weights
     result = solved(problems, first, refined)._replace(weights=weights)
-    return loss(result, problems, ramp, Guess(first, weights, result.ok, stacked, noise))
+    return loss(result, problems, ramp, Starts(first, weights, result.ok, stacked, noise))
 
 
 def test_a_perfect_set_result_costs_nothing(make_problems, perturb):
@@ -174,7 +174,7 @@ def test_losses_of_any_result(case):
         return
     truth = SyntheticProblems(n=inputs[0].shape[1], batch_size=len(kinds), dtype=inputs[0].dtype).batch(0)
     solver = SOLVER
-    result, guess = solver.with_guess(*inputs, weights=weights, mask=mask)
+    result, guess = solver.with_starts(*inputs, weights=weights, mask=mask)
     terms = [SetLoss()(result, truth, 1.0, guess), PoseLoss()(result, truth)]
     finite(terms)
     gradients_are_finite([x.total for x in terms], [x for x in inputs if x.requires_grad] or [SOLVER.refine.step.raw])

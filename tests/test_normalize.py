@@ -11,8 +11,10 @@ from kornia.geometry.conversions import normalize_points_with_intrinsics
 
 from kornia_pnpnet import MLPInit, Normalize, PnPNet, Pose, RobustWeightedLM
 from kornia_pnpnet.core.trees import iter_tensors
-from kornia_pnpnet.geometry import project, transform
-from kornia_pnpnet.normalize import F_CONST, VIEWS
+from kornia_pnpnet.geometry import transform
+from kornia_pnpnet.refine.residual import project
+from kornia_pnpnet.frame import F_CONST
+from kornia_pnpnet.propose.views import VIEWS
 
 DTYPES = (torch.float32, torch.float64)
 OPTIONS = [

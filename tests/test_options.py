@@ -28,9 +28,13 @@ from kornia_pnpnet.data import (
     SyntheticProblems,
     VaryingSize,
 )
-from kornia_pnpnet.init import P3P, RANSAC, EPnP, REPPnP, SubsetSolver
+from kornia_pnpnet.propose.epnp import EPnP
+from kornia_pnpnet.propose.minimal import SubsetSolver
+from kornia_pnpnet.propose.p3p import P3P
+from kornia_pnpnet.propose.ransac import RANSAC
+from kornia_pnpnet.propose.reppnp import REPPnP
 from kornia_pnpnet.peers import KorniaRs, OpenCVPnP, OpenCVRansac, OpenCVUsac, PeerSolver, PoseLib, PyColmap
-from kornia_pnpnet.refine import BoundedParameter
+from kornia_pnpnet.refine.parameters import BoundedParameter
 
 PROBLEMS = SyntheticProblems(n=12, batch_size=3, seed=0).batch(0)
 
@@ -56,7 +60,7 @@ def costs(loss, values):
     """The loss of a result is finite."""
     n9 = PROBLEMS._replace(world_points=PROBLEMS.world_points[:, :9], img_points=PROBLEMS.img_points[:, :9])
     n9 = n9._replace(inliers=PROBLEMS.inliers[:, :9])
-    result, guess = create_solver("pnpnet-set").with_guess(*n9[:3])
+    result, guess = create_solver("pnpnet-set").with_starts(*n9[:3])
     finite(loss(result, n9, 1.0, guess) if isinstance(loss, SetLoss) else loss(result, n9))
 
 

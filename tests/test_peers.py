@@ -14,7 +14,7 @@ from kornia_pnpnet import create_solver, pose_errors, success, success_rate
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.peers import KorniaRs, OpenCVPnP, OpenCVRansac, OpenCVUsac, PeerPose, PeerSolver, PoseLib, PyColmap
-from kornia_pnpnet.types import PnPResult, Problems
+from kornia_pnpnet.result import PnPResult, Problems
 
 pytest.importorskip("cv2")
 

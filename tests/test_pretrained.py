@@ -75,7 +75,7 @@ def test_weights_of_the_set_network_are_inlier_probabilities():
     for n in (6, 9, 20, 50):
         problems = SyntheticProblems(n=n, batch_size=2000, seed=555_013 + n, outliers=OutlierMix()).batch(0)
         with torch.no_grad():
-            _, guess = solver.with_guess(*problems[:3])
+            _, guess = solver.with_starts(*problems[:3])
         weights.append(guess.weights.flatten())
         right.append(problems.inliers.flatten())
     chance, truth = torch.cat(weights), torch.cat(right)

@@ -11,10 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import KINDS, are_rotations, correspondences, finite, gradients_are_finite, many, options, poses
 
-from kornia_pnpnet import Correspondences, Guess, Noise, Normalize, PnPNet, Pose, RobustWeightedLM, pose_errors
+from kornia_pnpnet import Problem, Starts, Noise, Normalize, PnPNet, Pose, RobustWeightedLM, pose_errors
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
-from kornia_pnpnet.geometry import NormalEquations, project, retract, retract_additive
-from kornia_pnpnet.refine import KERNELS, explains, lm_step, solve_damped
+from kornia_pnpnet.geometry import retract_additive
+from kornia_pnpnet.refine.residual import NormalEquations, project, retract
+from kornia_pnpnet.core.linalg import solve_positive
+from kornia_pnpnet.judge.belief import explains
+from kornia_pnpnet.refine.kernels import KERNELS
+from kornia_pnpnet.refine.residual import lm_step
 from kornia_pnpnet.refine.lm import BACKWARDS
 
 DTYPES = (torch.float32, torch.float64)
@@ -25,12 +29,12 @@ SMOOTH = [name for name in KERNELS if name != "truncated"]
 def guess(pose, corr, *others):
     """A guess with unit weights and, optionally, other poses to start from."""
     more = map_tensors(lambda *poses: torch.stack(poses, 1), *others) if others else None
-    return Guess(pose, torch.ones_like(corr.weights), others=more)
+    return Starts(pose, torch.ones_like(corr.weights), others=more)
 
 
 def of_pairs(function, corr):
     """The correspondences with a function applied to points, pixels and weights."""
-    return Correspondences(*map(function, (corr.world_points, corr.img_points, corr.weights)), corr.focal)
+    return Problem(*map(function, (corr.world_points, corr.img_points, corr.weights)), corr.focal)
 
 
 def number(value, dtype=torch.float64):
@@ -38,9 +42,9 @@ def number(value, dtype=torch.float64):
 
 
 def solve(hessian, rhs, damping):
-    """``solve_damped`` of matrices (B, D, D) and vectors (B, D)."""
+    """``solve_positive`` of matrices (B, D, D) and vectors (B, D)."""
     rows = [row.unbind(-1)[: i + 1] for i, row in enumerate(hessian.unbind(1))]
-    solution, solved = solve_damped(NormalEquations(rows, rhs.unbind(-1)), damping)
+    solution, solved = solve_positive(NormalEquations(rows, rhs.unbind(-1)), damping)
     return torch.stack(solution, -1), solved
 
 
@@ -62,7 +66,7 @@ def assert_close(one, two, rtol=1e-9, atol=1e-9):
 
 @pytest.fixture
 def case(make_problems, correspond, perturb):
-    """Correspondences, their true pose, and a pose ``near`` radians and units away from it."""
+    """Problem, their true pose, and a pose ``near`` radians and units away from it."""
 
     def make(n=9, batch=7, *, near=0.05, dtype=torch.float64, **options):
         corr, truth = correspond(make_problems(n, batch, **options))
@@ -277,7 +281,7 @@ def test_explains_compares_two_weighted_quantiles(n, unit, dtype, generator):
     # Points whose projections by the identity are the pixels plus the residuals, at depth 1 or -1.
     plane = torch.stack((pixels[..., 0] + residual, pixels[..., 1]), -1) / 100.0
     world = torch.cat((plane, in_front[..., None].to(dtype) * 2 - 1), -1)
-    corr = Correspondences(world, pixels, torch.ones(batch, n, dtype=dtype), number(100.0, dtype))
+    corr = Problem(world, pixels, torch.ones(batch, n, dtype=dtype), number(100.0, dtype))
     pose = Pose(torch.eye(3, dtype=dtype).expand(batch, 3, 3), torch.zeros(batch, 3, dtype=dtype))
 
     total = prior.sum(-1, keepdim=True)
@@ -382,7 +386,7 @@ def test_integer_weights_equal_repeating_and_zero_equals_removing(kernel, update
     lm = RobustWeightedLM(m=3, kernel=kernel, update=update)
     expected = lm(repeated, guess(start, repeated))
     given = lm(corr._replace(weights=weights), guess(start, corr))
-    guessed = lm(corr, Guess(start, weights))
+    guessed = lm(corr, Starts(start, weights))
     for refined in (given, guessed):
         assert_close(refined.pose, expected.pose)
         ends = times.cumsum(0)[there] - 1  # the last copy of each pair
@@ -424,9 +428,9 @@ def test_iterations_by_residual_ignore_the_guessed_weights_but_not_the_given_one
     corr, _, start = case(outliers=2)
     doubt = torch.rand(7, 9, generator=generator, dtype=torch.float64)
     lm = RobustWeightedLM(m=3, by_residual=1, backward=backward, reject_worse=False)
-    first = RobustWeightedLM(m=2, reject_worse=False)(corr, Guess(start, doubt)).pose
+    first = RobustWeightedLM(m=2, reject_worse=False)(corr, Starts(start, doubt)).pose
     for weights in (torch.ones_like(doubt), doubt.flip(1)):
-        refined = lm(corr._replace(weights=weights), Guess(start, doubt / weights))
+        refined = lm(corr._replace(weights=weights), Starts(start, doubt / weights))
         last = RobustWeightedLM(m=1, reject_worse=False)(corr._replace(weights=weights), guess(first, corr))
         assert_close(refined, last, rtol=1e-7)
 
@@ -528,8 +532,8 @@ def test_gradcheck_through_the_unrolled_iterations(kernel, shared, update, case,
 
     # Pixels and world points near 1, so that one difference step suits all.
     def run(world, pixels, weights, factor, tangent, *raw):
-        moved = Correspondences(world, 1000.0 * pixels, weights, corr.focal)
-        first = Guess(retract(start, tangent), factor)
+        moved = Problem(world, 1000.0 * pixels, weights, corr.focal)
+        first = Starts(retract(start, tangent), factor)
         refined = torch.func.functional_call(lm, dict(zip(names, raw, strict=True)), (moved, first))
         return (*refined.pose, refined.weights, refined.cost)
 
@@ -644,7 +648,7 @@ def test_implicit_gradients_do_not_depend_on_the_unit_of_pixels(make_problems, p
         corr, frame = normalize(*p[:3])
         rays = (corr.img_points / focal).detach().requires_grad_()
         refine = RobustWeightedLM(1, kernel="cauchy", robustness=0.005 * focal, backward="implicit").double()
-        guess = Guess(normalize.apply_to_pose(start, frame), torch.ones_like(corr.weights))
+        guess = Starts(normalize.apply_to_pose(start, frame), torch.ones_like(corr.weights))
         refined = refine(corr._replace(img_points=focal * rays), guess)
         gradients.append(torch.autograd.grad(refined.pose.translation.sum(), rays)[0])
     # The scale of the kernel is stored in float32.
@@ -722,7 +726,7 @@ def test_unlearned_hyperparameters_take_no_gradient(case):
 
 @pytest.fixture
 def near_and_far(case, perturb):
-    """Correspondences, a pose near the truth and one far from it."""
+    """Problem, a pose near the truth and one far from it."""
 
     def make(**options):
         corr, truth, _ = case(**options)
@@ -815,7 +819,7 @@ def test_refinements_take_anything(case, m, chosen, data):
     corr, tensors = case
     refine = RobustWeightedLM(m, **chosen).to(corr.world_points.dtype)
     pose = data.draw(poses(len(corr.world_points), corr.world_points.dtype))
-    refined = refine(corr, Guess(pose, torch.ones_like(corr.weights)))
+    refined = refine(corr, Starts(pose, torch.ones_like(corr.weights)))
     finite(refined)
     are_rotations(refined.pose.rotation)
     gradients_are_finite(

@@ -16,10 +16,11 @@ from kornia_pnpnet import (
     gravity_prior,
     pose_errors,
 )
-from kornia_pnpnet.geometry import project, retract
+from kornia_pnpnet.refine.residual import project, retract
 from kornia_pnpnet.metrics import success
 from kornia_pnpnet.refine.prior import prior_errors, prior_in_frame, prior_loss
-from kornia_pnpnet.types import Correspondences, Status
+from kornia_pnpnet.problem import Problem
+from kornia_pnpnet.result import Status
 
 SIGMA = math.radians(1.0)
 TOLD = {"img_sigma": 1.0, "world_sigma": 0.05}
@@ -71,7 +72,7 @@ def test_pose_is_a_minimum_of_the_whole_cost(kind, make_problems, generator):
     one = torch.ones(20, dtype=torch.float64)
     framed, _ = prior_in_frame(prior, torch.zeros(20, 3, dtype=torch.float64), one, one)
     focals, centre = problems.intrinsics[:, :1, 0], problems.intrinsics[:, None, :2, 2]
-    corr = Correspondences(problems.world_points, problems.img_points - centre, one[:, None].expand(20, 8), one[0])
+    corr = Problem(problems.world_points, problems.img_points - centre, one[:, None].expand(20, 8), one[0])
     delta = torch.zeros(20, 6, dtype=torch.float64, requires_grad=True)
     pose = retract(result.pose, delta)
     plane = torch.stack(project(pose, corr).plane_points, -1)

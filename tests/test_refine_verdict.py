@@ -10,20 +10,14 @@ from unittest import mock
 import pytest
 import torch
 
-from kornia_pnpnet import Correspondences, Pose, create_solver, pose_errors
+from kornia_pnpnet import Problem, Pose, create_solver, pose_errors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
-from kornia_pnpnet.geometry import project, transform
+from kornia_pnpnet.geometry import transform
+from kornia_pnpnet.refine.residual import project
 from kornia_pnpnet.refine import scale
-from kornia_pnpnet.refine.inliers import (
-    MAX_ERROR,
-    Judged,
-    Thresholds,
-    chance_of_inlier,
-    chance_of_others,
-    judge,
-    log_false_alarms,
-)
-from kornia_pnpnet.refine.verdict import LAWS, LEAST_PROBABILITY
+from kornia_pnpnet.judge.inliers import Judged, MAX_ERROR, Thresholds, judge, log_false_alarms
+from kornia_pnpnet.refine.inliers import chance_of_inlier, chance_of_others
+from kornia_pnpnet.judge.belief import LAWS, LEAST_PROBABILITY
 
 
 def test_inliers_weigh_by_the_inverse_of_their_threshold(make_problems, correspond):
@@ -58,7 +52,7 @@ def test_inliers_weigh_by_the_inverse_of_their_threshold(make_problems, correspo
     ids=["a disc in a box", "a strip of a thin box", "at most 1"],
 )
 def test_chance_is_the_share_of_the_box(pixels, errors, expected):
-    corr = Correspondences(torch.zeros(1, 3, 3), torch.tensor([pixels]), torch.ones(1, 3), torch.tensor(100.0))
+    corr = Problem(torch.zeros(1, 3, 3), torch.tensor([pixels]), torch.ones(1, 3), torch.tensor(100.0))
     thresholds = Thresholds(torch.tensor([10.0]), torch.zeros(1))
     judged = Judged(torch.ones(1, 3), torch.tensor([errors]))
     assert chance_of_inlier(corr, thresholds, judged).item() == pytest.approx(expected)
@@ -70,7 +64,7 @@ def test_outliers_close_to_their_projections_make_a_fit_likely_by_chance():
     """Two of five other pairs are outliers within thirty radii of the worst inlier's disc."""
     pixels = torch.zeros(1, 8, 2, dtype=torch.float64)
     pixels[0, 0], pixels[0, 1] = 1e4, -1e4
-    corr = Correspondences(pixels.new_zeros(1, 8, 3), pixels, pixels.new_ones(1, 8), pixels.new_tensor(100.0))
+    corr = Problem(pixels.new_zeros(1, 8, 3), pixels, pixels.new_ones(1, 8), pixels.new_tensor(100.0))
     thresholds = Thresholds(pixels.new_tensor([1.0]), pixels.new_tensor([0.0]))
     weights = pixels.new_tensor([[1.0, 1, 1, 1, 1, 1, 0, 0]])
 
@@ -173,7 +167,7 @@ def test_padding_does_not_change_the_chance_of_others(generator):
         far = torch.full((1, padding, 2), 1e3, dtype=torch.float64)
         weights = torch.cat((torch.ones(1, 40), torch.zeros(1, padding)), 1).double()
         world = torch.cat((points, torch.ones(1, padding, 3, dtype=torch.float64)), 1)
-        corr = Correspondences(world, torch.cat((pixels + 9.0, far), 1), weights, torch.tensor(100.0).double())
+        corr = Problem(world, torch.cat((pixels + 9.0, far), 1), weights, torch.tensor(100.0).double())
         projection = project(pose, corr)
         judged = judge(projection, corr, thresholds)
         chances.append(chance_of_others(projection, corr, thresholds, judged))

@@ -24,7 +24,7 @@ from kornia_pnpnet import (
     success,
 )
 from kornia_pnpnet.data import SyntheticProblems
-from kornia_pnpnet.init import p3p
+from kornia_pnpnet.propose.p3p import p3p
 from kornia_pnpnet.losses import pose_distances
 from kornia_pnpnet.metrics import PoseErrors, reliability
 
@@ -129,7 +129,7 @@ def test_solvers_stay_where_their_inputs_are(name):
     @given(st.sampled_from(DEVICES), calls(9 if name.endswith("-n9") else None))
     def run(device, case):
         call, _ = case
-        result, guess = solvers[device].with_guess(**moved(call, device, call))
+        result, guess = solvers[device].with_starts(**moved(call, device, call))
         expected = SOLVERS[name](**call)
         for ours, there in zip((*result[:5], *result.init), (*expected[:5], *expected.init), strict=True):
             assert ours.device.type == guess.weights.device.type == device
@@ -150,7 +150,7 @@ def test_inputs_on_different_devices_are_an_error_of_ours(name, device, case, da
 def functions_of_tensors():
     """Public functions of tensors, with some that they take."""
     problems = SyntheticProblems(n=9, batch_size=3, seed=0).batch(0)
-    result, guess = SOLVERS["pnpnet-set"].with_guess(*problems[:3])
+    result, guess = SOLVERS["pnpnet-set"].with_starts(*problems[:3])
     inputs, both, each = problems[:3], (*result.pose, *problems.pose), torch.full((3, 9), 0.5)
 
     def loss(function, *parts):

@@ -16,7 +16,7 @@ from strategies import NO_POSE, STRANGE
 from torch.utils import _pytree as pytree
 
 from kornia_pnpnet import (
-    Guess,
+    Starts,
     MLPInit,
     Normalize,
     PnPNet,
@@ -32,7 +32,7 @@ from kornia_pnpnet import (
 )
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.data import OutlierMix, SlabPoints, SyntheticProblems
-from kornia_pnpnet.init import EPnP
+from kornia_pnpnet.propose.epnp import EPnP
 from kornia_pnpnet.metrics import success
 
 DTYPES = (torch.float32, torch.float64)
@@ -424,16 +424,16 @@ def test_a_network_may_see_repeats(make_problems):
     blind, seeing = (PnPNet(SetInit(repeats=sees), normalize=Normalize(order=False)) for sees in (False, True))
     seeing.init.first.weight.data[:, :14] = blind.init.first.weight.data
     seeing.load_state_dict({k: v for k, v in blind.state_dict().items() if k != "init.first.weight"}, strict=False)
-    weights = [net.with_guess(problems[0], pixels, problems[2])[1].weights for net in (blind, seeing)]
+    weights = [net.with_starts(problems[0], pixels, problems[2])[1].weights for net in (blind, seeing)]
     assert (weights[0] != weights[1]).all()
-    distinct = [net.with_guess(*problems[:3])[1].weights for net in (blind, seeing)]
+    distinct = [net.with_starts(*problems[:3])[1].weights for net in (blind, seeing)]
     assert torch.allclose(*distinct)
     order = torch.arange(12).flip(0)
-    shuffled = seeing.with_guess(problems[0][:, order], pixels[:, order], problems[2])[1].weights
+    shuffled = seeing.with_starts(problems[0][:, order], pixels[:, order], problems[2])[1].weights
     assert torch.allclose(shuffled.flip(1), weights[1])
     mask = torch.arange(15) < 12
     padded = [torch.cat((x, x[:, -1:].expand(-1, 3, -1)), 1) for x in (problems[0], pixels)]
-    padded = seeing.with_guess(*padded, problems[2], mask=mask.expand(len(pixels), -1))[1].weights
+    padded = seeing.with_starts(*padded, problems[2], mask=mask.expand(len(pixels), -1))[1].weights
     assert torch.allclose(padded[:, :12], weights[1])
 
 
@@ -441,15 +441,15 @@ def test_a_network_may_see_the_confidence(make_problems, generator):
     problems = make_problems(12)
     confidence = believed(problems, generator).requires_grad_()
     blind, seeing = (PnPNet(SetInit(confidence=sees), normalize=Normalize(order=False)) for sees in (False, True))
-    result, guess = seeing.with_guess(*problems[:3], confidence=confidence)
+    result, guess = seeing.with_starts(*problems[:3], confidence=confidence)
     (gradient,) = torch.autograd.grad(guess.weights.sum(), confidence)
     assert gradient.isfinite().all()
     assert gradient.any()
     order = torch.randperm(12, generator=generator)
     shuffled = seeing(problems[0][:, order], problems[1][:, order], problems[2], confidence=confidence[:, order])
     assert torch.allclose(shuffled.translation, result.translation, rtol=1e-6, atol=1e-6)
-    assert not torch.equal(seeing.with_guess(*problems[:3])[1].weights, guess.weights)
-    same = [blind.with_guess(*problems[:3], confidence=c)[1].weights for c in (None, confidence)]
+    assert not torch.equal(seeing.with_starts(*problems[:3])[1].weights, guess.weights)
+    same = [blind.with_starts(*problems[:3], confidence=c)[1].weights for c in (None, confidence)]
     assert torch.equal(*same)
 
 
@@ -541,7 +541,7 @@ def test_any_leading_dimensions(name, make_problems):
     assert_same(one, only(2, batch), rtol=1e-6, atol=1e-6)
     if ours:
         sigma = torch.ones(9).double()
-        _, guess = solver.with_guess(p.world_points[2], p.img_points[2], p.intrinsics[2], img_sigma=sigma)
+        _, guess = solver.with_starts(p.world_points[2], p.img_points[2], p.intrinsics[2], img_sigma=sigma)
         assert guess.weights.shape == (9,)
     with pytest.raises(ShapeError, match=r"weights.*\(2, 3, 9\).*\(6, 9\)"):
         solver(
@@ -752,7 +752,7 @@ def test_an_initialiser_of_ones_own(make_problems, tmp_path):
         def forward(self, corr):
             batch = corr.weights.shape[0]
             eye = torch.eye(3).to(corr.weights).expand(batch, 3, 3)
-            return Guess(Pose(eye, corr.weights.new_zeros(batch, 3)), torch.ones_like(corr.weights))
+            return Starts(Pose(eye, corr.weights.new_zeros(batch, 3)), torch.ones_like(corr.weights))
 
     solver = PnPNet(Identity(), RobustWeightedLM(m=2))
     assert solver(*make_problems()[:3]).matrix.shape == (7, 4, 4)
@@ -766,7 +766,7 @@ def test_an_initialiser_without_a_guess_fails_its_problem_alone(make_problems):
     class Truth(torch.nn.Module):
         def forward(self, corr):
             ok = torch.arange(len(corr.weights)) != 2
-            return Guess(pose, torch.ones_like(corr.weights), ok)
+            return Starts(pose, torch.ones_like(corr.weights), ok)
 
     p = make_problems()
     normalize = Normalize()

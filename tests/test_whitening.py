@@ -25,7 +25,7 @@ from kornia_pnpnet import (
 )
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.evaluation.bounds import KnownInliersAndNoise
-from kornia_pnpnet.geometry import retract
+from kornia_pnpnet.refine.residual import retract
 
 DOUBLE = torch.float64
 CAMERA = torch.tensor([[800.0, 30.0, 320.0], [0.0, 1000.0, 240.0], [0.0, 0.0, 1.0]], dtype=DOUBLE)

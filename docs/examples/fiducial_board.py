@@ -22,7 +22,7 @@ from kornia_pnpnet import Pose, create_solver
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.evaluation.figures.style import BLUE, ORANGE, make_figure, save
 from kornia_pnpnet.evaluation.results import save_results
-from kornia_pnpnet.geometry import rotation_angle
+from kornia_pnpnet.refine.residual import rotation_angle
 
 SQUARES, SQUARE, MARKER = (7, 5), 0.04, 0.03  # metres
 PIXELS_PER_SQUARE, SIZE, FOCAL = 60, (640, 480), 700.0

@@ -24,7 +24,7 @@ from kornia_pnpnet.data.draws import batch_generator, random_poses
 from kornia_pnpnet.evaluation.figures.style import BLUE, GREEN, ORANGE, make_figure, save, themed
 from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.losses import pose_distances
-from kornia_pnpnet.types import Pose
+from kornia_pnpnet.result import Pose
 
 KEYPOINTS, BATCH, WRONG = 12, 64, 0.3
 FOCAL, CENTRE, PIXEL_NOISE, BIAS = 800.0, 320.0, 1.0, 12.0

@@ -40,7 +40,7 @@ from kornia_pnpnet import PnPResult, Pose, create_solver, heatmap_keypoints
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.evaluation.figures.style import BLUE, ORANGE, VERMILION, make_figure, save, themed
 from kornia_pnpnet.evaluation.results import save_results
-from kornia_pnpnet.geometry import rotation_angle
+from kornia_pnpnet.refine.residual import rotation_angle
 
 SIZE, FOCAL, BATCH = 64, 90.0, 32
 CAMERA = torch.tensor([[FOCAL, 0.0, (SIZE - 1) / 2], [0.0, FOCAL, (SIZE - 1) / 2], [0.0, 0.0, 1.0]])

@@ -45,7 +45,7 @@ from kornia_pnpnet.confidence import Calibration, fit_confidence
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.evaluation.figures.style import BLUE, make_figure, save, themed
 from kornia_pnpnet.evaluation.results import save_results
-from kornia_pnpnet.geometry import rotation_angle
+from kornia_pnpnet.refine.residual import rotation_angle
 
 LONGEST = 1600  # pixels; larger images are shrunk for the features
 EVERY = 5  # every fifth image of a model is a query

@@ -33,7 +33,7 @@ from kornia_pnpnet import PnPNet, Pose, PosePrior, RobustWeightedLM, create_solv
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.evaluation.figures.style import BLUE, GREEN, ORANGE, VERMILION, make_figure, save, themed
 from kornia_pnpnet.evaluation.results import save_results
-from kornia_pnpnet.geometry import rotation_angle
+from kornia_pnpnet.refine.residual import rotation_angle
 
 KEYFRAME = 15  # frames from one keyframe to the next
 PAIRS = (3, 4, 6, 10, 30, 100)  # matches of a frame that the solver gets

@@ -23,7 +23,7 @@ from kornia_pnpnet.metrics import reliability, success_rate
 from kornia_pnpnet.pretrained import WEIGHTS_FOLDER, shipped_weights
 from kornia_pnpnet.training.collect import collect_weights
 from kornia_pnpnet.training.results import load_run
-from kornia_pnpnet.types import PnPResult, Problems
+from kornia_pnpnet.result import PnPResult, Problems
 
 __all__ = ["ANY", "CHI_SQUARE_95", "HERE", "OURS", "PAPER", "PEERS", "RESULTS", "ROBUST", "compare", "measure", "ship"]
 
@@ -306,7 +306,7 @@ def measure_honesty(count: int) -> None:
     diagrams = {}
     for name, entry in sets.items():
         problems = entry.problems
-        _, guess = solver.with_guess(problems.world_points, problems.img_points, problems.intrinsics)
+        _, guess = solver.with_starts(problems.world_points, problems.img_points, problems.intrinsics)
         found = reliability(guess.weights, problems.inliers)
         lists = {key: x.nan_to_num(0.0).tolist() for key, x in found._asdict().items()}
         diagrams[name] = {**lists, "error": found.expected_error}

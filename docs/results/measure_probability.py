@@ -22,7 +22,7 @@ from kornia_pnpnet.evaluation.named_solvers import load_solver
 from kornia_pnpnet.metrics import pose_errors, reliability, success_rate
 from kornia_pnpnet.refine import verdict
 from kornia_pnpnet.refine.scale import larger_sigma
-from kornia_pnpnet.types import PnPResult, Problems
+from kornia_pnpnet.result import PnPResult, Problems
 
 __all__ = ["measure_probability"]
 
