@@ -35,8 +35,8 @@ from kornia_pnpnet.core.files import read_npz
 from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.data.colmap import _find_model
 from kornia_pnpnet.evaluation.bounds import Bound
-from kornia_pnpnet.evaluation.figures.style import BLUE, GREY, ORANGE, WIDTH, make_figure, save
 from kornia_pnpnet.evaluation.named_solvers import load_solver
+from kornia_pnpnet.evaluation.plots import BLUE, GREY, ORANGE, WIDTH, make_figure, save
 from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.metrics import reliability
 from kornia_pnpnet.peers.base import PeerSolver

@@ -1,6 +1,5 @@
 """What type checkers see, and what :mod:`kornia_pnpnet` imports at the first use of each name."""
 
-from .confidence import Calibration as Calibration, fit_confidence as fit_confidence
 from .covariance import pose_covariance as pose_covariance
 from .init import MLPInit as MLPInit, SetInit as SetInit, p3p as p3p
 from .likelihood import (

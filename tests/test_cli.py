@@ -197,7 +197,7 @@ def test_no_pose_is_exit_code_one_with_the_reason(capsys, tmp_path):
 
 
 def test_plot_draws_a_picture(capsys, csv_file, tmp_path):
-    pytest.importorskip("seaborn")
+    pytest.importorskip("matplotlib")
     picture = tmp_path / "sub" / "pose.png"
     answer(capsys, csv_file, "--intrinsics", CAMERA, "--solver", "identity-lm", "--plot", picture)
     assert picture.read_bytes().startswith(b"\x89PNG")
@@ -365,7 +365,7 @@ def test_help_and_version(capsys):
 
 
 def test_evaluate_writes_what_it_prints(capsys, tmp_path, shipped):
-    pytest.importorskip("seaborn")
+    pytest.importorskip("matplotlib")
     out_file, pictures = tmp_path / "results.json", tmp_path / "pictures"
     code, out, err = run(
         capsys, "evaluate", "--outliers", "none,uniform,2", "--problems", 20, "--out", out_file, "--plot", pictures
@@ -501,27 +501,6 @@ def test_an_error_in_a_solver_says_where(capsys, tmp_path, monkeypatch):
     assert "broken on synthetic, n = 9, 0 outliers" in err
 
 
-def test_figures_prints_what_it_draws(capsys, tmp_path):
-    pytest.importorskip("seaborn")
-    out_file, folder = tmp_path / "results.json", tmp_path / "figures"
-    solvers = ("identity-lm", "known-inliers")
-    run(capsys, "evaluate", "--problems", 5, "--n", "6,9", "--solver", *solvers, "--out", out_file)
-    code, out, err = run(capsys, "figures", out_file, "--out", folder)
-    assert (code, err) == (0, "")
-    drawn = out.splitlines()
-    assert drawn
-    assert sorted(drawn) == sorted(str(path) for path in folder.iterdir())
-
-
-def test_figures_refuses_in_one_line(capsys, tmp_path):
-    pytest.importorskip("seaborn")
-    no_results = tmp_path / "other.json"
-    no_results.write_text('{"success": 1}')
-    for path in (no_results, tmp_path / "missing.json"):
-        assert str(path) in refused(capsys, "figures", path, "--out", tmp_path / "figures")
-    assert not (tmp_path / "figures").exists()
-
-
 def test_list_names_solvers_and_missing_packages(capsys, shipped, monkeypatch):
     code, out, _ = run(capsys, "list")
     assert code == 0
@@ -534,7 +513,7 @@ def test_list_names_solvers_and_missing_packages(capsys, shipped, monkeypatch):
 
 
 def test_demo_compares_trains_and_draws(capsys, tmp_path, monkeypatch):
-    pytest.importorskip("seaborn")
+    pytest.importorskip("matplotlib")
     asked = []
 
     def train_briefly(seconds, folder):

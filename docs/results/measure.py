@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import torch
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
+from operations import complexity_results
 from torch import nn
 
 from kornia_pnpnet import PnPNet, RobustWeightedLM, pose_covariance
@@ -16,7 +17,6 @@ from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.core.files import write_json
 from kornia_pnpnet.evaluation import EvaluationData, evaluate
 from kornia_pnpnet.evaluation.named_solvers import load_solver
-from kornia_pnpnet.evaluation.operations import complexity_results
 from kornia_pnpnet.evaluation.problem_sets import evaluation_sets
 from kornia_pnpnet.evaluation.results import format_table, load_results, save_results
 from kornia_pnpnet.metrics import reliability, success_rate

@@ -52,8 +52,8 @@ def run(arguments: argparse.Namespace) -> int:
     import torch
 
     from kornia_pnpnet.evaluation import evaluate, format_table, save_results
-    from kornia_pnpnet.evaluation.figures import plot_errors, plot_success, plot_training
     from kornia_pnpnet.evaluation.named_solvers import default_solvers, load_solver
+    from kornia_pnpnet.evaluation.plots import plot_errors, plot_success, plot_training
     from kornia_pnpnet.evaluation.problem_sets import evaluation_sets
 
     sources = [arguments.data or "synthetic"]
@@ -115,7 +115,7 @@ def _draw_one(path: Path, name: str, solver: nn.Module, entry: EvaluationData) -
     import torch
 
     from kornia_pnpnet.cli.reprojection import reproject
-    from kornia_pnpnet.evaluation.figures import plot_pose
+    from kornia_pnpnet.evaluation.plots import plot_pose
 
     outliers = (~entry.problems.inliers).sum(-1)
     index = int((outliers == outliers.max()).int().argmax())

@@ -110,7 +110,7 @@ def run(arguments: argparse.Namespace) -> int:
     print(format_table(results))
     print(f"\nResults: {out}" + (f" ({found} of {len(results['rows'])} rows were there)" if found else ""))
     if arguments.plot:
-        from kornia_pnpnet.evaluation.figures import plot_errors, plot_success
+        from kornia_pnpnet.evaluation.plots import plot_errors, plot_success
 
         folder = Path(arguments.plot)
         pictures = plot_success(folder / "success.png", results), plot_errors(folder / "errors.png", results)

@@ -218,7 +218,7 @@ def _solve_image(arguments: argparse.Namespace, camera: Tensor | None) -> int:
     }
     print(json.dumps(answer, indent=2, allow_nan=False))
     if arguments.plot:
-        from kornia_pnpnet.evaluation.figures import plot_pose
+        from kornia_pnpnet.evaluation.plots import plot_pose
 
         plot_pose(
             arguments.plot, matches.img_points, found.pixels, rejected, title=name if ok else f"{name}: NOT SOLVED"
