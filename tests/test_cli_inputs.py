@@ -3,6 +3,7 @@
 import io
 import json
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -69,29 +70,6 @@ def test_damaged_files_are_a_line_and_no_traceback(kind, tmp_path):
     check_file()
 
 
-@many(300)
-@given(
-    st.lists(
-        st.tuples(st.sampled_from(["--intrinsics", "--solver", "--threshold", "--batch-size", "--batch", ""]), WORDS),
-        max_size=4,
-    ),
-    st.one_of(WORDS, st.none()),
-)
-def test_any_arguments_are_a_line_and_no_traceback(tmp_path_factory, options, file):
-    """Of a file that is not there, or of a sound one."""
-    sound = tmp_path_factory.getbasetemp() / "sound.csv"
-    if not sound.exists():
-        sound.write_bytes(problem_file("csv")[0])
-    arguments = [x for pair in options for x in pair if x]
-    code, out, err = run_main("solve", *arguments, "--", str(sound) if file is None else file)
-    if code == 2:
-        assert err.startswith("pnpnet: ")
-        assert err.count("\n") == 1
-    else:
-        assert file is None
-        assert json.loads(out)["n"] == 9
-
-
 def test_spoiled_results_are_a_line_and_no_traceback(tmp_path, drawn):
     made, path = tmp_path / "results.json", tmp_path / "spoiled.json"
     arguments = "evaluate", "--solver", "epnp", "--problems", "20", "--n", "9,12", "--outliers", "none,3", "--out"
@@ -118,6 +96,7 @@ def test_spoiled_results_are_a_line_and_no_traceback(tmp_path, drawn):
 
 #: What each needs to be quick, and what it can be given.
 COMMANDS = {
+    "solve": (("sound.csv", "--intrinsics", "3400,3400,960,540"), "--solver --threshold --batch-size --focal --camera"),
     "evaluate": (("--solver", "epnp", "--problems", 3), "--solver --data --n --outliers --seed --dtype --plot"),
     "export": (("--solver", "p3p-ransac"), "--n"),
     "list": ((), "--x"),
@@ -130,8 +109,9 @@ SAID = WORDS | st.sampled_from(
 )
 
 
-def test_any_arguments_of_other_commands_are_a_line_and_no_traceback(tmp_path, monkeypatch):
+def test_any_arguments_are_a_line_and_no_traceback(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    Path("sound.csv").write_bytes(problem_file("csv")[0])
     # No argument changes how a figure is drawn.
     monkeypatch.setattr(pytest.importorskip("matplotlib.figure").Figure, "savefig", lambda *_, **__: None)
     codes = Counter()
@@ -144,7 +124,7 @@ def test_any_arguments_of_other_commands_are_a_line_and_no_traceback(tmp_path, m
         files = data.draw(st.lists(SAID, max_size=1))
         code, out, err = run_main(name, *quick, *(x for pair in pairs for x in pair), *files)
         codes[name, code] += 1
-        assert code in (0, 2)
+        assert code in (0, 1, 2)
         if code == 2:
             assert err.startswith("pnpnet: ")
             assert err.count("\n") == 1
@@ -153,4 +133,5 @@ def test_any_arguments_of_other_commands_are_a_line_and_no_traceback(tmp_path, m
 
     run()
     assert all(codes[name, 2] for name in COMMANDS)
-    assert all(codes[name, 0] for name in ("evaluate", "list", "demo"))  # what others need is not among the words
+    # What `export` needs is not among the words.
+    assert all(codes[name, 0] for name in ("solve", "evaluate", "list", "demo"))

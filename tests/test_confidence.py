@@ -24,7 +24,7 @@ def test_fitted_confidences_find_poses_among_many_outliers(generator):
     calibration = isotonic.IsotonicRegression(y_min=0.01, y_max=0.99, increasing="auto", out_of_bounds="clip")
     calibration.fit(ratios(known.inliers, generator).ravel(), known.inliers.ravel())
     scores = ratios(problems.inliers, generator)
-    fitted = torch.from_numpy(calibration.predict(scores.ravel())).reshape(scores.shape)
+    fitted = torch.from_numpy(calibration.predict(scores.ravel())).reshape(scores.shape).float()
     solver = create_solver("p3p-ransac", max_samples=300)
     rates = {}
     for name, confidence in {"none": None, "raw": 1.0 - scores, "fitted": fitted}.items():
