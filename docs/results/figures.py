@@ -64,11 +64,9 @@ _LOOKS = {
     "known-inliers": ("k", "", "-."), "known-inliers-and-noise": ("k", "", ":"),
 }
 # fmt: on
-_MORE = (("#882255", "d"), ("#44AA99", "8"), ("#999933", "H"), ("#6644AA", "P"))
-_OTHERS = [(colour, marker, line) for line in ("-", "--", ":") for colour, marker in _MORE]
+_OTHERS = [(colour, "d", line) for line in ("-", "--", ":") for colour in ("#882255", "#44AA99", "#999933", "#6644AA")]
 _LETTERS, _HANDLE = 112, 11  # of a legend: letters across the page, and letters that a piece of line takes
 _ROW = 0.165  # inches from one solver to the next: a line of letters
-_WITH_NUMBERS = 3  # largest number of panels side by side that each have room for numbers
 _MOST_TICKS = 6  # largest number of places on a horizontal axis that are all ticked
 _LABELS = {"rate": "solved (%)", "us": "µs per problem", "n": "pairs n", "m": "iterations m"}
 Styles = Mapping[str, Mapping[str, Any]]  # arguments of Axes.plot by name
@@ -130,41 +128,31 @@ def reach(table: pd.DataFrame) -> np.ndarray:
     return np.clip([table.rate - table.low, table.high - table.rate], 0, None)
 
 
-def draw_dots(
-    path: str | Path, heading: Sequence[str], lines: Sequence[Mapping[str, pd.DataFrame]], most: int = _WITH_NUMBERS
-) -> Path:
-    """Draw success: a row for each solver, a panel for each table with ``solver``, ``rate``, ``low`` and ``high``.
-
-    Tables are by title, at most ``most`` side by side. The first panel has numbers, and others where there is room.
-    """
-    grouped = [list(line.items()) for line in lines]
-    sizes = [math.ceil(len(line) / math.ceil(len(line) / most)) for line in grouped]  # lines of about equal length
-    split = [line[i : i + size] for line, size in zip(grouped, sizes, strict=True) for i in range(0, len(line), size)]
-    styles = solver_styles(solver for line in split for _, table in line for solver in table.solver)
-    columns, narrow = max(sizes), max(sizes) > _WITH_NUMBERS
-    figure = make_figure(WIDTH, 0.5 + (_ROW * len(styles) + 0.85) * len(split), *heading)
-    ratios = [2 if narrow and column == 0 else 1 for column in range(columns)]
-    grid = figure.subplots(len(split), columns, sharex=True, sharey=True, squeeze=False, width_ratios=ratios)
-    for line, places in zip(split, grid, strict=True):
-        for index, (axes, (title, table)) in enumerate(zip(places, line, strict=False)):
-            for name, rate, (low, high) in zip(table.solver, table.rate, reach(table).T, strict=True):
-                look, row = styles[name], list(styles).index(name)
-                if not look["marker"]:  # a bound is a line across the panel
-                    axes.axvline(rate, color=look["color"], linestyle=look["linestyle"], linewidth=0.9, zorder=1)
-                dot = {**look, "linestyle": "none", "marker": look["marker"] or "|", "clip_on": False}
-                axes.errorbar([rate], [row], xerr=[[low], [high]], label=name, elinewidth=1.4, **dot)
-                if index == 0 or not narrow:
-                    font: dict[str, Any] = {"fontsize": 8, "fontweight": "bold" if is_ours(name) else "normal"}
-                    font |= {"transform": axes.get_yaxis_transform(), "va": "center_baseline"}
-                    axes.text(1.04, row, f"{rate:.1f} ±{max(low, high):.1f}", **font)
-            title = textwrap.fill(title.replace("_", " "), 11 if narrow and index else 34)
-            axes.set(title=title, xlabel=_LABELS["rate"])
-        for axes in places[len(line) :]:
-            axes.remove()
-        places[0].set_yticks(range(len(styles)), [shortened(name) for name in styles])
-        for label, name in zip(places[0].get_yticklabels(), styles, strict=True):
+def draw_dots(path: str | Path, heading: Sequence[str], panels: Mapping[str, pd.DataFrame]) -> Path:
+    """Draw success: a row for each solver, a panel for each table with ``solver``, ``rate``, ``low`` and ``high``."""
+    styles = solver_styles(solver for table in panels.values() for solver in table.solver)
+    lines = math.ceil(len(panels) / 3)
+    columns = math.ceil(len(panels) / lines)
+    figure = make_figure(WIDTH, 0.5 + (_ROW * len(styles) + 0.85) * lines, *heading)
+    grid = list(figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False).flat)
+    for axes, (title, table) in zip(grid, panels.items(), strict=False):
+        for name, rate, (low, high) in zip(table.solver, table.rate, reach(table).T, strict=True):
+            look, row = styles[name], list(styles).index(name)
+            if not look["marker"]:  # a bound is a line across the panel
+                axes.axvline(rate, color=look["color"], linestyle=look["linestyle"], linewidth=0.9, zorder=1)
+            dot = {**look, "linestyle": "none", "marker": look["marker"] or "|", "clip_on": False}
+            axes.errorbar([rate], [row], xerr=[[low], [high]], label=name, elinewidth=1.4, **dot)
+            font: dict[str, Any] = {"fontsize": 8, "fontweight": "bold" if is_ours(name) else "normal"}
+            font |= {"transform": axes.get_yaxis_transform(), "va": "center_baseline"}
+            axes.text(1.04, row, f"{rate:.1f} ±{max(low, high):.1f}", **font)
+        axes.set(title=textwrap.fill(title.replace("_", " "), 34), xlabel=_LABELS["rate"])
+    for axes in grid[len(panels) :]:
+        axes.remove()
+    grid[0].set_yticks(range(len(styles)), [shortened(name) for name in styles])
+    grid[0].set(xlim=(-3, 103), ylim=(len(styles) - 0.4, -0.6), xticks=range(0, 101, 25))
+    for axes in grid[: len(panels) : columns]:
+        for label, name in zip(axes.get_yticklabels(), styles, strict=True):
             label.set_fontweight("bold" if is_ours(name) else "normal")
-    grid[0, 0].set(xlim=(-3, 103), ylim=(len(styles) - 0.4, -0.6), xticks=range(0, 101, 50 if narrow else 25))
     return save(figure, path)
 
 
@@ -329,7 +317,7 @@ def plot_synthetic(path: str | Path, records: pd.DataFrame, source: str = "paper
     panels = {outliers_in_words(setting, n): part for setting, part in parts.items() if len(part)}
     require(panels, f"success on '{source}' with none, uniform or {n // 3} outliers")
     heading = [f"Success on {_SOURCES.get(source, source)}, n = {n}", in_words(pd.concat(panels.values()))]
-    return draw_dots(path, heading, [panels])
+    return draw_dots(path, heading, panels)
 
 
 @themed
@@ -338,13 +326,13 @@ def plot_scenes(path: str | Path, records: pd.DataFrame) -> Path:
     table = records.query("scene and not swept and not mismatches")
     table, n = at_usual_n(table[table.outliers.isin([0, _SCENE_OUTLIERS])])
     require(table, f"success on scenes with 0 or {_SCENE_OUTLIERS} outliers")
-    lines = []
+    panels = {}
     for setting, chosen in table.groupby("outliers"):
-        scenes = dict(list(chosen.groupby("source", sort=False)))
-        first, words = next(iter(scenes)), outliers_in_words(setting, n)
-        whole = {f"{words}: all {len(scenes)} scenes": pooled(chosen)}
-        lines.append({**whole, **scenes} if len(scenes) > 1 else {f"{words}: {first}": scenes[first]})
-    return draw_dots(path, [f"Success on scenes, n = {n}", in_words(table)], lines, 6)
+        words, scenes = outliers_in_words(setting, n), list(chosen.groupby("source", sort=False))
+        if len(scenes) > 1:
+            panels[f"{words}: all {len(scenes)} scenes"] = pooled(chosen)
+        panels |= {f"{words}: {scene}": part for scene, part in scenes}
+    return draw_dots(path, [f"Success on scenes, n = {n}", in_words(table)], panels)
 
 
 def plot_mismatches(path: str | Path, records: pd.DataFrame) -> Path:

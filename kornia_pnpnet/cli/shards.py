@@ -32,14 +32,9 @@ _NUMBERS_AT_ONCE = 2**25
 
 
 class ShardReport(NamedTuple):
-    """Counts of a run over shards.
+    """What a run over shards solved: problems with a pose, all problems, and shards.
 
-    Attributes:
-        solved: problems with a pose in the shards that this run solved.
-        problems: all problems in the shards that this run solved.
-        shards: number of shards that this run solved.
-        kept: number of shards that had results before.
-        failed: one line for each shard that cannot be read.
+    ``kept`` counts the shards that had results before; ``failed`` has a line for each shard that cannot be read.
     """
 
     solved: int

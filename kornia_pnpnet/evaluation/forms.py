@@ -1,5 +1,6 @@
 """The form of results files, as far as their readers rely on it. Needs pydantic."""
 
+# ruff: noqa: UP013  (a few lines for each small mapping)
 from __future__ import annotations
 
 from pathlib import Path
@@ -12,20 +13,15 @@ from kornia_pnpnet.core.schema import STRICT, Count, Kept, Positive, Share, read
 
 __all__ = ["read_results"]
 
-_Quartiles = TypedDict("_Quartiles", dict.fromkeys(("q25", "median", "q75"), float))  # type: ignore[misc]
-
-
-class _Rate(TypedDict):
-    rate: Share
-    low: Share
-    high: Share
-    total: Count
-
-
-class _PerProblem(TypedDict):
-    rotation_error_deg: list[float]
-    translation_error: list[float]
-    ok: list[Share]
+_Quartiles = TypedDict("_Quartiles", {"q25": float, "median": float, "q75": float})
+_Rate = TypedDict("_Rate", {"rate": Share, "low": Share, "high": Share, "total": Count})
+_PerProblem = TypedDict(
+    "_PerProblem", {"rotation_error_deg": list[float], "translation_error": list[float], "ok": list[Share]}
+)
+_Solver = TypedDict("_Solver", {"config": NotRequired[dict[str, Any] | None]})
+_Environment = TypedDict(
+    "_Environment", {"versions": NotRequired[dict[str, str | None]], "commit": NotRequired[str | None]}
+)
 
 
 class _Row(TypedDict):
@@ -45,15 +41,6 @@ class _ProblemSet(TypedDict):
     max_rotation_deg: float
     max_translation: float
     unit: str
-
-
-class _Solver(TypedDict):
-    config: NotRequired[dict[str, Any] | None]
-
-
-class _Environment(TypedDict):
-    versions: NotRequired[dict[str, str | None]]
-    commit: NotRequired[str | None]
 
 
 class _Evaluation(TypedDict):

@@ -120,8 +120,8 @@ def plot_errors(path: str | Path, results: Mapping[str, Any]) -> Path:
             axes.axvline(limit, color=GREY)
             axes.set(xscale="log", xlim=(limit / 1000, limit * 180), xlabel=label, title=name, ylabel="problems")
             axes.yaxis.set_major_formatter("{x:.0%}")
-    handles = {line.get_label(): line for axes in figure.axes for line in axes.lines if line.get_label() in colours}
-    figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=3)
+    lines = {str(line.get_label()): line for axes in figure.axes for line in axes.lines}
+    figure.legend([lines[name] for name in colours], list(colours), loc="outside lower center", ncols=3)
     return save(figure, path)
 
 

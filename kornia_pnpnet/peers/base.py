@@ -136,9 +136,9 @@ class PeerSolver(nn.Module):
         for i in np.flatnonzero(status == Status.NOT_BELIEVED):
             found = self.solve_one(world[i, used[i]], img[i, used[i]], cameras[i])
             if found is not None and all(map(_finite, (*found[:2], *(found.init or ())))):
-                pose = np.column_stack((found.rotation, found.translation))
-                start = pose if found.init is None else np.column_stack(found.init)
-                poses[:, i], inliers[i, used[i]], ok[i] = (pose, start), found.inliers, True
+                final = np.column_stack((found.rotation, found.translation))
+                start = final if found.init is None else np.column_stack(found.init)
+                poses[:, i], inliers[i, used[i]], ok[i] = (final, start), found.inliers, True
 
         largest = torch.finfo(world_points.dtype).max
         errors = _squared_errors(poses[0], world, img, cameras, used & ok[:, None])
@@ -211,7 +211,7 @@ def _squared_errors(
     poses: np.ndarray, world: np.ndarray, img: np.ndarray, cameras: np.ndarray, used: np.ndarray
 ) -> np.ndarray:
     """Return the squared reprojection errors in px², infinite behind the camera, 0 for unused pairs, (B, N)."""
-    cameras = np.where(used.any(-1)[:, None, None], cameras, np.eye(3))
+    cameras = np.where(used.sum(-1)[:, None, None] > 0, cameras, np.eye(3))
     world, img = (np.where(used[..., None], x, 0.0) for x in (world, img))
     with np.errstate(over="ignore", invalid="ignore"):
         cam_points = world @ poses[..., :3].swapaxes(-1, -2) + poses[:, None, :, 3]  # (B, N, 3)
