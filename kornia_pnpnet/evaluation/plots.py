@@ -19,8 +19,10 @@ from kornia_pnpnet.evaluation.results import row_errors
 
 try:
     from matplotlib import rc_context
+    from matplotlib.axes import Axes
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
+    from matplotlib.ticker import NullFormatter
 except ImportError as error:
     raise ImportError("Pictures need matplotlib: pip install 'kornia_pnpnet[eval]'") from error
 
@@ -118,7 +120,8 @@ def plot_errors(path: str | Path, results: Mapping[str, Any]) -> Path:
             for row in rows:
                 axes.ecdf(row_errors(row)[0][index].numpy(), color=colours[row["solver"]], label=row["solver"])
             axes.axvline(limit, color=GREY)
-            axes.set(xscale="log", xlim=(limit / 1000, limit * 180), xlabel=label, title=name, ylabel="problems")
+            axes.set(xlim=(limit / 1000, limit * 180), xlabel=label, title=name, ylabel="problems")
+            _log_scale(axes, "x")
             axes.yaxis.set_major_formatter("{x:.0%}")
     lines = {str(line.get_label()): line for axes in figure.axes for line in axes.lines}
     figure.legend([lines[name] for name in colours], list(colours), loc="outside lower center", ncols=3)
@@ -141,18 +144,30 @@ def plot_training(path: str | Path, history_csv: str | Path) -> Path:
     """Draw loss, distances and success (columns ``val/<set>/success``) of a training against ``update``."""
     rows = read_rows(history_csv)
     success = [name for name in rows[0] if name.startswith("val/") and name.endswith("/success")]
-    figure = make_figure(WIDTH, 5.4)
     panels = (
-        ("training loss (refined terms ramp in)", "linear", ["total"]),
-        ("validation success", "linear", success),
-        ("rotation distance ‖R̂ − R‖", "log", ["init_rotation", "refined_rotation"]),
-        ("translation distance ‖t̂ − t‖ (world unit)", "log", ["init_translation", "refined_translation"]),
+        ("training loss (refined terms ramp in)", ["total"]),
+        ("validation success", success),
+        ("rotation distance ‖R̂ − R‖", ["init_rotation", "refined_rotation"]),
+        ("translation distance ‖t̂ − t‖", ["init_translation", "refined_translation"]),
     )
-    for axes, (title, scale, columns) in zip(figure.subplots(2, 2, sharex=True).flat, panels, strict=True):
-        for column in columns:
+    figure = make_figure(WIDTH, 5.8)
+    grid = figure.subplots(2, 2, sharex=True).flat
+    for axes, (title, columns) in zip(grid, panels, strict=True):
+        for index, column in enumerate(columns):
             curve = np.array([read_column(history_csv, rows, name, float, gaps=True) for name in ("update", column)])
-            axes.plot(*curve[:, np.isfinite(curve).all(0)], label=column)
-        axes.set(title=title, yscale=scale, xlabel="update")
-        if columns:
-            axes.legend()
+            label = column.split("/")[1] if columns is success else column.split("_")[0]
+            axes.plot(*curve[:, np.isfinite(curve).all(0)], label=label, color=COLOURS[index % len(COLOURS)])
+        axes.set(title=title, xlabel="update")
+        if "distance" in title:
+            _log_scale(axes, "y")
+    figure.legend(handles=figure.axes[2].lines, loc="outside lower left")
+    figure.legend(handles=figure.axes[1].lines, loc="outside lower right", ncols=4)
     return save(figure, path)
+
+
+def _log_scale(axes: Axes, name: str) -> None:
+    """Make the axis x or y logarithmic, with numbers that are no formulas."""
+    axes.set(**{f"{name}scale": "log"})
+    axis = getattr(axes, f"{name}axis")
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(NullFormatter())
