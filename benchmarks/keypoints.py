@@ -5,9 +5,9 @@ Each file holds the problems of one source: ``world`` (P, N, 3), ``img`` (P, N, 
 problems that may be used for choosing, ``cluster`` (P,), equal for problems that depend on each other, such as those of
 neighbouring frames, and ``inlier_px`` (), the largest reprojection error of an inlier under the reference pose.
 
-Seen problems fit the map of ``fit_confidence`` and the noise, constant and as a power of the confidence; the others are
-measured. PoseLib's threshold is ``inlier_px``; masked, it gets pairs with a fitted confidence above 0.5. The error is
-the rotation error in radians plus the translation error relative to the distance of the points' centre.
+Seen problems fit an isotonic regression of the confidence, and the noise, constant and as a power of the confidence;
+the others are measured. PoseLib's threshold is ``inlier_px``; masked, it gets pairs with a fitted confidence above 0.5.
+The error is the rotation error in radians plus the translation error relative to the distance of the points' centre.
 """
 
 from __future__ import annotations
@@ -22,9 +22,10 @@ from typing import Any
 import numpy as np
 import torch
 from harness import load, threads
+from sklearn.isotonic import IsotonicRegression
 from torch import Tensor, nn
 
-from kornia_pnpnet import create_solver, fit_confidence, pose_errors
+from kornia_pnpnet import create_solver, pose_errors
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.core.files import read_npz
 from kornia_pnpnet.core.tables import markdown_table
@@ -80,7 +81,12 @@ def solve(p: Problems, way: Way) -> dict[str, Tensor]:
 def ways(seen: Problems, inlier_px: float) -> tuple[dict[str, Way], dict[str, float]]:
     """Ways to use the confidence, fitted on problems that were seen, and the fitted numbers."""
     error, used, c = reprojection(seen), seen["mask"], seen["confidence"]
-    calibration = fit_confidence(c, error < inlier_px, mask=used)
+    isotonic = IsotonicRegression(y_min=0.01, y_max=0.99, increasing="auto", out_of_bounds="clip")
+    isotonic.fit(c[used].numpy(), (error < inlier_px)[used].numpy())
+
+    def calibration(confidence: Tensor) -> Tensor:
+        return torch.from_numpy(isotonic.predict(confidence.flatten().numpy())).reshape_as(confidence).to(confidence)
+
     fitted = used & (error < FITTED[1] * inlier_px) & (error > FITTED[0] * inlier_px)
     sigma = error[fitted].median() / MEDIAN
     logs = c[fitted].clamp(min=LEAST).log().numpy(), error[fitted].log().numpy() - MEAN_LOG

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from kornia_pnpnet.evaluation.figures import style
+from kornia_pnpnet.evaluation.plots import WIDTH, make_figure, save, themed
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "docs" / "results"))
+import figures as style
 
 # Lines by the end of a name, which says how the solver runs. Without such an end the line is dashed.
 _WAYS = {" compiled": "-", " compiled whole": ":", " ONNX": "-.", " packaged": ":"}
@@ -26,11 +30,11 @@ def plot_times(
     return style.draw_curves(path, [title], curves, label, _looks(pd.concat(tables.values()).contender))
 
 
-@style.themed
+@themed
 def plot_latency(path: Path, title: str, rows: Sequence[Mapping[str, Any]]) -> Path:
     """Draw the share of the calls with one problem that end within a time, without the slowest hundredth."""
     looks = _looks(row["contender"] for row in rows)
-    figure = style.make_figure(style.WIDTH, 4.8, title)
+    figure = make_figure(WIDTH, 4.8, title)
     axes = figure.subplots()
     for name, look in looks.items():
         for row in (row for row in rows if row["contender"] == name):
@@ -41,7 +45,7 @@ def plot_latency(path: Path, title: str, rows: Sequence[Mapping[str, Any]]) -> P
     axes.set(xlabel="ms for one problem", ylabel="calls done (%)", ylim=(0, 100))
     style.log_scale(axes, "x")
     style.draw_legend(figure, looks)
-    return style.save(figure, path)
+    return save(figure, path)
 
 
 def _looks(names: Iterable[str]) -> dict[str, dict[str, Any]]:

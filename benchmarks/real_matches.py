@@ -34,9 +34,9 @@ from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.core.files import read_npz
 from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.data.colmap import _find_model
-from kornia_pnpnet.evaluation.bounds import Bound
-from kornia_pnpnet.evaluation.figures.style import BLUE, GREY, ORANGE, WIDTH, make_figure, save
+from kornia_pnpnet.evaluation import SeesTruth
 from kornia_pnpnet.evaluation.named_solvers import load_solver
+from kornia_pnpnet.evaluation.plots import BLUE, GREY, ORANGE, WIDTH, make_figure, save
 from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.metrics import reliability
 from kornia_pnpnet.peers.base import PeerSolver
@@ -405,7 +405,7 @@ def batch(problems: Problems, at: Tensor, dtype: torch.dtype) -> tuple[SolverPro
 
 def call(solver: nn.Module, spec: str, given: SolverProblems, mask: Tensor, ratio: Tensor) -> PnPResult:
     """Solve a batch; a bound sees the reference poses, and other libraries told the ratio get the best pairs first."""
-    if isinstance(solver, Bound):
+    if isinstance(solver, SeesTruth):
         return solver.solve_with_truth(given)
     if CONFIDENCE in spec and isinstance(solver, PeerSolver):
         order = ratio.argsort(dim=1, stable=True)

@@ -24,13 +24,15 @@ except ImportError as error:
 
 __all__ = ["INPUTS", "OUTPUTS", "Solve", "list_column"]
 
+_PAIRS = -1  # the number of pairs, in a shape
+# Shapes of the columns that Solve reads.
+_SHAPES: dict[str, tuple[int, ...]] = {"world_points": (_PAIRS, 3), "img_points": (_PAIRS, 2), "intrinsics": (3, 3)}
+_SHAPES |= dict.fromkeys(("weights", "img_sigma", "world_sigma"), (_PAIRS,))
 #: Columns that :class:`Solve` reads.
-INPUTS = ("world_points", "img_points", "intrinsics", "weights", "img_sigma", "world_sigma")
+INPUTS = tuple(_SHAPES)
 #: Columns that :class:`Solve` writes.
 OUTPUTS = ("rotation", "translation", "weights", "cost", "ok", "status")
 
-# Numbers of a cell for each pair. A cell of intrinsics has 9 numbers.
-_PER_PAIR = {"world_points": 3, "img_points": 2, "weights": 1, "img_sigma": 1, "world_sigma": 1}
 # Names of the values of Status, and of rows that no solver saw.
 _STATUS_NAMES = pa.array([*(status.name.lower() for status in Status), "malformed"])
 # Pairs. Problems with this number or more are padded, so that those with similar numbers are solved together.
@@ -144,12 +146,9 @@ def list_column(values: np.ndarray) -> pa.Array:
 
 
 class _Cells:
-    """The numbers of a column of lists.
+    """The numbers of a column of lists: ``values`` of all rows one after the other, NaN where one is missing.
 
-    Attributes:
-        values: numbers of all rows one after the other, NaN where one is missing, float32.
-        starts: position of the first number of each row.
-        sizes: count of the numbers of each row; 0 where the list is missing.
+    A row begins at ``starts`` and has ``sizes`` numbers, 0 where its list is missing.
     """
 
     def __init__(self, name: str, column: pa.ChunkedArray) -> None:
@@ -164,21 +163,18 @@ class _Cells:
             raise TypeCheckError(f"the column {name} must hold lists of numbers, got {column.type}")
         self.values = array.cast(pa.float32(), safe=False).to_numpy(zero_copy_only=False)
         self.starts, self.sizes = ends[:-1], np.diff(ends)
-        self._name = name
+        self.shape, self.one_for_all = _SHAPES[name], name.endswith("_sigma")
 
     def fit(self, counts: np.ndarray) -> np.ndarray:
         """Whether each cell has as many numbers as its problem needs."""
-        if self._name == "intrinsics":
-            return self.sizes == 9
-        right = self.sizes == _PER_PAIR[self._name] * counts
-        return right | (self.sizes == 1) if self._name.endswith("_sigma") else right
+        needed = math.prod(counts if size == _PAIRS else size for size in self.shape)
+        return (self.sizes == needed) | (self.one_for_all & (self.sizes == 1))
 
     def take(self, rows: np.ndarray, width: int) -> np.ndarray:
         """The cells of some rows, padded to ``width`` pairs: the last number of a cell is repeated."""
-        size = 9 if self._name == "intrinsics" else _PER_PAIR[self._name] * width
-        within = np.minimum(np.arange(size), self.sizes[rows, None] - 1)
-        shapes = {"world_points": (width, 3), "img_points": (width, 2), "intrinsics": (3, 3)}
-        return self.values[self.starts[rows, None] + within].reshape(len(rows), *shapes.get(self._name, (width,)))
+        shape = [width if size == _PAIRS else size for size in self.shape]
+        within = np.minimum(np.arange(math.prod(shape)), self.sizes[rows, None] - 1)
+        return self.values[self.starts[rows, None] + within].reshape(len(rows), *shape)
 
 
 def _is_list(kind: pa.DataType) -> bool:

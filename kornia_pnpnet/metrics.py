@@ -116,9 +116,7 @@ def pose_errors(estimate: Pose, truth: Pose) -> PoseErrors:
         The angle of :math:`\hat R R^\top` in degrees and :math:`\|\hat t - t\|`, each of shape :math:`(B,)`.
 
     Raises:
-        ShapeError: when a shape is not as above or the shapes differ.
-        TypeCheckError: when the dtypes differ.
-        DeviceError: when the devices differ.
+        BaseError: when shapes, dtypes or devices differ, or a shape is not as above.
 
     Example:
         >>> truth = Pose(torch.eye(3)[None], torch.zeros(1, 3))

@@ -519,7 +519,7 @@ def write_matches(path, seed):
 
 
 def test_real_matches_are_measured_and_failures_drawn(tmp_path):
-    pytest.importorskip("seaborn")
+    pytest.importorskip("pandas")
     pytest.importorskip("poselib")
     real_matches = importlib.import_module("real_matches")
     for seed, name in enumerate(("yard", "room")):
@@ -554,6 +554,7 @@ def test_real_matches_are_measured_and_failures_drawn(tmp_path):
 
 def test_keypoints_are_measured_where_they_were_not_seen(tmp_path, monkeypatch):
     pytest.importorskip("poselib")
+    pytest.importorskip("sklearn")
     keypoints = importlib.import_module("keypoints")
     draw = np.random.default_rng(0)
     problems = SyntheticProblems(n=12, batch_size=60, seed=3, dtype=torch.float64).batch(0)

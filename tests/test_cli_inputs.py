@@ -3,16 +3,15 @@
 import io
 import json
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import BOOL, WORDS, damage, many, places_in, run_main, spoiled
+from strategies import WORDS, damage, many, places_in, run_main, spoiled
 
 from kornia_pnpnet.data import SyntheticProblems
-from kornia_pnpnet.evaluation.operations import complexity_results
-from kornia_pnpnet.evaluation.results import save_results
 
 
 def problem_file(kind):
@@ -71,45 +70,19 @@ def test_damaged_files_are_a_line_and_no_traceback(kind, tmp_path):
     check_file()
 
 
-@many(300)
-@given(
-    st.lists(
-        st.tuples(st.sampled_from(["--intrinsics", "--solver", "--threshold", "--batch-size", "--batch", ""]), WORDS),
-        max_size=4,
-    ),
-    st.one_of(WORDS, st.none()),
-)
-def test_any_arguments_are_a_line_and_no_traceback(tmp_path_factory, options, file):
-    """Of a file that is not there, or of a sound one."""
-    sound = tmp_path_factory.getbasetemp() / "sound.csv"
-    if not sound.exists():
-        sound.write_bytes(problem_file("csv")[0])
-    arguments = [x for pair in options for x in pair if x]
-    code, out, err = run_main("solve", *arguments, "--", str(sound) if file is None else file)
-    if code == 2:
-        assert err.startswith("pnpnet: ")
-        assert err.count("\n") == 1
-    else:
-        assert file is None
-        assert json.loads(out)["n"] == 9
-
-
 def test_spoiled_results_are_a_line_and_no_traceback(tmp_path, drawn):
-    made, costs, path = (tmp_path / f"{name}.json" for name in ("results", "costs", "spoiled"))
+    made, path = tmp_path / "results.json", tmp_path / "spoiled.json"
     arguments = "evaluate", "--solver", "epnp", "--problems", "20", "--n", "9,12", "--outliers", "none,3", "--out"
     assert run_main(*arguments, made)[0] == 0
-    save_results(complexity_results(["epnp"], range(6, 9)), costs)
-    both = [json.loads(file.read_text()) for file in (made, costs)]
-    both = {kind: (content, list(places_in(content))) for kind, content in zip(("results", "costs"), both, strict=True)}
+    content = json.loads(made.read_text())
+    places = list(places_in(content))
     codes = Counter()
 
     @many(60)
-    @given(st.sampled_from(sorted(both)), BOOL, st.data())
-    def run(kind, plot, data):
-        path.write_text(json.dumps(data.draw(spoiled(*both[kind]))))
-        more = ("--plot", tmp_path / "plot") if plot else ()
-        figures = "figures", path, "--out", tmp_path / "figures"
-        code, _, err = run_main(*((*arguments, path, *more) if kind == "results" and plot else figures))
+    @given(spoiled(content, places))
+    def run(other):
+        path.write_text(json.dumps(other))
+        code, _, err = run_main(*arguments, path, "--plot", tmp_path / "plot")
         codes[code] += 1
         assert code in (0, 2)
         if code == 2:
@@ -117,13 +90,14 @@ def test_spoiled_results_are_a_line_and_no_traceback(tmp_path, drawn):
             assert err.count("\n") == 1
 
     run()
-    assert min(codes[0], codes[2]) >= 5
+    assert codes[0]
+    assert codes[2] >= 5
 
 
 #: What each needs to be quick, and what it can be given.
 COMMANDS = {
+    "solve": (("sound.csv", "--intrinsics", "3400,3400,960,540"), "--solver --threshold --batch-size --focal --camera"),
     "evaluate": (("--solver", "epnp", "--problems", 3), "--solver --data --n --outliers --seed --dtype --plot"),
-    "figures": ((), "--out"),
     "export": (("--solver", "p3p-ransac"), "--n"),
     "list": ((), "--x"),
     "demo": (("--problems", 3, "--train-seconds", 0), "--data --problems"),
@@ -135,8 +109,9 @@ SAID = WORDS | st.sampled_from(
 )
 
 
-def test_any_arguments_of_other_commands_are_a_line_and_no_traceback(tmp_path, monkeypatch):
+def test_any_arguments_are_a_line_and_no_traceback(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    Path("sound.csv").write_bytes(problem_file("csv")[0])
     # No argument changes how a figure is drawn.
     monkeypatch.setattr(pytest.importorskip("matplotlib.figure").Figure, "savefig", lambda *_, **__: None)
     codes = Counter()
@@ -149,7 +124,7 @@ def test_any_arguments_of_other_commands_are_a_line_and_no_traceback(tmp_path, m
         files = data.draw(st.lists(SAID, max_size=1))
         code, out, err = run_main(name, *quick, *(x for pair in pairs for x in pair), *files)
         codes[name, code] += 1
-        assert code in (0, 2)
+        assert code in (0, 1, 2)
         if code == 2:
             assert err.startswith("pnpnet: ")
             assert err.count("\n") == 1
@@ -158,4 +133,5 @@ def test_any_arguments_of_other_commands_are_a_line_and_no_traceback(tmp_path, m
 
     run()
     assert all(codes[name, 2] for name in COMMANDS)
-    assert all(codes[name, 0] for name in ("evaluate", "list", "demo"))  # what others need is not among the words
+    # What `export` needs is not among the words.
+    assert all(codes[name, 0] for name in ("solve", "evaluate", "list", "demo"))

@@ -43,16 +43,6 @@ def test_default_solvers_load_and_cover_every_n(sources):
     assert all(name.startswith(("pnpnet-", "net-")) and not name.endswith(("-n6", "-n9")) for name in left)
 
 
-def test_default_solvers_suit_their_source():
-    synthetic, real = default_solvers(9), default_solvers(9, ["a/room"])
-    assert set(real) & set(BOUNDS) == {"known-inliers"}  # the noise of a scene is unknown
-    assert [name_of(spec) for spec in real] == [
-        name_of(spec) for spec in synthetic if spec != "known-inliers-and-noise"
-    ]
-    assert {"opencv-ransac", "p3p-ransac:threshold=5,world_threshold=0.25"} <= set(synthetic)
-    assert {"opencv-ransac:threshold=12", "p3p-ransac:threshold=12"} <= set(real)
-
-
 def test_missing_packages_are_named_and_left_out(monkeypatch):
     needed = {
         "opencv-usac": "OpenCV",

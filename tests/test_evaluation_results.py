@@ -76,20 +76,6 @@ def test_the_wrong_entry_of_a_file_is_named(results, place, value, tmp_path):
         load_results(path)
 
 
-def test_operation_counts_are_read_only_on_request(results, tmp_path):
-    path = tmp_path / "counts.json"
-    counts = {"kind": "complexity", "format": 1, "n": [6], "counts": {"epnp": [1.0]}, "ransac": []}
-    save_results(counts, path)
-    assert load_results(path, complexity=True) == counts
-    with pytest.raises(ValueError, match=r"counts\.json.* evaluation"):
-        load_results(path)
-    save_results({**counts, "kind": ["other"]}, path)
-    with pytest.raises(ValueError, match=r"counts\.json.* complexity"):
-        load_results(path, complexity=True)
-    save_results(results, path)
-    assert load_results(path, complexity=True) == results
-
-
 def test_the_digest_of_the_code_covers_python_files_and_their_places(tmp_path, monkeypatch):
     monkeypatch.setattr(kornia_pnpnet.evaluation.results, "__file__", str(tmp_path / "results.py"))
     (tmp_path / "data").mkdir()

@@ -41,6 +41,7 @@ def test_a_boards_mislabelled_corners_do_not_matter(tmp_path):
 )
 def test_queries_of_a_folder_and_a_model_are_localised(tmp_path, monkeypatch, references, queries):
     """The queries are the images without points, or every fifth image where all have points."""
+    pytest.importorskip("sklearn")
     monkeypatch.syspath_prepend(EXAMPLES)
     import rendered_hall
 
@@ -58,6 +59,7 @@ def test_queries_of_a_folder_and_a_model_are_localised(tmp_path, monkeypatch, re
 
 def test_disk_and_lightglue_fit_the_localiser(monkeypatch):
     """An untrained network and a matcher of nearest neighbours, because the weights would be downloaded."""
+    pytest.importorskip("sklearn")
     monkeypatch.syspath_prepend(EXAMPLES)
     import localiser
     from kornia.feature import match_mnn

@@ -26,7 +26,6 @@ LAYERS = (
         "likelihood",
         "metrics",
         "covariance",
-        "confidence",
         "measurements",
         "pretrained",
         "inputs",
@@ -51,15 +50,13 @@ EXTRAS = (
     "pycolmap",
     "pydantic",
     "ray",
-    "seaborn",
     "tensorboard",
 )
 
 #: Optional packages and the only modules that may import them.
 OWNERS = {
-    "matplotlib": {"evaluation.figures"},
-    "pandas": {"evaluation.figures"},
-    "seaborn": {"evaluation.figures"},
+    "matplotlib": {"evaluation.plots"},
+    "pandas": set(),
     "hydra": set(),
     "cv2": {"peers"},
     "kornia_rs": {"peers"},

@@ -38,23 +38,6 @@ def test_means_are_kornias_soft_argmax(generator):
     torch.testing.assert_close(pixels, spatial_soft_argmax2d(heatmaps, 0.5, normalized_coordinates=False))
 
 
-def test_shifted_maps_have_shifted_means_and_the_same_covariance(generator):
-    heatmaps = torch.full((1, 4, 20, 30), -1e3, dtype=DOUBLE)
-    heatmaps[..., 3:9, 4:12] = torch.randn(1, 4, 6, 8, generator=generator, dtype=DOUBLE)
-    pixels, covariance = heatmap_keypoints(heatmaps)
-    moved_pixels, moved_covariance = heatmap_keypoints(heatmaps.roll((5, 11), (-2, -1)))
-    torch.testing.assert_close(moved_pixels, pixels + torch.tensor([11.0, 5.0], dtype=DOUBLE))
-    torch.testing.assert_close(moved_covariance, covariance)
-
-
-def test_transposed_maps_swap_u_and_v(generator):
-    heatmaps = torch.randn(1, 4, 6, 9, generator=generator, dtype=DOUBLE)
-    pixels, covariance = heatmap_keypoints(heatmaps)
-    turned_pixels, turned_covariance = heatmap_keypoints(heatmaps.mT)
-    torch.testing.assert_close(turned_pixels, pixels.flip(-1))
-    torch.testing.assert_close(turned_covariance, covariance.flip(-2, -1))
-
-
 def test_a_stride_is_each_cell_as_a_block_of_pixels(generator):
     """A cell that covers 3 by 3 pixels is the same density as 9 cells of a third of its share."""
     heatmaps = torch.randn(2, 3, 5, 6, generator=generator, dtype=DOUBLE)
@@ -62,24 +45,10 @@ def test_a_stride_is_each_cell_as_a_block_of_pixels(generator):
     torch.testing.assert_close(heatmap_keypoints(heatmaps, stride=3.0), heatmap_keypoints(blocks))
 
 
-def test_a_single_peak_has_the_variance_of_a_pixel():
-    heatmaps = torch.full((1, 1, 5, 5), -torch.inf)
-    heatmaps[..., 3, 1] = 0.0
-    pixels, covariance = heatmap_keypoints(heatmaps)
-    assert pixels.tolist() == [[[1.0, 3.0]]]
-    torch.testing.assert_close(covariance[0, 0], torch.eye(2) / 12.0)
-
-
 def test_gradients_of_heat_maps(generator):
     heatmaps = torch.randn(1, 2, 4, 5, generator=generator, dtype=DOUBLE, requires_grad=True)
     temperature = torch.tensor([[[[0.7]], [[1.3]]]], dtype=DOUBLE, requires_grad=True)
     assert gradcheck(heatmap_keypoints, (heatmaps, temperature))
-
-
-def test_half_precision_is_computed_in_float32(generator):
-    heatmaps = torch.randn(1, 2, 4, 5, generator=generator).half()
-    for half, full in zip(heatmap_keypoints(heatmaps), heatmap_keypoints(heatmaps.float()), strict=True):
-        assert torch.equal(half, full)
 
 
 def test_a_map_with_nan_spoils_its_own_problem_only(make_problems, generator):

@@ -72,13 +72,6 @@ def test_chances_that_come_true_have_no_calibration_error():
     assert reliability(2.0 * chances, outcomes).expected_error == pytest.approx(0.25, abs=0.01)
 
 
-def test_chances_of_0_and_1_are_in_the_outer_ranges():
-    found = reliability(torch.tensor([0.0, 1.0, 1.0]), torch.tensor([False, True, False]), ranges=4)
-    assert found.number.tolist() == [1.0, 0.0, 0.0, 2.0]
-    assert found.observed[3] == 0.5
-    assert found.expected_error == pytest.approx(1 / 3)
-
-
 @pytest.mark.parametrize(("chances", "outcomes", "ranges"), [(3, 2, 10), (0, 0, 10), (3, 3, 0)])
 def test_reliability_needs_as_many_outcomes_and_a_range(chances, outcomes, ranges):
     with pytest.raises(ERRORS):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("seaborn")
+pytest.importorskip("pandas")
 
 REPO = Path(__file__).resolve().parents[1]
 FOLDER = REPO / "docs" / "results"

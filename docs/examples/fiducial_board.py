@@ -20,7 +20,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from kornia_pnpnet import Pose, create_solver
 from kornia_pnpnet.core.environment import environment
-from kornia_pnpnet.evaluation.figures.style import BLUE, ORANGE, make_figure, save
+from kornia_pnpnet.evaluation.plots import BLUE, ORANGE, make_figure, save
 from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.refine.residual import rotation_angle
 

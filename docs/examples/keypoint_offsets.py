@@ -21,7 +21,7 @@ from torch import Tensor
 from kornia_pnpnet import create_solver
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.data.draws import batch_generator, random_poses
-from kornia_pnpnet.evaluation.figures.style import BLUE, GREEN, ORANGE, make_figure, save, themed
+from kornia_pnpnet.evaluation.plots import BLUE, GREEN, ORANGE, make_figure, save, themed
 from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.losses import pose_distances
 from kornia_pnpnet.result import Pose

@@ -38,7 +38,7 @@ from torch.nn import functional
 
 from kornia_pnpnet import PnPResult, Pose, create_solver, heatmap_keypoints
 from kornia_pnpnet.core.environment import environment
-from kornia_pnpnet.evaluation.figures.style import BLUE, ORANGE, VERMILION, make_figure, save, themed
+from kornia_pnpnet.evaluation.plots import BLUE, ORANGE, VERMILION, make_figure, save, themed
 from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.refine.residual import rotation_angle
 

@@ -37,13 +37,13 @@ from kornia.feature import (
     laf_is_filled,
     match_snn,
 )
+from sklearn.isotonic import IsotonicRegression
 from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
 
 from kornia_pnpnet import PnPResult, Pose, create_solver
-from kornia_pnpnet.confidence import Calibration, fit_confidence
 from kornia_pnpnet.core.environment import environment
-from kornia_pnpnet.evaluation.figures.style import BLUE, make_figure, save, themed
+from kornia_pnpnet.evaluation.plots import BLUE, make_figure, save, themed
 from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.refine.residual import rotation_angle
 
@@ -196,7 +196,7 @@ def errors_px(matches: Matches, photo: Photo) -> Tensor:
     return torch.where(cam_points[:, 2] > 0, error, torch.inf)
 
 
-def fit_scores(references: Sequence[Photo], detector: Detector) -> Calibration:
+def fit_scores(references: Sequence[Photo], detector: Detector) -> IsotonicRegression:
     """Fit confidences on every fourth image of the map, matched with the rest of the map."""
     scores, inliers = [], []
     for i in range(0, len(references), 4):
@@ -204,12 +204,13 @@ def fit_scores(references: Sequence[Photo], detector: Detector) -> Calibration:
         matches = match(references[i], most_alike(references[i], others), detector)
         scores.append(matches.scores)
         inliers.append(errors_px(matches, references[i]) < INLIER_PX)
-    return fit_confidence(torch.cat(scores), torch.cat(inliers))
+    calibration = IsotonicRegression(y_min=0.01, y_max=0.99, increasing="auto", out_of_bounds="clip")
+    return calibration.fit(torch.cat(scores).numpy(), torch.cat(inliers).numpy())
 
 
-def choose(matches: Matches, calibration: Calibration) -> tuple[Matches, Tensor]:
+def choose(matches: Matches, calibration: IsotonicRegression) -> tuple[Matches, Tensor]:
     """The likeliest pairs of a query, and their confidences."""
-    confidence = calibration(matches.scores)
+    confidence = torch.from_numpy(calibration.predict(matches.scores.numpy()))
     top = confidence.topk(min(MOST_PAIRS, len(confidence))).indices
     return Matches(*(x[top] for x in matches)), confidence[top]
 

@@ -31,7 +31,7 @@ from torch import Tensor, nn
 
 from kornia_pnpnet import PnPNet, Pose, PosePrior, RobustWeightedLM, create_solver, gravity_prior
 from kornia_pnpnet.core.environment import environment
-from kornia_pnpnet.evaluation.figures.style import BLUE, GREEN, ORANGE, VERMILION, make_figure, save, themed
+from kornia_pnpnet.evaluation.plots import BLUE, GREEN, ORANGE, VERMILION, make_figure, save, themed
 from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.refine.residual import rotation_angle
 

@@ -8,7 +8,6 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import torch
-from keypoint_tables import keypoint_tables
 from measure import ANY, HERE
 from real_matches_picture import find_rows
 from short_runs import read_summary
@@ -240,4 +239,35 @@ def page_facts(
         "files": [{"name": name, **facts(results)} for name, results in zip(MATCHES, files, strict=True)],
         "deciles": markdown_table(["predicted", "problems", "predicted mean (%)", "not far off (%)"], deciles),
         "keypoints": keypoint_tables(keypoints),
+    }
+
+
+# Ways to use confidences that the page compares pairwise, the first minus the second.
+_WAYS = (("confidence=c", "weights=c**6"), ("confidence=c", "nothing"))
+
+
+def keypoint_tables(found: Mapping[str, Any]) -> dict[str, Any]:
+    """Tables of what ``benchmarks/keypoints.py`` wrote: errors, paired differences, sources of the keypoints."""
+    results = found["results"]
+    names = [one["source"] for one in results]
+    by_way = [{row["way"]: row for row in one["rows"]} for one in results]
+    errors = [
+        [f"`{way}`", *(f"{r[way]['error']:.3f}, {100 * r[way]['right']:.1f}, {100 * r[way]['ok']:.0f}" for r in by_way)]
+        for way in by_way[0]
+    ]
+    differences = [
+        [name, *("{:+.4f} ({:+.4f} to {:+.4f})".format(*r[way]["less"][base]["capped"]) for way, base in _WAYS)]
+        for name, r in zip(names, by_way, strict=True)
+    ]
+    sources = []
+    for one in results:
+        source = found["sources"][one["source"]]
+        numbers = [str(one["measured"]), f"{one['pairs']:.0f}", f"{100 * one['inliers']:.0f}"]
+        sources.append([one["source"], *numbers, f"{source['repository']}: {source['what']}. Seen: {source['seen']}"])
+    header = ("error, at most 0.5", *(f"`{way}` less `{base}`" for way, base in _WAYS))
+    return {
+        "errors": markdown_table(("pnpnet-set with", *names), errors),
+        "differences": markdown_table(header, differences),
+        "sources": markdown_table(("keypoints", "problems", "pairs", "inliers (%)", "source"), sources, align="lrrrl"),
+        "right": found["settings"]["right"],
     }

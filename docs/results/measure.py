@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
+from operations import complexity_results
 from torch import nn
 
 from kornia_pnpnet import PnPNet, RobustWeightedLM, pose_covariance
@@ -16,7 +17,6 @@ from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.core.files import write_json
 from kornia_pnpnet.evaluation import EvaluationData, evaluate
 from kornia_pnpnet.evaluation.named_solvers import load_solver
-from kornia_pnpnet.evaluation.operations import complexity_results
 from kornia_pnpnet.evaluation.problem_sets import evaluation_sets
 from kornia_pnpnet.evaluation.results import format_table, load_results, save_results
 from kornia_pnpnet.metrics import reliability, success_rate
@@ -43,16 +43,8 @@ OTHER_SCENES = ("colmap/lund_door", "colmap/sceaux_castle")  # reconstructions o
 SEED_REPORT, SEED_TUNE = 20_261_131, 20_261_132
 
 UNTUNED = (
-    PAPER,
-    OURS,
-    "net-n9",
-    "identity-lm",
-    "epnp",
-    "epnp-lm",
-    "reppnp",
-    "reppnp-lm",
-    "opencv-epnp",
-    "opencv-sqpnp",
+    *(PAPER, OURS, "net-n9", "identity-lm", "epnp", "epnp-lm", "reppnp", "reppnp-lm"),
+    *("opencv-epnp", "opencv-sqpnp"),
 )
 THRESHOLDS = (1.0, 2.0, 5.0, 10.0, 20.0, 35.0, 50.0, 80.0, 120.0)  # pixels
 #: Threshold methods by the name on the page: the solver, and the values of its options that tuning tries.
@@ -185,7 +177,7 @@ def measure_protocol(counts: Counts, wanted: set[str]) -> None:
         run("against_n", named(dict.fromkeys((*shipped_weights(), *fast)), found), sets, tuned=found)
 
 
-def measure_crowd(counts: Counts) -> None:
+def measure_crowd(counts: Counts, _: set[str]) -> None:
     """A hundred pairs with many outliers."""
     crowd: dict[str, Any] = {"n": 100, "outliers": "50%,70%"}
     found = tune(counts.tuning(**crowd, count=counts.real // 5), "crowd", ROBUST)
@@ -206,14 +198,14 @@ def measure_scenes(counts: Counts, wanted: set[str]) -> None:
         run("mismatches", named(names, found), sets, tuned=found)
 
 
-def measure_depths(counts: Counts) -> None:
+def measure_depths(counts: Counts, _: set[str]) -> None:
     """Several numbers of iterations."""
     specs = [f"{name}:m={m}" for name in ("identity-lm", "epnp-lm", "reppnp-lm") for m in DEPTHS]
     specs += [f"{OURS}:m={m}" for m in range(PnPNet.from_pretrained(OURS).refine.m + 1)]
     run("against_m", named(specs, {}), counts.draw(["synthetic"], "none,uniform"))
 
 
-def measure_views(counts: Counts) -> None:
+def measure_views(counts: Counts, _: set[str]) -> None:
     """Several guesses for each problem, and refinements from the true pose."""
     solvers = named([f"{OURS}:views={count}" for count in VIEWS], {})
     solvers[f"{OURS} from the truth"] = FromTheTruth(PnPNet.from_pretrained(OURS))
@@ -229,13 +221,8 @@ def set_data(counts: Counts) -> tuple[dict[str, EvaluationData], dict[str, Evalu
     """Synthetic sets of many numbers of pairs, outliers and rotations, and sets of scenes and raw matches."""
     seed, count = SEED_REPORT + 20, 2 * counts.synthetic
     made = counts.draw(["synthetic", "any_rotation"], "none,uniform,3", seed=seed, count=count)
-    for n, outliers in (
-        (6, "uniform"),
-        (12, "uniform"),
-        (20, "uniform,50%"),
-        (50, "uniform,50%"),
-        (200, "uniform,50%"),
-    ):
+    for n in (6, 12, 20, 50, 200):
+        outliers = "uniform,50%" if n >= 20 else "uniform"
         fewer = count if n < 100 else count // 5
         made |= counts.draw(["synthetic"], outliers, n=n, seed=seed, count=fewer)
     real: dict[str, EvaluationData] = {}
@@ -282,7 +269,7 @@ def with_known_noise(sets: Mapping[str, EvaluationData], img_sigma: float) -> di
     return found
 
 
-def measure_set_told(counts: Counts) -> None:
+def measure_set_told(counts: Counts, _: set[str]) -> None:
     """The network for any number of pairs with known noise."""
     options: dict[str, Any] = {"count": 2 * counts.synthetic, "seed": SEED_REPORT + 20, "known_noise": True}
     sets = counts.draw(["synthetic", "any_rotation"], "none,uniform,3", **options)
@@ -290,9 +277,10 @@ def measure_set_told(counts: Counts) -> None:
 
 
 @torch.no_grad()
-def measure_honesty(count: int) -> None:
+def measure_honesty(counts: Counts, _: set[str]) -> None:
     """Weights as probabilities, ``ok`` on problems without an answer, and covariances."""
     tuned = load_results(HERE / "paper.json")["tuned"]
+    count = counts.synthetic // 2
     common: dict[str, Any] = {"count": count, "seed": SEED_REPORT + 30}
 
     def drawn(n: int, outliers: str, **more: Any) -> Problems:
@@ -342,30 +330,29 @@ def covariance_check(solver: PnPNet, problems: Problems) -> dict[str, Any]:
     return {"mean": squares.mean().item(), "inside": success_rate(squares < CHI_SQUARE_95)._asdict()}
 
 
+#: What measures which files.
+STEPS: tuple[tuple[set[str], Callable[[Counts, set[str]], None]], ...] = (
+    ({"paper", "gaussian_pose", "against_n"}, measure_protocol),
+    ({"crowd"}, measure_crowd),
+    ({"real", "mismatches"}, measure_scenes),
+    ({"against_m"}, measure_depths),
+    ({"views"}, measure_views),
+    ({"set", "set_real", "set_real_told"}, measure_set),
+    ({"set_told"}, measure_set_told),
+    ({"honesty"}, measure_honesty),
+)
+
+
 def measure(scenes: Path, synthetic_count: int, real_count: int, only: Sequence[str]) -> None:
     """Solve everything, or the files in ``only``, and write the results files."""
     import cv2
 
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    counts = Counts(scenes, synthetic_count, real_count)
     wanted = set(only or (*RESULTS, "honesty", "probability", "complexity"))
-    if wanted & {"paper", "gaussian_pose", "against_n"}:
-        measure_protocol(counts, wanted)
-    if "crowd" in wanted:
-        measure_crowd(counts)
-    if wanted & {"real", "mismatches"}:
-        measure_scenes(counts, wanted)
-    if "against_m" in wanted:
-        measure_depths(counts)
-    if "views" in wanted:
-        measure_views(counts)
-    if wanted & {"set", "set_real", "set_real_told"}:
-        measure_set(counts, wanted)
-    if "set_told" in wanted:
-        measure_set_told(counts)
-    if "honesty" in wanted:
-        measure_honesty(synthetic_count // 2)
+    for names, step in STEPS:
+        if wanted & names:
+            step(Counts(scenes, synthetic_count, real_count), wanted & names)
     if "probability" in wanted:
         from measure_probability import measure_probability  # needs hydra
 

@@ -5,6 +5,7 @@ The coefficients go from ``probability.json`` into the code by hand; a test comp
 
 from __future__ import annotations
 
+import math
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
+from sklearn.linear_model import LogisticRegression
 from torch import Tensor
 
 from kornia_pnpnet import solver as solver_module
@@ -95,13 +97,7 @@ def far_and_right(result: PnPResult, problems: Problems) -> tuple[Tensor, Tensor
 
 
 def fit_law(rows: Tensor) -> list[float]:
-    """Logistic regression of "not far off" on the two features, by Newton's method; every data set counts the same."""
-    inputs = torch.cat((torch.ones_like(rows[:, :1]), rows[:, :2]), 1)
-    target, weight = 1 - rows[:, 2], rows[:, -1]
-    law = torch.zeros(3, dtype=torch.float64)
-    for _ in range(50):
-        chance = torch.sigmoid(inputs @ law)
-        slope = inputs.mT @ (weight * (chance - target))
-        curvature = (inputs * (weight * chance * (1 - chance))[:, None]).mT @ inputs
-        law = law - torch.linalg.solve(curvature, slope)
-    return [float(f"{x:.5g}") for x in law]
+    """Logistic regression of "not far off" on the two features; every data set counts the same."""
+    features, target, weight = (x.numpy() for x in (rows[:, :2], 1 - rows[:, 2], rows[:, -1]))
+    law = LogisticRegression(C=math.inf, tol=1e-8, max_iter=1000).fit(features, target, sample_weight=weight)
+    return [float(f"{x:.5g}") for x in (*law.intercept_, *law.coef_[0])]

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from kornia_pnpnet import Pose, create_solver, pose_errors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
-from kornia_pnpnet.evaluation.figures.style import BLUE, GREY, VERMILION, WIDTH, make_figure, save, themed
+from kornia_pnpnet.evaluation.plots import BLUE, GREY, VERMILION, WIDTH, make_figure, save, themed
 
 __all__ = ["plot_problem"]
 

@@ -9,16 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from figures import draw_legend, log_scale, solver_styles
 
-from kornia_pnpnet.evaluation.figures.style import (
-    WIDTH,
-    draw_legend,
-    log_scale,
-    make_figure,
-    save,
-    solver_styles,
-    themed,
-)
+from kornia_pnpnet.evaluation.plots import WIDTH, make_figure, save, themed
 
 __all__ = ["find_rows", "plot_real_matches"]
 

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from figures import paper_figures, plot_reliability, plot_sweep
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matches import MATCHES, overview, page_facts
 from measure import ANY, CHI_SQUARE_95, HERE, OURS, PAPER, PEERS, RESULTS, ROBUST
@@ -18,7 +19,7 @@ from short_runs import Row, ablation, capacity, read_summary, sweep
 
 from kornia_pnpnet import PnPNet
 from kornia_pnpnet.core.tables import markdown_table
-from kornia_pnpnet.evaluation.figures import paper_figures, plot_reliability, plot_sweep, plot_training
+from kornia_pnpnet.evaluation.plots import plot_training
 from kornia_pnpnet.evaluation.results import format_table, load_results
 from kornia_pnpnet.metrics import SuccessRate
 from kornia_pnpnet.pretrained import WEIGHTS_FOLDER, shipped_weights

@@ -8,11 +8,11 @@ from itertools import pairwise, takewhile
 from pathlib import Path
 from typing import Any
 
+from figures import mix_in_words
 from measure import HERE
 from rates import interval
 
 from kornia_pnpnet.core.tables import markdown_table
-from kornia_pnpnet.evaluation.figures.training import mix_in_words
 
 __all__ = ["KERNEL", "ablation", "capacity", "claim", "compared", "read_summary", "sweep"]
 

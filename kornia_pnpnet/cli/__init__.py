@@ -13,7 +13,7 @@ import sys
 from types import ModuleType
 
 from kornia_pnpnet import __version__
-from kornia_pnpnet.cli import demo, evaluate, export, figures, listing, solve
+from kornia_pnpnet.cli import demo, evaluate, export, listing, solve
 from kornia_pnpnet.cli.arguments import OneLineParser
 
 __all__ = ["COMMANDS", "main", "make_parser"]
@@ -22,7 +22,6 @@ __all__ = ["COMMANDS", "main", "make_parser"]
 COMMANDS: dict[str, ModuleType] = {
     "solve": solve,
     "evaluate": evaluate,
-    "figures": figures,
     "export": export,
     "list": listing,
     "demo": demo,

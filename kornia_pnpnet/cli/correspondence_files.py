@@ -15,15 +15,7 @@ from torch import Tensor
 
 from kornia_pnpnet.core.files import read_npz
 
-__all__ = [
-    "ImageCorrespondences",
-    "InputError",
-    "camera_matrix",
-    "colmap_camera",
-    "check_camera",
-    "read_arrays",
-    "read_correspondences",
-]
+__all__ = ["ImageCorrespondences", "InputError", "camera_matrix", "read_arrays", "read_correspondences"]
 
 _COLUMNS = ("X", "Y", "Z", "u", "v")
 _MIN_COUNT = 3
@@ -53,6 +45,22 @@ class ImageCorrespondences(NamedTuple):
     weights: Tensor | None = None
     intrinsics: Tensor | None = None
 
+    def undistorted(self, camera: str) -> ImageCorrespondences:
+        """With the pixels of the pinhole camera of COLMAP's ``MODEL,width,height,params...``.
+
+        A pixel that no ray of the camera has gets the weight 0.
+        """
+        from kornia_pnpnet.data.colmap import undistort
+
+        try:
+            matrix, pixels = undistort(camera, self.img_points)
+        except ValueError as error:
+            raise InputError("--camera", str(error)) from None
+        there = pixels.isfinite().all(-1)
+        weights = there.to(pixels) if self.weights is None else torch.where(there, self.weights, 0.0)
+        pixels = torch.where(there[:, None], pixels, matrix[:2, 2])
+        return ImageCorrespondences(self.world_points, pixels, weights, _pinhole(matrix, "--camera"))
+
 
 def camera_matrix(text: str) -> Tensor:
     """Read ``fx,fy,cx,cy`` in pixels as a camera matrix, shape (3, 3), float64."""
@@ -61,21 +69,10 @@ def camera_matrix(text: str) -> Tensor:
     except ValueError:
         raise InputError("--intrinsics", f"expected four numbers fx,fy,cx,cy, got {text!r}") from None
     matrix = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    return check_camera(matrix, "--intrinsics")
+    return _pinhole(matrix, "--intrinsics")
 
 
-def colmap_camera(text: str, img_points: Tensor) -> tuple[Tensor, Tensor]:
-    """Undistort pixels (N, 2) by ``MODEL,width,height,params...``, see :func:`~kornia_pnpnet.data.colmap.undistort`."""
-    from kornia_pnpnet.data.colmap import undistort
-
-    try:
-        matrix, pixels = undistort(text, img_points)
-    except ValueError as error:
-        raise InputError("--camera", str(error)) from None
-    return check_camera(matrix, "--camera"), pixels
-
-
-def check_camera(matrix: Tensor, source: str | Path) -> Tensor:
+def _pinhole(matrix: Tensor, source: str | Path) -> Tensor:
     """Return the matrix of a pinhole camera, scaled to end in 1; raise an :class:`InputError` for any other matrix."""
     if not matrix.isfinite().all():
         raise InputError(source, "the intrinsics are not finite")
@@ -144,6 +141,7 @@ def _read_npz(path: Path) -> ImageCorrespondences:
     arrays = read_arrays(path, ("world_points", "img_points", "weights", "intrinsics"))
     count = len(arrays["world_points"]) if arrays["world_points"].ndim else 0
     shapes = {"world_points": (count, 3), "img_points": (count, 2), "weights": (count,), "intrinsics": (3, 3)}
+    tensors = {}
     for name, array in arrays.items():
         if array.dtype.kind not in "fiub" or array.shape != shapes[name]:
             got = f"{array.dtype} of {array.shape}"
@@ -152,9 +150,9 @@ def _read_npz(path: Path) -> ImageCorrespondences:
         if bad.any():
             wanted = "finite and at least 0" if name == "weights" else "finite"
             raise InputError(path, f"{name}[{int(np.nonzero(bad)[0][0])}] must be {wanted}")
-    tensors = {name: torch.tensor(array.astype(np.float64)) for name, array in arrays.items()}
+        tensors[name] = torch.tensor(array.astype(np.float64))
     if "intrinsics" in tensors:
-        tensors["intrinsics"] = check_camera(tensors["intrinsics"], path)
+        tensors["intrinsics"] = _pinhole(tensors["intrinsics"], path)
     return ImageCorrespondences(**tensors)
 
 

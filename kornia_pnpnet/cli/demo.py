@@ -52,32 +52,28 @@ def run(arguments: argparse.Namespace) -> int:
     import torch
 
     from kornia_pnpnet.evaluation import evaluate, format_table, save_results
-    from kornia_pnpnet.evaluation.figures import plot_errors, plot_success, plot_training
     from kornia_pnpnet.evaluation.named_solvers import default_solvers, load_solver
+    from kornia_pnpnet.evaluation.plots import plot_errors, plot_success, plot_training
     from kornia_pnpnet.evaluation.problem_sets import evaluation_sets
 
     sources = [arguments.data or "synthetic"]
-    names = [name for name in default_solvers(_N, sources) if name.partition(":")[0] in _SOLVERS]
-    for missing in sorted({*_SOLVERS} - {name.partition(":")[0] for name in names}):
+    specs = {name.partition(":")[0]: name for name in default_solvers(_N, sources)}
+    for missing in sorted({*_SOLVERS} - {*specs}):
         print(f"pnpnet: the demo runs without {missing}, which is not installed", file=sys.stderr)
-    sets = evaluation_sets(
-        sources,
-        "none,2" if arguments.data else "none,uniform",
-        n=_N,
-        count=arguments.problems,
-        metric=not arguments.arbitrary_unit,
-    )
-    solvers = {name: load_solver(name) for name in names}
+    outliers = "none,2" if arguments.data else "none,uniform"
+    count, metric = arguments.problems, not arguments.arbitrary_unit
+    sets = evaluation_sets(sources, outliers, n=_N, count=count, metric=metric)
+    solvers = {specs[name]: load_solver(specs[name]) for name in _SOLVERS if name in specs}
     # The tensors are small: more threads gain nothing, and lose much when another process computes at the same time.
     torch.set_num_threads(1)
-    print(f"{arguments.problems} problems of {_N} correspondences in each set, one thread:\n", flush=True)
+    print(f"{count} problems of {_N} correspondences in each set, one thread:\n", flush=True)
     results = evaluate(solvers, sets)
     print(format_table(results), flush=True)
     folder = Path(arguments.out)
     save_results(results, folder / "results.json")
     files = [folder / "results.json"]
     files += [plot_success(folder / "success.png", results), plot_errors(folder / "errors.png", results)]
-    files.append(_draw_one(folder / "problem.png", names[0], solvers[names[0]], list(sets.values())[-1]))
+    files.append(_draw_one(folder / "problem.png", *next(iter(solvers.items())), list(sets.values())[-1]))
     if arguments.train_seconds > 0:
         history = _train(arguments.train_seconds, folder / "training")
         if history is not None:
@@ -95,19 +91,16 @@ def verdict(results: Mapping[str, Any]) -> str:
     sentences = []
     for data in results["data"]:
         rows = [row for row in results["rows"] if row["data"] == data]
-        if not rows:
-            continue
+        texts = [
+            f"{row['solver']} ({100 * row['success']['rate']:.1f} %, {row['us_per_problem']:.0f} µs per problem)"
+            for row in rows
+        ]
         best = max(row["success"]["rate"] for row in rows)
-        most = [row for row in rows if row["success"]["high"] >= best]
-        fastest = min(rows, key=lambda row: row["us_per_problem"])
-        winners = " and ".join(map(_described, most))
-        second = "was" if most == [fastest] else f"{_described(fastest)} was"
-        sentences.append(f'on "{data}", {winners} solved the most problems and {second} the fastest')
+        most = [text for row, text in zip(rows, texts, strict=True) if row["success"]["high"] >= best]
+        fastest = texts[min(range(len(rows)), key=lambda i: rows[i]["us_per_problem"])]
+        second = "was" if most == [fastest] else f"{fastest} was"
+        sentences.append(f'on "{data}", {" and ".join(most)} solved the most problems and {second} the fastest')
     return f"In short: {'; '.join(sentences)}."
-
-
-def _described(row: Mapping[str, Any]) -> str:
-    return f"{row['solver']} ({100 * row['success']['rate']:.1f} %, {row['us_per_problem']:.0f} µs per problem)"
 
 
 def _draw_one(path: Path, name: str, solver: nn.Module, entry: EvaluationData) -> Path:
@@ -115,16 +108,16 @@ def _draw_one(path: Path, name: str, solver: nn.Module, entry: EvaluationData) -
     import torch
 
     from kornia_pnpnet.cli.reprojection import reproject
-    from kornia_pnpnet.evaluation.figures import plot_pose
+    from kornia_pnpnet.evaluation.plots import plot_pose
 
     outliers = (~entry.problems.inliers).sum(-1)
     index = int((outliers == outliers.max()).int().argmax())
     problem = entry.problems.map(lambda part: part[index : index + 1])
     with torch.no_grad():
-        result = solver(problem.world_points, problem.img_points, problem.intrinsics)
+        result = solver(*problem[:3])
     found = reproject(problem.world_points[0], problem.img_points[0], problem.intrinsics[0], result.pose)
     title = f"{name}, {int(outliers[index])} outliers"
-    return plot_pose(path, problem.img_points[0], found.pixels, found.rejected, title=title)
+    return plot_pose(path, problem.img_points[0], found.pixels, found.rejected, title)
 
 
 def _train(seconds: float, folder: Path) -> Path | None:
@@ -137,10 +130,9 @@ def _train(seconds: float, folder: Path) -> Path | None:
     print(f"\nTraining a new network for about {seconds:.0f} s:", flush=True)
     history = train_briefly(seconds, folder)
     rows = list(csv.DictReader(history.read_text().splitlines()))
-    for column in (name for name in rows[0] if name.startswith("val/") and name.endswith("/success")):
+    for column in rows[0]:
         filled = [row for row in rows if row[column]]
-        if filled:
-            label = column.removeprefix("val/").removesuffix("/success")
+        if filled and column.startswith("val/") and column.endswith("/success"):
             ends = (f"{100 * float(row[column]):.1f} % at update {row['update']}" for row in (filled[0], filled[-1]))
-            print(f"  success, outliers {label}: {' -> '.join(ends)}")
+            print(f"  success, outliers {column.split('/')[1]}: {' -> '.join(ends)}")
     return history

@@ -102,15 +102,14 @@ def run(arguments: argparse.Namespace) -> int:
         return 130
     if not results["rows"]:
         raise ValueError(f"no solver accepts these problems: {results['left_out'][0]['reason']}")
-    reasons: dict[str, list[str]] = {}
-    for entry in results["left_out"]:
-        reasons.setdefault(entry["solver"], []).append(entry["reason"])
-    for solver, given in reasons.items():
-        print(f"pnpnet: {solver} is skipped on {len(given)} of {len(sets)} sets: {given[0]}", file=sys.stderr)
+    for solver in solvers:
+        given = [entry["reason"] for entry in results["left_out"] if entry["solver"] == solver]
+        if given:
+            print(f"pnpnet: {solver} is skipped on {len(given)} of {len(sets)} sets: {given[0]}", file=sys.stderr)
     print(format_table(results))
     print(f"\nResults: {out}" + (f" ({found} of {len(results['rows'])} rows were there)" if found else ""))
     if arguments.plot:
-        from kornia_pnpnet.evaluation.figures import plot_errors, plot_success
+        from kornia_pnpnet.evaluation.plots import plot_errors, plot_success
 
         folder = Path(arguments.plot)
         pictures = plot_success(folder / "success.png", results), plot_errors(folder / "errors.png", results)

@@ -12,11 +12,11 @@ from torch import Tensor
 
 from kornia_pnpnet.result import Pose
 
-__all__ = ["Reprojection", "rejection_limit", "reproject"]
+__all__ = ["Reprojection", "reproject"]
 
-#: Median absolute deviation to standard deviation of a normal distribution.
+# Median absolute deviation to standard deviation of a normal distribution.
 _MAD_TO_SIGMA = 1.4826
-#: Lowest limit in pixels: about three standard deviations of a corner detector's noise.
+# Lowest limit in pixels: about three standard deviations of a corner detector's noise.
 _MIN_LIMIT_PX = 3.0
 
 
@@ -39,27 +39,17 @@ class Reprojection(NamedTuple):
 def reproject(
     world_points: Tensor, img_points: Tensor, intrinsics: Tensor, pose: Pose, limit_px: float | None = None
 ) -> Reprojection:
-    """Compare the pixels (N, 2) of one image with the projections of its world points (N, 3).
+    """Compare the pixels (N, 2) of one image with the projections of its world points (N, 3) by a pose (1, ...).
 
-    The pose has a batch of 1. Errors above ``limit_px`` are rejected, or above the :func:`rejection_limit`.
+    Without ``limit_px`` the limit is a robust estimate of three standard deviations of the inliers, at least 3 px.
     """
     cam_points = transform_points(pose.matrix, world_points[None])[0]
     in_front = cam_points[:, 2:] > 0
     pixels = convert_points_from_homogeneous(torch.where(in_front, cam_points, 1.0) @ intrinsics.mT, eps=0.0)
     pixels = torch.where(in_front, pixels, torch.nan)
     errors = (pixels - img_points).norm(dim=-1)
-    limit = rejection_limit(errors) if limit_px is None else limit_px
-    return Reprojection(pixels, errors, limit, ~(errors <= limit))
-
-
-def rejection_limit(errors_px: Tensor) -> float:
-    """Robust estimate of three standard deviations of the inliers' errors, at least 3 px; only finite errors count.
-
-    Example:
-        >>> rejection_limit(torch.tensor([0.1, 0.2, 900.0])), rejection_limit(torch.tensor([9.0, 10.0, 11.0]))
-        (3.0, 44.478)
-    """
-    finite = errors_px[errors_px.isfinite()]
-    if not len(finite):
-        return _MIN_LIMIT_PX
-    return max(_MIN_LIMIT_PX, 3.0 * _MAD_TO_SIGMA * finite.double().quantile(0.5).item())
+    if limit_px is None:
+        finite = errors[errors.isfinite()].double()
+        sigma = _MAD_TO_SIGMA * finite.quantile(0.5).item() if len(finite) else 0.0
+        limit_px = max(_MIN_LIMIT_PX, 3.0 * sigma)
+    return Reprojection(pixels, errors, limit_px, ~(errors <= limit_px))

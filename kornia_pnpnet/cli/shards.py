@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import nullcontext, suppress
 from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -32,14 +32,9 @@ _NUMBERS_AT_ONCE = 2**25
 
 
 class ShardReport(NamedTuple):
-    """Counts of a run over shards.
+    """What a run over shards solved: problems with a pose, all problems, and shards.
 
-    Attributes:
-        solved: problems with a pose in the shards that this run solved.
-        problems: all problems in the shards that this run solved.
-        shards: number of shards that this run solved.
-        kept: number of shards that had results before.
-        failed: one line for each shard that cannot be read.
+    ``kept`` counts the shards that had results before; ``failed`` has a line for each shard that cannot be read.
     """
 
     solved: int
@@ -61,10 +56,10 @@ def solve_shards(
 ) -> ShardReport:
     r"""Solve shards of problems one after the other, and write the results of ``part.*`` to ``part.parquet``.
 
-    A shard is a Parquet file with one problem per row and the columns of :class:`~kornia_pnpnet.arrow.Solve`. Or it is
-    an NPZ file with ``world_points`` (B, N, 3), ``img_points`` (B, N, 2) and optionally ``intrinsics`` (3, 3) or
-    (B, 3, 3), ``weights`` (B, N), and ``img_sigma`` and ``world_sigma``, each a number, (B,) or (B, N). A Parquet file
-    is read ``batch`` rows at a time, an NPZ file as a whole.
+    A shard is a Parquet file with one problem per row and the columns of :class:`~kornia_pnpnet.arrow.Solve`, of which
+    ``batch`` rows are read at a time. Or it is an NPZ file, read as a whole, with ``world_points`` (B, N, 3),
+    ``img_points`` (B, N, 2) and optionally ``intrinsics`` (3, 3) or (B, 3, 3), ``weights`` (B, N), and ``img_sigma``
+    and ``world_sigma``, each a number, (B,) or (B, N).
 
     A results file gets its name when it is complete, so a run that was stopped can be repeated: shards with results
     are skipped. A shard that cannot be read is reported, and the other shards are solved.
@@ -76,7 +71,7 @@ def solve_shards(
         name: name of the solver. Results files store it with the digest of the solver's parameters.
         batch: number of problems solved at once.
         overwrite: also solve the shards that have results.
-        progress: show a progress bar with the rate on stderr, where stderr is a terminal and tqdm is installed.
+        progress: show a progress bar on stderr, where stderr is a terminal and tqdm is installed.
 
     Returns:
         The :class:`ShardReport`.
@@ -94,10 +89,10 @@ def solve_shards(
         if target not in waiting and _solver_of(target) != mark:
             raise InputError(target, f"not of this {name}: choose another folder, or replace it with --overwrite")
     solved, problems, failed = 0, 0, []
-    with _bar(waiting.values(), progress) as advance:
+    with _bar(waiting.values(), progress) as bar:
         for target, shard in waiting.items():
             try:
-                ok, count = _solve_shard(solve, shard, target, mark, batch, advance)
+                ok, count = _solve_shard(solve, shard, target, mark, batch, bar)
             except InputError as error:
                 failed.append(str(error))
                 continue
@@ -132,24 +127,19 @@ def _solver_of(target: Path) -> bytes | None:
         return None
 
 
-@contextmanager
-def _bar(shards: Iterable[Path], shown: bool) -> Iterator[Callable[[int], object]]:
-    """A progress bar over the problems of shards; yields what advances it by a number of problems."""
+def _bar(shards: Iterable[Path], shown: bool) -> Any:
+    """A progress bar over the problems of shards, or a context without one."""
     if not shown or not sys.stderr.isatty() or find_spec("tqdm") is None:
-        yield lambda count: None
-        return
+        return nullcontext()
     from tqdm import tqdm
 
     total = None  # of NPZ files, and where a file cannot be read
     with suppress(OSError, pa.ArrowException):
         total = sum(parquet.read_metadata(shard).num_rows for shard in shards)
-    with tqdm(total=total, unit="problem", unit_scale=True) as bar:
-        yield bar.update
+    return tqdm(total=total, unit="problem", unit_scale=True)
 
 
-def _solve_shard(
-    solve: Solve, shard: Path, target: Path, mark: bytes, batch: int, advance: Callable[[int], object]
-) -> tuple[int, int]:
+def _solve_shard(solve: Solve, shard: Path, target: Path, mark: bytes, batch: int, bar: Any) -> tuple[int, int]:
     """Solve a shard; return the number of solved problems and of all problems."""
 
     def solved_tables() -> Iterator[pa.Table]:
@@ -167,7 +157,8 @@ def _solve_shard(
         for result in chain([first], results):
             writer.write_table(result)
             solved, count = solved + (compute.sum(result["ok"]).as_py() or 0), count + len(result)
-            advance(len(result))
+            if bar is not None:
+                bar.update(len(result))
     return solved, count
 
 

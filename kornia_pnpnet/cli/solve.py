@@ -38,7 +38,6 @@ from kornia_pnpnet.cli.arguments import (
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
-_DEFAULT = "pnpnet-set"
 _ADVICE = {
     "too_few_pairs": "a pose needs at least three correspondences that a camera can see",
     "degenerate": "the points lie on a line or coincide",
@@ -78,7 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--solver",
         metavar="NAME",
-        default=_DEFAULT,
+        default="pnpnet-set",
         help="a name of `pnpnet list`, or a folder of weights; default: %(default)s",
     )
     parser.add_argument(
@@ -128,38 +127,26 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.camera and (arguments.intrinsics or arguments.focal or arguments.batch):
         raise ValueError("--camera stands alone: without --intrinsics, --focal and --batch")
-
-    camera = camera_matrix(arguments.intrinsics) if arguments.intrinsics else None
-    if arguments.batch:
-        return _solve_batch(arguments, camera)
-    if len(arguments.file) > 1 or arguments.out:
+    if arguments.batch and (arguments.plot or arguments.threshold):
+        raise ValueError("--plot and --threshold are for one image, not for --batch")
+    if not arguments.batch and (len(arguments.file) > 1 or arguments.out):
         raise ValueError("several files and --out need --batch")
-    return _solve_image(arguments, camera)
+    camera = camera_matrix(arguments.intrinsics) if arguments.intrinsics else None
+    return _solve_batch(arguments, camera) if arguments.batch else _solve_image(arguments, camera)
 
 
 def _solve_batch(arguments: argparse.Namespace, camera: Tensor | None) -> int:
     from kornia_pnpnet.arrow import Solve
     from kornia_pnpnet.cli.shards import solve_shards
 
-    if arguments.plot or arguments.threshold:
-        raise ValueError("--plot and --threshold are for one image, not for --batch")
-    name, out = arguments.solver, arguments.out or "outputs/poses"
+    out, again = arguments.out or "outputs/poses", arguments.overwrite
+    solve = Solve(_load_solver(arguments), intrinsics=camera)
+    options = {"name": arguments.solver, "batch": arguments.batch_size, "overwrite": again, "progress": True}
     try:
-        report = solve_shards(
-            Solve(_load_solver(arguments), intrinsics=camera),
-            arguments.file,
-            out,
-            name=name,
-            batch=arguments.batch_size,
-            overwrite=arguments.overwrite,
-            progress=True,
-        )
+        report = solve_shards(solve, arguments.file, out, **options)
     except KeyboardInterrupt:
-        again = " without --overwrite" if arguments.overwrite else ""
-        print(
-            f"pnpnet: interrupted; the shards solved so far are in {out}: the same command{again} solves the others",
-            file=sys.stderr,
-        )
+        same = "the same command without --overwrite" if again else "the same command"
+        print(f"pnpnet: interrupted; the shards solved so far are in {out}: {same} solves the others", file=sys.stderr)
         return 130
     for line in report.failed:
         print(f"pnpnet: {line}", file=sys.stderr)
@@ -170,59 +157,50 @@ def _solve_batch(arguments: argparse.Namespace, camera: Tensor | None) -> int:
 
 def _solve_image(arguments: argparse.Namespace, camera: Tensor | None) -> int:
     import torch
-    from kornia.geometry.conversions import rotation_matrix_to_quaternion
 
     from kornia_pnpnet import Status
-    from kornia_pnpnet.cli.correspondence_files import InputError, colmap_camera, read_correspondences
+    from kornia_pnpnet.cli.correspondence_files import InputError, read_correspondences
     from kornia_pnpnet.cli.reprojection import reproject
 
     (path,) = arguments.file
     matches = read_correspondences(path)
-    camera = matches.intrinsics if camera is None else camera
-    weights = matches.weights
     if arguments.camera:
-        camera, pixels = colmap_camera(arguments.camera, matches.img_points)
-        there = pixels.isfinite().all(-1)
-        weights = there.to(pixels) if weights is None else torch.where(there, weights, 0.0)
-        matches = matches._replace(img_points=torch.where(there[:, None], pixels, camera[:2, 2]))
+        matches = matches.undistorted(arguments.camera)
+    camera = matches.intrinsics if camera is None else camera
     if camera is None:
         raise InputError(path, "the file has no intrinsics: pass --intrinsics fx,fy,cx,cy")
-    count = len(matches.world_points)
-    name = arguments.solver
     if arguments.plot and Path(arguments.plot).exists() and not arguments.overwrite:
         raise ValueError(f"'{arguments.plot}' exists: pass --overwrite to replace it")
-    solver = _load_solver(arguments)
-    weights = None if weights is None else weights[None]
+    solver, name = _load_solver(arguments), arguments.solver
+    weights = None if matches.weights is None else matches.weights[None]
     with torch.no_grad():
         result = solver(matches.world_points[None], matches.img_points[None], camera[None], weights)
-    camera = result.intrinsics[0]
+    camera, ok, status = result.intrinsics[0], bool(result.ok), Status(int(result.status)).name.lower()
     found = reproject(matches.world_points, matches.img_points, camera, result.pose, arguments.threshold)
-    ok, status = bool(result.ok), Status(int(result.status))
     rejected = found.rejected if ok else torch.ones_like(found.rejected)  # without a pose no pair is accepted
-    columns = (x.tolist() for x in (result.weights[0], found.errors_px, rejected))
+    pairs = zip(*(x.tolist() for x in (result.weights[0], found.errors_px, rejected)), strict=True)
     answer = {
         "solver": name,
-        "n": count,
+        "n": len(matches.world_points),
         "ok": ok,
-        "status": status.name.lower(),
+        "status": status,
         "rotation": result.rotation[0].tolist(),
         "translation": result.translation[0].tolist(),
-        "quaternion_wxyz": rotation_matrix_to_quaternion(result.rotation)[0].tolist(),
+        "quaternion_wxyz": result.pose.quaternion[0].tolist(),
         "intrinsics": camera.tolist(),
         "cost": result.cost.item(),
         "rejected_above_px": found.limit_px,
         "pairs": [
-            {"weight": weight, "reprojection_error_px": error if math.isfinite(error) else None, "rejected": rejected}
-            for weight, error, rejected in zip(*columns, strict=True)
+            {"weight": weight, "reprojection_error_px": error if math.isfinite(error) else None, "rejected": bad}
+            for weight, error, bad in pairs
         ],
     }
     print(json.dumps(answer, indent=2, allow_nan=False))
     if arguments.plot:
-        from kornia_pnpnet.evaluation.figures import plot_pose
+        from kornia_pnpnet.evaluation.plots import plot_pose
 
-        plot_pose(
-            arguments.plot, matches.img_points, found.pixels, rejected, title=name if ok else f"{name}: NOT SOLVED"
-        )
+        title = name if ok else f"{name}: NOT SOLVED"
+        plot_pose(arguments.plot, matches.img_points, found.pixels, rejected, title)
     if not ok:
-        print(f"pnpnet: not solved ({answer['status']}): {_ADVICE[answer['status']]}", file=sys.stderr)
+        print(f"pnpnet: not solved ({status}): {_ADVICE[status]}", file=sys.stderr)
     return 0 if ok else 1

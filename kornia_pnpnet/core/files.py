@@ -1,11 +1,10 @@
-"""Writing files in one piece, and digests of contents."""
+"""Writing files in one piece, reading NPZ files, and digests of contents."""
 
 from __future__ import annotations
 
 import errno
 import hashlib
 import json
-import math
 import os
 import zipfile
 from collections.abc import Collection, Iterator
@@ -17,12 +16,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["MOST_BYTES", "atomic_open", "check_size", "digest", "npz_shapes", "read_npz", "write_json"]
+__all__ = ["MOST_BYTES", "atomic_open", "digest", "read_npz", "write_json"]
 
 #: Bytes of numbers that are read from a file at once. A few compressed megabytes can unpack to any size.
 MOST_BYTES = 2**31
-# Readers of the headers by version.
-_NPY_HEADERS = {1: np.lib.format.read_array_header_1_0, 2: np.lib.format.read_array_header_2_0}
 
 
 @contextmanager
@@ -53,51 +50,27 @@ def write_json(path: str | Path, content: Any) -> None:
         file.write(json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
-def check_size(count: int, advice: str) -> None:
-    """Raise a ``ValueError`` when ``count`` bytes are more than :data:`MOST_BYTES`; ``advice`` says what to do."""
-    if count > MOST_BYTES:
-        raise ValueError(f"the numbers take {count / 1e9:.1f} GB, more than {MOST_BYTES / 1e9:.1f} GB: {advice}")
-
-
-def npz_shapes(path: Path, names: Collection[str] | None = None) -> dict[str, tuple[int, ...]]:
-    """Shapes of the arrays of an NPZ file, or of those of these names that it has, from their headers alone.
+def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
+    """Read the arrays of an NPZ file, or those of these names that it has, without unpickling.
 
     Raises:
         ValueError: when the file is not an NPZ file of numbers, or has more than :data:`MOST_BYTES` of them. The
             message does not name the file.
     """
-    shapes, size = {}, 0
-    with path.open("rb") as content:
+    size = 0
+    with path.open("rb") as file:
         try:
-            with zipfile.ZipFile(content) as archive:
-                for member in archive.infolist():
-                    name = member.filename.removesuffix(".npy")
-                    if names is not None and name not in names:
-                        continue
-                    with archive.open(member) as file:
-                        major = np.lib.format.read_magic(file)[0]
-                        shapes[name], _, dtype = _NPY_HEADERS[major](file)
-                    if dtype.hasobject:
-                        raise ValueError(f"{name} holds Python objects")
-                    size += max(math.prod(shapes[name]) * dtype.itemsize, member.file_size)
+            with zipfile.ZipFile(file) as archive:
+                sizes = {member.filename.removesuffix(".npy"): member.file_size for member in archive.infolist()}
+            wanted = sizes.keys() if names is None else sizes.keys() & names
+            size = sum(sizes[name] for name in wanted)
+            if size <= MOST_BYTES:
+                file.seek(0)
+                with np.load(file, allow_pickle=False) as content:
+                    return {name: np.asarray(content[name]) for name in content.files if name in wanted}
         except Exception as error:  # numpy, zipfile and zlib raise a dozen types of errors for broken files
             raise ValueError(f"not an NPZ file of numbers: {error}") from error
-    check_size(size, "split the file")
-    return shapes
-
-
-def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
-    """Read the arrays of an NPZ file, or those of these names that it has, without unpickling.
-
-    Raises:
-        ValueError: see :func:`npz_shapes`.
-    """
-    wanted = npz_shapes(path, names)
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as content:  # np.load leaves broken files open
-            return {name: np.asarray(content[name]) for name in content.files if name in wanted}
-    except Exception as error:  # numpy, zipfile and zlib raise a dozen types of errors for broken files
-        raise ValueError(f"not an NPZ file of numbers: {error}") from error
+    raise ValueError(f"the numbers take {size / 1e9:.1f} GB, more than {MOST_BYTES / 1e9:.1f} GB: split the file")
 
 
 def digest(*parts: Any) -> str:

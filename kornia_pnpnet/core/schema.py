@@ -93,21 +93,20 @@ def read_column(
     *,
     gaps: bool = False,
 ) -> list[float]:
-    """Convert a column of :func:`read_rows` to numbers with ``read``. With ``gaps``, an empty cell is NaN.
+    """Convert a column of :func:`read_rows` to numbers with ``read``.
 
-    Raises:
-        ValueError: when there is no such column, or a cell is not a finite number; the message names ``path``.
+    With ``gaps``, empty cells and numbers that are not finite become NaN; without, they are a ``ValueError``, as are a
+    missing column and other texts. The message names ``path``.
     """
     if column not in rows[0]:
         raise ValueError(f"'{path}' has no column '{column}'.")
     values = []
-    for number, row in enumerate(rows, 1):
-        cell = row[column]
+    for number, cell in enumerate((row[column] for row in rows), 1):
         try:
-            value = math.nan if gaps and not cell else read(cell)
-            if not gaps and not math.isfinite(value):
-                raise ValueError("not finite")
+            value = read(cell) if cell or not gaps else math.nan
         except (TypeError, ValueError, OverflowError) as error:
             raise ValueError(f"'{path}': '{column}' of row {number} is {cell!r}.") from error
+        if not gaps and not math.isfinite(value):
+            raise ValueError(f"'{path}': '{column}' of row {number} is {cell!r}.")
         values.append(value if math.isfinite(value) else math.nan)
     return values

@@ -26,15 +26,14 @@ def markdown_table(
         | epnp       |   7 |
         | p3p-ransac | 120 |
     """
-    align = "l" + "r" * (len(header) - 1) if align is None else align
+    align = align or "l" + "r" * (len(header) - 1)
     lines = [list(header), *map(list, rows)]
     widths = [max(2, *map(len, column)) if pad else 0 for column in zip(*lines, strict=True)]
-    rules = [
-        ("---:" if side == "r" else "---").rjust(width + 2, "-") for side, width in zip(align, widths, strict=True)
+    sides = [str.rjust if side == "r" else str.ljust for side in align]
+    texts = [
+        f"| {' | '.join(side(cell, width) for cell, side, width in zip(line, sides, widths, strict=True))} |"
+        for line in lines
     ]
-    texts = []
-    for line in lines:
-        cells = zip(line, align, widths, strict=True)
-        padded = (cell.rjust(width) if side == "r" else cell.ljust(width) for cell, side, width in cells)
-        texts.append(f"| {' | '.join(padded)} |")
-    return "\n".join([texts[0], f"|{'|'.join(rules)}|", *texts[1:]])
+    ends = zip(("---:" if side == "r" else "---" for side in align), widths, strict=True)
+    rule = "|".join(end.rjust(width + 2, "-") for end, width in ends)
+    return "\n".join([texts[0], f"|{rule}|", *texts[1:]])

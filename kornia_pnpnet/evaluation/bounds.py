@@ -5,7 +5,6 @@ A bound needs the true poses and inliers, so it cannot solve new problems.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -18,47 +17,20 @@ from kornia_pnpnet.refine.lm import RobustWeightedLM
 from kornia_pnpnet.solver import PnPNet
 from kornia_pnpnet.result import PnPResult, Problems
 
-__all__ = ["Bound", "KnownInliers", "KnownInliersAndNoise"]
+__all__ = ["KnownInliers", "KnownInliersAndNoise"]
 
 # From the true pose 3 iterations reach the minimum to 7 digits of the cost, 10 to the last digit of float64.
 _ITERATIONS = 10
 
 
-class Bound(Configured):
-    """Weighted least squares of the reprojection errors, started from the true pose; the base of all bounds.
-
-    Args:
-        arguments: ``locals()`` of the constructor of the subclass.
-    """
-
-    def __init__(self, arguments: Mapping[str, Any]) -> None:
-        super().__init__(arguments)
-        self.least_squares = PnPNet(None, RobustWeightedLM(_ITERATIONS, robustness=0.0, reject_worse=False))
-
-    def pair_weights(self, problems: Problems) -> Tensor:
-        """Return the weight of each pair, shape :math:`(B, N)`."""
-        raise NotImplementedError
-
-    def solve_with_truth(self, problems: Problems) -> PnPResult:
-        r"""Solve problems with the help of their true poses and inliers.
-
-        Args:
-            problems: :math:`B` problems with :math:`N` pairs each.
-
-        Returns:
-            The minimum next to the true pose.
-        """
-        return self.least_squares(
-            problems.world_points,
-            problems.img_points,
-            problems.intrinsics,
-            self.pair_weights(problems),
-            init=problems.pose,
-            cam_from_rig=problems.cam_from_rig,
-        )
+def _least_squares(problems: Problems, weights: Tensor, **noise: Any) -> PnPResult:
+    """The minimum of the weighted squared reprojection errors next to the true pose."""
+    solver = PnPNet(None, RobustWeightedLM(_ITERATIONS, robustness=0.0, reject_worse=False))
+    rig = problems.cam_from_rig
+    return solver(*problems[:3], weights, init=problems.pose, cam_from_rig=rig, **noise)
 
 
-class KnownInliers(Bound):
+class KnownInliers(Configured):
     r"""Least squares of the reprojection errors of the true inliers, started from the true pose.
 
     This is the best result of a method that finds all inliers and then minimises the reprojection error. Source: the
@@ -79,8 +51,12 @@ class KnownInliers(Bound):
         """Return the weight of each pair, 1 for an inlier and 0 for an outlier, shape :math:`(B, N)`."""
         return problems.inliers.to(problems.world_points.dtype)
 
+    def solve_with_truth(self, problems: Problems) -> PnPResult:
+        """Solve problems with the help of their true poses and inliers."""
+        return _least_squares(problems, self.pair_weights(problems))
 
-class KnownInliersAndNoise(Bound):
+
+class KnownInliersAndNoise(Configured):
     r"""Least squares as in :class:`KnownInliers`, with each inlier weighted by the inverse variance of its pixel.
 
     The noise of a world point moves the pixels of near points more than those of far points. With :math:`J_x` the
@@ -98,12 +74,6 @@ class KnownInliersAndNoise(Bound):
 
     Raises:
         BaseError: for a standard deviation that is negative or not finite, or when both are 0.
-
-    Example:
-        >>> KnownInliersAndNoise(world_sigma=0.01)
-        KnownInliersAndNoise(
-          img_sigma=1.0, world_sigma=0.01
-          ...
     """
 
     def __init__(self, *, img_sigma: float = 1.0, world_sigma: float = 0.05) -> None:
@@ -112,21 +82,6 @@ class KnownInliersAndNoise(Bound):
         KORNIA_CHECK(img_sigma + world_sigma > 0, "img_sigma and world_sigma must not both be 0.")
         self.img_sigma = img_sigma
         self.world_sigma = world_sigma
-
-    def solve_with_truth(self, problems: Problems) -> PnPResult:
-        """See :meth:`Bound.solve_with_truth`."""
-        if problems.img_cov is None and problems.world_cov is None:
-            return super().solve_with_truth(problems)
-        return self.least_squares(
-            *problems[:3],
-            problems.inliers.to(problems.world_points.dtype),
-            init=problems.pose,
-            img_sigma=self.img_sigma if problems.img_cov is None else None,
-            world_sigma=self.world_sigma if problems.world_cov is None else None,
-            img_cov=problems.img_cov,
-            world_cov=problems.world_cov,
-            cam_from_rig=problems.cam_from_rig,
-        )
 
     @torch.no_grad()
     def pair_weights(self, problems: Problems) -> Tensor:
@@ -143,3 +98,12 @@ class KnownInliersAndNoise(Bound):
         trace = ((focal / depth).square() * (1.0 + plane_points.square())).sum(-1)  # (B, N)
         variance = self.img_sigma**2 + self.world_sigma**2 * trace / 2.0
         return torch.where(problems.inliers, variance.reciprocal(), 0.0)
+
+    def solve_with_truth(self, problems: Problems) -> PnPResult:
+        """Solve problems with the help of their true poses and inliers."""
+        img_cov, world_cov = problems.img_cov, problems.world_cov
+        if img_cov is None and world_cov is None:
+            return _least_squares(problems, self.pair_weights(problems))
+        pixels = {"img_sigma": self.img_sigma} if img_cov is None else {"img_cov": img_cov}
+        points = {"world_sigma": self.world_sigma} if world_cov is None else {"world_cov": world_cov}
+        return _least_squares(problems, problems.inliers.to(problems.world_points.dtype), **pixels, **points)

@@ -7,6 +7,7 @@ import statistics
 import sys
 import time
 from collections.abc import Mapping
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -99,9 +100,8 @@ def evaluate(
     A pose that is not finite counts as the identity with ``ok=False``. All summaries are computed from the per-problem
     errors as they are stored, rounded to six digits, so that a reader of the file can reproduce the summaries.
 
-    With a ``path``, the file is written after every row, and a call with the same arguments continues where the file
-    ends: an evaluation that was killed loses only the unfinished row. The call may add solvers and data sets. A file
-    with rows of other code, versions, weights, configurations or problems is refused.
+    With a ``path``, the file is written after every row, and a call with the same arguments, or with more solvers and
+    data sets, continues it. A file with rows of other code, versions, weights, configurations or problems is refused.
 
     Args:
         solvers: by name, each called as ``solver(world_points, img_points, intrinsics)`` in evaluation mode, without
@@ -152,31 +152,26 @@ def evaluate(
         results = resume(results, path)
     results["left_out"] = []
     elsewhere = {key: here[key] for key in _MACHINE if results["environment"].get(key) != here[key]}
-
-    plan = [(data_name, solver_name) for data_name in data for solver_name in solvers]
-    done = {(row["data"], row["solver"]): row for row in results["rows"]}
     if path is not None:
         save_results(results, path)  # fails before the work when the file cannot be written
+
+    plan = list(product(data, solvers))
+    done = {(row["data"], row["solver"]): row for row in results["rows"]}
     hidden = not (sys.stderr.isatty() if progress is None else progress)
-    with tqdm(total=len(plan), initial=len(done), disable=hidden, unit="run") as bar:
-        for names in plan:
-            if names in done:
-                continue
-            row: dict[str, Any] = {"data": names[0], "solver": names[1]}
-            bar.set_postfix_str(f"{names[1]} on {names[0]}")
-            try:
-                row |= _row(solvers[names[1]], data[names[0]], chunk, repeats)
-            except ShapeError as error:
-                results["left_out"].append({**row, "reason": str(error).splitlines()[0]})
-            except Exception as error:
-                error.add_note(f"{names[1]} on {names[0]}")
-                raise
-            else:
-                done[names] = row | ({"environment": elsewhere} if elsewhere else {})
-                results["rows"] = [done[key] for key in plan if key in done]
-            if path is not None:
-                save_results(results, path)
-            bar.update()
+    for data_name, name in tqdm([names for names in plan if names not in done], disable=hidden, unit="run"):
+        row: dict[str, Any] = {"data": data_name, "solver": name}
+        try:
+            row |= _row(solvers[name], data[data_name], chunk, repeats)
+        except ShapeError as error:
+            results["left_out"].append({**row, "reason": str(error).splitlines()[0]})
+        except Exception as error:
+            error.add_note(f"{name} on {data_name}")
+            raise
+        else:
+            done[data_name, name] = row | ({"environment": elsewhere} if elsewhere else {})
+            results["rows"] = [done[names] for names in plan if names in done]
+        if path is not None:
+            save_results(results, path)
     return results
 
 

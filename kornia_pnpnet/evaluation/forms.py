@@ -13,9 +13,8 @@ from kornia_pnpnet.core.schema import STRICT, Count, Kept, Positive, Share, read
 
 __all__ = ["read_results"]
 
-
-_Rate = TypedDict("_Rate", {"rate": Share, "low": Share, "high": Share, "total": Count})
 _Quartiles = TypedDict("_Quartiles", {"q25": float, "median": float, "q75": float})
+_Rate = TypedDict("_Rate", {"rate": Share, "low": Share, "high": Share, "total": Count})
 _PerProblem = TypedDict(
     "_PerProblem", {"rotation_error_deg": list[float], "translation_error": list[float], "ok": list[Share]}
 )
@@ -54,29 +53,18 @@ class _Evaluation(TypedDict):
     rows: list[_Row]
 
 
-class _Complexity(TypedDict):
-    __pydantic_config__ = STRICT  # type: ignore[misc]
-    format: Literal[1]
-    n: list[Count]
-    counts: dict[str, list[float | None]]
-    ransac: list[str]
-
-
 def _consistent(results: _Evaluation) -> _Evaluation:
     """Refuse names in rows that have no entry, and lists of different lengths."""
     for i, row in enumerate(results["rows"]):
         if len({len(values) for values in row.get("per_problem", {}).values()}) > 1:  # type: ignore[arg-type]
             raise ValueError(f"rows[{i}].per_problem has lists of different lengths")
-        for key, name, names in (("data", row["data"], "data"), ("solver", row["solver"], "solvers")):
-            if name not in results[names]:  # type: ignore[literal-required]
-                raise ValueError(f"rows[{i}].{key} is {name!r}, which {names} does not contain")
+        for key, names in (("data", results["data"]), ("solver", results["solvers"])):
+            if row[key] not in names:  # type: ignore[literal-required]
+                raise ValueError(f"rows[{i}].{key} is {row[key]!r}, which has no entry")  # type: ignore[literal-required]
     return results
 
 
-def read_results(path: str | Path, complexity: bool) -> dict[str, Any]:
+def read_results(path: str | Path) -> dict[str, Any]:
     """See :func:`~kornia_pnpnet.evaluation.load_results`."""
-    what = f"a results file of evaluation{' or complexity' if complexity else ''}"
-    kinds: Any = Annotated[_Evaluation, AfterValidator(_consistent), Kept]
-    if complexity and read_json(path, dict[str, Any], what).get("kind") == "complexity":
-        kinds = Annotated[_Complexity, Kept]
-    return read_json(path, kinds, what)
+    kind: Any = Annotated[_Evaluation, AfterValidator(_consistent), Kept]
+    return read_json(path, kind, "a results file of evaluation")

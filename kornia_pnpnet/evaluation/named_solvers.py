@@ -25,23 +25,9 @@ BOUNDS: dict[str, type[nn.Module]] = {
 
 # Every competitor of the protocol, in the order of its figures.
 _COMPETITORS = (
-    "pnpnet-set",
-    "pnpnet-n{n}",
-    "net-n{n}",
-    "identity-lm",
-    "epnp",
-    "epnp-lm",
-    "reppnp",
-    "reppnp-lm",
-    "ransac-epnp-lm",
-    "p3p-ransac",
-    "opencv-sqpnp",
-    "opencv-epnp",
-    "opencv-ransac",
-    "opencv-usac",
-    "kornia-rs",
-    "poselib",
-    "pycolmap",
+    *("pnpnet-set", "pnpnet-n{n}", "net-n{n}", "identity-lm", "epnp", "epnp-lm", "reppnp", "reppnp-lm"),
+    *("ransac-epnp-lm", "p3p-ransac", "opencv-sqpnp", "opencv-epnp", "opencv-ransac", "opencv-usac"),
+    *("kornia-rs", "poselib", "pycolmap"),
 )
 # Thresholds for real scenes, in px. Their points are sharper than those of the protocol. Tuned for the RANSAC of
 # OpenCV, PoseLib, pycolmap and ours, from 3 to 60 px, on five scenes with 0, 2 and 4 outliers in 9 pairs and problems
@@ -80,8 +66,7 @@ def load_solver(spec: str) -> nn.Module:
     if name not in {*list_solvers(), *BOUNDS} and Path(spec).is_dir():
         return PnPNet.from_pretrained(spec)
     options = {}
-    for option in filter(None, text.split(",")):
-        key, _, value = option.partition("=")
+    for key, _, value in (option.partition("=") for option in text.split(",") if option):
         try:
             options[key] = json.loads(value)
         except ValueError:
@@ -108,9 +93,9 @@ def default_solvers(n: int | Iterable[int], sources: Iterable[str] = ("synthetic
     sizes = [n] if isinstance(n, int) else list(n)
     names = dict.fromkeys(competitor.format(n=size) for competitor in _COMPETITORS for size in sizes)
     known = list_solvers()
-    installed = [name for name in names if name in known and not missing_package(name)]
     synthetic = any(source in PRIORS for source in sources)
     options = _PRIOR_OPTIONS if synthetic else _SCENE_OPTIONS
+    installed = [name for name in names if name in known and not missing_package(name)]
     specs = [f"{name}:{options[name]}" if name in options else name for name in installed]
     return [*specs, *(BOUNDS if synthetic else ["known-inliers"])]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
@@ -14,7 +14,6 @@ from kornia.core.exceptions import ValueCheckError
 from kornia_pnpnet.data import (
     MixedProblems,
     OutlierMix,
-    Scene,
     SceneProblems,
     SlabPoints,
     SyntheticProblems,
@@ -41,33 +40,28 @@ PRIORS: dict[str, tuple[str, Callable[..., SyntheticProblems | MixedProblems]]] 
 _DRAW_BATCH = 1000
 
 
-def _outlier_mix(word: str, n: int, mismatch_share: float) -> OutlierMix:
-    """Read one word of ``--outliers``: ``none``, ``uniform``, ``2`` or ``50%``."""
-    if word == "uniform":
-        return OutlierMix(mismatch_share=mismatch_share)
-    if word == "none" or word.isdecimal():
-        count = 0 if word == "none" else int(word)
-    elif re.fullmatch(r"(\d+\.?\d*|\.\d+)\s*%", word, re.ASCII) and float(word[:-1]) <= 100:
-        count = OutlierMix(max_ratio=float(word[:-1]) / 100).max_count(n)
-    else:
-        raise ValueCheckError(
-            f"--outliers: expected none, uniform, numbers or shares like 50%, separated by commas, got {word!r}"
-        )
-    if count > n:
-        raise ValueCheckError(f"--outliers: {count} outliers do not fit into n = {n} pairs")
-    return OutlierMix(count=count, mismatch_share=mismatch_share)
-
-
 def _outlier_mixes(text: str, n: int, mismatches_only: bool) -> dict[str, tuple[OutlierMix, str | int]]:
     """Read ``--outliers``: for each label the mix and its number in results (``none``, ``uniform`` or an integer)."""
     one, many = ("mismatch", "mismatches") if mismatches_only else ("outlier", "outliers")
+    share = 1.0 if mismatches_only else 0.5
     mixes: dict[str, tuple[OutlierMix, str | int]] = {}
     for word in (part.strip() for part in text.split(",")):
-        mix = _outlier_mix(word, n, 1.0 if mismatches_only else 0.5)
-        if mix.count is None:
+        if word == "uniform":
+            mix = OutlierMix(mismatch_share=share)
             mixes[f"0-{mix.max_count(n)} {many}"] = mix, "uniform"
+            continue
+        if word == "none" or word.isdecimal():
+            count = 0 if word == "none" else int(word)
+        elif re.fullmatch(r"(\d+\.?\d*|\.\d+)\s*%", word, re.ASCII) and float(word[:-1]) <= 100:
+            count = OutlierMix(max_ratio=float(word[:-1]) / 100).max_count(n)
         else:
-            mixes[f"{mix.count} {one if mix.count == 1 else many}"] = mix, mix.count or "none"
+            raise ValueCheckError(
+                f"--outliers: expected none, uniform, numbers or shares like 50%, separated by commas, got {word!r}"
+            )
+        if count > n:
+            raise ValueCheckError(f"--outliers: {count} outliers do not fit into n = {n} pairs")
+        label = f"{count} {one if count == 1 else many}"
+        mixes[label] = OutlierMix(count=count, mismatch_share=share), count or "none"
     return mixes
 
 
@@ -118,36 +112,30 @@ def evaluation_sets(
             name = source if scene is None else scene.name
             if any(key.startswith(f"{name}, ") for key in sets):
                 name = source  # another scene of the same name
+            # Raw matches already contain outliers; those of the mix come on top.
+            added = "+" if scene is not None and source.endswith(".npz") else ""
+            noise = ", noise told" if known_noise and scene is None else ""
             for size in sizes:
                 for label, (mix, number) in mixes[size].items():
-                    options = {"n": size, "outliers": mix, "seed": seed, "dtype": dtype, "batch_size": _DRAW_BATCH}
-                    options |= {"known_noise": 1.0} if known_noise and scene is None else {}
-                    drawn = _draw_set(source, scene, count, mismatches_only, options)
+                    options: dict[str, Any] = {"n": size, "outliers": mix, "seed": seed, "dtype": dtype}
+                    options["batch_size"] = _DRAW_BATCH
                     described = {"outliers": number, "mismatch_share": mix.mismatch_share, "seed": seed}
-                    # Raw matches already contain outliers; those of the mix come on top.
-                    added = "+" if scene is not None and source.endswith(".npz") else ""
-                    noise = ", noise told" if known_noise and scene is None else ""
-                    sets[f"{name}, n = {size}, {added}{label}{noise}"] = drawn._replace(
-                        description={**drawn.description, **described}
-                    )
+                    if scene is None:
+                        prior, make = PRIORS[source]
+                        drawn = make(**options, known_noise=1.0) if known_noise else make(**options)
+                        entry = EvaluationData(draw_problems(drawn, count), description={"source": prior, **described})
+                    else:
+                        # A mismatch takes the pixel of a spare point. With one spare, all mismatches would agree on a
+                        # wrong pose.
+                        spares = max(1, mix.max_count(size)) if mismatches_only else 1
+                        views = SceneProblems(scene, num_spares=spares, **options)
+                        entry = EvaluationData(
+                            draw_problems(views, count),
+                            max_translation=views.max_translation,
+                            unit="m" if scene.metric else "",
+                            description={"source": scene.name, "path": source, **described},
+                        )
+                    sets[f"{name}, n = {size}, {added}{label}{noise}"] = entry
         except ValueError as error:
             raise ValueCheckError(f"{source}: {error}") from error
     return sets
-
-
-def _draw_set(
-    source: str, scene: Scene | None, count: int, mismatches_only: bool, options: Mapping[str, Any]
-) -> EvaluationData:
-    """Draw the problems of one set; the description names their source."""
-    if scene is None:
-        prior, make = PRIORS[source]
-        return EvaluationData(draw_problems(make(**options), count), description={"source": prior})
-    # A mismatch takes the pixel of a spare point. With one spare, all mismatches would agree on a wrong pose.
-    spares = max(1, options["outliers"].max_count(options["n"])) if mismatches_only else 1
-    drawn = SceneProblems(scene, num_spares=spares, **options)
-    return EvaluationData(
-        draw_problems(drawn, count),
-        max_translation=drawn.max_translation,
-        unit="m" if scene.metric else "",
-        description={"source": scene.name, "path": source},
-    )

@@ -42,10 +42,6 @@ def row_errors(row: Mapping[str, Any]) -> tuple[PoseErrors, Tensor]:
 def save_results(results: Mapping[str, Any], path: str | Path) -> None:
     """Write results as one JSON file, in one piece: a reader finds the old file or the new one.
 
-    Args:
-        results: what :func:`~kornia_pnpnet.evaluation.evaluate` returned.
-        path: the file; missing folders are made.
-
     Raises:
         ValueError: when a number is not finite, which JSON cannot express.
         OSError: when the file cannot be written.
@@ -54,15 +50,8 @@ def save_results(results: Mapping[str, Any], path: str | Path) -> None:
         file.write(json.dumps(results, separators=(",", ":"), allow_nan=False) + "\n")
 
 
-def load_results(path: str | Path, *, complexity: bool = False) -> dict[str, Any]:
-    """Read a results file.
-
-    Args:
-        path: a file of :func:`save_results`.
-        complexity: also accept operation counts (:func:`~kornia_pnpnet.evaluation.operations.complexity_results`).
-
-    Returns:
-        The results.
+def load_results(path: str | Path) -> dict[str, Any]:
+    """Read a file of :func:`save_results`.
 
     Raises:
         FileNotFoundError: when there is no such file.
@@ -72,7 +61,7 @@ def load_results(path: str | Path, *, complexity: bool = False) -> dict[str, Any
         from kornia_pnpnet.evaluation.forms import read_results
     except ImportError as error:
         raise ImportError("reading results files needs pydantic: pip install 'kornia_pnpnet[eval]'") from error
-    return read_results(path, complexity)
+    return read_results(path)
 
 
 def source_digest() -> str:
@@ -93,22 +82,23 @@ def resume(plan: Mapping[str, Any], path: str | Path) -> dict[str, Any]:
         return fresh
     differing = _differences(there, fresh)
     if differing:
-        shown = "; ".join(differing[:_SHOWN_DIFFERENCES])
-        more = f"; and {len(differing) - _SHOWN_DIFFERENCES} more" if len(differing) > _SHOWN_DIFFERENCES else ""
+        more = len(differing) - _SHOWN_DIFFERENCES
+        shown = [*differing[:_SHOWN_DIFFERENCES], *([f"and {more} more"] if more > 0 else [])]
         raise ValueError(
-            f"'{path}' holds another evaluation, which this one cannot continue: {shown}{more}. Choose another file, "
-            "or overwrite this one."
+            f"'{path}' holds another evaluation, which this one cannot continue: {'; '.join(shown)}. Choose another "
+            "file, or overwrite this one."
         )
     return {**there, "solvers": fresh["solvers"], "data": fresh["data"]}
 
 
 def _differences(there: Mapping[str, Any], plan: Mapping[str, Any]) -> list[str]:
     """Describe why the rows of a file do not belong to a plan."""
-    found = []
-    for package, version in plan["environment"]["versions"].items():
-        was = there["environment"].get("versions", {}).get(package)
-        if was != version:
-            found.append(f"{package} was {was} and is {version}")
+    versions = there["environment"].get("versions", {})
+    found = [
+        f"{package} was {versions.get(package)} and is {version}"
+        for package, version in plan["environment"]["versions"].items()
+        if versions.get(package) != version
+    ]
     if there.get("code") != plan["code"]:
         found.append(f"the package's code has changed since (commit {there['environment'].get('commit')})")
     for kind in ("solvers", "data"):
@@ -123,7 +113,7 @@ def _differences(there: Mapping[str, Any], plan: Mapping[str, Any]) -> list[str]
 
 
 def format_table(results: Mapping[str, Any]) -> str:
-    """Format the results as a Markdown table that also reads well as plain text.
+    """Format results as a Markdown table that also reads well as plain text.
 
     Args:
         results: what :func:`~kornia_pnpnet.evaluation.evaluate` returned.
@@ -131,20 +121,15 @@ def format_table(results: Mapping[str, Any]) -> str:
     Returns:
         One line for each set and solver: success with its 95 % interval, median errors, time and share of ok.
     """
-    header = ("data", "solver", "success [95 %]", "median rotation error", "median translation error")
-    rows = []
+    lines = []
     for row in results["rows"]:
-        errors = (row[name]["median"] for name in PoseErrors._fields)
-        rotation, translation = (f"{error:#.3g}".rstrip(".") for error in errors)  # zeros at the end stay: 0.160
-        rows.append(
-            (
-                row["data"],
-                row["solver"],
-                str(SuccessRate._make(row["success"][key] for key in SuccessRate._fields)),
-                f"{rotation}°",
-                f"{translation} {results['data'][row['data']]['unit']}".rstrip(),
-                f"{row['us_per_problem']:.0f}",
-                f"{100 * row['ok']:.1f} %",
-            )
+        # The alternate form keeps zeros at the end: 0.160.
+        rotation, translation = (f"{row[name]['median']:#.3g}".rstrip(".") for name in PoseErrors._fields)
+        unit = results["data"][row["data"]]["unit"]
+        success = str(SuccessRate(**{key: row["success"][key] for key in SuccessRate._fields}))
+        errors = f"{rotation}°", f"{translation} {unit}".rstrip()
+        lines.append(
+            (row["data"], row["solver"], success, *errors, f"{row['us_per_problem']:.0f}", f"{100 * row['ok']:.1f} %")
         )
-    return markdown_table((*header, "µs/problem", "ok"), rows, align="llrrrrr", pad=True)
+    header = ("data", "solver", "success [95 %]", "median rotation error", "median translation error")
+    return markdown_table((*header, "µs/problem", "ok"), lines, align="llrrrrr", pad=True)

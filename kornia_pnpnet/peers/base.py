@@ -5,8 +5,9 @@ from __future__ import annotations
 import importlib
 import inspect
 import math
+from collections.abc import Mapping
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -30,16 +31,14 @@ class PeerPose(NamedTuple):
         rotation: world-to-camera rotation, shape :math:`(3, 3)`.
         translation: world-to-camera translation, shape :math:`(3,)`.
         inliers: the pairs that the peer kept, bool, shape :math:`(N,)`.
-        init_rotation: rotation before the last refinement, shape :math:`(3, 3)`. ``None`` when the peer does not
-            report the pose before its refinement; the result then repeats the final pose.
-        init_translation: translation before the last refinement, shape :math:`(3,)`, or ``None``.
+        init: rotation and translation before the last refinement; ``None`` when the peer does not report them: the
+            result then repeats the final pose.
     """
 
     rotation: np.ndarray
     translation: np.ndarray
     inliers: np.ndarray
-    init_rotation: np.ndarray | None = None
-    init_translation: np.ndarray | None = None
+    init: tuple[np.ndarray, np.ndarray] | None = None
 
 
 class PeerSolver(nn.Module):
@@ -99,8 +98,8 @@ class PeerSolver(nn.Module):
         r"""Solve a batch of problems, one after the other, on the CPU in float64.
 
         Args:
-            world_points: shape :math:`(B, N, 3)`, any unit, floats or integers. Any leading dimensions may stand in
-                place of :math:`B`, in all arguments and in the result; a single problem has none.
+            world_points: shape :math:`(B, N, 3)`, any unit. Leading dimensions as in
+                :meth:`~kornia_pnpnet.solver.PnPNet.forward`.
             img_points: pixels, shape :math:`(B, N, 2)`.
             intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or Kornia's cameras.
             weights: pairs of weight 0 are left out, shape :math:`(B, N)`; 1 when ``None``.
@@ -131,38 +130,32 @@ class PeerSolver(nn.Module):
         shares = np.ones((batch, count)) if weights is None else weights.detach().cpu().double().numpy()
         present = np.ones((batch, count), dtype=bool) if mask is None else mask.detach().cpu().numpy()
         used = present & (shares > 0)
-
-        rotation, translation = np.tile(np.eye(3), (batch, 1, 1)), np.zeros((batch, 3))
-        first_rotation, first_translation = rotation.copy(), translation.copy()
-        pair_weights, ok = np.zeros((batch, count)), np.zeros(batch, dtype=bool)
         status = _status(world, img, cameras, shares, present)
+
+        poses = np.tile(np.eye(3, 4), (2, batch, 1, 1))  # the final pose, and that before the last refinement
+        inliers, ok = np.zeros((batch, count)), np.zeros(batch, dtype=bool)
         for i in np.flatnonzero(status == Status.NOT_BELIEVED):
             found = self.solve_one(world[i, used[i]], img[i, used[i]], cameras[i])
-            if found is None:
-                continue
-            start = found.rotation if found.init_rotation is None else found.init_rotation
-            origin = found.translation if found.init_translation is None else found.init_translation
-            if not all(np.isfinite(part).all() for part in (found.rotation, found.translation, start, origin)):
-                continue
-            rotation[i], translation[i], pair_weights[i, used[i]] = found.rotation, found.translation, found.inliers
-            first_rotation[i], first_translation[i] = start, origin
-            ok[i] = True
+            if found is not None and all(map(_finite, (*found[:2], *(found.init or ())))):
+                final = np.column_stack((found.rotation, found.translation))
+                start = final if found.init is None else np.column_stack(found.init)
+                poses[:, i], inliers[i, used[i]], ok[i] = (final, start), found.inliers, True
 
         largest = torch.finfo(world_points.dtype).max
-        errors = _squared_errors(rotation, translation, world, img, cameras, used & ok[:, None])
+        errors = _squared_errors(poses[0], world, img, cameras, used & ok[:, None])
         truncated = np.minimum(errors, min(self.threshold, largest**0.25) ** 2)
         cost = np.where(ok, truncated.sum(-1) / np.maximum(used.sum(-1), 1), largest**0.5)
 
         def back(values: np.ndarray) -> Tensor:
             return torch.from_numpy(values).clamp(-largest, largest).to(world_points)
 
-        pose = Pose(back(rotation), back(translation))
+        pose, init = (Pose(back(x[..., :3]), back(x[..., 3])) for x in poses)
         result = PnPResult(
             *pose,
-            back(pair_weights),
+            back(inliers),
             back(cost),
             torch.from_numpy(ok).to(world_points.device),
-            Pose(back(first_rotation), back(first_translation)),
+            init,
             torch.from_numpy(np.where(ok, Status.SOLVED, status).astype(np.int8)).to(world_points.device),
             back(ok.astype(np.float64)),
             Alternatives.none(pose),
@@ -173,28 +166,33 @@ class PeerSolver(nn.Module):
 
 
 class RobustPeer(PeerSolver):
-    """Base of the peers that draw samples: checks and keeps their options.
+    """Base of the peers that draw samples: checks and keeps their arguments.
 
     Args:
-        threshold: largest reprojection error of an inlier, in pixels, finite.
-        confidence: probability of having drawn an outlier-free sample, in (0, 1).
-        seed: seed of the samples.
-        counts: integers of at least 1, kept under their names.
+        arguments: ``locals()`` of the constructor that calls this one: ``threshold``, ``confidence``, ``seed``, numbers
+            of iterations, and others, which are not checked.
 
     Raises:
         BaseError: for an argument out of range.
     """
 
-    def __init__(self, *, threshold: float, confidence: float, seed: int, **counts: int) -> None:
-        super().__init__(threshold=threshold)
-        check_positive(threshold=threshold)
-        KORNIA_CHECK(0 < confidence < 1, f"confidence must lie in (0, 1), got {confidence}.")
-        check_whole(0, seed=seed)
+    confidence: float
+    seed: int
+
+    def __init__(self, arguments: Mapping[str, Any]) -> None:
+        options = {name: value for name, value in arguments.items() if name not in ("self", "__class__")}
+        super().__init__(threshold=options["threshold"])
+        check_positive(threshold=self.threshold)
+        KORNIA_CHECK(0 < options["confidence"] < 1, f"confidence must lie in (0, 1), got {options['confidence']}.")
+        counts = {name: value for name, value in options.items() if name.endswith("iterations")}
+        check_whole(0, seed=options["seed"])
         check_whole(1, **counts)
-        self.confidence = confidence
-        self.seed = int(seed)
-        for name, count in counts.items():
-            setattr(self, name, int(count))
+        for name, value in options.items():
+            setattr(self, name, int(value) if name in counts or name == "seed" else value)
+
+
+def _finite(values: np.ndarray) -> bool:
+    return bool(np.isfinite(values).all())
 
 
 def _status(
@@ -211,18 +209,13 @@ def _status(
 
 
 def _squared_errors(
-    rotation: np.ndarray,
-    translation: np.ndarray,
-    world: np.ndarray,
-    img: np.ndarray,
-    cameras: np.ndarray,
-    used: np.ndarray,
+    poses: np.ndarray, world: np.ndarray, img: np.ndarray, cameras: np.ndarray, used: np.ndarray
 ) -> np.ndarray:
     """Return the squared reprojection errors in px², infinite behind the camera, 0 for unused pairs, (B, N)."""
     cameras = np.where(used.sum(-1)[:, None, None] > 0, cameras, np.eye(3))
     world, img = (np.where(used[..., None], x, 0.0) for x in (world, img))
     with np.errstate(over="ignore", invalid="ignore"):
-        cam_points = world @ rotation.swapaxes(-1, -2) + translation[:, None]  # (B, N, 3)
+        cam_points = world @ poses[..., :3].swapaxes(-1, -2) + poses[:, None, :, 3]  # (B, N, 3)
         depth = cam_points[..., 2:]
         focal, centre = cameras[:, None, (0, 1), (0, 1)], cameras[:, None, :2, 2]  # (B, 1, 2)
         projected = cam_points[..., :2] / np.where(depth > 0, depth, 1.0) * focal + centre

@@ -23,26 +23,20 @@ class KorniaRs(RobustPeer):
     :class:`~kornia_pnpnet.peers.OpenCVRansac`. The local optimisation of the library, off by default there, finds
     nothing more on these data and is not offered here.
 
+    Threshold, confidence and seed are those of :class:`~kornia_pnpnet.peers.OpenCVRansac`.
+
     Args:
-        threshold: largest reprojection error of an inlier, in pixels of the input.
         max_iterations: largest number of RANSAC iterations.
-        confidence: RANSAC stops when it has drawn an outlier-free sample with this probability, in (0, 1).
         method: the library's name of the solver of minimal samples, ``"AP3P"`` or ``"EPnP"``.
-        seed: seed of the samples, the same for each problem.
 
     Raises:
         ImportError: when kornia-rs is not installed.
         BaseError: for an unknown method or an argument out of range, or when the installed kornia-rs is too old to
             let the caller choose the method.
-
-    Example:
-        >>> from kornia_pnpnet.data import SyntheticProblems
-        >>> problems = SyntheticProblems(n=9, batch_size=4, seed=0).batch(0)
-        >>> KorniaRs()(problems.world_points, problems.img_points, problems.intrinsics).ok
-        tensor([True, True, True, True])
     """
 
     max_iterations: int
+    method: str
 
     def __init__(
         self,
@@ -53,11 +47,10 @@ class KorniaRs(RobustPeer):
         method: str = "AP3P",
         seed: int = 0,
     ) -> None:
-        super().__init__(threshold=threshold, confidence=confidence, seed=seed, max_iterations=max_iterations)
+        super().__init__(locals())
         methods = getattr(_import_kornia_rs(), "PnPSolverMethod", None)
         KORNIA_CHECK(methods is not None, "This kornia-rs has no PnPSolverMethod: pip install 'kornia_pnpnet[eval]'.")
         KORNIA_CHECK(method in ("AP3P", "EPnP") and hasattr(methods, method), f"kornia-rs has no method {method!r}.")
-        self.method = method
 
     def solve_one(self, world_points: np.ndarray, img_points: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:
         """Solve one problem, see :meth:`~kornia_pnpnet.peers.PeerSolver.solve_one`."""

@@ -1,4 +1,4 @@
-"""OpenCV's ``solvePnP`` and the two families of its ``solvePnPRansac``."""
+"""OpenCV's PnP solvers."""
 
 from __future__ import annotations
 
@@ -17,8 +17,10 @@ def _import_opencv() -> ModuleType:
     return import_library("cv2", "OpenCV")
 
 
-def _check_method(cv2: ModuleType, method: str) -> None:
+def _check_method(method: str) -> str:
+    cv2 = _import_opencv()
     KORNIA_CHECK(hasattr(cv2, f"SOLVEPNP_{method}"), f"OpenCV {cv2.__version__} has no SOLVEPNP_{method}.")
+    return method
 
 
 class OpenCVPnP(PeerSolver):
@@ -32,18 +34,11 @@ class OpenCVPnP(PeerSolver):
     Raises:
         ImportError: when OpenCV is not installed.
         BaseError: for an unknown method.
-
-    Example:
-        >>> from kornia_pnpnet.data import SyntheticProblems
-        >>> problems = SyntheticProblems(n=9, batch_size=4, seed=0).batch(0)
-        >>> OpenCVPnP(method="EPNP")(problems.world_points, problems.img_points, problems.intrinsics).ok
-        tensor([True, True, True, True])
     """
 
     def __init__(self, *, method: str = "SQPNP") -> None:
         super().__init__(threshold=math.inf)
-        _check_method(_import_opencv(), method)
-        self.method = method
+        self.method = _check_method(method)
 
     def solve_one(self, world_points: np.ndarray, img_points: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:
         """Solve one problem, see :meth:`PeerSolver.solve_one`."""
@@ -51,12 +46,11 @@ class OpenCVPnP(PeerSolver):
         flag = getattr(cv2, f"SOLVEPNP_{self.method}")
         try:
             found, rotation_vector, translation = cv2.solvePnP(world_points, img_points, intrinsics, None, flags=flag)
-            if not found:
-                return None
-            rotation = cv2.Rodrigues(rotation_vector)[0]
         except cv2.error:  # an assertion of OpenCV's, on degenerate or too few pairs
             return None
-        return PeerPose(rotation, translation.ravel(), np.ones(len(world_points), dtype=bool))
+        if not found:
+            return None
+        return PeerPose(cv2.Rodrigues(rotation_vector)[0], translation.ravel(), np.ones(len(world_points), dtype=bool))
 
 
 class _Robust(RobustPeer):
@@ -94,7 +88,7 @@ class _Robust(RobustPeer):
             rotation = cv2.Rodrigues(rotation_vector)[0]
         except cv2.error:  # an assertion of OpenCV's, on degenerate or too few pairs
             return None
-        return PeerPose(rotation, translation.ravel(), np.isin(np.arange(len(world_points)), kept), *first)
+        return PeerPose(rotation, translation.ravel(), np.isin(np.arange(len(world_points)), kept), first)
 
 
 class OpenCVRansac(_Robust):
@@ -113,8 +107,7 @@ class OpenCVRansac(_Robust):
         method: OpenCV's name of the solver of minimal samples, for example ``"AP3P"`` for ``SOLVEPNP_AP3P``.
         refine: minimise the squared reprojection error of the inliers, started from RANSAC's pose. The result keeps
             that pose as ``init``.
-        seed: seed of OpenCV's global random numbers, set before each problem, so that the result of a problem does not
-            depend on the problems before it.
+        seed: seed of OpenCV's global random numbers, set before each problem.
 
     Raises:
         ImportError: when OpenCV is not installed.
@@ -139,37 +132,26 @@ class OpenCVRansac(_Robust):
         refine: bool = True,
         seed: int = 0,
     ) -> None:
-        super().__init__(threshold=threshold, iterations=iterations, confidence=confidence, seed=seed)
+        super().__init__(locals())
         KORNIA_CHECK(type(refine) is bool, f"refine must be true or false, got {refine!r}.")
-        _check_method(_import_opencv(), method)
-        self.method = method
-        self.refine = refine
+        _check_method(method)
 
 
 class OpenCVUsac(_Robust):
     r"""OpenCV's ``solvePnPRansac`` in one of its USAC variants, problem by problem.
 
     USAC has its own sampling, local optimisation and final refinement; nothing is refined afterwards. The default
-    threshold is tuned in the same way as that of :class:`OpenCVRansac`.
+    threshold is tuned in the same way as that of :class:`OpenCVRansac`, whose other arguments it has.
 
     Args:
-        threshold: largest reprojection error of an inlier, in pixels of the input.
         method: OpenCV's name of the variant, for example ``"USAC_ACCURATE"`` or ``"USAC_MAGSAC"``. ``USAC_PROSAC``
             expects the pairs sorted from the best to the worst.
-        iterations: largest number of iterations.
-        confidence: USAC stops when it has drawn an outlier-free sample with this probability, in (0, 1).
-        seed: seed of OpenCV's global random numbers, set before each problem and used by the local optimisation. The
-            samples come from a generator that OpenCV starts anew for every problem.
+        seed: used by the local optimisation. The samples come from a generator that OpenCV starts anew for every
+            problem.
 
     Raises:
         ImportError: when OpenCV is not installed.
         BaseError: for an unknown method or an argument out of range.
-
-    Example:
-        >>> from kornia_pnpnet.data import SyntheticProblems
-        >>> problems = SyntheticProblems(n=9, batch_size=4, seed=0).batch(0)
-        >>> OpenCVUsac()(problems.world_points, problems.img_points, problems.intrinsics).ok
-        tensor([True, True, True, True])
     """
 
     def __init__(
@@ -181,9 +163,8 @@ class OpenCVUsac(_Robust):
         confidence: float = 0.9999,
         seed: int = 0,
     ) -> None:
-        super().__init__(threshold=threshold, iterations=iterations, confidence=confidence, seed=seed)
+        super().__init__(locals())
         cv2 = _import_opencv()
         # USAC_FM_8PTS is in the same list of OpenCV but computes fundamental matrices.
         known = method.startswith("USAC_") and method != "USAC_FM_8PTS" and hasattr(cv2, method)
         KORNIA_CHECK(known, f"OpenCV {cv2.__version__} has no {method} for poses.")
-        self.method = method

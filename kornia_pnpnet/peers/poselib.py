@@ -19,24 +19,17 @@ class PoseLib(RobustPeer):
     :class:`~kornia_pnpnet.peers.OpenCVRansac`. PoseLib's own minimum of 1000 iterations, ten times
     the default here, finds nothing more with nine pairs.
 
+    Threshold, confidence and seed are those of :class:`~kornia_pnpnet.peers.OpenCVRansac`.
+
     Args:
-        threshold: largest reprojection error of an inlier, in pixels of the input.
         min_iterations: smallest number of iterations.
         max_iterations: largest number of iterations. A problem without a pose takes all of them.
-        confidence: RANSAC stops when it has drawn an outlier-free sample with this probability, in (0, 1).
         progressive_sampling: PROSAC: samples of the first pairs come first, so put the best pairs first.
-        seed: seed of the samples, the same for each problem.
 
     Raises:
         ImportError: when PoseLib is not installed.
         BaseError: for an argument out of range, or when the installed PoseLib lacks one of the options; PoseLib
             itself would ignore an unknown option.
-
-    Example:
-        >>> from kornia_pnpnet.data import SyntheticProblems
-        >>> problems = SyntheticProblems(n=9, batch_size=4, seed=0).batch(0)
-        >>> PoseLib()(problems.world_points, problems.img_points, problems.intrinsics).ok
-        tensor([True, True, True, True])
     """
 
     min_iterations: int
@@ -53,14 +46,7 @@ class PoseLib(RobustPeer):
         progressive_sampling: bool = False,
         seed: int = 0,
     ) -> None:
-        super().__init__(
-            threshold=threshold,
-            confidence=confidence,
-            seed=seed,
-            min_iterations=min_iterations,
-            max_iterations=max_iterations,
-        )
-        self.progressive_sampling = bool(progressive_sampling)
+        super().__init__(locals())
         poselib = import_library("poselib", "PoseLib")
         unknown = self._options().keys() - poselib.RansacOptions().keys()
         KORNIA_CHECK(not unknown, f"PoseLib {poselib.__version__} has no options {sorted(unknown)}.")

@@ -18,27 +18,21 @@ class PyColmap(RobustPeer):
     :class:`~kornia_pnpnet.peers.OpenCVRansac`. COLMAP's own loss scale of 1 px suits sharp points; with the
     noise of the protocol it solves several per cent fewer problems.
 
+    Threshold, confidence and seed are those of :class:`~kornia_pnpnet.peers.OpenCVRansac`.
+
     Args:
-        threshold: largest reprojection error of an inlier, in pixels of the input.
         loss_scale: scale of the Cauchy loss of the refinement, in pixels of the input.
         min_iterations: smallest number of RANSAC iterations.
         max_iterations: largest number of RANSAC iterations.
-        confidence: RANSAC stops when it has drawn an outlier-free sample with this probability, in (0, 1).
-        seed: seed of the samples, set by COLMAP before each problem.
 
     Raises:
         ImportError: when pycolmap is not installed.
         BaseError: for an argument out of range.
-
-    Example:
-        >>> from kornia_pnpnet.data import SyntheticProblems
-        >>> problems = SyntheticProblems(n=9, batch_size=4, seed=0).batch(0)
-        >>> PyColmap()(problems.world_points, problems.img_points, problems.intrinsics).ok
-        tensor([True, True, True, True])
     """
 
     min_iterations: int
     max_iterations: int
+    loss_scale: float
 
     def __init__(
         self,
@@ -50,17 +44,10 @@ class PyColmap(RobustPeer):
         confidence: float = 0.9999,
         seed: int = 0,
     ) -> None:
-        super().__init__(
-            threshold=threshold,
-            confidence=confidence,
-            seed=seed,
-            min_iterations=min_iterations,
-            max_iterations=max_iterations,
-        )
+        super().__init__(locals())
         check_positive(loss_scale=loss_scale)
         counts = f"min_iterations {min_iterations} must not exceed max_iterations {max_iterations}."
         KORNIA_CHECK(min_iterations <= max_iterations, counts)
-        self.loss_scale = loss_scale
         import_library("pycolmap", "pycolmap")
 
     def solve_one(self, world_points: np.ndarray, img_points: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:

@@ -1,0 +1,505 @@
+"""The figures of the paper's protocol, from results files: ``python docs/results/figures.py a.json --out figures``.
+
+Files are those of ``pnpnet evaluate`` and of operation counts (``complexity.json``). Each figure for which the files
+hold data is drawn. Each function writes the picture ``path``, whose ending gives the format, and returns the path.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import re
+import textwrap
+from collections.abc import Callable, Iterable, Mapping, Sequence, Sized
+from contextlib import suppress
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import EngFormatter, Formatter, LogLocator, MaxNLocator, NullFormatter
+
+from kornia_pnpnet.evaluation import load_results
+from kornia_pnpnet.evaluation.plots import (
+    BLUE,
+    BROWN,
+    COLOURS,
+    GREEN,
+    GREY,
+    ORANGE,
+    PINK,
+    SKY,
+    VERMILION,
+    WIDTH,
+    make_figure,
+    save,
+    themed,
+)
+from kornia_pnpnet.evaluation.problem_sets import PRIORS
+from kornia_pnpnet.metrics import success_rate
+
+__all__ = ["draw_curves", "paper_figures", "plot_reliability", "plot_sweep", "solver_styles"]
+
+# -- the look of solvers -----------------------------------------------------------------------------------------------
+
+# Colour, marker and line of a solver, in the order of the rows. A solver has the look of the longest name that its name
+# begins with, up to a hyphen. A bound has no marker.
+# fmt: off
+_LOOKS = {
+    "pnpnet": (BLUE, "o", "-"), "pnpnet-n9-paper": (BROWN, "o", "-"), "pnpnet-paper": (BROWN, "o", "-"),
+    "pnpnet-set": (BLUE, "D", "-."), "net": (SKY, "o", "--"),
+    "epnp": (VERMILION, "v", "--"), "epnp-lm": (VERMILION, "v", "-"),
+    "reppnp": (GREEN, "^", "--"), "reppnp-lm": (GREEN, "^", "-"), "ransac-epnp-lm": (PINK, "s", "-"),
+    "p3p-ransac": (ORANGE, "P", "-"), "p3p-ransac-noise": (ORANGE, "D", "--"), "identity-lm": (BROWN, "X", "-."),
+    "opencv-epnp": ("k", "<", ":"), "opencv-sqpnp": ("k", "<", "-."), "opencv-ransac": ("k", ">", "-"),
+    "opencv-ransac-sqpnp": ("k", "*", "-."), "opencv-usac": ("k", ">", "--"), "opencv": ("k", "*", ":"),
+    "kornia-rs": (GREY, "X", ":"), "poselib": (GREY, "p", "-"), "pycolmap": (GREY, "h", "--"),
+    "": ("", "", ""),  # all other solvers
+    "known-inliers": ("k", "", "-."), "known-inliers-and-noise": ("k", "", ":"),
+}
+# fmt: on
+_OTHERS = [(colour, "d", line) for line in ("-", "--", ":") for colour in ("#882255", "#44AA99", "#999933", "#6644AA")]
+_LETTERS, _HANDLE = 112, 11  # of a legend: letters across the page, and letters that a piece of line takes
+_ROW = 0.165  # inches from one solver to the next: a line of letters
+_MOST_TICKS = 6  # largest number of places on a horizontal axis that are all ticked
+_LABELS = {"rate": "solved (%)", "us": "µs per problem", "n": "pairs n", "m": "iterations m"}
+Styles = Mapping[str, Mapping[str, Any]]  # arguments of Axes.plot by name
+Panel = tuple[str, pd.DataFrame, str]
+
+
+def solver_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """Arguments of ``Axes.plot`` by name of the solver, in the order of legends.
+
+    A known solver has the same look in all pictures, with any options. Up to 12 unknown solvers have different looks.
+    """
+    base = {name: name.partition(":")[0] for name in names}
+    known = {n: max((key for key in _LOOKS if f"{b}-".startswith(key and f"{key}-")), key=len) for n, b in base.items()}
+    unknown = sorted({base[name] for name, key in known.items() if not key})
+    looks = {name: _LOOKS[key] if key else _OTHERS[unknown.index(base[name]) % 12] for name, key in known.items()}
+    natural = {name: re.sub(r"\d+", lambda number: number[0].zfill(9), name) for name in base}  # n9 before n20
+    order = sorted(base, key=lambda name: (list(_LOOKS).index(known[name]), natural[name]))
+    return {name: line_style(*looks[name], ours=is_ours(name)) for name in order}
+
+
+def line_style(colour: str, marker: str, line: str, *, ours: bool = False) -> dict[str, Any]:
+    """Arguments of ``Axes.plot``. Dashed and dotted lines have open markers, our lines are thick."""
+    face = "white" if line in ("--", ":") else colour
+    marks = {"marker": marker, "markersize": 4.6, "markerfacecolor": face, "markeredgecolor": colour}
+    return {"color": colour, "linestyle": line, "linewidth": 2.0 if ours else 1.2, "zorder": 4 if ours else 3, **marks}
+
+
+def is_ours(name: str) -> bool:
+    """Whether the solver stands out."""
+    return name.startswith("pnpnet")
+
+
+def shortened(name: str) -> str:
+    """The name; the middle of names above 27 letters is left out."""
+    return name if len(name) <= 27 else f"{name[:12]}…{name[-14:]}"
+
+
+def draw_legend(figure: Figure, styles: Styles) -> None:
+    """Write a legend below all panels, our solvers in bold."""
+    names = [shortened(name) for name in styles]
+    columns = min(4, _LETTERS // (_HANDLE + max(map(len, names))))
+    handles = [Line2D([], [], **style) for style in styles.values()]
+    legend = figure.legend(handles, names, loc="outside lower center", ncols=columns, handlelength=3.4)
+    for text in legend.get_texts():
+        text.set_fontweight("bold" if is_ours(text.get_text()) else "normal")
+
+
+def log_scale(axes: Axes, name: str, formatter: Formatter | str = "{x:g}") -> None:
+    """Make the axis x or y logarithmic, with a number at every power of 10, and at more places of a short axis."""
+    axes.set(**{f"{name}scale": "log"})
+    axis, (low, high) = getattr(axes, f"{name}axis"), getattr(axes, f"get_{name}lim")()
+    axis.set_major_locator(LogLocator(subs=(1, 2, 3, 5) if high < 100 * low else (1,)))
+    axis.set_major_formatter(formatter)
+    axis.set_minor_formatter(NullFormatter())
+
+
+def reach(table: pd.DataFrame) -> np.ndarray:
+    """Lengths of the intervals below and above the rates. A rounded rate can lie just outside its interval."""
+    return np.clip([table.rate - table.low, table.high - table.rate], 0, None)
+
+
+def draw_dots(path: str | Path, heading: Sequence[str], panels: Mapping[str, pd.DataFrame]) -> Path:
+    """Draw success: a row for each solver, a panel for each table with ``solver``, ``rate``, ``low`` and ``high``."""
+    styles = solver_styles(solver for table in panels.values() for solver in table.solver)
+    lines = math.ceil(len(panels) / 3)
+    columns = math.ceil(len(panels) / lines)
+    figure = make_figure(WIDTH, 0.5 + (_ROW * len(styles) + 0.85) * lines, *heading)
+    grid = list(figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False).flat)
+    for axes, (title, table) in zip(grid, panels.items(), strict=False):
+        for name, rate, (low, high) in zip(table.solver, table.rate, reach(table).T, strict=True):
+            look, row = styles[name], list(styles).index(name)
+            if not look["marker"]:  # a bound is a line across the panel
+                axes.axvline(rate, color=look["color"], linestyle=look["linestyle"], linewidth=0.9, zorder=1)
+            dot = {**look, "linestyle": "none", "marker": look["marker"] or "|", "clip_on": False}
+            axes.errorbar([rate], [row], xerr=[[low], [high]], label=name, elinewidth=1.4, **dot)
+            font: dict[str, Any] = {"fontsize": 8, "fontweight": "bold" if is_ours(name) else "normal"}
+            font |= {"transform": axes.get_yaxis_transform(), "va": "center_baseline"}
+            axes.text(1.04, row, f"{rate:.1f} ±{max(low, high):.1f}", **font)
+        axes.set(title=textwrap.fill(title.replace("_", " "), 34), xlabel=_LABELS["rate"])
+    for axes in grid[len(panels) :]:
+        axes.remove()
+    grid[0].set_yticks(range(len(styles)), [shortened(name) for name in styles])
+    grid[0].set(xlim=(-3, 103), ylim=(len(styles) - 0.4, -0.6), xticks=range(0, 101, 25))
+    for axes in grid[: len(panels) : columns]:
+        for label, name in zip(axes.get_yticklabels(), styles, strict=True):
+            label.set_fontweight("bold" if is_ours(name) else "normal")
+    return save(figure, path)
+
+
+@themed
+def draw_curves(
+    path: str | Path, heading: Sequence[str], panels: Sequence[Panel], x: str, styles: Styles | None = None
+) -> Path:
+    """Draw panels of curves against the column ``x``, with one legend below.
+
+    A panel is a title, a table with the column ``solver``, and the column of its vertical axis: ``rate`` in per cent
+    (with ``low`` and ``high``), ``us`` or ``operations``. Panels with the same vertical axis share its limits.
+    """
+    found = {solver for _, table, _ in panels for solver in table.solver}
+    styles = {name: look for name, look in (styles or solver_styles(found)).items() if name in found}
+    lines = math.ceil(len(panels) / 4)
+    columns = math.ceil(len(panels) / lines)
+    figure = make_figure(WIDTH, 1.0 + (2.4 if lines > 1 else 3.0) * lines + 0.04 * len(styles), *heading)
+    grid = list(figure.subplots(lines, columns, squeeze=False).flat)
+    first: dict[str, Axes] = {}
+    for index, (axes, (title, table, y)) in enumerate(zip(grid, panels, strict=False)):
+        for name, look in styles.items():
+            line = table[table.solver == name].sort_values(x)
+            error, every = reach(line) if y == "rate" else None, max(1, len(line) // 8)
+            if len(line):
+                axes.errorbar(line[x], line[y], yerr=error, label=name, elinewidth=1.0, markevery=every, **look)
+        places = sorted(table[x].unique())
+        log = 0 < 8 * places[0] < places[-1]
+        axes.set(title=title, xlabel=_LABELS.get(x, x), xscale="log" if log else "linear")
+        if index % columns == 0 or panels[index - 1][2] != y:
+            axes.set_ylabel(_LABELS.get(y, y))
+        if y in first:
+            axes.sharey(first[y])
+        first.setdefault(y, axes)
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)) if log else MaxNLocator(_MOST_TICKS, integer=True))
+        if len(places) <= _MOST_TICKS:
+            axes.set_xticks(places)
+        axes.xaxis.set_major_formatter("{x:,.0f}")
+        axes.set_xticks([], minor=True)
+    for axes in grid[len(panels) :]:
+        axes.remove()
+    for y, axes in first.items():
+        if y == "rate":
+            axes.set(ylim=(-3, 103), yticks=range(0, 101, 20))
+        else:
+            log_scale(axes, "y", EngFormatter(sep="") if y == "operations" else "{x:g}")
+    draw_legend(figure, styles)
+    return save(figure, path)
+
+
+# -- results files -----------------------------------------------------------------------------------------------------
+
+_KEYS = ["source", "outliers", "mismatches", "n", "solver"]
+_RATE = ["rate", "low", "high", "total"]
+_SOURCES = {"paper": "the paper's data", "gaussian_pose": "data with Gaussian positions"}
+_PROTOCOL_N, _SCENE_OUTLIERS = 9, 2  # as in the paper
+_FEWEST_MISMATCHES = 3  # numbers of mismatches of a curve
+
+
+class NothingToDrawError(ValueError):
+    """The results hold no data for a figure."""
+
+
+def require(found: Sized, what: str) -> None:
+    """Raise when nothing was found."""
+    if not len(found):
+        raise NothingToDrawError(f"The results hold no {what} to draw.")
+
+
+def read_records(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
+    """Read results files. Data sets without a source or outliers are left out.
+
+    One row for each source, outliers, kind of outliers, n and solver: the one with the most problems, then the last.
+    ``outliers`` is a number, ``"uniform"`` for 0 to a third of the pairs, or another text; ``mismatches`` says that
+    every outlier shows another point; ``base`` is the solver's name without the option m; an unknown ``m`` is -1.
+    """
+    rows, synthetic = [], {name for name, _ in PRIORS.values()}
+    for result in results:
+        for row in result["rows"]:
+            data, solver = result["data"][row["data"]], row["solver"]
+            description = data.get("description") or {}
+            source, outliers = description.get("source"), description.get("outliers")
+            if isinstance(source, str) and isinstance(outliers, int | str):
+                outliers = 0 if outliers == "none" else outliers
+                mismatches = outliers != 0 and description.get("mismatch_share") == 1
+                refine = (result["solvers"][solver].get("config") or {}).get("refine")
+                m = refine.get("m") if isinstance(refine, Mapping) else None
+                base = re.sub(r"([:,])m=[^,]*(,?)", lambda option: option[1] if option[2] else "", solver)
+                key = (source, outliers, mismatches, data["n"], solver, base, base != solver, source not in synthetic)
+                limit = [data[key] for key in ("max_rotation_deg", "max_translation", "unit")]
+                rows.append((*key, m if type(m) is int else -1, row["us_per_problem"], limit, *percent(row["success"])))
+    table = pd.DataFrame(rows, columns=[*_KEYS, "base", "swept", "scene", "m", "us", "limit", *_RATE])
+    table = table.astype({"outliers": object, "mismatches": bool, "swept": bool, "scene": bool})
+    return table.sort_values("total", kind="stable").drop_duplicates(_KEYS, keep="last").sort_index()
+
+
+def percent(success: Mapping[str, Any]) -> tuple[float, float, float, int]:
+    """Rate and interval of a success in per cent, and the number of problems."""
+    return 100 * success["rate"], 100 * success["low"], 100 * success["high"], success["total"]
+
+
+def pooled(table: pd.DataFrame) -> pd.DataFrame:
+    """Success over all scenes of a table with one n and one outlier setting, for solvers that solved all scenes."""
+    rows = []
+    for solver, parts in table.groupby("solver", sort=False):
+        if len(parts) == table.source.nunique():
+            solved = (parts.rate * parts.total / 100).round().sum()  # a rate in a file has six digits
+            rows.append((solver, *percent(success_rate(torch.arange(parts.total.sum()) < solved)._asdict())))
+    return pd.DataFrame(rows, columns=["solver", *_RATE])
+
+
+def in_words(table: pd.DataFrame) -> str:
+    """The limits of a success, and the numbers of problems."""
+    limits = pd.DataFrame(list(table.limit), columns=["degrees", "length", "unit"]).replace("", "world units")
+    lengths = [f"{_span(part.length, '.2g')} {unit}" for unit, part in limits.groupby("unit", sort=False)]
+    problems = f"{_span(table.total, 'd')} problems in each set, 95 % intervals."
+    return f"Solved: errors below {_span(limits.degrees, 'g')}° and {' or '.join(lengths)}. {problems}"
+
+
+def _span(values: Iterable[float], form: str) -> str:
+    """The value, or the least and the largest value when their texts differ."""
+    low, high = f"{min(values):{form}}", f"{max(values):{form}}"
+    return low if low == high else f"{low} to {high}"
+
+
+def outliers_in_words(outliers: int | str, n: int | str = "n") -> str:
+    """The number of outliers among ``n`` pairs, for a title."""
+    if outliers in (0, "uniform"):
+        return f"0 to {'⌊n/3⌋' if isinstance(n, str) else n // 3} outliers of {n}" if outliers else "no outliers"
+    return outliers if isinstance(outliers, str) else f"{outliers} outliers of {n}"
+
+
+def at_usual_n(table: pd.DataFrame) -> tuple[pd.DataFrame, int]:
+    """The rows at the n of a figure that does not vary n: 9 as in the protocol, or the smallest n."""
+    n = _PROTOCOL_N if table.empty or (table.n == _PROTOCOL_N).any() else int(table.n.min())
+    return table[table.n == n], n
+
+
+def _by_outliers(table: pd.DataFrame, n: int | str) -> list[Panel]:
+    """A panel of rates for each outlier setting: none, uniform, other numbers, other texts."""
+    settings = sorted(table.outliers.unique(), key=lambda x: (x != 0, x != "uniform", isinstance(x, str), x))
+    return [(outliers_in_words(setting, n), table[table.outliers == setting], "rate") for setting in settings]
+
+
+# -- figures -----------------------------------------------------------------------------------------------------------
+
+
+def plot_operations(path: str | Path, complexity: Mapping[str, Any]) -> Path:
+    """Draw operation counts without and with RANSAC, see ``operations.complexity_results``: figure 1."""
+    counts = {"n": complexity["n"], **complexity["counts"]}
+    table = pd.DataFrame(counts).melt("n", var_name="solver", value_name="operations")
+    require(table, "operation counts")
+    sampled = table.solver.isin(complexity["ransac"]).map({False: "without RANSAC", True: "with RANSAC"})
+    panels = [(title, part, "operations") for title, part in table.groupby(sampled, sort=False)]
+    return draw_curves(path, ["Operations that a problem of n pairs takes"], panels, "n")
+
+
+@themed
+def plot_synthetic(path: str | Path, records: pd.DataFrame, source: str = "paper") -> Path:
+    """Draw success on synthetic data with no outliers, 0 to a third, and a third: figures 2 and 3."""
+    table, n = at_usual_n(records.query("source == @source and not swept and not mismatches"))
+    parts = {setting: table[table.outliers == setting] for setting in (0, "uniform", n // 3)}
+    panels = {outliers_in_words(setting, n): part for setting, part in parts.items() if len(part)}
+    require(panels, f"success on '{source}' with none, uniform or {n // 3} outliers")
+    heading = [f"Success on {_SOURCES.get(source, source)}, n = {n}", in_words(pd.concat(panels.values()))]
+    return draw_dots(path, heading, panels)
+
+
+@themed
+def plot_scenes(path: str | Path, records: pd.DataFrame) -> Path:
+    """Draw success without and with two outliers over all scenes, and for each scene: figure 4."""
+    table = records.query("scene and not swept and not mismatches")
+    table, n = at_usual_n(table[table.outliers.isin([0, _SCENE_OUTLIERS])])
+    require(table, f"success on scenes with 0 or {_SCENE_OUTLIERS} outliers")
+    panels = {}
+    for setting, chosen in table.groupby("outliers"):
+        words, scenes = outliers_in_words(setting, n), list(chosen.groupby("source", sort=False))
+        if len(scenes) > 1:
+            panels[f"{words}: all {len(scenes)} scenes"] = pooled(chosen)
+        panels |= {f"{words}: {scene}": part for scene, part in scenes}
+    return draw_dots(path, [f"Success on scenes, n = {n}", in_words(table)], panels)
+
+
+def plot_mismatches(path: str | Path, records: pd.DataFrame) -> Path:
+    """Draw success, pooled over the scenes with the most numbers of mismatches, against their number: figure 5.
+
+    A solver that solved all these scenes at three numbers or more has a curve. Without sets of mismatches only, the
+    outliers of the protocol are drawn.
+    """
+    table = records.query("scene and not swept")
+    table = table[table.outliers.map(lambda outliers: isinstance(outliers, int)).astype(bool)]
+    kind = table.mismatches.any()
+    table, n = at_usual_n(table[(table.mismatches == kind) | (table.outliers == 0)])
+    counts = table.groupby("source").outliers.agg(set)
+    most: set[int] = max(counts, key=len, default=set())
+    table = table[table.source.isin(counts.index[counts >= most]) & table.outliers.isin(most)]
+    label = f"{'mismatches' if kind else 'outliers'} among {n} pairs"
+    parts = [pooled(part).assign(**{label: number}) for number, part in table.groupby("outliers")]
+    require(parts[_FEWEST_MISMATCHES - 1 :], f"scenes with {_FEWEST_MISMATCHES} numbers of mismatches")
+    rates = pd.concat(parts)
+    rates = rates[rates.groupby("solver").rate.transform("size") >= _FEWEST_MISMATCHES]
+    require(rates, f"solvers with {_FEWEST_MISMATCHES} numbers of mismatches")
+    scenes = table.source.unique()
+    title = f"Success on {f'{len(scenes)} scenes' if len(scenes) > 1 else scenes[0]}, n = {n}"
+    return draw_curves(path, [title, in_words(table)], [("", rates, "rate")], label)
+
+
+def plot_against_n(path: str | Path, records: pd.DataFrame) -> Path:
+    """Draw success on the protocol's data against the number of pairs, a panel for each outlier setting.
+
+    Solvers for one n each, such as ``pnpnet-n9`` and ``pnpnet-n20``, make one curve. Other solvers need two n.
+    """
+    table = records.query("source == 'paper' and not swept and not mismatches")
+    table = table[table.groupby("outliers").n.transform("nunique") > 1]
+    require(table, "success on 'paper' with several n and the same outliers")
+    families = [re.sub(rf"-n{n}\b", "-n*", solver) for solver, n in zip(table.solver, table.n, strict=True)]
+    single = table.groupby(families).solver.transform("nunique") == 1
+    table = table.assign(solver=table.solver.where(single, families))
+    several = table.groupby(["solver", "outliers"]).n.transform("size") > 1
+    table = table[several | table.solver.str.match("pnpnet|net")]
+    heading = [f"Success on {_SOURCES['paper']} against the number of pairs", in_words(table)]
+    return draw_curves(path, heading, _by_outliers(table, "n"), "n")
+
+
+def plot_against_m(path: str | Path, records: pd.DataFrame) -> Path:
+    """Draw success on the protocol's data, and time, against the iterations of the refinement.
+
+    Solvers that differ only in the option m, such as ``epnp-lm`` and ``epnp-lm:m=3``, make one curve; m is read from
+    their configurations. The time is of the last outlier setting.
+    """
+    table, n = at_usual_n(records.query("source == 'paper' and m >= 0 and not mismatches"))
+    table = table.assign(solver=table.base).drop_duplicates(["solver", "outliers", "m"], keep="last")
+    table = table[table.groupby(["solver", "outliers"]).m.transform("size") > 1]
+    require(table, "success on 'paper' of a solver with several m")
+    panels = _by_outliers(table, n)
+    panels.append((f"time, {panels[-1][0]}", panels[-1][1], "us"))
+    return draw_curves(path, [f"Success on {_SOURCES['paper']} against m, n = {n}", in_words(table)], panels, "m")
+
+
+_FIGURES: dict[str, Callable[..., Path]] = {
+    "figure2_paper.png": plot_synthetic,
+    "figure3_gaussian_pose.png": lambda path, records: plot_synthetic(path, records, "gaussian_pose"),
+    "figure4_scenes.png": plot_scenes,
+    "figure5_mismatches.png": plot_mismatches,
+    "success_against_n.png": plot_against_n,
+    "success_against_m.png": plot_against_m,
+}
+
+
+def paper_figures(results: Sequence[Mapping[str, Any]], folder: str | Path) -> list[Path]:
+    """Draw the protocol's five figures, success against n and success against m. Figures without data are left out.
+
+    Args:
+        results: results files of :func:`~kornia_pnpnet.evaluation.evaluate`, and at most one file of operation counts.
+            Of several results with the same source, outliers, n and solver, the one with the most problems is drawn,
+            and of these the last. A solver whose name sets m is in the figure against m only.
+        folder: folder of the pictures, made when missing.
+
+    Raises:
+        ValueError: when no figure has data, or there are several files of operation counts.
+    """
+    complexity = [entry for entry in results if entry.get("kind") == "complexity"]
+    if len(complexity) > 1 or not results:
+        raise ValueError(f"Expected at least one results file and at most one of operation counts, got {len(results)}.")
+    records = read_records(entry for entry in results if entry.get("kind") != "complexity")
+    made = [plot_operations(Path(folder) / "figure1_operations.png", entry) for entry in complexity]
+    for name, plot in _FIGURES.items():
+        with suppress(NothingToDrawError):
+            made.append(plot(Path(folder) / name, records))
+    if not made:
+        raise ValueError("The results hold no data for any figure: no data set has a source and outliers to compare.")
+    return made
+
+
+# -- trainings and probabilities ---------------------------------------------------------------------------------------
+
+_MIXES = ((GREEN, "o", "-"), (BLUE, "s", "--"), (VERMILION, "^", "-."), (PINK, "D", ":"))
+_TIME = "time, least over the mixes"
+
+
+def mix_in_words(max_ratio: float) -> str:
+    """The mix of outliers with a largest share, in words."""
+    share = Fraction(max_ratio).limit_denominator(10)
+    most = "n" if share.numerator == 1 else f"{share.numerator}n"
+    return f"0 to ⌊{most}/{share.denominator}⌋ outliers" if share else "no outliers"
+
+
+def plot_sweep(path: str | Path, summary_csv: str | Path, *, against: Literal["n", "m"]) -> Path:
+    """Draw the success of trained networks against n or m: a panel for each value of the other, a line for each mix.
+
+    The panels below show the time: the least over the mixes, which do not change the time. ``summary_csv`` is the
+    summary of ``train.py -m experiment=sweep``. ``ValueError`` when two rows have the same n, m and mix.
+    """
+    named = {"model.n": "n", "model.m": "m", "data.outliers.max_ratio": "mix", "us_per_problem": "us"}
+    named |= {f"uniform/{name}": name for name in ("rate", "low", "high")}
+    runs = pd.read_csv(summary_csv, usecols=list(named)).rename(columns=named)
+    runs = runs.assign(solver=runs.mix.map(mix_in_words))
+    runs[["rate", "low", "high"]] *= 100
+    if runs.duplicated(["n", "m", "mix"]).any():
+        raise ValueError(f"'{summary_csv}' has several runs with the same n, m and mix of outliers.")
+    mixes = {mix_in_words(mix): _MIXES[index % len(_MIXES)] for index, mix in enumerate(sorted(runs.mix.unique()))}
+    styles = {name: line_style(*look) for name, look in {**mixes, _TIME: (GREY, "X", "-")}.items()}
+    times = runs.groupby(["n", "m"], as_index=False).us.min().assign(solver=_TIME)
+    other = "m" if against == "n" else "n"
+    values = sorted(runs[other].unique())
+    panels = [(f"{other} = {value}", runs[runs[other] == value], "rate") for value in values]
+    panels += [("", times[times[other] == value], "us") for value in values]
+    heading = [f"Success and time of short trainings against {against}, with 95 % intervals"]
+    heading.append("Each network is tested on the mix of outliers that it was trained on.")
+    return draw_curves(path, heading, panels, against, styles)
+
+
+@themed
+def plot_reliability(path: str | Path, curves: Mapping[str, Mapping[str, Sequence[float]]]) -> Path:
+    """Draw observed shares against predicted probabilities, and below the number of predictions in each range.
+
+    ``curves`` are by name the lists ``number``, ``predicted`` and ``observed`` of a
+    :class:`~kornia_pnpnet.metrics.Reliability`. Empty ranges are left out.
+    """
+    figure = make_figure(0.72 * WIDTH, 6.0)
+    chance, share = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
+    chance.plot((0, 1), (0, 1), color=GREY, linewidth=1.0, linestyle=":")
+    for index, (name, curve) in enumerate(curves.items()):
+        lists = np.array([curve[key] for key in ("number", "predicted", "observed")], dtype=float)
+        number, predicted, observed = lists[:, lists[0] > 0]
+        look = line_style(COLOURS[index % 10], "os^DvP"[index % 6], "-")
+        chance.plot(predicted, observed, label=name, **look)
+        share.plot(predicted, 100 * number / number.sum(), **look)
+    chance.set(ylim=(-0.02, 1.02), xlim=(-0.02, 1.02), ylabel="share of inliers")
+    chance.legend(loc="upper left")
+    share.set(yscale="log", xlabel="weight: the predicted probability of an inlier", ylabel="pairs (%)")
+    share.yaxis.set_major_formatter("{x:g}")
+    return save(figure, path)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Draw the figures of results files and print their paths."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("files", metavar="RESULTS.json", nargs="+", type=Path)
+    parser.add_argument("--out", metavar="FOLDER", default="outputs/figures", help="default: outputs/figures")
+    arguments = parser.parse_args(argv)
+    results = []
+    for path in arguments.files:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        counts = isinstance(content, dict) and content.get("kind") == "complexity"
+        results.append(content if counts else load_results(path))
+    print(*paper_figures(results, arguments.out), sep="\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,173 @@
+"""Pictures of a pose, an evaluation and a training.
+
+Each function writes the picture ``path``, whose ending gives the format, and returns the path. matplotlib's settings
+change only while a picture is drawn.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from kornia_pnpnet.core.schema import read_column, read_rows
+from kornia_pnpnet.evaluation.results import row_errors
+
+try:
+    from matplotlib import rc_context
+    from matplotlib.axes import Axes
+    from matplotlib.collections import LineCollection
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import NullFormatter
+except ImportError as error:
+    raise ImportError("Pictures need matplotlib: pip install 'kornia_pnpnet[eval]'") from error
+
+__all__ = ["plot_errors", "plot_pose", "plot_success", "plot_training"]
+
+#: Colours that colour-blind readers can tell apart: the palette ``colorblind`` of seaborn.
+COLOURS = ("#0173b2", "#de8f05", "#029e73", "#d55e00", "#cc78bc", "#ca9161", "#fbafe4", "#949494", "#ece133", "#56b4e9")
+BLUE, ORANGE, GREEN, VERMILION, PINK, BROWN, _, GREY, _, SKY = COLOURS
+WIDTH = 7.2  #: inches; the width of a page with two columns, so that letters are printed at their size
+#: Settings of matplotlib while a picture is drawn. Names of solvers are not read as formulas.
+THEME: Any = {
+    **dict.fromkeys(("font.size", "axes.titlesize", "axes.labelsize", "figure.titlesize"), 9.0),
+    **dict.fromkeys(("xtick.labelsize", "ytick.labelsize", "legend.fontsize"), 8.4),
+    **dict.fromkeys(("axes.spines.right", "axes.spines.top", "legend.frameon", "text.parse_math"), False),
+    **{"axes.axisbelow": True, "axes.edgecolor": "#444444", "axes.grid": True, "grid.color": "#cccccc"},
+    **{"axes.titlelocation": "left", "errorbar.capsize": 1.6, "font.sans-serif": ["DejaVu Sans"]},
+}
+themed = rc_context(THEME)  #: Decorator of functions that draw.
+
+
+def make_figure(width: float, height: float, *heading: str) -> Figure:
+    """An opaque white figure with lines of a title, readable on a dark page too. Sizes are in inches."""
+    figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
+    if heading:
+        figure.suptitle("\n".join(heading), x=0.01, ha="left")
+    return figure
+
+
+def save(figure: Figure, path: str | Path) -> Path:
+    """Write the figure and make missing folders."""
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=200)
+    return Path(path)
+
+
+@themed
+def plot_pose(path: str | Path, img_points: Tensor, reprojections: Tensor, rejected: Tensor, title: str) -> Path:
+    """Draw each pixel of an image (N, 2), joined to the projection (N, 2) of its point; ``rejected`` is bool, (N,).
+
+    Pixels that are not finite are left out; projections that are not finite belong to points behind the camera.
+    """
+    there = img_points.isfinite().all(-1)
+    if not there.any():
+        raise ValueError("There is no pixel to draw.")
+    pixels, projected, bad = (x[there].numpy() for x in (img_points, reprojections, rejected))
+    seen = np.isfinite(projected).all(1)
+    margin = 0.3 * max(1.0, np.ptp(pixels, axis=0).max())
+    low, high = pixels.min(0) - margin, pixels.max(0) + margin
+    figure = make_figure(WIDTH, 1.0 + 6.2 * (high - low)[1] / (high - low)[0])
+    axes = figure.subplots()
+    for rows, colour, dash in ((seen & ~bad, BLUE, "-"), (seen & bad, VERMILION, "--")):
+        lines = list(np.stack((pixels[rows], projected[rows]), axis=1))
+        axes.add_collection(LineCollection(lines, colors=colour, linestyles=dash, alpha=0.8))
+    axes.plot(*pixels[~bad].T, "o", color=BLUE, markersize=9.0, markerfacecolor="none", label="pixel, kept")
+    axes.plot(*pixels[bad].T, "x", color=VERMILION, markersize=9.0, markeredgewidth=2.2, label="pixel, rejected")
+    axes.plot(*projected[seen].T, "+", color="black", markersize=9.0, label="reprojection")
+    axes.set(xlim=(low[0], high[0]), ylim=(high[1], low[1]), xlabel="u (px)", ylabel="v (px)", aspect="equal")
+    behind = "" if seen.all() else f", {(~seen).sum()} behind the camera"
+    axes.set_title(f"{title}: n = {len(pixels)}, {bad.sum()} rejected{behind}")
+    figure.legend(loc="outside lower center", ncols=3)
+    return save(figure, path)
+
+
+@themed
+def plot_success(path: str | Path, results: Mapping[str, Any]) -> Path:
+    """Draw the success of a results file with 95 % intervals: a panel for each data set, a row for each solver."""
+    panels, colours = _panels(results)
+    lines = math.ceil(len(panels) / 3)
+    figure = make_figure(WIDTH, 0.5 + (0.7 + 0.17 * len(colours)) * lines, "Success with 95 % intervals")
+    grid = list(figure.subplots(lines, math.ceil(len(panels) / lines), sharex=True, sharey=True, squeeze=False).flat)
+    for axes, (name, rows) in zip(grid, panels.items(), strict=False):
+        for row in rows:
+            rate, low, high = (100 * row["success"][key] for key in ("rate", "low", "high"))
+            reach = [[max(rate - low, 0.0)], [max(high - rate, 0.0)]]  # rounding can put the rate outside
+            look = {"color": colours[row["solver"]], "label": row["solver"]}
+            axes.errorbar([rate], [list(colours).index(row["solver"])], xerr=reach, fmt="o", **look)
+        axes.set(title=name, xlabel="solved (%)", xlim=(-3, 103), ylim=(len(colours) - 0.4, -0.6))
+        axes.set_yticks(range(len(colours)), list(colours))
+    for axes in grid[len(panels) :]:
+        axes.remove()
+    return save(figure, path)
+
+
+@themed
+def plot_errors(path: str | Path, results: Mapping[str, Any]) -> Path:
+    """Draw the share of problems with an error of at most x, of a results file with the errors of all problems."""
+    panels, colours = _panels(results)
+    heading = "Problems with an error of at most x; the vertical line is the limit of a success"
+    figure = make_figure(WIDTH, 1.2 + 2.2 * len(panels) + 0.05 * len(colours), heading)
+    for (name, rows), line in zip(panels.items(), figure.subplots(len(panels), 2, squeeze=False), strict=True):
+        entry = results["data"][name]
+        labels = "rotation error (°)", f"translation error ({entry['unit'] or 'world units'})"
+        limits = entry["max_rotation_deg"], entry["max_translation"]
+        for index, (axes, limit, label) in enumerate(zip(line, limits, labels, strict=True)):
+            for row in rows:
+                axes.ecdf(row_errors(row)[0][index].numpy(), color=colours[row["solver"]], label=row["solver"])
+            axes.axvline(limit, color=GREY)
+            axes.set(xlim=(limit / 1000, limit * 180), xlabel=label, title=name, ylabel="problems")
+            _log_scale(axes, "x")
+            axes.yaxis.set_major_formatter("{x:.0%}")
+    lines = {str(line.get_label()): line for axes in figure.axes for line in axes.lines}
+    figure.legend([lines[name] for name in colours], list(colours), loc="outside lower center", ncols=3)
+    return save(figure, path)
+
+
+def _panels(results: Mapping[str, Any]) -> tuple[dict[str, list[Mapping[str, Any]]], dict[str, str]]:
+    """The rows by data set, and a colour for each solver; ``ValueError`` when there are no rows."""
+    if not results["rows"]:
+        raise ValueError("The results hold no rows to draw.")
+    panels: dict[str, list[Mapping[str, Any]]] = {}
+    for row in results["rows"]:
+        panels.setdefault(row["data"], []).append(row)
+    solvers = dict.fromkeys(row["solver"] for row in results["rows"])
+    return panels, {name: COLOURS[index % len(COLOURS)] for index, name in enumerate(solvers)}
+
+
+@themed
+def plot_training(path: str | Path, history_csv: str | Path) -> Path:
+    """Draw loss, distances and success (columns ``val/<set>/success``) of a training against ``update``."""
+    rows = read_rows(history_csv)
+    success = [name for name in rows[0] if name.startswith("val/") and name.endswith("/success")]
+    panels = (
+        ("training loss (refined terms ramp in)", ["total"]),
+        ("validation success", success),
+        ("rotation distance ‖R̂ − R‖", ["init_rotation", "refined_rotation"]),
+        ("translation distance ‖t̂ − t‖", ["init_translation", "refined_translation"]),
+    )
+    figure = make_figure(WIDTH, 5.8)
+    grid = figure.subplots(2, 2, sharex=True).flat
+    for axes, (title, columns) in zip(grid, panels, strict=True):
+        for index, column in enumerate(columns):
+            curve = np.array([read_column(history_csv, rows, name, float, gaps=True) for name in ("update", column)])
+            label = column.split("/")[1] if columns is success else column.split("_")[0]
+            axes.plot(*curve[:, np.isfinite(curve).all(0)], label=label, color=COLOURS[index % len(COLOURS)])
+        axes.set(title=title, xlabel="update")
+        if "distance" in title:
+            _log_scale(axes, "y")
+    figure.legend(handles=figure.axes[2].lines, loc="outside lower left")
+    figure.legend(handles=figure.axes[1].lines, loc="outside lower right", ncols=4)
+    return save(figure, path)
+
+
+def _log_scale(axes: Axes, name: str) -> None:
+    """Make the axis x or y logarithmic, with numbers that are no formulas."""
+    axes.set(**{f"{name}scale": "log"})
+    axis = getattr(axes, f"{name}axis")
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(NullFormatter())
