@@ -162,6 +162,10 @@ def test_a_checkpoint_is_continued_by_the_same_run_only(tmp_path):
         fit(folder=tmp_path, identity=identity, resume=True, **make_parts(lr=1.0))
     with pytest.raises(TrainingError, match=r"of another run: data\.sigma\.1 was 2\.0 and is 5\.0\.$"):
         fit(folder=tmp_path, identity={"data": {"seed": 3, "sigma": [1.0, 5.0]}}, resume=True, **make_parts())
+    for option, value in (("effort", "fixed"), ("gradient", "always"), ("focal", "unknown"), ("views", 2)):
+        other = PnPNet(MLPInit(6), RobustWeightedLM(2), **{option: value})
+        with pytest.raises(TrainingError, match=rf"of another run: model\.{option} was .* and is {value!r}\.$"):
+            fit(folder=tmp_path, identity=identity, resume=True, **{**make_parts(), "model": other})
     assert (tmp_path / CHECKPOINT_NAME).read_bytes() == content
     report = fit(folder=tmp_path, identity={"data": {"seed": 3, "sigma": (1.0, 2.0)}}, resume=True, **make_parts())
     assert (report.start, report.update) == (6, 6)
