@@ -3,10 +3,7 @@
 from .confidence import Calibration as Calibration, fit_confidence as fit_confidence
 from .covariance import pose_covariance as pose_covariance
 from .init import MLPInit as MLPInit, SetInit as SetInit, p3p as p3p
-from .likelihood import (
-    gaussian_pose_loss as gaussian_pose_loss,
-    monte_carlo_pose_loss as monte_carlo_pose_loss,
-)
+from .likelihood import monte_carlo_pose_loss as monte_carlo_pose_loss
 from .losses import PoseLoss as PoseLoss, SetLoss as SetLoss
 from .measurements import depth_points as depth_points, heatmap_keypoints as heatmap_keypoints
 from .metrics import pose_errors as pose_errors, success as success, success_rate as success_rate
