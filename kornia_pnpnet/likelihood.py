@@ -90,16 +90,16 @@ def monte_carlo_pose_loss(
     Args:
         truth: true world-to-camera poses, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
         hypotheses: poses around which to look as well, such as the ``pose`` of a result.
-        world_points: see :meth:`PnPNet.forward`, also for the dimensions and dtypes of all arguments.
-        img_points: see :meth:`PnPNet.forward`.
-        intrinsics: see :meth:`PnPNet.forward`.
-        weights: see :meth:`PnPNet.forward`.
-        mask: see :meth:`PnPNet.forward`.
-        img_sigma: see :meth:`PnPNet.forward`; required without ``img_cov``. A network that predicts it learns from this
+        world_points: see :meth:`~kornia_pnpnet.solver.PnPNet.forward`, also for dimensions and dtypes.
+        img_points: see ``PnPNet.forward``.
+        intrinsics: see ``PnPNet.forward``.
+        weights: see ``PnPNet.forward``.
+        mask: see ``PnPNet.forward``.
+        img_sigma: see ``PnPNet.forward``; required without ``img_cov``. A network that predicts it learns from this
             loss how sure it is.
-        world_sigma: see :meth:`PnPNet.forward`; ``None`` without ``world_cov``: exact points.
-        img_cov: see :meth:`PnPNet.forward`.
-        world_cov: see :meth:`PnPNet.forward`.
+        world_sigma: see ``PnPNet.forward``; ``None`` without ``world_cov``: exact points.
+        img_cov: see ``PnPNet.forward``.
+        world_cov: see ``PnPNet.forward``.
         samples: number of poses drawn per problem.
         rounds: number of components that are added one after the other.
         kernel: name of the robust kernel, a key of :data:`~kornia_pnpnet.refine.kernels.KERNELS`.
@@ -109,7 +109,7 @@ def monte_carlo_pose_loss(
         The loss of each problem, shape :math:`(B,)`, in nats, for a density per radian³ and world unit³.
 
     Raises:
-        BaseError: see :meth:`PnPNet.forward`; for an unknown kernel, a scale that is not positive, fewer samples than
+        BaseError: see ``PnPNet.forward``; for an unknown kernel, a scale that is not positive, fewer samples than
             components, no noise of the pixels, or both a sigma and a covariance.
 
     Example:

@@ -84,16 +84,11 @@ def test_mismatched_pixels_belong_to_another_point_of_the_box_with_noise():
     assert_normal((noisy.img_points - clean.img_points)[wrong], 1.0)
 
 
-def test_near_outliers_are_a_little_off():
+def test_near_outliers_have_distances_in_pixels_beyond_the_noise():
     p = draw(9, 2000, outliers=OutlierMix(count=3, near_share=1.0), world_sigma=0.0)
     off = reprojection(p).norm(dim=-1)
-    assert (p.inliers.sum(-1) == 6).all()
     assert off[p.inliers].max() < 5.5
-    assert off[~p.inliers].min() > 1.0
-    assert off[~p.inliers].max() < 55.0
-
-
-def test_near_outliers_have_distances_in_pixels_beyond_the_noise():
+    assert 1.0 < off[~p.inliers].min() < off[~p.inliers].max() < 55.0
     mix = OutlierMix(count=3, near_share=1.0, near_pixels=(3.0, 30.0))
     off = reprojection(p := draw(9, outliers=mix, world_sigma=0.0, img_sigma=1e-6)).norm(dim=-1)[~p.inliers]
     assert_uniform(off.log(), math.log(3.0) - 1e-5, math.log(30.0) + 1e-5)
@@ -134,14 +129,6 @@ def test_crowds_of_a_point_have_many_pixels():
     assert not (points & pixels).any()
     assert_counts(torch.stack((points.sum(), pixels.sum())), (0.5 * 30 / 31, 0.5 * 30 / 31))
     assert reprojection(p)[p.inliers].norm(dim=-1).max() < 6
-
-
-def test_structured_outliers_may_outnumber_a_third_of_the_inliers(generator):
-    mix = OutlierMix(count=60, structured_share=1.0, structured_ratio=(0.2, 0.8))
-    kinds = mix.draw(4000, 100, generator)
-    found = kinds.structured.sum(-1)
-    assert (found.min(), found.max()) == (8, 32)
-    assert_counts(found[(found > 8) & (found < 32)].bincount()[9:].unflatten(0, (-1, 1))[:20, 0])
 
 
 @pytest.mark.parametrize(("mirrored", "angle"), [(0.0, 0.0), (1.0, 0.0), (0.0, math.pi)])

@@ -11,7 +11,6 @@ from kornia.core.exceptions import BaseError
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 from torch.testing import assert_close
 
-from kornia_pnpnet.core.trees import iter_tensors
 from kornia_pnpnet.data import OutlierMix, Scene, SceneProblems
 
 # --- views ------------------------------------------------------------------------------------------------------------
@@ -40,14 +39,6 @@ def test_match_behind_the_camera_has_infinite_error():
 
 
 # --- problems ---------------------------------------------------------------------------------------------------------
-
-
-def test_shapes_and_dtypes():
-    problems = SceneProblems(make_scene(20, 30), n=7, batch_size=5, dtype=torch.float32).batch(0)
-    shapes = [(5, 7, 3), (5, 7, 2), (5, 3, 3), (5, 3, 3), (5, 3), (5, 7)]
-    assert [tuple(x.shape) for x in iter_tensors(problems)] == shapes
-    assert [x.dtype for x in iter_tensors(problems)] == [torch.float32] * 5 + [torch.bool]
-    assert SceneProblems(make_scene(20)).batch(0).world_points.dtype == torch.float64
 
 
 @pytest.mark.parametrize("recentre", [True, False])

@@ -31,6 +31,7 @@ from kornia_pnpnet.data import (
 from kornia_pnpnet.init import P3P, RANSAC, EPnP, REPPnP, SubsetSolver
 from kornia_pnpnet.peers import KorniaRs, OpenCVPnP, OpenCVRansac, OpenCVUsac, PeerSolver, PoseLib, PyColmap
 from kornia_pnpnet.refine import BoundedParameter
+from kornia_pnpnet.training import TrainSettings
 
 PROBLEMS = SyntheticProblems(n=12, batch_size=3, seed=0).batch(0)
 
@@ -151,13 +152,29 @@ SOURCES = {
         ),
     ),
 }
+
+
+def factors_are_sound(settings, values):
+    """Learning rates and ramp stay in their bounds."""
+    for update in range(13):
+        assert 0 <= settings.lr_factor(update) < math.inf
+        assert 0 <= settings.ramp_factor(update) <= 1
+
+
+SETTINGS = {
+    "TrainSettings": (
+        lambda **values: TrainSettings(**{"updates": 12, **values}),
+        chosen("updates warmup max_skipped log_every validate_every", "lr clip final_lr", ranges="ramp"),
+    )
+}
 PARAMETERS = {
     "BoundedParameter": (
         lambda **values: BoundedParameter(**{**BOUNDS, **values}),
         chosen("size", "initial lower upper", flags="logarithmic"),
     )
 }
-USES = ((PARTS, solves), (LOSSES, costs), (SOURCES, is_sound), (PARAMETERS, has_its_initial_value))
+USES = ((PARTS, solves), (LOSSES, costs), (SOURCES, is_sound), (SETTINGS, factors_are_sound))
+USES = (*USES, (PARAMETERS, has_its_initial_value))
 CASES = {name: (*case, use) for cases, use in USES for name, case in cases.items()}
 
 

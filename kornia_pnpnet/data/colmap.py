@@ -173,9 +173,11 @@ def _colmap_view(image: Any, world_points: Mapping[int, np.ndarray]) -> View:
     depth = points @ world_to_cam[2, :3] + world_to_cam[2, 3]
     # `~(depth <= 0)`, so that a pose that is not finite reaches the check in View.
     seen = np.isfinite(pixels).all(axis=1) & ~(depth <= 0)
-    arrays = points[seen], pixels[seen], intrinsics, world_to_cam[:, :3], world_to_cam[:, 3]
-    size = int(image.camera.width), int(image.camera.height)
-    return View(image.name, *map(torch.tensor, arrays), *size, torch.ones(int(seen.sum()), dtype=torch.bool))
+    tensors = (points[seen], pixels[seen], intrinsics, world_to_cam[:, :3], world_to_cam[:, 3])
+    world, img, camera, rotation, translation = map(torch.tensor, tensors)
+    width, height = int(image.camera.width), int(image.camera.height)
+    inliers = torch.ones(len(world), dtype=torch.bool)
+    return View(image.name, world, img, camera, rotation, translation, width, height, inliers)
 
 
 def _match_views(arrays: Mapping[str, np.ndarray], max_error_px: float) -> list[View]:
@@ -195,12 +197,14 @@ def _match_views(arrays: Mapping[str, np.ndarray], max_error_px: float) -> list[
         raise ValueError("there is no array 'names'")
     names = [str(name) for name in np.atleast_1d(arrays["names"])]
     count = len(names)
-    cameras = read("K", count, 3, 3), read("R", count, 3, 3), read("t", count, 3)
-    sizes = read("size", count, 2).int().tolist()
+    intrinsics, rotation, translation = read("K", count, 3, 3), read("R", count, 3, 3), read("t", count, 3)
+    sizes = read("size", count, 2)
     views = []
-    for i, (name, *camera, size) in enumerate(zip(names, *cameras, sizes, strict=True)):
+    for i, name in enumerate(names):
         img_points = read(f"{i:03d}_img_points", None, 2)
         world_points = read(f"{i:03d}_world_points", len(img_points), 3)
         inliers = read(f"{i:03d}_error_px", len(img_points)) <= max_error_px
-        views.append(View(name, world_points, img_points, *camera, *size, inliers))
+        width, height = int(sizes[i, 0]), int(sizes[i, 1])
+        pose = rotation[i], translation[i]
+        views.append(View(name, world_points, img_points, intrinsics[i], *pose, width, height, inliers))
     return views

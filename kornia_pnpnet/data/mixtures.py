@@ -74,8 +74,7 @@ class MixedProblems:
         covariances = {(part.img_cov is None, part.world_cov is None) for part in parts}
         KORNIA_CHECK(len(covariances) == 1, "All sources of a mixture must know covariances, or none of them.")
         for name in ("img_sigma", "world_sigma", "confidence"):
-            values = _alike([getattr(part, name) for part in parts], parts)
-            parts = [part._replace(**{name: value}) for part, value in zip(parts, values, strict=True)]
+            parts = _with_known_alike(parts, name)
         problems = map_tensors(lambda *x: torch.cat(x), *parts)
         order = self._order.to(problems.inliers.device)
         return problems.map(lambda x: x[order])
@@ -90,15 +89,18 @@ def _checked_shares(what: str, count: int, shares: Sequence[float] | None) -> li
     return shares
 
 
-def _alike(values: list[Tensor | None], parts: list[Problems]) -> list[Tensor | None]:
-    """Sigmas or confidences of all parts in one shape, with NaN for ``None`` unless all are ``None``."""
-    dimensions = max((value.ndim for value in values if value is not None), default=0)
+def _with_known_alike(parts: list[Problems], name: str) -> list[Problems]:
+    """Parts whose sigmas or confidences have one shape, with NaN for ``None`` unless all are ``None``."""
+    dimensions = max((value.ndim for part in parts if (value := getattr(part, name)) is not None), default=0)
     if not dimensions:
-        return values
-    alike: list[Tensor | None] = []
-    for value, part in zip(values, parts, strict=True):
-        known = part.world_points.new_full(part.inliers.shape[:1], torch.nan) if value is None else value
-        alike.append(known[:, None].expand(part.inliers.shape) if known.ndim < dimensions else known)
+        return parts
+    alike = []
+    for part in parts:
+        known = getattr(part, name)
+        if known is None:
+            known = part.world_points.new_full(part.inliers.shape[:1], torch.nan)
+        known = known[:, None].expand(part.inliers.shape) if known.ndim < dimensions else known
+        alike.append(part._replace(**{name: known}))
     return alike
 
 

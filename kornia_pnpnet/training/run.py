@@ -110,8 +110,6 @@ class Run:
         self.solver, self.fabric_optimizer = fabric.setup(model, self.optimizer)
         self.solver.mark_forward_method("with_guess")
         if state is not None:  # after the parameters are on their device, so that Adam's state follows them
-            for group in state["optimizer"]["param_groups"]:
-                group["fused"] = True  # changes how a step is computed, not its result
             self.optimizer.load_state_dict(state["optimizer"])
 
         self.validation = {name: problems.map(lambda x: x.to(fabric.device)) for name, problems in validation.items()}

@@ -54,8 +54,8 @@ def validate(model: nn.Module, validation: Mapping[str, Problems]) -> dict[str, 
     results = {}
     for name, problems in validation.items():
         result = model(problems.world_points, problems.img_points, problems.intrinsics, **problems.known)
-        errors = [pose_errors(pose, problems.pose) for pose in (result.pose, result.init)]
-        rates = [success_rate(success(x)) for x in errors]
-        medians = [part.median().item() for x in errors for part in (x.rotation_error_deg, x.translation_error)]
+        refined, first = (pose_errors(pose, problems.pose) for pose in (result.pose, result.init))
+        rates = success_rate(success(refined)), success_rate(success(first))
+        medians = (part.median().item() for part in (*refined, *first))
         results[name] = ValidationResult(*rates, *medians)
     return results
