@@ -43,6 +43,13 @@ _ModelConfig = TypedDict("_ModelConfig", {"init": _Init | None, "refine": _Refin
 _RunConfig = TypedDict("_RunConfig", {"name": NotRequired[Any], "model": _Size})
 _RunEnvironment = TypedDict("_RunEnvironment", {"commit": str | None})
 
+#: What :meth:`PnPNet.config` returned.
+ModelConfig = Annotated[_ModelConfig, Kept]
+#: The resolved configuration of ``train.py``.
+RunConfig = Annotated[_RunConfig, Kept]
+#: What :func:`~kornia_pnpnet.core.environment.environment` returned during the run.
+RunEnvironment = Annotated[_RunEnvironment, Kept]
+
 
 @dataclass(frozen=True)
 class RunResults:
@@ -70,9 +77,9 @@ class RunResults:
     us_per_problem: float
     validation: dict[str, ValidationResult]
     learned: Learned
-    model: Annotated[_ModelConfig, Kept]
-    config: Annotated[_RunConfig, Kept]
-    environment: Annotated[_RunEnvironment, Kept]
+    model: ModelConfig
+    config: RunConfig
+    environment: RunEnvironment
     origin: RunResults | None = None
 
     def __post_init__(self) -> None:
@@ -121,9 +128,9 @@ def run_results(
         us_per_problem=_us_per_problem(model, [*validation.values()][-1]),
         validation=validate(model, validation),
         learned=Learned(*(values.tolist() for values in learned)),
-        model=cast(_ModelConfig, model.config()),
-        config=cast(_RunConfig, config),
-        environment=cast(_RunEnvironment, environment()),
+        model=cast(ModelConfig, model.config()),
+        config=cast(RunConfig, config),
+        environment=cast(RunEnvironment, environment()),
         origin=origin,
     )
 
