@@ -1,4 +1,4 @@
-"""The likelihood of the true pose: losses that train points, pixels and their noise."""
+"""The likelihood of the true pose: a loss that trains points, pixels and their noise."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from kornia.geometry.liegroup import So3
 from torch import Tensor
 
-from kornia_pnpnet.core.checks import check_like, check_positive, check_shapes, check_whole
+from kornia_pnpnet.core.checks import check_positive, check_whole
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.refine.residual import normal_equations, pixel_covariance, project, retract
 from kornia_pnpnet.arguments import checked_inputs
@@ -24,7 +24,7 @@ from kornia_pnpnet.refine.step import iterate, pixel_precision, sq_standardised
 from kornia_pnpnet.problem import Problem
 from kornia_pnpnet.result import Pose, check_poses
 
-__all__ = ["gaussian_pose_loss", "monte_carlo_pose_loss"]
+__all__ = ["monte_carlo_pose_loss"]
 
 # Degrees of freedom of the t distributions: their tails are heavier than those of a likelihood, so that no sample has a
 # very large weight.
@@ -40,18 +40,14 @@ _MODE_ITERATIONS, _MODE_DAMPING = 4, 1e-3
 _LEAST_DEPTH = 0.02
 
 
+# Poses drawn for each problem have rotations (S, B, 3, 3) and translations (S, B, 3).
+
+
 class _Component(NamedTuple):
     """A t distribution around a pose: its precision matrix is the square of the factor, lower triangular (B, 6, 6)."""
 
     pose: Pose
     factor: Tensor
-
-
-class _Samples(NamedTuple):
-    """Poses drawn for each problem: rotations (S, B, 3, 3), translations (S, B, 3)."""
-
-    rotation: Tensor
-    translation: Tensor
 
 
 def monte_carlo_pose_loss(
@@ -80,15 +76,14 @@ def monte_carlo_pose_loss(
     correspondences fit no pose; this loss has one from the first step, because it compares the true pose with all
     others.
 
-    Samples come in equal numbers from the prior, from a
-    t distribution around the true pose and around each hypothesis, with the precision of the normal equations there,
-    and from ``rounds`` more, each around the mode next to the likeliest sample so far. The prior :math:`p_0` has
-    uniform rotations, and translations of a t distribution around the true one as wide as half the distance between
-    camera and points. It only matters while the correspondences say little.
+    Samples come in equal numbers from the prior, from a t distribution around the true pose and around each hypothesis,
+    with the precision of the normal equations there, and from ``rounds`` more, each around the mode next to the
+    likeliest sample so far. The prior :math:`p_0` has uniform rotations, and translations of a t distribution around
+    the true one as wide as half the distance between camera and points. It only matters while the correspondences say
+    little.
 
-    Shapes below are those of a batch; any leading dimensions and dtypes are as in a solver's call. Gradients flow to
-    points, pixels, cameras, weights, sigmas and covariances, not to the poses. A problem that a solver would
-    refuse (NaN, points on a line, no pinhole camera) has the loss 0 without gradient.
+    Gradients flow to points, pixels, cameras, weights, sigmas and covariances, not to the poses. A problem that a
+    solver would refuse (NaN, points on a line, no pinhole camera) has the loss 0 without gradient.
 
     Source: H. Chen et al., "EPro-PnP: Generalized End-to-End Probabilistic Perspective-n-Points", CVPR 2022, equations
     4 to 7. Differences: several hypotheses, a prior, modes found by refinement in place of fitted proposals.
@@ -96,18 +91,16 @@ def monte_carlo_pose_loss(
     Args:
         truth: true world-to-camera poses, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
         hypotheses: poses around which to look as well, such as the ``pose`` of a result.
-        world_points: shape :math:`(B, N, 3)`.
-        img_points: pixels, shape :math:`(B, N, 2)`.
-        intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or Kornia's cameras.
-        weights: at least 0, shape :math:`(B, N)`.
-        mask: False where a pair is padding, bool, shape :math:`(B, N)`.
-        img_sigma: standard deviation of the noise on each pixel coordinate, in pixels: a number, :math:`(B,)` or
-            :math:`(B, N)`. A network that predicts it learns from this loss how sure it is.
-        world_sigma: standard deviation of the noise on each world coordinate, in the unit of ``world_points``;
-            ``None`` without ``world_cov``: exact points.
-        img_cov: covariance of the noise of each pixel in px², in place of ``img_sigma``, shape :math:`(B, N, 2, 2)`.
-        world_cov: covariance of the noise of each world point, in place of ``world_sigma``, shape
-            :math:`(B, N, 3, 3)`.
+        world_points: see :meth:`~kornia_pnpnet.solver.PnPNet.forward`, also for dimensions and dtypes.
+        img_points: see ``PnPNet.forward``.
+        intrinsics: see ``PnPNet.forward``.
+        weights: see ``PnPNet.forward``.
+        mask: see ``PnPNet.forward``.
+        img_sigma: see ``PnPNet.forward``; required without ``img_cov``. A network that predicts it learns from this
+            loss how sure it is.
+        world_sigma: see ``PnPNet.forward``; ``None`` without ``world_cov``: exact points.
+        img_cov: see ``PnPNet.forward``.
+        world_cov: see ``PnPNet.forward``.
         samples: number of poses drawn per problem.
         rounds: number of components that are added one after the other.
         kernel: name of the robust kernel, a key of :data:`~kornia_pnpnet.refine.kernels.KERNELS`.
@@ -117,11 +110,8 @@ def monte_carlo_pose_loss(
         The loss of each problem, shape :math:`(B,)`, in nats, for a density per radian³ and world unit³.
 
     Raises:
-        ShapeError: for shapes that do not fit each other.
-        TypeCheckError: for tensors of booleans or complex numbers.
-        DeviceError: for tensors on different devices.
-        BaseError: for an unknown kernel, a scale that is not positive, or fewer samples than components.
-        ValueCheckError: without the noise of the pixels, or with both a sigma and a covariance.
+        BaseError: see ``PnPNet.forward``; for an unknown kernel, a scale that is not positive, fewer samples than
+            components, no noise of the pixels, or both a sigma and a covariance.
 
     Example:
         >>> from kornia_pnpnet.data import SyntheticProblems
@@ -138,12 +128,12 @@ def monte_carlo_pose_loss(
     check_whole(count, samples=samples)
     check_positive(scale=scale)
     KORNIA_CHECK(kernel in KERNELS, f"kernel must be one of {sorted(KERNELS)}, got {kernel!r}.")
-    numbers = world_points, img_points, intrinsics, weights, mask
     if img_sigma is None and img_cov is None:
         raise ValueCheckError("monte_carlo_pose_loss needs the noise of the pixels: img_sigma or img_cov.")
     noisy_points = world_sigma is not None or world_cov is not None
-    given_noise = img_sigma, world_sigma if noisy_points else 0.0, img_cov, world_cov
-    checked = [checked_inputs(*numbers, pose, *given_noise) for pose in (truth, *others)]
+    pairs = world_points, img_points, intrinsics, weights, mask
+    pair_noise = img_sigma, world_sigma if noisy_points else 0.0, img_cov, world_cov
+    checked = [checked_inputs(*pairs, pose, *pair_noise) for pose in (truth, *others)]
     size, inputs = checked[0]
     given = [Pose(*x.init) for _, x in checked if x.init is not None]
     assert inputs.noise is not None
@@ -158,10 +148,9 @@ def monte_carlo_pose_loss(
     there = frame.valid[:, None, None] & (corr.weights > 0)[..., None]
     world = torch.where(there, (corr.world_points - frame.centroid[:, None]) * frame.scale[:, None, None], 0.0)
     assert corr.noise is not None
-    world_noise = corr.noise.world * frame.scale[:, None], corr.noise.world_cov
-    if corr.noise.world_cov is not None:
-        world_noise = world_noise[0], corr.noise.world_cov.scaled(frame.scale.square()[:, None])
-    noise = corr.noise._replace(world=world_noise[0], world_cov=world_noise[1])
+    noise = corr.noise._replace(world=corr.noise.world * frame.scale[:, None])
+    if noise.world_cov is not None:
+        noise = noise._replace(world_cov=noise.world_cov.scaled(frame.scale.square()[:, None]))
     corr = corr._replace(world_points=world, noise=noise)
 
     live = frame.valid & known
@@ -174,55 +163,8 @@ def monte_carlo_pose_loss(
         drawn, log_proposal = _draw(model._replace(corr=corr.map(torch.Tensor.detach)), poses, samples // count, rounds)
     log_weights = model.log_density(drawn) - log_proposal
     log_total = torch.logsumexp(log_weights, 0) - math.log(len(log_weights))
-    log_density = model.log_density(_Samples(*(x[None] for x in poses[0])))[0] - log_total
+    log_density = model.log_density(Pose(*(x[None] for x in poses[0])))[0] - log_total
     return torch.where(live, -log_density - 3.0 * frame.scale.log(), 0.0).reshape(size)
-
-
-def gaussian_pose_loss(truth: Pose, estimate: Pose, covariance: Tensor, ok: Tensor | None = None) -> Tensor:
-    r"""Negative log-likelihood of the true pose under a normal distribution around the estimate.
-
-    The loss is :math:`\tfrac12 (e^\top C^{-1} e + \log\det 2\pi C)` with the tangent :math:`e = (\omega, v)` from the
-    true pose to the estimate, see :func:`~kornia_pnpnet.refine.residual.retract`. With the
-    :func:`~kornia_pnpnet.covariance.pose_covariance` of a result, gradients reach the noise of pixels and points by
-    both: by the pose, and by how sure the pose is. The loss costs a small part of :func:`monte_carlo_pose_loss`, but
-    knows a single minimum: use it once the solver finds most poses. It grows with the square of the error.
-
-    Args:
-        truth: true world-to-camera poses, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
-        estimate: the ``pose`` of a result, as ``truth``.
-        covariance: its covariance :math:`C`, shape :math:`(B, 6, 6)`.
-        ok: the ``ok`` of the result, bool, shape :math:`(B,)`; ``None``: every pose counts.
-
-    Returns:
-        The loss of each problem in nats, shape :math:`(B,)`, for a density per radian³ and world unit³. It is 0 without
-        gradient where ``ok`` is False, and where the covariance is not finite or not positive definite.
-
-    Raises:
-        ShapeError: when a shape is wrong, or the batches differ.
-        TypeCheckError: when the dtypes differ.
-        DeviceError: when the devices differ.
-
-    Example:
-        >>> pose = Pose(torch.eye(3)[None], torch.zeros(1, 3))
-        >>> gaussian_pose_loss(pose, pose, torch.eye(6)[None])  # 3 log(2 pi)
-        tensor([5.5136])
-    """
-    check_poses(estimate, truth)
-    batch = len(truth.translation)
-    check_shapes({"covariance": (covariance, (batch, 6, 6)), "ok": (ok, (batch,))})
-    check_like({"covariance": covariance}, truth.translation, "the translation of the truth")
-    with torch.no_grad():
-        factor, info = torch.linalg.cholesky_ex(covariance)
-        found = torch.cat((factor.flatten(1), _tangent(estimate, truth)), 1)
-        live = (info == 0) & found.isfinite().all(1)
-        live = live if ok is None else live & ok
-    eye = torch.eye(6, dtype=covariance.dtype, device=covariance.device)
-    factor = torch.linalg.cholesky_ex(torch.where(live[:, None, None], covariance, eye))[0]
-    error = _tangent(_pose_where(live, estimate), _pose_where(live, truth))
-    standardised = torch.linalg.solve_triangular(factor, error[..., None], upper=False)
-    log_determinant = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    loss = 0.5 * standardised.square().sum((1, 2)) + log_determinant + 3.0 * math.log(2.0 * math.pi)
-    return torch.where(live, loss, 0.0)
 
 
 class _Posterior(NamedTuple):
@@ -249,7 +191,7 @@ class _Posterior(NamedTuple):
         """Distance between the true camera and the points, (B, 1)."""
         return self.translation.norm(dim=-1, keepdim=True)
 
-    def log_density(self, poses: _Samples) -> Tensor:
+    def log_density(self, poses: Pose) -> Tensor:
         """Logarithm of likelihood times prior, (S, B)."""
         return self.log_prior(poses.translation) - self._cost(poses)
 
@@ -259,14 +201,14 @@ class _Posterior(NamedTuple):
         sq_distance = ((translation - self.translation) / width).square().sum(-1)
         return _log_t(sq_distance, 3) - 3.0 * width.log().mT - math.log(8.0 * math.pi**2)
 
-    def sample_prior(self, count: int) -> _Samples:
+    def sample_prior(self, count: int) -> Pose:
         """Uniform rotations, and translations around the true one."""
         batch = self.translation.shape[0]
         rotation = quaternion_to_rotation_matrix(torch.randn(count, batch, 4).to(self.translation))
-        shift = _sample_t(count, self.translation)
-        return _Samples(rotation, self.translation + _PRIOR_TRANSLATION * self.distance * shift)
+        shift = _PRIOR_TRANSLATION * self.distance * _sample_t(count, self.translation)
+        return Pose(rotation, self.translation + shift)
 
-    def _cost(self, poses: _Samples) -> Tensor:
+    def _cost(self, poses: Pose) -> Tensor:
         """Half the weighted sum of robust losses, (S, B)."""
         corr = self.corr
         cam = corr.world_points @ poses.rotation.mT + poses.translation[..., None, :]  # (S, B, N, 3)
@@ -301,7 +243,8 @@ class _Posterior(NamedTuple):
         precision = map_tensors(lambda x: factor * x, pixel_precision(projection, corr.noise, corr.focal))
         rows = normal_equations(projection, precision).hessian
         matrix = torch.stack([torch.stack([rows[max(i, j)][min(i, j)] for j in range(6)], -1) for i in range(6)], -2)
-        least = torch.cat((torch.ones_like(self.translation) / _WIDEST_ROTATION**2, self._translation_precision), -1)
+        widest = torch.full_like(pose.translation, _WIDEST_ROTATION), _PRIOR_TRANSLATION * self.distance.expand(-1, 3)
+        least = torch.cat(widest, -1).square().reciprocal()
         matrix = matrix + torch.diag_embed(least)
         # Scaled to a diagonal of one, so that rounding does not depend on units.
         scale = matrix.diagonal(dim1=-2, dim2=-1).rsqrt()
@@ -309,11 +252,7 @@ class _Posterior(NamedTuple):
         scaled = matrix * scale[..., None] * scale[..., None, :] + 10.0 * torch.finfo(scale.dtype).eps * eye
         return _Component(pose, torch.linalg.cholesky_ex(scaled)[0] / scale[..., None])
 
-    @property
-    def _translation_precision(self) -> Tensor:
-        return (_PRIOR_TRANSLATION * self.distance).square().reciprocal().expand(-1, 3)
-
-    def mode(self, poses: _Samples, log_weights: Tensor) -> Pose:
+    def mode(self, poses: Pose, log_weights: Tensor) -> Pose:
         """The mode next to the pose of the largest weight."""
         best = log_weights.argmax(0)
         rows = torch.arange(len(best), device=best.device)
@@ -325,7 +264,7 @@ class _Posterior(NamedTuple):
         return pose
 
 
-def _draw(model: _Posterior, poses: Sequence[Pose], each: int, rounds: int) -> tuple[_Samples, Tensor]:
+def _draw(model: _Posterior, poses: Sequence[Pose], each: int, rounds: int) -> tuple[Pose, Tensor]:
     """Draw from the prior and from a component around every pose and every mode that is found.
 
     Returns:
@@ -334,15 +273,15 @@ def _draw(model: _Posterior, poses: Sequence[Pose], each: int, rounds: int) -> t
     components = [model.component(pose) for pose in poses]
     parts = [model.sample_prior(each), *(_sample(component, each) for component in components)]
 
-    def log_mixture(drawn: _Samples) -> Tensor:
+    def log_mixture(drawn: Pose) -> Tensor:
         every = [model.log_prior(drawn.translation), *(_log_density(component, drawn) for component in components)]
         return torch.logsumexp(torch.stack(every), 0) - math.log(len(every))
 
     for _ in range(rounds):
-        drawn = _Samples(*map(torch.cat, zip(*parts, strict=True)))
+        drawn = Pose(*map(torch.cat, zip(*parts, strict=True)))
         components.append(model.component(model.mode(drawn, model.log_density(drawn) - log_mixture(drawn))))
         parts.append(_sample(components[-1], each))
-    drawn = _Samples(*map(torch.cat, zip(*parts, strict=True)))
+    drawn = Pose(*map(torch.cat, zip(*parts, strict=True)))
     return drawn, log_mixture(drawn)
 
 
@@ -360,16 +299,16 @@ def _log_t(sq_distance: Tensor, size: int) -> Tensor:
     return constant - both * torch.log1p(sq_distance / _FREEDOM)
 
 
-def _sample(component: _Component, count: int) -> _Samples:
+def _sample(component: _Component, count: int) -> Pose:
     """Poses of a component."""
     pose, factor = component
     vectors = _sample_t(count, factor[..., 0])  # (S, B, 6)
     tangents = torch.linalg.solve_triangular(factor.mT, vectors.permute(1, 2, 0), upper=True).permute(2, 0, 1)
     moved = retract(map_tensors(lambda x: x.repeat(count, *(1,) * (x.ndim - 1)), pose), tangents.flatten(0, 1))
-    return _Samples(*map_tensors(lambda x: x.unflatten(0, (count, -1)), moved))
+    return Pose(*map_tensors(lambda x: x.unflatten(0, (count, -1)), moved))
 
 
-def _log_density(component: _Component, poses: _Samples) -> Tensor:
+def _log_density(component: _Component, poses: Pose) -> Tensor:
     """Logarithm of the density of a component per radian³ and unit³, (S, B)."""
     pose, factor = component
     tangent = _tangent(poses, pose)
@@ -386,7 +325,7 @@ def _pose_where(live: Tensor, pose: Pose) -> Pose:
     return Pose(rotation, torch.where(live[:, None], pose.translation, eye[2]))
 
 
-def _tangent(pose: Pose | _Samples, origin: Pose) -> Tensor:
+def _tangent(pose: Pose, origin: Pose) -> Tensor:
     """The inverse of ``retract``: the tangent vectors that move ``origin`` to ``pose``, (..., B, 6)."""
     turn = pose.rotation @ origin.rotation.mT
     # The inverse of Cayley's map; half a turn would be infinitely far away.

@@ -45,20 +45,19 @@ class LossTerms(NamedTuple):
     noise: Tensor
 
 
-def pose_distances(estimate: Pose, truth: Pose) -> tuple[Tensor, Tensor]:
+def pose_distances(estimate: Pose, truth: Pose, origin: Tensor | None = None) -> tuple[Tensor, Tensor]:
     r"""Distances between poses whose gradients are bounded everywhere, also at 0.
 
     Args:
         estimate: rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
         truth: rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
+        origin: world points at which the translations are compared, :math:`(B, 3)`; the world's origin when ``None``.
 
     Returns:
         :math:`\|\hat R - R\|_F = 2\sqrt2 \sin(\theta / 2)` and :math:`\|\hat t - t\|`, each :math:`(B,)`.
 
     Raises:
-        ShapeError: when a shape is wrong, or the batches differ.
-        TypeCheckError: when the dtypes differ.
-        DeviceError: when the devices differ.
+        BaseError: when shapes, dtypes or devices are wrong or differ.
 
     Example:
         >>> eye = Pose(torch.eye(3)[None], torch.zeros(1, 3))
@@ -67,17 +66,24 @@ def pose_distances(estimate: Pose, truth: Pose) -> tuple[Tensor, Tensor]:
         (tensor([2.]), tensor([5.]))
     """
     check_poses(estimate, truth)
-    return _distances(estimate, truth)
-
-
-def _distances(estimate: Pose, truth: Pose, origin: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """:func:`pose_distances` with the translations of a world whose origin is at the points ``origin``, (B, 3)."""
     rotation = estimate.rotation - truth.rotation
     translation = estimate.translation - truth.translation
     if origin is not None:
         translation = translation + (rotation * origin[:, None]).sum(-1)
     tiny = torch.finfo(rotation.dtype).tiny
     return (rotation.square().sum((-2, -1)) + tiny).sqrt(), (translation.square().sum(-1) + tiny).sqrt()
+
+
+def _refined_distances(
+    result: PnPResult, problems: Problems, ramp: float, origin: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Distances of the refined poses, without a gradient at the ramp 0."""
+    with torch.set_grad_enabled(torch.is_grad_enabled() and ramp > 0.0):
+        return pose_distances(result.pose, problems.pose, origin)
+
+
+def _saturated(distance: Tensor, limit: float | None) -> Tensor:
+    return distance if limit is None else distance / (1.0 + distance / limit)
 
 
 class PoseLoss(nn.Module):
@@ -144,16 +150,11 @@ class PoseLoss(nn.Module):
         Raises:
             BaseError: when result and truth differ in shape, dtype or device.
         """
-        for pose in (result.pose, result.init):
-            check_poses(pose, problems.pose)
-        init_rotation, init_translation = _distances(result.init, problems.pose, problems.world_points.mean(1))
-        with torch.set_grad_enabled(torch.is_grad_enabled() and ramp > 0.0):
-            rotation, translation = _distances(result.pose, problems.pose)
+        init_rotation, init_translation = pose_distances(result.init, problems.pose, problems.world_points.mean(1))
+        rotation, translation = _refined_distances(result, problems, ramp)
         init = self.rotation * init_rotation + self.init_translation * init_translation
         refined = self.rotation * rotation + self.translation * translation
-        if self.saturation is not None:
-            refined = refined / (1.0 + refined / self.saturation)
-        total = init + ramp * self.refined * refined
+        total = init + ramp * self.refined * _saturated(refined, self.saturation)
         none = torch.zeros_like(total)
         terms = LossTerms(total, init_rotation, init_translation, rotation, translation, weights=none, noise=none)
         return map_tensors(torch.mean, terms)
@@ -215,24 +216,13 @@ class SetLoss(nn.Module):
     def forward(self, result: PnPResult, problems: Problems, ramp: float, guess: Starts) -> LossTerms:
         """Compare a solver's result with the truth.
 
-        Args:
-            result: see :meth:`PoseLoss.forward`.
-            problems: see :meth:`PoseLoss.forward`.
-            ramp: see :meth:`PoseLoss.forward`.
-            guess: the first guess of the result, see :meth:`~kornia_pnpnet.solver.PnPNet.with_starts`.
-
-        Returns:
-            The loss and its terms, means over the batch.
-
-        Raises:
-            BaseError: when result and truth differ in shape, dtype or device.
+        Arguments, result and errors are those of :meth:`PoseLoss.forward`; ``guess`` is the first guess of the result,
+        see :meth:`~kornia_pnpnet.solver.PnPNet.with_guess`.
         """
-        for pose in (result.pose, result.init):
-            check_poses(pose, problems.pose)
         centre = problems.world_points.mean(1)
         distance = transform_points(problems.pose.matrix, centre[:, None])[:, 0].norm(dim=-1)
 
-        every = [_distances(pose, problems.pose, centre) for pose in guess.poses[: self.starts]]
+        every = [pose_distances(pose, problems.pose, centre) for pose in guess.poses[: self.starts]]
         rotations, translations = (torch.stack(x, 1) for x in zip(*every, strict=True))  # (B, S) each
         translations = translations / distance[:, None]
         sums = rotations + translations
@@ -240,22 +230,15 @@ class SetLoss(nn.Module):
         init_rotation, init_translation, least = (x.gather(1, best)[:, 0] for x in (rotations, translations, sums))
         first = (1.0 - self.every) * least + self.every * sums.mean(1)
 
-        with torch.set_grad_enabled(torch.is_grad_enabled() and ramp > 0.0):
-            rotation, translation = _distances(result.pose, problems.pose, centre)
-            translation = translation / distance
-            refined = rotation / self.rotation_unit + translation / self.translation_unit
-            refined = refined / (1.0 + refined / self.saturation)
-        entropy = _cross_entropy(guess.weights, problems.inliers)
+        rotation, translation = _refined_distances(result, problems, ramp, centre)
+        translation = translation / distance
+        refined = _saturated(rotation / self.rotation_unit + translation / self.translation_unit, self.saturation)
+        probability = torch.where(problems.inliers, guess.weights, 1.0 - guess.weights)
+        entropy = -probability.clamp(min=_LEAST_PROBABILITY).log().mean(-1)
         noise = torch.zeros_like(first) if guess.noise is None else _negative_log_likelihood(guess.noise, problems)
         total = first + ramp * self.refined * refined + self.weights * entropy + self.noise * noise
         terms = LossTerms(total, init_rotation, init_translation, rotation, translation, entropy, noise)
         return map_tensors(torch.mean, terms)
-
-
-def _cross_entropy(weights: Tensor, inliers: Tensor) -> Tensor:
-    """Binary cross entropy of the weights, mean over the pairs, (B,)."""
-    probability = torch.where(inliers, weights, 1.0 - weights)
-    return -probability.clamp(min=_LEAST_PROBABILITY).log().mean(-1)
 
 
 def _negative_log_likelihood(noise: Noise, problems: Problems) -> Tensor:

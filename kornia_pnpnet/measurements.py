@@ -29,8 +29,7 @@ def heatmap_keypoints(
     with a single peak has a positive definite covariance.
 
     The covariance says how far the map spreads. It is the error of the keypoint only when a loss has taught the
-    network so, such as :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss` or
-    :func:`~kornia_pnpnet.likelihood.gaussian_pose_loss`.
+    network so, such as :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss`.
 
     Convention:
         Pixels are (u, v) with the centre of the top-left pixel at (0, 0), as in Kornia. Add 0.5 where the principal

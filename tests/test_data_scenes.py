@@ -11,7 +11,6 @@ from kornia.core.exceptions import BaseError
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 from torch.testing import assert_close
 
-from kornia_pnpnet.core.trees import iter_tensors
 from kornia_pnpnet.data import OutlierMix, Scene, SceneProblems
 
 # --- views ------------------------------------------------------------------------------------------------------------
@@ -42,14 +41,6 @@ def test_match_behind_the_camera_has_infinite_error():
 # --- problems ---------------------------------------------------------------------------------------------------------
 
 
-def test_shapes_and_dtypes():
-    problems = SceneProblems(make_scene(20, 30), n=7, batch_size=5, dtype=torch.float32).batch(0)
-    shapes = [(5, 7, 3), (5, 7, 2), (5, 3, 3), (5, 3, 3), (5, 3), (5, 7)]
-    assert [tuple(x.shape) for x in iter_tensors(problems)] == shapes
-    assert [x.dtype for x in iter_tensors(problems)] == [torch.float32] * 5 + [torch.bool]
-    assert SceneProblems(make_scene(20)).batch(0).world_points.dtype == torch.float64
-
-
 @pytest.mark.parametrize("recentre", [True, False])
 @pytest.mark.parametrize("outliers", [None, OutlierMix()])
 def test_inliers_reproject_exactly_and_outliers_do_not(recentre, outliers):
@@ -61,12 +52,10 @@ def test_inliers_reproject_exactly_and_outliers_do_not(recentre, outliers):
     assert (wrong > 1e-3).all()
 
 
-@pytest.mark.parametrize(("box", "angle"), [(25.0, math.pi / 2), (2.0, 0.1)])
-def test_recentred_poses_have_the_protocols_prior(box, angle):
-    source = SceneProblems(make_scene(20), batch_size=20_000, translation_box=box, max_angle=angle)
-    pose = source.batch(0).pose
-    assert_uniform(pose.translation, -box / 2, box / 2)
-    assert_uniform(rotation_matrix_to_axis_angle(pose.rotation).norm(dim=-1), 0.0, angle + 1e-9)
+def test_recentred_poses_have_the_protocols_prior():
+    pose = SceneProblems(make_scene(20), batch_size=20_000).batch(0).pose
+    assert_uniform(pose.translation, -12.5, 12.5)
+    assert_uniform(rotation_matrix_to_axis_angle(pose.rotation).norm(dim=-1), 0.0, math.pi / 2 + 1e-9)
 
 
 def test_recentring_moves_the_world_rigidly():
@@ -144,17 +133,6 @@ def test_fixed_number_of_mismatches_with_spares_of_their_own():
         assert from_the_scene(scene, problems.img_points).all()
         for pixels in problems.img_points[:20]:
             assert len(pixels.unique(dim=0)) == 9, "no two pairs share a pixel"
-
-
-def test_mismatch_comes_from_the_same_image():
-    scene = make_scene(20, 30)
-    mix = OutlierMix(count=3, mismatch_share=1.0)
-    problems = SceneProblems(scene, batch_size=50, outliers=mix, recentre=False).batch(0)
-    for view in scene.views:
-        mine = (problems.pose.translation == view.translation).all(-1)
-        assert mine.any()
-        pixels = problems.img_points[mine].reshape(-1, 1, 2)
-        assert (pixels == view.img_points).all(-1).any(-1).all()
 
 
 def test_real_mismatches_are_marked_without_any_spoiling():

@@ -8,10 +8,8 @@ import torch
 from data_helpers import COUNT, assert_normal, assert_uniform, draw, reprojection, same
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
-from kornia_pnpnet import Pose, Problems
 from kornia_pnpnet.core.trees import iter_tensors
-from kornia_pnpnet.data import FacadePoints, ObjectPoints, OutlierMix, SlabPoints, SyntheticProblems
-from kornia_pnpnet.data.draws import random_poses
+from kornia_pnpnet.data import FacadePoints, ObjectPoints, OutlierMix, SyntheticProblems
 from kornia_pnpnet.geometry import transform
 
 # --- poses ------------------------------------------------------------------------------------------------------------
@@ -39,13 +37,6 @@ def test_rotations_have_a_uniform_axis_and_a_uniform_angle(pose):
     assert_uniform(torch.atan2(axis[:, 1], axis[:, 0]), -math.pi, math.pi)
     eye = torch.eye(3, dtype=torch.float64).expand(COUNT, 3, 3)
     torch.testing.assert_close(pose.rotation @ pose.rotation.mT, eye)
-
-
-def test_pose_constants_are_arguments(generator):
-    assert_normal(draw(3, translation_sigma=25.0).pose.translation, 25.0)
-    pose = random_poses(COUNT, generator, translation_box=2.0, max_angle=0.1)
-    assert_uniform(pose.translation, -1.0, 1.0)
-    assert_uniform(rotation_matrix_to_axis_angle(pose.rotation).norm(dim=-1), 0.0, 0.1 + 1e-9)
 
 
 # --- points and noise -------------------------------------------------------------------------------------------------
@@ -93,7 +84,8 @@ def test_noise_from_a_range_is_log_uniform_over_the_problems(name):
 
 
 def test_a_share_of_problems_comes_with_sigmas():
-    p = draw(4, known_noise=0.4, img_sigma=(0.5, 5.0), world_sigma=0.05)
+    p = draw(4, known_noise=0.4, img_sigma=(0.5, 5.0), world_sigma=0.05, translation_sigma=25.0)
+    assert_normal(p.pose.translation, 25.0)
     known = [~x.isnan() for x in (p.img_sigma, p.world_sigma)]
     assert (known[0] & known[1]).double().mean().item() == pytest.approx(0.4, abs=0.015)
     for one, other in (known, known[::-1]):
@@ -102,12 +94,6 @@ def test_a_share_of_problems_comes_with_sigmas():
     assert_uniform(p.img_sigma[known[0]].log(), math.log(0.5) - 1e-6, math.log(5.0) + 1e-6)
     assert set(p.sigmas) == {"img_sigma", "world_sigma"}
     assert draw(4, 2).sigmas == {}
-
-
-def test_known_sigmas_are_those_of_the_noise():
-    p = draw(200, 500, known_noise=1.0, img_sigma=(0.5, 5.0), world_sigma=0.0)
-    ratio = reprojection(p).flatten(1).square().mean(1).sqrt() / p.img_sigma
-    assert (ratio - 1).abs().max() < 0.2
 
 
 def test_heavy_tails_keep_the_sigma_of_the_bulk():
@@ -125,14 +111,6 @@ def test_heavy_tails_keep_the_sigma_of_the_bulk():
     assert few.quantile(0.2).item() == pytest.approx(normal.quantile(0.2).item(), rel=0.1)
     assert few.quantile(0.95) > 1.9 * normal.quantile(0.95)
     assert many.quantile(0.95).item() == pytest.approx(normal.quantile(0.95).item(), rel=0.01)
-
-
-def test_degrees_of_freedom_differ_between_problems():
-    p = draw(400, 500, world_sigma=0.0, degrees=(1.5, 50.0))
-    length = reprojection(p).norm(dim=-1)
-    heavy = length.quantile(0.99, dim=1) / length.quantile(0.5, dim=1)
-    assert heavy.quantile(0.05) < 2.9  # normal noise has 2.6
-    assert heavy.quantile(0.95) > 8.0
 
 
 def test_sigmas_of_pairs_are_log_normal_about_that_of_the_problem():
@@ -208,18 +186,6 @@ def test_a_batch_with_every_option_is_reproducible_and_finite():
 def test_the_stream_is_the_same_in_every_version():
     """Checkpoints are continued, and results compared, on the batches that they began with."""
     source = SyntheticProblems(
-        n=4, batch_size=2, seed=1, outliers=OutlierMix(count=2), points=SlabPoints(), dtype=torch.float64
-    )
-    p = source.batch(5)
-    expected = [22.701997641412, 32.510782258771, 7.399977915547, -537.263534025228, 241.439302635276]
-    expected += [-11.830719013041, 1.755626411493, -12.466575925139]
-    found = torch.cat((p.world_points[1, 3], p.img_points[1, 3], p.pose.translation[1]))
-    torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float64), rtol=1e-9, atol=0)
-    assert p.inliers.tolist() == [[True, False, False, True], [True, True, False, False]]
-
-
-def test_the_stream_of_all_kinds_of_outliers_is_the_same_in_every_version():
-    source = SyntheticProblems(
         n=12,
         batch_size=2,
         seed=1,
@@ -236,15 +202,6 @@ def test_the_stream_of_all_kinds_of_outliers_is_the_same_in_every_version():
     found = torch.cat((p.world_points[1, 11], p.img_points[1, 11], p.img_sigma, p.world_sigma))
     torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float64), rtol=1e-8, atol=0)
     assert p.inliers[1].tolist() == [x == "1" for x in "010011100110"]
-
-
-def test_dtype_and_shapes():
-    p, double = (SyntheticProblems(n=4, batch_size=3, dtype=d).batch(0) for d in (torch.float32, torch.float64))
-    assert isinstance(p, Problems)
-    assert isinstance(p.pose, Pose)
-    assert [tuple(x.shape) for x in iter_tensors(p)] == [(3, 4, 3), (3, 4, 2), (3, 3, 3), (3, 3, 3), (3, 3), (3, 4)]
-    assert {x.dtype for x in iter_tensors(double)} == {torch.float64, torch.bool}
-    assert same(double.map(lambda x: x.float() if x.dtype == torch.float64 else x), p)
 
 
 def test_confidences_tell_inliers_from_outliers_more_or_less():

@@ -12,8 +12,6 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from kornia_pnpnet.refine.kernels import KERNELS
-
 CONF = Path(__file__).resolve().parents[1] / "conf"
 FILES = {path.stem: path for path in sorted((CONF / "experiment").glob("*.yaml"))}
 # Two updates of the network alone and one through the refinement, where the recipe's ramp is not changed.
@@ -82,24 +80,6 @@ def test_identity_start_learns_the_refiner_alone_from_the_first_update(trained):
     assert torch.allclose(first.translation, torch.zeros(3), atol=1e-4)
     settings = instantiate(config.train, _convert_="all")
     assert [settings.ramp_factor(update) for update in range(3)] == [1.0, 1.0, 1.0]
-
-
-def test_shared_learns_one_set_of_hyperparameters(trained):
-    _, before, solver, _ = trained("experiment=shared", "train.ramp=[0,0]")
-    names = {f"refine.{name}.raw" for name in ("step", "damping", "robustness")}
-    assert {name: tuple(solver.state_dict()[name].shape) for name in names} == dict.fromkeys(names, (1,))
-    assert names <= moved(before, solver)
-
-
-def test_kernels_start_from_their_classical_scales():
-    kernels = swept("kernels")["model.solver.refine.kernel"]
-    assert {"power", *kernels} == set(KERNELS)
-    for kernel in kernels:
-        config = composed("experiment=kernels", f"model.solver.refine.kernel={kernel}")
-        refine = instantiate(config.model.solver).refine
-        assert refine.kernel is KERNELS[kernel]
-        assert refine.robustness().tolist() == pytest.approx([KERNELS[kernel].default] * config.model.m)
-        assert config.name == f"{kernel}-n9"
 
 
 @pytest.mark.parametrize("max_ratio", swept("sweep")["data.outliers.max_ratio"])

@@ -22,7 +22,7 @@ from kornia_pnpnet import MLPInit, PnPNet, PoseLoss, RobustWeightedLM
 from kornia_pnpnet.cli import main
 from kornia_pnpnet.data import SyntheticProblems
 from kornia_pnpnet.training import TrainSettings, fit
-from kornia_pnpnet.training.checkpoint import CHECKPOINT_NAME, HISTORY_NAME, save_checkpoint
+from kornia_pnpnet.training.checkpoint import CHECKPOINT_NAME, HISTORY_NAME
 
 KILLS = 20
 # Python 3.12 warns of every fork of a process with threads, which pytest-xdist's are.
@@ -124,22 +124,6 @@ def test_a_full_disk_loses_nothing(tmp_path):
     assert rows == history
 
 
-def test_a_torn_row_of_the_curves_is_dropped(tmp_path):
-
-    def crash():
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train(tmp_path, loss=Then(21, crash))
-    _, before = state(tmp_path)
-    with (tmp_path / HISTORY_NAME).open("a") as file:
-        file.write("2")  # of 21, and nothing after it
-    train(tmp_path, resume=True)
-    _, rows = state(tmp_path)
-    assert [row["update"] for row in rows] == [str(1 + i) for i in range(40)]
-    assert rows[:20] == before
-
-
 def arrays_of(source):
     """The arrays of a shard."""
     inputs = (x.numpy() for x in source.batch(0)[:3])
@@ -239,14 +223,3 @@ def test_damaged_weights_load_nothing(weights_folder, tmp_path):
         assert all(theirs[key].equal(value) for key, value in sound.state_dict().items())
 
     run()
-
-
-def test_a_checkpoint_is_not_replaced_by_half_of_one(tmp_path):
-    path = tmp_path / CHECKPOINT_NAME
-    save_checkpoint(path, {"a": 1})
-    process = in_a_process(save_checkpoint, path, {"a": torch.zeros(50_000_000)})
-    while process.is_alive() and not list(tmp_path.glob("*.tmp")):
-        time.sleep(0.001)
-    process.kill()
-    process.join()
-    assert torch.load(path)["a"] == 1

@@ -3,22 +3,20 @@
 import json
 import shutil
 from collections import Counter
-from functools import partial
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import ERRORS, WORD, damage, many, names_the_file, options, places_in, spoiled
+from strategies import ERRORS, damage, many, names_the_file, places_in, spoiled
 
-from kornia_pnpnet import MLPInit, PnPNet, RobustWeightedLM
+from kornia_pnpnet import PnPNet
 from kornia_pnpnet.core.files import write_json
 from kornia_pnpnet.core.schema import to_json
-from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.pretrained import WEIGHTS_FOLDER
-from kornia_pnpnet.training import FitReport
 from kornia_pnpnet.training.card import write_model_card
 from kornia_pnpnet.training.collect import collect_weights, summarize_runs
-from kornia_pnpnet.training.results import find_results, load_run, run_results
+from kornia_pnpnet.training.results import find_results, load_run
 
 
 def made_run(folder):
@@ -30,6 +28,29 @@ def made_run(folder):
     for name in ("config.json", "model.safetensors"):
         shutil.copy(shipped / name, folder / "weights" / name)
     return folder
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "weights=/tmp/runs/mine",
+        "weights=~/runs/mine",
+        r"weights=C:\runs\mine",
+        "weights=file:///runs/mine",
+        "+data.scenes=[/runs/mine/a,'/runs/mine b']",
+        "data={path:/runs/mine}",
+    ],
+)
+def test_a_card_names_no_folder_of_a_machine(override, tmp_path):
+    results = load_run(WEIGHTS_FOLDER / "pnpnet-n9" / "results.json")
+    overrides = ["train.ramp=[0,0]", override, "url=https://host/a", "weights=outputs/a/weights"]
+    for origin in (results.origin, None):
+        write_model_card(tmp_path, replace(results, overrides=overrides, origin=origin))
+        card = (tmp_path / "README.md").read_text()
+        assert "/runs" not in card
+        assert "mine" not in card
+        assert "train.ramp=[0,0]" in card
+        assert "url=https://host/a weights=outputs/a/weights" in card
 
 
 def test_spoiled_results_of_runs_are_an_error_of_ours(tmp_path):
@@ -94,41 +115,3 @@ def test_damaged_runs_are_an_error_of_ours(tmp_path):
     with pytest.raises(FileNotFoundError):
         collect_weights([spoilt], tmp_path / "none")
     assert not (tmp_path / "none").exists()
-
-
-REPORT = FitReport(0, 100, 0, False, 10.0, 10.0, {"data": 0.5, "forward": 0.5}, 300.0)
-
-
-@many(12)
-@given(
-    st.integers(0, 3), st.sampled_from([0, 1, 4]), st.booleans(), st.booleans(), st.lists(WORD, max_size=3), st.data()
-)
-def test_results_of_any_run_make_a_card_and_a_summary(tmp_path_factory, sets, m, network, told, words, data):
-    folder = tmp_path_factory.mktemp("run")
-    model = PnPNet(MLPInit(9) if network else None, RobustWeightedLM(m))
-    source = {"_target_": data.draw(st.sampled_from(["kornia_pnpnet.data.SyntheticProblems", "mine.Source"]))}
-    source |= data.draw(options(n=st.just([6, 9]), outliers=st.just({"_target_": "mine.Mix", "x": 1}), points=WORD))
-    validation = {}
-    for i in range(sets):
-        size, noise = data.draw(st.integers(1, 3)), (0.01, 0.05) if told else 0.05
-        problems = SyntheticProblems(n=9, batch_size=size, seed=i, outliers=OutlierMix(), world_sigma=noise).batch(0)
-        validation[f"set {i}"] = problems
-    config = {"batch_size": 8, "model": {"n": 9}, "name": data.draw(st.sampled_from([None, "drone"]))}
-    config["data"] = {"train": source, "validation": dict.fromkeys(validation, source)}
-    make = partial(run_results, model, validation, REPORT, config, [*words, "~x", "+a.b=1", "c=d=e"])
-    if not sets:
-        with pytest.raises(ValueError, match="at least one validation set"):
-            make()
-        return
-    results = make()
-    write_json(folder / "results.json", to_json(results))
-    assert load_run(folder / "results.json") == results
-    write_model_card(folder, results)
-    card = (folder / "README.md").read_text()
-    assert f"\n# {config['name'] or ('MLPInit' if network else 'PnPNet')}\n" in card
-    assert all(name in card for name in validation)
-    own = "mine.Source" in str(source) or "mine.Mix" in str(source)
-    assert ("from mine." in card) == own
-    assert ("synthetic problems" in card) == (not own)
-    summary = summarize_runs(folder).read_text()
-    assert "d=e" in summary

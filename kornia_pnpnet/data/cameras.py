@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import count
 
 import torch
 from kornia.core.check import KORNIA_CHECK
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
-from torch.nn import functional
+from torch.nn.functional import normalize
 
 from kornia_pnpnet.core.checks import check_numbers, check_positive, check_whole
 from kornia_pnpnet.core.trees import map_tensors
@@ -23,13 +24,14 @@ __all__ = ["CameraProblems"]
 _NEAREST, _FARTHEST = 2.0, 50.0
 
 
+@dataclass(kw_only=True, eq=False)
 class CameraProblems:
     r"""Random problems of cameras with random fields of view, endless and reproducible.
 
     Pixels are uniform in a square image, whose middle is the principal point; depths are uniform about a distance that
-    is log-uniform in 2 to 50. Outliers have a pixel that is uniform in the image. With several cameras, they look in
+    is log-uniform in 2 to 50. Outliers have a pixel that is uniform in the image. The cameras of a rig look in
     directions that are spread evenly about the rig's vertical axis, their centres lie on a sphere about its origin, and
-    the pairs go to them in turn.
+    the pairs are dealt to them in turn.
 
     Args:
         n: number of pairs per problem.
@@ -54,43 +56,31 @@ class CameraProblems:
         (torch.Size([2, 12, 3, 3]), torch.Size([2, 12, 3, 3]), tensor([9, 9]))
     """
 
-    def __init__(
-        self,
-        *,
-        n: int = 12,
-        batch_size: int = 1000,
-        seed: int = 0,
-        field_of_view: Sequence[float] = (18.0, 100.0),
-        depth_spread: Sequence[float] = (0.1, 0.5),
-        outlier_share: float = 0.0,
-        half_image: float = 1000.0,
-        img_sigma: float = 1.0,
-        cameras: int = 1,
-        baseline: float = 0.1,
-        dtype: torch.dtype = torch.float32,
-        device: str | torch.device = "cpu",
-    ) -> None:
-        check_whole(1, n=n, batch_size=batch_size, cameras=cameras)
-        check_whole(0, seed=seed)
-        check_positive(half_image=half_image)
-        check_numbers(0.0, img_sigma=img_sigma, baseline=baseline)
-        check_numbers(0.0, 1.0, outlier_share=outlier_share)
-        for name, values, high in (("field_of_view", field_of_view, 170.0), ("depth_spread", depth_spread, 0.95)):
+    n: int = 12
+    batch_size: int = 1000
+    seed: int = 0
+    field_of_view: Sequence[float] = (18.0, 100.0)
+    depth_spread: Sequence[float] = (0.1, 0.5)
+    outlier_share: float = 0.0
+    half_image: float = 1000.0
+    img_sigma: float = 1.0
+    cameras: int = 1
+    baseline: float = 0.1
+    dtype: torch.dtype = torch.float32
+    device: str | torch.device = "cpu"
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        check_whole(1, n=self.n, batch_size=self.batch_size, cameras=self.cameras)
+        check_whole(0, seed=self.seed)
+        check_positive(half_image=self.half_image)
+        check_numbers(0.0, img_sigma=self.img_sigma, baseline=self.baseline)
+        check_numbers(0.0, 1.0, outlier_share=self.outlier_share)
+        for name, high in (("field_of_view", 170.0), ("depth_spread", 0.95)):
+            values = getattr(self, name)
             rising = len(values) == 2 and 0 <= values[0] <= values[1] <= high
             KORNIA_CHECK(rising, f"{name} must be two rising numbers in [0, {high:g}], got {values!r}.")
-        KORNIA_CHECK(field_of_view[0] > 0, f"field_of_view must be positive, got {field_of_view!r}.")
-        self.n = n
-        self.batch_size = batch_size
-        self.seed = seed
-        self.field_of_view = tuple(field_of_view)
-        self.depth_spread = tuple(depth_spread)
-        self.outliers = round(outlier_share * n)
-        self.half_image = half_image
-        self.img_sigma = img_sigma
-        self.cameras = cameras
-        self.baseline = baseline
-        self.dtype = dtype
-        self.device = torch.device(device)
+        KORNIA_CHECK(self.field_of_view[0] > 0, f"field_of_view must be positive, got {self.field_of_view!r}.")
 
     def __iter__(self) -> Iterator[Problems]:
         """Yield batch 0, 1, 2, … without end."""
@@ -99,43 +89,38 @@ class CameraProblems:
     def batch(self, index: int) -> Problems:
         """Draw batch ``index``, at least 0; in a rig with ``cam_from_rig``."""
         generator = batch_generator(self.seed, index, self.device)
-        size = self.batch_size, self.n
-        of_rig = (self.batch_size, self.cameras)
-        angle = uniform(of_rig, self.field_of_view[0], self.field_of_view[1], generator).deg2rad()
-        focal = self.half_image / (0.5 * angle).tan()  # (B, C)
+        size, half = (self.batch_size, self.n), self.half_image
+        low, high = self.field_of_view
+        angle = uniform((self.batch_size, self.cameras), low, high, generator).deg2rad()
+        focal = half / (0.5 * angle).tan()  # (B, C)
         distance = log_uniform((self.batch_size, 1), _NEAREST, _FARTHEST, generator)
         spread = uniform((self.batch_size, 1), self.depth_spread[0], self.depth_spread[1], generator)
         depth = distance * (1.0 + spread * uniform(size, -1.0, 1.0, generator))
-        pixels = uniform((*size, 2), -self.half_image, self.half_image, generator)
-        turn = torch.arange(self.n, device=self.device) % self.cameras
+        pixels = uniform((*size, 2), -half, half, generator)
+        turn = torch.arange(self.n, device=pixels.device) % self.cameras
         focal = focal[:, turn]  # (B, N)
         points = torch.cat((pixels * (depth / focal)[..., None], depth[..., None]), -1)
-        rig = self._rig(distance, generator)
-        if rig is not None:
-            rig = map_tensors(lambda x: x[:, turn], rig)
+        rig = None
+        if self.cameras > 1:
+            rig = map_tensors(lambda x: x[:, turn], self._rig(distance, generator))
             points = (rig.rotation.mT @ (points - rig.translation)[..., None])[..., 0]
         pose = random_poses(self.batch_size, generator, translation_box=1.0, max_angle=math.pi)
         pose = pose._replace(translation=distance * pose.translation)
         world_points = (points - pose.translation[:, None]) @ pose.rotation
-        order = uniform(size, 0.0, 1.0, generator).argsort(1)
-        inliers = order >= self.outliers
+        inliers = uniform(size, 0.0, 1.0, generator).argsort(1) >= round(self.outlier_share * self.n)
         pixels = pixels + self.img_sigma * normal((*size, 2), generator)
-        anywhere = uniform((*size, 2), -self.half_image, self.half_image, generator)
-        pixels = torch.where(inliers[..., None], pixels, anywhere) + self.half_image
-        intrinsics = torch.eye(3, dtype=torch.float64, device=self.device).repeat(*size, 1, 1)
+        pixels = torch.where(inliers[..., None], pixels, uniform((*size, 2), -half, half, generator)) + half
+        intrinsics = torch.eye(3, dtype=torch.float64, device=pixels.device).repeat(*size, 1, 1)
         intrinsics[..., 0, 0] = intrinsics[..., 1, 1] = focal
-        intrinsics[..., :2, 2] = self.half_image
+        intrinsics[..., :2, 2] = half
         cameras = intrinsics[:, 0] if rig is None else intrinsics
         problems = Problems(world_points, pixels, cameras, pose, inliers, cam_from_rig=rig)
         return problems.map(lambda x: x.to(self.dtype) if x.is_floating_point() else x)
 
-    def _rig(self, distance: Tensor, generator: torch.Generator) -> Pose | None:
+    def _rig(self, distance: Tensor, generator: torch.Generator) -> Pose:
         """The cameras in the frame of the rig, (B, C, 3, 3) and (B, C, 3)."""
-        if self.cameras == 1:
-            return None
-        heading = torch.arange(self.cameras, dtype=torch.float64, device=self.device) * (2.0 * math.pi / self.cameras)
+        heading = torch.arange(self.cameras).to(distance) * (2.0 * math.pi / self.cameras)
         rotation = axis_angle_to_rotation_matrix(torch.stack((0.0 * heading, heading, 0.0 * heading), -1))
         rotation = rotation.expand(self.batch_size, -1, -1, -1)
-        centres = functional.normalize(normal((self.batch_size, self.cameras, 3), generator), dim=-1)
-        centres = self.baseline * distance[..., None] * centres
-        return Pose(rotation, -(rotation @ centres[..., None])[..., 0])
+        centres = normalize(normal((self.batch_size, self.cameras, 3), generator), dim=-1)
+        return Pose(rotation, -(rotation @ (self.baseline * distance[..., None] * centres)[..., None])[..., 0])

@@ -21,21 +21,19 @@ _MODEL_FILES = ("cameras", "images", "points3D")
 
 
 def load_scene(path: str | Path, *, metric: bool = True, min_points: int = 10, max_error_px: float = 10.0) -> Scene:
-    """Load a scene: an ``.npz`` file holds raw matches, a folder a COLMAP model.
+    """Load a scene: an ``.npz`` file with :func:`load_matches`, a folder with :func:`load_colmap`.
 
     Args:
-        path: the file (see :func:`load_matches`) or the folder (see :func:`load_colmap`).
+        path: the file or the folder.
         metric: whether the unit of the scene is the metre.
         min_points: images with fewer points are skipped.
         max_error_px: matches with a larger reprojection error under the true pose are outliers; ignored for COLMAP
             models.
 
-    Returns:
-        The scene.
-
     Raises:
         FileNotFoundError: if there is nothing at ``path`` or no model in the folder.
-        ValueError: if the file or the model cannot be used; the message says why.
+        ImportError: if a COLMAP model is to be read without ``pycolmap``.
+        ValueError: if the file or the model cannot be used, or all images are skipped; the message says why.
     """
     path = Path(path)
     if path.suffix == ".npz" and not path.is_dir():
@@ -44,32 +42,18 @@ def load_scene(path: str | Path, *, metric: bool = True, min_points: int = 10, m
 
 
 def load_colmap(folder: str | Path, *, metric: bool = True, min_points: int = 10) -> Scene:
-    """Load a COLMAP model, text or binary, through ``pycolmap``.
+    """Load a COLMAP model, text or binary, through ``pycolmap``. See :func:`load_scene` for options and errors.
 
     Pixels of distorted cameras are undistorted to the pinhole camera with the same focal length and principal point.
     A point that an image observes twice is used once, and points behind the camera, which only a fisheye lens can see,
-    are dropped.
+    are dropped. All pairs count as inliers.
 
-    Args:
-        folder: the folder of the model or a scene above it: ETH3D's, with the model in
-            ``dslr_calibration_undistorted``, or COLMAP's, with ``sparse/0`` or ``sparse``.
-        metric: whether the unit of the model is the metre.
-        min_points: images that observe fewer points are skipped.
-
-    Returns:
-        The scene. All its pairs count as inliers.
-
-    Raises:
-        ImportError: if ``pycolmap`` is missing.
-        FileNotFoundError: if the folder or the model in it is missing.
-        ValueError: if the model cannot be read, has no images, or all images are skipped.
+    The model is in ``folder`` or below it: ETH3D has it in ``dslr_calibration_undistorted``, COLMAP in ``sparse/0`` or
+    ``sparse``.
     """
     folder = Path(folder)
     model_folder = _find_model(folder)
-    try:
-        import pycolmap
-    except ImportError as error:
-        raise ImportError("reading COLMAP models needs pycolmap: pip install 'kornia_pnpnet[eval]'") from error
+    pycolmap = _pycolmap("reading COLMAP models needs")
     try:
         model = pycolmap.Reconstruction(str(model_folder))
     except Exception as error:  # its C++ code throws many types on bad files, std::bad_alloc included
@@ -85,28 +69,19 @@ def load_colmap(folder: str | Path, *, metric: bool = True, min_points: int = 10
         raise ValueError(f"the COLMAP model in '{model_folder}' has no point {error} that an image observes") from error
     except ValueError as error:
         raise ValueError(f"the COLMAP model in '{model_folder}' cannot be used: {error}") from error
-    return _scene(folder, _scene_name(folder), views, min_points, metric)
+    # The name is that of the scene above the usual folders of a model.
+    parts = list(folder.resolve().parts)
+    while len(parts) > 2 and parts[-1] in {"0", "sparse", "dslr_calibration_undistorted"}:
+        parts.pop()
+    return _scene(folder, parts[-1], views, min_points, metric)
 
 
 def load_matches(path: str | Path, *, metric: bool = True, min_points: int = 10, max_error_px: float = 10.0) -> Scene:
-    """Load a file of raw, unfiltered 2D-3D matches with the true poses.
+    """Load a file of raw, unfiltered 2D-3D matches with the true poses. See :func:`load_scene` for options and errors.
 
     The file holds ``names`` (V,), ``K`` (V, 3, 3), ``R`` (V, 3, 3), ``t`` (V, 3) and ``size`` (V, 2) as width and
     height; for image ``iii`` (three digits) ``iii_img_points`` (M, 2), ``iii_world_points`` (M, 3) and
     ``iii_error_px`` (M,), the reprojection error under the true pose. Nothing in it is unpickled.
-
-    Args:
-        path: the ``.npz`` file.
-        metric: whether the unit of the world is the metre.
-        min_points: images with fewer matches are skipped.
-        max_error_px: matches with a larger error are outliers.
-
-    Returns:
-        The scene.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is not such a file, an array is missing or has a wrong shape, or all images are skipped.
     """
     path = Path(path)
     if not path.is_file():
@@ -135,10 +110,7 @@ def undistort(camera: str, img_points: Tensor) -> tuple[Tensor, Tensor]:
         ImportError: if ``pycolmap`` is missing.
         ValueError: for an unknown model or other numbers than the model has.
     """
-    try:
-        import pycolmap
-    except ImportError as error:
-        raise ImportError("COLMAP's cameras need pycolmap: pip install 'kornia_pnpnet[eval]'") from error
+    pycolmap = _pycolmap("COLMAP's cameras need")
     try:
         model, *numbers = (part for part in camera.replace(" ", ",").split(",") if part)
         width, height, *parameters = map(float, numbers)
@@ -150,6 +122,14 @@ def undistort(camera: str, img_points: Tensor) -> tuple[Tensor, Tensor]:
         reason = " ".join(str(error).split())
         raise ValueError(f"expected MODEL,width,height,params of COLMAP, got {camera!r}: {reason}") from error
     return torch.tensor(matrix), torch.tensor(pixels)
+
+
+def _pycolmap(what: str) -> Any:
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise ImportError(f"{what} pycolmap: pip install 'kornia_pnpnet[eval]'") from error
+    return pycolmap
 
 
 def _pinhole(camera: Any, distorted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -178,43 +158,26 @@ def _find_model(folder: Path) -> Path:
         for ending in (".bin", ".txt"):
             if all((folder / below / (stem + ending)).is_file() for stem in _MODEL_FILES):
                 return folder / below
-    raise FileNotFoundError(
-        f"no COLMAP model in '{folder}': looked for cameras, images and points3D (.bin or .txt) in "
-        + ", ".join(_MODEL_FOLDERS)
-    )
-
-
-def _scene_name(folder: Path) -> str:
-    """The folder's name, or that of the scene above it if it is one of the usual folders of a model."""
-    parts = list(folder.resolve().parts)
-    while len(parts) > 2 and parts[-1] in {"0", "sparse", "dslr_calibration_undistorted"}:
-        parts.pop()
-    return parts[-1]
+    looked = f"looked for cameras, images and points3D (.bin or .txt) in {', '.join(_MODEL_FOLDERS)}"
+    raise FileNotFoundError(f"no COLMAP model in '{folder}': {looked}")
 
 
 def _colmap_view(image: Any, world_points: Mapping[int, np.ndarray]) -> View:
     """The observations of one ``pycolmap.Image``."""
-    camera = image.camera
     observed = image.get_observation_points2D()
     ids, first = np.unique(np.array([point.point3D_id for point in observed], dtype=np.uint64), return_index=True)
     distorted = np.array([observed[i].xy for i in first], dtype=np.float64).reshape(-1, 2)
     points = np.array([world_points[int(i)] for i in ids], dtype=np.float64).reshape(-1, 3)
     world_to_cam = image.cam_from_world().matrix()  # (3, 4)
-    intrinsics, pixels = _pinhole(camera, distorted)
+    intrinsics, pixels = _pinhole(image.camera, distorted)
     depth = points @ world_to_cam[2, :3] + world_to_cam[2, 3]
     # `~(depth <= 0)`, so that a pose that is not finite reaches the check in View.
     seen = np.isfinite(pixels).all(axis=1) & ~(depth <= 0)
-    return View(
-        name=image.name,
-        world_points=torch.tensor(points[seen]),
-        img_points=torch.tensor(pixels[seen]),
-        intrinsics=torch.tensor(intrinsics),
-        rotation=torch.tensor(world_to_cam[:, :3]),
-        translation=torch.tensor(world_to_cam[:, 3]),
-        width=int(camera.width),
-        height=int(camera.height),
-        inliers=torch.ones(int(seen.sum()), dtype=torch.bool),
-    )
+    tensors = (points[seen], pixels[seen], intrinsics, world_to_cam[:, :3], world_to_cam[:, 3])
+    world, img, camera, rotation, translation = map(torch.tensor, tensors)
+    width, height = int(image.camera.width), int(image.camera.height)
+    inliers = torch.ones(len(world), dtype=torch.bool)
+    return View(image.name, world, img, camera, rotation, translation, width, height, inliers)
 
 
 def _match_views(arrays: Mapping[str, np.ndarray], max_error_px: float) -> list[View]:
@@ -233,22 +196,15 @@ def _match_views(arrays: Mapping[str, np.ndarray], max_error_px: float) -> list[
     if "names" not in arrays:
         raise ValueError("there is no array 'names'")
     names = [str(name) for name in np.atleast_1d(arrays["names"])]
-    intrinsics, rotation = read("K", len(names), 3, 3), read("R", len(names), 3, 3)
-    translation, size = read("t", len(names), 3), read("size", len(names), 2)
+    count = len(names)
+    intrinsics, rotation, translation = read("K", count, 3, 3), read("R", count, 3, 3), read("t", count, 3)
+    sizes = read("size", count, 2)
     views = []
     for i, name in enumerate(names):
         img_points = read(f"{i:03d}_img_points", None, 2)
-        views.append(
-            View(
-                name=name,
-                world_points=read(f"{i:03d}_world_points", len(img_points), 3),
-                img_points=img_points,
-                intrinsics=intrinsics[i],
-                rotation=rotation[i],
-                translation=translation[i],
-                width=int(size[i, 0]),
-                height=int(size[i, 1]),
-                inliers=read(f"{i:03d}_error_px", len(img_points)) <= max_error_px,
-            )
-        )
+        world_points = read(f"{i:03d}_world_points", len(img_points), 3)
+        inliers = read(f"{i:03d}_error_px", len(img_points)) <= max_error_px
+        width, height = int(sizes[i, 0]), int(sizes[i, 1])
+        pose = rotation[i], translation[i]
+        views.append(View(name, world_points, img_points, intrinsics[i], *pose, width, height, inliers))
     return views

@@ -25,18 +25,18 @@ def batch_generator(seed: int, index: int, device: str | torch.device = "cpu") -
 
 
 def uniform(shape: Sequence[int], low: float, high: float, generator: torch.Generator) -> Tensor:
-    """Uniform float64 numbers in ``[low, high)`` of a shape, on the generator's device."""
+    """Uniform float64 numbers in ``[low, high)``, on the generator's device."""
     values = torch.rand(tuple(shape), generator=generator, device=generator.device, dtype=torch.float64)
     return values.mul_(high - low).add_(low)
 
 
 def normal(shape: Sequence[int], generator: torch.Generator) -> Tensor:
-    """Standard normal float64 numbers of a shape, on the generator's device."""
+    """Standard normal float64 numbers, on the generator's device."""
     return torch.randn(tuple(shape), generator=generator, device=generator.device, dtype=torch.float64)
 
 
 def log_uniform(shape: Sequence[int], low: float, high: float, generator: torch.Generator) -> Tensor:
-    """Float64 numbers of a shape whose logarithm is uniform between those of ``low`` and ``high``."""
+    """Float64 numbers whose logarithm is uniform between the logarithms of ``low`` and ``high``."""
     return uniform(shape, math.log(low), math.log(high), generator).exp_()
 
 
@@ -48,18 +48,10 @@ def random_poses(
     translation_sigma: float | None = None,
     max_angle: float = math.pi / 2,
 ) -> Pose:
-    r"""Draw world-to-camera poses as the protocol does.
+    """Draw world-to-camera poses of the protocol, in float64, on the generator's device.
 
-    Args:
-        batch_size: number of poses.
-        generator: source of randomness; the poses are on its device.
-        translation_box: side of the box centred at 0 in which the translation is uniform.
-        translation_sigma: draw the translation from a normal distribution with this standard deviation on each axis
-            instead.
-        max_angle: the angle is uniform from 0 to this many radians, the axis uniform in direction.
-
-    Returns:
-        Poses in float64.
+    The axis of the rotation is uniform in direction, its angle uniform from 0 to ``max_angle`` radians. The translation
+    is uniform in a box of side ``translation_box`` about 0, or normal with ``translation_sigma`` on each axis.
     """
     axis = torch.nn.functional.normalize(normal((batch_size, 3), generator), dim=-1)
     angle = uniform((batch_size, 1), 0.0, max_angle, generator)

@@ -42,10 +42,8 @@ class MixedProblems:
     Example:
         >>> from functools import partial
         >>> from kornia_pnpnet.data import SlabPoints
-        >>> source = MixedProblems(
-        ...     [SyntheticProblems, partial(SyntheticProblems, points=SlabPoints())], batch_size=5, n=4
-        ... )
-        >>> source.batch(0).world_points.shape
+        >>> slabs = partial(SyntheticProblems, points=SlabPoints())
+        >>> MixedProblems([SyntheticProblems, slabs], batch_size=5, n=4).batch(0).world_points.shape
         torch.Size([5, 4, 3])
     """
 
@@ -63,23 +61,14 @@ class MixedProblems:
         self.batch_size = batch_size
         bounds = [round(batch_size * sum(shares[:i]) / sum(shares)) for i in range(len(shares) + 1)]
         sizes = [end - start for start, end in pairwise(bounds)]
-        made = [
-            source(batch_size=size, seed=seed, **options) for source, size in zip(sources, sizes, strict=True) if size
-        ]
-        self.sources = made
+        made = zip(sources, sizes, strict=True)
+        self.sources = [source(batch_size=size, seed=seed, **options) for source, size in made if size]
         # Sources take turns in proportion to their shares, so that the first problems of a batch are mixed like all.
         turns = [(turn + 0.5) / size for size in sizes for turn in range(size)]
         self._order = torch.tensor(sorted(range(batch_size), key=turns.__getitem__))
 
     def batch(self, index: int) -> Problems:
-        """Draw batch ``index``.
-
-        Args:
-            index: at least 0.
-
-        Returns:
-            The problems.
-        """
+        """Draw batch ``index``, at least 0."""
         count = len(self.sources)  # no two sources see the same random numbers
         parts = [source.batch(count * index + i) for i, source in enumerate(self.sources)]
         covariances = {(part.img_cov is None, part.world_cov is None) for part in parts}
@@ -101,17 +90,16 @@ def _checked_shares(what: str, count: int, shares: Sequence[float] | None) -> li
 
 
 def _with_known_alike(parts: list[Problems], name: str) -> list[Problems]:
-    """Problems whose sigmas or confidences have one shape, with NaN for those that were ``None``."""
-    dimensions = {known.ndim for part in parts if (known := getattr(part, name)) is not None}
+    """Parts whose sigmas or confidences have one shape, with NaN for ``None`` unless all are ``None``."""
+    dimensions = max((value.ndim for part in parts if (value := getattr(part, name)) is not None), default=0)
     if not dimensions:
         return parts
     alike = []
     for part in parts:
         known = getattr(part, name)
         if known is None:
-            known = part.world_points.new_full(part.world_points.shape[:1], torch.nan)
-        if known.ndim < max(dimensions):
-            known = known[:, None].expand(part.inliers.shape)
+            known = part.world_points.new_full(part.inliers.shape[:1], torch.nan)
+        known = known[:, None].expand(part.inliers.shape) if known.ndim < dimensions else known
         alike.append(part._replace(**{name: known}))
     return alike
 
@@ -183,12 +171,11 @@ class VaryingSize:
             check_whole(1, n=count, batch_size=batch_size)
         self.batch_size = batch_size
         self.seed = seed
-        self.sources = [
-            source(n=count, batch_size=max(1, batch_size * min(n) // count), seed=seed + i) for i, count in enumerate(n)
-        ]
+        sizes = {count: max(1, batch_size * min(n) // count) for count in n}
+        self.sources = [source(n=count, batch_size=sizes[count], seed=seed + i) for i, count in enumerate(n)]
 
     def batch(self, index: int) -> Problems:
-        """Draw batch ``index``."""
+        """Draw batch ``index``, at least 0."""
         generator = batch_generator(self.seed + _SIZES, index)
         turn = int(torch.randint(len(self.sources), (), generator=generator))
         return self.sources[turn].batch(index)

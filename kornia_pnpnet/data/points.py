@@ -1,36 +1,47 @@
 """Priors of points in the camera's frame: the protocol's box, slabs, objects, façades, rooms, drives.
 
-A new prior is one more class with the ``__call__`` of :class:`PointPrior`.
+A new prior is one more class with the ``__call__`` of :class:`PointPrior`. Options are keywords; two numbers are the
+ends of a range. A number out of its bounds or a falling range raises ``BaseError``.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import torch
 from kornia.core.check import KORNIA_CHECK
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
-from kornia_pnpnet.core.checks import check_numbers, check_positive, check_ranges, check_whole
+from kornia_pnpnet.core.checks import check_numbers, check_positive, check_ranges
 from kornia_pnpnet.data.draws import log_uniform, normal, random_poses, uniform
 
 __all__ = ["BoxPoints", "DrivePoints", "FacadePoints", "ObjectPoints", "PointPrior", "RoomPoints", "SlabPoints"]
 
-# Smallest depth of a slab's tilted surface relative to its distance. A choice: keeps it in front of the camera.
-_LEAST_SURFACE = 0.3
-# Smallest cosine between a ray and a façade's normal, relative to that of the middle ray. A choice: rays that meet a
-# façade further away than 20 times its distance see something else at that depth.
+Range: TypeAlias = tuple[float, float]
+
+# The shapes of scenes are choices: from a flat picture on a wall to a street, at distances in metres.
+# Slabs: standard deviation of the slopes; thickness and smallest depth of the surface relative to the distance.
+_TILT, _THICKNESS, _LEAST_SURFACE = 0.5, (0.02, 4.0), 0.3
+# Objects: smallest factor of an axis.
+_THINNEST = 0.05
+# Façades: distance; largest turn in degrees; relief relative to the distance; share of problems with two façades.
+_FACADE_DISTANCE, _SLANT, _RELIEF, _CORNER = (4.0, 60.0), 70.0, (0.001, 0.1), 0.3
+# Smallest cosine between a ray and a façade's normal, relative to that of the middle ray: rays that meet a façade
+# further away than 20 times its distance see something else at that depth.
 _LEAST_FACING = 0.05
-# Added to components of rays before dividing by them: rays along a wall meet it far away instead of at infinity.
+# Rooms: sides, height, pieces of furniture, and depth of the nearest furniture relative to the wall behind it, since
+# nobody photographs a cupboard's door.
+_ROOM_SIDE, _ROOM_HEIGHT, _FURNITURE, _NEAREST = (2.0, 15.0), (2.2, 5.0), 4, 0.15
+# Drives: height of the camera, distances of the fronts and of the end of the street; standard deviation of the yaw in
+# degrees; share of points in front of the fronts; distance of the ceiling, which a street does not have.
+_CAMERA_HEIGHT, _STREET_SIDE, _STREET_END = (1.0, 3.0), (2.5, 20.0), (30.0, 200.0)
+_YAW, _NEARER, _NOWHERE = 15.0, 0.3, 1e6
+# Smallest components of rays that are divided by: rays along a wall meet it far away instead of at infinity.
 _PARALLEL = 1e-9
-# Depth of the nearest furniture relative to the wall behind it. A choice: nobody photographs a cupboard's door.
-_NEAREST = 0.15
 # Degrees. A camera's projection needs less than 180.
 _WIDEST = 170.0
-# Depth in metres of what is not there, such as the ceiling of a street.
-_NOWHERE = 1e6
 
 
 class PointPrior(Protocol):
@@ -42,15 +53,12 @@ class PointPrior(Protocol):
 
 
 class BoxPoints:
-    r"""The protocol's points: uniform in a box in front of the camera, in its frame.
+    r"""The protocol's points: uniform in a box in front of the camera.
 
     Args:
         half_width: largest :math:`|x|` and :math:`|y|`, in the unit of the world.
         z_near: depth of the box's near face, in the unit of the world.
         depth: length of the box along the optical axis, in the unit of the world.
-
-    Raises:
-        BaseError: for a negative length, or a near face that is not in front of the camera.
 
     Example:
         >>> points = BoxPoints(half_width=2.0, z_near=1.0, depth=3.0)(5, 9, torch.Generator().manual_seed(0))
@@ -80,45 +88,30 @@ class SlabPoints:
     window and a depth in the slab, :math:`z = d (1 + g_x x/z + g_y y/z)(1 + e\,u)` with :math:`u` uniform.
 
     Args:
-        window: smallest and largest half-size of the window as tangents of the viewing angle, uniform for each axis.
+        window: half-size of the window as tangents of the viewing angle, uniform for each axis.
         field_of_view: the window lies within this tangent on both axes.
-        distance: smallest and largest distance :math:`d` in the unit of the world, log-uniform.
-        tilt: standard deviation of the slopes :math:`g`.
-        thickness: smallest and largest thickness :math:`e` relative to the distance, log-uniform.
-
-    Raises:
-        BaseError: for a range that falls or is not positive, or a window that is larger than the field of view.
+        distance: distance :math:`d` in the unit of the world, log-uniform.
     """
 
     def __init__(
-        self,
-        *,
-        window: tuple[float, float] = (0.15, 0.8),
-        field_of_view: float = 0.9,
-        distance: tuple[float, float] = (10.0, 40.0),
-        tilt: float = 0.5,
-        thickness: tuple[float, float] = (0.02, 4.0),
+        self, *, window: Range = (0.15, 0.8), field_of_view: float = 0.9, distance: Range = (10.0, 40.0)
     ) -> None:
-        check_ranges(window=window, distance=distance, thickness=thickness)
-        check_numbers(0.0, field_of_view=field_of_view, tilt=tilt)
-        KORNIA_CHECK(
-            window[1] <= field_of_view, f"The window {window} must fit into the field of view, got {field_of_view}."
-        )
+        check_ranges(window=window, distance=distance)
+        check_numbers(0.0, field_of_view=field_of_view)
+        fits = window[1] <= field_of_view
+        KORNIA_CHECK(fits, f"The window {window} must fit into the field of view, got {field_of_view}.")
         self.window = window
         self.field_of_view = field_of_view
         self.distance = distance
-        self.tilt = tilt
-        self.thickness = thickness
 
     def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
         """Draw points of shape ``(batch_size, n, 3)``."""
         half = uniform((batch_size, 1, 2), *self.window, generator)
         centre = (self.field_of_view - half) * uniform((batch_size, 1, 2), -1.0, 1.0, generator)
         direction = centre + half * uniform((batch_size, n, 2), -1.0, 1.0, generator)
-        slope = self.tilt * normal((batch_size, 1, 2), generator)
-        rise = slope * (direction - centre)  # (B, n, 2)
+        rise = _TILT * normal((batch_size, 1, 2), generator) * (direction - centre)  # (B, n, 2)
         surface = (1.0 + (rise[..., 0] + rise[..., 1])).clamp(min=_LEAST_SURFACE)
-        thickness = log_uniform((batch_size, 1), *self.thickness, generator)
+        thickness = log_uniform((batch_size, 1), *_THICKNESS, generator)
         layer = 1.0 + thickness * uniform((batch_size, n), 0.0, 1.0, generator)
         z = log_uniform((batch_size, 1), *self.distance, generator) * surface * layer  # (B, n)
         return torch.cat((direction * z[..., None], z[..., None]), -1)
@@ -128,16 +121,12 @@ class ObjectPoints:
     r"""Points of an object of any proportions somewhere in the image, near or far.
 
     The object is an ellipsoid or a box of half-size about 1, made thinner by random factors along two axes, down to a
-    plane, and rotated at random. Its direction is random, its distance in half-sizes log-uniform.
+    plane, and rotated at random. Its direction is random.
 
     Args:
-        distance: smallest and largest distance of the centre in half-sizes, log-uniform.
+        distance: distance of the centre in half-sizes, log-uniform.
         field_of_view: the centre lies within this tangent on both axes.
-        thinnest: smallest factor of an axis; factors are log-uniform between this and 1.
         planar: share of problems whose points lie in a plane.
-
-    Raises:
-        BaseError: for a range that falls or is not positive, or a share outside [0, 1].
 
     Example:
         >>> from kornia_pnpnet.data import SyntheticProblems
@@ -147,21 +136,12 @@ class ObjectPoints:
         tensor([2, 2])
     """
 
-    def __init__(
-        self,
-        *,
-        distance: tuple[float, float] = (1.5, 40.0),
-        field_of_view: float = 0.8,
-        thinnest: float = 0.05,
-        planar: float = 0.15,
-    ) -> None:
+    def __init__(self, *, distance: Range = (1.5, 40.0), field_of_view: float = 0.8, planar: float = 0.15) -> None:
         check_ranges(distance=distance)
         check_numbers(0.0, field_of_view=field_of_view)
-        check_positive(thinnest=thinnest)
-        check_numbers(0.0, 1.0, thinnest=thinnest, planar=planar)
+        check_numbers(0.0, 1.0, planar=planar)
         self.distance = distance
         self.field_of_view = field_of_view
-        self.thinnest = thinnest
         self.planar = planar
 
     def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
@@ -169,7 +149,7 @@ class ObjectPoints:
         box = uniform((batch_size, n, 3), -1.0, 1.0, generator)
         ball = 0.5 * normal((batch_size, n, 3), generator)
         is_box = uniform((batch_size, 1, 1), 0.0, 1.0, generator) < 0.5
-        factors = log_uniform((batch_size, 1, 3), self.thinnest, 1.0, generator)
+        factors = log_uniform((batch_size, 1, 3), _THINNEST, 1.0, generator)
         factors[..., 0] = 1.0
         flat = uniform((batch_size, 1), 0.0, 1.0, generator) < self.planar
         factors[..., 2] = torch.where(flat, 0.0, factors[..., 2])
@@ -182,21 +162,21 @@ class ObjectPoints:
 
 
 class _View:
-    """What the priors of surfaces share: the rays of a random window of an image with a random field of view.
+    """The options of the priors of surfaces, and the rays of a random window of an image.
 
     Args:
-        field_of_view: smallest and largest angle in degrees between opposite sides of the square image, uniform.
-        window: smallest and largest share of the image's area in which the points lie, log-uniform.
+        field_of_view: angle in degrees between opposite sides of the square image, uniform.
+        window: share of the image's area in which the points lie, log-uniform.
     """
 
-    def __init__(self, field_of_view: tuple[float, float], window: tuple[float, float]) -> None:
+    def __init__(self, *, field_of_view: Range = (15.0, 120.0), window: Range = (0.1, 1.0)) -> None:
         check_ranges(field_of_view=field_of_view, window=window)
         check_numbers(0.0, _WIDEST, field_of_view=field_of_view[1])
         check_numbers(0.0, 1.0, window=window[1])
         self.field_of_view = field_of_view
         self.window = window
 
-    def rays(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
+    def _rays(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
         """Directions with a third coordinate of 1, (B, n, 3)."""
         angle = uniform((batch_size, 1, 1), *self.field_of_view, generator).deg2rad_()
         area = log_uniform((batch_size, 1, 1), *self.window, generator)
@@ -208,189 +188,85 @@ class _View:
 
 
 class FacadePoints(_View):
-    r"""Points of a façade or of two that meet at a corner, with relief.
+    """Points of a façade or of two that meet at a corner, with relief.
 
     Each façade is a plane that is turned away from the camera by a random angle. Recesses and balconies are steps: a
     random half of the points lies deeper by the relief, and all points vary by a tenth of the relief.
 
     Args:
-        field_of_view: smallest and largest angle in degrees between opposite sides of the square image, uniform.
-        window: smallest and largest share of the image's area in which the points lie, log-uniform.
-        distance: smallest and largest distance along the optical axis in metres, log-uniform.
-        slant: largest angle in degrees by which a façade is turned, uniform from 0.
-        relief: smallest and largest relief relative to the distance, log-uniform.
-        corner: share of problems with two façades.
-
-    Raises:
-        BaseError: for a range that falls or is not positive, an angle of 180° or more, or a share outside [0, 1].
-
-    Example:
-        >>> points = FacadePoints(corner=0.0)(2, 50, torch.Generator().manual_seed(0))
-        >>> points.shape, bool((points[..., 2] > 0).all())
-        (torch.Size([2, 50, 3]), True)
+        field_of_view: angle in degrees between opposite sides of the square image, uniform.
+        window: share of the image's area in which the points lie, log-uniform.
     """
-
-    def __init__(
-        self,
-        *,
-        field_of_view: tuple[float, float] = (15.0, 120.0),
-        window: tuple[float, float] = (0.1, 1.0),
-        distance: tuple[float, float] = (4.0, 60.0),
-        slant: float = 70.0,
-        relief: tuple[float, float] = (0.001, 0.1),
-        corner: float = 0.3,
-    ) -> None:
-        super().__init__(field_of_view, window)
-        check_ranges(distance=distance, relief=relief)
-        check_numbers(0.0, 89.0, slant=slant)
-        check_numbers(0.0, 1.0, corner=corner)
-        self.distance = distance
-        self.slant = slant
-        self.relief = relief
-        self.corner = corner
 
     def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
         """Draw points of shape ``(batch_size, n, 3)``."""
-        rays = self.rays(batch_size, n, generator)
-        slant = uniform((batch_size, 2, 1), 0.0, math.radians(self.slant), generator)
+        rays = self._rays(batch_size, n, generator)
+        slant = uniform((batch_size, 2, 1), 0.0, math.radians(_SLANT), generator)
         turn = uniform((batch_size, 2, 1), -math.pi, math.pi, generator)
         normals = torch.cat((slant.sin() * turn.cos(), slant.sin() * turn.sin(), slant.cos()), -1)  # (B, 2, 3)
         facing = (rays @ normals.mT / slant.cos().mT).clamp(min=_LEAST_FACING)  # (B, n, 2)
-        two = uniform((batch_size, 1), 0.0, 1.0, generator) < self.corner
+        two = uniform((batch_size, 1), 0.0, 1.0, generator) < _CORNER
         outward = uniform((batch_size, 1), 0.0, 1.0, generator) < 0.5
         corner = torch.where(outward, facing.amin(-1), facing.amax(-1))
-        z = log_uniform((batch_size, 1), *self.distance, generator) / torch.where(two, corner, facing[..., 0])
+        z = log_uniform((batch_size, 1), *_FACADE_DISTANCE, generator) / torch.where(two, corner, facing[..., 0])
         step = (uniform((batch_size, n), 0.0, 1.0, generator) < 0.5) + 0.1 * normal((batch_size, n), generator)
-        relief = log_uniform((batch_size, 1), *self.relief, generator)
+        relief = log_uniform((batch_size, 1), *_RELIEF, generator)
         return rays * (z * (1.0 + relief * step).clamp(min=_LEAST_SURFACE))[..., None]
 
 
 class RoomPoints(_View):
-    r"""Points of a room as seen from inside: floor, ceiling, walls and pieces of furniture.
+    """Points of a room as seen from inside: floor, ceiling, walls and pieces of furniture.
 
-    The room is a box, the camera anywhere in it but near a wall and turned anyhow. Pieces of furniture are boxes that
-    hide what is behind them.
-
-    Args:
-        field_of_view: smallest and largest angle in degrees between opposite sides of the square image, uniform.
-        window: smallest and largest share of the image's area in which the points lie, log-uniform.
-        side: smallest and largest length and width in metres, log-uniform.
-        height: smallest and largest height in metres, uniform.
-        furniture: number of pieces of furniture.
-
-    Raises:
-        BaseError: for a range that falls or is not positive, an angle of 180° or more, or a number that is not whole.
-
-    Example:
-        >>> points = RoomPoints(side=(4.0, 5.0), height=(2.0, 3.0))(2, 50, torch.Generator().manual_seed(0))
-        >>> points.shape, bool((points.norm(dim=-1) < 7.7).all())
-        (torch.Size([2, 50, 3]), True)
+    The room is a box. The camera is anywhere in it except close to a wall, with any rotation. Pieces of furniture are
+    boxes that hide what is behind them. Options: see :class:`FacadePoints`.
     """
-
-    def __init__(
-        self,
-        *,
-        field_of_view: tuple[float, float] = (15.0, 120.0),
-        window: tuple[float, float] = (0.1, 1.0),
-        side: tuple[float, float] = (2.0, 15.0),
-        height: tuple[float, float] = (2.2, 5.0),
-        furniture: int = 4,
-    ) -> None:
-        super().__init__(field_of_view, window)
-        check_ranges(side=side, height=height)
-        check_whole(0, furniture=furniture)
-        self.side = side
-        self.height = height
-        self.furniture = furniture
 
     def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
         """Draw points of shape ``(batch_size, n, 3)``."""
-        rays = self.rays(batch_size, n, generator)
+        rays = self._rays(batch_size, n, generator)
         turn = random_poses(batch_size, generator, max_angle=math.pi).rotation
-        ground = log_uniform((batch_size, 1, 2), *self.side, generator)
-        size = torch.cat((ground, uniform((batch_size, 1, 1), *self.height, generator)), -1)  # (B, 1, 3)
+        ground = log_uniform((batch_size, 1, 2), *_ROOM_SIDE, generator)
+        size = torch.cat((ground, uniform((batch_size, 1, 1), *_ROOM_HEIGHT, generator)), -1)  # (B, 1, 3)
         low = -size * uniform((batch_size, 1, 3), 0.15, 0.85, generator)  # from the camera, in the room's axes
         in_room = rays @ turn.mT
-        z = _far_side(in_room, low, low + size)
+        z = _hits(in_room, low, low + size)[1]
         # Furniture stands on the floor and not where the camera is.
-        shape = batch_size, self.furniture, 3
+        shape = batch_size, _FURNITURE, 3
         extent = size * uniform(shape, 0.08, 0.4, generator)
         start = low + (size - extent) * uniform(shape, 0.0, 1.0, generator)
         start[..., 2] = low[..., 2]
-        near = _near_side(in_room[:, :, None], start[:, None], (start + extent)[:, None])  # (B, n, furniture)
-        for hit in near.unbind(-1):
+        near, far = _hits(in_room[:, :, None], start[:, None], (start + extent)[:, None])  # (B, n, furniture) each
+        for hit in torch.where(near < far, near, math.inf).unbind(-1):
             z = torch.where((hit > _NEAREST * z) & (hit < z), hit, z)
         return rays * z[..., None]
 
 
 class DrivePoints(_View):
-    r"""Points as seen from a car: the road, the fronts on both sides, the end of the street, with a large depth range.
+    """Points as seen from a car: the road, the fronts on both sides, the end of the street, with a large depth range.
 
-    The camera looks along the street. Cars and trees in front of the fronts are points that are nearer than the fronts.
-
-    Args:
-        field_of_view: smallest and largest angle in degrees between opposite sides of the square image, uniform.
-        window: smallest and largest share of the image's area in which the points lie, log-uniform.
-        height: smallest and largest height of the camera above the road in metres, log-uniform.
-        side: smallest and largest distance of the fronts on each side in metres, log-uniform.
-        end: smallest and largest distance of the end of the street in metres, log-uniform.
-        turn: standard deviation of the yaw in degrees; that of pitch and roll is a third.
-        nearer: share of points in front of the fronts.
-
-    Raises:
-        BaseError: for a range that falls or is not positive, an angle of 180° or more, or a share outside [0, 1].
-
-    Example:
-        >>> points = DrivePoints(turn=0.0, height=(1.5, 1.5))(2, 50, torch.Generator().manual_seed(0))
-        >>> points.shape, bool((points[..., 1] < 1.5 + 1e-9).all())
-        (torch.Size([2, 50, 3]), True)
+    The camera looks along the street. Cars and trees are points that are nearer than the fronts. Options: see
+    :class:`FacadePoints`.
     """
-
-    def __init__(
-        self,
-        *,
-        field_of_view: tuple[float, float] = (15.0, 120.0),
-        window: tuple[float, float] = (0.1, 1.0),
-        height: tuple[float, float] = (1.0, 3.0),
-        side: tuple[float, float] = (2.5, 20.0),
-        end: tuple[float, float] = (30.0, 200.0),
-        turn: float = 15.0,
-        nearer: float = 0.3,
-    ) -> None:
-        super().__init__(field_of_view, window)
-        check_ranges(height=height, side=side, end=end)
-        check_numbers(0.0, 180.0, turn=turn)
-        check_numbers(0.0, 1.0, nearer=nearer)
-        self.height = height
-        self.side = side
-        self.end = end
-        self.turn = turn
-        self.nearer = nearer
 
     def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
         """Draw points of shape ``(batch_size, n, 3)``."""
-        rays = self.rays(batch_size, n, generator)
-        angles = math.radians(self.turn) * normal((batch_size, 3), generator)  # pitch, yaw, roll
-        angles *= angles.new_tensor((1 / 3, 1.0, 1 / 3))
-        turn = axis_angle_to_rotation_matrix(angles)
-        left, right = log_uniform((2, batch_size, 1), *self.side, generator)
-        height = log_uniform((batch_size, 1), *self.height, generator)
-        end = log_uniform((batch_size, 1), *self.end, generator)
+        rays = self._rays(batch_size, n, generator)
+        angles = math.radians(_YAW) * normal((batch_size, 3), generator)
+        turn = axis_angle_to_rotation_matrix(angles * angles.new_tensor((1 / 3, 1.0, 1 / 3)))  # pitch, yaw, roll
+        left, right = log_uniform((2, batch_size, 1), *_STREET_SIDE, generator)
+        height = log_uniform((batch_size, 1), *_CAMERA_HEIGHT, generator)
+        end = log_uniform((batch_size, 1), *_STREET_END, generator)
         low = torch.stack((-left, torch.full_like(left, -_NOWHERE), -end), -1)  # (B, 1, 3), y points down
-        z = _far_side(rays @ turn.mT, low, torch.stack((right, height, end), -1))
-        is_nearer = uniform((batch_size, n), 0.0, 1.0, generator) < self.nearer
+        z = _hits(rays @ turn.mT, low, torch.stack((right, height, end), -1))[1]
+        is_nearer = uniform((batch_size, n), 0.0, 1.0, generator) < _NEARER
         return rays * torch.where(is_nearer, z * uniform((batch_size, n), 0.3, 1.0, generator), z)[..., None]
 
 
-def _far_side(rays: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """Where rays from inside an axis-aligned box leave the box, as multiples of the rays; the last dimension goes."""
-    rays = torch.where(rays.abs() < _PARALLEL, _PARALLEL, rays)
-    return torch.where(rays > 0, high, low).div_(rays).amin(-1)
+def _hits(rays: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+    """Where rays, (..., 3), enter and leave an axis-aligned box, as multiples of the rays, (...).
 
-
-def _near_side(rays: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """Where rays from outside enter an axis-aligned box, infinite for a miss; shapes as of :func:`_far_side`."""
+    A ray misses the box when the first number is not smaller than the second.
+    """
     rays = torch.where(rays.abs() < _PARALLEL, _PARALLEL, rays)
     one, two = low / rays, high / rays
-    enter, leave = torch.minimum(one, two).amax(-1), torch.maximum(one, two).amin(-1)
-    return torch.where(enter < leave, enter, math.inf)
+    return torch.minimum(one, two).amax(-1), torch.maximum(one, two).amin(-1)

@@ -6,16 +6,15 @@ Convention: ``x_cam = R x_world + t``. Pixels and camera matrices are COLMAP's: 
 
 from __future__ import annotations
 
-import itertools
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import count
 
 import torch
 from kornia.core.check import KORNIA_CHECK
 from torch import Tensor
 
-from kornia_pnpnet.core.checks import check_numbers, check_whole
+from kornia_pnpnet.core.checks import check_whole
 from kornia_pnpnet.data.draws import batch_generator, random_poses, uniform
 from kornia_pnpnet.data.outliers import OutlierMix
 from kornia_pnpnet.result import Pose, Problems
@@ -53,15 +52,10 @@ class View:
     inliers: Tensor
 
     def __post_init__(self) -> None:
-        count = len(self.world_points)
-        expected = {
-            "world_points": (count, 3),
-            "img_points": (count, 2),
-            "intrinsics": (3, 3),
-            "rotation": (3, 3),
-            "translation": (3,),
-            "inliers": (count,),
-        }
+        """Check the tensors."""
+        m = len(self.world_points)
+        expected = {"world_points": (m, 3), "img_points": (m, 2), "inliers": (m,)}
+        expected |= {"intrinsics": (3, 3), "rotation": (3, 3), "translation": (3,)}
         for field, shape in expected.items():
             value: Tensor = getattr(self, field)
             if value.shape != shape:
@@ -78,18 +72,12 @@ class View:
         return self.world_points @ self.rotation.mT + self.translation
 
     @property
-    def median_depth(self) -> float:
-        """Median depth of the observed points in the unit of the scene."""
-        return self.cam_points[:, 2].median().item()
-
-    @property
     def reprojection_error_px(self) -> Tensor:
         """Distance of each pixel to its point's projection, infinite behind the camera, shape :math:`(M,)`."""
-        cam_points = self.cam_points  # (M, 3)
-        in_front = cam_points[:, 2] > 0
+        cam_points = self.cam_points
         projected = cam_points @ self.intrinsics.mT  # (M, 3)
         error = (projected[:, :2] / projected[:, 2:] - self.img_points).norm(dim=1)
-        return torch.where(in_front, error, torch.inf)
+        return torch.where(cam_points[:, 2] > 0, error, torch.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +111,7 @@ class SceneProblems:
     first 9 get the pixel of the 10th point or a uniform pixel. Points and poses do not depend on ``outliers``, so that
     different numbers of outliers are compared on the same problems.
 
-    As in the paper the world is centred on a coarse pose: a pose :math:`(R^*, t^*)` is drawn from the training prior
+    As in the paper the world is centred on a coarse pose: a pose :math:`(R^*, t^*)` is drawn from the protocol's prior
     and the world is moved so that this pose is the true one, :math:`x' = R^{*\top}(R x + t - t^*)`.
 
     Args:
@@ -136,31 +124,12 @@ class SceneProblems:
         num_spares: number of spare points per problem. Its mismatches get the pixels of the spare points in turn: with
             the protocol's one spare point all mismatches of a problem share a pixel.
         recentre: whether to move the world.
-        translation_box: side of the box centred at 0 in which :math:`t^*` is uniform.
-        max_angle: the angle of :math:`R^*` is uniform from 0 to this many radians, its axis uniform in direction.
         dtype: dtype of the batches; numbers are drawn in float64 and cast.
         device: device of the batches; numbers are drawn on the CPU and moved.
 
     Raises:
         BaseError: for an argument out of range, or ``outliers`` with *near* or *structured* outliers or crowds.
         ValueError: if no image has enough points.
-
-    Example:
-        >>> world_points = torch.rand(20, 3, dtype=torch.float64) + torch.tensor([0.0, 0.0, 4.0])
-        >>> view = View(
-        ...     name="a.jpg",
-        ...     world_points=world_points,
-        ...     img_points=500 * world_points[:, :2] / world_points[:, 2:],
-        ...     intrinsics=torch.diag(torch.tensor([500.0, 500.0, 1.0], dtype=torch.float64)),
-        ...     rotation=torch.eye(3, dtype=torch.float64),
-        ...     translation=torch.zeros(3, dtype=torch.float64),
-        ...     width=640,
-        ...     height=480,
-        ...     inliers=torch.ones(20, dtype=torch.bool),
-        ... )
-        >>> problems = SceneProblems(Scene("box", (view,)), batch_size=2, outliers=OutlierMix(count=3)).batch(0)
-        >>> problems.world_points.shape, problems.inliers.sum(-1)
-        (torch.Size([2, 9, 3]), tensor([6, 6]))
     """
 
     def __init__(
@@ -173,49 +142,41 @@ class SceneProblems:
         outliers: OutlierMix | None = None,
         num_spares: int = 1,
         recentre: bool = True,
-        translation_box: float = 25.0,
-        max_angle: float = math.pi / 2,
         dtype: torch.dtype = torch.float64,
         device: str | torch.device = "cpu",
     ) -> None:
         check_whole(1, n=n, batch_size=batch_size, num_spares=num_spares)
         check_whole(0, seed=seed)
-        check_numbers(0.0, translation_box=translation_box, max_angle=max_angle)
-        self.scene = scene
-        self.n = n
-        self.batch_size = batch_size
-        self.seed = seed
-        self.outliers = OutlierMix(count=0) if outliers is None else outliers
-        KORNIA_CHECK(
-            self.outliers.near_share == self.outliers.structured_share == self.outliers.crowd_share == 0,
-            "SceneProblems has no near or structured outliers and no crowds: near_share, structured_share and "
-            f"crowd_share must be 0, got {self.outliers.near_share}, {self.outliers.structured_share} and "
-            f"{self.outliers.crowd_share}.",
-        )
-        self.num_spares = num_spares
-        self.recentre = recentre
-        self.translation_box = translation_box
-        self.max_angle = max_angle
-        self.dtype = dtype
-        self.device = torch.device(device)
+        mix = outliers or OutlierMix(count=0)
+        for name in ("near_share", "structured_share", "crowd_share"):
+            share = getattr(mix, name)
+            KORNIA_CHECK(share == 0, f"SceneProblems has no near or structured outliers and no crowds: {name}={share}.")
         need = n + num_spares
-        self.views = tuple(view for view in scene.views if len(view.world_points) >= need)
-        if not self.views:
+        views = tuple(view for view in scene.views if len(view.world_points) >= need)
+        if not views:
             raise ValueError(
                 f"no image of '{scene.name}' has the {need} points for n = {n} and num_spares = {num_spares}"
             )
+        self.scene = scene
+        self.views = views
+        self.n = n
+        self.batch_size = batch_size
+        self.seed = seed
+        self.outliers = mix
+        self.num_spares = num_spares
+        self.recentre = recentre
+        self.dtype = dtype
+        self.device = torch.device(device)
 
-        # The points of all views one after the other, so that a batch is one gather.
-        self._counts = torch.tensor([len(view.world_points) for view in self.views])
+        # The pairs of all views one after the other, so that a batch is one gather.
+        self._counts = torch.tensor([len(view.world_points) for view in views])
         self._starts = self._counts.cumsum(0) - self._counts
-        self._world_points = torch.cat([view.world_points for view in self.views])
-        self._cam_points = torch.cat([view.cam_points for view in self.views])
-        self._img_points = torch.cat([view.img_points for view in self.views])
-        self._inliers = torch.cat([view.inliers for view in self.views])
-        self._intrinsics = torch.stack([view.intrinsics for view in self.views])
-        self._rotation = torch.stack([view.rotation for view in self.views])
-        self._translation = torch.stack([view.translation for view in self.views])
-        self._size = torch.tensor([[view.width, view.height] for view in self.views], dtype=torch.float64)
+        self._points = torch.cat([view.cam_points if recentre else view.world_points for view in views])
+        self._img_points = torch.cat([view.img_points for view in views])
+        self._inliers = torch.cat([view.inliers for view in views])
+        self._intrinsics = torch.stack([view.intrinsics for view in views])
+        self._poses = Pose(torch.stack([view.rotation for view in views]), torch.stack([v.translation for v in views]))
+        self._size = torch.tensor([[view.width, view.height] for view in views], dtype=torch.float64)
 
     @property
     def max_translation(self) -> float:
@@ -224,53 +185,39 @@ class SceneProblems:
 
     def __iter__(self) -> Iterator[Problems]:
         """Yield batch 0, 1, 2, … without end."""
-        return map(self.batch, itertools.count())
+        return map(self.batch, count())
 
     def batch(self, index: int) -> Problems:
-        """Draw batch ``index``.
+        """Draw batch ``index``, at least 0.
 
-        Args:
-            index: at least 0.
-
-        Returns:
-            The problems; points, pixels, intrinsics and pose in ``dtype`` on ``device``. A pair is an inlier when it is
-            an inlier of the scene and did not become an outlier.
+        A pair is an inlier when it is an inlier of the scene and did not become an outlier.
         """
         generator = batch_generator(self.seed, index)
         # Draws that depend on the outlier options come last.
         view = torch.randint(len(self.views), (self.batch_size,), generator=generator)
         rows = _choose(self._counts[view], self.n + self.num_spares, generator) + self._starts[view, None]
         rows, spare_rows = rows[:, : self.n], rows[:, self.n :]  # (B, N), (B, num_spares)
-        prior = random_poses(self.batch_size, generator, translation_box=self.translation_box, max_angle=self.max_angle)
+        pose = random_poses(self.batch_size, generator)
         anywhere = uniform((self.batch_size, self.n, 2), 0.0, 1.0, generator) * self._size[view, None]
         draw = self.outliers.draw(self.batch_size, self.n, generator)
 
+        world_points = self._points[rows]  # (B, N, 3)
         if self.recentre:
-            pose = prior
-            world_points = (self._cam_points[rows] - pose.translation[:, None]) @ pose.rotation  # (B, N, 3)
+            world_points = (world_points - pose.translation[:, None]) @ pose.rotation
         else:
-            pose = Pose(self._rotation[view], self._translation[view])
-            world_points = self._world_points[rows]
+            pose = Pose(*(x[view] for x in self._poses))
         turn = (draw.mismatch.cumsum(1) - 1) % self.num_spares  # (B, N), used at mismatches only
-        seen = torch.where(draw.mismatch, spare_rows.gather(1, turn), rows)
-        img_points = torch.where(draw.sensing[..., None], anywhere, self._img_points[seen])
+        shown = torch.where(draw.mismatch, spare_rows.gather(1, turn), rows)
+        img_points = torch.where(draw.sensing[..., None], anywhere, self._img_points[shown])
         inliers = self._inliers[rows] & draw.inliers
         problems = Problems(world_points, img_points, self._intrinsics[view], pose, inliers)
         return problems.map(lambda x: x.to(self.device, self.dtype if x.is_floating_point() else x.dtype))
 
 
 def _choose(counts: Tensor, k: int, generator: torch.Generator) -> Tensor:
-    """For each count c, k different integers of 0 ... c - 1, every ordered choice equally likely.
+    """For each count c of (B,), k different integers of 0 ... c - 1, every ordered choice equally likely, (B, k).
 
     Floyd's algorithm on the whole batch at once: its cost does not grow with the number of points in an image.
-
-    Args:
-        counts: at least k each, shape :math:`(B,)`.
-        k: number of choices.
-        generator: source of randomness.
-
-    Returns:
-        The choices, shape :math:`(B, k)`.
     """
     draws = uniform((len(counts), k), 0.0, 1.0, generator)
     chosen = torch.empty((len(counts), k), dtype=torch.int64)

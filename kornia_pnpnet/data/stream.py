@@ -11,8 +11,8 @@ from typing import Any, Protocol
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-from kornia_pnpnet.core.trees import iter_tensors
-from kornia_pnpnet.result import Problems
+from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.types import Problems
 
 __all__ = ["ProblemSource", "stream_batches"]
 
@@ -42,20 +42,10 @@ def stream_batches(source: ProblemSource, start: int, stop: int, workers: int = 
         start: number of the first batch.
         stop: number after the last batch.
         workers: number of processes that draw ahead; 0 draws each batch when it is requested. The numbers drawn do not
-            depend on the number of workers.
-
-    Yields:
-        The problems. With workers the memory of a batch is reused when the next batch is requested.
+            depend on the number of workers. With workers the memory of a batch is reused for the next batch.
 
     Raises:
         Exception: the error of a worker, with its traceback in the message.
-
-    Example:
-        >>> from kornia_pnpnet.data import SyntheticProblems
-        >>> source = SyntheticProblems(n=9, batch_size=2)
-        >>> batches = stream_batches(source, 0, 2)
-        >>> [torch.equal(batch.img_points, source.batch(i).img_points) for i, batch in enumerate(batches)]
-        [True, True]
     """
     if workers == 0:
         yield from map(source.batch, range(start, stop))
@@ -99,8 +89,7 @@ class _SharedSlots(Dataset[int]):
         self._memory = example.map(lambda x: torch.empty((slots, *x.shape), dtype=x.dtype).share_memory_())
 
     def __getitem__(self, index: int) -> int:
-        for slot, drawn in zip(iter_tensors(self.read(index)), iter_tensors(self._source.batch(index)), strict=True):
-            slot.copy_(drawn)
+        map_tensors(torch.Tensor.copy_, self.read(index), self._source.batch(index))
         return index
 
     def read(self, index: int) -> Problems:

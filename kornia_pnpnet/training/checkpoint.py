@@ -22,7 +22,6 @@ __all__ = [
     "History",
     "StageClock",
     "TrainingError",
-    "leaves",
     "load_checkpoint",
     "save_checkpoint",
     "stop_on_signal",
@@ -37,12 +36,13 @@ class TrainingError(RuntimeError):
 
 @contextmanager
 def stop_on_signal() -> Iterator[threading.Event]:
-    """Turn SIGTERM and Ctrl-C into an event, so that the loop can save before it ends."""
+    """Turn the first SIGTERM or Ctrl-C into an event, so that the loop can save before it ends.
+
+    Signals can only be caught in the main thread; elsewhere the event is never set.
+    """
     event = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield event
-        return
-    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+    in_main = threading.current_thread() is threading.main_thread()
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT) if in_main}
 
     def restore() -> None:
         for number, handler in before.items():
@@ -76,11 +76,11 @@ class StageClock:
         self.seconds[stage] += now - self._last
         self._last = now
 
-    def shares(self, before: Mapping[str, float] | None = None) -> dict[str, float]:
-        """Share of each stage in the time since ``before`` (an earlier copy of ``seconds``), or in all time."""
+    def since(self, before: Mapping[str, float] | None = None) -> tuple[float, dict[str, float]]:
+        """Seconds since ``before`` (an earlier copy of ``seconds``) or the start, and the share of each stage."""
         spent = {stage: seconds - (before or {}).get(stage, 0.0) for stage, seconds in self.seconds.items()}
-        whole = sum(spent.values())
-        return {stage: seconds / whole if whole > 0.0 else 0.0 for stage, seconds in spent.items()}
+        whole = max(sum(spent.values()), 1e-9)
+        return whole, {stage: seconds / whole for stage, seconds in spent.items()}
 
 
 class History:
@@ -121,10 +121,10 @@ def load_checkpoint(path: Path, identity: dict[str, Any]) -> dict[str, Any]:
     """Read a checkpoint; ``TrainingError`` when the file is damaged or its identity is another one."""
     try:
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
-        saved = state["identity"]
+        there = _leaves(state["identity"])
     except Exception as error:  # torch.load raises many types on a damaged file
         raise TrainingError(f"Cannot read the checkpoint {path}: {error}") from error
-    there, now = leaves(saved), leaves(identity)
+    now = _leaves(identity)
     differing = [key for key in {**there, **now} if there.get(key) != now.get(key)]
     if differing:
         details = "; ".join(f"{key} was {there.get(key)!r} and is {now.get(key)!r}" for key in differing)
@@ -132,12 +132,12 @@ def load_checkpoint(path: Path, identity: dict[str, Any]) -> dict[str, Any]:
     return state
 
 
-def leaves(value: Any, prefix: str = "") -> dict[str, Any]:
+def _leaves(value: Any, prefix: str = "") -> dict[str, Any]:
     """Nested plain data as ``{"a.b.0": leaf}``."""
     if isinstance(value, dict):
         entries = list(value.items())
     elif isinstance(value, (list, tuple)):
         entries = list(enumerate(value))
     else:
-        return {prefix: value}
-    return {k: v for key, entry in entries for k, v in leaves(entry, f"{prefix}.{key}" if prefix else str(key)).items()}
+        return {prefix.removeprefix("."): value}
+    return {k: v for key, entry in entries for k, v in _leaves(entry, f"{prefix}.{key}").items()}

@@ -25,11 +25,12 @@ _MOST_ROWS = 100
 def collect_weights(runs: Sequence[str | Path], folder: str | Path) -> None:
     """Gather weights, results, model card and learning curves of successive runs in one folder.
 
-    Of each run's learning curves at most 100 rows are kept, all with a validation.
+    Of each run's learning curves at most 100 rows are kept, all with a validation. The name of the folder becomes the
+    name of the weights.
 
     Args:
         runs: folders of ``train.py``. Each run but the first began with the weights of the run before.
-        folder: the destination; its name becomes the name of the weights.
+        folder: the destination.
 
     Raises:
         BaseError: when weights are damaged or incomplete.
@@ -69,10 +70,7 @@ def _validated_rows(path: Path, start: int) -> list[dict[str, str]]:
 def summarize_runs(folder: str | Path) -> Path | None:
     """Write ``summary.csv``: one row for each run of a sweep, with its overrides, speed and success.
 
-    A results file that cannot be read is left out with a warning.
-
-    Args:
-        folder: folder of the sweep, with each run in a sub-folder.
+    The runs are in sub-folders of the sweep. A results file that cannot be read is left out with a warning.
 
     Returns:
         Path of the summary, or ``None`` when no run has results.

@@ -62,8 +62,8 @@ def fit(
         folder: folder of the run.
         fabric: the launched engine; one process on the CPU when ``None``.
         identity: plain data that must be equal when the run is continued, for example the configuration of the data.
-        data_workers: processes that draw the next batches, for each process that trains. The numbers do not depend on
-            it; see :func:`~kornia_pnpnet.data.stream.stream_batches`.
+        data_workers: processes that draw the next batches, for each process that trains, see
+            :func:`~kornia_pnpnet.data.stream.stream_batches`.
         resume: continue from the checkpoint in ``folder`` if there is one.
         progress: show a progress bar.
 
@@ -72,7 +72,7 @@ def fit(
 
     Raises:
         TrainingError: when ``folder`` holds a checkpoint and ``resume`` is false, when the checkpoint is damaged or of
-            other settings, or when more than ``settings.max_skipped`` steps were not finite.
+            other settings or options of the solver, or when more than ``settings.max_skipped`` steps were not finite.
         BaseError: when the batch cannot be divided equally among the processes.
     """
     if fabric is None:
@@ -125,9 +125,10 @@ def train_briefly(seconds: float, folder: str | Path, *, progress: bool = True) 
         torch.manual_seed(0)
         model = PnPNet(MLPInit(9), RobustWeightedLM(5))
     data = SyntheticProblems(n=9, batch_size=250, seed=0, outliers=OutlierMix())
+    sets = {"none": (900_001, None), "uniform": (900_002, OutlierMix())}
     validation = {
-        "none": SyntheticProblems(n=9, batch_size=500, seed=900_001).batch(0),
-        "uniform": SyntheticProblems(n=9, batch_size=500, seed=900_002, outliers=OutlierMix()).batch(0),
+        name: SyntheticProblems(n=9, batch_size=500, seed=seed, outliers=mix).batch(0)
+        for name, (seed, mix) in sets.items()
     }
     loss = PoseLoss(saturation=0.02)
 
@@ -135,16 +136,14 @@ def train_briefly(seconds: float, folder: str | Path, *, progress: bool = True) 
         began = time.perf_counter()
         for index in range(10):
             problems = data.batch(index)
-            inputs = problems.world_points, problems.img_points, problems.intrinsics
-            result = model(*inputs, first_stage_only=ramp == 0.0)
+            result = model(*problems[:3], first_stage_only=ramp == 0.0)
             loss(result, problems, ramp).total.backward()
         return (time.perf_counter() - began) / 10
 
     alone = TrainSettings(0).ramp[0]  # share of the run that trains the network without the refinement
     expected = alone * seconds_per_update(0.0) + (1.0 - alone) * seconds_per_update(1.0)
     updates = max(100, round(seconds / expected) // 100 * 100)
-    settings = TrainSettings(
-        updates, warmup=100, log_every=updates // 20, validate_every=updates // 20, checkpoint_every=updates
-    )
+    rows = updates // 20
+    settings = TrainSettings(updates, warmup=100, log_every=rows, validate_every=rows, checkpoint_every=updates)
     fit(model, data, validation, loss, settings, folder, progress=progress)
     return folder / HISTORY_NAME

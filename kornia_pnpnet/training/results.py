@@ -36,35 +36,12 @@ class Learned(NamedTuple):
 
 
 # The keys that model cards and summaries read; the mappings have more.
-_Source = TypedDict("_Source", {"_target_": str})
-_Init = TypedDict("_Init", {"name": str, "starts": NotRequired[Count], "samples": NotRequired[Count]})
-_Refine = TypedDict("_Refine", {"m": Count, "kernel": str})
-_Normalize = TypedDict("_Normalize", {"center": bool, "scale": bool})
+_Init = TypedDict("_Init", {"name": str})
+_Refine = TypedDict("_Refine", {"m": Count})
 _Size = TypedDict("_Size", {"n": Count})
-_Data = TypedDict("_Data", {"train": _Source, "validation": dict[str, _Source]})
-_Versions = TypedDict("_Versions", {"torch": str})
-
-
-class _ModelConfig(TypedDict):
-    init: _Init | None
-    refine: _Refine
-    normalize: _Normalize
-    views: NotRequired[Count]  # weights of old versions do not have it
-
-
-class _RunConfig(TypedDict):
-    name: NotRequired[Any]
-    batch_size: Count
-    model: _Size
-    data: _Data
-
-
-class _RunEnvironment(TypedDict):
-    threads: Count
-    cpu: str
-    commit: str | None
-    versions: _Versions
-
+_ModelConfig = TypedDict("_ModelConfig", {"init": _Init | None, "refine": _Refine})
+_RunConfig = TypedDict("_RunConfig", {"name": NotRequired[Any], "model": _Size})
+_RunEnvironment = TypedDict("_RunEnvironment", {"commit": str | None})
 
 #: What :meth:`PnPNet.config` returned.
 ModelConfig = Annotated[_ModelConfig, Kept]
@@ -85,7 +62,7 @@ class RunResults:
         validation: success and errors on each validation set, at least one.
         learned: hyperparameters of the refinement.
         model: configuration of the solver.
-        config: configuration of the run.
+        config: resolved configuration of ``train.py``.
         environment: versions and machine.
         origin: results of the run whose weights this run began with; ``None`` for a run from scratch.
 
@@ -133,39 +110,26 @@ def run_results(
     model: PnPNet,
     validation: Mapping[str, Problems],
     report: FitReport,
-    config: RunConfig,
+    config: Mapping[str, Any],
     overrides: list[str],
     origin: RunResults | None = None,
 ) -> RunResults:
-    """Measure a trained solver and gather the results of its run.
-
-    Args:
-        model: the trained solver.
-        validation: problems by the name of their set.
-        report: what :func:`~kornia_pnpnet.training.fit` returned.
-        config: the resolved configuration.
-        overrides: arguments of ``train.py``, ``key=value``.
-        origin: results of the run whose weights this run began with.
-
-    Returns:
-        The results.
+    """Measure a trained solver and gather the :class:`RunResults` of its run, whose arguments these are.
 
     Raises:
         ValueError: when there is no validation set.
     """
     if not validation:
         raise ValueError("The results of a run need at least one validation set, got none.")
-    sets = validate(model, validation)
     learned = model.refine.hyperparameters(torch.zeros((), dtype=torch.float64))
-    *_, problems = validation.values()
     return RunResults(
         overrides=overrides,
         run=report,
-        us_per_problem=_us_per_problem(model, problems),
-        validation=sets,
+        us_per_problem=_us_per_problem(model, [*validation.values()][-1]),
+        validation=validate(model, validation),
         learned=Learned(*(values.tolist() for values in learned)),
         model=cast(ModelConfig, model.config()),
-        config=config,
+        config=cast(RunConfig, config),
         environment=cast(RunEnvironment, environment()),
         origin=origin,
     )
@@ -184,12 +148,6 @@ def _us_per_problem(model: PnPNet, problems: Problems) -> float:
 def load_run(path: str | Path) -> RunResults:
     """Read the results file of a run.
 
-    Args:
-        path: the file.
-
-    Returns:
-        The results.
-
     Raises:
         FileNotFoundError: when there is no such file.
         ValueError: when the file does not hold the results of a run; the message names the wrong entry.
@@ -198,10 +156,7 @@ def load_run(path: str | Path) -> RunResults:
 
 
 def find_results(weights: str | Path) -> RunResults | None:
-    """Find the results of the run that trained some weights.
-
-    Args:
-        weights: what ``PnPNet.from_pretrained`` takes.
+    """Find the results of the run that trained some weights; ``weights`` is what ``PnPNet.from_pretrained`` takes.
 
     Returns:
         The results, or ``None`` when there is no results file beside the weights or, for a folder named ``weights``,

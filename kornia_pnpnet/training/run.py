@@ -10,11 +10,11 @@ import threading
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from lightning_fabric import Fabric
-from torch import Tensor, nn
+from torch import nn
 
 from kornia_pnpnet.core.schema import Count
 from kornia_pnpnet.losses import LossTerms, PoseLoss, SetLoss
@@ -37,6 +37,8 @@ _log = logging.getLogger(__name__)
 
 # Parts of an update. The rest is between updates: rows of the learning curves, validations, checkpoints.
 _STAGES = ("data", "forward", "backward", "optimizer", "rest")
+# Options of a solver beside its parts.
+_OPTIONS = ("gradient", "effort", "focal", "focal_sigma", "radial")
 
 
 @dataclass(frozen=True)
@@ -64,24 +66,12 @@ class FitReport:
     peak_memory_mib: float
 
 
-def _peak_memory_mib(device: torch.device) -> float:
-    if device.type == "cuda":
-        return torch.cuda.max_memory_allocated(device) / 2**20
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (2**20 if sys.platform == "darwin" else 2**10)  # bytes on macOS, KiB elsewhere
-
-
-class _Step(NamedTuple):
-    """Values of one update that the learning curves show."""
-
-    terms: LossTerms
-    ramp: float
-    lr: float
-    grad_norm: Tensor
-
-
 class Run:
-    """State of a run: solver, optimizer, update, learning curves, clock. A checkpoint in the folder is continued."""
+    """State of a run: solver, optimizer, update, learning curves, clock. A checkpoint in the folder is continued.
+
+    A checkpoint is only continued by the same run: settings, the whole configuration of the solver, and ``identity``
+    must be equal.
+    """
 
     def __init__(
         self,
@@ -95,8 +85,9 @@ class Run:
         resume: bool,
     ) -> None:
         self.model, self.loss, self.settings, self.fabric = model, loss, settings, fabric
-        plain = json.dumps({"settings": asdict(settings), "model": model.config(), **identity})
-        self.identity = json.loads(plain)  # tuples become lists, as in a checkpoint
+        solver = {**model.config(), **{name: getattr(model, name) for name in _OPTIONS}}
+        # Tuples become lists, as in a checkpoint.
+        self.identity = json.loads(json.dumps({"settings": asdict(settings), "model": solver, **identity}))
         self.checkpoint = folder / CHECKPOINT_NAME
         self.update, self.skipped, self.interrupted = 0, 0, False
         self.rates = ""  # success rates of the last validation, for the progress bar
@@ -119,8 +110,6 @@ class Run:
         self.solver, self.fabric_optimizer = fabric.setup(model, self.optimizer)
         self.solver.mark_forward_method("with_starts")
         if state is not None:  # after the parameters are on their device, so that Adam's state follows them
-            for group in state["optimizer"]["param_groups"]:
-                group["fused"] = True  # changes how a step is computed, not its result
             self.optimizer.load_state_dict(state["optimizer"])
 
         self.validation = {name: problems.map(lambda x: x.to(fabric.device)) for name, problems in validation.items()}
@@ -130,14 +119,14 @@ class Run:
         self.history = History(folder, columns, self.start) if fabric.is_global_zero else None
         model.train()
         self.clock = StageClock(*_STAGES)
-        self.logged_update, self.logged_seconds = self.start, dict(self.clock.seconds)
+        self._logged = self.start, dict(self.clock.seconds)
 
     @property
     def finished(self) -> bool:
         """Whether all updates are done."""
         return self.update >= self.settings.updates
 
-    def forward(self, problems: Problems, ramp: float) -> LossTerms:
+    def _terms(self, problems: Problems, ramp: float) -> LossTerms:
         """Solve the problems and compare the results with the true poses."""
         inputs = problems.world_points, problems.img_points, problems.intrinsics
         options = {**problems.known, "first_stage_only": ramp == 0.0}
@@ -146,12 +135,12 @@ class Run:
             return self.loss(result, problems, ramp, guess)
         return self.loss(self.solver(*inputs, **options), problems, ramp)
 
-    def step(self, problems: Problems, stop: threading.Event) -> _Step:
-        """One update, skipped when the loss or the gradient is not finite."""
+    def step(self, problems: Problems, stop: threading.Event) -> dict[str, Any]:
+        """One update, skipped when loss or gradient is not finite; returns the values for the learning curves."""
         factor, ramp = self.settings.lr_factor(self.update), self.settings.ramp_factor(self.update)
         for group in self.optimizer.param_groups:
             group["lr"] = group["initial_lr"] * factor
-        terms = self.forward(problems, ramp)
+        terms = self._terms(problems, ramp)
         # The zero keeps the refiner in the graph before the ramp: processes expect gradients of every parameter.
         unused = sum(p.sum() for p in self.model.refine.parameters() if p.requires_grad) if ramp == 0.0 else 0.0
         self.clock.lap("forward")
@@ -160,7 +149,7 @@ class Run:
         self.clock.lap("backward")
         norm = nn.utils.clip_grad_norm_(self.parameters, self.settings.clip)
         # All processes must take the same branch, whichever process saw the bad number or the signal.
-        bad, stopped = _agree(self.fabric, not bool(torch.isfinite(terms.total + norm)), stop.is_set())
+        bad, stopped = self._any(not bool(torch.isfinite(terms.total + norm)), stop.is_set())
         self.update += 1
         if bad:
             self._skip()
@@ -168,35 +157,43 @@ class Run:
             self.fabric_optimizer.step()
         self.clock.lap("optimizer")
         self.interrupted = stopped and not self.finished
-        return _Step(terms, ramp, self.settings.lr * factor, norm)
+        return {**terms._asdict(), "ramp": ramp, "lr": self.settings.lr * factor, "grad_norm": norm}
+
+    def _any(self, *flags: bool) -> list[bool]:
+        """Whether each flag is set on any process."""
+        if self.fabric.world_size == 1:
+            return list(flags)
+        counts = torch.tensor(flags, dtype=torch.float32, device=self.fabric.device)
+        return (torch.as_tensor(self.fabric.all_reduce(counts, reduce_op="sum")) > 0).tolist()
 
     def _skip(self) -> None:
         self.skipped += 1
+        most = self.settings.max_skipped
         if self.fabric.is_global_zero:
             _log.warning("update %s: loss or gradient not finite, step skipped (%s so far)", self.update, self.skipped)
-        if self.skipped > self.settings.max_skipped:
+        if self.skipped > most:
             raise TrainingError(
-                f"{self.skipped} steps had a loss or a gradient that is not finite, more than max_skipped = "
-                f"{self.settings.max_skipped}, up to update {self.update}. Lower the learning rate or check the data."
+                f"{self.skipped} steps had a loss or a gradient that is not finite, more than max_skipped = {most}, up "
+                f"to update {self.update}. Lower the learning rate or check the data."
             )
 
-    def log(self, step: _Step, validates: bool) -> None:
-        """Append a row to the learning curves, with a validation or without."""
-        values = torch.stack([term.detach() for term in step.terms])
+    def log(self, step: dict[str, Any], validates: bool) -> None:
+        """Append what :meth:`step` returned to the learning curves, with a validation or without."""
+        values = torch.stack([step[name].detach() for name in LossTerms._fields])
         if self.fabric.world_size > 1:
             values = torch.as_tensor(self.fabric.all_reduce(values, reduce_op="mean"))
         if self.history is None:
             return
         self.clock.lap("rest")
-        shares = self.clock.shares(self.logged_seconds)
-        elapsed = sum(self.clock.seconds.values()) - sum(self.logged_seconds.values())
-        speed = (self.update - self.logged_update) / max(elapsed, 1e-9)
-        row: dict[str, float] = {"update": self.update, **dict(zip(step.terms._fields, values.tolist(), strict=True))}
-        if step.ramp == 0.0:  # nothing was refined yet
+        update, seconds = self._logged
+        elapsed, shares = self.clock.since(seconds)
+        speed = (self.update - update) / elapsed
+        row = {"update": self.update, **step, **dict(zip(LossTerms._fields, values.tolist(), strict=True))}
+        if step["ramp"] == 0.0:  # nothing was refined yet
             row = {name: value for name, value in row.items() if not name.startswith("refined")}
-        row |= {"ramp": step.ramp, "lr": step.lr, "grad_norm": step.grad_norm.item(), "skipped": self.skipped}
-        row |= {"updates_per_second": speed, **{f"{stage}_share": shares[stage] for stage in _STAGES}}
-        row["peak_memory_mib"] = _peak_memory_mib(self.fabric.device)
+        row |= {"grad_norm": step["grad_norm"].item(), "skipped": self.skipped, "updates_per_second": speed}
+        row |= {f"{stage}_share": share for stage, share in shares.items()}
+        row["peak_memory_mib"] = self._peak_memory_mib()
         if validates:
             self.model.eval()
             results = validate(self.model, self.validation)
@@ -208,7 +205,7 @@ class Run:
             _log.info("update %s: success %s; %s", self.update, self.rates, work)
         self.history.write(row)
         self.clock.lap("rest")
-        self.logged_update, self.logged_seconds = self.update, dict(self.clock.seconds)
+        self._logged = self.update, dict(self.clock.seconds)
 
     def save(self) -> None:
         """Write the checkpoint."""
@@ -224,27 +221,17 @@ class Run:
             self.history.board.close()
         self.model.eval()
         self.clock.lap("rest")
-        seconds = sum(self.clock.seconds.values())
-        return FitReport(
-            start=self.start,
-            update=self.update,
-            skipped=self.skipped,
-            interrupted=self.interrupted,
-            seconds=seconds,
-            updates_per_second=(self.update - self.start) / max(seconds, 1e-9),
-            time_shares=self.clock.shares(),
-            peak_memory_mib=_peak_memory_mib(self.fabric.device),
-        )
+        seconds, shares = self.clock.since()
+        speed, memory = (self.update - self.start) / seconds, self._peak_memory_mib()
+        return FitReport(self.start, self.update, self.skipped, self.interrupted, seconds, speed, shares, memory)
+
+    def _peak_memory_mib(self) -> float:
+        if self.fabric.device.type == "cuda":
+            return torch.cuda.max_memory_allocated(self.fabric.device) / 2**20
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return peak / (2**20 if sys.platform == "darwin" else 2**10)  # bytes on macOS, KiB elsewhere
 
 
 def describe_shares(shares: Mapping[str, float]) -> str:
     """Shares of the time as a line of a log, for example ``"data 1 %, forward 40 %"``."""
     return ", ".join(f"{stage} {100 * share:.0f} %" for stage, share in shares.items())
-
-
-def _agree(fabric: Fabric, *flags: bool) -> list[bool]:
-    """Whether each flag is set on any process."""
-    if fabric.world_size == 1:
-        return list(flags)
-    counts = fabric.all_reduce(torch.tensor(flags, dtype=torch.float32, device=fabric.device), reduce_op="sum")
-    return (torch.as_tensor(counts) > 0).tolist()

@@ -47,8 +47,9 @@ class TrainSettings:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        intervals = ("log_every", "validate_every", "checkpoint_every")
-        check_whole(1, **{name: getattr(self, name) for name in intervals})
+        check_whole(
+            1, log_every=self.log_every, validate_every=self.validate_every, checkpoint_every=self.checkpoint_every
+        )
         check_whole(0, updates=self.updates, warmup=self.warmup, max_skipped=self.max_skipped)
         check_numbers(0.0, lr=self.lr, lr_refine=self.lr_refine)
         check_positive(clip=self.clip, or_infinite=True)

@@ -28,13 +28,8 @@ CURVES = {
 class ValidationResult:
     """Success (rotation error below 1°, translation error below 0.2) and errors on one validation set.
 
-    Attributes:
-        success: success rate of the refined poses.
-        first_stage_success: success rate of the initial poses.
-        median_rotation_error_deg: of the refined poses, in degrees.
-        median_translation_error: of the refined poses, in the unit of the world.
-        first_stage_median_rotation_error_deg: of the initial poses, in degrees.
-        first_stage_median_translation_error: of the initial poses, in the unit of the world.
+    ``first_stage`` stands for the initial poses, the other fields for the refined poses. Translations are in the unit
+    of the world.
     """
 
     success: SuccessRate
@@ -51,14 +46,7 @@ class ValidationResult:
 
 @torch.no_grad()
 def validate(model: nn.Module, validation: Mapping[str, Problems]) -> dict[str, ValidationResult]:
-    """Solve fixed problems and summarise the errors.
-
-    Args:
-        model: a solver.
-        validation: problems by the name of their set.
-
-    Returns:
-        The result of each set.
+    """Solve fixed problems, given by the name of their set, and summarise the errors on each set.
 
     Raises:
         ValueError: when a set has no problems.
@@ -67,12 +55,7 @@ def validate(model: nn.Module, validation: Mapping[str, Problems]) -> dict[str, 
     for name, problems in validation.items():
         result = model(problems.world_points, problems.img_points, problems.intrinsics, **problems.known)
         refined, first = (pose_errors(pose, problems.pose) for pose in (result.pose, result.init))
-        results[name] = ValidationResult(
-            success_rate(success(refined)),
-            success_rate(success(first)),
-            refined.rotation_error_deg.median().item(),
-            refined.translation_error.median().item(),
-            first.rotation_error_deg.median().item(),
-            first.translation_error.median().item(),
-        )
+        rates = success_rate(success(refined)), success_rate(success(first))
+        medians = (part.median().item() for part in (*refined, *first))
+        results[name] = ValidationResult(*rates, *medians)
     return results
