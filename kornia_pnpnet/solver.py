@@ -27,7 +27,7 @@ from kornia_pnpnet.propose.focal import as_dist, distorted, scale_focal, with_fo
 from kornia_pnpnet.propose.initialiser import trait
 from kornia_pnpnet.propose.ransac import search_on
 from kornia_pnpnet.propose.views import VIEWS
-from kornia_pnpnet.refine.information import larger_sigma
+from kornia_pnpnet.refine.information import complete_noise, larger_sigma
 from kornia_pnpnet.refine.lm import Refinement, RobustWeightedLM
 from kornia_pnpnet.refine.residual import project
 from kornia_pnpnet.refine.terms import PoseTerm
@@ -348,9 +348,9 @@ class PnPNet(PretrainedMixin):
         refined = self.refine(seen, starts, m=0 if call.first_stage_only else None, more=more, run=self._run)
         result = self._run(self._result, frame, starts, refined, call)
         if adapts:
+            known, starts_of_known = _as_known(problem, starts, refined)
             pose = frame.apply(result.pose)
-            seen = problem.seen_with(refined.state.zoom)
-            mirror = mirror_probability(self.refine, seen, starts._replace(camera=None), pose, result.ok, result.cost)
+            mirror = mirror_probability(self.refine, known, starts_of_known, pose, result.ok, result.cost)
             result = _doubted(result, result.probability * (1.0 - mirror), call)
         return _Attempt(problem, frame, starts, refined, result)
 
@@ -435,8 +435,8 @@ class PnPNet(PretrainedMixin):
 
     def _with_alternatives(self, attempt: _Attempt, result: PnPResult, most: int) -> PnPResult:
         """The result with other poses that explain the pairs nearly as well."""
-        frame, zoom = attempt.frame, attempt.refined.state.zoom
-        problem, starts = attempt.problem.seen_with(zoom), attempt.starts._replace(camera=None)
+        frame = attempt.frame
+        problem, starts = _as_known(attempt.problem, attempt.starts, attempt.refined)
         found = find_alternatives(self.refine, problem, starts, frame.apply(result.pose), frame.valid, most)
         poses = frame.undo(Pose(found.rotation, found.translation))
         translation = torch.where(found.valid[..., None], poses.translation, 0.0)
@@ -449,6 +449,12 @@ class PnPNet(PretrainedMixin):
             raise ValueCheckError("focal='unknown' takes pixels of one camera without dist and fisheye.")
         if rig and (alternatives or (self.init is None and inputs.init is None)):
             raise ValueCheckError("A rig or bearings have no alternatives, and need an initialiser or `init`.")
+
+
+def _as_known(problem: Problem, starts: Starts, refined: Refinement) -> tuple[Problem, Starts]:
+    """The problem with the noise that it was refined with, and with the camera that was found, both as known."""
+    known = problem._replace(noise=complete_noise(problem, starts))
+    return known.seen_with(refined.state.zoom), starts._replace(camera=None)
 
 
 def _doubted(result: PnPResult, probability: Tensor, call: _Call) -> PnPResult:
