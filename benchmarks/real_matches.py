@@ -376,11 +376,11 @@ def read(paths: Sequence[Path]) -> Problems:
 # --- Solvers on problems ----------------------------------------------------------------------------------------------
 
 
-def batches(problems: Problems) -> list[Tensor]:
-    """Indices of problems that count, of one kind and with similar numbers of pairs, at most ``BATCH`` of them."""
+def batches(problems: Problems, size: int) -> list[Tensor]:
+    """Indices of problems that count, of one kind and with similar numbers of pairs, at most ``size`` of them."""
     pairs = problems.mask.sum(1)
     kinds = ((problems.counts & (problems.kind == kind)).nonzero()[:, 0] for kind in range(len(KINDS)))
-    return [part for at in kinds if len(at) for part in at[pairs[at].argsort()].split(BATCH)]
+    return [part for at in kinds if len(at) for part in at[pairs[at].argsort()].split(size)]
 
 
 def batch(problems: Problems, at: Tensor, dtype: torch.dtype) -> tuple[SolverProblems, Tensor, Tensor]:
@@ -418,13 +418,13 @@ def call(solver: nn.Module, spec: str, given: SolverProblems, mask: Tensor, rati
 
 
 @torch.no_grad()
-def solve(solvers: Mapping[str, nn.Module], problems: Problems, dtype: torch.dtype) -> dict[str, Solved]:
+def solve(solvers: Mapping[str, nn.Module], problems: Problems, dtype: torch.dtype, size: int) -> dict[str, Solved]:
     """Solve all problems that count with all solvers, which take turns on each batch."""
     found = {}
     for spec in solvers:
         zeros = [torch.zeros_like(x) for x in (problems.rotation, problems.translation, problems.counts)]
         found[spec] = Solved(*zeros, *torch.full((2, len(problems.kind)), torch.nan, dtype=torch.float64))
-    parts = batches(problems)
+    parts = batches(problems, size)
     for number, at in enumerate(parts):
         given, ratio, origin = batch(problems, at, dtype)
         mask = problems.mask[at][:, : ratio.shape[1]]
@@ -486,7 +486,12 @@ def rate(values: Tensor) -> float | None:
 
 
 def measure(
-    paths: Sequence[Path], specs: Sequence[str], dtype: torch.dtype, split: str, pictures: Path | None = None
+    paths: Sequence[Path],
+    specs: Sequence[str],
+    dtype: torch.dtype,
+    split: str,
+    pictures: Path | None = None,
+    sizes: Sequence[int] = (BATCH,),
 ) -> dict[str, Any]:
     """Solve the problems of the files.
 
@@ -496,6 +501,7 @@ def measure(
         dtype: dtype that the solvers get.
         split: whether the scenes were seen while choosing, in words.
         pictures: folder for pictures of failures.
+        sizes: numbers of problems in a call; all solvers run with each, and other libraries always get one problem.
 
     Returns:
         ``environment``, ``settings``, ``load_average`` (before and after), ``counts``, ``rows`` (one for each solver,
@@ -505,12 +511,13 @@ def measure(
     problems = read(paths)
     solvers = {spec: load_solver(spec.partition("+")[0]).to(dtype) for spec in specs}
     with threads():
-        solved = solve(solvers, problems, dtype)
+        solved = {size: solve(solvers, problems, dtype, size) for size in sizes}
     chosen = groups(problems)
     rows = []
     curves: dict[str, Any] = {}
     failures: list[dict[str, Any]] = []
-    for spec, one in solved.items():
+    for size, spec in itertools.product(sizes, specs):
+        one = solved[size][spec]
         right, far = judge(problems, one)
         told_chance = problems.counts & one.probability.isfinite()
         if told_chance.any():
@@ -519,8 +526,10 @@ def measure(
         for (kind, group), at in chosen.items():
             rates = {"success": rate(right[at]), "far": rate(far[at])}
             told = {"ok_of_right": rate(one.ok[at & right]), "ok_of_far": rate(one.ok[at & far])}
-            row = {"solver": spec, "kind": kind, "group": group, "count": int(at.sum()), **rates, **told}
-            rows.append({**row, "ms_per_problem": float(one.milliseconds[at].mean()) if at.any() else None})
+            row = {"solver": spec, "kind": kind, "group": group, "batch": size, "count": int(at.sum())}
+            rows.append(
+                {**row, **rates, **told, "ms_per_problem": float(one.milliseconds[at].mean()) if at.any() else None}
+            )
         if pictures is not None and not failures:
             failures = [draw_failure(problems, one, at, pictures) for at in worst_failures(problems, far)]
     limits = {"inlier_px": INLIER_PX, "min_inliers": MIN_INLIERS, "right": RIGHT, "far": FAR}
@@ -529,6 +538,7 @@ def measure(
         "split": split,
         "solvers": list(specs),
         "dtype": str(dtype),
+        "batch": list(sizes),
     }
     settings |= {"shares": SHARES, "pairs": PAIRS, "told": TOLD_SIGMAS, **limits}
     made = {"environment": environment(), "settings": settings, "load_average": [before, load()]}
@@ -669,7 +679,7 @@ def format_table(rows: Sequence[Mapping[str, Any]], kind: str, groups: Sequence[
     table: dict[str, dict[str, Mapping[str, Any]]] = {}
     for row in rows:
         if row["kind"] == kind:
-            table.setdefault(row["solver"], {})[row["group"]] = row
+            table.setdefault(f"`{row['solver']}`, calls of {row['batch']}", {})[row["group"]] = row
     numbers = next(iter(table.values()))
 
     def percent(value: float | None) -> str:
@@ -683,7 +693,7 @@ def format_table(rows: Sequence[Mapping[str, Any]], kind: str, groups: Sequence[
     for spec, found in table.items():
         told = [percent(found["all"][name]) for name in ("ok_of_right", "ok_of_far")]
         rates = [percent(found[group]["success"]) for group in groups]
-        lines.append([f"`{spec}`", milliseconds(found["all"]["ms_per_problem"]), *rates, *told])
+        lines.append([spec, milliseconds(found["all"]["ms_per_problem"]), *rates, *told])
     return markdown_table(header, lines, pad=True)
 
 
@@ -716,6 +726,9 @@ def make_parser() -> argparse.ArgumentParser:
     )
     measuring.add_argument("--pictures", type=Path, help="folder for pictures of failures of the first solver")
     measuring.add_argument("--out", type=Path, help="the results file (.json)")
+    measuring.add_argument(
+        "--batch", type=int, nargs="+", default=[BATCH], help="problems in a call of a solver of ours"
+    )
     measuring.add_argument("--double", action="store_true", help="give the solvers float64")
     timing = commands.add_parser("cost", help="time solvers on groups of problems")
     timing.add_argument("problems", type=Path, nargs="+", help="files of `make`")
@@ -740,7 +753,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     else:
         dtype = torch.float64 if options["double"] else torch.float32
         try:
-            told = options["split"], options["pictures"]
+            told = options["split"], options["pictures"], options["batch"]
             results = measure(options["problems"], options["solvers"], dtype, *told)
         except BaseError as error:
             parser.error(str(error))
