@@ -37,7 +37,7 @@ import numpy as np
 import poselib
 import pycolmap
 import torch
-from harness import Row, by_solver, parser, percent, pivot, recorded, say, table, target, threads, write
+from harness import Column, Row, by_solver, parser, percent, pivot, recorded, say, table, target, threads, write
 from tasks import relative_errors
 from torch import Tensor, nn
 
@@ -54,11 +54,8 @@ SIZES, SHARES = (6, 12, 30, 100), (0.0, 0.25, 0.5, 0.8)
 CELL = 1000
 RIGS, BASELINES, RIG_SETS = (3, 6), (0.02, 0.1, 0.5), ((6, 0.0), (12, 0.25), (30, 0.4), (60, 0.6), (200, 0.6))
 SCENES = (
-    "colmap/lund_door",
-    "colmap/sceaux_castle",
-    "eth3d/courtyard",
-    "strecha/fountain-P11",
-    "strecha/Herz-Jesus-P25",
+    *("colmap/lund_door", "colmap/sceaux_castle", "eth3d/courtyard"),
+    *("strecha/fountain-P11", "strecha/Herz-Jesus-P25"),
 )
 SCENE_N, SCENE_OUTLIERS = 20, (0, 5, 10)
 # A prior of the focal length that says nothing: the oracle starts from the true one.
@@ -148,7 +145,7 @@ def opencv_focals(world: np.ndarray, img: np.ndarray, intrinsics: np.ndarray, _:
     size, best = 2.0 * intrinsics[:2, 2].max(), None
     for focal in np.geomspace(size / 2, 3 * size, 21):
         camera = np.array([[focal, 0, intrinsics[0, 2]], [0, focal, intrinsics[1, 2]], [0, 0, 1]])
-        options = {"reprojectionError": 5.0, "iterationsCount": 100, "flags": cv2.SOLVEPNP_SQPNP}
+        options: Any = {"reprojectionError": 5.0, "iterationsCount": 100, "flags": cv2.SOLVEPNP_SQPNP}
         try:
             found, rvec, tvec, inliers = cv2.solvePnPRansac(world, img, camera, None, **options)
         except cv2.error:
@@ -226,8 +223,8 @@ def measure_real(data: Path) -> list[dict[str, Any]]:
         for i in np.flatnonzero(enough & (raw["kind"] == kind)):
             at = raw["M"][i]
             parts = raw["W"][i][at], raw["I"][i][at], raw["K"][i], raw["R"][i], raw["t"][i]
-            *inputs, rotation, translation = (torch.from_numpy(x).double()[None] for x in parts)
-            problems = Problems(*inputs, Pose(rotation, translation), torch.ones_like(inputs[0][..., 0]).bool())
+            world, img, intrinsics, *pose = (torch.from_numpy(x).double()[None] for x in parts)
+            problems = Problems(world, img, intrinsics, Pose(*pose), torch.ones_like(world[..., 0]).bool())
             for name, solve in solvers.items():  # in turns, so that a slow minute of the machine hits all of them
                 found = solve(problems)
                 spent = {"ok": found.ok, "us": torch.tensor([found.us])}
@@ -363,11 +360,11 @@ def _solved(row: Row) -> str:
 
 def page(results: Mapping[str, Any]) -> str:
     """The tables as a page."""
-    aims = {
+    aims: dict[str, Column] = {
         **{"Target": "{what}", "Measured": "{measured:.3g}", "Wanted": "{target:g}"},
         "Met": lambda x: "yes" if x["met"] else "**no**",
     }
-    cell = {
+    cell: dict[str, Column] = {
         **{
             "Solver": "`{solver}`",
             "recall (%)": percent("success"),
@@ -375,7 +372,7 @@ def page(results: Mapping[str, Any]) -> str:
         },
         **{"median focal (%)": percent("median_focal", 4), "µs": "{us:,.0f}"},
     }
-    real = {
+    real: dict[str, Column] = {
         **{"Matches": "{kind}", "Solver": "`{solver}`", "problems": "{count}", "solved (%)": percent("success")},
         **{"solved, 5 % (%)": percent("success_5"), "far but ok (%)": percent("far_but_ok")},
         **{"median focal error (%)": percent("median_focal", 2), "ms": lambda x: f"{x['us'] / 1000:,.1f}"},

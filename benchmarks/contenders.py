@@ -219,52 +219,25 @@ _SEED = 20_270_400
 
 
 class Settings(NamedTuple):
-    """How much is measured.
+    """How much is measured."""
 
-    Attributes:
-        contenders: names; ``None``: all.
-        problems: number of problems that success is counted on, and batch size of the rows with other numbers of pairs.
-        batches: batch sizes at 9 pairs.
-        pairs: numbers of pairs.
-        most_backward: largest batch size with gradients.
-        rounds: largest number of rounds.
-        loop_s: seconds for a contender in a round: a loop over problems solves fewer, a shorter call is repeated.
-        call_s: batches whose call takes more seconds are left out.
-        point_s: seconds for all rounds of one comparison, about.
-        latency_calls: number of calls with a single problem.
-        latency_s: seconds of these calls; slow contenders get fewer calls.
-        memory_batch: batch size of the memory measurement.
-    """
-
-    contenders: tuple[str, ...] | None = None
-    problems: int = 1000
-    batches: tuple[int, ...] = (1, 10, 100, 1000, 10_000, 100_000)
+    contenders: tuple[str, ...] | None = None  # names; None: all
+    problems: int = 1000  # that success is counted on; batch size of the rows with other numbers of pairs than N
+    batches: tuple[int, ...] = (1, 10, 100, 1000, 10_000, 100_000)  # at N pairs
     pairs: tuple[int, ...] = (6, 9, 20, 100, 1000)
-    most_backward: int = 10_000
-    rounds: int = 5
-    loop_s: float = 0.2
-    call_s: float = 2.0
-    point_s: float = 3.0
-    latency_calls: int = 1000
-    latency_s: float = 2.5
-    memory_batch: int = 10_000
+    most_backward: int = 10_000  # largest batch size with gradients
+    rounds: int = 5  # at most
+    loop_s: float = 0.2  # for a contender in a round: a loop solves fewer problems, a shorter call is repeated
+    call_s: float = 2.0  # batches whose call takes longer are left out
+    point_s: float = 3.0  # for all rounds of one comparison, about
+    latency_calls: int = 1000  # calls with a single problem
+    latency_s: float = 2.5  # for these calls; slow contenders get fewer
+    memory_batch: int = 10_000  # of the memory measurement
 
 
 FULL = Settings()
 #: A few small problems: does everything run?
-QUICK = Settings(
-    problems=20,
-    batches=(1, 20),
-    pairs=(6, 9),
-    most_backward=20,
-    rounds=3,
-    loop_s=0.01,
-    call_s=600.0,
-    point_s=1.0,
-    latency_calls=20,
-    latency_s=1.0,
-    memory_batch=100,
-)
+QUICK = Settings(None, 20, (1, 20), (6, 9), 20, 3, 0.01, 600.0, 1.0, 20, 1.0, 100)
 
 
 def draw(n: int, count: int, outliers: OutlierMix | None = None) -> Problems:
@@ -276,14 +249,9 @@ def draw(n: int, count: int, outliers: OutlierMix | None = None) -> Problems:
 
 
 def make_contenders(settings: Settings, *, count: int = 1) -> tuple[dict[str, Contender], list[dict[str, Any]]]:
-    """Make the contenders that are asked for.
+    """The contenders that are asked for by name, and for each that cannot be made its name and the reason.
 
-    Args:
-        settings: names.
-        count: number of threads; some contenders are measured on one thread only.
-
-    Returns:
-        Contenders by name, and for each contender that cannot be made its name and the reason.
+    Some contenders are measured on one thread only; ``count`` is the number of threads.
     """
     made: dict[str, Contender] = {}
     skipped: list[dict[str, Any]] = []

@@ -55,13 +55,8 @@ class Amount(NamedTuple):
     modes: tuple[str, ...] = ("eager", "compiled", "reduce-overhead", "captured")
     calls: tuple[int, ...] = (1, 100, 1000)
     contenders: tuple[str, ...] = (
-        "pnpnet-n9",
-        "pnpnet-n9 compiled",
-        "pnpnet-set",
-        "pnpnet-set compiled",
-        "epnp-lm",
-        "p3p-ransac",
-        "poselib",
+        *("pnpnet-n9", "pnpnet-n9 compiled", "pnpnet-set", "pnpnet-set compiled"),
+        *("epnp-lm", "p3p-ransac", "poselib"),
     )
     batches: tuple[int, ...] = (1000, 10_000, 100_000, 1_000_000)
     pairs: tuple[int, ...] = (9, 50)

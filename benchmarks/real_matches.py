@@ -178,12 +178,12 @@ def nearest(query: NDArray[np.float32], train: NDArray[np.float32]) -> tuple[Who
 
 def agree(first: View, second: View, pairs: Whole) -> NDArray[np.bool_]:
     """Whether matched keypoints, shape (M, 2), lie near each other's epipolar line under the poses of the model."""
-    projections = (torch.from_numpy(view.projection)[None] for view in (first, second))
-    fundamental = fundamental_from_projections(*projections)
+    one, two = (torch.from_numpy(view.projection)[None] for view in (first, second))
+    fundamental = fundamental_from_projections(one, two)
     points = [torch.from_numpy(x.pixels[at])[None] for x, at in ((first, pairs[:, 0]), (second, pairs[:, 1]))]
-    distances = left_to_right_epipolar_distance, right_to_left_epipolar_distance
-    near = [distance(*points, fundamental)[0] < EPIPOLAR_PX for distance in distances]
-    return (near[0] & near[1]).numpy()
+    right = left_to_right_epipolar_distance(points[0], points[1], fundamental)[0]
+    left = right_to_left_epipolar_distance(points[0], points[1], fundamental)[0]
+    return ((right < EPIPOLAR_PX) & (left < EPIPOLAR_PX)).numpy()
 
 
 def tracks(views: Sequence[View]) -> list[Whole]:

@@ -14,23 +14,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import harness
 import torch
-from harness import (
-    Row,
-    in_turns,
-    parser,
-    peak_bytes,
-    pivot,
-    ratio,
-    recorded,
-    run_child,
-    say,
-    seconds,
-    summary,
-    table,
-    threads,
-    write,
-)
 from kornia.core.exceptions import BaseError
 from others import bare_call
 from torch import nn
@@ -96,12 +81,12 @@ def measure_set(solvers: Mapping[str, nn.Module], name: str, count: int, repeats
     for spec, solver in solvers.items():
         result = solver(problems.world_points, problems.img_points, problems.intrinsics)  # not timed: slower
         rates[spec] = success_rate(success(pose_errors(result.pose, problems.pose)))
-        timers[spec] = partial(seconds, bare_call(solver, problems))
-    rounds = in_turns(timers, repeats)
-    return [
-        {"solver": spec, "set": name, "success": rates[spec]._asdict(), **summary([1e6 * s / count for s in times])}
-        for spec, times in rounds.items()
-    ]
+        timers[spec] = partial(harness.seconds, bare_call(solver, problems))
+    found = []
+    for spec, times in harness.in_turns(timers, repeats).items():
+        measured = {"success": rates[spec]._asdict(), **harness.summary([1e6 * s / count for s in times])}
+        found.append({"solver": spec, "set": name, **measured})
+    return found
 
 
 def speedups(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -111,7 +96,7 @@ def speedups(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         for mine, theirs in itertools.product(rows, rows):
             names = (base_name(mine["solver"]), base_name(theirs["solver"]))
             if names == (solver, peer) and mine["set"] == theirs["set"] and SETS[mine["set"]][0] == SMALL:
-                times = ratio(mine, theirs)
+                times = harness.ratio(mine, theirs)
                 entry = {"solver": mine["solver"], "peer": theirs["solver"], "set": mine["set"], "ratio": times}
                 found.append({**entry, "target": target, "met": times >= target})
     return found
@@ -119,11 +104,11 @@ def speedups(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 def memory_here(spec: str, count: int) -> dict[str, int]:
     """Solve one large batch in this process; the peak memory before and after."""
-    before = peak_bytes()
-    with threads(), torch.no_grad():
+    before = harness.peak_bytes()
+    with harness.threads(), torch.no_grad():
         problems = draw(MEMORY_SET, count)
         load_solver(spec)(problems.world_points, problems.img_points, problems.intrinsics)
-    return {"imports_bytes": before, "peak_bytes": peak_bytes()}
+    return {"imports_bytes": before, "peak_bytes": harness.peak_bytes()}
 
 
 def measure_memory(spec: str, count: int) -> dict[str, Any]:
@@ -131,8 +116,9 @@ def measure_memory(spec: str, count: int) -> dict[str, Any]:
 
     Peaks of the same call differ with the memory that the allocator has given back.
     """
-    say(f"memory of {spec}")
-    runs = [run_child(Path(__file__), "--memory-of", spec, "--memory-count", str(count)) for _ in range(MEMORY_RUNS)]
+    harness.say(f"memory of {spec}")
+    arguments = ("--memory-of", spec, "--memory-count", str(count))
+    runs = [harness.run_child(Path(__file__), *arguments) for _ in range(MEMORY_RUNS)]
     peak = max(run["peak_bytes"] for run in runs)
     rise = max(run["peak_bytes"] - run["imports_bytes"] for run in runs)
     found = {"runs": runs, "peak_bytes": peak, "rise_bytes": rise, "target_bytes": MEMORY_TARGET}
@@ -157,13 +143,13 @@ def measure(specs: Sequence[str], *, count: int, repeats: int, memory_count: int
             solvers[spec] = load_solver(spec).double()
         except ImportError as error:
             skipped[spec] = str(error)
-            say(f"skipped: {spec}: {error}")
+            harness.say(f"skipped: {spec}: {error}")
     wanted = [spec for spec in solvers if memory_count and base_name(spec) == MEMORY_SOLVER]
     memory = [measure_memory(spec, memory_count) for spec in wanted]
     rows = []
-    with threads():
+    with harness.threads():
         for name, (n, _) in SETS.items():
-            say(name)
+            harness.say(name)
             chosen = {spec: solver for spec, solver in solvers.items() if n == SMALL or base_name(spec) in ROBUST}
             rows += measure_set(chosen, name, count, repeats)
     return {"skipped": skipped, "rows": rows, "speedups": speedups(rows), "memory": memory}
@@ -172,10 +158,10 @@ def measure(specs: Sequence[str], *, count: int, repeats: int, memory_count: int
 def format_tables(results: Mapping[str, Any]) -> str:
     """Times with success, and the targets, as two Markdown tables."""
 
-    def cell(row: Row) -> str:
+    def cell(row: harness.Row) -> str:
         return f"{row['median_us']:.1f} µs (min {row['min_us']:.1f}), {100 * row['success']['rate']:.1f} %"
 
-    times = pivot(results["rows"], {"Solver": "`{solver}`"}, SETS, cell, by="set", align="l" * (1 + len(SETS)))
+    times = harness.pivot(results["rows"], {"Solver": "`{solver}`"}, SETS, cell, by="set", align="l" * (1 + len(SETS)))
     found = [
         {**entry, "wanted": "`{solver}` at least {target:g} times as fast as `{peer}`".format_map(entry)}
         | {"measured": f"{entry['ratio']:.2f} times"}
@@ -186,9 +172,9 @@ def format_tables(results: Mapping[str, Any]) -> str:
         wanted = f"`{entry['solver']}` on {entry['count']} problems below {target:g} GiB"
         measured = f"{peak:.2f} GiB, {rise:.2f} GiB without the imports"
         found.append({**entry, "wanted": wanted, "measured": measured})
-    verdict = {"Verdict": lambda entry: "met" if entry["met"] else "**missed**"}
-    columns = {"Target": "{wanted}", "Set": "{set}", "Measured": "{measured}", **verdict}
-    return f"{times}\n\n{table(found, columns, align='llll')}"
+    verdict: dict[str, harness.Column] = {"Verdict": lambda entry: "met" if entry["met"] else "**missed**"}
+    columns: dict[str, harness.Column] = {"Target": "{wanted}", "Set": "{set}", "Measured": "{measured}", **verdict}
+    return f"{times}\n\n{harness.table(found, columns, align='llll')}"
 
 
 def page(results: Mapping[str, Any]) -> str:
@@ -207,7 +193,7 @@ Written by `benchmarks/solvers.py`, see [README.md](README.md). Median and minim
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, write the files and print the tables."""
-    command = parser(__doc__)
+    command = harness.parser(__doc__)
     command.add_argument("--out", type=Path, help="the results file (.json); the tables go beside it (.md)")
     command.add_argument("--solvers", nargs="+", default=[*OURS, *PEERS], help="names, with options after a colon")
     command.add_argument("--count", type=int, default=1000, help="number of problems in a batch")
@@ -222,15 +208,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     given = {"count": options.count, "repeats": options.repeats}
     try:
-        with threads():  # the environment says how many
-            results = recorded(
+        with harness.threads():  # the environment says how many
+            results = harness.recorded(
                 partial(measure, options.solvers, **given, memory_count=options.memory_count),
                 **{"solvers": options.solvers, **given, "seed": SEED, "dtype": "float64"},
             )
     except BaseError as error:
         command.error(str(error))
     if options.out:
-        write(options.out, results, page)
+        harness.write(options.out, results, page)
     print(format_tables(results))
 
 

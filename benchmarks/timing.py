@@ -40,12 +40,8 @@ def ready(
 ) -> tuple[Task, int, float]:
     """A warm task, its number of problems, and the seconds of its call.
 
-    Args:
-        contender: the solver.
-        problems: the batch. A loop gets its first problems, enough for ``settings.loop_s`` seconds.
-        settings: the limits.
-        backward: with gradients.
-        known: seconds per problem of an earlier measurement, or ``None``.
+    A loop gets its first problems, enough for ``settings.loop_s`` seconds. ``known`` are seconds per problem of an
+    earlier measurement, or ``None``.
 
     Raises:
         CannotBeTimedError: when the call would take too long, or the contender cannot compile.
