@@ -1,4 +1,4 @@
-"""The contenders by name: solvers of ours, and of other libraries."""
+"""The contenders by name: solvers of ours and of other libraries; how much is measured, and on which problems."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import functools
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
-from harness import HERE
+from harness import HERE, say
 from others import KorniaDLT, Peer, PyPose
 from tasks import (
     ITERATIONS,
+    CannotBeTimedError,
     Contender,
     Task,
     compile_or_raise,
@@ -26,6 +27,8 @@ from tasks import (
 from torch import nn
 
 from kornia_pnpnet import PnPNet, RobustWeightedLM
+from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet.evaluation import draw_problems
 from kornia_pnpnet.evaluation.named_solvers import load_solver
 from kornia_pnpnet.result import Pose, Problems
 
@@ -34,8 +37,6 @@ TRAINED, ANY = "pnpnet-n9", "pnpnet-set"
 #: The network of ``TRAINED``, one guess, and the number of iterations that the targets were set for, with classical
 #: hyperparameters: the trained hyperparameters belong to more iterations.
 PLAIN = "net-n9+lm"
-#: ``TRAINED`` with one guess.
-ONE = f"{TRAINED}:views=1"
 WHOLE = f"{PLAIN} compiled whole"
 
 
@@ -48,13 +49,10 @@ class Ours(Contender):
         *,
         compiled: bool = False,
         whole: bool = False,
-        views: int | None = None,
         classical: int | None = None,
         device: str = "cpu",
     ) -> None:
         solver: Any = load_solver(spec)
-        if views is not None:
-            solver.views = views
         if classical is not None:
             solver = PnPNet(solver.init, RobustWeightedLM(classical, reject_worse=False), solver.normalize).eval()
         solver = solver.float().to(device)
@@ -184,10 +182,7 @@ class Onnx(Contender):
 OURS: dict[str, Callable[..., Contender]] = {
     TRAINED: functools.partial(Ours, TRAINED),
     f"{TRAINED} compiled": functools.partial(Ours, TRAINED, compiled=True),
-    ONE: functools.partial(Ours, TRAINED, views=1),
-    f"{ONE} compiled": functools.partial(Ours, TRAINED, views=1, compiled=True),
     PLAIN: functools.partial(Ours, TRAINED, classical=ITERATIONS),
-    f"{PLAIN} compiled": functools.partial(Ours, TRAINED, classical=ITERATIONS, compiled=True),
     WHOLE: functools.partial(Ours, TRAINED, classical=ITERATIONS, compiled=True, whole=True),
     ANY: functools.partial(Ours, ANY),
     f"{ANY} compiled": functools.partial(Ours, ANY, compiled=True),
@@ -213,3 +208,62 @@ CONTENDERS: dict[str, Callable[..., Contender]] = {
 }
 #: Contenders of thousands of small operations that wait for each other: on two threads they take minutes.
 ONE_THREAD = ("pypose-lm", "pypose-parts")
+
+
+# -- how much, and on which problems -----------------------------------------------------------------------------------
+
+#: Number of pairs unless a row says otherwise.
+N = 9
+# Seed of the problems. No training or tuning used it.
+_SEED = 20_270_400
+
+
+class Settings(NamedTuple):
+    """How much is measured."""
+
+    contenders: tuple[str, ...] | None = None  # names; None: all
+    problems: int = 1000  # that success is counted on; batch size of the rows with other numbers of pairs than N
+    batches: tuple[int, ...] = (1, 10, 100, 1000, 10_000, 100_000)  # at N pairs
+    pairs: tuple[int, ...] = (6, 9, 20, 100, 1000)
+    most_backward: int = 10_000  # largest batch size with gradients
+    rounds: int = 5  # at most
+    loop_s: float = 0.2  # for a contender in a round: a loop solves fewer problems, a shorter call is repeated
+    call_s: float = 2.0  # batches whose call takes longer are left out
+    point_s: float = 3.0  # for all rounds of one comparison, about
+    latency_calls: int = 1000  # calls with a single problem
+    latency_s: float = 2.5  # for these calls; slow contenders get fewer
+    memory_batch: int = 10_000  # of the memory measurement
+
+
+FULL = Settings()
+#: A few small problems: does everything run?
+QUICK = Settings(None, 20, (1, 20), (6, 9), 20, 3, 0.01, 600.0, 1.0, 20, 1.0, 100)
+
+
+def draw(n: int, count: int, outliers: OutlierMix | None = None) -> Problems:
+    """Problems of the protocol's data in float64; a third of the pairs are mismatches unless ``outliers`` is given."""
+    mix = OutlierMix(count=n // 3, mismatch_share=1.0) if outliers is None else outliers
+    # A constant batch size: a smaller count gives the first problems of a larger one.
+    source = SyntheticProblems(n=n, batch_size=1000, seed=_SEED + n, outliers=mix, dtype=torch.float64)
+    return draw_problems(source, count)
+
+
+def make_contenders(settings: Settings, *, count: int = 1) -> tuple[dict[str, Contender], list[dict[str, Any]]]:
+    """The contenders that are asked for by name, and for each that cannot be made its name and the reason.
+
+    Some contenders are measured on one thread only; ``count`` is the number of threads.
+    """
+    made: dict[str, Contender] = {}
+    skipped: list[dict[str, Any]] = []
+    for name, make in CONTENDERS.items():
+        if settings.contenders is not None and name not in settings.contenders:
+            continue
+        if count > 1 and name in ONE_THREAD:
+            skipped.append({"contender": name, "why": "measured on one thread only"})
+            continue
+        try:
+            made[name] = make()
+        except (ImportError, CannotBeTimedError) as error:
+            skipped.append({"contender": name, "why": str(error)})
+            say(f"skipped: {name}: {error}")
+    return made, skipped

@@ -5,12 +5,10 @@ README.md beside this file describes the measurements.
 
 from __future__ import annotations
 
-import argparse
 import functools
 import itertools
 import json
 import math
-import operator
 import re
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -18,9 +16,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from contenders import CONTENDERS, OURS
-from harness import HERE, in_turns, load, say, summary
-from settings import N, draw
+from contenders import CONTENDERS, OURS, N, draw
+from harness import HERE, in_turns, load, parser, say, summary
 from tasks import (
     CannotBeTimedError,
     Contender,
@@ -33,14 +30,13 @@ from tasks import (
     waiting,
     without_gradient,
 )
-from throughput import BACKWARD, FORWARD
+from timing import BACKWARD, FORWARD
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import flop_registry
 
 from kornia_pnpnet import PnPNet, create_solver, list_solvers, pose_errors, success
 from kornia_pnpnet.core.environment import environment
-from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.result import PnPResult, Pose, Problems
@@ -51,41 +47,23 @@ _DRAWN = 10_000  # problems; larger batches repeat them
 
 
 class Amount(NamedTuple):
-    """How much is measured.
+    """How much is measured. The first mode is what the others are compared with."""
 
-    Attributes:
-        parity: problems of each solver that both devices solve.
-        graphs: solvers of the comparison of modes.
-        modes: keys of ``MODES``, the first of them is what the others are compared with.
-        calls: batch sizes of that comparison.
-        contenders: names of throughput, from ``contenders.CONTENDERS``.
-        batches: batch sizes of throughput.
-        pairs: numbers of pairs of throughput.
-        rounds: calls that are timed.
-        call_s: seconds that a call may take; larger batches are left out.
-        copied: entries of the copy that measures the bandwidth, float32.
-        side: rows of the matrices that measure the rate of arithmetic.
-    """
-
-    parity: int = 1000
+    parity: int = 1000  # problems of each solver that both devices solve
+    # CUDA graphs: solvers, keys of MODES and batch sizes; then contenders, batch sizes and numbers of pairs.
     graphs: tuple[str, ...] = ("pnpnet-n9", "pnpnet-set")
     modes: tuple[str, ...] = ("eager", "compiled", "reduce-overhead", "captured")
     calls: tuple[int, ...] = (1, 100, 1000)
     contenders: tuple[str, ...] = (
-        "pnpnet-n9",
-        "pnpnet-n9 compiled",
-        "pnpnet-set",
-        "pnpnet-set compiled",
-        "epnp-lm",
-        "p3p-ransac",
-        "poselib",
+        *("pnpnet-n9", "pnpnet-n9 compiled", "pnpnet-set", "pnpnet-set compiled"),
+        *("epnp-lm", "p3p-ransac", "poselib"),
     )
     batches: tuple[int, ...] = (1000, 10_000, 100_000, 1_000_000)
     pairs: tuple[int, ...] = (9, 50)
-    rounds: int = 5
-    call_s: float = 10.0
-    copied: int = 2**28
-    side: int = 8192
+    rounds: int = 5  # calls that are timed
+    call_s: float = 10.0  # larger batches are left out where a call may take longer
+    copied: int = 2**28  # float32 entries of the copy that measures the bandwidth
+    side: int = 8192  # rows of the matrices that measure the rate of arithmetic
 
 
 FULL = Amount()
@@ -302,34 +280,6 @@ def _task(call: Callable[[], object], problems: Problems, device: str) -> Task:
     return Task(call, lambda: problems.pose, problems, waiting(device))
 
 
-def in_chunks(contender: Contender, problems: Problems, size: int, *, backward: bool) -> Task:
-    """A task that solves the problems ``size`` at a time."""
-    count = len(problems.world_points)
-    tasks = [
-        contender.task(problems.map(operator.itemgetter(slice(start, start + size))), backward=backward)
-        for start in range(0, count, size)
-    ]
-
-    def call() -> None:
-        for task in tasks:
-            task.call()  # its result is freed before the next chunk
-
-    return Task(call, tasks[0].poses, problems, tasks[0].finish)
-
-
-def fitting(contender: Contender, problems: Problems, *, backward: bool) -> tuple[Task, int]:
-    """A warm task and its chunk, the first of B, B/2, B/4, ... that fits the memory."""
-    size = len(problems.world_points)
-    while True:
-        try:
-            task = in_chunks(contender, problems, size, backward=backward)
-            task.warm()
-            return task, size
-        except torch.cuda.OutOfMemoryError:
-            size = math.ceil(size / 2)
-        torch.cuda.empty_cache()
-
-
 def work(contender: Contender, problems: Problems, *, backward: bool) -> dict[str, float]:
     """Count what a call that is not compiled does for a problem.
 
@@ -353,9 +303,9 @@ def measure_throughput(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
     """Time per problem, peak memory, and how far from the floors of the machine.
 
     Yields:
-        The rates of the machine. Then for each contender and point the times of a problem; ``chunk``; ``peak_bytes`` of
-        a call beyond what was allocated before, ``None`` on a CPU; ``work`` of a problem; ``warm_s``, seconds of the
-        first two calls; ``shares`` of the median time: ``floor``, the least possible time (the larger of the times of
+        The rates of the machine. Then for each contender and point the times of a problem; ``peak_bytes`` of a call
+        beyond what was allocated before, ``None`` on a CPU; ``work`` of a problem; ``warm_s``, seconds of the first two
+        calls; ``shares`` of the median time: ``floor``, the least possible time (the larger of the times of
         ``least_bytes`` and ``flops``), and ``traffic``, the time of ``bytes``, above 1 where a compiler has fused
         operations; or ``why`` a point is missing.
     """
@@ -381,7 +331,8 @@ def measure_throughput(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
             problems = first(map_tensors(lambda *x: torch.cat(x), *(drawn for _ in repeats)), batch)
             start = time.perf_counter()
             try:
-                task, chunk = fitting(contender, problems, backward=mode == BACKWARD)
+                task = contender.task(problems, backward=mode == BACKWARD)
+                task.warm()
             except CannotBeTimedError as error:
                 yield {**place, "why": reason(error)}
                 break  # it has failed to compile, and runs uncompiled from now on
@@ -396,7 +347,7 @@ def measure_throughput(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
             floor_s = max(each["least_bytes"] / rates["bytes_per_s"], each["flops"] / rates["flops_per_s"])
             traffic_s = each["bytes"] / rates["bytes_per_s"]
             shares = {key: 1e6 * x / found["median_us"] for key, x in (("floor", floor_s), ("traffic", traffic_s))}
-            place |= {"chunk": chunk, "peak_bytes": peak}
+            place["peak_bytes"] = peak
             if batch == amount.batches[0]:
                 place["success"] = task.success().rate
             yield {**place, "work": each, "shares": shares, **found}
@@ -440,70 +391,25 @@ PARTS: dict[str, Callable[[str, Amount], Iterator[dict[str, Any]]]] = {
 }
 
 
-def tables(results: dict[str, Any]) -> str:
-    """The results as text."""
-
-    def cells(*values: object) -> list[str]:
-        return ["–" if x is None else f"{x:.3g}" if isinstance(x, float) else str(x) for x in values]
-
-    def rows(part: str) -> list[dict[str, Any]]:
-        return list(results.get(part, {"rows": []})["rows"])
-
-    shares = ("same_ok", "same_pose", "same_gradient", "why")
-    found = [
-        cells(x["solver"], x["dtype"], *x.get("success", (None, None)), *map(x.get, shares)) for x in rows("parity")
-    ]
-    calls = [
-        cells(row["solver"], row["batch"], mode, *map(x.get, ("median_us", "rotation_difference", "warm_s", "why")))
-        for row in rows("graphs")
-        for mode, x in row["modes"].items()
-    ]
-    place, measured = ("contender", "mode", "n", "batch"), ("median_us", "peak_bytes", "chunk", "warm_s", "why")
-    times = [
-        cells(*map(x.get, place), *map(x.get, measured), *x.get("shares", {}).values()) for x in rows("throughput")
-    ]
-    made = {
-        "parity": ["against the CPU", "dtype", "success", "there", "same ok", "same pose", "same gradient", "why not"],
-        "graphs": ["solver", "B", "mode", "µs per call", "difference", "warm-up s", "why not"],
-        "throughput": ["solver", "mode", "n", "B", "µs per problem", "peak bytes", "chunk", "warm-up s", "why not"],
-    }
-    filled = {"parity": found, "graphs": calls, "throughput": times}
-    made["throughput"] += ["floor", "traffic"]
-    full = {part: [[*row, *["–"] * (len(made[part]) - len(row))] for row in lines] for part, lines in filled.items()}
-    return "\n\n".join(markdown_table(made[part], full[part], pad=True) for part in PARTS if full[part])
-
-
 def main(arguments: Sequence[str] | None = None, amount: Amount | None = None) -> None:
-    """Measure, write each row into the file as soon as it is known, and print tables."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--device", default="cuda", help="cuda, or cpu to try the script")
-    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), help="the others stay in the file")
-    parser.add_argument("--solvers", nargs="+", help="only these of graphs and throughput; the others stay in the file")
-    parser.add_argument("--quick", action="store_true", help="a few small problems: does everything run?")
-    parser.add_argument("--out", type=Path, default=HERE / "gpu.json", help="the results file")
-    options = parser.parse_args(arguments)
+    """Measure, and write each row into the file as soon as it is known."""
+    command = parser(__doc__)
+    command.add_argument("--device", default="cuda", help="cuda, or cpu to try the script")
+    command.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), help="the others stay in the file")
+    command.add_argument("--quick", action="store_true", help="a few small problems: does everything run?")
+    command.add_argument("--out", type=Path, default=HERE / "gpu.json", help="the results file")
+    options = command.parse_args(arguments)
     amount = amount or (QUICK if options.quick else FULL)
-    if options.solvers:
-        if unknown := set(options.solvers) - {*amount.graphs, *amount.contenders}:
-            parser.error(f"not measured here: {', '.join(sorted(unknown))}")
-        graphs, contenders = ([x for x in of if x in options.solvers] for of in (amount.graphs, amount.contenders))
-        amount = amount._replace(graphs=tuple(graphs), contenders=tuple(contenders))
     results = json.loads(options.out.read_text()) if options.out.exists() else {}
-    made_with = environment()
     for part in options.parts:
-        old = results.get(part, {"environment": {}, "rows": []})
-        same = all(old["environment"].get(key) == made_with[key] for key in ("versions", "cpu", "gpu", "commit"))
-        others = [x for x in old["rows"] if x.get("solver", x.get("contender")) not in (options.solvers or [])]
         settings = {"device": options.device, **amount._asdict()}
-        results[part] = {"environment": made_with, "settings": settings, "load_average": load()}
-        results[part]["rows"] = rows = others if options.solvers and part != "parity" and same else []
+        results[part] = {"environment": environment(), "settings": settings, "load_average": load(), "rows": []}
         for row in PARTS[part](options.device, amount):
             if "rates" in row:
                 results[part] |= row
             else:
-                rows.append(row)
+                results[part]["rows"].append(row)
             save_results(results, options.out)
-    print(tables(results))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
-"""What the benchmarks share: threads, timing in turns, the memory of a process, and processes of their own."""
+"""What the benchmarks share: threads, timing in turns, processes of their own, results files and tables."""
 
 from __future__ import annotations
 
+import argparse
 import gc
 import json
 import math
@@ -10,16 +11,23 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from kornia_pnpnet.core.environment import environment
+from kornia_pnpnet.core.files import write_json
 from kornia_pnpnet.core.performance import keep_freed_memory
+from kornia_pnpnet.core.tables import markdown_table
 
 HERE = Path(__file__).resolve().parent
+
+Row = Mapping[str, Any]
+#: A column of a table: a format string of the row's entries, or a function of the row.
+Column = str | Callable[[Row], str]
 
 
 @contextmanager
@@ -118,6 +126,76 @@ def target(what: str, measured: float, wanted: float, *, unit: str, at_most: boo
     """A target beside the measurement, and whether the target is met."""
     met = measured <= wanted if at_most else measured >= wanted
     return {"what": what, "measured": measured, "target": wanted, "unit": unit, "at_most": at_most, "met": met}
+
+
+# -- results files and tables ------------------------------------------------------------------------------------------
+
+
+def parser(description: str | None) -> argparse.ArgumentParser:
+    """A command line whose help shows the description as it is written."""
+    return argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+
+
+def recorded(measure: Callable[[], Mapping[str, Any]], **settings: Any) -> dict[str, Any]:
+    """What a measurement returns, with ``environment``, ``settings``, and ``load_average`` before and after."""
+    before = load()
+    found = measure()
+    return {"environment": environment(), "settings": settings, "load_average": [before, load()], **found}
+
+
+def write(path: Path, results: Mapping[str, Any], page: Callable[[Mapping[str, Any]], str]) -> None:
+    """Write a results file, and its page beside it."""
+    write_json(path, results)
+    path.with_suffix(".md").write_text(page(results), encoding="utf-8")
+
+
+def fill(column: Column, row: Row) -> str:
+    """The cell of a column in a row."""
+    return column.format_map(row) if isinstance(column, str) else column(row)
+
+
+def table(rows: Iterable[Row], columns: Mapping[str, Column], **options: Any) -> str:
+    """A Markdown table with a line for each row, by the titles of its columns."""
+    return markdown_table([*columns], [[fill(x, row) for x in columns.values()] for row in rows], **options)
+
+
+def pivot(
+    rows: Iterable[Row],
+    keys: Mapping[str, Column],
+    names: Iterable[str],
+    cell: Column,
+    *,
+    by: str = "solver",
+    **options: Any,
+) -> str:
+    """A Markdown table with a line for each combination of the keys, and a column for each of the names.
+
+    Args:
+        rows: the rows.
+        keys: the first columns.
+        names: values of the entry ``by``, and titles of their columns.
+        cell: what stands in these columns.
+        by: the entry that tells the columns apart.
+        options: those of :func:`~kornia_pnpnet.core.tables.markdown_table`.
+    """
+    lines: dict[tuple[str, ...], dict[str, str]] = {}
+    for row in rows:
+        lines.setdefault(tuple(fill(x, row) for x in keys.values()), {})[row[by]] = fill(cell, row)
+    cells = [[*place, *(line.get(name, "–") for name in names)] for place, line in lines.items()]
+    return markdown_table([*keys, *names], cells, **options)
+
+
+def by_solver(rows: Iterable[Row], *keys: str) -> dict[tuple[Any, ...], dict[str, Row]]:
+    """Rows by these entries, then by solver."""
+    found: dict[tuple[Any, ...], dict[str, Row]] = {}
+    for row in rows:
+        found.setdefault(tuple(row[key] for key in keys), {})[row["solver"]] = row
+    return found
+
+
+def percent(key: str, digits: int = 1, unit: str = "") -> Column:
+    """A column of shares in per cent."""
+    return lambda row: "–" if row[key] is None else f"{100 * row[key]:.{digits}f}{unit}"
 
 
 def say(text: str) -> None:

@@ -12,7 +12,6 @@ The error is the rotation error in radians plus the translation error relative t
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 from collections.abc import Callable
@@ -21,14 +20,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from harness import load, threads
-from sklearn.isotonic import IsotonicRegression
+from harness import parser, recorded, table, threads
 from torch import Tensor, nn
 
-from kornia_pnpnet import create_solver, pose_errors
-from kornia_pnpnet.core.environment import environment
+from kornia_pnpnet import create_solver, fit_confidence, pose_errors
 from kornia_pnpnet.core.files import read_npz
-from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.result import Pose
 
@@ -138,19 +134,20 @@ def measure(path: Path) -> dict[str, Any]:
 
 def main() -> None:
     """Measure, print the tables and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("problems", type=Path, nargs="+")
-    parser.add_argument("--sources", type=Path, required=True, help="JSON: what each source is, by its file")
-    parser.add_argument("--out", type=Path, required=True)
-    options, before, keys = parser.parse_args(), load(), ("error", "capped", "median", "right", "ok")
+    command = parser(__doc__)
+    command.add_argument("problems", type=Path, nargs="+")
+    command.add_argument("--sources", type=Path, required=True, help="JSON: what each source is, by its file")
+    command.add_argument("--out", type=Path, required=True)
+    options = command.parse_args()
+    sources = json.loads(options.sources.read_text())
     with threads():
-        found = [measure(path) for path in options.problems]
-    for one in found:
+        settings = {"right": RIGHT, "cap": CAP, "samples": SAMPLES, "dtype": "float64"}
+        made = recorded(lambda: {"results": [measure(path) for path in options.problems]}, **settings)
+    columns = {"way": "{way}", **{key: f"{{{key}:.3f}}" for key in ("error", "capped", "median", "right", "ok")}}
+    for one in made["results"]:
         print({key: value for key, value in one.items() if key != "rows"})
-        print(markdown_table(("way", *keys), [[r["way"], *(f"{r[k]:.3f}" for k in keys)] for r in one["rows"]]))
-    settings = {"right": RIGHT, "cap": CAP, "samples": SAMPLES, "dtype": "float64"}
-    made = {"environment": environment(), "settings": settings, "load_average": [before, load()]}
-    save_results({**made, "sources": json.loads(options.sources.read_text()), "results": found}, options.out)
+        print(table(one["rows"], columns))
+    save_results({**made, "sources": sources}, options.out)
 
 
 if __name__ == "__main__":

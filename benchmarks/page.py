@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from contenders import ANY, ONE, PLAIN, TRAINED
-from harness import HERE
+import numpy as np
+import pandas as pd
+from contenders import ANY, PLAIN, TRAINED, N
+from harness import HERE, Row
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from settings import N
 from startup import CACHED, COLD, EAGER
 from tasks import COARSE_ANGLE_DEG, COARSE_SHIFT, ITERATIONS
-from throughput import BACKWARD, FORWARD
+from timing import BACKWARD, FORWARD
 
 from kornia_pnpnet import PnPNet
 from kornia_pnpnet.core.files import atomic_open
 from kornia_pnpnet.core.tables import markdown_table
+from kornia_pnpnet.evaluation.figures import style
 from kornia_pnpnet.metrics import SuccessRate
 
 PAGE = HERE.parent / "docs" / "performance.md"
@@ -34,8 +36,6 @@ WAYS = (
 DRAWN = ("p3p-ransac", "kornia-dlt", "pypose-parts")
 #: Other libraries.
 PEERS = ("poselib", "pycolmap", "opencv-ransac", "kornia-rs")
-
-Row = Mapping[str, Any]
 
 
 def three_digits(value: float) -> str:
@@ -288,7 +288,7 @@ def page(results: Mapping[str, Mapping[str, Any]], gpu: Mapping[str, Any] | None
     options: dict[str, Any] = {"trim_blocks": True, "keep_trailing_newline": True, "undefined": StrictUndefined}
     environment = Environment(loader=FileSystemLoader(HERE), autoescape=False, **options)
     return environment.get_template("performance.md.jinja").render(
-        **{"trained": TRAINED, "plain": PLAIN, "one": ONE, "any": ANY, "n": N, "m": ITERATIONS},
+        **{"trained": TRAINED, "plain": PLAIN, "any": ANY, "n": N, "m": ITERATIONS},
         **{"angle": COARSE_ANGLE_DEG, "shift": 100 * COARSE_SHIFT},
         shipped={"m": shipped.refine.m, "views": shipped.views},
         made=results["throughput"]["environment"],
@@ -311,6 +311,55 @@ def page(results: Mapping[str, Mapping[str, Any]], gpu: Mapping[str, Any] | None
     )
 
 
+# -- pictures ----------------------------------------------------------------------------------------------------------
+
+# Lines by the end of a name, which says how the solver runs. Without such an end the line is dashed.
+_WAYS = {" compiled": "-", " compiled whole": ":", " ONNX": "-.", " packaged": ":"}
+_LAST_SHARE = 0.99  # share of the calls drawn; other programs delayed the slowest
+
+
+def plot_times(
+    path: Path, title: str, panels: Mapping[str, Sequence[Mapping[str, Any]]], *, against: str, label: str
+) -> Path:
+    """Draw the time per problem against a column of the rows, one panel for each list of rows."""
+    tables = {name: pd.DataFrame(rows).assign(solver=lambda table: table.contender) for name, rows in panels.items()}
+    columns = {"median_us": "us", against: label}
+    curves = [(name, table.rename(columns=columns), "us") for name, table in tables.items()]
+    return style.draw_curves(path, [title], curves, label, _looks(pd.concat(tables.values()).contender))
+
+
+@style.themed
+def plot_latency(path: Path, title: str, rows: Sequence[Mapping[str, Any]]) -> Path:
+    """Draw the share of the calls with one problem that end within a time, without the slowest hundredth."""
+    looks = _looks(row["contender"] for row in rows)
+    figure = style.make_figure(style.WIDTH, 4.8, title)
+    axes = figure.subplots()
+    for name, look in looks.items():
+        for row in (row for row in rows if row["contender"] == name):
+            shares = np.linspace(0, 1, len(row["quantiles_us"]))
+            kept = shares <= _LAST_SHARE
+            x, y = np.array(row["quantiles_us"])[kept] / 1e3, 100 * shares[kept]
+            axes.plot(x, y, **look, markevery=max(1, len(x) // 5))
+    axes.set(xlabel="ms for one problem", ylabel="calls done (%)", ylim=(0, 100))
+    style.log_scale(axes, "x")
+    style.draw_legend(figure, looks)
+    return style.save(figure, path)
+
+
+def _looks(names: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """Styles in order: a solver, and behind it the ways in which it also runs."""
+    there = set(names)
+    bases = {next((name.removesuffix(way) for way in _WAYS if name.endswith(way)), name) for name in there}
+    found = {}
+    for base, look in style.solver_styles(bases).items():
+        for way, line in {"": "--", **_WAYS}.items():
+            if base + way in there:
+                alone = not any(base + way in there for way in _WAYS)
+                shape = look["color"], look["marker"], look["linestyle"] if alone else line
+                found[base + way] = style.line_style(*shape, ours=style.is_ours(base) and line != "--")
+    return found
+
+
 def load_parts(folder: Path) -> tuple[dict[str, Any], dict[str, Any] | None]:
     """The results files, and the results file of a GPU when there is one."""
     results = {part: json.loads((folder / f"{part}.json").read_text(encoding="utf-8")) for part in PARTS}
@@ -320,8 +369,6 @@ def load_parts(folder: Path) -> tuple[dict[str, Any], dict[str, Any] | None]:
 
 def render(folder: Path, path: Path) -> None:
     """Write the page and its pictures from the results files of a folder."""
-    from pictures import plot_latency, plot_times  # needs matplotlib
-
     results, gpu = load_parts(folder)
     rows = [row for row in results["throughput"]["rows"] if row["threads"] == 1 and is_drawn(row["contender"])]
     pictures, size = path.parent / path.stem, results["throughput"]["settings"]["problems"]

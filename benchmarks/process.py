@@ -37,9 +37,8 @@ def main(request: dict[str, Any]) -> dict[str, Any]:
     import kornia_pnpnet  # noqa: F401
 
     package_s = time.perf_counter() - start
-    from contenders import CONTENDERS
+    from contenders import CONTENDERS, N, draw
     from harness import peak_bytes, threads
-    from settings import N, draw
 
     start = time.perf_counter()
     contender = CONTENDERS[request["contender"]]()

@@ -11,12 +11,11 @@ with ``+ratio`` at the end gets 1 - ratio as the confidence of each pair, one wi
 ``--pictures`` draws failures of the first solver: of each scene the far-off pose with the most inliers under the
 reference pose, and of these the three with the most.
 
-``cost`` times solvers by share of outliers and number of pairs.
+``--batch`` gives the numbers of problems in a call. ``cost`` times solvers by share of outliers and number of pairs.
 """
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import time
 from collections.abc import Mapping, Sequence
@@ -25,14 +24,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from harness import load, say, threads
+from harness import Row, parser, pivot, recorded, say, threads
 from kornia.core.exceptions import BaseError
+from kornia.geometry.epipolar import (
+    fundamental_from_projections,
+    left_to_right_epipolar_distance,
+    right_to_left_epipolar_distance,
+)
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from kornia_pnpnet.core.environment import environment
+from kornia_pnpnet import pose_errors
 from kornia_pnpnet.core.files import read_npz
-from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.data.colmap import _find_model
 from kornia_pnpnet.evaluation import SeesTruth
 from kornia_pnpnet.evaluation.named_solvers import load_solver
@@ -40,12 +43,10 @@ from kornia_pnpnet.evaluation.plots import BLUE, GREY, ORANGE, WIDTH, make_figur
 from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.metrics import reliability
 from kornia_pnpnet.peers.base import PeerSolver
-from kornia_pnpnet.result import PnPResult, Pose
-from kornia_pnpnet.result import Problems as SolverProblems
+from kornia_pnpnet.result import PnPResult, Pose, Problems
 
 Floats = NDArray[np.float64]
 Whole = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 # A pair is an inlier when its reprojection error under the reference pose is below this many pixels, in images of 1000
 # to 1600 pixels. A problem with fewer inliers than MIN_INLIERS does not count in rates.
@@ -72,7 +73,8 @@ PAIRS = (0, 25, 50, 100, 200, 400, 501)
 PICTURES = 3
 # Problems in a batch of `cost`, and problems of a group that has a row.
 COST_BATCH, MIN_GROUP = 250, 20
-FIELDS = ("world", "pixels", "ratio", "mask", "K", "R", "t", "kind", "error_px")
+# Arrays of a file: of pairs (P, N, ...), and of problems (P, ...).
+OF_PAIRS, OF_PROBLEMS = ("world", "pixels", "ratio", "mask", "error_px"), ("K", "R", "t", "kind")
 
 
 class View(NamedTuple):
@@ -97,47 +99,35 @@ class View(NamedTuple):
         return self.intrinsics @ np.column_stack([self.rotation, self.translation])
 
 
-class Problems(NamedTuple):
+class Matches(NamedTuple):
     """Problems of one or several scenes, padded to the same number of pairs."""
 
-    world: Tensor  # (P, N, 3)
-    pixels: Tensor  # (P, N, 2)
-    ratio: Tensor  # (P, N)
+    problems: Problems  # with the reference poses; inliers have an error below INLIER_PX under them
     mask: Tensor  # (P, N)
-    intrinsics: Tensor  # (P, 3, 3)
-    rotation: Tensor  # (P, 3, 3)
-    translation: Tensor  # (P, 3)
-    kind: Tensor  # (P,)
+    ratio: Tensor  # (P, N)
     error_px: Tensor  # (P, N)
+    kind: Tensor  # (P,)
     scene: tuple[str, ...]  # P names
-
-    @property
-    def inliers(self) -> Tensor:
-        """Pairs that are right under the reference pose, shape (P, N)."""
-        return self.mask & (self.error_px < INLIER_PX)
 
     @property
     def outlier_share(self) -> Tensor:
         """Share of the pairs that are outliers, shape (P,)."""
-        return 1 - self.inliers.sum(1) / self.mask.sum(1)
+        return 1 - self.problems.inliers.sum(1) / self.mask.sum(1)
 
     @property
     def counts(self) -> Tensor:
         """Problems that count in rates, shape (P,)."""
-        return self.inliers.sum(1) >= MIN_INLIERS
+        return self.problems.inliers.sum(1) >= MIN_INLIERS
 
-    @property
-    def depth(self) -> Tensor:
-        """Median depth of the inliers, shape (P,); NaN without an inlier."""
-        depth = (self.world @ self.rotation.mT + self.translation[:, None])[..., 2]
-        return depth.where(self.inliers, torch.nan).nanmedian(1).values
+    def of_scene(self, name: str) -> Tensor:
+        """Whether a problem belongs to a scene, shape (P,)."""
+        return torch.tensor([scene == name for scene in self.scene])
 
 
 class Solved(NamedTuple):
     """What a solver found for all problems."""
 
-    rotation: Tensor  # (P, 3, 3)
-    translation: Tensor  # (P, 3)
+    pose: Pose
     ok: Tensor  # (P,)
     milliseconds: Tensor  # (P,) of the processor, the same for all problems of a batch
     probability: Tensor  # (P,) NaN where the solver has none
@@ -186,19 +176,14 @@ def nearest(query: NDArray[np.float32], train: NDArray[np.float32]) -> tuple[Who
     return two[rows, first].astype(np.int64), distances[rows, first] / np.maximum(distances[rows, 1 - first], 1e-9)
 
 
-def agree(first: View, second: View, pairs: Whole) -> Mask:
+def agree(first: View, second: View, pairs: Whole) -> NDArray[np.bool_]:
     """Whether matched keypoints, shape (M, 2), lie near each other's epipolar line under the poses of the model."""
-    rotation = second.rotation @ first.rotation.T
-    x, y, z = second.translation - rotation @ first.translation
-    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    fundamental = np.linalg.inv(second.intrinsics).T @ skew @ rotation @ np.linalg.inv(first.intrinsics)
-    ones = np.ones((len(pairs), 1))
-    one = np.hstack([first.pixels[pairs[:, 0]], ones])
-    two = np.hstack([second.pixels[pairs[:, 1]], ones])
-    lines_two, lines_one = one @ fundamental.T, two @ fundamental
-    residual = np.abs((two * lines_two).sum(1))
-    bound = EPIPOLAR_PX * np.minimum(np.linalg.norm(lines_one[:, :2], axis=1), np.linalg.norm(lines_two[:, :2], axis=1))
-    return residual < bound
+    one, two = (torch.from_numpy(view.projection)[None] for view in (first, second))
+    fundamental = fundamental_from_projections(one, two)
+    points = [torch.from_numpy(x.pixels[at])[None] for x, at in ((first, pairs[:, 0]), (second, pairs[:, 1]))]
+    right = left_to_right_epipolar_distance(points[0], points[1], fundamental)[0]
+    left = right_to_left_epipolar_distance(points[0], points[1], fundamental)[0]
+    return ((right < EPIPOLAR_PX) & (left < EPIPOLAR_PX)).numpy()
 
 
 def tracks(views: Sequence[View]) -> list[Whole]:
@@ -306,7 +291,7 @@ def choose_images(query: View, database: Sequence[View], points: Sequence[Floats
     return [ranked[i] for i in at]
 
 
-def make(folder: Path, out: Path, *, features: int, every: int, views: int, pairs: int, seed: int) -> Problems:
+def make(folder: Path, out: Path, *, features: int, every: int, views: int, pairs: int, seed: int) -> Matches:
     """Make the problems of one scene and write them to ``out``.
 
     Args:
@@ -338,146 +323,138 @@ def make(folder: Path, out: Path, *, features: int, every: int, views: int, pair
                     continue
                 at = generator.permutation(at)[:pairs]
                 error = reprojection(query, world[at], query.pixels[at])
-                values = (world[at], query.pixels[at], ratio[at], np.ones(len(at), dtype=bool))
-                pose = (query.intrinsics, query.rotation, query.translation, kind, error)
+                values = (world[at], query.pixels[at], ratio[at], np.ones(len(at), dtype=bool), error)
+                pose = (query.intrinsics, query.rotation, query.translation, kind)
                 names = {"query": query.name, "database": database[number].name}
-                rows.append({**dict(zip(FIELDS, (*values, *pose), strict=True)), **names})
+                rows.append({**dict(zip((*OF_PAIRS, *OF_PROBLEMS), (*values, *pose), strict=True)), **names})
     if not rows:
         raise ValueError(f"{folder} has no problems.")
     longest = max(len(row["ratio"]) for row in rows)
     for row in rows:
-        for name in ("world", "pixels", "ratio", "mask", "error_px"):
+        for name in OF_PAIRS:
             width = [(0, longest - len(row[name]))] + [(0, 0)] * (row[name].ndim - 1)
             row[name] = np.pad(row[name], width, constant_values=np.inf if name == "error_px" else 0)
-    arrays = {name: np.stack([row[name] for row in rows]) for name in (*FIELDS, "query", "database")}
-    for name in ("ratio", "error_px"):
-        arrays[name] = arrays[name].astype(np.float32)
+    arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+    arrays |= {name: arrays[name].astype(np.float32) for name in ("ratio", "error_px")}
     out.parent.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(out, allow_pickle=False, **arrays)
     return read([out])
 
 
-def read(paths: Sequence[Path]) -> Problems:
+def read(paths: Sequence[Path]) -> Matches:
     """Read the problems of several files into one batch. A file's name is the name of its scene."""
-    files = [read_npz(path) for path in paths]
+    files = [
+        {name: torch.from_numpy(x) for name, x in read_npz(path, OF_PAIRS + OF_PROBLEMS).items()} for path in paths
+    ]
     longest = max(file["ratio"].shape[1] for file in files)
-    columns: dict[str, list[Tensor]] = {name: [] for name in FIELDS}
-    for file, name in itertools.product(files, FIELDS):
-        values = torch.from_numpy(file[name])
-        if name in ("world", "pixels", "ratio", "mask", "error_px"):
-            padded = values.new_zeros(len(values), longest, *values.shape[2:])
-            padded[:, : values.shape[1]] = values
-            values = padded
-        columns[name].append(values if values.dtype == torch.bool else values.double())
+    for file in files:
+        for name in OF_PAIRS:
+            padded = file[name].new_zeros(len(file[name]), longest, *file[name].shape[2:])
+            padded[:, : file[name].shape[1]] = file[name]
+            file[name] = padded
+    one = {name: torch.cat([file[name] for file in files]) for name in (*OF_PAIRS, *OF_PROBLEMS)}
+    one |= {name: x.double() for name, x in one.items() if name != "mask"}
+    pose, inliers = Pose(one["R"], one["t"]), one["mask"] & (one["error_px"] < INLIER_PX)
+    problems = Problems(one["world"], one["pixels"], one["K"], pose, inliers)
     scenes = tuple(path.stem for path, file in zip(paths, files, strict=True) for _ in file["kind"])
-    return Problems._make([*(torch.cat(columns[name]) for name in FIELDS), scenes])
+    return Matches(problems, one["mask"], one["ratio"], one["error_px"], one["kind"], scenes)
 
 
 # --- Solvers on problems ----------------------------------------------------------------------------------------------
 
 
-def batches(problems: Problems) -> list[Tensor]:
-    """Indices of problems that count, of one kind and with similar numbers of pairs, at most ``BATCH`` of them."""
-    pairs = problems.mask.sum(1)
-    kinds = ((problems.counts & (problems.kind == kind)).nonzero()[:, 0] for kind in range(len(KINDS)))
-    return [part for at in kinds if len(at) for part in at[pairs[at].argsort()].split(BATCH)]
+def batches(matches: Matches, size: int) -> list[Tensor]:
+    """Indices of problems that count, of one kind and with similar numbers of pairs, at most ``size`` of them."""
+    pairs = matches.mask.sum(1)
+    kinds = ((matches.counts & (matches.kind == kind)).nonzero()[:, 0] for kind in range(len(KINDS)))
+    return [part for at in kinds if len(at) for part in at[pairs[at].argsort()].split(size)]
 
 
-def batch(problems: Problems, at: Tensor, dtype: torch.dtype) -> tuple[SolverProblems, Tensor, Tensor]:
-    """Some of the problems without common padding, the ratios, and the points that became the origins.
+def batch(matches: Matches, at: Tensor) -> tuple[tuple[Problems, Tensor, Tensor], Tensor]:
+    """Some of the problems in float32 without common padding, their masks and ratios, and their origins.
 
     A world far from its origin would lose digits in float32. Padding has the ratio 1.
     """
-    mask = problems.mask[at]
-    longest = int(mask.sum(1).max())
-    origin = (problems.world[at] * mask[..., None]).sum(1) / mask.sum(1, keepdim=True)
-    world = problems.world[at] - origin[:, None]
-    translation = problems.translation[at] + (problems.rotation[at] @ origin[..., None])[..., 0]
-    made = SolverProblems(
-        world[:, :longest].to(dtype),
-        problems.pixels[at][:, :longest].to(dtype),
-        problems.intrinsics[at].to(dtype),
-        Pose(problems.rotation[at].to(dtype), translation.to(dtype)),
-        problems.inliers[at][:, :longest],
+    mask = matches.mask[at]
+    problems, longest = matches.problems.map(lambda x: x[at]), int(mask.sum(1).max())
+    rotation, translation = problems.pose
+    origin = (problems.world_points * mask[..., None]).sum(1) / mask.sum(1, keepdim=True)
+    moved = problems._replace(
+        world_points=(problems.world_points - origin[:, None])[:, :longest],
+        img_points=problems.img_points[:, :longest],
+        pose=Pose(rotation, translation + (rotation @ origin[..., None])[..., 0]),
+        inliers=problems.inliers[:, :longest],
     )
-    return made, problems.ratio[at].where(mask, 1.0)[:, :longest].to(dtype), origin
+    given = moved.map(lambda x: x if x.dtype == torch.bool else x.float())
+    return (given, mask[:, :longest], matches.ratio[at].where(mask, 1.0)[:, :longest].float()), origin
 
 
-def call(solver: nn.Module, spec: str, given: SolverProblems, mask: Tensor, ratio: Tensor) -> PnPResult:
-    """Solve a batch; a bound sees the reference poses, and other libraries told the ratio get the best pairs first."""
-    if isinstance(solver, SeesTruth):
+def call(solver: nn.Module, spec: str, given: Problems, mask: Tensor, ratio: Tensor) -> PnPResult:
+    """Solve a batch; a bound sees the reference poses, and other libraries with a ratio get the best pairs first."""
+    if isinstance(solver, Bound):
         return solver.solve_with_truth(given)
+    known: dict[str, Any] = {}
     if CONFIDENCE in spec and isinstance(solver, PeerSolver):
-        order = ratio.argsort(dim=1, stable=True)
-        rows = torch.arange(len(order))[:, None]
+        order, rows = ratio.argsort(dim=1, stable=True), torch.arange(len(ratio))[:, None]
         given = given._replace(world_points=given.world_points[rows, order], img_points=given.img_points[rows, order])
-        return solver(given.world_points, given.img_points, given.intrinsics, mask=mask.gather(1, order))
-    told: dict[str, Any] = {"confidence": 1 - ratio} if CONFIDENCE in spec else {}
-    told |= TOLD_SIGMAS if SIGMAS in spec else {}
-    return solver(given.world_points, given.img_points, given.intrinsics, mask=mask, **told)
+        mask = mask.gather(1, order)
+    elif CONFIDENCE in spec:
+        known["confidence"] = 1 - ratio
+    known |= TOLD_SIGMAS if SIGMAS in spec else {}
+    return solver(*given[:3], mask=mask, **known)
+
+
+def timed(solver: nn.Module, spec: str, given: tuple[Problems, Tensor, Tensor]) -> tuple[PnPResult, float]:
+    """The result of :func:`call`, and milliseconds of the processor for a problem."""
+    start = time.process_time()
+    result = call(solver, spec, *given)
+    return result, 1e3 * (time.process_time() - start) / len(given[1])
 
 
 @torch.no_grad()
-def solve(solvers: Mapping[str, nn.Module], problems: Problems, dtype: torch.dtype) -> dict[str, Solved]:
+def solve(solvers: Mapping[str, nn.Module], matches: Matches, size: int) -> dict[str, Solved]:
     """Solve all problems that count with all solvers, which take turns on each batch."""
     found = {}
     for spec in solvers:
-        zeros = [torch.zeros_like(x) for x in (problems.rotation, problems.translation, problems.counts)]
-        found[spec] = Solved(*zeros, *torch.full((2, len(problems.kind)), torch.nan, dtype=torch.float64))
-    parts = batches(problems)
+        pose, ok = Pose(*map(torch.zeros_like, matches.problems.pose)), torch.zeros_like(matches.counts)
+        found[spec] = Solved(pose, ok, *torch.full((2, len(ok)), torch.nan, dtype=torch.float64))
+    parts = batches(matches, size)
     for number, at in enumerate(parts):
-        given, ratio, origin = batch(problems, at, dtype)
-        mask = problems.mask[at][:, : ratio.shape[1]]
+        given, origin = batch(matches, at)
         for spec, solver in solvers.items():
             say(f"batch {number + 1} of {len(parts)}: {spec}")
-            call(solver, spec, given.map(lambda value: value[:2]), mask[:2], ratio[:2])  # not timed: slower
-            start = time.process_time()
-            result = call(solver, spec, given, mask, ratio)
-            milliseconds = 1e3 * (time.process_time() - start) / len(at)
+            call(solver, spec, given[0].map(lambda x: x[:2]), given[1][:2], given[2][:2])  # not timed: slower
             one = found[spec]
-            one.rotation[at] = result.rotation.double()
-            one.translation[at] = result.translation.double() - (one.rotation[at] @ origin[..., None])[..., 0]
+            result, one.milliseconds[at] = timed(solver, spec, given)
+            one.pose.rotation[at] = rotation = result.rotation.double()
+            one.pose.translation[at] = result.translation.double() - (rotation @ origin[..., None])[..., 0]
             one.ok[at] = result.ok
-            one.milliseconds[at] = milliseconds
             if result.probability is not None:
                 one.probability[at] = result.probability.double()
     return found
 
 
-def pose_errors(problems: Problems, rotation: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
-    """Rotation errors in degrees and distances of the camera centres by the median depth of the inliers."""
-    turned = rotation - problems.rotation  # |A - B| = 2 sqrt(2) sin(angle / 2), also precise for small angles
-    angle = 2 * torch.asin((turned.flatten(1).norm(dim=1) / 8**0.5).clamp(max=1)).rad2deg()
-    centres = (
-        (r.mT @ t[..., None])[..., 0] for r, t in ((rotation, translation), (problems.rotation, problems.translation))
-    )
-    return angle, (next(centres) - next(centres)).norm(dim=1) / problems.depth
+def ranges(
+    limits: Sequence[float], title: str, upper: float = 0.0, scale: float = 1.0
+) -> dict[str, tuple[float, float]]:
+    """Ranges between limits by a title that holds both ends; the upper end is shown less ``upper``."""
+    return {title.format(scale * low, scale * (high - upper)): (low, high) for low, high in itertools.pairwise(limits)}
 
 
-def groups(problems: Problems) -> dict[tuple[str, str], Tensor]:
-    """Problems that count, by kind and share of outliers, and by kind and scene."""
-    share, found = problems.outlier_share, {}
+BY_SHARE, BY_PAIRS = ranges(SHARES, "{:.0f}–{:.0f} %", scale=100), ranges(PAIRS, "{:.0f}–{:.0f} pairs", upper=1)
+
+
+def groups(matches: Matches) -> dict[tuple[str, str], Tensor]:
+    """Problems that count, by kind and share of outliers, by kind and number of pairs, and by kind and scene."""
+    found = {}
     for kind, title in enumerate(KINDS):
-        chosen = problems.counts & (problems.kind == kind)
-        found[title, "all"] = chosen
-        for low, high in itertools.pairwise(SHARES):
-            found[title, share_title(low, high)] = chosen & (share >= low) & (share < high)
-        count = problems.mask.sum(1)
-        for least, most in itertools.pairwise(PAIRS):
-            found[title, pairs_title(least, most)] = chosen & (count >= least) & (count < most)
-        for scene in dict.fromkeys(problems.scene):
-            found[title, scene] = chosen & torch.tensor([name == scene for name in problems.scene])
+        found[title, "all"] = chosen = matches.counts & (matches.kind == kind)
+        for values, limits in ((matches.outlier_share, BY_SHARE), (matches.mask.sum(1), BY_PAIRS)):
+            for name, (low, high) in limits.items():
+                found[title, name] = chosen & (values >= low) & (values < high)
+        for scene in dict.fromkeys(matches.scene):
+            found[title, scene] = chosen & matches.of_scene(scene)
     return found
-
-
-def pairs_title(least: int, most: int) -> str:
-    """Title of a group of numbers of pairs."""
-    return f"{least}–{most - 1} pairs"
-
-
-def share_title(low: float, high: float) -> str:
-    """Title of a group of shares of outliers."""
-    return f"{100 * low:.0f}–{100 * high:.0f} %"
 
 
 def rate(values: Tensor) -> float | None:
@@ -485,125 +462,106 @@ def rate(values: Tensor) -> float | None:
     return float(values.double().mean()) if len(values) else None
 
 
+def load_solvers(specs: Sequence[str]) -> dict[str, nn.Module]:
+    """Solvers and bounds as for :func:`load_solver`, in float32, with CONFIDENCE or SIGMAS at the end."""
+    return {spec: load_solver(spec.partition("+")[0]).float() for spec in specs}
+
+
 def measure(
-    paths: Sequence[Path], specs: Sequence[str], dtype: torch.dtype, split: str, pictures: Path | None = None
+    matches: Matches, specs: Sequence[str], pictures: Path | None = None, sizes: Sequence[int] = (BATCH,)
 ) -> dict[str, Any]:
-    """Solve the problems of the files.
+    """Solve the problems.
 
     Args:
-        paths: files of :func:`make`.
-        specs: solvers and bounds as for :func:`load_solver`, with :data:`CONFIDENCE` or :data:`SIGMAS` at the end.
-        dtype: dtype that the solvers get.
-        split: whether the scenes were seen while choosing, in words.
+        matches: problems of :func:`read`.
+        specs: as for :func:`load_solvers`.
         pictures: folder for pictures of failures.
+        sizes: numbers of problems in a call; all solvers run with each, and other libraries always get one problem.
 
     Returns:
-        ``environment``, ``settings``, ``load_average`` (before and after), ``counts``, ``rows`` (one for each solver,
-        kind and group), ``reliability`` by solver, and ``failures`` in the pictures.
+        ``counts``, ``rows`` (one for each solver, kind, group and size), ``reliability`` by solver, and ``failures`` in
+        the pictures.
     """
-    before = load()
-    problems = read(paths)
-    solvers = {spec: load_solver(spec.partition("+")[0]).to(dtype) for spec in specs}
+    solvers, chosen = load_solvers(specs), groups(matches)
     with threads():
-        solved = solve(solvers, problems, dtype)
-    chosen = groups(problems)
-    rows = []
+        solved = {size: solve(solvers, matches, size) for size in sizes}
+    rows: list[dict[str, Any]] = []
     curves: dict[str, Any] = {}
     failures: list[dict[str, Any]] = []
-    for spec, one in solved.items():
-        right, far = judge(problems, one)
-        told_chance = problems.counts & one.probability.isfinite()
-        if told_chance.any():
-            curve = reliability(one.probability[told_chance], ~far[told_chance])._asdict()
+    for size, spec in itertools.product(sizes, specs):
+        one = solved[size][spec]
+        right, far = judge(matches, one.pose)
+        predicted = matches.counts & one.probability.isfinite()
+        if predicted.any():
+            curve = reliability(one.probability[predicted], ~far[predicted])._asdict()
             curves[spec] = {name: values.nan_to_num(0.0).tolist() for name, values in curve.items()}
         for (kind, group), at in chosen.items():
+            place = {"solver": spec, "kind": kind, "group": group, "batch": size, "count": int(at.sum())}
             rates = {"success": rate(right[at]), "far": rate(far[at])}
-            told = {"ok_of_right": rate(one.ok[at & right]), "ok_of_far": rate(one.ok[at & far])}
-            row = {"solver": spec, "kind": kind, "group": group, "count": int(at.sum()), **rates, **told}
-            rows.append({**row, "ms_per_problem": float(one.milliseconds[at].mean()) if at.any() else None})
+            oks = {"ok_of_right": rate(one.ok[at & right]), "ok_of_far": rate(one.ok[at & far])}
+            ms = float(one.milliseconds[at].mean()) if at.any() else None
+            rows.append({**place, **rates, **oks, "ms_per_problem": ms})
         if pictures is not None and not failures:
-            failures = [draw_failure(problems, one, at, pictures) for at in worst_failures(problems, far)]
-    limits = {"inlier_px": INLIER_PX, "min_inliers": MIN_INLIERS, "right": RIGHT, "far": FAR}
-    settings: dict[str, Any] = {
-        "files": [path.name for path in paths],
-        "split": split,
-        "solvers": list(specs),
-        "dtype": str(dtype),
-    }
-    settings |= {"shares": SHARES, "pairs": PAIRS, "told": TOLD_SIGMAS, **limits}
-    made = {"environment": environment(), "settings": settings, "load_average": [before, load()]}
-    found = {"counts": describe(problems), "rows": rows, "reliability": curves, "failures": failures}
-    return {**made, **found}
+            failures = [draw_failure(matches, one, at, pictures) for at in worst_failures(matches, far)]
+    return {"counts": describe(matches), "rows": rows, "reliability": curves, "failures": failures}
 
 
 @torch.no_grad()
-def measure_cost(paths: Sequence[Path], specs: Sequence[str], dtype: torch.dtype) -> dict[str, Any]:
+def measure_cost(matches: Matches, specs: Sequence[str]) -> dict[str, Any]:
     """Time solvers on the matches without a ratio test, apart for every share of outliers and number of pairs.
 
     Args:
-        paths: files of :func:`make`.
-        specs: solvers as for :func:`measure`.
-        dtype: dtype that the solvers get.
+        matches: problems of :func:`read`.
+        specs: as for :func:`load_solvers`.
 
     Returns:
-        ``environment``, ``settings``, ``load_average`` and ``rows``: the milliseconds of a problem in a batch of a
-        group's problems, repeated in turns.
+        ``rows``: the milliseconds of a problem in a batch of a group's problems, repeated in turns.
     """
-    before, problems = load(), read(paths)
-    solvers = {spec: load_solver(spec.partition("+")[0]).to(dtype) for spec in specs}
-    by_share = [share_title(*limits) for limits in itertools.pairwise(SHARES)]
-    by_pairs = [pairs_title(*limits) for limits in itertools.pairwise(PAIRS)]
-    chosen, rows = groups(problems), []
+    solvers, chosen, rows = load_solvers(specs), groups(matches), []
     with threads():
-        for group in (*by_share, *by_pairs):
+        for group in (*BY_SHARE, *BY_PAIRS):
             at = chosen[KINDS[1], group].nonzero()[:, 0]
             if len(at) < MIN_GROUP:
                 continue
-            given, ratio, _ = batch(problems, at[torch.arange(COST_BATCH) % len(at)], dtype)
-            mask = problems.mask[at[torch.arange(COST_BATCH) % len(at)]][:, : ratio.shape[1]]
+            given, _ = batch(matches, at[torch.arange(COST_BATCH) % len(at)])
             for spec, solver in solvers.items():
                 say(f"{group}: {spec}")
-                start = time.process_time()
-                call(solver, spec, given, mask, ratio)
-                milliseconds = 1e3 * (time.process_time() - start) / COST_BATCH
-                rows.append({"solver": spec, "group": group, "ms_per_problem": milliseconds})
-    settings = {"files": [path.name for path in paths], "solvers": list(specs), "batch": COST_BATCH}
-    settings |= {"shares": SHARES, "pairs": PAIRS}
-    return {"environment": environment(), "settings": settings, "load_average": [before, load()], "rows": rows}
+                rows.append({"solver": spec, "group": group, "ms_per_problem": timed(solver, spec, given)[1]})
+    return {"rows": rows}
 
 
-def judge(problems: Problems, solved: Solved) -> tuple[Tensor, Tensor]:
+def judge(matches: Matches, pose: Pose) -> tuple[Tensor, Tensor]:
     """Which poses are right, and which are far off, bool (P,)."""
-    angle, distance = pose_errors(problems, solved.rotation, solved.translation)
+    problems = matches.problems
+    centres = [(x.rotation.mT @ x.translation[..., None])[..., 0] for x in (pose, problems.pose)]
+    depth = problems.true_cam_points[..., 2].where(problems.inliers, torch.nan).nanmedian(1).values
+    angle, distance = pose_errors(pose, problems.pose).rotation_error_deg, (centres[0] - centres[1]).norm(dim=1) / depth
     return (angle < RIGHT[0]) & (distance < RIGHT[1]), (angle > FAR[0]) | (distance > FAR[1])
 
 
-def worst_failures(problems: Problems, far: Tensor) -> list[int]:
+def worst_failures(matches: Matches, far: Tensor) -> list[int]:
     """Of each scene the far-off pose with the most inliers under the reference pose, the most first."""
-    inliers = torch.where(problems.counts & far, problems.inliers.sum(1), -1)
+    inliers = torch.where(matches.counts & far, matches.problems.inliers.sum(1), -1)
     best: dict[str, int] = {}
     for at in inliers.argsort(descending=True, stable=True).tolist():
         if inliers[at] >= 0:
-            best.setdefault(problems.scene[at], at)
-    return sorted(best.values(), key=lambda at: -int(inliers[at]))[:PICTURES]
+            best.setdefault(matches.scene[at], at)
+    return list(best.values())[:PICTURES]
 
 
-def draw_failure(problems: Problems, solved: Solved, at: int, folder: Path) -> dict[str, Any]:
-    """Draw the pairs of a problem under the reference pose and under a wrong pose, and tell how many fit each.
+def draw_failure(matches: Matches, solved: Solved, at: int, folder: Path) -> dict[str, Any]:
+    """Draw the pairs of a problem under the reference pose and under a wrong pose, and count how many fit each.
 
     The picture has pixels and projections, no photograph.
     """
-    mask = problems.mask[at]
-    world, pixels = problems.world[at][mask], problems.pixels[at][mask]
-    poses = {
-        "reference pose": (problems.rotation[at], problems.translation[at]),
-        "pose that was found": (solved.rotation[at], solved.translation[at]),
-    }
+    mask, problem = matches.mask[at], matches.problems.map(lambda x: x[at])
+    world, pixels = problem.world_points[mask], problem.img_points[mask]
+    poses = {"reference pose": problem.pose, "pose that was found": Pose(*(x[at] for x in solved.pose))}
     figure = make_figure(WIDTH, 3.1)
     panels, fits = figure.subplots(1, 2, sharex=True, sharey=True), []
-    for axes, (title, (rotation, translation)) in zip(panels, poses.items(), strict=True):
-        cam = world @ rotation.T + translation
-        image = cam @ problems.intrinsics[at].T
+    for axes, (title, pose) in zip(panels, poses.items(), strict=True):
+        cam = world @ pose.rotation.T + pose.translation
+        image = cam @ problem.intrinsics.T
         seen = image[:, :2] / torch.where(cam[:, 2:] > 0, cam[:, 2:], torch.nan)
         fit = (seen - pixels).norm(dim=1) < INLIER_PX
         fits.append(fit)
@@ -613,140 +571,96 @@ def draw_failure(problems: Problems, solved: Solved, at: int, folder: Path) -> d
         axes.set(title=f"{title}: {int(fit.sum())} of {len(fit)}", aspect="equal")
     axes.invert_yaxis()
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
-    name = f"real_failure_{problems.scene[at]}.png"
+    name = f"real_failure_{matches.scene[at]}.png"
     save(figure, folder / name)
     right, wrong = fits
-    spread = [float(pixels[fit].std(0).norm()) if fit.sum() > 1 else 0.0 for fit in (torch.ones_like(right), wrong)]
-    points = len(torch.unique(world[wrong], dim=0))
-    numbers = {
-        "pairs": len(right),
-        "right": int(right.sum()),
-        "found": int(wrong.sum()),
-        "both": int((right & wrong).sum()),
-    }
-    told = {"ok": bool(solved.ok[at]), "points": points, "spread": spread[1] / spread[0]}
-    return {"picture": name, "scene": problems.scene[at], "kind": KINDS[int(problems.kind[at])], **numbers, **told}
+    spread = float(pixels[wrong].std(0).norm() / pixels.std(0).norm()) if wrong.sum() > 1 else 0.0
+    numbers = {"right": int(right.sum()), "found": int(wrong.sum()), "both": int((right & wrong).sum())}
+    place = {"picture": name, "scene": matches.scene[at], "kind": KINDS[int(matches.kind[at])], "pairs": len(right)}
+    return {**place, **numbers, "ok": bool(solved.ok[at]), "spread": spread}
 
 
-def describe(problems: Problems) -> list[dict[str, Any]]:
+def describe(matches: Matches) -> list[dict[str, Any]]:
     """Numbers of problems by scene, kind and share of outliers, and the median reprojection error of the inliers."""
-    found = []
-    for scene in dict.fromkeys(problems.scene):
-        mine = torch.tensor([name == scene for name in problems.scene])
-        errors = problems.error_px[mine][problems.inliers[mine]]
+    found, chosen = [], groups(matches)
+    for scene in dict.fromkeys(matches.scene):
+        mine = matches.of_scene(scene)
+        errors = matches.error_px[mine][matches.problems.inliers[mine]]
         row: dict[str, Any] = {"scene": scene, "median_error_px": float(errors.median()) if len(errors) else None}
         for kind, title in enumerate(KINDS):
-            at = mine & (problems.kind == kind)
-            share = problems.outlier_share[at & problems.counts]
-            bins = [int(((share >= low) & (share < high)).sum()) for low, high in itertools.pairwise(SHARES)]
-            pairs = problems.mask[at & problems.counts].sum(1).double()
-            middle = float(pairs.median()) if len(pairs) else None
-            row[title] = {"problems": int(at.sum()), "counted": len(share), "shares": bins, "median_pairs": middle}
+            shares = [int((chosen[title, name] & mine).sum()) for name in BY_SHARE]
+            number = int((mine & (matches.kind == kind)).sum())
+            row[title] = {"problems": number, "counted": int(chosen[title, scene].sum()), "shares": shares}
         found.append(row)
     return found
 
 
-def format_counts(counts: Sequence[Mapping[str, Any]]) -> str:
-    """The numbers of problems as a Markdown table."""
-    header = ["Scene", "Kind", "error of inliers, px", "problems", "counted", "pairs, median"]
-    header += [share_title(low, high) for low, high in itertools.pairwise(SHARES)]
-    lines = []
-    for row in counts:
-        for kind in KINDS:
-            one, error = row[kind], row["median_error_px"]
-            cells = [
-                str(one["problems"]),
-                str(one["counted"]),
-                "–" if not one["counted"] else f"{one['median_pairs']:.0f}",
-            ]
-            shown = "–" if error is None else f"{error:.2f}"
-            lines.append([row["scene"], kind, shown, *cells, *map(str, one["shares"])])
-    return markdown_table(header, lines, align="ll" + "r" * (len(header) - 2), pad=True)
-
-
-def format_table(rows: Sequence[Mapping[str, Any]], kind: str, groups: Sequence[str]) -> str:
-    """Success in percent by solver and group, with time and ``ok``, as a Markdown table."""
-    table: dict[str, dict[str, Mapping[str, Any]]] = {}
-    for row in rows:
-        if row["kind"] == kind:
-            table.setdefault(row["solver"], {})[row["group"]] = row
-    numbers = next(iter(table.values()))
-
-    def percent(value: float | None) -> str:
-        return "–" if value is None else f"{100 * value:.1f}"
-
-    def milliseconds(value: float | None) -> str:
-        return "–" if value is None else f"{value:.2f}"
-
-    header = [kind, "ms", *(f"{group} ({numbers[group]['count']})" for group in groups), "ok of right", "ok of far off"]
-    lines = []
-    for spec, found in table.items():
-        told = [percent(found["all"][name]) for name in ("ok_of_right", "ok_of_far")]
-        rates = [percent(found[group]["success"]) for group in groups]
-        lines.append([f"`{spec}`", milliseconds(found["all"]["ms_per_problem"]), *rates, *told])
-    return markdown_table(header, lines, pad=True)
-
-
 def format_results(results: Mapping[str, Any]) -> str:
-    """The tables by share of outliers, then by scene."""
-    shares = ["all", *(share_title(low, high) for low, high in itertools.pairwise(SHARES))]
+    """Success in per cent and milliseconds of a problem by share of outliers, then by scene."""
     scenes = [row["scene"] for row in results["counts"]]
-    return "\n\n".join(format_table(results["rows"], kind, part) for part in (shares, scenes) for kind in KINDS)
 
+    def cell(row: Row) -> str:
+        return f"{100 * row['success']:.1f}, {row['ms_per_problem']:.2f} ms" if row["count"] else "–"
 
-def make_parser() -> argparse.ArgumentParser:
-    """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    commands = parser.add_subparsers(dest="command", required=True)
-    making = commands.add_parser("make", help="make the problems of one scene")
-    making.add_argument("folder", type=Path, help="a COLMAP model with its images in images/")
-    making.add_argument("out", type=Path, help="the file of problems (.npz)")
-    making.add_argument("--features", type=int, default=2000, help="keypoints of an image")
-    making.add_argument("--every", type=int, default=4, help="with 4, every fourth image is a query")
-    making.add_argument("--views", type=int, default=6, help="images of the map for each query")
-    making.add_argument("--pairs", type=int, default=500, help="largest number of pairs of a problem")
-    making.add_argument("--seed", type=int, default=0, help="seed of the subsets of pairs")
-    measuring = commands.add_parser("measure", help="solve problems")
-    measuring.add_argument("problems", type=Path, nargs="+", help="files of `make`")
-    measuring.add_argument(
-        "--solvers", nargs="+", required=True, help=f"names, with {CONFIDENCE} or {SIGMAS} at the end"
+    return "\n\n".join(
+        pivot(
+            [row for row in results["rows"] if row["kind"] == kind],
+            {kind: "`{solver}`, calls of {batch}"},
+            columns,
+            cell,
+            by="group",
+            pad=True,
+        )
+        for columns in (["all", *BY_SHARE], scenes)
+        for kind in KINDS
     )
-    measuring.add_argument(
-        "--split", default="", help="whether the scenes were seen while choosing, for the results file"
-    )
-    measuring.add_argument("--pictures", type=Path, help="folder for pictures of failures of the first solver")
-    measuring.add_argument("--out", type=Path, help="the results file (.json)")
-    measuring.add_argument("--double", action="store_true", help="give the solvers float64")
-    timing = commands.add_parser("cost", help="time solvers on groups of problems")
-    timing.add_argument("problems", type=Path, nargs="+", help="files of `make`")
-    timing.add_argument("--solvers", nargs="+", required=True, help="names as for `measure`")
-    timing.add_argument("--out", type=Path, required=True, help="the results file (.json)")
-    counting = commands.add_parser("count", help="number of problems by share of outliers; solves nothing")
-    counting.add_argument("problems", type=Path, nargs="+", help="files of `make`")
-    return parser
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Make, count or measure, and print the tables."""
-    parser = make_parser()
-    options = vars(parser.parse_args(arguments))
-    command = options.pop("command")
-    if command == "make":
-        print(format_counts(describe(make(**options))))
-    elif command == "count":
-        print(format_counts(describe(read(options["problems"]))))
-    elif command == "cost":
-        save_results(measure_cost(options["problems"], options["solvers"], torch.float32), options["out"])
-    else:
-        dtype = torch.float64 if options["double"] else torch.float32
-        try:
-            told = options["split"], options["pictures"]
-            results = measure(options["problems"], options["solvers"], dtype, *told)
-        except BaseError as error:
-            parser.error(str(error))
-        if options["out"]:
-            save_results(results, options["out"])
-        print(format_results(results))
+    """Make or measure problems, and print what was found."""
+    command = parser(__doc__)
+    commands = command.add_subparsers(dest="command", required=True)
+    making = commands.add_parser("make", help="make the problems of one scene")
+    making.add_argument("folder", type=Path, help="a COLMAP model with its images in images/")
+    making.add_argument("out", type=Path, help="the file of problems (.npz)")
+    for name, default, help_ in (
+        ("features", 2000, "keypoints of an image"),
+        ("every", 4, "with 4, every fourth image is a query"),
+        ("views", 6, "images of the map for each query"),
+        ("pairs", 500, "largest number of pairs of a problem"),
+        ("seed", 0, "seed of the subsets of pairs"),
+    ):
+        making.add_argument(f"--{name}", type=int, default=default, help=help_)
+    measuring = commands.add_parser("measure", help="solve problems")
+    timing = commands.add_parser("cost", help="time solvers on groups of problems")
+    for one in (measuring, timing):
+        one.add_argument("problems", type=Path, nargs="+", help="files of `make`")
+        one.add_argument("--solvers", nargs="+", required=True, help=f"names, with {CONFIDENCE} or {SIGMAS} at the end")
+        one.add_argument("--out", type=Path, required=True, help="the results file (.json)")
+    measuring.add_argument("--split", default="", help="whether the scenes were seen while choosing, in words")
+    measuring.add_argument("--pictures", type=Path, help="folder for pictures of failures of the first solver")
+    measuring.add_argument("--batch", type=int, nargs="+", default=[BATCH], help="problems in a call of ours")
+    options = command.parse_args(arguments)
+    if options.command == "make":
+        making_options = {key: value for key, value in vars(options).items() if key != "command"}
+        print(*describe(make(**making_options)), sep="\n")
+        return
+    matches = read(options.problems)
+    settings: dict[str, Any] = {"files": [path.name for path in options.problems], "solvers": options.solvers}
+    settings |= {"shares": SHARES, "pairs": PAIRS}
+    try:
+        if options.command == "cost":
+            settings["batch"] = COST_BATCH
+            results = recorded(lambda: measure_cost(matches, options.solvers), **settings)
+        else:
+            settings |= {"split": options.split, "batch": options.batch, "dtype": "torch.float32", "told": TOLD_SIGMAS}
+            settings |= {"inlier_px": INLIER_PX, "min_inliers": MIN_INLIERS, "right": RIGHT, "far": FAR}
+            parts = options.solvers, options.pictures, options.batch
+            results = recorded(lambda: measure(matches, *parts), **settings)
+            print(format_results(results))
+    except BaseError as error:
+        command.error(str(error))
+    save_results(results, options.out)
 
 
 if __name__ == "__main__":

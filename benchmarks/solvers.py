@@ -14,19 +14,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import harness
 import torch
-from harness import in_turns, load, peak_bytes, ratio, run_child, say, seconds, summary, threads
 from kornia.core.exceptions import BaseError
 from others import bare_call
 from torch import nn
 
 from kornia_pnpnet import pose_errors, success, success_rate
-from kornia_pnpnet.core.environment import environment
-from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.evaluation import draw_problems
 from kornia_pnpnet.evaluation.named_solvers import load_solver
-from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.result import Problems
 
 # Seed of the problems. No training or tuning used it.
@@ -63,10 +60,10 @@ MEMORY_SOLVER, MEMORY_TARGET, MEMORY_RUNS = "p3p-ransac", 2 * 2**30, 5
 SPEEDUPS = {("epnp", "opencv-epnp"): 3.0, ("p3p-ransac", "poselib"): 1.0}
 
 
-def draw(name: str, count: int, seed: int) -> Problems:
+def draw(name: str, count: int) -> Problems:
     """Problems of one of ``SETS``, in float64, each set from its own seed."""
     n, outliers = SETS[name]
-    seed += list(SETS).index(name)
+    seed = SEED + list(SETS).index(name)
     source = SyntheticProblems(n=n, batch_size=min(count, 1000), seed=seed, outliers=outliers, dtype=torch.float64)
     return draw_problems(source, count)
 
@@ -77,21 +74,19 @@ def base_name(spec: str) -> str:
 
 
 @torch.no_grad()
-def measure_set(
-    solvers: Mapping[str, nn.Module], name: str, count: int, repeats: int, seed: int
-) -> list[dict[str, Any]]:
+def measure_set(solvers: Mapping[str, nn.Module], name: str, count: int, repeats: int) -> list[dict[str, Any]]:
     """Time the solvers on one set, each solver once in a round, and measure success."""
-    problems = draw(name, count, seed)
+    problems = draw(name, count)
     rates, timers = {}, {}
     for spec, solver in solvers.items():
         result = solver(problems.world_points, problems.img_points, problems.intrinsics)  # not timed: slower
         rates[spec] = success_rate(success(pose_errors(result.pose, problems.pose)))
-        timers[spec] = partial(seconds, bare_call(solver, problems))
-    rounds = in_turns(timers, repeats)
-    return [
-        {"solver": spec, "set": name, "success": rates[spec]._asdict(), **summary([1e6 * s / count for s in times])}
-        for spec, times in rounds.items()
-    ]
+        timers[spec] = partial(harness.seconds, bare_call(solver, problems))
+    found = []
+    for spec, times in harness.in_turns(timers, repeats).items():
+        measured = {"success": rates[spec]._asdict(), **harness.summary([1e6 * s / count for s in times])}
+        found.append({"solver": spec, "set": name, **measured})
+    return found
 
 
 def speedups(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -101,43 +96,36 @@ def speedups(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         for mine, theirs in itertools.product(rows, rows):
             names = (base_name(mine["solver"]), base_name(theirs["solver"]))
             if names == (solver, peer) and mine["set"] == theirs["set"] and SETS[mine["set"]][0] == SMALL:
-                times = ratio(mine, theirs)
+                times = harness.ratio(mine, theirs)
                 entry = {"solver": mine["solver"], "peer": theirs["solver"], "set": mine["set"], "ratio": times}
                 found.append({**entry, "target": target, "met": times >= target})
     return found
 
 
-def memory_here(spec: str, count: int, seed: int) -> dict[str, int]:
+def memory_here(spec: str, count: int) -> dict[str, int]:
     """Solve one large batch in this process; the peak memory before and after."""
-    before = peak_bytes()
-    with threads(), torch.no_grad():
-        problems = draw(MEMORY_SET, count, seed)
+    before = harness.peak_bytes()
+    with harness.threads(), torch.no_grad():
+        problems = draw(MEMORY_SET, count)
         load_solver(spec)(problems.world_points, problems.img_points, problems.intrinsics)
-    return {"imports_bytes": before, "peak_bytes": peak_bytes()}
+    return {"imports_bytes": before, "peak_bytes": harness.peak_bytes()}
 
 
-def measure_memory(spec: str, count: int, seed: int) -> dict[str, Any]:
+def measure_memory(spec: str, count: int) -> dict[str, Any]:
     """Solve one large batch in several processes and compare the largest peak with the target.
 
     Peaks of the same call differ with the memory that the allocator has given back.
     """
-    say(f"memory of {spec}")
-    arguments = ("--memory-of", spec, "--memory-count", str(count), "--seed", str(seed))
-    runs = [run_child(Path(__file__), *arguments) for _ in range(MEMORY_RUNS)]
+    harness.say(f"memory of {spec}")
+    arguments = ("--memory-of", spec, "--memory-count", str(count))
+    runs = [harness.run_child(Path(__file__), *arguments) for _ in range(MEMORY_RUNS)]
     peak = max(run["peak_bytes"] for run in runs)
-    return {
-        "solver": spec,
-        "set": MEMORY_SET,
-        "count": count,
-        "runs": runs,
-        "peak_bytes": peak,
-        "rise_bytes": max(run["peak_bytes"] - run["imports_bytes"] for run in runs),
-        "target_bytes": MEMORY_TARGET,
-        "met": peak < MEMORY_TARGET,
-    }
+    rise = max(run["peak_bytes"] - run["imports_bytes"] for run in runs)
+    found = {"runs": runs, "peak_bytes": peak, "rise_bytes": rise, "target_bytes": MEMORY_TARGET}
+    return {"solver": spec, "set": MEMORY_SET, "count": count, **found, "met": peak < MEMORY_TARGET}
 
 
-def measure(specs: Sequence[str], *, count: int, repeats: int, memory_count: int, seed: int) -> dict[str, Any]:
+def measure(specs: Sequence[str], *, count: int, repeats: int, memory_count: int) -> dict[str, Any]:
     """Measure everything, with a line on standard error for each step.
 
     Args:
@@ -145,55 +133,48 @@ def measure(specs: Sequence[str], *, count: int, repeats: int, memory_count: int
         count: number of problems in a batch.
         repeats: number of rounds.
         memory_count: number of problems of the memory measurement; 0: none.
-        seed: seed of the problems.
 
     Returns:
-        ``environment``, ``settings``, ``load_average`` (before and after), ``skipped`` (the reason by solver), ``rows``
-        (one for each solver and set), ``speedups`` and ``memory``.
+        ``skipped`` (the reason by solver), ``rows`` (one for each solver and set), ``speedups`` and ``memory``.
     """
-    before = load()
     solvers, skipped = {}, {}
     for spec in specs:
         try:
             solvers[spec] = load_solver(spec).double()
         except ImportError as error:
             skipped[spec] = str(error)
-            say(f"skipped: {spec}: {error}")
+            harness.say(f"skipped: {spec}: {error}")
     wanted = [spec for spec in solvers if memory_count and base_name(spec) == MEMORY_SOLVER]
-    memory = [measure_memory(spec, memory_count, seed) for spec in wanted]
+    memory = [measure_memory(spec, memory_count) for spec in wanted]
     rows = []
-    with threads():
-        for name in SETS:
-            say(name)
-            small = SETS[name][0] == SMALL
-            chosen = {spec: solver for spec, solver in solvers.items() if small or base_name(spec) in ROBUST}
-            rows += measure_set(chosen, name, count, repeats, seed)
-        settings = {"solvers": list(specs), "count": count, "repeats": repeats, "seed": seed, "dtype": "float64"}
-        made = {"environment": environment(), "settings": settings, "load_average": [before, load()]}
-    return {**made, "skipped": skipped, "rows": rows, "speedups": speedups(rows), "memory": memory}
+    with harness.threads():
+        for name, (n, _) in SETS.items():
+            harness.say(name)
+            chosen = {spec: solver for spec, solver in solvers.items() if n == SMALL or base_name(spec) in ROBUST}
+            rows += measure_set(chosen, name, count, repeats)
+    return {"skipped": skipped, "rows": rows, "speedups": speedups(rows), "memory": memory}
 
 
 def format_tables(results: Mapping[str, Any]) -> str:
     """Times with success, and the targets, as two Markdown tables."""
-    cells = {}
-    for row in results["rows"]:
-        time_us, rate = f"{row['median_us']:.1f} µs (min {row['min_us']:.1f})", 100 * row["success"]["rate"]
-        cells[row["solver"], row["set"]] = f"{time_us}, {rate:.1f} %"
-    solvers = dict.fromkeys(row["solver"] for row in results["rows"])
-    lines = [[f"`{spec}`", *(cells.get((spec, name), "–") for name in SETS)] for spec in solvers]
-    times = markdown_table(["Solver", *SETS], lines, align="l" * (1 + len(SETS)))
-    found = []
-    for entry in results["speedups"]:
-        wanted = f"`{entry['solver']}` at least {entry['target']:g} times as fast as `{entry['peer']}`"
-        found.append((entry, wanted, f"{entry['ratio']:.2f} times"))
+
+    def cell(row: harness.Row) -> str:
+        return f"{row['median_us']:.1f} µs (min {row['min_us']:.1f}), {100 * row['success']['rate']:.1f} %"
+
+    times = harness.pivot(results["rows"], {"Solver": "`{solver}`"}, SETS, cell, by="set", align="l" * (1 + len(SETS)))
+    found = [
+        {**entry, "wanted": "`{solver}` at least {target:g} times as fast as `{peer}`".format_map(entry)}
+        | {"measured": f"{entry['ratio']:.2f} times"}
+        for entry in results["speedups"]
+    ]
     for entry in results["memory"]:
         peak, rise, target = (entry[f"{key}_bytes"] / 2**30 for key in ("peak", "rise", "target"))
         wanted = f"`{entry['solver']}` on {entry['count']} problems below {target:g} GiB"
-        found.append((entry, wanted, f"{peak:.2f} GiB, {rise:.2f} GiB without the imports"))
-    lines = [
-        [wanted, entry["set"], measured, "met" if entry["met"] else "**missed**"] for entry, wanted, measured in found
-    ]
-    return f"{times}\n\n{markdown_table(['Target', 'Set', 'Measured', 'Verdict'], lines, align='llll')}"
+        measured = f"{peak:.2f} GiB, {rise:.2f} GiB without the imports"
+        found.append({**entry, "wanted": wanted, "measured": measured})
+    verdict: dict[str, harness.Column] = {"Verdict": lambda entry: "met" if entry["met"] else "**missed**"}
+    columns: dict[str, harness.Column] = {"Target": "{wanted}", "Set": "{set}", "Measured": "{measured}", **verdict}
+    return f"{times}\n\n{harness.table(found, columns, align='llll')}"
 
 
 def page(results: Mapping[str, Any]) -> str:
@@ -210,36 +191,32 @@ Written by `benchmarks/solvers.py`, see [README.md](README.md). Median and minim
 """
 
 
-def make_parser() -> argparse.ArgumentParser:
-    """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, help="the results file (.json); the tables go beside it (.md)")
-    parser.add_argument("--solvers", nargs="+", default=[*OURS, *PEERS], help="names, with options after a colon")
-    parser.add_argument("--count", type=int, default=1000, help="number of problems in a batch")
-    parser.add_argument("--repeats", type=int, default=7, help="number of rounds")
-    parser.add_argument("--memory-count", type=int, default=10_000, help="problems of the memory measurement; 0: none")
-    parser.add_argument("--seed", type=int, default=SEED, help="seed of the problems")
-    parser.add_argument("--memory-of", help=argparse.SUPPRESS)  # a process of `measure_memory`
-    return parser
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, write the files and print the tables."""
-    parser = make_parser()
-    options = parser.parse_args(arguments)
+    command = harness.parser(__doc__)
+    command.add_argument("--out", type=Path, help="the results file (.json); the tables go beside it (.md)")
+    command.add_argument("--solvers", nargs="+", default=[*OURS, *PEERS], help="names, with options after a colon")
+    command.add_argument("--count", type=int, default=1000, help="number of problems in a batch")
+    command.add_argument("--repeats", type=int, default=7, help="number of rounds")
+    command.add_argument("--memory-count", type=int, default=10_000, help="problems of the memory measurement; 0: none")
+    command.add_argument("--memory-of", help=argparse.SUPPRESS)  # a process of `measure_memory`
+    options = command.parse_args(arguments)
     if options.count < 1 or options.repeats < 1 or options.memory_count < 0:
-        parser.error("--count and --repeats must be at least 1, --memory-count at least 0")
+        command.error("--count and --repeats must be at least 1, --memory-count at least 0")
     if options.memory_of:
-        print(json.dumps(memory_here(options.memory_of, options.memory_count, options.seed)))
+        print(json.dumps(memory_here(options.memory_of, options.memory_count)))
         return
-    sizes = {"count": options.count, "repeats": options.repeats, "memory_count": options.memory_count}
+    given = {"count": options.count, "repeats": options.repeats}
     try:
-        results = measure(options.solvers, **sizes, seed=options.seed)
+        with harness.threads():  # the environment says how many
+            results = harness.recorded(
+                partial(measure, options.solvers, **given, memory_count=options.memory_count),
+                **{"solvers": options.solvers, **given, "seed": SEED, "dtype": "float64"},
+            )
     except BaseError as error:
-        parser.error(str(error))
+        command.error(str(error))
     if options.out:
-        save_results(results, options.out)
-        options.out.with_suffix(".md").write_text(page(results), encoding="utf-8")
+        harness.write(options.out, results, page)
     print(format_tables(results))
 
 

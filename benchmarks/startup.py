@@ -10,9 +10,8 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from contenders import ONE, PLAIN, TRAINED, WHOLE
+from contenders import PLAIN, TRAINED, WHOLE, Settings, make_contenders
 from harness import HERE, run_child, say, target
-from settings import Settings, make_contenders
 
 # The first batch size shows the compiler's warm-up, the others whether another size compiles again.
 _BATCHES = (1000, 999, 100, 10, 1)
@@ -32,7 +31,7 @@ def measure_startup(settings: Settings) -> dict[str, Any]:
     contenders, skipped = make_contenders(settings)
     starts = []
     for name, contender in contenders.items():
-        if name.startswith((PLAIN, ONE)) and name != WHOLE:
+        if name.startswith(PLAIN) and name != WHOLE:
             continue  # as TRAINED
         for backward in (False, True) if contender.differentiable and name != WHOLE else (False,):
             say(f"cold start: {name}{', backward' if backward else ''}")

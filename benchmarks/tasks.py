@@ -124,6 +124,14 @@ def first(problems: Problems, count: int) -> Problems:
     return problems.map(lambda x: x[:count])
 
 
+def relative_errors(pose: Pose, problems: Problems) -> tuple[Tensor, Tensor]:
+    """Rotation errors in degrees, and distances of the camera centres by the median distance of the points, (B,)."""
+    centres = (-(x.rotation.mT @ x.translation[..., None])[..., 0] for x in (pose, problems.pose))
+    cam_points = problems.world_points @ problems.pose.rotation.mT + problems.pose.translation[:, None]
+    shift = (next(centres) - next(centres)).norm(dim=-1) / cam_points.norm(dim=-1).median(1).values
+    return pose_errors(pose, problems.pose).rotation_error_deg, shift
+
+
 def float_inputs(problems: Problems, device: str) -> list[Tensor]:
     """Points, pixels and intrinsics in float32 on a device."""
     inputs = (problems.world_points, problems.img_points, problems.intrinsics)

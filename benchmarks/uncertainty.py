@@ -22,38 +22,37 @@ truth.
 
 from __future__ import annotations
 
-import argparse
-import functools
+import itertools
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
-from harness import in_turns, ratio, summary, target, threads
+from harness import Column, Row, in_turns, parser, percent, ratio, recorded, summary, table, target, threads, write
 from kornia.geometry.liegroup import So3
 from torch import Tensor, nn
-from uncertain_problems import GRAVITY, SHIFT, TURN, gravity, last_pose, sigmas_of_same_trace, squares, uncertain_pnp
 
-from kornia_pnpnet import PnPNet, PnPResult, RobustWeightedLM, create_solver, pose_covariance, pose_errors, success
-from kornia_pnpnet.core.environment import environment
-from kornia_pnpnet.core.files import write_json
-from kornia_pnpnet.core.tables import markdown_table
+from kornia_pnpnet import (
+    PnPNet,
+    PnPResult,
+    PosePrior,
+    RobustWeightedLM,
+    create_solver,
+    gravity_prior,
+    pose_covariance,
+    pose_errors,
+    success,
+)
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet.data.points import BoxPoints
 from kornia_pnpnet.evaluation.bounds import KnownInliersAndNoise
+from kornia_pnpnet.geometry import transform
+from kornia_pnpnet.refine.residual import retract
 from kornia_pnpnet.peers import OpenCVPnP, PeerSolver, PoseLib
 from kornia_pnpnet.result import Pose, Problems
-
-__all__ = [
-    "main",
-    "measure_credibility",
-    "measure_errors",
-    "measure_priors",
-    "measure_squares",
-    "measure_times",
-    "page",
-    "targets",
-]
 
 SOLVER = "pnpnet-set"
 # Used for nothing else.
@@ -72,6 +71,10 @@ PEERS: dict[str, Callable[[], PeerSolver]] = {
 #: For covariances of poses and for priors: pairs of a problem, and how many of them are outliers.
 CREDIBLE = ((9, 0), (9, 2), (9, 4), (20, 0), (20, 10), (50, 0), (50, 25), (200, 0), (200, 100))
 FEW = ((3, 0), (4, 0), (4, 1), (5, 1), (6, 0), (6, 2), (9, 3), (12, 4))
+#: Standard deviations in degrees of gravity and of the last rotation; of the last position, relative to the distance.
+GRAVITY, TURN, SHIFT = 0.5, 1.0, 0.02
+# Grades of noise in uncertain PnP; standard deviations of grade 1 in pixels and in the unit of the world.
+_GRADES, _PIXEL, _POINT = 10, 1.0, 0.01
 #: Below this the squared error of six Gaussian numbers is in 95 % of all cases.
 LIMIT = 12.592
 #: Degrees between the normal of a planar target and the camera's axis.
@@ -82,6 +85,124 @@ WRONG = 10.0
 TIMED, BATCH, ROUNDS = (9, 50), 1000, 15
 #: Most that errors may be above those of maximum likelihood, without and with outliers; that covariances may cost.
 MOST_CLEAN, MOST_ROBUST, MOST_TIME = 1.05, 1.10, 1.6
+
+
+# -- problems ----------------------------------------------------------------------------------------------------------
+
+
+def uncertain_pnp(n: int, share: float, count: int, *, turned: bool, seed: int) -> Problems:
+    """Problems of the protocol of uncertain PnP (Vakhitov et al., CVPR 2021, arXiv 2107.03890, section 4.1).
+
+    Points lie in a box in front of a camera of 800 px, their centre is the origin of the world. A tenth of the pairs
+    each has grade 1, 2, ..., 10: the standard deviation along the longest axis, in pixels and in hundredths
+    of a unit. Those of the other axes are uniform between 0 and that; the axes have a random direction.
+
+    Args:
+        n: number of pairs.
+        share: share of outliers: half are mismatches, half have a random pixel.
+        count: number of problems.
+        turned: whether the noise of pixels has axes as well. It is isotropic otherwise, as in most of the protocol.
+        seed: seed of the problems.
+    """
+    exact = SyntheticProblems(
+        n=n,
+        batch_size=count,
+        seed=seed,
+        points=BoxPoints(half_width=2.0, z_near=4.0, depth=4.0),
+        outliers=OutlierMix(count=round(share * n)),
+        max_angle=math.pi,
+        focal=800.0,
+        half_image=400.0,
+        img_sigma=0.0,
+        world_sigma=0.0,
+        dtype=torch.float64,
+    ).batch(0)
+    rotation, translation = exact.pose
+    middle = exact.world_points.mean(1, keepdim=True)
+    generator = torch.Generator().manual_seed(seed)
+    grade = 1.0 + torch.arange(n, dtype=torch.float64).remainder(_GRADES).expand(count, n)
+    img_noise, img_cov = _noise(_PIXEL * grade, 2, generator, turned=turned)
+    world_noise, world_cov = _noise(_POINT * grade, 3, generator, turned=True)
+    return exact._replace(
+        world_points=exact.world_points - middle + world_noise,
+        img_points=exact.img_points + img_noise,
+        pose=Pose(rotation, translation + (middle @ rotation.mT)[:, 0]),
+        img_cov=img_cov,
+        world_cov=world_cov,
+    )
+
+
+def _noise(sigma: Tensor, size: int, generator: torch.Generator, *, turned: bool) -> tuple[Tensor, Tensor]:
+    """Noise (B, N, D) with the standard deviation of the longest axis, (B, N), and its covariance."""
+    ratio = torch.rand(*sigma.shape, size, generator=generator, dtype=sigma.dtype)
+    ratio[..., 0] = 1.0
+    axes = sigma[..., None] * (ratio if turned else torch.ones_like(ratio))
+    normal = torch.randn(*sigma.shape, size, size + 1, generator=generator, dtype=sigma.dtype)
+    factor = torch.linalg.qr(normal[..., :size]).Q * axes[..., None, :]
+    return (factor @ normal[..., size:])[..., 0], factor @ factor.mT
+
+
+def sigmas_of_same_trace(problems: Problems) -> dict[str, Tensor]:
+    """Standard deviations (B, N) of isotropic noise with the traces of the covariances, as arguments of a solver."""
+    return {
+        f"{name}_sigma": covariance.diagonal(dim1=-2, dim2=-1).mean(-1).sqrt()
+        for name, covariance in (("img", problems.img_cov), ("world", problems.world_cov))
+        if covariance is not None
+    }
+
+
+def last_pose(problems: Problems, generator: torch.Generator, wrong: float) -> PosePrior:
+    """The pose of the frame before."""
+    distance = problems.pose.translation.norm(dim=-1, keepdim=True)
+    sigma = torch.cat((torch.full_like(distance, math.radians(TURN)).repeat(1, 3), SHIFT * distance.repeat(1, 3)), -1)
+    noise, direction = torch.randn(2, *sigma.shape, generator=generator, dtype=sigma.dtype)
+    error = sigma * (noise + wrong * nn.functional.normalize(direction, dim=-1))
+    return PosePrior(retract(problems.pose, error), torch.diag_embed(sigma**-2))
+
+
+def gravity(problems: Problems, generator: torch.Generator, wrong: float) -> PosePrior:
+    """The direction of gravity, which is any direction in the world."""
+    like, sigma = problems.pose.translation, math.radians(GRAVITY)
+    down, noise, side = torch.randn(3, *like.shape, generator=generator, dtype=like.dtype)
+    down = nn.functional.normalize(down, dim=-1)
+    truth = (problems.pose.rotation @ down[..., None])[..., 0]
+    across = nn.functional.normalize(torch.linalg.cross(truth, side), dim=-1)
+    return gravity_prior(down, truth + torch.linalg.cross(sigma * (noise + wrong * across), truth), sigma)
+
+
+def squares(tilt: float, sigma: float, count: int, *, seed: int) -> Problems:
+    """Squares of four points under a tilt in degrees, with noise of the pixels."""
+    generator = torch.Generator().manual_seed(seed)
+    azimuth, roll, x, y, z = torch.rand(5, count, generator=generator, dtype=torch.float64)
+    azimuth, roll = 2.0 * math.pi * azimuth, 2.0 * math.pi * roll
+    zero = torch.zeros_like(roll)
+    axis = torch.stack((azimuth.cos(), azimuth.sin(), zero), -1) * math.radians(tilt)
+    translation = torch.stack((0.4 * x - 0.2, 0.4 * y - 0.2, 1.0 + z), -1)
+    turns = [Pose.from_rvec(v, translation).rotation for v in (axis, torch.stack((zero, zero, roll), -1))]
+    front = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+    pose = Pose(turns[0] @ turns[1] @ front, translation)
+    corners = [[-0.1, -0.1, 0.0], [0.1, -0.1, 0.0], [0.1, 0.1, 0.0], [-0.1, 0.1, 0.0]]
+    world = torch.tensor(corners, dtype=torch.float64).expand(count, 4, 3)
+    camera = torch.tensor([[800.0, 0.0, 320.0], [0.0, 800.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    seen = transform(pose, world) @ camera.mT
+    pixels = seen[..., :2] / seen[..., 2:]
+    pixels = pixels + sigma * torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
+    return Problems(world, pixels, camera.expand(count, 3, 3), pose, torch.ones(count, 4, dtype=torch.bool))
+
+
+def draw(n: int, outliers: int, count: int, seed: int, **options: Any) -> Problems:
+    """Problems of the protocol's data in float64."""
+    mix = OutlierMix(count=outliers)
+    options = {"batch_size": count, "seed": SEED + seed, "outliers": mix, "dtype": torch.float64, **options}
+    return SyntheticProblems(n=n, **options).batch(0)
+
+
+def share(values: Tensor) -> float:
+    """Share of true values."""
+    return values.double().mean().item()
+
+
+# -- measurements ------------------------------------------------------------------------------------------------------
 
 
 def medians(result: PnPResult, problems: Problems) -> Tensor:
@@ -95,20 +216,17 @@ def measure_errors(solver: nn.Module, count: int) -> list[dict[str, Any]]:
     bound = KnownInliersAndNoise()
     peers = {name: make() for name, make in PEERS.items()}
     rows = []
-    for turned in (False, True):
-        for n in SIZES:
-            for share in SHARES:
-                problems = uncertain_pnp(n, share, count, turned=turned, seed=SEED)
-                answers = {
-                    "covariances": solver(*problems[:3], **problems.known),
-                    "sigmas": solver(*problems[:3], **sigmas_of_same_trace(problems)),
-                    "nothing": solver(*problems[:3]),
-                    **{name: peer(*problems[:3]) for name, peer in peers.items()},
-                }
-                best = medians(bound.solve_with_truth(problems), problems)
-                row = {"pixels": "turned" if turned else "round", "n": n, "outliers": share, "bound": best.tolist()}
-                relative = {name: (medians(x, problems) / best).tolist() for name, x in answers.items()}
-                rows.append(row | relative)
+    for turned, n, outliers in itertools.product((False, True), SIZES, SHARES):
+        problems = uncertain_pnp(n, outliers, count, turned=turned, seed=SEED)
+        answers = {
+            "covariances": solver(*problems[:3], **problems.known),
+            "sigmas": solver(*problems[:3], **sigmas_of_same_trace(problems)),
+            "nothing": solver(*problems[:3]),
+            **{name: peer(*problems[:3]) for name, peer in peers.items()},
+        }
+        best = medians(bound.solve_with_truth(problems), problems)
+        row = {"pixels": "turned" if turned else "round", "n": n, "outliers": outliers, "bound": best.tolist()}
+        rows.append(row | {name: (medians(x, problems) / best).tolist() for name, x in answers.items()})
     return rows
 
 
@@ -126,26 +244,17 @@ def measure_credibility(solver: nn.Module, count: int) -> list[dict[str, Any]]:
     """How the errors of poses compare with their covariances, of each kind of noise and size."""
     rows = []
     kinds = ("isotropic", 1.0, True), ("covariances", AXIS_RATIO, True), ("unknown", 1.0, False)
-    for noise, axis_ratio, is_told in kinds:
-        for n, outliers in CREDIBLE:
-            problems = SyntheticProblems(
-                n=n,
-                batch_size=count,
-                seed=SEED + 1,
-                outliers=OutlierMix(count=outliers),
-                axis_ratio=axis_ratio,
-                known_noise=1.0,
-                dtype=torch.float64,
-            ).batch(0)
-            known: dict[str, Any] = dict(problems.known)
-            result = solver(*problems[:3], **(known if is_told else {}))
-            covariance = pose_covariance(result.pose, *problems[:3], **known, weights=result.weights)
-            errors, distance = pose_errors(result.pose, problems.pose), problems.pose.translation.norm(dim=-1)
-            near = (errors.rotation_error_deg < 10.0) & (errors.translation_error < 0.3 * distance)
-            used = result.ok & near & covariance.isfinite().all((1, 2))
-            squared = squared_errors(result, problems, covariance)[used]
-            row = {"noise": noise, "n": n, "outliers": outliers, "used": used.double().mean().item()}
-            rows.append(row | {"mean": squared.mean().item(), "below": (squared < LIMIT).double().mean().item()})
+    for (noise, axis_ratio, is_told), (n, outliers) in itertools.product(kinds, CREDIBLE):
+        problems = draw(n, outliers, count, 1, axis_ratio=axis_ratio, known_noise=1.0)
+        known: dict[str, Any] = dict(problems.known)
+        result = solver(*problems[:3], **(known if is_told else {}))
+        covariance = pose_covariance(result.pose, *problems[:3], **known, weights=result.weights)
+        errors, distance = pose_errors(result.pose, problems.pose), problems.pose.translation.norm(dim=-1)
+        near = (errors.rotation_error_deg < 10.0) & (errors.translation_error < 0.3 * distance)
+        used = result.ok & near & covariance.isfinite().all((1, 2))
+        squared = squared_errors(result, problems, covariance)[used]
+        row = {"noise": noise, "n": n, "outliers": outliers, "used": share(used)}
+        rows.append(row | {"mean": squared.mean().item(), "below": share(squared < LIMIT)})
     return rows
 
 
@@ -156,10 +265,7 @@ def measure_priors(solver: nn.Module, count: int) -> list[dict[str, Any]]:
     sigmas = {"img_sigma": 1.0, "world_sigma": 0.05}
     rows = []
     for n, outliers in FEW:
-        source = SyntheticProblems(
-            n=n, batch_size=count, seed=SEED + 2, outliers=OutlierMix(count=outliers), dtype=torch.float64
-        )
-        problems, generator = source.batch(0), torch.Generator().manual_seed(SEED)
+        problems, generator = draw(n, outliers, count, 2), torch.Generator().manual_seed(SEED)
         priors = {
             "nothing": None,
             "gravity": gravity(problems, generator, 0.0),
@@ -175,7 +281,7 @@ def measure_priors(solver: nn.Module, count: int) -> list[dict[str, Any]]:
                 bound = least_squares(*problems[:3], inliers, init=problems.pose, **sigmas, prior=prior)
                 answers[f"{name}, bound"] = bound
             for key, result in answers.items():
-                row[key] = success(pose_errors(result.pose, problems.pose)).double().mean().item()
+                row[key] = share(success(pose_errors(result.pose, problems.pose)))
         rows.append(row)
     return rows
 
@@ -198,31 +304,28 @@ def ippe(problems: Problems) -> Pose:
 def measure_squares(solver: nn.Module, count: int) -> list[dict[str, Any]]:
     """How often the right pose of a planar target is the pose, or among the alternatives."""
     rows = []
-    for tilt in TILTS:
-        for sigma in (0.5, 1.0, 3.0):
-            problems = squares(tilt, sigma, count, seed=SEED + 3)
+    for tilt, sigma in itertools.product(TILTS, (0.5, 1.0, 3.0)):
+        problems = squares(tilt, sigma, count, seed=SEED + 3)
+        distance = problems.pose.translation.norm(dim=-1)
+        result = solver(*problems[:3], img_sigma=sigma, world_sigma=0.0, alternatives=2)
+        others, theirs = result.alternatives, ippe(problems)
 
-            def right(
-                rotation: Tensor, translation: Tensor, truth: Pose = problems.pose, sigma: float = sigma
-            ) -> Tensor:
-                errors, distance = pose_errors(Pose(rotation, translation), truth), truth.translation.norm(dim=-1)
-                return (errors.rotation_error_deg < 5.0 + 5.0 * sigma) & (errors.translation_error < 0.1 * distance)
+        def right(
+            pose: Pose, most: Tensor = 0.1 * distance, sigma: float = sigma, truth: Pose = problems.pose
+        ) -> Tensor:
+            return success(pose_errors(pose, truth), 5.0 + 5.0 * sigma, most)
 
-            result = solver(*problems[:3], img_sigma=sigma, world_sigma=0.0, alternatives=2)
-            others, theirs = result.alternatives, ippe(problems)
-            first, any_right = (right(result.rotation, result.translation) for _ in range(2))
-            for i in (0, 1):
-                any_right |= others.valid[:, i] & right(others.rotation[:, i], others.translation[:, i])
-            of_theirs = [right(theirs.rotation[:, i], theirs.translation[:, i]) for i in (0, 1)]
-            shares = {
-                "pose": first,
-                "pose or alternatives": any_right,
-                "IPPE's first": of_theirs[0],
-                "IPPE's two": of_theirs[0] | of_theirs[1],
-                "problems with alternatives": others.valid.any(1),
-            }
-            row: dict[str, Any] = {"tilt": tilt, "sigma": sigma}
-            rows.append(row | {name: share.double().mean().item() for name, share in shares.items()})
+        first = right(result.pose)
+        either = [others.valid[:, i] & right(Pose(others.rotation[:, i], others.translation[:, i])) for i in (0, 1)]
+        of_theirs = [right(Pose(theirs.rotation[:, i], theirs.translation[:, i])) for i in (0, 1)]
+        shares = {
+            "pose": first,
+            "pose or alternatives": first | either[0] | either[1],
+            "IPPE's first": of_theirs[0],
+            "IPPE's two": of_theirs[0] | of_theirs[1],
+            "problems with alternatives": others.valid.any(1),
+        }
+        rows.append({"tilt": tilt, "sigma": sigma, **{name: share(x) for name, x in shares.items()}})
     return rows
 
 
@@ -242,7 +345,7 @@ def measure_times(solver: nn.Module) -> list[dict[str, Any]]:
             solver(*problems[:3], **known)
             return 1e6 * (time.process_time() - start) / BATCH
 
-        timers = {name: functools.partial(us_per_problem, problems, known) for name, known in told.items()}
+        timers = {name: partial(us_per_problem, problems, known) for name, known in told.items()}
         in_turns(timers, 2)  # to warm up
         times = {name: summary(rounds) for name, rounds in in_turns(timers, ROUNDS).items()}
         rows.append({"n": n, **times, "ratio": ratio(times["sigmas"], times["covariances"])})
@@ -260,112 +363,89 @@ def targets(results: Mapping[str, Any]) -> list[dict[str, Any]]:
     return [*found, target("Time with covariances by time with sigmas", slowest, MOST_TIME, unit="", at_most=True)]
 
 
-def shares_of(rows: Sequence[Mapping[str, Any]], *keys: str) -> tuple[list[str], list[list[str]]]:
-    """The columns of rows that are shares, without the keys that identify a row, and their cells."""
-    columns = [key for key in rows[0] if key not in keys]
-    return columns, [[f"{100 * row[column]:.1f} %" for column in columns] for row in rows]
+def share_columns(rows: Sequence[Row], *keys: str) -> dict[str, Column]:
+    """Columns of all entries but the keys that identify a row."""
+    return {name: percent(name, unit=" %") for name in rows[0] if name not in keys}
 
 
 def page(results: Mapping[str, Any]) -> str:
     """The page of the results."""
-    wanted = [
-        [x["what"], f"{x['measured']:.3f}", f"{x['target']:.2f}", "yes" if x["met"] else "no"]
-        for x in results["targets"]
-    ]
-    columns = ("covariances", "sigmas", "nothing", *PEERS)
-    errors = [
-        [
-            row["pixels"],
-            f"{row['n']}",
-            f"{100 * row['outliers']:.0f} %",
-            *(" ".join(f"{x:.3g}" if x > 10 else f"{x:.3f}" for x in row[c]) for c in columns),
-        ]
-        for row in results["rows"]
-    ]
-    times = [
-        [f"{row['n']}", *(f"{row[name]['median_us']:.1f}" for name in ("sigmas", "covariances")), f"{row['ratio']:.2f}"]
-        for row in results["times"]
-    ]
-    credible = [
-        [
-            row["noise"],
-            f"{row['n']}",
-            f"{row['outliers']}",
-            f"{row['mean']:.2f}",
-            f"{100 * row['below']:.1f} %",
-            f"{100 * row['used']:.1f} %",
-        ]
-        for row in results["covariances"]
-    ]
-    kinds, successes = shares_of(results["priors"], "n", "outliers")
-    priors = [
-        [f"{row['n']}", f"{row['outliers']}", *cells] for row, cells in zip(results["priors"], successes, strict=True)
-    ]
-    found, right = shares_of(results["squares"], "tilt", "sigma")
-    planar = [
-        [f"{row['tilt']:.0f}°", f"{row['sigma']:.1f} px", *cells]
-        for row, cells in zip(results["squares"], right, strict=True)
-    ]
+    wanted: dict[str, Column] = {
+        **{"Target": "{what}", "Measured": "{measured:.3f}", "At most": "{target:.2f}"},
+        "Met": lambda x: "yes" if x["met"] else "no",
+    }
+
+    def both(name: str) -> Column:
+        return lambda row: " ".join(f"{x:.3g}" if x > 10 else f"{x:.3f}" for x in row[name])
+
+    errors = {"Pixels": "{pixels}", "n": "{n}", "Outliers": percent("outliers", 0, " %")}
+    errors |= {name: both(name) for name in ("covariances", "sigmas", "nothing", *PEERS)}
+    times = {"n": "{n}", **{name: f"{{{name}[median_us]:.1f}}" for name in ("sigmas", "covariances")}}
+    size = {"n": "{n}", "Outliers": "{outliers}"}
+    shares = {"Below the limit": percent("below", unit=" %"), "Problems used": percent("used", unit=" %")}
+    credible = {"Noise": "{noise}", **size, "Mean": "{mean:.2f}", **shares}
+    priors = {**size, **share_columns(results["priors"], "n", "outliers")}
+    planar = {"Tilt": "{tilt:.0f}°", "Noise": "{sigma:.1f} px", **share_columns(results["squares"], "tilt", "sigma")}
     return f"""# Uncertainty
 
 Written by `benchmarks/uncertainty.py`, whose first lines say what is measured; `{results["solver"]}`,
 {results["problems"]} problems in each row.
 
-{markdown_table(["Target", "Measured", "At most", "Met"], wanted)}
+{table(results["targets"], wanted)}
 
 ## Noise that differs between pairs and directions
 
 Median rotation and translation error on the problems of uncertain PnP, relative to maximum likelihood on the true
 inliers. *Pixels*: whether their noise is round or has axes.
 
-{markdown_table(["Pixels", "n", "Outliers", *columns], errors)}
+{table(results["rows"], errors)}
 
 Processor time of a problem in µs (float32, {BATCH} problems at once, one thread), and the median ratio of a round:
 
-{markdown_table(["n", "sigmas", "covariances", "Ratio"], times, align="rrrr")}
+{table(results["times"], {**times, "Ratio": "{ratio:.2f}"}, align="rrrr")}
 
 ## Is the covariance of the pose right
 
 Mean squared error by the covariance (right: 6), and how often it is below the 95 % limit. The covariance knows the
 noise; *unknown*: the solver did not.
 
-{markdown_table(["Noise", "n", "Outliers", "Mean", "Below the limit", "Problems used"], credible)}
+{table(results["covariances"], credible)}
 
 ## What is known before
 
 Success. Gravity is known to {GRAVITY}°, the last pose to {TURN}° and {100 * SHIFT:.0f} % of the distance; *wrong*: off
 by {WRONG:.0f} standard deviations more.
 
-{markdown_table(["n", "Outliers", *kinds], priors)}
+{table(results["priors"], priors)}
 
 ## Planar targets
 
-{markdown_table(["Tilt", "Noise", *found], planar)}
+{table(results["squares"], planar)}
 """
 
 
 def main() -> None:
     """Measure and write the file and its page."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("outputs/bench/uncertainty.json"))
-    parser.add_argument("--count", type=int, default=4000, help="problems of each noise and size (default: 4000)")
-    arguments = parser.parse_args()
+    command = parser(__doc__)
+    command.add_argument("--out", type=Path, default=Path("outputs/bench/uncertainty.json"))
+    command.add_argument("--count", type=int, default=4000, help="problems of each noise and size (default: 4000)")
+    options = command.parse_args()
     solver = create_solver(SOLVER).double()
-    with threads():
-        results = {
-            "environment": environment(),
-            **{"solver": SOLVER, "seed": SEED, "axis_ratio": AXIS_RATIO, "problems": arguments.count},
+
+    def measure() -> dict[str, Any]:
+        return {
             "times": measure_times(create_solver(SOLVER)),
-            "rows": measure_errors(solver, arguments.count),
-            "covariances": measure_credibility(solver, arguments.count),
-            "priors": measure_priors(solver, arguments.count),
-            "squares": measure_squares(solver, arguments.count),
+            "rows": measure_errors(solver, options.count),
+            "covariances": measure_credibility(solver, options.count),
+            "priors": measure_priors(solver, options.count),
+            "squares": measure_squares(solver, options.count),
         }
-    results["targets"] = targets(results)
-    write_json(arguments.out, results)
-    text = page(results)
-    arguments.out.with_suffix(".md").write_text(text, encoding="utf-8")
-    print(text)
+
+    with threads():
+        results = recorded(measure, seed=SEED, axis_ratio=AXIS_RATIO)
+    results |= {"solver": SOLVER, "problems": options.count, "targets": targets(results)}
+    write(options.out, results, page)
+    print(page(results))
 
 
 if __name__ == "__main__":

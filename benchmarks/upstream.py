@@ -15,7 +15,6 @@ thread.
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
 import os
 import re
@@ -27,19 +26,15 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from harness import load, say, threads
+from harness import Row, parser, pivot, recorded, say, table, threads
 from kornia.geometry import solve_pnp_dlt
+from tasks import relative_errors
 from torch import Tensor
 
-from kornia_pnpnet import pose_errors
-from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.core.files import write_json
-from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.data import CameraProblems
 from kornia_pnpnet.peers import OpenCVRansac
 from kornia_pnpnet.result import Pose, Problems
-
-__all__ = ["main", "measure_batches", "measure_descent", "measure_success", "page", "patched"]
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PATCH = DOCS / "upstream" / "0001-Add-solve_pnp_robust.patch"
@@ -81,11 +76,14 @@ def _opencv(*inputs: Tensor) -> Tensor:
 
 def _errors(matrix: Tensor, problems: Problems) -> tuple[Tensor, Tensor]:
     """Rotation error in degrees and error of the position in median distances of the points, both (B,)."""
-    pose = Pose(matrix[..., :3].to(problems.world_points), matrix[..., 3].to(problems.world_points))
-    centres = [-(p.rotation.mT @ p.translation[..., None])[..., 0] for p in (pose, problems.pose)]
-    cam = problems.world_points @ problems.pose.rotation.mT + problems.pose.translation[:, None]
-    distance = cam.norm(dim=-1).median(1).values
-    return pose_errors(pose, problems.pose).rotation_error_deg, (centres[0] - centres[1]).norm(dim=-1) / distance
+    matrix = matrix.to(problems.world_points)
+    return relative_errors(Pose(matrix[..., :3], matrix[..., 3]), problems)
+
+
+def _draw(n: int, count: int, seed: int, share: float, **options: Any) -> Problems:
+    """Problems of random cameras."""
+    options |= {"batch_size": count, "seed": SEED + seed, "outlier_share": share, "dtype": torch.float64}
+    return CameraProblems(n=n, **options).batch(0)
 
 
 def _timed(solve: Solve, problems: Problems, call: int) -> tuple[Tensor, float]:
@@ -110,8 +108,7 @@ def measure_success(count: int, cells: Sequence[tuple[int, float]] = CELLS) -> l
     rows = []
     for k, (n, share) in enumerate(cells):
         say(f"success, n = {n}, {share:.0%} outliers")
-        source = CameraProblems(n=n, batch_size=count, seed=SEED + k, outlier_share=share, dtype=torch.float64)
-        problems = source.batch(0)
+        problems = _draw(n, count, k, share)
         for name, solve in solvers.items():
             found, us = _timed(solve, problems, CALL)
             turn, shift = _errors(found, problems)
@@ -128,8 +125,7 @@ def measure_batches(batches: Sequence[int] = BATCHES) -> list[dict[str, Any]]:
     for batch in batches:
         say(f"batches of {batch}")
         count = max(batch, min(20 * batch, CALL))
-        source = CameraProblems(n=30, batch_size=count, seed=SEED + 50, outlier_share=0.25, dtype=torch.float64)
-        problems = source.batch(0)
+        problems = _draw(30, count, 50, 0.25)
         us = [_timed(solve, problems, batch)[1] for solve in (lambda *x: robust(*x)[0], _opencv)]
         rows.append({"batch": batch, "us": us[0], "opencv_us": us[1]})
     return rows
@@ -145,10 +141,7 @@ def measure_descent(count: int, shares: Sequence[float] = (0.0, 0.25)) -> list[d
     rows = []
     for k, share in enumerate(shares):
         say(f"descent, {share:.0%} outliers")
-        source = CameraProblems(
-            n=12, batch_size=count, seed=SEED + 60 + k, img_sigma=5.0, outlier_share=share, dtype=torch.float64
-        )
-        problems = source.batch(0)
+        problems = _draw(12, count, 60 + k, share, img_sigma=5.0)
         for name, solve in solvers.items():
             pixels = problems.img_points.clone().requires_grad_()
             descent = torch.optim.Adam([pixels], lr=RATE)
@@ -168,51 +161,45 @@ def measure_descent(count: int, shares: Sequence[float] = (0.0, 0.25)) -> list[d
 def page(results: Mapping[str, Any]) -> str:
     """The tables of ``docs/upstream.md``."""
     names = list(dict.fromkeys(x["solver"] for x in results["success"]))
-    cells = list(dict.fromkeys((x["n"], x["share"]) for x in results["success"]))
-    by_cell = {(x["n"], x["share"], x["solver"]): x for x in results["success"]}
-    success = []
-    for n, share in cells:
-        found = [by_cell[n, share, name] for name in names]
-        success.append([str(n), f"{share:.0%}", *(f"{100 * x['success']:.1f} ({x['us']:,.0f})" for x in found)])
-    batches = [[f"{x['batch']}", f"{x['us']:,.0f}", f"{x['opencv_us']:,.0f}"] for x in results["batches"]]
-    descent = [
-        [f"{x['share']:.0%}", f"`{x['solver']}`", f"{x['first']:.1e}", f"{x['last']:.1e}"] for x in results["descent"]
-    ]
-    titles = [name if " " in name and "=" not in name else f"`{name}`" for name in names]
-    environment_ = results["environment"]
+    title = {name: name if " " in name and "=" not in name else f"`{name}`" for name in names}
+    success = [{**x, "title": title[x["solver"]]} for x in results["success"]]
+    outliers = {"outliers": "{share:.0%}"}
+    batches = {"batch": "{batch}", "`solve_pnp_robust`": "{us:,.0f}", "OpenCV RANSAC": "{opencv_us:,.0f}"}
+    descent = {**outliers, "solver": "`{solver}`", "first step": "{first:.1e}", "last step": "{last:.1e}"}
+
+    def solved(row: Row) -> str:
+        return f"{100 * row['success']:.1f} ({row['us']:,.0f})"
+
     return f"""\
 Solved problems in per cent, and in parentheses µs per problem ({results["settings"]["count"]} problems in each row):
 
-{markdown_table(["pairs", "outliers", *titles], success)}
+{pivot(success, {"pairs": "{n}", **outliers}, [*title.values()], solved, by="title")}
 
 µs per problem by batch size, 30 pairs with 25 % outliers:
 
-{markdown_table(["batch", "`solve_pnp_robust`", "OpenCV RANSAC"], batches)}
+{table(results["batches"], batches)}
 
 Median loss when {STEPS} steps of gradient descent move the pixels through a solver, 12 pairs with 5 px of noise:
 
-{markdown_table(["outliers", "solver", "first step", "last step"], descent, align="llrr")}
+{table(results["descent"], descent, align="llrr")}
 
-{environment_["cpu"]}, CPU time of one thread, {environment_["date"][:10]}.
+{results["environment"]["cpu"]}, CPU time of one thread, {results["environment"]["date"][:10]}.
 """
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure and write the file and the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="the results file (.json)")
-    parser.add_argument("--page", type=Path, default=DOCS / "upstream.md", help="the page that holds the tables")
-    parser.add_argument("--count", type=int, default=400, help="number of problems in a row")
-    options = parser.parse_args(arguments)
-    before = load()
-    results = {
-        "settings": {"count": options.count, "seed": SEED},
-        "environment": environment(),
-        "success": measure_success(options.count),
-        "batches": measure_batches(),
-        "descent": measure_descent(CALL),
-        "load_average": [before, load()],
-    }
+    command = parser(__doc__)
+    command.add_argument("--out", type=Path, required=True, help="the results file (.json)")
+    command.add_argument("--page", type=Path, default=DOCS / "upstream.md", help="the page that holds the tables")
+    command.add_argument("--count", type=int, default=400, help="number of problems in a row")
+    options = command.parse_args(arguments)
+
+    def measure() -> dict[str, Any]:
+        parts = {"success": measure_success(options.count), "batches": measure_batches()}
+        return {**parts, "descent": measure_descent(CALL)}
+
+    results = recorded(measure, count=options.count, seed=SEED)
     write_json(options.out, results)
     text = options.page.read_text(encoding="utf-8")
     tables = f"<!-- measured -->\n\n{page(results)}\n<!-- end -->"

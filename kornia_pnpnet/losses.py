@@ -217,7 +217,7 @@ class SetLoss(nn.Module):
         """Compare a solver's result with the truth.
 
         Arguments, result and errors are those of :meth:`PoseLoss.forward`; ``guess`` is the first guess of the result,
-        see :meth:`~kornia_pnpnet.solver.PnPNet.with_guess`.
+        see :meth:`~kornia_pnpnet.solver.PnPNet.with_starts`.
         """
         centre = problems.world_points.mean(1)
         distance = transform_points(problems.pose.matrix, centre[:, None])[:, 0].norm(dim=-1)

@@ -14,13 +14,23 @@ from kornia_pnpnet import Pose
 EXAMPLES = Path(__file__).resolve().parents[1] / "docs" / "examples"
 
 
+def run(tmp_path, name, *arguments, results=None):
+    """The results of an example that writes to ``tmp_path``; its pictures are not empty."""
+    subprocess.run([sys.executable, EXAMPLES / f"{name}.py", *map(str, arguments), "--out", tmp_path], check=True)
+    assert all(picture.stat().st_size > 0 for picture in tmp_path.glob("*.png"))
+    return json.loads((tmp_path / f"{results or name}.json").read_text())
+
+
+@pytest.fixture
+def hall(monkeypatch):
+    monkeypatch.syspath_prepend(EXAMPLES)
+    return pytest.importorskip("rendered_hall")
+
+
 @pytest.mark.slow
 def test_keypoint_offsets_are_learned_through_the_pose(tmp_path):
-    script = EXAMPLES / "keypoint_offsets.py"
-    subprocess.run([sys.executable, script, "--steps", "300", "--out", tmp_path], check=True)
-    runs = json.loads((tmp_path / "keypoint_offsets.json").read_text())["runs"]
-    assert (tmp_path / "keypoint_offsets.png").stat().st_size > 0
-    ours, *others = (run["error_px"] for run in runs.values())
+    runs = run(tmp_path, "keypoint_offsets", "--steps", 300)["runs"]
+    ours, *others = (found["error_px"] for found in runs.values())
     assert ours[-1] < ours[0] / 10
     assert all(errors[-1] > errors[0] / 2 for errors in others)
     assert runs["pnpnet-set"]["steps_without_finite_gradient"] == 0
@@ -28,28 +38,18 @@ def test_keypoint_offsets_are_learned_through_the_pose(tmp_path):
 
 @pytest.mark.slow
 def test_a_boards_mislabelled_corners_do_not_matter(tmp_path):
-    subprocess.run([sys.executable, EXAMPLES / "fiducial_board.py", "--frames", "20", "--out", tmp_path], check=True)
-    runs = json.loads((tmp_path / "fiducial_board.json").read_text())["runs"]
-    assert (tmp_path / "fiducial_board.png").stat().st_size > 0
-    assert all(row["within_10_mm"] == 1.0 for row in runs["pnpnet-set"].values())
-    assert all(row["median_mm"] < 2.0 for row in runs["pnpnet-set"].values())
+    rows = run(tmp_path, "fiducial_board", "--frames", 20)["runs"]["pnpnet-set"].values()
+    assert all(row["within_10_mm"] == 1.0 and row["median_mm"] < 2.0 for row in rows)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("references", "queries"), [(14, 4), (15, 0)], ids=["images without points", "held-out images"]
 )
-def test_queries_of_a_folder_and_a_model_are_localised(tmp_path, monkeypatch, references, queries):
+def test_queries_of_a_folder_and_a_model_are_localised(tmp_path, hall, references, queries):
     """The queries are the images without points, or every fifth image where all have points."""
-    pytest.importorskip("sklearn")
-    monkeypatch.syspath_prepend(EXAMPLES)
-    import rendered_hall
-
-    scene = rendered_hall.make_scene(tmp_path / "hall", references, queries)
-    arguments = ["--images", scene / "images", "--model", scene / "sparse", "--out", tmp_path]
-    subprocess.run([sys.executable, EXAMPLES / "localiser.py", *arguments], check=True)
-    results = json.loads((tmp_path / "localiser.json").read_text())
-    assert (tmp_path / "localiser.png").stat().st_size > 0
+    scene = hall.make_scene(tmp_path / "hall", references, queries)
+    results = run(tmp_path, "localiser", "--images", scene / "images", "--model", scene / "sparse")
     assert len(results["images"]) == (queries or references // 5)
     ours, *theirs = results["solvers"].values()
     assert ours["recall"][1] == 1.0  # 0.25 m, 2 degrees
@@ -81,59 +81,45 @@ def test_disk_and_lightglue_fit_the_localiser(monkeypatch):
 
 
 @pytest.mark.slow
-def test_priors_help_to_track_with_few_pairs(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(EXAMPLES)
-    import rendered_hall
-
-    sequence = rendered_hall.write_sequence(tmp_path / "walk", 30)
-    arguments = ["--sequence", sequence, "--intrinsics", "500", "500", "320", "240", "--out", tmp_path]
-    subprocess.run([sys.executable, EXAMPLES / "tracking.py", *arguments], check=True)
-    results = json.loads((tmp_path / "tracking.json").read_text())
-    assert (tmp_path / "tracking.png").stat().st_size > 0
+def test_priors_help_to_track_with_few_pairs(tmp_path, hall):
+    sequence = hall.write_sequence(tmp_path / "walk", 30)
+    results = run(tmp_path, "tracking", "--sequence", sequence, "--intrinsics", 500, 500, 320, 240)
     assert results["frames"] == 28
-    assert all(run["right"] == 1.0 for run in results["runs"]["100"].values())
-    alone, *known = (run["right"] for run in results["runs"]["4"].values())
+    assert all(found["right"] == 1.0 for found in results["runs"]["100"].values())
+    alone, *known = (found["right"] for found in results["runs"]["4"].values())
     assert all(right > alone for right in known)
 
 
 @pytest.mark.slow
 def test_images_become_poses_end_to_end(tmp_path):
     """A few updates of it."""
-    script = EXAMPLES / "keypoint_pipeline.py"
-    arguments = ["--updates", "60", "--seeds", "1", "--batches", "1", "--out", tmp_path]
-    subprocess.run([sys.executable, script, *arguments], check=True)
-    found = json.loads((tmp_path / "keypoint_pipeline.json").read_text())["seeds"]["0"]
+    arguments = ("--updates", 60, "--seeds", 1, "--batches", 1)
+    found = run(tmp_path, "keypoint_pipeline", *arguments)["seeds"]["0"]
     losses = found["keypoints first"]["curves"]["keypoint_loss"]
     assert losses[-1] < 0.9 * losses[0]
     assert 0.0 < found["end to end"]["mean_distance"] <= 1.0
-    for picture in ("keypoint_pipeline.png", "keypoint_pipeline_overlays.png"):
-        assert (tmp_path / picture).stat().st_size > 0
 
 
 @pytest.mark.slow
 def test_networks_predict_each_kind_of_noise(tmp_path):
     """A few updates of it."""
-    script = EXAMPLES / "keypoint_pipeline.py"
-    arguments = ["--covariances", "--updates", "40", "--seeds", "1", "--batches", "1", "--out", tmp_path]
-    subprocess.run([sys.executable, script, *arguments], check=True)
-    _, *kinds = json.loads((tmp_path / "keypoint_covariances.json").read_text())["seeds"]["0"].values()
+    arguments = ("--covariances", "--updates", 40, "--seeds", 1, "--batches", 1)
+    results = run(tmp_path, "keypoint_pipeline", *arguments, results="keypoint_covariances")
+    _, *kinds = results["seeds"]["0"].values()
     assert len(kinds) == 3
     assert all(0.0 < found["mean_distance"] <= 1.0 for found in kinds)
 
 
 @pytest.mark.slow
 def test_an_incremental_map_registers_its_images(tmp_path):
-    subprocess.run([sys.executable, EXAMPLES / "incremental_map.py", "--scenes", "4", "--out", tmp_path], check=True)
-    theirs, ours = json.loads((tmp_path / "incremental_map.json").read_text())["runs"].values()
+    theirs, ours = run(tmp_path, "incremental_map", "--scenes", 4)["runs"].values()
     assert ours["5%"]["within_1_deg"] > 0.7  # the map drifts without bundle adjustment
     assert all(ours[share]["within_1_deg"] >= theirs[share]["within_1_deg"] for share in ours)
 
 
 @pytest.mark.slow
 def test_a_pose_network_learns_from_nothing(tmp_path):
-    arguments = ["--steps", "200", "--seeds", "1", "--out", tmp_path]
-    subprocess.run([sys.executable, EXAMPLES / "pose_network.py", *arguments], check=True)
-    *distances, likelihood = json.loads((tmp_path / "pose_network.json").read_text())["runs"].values()
+    *distances, likelihood = run(tmp_path, "pose_network", "--steps", 200, "--seeds", 1)["runs"].values()
     assert likelihood[0]["rotation_deg"] < 20.0
     assert all(likelihood[0]["rotation_deg"] < rows[0]["rotation_deg"] for rows in distances)
 

@@ -34,7 +34,7 @@ from kornia_pnpnet.propose.p3p import P3P
 from kornia_pnpnet.propose.ransac import RANSAC
 from kornia_pnpnet.propose.reppnp import REPPnP
 from kornia_pnpnet.peers import KorniaRs, OpenCVPnP, OpenCVRansac, OpenCVUsac, PeerSolver, PoseLib, PyColmap
-from kornia_pnpnet.refine import BoundedParameter
+from kornia_pnpnet.refine.parameters import BoundedParameter
 from kornia_pnpnet.training import TrainSettings
 
 PROBLEMS = SyntheticProblems(n=12, batch_size=3, seed=0).batch(0)

@@ -8,21 +8,17 @@ is which; a share of them is then given the number of another one, as happens wh
 
 from __future__ import annotations
 
-import argparse
 import math
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
+from shared import centre, command, pose_error, write
 from torch.nn.utils.rnn import pad_sequence
 
 from kornia_pnpnet import Pose, create_solver
-from kornia_pnpnet.core.environment import environment
-from kornia_pnpnet.evaluation.plots import BLUE, ORANGE, make_figure, save
-from kornia_pnpnet.evaluation.results import save_results
-from kornia_pnpnet.refine.residual import rotation_angle
+from kornia_pnpnet.evaluation.figures.style import BLUE, ORANGE, make_figure, save
 
 SQUARES, SQUARE, MARKER = (7, 5), 0.04, 0.03  # metres
 PIXELS_PER_SQUARE, SIZE, FOCAL = 60, (640, 480), 700.0
@@ -37,22 +33,22 @@ def path(count: int) -> tuple[np.ndarray, np.ndarray]:
     turn = np.linspace(0.0, 2.0 * math.pi, count, endpoint=False)
     radius, height = 0.22 + 0.06 * np.sin(3.0 * turn), 0.34 + 0.08 * np.cos(2.0 * turn)
     # z of the board points away from the camera: OpenCV's boards have y down.
-    centre = middle + np.stack((radius * np.cos(turn), radius * np.sin(turn), -height), -1)
-    forward = middle - centre
+    place = middle + np.stack((radius * np.cos(turn), radius * np.sin(turn), -height), -1)
+    forward = middle - place
     forward /= np.linalg.norm(forward, axis=-1, keepdims=True)
     right = np.cross(np.array([0.0, 1.0, 0.0]), forward)
     right /= np.linalg.norm(right, axis=-1, keepdims=True)
-    return np.stack((right, np.cross(forward, right), forward), 1), centre
+    return np.stack((right, np.cross(forward, right), forward), 1), place
 
 
-def photograph(board: Any, rotation: np.ndarray, centre: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def photograph(board: Any, rotation: np.ndarray, place: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """What the camera sees of the board."""
     width, height = (PIXELS_PER_SQUARE * x for x in SQUARES)
     drawn = board.generateImage((width, height), marginSize=0)
     drawn = cv2.copyMakeBorder(drawn, 40, 40, 40, 40, cv2.BORDER_CONSTANT, value=255)
     # Pixel u of the drawing has its middle at (u + 0.5 - 40) / PIXELS_PER_SQUARE squares.
     to_board = np.array([[1, 0, -39.5], [0, 1, -39.5], [0, 0, PIXELS_PER_SQUARE / SQUARE]]) * SQUARE / PIXELS_PER_SQUARE
-    to_camera = CAMERA @ np.column_stack((rotation[:, 0], rotation[:, 1], -rotation @ centre))
+    to_camera = CAMERA @ np.column_stack((rotation[:, 0], rotation[:, 1], -rotation @ place))
     seen = cv2.warpPerspective(drawn, to_camera @ to_board, SIZE, flags=cv2.INTER_AREA, borderValue=150)
     seen = cv2.GaussianBlur(seen, (0, 0), 0.8).astype(float) + rng.normal(0.0, 4.0, SIZE[::-1])
     return seen.clip(0, 255).astype(np.uint8)
@@ -76,9 +72,8 @@ def opencv(corners: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 def main() -> None:
     """Draw, detect, solve, and write what came out."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command(__doc__)
     parser.add_argument("--frames", type=int, default=60)
-    parser.add_argument("--out", type=Path, default=Path("outputs/examples"))
     options = parser.parse_args()
     rng = np.random.default_rng(0)
     board = cv2.aruco.CharucoBoard(SQUARES, SQUARE, MARKER, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50))
@@ -91,11 +86,9 @@ def main() -> None:
         pixels, numbers, _, _ = detector.detectBoard(frame)
         if numbers is not None and len(numbers) >= 6:
             seen.append((i, pixels.reshape(-1, 2).astype(np.float64), numbers.reshape(-1)))
-    truth = Pose(
-        torch.from_numpy(rotations[[i for i, _, _ in seen]]),
-        torch.from_numpy(-(rotations @ centres[..., None])[[i for i, _, _ in seen], :, 0]),
-    )
-
+    shown = [i for i, _, _ in seen]
+    rotation = torch.from_numpy(rotations[shown])
+    truth = Pose(rotation, -(rotation @ torch.from_numpy(centres[shown])[..., None])[..., 0])
     solver = create_solver("pnpnet-set")
     runs: dict[str, dict[str, Any]] = {}
     paths = {}
@@ -109,19 +102,14 @@ def main() -> None:
         answers = [opencv(a.numpy(), b.numpy()) for a, b in pairs]
         theirs = Pose(*(torch.from_numpy(np.stack(x)) for x in zip(*answers, strict=True)))
         for name, pose in (("pnpnet-set", ours), ("cv2.solvePnPRansac", theirs)):
-            centre = -(pose.rotation.mT @ pose.translation[..., None])[..., 0]
-            away = 1000.0 * (centre - torch.from_numpy(centres[[i for i, _, _ in seen]])).norm(dim=-1)
-            angle = torch.rad2deg(rotation_angle(pose.rotation, truth.rotation))
+            away, angle = pose_error(pose, truth)
             runs.setdefault(name, {})[f"{share:.0%}"] = {
-                "median_mm": away.nanmedian().item(),
+                "median_mm": 1000.0 * away.nanmedian().item(),
                 "median_deg": angle.nanmedian().item(),
-                "within_10_mm": (away < 10.0).double().mean().item(),
+                "within_10_mm": (away < 0.01).double().mean().item(),
             }
-            paths[name] = centre
-    results = {"environment": environment(), "frames": len(seen), "runs": runs}
-    options.out.mkdir(parents=True, exist_ok=True)
-    save_results(results, options.out / "fiducial_board.json")
-
+            paths[name] = centre(pose)
+    write(options.out / "fiducial_board.json", frames=len(seen), runs=runs)
     figure = make_figure(8.6, 3.4)
     left, right = figure.subplots(1, 2)
     left.imshow(frames[seen[0][0]], cmap="gray")
@@ -142,9 +130,8 @@ def main() -> None:
     save(figure, options.out / "fiducial_board.png")
     for name, found in runs.items():
         for share, row in found.items():
-            print(
-                f"{name}, {share} mislabelled: {row['within_10_mm']:.0%} within 10 mm, median {row['median_mm']:.2f} mm"
-            )
+            within, off = row["within_10_mm"], row["median_mm"]
+            print(f"{name}, {share} mislabelled: {within:.0%} within 10 mm, median {off:.2f} mm")
 
 
 if __name__ == "__main__":

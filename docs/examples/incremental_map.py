@@ -8,21 +8,18 @@ the end all images are registered again to the whole map. Writes `incremental_ma
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import cv2
 import torch
 from kornia.geometry.epipolar import triangulate_points
+from shared import command, write
 from torch import Tensor
 
 from kornia_pnpnet import Pose, create_solver, pose_errors
-from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.data.draws import batch_generator
-from kornia_pnpnet.evaluation.results import save_results
 
 IMAGES, POINTS = 12, 300
 CAMERA = torch.tensor([[1000.0, 0.0, 640.0], [0.0, 1000.0, 480.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -108,9 +105,8 @@ def run(register: Register, truth: Pose, pixels: Tensor) -> tuple[Pose, float]:
 
 def main() -> None:
     """Map scenes with both libraries and write what came out."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command(__doc__)
     parser.add_argument("--scenes", type=int, default=20)
-    parser.add_argument("--out", type=Path, default=Path("outputs/examples"))
     options = parser.parse_args()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
@@ -128,9 +124,7 @@ def main() -> None:
             row = {"within_1_deg": right, "median_deg": error.median().item(), "ms_per_image": 1e3 * min(seconds)}
             runs[name][f"{wrong:.0%}"] = row
             print(f"{name}, {wrong:.0%} wrong: {right:.1%} of images, {row['ms_per_image']:.2f} ms per image")
-    options.out.mkdir(parents=True, exist_ok=True)
-    results = {"environment": environment(), "scenes": options.scenes, "images": IMAGES, "runs": runs}
-    save_results(results, options.out / "incremental_map.json")
+    write(options.out / "incremental_map.json", scenes=options.scenes, images=IMAGES, runs=runs)
 
 
 if __name__ == "__main__":

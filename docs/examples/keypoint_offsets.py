@@ -9,20 +9,18 @@ and a picture of it to `--out`.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
 from kornia.geometry import solve_pnp_dlt
+from shared import command, write
 from torch import Tensor
 
 from kornia_pnpnet import create_solver
-from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.data.draws import batch_generator, random_poses
-from kornia_pnpnet.evaluation.plots import BLUE, GREEN, ORANGE, make_figure, save, themed
-from kornia_pnpnet.evaluation.results import save_results
+from kornia_pnpnet.evaluation.figures.style import BLUE, GREEN, ORANGE, make_figure, save, themed
 from kornia_pnpnet.losses import pose_distances
 from kornia_pnpnet.result import Pose
 
@@ -106,11 +104,11 @@ def learn(solve: Solve, steps: int) -> dict[str, Any]:
 
 
 @themed
-def plot(results: dict[str, Any], path: Path) -> None:
+def plot(runs: dict[str, Any], path: Path) -> None:
     """The errors against steps."""
     figure = make_figure(7.0, 3.6)
     axes = figure.subplots()
-    for name, run in results["runs"].items():
+    for name, run in runs.items():
         axes.plot(run["error_px"], color=COLOURS[name], linewidth=1.7, label=name)
     axes.set(xlabel="step", ylabel="error of the learned offsets (px)", yscale="log")
     axes.set_title(f"{WRONG:.0%} of the keypoints anywhere", loc="left")
@@ -120,16 +118,13 @@ def plot(results: dict[str, Any], path: Path) -> None:
 
 def main() -> None:
     """Learn with every solver, write the results and draw them."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command(__doc__)
     parser.add_argument("--steps", type=int, default=600)
-    parser.add_argument("--out", type=Path, default=Path("outputs/examples"))
     options = parser.parse_args()
     torch.set_num_threads(1)
     runs = {name: learn(make(), options.steps) for name, make in SOLVERS.items()}
-    results = {"environment": environment(), "steps": options.steps, "runs": runs}
-    options.out.mkdir(parents=True, exist_ok=True)
-    save_results(results, options.out / "keypoint_offsets.json")
-    plot(results, options.out / "keypoint_offsets.png")
+    write(options.out / "keypoint_offsets.json", steps=options.steps, runs=runs)
+    plot(runs, options.out / "keypoint_offsets.png")
     for name, run in runs.items():
         first, last = run["error_px"][0], run["error_px"][-1]
         print(f"{name}: {first:.2f} px at first, {last:.2f} px after {options.steps} steps")

@@ -19,7 +19,6 @@ standard deviation; a 2×2 covariance; or a factor of the covariance of the keyp
 
 from __future__ import annotations
 
-import argparse
 import copy
 import math
 import multiprocessing
@@ -32,14 +31,13 @@ import torch
 from kornia.filters import gaussian_blur2d, motion_blur
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from kornia.geometry.subpix import spatial_softmax2d
+from shared import command, write
 from torch import Tensor, nn
 from torch.distributions import MultivariateNormal
 from torch.nn import functional
 
 from kornia_pnpnet import PnPResult, Pose, create_solver, heatmap_keypoints
-from kornia_pnpnet.core.environment import environment
-from kornia_pnpnet.evaluation.plots import BLUE, ORANGE, VERMILION, make_figure, save, themed
-from kornia_pnpnet.evaluation.results import save_results
+from kornia_pnpnet.evaluation.figures.style import BLUE, ORANGE, VERMILION, make_figure, save, themed
 from kornia_pnpnet.refine.residual import rotation_angle
 
 SIZE, FOCAL, BATCH = 64, 90.0, 32
@@ -262,8 +260,7 @@ def train(
         optimizer.step()
         schedule.step()
         log.append(terms)
-    means = torch.tensor(log).split(MEAN_OF)
-    curves = torch.stack([x.mean(0) for x in means]).T.tolist()
+    curves = torch.stack([x.mean(0) for x in torch.tensor(log).split(MEAN_OF)]).T.tolist()
     names = "keypoint_loss", "median_distance"
     return {name: [round(x, 5) for x in curve] for name, curve in zip(names, curves, strict=False)}
 
@@ -271,22 +268,18 @@ def train(
 @torch.no_grad()
 def test(network: Keypoints, solver: nn.Module, *, with_sigma: bool, batches: int, motion: bool) -> dict[str, float]:
     """Errors on images of a seed that no training uses."""
-    distances, angles, offs = [], [], []
+    rows = []
     for index in range(batches):
         problem = draw(999_983, index, motion=motion)
         pixels, sigma = network(problem.images)
         result = solve(solver, pixels, sigma if with_sigma else None)
-        distances.append(distance(result.pose, problem.pose))
-        angles.append(torch.rad2deg(rotation_angle(result.rotation, problem.pose.rotation)))
-        offs.append((pixels - problem.pixels).norm(dim=-1).mean(-1))
-    off, angle, pixel = torch.cat(distances), torch.cat(angles), torch.cat(offs)
-    return {
-        "mean_distance": off.clamp(max=1.0).mean().item(),
-        "median_distance": off.median().item(),
-        "mean_rotation_deg": angle.mean().item(),
-        "median_rotation_deg": angle.median().item(),
-        "mean_keypoint_px": pixel.mean().item(),
-    }
+        angle = torch.rad2deg(rotation_angle(result.rotation, problem.pose.rotation))
+        off = (pixels - problem.pixels).norm(dim=-1).mean(-1)
+        rows.append(torch.stack((distance(result.pose, problem.pose), angle, off)))
+    away, angle, pixel = torch.cat(rows, 1)
+    means = {"mean_distance": away.clamp(max=1.0).mean(), "mean_rotation_deg": angle.mean()}
+    medians = {"median_distance": away.median(), "median_rotation_deg": angle.median()}
+    return {name: x.item() for name, x in {**means, **medians, "mean_keypoint_px": pixel.mean()}.items()}
 
 
 def run(seed: int, updates: int, batches: int) -> tuple[dict[str, Any], dict[str, Keypoints]]:
@@ -380,22 +373,20 @@ def plot_overlays(networks: dict[str, Keypoints], path: Path, count: int = 6) ->
 
 def main() -> None:
     """Train with every seed, write the results and draw them."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command(__doc__)
     parser.add_argument("--updates", type=int, default=2000, help="of each half of the training")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--jobs", type=int, default=1, help="so many seeds at the same time")
     parser.add_argument("--batches", type=int, default=32, help="of test images")
     parser.add_argument("--covariances", action="store_true", help="compare kinds of noise; end to end half as long")
-    parser.add_argument("--out", type=Path, default=Path("outputs/examples"))
     options = parser.parse_args()
     arguments = range(options.seeds), repeat(options.updates), repeat(options.batches)
-    made = {"environment": environment(), "updates": options.updates, "batches": options.batches}
-    options.out.mkdir(parents=True, exist_ok=True)
+    made = {"updates": options.updates, "batches": options.batches}
     with ProcessPoolExecutor(options.jobs, multiprocessing.get_context("spawn")) as pool:
         if options.covariances:
             found = list(pool.map(run_covariances, *arguments))
-            results = {**made, "seeds": {str(seed): row for seed, row in enumerate(found)}}
-            save_results(results, options.out / "keypoint_covariances.json")
+            seeds = {str(seed): row for seed, row in enumerate(found)}
+            write(options.out / "keypoint_covariances.json", **made, seeds=seeds)
             return
         runs = list(pool.map(run, *arguments))
     seeds = {str(seed): found for seed, (found, _) in enumerate(runs)}
@@ -408,7 +399,7 @@ def main() -> None:
         for name in (ALONE, LIKELY, FULL, FULL_LIKELY)
     }
     results = {**made, "times_lower": times_lower, "seeds": seeds}
-    save_results(results, options.out / "keypoint_pipeline.json")
+    write(options.out / "keypoint_pipeline.json", **results)
     plot_errors(results, options.out / "keypoint_pipeline.png")
     plot_overlays(runs[-1][1], options.out / "keypoint_pipeline_overlays.png")
 

@@ -16,12 +16,11 @@ DISK and LightGlue, whose weights Kornia downloads unless they are in the cache 
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -37,15 +36,13 @@ from kornia.feature import (
     laf_is_filled,
     match_snn,
 )
-from sklearn.isotonic import IsotonicRegression
+from shared import command, pose_error, write
 from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
 
 from kornia_pnpnet import PnPResult, Pose, create_solver
-from kornia_pnpnet.core.environment import environment
-from kornia_pnpnet.evaluation.plots import BLUE, make_figure, save, themed
-from kornia_pnpnet.evaluation.results import save_results
-from kornia_pnpnet.refine.residual import rotation_angle
+from kornia_pnpnet.confidence import Calibration, fit_confidence
+from kornia_pnpnet.evaluation.figures.style import BLUE, make_figure, save, themed
 
 LONGEST = 1600  # pixels; larger images are shrunk for the features
 EVERY = 5  # every fifth image of a model is a query
@@ -59,16 +56,6 @@ OURS = "pnpnet-set, likeliest pairs"
 # The usual limits of visual localisation (T. Sattler et al., "Benchmarking 6DOF Outdoor Visual Localization in Changing
 # Conditions", CVPR 2018) and a finer one: distance of the camera in metres, rotation in degrees.
 LIMITS = ((0.05, 0.5), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
-
-
-class Detector(Protocol):
-    """Finds and matches features."""
-
-    def detect(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Local affine frames (1, M, 2, 3) and descriptors (M, D) of an image (1, 3, H, W)."""
-
-    def match(self, query: Photo, reference: Photo) -> tuple[Tensor, Tensor]:
-        """Scores (K,) of matches, and the numbers (K, 2) of their features in both images."""
 
 
 class Photo(NamedTuple):
@@ -99,13 +86,13 @@ class Sift:
         self.network = SIFTFeatureScaleSpace(count, descriptor_backend="pyramid")
 
     def detect(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """See Detector."""
+        """Local affine frames (1, M, 2, 3) and descriptors (M, D) of an image (1, 3, H, W)."""
         lafs, _, descriptors = self.network(image.mean(1, keepdim=True))
         filled = laf_is_filled(lafs)[0]
         return lafs[:, filled], descriptors[0, filled]
 
     def match(self, query: Photo, reference: Photo) -> tuple[Tensor, Tensor]:
-        """See Detector."""
+        """Scores (K,) of matches, and the numbers (K, 2) of their features in both images."""
         ratios, pairs = match_snn(query.descriptors, reference.descriptors, th=1.0)
         return ratios[:, 0], pairs
 
@@ -119,17 +106,18 @@ class DiskLightGlue:
         self.matcher = LightGlueMatcher("disk")
 
     def detect(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """See Detector."""
+        """See Sift."""
         found = self.network(image, self.count, pad_if_not_divisible=True)[0]
         return laf_from_center_scale_ori(found.keypoints[None]), found.descriptors
 
     def match(self, query: Photo, reference: Photo) -> tuple[Tensor, Tensor]:
-        """See Detector."""
+        """See Sift."""
         lafs = query.lafs, reference.lafs
         scores, pairs = self.matcher(query.descriptors, reference.descriptors, *lafs, query.shape, reference.shape)
         return scores[:, 0], pairs
 
 
+Detector = Sift | DiskLightGlue
 DETECTORS = {"sift": Sift, "disk": DiskLightGlue}
 
 
@@ -251,13 +239,12 @@ def solve_by_colmap(photo: Photo, matches: Matches) -> Pose | None:
     return Pose(matrix[:, :3], matrix[:, 3])
 
 
-def pose_error(found: Pose | None, truth: Pose, metre: float) -> dict[str, Any] | None:
+def error_of(found: Pose | None, truth: Pose, metre: float) -> dict[str, Any] | None:
     """Distance of the cameras in metres and angle of the rotations in degrees; None without a pose."""
     if found is None:
         return None
-    centres = [-(pose.rotation.mT @ pose.translation) for pose in (found, truth)]
-    angle = torch.rad2deg(rotation_angle(found.rotation, truth.rotation)).item()
-    return {"metres": (centres[0] - centres[1]).norm().item() * metre, "degrees": angle}
+    distance, angle = pose_error(found, truth)
+    return {"metres": distance.item() * metre, "degrees": angle.item()}
 
 
 def summary(errors: Sequence[dict[str, Any] | None], ms: float) -> dict[str, Any]:
@@ -328,7 +315,7 @@ def run(
         row: dict[str, Any] = {"image": photo.name, "matches": len(matched[i].scores), "pairs": len(error)}
         row["outliers"] = (error > INLIER_PX).double().mean().item()
         row["outliers_of_all"] = (errors_px(matched[i], photo) > INLIER_PX).double().mean().item()
-        row |= {name: pose_error(found[i], photo.pose, metre) for name, found in poses.items()}
+        row |= {name: error_of(found[i], photo.pose, metre) for name, found in poses.items()}
         rows.append(row)
         drawn.append((kept[i], weights[i][: len(error)] > 0.5, row))
     ms = {stage: 1000.0 * x / len(photos) for stage, x in seconds.items()}
@@ -358,7 +345,7 @@ def draw(drawn: Sequence[tuple[Matches, Tensor, dict[str, Any]]], images: Path, 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Localise, write the results and draw."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command(__doc__)
     parser.add_argument("--images", type=Path, help="folder of the images")
     parser.add_argument("--model", type=Path, help="folder of the COLMAP model, text or binary")
     parser.add_argument("--metre", type=float, default=1.0, help="metres in a unit of the model")
@@ -366,7 +353,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--count", type=int, default=1500, help="features of an image")
     parser.add_argument("--batch", type=int, default=64, help="queries that are solved in one call")
     parser.add_argument("--rendered", type=int, nargs=2, default=(20, 60), help="images of the map and queries")
-    parser.add_argument("--out", type=Path, default=Path("outputs/examples"))
     options = parser.parse_args(arguments)
     if (options.images is None) != (options.model is None):
         parser.error("--images and --model belong together")
@@ -381,9 +367,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         found, drawn = run(images, model, detector, batch=options.batch, metre=options.metre)
         options.out.mkdir(parents=True, exist_ok=True)
         draw(drawn, images, options.out / "localiser.png")
-    results = {"environment": environment(), "features": options.features, "count": options.count, **found}
-    save_results(results, options.out / "localiser.json")
-    for name, x in results["solvers"].items():
+    write(options.out / "localiser.json", features=options.features, count=options.count, **found)
+    for name, x in found["solvers"].items():
         recall = ", ".join(f"{100 * share:.0f} %" for share in x["recall"])
         print(f"{name}: recall {recall}, {x['ms']:.1f} ms for a query")
 

@@ -8,20 +8,17 @@ of the pose of Kornia's DLT, the distance of the pose of `pnpnet-set` with `grad
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import torch
 from kornia.geometry import solve_pnp_dlt
+from shared import command, write
 from torch import Tensor, nn
 
 from kornia_pnpnet import Pose, create_solver, monte_carlo_pose_loss, pose_errors
-from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.data.draws import batch_generator, random_poses
-from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.losses import pose_distances
 
 KEYPOINTS, BATCH, TEST = 12, 64, 512
@@ -124,10 +121,9 @@ def train(loss: Loss, steps: int, seed: int) -> dict[str, Any]:
 
 def main() -> None:
     """Train with every loss and write what came out."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command(__doc__)
     parser.add_argument("--steps", type=int, default=600)
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--out", type=Path, default=Path("outputs/examples"))
     options = parser.parse_args()
     torch.set_num_threads(1)
     runs: dict[str, list[dict[str, Any]]] = {}
@@ -135,10 +131,7 @@ def main() -> None:
         runs[name] = [train(make(), options.steps, seed) for seed in range(options.seeds)]
         for row in runs[name]:
             print(f"{name}: {row['rotation_deg']:.1f}°, {row['translation']:.2f}, {row['ms_per_step']:.1f} ms per step")
-    options.out.mkdir(parents=True, exist_ok=True)
-    save_results(
-        {"environment": environment(), "steps": options.steps, "runs": runs}, options.out / "pose_network.json"
-    )
+    write(options.out / "pose_network.json", steps=options.steps, runs=runs)
 
 
 if __name__ == "__main__":

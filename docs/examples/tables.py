@@ -59,32 +59,28 @@ def tracking(results: dict[str, Any]) -> str:
     return f"{caption}:\n\n{table}\n\nBefore the solver each frame takes: {stages}."
 
 
+def by_share(runs: dict[str, Any], title: str, cell: str) -> str:
+    """A table with a line for each share of wrong pairs, and a column for each solver."""
+    shares = next(iter(runs.values()))
+    lines = [[share.replace("%", " %"), *(cell.format_map(run[share]) for run in runs.values())] for share in shares]
+    return markdown_table([title, *(f"`{name}`" for name in runs)], lines)
+
+
 def fiducial_board(results: dict[str, Any]) -> str:
     """Success and errors of each solver, by the share of mislabelled corners."""
-    runs = results["runs"]
-    lines = []
-    for share in next(iter(runs.values())):
-        cells = [
-            f"{100 * run[share]['within_10_mm']:.0f} %, {run[share]['median_mm']:.2f} mm, "
-            f"{run[share]['median_deg']:.3f}°"
-            for run in runs.values()
-        ]
-        lines.append([share.replace("%", " %"), *cells])
-    share = f"Share of the {results['frames']} frames with the camera within 10 mm"
-    header = ["Corners mislabelled", *(f"`{name}`" for name in runs)]
-    return f"{share}, and median errors of the poses found:\n\n{markdown_table(header, lines)}"
+    cell = "{within_10_mm:.0%}, {median_mm:.2f} mm, {median_deg:.3f}°"
+    table = by_share(results["runs"], "Corners mislabelled", cell).replace("%,", " %,")
+    caption = (
+        f"Share of the {results['frames']} frames with the camera within 10 mm, and median errors of the poses found"
+    )
+    return f"{caption}:\n\n{table}"
 
 
 def incremental_map(results: dict[str, Any]) -> str:
     """Success of each way to register an image, by the share of wrong matches."""
-    runs = results["runs"]
-    lines = []
-    for share in next(iter(runs.values())):
-        cells = [f"{100 * run[share]['within_1_deg']:.0f} %, {run[share]['median_deg']:.3f}°" for run in runs.values()]
-        lines.append([share.replace("%", " %"), *cells])
-    header = ["Wrong matches", *(f"`{name}`" for name in runs)]
+    table = by_share(results["runs"], "Wrong matches", "{within_1_deg:.0%}, {median_deg:.3f}°").replace("%,", " %,")
     caption = f"Share of images within 1° and median error, {results['scenes']} scenes of {results['images']} images"
-    return f"{caption}:\n\n{markdown_table(header, lines)}"
+    return f"{caption}:\n\n{table}"
 
 
 def pose_network(results: dict[str, Any]) -> str:

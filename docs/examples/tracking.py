@@ -12,7 +12,6 @@ Without ``--sequence`` a walk through a hall is rendered first (``rendered_hall.
 
 from __future__ import annotations
 
-import argparse
 import math
 import tempfile
 import time
@@ -27,13 +26,11 @@ import torch
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from kornia.geometry.liegroup import So3
 from localiser import RATIO_TEST, Matches, Photo, Sift, match
+from shared import centre, command, pose_error, write
 from torch import Tensor, nn
 
 from kornia_pnpnet import PnPNet, Pose, PosePrior, RobustWeightedLM, create_solver, gravity_prior
-from kornia_pnpnet.core.environment import environment
-from kornia_pnpnet.evaluation.plots import BLUE, GREEN, ORANGE, VERMILION, make_figure, save, themed
-from kornia_pnpnet.evaluation.results import save_results
-from kornia_pnpnet.refine.residual import rotation_angle
+from kornia_pnpnet.evaluation.figures.style import BLUE, GREEN, ORANGE, VERMILION, make_figure, save, themed
 
 KEYFRAME = 15  # frames from one keyframe to the next
 PAIRS = (3, 4, 6, 10, 30, 100)  # matches of a frame that the solver gets
@@ -72,9 +69,9 @@ def read_sequence(folder: Path) -> list[tuple[Path, Path, Pose]]:
         near = [min(table, key=lambda x: abs(x - moment)) for table in (depths, poses)]
         if max(abs(x - moment) for x in near) > MOST_LAG:
             continue
-        *centre, x, y, z, w = map(float, poses[near[1]])
+        *at, x, y, z, w = map(float, poses[near[1]])
         turn = Pose.from_quaternion(torch.tensor([[w, x, y, z]], dtype=torch.float64), torch.zeros(1, 3)).rotation[0]
-        place = torch.tensor(centre, dtype=torch.float64)
+        place = torch.tensor(at, dtype=torch.float64)
         frames.append((folder / name, folder / depths[near[0]][0], Pose(turn.mT, -turn.mT @ place)))
     return frames
 
@@ -148,14 +145,13 @@ def with_gravity(prior: PosePrior, down: Tensor) -> PosePrior:
 
 def place(pose: Pose) -> list[float]:
     """Where a camera is, to a tenth of a millimetre."""
-    return [round(x, 4) for x in (-(pose.rotation.mT @ pose.translation)).tolist()]
+    return [round(x, 4) for x in centre(pose).tolist()]
 
 
 def moved(first: Pose, second: Pose) -> tuple[float, float]:
     """Distance of two cameras in metres and angle between them in degrees."""
-    centres = [pose.rotation.mT @ pose.translation for pose in (first, second)]
-    angle = torch.rad2deg(rotation_angle(first.rotation, second.rotation)).item()
-    return (centres[0] - centres[1]).norm().item(), angle
+    distance, angle = pose_error(first, second)
+    return distance.item(), angle.item()
 
 
 def track(
@@ -254,13 +250,12 @@ def draw(results: dict[str, Any], path: Path) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Track, write the results and draw."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command(__doc__)
     parser.add_argument("--sequence", type=Path, help="folder of an RGB-D sequence of the TUM benchmark")
     parser.add_argument(
         "--intrinsics", type=float, nargs=4, help=f"fx fy cx cy in pixels (default: of freiburg1, {FREIBURG1})"
     )
     parser.add_argument("--frames", type=int, default=100, help="of the sequence that is rendered")
-    parser.add_argument("--out", type=Path, default=Path("outputs/examples"))
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)  # times are those of one thread
     with tempfile.TemporaryDirectory() as temporary:
@@ -269,9 +264,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if folder is None:
             folder = rendered_hall.write_sequence(Path(temporary) / "walk", options.frames)
             intrinsics = torch.from_numpy(rendered_hall.INTRINSICS)
-        results = {"environment": environment(), **run(folder, intrinsics)}
-    options.out.mkdir(parents=True, exist_ok=True)
-    save_results(results, options.out / "tracking.json")
+        results = run(folder, intrinsics)
+    write(options.out / "tracking.json", **results)
     draw(results, options.out / "tracking.png")
     for pairs, row in results["runs"].items():
         for name, x in row.items():

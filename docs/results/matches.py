@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
@@ -19,6 +20,9 @@ __all__ = ["MATCHES", "Pooled", "facts", "overview", "pool", "title"]
 
 #: Files of ``benchmarks/real_matches.py measure``, each on scenes that no solver had seen, the latest last.
 MATCHES = ("real_matches", "real_matches_again", "real_matches_third", "real_matches_fourth")
+#: The file of ``benchmarks/real_matches.py measure --batch 1`` on some of these scenes: one image in each call.
+SINGLE = "real_matches_single"
+BATCH = 500  # problems in a call of ours in the files of MATCHES
 SCORES = "scores"  # what the title of a solver ends with that got a score for each pair
 _TITLES = {"poselib": "PoseLib", "opencv-usac": "OpenCV USAC", "known-inliers": "inliers known"}
 _TOLD = {"": "", "ratio": SCORES, "sigma": "noise known"}
@@ -84,6 +88,8 @@ def overview(files: Sequence[Mapping[str, Any]], link: str) -> str:
         link: where the page on real matches is, from the page that shows the table.
     """
     pooled = pool(files)
+    measured = json.loads((HERE / f"{SINGLE}.json").read_text(encoding="utf-8"))
+    single, batched = (pool([of_batch(measured, size)]) for size in (1, BATCH))
     kinds = [kind for kind in pooled[f"`{ANY}`"] if kind != "all"]
     ours = [f"`{ANY}`", f"`{ANY}`, {SCORES}"]
     others = [name for name in pooled if name[0] != "`" and name != _TITLES["known-inliers"]]
@@ -93,34 +99,59 @@ def overview(files: Sequence[Mapping[str, Any]], link: str) -> str:
     rows = [*ours, *sorted(shown, key=lambda name: -pooled[name]["all"].success.rate)]
     lines = []
     for name in rows:
-        cells = [name.replace(f", {SCORES}", f" with {SCORES}")]
+        title_ = name.replace(f", {SCORES}", f" with {SCORES}")
+        cells = [title_, f"{BATCH}" if name in ours else "1"]
         for kind in kinds:
-            cells += [f"{100 * pooled[name][kind].success.rate:.1f} %", f"{1e3 * pooled[name][kind].ms:.0f}"]
+            cells += [f"{100 * pooled[name][kind].success.rate:.1f} %", microseconds(pooled[name][kind])]
         lines.append([f"**{cell}**" if name in ours else cell for cell in cells])
+        if name in ours:
+            lines.append([title_, "1"])
+            for kind in kinds:
+                one, many = single[name][kind], batched[name][kind]
+                same = one.success.rate == many.success.rate
+                lines[-1] += ["same" if same else f"{100 * one.success.rate:.1f} %\\*", f"{microseconds(one)}\\*"]
     short = {"ratio test": "filtered", "no ratio test": "raw"}
-    header = ["Solver", *(text for kind in kinds for text in (f"{short[kind]}: right", "µs"))]
+    header = ["Solver", "images per call", *(x for kind in kinds for x in (f"{short[kind]}: right", "µs per image"))]
     scenes = sum(len(results["counts"]) for results in files)
     reach = max(half(pooled[name][kind].success) for name in rows for kind in kinds)
     right = files[0]["settings"]["right"]
     base = pooled[ours[0]]
     ahead = []
     for kind in kinds:
-        for what, better in (
-            ("more often right", [name for name in shown if pooled[name][kind].success.rate > base[kind].success.rate]),
-            ("faster", [name for name in shown if pooled[name][kind].ms < base[kind].ms]),
-        ):
-            names = dict.fromkeys(name.partition(",")[0] for name in better)
+        better = {
+            "more often right": [x for x in shown if pooled[x][kind].success.rate > base[kind].success.rate],
+            "faster": [x for x in shown if pooled[x][kind].ms < base[kind].ms],
+            "faster with one image per call": [x for x in shown if single[x][kind].ms < single[ours[0]][kind].ms],
+        }
+        for what, found in better.items():
+            names = dict.fromkeys(name.partition(",")[0] for name in found)
             ahead += [f"{' and '.join(names)} {what} on {short[kind]} matches"] if names else []
     steps = [100 * points_ahead(pool([results])) for results in files]
+    there = [
+        f"{what} takes {' and '.join(microseconds(one[kind]) for kind in kinds)} µs"
+        for what, one in ((f"`{ANY}` in batches of {BATCH}", batched[ours[0]]), (plain, single[plain]))
+    ]
     notes = (
         f"{base['all'].success.total} problems of {scenes} public scenes that no solver had seen: SIFT matches after a "
         f"ratio test (*filtered*) or without (*raw*). Right: within {right[0]:g}° and {100 * right[1]:g} % of the "
         f"distance; 95 % intervals: at most ±{reach:.1f} points. One thread, {files[0]['environment']['cpu']}. "
+        f"\\* {single[ours[0]]['all'].success.total} of these problems on {measured['environment']['cpu']}, where "
+        f"{' and '.join(there)} (filtered and raw). "
         f"**Where others are ahead** of `{ANY}`: {'; '.join(ahead) or 'nowhere'}. In the {len(files)} measurements "
         f"`{ANY}` was {min(steps):+.1f} to {max(steps):+.1f} points ahead of the best PoseLib. "
         f"[All measurements]({link})."
     )
     return f"{markdown_table(header, lines)}\n\n{notes}"
+
+
+def microseconds(one: Pooled) -> str:
+    """The time of an image for a table."""
+    return f"{1e3 * one.ms:.0f}"
+
+
+def of_batch(results: Mapping[str, Any], size: int) -> dict[str, Any]:
+    """The file with the rows of one number of problems in a call."""
+    return {**results, "rows": [row for row in results["rows"] if row["batch"] == size]}
 
 
 def points_ahead(pooled: Mapping[str, Mapping[str, Pooled]], ours: str = f"`{ANY}`") -> float:

@@ -1,0 +1,38 @@
+"""What the examples share: command lines, results files, and errors of poses."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kornia_pnpnet import Pose
+from kornia_pnpnet.core.environment import environment
+from kornia_pnpnet.evaluation.results import save_results
+from kornia_pnpnet.refine.residual import rotation_angle
+
+
+def command(description: str | None) -> argparse.ArgumentParser:
+    """The command line of an example, whose help shows the description as it is written."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("outputs/examples"), help="folder of results and pictures")
+    return parser
+
+
+def write(path: Path, /, **results: Any) -> None:
+    """Write a results file, with the environment; a missing folder is made."""
+    save_results({"environment": environment(), **results}, path)
+
+
+def centre(pose: Pose) -> Tensor:
+    """The centre of each camera in the world, (..., 3)."""
+    return -(pose.rotation.mT @ pose.translation[..., None])[..., 0]
+
+
+def pose_error(found: Pose, truth: Pose) -> tuple[Tensor, Tensor]:
+    """Distances of the cameras in the unit of the world, and angles of the rotations in degrees."""
+    angle = torch.rad2deg(rotation_angle(found.rotation, truth.rotation))
+    return (centre(found) - centre(truth)).norm(dim=-1), angle
