@@ -273,7 +273,6 @@ class P3P(Configured):
         plane = problem.img_points / problem.focal
         if problem.free_focal is None:
             return p3p(problem.world_points, plane)
-        batch = len(plane)
         at = (torch.arange(_FOCALS, device=plane.device) + 0.5) * (2.0 / _FOCALS) - 1.0
         zoom = at[:, None].to(plane) * problem.free_focal.width  # (F, B)
         world = problem.world_points.expand(_FOCALS, -1, -1, -1)

@@ -26,7 +26,7 @@ _DTYPE = torch.float32
 # Number of samples that are solved and scored together, and of pairs that are improved together: a core's caches hold
 # their tensors.
 _SAMPLES_AT_ONCE = 4096
-PAIRS_AT_ONCE = 4 * _SAMPLES_AT_ONCE
+PAIRS_AT_ONCE = 8 * _SAMPLES_AT_ONCE
 # Number of pairs that score all poses of a round first, see `_rank`: at least the first, and the second times the cube
 # root of the number of samples before. After k samples in vain at a confidence of 0.999 the share of the inliers is
 # below (7 / k)^(1/3); of 3 over that share, one is an inlier with a probability of 95 %.
