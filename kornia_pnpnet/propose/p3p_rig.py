@@ -42,18 +42,7 @@ class P3PRig(Configured):
         self.steps = steps
 
     def hypotheses(self, problem: Problem) -> Hypotheses:
-        r"""Solve samples of three pairs.
-
-        Args:
-            problem: normalised correspondences of a rig with :math:`N = 3`. Their weights are ignored.
-
-        Returns:
-            Four slots per sample, without gradients. Samples whose rays are more than 90 degrees from their mean have
-            none.
-
-        Raises:
-            ShapeError: when :math:`N` is not 3.
-        """
+        """Four slots per sample, without gradients; none valid where a ray is over 90 degrees from the mean ray."""
         problem = problems_last(problem)
         assert problem.rig is not None
         batch = problem.weights.shape[0]

@@ -12,7 +12,7 @@ from kornia_pnpnet.core.trees import map_tensors, take
 from kornia_pnpnet.judge.belief import residual_noise, rotation_sigma
 from kornia_pnpnet.judge.inliers import Thresholds, judge
 from kornia_pnpnet.problem import Noise, Problem, State
-from kornia_pnpnet.propose.minimal import MinimalSolver
+from kornia_pnpnet.propose.minimal import FocalHypotheses, MinimalSolver
 from kornia_pnpnet.propose.sampling import Samples, agreement_of_neighbours, kept_at_once
 from kornia_pnpnet.propose.scoring import Scene, Scorer
 from kornia_pnpnet.refine.residual import Projection, lm_step, normal_equations, project
@@ -242,7 +242,7 @@ class Search:
         # Components first, the layout of p3p's results: each is selected along a row of memory.
         (rotation, translation), zoom = map_tensors(
             lambda x: x.movedim((0, 1), (-1, -2)).flatten(-2).index_select(-1, at).unflatten(-1, valid.shape),
-            (solved.pose, solved.zoom),
+            (solved.pose, solved.zoom if isinstance(solved, FocalHypotheses) else None),
         )
         if zoom is not None:
             rotation[2] *= (scale := (-zoom).exp())
