@@ -235,10 +235,7 @@ class Hypotheses(NamedTuple):
     Attributes:
         pose: rotations :math:`(B, S, 3, 3)` and translations :math:`(B, S, 3)` in the frame of the sample.
         valid: which slots hold a solution, bool, shape :math:`(B, S)`. The other slots are finite.
-        zoom: logarithm of the focal length of each slot over that of the problem, shape :math:`(B, S)`; ``None``: the
-            focal length is known.
     """
 
     pose: Pose
     valid: Tensor
-    zoom: Tensor | None = None

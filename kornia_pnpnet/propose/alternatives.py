@@ -96,10 +96,13 @@ def find_alternatives(
     position = (~valid).to(torch.int8).sort(dim=0, stable=True).indices[:most]
     eye = torch.eye(3, dtype=cost.dtype, device=cost.device)
     found = (ends.rotation, ends.translation, cost, probability, valid)
-    fill = (eye, 0.0, torch.finfo(cost.dtype).max ** 0.5, 0.0, False)
+    fill = (eye, 0.0, torch.finfo(cost.dtype).max ** 0.5, 0.0)
     *picked, chosen = _pick(found, position)
-    filled = [torch.where(chosen.view(*chosen.shape, *(1,) * (x.ndim - 2)), x, y) for x, y in zip(picked, fill)]
-    return Alternatives(*(x.movedim(0, 1) for x in filled), chosen.mT)
+    filled = [
+        torch.where(chosen.view(*chosen.shape, *(1,) * (x.ndim - 2)), x, y).movedim(0, 1)
+        for x, y in zip(picked, fill, strict=True)
+    ]
+    return Alternatives(*filled, chosen.mT)
 
 
 @torch.no_grad()

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from kornia_pnpnet.core.checks import check_whole
 from kornia_pnpnet.core.configured import Configured
@@ -13,7 +13,15 @@ from kornia_pnpnet.problem import Hypotheses, Problem
 from kornia_pnpnet.refine.lm import RobustWeightedLM
 from kornia_pnpnet.result import Pose
 
-__all__ = ["MinimalSolver", "SubsetSolver", "describe"]
+__all__ = ["FocalHypotheses", "MinimalSolver", "SubsetSolver", "describe"]
+
+
+class FocalHypotheses(NamedTuple):
+    """:class:`~kornia_pnpnet.problem.Hypotheses` with the logarithm of the focal length over that of the problem."""
+
+    pose: Pose
+    valid: Tensor
+    zoom: Tensor
 
 
 class MinimalSolver(Protocol):
@@ -23,7 +31,7 @@ class MinimalSolver(Protocol):
     def sample_size(self) -> int:
         """Number of pairs in a sample."""
 
-    def hypotheses(self, problem: Problem) -> Hypotheses:
+    def hypotheses(self, problem: Problem) -> Hypotheses | FocalHypotheses:
         """The poses of a batch of samples: normalised, with :math:`N` = ``sample_size``. Their weights do not count."""
 
 

@@ -17,6 +17,7 @@ from kornia_pnpnet.core.performance import compiling, fold_vmap, unfold_vmap
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.problem import Hypotheses, Problem
 from kornia_pnpnet.propose.law_of_cosines import Triple, distances, turn_to_largest, turned
+from kornia_pnpnet.propose.minimal import FocalHypotheses
 from kornia_pnpnet.propose.sampling import kept_at_once
 from kornia_pnpnet.refine.residual import MIN_DEPTH_RATIO
 from kornia_pnpnet.result import Pose
@@ -258,7 +259,7 @@ class P3P(Configured):
     def __init__(self) -> None:
         super().__init__(locals())
 
-    def hypotheses(self, problem: Problem) -> Hypotheses:
+    def hypotheses(self, problem: Problem) -> Hypotheses | FocalHypotheses:
         r"""Solve samples of three pairs.
 
         Args:
@@ -273,7 +274,6 @@ class P3P(Configured):
         plane = problem.img_points / problem.focal
         if problem.free_focal is None:
             return p3p(problem.world_points, plane)
-        batch = len(plane)
         at = (torch.arange(_FOCALS, device=plane.device) + 0.5) * (2.0 / _FOCALS) - 1.0
         zoom = at[:, None].to(plane) * problem.free_focal.width  # (F, B)
         world = problem.world_points.expand(_FOCALS, -1, -1, -1)
@@ -285,4 +285,4 @@ class P3P(Configured):
             return last.movedim((-1, -2), (0, 1))
 
         pose, valid = map_tensors(slots, (solved.pose, solved.valid))
-        return Hypotheses(pose, valid, zoom.repeat(4, 1).mT)
+        return FocalHypotheses(pose, valid, zoom.repeat(4, 1).mT)

@@ -42,23 +42,14 @@ class P3PRig(Configured):
         self.steps = steps
 
     def hypotheses(self, problem: Problem) -> Hypotheses:
-        r"""Solve samples of three pairs.
-
-        Args:
-            problem: normalised correspondences of a rig with :math:`N = 3`. Their weights are ignored.
-
-        Returns:
-            Four slots per sample, without gradients. Samples whose rays are more than 90 degrees from their mean have
-            none.
-
-        Raises:
-            ShapeError: when :math:`N` is not 3.
-        """
+        """Four slots per sample, without gradients; none valid where a ray is over 90 degrees from the mean ray."""
         problem = problems_last(problem)
         assert problem.rig is not None
         batch = problem.weights.shape[0]
         # Problems last, before them pairs and coordinates: (3, 3, B).
-        world, rays, back = (x.permute(1, 2, 0) for x in (problem.world_points, problem.places, problem.rig.translation))
+        world, rays, back = (
+            x.permute(1, 2, 0) for x in (problem.world_points, problem.places, problem.rig.translation)
+        )
         rays = rays / rays.square().sum(1, keepdim=True).sqrt()  # in the frame of the rig
         centres = -(problem.rig.rotation.permute(1, 2, 3, 0) * back[:, :, None]).sum(1)
         turn = bearing_cameras(rays.sum(0).mT[:, None])[0][:, 0].permute(1, 2, 0)
@@ -67,25 +58,23 @@ class P3PRig(Configured):
         plane = torch.where(ahead > 0, seen[:, :2] / ahead, torch.inf)
         solved = p3p(problem.world_points, plane.permute(2, 0, 1))
         away = ((centres.mean(0) - centres) * rays).sum(1)
-        of_sample = world, rays, centres, turn, seen, away
         found = map_tensors(lambda x: x.movedim((0, 1), (-1, -2)).flatten(-2), solved.pose)  # (3, 3, 4 B) and (3, 4 B)
         valid, eye = solved.valid.mT.flatten(), torch.eye(3, dtype=rays.dtype, device=rays.device)
-        slots = valid.nonzero()[:, 0] if sees_values(rays) else None
-        if slots is None:  # a graph: slots without a solution, too
-            every = [x[..., None, :].expand(*x.shape[:-1], 4, batch).flatten(-2) for x in of_sample]
-            pose, exact = self._exact(found, *every)
-            exact = exact & valid
-        else:  # along rows of memory
-            found = map_tensors(lambda x: x.index_select(-1, slots), found)
-            pose, exact = self._exact(found, *(x.contiguous().index_select(-1, slots % batch) for x in of_sample))
-        rotation = torch.where(exact[:, None, None], pose.rotation, eye)
-        translation = torch.where(exact[:, None], pose.translation, 0.0)
-        if slots is not None:
-            none = eye[..., None].repeat(1, 1, 4 * batch)
-            rotation = none.index_copy_(-1, slots, rotation.movedim(0, -1)).movedim(-1, 0)
-            translation = rays.new_zeros(3, 4 * batch).index_copy_(-1, slots, translation.mT).mT
-            exact = torch.zeros_like(valid).index_copy_(0, slots, exact)
-        rotation, translation, valid = (x.unflatten(0, (4, batch)) for x in (rotation, translation, exact))
+        slots = torch.arange(4 * batch, device=rays.device)
+        if sees_values(rays):  # a graph tries slots without a solution, too
+            slots = valid.nonzero()[:, 0]
+        found = map_tensors(lambda x: x.index_select(-1, slots), found)
+        of_sample = (x.contiguous() for x in (world, rays, centres, turn, seen, away))
+        pose, exact = self._exact(found, *(x.index_select(-1, slots % batch) for x in of_sample))
+        exact = exact & valid[slots]
+        rotation = torch.where(exact[:, None, None], pose.rotation, eye).movedim(0, -1)
+        translation = torch.where(exact[:, None], pose.translation, 0.0).mT
+        rotation = eye[..., None].repeat(1, 1, 4 * batch).index_copy(-1, slots, rotation)
+        translation = rays.new_zeros(3, 4 * batch).index_copy(-1, slots, translation)
+        valid = torch.zeros_like(valid).index_copy(0, slots, exact)
+        rotation, translation, valid = (
+            x.movedim(-1, 0).unflatten(0, (4, batch)) for x in (rotation, translation, valid)
+        )
         return Hypotheses(Pose(rotation.transpose(0, 1), translation.transpose(0, 1)), valid.mT)
 
     def _exact(

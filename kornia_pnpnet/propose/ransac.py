@@ -11,7 +11,7 @@ from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_numbers, check_positive, check_whole
 from kornia_pnpnet.core.linalg import relative
-from kornia_pnpnet.core.performance import compiling, problems_last, ranked, sees_values
+from kornia_pnpnet.core.performance import compiling, problems_last, sees_values
 from kornia_pnpnet.core.trees import map_tensors, take
 from kornia_pnpnet.judge.inliers import MAX_FALSE_ALARMS, Judged, Thresholds, judge, log_false_alarms
 from kornia_pnpnet.problem import LEAST_NOISE, MIN_PAIRS, Problem, Starts, State
@@ -52,8 +52,7 @@ class RANSAC(Initialiser):
     improved by least squares on its inliers (LO-RANSAC). A problem is done when a sample without an outlier has been
     drawn with the probability ``confidence``. When the pairs have at most ``max_samples`` subsets, each subset is tried
     once instead. Problems share only the random numbers, which are the same in every call: a problem has the same
-    result alone, in any batch and at any place in the batch, except that torch's kernels for a single problem may round
-    the last bit differently.
+    result alone, in any batch and at any place in the batch, up to rounding.
 
     A pair is an inlier when :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`. The ``threshold`` :math:`\tau` is for errors
     of the pixels; the ``world_threshold`` :math:`\omega` is for errors of the points, which move the pixel by
@@ -238,11 +237,11 @@ def _robust(judged: Judged, inliers: Tensor) -> Tensor:
 
     Thresholds are wide, and noise has tails: with equal weights, pairs near the threshold would decide the pose.
     """
-    count = (inliers > 0).sum(-1)
-    middle = ((count + MIN_PAIRS) // 2).minimum(count - 1)
-    median = ranked(torch.where(inliers > 0, judged.errors, torch.inf).mT[None], middle)[0, :, None]
+    count = (inliers > 0).sum(-1, keepdim=True)
+    middle = ((count + MIN_PAIRS) // 2).minimum(count - 1).clamp(min=0)
+    median = torch.where(inliers > 0, judged.errors, torch.inf).sort(-1).values.gather(1, middle)
     # Few inliers lie close to the pose that was fitted to them: their residuals say less than they seem to.
-    free = ((count - _FITTED).clamp(min=0) / count.clamp(min=1))[:, None]
+    free = (count - _FITTED).clamp(min=0) / count.clamp(min=1)
     sq_scale = _KERNEL_SCALE**2 / _MEDIAN * median.clamp(min=torch.finfo(median.dtype).eps)
     return 1.0 / (1.0 + free * judged.errors / sq_scale)
 
@@ -274,8 +273,8 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
     Args:
         problem: normalised problems of a centred and scaled world.
         starts: several poses, probabilities of being an inlier as weights, and the noise of the pairs.
-        keep_others: whether the starts keep their other poses. The caller's pose is one of them, and few pairs alone may
-            lead away from it.
+        keep_others: whether the starts keep their other poses. The caller's pose is one of them, and few pairs alone
+            may lead away from it.
 
     Returns:
         The starts with the best pose, a constant. Where a problem was searched, the weights are those of a Cauchy

@@ -78,7 +78,7 @@ def _best_of_samples(problem: Problem) -> Starts:
     owners = torch.arange(batch, device=order.device)
     samples, judging = take_pairs(pack_pairs(problem), at).split((3 * _SAMPLES, _JUDGES), 1)  # (18, 3 S + J, B)
     samples = samples.unflatten(1, (3, _SAMPLES)).flatten(2)
-    pose, valid, _ = P3PRig().hypotheses(unpack_pairs(samples, problem, owners.repeat(_SAMPLES)))
+    pose, valid = P3PRig().hypotheses(unpack_pairs(samples, problem, owners.repeat(_SAMPLES)))
 
     jury = unpack_pairs(judging, problem, owners)._replace(prior=problem.prior)
     jury = jury._replace(weights=torch.where(turn < counts[:, None], jury.weights, 0.0))

@@ -26,8 +26,6 @@ _CANDIDATES = 512
 _INFINITE = 0x7F800000
 # Numbers of a block of distances, so that a processor's cache holds it.
 _BLOCK = 2**18
-
-
 # A graphics processor is slow at many small operations, and its memory holds what a CPU core's caches do not.
 _DEVICE_HOLDS = 64
 
@@ -118,7 +116,7 @@ def agreement_of_neighbours(world_points: Tensor, img_points: Tensor, there: Ten
         there: which pairs have a weight, bool, shape :math:`(B, N)`.
 
     Returns:
-        At least 0, float32, shape :math:`(B, N)`. What padding has means nothing.
+        At least 0, float32, shape :math:`(B, N)`; arbitrary for padding.
 
     Example:
         >>> points = torch.rand(1, 100, 3, generator=torch.Generator().manual_seed(0))
@@ -131,7 +129,7 @@ def agreement_of_neighbours(world_points: Tensor, img_points: Tensor, there: Ten
     order = torch.arange(width, dtype=torch.int32, device=there.device)
     at = present_first(there).gather(1, order * counts.clamp(min=width) // width)  # (B, W)
     rank = torch.arange(min(_NEIGHBOURS, width), device=there.device)
-    worth = (1.0 + torch.maximum(rank[:, None], rank)).reciprocal().flatten()
+    score = (1.0 + torch.maximum(rank[:, None], rank)).reciprocal().flatten()
     absent = (order >= counts)[:, None]
     world_points, img_points = world_points.float(), img_points.float()
     out = torch.empty_like(there, dtype=torch.float32)
@@ -146,7 +144,7 @@ def agreement_of_neighbours(world_points: Tensor, img_points: Tensor, there: Ten
         near, seen = (x.bitwise_or_(order).topk(len(rank), largest=False).values for x in keys)
         common = (near[..., :, None] & (_CANDIDATES - 1)) == (seen[..., None, :] & (_CANDIDATES - 1))
         common &= (near < _INFINITE)[..., :, None]
-        out[some[:, None], here] = common.flatten(2).float() @ worth
+        out[some[:, None], here] = common.flatten(2).float() @ score
     return out
 
 
@@ -246,8 +244,7 @@ class Samples:
         plain = samples_needed(inliers.sum(-1), self.counts[problems], self.size, confidence)
         if self.share is None:
             return plain
-        # The number for equally likely pairs, of which there are as many as the mean share of an inlier goes into 1.
-        # The mean is weighted by the share.
+        # As for equally likely pairs, each with the mean share of an inlier. The mean is weighted by the share.
         share = torch.where(inliers, self.share[problems], 0.0)
         mass = share.sum(-1)
         count = mass / share.square().sum(-1).clamp(min=torch.finfo(share.dtype).tiny)

@@ -12,7 +12,7 @@ from kornia_pnpnet.core.trees import map_tensors, take
 from kornia_pnpnet.judge.belief import residual_noise, rotation_sigma
 from kornia_pnpnet.judge.inliers import Thresholds, judge
 from kornia_pnpnet.problem import Noise, Problem, State
-from kornia_pnpnet.propose.minimal import MinimalSolver
+from kornia_pnpnet.propose.minimal import FocalHypotheses, MinimalSolver
 from kornia_pnpnet.propose.sampling import Samples, agreement_of_neighbours, kept_at_once
 from kornia_pnpnet.propose.scoring import Scene, Scorer
 from kornia_pnpnet.refine.residual import Projection, lm_step, normal_equations, project
@@ -26,7 +26,7 @@ _DTYPE = torch.float32
 # Number of samples that are solved and scored together, and of pairs that are improved together: a core's caches hold
 # their tensors.
 _SAMPLES_AT_ONCE = 4096
-PAIRS_AT_ONCE = 4 * _SAMPLES_AT_ONCE
+PAIRS_AT_ONCE = 8 * _SAMPLES_AT_ONCE
 # Number of pairs that score all poses of a round first, see `_rank`: at least the first, and the second times the cube
 # root of the number of samples before. After k samples in vain at a confidence of 0.999 the share of the inliers is
 # below (7 / k)^(1/3); of 3 over that share, one is an inlier with a probability of 95 %.
@@ -242,7 +242,7 @@ class Search:
         # Components first, the layout of p3p's results: each is selected along a row of memory.
         (rotation, translation), zoom = map_tensors(
             lambda x: x.movedim((0, 1), (-1, -2)).flatten(-2).index_select(-1, at).unflatten(-1, valid.shape),
-            (solved.pose, solved.zoom),
+            (solved.pose, solved.zoom if isinstance(solved, FocalHypotheses) else None),
         )
         if zoom is not None:
             rotation[2] *= (scale := (-zoom).exp())
