@@ -21,9 +21,10 @@ from typing import Any
 import numpy as np
 import torch
 from harness import parser, recorded, table, threads
+from sklearn.isotonic import IsotonicRegression
 from torch import Tensor, nn
 
-from kornia_pnpnet import create_solver, fit_confidence, pose_errors
+from kornia_pnpnet import create_solver, pose_errors
 from kornia_pnpnet.core.files import read_npz
 from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.result import Pose

@@ -12,6 +12,7 @@ import pandas as pd
 from contenders import ANY, PLAIN, TRAINED, N
 from harness import HERE, Row
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from kornia_pnpnet.evaluation.figures import style
 from startup import CACHED, COLD, EAGER
 from tasks import COARSE_ANGLE_DEG, COARSE_SHIFT, ITERATIONS
 from timing import BACKWARD, FORWARD
@@ -19,7 +20,6 @@ from timing import BACKWARD, FORWARD
 from kornia_pnpnet import PnPNet
 from kornia_pnpnet.core.files import atomic_open
 from kornia_pnpnet.core.tables import markdown_table
-from kornia_pnpnet.evaluation.figures import style
 from kornia_pnpnet.metrics import SuccessRate
 
 PAGE = HERE.parent / "docs" / "performance.md"

@@ -391,7 +391,7 @@ def batch(matches: Matches, at: Tensor) -> tuple[tuple[Problems, Tensor, Tensor]
 
 def call(solver: nn.Module, spec: str, given: Problems, mask: Tensor, ratio: Tensor) -> PnPResult:
     """Solve a batch; a bound sees the reference poses, and other libraries with a ratio get the best pairs first."""
-    if isinstance(solver, Bound):
+    if isinstance(solver, SeesTruth):
         return solver.solve_with_truth(given)
     known: dict[str, Any] = {}
     if CONFIDENCE in spec and isinstance(solver, PeerSolver):

@@ -16,7 +16,7 @@ from harness import seconds
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor, nn
 
-from kornia_pnpnet import Starts, Normalize, pose_errors, success, success_rate
+from kornia_pnpnet import Normalize, Starts, pose_errors, success, success_rate
 from kornia_pnpnet.metrics import SuccessRate
 from kornia_pnpnet.problem import Problem
 from kornia_pnpnet.result import Pose, Problems

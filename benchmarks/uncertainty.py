@@ -33,6 +33,7 @@ from typing import Any
 import torch
 from harness import Column, Row, in_turns, parser, percent, ratio, recorded, summary, table, target, threads, write
 from kornia.geometry.liegroup import So3
+from kornia_pnpnet.geometry import transform
 from torch import Tensor, nn
 
 from kornia_pnpnet import (
@@ -49,9 +50,8 @@ from kornia_pnpnet import (
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.data.points import BoxPoints
 from kornia_pnpnet.evaluation.bounds import KnownInliersAndNoise
-from kornia_pnpnet.geometry import transform
-from kornia_pnpnet.refine.residual import retract
 from kornia_pnpnet.peers import OpenCVPnP, PeerSolver, PoseLib
+from kornia_pnpnet.refine.residual import retract
 from kornia_pnpnet.result import Pose, Problems
 
 SOLVER = "pnpnet-set"

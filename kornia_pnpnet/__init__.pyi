@@ -1,7 +1,6 @@
 """What type checkers see, and what :mod:`kornia_pnpnet` imports at the first use of each name."""
 
 from .covariance import pose_covariance as pose_covariance
-from .init import MLPInit as MLPInit, SetInit as SetInit, p3p as p3p
 from .likelihood import monte_carlo_pose_loss as monte_carlo_pose_loss
 from .losses import PoseLoss as PoseLoss, SetLoss as SetLoss
 from .measurements import depth_points as depth_points, heatmap_keypoints as heatmap_keypoints

@@ -41,12 +41,12 @@ def pose_covariance(
     r"""First-order covariance of a pose found by weighted least squares.
 
     The covariance is :math:`(\sum_i w_i J_i^\top J_i / \sigma_i^2)^{-1}`. :math:`J_i` is the Jacobian of pixel
-    :math:`i` by the tangent :math:`(\omega, v)` of :func:`~kornia_pnpnet.refine.residual.retract`: when :math:`(R, t)` is the
-    true pose, the estimate is about :math:`(\mathrm{cay}(\omega) R,\; t + v)`. :math:`\sigma_i^2` is the
+    :math:`i` by the tangent :math:`(\omega, v)` of :func:`~kornia_pnpnet.refine.residual.retract`: when
+    :math:`(R, t)` is the true pose, the estimate is about :math:`(\mathrm{cay}(\omega) R,\; t + v)`. :math:`\sigma_i^2` is the
     :func:`~kornia_pnpnet.refine.residual.pixel_variance`. With covariances the covariance is
     :math:`(\sum_i w_i J_i^\top \Sigma_i^{-1} J_i)^{-1}`, where :math:`\Sigma_i` is the
-    :func:`~kornia_pnpnet.refine.residual.pixel_covariance`. The computation runs in float64. Gradients flow to the pose, the
-    points, the camera, the noise and the weights.
+    :func:`~kornia_pnpnet.refine.residual.pixel_covariance`. The computation runs in float64. Gradients flow to the
+    pose, the points, the camera, the noise and the weights.
 
     A robust kernel gives most inliers a weight below 1, but an M-estimate is hardly less accurate for it (P. Huber,
     "Robust Statistics", 1981). So :math:`w_i` is the weight over the mean weight of an inlier,

@@ -14,15 +14,16 @@ from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from kornia.geometry.liegroup import So3
 from torch import Tensor
 
+from kornia_pnpnet.arguments import checked_inputs
 from kornia_pnpnet.core.checks import check_positive, check_whole
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.refine.residual import normal_equations, pixel_covariance, project, retract
-from kornia_pnpnet.arguments import checked_inputs
 from kornia_pnpnet.frame import Normalize
-from kornia_pnpnet.refine.kernels import KERNELS, RobustKernel
-from kornia_pnpnet.refine.step import iterate, pixel_precision, sq_standardised
-from kornia_pnpnet.problem import Problem
-from kornia_pnpnet.result import Pose, check_poses
+from kornia_pnpnet.problem import Problem, Starts, State
+from kornia_pnpnet.refine.information import information
+from kornia_pnpnet.refine.kernels import KERNELS
+from kornia_pnpnet.refine.lm import RobustWeightedLM
+from kornia_pnpnet.refine.residual import covariance_at, normal_equations, project, retract
+from kornia_pnpnet.result import Pose
 
 __all__ = ["monte_carlo_pose_loss"]
 
@@ -132,35 +133,40 @@ def monte_carlo_pose_loss(
         raise ValueCheckError("monte_carlo_pose_loss needs the noise of the pixels: img_sigma or img_cov.")
     noisy_points = world_sigma is not None or world_cov is not None
     pairs = world_points, img_points, intrinsics, weights, mask
-    pair_noise = img_sigma, world_sigma if noisy_points else 0.0, img_cov, world_cov
-    checked = [checked_inputs(*pairs, pose, *pair_noise) for pose in (truth, *others)]
+    sigmas = {"img_sigma": img_sigma, "world_sigma": world_sigma if noisy_points else 0.0}
+    covariances = {"img_cov": img_cov, "world_cov": world_cov}
+    checked = [checked_inputs(*pairs, pose, **sigmas, **covariances) for pose in (truth, *others)]
     size, inputs = checked[0]
     given = [Pose(*x.init) for _, x in checked if x.init is not None]
     assert inputs.noise is not None
     known = inputs.noise.img.isfinite().all(1) & (inputs.noise.img > 0).all(1) & inputs.noise.world.isfinite().all(1)
-    sigmas = map_tensors(lambda x: torch.where(known[:, None], x, 1.0), inputs.noise.sigmas)
-    noise = inputs.noise._replace(img=sigmas.img, world=sigmas.world)
+    sound_noise = map_tensors(lambda x: torch.where(known[:, None], x, 1.0), inputs.noise.sigmas)
+    noise = inputs.noise._replace(img=sound_noise.img, world=sound_noise.world)
 
     with torch.no_grad():
         _, frame = Normalize(order=False)(*inputs[:5], noise)
-    corr, _ = Normalize(center=False, scale=False, order=False)(*inputs[:5], noise)
+    problem, _ = Normalize(center=False, scale=False, order=False)(*inputs[:5], noise)
     # The frame is a constant: its gradient would only add noise to that of the integral.
-    there = frame.valid[:, None, None] & (corr.weights > 0)[..., None]
-    world = torch.where(there, (corr.world_points - frame.centroid[:, None]) * frame.scale[:, None, None], 0.0)
-    assert corr.noise is not None
-    noise = corr.noise._replace(world=corr.noise.world * frame.scale[:, None])
+    there = frame.valid[:, None, None] & (problem.weights > 0)[..., None]
+    world = torch.where(there, (problem.world_points - frame.centroid[:, None]) * frame.scale[:, None, None], 0.0)
+    assert problem.noise is not None
+    noise = problem.noise._replace(world=problem.noise.world * frame.scale[:, None])
     if noise.world_cov is not None:
         noise = noise._replace(world_cov=noise.world_cov.scaled(frame.scale.square()[:, None]))
-    corr = corr._replace(world_points=world, noise=noise)
+    problem = problem._replace(world_points=world, noise=noise)
 
     live = frame.valid & known
     for pose in given:
         live = live & torch.cat((pose.rotation.flatten(1), pose.translation), 1).isfinite().all(1)
     sound = [_pose_where(live, map_tensors(torch.Tensor.detach, pose)) for pose in given]
-    poses = [Normalize().apply_to_pose(pose, frame) for pose in sound]
-    model = _Posterior(corr, *poses[0], KERNELS[kernel], world.new_tensor(scale), noisy_points)
+    poses = [frame.apply(pose) for pose in sound]
+    refine = RobustWeightedLM(
+        _MODE_ITERATIONS, kernel=kernel, robustness=scale, damping=_MODE_DAMPING, reject_worse=False, learnable=False
+    ).to(world)
+    model = _Posterior(problem, *poses[0], refine, world.new_tensor(scale), noisy_points)
+    fixed = model._replace(problem=problem.map(torch.Tensor.detach))
     with torch.no_grad():
-        drawn, log_proposal = _draw(model._replace(corr=corr.map(torch.Tensor.detach)), poses, samples // count, rounds)
+        drawn, log_proposal = _draw(fixed, poses, samples // count, rounds)
     log_weights = model.log_density(drawn) - log_proposal
     log_total = torch.logsumexp(log_weights, 0) - math.log(len(log_weights))
     log_density = model.log_density(Pose(*(x[None] for x in poses[0])))[0] - log_total
@@ -168,21 +174,21 @@ def monte_carlo_pose_loss(
 
 
 class _Posterior(NamedTuple):
-    """The density of poses, up to a factor, in the frame of the normalised correspondences.
+    """The density of poses, up to a factor, in the frame of a problem.
 
     Attributes:
-        corr: normalised correspondences with known noise.
+        problem: the problem with known noise.
         rotation: rotation of the true pose, (B, 3, 3).
         translation: translation of the true pose, (B, 3).
-        kernel: the robust kernel.
-        shape: its shape, a scalar.
+        refine: finds modes, by the robust kernel of the posterior.
+        shape: shape of the kernel, a scalar.
         noisy_points: whether world points have noise, so that the variance of a pixel depends on the pose.
     """
 
-    corr: Problem
+    problem: Problem
     rotation: Tensor
     translation: Tensor
-    kernel: RobustKernel
+    refine: RobustWeightedLM
     shape: Tensor
     noisy_points: bool
 
@@ -210,39 +216,37 @@ class _Posterior(NamedTuple):
 
     def _cost(self, poses: Pose) -> Tensor:
         """Half the weighted sum of robust losses, (S, B)."""
-        corr = self.corr
-        cam = corr.world_points @ poses.rotation.mT + poses.translation[..., None, :]  # (S, B, N, 3)
+        problem = self.problem
+        cam = problem.world_points @ poses.rotation.mT + poses.translation[..., None, :]  # (S, B, N, 3)
         least = _LEAST_DEPTH * self.distance
         depth = cam[..., 2].maximum(least)
         plane = cam[..., :2] / depth[..., None]
         behind = (depth - cam[..., 2]) / least
-        residual, sq_behind = corr.focal * plane - corr.img_points, (corr.focal * behind).square()
-        assert corr.noise is not None
-        if corr.noise.covariances:
-            at = poses.rotation[..., None], plane.unbind(-1), depth.reciprocal()
-            covariance = pixel_covariance(*at, corr.noise, corr.focal)
+        residual, sq_behind = problem.focal * plane - problem.img_points, (problem.focal * behind).square()
+        assert problem.noise is not None
+        if problem.noise.covariances:
+            at = poses.rotation[..., None, :, :], *plane.unbind(-1), problem.focal / depth
+            covariance = covariance_at(*at, problem.noise)
             determinant, precision = covariance.determinant, covariance.inverse()
             sq_residual = precision.form(*residual.unbind(-1)) + 0.5 * sq_behind * (precision.uu + precision.vv)
         else:
-            variance = corr.noise.img.square()
+            variance = problem.noise.img.square()
             if self.noisy_points:
                 sides = 1.0 + 0.5 * plane.square().sum(-1)
-                variance = variance + (corr.focal * corr.noise.world / depth).square() * sides
+                variance = variance + (problem.focal * problem.noise.world / depth).square() * sides
             sq_residual, determinant = (residual.square().sum(-1) + sq_behind) / variance, variance.square()
-        loss = self.kernel.loss(sq_residual, self.shape)
+        loss = self.refine.kernel.loss(sq_residual, self.shape)
         if self.noisy_points:
             loss = loss + determinant.log()
-        return 0.5 * (corr.weights * loss).sum(-1)
+        return 0.5 * (problem.weights * loss).sum(-1)
 
     def component(self, pose: Pose) -> _Component:
         """The t distribution whose precision is that of the normal equations at a pose, with a bounded width."""
-        corr, projection = self.corr, project(pose, self.corr)
-        assert corr.noise is not None
-        robust = self.kernel.weight(sq_standardised(projection, corr), self.shape)
-        factor = corr.focal.square() * corr.weights * robust
-        precision = map_tensors(lambda x: factor * x, pixel_precision(projection, corr.noise, corr.focal))
-        rows = normal_equations(projection, precision).hessian
-        matrix = torch.stack([torch.stack([rows[max(i, j)][min(i, j)] for j in range(6)], -1) for i in range(6)], -2)
+        problem, projection = self.problem, project(State.of(pose), self.problem)
+        sq_residual, precision = information(projection, problem)
+        factor = problem.focal.square() * problem.weights * self.refine.kernel.weight(sq_residual, self.shape)
+        weights = map_tensors(lambda x: factor * x, precision)
+        matrix = normal_equations(projection, problem, weights).matrix.permute(2, 0, 1)
         widest = torch.full_like(pose.translation, _WIDEST_ROTATION), _PRIOR_TRANSLATION * self.distance.expand(-1, 3)
         least = torch.cat(widest, -1).square().reciprocal()
         matrix = matrix + torch.diag_embed(least)
@@ -257,11 +261,8 @@ class _Posterior(NamedTuple):
         best = log_weights.argmax(0)
         rows = torch.arange(len(best), device=best.device)
         pose = Pose(poses.rotation[best, rows], poses.translation[best, rows])
-        one, damping = torch.ones_like(self.shape), torch.full_like(self.shape, _MODE_DAMPING)
-        for _ in range(_MODE_ITERATIONS):
-            step = iterate(self.corr, pose, one, damping, self.shape, None, kernel_weight=self.kernel.weight)
-            pose = step.pose
-        return pose
+        starts = Starts(pose, torch.ones_like(self.problem.weights))
+        return self.refine.iterate(self.refine.begin(self.problem, starts))[0].pose
 
 
 def _draw(model: _Posterior, poses: Sequence[Pose], each: int, rounds: int) -> tuple[Pose, Tensor]:

@@ -11,7 +11,6 @@ from torch import Tensor, nn
 
 from kornia_pnpnet.core.checks import check_numbers, check_positive, check_whole
 from kornia_pnpnet.core.trees import map_tensors
-
 from kornia_pnpnet.problem import Noise, Starts
 from kornia_pnpnet.result import PnPResult, Pose, Problems, check_poses
 

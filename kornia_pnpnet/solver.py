@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -73,9 +72,9 @@ class PnPNet(PretrainedMixin):
     r"""Find the pose of a calibrated camera from 2D-3D correspondences with outliers.
 
     The layer normalises the correspondences, lets ``init`` propose poses, refines and judges them, and expresses the
-    best pose in the frame of the inputs. All of it is batched and differentiable. A bad problem (non-finite input, fewer than three
-    pairs, points on a line, a pose that does not explain the pixels) has ``ok=False``, a ``status`` that says why, a
-    finite pose without gradient, and changes no other problem.
+    best pose in the frame of the inputs. All of it is batched and differentiable. A bad problem (non-finite input,
+    fewer than three pairs, points on a line, a pose that does not explain the pixels) has ``ok=False``, a ``status``
+    that says why, a finite pose without gradient, and changes no other problem.
 
     Convention: ``x_cam = R x_world + t``, +z forward, pixels ``u = fx x/z + s y/z + cx`` with the skew ``s``; any
     multiple of a camera matrix is the same camera.
@@ -90,9 +89,9 @@ class PnPNet(PretrainedMixin):
         refine: the refiner; classical :class:`~kornia_pnpnet.refine.lm.RobustWeightedLM` when ``None``.
         normalize: the normalisation; the default centres and scales the world and orders the pairs.
         effort: ``"fixed"``, or ``"adaptive"``: where the poses of the initialiser do not suffice, a problem gets as
-            many more minimal samples as it needs (:func:`~kornia_pnpnet.propose.ransac.search_on`), and a pose whose mirror image fits as
-            well is not ``ok``. Needs an initialiser that estimates the noise, :class:`~kornia_pnpnet.propose.SetInit`.
-            ``None``: adaptive with such an initialiser and a refinement in evaluation mode, else fixed. Always fixed:
+            many more minimal samples as it needs (:func:`~kornia_pnpnet.propose.ransac.search_on`), and a pose whose
+            mirror image fits as well is not ``ok``. Needs an initialiser that estimates the noise,
+            :class:`~kornia_pnpnet.propose.set.SetInit`. ``None``: adaptive with such an initialiser and a refinement in evaluation mode, else fixed. Always fixed:
             exported graphs, ``compile(whole=True)``, ``torch.func.vmap`` and the device ``meta``. Rigs and bearings:
             RANSAC, unless the effort is ``"fixed"`` or the solver is compiled.
         gradient: which problems carry a gradient: those that are ``"ok"``, or ``"always"`` every valid problem, to
@@ -199,8 +198,8 @@ class PnPNet(PretrainedMixin):
             world_cov: covariance of the noise of each world point, in place of ``world_sigma``, shape
                 :math:`(B, N, 3, 3)`.
             confidence: your own belief that a pair is an inlier, in [0, 1], for example a matcher's score, shape
-                :math:`(B, N)`; NaN where unknown. Minimal samples are drawn from likely pairs more often, and a network that was trained with
-                confidences sees them. What they are worth may differ between problems.
+                :math:`(B, N)`; NaN where unknown. Minimal samples are drawn from likely pairs more often, and a
+                network that was trained with confidences sees them. They need not be calibrated.
             prior: what is known of the pose besides the pairs, such as :func:`~kornia_pnpnet.gravity_prior`: a
                 term of the refinement and of the choice among poses, to which its pose belongs unless ``init`` is
                 given. ``ok`` and ``probability`` are judged by the pairs alone. Unknown noise counts as one pixel.
@@ -254,7 +253,9 @@ class PnPNet(PretrainedMixin):
             whole = self._whole
             single = (self._run.compiled or whole.compiled) and len(inputs.world_points) == 1
             single = single and not (self._run.failed or whole.failed)
-            if self._run.compiled or whole.compiled:  # a batch of one, and every layout, would be compiled for by itself
+            if (
+                self._run.compiled or whole.compiled
+            ):  # a batch of one, and every layout, would be compiled for by itself
                 inputs = map_tensors(lambda x: torch.cat((x, x)) if single else x.contiguous(), inputs)
             any_number = not (self._run.compiled or whole.compiled or trait(self.init, "fixed_pairs"))
             parts = split_batch(inputs, trait(self.init, "pairs_at_once"), any_number)
@@ -420,7 +421,7 @@ class PnPNet(PretrainedMixin):
         return self.effort == "adaptive" or (can and not self.training)
 
     def _shown_sigma(self, attempt: _Attempt, result: PnPResult) -> Tensor:
-        """Sigma of the pixels that a result shows, in the caller's pixels, where it is far above the estimate, else 0."""
+        """Sigma of pixels that a result shows, in pixels of the caller, where it is far above the estimate, else 0."""
         problem, frame, starts = attempt.problem, attempt.frame, attempt.starts
         assert starts.noise is not None
         assert result.intrinsics is not None

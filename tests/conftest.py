@@ -11,7 +11,7 @@ import torch
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
-from kornia_pnpnet import Problem, Normalize, Pose, Problems
+from kornia_pnpnet import Normalize, Pose, Problem, Problems
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.refine.residual import retract
 

@@ -4,10 +4,10 @@ import math
 
 import numpy as np
 import torch
+from kornia_pnpnet.geometry import transform
 
 from kornia_pnpnet.core.trees import iter_tensors
 from kornia_pnpnet.data import Scene, SyntheticProblems, View
-from kornia_pnpnet.geometry import transform
 
 COUNT = 20_000
 # 99.9 % points of the chi-square distribution by degrees of freedom. The seeds are fixed, so that results do not vary.

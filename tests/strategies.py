@@ -14,9 +14,9 @@ from kornia.core.exceptions import BaseError
 from kornia_pnpnet import Normalize, Pose, create_solver
 from kornia_pnpnet.cli import main
 from kornia_pnpnet.data import SyntheticProblems
+from kornia_pnpnet.problem import Noise
 from kornia_pnpnet.refine.kernels import KERNELS
 from kornia_pnpnet.refine.lm import BACKWARDS
-from kornia_pnpnet.problem import Noise
 
 SOLVERS = {
     name: create_solver(name)

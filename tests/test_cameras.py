@@ -9,16 +9,16 @@ import torch
 from kornia.core.exceptions import BaseError
 from kornia.geometry.calibration import distort_points
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+from kornia_pnpnet.refine.step import pixel_precision
 from torch.nn import functional
 
-from kornia_pnpnet import Starts, Normalize, PnPNet, Pose, RobustWeightedLM, create_solver, solve_pnp
+from kornia_pnpnet import Normalize, PnPNet, Pose, RobustWeightedLM, Starts, create_solver, solve_pnp
 from kornia_pnpnet.cameras import bearing_cameras, bearings, undistort
 from kornia_pnpnet.core.symmetric import Symmetric2, Symmetric3
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
+from kornia_pnpnet.problem import Noise
 from kornia_pnpnet.refine.residual import normal_equations, project, retract
 from kornia_pnpnet.refine.residual import rotation_angle as angle
-from kornia_pnpnet.refine.step import pixel_precision
-from kornia_pnpnet.problem import Noise
 
 DIST = {
     4: [-0.2, 0.05, 0.001, -0.002],

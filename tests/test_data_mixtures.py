@@ -6,9 +6,9 @@ import pytest
 import torch
 from data_helpers import assert_counts, reprojection, same
 from kornia.core.exceptions import BaseError
+from kornia_pnpnet.geometry import transform
 
 from kornia_pnpnet.data import BoxPoints, MixedPoints, MixedProblems, OutlierMix, SyntheticProblems, VaryingSize
-from kornia_pnpnet.geometry import transform
 
 
 def mixed(shares=None, batch_size=60, **chosen):

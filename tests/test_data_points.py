@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from data_helpers import COUNT, assert_normal, assert_uniform, draw, reprojection
+from kornia_pnpnet.geometry import transform
 
 from kornia_pnpnet.data import (
     BoxPoints,
@@ -15,7 +16,6 @@ from kornia_pnpnet.data import (
     RoomPoints,
     SlabPoints,
 )
-from kornia_pnpnet.geometry import transform
 
 VIEWS = [FacadePoints, RoomPoints, DrivePoints]
 

@@ -11,22 +11,22 @@ from hypothesis import strategies as st
 from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.camera.perspective import project_points
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+from kornia_pnpnet.geometry import additive_tangent_map, change_tangent, retract_additive, transform
 from strategies import are_rotations, correspondences, finite, gradients_are_finite, many, poses
 
-from kornia_pnpnet import Problem, Noise, Pose
+from kornia_pnpnet import Noise, Pose, Problem
+from kornia_pnpnet.core.linalg import solve_positive
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
-from kornia_pnpnet.geometry import additive_tangent_map, change_tangent, retract_additive, transform
+from kornia_pnpnet.judge.belief import explains
 from kornia_pnpnet.refine.residual import (
     MIN_DEPTH_RATIO,
+    lm_step,
     normal_equations,
     pixel_variance,
     project,
     retract,
     rotation_angle,
 )
-from kornia_pnpnet.core.linalg import solve_positive
-from kornia_pnpnet.judge.belief import explains
-from kornia_pnpnet.refine.residual import lm_step
 
 DTYPES = (torch.float32, torch.float64)
 FOCAL = torch.tensor(3400.0, dtype=torch.float64)
@@ -261,9 +261,7 @@ def test_in_front_does_not_depend_on_the_unit(dtype):
     point = torch.tensor([[[1.0, 1.0, 1e-3], [1.0, 1.0, 2e-3], [0.3, 0.1, 1.0], [0.0, 0.0, -1.0]]], dtype=dtype)
     pose = Pose(torch.eye(3, dtype=dtype)[None], torch.zeros(1, 3, dtype=dtype))
     for unit in (1e-6, 1.0, 1e6):
-        corr = Problem(
-            point * unit, torch.zeros(1, 4, 2).to(dtype), torch.ones(1, 4).to(dtype), FOCAL.to(dtype)
-        )
+        corr = Problem(point * unit, torch.zeros(1, 4, 2).to(dtype), torch.ones(1, 4).to(dtype), FOCAL.to(dtype))
         assert project(pose, corr).in_front.tolist() == [[False, True, True, False]]
 
 

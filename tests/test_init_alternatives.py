@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 from kornia.core.exceptions import BaseError
+from kornia_pnpnet.geometry import transform
 
 from kornia_pnpnet import Pose, create_solver, p3p, pose_errors
-from kornia_pnpnet.geometry import transform
 
 NAMES = ["pnpnet-set", "epnp-lm", "reppnp-lm", "p3p-ransac"]
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
+from kornia_pnpnet.init.epnp.control_points import control_points
 
 from kornia_pnpnet import Problem
 from kornia_pnpnet.core.linalg import align
-from kornia_pnpnet.init.epnp.control_points import control_points
 
 
 def correspondences(world, weights=None):

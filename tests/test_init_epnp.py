@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import pytest
 import torch
-
-from kornia_pnpnet import Problem, Normalize, PnPNet, Pose, RobustWeightedLM
-from kornia_pnpnet.data import SyntheticProblems
 from kornia_pnpnet.geometry import transform
 from kornia_pnpnet.init.epnp.control_points import control_points
 from kornia_pnpnet.init.epnp.depths import depth_system, four_cases, minimize
-from kornia_pnpnet.propose.epnp import EPnP
+
+from kornia_pnpnet import Normalize, PnPNet, Pose, Problem, RobustWeightedLM
+from kornia_pnpnet.data import SyntheticProblems
 from kornia_pnpnet.metrics import pose_errors, success
+from kornia_pnpnet.propose.epnp import EPnP
 
 DTYPES = (torch.float32, torch.float64)
 

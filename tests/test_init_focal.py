@@ -7,14 +7,18 @@ import torch
 from kornia.core.exceptions import BaseError
 from kornia.geometry.calibration import distort_points
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+from kornia_pnpnet.geometry import distort, dolly_zoom
+from kornia_pnpnet.init.focal import scale_focal
+from kornia_pnpnet.refine.prior import focal_loss, prior_in_frame, prior_loss
+from kornia_pnpnet.refine.radial import distorted
 
 from kornia_pnpnet import (
-    Starts,
     Normalize,
     PnPNet,
     Pose,
     Problems,
     RobustWeightedLM,
+    Starts,
     create_solver,
     pose_covariance,
 )
@@ -22,13 +26,9 @@ from kornia_pnpnet.cameras import undistort
 from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.export import export_program
-from kornia_pnpnet.geometry import distort, dolly_zoom
+from kornia_pnpnet.problem import Noise
 from kornia_pnpnet.refine.residual import normal_equations, project, retract
 from kornia_pnpnet.refine.residual import rotation_angle as angle
-from kornia_pnpnet.init.focal import scale_focal
-from kornia_pnpnet.refine.prior import focal_loss, prior_in_frame, prior_loss
-from kornia_pnpnet.refine.radial import distorted
-from kornia_pnpnet.problem import Noise
 from kornia_pnpnet.refine.terms import CameraTerm
 from kornia_pnpnet.result import PosePrior
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from init_helpers import assert_same, change, flattened
 
-from kornia_pnpnet import Problem, Pose, pose_errors
+from kornia_pnpnet import Pose, Problem, pose_errors
 from kornia_pnpnet.propose.epnp import EPnP
 from kornia_pnpnet.propose.reppnp import REPPnP
 

@@ -6,10 +6,10 @@ import pytest
 import torch
 from kornia.core.exceptions import BaseError, ShapeError
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+from kornia_pnpnet.init.mlp import rotation_about
 from torch import nn
 
-from kornia_pnpnet import Problem, MLPInit
-from kornia_pnpnet.init.mlp import rotation_about
+from kornia_pnpnet import MLPInit, Problem
 
 
 def correspondences(n, batch=5, dtype=torch.float32, seed=0):

@@ -10,10 +10,10 @@ import torch
 from kornia.core.exceptions import ShapeError, TypeCheckError
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix, normalize_points_with_intrinsics
 
-from kornia_pnpnet import Problem, Pose, Status, create_solver
+from kornia_pnpnet import Pose, Problem, Status, create_solver
 from kornia_pnpnet.data import SyntheticProblems
-from kornia_pnpnet.propose.p3p import P3P, p3p
 from kornia_pnpnet.problem import Hypotheses
+from kornia_pnpnet.propose.p3p import P3P, p3p
 
 DTYPES = (torch.float64, torch.float32)
 NEAR = 1e-6

@@ -7,16 +7,16 @@ import math
 import pytest
 import torch
 from kornia.core.exceptions import ShapeError
+from kornia_pnpnet.geometry import transform
+from kornia_pnpnet.init.ransac.search import Search
 
 from kornia_pnpnet import PnPNet, RobustWeightedLM, pose_errors, success
 from kornia_pnpnet.core.trees import map_tensors, take
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
-from kornia_pnpnet.geometry import transform
 from kornia_pnpnet.propose.epnp import EPnP
 from kornia_pnpnet.propose.minimal import SubsetSolver
 from kornia_pnpnet.propose.p3p import P3P
 from kornia_pnpnet.propose.ransac import RANSAC
-from kornia_pnpnet.init.ransac.search import Search
 
 #: Thresholds for the noise of the protocol: 1 px and 0.05 m.
 PROTOCOL = {"threshold": 6.0, "world_threshold": 0.3}

@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 from init_helpers import assert_same, change, flattened
-
-from kornia_pnpnet import Problem, Normalize, Pose
-from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.geometry import transform
-from kornia_pnpnet.propose.reppnp import REPPnP
+
+from kornia_pnpnet import Normalize, Pose, Problem
+from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.metrics import pose_errors, success
+from kornia_pnpnet.propose.reppnp import REPPnP
 
 
 def chosen(pose, index):

@@ -7,7 +7,6 @@ import math
 
 import pytest
 import torch
-
 from kornia_pnpnet.init.ransac.sampling import (
     Samples,
     agreement_of_neighbours,

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 import torch
-
-from kornia_pnpnet import Problem, Pose
 from kornia_pnpnet.geometry import transform
-from kornia_pnpnet.refine.residual import project
 from kornia_pnpnet.init.ransac.scoring import Scene, standardised_errors
+
+from kornia_pnpnet import Pose, Problem
 from kornia_pnpnet.judge.inliers import MAX_ERROR, Thresholds, judge
+from kornia_pnpnet.refine.residual import project
 
 
 @pytest.fixture

@@ -10,12 +10,12 @@ from itertools import combinations
 import pytest
 import torch
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+from kornia_pnpnet.init.set import _ENOUGH, _some_of
+from kornia_pnpnet.init.view import _same
 
 from kornia_pnpnet import Normalize, PnPNet, Pose, RobustWeightedLM, SetInit, SetLoss, pose_errors, success
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
-from kornia_pnpnet.init.set import _ENOUGH, _some_of
-from kornia_pnpnet.init.view import _same
 from kornia_pnpnet.problem import Noise
 
 NOISE = {"img_sigma": 1.0, "world_sigma": 0.05}

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from strategies import batches, finite, gradients_are_finite, many
 
-from kornia_pnpnet import Starts, Noise, PnPResult, Pose, PoseLoss, SetLoss, create_solver
+from kornia_pnpnet import Noise, PnPResult, Pose, PoseLoss, SetLoss, Starts, create_solver
 from kornia_pnpnet.data import SyntheticProblems
 from kornia_pnpnet.losses import pose_distances
 

@@ -12,9 +12,9 @@ from kornia.core.exceptions import BaseError
 from strategies import ANY, ERRORS, finite, gradients_are_finite, many, numbers, rotations
 
 from kornia_pnpnet import Pose, pose_errors, success, success_rate
-from kornia_pnpnet.refine.residual import rotation_angle
 from kornia_pnpnet.losses import pose_distances
 from kornia_pnpnet.metrics import PoseErrors, reliability
+from kornia_pnpnet.refine.residual import rotation_angle
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1.0, math.pi])

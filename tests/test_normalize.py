@@ -8,13 +8,13 @@ import math
 import pytest
 import torch
 from kornia.geometry.conversions import normalize_points_with_intrinsics
+from kornia_pnpnet.geometry import transform
 
 from kornia_pnpnet import MLPInit, Normalize, PnPNet, Pose, RobustWeightedLM
 from kornia_pnpnet.core.trees import iter_tensors
-from kornia_pnpnet.geometry import transform
-from kornia_pnpnet.refine.residual import project
 from kornia_pnpnet.frame import F_CONST
 from kornia_pnpnet.propose.views import VIEWS
+from kornia_pnpnet.refine.residual import project
 
 DTYPES = (torch.float32, torch.float64)
 OPTIONS = [

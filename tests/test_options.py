@@ -28,12 +28,12 @@ from kornia_pnpnet.data import (
     SyntheticProblems,
     VaryingSize,
 )
+from kornia_pnpnet.peers import KorniaRs, OpenCVPnP, OpenCVRansac, OpenCVUsac, PeerSolver, PoseLib, PyColmap
 from kornia_pnpnet.propose.epnp import EPnP
 from kornia_pnpnet.propose.minimal import SubsetSolver
 from kornia_pnpnet.propose.p3p import P3P
 from kornia_pnpnet.propose.ransac import RANSAC
 from kornia_pnpnet.propose.reppnp import REPPnP
-from kornia_pnpnet.peers import KorniaRs, OpenCVPnP, OpenCVRansac, OpenCVUsac, PeerSolver, PoseLib, PyColmap
 from kornia_pnpnet.refine.parameters import BoundedParameter
 from kornia_pnpnet.training import TrainSettings
 

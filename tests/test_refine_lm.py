@@ -9,17 +9,16 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from kornia_pnpnet.geometry import retract_additive
 from strategies import KINDS, are_rotations, correspondences, finite, gradients_are_finite, many, options, poses
 
-from kornia_pnpnet import Problem, Starts, Noise, Normalize, PnPNet, Pose, RobustWeightedLM, pose_errors
-from kornia_pnpnet.core.trees import iter_tensors, map_tensors
-from kornia_pnpnet.geometry import retract_additive
-from kornia_pnpnet.refine.residual import NormalEquations, project, retract
+from kornia_pnpnet import Noise, Normalize, PnPNet, Pose, Problem, RobustWeightedLM, Starts, pose_errors
 from kornia_pnpnet.core.linalg import solve_positive
+from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.judge.belief import explains
 from kornia_pnpnet.refine.kernels import KERNELS
-from kornia_pnpnet.refine.residual import lm_step
 from kornia_pnpnet.refine.lm import BACKWARDS
+from kornia_pnpnet.refine.residual import NormalEquations, lm_step, project, retract
 
 DTYPES = (torch.float32, torch.float64)
 UPDATES = ("retraction", "additive")

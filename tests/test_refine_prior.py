@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from kornia.core.exceptions import BaseError, ShapeError
+from kornia_pnpnet.refine.prior import prior_errors, prior_in_frame, prior_loss
 from torch import nn
 
 from kornia_pnpnet import (
@@ -16,10 +17,9 @@ from kornia_pnpnet import (
     gravity_prior,
     pose_errors,
 )
-from kornia_pnpnet.refine.residual import project, retract
 from kornia_pnpnet.metrics import success
-from kornia_pnpnet.refine.prior import prior_errors, prior_in_frame, prior_loss
 from kornia_pnpnet.problem import Problem
+from kornia_pnpnet.refine.residual import project, retract
 from kornia_pnpnet.result import Status
 
 SIGMA = math.radians(1.0)

@@ -9,15 +9,15 @@ from unittest import mock
 
 import pytest
 import torch
-
-from kornia_pnpnet import Problem, Pose, create_solver, pose_errors
-from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.geometry import transform
-from kornia_pnpnet.refine.residual import project
-from kornia_pnpnet.refine import scale
-from kornia_pnpnet.judge.inliers import Judged, MAX_ERROR, Thresholds, judge, log_false_alarms
 from kornia_pnpnet.refine.inliers import chance_of_inlier, chance_of_others
+
+from kornia_pnpnet import Pose, Problem, create_solver, pose_errors
+from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.judge.belief import LAWS, LEAST_PROBABILITY
+from kornia_pnpnet.judge.inliers import MAX_ERROR, Judged, Thresholds, judge, log_false_alarms
+from kornia_pnpnet.refine import scale
+from kornia_pnpnet.refine.residual import project
 
 
 def test_inliers_weigh_by_the_inverse_of_their_threshold(make_problems, correspond):

@@ -24,9 +24,9 @@ from kornia_pnpnet import (
     success,
 )
 from kornia_pnpnet.data import SyntheticProblems
-from kornia_pnpnet.propose.p3p import p3p
 from kornia_pnpnet.losses import pose_distances
 from kornia_pnpnet.metrics import PoseErrors, reliability
+from kornia_pnpnet.propose.p3p import p3p
 
 PEERS = {name: create_solver(name) for name in ("opencv-ransac", "poselib")}
 

@@ -16,7 +16,6 @@ from strategies import NO_POSE, STRANGE
 from torch.utils import _pytree as pytree
 
 from kornia_pnpnet import (
-    Starts,
     MLPInit,
     Normalize,
     PnPNet,
@@ -24,6 +23,7 @@ from kornia_pnpnet import (
     Pose,
     RobustWeightedLM,
     SetInit,
+    Starts,
     Status,
     create_solver,
     list_solvers,
@@ -32,8 +32,8 @@ from kornia_pnpnet import (
 )
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.data import OutlierMix, SlabPoints, SyntheticProblems
-from kornia_pnpnet.propose.epnp import EPnP
 from kornia_pnpnet.metrics import success
+from kornia_pnpnet.propose.epnp import EPnP
 
 DTYPES = (torch.float32, torch.float64)
 

@@ -21,9 +21,9 @@ from kornia_pnpnet.evaluation.problem_sets import evaluation_sets
 from kornia_pnpnet.evaluation.results import format_table, load_results, save_results
 from kornia_pnpnet.metrics import reliability, success_rate
 from kornia_pnpnet.pretrained import WEIGHTS_FOLDER, shipped_weights
+from kornia_pnpnet.result import PnPResult, Problems
 from kornia_pnpnet.training.collect import collect_weights
 from kornia_pnpnet.training.results import load_run
-from kornia_pnpnet.result import PnPResult, Problems
 
 __all__ = ["ANY", "CHI_SQUARE_95", "HERE", "OURS", "PAPER", "PEERS", "RESULTS", "ROBUST", "compare", "measure", "ship"]
 

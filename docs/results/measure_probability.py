@@ -14,6 +14,7 @@ from unittest import mock
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
+from kornia_pnpnet.refine.scale import larger_sigma
 from omegaconf import OmegaConf
 from sklearn.linear_model import LogisticRegression
 from torch import Tensor
@@ -23,7 +24,6 @@ from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.evaluation.named_solvers import load_solver
 from kornia_pnpnet.metrics import pose_errors, reliability, success_rate
 from kornia_pnpnet.refine import verdict
-from kornia_pnpnet.refine.scale import larger_sigma
 from kornia_pnpnet.result import PnPResult, Problems
 
 __all__ = ["measure_probability"]

@@ -9,7 +9,6 @@ from kornia.geometry.conversions import convert_points_from_homogeneous
 from kornia.geometry.linalg import transform_points
 from torch import Tensor
 
-
 from kornia_pnpnet.result import Pose
 
 __all__ = ["Reprojection", "reproject"]

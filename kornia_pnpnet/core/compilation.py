@@ -165,6 +165,10 @@ class Runner:
         return any(x.failed for x in self._functions.values())
 
 
+#: Runs everything uncompiled.
+EAGER = Runner()
+
+
 def _kinds(x: Any) -> Any:
     """Nested tuples with the type of each tensor in its place."""
     return tuple(map(_kinds, x)) if isinstance(x, (tuple, list)) else type(x) if isinstance(x, Tensor) else x

@@ -14,8 +14,8 @@ from torch import Tensor
 from kornia_pnpnet.core.checks import check_numbers
 from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.refine.lm import RobustWeightedLM
-from kornia_pnpnet.solver import PnPNet
 from kornia_pnpnet.result import PnPResult, Problems
+from kornia_pnpnet.solver import PnPNet
 
 __all__ = ["KnownInliers", "KnownInliersAndNoise"]
 

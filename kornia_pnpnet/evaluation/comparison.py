@@ -21,8 +21,8 @@ from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.data.stream import ProblemSource
 from kornia_pnpnet.evaluation.results import FORMAT, resume, save_results, source_digest
 from kornia_pnpnet.metrics import PoseErrors, pose_errors, success, success_rate
-from kornia_pnpnet.solver import PnPNet
 from kornia_pnpnet.result import PnPResult, Pose, Problems
+from kornia_pnpnet.solver import PnPNet
 
 __all__ = ["EvaluationData", "SeesTruth", "draw_problems", "evaluate"]
 

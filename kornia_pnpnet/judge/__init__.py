@@ -1,2 +1,1 @@
-"""Whether a pose is to be believed: its inliers (:mod:`~kornia_pnpnet.judge.inliers`), and what they are worth
-(:mod:`~kornia_pnpnet.judge.belief`)."""
+"""Whether a pose is to be believed: ``inliers`` says which pairs support it, ``belief`` what they say of it."""

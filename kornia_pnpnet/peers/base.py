@@ -16,8 +16,8 @@ from kornia.core.exceptions import ShapeError
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
-from kornia_pnpnet.core.checks import check_positive, check_whole
 from kornia_pnpnet.arguments import checked_inputs, restore_leading
+from kornia_pnpnet.core.checks import check_positive, check_whole
 from kornia_pnpnet.problem import MIN_PAIRS
 from kornia_pnpnet.result import Alternatives, PnPResult, Pose, Status
 

@@ -11,7 +11,6 @@ from torch.nn import functional
 from kornia_pnpnet.arguments import Inputs, with_undistorted
 from kornia_pnpnet.core.linalg import solve_positive
 from kornia_pnpnet.core.performance import ranked
-from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.frame import Normalize
 from kornia_pnpnet.problem import MIN_PAIRS, Problem, State
 from kornia_pnpnet.propose.p3p import P3P

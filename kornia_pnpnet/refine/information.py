@@ -69,7 +69,7 @@ KernelWeight: TypeAlias = Callable[[Tensor, Tensor], Tensor]
 
 
 def complete_noise(problem: Problem, starts: Starts) -> Noise | None:
-    """The caller's covariances, the initialiser's sigmas or else the caller's with 0 where unknown; ``None``: neither."""
+    """Covariances of the caller, sigmas of the initialiser or the caller with 0 where unknown; ``None``: neither."""
     noise = starts.noise
     if noise is None and problem.noise is not None:
         noise = map_tensors(lambda x: x.nan_to_num(0.0), problem.noise)
@@ -204,7 +204,7 @@ def larger_sigma(projection: Projection, problem: Problem, estimate: Noise, inli
 
 
 def outlier_area(problem: Problem) -> Tensor:
-    """Area of a square with the variance of the usual pixels, in which pixels of outliers lie, in square pixels, (B, 1)."""
+    """Area in which pixels of outliers lie: that of a square with the variance of the usual pixels, in px², (B, 1)."""
     there = (problem.usual_weights > 0).to(problem.weights)[..., None]
     share = there / there.sum(1, keepdim=True).clamp(min=1.0)
     places = problem.places.detach()
@@ -283,8 +283,8 @@ def _information_factor(
 
     The keypoints of a network are often less accurate where it is less sure; a matcher's ratio says nothing of the
     noise. So the standard deviation may be proportional to a power of the confidence, or independent of it. A power
-    replaces 0 where it is :math:`e^3` times as likely, by the mixture of :func:`_log_likelihoods`, and most of the pairs
-    are inliers: among many outliers, near misses would pass for noisy inliers.
+    replaces 0 where it is :math:`e^3` times as likely, by the mixture of :func:`_log_likelihoods`, and most pairs are
+    inliers: among many outliers, near misses would pass for noisy inliers.
     """
     assert problem.confidence is not None
     there = problem.weights > 0

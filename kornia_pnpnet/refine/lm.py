@@ -10,7 +10,7 @@ from kornia.core.exceptions import ValueCheckError
 from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_whole
-from kornia_pnpnet.core.compilation import Runner, per_problem
+from kornia_pnpnet.core.compilation import EAGER, Runner, per_problem
 from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.linalg import relative, solve_positive
 from kornia_pnpnet.core.performance import problems_last, repeat_problems
@@ -250,7 +250,7 @@ class RobustWeightedLM(Configured):
         return refine
 
     def forward(
-        self, problem: Problem, starts: Starts, *, m: int | None = None, more: int = 0, run: Runner = Runner()
+        self, problem: Problem, starts: Starts, *, m: int | None = None, more: int = 0, run: Runner = EAGER
     ) -> Refinement:
         r"""Refine poses.
 
@@ -291,13 +291,9 @@ class RobustWeightedLM(Configured):
         camera = pose.translation[:, : 0 if problem.free_focal is None else 1] * 0.0
         if starts.camera is not None:
             camera = starts.camera.repeat(len(poses), 1)
-        return Plan(
-            problem, prior, guided, by_residual, State(pose, camera), area, noiseless, step, damping, shape
-        )
+        return Plan(problem, prior, guided, by_residual, State(pose, camera), area, noiseless, step, damping, shape)
 
-    def iterate(
-        self, plan: Plan, m: int | None = None, *, more: int = 0, run: Runner = Runner()
-    ) -> tuple[State, Tensor]:
+    def iterate(self, plan: Plan, m: int | None = None, *, more: int = 0, run: Runner = EAGER) -> tuple[State, Tensor]:
         """Run the iterations: on all poses of a problem, then on the best pose of each, the last by residual.
 
         Args:
@@ -396,9 +392,7 @@ class RobustWeightedLM(Configured):
         rounding = _ROUNDING * torch.finfo(new.dtype).eps
         better = new <= old * (1.0 + rounding) + (rounding * projection.focal).square()
         factor = torch.where(better, now.factor * _DAMPING_DOWN, now.factor * _DAMPING_UP)
-        kept = map_tensors(
-            lambda x, y: torch.where(better.view(-1, *(1,) * (x.ndim - 1)), x, y), state, now.state
-        )
+        kept = map_tensors(lambda x, y: torch.where(better.view(-1, *(1,) * (x.ndim - 1)), x, y), state, now.state)
         return Progress(kept, solved, factor)
 
     def _equations(self, projection: Projection, problem: Problem, shape: Tensor) -> NormalEquations:

@@ -176,7 +176,9 @@ class PoseTerm(NamedTuple):
         rank = (_correlations(information)[0] > _KNOWN).sum(-1).to(centroid)
         widest = torch.full_like(scale, _SCALE) if prior.scale is None else torch.where(usable, prior.scale, _SCALE)
         sq_scale = 0.5 * widest.square() * rank.clamp(min=1.0)
-        return cls(Pose(rotation, moved), information, offset, _open_axis(information[:, :3, :3]), sq_scale, rank), usable
+        return cls(
+            Pose(rotation, moved), information, offset, _open_axis(information[:, :3, :3]), sq_scale, rank
+        ), usable
 
     def recentred(self, centre: Tensor) -> PoseTerm:
         """The prior where a world point (B, 3) becomes the origin."""
@@ -195,8 +197,8 @@ class PoseTerm(NamedTuple):
             axis of which the prior knows nothing are left out; the squared length, :math:`(B,)`.
         """
         turn = self.pose.rotation @ pose.rotation.mT
-        # Where the information leaves turns about an axis open, the nearest of all poses that it allows. There the error
-        # has no derivative by this angle.
+        # Where the information leaves turns about an axis open, the nearest of all poses that it allows. There the
+        # error has no derivative by this angle.
         free, fixed = self.free, turn.detach()
         along = fixed.diagonal(dim1=-2, dim2=-1).sum(-1) - (free * (fixed @ free[..., None])[..., 0]).sum(-1)
         around = -(free * So3.vee(fixed - fixed.mT)).sum(-1)

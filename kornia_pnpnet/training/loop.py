@@ -22,14 +22,14 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 from kornia_pnpnet.core.checks import check_positive
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.data.stream import ProblemSource, stream_batches
-from kornia_pnpnet.propose.mlp import MLPInit
 from kornia_pnpnet.losses import PoseLoss, SetLoss
+from kornia_pnpnet.propose.mlp import MLPInit
 from kornia_pnpnet.refine.lm import RobustWeightedLM
+from kornia_pnpnet.result import Problems
 from kornia_pnpnet.solver import PnPNet
 from kornia_pnpnet.training.checkpoint import CHECKPOINT_NAME, HISTORY_NAME, stop_on_signal
 from kornia_pnpnet.training.run import FitReport, Run
 from kornia_pnpnet.training.settings import TrainSettings
-from kornia_pnpnet.result import Problems
 
 __all__ = ["fit", "train_briefly"]
 

@@ -15,10 +15,10 @@ from typing_extensions import TypedDict
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.core.schema import STRICT, Count, Kept, read_json
 from kornia_pnpnet.pretrained import find_weights
+from kornia_pnpnet.result import Problems
 from kornia_pnpnet.solver import PnPNet
 from kornia_pnpnet.training.run import FitReport
 from kornia_pnpnet.training.validation import ValidationResult, validate
-from kornia_pnpnet.result import Problems
 
 __all__ = ["RESULTS_NAME", "Learned", "RunResults", "find_results", "load_run", "run_results"]
 

@@ -18,6 +18,7 @@ from torch import nn
 
 from kornia_pnpnet.core.schema import Count
 from kornia_pnpnet.losses import LossTerms, PoseLoss, SetLoss
+from kornia_pnpnet.result import Problems
 from kornia_pnpnet.solver import PnPNet
 from kornia_pnpnet.training.checkpoint import (
     CHECKPOINT_NAME,
@@ -29,7 +30,6 @@ from kornia_pnpnet.training.checkpoint import (
 )
 from kornia_pnpnet.training.settings import TrainSettings
 from kornia_pnpnet.training.validation import CURVES, validate
-from kornia_pnpnet.result import Problems
 
 __all__ = ["FitReport", "Run", "describe_shares"]
 
