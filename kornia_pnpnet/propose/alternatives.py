@@ -98,11 +98,11 @@ def find_alternatives(
     found = (ends.rotation, ends.translation, cost, probability, valid)
     fill = (eye, 0.0, torch.finfo(cost.dtype).max ** 0.5, 0.0)
     *picked, chosen = _pick(found, position)
-    filled = [
+    rotation, translation, cost, probability = (
         torch.where(chosen.view(*chosen.shape, *(1,) * (x.ndim - 2)), x, y).movedim(0, 1)
         for x, y in zip(picked, fill, strict=True)
-    ]
-    return Alternatives(*filled, chosen.mT)
+    )
+    return Alternatives(rotation, translation, cost, probability, chosen.mT)
 
 
 @torch.no_grad()

@@ -286,7 +286,7 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
     if starts.noise is None or starts.others is None:
         raise ValueCheckError('effort="adaptive" needs an initialiser with several poses and the noise, as SetInit.')
     constant = map_tensors(torch.Tensor.detach, starts)
-    known, noise = problem.noise, constant.noise
+    known, noise = problem.noise, map_tensors(torch.Tensor.detach, starts.noise)
     problem = problem._replace(noise=None).map(lambda x: x.detach().contiguous())
     depth = constant.pose.translation[:, 2:].clamp(min=_NEAREST)  # (B, 1)
     sigma = torch.hypot(noise.img, problem.focal * noise.world / depth).maximum(LEAST_NOISE * problem.focal)

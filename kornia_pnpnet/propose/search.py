@@ -39,7 +39,7 @@ _IMPROVED = 3
 # Each round draws at least this share of the samples before it. More: fewer rounds, but more needless samples.
 _GROWTH = 0.5
 # Where no more than this many rounds are left, one round draws them all.
-_FEW_LEFT = 1.5
+_FEW_LEFT = 2.0
 # Number of samples that are solved at once, up to multiples: twice the numbers in the longest vector of a processor.
 _VECTOR = 64
 # Relative damping of least squares: next to none, since the start is close to the minimum.
