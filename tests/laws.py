@@ -404,15 +404,17 @@ def is_broken(law: Callable[[Case], None], case: Case) -> bool:
     return law is bad_problems_have_no_gradient and (case.camera == "bearings" or case.focal == "unknown")
 
 
-def gradcheck(case: Case, solver: PnPNet | None = None) -> None:
+def gradcheck(case: Case) -> None:
     """Derivatives by all inputs are those of the result: of a refinement that starts near the truth, in float64.
 
     Each input moves relative to its own size, so that one difference step suits all.
     """
     call, _ = make(case._replace(solver="identity-lm"), 1)
     call |= {"weights": torch.linspace(0.6, 1.4, PAIRS, dtype=torch.float64)[None]}
-    lm = RobustWeightedLM(3 if case.focal == "known" else 40, kernel="cauchy", robustness=5.0, learnable=False)
-    solver = PnPNet(None, lm, gradient="always", focal=case.focal) if solver is None else solver
+    lm = RobustWeightedLM(3, kernel="cauchy", robustness=5.0, learnable=False)
+    if case.focal == "unknown":  # from a start that is a constant to the minimum
+        lm = RobustWeightedLM(30, robustness=0.0, damping=1e-6, learnable=False)
+    solver = PnPNet(None, lm, focal=case.focal)
     leaves, spec = pytree.tree_flatten(call)
     sizes = [x.abs().mean() if x.shape[1:] in ((PAIRS, 2), (PAIRS, 3)) else x for x in leaves]
 

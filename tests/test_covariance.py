@@ -41,15 +41,6 @@ def test_normalised_errors_are_chi_square(n, make_problems):
     assert (squares < 7.815).double().mean().item() == pytest.approx(0.95, abs=0.02)
 
 
-def test_inputs_of_half_precision_are_computed_in_float64(make_problems):
-    half = make_problems(n=12).map(torch.Tensor.half)
-    full = half.map(torch.Tensor.float)
-    found = pose_covariance(half.pose, *half[:3], img_sigma=torch.ones(7).bfloat16(), world_sigma=1)
-    expected = pose_covariance(full.pose, *full[:3], img_sigma=1, world_sigma=1)
-    assert found.dtype == torch.float32
-    assert torch.equal(found, expected)
-
-
 def test_zero_weight_equals_removing(make_problems):
     p = make_problems(n=12, batch=5)
     weights = (torch.arange(12) < 8).double().expand(5, 12)

@@ -140,13 +140,6 @@ def test_onnx_of_an_unknown_focal_length(tmp_path):
         torch.testing.assert_close(torch.from_numpy(camera), solver(*inputs).intrinsics, rtol=1e-3, atol=1e-3)
 
 
-@pytest.mark.slow
-def test_onnx_of_one_problem(make_problems, tmp_path):
-    solver = PnPNet(None, RobustWeightedLM(1))
-    inputs = inputs_of(make_problems(n=9, batch=1))
-    near(run_onnx(export_onnx(solver, tmp_path / "one.onnx", 9, batch=1), inputs), solver, inputs)
-
-
 def test_solvers_that_cannot_be_exported(tmp_path, capsys):
     with pytest.raises(ValueCheckError, match="RANSAC"):
         export_program(create_solver("p3p-ransac"), 9)
@@ -327,17 +320,3 @@ def test_what_compiled_code_gets(make_problems):
     ):
         with pytest.raises(ShapeError):
             package(*wrong)
-
-
-def test_what_compiled_code_of_rigs_gets():
-    inputs, package = rigs(5, 2), PackagedSolver(Loader(rig=True))
-    world, img, intrinsics, _, *rig = inputs
-    found = package(world.double(), img, intrinsics, cam_from_rig=Pose(*rig))
-    assert all(torch.equal(x, y) for x, y in zip(found, inputs, strict=True))
-    with pytest.raises(ValueCheckError, match="cam_from_rig"):
-        package(world, img, intrinsics)
-    with pytest.raises(ValueCheckError, match="cam_from_rig"):
-        PackagedSolver(Loader())(world, img, intrinsics[:, 0], cam_from_rig=Pose(*rig))
-    for wrong in ((intrinsics[:, 0], rig), (intrinsics, (rig[0][:, :4], rig[1])), (intrinsics, (rig[0], rig[1][0]))):
-        with pytest.raises(ShapeError):
-            package(world, img, wrong[0], cam_from_rig=Pose(*wrong[1]))

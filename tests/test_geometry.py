@@ -243,31 +243,6 @@ def test_points_behind_the_camera_do_not_count(point, dtype):
     torch.testing.assert_close(step.pose.matrix, without.pose.matrix, rtol=rtol, atol=0)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_all_points_at_the_camera_centre_are_finite(dtype):
-    points = torch.zeros(1, 4, 3, dtype=dtype, requires_grad=True)
-    translation = torch.zeros(1, 3, dtype=dtype, requires_grad=True)
-    pose = Pose(torch.eye(3, dtype=dtype)[None], translation)
-    corr = Correspondences(points, torch.zeros(1, 4, 2).to(dtype), torch.ones(1, 4).to(dtype), FOCAL.to(dtype))
-    matrix, right_side = normal_matrices(pose, corr, corr.weights)
-    assert not matrix.any()
-    assert not right_side.any()
-    (matrix.sum() + right_side.sum() + project(pose, corr).sq_residual.sum()).backward()
-    assert points.grad.isfinite().all()
-    assert translation.grad.isfinite().all()
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_in_front_does_not_depend_on_the_unit(dtype):
-    point = torch.tensor([[[1.0, 1.0, 1e-3], [1.0, 1.0, 2e-3], [0.3, 0.1, 1.0], [0.0, 0.0, -1.0]]], dtype=dtype)
-    pose = Pose(torch.eye(3, dtype=dtype)[None], torch.zeros(1, 3, dtype=dtype))
-    for unit in (1e-6, 1.0, 1e6):
-        corr = Correspondences(
-            point * unit, torch.zeros(1, 4, 2).to(dtype), torch.ones(1, 4).to(dtype), FOCAL.to(dtype)
-        )
-        assert project(pose, corr).in_front.tolist() == [[False, True, True, False]]
-
-
 def test_pixel_variance_is_that_of_the_pixel(make_problems):
     """Against the noise of many draws, mean over both coordinates."""
     p = make_problems(n=5, batch=1, noise=False)

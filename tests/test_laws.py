@@ -58,13 +58,16 @@ def test_what_the_contract_excludes_is_refused(name, camera):
         build(case)(**make(case)[0])
 
 
-@pytest.mark.parametrize("focal", FOCALS)
-@pytest.mark.parametrize("noise", NOISES)
-@pytest.mark.parametrize("camera", CAMERAS)
-def test_gradcheck(camera, noise, focal):
-    case = Case("identity-lm", camera, noise, focal)
-    if not case.is_refused:
-        gradcheck(case)
+CHECKED = [Case("identity-lm", *x) for x in product(CAMERAS, NOISES, FOCALS)]
+IN_TIME = [CHECKED[0], Case("identity-lm", "rig", "covariance"), Case("identity-lm", "pixels", "sigma", "unknown")]
+
+
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(x, id=str(x), marks=[] if x in IN_TIME else [pytest.mark.slow]) for x in CHECKED if not x.is_refused],
+)
+def test_gradcheck(case):
+    gradcheck(case)
 
 
 @XFAIL

@@ -3,18 +3,29 @@
 from __future__ import annotations
 
 import itertools
-import math
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from kornia.core.exceptions import ValueCheckError
 from strategies import KINDS, are_rotations, correspondences, finite, gradients_are_finite, many, options, poses
 
-from kornia_pnpnet import Correspondences, Guess, Noise, Normalize, PnPNet, Pose, RobustWeightedLM, pose_errors
+from kornia_pnpnet import (
+    Correspondences,
+    Guess,
+    Noise,
+    PnPNet,
+    Pose,
+    RobustWeightedLM,
+    create_solver,
+    pose_errors,
+    success,
+)
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
+from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.geometry import NormalEquations, project, retract, retract_additive
-from kornia_pnpnet.refine import KERNELS, explains, lm_step, solve_damped
+from kornia_pnpnet.refine import KERNELS, lm_step, solve_damped
 from kornia_pnpnet.refine.lm import BACKWARDS
 
 DTYPES = (torch.float32, torch.float64)
@@ -106,30 +117,6 @@ def test_solve_damped_is_linalg_solve(dim, damping, scaling, generator):
         assert ((solution - expected).norm(dim=-1) / expected.norm(dim=-1)).max() < 1e-9
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("rank", [0, 2, 5])
-def test_singular_systems_are_reported_finite_and_change_no_other(rank, dtype, generator):
-    root = torch.randn(5, 6, 9, generator=generator, dtype=dtype)
-    whole = root.clone()
-    root[2, :, rank:] = 0.0  # 6 rows in `rank` columns
-    root.requires_grad_()
-    rhs = torch.randn(5, 6, generator=generator, dtype=dtype).requires_grad_()
-    damping = torch.zeros((), dtype=dtype, requires_grad=True)
-    solution, solved = solve(root @ root.mT, rhs, damping)
-    assert solved.tolist() == [True, True, False, True, True]
-    assert solution.isfinite().all()
-    others = [0, 1, 3, 4]
-    assert torch.equal(solution[others], solve(whole @ whole.mT, rhs, damping)[0][others])
-    torch.where(solved[:, None], solution, 0.0).sum().backward()
-    assert all(tensor.grad.isfinite().all() for tensor in (root, rhs, damping))
-    assert not root.grad[2].any()
-    assert not rhs.grad[2].any()
-    missing = torch.diag(torch.tensor([1.0, 2, 0, 3, 4, 5], dtype=dtype))[None]  # damping does not help an empty row
-    solution, solved = solve(missing, torch.ones(1, 6, dtype=dtype), number(0.1, dtype))
-    assert not solved
-    assert solution.isfinite().all()
-
-
 # --- the step -------------------------------------------------------------------------------------------------------
 
 
@@ -201,16 +188,6 @@ def test_classical_lm_finds_the_truth_without_noise(n, batch, update, case):
     assert refined.cost.max() < 1e-6
 
 
-@pytest.mark.parametrize("update", UPDATES)
-def test_three_points_are_met_exactly(update, case):
-    corr, _, start = case(3, 1000, noise=False, near=0.01)
-    refined = RobustWeightedLM(m=50, update=update, reject_worse=True)(corr, guess(start, corr))
-    after, before = (project(pose, corr).sq_residual.amax(-1).sqrt() for pose in (refined.pose, start))
-    # Near a danger cylinder two of the solutions of P3P meet and the convergence is slow there.
-    assert (after < 1e-6).double().mean() >= 0.99
-    assert (after < before).all()
-
-
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_outliers_end_with_little_weight(kernel, make_problems, correspond, perturb):
     problems = make_problems(12, 50, outliers=2)
@@ -263,111 +240,6 @@ def test_points_behind_the_camera_never_lower_the_cost(kernel, case):
     assert not bad.weights.any()
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize(("n", "unit"), [(5, 1e-30), (9, 1e30), (10, 1.0)])
-def test_explains_compares_two_weighted_quantiles(n, unit, dtype, generator):
-    """Counted in integers, with weights of 0, ties, and shares of exactly 60 %."""
-    batch = 400
-    prior = torch.randint(0, 4, (batch, n), generator=generator)
-    prior[: batch // 2], prior[-20:] = 1, 0
-    pixels = 100.0 * torch.randint(-3, 4, (batch, n, 2), generator=generator, dtype=dtype)  # with ties
-    # From 0 to beyond the limit, in steps that no sum of squares above meets by rounding.
-    residual = 10.3 * torch.randint(0, 9, (batch, n), generator=generator).to(dtype)
-    in_front = torch.rand(batch, n, generator=generator) < 0.9
-    # Points whose projections by the identity are the pixels plus the residuals, at depth 1 or -1.
-    plane = torch.stack((pixels[..., 0] + residual, pixels[..., 1]), -1) / 100.0
-    world = torch.cat((plane, in_front[..., None].to(dtype) * 2 - 1), -1)
-    corr = Correspondences(world, pixels, torch.ones(batch, n, dtype=dtype), number(100.0, dtype))
-    pose = Pose(torch.eye(3, dtype=dtype).expand(batch, 3, 3), torch.zeros(batch, 3, dtype=dtype))
-
-    total = prior.sum(-1, keepdim=True)
-    mean = (prior[..., None] * pixels.double()).sum(1, keepdim=True) / total[..., None].clamp(min=1)
-    spread, order = (pixels - mean).norm(dim=-1).sort(-1)
-    below = 5 * prior.gather(-1, order).cumsum(-1) >= 3 * total
-    limit = 0.2 * spread.gather(-1, below.int().argmax(-1, keepdim=True))
-    explained = in_front & (residual <= limit)
-    expected = (5 * (prior * explained).sum(-1) >= 3 * total[:, 0]) & (
-        (explained & (prior > 0)).sum(-1) >= (prior > 0).sum(-1).clamp(3, 4)
-    )
-    assert torch.equal(explains(project(pose, corr), corr, unit * prior.to(dtype)), expected)
-    assert 0.1 < expected.double().mean() < 0.9
-    far = Pose(pose.rotation, number([0.0, 0.0, 1e6], dtype).expand(batch, 3))  # the image shrinks to one point
-    spread_out = spread.amin(-1) > 0
-    assert not explains(project(far, corr), corr, corr.weights)[spread_out].any()
-
-
-# --- one problem among many -----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("update", UPDATES)
-@pytest.mark.parametrize(("n", "batch"), [(3, 1000), (6, 7), (50, 7)])
-def test_a_problem_alone_is_itself_in_a_batch(n, batch, update, case):
-    corr, _, start = case(n, batch, outliers=n // 4)
-    lm = RobustWeightedLM(m=3, update=update, reject_worse=True)
-    together = lm(corr, guess(start, corr))
-    for i in (0, batch // 2, batch - 1):
-        only = slice(i, i + 1)
-        part, first = of_pairs(lambda x, only=only: x[only], corr), map_tensors(lambda x, only=only: x[only], start)
-        alone = lm(part, guess(first, part))
-        assert_close(map_tensors(lambda x, only=only: x[only], together), alone, rtol=1e-7)
-
-
-@pytest.mark.parametrize("bad", [math.nan, math.inf, 1e200, 0.0, None])
-def test_a_bad_problem_changes_no_other_by_a_bit(bad, case):
-    corr, _, start = case()
-    spoilt = of_pairs(torch.clone, corr)
-    for tensor in (spoilt.weights,) if bad is None else (spoilt.world_points, spoilt.img_points):
-        tensor[2] = 0.0 if bad is None else bad
-    for update in UPDATES:
-        lm = RobustWeightedLM(m=10, update=update, reject_worse=True)
-        sound, refined = (lm(x, guess(start, x)) for x in (corr, spoilt))
-        assert sound.ok.all()
-        assert refined.ok.tolist() == [i != 2 for i in range(7)]
-        assert_equal(*(map_tensors(lambda x: x[torch.arange(7) != 2], x) for x in (refined, sound)))
-
-
-@pytest.mark.parametrize("update", UPDATES)
-@pytest.mark.parametrize("n", [3, 9, 50])
-def test_shuffled_pairs_give_the_same_pose(n, update, case, generator):
-    corr, _, start = case(n, outliers=n // 4)
-    shuffle = torch.randperm(n, generator=generator)
-    mixed = of_pairs(lambda x: x[:, shuffle], corr)
-    lm = RobustWeightedLM(m=3, update=update, reject_worse=True)
-    straight, shuffled = lm(corr, guess(start, corr)), lm(mixed, guess(start, mixed))
-    assert_close(straight.pose, shuffled.pose)
-    assert_close(straight.weights[:, shuffle], shuffled.weights, rtol=1e-7)
-    assert torch.equal(straight.ok, shuffled.ok)
-
-
-@pytest.mark.parametrize("update", UPDATES)
-def test_float32_is_close_to_float64(update, case):
-    corr, _, start = case(9, 200, near=0.02)
-    lm = RobustWeightedLM(m=10, update=update)
-    double = lm(corr, guess(start, corr))
-    low, low_start = map_tensors(torch.Tensor.float, (corr, start))
-    single = lm(low, guess(low_start, low))
-    assert {x.dtype for x in iter_tensors(single)} == {torch.float32, torch.bool}
-    errors = pose_errors(map_tensors(torch.Tensor.double, single.pose), double.pose)
-    assert errors.rotation_error_deg.median() < 1e-3
-    assert errors.rotation_error_deg.max() < 0.05
-    assert errors.translation_error.max() < 1e-2
-    assert single.ok.all()
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("update", UPDATES)
-def test_the_unit_of_the_world_does_not_matter(update, dtype, case):
-    """To the bit, since powers of two round nothing: a world of micrometres, one of thousands of kilometres."""
-    corr, _, start = case(9, 100, outliers=2, dtype=dtype)
-    lm = RobustWeightedLM(m=5, update=update)
-    here = lm(corr, guess(start, corr))
-    for unit in (2.0**-20, 2.0**20):
-        scaled = corr._replace(world_points=unit * corr.world_points)
-        there = lm(scaled, guess(start._replace(translation=unit * start.translation), scaled))
-        pose = here.pose._replace(translation=unit * here.pose.translation)
-        assert_equal(there, here._replace(pose=pose))
-
-
 # --- weights ----------------------------------------------------------------------------------------------------------
 
 
@@ -392,24 +264,6 @@ def test_integer_weights_equal_repeating_and_zero_equals_removing(kernel, update
     assert torch.equal(given.ok, expected.ok)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("update", UPDATES)
-def test_a_common_factor_of_the_weights_does_not_matter(update, dtype, case, anywhere):
-    corr, _, start = case(9, 300, outliers=3, near=0.02, dtype=dtype)
-    lm = RobustWeightedLM(m=5, update=update)
-    here = lm(corr, guess(start, corr))
-    tolerance = 1e-3 if dtype == torch.float32 else 1e-9
-    for factor in (1e-30, 1e30):
-        scaled = corr._replace(weights=factor * corr.weights)
-        there = lm(scaled, guess(start, corr))
-        assert_close(there.pose.matrix, here.pose.matrix, tolerance, tolerance)
-        assert torch.equal(there.ok, here.ok)
-        scaled, pose = map_tensors(lambda x: x.clone().requires_grad_(), (scaled, anywhere(300, dtype)))
-        lm(scaled, guess(pose, corr)).pose.matrix.sum().backward()
-        for tensor in (scaled.world_points, scaled.img_points, *pose, *lm.parameters()):
-            assert tensor.grad.isfinite().all()
-
-
 # --- last iterations without the guess's weights --------------------------------------------------------------------
 
 
@@ -417,18 +271,6 @@ def with_noise(start, corr, img_sigma):
     """A guess that states the noise of the pixels, and none of the world points."""
     sigma = torch.full_like(corr.weights, img_sigma)
     return guess(start, corr)._replace(noise=Noise(sigma, torch.zeros_like(sigma)))
-
-
-@pytest.mark.parametrize("backward", ["unroll", "truncated", "implicit"])
-def test_iterations_by_residual_ignore_the_guessed_weights_but_not_the_given_ones(backward, case, generator):
-    corr, _, start = case(outliers=2)
-    doubt = torch.rand(7, 9, generator=generator, dtype=torch.float64)
-    lm = RobustWeightedLM(m=3, by_residual=1, backward=backward, reject_worse=False)
-    first = RobustWeightedLM(m=2, reject_worse=False)(corr, Guess(start, doubt)).pose
-    for weights in (torch.ones_like(doubt), doubt.flip(1)):
-        refined = lm(corr._replace(weights=weights), Guess(start, doubt / weights))
-        last = RobustWeightedLM(m=1, reject_worse=False)(corr._replace(weights=weights), guess(first, corr))
-        assert_close(refined, last, rtol=1e-7)
 
 
 def test_iterations_by_residual_correct_a_noise_that_is_stated_too_large(case, generator):
@@ -456,18 +298,6 @@ def test_iterations_by_residual_correct_a_noise_that_is_stated_too_large(case, g
     torch.testing.assert_close(kept.pose.matrix[25:], corrected.pose.matrix[25:])
 
 
-def test_iterations_by_residual_keep_a_noise_that_may_be_right(case, generator):
-    corr, _, start = case(9, 300, noise=False)
-    noise = torch.randn(corr.img_points.shape, generator=generator, dtype=torch.float64)
-    noisy = corr._replace(img_points=corr.img_points + 2.0 * noise)
-    kept, by_residual = (
-        RobustWeightedLM(m=10, kernel="geman_mcclure", by_residual=x)(noisy, with_noise(start, corr, 2.0))
-        for x in (0, 3)
-    )
-    moved = (kept.pose.matrix - by_residual.pose.matrix).flatten(1).abs().amax(1) > 1e-9
-    assert moved.double().mean() <= 0.05  # two likelihood ratios of e³ each
-
-
 @pytest.mark.parametrize("outliers", [0, 6])
 def test_iterations_by_residual_find_a_larger_noise(outliers, case, generator):
     """Noise of 20 px is stated as 2 px: weights and verdict are close to those of the right statement."""
@@ -485,24 +315,19 @@ def test_iterations_by_residual_find_a_larger_noise(outliers, case, generator):
     assert (found.weights > 0.5).sum() > 0.9 * (right.weights > 0.5).sum()
 
 
-@pytest.mark.parametrize("backward", ["unroll", "implicit"])
-def test_gradients_of_iterations_by_residual_without_any_noise_are_finite(backward, case):
-    corr, truth, _ = case(6, noise=False)
-    pixels = corr.img_points.clone().requires_grad_()
-    lm = RobustWeightedLM(m=3, kernel="geman_mcclure", by_residual=1, backward=backward)
-    refined = lm(corr._replace(img_points=pixels), with_noise(truth, corr, 1.0))
-    (refined.pose.rotation.sum() + refined.pose.translation.sum() + refined.weights.sum()).backward()
-    assert pixels.grad.isfinite().all()
-    assert pixels.grad.any()
-    assert_close(refined.pose, truth)
-
-
-@pytest.mark.parametrize(("m", "most"), [(0, 0), (1, 1), (3, 1), (10, 3)])
-def test_iterations_by_residual_come_after_the_choice_among_poses(m, most, case, perturb):
-    corr, truth, start = case(outliers=2)
-    starts = guess(start, corr, perturb(truth, seed=2))
-    some, more = (RobustWeightedLM(m=m, by_residual=count)(corr, starts) for count in (most, most + 5))
-    assert_equal(some, more)
+@pytest.mark.xfail(strict=True, reason="issue 46")
+def test_iterations_by_residual_refuse_a_kernel_that_they_do_not_suit():
+    """Weights of ``power`` exceed 1: without a refusal, success must not fall."""
+    try:
+        lms = [RobustWeightedLM(10, kernel="power", by_residual=count, learnable=False) for count in (0, 3)]
+    except ValueCheckError:
+        return
+    p = SyntheticProblems(n=9, batch_size=1000, seed=3, outliers=OutlierMix(count=2)).batch(0)
+    net = create_solver("pnpnet-set")
+    with torch.no_grad():
+        poses = [PnPNet(net.init, lm, net.normalize, effort="fixed").eval()(*p[:3]).pose for lm in lms]
+    rates = [success(pose_errors(pose, p.pose)).float().mean() for pose in poses]
+    assert rates[1] >= rates[0] - 0.01
 
 
 # --- gradients --------------------------------------------------------------------------------------------------------
@@ -560,15 +385,6 @@ def test_gradients_are_finite_from_anywhere(kernel, backward, dtype, case, anywh
         assert all(x.grad is None or x.grad.isfinite().all() for x in (*pose, *lm.parameters()))
 
 
-@pytest.mark.parametrize(("backward", "m"), [("truncated", 5), ("truncated", 2), ("implicit", 5)])
-@pytest.mark.parametrize("update", UPDATES)
-def test_the_backward_pass_does_not_change_the_result(update, backward, m, case):
-    corr, _, start = case(outliers=2)
-    options = {"m": m, "update": update, "reject_worse": True}
-    plain, other = RobustWeightedLM(**options), RobustWeightedLM(**options, backward=backward, last=2)
-    assert_equal(plain(corr, guess(start, corr)), other(corr, guess(start, corr)))
-
-
 @pytest.fixture
 def gradients(case, generator):
     """Gradients by points, pixels, weights, start and hyperparameters of a function of a refinement's result.
@@ -601,23 +417,6 @@ def gradients(case, generator):
     return of
 
 
-def test_truncated_gradients_are_those_of_the_last_iterations(gradients):
-    """From a constant pose: no gradient of the guess, nor of the hyperparameters before."""
-    truncated = gradients(RobustWeightedLM(m=5, backward="truncated", last=2, reject_worse=False).double())
-    last = gradients(RobustWeightedLM(m=2, reject_worse=False).double(), skip=3)
-    assert_close(truncated[:3], last[:3], atol=1e-12)
-    for a, b in zip(truncated[4:], last[4:], strict=True):
-        torch.testing.assert_close(a[3:], b, rtol=1e-9, atol=1e-12)
-        assert not a[:3].any()
-        assert a[3:].any()
-    assert last[3].any()
-    assert not truncated[3].any()
-    for m in (1, 2):  # nothing is cut off
-        whole = gradients(RobustWeightedLM(m=m).double())
-        assert_equal(whole, gradients(RobustWeightedLM(m=m, backward="truncated", last=2).double()))
-        assert all(x.any() for x in whole)
-
-
 @pytest.mark.parametrize("kernel", SMOOTH)
 def test_implicit_gradients_are_those_of_unrolling_to_the_minimum(kernel, gradients):
     unrolled, implicit = (
@@ -634,23 +433,6 @@ def test_implicit_gradients_are_those_of_unrolling_to_the_minimum(kernel, gradie
     assert not any(x.any() for x in implicit[3:6])
 
 
-def test_implicit_gradients_do_not_depend_on_the_unit_of_pixels(make_problems, perturb):
-    """Nor where the pose is no minimum, and the Gauss-Newton matrix replaces that of Newton."""
-    p = make_problems(n=8, batch=16).map(lambda x: x.double() if x.is_floating_point() else x)
-    start = perturb(p.pose, angle=0.3)
-    gradients = []
-    for focal in (30.0, 3000.0):
-        normalize = Normalize(f_const=focal, order=False)
-        corr, frame = normalize(*p[:3])
-        rays = (corr.img_points / focal).detach().requires_grad_()
-        refine = RobustWeightedLM(1, kernel="cauchy", robustness=0.005 * focal, backward="implicit").double()
-        guess = Guess(normalize.apply_to_pose(start, frame), torch.ones_like(corr.weights))
-        refined = refine(corr._replace(img_points=focal * rays), guess)
-        gradients.append(torch.autograd.grad(refined.pose.translation.sum(), rays)[0])
-    # The scale of the kernel is stored in float32.
-    torch.testing.assert_close(gradients[0], gradients[1], rtol=1e-3, atol=1e-5)
-
-
 def test_implicit_second_derivatives_are_those_of_unrolling_to_the_minimum(make_problems, perturb):
     p = make_problems(n=8, batch=2)
     direction = torch.randn_like(p.img_points)
@@ -664,26 +446,6 @@ def test_implicit_second_derivatives_are_those_of_unrolling_to_the_minimum(make_
         )
         products.append(torch.autograd.grad((gradient * direction).sum(), img_points)[0])
     assert (products[1] - products[0]).norm() < 1e-5 * products[0].norm()
-
-
-@pytest.mark.parametrize(("backward", "grows"), [("unroll", True), ("truncated", False), ("implicit", False)])
-def test_memory_of_the_backward_pass(backward, grows, case):
-    """Only unrolling keeps more tensors the more iterations there are."""
-    corr, _, start = case()
-    pixels = corr.img_points.clone().requires_grad_()
-    numbers = []
-
-    def count(tensor):
-        numbers[-1] += tensor.numel()
-        return tensor
-
-    for m in (3, 30):
-        numbers.append(0)
-        lm = RobustWeightedLM(m=m, shared=True, backward=backward, last=2)
-        with torch.autograd.graph.saved_tensors_hooks(count, lambda tensor: tensor):
-            lm(corr._replace(img_points=pixels), guess(start, corr))
-    assert (numbers[1] > 5 * numbers[0]) == grows
-    assert grows or numbers[1] == numbers[0]
 
 
 # --- hyperparameters -----------------------------------------------------------------------------------------------
@@ -708,13 +470,6 @@ def test_hyperparameters_start_classical_and_stay_bounded(kernel, shared, case):
         (refined.pose.rotation.sum() + refined.pose.translation.sum() + refined.cost.sum()).backward()
         assert all(x.isfinite().all() for x in iter_tensors(refined))
         assert all(p.grad.isfinite().all() for p in lm.parameters())
-
-
-def test_unlearned_hyperparameters_take_no_gradient(case):
-    corr, truth, _ = case()
-    lm = RobustWeightedLM(learnable=False)
-    assert not any(p.requires_grad for p in lm.parameters())
-    assert not lm(corr, guess(truth, corr)).pose.rotation.requires_grad
 
 
 # --- several starts -------------------------------------------------------------------------------------------------
@@ -745,53 +500,6 @@ def test_the_best_of_several_starts_goes_on(options, near_and_far):
         lm = RobustWeightedLM(m, **options)
         best, alone = (lm(corr, guess(*x), m=stop) for x in ((starts[0], corr, *starts[1:]), (near, corr)))
         assert_close(best, alone, atol=1e-12)
-
-
-@pytest.mark.parametrize("backward", ["unroll", "implicit", "truncated"])
-def test_only_the_best_start_has_a_gradient(backward, near_and_far):
-    corr, *poses = near_and_far()
-    gradients = []
-    for with_far in (True, False):
-        (near, far), points = map_tensors(lambda x: x.clone().requires_grad_(), (poses, corr.world_points))
-        first = guess(far, corr, near) if with_far else guess(near, corr)
-        m = 4 if backward == "unroll" else 20  # implicit gradients are those of a minimum
-        lm = RobustWeightedLM(m, robustness=0.0, backward=backward, last=12, reject_worse=False)
-        refined = lm(corr._replace(world_points=points), first)
-        leaves = (points, *near, *far)
-        gradients.append(torch.autograd.grad(refined.pose.translation.sum(), leaves, materialize_grads=True))
-    for together, alone in zip(*gradients, strict=True):
-        torch.testing.assert_close(together, alone, rtol=1e-6, atol=1e-9)
-    of_points, of_near, of_far = gradients[0][0], gradients[0][1:3], gradients[0][3:]
-    assert of_points.flatten(1).any(1).all()
-    assert all(x.flatten(1).any(1).all() == (backward == "unroll") for x in of_near)
-    assert not any(x.any() for x in of_far)
-
-
-def test_several_starts_are_compared_by_residual_where_the_last_iterations_are(case, perturb):
-    """A guess that trusts only three outliers prefers the pose that fits them."""
-    corr, near, _ = case(9, 5, noise=False)
-    far = perturb(near, angle=0.5, shift=0.5)
-    img_points = corr.img_points.clone()
-    img_points[:, :3] = torch.stack([corr.focal * x[:, :3] for x in project(far, corr).plane_points], -1)
-    corr = corr._replace(img_points=img_points)
-    trust = torch.where(torch.arange(9) < 3, 1.0, 1e-6).double().expand(5, 9)
-    first = guess(far, corr, near)._replace(weights=trust)
-    misled, right = (
-        RobustWeightedLM(m=4, kernel="geman_mcclure", robustness=10.0, step=0.0, by_residual=count)(corr, first).pose
-        for count in (0, 1)
-    )
-    torch.testing.assert_close(misled, far)
-    torch.testing.assert_close(right, near)
-
-
-@pytest.mark.parametrize("spoilt", [torch.nan, torch.inf, 1e30])
-def test_a_spoilt_start_is_never_the_best(spoilt, case):
-    corr, _, start = case()
-    bad = Pose(start.rotation, torch.full_like(start.translation, spoilt))
-    lm = RobustWeightedLM(4)
-    best = lm(corr, guess(bad, corr, start))
-    assert_close(best.pose, lm(corr, guess(start, corr)).pose, atol=1e-12)
-    assert best.ok.all()
 
 
 # -- fuzz --------------------------------------------------------------------------------------------------------------
