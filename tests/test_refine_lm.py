@@ -1,4 +1,4 @@
-"""Laws of the robust weighted Levenberg-Marquardt: the linear solve, one step, the loop and their gradients."""
+"""Laws of the robust weighted Levenberg-Marquardt, from given poses: its step, kernels, weights and gradients."""
 
 from __future__ import annotations
 
@@ -6,313 +6,154 @@ import itertools
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from kornia.core.exceptions import ValueCheckError
-from strategies import KINDS, are_rotations, correspondences, finite, gradients_are_finite, many, options, poses
 
-from kornia_pnpnet import (
-    Correspondences,
-    Guess,
-    Noise,
-    PnPNet,
-    Pose,
-    RobustWeightedLM,
-    create_solver,
-    pose_errors,
-    success,
-)
-from kornia_pnpnet.core.trees import iter_tensors, map_tensors
+from kornia_pnpnet import Normalize, PnPNet, Pose, RobustWeightedLM, create_solver, pose_errors, success
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
-from kornia_pnpnet.geometry import NormalEquations, project, retract, retract_additive
-from kornia_pnpnet.refine import KERNELS, lm_step, solve_damped
-from kornia_pnpnet.refine.lm import BACKWARDS
+from kornia_pnpnet.geometry import retract, retract_additive
+from kornia_pnpnet.refine import KERNELS
 
-DTYPES = (torch.float32, torch.float64)
-UPDATES = ("retraction", "additive")
+DTYPES = torch.float32, torch.float64
+UPDATES = {"retraction": retract, "additive": retract_additive}
 SMOOTH = [name for name in KERNELS if name != "truncated"]
 
 
-def guess(pose, corr, *others):
-    """A guess with unit weights and, optionally, other poses to start from."""
-    more = map_tensors(lambda *poses: torch.stack(poses, 1), *others) if others else None
-    return Guess(pose, torch.ones_like(corr.weights), others=more)
+def solver(m=5, **options):
+    """A refinement of given poses in the frame of the caller."""
+    return PnPNet(None, RobustWeightedLM(m, learnable=False, **options), Normalize(center=False, scale=False))
 
 
-def of_pairs(function, corr):
-    """The correspondences with a function applied to points, pixels and weights."""
-    return Correspondences(*map(function, (corr.world_points, corr.img_points, corr.weights)), corr.focal)
+def residuals(p, pose):
+    """Pixels of the points minus those of the problem, (B, N, 2)."""
+    seen = (p.world_points @ pose.rotation.mT + pose.translation[:, None]) @ p.intrinsics.mT
+    return seen[..., :2] / seen[..., 2:] - p.img_points
 
 
-def number(value, dtype=torch.float64):
-    return torch.tensor(value, dtype=dtype)
-
-
-def solve(hessian, rhs, damping):
-    """``solve_damped`` of matrices (B, D, D) and vectors (B, D)."""
-    rows = [row.unbind(-1)[: i + 1] for i, row in enumerate(hessian.unbind(1))]
-    solution, solved = solve_damped(NormalEquations(rows, rhs.unbind(-1)), damping)
-    return torch.stack(solution, -1), solved
-
-
-def one_step(corr, pose, weights=None, *, gamma=1.0, damping=1e-3, update="retraction"):
-    """``lm_step`` from a pose with fixed weights."""
-    weights = corr.weights if weights is None else weights
-    gamma, damping = number([gamma, damping], weights.dtype)
-    return lm_step(corr, pose, project(pose, corr), weights, gamma, damping, additive=update == "additive")
-
-
-def assert_equal(one, two):
-    assert all(torch.equal(a, b) for a, b in zip(iter_tensors(one), iter_tensors(two), strict=True))
-
-
-def assert_close(one, two, rtol=1e-9, atol=1e-9):
-    for a, b in zip(iter_tensors(one), iter_tensors(two), strict=True):
-        torch.testing.assert_close(a, b, rtol=rtol, atol=atol)
-
-
-@pytest.fixture
-def case(make_problems, correspond, perturb):
-    """Correspondences, their true pose, and a pose ``near`` radians and units away from it."""
-
-    def make(n=9, batch=7, *, near=0.05, dtype=torch.float64, **options):
-        corr, truth = correspond(make_problems(n, batch, **options))
-        start = perturb(truth, angle=near, shift=near)
-        return map_tensors(lambda x: x.to(dtype), (corr, truth, start))
-
-    return make
-
-
-@pytest.fixture
-def anywhere(random_rotations):
-    """Random poses: a third among the points, a third about as far as the points extend, a third far off."""
-
-    def make(batch, dtype):
-        translation = torch.randn(batch, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        far = torch.logspace(-3, 3, 3, dtype=torch.float64)[torch.arange(batch) % 3]
-        return map_tensors(lambda x: x.to(dtype), Pose(random_rotations(batch), far[:, None] * translation))
-
-    return make
-
-
-# --- the linear system ----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("damping", [0.0, 10.0])
-@pytest.mark.parametrize("dim", [1, 6])
-@pytest.mark.parametrize("scaling", ["even", "bad"])
-def test_solve_damped_is_linalg_solve(dim, damping, scaling, generator):
-    root = torch.randn(100, dim, dim + 3, generator=generator, dtype=torch.float64)
-    rhs = torch.randn(100, dim, generator=generator, dtype=torch.float64)
-    if scaling == "bad":
-        root = root * torch.logspace(-8, 8, dim, dtype=torch.float64)[:, None]
-    hessian = root @ root.mT
-    damped = hessian + damping * torch.diag_embed(hessian.diagonal(dim1=-2, dim2=-1))
-    # The reference is solved with a unit diagonal, where LU keeps its digits.
-    scale = hessian.diagonal(dim1=-2, dim2=-1).rsqrt()
-    expected = scale * torch.linalg.solve(scale[:, :, None] * damped * scale[:, None], scale * rhs)
-    for factor in (number(damping), torch.full((100,), damping, dtype=torch.float64)):
-        solution, solved = solve(hessian, rhs, factor)
-        assert solved.all()
-        assert ((solution - expected).norm(dim=-1) / expected.norm(dim=-1)).max() < 1e-9
+def assert_close(one, other, tolerance=1e-9):
+    torch.testing.assert_close(one, other, rtol=tolerance, atol=tolerance)
 
 
 # --- the step -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("update", UPDATES)
-@pytest.mark.parametrize("n", [3, 9, 50])
-def test_zero_residual_gives_zero_step(n, update, case):
-    corr, pose, _ = case(n, noise=False)
-    residual = torch.stack(project(pose, corr).residual, -1)
-    corr = corr._replace(img_points=residual + corr.img_points)  # residual 0 to the last bit
-    step = one_step(corr, pose, update=update)
-    # The additive update converts the rotation to a rotation vector and back.
-    atol = 1e-12 if update == "retraction" else 1e-9
-    torch.testing.assert_close(step.pose.rotation, pose.rotation, rtol=0, atol=atol)
-    torch.testing.assert_close(step.pose.translation, pose.translation, rtol=0, atol=1e-10)
+def test_the_step_is_the_damped_gauss_newton_step(update, make_problems, perturb, generator):
+    p = make_problems(outliers=2)
+    start, move = perturb(p.pose), UPDATES[update]
+    weights = 0.1 + torch.rand(7, 9, generator=generator, dtype=torch.float64)
+    options = {"robustness": 0.0, "step": 0.7, "damping": 0.3, "reject_worse": False, "update": update}
+    found = solver(1, **options).double()(*p[:3], weights, init=start, gradient="always")
 
-
-@pytest.mark.parametrize("update", UPDATES)
-def test_the_step_is_the_damped_gauss_newton_step(update, case, generator):
-    corr, _, pose = case(9, outliers=2)
-    weights = torch.rand(7, 9, generator=generator, dtype=torch.float64)
-    step = one_step(corr, pose, weights, gamma=0.7, damping=0.3, update=update)
-    move = {"additive": retract_additive, "retraction": retract}[update]
-
-    def residual(delta):
-        return torch.cat(project(move(pose, delta), corr).residual, 1)
+    def of(delta):
+        return residuals(p, move(start, delta)).flatten(1)
 
     at = torch.zeros(7, 6, dtype=torch.float64)
-    J = torch.autograd.functional.jacobian(lambda x: residual(x).sum(0), at).movedim(0, 1)  # (B, 2N, 6)
-    JW = J.mT * torch.cat((weights, weights), 1)[:, None]
+    J = torch.autograd.functional.jacobian(lambda x: of(x).sum(0), at).movedim(0, 1)  # (B, 2N, 6)
+    JW = J.mT * weights.repeat_interleave(2, 1)[:, None]
     H = JW @ J
     H = H + 0.3 * torch.diag_embed(H.diagonal(dim1=-2, dim2=-1))
-    delta = -0.7 * torch.linalg.solve(H, JW @ residual(at)[..., None])[..., 0]
-    # Of the additive update autograd differentiates kornia's series near the identity, accurate to 2e-10.
-    tolerance = 1e-7 if update == "additive" else 1e-10
-    assert_close(step.pose.matrix, move(pose, delta).matrix, tolerance, tolerance)
+    delta = -0.7 * torch.linalg.solve(H, JW @ of(at)[..., None])[..., 0]
+    # The hyperparameters are stored in float32; kornia's series near the identity is accurate to 2e-10.
+    assert_close(found.matrix, move(start, delta).matrix, 1e-6)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("update", UPDATES)
-def test_where_the_equations_have_no_solution_the_pose_stays(update, dtype, case):
-    corr, _, start = case(dtype=dtype)
-    weights = corr.weights.clone()
-    weights[2], weights[3, 2:] = 0.0, 0.0  # no pair, two pairs
-    weights.requires_grad_()
-    step = one_step(corr, start, weights, damping=0.0, update=update)
-    assert step.solved.tolist() == [True, True, False, False, True, True, True]
-    # The additive update converts the rotation to a rotation vector and back.
-    atol = 0.0 if update == "retraction" else 1e-9 if dtype == torch.float64 else 1e-6
-    torch.testing.assert_close(step.pose.rotation[2:4], start.rotation[2:4], rtol=0, atol=atol)
-    assert torch.equal(step.pose.translation[2:4], start.translation[2:4])
-    step.pose.matrix.sum().backward()
-    assert weights.grad.isfinite().all()
-    assert weights.grad.flatten(1).any(1).tolist() == step.solved.tolist()
-
-
-# --- convergence -----------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("n", [3, 9, 50])
+def test_zero_residual_gives_zero_step(n, update, make_problems):
+    p = make_problems(n, noise=False)
+    assert_close(solver(1, update=update)(*p[:3], init=p.pose).matrix, p.pose.matrix)
 
 
 @pytest.mark.parametrize("update", UPDATES)
 @pytest.mark.parametrize(("n", "batch"), [(4, 7), (6, 7), (9, 1000), (50, 1)])
-def test_classical_lm_finds_the_truth_without_noise(n, batch, update, case):
-    corr, truth, start = case(n, batch, noise=False, near=0.02)
+def test_the_truth_is_found_without_noise(n, batch, update, make_problems, perturb):
+    p = make_problems(n, batch, noise=False)
     # With the fixed damping the weakest direction of four points, nearly flat in some problems, converges slowly.
-    refined = RobustWeightedLM(m=100 if n == 4 else 30, update=update)(corr, guess(start, corr))
-    errors = pose_errors(refined.pose, truth)
+    lm = RobustWeightedLM(m=100 if n == 4 else 30, update=update)
+    result = PnPNet(None, lm)(*p[:3], init=perturb(p.pose, angle=0.02, shift=0.2))
+    errors = pose_errors(result.pose, p.pose)
     assert errors.rotation_error_deg.max() < 1e-6
-    assert errors.translation_error.max() < 1e-7
-    assert refined.ok.all()
-    assert refined.cost.max() < 1e-6
+    assert errors.translation_error.max() < 1e-6
+    assert result.ok.all()
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
-def test_outliers_end_with_little_weight(kernel, make_problems, correspond, perturb):
-    problems = make_problems(12, 50, outliers=2)
-    corr, truth = correspond(problems)
-    lm = RobustWeightedLM(m=30, kernel=kernel, robustness={"power": 1.5}.get(kernel))
-    refined = lm(corr, guess(perturb(truth, angle=0.005, shift=0.005), corr))
-    median = refined.weights.median(-1, keepdim=True).values
-    light = (refined.weights < 0.5 * median) if kernel != "truncated" else refined.weights == 0
-    assert light[~problems.inliers].double().mean() > 0.9
-    assert refined.ok.double().mean() > 0.95
+def test_a_far_start_does_not_diverge(make_problems):
+    """The default refiner comes home from a camera several times as far away, where plain iterations diverge."""
+    p = make_problems(20, 100)
+    middle = (p.world_points @ p.pose.rotation.mT).mean(1)
+    far = Pose(p.pose.rotation, 10.0 * (p.pose.translation + middle) - middle)
+    shares = []
+    for reject_worse in (True, False):
+        found = PnPNet(None, RobustWeightedLM(30, reject_worse=reject_worse))(*p[:3], init=far)
+        shares.append((pose_errors(found.pose, p.pose).rotation_error_deg < 1.0).double().mean())
+    assert shares[0] > 0.95
+    assert shares[1] < 0.5
 
 
 @pytest.mark.parametrize(("kernel", "update"), [*((kernel, "retraction") for kernel in KERNELS), ("power", "additive")])
-def test_rejecting_worse_steps_never_raises_the_cost(kernel, update, case):
-    near = 0.005 if kernel == "truncated" else 0.5  # that kernel is blind beyond its scale
-    corr, _, start = case(9, 100, outliers=3, near=near)
-    options = {"kernel": kernel, "update": update, "reject_worse": True}
-    costs = [RobustWeightedLM(m, **options)(corr, guess(start, corr)).cost for m in range(12)]
+def test_rejecting_worse_steps_never_raises_the_cost(kernel, update, make_problems, perturb):
+    p = make_problems(9, 100, outliers=3)
+    near = 0.005 if kernel == "truncated" else 0.3  # that kernel is blind beyond its scale
+    start = perturb(p.pose, angle=near, shift=10 * near)
+    costs = [solver(m, kernel=kernel, update=update)(*p[:3], init=start).cost for m in range(10)]
     for before, after in itertools.pairwise(costs):
-        assert (after <= before * (1 + 1e-12)).all()
+        assert (after <= before * (1 + 1e-9)).all()
     assert (costs[-1] < costs[0]).double().mean() > 0.9
-    if kernel == "power":  # the law can fail: without rejection, steps from far away do raise the cost of some problems
-        costs = [
-            RobustWeightedLM(m, update=update, reject_worse=False)(corr, guess(start, corr)).cost for m in range(3)
-        ]
-        assert ((costs[1] > costs[0]) | (costs[2] > costs[1])).any()
 
 
-# --- cost and judgement ----------------------------------------------------------------------------------------------
+# --- weights and costs -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_points_behind_the_camera_never_lower_the_cost(kernel, case):
-    corr, truth, _ = case(9, 200, outliers=3)
-    lm = RobustWeightedLM(m=0, kernel=kernel)  # which returns the guess and judges it
-    in_front = project(truth, corr).in_front
-    for shift in (0.5, 1.0, 2.0, 5.0, 100.0):
-        back = Pose(truth.rotation, truth.translation - shift * number([0.0, 0, 1]))
-        behind = in_front & ~project(back, corr).in_front
-        only = corr._replace(weights=behind.double())  # judge just the pairs that went behind
-        cost_front, cost_back = (lm(only, guess(pose, only)).cost for pose in (truth, back))
-        assert (cost_back >= cost_front).all()
-    assert behind.all()
-    good, bad = lm(corr, guess(truth, corr)), lm(corr, guess(back, corr))
-    assert_equal((good.pose, bad.pose), (truth, back))
+def test_outliers_end_with_little_weight(kernel, make_problems, perturb):
+    p = make_problems(12, 50, outliers=2)
+    lm = RobustWeightedLM(m=30, kernel=kernel, robustness={"power": 1.5}.get(kernel))
+    result = PnPNet(None, lm)(*p[:3], init=perturb(p.pose, angle=0.005, shift=0.05))
+    median = result.weights.median(-1, keepdim=True).values
+    light = (result.weights < 0.5 * median) if kernel != "truncated" else result.weights == 0
+    assert light[~p.inliers].double().mean() > 0.9
+    assert result.ok.double().mean() > 0.95
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_points_behind_the_camera_never_lower_the_cost(kernel, make_problems):
+    p = make_problems(9, 200, outliers=3)
+    judged = PnPNet(None, RobustWeightedLM(0, kernel=kernel))  # which returns the given pose
+    good = judged(*p[:3], init=p.pose)
+    back = Pose(p.pose.rotation, p.pose.translation - torch.tensor([0.0, 0.0, 1e4]).double())
+    bad = judged(*p[:3], init=back)
+    assert_close(bad.matrix, back.matrix)
     assert (bad.cost >= good.cost).all()
     assert (bad.cost == bad.cost.max()).all()
-    assert good.ok.double().mean() > 0.9
     assert not bad.ok.any()
     assert not bad.weights.any()
-
-
-# --- weights ----------------------------------------------------------------------------------------------------------
+    assert good.ok.double().mean() > 0.9
 
 
 @pytest.mark.parametrize("update", UPDATES)
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_integer_weights_equal_repeating_and_zero_equals_removing(kernel, update, case):
-    """Wherever the weights come from. The cost is a mean over pairs: 6 of them with weights, 9 when repeated."""
-    corr, _, start = case(7, outliers=1, near=0.01)
-    times = torch.tensor([1, 3, 1, 0, 2, 1, 1])
-    weights, there = times.double().expand(7, 7), times > 0
-    repeated = of_pairs(lambda x: x.repeat_interleave(times, 1), corr)
-    lm = RobustWeightedLM(m=3, kernel=kernel, update=update)
-    expected = lm(repeated, guess(start, repeated))
-    given = lm(corr._replace(weights=weights), guess(start, corr))
-    guessed = lm(corr, Guess(start, weights))
-    for refined in (given, guessed):
-        assert_close(refined.pose, expected.pose)
-        ends = times.cumsum(0)[there] - 1  # the last copy of each pair
-        assert_close((refined.weights / weights)[:, there], expected.weights[:, ends], rtol=1e-7)
-        assert not refined.weights[:, ~there].any()
-    assert_close(given.cost * 6, expected.cost * 9, rtol=1e-7)
-    assert torch.equal(given.ok, expected.ok)
+def test_integer_weights_equal_repeating(kernel, update, make_problems, perturb):
+    """Zero equals removing. The cost is a mean over pairs: 6 of them with weights, 9 when repeated."""
+    p, times = make_problems(7, outliers=1), torch.tensor([1, 3, 1, 0, 2, 1, 1])
+    start = perturb(p.pose, angle=0.01, shift=0.1)
+    lm = solver(3, kernel=kernel, update=update)
+    world, img = (x.repeat_interleave(times, 1) for x in p[:2])
+    expected = lm(world, img, p.intrinsics, init=start)
+    found = lm(*p[:3], times.double().expand(7, 7), init=start)
+    assert_close(found.matrix, expected.matrix, 1e-7)
+    assert_close(found.cost * 6, expected.cost * 9, 1e-6)
+    assert torch.equal(found.ok, expected.ok)
+    ends = times.cumsum(0)[times > 0] - 1  # the last copy of each pair
+    assert_close((found.weights / times)[:, times > 0], expected.weights[:, ends], 1e-6)
 
 
-# --- last iterations without the guess's weights --------------------------------------------------------------------
-
-
-def with_noise(start, corr, img_sigma):
-    """A guess that states the noise of the pixels, and none of the world points."""
-    sigma = torch.full_like(corr.weights, img_sigma)
-    return guess(start, corr)._replace(noise=Noise(sigma, torch.zeros_like(sigma)))
-
-
-def test_iterations_by_residual_correct_a_noise_that_is_stated_too_large(case, generator):
-    corr, truth, start = case(12, 50, noise=False)
-    pixels = corr.img_points + 0.5 * torch.randn(corr.img_points.shape, generator=generator, dtype=torch.float64)
-    pixels[:, :2] += 60.0  # two outliers, by six times the stated noise of 10 pixels
-    corr = corr._replace(img_points=pixels)
-    common = {"m": 10, "kernel": "geman_mcclure", "robustness": 6.0}
-    right, wrong, corrected = (
-        RobustWeightedLM(by_residual=by_residual, **common)(corr, with_noise(start, corr, sigma))
-        for by_residual, sigma in ((0, 0.5), (0, 10.0), (3, 10.0))
-    )
-    errors = [pose_errors(x.pose, truth).rotation_error_deg.median() for x in (right, wrong, corrected)]
-    assert errors[1] > 3.0 * errors[0]
-    assert errors[2] < 1.5 * errors[0]
-    assert wrong.weights[:, :2].median() > 0.05
-    assert corrected.weights[:, :2].median() < 1e-3
-    assert corrected.weights[:, 2:].median() > 0.8
-    # Noise that came with the correspondences stays as it is, in each problem that has any.
-    noise = with_noise(start, corr, 10.0).noise
-    partly = Noise(noise.img.where(torch.arange(50)[:, None] < 25, torch.nan), torch.full_like(noise.world, torch.nan))
-    kept = RobustWeightedLM(by_residual=3, **common)(corr._replace(noise=partly), with_noise(start, corr, 10.0))
-    torch.testing.assert_close(kept.pose.matrix[:25], wrong.pose.matrix[:25])
-    torch.testing.assert_close(kept.weights[:25], wrong.weights[:25])
-    torch.testing.assert_close(kept.pose.matrix[25:], corrected.pose.matrix[25:])
-
-
-@pytest.mark.parametrize("outliers", [0, 6])
-def test_iterations_by_residual_find_a_larger_noise(outliers, case, generator):
-    """Noise of 20 px is stated as 2 px: weights and verdict are close to those of the right statement."""
-    corr, _, start = case(20, 100, noise=False, outliers=outliers)
-    noise = torch.randn(corr.img_points.shape, generator=generator, dtype=torch.float64)
-    noisy = corr._replace(img_points=corr.img_points + 20.0 * noise)
-    lm = {x: RobustWeightedLM(m=10, kernel="geman_mcclure", robustness=5.0, by_residual=x) for x in (0, 5)}
-    wrong, found, right = (lm[x](noisy, with_noise(start, corr, s)) for x, s in ((0, 2.0), (5, 2.0), (0, 20.0)))
-
-    def apart(one):
-        return (one.pose.matrix - right.pose.matrix).flatten(1).norm(dim=1).median()
-
-    assert apart(found) < 0.3 * apart(wrong)
-    assert found.ok.float().mean() >= right.ok.float().mean() - 0.02
-    assert (found.weights > 0.5).sum() > 0.9 * (right.weights > 0.5).sum()
+@pytest.mark.parametrize("factor", [1e-30, 1e30])
+def test_a_common_factor_of_the_weights_does_not_matter(factor, make_problems, perturb):
+    p = make_problems(outliers=3)
+    start, weights = perturb(p.pose, angle=0.02), torch.ones(7, 9, dtype=torch.float64)
+    one, other = (solver()(*p[:3], f * weights, init=start) for f in (1.0, factor))
+    assert_close(other.matrix, one.matrix)
+    assert torch.equal(other.ok, one.ok)
 
 
 @pytest.mark.xfail(strict=True, reason="issue 46")
@@ -332,105 +173,49 @@ def test_iterations_by_residual_refuse_a_kernel_that_they_do_not_suit():
 
 # --- gradients --------------------------------------------------------------------------------------------------------
 
-# Settings that converge soon: reweighting with 1/‖r‖ takes hundreds of iterations.
-CONVERGING = {name: {"kernel": name, "shared": True, "robustness": {"power": 0.5}.get(name)} for name in SMOOTH}
 
-
-@pytest.mark.parametrize(
-    ("kernel", "shared", "update"),
-    [
-        ("power", False, "retraction"),
-        ("power", False, "additive"),
-        *((kernel, kernel != "huber", "retraction") for kernel in SMOOTH),
-        ("cauchy", True, "additive"),
-    ],
-)
-def test_gradcheck_through_the_unrolled_iterations(kernel, shared, update, case, generator):
-    corr, _, start = case(6, 2, outliers=1, near=0.01)
-    lm = RobustWeightedLM(m=3, kernel=kernel, shared=shared, update=update).double()
-    names = list(dict(lm.named_parameters()))
-    assert len(names) == 3
-
-    # Pixels and world points near 1, so that one difference step suits all.
-    def run(world, pixels, weights, factor, tangent, *raw):
-        moved = Correspondences(world, 1000.0 * pixels, weights, corr.focal)
-        first = Guess(retract(start, tangent), factor)
-        refined = torch.func.functional_call(lm, dict(zip(names, raw, strict=True)), (moved, first))
-        return (*refined.pose, refined.weights, refined.cost)
-
-    weights = 0.5 + torch.rand(2, 6, generator=generator, dtype=torch.float64)
-    inputs = [corr.world_points, corr.img_points / 1000.0, weights, torch.ones_like(weights)]
-    inputs += [torch.zeros(2, 6, dtype=torch.float64), *(p.detach() for p in lm.parameters())]
-    inputs = [x.clone().requires_grad_() for x in inputs]
-    # The other cases are differentiated along random directions, which is faster.
-    entry_by_entry = (kernel, update, shared) == ("power", "retraction", False)
-    assert torch.autograd.gradcheck(run, inputs, eps=1e-6, atol=1e-4, rtol=1e-4, fast_mode=not entry_by_entry)
-
-
-@pytest.mark.parametrize("backward", ["unroll", "truncated", "implicit"])
+@pytest.mark.parametrize("backward", ["unroll", "implicit"])
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_gradients_are_finite_from_anywhere(kernel, backward, dtype, case, anywhere):
+def test_gradients_are_finite_from_anywhere(kernel, backward, dtype, make_problems, random_rotations):
     """From random poses most points start behind the camera or far off, and may weigh next to nothing."""
-    corr = case(9, 300, outliers=3, dtype=dtype)[0]
-    shapes = ("lower", "default", "upper") if backward == "unroll" else ("default",)
-    for shape, update in itertools.product(shapes, UPDATES):
-        options = {"update": update, "backward": backward, "robustness": getattr(KERNELS[kernel], shape)}
-        lm = RobustWeightedLM(m=5, kernel=kernel, **options)
-        inputs, pose = map_tensors(lambda x: x.clone().requires_grad_(), (corr, anywhere(300, dtype)))
-        refined = lm(inputs, guess(pose, corr))
-        assert all(x.isfinite().all() for x in iter_tensors(refined))
-        sum(x.sum() for x in iter_tensors(refined) if x.requires_grad).backward()
-        assert all(x.grad.isfinite().all() for x in (inputs.world_points, inputs.img_points, inputs.weights))
-        assert all(x.grad is None or x.grad.isfinite().all() for x in (*pose, *lm.parameters()))
-
-
-@pytest.fixture
-def gradients(case, generator):
-    """Gradients by points, pixels, weights, start and hyperparameters of a function of a refinement's result.
-
-    Of all problems, or of those whose last iterations did not move the pose any more.
-    """
-    corr, _, start = case(6, 20, outliers=1, near=0.01)
-    probe = torch.randn(20, 4, 4, generator=generator, dtype=torch.float64)
-
-    def of(lm, *, skip=0, converged=False):
-        at = start
-        with torch.no_grad():
-            if skip:
-                at = RobustWeightedLM(m=skip, reject_worse=False).double()(corr, guess(start, corr)).pose
-            ends = [lm(corr, guess(at, corr), m=m).pose for m in (lm.m - 1, lm.m)]
-            counted = (ends[1].matrix - ends[0].matrix).abs().amax((1, 2)) < 1e-12
-            counted &= project(ends[1], corr).in_front.all(-1)  # else the pose diverged and stopped
-        tangent = torch.zeros(20, 6, dtype=torch.float64)  # of the start: off the group its gradient means nothing
-        leaves = [corr.world_points, corr.img_points, corr.weights, tangent]
-        leaves = [x.clone().requires_grad_() for x in leaves]
-        moved = corr._replace(world_points=leaves[0], img_points=leaves[1], weights=leaves[2])
-        refined = lm(moved, guess(retract(at, leaves[3]), corr))
-        loss = (probe * refined.pose.matrix).sum((1, 2))
-        if converged:
-            assert counted.double().mean() > 0.7
-            loss = loss[counted]
-        leaves += lm.parameters()
-        return torch.autograd.grad(loss.sum(), leaves, allow_unused=True, materialize_grads=True)
-
-    return of
+    p = make_problems(9, 300, outliers=3, dtype=dtype)
+    far = torch.logspace(-1, 4, 3, dtype=dtype)[torch.arange(300) % 3, None]
+    pose = Pose(random_rotations(300).to(dtype), far * torch.randn(300, 3, dtype=dtype))
+    for shape, update in itertools.product(("lower", "default", "upper"), UPDATES):
+        lm = RobustWeightedLM(
+            5, kernel=kernel, update=update, backward=backward, robustness=getattr(KERNELS[kernel], shape)
+        )
+        leaves = [x.clone().requires_grad_() for x in (*p[:3], *pose)]
+        result = PnPNet(None, lm, gradient="always")(*leaves[:3], init=Pose(*leaves[3:]))
+        outputs = result.rotation, result.translation, result.weights, result.cost
+        assert all(x.isfinite().all() for x in outputs)
+        sum(x.sum() for x in outputs).backward()
+        assert all(x.grad is None or x.grad.isfinite().all() for x in (*leaves, *lm.parameters()))
 
 
 @pytest.mark.parametrize("kernel", SMOOTH)
-def test_implicit_gradients_are_those_of_unrolling_to_the_minimum(kernel, gradients):
-    unrolled, implicit = (
-        gradients(
-            RobustWeightedLM(m=100, backward=b, reject_worse=False, **CONVERGING[kernel]).double(), converged=True
-        )
-        for b in ("unroll", "implicit")
-    )
-    for a, b in zip(unrolled, implicit, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-8 * a.abs().max().clamp(min=1.0))
-    assert all(x.any() for x in implicit[:3])
-    assert implicit[-1].any()
-    # The start, the step length and the damping do not move a minimum.
-    assert not any(x.any() for x in implicit[3:6])
+def test_implicit_gradients_are_those_of_unrolling_to_the_minimum(kernel, make_problems, perturb):
+    """Also to the shape of the kernel; step, damping and start do not move a minimum."""
+    p = make_problems(8, 20, outliers=1)
+    shape = {"power": 0.5}.get(kernel, 5.0)  # reweighting with 1/‖r‖ would take hundreds of iterations
+    start, gradients = perturb(p.pose, angle=0.01, shift=0.1), []
+    for backward in ("unroll", "implicit"):
+        options = {"kernel": kernel, "robustness": shape, "shared": True, "reject_worse": False, "backward": backward}
+        lm = RobustWeightedLM(100, **options).double()
+        leaves = [x.clone().requires_grad_() for x in (*p[:3], *start)]
+        result = PnPNet(None, lm)(*leaves[:3], init=Pose(*leaves[3:]))
+        with torch.no_grad():
+            again = PnPNet(None, RobustWeightedLM(1, **options).double())(*p[:3], init=result.pose)
+            there = result.ok & ((again.matrix - result.matrix).abs().amax((1, 2)) < 1e-9)
+        assert there.double().mean() > 0.6
+        loss = result.translation[there].sum() + 10.0 * result.rotation[there, 0].sum()
+        wanted = [*leaves, lm.robustness.raw, lm.step.raw, lm.damping.raw]
+        gradients.append(torch.autograd.grad(loss, wanted, materialize_grads=True))
+    for unrolled, implicit in zip(*(x[:3] for x in gradients), strict=True):
+        torch.testing.assert_close(implicit, unrolled, rtol=1e-4, atol=1e-5 * unrolled.abs().max().item())
+    assert all(x.any() for x in (*gradients[1][:3], gradients[1][5]))
+    assert not any(x.any() for x in (*gradients[1][3:5], *gradients[1][6:]))
 
 
 def test_implicit_second_derivatives_are_those_of_unrolling_to_the_minimum(make_problems, perturb):
@@ -438,14 +223,32 @@ def test_implicit_second_derivatives_are_those_of_unrolling_to_the_minimum(make_
     direction = torch.randn_like(p.img_points)
     products = []
     for backward in ("unroll", "implicit"):
-        refine = RobustWeightedLM(60, kernel="cauchy", step=1.0, damping=1e-4, robustness=3.0, backward=backward)
-        img_points = p.img_points.clone().requires_grad_()
-        result = PnPNet(None, refine).double()(p.world_points, img_points, p.intrinsics, init=perturb(p.pose))
-        (gradient,) = torch.autograd.grad(
-            result.rotation.sum() + result.translation.sum(), img_points, create_graph=True
-        )
-        products.append(torch.autograd.grad((gradient * direction).sum(), img_points)[0])
+        lm = RobustWeightedLM(60, kernel="cauchy", step=1.0, damping=1e-4, robustness=3.0, backward=backward)
+        img = p.img_points.clone().requires_grad_()
+        result = PnPNet(None, lm).double()(p.world_points, img, p.intrinsics, init=perturb(p.pose))
+        total = result.rotation.sum() + result.translation.sum()
+        (gradient,) = torch.autograd.grad(total, img, create_graph=True)
+        products.append(torch.autograd.grad((gradient * direction).sum(), img)[0])
     assert (products[1] - products[0]).norm() < 1e-5 * products[0].norm()
+
+
+@pytest.mark.parametrize(("backward", "grows"), [("unroll", True), ("implicit", False)])
+def test_memory_of_the_backward_pass(backward, grows, make_problems):
+    """Only unrolling keeps more tensors the more iterations there are."""
+    p, numbers = make_problems(), []
+    img = p.img_points.clone().requires_grad_()
+
+    def count(tensor):
+        numbers[-1] += tensor.numel()
+        return tensor
+
+    for m in (3, 30):
+        numbers.append(0)
+        lm = RobustWeightedLM(m, shared=True, backward=backward)
+        with torch.autograd.graph.saved_tensors_hooks(count, lambda tensor: tensor):
+            PnPNet(None, lm)(p.world_points, img, p.intrinsics, init=p.pose)
+    assert (numbers[1] > 5 * numbers[0]) == grows
+    assert grows or numbers[1] == numbers[0]
 
 
 # --- hyperparameters -----------------------------------------------------------------------------------------------
@@ -453,92 +256,20 @@ def test_implicit_second_derivatives_are_those_of_unrolling_to_the_minimum(make_
 
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("shared", [True, False])
-def test_hyperparameters_start_classical_and_stay_bounded(kernel, shared, case):
-    corr, _, start = case(outliers=2, dtype=torch.float32)
+def test_hyperparameters_start_classical_and_stay_bounded(kernel, shared, make_problems, perturb):
+    p = make_problems(outliers=2, dtype=torch.float32)
     lm = RobustWeightedLM(m=4, kernel=kernel, shared=shared)
     learned = (lm.step, lm.damping, lm.robustness)
     for parameter, classical in zip(learned, (1.0, 1e-3, KERNELS[kernel].default), strict=True):
         torch.testing.assert_close(parameter(), torch.full((1 if shared else 4,), classical), rtol=1e-5, atol=0)
-    assert len(list(lm.parameters())) == 3
     bounds = ((0.0, 2.0), (1e-8, 1e2), (KERNELS[kernel].lower, KERNELS[kernel].upper))
     for raw in (-50.0, 50.0):
         for parameter, (low, high) in zip(learned, bounds, strict=True):
             torch.nn.init.constant_(parameter.raw, raw)
             parameter.zero_grad()
             torch.testing.assert_close(parameter()[0].item(), low if raw < 0 else high, rtol=1e-4, atol=1e-12)
-        refined = lm(corr, guess(start, corr))  # at the bounds themselves
-        (refined.pose.rotation.sum() + refined.pose.translation.sum() + refined.cost.sum()).backward()
-        assert all(x.isfinite().all() for x in iter_tensors(refined))
-        assert all(p.grad.isfinite().all() for p in lm.parameters())
-
-
-# --- several starts -------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def near_and_far(case, perturb):
-    """Correspondences, a pose near the truth and one far from it."""
-
-    def make(**options):
-        corr, truth, _ = case(**options)
-        return corr, perturb(truth, angle=0.02), perturb(truth, angle=2.5, shift=2.0)
-
-    return make
-
-
-@pytest.mark.parametrize("options", [{}, {"reject_worse": True}, {"update": "additive"}], ids=str)
-def test_the_best_of_several_starts_goes_on(options, near_and_far):
-    """Near and far starts take turns: the result is that of the near one alone, also when stopped early."""
-    corr, near, far = near_and_far(noise=False)
-    turns = [torch.arange(7) % 3 == i for i in range(3)]
-    starts = [
-        Pose(torch.where(x[:, None, None], near.rotation, far.rotation), torch.where(x[:, None], *translations))
-        for translations in [(near.translation, far.translation)]
-        for x in turns
-    ]
-    for m, stop in ((1, None), (2, None), (5, None), (6, None), (6, 0), (6, 1), (6, 3), (6, 5)):
-        lm = RobustWeightedLM(m, **options)
-        best, alone = (lm(corr, guess(*x), m=stop) for x in ((starts[0], corr, *starts[1:]), (near, corr)))
-        assert_close(best, alone, atol=1e-12)
-
-
-# -- fuzz --------------------------------------------------------------------------------------------------------------
-
-
-@many(80)
-@given(
-    correspondences(),
-    st.integers(0, 4),
-    options(
-        kernel=KINDS,
-        shared=st.booleans(),
-        update=st.sampled_from(["retraction", "additive"]),
-        reject_worse=st.booleans(),
-        by_residual=st.integers(0, 3),
-        backward=st.sampled_from(BACKWARDS),
-    ),
-    st.data(),
-)
-def test_refinements_take_anything(case, m, chosen, data):
-    corr, tensors = case
-    refine = RobustWeightedLM(m, **chosen).to(corr.world_points.dtype)
-    pose = data.draw(poses(len(corr.world_points), corr.world_points.dtype))
-    refined = refine(corr, Guess(pose, torch.ones_like(corr.weights)))
-    finite(refined)
-    are_rotations(refined.pose.rotation)
-    gradients_are_finite(
-        [*refined.pose, refined.cost], [*tensors, *(p for p in refine.parameters() if p.requires_grad)]
-    )
-
-
-@pytest.mark.parametrize("distance", [3.0, 10.0])
-def test_a_far_start_does_not_diverge(distance, make_problems, correspond):
-    """The default refiner comes home from a camera several times as far away, where plain iterations all diverge."""
-    corr, truth = correspond(make_problems(20, 100))
-    far = truth._replace(translation=distance * truth.translation)
-    shares = []
-    for changes in ({}, {"reject_worse": False}):
-        refined = RobustWeightedLM(m=30, **changes)(corr, guess(far, corr))
-        shares.append((pose_errors(refined.pose, truth).rotation_error_deg < 1.0).double().mean())
-    assert shares[0] > 0.95
-    assert shares[1] < 0.5
+        result = PnPNet(None, lm, gradient="always")(*p[:3], init=perturb(p.pose))  # at the bounds themselves
+        (result.rotation.sum() + result.translation.sum() + result.cost.sum()).backward()
+        assert all(x.isfinite().all() for x in (result.matrix, result.cost))
+        assert all(x.grad.isfinite().all() for x in lm.parameters())
+    assert not any(x.requires_grad for x in RobustWeightedLM(learnable=False).parameters())
