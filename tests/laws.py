@@ -167,7 +167,9 @@ def assert_near(found: PnPResult, expected: PnPResult, tolerance: float | None =
     torch.testing.assert_close(found.rotation[ok], expected.rotation[ok], **close)
     torch.testing.assert_close(found.translation[ok] / length, expected.translation[ok] / length, **close)
     size = expected.weights[ok].amax(-1, keepdim=True)
-    torch.testing.assert_close(found.weights[ok] / size, expected.weights[ok] / size, rtol=0, atol=min(0.1, 1000 * tolerance))
+    torch.testing.assert_close(
+        found.weights[ok] / size, expected.weights[ok] / size, rtol=0, atol=min(0.1, 1000 * tolerance)
+    )
     torch.testing.assert_close(found.intrinsics[ok], expected.intrinsics[ok], rtol=10 * tolerance, atol=tolerance)
 
 

@@ -11,11 +11,10 @@ from kornia.geometry.calibration import distort_points
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch.nn import functional
 
-from kornia_pnpnet import Normalize, PnPNet, Pose, create_solver, solve_pnp
+from kornia_pnpnet import PnPNet, Pose, create_solver, solve_pnp
 from kornia_pnpnet.cameras import bearing_cameras, bearings, undistort
 from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.geometry import normal_equations, project, retract
 from kornia_pnpnet.geometry import rotation_angle as angle
 from kornia_pnpnet.types import Noise
 
@@ -295,30 +294,6 @@ def test_a_fixed_effort_looks_at_no_values(uniform):
         torch.testing.assert_close(x.flatten(0, 1), expected, rtol=1e-6, atol=1e-6)
     solver.to("meta")
     assert solve(*(x.to("meta") for x in inputs))[0].shape == (6, 3, 3)
-
-
-def framed_rig(uniform, **options):
-    points, pixels, intrinsics, places, pose = rig(uniform, 2, 9, 3, 0.3, **options)
-    normalize = Normalize(order=False)
-    corr, frame = normalize(points, pixels, intrinsics, rig=places)
-    return corr, normalize.apply_to_pose(pose, frame)
-
-
-def test_the_jacobian_of_a_rig(uniform):
-    """Normal equations of a residual r are J^T J and J^T r by the tangent of the rig's pose."""
-    corr, pose = framed_rig(uniform, noise=1.0)
-    zero = torch.zeros(2, 6, dtype=torch.float64)
-
-    def residual(delta):
-        return torch.cat(project(retract(pose, delta), corr).residual, 1)
-
-    jacobian = torch.autograd.functional.jacobian(lambda d: residual(d).sum(0), zero).movedim(0, 1) / corr.focal
-    hessian, gradient = normal_equations(project(pose, corr), corr.weights)
-    expected = jacobian.mT @ jacobian
-    for i in range(6):
-        torch.testing.assert_close(gradient[i], (jacobian.mT @ residual(zero)[..., None])[:, i, 0])
-        for j in range(i + 1):
-            torch.testing.assert_close(hessian[i][j], expected[:, i, j])
 
 
 def test_what_cannot_be_combined_is_refused(uniform):

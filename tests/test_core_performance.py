@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import pickle
 import warnings
-from typing import NamedTuple
 
 import pytest
 import torch
@@ -13,7 +12,6 @@ from torch._dynamo.testing import CompileCounter
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from kornia_pnpnet import MLPInit, PnPNet, Pose, RobustWeightedLM, create_solver
-from kornia_pnpnet.core import compilation
 from kornia_pnpnet.core.compilation import Compiled
 from kornia_pnpnet.core.performance import ascending_order, in_order, ranked
 from kornia_pnpnet.core.trees import iter_tensors
@@ -169,34 +167,6 @@ def test_too_little_memory_is_no_failure_of_the_compiler(monkeypatch):
     with pytest.raises(torch.cuda.OutOfMemoryError):
         twice(torch.ones(3))
     assert not twice.failed
-
-
-class Parts(NamedTuple):
-    first: torch.Tensor
-    second: torch.Tensor | None
-    third: torch.Tensor | None
-
-
-def test_an_older_pytorch_that_knows_fewer_options_compiles_too(backend, monkeypatch):
-    """Its graphs return tensors alone; what is there depends on what was given."""
-    capture = torch.compile
-
-    def older(function, *, mode=None, fullgraph=False, options=None):
-        if options:
-            raise RuntimeError("Unexpected optimization option")
-        return capture(function, mode=mode, fullgraph=fullgraph)
-
-    monkeypatch.setattr(torch, "compile", older)
-    monkeypatch.setattr(compilation, "_LIMITS", {})
-    compiled = Compiled(lambda x, parts: parts._replace(first=parts.first * x))
-    x, one, two = torch.full((3,), 2.0), torch.ones(3), torch.full((3,), 5.0)
-    for parts in (Parts(one, two, None), Parts(one, None, two), Parts(two, one, one), Parts(one, two, None)):
-        found = compiled(x, parts)
-        assert type(found) is Parts
-        for ours, theirs in zip(found, parts._replace(first=x * parts.first), strict=True):
-            assert ours is theirs is None or torch.equal(ours, theirs)
-    assert backend.frame_count == 3
-    assert not compiled.failed
 
 
 def test_errors_of_the_caller_are_the_callers(backend):

@@ -88,18 +88,6 @@ def test_covariances_from_the_weights_of_the_shipped_network(n, outliers):
     assert squares.mean().item() == pytest.approx(6.0, rel=0.06)
 
 
-def test_a_common_factor_of_the_weights_does_not_matter(make_problems, generator):
-    p = make_problems(n=20, batch=10)
-    weights = torch.rand(10, 20, generator=generator, dtype=torch.float64)
-    given = p.pose, *p[:3]
-    found = [pose_covariance(*given, img_sigma=1.0, weights=factor * weights) for factor in (1.0, 1e-3)]
-    torch.testing.assert_close(*found)
-    torch.testing.assert_close(
-        pose_covariance(*given, img_sigma=1.0, weights=torch.full_like(weights, 0.2)),
-        pose_covariance(*given, img_sigma=1.0),
-    )
-
-
 def test_gradients(make_problems):
     p = make_problems(n=5, batch=2)
     world, img, camera, pose = p[:4]

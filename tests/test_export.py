@@ -16,7 +16,6 @@ from kornia_pnpnet.data import CameraProblems
 from kornia_pnpnet.export import (
     OUTPUTS,
     RIG_INPUTS,
-    PackagedSolver,
     export_onnx,
     export_package,
     export_program,
@@ -290,33 +289,3 @@ def test_files_that_are_no_packages(tmp_path):
     path.write_text("text")
     with pytest.raises(ValueCheckError, match="text"):
         load_package(path)
-
-
-class Loader:
-    """Stands for compiled code: returns its inputs."""
-
-    def __init__(self, rig=False):
-        self.rig = rig
-
-    def get_metadata(self):
-        return {"pnpnet_n": "any", "pnpnet_batch": "any", "pnpnet_rig": str(self.rig)}
-
-    def run(self, inputs):
-        assert all(x.dtype == torch.float32 and x.is_contiguous() for x in inputs)
-        return [*inputs, *[inputs[0]] * (5 - len(inputs))]
-
-
-def test_what_compiled_code_gets(make_problems):
-    world, img, intrinsics, weights = inputs_of(make_problems(n=5, batch=2))
-    package = PackagedSolver(Loader())
-    for camera in (intrinsics, intrinsics[:1].expand(2, 3, 3), intrinsics[0]):
-        found = package(world.double(), img.mT.contiguous().mT, camera)
-        for x, expected in zip(found[:4], (world, img, camera.expand(2, 3, 3), weights), strict=True):
-            assert torch.equal(x, expected)
-    for wrong in (
-        (world[:, :3], img[:, :3], intrinsics),
-        (world, img[:1], intrinsics),
-        (world[0], img[0], intrinsics[0]),
-    ):
-        with pytest.raises(ShapeError):
-            package(*wrong)

@@ -6,12 +6,9 @@ import math
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.camera.perspective import project_points
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
-from strategies import are_rotations, correspondences, finite, gradients_are_finite, many, poses
 
 from kornia_pnpnet import Correspondences, Noise, Pose
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
@@ -27,7 +24,7 @@ from kornia_pnpnet.geometry import (
     rotation_angle,
     transform,
 )
-from kornia_pnpnet.refine import explains, lm_step, solve_damped
+from kornia_pnpnet.refine import lm_step
 
 DTYPES = (torch.float32, torch.float64)
 FOCAL = torch.tensor(3400.0, dtype=torch.float64)
@@ -256,34 +253,3 @@ def test_pixel_variance_is_that_of_the_pixel(make_problems):
     cam = transform(Pose(*(x.expand(100_000, *x.shape[1:]) for x in p.pose)), moved)
     drawn = (corr.focal * cam[..., :2] / cam[..., 2:] + off).var(0).mean(-1)
     torch.testing.assert_close(variance[0], drawn, rtol=0.02, atol=0)
-
-
-# -- fuzz --------------------------------------------------------------------------------------------------------------
-
-
-@many(60)
-@given(correspondences(), st.data())
-def test_the_calculus_takes_anything(case, data):
-    corr, tensors = case
-    batch, dtype = len(corr.world_points), corr.world_points.dtype
-    pose = data.draw(poses(batch, dtype))
-    finite(transform(pose, corr.world_points))
-    projection = project(pose, corr)
-    finite(projection)
-    if corr.noise is not None:
-        assert (pixel_variance(projection, corr.noise, corr.focal) > 0).all()
-    equations = normal_equations(projection, corr.weights)
-    damping = torch.tensor(10.0 ** data.draw(st.integers(-8, 2)), dtype=dtype)
-    delta, solved = solve_damped(equations, damping)
-    assert solved.shape == (batch,)
-    finite([x[solved] for x in delta])
-    explains(projection, corr, corr.weights)
-    additive = data.draw(st.booleans())
-    moved = lm_step(corr, pose, projection, corr.weights, torch.tensor(1.0, dtype=dtype), damping, additive=additive)
-    finite(moved)
-    are_rotations(moved.pose.rotation)
-    gradients_are_finite([*moved.pose, *projection.residual], tensors)
-    tangent = torch.randn(batch, 6, dtype=dtype)
-    for move in (retract, retract_additive):
-        are_rotations(move(pose, tangent).rotation)
-    finite(additive_tangent_map(pose))

@@ -9,7 +9,6 @@ from kornia.geometry.calibration import distort_points
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
 from kornia_pnpnet import (
-    Guess,
     Normalize,
     PnPNet,
     Pose,
@@ -20,10 +19,9 @@ from kornia_pnpnet import (
 )
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.export import export_program
-from kornia_pnpnet.geometry import distort, dolly_zoom, normal_equations, project, retract
+from kornia_pnpnet.geometry import retract
 from kornia_pnpnet.geometry import rotation_angle as angle
 from kornia_pnpnet.init.focal import scale_focal
-from kornia_pnpnet.types import FreeFocal
 
 HALF = 500.0  # pixels
 
@@ -116,41 +114,6 @@ def test_the_covariance_has_the_focal_length_last():
     assert squares[result.ok].mean().item() == pytest.approx(7.0, rel=0.1)
     last = log_focal[:, 0].square() / covariance[:, 6, 6]
     assert last[result.ok].mean().item() == pytest.approx(1.0, rel=0.1)
-
-
-def framed(problems):
-    """Correspondences with a free focal length in the frame of the solver, and the true poses there."""
-    normalize = Normalize(order=False)
-    corr, frame = normalize(*problems[:3])
-    one = torch.ones_like(corr.weights[:, 0])
-    free = FreeFocal(corr.focal * one, 0.0 * one, one, frame.img_scale)
-    return corr._replace(free_focal=free), normalize.apply_to_pose(problems.pose, frame)
-
-
-def test_the_seventh_column_is_the_derivative_of_the_pixels():
-    corr, pose = framed(draw(8, batch=3))
-    zoom = torch.zeros(3, dtype=torch.float64)
-
-    def residual(zoom):
-        return torch.cat(project(dolly_zoom(pose, zoom), corr.zoomed(zoom)).residual, 1)
-
-    column = torch.autograd.functional.jvp(residual, zoom, torch.ones_like(zoom))[1] / corr.focal
-    seen = project(pose, corr)
-    equations = normal_equations(seen, corr.weights, free_focal=True)
-    torch.testing.assert_close(equations.hessian[6][6], column.square().sum(1))
-    shifted = seen._replace(scaled_residual=tuple(torch.ones_like(x) / seen.inv_depth for x in seen.residual))
-    torch.testing.assert_close(normal_equations(shifted, corr.weights, free_focal=True).gradient[6], column.sum(1))
-
-
-@pytest.mark.parametrize("update", ["retraction", "additive"])
-def test_an_exact_focal_length_stays_and_a_wrong_one_is_corrected(update):
-    corr, pose = framed(draw(12, batch=32))
-    refine = RobustWeightedLM(20, robustness=0.0, update=update)
-    here = refine(corr, Guess(pose, torch.ones_like(corr.weights)))
-    assert here.zoom.abs().max() < 1e-9
-    off = torch.linspace(-0.2, 0.2, 32, dtype=torch.float64)
-    found = refine(corr, Guess(dolly_zoom(pose, off), torch.ones_like(corr.weights), zoom=off))
-    assert (found.zoom.abs() < 1e-6).double().mean() > 0.9
 
 
 def test_a_focal_length_is_learned_from_poses_alone():
@@ -296,24 +259,3 @@ def test_a_broken_problem_leaves_the_distortion_of_the_others():
     for gradient in torch.autograd.grad(total + result.intrinsics.sum(), inputs):
         assert gradient.isfinite().all()
         assert gradient.flatten(1).abs().amax(1).bool().tolist() == [True, False, False, True]
-
-
-def test_the_jacobian_of_radial_distortion():
-    corr, pose = framed(draw(9, batch=2, noise=1.0))
-    given = torch.tensor([[0.1, -0.05], [-0.2, 0.03]], dtype=torch.float64)
-
-    def residual(delta):
-        moved = dolly_zoom(retract(pose, delta[:, :6]), delta[:, 6])
-        pairs = corr.zoomed(delta[:, 6])
-        return torch.cat(distort(project(moved, pairs), pairs, given + delta[:, 7:])[0].residual, 1)
-
-    zero = torch.zeros(2, 9, dtype=torch.float64)
-    jacobian = torch.autograd.functional.jacobian(lambda d: residual(d).sum(0), zero).movedim(0, 1) / corr.focal
-    pairs = corr.zoomed(zero[:, 0])
-    seen, terms = distort(project(pose, pairs), pairs, given)
-    hessian, gradient = normal_equations(seen, corr.weights, free_focal=True, radial=terms)
-    expected, right_side = jacobian.mT @ jacobian, (jacobian.mT @ residual(zero)[..., None])[..., 0]
-    for i in range(9):
-        torch.testing.assert_close(gradient[i], right_side[:, i])
-        for j in range(i + 1):
-            torch.testing.assert_close(hessian[i][j], expected[:, i, j])

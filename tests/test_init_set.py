@@ -42,22 +42,6 @@ def test_any_number_of_pairs_and_any_precision(make_problems, tmp_path):
         near(single(*p[:3]).init, result.init, 1e-4)
 
 
-def test_the_poses_are_rigid_and_there_are_as_many_as_were_asked_for(make_problems):
-    p = make_problems(n=9, batch=30, outliers=3)
-    corr, _ = Normalize(order=False)(*p[:3])
-    for starts, samples, others in ((1, 0, 0), (3, 0, 2), (1, 2, 1), (3, 8, 3)):
-        guess = solver(starts=starts, samples=samples).init(corr)
-        rotations = guess.pose.rotation[:, None]
-        if others:
-            assert guess.others.translation.shape == (30, others, 3)
-            rotations = torch.cat((rotations, guess.others.rotation), 1)
-        else:
-            assert guess.others is None
-        eye = torch.eye(3, dtype=torch.float64).expand_as(rotations)
-        torch.testing.assert_close(rotations @ rotations.mT, eye)
-        torch.testing.assert_close(torch.linalg.det(rotations), torch.ones_like(rotations[..., 0, 0]))
-
-
 @pytest.mark.parametrize(("n", "outliers"), [(4, 0), (9, 0), (9, 4), (60, 0), (60, 50)])
 def test_samples_of_inliers_have_the_true_pose(n, outliers):
     """Where outliers are masked and there is no noise. Points in line and the like may fail."""
