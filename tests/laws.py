@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 from torch.utils import _pytree as pytree
 
-from kornia_pnpnet import PnPNet, PnPResult, Pose, RobustWeightedLM, create_solver
+from kornia_pnpnet import PnPNet, PnPResult, Pose, PosePrior, RobustWeightedLM, create_solver
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 
 CAMERAS, NOISES, FOCALS = ("pixels", "rig", "bearings"), ("none", "sigma", "covariance"), ("known", "unknown")
@@ -38,9 +38,10 @@ class Case(NamedTuple):
     noise: str = "none"
     focal: str = "known"
     dtype: torch.dtype = torch.float64
+    extra: str = ""  # what else is known: "prior" or "confidence"
 
     def __str__(self) -> str:
-        return "-".join([*self[:4], str(self.dtype).removeprefix("torch.")])
+        return "-".join([*self[:4], str(self.dtype).removeprefix("torch."), *[self.extra] * bool(self.extra)])
 
     @property
     def is_refused(self) -> bool:
@@ -107,6 +108,11 @@ def make(case: Case, batch: int = BATCH, seed: int = 0) -> tuple[Call, Pose]:
         call["world_cov"] = p.world_cov
     if case.solver == "identity-lm" and case.focal == "known":
         call["init"] = _near(p.pose, generator)
+    if case.extra == "prior":
+        known = torch.tensor([1e3] * 3 + [0.1] * 3, dtype=torch.float64).diag().repeat(batch, 1, 1)
+        call["prior"] = PosePrior(_near(p.pose, generator), known, torch.full((batch,), 3.0, dtype=torch.float64))
+    if case.extra == "confidence":
+        call["confidence"] = 0.2 + 0.6 * torch.rand(batch, n, generator=generator, dtype=torch.float64)
     if case.focal == "unknown":
         call["intrinsics"] = _with_focal(call["intrinsics"], 2.0)
     return to(case.dtype, call), p.pose
@@ -138,7 +144,9 @@ def of_pairs(function: Callable[[Tensor], Tensor], call: Call) -> Call:
     """The call with a function applied to each argument that has an entry for every pair."""
     shape = call["world_points"].shape[:2]
     return {
-        name: value if name == "init" else pytree.tree_map(lambda x: function(x) if x.shape[:2] == shape else x, value)
+        name: value
+        if name in ("init", "prior")
+        else pytree.tree_map(lambda x: function(x) if x.shape[:2] == shape else x, value)
         for name, value in call.items()
     }
 
@@ -255,6 +263,10 @@ def units_are_free(case: Case) -> None:
     changed["img_points"] = pixel * call["img_points"] if case.camera == "rig" else changed["img_points"]
     for name in {"init", "cam_from_rig"} & call.keys():
         changed[name] = Pose(call[name].rotation, length * call[name].translation)
+    if "prior" in call:
+        unit = torch.tensor([1.0] * 3 + [length] * 3, dtype=case.dtype)
+        pose = Pose(call["prior"].pose.rotation, length * call["prior"].pose.translation)
+        changed["prior"] = PosePrior(pose, call["prior"].information / (unit * unit[:, None]), call["prior"].scale)
     if case.is_ransac:  # whose threshold is in pixels
         changed |= {name: x for name, x in call.items() if name.startswith("img") or name == "intrinsics"}
         scale = torch.ones_like(scale)
@@ -269,7 +281,8 @@ def frames_are_free(case: Case) -> None:
     result = build(case)(**call)
     turn = axis_angle_to_rotation_matrix(torch.tensor([[0.4, -0.9, 0.7]], dtype=torch.float64)).to(case.dtype)[0]
     turn = turn if case.takes_any_n else torch.eye(3, dtype=case.dtype)
-    shift = torch.tensor([30.0, -20.0, 10.0], dtype=case.dtype)
+    # Of a prior the information would change, because a turn about another origin is another move.
+    shift = torch.tensor([30.0, -20.0, 10.0], dtype=case.dtype) * (case.extra != "prior")
 
     def followed(pose: Pose) -> Pose:  # x_cam = R a + t with a = Qᵀ (a' - c)
         rotation = pose.rotation @ turn.mT
@@ -280,6 +293,8 @@ def frames_are_free(case: Case) -> None:
         changed["world_cov"] = turn @ call["world_cov"] @ turn.mT
     if "init" in call:
         changed["init"] = followed(call["init"])
+    if "prior" in call:
+        changed["prior"] = call["prior"]._replace(pose=followed(call["prior"].pose))
     found = build(case)(**changed)
     assert_near(found, result._replace(**followed(result.pose)._asdict()))
 
@@ -313,6 +328,11 @@ BAD: dict[str, tuple[str, Callable[[Call, int], None]]] = {
     "indefinite pixel": ("img_cov", _put("img_cov", (1, [0, 1], [1, 0]), 1e4)),
     "negative ellipsoid": ("world_cov", _put("world_cov", (1, [0, 1, 2], [0, 1, 2]), -1.0)),
     "nan rig": ("cam_from_rig", lambda call, i: call["cam_from_rig"].translation[i, 2, 0].fill_(math.nan)),
+    "nan prior": ("prior", lambda call, i: call["prior"].pose.rotation[i, 0, 0].fill_(math.nan)),
+    "negative information": ("prior", lambda call, i: call["prior"].information[i, 5, 5].fill_(-1.0)),
+    "lopsided information": ("prior", lambda call, i: call["prior"].information[i, 0, 1].fill_(1e5)),
+    "prior without scale": ("prior", lambda call, i: call["prior"].scale[i].fill_(0.0)),
+    "impossible confidence": ("confidence", _put("confidence", 4, 1.1)),
     "nan start": ("init", lambda call, i: call["init"].rotation[i, 0, 0].fill_(math.nan)),
 }
 

@@ -43,16 +43,6 @@ def test_nearest_rotation_is_kabschs(generator):
     torch.testing.assert_close(rotation.permute(2, 0, 1), (U * sign[:, None]) @ Vh, rtol=0, atol=1e-11)
 
 
-@pytest.mark.parametrize(("dtype", "factors"), [(torch.float32, (1e-8, 1e15)), (torch.float64, (1e-70, 1e100))])
-def test_nearest_rotation_does_not_depend_on_the_unit(dtype, factors, generator):
-    matrix = torch.randn(3, 3, 20, generator=generator, dtype=torch.float64).to(dtype)
-    rotation, _ = nearest_rotation(matrix)
-    for factor in factors:
-        scaled, unique = nearest_rotation(factor * matrix)
-        assert unique.all()
-        torch.testing.assert_close(scaled, rotation)
-
-
 def test_where_there_is_no_nearest_rotation_it_is_the_identity_without_gradient(random_rotations):
     left, right = random_rotations(5), random_rotations(5, seed=1)
     values = [[0, 0, 0], [1, 0, 0], [3, 1, -1], [3e-200, 2e-200, 1e-200], [2, 1, 1]]

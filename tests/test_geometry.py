@@ -13,7 +13,6 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from kornia_pnpnet import Correspondences, Noise, Pose
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.geometry import (
-    MIN_DEPTH_RATIO,
     additive_tangent_map,
     change_tangent,
     normal_equations,
@@ -24,7 +23,6 @@ from kornia_pnpnet.geometry import (
     rotation_angle,
     transform,
 )
-from kornia_pnpnet.refine import lm_step
 
 DTYPES = (torch.float32, torch.float64)
 FOCAL = torch.tensor(3400.0, dtype=torch.float64)
@@ -197,47 +195,6 @@ def test_rotation_angle_of_a_known_turn(angle, random_rotations):
 
 
 # --- behind the camera ----------------------------------------------------------------------------------------------
-
-BEHIND = {
-    "behind": (1.0, 2.0, -5.0),
-    "in_the_plane": (1.0, 2.0, 0.0),
-    "at_the_centre": (0.0, 0.0, 0.0),
-    "nearly_in_the_plane": (1.0, 1.0, 0.5 * MIN_DEPTH_RATIO),
-    "far_behind": (1e12, -1e12, -1e12),
-    "tiny": (1e-30, 0.0, -1e-30),
-}
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("point", BEHIND.values(), ids=BEHIND.keys())
-def test_points_behind_the_camera_do_not_count(point, dtype):
-    front = torch.tensor([[1.0, 2, 10], [-4, 3, 20], [5, -6, 30], [3, 3, 7]], dtype=dtype)
-    world = torch.cat((front, torch.tensor([point], dtype=dtype)))[None].requires_grad_()
-    pixels = torch.full((1, 5, 2), 100.0, dtype=dtype, requires_grad=True)
-    corr = Correspondences(world, pixels, torch.ones(1, 5, dtype=dtype), FOCAL.to(dtype))
-    pose = Pose(torch.eye(3, dtype=dtype)[None].requires_grad_(), torch.zeros(1, 3, dtype=dtype, requires_grad=True))
-
-    projection = project(pose, corr)
-    assert projection.in_front.tolist() == [[True] * 4 + [False]]
-    assert all(x.isfinite().all() for x in iter_tensors(projection))
-    heavy = torch.tensor([[1.0] * 4 + [1e6]], dtype=dtype)
-    for counted, not_counted in zip(
-        *(normal_matrices(pose, corr, w) for w in (heavy, heavy.clamp(max=1.0))), strict=True
-    ):
-        assert torch.equal(counted, not_counted)
-
-    one = torch.tensor(1.0, dtype=dtype)
-    step = lm_step(corr, pose, projection, corr.weights, one, 1e-3 * one)
-    (step.pose.rotation.square().sum() + step.pose.translation.square().sum()).backward()
-    assert all(x.grad.isfinite().all() for x in (world, pixels, *pose))
-    assert not world.grad[0, 4].any()
-    assert not pixels.grad[0, 4].any()
-
-    # The step that the points in front would have taken alone, but for the order in which sums are rounded.
-    alone = Correspondences(world[:, :4], pixels[:, :4], corr.weights[:, :4], corr.focal)
-    without = lm_step(alone, pose, project(pose, alone), alone.weights, one, 1e-3 * one)
-    rtol = 1e-4 if dtype == torch.float32 else 1e-12
-    torch.testing.assert_close(step.pose.matrix, without.pose.matrix, rtol=rtol, atol=0)
 
 
 def test_pixel_variance_is_that_of_the_pixel(make_problems):

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from kornia.core.exceptions import BaseError
 
 from kornia_pnpnet import Pose, create_solver, p3p, pose_errors
 from kornia_pnpnet.geometry import transform
@@ -115,6 +116,36 @@ def test_none_where_the_pairs_say_enough(name, make_problems):
     assert expected.alternatives.valid.shape == (20, 0)
     assert not result.alternatives.valid.any()
     assert torch.equal(result.matrix, expected.matrix)
+
+
+def test_batch_dtype_padding_and_bad_problems(generator):
+    world, img, camera, _ = boards(generator, batch=6, sigma=1.0)
+    solver = create_solver("pnpnet-set")
+    with torch.no_grad():
+        whole = solver(world, img, camera, alternatives=2)
+        one = solver(world[2], img[2], camera[2], alternatives=2)
+        nested = solver(*(x.unflatten(0, (2, 3)) for x in (world, img, camera)), alternatives=2).alternatives
+        mask = torch.ones(6, 12, dtype=torch.bool)
+        mask[:, 9:] = False
+        padded = [torch.nn.functional.pad(x, (0, 0, 0, 3)) for x in (world, img)]
+        masked = solver(*padded, camera, mask=mask, alternatives=2)
+        broken = img.clone()
+        broken[1, 0, 0] = torch.nan
+        bad = solver(world, broken, camera, alternatives=2)
+        single = solver(*(x.float() for x in (world, img, camera)), alternatives=2)
+    for other in (bad, masked):
+        keep = [0, 2, 3, 4, 5]
+        torch.testing.assert_close(
+            other.alternatives.rotation[keep], whole.alternatives.rotation[keep], atol=1e-6, rtol=0
+        )
+    torch.testing.assert_close(one.alternatives.rotation, whole.alternatives.rotation[2], atol=1e-6, rtol=0)
+    assert nested.valid.shape == (2, 3, 2)
+    assert not bad.alternatives.valid[1].any()
+    assert all(x.isfinite().all() for x in bad.alternatives)
+    assert single.alternatives.rotation.dtype == torch.float32
+    assert (single.alternatives.valid == whole.alternatives.valid).double().mean() > 0.8
+    with pytest.raises(BaseError, match="alternatives"):
+        solver(world, img, camera, alternatives=-1)
 
 
 def test_gradients_do_not_change(generator):

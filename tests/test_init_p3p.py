@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -205,27 +204,6 @@ def test_all_poses_of_three_pixels_with_any_leading_dimensions():
         expected = (x[:first].flatten(0, 1) for x in (*whole.pose, whole.valid))
         for one, other in zip((*flat.pose, flat.valid), expected, strict=True):
             assert torch.equal(one, other)
-
-
-@pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
-def test_no_pose_is_missed_beside_poselib(scene):
-    poselib = pytest.importorskip("poselib")
-    count = 10_000
-    world_points, plane_points, pose = scene(count, seed=1)
-    rays = torch.nn.functional.pad(plane_points, (0, 1), value=1.0)
-    rays = torch.nn.functional.normalize(rays, dim=-1).numpy()
-    rotation, translation = np.zeros((count, 4, 3, 3)), np.zeros((count, 4, 3))
-    valid = np.zeros((count, 4), bool)
-    for i, pair in enumerate(zip(rays, world_points.numpy(), strict=True)):
-        for j, solution in enumerate(poselib.p3p(*pair)):
-            rotation[i, j], translation[i, j] = solution.R, solution.t
-            valid[i, j] = np.isfinite(solution.R).all()
-    theirs = Hypotheses(Pose(torch.from_numpy(rotation), torch.from_numpy(translation)), torch.from_numpy(valid))
-    ours = p3p(world_points, plane_points)
-    best, their_best = (errors(found, pose).amin(-1) for found in (ours, theirs))
-    assert (best < NEAR).all()
-    assert (ours.valid.sum(-1) != theirs.valid.sum(-1)).sum() <= 2
-    assert best.median() < their_best.median()
 
 
 @many(80)

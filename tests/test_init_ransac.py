@@ -101,14 +101,6 @@ def test_pairs_without_weight_are_never_drawn(masked, weighted, make_problems):
     assert all((weight > 0).all() for weight in minimal.samples)
 
 
-@pytest.mark.parametrize(("n", "batch"), [(9, 300), (1000, 3)])
-def test_a_chunk_bounds_the_samples_that_are_solved_together(n, batch, make_problems, correspond):
-    minimal = Counting()
-    RANSAC(minimal, **PROTOCOL, chunk_size=256)(correspond(make_problems(n, batch, outliers=n // 2))[0])
-    assert max(minimal.sizes) <= 256
-    assert len(minimal.sizes) > 1
-
-
 def test_sound_problems_are_ok_and_pixels_of_no_pose_are_not(make_problems):
     for n, outliers in ((3, 0), (4, 0), (5, 0), (9, 3), (40, 28)):
         problems = make_problems(n, 100, outliers=outliers)

@@ -26,6 +26,9 @@ QUICK = [
     Case("identity-lm", "pixels", "sigma", dtype=torch.float32),
     Case("identity-lm", "bearings"),
     Case("identity-lm", "rig", "covariance"),
+    Case("pnpnet-set", extra="prior"),
+    Case("epnp-lm", "pixels", "covariance", extra="prior"),
+    Case("p3p-ransac", extra="confidence"),
     *(Case(name) for name in ("epnp", "reppnp", "net-n9", "net-set", "pnpnet-n6", "ransac-epnp-lm")),
 ]
 ALL = [Case(*x) for x in product(SOLVERS, CAMERAS, NOISES, FOCALS, DTYPES)]

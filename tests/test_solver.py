@@ -117,18 +117,6 @@ def test_a_batch_of_bad_problems_gives_identities(dtype, make_problems):
     assert result.cost.sum().isfinite()
 
 
-@pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")  # PyTorch's own use of it in forward mode
-def test_a_failed_refinement_gives_no_derivative_in_forward_mode(make_problems):
-    p = make_problems(9, 100)
-    solver = net(9, 5)
-    everywhere = torch.ones_like(p.img_points)
-    _, moved = torch.func.jvp(lambda x: solver(p[0], x, p[2]).pose, (p.img_points,), (everywhere,))
-    ok = solver(*p[:3]).ok
-    assert (~ok).any()
-    assert not any(x[~ok].any() for x in moved)
-    assert all(x[ok].flatten(1).any(1).all() for x in moved)
-
-
 def test_everything_behind_the_true_pose_is_not_ok(make_problems):
     p = make_problems(9, 200)
     seen = [turn_away(p, i) for i in range(200)]
@@ -355,15 +343,6 @@ def test_inputs_of_half_precision_get_gradients_of_half_precision(cast_dtype, ma
     for half, full in zip(halves, rounded, strict=True):
         assert half.grad.dtype == cast_dtype
         assert torch.equal(half.grad, full.grad.to(cast_dtype))
-
-
-def test_a_given_pose_is_one_more_hypothesis(make_problems, perturb):
-    p = make_problems()
-    init = perturb(p.pose)
-    by_hand, alone = net(9, 5)(*p[:3], init=init), PnPNet(None, RobustWeightedLM(m=5))
-    assert by_hand.ok.all()
-    for given in (init, tuple(init)):
-        assert_same(by_hand._replace(init=None), alone(*p[:3], init=given)._replace(init=None))
 
 
 @pytest.mark.parametrize(

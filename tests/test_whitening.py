@@ -6,11 +6,8 @@ import math
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError, TypeCheckError, ValueCheckError
 from kornia.geometry.liegroup import So3
-from strategies import SOLVERS, batches, check, many
 
 from kornia_pnpnet import (
     PnPNet,
@@ -170,34 +167,6 @@ def test_what_contradicts_is_an_error(call):
     if call != "solver":
         with pytest.raises(ValueCheckError, match="img_sigma or img_cov"):
             run()
-
-
-@st.composite
-def any_covariances(draw, count, batch, dtype):
-    """Of any size and shape of ellipsoid, with now and then an entry that makes no sense."""
-    found = {}
-    for name, size in (("img_cov", 2), ("world_cov", 3)):
-        if draw(st.booleans()):
-            generator = torch.Generator().manual_seed(draw(st.integers(0, 99)))
-            rank = draw(st.integers(0, size))
-            factor = torch.randn(batch, count, size, rank, generator=generator, dtype=torch.float64)
-            matrix = (10.0 ** draw(st.integers(-12, 12)) * factor @ factor.mT).to(dtype)
-            if matrix.numel() and draw(st.booleans()):
-                matrix.view(-1)[draw(st.integers(0, 3))] = draw(
-                    st.sampled_from([0.0, -1.0, torch.nan, torch.inf, 1e30])
-                )
-            found[name] = matrix.requires_grad_() if draw(st.booleans()) else matrix
-    return found
-
-
-@many(150)
-@given(st.sampled_from([x for x in SOLVERS if "n9" not in x]), batches(), st.data())
-def test_a_solver_takes_any_covariances(name, case, data):
-    inputs, mask, weights, kinds = case
-    batch, count = inputs[0].shape[:2]
-    given_covs = data.draw(any_covariances(count, batch, inputs[0].dtype))
-    result = SOLVERS[name](*inputs, mask=mask, weights=weights, **given_covs)
-    check(result, [*inputs, *given_covs.values()], kinds)
 
 
 def test_undetermined_where_a_covariance_is_bad():
