@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from kornia.core.exceptions import BaseError
 
-from kornia_pnpnet import Normalize, Pose, create_solver
+from kornia_pnpnet import Pose, create_solver
 from kornia_pnpnet.cli import main
 from kornia_pnpnet.data import SyntheticProblems
 from kornia_pnpnet.problem import Noise
@@ -274,23 +274,6 @@ def gradients_are_finite(values, tensors):
     total = sum(x.sum() for x in values if x.requires_grad)
     if tensors and isinstance(total, torch.Tensor):
         finite(*(x for x in torch.autograd.grad(total, tensors, allow_unused=True) if x is not None))
-
-
-@st.composite
-def correspondences(draw, n=None, *, scaled=False):
-    """Of any batch, as parts of a solver see them; ``scaled`` is for those that ask for a world about 0 of size 1."""
-    inputs, mask, weights, _ = draw(batches(n))
-    about = st.just(True) if scaled else BOOL
-    normalize = Normalize(**draw(options(order=BOOL, center=about, scale=about)))
-    tensors = [x for x in inputs if x.requires_grad]
-    corr, frame = normalize(*inputs, weights=weights, mask=mask)
-    finite(corr, frame)
-    if draw(st.booleans()):
-        corr = corr._replace(noise=Noise(torch.full_like(corr.weights, 0.5), torch.full_like(corr.weights, 0.01)))
-    return corr, tensors
-
-
-KINDS = st.sampled_from(list(KERNELS))
 
 
 def names_the_file(error, path):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import pickle
 import warnings
-from typing import NamedTuple
 
 import pytest
 import torch
@@ -13,12 +12,10 @@ from torch._dynamo.testing import CompileCounter
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from kornia_pnpnet import MLPInit, PnPNet, Pose, RobustWeightedLM, create_solver
-from kornia_pnpnet.core import compilation
 from kornia_pnpnet.core.compilation import Compiled
-from kornia_pnpnet.core.performance import ascending_order, in_order, problems_last, ranked
+from kornia_pnpnet.core.performance import ascending_order, in_order, ranked
 from kornia_pnpnet.core.trees import iter_tensors
 from kornia_pnpnet.data import CameraProblems, OutlierMix, SyntheticProblems
-from kornia_pnpnet.refine.residual import project
 from kornia_pnpnet.result import PnPResult
 
 # torch.compile makes an instance of an autograd function while it looks into it.
@@ -98,21 +95,6 @@ def test_results_and_gradients_are_those_of_the_eager_solver(views, whole, graph
     assert backend.frame_count == graphs
 
 
-def test_the_first_stage_alone_and_other_arguments(backend):
-    eager, compiled = create_solver("pnpnet-n9", m=1), create_solver("pnpnet-n9", m=1)
-    compiled.compile()
-    world, img, intrinsics = problems(3)[:3]
-    weights = torch.ones(3, 9, dtype=torch.float64)
-    weights[:, 2] = 0.0
-    mask = torch.arange(9).expand(3, 9) < 8
-    with torch.no_grad():
-        options = {"weights": weights, "mask": mask, "init": eager(world, img, intrinsics).pose}
-        for first_stage_only in (True, False):
-            inputs = world, img, intrinsics[0]
-            ours, expected = (net(*inputs, **options, first_stage_only=first_stage_only) for net in (compiled, eager))
-            assert_same(ours, expected)
-
-
 @pytest.mark.parametrize("whole", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_what_cannot_be_captured_runs_as_it_is_with_one_warning(whole, backend):
     eager, compiled = create_solver("p3p-ransac", seed=1), create_solver("p3p-ransac", seed=1)
@@ -187,46 +169,6 @@ def test_too_little_memory_is_no_failure_of_the_compiler(monkeypatch):
     assert not twice.failed
 
 
-class Parts(NamedTuple):
-    first: torch.Tensor
-    second: torch.Tensor | None
-    third: torch.Tensor | None
-
-
-def test_an_older_pytorch_that_knows_fewer_options_compiles_too(backend, monkeypatch):
-    """Its graphs return tensors alone; what is there depends on what was given."""
-    capture = torch.compile
-
-    def older(function, *, mode=None, fullgraph=False, options=None):
-        if options:
-            raise RuntimeError("Unexpected optimization option")
-        return capture(function, mode=mode, fullgraph=fullgraph)
-
-    monkeypatch.setattr(torch, "compile", older)
-    monkeypatch.setattr(compilation, "_LIMITS", {})
-    compiled = Compiled(lambda x, parts: parts._replace(first=parts.first * x))
-    x, one, two = torch.full((3,), 2.0), torch.ones(3), torch.full((3,), 5.0)
-    for parts in (Parts(one, two, None), Parts(one, None, two), Parts(two, one, one), Parts(one, two, None)):
-        found = compiled(x, parts)
-        assert type(found) is Parts
-        for ours, theirs in zip(found, parts._replace(first=x * parts.first), strict=True):
-            assert ours is theirs is None or torch.equal(ours, theirs)
-    assert backend.frame_count == 3
-    assert not compiled.failed
-
-
-def test_what_recompiling_warns_of_is_no_reason_to_stop(backend):
-    """PyTorch warns of a tensor that is no leaf of the graph, as the pose is that an iteration begins with."""
-    twice = Compiled(lambda x: 2 * x)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", ".*should not be instantiated", DeprecationWarning)
-        for x in (torch.ones(3), torch.ones(3, requires_grad=True) * 1.0):  # of the same shape, but with a gradient
-            assert torch.equal(twice(x), 2 * x)
-    assert backend.frame_count == 2
-    assert not twice.failed
-
-
 def test_errors_of_the_caller_are_the_callers(backend):
     solver = create_solver("pnpnet-n9", m=0)
     solver.compile()
@@ -264,24 +206,6 @@ def test_copies_use_their_own_weights(backend):
         assert torch.equal(other.run(x), 0.5 * x)
         assert torch.equal(module.run(x), x)
     assert backend.frame_count == 3
-
-
-@pytest.mark.slow
-def test_compiling_changes_no_weights_and_copies_use_their_own(backend):
-    solver = create_solver("pnpnet-n9", m=0)
-    eager = copy.deepcopy(solver)
-    names, inputs = list(solver.state_dict()), problems(3)[:3]
-    for again in (True, False):  # compiling again replaces what was compiled
-        solver.compile(whole=again)
-        with torch.no_grad():
-            assert_same(solver(*inputs), eager(*inputs), rtol=1e-6, atol=1e-6)
-    assert list(solver.state_dict()) == names
-    with torch.no_grad():
-        eager.init.get_parameter(next(iter(dict(eager.init.named_parameters())))).mul_(0.5)
-        for other in (copy.deepcopy(solver), pickle.loads(pickle.dumps(solver))):
-            other.load_state_dict(eager.state_dict())
-            assert_same(other(*inputs), eager(*inputs), rtol=1e-6, atol=1e-6)
-            assert not torch.equal(solver(*inputs).init.rotation, other(*inputs).init.rotation)
 
 
 @pytest.mark.parametrize("name", ["pnpnet-n9", "epnp-lm", "reppnp-lm"])
@@ -344,18 +268,6 @@ def test_inductor_computes_the_same_with_more_pairs_than_problems():
         with torch.no_grad():
             ours, eager = compiled(*inputs, init=start), solver(*inputs, init=start)
         torch.testing.assert_close(ours.matrix, eager.matrix, rtol=1e-3, atol=1e-3)
-
-
-def test_problems_last_changes_only_the_order_of_memory(make_problems, correspond):
-    corr, pose = correspond(make_problems(n=4, batch=7))
-    laid = problems_last(corr)
-    for one, other in zip(iter_tensors(laid), iter_tensors(corr), strict=True):
-        assert torch.equal(one, other)
-    # The problem is the fastest index, then the pair.
-    assert laid.world_points.stride() == laid.img_points.stride() == (1, 7, 28)
-    assert laid.weights.stride() == (1, 7)
-    of_pairs = project(pose, laid)._replace(rotation=None)
-    assert all(x.stride() == (1, 7) for x in iter_tensors(of_pairs))  # arithmetic keeps the layout
 
 
 def several(values, *shape):

@@ -16,7 +16,6 @@ from kornia_pnpnet.data import CameraProblems
 from kornia_pnpnet.export import (
     OUTPUTS,
     RIG_INPUTS,
-    PackagedSolver,
     export_onnx,
     export_package,
     export_program,
@@ -138,13 +137,6 @@ def test_onnx_of_an_unknown_focal_length(tmp_path):
         near(found, solver, inputs)
         solver.effort = "fixed"
         torch.testing.assert_close(torch.from_numpy(camera), solver(*inputs).intrinsics, rtol=1e-3, atol=1e-3)
-
-
-@pytest.mark.slow
-def test_onnx_of_one_problem(make_problems, tmp_path):
-    solver = PnPNet(None, RobustWeightedLM(1))
-    inputs = inputs_of(make_problems(n=9, batch=1))
-    near(run_onnx(export_onnx(solver, tmp_path / "one.onnx", 9, batch=1), inputs), solver, inputs)
 
 
 def test_solvers_that_cannot_be_exported(tmp_path, capsys):
@@ -297,47 +289,3 @@ def test_files_that_are_no_packages(tmp_path):
     path.write_text("text")
     with pytest.raises(ValueCheckError, match="text"):
         load_package(path)
-
-
-class Loader:
-    """Stands for compiled code: returns its inputs."""
-
-    def __init__(self, rig=False):
-        self.rig = rig
-
-    def get_metadata(self):
-        return {"pnpnet_n": "any", "pnpnet_batch": "any", "pnpnet_rig": str(self.rig)}
-
-    def run(self, inputs):
-        assert all(x.dtype == torch.float32 and x.is_contiguous() for x in inputs)
-        return [*inputs, *[inputs[0]] * (5 - len(inputs))]
-
-
-def test_what_compiled_code_gets(make_problems):
-    world, img, intrinsics, weights = inputs_of(make_problems(n=5, batch=2))
-    package = PackagedSolver(Loader())
-    for camera in (intrinsics, intrinsics[:1].expand(2, 3, 3), intrinsics[0]):
-        found = package(world.double(), img.mT.contiguous().mT, camera)
-        for x, expected in zip(found[:4], (world, img, camera.expand(2, 3, 3), weights), strict=True):
-            assert torch.equal(x, expected)
-    for wrong in (
-        (world[:, :3], img[:, :3], intrinsics),
-        (world, img[:1], intrinsics),
-        (world[0], img[0], intrinsics[0]),
-    ):
-        with pytest.raises(ShapeError):
-            package(*wrong)
-
-
-def test_what_compiled_code_of_rigs_gets():
-    inputs, package = rigs(5, 2), PackagedSolver(Loader(rig=True))
-    world, img, intrinsics, _, *rig = inputs
-    found = package(world.double(), img, intrinsics, cam_from_rig=Pose(*rig))
-    assert all(torch.equal(x, y) for x, y in zip(found, inputs, strict=True))
-    with pytest.raises(ValueCheckError, match="cam_from_rig"):
-        package(world, img, intrinsics)
-    with pytest.raises(ValueCheckError, match="cam_from_rig"):
-        PackagedSolver(Loader())(world, img, intrinsics[:, 0], cam_from_rig=Pose(*rig))
-    for wrong in ((intrinsics[:, 0], rig), (intrinsics, (rig[0][:, :4], rig[1])), (intrinsics, (rig[0], rig[1][0]))):
-        with pytest.raises(ShapeError):
-            package(world, img, wrong[0], cam_from_rig=Pose(*wrong[1]))

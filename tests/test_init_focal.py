@@ -22,15 +22,11 @@ from kornia_pnpnet import (
     create_solver,
     pose_covariance,
 )
-from kornia_pnpnet.cameras import undistort
-from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.export import export_program
-from kornia_pnpnet.problem import Noise
-from kornia_pnpnet.refine.residual import normal_equations, project, retract
+from kornia_pnpnet.refine.residual import retract
 from kornia_pnpnet.refine.residual import rotation_angle as angle
-from kornia_pnpnet.refine.terms import CameraTerm
-from kornia_pnpnet.result import PosePrior
+from kornia_pnpnet.init.focal import scale_focal
 
 HALF = 500.0  # pixels
 
@@ -95,28 +91,6 @@ def test_outliers_are_left_out(name):
 
 
 @pytest.mark.parametrize("name", ["p3p-ransac", "pnpnet-set"])
-def test_the_given_focal_length_does_not_matter(name):
-    """Nor does one broken problem, padding, or a unit in which the pixels are counted."""
-    p = draw(10, wrong=2, noise=0.5, batch=6)
-    solver = create_solver(name, focal="unknown")
-    first = solver(*p[:2], withheld(p))
-    for given in (withheld(p, 3.0), withheld(p, 1e-3)):
-        torch.testing.assert_close(solver(*p[:2], given).intrinsics, first.intrinsics, rtol=1e-5, atol=1e-5)
-    broken = p.world_points.clone()
-    broken[2, 3] = math.nan
-    result = solver(broken, p.img_points, withheld(p))
-    assert not result.ok[2]
-    assert all(x.isfinite().all() for x in iter_tensors(result) if x.is_floating_point())
-    others = torch.arange(6) != 2
-    torch.testing.assert_close(result.intrinsics[others], first.intrinsics[others], rtol=1e-6, atol=1e-6)
-    mask = torch.arange(12).expand(6, 12) < 10
-    padded = [torch.cat((x, x[:, :2] * math.nan), 1) for x in p[:2]]
-    torch.testing.assert_close(
-        solver(*padded, withheld(p), mask=mask).intrinsics, first.intrinsics, rtol=1e-4, atol=1e-2
-    )
-
-
-@pytest.mark.parametrize("name", ["p3p-ransac", "pnpnet-set"])
 def test_a_plane_seen_from_the_front_is_not_believed(name):
     """Its distance and the focal length cannot be told apart; with a prior of the focal length they can."""
     p = draw(20, spread=0.0, noise=1.0)
@@ -145,95 +119,6 @@ def test_the_covariance_has_the_focal_length_last():
     assert squares[result.ok].mean().item() == pytest.approx(7.0, rel=0.1)
     last = log_focal[:, 0].square() / covariance[:, 6, 6]
     assert last[result.ok].mean().item() == pytest.approx(1.0, rel=0.1)
-
-
-def framed(problems):
-    """Problem with a free focal length in the frame of the solver, and the true poses there."""
-    normalize = Normalize(order=False)
-    corr, frame = normalize(*problems[:3])
-    one = torch.ones_like(corr.weights[:, 0])
-    free = CameraTerm(corr.focal * one, 0.0 * one, one, frame.img_scale)
-    return corr._replace(free_focal=free), normalize.apply_to_pose(problems.pose, frame)
-
-
-def test_the_seventh_column_is_the_derivative_of_the_pixels():
-    corr, pose = framed(draw(8, batch=3))
-    zoom = torch.zeros(3, dtype=torch.float64)
-
-    def residual(zoom):
-        return torch.cat(project(dolly_zoom(pose, zoom), corr.zoomed(zoom)).residual, 1)
-
-    column = torch.autograd.functional.jvp(residual, zoom, torch.ones_like(zoom))[1] / corr.focal
-    seen = project(pose, corr)
-    equations = normal_equations(seen, corr.weights, free_focal=True)
-    torch.testing.assert_close(equations.hessian[6][6], column.square().sum(1))
-    shifted = seen._replace(scaled_residual=tuple(torch.ones_like(x) / seen.inv_depth for x in seen.residual))
-    torch.testing.assert_close(normal_equations(shifted, corr.weights, free_focal=True).gradient[6], column.sum(1))
-
-
-@pytest.mark.parametrize("update", ["retraction", "additive"])
-def test_an_exact_focal_length_stays_and_a_wrong_one_is_corrected(update):
-    corr, pose = framed(draw(12, batch=32))
-    refine = RobustWeightedLM(20, robustness=0.0, update=update)
-    here = refine(corr, Starts(pose, torch.ones_like(corr.weights)))
-    assert here.zoom.abs().max() < 1e-9
-    off = torch.linspace(-0.2, 0.2, 32, dtype=torch.float64)
-    found = refine(corr, Starts(dolly_zoom(pose, off), torch.ones_like(corr.weights), zoom=off))
-    assert (found.zoom.abs() < 1e-6).double().mean() > 0.9
-
-
-@pytest.mark.parametrize(
-    ("backward", "kernel"),
-    [("unroll", "power"), ("unroll", "cauchy"), pytest.param("implicit", "cauchy", marks=pytest.mark.slow)],
-)
-def test_gradcheck_to_the_focal_length(backward, kernel):
-    """Through unrolled iterations and through the minimum, with a prior of the focal length."""
-    corr, pose = framed(draw(8, batch=2, noise=1.0))
-    corr = corr._replace(free_focal=corr.free_focal._replace(information=torch.full((2,), 1e2).double()))
-    refine = RobustWeightedLM(5 if backward == "unroll" else 40, kernel=kernel, backward=backward, learnable=False)
-
-    def solve(world_points, img_points, expected):
-        pairs = corr._replace(world_points=world_points, img_points=img_points)
-        pairs = pairs._replace(free_focal=pairs.free_focal._replace(expected=expected))
-        refined = refine(pairs, Starts(pose, torch.ones_like(corr.weights)))
-        return refined.zoom, *refined.pose
-
-    inputs = [x.detach().requires_grad_() for x in (corr.world_points, corr.img_points, corr.free_focal.expected)]
-    # Of the minimum the derivative is exact up to what 40 iterations leave.
-    assert torch.autograd.gradcheck(solve, inputs, eps=1e-5, atol=2e-4, rtol=1e-3, fast_mode=True)
-
-
-def test_a_prior_of_the_pose_leaves_its_minimum():
-    """Gradients of all terms of the cost vanish where the refinement ends, by the pose and by the focal length."""
-    p = draw(8, batch=3, noise=1.0)
-    corr, pose = framed(p)
-    known = PosePrior(pose, torch.diag(torch.tensor([1e4] * 3 + [1e3] * 3)).double().expand(3, 6, 6))
-    one = torch.ones(3, dtype=torch.float64)
-    prior, _ = prior_in_frame(known, torch.zeros(3, 3).double(), one, corr.free_focal.pixel)
-    corr = corr._replace(prior=prior._replace(sq_scale=torch.full_like(one, math.inf)))
-    corr = corr._replace(free_focal=corr.free_focal._replace(information=1e2 * one))
-    end = RobustWeightedLM(30, robustness=0.0)(corr, Starts(pose, torch.ones_like(corr.weights)))
-    delta = torch.zeros(3, 7, dtype=torch.float64, requires_grad=True)
-    moved = dolly_zoom(retract(end.pose, delta[:, :6]), delta[:, 6])
-    seen = corr.zoomed(end.zoom + delta[:, 6])
-    pixel = corr.free_focal.pixel
-    pairs = project(moved, seen).sq_residual.sum(1) / pixel.square()
-    cost = pairs + prior_loss(corr.prior, moved) + focal_loss(corr.free_focal, seen.focal[:, 0])
-    slope = torch.autograd.grad(cost.sum(), delta)[0]
-    curvature = 1e4  # of the prior, the least of all terms
-    assert (slope.abs() / curvature).max() < 1e-4
-
-
-def test_gradients_flow_through_the_solver():
-    p = draw(12, noise=1.0, batch=8)
-    inputs = [x.clone().requires_grad_() for x in (*p[:2], withheld(p, 1.2))]
-    for name in ("p3p-ransac", "pnpnet-set"):
-        result = create_solver(name, focal="unknown")(*inputs)
-        found = torch.autograd.grad(result.intrinsics[:, 0, 0].log().sum() + result.translation.sum(), inputs)
-        assert all(x.isfinite().all() and (x.flatten(1).abs().amax(1) > 0).all() for x in found)
-        # The focal length that was given is ignored: scaling both of its entries changes nothing.
-        along = (found[2] * inputs[2]).diagonal(dim1=1, dim2=2)[:, :2].sum(1)
-        assert along.abs().max() < 1e-6 * found[2].abs().max() * 1e3
 
 
 def test_a_focal_length_is_learned_from_poses_alone():
@@ -268,32 +153,6 @@ def test_options_are_checked():
     p = draw(6, batch=2)
     with pytest.raises(BaseError, match="focal"):
         pose_covariance(p.pose, *p[:3], img_sigma=1.0, focal_sigma=0.1)
-
-
-def test_known_cameras_come_back_as_they_were():
-    p = draw(8, batch=3)
-    for name in ("epnp", "opencv-sqpnp"):
-        torch.testing.assert_close(create_solver(name)(*p[:2], 2.0 * p.intrinsics).intrinsics, p.intrinsics)
-    camera = p.intrinsics.clone()
-    camera[1, 0, 0] = math.nan
-    for name in ("epnp", "opencv-sqpnp"):
-        result = create_solver(name)(*p[:2], camera)
-        assert torch.equal(result.intrinsics[1], torch.eye(3, dtype=torch.float64))
-        assert not result.ok[1]
-    shared = map_tensors(lambda x: x[:2], p)
-    assert create_solver("epnp")(*shared[:2], p.intrinsics[0]).intrinsics.shape == (2, 3, 3)
-
-
-@pytest.mark.slow
-def test_compiled_is_like_eager():
-    """All but the search for the first focal length is compiled."""
-    p = draw(12, noise=1.0, batch=6)
-    solver = PnPNet(None, RobustWeightedLM(2, kernel="cauchy", learnable=False), focal="unknown")
-    expected = solver(*p[:2], withheld(p))
-    solver.compile()
-    found = solver(*p[:2], withheld(p))
-    torch.testing.assert_close(found.intrinsics, expected.intrinsics, rtol=1e-6, atol=1e-6)
-    torch.testing.assert_close(found.translation, expected.translation, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize(("name", "radial"), [("p3p-ransac", 0), ("epnp-lm", 0), ("pnpnet-set", 1)])
@@ -360,19 +219,6 @@ def test_gradcheck_to_radial_distortion(radial):
     assert torch.autograd.gradcheck(solve, inputs, eps=1e-5, atol=1e-6, rtol=1e-4, fast_mode=True)
 
 
-@pytest.mark.slow
-def test_second_derivatives_of_radial_distortion():
-    p, pixels, _ = seen_through_a_lens(1, n=10, batch=1, fov=(60.0, 80.0))
-    solver, camera = create_solver("p3p-ransac", focal="unknown", radial=1), withheld(p)
-
-    def solve(*pairs):
-        result = solver(*pairs, camera)
-        return result.translation, result.dist[:, :1]
-
-    inputs = [x.clone().requires_grad_() for x in (p.world_points, pixels)]
-    assert torch.autograd.gradgradcheck(solve, inputs, eps=1e-4, atol=1e-5, rtol=1e-2, fast_mode=True)
-
-
 def test_radial_distortion_is_a_minimum_as_accurate_as_the_noise_allows():
     """A further Gauss-Newton step is short, and normalised errors are chi-square with 8 degrees of freedom."""
     batch = 400
@@ -418,48 +264,3 @@ def test_a_broken_problem_leaves_the_distortion_of_the_others():
     for gradient in torch.autograd.grad(total + result.intrinsics.sum(), inputs):
         assert gradient.isfinite().all()
         assert gradient.flatten(1).abs().amax(1).bool().tolist() == [True, False, False, True]
-
-
-def test_a_first_guess_keeps_the_first_distortion():
-    p, pixels, dist = seen_through_a_lens(1, n=16, batch=8, fov=(50.0, 90.0))
-    solver = create_solver("p3p-ransac", focal="unknown", radial=1)
-    result = solver(p.world_points, pixels, withheld(p), first_stage_only=True)
-    assert 0 < (result.dist - dist).abs().max() < 0.1
-    assert (result.dist != solver(p.world_points, pixels, withheld(p)).dist)[:, 0].all()
-
-
-def test_pixels_and_their_noise_are_distorted_back():
-    corr, _ = framed(draw(9, batch=2))
-    given = torch.tensor([[-0.1, 0.02], [0.2, -0.03]], dtype=torch.float64)
-    sigma = torch.linspace(1.0, 2.0, 18, dtype=torch.float64).view(2, 9)
-    noise = Noise(sigma, sigma, Symmetric2(sigma, 0.3 * sigma.flip(1), 2.0 * sigma))
-    corr = corr._replace(noise=noise)
-    back = distorted(corr, given)
-    assert (back.img_points - corr.img_points).abs().max() > 1.0
-    camera = torch.stack((corr.focal, corr.focal, torch.ones_like(corr.focal))).diag().expand(2, 3, 3)
-    lens = torch.nn.functional.pad(given, (0, 2))
-    pixels, found, again = undistort(back.img_points, camera, lens, None, back.noise)
-    assert found.all()
-    torch.testing.assert_close(pixels, corr.img_points, rtol=0, atol=1e-6)
-    torch.testing.assert_close(tuple(iter_tensors(again)), tuple(iter_tensors(noise)), rtol=1e-5, atol=1e-5)
-
-
-def test_the_jacobian_of_radial_distortion():
-    corr, pose = framed(draw(9, batch=2, noise=1.0))
-    given = torch.tensor([[0.1, -0.05], [-0.2, 0.03]], dtype=torch.float64)
-
-    def residual(delta):
-        moved = dolly_zoom(retract(pose, delta[:, :6]), delta[:, 6])
-        pairs = corr.zoomed(delta[:, 6])
-        return torch.cat(distort(project(moved, pairs), pairs, given + delta[:, 7:])[0].residual, 1)
-
-    zero = torch.zeros(2, 9, dtype=torch.float64)
-    jacobian = torch.autograd.functional.jacobian(lambda d: residual(d).sum(0), zero).movedim(0, 1) / corr.focal
-    pairs = corr.zoomed(zero[:, 0])
-    seen, terms = distort(project(pose, pairs), pairs, given)
-    hessian, gradient = normal_equations(seen, corr.weights, free_focal=True, radial=terms)
-    expected, right_side = jacobian.mT @ jacobian, (jacobian.mT @ residual(zero)[..., None])[..., 0]
-    for i in range(9):
-        torch.testing.assert_close(gradient[i], right_side[:, i])
-        for j in range(i + 1):
-            torch.testing.assert_close(hessian[i][j], expected[:, i, j])

@@ -6,10 +6,7 @@ import math
 
 import pytest
 import torch
-from kornia.core.check import KORNIA_CHECK, KORNIA_CHECK_SHAPE
-from kornia.core.exceptions import BaseError, DeviceError, ShapeError, TypeCheckError, ValueCheckError
 from kornia.geometry.conversions import (
-    Rt_to_matrix4x4,
     axis_angle_to_rotation_matrix,
     convert_points_from_homogeneous,
     denormalize_points_with_intrinsics,
@@ -77,14 +74,6 @@ def test_left_jacobian_is_the_derivative_of_the_exponential(angle):
     torch.testing.assert_close(So3.left_jacobian(vector), derivative, rtol=0, atol=1e-7)
 
 
-def test_left_jacobian_at_the_identity():
-    zero = torch.zeros(2, 3, dtype=torch.float64, requires_grad=True)
-    jacobian = So3.left_jacobian(zero)
-    assert torch.equal(jacobian.detach(), torch.eye(3, dtype=torch.float64).expand(2, 3, 3))
-    jacobian.sum().backward()
-    assert zero.grad.isfinite().all()
-
-
 def test_dehomogenising_with_zero_eps_divides_whatever_is_not_zero():
     points = torch.tensor([[2.0, 4.0, 2.0], [2e-20, 4e-20, 2e-20], [2.0, 4.0, -2.0], [2.0, 4.0, 0.0]])
     expected = torch.tensor([[1.0, 2.0], [1.0, 2.0], [-1.0, -2.0], [2.0, 4.0]])
@@ -100,18 +89,3 @@ def test_intrinsics_broadcast_over_the_points_of_their_problem():
     torch.testing.assert_close(denormalize_points_with_intrinsics(plane_points, K), pixels)
     # As many points as problems: the letters must not be mixed up.
     torch.testing.assert_close(denormalize_points_with_intrinsics(plane_points[:, :2], K), pixels[:, :2])
-
-
-def test_matrix_of_rotation_and_translation():
-    matrix = Rt_to_matrix4x4(torch.eye(3)[None], torch.tensor([[[1.0], [2.0], [3.0]]]))
-    assert matrix[0].tolist() == [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
-
-
-def test_checks_raise_typed_errors():
-    with pytest.raises(ShapeError):
-        KORNIA_CHECK_SHAPE(torch.zeros(2, 3), ["B", "N", "3"])
-    with pytest.raises(BaseError, match="no such thing"):
-        KORNIA_CHECK(False, "no such thing")
-    for error in (ShapeError, TypeCheckError, ValueCheckError, DeviceError):
-        assert issubclass(error, BaseError)
-    assert "came" in str(ShapeError("what came", actual_shape=[1], expected_shape=[2]))

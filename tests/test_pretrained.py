@@ -95,16 +95,6 @@ def test_sound_problems_are_ok_and_garbage_is_not(name, n):
     assert garbage.float().mean() < 0.1
 
 
-def test_net_n9_is_the_first_guess_of_pnpnet_n9():
-    problems = SyntheticProblems(n=9, batch_size=50, seed=555_004).batch(0)
-    inputs = (problems.world_points, problems.img_points, problems.intrinsics)
-    with torch.no_grad():
-        net, whole = create_solver("net-n9")(*inputs), create_solver("pnpnet-n9")(*inputs)
-    assert torch.equal(net.rotation, net.init.rotation)
-    assert torch.equal(net.rotation, whole.init.rotation)
-    assert not torch.equal(net.rotation, whole.rotation)
-
-
 @pytest.mark.parametrize("name", shipped_weights())
 def test_model_card_is_generated_from_the_run(name, tmp_path):
     folder = WEIGHTS_FOLDER / name

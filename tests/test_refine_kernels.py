@@ -31,19 +31,6 @@ def test_weight_is_the_derivative_of_the_loss(name, shape):
 
 
 @pytest.mark.parametrize(("name", "shape"), CASES)
-def test_weight_is_the_slope_of_the_loss(name, shape):
-    kernel = KERNELS[name]
-    middle = torch.logspace(-4, 8, 97, dtype=torch.float64) * 1.0123  # off the kinks
-    step = 1e-4 * middle
-    slope = (kernel.loss(middle + step, tensor(shape)) - kernel.loss(middle - step, tensor(shape))) / (2 * step)
-    weight = kernel.weight(middle, tensor(shape))
-    # Where the loss has saturated its digits no longer show the slope.
-    noise = 1e-15 * kernel.loss(middle, tensor(shape)) / step
-    near_kink = ((middle - shape**2).abs() < 2 * step) & (name in ("huber", "truncated"))
-    assert ((slope - weight).abs() <= 1e-6 * weight + 4 * noise)[~near_kink].all()
-
-
-@pytest.mark.parametrize(("name", "shape"), CASES)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_loss_starts_at_zero_and_rises_and_weight_falls(name, shape, dtype):
     kernel = KERNELS[name]
@@ -68,21 +55,6 @@ def test_gradcheck_in_both_arguments(name):
         # Differences across sq_residual = 0 need the loss a little below zero, which is smooth there.
         assert torch.autograd.gradcheck(kernel.loss, (sq_residual, value), eps=1e-5, atol=1e-4)
         assert torch.autograd.gradcheck(kernel.weight, (sq_residual, value), eps=1e-7, atol=1e-3, rtol=1e-3)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize(("name", "shape"), CASES)
-def test_finite_at_the_extremes(name, shape, dtype):
-    kernel = KERNELS[name]
-    for function in (kernel.loss, kernel.weight):
-        sq_residual = torch.tensor([0.0, 1e-30, 1e12], dtype=dtype, requires_grad=True)
-        value = torch.tensor(shape, dtype=dtype, requires_grad=True)
-        result = function(sq_residual, value)
-        assert result.isfinite().all()
-        if result.requires_grad:
-            result.sum().backward()
-            assert sq_residual.grad is None or sq_residual.grad.isfinite().all()
-            assert value.grad is None or value.grad.isfinite()
 
 
 def test_closed_forms():

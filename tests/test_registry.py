@@ -2,31 +2,20 @@
 
 import copy
 import re
-import warnings
-from functools import partial
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import BaseError, DeviceError
-from strategies import ANY, COUNTS, ERRORS, SOLVERS, WORD, Seen, batches, check, finite, many, numbers, options, same
+from strategies import ANY, COUNTS, ERRORS, SOLVERS, WORD, Seen, batches, check, finite, many, numbers, options
 
 from kornia_pnpnet import (
     Pose,
-    PoseLoss,
-    SetLoss,
     create_solver,
     list_solvers,
-    pose_covariance,
-    pose_errors,
-    solve_pnp,
-    success,
 )
 from kornia_pnpnet.data import SyntheticProblems
-from kornia_pnpnet.losses import pose_distances
-from kornia_pnpnet.metrics import PoseErrors, reliability
-from kornia_pnpnet.propose.p3p import p3p
 
 PEERS = {name: create_solver(name) for name in ("opencv-ransac", "poselib")}
 
@@ -60,28 +49,6 @@ def test_solvers_take_anything(name):
         check(SOLVERS[name](**call), list(call.values())[:3], kinds)
 
     run()
-
-
-@many(30)
-@given(
-    st.sampled_from(["pnpnet-set", "pnpnet-n9", "epnp-lm", "reppnp-lm"]),
-    st.integers(-6, 6),
-    st.integers(-3, 3),
-    st.integers(0, 100),
-)
-def test_units_of_world_and_camera_do_not_matter(name, world_power, pixel_power, seed):
-    problems = SyntheticProblems(n=9, batch_size=20, seed=seed, dtype=torch.float64).batch(0)
-    scale, zoom = 10.0**world_power, 10.0**pixel_power
-    camera = problems.intrinsics * torch.tensor([zoom, zoom, 1.0], dtype=torch.float64)[:, None]
-    plain = SOLVERS[name](*problems[:3])
-    scaled = SOLVERS[name](scale * problems.world_points, zoom * problems.img_points, camera)
-    assert scaled.ok.equal(plain.ok)
-    ok = plain.ok
-    torch.testing.assert_close(scaled.translation[ok] / scale, plain.translation[ok], rtol=1e-3, atol=1e-3)
-    back = scaled.pose._replace(translation=scaled.translation / scale)
-    solved, as_well = (success(pose_errors(pose, problems.pose)) for pose in (plain.pose, back))
-    assert (solved == as_well).float().mean() > 0.9  # at the limit rounding may decide
-    assert solved.any()
 
 
 @many(60)
@@ -145,120 +112,6 @@ def test_inputs_on_different_devices_are_an_error_of_ours(name, device, case, da
     names = data.draw(st.lists(st.sampled_from(list(call)), min_size=1, max_size=len(call) - 1, unique=True))
     with pytest.raises(DeviceError, match=f"on {device}"):
         {**SOLVERS, **PEERS}[name](**moved(call, device, names))
-
-
-def functions_of_tensors():
-    """Public functions of tensors, with some that they take."""
-    problems = SyntheticProblems(n=9, batch_size=3, seed=0).batch(0)
-    result, guess = SOLVERS["pnpnet-set"].with_starts(*problems[:3])
-    inputs, both, each = problems[:3], (*result.pose, *problems.pose), torch.full((3, 9), 0.5)
-
-    def loss(function, *parts):
-        outcome = result._replace(rotation=parts[0], translation=parts[1], init=Pose(*parts[2:4]))
-        return function(outcome, problems._replace(pose=Pose(*parts[4:])))
-
-    def covariance(a, b, world, img, camera, sigma, length, weights):
-        return pose_covariance(Pose(a, b), world, img, camera, img_sigma=sigma, world_sigma=length, weights=weights)
-
-    sigmas = torch.tensor(1.0), torch.ones(3), each
-    return {
-        "solve_pnp": (solve_pnp, (*inputs, each)),
-        "p3p": (p3p, (problems.world_points[:, :3], problems.img_points[:, :3])),
-        "pose_covariance": (covariance, (*both[:2], *inputs, *sigmas)),
-        "pose_errors": (lambda a, b, c, d: pose_errors(Pose(a, b), Pose(c, d)), both),
-        "pose_distances": (lambda a, b, c, d: pose_distances(Pose(a, b), Pose(c, d)), both),
-        "success": (lambda a, b, c: success(PoseErrors(a, b), 1.0, c), torch.ones(3, 3).unbind()),
-        "reliability": (reliability, (each, each > 0.2)),
-        "PoseLoss": (partial(loss, PoseLoss()), (*result.pose, *result.init, *problems.pose)),
-        "SetLoss": (
-            partial(loss, partial(SetLoss(), ramp=1.0, guess=guess)),
-            (*result.pose, *result.init, *problems.pose),
-        ),
-    }
-
-
-FUNCTIONS = functions_of_tensors()
-
-
-@many(100)
-@given(st.sampled_from(list(FUNCTIONS)), st.sampled_from(DEVICES), st.data())
-def test_tensors_on_different_devices_are_an_error_of_ours(name, device, data):
-    function, tensors = FUNCTIONS[name]
-    function(*tensors)
-    which = data.draw(st.lists(st.integers(0, len(tensors) - 1), min_size=1, max_size=len(tensors) - 1, unique=True))
-    with pytest.raises(DeviceError, match=f"on {device}"):
-        function(*(x.to(device) if i in which else x for i, x in enumerate(tensors)))
-
-
-def tensors_of(case):
-    """All tensors of a batch, and a function of them that solves it."""
-    inputs, mask, weights, _ = case
-    others = {name: value for name, value in (("weights", weights), ("mask", mask)) if value is not None}
-
-    def solve(solver, *tensors):
-        return solver(*tensors[:3], **dict(zip(others, tensors[3:], strict=True)))
-
-    return (*inputs, *others.values()), solve
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:There is a performance drop:UserWarning")
-@pytest.mark.parametrize("name", GRAPHS)
-def test_vmap_is_a_larger_batch(name, monkeypatch):
-    """With the fixed effort, the only one of vmap."""
-    solver = SOLVERS[name]
-    monkeypatch.setattr(solver, "effort", "fixed")
-
-    @many(15)
-    @given(batches(9 if name.endswith("-n9") else None))
-    def run(case):
-        tensors, solve = tensors_of(case)
-        mapped = torch.func.vmap(lambda *x: solve(solver, *x)[:5])(*(torch.stack((x, x.flip(0))) for x in tensors))
-        plain = solve(solver, *tensors)
-        same([x[0] for x in mapped], plain)
-        same([x[1].flip(0) for x in mapped], plain)
-        if not len(tensors[0]):
-            return
-        tensors = [x.detach() for x in tensors]
-
-        def outcome(*problem):
-            return solve(solver, *(x[None] for x in problem)).rotation.sum()
-
-        each = torch.func.vmap(torch.func.grad(outcome, argnums=1))(*tensors)
-        img = tensors[1].clone().requires_grad_()
-        (whole,) = torch.autograd.grad(solve(solver, tensors[0], img, *tensors[2:]).rotation.sum(), img)
-        assert each.isfinite().all()
-        usual = torch.tensor([kind == "nothing" for kind in case[3]])
-        size = whole[usual].abs().max().item() if usual.any() else 0.0
-        torch.testing.assert_close(each[usual], whole[usual], rtol=0.05, atol=0.05 * size)
-
-    run()
-
-
-@pytest.mark.filterwarnings("ignore:.*should not be instantiated:DeprecationWarning")
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["pnpnet-set", "pnpnet-n9", "epnp-lm"])
-def test_compiled_solvers_take_anything(name, monkeypatch):
-    """Captured and traced with its gradients; the graphs run as they are, for want of the time to compile them."""
-    compile_ = torch.compile
-    monkeypatch.setattr(
-        torch, "compile", lambda f, **more: compile_(f, **{**more, "options": None, "backend": "aot_eager"})
-    )
-    torch.compiler.reset()
-    solver = copy.deepcopy(SOLVERS[name])
-    solver.compile()
-
-    @many(5, times=1)
-    @given(batches(9))
-    def run(case):
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", RuntimeWarning)  # that it was not compiled
-            check(solver(*case[0], weights=case[2], mask=case[1]), case[0], case[3])
-        tensors, solve = tensors_of(case)
-        same(solve(solver, *tensors), solve(SOLVERS[name], *tensors))
-
-    run()
-    torch.compiler.reset()
 
 
 def test_solvers_of_any_name_and_options():

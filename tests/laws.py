@@ -1,0 +1,455 @@
+"""Laws that every solver keeps, written once: ``test_laws.py`` runs them over solvers, cameras, noise and dtypes.
+
+A :class:`Case` names what is combined, :func:`make` draws its problems as the arguments of one call, and each law
+compares that call with a changed one. Everything speaks through the public contract.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from functools import cache
+from typing import Any, NamedTuple
+
+import torch
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+from torch import Tensor
+from torch.nn.functional import pad
+from torch.utils import _pytree as pytree
+
+from kornia_pnpnet import PnPNet, PnPResult, Pose, PosePrior, RobustWeightedLM, create_solver
+from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+
+CAMERAS, NOISES, FOCALS = ("pixels", "rig", "bearings"), ("none", "sigma", "covariance"), ("known", "unknown")
+#: Sizes of the problems: of the batch, and of the pairs of each.
+BATCH, PAIRS = 5, 12
+#: Largest differences in entries of rotations and in translations relative to their length.
+TOLERANCE = {torch.float64: 1e-5, torch.float32: 1e-2}
+
+Call = dict[str, Any]
+
+
+class Case(NamedTuple):
+    """One solver with one kind of problems."""
+
+    solver: str
+    camera: str = "pixels"
+    noise: str = "none"
+    focal: str = "known"
+    dtype: torch.dtype = torch.float64
+    extra: str = ""  # what else is known: "prior" or "confidence"
+
+    def __str__(self) -> str:
+        return "-".join([*self[:4], str(self.dtype).removeprefix("torch."), *[self.extra] * bool(self.extra)])
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether the contract refuses the combination."""
+        return self.focal == "unknown" and self.camera != "pixels"
+
+    @property
+    def takes_any_n(self) -> bool:
+        return "net-n" not in self.solver
+
+    @property
+    def is_ransac(self) -> bool:
+        """Whether samples are drawn by the places of the pairs."""
+        return "ransac" in self.solver
+
+
+@cache
+def build(case: Case) -> PnPNet:
+    """The solver of a case, without parameters that require a gradient."""
+    options = {"max_samples": 30} if case.solver == "ransac-epnp-lm" else {}
+    return create_solver(case.solver, focal=case.focal, **options).to(case.dtype).requires_grad_(False)
+
+
+# --- problems ---------------------------------------------------------------------------------------------------------
+
+
+def make(case: Case, batch: int = BATCH, seed: int = 0) -> tuple[Call, Pose]:
+    """Arguments of a call, and the true poses. The last pair is an outlier where the solver is robust from its start.
+
+    The points are those of the protocol. In a rig every third pair belongs to a camera turned by a third of a turn;
+    bearings are turned to all sides.
+    """
+    n = PAIRS if case.takes_any_n else int(re.search(r"-n(\d+)", case.solver)[1])
+    outliers = 0 if case.solver.startswith(("epnp", "reppnp", "identity", "net")) or case.focal == "unknown" else 1
+    options = {"axis_ratio": 3.0, "known_noise": 1.0} if case.noise == "covariance" else {}
+    options |= {"n": n, "batch_size": batch, "seed": seed, "outliers": OutlierMix(count=outliers)}
+    p = SyntheticProblems(dtype=torch.float64, sigma_spread=0.5, **options).batch(0)
+    generator = torch.Generator().manual_seed(seed)
+    f = 700.0 + 50.0 * torch.arange(batch, dtype=torch.float64)
+    size = (f / p.intrinsics[:, 0, 0])[:, None, None]
+    intrinsics = torch.eye(3, dtype=torch.float64).repeat(batch, 1, 1)
+    intrinsics[:, 0, 0], intrinsics[:, 1, 1], intrinsics[:, :2, 2] = f, f, torch.tensor([320.0, 240.0]).double()
+    pixels = size * p.img_points + intrinsics[:, None, :2, 2]
+    call: Call = {"world_points": p.world_points, "img_points": pixels, "intrinsics": intrinsics}
+    if case.camera != "pixels":
+        if case.camera == "rig":
+            yaw = 2.0 * math.pi / 3.0 * (torch.arange(n) % 3).double()
+            turn = axis_angle_to_rotation_matrix(torch.stack((0 * yaw, yaw, 0 * yaw), -1)).expand(batch, n, 3, 3)
+            shift = (torch.arange(n) % 3)[:, None].double() * torch.tensor([1.0, -2.0, 0.5]).double()
+            call["cam_from_rig"] = Pose(turn.clone(), shift.expand(batch, n, 3).clone())
+            call["intrinsics"] = intrinsics[:, None].repeat(1, n, 1, 1)
+        else:
+            turn = axis_angle_to_rotation_matrix(3.0 * torch.rand(n, 3, generator=generator).double())
+            turn, shift = turn.expand(batch, n, 3, 3), torch.zeros(batch, n, 3).double()
+            rays = pad(p.img_points / p.intrinsics[:, :1, :1], (0, 1), value=1.0)
+            call["img_points"] = _apply(turn.mT, rays)
+        cam = p.world_points @ p.pose.rotation.mT + p.pose.translation[:, None]
+        call["world_points"] = (_apply(turn.mT, cam - shift) - p.pose.translation[:, None]) @ p.pose.rotation
+    if case.noise == "sigma":
+        call["img_sigma"] = size[..., 0] * torch.linspace(0.7, 1.4, n, dtype=torch.float64)
+        call["world_sigma"] = torch.linspace(0.04, 0.06, batch, dtype=torch.float64)
+    elif case.noise == "covariance":
+        call["img_cov"] = size[..., None] ** 2 * p.img_cov
+        call["world_cov"] = p.world_cov
+    if case.solver == "identity-lm" and case.focal == "known":
+        call["init"] = _near(p.pose, generator)
+    if case.extra == "prior":
+        known = torch.tensor([1e3] * 3 + [0.1] * 3, dtype=torch.float64).diag().repeat(batch, 1, 1)
+        call["prior"] = PosePrior(_near(p.pose, generator), known, torch.full((batch,), 3.0, dtype=torch.float64))
+    if case.extra == "confidence":
+        call["confidence"] = 0.2 + 0.6 * torch.rand(batch, n, generator=generator, dtype=torch.float64)
+    if case.focal == "unknown":
+        call["intrinsics"] = _with_focal(call["intrinsics"], 2.0)
+    return to(case.dtype, call), p.pose
+
+
+def _apply(matrices: Tensor, vectors: Tensor) -> Tensor:
+    return (matrices @ vectors[..., None])[..., 0]
+
+
+def _near(pose: Pose, generator: torch.Generator) -> Pose:
+    turn = axis_angle_to_rotation_matrix(0.02 * torch.randn(len(pose.rotation), 3, generator=generator).double())
+    return Pose(turn @ pose.rotation, 1.01 * pose.translation)
+
+
+def _with_focal(intrinsics: Tensor, factor: float) -> Tensor:
+    return intrinsics * torch.tensor([[factor] * 2 + [1.0]] * 2 + [[1.0] * 3], dtype=intrinsics.dtype)
+
+
+def to(dtype: torch.dtype, tree: Any) -> Any:
+    return pytree.tree_map(lambda x: x.to(dtype) if x.is_floating_point() else x, tree)
+
+
+def take(index: Any, tree: Any) -> Any:
+    """Some problems of a call or of a result."""
+    return pytree.tree_map(lambda x: x[index], tree)
+
+
+def of_pairs(function: Callable[[Tensor], Tensor], call: Call) -> Call:
+    """The call with a function applied to each argument that has an entry for every pair."""
+    shape = call["world_points"].shape[:2]
+    return {
+        name: value
+        if name in ("init", "prior")
+        else pytree.tree_map(lambda x: function(x) if x.shape[:2] == shape else x, value)
+        for name, value in call.items()
+    }
+
+
+def floats(result: PnPResult) -> list[Tensor]:
+    return [x for x in pytree.tree_leaves(result) if isinstance(x, Tensor) and x.is_floating_point()]
+
+
+# --- comparisons ------------------------------------------------------------------------------------------------------
+
+
+def assert_equal(found: Any, expected: Any) -> None:
+    """To the bit."""
+    for one, other in zip(pytree.tree_leaves(found), pytree.tree_leaves(expected), strict=True):
+        assert torch.equal(one, other)
+
+
+def assert_near(found: PnPResult, expected: PnPResult, tolerance: float | None = None) -> None:
+    """The same ``ok``, and the same poses, weights and cameras of the problems that are."""
+    tolerance = TOLERANCE[expected.rotation.dtype] if tolerance is None else tolerance
+    assert torch.equal(found.ok, expected.ok)
+    ok = expected.ok
+    assert ok.any()
+    length = expected.translation.norm(dim=-1, keepdim=True)[ok]
+    close = {"rtol": tolerance, "atol": tolerance}
+    torch.testing.assert_close(found.rotation[ok], expected.rotation[ok], **close)
+    torch.testing.assert_close(found.translation[ok] / length, expected.translation[ok] / length, **close)
+    size = expected.weights[ok].amax(-1, keepdim=True)
+    torch.testing.assert_close(
+        found.weights[ok] / size, expected.weights[ok] / size, rtol=0, atol=min(0.1, 1000 * tolerance)
+    )
+    torch.testing.assert_close(found.intrinsics[ok], expected.intrinsics[ok], rtol=10 * tolerance, atol=tolerance)
+
+
+# --- the laws ---------------------------------------------------------------------------------------------------------
+
+
+def sound(case: Case) -> None:
+    """Shapes, dtypes, rotations; the inputs stay as they are; most problems are solved."""
+    call, truth = make(case)
+    before = pytree.tree_map(torch.clone, call)
+    result = build(case)(**call)
+    n = call["world_points"].shape[1]
+    assert [tuple(x.shape) for x in result[:5]] == [(BATCH, 3, 3), (BATCH, 3), (BATCH, n), (BATCH,), (BATCH,)]
+    assert result.matrix.shape == (BATCH, 4, 4)
+    assert result.ok.dtype == torch.bool
+    assert {x.dtype for x in floats(result)} == {case.dtype}
+    assert all(x.isfinite().all() for x in floats(result))
+    eye = torch.eye(3, dtype=case.dtype).expand(BATCH, 3, 3)
+    torch.testing.assert_close(result.rotation @ result.rotation.mT, eye, rtol=0, atol=1e-5)
+    assert_equal(call, before)
+    if not case.solver.startswith("net-"):  # the first guess of a network is coarse
+        turn = (result.rotation.double() @ truth.rotation.mT).diagonal(dim1=1, dim2=2).sum(-1)
+        assert (turn[result.ok] > 2.99).double().mean() > 0.7
+        assert result.ok.double().mean() > 0.7
+
+
+def alone_is_in_batch(case: Case) -> None:
+    """A problem alone is that problem in a batch, and one problem needs no batch dimension."""
+    call, _ = make(case)
+    result = build(case)(**call)
+    at = int(result.ok.nonzero()[-1])
+    assert_near(build(case)(**take(slice(at, at + 1), call)), take(slice(at, at + 1), result))
+    single = build(case)(**take(at, call))
+    assert single.matrix.shape == (4, 4)
+    assert_near(take(None, single), take(slice(at, at + 1), result))
+
+
+def shuffled_is_ordered(case: Case) -> None:
+    """The order of the pairs does not matter, except to samplers."""
+    call, _ = make(case)
+    result = build(case)(**call)
+    order = torch.randperm(call["world_points"].shape[1], generator=torch.Generator().manual_seed(0))
+    shuffled = build(case)(**of_pairs(lambda x: x[:, order], call))
+    assert_near(shuffled, result._replace(weights=result.weights[:, order]))
+
+
+def padding_is_nothing(case: Case, sound: tuple[str, ...] = ("cam_from_rig",)) -> None:
+    """Pairs that are masked or weigh nothing change nothing, and have weight 0.
+
+    Their numbers do not matter, except in the arguments ``sound``.
+    """
+    call, _ = make(case)
+    batch, n = call["world_points"].shape[:2]
+    there = n - 2
+    mask = (torch.arange(n) < there).expand(batch, n)
+    if case.takes_any_n:
+        expected = build(case)(**of_pairs(lambda x: x[:, :there], call))
+    else:
+        expected = build(case)(**call, mask=mask)
+    spoiled = of_pairs(lambda x: torch.cat((x[:, :there], torch.full_like(x[:, there:], math.nan)), 1), call)
+    spoiled |= {name: call[name] for name in sound if name in call}
+    masked = build(case)(**spoiled, mask=mask)
+    weightless = build(case)(**spoiled, weights=mask.to(case.dtype))
+
+    def cut(result: PnPResult) -> PnPResult:
+        cameras = result.intrinsics[:, :there] if result.intrinsics.ndim == 4 else result.intrinsics
+        return result._replace(weights=result.weights[:, :there], intrinsics=cameras)
+
+    for found in (masked, weightless):
+        assert not found.weights[:, there:].any()
+        assert_near(cut(found), cut(expected))
+
+
+def units_are_free(case: Case) -> None:
+    """World and pixels may count in any unit, together with all that is measured in it."""
+    call, _ = make(case)
+    length, pixel = 1024.0, 0.25
+    result = build(case)(**call)
+    factors = {"world_points": length, "world_sigma": length, "world_cov": length**2}
+    if case.camera == "pixels":
+        factors["img_points"] = pixel
+    factors |= {"img_sigma": pixel, "img_cov": pixel**2}
+    changed = {name: factors[name] * x if name in factors else x for name, x in call.items()}
+    scale = torch.tensor([pixel, pixel, 1.0], dtype=case.dtype)[:, None]
+    changed["intrinsics"] = scale * call["intrinsics"]
+    changed["img_points"] = pixel * call["img_points"] if case.camera == "rig" else changed["img_points"]
+    for name in {"init", "cam_from_rig"} & call.keys():
+        changed[name] = Pose(call[name].rotation, length * call[name].translation)
+    if "prior" in call:
+        unit = torch.tensor([1.0] * 3 + [length] * 3, dtype=case.dtype)
+        pose = Pose(call["prior"].pose.rotation, length * call["prior"].pose.translation)
+        changed["prior"] = PosePrior(pose, call["prior"].information / (unit * unit[:, None]), call["prior"].scale)
+    if case.is_ransac:  # whose threshold is in pixels
+        changed |= {name: x for name, x in call.items() if name.startswith("img") or name == "intrinsics"}
+        scale = torch.ones_like(scale)
+    found = build(case)(**changed)
+    back = found._replace(translation=found.translation / length, intrinsics=found.intrinsics / scale)
+    assert_near(back, result)
+
+
+def frames_are_free(case: Case) -> None:
+    """Poses follow a move of the world; they follow a turn, too, unless the first guess is a network of coordinates."""
+    call, _ = make(case)
+    result = build(case)(**call)
+    turn = axis_angle_to_rotation_matrix(torch.tensor([[0.4, -0.9, 0.7]], dtype=torch.float64)).to(case.dtype)[0]
+    turn = turn if case.takes_any_n else torch.eye(3, dtype=case.dtype)
+    # Of a prior the information would change, because a turn about another origin is another move.
+    shift = torch.tensor([30.0, -20.0, 10.0], dtype=case.dtype) * (case.extra != "prior")
+
+    def followed(pose: Pose) -> Pose:  # x_cam = R a + t with a = Qᵀ (a' - c)
+        rotation = pose.rotation @ turn.mT
+        return Pose(rotation, pose.translation - rotation @ shift)
+
+    changed = {**call, "world_points": call["world_points"] @ turn.mT + shift}
+    if "world_cov" in call:
+        changed["world_cov"] = turn @ call["world_cov"] @ turn.mT
+    if "init" in call:
+        changed["init"] = followed(call["init"])
+    if "prior" in call:
+        changed["prior"] = call["prior"]._replace(pose=followed(call["prior"].pose))
+    found = build(case)(**changed)
+    assert_near(found, result._replace(**followed(result.pose)._asdict()))
+
+
+def _line(call: Call, i: int) -> None:
+    along = torch.arange(call["world_points"].shape[1], dtype=call["world_points"].dtype)[:, None]
+    call["world_points"][i] = along * torch.tensor([1.0, 2.0, -1.0], dtype=along.dtype)
+
+
+def _put(name: str, at: Any, value: float) -> Callable[[Call, int], None]:
+    def spoil(call: Call, i: int) -> None:
+        call[name][i][at] = value
+
+    return spoil
+
+
+#: What makes a problem impossible, by the argument that it needs. From a start that is no pose it may still be solved.
+BAD: dict[str, tuple[str, Callable[[Call, int], None]]] = {
+    "nan point": ("world_points", _put("world_points", (0, 1), math.nan)),
+    "infinite pixel": ("img_points", _put("img_points", (2, 0), math.inf)),
+    "only nan": ("world_points", _put("world_points", ..., math.nan)),
+    "a line": ("world_points", _line),
+    "one point": ("world_points", _put("world_points", ..., 1.5)),
+    "two pairs": ("weights", _put("weights", slice(2, None), 0.0)),
+    "negative weight": ("weights", _put("weights", 0, -1e-3)),
+    "no focal length": ("intrinsics", _put("intrinsics", (..., 0, 0), 0.0)),
+    "nan camera": ("intrinsics", _put("intrinsics", (..., 1, 2), math.nan)),
+    "no pinhole": ("intrinsics", _put("intrinsics", (..., 2, 0), 1e-3)),
+    "negative sigma": ("img_sigma", _put("img_sigma", 3, -1.0)),
+    "infinite length": ("world_sigma", _put("world_sigma", ..., math.inf)),
+    "indefinite pixel": ("img_cov", _put("img_cov", (1, [0, 1], [1, 0]), 1e4)),
+    "negative ellipsoid": ("world_cov", _put("world_cov", (1, [0, 1, 2], [0, 1, 2]), -1.0)),
+    "nan rig": ("cam_from_rig", lambda call, i: call["cam_from_rig"].translation[i, 2, 0].fill_(math.nan)),
+    "nan prior": ("prior", lambda call, i: call["prior"].pose.rotation[i, 0, 0].fill_(math.nan)),
+    "negative information": ("prior", lambda call, i: call["prior"].information[i, 5, 5].fill_(-1.0)),
+    "lopsided information": ("prior", lambda call, i: call["prior"].information[i, 0, 1].fill_(1e5)),
+    "prior without scale": ("prior", lambda call, i: call["prior"].scale[i].fill_(0.0)),
+    "impossible confidence": ("confidence", _put("confidence", 4, 1.1)),
+    "nan start": ("init", lambda call, i: call["init"].rotation[i, 0, 0].fill_(math.nan)),
+}
+
+
+def _with_bad_problems(case: Case) -> tuple[Call, Call, list[str]]:
+    """A call of sound problems, one in which every second problem is bad, with gradients, and the kinds of these."""
+    probe = make(case, 1)[0]
+    kinds = [kind for kind in BAD if BAD[kind][0] in (*probe, "weights")]
+    if case.camera == "bearings":  # of a camera they need the focal length alone
+        kinds = [kind for kind in kinds if kind not in ("nan camera", "no pinhole")]
+    call, _ = make(case, 2 * len(kinds) + 1)
+    call["weights"] = torch.ones_like(call["world_points"][..., 0])
+    spoiled = pytree.tree_map(torch.clone, call)
+    for i, kind in enumerate(kinds):
+        BAD[kind][1](spoiled, 2 * i + 1)
+    return call, pytree.tree_map(lambda x: x.requires_grad_(), spoiled), kinds
+
+
+def _answers(case: Case, result: PnPResult) -> list[Tensor]:
+    """All but the cameras of rigs and bearings, which come back as they were given."""
+    return floats(result if case.camera == "pixels" else result._replace(intrinsics=None))
+
+
+def bad_problems_fail_alone(case: Case) -> None:
+    """They are not ok and finite, say why, and no other problem changes by a bit."""
+    call, spoiled, kinds = _with_bad_problems(case)
+    result = build(case)(**spoiled)
+    assert_equal(take(slice(0, None, 2), result), take(slice(0, None, 2), build(case)(**call)))
+    assert torch.equal(result.status == 0, result.ok)
+    for kind, ok in zip(kinds, result.ok[1::2].tolist(), strict=True):
+        assert kind == "nan start" or not ok, kind
+    assert all(x.isfinite().all() for x in _answers(case, result))
+
+
+def bad_problems_have_no_gradient(case: Case) -> None:
+    """Every output may enter a loss: all gradients are finite, and 0 where there is no answer."""
+    _, spoiled, _ = _with_bad_problems(case)
+    result = build(case)(**spoiled)
+    leaves = pytree.tree_leaves(spoiled)
+    outputs = [x for x in _answers(case, result) if x.requires_grad]
+    gradients = torch.autograd.grad(sum(x.sum() for x in outputs), leaves, retain_graph=True, materialize_grads=True)
+    assert all(x.isfinite().all() for x in gradients)
+    bad = ~result.ok & (torch.arange(len(result.ok)) % 2 == 1)
+    of_bad = torch.autograd.grad(sum(x[bad].sum() for x in outputs), leaves, materialize_grads=True)
+    assert not any(x.any() for x in of_bad)
+
+
+def gradients_reach_the_inputs(case: Case) -> None:
+    """Of each problem that is ok to points, pixels, cameras and noise; finite everywhere."""
+    call = pytree.tree_map(lambda x: x.clone().requires_grad_(), make(case)[0])
+    result = build(case)(**call)
+    names = [name for name in call if name != "init"]
+    leaves = [pytree.tree_leaves(call[name])[0] for name in names]
+    total = result.rotation[:, 0].sum() + result.translation.sum()
+    gradients = torch.autograd.grad(total, leaves, allow_unused=True, materialize_grads=True)
+    assert result.ok.any()
+    for name, gradient in zip(names, gradients, strict=True):
+        assert gradient.isfinite().all(), name
+        there = gradient.reshape(BATCH, -1).any(1)
+        if name in ("world_points", "img_points") or (name == "intrinsics" and case.camera != "bearings"):
+            assert there[result.ok].all(), name
+        assert not there[~result.ok].any(), name
+
+
+LAWS = (
+    sound,
+    alone_is_in_batch,
+    shuffled_is_ordered,
+    padding_is_nothing,
+    units_are_free,
+    frames_are_free,
+    bad_problems_fail_alone,
+    bad_problems_have_no_gradient,
+    gradients_reach_the_inputs,
+)
+
+
+def applies(law: Callable[[Case], None], case: Case) -> bool:
+    """Whether the contract promises the law to the solver.
+
+    Samplers see the places of the pairs. A first guess alone may come from a sample, which is a constant, and a network
+    of a fixed number of pairs makes nothing of fewer without a refinement.
+    """
+    if case.solver.startswith("net-"):
+        return law not in (gradients_reach_the_inputs, padding_is_nothing)
+    samples = case.is_ransac or (case.focal == "unknown" and case.solver != "pnpnet-set")
+    return not (law is shuffled_is_ordered and samples)
+
+
+def is_broken(law: Callable[[Case], None], case: Case) -> bool:
+    """What does not hold yet: bad bearings, and bad cameras of an unknown focal length, have gradients of NaN."""
+    return law is bad_problems_have_no_gradient and (case.camera == "bearings" or case.focal == "unknown")
+
+
+def gradcheck(case: Case) -> None:
+    """Derivatives by all inputs are those of the result: of a refinement that starts near the truth, in float64.
+
+    Each input moves relative to its own size, so that one difference step suits all.
+    """
+    call, _ = make(case._replace(solver="identity-lm"), 1)
+    call |= {"weights": torch.linspace(0.6, 1.4, PAIRS, dtype=torch.float64)[None]}
+    lm = RobustWeightedLM(3, kernel="cauchy", robustness=5.0, learnable=False)
+    if case.focal == "unknown":  # from a start that is a constant to the minimum
+        lm = RobustWeightedLM(30, robustness=0.0, damping=1e-6, learnable=False)
+    solver = PnPNet(None, lm, focal=case.focal)
+    leaves, spec = pytree.tree_flatten(call)
+    sizes = [x.abs().mean() if x.shape[1:] in ((PAIRS, 2), (PAIRS, 3)) else x for x in leaves]
+
+    def run(*changes: Tensor) -> tuple[Tensor, ...]:
+        moved = [x + size * d for x, size, d in zip(leaves, sizes, changes, strict=True)]
+        result = solver(**pytree.tree_unflatten(moved, spec))
+        outputs = result.rotation, result.translation / 10.0, result.weights, result.cost
+        return outputs if case.focal == "known" else (*outputs[:2], result.intrinsics[:, 0, 0].log())
+
+    changes = [torch.zeros_like(x).requires_grad_() for x in leaves]
+    assert solver(**call).ok.all()
+    assert torch.autograd.gradcheck(run, changes, eps=1e-6, atol=1e-4, rtol=1e-3, fast_mode=True)

@@ -1,0 +1,185 @@
+"""EPnP, EPPnP and REPPnP: exact on exact pairs, differentiable, and as successful as their papers and OpenCV."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from kornia_pnpnet import Pose, create_solver, pose_errors, success
+from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet.core.linalg import align
+from kornia_pnpnet.geometry import transform
+
+SOLVERS = {
+    "EPnP": lambda **options: create_solver("epnp", **options),
+    "EPPnP": lambda **options: create_solver("reppnp", reject_outliers=False, **options),
+    "REPPnP": lambda **options: create_solver("reppnp", **options),
+}
+
+
+def flattened(p, thickness=0.0):
+    """The same pixels of points that lie on a slanted plane, apart from bumps of this share of their distances."""
+    normal = torch.tensor([0.2, -0.3, 1.0], dtype=torch.float64)
+    rays = torch.nn.functional.pad(p.img_points / p.intrinsics[:, :1, :1], (0, 1), value=1.0)
+    bumps = torch.randn(p.img_points.shape[:2], generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    cam_points = rays * (20.0 / (rays @ normal) * (1.0 + thickness * bumps))[..., None]
+    return p._replace(world_points=(cam_points - p.pose.translation[:, None]) @ p.pose.rotation)
+
+
+def rate(result, p):
+    return success(pose_errors(result.pose, p.pose)).double().mean()
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize(("n", "planar"), [(6, False), (50, False), (5, True), (20, True)])
+def test_exact_pairs_give_the_exact_pose(name, n, planar, make_problems):
+    p = make_problems(n, 100, noise=False)
+    p, solver = flattened(p) if planar else p, SOLVERS[name]()
+    result = solver(*p[:3])
+    assert result.ok.all()
+    assert result.weights.all()
+    assert pose_errors(result.pose, p.pose).rotation_error_deg.max() < 1e-4
+    single = solver(*(x.float() for x in p[:3]))
+    assert pose_errors(Pose(*(x.double() for x in single.pose)), p.pose).rotation_error_deg.max() < 0.2
+
+
+@pytest.mark.parametrize(("n", "planar", "share"), [(5, False, 1.0), (4, True, 0.99), (4, False, 0.85)])
+def test_four_and_five_exact_pairs_work_through_the_null_space(n, planar, share, make_problems):
+    p = make_problems(n, 500, noise=False)
+    p = flattened(p) if planar else p
+    errors = pose_errors(SOLVERS["EPnP"]()(*p[:3]).pose, p.pose)
+    assert (errors.rotation_error_deg < 1e-3).double().mean() >= share
+
+
+@pytest.mark.parametrize("thickness", [1e-1, 1e-3, 1e-8])
+def test_nearly_planar_points_are_solved(thickness, make_problems):
+    """Below a threshold the thickness is dropped and acts as noise of that size."""
+    p = flattened(make_problems(9, 200, noise=False), thickness)
+    errors = pose_errors(SOLVERS["EPnP"]()(*p[:3]).pose, p.pose)
+    assert (errors.rotation_error_deg < 1.0).double().mean() >= 0.98
+
+
+@pytest.mark.parametrize("name", ["EPnP", "EPPnP"])
+def test_weights_count_pairs(name, make_problems):
+    """A pair of weight 3 counts as three pairs, and a common factor of the weights does not matter."""
+    p, times = make_problems(9, 50), torch.tensor([1, 3, 1, 1, 2, 1, 1, 1, 1])
+    solver = SOLVERS[name]()
+    repeated = solver(*(x.repeat_interleave(times, 1) for x in p[:2]), p.intrinsics)
+    for factor in (1.0, 1e-6):
+        weighted = solver(*p[:3], factor * times.double().expand(50, 9))
+        torch.testing.assert_close(weighted.matrix, repeated.matrix, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize(("n", "outliers"), [(9, 1), (50, 12)])
+def test_gross_outliers_are_found_and_do_not_move_the_pose(n, outliers, make_problems):
+    p = make_problems(n, 200, outliers=outliers, noise=False)
+    cam = transform(p.pose, p.world_points)
+    off = (cam[..., :2] - p.img_points / p.intrinsics[:, :1, :1] * cam[..., 2:]).norm(dim=-1)
+    gross = (p.inliers | (off > 3.0)).all(-1)  # some mismatches happen to be close to the right pixel
+    assert gross.sum() > 100
+    result = SOLVERS["REPPnP"]()(*p[:3])
+    found = ((result.weights > 0) == p.inliers).all(-1)
+    assert found[gross].double().mean() > 0.97
+    assert pose_errors(result.pose, p.pose).rotation_error_deg[found].max() < 1e-4
+    every = SOLVERS["EPPnP"]()(*p[:3])
+    assert success(pose_errors(every.pose, p.pose))[gross].double().mean() < 0.03
+
+
+@pytest.mark.parametrize("thickness", [0.0, 1.0])
+@pytest.mark.parametrize(("dtype", "max_error_deg"), [(torch.float64, 1e-4), (torch.float32, 0.5)])
+def test_a_view_through_a_telephoto_lens(dtype, max_error_deg, thickness, random_rotations, generator):
+    """From a distance of 100 radii there is hardly any depth, and off the axis all pixels nearly coincide."""
+    world = torch.randn(100, 20, 3, generator=generator, dtype=torch.float64)
+    world[..., 2] *= thickness
+    truth = Pose(random_rotations(100), torch.tensor([50.0, -30.0, 100.0], dtype=torch.float64).expand(100, 3))
+    cam_points = transform(truth, world)
+    pixels = 3400.0 * cam_points[..., :2] / cam_points[..., 2:]
+    pixels[:, [2, 5, 11], 0] += 40.0  # more than a radius
+    camera = torch.diag(torch.tensor([3400.0, 3400.0, 1.0])).to(dtype)
+    result = SOLVERS["REPPnP"]()(world.to(dtype), pixels.to(dtype), camera)
+    errors = pose_errors(Pose(*(x.double() for x in result.pose)), truth)
+    assert (errors.rotation_error_deg < max_error_deg).double().mean() > 0.95
+
+
+# Shares of success by pairs and most outliers, about three standard deviations below those of 5000 problems.
+@pytest.mark.parametrize(("n", "most", "floor"), [(9, None, 0.88), (9, 3, 0.715), (20, 6, 0.975), (50, 16, 0.995)])
+def test_success_on_the_protocols_problems(n, most, floor):
+    mix = None if most is None else OutlierMix()
+    assert mix is None or mix.max_count(n) == most
+    p = SyntheticProblems(n=n, batch_size=1000, seed=7, outliers=mix).batch(0)
+    assert rate(SOLVERS["REPPnP"]()(*p[:3]), p) > floor
+
+
+@pytest.mark.parametrize("planar", [False, True])
+@pytest.mark.parametrize("n", [4, 6, 9, 50])
+def test_success_is_at_least_opencvs(n, planar):
+    cv2 = pytest.importorskip("cv2")
+    p = SyntheticProblems(n=n, batch_size=1000, seed=2002, world_sigma=0.0 if planar else 0.05, dtype=torch.float64)
+    p = p.batch(0)
+    p = flattened(p) if planar else p
+    rotation, translation = torch.eye(3).double().repeat(1000, 1, 1), torch.zeros(1000, 3, dtype=torch.float64)
+    for i, (world, img, camera) in enumerate(zip(*(x.numpy() for x in p[:3]), strict=True)):
+        found, turn, shift = cv2.solvePnP(world, img, camera, None, flags=cv2.SOLVEPNP_EPNP)
+        if found:
+            rotation[i], translation[i] = torch.from_numpy(cv2.Rodrigues(turn)[0]), torch.from_numpy(shift[:, 0])
+    theirs = success(pose_errors(Pose(rotation, translation), p.pose)).double().mean()
+    assert rate(SOLVERS["EPnP"]()(*p[:3]), p) >= theirs - 0.01
+
+
+@pytest.mark.parametrize("planar", [False, True])
+@pytest.mark.parametrize("name", SOLVERS)
+def test_gradcheck(name, planar, make_problems, generator):
+    p = make_problems(9, 1, seed=5)
+    p = flattened(p)._replace(img_points=p.img_points + 1.0) if planar else p
+    solver = SOLVERS[name](**({"iterations": 8} if name == "EPnP" else {"refine_iterations": 6}))
+    assert solver(*p[:3]).ok.all()
+
+    # All inputs near 1, so that one difference step suits all.
+    def run(world, pixels, focal, weights):
+        camera = torch.diag(torch.ones(3)).double() * torch.cat(
+            (1000.0 * focal, 1000.0 * focal, torch.ones(1).double())
+        )
+        return tuple(solver(world, 1000.0 * pixels, camera, weights).pose)
+
+    weights = 0.5 + torch.rand(1, 9, generator=generator, dtype=torch.float64)
+    inputs = [p.world_points, p.img_points / 1000.0, p.intrinsics[0, :1, 0] / 1000.0, weights]
+    inputs = [x.detach().clone().requires_grad_() for x in inputs]
+    assert torch.autograd.gradcheck(run, inputs, eps=1e-6, atol=1e-4, rtol=1e-4, fast_mode=True)
+
+
+SQUARE = torch.tensor([[[-1, -1], [1, -1], [-1, 1], [1, 1], [2, 0], [-2, 0]]], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("plane", [SQUARE, SQUARE[:, :4], SQUARE + 0.1 * SQUARE.square()], ids=["six", "four", "odd"])
+def test_a_plane_parallel_to_the_image_has_a_gradient(plane):
+    """There the depth of one direction is free in the equations, but not in the problem."""
+    pixels = (plane / 4.0).requires_grad_()
+    world = torch.nn.functional.pad(plane, (0, 1))
+    result = SOLVERS["EPnP"](iterations=8, gradient="always")(world, pixels, torch.eye(3).double())
+    torch.testing.assert_close(result.translation, torch.tensor([[0.0, 0.0, 4.0]]).double(), rtol=0, atol=1e-8)
+    result.translation[0, 2].backward()
+    # Pixels that grow together come from a camera that is closer: d(1/z) = dz / z.
+    torch.testing.assert_close((pixels.grad * pixels.detach()).sum().item(), -4.0, rtol=1e-5, atol=0)
+
+
+# --- alignment of two sets of points ---------------------------------------------------------------------------------
+
+
+def test_align_recovers_a_similarity_and_minimises_the_squares(generator, random_rotations):
+    world = 20.0 + torch.randn(7, 9, 3, generator=generator, dtype=torch.float64)
+    weights = 0.1 + torch.rand(7, 9, generator=generator, dtype=torch.float64)
+    rotation, shift = random_rotations(7), torch.randn(7, 3, generator=generator, dtype=torch.float64)
+    pose, scale = align(world, 0.5 * world @ rotation.mT + shift[:, None], weights)
+    torch.testing.assert_close(pose.rotation, rotation, rtol=0, atol=1e-9)
+    torch.testing.assert_close(scale, torch.full_like(scale, 0.5))
+    target = world @ rotation.mT + torch.randn(7, 9, 3, generator=generator, dtype=torch.float64)
+    pose, _ = align(world, target, weights)
+
+    def cost(rotation, translation):
+        return (weights[..., None] * (world @ rotation.mT + translation[:, None] - target).square()).sum((1, 2))
+
+    mean = (weights[..., None] * world).sum(1) / weights.sum(-1, keepdim=True)
+    centre = (pose.rotation @ mean[..., None])[..., 0] + pose.translation
+    for seed in range(20):
+        turned = random_rotations(7, angle=0.01, seed=seed) @ pose.rotation
+        assert (cost(turned, centre - (turned @ mean[..., None])[..., 0]) > cost(*pose)).all()
