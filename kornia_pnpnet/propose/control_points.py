@@ -1,10 +1,9 @@
 r"""Control points, which EPnP and REPPnP share.
 
-A world point is :math:`p_i = \sum_j a_{ij} c_j`. In the camera frame the same point has the same coordinates
-:math:`a_{ij}` with unknown :math:`c_j`. Lepetit et al. take four control points :math:`c_j` and barycentric
-coordinates. Here :math:`c_0` is the centroid and :math:`c_1, c_2, c_3` are *vectors* from the centroid, so that
-:math:`a_{i0} = 1`. Both describe the same affine maps, but with vectors the coordinates can be orthonormal,
-:math:`\sum_i w_i a_i a_i^\top = I`, and results do not depend on the axes of the world.
+A world point is :math:`p_i = \sum_j a_{ij} c_j`, and in the camera frame it has the same coordinates :math:`a_{ij}`.
+Lepetit et al. take four control points :math:`c_j` and barycentric coordinates. Here :math:`c_0` is the centroid and
+the others are *vectors* from it, so that the coordinates can be orthonormal, :math:`\sum_i w_i a_i a_i^\top = I`, and
+results do not depend on the axes of the world.
 """
 
 from __future__ import annotations
@@ -23,33 +22,20 @@ _PLANAR_RATIO = 1e-3
 
 
 class ControlPoints(NamedTuple):
-    r"""Control points and the coordinates of the world points.
+    """Control points, coordinates and weights of the pairs. In memory the problems are the last dimension."""
 
-    In memory the problems are the last dimension: elementwise operations are then several times faster.
-
-    Attributes:
-        points: the centroid and three vectors from the centroid, shape :math:`(B, 4, 3)`. The vectors are a square
-            root of the covariance of the points. The third vector of planar points is 0.
-        coordinates: :math:`a`, such that ``coordinates @ points`` are the world points and
-            :math:`\sum_i w_i a_i a_i^\top = I`, shape :math:`(B, N, 4)`. The last coordinate of planar points is 0.
-        weights: the weights of the pairs, with the sum 1, shape :math:`(B, N)`.
-        planar: whether the points lie in one plane (or on a line), bool, shape :math:`(B,)`.
-        ok: whether the points span more than a line, bool, shape :math:`(B,)`.
-    """
-
-    points: Tensor
-    coordinates: Tensor
-    weights: Tensor
-    planar: Tensor
-    ok: Tensor
+    points: Tensor  # the centroid and three vectors, a square root of the covariance; planar: c_3 is 0, (B, 4, 3)
+    coordinates: Tensor  # a: `coordinates @ points` are the world points; planar: the last ones are 0, (B, N, 4)
+    weights: Tensor  # with the sum 1, (B, N)
+    planar: Tensor  # whether the points lie in one plane (or on a line), bool, (B,)
+    ok: Tensor  # whether the points span more than a line, bool, (B,)
 
 
 def control_points(problem: Problem) -> ControlPoints:
     r"""Choose the control points by weighted Gram-Schmidt on the coordinates of the world points.
 
-    The axis along which the points spread most comes first and is projected out of the other axes, and so on. The
-    principal directions of the paper differ only by an orthogonal transform of :math:`c_1, c_2, c_3`; they cost an
-    eigendecomposition and have no gradient where two extents are equal.
+    The axis along which the points spread most is projected out of the other axes, and so on. The principal directions
+    of the paper cost an eigendecomposition and have no gradient where two extents are equal.
 
     Args:
         problem: the problem. Pairs with the weight 0 are ignored.
@@ -69,7 +55,7 @@ def control_points(problem: Problem) -> ControlPoints:
     # An axis below its limit is rounding. The first limit is absolute, the others are relative to the previous extent.
     limit = torch.full_like(total, torch.finfo(rest.dtype).tiny ** 0.5)
     line_ratio = torch.finfo(rest.dtype).eps ** 0.5
-    vectors, coordinates, found = [centroid], [torch.ones_like(weights)], []
+    vectors, axes, found = [centroid], [torch.ones_like(weights)], []
     for ratio in (line_ratio, _PLANAR_RATIO, 1.0):
         variance = (rest.square() * weights).sum(1)  # (3, B)
         largest, position = variance.max(0)
@@ -79,13 +65,8 @@ def control_points(problem: Problem) -> ControlPoints:
         vector = (rest * (weights * axis)).sum(1)  # (3, B)
         rest = rest - vector[:, None] * axis
         vectors.append(vector)
-        coordinates.append(axis)
+        axes.append(axis)
         found.append(there)
         limit = torch.where(there, (largest.detach() * ratio**2).maximum(limit), torch.inf)
-    return ControlPoints(
-        torch.stack(vectors, 1).permute(2, 1, 0),
-        torch.stack(coordinates).permute(2, 1, 0),
-        weights.mT,
-        ~found[2],
-        found[1],
-    )
+    points, coordinates = torch.stack(vectors, 1).permute(2, 1, 0), torch.stack(axes).permute(2, 1, 0)
+    return ControlPoints(points, coordinates, weights.mT, ~found[2], found[1])

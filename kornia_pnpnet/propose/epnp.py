@@ -2,16 +2,14 @@ r"""EPnP: a pose from four or more pairs, in closed form and by a few Gauss-Newt
 
 With orthonormal coordinates (see :mod:`~kornia_pnpnet.propose.control_points`) the equations
 :math:`\sum_j a_{ij} (x_j - u_i z_j) = 0`, and the same with :math:`y` and :math:`v`, are solved for x and y in closed
-form: :math:`x = P z` with :math:`P = \sum_i w_i u_i a_i a_i^\top`, and :math:`y = Q z` with :math:`v_i` instead of
-:math:`u_i`. The remaining algebraic error :math:`z^\top K z` has 4 unknowns where the paper's :math:`M^\top M` has 12,
-and every :math:`z` is a candidate, as in the paper's null space for N = 4. The control vectors in the camera frame are
-the columns of a 3 by 3 matrix :math:`D(z)`. They are the rotated control vectors :math:`L` of the world when
-:math:`D^\top D = L^\top L`. Arrays have the problems in the last dimension.
+form: :math:`x = P z` with :math:`P = \sum_i w_i u_i a_i a_i^\top`, and :math:`y = Q z` with :math:`v_i`. The remaining
+algebraic error :math:`z^\top K z` has 4 unknowns where the paper's :math:`M^\top M` has 12. The control vectors in the
+camera frame are the columns of a 3 by 3 matrix :math:`D(z)`. They are the rotated control vectors :math:`L` of the
+world when :math:`D^\top D = L^\top L`. Arrays have the problems in the last dimension.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -44,45 +42,32 @@ _MAX_SQ_RESIDUAL = 4.0
 # Share of the squared spread of the pixels. A ridge of this size breaks ties between null vectors: equal depths come
 # first, then tilts along the world's longest extents. It affects where the iterations start, not where they end.
 _TIE = 1e-4
-# Upper entries of a symmetric 4 by 4 matrix.
-_UPPER = [(i, j) for i in range(4) for j in range(i, 4)]
 # Upper entries of the Gram matrix of the three control vectors; an entry is the equation of an "edge".
-_EDGES = [(i, j) for i in range(3) for j in range(i, 3)]
+_EDGES = [(i, j) for i in range(1, 4) for j in range(i, 4)]
 
 
 class EPnP(Initialiser):
     r"""EPnP with weights, planar points and gradients, for batches.
 
-    The control points in the camera frame are a combination of the null vectors of the projection equations. The
-    coefficients are chosen so that the control points have the same distances from each other as in the world. Four
-    cases, N = 1 … 4 null vectors, start Gauss-Newton, and the case with the least weighted reprojection error is
-    selected (a point behind the camera counts as an error of two focal lengths). The pose moves the control points of
-    the world to the control points in the camera frame (orthogonal Procrustes).
+    The control points in the camera frame are a combination of the null vectors of the projection equations that keeps
+    the distances of the world. Gauss-Newton starts from four cases, N = 1 … 4 null vectors; the case with the least
+    weighted reprojection error is aligned with the world (orthogonal Procrustes).
 
     Source: V. Lepetit, F. Moreno-Noguer and P. Fua, "EPnP: An Accurate O(n) Solution to the PnP Problem", IJCV 2009.
-    Our changes are for accuracy, for speed, and to avoid eigenvectors of equal eigenvalues:
+    Ours are the elimination of two thirds of the unknowns (see the module), the order of the null vectors (by their
+    algebraic error at equal depth of the centroid, not at equal length), a norm of the distances that does not depend
+    on the choice of the control points, and the algebraic error as a part of the objective: with a dozen noisy pairs
+    the null vectors are not equally free. Planar points use the same equations, with 0 as the fourth control point.
 
-    - Two thirds of the 12 unknowns are eliminated (see the module); the depths of the control
-      points remain. The null vectors are ordered by their algebraic error at equal depth of the centroid instead of
-      equal length. Where fewer than six pairs leave several null vectors, the vectors along the world's longest
-      extents come first.
-    - The distances are compared in a norm that does not depend on the choice of the control points. The algebraic
-      error stays in the objective with the weight ``algebraic_weight``, since with a dozen noisy pairs the null
-      vectors are not equally free. The weight 0 is the paper's method.
-    - Planar points use the same equations, with 0 as the fourth control point.
-
-    Four or five pairs leave up to four solutions in the null space, and the solution with the least reprojection error
-    may be wrong. A problem is not ``ok`` with fewer than four pairs, with points on a line, and when fewer than three
-    pairs are in front of the camera.
-
-    Gradients to points, pixels and weights are first derivatives of the minimum that Gauss-Newton found, by the
-    implicit function theorem. The choice among the cases is not differentiated.
+    Four or five pairs leave up to four solutions, and the solution with the least reprojection error may be incorrect.
+    A problem is not ``ok`` with fewer than four pairs, with points on a line, and when fewer than three pairs are in
+    front of the camera. Gradients to points, pixels and weights are those of the minimum, by the implicit function
+    theorem.
 
     Args:
         iterations: number of Gauss-Newton steps, at least 2: two steps in every case, the other steps in the best case.
         algebraic_weight: :math:`\mu \ge 0`, weight of the algebraic error relative to the squared error of the
-            distances, for points of unit root mean square distance from their centroid and pixels over the focal
-            length.
+            distances, for a world of unit root mean square radius and pixels over the focal length; 0 in the paper.
 
     Raises:
         BaseError: when an argument is out of its range.
@@ -118,14 +103,14 @@ class EPnP(Initialiser):
         problem = problem._replace(weights=problem.usual_weights)
         control = control_points(problem)
         plane_points = (problem.img_points.permute(2, 1, 0) / problem.focal).contiguous()  # (2, N, B)
-        system = _depth_system(control, plane_points)
-        vectors = control.points[:, 1:].permute(2, 1, 0) / system.unit  # (3 axes, 3 vectors, B)
+        system = _depth_system(control, plane_points, self.algebraic_weight)
         with torch.no_grad():
-            depths, solved = self._depths(system, control, plane_points, vectors)
+            depths, solved = self._depths(system)
         if system.error.requires_grad:
-            depths = _attach_gradient(system, depths, control.planar, self.algebraic_weight)
+            depths = _attach_gradient(system, depths)
 
-        camera = torch.stack(_in_camera(system, depths))  # (3, 4, B)
+        vectors = system.vectors
+        camera = torch.stack(_in_camera(system, depths))[:, :, 0]  # (3, 4, B)
         affine = camera[:, 1:]
         rotation, unique = nearest_rotation(small_product(affine, vectors.transpose(0, 1)))
         # The control points miss their distances a little. The scale restores the known size of the world.
@@ -141,83 +126,61 @@ class EPnP(Initialiser):
         pose = Pose(rotation.permute(2, 0, 1).contiguous(), translation.mT.contiguous())
         return Starts(pose, torch.ones_like(problem.weights), ok)
 
-    def _depths(
-        self, system: _DepthSystem, control: ControlPoints, plane_points: Tensor, vectors: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """The depths (4, B) of the best case, and whether they were found (B,); where not, equal depths."""
+    def _depths(self, system: _DepthSystem) -> tuple[Tensor, Tensor]:
+        """The depths (4, 1, B) of the best case, and whether they were found (B,); where not, equal depths."""
         cases = _four_cases(system).detach()  # forward mode starts here: the square roots of 0 have no derivative
-        # The distances do not tell a shape from its mirror image along the optical axis, and Gauss-Newton does not
-        # change the one into the other: symmetric points need both.
+        # A shape and its mirror image along the optical axis have the same distances, and Gauss-Newton does not change
+        # the one into the other: symmetric points need both.
         mirrored = torch.cat((cases[:1, -1:], -cases[1:, -1:]))
-        cases = _minimize(system, torch.cat((cases, mirrored), 1), self.algebraic_weight, _CASE_ITERATIONS)
-        best = _best_case(system, cases, control, plane_points, vectors)
-        depths = cases.gather(1, best.expand(4, 1, -1))[:, 0]
-        depths = _minimize(system, depths, self.algebraic_weight, self.iterations - _CASE_ITERATIONS)
+        cases = _minimize(system, torch.cat((cases, mirrored), 1), _CASE_ITERATIONS)
+        best = cases.gather(1, _best_case(system, cases).expand(4, 1, -1))
+        depths = _minimize(system, best, self.iterations - _CASE_ITERATIONS)
         # Depths beyond the precision of the dtype are a failure; NaN compares false.
         solved = (depths.abs() < 1.0 / torch.finfo(depths.dtype).eps).all(0)
-        flat = torch.zeros_like(depths)
-        flat[0] = 1.0
-        return torch.where(solved, depths, flat), solved
+        return torch.where(solved, depths, system.maps[2][0]), solved[0]
 
 
 class _DepthSystem(NamedTuple):
-    """The equations of the depths of the control points."""
+    """The equations of depths (4, C, B): C candidates for each problem."""
 
-    first: Tensor  # P, (4, 4, B)
-    second: Tensor  # Q, (4, 4, B)
-    error: Tensor  # K, (4, 4, B)
-    gram: Tensor  # the Gram matrix of the control vectors, scaled to the trace 1, (3, 3, B)
+    control: ControlPoints
+    plane_points: Tensor  # (u, v), (2, N, B)
     unit: Tensor  # unit of the depths: the root mean square distance of the points from their centroid, (B,)
+    vectors: Tensor  # the control vectors of the world in this unit, (3 axes, 3 vectors, B)
+    maps: tuple[tuple[Tensor, ...], ...]  # rows (4, 1, B) of P, Q and the identity: x = P z, y = Q z, z
+    error: Tensor  # K, (4, 4, 1, B)
+    prior: Tensor  # half the weighted algebraic error, (4, 4, 1, B)
+    gram: Tensor  # the Gram matrix of the vectors, whose trace is 1, (3, 3, B)
+    target: dict[tuple[int, int], Tensor]  # minus its entry of each edge, (B,)
 
 
-class _Objective(NamedTuple):
-    """The system as :func:`_normal_equations` reads it: rows (4, *, B), and without their first entries (3, *, B)."""
-
-    first: tuple[Tensor, ...]
-    second: tuple[Tensor, ...]
-    first_inner: list[Tensor]
-    second_inner: list[Tensor]
-    prior: Tensor  # half the weighted algebraic error, (4, 4, *, B)
-    target: list[tuple[Tensor, ...]]  # minus the Gram matrix
-    axes: tuple[Tensor, ...]
-
-
-def _symmetric(upper: dict[tuple[int, int], Tensor]) -> Tensor:
-    """Symmetric matrices (*, 4, 4, B) from their upper entries (*, B)."""
-    entries = [upper[min(i, j), max(i, j)] for i in range(4) for j in range(4)]
-    return torch.stack(entries, -2).unflatten(-2, (4, 4))
-
-
-def _depth_system(control: ControlPoints, plane_points: Tensor) -> _DepthSystem:
-    """Eliminate the x and y coordinates of the control points; ``plane_points`` are (u, v), (2, N, B)."""
-    coordinates = control.coordinates.permute(2, 1, 0).unbind(0)[1:]  # (N, B) each; the first is 1
-    weights = control.weights.mT
-    weighted = [weights, *(weights * a for a in coordinates)]
-    scaled = [plane_points, *(plane_points * a for a in coordinates)]  # (2, N, B) each
-    moments = {(i, j): (weighted[i] * scaled[j]).sum(1) for i, j in _UPPER}  # (2, B) each
+def _depth_system(control: ControlPoints, plane_points: Tensor, weight: float) -> _DepthSystem:
+    """Eliminate the x and y coordinates of the control points."""
+    coordinates, weights = control.coordinates.permute(2, 1, 0), control.weights.mT
+    scaled = plane_points[:, None] * coordinates  # (2, 4, N, B)
+    moments = [((weights * a) * scaled).sum(2, keepdim=True) for a in coordinates]  # (2, 4, 1, B) each
     # K is a sum of squared residuals of the elimination. As a difference of moments float32 would lose it.
-    errors = []
-    for j in range(4):
-        error = scaled[j] - moments[0, j][:, None]
-        for i, a in enumerate(coordinates, 1):
-            error = torch.addcmul(error, a, moments[min(i, j), max(i, j)][:, None], value=-1)
-        errors.append(error)
-    weighted = [weights * error for error in errors]
-    quadratic = _symmetric({(i, j): (weighted[i] * errors[j]).sum((0, 1)) for i, j in _UPPER})
-    first, second = _symmetric(moments).unbind(0)
-    vectors = control.points[:, 1:].permute(2, 1, 0)  # (3 axes, 3 vectors, B)
+    errors = scaled
+    for a, moment in zip(coordinates, moments, strict=True):
+        errors = torch.addcmul(errors, a, moment, value=-1)
+    weighted = weights * errors
+    quadratic = torch.stack([(weighted[:, j, None] * errors).sum((0, 2)) for j in range(4)])[:, :, None]
+    first, second = torch.stack(moments).unbind(1)  # (4, 4, 1, B) each
+    eye = torch.eye(4, dtype=weights.dtype, device=weights.device)[..., None, None]
+    mean_square = control.points[:, 1:].square().sum((1, 2))
+    unit = torch.where(control.ok, mean_square, 1.0).sqrt()
+    vectors = control.points[:, 1:].permute(2, 1, 0) / unit
     gram = small_product(vectors.transpose(0, 1), vectors)
-    mean_square = torch.where(control.ok, gram[0, 0] + gram[1, 1] + gram[2, 2], 1.0)
-    return _DepthSystem(first, second, quadratic, gram / mean_square, mean_square.sqrt())
+    target = {(k, j): -gram[k - 1, j - 1] for k, j in _EDGES}
+    maps = first.unbind(), second.unbind(), eye.unbind()
+    prior = 0.5 * weight * quadratic
+    return _DepthSystem(control, plane_points, unit, vectors, maps, quadratic, prior, gram, target)
 
 
 def _in_camera(system: _DepthSystem, depths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """x, y and z of the centroid and the vectors in units of ``system.unit``, each (4, *, B), at depths (4, *, B)."""
+    """x, y and z of the centroid and the vectors in units of ``system.unit``, (4, C, B) each."""
     z = depths.unbind(0)
-    shape = (4, *(1,) * (depths.ndim - 2), -1)
-    x = dot((row.view(shape) for row in system.first.unbind(0)), z)  # P is symmetric: its rows are its columns
-    y = dot((row.view(shape) for row in system.second.unbind(0)), z)
-    return x, y, depths
+    return dot(system.maps[0], z), dot(system.maps[1], z), depths  # P is symmetric: its rows are its columns
 
 
 def _null_space(system: _DepthSystem) -> Tensor:
@@ -226,19 +189,18 @@ def _null_space(system: _DepthSystem) -> Tensor:
     The first vector has the least error with the centroid at depth 1. The other vectors have the centroid at depth 0;
     they are the eigenvectors of the rest of K, so that K is diagonal in this basis.
     """
-    first, second, error, gram = system.first, system.second, system.error, system.gram
-    spread = error[0, 0] + (first[0, 1:].square() + second[0, 1:].square()).sum(0)
-    eye = torch.eye(3, dtype=gram.dtype, device=gram.device)[..., None]
-    inner = torch.addcmul(error[1:, 1:], _TIE * spread, 1.1 * eye - gram)
-    usual = torch.zeros_like(first[0, 1:])  # (3, B)
+    error = system.error[:, :, 0]
+    first, second = (rows[0][1:, 0] for rows in system.maps[:2])  # (3, B) each
+    spread = error[0, 0] + (first.square() + second.square()).sum(0)
+    eye = torch.eye(3, dtype=error.dtype, device=error.device)[..., None]
+    usual = torch.zeros_like(first)
     directions = []
-    for value, direction in eigenvectors(inner):
+    for value, direction in eigenvectors(torch.addcmul(error[1:, 1:], _TIE * spread, 1.1 * eye - system.gram)):
         along = dot(error[0, 1:].unbind(0), direction.unbind(0)) / value
         usual = torch.addcmul(usual, along, direction, value=-1)
         directions.append(direction)
-    top = eye.new_zeros(4, 1)
-    top[0] = 1.0
-    return torch.cat((top.expand(1, 4, *spread.shape), torch.stack((usual, *directions), 1)))
+    top = system.maps[2][0][:, 0].expand(1, 4, *spread.shape)
+    return torch.cat((top, torch.stack((usual, *directions), 1)))
 
 
 def _four_cases(system: _DepthSystem) -> Tensor:
@@ -248,68 +210,48 @@ def _four_cases(system: _DepthSystem) -> Tensor:
     the smallest product. N = 4 adds :math:`\beta_1 \beta_4`, so that there are as many unknowns as equations (the paper
     linearises the four remaining products again). The systems of all cases are leading blocks of one system.
     """
-    basis = _null_space(system)  # (4, 4 vectors, B)
-    camera = _in_camera(system, basis)
-    vectors = [axis.unbind(0)[1:] for axis in camera]  # (4 vectors, B) for each axis and control vector
-    single = [[control.unbind(0) for control in axis] for axis in vectors]
+    basis = _null_space(system)
+    camera = [axis.unbind(0) for axis in _in_camera(system, basis)]  # (4 vectors, B) for each axis and control point
+    single = [[control.unbind(0) for control in axis] for axis in camera]
     normal, rhs = basis.new_zeros(6, 6, basis.shape[-1]), basis.new_zeros(6, basis.shape[-1])
     for k, j in _EDGES:
         sides = [(k, j), (j, k)] if k != j else [(k, j)]
         terms = [(axis, *side) for axis in range(3) for side in sides]
         # The unknowns are ½β₁², β₁β₂, β₁β₃, β₁β₄, ½β₂², β₂β₃; the equation of an edge with itself is halved.
         parts = [
-            dot((single[c][a][m] for c, a, _ in terms), (vectors[c][b][others] for c, _, b in terms))
+            dot((single[c][a][m] for c, a, _ in terms), (camera[c][b][others] for c, _, b in terms))
             for m, others in ((0, slice(0, 4)), (1, slice(1, 3)))
         ]
         row = torch.cat(parts)  # (6, B)
-        target, weight = (system.gram[k, j], 2.0) if k != j else (0.5 * system.gram[k, j], 4.0)
+        weight, half = (2.0, 1.0) if k != j else (4.0, 0.5)
         normal.addcmul_(row[:, None], row, value=weight)
-        rhs.addcmul_(target, row, value=weight)
+        rhs.addcmul_(system.target[k, j], row, value=-half * weight)
     nested = (0, 1, 4, 2, 5, 3)
     rows, right = [row.unbind(0) for row in normal.unbind(0)], rhs.unbind(0)
-    one, two, three, four = solve_leading(
-        [[rows[i][j] for j in nested] for i in nested], [right[i] for i in nested], (1, 3, 5, 6)
-    )
-    zero = torch.zeros_like(one[0])
-    square = torch.stack((one[0], two[0], three[0], four[0]))
+    solutions = solve_leading([[rows[i][j] for j in nested] for i in nested], [right[i] for i in nested], (1, 3, 5, 6))
+    zero = torch.zeros_like(right[0])
+    padded = [torch.stack([*x, *[zero] * (6 - len(x))]) for x in solutions]
+    square, mixed, other, third, _, fourth = torch.stack(padded, 1).unbind(0)  # (4 cases, B) each
     sign = square.sign()
     first = (2.0 * square.abs()).sqrt()
+    second = (2.0 * sign * other).clamp(min=0.0).sqrt().copysign(sign * mixed)
     inverse = sign / first
-    mixed = torch.stack((zero, two[1], three[1], four[1])) * sign
-    square = torch.stack((zero, two[2], three[2], four[2])) * sign
-    second = (2.0 * square).clamp(min=0.0).sqrt().copysign(mixed)
-    third = torch.stack((zero, zero, three[3], four[3])) * inverse
-    fourth = torch.stack((zero, zero, zero, four[5])) * inverse
-    return dot(basis[:, :, None].unbind(1), (first, second, third, fourth))
+    return dot(basis[:, :, None].unbind(1), (first, second, third * inverse, fourth * inverse))
 
 
-def _objective(system: _DepthSystem, weight: float, cases: bool) -> _Objective:
-    """Lay out the system for one candidate per problem, or, with ``cases``, for several in the middle dimension."""
-    shape = (4, 1, -1) if cases else (4, -1)
-    first, second = (tuple(row.view(shape) for row in x.unbind(0)) for x in (system.first, system.second))
-    eye = torch.eye(4, dtype=system.error.dtype, device=system.error.device)
-    return _Objective(
-        first,
-        second,
-        [row[1:] for row in first],
-        [row[1:] for row in second],
-        (0.5 * weight * system.error).view(4, *shape),
-        [row.unbind(0) for row in (-system.gram).unbind(0)],
-        tuple(row.view(4, *(1,) * (len(shape) - 1)) for row in eye[1:].unbind(0)),
-    )
-
-
-def _normal_equations(objective: _Objective, depths: Tensor) -> tuple[Tensor, Tensor, dict[tuple[int, int], Tensor]]:
-    r"""Half of :math:`J^\top J` (4, 4, *, B) and of :math:`J^\top r` (4, *, B), and the misfits of the edges (*, B)."""
-    first, second, first_inner, second_inner, prior, target, axes = objective
-    z = depths.unbind(0)
-    normal, gradient, misfits = prior.expand(4, *depths.shape).clone(), dot(prior.unbind(0), z), {}
-    x, y, z = dot(first_inner, z).unbind(0), dot(second_inner, z).unbind(0), z[1:]
+def _normal_equations(system: _DepthSystem, depths: Tensor) -> tuple[Tensor, Tensor, dict[tuple[int, int], Tensor]]:
+    r"""Half of :math:`J^\top J` (4, 4, C, B) and of :math:`J^\top r` (4, C, B), and the misfits of the edges (C, B)."""
+    p, q, axes = system.maps
+    normal, misfits = system.prior.expand(4, *depths.shape).clone(), {}
+    gradient = dot(system.prior.unbind(0), depths.unbind(0))
+    x, y, z = (axis.unbind(0) for axis in _in_camera(system, depths))
     for k, j in _EDGES:
-        misfits[k, j] = misfit = torch.addcmul(target[k][j], x[k], x[j]).addcmul_(y[k], y[j]).addcmul_(z[k], z[j])
-        slope = (x[k] * first[j + 1]).addcmul_(y[k], second[j + 1]).addcmul_(z[k], axes[j])
+        misfits[k, j] = misfit = (
+            torch.addcmul(system.target[k, j], x[k], x[j]).addcmul_(y[k], y[j]).addcmul_(z[k], z[j])
+        )
+        slope = (x[k] * p[j]).addcmul_(y[k], q[j]).addcmul_(z[k], axes[j])
         if k != j:
-            slope.addcmul_(x[j], first[k + 1]).addcmul_(y[j], second[k + 1]).addcmul_(z[j], axes[k])
+            slope.addcmul_(x[j], p[k]).addcmul_(y[j], q[k]).addcmul_(z[j], axes[k])
         # A diagonal entry of the Gram matrix appears once in the Frobenius norm, and its slope is halved; the other
         # entries appear twice.
         normal.addcmul_(slope[:, None], slope, value=1.0 if k != j else 2.0)
@@ -317,92 +259,71 @@ def _normal_equations(objective: _Objective, depths: Tensor) -> tuple[Tensor, Te
     return normal, gradient, misfits
 
 
-def _minimize(system: _DepthSystem, depths: Tensor, weight: float, iterations: int) -> Tensor:
-    r"""Gauss-Newton on :math:`\|D^\top D - L^\top L\|_F^2 + \mu\, z^\top K z`; depths (4, B) or (4, C, B).
+def _minimize(system: _DepthSystem, depths: Tensor, iterations: int) -> Tensor:
+    r"""Gauss-Newton on :math:`\|D^\top D - L^\top L\|_F^2 + \mu\, z^\top K z`.
 
-    The six entries of the Gram matrix are equivalent to the paper's six distances between control points, but their
-    norm does not depend on the choice of the control points.
+    The six entries of the Gram matrix are equivalent to the paper's six distances between control points.
     """
-    objective = _objective(system, weight, depths.ndim > 2)
     for _ in range(iterations):
-        normal, gradient, _ = _normal_equations(objective, depths)
+        normal, gradient, _ = _normal_equations(system, depths)
         (step,) = solve_leading((row.unbind(0) for row in normal.unbind(0)), gradient.unbind(0), (4,))
         depths = depths - torch.stack(step)
     return depths
 
 
-def _attach_gradient(system: _DepthSystem, depths: Tensor, planar: Tensor, weight: float) -> Tensor:
-    r"""Give a minimum (4, B) its gradient by the implicit function theorem; 0 where the minimum is not isolated.
+def _attach_gradient(system: _DepthSystem, depths: Tensor) -> Tensor:
+    r"""Give a minimum (4, 1, B) its gradient by the implicit function theorem; 0 where the minimum is not isolated.
 
     The result has the value of ``depths`` and the derivatives of two Newton steps with a constant matrix: the first
-    step makes first derivatives exact, the second step second derivatives. So the iterations need not be
-    differentiated, and the gradient does not depend on how the minimum was found.
+    step makes first derivatives exact, the second step second derivatives.
     """
-    objective, depths = _objective(system, weight, False), depths.detach()
-    normal, gradient, misfits = _normal_equations(objective, depths)
+    depths = depths.detach()
+    normal, gradient, misfits = _normal_equations(system, depths)
     with torch.no_grad():
-        entries = [misfits[min(i, j), max(i, j)] for i in range(3) for j in range(3)]
+        entries = [misfits[min(i, j), max(i, j)] for i in range(1, 4) for j in range(1, 4)]
         misfit = torch.stack(entries).unflatten(0, (3, 3))
-        for matrix in (system.first[1:], system.second[1:]):
+        for rows in system.maps:
+            matrix = torch.stack(rows[1:])
             normal = normal + small_product(matrix.transpose(0, 1), small_product(misfit, matrix))
-        normal = normal + torch.nn.functional.pad(misfit, (0, 0, 1, 0, 1, 0))
         # The depth of the third vector of planar points is always 0: an identity row keeps the system regular.
-        last = torch.zeros_like(normal[:, :, :1])
-        last[3, 3] = 1.0
-        normal = normal + last * planar
+        normal[3, 3] += system.control.planar
         # The four columns of the inverse, one system each.
-        eye = torch.eye(4, dtype=depths.dtype, device=depths.device)[..., None].expand_as(normal).flatten(1)
-        repeated = normal[:, :, None].expand(-1, -1, 4, -1).flatten(2)
-        columns, solved = solve_positive(repeated, eye, depths.new_zeros(()))
-        inverse = torch.where(solved, columns, 0.0).unflatten(1, (4, -1))  # (4, 4, B)
+        eye = torch.eye(4, dtype=depths.dtype, device=depths.device)[..., None].expand_as(normal[:, :, 0])
+        repeated = normal.expand(-1, -1, 4, -1).flatten(2)
+        columns, solved = solve_positive(repeated, eye.flatten(1), depths.new_zeros(()))
+        inverse = torch.where(solved, columns, 0.0).unflatten(1, (4, 1, -1))  # (4, 4, 1, B)
     for again in (True, False):
         step = small_product(inverse, gradient[:, None])[:, 0]
         depths = depths - step + step.detach()
         if again:
-            gradient = _normal_equations(objective, depths)[1]
+            gradient = _normal_equations(system, depths)[1]
     return depths
 
 
-def _frame(one: Sequence[Tensor], two: Sequence[Tensor]) -> list[tuple[Tensor, ...]]:
-    """Orthonormal axes from two vectors by Gram-Schmidt; a vector is a triple of tensors."""
-    length = dot(one, one).rsqrt()
-    a, b, c = (entry * length for entry in one)
-    along = dot((a, b, c), two)
-    two = [torch.addcmul(entry, along, axis, value=-1) for entry, axis in zip(two, (a, b, c), strict=True)]
-    length = dot(two, two).rsqrt()
-    d, e, f = (entry * length for entry in two)
-    return [(a, b, c), (d, e, f), (b * f - c * e, c * d - a * f, a * e - b * d)]
+def _frame(one: Tensor, two: Tensor) -> Tensor:
+    """Orthonormal axes (3, 3 axes, *) from two vectors (3, *) by Gram-Schmidt."""
+    first = one * dot(one.unbind(), one.unbind()).rsqrt()
+    second = torch.addcmul(two, dot(first.unbind(), two.unbind()), first, value=-1)
+    second = second * dot(second.unbind(), second.unbind()).rsqrt()
+    return torch.stack((first, second, torch.linalg.cross(first, second, dim=0)), 1)
 
 
-def _best_case(
-    system: _DepthSystem, cases: Tensor, control: ControlPoints, plane_points: Tensor, vectors: Tensor
-) -> Tensor:
+def _best_case(system: _DepthSystem, cases: Tensor) -> Tensor:
     """Number (B,) of the case with the least weighted sum of squared reprojection errors, of depths (4, C, B).
 
     The control vectors of a case are nearly the rotated control vectors of the world. The rotation between frames of
     two of these vectors, which is faster, replaces Procrustes.
     """
-    camera = zip(*(axis.unbind(0) for axis in _in_camera(system, cases)), strict=True)
-    centroid, *affine = camera  # triples of (C, B)
-    world = [vector.unbind(0) for vector in vectors.unbind(1)]  # triples of (B,)
-    axes, world_axes = _frame(*affine[:2]), _frame(*world[:2])
-    entries = [[dot(axis, vector) for axis in world_axes] for vector in world]
-    points = [centroid, *([dot(entry, axis) for axis in zip(*axes, strict=True)] for entry in entries)]
-    cases_first = [[axis.unbind(0) for axis in point] for point in points]
-    coordinates = control.coordinates.permute(2, 1, 0).unbind(0)[1:]  # (N, B) each
-    weights = control.weights.mT
-    minus_u, minus_v = (-plane_points).unbind(0)
-    errors = []
-    for case in range(cases.shape[1]):
-        x, y, z = (
-            torch.addcmul(origin[case], coordinates[0], a[case])
-            .addcmul_(coordinates[1], b[case])
-            .addcmul_(coordinates[2], c[case])
-            for origin, a, b, c in zip(*cases_first, strict=True)
-        )  # (N, B) each
-        inverse = z.reciprocal()
-        x, y = torch.addcmul(minus_u, x, inverse), torch.addcmul(minus_v, y, inverse)
-        error = (x * x).addcmul_(y, y).clamp_(max=_MAX_SQ_RESIDUAL)
-        error = torch.where(z > 0, error, _MAX_SQ_RESIDUAL)  # failed cases, too: NaN compares false
-        errors.append((error * weights).sum(0))
-    return torch.stack(errors).argmin(0)
+    camera, world = torch.stack(_in_camera(system, cases)), system.vectors[:, :, None]  # (3, 4, C, B), (3, 3, 1, B)
+    world_frame = _frame(world[:, 0], world[:, 1]).transpose(0, 1)
+    turned = small_product(small_product(_frame(camera[:, 1], camera[:, 2]), world_frame), world)  # (3, 3, C, B)
+    points = camera[:, 0, :, None]
+    for vector, coordinate in zip(turned.unbind(1), system.control.coordinates.permute(2, 1, 0)[1:], strict=True):
+        points = torch.addcmul(points, vector[:, :, None], coordinate)  # (3, C, N, B)
+    x, y, z = points.unbind()
+    inverse = z.reciprocal()
+    u, v = system.plane_points
+    x, y = torch.addcmul(-u, x, inverse), torch.addcmul(-v, y, inverse)
+    error = (x * x).addcmul_(y, y).clamp_(max=_MAX_SQ_RESIDUAL)
+    error = torch.where(z > 0, error, _MAX_SQ_RESIDUAL)  # failed cases, too: NaN compares false
+    return (error * system.control.weights.mT).sum(1).argmin(0)
