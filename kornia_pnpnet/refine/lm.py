@@ -67,6 +67,7 @@ class Plan(NamedTuple):
         step: :math:`\gamma` of each iteration, scalars.
         damping: :math:`\lambda` of each iteration, scalars.
         shape: shape of the kernel of each iteration, scalars.
+        count: number :math:`S` of states of each problem.
     """
 
     problem: Problem
@@ -79,6 +80,7 @@ class Plan(NamedTuple):
     step: tuple[Tensor, ...]
     damping: tuple[Tensor, ...]
     shape: tuple[Tensor, ...]
+    count: int
 
 
 class Progress(NamedTuple):
@@ -291,7 +293,7 @@ class RobustWeightedLM(Configured):
         camera = pose.translation[:, : 0 if problem.free_focal is None else 1] * 0.0
         if starts.camera is not None:
             camera = starts.camera.repeat(len(poses), 1)
-        return Plan(problem, prior, guided, by_residual, State(pose, camera), area, noiseless, step, damping, shape)
+        return Plan(problem, prior, guided, by_residual, State(pose, camera), area, noiseless, step, damping, shape, len(poses))
 
     def iterate(self, plan: Plan, m: int | None = None, *, more: int = 0, run: Runner = EAGER) -> tuple[State, Tensor]:
         """Run the iterations: on all poses of a problem, then on the best pose of each, the last by residual.
@@ -306,7 +308,7 @@ class RobustWeightedLM(Configured):
             The last state, and whether the last equations could be solved.
         """
         m = self.m if m is None else min(m, self.m)
-        problem, count = plan.problem, len(plan.state.camera) // max(len(plan.prior), 1)
+        problem, count = plan.problem, plan.count
         hyperparameters = list(zip(plan.step, plan.damping, plan.shape, strict=True))[:m]
         hyperparameters += hyperparameters[-1:] * more
         guided, by_residual = (problem._replace(weights=x) for x in (plan.guided, plan.by_residual))
