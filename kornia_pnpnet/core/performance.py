@@ -35,8 +35,6 @@ __all__ = [
 
 _T = TypeVar("_T")
 
-# -- switches ----------------------------------------------------------------------------------------------------------
-
 
 def compiling() -> bool:
     """Whether ``torch.compile`` or ``torch.export`` traces: loops over chunks would break the graph."""
@@ -62,7 +60,7 @@ def sees_values(x: Tensor) -> bool:
 
 def in_full_precision(device: str) -> AbstractContextManager[Any]:
     """Disable autocast on devices that have it; ``meta`` does not. In a graph for other programs it has no meaning."""
-    if torch.compiler.is_exporting() or not torch.amp.is_autocast_available(device):
+    if exporting() or not torch.amp.is_autocast_available(device):
         return nullcontext()
     return torch.autocast(device, enabled=False)
 
@@ -75,9 +73,6 @@ _FEW_NUMBERS = 4096
 def are_few(x: Tensor) -> bool:
     """Whether calls, not arithmetic, take the time of operations on a tensor: uncompiled, on a CPU, and small."""
     return not compiling() and x.device.type == "cpu" and x.numel() <= _FEW_NUMBERS
-
-
-# -- memory layouts ----------------------------------------------------------------------------------------------------
 
 
 def problems_last(tree: _T) -> _T:
@@ -102,8 +97,6 @@ def repeat_problems(tree: _T, count: int) -> _T:
 def _reversed(x: Tensor) -> Tensor:
     return x.permute(tuple(reversed(range(x.ndim))))
 
-
-# -- order -------------------------------------------------------------------------------------------------------------
 
 # Pairs. Up to this number, compiled and uncompiled, a network of minima and maxima replaces a sort, which waits for
 # mispredicted branches: a third of the time for 9 points of 1000 problems.
@@ -245,9 +238,6 @@ def _order_by_counting(keys: Tensor) -> Tensor:
     return torch.zeros_like(positions).scatter(0, torch.stack(rank).long(), positions).mT
 
 
-# -- one custom operation ----------------------------------------------------------------------------------------------
-
-
 def fold_vmap(size: int, in_dims: Sequence[int | None], *tensors: Tensor) -> list[Tensor]:
     """Make the dimension that ``torch.func.vmap`` maps a part of the batch, which is the first dimension."""
     pairs = zip(tensors, in_dims, strict=True)
@@ -286,10 +276,7 @@ def take_pairs(values: Tensor, index: Tensor) -> Tensor:
     return (_take_pairs if exporting() else torch.ops.kornia_pnpnet.take_pairs)(values, index)
 
 
-# -- the allocator -----------------------------------------------------------------------------------------------------
-
-# Bytes. glibc follows freed chunks up to 32 MiB with its mmap threshold (mallopt(3), M_MMAP_THRESHOLD); 64 KiB are left
-# for its header and for alignment.
+# Bytes. glibc raises its threshold up to 32 MiB (mallopt(3), M_MMAP_THRESHOLD); 64 KiB are left for its header.
 _LARGEST_KEPT = 2**25 - 2**16
 
 

@@ -43,7 +43,7 @@ class Symmetric2(NamedTuple):
         return torch.addcmul(cross * u, self.vv * v, v)
 
     def inverse(self) -> Symmetric2:
-        """The inverse of a positive definite matrix. Eigenvalues near rounding count as if they were larger.
+        """The inverse of a positive definite matrix. Eigenvalues at the level of rounding count as larger.
 
         Example:
             >>> Symmetric2(*torch.tensor([2.0, 1.0, 1.0])).inverse()

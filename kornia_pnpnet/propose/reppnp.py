@@ -144,9 +144,8 @@ class REPPnP(Initialiser):
         if self.reject_outliers:
             for _ in range(self.rigid_iterations):
                 rows = _linearize(pairs, pose)
-                jacobian, normal = rows[:, :6], _normal_matrix(rows, pairs.weights, kept)
-                leverage = _leverage(jacobian, _inverse(normal[..., :6]) @ jacobian)
-                kept = self._keep(pairs, _leave_one_out(rows[:, 6], *leverage, pairs, kept), _RIGID_FLOOR)
+                inverse = _inverse(_normal_matrix(rows, pairs.weights, kept)[..., :6])
+                kept = self._keep(pairs, _leave_one_out(rows[:, 6], rows[:, :6], inverse, pairs, kept), _RIGID_FLOOR)
                 pose = _step(pose, _normal_matrix(rows, pairs.weights, kept))
         return kept, pose
 
@@ -229,13 +228,12 @@ def _null_error(pairs: _Pairs, features: Tensor, null: _Null, kept: Tensor) -> T
     """Squared leave-one-out errors of the null vector, relative to its size, (B, N)."""
     a = pairs.coordinates
     moved = torch.cat((null.solution, null.inverse_gram), -1).mT @ a  # (B, 12, N)
-    from_xy = (moved[:, 8:] * a).sum(1)  # the leverage by x alone, and by y alone
+    from_xy = (moved[:, 8:] * a).sum(1)  # the leverage of u by x alone, and of v by y alone
     # The equations without x and y: coefficients of the depth of the centroid, and of the other depths.
     first = torch.cat((moved[:, 0] - features[:, 4], moved[:, 4] - features[:, 8]), -1)  # (B, 2N)
     rows = torch.cat((moved[:, 1:4] - features[:, 5:8], moved[:, 5:8] - features[:, 9:12]), -1)  # (B, 3, 2N)
     residual = first + (null.control[:, None, 1:, 2] @ rows)[:, 0]
-    uu, uv, vv = _leverage(rows, null.inverse_depths @ rows)
-    sq_error = _leave_one_out(residual, from_xy + uu, uv, from_xy + vv, pairs, kept)
+    sq_error = _leave_one_out(residual, rows, null.inverse_depths, pairs, kept, from_xy)
     sq_size = null.control[:, 1:].square().sum((1, 2))[:, None]
     return sq_error / sq_size.clamp(min=torch.finfo(sq_size.dtype).eps ** 2)
 
@@ -275,24 +273,21 @@ def _step(pose: Pose, normal: Tensor) -> Pose:
     return retract(pose, -(_inverse(normal[..., :6]) @ normal[..., 6:])[..., 0])
 
 
-def _leverage(jacobian: Tensor, solved: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Entries (B, N) of the 2 x 2 leverages from a Jacobian (B, D, 2N) and the inverse normal matrix times it."""
-    count = jacobian.shape[-1] // 2
-    uu, vv = (jacobian * solved).sum(1).chunk(2, -1)
-    return uu, (jacobian[..., :count] * solved[..., count:]).sum(1), vv
-
-
-def _leave_one_out(residual: Tensor, uu: Tensor, uv: Tensor, vv: Tensor, pairs: _Pairs, kept: Tensor) -> Tensor:
+def _leave_one_out(
+    residual: Tensor, jacobian: Tensor, inverse: Tensor, pairs: _Pairs, kept: Tensor, more: Tensor | float = 0.0
+) -> Tensor:
     r"""Decrease of the cost when a pair leaves the fit, or increase when it enters, over its weight, (B, N).
 
-    The value is :math:`e^\top (1 \mp w H)^{-1} e` with the pair's error :math:`e` from ``residual`` (B, 2N) and the
-    entries ``uu``, ``uv``, ``vv`` of its leverage :math:`H`; minus for the kept pairs.
+    The value is :math:`e^\top (1 \mp w H)^{-1} e`, minus for the kept pairs, with the pair's errors (B, 2N) and the
+    leverage :math:`H` from the Jacobian (B, D, 2N) and the inverse normal matrix; ``more`` is added to its diagonal.
     """
+    count, solved = kept.shape[-1], inverse @ jacobian
+    uu, vv = (jacobian * solved).sum(1).chunk(2, -1)
     e_u, e_v = residual.chunk(2, -1)
     weights = torch.where(kept, pairs.weights, -pairs.weights)
-    a = (1.0 + _LEVERAGE_RIDGE) - weights * uu
-    d = (1.0 + _LEVERAGE_RIDGE) - weights * vv
-    b = weights * uv
+    a = (1.0 + _LEVERAGE_RIDGE) - weights * (more + uu)
+    d = (1.0 + _LEVERAGE_RIDGE) - weights * (more + vv)
+    b = weights * (jacobian[..., :count] * solved[..., count:]).sum(1)
     return (d * e_u * e_u + 2.0 * b * e_u * e_v + a * e_v * e_v) / (a * d - b * b).clamp(min=_LEVERAGE_RIDGE**2)
 
 

@@ -24,12 +24,9 @@ __all__ = ["SetInit"]
 
 _T = TypeVar("_T")
 
-# Numbers per pair: 3 of the world, 2 of the image, 2 of the residual, 3 of the problem, 2 of the noise, 2 flags.
+# Numbers per pair: 3 of the world, 2 of the image, 2 of the residual, 3 of the problem, 2 of the noise, 2 flags. Also 2
+# with confidences (logit and flag), and 2 with repeats (pairs with the same pixel, and with the same point).
 _FEATURES = 14
-# With confidences: their logit and a flag more.
-_CONFIDENCE_FEATURES = 2
-# With repeats: the logarithms of the numbers of pairs with the same pixel and with the same point.
-_REPEAT_FEATURES = 2
 # Pairs. The softmax of PyTorch 2.13 takes its slow way through rows of fewer numbers.
 _SHORT = 16
 # Added to the score of padding.
@@ -41,8 +38,8 @@ _SAMPLES = ((0, 1, 2), (0, 1, 3), (2, 3, 4), (2, 3, 5), (0, 4, 5), (1, 4, 5), (0
 _SPREADS = {18: 3, 24: 4, 30: 5}
 # From 36 pairs on, 25 further samples: each of the 25 likeliest pairs is in three of them, no two pairs meet twice.
 _RING = {36: [(a, b, c) for i in range(25) for a, b, c in [sorted((i, (i + 1) % 25, (i + 6) % 25))]]}
-#: Number of top-ranked pairs that score each hypothesis.
-MOST_JUDGES = 32
+# Number of top-ranked pairs that score each hypothesis.
+_MOST_JUDGES = 32
 # Slots for poses of minimal samples. With more slots than this, empty slots are removed before scoring (CPU only).
 _MANY_SLOTS = 64
 # Variances. Squared residuals of this size halve the score of a pair.
@@ -215,7 +212,7 @@ class SetInit(Initialiser):
         self.starts = starts
         self.confidence = confidence
         self.repeats = repeats
-        self.first = nn.Linear(_FEATURES + _CONFIDENCE_FEATURES * confidence + _REPEAT_FEATURES * repeats, width)
+        self.first = nn.Linear(_FEATURES + 2 * confidence + 2 * repeats, width)
         self.blocks = nn.ModuleList(_Block(width, heads, hidden) for _ in range(layers))
         self.norm = nn.LayerNorm(width)
         # Per pair: the logit of being an inlier; per hypothesis a weight and a distance along the ray.
@@ -223,9 +220,8 @@ class SetInit(Initialiser):
         # Per problem: the distance of the world in each hypothesis; the noise of pixels and of points.
         self.problem = nn.Linear(width, starts + 2)
         with torch.no_grad():
-            self.pair.weight *= 0.3
-            self.problem.weight *= 0.1
-            for layer in (self.pair, self.problem):
+            for layer, scale in ((self.pair, 0.3), (self.problem, 0.1)):
+                layer.weight *= scale
                 layer.bias.zero_()
             self.pair.bias[0] = 2.0
 
@@ -303,9 +299,9 @@ class SetInit(Initialiser):
         of_pairs = torch.cat((problem.world_points, problem.img_points / problem.focal, rest), -1)  # (B, N, 7)
         if not isinstance(count, int):  # exported for any number of pairs: pad to the number of judges
             more = of_pairs[:, :1] * torch.tensor((1, 1, 1, 1, 1, 0, 1), dtype=vote.dtype, device=vote.device)
-            of_pairs = torch.cat((of_pairs, more.expand(-1, MOST_JUDGES, -1)), 1)
-            chances, count = functional.pad(chances, (0, MOST_JUDGES)), count + MOST_JUDGES
-        likely = chances.topk(min(MOST_JUDGES, count)).indices
+            of_pairs = torch.cat((of_pairs, more.expand(-1, _MOST_JUDGES, -1)), 1)
+            chances, count = functional.pad(chances, (0, _MOST_JUDGES)), count + _MOST_JUDGES
+        likely = chances.topk(min(_MOST_JUDGES, count)).indices
         pairs = take_pairs(of_pairs, likely)  # (7, K, B)
         samples = self.triples(count, search_follows=search_follows)
         drawn = [sample for group in samples.values() for sample in group]
