@@ -19,9 +19,9 @@ def matrices(size, count=200, eigenvalues=None):
 
 
 def full(symmetric):
-    rows = symmetric.rows
-    size = range(len(rows))
-    return torch.stack([torch.stack([rows[max(i, j)][min(i, j)] for j in size], -1) for i in size], -2)
+    size = range(2 if len(symmetric) == 3 else 3)
+    upper = dict(zip([(i, j) for i in size for j in size[i:]], symmetric, strict=True))
+    return torch.stack([torch.stack([upper[min(i, j), max(i, j)] for j in size], -1) for i in size], -2)
 
 
 @pytest.mark.parametrize("size", [2, 3])

@@ -1,4 +1,4 @@
-"""Functions that are compiled when they are first called, and what the compilers of PyTorch need to be told."""
+"""Functions that are compiled when they are first called, and options of the compilers of PyTorch."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ _T = TypeVar("_T")
 _LIMITS: dict[str, Any] = {"recompile_limit": 64, "isolate_recompiles": True}
 _LIMITS = _LIMITS if "isolate_recompiles" in inspect.signature(torch.compile).parameters else {}
 
-# Pairs. From this number on, the loop order that the CPU compiler of PyTorch 2.13 chooses can give wrong results where
-# a problem has more pairs than the batch has problems (it transposes vectors of 16 numbers). The given order is then
-# kept, which takes up to half as long again.
+# Pairs. From this number on, the loop order that the CPU compiler of PyTorch 2.13 chooses can give incorrect results
+# where a problem has more pairs than the batch has problems (it transposes vectors of 16 numbers). The given order is
+# then kept, which takes up to half as long again.
 _MANY_PAIRS = 16
 
 
 class Compiled(Generic[_P, _T]):
-    r"""A function of batches that is compiled when it is first called.
+    """A function of batches that is compiled when it is first called.
 
     The first dimension of its tensors, the batch, may change without a new compilation, except to or from a batch of
-    one. Other sizes, dtypes, and whether gradients are recorded are compiled for anew. When compilation fails, because
-    there is no C++ compiler or because the function cannot be traced, the function runs uncompiled after one warning.
+    one. Other sizes, dtypes, and whether gradients are recorded are compiled for anew. When compilation fails, for
+    example without a C++ compiler, the function runs uncompiled after one warning.
 
     Args:
         function: takes tensors and nested tuples of tensors. The first dimension of each tensor that has one is the
@@ -57,17 +57,19 @@ class Compiled(Generic[_P, _T]):
         # `vec_isa_ok` skips asking the C++ compiler for each instruction set: half of the first compilation. Loops end
         # with single numbers, not with a second vector loop: a third less to compile, and calls take the same time.
         options = {**torch._inductor.list_mode_options(mode or "default"), "cpp.vec_isa_ok": True}
-        options["cpp.enable_loop_tail_vec"] = False
-        options["guard_filter_fn"] = _is_worth_checking
-        few, many = (self._compile(more) for more in (options, {**options, "pick_loop_orders": False}))
-        self._compiled = {False: few, True: many}
+        options.update({"cpp.enable_loop_tail_vec": False, "guard_filter_fn": _needs_check})
+        target = function if _LIMITS else self._leaves
+        self._compiled = [
+            torch.compile(target, fullgraph=True, options=one, **_LIMITS)
+            for one in (options, {**options, "pick_loop_orders": False})
+        ]
         self.failed = False
         self._seen: set[tuple[torch.Size, torch.dtype, int, bool]] = set()
         self._like: dict[Any, _T] = {}
         # The next replay of a CUDA graph overwrites the results of the last one.
         self._copies = bool(options.get("triton.cudagraphs"))
 
-    def __reduce__(self) -> tuple[type[Compiled[_P, _T]], tuple[Callable[_P, _T], str | None]]:
+    def __reduce__(self) -> tuple[Any, ...]:
         """Copies and other processes compile for themselves."""
         return type(self), (self.function, self.mode)
 
@@ -100,31 +102,18 @@ class Compiled(Generic[_P, _T]):
             warnings.warn(f"Not compiled, running uncompiled. {reason[:300]}", RuntimeWarning, stacklevel=3)
             return result
 
-    def _compile(self, options: dict[str, Any]) -> Callable[..., Any]:
-        target = self.function if _LIMITS else self._leaves
-        try:
-            return torch.compile(target, fullgraph=True, options=options, **_LIMITS)
-        except RuntimeError:  # PyTorch before 2.8 does not know all of the options
-            return torch.compile(target, fullgraph=True, mode=self.mode)
-
     def _run(self, compiled: Callable[..., Any], *args: _P.args, **kwargs: _P.kwargs) -> _T:
         """Call the compiled function. A compiler before PyTorch 2.13 returns tensors: some named tuples it cannot."""
         if _LIMITS:
             result = compiled(*args, **kwargs)
         else:
-            like = self._structure(*args, **kwargs)
+            key = torch.is_grad_enabled(), _kinds((args, *kwargs.items()))
+            if key not in self._like:
+                self._like[key] = map_tensors(lambda x: x.new_empty(()), self.function(*args, **kwargs))
             with torch._dynamo.config.patch(cache_size_limit=64):  # all share the code of `_leaves`
-                leaves = dict(enumerate(compiled(*args, **kwargs)))
-            result = map_tensors(lambda _: leaves.pop(min(leaves)), like)
-            assert not leaves
+                leaves = iter(compiled(*args, **kwargs))
+            result = map_tensors(lambda _: next(leaves), self._like[key])
         return map_tensors(torch.clone, result) if self._copies else result
-
-    def _structure(self, *args: _P.args, **kwargs: _P.kwargs) -> _T:
-        """What the function returns, of empty tensors."""
-        key = torch.is_grad_enabled(), _kinds((args, *kwargs.items()))
-        if key not in self._like:
-            self._like[key] = map_tensors(lambda x: x.new_empty(()), self.function(*args, **kwargs))
-        return self._like[key]
 
     def _leaves(self, *args: _P.args, **kwargs: _P.kwargs) -> list[Tensor]:
         return list(iter_tensors(self.function(*args, **kwargs)))
@@ -146,7 +135,7 @@ class Runner:
         self.compiled, self.mode = compiled, mode
         self._functions: dict[str, Compiled[..., Any]] = {}
 
-    def __reduce__(self) -> tuple[type[Runner], tuple[bool, str | None]]:
+    def __reduce__(self) -> tuple[Any, ...]:
         """Copies and other processes compile for themselves."""
         return type(self), (self.compiled, self.mode)
 
@@ -175,17 +164,17 @@ def _kinds(x: Any) -> Any:
 
 
 def per_problem(scalar: Tensor, like: Tensor) -> Tensor:
-    """Expand a scalar to the shape of ``like`` in compiled code; elsewhere, and with a batch, it stays as it is.
+    """Expand a scalar to the shape of ``like`` in compiled code, so that its gradient is summed in float64.
 
-    The gradient of the scalar is then summed in float64. Code for a sum in float32 is compiled anew when the number of
-    addends, which grows with the batch, crosses a limit of the CPU compiler of PyTorch 2.13.
+    A sum in float32 is compiled anew when the number of addends, which grows with the batch, crosses a limit of the CPU
+    compiler of PyTorch 2.13.
     """
     if scalar.ndim or not compiling() or exporting() or like.device.type != "cpu":
         return scalar
     return scalar.double().expand(like.shape).to(like.dtype)
 
 
-def _is_worth_checking(guards: Sequence[Any]) -> list[bool]:
+def _needs_check(guards: Sequence[Any]) -> list[bool]:
     """Skip checks of functions and constants of modules, which do not change: they take time at each call."""
     return [guard.guard_type == "DUPLICATE_INPUT" or not guard.is_global for guard in guards]
 

@@ -1,7 +1,7 @@
-r"""Linear algebra of small matrices, written out in elementwise operations. The batch is the last dimension.
+"""Linear algebra of small matrices, written out in elementwise operations. The batch is the last dimension.
 
-A thousand 3 by 3 matrices are then 9 vectors of a thousand numbers. An operation on such vectors takes about a
-microsecond and its operands stay in the cache; a thousand calls of LAPACK take about a millisecond.
+A thousand 3 by 3 matrices are 9 vectors of a thousand numbers: an operation on such vectors takes about a microsecond,
+a thousand calls of LAPACK about a millisecond.
 """
 
 from __future__ import annotations
@@ -31,7 +31,6 @@ __all__ = [
     "solve_symmetric",
     "span_a_plane",
     "substitute",
-    "symmetric",
 ]
 
 # Sweeps of Jacobi's rotations in `eigenvectors`. After two, the median error of an eigenvalue of a random matrix is
@@ -74,11 +73,9 @@ class _BoundedGradient(torch.autograd.Function):
 
 
 def bound_gradient(values: Tensor, limit: float) -> Tensor:
-    r"""Return the values; their gradient is shortened, per problem, to a norm of at most ``limit``.
+    """Return the values (B, *); their gradient is shortened, per problem, to a norm of at most ``limit``.
 
-    Args:
-        values: shape :math:`(B, *)`.
-        limit: largest norm of the gradient of a problem. A gradient that is not finite becomes 0.
+    A gradient that is not finite becomes 0.
     """
     bounded: Tensor = _BoundedGradient.apply(values, limit)  # type: ignore[no-untyped-call]
     return bounded
@@ -100,29 +97,13 @@ def gate(value: Tensor, live: Tensor, finite: Tensor, fill: float | Tensor) -> T
 
 
 def relative(values: Tensor, size: Tensor) -> Tensor:
-    r"""Divide the values of each problem by the largest ``size`` of that problem.
-
-    Args:
-        values: at least 0, shape :math:`(B, N)`.
-        size: shape :math:`(B, N)`. Its maximum is treated as a constant: no gradient flows through it.
-
-    Returns:
-        Shape :math:`(B, N)`. Where the largest size is 0, the values are returned unchanged.
-    """
+    """Divide the values (B, N) of each problem by its largest ``size`` (B, N), a constant, unless that is 0."""
     largest = size.detach().amax(1, keepdim=True)
     return values / torch.where(largest > 0, largest, 1.0)
 
 
 def small_product(a: Tensor, b: Tensor) -> Tensor:
-    r"""Product of small matrices with the batch last. Several times faster than a batched ``matmul``.
-
-    Args:
-        a: shape :math:`(R, K, *)`.
-        b: shape :math:`(K, C, *)`.
-
-    Returns:
-        Shape :math:`(R, C, *)`.
-    """
+    """Product (R, C, *) of small matrices (R, K, *) and (K, C, *): several times faster than a batched ``matmul``."""
     (first, *others), (row, *rows) = a.unbind(1), b.unbind(0)
     total = first[:, None] * row
     for column, row in zip(others, rows, strict=True):
@@ -131,23 +112,17 @@ def small_product(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _cofactors(matrix: Tensor) -> Tensor:
-    """Cofactors of matrices (3, 3, *). The rows of the result are the cross products of the rows of the matrix."""
+    """Cofactors of matrices (3, 3, *): the rows are the cross products of the rows of the matrix."""
     m = [row.unbind(0) for row in matrix.unbind(0)]
     turns = ((1, 2), (2, 0), (0, 1))
     entries = [torch.addcmul(m[i][k] * m[j][n], m[i][n], m[j][k], value=-1) for i, j in turns for k, n in turns]
     return torch.stack(entries).unflatten(0, (3, 3))
 
 
-def _turn(a: Tensor, b: Tensor) -> Tensor:
-    r"""The vector :math:`v` with :math:`[v]_\times = a^\top b - b^\top a`, (3, *), of matrices (3, 3, *)."""
-    product = small_product(a.transpose(0, 1), b)
-    return torch.stack([product[j, i] - product[i, j] for i, j in ((1, 2), (2, 0), (0, 1))])
-
-
 def _rotation_by_svd(matrix: Tensor) -> tuple[Tensor, Tensor]:
     """:func:`nearest_rotation` by LAPACK, without gradient."""
     limits = torch.finfo(matrix.dtype)
-    flat = matrix.flatten(2).permute(2, 0, 1)
+    flat = matrix.reshape(3, 3, -1).permute(2, 0, 1)
     size = torch.linalg.vector_norm(flat, torch.inf, (1, 2), keepdim=True)  # (B, 1, 1)
     sound = size.clamp(limits.tiny**0.5, limits.max) == size  # LAPACK raises for NaN
     left, values, right = torch.linalg.svd(torch.where(sound, flat, 0.0))
@@ -175,7 +150,7 @@ def _rotation_in_closed_form(matrix: Tensor) -> tuple[Tensor, Tensor]:
     radius = (mean * mean - minors / 3.0).clamp(min=eps * eps).sqrt()
     cosine = (mean * (mean * mean - 0.5 * minors) + 0.5 * determinant * determinant) / radius**3
     largest = (mean + 2.0 * radius * (cosine.clamp(-1.0, 1.0).acos() / 3.0).cos()).sqrt()
-    # The stack makes a compiler compute these values once. Otherwise it repeats them for each of the nine entries.
+    # The stack makes a compiler compute these values once, not for each of the nine entries.
     largest, determinant = torch.stack((largest, determinant))
     # With singular values s₁ ≥ s₂ ≥ |s₃|, the last with the sign of the determinant, the matrix plus its cofactors
     # over s₁ has the same singular vectors and the values first = s₁ + s₂s₃/s₁ and, twice, second = s₂ + s₃, all
@@ -222,17 +197,17 @@ class _NearestRotation(torch.autograd.Function):
         """The change of the rotation by a change of the matrix."""
         # With M = R S, a change dM turns the rotation by dR = R [w], where (tr S - S) w is the vector of Rᵀ dM - dMᵀ R.
         matrix, rotation, unique = saved
-        inner = small_product(rotation.transpose(0, 1), matrix)
+        transposed = rotation.transpose(0, 1)
+        inner = small_product(transposed, matrix)
         size = inner.abs().amax((0, 1))
         inner = inner / torch.where(unique, size, 1.0)
         eye = torch.eye(3, dtype=matrix.dtype, device=matrix.device).view(3, 3, *(1,) * (matrix.ndim - 2))
-        normal = (inner[0, 0] + inner[1, 1] + inner[2, 2]) * eye - inner
-        normal = torch.where(unique, normal, eye)
+        normal = torch.where(unique, (inner[0, 0] + inner[1, 1] + inner[2, 2]) * eye - inner, eye)
         cofactors = _cofactors(normal)
-        determinant = (normal[0] * cofactors[0]).sum(0)
-        determinant = torch.where(unique, determinant * size, 1.0)
-        turn = (cofactors * _turn(rotation, change)).sum(1) / determinant
-        x, y, z = torch.where(unique, turn, 0.0).unbind(0)
+        determinant = torch.where(unique, (normal[0] * cofactors[0]).sum(0) * size, 1.0)
+        turn = small_product(transposed, change)
+        turn = torch.stack([turn[j, i] - turn[i, j] for i, j in ((1, 2), (2, 0), (0, 1))])
+        x, y, z = torch.where(unique, (cofactors * turn).sum(1) / determinant, 0.0).unbind(0)
         zero = torch.zeros_like(x)
         cross = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero)).unflatten(0, (3, 3))
         return small_product(rotation, cross)
@@ -262,9 +237,9 @@ def nearest_rotation(matrix: Tensor) -> tuple[Tensor, Tensor]:
         matrix: :math:`M` with the batch last, shape :math:`(3, 3, *)`.
 
     Returns:
-        The rotations, shape :math:`(3, 3, *)`, and whether each is unique, bool, shape :math:`(*)`. With singular
-        values :math:`s_1 \ge s_2 \ge |s_3|`, where :math:`s_3` has the sign of the determinant, the rotation is unique
-        when :math:`s_2 + s_3 > 0`. Where it is not, the identity without gradient is returned.
+        The rotations, shape :math:`(3, 3, *)`, and whether each is unique, bool, shape :math:`(*)`: whether
+        :math:`s_2 + s_3 > 0` for singular values :math:`s_1 \ge s_2 \ge |s_3|`, the last with the sign of the
+        determinant. Where it is not unique, the identity without gradient is returned.
 
     Example:
         >>> rotation, unique = nearest_rotation(torch.diag(torch.tensor([3.0, 2.0, 0.0])))
@@ -288,13 +263,13 @@ def align(source: Tensor, target: Tensor, weights: Tensor) -> tuple[Tensor, Tens
 
     Returns:
         The rotation :math:`R`, shape :math:`(B, 3, 3)`, the translation :math:`t`, shape :math:`(B, 3)`, and the scale
-        :math:`s`, shape :math:`(B,)`. The best rigid motion is :math:`R x + t`, the best similarity
-        :math:`s R (x - \bar x) + \bar y`, where the bars are weighted means.
+        :math:`s`, shape :math:`(B,)`: the best rigid motion is :math:`R x + t`, and the best similarity has the same
+        rotation.
 
     Example:
         >>> points = torch.tensor([[[0.0, 0, 0], [2, 0, 0], [0, 2, 0], [0, 0, 2]]])
         >>> rotation, translation, scale = align(points, 3.0 * points + 1.0, torch.ones(1, 4))
-        >>> translation, scale
+        >>> translation.round(), scale.round()
         (tensor([[2., 2., 2.]]), tensor([3.]))
     """
     total = weights.sum(-1, keepdim=True)
@@ -310,15 +285,12 @@ def align(source: Tensor, target: Tensor, weights: Tensor) -> tuple[Tensor, Tens
 
 
 def span_a_plane(centred: Tensor, share: Tensor, size: Tensor) -> Tensor:
-    """Whether points span more than a line, so that there are at least three.
+    """Whether points span more than a line, bool (B,).
 
     Args:
         centred: the points minus their mean, 0 for padding, (3, N, B).
         share: one over the number of points, (B,).
         size: the largest coordinate before the points were centred, (B,). Where it is 0 or NaN the result is false.
-
-    Returns:
-        bool of shape (B,).
     """
     # The second largest variance is about the sum of the principal minors of the covariance, (trace² - sum of squares)
     # / 2, over the trace. For points on a line only rounding remains.
@@ -331,19 +303,18 @@ def span_a_plane(centred: Tensor, share: Tensor, size: Tensor) -> Tensor:
 def solve_leading(
     matrix: Iterable[Sequence[Tensor]], rhs: Iterable[Tensor], sizes: Sequence[int]
 ) -> list[list[Tensor]]:
-    r"""Solve the leading blocks of symmetric systems by one LDLᵀ factorisation, entry by entry.
+    """Solve the leading blocks of symmetric systems by one LDLᵀ factorisation, entry by entry.
 
     A small multiple of the diagonal is added to each pivot. A singular system whose right side lies in the range of
     the matrix therefore has a finite solution.
 
     Args:
-        matrix: rows of the positive semi-definite matrices, entries of shape :math:`(*)`. Entries above the diagonal
-            are not read.
-        rhs: entries of the right side, shape :math:`(*)` each.
+        matrix: rows of the positive semi-definite matrices; entries above the diagonal are not read.
+        rhs: entries of the right side.
         sizes: sizes of the leading blocks to solve.
 
     Returns:
-        The entries of the solution of each block, in the order of ``sizes``.
+        The entries of the solution of each block.
 
     Example:
         >>> two, four, six = torch.tensor([[2.0], [4.0], [6.0]])
@@ -368,10 +339,9 @@ def factorise(
     r"""Factorise symmetric matrices into LDLᵀ, entry by entry, and apply the factors to a right side.
 
     Args:
-        rows: rows of the lower triangle with the diagonal, entries of shape :math:`(*)`; overwritten.
-        rest: entries of the right side, shape :math:`(*)` each; overwritten.
-        inverse: maps the index of a pivot and the pivot to the inverse of the pivot. It decides how to treat a pivot
-            of 0.
+        rows: rows of the lower triangle with the diagonal; overwritten.
+        rest: entries of the right side; overwritten.
+        inverse: maps the index of a pivot and the pivot to the inverse of the pivot, also for a pivot of 0.
 
     Returns:
         The entries of :math:`L` below its unit diagonal by (row, column), and :math:`D^{-1} L^{-1}` times the right
@@ -390,15 +360,7 @@ def factorise(
 
 
 def substitute(lower: Mapping[tuple[int, int], Tensor], scaled: Iterable[Tensor]) -> list[Tensor]:
-    r"""Solve :math:`L^\top x = b` by back substitution.
-
-    Args:
-        lower: the entries of :math:`L` that :func:`factorise` returned.
-        scaled: entries of :math:`b`; with fewer entries than :math:`L` has rows, the leading block is solved.
-
-    Returns:
-        The entries of :math:`x`.
-    """
+    """Solve Lᵀ x = b, or the leading block of the size of b, with the entries of L of :func:`factorise`."""
     solution = list(scaled)
     for i in range(len(solution) - 1, 0, -1):
         for k in range(i):
@@ -419,7 +381,7 @@ def solve_positive(matrix: Tensor, right: Tensor, damping: Tensor) -> tuple[Tens
 
     Returns:
         The solutions, shape :math:`(K, B)`, and whether there is a solution, bool :math:`(B,)`: whether all pivots are
-        above rounding, a test that does not depend on units. Without a solution it is 0, and gradients are finite.
+        above rounding, in any units. Without a solution it is 0, and gradients are finite.
 
     Example:
         >>> matrix, right = torch.tensor([[4.0, 0.0], [0.0, 4.0]])[..., None], torch.tensor([[8.0], [4.0]])
@@ -454,7 +416,7 @@ def solve_positive(matrix: Tensor, right: Tensor, damping: Tensor) -> tuple[Tens
 
 
 def eigenvectors(matrix: Tensor) -> list[tuple[Tensor, Tensor]]:
-    r"""Approximate eigenvectors of symmetric 3 by 3 matrices by two sweeps of Jacobi's rotations.
+    """Approximate eigenvectors of symmetric 3 by 3 matrices by two sweeps of Jacobi's rotations.
 
     The vectors are orthonormal up to rounding. They diagonalise the matrix only approximately.
 
@@ -468,33 +430,27 @@ def eigenvectors(matrix: Tensor) -> list[tuple[Tensor, Tensor]]:
     one, zero = torch.ones_like(a[0][0]), torch.zeros_like(a[0][0])
     vectors = [torch.stack([one if i == j else zero for i in range(3)]) for j in range(3)]
     tiny = torch.finfo(matrix.dtype).tiny
-    for _ in range(_SWEEPS):
-        for p, q, r in ((0, 1, 2), (0, 2, 1), (1, 2, 0)):
-            twice, difference = a[p][q] + a[p][q], a[q][q] - a[p][p]
-            root = torch.addcmul(difference * difference, twice, twice).sqrt() + tiny
-            tangent = twice / (difference + root.copysign(difference))
-            cosine = torch.addcmul(one, tangent, tangent).rsqrt()
-            sine = tangent * cosine
-            shift = tangent * a[p][q]
-            a[p][p], a[q][q] = a[p][p] - shift, a[q][q] + shift
-            a[p][q] = a[q][p] = zero
-            old_p, old_q = a[r][p], a[r][q]
-            a[r][p] = a[p][r] = torch.addcmul(cosine * old_p, sine, old_q, value=-1)
-            a[r][q] = a[q][r] = torch.addcmul(cosine * old_q, sine, old_p)
-            old_p, old_q = vectors[p], vectors[q]
-            vectors[p] = torch.addcmul(cosine * old_p, sine, old_q, value=-1)
-            vectors[q] = torch.addcmul(cosine * old_q, sine, old_p)
+    for p, q, r in _SWEEPS * ((0, 1, 2), (0, 2, 1), (1, 2, 0)):
+        twice, difference = a[p][q] + a[p][q], a[q][q] - a[p][p]
+        root = torch.addcmul(difference * difference, twice, twice).sqrt() + tiny
+        tangent = twice / (difference + root.copysign(difference))
+        cosine = torch.addcmul(one, tangent, tangent).rsqrt()
+        sine = tangent * cosine
+        shift = tangent * a[p][q]
+        a[p][p], a[q][q] = a[p][p] - shift, a[q][q] + shift
+        a[p][q] = a[q][p] = zero
+        (low, high), (first, second) = (
+            (torch.addcmul(cosine * x, sine, y, value=-1), torch.addcmul(cosine * y, sine, x))
+            for x, y in ((a[r][p], a[r][q]), (vectors[p], vectors[q]))
+        )
+        a[r][p] = a[p][r] = low
+        a[r][q] = a[q][r] = high
+        vectors[p], vectors[q] = first, second
     pairs = [torch.cat((a[i][i][None], vectors[i])) for i in range(3)]
     for i, j in ((0, 1), (1, 2), (0, 1)):
         swap = pairs[i][0] > pairs[j][0]
         pairs[i], pairs[j] = torch.where(swap, pairs[j], pairs[i]), torch.where(swap, pairs[i], pairs[j])
     return [(pair[0], pair[1:]) for pair in pairs]
-
-
-def symmetric(rows: Sequence[Sequence[Tensor]]) -> Tensor:
-    """The matrices (B, K, K) from the rows of their lower triangles; every entry is of shape (B,)."""
-    size = range(len(rows))
-    return torch.stack([torch.stack([rows[max(i, j)][min(i, j)] for j in size], -1) for i in size], -2)
 
 
 def solve_symmetric(matrix: Tensor, right: Tensor) -> Tensor:

@@ -35,8 +35,6 @@ __all__ = [
 
 _T = TypeVar("_T")
 
-# -- switches ----------------------------------------------------------------------------------------------------------
-
 
 def compiling() -> bool:
     """Whether ``torch.compile`` or ``torch.export`` traces: loops over chunks would break the graph."""
@@ -62,13 +60,13 @@ def sees_values(x: Tensor) -> bool:
 
 def in_full_precision(device: str) -> AbstractContextManager[Any]:
     """Disable autocast on devices that have it; ``meta`` does not. In a graph for other programs it has no meaning."""
-    if torch.compiler.is_exporting() or not torch.amp.is_autocast_available(device):
+    if exporting() or not torch.amp.is_autocast_available(device):
         return nullcontext()
     return torch.autocast(device, enabled=False)
 
 
-# Numbers. Up to here an operation on a processor takes about as long as its call: few operations on larger tensors that
-# repeat some work take less time than many operations on small ones.
+# Numbers. Up to here an operation on a processor takes about as long as its call, so that few operations that repeat
+# work take less time than many operations.
 _FEW_NUMBERS = 4096
 
 
@@ -77,56 +75,38 @@ def are_few(x: Tensor) -> bool:
     return not compiling() and x.device.type == "cpu" and x.numel() <= _FEW_NUMBERS
 
 
-# -- memory layouts ----------------------------------------------------------------------------------------------------
-
-
 def problems_last(tree: _T) -> _T:
     """Lay out tensors (B, N, C) as (C, N, B) in memory; shapes and values stay.
 
-    One coordinate of all problems is then one row of memory, so that elementwise operations run at full width however
-    few pairs a problem has, and a compiler can keep a problem in registers: half the time of an iteration at n = 9.
+    Elementwise operations then run at full width however few pairs a problem has, and a compiler can keep a problem in
+    registers: half the time of an iteration at n = 9.
     """
     return map_tensors(lambda x: _reversed(_reversed(x).contiguous()) if x.ndim > 1 else x, tree)
 
 
 def repeat_problems(tree: _T, count: int) -> _T:
-    """Repeat the batch of every tensor that has one, problems last in memory.
+    """Repeat the batch of every tensor that has one, problems last in memory."""
 
-    The batch is expanded, not repeated by ``Tensor.repeat``: a compiler would compute an index by division for each
-    entry.
-    """
-
-    def repeat(x: Tensor) -> Tensor:
-        if x.ndim == 0:
-            return x
+    def repeat(x: Tensor) -> Tensor:  # `Tensor.repeat` compiles to a division for the index of each entry
         last = _reversed(x)[..., None, :]
         return _reversed(last.expand(*last.shape[:-2], count, -1).flatten(-2))
 
-    return map_tensors(repeat, tree)
+    return map_tensors(lambda x: repeat(x) if x.ndim else x, tree)
 
 
 def _reversed(x: Tensor) -> Tensor:
     return x.permute(tuple(reversed(range(x.ndim))))
 
 
-# -- order -------------------------------------------------------------------------------------------------------------
-
-# Pairs. Up to this number a network of minima and maxima replaces a sort: in a compiled function, where it becomes one
-# loop, and in an uncompiled one. A sort of few numbers mostly waits for branches that were predicted wrongly; a network
-# has none and takes a third of the time for 9 points of 1000 problems.
+# Pairs. Up to this number, compiled and uncompiled, a network of minima and maxima replaces a sort, which waits for
+# mispredicted branches: a third of the time for 9 points of 1000 problems.
 _FEW_COMPILED, _FEW = 12, 32
 # Problems. From this number on, calls of many small operations take less time uncompiled than a call of one sort.
 _MANY_PROBLEMS = 256
 
 
 def in_order(values: Tensor) -> Tensor:
-    """Sort along the second dimension.
-
-    Args:
-        values: no NaN, shape :math:`(C, N, B)`.
-
-    Returns:
-        The values in ascending order, shape :math:`(C, N, B)`.
+    """Sort values without NaN, (C, N, B), along the second dimension.
 
     Example:
         >>> in_order(torch.tensor([[[3.0], [1.0], [2.0]]])).flatten()
@@ -139,7 +119,7 @@ def in_order(values: Tensor) -> Tensor:
 
 
 def ranked(values: Tensor, rank: Tensor | int) -> Tensor:
-    """Find the value of a rank along the second dimension.
+    """Find the value of a rank, along the second dimension.
 
     Args:
         values: no NaN, shape :math:`(C, N, B)`.
@@ -179,9 +159,8 @@ def _through_network(values: Tensor, rank: int | None) -> list[Tensor]:
 
 @cache
 def _network(count: int, rank: int | None) -> list[tuple[int, int, bool, bool]]:
-    """The comparisons that sort ``count`` numbers, or that find one of them.
+    """Comparisons that sort numbers, or find one: two positions, and whether their minimum and maximum are needed.
 
-    Each entry is two positions, and whether the smaller and the larger number at them matter for what is to be found.
     Source: D. Knuth, "The Art of Computer Programming", volume 3, algorithm 5.2.2M (Batcher's merge exchange).
     """
     pairs = []
@@ -202,10 +181,7 @@ def _network(count: int, rank: int | None) -> list[tuple[int, int, bool, bool]]:
 
 
 def present_first(present: Tensor) -> Tensor:
-    """Positions of the pairs that are present, then of the others, each in order: a stable sort, but faster.
-
-    Args:
-        present: bool, shape :math:`(B, N)`.
+    """Positions of the pairs that are present (B, N), then of the others, each in order: a stable sort, but faster.
 
     Example:
         >>> present_first(torch.tensor([[False, True, True]]))
@@ -262,15 +238,10 @@ def _order_by_counting(keys: Tensor) -> Tensor:
     return torch.zeros_like(positions).scatter(0, torch.stack(rank).long(), positions).mT
 
 
-# -- one custom operation ----------------------------------------------------------------------------------------------
-
-
 def fold_vmap(size: int, in_dims: Sequence[int | None], *tensors: Tensor) -> list[Tensor]:
     """Make the dimension that ``torch.func.vmap`` maps a part of the batch, which is the first dimension."""
-    moved = [
-        x.expand(size, *x.shape) if dim is None else x.movedim(dim, 0) for x, dim in zip(tensors, in_dims, strict=True)
-    ]
-    return [x.flatten(0, 1) for x in moved]
+    pairs = zip(tensors, in_dims, strict=True)
+    return [(x.expand(size, *x.shape) if dim is None else x.movedim(dim, 0)).flatten(0, 1) for x, dim in pairs]
 
 
 def unfold_vmap(size: int, result: Tensor) -> Tensor:
@@ -282,9 +253,8 @@ def _take_pairs(values: Tensor, index: Tensor) -> Tensor:
     return values.permute(2, 1, 0).gather(1, index.mT.expand(values.shape[-1], -1, -1))
 
 
-# A compiler does not look inside, so that the result is laid out as it says. Fused into what reads it, every reader
-# would gather anew: the compiled hypotheses of the set network take a third longer. `torch.library.custom_op` would do
-# the same, but its first call imports 800 modules, which takes 2 to 3 s.
+# Compilers do not look inside: fused into its readers, each would gather anew, and the compiled hypotheses of the set
+# network take a third longer. The first call of `torch.library.custom_op` would import 800 modules, for 2 to 3 s.
 _LIBRARY = torch.library.Library("kornia_pnpnet", "DEF")
 _LIBRARY.define("take_pairs(Tensor values, Tensor index) -> Tensor")
 _LIBRARY.impl("take_pairs", _take_pairs, "CompositeExplicitAutograd")
@@ -302,33 +272,21 @@ def _(info: Any, in_dims: tuple[int | None, int | None], *tensors: Tensor) -> tu
 
 
 def take_pairs(values: Tensor, index: Tensor) -> Tensor:
-    """Take some pairs of each problem.
-
-    Args:
-        values: shape :math:`(B, N, C)`.
-        index: positions of pairs, int64, shape :math:`(B, K)`.
-
-    Returns:
-        Shape :math:`(C, K, B)`.
-    """
+    """Take the pairs at positions (B, K) from values (B, N, C): shape (C, K, B)."""
     return (_take_pairs if exporting() else torch.ops.kornia_pnpnet.take_pairs)(values, index)
 
 
-# -- the allocator -----------------------------------------------------------------------------------------------------
-
-# Bytes. glibc follows freed chunks up to 32 MiB with its mmap threshold (mallopt(3), M_MMAP_THRESHOLD); 64 KiB are left
-# for its header and for alignment.
+# Bytes. glibc raises its threshold up to 32 MiB (mallopt(3), M_MMAP_THRESHOLD); 64 KiB are left for its header.
 _LARGEST_KEPT = 2**25 - 2**16
 
 
 def keep_freed_memory() -> None:
     """Let glibc keep the memory of large temporaries for the next call, for the whole process.
 
-    Without it every call asks the system anew for the memory of each tensor of more than 128 KiB, page by page: batches
-    of 1000 and more problems on a CPU take 20 to 45 % longer with ``pnpnet-set``; small batches do not change. The
-    process then holds up to 64 MiB of freed memory. Other allocators, and a glibc whose thresholds were set, stay as
-    they are. Nothing calls this function but the command ``pnpnet`` and the benchmarks: a library must not decide for
-    its process.
+    Else every call asks the system anew for each tensor of more than 128 KiB: batches of 1000 and more problems on a
+    CPU take 20 to 45 % longer with ``pnpnet-set``. The process then holds up to 64 MiB of freed memory. Other
+    allocators, and a glibc whose thresholds were set, stay as they are. Only the command ``pnpnet`` and the benchmarks
+    call this function: a library must not decide for its process.
 
     Example:
         >>> keep_freed_memory()

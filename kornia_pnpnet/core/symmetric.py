@@ -28,17 +28,7 @@ class Symmetric2(NamedTuple):
     @classmethod
     def of(cls, matrix: Tensor) -> Symmetric2:
         """The symmetric parts of matrices (..., 2, 2)."""
-        return cls(matrix[..., 0, 0], _mean(matrix, 0, 1), matrix[..., 1, 1])
-
-    @property
-    def diagonal(self) -> tuple[Tensor, ...]:
-        """The entries of the diagonal."""
-        return self.uu, self.vv
-
-    @property
-    def rows(self) -> list[list[Tensor]]:
-        """The rows of the lower triangle."""
-        return [[self.uu], [self.uv, self.vv]]
+        return cls(*_upper(matrix))
 
     @property
     def determinant(self) -> Tensor:
@@ -48,12 +38,12 @@ class Symmetric2(NamedTuple):
         return torch.addcmul(product, self.uv, self.uv, value=-1).maximum(least)
 
     def form(self, u: Tensor, v: Tensor) -> Tensor:
-        r"""The quadratic form :math:`x^\top A x` of :math:`x = (u, v)`."""
+        """The quadratic form of the vector (u, v)."""
         cross = torch.addcmul(self.uu * u, self.uv, v, value=2.0)
         return torch.addcmul(cross * u, self.vv * v, v)
 
     def inverse(self) -> Symmetric2:
-        """The inverse of a positive definite matrix. Eigenvalues near rounding count as if they were larger.
+        """The inverse of a positive definite matrix. Eigenvalues at the level of rounding count as larger.
 
         Example:
             >>> Symmetric2(*torch.tensor([2.0, 1.0, 1.0])).inverse()
@@ -90,18 +80,7 @@ class Symmetric3(NamedTuple):
     @classmethod
     def of(cls, matrix: Tensor) -> Symmetric3:
         """The symmetric parts of matrices (..., 3, 3)."""
-        x, y, z = (matrix[..., i, i] for i in range(3))
-        return cls(x, _mean(matrix, 0, 1), _mean(matrix, 0, 2), y, _mean(matrix, 1, 2), z)
-
-    @property
-    def diagonal(self) -> tuple[Tensor, ...]:
-        """The entries of the diagonal."""
-        return self.xx, self.yy, self.zz
-
-    @property
-    def rows(self) -> list[list[Tensor]]:
-        """The rows of the lower triangle."""
-        return [[self.xx], [self.xy, self.yy], [self.xz, self.yz, self.zz]]
+        return cls(*_upper(matrix))
 
     def scaled(self, factor: Tensor) -> Symmetric3:
         """The product with a number, plus a multiple of the identity that is above the rounding of the entries."""
@@ -116,8 +95,17 @@ class Symmetric3(NamedTuple):
         return [torch.addcmul(torch.addcmul(i * a, j, b), k, c) for i, j, k in rows]
 
 
-def _mean(matrix: Tensor, i: int, j: int) -> Tensor:
-    return 0.5 * (matrix[..., i, j] + matrix[..., j, i])
+def _upper(matrix: Tensor) -> list[Tensor]:
+    """The entries of the symmetric parts of matrices (..., K, K), row by row."""
+    size = range(matrix.shape[-1])
+    half = 0.5 * (matrix + matrix.mT)
+    return [half[..., i, j] for i in size for j in size[i:]]
+
+
+def _lower_rows(matrix: Symmetric2 | Symmetric3) -> list[list[Tensor]]:
+    if isinstance(matrix, Symmetric2):
+        return [[matrix.uu], [matrix.uv, matrix.vv]]
+    return [[matrix.xx], [matrix.xy, matrix.yy], [matrix.xz, matrix.yz, matrix.zz]]
 
 
 def are_semi_definite(matrix: Symmetric2 | Symmetric3) -> Tensor:
@@ -127,11 +115,11 @@ def are_semi_definite(matrix: Symmetric2 | Symmetric3) -> Tensor:
         >>> are_semi_definite(Symmetric2(torch.tensor([1.0, 1.0, 0.0]), torch.tensor([1.0, 2.0, 0.0]), torch.ones(3)))
         tensor([ True, False,  True])
     """
-    trace = sum(x.detach() for x in matrix.diagonal)
-    assert isinstance(trace, Tensor)
+    rows = [[x.detach() for x in row] for row in _lower_rows(matrix)]
+    trace = torch.stack([row[-1] for row in rows]).sum(0)
     limits = torch.finfo(trace.dtype)
     scale = torch.where(trace > 0, trace, 1.0).reciprocal()
-    rows = [[x.detach() * scale for x in row] for row in matrix.rows]
+    rows = [[x * scale for x in row] for row in rows]
     for row in rows:
         row[-1] = row[-1] + _ROUNDING * limits.eps
     good = trace < limits.max**0.25  # products stay finite
@@ -147,8 +135,7 @@ def are_semi_definite(matrix: Symmetric2 | Symmetric3) -> Tensor:
 
 def equivalent_sigma(matrix: Symmetric2 | Symmetric3) -> Tensor:
     """The standard deviation of isotropic noise of the same trace; NaN where the trace is not a sound number."""
-    entries = matrix.diagonal
-    variance = torch.stack(entries).mean(0)
+    variance = torch.stack([row[-1] for row in _lower_rows(matrix)]).mean(0)
     positive = (variance > 0) & (variance < torch.inf)  # at 0 the root has an infinite gradient
     sigma = torch.where(positive, variance, 1.0).sqrt()
     return torch.where(positive, sigma, torch.where(variance == 0, 0.0, torch.nan))

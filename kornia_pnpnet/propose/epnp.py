@@ -77,10 +77,10 @@ class EPnP(Initialiser):
         >>> from kornia_pnpnet.data import SyntheticProblems
         >>> from kornia_pnpnet.metrics import pose_errors
         >>> noiseless = SyntheticProblems(n=6, batch_size=2, world_sigma=0.0, img_sigma=0.0, dtype=torch.float64)
-        >>> problems, normalize = noiseless.batch(0), Normalize()
-        >>> problem, frame = normalize(problems.world_points, problems.img_points, problems.intrinsics)
+        >>> problems = noiseless.batch(0)
+        >>> problem, frame = Normalize()(problems.world_points, problems.img_points, problems.intrinsics)
         >>> starts = EPnP()(problem)
-        >>> pose_errors(normalize.undo(starts.pose, frame), problems.pose).translation_error < 1e-6, starts.ok
+        >>> pose_errors(frame.undo(starts.pose), problems.pose).translation_error < 1e-6, starts.ok
         (tensor([True, True]), tensor([True, True]))
     """
 

@@ -31,12 +31,8 @@ def _run(layers: nn.Sequential, hidden: Tensor) -> Tensor:
     """Apply layers to columns, (units, B), in the wider of the dtypes of the input and the weights."""
     for layer in layers:
         if isinstance(layer, nn.Linear):
-            weight: Tensor = layer.weight
-            bias: Tensor = layer.bias
-            if weight.dtype != hidden.dtype:
-                wider = torch.promote_types(weight.dtype, hidden.dtype)
-                weight, bias, hidden = weight.to(wider), bias.to(wider), hidden.to(wider)
-            hidden = torch.addmm(bias[:, None], weight, hidden)
+            wider = torch.promote_types(layer.weight.dtype, hidden.dtype)
+            hidden = torch.addmm(layer.bias.to(wider)[:, None], layer.weight.to(wider), hidden.to(wider))
         else:
             hidden = hidden.relu_()  # in place: nothing else reads the sum
     return hidden
@@ -63,12 +59,11 @@ class MLPInit(Initialiser):
     r"""Stage 1 of PnP-Net: a small multilayer perceptron for exactly ``n`` ordered pairs.
 
     The 5n coordinates pass through shared ReLU layers of 20n, 5n and 3n units. A rotation branch and a translation
-    branch follow, each of five ReLU layers of 2n units and a linear last layer. The rotation branch returns an
-    unnormalised axis and an angle, :math:`R = \exp(\theta [s / \|s\|]_\times)`; the translation branch returns three
-    numbers. All pairs have the weight 1.
+    branch follow, each of five ReLU layers of 2n units and a linear last layer. The rotation branch returns an axis and
+    an angle, :math:`R = \exp(\theta [s / \|s\|]_\times)`.
 
-    Source: Sheffer and Wiesel 2020, figure 2. The scales of the input are ours: they bring world and image coordinates
-    to the order of 1. The network computes in the wider of its own dtype and the dtype of the problem.
+    Source: Sheffer and Wiesel 2020, figure 2; the scales of the input are ours. The network computes in the wider of
+    its own dtype and the dtype of the problem.
 
     Args:
         n: number of pairs.
@@ -100,11 +95,10 @@ class MLPInit(Initialiser):
         self.translation = nn.Sequential(*_relu_layers(branch), nn.Linear(2 * n, 3))
 
     def forward(self, problem: Problem) -> Starts:
-        r"""Find a coarse pose.
+        """Find a coarse pose.
 
         Args:
-            problem: ``n`` pairs, ordered by their pixels. Pairs that are not of normal scale enter as zeros; the
-                network was not trained on such pairs.
+            problem: ``n`` pairs, ordered by their pixels. Pairs that are not of normal scale enter as zeros.
 
         Returns:
             The coarse pose, and weights of 1, or 0 for pairs that are not of normal scale.
@@ -127,7 +121,6 @@ class MLPInit(Initialiser):
         features = torch.cat([(x * usual).permute(1, 2, 0) for x in coordinates], 1).flatten(0, 1)  # (5n, B)
         hidden = _run(self.shared, features)  # (3n, B)
         axis, angle = _run(self.rotation, hidden).split((3, 1))
-        rotation = rotation_about(axis, angle[0])
-        translation = _run(self.translation, hidden).mT
-        pose = Pose(rotation.to(features.dtype), translation.to(features.dtype))
+        parts = rotation_about(axis, angle[0]), _run(self.translation, hidden).mT
+        pose = Pose(*(x.to(features.dtype) for x in parts))
         return Starts(pose, problem.usual)

@@ -1,8 +1,8 @@
 r"""EPPnP and REPPnP: the null space of the projection equations, with outliers rejected by their algebraic error.
 
-A world point is :math:`p_i = \sum_j a_{ij} c_j` with four control points :math:`c_j`. In the camera frame the control
-points are twelve unknowns, and a pair gives two equations, :math:`X_i - u_i Z_i = 0` and :math:`Y_i - v_i Z_i = 0`.
-Their residual is the algebraic error: the pixel error times the depth over the focal length, a length.
+In the camera frame four control points (see :mod:`~kornia_pnpnet.propose.control_points`) are twelve unknowns, and a
+pair gives two equations, :math:`X_i - u_i Z_i = 0` and :math:`Y_i - v_i Z_i = 0`. Their residual is the algebraic
+error: the pixel error times the depth over the focal length, a length.
 """
 
 from __future__ import annotations
@@ -23,11 +23,9 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["REPPnP"]
 
-# Number of pairs that are kept at any error with the null vector: 11 unknowns need 6 pairs of 2 equations, and one more
-# pair so that errors show.
-_NULL_FLOOR = 7
-# Number of pairs that are kept at any error with rigid control points: 6 unknowns need 3 pairs, and two more.
-_RIGID_FLOOR = 5
+# Number of pairs that are kept at any error: 11 unknowns of the null vector need 6 pairs, 6 unknowns of a rigid motion
+# 3 pairs, and one or two more so that errors show.
+_NULL_FLOOR, _RIGID_FLOOR = 7, 5
 # Number of pairs below which a problem is not `ok`.
 _MIN_PAIRS = 4
 # Weight of the squared depths of the control points relative to the centroid, during outlier rejection. Values from
@@ -42,29 +40,24 @@ _LEVERAGE_RIDGE = 1e-6
 class REPPnP(Initialiser):
     r"""Null space of the projection equations, algebraic outlier rejection, and the pose of the remaining pairs.
 
-    At first all pairs are kept. Each iteration finds the null vector of the kept pairs, and then keeps the pairs whose
-    algebraic error is at most :math:`\max(Q, \delta_{\max})`, where :math:`Q` is a quantile of the errors. The control
-    points of the last null vector are aligned with the control points of the world (orthogonal Procrustes). With
-    ``reject_outliers=False`` the method is EPPnP.
+    Each iteration finds the null vector of the kept pairs, at first of all pairs, and then keeps the pairs whose
+    algebraic error is at most :math:`\max(Q, \delta_{\max})`, with a quantile :math:`Q` of the errors. The last null
+    vector is aligned with the world (orthogonal Procrustes). Without rejection the method is EPPnP.
 
     Source: L. Ferraz, X. Binefa and F. Moreno-Noguer, "Very Fast Solution to the PnP Problem with Algebraic Outlier
     Rejection", CVPR 2014. Our changes are for success on the protocol's problems and for batches:
 
-    - The null vector has the least error among the vectors with the centroid at depth 1, instead of length 1: it solves
-      a linear system, has the right sign, and does not depend on the control points, the frame or the unit.
-    - During rejection a small ridge keeps the depths of the control points close to the centroid's. The fit then bends
-      less to outliers, and weak perspective fits a view that is too narrow to show depth.
-    - Pairs are compared by their leave-one-out error, because a single outlier among few pairs bends the fit to itself.
-    - The quantile is the median instead of 25 %, and at least 7 pairs are kept: a quarter of 20 pairs does not
-      determine a null vector.
-    - The same loop then continues with rigid control points and one Gauss-Newton step of their algebraic error per
-      iteration: with 6 unknowns instead of 11, fewer pairs suffice to find the outliers.
-    - The pose minimises the algebraic error over rigid motions by Gauss-Newton. The paper alternates between the span
-      of four null vectors, in which no direction has a cost, and the rigid control points.
+    - The null vector has the least error with the centroid at depth 1, instead of length 1: a linear system that does
+      not depend on the control points, the frame or the unit. A small ridge keeps the other depths close to the
+      centroid's, so that the fit bends less to outliers and a narrow view is weak perspective.
+    - Pairs are compared by their leave-one-out error. The quantile is the median instead of 25 %, and at least 7 pairs
+      are kept.
+    - The same loop continues with a rigid motion and one Gauss-Newton step of its algebraic error per iteration, and
+      the pose minimises this error. The paper alternates between the span of four null vectors and rigid points.
     - Both loops have a fixed length; the paper's loop stops when the quantile no longer falls.
 
-    Gradients: the selection is piecewise constant, and the last Gauss-Newton steps start from a detached pose. Close to
-    the minimum, their gradient is the derivative of the minimum.
+    Gradients: the selection is piecewise constant, and the last Gauss-Newton steps start from a detached pose, so that
+    their gradient is that of the minimum.
 
     Args:
         reject_outliers: reject outliers; otherwise all pairs are kept.
@@ -111,7 +104,7 @@ class REPPnP(Initialiser):
         self.refine_iterations = refine_iterations
 
     def forward(self, problem: Problem) -> Starts:
-        r"""Find the pose and the inliers.
+        """Find the pose and the inliers.
 
         Args:
             problem: the problem in the solver's frame.
@@ -151,8 +144,8 @@ class REPPnP(Initialiser):
         if self.reject_outliers:
             for _ in range(self.rigid_iterations):
                 rows = _linearize(pairs, pose)
-                normal = _normal_matrix(rows, pairs.weights, kept)
-                kept = self._keep(pairs, _rigid_error(pairs, rows, normal, kept), _RIGID_FLOOR)
+                inverse = _inverse(_normal_matrix(rows, pairs.weights, kept)[..., :6])
+                kept = self._keep(pairs, _leave_one_out(rows[:, 6], rows[:, :6], inverse, pairs, kept), _RIGID_FLOOR)
                 pose = _step(pose, _normal_matrix(rows, pairs.weights, kept))
         return kept, pose
 
@@ -169,10 +162,8 @@ class _Pairs(NamedTuple):
 
     coordinates: Tensor  # a, see ControlPoints, (B, 4, N)
     world: Tensor  # (B, 3, N)
-    u: Tensor  # pixel over focal length, (B, N)
-    v: Tensor
-    mean_u: Tensor  # (B, 1)
-    mean_v: Tensor
+    plane: Tensor  # u and v: pixel over focal length, (B, 2, N)
+    mean: Tensor  # of u and v, (B, 2, 1)
     weights: Tensor  # with the sum 1, (B, N)
     there: Tensor  # bool, (B, N)
 
@@ -191,20 +182,19 @@ def _own_frame(problem: Problem, control: ControlPoints) -> tuple[_Pairs, Tensor
     mean_square = control.points[:, 1:].square().sum((1, 2))
     radius = torch.where(control.ok, mean_square, 1.0).sqrt()
     world = (problem.world_points.mT - control.points[:, 0, :, None]) / radius[:, None, None]
-    u, v = (problem.img_points / problem.focal).unbind(-1)
+    plane = (problem.img_points / problem.focal).mT.contiguous()
     # No gradient through the frame and the sum of weights: the pose depends on neither.
     total = problem.weights.detach().sum(-1, keepdim=True)
     weights = problem.weights / torch.where(total > 0, total, 1.0)
-    mean_u, mean_v = ((control.weights * x).sum(-1, keepdim=True) for x in (u, v))
+    mean = (control.weights[:, None] * plane).sum(-1, keepdim=True)
     coordinates = control.coordinates.mT.contiguous()
-    return _Pairs(coordinates, world, u, v, mean_u, mean_v, weights, problem.weights > 0), radius
+    return _Pairs(coordinates, world, plane, mean, weights, problem.weights > 0), radius
 
 
 def _features(pairs: _Pairs) -> Tensor:
     """The right factors a, u a, v a, (u² + v²) a of the products in the normal matrix, (B, 16, N)."""
-    a = pairs.coordinates
-    u, v = (pairs.u - pairs.mean_u)[:, None], (pairs.v - pairs.mean_v)[:, None]
-    return torch.cat((a, u * a, v * a, (u * u + v * v) * a), 1)
+    a, centred = pairs.coordinates, pairs.plane - pairs.mean
+    return torch.cat((a, centred[:, :1] * a, centred[:, 1:] * a, centred.square().sum(1, keepdim=True) * a), 1)
 
 
 def _inverse(matrix: Tensor, ridge: float = 0.0) -> Tensor:
@@ -218,9 +208,9 @@ def _null_vector(pairs: _Pairs, features: Tensor, kept: Tensor, depth_prior: flo
     r"""Control points in the camera frame with the centroid at depth 1 and the least algebraic error.
 
     The pixels are relative to their mean: a shear of the camera frame that changes no error but keeps the digits of a
-    narrow view. The normal matrix is then :math:`[[A, 0, -U], [0, A, -V], [-U, -V, Q]]`: sums of :math:`a a^\top`,
-    :math:`u a a^\top`, :math:`v a a^\top` and :math:`(u^2 + v^2) a a^\top`. Eliminating x and y as :math:`A^{-1} U z`
-    and :math:`A^{-1} V z` leaves :math:`Q - U A^{-1} U - V A^{-1} V` for the depths z.
+    narrow view. The normal matrix is then :math:`[[A, 0, -U], [0, A, -V], [-U, -V, Q]]`, sums of the products of the
+    features. Eliminating x and y as :math:`A^{-1} U z` and :math:`A^{-1} V z` leaves
+    :math:`Q - U A^{-1} U - V A^{-1} V` for the depths z.
     """
     weighted = pairs.coordinates * torch.where(kept, pairs.weights, 0.0)[:, None]
     sums = weighted @ features.mT  # (B, 4, 16)
@@ -238,21 +228,20 @@ def _null_error(pairs: _Pairs, features: Tensor, null: _Null, kept: Tensor) -> T
     """Squared leave-one-out errors of the null vector, relative to its size, (B, N)."""
     a = pairs.coordinates
     moved = torch.cat((null.solution, null.inverse_gram), -1).mT @ a  # (B, 12, N)
-    from_xy = (moved[:, 8:] * a).sum(1)  # the leverage by x alone, and by y alone
+    from_xy = (moved[:, 8:] * a).sum(1)  # the leverage of u by x alone, and of v by y alone
     # The equations without x and y: coefficients of the depth of the centroid, and of the other depths.
     first = torch.cat((moved[:, 0] - features[:, 4], moved[:, 4] - features[:, 8]), -1)  # (B, 2N)
     rows = torch.cat((moved[:, 1:4] - features[:, 5:8], moved[:, 5:8] - features[:, 9:12]), -1)  # (B, 3, 2N)
     residual = first + (null.control[:, None, 1:, 2] @ rows)[:, 0]
-    uu, uv, vv = _leverage(rows, null.inverse_depths @ rows)
-    sq_error = _leave_one_out(residual, from_xy + uu, uv, from_xy + vv, pairs, kept)
+    sq_error = _leave_one_out(residual, rows, null.inverse_depths, pairs, kept, from_xy)
     sq_size = null.control[:, 1:].square().sum((1, 2))[:, None]
     return sq_error / sq_size.clamp(min=torch.finfo(sq_size.dtype).eps ** 2)
 
 
 def _aligned(pairs: _Pairs, null: _Null, kept: Tensor) -> Pose:
     """The rigid motion that fits the null vector best, by alignment of the points."""
-    x, y, z = null.control.unbind(-1)
-    control = torch.stack((x + pairs.mean_u * z, y + pairs.mean_v * z, z), -1)  # (B, 4, 3)
+    across, z = null.control.split((2, 1), -1)
+    control = torch.cat((across + pairs.mean.mT * z, z), -1)  # (B, 4, 3)
     cam_points = pairs.coordinates.mT @ control
     rotation, _, scale = align(pairs.world.mT, cam_points, torch.where(kept, pairs.weights, 0.0))
     large = scale > torch.finfo(scale.dtype).eps ** 0.5
@@ -261,30 +250,22 @@ def _aligned(pairs: _Pairs, null: _Null, kept: Tensor) -> Pose:
 
 def _linearize(pairs: _Pairs, pose: Pose) -> Tensor:
     """Jacobian of the algebraic errors by the tangent of ``retract``; the last row holds the errors, (B, 7, 2N)."""
-    u, v = pairs.u, pairs.v
-    rotated = pose.rotation @ pairs.world
-    x, y, z = rotated.unbind(1)  # (B, N) each
+    u, v = pairs.plane.unbind(1)
+    x, y, z = (pose.rotation @ pairs.world).unbind(1)  # (B, N) each
     tx, ty, tz = pose.translation[..., None].unbind(1)
     depth = z + tz
     one, zero = torch.ones_like(u), torch.zeros_like(u)
-    # fmt: off
     rows = (
-        -u * y, -z - v * y,
-        z + u * x, v * x,
-        -y, x,
-        one, zero,
-        zero, one,
-        -u, -v,
-        x + tx - u * depth, y + ty - v * depth,
+        *(-u * y, -z - v * y, z + u * x, v * x, -y, x),  # by the rotation: the errors of u and of v in turn
+        *(one, zero, zero, one, -u, -v),  # by the translation
+        *(x + tx - u * depth, y + ty - v * depth),
     )
-    # fmt: on
     return torch.stack(rows, 1).view(u.shape[0], 7, 2 * u.shape[1])
 
 
 def _normal_matrix(rows: Tensor, weights: Tensor, kept: Tensor) -> Tensor:
     """Normal matrix of the kept pairs; the last column holds the gradient, (B, 6, 7)."""
-    weights = torch.where(kept, weights, 0.0)
-    return (rows[:, :6] * torch.cat((weights, weights), -1)[:, None]) @ rows.mT
+    return (rows[:, :6] * torch.where(kept, weights, 0.0).repeat(1, 2)[:, None]) @ rows.mT
 
 
 def _step(pose: Pose, normal: Tensor) -> Pose:
@@ -292,30 +273,21 @@ def _step(pose: Pose, normal: Tensor) -> Pose:
     return retract(pose, -(_inverse(normal[..., :6]) @ normal[..., 6:])[..., 0])
 
 
-def _rigid_error(pairs: _Pairs, rows: Tensor, normal: Tensor, kept: Tensor) -> Tensor:
-    """Squared leave-one-out errors of the linearised rigid problem, (B, N)."""
-    jacobian = rows[:, :6]
-    return _leave_one_out(rows[:, 6], *_leverage(jacobian, _inverse(normal[..., :6]) @ jacobian), pairs, kept)
-
-
-def _leverage(jacobian: Tensor, solved: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Entries (B, N) of the 2 x 2 leverages from a Jacobian (B, D, 2N) and the inverse normal matrix times it."""
-    count = jacobian.shape[-1] // 2
-    uu, vv = (jacobian * solved).sum(1).chunk(2, -1)
-    return uu, (jacobian[..., :count] * solved[..., count:]).sum(1), vv
-
-
-def _leave_one_out(residual: Tensor, uu: Tensor, uv: Tensor, vv: Tensor, pairs: _Pairs, kept: Tensor) -> Tensor:
+def _leave_one_out(
+    residual: Tensor, jacobian: Tensor, inverse: Tensor, pairs: _Pairs, kept: Tensor, more: Tensor | float = 0.0
+) -> Tensor:
     r"""Decrease of the cost when a pair leaves the fit, or increase when it enters, over its weight, (B, N).
 
-    The value is :math:`e^\top (1 \mp w H)^{-1} e` with the pair's error :math:`e` from ``residual`` (B, 2N) and the
-    entries ``uu``, ``uv``, ``vv`` of its leverage :math:`H`; minus for the kept pairs.
+    The value is :math:`e^\top (1 \mp w H)^{-1} e`, minus for the kept pairs, with the pair's errors (B, 2N) and the
+    leverage :math:`H` from the Jacobian (B, D, 2N) and the inverse normal matrix; ``more`` is added to its diagonal.
     """
+    count, solved = kept.shape[-1], inverse @ jacobian
+    uu, vv = (jacobian * solved).sum(1).chunk(2, -1)
     e_u, e_v = residual.chunk(2, -1)
     weights = torch.where(kept, pairs.weights, -pairs.weights)
-    a = (1.0 + _LEVERAGE_RIDGE) - weights * uu
-    d = (1.0 + _LEVERAGE_RIDGE) - weights * vv
-    b = weights * uv
+    a = (1.0 + _LEVERAGE_RIDGE) - weights * (more + uu)
+    d = (1.0 + _LEVERAGE_RIDGE) - weights * (more + vv)
+    b = weights * (jacobian[..., :count] * solved[..., count:]).sum(1)
     return (d * e_u * e_u + 2.0 * b * e_u * e_v + a * e_v * e_v) / (a * d - b * b).clamp(min=_LEVERAGE_RIDGE**2)
 
 

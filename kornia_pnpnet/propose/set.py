@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from kornia_pnpnet.core.checks import check_devices, check_whole
 from kornia_pnpnet.core.linalg import align
-from kornia_pnpnet.core.performance import compiling, present_first, problems_last, sees_values, take_pairs
+from kornia_pnpnet.core.performance import are_few, compiling, present_first, problems_last, sees_values, take_pairs
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.problem import Noise, Problem, Starts, State
 from kornia_pnpnet.propose.initialiser import Initialiser
@@ -24,12 +24,9 @@ __all__ = ["SetInit"]
 
 _T = TypeVar("_T")
 
-# Numbers per pair: 3 of the world, 2 of the image, 2 of the residual, 3 of the problem, 2 of the noise, 2 flags.
+# Numbers per pair: 3 of the world, 2 of the image, 2 of the residual, 3 of the problem, 2 of the noise, 2 flags. Also 2
+# with confidences (logit and flag), and 2 with repeats (pairs with the same pixel, and with the same point).
 _FEATURES = 14
-# With confidences: their logit and a flag more.
-_CONFIDENCE_FEATURES = 2
-# With repeats: the logarithms of the numbers of pairs with the same pixel and with the same point.
-_REPEAT_FEATURES = 2
 # Pairs. The softmax of PyTorch 2.13 takes its slow way through rows of fewer numbers.
 _SHORT = 16
 # Added to the score of padding.
@@ -41,14 +38,14 @@ _SAMPLES = ((0, 1, 2), (0, 1, 3), (2, 3, 4), (2, 3, 5), (0, 4, 5), (1, 4, 5), (0
 _SPREADS = {18: 3, 24: 4, 30: 5}
 # From 36 pairs on, 25 further samples: each of the 25 likeliest pairs is in three of them, no two pairs meet twice.
 _RING = {36: [(a, b, c) for i in range(25) for a, b, c in [sorted((i, (i + 1) % 25, (i + 6) % 25))]]}
-#: Number of top-ranked pairs that score each hypothesis.
-MOST_JUDGES = 32
+# Number of top-ranked pairs that score each hypothesis.
+_MOST_JUDGES = 32
 # Slots for poses of minimal samples. With more slots than this, empty slots are removed before scoring (CPU only).
 _MANY_SLOTS = 64
 # Variances. Squared residuals of this size halve the score of a pair.
 _JUDGED = 50.0
-# Normalised units. A pose that has the centre of the world nearer than this counts as this near.
-_NEAREST = 0.5
+# Normalised units: the least depth of the centre of the world in the variance of a pair.
+_LEAST_DEPTH = 0.5
 # Score of a pair whose likelihood is 0, relative to a pair whose likelihood is 1.
 _LEAST_VOTE = 0.5
 # Pairs. Before a search the network sees at most 48 pairs; the search uses all pairs. On real matches (the file
@@ -59,7 +56,7 @@ _GOLDEN = 0.6180339887
 
 
 def _taken(tree: _T, index: Tensor) -> _T:
-    """Some pairs, at the positions (B, K), of all tensors (B, N, ...) of pairs; other tensors as they are."""
+    """The pairs at the positions (B, K) in all tensors (B, N, ...) of pairs; other tensors as they are."""
 
     def take(x: Tensor) -> Tensor:
         if x.ndim < 2 or x.shape[1] <= index.shape[1]:
@@ -71,7 +68,7 @@ def _taken(tree: _T, index: Tensor) -> _T:
 
 @torch.no_grad()
 def _some_of(present: Tensor, count: int) -> Tensor:
-    """Positions (B, count) of pairs that are present, evenly spread over these, or of all of them where they are fewer.
+    """Positions (B, count) of pairs that are present, evenly spread; all of them where a problem has fewer.
 
     Multiples of the golden ratio shift the positions, so that a pattern in the order of the pairs is not repeated; the
     shifts are small enough that no position occurs twice.
@@ -94,14 +91,11 @@ def _agreement(problem: Problem, noise: Noise, pose: Pose) -> Tensor:
 
 def _variance(img: Tensor, world: Tensor, focal: Tensor, depth: Tensor) -> Tensor:
     """Variance of pixels whose points are all at the depth of the centre of the world."""
-    return img.square() + (focal * world / depth.clamp(min=_NEAREST)).square()
+    return img.square() + (focal * world / depth.clamp(min=_LEAST_DEPTH)).square()
 
 
 def _support(rotation: Tensor, translation: Tensor, judges: Tensor) -> Tensor:
-    """Scores (H, B) of poses (3, 3, H, B) and (3, H, B) by pairs (7, K, B): points, pixels, votes, 1 / variances.
-
-    Pixels and variances are over the focal length and its square.
-    """
+    """Scores (H, B) of poses (3, 3, H, B), (3, H, B) by pairs (7, K, B): points, plane points, votes, 1 / variances."""
     a, b, c, u, v, vote, precision = judges.unbind()  # (K, B) each
     points = torch.addcmul(translation[:, :, None], rotation[:, 0, :, None], a)  # (3, H, K, B)
     x, y, z = points.addcmul_(rotation[:, 1, :, None], b).addcmul_(rotation[:, 2, :, None], c).unbind()
@@ -129,55 +123,50 @@ class _Block(nn.Module):
             self.out.bias.zero_()
 
     def forward(self, x: Tensor, absent: Tensor) -> Tensor:
-        """Map (B, N, width) to the same shape; ``absent`` (B, N) is a large negative number for padding, else 0."""
-        (batch, count, width), heads = x.shape, self.heads
+        """Map (B * N, width) to the same shape; ``absent`` (B, N) is a large negative number for padding, else 0."""
+        width, heads = x.shape[1], self.heads
         y = self.norm(x)
         # The scores need no bias: the softmax over pairs cancels it.
-        attention = _softmax(_by_channel(y, self.look.weight[width:]) + absent)  # (heads, B, N)
+        attention = _attention(y, self.look.weight[width:], absent)  # (heads, B, N)
         # Pooling is linear: the values of the means are the means of the values, which a problem has instead of a pair.
-        means = torch.bmm(attention.movedim(0, 1), y)  # (B, heads, width)
+        means = torch.bmm(attention.movedim(0, 1), y.view(*absent.shape, width))  # (B, heads, width)
         values = self.look.weight[:width].view(heads, width // heads, width)
         context = torch.bmm(means.movedim(1, 0), values.mT).movedim(0, 1).flatten(1) + self.look.bias[:width]
-        hidden = functional.linear(y, self.pair.weight)
-        hidden = hidden.add_((self.all(context) + self.pair.bias)[:, None]).relu_()
-        x = (x + self.out.bias).flatten(0, 1)
-        return torch.addmm(x, hidden.flatten(0, 1), self.out.weight.mT).view(batch, count, width)
+        hidden = torch.mm(y, self.pair.weight.mT).view(*absent.shape, -1)
+        hidden = hidden.add_(functional.linear(context, self.all.weight, self.pair.bias)[:, None]).relu_()
+        return torch.addmm(x + self.out.bias, hidden.flatten(0, 1), self.out.weight.mT)
 
 
-def _softmax(scores: Tensor) -> Tensor:
-    """Softmax over the pairs of (C, B, N). Of rows shorter than a processor's vectors, a column takes a tenth."""
-    if compiling() or scores.shape[-1] >= _SHORT:
+def _attention(x: Tensor, weight: Tensor, absent: Tensor) -> Tensor:
+    """Softmax over the pairs, (C, B, N), of scores that are linear in x (B * N, width).
+
+    The scores of a channel are contiguous in memory. Of rows shorter than a processor's vectors, a softmax over columns
+    takes a tenth of the time.
+    """
+    scores = torch.addmm(absent.view(1, -1), weight, x.mT).view(-1, *absent.shape)
+    if compiling() or scores.shape[-1] >= _SHORT or are_few(scores):
         return scores.softmax(-1)
     return scores.mT.contiguous().softmax(1).mT.contiguous()  # `bmm` takes other layouts row by row
-
-
-def _by_channel(x: Tensor, weight: Tensor) -> Tensor:
-    """A linear map of (B, N, width) to few channels (C, B, N), each contiguous in memory, which is faster for BLAS."""
-    return (weight @ x.flatten(0, 1).mT).unflatten(1, x.shape[:2])
 
 
 class SetInit(Initialiser):
     r"""A small network over the set of pairs: several coarse poses, a weight for each pair, and the noise.
 
-    Each pair passes residual layers that see all pairs through pooled attention: the cost is linear in the number of
-    pairs, and their order does not matter. For each of ``starts`` hypotheses the network then predicts the distance of
-    each point along its ray and a weight for it, and the pose is the rigid motion that moves the world points there
-    (weighted least squares in closed form). The poses are equivariant to similarity transforms of the world, rotations
-    by any angle included, and to rotations of the camera except its roll; intrinsics enter through the rays alone. The
+    Residual layers see all pairs through pooled attention: the cost is linear in the number of pairs, and their order
+    does not matter. For each hypothesis the network predicts the distance of each point along its ray and a weight; the
+    pose is the rigid motion that moves the world points there. Poses are equivariant to similarity transforms of the
+    world and to rotations of the camera except its roll; intrinsics enter through the rays alone. The likeliest pairs
+    also form minimal samples of three (see :func:`~kornia_pnpnet.propose.p3p`). The best of their poses, scored by the
+    32 likeliest pairs, is one more hypothesis, without gradient.
+
+    The weight of a pair is the estimated probability that it is an inlier. The noise is that of the problem where
+    known, else the network's estimate; of a covariance the network sees the isotropic noise of the same trace. The
     network runs in the dtype of its weights, everything around it in the dtype of the correspondences.
 
-    The likeliest pairs also form ``samples`` minimal samples of three, and more samples where there are more pairs.
-    The poses of the samples (see :func:`~kornia_pnpnet.propose.p3p`) are scored by the 32 likeliest pairs, and the best
-    pose is one more hypothesis: a constant without gradient, at a fixed cost.
-
-    The weight of a pair is the estimated probability that it is an inlier. Of noise with covariances the network and
-    the scores of samples see the standard deviation of isotropic noise of the same trace. The noise is the ``noise`` of
-    the :class:`~kornia_pnpnet.problem.Problem` where known, else the network's estimate.
-
     The design is ours. Distances along rays before a closed-form alignment: J. Hesch and S. Roumeliotis, "A direct
-    least-squares method for PnP", ICCV 2011, among many; attention pooled over correspondences: W. Sun et al., "ACNe:
-    Attentive context normalization for robust permutation-equivariant learning", CVPR 2020; six samples of six pairs of
-    which one is free of any two outliers: P. Turán's problem for (6, 4, 3), 1941.
+    least-squares method for PnP", ICCV 2011; attention pooled over correspondences: W. Sun et al., "ACNe: Attentive
+    context normalization for robust permutation-equivariant learning", CVPR 2020; samples: P. Turán's problem for
+    (6, 4, 3), 1941.
 
     Args:
         width: number of channels of each pair.
@@ -223,7 +212,7 @@ class SetInit(Initialiser):
         self.starts = starts
         self.confidence = confidence
         self.repeats = repeats
-        self.first = nn.Linear(_FEATURES + _CONFIDENCE_FEATURES * confidence + _REPEAT_FEATURES * repeats, width)
+        self.first = nn.Linear(_FEATURES + 2 * confidence + 2 * repeats, width)
         self.blocks = nn.ModuleList(_Block(width, heads, hidden) for _ in range(layers))
         self.norm = nn.LayerNorm(width)
         # Per pair: the logit of being an inlier; per hypothesis a weight and a distance along the ray.
@@ -231,9 +220,8 @@ class SetInit(Initialiser):
         # Per problem: the distance of the world in each hypothesis; the noise of pixels and of points.
         self.problem = nn.Linear(width, starts + 2)
         with torch.no_grad():
-            self.pair.weight *= 0.3
-            self.problem.weight *= 0.1
-            for layer in (self.pair, self.problem):
+            for layer, scale in ((self.pair, 0.3), (self.problem, 0.1)):
+                layer.weight *= scale
                 layer.bias.zero_()
             self.pair.bias[0] = 2.0
 
@@ -258,35 +246,28 @@ class SetInit(Initialiser):
         if search_follows and problem.weights.shape[1] > _ENOUGH:
             index = _some_of(problem.usual_weights > 0, _ENOUGH)
             problem, same = _taken((problem, same), index)
-        view = View(problem, self.confidence, same)
-        dtype = problem.world_points.dtype
-        of_pairs, of_problem = (x.to(dtype) for x in self._run(view.features, view.there))
-        starts = self.starts
+        view, starts = View(problem, self.confidence, same), self.starts
+        of_pairs, of_problem = (x.to(view.there.dtype) for x in self._run(view))
         right = torch.sigmoid(of_pairs[0])
         counts, along = of_pairs[1:].split(starts)  # (S, B, N) each
         away, noise = of_problem.split((starts, 2), -1)
         # A point's distance is the distance of the world's centre plus an offset, so that far worlds keep their relief.
         distance = (away.clamp(-6.0, 6.0) - view.log_spread).exp().mT[..., None]  # (S, B, 1)
-        relief = torch.add(view.points[..., 2], along, alpha=3.0) / distance
+        relief = torch.add(view.height, along, alpha=3.0) / distance
         ranges = distance * relief.clamp(-3.0, 3.0).exp()
-        counts = torch.addcmul(view.there * 1e-6, right * view.there, (3.0 * counts.tanh()).exp())
-        source = view.points.expand(starts, -1, -1, -1).flatten(0, 1)
-        rotation, translation, _ = align(source, (ranges[..., None] * view.rays).flatten(0, 1), counts.flatten(0, 1))
-        back = view.camera.mT.repeat(starts, 1, 1)  # from the view's frames to the problem's
-        rotation = torch.bmm(torch.bmm(back, rotation), view.world.repeat(starts, 1, 1)).unflatten(0, (starts, -1))
-        translation = torch.bmm(back, translation[..., None]).view(starts, -1, 3)
-        noises = self._noise(given, view.spread, noise)
+        chances = right * view.there
+        counts = torch.addcmul(view.there * 1e-6, chances, (3.0 * counts.tanh()).exp())
+        points = (ranges[..., None] * view.rays).flatten(0, 1)
+        source = problem.world_points.expand(starts, -1, -1, -1).flatten(0, 1)
+        rotation, translation, _ = align(source, points, counts.flatten(0, 1))
+        poses = [*map(Pose, rotation.chunk(starts), translation.chunk(starts))]
+        noises = self._noise(given, view, noise)
         if self.samples:
-            fallback = Pose(rotation[0], translation[0])
             seen = noises if index is None else _taken(noises, index)
-            sampled = self._sampled(problem, right, seen, fallback, search_follows)
-            rotation, translation = torch.cat((rotation, sampled[0][None])), torch.cat((translation, sampled[1][None]))
+            poses.append(self._sampled(problem, chances, seen, poses[0], search_follows))
         if index is not None:
-            best = Pose(rotation[-1], translation[-1])
-            right = _agreement(given, noises, best).scatter(1, index, right)
-        every = Pose(rotation.transpose(0, 1), translation.transpose(0, 1))  # (B, S, 3, 3) and (B, S, 3)
-        others = Pose(every.rotation[:, 1:], every.translation[:, 1:]) if len(rotation) > 1 else None
-        return Starts(Pose(rotation[0], translation[0]), right, others=others, noise=noises)
+            right = _agreement(given, noises, poses[-1]).scatter(1, index, right)
+        return Starts(poses[0], right, noise=noises).with_others(*poses[1:])
 
     def triples(self, count: int, *, search_follows: bool = False) -> dict[int, list[tuple[int, int, int]]]:
         """Minimal samples of a problem.
@@ -299,33 +280,28 @@ class SetInit(Initialiser):
             Groups of samples, as ranks of pairs by likelihood, by the least number of pairs of a problem that uses the
             group. Groups that spread over more pairs help where the likeliest pairs are outliers that agree.
         """
-        near = [x for x in _SAMPLES[: self.samples] if max(x) < count]
+        likeliest = [x for x in _SAMPLES[: self.samples] if max(x) < count]
         if search_follows:
-            return {0: near}
-        spread = {least: [(f * i, f * j, f * k) for i, j, k in near] for least, f in _SPREADS.items() if least <= count}
-        ring = {least: ring for least, ring in _RING.items() if least <= count}
-        return {0: near, **spread, **ring}
+            return {0: likeliest}
+        spread = {least: [(f * i, f * j, f * k) for i, j, k in likeliest] for least, f in _SPREADS.items()}
+        return {0: likeliest, **{least: group for least, group in (spread | _RING).items() if least <= count}}
 
     @torch.no_grad()
-    def _sampled(
-        self, problem: Problem, right: Tensor, noise: Noise, fallback: Pose, search_follows: bool
-    ) -> tuple[Tensor, Tensor]:
-        """Rotations and translations of the best minimal samples by the score of the likeliest pairs."""
-        batch, count = right.shape
+    def _sampled(self, problem: Problem, chances: Tensor, noise: Noise, fallback: Pose, search_follows: bool) -> Pose:
+        """The best poses of minimal samples by the score of the likeliest pairs; the fallback where there are none."""
+        batch, count = chances.shape
         there = problem.usual_weights > 0
-        chances = torch.where(there, right, 0.0)
         # An unlikely pair that agrees may be an inlier after all; padding does not score.
         vote = torch.add(_LEAST_VOTE * there, chances, alpha=1.0 - _LEAST_VOTE)
-        # The variance is at the depth of the network's pose: by each pose's own depths, a pose close
-        # to the points would explain most pixels.
+        # At the depth of the network's pose: by its own depths, a pose close to the points would explain most pixels.
         variance = _variance(noise.img, noise.world, problem.focal, fallback.translation[:, 2:])
         rest = torch.stack((vote, problem.focal.square() / (_JUDGED * variance)), -1)
         of_pairs = torch.cat((problem.world_points, problem.img_points / problem.focal, rest), -1)  # (B, N, 7)
         if not isinstance(count, int):  # exported for any number of pairs: pad to the number of judges
             more = of_pairs[:, :1] * torch.tensor((1, 1, 1, 1, 1, 0, 1), dtype=vote.dtype, device=vote.device)
-            of_pairs = torch.cat((of_pairs, more.expand(-1, MOST_JUDGES, -1)), 1)
-            chances, count = functional.pad(chances, (0, MOST_JUDGES)), count + MOST_JUDGES
-        likely = chances.topk(min(MOST_JUDGES, count)).indices
+            of_pairs = torch.cat((of_pairs, more.expand(-1, _MOST_JUDGES, -1)), 1)
+            chances, count = functional.pad(chances, (0, _MOST_JUDGES)), count + _MOST_JUDGES
+        likely = chances.topk(min(_MOST_JUDGES, count)).indices
         pairs = take_pairs(of_pairs, likely)  # (7, K, B)
         samples = self.triples(count, search_follows=search_follows)
         drawn = [sample for group in samples.values() for sample in group]
@@ -335,7 +311,7 @@ class SetInit(Initialiser):
             three = pairs[:6].index_select(1, torch.tensor(drawn, device=pairs.device).mT.flatten())
         three = three.unflatten(1, (3, len(drawn))).flatten(2)  # (6, 3, S B)
         pose, valid = p3p(three[:3].permute(2, 1, 0), three[3:5].permute(2, 1, 0))[:2]
-        # Components first, then the four solutions and the samples, problems last: the layout of p3p's results.
+        # Problems last, as p3p lays them out, after the four solutions and the samples.
         each = len(drawn), batch
         rotation, translation = (x.movedim((0, 1), (-1, -2)).unflatten(-1, each).flatten(-3, -2) for x in pose)
         rotation = rotation.flatten(0, 1)  # (9, H, B)
@@ -358,24 +334,23 @@ class SetInit(Initialiser):
         every = torch.cat((rotation, translation)).gather(1, best.indices.expand(12, 1, -1))[:, 0].mT  # (B, 12)
         found = (best.values > -torch.inf)[:, None]
         every = torch.where(found, every, torch.cat((fallback.rotation.flatten(1), fallback.translation), 1))
-        return every[:, :9].unflatten(1, (3, 3)), every[:, 9:]
+        return Pose(every[:, :9].unflatten(1, (3, 3)), every[:, 9:])
 
-    def _run(self, features: Tensor, there: Tensor) -> tuple[Tensor, Tensor]:
+    def _run(self, view: View) -> tuple[Tensor, Tensor]:
         """The network: outputs for each pair, (1 + 2 S, B, N), and for each problem, (B, S + 2)."""
-        x = self.first(features.to(self.first.weight.dtype))
-        absent = torch.where(there > 0, 0.0, _ABSENT).to(x.dtype)
+        x = self.first(view.features.flatten(0, 1).to(self.first.weight.dtype))
+        absent = torch.where(view.there > 0, 0.0, _ABSENT).to(x.dtype).contiguous()
         for block in self.blocks:
             x = block(x, absent)
         x = self.norm(x)
-        pair = _by_channel(x, self.pair.weight) + self.pair.bias[:, None, None]
-        share = _softmax(pair[:1] + absent)[0]
-        return pair, self.problem(torch.bmm(share[:, None], x)[:, 0])
+        pair = torch.addmm(self.pair.bias[:, None], self.pair.weight, x.mT).view(-1, *absent.shape)
+        share = _attention(x, self.pair.weight[:1], absent)[0]  # the softmax cancels the bias
+        return pair, self.problem(torch.bmm(share[:, None], x.view(*absent.shape, -1))[:, 0])
 
-    def _noise(self, problem: Problem, spread: Tensor, estimate: Tensor) -> Noise:
+    def _noise(self, problem: Problem, view: View, estimate: Tensor) -> Noise:
         """The known noise, and the network's estimate where it is unknown."""
-        unit = torch.cat((problem.focal * spread, torch.ones_like(spread)), -1)  # (B, 2)
-        guessed = ((LOG_NOISE + 3.0 * estimate.tanh()).exp() * unit)[:, None].expand(*problem.weights.shape, 2)
+        guessed = ((LOG_NOISE + 3.0 * estimate.tanh()).exp() * view.unit)[:, None].expand(*problem.weights.shape, 2)
         if problem.noise is not None:
             known = torch.stack((problem.noise.img, problem.noise.world), -1)
             guessed = torch.where(known.isfinite(), known, guessed)
-        return Noise(*guessed.maximum(LEAST_NOISE * unit[:, None]).unbind(-1))
+        return Noise(*guessed.maximum(LEAST_NOISE * view.unit[:, None]).unbind(-1))

@@ -35,11 +35,10 @@ class View:
 
     Attributes:
         there: 1 for pairs with a weight and of normal scale, 0 for others, shape :math:`(B, N)`.
-        camera: the smallest rotation that turns the mean ray to the optical axis, shape :math:`(B, 3, 3)`.
-        rays: unit rays in the rotated camera, shape :math:`(B, N, 3)`.
-        spread: root mean square distance of the rays from the axis, shape :math:`(B, 1)`.
-        world: rotation of the world, shape :math:`(B, 3, 3)`.
-        points: the rotated world points, shape :math:`(B, N, 3)`.
+        rays: unit rays in the frame of the camera, shape :math:`(B, N, 3)`.
+        log_spread: logarithm of the root mean square distance of the rays from their mean, shape :math:`(B, 1)`.
+        unit: spread of the pixels and of the world, shape :math:`(B, 2)`.
+        height: the last coordinate of the rotated world points, shape :math:`(B, N)`.
         features: the network's input, shape :math:`(B, N, C)`.
     """
 
@@ -49,30 +48,28 @@ class View:
         self.there = (problem.usual_weights > 0).to(world.dtype)
         share = (self.there / self.there.sum(1, keepdim=True).clamp(min=1.0))[..., None]  # (B, N, 1)
         plane = functional.pad(problem.img_points / problem.focal, (0, 1), value=1.0)
-        rays = functional.normalize(plane, dim=-1)
-        mean = functional.normalize((share * rays).sum(1), dim=-1)
-        # A reflection that maps the mean to the negative axis, and the negative third row.
+        self.rays = functional.normalize(plane, dim=-1)
+        mean = functional.normalize((share * self.rays).sum(1), dim=-1)
+        # The smallest rotation of the mean to the axis: a reflection that maps it to the negative axis, and the
+        # negative third row.
         half = mean + eye[2]
         mirror = 1.0 - 2.0 * eye[2]
         turn = (half * mirror)[..., None] * (half / half[:, 2:])[:, None]
-        self.camera = eye * mirror - turn
-        self.rays = torch.bmm(rays, self.camera.mT)
-        across = self.rays[..., :2]
-        self.spread = ((share * across.square()).sum((1, 2)) + 1e-12).sqrt()[:, None]
-        seen = across / self.spread[..., None]
+        across = torch.bmm(self.rays, (eye * mirror - turn)[:, :2].mT)
+        spread = ((share * across.square()).sum((1, 2)) + 1e-12).sqrt()[:, None]
+        seen = across / spread[..., None]
         seen = seen - (share * seen).sum(1, keepdim=True)
 
-        transposed, weighted = world.mT, share * torch.cat((world, seen), -1)
-        moment, cross = torch.bmm(transposed, weighted).split((3, 2), -1)
+        moment, cross = torch.bmm(world.mT, share * torch.cat((world, seen), -1)).split((3, 2), -1)
         affine = solve_symmetric(moment + _RIDGE * eye, cross).mT  # (B, 2, 3)
         squares = affine.square().sum(-1)  # (B, 2)
-        self.world = _frame(affine, squares)
-        self.points = torch.bmm(world, self.world.mT)
+        points = torch.bmm(world, _frame(affine, squares).mT)
         residual = torch.baddbmm(seen, world, affine.mT, alpha=-1)
-        self.log_spread = self.spread.log()
+        self.height = points[..., 2]
+        self.log_spread = spread.log()
+        self.unit = torch.cat((problem.focal * spread, torch.ones_like(spread)), -1)
         of_problem = torch.cat((self.log_spread, 0.5 * (squares + 1e-3).log()), -1)
-        parts = [self.points, seen, residual, of_problem[:, None].expand(-1, world.shape[1], -1)]
-        parts += [self._noise(problem)]
+        parts = [points, seen, residual, of_problem[:, None].expand(-1, world.shape[1], -1), self._noise(problem)]
         if confidence:
             given = torch.full_like(problem.weights, torch.nan) if problem.confidence is None else problem.confidence
             believed = given.nan_to_num(0.5).clamp(_LEAST_CONFIDENCE, 1.0 - _LEAST_CONFIDENCE)
@@ -88,8 +85,7 @@ class View:
         sigmas = torch.stack((problem.noise.img, problem.noise.world), -1)  # (B, N, 2)
         known = sigmas.isfinite()
         # Unknown sigmas are NaN. Replace them before dividing, or the gradient of the unit becomes NaN.
-        unit = torch.cat((problem.focal * self.spread, torch.ones_like(self.spread)), -1)[:, None]
-        relative = torch.where(known, sigmas, 1.0) / torch.where(known, unit, 1.0)
+        relative = torch.where(known, sigmas, 1.0) / torch.where(known, self.unit[:, None], 1.0)
         logs = torch.where(known, relative.clamp(min=LEAST_NOISE).log() - LOG_NOISE, 0.0)
         return torch.cat((logs, known.to(logs.dtype)), -1)
 
