@@ -44,7 +44,7 @@ def from_views(init: Callable[[Problem], Starts], problem: Problem, count: int, 
     """
     if count == 1:
         return init(problem)
-    batch = len(problem.weights)
+    batch = problem.weights.shape[0]
     starts = init(_views(problem, count, order))
     _, *others = [x for pose in starts.poses for x in _undone(pose, count)]
     # Weights, ok and noise of the first view, whose pairs have the order of the problem.

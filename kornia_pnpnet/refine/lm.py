@@ -293,7 +293,9 @@ class RobustWeightedLM(Configured):
         camera = pose.translation[:, : 0 if problem.free_focal is None else 1] * 0.0
         if starts.camera is not None:
             camera = starts.camera.repeat(len(poses), 1)
-        return Plan(problem, prior, guided, by_residual, State(pose, camera), area, noiseless, step, damping, shape, len(poses))
+        return Plan(
+            problem, prior, guided, by_residual, State(pose, camera), area, noiseless, step, damping, shape, len(poses)
+        )
 
     def iterate(self, plan: Plan, m: int | None = None, *, more: int = 0, run: Runner = EAGER) -> tuple[State, Tensor]:
         """Run the iterations: on all poses of a problem, then on the best pose of each, the last by residual.
@@ -445,7 +447,7 @@ class RobustWeightedLM(Configured):
         def equations(problem: Problem, at: State, shape: Tensor) -> NormalEquations:
             return self._equations(project(at, problem), problem, shape)
 
-        zero = torch.zeros_like(state.pose.translation[:1, 0]).expand(6 + state.camera.shape[1], len(state.camera))
+        zero = torch.zeros_like(state.pose.translation[:1, 0]).expand(6 + state.camera.shape[1], state.camera.shape[0])
         zero = zero.clone().requires_grad_()
         with torch.enable_grad():
             fixed, slope = equations(problem.map(torch.Tensor.detach), moved(state, zero), shape.detach())

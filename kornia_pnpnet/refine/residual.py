@@ -393,7 +393,7 @@ def change_tangent(equations: NormalEquations, tangent_map: Tensor) -> NormalEqu
         The equations by the other parameters.
     """
     size = len(equations.gradient)
-    whole = torch.eye(size, dtype=tangent_map.dtype, device=tangent_map.device).repeat(len(tangent_map), 1, 1)
+    whole = torch.eye(size, dtype=tangent_map.dtype, device=tangent_map.device).repeat(tangent_map.shape[0], 1, 1)
     whole[:, :3, :3] = tangent_map
     matrix = whole.mT @ equations.matrix.permute(2, 0, 1) @ whole
     return NormalEquations(matrix.permute(1, 2, 0), (whole.mT @ equations.gradient.mT[..., None])[..., 0].mT)
