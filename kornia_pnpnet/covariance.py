@@ -42,8 +42,8 @@ def pose_covariance(
 
     The covariance is :math:`(\sum_i w_i J_i^\top J_i / \sigma_i^2)^{-1}`. :math:`J_i` is the Jacobian of pixel
     :math:`i` by the tangent :math:`(\omega, v)` of :func:`~kornia_pnpnet.refine.residual.retract`: when
-    :math:`(R, t)` is the true pose, the estimate is about :math:`(\mathrm{cay}(\omega) R,\; t + v)`. :math:`\sigma_i^2` is the
-    :func:`~kornia_pnpnet.refine.residual.pixel_variance`. With covariances the covariance is
+    :math:`(R, t)` is the true pose, the estimate is about :math:`(\mathrm{cay}(\omega) R,\; t + v)`.
+    :math:`\sigma_i^2` is the :func:`~kornia_pnpnet.refine.residual.pixel_variance`. With covariances the covariance is
     :math:`(\sum_i w_i J_i^\top \Sigma_i^{-1} J_i)^{-1}`, where :math:`\Sigma_i` is the
     :func:`~kornia_pnpnet.refine.residual.pixel_covariance`. The computation runs in float64. Gradients flow to the
     pose, the points, the camera, the noise and the weights.
@@ -140,11 +140,11 @@ def pose_covariance(
     if focal_sigma is not None:
         check_positive(focal_sigma=focal_sigma)
         term = CameraTerm(one, one * focal_sigma**-2, one, one)
-        equations = add_term(equations, term.linearise(state), one, problem.focal)
+        equations = add_term(equations, term.linearise(state), problem.focal)
     if prior is not None:
         framed, usable = PoseTerm.of(map_tensors(torch.Tensor.double, prior), centroid[:, 0], spread[:, 0].reciprocal())
         sound.append(usable)
-        equations = add_term(equations, framed.linearise(state), one, problem.focal)
+        equations = add_term(equations, framed.linearise(state), problem.focal)
     information = equations.matrix.permute(2, 0, 1)
     size = information.shape[-1]
     with torch.no_grad():

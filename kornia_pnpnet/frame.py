@@ -265,20 +265,25 @@ class Normalize(Configured):
         mean_scale = (img_scale * is_there).sum(0) / is_there.sum(0).clamp(min=1.0) if rig is not None else img_scale[0]
         frame = Frame(centroid.mT, scale, mean_scale, order, status, matrices)
         if noise is not None:
-            # Scaling an infinite sigma would give gradients of NaN: an invalid problem has no known noise.
-            sigmas = map_tensors(lambda sigma: torch.where(has_noise[:, None], sigma, torch.nan), noise.sigmas)
-            noise = noise._replace(img=sigmas.img, world=sigmas.world)
+            # Unknown sigmas, NaN, and those of invalid problems are replaced before they are scaled: the gradient of
+            # the scale would be NaN.
+            known = [has_noise[:, None] & ~sigma.isnan() for sigma in noise[:2]]
+            scaled = [
+                torch.where(is_known, torch.where(is_known, sigma, 0.0) * unit, torch.nan)
+                for is_known, sigma, unit in zip(known, noise[:2], (img_scale.mT, scale[:, None]), strict=True)
+            ]
+            noise = noise._replace(img=scaled[0], world=scaled[1])
             if noise.covariances:
                 pixel_map = [x.mT for x in (img_scales[0], -camera[1] / camera[0] * img_scales[1], img_scales[1])]
                 noise = self._scaled_covariances(noise, (there & has_noise).mT, pixel_map, scale)
-            noise = self._apply_to_noise(noise, frame, img_scale.mT)
-        if confidence is not None and order is not None:
-            confidence = confidence.gather(1, order)
         if rig is not None:
             rig = Pose(rig.rotation, rig.translation * scale[:, None, None])
-            if order is not None:
-                rotation = rig.rotation.gather(1, order[..., None, None].expand_as(rig.rotation))
-                rig = Pose(rotation, rig.translation.gather(1, order[..., None].expand_as(rig.translation)))
+        if order is not None:
+            position = order
+            noise, confidence, rig = map_tensors(
+                lambda x: x.gather(1, position.view(*position.shape, *(1,) * (x.ndim - 2)).expand_as(x)),
+                (noise, confidence, rig),
+            )
         scales = mean_scale, scale, is_usual.mT
         return Problem(world_points, img_points, weights[..., 0], focal, *scales, noise, confidence, rig), frame
 
@@ -293,16 +298,6 @@ class Normalize(Configured):
         if world_cov is not None:
             world_cov = world_cov.scaled(scale.square()[:, None])
         return noise._replace(img_cov=img_cov, world_cov=world_cov)
-
-    def _apply_to_noise(self, noise: Noise, frame: Frame, img_scale: Tensor) -> Noise:
-        """Standard deviations in the units of the problem, and all noise in their order."""
-
-        def scaled(sigma: Tensor, scale: Tensor) -> Tensor:
-            # Unknown sigmas are NaN. Replace them before scaling, or the gradient of the scale becomes NaN.
-            return torch.where(sigma.isnan(), sigma, sigma.nan_to_num() * scale)
-
-        noise = noise._replace(img=scaled(noise.img, img_scale), world=scaled(noise.world, frame.scale[:, None]))
-        return noise if frame.order is None else map_tensors(lambda x: x.gather(1, frame.order), noise)
 
 
 def _is_usable(noise: Noise, there: Tensor) -> Tensor:

@@ -13,8 +13,7 @@ from kornia_pnpnet.core.checks import check_whole
 from kornia_pnpnet.core.compilation import EAGER, Runner, per_problem
 from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.linalg import relative, solve_positive
-from kornia_pnpnet.core.performance import problems_last, repeat_problems
-from kornia_pnpnet.core.symmetric import Symmetric2
+from kornia_pnpnet.core.performance import problems_last, repeat_problems, sees_values
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.judge.belief import believe, explains, has_enough, has_focal, residual_noise
 from kornia_pnpnet.problem import Noise, Problem, Starts, State
@@ -282,7 +281,8 @@ class RobustWeightedLM(Configured):
         prior = problem.weights * problems_last(starts.weights)
         area = None
         if self.by_residual and unknown is not None and problem.noise is not None and not problem.noise.covariances:
-            area = torch.where(unknown, outlier_area(problem), 0.0)
+            all_known = sees_values(unknown) and unknown.device.type == "cpu" and not bool(unknown.any())
+            area = None if all_known else torch.where(unknown, outlier_area(problem), 0.0)
         # Steps do not depend on a common factor of the weights; tiny weights must not vanish when multiplied.
         guided = by_residual = relative(prior, prior)
         if self.by_residual:
@@ -400,19 +400,13 @@ class RobustWeightedLM(Configured):
         return Progress(kept, solved, factor)
 
     def _equations(self, projection: Projection, problem: Problem, shape: Tensor) -> NormalEquations:
-        """Normal equations of the pairs, weighted and whitened, and of the terms.
-
-        Weights are relative to the heaviest row of the Jacobian, so that products of tiny weights do not vanish.
-        """
+        """Normal equations of the pairs, weighted and whitened, and of the terms."""
         sq_residual, precision = information(projection, problem)
         robust = problem.weights * self.kernel.weight(sq_residual, shape)
         weights = map_tensors(lambda x: x * robust, precision)
-        size = weights.uu + weights.vv if isinstance(weights, Symmetric2) else weights
-        largest = (size * projection.inv_depth.mT.square()).detach().amax(1, keepdim=True)
-        unit = torch.where(largest > 0, largest, 1.0)
-        equations = normal_equations(projection, problem, map_tensors(lambda x: x / unit, weights))
+        equations = normal_equations(projection, problem, weights, relative=True)
         for term in problem.terms:
-            equations = add_term(equations, term.linearise(projection.state), unit[:, 0], projection.focal)
+            equations = add_term(equations, term.linearise(projection.state), projection.focal)
         return equations
 
     def _best(self, rivals: Problem, prior: Tensor, shape: Tensor, now: Progress) -> Progress:

@@ -99,10 +99,12 @@ class NormalEquations(NamedTuple):
     Attributes:
         matrix: :math:`J^\top W J`, shape :math:`(6 + K, 6 + K, B)`.
         gradient: :math:`J^\top W r`, shape :math:`(6 + K, B)`.
+        unit: the weights were divided by this, shape :math:`(B,)`; ``None``: 1.
     """
 
     matrix: Tensor
     gradient: Tensor
+    unit: Tensor | None = None
 
 
 def project(state: State, problem: Problem) -> Projection:
@@ -133,8 +135,7 @@ def project(state: State, problem: Problem) -> Projection:
         shift = problem.rig.translation.permute(2, 1, 0)
         points = torch.addcmul(torch.addcmul(torch.addcmul(shift, i, x), j, y), k, z)
     z = points[2]
-    # z |z| > ratio² |x|² tests the sign and the ratio at once, without a square root, whose gradient is infinite at 0.
-    front = torch.add(z * z.abs(), points.square().sum(0), alpha=-MIN_DEPTH_RATIO * MIN_DEPTH_RATIO) > 0
+    front = z > MIN_DEPTH_RATIO * torch.linalg.vector_norm(points.detach(), dim=0)
     inv_depth = torch.where(front, z, torch.inf).reciprocal()
     img = problem.img_points.permute(2, 1, 0)
     focal = problem.focal * state.camera[:, 0].exp() if state.camera.shape[1] else problem.focal
@@ -224,7 +225,9 @@ def covariance_at(rotation: Tensor, p: Tensor, q: Tensor, scale: Tensor, noise: 
     return Symmetric2(uu + noise.img_cov.uu, uv + noise.img_cov.uv, vv + noise.img_cov.vv)
 
 
-def normal_equations(projection: Projection, problem: Problem, weights: Tensor | Symmetric2) -> NormalEquations:
+def normal_equations(
+    projection: Projection, problem: Problem, weights: Tensor | Symmetric2, *, relative: bool = False
+) -> NormalEquations:
     r"""The normal equations of the residuals by the pose and by the unknown parameters of the camera.
 
     With :math:`y = R x`, and the rows :math:`e` of :math:`z` times the derivative of :math:`(p, q)` by a point in the
@@ -236,16 +239,22 @@ def normal_equations(projection: Projection, problem: Problem, weights: Tensor |
         problem: its problem.
         weights: weight of each pair, :math:`(B, N)`, or 2x2 matrices with entries of that shape. Points behind the
             camera do not count.
+        relative: divide the weights of each problem by that of the heaviest row of the Jacobian, a constant, so that
+            products of tiny weights do not vanish.
 
     Returns:
         The equations, with :math:`J` divided by the focal length and :math:`r` in pixels.
     """
-    columns = _columns(projection, problem)
-    sq_inverse = (projection.inv_depth * projection.inv_depth).mT
-    weights = map_tensors(lambda w: (w * sq_inverse).mT, weights)
+    columns, unit = _columns(projection, problem), None
+    sq_inverse = projection.inv_depth * projection.inv_depth
+    weights = map_tensors(lambda w: w.mT * sq_inverse, weights)
+    if relative:
+        largest = (weights if isinstance(weights, Tensor) else weights.uu + weights.vv).detach().amax(0)
+        unit = torch.where(largest > 0, largest, 1.0)
+        weights = map_tensors(lambda w: w / unit, weights)
     if are_few(projection.inv_depth):
-        return _stacked_equations(columns, projection.scaled, weights)
-    return _entrywise_equations(columns, projection.scaled.unbind(), weights)
+        return NormalEquations(*_stacked_equations(columns, projection.scaled, weights), unit)
+    return NormalEquations(*_entrywise_equations(columns, projection.scaled.unbind(), weights), unit)
 
 
 def _columns(projection: Projection, problem: Problem) -> list[_Column]:
@@ -286,7 +295,7 @@ def _columns(projection: Projection, problem: Problem) -> list[_Column]:
     return [*columns, *((p * x, q * x) for x in (zoomed, *powers))]
 
 
-def _stacked_equations(columns: list[_Column], scaled: Tensor, weights: Tensor | Symmetric2) -> NormalEquations:
+def _stacked_equations(columns: list[_Column], scaled: Tensor, weights: Tensor | Symmetric2) -> tuple[Tensor, Tensor]:
     """All products at once: few calls, for few pairs."""
     size, zero = len(columns), torch.zeros_like(scaled[0])
     one = zero + 1.0
@@ -299,12 +308,12 @@ def _stacked_equations(columns: list[_Column], scaled: Tensor, weights: Tensor |
         uu, uv, vv = weights
         weighted = torch.stack((uu * u + uv * v, uv * u + vv * v), 1)
     products = (weighted.flatten(1, 2)[:, None] * jacobian.flatten(1, 2)).sum(2)  # (K, K + 1, B)
-    return NormalEquations(products[:, :size], products[:, size])
+    return products[:, :size], products[:, size]
 
 
 def _entrywise_equations(
     columns: list[_Column], scaled: tuple[Tensor, ...], weights: Tensor | Symmetric2
-) -> NormalEquations:
+) -> tuple[Tensor, Tensor]:
     """Entry by entry: temporaries of (N, B) stay in a processor's cache, and a compiler keeps them in registers."""
     uu, uv, vv = (weights, 0.0, weights) if isinstance(weights, Tensor) else weights
     total = uu.sum(0)
@@ -329,7 +338,7 @@ def _entrywise_equations(
         for j in size[: i + 1]
     }
     matrix = torch.stack([lower[max(i, j), min(i, j)] for i in size for j in size]).unflatten(0, (len(size), len(size)))
-    return NormalEquations(matrix, torch.stack([inner(column, scaled) for column in weighted]))
+    return matrix, torch.stack([inner(column, scaled) for column in weighted])
 
 
 def _times(a: Any, b: Any) -> Any:
@@ -396,7 +405,8 @@ def change_tangent(equations: NormalEquations, tangent_map: Tensor) -> NormalEqu
     whole = torch.eye(size, dtype=tangent_map.dtype, device=tangent_map.device).repeat(tangent_map.shape[0], 1, 1)
     whole[:, :3, :3] = tangent_map
     matrix = whole.mT @ equations.matrix.permute(2, 0, 1) @ whole
-    return NormalEquations(matrix.permute(1, 2, 0), (whole.mT @ equations.gradient.mT[..., None])[..., 0].mT)
+    gradient = (whole.mT @ equations.gradient.mT[..., None])[..., 0].mT
+    return equations._replace(matrix=matrix.permute(1, 2, 0), gradient=gradient)
 
 
 def moved(state: State, delta: Tensor) -> State:
@@ -407,12 +417,14 @@ def moved(state: State, delta: Tensor) -> State:
     and a shift along the axis, which look alike from far away, are then well separated parameters.
     """
     if not state.camera.shape[1]:
-        return State(retract(state.pose, delta.mT), state.camera)
-    pose = retract(state.pose, delta[:6].mT)
-    zoom, radial = delta[6].clamp(-_LARGEST_ZOOM, _LARGEST_ZOOM), delta[7:].clamp(-_LARGEST_RADIAL, _LARGEST_RADIAL)
+        return State(_retract(state.pose, *delta.split(3)), state.camera)
+    pose = _retract(state.pose, delta[:3], delta[3:6])
+    change = zoom = delta[6:7].clamp(-_LARGEST_ZOOM, _LARGEST_ZOOM)
+    if len(delta) > 7:
+        change = torch.cat((zoom, delta[7:].clamp(-_LARGEST_RADIAL, _LARGEST_RADIAL)))
     x, y, z = pose.translation.unbind(-1)
-    translation = torch.stack((x, y, z * zoom.exp())).mT
-    return State(pose._replace(translation=translation), state.camera + torch.cat((zoom[None], radial)).mT)
+    translation = torch.stack((x, y, z * zoom[0].exp())).mT
+    return State(pose._replace(translation=translation), state.camera + change.mT)
 
 
 def retract(pose: Pose, delta: Tensor) -> Pose:
@@ -436,7 +448,11 @@ def retract(pose: Pose, delta: Tensor) -> Pose:
         >>> retract(pose, torch.tensor([[0.0, 0.0, 0.0, 1.0, 2.0, 3.0]])).translation
         tensor([[1., 2., 3.]])
     """
-    turn, shift = delta.mT.split(3)
+    return _retract(pose, *delta.mT.split(3))
+
+
+def _retract(pose: Pose, turn: Tensor, shift: Tensor) -> Pose:
+    """:func:`retract` by the two parts of the tangent, (3, B) each."""
     half = (0.5 * turn)[:, None]  # (3, 1, B)
     rotation = pose.rotation.permute(1, 2, 0)
     once = torch.linalg.cross(half, rotation, dim=0)

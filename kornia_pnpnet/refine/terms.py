@@ -73,20 +73,19 @@ def gravity_prior(world_down: Tensor, cam_down: Tensor, sigma: Tensor | float) -
     return PosePrior(Pose(rotation, torch.zeros_like(b)), information)
 
 
-def add_term(equations: NormalEquations, linear: Linear, unit: Tensor, focal: Tensor) -> NormalEquations:
+def add_term(equations: NormalEquations, linear: Linear, focal: Tensor) -> NormalEquations:
     r"""Add a term to the normal equations of the pairs.
 
     Args:
-        equations: of the pairs at a state, with the Jacobian divided by the focal length.
+        equations: of the pairs at a state, with weights in inverse square pixels.
         linear: the term at the same state.
-        unit: what a weight of 1 in the equations stands for, in inverse square pixels, (B,).
         focal: the focal length in pixels, a scalar or (B,).
     """
     weighted = torch.bmm(linear.jacobian.mT, linear.information)  # (B, 6 + K, D)
-    weight = linear.weight / (unit * focal)
+    weight = linear.weight / (focal if equations.unit is None else equations.unit * focal)
     matrix = torch.bmm(weighted, linear.jacobian).permute(1, 2, 0) * (weight / focal)
     gradient = torch.bmm(weighted, linear.residual[..., None])[..., 0].mT * weight
-    return NormalEquations(equations.matrix + matrix, equations.gradient + gradient)
+    return equations._replace(matrix=equations.matrix + matrix, gradient=equations.gradient + gradient)
 
 
 class CameraTerm(NamedTuple):
