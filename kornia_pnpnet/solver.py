@@ -349,6 +349,7 @@ class PnPNet(PretrainedMixin):
         refined = self.refine(seen, starts, m=0 if call.first_stage_only else None, more=more, run=self._run)
         result = self._run(self._result, frame, starts, refined, call)
         if adapts:
+            assert result.probability is not None
             known, starts_of_known = _as_known(problem, starts, refined)
             pose = frame.apply(result.pose)
             mirror = mirror_probability(self.refine, known, starts_of_known, pose, result.ok, result.cost)
@@ -464,7 +465,7 @@ def _doubted(result: PnPResult, probability: Tensor, call: _Call) -> PnPResult:
     doubted = result.ok & (probability < LEAST_PROBABILITY)
     live, everywhere = ~doubted | call.always, torch.ones_like(doubted)
     names = "rotation", "translation", "weights", "cost", "intrinsics", "dist"
-    gated = {name: gate(getattr(result, name), live, everywhere, 0.0) for name in names}
+    gated: dict[str, Any] = {name: gate(getattr(result, name), live, everywhere, 0.0) for name in names}
     status = result.status.masked_fill(doubted, Status.NOT_BELIEVED.value)
     return result._replace(**gated, ok=result.ok & ~doubted, status=status, probability=probability)
 
