@@ -10,7 +10,7 @@ from kornia.core.exceptions import ShapeError, TypeCheckError, ValueCheckError
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from kornia_pnpnet.cameras import bearing_cameras, check_coefficients, compose, undistort
+from kornia_pnpnet.cameras import bearing_cameras, check_coefficients, pinholes, undistort
 from kornia_pnpnet.core.checks import Shapes, check_devices, check_shapes, common_dtype, expand_sigma
 from kornia_pnpnet.core.performance import present_first, sees_values
 from kornia_pnpnet.core.symmetric import Symmetric2, Symmetric3, equivalent_sigma
@@ -242,11 +242,15 @@ def _looking_along(inputs: Inputs) -> Inputs:
     The focal length is the geometric mean of those given: pixels of sigma per radian.
     """
     rotation, sound = bearing_cameras(inputs.img_points)
-    axis = torch.where(sound[..., None], inputs.img_points[..., :2] * 0.0, torch.nan)
-    cameras = inputs.intrinsics / inputs.intrinsics[..., 2:, 2:]
-    focal = (cameras[..., 0, 0] * cameras[..., 1, 1]).sqrt()
+    axis = torch.where(sound[..., None], torch.zeros_like(inputs.img_points[..., :2]), torch.nan)
+    # Of the camera only the diagonal counts.
+    cameras, has_focal = pinholes(inputs.intrinsics.diagonal(dim1=-2, dim2=-1).diag_embed())
+    focal = torch.where(has_focal, (cameras[..., 0, 0] * cameras[..., 1, 1]).sqrt(), 0.0)
     cameras = torch.stack((focal, focal, torch.ones_like(focal)), -1).diag_embed()
-    return inputs._replace(img_points=axis, intrinsics=cameras, rig=compose(rotation, inputs.rig))
+    rig = Pose(rotation, torch.zeros_like(rotation[..., 0]))
+    if inputs.rig is not None:
+        rig = Pose(rotation @ inputs.rig.rotation, (rotation @ inputs.rig.translation[..., None])[..., 0])
+    return inputs._replace(img_points=axis, intrinsics=cameras, rig=rig)
 
 
 def one_batch(x: Tensor, size: torch.Size, dtype: torch.dtype) -> Tensor:

@@ -33,6 +33,9 @@ INPUTS = tuple(_SHAPES)
 #: Columns that :class:`Solve` writes.
 OUTPUTS = ("rotation", "translation", "weights", "cost", "ok", "status")
 
+# Types of the cells and of what they hold.
+_LISTS = pa.types.is_list, pa.types.is_large_list, pa.types.is_fixed_size_list
+_NUMBERS = pa.types.is_integer, pa.types.is_floating, pa.types.is_null
 # Names of the values of Status, and of rows that no solver saw.
 _STATUS_NAMES = pa.array([*(status.name.lower() for status in Status), "malformed"])
 # Pairs. Problems with this number or more are padded, so that those with similar numbers are solved together.
@@ -54,8 +57,8 @@ class Solve:
     with other names, for example an ``id``. Rows keep their order, and numbers are float32.
 
     A bad row raises nothing: its ``ok`` is false and its pose is the identity. Its status is ``malformed`` when a list
-    is missing or has the wrong length, or when the solver is for another number of pairs. Rows do not change each
-    other's results beyond rounding.
+    is missing or has the wrong length, or when the solver is for another number of pairs. Rows change each other's
+    results by rounding only.
 
     Args:
         solver: a name of :func:`~kornia_pnpnet.registry.list_solvers`, or a solver.
@@ -88,13 +91,7 @@ class Solve:
         self.intrinsics = intrinsics
 
     def __call__(self, table: pa.Table) -> pa.Table:
-        """Solve the problems of a table.
-
-        Args:
-            table: one problem per row, see the class.
-
-        Returns:
-            The table of the results, one row per problem.
+        """Solve the problems of a table, see the class.
 
         Raises:
             ValueCheckError: when a column is missing.
@@ -132,10 +129,7 @@ class Solve:
 
 
 def list_column(values: np.ndarray) -> pa.Array:
-    r"""Make a column of lists, one list for each problem.
-
-    Args:
-        values: numbers of :math:`B` problems, shape :math:`(B, …)`.
+    r"""Make a column of lists, one for each problem, of their numbers, shape :math:`(B, …)`.
 
     Example:
         >>> list_column(np.eye(2)).to_pylist()
@@ -154,12 +148,11 @@ class _Cells:
     def __init__(self, name: str, column: pa.ChunkedArray) -> None:
         array = column.combine_chunks()
         ends = np.arange(len(array) + 1)
-        while _is_list(array.type):  # a list may be nested, as `.tolist()` makes it
+        while any(is_list(array.type) for is_list in _LISTS):  # a list may be nested, as `.tolist()` makes it
             sizes = compute.list_value_length(array).fill_null(0).to_numpy(zero_copy_only=False)
             ends = np.append(0, sizes.cumsum())[ends]
             array = compute.list_flatten(array)
-        kinds = pa.types.is_integer, pa.types.is_floating, pa.types.is_null
-        if not any(is_kind(array.type) for is_kind in kinds):
+        if not any(is_number(array.type) for is_number in _NUMBERS):
             raise TypeCheckError(f"the column {name} must hold lists of numbers, got {column.type}")
         self.values = array.cast(pa.float32(), safe=False).to_numpy(zero_copy_only=False)
         self.starts, self.sizes = ends[:-1], np.diff(ends)
@@ -177,15 +170,11 @@ class _Cells:
         return self.values[self.starts[rows, None] + within].reshape(len(rows), *shape)
 
 
-def _is_list(kind: pa.DataType) -> bool:
-    return pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
-
-
 def _groups(counts: np.ndarray, fits: np.ndarray, most: int) -> Iterator[tuple[np.ndarray, int]]:
     """Rows that are solved in one call, and the number of pairs to which they are padded.
 
-    That number depends on the row alone, so that the result does, too: the number of pairs below 16, and from there on
-    the next of 16, 20, 24, 28, 32, 40, 48, ..., which is at most a quarter more.
+    This number depends on the row alone, so that the result does, too: below 16 pairs there is no padding, with more
+    the number is the next of 16, 20, 24, 28, 32, 40, 48, ..., at most a quarter more.
     """
     step = 2 ** (np.log2(counts.clip(_PADDED_FROM)).astype(int) - 2)
     widths = np.where(counts < _PADDED_FROM, counts, -(-counts // step) * step)

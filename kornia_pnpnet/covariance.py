@@ -6,9 +6,9 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from kornia.core.exceptions import ValueCheckError
 from kornia.geometry.camera import PinholeCamera
+from kornia.geometry.conversions import normalize_points_with_intrinsics
 from kornia.geometry.liegroup import So3
 from torch import Tensor
-from torch.nn import functional
 
 from kornia_pnpnet.arguments import checked_noise
 from kornia_pnpnet.core.checks import Shapes, check_devices, check_positive, check_shapes, common_dtype
@@ -21,6 +21,9 @@ from kornia_pnpnet.refine.terms import CameraTerm, PoseTerm, add_term
 from kornia_pnpnet.result import Pose, PosePrior, camera_matrices
 
 __all__ = ["pose_covariance"]
+
+# An information matrix with a diagonal of 1 and a smaller eigenvalue is singular up to rounding in float64.
+_LEAST_EIGENVALUE = 1e-13
 
 
 def pose_covariance(
@@ -40,13 +43,12 @@ def pose_covariance(
 ) -> Tensor:
     r"""First-order covariance of a pose found by weighted least squares.
 
-    The covariance is :math:`(\sum_i w_i J_i^\top J_i / \sigma_i^2)^{-1}`. :math:`J_i` is the Jacobian of pixel
+    The covariance is :math:`(\sum_i w_i J_i^\top \Sigma_i^{-1} J_i)^{-1}`. :math:`J_i` is the Jacobian of pixel
     :math:`i` by the tangent :math:`(\omega, v)` of :func:`~kornia_pnpnet.refine.residual.retract`: when
     :math:`(R, t)` is the true pose, the estimate is about :math:`(\mathrm{cay}(\omega) R,\; t + v)`.
-    :math:`\sigma_i^2` is the :func:`~kornia_pnpnet.refine.residual.pixel_variance`. With covariances the covariance is
-    :math:`(\sum_i w_i J_i^\top \Sigma_i^{-1} J_i)^{-1}`, where :math:`\Sigma_i` is the
-    :func:`~kornia_pnpnet.refine.residual.pixel_covariance`. The computation runs in float64. Gradients flow to the
-    pose, the points, the camera, the noise and the weights.
+    :math:`\Sigma_i` is the :func:`~kornia_pnpnet.refine.residual.pixel_covariance`, of isotropic noise the
+    :func:`~kornia_pnpnet.refine.residual.pixel_variance`. The computation runs in float64. Gradients flow to the pose,
+    the points, the camera, the noise and the weights.
 
     A robust kernel gives most inliers a weight below 1, but an M-estimate is hardly less accurate for it (P. Huber,
     "Robust Statistics", 1981). So :math:`w_i` is the weight over the mean weight of an inlier,
@@ -54,24 +56,20 @@ def pose_covariance(
 
     Args:
         pose: the estimated world-to-camera pose, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
-        world_points: shape :math:`(B, N, 3)`.
-        img_points: pixels, shape :math:`(B, N, 2)`.
-        intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or Kornia's cameras.
-        img_sigma: standard deviation of the noise on each pixel coordinate, in pixels: a number, :math:`(B,)` or
-            :math:`(B, N)`.
-        world_sigma: standard deviation of the noise on each world coordinate, in the unit of ``world_points``: a
-            number, :math:`(B,)` or :math:`(B, N)`. World points are exact without this and ``world_cov``.
-        img_cov: covariance of the noise of each pixel in px², in place of ``img_sigma``, shape :math:`(B, N, 2, 2)`.
-        world_cov: covariance of the noise of each world point, in place of ``world_sigma``, shape
-            :math:`(B, N, 3, 3)`.
+        world_points: see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`.
+        img_points: pixels; see ``PnPNet.forward``.
+        intrinsics: see ``PnPNet.forward``.
+        img_sigma: see ``PnPNet.forward``; required without ``img_cov``.
+        world_sigma: see ``PnPNet.forward``. World points are exact without this and ``world_cov``.
+        img_cov: see ``PnPNet.forward``.
+        world_cov: see ``PnPNet.forward``.
         weights: weight of each pair, 0 for outliers, shape :math:`(B, N)`: the ``weights`` of a result. Those of
             `p3p-ransac` with a ``world_threshold`` also depend on the depth: pass ``(result.weights > 0).double()``.
             ``None``: 1 for every pair.
         prior: the prior that the pose was found with; its information adds to that of the pairs.
         focal: ``"known"``, or ``"unknown"``: the pose was found together with the focal length of the ``intrinsics``,
             which are then the ``intrinsics`` of the result.
-        focal_sigma: standard deviation of the logarithm of the focal length that was expected, see
-            :class:`~kornia_pnpnet.solver.PnPNet`; its information adds to that of the pairs.
+        focal_sigma: the option of the solver with an unknown focal length; its information adds to that of the pairs.
 
     Returns:
         Shape :math:`(B, 6, 6)`, with an unknown focal length :math:`(B, 7, 7)`, whose last row and column are of the
@@ -125,9 +123,8 @@ def pose_covariance(
     spread = torch.where(mean_square > 0, mean_square, 1.0).sqrt()
     rotated_centroid = (rotation @ centroid.mT)[..., 0]  # (B, 3)
     centred_pose = Pose(rotation, (pose.translation.double() + rotated_centroid) / spread)
-    focals, principal_point = camera.diagonal(dim1=-2, dim2=-1)[..., :2], camera[..., :2, 2]
-    rays = (img_points.double() - principal_point[..., None, :]) / focals[..., None, :]
-    mean_focal = focals.log().mean(-1).exp().reshape(-1, 1)  # (B or 1, 1), geometric mean of fx and fy
+    rays = normalize_points_with_intrinsics(img_points.double(), camera.expand(batch, 3, 3))
+    mean_focal = camera.diagonal(dim1=-2, dim2=-1)[..., :2].log().mean(-1).exp().reshape(-1, 1)  # (B or 1, 1)
     one = torch.ones_like(spread[:, 0])
     problem = Problem.of(offsets / spread[..., None], rays, weights=inlier)
     state = State(centred_pose, one.new_zeros(batch, 0 if focal == "known" else 1))
@@ -140,34 +137,29 @@ def pose_covariance(
     if focal_sigma is not None:
         check_positive(focal_sigma=focal_sigma)
         term = CameraTerm(one, one * focal_sigma**-2, one, one)
-        equations = add_term(equations, term.linearise(state), problem.focal)
+        equations = add_term(equations, term.linearise(state), one, problem.focal)
     if prior is not None:
         framed, usable = PoseTerm.of(map_tensors(torch.Tensor.double, prior), centroid[:, 0], spread[:, 0].reciprocal())
         sound.append(usable)
-        equations = add_term(equations, framed.linearise(state), problem.focal)
+        equations = add_term(equations, framed.linearise(state), one, problem.focal)
     information = equations.matrix.permute(2, 0, 1)
     size = information.shape[-1]
+    eye = torch.eye(size, dtype=information.dtype, device=information.device)
     with torch.no_grad():
-        inverse, info = torch.linalg.inv_ex(information)
-        positive = (inverse.diagonal(dim1=1, dim2=2) > 0).all(-1)
-        determined = (info == 0) & inverse.isfinite().all((1, 2)) & positive
-        determined = torch.stack((determined, *sound)).all(0)[:, None, None]
-    inverse = torch.linalg.inv_ex(torch.where(determined, information, torch.eye(size).to(information))).inverse
+        unit = information.diagonal(dim1=1, dim2=2).rsqrt()
+        correlation = unit[:, :, None] * information * unit[:, None]
+        is_definite = torch.linalg.cholesky_ex(correlation - _LEAST_EIGENVALUE * eye).info == 0
+        determined = torch.stack((is_definite, correlation.isfinite().all((1, 2)), *sound)).all(0)[:, None, None]
+    inverse = torch.linalg.inv_ex(torch.where(determined, information, eye)).inverse
 
     # Back to the given coordinates: omega stays, v = spread * v_centred + (R centroid) x omega.
-    eye = torch.eye(3, dtype=torch.float64, device=points.device).expand(batch, 3, 3)
-    omega_rows = torch.cat((eye, torch.zeros_like(eye)), -1)
-    v_rows = torch.cat((So3.hat(rotated_centroid), spread[..., None] * eye), -1)
-    back = torch.cat((omega_rows, v_rows), 1)  # (B, 6, 6)
+    back = eye.repeat(batch, 1, 1)
+    back[:, 3:6, :3] = So3.hat(rotated_centroid)
+    back[:, 3:6, 3:6] *= spread[..., None]
     if size == 7:  # the depth of the centroid grows with the focal length, see `moved`
-        depth = pose.translation[:, 2].double() + rotated_centroid[:, 2]
-        back = functional.pad(back, (0, 1, 0, 1))
-        more = torch.zeros_like(back)
-        more[:, 5, 6], more[:, 6, 6] = depth, 1.0
-        back = back + more
+        back[:, 5, 6] = pose.translation[:, 2].double() + rotated_centroid[:, 2]
     covariance = back @ torch.where(determined, inverse, 0.0) @ back.mT
-    undetermined = covariance.new_full((size,), torch.inf).diag()
-    return torch.where(determined, covariance, undetermined).to(dtype)
+    return torch.where(determined, covariance, torch.where(eye > 0, torch.inf, 0.0)).to(dtype)
 
 
 def _inlier_probability(weights: Tensor) -> Tensor:

@@ -54,14 +54,14 @@ class ExportedResult(NamedTuple):
 
 
 class ExportedCamera(NamedTuple):
-    """What an exported solver returns that estimates the focal length.
+    """An :class:`ExportedResult` of a solver that estimates the focal length.
 
     Attributes:
-        rotation: See ExportedResult.
-        translation: See ExportedResult.
-        pair_weights: See ExportedResult.
-        cost: See ExportedResult.
-        ok: See ExportedResult.
+        rotation: see ExportedResult.
+        translation: see ExportedResult.
+        pair_weights: see ExportedResult.
+        cost: see ExportedResult.
+        ok: see ExportedResult.
         camera: the result's ``intrinsics``, shape :math:`(B, 3, 3)`.
     """
 
@@ -73,9 +73,9 @@ class ExportedCamera(NamedTuple):
     camera: Tensor
 
 
-#: Names of the inputs of an exported solver, in this order, all float32.
+#: Names of the inputs of an exported solver in their order, all float32.
 INPUTS = ("world_points", "img_points", "intrinsics", "weights")
-#: Names of the inputs of a solver that was exported for rigs, in this order, all float32.
+#: Names of the inputs of a solver that was exported for rigs.
 RIG_INPUTS = (*INPUTS, "rig_rotation", "rig_translation")
 #: Names of the outputs with known focal lengths: the fields of :class:`ExportedResult`.
 OUTPUTS = ExportedResult._fields
@@ -108,8 +108,7 @@ def export_program(
     r"""Trace a solver for batches of any size or of one size.
 
     Args:
-        solver: any solver but RANSAC, whose number of iterations depends on the data. The program always has the
-            fixed effort.
+        solver: any solver but RANSAC. The program always has the fixed effort.
         n: number of correspondences per problem. With ``None`` the n of the network, or any n of at least 4 when the
             network accepts any n.
         batch: number of problems of each call, which a compiler can specialise for; ``None``: any number.
@@ -117,10 +116,9 @@ def export_program(
 
     Returns:
         A program that maps :data:`INPUTS` to the fields of :class:`ExportedResult`, with an unknown focal length to
-        those of :class:`ExportedCamera`. The inputs are world points :math:`(B, N, 3)`, pixels
-        :math:`(B, N, 2)`, camera matrices :math:`(B, 3, 3)` and weights :math:`(B, N)`, 0 for padding. For rigs the
-        inputs are :data:`RIG_INPUTS`: camera matrices :math:`(B, N, 3, 3)`, and the transform from the rig to the
-        camera of each pair, :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`.
+        those of :class:`ExportedCamera`. The inputs are world points :math:`(B, N, 3)`, pixels :math:`(B, N, 2)`,
+        camera matrices :math:`(B, 3, 3)` and weights :math:`(B, N)`, 0 for padding. For rigs they are
+        :data:`RIG_INPUTS`: camera matrices :math:`(B, N, 3, 3)`, and ``cam_from_rig`` of ``PnPNet.forward``.
 
     Raises:
         BaseError: when ``n`` is less than 3 or not the n of the network, or ``batch`` less than 1.
@@ -150,12 +148,11 @@ def export_program(
     fixed = _fixed_n(solver, n)
     if n not in (None, fixed):
         raise ValueCheckError(f"The solver's network was built for n = {fixed}, got n = {n!r}.")
-    size = 3 if batch is None else int(batch)
-    pairs = 12 if fixed is None else fixed
-    data = CameraProblems(n=pairs, batch_size=size, cameras=3) if rig else SyntheticProblems(n=pairs, batch_size=size)
-    problems = data.batch(0)
-    weights = torch.ones_like(problems.world_points[..., 0])
-    inputs = (problems.world_points, problems.img_points, problems.intrinsics, weights, *(problems.cam_from_rig or ()))
+    sizes_of_example = {"n": fixed or 12, "batch_size": int(batch or 3)}
+    problems = (CameraProblems(cameras=3, **sizes_of_example) if rig else SyntheticProblems(**sizes_of_example)).batch(
+        0
+    )
+    inputs = (*problems[:3], torch.ones_like(problems.world_points[..., 0]), *(problems.cam_from_rig or ()))
     sizes: dict[int, Any] = {} if batch is not None else {0: torch.export.Dim("batch", min=1, max=_MAX_BATCH)}
     points = sizes if fixed is not None else {**sizes, 1: torch.export.Dim("pairs", min=4, max=_MAX_N)}
     shapes = (points, points, points if rig else sizes, points, *((points, points),) * rig)
@@ -197,7 +194,6 @@ def export_package(
     Raises:
         BaseError: see :func:`export_program`; or when the name does not end in ``.pt2``.
         ImportError: without a C++ compiler.
-        OSError: when the file cannot be written.
     """
     path = Path(path)
     if path.suffix != ".pt2":
@@ -254,15 +250,10 @@ class PackagedSolver:
         *,
         cam_from_rig: Pose | None = None,
     ) -> ExportedResult | ExportedCamera:
-        r"""Solve a batch of problems.
+        """Solve a batch of problems.
 
-        Args:
-            world_points: shape :math:`(B, N, 3)`.
-            img_points: pixels, shape :math:`(B, N, 2)`.
-            intrinsics: camera matrices, shape :math:`(B, 3, 3)`, in rigs :math:`(B, N, 3, 3)`; or :math:`(3, 3)`.
-            weights: weight of each pair, 0 for padding, shape :math:`(B, N)`; 1 when ``None``.
-            cam_from_rig: the transform from the rig to the camera that sees each pair, :math:`(B, N, 3, 3)` and
-                :math:`(B, N, 3)`, in a package for rigs and only there.
+        For the arguments see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`. A package for rigs needs
+        ``cam_from_rig`` and a camera for each pair or for all; others do not take it.
 
         Raises:
             ShapeError: for other shapes; compiled code would read beyond the end of a tensor.
@@ -294,8 +285,7 @@ def load_package(path: str | Path) -> PackagedSolver:
         OSError: when the file cannot be read.
         ValueCheckError: when the file is not a package of :func:`export_package`, or of another platform.
     """
-    with Path(path).open("rb"):
-        pass
+    Path(path).open("rb").close()
     try:
         # `torch._inductor.aoti_load_package` is the same, but imports the compiler first, which takes seconds, and
         # parses the signature in each call.
@@ -310,20 +300,14 @@ def export_onnx(
 ) -> Path:
     """Write a solver as an ONNX model in one file. ONNX Runtime runs the model without PyTorch.
 
-    Args:
-        solver: see :func:`export_program`.
-        path: the file to write. An existing file is replaced when the model is complete.
-        n: see :func:`export_program`.
-        batch: see :func:`export_program`.
-        rig: see :func:`export_program`.
+    See :func:`export_program` for the arguments and their errors, and for the inputs and outputs of the model. The file
+    ``path`` is replaced when the model is complete.
 
     Returns:
         The path.
 
     Raises:
-        BaseError: see :func:`export_program`.
         ImportError: without the extra ``onnx``.
-        OSError: when the file cannot be written.
     """
     try:
         import onnxscript  # noqa: F401
@@ -331,14 +315,11 @@ def export_onnx(
         raise ImportError("ONNX needs more packages: pip install 'kornia_pnpnet[onnx]'") from error
     path = Path(path)
     program = export_program(solver, n, batch=batch, rig=rig)
-    inputs, outputs = (
-        list(RIG_INPUTS if rig else INPUTS),
-        [*(OUTPUTS if solver.focal == "known" else ExportedCamera._fields)],
-    )
+    inputs, outputs = RIG_INPUTS if rig else INPUTS, OUTPUTS if solver.focal == "known" else ExportedCamera._fields
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # the exporter warns about its own code
         model = torch.onnx.export(
-            program, dynamo=True, verbose=False, optimize=False, input_names=inputs, output_names=outputs
+            program, dynamo=True, verbose=False, optimize=False, input_names=[*inputs], output_names=[*outputs]
         )
     assert model is not None
     _simplify(model.model)

@@ -200,8 +200,8 @@ class Normalize(Configured):
             is_finite = is_finite & has_noise
         if rig is not None:
             values = torch.cat((rig.rotation.flatten(-2), rig.translation), -1).detach()
-            sound = (values.abs() < limit).all(-1) | ~there.mT  # (B, N)
-            is_finite = is_finite & sound.all(-1)
+            sound = (values.abs() < limit).all(-1)  # (B, N)
+            is_finite = is_finite & (sound | ~there.mT).all(-1)
             eye = torch.eye(3, dtype=rows.dtype, device=rows.device)
             rotation = torch.where(sound[..., None, None], rig.rotation, eye)
             rig = Pose(rotation, torch.where(sound[..., None], rig.translation, 0.0))
@@ -262,7 +262,10 @@ class Normalize(Configured):
         eye = torch.eye(3, dtype=camera.dtype, device=camera.device).view(9, *(1,) * (cameras.ndim - 1))
         matrices = torch.where(is_camera, cameras, eye)
         matrices = (matrices.mT if intrinsics.ndim == 3 else matrices.permute(2, 1, 0)).unflatten(-1, (3, 3))
-        mean_scale = (img_scale * is_there).sum(0) / is_there.sum(0).clamp(min=1.0) if rig is not None else img_scale[0]
+        mean_scale = img_scale[0]
+        if rig is not None:  # 1 where no pair is there
+            share = is_there / is_there.sum(0).clamp(min=1.0)
+            mean_scale = torch.where(there.any(0), (img_scale * share).sum(0), 1.0)
         frame = Frame(centroid.mT, scale, mean_scale, order, status, matrices)
         if noise is not None:
             # Unknown sigmas, NaN, and those of invalid problems are replaced before they are scaled: the gradient of

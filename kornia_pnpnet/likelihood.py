@@ -41,9 +41,6 @@ _MODE_ITERATIONS, _MODE_DAMPING = 4, 1e-3
 _LEAST_DEPTH = 0.02
 
 
-# Poses drawn for each problem have rotations (S, B, 3, 3) and translations (S, B, 3).
-
-
 class _Component(NamedTuple):
     """A t distribution around a pose: its precision matrix is the square of the factor, lower triangular (B, 6, 6)."""
 
@@ -92,7 +89,7 @@ def monte_carlo_pose_loss(
     Args:
         truth: true world-to-camera poses, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
         hypotheses: poses around which to look as well, such as the ``pose`` of a result.
-        world_points: see :meth:`~kornia_pnpnet.solver.PnPNet.forward`, also for dimensions and dtypes.
+        world_points: see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`, also for dimensions and dtypes.
         img_points: see ``PnPNet.forward``.
         intrinsics: see ``PnPNet.forward``.
         weights: see ``PnPNet.forward``.
@@ -138,10 +135,11 @@ def monte_carlo_pose_loss(
     checked = [checked_inputs(*pairs, pose, **sigmas, **covariances) for pose in (truth, *others)]
     size, inputs = checked[0]
     given = [Pose(*x.init) for _, x in checked if x.init is not None]
-    assert inputs.noise is not None
-    known = inputs.noise.img.isfinite().all(1) & (inputs.noise.img > 0).all(1) & inputs.noise.world.isfinite().all(1)
-    sound_noise = map_tensors(lambda x: torch.where(known[:, None], x, 1.0), inputs.noise.sigmas)
-    noise = inputs.noise._replace(img=sound_noise.img, world=sound_noise.world)
+    noise = inputs.noise
+    assert noise is not None
+    known = noise.img.isfinite().all(1) & (noise.img > 0).all(1) & noise.world.isfinite().all(1)
+    img, world = (torch.where(known[:, None], x, 1.0) for x in noise[:2])
+    noise = noise._replace(img=img, world=world)
 
     with torch.no_grad():
         _, frame = Normalize(order=False)(*inputs[:5], noise)
@@ -157,13 +155,16 @@ def monte_carlo_pose_loss(
 
     live = frame.valid & known
     for pose in given:
-        live = live & torch.cat((pose.rotation.flatten(1), pose.translation), 1).isfinite().all(1)
-    sound = [_pose_where(live, map_tensors(torch.Tensor.detach, pose)) for pose in given]
-    poses = [frame.apply(pose) for pose in sound]
+        live = live & pose.matrix.isfinite().all(-1).all(-1)
+    eye = torch.eye(3).to(world)
+    poses = []
+    for pose in given:  # a problem that is refused has a constant pose
+        rotation = torch.where(live[:, None, None], pose.rotation.detach(), eye)
+        poses.append(frame.apply(Pose(rotation, torch.where(live[:, None], pose.translation.detach(), eye[2]))))
     refine = RobustWeightedLM(
         _MODE_ITERATIONS, kernel=kernel, robustness=scale, damping=_MODE_DAMPING, reject_worse=False, learnable=False
     ).to(world)
-    model = _Posterior(problem, *poses[0], refine, world.new_tensor(scale), noisy_points)
+    model = _Posterior(problem, poses[0].translation, refine, world.new_tensor(scale), noisy_points)
     fixed = model._replace(problem=problem.map(torch.Tensor.detach))
     with torch.no_grad():
         drawn, log_proposal = _draw(fixed, poses, samples // count, rounds)
@@ -178,7 +179,6 @@ class _Posterior(NamedTuple):
 
     Attributes:
         problem: the problem with known noise.
-        rotation: rotation of the true pose, (B, 3, 3).
         translation: translation of the true pose, (B, 3).
         refine: finds modes, by the robust kernel of the posterior.
         shape: shape of the kernel, a scalar.
@@ -186,7 +186,6 @@ class _Posterior(NamedTuple):
     """
 
     problem: Problem
-    rotation: Tensor
     translation: Tensor
     refine: RobustWeightedLM
     shape: Tensor
@@ -198,7 +197,7 @@ class _Posterior(NamedTuple):
         return self.translation.norm(dim=-1, keepdim=True)
 
     def log_density(self, poses: Pose) -> Tensor:
-        """Logarithm of likelihood times prior, (S, B)."""
+        """Logarithm of likelihood times prior, (S, B), of rotations (S, B, 3, 3) and translations (S, B, 3)."""
         return self.log_prior(poses.translation) - self._cost(poses)
 
     def log_prior(self, translation: Tensor) -> Tensor:
@@ -317,13 +316,6 @@ def _log_density(component: _Component, poses: Pose) -> Tensor:
     log_determinant = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     # Volume of rotations by volume of Cayley's vectors: 1 / (1 + |omega|² / 4)².
     return _log_t(sq_distance, 6) + log_determinant + 2.0 * torch.log1p(0.25 * tangent[..., :3].square().sum(-1))
-
-
-def _pose_where(live: Tensor, pose: Pose) -> Pose:
-    """The pose of each problem that is ``live``, bool (B,), and a constant pose for the others."""
-    eye = torch.eye(3, dtype=pose.rotation.dtype, device=pose.rotation.device)
-    rotation = torch.where(live[:, None, None], pose.rotation, eye)
-    return Pose(rotation, torch.where(live[:, None], pose.translation, eye[2]))
 
 
 def _tangent(pose: Pose, origin: Pose) -> Tensor:

@@ -6,6 +6,7 @@ import math
 from typing import NamedTuple
 
 import torch
+from kornia.geometry.camera import project_points
 from kornia.geometry.linalg import transform_points
 from torch import Tensor, nn
 
@@ -31,8 +32,8 @@ class LossTerms(NamedTuple):
         init_translation: translation distance of the first guess at the centroid of the points.
         refined_rotation: chordal rotation distance after refinement.
         refined_translation: translation distance after refinement.
-        weights: cross entropy of the weights as probabilities of being an inlier; 0 where the loss ignores weights.
-        noise: negative log-likelihood of the inliers under the estimated noise; 0 where the loss ignores noise.
+        weights: cross entropy of the weights as probabilities of being an inlier, of :class:`SetLoss`.
+        noise: negative log-likelihood of the inliers under the estimated noise, of :class:`SetLoss`.
     """
 
     total: Tensor
@@ -81,10 +82,6 @@ def _refined_distances(
         return pose_distances(result.pose, problems.pose, origin)
 
 
-def _saturated(distance: Tensor, limit: float | None) -> Tensor:
-    return distance if limit is None else distance / (1.0 + distance / limit)
-
-
 class PoseLoss(nn.Module):
     r"""Weighted sum of four distances: rotation and translation, of the first guess and after the refinement.
 
@@ -93,8 +90,8 @@ class PoseLoss(nn.Module):
     error.
 
     A failed refinement may be off by any amount. So that such problems do not dominate the batch, the refined distance
-    :math:`d` of a problem may be saturated to :math:`d / (1 + d / c)`. With :math:`c` near the limit of success the
-    loss follows the success rate.
+    :math:`d` of a problem is saturated to :math:`d / (1 + d / c)`. With :math:`c` near the limit of success the loss
+    follows the success rate.
 
     Args:
         rotation: weight of the chordal rotation distances.
@@ -124,11 +121,10 @@ class PoseLoss(nn.Module):
         saturation: float | None = None,
     ) -> None:
         super().__init__()
-        check_numbers(
-            0.0, rotation=rotation, translation=translation, init_translation=init_translation, refined=refined
-        )
-        if saturation is not None:
-            check_positive(saturation=saturation, or_infinite=True)
+        weights = {"rotation": rotation, "translation": translation, "init_translation": init_translation}
+        check_numbers(0.0, **weights, refined=refined)
+        saturation = math.inf if saturation is None else saturation
+        check_positive(saturation=saturation, or_infinite=True)
         self.rotation = rotation
         self.translation = translation
         self.init_translation = init_translation
@@ -143,9 +139,6 @@ class PoseLoss(nn.Module):
             problems: the problems with their true poses.
             ramp: factor of the refined terms. At 0, the start of a training, no gradient passes through them.
 
-        Returns:
-            The loss and its terms, means over the batch.
-
         Raises:
             BaseError: when result and truth differ in shape, dtype or device.
         """
@@ -153,7 +146,7 @@ class PoseLoss(nn.Module):
         rotation, translation = _refined_distances(result, problems, ramp)
         init = self.rotation * init_rotation + self.init_translation * init_translation
         refined = self.rotation * rotation + self.translation * translation
-        total = init + ramp * self.refined * _saturated(refined, self.saturation)
+        total = init + ramp * self.refined * refined / (1.0 + refined / self.saturation)
         none = torch.zeros_like(total)
         terms = LossTerms(total, init_rotation, init_translation, rotation, translation, weights=none, noise=none)
         return map_tensors(torch.mean, terms)
@@ -213,11 +206,7 @@ class SetLoss(nn.Module):
         self.translation_unit = translation_unit
 
     def forward(self, result: PnPResult, problems: Problems, ramp: float, guess: Starts) -> LossTerms:
-        """Compare a solver's result with the truth.
-
-        Arguments, result and errors are those of :meth:`PoseLoss.forward`; ``guess`` is the first guess of the result,
-        see :meth:`~kornia_pnpnet.solver.PnPNet.with_starts`.
-        """
+        """See :meth:`PoseLoss.forward`; ``guess``: see :meth:`~kornia_pnpnet.solver.PnPNet.with_starts`."""
         centre = problems.world_points.mean(1)
         distance = transform_points(problems.pose.matrix, centre[:, None])[:, 0].norm(dim=-1)
 
@@ -231,7 +220,8 @@ class SetLoss(nn.Module):
 
         rotation, translation = _refined_distances(result, problems, ramp, centre)
         translation = translation / distance
-        refined = _saturated(rotation / self.rotation_unit + translation / self.translation_unit, self.saturation)
+        refined = rotation / self.rotation_unit + translation / self.translation_unit
+        refined = refined / (1.0 + refined / self.saturation)
         probability = torch.where(problems.inliers, guess.weights, 1.0 - guess.weights)
         entropy = -probability.clamp(min=_LEAST_PROBABILITY).log().mean(-1)
         noise = torch.zeros_like(first) if guess.noise is None else _negative_log_likelihood(guess.noise, problems)
@@ -243,12 +233,10 @@ class SetLoss(nn.Module):
 def _negative_log_likelihood(noise: Noise, problems: Problems) -> Tensor:
     """Negative log-likelihood of the residuals at the true pose up to a constant, mean over the inliers, (B,)."""
     cam = problems.true_cam_points
-    z = torch.where(problems.inliers, cam[..., 2], 1.0)
-    focal = problems.pair_intrinsics.diagonal(dim1=-2, dim2=-1)[..., :2]
-    centre = problems.pair_intrinsics[..., :2, 2]
-    plane = cam[..., :2] / z[..., None]
-    sq_residual = (focal * plane + centre - problems.img_points).square().sum(-1)
-    moved = focal.mean(-1) * noise.world / z
-    variance = noise.img.square() + moved.square() * (1.0 + 0.5 * plane.square().sum(-1))
+    cam = torch.where(problems.inliers[..., None], cam, torch.eye(3).to(cam)[2])
+    cameras = problems.pair_intrinsics
+    sq_residual = (project_points(cam, cameras.expand(*cam.shape, 3)) - problems.img_points).square().sum(-1)
+    moved = cameras.diagonal(dim1=-2, dim2=-1)[..., :2].mean(-1) * noise.world / cam[..., 2]
+    variance = noise.img.square() + moved.square() * (1.0 + 0.5 * (cam[..., :2] / cam[..., 2:]).square().sum(-1))
     loss = variance.log() + 0.5 * (sq_residual / variance).clamp(max=_MOST_VARIANCES)
     return torch.where(problems.inliers, loss, 0.0).sum(-1) / problems.inliers.sum(-1).clamp(min=1)

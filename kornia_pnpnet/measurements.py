@@ -26,10 +26,8 @@ def heatmap_keypoints(
 
     The softmax of a map is a density that is constant in each cell. Its mean is Kornia's soft-argmax. Its covariance
     is that of the cells' centres plus the variance of a cell, 1/12 per axis (Sheppard's correction), so that a map
-    with a single peak has a positive definite covariance.
-
-    The covariance says how far the map spreads. It is the error of the keypoint only when a loss has taught the
-    network so, such as :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss`.
+    with a single peak has a positive definite covariance. This is the error of the keypoint only when a loss such as
+    :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss` has taught the network so.
 
     Convention:
         Pixels are (u, v) with the centre of the top-left pixel at (0, 0), as in Kornia. Add 0.5 where the principal
@@ -47,9 +45,8 @@ def heatmap_keypoints(
         and ``img_cov`` of a solver. Both are NaN for a map with NaN, so that its problem is not ``ok``.
 
     Raises:
-        ShapeError: when the maps have no four dimensions.
-        TypeCheckError: for maps of booleans or complex numbers.
-        BaseError: for a temperature that is a number but not positive, or a stride that is not positive.
+        BaseError: for maps without four dimensions, of booleans or of complex numbers, or for a temperature that is a
+            number but not positive, or a stride that is not positive.
 
     Example:
         >>> heatmaps = torch.full((1, 1, 5, 5), -100.0)
@@ -98,12 +95,11 @@ def depth_points(
     Args:
         img_points: pixels of the camera that measured the depth, shape :math:`(B, N, 2)`.
         depth: along the camera's z axis, in the unit of the world, shape :math:`(B, N)`.
-        intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or Kornia's cameras.
+        intrinsics: see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`.
         pose: world-to-camera pose of this camera, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
         depth_sigma: standard deviation of the depth in its unit: a number, :math:`(B,)` or :math:`(B, N)`.
-        img_sigma: standard deviation of each pixel coordinate, as ``depth_sigma``; ``None`` without ``img_cov``: exact
-            pixels.
-        img_cov: covariance of each pixel in px², in place of ``img_sigma``, shape :math:`(B, N, 2, 2)`.
+        img_sigma: see ``PnPNet.forward``. Pixels are exact without this and ``img_cov``.
+        img_cov: see ``PnPNet.forward``.
 
     Returns:
         The points, shape :math:`(B, N, 3)`, and their covariances in squared units of the world, shape
@@ -112,10 +108,8 @@ def depth_points(
         unless the solver's ``mask`` leaves the pair out.
 
     Raises:
-        ShapeError: when shapes do not match.
-        TypeCheckError: for tensors of booleans or complex numbers, or a sigma that is no number.
-        DeviceError: for tensors on different devices.
-        ValueCheckError: with both ``img_sigma`` and ``img_cov``.
+        BaseError: for tensors whose shapes or devices do not match, tensors of booleans or complex numbers, a sigma
+            that is no number, or both ``img_sigma`` and ``img_cov``.
 
     Example:
         >>> camera = torch.tensor([[100.0, 0.0, 50.0], [0.0, 100.0, 50.0], [0.0, 0.0, 1.0]])
@@ -156,7 +150,7 @@ def depth_points(
     eye = torch.eye(2, dtype=dtype, device=pixels.device)
     noise = sigma_img.square()[..., None, None] * eye if img_cov is None else img_cov.to(dtype)
 
-    # Rays of the world's axes: Kornia's unprojection ignores a skew.
+    # Rays along the world's axes: Kornia's unprojection ignores a skew.
     back = rotation.mT @ torch.linalg.inv_ex(camera).inverse  # (B, 3, 3)
     rays = convert_points_to_homogeneous(pixels) @ back.mT  # (B, N, 3)
     points = depth[..., None] * rays - translation[:, None] @ rotation

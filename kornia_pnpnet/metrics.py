@@ -22,8 +22,8 @@ class PoseErrors(NamedTuple):
     r"""Errors of a batch of poses.
 
     Attributes:
-        rotation_error_deg: angle between the estimated and the true rotation in degrees, shape :math:`(B,)`.
-        translation_error: distance of the translations in the unit of the world, shape :math:`(B,)`.
+        rotation_error_deg: angle of :math:`\hat R R^\top` in degrees, shape :math:`(B,)`.
+        translation_error: :math:`\|\hat t - t\|` in the unit of the world, shape :math:`(B,)`.
     """
 
     rotation_error_deg: Tensor
@@ -53,9 +53,9 @@ class Reliability(NamedTuple):
     r"""Predicted probabilities against observed frequencies, in :math:`K` equally wide bins from 0 to 1.
 
     Attributes:
-        number: number of predictions in each bin, shape :math:`(K,)`.
-        predicted: mean predicted probability of each bin, NaN for an empty bin, shape :math:`(K,)`.
-        observed: share of true outcomes in each bin, NaN for an empty bin, shape :math:`(K,)`.
+        number: number of predictions, shape :math:`(K,)`.
+        predicted: mean predicted probability, NaN for an empty bin, shape :math:`(K,)`.
+        observed: share of true outcomes, NaN for an empty bin, shape :math:`(K,)`.
     """
 
     number: Tensor
@@ -79,13 +79,9 @@ def reliability(chances: Tensor, outcomes: Tensor, ranges: int = 10) -> Reliabil
         outcomes: whether each predicted event happened, bool, same shape.
         ranges: number of bins, :math:`K`.
 
-    Returns:
-        The :class:`Reliability` in float64.
-
     Raises:
         ValueError: when the shapes differ or the tensors are empty.
-        BaseError: when ``ranges`` is not an integer of at least 1.
-        DeviceError: when the tensors are on different devices.
+        BaseError: when ``ranges`` is not an integer of at least 1, or the tensors are on different devices.
 
     Example:
         >>> found = reliability(torch.tensor([0.9, 0.9, 0.9, 0.1]), torch.tensor([True, True, False, False]), ranges=2)
@@ -106,17 +102,10 @@ def reliability(chances: Tensor, outcomes: Tensor, ranges: int = 10) -> Reliabil
 
 
 def pose_errors(estimate: Pose, truth: Pose) -> PoseErrors:
-    r"""Compute rotation and translation errors.
-
-    Args:
-        estimate: estimated pose, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
-        truth: true pose of the same shapes.
-
-    Returns:
-        The angle of :math:`\hat R R^\top` in degrees and :math:`\|\hat t - t\|`, each of shape :math:`(B,)`.
+    r"""Errors of estimated poses, rotations :math:`(B, 3, 3)` and translations :math:`(B, 3)`.
 
     Raises:
-        BaseError: when shapes, dtypes or devices differ, or a shape is not as above.
+        BaseError: when shapes, dtypes or devices of the poses differ, or a shape is not as above.
 
     Example:
         >>> truth = Pose(torch.eye(3)[None], torch.zeros(1, 3))
@@ -130,10 +119,10 @@ def pose_errors(estimate: Pose, truth: Pose) -> PoseErrors:
 
 
 def success(errors: PoseErrors, max_rotation_deg: float = 1.0, max_translation: float | Tensor = 0.2) -> Tensor:
-    r"""Decide which poses succeed: both errors are below their limits.
+    r"""Whether both errors are below their limits.
 
     Args:
-        errors: the errors, each of shape :math:`(B,)`.
+        errors: the errors of :math:`B` poses.
         max_rotation_deg: limit of the rotation error in degrees.
         max_translation: limit of the translation error in the unit of the world, a number or :math:`(B,)`.
 
@@ -154,17 +143,12 @@ def success(errors: PoseErrors, max_rotation_deg: float = 1.0, max_translation: 
 
 
 def success_rate(successes: Tensor) -> SuccessRate:
-    r"""Success rate with its 95 % interval.
+    r"""Success rate with its 95 % Wilson score interval (E. B. Wilson, 1927).
+
+    Unlike the interval of the normal approximation it stays inside [0, 1] and keeps a positive width at 0 and 1.
 
     Args:
-        successes: bool, any shape with at least one element.
-
-    Returns:
-        The rate and the bounds of the Wilson score interval (E. B. Wilson, 1927). Unlike the interval of the normal
-        approximation it stays inside [0, 1] and keeps a positive width at 0 and 1.
-
-    Raises:
-        ValueError: when ``successes`` is empty.
+        successes: bool, any shape with at least one element, else ``ValueError``.
 
     Example:
         >>> print(success_rate(torch.tensor([True] * 8 + [False] * 2)))

@@ -34,9 +34,7 @@ WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 CONFIG_NAME, WEIGHTS_NAME = "config.json", "model.safetensors"
 # Key of the digest in the metadata of the weights file.
 _FINGERPRINT = "sha256"
-
-
-# Bytes. No configuration comes near.
+# Bytes of a configuration, far more than any has.
 _LARGEST_CONFIG = 2**20
 # Sizes up to this one take little memory, whatever the tensors are.
 _SMALL = 1000
@@ -48,15 +46,9 @@ def shipped_weights() -> list[str]:
 
 
 def write_weights(folder: str | Path, config: Mapping[str, Any], state: Mapping[str, Tensor]) -> None:
-    """Write ``config.json`` and ``model.safetensors``.
+    """Write constructor arguments and tensors by name as ``config.json`` and ``model.safetensors``.
 
-    Args:
-        folder: destination; created when missing.
-        config: constructor arguments as plain data.
-        state: parameters and buffers by name.
-
-    Raises:
-        OSError: when a file cannot be written.
+    A missing folder is made. ``OSError`` when a file cannot be written.
     """
     from safetensors.torch import save
 
@@ -68,16 +60,10 @@ def write_weights(folder: str | Path, config: Mapping[str, Any], state: Mapping[
 
 
 def read_weights(name_or_folder: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Read what :func:`write_weights` wrote. Nothing is unpickled.
-
-    Args:
-        name_or_folder: see :func:`find_weights`.
-
-    Returns:
-        The constructor arguments, and parameters and buffers by name.
+    """Read the arguments and tensors that :func:`write_weights` wrote. Nothing is unpickled.
 
     Raises:
-        FileNotFoundError: when there is no such name, folder or repository.
+        FileNotFoundError: see :func:`find_weights`.
         ValueCheckError: when the files are damaged or do not belong together.
     """
     folder = find_weights(name_or_folder)
@@ -99,12 +85,7 @@ def read_weights(name_or_folder: str | Path) -> tuple[dict[str, Any], dict[str, 
     for name, tensor in state.items():
         if not tensor.isfinite().all():
             raise ValueCheckError(f"The weights in {folder} are not finite: {name}.")
-    _check_sizes(config, state, folder)
-    return config, state
-
-
-def _check_sizes(config: Any, state: Mapping[str, Tensor], folder: Path) -> None:
-    """Refuse numbers that cannot be sizes of these tensors, before anything of such a size is built."""
+    # Refuse numbers that cannot be sizes of these tensors, before anything of such a size is built.
     largest = max([_SMALL, *(size for tensor in state.values() for size in tensor.shape)])
     entries = [("", config)]
     while entries:
@@ -115,6 +96,7 @@ def _check_sizes(config: Any, state: Mapping[str, Tensor], folder: Path) -> None
             raise ValueCheckError(
                 f"{folder / CONFIG_NAME}: {name} is {entry}, too large for the tensors in {WEIGHTS_NAME}."
             )
+    return config, state
 
 
 def _fingerprint(config: Any, state: dict[str, Tensor]) -> str:
@@ -123,14 +105,11 @@ def _fingerprint(config: Any, state: dict[str, Tensor]) -> str:
 
 
 def find_weights(name_or_folder: str | Path) -> Path:
-    """Find the folder of weights: shipped, local, or on the Hugging Face Hub.
+    """Find the folder of weights.
 
     Args:
         name_or_folder: the name of shipped weights (see :func:`shipped_weights`), which needs no network; a local
-            folder; or a Hub repository id. The first that exists is used.
-
-    Returns:
-        The folder.
+            folder; or a repository id of the Hugging Face Hub. The first that exists is used.
 
     Raises:
         FileNotFoundError: when there is no such name, folder or repository.
@@ -208,10 +187,7 @@ class PretrainedMixin(nn.Module):
             raise ValueCheckError(f"Not a configuration of PnPNet: {error!r}.") from error
 
     def save_pretrained(self, folder: str | Path) -> None:
-        """Write ``config.json`` and ``model.safetensors``.
-
-        Args:
-            folder: destination; created when missing.
+        """Write ``config.json`` and ``model.safetensors`` to a folder, which is made when missing.
 
         Raises:
             ValueCheckError: when the initialiser is not one of the package's.
@@ -226,9 +202,7 @@ class PretrainedMixin(nn.Module):
         """Load a trained solver, in evaluation mode.
 
         Args:
-            name_or_folder: the name of shipped weights (see :func:`~kornia_pnpnet.pretrained.shipped_weights`), which
-                needs no network; a local folder; or a Hugging Face Hub repository id. The first that exists is taken.
-                Nothing is unpickled.
+            name_or_folder: see :func:`~kornia_pnpnet.pretrained.find_weights`. Nothing is unpickled.
 
         Returns:
             The solver in float32 on the CPU.

@@ -25,8 +25,18 @@ __all__ = ["create_solver", "list_solvers", "solve_pnp"]
 
 # Iterations of the classical robust LM: from a pose that is nearly right, and from the identity.
 _FEW, _MANY = 10, 30
-# The paper's RANSAC: EPnP-LM on samples of 7 of the pairs.
+# Pairs in a sample of the paper's RANSAC.
 _PAPERS_SAMPLE = 7
+#: Solvers of other libraries: class and arguments in :mod:`kornia_pnpnet.peers`, which need the extras.
+_PEERS: dict[str, tuple[str, dict[str, str]]] = {
+    "opencv-epnp": ("OpenCVPnP", {"method": "EPNP"}),
+    "opencv-sqpnp": ("OpenCVPnP", {"method": "SQPNP"}),
+    "opencv-ransac": ("OpenCVRansac", {}),
+    "opencv-usac": ("OpenCVUsac", {}),
+    "kornia-rs": ("KorniaRs", {}),
+    "poselib": ("PoseLib", {}),
+    "pycolmap": ("PyColmap", {}),
+}
 
 
 def _trained(weights: str, m: int | None = None) -> PnPNet:
@@ -35,14 +45,10 @@ def _trained(weights: str, m: int | None = None) -> PnPNet:
     return solver if m is None else solver.with_options(refine=solver.refine.with_iterations(m))
 
 
-def _judged(init: nn.Module, *, order: bool = True) -> PnPNet:
-    """An initialiser without refinement: its pose is judged, and its weights are the weights of the result."""
-    return PnPNet(init, RobustWeightedLM(0, robustness=0.0, learnable=False), Normalize(order=order))
-
-
 def _alone(init: Callable[..., nn.Module], **options: Any) -> PnPNet:
-    """An unrefined method that does not depend on the order of the pairs."""
-    return _judged(init(**options), order=False)
+    """A method without refinement: its pose is judged, and its weights are the weights of the result."""
+    refine = RobustWeightedLM(0, robustness=0.0, learnable=False)
+    return PnPNet(init(**options), refine, Normalize(order=init is RANSAC))  # others do not see the order of the pairs
 
 
 def _paper_lm(m: int) -> RobustWeightedLM:
@@ -55,21 +61,13 @@ def _refined(init: Callable[..., nn.Module], m: int = _FEW, **options: Any) -> P
     return PnPNet(init(**options), _paper_lm(m), Normalize(order=False))
 
 
-def _identity_lm(m: int = _MANY) -> PnPNet:
-    return PnPNet(None, _paper_lm(m))
-
-
-def _p3p_ransac(**options: Any) -> PnPNet:
-    return _judged(RANSAC(P3P(), **options))
-
-
 def _ransac_epnp_lm(m: int = _FEW, **options: Any) -> PnPNet:
-    samples = SubsetSolver(EPnP(), _paper_lm(m), size=_PAPERS_SAMPLE)
-    return _judged(RANSAC(samples, **options))
+    """The paper's RANSAC: EPnP-LM on samples."""
+    return _alone(RANSAC, minimal=SubsetSolver(EPnP(), _paper_lm(m), size=_PAPERS_SAMPLE), **options)
 
 
 def _peer(name: str, **options: Any) -> nn.Module:
-    from kornia_pnpnet import peers  # needs the extras
+    from kornia_pnpnet import peers
 
     solver: nn.Module = getattr(peers, name)(**options)
     return solver
@@ -81,23 +79,14 @@ def _builders() -> dict[str, Callable[..., nn.Module]]:
         "epnp-lm": partial(_refined, EPnP),
         "reppnp": partial(_alone, REPPnP),
         "reppnp-lm": partial(_refined, REPPnP),
-        "p3p-ransac": _p3p_ransac,
+        "p3p-ransac": lambda **options: _alone(RANSAC, minimal=P3P(), **options),
         "ransac-epnp-lm": _ransac_epnp_lm,
-        "identity-lm": _identity_lm,
-    }
-    peers = {
-        "opencv-epnp": partial(_peer, "OpenCVPnP", method="EPNP"),
-        "opencv-sqpnp": partial(_peer, "OpenCVPnP", method="SQPNP"),
-        "opencv-ransac": partial(_peer, "OpenCVRansac"),
-        "opencv-usac": partial(_peer, "OpenCVUsac"),
-        "kornia-rs": partial(_peer, "KorniaRs"),
-        "poselib": partial(_peer, "PoseLib"),
-        "pycolmap": partial(_peer, "PyColmap"),
+        "identity-lm": lambda m=_MANY: PnPNet(None, _paper_lm(m)),
     }
     for name in shipped_weights():
         builders[name] = partial(_trained, name)
         builders[name.replace("pnpnet-", "net-")] = partial(_trained, name, m=0)
-    return builders | peers
+    return builders | {name: partial(_peer, kind, **options) for name, (kind, options) in _PEERS.items()}
 
 
 def list_solvers() -> list[str]:
@@ -118,12 +107,11 @@ def create_solver(name: str, **options: Any) -> nn.Module:
 
     Args:
         name: one of :func:`list_solvers`.
-        options: options of that solver. ``identity-lm``, every ``-lm`` and trained weights take ``m``, the number of
-            iterations (see :meth:`~kornia_pnpnet.RobustWeightedLM.with_iterations`); ``epnp`` and ``epnp-lm`` take the
-            arguments of :class:`~kornia_pnpnet.propose.epnp.EPnP`, ``reppnp`` and ``reppnp-lm`` of
-            :class:`~kornia_pnpnet.propose.reppnp.REPPnP`, ``p3p-ransac`` and ``ransac-epnp-lm`` of
-            :class:`~kornia_pnpnet.propose.ransac.RANSAC`, peers of their class in :mod:`kornia_pnpnet.peers`. All
-            but the peers take the options of :class:`~kornia_pnpnet.solver.PnPNet`.
+        options: options of that solver: ``m``, the number of iterations, of every ``-lm`` and of trained weights (see
+            :meth:`~kornia_pnpnet.RobustWeightedLM.with_iterations`); the arguments of
+            :class:`~kornia_pnpnet.propose.epnp.EPnP`, :class:`~kornia_pnpnet.propose.reppnp.REPPnP`,
+            :class:`~kornia_pnpnet.propose.ransac.RANSAC`, and of the classes in :mod:`kornia_pnpnet.peers`; and for all
+            but the peers the options of :class:`~kornia_pnpnet.solver.PnPNet`.
 
     Returns:
         The solver as a module in evaluation mode.
@@ -170,18 +158,16 @@ def solve_pnp(
 ) -> Tensor:
     r"""Find world-to-camera matrices, with the signature of :func:`kornia.geometry.solve_pnp_dlt`, despite outliers.
 
-    For masks, the weights of the pairs and the uncertainty of the pose use a solver of :func:`create_solver`.
+    A solver of :func:`create_solver` also takes masks and noise, and returns weights and a probability.
 
     Args:
-        world_points: shape :math:`(B, N, 3)`, any unit, floats or integers, :math:`N` as the solver takes it. Any
-            leading dimensions may stand in place of :math:`B`, in all arguments and in the result.
-        img_points: pixels, shape :math:`(B, N, 2)`.
-        intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or Kornia's cameras.
-        weights: weight of each pair, at least 0, shape :math:`(B, N)`; 1 when ``None``.
+        world_points: see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`.
+        img_points: see ``PnPNet.forward``.
+        intrinsics: see ``PnPNet.forward``.
+        weights: see ``PnPNet.forward``.
         solver: one of :func:`list_solvers`, or a module with the same signature. A named solver is built once.
-        dist: distortion of the camera, 4, 5, 8, 12 or 14 coefficients of Kornia and OpenCV, shape :math:`(B, D)` or
-            :math:`(D,)`; solvers of other libraries take none.
-        fisheye: the four coefficients of ``cv2.fisheye``, in place of ``dist``.
+        dist: see ``PnPNet.forward``; solvers of other libraries take none.
+        fisheye: see ``PnPNet.forward``; solvers of other libraries take none.
 
     Returns:
         :math:`[R\,|\,t]` with ``x_cam = R x_world + t``, shape :math:`(B, 3, 4)`, float64 when any input is, else

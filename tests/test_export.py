@@ -13,14 +13,7 @@ from kornia.core.exceptions import BaseError, ShapeError, ValueCheckError
 from kornia_pnpnet import PnPNet, Pose, RobustWeightedLM, SetInit, create_solver
 from kornia_pnpnet.cli import main
 from kornia_pnpnet.data import CameraProblems
-from kornia_pnpnet.export import (
-    OUTPUTS,
-    RIG_INPUTS,
-    export_onnx,
-    export_package,
-    export_program,
-    load_package,
-)
+from kornia_pnpnet.export import OUTPUTS, RIG_INPUTS, export_onnx, export_package, export_program, load_package
 
 CPP = Path(__file__).resolve().parents[1] / "docs" / "examples" / "cpp"
 
@@ -30,11 +23,17 @@ def inputs_of(problems, weights=None):
     return tuple(x.float() for x in (problems.world_points, problems.img_points, problems.intrinsics, weights))
 
 
-def rigs(n, batch, outlier_share=0.25):
+def rigs(n, batch):
     """Inputs of a solver for rigs."""
-    data = CameraProblems(n=n, batch_size=batch, seed=5, cameras=3, outlier_share=outlier_share)
-    problems = data.batch(0)
+    problems = CameraProblems(n=n, batch_size=batch, seed=5, cameras=3, outlier_share=0.25).batch(0)
     return *inputs_of(problems), *problems.cam_from_rig
+
+
+def broken(problems):
+    """Problems of which the fourth, if there is one, has NaN."""
+    world = problems.world_points.clone()
+    world[3:4, 1] = torch.nan
+    return problems._replace(world_points=world)
 
 
 def near(found, solver, inputs):
@@ -104,11 +103,10 @@ def test_onnx(name, fixed, sizes, make_problems, tmp_path):
     solver = PnPNet(None, RobustWeightedLM(1)) if name == "one iteration" else create_solver(name)
     path = export_onnx(solver, tmp_path / "model.onnx", 9 if name == "one iteration" else None, batch=fixed)
     for count, batch in sizes:
-        problems = make_problems(n=count, batch=batch, outliers=count // 4)
-        world, weights = problems.world_points.clone(), torch.ones_like(problems.world_points[..., 0])
+        problems = broken(make_problems(n=count, batch=batch, outliers=count // 4))
+        weights = torch.ones_like(problems.world_points[..., 0])
         weights[:, 4:5] = 0.0 if name == "pnpnet-set" else 1.0
-        world[3:4, 1] = torch.nan
-        inputs = inputs_of(problems._replace(world_points=world), weights)
+        inputs = inputs_of(problems, weights)
         found = run_onnx(path, inputs)
         near(found, solver, inputs)
         assert all(np.isfinite(x).all() for x in found[:4])
@@ -139,101 +137,71 @@ def test_onnx_of_an_unknown_focal_length(tmp_path):
         torch.testing.assert_close(torch.from_numpy(camera), solver(*inputs).intrinsics, rtol=1e-3, atol=1e-3)
 
 
-def test_solvers_that_cannot_be_exported(tmp_path, capsys):
-    with pytest.raises(ValueCheckError, match="RANSAC"):
-        export_program(create_solver("p3p-ransac"), 9)
-    with pytest.raises(ValueCheckError, match="9"):
-        export_program(create_solver("pnpnet-n9"), 8)
-    for n in (0, 1, 2, -1, True, 0.5, 6.0, math.nan, "6"):
+REFUSED = [("p3p-ransac", {"n": 9}), ("pnpnet-n9", {"n": 8}), ("identity-lm", {"rig": True})]
+REFUSED += [("identity-lm", {"n": n}) for n in (2, True, 6.0, math.nan, "6")]
+REFUSED += [("identity-lm", {"n": 9, "batch": batch}) for batch in (0, True, 0.5, "1")]
+
+
+@pytest.mark.parametrize(("name", "options"), REFUSED)
+def test_what_cannot_be_exported_leaves_the_old_file(name, options, tmp_path):
+    for export, path in ((export_onnx, tmp_path / "old.onnx"), (export_package, tmp_path / "old.pt2")):
+        path.write_bytes(b"old")
         with pytest.raises(BaseError):
-            export_program(PnPNet(None, RobustWeightedLM(1)), n)
-    for batch in (0, -1, True, 0.5, "1"):
-        with pytest.raises(BaseError):
-            export_program(PnPNet(None, RobustWeightedLM(1)), 9, batch=batch)
-    for solver in (PnPNet(None, RobustWeightedLM(1)), create_solver("pnpnet-set", focal="unknown")):
-        with pytest.raises(ValueCheckError, match="rig"):
-            export_program(solver, rig=True)
-    (tmp_path / "old.onnx").write_bytes(b"old")
-    with pytest.raises(ValueCheckError, match="RANSAC"):
-        export_onnx(create_solver("p3p-ransac"), tmp_path / "old.onnx", 9)
-    assert (tmp_path / "old.onnx").read_bytes() == b"old"
-    (tmp_path / "old.onnx").unlink()
-    assert main(["export", str(tmp_path / "x.onnx"), "--solver", "opencv-ransac"]) == 2
-    assert "opencv-ransac" in capsys.readouterr().err
-    assert main(["export", str(tmp_path / "x.onnx"), "--solver", "identity-lm", "--rig"]) == 2
-    assert "rigs" in capsys.readouterr().err
+            export(create_solver(name), path, **options)
+        assert path.read_bytes() == b"old"
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_solvers_that_the_command_cannot_export(tmp_path, capsys):
+    for arguments, reason in ((["opencv-ransac"], "opencv-ransac"), (["identity-lm", "--rig"], "rigs")):
+        assert main(["export", str(tmp_path / "x.onnx"), "--solver", *arguments]) == 2
+        assert reason in capsys.readouterr().err
+    with pytest.raises(ValueCheckError, match="rig"):
+        export_program(create_solver("pnpnet-set", focal="unknown"), rig=True)
     assert list(tmp_path.iterdir()) == []
 
 
 # -- ahead-of-time packages --------------------------------------------------------------------------------------------
 
 
-def packaged(folder, solver, n, batch):
+def packaged(folder, solver, n, **options):
     if shutil.which("g++") is None and shutil.which("clang++") is None:
         pytest.skip("no C++ compiler")
-    return export_package(solver, folder / f"{batch}.pt2", n, batch=batch)
+    return export_package(solver, folder / "model.pt2", n, **options)
 
 
-def solve_sizes(path, solver, sizes, make_problems):
-    """Packages get tensors of other dtypes and layouts than they were compiled for, and a broken problem."""
-    package = load_package(path)
-    for count, batch in sizes:
-        problems = make_problems(n=count, batch=batch, outliers=count // 4)
-        world = problems.world_points.clone()
-        world[3:4, 1] = torch.nan
-        inputs = inputs_of(problems._replace(world_points=world))
-        with torch.no_grad():
-            found = package(*inputs)
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("n", "batch", "sizes"),
+    [(9, 1, ((9, 1),)), (9, None, ((9, 1), (9, 3), (9, 100))), (None, None, ((6, 3), (9, 1), (40, 2), (20, 50)))],
+)
+def test_packages(n, batch, sizes, make_problems, tmp_path):
+    """Tensors of other dtypes and layouts than the package was compiled for, and a broken problem."""
+    solver = PnPNet(None, RobustWeightedLM(1))
+    package = load_package(packaged(tmp_path, solver, n, batch=batch))
+    assert (package.n, package.batch) == (n, batch)
+    for count, size in sizes:
+        inputs = inputs_of(broken(make_problems(n=count, batch=size, outliers=count // 4)))
+        found = package(*inputs)
         assert found._fields == OUTPUTS
         near(found, solver, inputs)
         assert all(x.isfinite().all() for x in found[:4])
         assert not found.ok[3:4].any()
         transposed = [x.double().mT.contiguous().mT for x in inputs[:3]]
-        transposed[2] = transposed[2][:1].expand(batch, 3, 3)
-        for ours, again in zip(
-            package(*(x.float().contiguous() for x in transposed)), package(*transposed), strict=True
-        ):
+        for ours, again in zip(package(*inputs[:3]), package(*transposed), strict=True):
             assert torch.equal(ours, again)
-    return package
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("batch", "sizes"), [(1, (1,)), (None, (1, 3, 100))])
-def test_packages(batch, sizes, make_problems, tmp_path):
-    solver = PnPNet(None, RobustWeightedLM(1))
-    path = packaged(tmp_path, solver, 9, batch)
-    package = solve_sizes(path, solver, [(9, size) for size in sizes], make_problems)
-    assert (package.n, package.batch) == (9, batch)
-    world, img, intrinsics, weights = inputs_of(make_problems(n=9, batch=2 if batch else 3))
-    wrong = [
-        (world[:, :8], img[:, :8], intrinsics, weights[:, :8]),
-        (world, img[:1], intrinsics),
-        (world[0], img, intrinsics),
-    ]
-    wrong += [(world, img, intrinsics, weights)] if batch else [(world, img, intrinsics[:1])]
+    world, img, intrinsics, weights = inputs_of(make_problems(n=9, batch=batch or 3))
+    wrong = [(world[:, :3], img[:, :3], intrinsics), (world, img[:, :8], intrinsics), (world[0], img, intrinsics)]
+    wrong += [(world, img, intrinsics, weights[:, :8]), (world, img, intrinsics[:0])]
     for inputs in wrong:
         with pytest.raises(ShapeError):
             package(*inputs)
 
 
 @pytest.mark.slow
-def test_packages_of_any_number_of_pairs(make_problems, tmp_path):
-    solver = PnPNet(None, RobustWeightedLM(1))
-    package = solve_sizes(
-        packaged(tmp_path, solver, None, None), solver, ((6, 3), (9, 1), (40, 2), (20, 50)), make_problems
-    )
-    assert (package.n, package.batch) == (None, None)
-    assert package(*inputs_of(make_problems(n=4, batch=3))).translation.isfinite().all()
-    with pytest.raises(ShapeError):
-        package(*inputs_of(make_problems(n=3, batch=3)))
-
-
-@pytest.mark.slow
 def test_packages_of_rigs(tmp_path):
     solver = PnPNet(SetInit(), RobustWeightedLM(1))
-    if shutil.which("g++") is None and shutil.which("clang++") is None:
-        pytest.skip("no C++ compiler")
-    package = load_package(export_package(solver, tmp_path / "rig.pt2", 12, rig=True))
+    package = load_package(packaged(tmp_path, solver, 12, rig=True))
     for batch in (1, 50):
         inputs = rigs(12, batch)
         near(package(*inputs[:4], cam_from_rig=Pose(*inputs[4:])), solver, inputs)
@@ -244,7 +212,7 @@ def test_cpp_example(make_problems, tmp_path):
     """The C++ program and Python get the same numbers from the same package."""
     if shutil.which("cmake") is None:
         pytest.skip("no cmake")
-    path = packaged(tmp_path, PnPNet(None, RobustWeightedLM(1)), 9, 1)
+    path = packaged(tmp_path, PnPNet(None, RobustWeightedLM(1)), 9, batch=1)
     prefix = f"-DCMAKE_PREFIX_PATH={torch.utils.cmake_prefix_path}"
     subprocess.run(["cmake", "-S", CPP, "-B", tmp_path / "build", prefix], check=True)
     subprocess.run(["cmake", "--build", tmp_path / "build"], check=True)
@@ -268,18 +236,13 @@ def test_cpp_example(make_problems, tmp_path):
     assert "n = 9" in refused.stderr
 
 
-def test_packages_that_cannot_be_made(tmp_path, monkeypatch):
-    path = tmp_path / "old.pt2"
-    path.write_bytes(b"old")
+def test_a_package_needs_its_suffix_and_a_compiler(tmp_path, monkeypatch):
+    solver = PnPNet(None, RobustWeightedLM(1))
     with pytest.raises(ValueCheckError, match=r"\.pt2"):
-        export_package(PnPNet(None, RobustWeightedLM(1)), tmp_path / "model.so", 9)
-    with pytest.raises(ValueCheckError, match="RANSAC"):
-        export_package(create_solver("p3p-ransac"), path, 9)
+        export_package(solver, tmp_path / "model.so", 9)
     monkeypatch.setattr("torch._inductor.config.cpp.cxx", ("no-such-compiler",))
     with pytest.raises(ImportError, match="compiler"):
-        export_package(PnPNet(None, RobustWeightedLM(1)), path, 9)
-    assert path.read_bytes() == b"old"
-    assert list(tmp_path.iterdir()) == [path]
+        export_package(solver, tmp_path / "model.pt2", 9)
 
 
 def test_files_that_are_no_packages(tmp_path):

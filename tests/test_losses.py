@@ -23,28 +23,19 @@ def solved(problems, init, refined):
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-6, 0.1, 1.0, math.pi])
-def test_distances_have_their_closed_forms(angle, random_rotations):
+def test_distances_have_their_closed_forms_and_bounded_gradients(angle, random_rotations):
     base = random_rotations(20, seed=1)
-    turned = random_rotations(20, angle=angle, seed=2) @ base
     zeros = torch.zeros(20, 3, dtype=torch.float64)
-    moved = zeros + torch.tensor([2.0, 3.0, 6.0])
+    moved = (zeros + angle * torch.tensor([2.0, 3.0, 6.0])).requires_grad_()
+    turned = (base if angle == 0.0 else random_rotations(20, angle=angle, seed=2) @ base).requires_grad_()
     rotation, translation = pose_distances(Pose(turned, moved), Pose(base, zeros))
     expected = torch.full((20,), 2 * math.sqrt(2) * math.sin(angle / 2), dtype=torch.float64)
     torch.testing.assert_close(rotation, expected, rtol=1e-9, atol=1e-14)
-    torch.testing.assert_close(translation, torch.full((20,), 7.0, dtype=torch.float64))
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_gradients_are_zero_at_zero_and_bounded_by_one(dtype):
-    truth = Pose(torch.eye(3, dtype=dtype)[None], torch.zeros(1, 3, dtype=dtype))
-    estimate = Pose(*(x.clone().requires_grad_() for x in truth))
-    sum(x.sum() for x in pose_distances(estimate, truth)).backward()
-    assert not estimate.rotation.grad.any()
-    assert not estimate.translation.grad.any()
-    for distance in (1e-30, 1e-12, 1e-3, 1.0, 1e6):
-        translation = torch.tensor([[distance, 0.0, 0.0]], dtype=dtype, requires_grad=True)
-        pose_distances(Pose(truth.rotation, translation), truth)[1].sum().backward()
-        assert translation.grad.norm() <= 1 + EPS
+    torch.testing.assert_close(translation, torch.full((20,), 7.0 * angle, dtype=torch.float64))
+    for x, distance in ((turned, rotation), (moved, translation)):
+        (gradient,) = torch.autograd.grad(distance.sum(), x)
+        assert (gradient.flatten(1).norm(dim=-1) <= 1 + EPS).all()
+        assert angle != 0.0 or not gradient.any()
 
 
 def test_the_total_is_the_weighted_sum_with_the_ramp(make_problems, perturb, random_rotations):
@@ -65,14 +56,12 @@ def test_the_total_is_the_weighted_sum_with_the_ramp(make_problems, perturb, ran
 def test_the_first_translation_is_compared_at_the_centroid(make_problems, random_rotations):
     """A first guess that turns the world about its centroid has no translation error."""
     p = make_problems()
-    centroid = p.world_points.mean(1)
     turned = random_rotations(7, angle=0.5) @ p.pose.rotation
+    centroid = p.world_points.mean(1)
     kept = p.pose.translation + ((p.pose.rotation - turned) @ centroid[..., None])[..., 0]
     terms = PoseLoss()(solved(p, Pose(turned, kept), p.pose), p)
     assert terms.init_translation < EPS
     assert terms.init_rotation > 0.1
-    shifted = Pose(p.pose.rotation, p.pose.translation + 2.0 * torch.eye(3).double()[0])
-    torch.testing.assert_close(PoseLoss()(solved(p, shifted, p.pose), p).init_translation, torch.tensor(2.0).double())
 
 
 def test_saturation_bounds_each_problem(make_problems):
@@ -82,12 +71,8 @@ def test_saturation_bounds_each_problem(make_problems):
         total = PoseLoss(translation=1.0, saturation=0.5)(solved(p, p.pose, far), p).total
         torch.testing.assert_close(total, torch.tensor(distance / (1 + distance / 0.5)).double(), rtol=1e-6, atol=0)
         assert total <= 0.5
-    translation = far.translation.clone().requires_grad_()
-    PoseLoss(saturation=0.5)(solved(p, p.pose, far._replace(translation=translation)), p).total.backward()
-    assert translation.grad.norm() < EPS
-    # The first guess is not saturated.
-    total = PoseLoss(init_translation=1.0, saturation=0.5)(solved(p, far, p.pose), p)
-    torch.testing.assert_close(total.total, torch.tensor(1e12).double())
+    first_guess = PoseLoss(init_translation=1.0, saturation=0.5)(solved(p, far, p.pose), p)
+    torch.testing.assert_close(first_guess.total, torch.tensor(1e12).double())
 
 
 def terms_of(loss, problems, refined, hypotheses, noise=None, weights=None, ramp=1.0):
@@ -157,18 +142,14 @@ def test_the_true_noise_is_the_likeliest(make_problems):
     assert all(term(*wrong) > true for wrong in ((2.0, 0.05), (0.1, 0.05), (1.0, 0.1), (1.0, 0.025), (2.0, 0.1)))
 
 
-# -- fuzz --------------------------------------------------------------------------------------------------------------
-
-
-@many(40)
+@many(20)
 @given(batches(most=3))
 def test_losses_of_any_result(case):
     inputs, mask, weights, kinds = case
     if not kinds:
         return
     truth = SyntheticProblems(n=inputs[0].shape[1], batch_size=len(kinds), dtype=inputs[0].dtype).batch(0)
-    solver = SOLVER
-    result, guess = solver.with_starts(*inputs, weights=weights, mask=mask)
+    result, guess = SOLVER.with_starts(*inputs, weights=weights, mask=mask)
     terms = [SetLoss()(result, truth, 1.0, guess), PoseLoss()(result, truth)]
     finite(terms)
     gradients_are_finite([x.total for x in terms], [x for x in inputs if x.requires_grad] or [SOLVER.refine.step.raw])

@@ -3,6 +3,8 @@
 import pytest
 import torch
 from kornia.core.exceptions import BaseError, ShapeError, TypeCheckError, ValueCheckError
+from kornia.geometry.conversions import convert_points_from_homogeneous, convert_points_to_homogeneous
+from kornia.geometry.linalg import transform_points
 from kornia.geometry.subpix import spatial_soft_argmax2d
 from torch.autograd import gradcheck
 
@@ -32,15 +34,11 @@ def test_gaussian_maps_have_their_mean_and_covariance(dtype, atol):
     torch.testing.assert_close(found, expected.to(dtype).expand(2, 3, 2, 2), atol=atol, rtol=0.0)
 
 
-def test_means_are_kornias_soft_argmax(generator):
-    heatmaps = torch.randn(2, 3, 7, 9, generator=generator, dtype=DOUBLE)
-    pixels, _ = heatmap_keypoints(heatmaps, 0.5)
-    torch.testing.assert_close(pixels, spatial_soft_argmax2d(heatmaps, 0.5, normalized_coordinates=False))
-
-
-def test_a_stride_is_each_cell_as_a_block_of_pixels(generator):
+def test_means_are_kornias_and_a_stride_is_each_cell_as_a_block_of_pixels(generator):
     """A cell that covers 3 by 3 pixels is the same density as 9 cells of a third of its share."""
     heatmaps = torch.randn(2, 3, 5, 6, generator=generator, dtype=DOUBLE)
+    pixels, _ = heatmap_keypoints(heatmaps, 0.5)
+    torch.testing.assert_close(pixels, spatial_soft_argmax2d(heatmaps, 0.5, normalized_coordinates=False))
     blocks = heatmaps.repeat_interleave(3, -1).repeat_interleave(3, -2)
     torch.testing.assert_close(heatmap_keypoints(heatmaps, stride=3.0), heatmap_keypoints(blocks))
 
@@ -66,15 +64,18 @@ def test_a_map_with_nan_spoils_its_own_problem_only(make_problems, generator):
     assert heatmaps.grad[0].any()
 
 
-def test_errors_of_heat_maps():
-    with pytest.raises(ShapeError):
-        heatmap_keypoints(torch.zeros(2, 4, 4))
-    with pytest.raises(TypeCheckError):
-        heatmap_keypoints(torch.zeros(1, 1, 4, 4, dtype=torch.bool))
-    with pytest.raises(BaseError, match="temperature"):
-        heatmap_keypoints(torch.zeros(1, 1, 4, 4), 0.0)
-    with pytest.raises(BaseError, match="stride"):
-        heatmap_keypoints(torch.zeros(1, 1, 4, 4), stride=0)
+@pytest.mark.parametrize(
+    ("heatmaps", "options"),
+    [
+        (torch.zeros(2, 4, 4), {}),
+        (torch.zeros(1, 1, 4, 4, dtype=torch.bool), {}),
+        (torch.zeros(1, 1, 4, 4), {"temperature": 0.0}),
+        (torch.zeros(1, 1, 4, 4), {"stride": 0}),
+    ],
+)
+def test_errors_of_heat_maps(heatmaps, options):
+    with pytest.raises(BaseError):
+        heatmap_keypoints(heatmaps, **options)
 
 
 @pytest.fixture
@@ -82,17 +83,20 @@ def seen(random_rotations, generator):
     """Points, the pose of a camera, and their pixels and depth in it."""
     points = torch.randn(2, 7, 3, generator=generator, dtype=DOUBLE)
     pose = Pose(random_rotations(2), torch.tensor([[0.3, -0.2, 6.0], [0.1, 0.4, 8.0]], dtype=DOUBLE))
-    cam = points @ pose.rotation.mT + pose.translation[:, None]
-    homogeneous = cam @ CAMERA.mT
-    return points, pose, homogeneous[..., :2] / homogeneous[..., 2:], cam[..., 2]
+    cam = transform_points(pose.matrix, points)
+    return points, pose, convert_points_from_homogeneous(cam @ CAMERA.mT), cam[..., 2]
 
 
 def test_exact_measurements_give_exact_points(seen):
-    """Back to the points that were projected, with a skew; zero noise has a zero covariance."""
+    """Back to the points that were projected, with a skew; a sigma is a multiple of the identity, of 0 for none."""
     points, pose, pixels, depth = seen
     found, covariance = depth_points(pixels, depth, CAMERA, pose, depth_sigma=0.0)
     torch.testing.assert_close(found, points)
     assert not covariance.any()
+    img_cov = (4.0 * torch.eye(2, dtype=DOUBLE)).expand(2, 7, 2, 2)
+    one = depth_points(pixels, depth, CAMERA, pose, depth_sigma=0.1, img_sigma=2.0)
+    other = depth_points(pixels, depth, CAMERA, pose, depth_sigma=torch.full((2,), 0.1), img_cov=img_cov)
+    torch.testing.assert_close(one, other)
 
 
 def test_covariances_of_points_are_those_of_samples(seen, generator):
@@ -104,7 +108,7 @@ def test_covariances_of_points_are_those_of_samples(seen, generator):
     points, covariance = depth_points(pixels, depth, CAMERA, pose, depth_sigma=sigma, img_cov=img_cov)
     drawn_pixels = pixels + torch.randn(40000, *pixels.shape, generator=generator, dtype=DOUBLE) @ factor.mT
     drawn_depth = depth + sigma * torch.randn(40000, *depth.shape, generator=generator, dtype=DOUBLE)
-    rays = torch.cat((drawn_pixels, torch.ones_like(drawn_pixels[..., :1])), -1) @ torch.linalg.inv(CAMERA).mT
+    rays = convert_points_to_homogeneous(drawn_pixels) @ torch.linalg.inv(CAMERA).mT
     drawn = (drawn_depth[..., None] * rays - pose.translation[:, None]) @ pose.rotation
     offset = drawn - points
     sampled = torch.einsum("sbni,sbnj->bnij", offset, offset) / len(offset)
@@ -112,14 +116,6 @@ def test_covariances_of_points_are_those_of_samples(seen, generator):
     torch.testing.assert_close(offset.mean(0) / size, torch.zeros_like(points), atol=0.03, rtol=0.0)
     correlation = size[..., None] * size[..., None, :]
     torch.testing.assert_close(sampled / correlation, covariance / correlation, atol=0.05, rtol=0.0)
-
-
-def test_a_sigma_is_a_multiple_of_the_identity(seen):
-    _, pose, pixels, depth = seen
-    img_cov = (4.0 * torch.eye(2, dtype=DOUBLE)).expand(2, 7, 2, 2)
-    one = depth_points(pixels, depth, CAMERA, pose, depth_sigma=0.1, img_sigma=2.0)
-    other = depth_points(pixels, depth, CAMERA, pose, depth_sigma=torch.full((2,), 0.1), img_cov=img_cov)
-    torch.testing.assert_close(one, other)
 
 
 def test_gradients_of_points(seen):
@@ -157,12 +153,8 @@ def test_missing_depth_is_nan_without_a_gradient_and_can_be_masked(seen):
     for x in (depth, sigma, pixels):
         assert x.grad is None or x.grad.isfinite().all()
     assert not depth.grad[~good].any()
-    points, covariance = depth_points(pixels[1:], depth[1:], CAMERA, Pose(*(x[1:] for x in pose)), depth_sigma=0.01)
-    points = torch.cat((points, torch.full_like(points[:, :1], torch.nan)), 1)
-    covariance = torch.cat((covariance, torch.full_like(covariance[:, :1], torch.nan)), 1)
-    pixels = torch.cat((pixels[1:], pixels[1:, :1]), 1)
-    mask = torch.arange(8)[None] < 7
-    assert solver(points, pixels, CAMERA, mask=mask, img_sigma=1.0, world_cov=covariance).ok.all()
+    masked = solver(points, *other, mask=good, img_sigma=1.0, world_cov=covariance)
+    assert masked.ok[1]
 
 
 def test_float32_and_errors_of_depth(seen):

@@ -6,15 +6,12 @@ import math
 
 import pytest
 import torch
-from hypothesis import assume, given
-from hypothesis import strategies as st
 from kornia.core.exceptions import BaseError
-from strategies import ANY, ERRORS, finite, gradients_are_finite, many, numbers, rotations
+from strategies import ERRORS
 
 from kornia_pnpnet import Pose, pose_errors, success, success_rate
 from kornia_pnpnet.losses import pose_distances
 from kornia_pnpnet.metrics import PoseErrors, reliability
-from kornia_pnpnet.refine.residual import rotation_angle
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1.0, math.pi])
@@ -78,50 +75,26 @@ def test_reliability_needs_as_many_outcomes_and_a_range(chances, outcomes, range
         reliability(torch.rand(chances), torch.ones(outcomes).bool(), ranges)
 
 
-# -- fuzz --------------------------------------------------------------------------------------------------------------
-
-
-@st.composite
-def pose_pairs(draw):
-    dtype, batch = draw(st.sampled_from([torch.float32, torch.float64])), draw(st.integers(0, 4))
-    shapes = (batch, 3, 3), (batch, 3)
-    pairs = [Pose(*(draw(numbers(dtype, shape)) for shape in shapes)) for _ in range(2)]
-    sound = draw(st.booleans())
-    if sound:
-        pairs = [pose._replace(rotation=rotations(batch, i, dtype)) for i, pose in enumerate(pairs)]
-    return pairs
-
-
-@many(60)
-@given(pose_pairs(), ANY, ANY)
-def test_errors_of_any_poses(pair, degrees, length):
-    estimate, truth = pair
+@pytest.mark.parametrize("value", [math.nan, math.inf, 1e30, -1e-30])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_errors_of_any_numbers(value, dtype, random_rotations):
+    """An angle is in [0, 180] degrees or NaN, and no pose with NaN succeeds."""
+    truth = Pose(random_rotations(4).to(dtype), torch.zeros(4, 3, dtype=dtype))
+    estimate = Pose(truth.rotation.clone(), truth.translation.clone())
+    estimate.rotation[0, 1, 1], estimate.translation[1, 0] = value, value
     errors = pose_errors(estimate, truth)
-    batch = len(truth.translation)
-    assert all(x.shape == (batch,) and x.dtype == truth.translation.dtype for x in errors)
-    assert not (errors.rotation_error_deg < 0).any()
-    assert not (errors.rotation_error_deg > 180.001).any()
-    right = success(errors, degrees, length)
-    assert right.dtype == torch.bool
+    assert all(x.shape == (4,) and x.dtype == dtype for x in errors)
+    assert not ((errors.rotation_error_deg < 0) | (errors.rotation_error_deg > 180.001)).any()
+    right = success(errors)
+    assert right[2:].all()
     assert not right[errors.rotation_error_deg.isnan() | errors.translation_error.isnan()].any()
-    assert rotation_angle(*(pose.rotation for pose in pair)).shape == (batch,)
-    if batch:
-        rate = success_rate(right)
-        assert 0 <= rate.low <= rate.rate <= rate.high <= 1
-    else:
-        with pytest.raises(ValueError, match="at least one"):
-            success_rate(right)
-    tensors = [x.detach().clamp(-1e6, 1e6).nan_to_num(0.0).requires_grad_() for x in estimate]
-    distances = pose_distances(Pose(*tensors), Pose(*(x.clamp(-1e6, 1e6).nan_to_num(0.0) for x in truth)))
-    finite(distances)
-    gradients_are_finite(distances, tensors)
+    assert 0 <= success_rate(right).low <= success_rate(right).rate <= success_rate(right).high <= 1
+    with pytest.raises(ValueError, match="at least one"):
+        success_rate(right[:0])
 
 
-@many(60)
-@given(st.lists(st.sampled_from([(), (1,), (3,), (2, 3), (1, 3, 3), (2, 3, 3), (3, 3)]), min_size=4, max_size=4))
-def test_poses_that_do_not_fit_are_an_error(shapes):
-    assume(shapes not in ([(2, 3, 3), (2, 3)] * 2, [(3, 3), (3,)] * 2))
-    first, second = (Pose(*(torch.zeros(shape) for shape in pair)) for pair in (shapes[:2], shapes[2:]))
-    for function in (pose_errors, pose_distances):
-        with pytest.raises(BaseError):
-            function(first, second)
+@pytest.mark.parametrize(("rotation", "translation"), [((1, 3, 3), (2, 3)), ((2, 3, 3), (1, 3)), ((3, 3), (3,))])
+@pytest.mark.parametrize("function", [pose_errors, pose_distances])
+def test_poses_that_do_not_fit_are_an_error(function, rotation, translation):
+    with pytest.raises(BaseError):
+        function(Pose(torch.zeros(rotation), torch.zeros(translation)), Pose(torch.zeros(2, 3, 3), torch.zeros(2, 3)))

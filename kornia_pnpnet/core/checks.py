@@ -30,20 +30,13 @@ Shapes: TypeAlias = dict[str, tuple[Tensor | None, tuple[int, ...]]]
 
 
 def _is_number(value: Any) -> bool:
-    is_real = isinstance(value, Real) and not isinstance(value, bool)
-    return is_real and bool(-math.inf < value < math.inf)
+    return isinstance(value, Real) and not isinstance(value, bool) and bool(-math.inf < value < math.inf)
 
 
 def check_whole(least: int, most: int | None = None, /, **values: Any) -> None:
     """Raise ``BaseError`` unless each value is an integer from ``least`` to ``most`` (``None``: without upper bound).
 
     NumPy integers pass, booleans do not.
-
-    Example:
-        >>> check_whole(1, 8, views=9)
-        Traceback (most recent call last):
-        ...
-        kornia.core.exceptions.BaseError: views must be an integer from 1 to 8, got 9.
     """
     bounds = f"of at least {least}" if most is None else f"from {least} to {most}"
     for name, value in values.items():
@@ -104,14 +97,8 @@ def check_devices(tensors: Mapping[str, Tensor | None], like: Tensor, like_name:
 def common_dtype(tensors: Mapping[str, Tensor | None]) -> torch.dtype:
     """The dtype to compute in: float64 when any tensor is float64, else float32. ``None`` does not count.
 
-    Half precision has too few digits for a pixel, and integers have no gradient.
-
-    Raises:
-        TypeCheckError: for a tensor of booleans or complex numbers.
-
-    Example:
-        >>> common_dtype({"img_points": torch.zeros(2).half(), "world_points": torch.zeros(2).double()})
-        torch.float64
+    Half precision has too few digits for a pixel, and integers have no gradient. ``TypeCheckError`` for a tensor of
+    booleans or complex numbers.
     """
     given = {name: tensor.dtype for name, tensor in tensors.items() if tensor is not None}
     for name, dtype in given.items():
@@ -121,17 +108,12 @@ def common_dtype(tensors: Mapping[str, Tensor | None]) -> torch.dtype:
 
 
 def expand_sigma(name: str, sigma: Tensor | float | None, world_points: Tensor) -> Tensor:
-    """Check a standard deviation that a user gave, and expand it to every pair: shape (*, N), like ``world_points``.
+    """Check a standard deviation that a user gave, and expand it to every pair: shape (*, N).
 
     Args:
         name: name of the argument in error messages.
         sigma: a number, a tensor of shape (), (*) or (*, N), or ``None`` for unknown: NaN.
         world_points: shape (*, N, 3).
-
-    Example:
-        >>> expand_sigma("img_sigma", torch.tensor([1.0, 2.0]), torch.zeros(2, 3, 3))
-        tensor([[1., 1., 1.],
-                [2., 2., 2.]])
     """
     pairs = world_points.shape[:-1]
     if sigma is None or isinstance(sigma, int | float):

@@ -14,8 +14,10 @@ import torch
 
 __all__ = ["environment"]
 
-# Distributions that contain OpenCV, the most common first.
+# Distributions that contain each package, the most common first.
 _OPENCV = tuple(f"opencv-{kind}" for kind in ("python-headless", "python", "contrib-python-headless", "contrib-python"))
+_PACKAGES = {name: (name,) for name in ("kornia_pnpnet", "torch", "kornia", "numpy")}
+_PACKAGES |= {"opencv": _OPENCV, **{name: (name,) for name in ("kornia_rs", "poselib", "pycolmap")}}
 
 
 def environment() -> dict[str, Any]:
@@ -26,12 +28,8 @@ def environment() -> dict[str, Any]:
         PyTorch, ``gpu``, ``commit`` of the checkout that the package runs from (``+`` at the end: with changed files;
         ``None``: outside a checkout) and the ``date`` in UTC.
     """
-    names = ("kornia_pnpnet", "torch", "kornia", "numpy")
-    versions = {name: _version(name) for name in names}
-    versions["opencv"] = next(filter(None, map(_version, _OPENCV)), None)
-    versions |= {name: _version(name) for name in ("kornia_rs", "poselib", "pycolmap")}
     return {
-        "versions": versions,
+        "versions": {name: _version(*distributions) for name, distributions in _PACKAGES.items()},
         "python": platform.python_version(),
         "platform": platform.platform(),
         "cpu": _cpu_name(),
@@ -42,11 +40,11 @@ def environment() -> dict[str, Any]:
     }
 
 
-def _version(name: str) -> str | None:
-    try:
-        return metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return None
+def _version(*distributions: str) -> str | None:
+    for name in distributions:
+        with suppress(metadata.PackageNotFoundError):
+            return metadata.version(name)
+    return None
 
 
 def _cpu_name() -> str:

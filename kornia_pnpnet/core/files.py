@@ -6,7 +6,6 @@ import errno
 import hashlib
 import json
 import os
-import zipfile
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -60,14 +59,12 @@ def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, np.n
     size = 0
     with path.open("rb") as file:
         try:
-            with zipfile.ZipFile(file) as archive:
-                sizes = {member.filename.removesuffix(".npy"): member.file_size for member in archive.infolist()}
-            wanted = sizes.keys() if names is None else sizes.keys() & names
-            size = sum(sizes[name] for name in wanted)
-            if size <= MOST_BYTES:
-                file.seek(0)
-                with np.load(file, allow_pickle=False) as content:
-                    return {name: np.asarray(content[name]) for name in content.files if name in wanted}
+            with np.lib.npyio.NpzFile(file, allow_pickle=False) as content:
+                members = {member.filename.removesuffix(".npy"): member.file_size for member in content.zip.infolist()}
+                wanted = [name for name in members if names is None or name in names]
+                size = sum(members[name] for name in wanted)
+                if size <= MOST_BYTES:
+                    return {name: np.asarray(content[name]) for name in wanted}
         except Exception as error:  # numpy, zipfile and zlib raise a dozen types of errors for broken files
             raise ValueError(f"not an NPZ file of numbers: {error}") from error
     raise ValueError(f"the numbers take {size / 1e9:.1f} GB, more than {MOST_BYTES / 1e9:.1f} GB: split the file")
@@ -77,22 +74,15 @@ def digest(*parts: Any) -> str:
     """SHA-256, in hexadecimal, of contents one after the other.
 
     Tensors count by dtype, shape and values, on any device; plain data as JSON with sorted keys.
-
-    Example:
-        >>> state = {"weight": torch.ones(2)}
-        >>> len(digest({"m": 3}, *(part for item in sorted(state.items()) for part in item)))
-        64
     """
     sha = hashlib.sha256()
     for part in parts:
-        if isinstance(part, bytes):
-            sha.update(part)
-        elif isinstance(part, str):
-            sha.update(part.encode())
-        elif isinstance(part, Tensor):
+        if isinstance(part, Tensor):
             values = part.detach().cpu().contiguous()
             sha.update(f" {values.dtype} {tuple(values.shape)}".encode())
             sha.update(values.reshape(-1).view(torch.uint8).numpy().tobytes())  # NumPy does not have every dtype
+        elif isinstance(part, bytes):
+            sha.update(part)
         else:
-            sha.update(json.dumps(part, sort_keys=True).encode())
+            sha.update((part if isinstance(part, str) else json.dumps(part, sort_keys=True)).encode())
     return sha.hexdigest()

@@ -104,9 +104,9 @@ def read_column(
     for number, cell in enumerate((row[column] for row in rows), 1):
         try:
             value = read(cell) if cell or not gaps else math.nan
+            if not gaps and not math.isfinite(value):
+                raise ValueError("not finite")
         except (TypeError, ValueError, OverflowError) as error:
             raise ValueError(f"'{path}': '{column}' of row {number} is {cell!r}.") from error
-        if not gaps and not math.isfinite(value):
-            raise ValueError(f"'{path}': '{column}' of row {number} is {cell!r}.")
         values.append(value if math.isfinite(value) else math.nan)
     return values

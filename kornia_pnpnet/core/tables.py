@@ -15,8 +15,7 @@ def markdown_table(
     Args:
         header: titles of the columns.
         rows: cells of each row, one for each column.
-        align: one letter for each column, ``l`` (left) or ``r`` (right). When ``None``, only the first column is
-            aligned to the left.
+        align: one letter for each column, ``l`` (left) or ``r`` (right); ``None``: only the first one to the left.
         pad: fill the cells with spaces so that the columns also line up as plain text, for a terminal.
 
     Example:

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from kornia_pnpnet.arguments import Inputs, with_undistorted
+from kornia_pnpnet.cameras import pinholes
 from kornia_pnpnet.core.linalg import solve_positive
 from kornia_pnpnet.core.performance import ranked
 from kornia_pnpnet.frame import Normalize
@@ -56,9 +57,10 @@ def with_nominal_focal(inputs: Inputs, sigma: float | None) -> Inputs:
         sigma: standard deviation of the logarithm of the focal length in the intrinsics; ``None``: ignore it.
 
     Returns:
-        The problems with other cameras and ``free_focal``. The aspect ratio of the pixels is kept.
+        The problems with other cameras and ``free_focal``. The aspect ratio of the pixels is kept. Matrices that are no
+        pinhole cameras become NaN, without gradient.
     """
-    camera = inputs.intrinsics / inputs.intrinsics[:, 2:, 2:]
+    camera, is_pinhole = pinholes(inputs.intrinsics)
     given = (camera[:, 0, 0] * camera[:, 1, 1]).sqrt()  # (B,)
     if sigma is None:
         with torch.no_grad():
@@ -77,7 +79,8 @@ def with_nominal_focal(inputs: Inputs, sigma: float | None) -> Inputs:
         width, precision = min(_SEARCHED * sigma, _WIDTH), sigma**-2
     information = None if precision is None else torch.full_like(nominal, precision)
     known = CameraTerm(expected, information, torch.full_like(nominal, width), nominal)
-    return inputs._replace(intrinsics=scale_focal(camera, nominal / given), free_focal=known)
+    camera = scale_focal(camera, nominal / given)
+    return inputs._replace(intrinsics=torch.where(is_pinhole[:, None, None], camera, torch.nan), free_focal=known)
 
 
 def scale_focal(intrinsics: Tensor, factor: Tensor) -> Tensor:
