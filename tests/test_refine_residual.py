@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from jacobians import derivative
+from jacobians import verified_derivative
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from kornia.geometry.linalg import transform_points
 
@@ -55,7 +55,7 @@ def scene(camera, unknown, rotation, batch=7, n=9):
 def test_normal_equations_are_those_of_the_derivative(camera, unknown, few, random_rotations, monkeypatch, generator):
     """Both forms of them, for weights and for matrices as weights."""
     state, problem = scene(camera, unknown, random_rotations(7))
-    jacobian = derivative(lambda x: project(x, problem).residual.flatten(0, 1).mT, state).unflatten(1, (2, 9))
+    jacobian = verified_derivative(lambda x: project(x, problem).residual.flatten(0, 1).mT, state).unflatten(1, (2, 9))
     projection = project(state, problem)
     assert projection.in_front.sum() == 62
     monkeypatch.setattr(residual, "are_few", lambda _: few)

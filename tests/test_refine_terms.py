@@ -1,25 +1,28 @@
-"""What is known of the pose besides the pairs: exact least squares, no harm by a wrong prior, any unit and heading."""
+"""What is known besides the pairs: Jacobians, exact least squares, no harm by a wrong prior, any unit and heading."""
 
 import math
 
 import pytest
 import torch
+from jacobians import derivative, verified_derivative, verify_jacobian
 from torch import nn
 
 from kornia_pnpnet import (
     PnPNet,
+    Pose,
     PosePrior,
     RobustWeightedLM,
     create_solver,
     gravity_prior,
     pose_errors,
+    success,
 )
-from kornia_pnpnet.metrics import success
-from kornia_pnpnet.refine.prior import prior_errors, prior_in_frame
-from kornia_pnpnet.problem import Problem
+from kornia_pnpnet.problem import Problem, State
+from kornia_pnpnet.refine.residual import project, retract
+from kornia_pnpnet.refine.terms import CameraTerm, PoseTerm
 
 SIGMA = math.radians(1.0)
-TOLD = {"img_sigma": 1.0, "world_sigma": 0.05}
+SIGMAS = {"img_sigma": 1.0, "world_sigma": 0.05}
 
 
 def drawn(problems, generator, wrong=0.0, sigma=SIGMA):
@@ -57,31 +60,99 @@ def rate(result, problems):
     return success(pose_errors(result.pose, problems.pose)).double().mean()
 
 
+# --- the terms --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def state(request, random_rotations, generator):
+    """Poses, and so many unknown parameters of the camera as the test's ``unknown`` says."""
+    unknown = request.getfixturevalue("unknown")
+    pose = Pose(random_rotations(5), 3.0 * torch.randn(5, 3, generator=generator, dtype=torch.float64))
+    return State(pose, 0.1 * torch.randn(5, unknown, generator=generator, dtype=torch.float64))
+
+
+@pytest.fixture
+def known(generator):
+    """Makes a term of an information (5, 6, 6) and an expected pose, in a frame off the caller's."""
+
+    def make(expected, information, scale=None):
+        centroid, size = torch.randn(5, 3, generator=generator).double(), torch.linspace(0.5, 2.0, 5).double()
+        term, usable = PoseTerm.of(PosePrior(expected, information, scale), centroid, size)
+        assert usable.all()
+        turned = (expected.rotation * term.offset[:, None]).sum(-1)
+        torch.testing.assert_close(term.pose.translation, expected.translation * size[:, None] + turned)
+        return term
+
+    return make
+
+
+def assert_gradient(term, state):
+    """Half of the robust loss has the gradient of the normal equations."""
+    linear = term.linearise(state)
+    pulled = linear.weight[:, None, None] * linear.information @ linear.jacobian
+    gradient = (linear.residual[:, None] @ pulled)[:, 0]
+    expected = verified_derivative(lambda x: 0.5 * term.loss(x)[:, None], state)[:, 0]
+    torch.testing.assert_close(gradient, expected, rtol=1e-9, atol=1e-9 * expected.abs().max().item())
+
+
+@pytest.mark.parametrize("unknown", range(4))
+@pytest.mark.parametrize("scale", [3.0, math.inf])
+def test_a_pose_term_is_linearised(unknown, scale, state, known, generator):
+    root = torch.randn(5, 6, 6, generator=generator, dtype=torch.float64)
+    expected = retract(state.pose, 0.5 * torch.randn(5, 6, generator=generator, dtype=torch.float64))
+    term = known(expected, root @ root.mT, torch.full((5,), scale, dtype=torch.float64))
+    verify_jacobian(lambda x: term.errors(x.pose)[0], state, term.linearise(state).jacobian)
+    assert_gradient(term, state)
+
+
+@pytest.mark.parametrize("unknown", range(4))
+def test_a_term_with_an_open_axis_is_linearised(unknown, state, known, generator):
+    """Turns about the axis change nothing; there the error is that of the nearest pose that the term allows."""
+    axis = nn.functional.normalize(torch.randn(5, 3, generator=generator, dtype=torch.float64), dim=-1)
+    turns = torch.eye(3).double() - axis[:, :, None] * axis[:, None]
+    information = torch.block_diag(torch.zeros(3, 3), torch.eye(3)).double() + nn.functional.pad(turns, (0, 3, 0, 3))
+    about, off = torch.zeros(5, 6, dtype=torch.float64), torch.randn(5, 6, generator=generator, dtype=torch.float64)
+    about[:, :3] = 1.5 * axis
+    term = known(retract(state.pose, about), information)
+    assert term.linearise(state).residual[:, :3].abs().max() < 1e-12
+    verify_jacobian(
+        lambda x: (information @ term.errors(x.pose)[0][..., None])[..., 0],
+        state,
+        information @ term.linearise(state).jacobian,
+    )
+    assert_gradient(known(retract(retract(state.pose, about), 0.3 * off), information), state)
+
+
+@pytest.mark.parametrize("unknown", [1, 2, 3])
+def test_a_camera_term_is_linearised(unknown, state):
+    focal = torch.linspace(500.0, 900.0, 5, dtype=torch.float64)
+    term = CameraTerm(1.2 * focal, torch.linspace(1.0, 9.0, 5).double(), torch.ones(5).double(), focal)
+    linear = term.linearise(state)
+    verify_jacobian(lambda x: term.linearise(x).residual, state, linear.jacobian)
+    assert_gradient(term, state)
+    torch.testing.assert_close(linear.residual[:, 0], (focal * state.camera[:, 0].exp() / term.expected).log())
+
+
+# --- solvers ----------------------------------------------------------------------------------------------------------
+
+
 @pytest.mark.parametrize("kind", [informative, gravity, drawn])
 def test_pose_is_a_minimum_of_the_whole_cost(kind, make_problems, generator):
     problems = make_problems(n=8, batch=20, outliers=0)
-    prior = kind(problems, generator)
-    prior = prior._replace(scale=torch.full((20,), torch.inf, dtype=torch.float64))
+    prior = kind(problems, generator)._replace(scale=torch.full((20,), torch.inf, dtype=torch.float64))
     with torch.no_grad():
         result = refiner()(*problems[:3], prior=prior, init=problems.pose, img_sigma=2.0)
+    centre, focal = problems.intrinsics[:, None, :2, 2], problems.intrinsics[0, 0, 0]
+    problem = Problem.of(problems.world_points, problems.img_points - centre, focal)
+    term, _ = PoseTerm.of(prior, torch.zeros(20, 3).double(), torch.ones(20).double())
 
-    one = torch.ones(20, dtype=torch.float64)
-    framed, _ = prior_in_frame(prior, torch.zeros(20, 3, dtype=torch.float64), one, one)
-    focals, centre = problems.intrinsics[:, :1, 0], problems.intrinsics[:, None, :2, 2]
-    corr = Problem(problems.world_points, problems.img_points - centre, one[:, None].expand(20, 8), one[0])
-    delta = torch.zeros(20, 6, dtype=torch.float64, requires_grad=True)
-    pose = retract(result.pose, delta)
-    plane = torch.stack(project(pose, corr).plane_points, -1)
-    fy = problems.intrinsics[:, 1:2, 1]
-    pixels = plane * torch.stack((focals, fy), -1)
-    # Residuals of the solver are those of a camera with one focal length, the geometric mean.
-    mean = (focals * fy).sqrt()
-    off = (pixels - corr.img_points) * mean[..., None] / torch.stack((focals, fy), -1)
-    of_pairs = off.square().sum((1, 2)) / 4.0
-    cost = of_pairs + prior_errors(framed, pose)[1]
-    (gradient,) = torch.autograd.grad(cost.sum(), delta, retain_graph=True)
-    (alone,) = torch.autograd.grad(of_pairs.sum(), delta)
-    assert (gradient.norm(dim=-1) < 1e-5 * alone.norm(dim=-1)).all()
+    def of_pairs(state):
+        return project(state, problem).sq_residual.sum(1, keepdim=True) / 4.0
+
+    state = State.of(result.pose)
+    alone = derivative(of_pairs, state)[:, 0]
+    whole = derivative(lambda x: of_pairs(x) + term.errors(x.pose)[1][:, None], state)[:, 0]
+    assert (whole.norm(dim=-1) < 1e-5 * alone.norm(dim=-1)).all()
 
 
 def test_a_prior_without_information_is_a_start_alone(make_problems):
@@ -100,14 +171,14 @@ def test_what_is_known_helps_and_what_is_wrong_hardly_harms(make_problems, gener
     three = make_problems(n=3, batch=500, outliers=0)
     nine = make_problems(n=9, batch=500, outliers=3)
     with torch.no_grad():
-        assert rate(solver(*three[:3], prior=drawn(three, generator), **TOLD), three) > (
-            rate(solver(*three[:3], **TOLD), three) + 0.15
+        assert rate(solver(*three[:3], prior=drawn(three, generator), **SIGMAS), three) > (
+            rate(solver(*three[:3], **SIGMAS), three) + 0.15
         )
-        alone = rate(solver(*nine[:3], **TOLD), nine)
-        assert rate(solver(*nine[:3], prior=drawn(nine, generator), **TOLD), nine) > alone + 0.04
+        alone = rate(solver(*nine[:3], **SIGMAS), nine)
+        assert rate(solver(*nine[:3], prior=drawn(nine, generator), **SIGMAS), nine) > alone + 0.04
         for kind in (drawn, gravity):
             for wrong in (10.0, 100.0):
-                assert rate(solver(*nine[:3], prior=kind(nine, generator, wrong), **TOLD), nine) > alone - 0.03
+                assert rate(solver(*nine[:3], prior=kind(nine, generator, wrong), **SIGMAS), nine) > alone - 0.03
 
 
 @pytest.mark.parametrize("effort", ["fixed", "adaptive"])
@@ -116,8 +187,8 @@ def test_gravity_chooses_among_poses(effort, make_problems, generator):
     problems = make_problems(n=4, batch=500, outliers=1)
     for solver in (create_solver("pnpnet-set", effort=effort), create_solver("p3p-ransac", threshold=10.0)):
         with torch.no_grad():
-            alone = rate(solver(*problems[:3], **TOLD), problems)
-            assert rate(solver(*problems[:3], prior=gravity(problems, generator), **TOLD), problems) > alone + 0.02
+            alone = rate(solver(*problems[:3], **SIGMAS), problems)
+            assert rate(solver(*problems[:3], prior=gravity(problems, generator), **SIGMAS), problems) > alone + 0.02
 
 
 def test_opposite_directions(generator):

@@ -250,7 +250,8 @@ class _NearestRotationForward(_NearestRotation):
 
     @staticmethod
     def jvp(ctx: Any, change: Tensor) -> tuple[Tensor, None]:
-        return _NearestRotation.turned(ctx.saved_tensors, change), None
+        # A tangent must have the memory layout of its value.
+        return torch.zeros_like(ctx.saved_tensors[1]) + _NearestRotation.turned(ctx.saved_tensors, change), None
 
 
 def nearest_rotation(matrix: Tensor) -> tuple[Tensor, Tensor]:
@@ -442,7 +443,7 @@ def solve_positive(matrix: Tensor, right: Tensor, damping: Tensor) -> tuple[Tens
 
         lower, scaled = factorise(rows, list(right.unbind()), inverse)
         solved = reduce(and_, good)
-        return torch.stack(substitute(lower, scaled)) * solved, solved
+        return torch.where(solved, torch.stack(substitute(lower, scaled)), 0.0), solved
     batched = damped.permute(2, 0, 1)
     factor, info = torch.linalg.cholesky_ex(batched.detach())
     pivots = factor.diagonal(dim1=1, dim2=2).square().add(damped.detach().diagonal(), alpha=-_PIVOT * limits.eps)
