@@ -148,8 +148,9 @@ def test_damped_systems_are_solved(systems):
     damped = matrix + damping[:, None, None] * torch.diag_embed(matrix.diagonal(dim1=1, dim2=2))
     torch.testing.assert_close(solution.mT[good], torch.linalg.solve(damped[good], rhs[good]), rtol=1e-9, atol=1e-9)
     assert not solution[:, ~good].any()
+    (alone,) = torch.autograd.grad(solve_positive(leaves[0].detach(), leaves[1], damping)[0].sum(), leaves[1])
     gradients = torch.autograd.grad(solution.square().sum(), leaves)
-    assert all(x[..., matrix.isfinite().all((1, 2))].isfinite().all() for x in gradients)
+    assert all(x[..., matrix.isfinite().all((1, 2))].isfinite().all() for x in (*gradients, alone))
 
 
 def test_eigenvectors_are_orthonormal_and_nearly_diagonalise(generator):
