@@ -5,8 +5,16 @@ from __future__ import annotations
 import pytest
 import torch
 
-from kornia_pnpnet.core.linalg import eigenvectors, nearest_rotation, solve_leading
+from kornia_pnpnet.core import linalg
+from kornia_pnpnet.core.linalg import align, eigenvectors, nearest_rotation, solve_leading, solve_positive
 from kornia_pnpnet.refine.residual import rotation_angle
+
+
+@pytest.fixture(params=[True, False], ids=["few", "many"])
+def few(request, monkeypatch):
+    """Whether functions that have a form for few problems and one for many use the first one."""
+    monkeypatch.setattr(linalg, "are_few", lambda _: request.param)
+
 
 # --- the nearest rotation -------------------------------------------------------------------------------------------
 
@@ -17,8 +25,9 @@ HARD = [(1, 1e-5, -1e-7), (1, 1e-10, 0)]
 
 @pytest.mark.parametrize(
     ("dtype", "values", "tolerance"),
-    [(torch.float32, values, 3e-6) for values in EASY] + [(torch.float64, values, 5e-15) for values in EASY + HARD],
+    [(torch.float32, values, 3e-6) for values in EASY] + [(torch.float64, values, 1e-14) for values in EASY + HARD],
 )
+@pytest.mark.usefixtures("few")
 def test_nearest_rotation_is_known_from_its_singular_vectors(dtype, values, tolerance, random_rotations):
     left, right = random_rotations(50), random_rotations(50, seed=1)
     matrix = (left * torch.tensor(values, dtype=torch.float64)) @ right.mT
@@ -32,8 +41,9 @@ def test_nearest_rotation_is_known_from_its_singular_vectors(dtype, values, tole
     assert (rotation_angle(rotation, left @ right.mT) < tolerance / gap).all()
 
 
+@pytest.mark.usefixtures("few")
 def test_nearest_rotation_is_kabschs(generator):
-    matrix = torch.randn(1000, 3, 3, generator=generator, dtype=torch.float64)
+    matrix = torch.randn(100, 3, 3, generator=generator, dtype=torch.float64)
     rotation, unique = nearest_rotation(matrix.permute(1, 2, 0))
     assert unique.all()
     assert (torch.linalg.det(matrix) < 0).any()
@@ -43,6 +53,7 @@ def test_nearest_rotation_is_kabschs(generator):
     torch.testing.assert_close(rotation.permute(2, 0, 1), (U * sign[:, None]) @ Vh, rtol=0, atol=1e-11)
 
 
+@pytest.mark.usefixtures("few")
 def test_where_there_is_no_nearest_rotation_it_is_the_identity_without_gradient(random_rotations):
     left, right = random_rotations(5), random_rotations(5, seed=1)
     values = [[0, 0, 0], [1, 0, 0], [3, 1, -1], [3e-200, 2e-200, 1e-200], [2, 1, 1]]
@@ -69,6 +80,22 @@ def test_gradcheck_of_the_nearest_rotation(generator):
         inputs = (x.clone().requires_grad_(),)
         assert torch.autograd.gradcheck(lambda m: nearest_rotation(m)[0], inputs, check_forward_ad=True)
         assert torch.autograd.gradgradcheck(lambda m: nearest_rotation(m)[0], inputs)
+
+
+def test_align_finds_a_similarity(random_rotations, generator):
+    """With weights of 0 for outliers; without noise it is exact."""
+    source = torch.randn(7, 9, 3, generator=generator, dtype=torch.float64)
+    rotation, shift = random_rotations(7), torch.randn(7, 1, 3, generator=generator, dtype=torch.float64)
+    target = 2.5 * source @ rotation.mT + shift
+    target[:, 0] += 100.0
+    weights = torch.rand(7, 9, generator=generator, dtype=torch.float64)
+    weights[:, 0] = 0.0
+    found, translation, scale = align(source, target, weights)
+    torch.testing.assert_close(found, rotation)
+    torch.testing.assert_close(scale, torch.full((7,), 2.5, dtype=torch.float64))
+    share = (weights / weights.sum(1, keepdim=True))[..., None]
+    means = [(share * x).sum(1) for x in (source, target)]
+    torch.testing.assert_close(translation, means[1] - (rotation @ means[0][..., None])[..., 0])
 
 
 # --- systems and eigenvectors ---------------------------------------------------------------------------------------
@@ -104,6 +131,26 @@ def test_a_singular_system_in_its_range_has_a_finite_solution():
     reached = (matrix[..., 0] @ torch.stack(solution)[:, 0])[:, None]
     torch.testing.assert_close(reached, rhs)
     assert torch.stack(solution).isfinite().all()
+
+
+@pytest.mark.usefixtures("few")
+def test_damped_systems_are_solved(systems):
+    """One that is singular and one that is no number have the solution 0, with finite gradients, and harm no other."""
+    matrix, rhs, _ = systems
+    matrix = matrix.clone()
+    matrix[3], matrix[4], matrix[5, 2, 2] = torch.nan, torch.ones(6, 6), -1.0
+    damping = torch.linspace(0.0, 2.0, 20, dtype=torch.float64)
+    damping[3:6] = 0.0
+    leaves = [x.clone().requires_grad_() for x in (matrix.permute(1, 2, 0), rhs.mT, damping)]
+    solution, solved = solve_positive(*leaves)
+    good = torch.arange(20) // 3 != 1
+    assert torch.equal(solved, good)
+    damped = matrix + damping[:, None, None] * torch.diag_embed(matrix.diagonal(dim1=1, dim2=2))
+    torch.testing.assert_close(solution.mT[good], torch.linalg.solve(damped[good], rhs[good]), rtol=1e-9, atol=1e-9)
+    assert not solution[:, ~good].any()
+    (alone,) = torch.autograd.grad(solve_positive(leaves[0].detach(), leaves[1], damping)[0].sum(), leaves[1])
+    gradients = torch.autograd.grad(solution.square().sum(), leaves)
+    assert all(x[..., matrix.isfinite().all((1, 2))].isfinite().all() for x in (*gradients, alone))
 
 
 def test_eigenvectors_are_orthonormal_and_nearly_diagonalise(generator):

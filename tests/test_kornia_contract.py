@@ -1,4 +1,4 @@
-"""What this package relies on in kornia. A failure here is a change of kornia's, not ours."""
+"""What this package relies on in kornia, and what it computes otherwise but equally."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import math
 
 import pytest
 import torch
+from kornia.geometry.camera import PinholeCamera
+from kornia.geometry.camera.perspective import project_points
 from kornia.geometry.conversions import (
     axis_angle_to_rotation_matrix,
     convert_points_from_homogeneous,
@@ -13,6 +15,11 @@ from kornia.geometry.conversions import (
     rotation_matrix_to_axis_angle,
 )
 from kornia.geometry.liegroup import So3
+from kornia.geometry.linalg import inverse_transformation, transform_points
+
+from kornia_pnpnet import Pose
+from kornia_pnpnet.problem import Problem, State
+from kornia_pnpnet.refine.residual import project
 
 ANGLES = (0.0, 1e-12, 1e-6, 9.9e-4, 1.1e-3, 0.1, 1.0, 3.0, math.pi)
 
@@ -89,3 +96,42 @@ def test_intrinsics_broadcast_over_the_points_of_their_problem():
     torch.testing.assert_close(denormalize_points_with_intrinsics(plane_points, K), pixels)
     # As many points as problems: the letters must not be mixed up.
     torch.testing.assert_close(denormalize_points_with_intrinsics(plane_points[:, :2], K), pixels[:, :2])
+
+
+# --- projection: ours is kornia's, in another layout and with a residual ----------------------------------------------
+
+
+@pytest.fixture
+def scene(random_rotations, generator):
+    """Poses of 7 cameras with 5 points in front of each, and the focal lengths as factors of 800 pixels."""
+    points = 2.0 * torch.rand(7, 5, 3, generator=generator, dtype=torch.float64) + torch.tensor([-1.0, -1.0, 4.0])
+    pose = Pose(random_rotations(7), torch.randn(7, 3, generator=generator, dtype=torch.float64))
+    return pose, points, 0.2 * torch.randn(7, 1, generator=generator, dtype=torch.float64)
+
+
+def test_our_projection_is_kornias(scene):
+    pose, points, zoom = scene
+    world = transform_points(inverse_transformation(pose.matrix), points)
+    pixels = 100.0 * torch.ones(7, 5, 2, dtype=torch.float64)
+    found = project(State(pose, zoom), Problem.of(world, pixels, 800.0)).residual.permute(2, 1, 0) + pixels
+    intrinsics = torch.eye(4, dtype=torch.float64).repeat(7, 1, 1)
+    intrinsics[:, 0, 0] = intrinsics[:, 1, 1] = 800.0 * zoom[:, 0].exp()
+    by_functions = project_points(transform_points(pose.matrix, world), intrinsics[:, None, :3, :3].expand(7, 5, 3, 3))
+    torch.testing.assert_close(found, by_functions, rtol=1e-9, atol=1e-9)
+    size = torch.full((7,), 640.0, dtype=torch.float64)
+    torch.testing.assert_close(
+        found, PinholeCamera(intrinsics, pose.matrix, size, size).project(world), rtol=1e-7, atol=1e-7
+    )
+
+
+def test_our_rigs_are_two_transforms_of_kornias(scene, random_rotations, generator):
+    pose, points, _ = scene
+    rig = Pose(random_rotations(35, seed=1), torch.randn(35, 3, generator=generator, dtype=torch.float64))
+    in_rig = transform_points(inverse_transformation(rig.matrix), points.view(35, 1, 3)).view(7, 5, 3)
+    world = transform_points(inverse_transformation(pose.matrix), in_rig)
+    of_pairs = Pose(rig.rotation.unflatten(0, (7, 5)), rig.translation.unflatten(0, (7, 5)))
+    problem = Problem.of(world, torch.zeros(7, 5, 2, dtype=torch.float64), 800.0, rig=of_pairs)
+    projection = project(State.of(pose), problem)
+    expected = convert_points_from_homogeneous(points, eps=0.0)
+    torch.testing.assert_close(projection.residual.permute(2, 1, 0), 800.0 * expected)
+    assert projection.in_front.all()

@@ -7,13 +7,13 @@ import itertools
 import pytest
 import torch
 from kornia.geometry.conversions import normalize_points_with_intrinsics
-from kornia_pnpnet.geometry import transform
+from kornia.geometry.linalg import transform_points
 
 from kornia_pnpnet import Normalize, Pose
-from kornia_pnpnet.geometry import transform
-from kornia_pnpnet.refine.residual import project
 from kornia_pnpnet.frame import F_CONST
-from kornia_pnpnet.propose.views import VIEWS
+from kornia_pnpnet.problem import Starts, State
+from kornia_pnpnet.propose.views import VIEWS, from_views
+from kornia_pnpnet.refine.residual import project
 
 DTYPES = (torch.float32, torch.float64)
 OPTIONS = [
@@ -35,8 +35,8 @@ def see(problems, K):
     return rays * K.diagonal(dim1=-2, dim2=-1)[:, None, :2] + K[:, None, :2, 2]
 
 
-def residuals(pose, corr):
-    return torch.stack(project(pose, corr).residual, -1)
+def residuals(pose, problem):
+    return project(State.of(pose), problem).residual.permute(2, 1, 0)
 
 
 # --- poses and cameras ------------------------------------------------------------------------------------------------
@@ -49,22 +49,22 @@ def test_poses_go_to_the_frame_of_the_points_and_back(options, make_problems):
     for f in (500.0, 12345.6):
         K = camera(f, f, 320.0, 240.0, 7)
         pixels = see(p, K)
-        cam_points = transform(p.pose, p.world_points)
+        cam_points = transform_points(p.pose.matrix, p.world_points)
         expected = (f * cam_points[..., :2] / cam_points[..., 2:] + K[:, None, :2, 2]) - pixels
         normalize = Normalize(**options)
-        corr, frame = normalize(p.world_points, pixels, K)
-        pose = normalize.apply_to_pose(p.pose, frame)
+        problem, frame = normalize(p.world_points, pixels, K)
+        pose = frame.apply(p.pose)
         if frame.order is not None:
             expected = expected.gather(1, frame.order[..., None].expand(-1, -1, 2))
-        torch.testing.assert_close(residuals(pose, corr), expected * (F_CONST / f), rtol=1e-9, atol=1e-7)
-        assert corr.focal == F_CONST
-        torch.testing.assert_close(normalize.undo(pose, frame).matrix, p.pose.matrix, rtol=0, atol=1e-10)
-        forth = normalize.apply_to_pose(normalize.undo(p.pose, frame), frame)
+        torch.testing.assert_close(residuals(pose, problem), expected * (F_CONST / f), rtol=1e-9, atol=1e-7)
+        assert problem.focal == F_CONST
+        torch.testing.assert_close(frame.undo(pose).matrix, p.pose.matrix, rtol=0, atol=1e-10)
+        forth = frame.apply(frame.undo(p.pose))
         torch.testing.assert_close(forth.matrix, p.pose.matrix, rtol=0, atol=1e-10)
     if options["center"]:
-        assert corr.world_points.mean(1).abs().max() < 1e-10
+        assert problem.world_points.mean(1).abs().max() < 1e-10
     if options["center"] and options["scale"]:
-        torch.testing.assert_close(corr.world_points.square().sum((1, 2)) / 9, torch.ones(7).double())
+        torch.testing.assert_close(problem.world_points.square().sum((1, 2)) / 9, torch.ones(7).double())
     if not options["scale"]:
         assert torch.equal(frame.scale, torch.ones(7).double())
 
@@ -75,10 +75,10 @@ def test_pixels_are_kornias_times_the_focal_length_for_any_camera(fx, fy, cx, cy
     p = make_problems(noise=False)
     K = camera(fx, fy, cx, cy, 7)
     normalize = Normalize(f_const=f_const, order=False)
-    corr, frame = normalize(p.world_points, see(p, K), K)
-    torch.testing.assert_close(corr.img_points, f_const * normalize_points_with_intrinsics(see(p, K), K))
-    assert residuals(normalize.apply_to_pose(p.pose, frame), corr).abs().max() < 1e-8  # the true pose
-    assert corr.focal == f_const
+    problem, frame = normalize(p.world_points, see(p, K), K)
+    torch.testing.assert_close(problem.img_points, f_const * normalize_points_with_intrinsics(see(p, K), K))
+    assert residuals(frame.apply(p.pose), problem).abs().max() < 1e-8  # the true pose
+    assert problem.focal == f_const
     assert frame.valid.all()
 
 
@@ -91,14 +91,14 @@ def test_pairs_are_ordered_by_u_then_v_and_padding_is_last():
     mask = torch.tensor([[True, True, False, True, True, True, True]])
     weights = torch.tensor([[1.0, 2, 3, 4, 5, 6, 0]], dtype=torch.float64)
     normalize = Normalize(f_const=1.0, center=False, scale=False)
-    corr, frame = normalize(world, pixels, camera(1, 1, 0, 0, 1), weights, mask)
+    problem, frame = normalize(world, pixels, camera(1, 1, 0, 0, 1), weights, mask)
     # 3 and 5 tie in both: they keep the order they came in.
     assert frame.order[0, :5].tolist() == [3, 5, 1, 4, 0]
-    assert corr.img_points[0, :5].tolist() == [[1, 4], [1, 4], [1, 5], [2, 7], [3, 0]]
-    assert corr.weights.tolist() == [[4, 6, 2, 5, 1, 0, 0]]
-    assert torch.equal(corr.world_points[0, :5], world[0, [3, 5, 1, 4, 0]])
-    assert not corr.world_points[0, 5:].any()
-    assert not corr.img_points[0, 5:].any()
+    assert problem.img_points[0, :5].tolist() == [[1, 4], [1, 4], [1, 5], [2, 7], [3, 0]]
+    assert problem.weights.tolist() == [[4, 6, 2, 5, 1, 0, 0]]
+    assert torch.equal(problem.world_points[0, :5], world[0, [3, 5, 1, 4, 0]])
+    assert not problem.world_points[0, 5:].any()
+    assert not problem.img_points[0, 5:].any()
 
 
 # --- validity ---------------------------------------------------------------------------------------------------------
@@ -146,22 +146,25 @@ def test_points_off_a_line_are_valid(n, dtype, random_rotations, generator):
 def test_mirrors_show_the_same_problems_and_are_undone(order, make_problems):
     """Every view has a pose that explains its pixels exactly, and undoing the view gives the true one."""
     p = make_problems(noise=False)
-    normalize = Normalize(order=order)
-    corr, frame = normalize(*p[:3])
-    count = len(VIEWS)
-    seen = normalize.views(corr, count)
-    points = seen.world_points.unflatten(0, (count, 7))
-    assert torch.equal(points[0], corr.world_points)  # the problem itself; no two views are alike
-    assert not any(torch.equal(points[i], points[j]) for i in range(count) for j in range(i))
-    true = normalize.apply_to_pose(p.pose, frame)
+    problem, frame = Normalize(order=order)(*p[:3])
+    true, count = frame.apply(p.pose), len(VIEWS)
     poses = []
     for swap, reverse_x, reverse_y in VIEWS:
         mirror = torch.diag(torch.tensor([1.0 - 2 * reverse_x, 1.0 - 2 * reverse_y, 1.0], dtype=torch.float64))
         mirror = mirror[:, [1, 0, 2]] if swap else mirror
         poses.append((mirror @ true.rotation @ mirror.mT, true.translation @ mirror.mT))
     stacked = Pose(*(torch.cat(entries) for entries in zip(*poses, strict=True)))
-    assert project(stacked, seen).sq_residual.max() < 1e-12
-    undone = normalize.undo_views(stacked, count)
-    assert len(undone) == count
-    for pose in undone:
+
+    def knowing(seen):
+        points = seen.world_points.unflatten(0, (count, 7))
+        assert torch.equal(points[0], problem.world_points)  # the problem itself; no two views are alike
+        assert not any(torch.equal(points[i], points[j]) for i in range(count) for j in range(i))
+        assert residuals(stacked, seen).abs().max() < 1e-6
+        if order:
+            assert (seen.img_points[:, 1:, 0] >= seen.img_points[:, :-1, 0]).all()
+        return Starts(stacked, seen.weights)
+
+    starts = from_views(knowing, problem, count, order)
+    assert len(starts.poses) == count
+    for pose in starts.poses:
         torch.testing.assert_close(pose, true)

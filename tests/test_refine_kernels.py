@@ -42,6 +42,7 @@ def test_loss_starts_at_zero_and_rises_and_weight_falls(name, shape, dtype):
     rounding = 4 * torch.finfo(dtype).eps
     assert (loss[1:] >= loss[:-1] * (1 - rounding)).all()
     assert (weight >= 0).all()
+    assert not kernel.bounded or weight[0] <= 1.0
     assert (weight[1:] <= weight[:-1] * (1 + rounding)).all()
 
 
@@ -58,6 +59,7 @@ def test_gradcheck_in_both_arguments(name):
 
 
 def test_closed_forms():
+    assert [name for name, kernel in KERNELS.items() if not kernel.bounded] == ["power"]
     s = tensor([0.0, 1.0, 4.0, 100.0])
     two = tensor(2.0)
     torch.testing.assert_close(KERNELS["huber"].loss(s, two), tensor([0.0, 1.0, 4.0, 36.0]))

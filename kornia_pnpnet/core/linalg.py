@@ -225,7 +225,8 @@ class _NearestRotationForward(_NearestRotation):
 
     @staticmethod
     def jvp(ctx: Any, change: Tensor) -> tuple[Tensor, None]:
-        return _NearestRotation.turned(ctx.saved_tensors, change), None
+        # A tangent must have the memory layout of its value.
+        return torch.zeros_like(ctx.saved_tensors[1]) + _NearestRotation.turned(ctx.saved_tensors, change), None
 
 
 def nearest_rotation(matrix: Tensor) -> tuple[Tensor, Tensor]:
@@ -404,12 +405,12 @@ def solve_positive(matrix: Tensor, right: Tensor, damping: Tensor) -> tuple[Tens
 
         lower, scaled = factorise(rows, list(right.unbind()), inverse)
         solved = reduce(and_, good)
-        return torch.stack(substitute(lower, scaled)) * solved, solved
+        return torch.where(solved, torch.stack(substitute(lower, scaled)), 0.0), solved
     batched = damped.permute(2, 0, 1)
     factor, info = torch.linalg.cholesky_ex(batched.detach())
     pivots = factor.diagonal(dim1=1, dim2=2).square().add(damped.detach().diagonal(), alpha=-_PIVOT * limits.eps)
     solved = (pivots > limits.tiny).all(1) & (info == 0)  # NaN compares false
-    if batched.requires_grad:  # a factorisation that failed would have gradients of NaN
+    if batched.requires_grad or right.requires_grad:  # a factorisation that failed would have gradients of NaN
         factor = torch.linalg.cholesky_ex(torch.where(solved[:, None, None], batched, eye)).L
     solution = torch.cholesky_solve(right.mT[..., None], factor)[..., 0].mT
     return torch.where(solved, solution, 0.0), solved

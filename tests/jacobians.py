@@ -1,0 +1,40 @@
+"""Derivatives of functions of a state, by automatic differentiation and by central differences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from kornia_pnpnet.problem import State
+from kornia_pnpnet.refine.residual import moved
+
+
+def derivative(function: Callable[[State], Tensor], state: State) -> Tensor:
+    """The derivative (B, M, 6 + K) of a function (B, M) of states along ``moved``, by automatic differentiation."""
+    zero = state.camera.new_zeros(6 + state.camera.shape[1], len(state.camera))
+    # Problems do not meet, so that the derivative of a sum over them has one problem in each entry.
+    total = torch.autograd.functional.jacobian(lambda delta: function(moved(state, delta)).sum(0), zero)
+    return total.permute(2, 0, 1)
+
+
+def verified_derivative(function: Callable[[State], Tensor], state: State) -> Tensor:
+    """See :func:`derivative`. Central differences must agree with it."""
+    jacobian = derivative(function, state)
+    longest = jacobian.abs().amax((0, 1)).clamp(min=1e-3)
+    # Each step changes the values by about a share of 1e-4, and the state by 1e-4 at most.
+    steps = (1e-4 * function(state).abs().max().clamp(min=1e-2) / longest).clamp(max=1e-4)
+    every = torch.diag(steps)[:, :, None].expand(-1, -1, len(state.camera))
+    central = torch.stack([function(moved(state, x)) - function(moved(state, -x)) for x in every], -1) / (2.0 * steps)
+    assert ((jacobian - central) / longest).abs().max() < 1e-5
+    return jacobian
+
+
+def verify_jacobian(
+    function: Callable[[State], Tensor], state: State, analytic: Tensor, tolerance: float = 1e-9
+) -> None:
+    """Check that ``analytic`` (B, M, 6 + K) is the derivative of a function (B, M) of states."""
+    expected = verified_derivative(function, state)
+    longest = expected.abs().amax((0, 1)).clamp(min=1e-3)
+    assert ((analytic - expected) / longest).abs().max() < tolerance

@@ -1,0 +1,179 @@
+"""Laws of the residual, its normal equations, the retraction and the rotation angle."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from jacobians import verified_derivative
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+from kornia.geometry.linalg import transform_points
+
+from kornia_pnpnet import Pose
+from kornia_pnpnet.core.symmetric import Symmetric2
+from kornia_pnpnet.problem import Noise, Problem, State
+from kornia_pnpnet.refine import residual
+from kornia_pnpnet.refine.residual import (
+    moved,
+    normal_equations,
+    pixel_covariance,
+    pixel_variance,
+    project,
+    retract,
+    rotation_angle,
+)
+
+DTYPES = (torch.float32, torch.float64)
+FOCAL, RADIAL = 3400.0, torch.tensor([[0.05, -0.02]], dtype=torch.float64)
+
+
+def scene(camera, unknown, rotation, batch=7, n=9):
+    """Points in front of cameras but for one, pixels 50 px off, and a state of so many unknowns of the camera."""
+    generator = torch.Generator().manual_seed(0)
+
+    def uniform(*shape):
+        return 2.0 * torch.rand(*shape, generator=generator, dtype=torch.float64) - 1.0
+
+    points = uniform(batch, n, 3) * torch.tensor([10.0, 10.0, 40.0]) + torch.tensor([0.0, 0.0, 50.0])
+    pixels = FOCAL * points[..., :2] / points[..., 2:] + 50.0 * uniform(batch, n, 2)
+    points[0, 0, 2] = -20.0
+    pose, rig = Pose(rotation, 12.5 * uniform(batch, 3)), None
+    if camera != "pixels":
+        turn = axis_angle_to_rotation_matrix(uniform(batch * n, 3)).unflatten(0, (batch, n))
+        rig = Pose(turn, uniform(batch, n, 3) * (camera == "rig"))
+        points = ((points - rig.translation)[..., None, :] @ turn)[..., 0, :]
+    world = (points - pose.translation[:, None]) @ pose.rotation
+    known = torch.cat((0.1 * uniform(batch, 1), RADIAL.expand(batch, 2)), 1)[:, :unknown]
+    return State(pose, known), Problem.of(world, pixels, FOCAL, rig=rig)
+
+
+@pytest.mark.parametrize("few", [True, False])
+@pytest.mark.parametrize(
+    ("camera", "unknown"), [("pixels", 0), ("rig", 0), ("bearings", 0), *(("pixels", k) for k in (1, 2, 3))]
+)
+def test_normal_equations_are_those_of_the_derivative(camera, unknown, few, random_rotations, monkeypatch, generator):
+    """Both forms of them, for weights and for matrices as weights."""
+    state, problem = scene(camera, unknown, random_rotations(7))
+    jacobian = verified_derivative(lambda x: project(x, problem).residual.flatten(0, 1).mT, state).unflatten(1, (2, 9))
+    projection = project(state, problem)
+    assert projection.in_front.sum() == 62
+    monkeypatch.setattr(residual, "are_few", lambda _: few)
+    root = torch.randn(7, 9, 2, 2, generator=generator, dtype=torch.float64)
+    for matrices in (root @ root.mT, torch.eye(2) * root[..., :1, :1].square()):
+        is_scalar = not matrices[..., 0, 1].any()
+        weights = matrices[..., 0, 0] if is_scalar else Symmetric2.of(matrices)
+        found = normal_equations(projection, problem, weights)
+        left = torch.einsum("buni,bnuv->bvni", jacobian, matrices * projection.in_front[..., None, None])
+        focal = projection.focal.expand(7)
+        matrix = torch.einsum("bvni,bvnj->ijb", left, jacobian) / focal**2
+        gradient = torch.einsum("bvni,vnb->ib", left, projection.residual) / focal
+        size = matrix.diagonal().mT.sqrt()
+        assert ((found.matrix - matrix) / (size[:, None] * size)).abs().max() < 1e-10
+        assert ((found.gradient - gradient) / size).abs().max() < 1e-8 * FOCAL
+
+
+def test_a_zoom_keeps_the_image_of_the_origin(random_rotations):
+    """Its pixel and its scale; the coefficients of distortion add up."""
+    state, problem = scene("pixels", 2, random_rotations(7))
+    state = state._replace(camera=0.0 * state.camera)
+    delta = torch.zeros(8, 7, dtype=torch.float64)
+    delta[6], delta[7] = 0.2, 0.1
+    zoomed = moved(state, delta)
+    torch.testing.assert_close(zoomed.camera, torch.tensor([[0.2, 0.1]], dtype=torch.float64).expand(7, 2))
+    scales = [project(x, problem).focal / x.pose.translation[:, 2] for x in (state, zoomed)]
+    torch.testing.assert_close(*scales)
+    assert zoomed.pose.translation[:, :2].equal(state.pose.translation[:, :2])
+    assert zoomed.pose.rotation.equal(state.pose.rotation)
+
+
+def test_points_behind_the_camera_have_finite_gradients():
+    world = torch.tensor([[[1.0, 2.0, z] for z in (-1.0, 0.0, 1e-30, 5.0)]], requires_grad=True)
+    for unknown in (0, 3):
+        state = State(Pose(torch.eye(3)[None], torch.zeros(1, 3)), torch.zeros(1, unknown, requires_grad=True))
+        projection = project(state, Problem.of(world, torch.zeros(1, 4, 2), 1000.0))
+        assert projection.in_front.tolist() == [[False, False, False, True]]
+        leaves = [world, state.camera] if unknown else [world]
+        assert all(x.isfinite().all() for x in torch.autograd.grad(projection.residual.sum(), leaves))
+
+
+# --- retraction -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def turns(random_rotations, generator):
+    """A pose, tangents (50, 6) whose turns have length 1, and the pose by the exponential map."""
+    delta = torch.randn(50, 6, generator=generator, dtype=torch.float64)
+    delta = delta / delta[:, :3].norm(dim=-1, keepdim=True)
+    pose = Pose(random_rotations(50), torch.zeros(50, 3).double())
+
+    def exponential(omega):
+        return axis_angle_to_rotation_matrix(omega) @ pose.rotation
+
+    return pose, delta, exponential
+
+
+@pytest.mark.parametrize("length", [0.0, 1e-12, 1e-3, 0.03, 1.0, 1e6])
+def test_retraction_is_cayleys(length, turns):
+    """It turns about its axis by 2 arctan(length / 2) = x - x³/12 + x⁵/80 - …; the opposite one undoes it."""
+    pose, delta, exponential = turns
+    there = retract(pose, length * delta)
+    expected = exponential(2.0 * math.atan(0.5 * length) * delta[:, :3])
+    torch.testing.assert_close(there.rotation, expected, rtol=0, atol=1e-14)
+    torch.testing.assert_close(there.translation, length * delta[:, 3:], rtol=0, atol=0)
+    if 1e-3 < length < 0.1:
+        error = rotation_angle(there.rotation, exponential(length * delta[:, :3]))
+        torch.testing.assert_close(error, torch.full_like(error, length**3 / 12), rtol=length**2, atol=0)
+    back = retract(there, -length * delta)
+    torch.testing.assert_close(back.rotation, pose.rotation, rtol=0, atol=1e-13)
+    torch.testing.assert_close(back.translation, pose.translation, rtol=0, atol=1e-14 * max(length, 1.0))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("length", [0.0, 1e-30, 1e-3, 1.0, 1e3, 1e15])
+def test_retraction_by_anything_is_a_rotation_with_finite_gradients(length, dtype, turns):
+    pose, delta, _ = turns
+    rotation, delta = pose.rotation.to(dtype), (length * delta).to(dtype).requires_grad_()
+    there = retract(Pose(rotation, pose.translation.to(dtype)), delta)
+    eye = torch.eye(3, dtype=dtype).expand(50, 3, 3)
+    torch.testing.assert_close(there.rotation @ there.rotation.mT, eye, rtol=0, atol=20 * torch.finfo(dtype).eps)
+    assert (torch.linalg.det(there.rotation) > 0.5).all()
+    there.rotation.sum().backward()
+    assert delta.grad.isfinite().all()
+
+
+# --- rotation angle -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-6, 9e-4, 1.1e-3, 1.0, math.pi / 2, math.pi - 1e-7, math.pi])
+def test_rotation_angle_of_a_known_turn(angle, random_rotations):
+    base, turn = random_rotations(200, seed=1), random_rotations(200, angle=angle, seed=2)
+    expected = torch.full((200,), angle, dtype=torch.float64)
+    for a, b in ((turn @ base, base), (base, turn @ base)):
+        torch.testing.assert_close(rotation_angle(a, b), expected, rtol=0, atol=2e-15)
+    if 1e-5 < angle < 3.0:  # float32 keeps small angles, too
+        single = rotation_angle(turn.float(), torch.eye(3).expand(200, 3, 3))
+        torch.testing.assert_close(single, expected.float(), rtol=1e-2, atol=0)
+
+
+# --- noise ----------------------------------------------------------------------------------------------------------
+
+
+def test_variance_and_covariance_are_those_of_the_pixel(make_problems):
+    """Against the noise of many draws; the variance is the mean over both coordinates."""
+    p, draws = make_problems(n=5, batch=1, noise=False), 100_000
+    generator = torch.Generator().manual_seed(0)
+    points = p.world_points + 0.05 * torch.randn(draws, 5, 3, generator=generator, dtype=torch.float64)
+    off = 2.0 * torch.randn(draws, 5, 2, generator=generator, dtype=torch.float64)
+    problem = Problem.of(p.world_points, p.img_points, p.intrinsics[0, 0, 0])
+    noise = Noise(2.0 * problem.weights, 0.05 * problem.weights)
+    projection = project(State.of(p.pose), problem)
+    cam = transform_points(p.pose.matrix.expand(draws, 4, 4), points)
+    drawn = problem.focal * cam[..., :2] / cam[..., 2:] + off
+    variance = pixel_variance(projection, noise)[0]
+    torch.testing.assert_close(variance, drawn.var(0).mean(-1), rtol=0.02, atol=0)
+    uu, uv, vv = (x[0] for x in pixel_covariance(projection, problem, noise))
+    for i in range(5):
+        expected = torch.cov(drawn[:, i].mT)
+        found = torch.stack((uu[i], uv[i], uv[i], vv[i])).view(2, 2)
+        torch.testing.assert_close(found, expected, rtol=0.03, atol=0.03 * variance[i].item())

@@ -1,0 +1,223 @@
+"""What is known besides the pairs: Jacobians, exact least squares, no harm by a wrong prior, any unit and heading."""
+
+import math
+
+import pytest
+import torch
+from jacobians import derivative, verified_derivative, verify_jacobian
+from torch import nn
+
+from kornia_pnpnet import (
+    PnPNet,
+    Pose,
+    PosePrior,
+    RobustWeightedLM,
+    create_solver,
+    gravity_prior,
+    pose_errors,
+    success,
+)
+from kornia_pnpnet.problem import Problem, State
+from kornia_pnpnet.refine.residual import project, retract
+from kornia_pnpnet.refine.terms import CameraTerm, PoseTerm
+
+SIGMA = math.radians(1.0)
+SIGMAS = {"img_sigma": 1.0, "world_sigma": 0.05}
+
+
+def drawn(problems, generator, wrong=0.0, sigma=SIGMA):
+    """The pose of the frame before: 1 degree and 2 % of the distance off, and ``wrong`` sigmas more."""
+    like = problems.world_points
+    batch, distance = len(like), problems.pose.translation.norm(dim=-1, keepdim=True)
+    sigmas = torch.cat((torch.full_like(distance, sigma).expand(batch, 3), 0.02 * distance.expand(batch, 3)), -1)
+    noise, direction = torch.randn(2, batch, 6, generator=generator, dtype=like.dtype)
+    error = sigmas * (noise + wrong * nn.functional.normalize(direction, dim=-1))
+    return PosePrior(retract(problems.pose, error), torch.diag_embed(sigmas**-2))
+
+
+def gravity(problems, generator, wrong=0.0, sigma=0.5 * SIGMA):
+    like = problems.world_points
+    down, noise, side = torch.randn(3, len(like), 3, generator=generator, dtype=like.dtype)
+    down = nn.functional.normalize(down, dim=-1)
+    truth = (problems.pose.rotation @ down[..., None])[..., 0]
+    across = nn.functional.normalize(torch.linalg.cross(truth, side), dim=-1)
+    turn = sigma * (noise + wrong * across)
+    return gravity_prior(down, truth + torch.linalg.cross(turn, truth), sigma)
+
+
+def informative(problems, generator):
+    """An information with correlations between turns and shifts."""
+    root = torch.randn(len(problems.world_points), 6, 6, generator=generator, dtype=torch.float64)
+    expected = retract(problems.pose, 0.01 * root[:, 0])
+    return PosePrior(expected, 400.0 * root @ root.mT, torch.full_like(root[:, 0, 0], torch.inf))
+
+
+def refiner(m=40, kernel="huber", robustness=1e4):
+    return PnPNet(None, RobustWeightedLM(m, kernel=kernel, robustness=robustness, learnable=False))
+
+
+def rate(result, problems):
+    return success(pose_errors(result.pose, problems.pose)).double().mean()
+
+
+# --- the terms --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def state(request, random_rotations, generator):
+    """Poses, and so many unknown parameters of the camera as the test's ``unknown`` says."""
+    unknown = request.getfixturevalue("unknown")
+    pose = Pose(random_rotations(5), 3.0 * torch.randn(5, 3, generator=generator, dtype=torch.float64))
+    return State(pose, 0.1 * torch.randn(5, unknown, generator=generator, dtype=torch.float64))
+
+
+@pytest.fixture
+def known(generator):
+    """Makes a term of an information (5, 6, 6) and an expected pose, in a frame off the caller's."""
+
+    def make(expected, information, scale=None):
+        centroid, size = torch.randn(5, 3, generator=generator).double(), torch.linspace(0.5, 2.0, 5).double()
+        term, usable = PoseTerm.of(PosePrior(expected, information, scale), centroid, size)
+        assert usable.all()
+        turned = (expected.rotation * term.offset[:, None]).sum(-1)
+        torch.testing.assert_close(term.pose.translation, expected.translation * size[:, None] + turned)
+        return term
+
+    return make
+
+
+def assert_gradient(term, state):
+    """Half of the robust loss has the gradient of the normal equations."""
+    linear = term.linearise(state)
+    pulled = linear.weight[:, None, None] * linear.information @ linear.jacobian
+    gradient = (linear.residual[:, None] @ pulled)[:, 0]
+    expected = verified_derivative(lambda x: 0.5 * term.loss(x)[:, None], state)[:, 0]
+    torch.testing.assert_close(gradient, expected, rtol=1e-9, atol=1e-9 * expected.abs().max().item())
+
+
+@pytest.mark.parametrize("unknown", range(4))
+@pytest.mark.parametrize("scale", [3.0, math.inf])
+def test_a_pose_term_is_linearised(unknown, scale, state, known, generator):
+    root = torch.randn(5, 6, 6, generator=generator, dtype=torch.float64)
+    expected = retract(state.pose, 0.5 * torch.randn(5, 6, generator=generator, dtype=torch.float64))
+    term = known(expected, root @ root.mT, torch.full((5,), scale, dtype=torch.float64))
+    verify_jacobian(lambda x: term.errors(x.pose)[0], state, term.linearise(state).jacobian)
+    assert_gradient(term, state)
+
+
+@pytest.mark.parametrize("unknown", range(4))
+def test_a_term_with_an_open_axis_is_linearised(unknown, state, known, generator):
+    """Turns about the axis change nothing; there the error is that of the nearest pose that the term allows."""
+    axis = nn.functional.normalize(torch.randn(5, 3, generator=generator, dtype=torch.float64), dim=-1)
+    turns = torch.eye(3).double() - axis[:, :, None] * axis[:, None]
+    information = torch.block_diag(torch.zeros(3, 3), torch.eye(3)).double() + nn.functional.pad(turns, (0, 3, 0, 3))
+    about, off = torch.zeros(5, 6, dtype=torch.float64), torch.randn(5, 6, generator=generator, dtype=torch.float64)
+    about[:, :3] = 1.5 * axis
+    term = known(retract(state.pose, about), information)
+    assert term.linearise(state).residual[:, :3].abs().max() < 1e-12
+    verify_jacobian(
+        lambda x: (information @ term.errors(x.pose)[0][..., None])[..., 0],
+        state,
+        information @ term.linearise(state).jacobian,
+    )
+    assert_gradient(known(retract(retract(state.pose, about), 0.3 * off), information), state)
+
+
+@pytest.mark.parametrize("unknown", [1, 2, 3])
+def test_a_camera_term_is_linearised(unknown, state):
+    focal = torch.linspace(500.0, 900.0, 5, dtype=torch.float64)
+    term = CameraTerm(1.2 * focal, torch.linspace(1.0, 9.0, 5).double(), torch.ones(5).double(), focal)
+    linear = term.linearise(state)
+    verify_jacobian(lambda x: term.linearise(x).residual, state, linear.jacobian)
+    assert_gradient(term, state)
+    torch.testing.assert_close(linear.residual[:, 0], (focal * state.camera[:, 0].exp() / term.expected).log())
+
+
+# --- solvers ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", [informative, gravity, drawn])
+def test_pose_is_a_minimum_of_the_whole_cost(kind, make_problems, generator):
+    problems = make_problems(n=8, batch=20, outliers=0)
+    prior = kind(problems, generator)._replace(scale=torch.full((20,), torch.inf, dtype=torch.float64))
+    with torch.no_grad():
+        result = refiner()(*problems[:3], prior=prior, init=problems.pose, img_sigma=2.0)
+    centre, focal = problems.intrinsics[:, None, :2, 2], problems.intrinsics[0, 0, 0]
+    problem = Problem.of(problems.world_points, problems.img_points - centre, focal)
+    term, _ = PoseTerm.of(prior, torch.zeros(20, 3).double(), torch.ones(20).double())
+
+    def of_pairs(state):
+        return project(state, problem).sq_residual.sum(1, keepdim=True) / 4.0
+
+    state = State.of(result.pose)
+    alone = derivative(of_pairs, state)[:, 0]
+    whole = derivative(lambda x: of_pairs(x) + term.errors(x.pose)[1][:, None], state)[:, 0]
+    assert (whole.norm(dim=-1) < 1e-5 * alone.norm(dim=-1)).all()
+
+
+def test_a_prior_without_information_is_a_start_alone(make_problems):
+    problems = make_problems(n=9, batch=10, outliers=2)
+    nothing = PosePrior(problems.pose, torch.zeros(10, 6, 6, dtype=torch.float64))
+    for name in ("pnpnet-set", "epnp-lm", "p3p-ransac"):
+        solver = create_solver(name)
+        with torch.no_grad():
+            expected = solver(*problems[:3], init=problems.pose)
+            found = solver(*problems[:3], prior=nothing)
+        torch.testing.assert_close(found.matrix, expected.matrix)
+
+
+def test_what_is_known_helps_and_what_is_wrong_hardly_harms(make_problems, generator):
+    solver = create_solver("pnpnet-set")
+    three = make_problems(n=3, batch=500, outliers=0)
+    nine = make_problems(n=9, batch=500, outliers=3)
+    with torch.no_grad():
+        assert rate(solver(*three[:3], prior=drawn(three, generator), **SIGMAS), three) > (
+            rate(solver(*three[:3], **SIGMAS), three) + 0.15
+        )
+        alone = rate(solver(*nine[:3], **SIGMAS), nine)
+        assert rate(solver(*nine[:3], prior=drawn(nine, generator), **SIGMAS), nine) > alone + 0.04
+        for kind in (drawn, gravity):
+            for wrong in (10.0, 100.0):
+                assert rate(solver(*nine[:3], prior=kind(nine, generator, wrong), **SIGMAS), nine) > alone - 0.03
+
+
+@pytest.mark.parametrize("effort", ["fixed", "adaptive"])
+def test_gravity_chooses_among_poses(effort, make_problems, generator):
+    """Of four pairs with one outlier, three decide: gravity tells their poses apart."""
+    problems = make_problems(n=4, batch=500, outliers=1)
+    for solver in (create_solver("pnpnet-set", effort=effort), create_solver("p3p-ransac", threshold=10.0)):
+        with torch.no_grad():
+            alone = rate(solver(*problems[:3], **SIGMAS), problems)
+            assert rate(solver(*problems[:3], prior=gravity(problems, generator), **SIGMAS), problems) > alone + 0.02
+
+
+def test_opposite_directions(generator):
+    down = torch.randn(4, 3, generator=generator, dtype=torch.float64)
+    prior = gravity_prior(down, -down, torch.tensor(0.1, dtype=torch.float64))
+    torch.testing.assert_close((prior.pose.rotation @ down[..., None])[..., 0], -down)
+    torch.testing.assert_close(torch.linalg.det(prior.pose.rotation), torch.ones(4, dtype=torch.float64))
+
+
+def test_gradients(make_problems, generator):
+    problems = make_problems(n=5, batch=1, outliers=0)
+    prior, (world, img, camera) = drawn(problems, generator), problems[:3]
+    solver = refiner(10)
+    zero, root = torch.zeros(1, 6, dtype=torch.float64), prior.information.diagonal(dim1=1, dim2=2).sqrt()
+
+    def answer(delta, root, scale):
+        known = PosePrior(retract(prior.pose, delta), torch.diag_embed(root**2), scale)
+        return solver(world, img, camera, prior=known, gradient="always", img_sigma=1.0).matrix[:, :3]
+
+    inputs = zero, root, torch.full((1,), 2.0, dtype=torch.float64)
+    assert torch.autograd.gradcheck(answer, [x.requires_grad_() for x in inputs], eps=1e-6, atol=1e-4, rtol=1e-3)
+
+    down = torch.randn(1, 3, generator=generator, dtype=torch.float64)
+    cam = (problems.pose.rotation @ down[..., None])[..., 0] + 0.01
+    sigma = torch.full((1,), 0.02, dtype=torch.float64)
+
+    def level(down, cam, sigma):
+        known = gravity_prior(down, cam, sigma)
+        return solver(world, img, camera, prior=known, init=problems.pose, gradient="always", img_sigma=1.0).matrix
+
+    inputs = [x.requires_grad_() for x in (down, cam, sigma)]
+    assert torch.autograd.gradcheck(level, inputs, eps=1e-6, atol=1e-4, rtol=1e-3, fast_mode=True)
