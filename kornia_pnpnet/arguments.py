@@ -243,8 +243,10 @@ def _looking_along(inputs: Inputs) -> Inputs:
     """
     rotation, sound = bearing_cameras(inputs.img_points)
     axis = torch.where(sound[..., None], inputs.img_points[..., :2] * 0.0, torch.nan)
-    cameras = inputs.intrinsics / inputs.intrinsics[..., 2:, 2:]
-    focal = (cameras[..., 0, 0] * cameras[..., 1, 1]).sqrt()
+    diagonal = inputs.intrinsics.diagonal(dim1=-2, dim2=-1)
+    has_focal = (diagonal / diagonal[..., 2:] > 0).all(-1, keepdim=True)
+    fx, fy, last = torch.where(has_focal, diagonal, torch.nan).unbind(-1)  # selected first, for finite gradients
+    focal = (fx * fy).sqrt() / last.abs()
     cameras = torch.stack((focal, focal, torch.ones_like(focal)), -1).diag_embed()
     return inputs._replace(img_points=axis, intrinsics=cameras, rig=compose(rotation, inputs.rig))
 

@@ -200,8 +200,8 @@ class Normalize(Configured):
             is_finite = is_finite & has_noise
         if rig is not None:
             values = torch.cat((rig.rotation.flatten(-2), rig.translation), -1).detach()
-            sound = (values.abs() < limit).all(-1) | ~there.mT  # (B, N)
-            is_finite = is_finite & sound.all(-1)
+            sound = (values.abs() < limit).all(-1)  # (B, N)
+            is_finite = is_finite & (sound | ~there.mT).all(-1)
             eye = torch.eye(3, dtype=rows.dtype, device=rows.device)
             rotation = torch.where(sound[..., None, None], rig.rotation, eye)
             rig = Pose(rotation, torch.where(sound[..., None], rig.translation, 0.0))
@@ -263,6 +263,7 @@ class Normalize(Configured):
         matrices = torch.where(is_camera, cameras, eye)
         matrices = (matrices.mT if intrinsics.ndim == 3 else matrices.permute(2, 1, 0)).unflatten(-1, (3, 3))
         mean_scale = (img_scale * is_there).sum(0) / is_there.sum(0).clamp(min=1.0) if rig is not None else img_scale[0]
+        mean_scale = torch.where(mean_scale > 0, mean_scale, one[0])  # of a rig without any pair
         frame = Frame(centroid.mT, scale, mean_scale, order, status, matrices)
         if noise is not None:
             # Scaling an infinite sigma would give gradients of NaN: an invalid problem has no known noise.

@@ -224,11 +224,8 @@ def shuffled_is_ordered(case: Case) -> None:
     assert_near(shuffled, result._replace(weights=result.weights[:, order]))
 
 
-def padding_is_nothing(case: Case, sound: tuple[str, ...] = ("cam_from_rig",)) -> None:
-    """Pairs that are masked or weigh nothing change nothing, and have weight 0.
-
-    Their numbers do not matter, except in the arguments ``sound``.
-    """
+def padding_is_nothing(case: Case) -> None:
+    """Pairs that are masked or weigh nothing change nothing, have weight 0, and may hold any numbers."""
     call, _ = make(case)
     batch, n = call["world_points"].shape[:2]
     there = n - 2
@@ -238,7 +235,6 @@ def padding_is_nothing(case: Case, sound: tuple[str, ...] = ("cam_from_rig",)) -
     else:
         expected = build(case)(**call, mask=mask)
     spoiled = of_pairs(lambda x: torch.cat((x[:, :there], torch.full_like(x[:, there:], math.nan)), 1), call)
-    spoiled |= {name: call[name] for name in sound if name in call}
     masked = build(case)(**spoiled, mask=mask)
     weightless = build(case)(**spoiled, weights=mask.to(case.dtype))
 
@@ -425,11 +421,6 @@ def applies(law: Callable[[Case], None], case: Case) -> bool:
     return not (law is shuffled_is_ordered and samples)
 
 
-def is_broken(law: Callable[[Case], None], case: Case) -> bool:
-    """What does not hold yet: bad bearings, and bad cameras of an unknown focal length, have gradients of NaN."""
-    return law is bad_problems_have_no_gradient and (case.camera == "bearings" or case.focal == "unknown")
-
-
 def gradcheck(case: Case) -> None:
     """Derivatives by all inputs are those of the result: of a refinement that starts near the truth, in float64.
 
@@ -439,7 +430,7 @@ def gradcheck(case: Case) -> None:
     call |= {"weights": torch.linspace(0.6, 1.4, PAIRS, dtype=torch.float64)[None]}
     lm = RobustWeightedLM(3, kernel="cauchy", robustness=5.0, learnable=False)
     if case.focal == "unknown":  # from a start that is a constant to the minimum
-        lm = RobustWeightedLM(30, robustness=0.0, damping=1e-6, learnable=False)
+        lm = RobustWeightedLM(12, robustness=0.0, damping=1e-6, learnable=False)
     solver = PnPNet(None, lm, focal=case.focal)
     leaves, spec = pytree.tree_flatten(call)
     sizes = [x.abs().mean() if x.shape[1:] in ((PAIRS, 2), (PAIRS, 3)) else x for x in leaves]

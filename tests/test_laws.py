@@ -5,7 +5,7 @@ from itertools import product
 import pytest
 import torch
 from kornia.core.exceptions import ValueCheckError
-from laws import CAMERAS, FOCALS, LAWS, NOISES, Case, applies, build, gradcheck, is_broken, make, padding_is_nothing
+from laws import CAMERAS, FOCALS, LAWS, NOISES, Case, applies, build, gradcheck, make
 
 SOLVERS = ("pnpnet-set", "pnpnet-n9", "epnp-lm", "reppnp-lm", "p3p-ransac", "identity-lm")
 DTYPES = torch.float64, torch.float32
@@ -34,15 +34,9 @@ QUICK = [
 ALL = [Case(*x) for x in product(SOLVERS, CAMERAS, NOISES, FOCALS, DTYPES)]
 
 
-XFAIL = pytest.mark.xfail(strict=True, reason="issue 46")
-
-
 def params(cases, marks=()):
     pairs = ((law, case) for case in cases if not case.is_refused for law in LAWS if applies(law, case))
-    return [
-        pytest.param(law, case, id=f"{law.__name__}-{case}", marks=[*marks, *[XFAIL] * is_broken(law, case)])
-        for law, case in pairs
-    ]
+    return [pytest.param(law, case, id=f"{law.__name__}-{case}", marks=marks) for law, case in pairs]
 
 
 @pytest.mark.parametrize(
@@ -71,8 +65,3 @@ IN_TIME = [CHECKED[0], Case("identity-lm", "rig", "covariance"), Case("identity-
 )
 def test_gradcheck(case):
     gradcheck(case)
-
-
-@XFAIL
-def test_padding_of_a_rig_may_hold_any_place():
-    padding_is_nothing(Case("identity-lm", "rig"), sound=())

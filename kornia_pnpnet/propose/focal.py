@@ -58,7 +58,10 @@ def with_nominal_focal(inputs: Inputs, sigma: float | None) -> Inputs:
     Returns:
         The problems with other cameras and ``free_focal``. The aspect ratio of the pixels is kept.
     """
-    camera = inputs.intrinsics / inputs.intrinsics[:, 2:, 2:]
+    diagonal = inputs.intrinsics.diagonal(dim1=1, dim2=2)
+    usable = inputs.intrinsics.isfinite().flatten(1).all(1) & (diagonal / diagonal[:, 2:] > 0).all(1)
+    camera = torch.where(usable[:, None, None], inputs.intrinsics, torch.nan)  # selected first, for finite gradients
+    camera = camera / camera[:, 2:, 2:]
     given = (camera[:, 0, 0] * camera[:, 1, 1]).sqrt()  # (B,)
     if sigma is None:
         with torch.no_grad():
