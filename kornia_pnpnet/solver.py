@@ -91,9 +91,9 @@ class PnPNet(PretrainedMixin):
         effort: ``"fixed"``, or ``"adaptive"``: where the poses of the initialiser do not suffice, a problem gets as
             many more minimal samples as it needs (:func:`~kornia_pnpnet.propose.ransac.search_on`), and a pose whose
             mirror image fits as well is not ``ok``. Needs an initialiser that estimates the noise,
-            :class:`~kornia_pnpnet.propose.set.SetInit`. ``None``: adaptive with such an initialiser and a refinement in evaluation mode, else fixed. Always fixed:
-            exported graphs, ``compile(whole=True)``, ``torch.func.vmap`` and the device ``meta``. Rigs and bearings:
-            RANSAC, unless the effort is ``"fixed"`` or the solver is compiled.
+            :class:`~kornia_pnpnet.propose.set.SetInit`. ``None``: adaptive with such an initialiser and a refinement in
+            evaluation mode, else fixed. Always fixed: exported graphs, ``compile(whole=True)``, ``torch.func.vmap`` and
+            the device ``meta``. Rigs and bearings: RANSAC, unless the effort is ``"fixed"`` or the solver is compiled.
         gradient: which problems carry a gradient: those that are ``"ok"``, or ``"always"`` every valid problem, to
             train a network that does not predict anything sensible yet. The gradient of each problem to its normalised
             points, pixels and weights is then finite and at most 10 long.

@@ -38,7 +38,7 @@ class Case(NamedTuple):
     noise: str = "none"
     focal: str = "known"
     dtype: torch.dtype = torch.float64
-    extra: str = ""  # what else is known: "prior" or "confidence"
+    extra: str = ""  # what else is known or unknown: "prior", "confidence" or "radial"
 
     def __str__(self) -> str:
         return "-".join([*self[:4], str(self.dtype).removeprefix("torch."), *[self.extra] * bool(self.extra)])
@@ -62,6 +62,7 @@ class Case(NamedTuple):
 def build(case: Case) -> PnPNet:
     """The solver of a case, without parameters that require a gradient."""
     options = {"max_samples": 30} if case.solver == "ransac-epnp-lm" else {}
+    options |= {"radial": 1} if case.extra == "radial" else {}
     return create_solver(case.solver, focal=case.focal, **options).to(case.dtype).requires_grad_(False)
 
 
