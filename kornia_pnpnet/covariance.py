@@ -137,11 +137,11 @@ def pose_covariance(
     if focal_sigma is not None:
         check_positive(focal_sigma=focal_sigma)
         term = CameraTerm(one, one * focal_sigma**-2, one, one)
-        equations = add_term(equations, term.linearise(state), one, problem.focal)
+        equations = add_term(equations, term.linearise(state), problem.focal)
     if prior is not None:
         framed, usable = PoseTerm.of(map_tensors(torch.Tensor.double, prior), centroid[:, 0], spread[:, 0].reciprocal())
         sound.append(usable)
-        equations = add_term(equations, framed.linearise(state), one, problem.focal)
+        equations = add_term(equations, framed.linearise(state), problem.focal)
     information = equations.matrix.permute(2, 0, 1)
     size = information.shape[-1]
     eye = torch.eye(size, dtype=information.dtype, device=information.device)

@@ -144,6 +144,8 @@ class PnPNet(PretrainedMixin):
         check_whole(0, 2, radial=radial)
         fits = focal == "unknown" or (focal_sigma is None and not radial)
         KORNIA_CHECK(fits, "focal_sigma and radial are for focal='unknown'.")
+        searches = effort != "adaptive" or trait(init, "estimates_noise")
+        KORNIA_CHECK(searches, "effort='adaptive' needs an initialiser that estimates the noise.")
         self.views, self.gradient, self.effort = int(views), _checked_gradient(gradient), effort
         self.focal, self.focal_sigma, self.radial = focal, focal_sigma, int(radial)
         self.init = init

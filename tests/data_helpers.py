@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import torch
-from kornia_pnpnet.geometry import transform
 
 from kornia_pnpnet.core.trees import iter_tensors
 from kornia_pnpnet.data import Scene, SyntheticProblems, View
@@ -46,7 +45,8 @@ def draw(n=9, batch=COUNT, **options):
 
 def reprojection(problems):
     """Projections under the true pose less the pixels, (B, N, 2)."""
-    projected = transform(problems.pose, problems.world_points) @ problems.intrinsics.mT
+    pose = problems.pose
+    projected = (problems.world_points @ pose.rotation.mT + pose.translation[:, None]) @ problems.intrinsics.mT
     return projected[..., :2] / projected[..., 2:] - problems.img_points
 
 

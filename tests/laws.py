@@ -38,7 +38,7 @@ class Case(NamedTuple):
     noise: str = "none"
     focal: str = "known"
     dtype: torch.dtype = torch.float64
-    extra: str = ""  # what else is known: "prior" or "confidence"
+    extra: str = ""  # what else is known or unknown: "prior", "confidence" or "radial"
 
     def __str__(self) -> str:
         return "-".join([*self[:4], str(self.dtype).removeprefix("torch."), *[self.extra] * bool(self.extra)])
@@ -62,6 +62,7 @@ class Case(NamedTuple):
 def build(case: Case) -> PnPNet:
     """The solver of a case, without parameters that require a gradient."""
     options = {"max_samples": 30} if case.solver == "ransac-epnp-lm" else {}
+    options |= {"radial": 1} if case.extra == "radial" else {}
     return create_solver(case.solver, focal=case.focal, **options).to(case.dtype).requires_grad_(False)
 
 
@@ -430,7 +431,7 @@ def gradcheck(case: Case) -> None:
     call |= {"weights": torch.linspace(0.6, 1.4, PAIRS, dtype=torch.float64)[None]}
     lm = RobustWeightedLM(3, kernel="cauchy", robustness=5.0, learnable=False)
     if case.focal == "unknown":  # from a start that is a constant to the minimum
-        lm = RobustWeightedLM(30, robustness=0.0, damping=1e-6, learnable=False)
+        lm = RobustWeightedLM(12, robustness=0.0, damping=1e-6, learnable=False)
     solver = PnPNet(None, lm, focal=case.focal)
     leaves, spec = pytree.tree_flatten(call)
     sizes = [x.abs().mean() if x.shape[1:] in ((PAIRS, 2), (PAIRS, 3)) else x for x in leaves]

@@ -1,13 +1,7 @@
-"""Code of the documentation that replaces a call of another package, run against that package where it is installed.
+"""Code of the documentation that replaces a call of another package, run against that package where it is installed."""
 
-The name of each test says which package and version it ran against; a test of a package that cannot be imported is
-skipped and says how to install it.
-"""
-
-import importlib
 import re
 import warnings
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import numpy as np
@@ -29,32 +23,10 @@ INSTALL = {
 }
 
 
-def imported(name):
-    """A module of another package, without its warnings."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return importlib.import_module(name)
-
-
-def against(name):
-    """The package's name and version as the id of a test."""
-    try:
-        found = version(name)
-    except PackageNotFoundError:
-        try:
-            found = getattr(imported(name), "__version__", "without version")
-        except ImportError:
-            found = "not installed"
-    return pytest.mark.parametrize("package", [name], ids=[f"{name} {found}"])
-
-
 def real(name):
-    """A module of another package, or a skip that says why it cannot be imported."""
-    try:
-        return imported(name)
-    except ImportError as error:
-        package = name.partition(".")[0]
-        pytest.skip(f"{package} could not be imported ({error}); {INSTALL[package]}")
+    """A module of another package, or a skip that says how to install it."""
+    package, _, _ = name.partition(".")
+    return pytest.importorskip(name, reason=INSTALL.get(package), exc_type=ImportError)
 
 
 def snippet(page, heading=""):
@@ -127,8 +99,7 @@ def hloc_errors(localize_sfm, folder, truth):
 
 
 @pytest.mark.slow
-@against("hloc")
-def test_hloc_localises_its_queries_with_the_localizer_of_the_page(package, tmp_path, monkeypatch):
+def test_hloc_localises_its_queries_with_the_localizer_of_the_page(tmp_path, monkeypatch):
     localize_sfm = real("hloc.localize_sfm")
     truth = write_hloc_scene(tmp_path)
     theirs = hloc_errors(localize_sfm, tmp_path, truth)
@@ -140,8 +111,7 @@ def test_hloc_localises_its_queries_with_the_localizer_of_the_page(package, tmp_
 
 
 @pytest.mark.slow
-@against("dust3r")
-def test_dust3r_gets_focal_length_and_pose_from_the_function_of_the_page(package, monkeypatch):
+def test_dust3r_gets_focal_length_and_pose_from_the_function_of_the_page(monkeypatch):
     init_im_poses = real("dust3r.cloud_opt.init_im_poses")
     focal, height, width = 210.0, 120, 160
     generator = torch.Generator().manual_seed(0)
@@ -189,8 +159,7 @@ def median_errors(poses, truth):
 
 
 @pytest.mark.slow
-@against("epropnp")
-def test_epro_pnps_layer_and_loss_are_two_calls(package):
+def test_epro_pnps_layer_and_loss_are_two_calls():
     epropnp, lm = real("epropnp.epropnp"), real("epropnp.levenberg_marquardt")
     camera, cost = real("epropnp.camera").PerspectiveCamera(), real("epropnp.cost_fun").AdaptiveHuberPnPCost()
     start = lm.RSLMSolver(dof=6, num_points=8, num_proposals=128, num_iter=5)
@@ -221,8 +190,7 @@ def test_epro_pnps_layer_and_loss_are_two_calls(package):
 
 
 @pytest.mark.slow
-@against("pytorch3d")
-def test_pytorch3ds_solution_has_the_axes_of_the_page(package):
+def test_pytorch3ds_solution_has_the_axes_of_the_page():
     ops = real("pytorch3d.ops")
 
     def efficient_pnp(x, y):
@@ -244,8 +212,7 @@ def test_pytorch3ds_solution_has_the_axes_of_the_page(package):
     assert ours < 1.0
 
 
-@against("kornia")
-def test_matches_of_kornias_matcher_make_one_batch(package):
+def test_matches_of_kornias_matcher_make_one_batch():
     page = snippet("howto/kornia.md")
     moved = torch.tensor([-0.2, 0.0, 0.0]).expand(2, 3)
     points, pixels, camera = (page[name] for name in ("points", "pixels1", "camera"))

@@ -23,6 +23,7 @@ QUICK = [
     Case("p3p-ransac", "pixels", "sigma"),
     Case("p3p-ransac", "bearings", "covariance"),
     Case("p3p-ransac", focal="unknown"),
+    Case("p3p-ransac", focal="unknown", extra="radial"),
     Case("identity-lm", "pixels", "sigma", dtype=torch.float32),
     Case("identity-lm", "bearings"),
     Case("identity-lm", "rig", "covariance"),

@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.forward_ad import unpack_dual
 
 from kornia_pnpnet.core.performance import are_few, compiling
 
@@ -410,7 +411,8 @@ def solve_positive(matrix: Tensor, right: Tensor, damping: Tensor) -> tuple[Tens
     factor, info = torch.linalg.cholesky_ex(batched.detach())
     pivots = factor.diagonal(dim1=1, dim2=2).square().add(damped.detach().diagonal(), alpha=-_PIVOT * limits.eps)
     solved = (pivots > limits.tiny).all(1) & (info == 0)  # NaN compares false
-    if batched.requires_grad or right.requires_grad:  # a factorisation that failed would have gradients of NaN
+    # With a gradient, in either mode: a factorisation that failed would have gradients of NaN.
+    if batched.requires_grad or right.requires_grad or unpack_dual(batched).tangent is not None:
         factor = torch.linalg.cholesky_ex(torch.where(solved[:, None, None], batched, eye)).L
     solution = torch.cholesky_solve(right.mT[..., None], factor)[..., 0].mT
     return torch.where(solved, solution, 0.0), solved
