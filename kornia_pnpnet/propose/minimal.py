@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import NamedTuple, Protocol
 
-import torch
 from torch import Tensor, nn
 
 from kornia_pnpnet.core.checks import check_whole
@@ -48,6 +47,7 @@ class SubsetSolver(Configured):
         BaseError: when ``size`` is less than 3.
 
     Example:
+        >>> import torch
         >>> from kornia_pnpnet.propose.mlp import MLPInit
         >>> solver = SubsetSolver(MLPInit(n=7), RobustWeightedLM(m=5, learnable=False), size=7)
         >>> solver.hypotheses(Problem.of(torch.randn(2, 7, 3), torch.randn(2, 7, 2), 3400.0)).pose.rotation.shape

@@ -432,7 +432,7 @@ class P3P(Configured):
         super().__init__(locals())
 
     def hypotheses(self, problem: Problem) -> Hypotheses | FocalHypotheses:
-        """Four slots per sample and focal length, without gradients. See :class:`~kornia_pnpnet.propose.minimal.MinimalSolver`."""
+        """Four slots per sample and focal length, without gradients."""
         plane = problem.img_points / problem.focal
         if problem.free_focal is None:
             return p3p(problem.world_points, plane)
