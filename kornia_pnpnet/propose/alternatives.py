@@ -56,15 +56,16 @@ def find_alternatives(
         refine: the refinement that found the pose.
         problem: the problem.
         starts: what the refinement started from.
-        pose: the pose that was found.
+        pose: the pose that was found, in the frame of the problem.
         valid: problems that have a pose at all, bool (B,).
         most: largest number of other poses.
 
     Returns:
-        The other poses in the frame of the correspondences.
+        The other poses in the frame of the problem.
     """
     problem, starts, pose = map_tensors(torch.Tensor.detach, (problem, starts, pose))
     weights = problem.weights * starts.weights
+    middle = _mean(problem.world_points, weights)
     mirrored = _mirrored(pose, problem, weights)
     every = [pose, mirrored, *_of_three(problem, weights, pose), *starts.poses]
     count, batch = len(every), weights.shape[0]
@@ -74,33 +75,31 @@ def find_alternatives(
     for _ in range(2):
         refined = refine(many, tried)
         tried = tried._replace(pose=refined.pose)
-    unrefined = refine(problem, starts._replace(pose=mirrored, others=None, camera=None), m=0)
+    unrefined = _ends(refine(problem, starts._replace(pose=mirrored, others=None, camera=None), m=0))
     ends, cost, usable = map_tensors(lambda x: x.unflatten(0, (count, batch)), _ends(refined))  # (S, B, ...)
-    is_lost = _are_same(map_tensors(lambda x: x[1:2], ends), pose, problem, weights)[0]
-    for x, image in zip(iter_tensors((ends, cost, usable)), iter_tensors(_ends(unrefined)), strict=True):
-        x[1] = torch.where(is_lost.view(-1, *(1,) * (image.ndim - 1)), image, x[1])
+    lost = _are_same(take(ends, slice(1, 2)), pose, middle)[0].nonzero()[:, 0]
+    for x, image in zip(iter_tensors((ends, cost, usable)), iter_tensors(unrefined), strict=True):
+        x[1, lost] = image[lost]
 
     # From costs, which are means over the pairs, to log-likelihoods.
-    unit = (problem.weights > 0).sum(-1) / _unit(problem, starts, map_tensors(lambda x: x[0], ends))
+    unit = (problem.weights > 0).sum(-1) / _unit(problem, starts, Pose(ends.rotation[0], ends.translation[0]))
     log_ratio = (-0.5 * unit * (cost - cost[0])).clamp(max=_LIKELIER)
     log_ratio = torch.where(usable & (log_ratio > math.log(_LIKELY)), log_ratio, -torch.inf)
     log_ratio, order = log_ratio.sort(dim=0, descending=True, stable=True)
     ends, cost = _pick((ends, cost), order)
-    valid = valid & log_ratio.isfinite() & ~_are_same(ends, pose, problem, weights)
+    valid = valid & log_ratio.isfinite() & ~_are_same(ends, pose, middle)
     for i in range(1, count):
-        same = _are_same(ends, map_tensors(lambda x: x[i], ends), problem, weights)  # noqa: B023
-        valid[i] = valid[i] & ~(same[:i] & valid[:i]).any(0)
+        same = _are_same(ends, Pose(ends.rotation[i], ends.translation[i]), middle)
+        valid[i] &= ~(same[:i] & valid[:i]).any(0)
     share = torch.where(valid, log_ratio, -torch.inf).exp()
     probability = share / (1.0 + share.sum(0))
 
     position = (~valid).to(torch.int8).sort(dim=0, stable=True).indices[:most]
     eye = torch.eye(3, dtype=cost.dtype, device=cost.device)
-    found = (ends.rotation, ends.translation, cost, probability, valid)
-    fill = (eye, 0.0, torch.finfo(cost.dtype).max ** 0.5, 0.0)
-    *picked, chosen = _pick(found, position)
+    *picked, chosen = _pick((*ends, cost, probability, valid), position)
     rotation, translation, cost, probability = (
-        torch.where(chosen.view(*chosen.shape, *(1,) * (x.ndim - 2)), x, y).movedim(0, 1)
-        for x, y in zip(picked, fill, strict=True)
+        torch.where(chosen.view(*chosen.shape, *(1,) * (x.ndim - 2)), x, fill).movedim(0, 1)
+        for x, fill in zip(picked, (eye, 0.0, torch.finfo(cost.dtype).max ** 0.5, 0.0), strict=True)
     )
     return Alternatives(rotation, translation, cost, probability, chosen.mT)
 
@@ -109,44 +108,38 @@ def find_alternatives(
 def mirror_probability(
     refine: RobustWeightedLM, problem: Problem, starts: Starts, pose: Pose, ok: Tensor, cost: Tensor
 ) -> Tensor:
-    """Probability that the mirror image of a pose, refined, is right instead of the pose.
+    """Probability that the mirror image of a pose, refined, is right instead of the pose, (B,); 0 where not ``ok``.
 
     Only a mirror image that is far off and explains the pairs nearly as well makes a pose doubtful.
 
     Args:
-        refine: the refinement that found the pose.
-        problem: the problem.
-        starts: what the refinement started from.
-        pose: the pose that was found, in the frame of the problem.
-        ok: which poses are to be believed otherwise, bool, shape :math:`(B,)`.
-        cost: the cost of the pose, shape :math:`(B,)`.
-
-    Returns:
-        Shape :math:`(B,)`, 0 where not ``ok``.
+        refine: See find_alternatives.
+        problem: See find_alternatives.
+        starts: See find_alternatives.
+        pose: See find_alternatives.
+        ok: which poses are to be believed otherwise, bool (B,).
+        cost: the cost of the pose, (B,).
     """
     weights = problem.weights * starts.weights
-    share = _shares(weights)
-    middle = (share[..., None] * problem.img_points).sum(1, keepdim=True)
-    spread = (share * (problem.img_points - middle).square().sum(-1)).sum(-1, keepdim=True)
+    away = (problem.img_points - _mean(problem.img_points, weights)[:, None]).square().sum(-1)
+    spread = _mean(away[..., None], weights)
     mirrored = _mirrored(pose, problem, weights)
     projection = project(State.of(mirrored), problem)
     close = projection.in_front & (projection.sq_residual < _NEAR_MIRROR**2 * spread)
     few = (weights > 0.5).sum(-1) < _FEW_INLIERS
-    rows = (ok & (few | ((share * close).sum(-1) > 0.5))).nonzero()[:, 0]
+    rows = (ok & (few | (_mean(close[..., None], weights)[:, 0] > 0.5))).nonzero()[:, 0]
     probability = torch.zeros_like(cost)
-    if not len(rows):
-        return probability
     start = Starts(mirrored, starts.weights, noise=starts.noise)
-    unit = 0.5 * (problem.weights > 0).sum(-1) / _unit(problem, start, pose)
     for m in (_FIRST_LOOK, refine.m):
+        if not len(rows):
+            return probability
         begun = refine.begin(take(problem, rows), take(start, rows))
         end, _ = refine.iterate(begun, m)
         of_end = refine.cost(begun, end)
-        log_ratio = torch.where(of_end.isfinite(), unit[rows] * (cost[rows] - of_end), -torch.inf)
+        unit = 0.5 * (begun.problem.weights > 0).sum(-1) / _unit(problem, start, pose)[rows]
+        log_ratio = torch.where(of_end.isfinite(), unit * (cost[rows] - of_end), -torch.inf)
         if m < refine.m:
             rows = rows[log_ratio > _HOPELESS]
-            if not len(rows):
-                return probability
     usable = has_enough(project(end, begun.problem), begun.problem.weights)
     usable &= rotation_angle(end.pose.rotation, pose.rotation[rows]) > _FAR_TURN
     probability[rows] = torch.where(usable, log_ratio.sigmoid(), 0.0)
@@ -164,22 +157,27 @@ def _pick(tree: _T, index: Tensor) -> _T:
     return map_tensors(lambda x: x[index, problems], tree)
 
 
-def _shares(weights: Tensor) -> Tensor:
-    """Weights (B, N) over their sum."""
-    return weights / weights.sum(-1, keepdim=True).clamp(min=torch.finfo(weights.dtype).tiny)
+def _mean(points: Tensor, weights: Tensor) -> Tensor:
+    """Weighted mean (B, C) of points (B, N, C)."""
+    total = weights.sum(-1, keepdim=True).clamp(min=torch.finfo(weights.dtype).tiny)
+    return ((weights / total)[..., None] * points).sum(1)
+
+
+def _moved(points: Tensor, pose: Pose) -> Tensor:
+    """Points (B, 3) in the frame of a camera."""
+    return (pose.rotation @ points[..., None])[..., 0] + pose.translation
 
 
 def _mirrored(pose: Pose, problem: Problem, weights: Tensor) -> Pose:
     """Half a turn about the normal of the plane through the points, then about the line of sight to its middle."""
-    share = _shares(weights)
-    middle = (share[..., None] * problem.world_points).sum(1)
+    middle = _mean(problem.world_points, weights)
     centred = problem.world_points - middle[:, None]
-    covariance = centred.mT @ (share[..., None] * centred)
+    covariance = centred.mT @ (weights[..., None] * centred)
     if covariance.device.type == "cpu":
         normal = torch.linalg.eigh(covariance).eigenvectors[..., 0]
     else:  # cuSOLVER takes 250 KiB for each, and fails for a hundred thousand
         normal = eigenvectors(covariance.permute(1, 2, 0))[0][1].mT
-    seen = (pose.rotation @ middle[..., None])[..., 0] + pose.translation
+    seen = _moved(middle, pose)
     rotation = _half_turn(seen) @ pose.rotation @ _half_turn(normal)
     return Pose(rotation, seen - (rotation @ middle[..., None])[..., 0])
 
@@ -197,17 +195,19 @@ def _of_three(problem: Problem, weights: Tensor, fallback: Pose) -> list[Pose]:
     def farthest(vectors: Tensor) -> Tensor:
         return torch.where(likely > 0, vectors.square().sum(-1), -1.0).argmax(1, keepdim=True)
 
-    middle = (likely[..., None] * points).sum(1, keepdim=True) / likely.sum(1).clamp(min=1e-30)[:, None, None]
-    first = farthest(points - middle)
+    first = farthest(points - _mean(points, likely)[:, None])
     from_first = points - points[rows, first]
     second = farthest(from_first)
     third = farthest(torch.linalg.cross(from_first, from_first[rows, second].expand_as(points)))
     index = torch.cat((first, second, third), 1)
     solved = p3p(points[rows, index], problem.img_points[rows, index] / problem.focal)
-    valid, (rotation, translation) = solved.valid, solved.pose
-    rotation = torch.where(valid[..., None, None], rotation, fallback.rotation[:, None])
-    translation = torch.where(valid[..., None], translation, fallback.translation[:, None])
-    return list(map(Pose, rotation.unbind(1), translation.unbind(1)))
+    return [
+        Pose(
+            torch.where(valid[:, None, None], rotation, fallback.rotation),
+            torch.where(valid[:, None], translation, fallback.translation),
+        )
+        for rotation, translation, valid in zip(*(x.unbind(1) for x in (*solved.pose, solved.valid)), strict=True)
+    ]
 
 
 def _unit(problem: Problem, starts: Starts, pose: Pose) -> Tensor:
@@ -218,13 +218,10 @@ def _unit(problem: Problem, starts: Starts, pose: Pose) -> Tensor:
     return noise.img[:, 0].square()
 
 
-def _are_same(poses: Pose, other: Pose, problem: Problem, weights: Tensor) -> Tensor:
-    """Which of the poses (S, B, ...) are the other pose (B, ...), bool (S, B)."""
-    share = _shares(weights)
-    middle = (share[..., None] * problem.world_points).sum(1)
-    seen = (poses.rotation @ middle[..., None])[..., 0] + poses.translation
-    there = (other.rotation @ middle[..., None])[..., 0] + other.translation
-    shift = (seen - there).norm(dim=-1) < _SAME_SHIFT * there.norm(dim=-1)
+def _are_same(poses: Pose, other: Pose, middle: Tensor) -> Tensor:
+    """Which of the poses (S, B, ...) are the other pose (B, ...), by what they do to points (B, 3); bool (S, B)."""
+    there = _moved(middle, other)
+    shift = (_moved(middle, poses) - there).norm(dim=-1) < _SAME_SHIFT * there.norm(dim=-1)
     return shift & (rotation_angle(poses.rotation, other.rotation.expand_as(poses.rotation)) < _SAME_TURN)
 
 

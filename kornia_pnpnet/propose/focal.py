@@ -12,6 +12,7 @@ from kornia_pnpnet.arguments import Inputs, with_undistorted
 from kornia_pnpnet.cameras import pinholes
 from kornia_pnpnet.core.linalg import solve_positive
 from kornia_pnpnet.core.performance import ranked
+from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.frame import Normalize
 from kornia_pnpnet.problem import MIN_PAIRS, Problem, State
 from kornia_pnpnet.propose.p3p import P3P
@@ -47,18 +48,12 @@ _LEAST = 1e-5
 
 
 def with_nominal_focal(inputs: Inputs, sigma: float | None) -> Inputs:
-    """Give the cameras the focal length in the middle of the range in which theirs is searched.
+    """Give the cameras the focal length in the middle of the range in which theirs is searched, and ``free_focal``.
 
-    The range is that of the caller's focal length and its ``sigma`` where there is one. Otherwise it follows from the
-    size of the image, which is twice the principal point, or what the pixels cover where this is more.
-
-    Args:
-        inputs: the problems.
-        sigma: standard deviation of the logarithm of the focal length in the intrinsics; ``None``: ignore it.
-
-    Returns:
-        The problems with other cameras and ``free_focal``. The aspect ratio of the pixels is kept. Matrices that are no
-        pinhole cameras become NaN, without gradient.
+    The range is that of the caller's focal length and ``sigma``, the standard deviation of its logarithm. For ``None``
+    it follows from the size of the image, which is twice the principal point, or what the pixels cover where this is
+    more. The aspect ratio of the pixels is kept.
+    Matrices that are no pinhole cameras become NaN, without gradient.
     """
     camera, is_pinhole = pinholes(inputs.intrinsics)
     given = (camera[:, 0, 0] * camera[:, 1, 1]).sqrt()  # (B,)
@@ -96,11 +91,8 @@ def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
     P3P at focal lengths on a grid, and least squares of the inliers, find both.
 
     Args:
-        inputs: the problems, with a nominal focal length, see :func:`with_nominal_focal`.
-        radial: number of coefficients of radial distortion to estimate, too.
-
-    Returns:
-        The problems; where ``radial`` is not 0, with undistorted pixels and the coefficients.
+        inputs: what :func:`with_nominal_focal` returned.
+        radial: number of coefficients of radial distortion to estimate; the pixels are then undistorted.
     """
     assert inputs.free_focal is not None
     normalize = Normalize(order=False)
@@ -121,10 +113,8 @@ def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
             problem = problem._replace(free_focal=inputs.free_focal.scaled(frame.img_scale))
             at = _with_distortion(problem, frame.apply(pose), radial)
             finite = frame.valid & (at.pose.translation.sum(-1) + at.camera.sum(-1)).isfinite()
-            better = frame.undo(at.pose)
-            pose = Pose(
-                torch.where(finite[:, None, None], better.rotation, pose.rotation),
-                torch.where(finite[:, None], better.translation, pose.translation),
+            pose = map_tensors(
+                lambda x, y: torch.where(finite.view(-1, *(1,) * (x.ndim - 1)), x, y), frame.undo(at.pose), pose
             )
             camera = torch.where(finite[:, None], at.camera, 0.0)
         inputs = _zoomed(inputs, camera[:, 0])
@@ -164,10 +154,9 @@ def as_dist(coefficients: Tensor) -> Tensor:
 
 
 def _with_distortion(problem: Problem, pose: Pose, radial: int) -> State:
-    r"""Estimate radial distortion with the pose and the focal length.
+    """Estimate radial distortion with the pose and the focal length, by Gauss-Newton steps with Cauchy's kernel.
 
-    Gauss-Newton steps weigh the pairs by Cauchy's kernel; its scale first is that of what distortion does at the edge
-    of an image, and shrinks to the median residual.
+    Its scale first is that of what distortion does at the edge of an image, and shrinks to the median residual.
     """
     state = State(pose, problem.weights.new_zeros(len(problem.weights), 1 + radial))
     there, limit = problem.weights > 0, _WIDE

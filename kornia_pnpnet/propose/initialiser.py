@@ -38,11 +38,7 @@ class Initialiser(Configured):
     weighs_unusual: bool = False
 
     def forward(self, problem: Problem) -> Starts:
-        """Propose poses.
-
-        Args:
-            problem: the problem in the solver's frame.
-        """
+        """Propose poses for a problem in the solver's frame."""
         raise NotImplementedError
 
 

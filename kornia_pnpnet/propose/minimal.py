@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import NamedTuple, Protocol
 
-import torch
 from torch import Tensor, nn
 
 from kornia_pnpnet.core.checks import check_whole
 from kornia_pnpnet.core.configured import Configured
+from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.problem import Hypotheses, Problem
 from kornia_pnpnet.refine.lm import RobustWeightedLM
-from kornia_pnpnet.result import Pose
+from kornia_pnpnet.result import Pose, gate_pose
 
 __all__ = ["FocalHypotheses", "MinimalSolver", "SubsetSolver", "describe"]
 
@@ -47,6 +47,7 @@ class SubsetSolver(Configured):
         BaseError: when ``size`` is less than 3.
 
     Example:
+        >>> import torch
         >>> from kornia_pnpnet.propose.mlp import MLPInit
         >>> solver = SubsetSolver(MLPInit(n=7), RobustWeightedLM(m=5, learnable=False), size=7)
         >>> solver.hypotheses(Problem.of(torch.randn(2, 7, 3), torch.randn(2, 7, 2), 3400.0)).pose.rotation.shape
@@ -57,20 +58,16 @@ class SubsetSolver(Configured):
         super().__init__(locals())
         check_whole(3, size=size)
         self.config.update(init=describe(init), refine=None if refine is None else refine.config)
-        self.init = init
-        self.refine = refine
-        self.sample_size = size
+        self.init, self.refine, self.sample_size = init, refine, size
 
     def hypotheses(self, problem: Problem) -> Hypotheses:
         """One pose per sample, valid where the initialiser has one and the pose is finite."""
         starts = self.init(problem)
         pose = starts.pose if self.refine is None else self.refine(problem, starts).pose
         valid = pose.rotation.isfinite().flatten(1).all(-1) & pose.translation.isfinite().all(-1)
-        eye = torch.eye(3, dtype=pose.rotation.dtype, device=pose.rotation.device)
-        rotation = torch.where(valid[:, None, None], pose.rotation, eye)
-        translation = torch.where(valid[:, None], pose.translation, 0.0)
+        pose = gate_pose(pose, valid, valid)
         valid = valid if starts.ok is None else valid & starts.ok
-        return Hypotheses(Pose(rotation[:, None], translation[:, None]), valid[:, None])
+        return Hypotheses(map_tensors(lambda x: x[:, None], pose), valid[:, None])
 
 
 def describe(part: object) -> dict[str, object]:

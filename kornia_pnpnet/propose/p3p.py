@@ -1,10 +1,34 @@
-r"""P3P: the up to four poses that project three world points exactly onto three pixels, for whole batches."""
+r"""P3P: the up to four poses that project three world points exactly onto three pixels, for whole batches.
+
+The unknowns are the distances :math:`\lambda_k` of the points along their unit rays. The law of cosines for the edge
+:math:`k`, the one opposite to point :math:`k` with the ends :math:`i` and :math:`j`, is
+
+.. math:: (\lambda_i - \lambda_j)^2 + b_k \lambda_i \lambda_j = a_k,
+
+with the squared length :math:`a_k` of the edge and the squared length :math:`b_k` of the difference of the two rays.
+(:math:`b_k` keeps the digits that :math:`2 - 2\cos` loses between rays close to each other.) A sum of the three
+equations with weights :math:`u` such that :math:`a \cdot u = 0` is a conic in the ratios of the distances. The conic
+is a pair of lines when
+
+.. math:: (u_1 u_2 + u_2 u_3 + u_3 u_1)\,(s \cdot u) = g\, u_1 u_2 u_3,
+
+with the squared sine :math:`s_k` of the angle of two rays and the squared determinant :math:`g` of all three rays. One
+root of this cubic gives two lines, and each line meets the other conics in two points. A Newton step then refines the
+ratios.
+
+Sources: M. Persson and K. Nordberg, "Lambda Twist", ECCV 2018, for the route by one degenerate conic; Y. Ding, J. Yang,
+V. Larsson, C. Olsson and K. Åström, "Revisiting the P3P Problem", CVPR 2023, for how the roots of the cubic determine
+the solutions and for the lines from the adjugate matrix. The short form of the cubic, the choice of its root and the
+lines in differences of distances are ours.
+
+The problems of a chunk are the last dimension of every tensor, (*, C). A choice between two finite values is a ``lerp``
+with a weight of exactly 0 or 1, which returns exactly one of the values: with an unpredictable mask, ``where`` takes a
+CPU ten times as long.
+"""
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
@@ -12,19 +36,15 @@ from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_devices, check_shapes, common_dtype
 from kornia_pnpnet.core.configured import Configured
-from kornia_pnpnet.core.linalg import dot
-from kornia_pnpnet.core.performance import compiling, fold_vmap, unfold_vmap
+from kornia_pnpnet.core.performance import compiling, exporting, fold_vmap, unfold_vmap
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.problem import Hypotheses, Problem
-from kornia_pnpnet.propose.law_of_cosines import Triple, distances, turn_to_largest, turned
 from kornia_pnpnet.propose.minimal import FocalHypotheses
 from kornia_pnpnet.propose.sampling import kept_at_once
 from kornia_pnpnet.refine.residual import MIN_DEPTH_RATIO
 from kornia_pnpnet.result import Pose
 
 __all__ = ["P3P", "p3p"]
-
-_T = TypeVar("_T")
 
 # Bytes. One number per problem of a chunk takes this many: a few dozen of these vectors fit into a core's caches.
 _CHUNK_BYTES = 2**16
@@ -40,126 +60,279 @@ _FOCALS = 12
 # Longest edges, times the machine epsilon to the power `_ERROR_POWER`. A camera closer to a point than this is no
 # solution: rounding would decide in which direction it sees the point.
 _CLOSE = 64.0
+# Number of Newton steps for the root of the cubic: from an error of a tenth at the start to rounding in float64.
+_CUBIC_STEPS = 4
+# Power of the machine epsilon. The last Newton step fades out where its squared determinant is less than this power, in
+# squared edges: there two solutions meet, and the step would be noise.
+_DAMPING_POWER = 1.25
 
 
-def _cross(v: Sequence[Tensor] | Tensor, w: Sequence[Tensor] | Tensor) -> list[Tensor]:
-    """The cross product of two vectors by components."""
-    return [(v[i] * w[j]).addcmul_(v[j], w[i], value=-1.0) for i, j in ((1, 2), (2, 0), (0, 1))]
+def _greater(first: Tensor, second: Tensor) -> Tensor:
+    """1.0 where the first is greater, else 0.0."""
+    return torch.gt(first, second, out=torch.empty_like(first))
 
 
-def _axes(base: list[Tensor], side: list[Tensor]) -> tuple[list[Tensor], list[Tensor], Triple]:
-    """Unit vectors along the base and the height of a triangle, whose two sides are overwritten.
+def _turn_to_largest(values: Tensor) -> tuple[Tensor, Tensor]:
+    """Weights (C,) of the turn by one and by two places that brings the largest of three values (3, C) to the front."""
+    first, second, third = values
+    return _greater(second, first), _greater(third, torch.maximum(first, second))
 
-    The third result is: one over the length of the base, the other side along the base, and the squared height.
+
+def _turned(triple: Tensor, turn: tuple[Tensor, Tensor], step: int = 1) -> Tensor:
+    """Turn the triple (3, *, C) of each problem; with the step -1, turn it back."""
+    return triple.lerp(triple.roll(-step, 0), turn[0]).lerp_(triple.roll(step, 0), turn[1])
+
+
+def _sqrt(square: Tensor) -> Tensor:
+    """The square root of a positive number, faster than ``torch.sqrt``."""
+    return square.rsqrt().mul_(square)
+
+
+def _signed(size: Tensor, sign: Tensor) -> Tensor:
+    """Give a positive number, which is overwritten, the sign of another number."""
+    if exporting():  # ONNX has no `copysign`
+        return torch.where(sign < 0, -size, size)
+    return size.copysign_(sign)
+
+
+def _isolated_root(k: Tensor) -> tuple[Tensor, Tensor]:
+    """The real root, as a ratio ``u : v``, of a cubic form (4, C) that is farthest from the other two roots.
+
+    Where two solutions of the P3P problem are close, two roots are close, too. The third root, which is returned, then
+    has both solutions on one of its lines.
     """
-    tiny = torch.finfo(base[0].dtype).tiny
-    inv_base = dot(base, base).clamp_(min=tiny).rsqrt_()
-    axis1 = [x.mul_(inv_base) for x in base]
-    along = dot(axis1, side)
-    axis2 = [x.addcmul_(along, y, value=-1.0) for x, y in zip(side, axis1, strict=True)]
-    sq_height = dot(axis2, axis2)
-    inv_height = sq_height.clamp(min=tiny).rsqrt_()
-    return axis1, [x.mul_(inv_height) for x in axis2], (inv_base, along, sq_height)
+    tiny = torch.finfo(k.dtype).tiny
+    sizes = k.abs()
+    k = k * sizes.amax(0).clamp_(min=tiny).reciprocal_()
+    # Swap u and v where two roots could be at infinity.
+    swap = _greater(sizes[2], sizes[1])
+    k3, k2, k1, k0 = k.lerp_(k.flip(0), swap)
+    # x = k3 u / v + k2 / 3 solves x³ = 3 p x + 2 q. The root is the outermost one, of the sign of q.
+    third = k2 * (1 / 3)
+    k31, sq_third = k3 * k1, third * third
+    p = torch.add(sq_third, k31, alpha=-1 / 3)
+    q = torch.sub(k31, sq_third, alpha=2).mul_(third).addcmul_(k3 * k3, k0, value=-1.0).mul_(0.5)
+    size = q.abs()
+    pure = (2.0 * size).pow_(2 / 3).clamp_(min=tiny)  # x² if p were 0
+    up = p.clamp(min=0.0)
+    x = _sqrt(torch.add(pure, up, alpha=3)).mul_(pure).div_(pure.add_(up.sub_(p), alpha=2.2))  # within a tenth
+    for _ in range(_CUBIC_STEPS):
+        sq_x = x * x
+        x = torch.addcmul(size, sq_x, x).mul_(2 / 3).div_(sq_x.sub_(p).clamp_(min=tiny))
+    root = torch.stack((_signed(x, q).sub_(third), k3))
+    root = root * root.abs().amax(0).clamp_(min=tiny).reciprocal_()
+    u, v = root.lerp(root.flip(0), swap)
+    return u, v
 
 
-def _load(world_points: Tensor, plane_points: Tensor) -> tuple[list[Tensor], Tensor]:
-    """The three points by components (5, C), ordered so that the longest edge is opposite to the first point.
+def _lines(u: Tensor, h: Tensor, pairs: Tensor) -> tuple[Tensor, Tensor]:
+    r"""The two lines (2, C) that form the conic with the weights ``u`` (3, C), of which ``u[1] + u[2]`` is not small.
 
-    The second result is whether the components are finite and small enough for arithmetic, (C,). The points of other
-    problems are 0.
+    The lines are :math:`\lambda_1 - \lambda_3 = \text{slope}\,(\lambda_2 - \lambda_3) + \text{offset}\,\lambda_3`.
+
+    Args:
+        u: root of the cubic.
+        h: :math:`1 - \cos` of the angles between the rays, (3, C).
+        pairs: first factor of the cubic, :math:`u_1 u_2 + u_2 u_3 + u_3 u_1`, (C,).
     """
-    given = torch.cat((world_points.permute(1, 2, 0), plane_points.permute(1, 2, 0)), 1)  # (3, 5, C)
-    sound = given.abs().sum((0, 1)) <= torch.finfo(given.dtype).max ** 0.2  # larger numbers could overflow
-    points = [torch.where(sound, x, 0.0) for x in given]
-    edges = [x[:3] - y[:3] for x, y in _ends(points)]
-    return [*turned(points, turn_to_largest(*(dot(x, x) for x in edges)))], sound
+    tiny = torch.finfo(pairs.dtype).tiny
+    # The matrix D of the conic has u_2 + u_3, u_3 + u_1, u_1 + u_2 on its diagonal and -u_k cos_k beside it. The lines
+    # cross in m with m mᵀ = -adj D. The matrices D + [m]ₓ and D - [m]ₓ have rank one; their first rows are the lines.
+    e1, e2, e3 = torch.addcmul(u, u, h, value=-1.0)
+    u, h = u[1:], h[1:]
+    d11 = u.sum(0)
+    inv = d11 / (d11 * d11).add_(tiny)
+    us = (u * u).mul_(torch.addcmul(2.0 * h, h, h, value=-1.0))
+    sq_m2, sq_m3 = (us + pairs).neg_().clamp_(min=tiny)
+    large = _sqrt(torch.maximum(sq_m2, sq_m3))
+    # The bound matters where the lines are not real.
+    least = -large
+    small = (e1 * d11).addcmul_(e2, e3).neg_().div_(large).clamp_(least, large)
+    third = _greater(sq_m3, sq_m2)
+    m2, m3 = large.lerp(small, third), small.lerp(large, third)
+    # m_3 - m_2 from the difference of the squares, which keeps more digits, unless the signs differ.
+    same_sign = _greater(small, torch.zeros_like(small))
+    apart = (us[0] - us[1]).div_((m2 + m3).abs_().clamp_(min=tiny**0.5)).clamp_(least, large)
+    apart = (m3 - m2).lerp_(apart, same_sign)
+    bend = (u * h).sum(0).neg_()
+    sign = 1.0 - 2.0 * torch.arange(2, dtype=pairs.dtype, device=pairs.device)[:, None]
+    return torch.addcmul(e3, sign, m3).mul_(inv), torch.addcmul(bend, sign, apart).mul_(inv)
 
 
-def _ends(points: Sequence[_T]) -> list[tuple[_T, _T]]:
-    """The ends of the edges opposite to each of three points."""
-    return [(points[2], points[1]), (points[0], points[2]), (points[1], points[0])]
+def _meet(slope: Tensor, offset: Tensor, v: Tensor, h: Tensor) -> Tensor:
+    """The points where lines (2, C) meet the conic with the weights ``v`` (3, C): distances (3, 2, 2, C) up to scale.
+
+    A line that misses the conic counts as touching it. Where a line touches the conic, the second point is 0.
+    """
+    v1, v2, v3 = v
+    vh1, vh2, vh3 = v * h
+    # Coefficients of y², 2 y and 1 in y = (λ_2 - λ_3) / λ_3.
+    v2_slope, less = slope * v2, slope - 1.0
+    c2 = (less * less).mul_(v3).addcmul_(slope, vh3, value=2.0).addcmul_(v2_slope, slope).add_(v1)
+    c1 = (slope + offset).add_(1.0).mul_(vh3).addcmul_(less * v3, offset).addcmul_(v2_slope, offset).add_(vh1)
+    c1.addcmul_(slope, vh2)
+    vh23 = (vh2 + vh3).mul_(2.0)
+    c0 = (offset * offset).mul_(v2 + v3).addcmul_(offset, vh23).add_(vh23.add_(vh1, alpha=2.0))
+    disc = (c1 * c1).addcmul_(c2, c0, value=-1.0)
+    two = _greater(disc, torch.zeros_like(disc))
+    z = _signed(_sqrt(disc.clamp_(min=torch.finfo(disc.dtype).tiny)), c1).add_(c1).neg_()
+    y, dist3 = torch.stack((z, c0.mul_(two))), torch.stack((c2, z * two))
+    return torch.stack((torch.addcmul(dist3, slope, y).addcmul_(offset, dist3), y.add_(dist3), dist3))
 
 
-def _look(plane: list[Tensor]) -> tuple[list[list[Tensor]], Triple, Tensor, Tensor]:
-    """Three unit rays of three (C,), their squared differences, their squared determinant, whether all are in view."""
-    depths = [(x * x).addcmul_(y, y).add_(1.0).rsqrt_() for x, y in plane]
-    rays = [[x * depth, y * depth, depth] for (x, y), depth in zip(plane, depths, strict=True)]
-    gaps = [[a - b for a, b in zip(x, y, strict=True)] for x, y in _ends(rays)]
-    det = dot(_cross(gaps[1], gaps[2]), rays[0])
-    sees = functools.reduce(torch.minimum, depths) > MIN_DEPTH_RATIO
-    b1, b2, b3 = (dot(x, x) for x in gaps)
-    return rays, (b1, b2, b3), det.mul_(det), sees
+def _candidates(p: Tensor, q: Tensor, r: Tensor, b: Tensor, g: Tensor) -> Tensor:
+    """Solutions of the equations of :func:`_distances` up to rounding."""
+    h = 0.5 * b
+    s1, s2, s3 = torch.addcmul(b, h, h, value=-1.0)
+    # With u_1 = -(p u_3 + q u_2) the cubic is one in u_3 : u_2, and s · u = t_3 u_3 + t_2 u_2.
+    t3, t2 = s3.addcmul_(p, s1, value=-1.0), s2.addcmul_(q, s1, value=-1.0)
+    k2, k1 = (r * t3).addcmul_(p, g - t2), (r * t2).addcmul_(q, g - t3)
+    u3, u2 = _isolated_root(torch.stack(((p * t3).neg_(), k2, k1, (q * t2).neg_())))
+    u = torch.stack(((p * u3).addcmul_(q, u2).neg_(), u2, u3))
+    pairs = (u2 * u3).addcmul_(u[0], u2 + u3)
+    turn = _turn_to_largest((u.roll(-1, 0) + u.roll(1, 0)).abs_())
+    # Intersect the lines with the conic whose weights are orthogonal to u: (p u_2 - q u_3, u_3, -u_2).
+    v = torch.stack(((p * u2).addcmul_(q, u3, value=-1.0), u3, -u2))
+    u, v, h = _turned(torch.stack((u, v, h), 1), turn).unbind(1)
+    slope, offset = _lines(u, h, pairs)
+    return _turned(_meet(slope, offset, v, h), turn, -1)
 
 
-def _solve_chunk(world_points: Tensor, plane_points: Tensor) -> tuple[list[Tensor], Tensor]:
-    """The twelve components of rotations and translations (2, 2, C), and which poses are solutions (2, 2, C)."""
+def _refined(candidates: Tensor, p: Tensor, q: Tensor, b: Tensor) -> Tensor:
+    """Take one Newton step on the ratios of the distances."""
+    dist1, dist2, dist3 = candidates
+    h1, h2, h3 = 0.5 * b
+    after, before = candidates.roll(-1, 0), candidates.roll(1, 0)
+    d = after - before
+    # The squared edges e; the equations are e2 = q e1 and e3 = p e1.
+    e1, e2, e3 = (d * d).addcmul_(b[:, None, None], after.mul_(before))
+    d1, d2, d3 = d
+    r2, r3 = torch.addcmul(e2, q, e1, value=-1.0), torch.addcmul(e3, p, e1, value=-1.0)
+    # Half the derivatives: of e1 by dist2, of -e1 by dist3, of e2 by dist3, of -e3 by dist2; from these, of -r2 and -r3
+    # by dist2 (r22, r32), and of r2 and r3 by dist3 (r23, r33).
+    e12, e13 = torch.addcmul(d1, h1, dist3), d1.addcmul_(h1, dist2, value=-1.0)
+    e23, e32 = d2.addcmul_(h2, dist1), d3.addcmul_(h3, dist1, value=-1.0)
+    r22, r23 = q * e12, e23.addcmul_(q, e13)
+    r32, r33 = e32.addcmul_(p, e12), e13.mul_(p)
+    det = (r23 * r32).addcmul_(r22, r33, value=-1.0)
+    finfo = torch.finfo(det.dtype)
+    inv = det.div_((det * det).addcmul_(e2, e3, value=finfo.eps**_DAMPING_POWER).add_(finfo.tiny))
+    step2 = (r2 * r33).addcmul_(r3, r23, value=-1.0)
+    step3 = r2.mul_(r32).addcmul_(r3, r22, value=-1.0)
+    return torch.stack((dist1, *(torch.stack((dist2, dist3)).addcmul_(torch.stack((step2, step3)), inv, value=-0.5))))
+
+
+def _distances(p: Tensor, q: Tensor, r: Tensor, b: Tensor, g: Tensor) -> Tensor:
+    r"""Solve the law of cosines for a triangle whose edge 1 is the longest edge and has the length 1.
+
+    Args:
+        p: squared edge 3, (C,).
+        q: squared edge 2, (C,).
+        r: :math:`1 - p - q`, which the caller may know with more digits, (C,).
+        b: squared difference of the two rays to the ends of each edge, (3, C).
+        g: squared determinant of the three rays, (C,).
+
+    Returns:
+        Four candidates for the distances of the points, (3, 2, 2, C). The first distance is not negative. A candidate
+        that is no solution with positive distances is finite.
+    """
+    dist = _refined(_candidates(p, q, r, b, g), p, q, b)
+    dist1, dist2, dist3 = dist
+    edge = dist2 - dist3
+    sq_edge = edge.mul_(edge).addcmul_(b[0], dist2 * dist3)
+    return dist.mul_(_signed(sq_edge.clamp_(min=torch.finfo(p.dtype).tiny ** 0.5).rsqrt_(), dist1))
+
+
+def _dot(v: Tensor, w: Tensor) -> Tensor:
+    """Products of the vectors (3, *, C)."""
+    return (v * w).sum(0)
+
+
+def _cross(v: Tensor, w: Tensor) -> Tensor:
+    """Cross products of vectors (3, *, C); ``torch.linalg.cross`` takes a CPU several times as long."""
+    return (v.roll(-1, 0) * w.roll(1, 0)).addcmul_(v.roll(1, 0), w.roll(-1, 0), value=-1.0)
+
+
+def _axes(base: Tensor, side: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Of a triangle with two given sides: unit vectors along its base and its height, and three numbers.
+
+    These are one over the length of the base, the other side along the base, and the squared height.
+    """
+    tiny = torch.finfo(base.dtype).tiny
+    inv_base = _dot(base, base).clamp_(min=tiny).rsqrt_()
+    axis1 = base * inv_base
+    along = _dot(axis1, side)
+    height = torch.addcmul(side, along, axis1, value=-1.0)
+    sq_height = _dot(height, height)
+    return axis1, height.mul_(sq_height.clamp(min=tiny).rsqrt_()), inv_base, along, sq_height
+
+
+def _edges(points: Tensor) -> Tensor:
+    """The edges opposite to each of three points (3, *, C)."""
+    return points.roll(1, 0) - points.roll(-1, 0)
+
+
+def _solve_chunk(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Rotations (3, 3, 2, 2, C), translations (3, 2, 2, C), and which poses are solutions (2, 2, C)."""
     finfo = torch.finfo(world_points.dtype)
-    points, sound = _load(world_points, plane_points)
-    x1, x2, x3 = (x[:3] for x in points)
-    # Component by component: an exporter cannot write into parts of a tensor for a variable number of problems.
-    base, side = ([x - y for x, y in zip(end, x2, strict=True)] for end in (x3, x1))
-    axis1, axis2, (inv_base, along, sq_height) = _axes(base, side)
-    axis3 = _cross(axis1, axis2)
+    # Points by components, ordered so that the longest edge is opposite to the first point; 0 where not sound.
+    points = torch.cat((world_points.permute(1, 2, 0), plane_points.permute(1, 2, 0)), 1)  # (3, 5, C)
+    sound = points.abs().sum((0, 1)) <= finfo.max**0.2  # larger numbers could overflow
+    points = torch.where(sound, points, 0.0)
+    points = _turned(points, _turn_to_largest(_edges(points[:, :3]).square_().sum(1)))
+    (x1, x2, x3), plane = points[:, :3], points[:, 3:]
+    axis1, axis2, inv_base, along, sq_height = _axes(x3 - x2, x1 - x2)
     inv_sq_base = inv_base * inv_base
     along, sq_height = along.mul_(inv_base), sq_height.mul_(inv_sq_base)
-    line = dot(x1, x1).mul_(inv_sq_base).add_(1.0).mul_((_LINE * finfo.eps) ** 2)
+    line = _dot(x1, x1).mul_(inv_sq_base).add_(1.0).mul_((_LINE * finfo.eps) ** 2)
     sound = sound.bitwise_and_(sq_height > line).bitwise_and_(inv_sq_base < finfo.tiny**-0.5)
     rest = 1.0 - along
     p, q = (along * along).add_(sq_height), (rest * rest).add_(sq_height)
     r = rest.mul_(along).sub_(sq_height).mul_(2.0)
-    rays, b, g, sees = _look([x[3:] for x in points])
-    dist = distances(p, q, r, b, g)
+    # The rays, their differences, and their determinant.
+    depths = plane.square().sum(1, keepdim=True).add_(1.0).rsqrt_()
+    rays = torch.cat((plane * depths, depths), 1)  # (3, 3, C)
+    sound.bitwise_and_(depths.amin((0, 1)) > MIN_DEPTH_RATIO)
+    gaps = _edges(rays)
+    det = _dot(_cross(gaps[1], gaps[2]), rays[0])
+    dist = _distances(p, q, r, gaps.square_().sum(1), det.mul_(det))
 
     # So far the longest edge had the length 1; from here on lengths are in the unit of the world.
     base_length = inv_base.reciprocal()
-    y1, y2, y3 = ([d * x for x in ray] for d, ray in zip([d * base_length for d in dist], rays, strict=True))
-    base = [y.sub_(x) for y, x in zip(y3, y2, strict=True)]
-    side = [torch.sub(y, x, out=x) for y, x in zip(y1, y2, strict=True)]
-    cam1, cam2, (cam_inv_base, cam_along, cam_sq_height) = _axes(base, side)
+    y1, y2, y3 = (dist * base_length)[:, None] * rays[:, :, None, None]
+    cam1, cam2, cam_inv_base, cam_along, cam_sq_height = _axes(y3 - y2, y1 - y2)
     # The two triangles differ in the base, the side along it and the squared height, relative to the base.
     base_error = (cam_inv_base * base_length).sub_(1.0)
     along_error = torch.addcmul(-along, cam_along, inv_base)
     height_error = torch.addcmul(-sq_height, cam_sq_height, inv_sq_base)
     sq_error = base_error.mul_(base_error).addcmul_(along_error, along_error).addcmul_(height_error, height_error)
-    least = torch.minimum(torch.minimum(dist[0], dist[1]), dist[2])
-    bound = sound.bitwise_and_(sees) * least.new_full((), finfo.eps ** (2 * _ERROR_POWER))
+    least = dist.amin(0)
     # No distance is more than dist[0] + 1, in longest edges.
-    room = least.addcmul_(least, dist[0]).sub_(_CLOSE * finfo.eps**_ERROR_POWER).mul_(bound)
-    valid = sq_error < room.clamp_(max=_LARGEST_ERROR**2)
+    room = torch.addcmul(least, least, dist[0]).sub_(_CLOSE * finfo.eps**_ERROR_POWER)
+    room.mul_(sound * finfo.eps ** (2 * _ERROR_POWER)).clamp_(max=_LARGEST_ERROR**2)
 
-    # R = Σ camera axis · world axisᵀ, the last row from the first two; t = y1 - R x1.
-    (a0, a1, a2), (b0, b1, b2) = cam1, cam2
-    cam3 = ((a1 * b2).addcmul_(a2, b1, value=-1.0), (a2 * b0).addcmul_(a0, b2, value=-1.0))
-    rows = [
-        [(cam1[i] * axis1[j]).addcmul_(cam2[i], axis2[j]).addcmul_(cam3[i], axis3[j]) for j in range(3)]
-        for i in range(2)
-    ]
-    rows.append(_cross(*rows))
-    back = -x1
-    translation = [
-        torch.addcmul(y, row[0], back[0]).addcmul_(row[1], back[1]).addcmul_(row[2], back[2])
-        for y, row in zip(y1, rows, strict=True)
-    ]
-    return [*rows[0], *rows[1], *rows[2], *translation], valid
+    # R = Σ camera axis · world axisᵀ, t = y1 - R x1.
+    axis3, cam3 = _cross(axis1, axis2), _cross(cam1, cam2)
+    world_axes = [axis[:, None, None] for axis in (axis1, axis2, axis3)]
+    rotation = cam1[:, None] * world_axes[0]
+    rotation.addcmul_(cam2[:, None], world_axes[1]).addcmul_(cam3[:, None], world_axes[2])
+    return rotation, y1 - (rotation * x1[:, None, None]).sum(1), sq_error < room
 
 
 def _solve(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Tensor]:
-    """Components of rotations and translations, (12, 4, B), and which poses are solutions, (4, B).
-
-    The problems are solved in chunks that fit into a core's caches. The loops of a compiler need no chunks.
-    """
+    """Components of rotations and translations, (12, 4, B), and which poses are solutions, (4, B)."""
     batch = world_points.shape[0]
     if compiling():
-        entries, found = _solve_chunk(world_points, plane_points)
-        return torch.stack(entries).flatten(1, 2), found.flatten(0, 1)
+        rotation, translation, found = _solve_chunk(world_points, plane_points)
+        return torch.cat((rotation.flatten(0, 1), translation)).flatten(1, 2), found.flatten(0, 1)
     out = world_points.new_empty(12, 2, 2, batch)
     valid = torch.empty(2, 2, batch, dtype=torch.bool, device=world_points.device)
     chunk = kept_at_once(_CHUNK_BYTES, world_points) // world_points.element_size()
     with torch.inference_mode():  # an eighth faster than `no_grad`; the results were made outside
         for start in range(0, batch, chunk):
             part = slice(start, start + chunk)
-            entries, valid[..., part] = _solve_chunk(world_points[part], plane_points[part])
-            torch.stack(entries, out=out[..., part])
+            rotation, translation, valid[..., part] = _solve_chunk(world_points[part], plane_points[part])
+            torch.cat((rotation.flatten(0, 1), translation), out=out[..., part])
     return out.flatten(1, 2), valid.flatten(0, 1)
 
 
@@ -189,16 +362,15 @@ class _Solve(torch.autograd.Function):
 def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
     r"""Find all poses that project three world points exactly onto three image points, for a batch of problems.
 
-    Use this function when there are exactly three pairs. A solver answers with one pose, which most solvers do not
-    believe (:attr:`~kornia_pnpnet.result.Status.NOT_BELIEVED`), because no fourth pair confirms it.
+    Use this function when there are exactly three pairs: most solvers do not believe a pose that no fourth pair
+    confirms (:attr:`~kornia_pnpnet.result.Status.NOT_BELIEVED`).
 
     Convention: ``x_cam = R x_world + t``, the camera looks along +z.
 
-    The poses carry no gradient: they are hypotheses, of which one is selected and refined on all pairs. In memory the
-    batch is the last dimension, which suits arithmetic over many poses.
+    The poses carry no gradient. In memory the batch is the last dimension, which suits arithmetic over many poses.
 
     Source: M. Persson and K. Nordberg, "Lambda Twist", ECCV 2018; Y. Ding et al., "Revisiting the P3P Problem", CVPR
-    2023; details in :mod:`kornia_pnpnet.propose.law_of_cosines`.
+    2023; details in :mod:`kornia_pnpnet.propose.p3p`.
 
     Args:
         world_points: points in any unit, shape :math:`(B, 3, 3)`. Any leading dimensions may stand in place of
@@ -260,17 +432,7 @@ class P3P(Configured):
         super().__init__(locals())
 
     def hypotheses(self, problem: Problem) -> Hypotheses | FocalHypotheses:
-        r"""Solve samples of three pairs.
-
-        Args:
-            problem: samples, :math:`N = 3`. Their weights are ignored.
-
-        Returns:
-            Four slots per sample and focal length, without gradients.
-
-        Raises:
-            ShapeError: when :math:`N` is not 3.
-        """
+        """Four slots per sample and focal length, without gradients."""
         plane = problem.img_points / problem.focal
         if problem.free_focal is None:
             return p3p(problem.world_points, plane)
@@ -278,11 +440,9 @@ class P3P(Configured):
         zoom = at[:, None].to(plane) * problem.free_focal.width  # (F, B)
         world = problem.world_points.expand(_FOCALS, -1, -1, -1)
         solved = p3p(world, plane * (-zoom).exp()[..., None, None])
-
-        def slots(x: Tensor) -> Tensor:
-            """Of (F, B, 4, ...) the slots of a sample side by side, (B, 4 F, ...); the batch stays last in memory."""
-            last = x.movedim((0, 1, 2), (-2, -1, -3)).flatten(-3, -2)
-            return last.movedim((-1, -2), (0, 1))
-
-        pose, valid = map_tensors(slots, (solved.pose, solved.valid))
+        # From (F, B, 4, ...) to (B, 4 F, ...): the slots of a sample side by side, the batch last in memory.
+        pose, valid = map_tensors(
+            lambda x: x.movedim((0, 1, 2), (-2, -1, -3)).flatten(-3, -2).movedim((-1, -2), (0, 1)),
+            (solved.pose, solved.valid),
+        )
         return FocalHypotheses(pose, valid, zoom.repeat(4, 1).mT)

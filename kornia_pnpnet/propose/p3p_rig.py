@@ -58,42 +58,50 @@ class P3PRig(Configured):
         plane = torch.where(ahead > 0, seen[:, :2] / ahead, torch.inf)
         solved = p3p(problem.world_points, plane.permute(2, 0, 1))
         away = ((centres.mean(0) - centres) * rays).sum(1)
-        found = map_tensors(lambda x: x.movedim((0, 1), (-1, -2)).flatten(-2), solved.pose)  # (3, 3, 4 B) and (3, 4 B)
-        valid, eye = solved.valid.mT.flatten(), torch.eye(3, dtype=rays.dtype, device=rays.device)
-        slots = torch.arange(4 * batch, device=rays.device)
+        # The slots of all samples side by side: (3, 3, 4 B), (3, 4 B) and (4 B,).
+        last = map_tensors(lambda x: x.movedim((0, 1), (-1, -2)).flatten(-2), solved)
+        valid, slots = last.valid, torch.arange(4 * batch, device=rays.device)
         if sees_values(rays):  # a graph tries slots without a solution, too
             slots = valid.nonzero()[:, 0]
-        found = map_tensors(lambda x: x.index_select(-1, slots), found)
-        of_sample = (x.contiguous() for x in (world, rays, centres, turn, seen, away))
-        pose, exact = self._exact(found, *(x.index_select(-1, slots % batch) for x in of_sample))
+        rotation, translation = (x.index_select(-1, slots) for x in last.pose)
+        of_sample = (x.contiguous().index_select(-1, slots % batch) for x in (world, rays, centres, turn, seen, away))
+        rotation, translation, exact = self._exact(rotation, translation, *of_sample)
         exact = exact & valid[slots]
-        rotation = torch.where(exact[:, None, None], pose.rotation, eye).movedim(0, -1)
-        translation = torch.where(exact[:, None], pose.translation, 0.0).mT
-        rotation = eye[..., None].repeat(1, 1, 4 * batch).index_copy(-1, slots, rotation)
-        translation = rays.new_zeros(3, 4 * batch).index_copy(-1, slots, translation)
-        valid = torch.zeros_like(valid).index_copy(0, slots, exact)
-        rotation, translation, valid = (
-            x.movedim(-1, 0).unflatten(0, (4, batch)) for x in (rotation, translation, valid)
+        eye = torch.eye(3, dtype=rays.dtype, device=rays.device)[..., None]
+        rotation, translation = torch.where(exact, rotation, eye), torch.where(exact, translation, 0.0)
+        found = Hypotheses(
+            Pose(
+                eye.repeat(1, 1, 4 * batch).index_copy(-1, slots, rotation),
+                rays.new_zeros(3, 4 * batch).index_copy(-1, slots, translation),
+            ),
+            torch.zeros_like(valid).index_copy(0, slots, exact),
         )
-        return Hypotheses(Pose(rotation.transpose(0, 1), translation.transpose(0, 1)), valid.mT)
+        return map_tensors(lambda x: x.unflatten(-1, (4, batch)).movedim((-1, -2), (0, 1)), found)
 
     def _exact(
-        self, found: Pose, world: Tensor, rays: Tensor, centres: Tensor, turn: Tensor, seen: Tensor, away: Tensor
-    ) -> tuple[Pose, Tensor]:
+        self,
+        rotation: Tensor,
+        translation: Tensor,
+        world: Tensor,
+        rays: Tensor,
+        centres: Tensor,
+        turn: Tensor,
+        seen: Tensor,
+        away: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """From M poses of the central approximation, problems last, to exact ones, and whether they are exact."""
-        rotation, translation = found
         if not self.steps:
             back = turn.transpose(0, 1)
             rotation, translation = small_product(back, rotation), small_product(back, translation[:, None])[:, 0]
-            return Pose(rotation.movedim(-1, 0), translation.mT), torch.ones_like(translation[0], dtype=torch.bool)
+            return rotation, translation, torch.ones_like(translation[0], dtype=torch.bool)
         # From the points of the central approximation to those nearest on the rays.
         cam = small_product(world, rotation.transpose(0, 1)) + translation
-        ranges = (cam * seen).sum(1) + away
-        world, rays, centres, ranges = (x.contiguous() for x in (world, rays, centres, ranges))
-        return _newton(world, rays, centres, ranges, self.steps)
+        return _newton(world, rays, centres, (cam * seen).sum(1) + away, self.steps)
 
 
-def _newton(world_points: Tensor, rays: Tensor, centres: Tensor, ranges: Tensor, steps: int) -> tuple[Pose, Tensor]:
+def _newton(
+    world_points: Tensor, rays: Tensor, centres: Tensor, ranges: Tensor, steps: int
+) -> tuple[Tensor, Tensor, Tensor]:
     r"""Find the distances along three rays at which the points have the distances of the world from each other.
 
     Three equations :math:`\|c_i + d_i r_i - c_j - d_j r_j\|^2 = \|x_i - x_j\|^2` for three distances.
@@ -106,24 +114,21 @@ def _newton(world_points: Tensor, rays: Tensor, centres: Tensor, ranges: Tensor,
         steps: number of steps.
 
     Returns:
-        :math:`M` poses, and whether they are exact and all distances positive.
+        Rotations, translations, and whether they are exact and all distances positive.
     """
-    first, second = (0, 0, 1), (1, 2, 2)
-    sides = (world_points[list(first)] - world_points[list(second)]).square().sum(1)  # (3, M)
-
-    def edges() -> tuple[Tensor, Tensor]:
+    first, second = [0, 0, 1], [1, 2, 2]
+    sides = (world_points[first] - world_points[second]).square().sum(1)  # (3, M)
+    for step in range(steps + 1):
         points = centres + ranges[:, None] * rays
-        edge = points[list(first)] - points[list(second)]  # (3, 3, M)
-        return edge, 0.5 * (sides - edge.square().sum(1))
-
-    for _ in range(steps):
-        edge, (g, h, k) = edges()
+        edge = points[first] - points[second]  # (3, 3, M)
+        gap = 0.5 * (sides - edge.square().sum(1))
+        if step == steps:
+            break
         # The Jacobian is [[a, -b, 0], [c, 0, -d], [0, e, -f]]: Cramer's rule.
-        (a, c, e), (b, d, f) = ((edge * rays[list(at)]).sum(1) for at in (first, second))
+        (a, c, e), (b, d, f), (g, h, k) = (edge * rays[first]).sum(1), (edge * rays[second]).sum(1), gap
         both = d * k - f * h
         steps_by_det = torch.stack((g * d * e + b * both, a * both + g * c * f, b * c * k + e * (g * c - a * h)))
         ranges = ranges + steps_by_det / (a * d * e - b * c * f)
-    edge, gap = edges()
     exact = (gap.abs() < _EXACT * sides).all(0) & (ranges > 0).all(0)
     # The rotation maps one triple of edges to the other: two sides of the triangle and its normal.
     cam = [-edge[0], -edge[1], torch.linalg.cross(edge[0], edge[1], dim=0)]
@@ -131,9 +136,8 @@ def _newton(world_points: Tensor, rays: Tensor, centres: Tensor, ranges: Tensor,
     normal = torch.linalg.cross(*world, dim=0)
     dual = torch.linalg.cross(world[1], normal, dim=0), torch.linalg.cross(normal, world[0], dim=0), normal
     rotation = sum(x[:, None] * (y / normal.square().sum(0)) for x, y in zip(cam, dual, strict=True))
-    translation = centres[0] + ranges[0] * rays[0] - (rotation * world_points[0]).sum(1)
-    pose = Pose(rotation.movedim(-1, 0), translation.mT)
-    return pose, exact & translation.isfinite().all(0)
+    translation = points[0] - (rotation * world_points[0]).sum(1)
+    return rotation, translation, exact & translation.isfinite().all(0)
 
 
 def is_central(rig: Pose) -> bool:

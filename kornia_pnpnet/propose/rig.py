@@ -40,16 +40,13 @@ _ROOT = 1.2207440846057596
 
 @torch.no_grad()
 def starts_of_rig(problem: Problem, given: Pose | None, *, with_noise: bool, fixed: bool = False) -> Starts:
-    """Find the pose of a rig, its inliers and their noise.
+    """Find the pose of a rig, its inliers and their noise, as constants.
 
     Args:
         problem: normalised problems of a rig.
-        given: see :meth:`~kornia_pnpnet.propose.RANSAC.forward`.
+        given: See RANSAC.forward.
         with_noise: estimate the noise of the pixels from the residuals, for a refinement that expects it.
         fixed: try a fixed number of samples, as in graphs, in place of RANSAC.
-
-    Returns:
-        The starts, a constant.
     """
     problem = problem.map(torch.Tensor.detach)
     if fixed or not sees_values(problem.weights):
@@ -103,13 +100,7 @@ def _best_of_samples(problem: Problem) -> Starts:
 
 
 def _draw(problem: Problem, order: Tensor, counts: Tensor) -> Tensor:
-    """Positions of the pairs of the samples, (B, 3 S): first pairs, second pairs, third pairs.
-
-    Args:
-        problem: normalised problems of a rig.
-        order: positions of the pairs, those that have a weight first, (B, N).
-        counts: number of pairs that have a weight, (B,).
-    """
+    """Positions of the pairs of the samples, (B, 3 S), in ``order`` (B, N) of which the first ``counts`` are drawn."""
     numbers = torch.arange(1, _DRAWS * _SAMPLES + 1, dtype=torch.float64, device=order.device)
     numbers = torch.stack([numbers * _ROOT**-k for k in (1, 2, 3)], -1)
     drawn = draw_subsets(numbers - numbers.floor(), counts).mT  # (B, 3, D S)

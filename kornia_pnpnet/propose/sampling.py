@@ -1,7 +1,6 @@
 r"""Samples of RANSAC: which subsets of the pairs are drawn, and how many samples suffice.
 
-All numbers are per problem; problems share only the random numbers. So a problem has the same samples alone, in any
-batch and at any place in the batch. Another sampling rule replaces :class:`Samples`.
+Problems share only the random numbers: a problem has the same samples alone and at any place in any batch.
 """
 
 from __future__ import annotations
@@ -26,25 +25,20 @@ _CANDIDATES = 512
 _INFINITE = 0x7F800000
 # Numbers of a block of distances, so that a processor's cache holds it.
 _BLOCK = 2**18
-# A graphics processor is slow at many small operations, and its memory holds what a CPU core's caches do not.
-_DEVICE_HOLDS = 64
 
 
 def kept_at_once(count: int, like: Tensor) -> int:
-    """How much is computed at once: ``count``, what the caches of a CPU's core hold, or 64 times as much elsewhere."""
-    return count if like.device.type == "cpu" else _DEVICE_HOLDS * count
+    """How much is computed at once: ``count``, what the caches of a CPU's core hold, or 64 times as much elsewhere.
+
+    A graphics processor is slow at many small operations, and its memory holds more.
+    """
+    return count if like.device.type == "cpu" else 64 * count
 
 
 def draw_subsets(numbers: Tensor, counts: Tensor) -> Tensor:
-    r"""Turn uniform numbers into subsets, item by item without replacement.
+    """Subsets (P, H, s), ascending, of the ``counts`` (P,) items of problems, from uniform numbers (H, s) in [0, 1).
 
-    Args:
-        numbers: uniform in [0, 1), float64, shape :math:`(H, s)`.
-        counts: number of items of each problem, shape :math:`(P,)`. Where it is less than :math:`s`, subsets hold
-            positions past the last item.
-
-    Returns:
-        :math:`H` subsets for each problem, ascending, int64, shape :math:`(P, H, s)`.
+    Items are drawn one by one without replacement; of too few items, subsets hold positions past the last one.
 
     Example:
         >>> draw_subsets(torch.tensor([[0.0, 0.0, 0.99]], dtype=torch.float64), torch.tensor([3, 10])).tolist()
@@ -63,15 +57,9 @@ def draw_subsets(numbers: Tensor, counts: Tensor) -> Tensor:
 
 
 def draw_likely(numbers: Tensor, upper: Tensor) -> Tensor:
-    r"""Turn uniform numbers into subsets of unequally likely items, item by item without replacement.
+    """:func:`draw_subsets`, not ascending, of unequally likely items, by their cumulative probabilities (P, N).
 
-    Args:
-        numbers: uniform in [0, 1), float64, shape :math:`(H, s)`.
-        upper: cumulative probabilities of the items of each problem, float64, shape :math:`(P, N)`.
-
-    Returns:
-        :math:`H` subsets for each problem, int64, shape :math:`(P, H, s)`. Items of probability 0 are drawn only where
-        there are less than :math:`s` others.
+    Items of probability 0 are drawn only where there are too few others.
 
     Example:
         >>> draw_likely(
@@ -99,13 +87,12 @@ def draw_likely(numbers: Tensor, upper: Tensor) -> Tensor:
 
 
 def agreement_of_neighbours(world_points: Tensor, img_points: Tensor, there: Tensor) -> Tensor:
-    r"""Tell how well the neighbours of each pair in the image agree with those in the world.
+    r"""How well the neighbours of each pair in the image agree with those in the world, (B, N), at least 0.
 
     What is seen side by side mostly lies side by side, so that inliers share neighbours; outliers share them by chance.
-    Among the 16 nearest neighbours in the image and the 16 nearest in the world, counted from 0, a pair that is the
-    :math:`a`-th in the one and the :math:`b`-th in the other counts :math:`1 / (1 + \max(a, b))`. Pairs with the same
-    pixel or the same point do not count: they are what one wrong match looks like when it is made many times. Of more
-    than 512 pairs, as many that are spread over all of them are the neighbours.
+    A pair that is the :math:`a`-th nearest in the image and the :math:`b`-th nearest in the world, counted from 0 and
+    both among 16, counts :math:`1 / (1 + \max(a, b))`. Pairs with the same pixel or the same point do not count: one
+    wrong match that is made many times looks like this.
 
     Source: the idea is that of J. Bian et al., "GMS: Grid-based motion statistics for fast, ultra-robust feature
     correspondence", CVPR 2017, for matches between two images.
@@ -114,16 +101,6 @@ def agreement_of_neighbours(world_points: Tensor, img_points: Tensor, there: Ten
         world_points: shape :math:`(B, N, 3)`.
         img_points: shape :math:`(B, N, 2)`.
         there: which pairs have a weight, bool, shape :math:`(B, N)`.
-
-    Returns:
-        At least 0, float32, shape :math:`(B, N)`; arbitrary for padding.
-
-    Example:
-        >>> points = torch.rand(1, 100, 3, generator=torch.Generator().manual_seed(0))
-        >>> pixels = torch.cat((points[:, :50, :2], points[:, :50, 1:]), 1)  # the second half is wrong
-        >>> agreement = agreement_of_neighbours(points, pixels, torch.ones(1, 100, dtype=torch.bool))
-        >>> bool(agreement[:, :50].mean() > 2 * agreement[:, 50:].mean())
-        True
     """
     counts, width = there.sum(-1, keepdim=True), min(there.shape[1], _CANDIDATES)
     order = torch.arange(width, dtype=torch.int32, device=there.device)
@@ -158,22 +135,21 @@ def _sq_distances(points: Tensor, others: Tensor) -> Tensor:
 
 
 class Samples:
-    r"""The samples that RANSAC tries, for every problem of a batch.
+    """The samples that RANSAC tries, for every problem of a batch.
 
-    When a problem has at most ``most`` subsets of its pairs, each subset is a sample once, in an order that ``seed``
-    fixes. Otherwise ``most`` samples are drawn from the pairs that have a weight, all equally likely or with
-    probabilities in proportion to ``chances``.
+    When a problem has at most ``most`` subsets of its pairs, each subset is a sample once, in random order. Otherwise
+    ``most`` samples are drawn, all pairs equally likely or with probabilities in proportion to ``chances``.
 
     Args:
-        there: which pairs have a weight, bool, shape :math:`(B, N)`.
+        there: which pairs have a weight, bool (B, N).
         size: number of pairs in a sample.
         most: largest number of samples.
         seed: seed of the random numbers, which are the same for every problem.
-        chances: at least 0, shape :math:`(B, N)`.
+        chances: at least 0, (B, N).
 
     Attributes:
-        counts: number of pairs that have a weight, int64, shape :math:`(B,)`.
-        totals: number of samples of each problem, int64, shape :math:`(B,)`.
+        counts: number of pairs that have a weight, (B,).
+        totals: number of samples of each problem, (B,).
 
     Example:
         >>> samples = Samples(torch.ones(1, 4, dtype=torch.bool), size=3, most=10, seed=0)
@@ -202,45 +178,24 @@ class Samples:
             self._upper = self.share.gather(1, self._present_first).cumsum(-1)
 
     def positions(self, problems: Tensor, start: int, stop: int) -> Tensor:
-        r"""Samples ``start`` to ``stop - 1`` of some problems; those after the last sample of a problem repeat others.
+        """Positions of the pairs of the samples ``start`` to ``stop - 1`` of some problems (P,), (P, H, s).
 
-        Args:
-            problems: indices of the problems, int64, shape :math:`(P,)`.
-            start: number of the first sample.
-            stop: number after the last sample.
-
-        Returns:
-            Positions of pairs, int64, shape :math:`(P, H, s)`.
+        Samples after the last one of a problem repeat others.
         """
-        enumerated = self._enumerated[problems]
-        if self._numbers is None:
-            return self._present(problems, self._listed(problems, start, stop))
-        numbers = self._numbers[start:stop]
-        if self.share is not None:
-            ranks = draw_likely(numbers, self._upper[problems])
-        else:
-            ranks = draw_subsets(numbers, self.counts[problems])
-        if bool(enumerated.any()):
-            ranks = torch.where(enumerated[:, None, None], self._listed(problems, start, stop), ranks)
+        kind = self._kinds[problems]
+        listed = torch.arange(start, stop, device=problems.device) % self._lengths[kind, None]
+        ranks = self._table[self._firsts[kind, None] + listed]
+        if self._numbers is not None:
+            numbers = self._numbers[start:stop]
+            if self.share is None:
+                drawn = draw_subsets(numbers, self.counts[problems])
+            else:
+                drawn = draw_likely(numbers, self._upper[problems])
+            ranks = torch.where(self._enumerated[problems, None, None], ranks, drawn)
         return self._present(problems, ranks)
 
-    def _listed(self, problems: Tensor, start: int, stop: int) -> Tensor:
-        """Ranks of the samples of problems that are enumerated, (P, H, s); anything for the others."""
-        kind = self._kinds[problems]
-        number = torch.arange(start, stop, device=problems.device) % self._lengths[kind, None]
-        return self._table[self._firsts[kind, None] + number]
-
     def needed(self, problems: Tensor, inliers: Tensor, confidence: float) -> Tensor:
-        r"""Number of samples of which at least one has no outlier, see :func:`samples_needed`.
-
-        Args:
-            problems: indices of the problems, int64, shape :math:`(P,)`.
-            inliers: inliers of the best pose so far, bool, shape :math:`(P, N)`.
-            confidence: in (0, 1).
-
-        Returns:
-            float64 of shape :math:`(P,)`.
-        """
+        """:func:`samples_needed` of some problems (P,) with the inliers (P, N) of their best poses so far."""
         plain = samples_needed(inliers.sum(-1), self.counts[problems], self.size, confidence)
         if self.share is None:
             return plain
@@ -252,17 +207,17 @@ class Samples:
         return torch.where(self._enumerated[problems], plain, likely)
 
     def spread(self, problems: Tensor, count: int) -> Tensor:
-        r"""Positions of ``count`` pairs spread evenly over the pairs that have a weight, shape :math:`(P, count)`.
+        """Positions of ``count`` pairs spread evenly over the pairs that have a weight, (P, count).
 
-        Pairs that :class:`~kornia_pnpnet.frame.Normalize` has ordered are then spread over the image. Where pairs
-        are unequally likely, likely ones come more often.
+        :class:`~kornia_pnpnet.frame.Normalize` orders pairs by their pixels: these are spread over the image. Where
+        pairs are unequally likely, likely ones come more often.
         """
         middle = 2 * torch.arange(count, device=problems.device) + 1
-        if self.share is not None:
-            at = (middle / (2 * count)).to(self._upper).expand(len(problems), -1).contiguous()
-            ranks = torch.searchsorted(self._upper[problems], at, right=True)
-            return self._present(problems, ranks.clamp(max=self._upper.shape[1] - 1))
-        return self._present(problems, middle * self.counts[problems, None] // (2 * count))
+        if self.share is None:
+            return self._present(problems, middle * self.counts[problems, None] // (2 * count))
+        at = (middle / (2 * count)).to(self._upper).expand(len(problems), -1).contiguous()
+        ranks = torch.searchsorted(self._upper[problems], at, right=True)
+        return self._present(problems, ranks.clamp(max=self._upper.shape[1] - 1))
 
     def _present(self, problems: Tensor, ranks: Tensor) -> Tensor:
         """Positions of pairs from their ranks (P, ...) among the pairs that have a weight."""
@@ -283,21 +238,12 @@ def _subsets(count: int, size: int, seed: int) -> Tensor:
 
 
 def samples_needed(inliers: Tensor, counts: Tensor, size: int, confidence: float) -> Tensor:
-    r"""Number of samples of which at least one has no outlier with the confidence :math:`p`.
+    r"""Number of samples of which at least one has no outlier with the confidence :math:`p`, float64 (B,).
 
-    The number is :math:`\log(1-p) / \log(1-w)`, where :math:`w = \binom{k}{s} / \binom{c}{s}` is the share of samples
-    without an outlier.
+    It is :math:`\log(1-p) / \log(1-w)` with the share :math:`w = \binom{k}{s} / \binom{c}{s}` of samples of :math:`s`
+    pairs without an outlier, of :math:`k` inliers (B,), whole or not, of :math:`c` pairs (B,).
 
     Source: M. Fischler and R. Bolles, "Random sample consensus", Communications of the ACM 24(6), 1981, section II.B.
-
-    Args:
-        inliers: number of inliers :math:`k` of the best pose so far, shape :math:`(B,)`, whole or not.
-        counts: number of pairs :math:`c`, shape :math:`(B,)`.
-        size: number of pairs :math:`s` in a sample.
-        confidence: :math:`p`, in (0, 1).
-
-    Returns:
-        float64 of shape :math:`(B,)`, infinite where every sample has an outlier.
 
     Example:
         >>> samples_needed(torch.tensor([9, 6, 2]), torch.tensor([9, 9, 9]), 3, 0.999)

@@ -63,13 +63,7 @@ class Scene(NamedTuple):
 
     @classmethod
     def of(cls, problem: Problem, thresholds: Thresholds, dtype: torch.dtype) -> Scene:
-        """Bring problems to this form, in a dtype that suffices to compare poses.
-
-        Args:
-            problem: the problems.
-            thresholds: thresholds in pixels of shape :math:`(B, 1)` or :math:`(B, N)`, in the world :math:`(B, 1)`.
-            dtype: dtype of the scene.
-        """
+        """Bring problems to this form, in a dtype that suffices to compare poses."""
         points = torch.cat((problem.world_points, torch.ones_like(problem.weights)[..., None]), -1)
         tau, wider = thresholds.img, None
         if tau.shape[1] > 1:
@@ -99,15 +93,10 @@ class Scene(NamedTuple):
         )
 
     def pack(self, rotation: Tensor, translation: Tensor) -> Tensor:
-        r"""Bring :math:`H` poses of each problem to the form that :meth:`errors` reads.
+        """Poses by components, (3, 3, P, H) and (3, P, H), in the form that :meth:`errors` reads, (P, 4, 3, H).
 
-        Args:
-            rotation: rotations by components, shape :math:`(3, 3, P, H)`.
-            translation: translations by components, shape :math:`(3, P, H)`.
-
-        Returns:
-            Transposed 3x4 matrices with the depth multiplied by ``depth_scale``. The poses are in the last dimension,
-            where the arithmetic is fastest, shape :math:`(P, 4, 3, H)`.
+        These are transposed 3x4 matrices with the depth multiplied by ``depth_scale``. The poses are in the last
+        dimension, where the arithmetic is fastest.
         """
         out = self.points.new_empty(translation.shape[1], 4, 3, translation.shape[2])
         out[:, :3] = rotation.permute(2, 1, 0, 3)
@@ -133,16 +122,10 @@ class Scene(NamedTuple):
         return losses + prior.disagreement(Pose(matrices[..., :3], matrices[..., 3]))
 
     def errors(self, packed: Tensor) -> Tensor:
-        r"""The standardised squared residual of every pair at every pose.
+        """The standardised squared residual of every pair at every pose of :meth:`pack`, (P, N, H), at most MAX_ERROR.
 
         Every operation passes once over memory, in place. There is no mask: comparing and selecting would take longer
         than all the arithmetic.
-
-        Args:
-            packed: poses of :meth:`pack`, shape :math:`(P, 4, 3, H)`.
-
-        Returns:
-            At most :data:`~kornia_pnpnet.judge.inliers.MAX_ERROR`, shape :math:`(P, N, H)`.
 
         Example:
             >>> points = torch.tensor([[[0.0, 0.0, 4.0], [1.0, 0.0, 4.0]]])

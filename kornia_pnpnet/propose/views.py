@@ -28,7 +28,7 @@ VIEWS = (
 
 
 def from_views(init: Callable[[Problem], Starts], problem: Problem, count: int, order: bool) -> Starts:
-    """Start from the poses that an initialiser proposes for a problem and for its mirror images.
+    """The starts of an initialiser for a problem, with its poses for mirror images of the problem.
 
     The axes of image and world are exchanged or reversed, both in the same way: the distribution of random problems
     does not change.
@@ -36,14 +36,9 @@ def from_views(init: Callable[[Problem], Starts], problem: Problem, count: int, 
     Args:
         init: the initialiser.
         problem: :math:`B` problems.
-        count: number of views of each problem, 1 to 8; the first view is the problem itself.
+        count: number of views of each problem, 2 to 8; the first view is the problem itself.
         order: whether the initialiser needs the pairs in the order of their pixels.
-
-    Returns:
-        The starts of the first view, with the poses from the other views.
     """
-    if count == 1:
-        return init(problem)
     batch = problem.weights.shape[0]
     starts = init(_views(problem, count, order))
     _, *others = [x for pose in starts.poses for x in _undone(pose, count)]
@@ -91,7 +86,6 @@ def _exchanged(x: Tensor, y: Tensor, swap: bool, reverse_x: bool, reverse_y: boo
 
 def _axes_back(entries: Tensor, axis: int, view: tuple[bool, bool, bool]) -> Tensor:
     """Undo a mirrored view along one axis of three coordinates."""
-    swap, reverse_x, reverse_y = view
     x, y, z = entries.unbind(axis)
-    x, y = -x if reverse_x else x, -y if reverse_y else y
-    return torch.stack((y, x, z) if swap else (x, y, z), axis)
+    x, y = _exchanged(x, y, False, *view[1:])
+    return torch.stack((y, x, z) if view[0] else (x, y, z), axis)
