@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import torch
-from kornia_pnpnet.geometry import transform
 
 from kornia_pnpnet.core.trees import iter_tensors
 from kornia_pnpnet.data import Scene, SyntheticProblems, View
@@ -42,6 +41,11 @@ def assert_counts(counts, shares=None):
 
 def draw(n=9, batch=COUNT, **options):
     return SyntheticProblems(n=n, batch_size=batch, seed=7, dtype=torch.float64, **options).batch(0)
+
+
+def transform(pose, points):
+    """Points in the camera's frame, (B, N, 3)."""
+    return points @ pose.rotation.mT + pose.translation[:, None]
 
 
 def reprojection(problems):

@@ -5,9 +5,8 @@ import math
 
 import pytest
 import torch
-from data_helpers import COUNT, assert_normal, assert_uniform, draw, reprojection, same
+from data_helpers import COUNT, assert_normal, assert_uniform, draw, reprojection, same, transform
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
-from kornia_pnpnet.geometry import transform
 
 from kornia_pnpnet.core.trees import iter_tensors
 from kornia_pnpnet.data import FacadePoints, ObjectPoints, OutlierMix, SyntheticProblems
