@@ -8,7 +8,8 @@ import resource
 import sys
 import threading
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,6 @@ import torch
 from lightning_fabric import Fabric
 from torch import nn
 
-from kornia_pnpnet.core.schema import Count
 from kornia_pnpnet.losses import LossTerms, PoseLoss, SetLoss
 from kornia_pnpnet.result import Problems
 from kornia_pnpnet.solver import PnPNet
@@ -28,42 +28,23 @@ from kornia_pnpnet.training.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
+from kornia_pnpnet.training.results import FitReport, validate
 from kornia_pnpnet.training.settings import TrainSettings
-from kornia_pnpnet.training.validation import CURVES, validate
 
-__all__ = ["FitReport", "Run", "describe_shares"]
+__all__ = ["Run", "describe_shares"]
 
 _log = logging.getLogger(__name__)
 
 # Parts of an update. The rest is between updates: rows of the learning curves, validations, checkpoints.
 _STAGES = ("data", "forward", "backward", "optimizer", "rest")
-# Options of a solver beside its parts.
-_OPTIONS = ("gradient", "effort", "focal", "focal_sigma", "radial")
-
-
-@dataclass(frozen=True)
-class FitReport:
-    """Report of one call of :func:`fit`.
-
-    Attributes:
-        start: updates done by earlier calls.
-        update: updates done in all.
-        skipped: steps skipped in all, because the loss or the gradient was not finite.
-        interrupted: whether a signal ended the call early. The checkpoint is saved.
-        seconds: wall-clock time of this call.
-        updates_per_second: updates per second of this call.
-        time_shares: shares of ``seconds`` spent waiting for data, on forward, backward, optimizer, and the rest.
-        peak_memory_mib: largest resident memory of this process, or largest allocation on the GPU that is used.
-    """
-
-    start: Count
-    update: Count
-    skipped: Count
-    interrupted: bool
-    seconds: float
-    updates_per_second: float
-    time_shares: dict[str, float]
-    peak_memory_mib: float
+# Columns of the learning curves, after ``val/<set>/``, and the field that each column shows.
+_CURVES = {
+    "success": "success.rate",
+    "rotation_error_deg": "median_rotation_error_deg",
+    "translation_error": "median_translation_error",
+    "init_rotation_error_deg": "first_stage_median_rotation_error_deg",
+    "init_translation_error": "first_stage_median_translation_error",
+}
 
 
 class Run:
@@ -85,9 +66,8 @@ class Run:
         resume: bool,
     ) -> None:
         self.model, self.loss, self.settings, self.fabric = model, loss, settings, fabric
-        solver = {**model.config(), **{name: getattr(model, name) for name in _OPTIONS}}
         # Tuples become lists, as in a checkpoint.
-        self.identity = json.loads(json.dumps({"settings": asdict(settings), "model": solver, **identity}))
+        self.identity = json.loads(json.dumps({"settings": asdict(settings), "model": model.config(), **identity}))
         self.checkpoint = folder / CHECKPOINT_NAME
         self.update, self.skipped, self.interrupted = 0, 0, False
         self.rates = ""  # success rates of the last validation, for the progress bar
@@ -115,7 +95,7 @@ class Run:
         self.validation = {name: problems.map(lambda x: x.to(fabric.device)) for name, problems in validation.items()}
         columns = ["update", *LossTerms._fields, "ramp", "lr", "grad_norm", "skipped", "updates_per_second"]
         columns += [*(f"{stage}_share" for stage in _STAGES), "peak_memory_mib"]
-        columns += [f"val/{name}/{column}" for name in validation for column in CURVES]
+        columns += [f"val/{name}/{column}" for name in validation for column in _CURVES]
         self.history = History(folder, columns, self.start) if fabric.is_global_zero else None
         model.train()
         self.clock = StageClock(*_STAGES)
@@ -199,7 +179,7 @@ class Run:
             results = validate(self.model, self.validation)
             self.model.train()
             for name, result in results.items():
-                row |= result.curves(name)
+                row |= {f"val/{name}/{column}": attrgetter(field)(result) for column, field in _CURVES.items()}
             self.rates = ", ".join(f"{name} {100 * result.success.rate:.1f} %" for name, result in results.items())
             work = f"{speed:.1f} updates/s ({describe_shares(shares)}); {row['peak_memory_mib']:.0f} MiB"
             _log.info("update %s: success %s; %s", self.update, self.rates, work)
