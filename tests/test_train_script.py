@@ -14,10 +14,13 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
 from kornia_pnpnet import PnPNet
-from kornia_pnpnet.training.collect import collect_weights
 from kornia_pnpnet.training.results import load_run
 
 REPO = Path(__file__).resolve().parents[1]
+sys.path.append(str(REPO / "docs" / "results"))
+
+from measure import collect_weights  # noqa: E402
+
 DATA = sorted(path.stem for path in (REPO / "conf" / "data").glob("*.yaml"))
 
 

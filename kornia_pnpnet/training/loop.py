@@ -30,8 +30,7 @@ from kornia_pnpnet.result import Problems
 from kornia_pnpnet.solver import PnPNet
 from kornia_pnpnet.training.checkpoint import CHECKPOINT_NAME, HISTORY_NAME, stop_on_signal
 from kornia_pnpnet.training.results import FitReport
-from kornia_pnpnet.training.run import Run
-from kornia_pnpnet.training.settings import TrainSettings
+from kornia_pnpnet.training.run import Run, TrainSettings
 
 __all__ = ["fit", "train_briefly"]
 
