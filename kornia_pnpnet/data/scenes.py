@@ -129,7 +129,7 @@ class SceneProblems(RandomProblems):
         ValueError: if no image has enough points.
     """
 
-    scene: Scene = field(kw_only=False)
+    scene: Scene = field(kw_only=False, repr=False)
     outliers: OutlierMix | None = None
     num_spares: int = 1
     recentre: bool = True
