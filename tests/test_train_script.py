@@ -226,8 +226,8 @@ def swept(experiment):
     return {x.key_or_group: list(x.sweep_string_iterator()) for x in overrides}
 
 
-# An experiment alone, and with the first and the last value of each override that its sweeper runs over.
-CASES = [(name, ()) for name in EXPERIMENTS] + [("set", ("data=rigs", "model.n=12"))]
+# An experiment alone, or with the first and the last value of each override that its sweeper runs over.
+CASES = [(name, ()) for name in EXPERIMENTS if not swept(name)] + [("set", ("data=rigs", "model.n=12"))]
 CASES += [
     (name, (f"{key}={value}",))
     for name in EXPERIMENTS

@@ -299,7 +299,7 @@ def measure_honesty(counts: Counts, _: set[str]) -> None:
     diagrams = {}
     for name, entry in sets.items():
         problems = entry.problems
-        _, guess = solver.with_starts(problems.world_points, problems.img_points, problems.intrinsics)
+        guess = solver.with_starts(problems.world_points, problems.img_points, problems.intrinsics)[1]
         found = reliability(guess.weights, problems.inliers)
         lists = {key: x.nan_to_num(0.0).tolist() for key, x in found._asdict().items()}
         diagrams[name] = {**lists, "error": found.expected_error}
