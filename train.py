@@ -21,8 +21,7 @@ from kornia_pnpnet.core.schema import to_json
 from kornia_pnpnet.solver import PnPNet
 from kornia_pnpnet.training import TrainingError, describe_shares, fit
 from kornia_pnpnet.training.card import write_model_card
-from kornia_pnpnet.training.collect import summarize_runs
-from kornia_pnpnet.training.results import RESULTS_NAME, find_results, load_run, run_results
+from kornia_pnpnet.training.results import RESULTS_NAME, find_results, load_run, run_results, summarize_runs
 
 log = logging.getLogger("train")
 

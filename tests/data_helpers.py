@@ -43,6 +43,11 @@ def draw(n=9, batch=COUNT, **options):
     return SyntheticProblems(n=n, batch_size=batch, seed=7, dtype=torch.float64, **options).batch(0)
 
 
+def transform(pose, points):
+    """Points in the camera's frame, (B, N, 3)."""
+    return points @ pose.rotation.mT + pose.translation[:, None]
+
+
 def reprojection(problems):
     """Projections under the true pose less the pixels, (B, N, 2)."""
     pose = problems.pose

@@ -4,9 +4,8 @@ from functools import partial
 
 import pytest
 import torch
-from data_helpers import assert_counts, reprojection, same
+from data_helpers import assert_counts, reprojection, same, transform
 from kornia.core.exceptions import BaseError
-from kornia_pnpnet.geometry import transform
 
 from kornia_pnpnet.data import BoxPoints, MixedPoints, MixedProblems, OutlierMix, SyntheticProblems, VaryingSize
 

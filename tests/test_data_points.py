@@ -4,8 +4,7 @@ import math
 
 import pytest
 import torch
-from data_helpers import COUNT, assert_normal, assert_uniform, draw, reprojection
-from kornia_pnpnet.geometry import transform
+from data_helpers import COUNT, assert_normal, assert_uniform, draw, reprojection, transform
 
 from kornia_pnpnet.data import (
     BoxPoints,

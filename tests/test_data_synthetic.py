@@ -2,15 +2,22 @@
 
 import itertools
 import math
+from functools import partial
 
 import pytest
 import torch
-from data_helpers import COUNT, assert_normal, assert_uniform, draw, reprojection, same
+from data_helpers import COUNT, assert_normal, assert_uniform, draw, make_scene, reprojection, same, transform
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
-from kornia_pnpnet.geometry import transform
 
 from kornia_pnpnet.core.trees import iter_tensors
-from kornia_pnpnet.data import FacadePoints, ObjectPoints, OutlierMix, SyntheticProblems
+from kornia_pnpnet.data import (
+    CameraProblems,
+    FacadePoints,
+    ObjectPoints,
+    OutlierMix,
+    SceneProblems,
+    SyntheticProblems,
+)
 
 # --- poses ------------------------------------------------------------------------------------------------------------
 
@@ -154,22 +161,28 @@ def test_an_image_without_a_size_holds_the_points():
 # --- streams ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_batch_depends_on_seed_and_index_alone():
-    def source(seed):
-        return SyntheticProblems(n=6, batch_size=5, seed=seed, outliers=OutlierMix())
-
+@pytest.mark.parametrize(
+    "source",
+    [
+        partial(SyntheticProblems, outliers=OutlierMix()),
+        partial(CameraProblems, cameras=2),
+        partial(SceneProblems, make_scene(20, 30), outliers=OutlierMix()),
+    ],
+)
+def test_a_batch_depends_on_seed_and_index_alone(source):
+    make = partial(source, n=6, batch_size=5)
     torch.manual_seed(1)
     expected = torch.rand(3)
     torch.manual_seed(1)
-    first = source(3).batch(11)
+    first = make(seed=3).batch(11)
     assert torch.equal(torch.rand(3), expected), "drawing leaves the global generator alone"
-    assert same(source(3).batch(11), first)
+    assert same(make(seed=3).batch(11), first)
     # PyTorch's CPU generator uses 32 bits of its own seed.
-    distinct = [source(seed).batch(index) for seed in (0, 1, 2**32, 2**40) for index in (0, 1, 2)]
+    distinct = [make(seed=seed).batch(index) for seed in (0, 1, 2**32, 2**40) for index in (0, 1, 2)]
     for one, two in itertools.combinations(distinct, 2):
         assert not torch.equal(one.world_points, two.world_points)
-    for index, batch in enumerate(itertools.islice(source(3), 4)):
-        assert same(batch, source(3).batch(index))
+    for index, batch in enumerate(itertools.islice(make(seed=3), 4)):
+        assert same(batch, make(seed=3).batch(index))
 
 
 def test_a_batch_with_every_option_is_reproducible_and_finite():

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from itertools import product
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import pandas as pd
 import torch
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 from operations import complexity_results
@@ -15,6 +17,7 @@ from torch import nn
 from kornia_pnpnet import PnPNet, RobustWeightedLM, pose_covariance
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.core.files import write_json
+from kornia_pnpnet.core.schema import to_json
 from kornia_pnpnet.evaluation import EvaluationData, evaluate
 from kornia_pnpnet.evaluation.named_solvers import load_solver
 from kornia_pnpnet.evaluation.problem_sets import evaluation_sets
@@ -22,8 +25,9 @@ from kornia_pnpnet.evaluation.results import format_table, load_results, save_re
 from kornia_pnpnet.metrics import reliability, success_rate
 from kornia_pnpnet.pretrained import WEIGHTS_FOLDER, shipped_weights
 from kornia_pnpnet.result import PnPResult, Problems
-from kornia_pnpnet.training.collect import collect_weights
-from kornia_pnpnet.training.results import load_run
+from kornia_pnpnet.training.card import write_model_card
+from kornia_pnpnet.training.checkpoint import HISTORY_NAME
+from kornia_pnpnet.training.results import RESULTS_NAME, load_run
 
 __all__ = ["ANY", "CHI_SQUARE_95", "HERE", "OURS", "PAPER", "PEERS", "RESULTS", "ROBUST", "compare", "measure", "ship"]
 
@@ -69,6 +73,7 @@ BOUNDS = ("known-inliers", "known-inliers-and-noise")
 VIEWS = (1, 2, 3, 4, 8)
 DEPTHS = (0, 1, 2, 3, 5, 7, 10, 15, 20, 30)  # iterations of the classical refinement
 SIGMAS = (0.25, 0.5, 1.0, 2.0)  # pixels; standard deviations that tuning tries for the scenes
+_MOST_ROWS = 100  # rows of the learning curves of a run that are shipped
 CHI_SQUARE_95 = 12.592  # 95 % quantile of the chi-square distribution with 6 degrees of freedom
 SCALES = (("cauchy", 10.0), ("geman_mcclure", 20.0))  # kernels and their scales in pixels
 
@@ -294,7 +299,7 @@ def measure_honesty(counts: Counts, _: set[str]) -> None:
     diagrams = {}
     for name, entry in sets.items():
         problems = entry.problems
-        _, guess = solver.with_starts(problems.world_points, problems.img_points, problems.intrinsics)
+        guess = solver.with_starts(problems.world_points, problems.img_points, problems.intrinsics)[1]
         found = reliability(guess.weights, problems.inliers)
         lists = {key: x.nan_to_num(0.0).tolist() for key, x in found._asdict().items()}
         diagrams[name] = {**lists, "error": found.expected_error}
@@ -375,3 +380,30 @@ def ship(runs: Sequence[Path]) -> None:
     kind = "set" if results.initializer == "SetInit" else f"n{results.config['model']['n']}"
     kind += "-paper" if results.config["name"].endswith("-paper") else ""
     collect_weights(runs, WEIGHTS_FOLDER / f"pnpnet-{kind}")
+
+
+def collect_weights(runs: Sequence[Path], folder: Path) -> None:
+    """Gather weights, results, model card and learning curves of successive runs of ``train.py`` in one folder.
+
+    Each run but the first began with the weights of the run before. Of each run's learning curves at most 100 rows are
+    kept, all with a validation. The name of the folder becomes the name of the weights. After an error nothing is
+    written.
+    """
+    curves = [_validated_rows(run / HISTORY_NAME) for run in runs]
+    for before, rows in pairwise(curves):  # updates count from the first run on
+        rows["update"] += before["update"].iloc[-1]
+    results = load_run(runs[-1] / RESULTS_NAME)
+    PnPNet.from_pretrained(runs[-1] / "weights")  # raises when they are damaged
+    shutil.copytree(runs[-1] / "weights", folder, dirs_exist_ok=True)
+    write_json(folder / RESULTS_NAME, to_json(results))
+    write_model_card(folder, results, name=folder.name)
+    pd.concat(curves).to_csv(folder / HISTORY_NAME, index=False)
+
+
+def _validated_rows(path: Path) -> pd.DataFrame:
+    """Evenly spaced rows with a validation, the last one included."""
+    rows = pd.read_csv(path)
+    rows = rows.dropna(subset=[name for name in rows if name.startswith("val/")], how="all")
+    if rows.empty:
+        raise ValueError(f"'{path}' has no row with a validation.")
+    return rows[:: -max(1, -(-len(rows) // _MOST_ROWS))][::-1].copy()

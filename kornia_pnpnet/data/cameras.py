@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import count
 
 import torch
 from kornia.core.check import KORNIA_CHECK
@@ -15,7 +13,7 @@ from torch.nn.functional import normalize
 
 from kornia_pnpnet.core.checks import check_numbers, check_positive, check_whole
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.data.draws import batch_generator, log_uniform, normal, random_poses, uniform
+from kornia_pnpnet.data.draws import RandomProblems, batch_generator, log_uniform, normal, random_poses, uniform, unit
 from kornia_pnpnet.result import Pose, Problems
 
 __all__ = ["CameraProblems"]
@@ -25,8 +23,8 @@ _NEAREST, _FARTHEST = 2.0, 50.0
 
 
 @dataclass(kw_only=True, eq=False)
-class CameraProblems:
-    r"""Random problems of cameras with random fields of view, endless and reproducible.
+class CameraProblems(RandomProblems):
+    r"""Random problems of cameras with random fields of view.
 
     Pixels are uniform in a square image, whose middle is the principal point; depths are uniform about a distance that
     is log-uniform in 2 to 50. Outliers have a pixel that is uniform in the image. The cameras of a rig look in
@@ -34,18 +32,15 @@ class CameraProblems:
     the pairs are dealt to them in turn.
 
     Args:
-        n: number of pairs per problem.
-        batch_size: number of problems per batch.
-        seed: seed of the stream.
+        n: number of pairs per problem; for ``batch_size``, ``seed``, ``dtype`` and ``device`` see
+            :class:`~kornia_pnpnet.data.SyntheticProblems`.
         field_of_view: range of the horizontal fields of view in degrees, uniform.
         depth_spread: range of the largest relative distance of a depth from the mean depth, uniform.
         outlier_share: share of the pairs that are outliers, rounded to the nearest number of pairs.
         half_image: half the width of the image in pixels.
         img_sigma: standard deviation of the noise on each pixel coordinate.
-        cameras: number of cameras of a rig; 1: no rig.
+        cameras: number of cameras of a rig, with ``cam_from_rig`` in the batches; 1: no rig.
         baseline: distance of the cameras' centres from the origin of the rig, in mean depths.
-        dtype: dtype of the batches; numbers are drawn in float64 and cast.
-        device: device of the batches.
 
     Raises:
         BaseError: for a number out of its bounds.
@@ -57,22 +52,18 @@ class CameraProblems:
     """
 
     n: int = 12
-    batch_size: int = 1000
-    seed: int = 0
-    field_of_view: Sequence[float] = (18.0, 100.0)
-    depth_spread: Sequence[float] = (0.1, 0.5)
+    field_of_view: tuple[float, float] = (18.0, 100.0)
+    depth_spread: tuple[float, float] = (0.1, 0.5)
     outlier_share: float = 0.0
     half_image: float = 1000.0
     img_sigma: float = 1.0
     cameras: int = 1
     baseline: float = 0.1
-    dtype: torch.dtype = torch.float32
-    device: str | torch.device = "cpu"
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        check_whole(1, n=self.n, batch_size=self.batch_size, cameras=self.cameras)
-        check_whole(0, seed=self.seed)
+        super().__post_init__()
+        check_whole(1, cameras=self.cameras)
         check_positive(half_image=self.half_image)
         check_numbers(0.0, img_sigma=self.img_sigma, baseline=self.baseline)
         check_numbers(0.0, 1.0, outlier_share=self.outlier_share)
@@ -82,23 +73,16 @@ class CameraProblems:
             KORNIA_CHECK(rising, f"{name} must be two rising numbers in [0, {high:g}], got {values!r}.")
         KORNIA_CHECK(self.field_of_view[0] > 0, f"field_of_view must be positive, got {self.field_of_view!r}.")
 
-    def __iter__(self) -> Iterator[Problems]:
-        """Yield batch 0, 1, 2, … without end."""
-        return map(self.batch, count())
-
-    def batch(self, index: int) -> Problems:
-        """Draw batch ``index``, at least 0; in a rig with ``cam_from_rig``."""
+    def _draw(self, index: int) -> Problems:
         generator = batch_generator(self.seed, index, self.device)
         size, half = (self.batch_size, self.n), self.half_image
-        low, high = self.field_of_view
-        angle = uniform((self.batch_size, self.cameras), low, high, generator).deg2rad()
-        focal = half / (0.5 * angle).tan()  # (B, C)
+        angle = uniform((self.batch_size, self.cameras), *self.field_of_view, generator).deg2rad()
         distance = log_uniform((self.batch_size, 1), _NEAREST, _FARTHEST, generator)
-        spread = uniform((self.batch_size, 1), self.depth_spread[0], self.depth_spread[1], generator)
+        spread = uniform((self.batch_size, 1), *self.depth_spread, generator)
         depth = distance * (1.0 + spread * uniform(size, -1.0, 1.0, generator))
         pixels = uniform((*size, 2), -half, half, generator)
         turn = torch.arange(self.n, device=pixels.device) % self.cameras
-        focal = focal[:, turn]  # (B, N)
+        focal = (half / (0.5 * angle).tan())[:, turn]  # (B, N)
         points = torch.cat((pixels * (depth / focal)[..., None], depth[..., None]), -1)
         rig = None
         if self.cameras > 1:
@@ -107,15 +91,14 @@ class CameraProblems:
         pose = random_poses(self.batch_size, generator, translation_box=1.0, max_angle=math.pi)
         pose = pose._replace(translation=distance * pose.translation)
         world_points = (points - pose.translation[:, None]) @ pose.rotation
-        inliers = uniform(size, 0.0, 1.0, generator).argsort(1) >= round(self.outlier_share * self.n)
+        inliers = unit(size, generator).argsort(1) >= round(self.outlier_share * self.n)
         pixels = pixels + self.img_sigma * normal((*size, 2), generator)
         pixels = torch.where(inliers[..., None], pixels, uniform((*size, 2), -half, half, generator)) + half
         intrinsics = torch.eye(3, dtype=torch.float64, device=pixels.device).repeat(*size, 1, 1)
         intrinsics[..., 0, 0] = intrinsics[..., 1, 1] = focal
         intrinsics[..., :2, 2] = half
         cameras = intrinsics[:, 0] if rig is None else intrinsics
-        problems = Problems(world_points, pixels, cameras, pose, inliers, cam_from_rig=rig)
-        return problems.map(lambda x: x.to(self.dtype) if x.is_floating_point() else x)
+        return Problems(world_points, pixels, cameras, pose, inliers, cam_from_rig=rig)
 
     def _rig(self, distance: Tensor, generator: torch.Generator) -> Pose:
         """The cameras in the frame of the rig, (B, C, 3, 3) and (B, C, 3)."""

@@ -53,7 +53,7 @@ def load_colmap(folder: str | Path, *, metric: bool = True, min_points: int = 10
     """
     folder = Path(folder)
     model_folder = _find_model(folder)
-    pycolmap = _pycolmap("reading COLMAP models needs")
+    pycolmap = _pycolmap()
     try:
         model = pycolmap.Reconstruction(str(model_folder))
     except Exception as error:  # its C++ code throws many types on bad files, std::bad_alloc included
@@ -61,7 +61,6 @@ def load_colmap(folder: str | Path, *, metric: bool = True, min_points: int = 10
         raise ValueError(f"pycolmap cannot read the model in '{model_folder}': {reason}") from error
     if not model.images:
         raise ValueError(f"the COLMAP model in '{model_folder}' has no images")
-
     world_points = {point_id: point.xyz for point_id, point in model.points3D.items()}
     try:
         views = [_colmap_view(image, world_points) for image in model.images.values()]
@@ -69,11 +68,10 @@ def load_colmap(folder: str | Path, *, metric: bool = True, min_points: int = 10
         raise ValueError(f"the COLMAP model in '{model_folder}' has no point {error} that an image observes") from error
     except ValueError as error:
         raise ValueError(f"the COLMAP model in '{model_folder}' cannot be used: {error}") from error
-    # The name is that of the scene above the usual folders of a model.
-    parts = list(folder.resolve().parts)
-    while len(parts) > 2 and parts[-1] in {"0", "sparse", "dslr_calibration_undistorted"}:
-        parts.pop()
-    return _scene(folder, parts[-1], views, min_points, metric)
+    place = folder.resolve()
+    while place.name in {"0", "sparse", "dslr_calibration_undistorted"}:  # the scene is above these folders of a model
+        place = place.parent
+    return _scene(folder, place.name, views, min_points, metric)
 
 
 def load_matches(path: str | Path, *, metric: bool = True, min_points: int = 10, max_error_px: float = 10.0) -> Scene:
@@ -110,7 +108,7 @@ def undistort(camera: str, img_points: Tensor) -> tuple[Tensor, Tensor]:
         ImportError: if ``pycolmap`` is missing.
         ValueError: for an unknown model or other numbers than the model has.
     """
-    pycolmap = _pycolmap("COLMAP's cameras need")
+    pycolmap = _pycolmap()
     try:
         model, *numbers = (part for part in camera.replace(" ", ",").split(",") if part)
         width, height, *parameters = map(float, numbers)
@@ -124,11 +122,11 @@ def undistort(camera: str, img_points: Tensor) -> tuple[Tensor, Tensor]:
     return torch.tensor(matrix), torch.tensor(pixels)
 
 
-def _pycolmap(what: str) -> Any:
+def _pycolmap() -> Any:
     try:
         import pycolmap
     except ImportError as error:
-        raise ImportError(f"{what} pycolmap: pip install 'kornia_pnpnet[eval]'") from error
+        raise ImportError("COLMAP's models and cameras need pycolmap: pip install 'kornia_pnpnet[eval]'") from error
     return pycolmap
 
 
@@ -200,11 +198,11 @@ def _match_views(arrays: Mapping[str, np.ndarray], max_error_px: float) -> list[
     intrinsics, rotation, translation = read("K", count, 3, 3), read("R", count, 3, 3), read("t", count, 3)
     sizes = read("size", count, 2)
     views = []
-    for i, name in enumerate(names):
+    for i, (name, size) in enumerate(zip(names, sizes.tolist(), strict=True)):
         img_points = read(f"{i:03d}_img_points", None, 2)
         world_points = read(f"{i:03d}_world_points", len(img_points), 3)
         inliers = read(f"{i:03d}_error_px", len(img_points)) <= max_error_px
-        width, height = int(sizes[i, 0]), int(sizes[i, 1])
+        width, height = map(int, size)
         pose = rotation[i], translation[i]
         views.append(View(name, world_points, img_points, intrinsics[i], *pose, width, height, inliers))
     return views

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_whole
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.data.draws import batch_generator, uniform
+from kornia_pnpnet.data.draws import batch_generator, unit
 from kornia_pnpnet.data.points import PointPrior
 from kornia_pnpnet.data.synthetic import SyntheticProblems
 from kornia_pnpnet.result import Problems
@@ -91,17 +91,14 @@ def _checked_shares(what: str, count: int, shares: Sequence[float] | None) -> li
 
 def _with_known_alike(parts: list[Problems], name: str) -> list[Problems]:
     """Parts whose sigmas or confidences have one shape, with NaN for ``None`` unless all are ``None``."""
-    dimensions = max((value.ndim for part in parts if (value := getattr(part, name)) is not None), default=0)
-    if not dimensions:
-        return parts
-    alike = []
-    for part in parts:
-        known = getattr(part, name)
-        if known is None:
-            known = part.world_points.new_full(part.inliers.shape[:1], torch.nan)
-        known = known[:, None].expand(part.inliers.shape) if known.ndim < dimensions else known
-        alike.append(part._replace(**{name: known}))
-    return alike
+    known = [getattr(part, name) for part in parts]
+    dimensions = max((value.ndim for value in known if value is not None), default=0)
+    for i, part in enumerate(parts if dimensions else ()):
+        if known[i] is None:
+            known[i] = part.world_points.new_full((len(part.inliers),), torch.nan)
+        if known[i].ndim < dimensions:
+            known[i] = known[i][:, None].expand(part.inliers.shape)
+    return [part._replace(**{name: value}) for part, value in zip(parts, known, strict=True)]
 
 
 class MixedPoints:
@@ -130,13 +127,13 @@ class MixedPoints:
     def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
         """Draw points of shape ``(batch_size, n, 3)``."""
         # A random offset gives each prior its share on average, however small the batch.
-        offset = uniform((), 0.0, 1.0, generator).item()
+        offset = unit((), generator).item()
         total = sum(self.shares)
         bounds = [0, *(math.floor(batch_size * part / total + offset) for part in accumulate(self.shares))]
         bounds[-1] = batch_size
         sizes = [end - start for start, end in pairwise(bounds)]
         drawn = [prior(size, n, generator) for prior, size in zip(self.priors, sizes, strict=True) if size]
-        return torch.cat(drawn)[uniform((batch_size,), 0.0, 1.0, generator).argsort()]
+        return torch.cat(drawn)[unit((batch_size,), generator).argsort()]
 
 
 class VaryingSize:
@@ -169,8 +166,7 @@ class VaryingSize:
         KORNIA_CHECK(len(n) > 0, "VaryingSize needs at least one number of pairs.")
         for count in n:
             check_whole(1, n=count, batch_size=batch_size)
-        self.batch_size = batch_size
-        self.seed = seed
+        self.batch_size, self.seed = batch_size, seed
         sizes = {count: max(1, batch_size * min(n) // count) for count in n}
         self.sources = [source(n=count, batch_size=sizes[count], seed=seed + i) for i, count in enumerate(n)]
 

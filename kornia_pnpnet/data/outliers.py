@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from kornia_pnpnet.core.checks import check_numbers, check_ranges, check_whole
-from kornia_pnpnet.data.draws import log_uniform, normal, random_poses, uniform
+from kornia_pnpnet.data.draws import log_uniform, normal, random_poses, uniform, unit
 
 __all__ = ["OutlierDraw", "OutlierMix", "crowd_leaders", "near_offsets", "structured_points"]
 
@@ -107,9 +107,8 @@ class OutlierMix:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        shares = "max_ratio", "mismatch_share", "near_share", "structured_share", "mirrored_share"
-        for name in (*shares, "crowd_share", "point_crowd_share"):
-            check_numbers(0.0, 1.0, **{name: getattr(self, name)})
+        shares = {name: value for name, value in vars(self).items() if name.endswith("_share")}
+        check_numbers(0.0, 1.0, max_ratio=self.max_ratio, **shares)
         check_numbers(0.0, structured_angle=self.structured_angle)
         check_ranges(structured_ratio=self.structured_ratio)
         if self.near_pixels is not None:
@@ -127,9 +126,7 @@ class OutlierMix:
 
     def least_count(self, n: int) -> int:
         """The smallest number of outliers among ``n`` pairs."""
-        if self.count is not None:
-            return self.count
-        return min(self.min_count, self.max_count(n))
+        return min(self.min_count, self.max_count(n)) if self.count is None else self.count
 
     def draw(self, batch_size: int, n: int, generator: torch.Generator) -> OutlierDraw:
         """Draw the outliers of ``batch_size`` problems of ``n`` pairs, on the generator's device.
@@ -181,7 +178,7 @@ def near_offsets(
     if pixels is None:
         return direction * (log_uniform(each, *_NEAR, generator) * img_sigma)
     low, high = ((factor * img_sigma).clamp(min=x) for factor, x in zip(_LEAST_NEAR, pixels, strict=True))
-    return direction * (low * (high / low) ** uniform(each, 0.0, 1.0, generator))
+    return direction * (low * (high / low) ** unit(each, generator))
 
 
 def structured_points(cam_points: Tensor, mix: OutlierMix, generator: torch.Generator) -> Tensor:
@@ -195,14 +192,14 @@ def structured_points(cam_points: Tensor, mix: OutlierMix, generator: torch.Gene
     shift = 0.5 * size * normal((batch_size, 1, 3), generator)
     if mix.mirrored_share:  # at a plane of random direction
         axis = normalize(normal((batch_size, 3, 1), generator), dim=1)
-        mirrored = uniform((batch_size, 1, 1), 0.0, 1.0, generator) < mix.mirrored_share
+        mirrored = unit((batch_size, 1, 1), generator) < mix.mirrored_share
         turn = torch.where(mirrored, turn - 2.0 * (turn @ axis) @ axis.mT, turn)
     return (cam_points - centre) @ turn.mT + centre + shift
 
 
 def crowd_leaders(batch_size: int, n: int, max_crowds: int, generator: torch.Generator) -> Tensor:
     """Draw for each pair the pair whose pixel or point its crowd shares, (B, N); a problem has few such pairs."""
-    leader = (n * uniform((batch_size, max_crowds), 0.0, 1.0, generator)).long().clamp(max=n - 1)  # (B, max_crowds)
-    crowds = 1 + (max_crowds * uniform((batch_size, 1), 0.0, 1.0, generator)).long()  # (B, 1)
-    crowd = (crowds * uniform((batch_size, n), 0.0, 1.0, generator)).long().clamp(max=max_crowds - 1)
+    leader = (n * unit((batch_size, max_crowds), generator)).long().clamp(max=n - 1)  # (B, max_crowds)
+    crowds = 1 + (max_crowds * unit((batch_size, 1), generator)).long()  # (B, 1)
+    crowd = (crowds * unit((batch_size, n), generator)).long().clamp(max=max_crowds - 1)
     return leader.gather(1, crowd)

@@ -15,7 +15,7 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_numbers, check_positive, check_ranges
-from kornia_pnpnet.data.draws import log_uniform, normal, random_poses, uniform
+from kornia_pnpnet.data.draws import log_uniform, normal, random_poses, uniform, unit
 
 __all__ = ["BoxPoints", "DrivePoints", "FacadePoints", "ObjectPoints", "PointPrior", "RoomPoints", "SlabPoints"]
 
@@ -69,9 +69,7 @@ class BoxPoints:
     def __init__(self, *, half_width: float = 10.0, z_near: float = 10.0, depth: float = 80.0) -> None:
         check_numbers(0.0, half_width=half_width, depth=depth)
         check_positive(z_near=z_near)
-        self.half_width = half_width
-        self.z_near = z_near
-        self.depth = depth
+        self.half_width, self.z_near, self.depth = half_width, z_near, depth
 
     def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
         """Draw points of shape ``(batch_size, n, 3)``."""
@@ -100,9 +98,7 @@ class SlabPoints:
         check_numbers(0.0, field_of_view=field_of_view)
         fits = window[1] <= field_of_view
         KORNIA_CHECK(fits, f"The window {window} must fit into the field of view, got {field_of_view}.")
-        self.window = window
-        self.field_of_view = field_of_view
-        self.distance = distance
+        self.window, self.field_of_view, self.distance = window, field_of_view, distance
 
     def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
         """Draw points of shape ``(batch_size, n, 3)``."""
@@ -112,7 +108,7 @@ class SlabPoints:
         rise = _TILT * normal((batch_size, 1, 2), generator) * (direction - centre)  # (B, n, 2)
         surface = (1.0 + (rise[..., 0] + rise[..., 1])).clamp(min=_LEAST_SURFACE)
         thickness = log_uniform((batch_size, 1), *_THICKNESS, generator)
-        layer = 1.0 + thickness * uniform((batch_size, n), 0.0, 1.0, generator)
+        layer = 1.0 + thickness * unit((batch_size, n), generator)
         z = log_uniform((batch_size, 1), *self.distance, generator) * surface * layer  # (B, n)
         return torch.cat((direction * z[..., None], z[..., None]), -1)
 
@@ -140,18 +136,16 @@ class ObjectPoints:
         check_ranges(distance=distance)
         check_numbers(0.0, field_of_view=field_of_view)
         check_numbers(0.0, 1.0, planar=planar)
-        self.distance = distance
-        self.field_of_view = field_of_view
-        self.planar = planar
+        self.distance, self.field_of_view, self.planar = distance, field_of_view, planar
 
     def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
         """Draw points of shape ``(batch_size, n, 3)``."""
         box = uniform((batch_size, n, 3), -1.0, 1.0, generator)
         ball = 0.5 * normal((batch_size, n, 3), generator)
-        is_box = uniform((batch_size, 1, 1), 0.0, 1.0, generator) < 0.5
+        is_box = unit((batch_size, 1, 1), generator) < 0.5
         factors = log_uniform((batch_size, 1, 3), _THINNEST, 1.0, generator)
         factors[..., 0] = 1.0
-        flat = uniform((batch_size, 1), 0.0, 1.0, generator) < self.planar
+        flat = unit((batch_size, 1), generator) < self.planar
         factors[..., 2] = torch.where(flat, 0.0, factors[..., 2])
         turn = random_poses(batch_size, generator, max_angle=math.pi).rotation
         points = (torch.where(is_box, box, ball) * factors) @ turn.mT
@@ -162,29 +156,28 @@ class ObjectPoints:
 
 
 class _View:
-    """The options of the priors of surfaces, and the rays of a random window of an image.
-
-    Args:
-        field_of_view: angle in degrees between opposite sides of the square image, uniform.
-        window: share of the image's area in which the points lie, log-uniform.
-    """
+    """Points on surfaces, seen through a random window of an image. Options: see :class:`FacadePoints`."""
 
     def __init__(self, *, field_of_view: Range = (15.0, 120.0), window: Range = (0.1, 1.0)) -> None:
         check_ranges(field_of_view=field_of_view, window=window)
         check_numbers(0.0, _WIDEST, field_of_view=field_of_view[1])
         check_numbers(0.0, 1.0, window=window[1])
-        self.field_of_view = field_of_view
-        self.window = window
+        self.field_of_view, self.window = field_of_view, window
 
-    def _rays(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
-        """Directions with a third coordinate of 1, (B, n, 3)."""
+    def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
+        """Draw points of shape ``(batch_size, n, 3)``."""
         angle = uniform((batch_size, 1, 1), *self.field_of_view, generator).deg2rad_()
         area = log_uniform((batch_size, 1, 1), *self.window, generator)
         split = uniform((batch_size, 1, 1), 0.25, 0.75, generator)  # the window's shape: wide, square or high
         size = torch.cat((area**split, area ** (1.0 - split)), -1)  # (B, 1, 2)
         centre = (1.0 - size) * uniform((batch_size, 1, 2), -1.0, 1.0, generator)
         tangents = (angle / 2).tan() * (centre + size * uniform((batch_size, n, 2), -1.0, 1.0, generator))
-        return torch.nn.functional.pad(tangents, (0, 1), value=1.0)
+        rays = torch.nn.functional.pad(tangents, (0, 1), value=1.0)
+        return rays * self._depth(rays, generator)[..., None]
+
+    def _depth(self, rays: Tensor, generator: torch.Generator) -> Tensor:
+        """The depths, (B, n), of points on rays with a third coordinate of 1, (B, n, 3)."""
+        raise NotImplementedError
 
 
 class FacadePoints(_View):
@@ -198,20 +191,19 @@ class FacadePoints(_View):
         window: share of the image's area in which the points lie, log-uniform.
     """
 
-    def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
-        """Draw points of shape ``(batch_size, n, 3)``."""
-        rays = self._rays(batch_size, n, generator)
+    def _depth(self, rays: Tensor, generator: torch.Generator) -> Tensor:
+        batch_size, n, _ = rays.shape
         slant = uniform((batch_size, 2, 1), 0.0, math.radians(_SLANT), generator)
         turn = uniform((batch_size, 2, 1), -math.pi, math.pi, generator)
         normals = torch.cat((slant.sin() * turn.cos(), slant.sin() * turn.sin(), slant.cos()), -1)  # (B, 2, 3)
         facing = (rays @ normals.mT / slant.cos().mT).clamp(min=_LEAST_FACING)  # (B, n, 2)
-        two = uniform((batch_size, 1), 0.0, 1.0, generator) < _CORNER
-        outward = uniform((batch_size, 1), 0.0, 1.0, generator) < 0.5
+        two = unit((batch_size, 1), generator) < _CORNER
+        outward = unit((batch_size, 1), generator) < 0.5
         corner = torch.where(outward, facing.amin(-1), facing.amax(-1))
         z = log_uniform((batch_size, 1), *_FACADE_DISTANCE, generator) / torch.where(two, corner, facing[..., 0])
-        step = (uniform((batch_size, n), 0.0, 1.0, generator) < 0.5) + 0.1 * normal((batch_size, n), generator)
+        step = (unit((batch_size, n), generator) < 0.5) + 0.1 * normal((batch_size, n), generator)
         relief = log_uniform((batch_size, 1), *_RELIEF, generator)
-        return rays * (z * (1.0 + relief * step).clamp(min=_LEAST_SURFACE))[..., None]
+        return z * (1.0 + relief * step).clamp(min=_LEAST_SURFACE)
 
 
 class RoomPoints(_View):
@@ -221,9 +213,8 @@ class RoomPoints(_View):
     boxes that hide what is behind them. Options: see :class:`FacadePoints`.
     """
 
-    def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
-        """Draw points of shape ``(batch_size, n, 3)``."""
-        rays = self._rays(batch_size, n, generator)
+    def _depth(self, rays: Tensor, generator: torch.Generator) -> Tensor:
+        batch_size = len(rays)
         turn = random_poses(batch_size, generator, max_angle=math.pi).rotation
         ground = log_uniform((batch_size, 1, 2), *_ROOM_SIDE, generator)
         size = torch.cat((ground, uniform((batch_size, 1, 1), *_ROOM_HEIGHT, generator)), -1)  # (B, 1, 3)
@@ -233,12 +224,12 @@ class RoomPoints(_View):
         # Furniture stands on the floor and not where the camera is.
         shape = batch_size, _FURNITURE, 3
         extent = size * uniform(shape, 0.08, 0.4, generator)
-        start = low + (size - extent) * uniform(shape, 0.0, 1.0, generator)
+        start = low + (size - extent) * unit(shape, generator)
         start[..., 2] = low[..., 2]
         near, far = _hits(in_room[:, :, None], start[:, None], (start + extent)[:, None])  # (B, n, furniture) each
         for hit in torch.where(near < far, near, math.inf).unbind(-1):
             z = torch.where((hit > _NEAREST * z) & (hit < z), hit, z)
-        return rays * z[..., None]
+        return z
 
 
 class DrivePoints(_View):
@@ -248,9 +239,8 @@ class DrivePoints(_View):
     :class:`FacadePoints`.
     """
 
-    def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
-        """Draw points of shape ``(batch_size, n, 3)``."""
-        rays = self._rays(batch_size, n, generator)
+    def _depth(self, rays: Tensor, generator: torch.Generator) -> Tensor:
+        batch_size, n, _ = rays.shape
         angles = math.radians(_YAW) * normal((batch_size, 3), generator)
         turn = axis_angle_to_rotation_matrix(angles * angles.new_tensor((1 / 3, 1.0, 1 / 3)))  # pitch, yaw, roll
         left, right = log_uniform((2, batch_size, 1), *_STREET_SIDE, generator)
@@ -258,8 +248,8 @@ class DrivePoints(_View):
         end = log_uniform((batch_size, 1), *_STREET_END, generator)
         low = torch.stack((-left, torch.full_like(left, -_NOWHERE), -end), -1)  # (B, 1, 3), y points down
         z = _hits(rays @ turn.mT, low, torch.stack((right, height, end), -1))[1]
-        is_nearer = uniform((batch_size, n), 0.0, 1.0, generator) < _NEARER
-        return rays * torch.where(is_nearer, z * uniform((batch_size, n), 0.3, 1.0, generator), z)[..., None]
+        is_nearer = unit((batch_size, n), generator) < _NEARER
+        return torch.where(is_nearer, z * uniform((batch_size, n), 0.3, 1.0, generator), z)
 
 
 def _hits(rays: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:

@@ -6,16 +6,14 @@ Convention: ``x_cam = R x_world + t``. Pixels and camera matrices are COLMAP's: 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-from itertools import count
+from dataclasses import dataclass, field
 
 import torch
 from kornia.core.check import KORNIA_CHECK
 from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_whole
-from kornia_pnpnet.data.draws import batch_generator, random_poses, uniform
+from kornia_pnpnet.data.draws import RandomProblems, batch_generator, random_poses, unit
 from kornia_pnpnet.data.outliers import OutlierMix
 from kornia_pnpnet.result import Pose, Problems
 
@@ -56,12 +54,12 @@ class View:
         m = len(self.world_points)
         expected = {"world_points": (m, 3), "img_points": (m, 2), "inliers": (m,)}
         expected |= {"intrinsics": (3, 3), "rotation": (3, 3), "translation": (3,)}
-        for field, shape in expected.items():
-            value: Tensor = getattr(self, field)
+        for name, shape in expected.items():
+            value: Tensor = getattr(self, name)
             if value.shape != shape:
-                raise ValueError(f"image '{self.name}': {field} has shape {tuple(value.shape)}, expected {shape}")
+                raise ValueError(f"image '{self.name}': {name} has shape {tuple(value.shape)}, expected {shape}")
             if not value.isfinite().all():
-                raise ValueError(f"image '{self.name}': {field} has values that are not finite")
+                raise ValueError(f"image '{self.name}': {name} has values that are not finite")
         deviation = (self.rotation @ self.rotation.mT - torch.eye(3, dtype=self.rotation.dtype)).abs().max()
         if deviation > 1e-3 or self.rotation.det() < 0:
             raise ValueError(f"image '{self.name}': rotation is not a rotation matrix")
@@ -102,12 +100,14 @@ class Scene:
         return torch.cat([view.cam_points[:, 2] for view in self.views]).median().item()
 
 
-class SceneProblems:
-    r"""Random problems of a scene, endless and reproducible: batch ``i`` depends on ``seed`` and ``i`` alone.
+@dataclass(kw_only=True, eq=False)
+class SceneProblems(RandomProblems):
+    r"""Random problems of a scene, endless and reproducible.
 
     Each problem is a random image with ``n`` random points that it observes and their pixels. Some pairs become
     outliers: a *mismatch* gets the pixel of a spare point of the same image, a *sensing* outlier a uniform pixel of the
-    image. ``outliers=OutlierMix(count=2)`` is the protocol's real data with outliers: 10 points are drawn, and 2 of the
+    image. A pair is an inlier when it is an inlier of the scene and did not become an outlier.
+    ``outliers=OutlierMix(count=2)`` is the protocol's real data with outliers: 10 points are drawn, and 2 of the
     first 9 get the pixel of the 10th point or a uniform pixel. Points and poses do not depend on ``outliers``, so that
     different numbers of outliers are compared on the same problems.
 
@@ -116,15 +116,12 @@ class SceneProblems:
 
     Args:
         scene: the scene. Only its images with at least ``n + num_spares`` points are used.
-        n: number of pairs per problem.
-        batch_size: number of problems per batch.
-        seed: seed of the stream, at least 0.
+        n: number of pairs per problem; for ``batch_size``, ``seed`` and ``dtype`` see :class:`SyntheticProblems`.
         outliers: number of outliers, and the share of mismatches among them; no outliers when ``None``. Raw matches
             have mismatches of their own.
         num_spares: number of spare points per problem. Its mismatches get the pixels of the spare points in turn: with
             the protocol's one spare point all mismatches of a problem share a pixel.
         recentre: whether to move the world.
-        dtype: dtype of the batches; numbers are drawn in float64 and cast.
         device: device of the batches; numbers are drawn on the CPU and moved.
 
     Raises:
@@ -132,46 +129,29 @@ class SceneProblems:
         ValueError: if no image has enough points.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        *,
-        n: int = 9,
-        batch_size: int = 1000,
-        seed: int = 0,
-        outliers: OutlierMix | None = None,
-        num_spares: int = 1,
-        recentre: bool = True,
-        dtype: torch.dtype = torch.float64,
-        device: str | torch.device = "cpu",
-    ) -> None:
-        check_whole(1, n=n, batch_size=batch_size, num_spares=num_spares)
-        check_whole(0, seed=seed)
-        mix = outliers or OutlierMix(count=0)
+    scene: Scene = field(kw_only=False, repr=False)
+    outliers: OutlierMix | None = None
+    num_spares: int = 1
+    recentre: bool = True
+    dtype: torch.dtype = torch.float64
+
+    def __post_init__(self) -> None:
+        """Check the arguments, and put the pairs of all views one after the other, so that a batch is one gather."""
+        super().__post_init__()
+        check_whole(1, num_spares=self.num_spares)
         for name in ("near_share", "structured_share", "crowd_share"):
-            share = getattr(mix, name)
+            share = getattr(self.outliers, name, 0.0)
             KORNIA_CHECK(share == 0, f"SceneProblems has no near or structured outliers and no crowds: {name}={share}.")
-        need = n + num_spares
-        views = tuple(view for view in scene.views if len(view.world_points) >= need)
+        need = self.n + self.num_spares
+        self.views = views = tuple(view for view in self.scene.views if len(view.world_points) >= need)
         if not views:
             raise ValueError(
-                f"no image of '{scene.name}' has the {need} points for n = {n} and num_spares = {num_spares}"
+                f"no image of '{self.scene.name}' has the {need} points for n = {self.n} and "
+                f"num_spares = {self.num_spares}"
             )
-        self.scene = scene
-        self.views = views
-        self.n = n
-        self.batch_size = batch_size
-        self.seed = seed
-        self.outliers = mix
-        self.num_spares = num_spares
-        self.recentre = recentre
-        self.dtype = dtype
-        self.device = torch.device(device)
-
-        # The pairs of all views one after the other, so that a batch is one gather.
         self._counts = torch.tensor([len(view.world_points) for view in views])
         self._starts = self._counts.cumsum(0) - self._counts
-        self._points = torch.cat([view.cam_points if recentre else view.world_points for view in views])
+        self._points = torch.cat([view.cam_points if self.recentre else view.world_points for view in views])
         self._img_points = torch.cat([view.img_points for view in views])
         self._inliers = torch.cat([view.inliers for view in views])
         self._intrinsics = torch.stack([view.intrinsics for view in views])
@@ -183,23 +163,15 @@ class SceneProblems:
         """Translation error below which a pose is a success: 0.2 in metres, else 0.5 % of the median depth."""
         return 0.2 if self.scene.metric else 0.005 * self.scene.median_depth
 
-    def __iter__(self) -> Iterator[Problems]:
-        """Yield batch 0, 1, 2, … without end."""
-        return map(self.batch, count())
-
-    def batch(self, index: int) -> Problems:
-        """Draw batch ``index``, at least 0.
-
-        A pair is an inlier when it is an inlier of the scene and did not become an outlier.
-        """
+    def _draw(self, index: int) -> Problems:
         generator = batch_generator(self.seed, index)
         # Draws that depend on the outlier options come last.
         view = torch.randint(len(self.views), (self.batch_size,), generator=generator)
         rows = _choose(self._counts[view], self.n + self.num_spares, generator) + self._starts[view, None]
         rows, spare_rows = rows[:, : self.n], rows[:, self.n :]  # (B, N), (B, num_spares)
         pose = random_poses(self.batch_size, generator)
-        anywhere = uniform((self.batch_size, self.n, 2), 0.0, 1.0, generator) * self._size[view, None]
-        draw = self.outliers.draw(self.batch_size, self.n, generator)
+        anywhere = unit((self.batch_size, self.n, 2), generator) * self._size[view, None]
+        draw = (self.outliers or OutlierMix(count=0)).draw(self.batch_size, self.n, generator)
 
         world_points = self._points[rows]  # (B, N, 3)
         if self.recentre:
@@ -209,9 +181,7 @@ class SceneProblems:
         turn = (draw.mismatch.cumsum(1) - 1) % self.num_spares  # (B, N), used at mismatches only
         shown = torch.where(draw.mismatch, spare_rows.gather(1, turn), rows)
         img_points = torch.where(draw.sensing[..., None], anywhere, self._img_points[shown])
-        inliers = self._inliers[rows] & draw.inliers
-        problems = Problems(world_points, img_points, self._intrinsics[view], pose, inliers)
-        return problems.map(lambda x: x.to(self.device, self.dtype if x.is_floating_point() else x.dtype))
+        return Problems(world_points, img_points, self._intrinsics[view], pose, self._inliers[rows] & draw.inliers)
 
 
 def _choose(counts: Tensor, k: int, generator: torch.Generator) -> Tensor:
@@ -219,7 +189,7 @@ def _choose(counts: Tensor, k: int, generator: torch.Generator) -> Tensor:
 
     Floyd's algorithm on the whole batch at once: its cost does not grow with the number of points in an image.
     """
-    draws = uniform((len(counts), k), 0.0, 1.0, generator)
+    draws = unit((len(counts), k), generator)
     chosen = torch.empty((len(counts), k), dtype=torch.int64)
     for i in range(k):
         last = counts - k + i  # the range grows by one each time, so that its last element was not chosen before
@@ -227,4 +197,4 @@ def _choose(counts: Tensor, k: int, generator: torch.Generator) -> Tensor:
         chosen_before = (chosen[:, :i] == candidate[:, None]).any(1)
         chosen[:, i] = torch.where(chosen_before, last, candidate)
     # The set is uniform, its order is not: shuffle each row.
-    return chosen.gather(1, uniform((len(counts), k), 0.0, 1.0, generator).argsort(1))
+    return chosen.gather(1, unit((len(counts), k), generator).argsort(1))

@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import count
+from typing import Any
 
 import torch
 from kornia.core.check import KORNIA_CHECK
 from torch import Tensor
 from torch.nn.functional import normalize, pad
 
-from kornia_pnpnet.core.checks import check_numbers, check_positive, check_whole
-from kornia_pnpnet.data.draws import batch_generator, random_poses, uniform
-from kornia_pnpnet.data.noise import checked_sigma, draw_confidence, draw_noise, hide_sigmas
+from kornia_pnpnet.core.checks import check_numbers, check_positive
+from kornia_pnpnet.data.draws import (
+    Amount,
+    RandomProblems,
+    batch_generator,
+    check_amount,
+    draw_confidence,
+    draw_noise,
+    hide_sigmas,
+    random_poses,
+    uniform,
+    unit,
+)
 from kornia_pnpnet.data.outliers import OutlierMix, crowd_leaders, near_offsets, structured_points
 from kornia_pnpnet.data.points import BoxPoints, PointPrior
 from kornia_pnpnet.result import Problems
@@ -37,7 +46,7 @@ _MOST_BLUR = 2.0
 
 
 @dataclass(kw_only=True, eq=False)
-class SyntheticProblems:
+class SyntheticProblems(RandomProblems):
     r"""Random problems of the protocol, endless and reproducible: batch ``i`` depends on ``seed`` and ``i`` alone.
 
     Points are drawn in the camera's frame, and the inverse of a random pose moves them to the world. World coordinates
@@ -72,7 +81,7 @@ class SyntheticProblems:
             all problems or of none.
         known_noise: share of the problems that come with both sigmas. A third of the other problems come with one of
             them; unknown sigmas are NaN.
-        confidence_share: share of the problems that come with confidences, see ``data.noise.draw_confidence``.
+        confidence_share: share of the problems that come with confidences, see ``data.draws.draw_confidence``.
         bunched_share: share of the problems whose inliers are bunched in a part of the image; the points and pixels of
             outliers, except *near* and *structured* ones, come from the rest of the scene.
         dtype: dtype of the batches; numbers are drawn in float64 and cast.
@@ -87,9 +96,6 @@ class SyntheticProblems:
         (torch.Size([2, 9, 3]), tensor([6, 6]))
     """
 
-    n: int = 9
-    batch_size: int = 1000
-    seed: int = 0
     points: PointPrior | None = None
     outliers: OutlierMix | None = None
     translation_box: float = 25.0
@@ -97,44 +103,36 @@ class SyntheticProblems:
     max_angle: float = math.pi / 2
     focal: float = 3400.0
     half_image: float | None = 3400.0
-    img_sigma: float | Sequence[float] = 1.0
-    world_sigma: float | Sequence[float] = 0.05
-    degrees: float | Sequence[float] = 0.0
-    sigma_spread: float | Sequence[float] = 0.0
+    img_sigma: Amount = 1.0
+    world_sigma: Amount = 0.05
+    degrees: Amount = 0.0
+    sigma_spread: Amount = 0.0
     axis_ratio: float = 1.0
     known_noise: float = 0.0
     confidence_share: float = 0.0
     bunched_share: float = 0.0
-    dtype: torch.dtype = torch.float32
-    device: str | torch.device = "cpu"
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        check_whole(1, n=self.n, batch_size=self.batch_size)
-        check_whole(0, seed=self.seed)
+        super().__post_init__()
         check_numbers(0.0, translation_box=self.translation_box, max_angle=self.max_angle)
         check_positive(focal=self.focal)
-        for name in ("known_noise", "confidence_share", "bunched_share"):
-            check_numbers(0.0, 1.0, **{name: getattr(self, name)})
+        shares = {name: getattr(self, name) for name in ("known_noise", "confidence_share", "bunched_share")}
+        check_numbers(0.0, 1.0, **shares)
         for name in ("half_image", "translation_sigma"):
             if getattr(self, name) is not None:
                 check_numbers(0.0, **{name: getattr(self, name)})
-        self._img_sigma = checked_sigma("img_sigma", self.img_sigma)
-        self._world_sigma = checked_sigma("world_sigma", self.world_sigma)
-        self._degrees = checked_sigma("degrees", self.degrees, _LEAST_DEGREES)
-        self._spread = checked_sigma("sigma_spread", self.sigma_spread, 0.0, _MOST_SPREAD)
+        self.img_sigma = check_amount("img_sigma", self.img_sigma)
+        self.world_sigma = check_amount("world_sigma", self.world_sigma)
+        self.degrees = check_amount("degrees", self.degrees, _LEAST_DEGREES)
+        self.sigma_spread = check_amount("sigma_spread", self.sigma_spread, 0.0, _MOST_SPREAD)
         check_numbers(1.0, _MOST_RATIO, axis_ratio=self.axis_ratio)
         KORNIA_CHECK(
             self.axis_ratio == 1.0 or self.known_noise in (0.0, 1.0),
             f"Covariances are known for all problems or for none, got known_noise={self.known_noise}.",
         )
 
-    def __iter__(self) -> Iterator[Problems]:
-        """Yield batch 0, 1, 2, … without end."""
-        return map(self.batch, count())
-
-    def batch(self, index: int) -> Problems:
-        """Draw batch ``index``, at least 0."""
+    def _draw(self, index: int) -> Problems:
         generator = batch_generator(self.seed, index, self.device)
         size, mix = self.batch_size, self.outliers or OutlierMix(count=0)
         box, sigma = self.translation_box, self.translation_sigma
@@ -148,9 +146,8 @@ class SyntheticProblems:
         cam_points, other_points = scene.chunk(2, 1)
 
         world_points = (cam_points - pose.translation[:, None]) @ pose.rotation
-        noise, world_sigma, world_cov = draw_noise(
-            world_points.shape, self._world_sigma, generator, spread=self._spread, axis_ratio=self.axis_ratio
-        )
+        noise_options: dict[str, Any] = {"spread": self.sigma_spread, "axis_ratio": self.axis_ratio}
+        noise, world_sigma, world_cov = draw_noise(world_points.shape, self.world_sigma, generator, **noise_options)
         world_points += noise
         shown = torch.where((draw.mismatch | draw.crowd)[..., None], other_points, cam_points)
         if mix.structured_share:
@@ -161,18 +158,12 @@ class SyntheticProblems:
         shown = torch.where(behind[..., None], torch.ones_like(shown), shown)
         img_points = self.focal * shown[..., :2] / shown[..., 2:]
         img_points = torch.where((draw.sensing | behind)[..., None], anywhere, img_points)
-        noise, img_sigma, img_cov = draw_noise(
-            img_points.shape,
-            self._img_sigma,
-            generator,
-            spread=self._spread,
-            degrees=self._degrees,
-            axis_ratio=self.axis_ratio,
-        )
+        noise_options["degrees"] = self.degrees
+        noise, img_sigma, img_cov = draw_noise(img_points.shape, self.img_sigma, generator, **noise_options)
         img_points += noise
         length = noise.norm(dim=-1)
         inliers = draw.inliers & ~behind
-        if self._degrees:
+        if self.degrees:
             inliers &= length <= _MOST_NOISE * img_sigma
         if mix.near_share:
             offsets = near_offsets(img_sigma, self.n, generator, mix.near_pixels)
@@ -183,23 +174,19 @@ class SyntheticProblems:
             img_points = torch.where((draw.crowd & ~draw.of_points)[..., None], pixels, img_points)
             world_points = torch.where((draw.crowd & draw.of_points)[..., None], points, world_points)
 
-        problems = Problems(world_points, img_points, self._intrinsics(generator), pose, inliers)
+        intrinsics = torch.tensor((self.focal, self.focal, 1.0), dtype=torch.float64, device=generator.device).diag()
+        problems = Problems(world_points, img_points, intrinsics.expand(size, 3, 3), pose, inliers)
         if self.known_noise and img_cov is not None:
             problems = problems._replace(img_cov=img_cov, world_cov=world_cov)
         elif self.known_noise:
             sigmas = hide_sigmas(img_sigma, world_sigma, self.known_noise, generator)
-            of_img, of_world = sigmas if self._spread else (x[:, 0] for x in sigmas)
+            of_img, of_world = sigmas if self.sigma_spread else (x[:, 0] for x in sigmas)
             problems = problems._replace(img_sigma=of_img, world_sigma=of_world)
         if self.confidence_share:
             errors = length / img_sigma.mean(1, keepdim=True).clamp(min=_TINY)
             confidence = draw_confidence(inliers, errors, self.confidence_share, generator)
             problems = problems._replace(confidence=confidence)
-        return problems.map(lambda x: x.to(self.dtype) if x.is_floating_point() else x)
-
-    def _intrinsics(self, generator: torch.Generator) -> Tensor:
-        """Camera matrices, (B, 3, 3)."""
-        diagonal = torch.tensor((self.focal, self.focal, 1.0), dtype=torch.float64, device=generator.device)
-        return diagonal.diag().expand(self.batch_size, 3, 3)
+        return problems
 
     def _anywhere(self, scene: Tensor, generator: torch.Generator) -> Tensor:
         """Pixels that are uniform in the image, (B, N, 2)."""
@@ -228,12 +215,12 @@ def _bunched(scene: Tensor, displaced: Tensor, share: float, generator: torch.Ge
     each = shape[0], 1
     direction = normalize(scene, dim=-1)
     distance = (direction - direction[:, :1]).square().sum(-1).sqrt()
-    blur = uniform(each, 0.0, _MOST_BLUR, generator) * uniform(shape, 0.0, 1.0, generator)
+    blur = uniform(each, 0.0, _MOST_BLUR, generator) * unit(shape, generator)
     score = distance / distance.mean(1, keepdim=True).clamp(min=torch.finfo(distance.dtype).tiny) + blur
-    chosen = uniform(each, 0.0, 1.0, generator) < share
-    score = torch.where(chosen, score, uniform(shape, 0.0, 1.0, generator))
+    chosen = unit(each, generator) < share
+    score = torch.where(chosen, score, unit(shape, generator))
     last = pad(displaced, (0, shape[1] - displaced.shape[1]), value=True)
     # Kept pairs first, in random order: the number of a pair says nothing about its place in the image.
-    places = (last + uniform(shape, 0.0, 1.0, generator)).argsort(1)
+    places = (last + unit(shape, generator)).argsort(1)
     order = torch.empty_like(places).scatter_(1, places, score.argsort(1))
     return scene.gather(1, order[..., None].expand(-1, -1, 3))

@@ -2,9 +2,8 @@
 
 from kornia_pnpnet.training.checkpoint import TrainingError
 from kornia_pnpnet.training.loop import fit, train_briefly
-from kornia_pnpnet.training.run import FitReport, describe_shares
-from kornia_pnpnet.training.settings import TrainSettings
-from kornia_pnpnet.training.validation import ValidationResult, validate
+from kornia_pnpnet.training.results import FitReport, ValidationResult, validate
+from kornia_pnpnet.training.run import TrainSettings, describe_shares
 
 __all__ = [
     "FitReport",

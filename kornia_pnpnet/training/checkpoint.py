@@ -23,7 +23,6 @@ __all__ = [
     "StageClock",
     "TrainingError",
     "load_checkpoint",
-    "save_checkpoint",
     "stop_on_signal",
 ]
 
@@ -41,8 +40,8 @@ def stop_on_signal() -> Iterator[threading.Event]:
     Signals can only be caught in the main thread; elsewhere the event is never set.
     """
     event = threading.Event()
-    in_main = threading.current_thread() is threading.main_thread()
-    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT) if in_main}
+    numbers = (signal.SIGTERM, signal.SIGINT) if threading.current_thread() is threading.main_thread() else ()
+    before = {number: signal.getsignal(number) for number in numbers}
 
     def restore() -> None:
         for number, handler in before.items():
@@ -109,12 +108,6 @@ class History:
         for key, value in row.items():
             if key != "update":
                 self.board.add_scalar(key, value, int(row["update"]))
-
-
-def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
-    """Write a checkpoint in one piece."""
-    with atomic_open(path, "wb") as file:
-        torch.save(state, file)
 
 
 def load_checkpoint(path: Path, identity: dict[str, Any]) -> dict[str, Any]:

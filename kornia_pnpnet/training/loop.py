@@ -7,9 +7,10 @@ are not finite, and a run that can be stopped at any moment and continued to the
 from __future__ import annotations
 
 import shutil
-import time
+import timeit
 from collections.abc import Mapping
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +29,8 @@ from kornia_pnpnet.refine.lm import RobustWeightedLM
 from kornia_pnpnet.result import Problems
 from kornia_pnpnet.solver import PnPNet
 from kornia_pnpnet.training.checkpoint import CHECKPOINT_NAME, HISTORY_NAME, stop_on_signal
-from kornia_pnpnet.training.run import FitReport, Run
-from kornia_pnpnet.training.settings import TrainSettings
+from kornia_pnpnet.training.results import FitReport
+from kornia_pnpnet.training.run import Run, TrainSettings
 
 __all__ = ["fit", "train_briefly"]
 
@@ -132,16 +133,13 @@ def train_briefly(seconds: float, folder: str | Path, *, progress: bool = True) 
     }
     loss = PoseLoss(saturation=0.02)
 
-    def seconds_per_update(ramp: float) -> float:
-        began = time.perf_counter()
-        for index in range(10):
-            problems = data.batch(index)
-            result = model(*problems[:3], first_stage_only=ramp == 0.0)
-            loss(result, problems, ramp).total.backward()
-        return (time.perf_counter() - began) / 10
+    def try_update(ramp: float) -> None:
+        problems = data.batch(0)
+        loss(model(*problems[:3], first_stage_only=ramp == 0.0), problems, ramp).total.backward()
 
     alone = TrainSettings(0).ramp[0]  # share of the run that trains the network without the refinement
-    expected = alone * seconds_per_update(0.0) + (1.0 - alone) * seconds_per_update(1.0)
+    fast, slow = (timeit.timeit(partial(try_update, ramp), number=10) / 10 for ramp in (0.0, 1.0))
+    expected = alone * fast + (1.0 - alone) * slow
     updates = max(100, round(seconds / expected) // 100 * 100)
     rows = updates // 20
     settings = TrainSettings(updates, warmup=100, log_every=rows, validate_every=rows, checkpoint_every=updates)

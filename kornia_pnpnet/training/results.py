@@ -1,30 +1,85 @@
-"""The results file of a training run: success, learned hyperparameters, speed, and how to repeat the run."""
+"""What a training run finds: its report, its validation, its results file, and the summary of a sweep."""
 
 # ruff: noqa: UP013  (one line for each small mapping)
 from __future__ import annotations
 
-import time
+import csv
+import timeit
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, NamedTuple, NotRequired, cast
 
 import torch
+from torch import nn
 from typing_extensions import TypedDict
 
 from kornia_pnpnet.core.environment import environment
+from kornia_pnpnet.core.files import atomic_open
 from kornia_pnpnet.core.schema import STRICT, Count, Kept, read_json
+from kornia_pnpnet.metrics import SuccessRate, pose_errors, success, success_rate
 from kornia_pnpnet.pretrained import find_weights
 from kornia_pnpnet.result import Problems
 from kornia_pnpnet.solver import PnPNet
-from kornia_pnpnet.training.run import FitReport
-from kornia_pnpnet.training.validation import ValidationResult, validate
 
-__all__ = ["RESULTS_NAME", "Learned", "RunResults", "find_results", "load_run", "run_results"]
+__all__ = [
+    "RESULTS_NAME",
+    "FitReport",
+    "Learned",
+    "RunResults",
+    "ValidationResult",
+    "find_results",
+    "load_run",
+    "run_results",
+    "summarize_runs",
+    "validate",
+]
 
 RESULTS_NAME = "results.json"
 # Problems of a timed call, and timed calls. The shortest call counts, since other work on the machine only adds time.
 _TIMED_PROBLEMS, _TIMED_CALLS = 1000, 20
+
+
+@dataclass(frozen=True)
+class FitReport:
+    """Report of one call of :func:`fit`.
+
+    Attributes:
+        start: updates done by earlier calls.
+        update: updates done in all.
+        skipped: steps skipped in all, because the loss or the gradient was not finite.
+        interrupted: whether a signal ended the call early. The checkpoint is saved.
+        seconds: wall-clock time of this call.
+        updates_per_second: updates per second of this call.
+        time_shares: shares of ``seconds`` spent waiting for data, on forward, backward, optimizer, and the rest.
+        peak_memory_mib: largest resident memory of this process, or largest allocation on the GPU that is used.
+    """
+
+    start: Count
+    update: Count
+    skipped: Count
+    interrupted: bool
+    seconds: float
+    updates_per_second: float
+    time_shares: dict[str, float]
+    peak_memory_mib: float
+
+
+@dataclass(frozen=True)
+class ValidationResult:
+    """Success (rotation error below 1°, translation error below 0.2) and errors on one validation set.
+
+    ``first_stage`` stands for the initial poses, the other fields for the refined poses. Translations are in the unit
+    of the world.
+    """
+
+    success: SuccessRate
+    first_stage_success: SuccessRate
+    median_rotation_error_deg: float
+    median_translation_error: float
+    first_stage_median_rotation_error_deg: float
+    first_stage_median_translation_error: float
 
 
 class Learned(NamedTuple):
@@ -106,6 +161,23 @@ class RunResults:
 
 
 @torch.no_grad()
+def validate(model: nn.Module, validation: Mapping[str, Problems]) -> dict[str, ValidationResult]:
+    """Solve fixed problems, given by the name of their set, and summarise the errors on each set.
+
+    Raises:
+        ValueError: when a set has no problems.
+    """
+    results = {}
+    for name, problems in validation.items():
+        result = model(problems.world_points, problems.img_points, problems.intrinsics, **problems.known)
+        refined, first = (pose_errors(pose, problems.pose) for pose in (result.pose, result.init))
+        rates = success_rate(success(refined)), success_rate(success(first))
+        medians = (part.median().item() for part in (*refined, *first))
+        results[name] = ValidationResult(*rates, *medians)
+    return results
+
+
+@torch.no_grad()
 def run_results(
     model: PnPNet,
     validation: Mapping[str, Problems],
@@ -121,11 +193,14 @@ def run_results(
     """
     if not validation:
         raise ValueError("The results of a run need at least one validation set, got none.")
+    part = [*validation.values()][-1].map(lambda x: x[:_TIMED_PROBLEMS])
+    inputs = part.world_points, part.img_points, part.intrinsics
+    seconds = timeit.repeat(lambda: model(*inputs, **part.known), number=1, repeat=_TIMED_CALLS)
     learned = model.refine.hyperparameters(torch.zeros((), dtype=torch.float64))
     return RunResults(
         overrides=overrides,
         run=report,
-        us_per_problem=_us_per_problem(model, [*validation.values()][-1]),
+        us_per_problem=1e6 * min(seconds) / len(part.world_points),
         validation=validate(model, validation),
         learned=Learned(*(values.tolist() for values in learned)),
         model=cast(ModelConfig, model.config()),
@@ -133,16 +208,6 @@ def run_results(
         environment=cast(RunEnvironment, environment()),
         origin=origin,
     )
-
-
-def _us_per_problem(model: PnPNet, problems: Problems) -> float:
-    part = problems.map(lambda x: x[:_TIMED_PROBLEMS])
-    seconds = []
-    for _ in range(_TIMED_CALLS):
-        began = time.perf_counter()
-        model(part.world_points, part.img_points, part.intrinsics, **part.known)
-        seconds.append(time.perf_counter() - began)
-    return 1e6 * min(seconds) / len(part.world_points)
 
 
 def load_run(path: str | Path) -> RunResults:
@@ -171,3 +236,41 @@ def find_results(weights: str | Path) -> RunResults | None:
     folders = [folder, folder.parent] if folder.name == "weights" else [folder]
     paths = (place / RESULTS_NAME for place in folders)
     return next((load_run(path) for path in paths if path.is_file()), None)
+
+
+def summarize_runs(folder: str | Path) -> Path | None:
+    """Write ``summary.csv``: one row for each run of a sweep, with its overrides, speed and success.
+
+    The runs are in sub-folders of the sweep. A results file that cannot be read is left out with a warning.
+
+    Returns:
+        Path of the summary, or ``None`` when no run has results.
+
+    Raises:
+        OSError: when the summary cannot be written.
+    """
+    folder = Path(folder)
+    rows = []
+    for path in sorted(folder.glob(f"**/{RESULTS_NAME}")):
+        try:
+            results = load_run(path)
+        except ValueError as error:
+            warnings.warn(f"Left out of the summary: {error}", stacklevel=2)
+            continue
+        row: dict[str, Any] = {"run": str(path.parent.relative_to(folder))}
+        overrides = (override.lstrip("+").partition("=") for override in results.overrides)
+        row |= {key: value for key, _, value in overrides}
+        for key in ("update", "skipped", "updates_per_second", "peak_memory_mib"):
+            row[key] = getattr(results.run, key)
+        row["us_per_problem"] = f"{results.us_per_problem:.4g}"
+        for name, entry in results.validation.items():
+            row |= {f"{name}/{bound}": f"{getattr(entry.success, bound):.4f}" for bound in ("rate", "low", "high")}
+        rows.append(row)
+    if not rows:
+        return None
+    path = folder / "summary.csv"
+    with atomic_open(path, newline="") as file:  # runs of a parallel launcher may end at the same time
+        writer = csv.DictWriter(file, list(dict.fromkeys(key for row in rows for key in row)), restval="")
+        writer.writeheader()
+        writer.writerows(rows)
+    return path

@@ -1,69 +1,102 @@
-"""The state of a training run and what one update does to it."""
+"""The settings of a training run, its state, and what one update does to it."""
 
 from __future__ import annotations
 
 import json
 import logging
+import math
 import resource
 import sys
 import threading
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import torch
+from kornia.core.check import KORNIA_CHECK
 from lightning_fabric import Fabric
 from torch import nn
 
-from kornia_pnpnet.core.schema import Count
+from kornia_pnpnet.core.checks import check_numbers, check_positive, check_whole
+from kornia_pnpnet.core.files import atomic_open
 from kornia_pnpnet.losses import LossTerms, PoseLoss, SetLoss
 from kornia_pnpnet.result import Problems
 from kornia_pnpnet.solver import PnPNet
-from kornia_pnpnet.training.checkpoint import (
-    CHECKPOINT_NAME,
-    History,
-    StageClock,
-    TrainingError,
-    load_checkpoint,
-    save_checkpoint,
-)
-from kornia_pnpnet.training.settings import TrainSettings
-from kornia_pnpnet.training.validation import CURVES, validate
+from kornia_pnpnet.training.checkpoint import CHECKPOINT_NAME, History, StageClock, TrainingError, load_checkpoint
+from kornia_pnpnet.training.results import FitReport, validate
 
-__all__ = ["FitReport", "Run", "describe_shares"]
+__all__ = ["Run", "TrainSettings", "describe_shares"]
 
 _log = logging.getLogger(__name__)
 
 # Parts of an update. The rest is between updates: rows of the learning curves, validations, checkpoints.
 _STAGES = ("data", "forward", "backward", "optimizer", "rest")
-# Options of a solver beside its parts.
-_OPTIONS = ("gradient", "effort", "focal", "focal_sigma", "radial")
+# Columns of the learning curves, after ``val/<set>/``, and the field that each column shows.
+_CURVES = {
+    "success": "success.rate",
+    "rotation_error_deg": "median_rotation_error_deg",
+    "translation_error": "median_translation_error",
+    "init_rotation_error_deg": "first_stage_median_rotation_error_deg",
+    "init_translation_error": "first_stage_median_translation_error",
+}
 
 
 @dataclass(frozen=True)
-class FitReport:
-    """Report of one call of :func:`fit`.
+class TrainSettings:
+    """Numbers of a training run.
 
     Attributes:
-        start: updates done by earlier calls.
-        update: updates done in all.
-        skipped: steps skipped in all, because the loss or the gradient was not finite.
-        interrupted: whether a signal ended the call early. The checkpoint is saved.
-        seconds: wall-clock time of this call.
-        updates_per_second: updates per second of this call.
-        time_shares: shares of ``seconds`` spent waiting for data, on forward, backward, optimizer, and the rest.
-        peak_memory_mib: largest resident memory of this process, or largest allocation on the GPU that is used.
+        updates: number of updates of the whole run.
+        lr: Adam's learning rate for the network.
+        lr_refine: Adam's learning rate for the hyperparameters of the refinement.
+        warmup: number of updates over which the learning rates rise linearly.
+        final_lr: factor of the learning rates at the end of the cosine decay; 1 keeps the rates constant.
+        clip: largest norm of the gradient; infinity does not clip.
+        ramp: shares of the run at which the refined terms of the loss begin to count, and count in full.
+        max_skipped: largest number of skipped steps; one more ends the run.
+        log_every: updates between rows of the learning curves.
+        validate_every: updates between validations.
+        checkpoint_every: updates between checkpoints.
+
+    Raises:
+        BaseError: for a number that is out of range, or a ramp that falls.
     """
 
-    start: Count
-    update: Count
-    skipped: Count
-    interrupted: bool
-    seconds: float
-    updates_per_second: float
-    time_shares: dict[str, float]
-    peak_memory_mib: float
+    updates: int
+    lr: float = 3e-3
+    lr_refine: float = 1e-2
+    warmup: int = 200
+    final_lr: float = 0.02
+    clip: float = 1.0
+    ramp: tuple[float, float] = (0.8, 0.81)
+    max_skipped: int = 100
+    log_every: int = 100
+    validate_every: int = 1000
+    checkpoint_every: int = 500
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        check_whole(
+            1, log_every=self.log_every, validate_every=self.validate_every, checkpoint_every=self.checkpoint_every
+        )
+        check_whole(0, updates=self.updates, warmup=self.warmup, max_skipped=self.max_skipped)
+        check_numbers(0.0, lr=self.lr, lr_refine=self.lr_refine)
+        check_positive(clip=self.clip, or_infinite=True)
+        check_numbers(0.0, 1.0, final_lr=self.final_lr)
+        rises = len(self.ramp) == 2 and 0.0 <= self.ramp[0] <= self.ramp[1] < math.inf
+        KORNIA_CHECK(rises, f"ramp must be two shares, the second not smaller, got {self.ramp}.")
+
+    def lr_factor(self, update: int) -> float:
+        """Factor of the learning rates at an update: a linear warm-up times a cosine from 1 to ``final_lr``."""
+        cosine = 0.5 * (1.0 + math.cos(math.pi * min(1.0, update / max(1, self.updates))))
+        return min(1.0, (update + 1) / max(1, self.warmup)) * (self.final_lr + (1.0 - self.final_lr) * cosine)
+
+    def ramp_factor(self, update: int) -> float:
+        """Weight of the refined terms at an update, from 0 to 1."""
+        start, end = (share * self.updates for share in self.ramp)
+        return 0.0 if update < start else 1.0 if update >= end else (update - start) / (end - start)
 
 
 class Run:
@@ -85,9 +118,8 @@ class Run:
         resume: bool,
     ) -> None:
         self.model, self.loss, self.settings, self.fabric = model, loss, settings, fabric
-        solver = {**model.config(), **{name: getattr(model, name) for name in _OPTIONS}}
         # Tuples become lists, as in a checkpoint.
-        self.identity = json.loads(json.dumps({"settings": asdict(settings), "model": solver, **identity}))
+        self.identity = json.loads(json.dumps({"settings": asdict(settings), "model": model.config(), **identity}))
         self.checkpoint = folder / CHECKPOINT_NAME
         self.update, self.skipped, self.interrupted = 0, 0, False
         self.rates = ""  # success rates of the last validation, for the progress bar
@@ -102,10 +134,10 @@ class Run:
             model.load_state_dict(state["model"])
         self.start = self.update
 
-        parts = ((model.init, settings.lr), (model.refine, settings.lr_refine))
-        trained = [([p for p in part.parameters() if p.requires_grad], lr) for part, lr in parts if part is not None]
-        groups = [{"params": params, "lr": lr, "initial_lr": lr} for params, lr in trained if params]
-        self.parameters = [p for params, _ in trained for p in params]
+        groups = []
+        for part, lr in ((model.init, settings.lr), (model.refine, settings.lr_refine)):
+            if part is not None and (trained := [p for p in part.parameters() if p.requires_grad]):
+                groups.append({"params": trained, "lr": lr, "initial_lr": lr})
         self.optimizer = torch.optim.Adam(groups, fused=True)
         self.solver, self.fabric_optimizer = fabric.setup(model, self.optimizer)
         self.solver.mark_forward_method("with_starts")
@@ -115,7 +147,7 @@ class Run:
         self.validation = {name: problems.map(lambda x: x.to(fabric.device)) for name, problems in validation.items()}
         columns = ["update", *LossTerms._fields, "ramp", "lr", "grad_norm", "skipped", "updates_per_second"]
         columns += [*(f"{stage}_share" for stage in _STAGES), "peak_memory_mib"]
-        columns += [f"val/{name}/{column}" for name in validation for column in CURVES]
+        columns += [f"val/{name}/{column}" for name in validation for column in _CURVES]
         self.history = History(folder, columns, self.start) if fabric.is_global_zero else None
         model.train()
         self.clock = StageClock(*_STAGES)
@@ -147,12 +179,12 @@ class Run:
         self.optimizer.zero_grad()
         self.fabric.backward(terms.total + 0.0 * unused)
         self.clock.lap("backward")
-        norm = nn.utils.clip_grad_norm_(self.parameters, self.settings.clip)
+        norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.settings.clip)
         # All processes must take the same branch, whichever process saw the bad number or the signal.
         bad, stopped = self._any(not bool(torch.isfinite(terms.total + norm)), stop.is_set())
         self.update += 1
         if bad:
-            self._skip()
+            self._count_skipped()
         else:
             self.fabric_optimizer.step()
         self.clock.lap("optimizer")
@@ -166,7 +198,7 @@ class Run:
         counts = torch.tensor(flags, dtype=torch.float32, device=self.fabric.device)
         return (torch.as_tensor(self.fabric.all_reduce(counts, reduce_op="sum")) > 0).tolist()
 
-    def _skip(self) -> None:
+    def _count_skipped(self) -> None:
         self.skipped += 1
         most = self.settings.max_skipped
         if self.fabric.is_global_zero:
@@ -199,7 +231,7 @@ class Run:
             results = validate(self.model, self.validation)
             self.model.train()
             for name, result in results.items():
-                row |= result.curves(name)
+                row |= {f"val/{name}/{column}": attrgetter(field)(result) for column, field in _CURVES.items()}
             self.rates = ", ".join(f"{name} {100 * result.success.rate:.1f} %" for name, result in results.items())
             work = f"{speed:.1f} updates/s ({describe_shares(shares)}); {row['peak_memory_mib']:.0f} MiB"
             _log.info("update %s: success %s; %s", self.update, self.rates, work)
@@ -212,7 +244,8 @@ class Run:
         if self.fabric.is_global_zero:
             content = {"update": self.update, "skipped": self.skipped, "identity": self.identity}
             content |= {"model": self.model.state_dict(), "optimizer": self.optimizer.state_dict()}
-            save_checkpoint(self.checkpoint, content)
+            with atomic_open(self.checkpoint, "wb") as file:
+                torch.save(content, file)
         self.fabric.barrier()
 
     def report(self) -> FitReport:
