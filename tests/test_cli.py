@@ -17,7 +17,7 @@ from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from kornia_pnpnet import MLPInit, PnPNet, RobustWeightedLM, create_solver, list_solvers, pretrained
 from kornia_pnpnet.cli import COMMANDS, main
 from kornia_pnpnet.cli.demo import verdict
-from kornia_pnpnet.cli.evaluate import SYNTHETIC
+from kornia_pnpnet.cli.arguments import SYNTHETIC
 from kornia_pnpnet.core import files
 from kornia_pnpnet.evaluation.named_solvers import BOUNDS, default_solvers
 from kornia_pnpnet.evaluation.problem_sets import PRIORS

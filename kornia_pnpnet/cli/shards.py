@@ -85,19 +85,18 @@ def solve_shards(
     state = sorted(solve.solver.state_dict().items())
     mark = json.dumps({"name": name, "parameters": digest(*(part for item in state for part in item))}).encode()
     waiting = {target: shard for target, shard in targets.items() if overwrite or not target.exists()}
-    for target in targets:
-        if target not in waiting and _solver_of(target) != mark:
+    for target in targets.keys() - waiting.keys():
+        if _solver_of(target) != mark:
             raise InputError(target, f"not of this {name}: choose another folder, or replace it with --overwrite")
-    solved, problems, failed = 0, 0, []
+    counts, failed = [], []
     with _bar(waiting.values(), progress) as bar:
         for target, shard in waiting.items():
             try:
-                ok, count = _solve_shard(solve, shard, target, mark, batch, bar)
+                counts.append(_solve_shard(solve, shard, target, mark, batch, bar))
             except InputError as error:
                 failed.append(str(error))
-                continue
-            solved, problems = solved + ok, problems + count
-    return ShardReport(solved, problems, len(waiting) - len(failed), len(targets) - len(waiting), failed)
+    solved, problems = (sum(numbers) for numbers in zip((0, 0), *counts, strict=True))
+    return ShardReport(solved, problems, len(counts), len(targets) - len(waiting), failed)
 
 
 def _find(sources: Sequence[str | Path], out: Path) -> list[Path]:
@@ -150,10 +149,11 @@ def _solve_shard(solve: Solve, shard: Path, target: Path, mark: bytes, batch: in
                 raise InputError(shard, str(error)) from None
 
     results = solved_tables()
-    first = next(results)
-    solved = count = 0
-    schema = first.schema.with_metadata({_SOLVER: mark})
-    with atomic_open(target, "wb") as file, parquet.ParquetWriter(file, schema) as writer:
+    first, solved, count = next(results), 0, 0
+    with (
+        atomic_open(target, "wb") as file,
+        parquet.ParquetWriter(file, first.schema.with_metadata({_SOLVER: mark})) as writer,
+    ):
         for result in chain([first], results):
             writer.write_table(result)
             solved, count = solved + (compute.sum(result["ok"]).as_py() or 0), count + len(result)

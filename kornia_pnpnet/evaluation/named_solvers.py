@@ -32,7 +32,7 @@ _COMPETITORS = (
 )
 # Thresholds of RANSAC in px and m, each the best of a grid on problems of another seed. Real scenes, whose points are
 # sharper than those of the protocol: from 3 to 60 px on five scenes with 0, 2 and 4 outliers in 9 pairs, where success
-# hardly changes between 6 and 20 px. Synthetic data, for which the other solvers' defaults suit: three to five times the
+# hardly changes between 6 and 20 px. Synthetic data, which the other solvers' defaults suit: three to five times the
 # noise, from 3 px and 0.15 m to 8 px and 0.4 m, within which success changes by one percentage point.
 _SCENE_OPTIONS = dict.fromkeys(
     ("ransac-epnp-lm", "p3p-ransac", "opencv-ransac", "opencv-usac", "poselib", "pycolmap"), "threshold=12"
