@@ -9,8 +9,7 @@ import pytest
 
 pytest.importorskip("pandas")
 
-REPO = Path(__file__).resolve().parents[1]
-FOLDER = REPO / "docs" / "results"
+FOLDER = Path(__file__).resolve().parents[1] / "docs" / "results"
 
 
 @pytest.fixture(scope="module")
@@ -20,17 +19,17 @@ def modules():
         yield {name: importlib.import_module(name) for name in ("render", "matches", "short_runs")}
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def render(modules):
     return modules["render"]
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def matches(modules):
     return modules["matches"]
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def short_runs(modules):
     return modules["short_runs"]
 
@@ -42,17 +41,8 @@ def row(rate, *, half=1.0, **columns):
 
 
 def test_the_pages_are_rendered_from_their_files(render):
-    results = {name: render.load_results(FOLDER / f"{name}.json") for name in render.RESULTS}
-    runs = {name: render.read_summary(FOLDER / f"{name}.csv") for name in render.SUMMARIES}
-    benchmark, cameras = (render.load(name, REPO / "benchmarks") for name in ("solvers", "cameras"))
-    matches = [render.load(name) for name in render.MATCHES]
-    text = render.page(results, render.load("complexity"), render.load("honesty"), runs, benchmark, matches, cameras)
-    assert text == (FOLDER / "README.md").read_text(encoding="utf-8")
-    text = render.real_matches(matches, render.load("real_matches_cost"), render.load("keypoints"))
-    assert text == (FOLDER / "real_matches.md").read_text(encoding="utf-8")
-    for page in render.OVERVIEW_PAGES:
-        text = page.read_text(encoding="utf-8")
-        assert render.with_block(text, render.overview_of(page, matches)) == text
+    for path, text in render.pages().items():
+        assert text == path.read_text(encoding="utf-8")
 
 
 def test_a_block_stands_between_its_lines(render):
