@@ -32,9 +32,9 @@ _NUMBERS_AT_ONCE = 2**25
 
 
 class ShardReport(NamedTuple):
-    """What a run over shards solved: problems with a pose, all problems, and shards.
+    """Numbers of problems with a pose, of all problems, of shards that were solved and that had results before.
 
-    ``kept`` counts the shards that had results before; ``failed`` has a line for each shard that cannot be read.
+    ``failed`` has a line for each shard that cannot be read.
     """
 
     solved: int
@@ -72,9 +72,6 @@ def solve_shards(
         batch: number of problems solved at once.
         overwrite: also solve the shards that have results.
         progress: show a progress bar on stderr, where stderr is a terminal and tqdm is installed.
-
-    Returns:
-        The :class:`ShardReport`.
 
     Raises:
         InputError: when there is no shard, two results would have the same name, ``out`` holds the shards themselves,
@@ -175,8 +172,7 @@ def _tables(shard: Path, batch: int) -> Iterator[pa.Table]:
             rows = min(batch, max(_NUMBERS_AT_ONCE // max([*numbers, 1]), 1))
             if not file.metadata.num_rows:
                 yield file.schema_arrow.empty_table()
-            for part in file.iter_batches(rows):
-                yield pa.Table.from_batches([part])
+            yield from (pa.Table.from_batches([part]) for part in file.iter_batches(rows))
     except Exception as error:  # Arrow raises half a dozen types of errors for broken files
         raise InputError(shard, f"not a Parquet file of problems: {error}") from None
 
