@@ -128,13 +128,11 @@ def test_a_pose_that_is_not_finite_is_a_failure(sets, bad):
 
 
 def test_data_and_solvers_are_described(results, solver):
-    described = results["solvers"]["lm"]
-    assert (described["class"], described["config"]) == ("PnPNet", solver.config())
-    assert results["solvers"]["fixed"] == {"class": "_Fixed", "config": None, "weights": None}
-    assert results["data"]["clean"]["description"] == {"seed": 5}
-    spoilt = results["data"]["spoilt"]
-    assert (spoilt["count"], spoilt["n"], spoilt["mean_outliers"], spoilt["dtype"]) == (60, 9, 2.0, "float32")
-    assert (spoilt["max_translation"], spoilt["unit"]) == (0.5, "")
+    described = results["solvers"]
+    assert (described["lm"]["class"], described["lm"]["config"]) == ("PnPNet", solver.config())
+    assert described["fixed"] == {"class": "_Fixed", "config": None, "weights": None}
+    spoilt = {"count": 60, "n": 9, "mean_outliers": 2.0, "dtype": "float32", "max_translation": 0.5, "unit": ""}
+    assert spoilt.items() <= results["data"]["spoilt"].items()
 
 
 def test_the_environment_is_plain_data():
