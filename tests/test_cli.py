@@ -253,17 +253,14 @@ def test_export_takes_two_suffixes_and_overwrites_nothing(capsys, tmp_path, name
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"mine.onnx": "mine", "mine.pt2": "mine"}
 
 
-def test_missing_files_and_folders(capsys, tmp_path):
-    for path in (tmp_path / "missing.csv", tmp_path):
-        assert f"{path}: " in refused(capsys, "solve", path, "--intrinsics", CAMERA)
-
-
 @pytest.mark.parametrize("camera", ["1,2,3", "1,2,3,x", "1,2,3,4,5", "0,800,320,240", "800,-1,320,240", "8,8,nan,2"])
 def test_bad_intrinsics(capsys, csv_file, camera):
     assert refused(capsys, "solve", csv_file, f"--intrinsics={camera}").startswith("pnpnet: --intrinsics: ")
 
 
 def test_wrong_n_and_wrong_solvers(capsys, csv_file, tmp_path, weights_folder):
+    for path in (tmp_path / "missing.csv", tmp_path):
+        assert f"{path}: " in refused(capsys, "solve", path, "--intrinsics", CAMERA)
     eight = tmp_path / "eight.csv"
     eight.write_text("\n".join(csv_file.read_text().splitlines()[:-1]))
     err = refused(capsys, "solve", eight, "--intrinsics", CAMERA, "--solver", weights_folder)
@@ -283,27 +280,13 @@ def test_wrong_n_and_wrong_solvers(capsys, csv_file, tmp_path, weights_folder):
 
 @pytest.mark.parametrize(
     "arguments",
-    [
-        (),
-        ("solve",),
-        ("fly",),
-        ("solve", __file__, "--threshold", "0"),
-        ("solve", __file__, "--focal=-1"),
-        ("solve", __file__, "--plot", "x.doc"),
-        ("evaluate", "--problems", "0"),
-        ("evaluate", "--seed", "-1"),
-        ("evaluate", "--n", "9,"),
-        ("evaluate", "--dtype", "float16"),
-        ("demo", "--train-seconds", "nan"),
-    ],
+    ["", "fly", "solve", f"solve {__file__} --threshold 0", f"solve {__file__} --focal=-1", "evaluate --n 9,"],
 )
 def test_wrong_usage_is_one_line(capsys, arguments):
     with pytest.raises(SystemExit) as stopped:
-        main(list(arguments))
-    _, err = capsys.readouterr()
-    assert stopped.value.code == 2
-    assert err.startswith("pnpnet: ")
-    assert err.count("\n") == 1
+        main(arguments.split())
+    err = capsys.readouterr().err
+    assert (stopped.value.code, err[:8], err.count("\n")) == (2, "pnpnet: ", 1)
 
 
 def test_help_and_version(capsys):
@@ -420,22 +403,19 @@ def test_evaluate_accepts_scenes_options_and_folders(capsys, tmp_path, weights_f
 
 
 @pytest.mark.parametrize(
-    ("arguments", "expected"),
+    ("arguments", "culprit"),
     [
-        (("--data", "nowhere"), "nowhere"),
-        (("--outliers", "none,some"), "'some'"),
-        (("--outliers", "none,"), "''"),
-        (("--outliers", "120%"), "'120%'"),
-        (("--outliers", "x%"), "'x%'"),
-        (("--n", "9,2"), "2"),
-        (("--n", "20,6", "--outliers", "7"), "n = 6"),
-        (("--solver", "known-inliers:threshold=3"), "threshold"),
-        (("--solver", "nobody"), "nobody"),
+        ("--data nowhere", "nowhere"),
+        *((f"--outliers {word}", repr(word.split(",")[-1])) for word in ("none,some", "none,", "120%", "x%")),
+        ("--n 9,2", "2"),
+        ("--n 20,6 --outliers 7", "n = 6"),
+        ("--solver known-inliers:threshold=3", "threshold"),
+        ("--solver nobody", "nobody"),
     ],
 )
-def test_evaluate_refuses_in_one_line(capsys, tmp_path, arguments, expected):
+def test_evaluate_refuses_in_one_line(capsys, tmp_path, arguments, culprit):
     out_file = tmp_path / "results.json"
-    assert expected in refused(capsys, "evaluate", "--problems", 5, "--out", out_file, *arguments)
+    assert culprit in refused(capsys, "evaluate", "--problems", 5, "--out", out_file, *arguments.split())
     assert not out_file.exists()
 
 

@@ -282,20 +282,19 @@ def test_only_bounds_get_the_truth(sets):
 
 def test_only_our_solvers_get_the_noise_level(sets):
     known = EvaluationData(draw_problems(SyntheticProblems(batch_size=40, seed=3, known_noise=1.0), count=60))
-    sigmas = []
+    given = []
 
     class Listening(PnPNet):
-        def forward(self, *args, img_sigma=None, world_sigma=None):
-            sigmas.append((img_sigma, world_sigma))
-            return super().forward(*args, img_sigma=img_sigma, world_sigma=world_sigma)
+        def forward(self, *args, **noise):
+            given.append(noise)
+            return super().forward(*args, **noise)
 
-    solvers = {"ours": Listening(None, RobustWeightedLM(1)), "other": _Fixed()}
-    evaluate(solvers, {"known": known}, chunk=60)
-    assert all(torch.equal(img_sigma, known.problems.img_sigma) for img_sigma, _ in sigmas)
-    assert all(torch.equal(world_sigma, known.problems.world_sigma) for _, world_sigma in sigmas)
-    sigmas.clear()
-    evaluate(solvers, sets)
-    assert set(sigmas) == {(None, None)}
+    for data in (known, sets["clean"]):
+        evaluate({"ours": Listening(None, RobustWeightedLM(1)), "other": _Fixed()}, {"data": data}, chunk=60)
+        assert given
+        assert all(noise.keys() == data.problems.sigmas.keys() for noise in given)
+        assert all(torch.equal(noise[name], sigma) for noise in given for name, sigma in data.problems.sigmas.items())
+        given.clear()
 
 
 def test_a_solver_for_another_n_is_left_out(tmp_path):
