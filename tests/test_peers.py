@@ -143,6 +143,8 @@ def test_bad_problems_fail_alone(name, make_problems):
     assert (result.weights[bad] == 0).all()
     assert all(part.isfinite().all() for part in iter_tensors(result))
     assert result.ok[others].all()
+    assert torch.equal(result.probability, result.ok.double())
+    assert result.alternatives.probability.shape == (12, 0)
     assert_same(map_tensors(lambda part: part[others], result), map_tensors(lambda part: part[others], good))
 
 

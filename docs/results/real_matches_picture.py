@@ -15,7 +15,7 @@ from kornia_pnpnet.evaluation.plots import WIDTH, log_scale, make_figure, save, 
 
 __all__ = ["find_rows", "plot_real_matches"]
 
-_LOOKS = {  # the same solver told more has the same colour and another marker and line
+_LOOKS = {  # a solver with more inputs keeps its colour and has another marker and line
     "+ratio": {"marker": "s", "linestyle": "--", "markerfacecolor": "white"},
     ":adaptive": {"marker": "^"},
 }

@@ -4,7 +4,7 @@ To add a command, write a module whose docstring is the command's help (the firs
 ``run(arguments)``, which returns the exit code. Register the module in :data:`COMMANDS`, and its arguments in
 :data:`kornia_pnpnet.cli.arguments.ARGUMENTS`.
 PyTorch takes seconds to import: modules of commands import what needs PyTorch inside ``run``, so that wrong arguments
-and missing files are told at once.
+and missing files are reported at once.
 """
 
 from __future__ import annotations

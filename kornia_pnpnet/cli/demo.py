@@ -84,10 +84,11 @@ def _draw_one(path: Path, name: str, solver: nn.Module, entry: EvaluationData) -
 
     outliers = (~entry.problems.inliers).sum(-1)
     index = int(outliers.argmax())
-    inputs = [x[index] for x in entry.problems[:3]]
+    world_points, img_points, intrinsics = (x[index] for x in entry.problems[:3])
     with torch.no_grad():
-        found = reproject(*inputs, solver(*(x[None] for x in inputs)).pose)
-    return plot_pose(path, inputs[1], found.pixels, found.rejected, f"{name}, {int(outliers[index])} outliers")
+        pose = solver(world_points[None], img_points[None], intrinsics[None]).pose
+    found = reproject(world_points, img_points, intrinsics, pose)
+    return plot_pose(path, img_points, found.pixels, found.rejected, f"{name}, {int(outliers[index])} outliers")
 
 
 def _train(seconds: float, folder: Path) -> Path | None:

@@ -243,15 +243,17 @@ def _run(solver: nn.Module, problems: Problems, chunk: int, repeats: int) -> tup
 
 
 def _timed(solver: nn.Module, problems: Problems) -> tuple[PnPResult, float]:
-    wait = torch.cuda.synchronize if problems.world_points.is_cuda else lambda: None
-    wait()
+    on_gpu = problems.world_points.is_cuda
+    if on_gpu:
+        torch.cuda.synchronize()
     start = time.perf_counter()
     if isinstance(solver, SeesTruth):
         result = solver.solve_with_truth(problems)
     else:
         known = problems.known if isinstance(solver, PnPNet) else {}
         result = solver(problems.world_points, problems.img_points, problems.intrinsics, **known)
-    wait()
+    if on_gpu:
+        torch.cuda.synchronize()
     return result, time.perf_counter() - start
 
 

@@ -137,7 +137,7 @@ class PeerSolver(nn.Module):
         poses = torch.eye(3, 4, dtype=torch.float64).repeat(2, len(world), 1, 1)  # final, before the last refinement
         inliers, ok = torch.zeros_like(shares), torch.zeros(len(world), dtype=torch.bool)
         for i in (status == Status.NOT_BELIEVED).nonzero()[:, 0].tolist():
-            found = self.solve_one(*(x[i, used[i]].numpy() for x in (world, img)), cameras[i].numpy())
+            found = self.solve_one(world[i, used[i]].numpy(), img[i, used[i]].numpy(), cameras[i].numpy())
             if found is not None:
                 both = np.stack([np.column_stack(x) for x in (found[:2], found.init or found[:2])])
                 if np.isfinite(both).all():
@@ -154,15 +154,15 @@ class PeerSolver(nn.Module):
         pose, init = (Pose(back(x[..., :3]), back(x[..., 3])) for x in poses)
         result = PnPResult(
             *pose,
-            back(inliers),
-            back(torch.where(ok, cost, largest**0.5)),
-            ok.to(like.device),
-            init,
-            torch.where(ok, Status.SOLVED, status).to(like.device, torch.int8),
-            Alternatives.none(pose),
-            back(ok.double()),
-            back(torch.where((status == Status.CAMERA)[:, None, None], torch.eye(3).double(), cameras)),
-            like.new_zeros(len(like), 4),
+            weights=back(inliers),
+            cost=back(torch.where(ok, cost, largest**0.5)),
+            ok=ok.to(like.device),
+            init=init,
+            status=torch.where(ok, Status.SOLVED, status).to(like.device, torch.int8),
+            probability=back(ok.double()),
+            alternatives=Alternatives.none(pose),
+            intrinsics=back(torch.where((status == Status.CAMERA)[:, None, None], torch.eye(3).double(), cameras)),
+            dist=like.new_zeros(len(like), 4),
         )
         return restore_leading(size, result)
 
