@@ -82,8 +82,8 @@ def solve_shards(
     state = sorted(solve.solver.state_dict().items())
     mark = json.dumps({"name": name, "parameters": digest(*(part for item in state for part in item))}).encode()
     waiting = {target: shard for target, shard in targets.items() if overwrite or not target.exists()}
-    for target in targets.keys() - waiting.keys():
-        if _solver_of(target) != mark:
+    for target in targets:
+        if target not in waiting and _solver_of(target) != mark:
             raise InputError(target, f"not of this {name}: choose another folder, or replace it with --overwrite")
     counts, failed = [], []
     with _bar(waiting.values(), progress) as bar:
