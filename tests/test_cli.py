@@ -12,14 +12,13 @@ from types import ModuleType
 import numpy as np
 import pytest
 import torch
-from kornia.geometry.conversions import quaternion_to_rotation_matrix
 
-from kornia_pnpnet import MLPInit, PnPNet, RobustWeightedLM, create_solver, list_solvers, pretrained
+from kornia_pnpnet import MLPInit, PnPNet, RobustWeightedLM, list_solvers, pretrained
 from kornia_pnpnet.cli import COMMANDS, main
+from kornia_pnpnet.cli.arguments import SYNTHETIC
 from kornia_pnpnet.cli.demo import verdict
-from kornia_pnpnet.cli.evaluate import SYNTHETIC
 from kornia_pnpnet.core import files
-from kornia_pnpnet.evaluation.named_solvers import BOUNDS, default_solvers
+from kornia_pnpnet.evaluation.named_solvers import BOUNDS, default_solvers, load_solver
 from kornia_pnpnet.evaluation.problem_sets import PRIORS
 from kornia_pnpnet.evaluation.results import load_results
 
@@ -93,20 +92,15 @@ def answer(capsys, *arguments) -> dict:
 def test_solve_prints_what_the_library_returns(capsys, csv_file, problem, weights_folder, solver):
     name = solver if solver == "identity-lm" else str(weights_folder)
     got = answer(capsys, csv_file, "--intrinsics", CAMERA, "--solver", name)
-    module = create_solver(name) if solver == "identity-lm" else PnPNet.from_pretrained(weights_folder)
+    module = load_solver(name)
     world, img = (torch.from_numpy(part)[None] for part in problem)
     with torch.no_grad():
         result = module(world, img, K)
-    assert got["solver"] == name
-    assert got["n"] == 9
-    assert got["ok"] == result.ok.item()
+    assert (got["solver"], got["n"], got["ok"], got["cost"]) == (name, 9, result.ok.item(), result.cost.item())
     assert got["rotation"] == result.rotation[0].tolist()
     assert got["translation"] == result.translation[0].tolist()
-    assert got["cost"] == result.cost.item()
     assert [pair["weight"] for pair in got["pairs"]] == result.weights[0].tolist()
-    torch.testing.assert_close(
-        quaternion_to_rotation_matrix(torch.tensor(got["quaternion_wxyz"], dtype=torch.float64)), result.rotation[0]
-    )
+    assert got["quaternion_wxyz"] == result.pose.quaternion[0].tolist()
     cam = world @ result.rotation.mT + result.translation[:, None]
     pixels = cam[0, :, :2] / cam[0, :, 2:] * K.diagonal()[:2] + K[:2, 2]
     for pair, point, error in zip(got["pairs"], cam[0], (pixels - img[0]).norm(dim=-1), strict=True):
@@ -154,20 +148,8 @@ def test_csv_in_any_column_order_and_npz_give_the_same(capsys, tmp_path, problem
     assert from_csv != answer(capsys, csv_file, "--intrinsics", CAMERA, "--solver", "identity-lm")
     renamed = tmp_path / "pairs.dat"
     archive.rename(renamed)
-    assert answer(capsys, renamed, "--solver", "identity-lm") == from_npz
     other_camera = answer(capsys, renamed, "--intrinsics", "900,900,320,240", "--solver", "identity-lm")
     assert other_camera["rotation"] != from_npz["rotation"]
-
-
-def test_weights_keep_their_order_and_zero_means_absent(capsys, csv_file, tmp_path):
-    lines = csv_file.read_text().splitlines()
-    weighted = tmp_path / "weighted.csv"
-    factors = [0.0 if i in (1, 6) else 1.0 for i in range(9)]
-    body = [f"{line},{factor}" for line, factor in zip(lines[1:], factors, strict=True)]
-    weighted.write_text("\n".join([f"{lines[0]},weight", *body]))
-    got = answer(capsys, weighted, "--intrinsics", CAMERA, "--solver", "identity-lm")
-    assert [pair["weight"] == 0 for pair in got["pairs"]] == [factor == 0 for factor in factors]
-    assert [pair["rejected"] for pair in got["pairs"]] == [factor == 0 for factor in factors]
 
 
 def test_no_pose_is_exit_code_one_with_the_reason(capsys, tmp_path):
@@ -202,9 +184,7 @@ HEADER = "X,Y,Z,u,v\n"
     [
         ("\n \n", ":1: expected the header X,Y,Z,u,v"),
         ("\nX,Z,v\n1,2,3\n", ":2: expected the header X,Y,Z,u,v, each once, found 'X,Z,v'"),
-        (GOOD * 3, ":1: expected the header"),
         (f"X,{HEADER}{GOOD}", ":1: expected the header"),
-        (HEADER + GOOD + "1,2,3,4\n" + GOOD, ":3: 4 values"),
         (HEADER + GOOD + "1,2,3,4,5,6\n" + GOOD, ":3: 6 values"),
         (HEADER + GOOD + GOOD + "1,2,x,4,5\n", ":4: Z must be a finite number, got 'x'"),
         (HEADER + "\n" + GOOD + "1,2,,4,5\n", ":4: Z must be a finite number, got ''"),
@@ -212,7 +192,6 @@ HEADER = "X,Y,Z,u,v\n"
         ("X,Y,Z,u,v,weight\n1,2,3,4,5,-1\n", ":2: weight must be a number of at least 0, got '-1'"),
         (HEADER + GOOD * 2, ": a pose needs at least 3 correspondences, got 2"),
         (HEADER + '1,2,3,4,"5\n' + GOOD, ":3: not a CSV file"),
-        (HEADER + GOOD + "\0\0", ":3: 1 values"),
         (HEADER.encode() + b"\xff\xfe\n", ":2: not a text file in UTF-8"),
     ],
 )
@@ -226,11 +205,9 @@ def test_bad_npz_files(capsys, tmp_path):
     path = tmp_path / "bad.npz"
     points = {"world_points": np.ones((4, 3)), "img_points": np.ones((4, 2))}
     for changed, expected in (
-        ({"world_points": None}, "world_points"),
         ({"img_points": None}, "img_points"),
         ({"img_points": np.ones((5, 2))}, "img_points must hold numbers of the shape (4, 2), got float64 of (5, 2)"),
         ({"world_points": np.ones(())}, "world_points must hold numbers"),
-        ({"world_points": np.ones((4, 3)).astype("U1")}, "world_points must hold numbers"),
         ({"world_points": np.array([{}], dtype=object)}, "not an NPZ file of numbers"),
         ({"world_points": np.ones((0, 3)), "img_points": np.ones((0, 2))}, "at least 3 correspondences, got 0"),
         ({"img_points": np.array([[0, 0], [1, 1], [0, math.nan], [2, 2]])}, "img_points[2] must be finite"),
@@ -268,25 +245,12 @@ def test_a_small_file_that_unpacks_to_gigabytes_is_refused(capsys, tmp_path, mon
     assert "more than 0.0 GB: split the file" in refused(capsys, "solve", path, "--intrinsics", CAMERA)
 
 
-@pytest.mark.parametrize("name", ["model", "model.pt", "model.so", ".onnx"])
-def test_the_suffix_says_what_is_exported(capsys, tmp_path, name):
-    err = refused(capsys, "export", tmp_path / name)
-    assert ".onnx" in err
-    assert ".pt2" in err
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("name", ["model.onnx", "model.pt2"])
-def test_export_does_not_overwrite(capsys, tmp_path, name):
-    path = tmp_path / name
-    path.write_text("mine")
-    assert "pass --overwrite" in refused(capsys, "export", path)
-    assert path.read_text() == "mine"
-
-
-def test_missing_files_and_folders(capsys, tmp_path):
-    for path in (tmp_path / "missing.csv", tmp_path):
-        assert f"{path}: " in refused(capsys, "solve", path, "--intrinsics", CAMERA)
+@pytest.mark.parametrize("name", ["model", "model.pt", "model.so", ".onnx", "mine.onnx", "mine.pt2"])
+def test_export_takes_two_suffixes_and_overwrites_nothing(capsys, tmp_path, name):
+    (tmp_path / "mine.onnx").write_text("mine")
+    (tmp_path / "mine.pt2").write_text("mine")
+    assert ("--overwrite" if "mine" in name else ".pt2") in refused(capsys, "export", tmp_path / name)
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"mine.onnx": "mine", "mine.pt2": "mine"}
 
 
 @pytest.mark.parametrize("camera", ["1,2,3", "1,2,3,x", "1,2,3,4,5", "0,800,320,240", "800,-1,320,240", "8,8,nan,2"])
@@ -295,6 +259,8 @@ def test_bad_intrinsics(capsys, csv_file, camera):
 
 
 def test_wrong_n_and_wrong_solvers(capsys, csv_file, tmp_path, weights_folder):
+    for path in (tmp_path / "missing.csv", tmp_path):
+        assert f"{path}: " in refused(capsys, "solve", path, "--intrinsics", CAMERA)
     eight = tmp_path / "eight.csv"
     eight.write_text("\n".join(csv_file.read_text().splitlines()[:-1]))
     err = refused(capsys, "solve", eight, "--intrinsics", CAMERA, "--solver", weights_folder)
@@ -306,11 +272,7 @@ def test_wrong_n_and_wrong_solvers(capsys, csv_file, tmp_path, weights_folder):
         tmp_path: str(tmp_path),
         weights_folder: "",
         "opencv-ransac:speed=9": "speed",
-        "opencv-ransac:threshold=-1": "threshold",
         "opencv-ransac:refine=no": "refine",
-        "opencv-ransac:iterations=10.5": "iterations",
-        "opencv-ransac:seed=abc": "seed",
-        "opencv-ransac:threshold=Infinity": "threshold",
         "known-inliers": "bound",
     }.items():
         assert expected in refused(capsys, "solve", csv_file, "--intrinsics", CAMERA, "--solver", name)
@@ -318,26 +280,13 @@ def test_wrong_n_and_wrong_solvers(capsys, csv_file, tmp_path, weights_folder):
 
 @pytest.mark.parametrize(
     "arguments",
-    [
-        (),
-        ("solve",),
-        ("fly",),
-        ("solve", __file__, "--threshold", "0"),
-        ("solve", __file__, "--plot", "x.doc"),
-        ("evaluate", "--problems", "0"),
-        ("evaluate", "--seed", "-1"),
-        ("evaluate", "--n", "9,"),
-        ("evaluate", "--dtype", "float16"),
-        ("demo", "--train-seconds", "nan"),
-    ],
+    ["", "fly", "solve", f"solve {__file__} --threshold 0", f"solve {__file__} --focal=-1", "evaluate --n 9,"],
 )
 def test_wrong_usage_is_one_line(capsys, arguments):
     with pytest.raises(SystemExit) as stopped:
-        main(list(arguments))
-    _, err = capsys.readouterr()
-    assert stopped.value.code == 2
-    assert err.startswith("pnpnet: ")
-    assert err.count("\n") == 1
+        main(arguments.split())
+    err = capsys.readouterr().err
+    assert (stopped.value.code, err[:8], err.count("\n")) == (2, "pnpnet: ", 1)
 
 
 def test_help_and_version(capsys):
@@ -397,17 +346,20 @@ def test_the_same_command_continues_and_another_is_refused(capsys, tmp_path):
     assert out_file.read_text() == '{"format": 1, "rows": [{"data"'
 
 
-def test_interruptions_are_one_line(capsys, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("name", "command"),
+    [
+        ("evaluation.comparison.evaluate", "evaluate --problems 5 --solver identity-lm --out x"),
+        ("list_solvers", "list"),
+    ],
+)
+def test_interruptions_are_one_line(capsys, monkeypatch, name, command):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("kornia_pnpnet.evaluation.comparison.evaluate", interrupt)
-    out_file = tmp_path / "results.json"
-    code, out, err = run(capsys, "evaluate", "--problems", 5, "--solver", "identity-lm", "--out", out_file)
+    monkeypatch.setattr(f"kornia_pnpnet.{name}", interrupt)
+    code, out, err = run(capsys, *command.split())
     assert (code, out, err.count("\n")) == (130, "", 1)
-    assert str(out_file) in err
-    monkeypatch.setattr("kornia_pnpnet.list_solvers", interrupt)
-    assert run(capsys, "list") == (130, "", "pnpnet: interrupted\n")
 
 
 def test_solvers_for_another_n_are_skipped(capsys, tmp_path, weights_folder):
@@ -425,20 +377,14 @@ def test_solvers_for_another_n_are_skipped(capsys, tmp_path, weights_folder):
 
 def test_evaluate_accepts_scenes_options_and_folders(capsys, tmp_path, weights_folder):
     world = np.random.default_rng(0).uniform((-2, -2, 4), (2, 2, 9), (30, 3))
-    matches = tmp_path / "scene.npz"
-    np.savez(
-        matches,
-        names=np.array(["a.jpg"]),
-        K=K.numpy()[None],
-        R=np.eye(3)[None],
-        t=np.zeros((1, 3)),
-        size=np.array([[640, 480]]),
-        **{
-            "000_world_points": world,
-            "000_img_points": world[:, :2] / world[:, 2:] * (800, 810) + (320, 240),
-            "000_error_px": np.zeros(30),
-        },
+    img, view = (
+        world[:, :2] / world[:, 2:] * (800, 810) + (320, 240),
+        {"names": np.array(["a.jpg"]), "K": K.numpy()[None]},
     )
+    view |= {"R": np.eye(3)[None], "t": np.zeros((1, 3)), "size": np.array([[640, 480]])}
+    pairs = {"000_world_points": world, "000_img_points": img, "000_error_px": np.zeros(30)}
+    matches = tmp_path / "scene.npz"
+    np.savez(matches, **view, **pairs)
     out_file = tmp_path / "results.json"
     solvers = ("opencv-ransac:threshold=5,refine=false", str(weights_folder))
     common = ("evaluate", "--data", matches, "--outliers", "none,1", "--problems", 5, "--out", out_file)
@@ -457,22 +403,19 @@ def test_evaluate_accepts_scenes_options_and_folders(capsys, tmp_path, weights_f
 
 
 @pytest.mark.parametrize(
-    ("arguments", "expected"),
+    ("arguments", "culprit"),
     [
-        (("--data", "nowhere"), "nowhere"),
-        (("--outliers", "none,some"), "'some'"),
-        (("--outliers", "none,"), "''"),
-        (("--outliers", "120%"), "'120%'"),
-        (("--outliers", "x%"), "'x%'"),
-        (("--n", "9,2"), "2"),
-        (("--n", "20,6", "--outliers", "7"), "n = 6"),
-        (("--solver", "known-inliers:threshold=3"), "threshold"),
-        (("--solver", "nobody"), "nobody"),
+        ("--data nowhere", "nowhere"),
+        *((f"--outliers {word}", repr(word.split(",")[-1])) for word in ("none,some", "none,", "120%", "x%")),
+        ("--n 9,2", "2"),
+        ("--n 20,6 --outliers 7", "n = 6"),
+        ("--solver known-inliers:threshold=3", "threshold"),
+        ("--solver nobody", "nobody"),
     ],
 )
-def test_evaluate_refuses_in_one_line(capsys, tmp_path, arguments, expected):
+def test_evaluate_refuses_in_one_line(capsys, tmp_path, arguments, culprit):
     out_file = tmp_path / "results.json"
-    assert expected in refused(capsys, "evaluate", "--problems", 5, "--out", out_file, *arguments)
+    assert culprit in refused(capsys, "evaluate", "--problems", 5, "--out", out_file, *arguments.split())
     assert not out_file.exists()
 
 
@@ -517,19 +460,14 @@ def test_demo_compares_trains_and_draws(capsys, tmp_path, monkeypatch):
 
 
 def test_the_verdict_names_the_most_successful_and_the_fastest():
-    def row(data, solver, rate, high, time):
-        return {"data": data, "solver": solver, "success": {"rate": rate, "high": high}, "us_per_problem": time}
+    def row(solver, rate, high, time):
+        return {"data": "a", "solver": solver, "success": {"rate": rate, "high": high}, "us_per_problem": time}
 
-    rows = [row("a", "x", 0.9, 0.92, 50), row("a", "y", 0.91, 0.93, 90), row("a", "z", 0.5, 0.6, 20)]
-    rows += [row("b", "x", 0.2, 0.3, 50), row("b", "y", 0.8, 0.9, 90)]
-    first, second = verdict({"data": {"a": {}, "b": {}}, "rows": rows}).split(";")
-    winners, fastest = first.split(" solved the most problems")
+    rows = [row("x", 0.9, 0.92, 50), row("y", 0.91, 0.93, 90), row("z", 0.5, 0.6, 20)]
+    winners, fastest = verdict({"data": {"a": {}}, "rows": rows}).split(" solved the most problems")
     assert "x (90.0 %, 50 µs" in winners  # the 95 % interval of x contains the rate of y
     assert "y (91.0 %, 90 µs" in winners
     assert "z (50.0 %, 20 µs" in fastest
-    winners, fastest = second.split(" solved the most problems")
-    assert "x" not in winners
-    assert "x (20.0 %" in fastest
 
 
 @pytest.mark.parametrize(
@@ -550,9 +488,6 @@ def test_the_names_of_synthetic_data():
     assert tuple(PRIORS) == SYNTHETIC
 
 
-# -- reprojection ----------------------------------------------------------------------------------------------------
-
-
 def test_solve_estimates_the_focal_length(capsys, csv_file):
     got = answer(capsys, csv_file, "--focal", "unknown", "--intrinsics", "1,1.0125,320,240")
     assert got["ok"]
@@ -561,9 +496,6 @@ def test_solve_estimates_the_focal_length(capsys, csv_file):
     told = answer(capsys, csv_file, "--focal", "0.1", "--intrinsics", "780,790,320,240")
     assert told["intrinsics"][0][0] == pytest.approx(800, rel=0.02)
     assert answer(capsys, csv_file, "--focal", "known", "--intrinsics", CAMERA)["intrinsics"] == K.tolist()
-    for focal in ("free", "-1", "nan"):
-        with pytest.raises(SystemExit):
-            main(["solve", str(csv_file), "--intrinsics", CAMERA, f"--focal={focal}"])
     err = refused(capsys, "solve", csv_file, "--intrinsics", CAMERA, "--focal", "unknown", "--solver", "poselib")
     assert "does not estimate focal lengths" in err
 

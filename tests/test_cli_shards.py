@@ -121,17 +121,21 @@ def test_results_of_another_solver_are_not_taken_for_its_own(shards, solve, tmp_
 def test_a_shard_that_cannot_be_read_stops_no_other(shards, solve, tmp_path):
     folder, drawn = shards
     good = arrays(drawn[0])
+    points = {name: good[name] for name in NAMES[:2]}
+    bad = {
+        "b": {"world_points": good["world_points"]},
+        "c": good | {"img_points": good["img_points"][:5]},
+        "d": good | {"world_points": good["world_points"].astype(object)},
+        "e": points,
+        "f": good | {"world_points": good["world_points"].swapaxes(1, 2)},
+    }
+    for name, content in bad.items():
+        np.savez(folder / f"{name}.npz", **content)
     (folder / "a.npz").write_bytes(b"PK\x03\x04 nothing")
-    np.savez(folder / "b.npz", world_points=good["world_points"])
-    np.savez(folder / "c.npz", **{**good, "img_points": good["img_points"][:5]})
-    np.savez(folder / "d.npz", **{**good, "world_points": good["world_points"].astype(object)})
-    np.savez(folder / "e.npz", world_points=good["world_points"], img_points=good["img_points"])
-    np.savez(folder / "f.npz", **{**good, "world_points": good["world_points"].swapaxes(1, 2)})
     (folder / "g.parquet").write_bytes(b"PAR1")
     parquet.write_table(table(drawn[0]).drop_columns("intrinsics"), folder / "h.parquet")
     report = solve_shards(solve, [folder], tmp_path / "out", name="reppnp")
     assert report.shards == 3
-    assert len(report.failed) == 8
     for name, line in zip("abcdefgh", report.failed, strict=True):
         assert f"/{name}." in line
     assert sorted(x.stem for x in (tmp_path / "out").iterdir()) == ["part0", "part1", "part2"]

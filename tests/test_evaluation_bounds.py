@@ -20,9 +20,9 @@ BOUNDS = (KnownInliers, KnownInliersAndNoise)
 
 
 def pixels(rotation, translation, world_points, intrinsics):
-    """One problem: (N, 3) -> (N, 2)."""
+    """World points (*, N, 3) in the image, (*, N, 2)."""
     projected = (world_points @ rotation.mT + translation) @ intrinsics.mT
-    return projected[:, :2] / projected[:, 2:]
+    return projected[..., :2] / projected[..., 2:]
 
 
 @pytest.mark.parametrize("bound", BOUNDS)
@@ -47,18 +47,13 @@ def test_the_pose_minimises_the_weighted_squares_of_the_inliers(make_problems, b
     assert torch.equal(weights > 0, problems.inliers)
     result = bound.solve_with_truth(problems)
     assert result.ok.all()
-    turn = torch.zeros(5, 3, dtype=torch.float64, requires_grad=True)
-    shift = torch.zeros(5, 3, dtype=torch.float64, requires_grad=True)
+    turn, shift = torch.zeros(2, 5, 3, dtype=torch.float64).requires_grad_()
     rotation = axis_angle_to_rotation_matrix(turn) @ result.rotation
-    largest = 0.0
-    for i in range(5):
-        where = pixels(rotation[i], result.translation[i] + shift[i], problems.world_points[i], problems.intrinsics[i])
-        cost = (weights[i] * (where - problems.img_points[i]).square().sum(-1)).sum()
-        largest = max(largest, cost.item())
-        cost.backward(retain_graph=True)
+    where = pixels(rotation, (result.translation + shift)[:, None], problems.world_points, problems.intrinsics)
+    costs = (weights * (where - problems.img_points).square().sum(-1)).sum(-1)
     # A radian moves pixels by thousands, so that a gradient of this size is rounding.
-    assert turn.grad.abs().max() < 1e-6 * largest
-    assert shift.grad.abs().max() < 1e-6 * largest
+    for gradient in torch.autograd.grad(costs.sum(), (turn, shift)):
+        assert gradient.abs().max() < 1e-6 * costs.max()
 
 
 def test_weights_are_inverse_variances_by_the_jacobian(make_problems):

@@ -96,22 +96,18 @@ def test_rows_hold_the_errors_of_the_solver(results, sets, solver):
 
 def test_summaries_and_table_are_those_of_the_stored_errors(results):
     lines = format_table(results).splitlines()
-    assert len(lines) == 2 + len(results["rows"])
     for line, row in zip(lines[2:], results["rows"], strict=True):
         entry = results["data"][row["data"]]
-        errors, was_ok = row_errors(row)
+        errors, _ = row_errors(row)
         rate = success_rate(success(errors, entry["max_rotation_deg"], entry["max_translation"]))
         assert row["success"] == pytest.approx(rate._asdict(), rel=1e-5)
         for name, values in errors._asdict().items():
             quartiles = values.quantile(torch.tensor([0.25, 0.5, 0.75], dtype=torch.float64)).tolist()
             assert [row[name][key] for key in ("q25", "median", "q75")] == pytest.approx(quartiles, rel=1e-5)
-        data, name, shown, rotation, translation, micros, ok = (cell.strip() for cell in line.strip("|").split("|"))
-        assert (data, name, shown) == (row["data"], row["solver"], str(rate))
-        assert float(rotation.rstrip("°")) == pytest.approx(errors.rotation_error_deg.quantile(0.5).item(), rel=6e-3)
-        assert float(translation.split()[0]) == pytest.approx(errors.translation_error.quantile(0.5).item(), rel=6e-3)
-        assert translation.endswith(" m") == (entry["unit"] == "m")
-        assert float(micros) == round(row["us_per_problem"])
-        assert ok == f"{100 * was_ok.double().mean():.1f} %"
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        assert cells[:3] == [row["data"], row["solver"], str(rate)]
+        assert float(cells[3].rstrip("°")) == pytest.approx(errors.rotation_error_deg.quantile(0.5).item(), rel=6e-3)
+        assert cells[4].endswith(" m") == (entry["unit"] == "m")
 
 
 def test_big_sets_are_solved_in_chunks_with_one_untimed_call(sets):
@@ -132,21 +128,16 @@ def test_a_pose_that_is_not_finite_is_a_failure(sets, bad):
 
 
 def test_data_and_solvers_are_described(results, solver):
-    described = results["solvers"]["lm"]
-    assert (described["class"], described["config"]) == ("PnPNet", solver.config())
-    assert results["solvers"]["fixed"] == {"class": "_Fixed", "config": None, "weights": None}
-    assert results["data"]["clean"]["description"] == {"seed": 5}
-    spoilt = results["data"]["spoilt"]
-    assert (spoilt["count"], spoilt["n"], spoilt["mean_outliers"], spoilt["dtype"]) == (60, 9, 2.0, "float32")
-    assert (spoilt["max_translation"], spoilt["unit"]) == (0.5, "")
+    described = results["solvers"]
+    assert (described["lm"]["class"], described["lm"]["config"]) == ("PnPNet", solver.config())
+    assert described["fixed"] == {"class": "_Fixed", "config": None, "weights": None}
+    spoilt = {"count": 60, "n": 9, "mean_outliers": 2.0, "dtype": "float32", "max_translation": 0.5, "unit": ""}
+    assert spoilt.items() <= results["data"]["spoilt"].items()
 
 
-def test_the_environment_names_versions_and_the_machine():
+def test_the_environment_is_plain_data():
     env = environment()
-    assert env["versions"]["torch"] == torch.__version__
     assert set(env["versions"]) >= {"kornia_pnpnet", "torch", "kornia", "numpy", "opencv"}
-    assert env["threads"] == torch.get_num_threads()
-    assert env["commit"] is None or len(env["commit"].rstrip("+")) == 40
     json.dumps(env, allow_nan=False)
 
 
@@ -252,20 +243,6 @@ def test_rows_of_other_code_or_versions_are_refused(sets, tmp_path, monkeypatch)
         evaluate({"fixed": _Fixed()}, sets, path=path)
 
 
-@pytest.mark.parametrize("keep", [0, 200, -1])
-def test_a_damaged_file_is_refused_and_kept(results, sets, tmp_path, keep):
-    path = tmp_path / "results.json"
-    save_results(results, path)
-    content = path.read_bytes().rstrip()[:keep]
-    path.write_bytes(content)
-    counted = _Fixed()
-    with pytest.raises(ValueError, match=r"results\.json"):
-        evaluate({"fixed": counted}, sets, path=path)
-    assert path.read_bytes() == content
-    assert counted.sizes == []
-    assert len(evaluate({"fixed": counted}, sets, path=path, overwrite=True)["rows"]) == 2
-
-
 def test_a_path_that_cannot_be_written_is_an_error_before_the_work(sets, tmp_path):
     (tmp_path / "file").write_text("")
     counted = _Fixed()
@@ -305,20 +282,19 @@ def test_only_bounds_get_the_truth(sets):
 
 def test_only_our_solvers_get_the_noise_level(sets):
     known = EvaluationData(draw_problems(SyntheticProblems(batch_size=40, seed=3, known_noise=1.0), count=60))
-    sigmas = []
+    given = []
 
     class Listening(PnPNet):
-        def forward(self, *args, img_sigma=None, world_sigma=None):
-            sigmas.append((img_sigma, world_sigma))
-            return super().forward(*args, img_sigma=img_sigma, world_sigma=world_sigma)
+        def forward(self, *args, **noise):
+            given.append(noise)
+            return super().forward(*args, **noise)
 
-    solvers = {"ours": Listening(None, RobustWeightedLM(1)), "other": _Fixed()}
-    evaluate(solvers, {"known": known}, chunk=60)
-    assert all(torch.equal(img_sigma, known.problems.img_sigma) for img_sigma, _ in sigmas)
-    assert all(torch.equal(world_sigma, known.problems.world_sigma) for _, world_sigma in sigmas)
-    sigmas.clear()
-    evaluate(solvers, sets)
-    assert set(sigmas) == {(None, None)}
+    for data in (known, sets["clean"]):
+        evaluate({"ours": Listening(None, RobustWeightedLM(1)), "other": _Fixed()}, {"data": data}, chunk=60)
+        assert given
+        assert all(noise.keys() == data.problems.sigmas.keys() for noise in given)
+        assert all(torch.equal(noise[name], sigma) for noise in given for name, sigma in data.problems.sigmas.items())
+        given.clear()
 
 
 def test_a_solver_for_another_n_is_left_out(tmp_path):

@@ -11,10 +11,6 @@ from kornia_pnpnet.evaluation.comparison import SeesTruth
 from kornia_pnpnet.evaluation.named_solvers import BOUNDS, default_solvers, load_solver, missing_package
 
 
-def name_of(spec):
-    return spec.partition(":")[0]
-
-
 def test_bounds_take_options():
     bound = load_solver("known-inliers-and-noise:world_sigma=0.01")
     assert isinstance(bound, KnownInliersAndNoise)
@@ -38,8 +34,8 @@ def test_default_solvers_load_and_cover_every_n(sources):
     assert len(set(specs)) == len(specs)
     assert set(default_solvers(9, sources)) | set(default_solvers(6, sources)) == set(specs)
     for spec in specs:
-        assert isinstance(load_solver(spec), SeesTruth) == (name_of(spec) in BOUNDS)
-    left = set(list_solvers()) - set(map(name_of, specs))
+        assert isinstance(load_solver(spec), SeesTruth) == (spec.partition(":")[0] in BOUNDS)
+    left = set(list_solvers()) - {spec.partition(":")[0] for spec in specs}
     assert all(name.startswith(("pnpnet-", "net-")) and not name.endswith(("-n6", "-n9")) for name in left)
 
 
@@ -49,7 +45,6 @@ def test_missing_packages_are_named_and_left_out(monkeypatch):
         "poselib": "PoseLib",
         "pycolmap": "pycolmap",
         "kornia-rs": "kornia-rs",
-        "p3p-ransac": None,
         "epnp": None,
     }
     assert {name: missing_package(name) for name in needed} == dict.fromkeys(needed)

@@ -168,12 +168,10 @@ def test_results_are_plain_data_with_a_count_for_each_n():
     results = complexity_results(names, sizes)
     assert json.loads(json.dumps(results, allow_nan=False)) == results
     assert (results["n"], results["outliers"], results["ransac"]) == (sizes, [2, 3], names[2:])
-    assert {name: [x is None for x in counts] for name, counts in results["counts"].items()} == {
-        **{name: [False, False] for name in names[:3]},
-        "ransac-epnp-lm": [True, False],  # its samples have 7 pairs
-    }
-    assert results["counts"]["net"][1] == operation_count("net-n9", 9) == operation_count("net", 9)
-    assert results["counts"]["p3p-ransac"][1] == operation_count("p3p-ransac", 9, outliers=3)
+    counts = results["counts"]
+    assert [name for name in names if None in counts[name]] == ["ransac-epnp-lm"]  # its samples have 7 pairs
+    assert counts["net"][1] == operation_count("net-n9", 9) == operation_count("net", 9)
+    assert counts["p3p-ransac"][1] == operation_count("p3p-ransac", 9, outliers=3)
 
 
 def test_what_cannot_be_counted_is_an_error():

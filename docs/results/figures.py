@@ -23,28 +23,16 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import EngFormatter, Formatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import EngFormatter, LogLocator, MaxNLocator
 
 from kornia_pnpnet.evaluation import load_results
-from kornia_pnpnet.evaluation.plots import (
-    BLUE,
-    BROWN,
-    COLOURS,
-    GREEN,
-    GREY,
-    ORANGE,
-    PINK,
-    SKY,
-    VERMILION,
-    WIDTH,
-    make_figure,
-    save,
-    themed,
-)
+from kornia_pnpnet.evaluation.plots import COLOURS, WIDTH, log_scale, make_figure, save, themed
 from kornia_pnpnet.evaluation.problem_sets import PRIORS
 from kornia_pnpnet.metrics import success_rate
 
 __all__ = ["draw_curves", "paper_figures", "plot_reliability", "plot_sweep", "solver_styles"]
+
+BLUE, ORANGE, GREEN, VERMILION, PINK, BROWN, _, GREY, _, SKY = COLOURS
 
 # -- the look of solvers -----------------------------------------------------------------------------------------------
 
@@ -114,13 +102,20 @@ def draw_legend(figure: Figure, styles: Styles) -> None:
         text.set_fontweight("bold" if is_ours(text.get_text()) else "normal")
 
 
-def log_scale(axes: Axes, name: str, formatter: Formatter | str = "{x:g}") -> None:
-    """Make the axis x or y logarithmic, with a number at every power of 10, and at more places of a short axis."""
-    axes.set(**{f"{name}scale": "log"})
-    axis, (low, high) = getattr(axes, f"{name}axis"), getattr(axes, f"get_{name}lim")()
-    axis.set_major_locator(LogLocator(subs=(1, 2, 3, 5) if high < 100 * low else (1,)))
-    axis.set_major_formatter(formatter)
-    axis.set_minor_formatter(NullFormatter())
+def make_panels(
+    count: int, columns: int, heights: tuple[float, float], heading: Sequence[str], **shared: bool
+) -> tuple[Figure, list[Axes], int]:
+    """A figure with panels in lines of at most ``columns``, and the number of columns that it has.
+
+    ``heights`` in inches: of the page besides the panels, and of a line of panels.
+    """
+    lines = math.ceil(count / columns)
+    columns = math.ceil(count / lines)
+    figure = make_figure(WIDTH, heights[0] + heights[1] * lines, *heading)
+    grid = list(figure.subplots(lines, columns, squeeze=False, **shared).flat)
+    for axes in grid[count:]:
+        axes.remove()
+    return figure, grid[:count], columns
 
 
 def reach(table: pd.DataFrame) -> np.ndarray:
@@ -131,11 +126,9 @@ def reach(table: pd.DataFrame) -> np.ndarray:
 def draw_dots(path: str | Path, heading: Sequence[str], panels: Mapping[str, pd.DataFrame]) -> Path:
     """Draw success: a row for each solver, a panel for each table with ``solver``, ``rate``, ``low`` and ``high``."""
     styles = solver_styles(solver for table in panels.values() for solver in table.solver)
-    lines = math.ceil(len(panels) / 3)
-    columns = math.ceil(len(panels) / lines)
-    figure = make_figure(WIDTH, 0.5 + (_ROW * len(styles) + 0.85) * lines, *heading)
-    grid = list(figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False).flat)
-    for axes, (title, table) in zip(grid, panels.items(), strict=False):
+    heights = 0.5, _ROW * len(styles) + 0.85
+    figure, grid, columns = make_panels(len(panels), 3, heights, heading, sharex=True, sharey=True)
+    for axes, (title, table) in zip(grid, panels.items(), strict=True):
         for name, rate, (low, high) in zip(table.solver, table.rate, reach(table).T, strict=True):
             look, row = styles[name], list(styles).index(name)
             if not look["marker"]:  # a bound is a line across the panel
@@ -146,11 +139,9 @@ def draw_dots(path: str | Path, heading: Sequence[str], panels: Mapping[str, pd.
             font |= {"transform": axes.get_yaxis_transform(), "va": "center_baseline"}
             axes.text(1.04, row, f"{rate:.1f} ±{max(low, high):.1f}", **font)
         axes.set(title=textwrap.fill(title.replace("_", " "), 34), xlabel=_LABELS["rate"])
-    for axes in grid[len(panels) :]:
-        axes.remove()
     grid[0].set_yticks(range(len(styles)), [shortened(name) for name in styles])
     grid[0].set(xlim=(-3, 103), ylim=(len(styles) - 0.4, -0.6), xticks=range(0, 101, 25))
-    for axes in grid[: len(panels) : columns]:
+    for axes in grid[::columns]:
         for label, name in zip(axes.get_yticklabels(), styles, strict=True):
             label.set_fontweight("bold" if is_ours(name) else "normal")
     return save(figure, path)
@@ -167,12 +158,10 @@ def draw_curves(
     """
     found = {solver for _, table, _ in panels for solver in table.solver}
     styles = {name: look for name, look in (styles or solver_styles(found)).items() if name in found}
-    lines = math.ceil(len(panels) / 4)
-    columns = math.ceil(len(panels) / lines)
-    figure = make_figure(WIDTH, 1.0 + (2.4 if lines > 1 else 3.0) * lines + 0.04 * len(styles), *heading)
-    grid = list(figure.subplots(lines, columns, squeeze=False).flat)
+    heights = 1.0 + 0.04 * len(styles), 2.4 if len(panels) > 4 else 3.0
+    figure, grid, columns = make_panels(len(panels), 4, heights, heading)
     first: dict[str, Axes] = {}
-    for index, (axes, (title, table, y)) in enumerate(zip(grid, panels, strict=False)):
+    for index, (axes, (title, table, y)) in enumerate(zip(grid, panels, strict=True)):
         for name, look in styles.items():
             line = table[table.solver == name].sort_values(x)
             error, every = reach(line) if y == "rate" else None, max(1, len(line) // 8)
@@ -191,8 +180,6 @@ def draw_curves(
             axes.set_xticks(places)
         axes.xaxis.set_major_formatter("{x:,.0f}")
         axes.set_xticks([], minor=True)
-    for axes in grid[len(panels) :]:
-        axes.remove()
     for y, axes in first.items():
         if y == "rate":
             axes.set(ylim=(-3, 103), yticks=range(0, 101, 20))

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
 
+import pandas as pd
 import torch
 from measure import ANY, HERE
 from real_matches_picture import find_rows
@@ -53,25 +54,20 @@ class Pooled(NamedTuple):
 
 def pool(files: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Pooled]]:
     """The solvers that all files have, by title and kind of matches; over both kinds together as ``all``."""
-    sums: dict[str, dict[str, list[float]]] = {}
-    measured: dict[str, set[int]] = {}
-    for number, results in enumerate(files):
-        for row in results["rows"]:
-            if row["group"] == "all":
-                name = title(row["solver"], results["settings"])
-                measured.setdefault(name, set()).add(number)
-                for kind in (row["kind"], "all"):
-                    total = sums.setdefault(name, {}).setdefault(kind, [0, 0, 0.0])
-                    for i, factor in enumerate((1.0, row["success"], row["ms_per_problem"])):
-                        total[i] += row["count"] * factor
-    return {
-        name: {
-            kind: Pooled(success_rate(torch.arange(round(count)) < round(right)), ms / count)
-            for kind, (count, right, ms) in kinds.items()
-        }
-        for name, kinds in sums.items()
-        if len(measured[name]) == len(files)
-    }
+    rows = pd.concat([pd.DataFrame(one["rows"]).assign(file=i) for i, one in enumerate(files)], ignore_index=True)
+    rows = rows[rows.group == "all"]
+    names = [title(solver, files[i]["settings"]) for solver, i in zip(rows.solver, rows.file, strict=True)]
+    rows = rows.assign(name=names, right=rows["count"] * rows.success, ms=rows["count"] * rows.ms_per_problem)
+    found: dict[str, dict[str, Pooled]] = {}
+    for name, one in rows.groupby("name", sort=False):
+        if one.file.nunique() == len(files):
+            kinds = [*one.groupby("kind", sort=False), ("all", one)]
+            sums = {kind: part[["count", "right", "ms"]].sum() for kind, part in kinds}
+            found[str(name)] = {
+                str(kind): Pooled(success_rate(torch.arange(int(x["count"])) < round(x.right)), x.ms / x["count"])
+                for kind, x in sums.items()
+            }
+    return found
 
 
 def best_peer(pooled: Mapping[str, Mapping[str, Pooled]], kind: str = "all") -> str:
@@ -113,7 +109,8 @@ def overview(files: Sequence[Mapping[str, Any]], link: str) -> str:
     short = {"ratio test": "filtered", "no ratio test": "raw"}
     header = ["Solver", "images per call", *(x for kind in kinds for x in (f"{short[kind]}: right", "µs per image"))]
     scenes = sum(len(results["counts"]) for results in files)
-    reach = max(half(pooled[name][kind].success) for name in rows for kind in kinds)
+    rates = [pooled[name][kind].success for name in rows for kind in kinds]
+    reach = 100 * max(max(x.rate - x.low, x.high - x.rate) for x in rates)
     right = files[0]["settings"]["right"]
     base = pooled[ours[0]]
     ahead = []
@@ -157,11 +154,6 @@ def of_batch(results: Mapping[str, Any], size: int) -> dict[str, Any]:
 def points_ahead(pooled: Mapping[str, Mapping[str, Pooled]], ours: str = f"`{ANY}`") -> float:
     """Difference of the success of one of our solvers and of the best PoseLib."""
     return pooled[ours]["all"].success.rate - pooled[best_peer(pooled)]["all"].success.rate
-
-
-def half(success: SuccessRate) -> float:
-    """The larger distance in points from a rate to the ends of its interval."""
-    return 100 * max(success.rate - success.low, success.high - success.rate)
 
 
 def percent(value: float | None) -> str:

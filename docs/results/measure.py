@@ -50,22 +50,22 @@ UNTUNED = (
     *(PAPER, OURS, "net-n9", "identity-lm", "epnp", "epnp-lm", "reppnp", "reppnp-lm"),
     *("opencv-epnp", "opencv-sqpnp"),
 )
-THRESHOLDS = (1.0, 2.0, 5.0, 10.0, 20.0, 35.0, 50.0, 80.0, 120.0)  # pixels
+_PIXELS = {"threshold": (1.0, 2.0, 5.0, 10.0, 20.0, 35.0, 50.0, 80.0, 120.0)}
 #: Threshold methods by the name on the page: the solver, and the values of its options that tuning tries.
 #: ``p3p-ransac`` has one threshold in pixels like the peers, ``p3p-ransac-noise`` also one for noise of the world
 #: points. OpenCV's RANSAC once with its usual options (AP3P, refined) and once with the best options that we found.
 TUNED: dict[str, tuple[str, dict[str, Sequence[float]]]] = {
-    "ransac-epnp-lm": ("ransac-epnp-lm", {"threshold": THRESHOLDS}),
-    "p3p-ransac": ("p3p-ransac", {"threshold": THRESHOLDS}),
+    "ransac-epnp-lm": ("ransac-epnp-lm", _PIXELS),
+    "p3p-ransac": ("p3p-ransac", _PIXELS),
     "p3p-ransac-noise": (
         "p3p-ransac",
         {"threshold": (1.0, 2.0, 3.0, 5.0, 10.0), "world_threshold": (0.05, 0.1, 0.15, 0.2, 0.3, 0.4)},
     ),
-    "opencv-ransac": ("opencv-ransac", {"threshold": THRESHOLDS}),
-    "opencv-ransac-sqpnp": ("opencv-ransac:method=SQPNP,refine=false", {"threshold": THRESHOLDS}),
-    "opencv-usac": ("opencv-usac", {"threshold": THRESHOLDS}),
-    "poselib": ("poselib", {"threshold": THRESHOLDS}),
-    "pycolmap": ("pycolmap", {"threshold": THRESHOLDS}),
+    "opencv-ransac": ("opencv-ransac", _PIXELS),
+    "opencv-ransac-sqpnp": ("opencv-ransac:method=SQPNP,refine=false", _PIXELS),
+    "opencv-usac": ("opencv-usac", _PIXELS),
+    "poselib": ("poselib", _PIXELS),
+    "pycolmap": ("pycolmap", _PIXELS),
 }
 PEERS = ("opencv-ransac", "opencv-ransac-sqpnp", "opencv-usac", "poselib", "pycolmap")
 ROBUST = ("p3p-ransac", "p3p-ransac-noise", *PEERS)
@@ -79,19 +79,13 @@ SCALES = (("cauchy", 10.0), ("geman_mcclure", 20.0))  # kernels and their scales
 
 
 class Counts(NamedTuple):
-    """Where the scenes are, and how many problems are solved.
-
-    Attributes:
-        scenes: folder of the scenes.
-        synthetic: problems of a synthetic set.
-        real: problems of a scene.
-    """
+    """Where the scenes are, and the numbers of problems of a synthetic set and of a scene."""
 
     scenes: Path
     synthetic: int
     real: int
 
-    def draw(self, sources: Sequence[str], outliers: str, **changed: Any) -> dict[str, EvaluationData]:
+    def draw(self, sources: Iterable[str], outliers: str, **changed: Any) -> dict[str, EvaluationData]:
         """Sets of the seed for the report, 9 pairs unless ``changed`` says otherwise."""
         options: dict[str, Any] = {"dtype": torch.float64, "seed": SEED_REPORT, "n": 9, "count": self.synthetic}
         return evaluation_sets(list(sources), outliers, **{**options, **changed})
@@ -100,15 +94,12 @@ class Counts(NamedTuple):
         """Smaller synthetic sets, of the seed for tuning."""
         return self.draw(["synthetic"], outliers, **{"seed": SEED_TUNE, "count": self.synthetic // 10, **changed})
 
-    def draw_scenes(
-        self, outliers: str, *, seed: int = SEED_REPORT, others: bool = True, **changed: Any
-    ) -> dict[str, EvaluationData]:
+    def draw_scenes(self, outliers: str, *, others: bool = True, **changed: Any) -> dict[str, EvaluationData]:
         """Problems of the scenes in metres and, with ``others``, of the scenes of arbitrary unit."""
-        options: dict[str, Any] = {"n": 9, "count": self.real, "seed": seed, "dtype": torch.float64, **changed}
-        sets = evaluation_sets([str(self.scenes / name) for name in METRIC_SCENES], outliers, **options)
-        if others:
-            names = [str(self.scenes / name) for name in OTHER_SCENES]
-            sets |= evaluation_sets(names, outliers, metric=False, **options)
+        sets: dict[str, EvaluationData] = {}
+        for metric, names in ((True, METRIC_SCENES), (False, OTHER_SCENES if others else ())):
+            paths = [str(self.scenes / name) for name in names]
+            sets |= self.draw(paths, outliers, **{"metric": metric, "count": self.real, **changed})
         return sets
 
     def tuning_scenes(self) -> dict[str, EvaluationData]:
@@ -145,17 +136,15 @@ def tune(data: Mapping[str, EvaluationData], label: str, names: Iterable[str] = 
     best = {}
     for name in names:
         base, grid = TUNED[name]
-        start = base + ("," if ":" in base else ":")
-        specs = [
-            start + ",".join(f"{key}={value:g}" for key, value in zip(grid, values, strict=True))
-            for values in product(*grid.values())
-        ]
-        candidates = {spec: load_solver(spec) for spec in specs}
+        choices = (
+            ",".join(f"{key}={x:g}" for key, x in zip(grid, values, strict=True)) for values in product(*grid.values())
+        )
+        candidates = {spec: load_solver(spec) for spec in (f"{base}{',' if ':' in base else ':'}{x}" for x in choices)}
         results = evaluate(candidates, data, path=OUTPUTS / "tuning" / f"{label}, {name}.json", repeats=1)
-        total = dict.fromkeys(specs, 0.0)
+        total = dict.fromkeys(candidates, 0.0)
         for row in results["rows"]:
             total[row["solver"]] += row["success"]["rate"]
-        best[name] = max(specs, key=lambda spec: total[spec])
+        best[name] = max(total, key=lambda spec: total[spec])
     return best
 
 

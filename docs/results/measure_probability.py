@@ -1,4 +1,4 @@
-"""Fit the law of ``PnPResult.probability``, see ``kornia_pnpnet.refine.verdict``. ``make.py`` is the command.
+"""Fit the law of ``PnPResult.probability``, see ``kornia_pnpnet.judge.belief``. ``make.py`` is the command.
 
 The coefficients go from ``probability.json`` into the code by hand; a test compares them.
 """
@@ -14,7 +14,6 @@ from unittest import mock
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
-from kornia_pnpnet.refine.scale import larger_sigma
 from omegaconf import OmegaConf
 from sklearn.linear_model import LogisticRegression
 from torch import Tensor
@@ -22,8 +21,9 @@ from torch import Tensor
 from kornia_pnpnet import solver as solver_module
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.evaluation.named_solvers import load_solver
+from kornia_pnpnet.judge import belief
 from kornia_pnpnet.metrics import pose_errors, reliability, success_rate
-from kornia_pnpnet.refine import verdict
+from kornia_pnpnet.refine.information import larger_sigma
 from kornia_pnpnet.result import PnPResult, Problems
 
 __all__ = ["measure_probability"]
@@ -49,10 +49,10 @@ def measure_probability(seed_fit: int, seed_report: int) -> dict[str, Any]:
     sizes = [(matches, n) for n in (5, 6, 7, 9, 12, 24, 50, 120, 250)] + [(protocol, n) for n in (6, 9, 20)]
     solvers = {name: load_solver(name) for names in FITTED.values() for name in names}
     found: dict[str, dict[str, list[Tensor]]] = {name: {"fit": [], "report": []} for name in solvers}
-    law, features = verdict.probability, []
+    law, features = belief.probability, []
 
     def listen(alarms: Tensor, sigma: Tensor, name: str) -> Tensor:
-        features.append(torch.stack(verdict.clipped(alarms, sigma), -1))
+        features.append(torch.stack(belief.clipped(alarms, sigma), -1))
         return law(alarms, sigma, name)
 
     for (part, seed), (source, n) in product((("fit", seed_fit), ("report", seed_report)), sizes):
@@ -63,7 +63,7 @@ def measure_probability(seed_fit: int, seed_report: int) -> dict[str, Any]:
             # While the law is fitted, nothing is solved once more, so that each problem has one row.
             larger = larger_sigma if part == "report" else lambda x, *_: x.new_zeros(x.shape[:2])
             with (
-                mock.patch.object(verdict, "probability", listen),
+                mock.patch.object(belief, "probability", listen),
                 mock.patch.object(solver_module, "larger_sigma", larger),
             ):
                 result = solver(problems.world_points, problems.img_points, problems.intrinsics)
@@ -86,11 +86,7 @@ def measure_probability(seed_fit: int, seed_report: int) -> dict[str, Any]:
 def far_and_right(result: PnPResult, problems: Problems) -> tuple[Tensor, Tensor]:
     """Which poses are far off, and which are right, by rotation and by the camera's centre."""
     angle = pose_errors(result.pose, problems.pose).rotation_error_deg
-    depth = (
-        (problems.world_points @ problems.pose.rotation.mT + problems.pose.translation[:, None])[..., 2]
-        .median(1)
-        .values
-    )
+    depth = problems.true_cam_points[..., 2].median(1).values
     centres = [-(pose.rotation.mT @ pose.translation[..., None])[..., 0] for pose in (result.pose, problems.pose)]
     distance = (centres[0] - centres[1]).norm(dim=-1) / depth
     return (angle > 10) | (distance > 0.3), (angle < 1) & (distance < 0.02)

@@ -1,10 +1,9 @@
-r"""Operation counts: how many scalar operations a solver executes for one problem of n pairs (figure 1 of the paper).
+r"""Operation counts: the scalar operations that a solver executes for one problem of n pairs (figure 1 of the paper).
 
-Every count is measured: :class:`OperationCounter` runs the solver and adds up what each PyTorch operation costs,
-weighted by :data:`OPERATION_COSTS`. The batched code computes both sides of a branch and runs a fixed number of
-iterations, so the counts of all solvers but RANSAC are the same for every problem of n pairs. RANSAC draws samples
-until its stopping rule is met: its count is the mean over 64 problems of the protocol without noise, where RANSAC stops
-as early as its rule allows. Moving data and changing signs cost nothing.
+Every count is measured: :class:`OperationCounter` runs the solver and adds up what each PyTorch operation costs by
+:data:`OPERATION_COSTS`; moving data and changing signs cost nothing. All problems of n pairs cost the same, except for
+RANSAC, whose count is the mean over 64 problems of the protocol without noise, where it stops as early as its rule
+allows.
 
 Source: R. Sheffer and A. Wiesel, "PnP-Net: A hybrid Perspective-n-Point Network", 2020, which counts by T. Minka's
 Lightspeed toolbox.
@@ -113,14 +112,6 @@ _REDUCTIONS = {
     **dict.fromkeys(("amax", "amin", "argmax", "argmin", "max", "min"), COMPARE),
     **dict.fromkeys(("all", "any"), LOGIC),
 }
-# Cost for one row, by its length.
-_ROWS: dict[str, Callable[[int], float]] = {
-    "linalg_vector_norm": lambda length: (length - 1) * ADD + length * MULTIPLY + SQRT,
-    # Subtract the maximum, divide the exponentials by their sum.
-    "_softmax": lambda length: (2 * length - 1) * ADD + length * (DIVIDE + EXP) + (length - 1) * COMPARE,
-    # Subtract the mean, divide by the root of variance plus epsilon, apply weight and bias.
-    "native_layer_norm": lambda length: (4 * length - 1) * ADD + 3 * length * MULTIPLY + 3 * DIVIDE + SQRT,
-}
 # Cost for one matrix of the batch, by the shapes of the input matrices.
 _MATRIX: dict[str, Callable[..., float]] = {
     "mm": lambda first, second: matmul(first[0], first[1], second[1]),
@@ -133,13 +124,18 @@ _MATRIX: dict[str, Callable[..., float]] = {
     # Van Loan, "Matrix Computations", 4th edition, section 8.3.
     "_linalg_eigh": lambda matrix: 4.5 * matrix[0] ** 3 * (ADD + MULTIPLY),
 }
-# Cost for one row, by its length and the number of wanted entries.
-_SELECTIONS: dict[str, Callable[[int, dict[str, Any]], float]] = {
-    "kthvalue": lambda length, call: smallest(length, call["k"]),
-    "nanmedian": lambda length, call: length * COMPARE + smallest(length, (length + 1) // 2),
-    "sort": lambda length, call: sort(length),
-    "topk": lambda length, call: smallest(length, call["k"]) + (sort(call["k"]) if call["sorted"] else 0),
-    "_unique2": lambda length, call: sort(length),
+# Cost for one row, by its length n and the arguments of the call.
+_ROWS: dict[str, Callable[[int, dict[str, Any]], float]] = {
+    "linalg_vector_norm": lambda n, _: (n - 1) * ADD + n * MULTIPLY + SQRT,
+    # Subtract the maximum, divide the exponentials by their sum.
+    "_softmax": lambda n, _: (2 * n - 1) * ADD + n * (DIVIDE + EXP) + (n - 1) * COMPARE,
+    # Subtract the mean, divide by the root of variance plus epsilon, apply weight and bias.
+    "native_layer_norm": lambda n, _: (4 * n - 1) * ADD + 3 * n * MULTIPLY + 3 * DIVIDE + SQRT,
+    "kthvalue": lambda n, call: smallest(n, call["k"]),
+    "nanmedian": lambda n, _: n * COMPARE + smallest(n, (n + 1) // 2),
+    "sort": lambda n, _: sort(n),
+    "topk": lambda n, call: smallest(n, call["k"]) + (sort(call["k"]) if call["sorted"] else 0),
+    "_unique2": lambda n, _: sort(n),
 }
 
 
@@ -153,36 +149,40 @@ def _power(exponent: Any) -> float:
     return products * MULTIPLY + root + (DIVIDE if exponent < 0 else 0)
 
 
+def _for_each_result(name: str, call: dict[str, Any]) -> float | None:
+    """Cost for each entry of the result of an elementwise operation; ``None`` for other operations."""
+    if name == "pow":
+        return _power(call["exponent"])
+    if name == "clamp":
+        return sum(call[bound] is not None for bound in ("min", "max")) * COMPARE
+    if name == "searchsorted":  # by bisection
+        return int(call["sorted_sequence"].shape[-1] + 1).bit_length() * COMPARE
+    scaled = name in ("add", "sub", "addcmul") and call.get("alpha", call.get("value", 1)) not in (1, -1)
+    return _ELEMENTWISE[name] + (MULTIPLY if scaled else 0) if name in _ELEMENTWISE else None
+
+
 def _operations(name: str, call: dict[str, Any], output: Any) -> float:
     """Cost of one call of the PyTorch operation ``aten.<name>`` with the given arguments and output."""
-    result = output[0] if isinstance(output, tuple | list) else output
+    each = _for_each_result(name, call)
+    if each == 0:  # the output need not be a tensor
+        return 0
+    results = (output[0] if isinstance(output, tuple | list) else output).numel()
+    if each is not None:
+        return results * each
     tensors = [value for value in call.values() if isinstance(value, Tensor)]
     entries = tensors[0].numel() if tensors else 0
-    if name in _ELEMENTWISE:
-        cost = _ELEMENTWISE[name]
-        scaled = name in ("add", "sub", "addcmul") and call.get("alpha", call.get("value", 1)) not in (1, -1)
-        return result.numel() * (cost + MULTIPLY if scaled else cost) if cost else 0
-    if name == "pow":
-        return result.numel() * _power(call["exponent"])
-    if name == "clamp":
-        return result.numel() * sum(call[bound] is not None for bound in ("min", "max")) * COMPARE
     if name == "mean":
-        return (entries - result.numel()) * ADD + result.numel() * DIVIDE
-    if name == "searchsorted":  # by bisection
-        return result.numel() * (call["sorted_sequence"].shape[-1] + 1).bit_length() * COMPARE
+        return (entries - results) * ADD + results * DIVIDE
     if name in _MATRIX:
         return math.prod(tensors[0].shape[:-2]) * _MATRIX[name](*(tensor.shape[-2:] for tensor in tensors))
     if name in _REDUCTIONS:
-        results = entries // tensors[0].shape[call["dim"]] if name == "cumsum" else result.numel()
-        return (entries - results) * _REDUCTIONS[name]
-    shape, dims = tensors[0].shape if tensors else (), call.get("dim")
-    if "normalized_shape" in call:
-        shape, dims = call["normalized_shape"], None
-    length = math.prod(shape if dims is None else (shape[dim] for dim in ([dims] if isinstance(dims, int) else dims)))
+        first = entries // tensors[0].shape[call["dim"]] if name == "cumsum" else results
+        return (entries - first) * _REDUCTIONS[name]
     if name in _ROWS:
-        return entries // length * _ROWS[name](length)
-    if name in _SELECTIONS:
-        return entries // max(length, 1) * _SELECTIONS[name](length, call)
+        shape, dims = call.get("normalized_shape", tensors[0].shape), call.get("dim")
+        kept = range(len(shape)) if dims is None else [dims] if isinstance(dims, int) else dims
+        length = math.prod(shape[dim] for dim in kept)
+        return entries // max(length, 1) * _ROWS[name](length, call)
     raise NotImplementedError(f"The cost of aten.{name} is unknown. Add the cost to {__name__}.")
 
 
@@ -271,20 +271,21 @@ def complexity_results(solvers: Sequence[str] = SOLVERS, n: Iterable[int] = rang
         RANSAC has more than n pairs; ``ransac``, the solvers that draw samples; ``outliers`` for each n; ``costs``, the
         table of costs; ``environment``.
     """
-    sizes, smallest_n = list(n), {}
-    for name in solvers:
-        init = _solver(name, n=9).init
-        smallest_n[name] = init.minimal.sample_size if isinstance(init, RANSAC) else 0
+    sizes = list(n)
+    inits = {name: _solver(name, n=9).init for name in solvers}
+    samples = {name: init.minimal.sample_size for name, init in inits.items() if isinstance(init, RANSAC)}
     counts = {
-        name: [operation_count(name, size, outliers=size // 3) if size >= least else None for size in sizes]
-        for name, least in smallest_n.items()
+        name: [
+            operation_count(name, size, outliers=size // 3) if size >= samples.get(name, 0) else None for size in sizes
+        ]
+        for name in solvers
     }
     return {
         "kind": "complexity",
         "format": 1,
         "n": sizes,
         "counts": counts,
-        "ransac": [name for name, least in smallest_n.items() if least],
+        "ransac": list(samples),
         "outliers": [size // 3 for size in sizes],
         "costs": OPERATION_COSTS,
         "environment": environment(),

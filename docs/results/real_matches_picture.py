@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from figures import draw_legend, log_scale, solver_styles
+from figures import draw_legend, solver_styles
 
-from kornia_pnpnet.evaluation.plots import WIDTH, make_figure, save, themed
+from kornia_pnpnet.evaluation.plots import WIDTH, log_scale, make_figure, save, themed
 
 __all__ = ["find_rows", "plot_real_matches"]
 
-_LOOKS = {  # the same solver told more has the same colour and another marker and line
+_LOOKS = {  # a solver with more inputs keeps its colour and has another marker and line
     "+ratio": {"marker": "s", "linestyle": "--", "markerfacecolor": "white"},
     ":adaptive": {"marker": "^"},
 }
@@ -34,13 +34,8 @@ def find_rows(results: Mapping[str, Any], kind: str) -> dict[str, dict[str, Mapp
 def plot_real_matches(path: str | Path, results: Mapping[str, Any], costs: Mapping[str, Any]) -> Path:
     """Draw success and time against the share of outliers, and time against the number of pairs, of raw matches.
 
-    Args:
-        path: the picture to write.
-        results: what ``benchmarks/real_matches.py measure`` wrote.
-        costs: what ``benchmarks/real_matches.py cost`` wrote; its solvers are drawn.
-
-    Returns:
-        The path.
+    ``results`` and ``costs`` are what ``benchmarks/real_matches.py measure`` and ``cost`` wrote; the solvers of
+    ``costs`` are drawn.
     """
     table = find_rows(results, "no ratio test")
     times = {(row["solver"], row["group"]): row["ms_per_problem"] for row in costs["rows"]}
@@ -50,22 +45,17 @@ def plot_real_matches(path: str | Path, results: Mapping[str, Any], costs: Mappi
     for name, style in styles.items():
         for part, look in _LOOKS.items():
             style |= look if part in name else {}
-    settings = costs["settings"]
-    shares = [
-        (f"{100 * a:.0f}–{100 * b:.0f} %", f"{100 * a:.0f}–{100 * b:.0f}") for a, b in pairwise(settings["shares"])
-    ]
-    pairs = [(f"{a}–{b - 1} pairs", f"{a}–{b - 1}") for a, b in pairwise(settings["pairs"])]
+    shares, pairs = (list(pairwise(costs["settings"][key])) for key in ("shares", "pairs"))
+    by_share = {f"{100 * a:.0f}–{100 * b:.0f} %": f"{100 * a:.0f}–{100 * b:.0f}" for a, b in shares}
+    by_pairs = {f"{a}–{b - 1} pairs": f"{a}–{b - 1}" for a, b in pairs}
     figure = make_figure(WIDTH, 3.6, "Nearest-neighbour matches without a ratio test")
-    for axes, (value, groups, label) in zip(
-        figure.subplots(1, 3),
-        (("success", shares, "outliers (%)"), ("ms", shares, "outliers (%)"), ("ms", pairs, "pairs")),
-        strict=True,
-    ):
-        there = [(group, title) for group, title in groups if (solvers[0], group) in times]
+    plots = ("success", by_share, "outliers (%)"), ("ms", by_share, "outliers (%)"), ("ms", by_pairs, "pairs")
+    for axes, (value, groups, label) in zip(figure.subplots(1, 3), plots, strict=True):
+        there = [group for group in groups if (solvers[0], group) in times]
         for name in solvers:
-            heights = [100 * table[name][g]["success"] if value == "success" else times[name, g] for g, _ in there]
+            heights = [100 * table[name][g]["success"] if value == "success" else times[name, g] for g in there]
             axes.plot(np.arange(len(there)), heights, **styles[shown[name]])
-        axes.set_xticks(range(len(there)), [title for _, title in there], rotation=40, ha="right")
+        axes.set_xticks(range(len(there)), [groups[group] for group in there], rotation=40, ha="right")
         axes.set(xlabel=label, title="right poses (%)" if value == "success" else "ms per problem")
         if value == "ms":
             log_scale(axes, "y")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from measure import ANY, CHI_SQUARE_95, HERE, OURS, PAPER, PEERS, RESULTS, ROBUS
 from problem_picture import plot_problem
 from rates import Rates, compare_all
 from real_matches_picture import plot_real_matches
-from short_runs import Row, ablation, capacity, read_summary, sweep
+from short_runs import ablation, capacity, read_summary, sweep
 
 from kornia_pnpnet import PnPNet
 from kornia_pnpnet.core.tables import markdown_table
@@ -24,7 +24,7 @@ from kornia_pnpnet.evaluation.results import format_table, load_results
 from kornia_pnpnet.metrics import SuccessRate
 from kornia_pnpnet.pretrained import WEIGHTS_FOLDER, shipped_weights
 
-__all__ = ["OVERVIEW_PAGES", "SUMMARIES", "page", "real_matches", "render", "with_block"]
+__all__ = ["page", "pages", "real_matches", "render", "with_block"]
 
 REPOSITORY = HERE.parents[1]
 #: Files of short runs, see ``make.py``.
@@ -45,32 +45,23 @@ def written(template: str, **facts: Any) -> str:
 
 
 def summary(benchmark: Mapping[str, Any]) -> str:
-    """Success and time of the most used solvers on synthetic problems: the default solver, then by success.
-
-    Args:
-        benchmark: ``benchmarks/solvers.json``.
-    """
+    """Success and time of the most used solvers on synthetic problems: the default solver, then by success."""
     rows = {(row["solver"], row["set"]): row for row in benchmark["rows"]}
     found = []
     for spec in dict.fromkeys(solver for solver, _ in rows):
         if spec.partition(":")[0] in SUMMARY_SOLVERS:
-            there = [rows.get((spec, name)) for name in SUMMARY_SETS]
-            cells = [
-                (f"{100 * row['success']['rate']:.1f}", f"{row['median_us']:.0f}") if row else ("–", "–")
-                for row in there
-            ]
-            found.append((there[0]["success"]["rate"] if there[0] else 0.0, [f"`{spec}`", *cells[0], *cells[1]]))
-    found.sort(key=lambda entry: (entry[1][0] != f"`{ANY}`", -entry[0]))
+            rates, cells = [], []
+            for row in (rows.get((spec, name)) for name in SUMMARY_SETS):
+                rates.append(row["success"]["rate"] if row else 0.0)
+                cells += [f"{100 * rates[-1]:.1f}", f"{row['median_us']:.0f}"] if row else ["–", "–"]
+            found.append((spec != ANY, -rates[0], [f"`{spec}`", *cells]))
+    found.sort(key=lambda entry: entry[:2])
     header = [text for name in SUMMARY_SETS.values() for text in (f"{name}: solved (%)", "µs")]
-    return markdown_table(["Solver", *header], [line for _, line in found])
+    return markdown_table(["Solver", *header], [line for *_, line in found])
 
 
 def unknown_focal(measured: Mapping[str, Any]) -> str:
-    """Success and time on real matches without the focal length.
-
-    Args:
-        measured: ``benchmarks/cameras.json``.
-    """
+    """Success and time on real matches without the focal length, from ``benchmarks/cameras.json``."""
     solvers: dict[str, list[str]] = {}
     for row in measured["real"]:
         cells = [f"{100 * row['success']:.1f}", f"{100 * row['far_but_ok']:.1f}", f"{row['us'] / 1000:.1f}"]
@@ -81,7 +72,7 @@ def unknown_focal(measured: Mapping[str, Any]) -> str:
 
 
 def rigs(measured: Mapping[str, Any]) -> dict[str, float]:
-    """Least success on rigs and the range of times as fast as PoseLib. The argument is that of `unknown_focal`."""
+    """Least success on rigs and the range of times as fast as PoseLib. From the same file."""
     cells: dict[tuple[Any, ...], dict[str, Any]] = {}
     for row in measured["rigs"]:
         cells.setdefault((row["cameras"], row["baseline"], row["n"], row["share"]), {})[row["solver"]] = row
@@ -102,13 +93,9 @@ def honesty(found: Mapping[str, Any]) -> dict[str, Any]:
         [kind, *(f"{100 * rates[name]['rate']:.1f}" if name in rates else "–" for name in names)]
         for kind, rates in found["ok"].items()
     ]
-    covariances = [
-        [name, f"{entry['mean']:.2f}", str(SuccessRate(**entry["inside"]))]
-        for name, entry in found["covariance"].items()
-    ]
-    means, inside = zip(
-        *((one["mean"], 100 * one["inside"]["rate"]) for one in found["covariance"].values()), strict=True
-    )
+    found_cov = found["covariance"]
+    covariances = [[name, f"{x['mean']:.2f}", str(SuccessRate(**x["inside"]))] for name, x in found_cov.items()]
+    means, inside = ([x["mean"] for x in found_cov.values()], [100 * x["inside"]["rate"] for x in found_cov.values()])
     return {
         "oks": markdown_table(["`ok` (%)", *(f"`{name}`" for name in names)], oks),
         "covariances": markdown_table(["Problems", "mean", "below the limit"], covariances),
@@ -118,26 +105,11 @@ def honesty(found: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def page(
-    results: Mapping[str, Mapping[str, Any]],
-    complexity: Mapping[str, Any],
-    honest: Mapping[str, Any],
-    short_runs: Mapping[str, Sequence[Row]],
-    benchmark: Mapping[str, Any],
-    matches: Sequence[Mapping[str, Any]],
-    cameras: Mapping[str, Any],
-) -> str:
-    """The results page as Markdown.
-
-    Args:
-        results: the results files by their names, see ``RESULTS``.
-        complexity: operation counts.
-        honest: the file of ``measure_honesty``.
-        short_runs: the summaries :data:`SUMMARIES`.
-        benchmark: ``benchmarks/solvers.json``.
-        matches: the files :data:`matches.MATCHES`.
-        cameras: ``benchmarks/cameras.json``.
-    """
+def page() -> str:
+    """The results page as Markdown."""
+    results = {name: load_results(HERE / f"{name}.json") for name in RESULTS}
+    complexity, runs = load("complexity"), {name: read_summary(HERE / f"{name}.csv") for name in SUMMARIES}
+    benchmark, cameras = (load(name, REPOSITORY / "benchmarks") for name in ("solvers", "cameras"))
     at_nine = complexity["n"].index(9)
     any_network: Any = PnPNet.from_pretrained(ANY).init
     rates = {name: Rates(entry) for name, entry in results.items()}
@@ -151,7 +123,7 @@ def page(
         commits={name: f"{entry['environment']['commit']:.9}" for name, entry in results.items()},
         results=results,
         operations={name: counts[at_nine] for name, counts in complexity["counts"].items()},
-        overview=overview(matches, "real_matches.md"),
+        overview=overview(load_matches(), "real_matches.md"),
         summary=summary(benchmark),
         benchmark=benchmark,
         unknown_focal=unknown_focal(cameras),
@@ -159,20 +131,21 @@ def page(
         beside_robust=compare_all((rates["set"], rates["set_real"]), ANY, ROBUST),
         beside_peers=compare_all((rates["set"], rates["set_real"]), ANY, PEERS),
         ours_beside_peers=compare_all((rates["paper"], rates["gaussian_pose"], rates["real"]), OURS, PEERS),
-        honest=honesty(honest),
+        honest=honesty(load("honesty")),
         chi_square=CHI_SQUARE_95,
         distribution_table=format_table(results["distribution"]),
-        ablation=ablation(short_runs["ablation"]),
-        sweep=sweep(short_runs["sweep"]),
-        capacity=capacity(short_runs["capacity"], "set-{width}x{layers}x{hidden}".format(**any_network.config)),
+        ablation=ablation(runs["ablation"]),
+        sweep=sweep(runs["sweep"]),
+        capacity=capacity(runs["capacity"], "set-{width}x{layers}x{hidden}".format(**any_network.config)),
         weights=shipped_weights(),
         rates=rates,
     )
 
 
-def real_matches(files: Sequence[Mapping[str, Any]], costs: Mapping[str, Any], keypoints: Mapping[str, Any]) -> str:
-    """The page on real matches as Markdown. Arguments are those of :func:`matches.page_facts`."""
-    return written("real_matches.md.jinja", **page_facts(files, costs, keypoints))
+def real_matches() -> str:
+    """The page on real matches as Markdown."""
+    facts = page_facts(load_matches(), load("real_matches_cost"), load("keypoints"))
+    return written("real_matches.md.jinja", **facts)
 
 
 def with_block(text: str, block: str) -> str:
@@ -183,13 +156,13 @@ def with_block(text: str, block: str) -> str:
     """
     if text.count(BEGIN) != 1 or text.count(END) != 1:
         raise ValueError(f"A page with an overview needs one line '{BEGIN}' and one line '{END}' below it.")
-    before, after = text.partition(BEGIN)[0], text.partition(END)[2]
-    return f"{before}{BEGIN}\n{block}\n{END}{after}"
+    return f"{text.partition(BEGIN)[0]}{BEGIN}\n{block}\n{END}{text.partition(END)[2]}"
 
 
-def overview_of(path: Path, matches: Sequence[Mapping[str, Any]]) -> str:
-    """The overview for a page, whose link leads from there."""
-    return overview(matches, Path(os.path.relpath(HERE / "real_matches.md", path.parent)).as_posix())
+def with_overview(path: Path) -> str:
+    """The page at ``path`` with the overview, whose link leads from there."""
+    link = Path(os.path.relpath(HERE / "real_matches.md", path.parent)).as_posix()
+    return with_block(path.read_text(encoding="utf-8"), overview(load_matches(), link))
 
 
 def load(name: str, folder: Path = HERE) -> Any:
@@ -197,32 +170,27 @@ def load(name: str, folder: Path = HERE) -> Any:
     return json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
 
 
+def load_matches() -> list[Any]:
+    """The files :data:`matches.MATCHES`."""
+    return [load(name) for name in MATCHES]
+
+
+def pages() -> dict[Path, str]:
+    """The pages and the texts that their files hold."""
+    overviews = {path: with_overview(path) for path in OVERVIEW_PAGES}
+    return {HERE / "README.md": page(), HERE / "real_matches.md": real_matches(), **overviews}
+
+
 def render() -> None:
     """Write the pages, their pictures, and the overviews."""
-    results = {name: load_results(HERE / f"{name}.json") for name in RESULTS}
-    complexity, honest, matches = load("complexity"), load("honesty"), [load(name) for name in MATCHES]
     drawn = ("paper", "gaussian_pose", "real", "mismatches", "crowd", "against_n", "against_m")
-    paper_figures([*(results[name] for name in drawn), complexity], HERE)
+    paper_figures([*(load_results(HERE / f"{name}.json") for name in drawn), load("complexity")], HERE)
     for name in shipped_weights():
         plot_training(HERE / f"training-{name}.png", WEIGHTS_FOLDER / name / "history.csv")
     plot_sweep(HERE / "sweep_against_n.png", HERE / "sweep.csv", against="n")
     plot_sweep(HERE / "sweep_against_m.png", HERE / "sweep.csv", against="m")
-    plot_reliability(HERE / "reliability.png", honest["reliability"])
-    plot_real_matches(HERE / "real_matches.png", matches[0], load("real_matches_cost"))
+    plot_reliability(HERE / "reliability.png", load("honesty")["reliability"])
+    plot_real_matches(HERE / "real_matches.png", load_matches()[0], load("real_matches_cost"))
     plot_problem(HERE / "problem.png")
-    write_pages(results, complexity, honest, matches)
-
-
-def write_pages(
-    results: Mapping[str, Any], complexity: Mapping[str, Any], honest: Mapping[str, Any], matches: Sequence[Any]
-) -> None:
-    """Write the pages and the overviews."""
-    short_runs = {name: read_summary(HERE / f"{name}.csv") for name in SUMMARIES}
-    benchmark, cameras = (load(name, REPOSITORY / "benchmarks") for name in ("solvers", "cameras"))
-    text = page(results, complexity, honest, short_runs, benchmark, matches, cameras)
-    (HERE / "README.md").write_text(text, encoding="utf-8")
-    text = real_matches(matches, load("real_matches_cost"), load("keypoints"))
-    (HERE / "real_matches.md").write_text(text, encoding="utf-8")
-    for path in OVERVIEW_PAGES:
-        text = with_block(path.read_text(encoding="utf-8"), overview_of(path, matches))
+    for path, text in pages().items():
         path.write_text(text, encoding="utf-8")

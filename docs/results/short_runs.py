@@ -73,35 +73,24 @@ def ablation(rows: Sequence[Row]) -> dict[str, Any]:
         seed = f"seed={row['seed']}" if row.get("seed") else ""
         name = " ".join(filter(None, (row["experiment"], row.get(KERNEL), seed)))
         lines.append([f"`{name}`", *(interval(*percent(row, data)) for data in sets)])
-    findings: dict[str, dict[str, list[Row]]] = {}
+    kinds: dict[tuple[str, str], list[Row]] = {}
     for row in others:
-        findings.setdefault(row["experiment"], {}).setdefault(row.get(KERNEL, ""), []).append(row)
-    rates = [[percent(row, data)[0] for row in recipe] for data in sets]
+        kinds.setdefault((row["experiment"], row.get(KERNEL, "")), []).append(row)
+    findings: dict[str, dict[str, str]] = {}
     verdicts: dict[str, list[str]] = {"Higher success": [], "Lower success": [], "No difference seen": []}
-    for experiment, by_kind in findings.items():
-        for kind, runs in by_kind.items():
-            found = " ".join(compared(runs, recipe, data) for data in sets)
-            verdict = (
-                "Lower success" if "below" in found else "Higher success" if "above" in found else "No difference seen"
-            )
-            verdicts[verdict].append(f"`{experiment}{' ' if kind else ''}{kind}`")
+    for (experiment, kind), runs in kinds.items():
+        found = ", ".join(f"{data} {compared(runs, recipe, data)}" for data in sets)
+        verdict = "Lower success" if "(below)" in found else "Higher success" if "(above)" in found else None
+        verdicts[verdict or "No difference seen"].append(f"`{experiment}{' ' if kind else ''}{kind}`")
+        findings.setdefault(experiment, {})[kind] = found
+    rates = [[percent(row, data)[0] for row in recipe] for data in sets]
     return {
         "updates": updates_of(rows),
         "seeds": len(recipe),
         "spread": max(max(values) - min(values) for values in rates),
         "table": markdown_table(["Run", *(f"{data} (%)" for data in sets)], lines),
         "verdicts": verdicts,
-        "findings": [
-            {
-                "experiment": experiment,
-                "claim": claim(experiment),
-                "found": {
-                    kind: ", ".join(f"{data} {compared(runs, recipe, data)}" for data in sets)
-                    for kind, runs in by_kind.items()
-                },
-            }
-            for experiment, by_kind in findings.items()
-        ],
+        "findings": [{"experiment": name, "claim": claim(name), "found": found} for name, found in findings.items()],
     }
 
 

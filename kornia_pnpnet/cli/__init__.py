@@ -1,9 +1,10 @@
-"""The command ``pnpnet``: one module per command, with the command's arguments and its action.
+"""The command ``pnpnet``: one module per command.
 
 To add a command, write a module whose docstring is the command's help (the first line its summary), with
-``add_arguments(parser)`` and ``run(arguments)``, which returns the exit code. Register the module in :data:`COMMANDS`.
+``run(arguments)``, which returns the exit code. Register the module in :data:`COMMANDS`, and its arguments in
+:data:`kornia_pnpnet.cli.arguments.ARGUMENTS`.
 PyTorch takes seconds to import: modules of commands import what needs PyTorch inside ``run``, so that wrong arguments
-and missing files are told at once.
+and missing files are reported at once.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from types import ModuleType
 
 from kornia_pnpnet import __version__
 from kornia_pnpnet.cli import demo, evaluate, export, listing, solve
-from kornia_pnpnet.cli.arguments import OneLineParser
+from kornia_pnpnet.cli.arguments import ARGUMENTS, OneLineParser
 
 __all__ = ["COMMANDS", "main", "make_parser"]
 
@@ -35,14 +36,10 @@ def make_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", dest="command", required=True)
     for name, command in COMMANDS.items():
         text = command.__doc__ or ""
-        command.add_arguments(
-            commands.add_parser(
-                name,
-                help=text.partition("\n")[0].rstrip("."),
-                description=text,
-                formatter_class=argparse.RawDescriptionHelpFormatter,
-            )
-        )
+        help_, form = text.partition("\n")[0].rstrip("."), argparse.RawDescriptionHelpFormatter
+        added = commands.add_parser(name, help=help_, description=text, formatter_class=form)
+        for argument, about in ARGUMENTS[name].items():
+            added.add_argument(argument, **about)
     return parser
 
 
@@ -58,8 +55,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         arguments = make_parser().parse_args(argv)
     except OSError as error:
-        print(f"pnpnet: {_one_line(error)}", file=sys.stderr)
-        return 2
+        return _failed(_one_line(error))
     from kornia.core.exceptions import BaseError
 
     from kornia_pnpnet.core.performance import keep_freed_memory
@@ -68,16 +64,18 @@ def main(argv: list[str] | None = None) -> int:
     try:
         return COMMANDS[arguments.command].run(arguments)
     except (BaseError, OSError, ImportError, ValueError) as error:
-        print(f"pnpnet: {_one_line(error)}", file=sys.stderr)
-        return 2
+        return _failed(_one_line(error))
     except (MemoryError, RuntimeError) as error:
         if not isinstance(error, MemoryError) and "allocate" not in str(error):
             raise
-        print(f"pnpnet: not enough memory for so much at once: {_one_line(error)}", file=sys.stderr)
-        return 2
+        return _failed(f"not enough memory for so much at once: {_one_line(error)}")
     except KeyboardInterrupt:
-        print("pnpnet: interrupted", file=sys.stderr)
-        return 130
+        return _failed("interrupted", 130)
+
+
+def _failed(reason: str, code: int = 2) -> int:
+    print(f"pnpnet: {reason}", file=sys.stderr)
+    return code
 
 
 def _one_line(error: Exception) -> str:

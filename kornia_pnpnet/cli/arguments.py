@@ -1,4 +1,4 @@
-"""What several commands share: a parser with one-line errors, types of arguments, and the choice of a solver."""
+"""The arguments of all commands as one table, the parser that reads them, and the choice of a solver."""
 
 from __future__ import annotations
 
@@ -12,16 +12,10 @@ from typing import TYPE_CHECKING, Any, NoReturn
 if TYPE_CHECKING:
     from torch import nn
 
-__all__ = [
-    "OneLineParser",
-    "add_arbitrary_unit",
-    "counts",
-    "existing_path",
-    "load_solver_without_truth",
-    "picture_path",
-    "positive_float",
-    "whole_number",
-]
+__all__ = ["ARGUMENTS", "SYNTHETIC", "OneLineParser", "load_solver_without_truth"]
+
+#: Names of synthetic data for ``--data``.
+SYNTHETIC = ("synthetic", "gaussian_pose", "any_rotation", "slab", "mixed")
 
 _PICTURES = (".pdf", ".png", ".svg")
 
@@ -38,8 +32,11 @@ class OneLineParser(argparse.ArgumentParser):
         self.exit(2, f"pnpnet: {' '.join(message.split())} (see {self.prog} --help)\n")
 
 
-def whole_number(low: int, high: int = 10**8) -> Callable[[str], int]:
-    """Make a parser of integers from ``low`` to ``high``; more problems or pairs than the default fill no memory."""
+# -- types of arguments ------------------------------------------------------------------------------------------------
+
+
+def _whole(low: int, high: int = 10**8) -> Callable[[str], int]:
+    """A parser of integers from ``low`` to ``high``; more problems or pairs than the default fill no memory."""
 
     def parse(text: str) -> int:
         if not text.isdecimal() or not low <= int(text[:20]) <= high:
@@ -49,13 +46,12 @@ def whole_number(low: int, high: int = 10**8) -> Callable[[str], int]:
     return parse
 
 
-def counts(text: str) -> list[int]:
-    """Parse integers of at least 1 separated by commas, without duplicates."""
-    return list(dict.fromkeys(whole_number(1)(part.strip()) for part in text.split(",")))
+def _counts(text: str) -> list[int]:
+    """Integers of at least 1 separated by commas, without duplicates."""
+    return list(dict.fromkeys(_whole(1)(part.strip()) for part in text.split(",")))
 
 
-def positive_float(text: str) -> float:
-    """Parse a finite number above 0."""
+def _positive(text: str) -> float:
     try:
         value = float(text)
     except ValueError:
@@ -65,26 +61,133 @@ def positive_float(text: str) -> float:
     return value
 
 
-def existing_path(text: str) -> str:
-    """Parse the path of a file or a folder; ``OSError`` where there is none."""
+def _seconds(text: str) -> float:
+    return 0.0 if text in ("0", "0.0") else _positive(text)
+
+
+def _focal(text: str) -> dict[str, Any]:
+    """Options of :class:`~kornia_pnpnet.PnPNet`."""
+    return {"focal": text} if text in ("known", "unknown") else {"focal": "unknown", "focal_sigma": _positive(text)}
+
+
+def _path(text: str) -> str:
+    """A file or a folder; ``OSError`` where there is none."""
     Path(text).stat()
     return text
 
 
-def picture_path(text: str) -> Path:
-    """Parse the path of a picture, whose ending gives the format."""
+def _source(text: str) -> str:
+    return text if text in SYNTHETIC else _path(text)
+
+
+def _picture(text: str) -> Path:
+    """A picture, whose ending gives the format."""
     if Path(text).suffix.lower() not in _PICTURES:
         raise argparse.ArgumentTypeError(f"expected a file ending in {', '.join(_PICTURES)}, got {text!r}")
     return Path(text)
 
 
-def add_arbitrary_unit(parser: argparse.ArgumentParser) -> None:
-    """Add ``--arbitrary-unit``, for scenes of unknown scale."""
-    parser.add_argument(
-        "--arbitrary-unit",
-        action="store_true",
-        help="the scene is not in metres: success needs a translation error below 0.5 %% of the median depth",
-    )
+# -- the table ---------------------------------------------------------------------------------------------------------
+
+
+def _arg(help_: str, metavar: str | None = None, **more: Any) -> dict[str, Any]:
+    """What argparse takes about an argument. Its help ends with its default."""
+    return {"help": f"{help_}; default: %(default)s" if "default" in more else help_, "metavar": metavar, **more}
+
+
+def _flag(help_: str) -> dict[str, Any]:
+    return {"help": help_, "action": "store_true"}
+
+
+_PROBLEMS = _arg("problems per set", "COUNT", type=_whole(1), default=1000)
+_UNIT = _flag("the scene is not in metres: success needs a translation error below 0.5 %% of the median depth")
+_SOLVER = _arg("a name of `pnpnet list`, or a folder of weights", "NAME", default="pnpnet-set")
+#: The arguments of each command.
+ARGUMENTS: dict[str, dict[str, dict[str, Any]]] = {
+    "solve": {
+        "file": _arg(
+            "CSV with the header X,Y,Z,u,v and optionally weight, or NPZ with world_points (N, 3), img_points (N, 2) "
+            "and optionally weights (N,) and intrinsics (3, 3)",
+            "FILE",
+            nargs="+",
+            type=_path,
+        ),
+        "--intrinsics": _arg("the camera in pixels; replaces the intrinsics of an NPZ file", "fx,fy,cx,cy"),
+        "--camera": _arg(
+            "a distorted camera as in COLMAP's cameras.txt, in place of --intrinsics, for example "
+            "SIMPLE_RADIAL,1920,1080,1500,960,540,-0.02; errors are those of undistorted pixels",
+            "MODEL,w,h,PARAMS",
+        ),
+        "--focal": _arg(
+            "estimate the focal length; SIGMA: that of the intrinsics is right up to this share, such as 0.1",
+            "known|unknown|SIGMA",
+            type=_focal,
+        ),
+        "--solver": _SOLVER,
+        "--plot": _arg("draw pixels, reprojections and rejected correspondences", "PNG", type=_picture),
+        "--threshold": _arg(
+            "reject correspondences with a larger reprojection error; default: a robust estimate of three standard "
+            "deviations, at least 3 px",
+            "PX",
+            type=_positive,
+        ),
+        "--batch": _flag("FILE are shards of many problems, or folders of shards"),
+        "--out": _arg("where --batch writes poses; default: outputs/poses", "FOLDER"),
+        "--batch-size": _arg("problems per call", "B", type=_whole(1), default=10_000),
+        "--overwrite": _flag("replace the picture; with --batch also solve the shards that have results"),
+    },
+    "evaluate": {
+        "--solver": _arg(
+            "names of `pnpnet list`, with options after a colon (opencv-ransac:threshold=12,iterations=100), or "
+            "folders of weights; solvers for another n are skipped; default: all installed "
+            "solvers for these n, and the bounds",
+            "NAME",
+            nargs="+",
+            action="extend",
+        ),
+        "--data": _arg(
+            f"{', '.join(SYNTHETIC)}, a folder with a COLMAP model, or an .npz file of matches; default: synthetic",
+            "DATA",
+            nargs="+",
+            action="extend",
+            type=_source,
+        ),
+        "--n": _arg("numbers of correspondences per problem, separated by commas", "LIST", type=_counts, default="9"),
+        "--outliers": _arg(
+            "none, uniform (0 to n/3 per problem), numbers or shares like 50%%, separated by commas",
+            "LIST",
+            default="none,uniform",
+        ),
+        "--mismatches-only": _flag(
+            "every outlier is the pixel of another point; default: half of the outliers, the others are random pixels"
+        ),
+        "--problems": _PROBLEMS,
+        "--seed": _arg("of the problems; default: that of the published results", type=_whole(0, 2**63 - 1)),
+        "--dtype": _arg("of the problems", choices=("float32", "float64"), default="float32"),
+        "--arbitrary-unit": _UNIT,
+        "--out": _arg("the results file", "JSON", default="outputs/results.json"),
+        "--overwrite": _flag("replace the results file instead of continuing it"),
+        "--plot": _arg("draw success rates and error curves into this folder", "FOLDER"),
+    },
+    "export": {
+        "file": _arg("the file to write, .onnx or .pt2", "FILE"),
+        "--solver": _SOLVER,
+        "--n": _arg("correspondences per problem; default: any number", "N", type=_whole(1)),
+        "--batch": _arg("problems per call; default: any number", "B", type=_whole(1)),
+        "--rig": _flag("for rigs: several cameras with one pose"),
+        "--overwrite": _flag("replace the file"),
+    },
+    "list": {},
+    "demo": {
+        "--data": _arg("a COLMAP model or an .npz file of matches instead of random problems", "FOLDER", type=_path),
+        "--arbitrary-unit": _UNIT,
+        "--out": _arg("where results and pictures go", "FOLDER", default="outputs/demo"),
+        "--problems": _PROBLEMS,
+        "--train-seconds": _arg(
+            "approximate duration of the training; 0 skips the training", "SECONDS", type=_seconds, default=60.0
+        ),
+    },
+}
 
 
 def load_solver_without_truth(name: str) -> nn.Module:

@@ -68,8 +68,7 @@ def camera_matrix(text: str) -> Tensor:
         fx, fy, cx, cy = (float(part) for part in text.split(","))
     except ValueError:
         raise InputError("--intrinsics", f"expected four numbers fx,fy,cx,cy, got {text!r}") from None
-    matrix = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    return _pinhole(matrix, "--intrinsics")
+    return _pinhole(torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64), "--intrinsics")
 
 
 def _pinhole(matrix: Tensor, source: str | Path) -> Tensor:
@@ -103,38 +102,38 @@ def read_correspondences(path: str | Path) -> ImageCorrespondences:
 
 def _read_csv(path: Path, content: bytes) -> ImageCorrespondences:
     try:
-        text = content.decode("utf-8-sig")
+        reader = csv.reader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True)
     except UnicodeDecodeError as error:
         raise InputError(path, "not a text file in UTF-8", content[: error.start].count(b"\n") + 1) from None
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     try:
         lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
     except csv.Error as error:
         raise InputError(path, f"not a CSV file: {error}", reader.line_num) from None
-    lines = [(line, cells) for line, cells in lines if any(cells)]
-    (header_line, header), *rows = lines or [(1, [""])]
-    columns = [*_COLUMNS, "weight"] if "weight" in header else [*_COLUMNS]
+    (header_line, header), *rows = [(line, cells) for line, cells in lines if any(cells)] or [(1, [""])]
+    columns = [*_COLUMNS, *(["weight"] if "weight" in header else [])]
     if any(header.count(column) != 1 for column in columns):
         found = ",".join(header)[:60]
         raise InputError(path, f"expected the header {','.join(_COLUMNS)}, each once, found {found!r}", header_line)
-    numbers = []
-    for line, cells in rows:
+    table = np.empty((len(rows), len(columns)))
+    for number, (line, cells) in enumerate(rows):
         if len(cells) != len(header):
             raise InputError(path, f"{len(cells)} values, but the header has {len(header)} columns", line)
-        numbers.append([_number(path, line, column, cells[header.index(column)]) for column in columns])
-    table = torch.tensor(numbers, dtype=torch.float64).reshape(-1, len(columns))
-    return ImageCorrespondences(table[:, :3], table[:, 3:5], table[:, 5] if "weight" in columns else None)
+        named = dict(zip(header, cells, strict=True))
+        for index, column in enumerate(columns):
+            table[number, index] = value = _number(named[column])
+            least = 0.0 if column == "weight" else -math.inf
+            if not (math.isfinite(value) and value >= least):
+                wanted = "a number of at least 0" if column == "weight" else "a finite number"
+                raise InputError(path, f"{column} must be {wanted}, got {named[column][:40]!r}", line)
+    world_points, img_points, weights = torch.from_numpy(table).tensor_split((3, 5), 1)
+    return ImageCorrespondences(world_points, img_points, weights[:, 0] if "weight" in columns else None)
 
 
-def _number(path: Path, line: int, column: str, cell: str) -> float:
+def _number(cell: str) -> float:
     try:
-        value = float(cell)
+        return float(cell)
     except ValueError:
-        value = math.nan
-    if not math.isfinite(value) or (column == "weight" and value < 0):
-        wanted = "a number of at least 0" if column == "weight" else "a finite number"
-        raise InputError(path, f"{column} must be {wanted}, got {cell[:40]!r}", line)
-    return value
+        return math.nan
 
 
 def _read_npz(path: Path) -> ImageCorrespondences:

@@ -14,8 +14,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kornia_pnpnet.cli.arguments import add_arbitrary_unit, existing_path, positive_float, whole_number
-
 if TYPE_CHECKING:
     from torch import nn
 
@@ -23,28 +21,6 @@ if TYPE_CHECKING:
 
 _N = 9
 _SOLVERS = ("pnpnet-set", f"pnpnet-n{_N}", "opencv-ransac", "poselib")
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of ``pnpnet demo``."""
-    parser.add_argument(
-        "--data",
-        metavar="FOLDER",
-        type=existing_path,
-        help="a COLMAP model or an .npz file of matches instead of random problems",
-    )
-    add_arbitrary_unit(parser)
-    parser.add_argument("--out", metavar="FOLDER", default="outputs/demo", help="default: outputs/demo")
-    parser.add_argument(
-        "--problems", metavar="COUNT", type=whole_number(1), default=1000, help="problems per set; default: 1000"
-    )
-    parser.add_argument(
-        "--train-seconds",
-        metavar="SECONDS",
-        type=lambda text: 0.0 if text in ("0", "0.0") else positive_float(text),
-        default=60.0,
-        help="approximate duration of the training; 0 skips the training; default: 60",
-    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -56,13 +32,11 @@ def run(arguments: argparse.Namespace) -> int:
     from kornia_pnpnet.evaluation.plots import plot_errors, plot_success, plot_training
     from kornia_pnpnet.evaluation.problem_sets import evaluation_sets
 
-    sources = [arguments.data or "synthetic"]
+    sources, count, metric = [arguments.data or "synthetic"], arguments.problems, not arguments.arbitrary_unit
     specs = {name.partition(":")[0]: name for name in default_solvers(_N, sources)}
     for missing in sorted({*_SOLVERS} - {*specs}):
         print(f"pnpnet: the demo runs without {missing}, which is not installed", file=sys.stderr)
-    outliers = "none,2" if arguments.data else "none,uniform"
-    count, metric = arguments.problems, not arguments.arbitrary_unit
-    sets = evaluation_sets(sources, outliers, n=_N, count=count, metric=metric)
+    sets = evaluation_sets(sources, "none,2" if arguments.data else "none,uniform", n=_N, count=count, metric=metric)
     solvers = {specs[name]: load_solver(specs[name]) for name in _SOLVERS if name in specs}
     # The tensors are small: more threads gain nothing, and lose much when another process computes at the same time.
     torch.set_num_threads(1)
@@ -71,14 +45,12 @@ def run(arguments: argparse.Namespace) -> int:
     print(format_table(results), flush=True)
     folder = Path(arguments.out)
     save_results(results, folder / "results.json")
-    files = [folder / "results.json"]
-    files += [plot_success(folder / "success.png", results), plot_errors(folder / "errors.png", results)]
+    files = [plot_success(folder / "success.png", results), plot_errors(folder / "errors.png", results)]
     files.append(_draw_one(folder / "problem.png", *next(iter(solvers.items())), list(sets.values())[-1]))
-    if arguments.train_seconds > 0:
-        history = _train(arguments.train_seconds, folder / "training")
-        if history is not None:
-            files.append(plot_training(folder / "training.png", history))
-    print("\nSaved:", *files, sep="\n  ")
+    history = _train(arguments.train_seconds, folder / "training") if arguments.train_seconds > 0 else None
+    if history is not None:
+        files.append(plot_training(folder / "training.png", history))
+    print("\nSaved:", folder / "results.json", *files, sep="\n  ")
     print(f"\n{verdict(results)}")
     return 0
 
@@ -90,14 +62,14 @@ def verdict(results: Mapping[str, Any]) -> str:
     """
     sentences = []
     for data in results["data"]:
-        rows = [row for row in results["rows"] if row["data"] == data]
-        texts = [
-            f"{row['solver']} ({100 * row['success']['rate']:.1f} %, {row['us_per_problem']:.0f} µs per problem)"
-            for row in rows
-        ]
-        best = max(row["success"]["rate"] for row in rows)
-        most = [text for row, text in zip(rows, texts, strict=True) if row["success"]["high"] >= best]
-        fastest = texts[min(range(len(rows)), key=lambda i: rows[i]["us_per_problem"])]
+        rows = {
+            f"{row['solver']} ({100 * row['success']['rate']:.1f} %, {row['us_per_problem']:.0f} µs per problem)": row
+            for row in results["rows"]
+            if row["data"] == data
+        }
+        best = max(row["success"]["rate"] for row in rows.values())
+        most = [text for text, row in rows.items() if row["success"]["high"] >= best]
+        fastest = min(rows, key=lambda text: rows[text]["us_per_problem"])
         second = "was" if most == [fastest] else f"{fastest} was"
         sentences.append(f'on "{data}", {" and ".join(most)} solved the most problems and {second} the fastest')
     return f"In short: {'; '.join(sentences)}."
@@ -111,13 +83,12 @@ def _draw_one(path: Path, name: str, solver: nn.Module, entry: EvaluationData) -
     from kornia_pnpnet.evaluation.plots import plot_pose
 
     outliers = (~entry.problems.inliers).sum(-1)
-    index = int((outliers == outliers.max()).int().argmax())
-    problem = entry.problems.map(lambda part: part[index : index + 1])
+    index = int(outliers.argmax())
+    world_points, img_points, intrinsics = (x[index] for x in entry.problems[:3])
     with torch.no_grad():
-        result = solver(*problem[:3])
-    found = reproject(problem.world_points[0], problem.img_points[0], problem.intrinsics[0], result.pose)
-    title = f"{name}, {int(outliers[index])} outliers"
-    return plot_pose(path, problem.img_points[0], found.pixels, found.rejected, title)
+        pose = solver(world_points[None], img_points[None], intrinsics[None]).pose
+    found = reproject(world_points, img_points, intrinsics, pose)
+    return plot_pose(path, img_points, found.pixels, found.rejected, f"{name}, {int(outliers[index])} outliers")
 
 
 def _train(seconds: float, folder: Path) -> Path | None:

@@ -13,64 +13,6 @@ import argparse
 import sys
 from pathlib import Path
 
-from kornia_pnpnet.cli.arguments import add_arbitrary_unit, counts, existing_path, whole_number
-
-#: Names of synthetic data for ``--data``.
-SYNTHETIC = ("synthetic", "gaussian_pose", "any_rotation", "slab", "mixed")
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of ``pnpnet evaluate``."""
-    parser.add_argument(
-        "--solver",
-        metavar="NAME",
-        nargs="+",
-        action="extend",
-        help="names of `pnpnet list`, with options after a colon (opencv-ransac:threshold=12,iterations=100), or "
-        "folders of weights; solvers for another n are skipped; default: all installed solvers for these n, and the "
-        "bounds",
-    )
-    parser.add_argument(
-        "--data",
-        metavar="DATA",
-        nargs="+",
-        action="extend",
-        type=lambda text: text if text in SYNTHETIC else existing_path(text),
-        help=f"{', '.join(SYNTHETIC)}, a folder with a COLMAP model, or an .npz file of matches; default: synthetic",
-    )
-    parser.add_argument(
-        "--n",
-        metavar="LIST",
-        type=counts,
-        default=[9],
-        help="numbers of correspondences per problem, separated by commas; default: 9",
-    )
-    parser.add_argument(
-        "--outliers",
-        metavar="LIST",
-        default="none,uniform",
-        help="none, uniform (0 to n/3 per problem), numbers or shares like 50%%, separated by commas; "
-        "default: none,uniform",
-    )
-    parser.add_argument(
-        "--mismatches-only",
-        action="store_true",
-        help="every outlier is the pixel of another point; default: half of the outliers, the others are random pixels",
-    )
-    parser.add_argument(
-        "--problems", metavar="COUNT", type=whole_number(1), default=1000, help="problems per set; default: 1000"
-    )
-    parser.add_argument(
-        "--seed",
-        type=whole_number(0, 2**63 - 1),
-        help="seed of the problems; default: that of the published results",
-    )
-    parser.add_argument("--dtype", choices=("float32", "float64"), default="float32", help="default: float32")
-    add_arbitrary_unit(parser)
-    parser.add_argument("--out", metavar="JSON", default="outputs/results.json", help="default: outputs/results.json")
-    parser.add_argument("--overwrite", action="store_true", help="replace the results file instead of continuing it")
-    parser.add_argument("--plot", metavar="FOLDER", help="draw success rates and error curves into this folder")
-
 
 def run(arguments: argparse.Namespace) -> int:
     """Evaluate the solvers; print the table and the path of the results."""

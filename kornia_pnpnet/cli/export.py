@@ -14,19 +14,7 @@ import argparse
 import warnings
 from pathlib import Path
 
-from kornia_pnpnet.cli.arguments import load_solver_without_truth, whole_number
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of ``pnpnet export``."""
-    parser.add_argument("file", metavar="FILE", help="the file to write, .onnx or .pt2")
-    parser.add_argument("--solver", metavar="NAME", default="pnpnet-set", help="default: pnpnet-set")
-    parser.add_argument(
-        "--n", metavar="N", type=whole_number(1), help="correspondences per problem; default: any number"
-    )
-    parser.add_argument("--batch", metavar="B", type=whole_number(1), help="problems per call; default: any number")
-    parser.add_argument("--rig", action="store_true", help="for rigs: several cameras with one pose")
-    parser.add_argument("--overwrite", action="store_true", help="replace the file")
+from kornia_pnpnet.cli.arguments import load_solver_without_truth
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -28,10 +28,6 @@ _WHAT = {
 }
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """``pnpnet list`` has no arguments."""
-
-
 def run(_: argparse.Namespace) -> int:
     """Print what each solver is, and the package that it needs where it is not installed."""
     from kornia_pnpnet import list_solvers, shipped_weights

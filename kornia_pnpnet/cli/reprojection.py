@@ -20,13 +20,13 @@ _MIN_LIMIT_PX = 3.0
 
 
 class Reprojection(NamedTuple):
-    r"""The correspondences of one image under a pose.
+    """The correspondences of one image under a pose.
 
     Attributes:
-        pixels: projections of the world points, shape :math:`(N, 2)`; NaN where a point is not in front of the camera.
-        errors_px: reprojection errors in pixels, shape :math:`(N,)`; NaN where ``pixels`` is NaN.
-        limit_px: largest error in pixels of a correspondence that is not rejected.
-        rejected: whether the error is NaN or above the limit, shape :math:`(N,)`, bool.
+        pixels: projections of the world points, (N, 2); NaN where a point is not in front of the camera.
+        errors_px: reprojection errors, (N,); NaN where ``pixels`` is NaN.
+        limit_px: largest error of a correspondence that is not rejected.
+        rejected: whether the error is NaN or above the limit, (N,), bool.
     """
 
     pixels: Tensor

@@ -32,9 +32,9 @@ _NUMBERS_AT_ONCE = 2**25
 
 
 class ShardReport(NamedTuple):
-    """What a run over shards solved: problems with a pose, all problems, and shards.
+    """Numbers of problems with a pose, of all problems, of shards that were solved and that had results before.
 
-    ``kept`` counts the shards that had results before; ``failed`` has a line for each shard that cannot be read.
+    ``failed`` has a line for each shard that cannot be read.
     """
 
     solved: int
@@ -73,9 +73,6 @@ def solve_shards(
         overwrite: also solve the shards that have results.
         progress: show a progress bar on stderr, where stderr is a terminal and tqdm is installed.
 
-    Returns:
-        The :class:`ShardReport`.
-
     Raises:
         InputError: when there is no shard, two results would have the same name, ``out`` holds the shards themselves,
             or a shard has results of another solver.
@@ -88,16 +85,15 @@ def solve_shards(
     for target in targets:
         if target not in waiting and _solver_of(target) != mark:
             raise InputError(target, f"not of this {name}: choose another folder, or replace it with --overwrite")
-    solved, problems, failed = 0, 0, []
+    counts, failed = [], []
     with _bar(waiting.values(), progress) as bar:
         for target, shard in waiting.items():
             try:
-                ok, count = _solve_shard(solve, shard, target, mark, batch, bar)
+                counts.append(_solve_shard(solve, shard, target, mark, batch, bar))
             except InputError as error:
                 failed.append(str(error))
-                continue
-            solved, problems = solved + ok, problems + count
-    return ShardReport(solved, problems, len(waiting) - len(failed), len(targets) - len(waiting), failed)
+    solved, problems = (sum(numbers) for numbers in zip((0, 0), *counts, strict=True))
+    return ShardReport(solved, problems, len(counts), len(targets) - len(waiting), failed)
 
 
 def _find(sources: Sequence[str | Path], out: Path) -> list[Path]:
@@ -150,10 +146,11 @@ def _solve_shard(solve: Solve, shard: Path, target: Path, mark: bytes, batch: in
                 raise InputError(shard, str(error)) from None
 
     results = solved_tables()
-    first = next(results)
-    solved = count = 0
-    schema = first.schema.with_metadata({_SOLVER: mark})
-    with atomic_open(target, "wb") as file, parquet.ParquetWriter(file, schema) as writer:
+    first, solved, count = next(results), 0, 0
+    with (
+        atomic_open(target, "wb") as file,
+        parquet.ParquetWriter(file, first.schema.with_metadata({_SOLVER: mark})) as writer,
+    ):
         for result in chain([first], results):
             writer.write_table(result)
             solved, count = solved + (compute.sum(result["ok"]).as_py() or 0), count + len(result)
@@ -175,8 +172,7 @@ def _tables(shard: Path, batch: int) -> Iterator[pa.Table]:
             rows = min(batch, max(_NUMBERS_AT_ONCE // max([*numbers, 1]), 1))
             if not file.metadata.num_rows:
                 yield file.schema_arrow.empty_table()
-            for part in file.iter_batches(rows):
-                yield pa.Table.from_batches([part])
+            yield from (pa.Table.from_batches([part]) for part in file.iter_batches(rows))
     except Exception as error:  # Arrow raises half a dozen types of errors for broken files
         raise InputError(shard, f"not a Parquet file of problems: {error}") from None
 

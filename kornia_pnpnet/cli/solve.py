@@ -25,15 +25,9 @@ import json
 import math
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from kornia_pnpnet.cli.arguments import (
-    existing_path,
-    load_solver_without_truth,
-    picture_path,
-    positive_float,
-    whole_number,
-)
+from kornia_pnpnet.cli.arguments import load_solver_without_truth
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -49,66 +43,6 @@ _ADVICE = {
 }
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of ``pnpnet solve``."""
-    parser.add_argument(
-        "file",
-        metavar="FILE",
-        nargs="+",
-        type=existing_path,
-        help="CSV with the header X,Y,Z,u,v and optionally weight, or NPZ with world_points (N, 3), img_points (N, 2) "
-        "and optionally weights (N,) and intrinsics (3, 3)",
-    )
-    parser.add_argument(
-        "--intrinsics", metavar="fx,fy,cx,cy", help="the camera in pixels; replaces the intrinsics of an NPZ file"
-    )
-    parser.add_argument(
-        "--camera",
-        metavar="MODEL,w,h,PARAMS",
-        help="a distorted camera as in COLMAP's cameras.txt, in place of --intrinsics, for example "
-        "SIMPLE_RADIAL,1920,1080,1500,960,540,-0.02; errors are those of undistorted pixels",
-    )
-    parser.add_argument(
-        "--focal",
-        metavar="known|unknown|SIGMA",
-        type=_focal,
-        help="estimate the focal length; SIGMA: that of the intrinsics is right up to this share, such as 0.1",
-    )
-    parser.add_argument(
-        "--solver",
-        metavar="NAME",
-        default="pnpnet-set",
-        help="a name of `pnpnet list`, or a folder of weights; default: %(default)s",
-    )
-    parser.add_argument(
-        "--plot", metavar="PNG", type=picture_path, help="draw pixels, reprojections and rejected correspondences"
-    )
-    parser.add_argument(
-        "--threshold",
-        metavar="PX",
-        type=positive_float,
-        help="reject correspondences with a larger reprojection error; default: a robust estimate of three standard "
-        "deviations, at least 3 px",
-    )
-    parser.add_argument("--batch", action="store_true", help="FILE are shards of many problems, or folders of shards")
-    parser.add_argument("--out", metavar="FOLDER", help="where --batch writes poses; default: outputs/poses")
-    parser.add_argument(
-        "--batch-size", metavar="B", type=whole_number(1), default=10_000, help="problems per call; default: 10000"
-    )
-    parser.add_argument(
-        "--overwrite",
-        action="store_true",
-        help="replace the picture; with --batch also solve the shards that have results",
-    )
-
-
-def _focal(text: str) -> dict[str, Any]:
-    """Options of a solver from ``--focal``."""
-    if text in ("known", "unknown"):
-        return {"focal": text}
-    return {"focal": "unknown", "focal_sigma": positive_float(text)}
-
-
 def _load_solver(arguments: argparse.Namespace) -> nn.Module:
     from kornia_pnpnet.solver import PnPNet
 
@@ -117,8 +51,7 @@ def _load_solver(arguments: argparse.Namespace) -> nn.Module:
         return solver
     if not isinstance(solver, PnPNet):
         raise ValueError(f"--focal: {arguments.solver} does not estimate focal lengths")
-    options: dict[str, Any] = {"views": solver.views, "gradient": solver.gradient, "effort": solver.effort}
-    return PnPNet(solver.init, solver.refine, solver.normalize, **options, **arguments.focal).eval()
+    return solver.with_options(**arguments.focal).eval()
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -139,11 +72,10 @@ def _solve_batch(arguments: argparse.Namespace, camera: Tensor | None) -> int:
     from kornia_pnpnet.arrow import Solve
     from kornia_pnpnet.cli.shards import solve_shards
 
-    out, again = arguments.out or "outputs/poses", arguments.overwrite
-    solve = Solve(_load_solver(arguments), intrinsics=camera)
-    options = {"name": arguments.solver, "batch": arguments.batch_size, "overwrite": again, "progress": True}
+    out, again, name = arguments.out or "outputs/poses", arguments.overwrite, arguments.solver
+    solve, size = Solve(_load_solver(arguments), intrinsics=camera), arguments.batch_size
     try:
-        report = solve_shards(solve, arguments.file, out, **options)
+        report = solve_shards(solve, arguments.file, out, name=name, batch=size, overwrite=again, progress=True)
     except KeyboardInterrupt:
         same = "the same command without --overwrite" if again else "the same command"
         print(f"pnpnet: interrupted; the shards solved so far are in {out}: {same} solves the others", file=sys.stderr)

@@ -26,8 +26,7 @@ _ITERATIONS = 10
 def _least_squares(problems: Problems, weights: Tensor, **noise: Any) -> PnPResult:
     """The minimum of the weighted squared reprojection errors next to the true pose."""
     solver = PnPNet(None, RobustWeightedLM(_ITERATIONS, robustness=0.0, reject_worse=False))
-    rig = problems.cam_from_rig
-    return solver(*problems[:3], weights, init=problems.pose, cam_from_rig=rig, **noise)
+    return solver(*problems[:3], weights, init=problems.pose, cam_from_rig=problems.cam_from_rig, **noise)
 
 
 class KnownInliers(Configured):
@@ -56,7 +55,7 @@ class KnownInliers(Configured):
         return _least_squares(problems, self.pair_weights(problems))
 
 
-class KnownInliersAndNoise(Configured):
+class KnownInliersAndNoise(KnownInliers):
     r"""Least squares as in :class:`KnownInliers`, with each inlier weighted by the inverse variance of its pixel.
 
     The noise of a world point moves the pixels of near points more than those of far points. With :math:`J_x` the
@@ -77,11 +76,9 @@ class KnownInliersAndNoise(Configured):
     """
 
     def __init__(self, *, img_sigma: float = 1.0, world_sigma: float = 0.05) -> None:
-        super().__init__(locals())
+        Configured.__init__(self, locals())
         check_numbers(0.0, img_sigma=img_sigma, world_sigma=world_sigma)
         KORNIA_CHECK(img_sigma + world_sigma > 0, "img_sigma and world_sigma must not both be 0.")
-        self.img_sigma = img_sigma
-        self.world_sigma = world_sigma
 
     @torch.no_grad()
     def pair_weights(self, problems: Problems) -> Tensor:
@@ -92,18 +89,17 @@ class KnownInliersAndNoise(Configured):
         cam_points = problems.true_cam_points
         depth = cam_points[..., 2:]
         depth = torch.where(depth > 0, depth, 1.0)  # pairs behind the camera have no weight in the solver
-        plane_points = cam_points[..., :2] / depth
         focal = problems.pair_intrinsics.diagonal(dim1=-2, dim2=-1)[..., :2]
         # J_x = (f / z) [1, 0, -p; 0, 1, -q] R; the rotation cancels in the trace.
-        trace = ((focal / depth).square() * (1.0 + plane_points.square())).sum(-1)  # (B, N)
-        variance = self.img_sigma**2 + self.world_sigma**2 * trace / 2.0
+        trace = ((focal / depth).square() * (1.0 + (cam_points[..., :2] / depth).square())).sum(-1)  # (B, N)
+        variance = self.config["img_sigma"] ** 2 + self.config["world_sigma"] ** 2 * trace / 2.0
         return torch.where(problems.inliers, variance.reciprocal(), 0.0)
 
     def solve_with_truth(self, problems: Problems) -> PnPResult:
-        """Solve problems with the help of their true poses and inliers."""
-        img_cov, world_cov = problems.img_cov, problems.world_cov
-        if img_cov is None and world_cov is None:
-            return _least_squares(problems, self.pair_weights(problems))
-        pixels = {"img_sigma": self.img_sigma} if img_cov is None else {"img_cov": img_cov}
-        points = {"world_sigma": self.world_sigma} if world_cov is None else {"world_cov": world_cov}
-        return _least_squares(problems, problems.inliers.to(problems.world_points.dtype), **pixels, **points)
+        """See :meth:`KnownInliers.solve_with_truth`."""
+        noise: dict[str, Any] = {}
+        for kind, cov in (("img", problems.img_cov), ("world", problems.world_cov)):
+            noise |= {f"{kind}_sigma": self.config[f"{kind}_sigma"]} if cov is None else {f"{kind}_cov": cov}
+        if not {"img_cov", "world_cov"} & noise.keys():
+            return super().solve_with_truth(problems)
+        return _least_squares(problems, KnownInliers().pair_weights(problems), **noise)

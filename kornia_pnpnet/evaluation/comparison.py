@@ -17,11 +17,11 @@ from torch import Tensor, nn
 
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.core.files import digest
-from kornia_pnpnet.core.trees import iter_tensors, map_tensors
+from kornia_pnpnet.core.trees import iter_tensors, map_tensors, take
 from kornia_pnpnet.data.stream import ProblemSource
 from kornia_pnpnet.evaluation.results import FORMAT, resume, save_results, source_digest
 from kornia_pnpnet.metrics import PoseErrors, pose_errors, success, success_rate
-from kornia_pnpnet.result import PnPResult, Pose, Problems
+from kornia_pnpnet.result import PnPResult, Pose, Problems, gate_pose
 from kornia_pnpnet.solver import PnPNet
 
 __all__ = ["EvaluationData", "SeesTruth", "draw_problems", "evaluate"]
@@ -66,8 +66,8 @@ def draw_problems(source: ProblemSource, count: int) -> Problems:
         count: number of problems, at least 1.
 
     Returns:
-        ``count`` problems: the source's batches 0, 1, ... one after the other, cut to length. With the same batch
-        size, a smaller count gives the first problems of a larger count.
+        The source's batches 0, 1, ... one after the other, cut to ``count`` problems. With the same batch size, a
+        smaller count gives the first problems of a larger count.
 
     Raises:
         ValueError: when ``count`` is below 1.
@@ -79,10 +79,9 @@ def draw_problems(source: ProblemSource, count: int) -> Problems:
     """
     if count < 1:
         raise ValueError(f"count must be at least 1, got {count}.")
-    batches = [source.batch(0)]
-    size = len(batches[0].world_points)
-    batches += [source.batch(index) for index in range(1, math.ceil(count / size))]
-    return map_tensors(lambda *parts: torch.cat(parts)[:count], *batches)
+    first = source.batch(0)
+    more = (source.batch(index) for index in range(1, math.ceil(count / len(first.world_points))))
+    return map_tensors(lambda *parts: torch.cat(parts)[:count], first, *more)
 
 
 def evaluate(
@@ -105,7 +104,7 @@ def evaluate(
 
     Args:
         solvers: by name, each called as ``solver(world_points, img_points, intrinsics)`` in evaluation mode, without
-            gradients. A bound (see :class:`SeesTruth`) also gets the true poses and inliers. A
+            gradients. A bound (see :class:`SeesTruth`) gets the problems with their truth. A
             :class:`~kornia_pnpnet.solver.PnPNet` gets the noise level where the problems have it
             (:attr:`~kornia_pnpnet.result.Problems.known`).
         data: problems by name. Each set is solved on its own device and in its own dtype.
@@ -132,22 +131,21 @@ def evaluate(
         >>> from kornia_pnpnet import create_solver
         >>> from kornia_pnpnet.data import SyntheticProblems
         >>> data = {"synthetic": EvaluationData(SyntheticProblems(n=9, batch_size=100, seed=0).batch(0))}
-        >>> results = evaluate({"mine": create_solver("epnp-lm")}, data, repeats=1)
-        >>> row = results["rows"][0]
+        >>> row = evaluate({"mine": create_solver("epnp-lm")}, data, repeats=1)["rows"][0]
         >>> row["success"]["total"], row["success"]["rate"] > 0.5
         (100, True)
     """
     from tqdm import tqdm
 
+    here = environment()
     results: dict[str, Any] = {
         "format": FORMAT,
-        "environment": environment(),
+        "environment": here,
         "code": source_digest(),
         "solvers": {name: _describe_solver(solver) for name, solver in solvers.items()},
         "data": {name: {**_describe(entry), "chunk": chunk} for name, entry in data.items()},
         "rows": [],
     }
-    here = results["environment"]
     if path is not None and not overwrite:
         results = resume(results, path)
     results["left_out"] = []
@@ -158,17 +156,17 @@ def evaluate(
     plan = list(product(data, solvers))
     done = {(row["data"], row["solver"]): row for row in results["rows"]}
     hidden = not (sys.stderr.isatty() if progress is None else progress)
-    for data_name, name in tqdm([names for names in plan if names not in done], disable=hidden, unit="run"):
-        row: dict[str, Any] = {"data": data_name, "solver": name}
+    for names in tqdm([names for names in plan if names not in done], disable=hidden, unit="run"):
+        row: dict[str, Any] = dict(zip(("data", "solver"), names, strict=True))
         try:
-            row |= _row(solvers[name], data[data_name], chunk, repeats)
+            row |= _row(solvers[row["solver"]], data[row["data"]], chunk, repeats)
         except ShapeError as error:
             results["left_out"].append({**row, "reason": str(error).splitlines()[0]})
         except Exception as error:
-            error.add_note(f"{name} on {data_name}")
+            error.add_note(f"{row['solver']} on {row['data']}")
             raise
         else:
-            done[data_name, name] = row | ({"environment": elsewhere} if elsewhere else {})
+            done[names] = row | ({"environment": elsewhere} if elsewhere else {})
             results["rows"] = [done[names] for names in plan if names in done]
         if path is not None:
             save_results(results, path)
@@ -178,7 +176,7 @@ def evaluate(
 def _describe_solver(solver: nn.Module) -> dict[str, Any]:
     config = getattr(solver, "config", None)
     config = config() if callable(config) else config
-    state = [value for value in solver.state_dict().values() if isinstance(value, Tensor)]
+    state = list(iter_tensors(list(solver.state_dict().values())))
     return {
         "class": type(solver).__name__,
         "config": config if isinstance(config, dict) else None,
@@ -212,25 +210,24 @@ def _row(solver: nn.Module, entry: EvaluationData, chunk: int, repeats: int) -> 
             errors, ok, seconds = _run(solver, entry.problems, chunk, repeats)
     finally:
         solver.train(was_training)
-    per_problem = {name: [_rounded(value) for value in values.tolist()] for name, values in errors._asdict().items()}
-    stored = PoseErrors(*(torch.tensor(values, dtype=torch.float64) for values in per_problem.values()))
-    rate = success_rate(success(stored, entry.max_rotation_deg, entry.max_translation))
+    lists = {name: [_rounded(value) for value in values.tolist()] for name, values in errors._asdict().items()}
+    stored = PoseErrors(*(torch.tensor(values, dtype=torch.float64) for values in lists.values()))
+    rate = success_rate(success(stored, entry.max_rotation_deg, entry.max_translation))._asdict()
     return {
-        "success": {name: value if name == "total" else _rounded(value) for name, value in rate._asdict().items()},
+        "success": {name: value if name == "total" else _rounded(value) for name, value in rate.items()},
         **{
             name: {key: _rounded(values.quantile(share).item()) for key, share in _QUARTILES.items()}
             for name, values in stored._asdict().items()
         },
         "ok": _rounded(ok.double().mean().item()),
         "us_per_problem": _rounded(1e6 * seconds),
-        "per_problem": {**per_problem, "ok": ok.int().tolist()},
+        "per_problem": {**lists, "ok": ok.int().tolist()},
     }
 
 
 def _run(solver: nn.Module, problems: Problems, chunk: int, repeats: int) -> tuple[PoseErrors, Tensor, float]:
     """Errors and ok of all problems, and the median time per problem in seconds."""
-    starts = range(0, len(problems.world_points), chunk)
-    chunks = [problems.map(lambda part, i=start: part[i : i + chunk]) for start in starts]  # type: ignore[misc]
+    chunks = [take(problems, slice(i, i + chunk)) for i in range(0, len(problems.world_points), chunk)]
     full = len(chunks[0].world_points)
     _timed(solver, chunks[0])
     compared, seconds = [], []
@@ -262,11 +259,9 @@ def _timed(solver: nn.Module, problems: Problems) -> tuple[PnPResult, float]:
 
 def _compare(result: PnPResult, truth: Pose) -> tuple[PoseErrors, Tensor]:
     """Errors in float64, and ok, on the CPU."""
-    pose, true = (map_tensors(lambda part: part.double().cpu(), pose) for pose in (result.pose, truth))
+    pose, true = map_tensors(lambda part: part.double().cpu(), (result.pose, truth))
     finite = pose.rotation.isfinite().flatten(1).all(-1) & pose.translation.isfinite().all(-1)
-    rotation = torch.where(finite[:, None, None], pose.rotation, torch.eye(3, dtype=torch.float64))
-    translation = torch.where(finite[:, None], pose.translation, 0.0)
-    return pose_errors(Pose(rotation, translation), true), result.ok.cpu() & finite
+    return pose_errors(gate_pose(pose, finite, finite), true), result.ok.cpu() & finite
 
 
 def _rounded(value: float) -> float:

@@ -15,9 +15,7 @@ __all__ = ["read_results"]
 
 _Quartiles = TypedDict("_Quartiles", {"q25": float, "median": float, "q75": float})
 _Rate = TypedDict("_Rate", {"rate": Share, "low": Share, "high": Share, "total": Count})
-_PerProblem = TypedDict(
-    "_PerProblem", {"rotation_error_deg": list[float], "translation_error": list[float], "ok": list[Share]}
-)
+_Lists = TypedDict("_Lists", {"rotation_error_deg": list[float], "translation_error": list[float], "ok": list[Share]})
 _Solver = TypedDict("_Solver", {"config": NotRequired[dict[str, Any] | None]})
 _Environment = TypedDict(
     "_Environment", {"versions": NotRequired[dict[str, str | None]], "commit": NotRequired[str | None]}
@@ -32,7 +30,7 @@ class _Row(TypedDict):
     translation_error: _Quartiles
     ok: Share
     us_per_problem: Positive
-    per_problem: NotRequired[_PerProblem]
+    per_problem: NotRequired[_Lists]
 
 
 class _ProblemSet(TypedDict):

@@ -6,6 +6,7 @@ import importlib.util
 import json
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from kornia.core.exceptions import ValueCheckError
 from torch import nn
@@ -29,15 +30,13 @@ _COMPETITORS = (
     *("ransac-epnp-lm", "p3p-ransac", "opencv-sqpnp", "opencv-epnp", "opencv-ransac", "opencv-usac"),
     *("kornia-rs", "poselib", "pycolmap"),
 )
-# Thresholds for real scenes, in px. Their points are sharper than those of the protocol. Tuned for the RANSAC of
-# OpenCV, PoseLib, pycolmap and ours, from 3 to 60 px, on five scenes with 0, 2 and 4 outliers in 9 pairs and problems
-# of another seed than the evaluation: success hardly changes between 6 and 20 px.
+# Thresholds of RANSAC in px and m, each the best of a grid on problems of another seed. Real scenes, whose points are
+# sharper than those of the protocol: from 3 to 60 px on five scenes with 0, 2 and 4 outliers in 9 pairs, where success
+# hardly changes between 6 and 20 px. Synthetic data, which the other solvers' defaults suit: three to five times the
+# noise, from 3 px and 0.15 m to 8 px and 0.4 m, within which success changes by one percentage point.
 _SCENE_OPTIONS = dict.fromkeys(
     ("ransac-epnp-lm", "p3p-ransac", "opencv-ransac", "opencv-usac", "poselib", "pycolmap"), "threshold=12"
 )
-# Thresholds of our RANSAC for the protocol's synthetic data, in px and m. They are three to five times its noise: the
-# best of a grid from 3 px and 0.15 m to 8 px and 0.4 m on problems of another seed, within which success changes by one
-# percentage point. The other solvers' defaults already suit these data.
 _PRIOR_OPTIONS = dict.fromkeys(("ransac-epnp-lm", "p3p-ransac"), "threshold=5,world_threshold=0.25")
 # Optional packages, by the prefix of the solvers that need them: the module and the package's name.
 _PACKAGES = {
@@ -65,18 +64,22 @@ def load_solver(spec: str) -> nn.Module:
     name, _, text = spec.partition(":")
     if name not in {*list_solvers(), *BOUNDS} and Path(spec).is_dir():
         return PnPNet.from_pretrained(spec)
-    options = {}
-    for key, _, value in (option.partition("=") for option in text.split(",") if option):
-        try:
-            options[key] = json.loads(value)
-        except ValueError:
-            options[key] = value
+    pairs = (option.partition("=") for option in text.split(",") if option)
+    options = {key: _value(word) for key, _, word in pairs}
     if name not in BOUNDS:
         return create_solver(name, **options)
     try:
         return BOUNDS[name](**options).eval()
     except TypeError as error:
         raise ValueCheckError(f"Bound {name!r} does not accept these options: {error}.") from error
+
+
+def _value(word: str) -> Any:
+    """A number, true, false or null as in JSON; any other word is a text."""
+    try:
+        return json.loads(word)
+    except ValueError:
+        return word
 
 
 def default_solvers(n: int | Iterable[int], sources: Iterable[str] = ("synthetic",)) -> list[str]:
@@ -95,14 +98,12 @@ def default_solvers(n: int | Iterable[int], sources: Iterable[str] = ("synthetic
     known = list_solvers()
     synthetic = any(source in PRIORS for source in sources)
     options = _PRIOR_OPTIONS if synthetic else _SCENE_OPTIONS
-    installed = [name for name in names if name in known and not missing_package(name)]
-    specs = [f"{name}:{options[name]}" if name in options else name for name in installed]
+    installed = (name for name in names if name in known and not missing_package(name))
+    specs = (f"{name}:{options[name]}" if name in options else name for name in installed)
     return [*specs, *(BOUNDS if synthetic else ["known-inliers"])]
 
 
 def missing_package(solver: str) -> str | None:
     """Return the name of the package that a solver needs and that is not installed, or ``None``."""
-    for prefix, (module, package) in _PACKAGES.items():
-        if solver.startswith(prefix) and importlib.util.find_spec(module) is None:
-            return package
-    return None
+    needed = (package for prefix, package in _PACKAGES.items() if solver.startswith(prefix))
+    return next((name for module, name in needed if importlib.util.find_spec(module) is None), None)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ try:
     from matplotlib.axes import Axes
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
-    from matplotlib.ticker import NullFormatter
+    from matplotlib.ticker import Formatter, LogLocator, NullFormatter
 except ImportError as error:
     raise ImportError("Pictures need matplotlib: pip install 'kornia_pnpnet[eval]'") from error
 
@@ -90,17 +91,16 @@ def plot_pose(path: str | Path, img_points: Tensor, reprojections: Tensor, rejec
 def plot_success(path: str | Path, results: Mapping[str, Any]) -> Path:
     """Draw the success of a results file with 95 % intervals: a panel for each data set, a row for each solver."""
     panels, colours = _panels(results)
-    lines = math.ceil(len(panels) / 3)
-    figure = make_figure(WIDTH, 0.5 + (0.7 + 0.17 * len(colours)) * lines, "Success with 95 % intervals")
+    names, lines = list(colours), math.ceil(len(panels) / 3)
+    figure = make_figure(WIDTH, 0.5 + (0.7 + 0.17 * len(names)) * lines, "Success with 95 % intervals")
     grid = list(figure.subplots(lines, math.ceil(len(panels) / lines), sharex=True, sharey=True, squeeze=False).flat)
-    for axes, (name, rows) in zip(grid, panels.items(), strict=False):
+    for axes, (title, rows) in zip(grid, panels.items(), strict=False):
         for row in rows:
-            rate, low, high = (100 * row["success"][key] for key in ("rate", "low", "high"))
+            name, (rate, low, high) = row["solver"], (100 * row["success"][key] for key in ("rate", "low", "high"))
             reach = [[max(rate - low, 0.0)], [max(high - rate, 0.0)]]  # rounding can put the rate outside
-            look = {"color": colours[row["solver"]], "label": row["solver"]}
-            axes.errorbar([rate], [list(colours).index(row["solver"])], xerr=reach, fmt="o", **look)
-        axes.set(title=name, xlabel="solved (%)", xlim=(-3, 103), ylim=(len(colours) - 0.4, -0.6))
-        axes.set_yticks(range(len(colours)), list(colours))
+            axes.errorbar([rate], [names.index(name)], xerr=reach, fmt="o", color=colours[name], label=name)
+        axes.set(title=title, xlabel="solved (%)", xlim=(-3, 103), ylim=(len(names) - 0.4, -0.6))
+        axes.set_yticks(range(len(names)), names)
     for axes in grid[len(panels) :]:
         axes.remove()
     return save(figure, path)
@@ -112,31 +112,29 @@ def plot_errors(path: str | Path, results: Mapping[str, Any]) -> Path:
     panels, colours = _panels(results)
     heading = "Problems with an error of at most x; the vertical line is the limit of a success"
     figure = make_figure(WIDTH, 1.2 + 2.2 * len(panels) + 0.05 * len(colours), heading)
-    for (name, rows), line in zip(panels.items(), figure.subplots(len(panels), 2, squeeze=False), strict=True):
-        entry = results["data"][name]
+    for (title, rows), line in zip(panels.items(), figure.subplots(len(panels), 2, squeeze=False), strict=True):
+        entry = results["data"][title]
         labels = "rotation error (°)", f"translation error ({entry['unit'] or 'world units'})"
         limits = entry["max_rotation_deg"], entry["max_translation"]
         for index, (axes, limit, label) in enumerate(zip(line, limits, labels, strict=True)):
             for row in rows:
                 axes.ecdf(row_errors(row)[0][index].numpy(), color=colours[row["solver"]], label=row["solver"])
             axes.axvline(limit, color=GREY)
-            axes.set(xlim=(limit / 1000, limit * 180), xlabel=label, title=name, ylabel="problems")
-            _log_scale(axes, "x")
+            axes.set(xlim=(limit / 1000, limit * 180), xlabel=label, title=title, ylabel="problems")
+            log_scale(axes, "x")
             axes.yaxis.set_major_formatter("{x:.0%}")
-    lines = {str(line.get_label()): line for axes in figure.axes for line in axes.lines}
-    figure.legend([lines[name] for name in colours], list(colours), loc="outside lower center", ncols=3)
+    curves = {str(line.get_label()): line for axes in figure.axes for line in axes.lines}
+    figure.legend([curves[name] for name in colours], list(colours), loc="outside lower center", ncols=3)
     return save(figure, path)
 
 
 def _panels(results: Mapping[str, Any]) -> tuple[dict[str, list[Mapping[str, Any]]], dict[str, str]]:
     """The rows by data set, and a colour for each solver; ``ValueError`` when there are no rows."""
-    if not results["rows"]:
+    rows = results["rows"]
+    if not rows:
         raise ValueError("The results hold no rows to draw.")
-    panels: dict[str, list[Mapping[str, Any]]] = {}
-    for row in results["rows"]:
-        panels.setdefault(row["data"], []).append(row)
-    solvers = dict.fromkeys(row["solver"] for row in results["rows"])
-    return panels, {name: COLOURS[index % len(COLOURS)] for index, name in enumerate(solvers)}
+    panels = {data: [row for row in rows if row["data"] == data] for data in dict.fromkeys(row["data"] for row in rows)}
+    return panels, dict(zip(dict.fromkeys(row["solver"] for row in rows), cycle(COLOURS), strict=False))
 
 
 @themed
@@ -151,23 +149,23 @@ def plot_training(path: str | Path, history_csv: str | Path) -> Path:
         ("translation distance ‖t̂ − t‖", ["init_translation", "refined_translation"]),
     )
     figure = make_figure(WIDTH, 5.8)
-    grid = figure.subplots(2, 2, sharex=True).flat
-    for axes, (title, columns) in zip(grid, panels, strict=True):
-        for index, column in enumerate(columns):
+    for axes, (title, columns) in zip(figure.subplots(2, 2, sharex=True).flat, panels, strict=True):
+        for colour, column in zip(cycle(COLOURS), columns, strict=False):
             curve = np.array([read_column(history_csv, rows, name, float, gaps=True) for name in ("update", column)])
             label = column.split("/")[1] if columns is success else column.split("_")[0]
-            axes.plot(*curve[:, np.isfinite(curve).all(0)], label=label, color=COLOURS[index % len(COLOURS)])
+            axes.plot(*curve[:, np.isfinite(curve).all(0)], label=label, color=colour)
         axes.set(title=title, xlabel="update")
         if "distance" in title:
-            _log_scale(axes, "y")
+            log_scale(axes, "y")
     figure.legend(handles=figure.axes[2].lines, loc="outside lower left")
     figure.legend(handles=figure.axes[1].lines, loc="outside lower right", ncols=4)
     return save(figure, path)
 
 
-def _log_scale(axes: Axes, name: str) -> None:
-    """Make the axis x or y logarithmic, with numbers that are no formulas."""
+def log_scale(axes: Axes, name: str, formatter: Formatter | str = "{x:g}") -> None:
+    """Make the axis x or y logarithmic, with a number at every power of 10, and at more places of a short axis."""
     axes.set(**{f"{name}scale": "log"})
-    axis = getattr(axes, f"{name}axis")
-    axis.set_major_formatter("{x:g}")
+    axis, (low, high) = getattr(axes, f"{name}axis"), getattr(axes, f"get_{name}lim")()
+    axis.set_major_locator(LogLocator(subs=(1, 2, 3, 5) if high < 100 * low else (1,)))
+    axis.set_major_formatter(formatter)
     axis.set_minor_formatter(NullFormatter())

@@ -11,14 +11,7 @@ from typing import Any
 import torch
 from kornia.core.exceptions import ValueCheckError
 
-from kornia_pnpnet.data import (
-    MixedProblems,
-    OutlierMix,
-    SceneProblems,
-    SlabPoints,
-    SyntheticProblems,
-    load_scene,
-)
+from kornia_pnpnet.data import MixedProblems, OutlierMix, SceneProblems, SlabPoints, SyntheticProblems, load_scene
 from kornia_pnpnet.evaluation.comparison import EvaluationData, draw_problems
 
 __all__ = ["DEFAULT_SEED", "PRIORS", "evaluation_sets"]
@@ -40,15 +33,14 @@ PRIORS: dict[str, tuple[str, Callable[..., SyntheticProblems | MixedProblems]]] 
 _DRAW_BATCH = 1000
 
 
-def _outlier_mixes(text: str, n: int, mismatches_only: bool) -> dict[str, tuple[OutlierMix, str | int]]:
-    """Read ``--outliers``: for each label the mix and its number in results (``none``, ``uniform`` or an integer)."""
-    one, many = ("mismatch", "mismatches") if mismatches_only else ("outlier", "outliers")
-    share = 1.0 if mismatches_only else 0.5
-    mixes: dict[str, tuple[OutlierMix, str | int]] = {}
+def _outlier_mixes(text: str, n: int, mismatches_only: bool) -> list[tuple[str, OutlierMix, str | int]]:
+    """Read ``--outliers``: labels, mixes and their numbers in results (``none``, ``uniform`` or an integer)."""
+    one, many, share = ("mismatch", "mismatches", 1.0) if mismatches_only else ("outlier", "outliers", 0.5)
+    mixes: list[tuple[str, OutlierMix, str | int]] = []
     for word in (part.strip() for part in text.split(",")):
         if word == "uniform":
             mix = OutlierMix(mismatch_share=share)
-            mixes[f"0-{mix.max_count(n)} {many}"] = mix, "uniform"
+            mixes.append((f"0-{mix.max_count(n)} {many}", mix, "uniform"))
             continue
         if word == "none" or word.isdecimal():
             count = 0 if word == "none" else int(word)
@@ -61,7 +53,7 @@ def _outlier_mixes(text: str, n: int, mismatches_only: bool) -> dict[str, tuple[
         if count > n:
             raise ValueCheckError(f"--outliers: {count} outliers do not fit into n = {n} pairs")
         label = f"{count} {one if count == 1 else many}"
-        mixes[label] = OutlierMix(count=count, mismatch_share=share), count or "none"
+        mixes.append((label, OutlierMix(count=count, mismatch_share=share), count or "none"))
     return mixes
 
 
@@ -104,7 +96,7 @@ def evaluation_sets(
     sizes = [n] if isinstance(n, int) else list(n)
     if min(sizes) < 3:
         raise ValueCheckError(f"--n: a pose needs at least 3 pairs, got {min(sizes)}")
-    mixes = {size: _outlier_mixes(outliers, size, mismatches_only) for size in sizes}  # checked before any is drawn
+    mixes = [(size, *mix) for size in sizes for mix in _outlier_mixes(outliers, size, mismatches_only)]
     sets: dict[str, EvaluationData] = {}
     for source in dict.fromkeys(sources):
         try:
@@ -115,27 +107,26 @@ def evaluation_sets(
             # Raw matches already contain outliers; those of the mix come on top.
             added = "+" if scene is not None and source.endswith(".npz") else ""
             noise = ", noise told" if known_noise and scene is None else ""
-            for size in sizes:
-                for label, (mix, number) in mixes[size].items():
-                    options: dict[str, Any] = {"n": size, "outliers": mix, "seed": seed, "dtype": dtype}
-                    options["batch_size"] = _DRAW_BATCH
-                    described = {"outliers": number, "mismatch_share": mix.mismatch_share, "seed": seed}
-                    if scene is None:
-                        prior, make = PRIORS[source]
-                        drawn = make(**options, known_noise=1.0) if known_noise else make(**options)
-                        entry = EvaluationData(draw_problems(drawn, count), description={"source": prior, **described})
-                    else:
-                        # A mismatch takes the pixel of a spare point. With one spare, all mismatches would agree on a
-                        # wrong pose.
-                        spares = max(1, mix.max_count(size)) if mismatches_only else 1
-                        views = SceneProblems(scene, num_spares=spares, **options)
-                        entry = EvaluationData(
-                            draw_problems(views, count),
-                            max_translation=views.max_translation,
-                            unit="m" if scene.metric else "",
-                            description={"source": scene.name, "path": source, **described},
-                        )
-                    sets[f"{name}, n = {size}, {added}{label}{noise}"] = entry
+            for size, label, mix, number in mixes:
+                options: dict[str, Any] = {"n": size, "outliers": mix, "seed": seed, "dtype": dtype}
+                options["batch_size"] = _DRAW_BATCH
+                described = {"outliers": number, "mismatch_share": mix.mismatch_share, "seed": seed}
+                if scene is None:
+                    prior, make = PRIORS[source]
+                    drawn = make(**options, known_noise=1.0) if known_noise else make(**options)
+                    entry = EvaluationData(draw_problems(drawn, count), description={"source": prior, **described})
+                else:
+                    # A mismatch takes the pixel of a spare point. With one spare, all mismatches would agree on a
+                    # wrong pose.
+                    spares = max(1, mix.max_count(size)) if mismatches_only else 1
+                    views = SceneProblems(scene, num_spares=spares, **options)
+                    entry = EvaluationData(
+                        draw_problems(views, count),
+                        max_translation=views.max_translation,
+                        unit="m" if scene.metric else "",
+                        description={"source": scene.name, "path": source, **described},
+                    )
+                sets[f"{name}, n = {size}, {added}{label}{noise}"] = entry
         except ValueError as error:
             raise ValueCheckError(f"{source}: {error}") from error
     return sets

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +21,7 @@ _SHOWN_DIFFERENCES = 3
 
 
 def row_errors(row: Mapping[str, Any]) -> tuple[PoseErrors, Tensor]:
-    """Read the per-problem errors of a row.
-
-    Args:
-        row: one of ``results["rows"]``.
-
-    Returns:
-        The errors in float64, and ok as bool, each of shape :math:`(B,)`.
+    """Read the errors (float64) and ok (bool) of the problems of one of ``results["rows"]``, each :math:`(B,)`.
 
     Raises:
         ValueError: when the row has no per-problem errors, like the rows of the files in the repository.
@@ -80,46 +74,38 @@ def resume(plan: Mapping[str, Any], path: str | Path) -> dict[str, Any]:
     there = load_results(path) if Path(path).exists() else fresh
     if not there["rows"]:
         return fresh
-    differing = _differences(there, fresh)
-    if differing:
-        more = len(differing) - _SHOWN_DIFFERENCES
-        shown = [*differing[:_SHOWN_DIFFERENCES], *([f"and {more} more"] if more > 0 else [])]
+    found = list(_differences(there, fresh))
+    if found:
+        more = [f"and {len(found) - _SHOWN_DIFFERENCES} more"] if len(found) > _SHOWN_DIFFERENCES else []
         raise ValueError(
-            f"'{path}' holds another evaluation, which this one cannot continue: {'; '.join(shown)}. Choose another "
-            "file, or overwrite this one."
+            f"'{path}' holds another evaluation, which this one cannot continue: "
+            f"{'; '.join(found[:_SHOWN_DIFFERENCES] + more)}. Choose another file, or overwrite this one."
         )
     return {**there, "solvers": fresh["solvers"], "data": fresh["data"]}
 
 
-def _differences(there: Mapping[str, Any], plan: Mapping[str, Any]) -> list[str]:
-    """Describe why the rows of a file do not belong to a plan."""
+def _differences(there: Mapping[str, Any], plan: Mapping[str, Any]) -> Iterator[str]:
+    """Why the rows of a file do not belong to a plan."""
     versions = there["environment"].get("versions", {})
-    found = [
-        f"{package} was {versions.get(package)} and is {version}"
-        for package, version in plan["environment"]["versions"].items()
-        if versions.get(package) != version
-    ]
+    for package, version in plan["environment"]["versions"].items():
+        if versions.get(package) != version:
+            yield f"{package} was {versions.get(package)} and is {version}"
     if there.get("code") != plan["code"]:
-        found.append(f"the package's code has changed since (commit {there['environment'].get('commit')})")
+        yield f"the package's code has changed since (commit {there['environment'].get('commit')})"
     for kind in ("solvers", "data"):
         for name, entry in there[kind].items():
             now = plan[kind].get(name)
             if now is None:
-                found.append(f"{kind}: '{name}' is not part of this one")
+                yield f"{kind}: '{name}' is not part of this one"
             elif now != entry:
                 keys = [key for key in {**entry, **now} if entry.get(key) != now.get(key)]
-                found.append(f"{kind}: '{name}' has another {', another '.join(keys)}")
-    return found
+                yield f"{kind}: '{name}' has another {', another '.join(keys)}"
 
 
 def format_table(results: Mapping[str, Any]) -> str:
     """Format results as a Markdown table that also reads well as plain text.
 
-    Args:
-        results: what :func:`~kornia_pnpnet.evaluation.evaluate` returned.
-
-    Returns:
-        One line for each set and solver: success with its 95 % interval, median errors, time and share of ok.
+    There is one line for each set and solver: success with its 95 % interval, median errors, time and share of ok.
     """
     lines = []
     for row in results["rows"]:
@@ -127,9 +113,7 @@ def format_table(results: Mapping[str, Any]) -> str:
         rotation, translation = (f"{row[name]['median']:#.3g}".rstrip(".") for name in PoseErrors._fields)
         unit = results["data"][row["data"]]["unit"]
         success = str(SuccessRate(**{key: row["success"][key] for key in SuccessRate._fields}))
-        errors = f"{rotation}°", f"{translation} {unit}".rstrip()
-        lines.append(
-            (row["data"], row["solver"], success, *errors, f"{row['us_per_problem']:.0f}", f"{100 * row['ok']:.1f} %")
-        )
+        cells = success, f"{rotation}°", f"{translation} {unit}".rstrip(), f"{row['us_per_problem']:.0f}"
+        lines.append((row["data"], row["solver"], *cells, f"{100 * row['ok']:.1f} %"))
     header = ("data", "solver", "success [95 %]", "median rotation error", "median translation error")
     return markdown_table((*header, "µs/problem", "ok"), lines, align="llrrrrr", pad=True)

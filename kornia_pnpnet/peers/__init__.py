@@ -4,9 +4,7 @@ A library is imported when one of its solvers is made.
 """
 
 from kornia_pnpnet.peers.base import PeerPose, PeerSolver
-from kornia_pnpnet.peers.kornia_rs import KorniaRs
 from kornia_pnpnet.peers.opencv import OpenCVPnP, OpenCVRansac, OpenCVUsac
-from kornia_pnpnet.peers.poselib import PoseLib
-from kornia_pnpnet.peers.pycolmap import PyColmap
+from kornia_pnpnet.peers.samplers import KorniaRs, PoseLib, PyColmap
 
 __all__ = ["KorniaRs", "OpenCVPnP", "OpenCVRansac", "OpenCVUsac", "PeerPose", "PeerSolver", "PoseLib", "PyColmap"]

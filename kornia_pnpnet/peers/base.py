@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import importlib
-import inspect
 import math
-from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
 from kornia.core.check import KORNIA_CHECK
 from kornia.core.exceptions import ShapeError
 from kornia.geometry.camera import PinholeCamera
+from kornia.geometry.conversions import convert_points_from_homogeneous
 from torch import Tensor, nn
 
 from kornia_pnpnet.arguments import checked_inputs, restore_leading
@@ -41,10 +41,11 @@ class PeerPose(NamedTuple):
     init: tuple[np.ndarray, np.ndarray] | None = None
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class PeerSolver(nn.Module):
     r"""A solver of another library, which takes one problem at a time, as a batched layer without gradients.
 
-    A subclass implements :meth:`solve_one` and keeps the arguments of its constructor as attributes of the same names.
+    A subclass implements :meth:`solve_one` and is a dataclass, whose fields are the arguments of its constructor.
     The peer sees only the pairs that are present and have a weight above 0; the size of the weight has no effect. A
     problem fails, with ``ok=False`` and the identity as its pose, when the peer finds no pose, and without asking the
     peer when the problem is not finite, has a negative weight, fewer than three pairs, or a camera with skew or without
@@ -57,17 +58,32 @@ class PeerSolver(nn.Module):
             pairs.
 
     Raises:
-        BaseError: when ``threshold`` is not positive.
+        ImportError: when the library is not installed.
+        BaseError: for an argument out of range, or an option that the installed library does not have.
     """
 
-    def __init__(self, *, threshold: float) -> None:
+    threshold: float
+    #: The module that the peer imports, and the name of its library.
+    source: ClassVar[tuple[str, str] | None] = None
+
+    def __post_init__(self) -> None:
         super().__init__()
-        check_positive(or_infinite=True, threshold=threshold)
-        self.threshold = threshold
+        check_positive(or_infinite=True, threshold=self.threshold)
+        if self.source is not None:
+            self.library()
+
+    def library(self) -> ModuleType:
+        """Import the library, or raise an ImportError that names the extra which installs it."""
+        assert self.source is not None
+        module, name = self.source
+        try:
+            return importlib.import_module(module)
+        except ImportError as error:
+            raise ImportError(f"This solver needs {name}: pip install 'kornia_pnpnet[eval]'") from error
 
     def config(self) -> dict[str, float | int | str | bool]:
         """Return the arguments of the constructor as plain data."""
-        return {name: getattr(self, name) for name in inspect.signature(type(self)).parameters}
+        return {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.init}
 
     def extra_repr(self) -> str:
         """Show the arguments of the constructor."""
@@ -97,23 +113,12 @@ class PeerSolver(nn.Module):
     ) -> PnPResult:
         r"""Solve a batch of problems, one after the other, on the CPU in float64.
 
-        Args:
-            world_points: shape :math:`(B, N, 3)`, any unit. Leading dimensions as in
-                :meth:`~kornia_pnpnet.solver.PnPNet.forward`.
-            img_points: pixels, shape :math:`(B, N, 2)`.
-            intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or Kornia's cameras.
-            weights: pairs of weight 0 are left out, shape :math:`(B, N)`; 1 when ``None``.
-            mask: False where a pair is padding, bool, shape :math:`(B, N)`.
+        Args and errors are those of :meth:`~kornia_pnpnet.solver.PnPNet.forward`, for pixels only.
 
         Returns:
             The :class:`~kornia_pnpnet.result.PnPResult` on the device of the input, without gradients; float64 when any
             input is, else float32. Its weights are 1 for the inliers that the peer reports, else 0; its cost is the
             mean over the pairs of the squared reprojection error in px², truncated at the squared threshold.
-
-        Raises:
-            ShapeError: for shapes that do not fit each other, or fewer than 3 pairs.
-            TypeCheckError: for arguments that are no tensors, or hold booleans or complex numbers.
-            DeviceError: for tensors on different devices.
         """
         size, inputs = checked_inputs(world_points, img_points, intrinsics, weights, mask)
         if inputs.rig is not None:
@@ -122,115 +127,83 @@ class PeerSolver(nn.Module):
                 actual_shape=tuple(img_points.shape),
                 expected_shape=["B", "N", "2"],
             )
-        world_points, img_points, intrinsics, weights, mask = inputs[:5]
-        batch, count = world_points.shape[:2]
-        world, img, cameras = (x.detach().cpu().double().numpy() for x in (world_points, img_points, intrinsics))
-        with np.errstate(all="ignore"):  # a camera without a last entry is refused below
-            cameras = cameras / cameras[:, 2:, 2:]
-        shares = np.ones((batch, count)) if weights is None else weights.detach().cpu().double().numpy()
-        present = np.ones((batch, count), dtype=bool) if mask is None else mask.detach().cpu().numpy()
-        used = present & (shares > 0)
-        status = _status(world, img, cameras, shares, present)
+        like = inputs[0]
+        world, img, cameras = (x.detach().cpu().double() for x in inputs[:3])
+        shares = torch.ones_like(world[..., 0]) if inputs[3] is None else inputs[3].detach().cpu().double()
+        present = torch.ones_like(shares, dtype=torch.bool) if inputs[4] is None else inputs[4].cpu()
+        cameras, used = cameras / cameras[:, 2:, 2:], present & (shares > 0)
+        status = _status(world, img, cameras, torch.where(present, shares, 0.0), present)
 
-        poses = np.tile(np.eye(3, 4), (2, batch, 1, 1))  # the final pose, and that before the last refinement
-        inliers, ok = np.zeros((batch, count)), np.zeros(batch, dtype=bool)
-        for i in np.flatnonzero(status == Status.NOT_BELIEVED):
-            found = self.solve_one(world[i, used[i]], img[i, used[i]], cameras[i])
-            if found is not None and all(map(_finite, (*found[:2], *(found.init or ())))):
-                final = np.column_stack((found.rotation, found.translation))
-                start = final if found.init is None else np.column_stack(found.init)
-                poses[:, i], inliers[i, used[i]], ok[i] = (final, start), found.inliers, True
+        poses = torch.eye(3, 4, dtype=torch.float64).repeat(2, len(world), 1, 1)  # final, before the last refinement
+        inliers, ok = torch.zeros_like(shares), torch.zeros(len(world), dtype=torch.bool)
+        for i in (status == Status.NOT_BELIEVED).nonzero()[:, 0].tolist():
+            found = self.solve_one(world[i, used[i]].numpy(), img[i, used[i]].numpy(), cameras[i].numpy())
+            if found is not None:
+                both = np.stack([np.column_stack(x) for x in (found[:2], found.init or found[:2])])
+                if np.isfinite(both).all():
+                    poses[:, i], ok[i] = torch.from_numpy(both), True
+                    inliers[i, used[i]] = torch.from_numpy(np.asarray(found.inliers)).double()
 
-        largest = torch.finfo(world_points.dtype).max
-        errors = _squared_errors(poses[0], world, img, cameras, used & ok[:, None])
-        truncated = np.minimum(errors, min(self.threshold, largest**0.25) ** 2)
-        cost = np.where(ok, truncated.sum(-1) / np.maximum(used.sum(-1), 1), largest**0.5)
+        largest = torch.finfo(like.dtype).max
+        truncated = _squared_errors(poses[0], world, img, cameras).clamp(max=min(self.threshold, largest**0.25) ** 2)
+        cost = torch.where(used, truncated, 0.0).sum(-1) / used.sum(-1).clamp(min=1)
 
-        def back(values: np.ndarray) -> Tensor:
-            return torch.from_numpy(values).clamp(-largest, largest).to(world_points)
+        def back(values: Tensor) -> Tensor:
+            return values.clamp(-largest, largest).to(like)
 
         pose, init = (Pose(back(x[..., :3]), back(x[..., 3])) for x in poses)
         result = PnPResult(
             *pose,
-            back(inliers),
-            back(cost),
-            torch.from_numpy(ok).to(world_points.device),
-            init,
-            torch.from_numpy(np.where(ok, Status.SOLVED, status).astype(np.int8)).to(world_points.device),
-            back(ok.astype(np.float64)),
-            Alternatives.none(pose),
-            back(np.where((status == Status.CAMERA)[:, None, None], np.eye(3), cameras)),
-            back(np.zeros((batch, 4))),
+            weights=back(inliers),
+            cost=back(torch.where(ok, cost, largest**0.5)),
+            ok=ok.to(like.device),
+            init=init,
+            status=torch.where(ok, Status.SOLVED, status).to(like.device, torch.int8),
+            probability=back(ok.double()),
+            alternatives=Alternatives.none(pose),
+            intrinsics=back(torch.where((status == Status.CAMERA)[:, None, None], torch.eye(3).double(), cameras)),
+            dist=like.new_zeros(len(like), 4),
         )
         return restore_leading(size, result)
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class RobustPeer(PeerSolver):
-    """Base of the peers that draw samples: checks and keeps their arguments.
-
-    Args:
-        arguments: ``locals()`` of the constructor that calls this one: ``threshold``, ``confidence``, ``seed``, numbers
-            of iterations, and others, which are not checked.
+    """Base of the peers that draw samples. It checks ``threshold``, ``confidence``, ``seed`` and numbers of iterations.
 
     Raises:
         BaseError: for an argument out of range.
     """
 
-    confidence: float
-    seed: int
+    confidence: float = 0.9999
+    seed: int = 0
 
-    def __init__(self, arguments: Mapping[str, Any]) -> None:
-        options = {name: value for name, value in arguments.items() if name not in ("self", "__class__")}
-        super().__init__(threshold=options["threshold"])
+    def __post_init__(self) -> None:
+        super().__post_init__()
         check_positive(threshold=self.threshold)
-        KORNIA_CHECK(0 < options["confidence"] < 1, f"confidence must lie in (0, 1), got {options['confidence']}.")
-        counts = {name: value for name, value in options.items() if name.endswith("iterations")}
-        check_whole(0, seed=options["seed"])
+        KORNIA_CHECK(0 < self.confidence < 1, f"confidence must lie in (0, 1), got {self.confidence}.")
+        counts = {name: value for name, value in self.config().items() if name.endswith("iterations")}
+        check_whole(0, seed=self.seed)
         check_whole(1, **counts)
-        for name, value in options.items():
-            setattr(self, name, int(value) if name in counts or name == "seed" else value)
+        for name, value in {**counts, "seed": self.seed}.items():
+            setattr(self, name, int(value))
 
 
-def _finite(values: np.ndarray) -> bool:
-    return bool(np.isfinite(values).all())
-
-
-def _status(
-    world: np.ndarray, img: np.ndarray, cameras: np.ndarray, weights: np.ndarray, present: np.ndarray
-) -> np.ndarray:
+def _status(world: Tensor, img: Tensor, cameras: Tensor, weights: Tensor, present: Tensor) -> Tensor:
     """Why problems are not passed to the peer, by the rules of ``Normalize``; ``NOT_BELIEVED`` for the others, (B,)."""
-    sound = np.isfinite(world).all(-1) & np.isfinite(img).all(-1) & np.isfinite(weights) & (weights >= 0)  # (B, N)
+    sound = world.isfinite().all(-1) & img.isfinite().all(-1) & weights.isfinite() & (weights >= 0) | ~present  # (B, N)
     enough = (present & (weights > 0)).sum(-1) >= MIN_PAIRS
-    # No peer takes a skew.
-    pinhole = np.isfinite(cameras).all((-1, -2)) & (cameras[:, 0, 0] > 0) & (cameras[:, 1, 1] > 0)
-    pinhole &= (cameras[:, (0, 1, 2, 2), (1, 0, 0, 1)] == 0).all(-1)
-    reasons = [~(sound | ~present).all(-1), ~pinhole, ~enough]
-    return np.select(reasons, [Status.NOT_FINITE, Status.CAMERA, Status.TOO_FEW_PAIRS], Status.NOT_BELIEVED)
+    focal, others = cameras[:, (0, 1), (0, 1)], cameras[:, (0, 1, 2, 2), (1, 0, 0, 1)]  # no peer takes a skew
+    pinhole = cameras.isfinite().flatten(1).all(-1) & (focal > 0).all(-1) & (others == 0).all(-1)
+    status = torch.where(enough, Status.NOT_BELIEVED, Status.TOO_FEW_PAIRS)
+    status = torch.where(pinhole, status, Status.CAMERA)
+    return torch.where(sound.all(-1), status, Status.NOT_FINITE)
 
 
-def _squared_errors(
-    poses: np.ndarray, world: np.ndarray, img: np.ndarray, cameras: np.ndarray, used: np.ndarray
-) -> np.ndarray:
-    """Return the squared reprojection errors in px², infinite behind the camera, 0 for unused pairs, (B, N)."""
-    cameras = np.where(used.sum(-1)[:, None, None] > 0, cameras, np.eye(3))
-    world, img = (np.where(used[..., None], x, 0.0) for x in (world, img))
-    with np.errstate(over="ignore", invalid="ignore"):
-        cam_points = world @ poses[..., :3].swapaxes(-1, -2) + poses[:, None, :, 3]  # (B, N, 3)
-        depth = cam_points[..., 2:]
-        focal, centre = cameras[:, None, (0, 1), (0, 1)], cameras[:, None, :2, 2]  # (B, 1, 2)
-        projected = cam_points[..., :2] / np.where(depth > 0, depth, 1.0) * focal + centre
-        errors = np.where(depth[..., 0] > 0, np.square(projected - img).sum(-1), math.inf)
-    return np.where(used, np.nan_to_num(errors, nan=math.inf, posinf=math.inf), 0.0)
-
-
-def import_library(module: str, library: str) -> ModuleType:
-    """Import a module, or raise an ImportError that names the extra which installs the library."""
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise ImportError(f"This solver needs {library}: pip install 'kornia_pnpnet[eval]'") from error
-
-
-def pinhole_parameters(intrinsics: np.ndarray) -> list[float]:
-    """Return focal lengths and principal point in the order of COLMAP's camera model ``PINHOLE``."""
-    return [intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]]
+def _squared_errors(poses: Tensor, world: Tensor, img: Tensor, cameras: Tensor) -> Tensor:
+    """The squared reprojection errors in px², infinite behind the camera, (B, N)."""
+    cam_points = world @ poses[..., :3].mT + poses[:, None, :, 3]
+    in_front = cam_points[..., 2:] > 0
+    pixels = convert_points_from_homogeneous(torch.where(in_front, cam_points, 1.0) @ cameras.mT, eps=0.0)
+    errors = (pixels - img).square().sum(-1, keepdim=True)
+    return torch.where(in_front, errors.nan_to_num(nan=math.inf), math.inf)[..., 0]

@@ -3,26 +3,24 @@
 from __future__ import annotations
 
 import math
-from types import ModuleType
+from dataclasses import dataclass, field
 
 import numpy as np
 from kornia.core.check import KORNIA_CHECK
 
-from kornia_pnpnet.peers.base import PeerPose, PeerSolver, RobustPeer, import_library
+from kornia_pnpnet.peers.base import PeerPose, PeerSolver, RobustPeer
 
 __all__ = ["OpenCVPnP", "OpenCVRansac", "OpenCVUsac"]
 
-
-def _import_opencv() -> ModuleType:
-    return import_library("cv2", "OpenCV")
+_SOURCE = "cv2", "OpenCV"
 
 
-def _check_method(method: str) -> str:
-    cv2 = _import_opencv()
-    KORNIA_CHECK(hasattr(cv2, f"SOLVEPNP_{method}"), f"OpenCV {cv2.__version__} has no SOLVEPNP_{method}.")
-    return method
+def _check_method(peer: PeerSolver, name: str) -> None:
+    cv2 = peer.library()
+    KORNIA_CHECK(hasattr(cv2, name), f"OpenCV {cv2.__version__} has no {name} for poses.")
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class OpenCVPnP(PeerSolver):
     r"""OpenCV's ``solvePnP`` on all pairs, problem by problem. The solver is not robust to outliers.
 
@@ -30,19 +28,19 @@ class OpenCVPnP(PeerSolver):
 
     Args:
         method: OpenCV's name of the solver, for example ``"EPNP"`` for ``SOLVEPNP_EPNP``.
-
-    Raises:
-        ImportError: when OpenCV is not installed.
-        BaseError: for an unknown method.
     """
 
-    def __init__(self, *, method: str = "SQPNP") -> None:
-        super().__init__(threshold=math.inf)
-        self.method = _check_method(method)
+    threshold: float = field(default=math.inf, init=False)
+    method: str = "SQPNP"
+    source = _SOURCE
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_method(self, f"SOLVEPNP_{self.method}")
 
     def solve_one(self, world_points: np.ndarray, img_points: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:
-        """Solve one problem, see :meth:`PeerSolver.solve_one`."""
-        cv2 = _import_opencv()
+        """See :meth:`PeerSolver.solve_one`."""
+        cv2 = self.library()
         flag = getattr(cv2, f"SOLVEPNP_{self.method}")
         try:
             found, rotation_vector, translation = cv2.solvePnP(world_points, img_points, intrinsics, None, flags=flag)
@@ -53,45 +51,48 @@ class OpenCVPnP(PeerSolver):
         return PeerPose(cv2.Rodrigues(rotation_vector)[0], translation.ravel(), np.ones(len(world_points), dtype=bool))
 
 
-class _Robust(RobustPeer):
-    """OpenCV's ``solvePnPRansac``."""
+@dataclass(eq=False, repr=False, kw_only=True)
+class _Sampling(RobustPeer):
+    """OpenCV's ``solvePnPRansac`` with the method ``flag``."""
 
-    iterations: int
+    threshold: float = 50.0
+    iterations: int = 1000
     method: str
     refine = False
-    # Start of the method's name in OpenCV.
-    prefix = ""
+    source = _SOURCE
+
+    @property
+    def flag(self) -> str:
+        """OpenCV's name of the method."""
+        return f"SOLVEPNP_{self.method}"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        KORNIA_CHECK(type(self.refine) is bool, f"refine must be true or false, got {self.refine!r}.")
+        _check_method(self, self.flag)
 
     def solve_one(self, world_points: np.ndarray, img_points: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:
-        """Solve one problem, see :meth:`PeerSolver.solve_one`."""
-        cv2 = _import_opencv()
+        """See :meth:`PeerSolver.solve_one`."""
+        cv2 = self.library()
         cv2.setRNGSeed(self.seed)
+        options = {"iterationsCount": self.iterations, "reprojectionError": self.threshold}
+        options |= {"confidence": self.confidence, "flags": getattr(cv2, self.flag)}
         try:
-            found, rotation_vector, translation, kept = cv2.solvePnPRansac(
-                world_points,
-                img_points,
-                intrinsics,
-                None,
-                iterationsCount=self.iterations,
-                reprojectionError=self.threshold,
-                confidence=self.confidence,
-                flags=getattr(cv2, self.prefix + self.method),
-            )
+            found, turn, shift, kept = cv2.solvePnPRansac(world_points, img_points, intrinsics, None, **options)
             if not found or kept is None:
                 return None
             kept = kept.ravel()
-            first = cv2.Rodrigues(rotation_vector)[0], translation.ravel().copy()
+            first = cv2.Rodrigues(turn)[0], shift.ravel().copy()
             if self.refine and len(kept) > 3:
-                rotation_vector, translation = cv2.solvePnPRefineLM(
-                    world_points[kept], img_points[kept], intrinsics, None, rotation_vector, translation
-                )
-            rotation = cv2.Rodrigues(rotation_vector)[0]
+                turn, shift = cv2.solvePnPRefineLM(world_points[kept], img_points[kept], intrinsics, None, turn, shift)
+            rotation = cv2.Rodrigues(turn)[0]
         except cv2.error:  # an assertion of OpenCV's, on degenerate or too few pairs
             return None
-        return PeerPose(rotation, translation.ravel(), np.isin(np.arange(len(world_points)), kept), first)
+        return PeerPose(rotation, shift.ravel(), np.isin(np.arange(len(world_points)), kept), first)
 
 
-class OpenCVRansac(_Robust):
+@dataclass(eq=False, repr=False, kw_only=True)
+class OpenCVRansac(_Sampling):
     r"""OpenCV's ``solvePnPRansac``, then ``solvePnPRefineLM`` on its inliers, problem by problem.
 
     The defaults are the best of a grid on the protocol's data (3000 problems of another seed without and with outliers,
@@ -109,10 +110,6 @@ class OpenCVRansac(_Robust):
             that pose as ``init``.
         seed: seed of OpenCV's global random numbers, set before each problem.
 
-    Raises:
-        ImportError: when OpenCV is not installed.
-        BaseError: for an unknown method or an argument out of range.
-
     Example:
         >>> from kornia_pnpnet.data import SyntheticProblems
         >>> problems = SyntheticProblems(n=9, batch_size=4, seed=0).batch(0)
@@ -120,24 +117,12 @@ class OpenCVRansac(_Robust):
         tensor([True, True, True, True])
     """
 
-    prefix = "SOLVEPNP_"
-
-    def __init__(
-        self,
-        *,
-        threshold: float = 50.0,
-        iterations: int = 1000,
-        confidence: float = 0.9999,
-        method: str = "AP3P",
-        refine: bool = True,
-        seed: int = 0,
-    ) -> None:
-        super().__init__(locals())
-        KORNIA_CHECK(type(refine) is bool, f"refine must be true or false, got {refine!r}.")
-        _check_method(method)
+    method: str = "AP3P"
+    refine: bool = True
 
 
-class OpenCVUsac(_Robust):
+@dataclass(eq=False, repr=False, kw_only=True)
+class OpenCVUsac(_Sampling):
     r"""OpenCV's ``solvePnPRansac`` in one of its USAC variants, problem by problem.
 
     USAC has its own sampling, local optimisation and final refinement; nothing is refined afterwards. The default
@@ -148,23 +133,12 @@ class OpenCVUsac(_Robust):
             expects the pairs sorted from the best to the worst.
         seed: used by the local optimisation. The samples come from a generator that OpenCV starts anew for every
             problem.
-
-    Raises:
-        ImportError: when OpenCV is not installed.
-        BaseError: for an unknown method or an argument out of range.
     """
 
-    def __init__(
-        self,
-        *,
-        threshold: float = 50.0,
-        method: str = "USAC_ACCURATE",
-        iterations: int = 1000,
-        confidence: float = 0.9999,
-        seed: int = 0,
-    ) -> None:
-        super().__init__(locals())
-        cv2 = _import_opencv()
-        # USAC_FM_8PTS is in the same list of OpenCV but computes fundamental matrices.
-        known = method.startswith("USAC_") and method != "USAC_FM_8PTS" and hasattr(cv2, method)
-        KORNIA_CHECK(known, f"OpenCV {cv2.__version__} has no {method} for poses.")
+    method: str = "USAC_ACCURATE"
+
+    @property
+    def flag(self) -> str:
+        """OpenCV's name of the variant; USAC_FM_8PTS, for fundamental matrices, is in the same list and is none."""
+        usable = self.method.startswith("USAC_") and self.method != "USAC_FM_8PTS"
+        return self.method if usable else f"variant {self.method}"
