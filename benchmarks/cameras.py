@@ -38,13 +38,13 @@ import poselib
 import pycolmap
 import torch
 from harness import Column, Row, by_solver, parser, percent, pivot, recorded, say, table, target, threads, write
-from kornia_pnpnet.init.focal import scale_focal
 from tasks import relative_errors
 from torch import Tensor, nn
 
 from kornia_pnpnet import Normalize, PnPNet, RobustWeightedLM, create_solver
 from kornia_pnpnet.core.trees import map_tensors, take
 from kornia_pnpnet.data import CameraProblems, OutlierMix, SceneProblems, load_scene
+from kornia_pnpnet.propose.focal import scale_focal
 from kornia_pnpnet.result import Pose, Problems
 
 # Used for nothing else. The grid of focal lengths and its threshold were chosen on seed 6 of another generator.

@@ -92,15 +92,15 @@ class Refinement(Contender):
 
     def task(self, problems: Problems, *, backward: bool = False) -> Task:
         """The call of the refinement."""
-        corr, guess, undo = normalized(problems, self.device)
-        call: Callable[[], object] = without_gradient(lambda: self.refine(corr, guess))
+        pairs, starts, undo = normalized(problems, self.device)
+        call: Callable[[], object] = without_gradient(lambda: self.refine(pairs, starts))
         if backward:
             # Not cloned: a clone would change the layout in memory in which the solver hands pairs over.
-            leaves = [x.detach().requires_grad_() for x in (corr.world_points, corr.img_points)]
-            wanted = corr._replace(world_points=leaves[0], img_points=leaves[1])
+            leaves = [x.detach().requires_grad_() for x in (pairs.world_points, pairs.img_points)]
+            wanted = pairs._replace(world_points=leaves[0], img_points=leaves[1])
             learned = [x for x in self.refine.parameters() if x.requires_grad]
-            call = lambda: gradient(self.refine(wanted, guess).pose, [*leaves, *learned])  # noqa: E731
-        return Task(call, lambda: undo(self.refine(corr, guess).pose), problems, waiting(self.device))
+            call = lambda: gradient(self.refine(wanted, starts).pose, [*leaves, *learned])  # noqa: E731
+        return Task(call, lambda: undo(self.refine(pairs, starts).pose), problems, waiting(self.device))
 
 
 def exported(spec: str, suffix: str, export: Callable[[PnPNet, Path], object]) -> Path:

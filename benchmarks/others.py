@@ -95,10 +95,10 @@ class PyPose(Contender):
 
     def task(self, problems: Problems, *, backward: bool = False) -> Task:
         """Refine all problems."""
-        corr, guess, undo = normalized(problems, "cpu")
-        points, pixels = corr.world_points.contiguous(), (corr.img_points / corr.focal).contiguous()
+        pairs, starts, undo = normalized(problems, "cpu")
+        points, pixels = pairs.world_points.contiguous(), (pairs.img_points / pairs.focal).contiguous()
         start = self.pypose.mat2SE3(
-            torch.cat((guess.pose.rotation, guess.pose.translation[..., None]), -1), check=False
+            torch.cat((starts.pose.rotation, starts.pose.translation[..., None]), -1), check=False
         )
         refine: Callable[..., Any] = self._steps if self.own_loop else self._optimize
         leaves = leaves_of(points, pixels)

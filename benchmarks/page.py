@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,6 @@ import pandas as pd
 from contenders import ANY, PLAIN, TRAINED, N
 from harness import HERE, Row
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from kornia_pnpnet.evaluation.figures import style
 from startup import CACHED, COLD, EAGER
 from tasks import COARSE_ANGLE_DEG, COARSE_SHIFT, ITERATIONS
 from timing import BACKWARD, FORWARD
@@ -21,6 +21,9 @@ from kornia_pnpnet import PnPNet
 from kornia_pnpnet.core.files import atomic_open
 from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.metrics import SuccessRate
+
+sys.path.append(str(HERE.parent / "docs" / "results"))
+import figures
 
 PAGE = HERE.parent / "docs" / "performance.md"
 PARTS = ("throughput", "latency", "startup")
@@ -325,14 +328,14 @@ def plot_times(
     tables = {name: pd.DataFrame(rows).assign(solver=lambda table: table.contender) for name, rows in panels.items()}
     columns = {"median_us": "us", against: label}
     curves = [(name, table.rename(columns=columns), "us") for name, table in tables.items()]
-    return style.draw_curves(path, [title], curves, label, _looks(pd.concat(tables.values()).contender))
+    return figures.draw_curves(path, [title], curves, label, _looks(pd.concat(tables.values()).contender))
 
 
-@style.themed
+@figures.themed
 def plot_latency(path: Path, title: str, rows: Sequence[Mapping[str, Any]]) -> Path:
     """Draw the share of the calls with one problem that end within a time, without the slowest hundredth."""
     looks = _looks(row["contender"] for row in rows)
-    figure = style.make_figure(style.WIDTH, 4.8, title)
+    figure = figures.make_figure(figures.WIDTH, 4.8, title)
     axes = figure.subplots()
     for name, look in looks.items():
         for row in (row for row in rows if row["contender"] == name):
@@ -341,9 +344,9 @@ def plot_latency(path: Path, title: str, rows: Sequence[Mapping[str, Any]]) -> P
             x, y = np.array(row["quantiles_us"])[kept] / 1e3, 100 * shares[kept]
             axes.plot(x, y, **look, markevery=max(1, len(x) // 5))
     axes.set(xlabel="ms for one problem", ylabel="calls done (%)", ylim=(0, 100))
-    style.log_scale(axes, "x")
-    style.draw_legend(figure, looks)
-    return style.save(figure, path)
+    figures.log_scale(axes, "x")
+    figures.draw_legend(figure, looks)
+    return figures.save(figure, path)
 
 
 def _looks(names: Iterable[str]) -> dict[str, dict[str, Any]]:
@@ -351,12 +354,12 @@ def _looks(names: Iterable[str]) -> dict[str, dict[str, Any]]:
     there = set(names)
     bases = {next((name.removesuffix(way) for way in _WAYS if name.endswith(way)), name) for name in there}
     found = {}
-    for base, look in style.solver_styles(bases).items():
+    for base, look in figures.solver_styles(bases).items():
         for way, line in {"": "--", **_WAYS}.items():
             if base + way in there:
                 alone = not any(base + way in there for way in _WAYS)
                 shape = look["color"], look["marker"], look["linestyle"] if alone else line
-                found[base + way] = style.line_style(*shape, ours=style.is_ours(base) and line != "--")
+                found[base + way] = figures.line_style(*shape, ours=figures.is_ours(base) and line != "--")
     return found
 
 

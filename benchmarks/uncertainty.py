@@ -33,7 +33,7 @@ from typing import Any
 import torch
 from harness import Column, Row, in_turns, parser, percent, ratio, recorded, summary, table, target, threads, write
 from kornia.geometry.liegroup import So3
-from kornia_pnpnet.geometry import transform
+from kornia.geometry.linalg import transform_points
 from torch import Tensor, nn
 
 from kornia_pnpnet import (
@@ -184,7 +184,7 @@ def squares(tilt: float, sigma: float, count: int, *, seed: int) -> Problems:
     corners = [[-0.1, -0.1, 0.0], [0.1, -0.1, 0.0], [0.1, 0.1, 0.0], [-0.1, 0.1, 0.0]]
     world = torch.tensor(corners, dtype=torch.float64).expand(count, 4, 3)
     camera = torch.tensor([[800.0, 0.0, 320.0], [0.0, 800.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    seen = transform(pose, world) @ camera.mT
+    seen = transform_points(pose.matrix, world) @ camera.mT
     pixels = seen[..., :2] / seen[..., 2:]
     pixels = pixels + sigma * torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
     return Problems(world, pixels, camera.expand(count, 3, 3), pose, torch.ones(count, 4, dtype=torch.bool))

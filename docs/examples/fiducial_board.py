@@ -14,11 +14,11 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from kornia_pnpnet.evaluation.figures.style import BLUE, ORANGE, make_figure, save
 from shared import centre, command, pose_error, write
 from torch.nn.utils.rnn import pad_sequence
 
 from kornia_pnpnet import Pose, create_solver
+from kornia_pnpnet.evaluation.plots import BLUE, ORANGE, make_figure, save
 
 SQUARES, SQUARE, MARKER = (7, 5), 0.04, 0.03  # metres
 PIXELS_PER_SQUARE, SIZE, FOCAL = 60, (640, 480), 700.0

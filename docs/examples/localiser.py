@@ -36,13 +36,13 @@ from kornia.feature import (
     laf_is_filled,
     match_snn,
 )
-from kornia_pnpnet.evaluation.figures.style import BLUE, make_figure, save, themed
 from shared import command, pose_error, write
 from sklearn.isotonic import IsotonicRegression
 from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
 
 from kornia_pnpnet import PnPResult, Pose, create_solver
+from kornia_pnpnet.evaluation.plots import BLUE, make_figure, save, themed
 
 LONGEST = 1600  # pixels; larger images are shrunk for the features
 EVERY = 5  # every fifth image of a model is a query

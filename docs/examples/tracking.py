@@ -25,12 +25,12 @@ import rendered_hall
 import torch
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from kornia.geometry.liegroup import So3
-from kornia_pnpnet.evaluation.figures.style import BLUE, GREEN, ORANGE, VERMILION, make_figure, save, themed
 from localiser import RATIO_TEST, Matches, Photo, Sift, match
 from shared import centre, command, pose_error, write
 from torch import Tensor, nn
 
 from kornia_pnpnet import PnPNet, Pose, PosePrior, RobustWeightedLM, create_solver, gravity_prior
+from kornia_pnpnet.evaluation.plots import BLUE, GREEN, ORANGE, VERMILION, make_figure, save, themed
 
 KEYFRAME = 15  # frames from one keyframe to the next
 PAIRS = (3, 4, 6, 10, 30, 100)  # matches of a frame that the solver gets
