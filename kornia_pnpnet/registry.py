@@ -119,8 +119,8 @@ def create_solver(name: str, **options: Any) -> nn.Module:
     Args:
         name: one of :func:`list_solvers`.
         options: options of that solver. ``identity-lm``, every ``-lm`` and trained weights take ``m``, the number of
-            iterations (see :meth:`~kornia_pnpnet.RobustWeightedLM.with_iterations`); ``epnp`` and ``epnp-lm`` take the
-            arguments of :class:`~kornia_pnpnet.propose.epnp.EPnP`, ``reppnp`` and ``reppnp-lm`` of
+            iterations (see :meth:`~kornia_pnpnet.refine.lm.RobustWeightedLM.with_iterations`); ``epnp`` and ``epnp-lm``
+            take the arguments of :class:`~kornia_pnpnet.propose.epnp.EPnP`, ``reppnp`` and ``reppnp-lm`` of
             :class:`~kornia_pnpnet.propose.reppnp.REPPnP`, ``p3p-ransac`` and ``ransac-epnp-lm`` of
             :class:`~kornia_pnpnet.propose.ransac.RANSAC`, peers of their class in :mod:`kornia_pnpnet.peers`. All
             but the peers take the options of :class:`~kornia_pnpnet.solver.PnPNet`.

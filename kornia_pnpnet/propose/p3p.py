@@ -198,7 +198,7 @@ def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
     batch is the last dimension, which suits arithmetic over many poses.
 
     Source: M. Persson and K. Nordberg, "Lambda Twist", ECCV 2018; Y. Ding et al., "Revisiting the P3P Problem", CVPR
-    2023; details in :mod:`kornia_pnpnet.propose.law_of_cosines`.
+    2023; details in ``kornia_pnpnet.propose.law_of_cosines``.
 
     Args:
         world_points: points in any unit, shape :math:`(B, 3, 3)`. Any leading dimensions may stand in place of
@@ -241,7 +241,7 @@ def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
 
 
 class P3P(Configured):
-    r"""Minimal solver of three pairs for :class:`~kornia_pnpnet.propose.RANSAC`: :func:`p3p` as a module.
+    r"""Minimal solver of three pairs for :class:`~kornia_pnpnet.propose.ransac.RANSAC`: :func:`p3p` as a module.
 
     With an unknown focal length :func:`p3p` solves each sample at focal lengths on a grid, spread evenly in logarithms
     over the range of :class:`~kornia_pnpnet.refine.terms.CameraTerm`. Least squares of all inliers, with the focal
