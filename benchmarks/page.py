@@ -36,7 +36,7 @@ WAYS = (
     ("no PyTorch on the machine", "`pnpnet export x.onnx`", " ONNX"),
 )
 #: Contenders that the pictures also show.
-DRAWN = ("p3p-ransac", "kornia-dlt", "pypose-parts")
+DRAWN = ("p3p-ransac", "kornia-dlt")
 #: Other libraries.
 PEERS = ("poselib", "pycolmap", "opencv-ransac", "kornia-rs")
 
