@@ -37,7 +37,7 @@ import numpy as np
 import poselib
 import pycolmap
 import torch
-from harness import Column, Row, by_solver, parser, percent, pivot, recorded, say, table, target, threads, write
+from harness import Column, Row, by_solver, parser, percent, pivot, recorded, say, share, table, target, threads, write
 from tasks import relative_errors
 from torch import Tensor, nn
 
@@ -168,11 +168,6 @@ def errors(found: Found, problems: Problems) -> dict[str, Tensor]:
     turn, shift = relative_errors(found.pose, problems)
     focal = (found.focal / first_focal(problems.intrinsics) - 1.0).abs()
     return {"rotation_deg": turn, "position": shift, "focal": focal}
-
-
-def share(values: Tensor) -> float:
-    """Share of true values."""
-    return values.double().mean().item()
 
 
 def row(found: Found, problems: Problems, *, focal: float = 0.05) -> dict[str, Any]:

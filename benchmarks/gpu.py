@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import torch
 from contenders import CONTENDERS, OURS, N, draw
-from harness import HERE, in_turns, load, parser, say, summary
+from harness import HERE, in_turns, load, parser, say, share, summary
 from tasks import (
     CannotBeTimedError,
     Contender,
@@ -136,11 +136,6 @@ def reason(error: Exception) -> str:
 def rotation_difference(one: Tensor, other: Tensor) -> Tensor:
     """Angles between rotations, radians, shape (B,). Exact to the first order, also where the angle is tiny."""
     return (one - other).flatten(1).norm(dim=1) / math.sqrt(2.0)
-
-
-def share(picked: Tensor) -> float | None:
-    """Share of the entries that are true, ``None`` without entries."""
-    return float(picked.double().mean()) if len(picked) else None
 
 
 # -- CUDA graphs -------------------------------------------------------------------------------------------------------

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import gc
 import json
-import math
 import os
 import statistics
 import subprocess
@@ -16,7 +15,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from torch import Tensor
 
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.core.files import write_json
@@ -98,8 +99,12 @@ def ratio(mine: Mapping[str, Any], theirs: Mapping[str, Any]) -> float:
 
 def quantiles(values: Sequence[float], steps: int) -> list[float]:
     """Quantiles at 0, 1/steps, ..., 1. Each is one of the values."""
-    ascending = sorted(values)
-    return [ascending[max(0, math.ceil(step / steps * len(ascending)) - 1)] for step in range(steps + 1)]
+    return list(np.quantile(values, np.linspace(0, 1, steps + 1), method="inverted_cdf"))
+
+
+def share(picked: Tensor) -> float | None:
+    """Share of the entries that are true, ``None`` without entries."""
+    return float(picked.double().mean()) if len(picked) else None
 
 
 def peak_bytes() -> int:

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from harness import Row, parser, pivot, recorded, say, threads
+from harness import Row, parser, pivot, recorded, say, share, threads
 from kornia.core.exceptions import BaseError
 from kornia.geometry.epipolar import (
     fundamental_from_projections,
@@ -457,11 +457,6 @@ def groups(matches: Matches) -> dict[tuple[str, str], Tensor]:
     return found
 
 
-def rate(values: Tensor) -> float | None:
-    """Share of True, ``None`` of nothing."""
-    return float(values.double().mean()) if len(values) else None
-
-
 def load_solvers(specs: Sequence[str]) -> dict[str, nn.Module]:
     """Solvers and bounds as for :func:`load_solver`, in float32, with CONFIDENCE or SIGMAS at the end."""
     return {spec: load_solver(spec.partition("+")[0]).float() for spec in specs}
@@ -497,8 +492,8 @@ def measure(
             curves[spec] = {name: values.nan_to_num(0.0).tolist() for name, values in curve.items()}
         for (kind, group), at in chosen.items():
             place = {"solver": spec, "kind": kind, "group": group, "batch": size, "count": int(at.sum())}
-            rates = {"success": rate(right[at]), "far": rate(far[at])}
-            oks = {"ok_of_right": rate(one.ok[at & right]), "ok_of_far": rate(one.ok[at & far])}
+            rates = {"success": share(right[at]), "far": share(far[at])}
+            oks = {"ok_of_right": share(one.ok[at & right]), "ok_of_far": share(one.ok[at & far])}
             ms = float(one.milliseconds[at].mean()) if at.any() else None
             rows.append({**place, **rates, **oks, "ms_per_problem": ms})
         if pictures is not None and not failures:

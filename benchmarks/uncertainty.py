@@ -31,7 +31,21 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from harness import Column, Row, in_turns, parser, percent, ratio, recorded, summary, table, target, threads, write
+from harness import (
+    Column,
+    Row,
+    in_turns,
+    parser,
+    percent,
+    ratio,
+    recorded,
+    share,
+    summary,
+    table,
+    target,
+    threads,
+    write,
+)
 from kornia.geometry.liegroup import So3
 from kornia.geometry.linalg import transform_points
 from torch import Tensor, nn
@@ -197,11 +211,6 @@ def draw(n: int, outliers: int, count: int, seed: int, **options: Any) -> Proble
     return SyntheticProblems(n=n, **options).batch(0)
 
 
-def share(values: Tensor) -> float:
-    """Share of true values."""
-    return values.double().mean().item()
-
-
 # -- measurements ------------------------------------------------------------------------------------------------------
 
 
@@ -355,10 +364,10 @@ def measure_times(solver: nn.Module) -> list[dict[str, Any]]:
 def targets(results: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The largest measurements beside what was wanted."""
     found = []
-    for share in SHARES:
-        worst = max(max(row["covariances"]) for row in results["rows"] if row["outliers"] == share)
-        what = f"Largest relative error with {100 * share:.0f} % outliers"
-        found.append(target(what, worst, MOST_ROBUST if share else MOST_CLEAN, unit="", at_most=True))
+    for outliers in SHARES:
+        worst = max(max(row["covariances"]) for row in results["rows"] if row["outliers"] == outliers)
+        what = f"Largest relative error with {100 * outliers:.0f} % outliers"
+        found.append(target(what, worst, MOST_ROBUST if outliers else MOST_CLEAN, unit="", at_most=True))
     slowest = max(row["ratio"] for row in results["times"])
     return [*found, target("Time with covariances by time with sigmas", slowest, MOST_TIME, unit="", at_most=True)]
 
