@@ -56,16 +56,18 @@ def matching(rows: Iterable[Row], **wanted: Any) -> dict[str, Row]:
     return {row["contender"]: row for row in rows if all(row[key] == value for key, value in wanted.items())}
 
 
+def time_of(rows: Mapping[str, Row], name: str, unit: float = 1.0) -> str:
+    """The median time of a contender in ``unit`` microseconds, or a dash."""
+    return three_digits(rows[name]["median_us"] / unit) if name in rows else "–"
+
+
 def ways_table(results: Mapping[str, Mapping[str, Any]], batch: int) -> str:
     """When to call a solver in which way, and what that costs; in each cell ``TRAINED`` and ``ANY``."""
     alone, many = latency_rows(results), batch_rows(results, batch)
     lines = []
     for who, call, way in WAYS:
         names = [f"{solver}{way}" for solver in (TRAINED, ANY)]
-        times = [
-            [three_digits(rows[name]["median_us"] / scale) if name in rows else "–" for name in names]
-            for rows, scale in ((alone, 1e3), (many, 1.0))
-        ]
+        times = [[time_of(rows, name, unit) for name in names] for rows, unit in ((alone, 1e3), (many, 1.0))]
         firsts = [three_digits(first) if (first := first_call(results, name)) else "–" for name in names]
         lines.append((who, call, *(" · ".join(cells) for cells in (*times, firsts))))
     head = ("You have", "Use", "one problem (ms)", f"each of {batch} (µs)", "first call (s)")
@@ -118,12 +120,8 @@ def rounded(count: float) -> str:
 def libraries_table(results: Mapping[str, Mapping[str, Any]], batch: int) -> str:
     """Whole solvers of ours and of other libraries: one problem at a time, and batches."""
     alone, many = latency_rows(results), batch_rows(results, batch)
-    lines = []
-    for name in (*whole_solvers(alone), *(peer for peer in PEERS if peer in alone)):
-        times = [three_digits(alone[name]["median_us"] / 1e3), "–"]
-        if name in many:
-            times[1] = three_digits(many[name]["median_us"])
-        lines.append((f"`{name}`", *times, percent(alone[name]["success"])))
+    names = (*whole_solvers(alone), *(peer for peer in PEERS if peer in alone))
+    lines = [(f"`{x}`", time_of(alone, x, 1e3), time_of(many, x), percent(alone[x]["success"])) for x in names]
     return markdown_table(("Solver", "one problem (ms)", f"each of {batch} (µs)", "success, one problem (%)"), lines)
 
 
@@ -166,12 +164,8 @@ def throughput_table(results: Mapping[str, Any], batch: int) -> str:
     """One batch size on one thread and two, forward and with gradients."""
     rows = [row for row in results["rows"] if (row["n"], row["batch"]) == (N, batch)]
     columns = [matching(rows, threads=count, mode=mode) for mode in (FORWARD, BACKWARD) for count in (1, 2)]
-    lines = []
-    for name in dict.fromkeys(row["contender"] for row in rows):
-        there = [column.get(name) for column in columns]
-        cells = [three_digits(row["median_us"]) if row else "–" for row in there]
-        rate = next(row["success"] for row in there if row)
-        lines.append((f"`{name}`", *cells, percent(rate)))
+    rates = {row["contender"]: row["success"] for row in rows}
+    lines = [(f"`{x}`", *(time_of(column, x) for column in columns), percent(rates[x])) for x in rates]
     head = ("Contender", "one thread", "two", "forward+backward, one", "two", "success (%)")
     return markdown_table(head, lines)
 
@@ -182,8 +176,8 @@ def latency_table(results: Mapping[str, Any]) -> str:
     lines = []
     for name, row in one.items():
         cells = [three_digits(row[key] / 1e3) for key in ("median_us", "p90_us", "p99_us", "max_us")]
-        other = three_digits(two[name]["median_us"] / 1e3) if name in two else "–"
-        lines.append((f"`{name}`", *cells, f"{row['p99_us'] / row['median_us']:.2f}", other, percent(row["success"])))
+        cells += [f"{row['p99_us'] / row['median_us']:.2f}", time_of(two, name, 1e3), percent(row["success"])]
+        lines.append((f"`{name}`", *cells))
     head = ("Contender", "median (ms)", "90 %", "99 %", "largest", "99 % by median", "median, two threads")
     return markdown_table((*head, "success (%)"), lines)
 

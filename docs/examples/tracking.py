@@ -12,6 +12,7 @@ Without ``--sequence`` a walk through a hall is rendered first (``rendered_hall.
 
 from __future__ import annotations
 
+import itertools
 import math
 import tempfile
 import time
@@ -203,23 +204,21 @@ def run(folder: Path, intrinsics: Tensor) -> dict[str, Any]:
     solver = create_solver("pnpnet-set")
     refiner = PnPNet(None, RobustWeightedLM(m=4))  # the last pose is near: few iterations suffice
 
-    def from_last(last: Pose, since: int, frame: Frame) -> PosePrior:
-        return motion_prior(last, since)
-
-    def from_both(last: Pose, since: int, frame: Frame) -> PosePrior:
-        return with_gravity(motion_prior(last, since), frame.down)
-
-    ways = ((solver, lambda *_: None), (solver, from_last), (solver, from_both), (refiner, from_both))
+    ways = (
+        (solver, lambda *_: None),
+        (solver, lambda last, since, _: motion_prior(last, since)),
+        *(
+            (way, lambda last, since, frame: with_gravity(motion_prior(last, since), frame.down))
+            for way in (solver, refiner)
+        ),
+    )
     for way in ways:
         track(frames[:2], intrinsics, *way, PAIRS[-1])  # the first call of a process takes longer
-    runs: dict[str, dict[str, Any]] = {}
-    for pairs in PAIRS:
-        runs[str(pairs)] = {
-            name: track(frames, intrinsics, *way, pairs) for name, way in zip(VARIANTS, ways, strict=True)
-        }
+    runs: dict[str, dict[str, Any]] = {str(pairs): {} for pairs in PAIRS}
+    for pairs, (name, way) in itertools.product(PAIRS, zip(VARIANTS, ways, strict=True)):
+        runs[str(pairs)][name] = found = track(frames, intrinsics, *way, pairs)
         if pairs != DRAWN:
-            for row in runs[str(pairs)].values():
-                del row["path"]
+            del found["path"]
     true = [place(frame.pose) for frame in frames]
     return {"frames": len(frames), "right": RIGHT, "stages_ms": stages, "path": true, "runs": runs}
 
@@ -235,8 +234,7 @@ def draw(results: dict[str, Any], path: Path) -> None:
         above.plot(*np.array(results["runs"][few][name]["path"]).T[:2], color=colours[name], linewidth=1.0)
     above.plot(*np.array(results["path"]).T[:2], color="black", linewidth=0.8, linestyle=":")
     above.set_title(f"{few} pairs per frame, from above", fontsize=8)
-    above.set_xlabel("x (m)")
-    above.set_ylabel("y (m)")
+    above.set(xlabel="x (m)", ylabel="y (m)")
     for name, colour in colours.items():
         shares = [100.0 * results["runs"][str(pairs)][name]["right"] for pairs in PAIRS]
         curves.plot(PAIRS, shares, marker="o", markersize=3.5, color=colour, label=name)
