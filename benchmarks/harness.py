@@ -173,15 +173,9 @@ def pivot(
     by: str = "solver",
     **options: Any,
 ) -> str:
-    """A Markdown table with a line for each combination of the keys, and a column for each of the names.
+    """A Markdown table with a line for each combination of the keys, and a column for each value of the entry ``by``.
 
-    Args:
-        rows: the rows.
-        keys: the first columns.
-        names: values of the entry ``by``, and titles of their columns.
-        cell: what stands in these columns.
-        by: the entry that tells the columns apart.
-        options: those of :func:`~kornia_pnpnet.core.tables.markdown_table`.
+    The columns of ``names`` hold ``cell``; options are those of :func:`~kornia_pnpnet.core.tables.markdown_table`.
     """
     lines: dict[tuple[str, ...], dict[str, str]] = {}
     for row in rows:

@@ -272,12 +272,7 @@ def skipped_reasons(results: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 
 def page(results: Mapping[str, Mapping[str, Any]], gpu: Mapping[str, Any] | None = None) -> str:
-    """The page as Markdown.
-
-    Args:
-        results: the results files by their names in ``PARTS``.
-        gpu: the results file of ``gpu.py``.
-    """
+    """The page as Markdown, from the results files by their names in ``PARTS`` and the one of ``gpu.py``."""
     settings, shipped = results["throughput"]["settings"], PnPNet.from_pretrained(TRAINED)
     batch = settings["problems"]
     targets = [entry for part in PARTS for entry in results[part]["targets"]]

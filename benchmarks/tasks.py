@@ -160,11 +160,7 @@ def without_gradient(call: Callable[[], Any]) -> Callable[[], Any]:
 
 
 def coarse_pose(problems: Problems, seed: int = 0) -> Pose:
-    """The true poses, turned about the centre of the points and moved.
-
-    Returns:
-        Poses in the frame of the problems, in their dtype.
-    """
+    """The true poses, turned about the centre of the points and moved."""
     rotation, translation = problems.pose
     generator = torch.Generator().manual_seed(seed)
     turn, shift = torch.randn(2, len(rotation), 3, generator=generator, dtype=torch.float64)

@@ -59,12 +59,7 @@ def ready(
 
 
 def measure_throughput(settings: Settings, *, count: int) -> dict[str, list[dict[str, Any]]]:
-    """Times on ``count`` threads.
-
-    Returns:
-        ``rows``, one for each contender and point: ``contender``, ``threads``, ``mode``, ``n``, ``batch``, ``count``
-        (number of problems, less than the batch for a loop), ``success``, times; and ``skipped``.
-    """
+    """Times on ``count`` threads. The entry ``count`` of a row is less than the batch for a loop."""
     rows: list[dict[str, Any]] = []
     skipped: list[dict[str, Any]] = []
     # Seconds per problem of the last measurement, scaled in proportion to the number of pairs.
@@ -156,12 +151,7 @@ _WARM = 10  # calls before all others
 
 
 def measure_latency(settings: Settings, *, count: int) -> dict[str, list[dict[str, Any]]]:
-    """Call every contender with one problem at a time, on ``count`` threads.
-
-    Returns:
-        ``rows``, one for each contender: ``calls``, ``median_us``, ``p90_us``, ``p99_us``, ``max_us`` and
-        ``quantiles_us``; and ``skipped``.
-    """
+    """Call every contender with one problem at a time, on ``count`` threads."""
     # The page shows the distribution on one thread, and only the median on two.
     problems = draw(N, settings.latency_calls if count == 1 else max(1, settings.latency_calls // 4), OutlierMix())
     rows = []

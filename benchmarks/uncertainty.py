@@ -111,12 +111,8 @@ def uncertain_pnp(n: int, share: float, count: int, *, turned: bool, seed: int) 
     each has grade 1, 2, ..., 10: the standard deviation along the longest axis, in pixels and in hundredths
     of a unit. Those of the other axes are uniform between 0 and that; the axes have a random direction.
 
-    Args:
-        n: number of pairs.
-        share: share of outliers: half are mismatches, half have a random pixel.
-        count: number of problems.
-        turned: whether the noise of pixels has axes as well. It is isotropic otherwise, as in most of the protocol.
-        seed: seed of the problems.
+    Half of the outliers are mismatches, half have a random pixel. The noise of pixels has axes if ``turned``, and is
+    isotropic otherwise, as in most of the protocol.
     """
     exact = SyntheticProblems(
         n=n,

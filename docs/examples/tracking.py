@@ -162,13 +162,7 @@ def track(
 
     A pose is taken when the solver believes it (``ok``), with a prior also when the camera can have moved there. Else
     the frame keeps the last pose. The camera starts at a known place.
-
-    Args:
-        frames: of a sequence.
-        intrinsics: camera matrix (3, 3).
-        solver: finds each pose.
-        prior: makes the prior of a frame from the last pose, the number of frames since then, and the frame.
-        pairs: largest number of matches of a frame.
+    ``prior`` makes the prior of a frame from the last pose, the number of frames since then, and the frame.
     """
     last, since, path, errors, seconds = frames[0].pose, 1, [], [], []
     for frame in frames:
