@@ -37,14 +37,14 @@ import numpy as np
 import poselib
 import pycolmap
 import torch
-from harness import Column, Row, by_solver, parser, percent, pivot, recorded, say, table, target, threads, write
-from kornia_pnpnet.init.focal import scale_focal
+from harness import Column, Row, by_solver, parser, percent, pivot, recorded, say, share, table, target, threads, write
 from tasks import relative_errors
 from torch import Tensor, nn
 
 from kornia_pnpnet import Normalize, PnPNet, RobustWeightedLM, create_solver
 from kornia_pnpnet.core.trees import map_tensors, take
 from kornia_pnpnet.data import CameraProblems, OutlierMix, SceneProblems, load_scene
+from kornia_pnpnet.propose.focal import scale_focal
 from kornia_pnpnet.result import Pose, Problems
 
 # Used for nothing else. The grid of focal lengths and its threshold were chosen on seed 6 of another generator.
@@ -168,11 +168,6 @@ def errors(found: Found, problems: Problems) -> dict[str, Tensor]:
     turn, shift = relative_errors(found.pose, problems)
     focal = (found.focal / first_focal(problems.intrinsics) - 1.0).abs()
     return {"rotation_deg": turn, "position": shift, "focal": focal}
-
-
-def share(values: Tensor) -> float:
-    """Share of true values."""
-    return values.double().mean().item()
 
 
 def row(found: Found, problems: Problems, *, focal: float = 0.05) -> dict[str, Any]:

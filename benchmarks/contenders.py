@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import torch
 from harness import HERE, say
-from others import KorniaDLT, Peer, PyPose
+from others import KorniaDLT, Peer
 from tasks import (
     ITERATIONS,
     CannotBeTimedError,
@@ -92,15 +92,15 @@ class Refinement(Contender):
 
     def task(self, problems: Problems, *, backward: bool = False) -> Task:
         """The call of the refinement."""
-        corr, guess, undo = normalized(problems, self.device)
-        call: Callable[[], object] = without_gradient(lambda: self.refine(corr, guess))
+        pairs, starts, undo = normalized(problems, self.device)
+        call: Callable[[], object] = without_gradient(lambda: self.refine(pairs, starts))
         if backward:
             # Not cloned: a clone would change the layout in memory in which the solver hands pairs over.
-            leaves = [x.detach().requires_grad_() for x in (corr.world_points, corr.img_points)]
-            wanted = corr._replace(world_points=leaves[0], img_points=leaves[1])
+            leaves = [x.detach().requires_grad_() for x in (pairs.world_points, pairs.img_points)]
+            wanted = pairs._replace(world_points=leaves[0], img_points=leaves[1])
             learned = [x for x in self.refine.parameters() if x.requires_grad]
-            call = lambda: gradient(self.refine(wanted, guess).pose, [*leaves, *learned])  # noqa: E731
-        return Task(call, lambda: undo(self.refine(corr, guess).pose), problems, waiting(self.device))
+            call = lambda: gradient(self.refine(wanted, starts).pose, [*leaves, *learned])  # noqa: E731
+        return Task(call, lambda: undo(self.refine(pairs, starts).pose), problems, waiting(self.device))
 
 
 def exported(spec: str, suffix: str, export: Callable[[PnPNet, Path], object]) -> Path:
@@ -203,11 +203,7 @@ CONTENDERS: dict[str, Callable[..., Contender]] = {
     "poselib": functools.partial(Peer, "poselib"),
     "pycolmap": functools.partial(Peer, "pycolmap"),
     "kornia-dlt": KorniaDLT,
-    "pypose-lm": functools.partial(PyPose, own_loop=False),
-    "pypose-parts": functools.partial(PyPose, own_loop=True),
 }
-#: Contenders of thousands of small operations that wait for each other: on two threads they take minutes.
-ONE_THREAD = ("pypose-lm", "pypose-parts")
 
 
 # -- how much, and on which problems -----------------------------------------------------------------------------------
@@ -248,18 +244,12 @@ def draw(n: int, count: int, outliers: OutlierMix | None = None) -> Problems:
     return draw_problems(source, count)
 
 
-def make_contenders(settings: Settings, *, count: int = 1) -> tuple[dict[str, Contender], list[dict[str, Any]]]:
-    """The contenders that are asked for by name, and for each that cannot be made its name and the reason.
-
-    Some contenders are measured on one thread only; ``count`` is the number of threads.
-    """
+def make_contenders(settings: Settings) -> tuple[dict[str, Contender], list[dict[str, Any]]]:
+    """The contenders that are asked for by name, and for each that cannot be made its name and the reason."""
     made: dict[str, Contender] = {}
     skipped: list[dict[str, Any]] = []
     for name, make in CONTENDERS.items():
         if settings.contenders is not None and name not in settings.contenders:
-            continue
-        if count > 1 and name in ONE_THREAD:
-            skipped.append({"contender": name, "why": "measured on one thread only"})
             continue
         try:
             made[name] = make()

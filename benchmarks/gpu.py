@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import torch
 from contenders import CONTENDERS, OURS, N, draw
-from harness import HERE, in_turns, load, parser, say, summary
+from harness import HERE, in_turns, load, parser, say, share, summary
 from tasks import (
     CannotBeTimedError,
     Contender,
@@ -75,13 +75,7 @@ QUICK = Amount(4, ("pnpnet-n9",), ("eager",), (1, 4), ("pnpnet-n9", "epnp-lm"), 
 
 
 def parity(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
-    """Solve the same problems on the CPU and on the device, with gradients, by every solver of ours.
-
-    Yields:
-        For each solver and dtype ``success`` on the CPU and on the device; ``same_ok``, the share of problems of the
-        same ``ok``; of those that are ``ok`` on both ``same_pose`` and ``same_gradient``, the shares within ``limit``;
-        or ``why`` a solver fails.
-    """
+    """Solve the same problems on the CPU and on the device, with gradients, by every solver of ours."""
     for name in list_solvers():
         try:
             solver = create_solver(name)
@@ -138,11 +132,6 @@ def rotation_difference(one: Tensor, other: Tensor) -> Tensor:
     return (one - other).flatten(1).norm(dim=1) / math.sqrt(2.0)
 
 
-def share(picked: Tensor) -> float | None:
-    """Share of the entries that are true, ``None`` without entries."""
-    return float(picked.double().mean()) if len(picked) else None
-
-
 # -- CUDA graphs -------------------------------------------------------------------------------------------------------
 
 #: By mode the options of ``solver.compile``; ``None``: not compiled.
@@ -174,13 +163,7 @@ def captured(call: Callable[[], PnPResult]) -> Callable[[], PnPResult]:
 
 
 def graphs(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
-    """Time a call of each mode, of solvers with a fixed effort.
-
-    Yields:
-        For each solver and batch ``modes``: by mode the times of a call, ``rotation_difference``, the largest angle to
-        the pose of the first mode, ``same_ok``, and ``warm_s``, the seconds of the first calls, which may compile; or
-        ``why`` the mode is missing.
-    """
+    """Time a call of each mode, of solvers with a fixed effort."""
     for name in amount.graphs:
         say(f"graphs: {name}")
         torch.compiler.reset()
@@ -281,11 +264,7 @@ def _task(call: Callable[[], object], problems: Problems, device: str) -> Task:
 
 
 def work(contender: Contender, problems: Problems, *, backward: bool) -> dict[str, float]:
-    """Count what a call that is not compiled does for a problem.
-
-    Returns:
-        ``least_bytes`` of inputs, pose and gradients; ``bytes`` and ``flops`` of :class:`Work`.
-    """
+    """Count what a call that is not compiled does for a problem, see :class:`Work`."""
     task = contender.task(problems, backward=backward)
     with Work() as counted:
         task.call()
@@ -300,15 +279,7 @@ def work(contender: Contender, problems: Problems, *, backward: bool) -> dict[st
 
 
 def measure_throughput(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
-    """Time per problem, peak memory, and how far from the floors of the machine.
-
-    Yields:
-        The rates of the machine. Then for each contender and point the times of a problem; ``peak_bytes`` of a call
-        beyond what was allocated before, ``None`` on a CPU; ``work`` of a problem; ``warm_s``, seconds of the first two
-        calls; ``shares`` of the median time: ``floor``, the least possible time (the larger of the times of
-        ``least_bytes`` and ``flops``), and ``traffic``, the time of ``bytes``, above 1 where a compiler has fused
-        operations; or ``why`` a point is missing.
-    """
+    """Time per problem, peak memory, and how far from the floors of the machine, after the rates of the machine."""
     rates = machine_rates(device, amount)
     yield {"rates": rates}
     for name, n in itertools.product(amount.contenders, amount.pairs):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import gc
 import json
-import math
 import os
 import statistics
 import subprocess
@@ -16,7 +15,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from torch import Tensor
 
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.core.files import write_json
@@ -98,8 +99,12 @@ def ratio(mine: Mapping[str, Any], theirs: Mapping[str, Any]) -> float:
 
 def quantiles(values: Sequence[float], steps: int) -> list[float]:
     """Quantiles at 0, 1/steps, ..., 1. Each is one of the values."""
-    ascending = sorted(values)
-    return [ascending[max(0, math.ceil(step / steps * len(ascending)) - 1)] for step in range(steps + 1)]
+    return list(np.quantile(values, np.linspace(0, 1, steps + 1), method="inverted_cdf"))
+
+
+def share(picked: Tensor) -> float | None:
+    """Share of the entries that are true, ``None`` without entries."""
+    return float(picked.double().mean()) if len(picked) else None
 
 
 def peak_bytes() -> int:
@@ -168,15 +173,9 @@ def pivot(
     by: str = "solver",
     **options: Any,
 ) -> str:
-    """A Markdown table with a line for each combination of the keys, and a column for each of the names.
+    """A Markdown table with a line for each combination of the keys, and a column for each value of the entry ``by``.
 
-    Args:
-        rows: the rows.
-        keys: the first columns.
-        names: values of the entry ``by``, and titles of their columns.
-        cell: what stands in these columns.
-        by: the entry that tells the columns apart.
-        options: those of :func:`~kornia_pnpnet.core.tables.markdown_table`.
+    The columns of ``names`` hold ``cell``; options are those of :func:`~kornia_pnpnet.core.tables.markdown_table`.
     """
     lines: dict[tuple[str, ...], dict[str, str]] = {}
     for row in rows:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,6 @@ import pandas as pd
 from contenders import ANY, PLAIN, TRAINED, N
 from harness import HERE, Row
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from kornia_pnpnet.evaluation.figures import style
 from startup import CACHED, COLD, EAGER
 from tasks import COARSE_ANGLE_DEG, COARSE_SHIFT, ITERATIONS
 from timing import BACKWARD, FORWARD
@@ -21,6 +21,9 @@ from kornia_pnpnet import PnPNet
 from kornia_pnpnet.core.files import atomic_open
 from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.metrics import SuccessRate
+
+sys.path.append(str(HERE.parent / "docs" / "results"))
+import figures
 
 PAGE = HERE.parent / "docs" / "performance.md"
 PARTS = ("throughput", "latency", "startup")
@@ -33,7 +36,7 @@ WAYS = (
     ("no PyTorch on the machine", "`pnpnet export x.onnx`", " ONNX"),
 )
 #: Contenders that the pictures also show.
-DRAWN = ("p3p-ransac", "kornia-dlt", "pypose-parts")
+DRAWN = ("p3p-ransac", "kornia-dlt")
 #: Other libraries.
 PEERS = ("poselib", "pycolmap", "opencv-ransac", "kornia-rs")
 
@@ -53,16 +56,18 @@ def matching(rows: Iterable[Row], **wanted: Any) -> dict[str, Row]:
     return {row["contender"]: row for row in rows if all(row[key] == value for key, value in wanted.items())}
 
 
+def time_of(rows: Mapping[str, Row], name: str, unit: float = 1.0) -> str:
+    """The median time of a contender in ``unit`` microseconds, or a dash."""
+    return three_digits(rows[name]["median_us"] / unit) if name in rows else "–"
+
+
 def ways_table(results: Mapping[str, Mapping[str, Any]], batch: int) -> str:
     """When to call a solver in which way, and what that costs; in each cell ``TRAINED`` and ``ANY``."""
     alone, many = latency_rows(results), batch_rows(results, batch)
     lines = []
     for who, call, way in WAYS:
         names = [f"{solver}{way}" for solver in (TRAINED, ANY)]
-        times = [
-            [three_digits(rows[name]["median_us"] / scale) if name in rows else "–" for name in names]
-            for rows, scale in ((alone, 1e3), (many, 1.0))
-        ]
+        times = [[time_of(rows, name, unit) for name in names] for rows, unit in ((alone, 1e3), (many, 1.0))]
         firsts = [three_digits(first) if (first := first_call(results, name)) else "–" for name in names]
         lines.append((who, call, *(" · ".join(cells) for cells in (*times, firsts))))
     head = ("You have", "Use", "one problem (ms)", f"each of {batch} (µs)", "first call (s)")
@@ -115,12 +120,8 @@ def rounded(count: float) -> str:
 def libraries_table(results: Mapping[str, Mapping[str, Any]], batch: int) -> str:
     """Whole solvers of ours and of other libraries: one problem at a time, and batches."""
     alone, many = latency_rows(results), batch_rows(results, batch)
-    lines = []
-    for name in (*whole_solvers(alone), *(peer for peer in PEERS if peer in alone)):
-        times = [three_digits(alone[name]["median_us"] / 1e3), "–"]
-        if name in many:
-            times[1] = three_digits(many[name]["median_us"])
-        lines.append((f"`{name}`", *times, percent(alone[name]["success"])))
+    names = (*whole_solvers(alone), *(peer for peer in PEERS if peer in alone))
+    lines = [(f"`{x}`", time_of(alone, x, 1e3), time_of(many, x), percent(alone[x]["success"])) for x in names]
     return markdown_table(("Solver", "one problem (ms)", f"each of {batch} (µs)", "success, one problem (%)"), lines)
 
 
@@ -163,12 +164,8 @@ def throughput_table(results: Mapping[str, Any], batch: int) -> str:
     """One batch size on one thread and two, forward and with gradients."""
     rows = [row for row in results["rows"] if (row["n"], row["batch"]) == (N, batch)]
     columns = [matching(rows, threads=count, mode=mode) for mode in (FORWARD, BACKWARD) for count in (1, 2)]
-    lines = []
-    for name in dict.fromkeys(row["contender"] for row in rows):
-        there = [column.get(name) for column in columns]
-        cells = [three_digits(row["median_us"]) if row else "–" for row in there]
-        rate = next(row["success"] for row in there if row)
-        lines.append((f"`{name}`", *cells, percent(rate)))
+    rates = {row["contender"]: row["success"] for row in rows}
+    lines = [(f"`{x}`", *(time_of(column, x) for column in columns), percent(rates[x])) for x in rates]
     head = ("Contender", "one thread", "two", "forward+backward, one", "two", "success (%)")
     return markdown_table(head, lines)
 
@@ -179,8 +176,8 @@ def latency_table(results: Mapping[str, Any]) -> str:
     lines = []
     for name, row in one.items():
         cells = [three_digits(row[key] / 1e3) for key in ("median_us", "p90_us", "p99_us", "max_us")]
-        other = three_digits(two[name]["median_us"] / 1e3) if name in two else "–"
-        lines.append((f"`{name}`", *cells, f"{row['p99_us'] / row['median_us']:.2f}", other, percent(row["success"])))
+        cells += [f"{row['p99_us'] / row['median_us']:.2f}", time_of(two, name, 1e3), percent(row["success"])]
+        lines.append((f"`{name}`", *cells))
     head = ("Contender", "median (ms)", "90 %", "99 %", "largest", "99 % by median", "median, two threads")
     return markdown_table((*head, "success (%)"), lines)
 
@@ -275,12 +272,7 @@ def skipped_reasons(results: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 
 def page(results: Mapping[str, Mapping[str, Any]], gpu: Mapping[str, Any] | None = None) -> str:
-    """The page as Markdown.
-
-    Args:
-        results: the results files by their names in ``PARTS``.
-        gpu: the results file of ``gpu.py``.
-    """
+    """The page as Markdown, from the results files by their names in ``PARTS`` and the one of ``gpu.py``."""
     settings, shipped = results["throughput"]["settings"], PnPNet.from_pretrained(TRAINED)
     batch = settings["problems"]
     targets = [entry for part in PARTS for entry in results[part]["targets"]]
@@ -325,14 +317,14 @@ def plot_times(
     tables = {name: pd.DataFrame(rows).assign(solver=lambda table: table.contender) for name, rows in panels.items()}
     columns = {"median_us": "us", against: label}
     curves = [(name, table.rename(columns=columns), "us") for name, table in tables.items()]
-    return style.draw_curves(path, [title], curves, label, _looks(pd.concat(tables.values()).contender))
+    return figures.draw_curves(path, [title], curves, label, _looks(pd.concat(tables.values()).contender))
 
 
-@style.themed
+@figures.themed
 def plot_latency(path: Path, title: str, rows: Sequence[Mapping[str, Any]]) -> Path:
     """Draw the share of the calls with one problem that end within a time, without the slowest hundredth."""
     looks = _looks(row["contender"] for row in rows)
-    figure = style.make_figure(style.WIDTH, 4.8, title)
+    figure = figures.make_figure(figures.WIDTH, 4.8, title)
     axes = figure.subplots()
     for name, look in looks.items():
         for row in (row for row in rows if row["contender"] == name):
@@ -341,9 +333,9 @@ def plot_latency(path: Path, title: str, rows: Sequence[Mapping[str, Any]]) -> P
             x, y = np.array(row["quantiles_us"])[kept] / 1e3, 100 * shares[kept]
             axes.plot(x, y, **look, markevery=max(1, len(x) // 5))
     axes.set(xlabel="ms for one problem", ylabel="calls done (%)", ylim=(0, 100))
-    style.log_scale(axes, "x")
-    style.draw_legend(figure, looks)
-    return style.save(figure, path)
+    figures.log_scale(axes, "x")
+    figures.draw_legend(figure, looks)
+    return figures.save(figure, path)
 
 
 def _looks(names: Iterable[str]) -> dict[str, dict[str, Any]]:
@@ -351,12 +343,12 @@ def _looks(names: Iterable[str]) -> dict[str, dict[str, Any]]:
     there = set(names)
     bases = {next((name.removesuffix(way) for way in _WAYS if name.endswith(way)), name) for name in there}
     found = {}
-    for base, look in style.solver_styles(bases).items():
+    for base, look in figures.solver_styles(bases).items():
         for way, line in {"": "--", **_WAYS}.items():
             if base + way in there:
                 alone = not any(base + way in there for way in _WAYS)
                 shape = look["color"], look["marker"], look["linestyle"] if alone else line
-                found[base + way] = style.line_style(*shape, ours=style.is_ours(base) and line != "--")
+                found[base + way] = figures.line_style(*shape, ours=figures.is_ours(base) and line != "--")
     return found
 
 

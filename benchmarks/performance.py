@@ -68,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for part in options.parts:
         path = options.results / f"{part}.json"
         results = recorded(partial(measure_part, part, settings), **settings._asdict())
-        results["environment"]["versions"] |= {name: installed.get(name) for name in ("pypose", "onnxruntime")}
+        results["environment"]["versions"]["onnxruntime"] = installed.get("onnxruntime")
         save_results(results, path)
         say(f"wrote {path}")
 

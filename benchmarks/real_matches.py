@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from harness import Row, parser, pivot, recorded, say, threads
+from harness import Row, parser, pivot, recorded, say, share, threads
 from kornia.core.exceptions import BaseError
 from kornia.geometry.epipolar import (
     fundamental_from_projections,
@@ -32,6 +32,8 @@ from kornia.geometry.epipolar import (
     right_to_left_epipolar_distance,
 )
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor, nn
 
 from kornia_pnpnet import pose_errors
@@ -193,27 +195,21 @@ def tracks(views: Sequence[View]) -> list[Whole]:
     track with two keypoints in one image is dropped.
     """
     starts = np.cumsum([0, *(len(view.pixels) for view in views)])
-    parent = np.arange(starts[-1])
-
-    def root(node: int) -> int:
-        while parent[node] != node:
-            parent[node] = parent[parent[node]]
-            node = parent[node]
-        return node
-
+    edges = [np.zeros((0, 2), dtype=np.int64)]
     for i, j in itertools.combinations(range(len(views)), 2):
         there, ratio = nearest(views[i].descriptors, views[j].descriptors)
         back, _ = nearest(views[j].descriptors, views[i].descriptors)
         mine = np.arange(len(there))
         pairs = np.column_stack([mine, there])[(back[there] == mine) & (ratio < RATIO_TEST)]
-        for a, b in pairs[agree(views[i], views[j], pairs)]:
-            parent[root(starts[i] + a)] = root(starts[j] + b)
-    roots = np.array([root(node) for node in range(starts[-1])])
-    size = np.bincount(roots, minlength=starts[-1])
+        edges.append(pairs[agree(views[i], views[j], pairs)] + [starts[i], starts[j]])
+    ends = np.concatenate(edges).T
+    graph = coo_array((np.ones(ends.shape[1]), (ends[0], ends[1])), shape=(starts[-1], starts[-1]))
+    _, track = connected_components(graph, directed=False)
+    size = np.bincount(track)
     image = np.repeat(np.arange(len(views)), np.diff(starts))
-    keys, times = np.unique(roots * len(views) + image, return_counts=True)
+    keys, times = np.unique(track * len(views) + image, return_counts=True)
     size[keys[times > 1] // len(views)] = 0
-    labels = np.where(size[roots] >= 2, roots, -1)
+    labels = np.where(size[track] >= 2, track, -1)
     return [labels[start:end] for start, end in itertools.pairwise(starts)]
 
 
@@ -292,20 +288,7 @@ def choose_images(query: View, database: Sequence[View], points: Sequence[Floats
 
 
 def make(folder: Path, out: Path, *, features: int, every: int, views: int, pairs: int, seed: int) -> Matches:
-    """Make the problems of one scene and write them to ``out``.
-
-    Args:
-        folder: the scene.
-        out: the ``.npz`` file.
-        features: largest number of keypoints of an image.
-        every: every ``every``-th image is a query.
-        views: number of images of the map that each query is matched to.
-        pairs: largest number of pairs of a problem; of more pairs a random subset is kept.
-        seed: seed of the subsets.
-
-    Returns:
-        The problems, as :func:`read` reads them.
-    """
+    """Make the problems of one scene, with the options of the command, write them and read them again."""
     found = read_views(folder, features)
     queries, database = found[every // 2 :: every], [v for i, v in enumerate(found) if i % every != every // 2]
     points = triangulate(database, tracks(database))
@@ -457,11 +440,6 @@ def groups(matches: Matches) -> dict[tuple[str, str], Tensor]:
     return found
 
 
-def rate(values: Tensor) -> float | None:
-    """Share of True, ``None`` of nothing."""
-    return float(values.double().mean()) if len(values) else None
-
-
 def load_solvers(specs: Sequence[str]) -> dict[str, nn.Module]:
     """Solvers and bounds as for :func:`load_solver`, in float32, with CONFIDENCE or SIGMAS at the end."""
     return {spec: load_solver(spec.partition("+")[0]).float() for spec in specs}
@@ -470,18 +448,7 @@ def load_solvers(specs: Sequence[str]) -> dict[str, nn.Module]:
 def measure(
     matches: Matches, specs: Sequence[str], pictures: Path | None = None, sizes: Sequence[int] = (BATCH,)
 ) -> dict[str, Any]:
-    """Solve the problems.
-
-    Args:
-        matches: problems of :func:`read`.
-        specs: as for :func:`load_solvers`.
-        pictures: folder for pictures of failures.
-        sizes: numbers of problems in a call; all solvers run with each, and other libraries always get one problem.
-
-    Returns:
-        ``counts``, ``rows`` (one for each solver, kind, group and size), ``reliability`` by solver, and ``failures`` in
-        the pictures.
-    """
+    """Solve the problems with all solvers, with each of the ``sizes`` of a call; draw failures into ``pictures``."""
     solvers, chosen = load_solvers(specs), groups(matches)
     with threads():
         solved = {size: solve(solvers, matches, size) for size in sizes}
@@ -497,8 +464,8 @@ def measure(
             curves[spec] = {name: values.nan_to_num(0.0).tolist() for name, values in curve.items()}
         for (kind, group), at in chosen.items():
             place = {"solver": spec, "kind": kind, "group": group, "batch": size, "count": int(at.sum())}
-            rates = {"success": rate(right[at]), "far": rate(far[at])}
-            oks = {"ok_of_right": rate(one.ok[at & right]), "ok_of_far": rate(one.ok[at & far])}
+            rates = {"success": share(right[at]), "far": share(far[at])}
+            oks = {"ok_of_right": share(one.ok[at & right]), "ok_of_far": share(one.ok[at & far])}
             ms = float(one.milliseconds[at].mean()) if at.any() else None
             rows.append({**place, **rates, **oks, "ms_per_problem": ms})
         if pictures is not None and not failures:
@@ -510,12 +477,7 @@ def measure(
 def measure_cost(matches: Matches, specs: Sequence[str]) -> dict[str, Any]:
     """Time solvers on the matches without a ratio test, apart for every share of outliers and number of pairs.
 
-    Args:
-        matches: problems of :func:`read`.
-        specs: as for :func:`load_solvers`.
-
-    Returns:
-        ``rows``: the milliseconds of a problem in a batch of a group's problems, repeated in turns.
+    A batch holds the problems of a group, repeated in turns.
     """
     solvers, chosen, rows = load_solvers(specs), groups(matches), []
     with threads():

@@ -8,11 +8,8 @@ problem. Writes ``scale.json``.
 
 from __future__ import annotations
 
-import argparse
 import os
 import shutil
-import signal
-import subprocess
 import sys
 import time
 from contextlib import suppress
@@ -21,8 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pyarrow as pa
-from harness import HERE, load, say
+from harness import HERE, load, parser, say
 from pyarrow import dataset, parquet
 
 from kornia_pnpnet.arrow import list_column
@@ -77,19 +75,24 @@ def run(command: list[str], kill_at: tuple[Path, int, str] | None = None) -> dic
     start = time.perf_counter()
     killed, peak = None, 0
     cpu: dict[int, float] = {}
-    with subprocess.Popen(
-        command, env={**os.environ, "OMP_NUM_THREADS": "1", "RAY_ADDRESS": "local"}, stdout=sys.stderr
-    ) as process:
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "RAY_ADDRESS": "local"}
+    with psutil.Popen(command, env=environment, stdout=sys.stderr) as process:
         while process.poll() is None:
             time.sleep(PERIOD)
-            family = processes(process.pid)
-            peak = max(peak, sum(map(memory, family)))
-            cpu.update((pid, cpu_seconds(pid) or cpu.get(pid, 0.0)) for pid in family)
+            memory, victims = 0, []
+            with suppress(psutil.NoSuchProcess):
+                family = [process, *process.children(recursive=True)]
+            for one in family:
+                with suppress(psutil.NoSuchProcess):  # it has ended
+                    memory += one.memory_full_info().pss  # memory that processes share is divided among them
+                    spent = one.cpu_times()
+                    cpu[one.pid] = spent.user + spent.system
+                    victims += [one] if kill_at and kill_at[2] in " ".join(one.cmdline()) else []
+            peak = max(peak, memory)
             if kill_at and killed is None and rows(kill_at[0]) >= kill_at[1]:
                 killed = rows(kill_at[0])
-                victims = [pid for pid in family if kill_at[2] in title_of(pid)]
-                for pid in victims[:1] if kill_at[2] else victims:
-                    os.kill(pid, signal.SIGKILL)
+                for one in victims[:1] if kill_at[2] else victims:
+                    one.kill()
         wall = time.perf_counter() - start
     if kill_at and killed is None:
         raise RuntimeError("the command ended before a process could be killed")
@@ -105,47 +108,6 @@ def rows(folder: Path) -> int:
         with suppress(pa.ArrowException, OSError):
             count += parquet.read_metadata(path).num_rows
     return count
-
-
-def processes(root: int) -> list[int]:
-    """A process and all that it started, directly or not."""
-    children: dict[int, list[int]] = {}
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            parent = int(path.read_text().rpartition(")")[2].split()[1])
-        except OSError:  # the process has ended
-            continue
-        children.setdefault(parent, []).append(int(path.parent.name))
-    found = [root]
-    for pid in found:
-        found += children.get(pid, [])
-    return found
-
-
-def memory(pid: int) -> int:
-    """Bytes of a process; memory that processes share is divided among them."""
-    try:
-        lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
-    except OSError:
-        return 0
-    return 1024 * next((int(line.split()[1]) for line in lines if line.startswith("Pss:")), 0)
-
-
-def cpu_seconds(pid: int) -> float:
-    """Seconds that a process has computed; 0 when it has ended."""
-    try:
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    except OSError:
-        return 0.0
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
-def title_of(pid: int) -> str:
-    """The title of a process."""
-    try:
-        return Path(f"/proc/{pid}/cmdline").read_text()
-    except OSError:
-        return ""
 
 
 def read(folder: Path) -> dict[str, np.ndarray]:
@@ -217,13 +179,13 @@ def measure(problems: int, solver: str, batch: int, folder: Path) -> dict[str, A
 
 def main() -> None:
     """Measure, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--problems", type=int, default=1_000_000)
-    parser.add_argument("--solver", default="pnpnet-n9")
-    parser.add_argument("--batch-size", type=int, default=10_000)
-    parser.add_argument("--folder", type=Path, default=Path("outputs/scale"), help="of the problems and the results")
-    parser.add_argument("--out", type=Path, default=HERE / "scale.json")
-    options = parser.parse_args()
+    command = parser(__doc__)
+    command.add_argument("--problems", type=int, default=1_000_000)
+    command.add_argument("--solver", default="pnpnet-n9")
+    command.add_argument("--batch-size", type=int, default=10_000)
+    command.add_argument("--folder", type=Path, default=Path("outputs/scale"), help="of the problems and the results")
+    command.add_argument("--out", type=Path, default=HERE / "scale.json")
+    options = command.parse_args()
     found = measure(options.problems, options.solver, options.batch_size, options.folder)
     versions = {name: metadata.version(name) for name in ("ray", "pyarrow")}
     write_json(options.out, {"environment": environment(), "versions": versions, **found})

@@ -126,17 +126,7 @@ def measure_memory(spec: str, count: int) -> dict[str, Any]:
 
 
 def measure(specs: Sequence[str], *, count: int, repeats: int, memory_count: int) -> dict[str, Any]:
-    """Measure everything, with a line on standard error for each step.
-
-    Args:
-        specs: solvers, as for :func:`load_solver`. Solvers without their package are skipped.
-        count: number of problems in a batch.
-        repeats: number of rounds.
-        memory_count: number of problems of the memory measurement; 0: none.
-
-    Returns:
-        ``skipped`` (the reason by solver), ``rows`` (one for each solver and set), ``speedups`` and ``memory``.
-    """
+    """Measure everything, with the options of the command. Solvers without their package are skipped."""
     solvers, skipped = {}, {}
     for spec in specs:
         try:

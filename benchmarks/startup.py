@@ -24,9 +24,6 @@ def measure_startup(settings: Settings) -> dict[str, Any]:
     """Start every contender alone, forward and with gradients, on one thread.
 
     Compiled contenders start with an empty cache of the compiler, and again with the cache of that first start.
-
-    Returns:
-        ``starts``, one for each process: the answer of ``process.py``, and the ``cache``; ``skipped`` and ``targets``.
     """
     contenders, skipped = make_contenders(settings)
     starts = []

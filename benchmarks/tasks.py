@@ -160,11 +160,7 @@ def without_gradient(call: Callable[[], Any]) -> Callable[[], Any]:
 
 
 def coarse_pose(problems: Problems, seed: int = 0) -> Pose:
-    """The true poses, turned about the centre of the points and moved.
-
-    Returns:
-        Poses in the frame of the problems, in their dtype.
-    """
+    """The true poses, turned about the centre of the points and moved."""
     rotation, translation = problems.pose
     generator = torch.Generator().manual_seed(seed)
     turn, shift = torch.randn(2, len(rotation), 3, generator=generator, dtype=torch.float64)
@@ -178,8 +174,7 @@ def coarse_pose(problems: Problems, seed: int = 0) -> Pose:
 
 def normalized(problems: Problems, device: str) -> tuple[Problem, Starts, Callable[[Pose], Pose]]:
     """Normalised pairs, the coarse pose in their frame, and the function that undoes normalisation for a pose."""
-    normalize = Normalize(order=False)
     with torch.no_grad():
-        corr, frame = normalize(*float_inputs(problems, device))
-        start = normalize.apply_to_pose(Pose(*(x.to(corr.world_points) for x in coarse_pose(problems))), frame)
-    return corr, Starts(start, torch.ones_like(corr.weights)), lambda pose: normalize.undo(pose, frame)
+        problem, frame = Normalize(order=False)(*float_inputs(problems, device))
+        start = frame.apply(Pose(*(x.to(problem.world_points) for x in coarse_pose(problems))))
+    return problem, Starts(start, torch.ones_like(problem.weights)), frame.undo

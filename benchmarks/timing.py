@@ -59,12 +59,7 @@ def ready(
 
 
 def measure_throughput(settings: Settings, *, count: int) -> dict[str, list[dict[str, Any]]]:
-    """Times on ``count`` threads.
-
-    Returns:
-        ``rows``, one for each contender and point: ``contender``, ``threads``, ``mode``, ``n``, ``batch``, ``count``
-        (number of problems, less than the batch for a loop), ``success``, times; and ``skipped``.
-    """
+    """Times on ``count`` threads. The entry ``count`` of a row is less than the batch for a loop."""
     rows: list[dict[str, Any]] = []
     skipped: list[dict[str, Any]] = []
     # Seconds per problem of the last measurement, scaled in proportion to the number of pairs.
@@ -75,7 +70,7 @@ def measure_throughput(settings: Settings, *, count: int) -> dict[str, list[dict
             known = {key: seconds * max(1.0, n / before) for key, seconds in known.items()}
             before = n
             torch.compiler.reset()  # compile for this number of pairs only
-            contenders, missing = make_contenders(settings, count=count)
+            contenders, missing = make_contenders(settings)
             skipped += [{**entry, "threads": count, "n": n} for entry in missing]
             problems = draw(n, max(settings.problems, *(batch for batch, _ in points)))
             rates: dict[str, dict[str, Any]] = {}
@@ -129,22 +124,22 @@ def timed(
 
 def throughput_targets(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Targets of 1000 problems of 9 pairs with 3 mismatches on one thread, where both sides were measured."""
-    here = [row for row in rows if (row["threads"], row["n"], row["batch"]) == (1, N, 1000)]
-    forward, backward = ({row["contender"]: row for row in here if row["mode"] == mode} for mode in (FORWARD, BACKWARD))
+    here = {row["contender"]: row for row in rows if _place(row) == (1, N, 1000, FORWARD)}
     found = []
-    solvers = (f"{TRAINED} compiled",)
-    for name, most in (("refinement compiled", 3.0), *((name, 8.0) for name in solvers)):
-        if name in forward:
+    for name, most in (("refinement compiled", 3.0), (f"{TRAINED} compiled", 8.0)):
+        if name in here:
             what = f"`{name}`, per problem"
-            found.append(target(what, forward[name]["median_us"], most, unit="µs", at_most=True))
-    ratios = [(forward, name, *least) for least in (("opencv-ransac", 20.0), ("poselib", 10.0)) for name in solvers]
-    ratios += [(forward, f"{ANY} compiled", "poselib", 5.0)]
-    ratios += [(backward, "refinement compiled", name, 10.0) for name in ("pypose-lm", "pypose-parts")]
-    for times, mine, theirs, least in ratios:
-        if mine in times and theirs in times:
-            what = f"`{mine}` against `{theirs}`, {times[mine]['mode']}"
-            found.append(target(what, ratio(times[mine], times[theirs]), least, unit="times as fast", at_most=False))
+            found.append(target(what, here[name]["median_us"], most, unit="µs", at_most=True))
+    for solver, peer, least in ((TRAINED, "opencv-ransac", 20.0), (TRAINED, "poselib", 10.0), (ANY, "poselib", 5.0)):
+        mine = f"{solver} compiled"
+        if mine in here and peer in here:
+            what = f"`{mine}` against `{peer}`, {FORWARD}"
+            found.append(target(what, ratio(here[mine], here[peer]), least, unit="times as fast", at_most=False))
     return found
+
+
+def _place(row: Mapping[str, Any]) -> tuple[int, int, int, str]:
+    return row["threads"], row["n"], row["batch"], row["mode"]
 
 
 # -- one problem at a time ---------------------------------------------------------------------------------------------
@@ -156,17 +151,12 @@ _WARM = 10  # calls before all others
 
 
 def measure_latency(settings: Settings, *, count: int) -> dict[str, list[dict[str, Any]]]:
-    """Call every contender with one problem at a time, on ``count`` threads.
-
-    Returns:
-        ``rows``, one for each contender: ``calls``, ``median_us``, ``p90_us``, ``p99_us``, ``max_us`` and
-        ``quantiles_us``; and ``skipped``.
-    """
+    """Call every contender with one problem at a time, on ``count`` threads."""
     # The page shows the distribution on one thread, and only the median on two.
     problems = draw(N, settings.latency_calls if count == 1 else max(1, settings.latency_calls // 4), OutlierMix())
     rows = []
     with threads(count):
-        contenders, skipped = make_contenders(settings, count=count)
+        contenders, skipped = make_contenders(settings)
         tasks = {}
         for name, contender in contenders.items():
             say(f"latency: {count} thread(s), {name}")

@@ -31,9 +31,23 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from harness import Column, Row, in_turns, parser, percent, ratio, recorded, summary, table, target, threads, write
+from harness import (
+    Column,
+    Row,
+    in_turns,
+    parser,
+    percent,
+    ratio,
+    recorded,
+    share,
+    summary,
+    table,
+    target,
+    threads,
+    write,
+)
 from kornia.geometry.liegroup import So3
-from kornia_pnpnet.geometry import transform
+from kornia.geometry.linalg import transform_points
 from torch import Tensor, nn
 
 from kornia_pnpnet import (
@@ -97,12 +111,8 @@ def uncertain_pnp(n: int, share: float, count: int, *, turned: bool, seed: int) 
     each has grade 1, 2, ..., 10: the standard deviation along the longest axis, in pixels and in hundredths
     of a unit. Those of the other axes are uniform between 0 and that; the axes have a random direction.
 
-    Args:
-        n: number of pairs.
-        share: share of outliers: half are mismatches, half have a random pixel.
-        count: number of problems.
-        turned: whether the noise of pixels has axes as well. It is isotropic otherwise, as in most of the protocol.
-        seed: seed of the problems.
+    Half of the outliers are mismatches, half have a random pixel. The noise of pixels has axes if ``turned``, and is
+    isotropic otherwise, as in most of the protocol.
     """
     exact = SyntheticProblems(
         n=n,
@@ -184,7 +194,7 @@ def squares(tilt: float, sigma: float, count: int, *, seed: int) -> Problems:
     corners = [[-0.1, -0.1, 0.0], [0.1, -0.1, 0.0], [0.1, 0.1, 0.0], [-0.1, 0.1, 0.0]]
     world = torch.tensor(corners, dtype=torch.float64).expand(count, 4, 3)
     camera = torch.tensor([[800.0, 0.0, 320.0], [0.0, 800.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    seen = transform(pose, world) @ camera.mT
+    seen = transform_points(pose.matrix, world) @ camera.mT
     pixels = seen[..., :2] / seen[..., 2:]
     pixels = pixels + sigma * torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
     return Problems(world, pixels, camera.expand(count, 3, 3), pose, torch.ones(count, 4, dtype=torch.bool))
@@ -195,11 +205,6 @@ def draw(n: int, outliers: int, count: int, seed: int, **options: Any) -> Proble
     mix = OutlierMix(count=outliers)
     options = {"batch_size": count, "seed": SEED + seed, "outliers": mix, "dtype": torch.float64, **options}
     return SyntheticProblems(n=n, **options).batch(0)
-
-
-def share(values: Tensor) -> float:
-    """Share of true values."""
-    return values.double().mean().item()
 
 
 # -- measurements ------------------------------------------------------------------------------------------------------
@@ -355,10 +360,10 @@ def measure_times(solver: nn.Module) -> list[dict[str, Any]]:
 def targets(results: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The largest measurements beside what was wanted."""
     found = []
-    for share in SHARES:
-        worst = max(max(row["covariances"]) for row in results["rows"] if row["outliers"] == share)
-        what = f"Largest relative error with {100 * share:.0f} % outliers"
-        found.append(target(what, worst, MOST_ROBUST if share else MOST_CLEAN, unit="", at_most=True))
+    for outliers in SHARES:
+        worst = max(max(row["covariances"]) for row in results["rows"] if row["outliers"] == outliers)
+        what = f"Largest relative error with {100 * outliers:.0f} % outliers"
+        found.append(target(what, worst, MOST_ROBUST if outliers else MOST_CLEAN, unit="", at_most=True))
     slowest = max(row["ratio"] for row in results["times"])
     return [*found, target("Time with covariances by time with sigmas", slowest, MOST_TIME, unit="", at_most=True)]
 

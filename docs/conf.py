@@ -38,7 +38,7 @@ python_use_unqualified_type_names = True
 nitpicky = True
 nitpick_ignore_regex = [
     ("py:.*", r"(torch|numpy|np|kornia|lightning_fabric|pathlib|collections|functools|pyarrow|pa)\..*"),
-    ("py:class", r"Tensor|Count|Share|kornia_pnpnet\.(\w+\.)*_\w+"),
+    ("py:class", r"Tensor|Count|Share|kornia_pnpnet\.(\w+\.)*(_\w+|Runner)"),
     ("py:exc", r"(Base|Device|Shape|TypeCheck|ValueCheck)Error"),
 ]
 napoleon_numpy_docstring = False  # all are Google's

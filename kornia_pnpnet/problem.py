@@ -1,7 +1,7 @@
 """What a solver works on: the pairs of a batch in its own frame, their noise, and the poses from which it starts.
 
 Tensors of pairs have the shapes ``(B, N)`` and ``(B, N, C)``; in memory the problems come last, see
-:func:`~kornia_pnpnet.core.performance.problems_last`.
+``kornia_pnpnet.core.performance.problems_last``.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from kornia_pnpnet.core.symmetric import Symmetric2, Symmetric3
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.result import Pose
 
-__all__ = ["LEAST_NOISE", "MIN_PAIRS", "Hypotheses", "Noise", "Problem", "Starts", "State", "Term"]
+__all__ = ["LEAST_NOISE", "MIN_PAIRS", "Hypotheses", "Linear", "Noise", "Problem", "Starts", "State", "Term"]
 
 #: Focal lengths. Pixels are never known better than this, so that weights stay finite.
 LEAST_NOISE = 1e-6

@@ -108,7 +108,7 @@ def create_solver(name: str, **options: Any) -> nn.Module:
     Args:
         name: one of :func:`list_solvers`.
         options: options of that solver: ``m``, the number of iterations, of every ``-lm`` and of trained weights (see
-            :meth:`~kornia_pnpnet.RobustWeightedLM.with_iterations`); the arguments of
+            :meth:`~kornia_pnpnet.refine.lm.RobustWeightedLM.with_iterations`); the arguments of
             :class:`~kornia_pnpnet.propose.epnp.EPnP`, :class:`~kornia_pnpnet.propose.reppnp.REPPnP`,
             :class:`~kornia_pnpnet.propose.ransac.RANSAC`, and of the classes in :mod:`kornia_pnpnet.peers`; and for all
             but the peers the options of :class:`~kornia_pnpnet.solver.PnPNet`.

@@ -144,7 +144,7 @@ def check_poses(estimate: Pose, truth: Pose) -> None:
 
 
 def gate_pose(pose: Pose, live: Tensor, finite: Tensor) -> Pose:
-    """:func:`~kornia_pnpnet.core.linalg.gate` for a pose; the identity fills."""
+    """``core.linalg.gate`` for a pose; the identity fills."""
     eye = torch.eye(3, dtype=pose.rotation.dtype, device=pose.rotation.device)
     return Pose(gate(pose.rotation, live, finite, eye), gate(pose.translation, live, finite, 0.0))
 
@@ -185,7 +185,7 @@ class Status(IntEnum):
     #: The intrinsics are not a multiple of ``[[fx, s, cx], [0, fy, cy], [0, 0, 1]]`` with positive ``fx`` and ``fy``.
     CAMERA = 4
     #: No pose was found with which enough pairs agree. Of three pairs most solvers answer this: see
-    #: :func:`kornia_pnpnet.p3p`, which finds all poses of three pairs.
+    #: :func:`~kornia_pnpnet.propose.p3p.p3p`, which finds all poses of three pairs.
     NOT_BELIEVED = 5
     #: The pose that was found has fewer than 3 pairs in front of the camera.
     BEHIND = 6

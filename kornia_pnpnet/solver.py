@@ -85,7 +85,7 @@ class PnPNet(PretrainedMixin):
 
     Args:
         init: maps a :class:`~kornia_pnpnet.problem.Problem` to :class:`~kornia_pnpnet.problem.Starts`, see
-            :mod:`kornia_pnpnet.propose`; ``None`` starts from the identity or from the pose given with the call.
+            ``kornia_pnpnet.propose``; ``None`` starts from the identity or from the pose given with the call.
         refine: the refiner; classical :class:`~kornia_pnpnet.refine.lm.RobustWeightedLM` when ``None``.
         normalize: the normalisation; the default centres and scales the world and orders the pairs.
         effort: ``"fixed"``, or ``"adaptive"``: where the poses of the initialiser do not suffice, a problem gets as
@@ -202,8 +202,8 @@ class PnPNet(PretrainedMixin):
             confidence: your own belief that a pair is an inlier, in [0, 1], for example a matcher's score, shape
                 :math:`(B, N)`; NaN where unknown. Minimal samples are drawn from likely pairs more often, and a
                 network that was trained with confidences sees them. They need not be calibrated.
-            prior: what is known of the pose besides the pairs, such as :func:`~kornia_pnpnet.gravity_prior`: a
-                term of the refinement and of the choice among poses, to which its pose belongs unless ``init`` is
+            prior: what is known of the pose besides the pairs, such as
+                :func:`~kornia_pnpnet.refine.terms.gravity_prior`: a term of the refinement and of the choice among poses, to which its pose belongs unless ``init`` is
                 given. ``ok`` and ``probability`` are judged by the pairs alone. Unknown noise counts as one pixel.
             dist: distortion of the camera as Kornia and OpenCV have it, 4, 5, 8, 12 or 14 coefficients, shape
                 :math:`(B, D)` or :math:`(D,)`. Pixels are undistorted once, and their noise with them. Pairs beyond

@@ -114,7 +114,7 @@ def test_networks_predict_each_kind_of_noise(tmp_path):
 def test_an_incremental_map_registers_its_images(tmp_path):
     theirs, ours = run(tmp_path, "incremental_map", "--scenes", 4)["runs"].values()
     assert ours["5%"]["within_1_deg"] > 0.7  # the map drifts without bundle adjustment
-    assert all(ours[share]["within_1_deg"] >= theirs[share]["within_1_deg"] for share in ours)
+    assert ours["20%"]["within_1_deg"] > 2.0 * theirs["20%"]["within_1_deg"]
 
 
 @pytest.mark.slow

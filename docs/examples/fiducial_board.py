@@ -14,11 +14,11 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from kornia_pnpnet.evaluation.figures.style import BLUE, ORANGE, make_figure, save
-from shared import centre, command, pose_error, write
+from shared import centre, command, opencv, pose_error, write
 from torch.nn.utils.rnn import pad_sequence
 
 from kornia_pnpnet import Pose, create_solver
+from kornia_pnpnet.evaluation.plots import BLUE, ORANGE, make_figure, save
 
 SQUARES, SQUARE, MARKER = (7, 5), 0.04, 0.03  # metres
 PIXELS_PER_SQUARE, SIZE, FOCAL = 60, (640, 480), 700.0
@@ -62,14 +62,6 @@ def mislabelled(numbers: np.ndarray, share: float, rng: np.random.Generator) -> 
     return numbers
 
 
-def opencv(corners: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation and translation by `cv2.solvePnPRansac`, NaN where it finds none."""
-    found, turn, shift, _ = cv2.solvePnPRansac(corners, pixels, CAMERA, None, reprojectionError=THRESHOLD_PX)
-    if not found:
-        return np.full((3, 3), np.nan), np.full(3, np.nan)
-    return cv2.Rodrigues(turn)[0], shift[:, 0]
-
-
 def main() -> None:
     """Draw, detect, solve, and write what came out."""
     parser = command(__doc__)
@@ -89,24 +81,23 @@ def main() -> None:
     shown = [i for i, _, _ in seen]
     rotation = torch.from_numpy(rotations[shown])
     truth = Pose(rotation, -(rotation @ torch.from_numpy(centres[shown])[..., None])[..., 0])
-    solver = create_solver("pnpnet-set")
-    runs: dict[str, dict[str, Any]] = {}
+    solvers = {"pnpnet-set": create_solver("pnpnet-set"), "cv2.solvePnPRansac": opencv(THRESHOLD_PX)}
+    runs: dict[str, dict[str, Any]] = {name: {} for name in solvers}
     paths = {}
+    img = pad_sequence([torch.from_numpy(pixels) for _, pixels, _ in seen], batch_first=True)
+    mask = torch.arange(img.shape[1]) < torch.tensor([len(pixels) for _, pixels, _ in seen])[:, None]
     for share in SHARES:
         labels = [mislabelled(numbers, share, rng) for _, _, numbers in seen]
-        pairs = [(torch.from_numpy(corners[x]), torch.from_numpy(y)) for x, (_, y, _) in zip(labels, seen, strict=True)]
-        world, img = (pad_sequence(list(x), batch_first=True) for x in zip(*pairs, strict=True))
-        mask = torch.arange(world.shape[1]) < torch.tensor([len(x) for x, _ in pairs])[:, None]
-        with torch.no_grad():
-            ours = solver(world, img, torch.from_numpy(CAMERA), mask=mask).pose
-        answers = [opencv(a.numpy(), b.numpy()) for a, b in pairs]
-        theirs = Pose(*(torch.from_numpy(np.stack(x)) for x in zip(*answers, strict=True)))
-        for name, pose in (("pnpnet-set", ours), ("cv2.solvePnPRansac", theirs)):
+        world = pad_sequence([torch.from_numpy(corners[x]) for x in labels], batch_first=True)
+        for name, solver in solvers.items():
+            with torch.no_grad():
+                result = solver(world, img, torch.from_numpy(CAMERA), mask=mask)
+            pose = result.pose
             away, angle = pose_error(pose, truth)
-            runs.setdefault(name, {})[f"{share:.0%}"] = {
-                "median_mm": 1000.0 * away.nanmedian().item(),
-                "median_deg": angle.nanmedian().item(),
-                "within_10_mm": (away < 0.01).double().mean().item(),
+            runs[name][f"{share:.0%}"] = {
+                "median_mm": 1000.0 * away[result.ok].median().item(),
+                "median_deg": angle[result.ok].median().item(),
+                "within_10_mm": (result.ok & (away < 0.01)).double().mean().item(),
             }
             paths[name] = centre(pose)
     write(options.out / "fiducial_board.json", frames=len(seen), runs=runs)

@@ -15,8 +15,8 @@ from typing import Any
 import cv2
 import torch
 from kornia.geometry.epipolar import triangulate_points
-from shared import command, write
-from torch import Tensor
+from shared import command, opencv, write
+from torch import Tensor, nn
 
 from kornia_pnpnet import Pose, create_solver, pose_errors
 from kornia_pnpnet.data.draws import batch_generator
@@ -26,36 +26,11 @@ CAMERA = torch.tensor([[1000.0, 0.0, 640.0], [0.0, 1000.0, 480.0], [0.0, 0.0, 1.
 PIXEL_NOISE, THRESHOLD = 1.0, 6.0  # px
 SEED = 20_261_123
 
-#: Poses of images (B) from world points (B, N, 3), pixels (B, N, 2) and which of them are matches (B, N).
-Register = Callable[[Tensor, Tensor, Tensor], Pose]
-
-
-def register_with_opencv(world_points: Tensor, img_points: Tensor, mask: Tensor) -> Pose:
-    """One call of OpenCV for each image."""
-    rvecs, translations = [], []
-    for points, pixels, there in zip(world_points, img_points, mask, strict=True):
-        _, rvec, tvec, _ = cv2.solvePnPRansac(
-            points[there].numpy(), pixels[there].numpy(), CAMERA.numpy(), None, reprojectionError=THRESHOLD
-        )
-        rvecs.append(torch.from_numpy(rvec[:, 0]))
-        translations.append(torch.from_numpy(tvec[:, 0]))
-    return Pose.from_rvec(torch.stack(rvecs), torch.stack(translations))
-
-
-def register_with_pnpnet() -> Register:
-    """One call for all images; shorter lists of matches are padded."""
-    solver = create_solver("pnpnet-set")
-
-    def register(world_points: Tensor, img_points: Tensor, mask: Tensor) -> Pose:
-        with torch.no_grad():
-            return solver(world_points, img_points, CAMERA, mask=mask).pose
-
-    return register
-
-
-REGISTER: dict[str, Callable[[], Register]] = {
-    "cv2.solvePnPRansac": lambda: register_with_opencv,
-    "pnpnet-set": register_with_pnpnet,
+#: By name the solver that registers images, from world points (B, N, 3), pixels (B, N, 2), the camera and a mask of the
+#: matches. Shorter lists of matches are padded.
+REGISTER: dict[str, Callable[[], nn.Module]] = {
+    "cv2.solvePnPRansac": lambda: opencv(THRESHOLD),
+    "pnpnet-set": lambda: create_solver("pnpnet-set"),
 }
 
 
@@ -82,7 +57,8 @@ def project(pose: Pose, points: Tensor) -> Tensor:
     return cam[..., :2] / cam[..., 2:]
 
 
-def run(register: Register, truth: Pose, pixels: Tensor) -> tuple[Pose, float]:
+@torch.no_grad()
+def run(solver: nn.Module, truth: Pose, pixels: Tensor) -> tuple[Pose, float]:
     """Map and register: the last poses of all images, and the seconds that registering all of them took."""
     rotation, translation = truth.rotation.clone(), truth.translation.clone()  # the first two images are given
     points = torch.zeros(POINTS, 3, dtype=torch.float64)
@@ -90,17 +66,17 @@ def run(register: Register, truth: Pose, pixels: Tensor) -> tuple[Pose, float]:
     for image in range(1, IMAGES):
         if image > 1:
             one = slice(image, image + 1)
-            found = register(points[None], pixels[one], mapped[None])
+            found = solver(points[None], pixels[one], CAMERA, mask=mapped[None]).pose
             rotation[image], translation[image] = found.rotation[0], found.translation[0]
         pair = [image - 1, image]
         cameras = CAMERA @ torch.cat((rotation[pair], translation[pair][..., None]), -1)
         new = triangulate_points(cameras[:1], cameras[1:], pixels[pair[:1]], pixels[pair[1:]])[0]
         fresh = ~mapped & new.isfinite().all(-1) & (torch.arange(POINTS) % IMAGES <= image)
         points[fresh], mapped = new[fresh], mapped | fresh
-    everything = points.expand(IMAGES, -1, -1), pixels, mapped.expand(IMAGES, -1)
-    register(*everything)  # untimed: the first call loads libraries
+    everything, mask = (points.expand(IMAGES, -1, -1), pixels, CAMERA), mapped.expand(IMAGES, -1)
+    solver(*everything, mask=mask)  # untimed: the first call loads libraries
     start = time.perf_counter()
-    return register(*everything), time.perf_counter() - start
+    return solver(*everything, mask=mask).pose, time.perf_counter() - start
 
 
 def main() -> None:
@@ -113,10 +89,10 @@ def main() -> None:
     runs: dict[str, Any] = {name: {} for name in REGISTER}
     for wrong in (0.05, 0.1, 0.2):
         for name, make in REGISTER.items():
-            register, errors, seconds = make(), [], []
+            solver, errors, seconds = make(), [], []
             for index in range(options.scenes):
                 truth, pixels = draw_scene(wrong, index)
-                poses, spent = run(register, truth, pixels)
+                poses, spent = run(solver, truth, pixels)
                 errors.append(pose_errors(poses, truth).rotation_error_deg[2:])
                 seconds.append(spent / IMAGES)
             error = torch.cat(errors)

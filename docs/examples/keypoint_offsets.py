@@ -14,13 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from kornia.geometry import solve_pnp_dlt
-from kornia_pnpnet.evaluation.figures.style import BLUE, GREEN, ORANGE, make_figure, save, themed
-from shared import command, write
+from shared import command, dlt, write
 from torch import Tensor
 
 from kornia_pnpnet import create_solver
 from kornia_pnpnet.data.draws import batch_generator, random_poses
+from kornia_pnpnet.evaluation.plots import BLUE, GREEN, ORANGE, make_figure, save, themed
 from kornia_pnpnet.losses import pose_distances
 from kornia_pnpnet.result import Pose
 
@@ -28,24 +27,25 @@ KEYPOINTS, BATCH, WRONG = 12, 64, 0.3
 FOCAL, CENTRE, PIXEL_NOISE, BIAS = 800.0, 320.0, 1.0, 12.0
 SEED = 20_261_150
 
+#: Poses of problems, and which of them count, (B,).
 Solve = Callable[[Tensor, Tensor, Tensor], tuple[Pose, Tensor]]
 
 
 def ours(name: str, **noise: float) -> Solve:
-    """A solver of ours, told how large the noise is; its problems count where it says ok."""
+    """A solver of ours that knows the noise; problems count where it says ok."""
     solver = create_solver(name)
 
-    def solve(world_points: Tensor, img_points: Tensor, intrinsics: Tensor) -> tuple[Pose, Tensor]:
-        result = solver(world_points, img_points, intrinsics, **noise)
+    def solve(*inputs: Tensor) -> tuple[Pose, Tensor]:
+        result = solver(*inputs, **noise)
         return result.pose, result.ok
 
     return solve
 
 
-def kornias_dlt(world_points: Tensor, img_points: Tensor, intrinsics: Tensor) -> tuple[Pose, Tensor]:
+def kornias_dlt(*inputs: Tensor) -> tuple[Pose, Tensor]:
     """Kornia's; what is not finite does not count."""
-    found = solve_pnp_dlt(world_points, img_points, intrinsics)
-    return Pose(found[..., :3], found[..., 3]), found.detach().isfinite().all(-1).all(-1)
+    pose = dlt(*inputs)
+    return pose, pose.matrix.detach().isfinite().all(-1).all(-1)
 
 
 SOLVERS: dict[str, Callable[[], Solve]] = {

@@ -31,13 +31,13 @@ import torch
 from kornia.filters import gaussian_blur2d, motion_blur
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from kornia.geometry.subpix import spatial_softmax2d
-from kornia_pnpnet.evaluation.figures.style import BLUE, ORANGE, VERMILION, make_figure, save, themed
 from shared import command, write
 from torch import Tensor, nn
 from torch.distributions import MultivariateNormal
 from torch.nn import functional
 
 from kornia_pnpnet import PnPResult, Pose, create_solver, heatmap_keypoints
+from kornia_pnpnet.evaluation.plots import BLUE, ORANGE, VERMILION, make_figure, save, themed
 from kornia_pnpnet.refine.residual import rotation_angle
 
 SIZE, FOCAL, BATCH = 64, 90.0, 32

@@ -36,13 +36,13 @@ from kornia.feature import (
     laf_is_filled,
     match_snn,
 )
-from kornia_pnpnet.evaluation.figures.style import BLUE, make_figure, save, themed
 from shared import command, pose_error, write
 from sklearn.isotonic import IsotonicRegression
 from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
 
 from kornia_pnpnet import PnPResult, Pose, create_solver
+from kornia_pnpnet.evaluation.plots import BLUE, make_figure, save, themed
 
 LONGEST = 1600  # pixels; larger images are shrunk for the features
 EVERY = 5  # every fifth image of a model is a query
@@ -131,14 +131,7 @@ def read_image(path: Path) -> tuple[np.ndarray, float]:
 
 
 def read_photo(image: pycolmap.Image, world: dict[int, np.ndarray], folder: Path, detector: Detector) -> Photo:
-    """Find the features of an image of a model.
-
-    Args:
-        image: of the model.
-        world: the points by number; empty for a query.
-        folder: the folder of the images.
-        detector: finds the features.
-    """
+    """Find the features of an image of a model, whose points are ``world`` by number: none for a query."""
     picture, scale = read_image(folder / image.name)
     lafs, descriptors = detector.detect(torch.from_numpy(picture).permute(2, 0, 1)[None].float() / 255.0)
     # COLMAP's first pixel has its middle at (0.5, 0.5).
@@ -258,12 +251,7 @@ def summary(errors: Sequence[dict[str, Any] | None], ms: float) -> dict[str, Any
 def run(
     images: Path, model: pycolmap.Reconstruction, detector: Detector, *, batch: int, metre: float
 ) -> tuple[dict[str, Any], list[tuple[Matches, Tensor, dict[str, Any]]]]:
-    """Localise the queries of a model.
-
-    Returns:
-        The results, and of each query what the picture needs: its pairs, which of them the solver kept, and its row of
-        the results.
-    """
+    """Localise the queries of a model; the results, and of each query its pairs, which of them count, and its row."""
     seconds: dict[str, float] = {}
     clock = time.process_time()
 

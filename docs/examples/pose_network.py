@@ -13,8 +13,7 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from kornia.geometry import solve_pnp_dlt
-from shared import command, write
+from shared import command, dlt, write
 from torch import Tensor, nn
 
 from kornia_pnpnet import Pose, create_solver, monte_carlo_pose_loss, pose_errors
@@ -31,29 +30,19 @@ SEED = 20_261_123
 Loss = Callable[[Tensor, Tensor, Tensor, Pose], Tensor]
 
 
-def saturated(distance: Tensor) -> Tensor:
-    """The mean distance, in which a pose that is far off, or not finite, counts little."""
+def distance_to(truth: Pose, found: Pose) -> Tensor:
+    """The mean distance of poses, in which a pose that is far off, or not finite, counts little."""
+    distance = sum(pose_distances(found, truth))
     distance = distance[distance.isfinite()]
     return (distance / (1.0 + distance)).sum() / BATCH
 
 
-def distance_of_dlt(keypoints: Tensor, pixels: Tensor, sigma: Tensor, truth: Pose) -> Tensor:
-    """Kornia's solver, and the distance of its pose."""
-    found = solve_pnp_dlt(keypoints, pixels, CAMERA.expand(len(pixels), 3, 3))
-    rotation, translation = pose_distances(Pose(found[..., :3], found[..., 3]), truth)
-    return saturated(rotation + translation)
-
-
 def distance_of_pnpnet() -> Loss:
-    """The same with this package's solver."""
+    """The distance of the pose of this package's solver."""
     solver = create_solver("pnpnet-set", gradient="always", effort="fixed")
-
-    def loss(keypoints: Tensor, pixels: Tensor, sigma: Tensor, truth: Pose) -> Tensor:
-        result = solver(keypoints, pixels, CAMERA, img_sigma=sigma.detach())
-        rotation, translation = pose_distances(result.pose, truth)
-        return saturated(rotation + translation)
-
-    return loss
+    return lambda keypoints, pixels, sigma, truth: distance_to(
+        truth, solver(keypoints, pixels, CAMERA, img_sigma=sigma.detach()).pose
+    )
 
 
 def likelihood(keypoints: Tensor, pixels: Tensor, sigma: Tensor, truth: Pose) -> Tensor:
@@ -62,7 +51,7 @@ def likelihood(keypoints: Tensor, pixels: Tensor, sigma: Tensor, truth: Pose) ->
 
 
 LOSSES: dict[str, Callable[[], Loss]] = {
-    "distance, `solve_pnp_dlt`": lambda: distance_of_dlt,
+    "distance, `solve_pnp_dlt`": lambda: lambda x, pixels, _, truth: distance_to(truth, dlt(x, pixels, CAMERA)),
     "distance, `pnpnet-set`": distance_of_pnpnet,
     "`monte_carlo_pose_loss`": lambda: likelihood,
 }
@@ -98,10 +87,8 @@ def train(loss: Loss, steps: int, seed: int) -> dict[str, Any]:
     torch.manual_seed(seed)
     keypoints = torch.randn(KEYPOINTS, 3, generator=batch_generator(SEED, 0)) * 0.5
     network, judge, truth = Network(), create_solver("epnp-lm"), draw(1, TEST)
-    optimizer = torch.optim.Adam(
-        [{"params": network.layers.parameters()}, {"params": network.pixels.parameters()}], 1e-3
-    )
-    optimizer.add_param_group({"params": [network.log_sigma], "lr": 1e-2})
+    weights = [*network.layers.parameters(), *network.pixels.parameters()]
+    optimizer = torch.optim.Adam([{"params": weights}, {"params": [network.log_sigma], "lr": 1e-2}], 1e-3)
     start = time.perf_counter()
     for step in range(steps):
         pose = draw(2 + step, BATCH)

@@ -33,17 +33,7 @@ def solve(
     id_column: str | None = None,
     function: type[Solve] = Solve,
 ) -> None:
-    """Solve the problems of Parquet files.
-
-    Args:
-        source: a file or a folder.
-        out: folder of the results.
-        solver: name of the solver.
-        workers: number of processes that solve, each on one core.
-        batch: number of problems solved at once.
-        id_column: column of unique numbers, to go on after a stop.
-        function: the class of the workers.
-    """
+    """Solve problems of Parquet files, with the options of the command; ``function`` is the class of the workers."""
     context = DataContext.get_current()
     context.target_max_block_size = BLOCK
     if id_column:

@@ -173,13 +173,8 @@ def query_views(hall: list[Plane], count: int, seed: int = 2) -> Iterator[View]:
 def make_scene(folder: Path, references: int = 20, queries: int = 60, seed: int = 0) -> Path:
     """Write a folder of images and a COLMAP text model of them, as COLMAP leaves it: `images` and `sparse`.
 
-    The model's points are triangulated from SIFT matches of the reference images; the queries only have poses.
-
-    Args:
-        folder: the folder to write.
-        references: number of images that make the points, `reference00.png` and so on.
-        queries: number of images that see them, `query00.png` and so on.
-        seed: seed of the hall.
+    The model's points are triangulated from SIFT matches of the reference images (`reference00.png` and so on); the
+    queries (`query00.png` and so on) only have poses.
     """
     hall = make_hall(seed)
     views = {f"reference{i:02}.png": view for i, view in enumerate(reference_views(hall, references))}
@@ -203,13 +198,7 @@ def depth_sigma(depth: Any) -> Any:
 def write_sequence(folder: Path, frames: int = 100, seed: int = 3) -> Path:
     """Write an RGB-D sequence of a camera carried around a corner of the hall, in the format of the TUM benchmark.
 
-    The camera walks at 0.8 m/s, 30 frames per second, and shakes.
-
-    Args:
-        folder: the folder to write: `rgb`, `depth` (16 bits, 5000 per metre), `rgb.txt`, `depth.txt`,
-            `groundtruth.txt`.
-        frames: number of images.
-        seed: seed of the hall and the noise.
+    The camera walks at 0.8 m/s, 30 frames per second, and shakes. Depths have 16 bits, 5000 per metre.
     """
     hall, rng = make_hall(0), np.random.default_rng(seed)
     lines: dict[str, list[str]] = {"rgb": [], "depth": [], "groundtruth": []}
@@ -236,12 +225,7 @@ def write_sequence(folder: Path, frames: int = 100, seed: int = 3) -> Path:
 
 
 def triangulate(views: list[View]) -> tuple[list[Floats], list[Floats], list[dict[int, int]]]:
-    """Points from the SIFT matches of views with known poses.
-
-    Returns:
-        The keypoints (K, 2) of each view, the points (3,), and the track of each point: the number of its keypoint by
-        view.
-    """
+    """Keypoints (K, 2) of views with known poses, points (3,) from their matches, and the keypoint of each by view."""
     sift = cv2.SIFT_create(nfeatures=FEATURES, enable_precise_upscale=True)
     found = [sift.detectAndCompute(view.image, None) for view in views]
     keypoints = [np.array([x.pt for x in points], dtype=np.float64) + 0.5 for points, _ in found]

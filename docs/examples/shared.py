@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
+from kornia.geometry import solve_pnp_dlt
+from torch import Tensor, nn
 
-from kornia_pnpnet import Pose
+from kornia_pnpnet import Pose, create_solver
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.refine.residual import rotation_angle
@@ -36,3 +37,15 @@ def pose_error(found: Pose, truth: Pose) -> tuple[Tensor, Tensor]:
     """Distances of the cameras in the unit of the world, and angles of the rotations in degrees."""
     angle = torch.rad2deg(rotation_angle(found.rotation, truth.rotation))
     return (centre(found) - centre(truth)).norm(dim=-1), angle
+
+
+def opencv(threshold: float) -> nn.Module:
+    """``cv2.solvePnPRansac`` with a threshold in pixels and all else as it comes, called like a solver of ours."""
+    defaults = {"iterations": 100, "confidence": 0.99, "method": "ITERATIVE", "refine": False}
+    return create_solver("opencv-ransac", threshold=threshold, **defaults)
+
+
+def dlt(world_points: Tensor, img_points: Tensor, intrinsics: Tensor) -> Pose:
+    """Poses by Kornia's ``solve_pnp_dlt``."""
+    found = solve_pnp_dlt(world_points, img_points, intrinsics.expand(len(world_points), 3, 3))
+    return Pose(found[..., :3], found[..., 3])

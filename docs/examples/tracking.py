@@ -12,6 +12,7 @@ Without ``--sequence`` a walk through a hall is rendered first (``rendered_hall.
 
 from __future__ import annotations
 
+import itertools
 import math
 import tempfile
 import time
@@ -25,12 +26,12 @@ import rendered_hall
 import torch
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from kornia.geometry.liegroup import So3
-from kornia_pnpnet.evaluation.figures.style import BLUE, GREEN, ORANGE, VERMILION, make_figure, save, themed
 from localiser import RATIO_TEST, Matches, Photo, Sift, match
 from shared import centre, command, pose_error, write
 from torch import Tensor, nn
 
 from kornia_pnpnet import PnPNet, Pose, PosePrior, RobustWeightedLM, create_solver, gravity_prior
+from kornia_pnpnet.evaluation.plots import BLUE, GREEN, ORANGE, VERMILION, make_figure, save, themed
 
 KEYFRAME = 15  # frames from one keyframe to the next
 PAIRS = (3, 4, 6, 10, 30, 100)  # matches of a frame that the solver gets
@@ -161,13 +162,7 @@ def track(
 
     A pose is taken when the solver believes it (``ok``), with a prior also when the camera can have moved there. Else
     the frame keeps the last pose. The camera starts at a known place.
-
-    Args:
-        frames: of a sequence.
-        intrinsics: camera matrix (3, 3).
-        solver: finds each pose.
-        prior: makes the prior of a frame from the last pose, the number of frames since then, and the frame.
-        pairs: largest number of matches of a frame.
+    ``prior`` makes the prior of a frame from the last pose, the number of frames since then, and the frame.
     """
     last, since, path, errors, seconds = frames[0].pose, 1, [], [], []
     for frame in frames:
@@ -203,23 +198,21 @@ def run(folder: Path, intrinsics: Tensor) -> dict[str, Any]:
     solver = create_solver("pnpnet-set")
     refiner = PnPNet(None, RobustWeightedLM(m=4))  # the last pose is near: few iterations suffice
 
-    def from_last(last: Pose, since: int, frame: Frame) -> PosePrior:
-        return motion_prior(last, since)
-
-    def from_both(last: Pose, since: int, frame: Frame) -> PosePrior:
-        return with_gravity(motion_prior(last, since), frame.down)
-
-    ways = ((solver, lambda *_: None), (solver, from_last), (solver, from_both), (refiner, from_both))
+    ways = (
+        (solver, lambda *_: None),
+        (solver, lambda last, since, _: motion_prior(last, since)),
+        *(
+            (way, lambda last, since, frame: with_gravity(motion_prior(last, since), frame.down))
+            for way in (solver, refiner)
+        ),
+    )
     for way in ways:
         track(frames[:2], intrinsics, *way, PAIRS[-1])  # the first call of a process takes longer
-    runs: dict[str, dict[str, Any]] = {}
-    for pairs in PAIRS:
-        runs[str(pairs)] = {
-            name: track(frames, intrinsics, *way, pairs) for name, way in zip(VARIANTS, ways, strict=True)
-        }
+    runs: dict[str, dict[str, Any]] = {str(pairs): {} for pairs in PAIRS}
+    for pairs, (name, way) in itertools.product(PAIRS, zip(VARIANTS, ways, strict=True)):
+        runs[str(pairs)][name] = found = track(frames, intrinsics, *way, pairs)
         if pairs != DRAWN:
-            for row in runs[str(pairs)].values():
-                del row["path"]
+            del found["path"]
     true = [place(frame.pose) for frame in frames]
     return {"frames": len(frames), "right": RIGHT, "stages_ms": stages, "path": true, "runs": runs}
 
@@ -235,8 +228,7 @@ def draw(results: dict[str, Any], path: Path) -> None:
         above.plot(*np.array(results["runs"][few][name]["path"]).T[:2], color=colours[name], linewidth=1.0)
     above.plot(*np.array(results["path"]).T[:2], color="black", linewidth=0.8, linestyle=":")
     above.set_title(f"{few} pairs per frame, from above", fontsize=8)
-    above.set_xlabel("x (m)")
-    above.set_ylabel("y (m)")
+    above.set(xlabel="x (m)", ylabel="y (m)")
     for name, colour in colours.items():
         shares = [100.0 * results["runs"][str(pairs)][name]["right"] for pairs in PAIRS]
         curves.plot(PAIRS, shares, marker="o", markersize=3.5, color=colour, label=name)

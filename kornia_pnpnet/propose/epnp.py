@@ -1,6 +1,6 @@
 r"""EPnP: a pose from four or more pairs, in closed form and by a few Gauss-Newton steps in four unknowns.
 
-With orthonormal coordinates (see :mod:`~kornia_pnpnet.propose.control_points`) the equations
+With orthonormal coordinates (see ``kornia_pnpnet.propose.control_points``) the equations
 :math:`\sum_j a_{ij} (x_j - u_i z_j) = 0`, and the same with :math:`y` and :math:`v`, are solved for x and y in closed
 form: :math:`x = P z` with :math:`P = \sum_i w_i u_i a_i a_i^\top`, and :math:`y = Q z` with :math:`v_i`. The remaining
 algebraic error :math:`z^\top K z` has 4 unknowns where the paper's :math:`M^\top M` has 12. The control vectors in the

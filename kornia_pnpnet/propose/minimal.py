@@ -25,7 +25,7 @@ class FocalHypotheses(NamedTuple):
 
 
 class MinimalSolver(Protocol):
-    """Solves samples of ``sample_size`` pairs each, for example :class:`~kornia_pnpnet.propose.P3P`."""
+    """Solves samples of ``sample_size`` pairs each, for example :class:`~kornia_pnpnet.propose.p3p.P3P`."""
 
     @property
     def sample_size(self) -> int:

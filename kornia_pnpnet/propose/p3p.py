@@ -413,7 +413,7 @@ def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
 
 
 class P3P(Configured):
-    r"""Minimal solver of three pairs for :class:`~kornia_pnpnet.propose.RANSAC`: :func:`p3p` as a module.
+    r"""Minimal solver of three pairs for :class:`~kornia_pnpnet.propose.ransac.RANSAC`: :func:`p3p` as a module.
 
     With an unknown focal length :func:`p3p` solves each sample at focal lengths on a grid, spread evenly in logarithms
     over the range of :class:`~kornia_pnpnet.refine.terms.CameraTerm`. Least squares of all inliers, with the focal

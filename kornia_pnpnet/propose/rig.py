@@ -44,7 +44,7 @@ def starts_of_rig(problem: Problem, given: Pose | None, *, with_noise: bool, fix
 
     Args:
         problem: normalised problems of a rig.
-        given: See RANSAC.forward.
+        given: see :meth:`~kornia_pnpnet.propose.ransac.RANSAC.forward`.
         with_noise: estimate the noise of the pixels from the residuals, for a refinement that expects it.
         fixed: try a fixed number of samples, as in graphs, in place of RANSAC.
     """
