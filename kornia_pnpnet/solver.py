@@ -203,8 +203,9 @@ class PnPNet(PretrainedMixin):
                 :math:`(B, N)`; NaN where unknown. Minimal samples are drawn from likely pairs more often, and a
                 network that was trained with confidences sees them. They need not be calibrated.
             prior: what is known of the pose besides the pairs, such as
-                :func:`~kornia_pnpnet.refine.terms.gravity_prior`: a term of the refinement and of the choice among poses, to which its pose belongs unless ``init`` is
-                given. ``ok`` and ``probability`` are judged by the pairs alone. Unknown noise counts as one pixel.
+                :func:`~kornia_pnpnet.refine.terms.gravity_prior`: a term of the refinement and of the choice among
+                poses, to which its pose belongs unless ``init`` is given. ``ok`` and ``probability`` are judged by the
+                pairs alone. Unknown noise counts as one pixel.
             dist: distortion of the camera as Kornia and OpenCV have it, 4, 5, 8, 12 or 14 coefficients, shape
                 :math:`(B, D)` or :math:`(D,)`. Pixels are undistorted once, and their noise with them. Pairs beyond
                 what the coefficients can show are left out.
