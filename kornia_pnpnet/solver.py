@@ -253,16 +253,13 @@ class PnPNet(PretrainedMixin):
         self._check_cameras(inputs, distorted=dist is not None or fisheye is not None, alternatives=alternatives)
         call = _Call(first_stage_only, _checked_gradient(gradient or self.gradient) == "always", alternatives)
         with in_full_precision(inputs.world_points.device.type):
-            whole = self._whole
-            single = (self._run.compiled or whole.compiled) and len(inputs.world_points) == 1
-            single = single and not (self._run.failed or whole.failed)
-            if (
-                self._run.compiled or whole.compiled
-            ):  # a batch of one, and every layout, would be compiled for by itself
+            compiled = self._run.compiled or self._whole.compiled
+            single = compiled and len(inputs.world_points) == 1 and not (self._run.failed or self._whole.failed)
+            if compiled:  # a batch of one, and every layout in memory, would be compiled for by itself
                 inputs = map_tensors(lambda x: torch.cat((x, x)) if single else x.contiguous(), inputs)
-            any_number = not (self._run.compiled or whole.compiled or trait(self.init, "fixed_pairs"))
+            any_number = not (compiled or trait(self.init, "fixed_pairs"))
             parts = split_batch(inputs, trait(self.init, "pairs_at_once"), any_number)
-            result = joined(parts, [whole(self._solve, part.inputs, call) for part in parts])
+            result = joined(parts, [self._whole(self._solve, part.inputs, call) for part in parts])
         result = restore_leading(size, map_tensors(lambda x: x[:1], result) if single else result)
         if inputs.rig is not None:
             result = result._replace(intrinsics=given_cameras(intrinsics, world_points, result.translation))
