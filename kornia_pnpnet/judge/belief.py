@@ -1,4 +1,9 @@
-r"""Is this pose to be believed? Whether it explains the pixels, and whether its inliers could be chance."""
+r"""Is this pose to be believed? Whether it explains the pixels, and whether its inliers could be chance.
+
+The functions take the :class:`~kornia_pnpnet.refine.residual.Projection` of one pose per problem, the problem, the
+noise of every pair, and weights of the pairs, :math:`(B, N)`. Their answers have no gradient and the shape
+:math:`(B,)`.
+"""
 
 from __future__ import annotations
 
@@ -61,15 +66,8 @@ def explains(projection: Projection, problem: Problem, weights: Tensor) -> Tenso
     A pose explains the pixels when the residual that 60 % of the pairs (by weight) stay below is less than a fifth of
     the distance from their mean that 60 % of the pixels stay below: a pose hardly better than "everything is at one
     point" is no answer. Both sides scale with the image, so that no threshold is in pixels. At least four pairs have to
-    agree (of three pairs all three), and their points must span more than a line.
-
-    Args:
-        projection: the points at the pose.
-        problem: the problem.
-        weights: weight of each pair before its residual was looked at, :math:`(B, N)`.
-
-    Returns:
-        bool of shape :math:`(B,)`.
+    agree (of three pairs all three), and their points must span more than a line. The weights are those before
+    residuals were looked at.
     """
     weights = weights.detach()
     there = weights > 0
@@ -88,30 +86,16 @@ def explains(projection: Projection, problem: Problem, weights: Tensor) -> Tenso
 
 
 class Belief(NamedTuple):
-    """What the inliers say of a pose.
-
-    Attributes:
-        probability: see :func:`probability`, shape :math:`(B,)`.
-        ok: whether the pose is to be believed, bool, shape :math:`(B,)`.
-    """
+    """What the inliers say of a pose: its :func:`probability`, and whether it is to be believed, bool."""
 
     probability: Tensor
     ok: Tensor
 
 
 def believe(projection: Projection, problem: Problem, noise: Noise, law: str = "sigmas") -> Belief:
-    """Tell whether a pose is to be believed, when the noise is known for every pair.
+    """Tell whether a pose is to be believed, when the noise is known for every pair, by one of the :data:`LAWS`.
 
     Its inliers must be more than chance would give it and span more than a line, and it must probably not be far off.
-
-    Args:
-        projection: the points at the pose.
-        problem: the problem.
-        noise: the noise of every pair.
-        law: one of :data:`LAWS`.
-
-    Returns:
-        The probability and the answer, without a gradient.
     """
     projection, problem, noise = map_tensors(torch.Tensor.detach, (projection, problem, noise))
     precision = pixel_precision(projection, problem, noise) if noise.covariances else None
@@ -159,16 +143,7 @@ def clipped(log_alarms: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def residual_noise(projection: Projection, problem: Problem, weights: Tensor) -> Noise:
-    """The noise of the pixels that the median residual shows.
-
-    Args:
-        projection: the points at the pose.
-        problem: the problem.
-        weights: weight of each pair before its residual was looked at, :math:`(B, N)`.
-
-    Returns:
-        The same sigma for all pairs of a problem.
-    """
+    """The noise of the pixels that the median residual shows, the same sigma for all pairs of a problem."""
     there = (weights > 0) & projection.in_front
     count = there.sum(-1, keepdim=True)
     ascending = in_order(torch.where(there, projection.sq_residual, torch.inf).detach().mT[None])[0].mT
@@ -182,14 +157,7 @@ def residual_noise(projection: Projection, problem: Problem, weights: Tensor) ->
 def rotation_sigma(projection: Projection, problem: Problem, noise: Noise, judged: Judged) -> Tensor:
     """Standard deviation of the rotation in radians, by the noise of the inliers; infinite where they leave it open.
 
-    Args:
-        projection: the points at the pose.
-        problem: the problem.
-        noise: the noise of every pair.
-        judged: what :func:`~kornia_pnpnet.judge.inliers.judge` returned.
-
-    Returns:
-        The square root of the trace of the rotation's covariance, float64, shape :math:`(B,)`.
+    It is the square root of the trace of the rotation's covariance, float64.
     """
     inlier = problem.focal.square() * (judged.weights > 0)
     weights = map_tensors(lambda x: inlier * x, pixel_precision(projection, problem, noise))
@@ -204,13 +172,7 @@ def rotation_sigma(projection: Projection, problem: Problem, noise: Noise, judge
 def has_focal(projection: Projection, problem: Problem, noise: Noise, weights: Tensor) -> Tensor:
     """Whether the pairs determine an unknown focal length, to 15 % in standard deviations, bool (B,).
 
-    Two standard deviations are then the 30 % of the distance beyond which a pose is far off.
-
-    Args:
-        projection: the points at the pose.
-        problem: the problem.
-        noise: the noise of every pair.
-        weights: final weight of each pair, :math:`(B, N)`.
+    Two standard deviations are then the 30 % of the distance beyond which a pose is far off. The weights are final.
     """
     projection, problem, noise = map_tensors(torch.Tensor.detach, (projection, problem, noise))
     weights = weights.detach()

@@ -78,12 +78,7 @@ class Judged(NamedTuple):
 
 
 def judge(projection: Projection, problem: Problem, thresholds: Thresholds) -> Judged:
-    """Tell which pairs are inliers of a pose, and how precise the inliers are.
-
-    Args:
-        projection: the points of each problem at its pose.
-        problem: the problem. Pairs without weight are no inliers.
-        thresholds: what counts as an inlier.
+    """Tell which pairs are inliers of a pose, and how precise the inliers are. Pairs without weight are no inliers.
 
     Example:
         >>> from kornia_pnpnet.problem import State
@@ -128,7 +123,7 @@ def log_false_alarms(
         judged: what :func:`judge` returned, :math:`k` inliers.
 
     Returns:
-        float64 of shape :math:`(B,)`; with fewer than three inliers the logarithm of the number of tested poses.
+        float64 of shape :math:`(B,)`.
     """
     chance = _chance_by_place(problem, thresholds, judged).maximum(
         _chance_by_others(projection, problem, thresholds, judged)
