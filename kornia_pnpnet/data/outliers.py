@@ -24,15 +24,9 @@ _SLACK = 0.05
 
 
 class OutlierDraw(NamedTuple):
-    r"""The outliers of a batch, by kind: bool, shape :math:`(B, N)` each. A pair has at most one kind.
+    r"""The outliers of a batch, by the kinds of :class:`OutlierMix`: bool, shape :math:`(B, N)` each.
 
-    Attributes:
-        mismatch: the pixel shows another point.
-        sensing: the pixel is uniform in the image.
-        near: the pixel is a little off.
-        structured: the pixel shows the point from another pose, which all structured outliers of a problem share.
-        crowd: many outliers of the problem share the pixel, or the point.
-        of_points: whether the crowds of a problem share points, not pixels, shape :math:`(B, 1)`.
+    A pair has at most one kind. ``of_points``, shape :math:`(B, 1)`, says whether the crowds of a problem share points.
     """
 
     mismatch: Tensor
