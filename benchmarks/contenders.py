@@ -116,7 +116,7 @@ class Packaged(Contender):
     """A solver of this package for nine pairs, compiled ahead of time for one problem per call, in float32."""
 
     loops, differentiable = True, False
-    n = 9
+    n: int = 9
 
     def __init__(self, spec: str) -> None:
         from kornia_pnpnet.export import export_package, load_package
@@ -141,7 +141,7 @@ class Onnx(Contender):
     """A solver of this package as an ONNX model for nine pairs, under ONNX Runtime, in float32."""
 
     differentiable = False
-    n = 9
+    n: int = 9
 
     def __init__(self, spec: str) -> None:
         import onnxruntime
