@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import torch
 from harness import HERE, say
-from others import KorniaDLT, Peer
+from kornia.geometry import solve_pnp_dlt
 from tasks import (
     ITERATIONS,
     CannotBeTimedError,
@@ -30,6 +30,7 @@ from kornia_pnpnet import PnPNet, RobustWeightedLM
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.evaluation import draw_problems
 from kornia_pnpnet.evaluation.named_solvers import load_solver
+from kornia_pnpnet.peers import PeerSolver
 from kornia_pnpnet.result import Pose, Problems
 
 #: The paper's solver as it is shipped, and the solver for any number of pairs.
@@ -58,13 +59,9 @@ class Ours(Contender):
         solver = solver.float().to(device)
         self.solver: nn.Module = solver
         self.device = device
-        self.only_n = int(found[1]) if (found := re.match(r"pnpnet-n(\d+)", spec)) else None
+        self.n = int(found[1]) if (found := re.match(r"pnpnet-n(\d+)", spec)) else None
         if compiled:
             compile_or_raise(self.solver, **({"whole": True} if whole else {}))
-
-    def takes(self, n: int) -> bool:
-        """The paper's network has a fixed number of pairs."""
-        return self.only_n in (None, n)
 
     def task(self, problems: Problems, *, backward: bool = False) -> Task:
         """The call with the whole batch."""
@@ -119,7 +116,7 @@ class Packaged(Contender):
     """A solver of this package for nine pairs, compiled ahead of time for one problem per call, in float32."""
 
     loops, differentiable = True, False
-    n = 9
+    n: int = 9
 
     def __init__(self, spec: str) -> None:
         from kornia_pnpnet.export import export_package, load_package
@@ -127,10 +124,6 @@ class Packaged(Contender):
         self.solver = load_package(
             exported(spec, ".pt2", lambda solver, path: export_package(solver, path, self.n, batch=1))
         )
-
-    def takes(self, n: int) -> bool:
-        """The number of pairs of the package."""
-        return n == self.n
 
     def task(self, problems: Problems, *, backward: bool = False) -> Task:
         """The calls one after the other."""
@@ -148,7 +141,7 @@ class Onnx(Contender):
     """A solver of this package as an ONNX model for nine pairs, under ONNX Runtime, in float32."""
 
     differentiable = False
-    n = 9
+    n: int = 9
 
     def __init__(self, spec: str) -> None:
         import onnxruntime
@@ -162,10 +155,6 @@ class Onnx(Contender):
         options.log_severity_level = 3
         self.session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
 
-    def takes(self, n: int) -> bool:
-        """The number of pairs of the exported model."""
-        return n == self.n
-
     def task(self, problems: Problems, *, backward: bool = False) -> Task:
         """The call of the session with the whole batch."""
         tensors = *float_inputs(problems, "cpu"), torch.ones(problems.world_points.shape[:2])
@@ -176,6 +165,57 @@ class Onnx(Contender):
             return Pose(torch.from_numpy(rotation), torch.from_numpy(translation))
 
         return Task(lambda: self.session.run(None, inputs), poses, problems)
+
+
+# -- other libraries, called as fast as a user of the library can call them --------------------------------------------
+
+
+def bare_call(solver: nn.Module, problems: Problems) -> Callable[[], object]:
+    """One call with the whole batch for a solver of ours; the calls of the library alone for a peer."""
+    inputs = (problems.world_points, problems.img_points, problems.intrinsics)
+    if isinstance(solver, PeerSolver):
+        single = list(zip(*(x.numpy() for x in inputs), strict=True))
+        return lambda: [solver.solve_one(*one) for one in single]
+    return lambda: solver(*inputs)
+
+
+class Peer(Contender):
+    """The call of a library for each problem, on arrays in float64 that are prepared."""
+
+    loops, differentiable = True, False
+
+    def __init__(self, spec: str) -> None:
+        self.solver = load_solver(spec)
+
+    def task(self, problems: Problems, *, backward: bool = False) -> Task:
+        """The calls one after the other."""
+
+        def poses() -> Pose:
+            return Pose(*self.solver(problems.world_points, problems.img_points, problems.intrinsics).pose)
+
+        return Task(bare_call(self.solver, problems), poses, problems)
+
+
+class KorniaDLT(Contender):
+    """Kornia's direct linear transform, batched, in float32. Float64 has the same success."""
+
+    def takes(self, n: int) -> bool:
+        """At least six pairs. Above 200 the singular value decomposition of all pairs takes too long."""
+        return 6 <= n <= 200
+
+    def task(self, problems: Problems, *, backward: bool = False) -> Task:
+        """One call with the whole batch."""
+        world, img, intrinsics = float_inputs(problems, "cpu")
+        leaves = leaves_of(world, img)
+        call: Callable[[], object] = without_gradient(lambda: solve_pnp_dlt(world, img, intrinsics))
+        if backward:
+            call = lambda: gradient(solve_pnp_dlt(leaves[0], leaves[1], intrinsics), leaves)  # noqa: E731
+
+        def poses() -> Pose:
+            matrix = solve_pnp_dlt(world, img, intrinsics)
+            return Pose(matrix[:, :, :3], matrix[:, :, 3])
+
+        return Task(call, poses, problems)
 
 
 #: Our solvers. The threshold of the RANSAC is tuned for the protocol's data (docs/results).

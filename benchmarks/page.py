@@ -20,6 +20,7 @@ from timing import BACKWARD, FORWARD
 from kornia_pnpnet import PnPNet
 from kornia_pnpnet.core.files import atomic_open
 from kornia_pnpnet.core.tables import markdown_table
+from kornia_pnpnet.evaluation.plots import WIDTH, make_figure, save, themed
 from kornia_pnpnet.metrics import SuccessRate
 
 sys.path.append(str(HERE.parent / "docs" / "results"))
@@ -164,7 +165,9 @@ def throughput_table(results: Mapping[str, Any], batch: int) -> str:
     """One batch size on one thread and two, forward and with gradients."""
     rows = [row for row in results["rows"] if (row["n"], row["batch"]) == (N, batch)]
     columns = [matching(rows, threads=count, mode=mode) for mode in (FORWARD, BACKWARD) for count in (1, 2)]
-    rates = {row["contender"]: row["success"] for row in rows}
+    rates: dict[str, Any] = {}
+    for row in rows:
+        rates.setdefault(row["contender"], row["success"])  # the first: of one thread, forward
     lines = [(f"`{x}`", *(time_of(column, x) for column in columns), percent(rates[x])) for x in rates]
     head = ("Contender", "one thread", "two", "forward+backward, one", "two", "success (%)")
     return markdown_table(head, lines)
@@ -320,11 +323,11 @@ def plot_times(
     return figures.draw_curves(path, [title], curves, label, _looks(pd.concat(tables.values()).contender))
 
 
-@figures.themed
+@themed
 def plot_latency(path: Path, title: str, rows: Sequence[Mapping[str, Any]]) -> Path:
     """Draw the share of the calls with one problem that end within a time, without the slowest hundredth."""
     looks = _looks(row["contender"] for row in rows)
-    figure = figures.make_figure(figures.WIDTH, 4.8, title)
+    figure = make_figure(WIDTH, 4.8, title)
     axes = figure.subplots()
     for name, look in looks.items():
         for row in (row for row in rows if row["contender"] == name):
@@ -335,7 +338,7 @@ def plot_latency(path: Path, title: str, rows: Sequence[Mapping[str, Any]]) -> P
     axes.set(xlabel="ms for one problem", ylabel="calls done (%)", ylim=(0, 100))
     figures.log_scale(axes, "x")
     figures.draw_legend(figure, looks)
-    return figures.save(figure, path)
+    return save(figure, path)
 
 
 def _looks(names: Iterable[str]) -> dict[str, dict[str, Any]]:

@@ -16,8 +16,8 @@ from typing import Any
 
 import harness
 import torch
+from contenders import bare_call
 from kornia.core.exceptions import BaseError
-from others import bare_call
 from torch import nn
 
 from kornia_pnpnet import pose_errors, success, success_rate

@@ -105,14 +105,16 @@ class Contender:
     Attributes:
         loops: whether problems are solved one after the other. Then a part of a batch tells the time per problem.
         differentiable: whether there are gradients.
+        n: the only number of pairs that the solver takes, if there is one.
     """
 
     loops = False
     differentiable = True
+    n: int | None = None
 
     def takes(self, n: int) -> bool:
         """Whether the contender gets problems of ``n`` pairs."""
-        return True
+        return self.n in (None, n)
 
     def task(self, problems: Problems, *, backward: bool = False) -> Task:
         """Prepare a batch; this is not timed."""

@@ -23,10 +23,10 @@ from kornia_pnpnet.evaluation.bounds import KnownInliersAndNoise
 FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"
 SOLVERS = ("epnp", "p3p-ransac:max_samples=50", "opencv-epnp", "poselib")
 sys.path.insert(0, str(FOLDER))  # the benchmarks are scripts and import each other
-contenders, gpu, harness, others, page, performance, process, benchmark, startup, tasks, timing, uncertainty = map(
+contenders, gpu, harness, page, performance, process, benchmark, startup, tasks, timing, uncertainty = map(
     importlib.import_module,
     (
-        *("contenders", "gpu", "harness", "others", "page", "performance", "process", "solvers", "startup", "tasks"),
+        *("contenders", "gpu", "harness", "page", "performance", "process", "solvers", "startup", "tasks"),
         *("timing", "uncertainty"),
     ),
 )
@@ -99,7 +99,7 @@ def test_peers_are_timed_without_our_adapter(make_problems):
     pytest.importorskip("cv2")
     solver, seen = create_solver("opencv-epnp"), []
     solver.solve_one = lambda *arrays: seen.append([array.shape for array in arrays])
-    call = others.bare_call(solver, make_problems(n=9, batch=4))
+    call = contenders.bare_call(solver, make_problems(n=9, batch=4))
     assert seen == []
     call()
     assert seen == 4 * [[(9, 3), (9, 2), (3, 3)]]
