@@ -14,7 +14,6 @@ from kornia.core.exceptions import BaseError
 from kornia_pnpnet import Pose, create_solver
 from kornia_pnpnet.cli import main
 from kornia_pnpnet.data import SyntheticProblems
-from kornia_pnpnet.problem import Noise
 from kornia_pnpnet.refine.kernels import KERNELS
 from kornia_pnpnet.refine.lm import BACKWARDS
 
