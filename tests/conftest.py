@@ -11,8 +11,9 @@ import torch
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
-from kornia_pnpnet import Normalize, Pose, Problem, Problems
+from kornia_pnpnet import Normalize, Pose, Problems
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet.problem import Problem
 from kornia_pnpnet.refine.residual import retract
 
 if TYPE_CHECKING:
@@ -47,28 +48,20 @@ def make_problems() -> Callable[..., Problems]:
         seed: int = 0,
         dtype: torch.dtype = torch.float64,
     ) -> Problems:
-        source = SyntheticProblems(
-            n=n,
-            batch_size=batch,
-            seed=seed,
-            outliers=OutlierMix(count=outliers),
-            img_sigma=1.0 if noise else 0.0,
-            world_sigma=0.05 if noise else 0.0,
-            dtype=dtype,
-        )
-        return source.batch(0)
+        sigmas = {"img_sigma": 1.0 if noise else 0.0, "world_sigma": 0.05 if noise else 0.0}
+        mix = OutlierMix(count=outliers)
+        return SyntheticProblems(n=n, batch_size=batch, seed=seed, outliers=mix, dtype=dtype, **sigmas).batch(0)
 
     return make
 
 
 @pytest.fixture
 def correspond() -> Callable[[Problems], tuple[Problem, Pose]]:
-    """Normalised correspondences (centred, scaled, unordered) of some problems, and the true pose in their frame."""
+    """Problems in their own frame (centred, scaled, unordered), and the true poses in it."""
 
     def make(problems: Problems) -> tuple[Problem, Pose]:
-        normalize = Normalize(order=False)
-        corr, frame = normalize(problems.world_points, problems.img_points, problems.intrinsics)
-        return corr, normalize.apply_to_pose(problems.pose, frame)
+        problem, frame = Normalize(order=False)(*problems[:3])
+        return problem, frame.apply(problems.pose)
 
     return make
 

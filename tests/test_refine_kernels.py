@@ -42,7 +42,7 @@ def test_loss_starts_at_zero_and_rises_and_weight_falls(name, shape, dtype):
     rounding = 4 * torch.finfo(dtype).eps
     assert (loss[1:] >= loss[:-1] * (1 - rounding)).all()
     assert (weight >= 0).all()
-    assert not kernel.bounded or weight[0] <= 1.0
+    assert not kernel.bounded or weight[0] <= 1
     assert (weight[1:] <= weight[:-1] * (1 + rounding)).all()
 
 
