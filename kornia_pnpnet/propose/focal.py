@@ -33,7 +33,7 @@ _SEARCHED = 2.0
 # Pixels of a camera whose focal length is in the middle of the range: 0.65 % of half the width of the image. The least
 # threshold of an inlier; near the right focal length on the grid of the search, inliers have larger residuals.
 _THRESHOLD = 10.0
-_FINDER = RANSAC(P3P(), threshold=_THRESHOLD, min_samples=16, confidence=0.99)
+_FINDER = RANSAC(P3P(), threshold=_THRESHOLD, confidence=0.99, final_steps=3)
 
 # Focal lengths. Pairs with a smaller residual count in the first steps, before distortion is known: 0.2 times the cube
 # of a tangent of 0.7 is 0.07. From step to step the limit shrinks by a factor, down to the scale of the residuals.
