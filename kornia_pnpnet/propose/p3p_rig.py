@@ -127,7 +127,7 @@ def _newton(
     world = [world_points[1] - world_points[0], world_points[2] - world_points[0]]
     normal = torch.linalg.cross(*world, dim=0)
     dual = torch.linalg.cross(world[1], normal, dim=0), torch.linalg.cross(normal, world[0], dim=0), normal
-    rotation = sum(x[:, None] * (y / normal.square().sum(0)) for x, y in zip(cam, dual, strict=True))
+    rotation = (torch.stack(cam)[:, :, None] * (torch.stack(dual) / normal.square().sum(0))[:, None]).sum(0)
     translation = points[0] - (rotation * world_points[0]).sum(1)
     return rotation, translation, exact & translation.isfinite().all(0)
 
