@@ -102,12 +102,14 @@ def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
     pose = frame.undo(found.pose)
     inputs = _zoomed(inputs, zoom)
     if radial:
-        if inputs.free_focal.information is None:  # coefficients are small also where nothing is known of f
-            inputs = inputs._replace(free_focal=inputs.free_focal._replace(information=torch.zeros_like(zoom)))
+        known = inputs.free_focal
+        assert known is not None
+        if known.information is None:  # coefficients are small also where nothing is known of f
+            known = known._replace(information=torch.zeros_like(zoom))
+            inputs = inputs._replace(free_focal=known)
         with torch.no_grad():
             problem, frame = normalize(*inputs[:5])
-            assert inputs.free_focal is not None
-            problem = problem._replace(free_focal=inputs.free_focal.scaled(frame.img_scale))
+            problem = problem._replace(free_focal=known.scaled(frame.img_scale))
             at = _with_distortion(problem, frame.apply(pose), radial)
             finite = frame.valid & (at.pose.translation.sum(-1) + at.camera.sum(-1)).isfinite()
             pose = map_tensors(
