@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from kornia_pnpnet.problem import Problem, Starts
 from kornia_pnpnet.propose.alternatives import is_seen
@@ -42,19 +42,14 @@ def propose(
     if problem.rig is not None and not trait(init, "takes_rigs"):
         starts = starts_of_rig(problem, given, with_noise=trait(init, "estimates_noise"), fixed=fixed)
     elif trait(init, "takes_given"):
-        return _of_usual_pairs(init, init(problem, given), problem)
+        starts, given = init(problem, given), None
     elif views > 1:
         starts = from_views(init, problem, views, order)
     else:
         starts = init(problem, search_follows=True) if search_follows else init(problem)
     if given is not None:
         starts = starts.with_others(given)._replace(ok=None)
-    return _of_usual_pairs(init, starts, problem)
-
-
-def _of_usual_pairs(init: nn.Module, starts: Starts, problem: Problem) -> Starts:
-    """Pairs that are not of normal scale have a weight where a start sees them, or the initialiser weighs them."""
     if trait(init, "weighs_unusual"):
         return starts
-    seen: Tensor = is_seen(starts, problem)
-    return starts._replace(weights=starts.weights * torch.where(seen, 1.0, problem.usual))
+    # Pairs that are not of normal scale have a weight where a start sees them.
+    return starts._replace(weights=starts.weights * torch.where(is_seen(starts, problem), 1.0, problem.usual))

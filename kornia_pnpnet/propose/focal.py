@@ -34,7 +34,7 @@ _SEARCHED = 2.0
 # Pixels of a camera whose focal length is in the middle of the range: 0.65 % of half the width of the image. The least
 # threshold of an inlier; near the right focal length on the grid of the search, inliers have larger residuals.
 _THRESHOLD = 10.0
-_FINDER = RANSAC(P3P(), threshold=_THRESHOLD, min_samples=16, confidence=0.99)
+_FINDER = RANSAC(P3P(), threshold=_THRESHOLD, confidence=0.99, final_steps=3)
 
 # Focal lengths. Pairs with a smaller residual count in the first steps, before distortion is known: 0.2 times the cube
 # of a tangent of 0.7 is 0.07. From step to step the limit shrinks by a factor, down to the scale of the residuals.
@@ -105,12 +105,14 @@ def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
     pose = frame.undo(found.pose)
     inputs = _zoomed(inputs, zoom)
     if radial:
-        if inputs.free_focal.information is None:  # coefficients are small also where nothing is known of f
-            inputs = inputs._replace(free_focal=inputs.free_focal._replace(information=torch.zeros_like(zoom)))
+        known = inputs.free_focal
+        assert known is not None
+        if known.information is None:  # coefficients are small also where nothing is known of f
+            known = known._replace(information=torch.zeros_like(zoom))
+            inputs = inputs._replace(free_focal=known)
         with torch.no_grad():
             problem, frame = normalize(*inputs[:5])
-            assert inputs.free_focal is not None
-            problem = problem._replace(free_focal=inputs.free_focal.scaled(frame.img_scale))
+            problem = problem._replace(free_focal=known.scaled(frame.img_scale))
             at = _with_distortion(problem, frame.apply(pose), radial)
             finite = frame.valid & (at.pose.translation.sum(-1) + at.camera.sum(-1)).isfinite()
             pose = map_tensors(

@@ -129,11 +129,7 @@ def _lines(u: Tensor, h: Tensor, pairs: Tensor) -> tuple[Tensor, Tensor]:
     r"""The two lines (2, C) that form the conic with the weights ``u`` (3, C), of which ``u[1] + u[2]`` is not small.
 
     The lines are :math:`\lambda_1 - \lambda_3 = \text{slope}\,(\lambda_2 - \lambda_3) + \text{offset}\,\lambda_3`.
-
-    Args:
-        u: root of the cubic.
-        h: :math:`1 - \cos` of the angles between the rays, (3, C).
-        pairs: first factor of the cubic, :math:`u_1 u_2 + u_2 u_3 + u_3 u_1`, (C,).
+    ``h`` (3, C) is 1 minus the cosines of the angles between rays, ``pairs`` (C,) the first factor of the cubic.
     """
     tiny = torch.finfo(pairs.dtype).tiny
     # The matrix D of the conic has u_2 + u_3, u_3 + u_1, u_1 + u_2 on its diagonal and -u_k cos_k beside it. The lines
@@ -223,18 +219,17 @@ def _refined(candidates: Tensor, p: Tensor, q: Tensor, b: Tensor) -> Tensor:
 
 
 def _distances(p: Tensor, q: Tensor, r: Tensor, b: Tensor, g: Tensor) -> Tensor:
-    r"""Solve the law of cosines for a triangle whose edge 1 is the longest edge and has the length 1.
+    """Solve the law of cosines for a triangle whose edge 1 is the longest edge and has the length 1.
 
     Args:
         p: squared edge 3, (C,).
         q: squared edge 2, (C,).
-        r: :math:`1 - p - q`, which the caller may know with more digits, (C,).
-        b: squared difference of the two rays to the ends of each edge, (3, C).
-        g: squared determinant of the three rays, (C,).
+        r: ``1 - p - q``, which the caller may know with more digits, (C,).
+        b: see the module, (3, C).
+        g: see the module, (C,).
 
     Returns:
-        Four candidates for the distances of the points, (3, 2, 2, C). The first distance is not negative. A candidate
-        that is no solution with positive distances is finite.
+        Four candidates for the distances of the points, (3, 2, 2, C): finite, the first distance not negative.
     """
     dist = _refined(_candidates(p, q, r, b, g), p, q, b)
     dist1, dist2, dist3 = dist

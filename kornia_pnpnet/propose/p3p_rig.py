@@ -104,17 +104,9 @@ def _newton(
 ) -> tuple[Tensor, Tensor, Tensor]:
     r"""Find the distances along three rays at which the points have the distances of the world from each other.
 
-    Three equations :math:`\|c_i + d_i r_i - c_j - d_j r_j\|^2 = \|x_i - x_j\|^2` for three distances.
-
-    Args:
-        world_points: of each pair, :math:`(3, 3, M)`, like ``rays`` and ``centres``.
-        rays: of length 1.
-        centres: where the rays start.
-        ranges: first distances, :math:`(3, M)`.
-        steps: number of steps.
-
-    Returns:
-        Rotations, translations, and whether they are exact and all distances positive.
+    Three equations :math:`\|c_i + d_i r_i - c_j - d_j r_j\|^2 = \|x_i - x_j\|^2` for the distances (3, M), of points
+    :math:`x`, rays :math:`r` of length 1 and their starts :math:`c`, (3, 3, M) each. Returns rotations, translations,
+    and whether they are exact and all distances positive.
     """
     first, second = [0, 0, 1], [1, 2, 2]
     sides = (world_points[first] - world_points[second]).square().sum(1)  # (3, M)
@@ -135,7 +127,7 @@ def _newton(
     world = [world_points[1] - world_points[0], world_points[2] - world_points[0]]
     normal = torch.linalg.cross(*world, dim=0)
     dual = torch.linalg.cross(world[1], normal, dim=0), torch.linalg.cross(normal, world[0], dim=0), normal
-    rotation = sum(x[:, None] * (y / normal.square().sum(0)) for x, y in zip(cam, dual, strict=True))
+    rotation = (torch.stack(cam)[:, :, None] * (torch.stack(dual) / normal.square().sum(0))[:, None]).sum(0)
     translation = points[0] - (rotation * world_points[0]).sum(1)
     return rotation, translation, exact & translation.isfinite().all(0)
 

@@ -30,10 +30,9 @@ __all__ = ["RANSAC", "search_on"]
 # Scale of the Cauchy kernel of the last least squares, in standard deviations of the inliers' residuals; the median of
 # the squared residuals of Gaussian noise, in variances of a pixel coordinate; number of pairs that any pose fits.
 _KERNEL_SCALE, _MEDIAN, _FITTED = 3.4, 2.0 * math.log(2.0), 5
-# Standard deviations. :func:`search_on` counts nearer pairs as inliers. The limit of estimated noise is wide because
-# networks estimate too little noise where most pairs are outliers: an inlier that does not count costs more than an
-# outlier that does. That of known noise was tuned on problems of uncertain PnP (`benchmarks/uncertain_problems.py`,
-# seeds 777 and 778, 10 pairs with 5 outliers): 4 and 8 lead to larger errors.
+# Standard deviations up to which :func:`search_on` counts inliers: of estimated noise, which networks estimate too low
+# where most pairs are outliers, and of known noise, tuned on problems of uncertain PnP
+# (`benchmarks/uncertain_problems.py`, seeds 777 and 778, 10 pairs with 5 outliers): 4 and 8 lead to larger errors.
 _INLIER, _KNOWN_INLIER = 10.0, 5.0
 # Residuals at the best focal length on a grid, relative to the median distance of the pixels from the principal point
 # and the range of the grid in logarithms. Tuned on random problems with fields of view of 18 to 100 degrees (seed 6).
@@ -41,7 +40,7 @@ _GRID_RESIDUAL = 0.04
 # Normalised units. A start that has the centre of the world nearer than this counts as this near.
 _NEAREST = 0.5
 # A pair whose weight or confidence is 0 is drawn this often, relative to a pair where it is 1. Networks mislead more
-# often than callers: where repeated structure or crowds agree, for example.
+# often than callers, for example where structure repeats.
 _DOUBT, _LEAST_TRUST = 0.8, 0.05
 
 

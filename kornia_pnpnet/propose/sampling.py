@@ -39,10 +39,6 @@ def draw_subsets(numbers: Tensor, counts: Tensor) -> Tensor:
     """Subsets (P, H, s), ascending, of the ``counts`` (P,) items of problems, from uniform numbers (H, s) in [0, 1).
 
     Items are drawn one by one without replacement; of too few items, subsets hold positions past the last one.
-
-    Example:
-        >>> draw_subsets(torch.tensor([[0.0, 0.0, 0.99]], dtype=torch.float64), torch.tensor([3, 10])).tolist()
-        [[[0, 1, 2]], [[0, 1, 9]]]
     """
     chosen: list[Tensor] = []
     for j in range(numbers.shape[1]):
@@ -60,12 +56,6 @@ def draw_likely(numbers: Tensor, upper: Tensor) -> Tensor:
     """:func:`draw_subsets`, not ascending, of unequally likely items, by their cumulative probabilities (P, N).
 
     Items of probability 0 are drawn only where there are too few others.
-
-    Example:
-        >>> draw_likely(
-        ...     torch.tensor([[0.0, 0.5, 0.9]]).double(), torch.tensor([[0.1, 0.9, 0.9, 1.0]]).double()
-        ... ).tolist()
-        [[[0, 1, 3]]]
     """
     lower = torch.cat((torch.zeros_like(upper[:, :1]), upper[:, :-1]), 1)
     chosen: list[tuple[Tensor, Tensor]] = []  # where the interval of an item begins, and its length, ascending

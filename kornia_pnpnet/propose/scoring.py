@@ -126,13 +126,6 @@ class Scene(NamedTuple):
 
         Every operation passes once over memory, in place. There is no mask: comparing and selecting would take longer
         than all the arithmetic.
-
-        Example:
-            >>> points = torch.tensor([[[0.0, 0.0, 4.0], [1.0, 0.0, 4.0]]])
-            >>> problem = Problem.of(points, torch.zeros(1, 2, 2), 100.0)
-            >>> scene = Scene.of(problem, Thresholds(torch.tensor([[10.0]]), torch.tensor([[0.0]])), torch.float64)
-            >>> scene.errors(scene.pack(torch.eye(3).view(3, 3, 1, 1), torch.zeros(3, 1, 1)))[0, :, 0]
-            tensor([0.0000, 6.2500], dtype=torch.float64)
         """
         if self.rows is not None:
             rows = self.rows.flatten(1, 2)

@@ -26,9 +26,9 @@ _DTYPE = torch.float32
 # Number of samples that are solved, and of pairs that are improved together: a core's caches hold their tensors.
 _SAMPLES_AT_ONCE = 4096
 PAIRS_AT_ONCE = 8 * _SAMPLES_AT_ONCE
-# Number of pairs that score all poses of a round first, see `_rank`: at least the first, and the second times the cube
-# root of the number of samples before. After k samples in vain at a confidence of 0.999 the share of the inliers is
-# below (7 / k)^(1/3); of 3 over that share, one is an inlier with a probability of 95 %.
+# Number of pairs that score all poses of a round first: at least the first, and the second times the cube root of the
+# number of samples before. After k samples in vain at a confidence of 0.999 the share of the inliers is below
+# (7 / k)^(1/3); of 3 over that share, one is an inlier with a probability of 95 %.
 _FIRST_PAIRS, _PAIRS_BY_SAMPLES = 24, 3.0 / 7.0 ** (1 / 3)
 # Between two rankings the number of poses is divided by the first, the number of pairs that score multiplied by the
 # second. With more than 90 % outliers the few pairs that score first have hardly an inlier: more must be kept.
@@ -92,17 +92,6 @@ class Search:
         chances: how likely a pair is an inlier, up to a factor, shape :math:`(B, N)`; all the same when ``None``.
         sigma: standard deviation of the pixels, shape :math:`(B, 1)` or :math:`(B, N)`; as the residuals of the inliers
             show it when ``None``.
-
-    Example:
-        >>> from kornia_pnpnet.propose.p3p import P3P
-        >>> from kornia_pnpnet.propose.scoring import SCORERS
-        >>> points = torch.rand(1, 6, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        >>> cam_points = points + torch.tensor([0.0, 0.0, 5.0], dtype=torch.float64)
-        >>> problem = Problem.of(points, 100.0 * cam_points[..., :2] / cam_points[..., 2:], 100.0)
-        >>> plan = Plan(P3P(), SCORERS["msac"], max_samples=100, min_samples=32, confidence=0.999, seed=0)
-        >>> found = Search(plan, problem, Thresholds(points.new_ones(1, 1), points.new_zeros(1, 1))).run()
-        >>> round(found.state.pose.translation[0, 2].item(), 3), found.samples
-        (5.0, tensor([20]))
     """
 
     def __init__(
@@ -287,8 +276,7 @@ class Search:
 
 def least_squares(problem: Problem, projection: Projection, weights: Tensor) -> State:
     """Take one step of least squares with the weights (B, N) times the weights of the pairs."""
-    weights = problem.weights * weights
-    equations = normal_equations(projection, problem, weights)
+    equations = normal_equations(projection, problem, problem.weights * weights)
     for term in problem._replace(prior=None).terms:  # a residual of a pixel of the caller is a standard deviation
         equations = equations._replace(unit=problem.img_scale.square().reciprocal())
         equations = add_term(equations, term.linearise(projection.state), projection.focal)
