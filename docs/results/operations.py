@@ -120,6 +120,12 @@ _MATRIX: dict[str, Callable[..., float]] = {
     "addmm": lambda bias, first, second: matmul(first[0], first[1], second[1]) + first[0] * second[1] * ADD,
     "linalg_cholesky_ex": lambda matrix: cholesky(matrix[0]),
     "linalg_inv_ex": lambda matrix: solve(matrix[0], matrix[0]),
+    "_linalg_solve_ex": lambda matrix, right: solve(matrix[0], right[1]),
+    "_linalg_det": lambda matrix: solve(matrix[0], 0) + (matrix[0] - 1) * MULTIPLY,
+    "cholesky_solve": lambda right, factor: right[1] * 2 * factor[0] * (factor[0] - 1 + DIVIDE),
+    "baddbmm": lambda bias, first, second: matmul(first[0], first[1], second[1]) + first[0] * second[1] * ADD,
+    # With both sets of vectors: about 21 n^3, half of them products. Source: as below, section 8.6.
+    "_linalg_svd": lambda matrix: 10.5 * matrix[0] ** 3 * (ADD + MULTIPLY),
     # Tridiagonal form and QR iterations with eigenvectors: about 9 n^3, half of them products. Source: G. Golub and C.
     # Van Loan, "Matrix Computations", 4th edition, section 8.3.
     "_linalg_eigh": lambda matrix: 4.5 * matrix[0] ** 3 * (ADD + MULTIPLY),
