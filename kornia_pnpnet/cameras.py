@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from kornia.core.exceptions import ShapeError, ValueCheckError
 from kornia.geometry.calibration import distort_points
-from kornia.geometry.conversions import convert_points_to_homogeneous
+from kornia.geometry.conversions import convert_points_to_homogeneous, normalize_points_with_intrinsics
 from kornia.geometry.linalg import transform_points
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -172,8 +172,9 @@ def _through(
         coefficients, sound = torch.where(finite[:, None], coefficients, 0.0), sound & finite
     lens = _lens(coefficients, is_fisheye=dist is None)
     there = img_points.detach().isfinite().all(-1) & sound[:, None]
-    plane = transform_points(torch.linalg.inv(camera), torch.where(there[..., None], img_points, 0.0))
-    point, found = _invert(lens, plane)
+    x, y = normalize_points_with_intrinsics(torch.where(there[..., None], img_points, 0.0), camera).unbind(-1)
+    skew = camera[:, None, 0, 1] / camera[:, None, 0, 0]  # which Kornia leaves out
+    point, found = _invert(lens, torch.stack((x - skew * y, y), -1))
     return point, found & there, lens
 
 

@@ -149,7 +149,8 @@ class Problem(NamedTuple):
     def of(cls, world_points: Tensor, img_points: Tensor, focal: Tensor | float = 1.0, **more: Any) -> Problem:
         """A problem of its own frame: all weights are 1 and all scales are 1 unless given."""
         one = torch.ones_like(world_points[..., 0])
-        given = {"weights": one, "usual": one, "img_scale": one[:, 0], "world_scale": one[:, 0], **more}
+        scale = one.new_ones(len(one))
+        given = {"weights": one, "usual": one, "img_scale": scale, "world_scale": scale, **more}
         return cls(world_points, img_points, focal=torch.as_tensor(focal).to(one), **given)
 
     @property
