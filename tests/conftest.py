@@ -68,7 +68,7 @@ def correspond() -> Callable[[Problems], tuple[Problem, Pose]]:
     def make(problems: Problems) -> tuple[Problem, Pose]:
         normalize = Normalize(order=False)
         corr, frame = normalize(problems.world_points, problems.img_points, problems.intrinsics)
-        return corr, normalize.apply_to_pose(problems.pose, frame)
+        return corr, frame.apply(problems.pose)
 
     return make
 
