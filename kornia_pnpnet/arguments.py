@@ -230,8 +230,13 @@ def with_undistorted(inputs: Inputs, dist: Tensor | None, fisheye: Tensor | None
 
     Pairs without such a pixel are left out; one that is not finite still fails its problem.
     """
-    pixels, found, noise = undistort(inputs.img_points, inputs.intrinsics, dist, fisheye, inputs.noise)
     broken = ~inputs.img_points.isfinite().all(-1)
+    # Safe inputs give finite gradients; problems with other cameras fail later.
+    diagonal = inputs.intrinsics.diagonal(dim1=-2, dim2=-1)
+    usable = inputs.intrinsics.isfinite().flatten(-2).all(-1) & (diagonal / diagonal[..., 2:] > 0).all(-1)
+    camera = torch.where(usable[..., None, None], inputs.intrinsics, torch.eye(3).to(diagonal))
+    seen = torch.where(broken[..., None], 0.0, inputs.img_points)
+    pixels, found, noise = undistort(seen, camera, dist, fisheye, inputs.noise)
     mask = found | broken if inputs.mask is None else (found | broken) & inputs.mask
     return inputs._replace(img_points=torch.where(broken[..., None], inputs.img_points, pixels), mask=mask, noise=noise)
 

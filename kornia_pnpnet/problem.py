@@ -105,7 +105,7 @@ class Term(Protocol):
         """Robust loss in squared standard deviations, shape (B,)."""
 
     def disagreement(self, pose: Pose) -> Tensor:
-        """Loss of poses in pairs, beside those of inliers that fit and outliers; at least 0, the shape of the batch."""
+        """Penalty in the choice among poses, in pairs: an inlier that fits costs 0, an outlier 1. The batch's shape."""
 
 
 class Problem(NamedTuple):
@@ -155,8 +155,10 @@ class Problem(NamedTuple):
 
     @property
     def terms(self) -> Iterator[Term]:
-        """What is known besides the pairs; an unknown focal length of which nothing is known is no term."""
-        return (term for term in (self.prior, self.free_focal) if term is not None and term.information is not None)
+        """What is known besides the pairs. An unknown focal length without ``focal_sigma`` has no information."""
+        free = self.free_focal is not None and self.free_focal.information is not None
+        known = self.prior, self.free_focal if free else None
+        return (term for term in known if term is not None)
 
     @property
     def usual_weights(self) -> Tensor:

@@ -23,7 +23,7 @@ NEAR = 1e-6
 
 def seen(cam_points, generator):
     """World points and plane points of points in the camera frame, and the pose, which is anywhere."""
-    rotation = rotations(len(cam_points), seed=0)
+    rotation = rotations(len(cam_points), seed=77)
     translation = torch.randn(len(cam_points), 3, generator=generator, dtype=torch.float64)
     world_points = (cam_points - translation[:, None]) @ rotation
     return world_points, cam_points[..., :2] / cam_points[..., 2:], Pose(rotation, translation)

@@ -444,9 +444,9 @@ class RobustWeightedLM(Configured):
         zero = torch.zeros_like(state.pose.translation[:1, 0]).expand(6 + state.camera.shape[1], state.camera.shape[0])
         zero = zero.clone().requires_grad_()
         with torch.enable_grad():
-            fixed, slope = equations(problem.map(torch.Tensor.detach), moved(state, zero), shape.detach())
-            hessian = [torch.autograd.grad(x.sum(), zero, retain_graph=True)[0] for x in slope]
-        matrix, around, none = torch.stack(hessian), fixed.detach(), torch.zeros_like(shape)
+            near = equations(problem.map(torch.Tensor.detach), moved(state, zero), shape.detach())
+            hessian = [torch.autograd.grad(x.sum(), zero, retain_graph=True)[0] for x in near.gradient]
+        matrix, around, none = torch.stack(hessian), near.matrix.detach(), shape.new_zeros(())
         focal = project(state, problem).focal.detach()
         for _ in range(3 if problem.noise is not None and problem.noise.covariances else 2):
             gradient = equations(problem, state, shape).gradient

@@ -1,6 +1,6 @@
 r"""What is known besides the pairs: priors of the pose and of the camera, each a :class:`~kornia_pnpnet.problem.Term`.
 
-A new prior is one class with ``linearise`` and ``loss``.
+A new prior is a class with the methods of :class:`~kornia_pnpnet.problem.Term`, and a place in ``Problem.terms``.
 """
 
 from __future__ import annotations
