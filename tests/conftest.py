@@ -60,14 +60,8 @@ def correspond() -> Callable[[Problems], tuple[Problem, Pose]]:
     """Problems in their own frame (centred, scaled, unordered), and the true poses in it."""
 
     def make(problems: Problems) -> tuple[Problem, Pose]:
-<<<<<<< HEAD
         problem, frame = Normalize(order=False)(*problems[:3])
         return problem, frame.apply(problems.pose)
-=======
-        normalize = Normalize(order=False)
-        corr, frame = normalize(problems.world_points, problems.img_points, problems.intrinsics)
-        return corr, frame.apply(problems.pose)
->>>>>>> wt-t2
 
     return make
 
