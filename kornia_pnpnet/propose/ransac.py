@@ -21,7 +21,7 @@ from kornia_pnpnet.propose.p3p import P3P
 from kornia_pnpnet.propose.p3p_rig import P3PRig, is_central
 from kornia_pnpnet.propose.sampling import kept_at_once
 from kornia_pnpnet.propose.scoring import SCORERS, Scorer
-from kornia_pnpnet.propose.search import PAIRS_AT_ONCE, Plan, Search, least_squares
+from kornia_pnpnet.propose.search import PAIRS_AT_ONCE, Plan, Search, full_vectors, least_squares
 from kornia_pnpnet.refine.residual import project
 from kornia_pnpnet.result import Pose
 
@@ -30,9 +30,10 @@ __all__ = ["RANSAC", "search_on"]
 # Scale of the Cauchy kernel of the last least squares, in standard deviations of the inliers' residuals; the median of
 # the squared residuals of Gaussian noise, in variances of a pixel coordinate; number of pairs that any pose fits.
 _KERNEL_SCALE, _MEDIAN, _FITTED = 3.4, 2.0 * math.log(2.0), 5
-# Standard deviations up to which :func:`search_on` counts inliers: of estimated noise, which networks estimate too low
-# where most pairs are outliers, and of known noise, tuned on problems of uncertain PnP
-# (`benchmarks/uncertain_problems.py`, seeds 777 and 778, 10 pairs with 5 outliers): 4 and 8 lead to larger errors.
+# Standard deviations. :func:`search_on` counts nearer pairs as inliers. The limit of estimated noise is wide because
+# networks estimate too little noise where most pairs are outliers: an inlier that does not count costs more than an
+# outlier that does. That of known noise was tuned on problems of uncertain PnP (`benchmarks/uncertain_problems.py`,
+# seeds 777 and 778, 10 pairs with 5 outliers): 4 and 8 lead to larger errors.
 _INLIER, _KNOWN_INLIER = 10.0, 5.0
 # Residuals at the best focal length on a grid, relative to the median distance of the pixels from the principal point
 # and the range of the grid in logarithms. Tuned on random problems with fields of view of 18 to 100 degrees (seed 6).
@@ -40,7 +41,7 @@ _GRID_RESIDUAL = 0.04
 # Normalised units. A start that has the centre of the world nearer than this counts as this near.
 _NEAREST = 0.5
 # A pair whose weight or confidence is 0 is drawn this often, relative to a pair where it is 1. Networks mislead more
-# often than callers, for example where structure repeats.
+# often than callers: where repeated structure or crowds agree, for example.
 _DOUBT, _LEAST_TRUST = 0.8, 0.05
 
 
@@ -50,27 +51,30 @@ class RANSAC(Initialiser):
     The samples of all problems are solved as one batch, in rounds. After each round the best pose of a problem is
     improved by least squares on its inliers (LO-RANSAC). A problem is done when a sample without an outlier has been
     drawn with the probability ``confidence``. When the pairs have at most ``max_samples`` subsets, each subset is tried
-    once instead. Problems share only the random numbers: a problem has the same result in any batch, up to rounding.
+    once instead. Problems share only the random numbers, which are the same in every call: a problem has the same
+    result alone, in any batch and at any place in the batch, up to rounding.
 
     A pair is an inlier when :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`. The ``threshold`` :math:`\tau` is for errors
     of the pixels; the ``world_threshold`` :math:`\omega` is for errors of the points, which move the pixel by
     :math:`f/z` times as much. Least squares weigh an inlier by the inverse of the right hand side.
 
-    The pose is ``ok`` when fewer than 0.01 poses with as many inliers are expected by chance
-    (:func:`~kornia_pnpnet.judge.inliers.log_false_alarms`). Of only three pairs, which hold no evidence, any pose is.
+    The guess is ``ok`` when fewer than 0.01 poses with as many inliers are expected by chance, from pairs without any
+    pose behind them (see :func:`~kornia_pnpnet.judge.inliers.log_false_alarms`). A problem of only three pairs is
+    ``ok`` when it has a pose: three pairs hold no evidence.
 
-    Samples hold pairs in proportion to the caller's confidence: fewer suffice when it is right.
+    Where the caller gave a confidence for each pair, samples hold pairs in proportion to it, and fewer samples suffice
+    when the inliers are those with much confidence.
 
-    Gradients: inliers and their weights are constants. The last refinement, unrolled least squares from a constant
-    start near the minimum, has a gradient to points, pixels and weights.
+    Gradients: the inliers, and their weights by depth, are selected without a gradient. The last refinement, unrolled
+    least squares on the inliers from a constant start near the minimum, has a gradient to points, pixels and weights.
 
     Source: M. Fischler and R. Bolles, Communications of the ACM 24(6), 1981; O. Chum, J. Matas and J. Kittler,
     "Locally optimized RANSAC", DAGM 2003; P. Torr and A. Zisserman, CVIU 78(1), 2000 (MSAC); scoring few pairs first as
     in D. Nistér, "Preemptive RANSAC for live structure and motion estimation", ICCV 2003.
 
     Args:
-        minimal: solver of samples, for example :class:`~kornia_pnpnet.propose.p3p.P3P` or
-            :class:`~kornia_pnpnet.propose.minimal.SubsetSolver`.
+        minimal: solver of samples, for example :class:`~kornia_pnpnet.propose.P3P` or
+            :class:`~kornia_pnpnet.propose.SubsetSolver`.
         threshold: :math:`\tau` in pixels of the user's camera.
         world_threshold: :math:`\omega` in the unit of the user's world.
         scorer: ``"msac"``, the truncated squares; ``"inliers"``, the number of outliers; or any function from squared
@@ -127,18 +131,24 @@ class RANSAC(Initialiser):
         KORNIA_CHECK(callable(scorer) or scorer in SCORERS, f"scorer must be one of {sorted(SCORERS)}, got {scorer!r}.")
         name = getattr(scorer, "__name__", type(scorer).__name__) if callable(scorer) else scorer
         self.config.update(minimal=describe(minimal), scorer=name)
-        self.minimal, self.final_steps = minimal, final_steps
-        self.threshold, self.world_threshold = threshold, world_threshold
+        self.minimal = minimal
+        self.threshold = threshold
+        self.world_threshold = world_threshold
+        self.final_steps = final_steps
         self.finds_focal = isinstance(minimal, P3P)
         score = scorer if callable(scorer) else SCORERS[scorer]
         self.plan = Plan(minimal, score, max_samples, min_samples, confidence, self.config["seed"])
 
     def forward(self, problem: Problem, given: Pose | None = None) -> Starts:
-        r"""Find the poses; the weights are :math:`\tau^2 / (\tau^2 + (f \omega / z)^2)` for inliers, 0 for outliers.
+        r"""Find the poses.
 
         Args:
             problem: normalised problems.
             given: a pose of each problem that competes with those of the samples, in the frame of the problem.
+
+        Returns:
+            The poses; as weights :math:`\tau^2 / (\tau^2 + (f \omega / z)^2)` for the inliers, 0 for the outliers; and
+            ``ok``.
 
         Raises:
             ShapeError: when there are fewer pairs than in a sample.
@@ -194,12 +204,16 @@ class RANSAC(Initialiser):
         return Starts(Pose(pose.rotation, pose.translation - offset), judged.weights, ok, camera=camera)
 
     def _refine(self, problem: Problem, state: State, stages: list[Thresholds]) -> tuple[State, Judged]:
-        """Improve poses on the inliers of each stage in turn, in chunks that a cache holds; return the last inliers."""
+        """Improve poses on their inliers, in chunks whose tensors a cache holds; return the inliers afterwards, too.
+
+        The inliers are chosen anew for each entry of ``stages``.
+        """
         batch, count = problem.weights.shape
         size = max(1, kept_at_once(PAIRS_AT_ONCE, problem.weights) // count)
         results = []
         for rows in torch.arange(batch, device=problem.weights.device).split(size):
-            part, now, limits_of_part = take((problem, state, stages), rows)
+            at = full_vectors(rows, count)
+            part, now, limits_of_part = take((problem, state, stages), at)
             part = problems_last(part)
             projection = project(now, part)
             for limits in limits_of_part:
@@ -208,7 +222,7 @@ class RANSAC(Initialiser):
                     weights = inliers * _robust(judge(projection, part, limits), inliers)
                     projection = project(least_squares(part, projection, weights), part)
             judged = map_tensors(torch.Tensor.detach, judge(projection, part, limits))
-            results.append((projection.state, judged))
+            results.append(take((projection.state, judged), slice(len(rows))))
         return map_tensors(lambda *parts: torch.cat(parts), *results)
 
 
@@ -247,12 +261,14 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
 
     Samples hold pairs in proportion to 0.8 plus 0.2 times the weight of the starts, times the caller's confidence:
     weights that mislead then cost some samples, but no pose. An inlier is within ten standard deviations of the noise
-    that the starts estimate (its mean over the pairs), or within five of the caller's noise of its pair. The limit is
-    that of a point at the depth of the centre of the world in the first pose: with a limit by each pose's own depths, a
-    pose close to the points would have most inliers.
+    that the starts estimate (its mean over the pairs), or within five of the noise of its pair that the caller gave; of
+    noise with covariances the standard deviation of isotropic noise of the same trace. The limit is that of a point as
+    far away as the centre of the world in the first pose, for all poses: with a limit by each pose's own depths, a pose
+    close to the points would have most inliers.
 
     A problem is searched only when, by the number of inliers of the best pose of the starts, it needs more than 64
-    samples to reach a confidence of 0.999, and still does after its poses were improved on their inliers.
+    samples to reach a confidence of 0.999, and still does after its poses were improved on their inliers. Problems that
+    are done leave the batch, and no problem's result depends on the others.
 
     Args:
         problem: normalised problems of a centred and scaled world.

@@ -19,16 +19,17 @@ from kornia_pnpnet.refine.residual import Projection, lm_step, normal_equations,
 from kornia_pnpnet.refine.terms import add_term
 from kornia_pnpnet.result import Pose
 
-__all__ = ["PAIRS_AT_ONCE", "Found", "Plan", "Search", "least_squares", "pack_pairs", "unpack_pairs"]
+__all__ = ["PAIRS_AT_ONCE", "Found", "Plan", "Search", "full_vectors", "least_squares", "pack_pairs", "unpack_pairs"]
 
 # Poses are compared and improved in this precision, which resolves 1e-4 px at the protocol's focal length of 3400 px.
 _DTYPE = torch.float32
-# Number of samples that are solved, and of pairs that are improved together: a core's caches hold their tensors.
+# Number of samples that are solved and scored together, and of pairs that are improved together: a core's caches hold
+# their tensors.
 _SAMPLES_AT_ONCE = 4096
 PAIRS_AT_ONCE = 8 * _SAMPLES_AT_ONCE
-# Number of pairs that score all poses of a round first: at least the first, and the second times the cube root of the
-# number of samples before. After k samples in vain at a confidence of 0.999 the share of the inliers is below
-# (7 / k)^(1/3); of 3 over that share, one is an inlier with a probability of 95 %.
+# Number of pairs that score all poses of a round first, see `_rank`: at least the first, and the second times the cube
+# root of the number of samples before. After k samples in vain at a confidence of 0.999 the share of the inliers is
+# below (7 / k)^(1/3); of 3 over that share, one is an inlier with a probability of 95 %.
 _FIRST_PAIRS, _PAIRS_BY_SAMPLES = 24, 3.0 / 7.0 ** (1 / 3)
 # Between two rankings the number of poses is divided by the first, the number of pairs that score multiplied by the
 # second. With more than 90 % outliers the few pairs that score first have hardly an inlier: more must be kept.
@@ -39,6 +40,8 @@ _IMPROVED = 3
 _GROWTH = 0.5
 # Where no more than this many rounds are left, one round draws them all.
 _FEW_LEFT = 2.0
+# Number of samples that are solved at once, up to multiples: twice the numbers in the longest vector of a processor.
+_VECTOR = 64
 # Relative damping of least squares: next to none, since the start is close to the minimum.
 _DAMPING = 1e-6
 # Thresholds. The first least squares use the pairs up to this limit: the pose of a noisy sample misses some inliers.
@@ -92,6 +95,17 @@ class Search:
         chances: how likely a pair is an inlier, up to a factor, shape :math:`(B, N)`; all the same when ``None``.
         sigma: standard deviation of the pixels, shape :math:`(B, 1)` or :math:`(B, N)`; as the residuals of the inliers
             show it when ``None``.
+
+    Example:
+        >>> from kornia_pnpnet.propose.p3p import P3P
+        >>> from kornia_pnpnet.propose.scoring import SCORERS
+        >>> points = torch.rand(1, 6, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        >>> cam_points = points + torch.tensor([0.0, 0.0, 5.0], dtype=torch.float64)
+        >>> problem = Problem.of(points, 100.0 * cam_points[..., :2] / cam_points[..., 2:], 100.0)
+        >>> plan = Plan(P3P(), SCORERS["msac"], max_samples=100, min_samples=32, confidence=0.999, seed=0)
+        >>> found = Search(plan, problem, Thresholds(points.new_ones(1, 1), points.new_zeros(1, 1))).run()
+        >>> round(found.state.pose.translation[0, 2].item(), 3), found.samples
+        (5.0, tensor([20]))
     """
 
     def __init__(
@@ -102,13 +116,15 @@ class Search:
         chances: Tensor | None = None,
         sigma: Tensor | None = None,
     ) -> None:
-        self.plan, self.problem, self.chances = plan, problem, chances
+        self.plan = plan
+        self.problem = problem
         batch, device = len(problem.weights), problem.weights.device
         thresholds, sigma = map_tensors(lambda x: x.to(_DTYPE), (thresholds, sigma))
         self.limits = thresholds, None if sigma is None else sigma.expand_as(problem.weights)
         self.scene = Scene.of(problem, thresholds, _DTYPE)
         self.pairs = pack_pairs(problem)
         self.low = self.pairs.to(_DTYPE)
+        self.chances = chances
         self.samples = self.plain = self._samples(chances)
         self.matrix = torch.eye(3, 4, dtype=_DTYPE, device=device).repeat(batch, 1, 1)
         self.loss = self.matrix.new_full((batch,), torch.inf)
@@ -164,10 +180,9 @@ class Search:
         matrix = torch.cat((matrix[:, :2], matrix[:, 2:] / scale[..., None]), 1)
         return State(Pose(matrix[..., :3], matrix[..., 3]), -scale.log())
 
-    def _projected(self, rows: Tensor, matrix: Tensor) -> tuple[Projection, Problem]:
-        """Some of the problems, in the precision of the search, at a pose of each."""
-        problem = unpack_pairs(self.low[rows].permute(2, 1, 0).contiguous(), self.problem, rows)
-        return project(self._state(matrix), problem), problem
+    def _some(self, rows: Tensor) -> Problem:
+        """Some of the problems, in the precision of the search."""
+        return unpack_pairs(self.low[rows].permute(2, 1, 0).contiguous(), self.problem, rows)
 
     def _samples(self, chances: Tensor | None) -> Samples:
         plan, there = self.plan, self.problem.weights > 0
@@ -182,18 +197,24 @@ class Search:
         self.samples = self._samples(chances)
 
     def _expect(self, at: Tensor) -> None:
-        """Find how many samples some problems need, by the inliers of their best poses."""
-        thresholds, sigma = take(self.limits, at)
-        projection, problem = self._projected(at, self.matrix[at])
+        """Find how many samples some problems need, by the inliers of their best poses.
+
+        Once agreement was counted, it is the geometric mean of the numbers with and without agreement. Neighbours also
+        agree where structure repeats: such a wrong pose must not end the search too early.
+        """
+        rows = full_vectors(at, self.problem.weights.shape[1])
+        thresholds, sigma = take(self.limits, rows)
+        problem = self._some(rows)
+        projection = project(self._state(self.matrix[rows]), problem)
         judged = judge(projection, problem, thresholds)
         if self.problem.free_focal is None:
             known = None if sigma is None else Noise(sigma, torch.zeros_like(sigma))
             noise = known or residual_noise(projection, problem, judged.weights)
             is_open = rotation_sigma(projection, problem, noise, judged) > _OPEN
-            self.least[at] = self.least[at].where(~is_open, _OPEN_SAMPLES)
-        inliers = judged.weights > 0
+            self.least[at] = self.least[at].where(~is_open[: len(at)], _OPEN_SAMPLES)
+        inliers = judged.weights[: len(at)] > 0
         needed = self.samples.needed(at, inliers, self.plan.confidence)
-        if self.samples is not self.plain:  # neighbours also agree where structure repeats: do not end too early
+        if self.samples is not self.plain:
             needed = (needed * self.plain.needed(at, inliers, self.plan.confidence)).sqrt()
         self.needed[at] = needed.maximum(self.least[at])
 
@@ -207,16 +228,17 @@ class Search:
         positions = self.samples.positions(problems, start, stop)  # (P, H, s)
         batch, count, size = positions.shape
         rows = (positions + problems[:, None, None] * self.problem.weights.shape[1]).flatten(0, 1)  # (P H, s)
+        rows = full_vectors(rows)
         values = self.pairs.flatten(0, 1).index_select(0, rows.flatten()).view(-1, size, self.pairs.shape[2])
-        owners = problems.repeat_interleave(count)
+        owners = full_vectors(problems.repeat_interleave(count))
         solved = self.plan.minimal.hypotheses(unpack_pairs(values.permute(2, 1, 0), self.problem, owners))
         fresh = torch.arange(start, stop, device=problems.device) < self.samples.totals[problems, None]  # (P, H)
-        valid = solved.valid.unflatten(0, (batch, count)) & fresh[..., None]
+        valid = solved.valid[: batch * count].unflatten(0, (batch, count)) & fresh[..., None]
         valid = valid.mT.flatten(1)  # (P, S H)
         number = valid.sum(1)
         at, valid = _present_first(valid, number)
         row = at % count + count * torch.arange(batch, device=at.device)[:, None]
-        at = (at // count * (batch * count) + row).flatten()
+        at = (at // count * len(rows) + row).flatten()
         # Components first, the layout of p3p's results: each is selected along a row of memory.
         (rotation, translation), zoom = map_tensors(
             lambda x: x.movedim((0, 1), (-1, -2)).flatten(-2).index_select(-1, at).unflatten(-1, valid.shape),
@@ -230,7 +252,10 @@ class Search:
         return losses, scene.unpack(packed), number
 
     def _rank(self, problems: Tensor, scene: Scene, packed: Tensor, valid: Tensor, done: int) -> tuple[Tensor, Tensor]:
-        """Losses and poses of the best; of many pairs, a few score all poses first, then more pairs the best poses."""
+        """Losses and poses of the best; of many pairs, a few score all poses first, then more pairs the best poses.
+
+        After many samples in vain the share of the inliers is small, and more pairs are needed to see one of them.
+        """
 
         def keep(judges: Scene, width: int, last: bool) -> tuple[Tensor, Tensor, Tensor]:
             """The poses with the smallest losses: losses (P, K), packed (P, 4, 3, K), valid (P, K)."""
@@ -261,14 +286,17 @@ class Search:
 
     def _descend(self, problems: Tensor, loss: Tensor, matrix: Tensor, limit: float) -> tuple[Tensor, Tensor]:
         """Take one step of least squares on the pairs within ``limit`` thresholds, where it lowers the loss."""
-        projection, some = self._projected(problems, matrix)
-        wide = map_tensors(lambda x: limit * x[problems], self.limits[0])
+        count = self.problem.weights.shape[1]
+        rows = full_vectors(problems, count)
+        some, scene = self._some(rows), take(self.scene, problems)
+        wide = map_tensors(lambda x: limit * x[rows], self.limits[0])
+        projection = project(self._state(full_vectors(matrix, count)), some)
         pose, camera = least_squares(some, projection, judge(projection, some, wide).weights)
-        new_matrix = torch.cat((pose.rotation, pose.translation[..., None]), -1)
+        new_matrix = torch.cat((pose.rotation, pose.translation[..., None]), -1)[: len(problems)]
         if camera.shape[1]:
-            zoomed = new_matrix[:, 2:] * (-camera[:, None]).exp()
+            zoomed = new_matrix[:, 2:] * (-camera[: len(problems), None]).exp()
             new_matrix = torch.cat((new_matrix[:, :2], zoomed), 1)
-        components, scene = new_matrix.permute(1, 2, 0)[..., None], take(self.scene, problems)
+        components = new_matrix.permute(1, 2, 0)[..., None]
         new_loss = scene.losses(scene.pack(components[:, :3], components[:, 3]), self.plan.scorer)[:, 0]
         better = (new_loss < loss) & loss.isfinite()  # an invalid pose stays invalid
         return torch.where(better, new_loss, loss), torch.where(better[:, None, None], new_matrix, matrix)
@@ -276,7 +304,8 @@ class Search:
 
 def least_squares(problem: Problem, projection: Projection, weights: Tensor) -> State:
     """Take one step of least squares with the weights (B, N) times the weights of the pairs."""
-    equations = normal_equations(projection, problem, problem.weights * weights)
+    weights = problem.weights * weights
+    equations = normal_equations(projection, problem, weights)
     for term in problem._replace(prior=None).terms:  # a residual of a pixel of the caller is a standard deviation
         equations = equations._replace(unit=problem.img_scale.square().reciprocal())
         equations = add_term(equations, term.linearise(projection.state), projection.focal)
@@ -291,7 +320,13 @@ def pack_pairs(problem: Problem) -> Tensor:
 
 
 def unpack_pairs(values: Tensor, problem: Problem, owners: Tensor) -> Problem:
-    """Undo :func:`pack_pairs` for pairs (C, n, P) of the problems with the indices ``owners`` (P,)."""
+    """Undo :func:`pack_pairs`.
+
+    Args:
+        values: pairs of :math:`P` problems, shape :math:`(C, n, P)`.
+        problem: the problems they are from.
+        owners: which of these, shape :math:`(P,)`.
+    """
     dtype = values.dtype
     scales, free = take(((problem.img_scale, problem.world_scale), problem.free_focal), owners)
     scales, free, focal = map_tensors(lambda x: x.to(dtype), (scales, free, problem.focal))
@@ -302,9 +337,22 @@ def unpack_pairs(values: Tensor, problem: Problem, owners: Tensor) -> Problem:
     return Problem(values[..., :3], values[..., 3:5], weights, focal, *scales, usual, rig=rig, free_focal=free)
 
 
+def full_vectors(rows: Tensor, pairs: int = 1) -> Tensor:
+    """Repeat the first row at the end until the rows fill a processor's vectors; not where each has many pairs.
+
+    Some arithmetic rounds differently in the remainder of the vectors. With full vectors a sample has the same poses at
+    any place in the batch. Sums over many pairs may round differently: there, more rows would take more time.
+    """
+    left_over = -len(rows) % _VECTOR if pairs <= _VECTOR else 0
+    return torch.cat((rows, rows[:1].expand(left_over, *rows.shape[1:]))) if left_over else rows
+
+
 def _present_first(present: Tensor, number: Tensor) -> tuple[Tensor, Tensor]:
-    """Positions of what is present, (P, K) to (P, W) of the least width, and which of them are no padding."""
-    width = max(_IMPROVED, int(number.max()))
+    """Positions of what is present, (P, K) to (P, W), and which of them are no padding.
+
+    The width is as small as the largest number of a problem allows, and fills a processor's vectors.
+    """
+    width = max(1, -(-int(number.max()) // _VECTOR)) * _VECTOR
     problem, at = present.nonzero(as_tuple=True)
     rank = torch.arange(len(at), device=at.device) - (number.cumsum(0) - number)[problem]
     positions = at.new_zeros(len(present), width)
