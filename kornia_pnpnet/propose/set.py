@@ -132,7 +132,7 @@ class _Block(nn.Module):
         means = torch.bmm(attention.movedim(0, 1), y.view(*absent.shape, width))  # (B, heads, width)
         values = self.look.weight[:width].view(heads, width // heads, width)
         context = torch.bmm(means.movedim(1, 0), values.mT).movedim(0, 1).flatten(1) + self.look.bias[:width]
-        hidden = torch.mm(y, self.pair.weight.mT).view(*absent.shape, -1)
+        hidden = torch.mm(y, self.pair.weight.mT).view(*absent.shape, self.pair.out_features)
         hidden = hidden.add_(functional.linear(context, self.all.weight, self.pair.bias)[:, None]).relu_()
         return torch.addmm(x + self.out.bias, hidden.flatten(0, 1), self.out.weight.mT)
 
@@ -143,7 +143,7 @@ def _attention(x: Tensor, weight: Tensor, absent: Tensor) -> Tensor:
     The scores of a channel are contiguous in memory. Of rows shorter than a processor's vectors, a softmax over columns
     takes a tenth of the time.
     """
-    scores = torch.addmm(absent.view(1, -1), weight, x.mT).view(-1, *absent.shape)
+    scores = torch.addmm(absent.view(1, -1), weight, x.mT).view(weight.shape[0], *absent.shape)
     if compiling() or scores.shape[-1] >= _SHORT or are_few(scores):
         return scores.softmax(-1)
     return scores.mT.contiguous().softmax(1).mT.contiguous()  # `bmm` takes other layouts row by row
@@ -343,9 +343,9 @@ class SetInit(Initialiser):
         for block in self.blocks:
             x = block(x, absent)
         x = self.norm(x)
-        pair = torch.addmm(self.pair.bias[:, None], self.pair.weight, x.mT).view(-1, *absent.shape)
+        pair = torch.addmm(self.pair.bias[:, None], self.pair.weight, x.mT).view(self.pair.out_features, *absent.shape)
         share = _attention(x, self.pair.weight[:1], absent)[0]  # the softmax cancels the bias
-        return pair, self.problem(torch.bmm(share[:, None], x.view(*absent.shape, -1))[:, 0])
+        return pair, self.problem(torch.bmm(share[:, None], x.view(*absent.shape, self.pair.out_features))[:, 0])
 
     def _noise(self, problem: Problem, view: View, estimate: Tensor) -> Noise:
         """The known noise, and the network's estimate where it is unknown."""
