@@ -20,7 +20,7 @@ from timing import BACKWARD, FORWARD
 from kornia_pnpnet import PnPNet
 from kornia_pnpnet.core.files import atomic_open
 from kornia_pnpnet.core.tables import markdown_table
-from kornia_pnpnet.evaluation.plots import WIDTH, make_figure, save, themed
+from kornia_pnpnet.evaluation.plots import WIDTH, log_scale, make_figure, save, themed
 from kornia_pnpnet.metrics import SuccessRate
 
 sys.path.append(str(HERE.parent / "docs" / "results"))
@@ -336,7 +336,7 @@ def plot_latency(path: Path, title: str, rows: Sequence[Mapping[str, Any]]) -> P
             x, y = np.array(row["quantiles_us"])[kept] / 1e3, 100 * shares[kept]
             axes.plot(x, y, **look, markevery=max(1, len(x) // 5))
     axes.set(xlabel="ms for one problem", ylabel="calls done (%)", ylim=(0, 100))
-    figures.log_scale(axes, "x")
+    log_scale(axes, "x")
     figures.draw_legend(figure, looks)
     return save(figure, path)
 

@@ -319,7 +319,8 @@ def _without_padding(inputs: Inputs, most: int) -> list[Part]:
         of_problem: dict[str, Any] = {"init": inputs.init, "prior": inputs.prior}
         if inputs.rig is None:
             of_problem["intrinsics"] = inputs.intrinsics
-        without = inputs._replace(**dict.fromkeys(of_problem))
+        nothing: dict[str, Any] = dict.fromkeys(of_problem)
+        without = inputs._replace(**nothing)
         some = map_tensors(lambda x, at=at, pairs=pairs: x[at[:, None], pairs], without)
         some = some._replace(**{name: take(tree, at) for name, tree in of_problem.items()})
         parts.append(Part(some, at, pairs, count))

@@ -148,10 +148,11 @@ def export_program(
     fixed = _fixed_n(solver, n)
     if n not in (None, fixed):
         raise ValueCheckError(f"The solver's network was built for n = {fixed}, got n = {n!r}.")
-    sizes_of_example = {"n": fixed or 12, "batch_size": int(batch or 3)}
-    problems = (CameraProblems(cameras=3, **sizes_of_example) if rig else SyntheticProblems(**sizes_of_example)).batch(
-        0
-    )
+    pairs, count = fixed or 12, int(batch or 3)
+    if rig:
+        problems = CameraProblems(n=pairs, batch_size=count, cameras=3).batch(0)
+    else:
+        problems = SyntheticProblems(n=pairs, batch_size=count).batch(0)
     inputs = (*problems[:3], torch.ones_like(problems.world_points[..., 0]), *(problems.cam_from_rig or ()))
     sizes: dict[int, Any] = {} if batch is not None else {0: torch.export.Dim("batch", min=1, max=_MAX_BATCH)}
     points = sizes if fixed is not None else {**sizes, 1: torch.export.Dim("pairs", min=4, max=_MAX_N)}
@@ -167,7 +168,10 @@ def export_program(
 
 def _fixed_n(solver: PnPNet, n: int | None) -> int | None:
     """The number of pairs of a program; ``None``: any."""
-    return int(solver.init.config["n"]) if solver.init is not None and trait(solver.init, "fixed_pairs") else n
+    if solver.init is None or not trait(solver.init, "fixed_pairs"):
+        return n
+    config: Any = solver.init.config
+    return int(config["n"])
 
 
 def export_package(

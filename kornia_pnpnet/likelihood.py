@@ -129,10 +129,16 @@ def monte_carlo_pose_loss(
     if img_sigma is None and img_cov is None:
         raise ValueCheckError("monte_carlo_pose_loss needs the noise of the pixels: img_sigma or img_cov.")
     noisy_points = world_sigma is not None or world_cov is not None
-    pairs = world_points, img_points, intrinsics, weights, mask
-    sigmas = {"img_sigma": img_sigma, "world_sigma": world_sigma if noisy_points else 0.0}
-    covariances = {"img_cov": img_cov, "world_cov": world_cov}
-    checked = [checked_inputs(*pairs, pose, **sigmas, **covariances) for pose in (truth, *others)]
+    checked = [
+        checked_inputs(
+            *(world_points, img_points, intrinsics, weights, mask, pose),
+            img_sigma=img_sigma,
+            world_sigma=world_sigma if noisy_points else 0.0,
+            img_cov=img_cov,
+            world_cov=world_cov,
+        )
+        for pose in (truth, *others)
+    ]
     size, inputs = checked[0]
     given = [Pose(*x.init) for _, x in checked if x.init is not None]
     noise = inputs.noise
@@ -224,8 +230,8 @@ class _Posterior(NamedTuple):
         residual, sq_behind = problem.focal * plane - problem.img_points, (problem.focal * behind).square()
         assert problem.noise is not None
         if problem.noise.covariances:
-            at = poses.rotation[..., None, :, :], *plane.unbind(-1), problem.focal / depth
-            covariance = covariance_at(*at, problem.noise)
+            p, q = plane.unbind(-1)
+            covariance = covariance_at(poses.rotation[..., None, :, :], p, q, problem.focal / depth, problem.noise)
             determinant, precision = covariance.determinant, covariance.inverse()
             sq_residual = precision.form(*residual.unbind(-1)) + 0.5 * sq_behind * (precision.uu + precision.vv)
         else:

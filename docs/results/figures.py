@@ -103,16 +103,16 @@ def draw_legend(figure: Figure, styles: Styles) -> None:
 
 
 def make_panels(
-    count: int, columns: int, heights: tuple[float, float], heading: Sequence[str], **shared: bool
+    count: int, columns: int, heights: tuple[float, float], heading: Sequence[str], *, shared: bool = False
 ) -> tuple[Figure, list[Axes], int]:
     """A figure with panels in lines of at most ``columns``, and the number of columns that it has.
 
-    ``heights`` in inches: of the page besides the panels, and of a line of panels.
+    ``heights`` in inches: of the page besides the panels, and of a line of panels. ``shared``: the same axes in all.
     """
     lines = math.ceil(count / columns)
     columns = math.ceil(count / lines)
     figure = make_figure(WIDTH, heights[0] + heights[1] * lines, *heading)
-    grid = list(figure.subplots(lines, columns, squeeze=False, **shared).flat)
+    grid = list(figure.subplots(lines, columns, squeeze=False, sharex=shared, sharey=shared).flat)
     for axes in grid[count:]:
         axes.remove()
     return figure, grid[:count], columns
@@ -127,7 +127,7 @@ def draw_dots(path: str | Path, heading: Sequence[str], panels: Mapping[str, pd.
     """Draw success: a row for each solver, a panel for each table with ``solver``, ``rate``, ``low`` and ``high``."""
     styles = solver_styles(solver for table in panels.values() for solver in table.solver)
     heights = 0.5, _ROW * len(styles) + 0.85
-    figure, grid, columns = make_panels(len(panels), 3, heights, heading, sharex=True, sharey=True)
+    figure, grid, columns = make_panels(len(panels), 3, heights, heading, shared=True)
     for axes, (title, table) in zip(grid, panels.items(), strict=True):
         for name, rate, (low, high) in zip(table.solver, table.rate, reach(table).T, strict=True):
             look, row = styles[name], list(styles).index(name)

@@ -50,7 +50,7 @@ UNTUNED = (
     *(PAPER, OURS, "net-n9", "identity-lm", "epnp", "epnp-lm", "reppnp", "reppnp-lm"),
     *("opencv-epnp", "opencv-sqpnp"),
 )
-_PIXELS = {"threshold": (1.0, 2.0, 5.0, 10.0, 20.0, 35.0, 50.0, 80.0, 120.0)}
+_PIXELS: dict[str, Sequence[float]] = {"threshold": (1.0, 2.0, 5.0, 10.0, 20.0, 35.0, 50.0, 80.0, 120.0)}
 #: Threshold methods by the name on the page: the solver, and the values of its options that tuning tries.
 #: ``p3p-ransac`` has one threshold in pixels like the peers, ``p3p-ransac-noise`` also one for noise of the world
 #: points. OpenCV's RANSAC once with its usual options (AP3P, refined) and once with the best options that we found.

@@ -30,7 +30,8 @@ Shapes: TypeAlias = dict[str, tuple[Tensor | None, tuple[int, ...]]]
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool) and bool(-math.inf < value < math.inf)
+    real = isinstance(value, Real) and not isinstance(value, bool)
+    return real and bool(-math.inf < value < math.inf)
 
 
 def check_whole(least: int, most: int | None = None, /, **values: Any) -> None:

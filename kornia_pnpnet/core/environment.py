@@ -16,7 +16,7 @@ __all__ = ["environment"]
 
 # Distributions that contain each package, the most common first.
 _OPENCV = tuple(f"opencv-{kind}" for kind in ("python-headless", "python", "contrib-python-headless", "contrib-python"))
-_PACKAGES = {name: (name,) for name in ("kornia_pnpnet", "torch", "kornia", "numpy")}
+_PACKAGES: dict[str, tuple[str, ...]] = {name: (name,) for name in ("kornia_pnpnet", "torch", "kornia", "numpy")}
 _PACKAGES |= {"opencv": _OPENCV, **{name: (name,) for name in ("kornia_rs", "poselib", "pycolmap")}}
 
 

@@ -60,6 +60,7 @@ def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, np.n
     with path.open("rb") as file:
         try:
             with np.lib.npyio.NpzFile(file, allow_pickle=False) as content:
+                assert content.zip is not None
                 members = {member.filename.removesuffix(".npy"): member.file_size for member in content.zip.infolist()}
                 wanted = [name for name in members if names is None or name in names]
                 size = sum(members[name] for name in wanted)

@@ -32,8 +32,8 @@ def map_tensors(function: Callable[..., Any], tree: _T, *others: _T) -> _T:
         return function(tree, *others)
     if not isinstance(tree, (tuple, list)):
         return tree
-    parts = (map_tensors(function, *entries) for entries in zip(tree, *others, strict=True))  # type: ignore[call-overload]
-    return type(tree)(*parts) if hasattr(tree, "_fields") else type(tree)(parts)  # type: ignore[call-arg]
+    parts = (map_tensors(function, *entries) for entries in zip(tree, *others, strict=True))
+    return type(tree)(*parts) if hasattr(tree, "_fields") else type(tree)(parts)
 
 
 def take(tree: _T, at: Tensor | slice) -> _T:

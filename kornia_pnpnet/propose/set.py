@@ -353,4 +353,5 @@ class SetInit(Initialiser):
         if problem.noise is not None:
             known = torch.stack((problem.noise.img, problem.noise.world), -1)
             guessed = torch.where(known.isfinite(), known, guessed)
-        return Noise(*guessed.maximum(LEAST_NOISE * view.unit[:, None]).unbind(-1))
+        img, world = guessed.maximum(LEAST_NOISE * view.unit[:, None]).unbind(-1)
+        return Noise(img, world)

@@ -66,7 +66,7 @@ class Plan(NamedTuple):
         step: :math:`\gamma` of each iteration, scalars.
         damping: :math:`\lambda` of each iteration, scalars.
         shape: shape of the kernel of each iteration, scalars.
-        count: number :math:`S` of states of each problem.
+        starts: number :math:`S` of states of each problem.
     """
 
     problem: Problem
@@ -79,7 +79,7 @@ class Plan(NamedTuple):
     step: tuple[Tensor, ...]
     damping: tuple[Tensor, ...]
     shape: tuple[Tensor, ...]
-    count: int
+    starts: int
 
 
 class Progress(NamedTuple):
@@ -310,7 +310,7 @@ class RobustWeightedLM(Configured):
             The last state, and whether the last equations could be solved.
         """
         m = self.m if m is None else min(m, self.m)
-        problem, count = plan.problem, plan.count
+        problem, starts = plan.problem, plan.starts
         hyperparameters = list(zip(plan.step, plan.damping, plan.shape, strict=True))[:m]
         hyperparameters += hyperparameters[-1:] * more
         guided, by_residual = (problem._replace(weights=x) for x in (plan.guided, plan.by_residual))
@@ -318,12 +318,12 @@ class RobustWeightedLM(Configured):
         now, narrower = Progress(plan.state, ones > 0, ones), None
         explored = 0
         with torch.set_grad_enabled(torch.is_grad_enabled() and self.backward == "unroll"):
-            if count > 1:
+            if starts > 1:
                 explored = min(self.explored, m)
-                several = repeat_problems(guided, count)
+                several = repeat_problems(guided, starts)
                 for each in hyperparameters[:explored]:
                     now = run(self._iteration, several, now, *each)
-                rivals = several._replace(weights=repeat_problems(plan.by_residual, count))
+                rivals = several._replace(weights=repeat_problems(plan.by_residual, starts))
                 now = run(self._best, rivals, plan.prior, plan.shape[max(self.explored - 1, 0)], now)
             switch = max(self.m - self.by_residual, explored)
             for each in hyperparameters[explored:switch]:

@@ -320,7 +320,7 @@ def _entrywise_equations(
     zero = torch.zeros_like(total)
     weighted = [(_plus(_times(u, uu), _times(v, uv)), _plus(_times(u, uv), _times(v, vv))) for u, v in columns]
 
-    def inner(a: _Column, b: _Column) -> Tensor:
+    def inner(a: _Column, b: tuple[Any, ...]) -> Tensor:
         """Sum over pairs and rows of the products of two columns, (B,)."""
         (a_u, a_v), (b_u, b_v) = a, b
         if type(a_u) is type(a_v) is type(b_u) is type(b_v):
