@@ -345,7 +345,7 @@ class SetInit(Initialiser):
         x = self.norm(x)
         pair = torch.addmm(self.pair.bias[:, None], self.pair.weight, x.mT).view(self.pair.out_features, *absent.shape)
         share = _attention(x, self.pair.weight[:1], absent)[0]  # the softmax cancels the bias
-        return pair, self.problem(torch.bmm(share[:, None], x.view(*absent.shape, self.pair.out_features))[:, 0])
+        return pair, self.problem(torch.bmm(share[:, None], x.view(*absent.shape, x.shape[-1]))[:, 0])
 
     def _noise(self, problem: Problem, view: View, estimate: Tensor) -> Noise:
         """The known noise, and the network's estimate where it is unknown."""

@@ -244,7 +244,8 @@ class RobustWeightedLM(Configured):
             (20, torch.Size([20]))
         """
         check_whole(0, m=m)
-        refine = RobustWeightedLM(**{**self.config, "m": m, "by_residual": max(self.by_residual + m - self.m, 0)})
+        by_residual = max(self.by_residual + m - self.m, 0) if self.by_residual else 0
+        refine = RobustWeightedLM(**{**self.config, "m": m, "by_residual": by_residual})
         for name, parameter in refine.named_parameters():
             trained = self.get_parameter(name).detach()
             parameter.data = trained[torch.arange(len(parameter)).clamp(max=len(trained) - 1)]

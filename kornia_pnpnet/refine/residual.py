@@ -239,19 +239,20 @@ def normal_equations(
         problem: its problem.
         weights: weight of each pair, :math:`(B, N)`, or 2x2 matrices with entries of that shape. Points behind the
             camera do not count.
-        relative: divide the weights of each problem by that of the heaviest row of the Jacobian, a constant, so that
-            products of tiny weights do not vanish.
+        relative: divide the weights of each problem by the largest, a constant, so that products of tiny weights do
+            not vanish.
 
     Returns:
         The equations, with :math:`J` divided by the focal length and :math:`r` in pixels.
     """
     columns, unit = _columns(projection, problem), None
     sq_inverse = projection.inv_depth * projection.inv_depth
-    weights = map_tensors(lambda w: w.mT * sq_inverse, weights)
     if relative:
-        largest = (weights if isinstance(weights, Tensor) else weights.uu + weights.vv).detach().amax(0)
+        sizes = (weights if isinstance(weights, Tensor) else weights.uu + weights.vv).detach()
+        largest = sizes.amax(1)
         unit = torch.where(largest > 0, largest, 1.0)
-        weights = map_tensors(lambda w: w / unit, weights)
+        weights = map_tensors(lambda w: w / unit[:, None], weights)
+    weights = map_tensors(lambda w: w.mT * sq_inverse, weights)
     if are_few(projection.inv_depth):
         return NormalEquations(*_stacked_equations(columns, projection.scaled, weights), unit)
     return NormalEquations(*_entrywise_equations(columns, projection.scaled.unbind(), weights), unit)
