@@ -47,7 +47,7 @@ def _trained(weights: str, m: int | None = None) -> PnPNet:
 
 def _alone(init: Callable[..., nn.Module], **options: Any) -> PnPNet:
     """A method without refinement: its pose is judged, and its weights are the weights of the result."""
-    refine = RobustWeightedLM(0, robustness=0.0, learnable=False)
+    refine = RobustWeightedLM(0, damping=1e-6, robustness=0.0, learnable=False)
     return PnPNet(init(**options), refine, Normalize(order=init is RANSAC))  # others do not see the order of the pairs
 
 

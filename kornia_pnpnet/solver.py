@@ -38,6 +38,7 @@ __all__ = ["PnPNet"]
 _LONGEST_GRADIENT = 10.0
 # Further iterations from the nominal focal length: the least that converge with 1000 pairs. With 2, 4 and 8 of them the
 # median error of the focal length is 0.037, 0.029 and 0.030 % (CameraProblems, seeds 4321, 4322, half outliers).
+# Radial distortion takes them, too: of what is refined on undistorted pixels it has no gradient.
 _MORE_ITERATIONS = 4
 # Least probability of a pose that started with the nominal focal length. Of problems with 50 % outliers (n = 12, seeds
 # 7700 to 7709 of CameraProblems), 0.4 to 0.6 % have more and are wrong, as are 0.6 % of those of the oracle.
@@ -305,7 +306,7 @@ class PnPNet(PretrainedMixin):
         """Problem, attempts, judge: a first attempt for all problems, further ones for those that ask for them."""
         given = inputs
         inputs, nominal = self._with_camera(inputs)
-        attempt = self._attempt(inputs, call, more=_MORE_ITERATIONS if nominal else 0)
+        attempt = self._attempt(inputs, call, more=_MORE_ITERATIONS if nominal or self.radial else 0)
         result = attempt.result
         if self._adapts(inputs, call):
             if nominal:

@@ -312,8 +312,8 @@ class RobustWeightedLM(Configured):
         """
         m = self.m if m is None else min(m, self.m)
         problem, starts = plan.problem, plan.starts
-        hyperparameters = list(zip(plan.step, plan.damping, plan.shape, strict=True))[:m]
-        hyperparameters += hyperparameters[-1:] * more
+        hyperparameters = list(zip(plan.step, plan.damping, plan.shape, strict=True))
+        hyperparameters = hyperparameters[:m] + hyperparameters[max(m - 1, 0) :][:1] * more
         guided, by_residual = (problem._replace(weights=x) for x in (plan.guided, plan.by_residual))
         ones = torch.ones_like(plan.state.pose.translation[:, 0])
         now, narrower = Progress(plan.state, ones > 0, ones), None
