@@ -30,7 +30,7 @@ from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.result import Pose
 
 FIELDS = ("world", "img", "mask", "confidence", "K", "R", "t", "seen", "cluster")
-# A pose is right below this many degrees and this relative translation error; errors are also averaged up to CAP.
+# A pose is right below this number of degrees and this relative translation error; errors are also averaged up to CAP.
 RIGHT, CAP = (5.0, 0.05), 0.5
 FEWEST = 6  # pairs that PoseLib gets at least, the most confident ones
 # Median and mean logarithm of the length of a two-dimensional residual, relative to its standard deviation.

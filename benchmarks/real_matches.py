@@ -64,7 +64,7 @@ BATCH = 500
 # Points of the map: largest distance to the epipolar line and largest reprojection error in an image of the map, in
 # pixels; smallest angle between two of the rays, in degrees.
 EPIPOLAR_PX, TRIANGULATION_PX, MIN_ANGLE = 2.0, 2.0, 1.5
-# An image of the map can be matched to a query when this share of its points, and at least this number of them, lies
+# An image of the map can be matched to a query when this fraction of its points, and at least this number of them, lies
 # inside the query.
 MIN_OVERLAP, MIN_POINTS = 0.25, 30
 # What a solver is told whose name ends with this: 1 - ratio as the confidence of each pair, or sigmas.

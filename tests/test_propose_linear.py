@@ -17,7 +17,7 @@ SOLVERS = {
 
 
 def flattened(p, thickness=0.0):
-    """The same pixels of points that lie on a slanted plane, apart from bumps of this share of their distances."""
+    """The same pixels of points that lie on a slanted plane, apart from bumps of this fraction of their distances."""
     normal = torch.tensor([0.2, -0.3, 1.0], dtype=torch.float64)
     rays = torch.nn.functional.pad(p.img_points / p.intrinsics[:, :1, :1], (0, 1), value=1.0)
     bumps = torch.randn(p.img_points.shape[:2], generator=torch.Generator().manual_seed(0), dtype=torch.float64)

@@ -29,7 +29,7 @@ FOCAL, RADIAL = 3400.0, torch.tensor([[0.05, -0.02]], dtype=torch.float64)
 
 
 def scene(camera, unknown, rotation, batch=7, n=9):
-    """Points in front of cameras but for one, pixels 50 px off, and a state of so many unknowns of the camera."""
+    """Points in front of cameras but for one, pixels 50 px off, and a state with unknown parameters of the camera."""
     generator = torch.Generator().manual_seed(0)
 
     def uniform(*shape):

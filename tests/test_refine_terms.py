@@ -65,7 +65,7 @@ def rate(result, problems):
 
 @pytest.fixture
 def state(request, random_rotations, generator):
-    """Poses, and so many unknown parameters of the camera as the test's ``unknown`` says."""
+    """Poses, and the number of unknown parameters of the camera that the test's ``unknown`` says."""
     unknown = request.getfixturevalue("unknown")
     pose = Pose(random_rotations(5), 3.0 * torch.randn(5, 3, generator=generator, dtype=torch.float64))
     return State(pose, 0.1 * torch.randn(5, unknown, generator=generator, dtype=torch.float64))

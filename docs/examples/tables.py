@@ -60,7 +60,7 @@ def tracking(results: dict[str, Any]) -> str:
 
 
 def by_share(runs: dict[str, Any], title: str, cell: str) -> str:
-    """A table with a line for each share of wrong pairs, and a column for each solver."""
+    """A table with a line for each fraction of outliers, and a column for each solver."""
     shares = next(iter(runs.values()))
     lines = [[share.replace("%", " %"), *(cell.format_map(run[share]) for run in runs.values())] for share in shares]
     return markdown_table([title, *(f"`{name}`" for name in runs)], lines)
@@ -77,7 +77,7 @@ def fiducial_board(results: dict[str, Any]) -> str:
 
 
 def incremental_map(results: dict[str, Any]) -> str:
-    """Success of each way to register an image, by the share of wrong matches."""
+    """Success of each way to register an image, by the fraction of wrong matches."""
     table = by_share(results["runs"], "Wrong matches", "{within_1_deg:.0%}, {median_deg:.3f}°").replace("%,", " %,")
     caption = f"Share of images within 1° and median error, {results['scenes']} scenes of {results['images']} images"
     return f"{caption}:\n\n{table}"

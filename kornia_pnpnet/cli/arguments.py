@@ -119,7 +119,7 @@ ARGUMENTS: dict[str, dict[str, dict[str, Any]]] = {
             "MODEL,w,h,PARAMS",
         ),
         "--focal": _arg(
-            "estimate the focal length; SIGMA: that of the intrinsics is right up to this share, such as 0.1",
+            "estimate the focal length; SIGMA: that of the intrinsics is right up to this fraction, such as 0.1",
             "known|unknown|SIGMA",
             type=_focal,
         ),

@@ -47,11 +47,11 @@ _ALARMS, _LOG_SIGMA = (-20.0, 10.0), (-12.0, 2.0)
 _EVIDENT = 3.5
 # Standard deviation of the logarithm of a focal length beyond which it is open.
 _OPEN_FOCAL = 0.15
-# A pose explains the pixels when this share of the pairs (by weight) has small residuals. Just below 0.6, so that a sum
-# of shares that is 0.6 up to rounding suffices.
+# A pose explains the pixels when this fraction of the pairs (by weight) has small residuals. Just below 0.6, so that a
+# sum of shares that is 0.6 up to rounding suffices.
 _EXPLAINED_SHARE = 0.6 - 1e-5
-# A residual is small when it is below this share of the pixels' spread. A compromise: points behind the camera nearly
-# always leave larger residuals, small objects with noise of a tenth of their size leave smaller residuals.
+# A residual is small when it is below this fraction of the pixels' spread. A compromise: points behind the camera
+# nearly always leave larger residuals, small objects with noise of a tenth of their size leave smaller residuals.
 _EXPLAINED_RESIDUAL = 0.2
 
 

@@ -23,7 +23,7 @@ __all__ = ["find_alternatives", "is_seen", "mirror_probability"]
 
 _T = TypeVar("_T")
 
-# A pose explains the pairs nearly as well when its likelihood is at least this share of the best one's.
+# A pose explains the pairs nearly as well when its likelihood is at least this fraction of the best one's.
 _LIKELY = 1e-3
 # Logarithm. Poses that are this much likelier than the best one are not compared further.
 _LIKELIER = 30.0

@@ -17,7 +17,7 @@ from kornia_pnpnet.problem import Problem
 
 __all__ = ["ControlPoints", "control_points"]
 
-# Points are planar when their extent across the plane is below this share of their extent along the plane.
+# Points are planar when their extent across the plane is below this fraction of their extent along the plane.
 _PLANAR_RATIO = 1e-3
 
 

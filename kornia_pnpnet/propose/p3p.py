@@ -46,12 +46,12 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["P3P", "p3p"]
 
-# Bytes. One number per problem of a chunk takes this many: a few dozen of these vectors fit into a core's caches.
+# Bytes that one number per problem of a chunk takes: a few dozen of these vectors fit into a core's caches.
 _CHUNK_BYTES = 2**16
 # Power of the machine epsilon. The triangle of a solution differs from the given triangle, whose longest edge is 1, by
 # less than this power times the distance.
 _ERROR_POWER = 2 / 3
-# Share of the longest edge. The two triangles differ by less than this share at any distance.
+# Share of the longest edge. The two triangles differ by less than this fraction at any distance.
 _LARGEST_ERROR = 0.01
 # Machine epsilons of the coordinates and the longest edge. A triangle less high than this is a line.
 _LINE = 32.0

@@ -36,9 +36,9 @@ _FIRST_PAIRS, _PAIRS_BY_SAMPLES = 24, 3.0 / 7.0 ** (1 / 3)
 _KEPT_ONE_IN, _MORE = 2, 4
 # Number of best poses of a round that are improved once; the best of them is then improved again.
 _IMPROVED = 3
-# Each round draws at least this share of the samples before it. More: fewer rounds, but more needless samples.
+# Each round draws at least this fraction of the samples before it. More: fewer rounds, but more needless samples.
 _GROWTH = 0.5
-# Where no more than this many rounds are left, one round draws them all.
+# Where no more rounds than these are left, one round draws them all.
 _FEW_LEFT = 2.0
 # Number of samples that are solved at once, up to multiples: twice the numbers in the longest vector of a processor.
 _VECTOR = 64
@@ -50,7 +50,7 @@ _WIDE = 3.0
 # scene in a narrow field of view do, another pose may have as many: at least the second number of samples is drawn.
 # Chosen on a scene with a field of view of 13 degrees; half of the angle takes twice the time at 9 pairs.
 _OPEN, _OPEN_SAMPLES = 0.008, 256.0
-# After this many samples, pairs whose neighbours agree are drawn more often. Finding these takes about as long.
+# After this number of samples, pairs whose neighbours agree are drawn more often. Finding these takes about as long.
 _PLAIN_SAMPLES = 256
 # A pair without any agreement is drawn this often, relative to one unit of agreement; the exponent is empirical.
 _LEAST_AGREEMENT, _AGREEMENT_POWER = 0.3, 1.5

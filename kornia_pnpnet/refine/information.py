@@ -51,7 +51,7 @@ NARROWER = 0.1
 # Standard deviations that the residuals show, relative to the estimate. Nearer ones are within the reach of the
 # iterations by residual; from here on these start too far from the minimum.
 _LARGER = 4.0
-# A pair is an inlier if its final weight is at least this share of its initial weight.
+# A pair is an inlier if its final weight is at least this fraction of its initial weight.
 _INLIER = 0.25
 # Inliers. The residuals of fewer say little of a pose that was fitted to them: solved again with the noise that they
 # show, problems of 6 to 9 pairs are right as often as before (seeds 3117 and 3120 of SyntheticProblems).

@@ -21,7 +21,7 @@ from kornia_pnpnet.result import Pose, PosePrior
 
 __all__ = ["CameraTerm", "PoseTerm", "add_term", "gravity_prior"]
 
-# Eigenvalues of an information below this share count as 0: nothing is known in that direction.
+# Eigenvalues of an information below this fraction count as 0: nothing is known in that direction.
 _KNOWN = 1e-5
 # Standard deviations: scale of the robust kernel unless the caller gave one.
 _SCALE = 3.0
