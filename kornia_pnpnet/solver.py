@@ -115,6 +115,7 @@ class PnPNet(PretrainedMixin):
             values, or ``focal_sigma`` not positive, or given with a known focal length.
 
     Example:
+        >>> from kornia_pnpnet import MLPInit
         >>> from kornia_pnpnet.data import SyntheticProblems
         >>> problems = SyntheticProblems(n=9, batch_size=4, seed=0).batch(0)
         >>> solver = PnPNet(MLPInit(n=9), RobustWeightedLM(m=5))

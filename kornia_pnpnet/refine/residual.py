@@ -135,7 +135,8 @@ def project(state: State, problem: Problem) -> Projection:
         shift = problem.rig.translation.permute(2, 1, 0)
         points = torch.addcmul(torch.addcmul(torch.addcmul(shift, i, x), j, y), k, z)
     z = points[2]
-    front = z > MIN_DEPTH_RATIO * torch.linalg.vector_norm(points.detach(), dim=0)
+    smallest = torch.finfo(z.dtype).tiny ** 0.5  # the square of the inverse depth is finite
+    front = z > (MIN_DEPTH_RATIO * torch.linalg.vector_norm(points, dim=0)).clamp(min=smallest)
     inv_depth = torch.where(front, z, torch.inf).reciprocal()
     img = problem.img_points.permute(2, 1, 0)
     focal = problem.focal * state.camera[:, 0].exp() if state.camera.shape[1] else problem.focal
