@@ -188,8 +188,8 @@ def export_package(
         path: the file to write, ``.pt2``. An existing file is replaced when the package is complete.
         n: see :func:`export_program`.
         batch: see :func:`export_program`. With 1 and a fixed number of correspondences, a problem takes a fraction of
-            the time. Such a package, called without :func:`load_package`, writes each result of a thread over the one
-            before.
+            the time. Load such a package with :func:`load_package`: with PyTorch's own loader, each call overwrites the
+            result of the previous call on the same thread.
         rig: see :func:`export_program`.
 
     Returns:

@@ -32,7 +32,7 @@ __all__ = ["monte_carlo_pose_loss"]
 _FREEDOM = 3.0
 # Scale of the prior of the translation, as a share of the distance between camera and points.
 _PRIOR_TRANSLATION = 0.5
-# Radians. A component is at most about this wide; beyond it a tangent vector describes rotations badly.
+# Radians. Upper limit of the scale of a component's rotation: a tangent vector describes larger rotations badly.
 _WIDEST_ROTATION = 1.0
 # Iterations from the likeliest sample to the mode beside it, and their damping.
 _MODE_ITERATIONS, _MODE_DAMPING = 4, 1e-3
@@ -292,7 +292,7 @@ def _draw(model: _Posterior, poses: Sequence[Pose], each: int, rounds: int) -> t
 
 
 def _sample_t(count: int, like: Tensor) -> Tensor:
-    """Vectors of the standard t distribution, ``count`` for each row of ``like``."""
+    """Draw ``count`` vectors from the standard t distribution for each row of ``like``."""
     normal = torch.randn(count, *like.shape, dtype=like.dtype, device=like.device)
     freedom = torch.full((count, *like.shape[:-1], 1), 0.5 * _FREEDOM, dtype=like.dtype, device=like.device)
     return normal * (0.5 * _FREEDOM / torch._standard_gamma(freedom)).sqrt()

@@ -29,8 +29,9 @@ class State(NamedTuple):
 
     Attributes:
         pose: world-to-camera poses.
-        camera: unknown parameters of the camera, shape :math:`(B, K)`: none for a known camera; the logarithm of the
-            focal length over that of the problem; then the coefficients :math:`k_1, k_2` of radial distortion.
+        camera: unknown parameters of the camera, shape :math:`(B, K)`. A known camera has none. The first parameter is
+            the logarithm of the ratio of the focal length to the focal length of the problem; the coefficients
+            :math:`k_1, k_2` of radial distortion follow.
     """
 
     pose: Pose

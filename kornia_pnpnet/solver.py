@@ -95,9 +95,9 @@ class PnPNet(PretrainedMixin):
             :class:`~kornia_pnpnet.propose.set.SetInit`. ``None``: adaptive with such an initialiser and a refinement in
             evaluation mode, else fixed. Always fixed: exported graphs, ``compile(whole=True)``, ``torch.func.vmap`` and
             the device ``meta``. Rigs and bearings: RANSAC, unless the effort is ``"fixed"`` or the solver is compiled.
-        gradient: which problems carry a gradient: those that are ``"ok"``, or ``"always"`` every valid problem, to
-            train a network that does not predict anything sensible yet. The gradient of each problem to its normalised
-            points, pixels and weights is then finite and at most 10 long.
+        gradient: which problems have a gradient. ``"ok"``: only those whose result is ``ok``. ``"always"``: every valid
+            problem, to train a network that does not predict anything sensible yet. The gradient of each problem to its
+            normalised points, pixels and weights is then finite and at most 10 long.
         views: number of poses for each problem, 1 to 8: one of the problem itself and others of its mirror images (see
             :mod:`kornia_pnpnet.propose.views`), which a network answers differently. All poses are refined; after seven
             tenths of the iterations the best one goes on alone.
@@ -325,7 +325,7 @@ class PnPNet(PretrainedMixin):
         return self._with_alternatives(attempt, result, call.alternatives) if call.alternatives else result
 
     def _with_camera(self, inputs: Inputs) -> tuple[Inputs, bool]:
-        """Problems with a first focal length where it is unknown, and whether this is only a nominal one."""
+        """Give the problems a first focal length if theirs is unknown, and tell whether it is only a nominal one."""
         if self.focal == "known":
             return inputs, False
         inputs = with_nominal_focal(inputs, self.focal_sigma)

@@ -191,7 +191,7 @@ ARGUMENTS: dict[str, dict[str, dict[str, Any]]] = {
 
 
 def load_solver_without_truth(name: str) -> nn.Module:
-    """Make the solver named by ``--solver``; raise a ``ValueError`` for a bound, which needs the true pose."""
+    """Make the solver named by ``--solver``. Bounds need the true pose: the name of one raises a ``ValueError``."""
     from kornia_pnpnet.evaluation.named_solvers import BOUNDS, load_solver
 
     if name.partition(":")[0] in BOUNDS:

@@ -29,7 +29,8 @@ PRIORS: dict[str, tuple[str, Callable[..., SyntheticProblems | MixedProblems]]] 
     "mixed": ("mixed", partial(MixedProblems, [SyntheticProblems, _slab])),
 }
 
-# Problems per drawn batch. A constant, so that a smaller count gives the first problems of a larger one.
+# Problems per drawn batch. It does not depend on the number of problems asked for, so that a request for 100 problems
+# gives the first 100 of a request for 1000.
 _DRAW_BATCH = 1000
 
 

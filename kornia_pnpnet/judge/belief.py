@@ -138,7 +138,7 @@ def probability(log_alarms: Tensor, sigma: Tensor, law: str = "sigmas") -> Tenso
 
 
 def clipped(log_alarms: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
-    """The two numbers of :data:`LAWS`: beyond their ranges more evidence says nothing more."""
+    """Logarithms of the false alarms and of sigma, clipped to the ranges in which :data:`LAWS` depend on them."""
     return log_alarms.clamp(*_ALARMS), sigma.log().clamp(*_LOG_SIGMA)
 
 

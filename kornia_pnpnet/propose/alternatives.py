@@ -27,7 +27,8 @@ _T = TypeVar("_T")
 _LIKELY = 1e-3
 # Logarithm. Poses that are this much likelier than the best one are not compared further.
 _LIKELIER = 30.0
-# Radians, and shares of the distance of the points: poses that are closer are the same minimum.
+# Two poses are the same minimum when their rotations differ by less than `_SAME_TURN` radians, and the mean of the
+# points, in camera coordinates, differs by less than the fraction `_SAME_SHIFT` of its distance from the camera.
 _SAME_TURN, _SAME_SHIFT = 0.035, 0.035
 # Focal lengths. A pair that is not of normal scale is refined only when some first pose projects it this close.
 _SEEN = 0.25
@@ -49,8 +50,9 @@ def find_alternatives(
     """Refine other starts and keep the minima that differ from the pose, and from each other, and are nearly as likely.
 
     The starts are the mirror image of the pose about the line of sight to the plane through the points, all poses of
-    three pairs that lie far apart, and the poses of the starts. The mirror image is kept unrefined where its refinement
-    ends at the pose: of a plane that is seen almost from the front, it can be nearly as likely and no minimum.
+    three pairs that lie far apart, and the poses of the starts. If the refinement of the mirror image ends at the pose,
+    the unrefined mirror image is used instead: when the camera sees a plane almost from the front, the mirror image can
+    be nearly as likely as the pose without being a minimum.
 
     Args:
         refine: the refinement that found the pose.

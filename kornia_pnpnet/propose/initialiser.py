@@ -15,7 +15,7 @@ __all__ = ["Initialiser", "trait"]
 class Initialiser(Configured):
     """A module that maps a :class:`~kornia_pnpnet.problem.Problem` to :class:`~kornia_pnpnet.problem.Starts`.
 
-    Any module with such a ``forward`` is an initialiser; a trait that it does not have is that of this class.
+    Any module with such a ``forward`` is an initialiser. An attribute below that it lacks has the value of this class.
 
     Attributes:
         pairs_at_once: pairs per core whose temporaries stay in its caches. A solver splits larger batches where

@@ -18,8 +18,8 @@ ratios.
 
 Sources: M. Persson and K. Nordberg, "Lambda Twist", ECCV 2018, for the route by one degenerate conic; Y. Ding, J. Yang,
 V. Larsson, C. Olsson and K. Åström, "Revisiting the P3P Problem", CVPR 2023, for how the roots of the cubic determine
-the solutions and for the lines from the adjugate matrix. The short form of the cubic, the choice of its root and the
-lines in differences of distances are ours.
+the solutions and for the lines from the adjugate matrix. Three things are new here: the short form of the cubic, the
+choice of its root, and equations of the two lines that are written in differences of distances.
 
 The problems of a chunk are the last dimension of every tensor, (*, C). A choice between two finite values is a ``lerp``
 with a weight of exactly 0 or 1, which returns exactly one of the values: with an unpredictable mask, ``where`` takes a
@@ -57,8 +57,8 @@ _LARGEST_ERROR = 0.01
 _LINE = 32.0
 # Number of focal lengths on the grid for an unknown one.
 _FOCALS = 12
-# Longest edges, times the machine epsilon to the power `_ERROR_POWER`. A camera closer to a point than this is no
-# solution: rounding would decide in which direction it sees the point.
+# Least distance of the camera from a point, approximately. The unit is the longest edge times the machine epsilon to
+# the power `_ERROR_POWER`. Closer cameras are rejected: rounding would decide in which direction they see the point.
 _CLOSE = 64.0
 # Number of Newton steps for the root of the cubic: from an error of a tenth at the start to rounding in float64.
 _CUBIC_STEPS = 4

@@ -28,7 +28,7 @@ _FINDER = RANSAC(P3P(), threshold=_THRESHOLD, final_steps=0)
 # Number of samples of a fixed effort, and of draws for each, of which the first that P3PRig can solve is the sample: of
 # three cameras that look in all directions it can solve every second draw. Chosen on `CameraProblems` with seed 77002.
 _SAMPLES, _DRAWS = 128, 4
-# Number of pairs that score each pose of a fixed effort.
+# Number of pairs on which each pose is scored when the effort is fixed.
 _JUDGES = 32
 # Number of best poses that a fixed effort improves, by one step of least squares on the pairs up to each limit in
 # thresholds.

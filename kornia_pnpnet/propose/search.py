@@ -239,7 +239,8 @@ class Search:
         at, valid = _present_first(valid, number)
         row = at % count + count * torch.arange(batch, device=at.device)[:, None]
         at = (at // count * len(rows) + row).flatten()
-        # Components first, the layout of p3p's results: each is selected along a row of memory.
+        # The components of a pose are the first dimensions, as in p3p's results, so that selecting poses reads each
+        # component from contiguous memory.
         (rotation, translation), zoom = map_tensors(
             lambda x: x.movedim((0, 1), (-1, -2)).flatten(-2).index_select(-1, at).unflatten(-1, valid.shape),
             (solved.pose, solved.zoom if isinstance(solved, FocalHypotheses) else None),

@@ -128,7 +128,8 @@ class _Block(nn.Module):
         y = self.norm(x)
         # The scores need no bias: the softmax over pairs cancels it.
         attention = _attention(y, self.look.weight[width:], absent)  # (heads, B, N)
-        # Pooling is linear: the values of the means are the means of the values, which a problem has instead of a pair.
+        # The values are linear in y, so the mean of the values is the value of the mean: one product per problem and
+        # head is enough, instead of one per pair.
         means = torch.bmm(attention.movedim(0, 1), y.view(*absent.shape, width))  # (B, heads, width)
         values = self.look.weight[:width].view(heads, width // heads, width)
         context = torch.bmm(means.movedim(1, 0), values.mT).movedim(0, 1).flatten(1) + self.look.bias[:width]

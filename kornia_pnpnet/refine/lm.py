@@ -459,6 +459,9 @@ class RobustWeightedLM(Configured):
 
 
 def _relative_to_mean(weights: Tensor) -> Tensor:
-    """Weights over the mean of those that are not 0: unlike the largest weight, the mean has a derivative at ties."""
+    """Divide the weights of a problem by the mean of its positive weights.
+
+    The largest weight would be another divisor, but it has no derivative where two weights are equally large.
+    """
     mean = weights.sum(-1, keepdim=True) / (weights > 0).sum(-1, keepdim=True).clamp(min=1)
     return weights / torch.where(mean > 0, mean, 1.0)

@@ -12,6 +12,7 @@ times as long for 1000 problems of 9 pairs (batch first).
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple, TypeAlias
 
 import torch
@@ -134,9 +135,10 @@ def project(state: State, problem: Problem) -> Projection:
         x, y, z = points.unbind()
         shift = problem.rig.translation.permute(2, 1, 0)
         points = torch.addcmul(torch.addcmul(torch.addcmul(shift, i, x), j, y), k, z)
-    z = points[2]
+    x, y, z = points.unbind()
+    least_slope = MIN_DEPTH_RATIO / math.sqrt(1.0 - MIN_DEPTH_RATIO**2)
     smallest = torch.finfo(z.dtype).tiny ** 0.5  # the square of the inverse depth is finite
-    front = z > (MIN_DEPTH_RATIO * torch.linalg.vector_norm(points, dim=0)).clamp(min=smallest)
+    front = z > (least_slope * torch.hypot(x, y)).clamp(min=smallest)
     inv_depth = torch.where(front, z, torch.inf).reciprocal()
     img = problem.img_points.permute(2, 1, 0)
     focal = problem.focal * state.camera[:, 0].exp() if state.camera.shape[1] else problem.focal
@@ -229,7 +231,7 @@ def covariance_at(rotation: Tensor, p: Tensor, q: Tensor, scale: Tensor, noise: 
 def normal_equations(
     projection: Projection, problem: Problem, weights: Tensor | Symmetric2, *, relative: bool = False
 ) -> NormalEquations:
-    r"""The normal equations of the residuals by the pose and by the unknown parameters of the camera.
+    r"""Build the normal equations of the residuals for the pose and the unknown parameters of the camera.
 
     With :math:`y = R x`, and the rows :math:`e` of :math:`z` times the derivative of :math:`(p, q)` by a point in the
     frame of the pose, a column of :math:`z J / f` is :math:`y \times e` for a turn and :math:`e` for a shift. For one

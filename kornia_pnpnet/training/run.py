@@ -192,7 +192,7 @@ class Run:
         return {**terms._asdict(), "ramp": ramp, "lr": self.settings.lr * factor, "grad_norm": norm}
 
     def _any(self, *flags: bool) -> list[bool]:
-        """Whether each flag is set on any process."""
+        """Tell for each flag whether it is set on at least one process."""
         if self.fabric.world_size == 1:
             return list(flags)
         counts = torch.tensor(flags, dtype=torch.float32, device=self.fabric.device)
