@@ -171,7 +171,7 @@ def _with_distortion(problem: Problem, pose: Pose, radial: int) -> State:
         equations = normal_equations(projection, problem, weights)
         # The distortion is small; what is known of the focal length is left to the refinement.
         known = problem.free_focal._replace(information=torch.zeros_like(problem.img_scale))
-        equations = equations._replace(unit=(_KERNEL_SCALE / scale[:, 0]).square())
+        equations = equations._replace(unit=(_KERNEL_SCALE / scale).square())
         equations = add_term(equations, known.linearise(state), projection.focal)
         delta, solved = solve_positive(
             equations.matrix, equations.gradient, torch.full_like(projection.focal, _DAMPING)

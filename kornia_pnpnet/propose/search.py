@@ -308,7 +308,7 @@ def least_squares(problem: Problem, projection: Projection, weights: Tensor) -> 
     weights = problem.weights * weights
     equations = normal_equations(projection, problem, weights)
     for term in problem._replace(prior=None).terms:  # a residual of a pixel of the caller is a standard deviation
-        equations = equations._replace(unit=problem.img_scale.square().reciprocal())
+        equations = equations._replace(unit=problem.img_scale.square().reciprocal()[:, None])
         equations = add_term(equations, term.linearise(projection.state), projection.focal)
     one, damping = weights.new_ones(()), weights.new_full((), _DAMPING)
     return lm_step(equations, projection.state, projection.focal, one, damping)[0]

@@ -100,7 +100,7 @@ class NormalEquations(NamedTuple):
     Attributes:
         matrix: :math:`J^\top W J`, shape :math:`(6 + K, 6 + K, B)`.
         gradient: :math:`J^\top W r`, shape :math:`(6 + K, B)`.
-        unit: the weights were divided by this, shape :math:`(B,)`; ``None``: 1.
+        unit: the weights were divided by this, shape :math:`(B, 1)`; ``None``: 1.
     """
 
     matrix: Tensor
@@ -138,7 +138,7 @@ def project(state: State, problem: Problem) -> Projection:
     x, y, z = points.unbind()
     least_slope = MIN_DEPTH_RATIO / math.sqrt(1.0 - MIN_DEPTH_RATIO**2)
     smallest = torch.finfo(z.dtype).tiny ** 0.5  # the square of the inverse depth is finite
-    front = z > (least_slope * torch.hypot(x, y)).clamp(min=smallest)
+    front = z > (least_slope * torch.addcmul(x * x, y, y).sqrt()).clamp(min=smallest)  # ONNX has no hypot
     inv_depth = torch.where(front, z, torch.inf).reciprocal()
     img = problem.img_points.permute(2, 1, 0)
     focal = problem.focal * state.camera[:, 0].exp() if state.camera.shape[1] else problem.focal
@@ -178,10 +178,10 @@ def pixel_variance(projection: Projection, noise: Noise) -> Tensor:
         >>> pixel_variance(projection, Noise(torch.tensor([[3.0]]), torch.tensor([[0.04]])))
         tensor([[10.]])
     """
-    p, q = projection.plane.unbind()
-    moved = projection.focal * noise.world.mT * projection.inv_depth
-    sides = torch.addcmul(torch.addcmul(torch.ones_like(p), p, p, value=0.5), q, q, value=0.5)
-    return torch.addcmul(noise.img * noise.img, (moved * moved).mT, sides.mT)
+    img = noise.img.mT
+    moved = (projection.focal * noise.world.mT * projection.inv_depth).square()
+    sides = projection.plane.square().sum(0)
+    return torch.addcmul(torch.addcmul(moved, img, img), moved, sides, value=0.5).mT
 
 
 def pixel_covariance(projection: Projection, problem: Problem, noise: Noise) -> Symmetric2:
@@ -252,9 +252,9 @@ def normal_equations(
     sq_inverse = projection.inv_depth * projection.inv_depth
     if relative:
         sizes = (weights if isinstance(weights, Tensor) else weights.uu + weights.vv).detach()
-        largest = sizes.amax(1)
+        largest = sizes.amax(1, keepdim=True)
         unit = torch.where(largest > 0, largest, 1.0)
-        weights = map_tensors(lambda w: w / unit[:, None], weights)
+        weights = map_tensors(lambda w: w / unit, weights)
     weights = map_tensors(lambda w: w.mT * sq_inverse, weights)
     if are_few(projection.inv_depth):
         return NormalEquations(*_stacked_equations(columns, projection.scaled, weights), unit)

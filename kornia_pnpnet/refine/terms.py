@@ -82,7 +82,7 @@ def add_term(equations: NormalEquations, linear: Linear, focal: Tensor) -> Norma
         focal: the focal length in pixels, a scalar or (B,).
     """
     weighted = torch.bmm(linear.jacobian.mT, linear.information)  # (B, 6 + K, D)
-    weight = linear.weight / (focal if equations.unit is None else equations.unit * focal)
+    weight = linear.weight / (focal if equations.unit is None else equations.unit[:, 0] * focal)
     matrix = torch.bmm(weighted, linear.jacobian).permute(1, 2, 0) * (weight / focal)
     gradient = torch.bmm(weighted, linear.residual[..., None])[..., 0].mT * weight
     return equations._replace(matrix=equations.matrix + matrix, gradient=equations.gradient + gradient)
