@@ -37,7 +37,7 @@ python_use_unqualified_type_names = True
 # A name of ours that leads nowhere is an error. Those of other projects and private ones have no page here.
 nitpicky = True
 nitpick_ignore_regex = [
-    ("py:.*", r"(torch|numpy|np|kornia|lightning_fabric|pathlib|collections|functools|pyarrow|pa)\..*"),
+    ("py:.*", r"(torch|numpy|np|kornia|lightning_fabric|pathlib|types|collections|functools|pyarrow|pa)\..*"),
     ("py:class", r"Tensor|Count|Share|kornia_pnpnet\.(\w+\.)*(_\w+|Runner)"),
     ("py:exc", r"(Base|Device|Shape|TypeCheck|ValueCheck)Error"),
 ]

@@ -21,9 +21,9 @@ V. Larsson, C. Olsson and K. Åström, "Revisiting the P3P Problem", CVPR 2023, 
 the solutions and for the lines from the adjugate matrix. Three things are new here: the short form of the cubic, the
 choice of its root, and equations of the two lines that are written in differences of distances.
 
-The problems of a chunk are the last dimension of every tensor, (*, C). A choice between two finite values is a ``lerp``
-with a weight of exactly 0 or 1, which returns exactly one of the values: with an unpredictable mask, ``where`` takes a
-CPU ten times as long.
+The problems of a chunk are the last dimension of every tensor, ``(*, C)``. A choice between two finite values is a
+``lerp`` with a weight of exactly 0 or 1, which returns exactly one of the values: with an unpredictable mask, ``where``
+takes a CPU ten times as long.
 """
 
 from __future__ import annotations

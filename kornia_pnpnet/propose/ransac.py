@@ -73,8 +73,8 @@ class RANSAC(Initialiser):
     in D. Nistér, "Preemptive RANSAC for live structure and motion estimation", ICCV 2003.
 
     Args:
-        minimal: solver of samples, for example :class:`~kornia_pnpnet.propose.P3P` or
-            :class:`~kornia_pnpnet.propose.SubsetSolver`.
+        minimal: solver of samples, for example :class:`~kornia_pnpnet.propose.p3p.P3P` or
+            :class:`~kornia_pnpnet.propose.minimal.SubsetSolver`.
         threshold: :math:`\tau` in pixels of the user's camera.
         world_threshold: :math:`\omega` in the unit of the user's world.
         scorer: ``"msac"``, the truncated squares; ``"inliers"``, the number of outliers; or any function from squared

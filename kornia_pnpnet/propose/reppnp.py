@@ -1,6 +1,6 @@
 r"""EPPnP and REPPnP: the null space of the projection equations, with outliers rejected by their algebraic error.
 
-In the camera frame four control points (see :mod:`~kornia_pnpnet.propose.control_points`) are twelve unknowns, and a
+In the camera frame four control points (see ``propose/control_points.py``) are twelve unknowns, and a
 pair gives two equations, :math:`X_i - u_i Z_i = 0` and :math:`Y_i - v_i Z_i = 0`. Their residual is the algebraic
 error: the pixel error times the depth over the focal length, a length.
 """

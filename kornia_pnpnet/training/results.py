@@ -43,7 +43,7 @@ _TIMED_PROBLEMS, _TIMED_CALLS = 1000, 20
 
 @dataclass(frozen=True)
 class FitReport:
-    """Report of one call of :func:`fit`.
+    """Report of one call of :func:`~kornia_pnpnet.training.fit`.
 
     Attributes:
         start: updates done by earlier calls.
