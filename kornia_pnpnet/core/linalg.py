@@ -414,7 +414,6 @@ def solve_positive(matrix: Tensor, right: Tensor, damping: Tensor) -> tuple[Tens
     # With a gradient, in either mode: a factorisation that failed would have gradients of NaN.
     if batched.requires_grad or right.requires_grad or unpack_dual(batched).tangent is not None:
         factor = torch.linalg.cholesky_ex(torch.where(solved[:, None, None], batched, eye)).L
-        right = torch.where(solved, right, 0.0)
     solution = torch.cholesky_solve(right.mT[..., None], factor)[..., 0].mT
     return torch.where(solved, solution, 0.0), solved
 
