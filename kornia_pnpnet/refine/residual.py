@@ -31,7 +31,6 @@ __all__ = [
     "MIN_DEPTH_RATIO",
     "NormalEquations",
     "Projection",
-    "change_tangent",
     "covariance_at",
     "lm_step",
     "moved",
@@ -85,8 +84,7 @@ class Projection(NamedTuple):
     @property
     def sq_residual(self) -> Tensor:
         """Squared length of the residual in square pixels, shape :math:`(B, N)`."""
-        u, v = self.residual.unbind()
-        return torch.addcmul(u * u, v, v).mT
+        return self.residual.square().sum(0).mT
 
     @property
     def in_front(self) -> Tensor:
@@ -185,18 +183,9 @@ def pixel_variance(projection: Projection, noise: Noise) -> Tensor:
 
 
 def pixel_covariance(projection: Projection, problem: Problem, noise: Noise) -> Symmetric2:
-    r"""Covariance of a pixel, from the noise of the pixel and of the world point.
+    """:func:`covariance_at` of the points of a :class:`Projection`, entries :math:`(B, N)`.
 
-    It is :math:`\Sigma_\mathrm{img} + J R\,\Sigma_\mathrm{world} R^\top J^\top` with :math:`J` of
-    :func:`pixel_variance`. A standard deviation stands for a multiple of the identity.
-
-    Args:
-        projection: what :func:`project` returned.
-        problem: its problem.
-        noise: noise of each pair.
-
-    Returns:
-        Entries of shape :math:`(B, N)`. Behind the camera they are the covariance of the pixel alone.
+    Behind the camera it is the covariance of the pixel alone.
     """
     rotation = projection.state.pose.rotation[:, None]
     rotation = rotation if problem.rig is None else problem.rig.rotation @ rotation
@@ -205,12 +194,15 @@ def pixel_covariance(projection: Projection, problem: Problem, noise: Noise) -> 
 
 
 def covariance_at(rotation: Tensor, p: Tensor, q: Tensor, scale: Tensor, noise: Noise) -> Symmetric2:
-    """:func:`pixel_covariance` at any points of the plane z = 1.
+    r"""Covariance of a pixel, from the noise of the pixel and of the world point.
+
+    It is :math:`\Sigma_\mathrm{img} + J R\,\Sigma_\mathrm{world} R^\top J^\top` with :math:`J` of
+    :func:`pixel_variance`. A standard deviation stands for a multiple of the identity.
 
     Args:
         rotation: rotation from the world to the camera, :math:`(*, 1, 3, 3)` or :math:`(*, N, 3, 3)`.
-        p: horizontal coordinate, shape :math:`(*, N)`.
-        q: vertical coordinate, shape :math:`(*, N)`.
+        p: horizontal coordinate :math:`x/z`, shape :math:`(*, N)`.
+        q: vertical coordinate :math:`y/z`, shape :math:`(*, N)`.
         scale: focal length over depth, shape :math:`(*, N)`.
         noise: noise of each pair.
     """
@@ -233,10 +225,6 @@ def normal_equations(
 ) -> NormalEquations:
     r"""Build the normal equations of the residuals for the pose and the unknown parameters of the camera.
 
-    With :math:`y = R x`, and the rows :math:`e` of :math:`z` times the derivative of :math:`(p, q)` by a point in the
-    frame of the pose, a column of :math:`z J / f` is :math:`y \times e` for a turn and :math:`e` for a shift. For one
-    camera :math:`e = (1, 0, -p), (0, 1, -q)`. The parameters of the camera are those of :func:`moved`.
-
     Args:
         projection: what :func:`project` returned.
         problem: its problem.
@@ -246,85 +234,74 @@ def normal_equations(
             not vanish.
 
     Returns:
-        The equations, with :math:`J` divided by the focal length and :math:`r` in pixels.
+        The equations for a tangent vector of :func:`moved`, with :math:`J` divided by the focal length and :math:`r` in
+        pixels.
     """
-    columns, unit = _columns(projection, problem), None
-    sq_inverse = projection.inv_depth * projection.inv_depth
+    unit, sq_inverse = None, projection.inv_depth * projection.inv_depth
     if relative:
         sizes = (weights if isinstance(weights, Tensor) else weights.uu + weights.vv).detach()
-        largest = sizes.amax(1, keepdim=True)
-        unit = torch.where(largest > 0, largest, 1.0)
+        unit = sizes.amax(1, keepdim=True).clamp(min=torch.finfo(sizes.dtype).tiny ** 0.5)
         weights = map_tensors(lambda w: w / unit, weights)
     weights = map_tensors(lambda w: w.mT * sq_inverse, weights)
-    if are_few(projection.inv_depth):
-        return NormalEquations(*_stacked_equations(columns, projection.scaled, weights), unit)
-    return NormalEquations(*_entrywise_equations(columns, projection.scaled.unbind(), weights), unit)
+    form = _stacked_equations if are_few(projection.inv_depth) else _entrywise_equations
+    return NormalEquations(*form(projection, problem, weights), unit)
 
 
-def _columns(projection: Projection, problem: Problem) -> list[_Column]:
-    """The columns of z J / f: an entry in the row of u and one in the row of v, (N, B) each."""
-    y1, y2, y3 = projection.rotated.unbind()
-    p, q = projection.plane.unbind()
-    minus_p, minus_q = (-projection.plane).unbind()
+def _jacobian(projection: Projection, problem: Problem) -> Tensor:
+    r"""The rows of u and v of :math:`z J / f`, shape :math:`(2, 6 + K, N, B)`.
+
+    With :math:`y = R x`, and the rows :math:`e` of :math:`z` times the derivative of :math:`(p, q)` by a point in the
+    frame of the pose, a row is :math:`y \times e` for a turn and :math:`e` for a shift. For one camera
+    :math:`e = (1, 0, -p), (0, 1, -q)`.
+    """
+    plane, y3 = projection.plane, projection.rotated[2]
     if problem.rig is None:
-        columns: list[_Column] = [
-            (minus_p * y2, torch.addcmul(-y3, minus_q, y2)),
-            (torch.addcmul(y3, p, y1), q * y1),
-            (-y2, y1),
-            (1.0, 0.0),
-            (0.0, 1.0),
-            (minus_p, minus_q),
-        ]
+        ones = torch.eye(2, dtype=plane.dtype, device=plane.device)[..., None, None].expand(2, *plane.shape)
+        shifts = torch.cat((ones, -plane[:, None]), 1)
     else:
-        i, j, k = problem.rig.rotation.permute(2, 3, 1, 0).unbind()  # rows, (3, N, B) each
-        rows = torch.addcmul(i, minus_p, k), torch.addcmul(j, minus_q, k)
-        turns = [torch.linalg.cross(projection.rotated, row, dim=0) for row in rows]
-        columns = [*zip(*(x.unbind() for x in turns), strict=True), *zip(*(x.unbind() for x in rows), strict=True)]
+        axes = problem.rig.rotation.permute(2, 3, 1, 0)
+        shifts = torch.addcmul(axes[:2], plane[:, None], axes[2], value=-1)
+    jacobian = torch.cat((torch.linalg.cross(projection.rotated[None], shifts, dim=1), shifts), 1)
     unknown = projection.state.camera.shape[1]
     if not unknown:
-        return columns
+        return jacobian
     if projection.stretch is None or projection.slope is None:
-        return [*columns, (p * y3, q * y3)]  # the focal length grows, and the depth of the origin with it
-    stretch, slope = projection.stretch, projection.slope
-    # The derivative of the distorted by the undistorted point is d I + 2 d' (p, q) (p, q)^T.
-    along = [slope * _plus(_times(p, u), _times(q, v)) for u, v in columns]
-    columns = [
-        (_plus(_times(stretch, u), x * p), _plus(_times(stretch, v), x * q))
-        for (u, v), x in zip(columns, along, strict=True)
-    ]
-    depth = torch.where(projection.front, projection.inv_depth, 1.0).reciprocal()
-    square = torch.addcmul(p * p, q, q)
-    zoomed = stretch * y3 - slope * square * (depth - y3)
-    powers = [depth * square ** (power + 1) for power in range(unknown - 1)]
-    return [*columns, *((p * x, q * x) for x in (zoomed, *powers))]
-
-
-def _stacked_equations(columns: list[_Column], scaled: Tensor, weights: Tensor | Symmetric2) -> tuple[Tensor, Tensor]:
-    """All products at once: few calls, for few pairs."""
-    size, zero = len(columns), torch.zeros_like(scaled[0])
-    one = zero + 1.0
-    entries = [(one if x == 1.0 else zero) if type(x) is float else x for column in columns for x in column]
-    jacobian = torch.stack([*entries, *scaled.unbind()]).unflatten(0, (size + 1, 2))  # (K + 1, 2, N, B)
-    if isinstance(weights, Tensor):
-        weighted = jacobian[:size] * weights
+        zoomed, powers = y3, []  # the focal length grows, and the depth of the origin with it
     else:
-        u, v = jacobian[:size].unbind(1)
-        uu, uv, vv = weights
-        weighted = torch.stack((uu * u + uv * v, uv * u + vv * v), 1)
-    products = (weighted.flatten(1, 2)[:, None] * jacobian.flatten(1, 2)).sum(2)  # (K, K + 1, B)
-    return products[:, :size], products[:, size]
+        # The derivative of the distorted by the undistorted point is d I + 2 d' (p, q) (p, q)^T.
+        along = projection.slope * (plane[:, None] * jacobian).sum(0)
+        jacobian = projection.stretch * jacobian + along * plane[:, None]
+        depth = torch.where(projection.front, projection.inv_depth, 1.0).reciprocal()
+        square = plane.square().sum(0)
+        zoomed = projection.stretch * y3 - projection.slope * square * (depth - y3)
+        powers = [depth * square ** (power + 1) for power in range(unknown - 1)]
+    return torch.cat((jacobian, plane[:, None] * torch.stack((zoomed, *powers))), 1)
+
+
+def _stacked_equations(projection: Projection, problem: Problem, weights: Tensor | Symmetric2) -> tuple[Tensor, Tensor]:
+    """All products at once: few calls, for few pairs."""
+    jacobian = _jacobian(projection, problem)
+    if isinstance(weights, Tensor):
+        weighted = jacobian * weights
+    else:
+        (u, v), (uu, uv, vv) = jacobian, weights
+        weighted = torch.stack((uu * u + uv * v, uv * u + vv * v))
+    right = torch.cat((jacobian, projection.scaled[:, None]), 1)
+    products = (weighted[:, :, None] * right[:, None]).sum((0, 3))  # (K, K + 1, B)
+    return products[:, :-1], products[:, -1]
 
 
 def _entrywise_equations(
-    columns: list[_Column], scaled: tuple[Tensor, ...], weights: Tensor | Symmetric2
+    projection: Projection, problem: Problem, weights: Tensor | Symmetric2
 ) -> tuple[Tensor, Tensor]:
     """Entry by entry: temporaries of (N, B) stay in a processor's cache, and a compiler keeps them in registers."""
+    columns = _columns(projection, problem)
     uu, uv, vv = (weights, 0.0, weights) if isinstance(weights, Tensor) else weights
     total = uu.sum(0)
     zero = torch.zeros_like(total)
     weighted = [(_plus(_times(u, uu), _times(v, uv)), _plus(_times(u, uv), _times(v, vv))) for u, v in columns]
 
-    def inner(a: _Column, b: tuple[Any, ...]) -> Tensor:
+    def inner(a: _Column, b: _Column) -> Tensor:
         """Sum over pairs and rows of the products of two columns, (B,)."""
         (a_u, a_v), (b_u, b_v) = a, b
         if type(a_u) is type(a_v) is type(b_u) is type(b_v):
@@ -342,7 +319,25 @@ def _entrywise_equations(
         for j in size[: i + 1]
     }
     matrix = torch.stack([lower[max(i, j), min(i, j)] for i in size for j in size]).unflatten(0, (len(size), len(size)))
+    scaled = (projection.scaled[0], projection.scaled[1])
     return matrix, torch.stack([inner(column, scaled) for column in weighted])
+
+
+def _columns(projection: Projection, problem: Problem) -> list[_Column]:
+    """The columns of :func:`_jacobian`. Of a camera without a rig two columns are constant, which saves a quarter."""
+    if problem.rig is not None or projection.stretch is not None:
+        u, v = _jacobian(projection, problem)
+        return list(zip(u, v, strict=True))
+    y1, y2, y3 = projection.rotated.unbind()
+    p, q = projection.plane.unbind()
+    minus_p, minus_q = (-projection.plane).unbind()
+    turns: list[_Column] = [
+        (minus_p * y2, torch.addcmul(-y3, minus_q, y2)),
+        (torch.addcmul(y3, p, y1), q * y1),
+        (-y2, y1),
+    ]
+    shifts: list[_Column] = [(1.0, 0.0), (0.0, 1.0), (minus_p, minus_q)]
+    return [*turns, *shifts, (p * y3, q * y3)] if projection.state.camera.shape[1] else [*turns, *shifts]
 
 
 def _times(a: Any, b: Any) -> Any:
@@ -383,62 +378,53 @@ def lm_step(
     Returns:
         The moved state, and whether the equations could be solved (if not, the state stays), bool, shape :math:`(B,)`.
     """
-    if additive:
-        equations = change_tangent(equations, So3.left_jacobian(rotation_matrix_to_axis_angle(state.pose.rotation)))
-    delta, solved = solve_positive(equations.matrix, equations.gradient, damping)
-    delta = delta * (-step / focal)
     if not additive:
-        return moved(state, delta), solved
-    rotation_vector = rotation_matrix_to_axis_angle(state.pose.rotation) + delta[:3].mT
-    pose = state.pose._replace(rotation=axis_angle_to_rotation_matrix(rotation_vector))
+        delta, solved = solve_positive(equations.matrix, equations.gradient, damping)
+        return moved(state, delta * (-step / focal)), solved
+    # The equations by the rotation vector, whose derivative is the left Jacobian of SO(3).
+    rvec = rotation_matrix_to_axis_angle(state.pose.rotation)
+    size, matrix = len(equations.gradient), equations.matrix.permute(2, 0, 1)
+    tangent = torch.eye(size, dtype=rvec.dtype, device=rvec.device).repeat(len(rvec), 1, 1)
+    tangent[:, :3, :3] = So3.left_jacobian(rvec)
+    gradient = (tangent.mT @ equations.gradient.mT[..., None])[..., 0].mT
+    delta, solved = solve_positive((tangent.mT @ matrix @ tangent).permute(1, 2, 0), gradient, damping)
+    delta = delta * (-step / focal)
+    pose = state.pose._replace(rotation=axis_angle_to_rotation_matrix(rvec + delta[:3].mT))
     return moved(State(pose, state.camera), torch.cat((torch.zeros_like(delta[:3]), delta[3:]))), solved
 
 
-def change_tangent(equations: NormalEquations, tangent_map: Tensor) -> NormalEquations:
-    r"""Express normal equations in other rotation parameters.
-
-    Args:
-        equations: by the tangent :math:`(\omega, v, …)`.
-        tangent_map: derivative of :math:`\omega` by the other parameters, :math:`(B, 3, 3)`; for an additive update of
-            the rotation vector the left Jacobian of SO(3).
-
-    Returns:
-        The equations by the other parameters.
-    """
-    size = len(equations.gradient)
-    whole = torch.eye(size, dtype=tangent_map.dtype, device=tangent_map.device).repeat(tangent_map.shape[0], 1, 1)
-    whole[:, :3, :3] = tangent_map
-    matrix = whole.mT @ equations.matrix.permute(2, 0, 1) @ whole
-    gradient = (whole.mT @ equations.gradient.mT[..., None])[..., 0].mT
-    return equations._replace(matrix=matrix.permute(1, 2, 0), gradient=gradient)
-
-
 def moved(state: State, delta: Tensor) -> State:
-    r"""Move a state along a tangent vector, shape :math:`(6 + K, B)`.
+    r"""Move a state along a tangent vector :math:`(\omega, v, c)`, shape :math:`(6 + K, B)`.
 
-    The pose moves by :func:`retract`. A larger focal length moves the camera away as in a dolly zoom: the origin, which
-    is the centroid of a centred world, keeps its pixel and the scale at which it is seen. A change of the focal length
-    and a shift along the axis, which look alike from far away, are then well separated parameters.
+    The pose becomes :math:`(\mathrm{cay}(\omega) R,\; t + v)`. Rotation and translation move independently. With a
+    centred world a rotation then leaves the centroid in place, so that both stay well separated in the normal equations
+    at any distance of the points. The rotation is Cayley's,
+    :math:`\mathrm{cay}(\omega) = (I - \tfrac12[\omega]_\times)^{-1}(I + \tfrac12[\omega]_\times)`. It agrees with
+    the exponential to second order, rotates by :math:`2 \arctan(|\omega|/2)`, at most half a turn, and needs neither
+    trigonometry nor a branch at 0.
+
+    A larger focal length moves the camera away as in a dolly zoom: the origin, which is the centroid of a centred
+    world, keeps its pixel and its scale. A change of the focal length and a shift along the axis look alike from far
+    away; they are then well separated parameters.
     """
+    half = (0.5 * delta[:3])[:, None]  # (3, 1, B)
+    rotation = state.pose.rotation.permute(1, 2, 0)
+    once = torch.linalg.cross(half, rotation, dim=0)
+    twice = once + torch.linalg.cross(half, once, dim=0)
+    factor = 2.0 / (1.0 + half.square().sum(0))
+    rotation = torch.addcmul(rotation, factor, twice).permute(2, 0, 1)
+    translation = state.pose.translation + delta[3:6].mT
     if not state.camera.shape[1]:
-        return State(_retract(state.pose, *delta.split(3)), state.camera)
-    pose = _retract(state.pose, delta[:3], delta[3:6])
-    change = zoom = delta[6:7].clamp(-_LARGEST_ZOOM, _LARGEST_ZOOM)
-    if len(delta) > 7:
-        change = torch.cat((zoom, delta[7:].clamp(-_LARGEST_RADIAL, _LARGEST_RADIAL)))
-    x, y, z = pose.translation.unbind(-1)
+        return State(Pose(rotation, translation), state.camera)
+    zoom = delta[6:7].clamp(-_LARGEST_ZOOM, _LARGEST_ZOOM)
+    change = torch.cat((zoom, delta[7:].clamp(-_LARGEST_RADIAL, _LARGEST_RADIAL)))
+    x, y, z = translation.unbind(-1)
     translation = torch.stack((x, y, z * zoom[0].exp())).mT
-    return State(pose._replace(translation=translation), state.camera + change.mT)
+    return State(Pose(rotation, translation), state.camera + change.mT)
 
 
 def retract(pose: Pose, delta: Tensor) -> Pose:
-    r"""Move a pose along a tangent vector, :math:`(\mathrm{cay}(\omega) R,\; t + v)`.
-
-    Rotation and translation move independently. With a centred world a rotation then leaves the centroid in place, so
-    that both stay well separated in the normal equations at any distance of the points. The rotation is Cayley's,
-    :math:`\mathrm{cay}(\omega) = (I - \tfrac12[\omega]_\times)^{-1}(I + \tfrac12[\omega]_\times)`, which agrees with
-    the exponential to second order, rotates by :math:`2 \arctan(|\omega|/2)`, at most half a turn, and needs neither
-    trigonometry nor a branch at 0.
+    r"""Move a pose by :func:`moved`.
 
     Args:
         pose: rotation :math:`(B, 3, 3)`, translation :math:`(B, 3)`.
@@ -452,17 +438,7 @@ def retract(pose: Pose, delta: Tensor) -> Pose:
         >>> retract(pose, torch.tensor([[0.0, 0.0, 0.0, 1.0, 2.0, 3.0]])).translation
         tensor([[1., 2., 3.]])
     """
-    return _retract(pose, *delta.mT.split(3))
-
-
-def _retract(pose: Pose, turn: Tensor, shift: Tensor) -> Pose:
-    """:func:`retract` by the two parts of the tangent, (3, B) each."""
-    half = (0.5 * turn)[:, None]  # (3, 1, B)
-    rotation = pose.rotation.permute(1, 2, 0)
-    once = torch.linalg.cross(half, rotation, dim=0)
-    twice = once + torch.linalg.cross(half, once, dim=0)
-    factor = 2.0 / (1.0 + half.square().sum(0))
-    return Pose(torch.addcmul(rotation, factor, twice).permute(2, 0, 1), pose.translation + shift.mT)
+    return moved(State.of(pose), delta.mT).pose
 
 
 def rotation_angle(rotation_a: Tensor, rotation_b: Tensor) -> Tensor:
