@@ -55,17 +55,14 @@ class Plan(NamedTuple):
         prior: weight of each pair without the robust factor, for cost and judgement: the caller's times the
             initialiser's, or the caller's alone when there are iterations by residual, :math:`(B, N)`.
         guided: weights of caller and initialiser, relative to the largest, :math:`(B, N)`.
-        by_residual: the weights of the last iterations: those of the caller alone, relative to their mean, or
-            ``guided`` without such iterations, :math:`(B, N)`.
+        by_residual: weights of the last iterations: those of the caller alone, relative to their mean, or ``guided``
+            without such iterations, :math:`(B, N)`.
         state: the first states of :math:`S B` refinements: one of every problem, then the next of every problem.
-        area: area of the image in which pixels of outliers lie, in square pixels, for problems for which the caller
-            gave no sigma, so that the last iterations may correct the initialiser's estimate; 0 for the others,
-            :math:`(B, 1)`; ``None`` when there are no such iterations.
-        noiseless: problems for which neither the caller gave a sigma nor the initialiser an estimate, although the
-            caller gave one for others, bool :math:`(B,)`; ``None``: no such problems.
-        step: :math:`\gamma` of each iteration, scalars.
-        damping: :math:`\lambda` of each iteration, scalars.
-        shape: shape of the kernel of each iteration, scalars.
+        area: :func:`~kornia_pnpnet.refine.information.outlier_area` of problems whose noise the last iterations
+            correct, 0 of others, :math:`(B, 1)`; ``None``: the noise is not corrected.
+        noiseless: problems without any noise beside others whose noise the caller gave, bool :math:`(B,)`; ``None``:
+            there are no such problems.
+        hyperparameters: step :math:`\gamma`, damping :math:`\lambda` and the kernel's shape of each iteration, scalars.
         starts: number :math:`S` of states of each problem.
     """
 
@@ -76,20 +73,12 @@ class Plan(NamedTuple):
     state: State
     area: Tensor | None
     noiseless: Tensor | None
-    step: tuple[Tensor, ...]
-    damping: tuple[Tensor, ...]
-    shape: tuple[Tensor, ...]
+    hyperparameters: tuple[tuple[Tensor, Tensor, Tensor], ...]
     starts: int
 
 
 class Progress(NamedTuple):
-    """Between two iterations.
-
-    Attributes:
-        state: the states.
-        solved: whether the last equations were solved, bool (S B,).
-        factor: a factor of the damping, (S B,).
-    """
+    """States between two iterations, whether the last equations were solved (bool), and a factor of the damping."""
 
     state: State
     solved: Tensor
@@ -124,26 +113,21 @@ class Refinement(NamedTuple):
 class RobustWeightedLM(Configured):
     r"""Refine poses by ``m`` unrolled iterations of robust weighted Levenberg-Marquardt.
 
-    Each iteration weighs a pair by the product of the weight that came with the problem, the initialiser's weight, and
-    the robust weight of its residual at the previous estimate, and takes one
-    :func:`~kornia_pnpnet.refine.residual.lm_step`. Step :math:`\gamma`, damping :math:`\lambda` and robustness (the
-    shape of the kernel, :math:`\alpha` for ``power``) are learned, by default one set per iteration. At their initial
-    values this is the classical method.
+    Each iteration weighs a pair by the product of the caller's weight, the initialiser's weight, and the robust weight
+    of the pair's residual at the previous estimate, and takes one :func:`~kornia_pnpnet.refine.residual.lm_step`. Step
+    :math:`\gamma`, damping :math:`\lambda` and robustness (the shape of the kernel, :math:`\alpha` for ``power``) are
+    learned, by default one set per iteration. Their initial values give the classical method.
 
-    *Noise.* Where the noise of each pair is known or estimated, residuals count in standard deviations: a pair weighs
-    :math:`1 / \sigma^2` times the robust weight of :math:`\|r\|^2 / \sigma^2`, with the
-    :func:`~kornia_pnpnet.refine.residual.pixel_variance` :math:`\sigma^2` at the previous estimate. Where the caller
-    gave covariances, residuals are whitened by the :func:`~kornia_pnpnet.refine.residual.pixel_covariance` instead.
-    Scales of kernels and the cost then count in standard deviations, too.
+    *Noise.* Where the noise of each pair is known or estimated, residuals are divided by the standard deviation of
+    their pixel (:func:`~kornia_pnpnet.refine.residual.pixel_variance` at the previous estimate), or whitened by its
+    covariance where the caller gave covariances. Scales of kernels and the cost then count in standard deviations.
 
     *Several poses.* Where an initialiser returns several poses, the first seven tenths of the iterations (rounded down)
     refine all of them. Then the pose of the lowest cost by the kernel of the last of these iterations goes on alone.
 
     *By residual.* The last ``by_residual`` iterations and the choice among several poses ignore the initialiser's
-    weights: by then the residuals say better which pairs are outliers. Where the initialiser estimated the noise, and
-    the residuals show that its variance is too small or too large (by likelihood ratios), :meth:`judge` multiplies the
-    variance by the factor that they show. Where it is too large the iterations multiply by a tenth of that factor,
-    since a narrower kernel separates inliers from outliers better. Noise that the caller gave stays as it is.
+    weights, because residuals then separate inliers from outliers better. If the initialiser estimated the noise, they
+    correct it (:func:`~kornia_pnpnet.refine.information.corrected_noise`). Noise that the caller gave stays as it is.
 
     All operations are per problem: a problem that cannot be solved keeps its pose, reports ``ok=False`` and changes
     no other.
@@ -219,13 +203,10 @@ class RobustWeightedLM(Configured):
         self.requires_grad_(learnable and m > 0)
 
     def hyperparameters(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        r"""Return :math:`\gamma`, :math:`\lambda` and the kernel's shape for each iteration.
+        r"""Step :math:`\gamma`, damping :math:`\lambda` and shape of the kernel, :math:`(\max(m, 1),)` each.
 
         Args:
             like: a tensor of the dtype and device to return them in.
-
-        Returns:
-            Three tensors of shape :math:`(\max(m, 1),)`.
         """
         count = max(self.m, 1)
         step, damping, shape = (p().to(like).expand(count) for p in (self.step, self.damping, self.robustness))
@@ -275,7 +256,7 @@ class RobustWeightedLM(Configured):
 
     def begin(self, problem: Problem, starts: Starts) -> Plan:
         """Prepare a refinement: everything before the first iteration. For the arguments see :meth:`forward`."""
-        step, damping, shape = (x.unbind() for x in self.hyperparameters(problem.world_points))
+        each = zip(*(x.unbind() for x in self.hyperparameters(problem.world_points)), strict=True)
         unknown = is_unknown(problem) if self.by_residual or problem.noise is not None else None
         noiseless = None if unknown is None or problem.noise is None or starts.noise is not None else unknown[:, 0]
         problem = problems_last(problem._replace(noise=complete_noise(problem, starts)))
@@ -294,62 +275,46 @@ class RobustWeightedLM(Configured):
         camera = pose.translation[:, : 0 if problem.free_focal is None else 1] * 0.0
         if starts.camera is not None:
             camera = starts.camera.repeat(len(poses), 1)
-        return Plan(
-            problem, prior, guided, by_residual, State(pose, camera), area, noiseless, step, damping, shape, len(poses)
-        )
+        weights, state = (prior, guided, by_residual), State(pose, camera)
+        return Plan(problem, *weights, state, area, noiseless, tuple(each), len(poses))
 
     def iterate(self, plan: Plan, m: int | None = None, *, more: int = 0, run: Runner = EAGER) -> tuple[State, Tensor]:
         """Run the iterations: on all poses of a problem, then on the best pose of each, the last by residual.
 
-        Args:
-            plan: what :meth:`begin` returned.
-            m: See forward.
-            more: See forward.
-            run: See forward.
-
-        Returns:
-            The last state, and whether the last equations could be solved.
+        For the arguments see :meth:`forward`. Returns the last state, and whether the last equations could be solved.
         """
         m = self.m if m is None else min(m, self.m)
-        problem, starts = plan.problem, plan.starts
-        hyperparameters = list(zip(plan.step, plan.damping, plan.shape, strict=True))
-        hyperparameters = hyperparameters[:m] + hyperparameters[max(m - 1, 0) :][:1] * more
-        guided, by_residual = (problem._replace(weights=x) for x in (plan.guided, plan.by_residual))
+        each = plan.hyperparameters[:m] + plan.hyperparameters[max(m - 1, 0) :][:1] * more
+        explored = min(self.explored, m) if plan.starts > 1 else 0
+        switch = max(self.m - self.by_residual, explored)
+        guided, by_residual = (plan.problem._replace(weights=x) for x in (plan.guided, plan.by_residual))
         ones = torch.ones_like(plan.state.pose.translation[:, 0])
         now, narrower = Progress(plan.state, ones > 0, ones), None
-        explored = 0
         with torch.set_grad_enabled(torch.is_grad_enabled() and self.backward == "unroll"):
-            if starts > 1:
-                explored = min(self.explored, m)
-                several = repeat_problems(guided, starts)
-                for each in hyperparameters[:explored]:
-                    now = run(self._iteration, several, now, *each)
-                rivals = several._replace(weights=repeat_problems(plan.by_residual, starts))
-                now = run(self._best, rivals, plan.prior, plan.shape[max(self.explored - 1, 0)], now)
-            switch = max(self.m - self.by_residual, explored)
-            for each in hyperparameters[explored:switch]:
-                now = run(self._iteration, guided, now, *each)
-            if hyperparameters[switch:] and plan.area is not None:
-                shape = hyperparameters[switch][2]
-                noise, narrower = run(self._correct, by_residual, now.state, shape, plan.area, NARROWER)
+            if plan.starts > 1:
+                several = repeat_problems(guided, plan.starts)
+                for one in each[:explored]:
+                    now = run(self._iteration, several, now, *one)
+                rivals = several._replace(weights=repeat_problems(plan.by_residual, plan.starts))
+                now = run(self._best, rivals, plan.prior, plan.hyperparameters[max(self.explored - 1, 0)][2], now)
+            for one in each[explored:switch]:
+                now = run(self._iteration, guided, now, *one)
+            if each[switch:] and plan.area is not None:
+                noise, narrower = run(self._correct, by_residual, now.state, each[switch][2], plan.area, NARROWER)
                 by_residual = by_residual._replace(noise=noise)
-            for step, damping, shape in hyperparameters[switch:]:
+            for step, damping, shape in each[switch:]:
                 shape = shape if narrower is None else shape * narrower
                 now = run(self._iteration, by_residual, now, step, damping, shape)
         if self.backward == "implicit" and m and torch.is_grad_enabled():
-            shape = plan.shape[m - 1] if narrower is None else plan.shape[m - 1] * narrower
-            return self._with_gradient(by_residual, now.state, shape), now.solved
+            shape = plan.hyperparameters[m - 1][2]
+            return self._with_gradient(
+                by_residual, now.state, shape if narrower is None else shape * narrower
+            ), now.solved
         return now.state, now.solved
 
     def judge(self, plan: Plan, state: State, solved: Tensor) -> Refinement:
-        """Judge where the iterations ended: everything after the last iteration.
-
-        Args:
-            plan: what :meth:`begin` returned.
-            state: where the iterations ended.
-            solved: whether the last equations could be solved, bool :math:`(B,)`.
-        """
-        projection, shape = project(state, plan.problem), per_problem(plan.shape[-1], plan.prior[:, :1])
+        """Judge what :meth:`iterate` returned: everything after the last iteration."""
+        projection, shape = project(state, plan.problem), per_problem(plan.hyperparameters[-1][2], plan.prior[:, :1])
         cost = self._cost(projection, plan.problem, plan.prior, shape)
         seen, noise = plan.problem._replace(weights=plan.by_residual), plan.problem.noise
         if plan.area is not None:
@@ -372,7 +337,7 @@ class RobustWeightedLM(Configured):
 
     def cost(self, plan: Plan, state: State) -> Tensor:
         """The ``cost`` of :meth:`judge` at any state, shape :math:`(B,)`."""
-        return self._cost(project(state, plan.problem), plan.problem, plan.prior, plan.shape[-1])
+        return self._cost(project(state, plan.problem), plan.problem, plan.prior, plan.hyperparameters[-1][2])
 
     def _correct(
         self, problem: Problem, state: State, shape: Tensor, area: Tensor, narrower: float
