@@ -38,21 +38,16 @@ __all__ = ["PnPNet"]
 _LONGEST_GRADIENT = 10.0
 # Further iterations from the nominal focal length: the least that converge with 1000 pairs. With 2, 4 and 8 of them the
 # median error of the focal length is 0.037, 0.029 and 0.030 % (CameraProblems, seeds 4321, 4322, half outliers).
-# Radial distortion takes them, too: of what is refined on undistorted pixels it has no gradient.
+# Radial distortion needs them for its gradient: the search before them works on undistorted pixels, without gradient.
 _MORE_ITERATIONS = 4
-# Least probability of a pose that started with the nominal focal length. Of problems with 50 % outliers (n = 12, seeds
-# 7700 to 7709 of CameraProblems), 0.4 to 0.6 % have more and are wrong, as are 0.6 % of those of the oracle.
+# Least probability with which a pose that started with the nominal focal length is accepted. Of problems with 50 %
+# outliers (n = 12, seeds 7700 to 7709 of CameraProblems), 0.4 to 0.6 % exceed it and are far off, as are 0.6 % of the
+# poses of least squares on the inliers.
 _CONVINCING = 0.97
 
 
 class _Call(NamedTuple):
-    """How a batch is solved.
-
-    Attributes:
-        first_stage_only: return the first pose unrefined.
-        always: whether gradients flow through every valid problem.
-        alternatives: largest number of other poses to return.
-    """
+    """How a batch is solved: options of :meth:`PnPNet.forward`; ``always``: every valid problem has a gradient."""
 
     first_stage_only: bool
     always: bool
@@ -60,7 +55,7 @@ class _Call(NamedTuple):
 
 
 class _Attempt(NamedTuple):
-    """One pass from a problem to a result: what was proposed, and what came of it."""
+    """One pass from a problem to a result: what was proposed, and how the refinement ended."""
 
     problem: Problem
     frame: Frame
@@ -86,29 +81,32 @@ class PnPNet(PretrainedMixin):
 
     Args:
         init: maps a :class:`~kornia_pnpnet.problem.Problem` to :class:`~kornia_pnpnet.problem.Starts`, see
-            ``kornia_pnpnet.propose``; ``None`` starts from the identity or from the pose given with the call.
+            ``kornia_pnpnet.propose``; ``None``: the refinement starts from the pose given with the call, else from the
+            identity.
         refine: the refiner; classical :class:`~kornia_pnpnet.refine.lm.RobustWeightedLM` when ``None``.
         normalize: the normalisation; the default centres and scales the world and orders the pairs.
-        effort: ``"fixed"``, or ``"adaptive"``: where the poses of the initialiser do not suffice, a problem gets as
-            many more minimal samples as it needs (:func:`~kornia_pnpnet.propose.ransac.search_on`), and a pose whose
-            mirror image fits as well is not ``ok``. Needs an initialiser that estimates the noise,
-            :class:`~kornia_pnpnet.propose.set.SetInit`. ``None``: adaptive with such an initialiser and a refinement in
-            evaluation mode, else fixed. Always fixed: exported graphs, ``compile(whole=True)``, ``torch.func.vmap`` and
-            the device ``meta``. Rigs and bearings: RANSAC, unless the effort is ``"fixed"`` or the solver is compiled.
-        gradient: which problems have a gradient. ``"ok"``: only those whose result is ``ok``. ``"always"``: every valid
-            problem, to train a network that does not predict anything sensible yet. The gradient of each problem to its
-            normalised points, pixels and weights is then finite and at most 10 long.
+        effort: ``"adaptive"``: a problem whose first poses do not suffice gets further minimal samples
+            (:func:`~kornia_pnpnet.propose.ransac.search_on`), and a pose whose mirror image fits as well is not
+            ``ok``; needs an initialiser that estimates the noise, :class:`~kornia_pnpnet.propose.set.SetInit`.
+            ``"fixed"``: every problem gets the same work. ``None``: adaptive with such an initialiser and a refinement
+            in evaluation mode, else fixed. Always fixed: exported graphs, ``compile(whole=True)``,
+            ``torch.func.vmap`` and the device ``meta``. Rigs and bearings get further samples unless the effort is
+            ``"fixed"`` or the solver is compiled.
+        gradient: which problems have a gradient. ``"ok"``: those whose result is ``ok``. ``"always"``: every valid
+            problem, to train a network whose poses are still far off; the gradient of each problem by its normalised
+            points, pixels and weights is then finite and at most 10 long.
         views: number of poses for each problem, 1 to 8: one of the problem itself and others of its mirror images (see
             :mod:`kornia_pnpnet.propose.views`), which a network answers differently. All poses are refined; after seven
             tenths of the iterations the best one goes on alone.
-        focal: ``"known"``, or ``"unknown"``: the focal length is estimated with the pose and returned in the result's
-            ``intrinsics``. Those of the call then give the principal point, the aspect ratio and the skew relative to
-            the focal length. The refinement starts from a nominal focal length with ``SetInit``; where that does not
-            suffice, and with other initialisers, from one that P3P finds. If it stays open by over 15 %: not ``ok``.
+        focal: ``"unknown"``: the focal length is estimated with the pose and returned in the result's ``intrinsics``.
+            The intrinsics of the call then give the principal point, the aspect ratio and the skew relative to the
+            focal length. The refinement starts from a nominal focal length with ``SetInit``; where that does not
+            suffice, and with other initialisers, from one that P3P finds. A problem is not ``ok`` when the standard
+            deviation of log f exceeds 0.15. ``"known"``: the focal length is that of the intrinsics.
         focal_sigma: standard deviation of the logarithm of the focal length in the intrinsics of a call, for example
             0.1 for one that is known to about 10 %; ``None``: the focal length in the intrinsics is ignored.
-        radial: number of coefficients of radial distortion, 0 to 2, estimated with an unknown focal length: before the
-            refinement, and together with the pose after it. The result has them as ``dist``, with gradients.
+        radial: number of coefficients of radial distortion, 0 to 2, estimated with an unknown focal length and returned
+            as ``dist``.
 
     Raises:
         BaseError: when ``views`` is not an integer from 1 to 8, or ``gradient``, ``effort`` or ``focal`` neither of its
@@ -182,16 +180,15 @@ class PnPNet(PretrainedMixin):
         Args:
             world_points: shape :math:`(B, N, 3)`, any unit, floats or integers. Any leading dimensions may stand in
                 place of :math:`B`, in all arguments and in the result; a single problem has none.
-            img_points: pixels, shape :math:`(B, N, 2)`; or bearings, directions in the camera's frame of any length, as
-                those of :func:`~kornia_pnpnet.cameras.bearings`, shape :math:`(B, N, 3)`.
+            img_points: pixels, shape :math:`(B, N, 2)`; or bearings, directions of any length in the camera's frame
+                (:func:`~kornia_pnpnet.cameras.bearings`), shape :math:`(B, N, 3)`.
             intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or Kornia's cameras, whose
-                extrinsics are ignored; in a rig also one for each pair, :math:`(B, N, 3, 3)`. Bearings need none.
-                With intrinsics, the ``img_sigma`` and thresholds of bearings are in pixels, and a radian is as many
-                pixels as the focal length; without intrinsics they are in radians.
+                extrinsics are ignored; in a rig also one for each pair, :math:`(B, N, 3, 3)`. Bearings may omit them.
+                Sigmas and thresholds of bearings are then in radians, else in pixels of the focal length.
             weights: weight of each pair, the same for u and v, at least 0, shape :math:`(B, N)`; 1 when ``None``.
             mask: False where a pair is padding, bool, shape :math:`(B, N)`. The numbers of padding do not matter.
-            init: a world-to-camera pose, :math:`(B, 3, 3)` and :math:`(B, 3)`. It competes with the poses of the
-                initialiser and is refined as they are; without an initialiser the refinement starts from it.
+            init: a world-to-camera pose, :math:`(B, 3, 3)` and :math:`(B, 3)`. It is refined beside the poses of the
+                initialiser; without an initialiser the refinement starts from it.
             img_sigma: standard deviation of the noise on each pixel coordinate, a number, :math:`(B,)` or
                 :math:`(B, N)`, at least 0; NaN where unknown. With this or ``world_sigma``, residuals and the scales of
                 the refinement's kernel count in standard deviations.
@@ -201,16 +198,16 @@ class PnPNet(PretrainedMixin):
                 :math:`(B, N, 2, 2)`, symmetric and positive semi-definite. Residuals are whitened by it.
             world_cov: covariance of the noise of each world point, in place of ``world_sigma``, shape
                 :math:`(B, N, 3, 3)`.
-            confidence: your own belief that a pair is an inlier, in [0, 1], for example a matcher's score, shape
+            confidence: the caller's belief that a pair is an inlier, in [0, 1], for example a matcher's score, shape
                 :math:`(B, N)`; NaN where unknown. Minimal samples are drawn from likely pairs more often, and a
                 network that was trained with confidences sees them. They need not be calibrated.
             prior: what is known of the pose besides the pairs, such as
                 :func:`~kornia_pnpnet.refine.terms.gravity_prior`: a term of the refinement and of the choice among
-                poses, to which its pose belongs unless ``init`` is given. ``ok`` and ``probability`` are judged by the
-                pairs alone. Unknown noise counts as one pixel.
+                poses. Its pose is one of the starts unless ``init`` is given. ``ok`` and ``probability`` are judged by
+                the pairs alone. Unknown noise counts as one pixel.
             dist: distortion of the camera as Kornia and OpenCV have it, 4, 5, 8, 12 or 14 coefficients, shape
-                :math:`(B, D)` or :math:`(D,)`. Pixels are undistorted once, and their noise with them. Pairs beyond
-                what the coefficients can show are left out.
+                :math:`(B, D)` or :math:`(D,)`. Pixels and their noise are undistorted once. Pairs beyond what the
+                coefficients can show are left out.
             fisheye: the four coefficients of ``cv2.fisheye``, in place of ``dist``, shape :math:`(B, 4)` or
                 :math:`(4,)`. Pixels more than 85 degrees off the axis are left out; bearings keep them.
             cam_from_rig: for several cameras with one pose, that of their rig: the transform from the rig to the camera
@@ -272,14 +269,8 @@ class PnPNet(PretrainedMixin):
     ) -> tuple[PnPResult, Starts]:
         """Solve a batch and return the whole first proposal as well (poses, weights and noise), to train it.
 
-        Args:
-            args: See forward.
-            first_stage_only: See forward.
-            gradient: See forward.
-            options: the other arguments of ``forward``, except ``alternatives``.
-
-        Returns:
-            The result, and the starts in the frame, order and units of the inputs; their ``ok``: is the problem valid.
+        For the arguments see :meth:`forward`; ``alternatives`` is not among them. The starts are in the frame, order
+        and units of the inputs, and their ``ok`` says whether the problem is valid.
         """
         size, inputs = checked_inputs(*args, **options)
         with in_full_precision(inputs.world_points.device.type):
@@ -349,14 +340,12 @@ class PnPNet(PretrainedMixin):
             camera = torch.cat((torch.zeros_like(inputs.radial[:, :1]), inputs.radial), 1)
             starts = starts._replace(camera=camera)
         refined = self.refine(seen, starts, m=0 if call.first_stage_only else None, more=more, run=self._run)
-        result = self._run(self._result, frame, starts, refined, call)
         if adapts:
-            assert result.probability is not None
-            known, starts_of_known = _as_known(problem, starts, refined)
-            pose = frame.apply(result.pose)
-            mirror = mirror_probability(self.refine, known, starts_of_known, pose, result.ok, result.cost)
-            result = _doubted(result, result.probability * (1.0 - mirror), call)
-        return _Attempt(problem, frame, starts, refined, result)
+            known = _as_known(problem, starts, refined)
+            mirror = mirror_probability(self.refine, *known, refined.pose, refined.ok & frame.valid, refined.cost)
+            probability = refined.probability * (1.0 - mirror)
+            refined = refined._replace(ok=refined.ok & (probability >= LEAST_PROBABILITY), probability=probability)
+        return _Attempt(problem, frame, starts, refined, self._run(self._result, frame, starts, refined, call))
 
     def _propose(self, inputs: Inputs, call: _Call, search_follows: bool) -> tuple[Problem, Frame, Starts]:
         """Normalise and propose: everything before the refinement."""
@@ -459,17 +448,6 @@ def _as_known(problem: Problem, starts: Starts, refined: Refinement) -> tuple[Pr
     """The problem with the noise that it was refined with, and with the camera that was found, both as known."""
     known = problem._replace(noise=complete_noise(problem, starts))
     return known.seen_with(refined.state.zoom), starts._replace(camera=None)
-
-
-def _doubted(result: PnPResult, probability: Tensor, call: _Call) -> PnPResult:
-    """The result with another probability: not ``ok``, and without gradient, where it is below the least."""
-    assert result.status is not None
-    doubted = result.ok & (probability < LEAST_PROBABILITY)
-    live, everywhere = ~doubted | call.always, torch.ones_like(doubted)
-    names = "rotation", "translation", "weights", "cost", "intrinsics", "dist"
-    gated: dict[str, Any] = {name: gate(getattr(result, name), live, everywhere, 0.0) for name in names}
-    status = result.status.masked_fill(doubted, Status.NOT_BELIEVED.value)
-    return result._replace(**gated, ok=result.ok & ~doubted, status=status, probability=probability)
 
 
 def _checked_gradient(gradient: str) -> str:
