@@ -34,7 +34,7 @@ __all__ = [
 
 _T = TypeVar("_T")
 
-# Pairs. Problems are not cut to less, so that no solver sees too few.
+# Parts without padding keep at least this number of pairs.
 _LEAST_PAIRS = 16
 #: The tensors of a call, by their names in error messages: whether they have an entry for each pair (N) or for each
 #: problem, and the shape of an entry. Those of cameras and lenses depend on more.
@@ -56,11 +56,11 @@ _ENTRIES: dict[str, tuple[bool, tuple[int, ...]]] = {
 
 
 class Inputs(NamedTuple):
-    """Arguments of a call as one batch in one dtype: a camera per problem, sigmas per pair where any is known.
+    """Arguments of a call as one batch in one dtype, with sigmas for every pair where any is known.
 
-    Where a solver estimates the focal length, ``free_focal`` says in pixels of the caller what is known of it, and
-    ``radial`` holds the coefficients of the distortion that was taken from the pixels. In a rig each pair has a camera,
-    (B, N, 3, 3), and its place in the ``rig``.
+    In a rig each pair has a camera, (B, N, 3, 3), and a pose of this camera in ``rig``. Where a solver estimates the
+    focal length, ``free_focal`` says in pixels of the caller what is known of it, and ``radial`` holds the coefficients
+    of distortion by which the pixels were undistorted.
     """
 
     world_points: Tensor
@@ -78,13 +78,13 @@ class Inputs(NamedTuple):
 
 
 class Part(NamedTuple):
-    """Some problems of a batch.
+    """Some problems of a batch, and their positions in it.
 
     Attributes:
         inputs: the problems.
-        problems: their positions in the batch, (P,); ``None``: they follow those of the part before.
-        pairs: positions of their pairs among the N pairs of the batch, (P, n); ``None``: they have all pairs in order.
-        most_pairs: the number N.
+        problems: positions among the problems, (P,); ``None``: they follow those of the part before.
+        pairs: positions of their pairs among the pairs of the batch, (P, n); ``None``: all pairs in order.
+        most_pairs: number of pairs of the batch.
     """
 
     inputs: Inputs
@@ -111,20 +111,14 @@ def checked_inputs(
     fisheye: Tensor | None = None,
     cam_from_rig: Pose | None = None,
 ) -> tuple[torch.Size, Inputs]:
-    """Check the arguments of a call, and make them one batch of one dtype, see :func:`common_dtype`.
+    """Check the arguments of a call, and make them one batch of one dtype (:func:`common_dtype`).
 
-    For the arguments see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`. Distorted pixels become those of
-    pinhole cameras, and bearings a rig of cameras that each look at their own point. Shapes, dtypes and devices are
-    checked; never values, which would stall a GPU and let one problem fail a batch.
+    For the arguments and errors see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`. Distorted pixels
+    become pixels of pinhole cameras; bearings become a rig of cameras that each look at their own point. Shapes, dtypes
+    and devices are checked. Values are not: this would stall a GPU and let one problem fail a batch.
 
     Returns:
         The leading dimensions of ``world_points``, none for a single problem, and the inputs with one batch dimension.
-
-    Raises:
-        ShapeError: for shapes that do not fit each other, or fewer than 3 pairs.
-        TypeCheckError: for arguments that are no tensors, or hold booleans or complex numbers.
-        DeviceError: for tensors on different devices.
-        ValueCheckError: for both a sigma and a covariance of the pixels, or of the points.
     """
     is_bearing = isinstance(img_points, Tensor) and img_points.ndim > 1 and img_points.shape[-1] == 3
     if intrinsics is None and is_bearing:
@@ -202,12 +196,9 @@ def checked_noise(
     img_cov: Tensor | None,
     world_cov: Tensor | None,
 ) -> Noise | None:
-    """The noise of every pair in the dtype of the points, from sigmas of any kind or covariances of sound shapes.
+    """The noise of every pair in the dtype of the points; ``None`` where nothing is known of any pair.
 
-    Raises:
-        ShapeError: for a sigma of another shape.
-        TypeCheckError: for a sigma that is no number.
-        ValueCheckError: for both a sigma and a covariance of the pixels, or of the points.
+    For the arguments and errors see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`.
     """
     kinds = {"img": (img_sigma, img_cov), "world": (world_sigma, world_cov)}
     for name, (sigma, cov) in kinds.items():
@@ -242,9 +233,9 @@ def with_undistorted(inputs: Inputs, dist: Tensor | None, fisheye: Tensor | None
 
 
 def _looking_along(inputs: Inputs) -> Inputs:
-    """Inputs with bearings as those of cameras whose axes are the bearings, with a focal length each and no skew.
+    """Bearings as a rig of cameras without skew whose axes are the bearings.
 
-    The focal length is the geometric mean of those given: pixels of sigma per radian.
+    The focal length of a camera, by which a sigma in pixels is one in radians, is the geometric mean of those given.
     """
     rotation, sound = bearing_cameras(inputs.img_points)
     axis = torch.where(sound[..., None], torch.zeros_like(inputs.img_points[..., :2]), torch.nan)
@@ -279,14 +270,13 @@ def given_cameras(intrinsics: Tensor | PinholeCamera | None, world_points: Tenso
 
 
 def split_batch(inputs: Inputs, most: int | None, any_number: bool) -> list[Part]:
-    """Split a batch into the parts that are solved one after the other.
-
-    Only on a CPU, where a small part stays in the caches, and only where values are seen.
+    """Split a batch into parts that are solved one after the other, on a CPU, whose caches hold a small part.
 
     Args:
         inputs: the batch.
         most: largest number of pairs of a part for each thread, without gradients; ``None``: the whole batch.
-        any_number: whether parts may have fewer pairs than the batch, so that they have little padding.
+        any_number: whether parts may have fewer pairs than the batch, so that they have little padding. Problems of
+            few among problems of many pairs then take a half to two thirds of the time.
     """
     batch, count = inputs.world_points.shape[:2]
     if inputs.world_points.device.type != "cpu" or not sees_values(inputs.world_points) or not batch:
@@ -301,7 +291,7 @@ def split_batch(inputs: Inputs, most: int | None, any_number: bool) -> list[Part
 
 
 def _without_padding(inputs: Inputs, most: int) -> list[Part]:
-    """Parts of problems of about the same number of pairs, at least two where there are two."""
+    """Parts of problems of about the same number of pairs, with at least two problems where the batch has two."""
     assert inputs.mask is not None
     batch, count = inputs.mask.shape
     counts = inputs.mask.sum(1)
@@ -329,7 +319,7 @@ def _without_padding(inputs: Inputs, most: int) -> list[Part]:
 
 
 def joined(parts: list[Part], results: list[PnPResult]) -> PnPResult:
-    """The results of all problems and pairs of a batch from those of its parts."""
+    """The result of a batch from the results of its parts."""
     padded = []
     for part, result in zip(parts, results, strict=True):
         if part.pairs is not None:

@@ -1,7 +1,7 @@
-r"""Into the solver's frame and back: from any camera and any world to what initialisers and refiners see.
+r"""Into the solver's frame and back.
 
-Pixels become those of a camera with the focal length ``f_const`` and the principal point 0; the pairs may be ordered
-by their pixels, as the paper does; the world may be centred and scaled, which makes the solved pose equivariant to
+Pixels become those of a camera with the focal length ``f_const`` and the principal point 0. The pairs may be ordered
+by their pixels, as in the paper. The world may be centred and scaled, which makes the solved pose equivariant to
 similarity transforms of the world. Every step has an exact inverse on the pose.
 """
 
@@ -27,25 +27,24 @@ __all__ = ["F_CONST", "Frame", "Normalize"]
 
 #: Focal length of the normalised camera in pixels (the cameras of ETH3D have 3400 to 3430).
 F_CONST = 3400.0
-# Typical distances from the median of the points. Beyond this a pair does not count for centre and scale.
-_FAR = 5.0
-# The same with fewer pairs than this: few pairs say little about what is typical.
-_MANY, _FAR_OF_FEW = 12, 25.0
-# Typical distances. Beyond this a float32 has too few digits for the pair.
+# A point further from the median of the points than this number of typical distances does not count for centre and
+# scale. With fewer than 12 pairs the larger number holds, because few pairs say little about a typical distance.
+_FAR, _MANY, _FAR_OF_FEW = 5.0, 12, 25.0
+# Typical distances from the median. A float32 has too few digits for points further away.
 _LARGEST_DISTANCE = 1e6
-# Tangent of 85 degrees, more than a lens without distortion can show.
+# Tangent of 85 degrees, a larger angle than a lens without distortion can show.
 _FAR_ANGLE = 11.4
 
 
 class Frame(NamedTuple):
-    r"""How :class:`Normalize` moved and ordered a problem, so that it can be undone.
+    r"""How :class:`Normalize` moved and ordered problems.
 
     Attributes:
         centroid: the world point that became the origin, shape :math:`(B, 3)`.
         scale: factor of world lengths, shape :math:`(B,)`.
         img_scale: factor of pixels, the geometric mean of both axes, shape :math:`(B,)`.
         order: position in the input of each normalised pair, int64, shape :math:`(B, N)`; ``None``: unchanged.
-        status: ``Status.SOLVED`` where the problem can be solved at all, else why not, int64, shape :math:`(B,)`.
+        status: ``Status.SOLVED`` where the problem is valid, else the reason, int64, shape :math:`(B,)`.
         intrinsics: the camera matrices with a last entry of 1, the identity where they are impossible, shape
             :math:`(B, 3, 3)`, of a rig :math:`(B, N, 3, 3)`.
     """
@@ -59,7 +58,7 @@ class Frame(NamedTuple):
 
     @property
     def valid(self) -> Tensor:
-        """Whether the problem can be solved at all, bool, shape :math:`(B,)`."""
+        """Whether the problem is valid, see :class:`Normalize`, bool, shape :math:`(B,)`."""
         return self.status == Status.SOLVED.value
 
     def apply(self, pose: Pose) -> Pose:
@@ -106,9 +105,10 @@ class Normalize(Configured):
     coincide. The inputs of invalid problems are replaced by zeros, which keeps all later values and gradients finite. A
     pair without weight is padding: its numbers do not matter.
 
-    Bad triangulations and bad detections do not spoil the frame: centroid and scale are those of the *usual* pairs.
-    These are at most five times as far from the median of the points as two thirds of the pairs, and less than 85° off
-    the camera's axis. Pairs a million times as far, or too close to 90° to be seen, are outliers and lose their weight.
+    Centroid and scale are those of the *usual* pairs, so that bad triangulations and bad detections do not spoil the
+    frame. A usual pair is less than 85° off the camera's axis, and its point is at most five typical distances from the
+    median of the points; two thirds of the pairs are within one typical distance. Pairs beyond a million typical
+    distances, or too close to 90° to be seen, lose their weight.
 
     Args:
         f_const: focal length of the normalised camera in pixels.
