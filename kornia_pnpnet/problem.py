@@ -81,7 +81,7 @@ class Noise(NamedTuple):
 
 
 class Linear(NamedTuple):
-    r"""A term near a state: half of its loss is about :math:`\tfrac12 w (r + J \delta)^\top \Omega (r + J \delta)`.
+    r"""A term near a state: its loss is about :math:`w (r + J \delta)^\top \Omega (r + J \delta)`.
 
     Attributes:
         residual: :math:`r`, shape :math:`(B, D)`.
@@ -106,7 +106,7 @@ class Term(Protocol):
         """Robust loss in squared standard deviations, shape (B,)."""
 
     def disagreement(self, pose: Pose) -> Tensor:
-        """Penalty in the choice among poses, in pairs: an inlier that fits costs 0, an outlier 1. The batch's shape."""
+        """Penalty of poses :math:`(B, …)` in the choice among starts, in units of the penalty of one outlier."""
 
 
 class Problem(NamedTuple):
@@ -120,9 +120,9 @@ class Problem(NamedTuple):
         focal: the focal length in pixels that all pairs share, a scalar.
         img_scale: pixels of ``img_points`` per pixel of the caller, shape :math:`(B,)`.
         world_scale: lengths of ``world_points`` per unit of the caller's world, shape :math:`(B,)`.
-        usual: 1 for pairs of normal scale; 0 for points that are many times as far from the others as these are from
-            each other, and for pixels at extreme angles, shape :math:`(B, N)`. Initialisers that are not robust use
-            :attr:`usual_weights`: other pairs are bad data or the horizon.
+        usual: 1 for usual pairs, 0 for points far from the others and pixels at extreme angles (see
+            :class:`~kornia_pnpnet.frame.Normalize`), shape :math:`(B, N)`. Initialisers that are not robust use
+            :attr:`usual_weights`.
         noise: noise of each pair in the units of ``img_points`` and ``world_points``, NaN where unknown; ``None``: all
             unknown.
         confidence: the caller's belief that a pair is an inlier, in [0, 1], NaN where unknown, shape :math:`(B, N)`;
@@ -156,35 +156,32 @@ class Problem(NamedTuple):
 
     @property
     def terms(self) -> Iterator[Term]:
-        """What is known besides the pairs. An unknown focal length without ``focal_sigma`` has no information."""
+        """What is known besides the pairs. An unknown focal length without ``focal_sigma`` is no term."""
         free = self.free_focal is not None and self.free_focal.information is not None
         known = self.prior, self.free_focal if free else None
         return (term for term in known if term is not None)
 
     @property
     def usual_weights(self) -> Tensor:
-        """The weights, 0 for pairs that are not of normal scale, shape :math:`(B, N)`."""
+        """The weights, 0 for pairs that are not usual, shape :math:`(B, N)`."""
         return self.weights * self.usual
 
     @property
     def places(self) -> Tensor:
-        """Where each pair is seen: its pixel, in a rig the ray in the frame of the rig times the focal length.
-
-        Shape :math:`(B, N, 2)` or :math:`(B, N, 3)`.
-        """
+        """Where each pair is seen: its pixel, :math:`(B, N, 2)`; in a rig its ray (:meth:`rays`), :math:`(B, N, 3)`."""
         return self.img_points if self.rig is None else self.rays(self.img_points / self.focal)
 
     def rays(self, plane_points: Tensor) -> Tensor:
-        """Rays of points in the planes of a rig's cameras, as long as the focal length, in its frame, (B, N, 3)."""
+        """Rays of points on the planes z = 1 of a rig's cameras, as long as the focal length, in its frame, (B, N, 3)."""
         assert self.rig is not None
         rays = torch.cat((plane_points, torch.ones_like(plane_points[..., :1])), -1)
         rays = self.focal * torch.nn.functional.normalize(rays, dim=-1)
         return (self.rig.rotation * rays[..., None]).sum(-2)
 
     def seen_with(self, zoom: Tensor) -> Problem:
-        """The same pairs with a known focal length, larger by the exponential of ``zoom``, (B, 1) or (B, 0).
+        """The same pairs with a known focal length, multiplied by the exponential of ``zoom``, (B, 1) or (B, 0).
 
-        Pixels and their noise are divided instead of the focal length being multiplied.
+        Dividing the pixels and their noise by this factor has the same effect.
         """
         if not zoom.shape[1]:
             return self
@@ -202,15 +199,16 @@ class Problem(NamedTuple):
 
 
 class Starts(NamedTuple):
-    r"""What an initialiser returns: poses to refine, and what it thinks of the pairs.
+    r"""What an initialiser returns: poses to refine, and weights and noise of the pairs.
 
     Attributes:
         pose: a coarse pose in the frame of the :class:`Problem`.
         weights: a factor for the weight of each pair, at least 0, shape :math:`(B, N)`.
-        ok: whether there is a pose at all (degenerate pairs may have none), bool, shape :math:`(B,)`; ``None``: always.
+        ok: whether a pose was found (degenerate pairs may have none), bool, shape :math:`(B,)`; ``None``: always.
         others: more poses, rotations :math:`(B, S, 3, 3)` and translations :math:`(B, S, 3)`; ``None``: no others.
-        noise: noise of each pair in the units of the problem, where unknown the initialiser's estimate, without
-            covariances; residuals then count in standard deviations. ``None``: the initialiser does not estimate noise.
+        noise: noise of each pair in the units of the problem, without covariances: the caller's, and the initialiser's
+            estimate where it is unknown. Residuals then count in standard deviations. ``None``: the initialiser does
+            not estimate noise.
         camera: first parameters of the camera for every pose, see :class:`State`; ``None``: zeros.
     """
 

@@ -130,7 +130,7 @@ def camera_matrices(intrinsics: Tensor | PinholeCamera) -> Tensor:
 
 
 def check_poses(estimate: Pose, truth: Pose) -> None:
-    """Check that two batches of poses match exactly. Broadcasting would compare poses of different problems."""
+    """Check that two batches of poses have equal shapes. Broadcasting would compare poses of different problems."""
     batch = tuple(estimate.translation.shape[:-1])
     shapes: Shapes = {
         "The rotation of the estimate": (estimate.rotation, (*batch, 3, 3)),
@@ -160,9 +160,9 @@ class PosePrior(NamedTuple):
         pose: the expected world-to-camera pose.
         information: inverse of the covariance in radians and the unit of the world, positive semi-definite; rows and
             columns of zeros where nothing is known, shape :math:`(B, 6, 6)`.
-        scale: :math:`c`, shape :math:`(B,)`; ``None``: 3. The squared error :math:`s` in standard deviations weighs
-            :math:`\exp(-2 s / (k c^2))` with :math:`k` known directions (Welsch's kernel), so that a wrong prior does
-            not spoil a pose that the pairs determine. Infinite: least squares.
+        scale: :math:`c`, shape :math:`(B,)`; ``None``: 3. A squared error of :math:`s` standard deviations has the
+            weight :math:`\exp(-2 s / (k c^2))` with :math:`k` known directions (Welsch's kernel), so that a wrong prior
+            does not spoil a pose that the pairs determine. Infinite: least squares.
     """
 
     pose: Pose
@@ -184,8 +184,8 @@ class Status(IntEnum):
     NOT_FINITE = 3
     #: The intrinsics are not a multiple of ``[[fx, s, cx], [0, fy, cy], [0, 0, 1]]`` with positive ``fx`` and ``fy``.
     CAMERA = 4
-    #: No pose was found with which enough pairs agree. Of three pairs most solvers answer this: see
-    #: :func:`~kornia_pnpnet.propose.p3p.p3p`, which finds all poses of three pairs.
+    #: No pose was found with which enough pairs agree. Most solvers answer this for three pairs, whose poses
+    #: :func:`~kornia_pnpnet.propose.p3p.p3p` finds.
     NOT_BELIEVED = 5
     #: The pose that was found has fewer than 3 pairs in front of the camera.
     BEHIND = 6
@@ -197,8 +197,8 @@ class Alternatives(NamedTuple):
     Attributes:
         rotation: world-to-camera rotations in the order of their costs, shape :math:`(B, S, 3, 3)`.
         translation: world-to-camera translations, shape :math:`(B, S, 3)`.
-        cost: as the ``cost`` of a :class:`PnPResult`, of the refinement that compares the poses, shape :math:`(B, S)`.
-        probability: probability of each pose when one of them or the result's pose is right, shape :math:`(B, S)`.
+        cost: cost of the refinement that compares the poses, see :class:`PnPResult`, shape :math:`(B, S)`.
+        probability: probability of each pose if one of them or the result's pose is the true one, shape :math:`(B, S)`.
         valid: which slots hold a pose, the first ones of a problem, bool, shape :math:`(B, S)`.
     """
 
@@ -223,22 +223,20 @@ class PnPResult(NamedTuple):
         rotation: world-to-camera rotation, shape :math:`(B, 3, 3)`.
         translation: world-to-camera translation in the unit of the world points, shape :math:`(B, 3)`.
         weights: final weight of each pair, in the order in which the pairs were given, shape :math:`(B, N)`.
-        cost: mean robust loss of the pairs, with that of a prior, in the kernel's unit (see
-            :mod:`kornia_pnpnet.refine.kernels`), shape :math:`(B,)`. Comparable between problems that the
-            same solver solved.
+        cost: mean robust loss of the pairs and of a prior in the kernel's unit (see
+            :mod:`kornia_pnpnet.refine.kernels`), shape :math:`(B,)`. Costs of the same solver are comparable.
         ok: whether the pose is to be believed, bool, shape :math:`(B,)`. Where ``ok`` is false the fields above, the
             ``intrinsics`` and ``dist`` are finite and carry no gradient.
         init: the first guess. It carries a gradient for every valid problem, also where refinement failed, so that an
             initialiser can learn from its failures.
         status: why a problem is not ``ok``: the value of a :class:`Status`, int8, shape :math:`(B,)`.
         probability: estimated probability that the pose is within 10 degrees and 30 % of the distance of the points,
-            shape :math:`(B,)`, without gradient. Where the solver neither knows nor estimates the noise, the noise
-            follows from the residuals. Peers do not estimate the probability: theirs is 1 where ``ok``.
+            shape :math:`(B,)`, without gradient. A solver that neither knows nor estimates the noise takes it from the
+            residuals. Peers do not estimate the probability and return 1 where ``ok``.
         alternatives: other poses that explain the pairs nearly as well; no slots where the call did not ask for them.
-        intrinsics: the camera matrices that the poses go with, with a last entry of 1, shape :math:`(B, 3, 3)`. With an
-            unknown focal length they hold its estimate. The identity for a problem whose camera is impossible.
-        dist: the estimated distortion (k1, k2, 0, 0), which goes with the ``intrinsics``, shape :math:`(B, 4)`; 0 where
-            it was not estimated.
+        intrinsics: camera matrices of the poses with a last entry of 1, shape :math:`(B, 3, 3)`. With an unknown focal
+            length they hold its estimate. The identity for a problem whose camera is impossible.
+        dist: estimated distortion (k1, k2, 0, 0), shape :math:`(B, 4)`; 0 where it was not estimated.
     """
 
     rotation: Tensor
@@ -272,7 +270,7 @@ class Problems(NamedTuple):
         img_points: pixels, shape :math:`(B, N, 2)`.
         intrinsics: camera matrices, shape :math:`(B, 3, 3)`, in a rig :math:`(B, N, 3, 3)`.
         pose: the true world-to-camera pose.
-        inliers: whether the pixel of a pair shows its point, bool, shape :math:`(B, N)`.
+        inliers: whether a pair is an inlier, bool, shape :math:`(B, N)`.
         img_sigma: standard deviation of the noise on each pixel coordinate, as a solver may know it: NaN where it is
             unknown, ``None`` where it is unknown for all problems, shape :math:`(B,)` or :math:`(B, N)`.
         world_sigma: standard deviation of the noise on each world coordinate; see ``img_sigma``.

@@ -1,4 +1,4 @@
-r"""Is this pose to be believed? Whether it explains the pixels, and whether its inliers could be chance.
+r"""Whether a pose is to be believed: whether it explains the pixels, and whether its inliers could be chance.
 
 The functions take the :class:`~kornia_pnpnet.refine.residual.Projection` of one pose per problem, the problem, the
 noise of every pair, and weights of the pairs, :math:`(B, N)`. Their answers have no gradient and the shape
@@ -35,23 +35,23 @@ __all__ = [
     "rotation_sigma",
 ]
 
-#: A pose is to be believed when it is not far off with at least this probability. Of synthetic problems that the law of
-#: :func:`probability` was not fitted to, 98 % of the right poses keep it, and 5 to 7 % of the poses that are far off.
+#: A pose is believed when its :func:`probability` is at least this. On synthetic problems to which the law was not
+#: fitted, 98 % of the poses within the limits pass, and 5 to 7 % of the poses that are far off.
 LEAST_PROBABILITY = 0.93
-#: The laws of :func:`probability`: the log-odds when both numbers are 0, and their slopes by the logarithms of the
-#: false alarms and of the rotation's sigma; for noise that was given or estimated by a network, and for noise of
-#: :func:`residual_noise`. Fitted by ``python docs/results/make.py measure --only probability``.
+#: The laws of :func:`probability`: the log-odds when both numbers are 0, and the slopes by the logarithms of the false
+#: alarms and of the rotation's sigma. The first law is for noise that was given or estimated by a network, the second
+#: for :func:`residual_noise`. Fitted by ``python docs/results/make.py measure --only probability``.
 LAWS = {"sigmas": (-3.2501, -0.16608, -1.0784), "residuals": (0.89795, -0.27745, 0.070018)}
 _ALARMS, _LOG_SIGMA = (-20.0, 10.0), (-12.0, 2.0)
-# Standard deviations. Pairs further off than this are no evidence for a pose.
+# Standard deviations. A pair with a larger residual is no evidence for a pose.
 _EVIDENT = 3.5
 # Standard deviation of the logarithm of a focal length beyond which it is open.
 _OPEN_FOCAL = 0.15
-# A pose explains the pixels when this fraction of the pairs (by weight) has small residuals. Just below 0.6, so that a
-# sum of shares that is 0.6 up to rounding suffices.
+# A pose explains the pixels when at least this fraction of the pairs (by weight) has small residuals. The fraction is
+# just below 0.6, so that a sum of shares that is 0.6 up to rounding suffices.
 _EXPLAINED_SHARE = 0.6 - 1e-5
-# A residual is small when it is below this fraction of the pixels' spread. A compromise: points behind the camera
-# nearly always leave larger residuals, small objects with noise of a tenth of their size leave smaller residuals.
+# A residual is small when it is below this fraction of the pixels' spread. Poses with points behind the camera nearly
+# always have larger residuals; small objects with noise of a tenth of their size have smaller ones.
 _EXPLAINED_RESIDUAL = 0.2
 
 
@@ -86,7 +86,7 @@ def explains(projection: Projection, problem: Problem, weights: Tensor) -> Tenso
 
 
 class Belief(NamedTuple):
-    """What the inliers say of a pose: its :func:`probability`, and whether it is to be believed, bool."""
+    """The :func:`probability` of a pose, and whether it is to be believed, bool."""
 
     probability: Tensor
     ok: Tensor
@@ -95,7 +95,8 @@ class Belief(NamedTuple):
 def believe(projection: Projection, problem: Problem, noise: Noise, law: str = "sigmas") -> Belief:
     """Tell whether a pose is to be believed, when the noise is known for every pair, by one of the :data:`LAWS`.
 
-    Its inliers must be more than chance would give it and span more than a line, and it must probably not be far off.
+    The pose must have more inliers than chance would give it, the inliers must span more than a line, and the
+    probability must be at least :data:`LEAST_PROBABILITY`.
     """
     projection, problem, noise = map_tensors(torch.Tensor.detach, (projection, problem, noise))
     precision = pixel_precision(projection, problem, noise) if noise.covariances else None
@@ -143,7 +144,7 @@ def clipped(log_alarms: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def residual_noise(projection: Projection, problem: Problem, weights: Tensor) -> Noise:
-    """The noise of the pixels that the median residual shows, the same sigma for all pairs of a problem."""
+    """The noise of the pixels by the median residual, the same sigma for all pairs of a problem."""
     there = (weights > 0) & projection.in_front
     count = there.sum(-1, keepdim=True)
     ascending = in_order(torch.where(there, projection.sq_residual, torch.inf).detach().mT[None])[0].mT
@@ -155,9 +156,9 @@ def residual_noise(projection: Projection, problem: Problem, weights: Tensor) ->
 
 
 def rotation_sigma(projection: Projection, problem: Problem, noise: Noise, judged: Judged) -> Tensor:
-    """Standard deviation of the rotation in radians, by the noise of the inliers; infinite where they leave it open.
+    """Square root of the trace of the rotation's covariance in radians, by the noise of the inliers, float64 (B,).
 
-    It is the square root of the trace of the rotation's covariance, float64.
+    Infinite where the inliers do not determine the rotation.
     """
     inlier = problem.focal.square() * (judged.weights > 0)
     weights = map_tensors(lambda x: inlier * x, pixel_precision(projection, problem, noise))
@@ -170,9 +171,10 @@ def rotation_sigma(projection: Projection, problem: Problem, noise: Noise, judge
 
 
 def has_focal(projection: Projection, problem: Problem, noise: Noise, weights: Tensor) -> Tensor:
-    """Whether the pairs determine an unknown focal length, to 15 % in standard deviations, bool (B,).
+    """Whether the pairs determine an unknown focal length to a standard deviation of 15 %, bool (B,).
 
-    Two standard deviations are then the 30 % of the distance beyond which a pose is far off. The weights are final.
+    Two standard deviations are then the 30 % of the distance beyond which a pose is far off. ``weights`` are the final
+    weights of the pairs.
     """
     projection, problem, noise = map_tensors(torch.Tensor.detach, (projection, problem, noise))
     weights = weights.detach()

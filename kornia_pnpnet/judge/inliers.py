@@ -1,4 +1,4 @@
-r"""Which pairs are inliers of a pose, and how many of them chance would give it.
+r"""Which pairs are inliers of a pose, and whether the pose could have them by chance.
 
 A pair is an inlier of a pose when :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`, with the threshold :math:`\tau` in
 pixels and the pixels by which a shift of the world point by the threshold :math:`\omega` moves its projection at the
@@ -26,13 +26,14 @@ __all__ = ["MAX_ERROR", "MAX_FALSE_ALARMS", "Judged", "Thresholds", "judge", "lo
 MAX_ERROR = 1e6
 #: A pose is evident when fewer poses than this are expected to have as many inliers by chance.
 MAX_FALSE_ALARMS = 0.01
-# Pairs. Of more pairs, as many that are spread evenly stand for all in `_chance_by_others`.
+# Largest number of pairs, spread evenly over all, that `_chance_by_others` compares.
 _MOST_OTHERS = 64
 # Hits that are ignored, because pixels of inliers can coincide.
 _FEW_HITS = 4
-# Radii of the disc of the worst inlier. Nearer outliers say nothing about chance: they are pairs that are slightly off,
-# or inliers where the caller's sigmas are too small. Tuned on synthetic problems (`pnpnet-set`, seed 9101) with sigmas
-# that are half of the noise: ten radii refuse many more right poses, thirty accept more wrong ones.
+# Ratio of the residual of an outlier to that of the worst inlier. Outliers of smaller ratios say nothing about chance:
+# they are inliers where the caller's sigmas are too small, or near misses. Tuned on synthetic problems (`pnpnet-set`, seed
+# 9101) with sigmas that are half of the noise: 10 refuses many more poses within the limits, 30 accepts more poses that
+# are far off.
 _REACH = 20.0
 
 
@@ -43,8 +44,8 @@ class Thresholds(NamedTuple):
         img: :math:`\tau` in pixels of the problem, shape :math:`(B, 1)` or :math:`(B, N)`.
         world: :math:`\omega` in units of the problem's world, shape :math:`(B, 1)` or :math:`(B, N)`.
         precision: the matrix by which the squared length of a residual is 1 at the threshold, entries :math:`(B, N)`;
-            ``None``: that of :math:`\tau` and :math:`\omega`. A disc of the same area stands for its ellipse where
-            the chance of an inlier is estimated.
+            ``None``: the matrix follows from :math:`\tau` and :math:`\omega`. The chance of an inlier is estimated by
+            a disc of the same area as its ellipse.
     """
 
     img: Tensor
@@ -78,7 +79,7 @@ class Judged(NamedTuple):
 
 
 def judge(projection: Projection, problem: Problem, thresholds: Thresholds) -> Judged:
-    """Tell which pairs are inliers of a pose, and how precise the inliers are. Pairs without weight are no inliers.
+    """Find the inliers of a pose, and their precision. Pairs without weight are no inliers.
 
     Example:
         >>> from kornia_pnpnet.problem import State
@@ -106,9 +107,9 @@ def log_false_alarms(
 
     Three pairs give a pose, which leaves :math:`\binom{c - 3}{k - 3}` ways to choose the other inliers. Each of them is
     an inlier by chance with the probability :math:`p`, and every tested pose is another chance. So the expected number
-    of such poses is at most :math:`T \binom{c-3}{k-3} p^{k-3}`. An unknown focal length takes a fourth pair.
+    of such poses is at most :math:`T \binom{c-3}{k-3} p^{k-3}`. With an unknown focal length four pairs give a pose.
 
-    The probability is the largest of three estimates, from the image, from the outliers and from other pairs.
+    The probability :math:`p` is the largest of three estimates: from the image, from the outliers and from other pairs.
 
     Source: L. Moisan and B. Stival, "A probabilistic criterion to detect rigid point matches between two images and
     estimate the fundamental matrix", IJCV 57(3), 2004; P. Moulon, P. Monasse and R. Marlet, "Adaptive structure from
@@ -139,16 +140,16 @@ def log_false_alarms(
 def _chance_by_place(problem: Problem, thresholds: Thresholds, judged: Judged) -> Tensor:
     r"""Probability that an outlier fits by chance as well as the worst inlier does, at most 1, (B,).
 
-    *The image.* The pixel of an outlier is uniform in the smallest axis-parallel box around the pixels. It fits when it
-    falls into the disc around a projection whose radius is the worst inlier's share of its threshold. The chance is the
-    smaller of two shares: that of the disc's area in the box's, and that of the disc's diameter in the shorter side.
-    The mean over the inliers counts.
+    *The image.* The pixel of an outlier is uniform in the smallest axis-parallel box around the pixels. The pixel fits
+    when it falls into a disc around the projection, whose standardised radius is the residual of the worst inlier. The
+    chance is the ratio of the areas of disc and box, or the ratio of the disc's diameter to the shorter side of the box
+    if this is smaller; then its mean over the inliers.
 
-    *The outliers.* A wrong pose that brings all points near their pixels has more inliers than independent pixels would
-    give it. Points behind the camera, for example, have such poses. The outliers then lie close to their projections.
-    The chance is the share of the pairs (without the three that give the pose) that are outliers within a larger disc,
-    times the ratio of the areas of both discs. The larger disc is at least twenty times as wide and holds at least two
-    outliers; the one with the largest chance counts.
+    *The outliers.* A pose that is far off but brings all points near their pixels has more inliers than independent
+    pixels would give it. Points behind the camera, for example, have such poses. The outliers then lie close to their
+    projections. The chance is the share of the pairs (without the three that give the pose) that are outliers within a
+    larger disc, times the ratio of the areas of both discs. The larger disc is at least twenty times as wide and holds
+    at least two outliers; of all such discs the one with the largest chance is taken.
     """
     there, inlier = problem.weights > 0, judged.weights > 0
     high = torch.where(there[..., None], problem.places, -torch.inf).amax(1)
@@ -171,10 +172,10 @@ def _chance_by_place(problem: Problem, thresholds: Thresholds, judged: Judged) -
 
 
 def _chance_by_others(projection: Projection, problem: Problem, thresholds: Thresholds, judged: Judged) -> Tensor:
-    """Share of other pairs' pixels that are as near to a point's projection as the worst inlier's pixel to its own.
+    """Probability that the pixel of another pair is as close to a projection as the pixel of the worst inlier is, (B,).
 
-    Pixels are not uniform: many outliers may have the same pixel, and a pose from which all points are seen in a small
-    part of the image finds many pixels there. At most 1, (B,).
+    Pixels are not uniform: many outliers may have the same pixel, and a pose that projects all points into a small part
+    of the image finds many pixels there.
     """
     there = problem.weights > 0
     worst = torch.where(judged.weights > 0, judged.errors, 0.0).amax(-1, keepdim=True)

@@ -1,4 +1,4 @@
-r"""The one place where noise becomes information: the precision of each pixel, and what the residuals say of it."""
+r"""The one place where noise becomes information: the precision of each pixel, and its correction by the residuals."""
 
 from __future__ import annotations
 
@@ -27,39 +27,38 @@ __all__ = [
     "sq_standardised",
 ]
 
-# Logarithm of a likelihood ratio. The residuals' own variance factor replaces 1 where it is e³ times as likely.
+# Logarithm of a likelihood ratio. A variance factor that the residuals show replaces 1 where it is e³ times as likely.
 _BELIEVED = 3.0
-# Exponents of 4: variance factors that are compared before. Noise above the estimate needs them: a kernel that is too
-# narrow hides it.
+# Exponents of 4: the variance factors of noise above the estimate. A kernel that is too narrow hides such noise.
 _FACTORS = range(8)
-# Powers of the confidence that the standard deviation of the noise may be proportional to, and the variance factors at
-# which they are compared: noise of the geometric mean's confidence may be below the estimate.
+# The standard deviation of the noise may be proportional to one of these powers of the confidence. The powers are
+# compared at variance factors of these exponents of 4.
 _POWERS = (0.0, -1.0, -2.0, -3.0)
 _POWER_FACTORS = range(-5, 8)
-# Lower confidences count as this much, so that the pair keeps some weight.
+# Lower confidences are raised to this, so that the pair keeps some weight.
 _LEAST_CONFIDENCE = 0.05
-# Share of the pairs that are inliers above which the noise may depend on the confidence.
+# The noise may depend on the confidence only where a larger share of the pairs are inliers.
 _MOST = 0.5
-# Rounds of expectation and maximisation for the share of the inliers at each factor; bounds of the share.
+# Rounds of expectation and maximisation for the share of the inliers at each factor; lower bound of this share.
 _ROUNDS, _LEAST_SHARE = 2, 0.02
 # The smallest variance factor: residuals of exact data would give 0.
 _LEAST_FACTOR = 1e-4
-#: The iterations multiply a variance factor below 1 by this: where the noise is known so well, a kernel of a third of
-#: the width separates inliers from near misses better. Tuned with the weights of `pnpnet-set`, on synthetic problems.
+#: The iterations multiply a variance factor below 1 by this: a kernel of a third of the width separates inliers from
+#: near misses better. Tuned with the weights of `pnpnet-set`, on synthetic problems.
 NARROWER = 0.1
 
-# Standard deviations that the residuals show, relative to the estimate. Nearer ones are within the reach of the
-# iterations by residual; from here on these start too far from the minimum.
+# Ratio of the standard deviation that the residuals show to its estimate. Iterations by residual correct smaller
+# ratios; with larger ones they start too far from the minimum.
 _LARGER = 4.0
 # A pair is an inlier if its final weight is at least this fraction of its initial weight.
 _INLIER = 0.25
-# Inliers. The residuals of fewer say little of a pose that was fitted to them: solved again with the noise that they
-# show, problems of 6 to 9 pairs are right as often as before (seeds 3117 and 3120 of SyntheticProblems).
+# The residuals of fewer inliers than this say little of a pose that was fitted to them: with 6 to 9 pairs a second
+# solution by their noise succeeds as often as the first (seeds 3117 and 3120 of SyntheticProblems).
 _FEWEST = 7
-# The poses of the fit are closer to the pixels than the true pose is.
+# Ratio of the residuals at the true pose to the residuals at the pose that was fitted to them.
 _FITTED = 1.1
-# With confidences, sigmas fall with this power of them: on keypoints of networks it lies near 1, and more is better
-# where low confidences are outliers.
+# Sigmas are proportional to the inverse of this power of the confidences. On keypoints of networks the power is near 1;
+# a larger one is better where pairs of low confidence are outliers.
 _POWER = 1.5
 # Median of the length of a residual of unit variance in both coordinates.
 _MEDIAN = math.sqrt(2.0 * math.log(2.0))
@@ -69,7 +68,10 @@ KernelWeight: TypeAlias = Callable[[Tensor, Tensor], Tensor]
 
 
 def complete_noise(problem: Problem, starts: Starts) -> Noise | None:
-    """Covariances of the caller, sigmas of the initialiser or the caller with 0 where unknown; ``None``: neither."""
+    """Noise of every pair: sigmas of the initialiser, or the caller's with 0 where unknown; covariances of the caller.
+
+    ``None`` where neither knows any noise.
+    """
     noise = starts.noise
     if noise is None and problem.noise is not None:
         noise = map_tensors(lambda x: x.nan_to_num(0.0), problem.noise)
@@ -81,7 +83,7 @@ def complete_noise(problem: Problem, starts: Starts) -> Noise | None:
 
 
 def is_unknown(problem: Problem) -> Tensor:
-    """Problems of which the caller gave neither sigma for any pair, bool (B, 1)."""
+    """Problems for which the caller gave no sigma, neither of a pixel nor of a point, bool (B, 1)."""
     known = torch.zeros_like(problem.weights[:, :1], dtype=torch.bool)
     for sigma in () if problem.noise is None else problem.noise.sigmas[:2]:
         known = known | sigma.isfinite().any(1, keepdim=True)
@@ -101,8 +103,8 @@ def sq_standardised(projection: Projection, problem: Problem, most: Tensor) -> T
     Args:
         projection: the points at a state.
         problem: the problem; its noise is known for every pair or for none.
-        most: square pixels, a scalar or (B, 1). Larger squared residuals count as this much, and so does a point behind
-            the camera. With covariances these square pixels have the mean precision of both coordinates.
+        most: upper bound of a squared residual and its value behind the camera, in square pixels, a scalar or (B, 1).
+            With covariances these square pixels have the mean precision of both coordinates.
 
     Returns:
         Shape :math:`(B, N)`.
@@ -150,12 +152,12 @@ def corrected_noise(
         problem: the problem; its noise is known for every pair, its weights are at most about 1.
         kernel_weight: the robust kernel's weight, at most 1.
         shape: shape of the kernel, a scale.
-        outlier_area: see :func:`outlier_area`, 0 where the caller gave the noise, (B, 1).
+        outlier_area: See :func:`outlier_area`, 0 where the caller gave the noise, (B, 1).
         narrower: multiplies a variance factor below 1.
 
     Returns:
-        The noise, with sigmas no smaller than estimated, and a factor for the shape of the kernel, at most 1, (B, 1):
-        smaller noise only makes the kernel narrower.
+        The noise, with sigmas at least as large as estimated, and a factor of the kernel's shape, at most 1, (B, 1).
+        Noise below the estimate makes only the kernel narrower.
     """
     noise = problem.noise
     assert noise is not None
@@ -175,13 +177,13 @@ def corrected_noise(
 def larger_sigma(projection: Projection, problem: Problem, estimate: Noise, inlier_weights: Tensor) -> Tensor:
     """Standard deviation of the pixels that the inliers show, where it is much larger than estimated, else 0.
 
-    Where confidences are given, the sigmas of a problem differ between its pairs, around the same mean.
+    With confidences, pairs of low confidence get larger sigmas than others.
 
     Args:
         projection: the points at the pose that was found.
         problem: the problem.
         estimate: the estimated noise.
-        inlier_weights: final weight of each pair relative to that before its residual was looked at, :math:`(B, N)`.
+        inlier_weights: final weight of each pair relative to its weight before the refinement, :math:`(B, N)`.
 
     Returns:
         In pixels of the problem, shape :math:`(B, N)`.
@@ -204,7 +206,7 @@ def larger_sigma(projection: Projection, problem: Problem, estimate: Noise, inli
 
 
 def outlier_area(problem: Problem) -> Tensor:
-    """Area in which pixels of outliers lie: that of a square with the variance of the usual pixels, in px², (B, 1)."""
+    """Area in which pixels of outliers lie: a square with the variance of the usual pixels, in px², (B, 1)."""
     there = (problem.usual_weights > 0).to(problem.weights)[..., None]
     share = there / there.sum(1, keepdim=True).clamp(min=1.0)
     places = problem.places.detach()
@@ -222,13 +224,15 @@ def _variance_factor(
     outlier_area: Tensor,
     narrower: float,
 ) -> Tensor:
-    r"""Factor by which the residuals say that the variance of the noise differs from its estimate, (B, 1).
+    r"""Ratio of the variance that the residuals show to the estimated variance, (B, 1).
 
-    First from above: inliers have Gaussian residuals with the variance times a factor, outliers have pixels anywhere in
-    an area. The factor among powers of 4 with the largest likelihood replaces 1 where it is :math:`e^3` times as
-    likely; the share of inliers is estimated for each, and the three pairs that any pose fits do not count. Then the a
-    posteriori variance factor of an adjustment may lower it: the weighted sum of squared residuals by the degrees of
-    freedom, of the pairs deep within the kernel, where its likelihood ratio against 1 is beyond chance.
+    Noise above the estimate: inliers have Gaussian residuals with the variance times a factor, outliers have pixels
+    anywhere in an area. The power of 4 with the largest likelihood replaces 1 where it is :math:`e^3` times as likely.
+    The share of inliers is estimated for each factor, and the three pairs that any pose fits do not count.
+
+    Noise below the estimate: the a posteriori variance factor of an adjustment, which is the weighted sum of squared
+    residuals over the degrees of freedom, of the pairs deep within the kernel. It replaces 1 where its likelihood ratio
+    is beyond chance.
     """
     there = weights > 0
     with torch.no_grad():
@@ -249,7 +253,7 @@ def _variance_factor(
 
 
 def _powers_of_4(exponents: range, like: Tensor) -> Tensor:
-    """Powers (F,), made on the device: a copy from the CPU cannot be captured in a CUDA graph."""
+    """Powers of 4, (F,), made on the device: a CUDA graph cannot capture a copy from the CPU."""
     return 4.0 ** torch.arange(exponents.start, exponents.stop, dtype=like.dtype, device=like.device)
 
 
@@ -261,7 +265,7 @@ def _log_likelihoods(
     outlier_area: Tensor,
     exponents: range,
 ) -> tuple[Tensor, Tensor]:
-    """Log-likelihood of the residuals at each variance factor and the number of inliers, (F, B) each."""
+    """Log-likelihood of the residuals at each variance factor, and the number of inliers, (F, B) each."""
     grid = _powers_of_4(exponents, sq_residual)
     # Densities of a pixel, relative to that of an inlier without a residual whose factor is 1.
     inlier = torch.exp(sq_residual * (-0.5 / grid)[:, None, None]) * in_front / grid[:, None, None]
@@ -279,12 +283,12 @@ def _log_likelihoods(
 def _information_factor(
     sq_residual: Tensor, precision: Tensor, projection: Projection, problem: Problem, outlier_area: Tensor
 ) -> Tensor:
-    r"""Factor of each pair's precision where the residuals say that noise grows as the confidence falls, (B, N).
+    r"""Factor of each pair's precision where the residuals show that noise grows as the confidence falls, (B, N).
 
-    The keypoints of a network are often less accurate where it is less sure; a matcher's ratio says nothing of the
-    noise. So the standard deviation may be proportional to a power of the confidence, or independent of it. A power
-    replaces 0 where it is :math:`e^3` times as likely, by the mixture of :func:`_log_likelihoods`, and most pairs are
-    inliers: among many outliers, near misses would pass for noisy inliers.
+    The keypoints of a network are often less accurate where their confidence is low, but a matcher's ratio says nothing
+    of the noise. So the standard deviation is proportional to a power of the confidence, or independent of it. A power
+    replaces 0 where it is :math:`e^3` times as likely by the mixture of :func:`_log_likelihoods`, and most pairs are
+    inliers. Among many outliers, near misses would pass for noisy inliers.
     """
     assert problem.confidence is not None
     there = problem.weights > 0

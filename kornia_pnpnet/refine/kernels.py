@@ -19,7 +19,7 @@ from torch import Tensor
 
 __all__ = ["KERNELS", "POWER_FLOOR", "RobustKernel"]
 
-#: Pixels. Smaller residuals count as this in ``power``, whose weight would be infinite at 0.
+#: Pixels. Added to residuals (in squares) in ``power``, whose weight would be infinite at 0.
 POWER_FLOOR = 0.1
 
 

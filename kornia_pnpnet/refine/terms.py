@@ -21,16 +21,15 @@ from kornia_pnpnet.result import Pose, PosePrior
 
 __all__ = ["CameraTerm", "PoseTerm", "add_term", "gravity_prior"]
 
-# Eigenvalues of an information below this fraction count as 0: nothing is known in that direction.
+# An eigenvalue of an information below this fraction counts as 0: nothing is known in its direction.
 _KNOWN = 1e-5
 # Standard deviations: scale of the robust kernel unless the caller gave one.
 _SCALE = 3.0
-# Rotations further off count as this far (1 + the cosine of the angle).
+# Least value of 1 plus the cosine of the angle to the prior's rotation, by which the tangent vector is divided.
 _LEAST_DENOMINATOR = 1e-4
-# Standard deviation of a coefficient of radial distortion before any pair is looked at; it keeps those that no pair
-# determines near 0.
+# Prior standard deviation of a coefficient of radial distortion; it keeps a coefficient near 0 that no pair determines.
 _RADIAL = 0.15
-# Matrices whose eigenvalues a graphics processor finds at once.
+# Largest number of matrices whose eigenvalues cuSOLVER finds in one call; it fails for a hundred thousand.
 _MOST_MATRICES = 10_000
 
 
@@ -125,7 +124,7 @@ class CameraTerm(NamedTuple):
         return (linear.information.diagonal(dim1=1, dim2=2) * linear.residual.square()).sum(1)
 
     def disagreement(self, pose: Pose) -> Tensor:
-        """A focal length says nothing of a pose."""
+        """See Term. A focal length says nothing of a pose."""
         return torch.zeros_like(pose.translation[..., 0])
 
 
@@ -135,10 +134,10 @@ class PoseTerm(NamedTuple):
     Attributes:
         pose: the expected pose.
         information: its inverse covariance, shape :math:`(B, 6, 6)`.
-        offset: the centroid of the world in lengths of the problem, shape :math:`(B, 3)`: shifts of the pose are those
-            of the caller's world.
-        free: axis in the camera about which turns are open although the other turns are known, else 0,
-            shape :math:`(B, 3)`.
+        offset: the centroid of the world in lengths of the problem, shape :math:`(B, 3)`, because the prior's shifts
+            are those of the caller's world.
+        free: the one axis in the camera about which turns are unknown; 0 where there is no such axis, shape
+            :math:`(B, 3)`.
         sq_scale: squared scale of the robust kernel, in squared standard deviations, shape :math:`(B,)`.
         rank: number of known directions, shape :math:`(B,)`.
     """
@@ -160,8 +159,8 @@ class PoseTerm(NamedTuple):
             scale: factor of world lengths, (B,).
 
         Returns:
-            The term, and whether the prior is possible, bool (B,): finite, its information symmetric and positive
-            semi-definite. An impossible prior says nothing.
+            The term, and whether the prior is possible, bool (B,): its numbers are finite and its information is
+            symmetric and positive semi-definite. The information of an impossible prior becomes 0.
         """
         usable = _is_usable(prior)
         eye = torch.eye(3, dtype=centroid.dtype, device=centroid.device)
@@ -192,12 +191,12 @@ class PoseTerm(NamedTuple):
             pose: poses, :math:`(B, 3, 3)` and :math:`(B, 3)`.
 
         Returns:
-            :math:`(\omega, v)` of :func:`~kornia_pnpnet.refine.residual.retract`, :math:`(B, 6)`, where turns about an
-            axis of which the prior knows nothing are left out; the squared length, :math:`(B,)`.
+            :math:`(\omega, v)` of :func:`~kornia_pnpnet.refine.residual.retract` without turns about ``free``,
+            :math:`(B, 6)`; the squared length, :math:`(B,)`.
         """
         turn = self.pose.rotation @ pose.rotation.mT
-        # Where the information leaves turns about an axis open, the nearest of all poses that it allows. There the
-        # error has no derivative by this angle.
+        # Turn the prior's pose about its free axis to the angle nearest to the pose. The error has no derivative by
+        # this angle.
         free, fixed = self.free, turn.detach()
         along = fixed.diagonal(dim1=-2, dim2=-1).sum(-1) - (free * (fixed @ free[..., None])[..., 0]).sum(-1)
         around = -(free * So3.vee(fixed - fixed.mT)).sum(-1)
@@ -236,7 +235,7 @@ class PoseTerm(NamedTuple):
         return torch.where(self.sq_scale.isinf(), square, -scale * torch.expm1(-square / scale))
 
     def disagreement(self, pose: Pose) -> Tensor:
-        """Loss of poses in pairs: a prior of two known directions counts as one pair."""
+        """See Term. A prior of two known directions counts as one pair."""
         scale = torch.where(self.sq_scale.isinf(), _SCALE**2 * self.rank.clamp(min=1.0), self.sq_scale)
         return -0.5 * self.rank * torch.expm1(-self.errors(pose)[1] / scale)
 
@@ -253,7 +252,7 @@ def _is_usable(prior: PosePrior) -> Tensor:
 
 
 def _open_axis(information: Tensor) -> Tensor:
-    """The axis (B, 3) about which turns are open where both other axes are known, else 0."""
+    """The axis (B, 3) about which turns are unknown while turns about both other axes are known, else 0."""
     eigenvalues = _eigenvalues(information.detach().double())
     least, middle, largest = eigenvalues.unbind(-1)
     is_open = (least < _KNOWN * largest) & (middle > _KNOWN * largest)
@@ -279,6 +278,6 @@ def _correlations(information: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _eigenvalues(matrix: Tensor) -> Tensor:
-    """Eigenvalues of symmetric matrices, ascending. cuSOLVER fails for a hundred thousand of them at once."""
+    """Eigenvalues of symmetric matrices, ascending."""
     whole = matrix.device.type == "cpu" or compiling()
     return torch.cat([torch.linalg.eigvalsh(part) for part in ([matrix] if whole else matrix.split(_MOST_MATRICES))])
