@@ -172,7 +172,7 @@ class Problem(NamedTuple):
         return self.img_points if self.rig is None else self.rays(self.img_points / self.focal)
 
     def rays(self, plane_points: Tensor) -> Tensor:
-        """Rays of points on the planes z = 1 of a rig's cameras, as long as the focal length, in its frame, (B, N, 3)."""
+        """Rays in the frame of a rig, as long as the focal length, of points on the planes z = 1, (B, N, 3)."""
         assert self.rig is not None
         rays = torch.cat((plane_points, torch.ones_like(plane_points[..., :1])), -1)
         rays = self.focal * torch.nn.functional.normalize(rays, dim=-1)

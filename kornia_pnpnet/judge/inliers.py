@@ -31,9 +31,9 @@ _MOST_OTHERS = 64
 # Hits that are ignored, because pixels of inliers can coincide.
 _FEW_HITS = 4
 # Ratio of the residual of an outlier to that of the worst inlier. Outliers of smaller ratios say nothing about chance:
-# they are inliers where the caller's sigmas are too small, or near misses. Tuned on synthetic problems (`pnpnet-set`, seed
-# 9101) with sigmas that are half of the noise: 10 refuses many more poses within the limits, 30 accepts more poses that
-# are far off.
+# they are near misses, or inliers where the caller's sigmas are too small. Tuned on synthetic problems (`pnpnet-set`,
+# seed 9101) with sigmas that are half of the noise: 10 refuses many more poses within the limits, 30 accepts more poses
+# that are far off.
 _REACH = 20.0
 
 
