@@ -296,9 +296,9 @@ class PnPNet(PretrainedMixin):
 
     def _solve(self, inputs: Inputs, call: _Call) -> PnPResult:
         """Problem, attempts, judge: a first attempt for all problems, further ones for those that ask for them."""
-        given = inputs
         inputs, nominal = self._with_camera(inputs)
-        attempt = self._attempt(inputs, call, more=_MORE_ITERATIONS if nominal or self.radial else 0)
+        more = _MORE_ITERATIONS if nominal or self.radial else 0
+        attempt = self._attempt(inputs, call, more)
         result = attempt.result
         if self._adapts(inputs, call):
             if nominal:
@@ -312,7 +312,8 @@ class PnPNet(PretrainedMixin):
                 rows = (sigma[:, 0] > 0).nonzero()[:, 0]
                 if len(rows):
                     noise = Noise(sigma[rows], torch.zeros_like(sigma[rows]))
-                    result = put(result, rows, self._solve(take(given, rows)._replace(noise=noise), call))
+                    again = self._attempt(take(inputs, rows)._replace(noise=noise), call, more).result
+                    result = put(result, rows, again)
         return self._with_alternatives(attempt, result, call.alternatives) if call.alternatives else result
 
     def _with_camera(self, inputs: Inputs) -> tuple[Inputs, bool]:

@@ -15,7 +15,6 @@ from kornia_pnpnet.problem import LEAST_NOISE, MIN_PAIRS, Noise, Problem, Starts
 from kornia_pnpnet.refine.residual import Projection, pixel_covariance, pixel_variance
 
 __all__ = [
-    "NARROWER",
     "KernelWeight",
     "complete_noise",
     "corrected_noise",
@@ -43,10 +42,6 @@ _MOST = 0.5
 _ROUNDS, _LEAST_SHARE = 2, 0.02
 # The smallest variance factor: residuals of exact data would give 0.
 _LEAST_FACTOR = 1e-4
-#: The iterations multiply a variance factor below 1 by this: a kernel of a third of the width separates inliers from
-#: near misses better. Tuned with the weights of `pnpnet-set`, on synthetic problems.
-NARROWER = 0.1
-
 # Ratio of the standard deviation that the residuals show to its estimate. Iterations by residual correct smaller
 # ratios; with larger ones they start too far from the minimum.
 _LARGER = 4.0
@@ -138,14 +133,17 @@ def information(projection: Projection, problem: Problem) -> tuple[Tensor, Tenso
 
 
 def corrected_noise(
-    projection: Projection,
-    problem: Problem,
-    kernel_weight: KernelWeight,
-    shape: Tensor,
-    outlier_area: Tensor,
-    narrower: float = 1.0,
+    projection: Projection, problem: Problem, kernel_weight: KernelWeight, shape: Tensor, outlier_area: Tensor
 ) -> tuple[Noise, Tensor]:
-    """The noise that the residuals show, where an initialiser estimated it.
+    r"""The noise that the residuals show, where an initialiser estimated it.
+
+    Noise above the estimate: inliers have Gaussian residuals with the variance times a factor, outliers have pixels
+    anywhere in an area. The power of 4 with the largest likelihood replaces 1 where it is :math:`e^3` times as likely.
+    The share of inliers is estimated for each factor, and the three pairs that any pose fits do not count.
+
+    Noise below the estimate: the a posteriori variance factor of an adjustment, which is the weighted sum of squared
+    residuals over the degrees of freedom, of the pairs deep within the kernel. It replaces 1 where its likelihood ratio
+    is beyond chance.
 
     Args:
         projection: the points at a state.
@@ -153,22 +151,33 @@ def corrected_noise(
         kernel_weight: the robust kernel's weight, at most 1.
         shape: shape of the kernel, a scale.
         outlier_area: See :func:`outlier_area`, 0 where the caller gave the noise, (B, 1).
-        narrower: multiplies a variance factor below 1.
 
     Returns:
         The noise, with sigmas at least as large as estimated, and a factor of the kernel's shape, at most 1, (B, 1).
         Noise below the estimate makes only the kernel narrower.
     """
-    noise = problem.noise
+    noise, weights, area = problem.noise, problem.weights, outlier_area
     assert noise is not None
     sq_residual, precision = information(projection, problem)
     assert isinstance(precision, Tensor)
     if problem.confidence is not None:
-        factor = _information_factor(sq_residual, precision, projection, problem, outlier_area)
+        factor = _information_factor(sq_residual, precision, projection, problem, area)
         sq_residual, precision = sq_residual * factor, precision * factor
         noise = map_tensors(lambda sigma: sigma * factor.rsqrt(), noise)
-    seen = sq_residual, precision, projection, problem.weights
-    variance = _variance_factor(*seen, kernel_weight, shape, outlier_area, narrower)
+    with torch.no_grad():
+        there = weights > 0
+        likelihood, _ = _log_likelihoods(sq_residual, precision, projection.in_front & there, there, area, _FACTORS)
+        best = likelihood.max(0)
+        believed = (area[:, 0] > 0) & (best.values > likelihood[0] + _BELIEVED)
+        above = torch.where(believed, _powers_of_4(_FACTORS, sq_residual)[best.indices], 1.0)[:, None]
+    sq_residual = sq_residual / above
+    within = torch.where(projection.in_front, kernel_weight(sq_residual, shape), 0.0)
+    deep = weights * within.square().square()
+    freedom = (2.0 * deep.sum(-1, keepdim=True) - 6.0).clamp(min=1.0)
+    below = ((deep * sq_residual).sum(-1, keepdim=True) / freedom).clamp(min=_LEAST_FACTOR)
+    log_ratio = 0.5 * freedom * (below - 1.0 - below.log())
+    lowered = (area > 0) & (below < 1.0) & (log_ratio > _BELIEVED)
+    variance = above * torch.where(lowered, below, 1.0)
     larger = variance.detach().clamp(min=1.0).sqrt()
     return map_tensors(lambda sigma: larger * sigma, noise), variance.clamp(max=1.0).sqrt()
 
@@ -212,44 +221,6 @@ def outlier_area(problem: Problem) -> Tensor:
     places = problem.places.detach()
     variance = (share * (places - (share * places).sum(1, keepdim=True)).square()).sum((1, 2))[:, None]
     return 6.0 * variance + torch.finfo(variance.dtype).tiny
-
-
-def _variance_factor(
-    sq_residual: Tensor,
-    precision: Tensor,
-    projection: Projection,
-    weights: Tensor,
-    kernel_weight: KernelWeight,
-    shape: Tensor,
-    outlier_area: Tensor,
-    narrower: float,
-) -> Tensor:
-    r"""Ratio of the variance that the residuals show to the estimated variance, (B, 1).
-
-    Noise above the estimate: inliers have Gaussian residuals with the variance times a factor, outliers have pixels
-    anywhere in an area. The power of 4 with the largest likelihood replaces 1 where it is :math:`e^3` times as likely.
-    The share of inliers is estimated for each factor, and the three pairs that any pose fits do not count.
-
-    Noise below the estimate: the a posteriori variance factor of an adjustment, which is the weighted sum of squared
-    residuals over the degrees of freedom, of the pairs deep within the kernel. It replaces 1 where its likelihood ratio
-    is beyond chance.
-    """
-    there = weights > 0
-    with torch.no_grad():
-        likelihood, _ = _log_likelihoods(
-            sq_residual, precision, projection.in_front & there, there, outlier_area, _FACTORS
-        )
-        best = likelihood.max(0)
-        believed = (outlier_area[:, 0] > 0) & (best.values > likelihood[0] + _BELIEVED)
-        above = torch.where(believed, _powers_of_4(_FACTORS, sq_residual)[best.indices], 1.0)[:, None]
-    sq_residual = sq_residual / above
-    within = torch.where(projection.in_front, kernel_weight(sq_residual, shape), 0.0)
-    deep = weights * within.square().square()
-    freedom = (2.0 * deep.sum(-1, keepdim=True) - 6.0).clamp(min=1.0)
-    below = ((deep * sq_residual).sum(-1, keepdim=True) / freedom).clamp(min=_LEAST_FACTOR)
-    log_ratio = 0.5 * freedom * (below - 1.0 - below.log())
-    lowered = (outlier_area > 0) & (below < 1.0) & (log_ratio > _BELIEVED)
-    return above * torch.where(lowered, narrower * below, 1.0)
 
 
 def _powers_of_4(exponents: range, like: Tensor) -> Tensor:
