@@ -7,9 +7,9 @@ processes. A new data source is one more class with ``batch_size`` and ``batch(i
 """
 
 from kornia_pnpnet.data.cameras import CameraProblems
-from kornia_pnpnet.data.colmap import load_colmap, load_matches, load_scene
+from kornia_pnpnet.data.colmap import load_scene
 from kornia_pnpnet.data.mixtures import MixedPoints, MixedProblems, VaryingSize
-from kornia_pnpnet.data.outliers import OutlierDraw, OutlierMix
+from kornia_pnpnet.data.outliers import OutlierKind, OutlierMix
 from kornia_pnpnet.data.points import (
     BoxPoints,
     DrivePoints,
@@ -30,7 +30,7 @@ __all__ = [
     "MixedPoints",
     "MixedProblems",
     "ObjectPoints",
-    "OutlierDraw",
+    "OutlierKind",
     "OutlierMix",
     "PointPrior",
     "RoomPoints",
@@ -40,7 +40,5 @@ __all__ = [
     "SyntheticProblems",
     "VaryingSize",
     "View",
-    "load_colmap",
-    "load_matches",
     "load_scene",
 ]

@@ -12,7 +12,7 @@ from kornia.core.check import KORNIA_CHECK
 from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_whole
-from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.core.trees import map_tensors, take
 from kornia_pnpnet.data.draws import batch_generator, unit
 from kornia_pnpnet.data.points import PointPrior
 from kornia_pnpnet.data.synthetic import SyntheticProblems
@@ -63,7 +63,7 @@ class MixedProblems:
         sizes = [end - start for start, end in pairwise(bounds)]
         made = zip(sources, sizes, strict=True)
         self.sources = [source(batch_size=size, seed=seed, **options) for source, size in made if size]
-        # Sources take turns in proportion to their shares, so that the first problems of a batch are mixed like all.
+        # Sources take turns in proportion to their shares, so that every part of a batch is mixed in the same way.
         turns = [(turn + 0.5) / size for size in sizes for turn in range(size)]
         self._order = torch.tensor(sorted(range(batch_size), key=turns.__getitem__))
 
@@ -71,13 +71,12 @@ class MixedProblems:
         """Draw batch ``index``, at least 0."""
         count = len(self.sources)  # no two sources see the same random numbers
         parts = [source.batch(count * index + i) for i, source in enumerate(self.sources)]
-        covariances = {(part.img_cov is None, part.world_cov is None) for part in parts}
-        KORNIA_CHECK(len(covariances) == 1, "All sources of a mixture must know covariances, or none of them.")
-        for name in ("img_sigma", "world_sigma", "confidence"):
-            parts = _with_known_alike(parts, name)
-        problems = map_tensors(lambda *x: torch.cat(x), *parts)
-        order = self._order.to(problems.inliers.device)
-        return problems.map(lambda x: x[order])
+        with_covariances = sum(part.img_cov is not None for part in parts)
+        KORNIA_CHECK(with_covariances in (0, count), "All sources of a mixture must know covariances, or none of them.")
+        known = {name: _joined(parts, name) for name in ("img_sigma", "world_sigma", "confidence")}
+        others = [part._replace(**dict.fromkeys(known)) for part in parts]
+        problems = map_tensors(lambda *x: torch.cat(x), *others)._replace(**known)
+        return take(problems, self._order.to(problems.inliers.device))
 
 
 def _checked_shares(what: str, count: int, shares: Sequence[float] | None) -> list[float]:
@@ -89,16 +88,17 @@ def _checked_shares(what: str, count: int, shares: Sequence[float] | None) -> li
     return shares
 
 
-def _with_known_alike(parts: list[Problems], name: str) -> list[Problems]:
-    """Parts whose sigmas or confidences have one shape, with NaN for ``None`` unless all are ``None``."""
+def _joined(parts: list[Problems], name: str) -> Tensor | None:
+    """The sigmas or confidences of all parts, (B,) or (B, N); NaN for the parts that know none."""
     known = [getattr(part, name) for part in parts]
     dimensions = max((value.ndim for value in known if value is not None), default=0)
-    for i, part in enumerate(parts if dimensions else ()):
-        if known[i] is None:
-            known[i] = part.world_points.new_full((len(part.inliers),), torch.nan)
-        if known[i].ndim < dimensions:
-            known[i] = known[i][:, None].expand(part.inliers.shape)
-    return [part._replace(**{name: value}) for part, value in zip(parts, known, strict=True)]
+    if not dimensions:
+        return None
+    for i, part in enumerate(parts):
+        shape = part.inliers.shape[:dimensions]
+        value = part.world_points.new_tensor(torch.nan) if known[i] is None else known[i]
+        known[i] = (value[:, None] if value.ndim == 1 < dimensions else value).expand(shape)
+    return torch.cat(known)
 
 
 class MixedPoints:
@@ -167,8 +167,9 @@ class VaryingSize:
         for count in n:
             check_whole(1, n=count, batch_size=batch_size)
         self.batch_size, self.seed = batch_size, seed
-        sizes = {count: max(1, batch_size * min(n) // count) for count in n}
-        self.sources = [source(n=count, batch_size=sizes[count], seed=seed + i) for i, count in enumerate(n)]
+        sizes = [max(1, batch_size * min(n) // count) for count in n]
+        made = enumerate(zip(n, sizes, strict=True))
+        self.sources = [source(n=count, batch_size=size, seed=seed + i) for i, (count, size) in made]
 
     def batch(self, index: int) -> Problems:
         """Draw batch ``index``, at least 0."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from enum import IntEnum
 
 import torch
 from kornia.core.check import KORNIA_CHECK
@@ -14,7 +14,7 @@ from torch.nn.functional import normalize
 from kornia_pnpnet.core.checks import check_numbers, check_ranges, check_whole
 from kornia_pnpnet.data.draws import log_uniform, normal, random_poses, uniform, unit
 
-__all__ = ["OutlierDraw", "OutlierMix", "crowd_leaders", "near_offsets", "structured_points"]
+__all__ = ["OutlierKind", "OutlierMix", "crowd_leaders", "near_offsets", "structured_points"]
 
 # Standard deviations of the pixel noise: the range of a near outlier's distance from its pixel, from just outside the
 # noise to ten times that. With ``near_pixels``, the smallest values of the two ends of its range.
@@ -23,28 +23,18 @@ _NEAR, _LEAST_NEAR = (5.0, 50.0), (5.0, 10.0)
 _SLACK = 0.05
 
 
-class OutlierDraw(NamedTuple):
-    r"""The outliers of a batch, by the kinds of :class:`OutlierMix`: bool, shape :math:`(B, N)` each.
+class OutlierKind(IntEnum):
+    """What a pair is, see :class:`OutlierMix`; the pixels of kinds 1 to 4 are unrelated to their points."""
 
-    A pair has at most one kind. ``of_points``, shape :math:`(B, 1)`, says whether the crowds of a problem share points.
-    """
-
-    mismatch: Tensor
-    sensing: Tensor
-    near: Tensor
-    structured: Tensor
-    crowd: Tensor
-    of_points: Tensor
-
-    @property
-    def displaced(self) -> Tensor:
-        """Pairs whose pixel is unrelated to their point, bool, shape :math:`(B, N)`."""
-        return self.mismatch | self.sensing | self.crowd
-
-    @property
-    def inliers(self) -> Tensor:
-        """Pairs that are no outliers, bool, shape :math:`(B, N)`."""
-        return ~(self.displaced | self.near | self.structured)
+    INLIER = 0
+    MISMATCH = 1
+    SENSING = 2
+    #: A crowd that shares a pixel.
+    CROWD = 3
+    #: A crowd that shares a point.
+    POINT_CROWD = 4
+    NEAR = 5
+    STRUCTURED = 6
 
 
 @dataclass(kw_only=True, eq=False)
@@ -118,17 +108,14 @@ class OutlierMix:
             return self.count
         return max(0, min(math.floor(n * self.max_ratio + _SLACK), n - self.min_inliers))
 
-    def least_count(self, n: int) -> int:
-        """The smallest number of outliers among ``n`` pairs."""
-        return min(self.min_count, self.max_count(n)) if self.count is None else self.count
-
-    def draw(self, batch_size: int, n: int, generator: torch.Generator) -> OutlierDraw:
-        """Draw the outliers of ``batch_size`` problems of ``n`` pairs, on the generator's device.
+    def draw(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
+        """Draw the kinds of the pairs, the values of :class:`OutlierKind`, int64, shape ``(batch_size, n)``.
 
         Raises:
             BaseError: when there are to be more outliers than pairs.
         """
-        least, most = self.least_count(n), self.max_count(n)
+        most = self.max_count(n)
+        least = min(self.min_count, most) if self.count is None else most
         KORNIA_CHECK(most <= n, f"{most} outliers do not fit into n = {n} pairs.")
         device = generator.device
 
@@ -136,33 +123,27 @@ class OutlierMix:
             return torch.rand(batch_size, *shape, generator=generator, device=device)
 
         count = torch.randint(least, most + 1, (batch_size, 1), generator=generator, device=device)
-        order = chance(n).argsort(-1)
-        rank = torch.empty_like(order).scatter_(1, order, torch.arange(n, device=device).expand(batch_size, n))
-        outlier = rank < count
-        mismatch = chance(n) < self.mismatch_share
-        near = structured = crowd = torch.zeros_like(outlier)
-        of_points = crowd[:, :1]
+        rank = chance(n).argsort(-1).argsort(-1)
+        is_open = rank < count  # outliers without a special kind so far
+        kind = is_open * torch.where(chance(n) < self.mismatch_share, OutlierKind.MISMATCH, OutlierKind.SENSING)
         if self.structured_share:
             chosen = chance(1) < self.structured_share
             low, high = self.structured_ratio
             ratio = uniform((batch_size, 1), low, high, generator) if low < high else low
-            structured = outlier & chosen & (rank < ((n - count) * ratio + _SLACK).floor())
-            outlier = outlier & ~structured
+            chosen = is_open & chosen & (rank < ((n - count) * ratio + _SLACK).floor())
+            kind[chosen], is_open = OutlierKind.STRUCTURED, is_open & ~chosen
         if self.near_share:
-            near = outlier & (chance(n) < self.near_share)
-            outlier = outlier & ~near
+            chosen = is_open & (chance(n) < self.near_share)
+            kind[chosen], is_open = OutlierKind.NEAR, is_open & ~chosen
         if self.crowd_share:
             chosen, share = chance(1) < self.crowd_share, chance(1)
-            crowd = outlier & chosen & (chance(n) < share)
-            outlier = outlier & ~crowd
+            kind[is_open & chosen & (chance(n) < share)] = OutlierKind.CROWD
             if self.point_crowd_share:
-                of_points = chance(1) < self.point_crowd_share
-        return OutlierDraw(outlier & mismatch, outlier & ~mismatch, near, structured, crowd, of_points)
+                kind[(kind == OutlierKind.CROWD) & (chance(1) < self.point_crowd_share)] = OutlierKind.POINT_CROWD
+        return kind
 
 
-def near_offsets(
-    img_sigma: Tensor, n: int, generator: torch.Generator, pixels: tuple[float, float] | None = None
-) -> Tensor:
+def near_offsets(img_sigma: Tensor, n: int, generator: torch.Generator, pixels: tuple[float, float] | None) -> Tensor:
     """Draw the offsets in pixels of near outliers, (B, n, 2).
 
     ``img_sigma`` is the noise of the pixels, (B, 1) or (B, n); ``pixels`` is ``near_pixels`` of :class:`OutlierMix`.

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_whole
 from kornia_pnpnet.data.draws import RandomProblems, batch_generator, random_poses, unit
-from kornia_pnpnet.data.outliers import OutlierMix
-from kornia_pnpnet.result import Pose, Problems
+from kornia_pnpnet.data.outliers import OutlierKind, OutlierMix
+from kornia_pnpnet.result import Problems
 
 __all__ = ["Scene", "SceneProblems", "View"]
 
@@ -69,14 +69,6 @@ class View:
         """The observed points in the camera's frame, shape :math:`(M, 3)`."""
         return self.world_points @ self.rotation.mT + self.translation
 
-    @property
-    def reprojection_error_px(self) -> Tensor:
-        """Distance of each pixel to its point's projection, infinite behind the camera, shape :math:`(M,)`."""
-        cam_points = self.cam_points
-        projected = cam_points @ self.intrinsics.mT  # (M, 3)
-        error = (projected[:, :2] / projected[:, 2:] - self.img_points).norm(dim=1)
-        return torch.where(cam_points[:, 2] > 0, error, torch.inf)
-
 
 @dataclass(frozen=True, eq=False)
 class Scene:
@@ -121,7 +113,6 @@ class SceneProblems(RandomProblems):
             have mismatches of their own.
         num_spares: number of spare points per problem. Its mismatches get the pixels of the spare points in turn: with
             the protocol's one spare point all mismatches of a problem share a pixel.
-        recentre: whether to move the world.
         device: device of the batches; numbers are drawn on the CPU and moved.
 
     Raises:
@@ -132,7 +123,6 @@ class SceneProblems(RandomProblems):
     scene: Scene = field(kw_only=False, repr=False)
     outliers: OutlierMix | None = None
     num_spares: int = 1
-    recentre: bool = True
     dtype: torch.dtype = torch.float64
 
     def __post_init__(self) -> None:
@@ -145,18 +135,13 @@ class SceneProblems(RandomProblems):
         need = self.n + self.num_spares
         self.views = views = tuple(view for view in self.scene.views if len(view.world_points) >= need)
         if not views:
-            raise ValueError(
-                f"no image of '{self.scene.name}' has the {need} points for n = {self.n} and "
-                f"num_spares = {self.num_spares}"
-            )
-        self._counts = torch.tensor([len(view.world_points) for view in views])
-        self._starts = self._counts.cumsum(0) - self._counts
-        self._points = torch.cat([view.cam_points if self.recentre else view.world_points for view in views])
-        self._img_points = torch.cat([view.img_points for view in views])
-        self._inliers = torch.cat([view.inliers for view in views])
+            wanted = f"n = {self.n} and num_spares = {self.num_spares}"
+            raise ValueError(f"no image of '{self.scene.name}' has the {need} points for {wanted}")
+        pairs = zip(*((view.cam_points, view.img_points, view.inliers) for view in views), strict=True)
+        self._pairs = [torch.cat(parts) for parts in pairs]
         self._intrinsics = torch.stack([view.intrinsics for view in views])
-        self._poses = Pose(torch.stack([view.rotation for view in views]), torch.stack([v.translation for v in views]))
         self._size = torch.tensor([[view.width, view.height] for view in views], dtype=torch.float64)
+        self._counts = torch.tensor([len(view.world_points) for view in views])
 
     @property
     def max_translation(self) -> float:
@@ -167,21 +152,21 @@ class SceneProblems(RandomProblems):
         generator = batch_generator(self.seed, index)
         # Draws that depend on the outlier options come last.
         view = torch.randint(len(self.views), (self.batch_size,), generator=generator)
-        rows = _choose(self._counts[view], self.n + self.num_spares, generator) + self._starts[view, None]
+        rows = _choose(self._counts[view], self.n + self.num_spares, generator)
+        rows += (self._counts.cumsum(0) - self._counts)[view, None]
         rows, spare_rows = rows[:, : self.n], rows[:, self.n :]  # (B, N), (B, num_spares)
         pose = random_poses(self.batch_size, generator)
         anywhere = unit((self.batch_size, self.n, 2), generator) * self._size[view, None]
-        draw = (self.outliers or OutlierMix(count=0)).draw(self.batch_size, self.n, generator)
+        kind = (self.outliers or OutlierMix(count=0)).draw(self.batch_size, self.n, generator)  # (B, N)
 
-        world_points = self._points[rows]  # (B, N, 3)
-        if self.recentre:
-            world_points = (world_points - pose.translation[:, None]) @ pose.rotation
-        else:
-            pose = Pose(*(x[view] for x in self._poses))
-        turn = (draw.mismatch.cumsum(1) - 1) % self.num_spares  # (B, N), used at mismatches only
-        shown = torch.where(draw.mismatch, spare_rows.gather(1, turn), rows)
-        img_points = torch.where(draw.sensing[..., None], anywhere, self._img_points[shown])
-        return Problems(world_points, img_points, self._intrinsics[view], pose, self._inliers[rows] & draw.inliers)
+        cam_points, img_points, inliers = self._pairs
+        world_points = (cam_points[rows] - pose.translation[:, None]) @ pose.rotation  # (B, N, 3)
+        mismatch = kind == OutlierKind.MISMATCH
+        turn = (mismatch.cumsum(1) - 1) % self.num_spares  # (B, N), used at mismatches only
+        pixels = img_points[torch.where(mismatch, spare_rows.gather(1, turn), rows)]
+        pixels = torch.where((kind == OutlierKind.SENSING)[..., None], anywhere, pixels)
+        inliers = inliers[rows] & (kind == OutlierKind.INLIER)
+        return Problems(world_points, pixels, self._intrinsics[view], pose, inliers)
 
 
 def _choose(counts: Tensor, k: int, generator: torch.Generator) -> Tensor:

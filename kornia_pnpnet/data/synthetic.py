@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -12,19 +13,9 @@ from torch import Tensor
 from torch.nn.functional import normalize, pad
 
 from kornia_pnpnet.core.checks import check_numbers, check_positive
-from kornia_pnpnet.data.draws import (
-    Amount,
-    RandomProblems,
-    batch_generator,
-    check_amount,
-    draw_confidence,
-    draw_noise,
-    hide_sigmas,
-    random_poses,
-    uniform,
-    unit,
-)
-from kornia_pnpnet.data.outliers import OutlierMix, crowd_leaders, near_offsets, structured_points
+from kornia_pnpnet.data.draws import RandomProblems, batch_generator, random_poses, uniform, unit
+from kornia_pnpnet.data.noise import Amount, check_amount, draw_confidence, draw_noise, hide_sigmas
+from kornia_pnpnet.data.outliers import OutlierKind, OutlierMix, crowd_leaders, near_offsets, structured_points
 from kornia_pnpnet.data.points import BoxPoints, PointPrior
 from kornia_pnpnet.result import Problems
 
@@ -117,16 +108,15 @@ class SyntheticProblems(RandomProblems):
         super().__post_init__()
         check_numbers(0.0, translation_box=self.translation_box, max_angle=self.max_angle)
         check_positive(focal=self.focal)
+        optional = {"half_image": self.half_image, "translation_sigma": self.translation_sigma}
+        check_numbers(0.0, **{name: value for name, value in optional.items() if value is not None})
         shares = {name: getattr(self, name) for name in ("known_noise", "confidence_share", "bunched_share")}
         check_numbers(0.0, 1.0, **shares)
-        for name in ("half_image", "translation_sigma"):
-            if getattr(self, name) is not None:
-                check_numbers(0.0, **{name: getattr(self, name)})
+        check_numbers(1.0, _MOST_RATIO, axis_ratio=self.axis_ratio)
         self.img_sigma = check_amount("img_sigma", self.img_sigma)
         self.world_sigma = check_amount("world_sigma", self.world_sigma)
         self.degrees = check_amount("degrees", self.degrees, _LEAST_DEGREES)
         self.sigma_spread = check_amount("sigma_spread", self.sigma_spread, 0.0, _MOST_SPREAD)
-        check_numbers(1.0, _MOST_RATIO, axis_ratio=self.axis_ratio)
         KORNIA_CHECK(
             self.axis_ratio == 1.0 or self.known_noise in (0.0, 1.0),
             f"Covariances are known for all problems or for none, got known_noise={self.known_noise}.",
@@ -134,93 +124,92 @@ class SyntheticProblems(RandomProblems):
 
     def _draw(self, index: int) -> Problems:
         generator = batch_generator(self.seed, index, self.device)
-        size, mix = self.batch_size, self.outliers or OutlierMix(count=0)
+        size, n, mix = self.batch_size, self.n, self.outliers or OutlierMix(count=0)
         box, sigma = self.translation_box, self.translation_sigma
         pose = random_poses(size, generator, translation_box=box, translation_sigma=sigma, max_angle=self.max_angle)
         # Mismatches show other points of the same scene, so both are drawn at once.
-        scene = (self.points or BoxPoints())(size, 2 * self.n, generator)
-        draw = mix.draw(size, self.n, generator)
+        scene = (self.points or BoxPoints())(size, 2 * n, generator)
+        kind = mix.draw(size, n, generator)[..., None]  # (B, N, 1), as all masks below
+        in_crowd = (kind == OutlierKind.CROWD) | (kind == OutlierKind.POINT_CROWD)
+        has_other = (kind == OutlierKind.MISMATCH) | in_crowd
+        is_sensing = kind == OutlierKind.SENSING
         anywhere = self._anywhere(scene, generator)
         if self.bunched_share:
-            scene = _bunched(scene, draw.displaced, self.bunched_share, generator)
+            scene = _bunched(scene, (has_other | is_sensing)[..., 0], self.bunched_share, generator)
         cam_points, other_points = scene.chunk(2, 1)
 
         world_points = (cam_points - pose.translation[:, None]) @ pose.rotation
-        noise_options: dict[str, Any] = {"spread": self.sigma_spread, "axis_ratio": self.axis_ratio}
-        noise, world_sigma, world_cov = draw_noise(world_points.shape, self.world_sigma, generator, **noise_options)
+        noise_of = partial(draw_noise, generator=generator, spread=self.sigma_spread, axis_ratio=self.axis_ratio)
+        noise, world_sigma, world_cov = noise_of(world_points.shape, self.world_sigma)
         world_points += noise
-        shown = torch.where((draw.mismatch | draw.crowd)[..., None], other_points, cam_points)
+        shown = torch.where(has_other, other_points, cam_points)
         if mix.structured_share:
             moved = structured_points(cam_points, mix, generator)
-            shown = torch.where(draw.structured[..., None], moved, shown)
+            shown = torch.where(kind == OutlierKind.STRUCTURED, moved, shown)
         # A point that is not in front of the camera has no pixel: its pair is an outlier.
-        behind = ~_is_in_front(shown)
-        shown = torch.where(behind[..., None], torch.ones_like(shown), shown)
+        in_front = _is_in_front(shown)
+        shown = torch.where(in_front, shown, 1.0)
         img_points = self.focal * shown[..., :2] / shown[..., 2:]
-        img_points = torch.where((draw.sensing | behind)[..., None], anywhere, img_points)
-        noise_options["degrees"] = self.degrees
-        noise, img_sigma, img_cov = draw_noise(img_points.shape, self.img_sigma, generator, **noise_options)
+        img_points = torch.where(is_sensing | ~in_front, anywhere, img_points)
+        noise, img_sigma, img_cov = noise_of(img_points.shape, self.img_sigma, degrees=self.degrees)
         img_points += noise
         length = noise.norm(dim=-1)
-        inliers = draw.inliers & ~behind
+        inliers = ((kind == OutlierKind.INLIER) & in_front)[..., 0]
         if self.degrees:
             inliers &= length <= _MOST_NOISE * img_sigma
         if mix.near_share:
-            offsets = near_offsets(img_sigma, self.n, generator, mix.near_pixels)
-            img_points += torch.where(draw.near[..., None], offsets, 0.0)
+            offsets = near_offsets(img_sigma, n, generator, mix.near_pixels)
+            img_points += torch.where(kind == OutlierKind.NEAR, offsets, 0.0)
         if mix.crowd_share:
-            leader = crowd_leaders(size, self.n, mix.max_crowds, generator)[..., None]
+            leader = crowd_leaders(size, n, mix.max_crowds, generator)[..., None]
             pixels, points = img_points.take_along_dim(leader, 1), world_points.take_along_dim(leader, 1)
-            img_points = torch.where((draw.crowd & ~draw.of_points)[..., None], pixels, img_points)
-            world_points = torch.where((draw.crowd & draw.of_points)[..., None], points, world_points)
+            img_points = torch.where(kind == OutlierKind.CROWD, pixels, img_points)
+            world_points = torch.where(kind == OutlierKind.POINT_CROWD, points, world_points)
 
-        intrinsics = torch.tensor((self.focal, self.focal, 1.0), dtype=torch.float64, device=generator.device).diag()
-        problems = Problems(world_points, img_points, intrinsics.expand(size, 3, 3), pose, inliers)
+        known: dict[str, Any] = {}
         if self.known_noise and img_cov is not None:
-            problems = problems._replace(img_cov=img_cov, world_cov=world_cov)
+            known = {"img_cov": img_cov, "world_cov": world_cov}
         elif self.known_noise:
             sigmas = hide_sigmas(img_sigma, world_sigma, self.known_noise, generator)
             of_img, of_world = sigmas if self.sigma_spread else (x[:, 0] for x in sigmas)
-            problems = problems._replace(img_sigma=of_img, world_sigma=of_world)
+            known = {"img_sigma": of_img, "world_sigma": of_world}
         if self.confidence_share:
             errors = length / img_sigma.mean(1, keepdim=True).clamp(min=_TINY)
-            confidence = draw_confidence(inliers, errors, self.confidence_share, generator)
-            problems = problems._replace(confidence=confidence)
-        return problems
+            known["confidence"] = draw_confidence(inliers, errors, self.confidence_share, generator)
+        intrinsics = torch.tensor((self.focal, self.focal, 1.0), dtype=torch.float64, device=generator.device).diag()
+        return Problems(world_points, img_points, intrinsics.expand(size, 3, 3), pose, inliers, **known)
 
     def _anywhere(self, scene: Tensor, generator: torch.Generator) -> Tensor:
         """Pixels that are uniform in the image, (B, N, 2)."""
         shape = self.batch_size, self.n, 2
         if self.half_image is not None:
             return uniform(shape, -self.half_image, self.half_image, generator)
-        in_front = _is_in_front(scene)[..., None]
-        depth = torch.where(in_front, scene[..., 2:], 1.0)
-        tangent = torch.where(in_front, scene[..., :2] / depth, 0.0)
+        in_front = _is_in_front(scene)
+        tangent = torch.where(in_front, scene[..., :2], 0.0) / torch.where(in_front, scene[..., 2:], 1.0)
         half = self.focal * tangent.abs().amax((1, 2), keepdim=True).clamp(max=_WIDEST_TANGENT)
         return half * uniform(shape, -1.0, 1.0, generator)
 
 
 def _is_in_front(cam_points: Tensor) -> Tensor:
-    """Whether a camera can see each point, (B, N)."""
-    return cam_points[..., 2] > _LEAST_COSINE * cam_points.norm(dim=-1)
+    """Whether a camera can see each point, (B, N, 1)."""
+    return cam_points[..., 2:] > _LEAST_COSINE * cam_points.norm(dim=-1, keepdim=True)
 
 
 def _bunched(scene: Tensor, displaced: Tensor, share: float, generator: torch.Generator) -> Tensor:
     """The points of each scene, (B, 2N, 3), sorted so that pairs that are not ``displaced``, (B, N), lie together.
 
-    Points are ranked by their angle from one of them, with random numbers of a random size added: bunches differ in how
-    sharp they are. In a share of the problems the first points of the ranking go to the pairs that are not displaced.
+    Points are ranked by their angle from one of them plus random numbers, whose random size makes bunches more or less
+    sharp. In a share of the problems the first points of the ranking go to the pairs that are not displaced.
     """
-    shape = scene.shape[:2]
-    each = shape[0], 1
+    shape, each = scene.shape[:2], (len(scene), 1)
     direction = normalize(scene, dim=-1)
     distance = (direction - direction[:, :1]).square().sum(-1).sqrt()
     blur = uniform(each, 0.0, _MOST_BLUR, generator) * unit(shape, generator)
     score = distance / distance.mean(1, keepdim=True).clamp(min=torch.finfo(distance.dtype).tiny) + blur
     chosen = unit(each, generator) < share
     score = torch.where(chosen, score, unit(shape, generator))
-    last = pad(displaced, (0, shape[1] - displaced.shape[1]), value=True)
-    # Kept pairs first, in random order: the number of a pair says nothing about its place in the image.
-    places = (last + unit(shape, generator)).argsort(1)
-    order = torch.empty_like(places).scatter_(1, places, score.argsort(1))
-    return scene.gather(1, order[..., None].expand(-1, -1, 3))
+    last = pad(displaced, (0, displaced.shape[1]), value=True)
+    # Pairs that are not displaced come first, in random order, so that the position of a pair in the batch says nothing
+    # about its place in the image.
+    rank = (last + unit(shape, generator)).argsort(1).argsort(1)
+    return scene.take_along_dim(score.argsort(1).gather(1, rank)[..., None], 1)
