@@ -1,9 +1,9 @@
 """Sources of problems: synthetic problems and real scenes.
 
-``synthetic`` puts problems together from ``points`` (priors of points), ``noise`` (the noise model), ``outliers``
-(number and kinds of outliers) and ``draws`` (random poses and numbers); ``mixtures`` combines several sources;
+``synthetic`` makes problems from ``points`` (priors of points), ``outliers`` (their number and kinds) and ``draws``
+(random poses and numbers); ``cameras`` makes problems of many cameras; ``mixtures`` combines several sources;
 ``scenes`` draws problems from real scenes, which ``colmap`` reads from files; ``stream`` draws batches in other
-processes. A new data source is one more class with ``batch_size`` and ``batch(index)``.
+processes. A new source is a class with ``batch_size`` and ``batch(index)``.
 """
 
 from kornia_pnpnet.data.cameras import CameraProblems

@@ -1,7 +1,4 @@
-"""Random numbers: the base class of the sources, a generator for each batch, distributions, and random poses.
-
-All numbers are float64, on the generator's device.
-"""
+"""The base class of random sources, a generator for each batch, random numbers in float64, and random poses."""
 
 from __future__ import annotations
 
@@ -43,24 +40,25 @@ class RandomProblems:
 
     def batch(self, index: int) -> Problems:
         """Draw batch ``index``, at least 0."""
-        return self._draw(index).map(lambda x: x.to(self.device, self.dtype if x.is_floating_point() else x.dtype))
+        problems = self._draw(batch_generator(self.seed, index))
+        return problems.map(lambda x: x.to(self.device, self.dtype if x.is_floating_point() else x.dtype))
 
-    def _draw(self, index: int) -> Problems:
+    def _draw(self, generator: torch.Generator) -> Problems:
         raise NotImplementedError
 
 
-def batch_generator(seed: int, index: int, device: str | torch.device = "cpu") -> torch.Generator:
+def batch_generator(seed: int, index: int) -> torch.Generator:
     """A generator for batch ``index`` of the stream ``seed``, the same on every call.
 
     The two numbers are hashed because CPU generators use only 32 bits of their seed.
     """
     state = int(np.random.SeedSequence(seed, spawn_key=(index,)).generate_state(1, np.uint64)[0])
-    return torch.Generator(device).manual_seed(state >> 1)
+    return torch.Generator().manual_seed(state >> 1)
 
 
 def unit(shape: Sequence[int], generator: torch.Generator) -> Tensor:
     """Uniform numbers in [0, 1)."""
-    return torch.rand(tuple(shape), generator=generator, device=generator.device, dtype=torch.float64)
+    return torch.rand(tuple(shape), generator=generator, dtype=torch.float64)
 
 
 def uniform(shape: Sequence[int], low: float, high: float, generator: torch.Generator) -> Tensor:
@@ -70,7 +68,7 @@ def uniform(shape: Sequence[int], low: float, high: float, generator: torch.Gene
 
 def normal(shape: Sequence[int], generator: torch.Generator) -> Tensor:
     """Standard normal numbers."""
-    return torch.randn(tuple(shape), generator=generator, device=generator.device, dtype=torch.float64)
+    return torch.randn(tuple(shape), generator=generator, dtype=torch.float64)
 
 
 def log_uniform(shape: Sequence[int], low: float, high: float, generator: torch.Generator) -> Tensor:

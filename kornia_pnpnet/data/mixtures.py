@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from itertools import accumulate, pairwise
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -28,8 +28,8 @@ class MixedProblems:
     """Batches of problems that alternate between several sources.
 
     Args:
-        sources: each makes a :class:`SyntheticProblems` from ``batch_size``, ``seed`` and ``options``, such as the
-            class itself or a :func:`functools.partial` of it.
+        sources: each makes a :class:`SyntheticProblems` from ``batch_size``, ``seed`` and ``options``: the class itself
+            or a :func:`functools.partial` of it.
         shares: share of the batch of each source, up to a common factor; equal shares when ``None``.
         batch_size: number of problems per batch.
         seed: seed of the stream.
@@ -59,10 +59,9 @@ class MixedProblems:
         check_whole(1, batch_size=batch_size)
         shares = _checked_shares("source", len(sources), shares)
         self.batch_size = batch_size
-        bounds = [round(batch_size * sum(shares[:i]) / sum(shares)) for i in range(len(shares) + 1)]
-        sizes = [end - start for start, end in pairwise(bounds)]
-        made = zip(sources, sizes, strict=True)
-        self.sources = [source(batch_size=size, seed=seed, **options) for source, size in made if size]
+        sizes = _split(batch_size, shares, round)
+        parts = zip(sources, sizes, strict=True)
+        self.sources = [source(batch_size=size, seed=seed, **options) for source, size in parts if size]
         # Sources take turns in proportion to their shares, so that every part of a batch is mixed in the same way.
         turns = [(turn + 0.5) / size for size in sizes for turn in range(size)]
         self._order = torch.tensor(sorted(range(batch_size), key=turns.__getitem__))
@@ -88,6 +87,12 @@ def _checked_shares(what: str, count: int, shares: Sequence[float] | None) -> li
     return shares
 
 
+def _split(batch_size: int, shares: Sequence[float], rounded: Callable[[float], int]) -> list[int]:
+    """The number of problems of each share; ``rounded`` makes the bounds between the shares whole."""
+    bounds = [rounded(batch_size * sum(shares[:i]) / sum(shares)) for i in range(len(shares))]
+    return [end - start for start, end in pairwise([*bounds, batch_size])]
+
+
 def _joined(parts: list[Problems], name: str) -> Tensor | None:
     """The sigmas or confidences of all parts, (B,) or (B, N); NaN for the parts that know none."""
     known = [getattr(part, name) for part in parts]
@@ -95,16 +100,13 @@ def _joined(parts: list[Problems], name: str) -> Tensor | None:
     if not dimensions:
         return None
     for i, part in enumerate(parts):
-        shape = part.inliers.shape[:dimensions]
-        value = part.world_points.new_tensor(torch.nan) if known[i] is None else known[i]
-        known[i] = (value[:, None] if value.ndim == 1 < dimensions else value).expand(shape)
+        value = part.world_points.new_full((len(part.inliers),), torch.nan) if known[i] is None else known[i]
+        known[i] = value if value.ndim == dimensions else value[:, None].expand(part.inliers.shape)
     return torch.cat(known)
 
 
 class MixedPoints:
-    """A prior of points that draws the points of each problem from one of several priors.
-
-    It is faster than a mixture of sources that differ in their points alone.
+    """A prior that draws the points of each problem from one of several priors.
 
     Args:
         priors: the priors.
@@ -128,10 +130,7 @@ class MixedPoints:
         """Draw points of shape ``(batch_size, n, 3)``."""
         # A random offset gives each prior its share on average, however small the batch.
         offset = unit((), generator).item()
-        total = sum(self.shares)
-        bounds = [0, *(math.floor(batch_size * part / total + offset) for part in accumulate(self.shares))]
-        bounds[-1] = batch_size
-        sizes = [end - start for start, end in pairwise(bounds)]
+        sizes = _split(batch_size, self.shares, lambda bound: math.floor(bound + offset))
         drawn = [prior(size, n, generator) for prior, size in zip(self.priors, sizes, strict=True) if size]
         return torch.cat(drawn)[unit((batch_size,), generator).argsort()]
 
@@ -140,8 +139,7 @@ class VaryingSize:
     """Batches that differ in the number of pairs per problem and agree in the total number of pairs.
 
     Args:
-        source: makes a source from ``n``, ``batch_size`` and ``seed``, such as a :func:`functools.partial` of
-            :class:`MixedProblems`.
+        source: makes a source from ``n``, ``batch_size`` and ``seed``.
         n: numbers of pairs; each batch draws one.
         batch_size: number of problems in a batch of the smallest number of pairs; other batches have fewer problems.
         seed: seed of the stream.
@@ -167,9 +165,8 @@ class VaryingSize:
         for count in n:
             check_whole(1, n=count, batch_size=batch_size)
         self.batch_size, self.seed = batch_size, seed
-        sizes = [max(1, batch_size * min(n) // count) for count in n]
-        made = enumerate(zip(n, sizes, strict=True))
-        self.sources = [source(n=count, batch_size=size, seed=seed + i) for i, (count, size) in made]
+        most = batch_size * min(n)
+        self.sources = [source(n=x, batch_size=max(1, most // x), seed=seed + i) for i, x in enumerate(n)]
 
     def batch(self, index: int) -> Problems:
         """Draw batch ``index``, at least 0."""

@@ -1,4 +1,4 @@
-"""Outliers of synthetic problems and of scenes: their number, positions and kinds, and the pixels of each kind."""
+"""Outliers of synthetic problems and of scenes: their number, positions, kinds and pixels."""
 
 from __future__ import annotations
 
@@ -24,17 +24,15 @@ _SLACK = 0.05
 
 
 class OutlierKind(IntEnum):
-    """What a pair is, see :class:`OutlierMix`; the pixels of kinds 1 to 4 are unrelated to their points."""
+    """The kinds of pairs, see :class:`OutlierMix`. A crowd shares a pixel, a point crowd shares a point."""
 
     INLIER = 0
     MISMATCH = 1
     SENSING = 2
-    #: A crowd that shares a pixel.
-    CROWD = 3
-    #: A crowd that shares a point.
-    POINT_CROWD = 4
-    NEAR = 5
-    STRUCTURED = 6
+    NEAR = 3
+    STRUCTURED = 4
+    CROWD = 5
+    POINT_CROWD = 6
 
 
 @dataclass(kw_only=True, eq=False)
@@ -44,27 +42,24 @@ class OutlierMix:
     The shares apply in the order structured, near, crowd, mismatch, each to the outliers without a kind so far.
 
     Args:
-        max_ratio: the maximum as a share of the pairs, rounded down. 0.33 means :math:`\lfloor n/3 \rfloor` for every n
-            up to 15.
+        max_ratio: the maximum as a share of the pairs, rounded down; 0.33 gives n // 3 for every n up to 15.
         count: exact number of outliers, which replaces the range.
         min_count: smallest number of outliers, up to the maximum.
         min_inliers: smallest number of inliers, which limits the maximum.
         mismatch_share: probability that an outlier is a *mismatch* (the projection of another point) rather than
             *sensing* (a uniform pixel of the image).
-        near_share: probability that an outlier is *near* its pixel.
-        near_pixels: smallest and largest distance of a near outlier from its pixel in pixels, log-uniform, but at least
-            5 and 10 standard deviations of the noise. ``None``: 5 to 50 standard deviations.
-        structured_share: probability that a problem has *structured* outliers, which agree on another pose, as with
+        near_share: probability that an outlier is *near* the pixel of its point.
+        near_pixels: smallest and largest distance of near outliers in pixels, log-uniform, but at least 5 and 10
+            standard deviations of the noise. ``None``: 5 to 50 standard deviations.
+        structured_share: probability that a problem has *structured* outliers. They agree on another pose, as with
             repeated structure.
-        structured_ratio: smallest and largest number of structured outliers relative to the number of inliers, uniform
-            over the problems, limited by the number of outliers.
-        structured_angle: largest angle in radians by which the structured part of a scene is rotated; the part is
-            always shifted.
+        structured_ratio: smallest and largest number of structured outliers relative to the number of inliers, uniform.
+        structured_angle: largest rotation in radians of the structured part of a scene, which is always shifted.
         mirrored_share: probability that the structured part of a problem is mirrored as well.
-        crowd_share: probability that a problem has *crowds*: a share of its outliers, uniform from 0 to 1, has the
+        crowd_share: probability that a problem has *crowds*. A share of its outliers, uniform from 0 to 1, then has the
             pixels of a few other pairs.
         max_crowds: largest number of these other pairs; their number is uniform from 1.
-        point_crowd_share: probability that the crowds of a problem share points instead, each with many pixels.
+        point_crowd_share: probability that the crowds of a problem share points, each with many pixels, not pixels.
 
     Raises:
         BaseError: for a number or a range out of its bounds.
@@ -109,7 +104,7 @@ class OutlierMix:
         return max(0, min(math.floor(n * self.max_ratio + _SLACK), n - self.min_inliers))
 
     def draw(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
-        """Draw the kinds of the pairs, the values of :class:`OutlierKind`, int64, shape ``(batch_size, n)``.
+        """Draw a value of :class:`OutlierKind` for each pair, int64, shape ``(batch_size, n)``.
 
         Raises:
             BaseError: when there are to be more outliers than pairs.
@@ -117,12 +112,11 @@ class OutlierMix:
         most = self.max_count(n)
         least = min(self.min_count, most) if self.count is None else most
         KORNIA_CHECK(most <= n, f"{most} outliers do not fit into n = {n} pairs.")
-        device = generator.device
 
         def chance(*shape: int) -> Tensor:
-            return torch.rand(batch_size, *shape, generator=generator, device=device)
+            return torch.rand(batch_size, *shape, generator=generator)
 
-        count = torch.randint(least, most + 1, (batch_size, 1), generator=generator, device=device)
+        count = torch.randint(least, most + 1, (batch_size, 1), generator=generator)
         rank = chance(n).argsort(-1).argsort(-1)
         is_open = rank < count  # outliers without a special kind so far
         kind = is_open * torch.where(chance(n) < self.mismatch_share, OutlierKind.MISMATCH, OutlierKind.SENSING)
@@ -144,10 +138,7 @@ class OutlierMix:
 
 
 def near_offsets(img_sigma: Tensor, n: int, generator: torch.Generator, pixels: tuple[float, float] | None) -> Tensor:
-    """Draw the offsets in pixels of near outliers, (B, n, 2).
-
-    ``img_sigma`` is the noise of the pixels, (B, 1) or (B, n); ``pixels`` is ``near_pixels`` of :class:`OutlierMix`.
-    """
+    """The offsets in pixels of near outliers, (B, n, 2), with noise ``img_sigma``, (B, 1) or (B, n)."""
     direction = normalize(normal((len(img_sigma), n, 2), generator), dim=-1)
     each, img_sigma = (len(img_sigma), n, 1), img_sigma[..., None]
     if pixels is None:
@@ -161,7 +152,7 @@ def structured_points(cam_points: Tensor, mix: OutlierMix, generator: torch.Gene
     batch_size = len(cam_points)
     centre = cam_points.mean(1, keepdim=True)
     size = (cam_points - centre).square().sum(-1).mean(1).sqrt()[:, None, None]
-    turn = torch.eye(3, dtype=cam_points.dtype, device=cam_points.device)
+    turn = torch.eye(3, dtype=cam_points.dtype)
     if mix.structured_angle:
         turn = random_poses(batch_size, generator, max_angle=mix.structured_angle).rotation
     shift = 0.5 * size * normal((batch_size, 1, 3), generator)
@@ -173,7 +164,7 @@ def structured_points(cam_points: Tensor, mix: OutlierMix, generator: torch.Gene
 
 
 def crowd_leaders(batch_size: int, n: int, max_crowds: int, generator: torch.Generator) -> Tensor:
-    """Draw for each pair the pair whose pixel or point its crowd shares, (B, N); a problem has few such pairs."""
+    """For each pair the index of the pair whose pixel or point its crowd shares, (B, N)."""
     leader = (n * unit((batch_size, max_crowds), generator)).long().clamp(max=n - 1)  # (B, max_crowds)
     crowds = 1 + (max_crowds * unit((batch_size, 1), generator)).long()  # (B, 1)
     crowd = (crowds * unit((batch_size, n), generator)).long().clamp(max=max_crowds - 1)

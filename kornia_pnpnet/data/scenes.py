@@ -13,7 +13,7 @@ from kornia.core.check import KORNIA_CHECK
 from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_whole
-from kornia_pnpnet.data.draws import RandomProblems, batch_generator, random_poses, unit
+from kornia_pnpnet.data.draws import RandomProblems, random_poses, unit
 from kornia_pnpnet.data.outliers import OutlierKind, OutlierMix
 from kornia_pnpnet.result import Problems
 
@@ -96,24 +96,23 @@ class Scene:
 class SceneProblems(RandomProblems):
     r"""Random problems of a scene, endless and reproducible.
 
-    Each problem is a random image with ``n`` random points that it observes and their pixels. Some pairs become
-    outliers: a *mismatch* gets the pixel of a spare point of the same image, a *sensing* outlier a uniform pixel of the
-    image. A pair is an inlier when it is an inlier of the scene and did not become an outlier.
-    ``outliers=OutlierMix(count=2)`` is the protocol's real data with outliers: 10 points are drawn, and 2 of the
-    first 9 get the pixel of the 10th point or a uniform pixel. Points and poses do not depend on ``outliers``, so that
-    different numbers of outliers are compared on the same problems.
+    Each problem is a random image with ``n`` random points that it observes and their pixels. A *mismatch* gets the
+    pixel of a spare point of the same image, a *sensing* outlier a uniform pixel of the image. A pair is an inlier when
+    it is an inlier of the scene and did not become an outlier. ``outliers=OutlierMix(count=2)`` is the protocol's real
+    data with outliers. Points and poses do not depend on ``outliers``, so that different numbers of outliers are
+    compared on the same problems.
 
     As in the paper the world is centred on a coarse pose: a pose :math:`(R^*, t^*)` is drawn from the protocol's prior
     and the world is moved so that this pose is the true one, :math:`x' = R^{*\top}(R x + t - t^*)`.
 
     Args:
         scene: the scene. Only its images with at least ``n + num_spares`` points are used.
-        n: number of pairs per problem; for ``batch_size``, ``seed`` and ``dtype`` see :class:`SyntheticProblems`.
+        n: number of pairs per problem. For ``batch_size``, ``seed``, ``dtype`` and ``device`` see
+            :class:`SyntheticProblems`.
         outliers: number of outliers, and the share of mismatches among them; no outliers when ``None``. Raw matches
             have mismatches of their own.
-        num_spares: number of spare points per problem. Its mismatches get the pixels of the spare points in turn: with
-            the protocol's one spare point all mismatches of a problem share a pixel.
-        device: device of the batches; numbers are drawn on the CPU and moved.
+        num_spares: number of spare points per problem, whose pixels the mismatches get in turn. With the protocol's one
+            spare point all mismatches of a problem share a pixel.
 
     Raises:
         BaseError: for an argument out of range, or ``outliers`` with *near* or *structured* outliers or crowds.
@@ -148,8 +147,7 @@ class SceneProblems(RandomProblems):
         """Translation error below which a pose is a success: 0.2 in metres, else 0.5 % of the median depth."""
         return 0.2 if self.scene.metric else 0.005 * self.scene.median_depth
 
-    def _draw(self, index: int) -> Problems:
-        generator = batch_generator(self.seed, index)
+    def _draw(self, generator: torch.Generator) -> Problems:
         # Draws that depend on the outlier options come last.
         view = torch.randint(len(self.views), (self.batch_size,), generator=generator)
         rows = _choose(self._counts[view], self.n + self.num_spares, generator)
@@ -172,7 +170,7 @@ class SceneProblems(RandomProblems):
 def _choose(counts: Tensor, k: int, generator: torch.Generator) -> Tensor:
     """For each count c of (B,), k different integers of 0 ... c - 1, every ordered choice equally likely, (B, k).
 
-    Floyd's algorithm on the whole batch at once: its cost does not grow with the number of points in an image.
+    Floyd's algorithm for the whole batch. Its cost does not grow with the number of points in an image.
     """
     draws = unit((len(counts), k), generator)
     chosen = torch.empty((len(counts), k), dtype=torch.int64)
