@@ -61,7 +61,6 @@ class CameraProblems(RandomProblems):
     baseline: float = 0.1
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         super().__post_init__()
         check_whole(1, cameras=self.cameras)
         check_numbers(0.0, img_sigma=self.img_sigma, baseline=self.baseline)

@@ -30,7 +30,6 @@ class RandomProblems:
     device: str | torch.device = "cpu"
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         check_whole(1, n=self.n, batch_size=self.batch_size)
         check_whole(0, seed=self.seed)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import KW_ONLY, dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -72,8 +73,9 @@ class MixedProblems:
         parts = [source.batch(count * index + i) for i, source in enumerate(self.sources)]
         with_covariances = sum(part.img_cov is not None for part in parts)
         KORNIA_CHECK(with_covariances in (0, count), "All sources of a mixture must know covariances, or none of them.")
-        known = {name: _joined(parts, name) for name in ("img_sigma", "world_sigma", "confidence")}
-        others = [part._replace(**dict.fromkeys(known)) for part in parts]
+        known: dict[str, Any] = {name: _joined(parts, name) for name in ("img_sigma", "world_sigma", "confidence")}
+        unknown: dict[str, Any] = dict.fromkeys(known)
+        others = [part._replace(**unknown) for part in parts]
         problems = map_tensors(lambda *x: torch.cat(x), *others)._replace(**known)
         return take(problems, self._order.to(problems.inliers.device))
 
@@ -127,7 +129,7 @@ class MixedPoints:
         self.shares = _checked_shares("prior", len(self.priors), shares)
 
     def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
-        """Draw points of shape ``(batch_size, n, 3)``."""
+        """See :class:`PointPrior`."""
         # A random offset gives each prior its share on average, however small the batch.
         offset = unit((), generator).item()
         sizes = _split(batch_size, self.shares, lambda bound: math.floor(bound + offset))
@@ -135,6 +137,7 @@ class MixedPoints:
         return torch.cat(drawn)[unit((batch_size,), generator).argsort()]
 
 
+@dataclass(eq=False)
 class VaryingSize:
     """Batches that differ in the number of pairs per problem and agree in the total number of pairs.
 
@@ -153,20 +156,19 @@ class VaryingSize:
         [(3, 8), (6, 4)]
     """
 
-    def __init__(
-        self,
-        source: Callable[..., SyntheticProblems | MixedProblems],
-        *,
-        n: Sequence[int],
-        batch_size: int = 1000,
-        seed: int = 0,
-    ) -> None:
-        KORNIA_CHECK(len(n) > 0, "VaryingSize needs at least one number of pairs.")
-        for count in n:
-            check_whole(1, n=count, batch_size=batch_size)
-        self.batch_size, self.seed = batch_size, seed
-        most = batch_size * min(n)
-        self.sources = [source(n=x, batch_size=max(1, most // x), seed=seed + i) for i, x in enumerate(n)]
+    source: Callable[..., SyntheticProblems | MixedProblems]
+    _: KW_ONLY
+    n: Sequence[int]
+    batch_size: int = 1000
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        KORNIA_CHECK(len(self.n) > 0, "VaryingSize needs at least one number of pairs.")
+        for n in self.n:
+            check_whole(1, n=n, batch_size=self.batch_size)
+        most = self.batch_size * min(self.n)
+        sizes = [(n, max(1, most // n), self.seed + i) for i, n in enumerate(self.n)]
+        self.sources = [self.source(n=n, batch_size=batch_size, seed=seed) for n, batch_size, seed in sizes]
 
     def batch(self, index: int) -> Problems:
         """Draw batch ``index``, at least 0."""

@@ -85,7 +85,6 @@ class OutlierMix:
     point_crowd_share: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         shares = {name: value for name, value in vars(self).items() if name.endswith("_share")}
         check_numbers(0.0, 1.0, max_ratio=self.max_ratio, **shares)
         check_numbers(0.0, structured_angle=self.structured_angle)

@@ -75,7 +75,7 @@ class BoxPoints:
         self.half_width, self.z_near, self.depth = half_width, z_near, depth
 
     def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
-        """Draw points of shape ``(batch_size, n, 3)``."""
+        """See :class:`PointPrior`."""
         xy = uniform((batch_size, n, 2), -self.half_width, self.half_width, generator)
         z = uniform((batch_size, n, 1), self.z_near, self.z_near + self.depth, generator)
         return torch.cat((xy, z), -1)
@@ -91,7 +91,7 @@ class SlabPoints:
     """
 
     def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
-        """Draw points of shape ``(batch_size, n, 3)``."""
+        """See :class:`PointPrior`."""
         half = uniform((batch_size, 1, 2), *_SLAB_WINDOW, generator)
         centre = (_SLAB_TANGENT - half) * uniform((batch_size, 1, 2), -1.0, 1.0, generator)
         direction = centre + half * uniform((batch_size, n, 2), -1.0, 1.0, generator)
@@ -111,7 +111,7 @@ class ObjectPoints:
     """
 
     def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
-        """Draw points of shape ``(batch_size, n, 3)``."""
+        """See :class:`PointPrior`."""
         box = uniform((batch_size, n, 3), -1.0, 1.0, generator)
         ball = 0.5 * normal((batch_size, n, 3), generator)
         is_box = unit((batch_size, 1, 1), generator) < 0.5
@@ -135,7 +135,6 @@ class _View:
         self.field_of_view, self.window = field_of_view, window
 
     def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
-        """Draw points of shape ``(batch_size, n, 3)``."""
         angle = uniform((batch_size, 1, 1), *self.field_of_view, generator).deg2rad_()
         area = log_uniform((batch_size, 1, 1), *self.window, generator)
         split = uniform((batch_size, 1, 1), 0.25, 0.75, generator)  # the window's shape: wide, square or high

@@ -50,11 +50,9 @@ class View:
     inliers: Tensor
 
     def __post_init__(self) -> None:
-        """Check the tensors."""
         m = len(self.world_points)
-        expected = {"world_points": (m, 3), "img_points": (m, 2), "inliers": (m,)}
-        expected |= {"intrinsics": (3, 3), "rotation": (3, 3), "translation": (3,)}
-        for name, shape in expected.items():
+        of_pairs = {"world_points": (m, 3), "img_points": (m, 2), "inliers": (m,)}
+        for name, shape in {**of_pairs, "intrinsics": (3, 3), "rotation": (3, 3), "translation": (3,)}.items():
             value: Tensor = getattr(self, name)
             if value.shape != shape:
                 raise ValueError(f"image '{self.name}': {name} has shape {tuple(value.shape)}, expected {shape}")
@@ -125,7 +123,6 @@ class SceneProblems(RandomProblems):
     dtype: torch.dtype = torch.float64
 
     def __post_init__(self) -> None:
-        """Check the arguments, and put the pairs of all views one after the other, so that a batch is one gather."""
         super().__post_init__()
         check_whole(1, num_spares=self.num_spares)
         for name in ("near_share", "structured_share", "crowd_share"):
@@ -136,6 +133,7 @@ class SceneProblems(RandomProblems):
         if not views:
             wanted = f"n = {self.n} and num_spares = {self.num_spares}"
             raise ValueError(f"no image of '{self.scene.name}' has the {need} points for {wanted}")
+        # The pairs of all views, one view after the other, so that a batch is one gather.
         pairs = zip(*((view.cam_points, view.img_points, view.inliers) for view in views), strict=True)
         self._pairs = [torch.cat(parts) for parts in pairs]
         self._intrinsics = torch.stack([view.intrinsics for view in views])

@@ -115,7 +115,6 @@ class SyntheticProblems(RandomProblems):
     bunched_share: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         super().__post_init__()
         sizes = {name: getattr(self, name) for name in ("max_angle", "half_image", "translation_sigma")}
         check_numbers(0.0, **{name: value for name, value in sizes.items() if value is not None})
@@ -246,7 +245,7 @@ class SyntheticProblems(RandomProblems):
         """A number for each problem, (B, 1, 1)."""
         each = self.batch_size, 1, 1
         if isinstance(value, Sequence):
-            return log_uniform(each, *value, generator)
+            return log_uniform(each, value[0], value[1], generator)
         return torch.full(each, value, dtype=torch.float64)
 
     def _known_sigmas(self, img_sigma: Tensor, world_sigma: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
