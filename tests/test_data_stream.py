@@ -31,11 +31,8 @@ def make_source(kind=SyntheticProblems, **options):
 @pytest.mark.parametrize(("workers", "dtype"), [(0, torch.float32), (1, torch.float64), (2, torch.float32)])
 def test_batches_are_those_of_the_source_in_order(workers, dtype):
     source = make_source(dtype=dtype)
-    count = 0
-    for index, problems in enumerate(stream_batches(source, 4, 25, workers), 4):
-        assert same(problems, source.batch(index))  # after others were drawn meanwhile
-        count += 1
-    assert count == 21
+    found = [same(problems, source.batch(4 + i)) for i, problems in enumerate(stream_batches(source, 4, 25, workers))]
+    assert found == [True] * 21
     assert list(stream_batches(source, 3, 3, workers)) == []
     assert not multiprocessing.active_children()
 

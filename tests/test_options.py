@@ -21,11 +21,9 @@ from kornia_pnpnet.data import (
     FacadePoints,
     MixedPoints,
     MixedProblems,
-    ObjectPoints,
     OutlierMix,
     RoomPoints,
     SceneProblems,
-    SlabPoints,
     SyntheticProblems,
     VaryingSize,
 )
@@ -125,7 +123,7 @@ def factors_are_sound(settings, values):
 BOUNDS = {"initial": 3.0, "size": 2, "lower": 1.0, "upper": 50.0}
 SOLVER_PARTS = (RobustWeightedLM, SetInit, EPnP, REPPnP, Normalize)
 SOLVER_PARTS += (OpenCVPnP, OpenCVRansac, OpenCVUsac, KorniaRs, PoseLib, PyColmap)
-POINTS = (BoxPoints, SlabPoints, ObjectPoints, FacadePoints, RoomPoints, DrivePoints)
+POINTS = (BoxPoints, FacadePoints, RoomPoints, DrivePoints)
 
 #: Whose options are drawn, what is made with them, and what the product must do.
 CASES = [

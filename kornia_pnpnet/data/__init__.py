@@ -1,15 +1,15 @@
 """Sources of problems: synthetic problems and real scenes.
 
-``synthetic`` puts problems together from ``points`` (priors of points), ``noise`` (the noise model), ``outliers``
-(number and kinds of outliers) and ``draws`` (random poses and numbers); ``mixtures`` combines several sources;
+``synthetic`` makes problems from ``points`` (priors of points), ``outliers`` (their number and kinds) and ``draws``
+(random poses and numbers); ``cameras`` makes problems of many cameras; ``mixtures`` combines several sources;
 ``scenes`` draws problems from real scenes, which ``colmap`` reads from files; ``stream`` draws batches in other
-processes. A new data source is one more class with ``batch_size`` and ``batch(index)``.
+processes. A new source is a class with ``batch_size`` and ``batch(index)``.
 """
 
 from kornia_pnpnet.data.cameras import CameraProblems
-from kornia_pnpnet.data.colmap import load_colmap, load_matches, load_scene
+from kornia_pnpnet.data.colmap import load_scene
 from kornia_pnpnet.data.mixtures import MixedPoints, MixedProblems, VaryingSize
-from kornia_pnpnet.data.outliers import OutlierDraw, OutlierMix
+from kornia_pnpnet.data.outliers import OutlierKind, OutlierMix
 from kornia_pnpnet.data.points import (
     BoxPoints,
     DrivePoints,
@@ -30,7 +30,7 @@ __all__ = [
     "MixedPoints",
     "MixedProblems",
     "ObjectPoints",
-    "OutlierDraw",
+    "OutlierKind",
     "OutlierMix",
     "PointPrior",
     "RoomPoints",
@@ -40,7 +40,5 @@ __all__ = [
     "SyntheticProblems",
     "VaryingSize",
     "View",
-    "load_colmap",
-    "load_matches",
     "load_scene",
 ]

@@ -9,35 +9,36 @@ import torch
 from kornia.core.check import KORNIA_CHECK
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.nn.functional import normalize, pad
 
-from kornia_pnpnet.core.checks import check_numbers, check_positive, check_whole
+from kornia_pnpnet.core.checks import check_numbers, check_whole
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.data.draws import RandomProblems, batch_generator, log_uniform, normal, random_poses, uniform, unit
+from kornia_pnpnet.data.draws import RandomProblems, log_uniform, normal, random_poses, uniform, unit
 from kornia_pnpnet.result import Pose, Problems
 
 __all__ = ["CameraProblems"]
 
 # Distances of the middle of the points: their unit does not matter to a solver.
 _NEAREST, _FARTHEST = 2.0, 50.0
+# Pixels. Half the side of the square image.
+_HALF_IMAGE = 1000.0
 
 
 @dataclass(kw_only=True, eq=False)
 class CameraProblems(RandomProblems):
     r"""Random problems of cameras with random fields of view.
 
-    Pixels are uniform in a square image, whose middle is the principal point; depths are uniform about a distance that
-    is log-uniform in 2 to 50. Outliers have a pixel that is uniform in the image. The cameras of a rig look in
-    directions that are spread evenly about the rig's vertical axis, their centres lie on a sphere about its origin, and
-    the pairs are dealt to them in turn.
+    Pixels are uniform in an image of 2000 x 2000 pixels with the principal point in its middle. Depths are uniform
+    about a distance that is log-uniform in 2 to 50. The pixels of outliers are uniform in the image. The cameras of a
+    rig look in directions that are spread evenly about the rig's vertical axis, their centres lie on a sphere about the
+    rig's origin, and the cameras get the pairs in turn.
 
     Args:
-        n: number of pairs per problem; for ``batch_size``, ``seed``, ``dtype`` and ``device`` see
+        n: number of pairs per problem. For ``batch_size``, ``seed``, ``dtype`` and ``device`` see
             :class:`~kornia_pnpnet.data.SyntheticProblems`.
         field_of_view: range of the horizontal fields of view in degrees, uniform.
         depth_spread: range of the largest relative distance of a depth from the mean depth, uniform.
         outlier_share: share of the pairs that are outliers, rounded to the nearest number of pairs.
-        half_image: half the width of the image in pixels.
         img_sigma: standard deviation of the noise on each pixel coordinate.
         cameras: number of cameras of a rig, with ``cam_from_rig`` in the batches; 1: no rig.
         baseline: distance of the cameras' centres from the origin of the rig, in mean depths.
@@ -55,55 +56,49 @@ class CameraProblems(RandomProblems):
     field_of_view: tuple[float, float] = (18.0, 100.0)
     depth_spread: tuple[float, float] = (0.1, 0.5)
     outlier_share: float = 0.0
-    half_image: float = 1000.0
     img_sigma: float = 1.0
     cameras: int = 1
     baseline: float = 0.1
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         super().__post_init__()
         check_whole(1, cameras=self.cameras)
-        check_positive(half_image=self.half_image)
         check_numbers(0.0, img_sigma=self.img_sigma, baseline=self.baseline)
         check_numbers(0.0, 1.0, outlier_share=self.outlier_share)
-        for name, high in (("field_of_view", 170.0), ("depth_spread", 0.95)):
+        for name, low, high in (("field_of_view", 1e-3, 170.0), ("depth_spread", 0.0, 0.95)):
             values = getattr(self, name)
-            rising = len(values) == 2 and 0 <= values[0] <= values[1] <= high
-            KORNIA_CHECK(rising, f"{name} must be two rising numbers in [0, {high:g}], got {values!r}.")
-        KORNIA_CHECK(self.field_of_view[0] > 0, f"field_of_view must be positive, got {self.field_of_view!r}.")
+            rising = len(values) == 2 and low <= values[0] <= values[1] <= high
+            KORNIA_CHECK(rising, f"{name} must be two rising numbers in [{low:g}, {high:g}], got {values!r}.")
 
-    def _draw(self, index: int) -> Problems:
-        generator = batch_generator(self.seed, index, self.device)
-        size, half = (self.batch_size, self.n), self.half_image
+    def _draw(self, generator: torch.Generator) -> Problems:
+        size, each = (self.batch_size, self.n), (self.batch_size, 1)
         angle = uniform((self.batch_size, self.cameras), *self.field_of_view, generator).deg2rad()
-        distance = log_uniform((self.batch_size, 1), _NEAREST, _FARTHEST, generator)
-        spread = uniform((self.batch_size, 1), *self.depth_spread, generator)
+        distance = log_uniform(each, _NEAREST, _FARTHEST, generator)
+        spread = uniform(each, *self.depth_spread, generator)
         depth = distance * (1.0 + spread * uniform(size, -1.0, 1.0, generator))
-        pixels = uniform((*size, 2), -half, half, generator)
-        turn = torch.arange(self.n, device=pixels.device) % self.cameras
-        focal = (half / (0.5 * angle).tan())[:, turn]  # (B, N)
+        pixels = uniform((*size, 2), -_HALF_IMAGE, _HALF_IMAGE, generator)
+        camera = torch.arange(self.n) % self.cameras
+        focal = (_HALF_IMAGE / (0.5 * angle).tan())[:, camera]  # (B, N)
         points = torch.cat((pixels * (depth / focal)[..., None], depth[..., None]), -1)
         rig = None
         if self.cameras > 1:
-            rig = map_tensors(lambda x: x[:, turn], self._rig(distance, generator))
+            rig = map_tensors(lambda x: x[:, camera], self._rig(distance, generator))
             points = (rig.rotation.mT @ (points - rig.translation)[..., None])[..., 0]
         pose = random_poses(self.batch_size, generator, translation_box=1.0, max_angle=math.pi)
         pose = pose._replace(translation=distance * pose.translation)
         world_points = (points - pose.translation[:, None]) @ pose.rotation
         inliers = unit(size, generator).argsort(1) >= round(self.outlier_share * self.n)
-        pixels = pixels + self.img_sigma * normal((*size, 2), generator)
-        pixels = torch.where(inliers[..., None], pixels, uniform((*size, 2), -half, half, generator)) + half
-        intrinsics = torch.eye(3, dtype=torch.float64, device=pixels.device).repeat(*size, 1, 1)
+        pixels += self.img_sigma * normal((*size, 2), generator)
+        anywhere = uniform((*size, 2), -_HALF_IMAGE, _HALF_IMAGE, generator)
+        pixels = torch.where(inliers[..., None], pixels, anywhere) + _HALF_IMAGE
+        intrinsics = torch.eye(3, dtype=torch.float64).repeat(*size, 1, 1)
         intrinsics[..., 0, 0] = intrinsics[..., 1, 1] = focal
-        intrinsics[..., :2, 2] = half
-        cameras = intrinsics[:, 0] if rig is None else intrinsics
-        return Problems(world_points, pixels, cameras, pose, inliers, cam_from_rig=rig)
+        intrinsics[..., :2, 2] = _HALF_IMAGE
+        return Problems(world_points, pixels, intrinsics if rig else intrinsics[:, 0], pose, inliers, cam_from_rig=rig)
 
     def _rig(self, distance: Tensor, generator: torch.Generator) -> Pose:
         """The cameras in the frame of the rig, (B, C, 3, 3) and (B, C, 3)."""
-        heading = torch.arange(self.cameras).to(distance) * (2.0 * math.pi / self.cameras)
-        rotation = axis_angle_to_rotation_matrix(torch.stack((0.0 * heading, heading, 0.0 * heading), -1))
-        rotation = rotation.expand(self.batch_size, -1, -1, -1)
+        heading = torch.arange(self.cameras).double()[:, None] * (2.0 * math.pi / self.cameras)
+        rotation = axis_angle_to_rotation_matrix(pad(heading, (1, 1))).expand(self.batch_size, -1, -1, -1)
         centres = normalize(normal((self.batch_size, self.cameras, 3), generator), dim=-1)
         return Pose(rotation, -(rotation @ (self.baseline * distance[..., None] * centres)[..., None])[..., 0])

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from itertools import accumulate, pairwise
+from dataclasses import KW_ONLY, dataclass
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -12,7 +13,7 @@ from kornia.core.check import KORNIA_CHECK
 from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_whole
-from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.core.trees import map_tensors, take
 from kornia_pnpnet.data.draws import batch_generator, unit
 from kornia_pnpnet.data.points import PointPrior
 from kornia_pnpnet.data.synthetic import SyntheticProblems
@@ -28,8 +29,8 @@ class MixedProblems:
     """Batches of problems that alternate between several sources.
 
     Args:
-        sources: each makes a :class:`SyntheticProblems` from ``batch_size``, ``seed`` and ``options``, such as the
-            class itself or a :func:`functools.partial` of it.
+        sources: each makes a :class:`SyntheticProblems` from ``batch_size``, ``seed`` and ``options``: the class itself
+            or a :func:`functools.partial` of it.
         shares: share of the batch of each source, up to a common factor; equal shares when ``None``.
         batch_size: number of problems per batch.
         seed: seed of the stream.
@@ -59,11 +60,10 @@ class MixedProblems:
         check_whole(1, batch_size=batch_size)
         shares = _checked_shares("source", len(sources), shares)
         self.batch_size = batch_size
-        bounds = [round(batch_size * sum(shares[:i]) / sum(shares)) for i in range(len(shares) + 1)]
-        sizes = [end - start for start, end in pairwise(bounds)]
-        made = zip(sources, sizes, strict=True)
-        self.sources = [source(batch_size=size, seed=seed, **options) for source, size in made if size]
-        # Sources take turns in proportion to their shares, so that the first problems of a batch are mixed like all.
+        sizes = _split(batch_size, shares, round)
+        parts = zip(sources, sizes, strict=True)
+        self.sources = [source(batch_size=size, seed=seed, **options) for source, size in parts if size]
+        # Sources take turns in proportion to their shares, so that every part of a batch is mixed in the same way.
         turns = [(turn + 0.5) / size for size in sizes for turn in range(size)]
         self._order = torch.tensor(sorted(range(batch_size), key=turns.__getitem__))
 
@@ -71,13 +71,13 @@ class MixedProblems:
         """Draw batch ``index``, at least 0."""
         count = len(self.sources)  # no two sources see the same random numbers
         parts = [source.batch(count * index + i) for i, source in enumerate(self.sources)]
-        covariances = {(part.img_cov is None, part.world_cov is None) for part in parts}
-        KORNIA_CHECK(len(covariances) == 1, "All sources of a mixture must know covariances, or none of them.")
-        for name in ("img_sigma", "world_sigma", "confidence"):
-            parts = _with_known_alike(parts, name)
-        problems = map_tensors(lambda *x: torch.cat(x), *parts)
-        order = self._order.to(problems.inliers.device)
-        return problems.map(lambda x: x[order])
+        with_covariances = sum(part.img_cov is not None for part in parts)
+        KORNIA_CHECK(with_covariances in (0, count), "All sources of a mixture must know covariances, or none of them.")
+        known: dict[str, Any] = {name: _joined(parts, name) for name in ("img_sigma", "world_sigma", "confidence")}
+        unknown: dict[str, Any] = dict.fromkeys(known)
+        others = [part._replace(**unknown) for part in parts]
+        problems = map_tensors(lambda *x: torch.cat(x), *others)._replace(**known)
+        return take(problems, self._order.to(problems.inliers.device))
 
 
 def _checked_shares(what: str, count: int, shares: Sequence[float] | None) -> list[float]:
@@ -89,22 +89,26 @@ def _checked_shares(what: str, count: int, shares: Sequence[float] | None) -> li
     return shares
 
 
-def _with_known_alike(parts: list[Problems], name: str) -> list[Problems]:
-    """Parts whose sigmas or confidences have one shape, with NaN for ``None`` unless all are ``None``."""
+def _split(batch_size: int, shares: Sequence[float], rounded: Callable[[float], int]) -> list[int]:
+    """The number of problems of each share; ``rounded`` makes the bounds between the shares whole."""
+    bounds = [rounded(batch_size * sum(shares[:i]) / sum(shares)) for i in range(len(shares))]
+    return [end - start for start, end in pairwise([*bounds, batch_size])]
+
+
+def _joined(parts: list[Problems], name: str) -> Tensor | None:
+    """The sigmas or confidences of all parts, (B,) or (B, N); NaN for the parts that know none."""
     known = [getattr(part, name) for part in parts]
     dimensions = max((value.ndim for value in known if value is not None), default=0)
-    for i, part in enumerate(parts if dimensions else ()):
-        if known[i] is None:
-            known[i] = part.world_points.new_full((len(part.inliers),), torch.nan)
-        if known[i].ndim < dimensions:
-            known[i] = known[i][:, None].expand(part.inliers.shape)
-    return [part._replace(**{name: value}) for part, value in zip(parts, known, strict=True)]
+    if not dimensions:
+        return None
+    for i, part in enumerate(parts):
+        value = part.world_points.new_full((len(part.inliers),), torch.nan) if known[i] is None else known[i]
+        known[i] = value if value.ndim == dimensions else value[:, None].expand(part.inliers.shape)
+    return torch.cat(known)
 
 
 class MixedPoints:
-    """A prior of points that draws the points of each problem from one of several priors.
-
-    It is faster than a mixture of sources that differ in their points alone.
+    """A prior that draws the points of each problem from one of several priors.
 
     Args:
         priors: the priors.
@@ -125,23 +129,20 @@ class MixedPoints:
         self.shares = _checked_shares("prior", len(self.priors), shares)
 
     def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
-        """Draw points of shape ``(batch_size, n, 3)``."""
+        """See :class:`PointPrior`."""
         # A random offset gives each prior its share on average, however small the batch.
         offset = unit((), generator).item()
-        total = sum(self.shares)
-        bounds = [0, *(math.floor(batch_size * part / total + offset) for part in accumulate(self.shares))]
-        bounds[-1] = batch_size
-        sizes = [end - start for start, end in pairwise(bounds)]
+        sizes = _split(batch_size, self.shares, lambda bound: math.floor(bound + offset))
         drawn = [prior(size, n, generator) for prior, size in zip(self.priors, sizes, strict=True) if size]
         return torch.cat(drawn)[unit((batch_size,), generator).argsort()]
 
 
+@dataclass(eq=False)
 class VaryingSize:
     """Batches that differ in the number of pairs per problem and agree in the total number of pairs.
 
     Args:
-        source: makes a source from ``n``, ``batch_size`` and ``seed``, such as a :func:`functools.partial` of
-            :class:`MixedProblems`.
+        source: makes a source from ``n``, ``batch_size`` and ``seed``.
         n: numbers of pairs; each batch draws one.
         batch_size: number of problems in a batch of the smallest number of pairs; other batches have fewer problems.
         seed: seed of the stream.
@@ -155,20 +156,19 @@ class VaryingSize:
         [(3, 8), (6, 4)]
     """
 
-    def __init__(
-        self,
-        source: Callable[..., SyntheticProblems | MixedProblems],
-        *,
-        n: Sequence[int],
-        batch_size: int = 1000,
-        seed: int = 0,
-    ) -> None:
-        KORNIA_CHECK(len(n) > 0, "VaryingSize needs at least one number of pairs.")
-        for count in n:
-            check_whole(1, n=count, batch_size=batch_size)
-        self.batch_size, self.seed = batch_size, seed
-        sizes = {count: max(1, batch_size * min(n) // count) for count in n}
-        self.sources = [source(n=count, batch_size=sizes[count], seed=seed + i) for i, count in enumerate(n)]
+    source: Callable[..., SyntheticProblems | MixedProblems]
+    _: KW_ONLY
+    n: Sequence[int]
+    batch_size: int = 1000
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        KORNIA_CHECK(len(self.n) > 0, "VaryingSize needs at least one number of pairs.")
+        for n in self.n:
+            check_whole(1, n=n, batch_size=self.batch_size)
+        most = self.batch_size * min(self.n)
+        sizes = [(n, max(1, most // n), self.seed + i) for i, n in enumerate(self.n)]
+        self.sources = [self.source(n=n, batch_size=batch_size, seed=seed) for n, batch_size, seed in sizes]
 
     def batch(self, index: int) -> Problems:
         """Draw batch ``index``, at least 0."""

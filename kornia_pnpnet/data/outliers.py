@@ -1,10 +1,10 @@
-"""Outliers of synthetic problems and of scenes: their number, positions and kinds, and the pixels of each kind."""
+"""Outliers of synthetic problems and of scenes: their number, positions, kinds and pixels."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from enum import IntEnum
 
 import torch
 from kornia.core.check import KORNIA_CHECK
@@ -14,7 +14,7 @@ from torch.nn.functional import normalize
 from kornia_pnpnet.core.checks import check_numbers, check_ranges, check_whole
 from kornia_pnpnet.data.draws import log_uniform, normal, random_poses, uniform, unit
 
-__all__ = ["OutlierDraw", "OutlierMix", "crowd_leaders", "near_offsets", "structured_points"]
+__all__ = ["OutlierKind", "OutlierMix", "crowd_leaders", "near_offsets", "structured_points"]
 
 # Standard deviations of the pixel noise: the range of a near outlier's distance from its pixel, from just outside the
 # noise to ten times that. With ``near_pixels``, the smallest values of the two ends of its range.
@@ -23,28 +23,16 @@ _NEAR, _LEAST_NEAR = (5.0, 50.0), (5.0, 10.0)
 _SLACK = 0.05
 
 
-class OutlierDraw(NamedTuple):
-    r"""The outliers of a batch, by the kinds of :class:`OutlierMix`: bool, shape :math:`(B, N)` each.
+class OutlierKind(IntEnum):
+    """The kinds of pairs, see :class:`OutlierMix`. A crowd shares a pixel, a point crowd shares a point."""
 
-    A pair has at most one kind. ``of_points``, shape :math:`(B, 1)`, says whether the crowds of a problem share points.
-    """
-
-    mismatch: Tensor
-    sensing: Tensor
-    near: Tensor
-    structured: Tensor
-    crowd: Tensor
-    of_points: Tensor
-
-    @property
-    def displaced(self) -> Tensor:
-        """Pairs whose pixel is unrelated to their point, bool, shape :math:`(B, N)`."""
-        return self.mismatch | self.sensing | self.crowd
-
-    @property
-    def inliers(self) -> Tensor:
-        """Pairs that are no outliers, bool, shape :math:`(B, N)`."""
-        return ~(self.displaced | self.near | self.structured)
+    INLIER = 0
+    MISMATCH = 1
+    SENSING = 2
+    NEAR = 3
+    STRUCTURED = 4
+    CROWD = 5
+    POINT_CROWD = 6
 
 
 @dataclass(kw_only=True, eq=False)
@@ -54,27 +42,24 @@ class OutlierMix:
     The shares apply in the order structured, near, crowd, mismatch, each to the outliers without a kind so far.
 
     Args:
-        max_ratio: the maximum as a share of the pairs, rounded down. 0.33 means :math:`\lfloor n/3 \rfloor` for every n
-            up to 15.
+        max_ratio: the maximum as a share of the pairs, rounded down; 0.33 gives n // 3 for every n up to 15.
         count: exact number of outliers, which replaces the range.
         min_count: smallest number of outliers, up to the maximum.
         min_inliers: smallest number of inliers, which limits the maximum.
         mismatch_share: probability that an outlier is a *mismatch* (the projection of another point) rather than
             *sensing* (a uniform pixel of the image).
-        near_share: probability that an outlier is *near* its pixel.
-        near_pixels: smallest and largest distance of a near outlier from its pixel in pixels, log-uniform, but at least
-            5 and 10 standard deviations of the noise. ``None``: 5 to 50 standard deviations.
-        structured_share: probability that a problem has *structured* outliers, which agree on another pose, as with
+        near_share: probability that an outlier is *near* the pixel of its point.
+        near_pixels: smallest and largest distance of near outliers in pixels, log-uniform, but at least 5 and 10
+            standard deviations of the noise. ``None``: 5 to 50 standard deviations.
+        structured_share: probability that a problem has *structured* outliers. They agree on another pose, as with
             repeated structure.
-        structured_ratio: smallest and largest number of structured outliers relative to the number of inliers, uniform
-            over the problems, limited by the number of outliers.
-        structured_angle: largest angle in radians by which the structured part of a scene is rotated; the part is
-            always shifted.
+        structured_ratio: smallest and largest number of structured outliers relative to the number of inliers, uniform.
+        structured_angle: largest rotation in radians of the structured part of a scene, which is always shifted.
         mirrored_share: probability that the structured part of a problem is mirrored as well.
-        crowd_share: probability that a problem has *crowds*: a share of its outliers, uniform from 0 to 1, has the
+        crowd_share: probability that a problem has *crowds*. A share of its outliers, uniform from 0 to 1, then has the
             pixels of a few other pairs.
         max_crowds: largest number of these other pairs; their number is uniform from 1.
-        point_crowd_share: probability that the crowds of a problem share points instead, each with many pixels.
+        point_crowd_share: probability that the crowds of a problem share points, each with many pixels, not pixels.
 
     Raises:
         BaseError: for a number or a range out of its bounds.
@@ -100,7 +85,6 @@ class OutlierMix:
     point_crowd_share: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         shares = {name: value for name, value in vars(self).items() if name.endswith("_share")}
         check_numbers(0.0, 1.0, max_ratio=self.max_ratio, **shares)
         check_numbers(0.0, structured_angle=self.structured_angle)
@@ -118,55 +102,42 @@ class OutlierMix:
             return self.count
         return max(0, min(math.floor(n * self.max_ratio + _SLACK), n - self.min_inliers))
 
-    def least_count(self, n: int) -> int:
-        """The smallest number of outliers among ``n`` pairs."""
-        return min(self.min_count, self.max_count(n)) if self.count is None else self.count
-
-    def draw(self, batch_size: int, n: int, generator: torch.Generator) -> OutlierDraw:
-        """Draw the outliers of ``batch_size`` problems of ``n`` pairs, on the generator's device.
+    def draw(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
+        """Draw a value of :class:`OutlierKind` for each pair, int64, shape ``(batch_size, n)``.
 
         Raises:
             BaseError: when there are to be more outliers than pairs.
         """
-        least, most = self.least_count(n), self.max_count(n)
+        most = self.max_count(n)
+        least = min(self.min_count, most) if self.count is None else most
         KORNIA_CHECK(most <= n, f"{most} outliers do not fit into n = {n} pairs.")
-        device = generator.device
 
         def chance(*shape: int) -> Tensor:
-            return torch.rand(batch_size, *shape, generator=generator, device=device)
+            return torch.rand(batch_size, *shape, generator=generator)
 
-        count = torch.randint(least, most + 1, (batch_size, 1), generator=generator, device=device)
-        order = chance(n).argsort(-1)
-        rank = torch.empty_like(order).scatter_(1, order, torch.arange(n, device=device).expand(batch_size, n))
-        outlier = rank < count
-        mismatch = chance(n) < self.mismatch_share
-        near = structured = crowd = torch.zeros_like(outlier)
-        of_points = crowd[:, :1]
+        count = torch.randint(least, most + 1, (batch_size, 1), generator=generator)
+        rank = chance(n).argsort(-1).argsort(-1)
+        is_open = rank < count  # outliers without a special kind so far
+        kind = is_open * torch.where(chance(n) < self.mismatch_share, OutlierKind.MISMATCH, OutlierKind.SENSING)
         if self.structured_share:
             chosen = chance(1) < self.structured_share
             low, high = self.structured_ratio
             ratio = uniform((batch_size, 1), low, high, generator) if low < high else low
-            structured = outlier & chosen & (rank < ((n - count) * ratio + _SLACK).floor())
-            outlier = outlier & ~structured
+            chosen = is_open & chosen & (rank < ((n - count) * ratio + _SLACK).floor())
+            kind[chosen], is_open = OutlierKind.STRUCTURED, is_open & ~chosen
         if self.near_share:
-            near = outlier & (chance(n) < self.near_share)
-            outlier = outlier & ~near
+            chosen = is_open & (chance(n) < self.near_share)
+            kind[chosen], is_open = OutlierKind.NEAR, is_open & ~chosen
         if self.crowd_share:
             chosen, share = chance(1) < self.crowd_share, chance(1)
-            crowd = outlier & chosen & (chance(n) < share)
-            outlier = outlier & ~crowd
+            kind[is_open & chosen & (chance(n) < share)] = OutlierKind.CROWD
             if self.point_crowd_share:
-                of_points = chance(1) < self.point_crowd_share
-        return OutlierDraw(outlier & mismatch, outlier & ~mismatch, near, structured, crowd, of_points)
+                kind[(kind == OutlierKind.CROWD) & (chance(1) < self.point_crowd_share)] = OutlierKind.POINT_CROWD
+        return kind
 
 
-def near_offsets(
-    img_sigma: Tensor, n: int, generator: torch.Generator, pixels: tuple[float, float] | None = None
-) -> Tensor:
-    """Draw the offsets in pixels of near outliers, (B, n, 2).
-
-    ``img_sigma`` is the noise of the pixels, (B, 1) or (B, n); ``pixels`` is ``near_pixels`` of :class:`OutlierMix`.
-    """
+def near_offsets(img_sigma: Tensor, n: int, generator: torch.Generator, pixels: tuple[float, float] | None) -> Tensor:
+    """The offsets in pixels of near outliers, (B, n, 2), with noise ``img_sigma``, (B, 1) or (B, n)."""
     direction = normalize(normal((len(img_sigma), n, 2), generator), dim=-1)
     each, img_sigma = (len(img_sigma), n, 1), img_sigma[..., None]
     if pixels is None:
@@ -180,7 +151,7 @@ def structured_points(cam_points: Tensor, mix: OutlierMix, generator: torch.Gene
     batch_size = len(cam_points)
     centre = cam_points.mean(1, keepdim=True)
     size = (cam_points - centre).square().sum(-1).mean(1).sqrt()[:, None, None]
-    turn = torch.eye(3, dtype=cam_points.dtype, device=cam_points.device)
+    turn = torch.eye(3, dtype=cam_points.dtype)
     if mix.structured_angle:
         turn = random_poses(batch_size, generator, max_angle=mix.structured_angle).rotation
     shift = 0.5 * size * normal((batch_size, 1, 3), generator)
@@ -192,7 +163,7 @@ def structured_points(cam_points: Tensor, mix: OutlierMix, generator: torch.Gene
 
 
 def crowd_leaders(batch_size: int, n: int, max_crowds: int, generator: torch.Generator) -> Tensor:
-    """Draw for each pair the pair whose pixel or point its crowd shares, (B, N); a problem has few such pairs."""
+    """For each pair the index of the pair whose pixel or point its crowd shares, (B, N)."""
     leader = (n * unit((batch_size, max_crowds), generator)).long().clamp(max=n - 1)  # (B, max_crowds)
     crowds = 1 + (max_crowds * unit((batch_size, 1), generator)).long()  # (B, 1)
     crowd = (crowds * unit((batch_size, n), generator)).long().clamp(max=max_crowds - 1)

@@ -10,9 +10,9 @@ import math
 from typing import Protocol, TypeAlias
 
 import torch
-from kornia.core.check import KORNIA_CHECK
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
+from torch.nn.functional import pad
 
 from kornia_pnpnet.core.checks import check_numbers, check_positive, check_ranges
 from kornia_pnpnet.data.draws import log_uniform, normal, random_poses, uniform, unit
@@ -22,10 +22,13 @@ __all__ = ["BoxPoints", "DrivePoints", "FacadePoints", "ObjectPoints", "PointPri
 Range: TypeAlias = tuple[float, float]
 
 # The shapes of scenes are choices: from a flat picture on a wall to a street, at distances in metres.
-# Slabs: standard deviation of the slopes; thickness and smallest depth of the surface relative to the distance.
+# Slabs: half-size of the window and largest coordinate of a direction as tangents, distance, standard deviation of the
+# slopes; thickness and smallest depth of the surface relative to the distance.
+_SLAB_WINDOW, _SLAB_TANGENT, _SLAB_DISTANCE = (0.15, 0.8), 0.9, (10.0, 40.0)
 _TILT, _THICKNESS, _LEAST_SURFACE = 0.5, (0.02, 4.0), 0.3
-# Objects: smallest factor of an axis.
-_THINNEST = 0.05
+# Objects: distance in half-sizes, largest tangent of the direction of the centre, smallest factor of an axis, share of
+# planar objects.
+_OBJECT_DISTANCE, _OBJECT_TANGENT, _THINNEST, _PLANAR = (1.5, 40.0), 0.8, 0.05, 0.15
 # Façades: distance; largest turn in degrees; relief relative to the distance; share of problems with two façades.
 _FACADE_DISTANCE, _SLANT, _RELIEF, _CORNER = (4.0, 60.0), 70.0, (0.001, 0.1), 0.3
 # Smallest cosine between a ray and a façade's normal, relative to that of the middle ray: rays that meet a façade
@@ -72,7 +75,7 @@ class BoxPoints:
         self.half_width, self.z_near, self.depth = half_width, z_near, depth
 
     def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
-        """Draw points of shape ``(batch_size, n, 3)``."""
+        """See :class:`PointPrior`."""
         xy = uniform((batch_size, n, 2), -self.half_width, self.half_width, generator)
         z = uniform((batch_size, n, 1), self.z_near, self.z_near + self.depth, generator)
         return torch.cat((xy, z), -1)
@@ -82,77 +85,44 @@ class SlabPoints:
     r"""Points as in photographs: a tilted slab of any thickness, seen through a window of the image.
 
     A façade fills part of the image and is thin, a courtyard is deep; a box along the optical axis is neither.
-    A window, a distance, a tilt and a thickness are drawn for each problem. Each point has a uniform direction in the
-    window and a depth in the slab, :math:`z = d (1 + g_x x/z + g_y y/z)(1 + e\,u)` with :math:`u` uniform.
-
-    Args:
-        window: half-size of the window as tangents of the viewing angle, uniform for each axis.
-        field_of_view: the window lies within this tangent on both axes.
-        distance: distance :math:`d` in the unit of the world, log-uniform.
+    A window, a distance :math:`d`, slopes :math:`g` and a thickness :math:`e` are drawn for each problem. Each point
+    has a uniform direction in the window and a depth in the slab,
+    :math:`z = d (1 + g_x x/z + g_y y/z)(1 + e\,u)` with :math:`u` uniform.
     """
 
-    def __init__(
-        self, *, window: Range = (0.15, 0.8), field_of_view: float = 0.9, distance: Range = (10.0, 40.0)
-    ) -> None:
-        check_ranges(window=window, distance=distance)
-        check_numbers(0.0, field_of_view=field_of_view)
-        fits = window[1] <= field_of_view
-        KORNIA_CHECK(fits, f"The window {window} must fit into the field of view, got {field_of_view}.")
-        self.window, self.field_of_view, self.distance = window, field_of_view, distance
-
     def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
-        """Draw points of shape ``(batch_size, n, 3)``."""
-        half = uniform((batch_size, 1, 2), *self.window, generator)
-        centre = (self.field_of_view - half) * uniform((batch_size, 1, 2), -1.0, 1.0, generator)
+        """See :class:`PointPrior`."""
+        half = uniform((batch_size, 1, 2), *_SLAB_WINDOW, generator)
+        centre = (_SLAB_TANGENT - half) * uniform((batch_size, 1, 2), -1.0, 1.0, generator)
         direction = centre + half * uniform((batch_size, n, 2), -1.0, 1.0, generator)
         rise = _TILT * normal((batch_size, 1, 2), generator) * (direction - centre)  # (B, n, 2)
         surface = (1.0 + (rise[..., 0] + rise[..., 1])).clamp(min=_LEAST_SURFACE)
         thickness = log_uniform((batch_size, 1), *_THICKNESS, generator)
         layer = 1.0 + thickness * unit((batch_size, n), generator)
-        z = log_uniform((batch_size, 1), *self.distance, generator) * surface * layer  # (B, n)
-        return torch.cat((direction * z[..., None], z[..., None]), -1)
+        z = log_uniform((batch_size, 1), *_SLAB_DISTANCE, generator) * surface * layer  # (B, n)
+        return pad(direction, (0, 1), value=1.0) * z[..., None]
 
 
 class ObjectPoints:
-    r"""Points of an object of any proportions somewhere in the image, near or far.
+    """Points of an object of any proportions somewhere in the image, near or far.
 
-    The object is an ellipsoid or a box of half-size about 1, made thinner by random factors along two axes, down to a
-    plane, and rotated at random. Its direction is random.
-
-    Args:
-        distance: distance of the centre in half-sizes, log-uniform.
-        field_of_view: the centre lies within this tangent on both axes.
-        planar: share of problems whose points lie in a plane.
-
-    Example:
-        >>> from kornia_pnpnet.data import SyntheticProblems
-        >>> problems = SyntheticProblems(n=8, batch_size=2, points=ObjectPoints(planar=1.0), world_sigma=0.0).batch(0)
-        >>> centred = problems.world_points - problems.world_points.mean(1, keepdim=True)
-        >>> torch.linalg.matrix_rank(centred, rtol=1e-4)
-        tensor([2, 2])
+    The object is an ellipsoid or a box of half-size about 1, made thinner by random factors along two axes, in some
+    problems down to a plane, and rotated at random. Its direction is random.
     """
 
-    def __init__(self, *, distance: Range = (1.5, 40.0), field_of_view: float = 0.8, planar: float = 0.15) -> None:
-        check_ranges(distance=distance)
-        check_numbers(0.0, field_of_view=field_of_view)
-        check_numbers(0.0, 1.0, planar=planar)
-        self.distance, self.field_of_view, self.planar = distance, field_of_view, planar
-
     def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
-        """Draw points of shape ``(batch_size, n, 3)``."""
+        """See :class:`PointPrior`."""
         box = uniform((batch_size, n, 3), -1.0, 1.0, generator)
         ball = 0.5 * normal((batch_size, n, 3), generator)
         is_box = unit((batch_size, 1, 1), generator) < 0.5
         factors = log_uniform((batch_size, 1, 3), _THINNEST, 1.0, generator)
         factors[..., 0] = 1.0
-        flat = unit((batch_size, 1), generator) < self.planar
-        factors[..., 2] = torch.where(flat, 0.0, factors[..., 2])
+        factors[..., 2] *= unit((batch_size, 1), generator) >= _PLANAR
         turn = random_poses(batch_size, generator, max_angle=math.pi).rotation
         points = (torch.where(is_box, box, ball) * factors) @ turn.mT
-        tangents = uniform((batch_size, 2), -self.field_of_view, self.field_of_view, generator)
-        away = log_uniform((batch_size, 1), *self.distance, generator)
-        centre = away * torch.cat((tangents, torch.ones_like(away)), -1)
-        return points + centre[:, None]
+        tangents = uniform((batch_size, 1, 2), -_OBJECT_TANGENT, _OBJECT_TANGENT, generator)
+        distance = log_uniform((batch_size, 1, 1), *_OBJECT_DISTANCE, generator)
+        return points + distance * pad(tangents, (0, 1), value=1.0)
 
 
 class _View:
@@ -165,14 +135,13 @@ class _View:
         self.field_of_view, self.window = field_of_view, window
 
     def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
-        """Draw points of shape ``(batch_size, n, 3)``."""
         angle = uniform((batch_size, 1, 1), *self.field_of_view, generator).deg2rad_()
         area = log_uniform((batch_size, 1, 1), *self.window, generator)
         split = uniform((batch_size, 1, 1), 0.25, 0.75, generator)  # the window's shape: wide, square or high
         size = torch.cat((area**split, area ** (1.0 - split)), -1)  # (B, 1, 2)
         centre = (1.0 - size) * uniform((batch_size, 1, 2), -1.0, 1.0, generator)
         tangents = (angle / 2).tan() * (centre + size * uniform((batch_size, n, 2), -1.0, 1.0, generator))
-        rays = torch.nn.functional.pad(tangents, (0, 1), value=1.0)
+        rays = pad(tangents, (0, 1), value=1.0)
         return rays * self._depth(rays, generator)[..., None]
 
     def _depth(self, rays: Tensor, generator: torch.Generator) -> Tensor:

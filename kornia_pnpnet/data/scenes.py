@@ -13,9 +13,9 @@ from kornia.core.check import KORNIA_CHECK
 from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_whole
-from kornia_pnpnet.data.draws import RandomProblems, batch_generator, random_poses, unit
-from kornia_pnpnet.data.outliers import OutlierMix
-from kornia_pnpnet.result import Pose, Problems
+from kornia_pnpnet.data.draws import RandomProblems, random_poses, unit
+from kornia_pnpnet.data.outliers import OutlierKind, OutlierMix
+from kornia_pnpnet.result import Problems
 
 __all__ = ["Scene", "SceneProblems", "View"]
 
@@ -50,11 +50,9 @@ class View:
     inliers: Tensor
 
     def __post_init__(self) -> None:
-        """Check the tensors."""
         m = len(self.world_points)
-        expected = {"world_points": (m, 3), "img_points": (m, 2), "inliers": (m,)}
-        expected |= {"intrinsics": (3, 3), "rotation": (3, 3), "translation": (3,)}
-        for name, shape in expected.items():
+        of_pairs = {"world_points": (m, 3), "img_points": (m, 2), "inliers": (m,)}
+        for name, shape in {**of_pairs, "intrinsics": (3, 3), "rotation": (3, 3), "translation": (3,)}.items():
             value: Tensor = getattr(self, name)
             if value.shape != shape:
                 raise ValueError(f"image '{self.name}': {name} has shape {tuple(value.shape)}, expected {shape}")
@@ -68,14 +66,6 @@ class View:
     def cam_points(self) -> Tensor:
         """The observed points in the camera's frame, shape :math:`(M, 3)`."""
         return self.world_points @ self.rotation.mT + self.translation
-
-    @property
-    def reprojection_error_px(self) -> Tensor:
-        """Distance of each pixel to its point's projection, infinite behind the camera, shape :math:`(M,)`."""
-        cam_points = self.cam_points
-        projected = cam_points @ self.intrinsics.mT  # (M, 3)
-        error = (projected[:, :2] / projected[:, 2:] - self.img_points).norm(dim=1)
-        return torch.where(cam_points[:, 2] > 0, error, torch.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,25 +94,23 @@ class Scene:
 class SceneProblems(RandomProblems):
     r"""Random problems of a scene, endless and reproducible.
 
-    Each problem is a random image with ``n`` random points that it observes and their pixels. Some pairs become
-    outliers: a *mismatch* gets the pixel of a spare point of the same image, a *sensing* outlier a uniform pixel of the
-    image. A pair is an inlier when it is an inlier of the scene and did not become an outlier.
-    ``outliers=OutlierMix(count=2)`` is the protocol's real data with outliers: 10 points are drawn, and 2 of the
-    first 9 get the pixel of the 10th point or a uniform pixel. Points and poses do not depend on ``outliers``, so that
-    different numbers of outliers are compared on the same problems.
+    Each problem is a random image with ``n`` random points that it observes and their pixels. A *mismatch* gets the
+    pixel of a spare point of the same image, a *sensing* outlier a uniform pixel of the image. A pair is an inlier when
+    it is an inlier of the scene and did not become an outlier. ``outliers=OutlierMix(count=2)`` is the protocol's real
+    data with outliers. Points and poses do not depend on ``outliers``, so that different numbers of outliers are
+    compared on the same problems.
 
     As in the paper the world is centred on a coarse pose: a pose :math:`(R^*, t^*)` is drawn from the protocol's prior
     and the world is moved so that this pose is the true one, :math:`x' = R^{*\top}(R x + t - t^*)`.
 
     Args:
         scene: the scene. Only its images with at least ``n + num_spares`` points are used.
-        n: number of pairs per problem; for ``batch_size``, ``seed`` and ``dtype`` see :class:`SyntheticProblems`.
+        n: number of pairs per problem. For ``batch_size``, ``seed``, ``dtype`` and ``device`` see
+            :class:`SyntheticProblems`.
         outliers: number of outliers, and the share of mismatches among them; no outliers when ``None``. Raw matches
             have mismatches of their own.
-        num_spares: number of spare points per problem. Its mismatches get the pixels of the spare points in turn: with
-            the protocol's one spare point all mismatches of a problem share a pixel.
-        recentre: whether to move the world.
-        device: device of the batches; numbers are drawn on the CPU and moved.
+        num_spares: number of spare points per problem, whose pixels the mismatches get in turn. With the protocol's one
+            spare point all mismatches of a problem share a pixel.
 
     Raises:
         BaseError: for an argument out of range, or ``outliers`` with *near* or *structured* outliers or crowds.
@@ -132,11 +120,9 @@ class SceneProblems(RandomProblems):
     scene: Scene = field(kw_only=False, repr=False)
     outliers: OutlierMix | None = None
     num_spares: int = 1
-    recentre: bool = True
     dtype: torch.dtype = torch.float64
 
     def __post_init__(self) -> None:
-        """Check the arguments, and put the pairs of all views one after the other, so that a batch is one gather."""
         super().__post_init__()
         check_whole(1, num_spares=self.num_spares)
         for name in ("near_share", "structured_share", "crowd_share"):
@@ -145,49 +131,44 @@ class SceneProblems(RandomProblems):
         need = self.n + self.num_spares
         self.views = views = tuple(view for view in self.scene.views if len(view.world_points) >= need)
         if not views:
-            raise ValueError(
-                f"no image of '{self.scene.name}' has the {need} points for n = {self.n} and "
-                f"num_spares = {self.num_spares}"
-            )
-        self._counts = torch.tensor([len(view.world_points) for view in views])
-        self._starts = self._counts.cumsum(0) - self._counts
-        self._points = torch.cat([view.cam_points if self.recentre else view.world_points for view in views])
-        self._img_points = torch.cat([view.img_points for view in views])
-        self._inliers = torch.cat([view.inliers for view in views])
+            wanted = f"n = {self.n} and num_spares = {self.num_spares}"
+            raise ValueError(f"no image of '{self.scene.name}' has the {need} points for {wanted}")
+        # The pairs of all views, one view after the other, so that a batch is one gather.
+        pairs = zip(*((view.cam_points, view.img_points, view.inliers) for view in views), strict=True)
+        self._pairs = [torch.cat(parts) for parts in pairs]
         self._intrinsics = torch.stack([view.intrinsics for view in views])
-        self._poses = Pose(torch.stack([view.rotation for view in views]), torch.stack([v.translation for v in views]))
         self._size = torch.tensor([[view.width, view.height] for view in views], dtype=torch.float64)
+        self._counts = torch.tensor([len(view.world_points) for view in views])
 
     @property
     def max_translation(self) -> float:
         """Translation error below which a pose is a success: 0.2 in metres, else 0.5 % of the median depth."""
         return 0.2 if self.scene.metric else 0.005 * self.scene.median_depth
 
-    def _draw(self, index: int) -> Problems:
-        generator = batch_generator(self.seed, index)
+    def _draw(self, generator: torch.Generator) -> Problems:
         # Draws that depend on the outlier options come last.
         view = torch.randint(len(self.views), (self.batch_size,), generator=generator)
-        rows = _choose(self._counts[view], self.n + self.num_spares, generator) + self._starts[view, None]
+        rows = _choose(self._counts[view], self.n + self.num_spares, generator)
+        rows += (self._counts.cumsum(0) - self._counts)[view, None]
         rows, spare_rows = rows[:, : self.n], rows[:, self.n :]  # (B, N), (B, num_spares)
         pose = random_poses(self.batch_size, generator)
         anywhere = unit((self.batch_size, self.n, 2), generator) * self._size[view, None]
-        draw = (self.outliers or OutlierMix(count=0)).draw(self.batch_size, self.n, generator)
+        kind = (self.outliers or OutlierMix(count=0)).draw(self.batch_size, self.n, generator)  # (B, N)
 
-        world_points = self._points[rows]  # (B, N, 3)
-        if self.recentre:
-            world_points = (world_points - pose.translation[:, None]) @ pose.rotation
-        else:
-            pose = Pose(*(x[view] for x in self._poses))
-        turn = (draw.mismatch.cumsum(1) - 1) % self.num_spares  # (B, N), used at mismatches only
-        shown = torch.where(draw.mismatch, spare_rows.gather(1, turn), rows)
-        img_points = torch.where(draw.sensing[..., None], anywhere, self._img_points[shown])
-        return Problems(world_points, img_points, self._intrinsics[view], pose, self._inliers[rows] & draw.inliers)
+        cam_points, img_points, inliers = self._pairs
+        world_points = (cam_points[rows] - pose.translation[:, None]) @ pose.rotation  # (B, N, 3)
+        mismatch = kind == OutlierKind.MISMATCH
+        turn = (mismatch.cumsum(1) - 1) % self.num_spares  # (B, N), used at mismatches only
+        pixels = img_points[torch.where(mismatch, spare_rows.gather(1, turn), rows)]
+        pixels = torch.where((kind == OutlierKind.SENSING)[..., None], anywhere, pixels)
+        inliers = inliers[rows] & (kind == OutlierKind.INLIER)
+        return Problems(world_points, pixels, self._intrinsics[view], pose, inliers)
 
 
 def _choose(counts: Tensor, k: int, generator: torch.Generator) -> Tensor:
     """For each count c of (B,), k different integers of 0 ... c - 1, every ordered choice equally likely, (B, k).
 
-    Floyd's algorithm on the whole batch at once: its cost does not grow with the number of points in an image.
+    Floyd's algorithm for the whole batch. Its cost does not grow with the number of points in an image.
     """
     draws = unit((len(counts), k), generator)
     chosen = torch.empty((len(counts), k), dtype=torch.int64)

@@ -43,14 +43,9 @@ def stream_batches(source: ProblemSource, start: int, stop: int, workers: int = 
         stop: number after the last batch.
         workers: number of processes that draw ahead; 0 draws each batch when it is requested. The numbers drawn do not
             depend on the number of workers. With workers the memory of a batch is reused for the next batch.
-
-    Raises:
-        Exception: the error of a worker, with its traceback in the message.
     """
-    if workers == 0:
+    if workers == 0 or start >= stop:
         yield from map(source.batch, range(start, stop))
-        return
-    if start >= stop:
         return
     slots = _SharedSlots(source, source.batch(start), slots=workers * _AHEAD + 1)
     methods = multiprocessing.get_all_start_methods()
@@ -84,8 +79,7 @@ class _SharedSlots(Dataset[int]):
     """
 
     def __init__(self, source: ProblemSource, example: Problems, slots: int) -> None:
-        self._source = source
-        self._slots = slots
+        self._source, self._slots = source, slots
         self._memory = example.map(lambda x: torch.empty((slots, *x.shape), dtype=x.dtype).share_memory_())
 
     def __getitem__(self, index: int) -> int:

@@ -3,38 +3,38 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 from kornia.core.check import KORNIA_CHECK
 from torch import Tensor
 from torch.nn.functional import normalize, pad
 
-from kornia_pnpnet.core.checks import check_numbers, check_positive
-from kornia_pnpnet.data.draws import (
-    Amount,
-    RandomProblems,
-    batch_generator,
-    check_amount,
-    draw_confidence,
-    draw_noise,
-    hide_sigmas,
-    random_poses,
-    uniform,
-    unit,
-)
-from kornia_pnpnet.data.outliers import OutlierMix, crowd_leaders, near_offsets, structured_points
+from kornia_pnpnet.core.checks import check_numbers, check_positive, check_ranges
+from kornia_pnpnet.data.draws import RandomProblems, log_uniform, normal, random_poses, uniform, unit
+from kornia_pnpnet.data.outliers import OutlierKind, OutlierMix, crowd_leaders, near_offsets, structured_points
 from kornia_pnpnet.data.points import BoxPoints, PointPrior
 from kornia_pnpnet.result import Problems
 
 __all__ = ["SyntheticProblems"]
 
-# Bounds that keep noise finite in float32: smallest degrees of freedom of the tails, largest standard deviation of the
-# logarithm of the sigmas, largest ratio of axes (the covariance keeps digits of the shortest axis).
-_LEAST_DEGREES, _MOST_SPREAD, _MOST_RATIO = 1.0, 3.0, 100.0
+#: A number, or the two ends of a range from which each problem draws a number, log-uniform.
+Amount: TypeAlias = float | Sequence[float]
+
+# Bounds that keep noise finite in float32, and the digits of a covariance's shortest axis. An amount may also be 0.
+_AMOUNTS = {
+    "img_sigma": (0.0, math.inf),
+    "world_sigma": (0.0, math.inf),
+    "degrees": (1.0, math.inf),
+    "sigma_spread": (0.0, 3.0),
+}
+_MOST_RATIO = 100.0
 # Standard deviations. A choice: a pair whose pixel has more noise is called an outlier.
 _MOST_NOISE = 10.0
+# Squared standard deviations. Keeps the quotient of the tails from 0 / 0; float64 resolves the quotient here.
+_LEAST_SQ_LENGTH = 1e-12
 # Pixels. Noise of no size divides by this.
 _TINY = 1e-9
 # A camera sees a point when the cosine between its direction and the optical axis is larger. A choice: 87 degrees.
@@ -43,6 +43,9 @@ _LEAST_COSINE = 0.05
 _WIDEST_TANGENT = math.tan(math.radians(60.0))
 # Mean distances between points in the image. A choice: bunches are sharp to hardly visible.
 _MOST_BLUR = 2.0
+# Ranges of the quality of a confidence: standard deviations between inliers and outliers, influence of the noise, and
+# scale of the logits; standard deviation of the offset of the logits.
+_SEPARATION, _NOISINESS, _GAIN, _OFFSET = (0.0, 4.0), (0.0, 1.0), (0.3, 3.0), 1.5
 
 
 @dataclass(kw_only=True, eq=False)
@@ -61,31 +64,31 @@ class SyntheticProblems(RandomProblems):
         seed: seed of the stream.
         points: prior of the points in the camera's frame; the protocol's box when ``None``.
         outliers: number and kinds of outliers; no outliers when ``None``.
-        translation_box: side of the box in which translations are uniform.
-        translation_sigma: standard deviation of normally distributed translations, which replace the box.
+        translation_sigma: standard deviation of normally distributed translations. ``None``: translations are uniform
+            in a box of side 25.
         max_angle: largest rotation angle in radians.
         focal: focal length in pixels; the principal point is 0.
-        half_image: pixels of *sensing* outliers are uniform in ``[-half_image, half_image]`` on both axes; ``None``:
+        half_image: pixels of *sensing* outliers are uniform in ``[-half_image, half_image]`` on both axes. ``None``:
             in the smallest such square that holds the pixels of all points of the problem, up to a field of view of
             120°.
         img_sigma: standard deviation of the noise on each pixel coordinate, or a range.
         world_sigma: standard deviation of the noise on each world coordinate, or a range.
         degrees: degrees of freedom of the pixel noise's Student distribution, at least 1, or a range. 0: Gaussian
             noise. ``img_sigma`` is the standard deviation of the bulk; a pair with noise above 10 of it is an outlier.
-        sigma_spread: the sigmas of a problem's pairs are log-normal about those of the problem, with this standard
-            deviation of the logarithm, at most 3, or a range. Known sigmas are then those of each pair, shape
-            ``(batch_size, n)``.
+        sigma_spread: standard deviation, at most 3, or a range, of the logarithm of the sigmas of a problem's pairs
+            about the sigmas of the problem. Known sigmas then have the shape ``(batch_size, n)``.
         axis_ratio: largest over smallest standard deviation of the noise of each pixel and of each point, at most 100;
             the standard deviations are a geometric series along random axes that differ between pairs. Above 1,
             ``img_sigma`` and ``world_sigma`` are the root mean square over the axes, and known noise is covariances, of
             all problems or of none.
         known_noise: share of the problems that come with both sigmas. A third of the other problems come with one of
             them; unknown sigmas are NaN.
-        confidence_share: share of the problems that come with confidences, see ``data.draws.draw_confidence``.
+        confidence_share: share of the problems that come with confidences; the other problems have NaN. The
+            separation of inliers from outliers and the scale of the logits differ between problems.
         bunched_share: share of the problems whose inliers are bunched in a part of the image; the points and pixels of
             outliers, except *near* and *structured* ones, come from the rest of the scene.
-        dtype: dtype of the batches; numbers are drawn in float64 and cast.
-        device: device of the batches.
+        dtype: dtype of the batches; numbers are drawn in float64.
+        device: device of the batches; numbers are drawn on the CPU.
 
     Raises:
         BaseError: for a number or a range out of its bounds.
@@ -98,7 +101,6 @@ class SyntheticProblems(RandomProblems):
 
     points: PointPrior | None = None
     outliers: OutlierMix | None = None
-    translation_box: float = 25.0
     translation_sigma: float | None = None
     max_angle: float = math.pi / 2
     focal: float = 3400.0
@@ -113,114 +115,162 @@ class SyntheticProblems(RandomProblems):
     bunched_share: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         super().__post_init__()
-        check_numbers(0.0, translation_box=self.translation_box, max_angle=self.max_angle)
+        sizes = {name: getattr(self, name) for name in ("max_angle", "half_image", "translation_sigma")}
+        check_numbers(0.0, **{name: value for name, value in sizes.items() if value is not None})
         check_positive(focal=self.focal)
         shares = {name: getattr(self, name) for name in ("known_noise", "confidence_share", "bunched_share")}
         check_numbers(0.0, 1.0, **shares)
-        for name in ("half_image", "translation_sigma"):
-            if getattr(self, name) is not None:
-                check_numbers(0.0, **{name: getattr(self, name)})
-        self.img_sigma = check_amount("img_sigma", self.img_sigma)
-        self.world_sigma = check_amount("world_sigma", self.world_sigma)
-        self.degrees = check_amount("degrees", self.degrees, _LEAST_DEGREES)
-        self.sigma_spread = check_amount("sigma_spread", self.sigma_spread, 0.0, _MOST_SPREAD)
         check_numbers(1.0, _MOST_RATIO, axis_ratio=self.axis_ratio)
+        for name, (low, high) in _AMOUNTS.items():
+            value = getattr(self, name)
+            if isinstance(value, Sequence):
+                check_ranges(**{name: value})
+            for end in value if isinstance(value, Sequence) else [value]:
+                check_numbers(low if end else 0.0, high, **{name: end})
         KORNIA_CHECK(
             self.axis_ratio == 1.0 or self.known_noise in (0.0, 1.0),
             f"Covariances are known for all problems or for none, got known_noise={self.known_noise}.",
         )
 
-    def _draw(self, index: int) -> Problems:
-        generator = batch_generator(self.seed, index, self.device)
-        size, mix = self.batch_size, self.outliers or OutlierMix(count=0)
-        box, sigma = self.translation_box, self.translation_sigma
-        pose = random_poses(size, generator, translation_box=box, translation_sigma=sigma, max_angle=self.max_angle)
+    def _draw(self, generator: torch.Generator) -> Problems:
+        size, n, mix = self.batch_size, self.n, self.outliers or OutlierMix(count=0)
+        pose = random_poses(size, generator, translation_sigma=self.translation_sigma, max_angle=self.max_angle)
         # Mismatches show other points of the same scene, so both are drawn at once.
-        scene = (self.points or BoxPoints())(size, 2 * self.n, generator)
-        draw = mix.draw(size, self.n, generator)
+        scene = (self.points or BoxPoints())(size, 2 * n, generator)
+        kind = mix.draw(size, n, generator)[..., None]  # (B, N, 1), as all masks below
+        in_crowd = (kind == OutlierKind.CROWD) | (kind == OutlierKind.POINT_CROWD)
+        has_other = (kind == OutlierKind.MISMATCH) | in_crowd
+        is_sensing = kind == OutlierKind.SENSING
         anywhere = self._anywhere(scene, generator)
         if self.bunched_share:
-            scene = _bunched(scene, draw.displaced, self.bunched_share, generator)
+            scene = self._bunched(scene, (has_other | is_sensing)[..., 0], generator)
         cam_points, other_points = scene.chunk(2, 1)
 
         world_points = (cam_points - pose.translation[:, None]) @ pose.rotation
-        noise_options: dict[str, Any] = {"spread": self.sigma_spread, "axis_ratio": self.axis_ratio}
-        noise, world_sigma, world_cov = draw_noise(world_points.shape, self.world_sigma, generator, **noise_options)
+        noise, world_sigma, world_cov = self._noise(world_points.shape, self.world_sigma, 0.0, generator)
         world_points += noise
-        shown = torch.where((draw.mismatch | draw.crowd)[..., None], other_points, cam_points)
+        shown = torch.where(has_other, other_points, cam_points)
         if mix.structured_share:
             moved = structured_points(cam_points, mix, generator)
-            shown = torch.where(draw.structured[..., None], moved, shown)
+            shown = torch.where(kind == OutlierKind.STRUCTURED, moved, shown)
         # A point that is not in front of the camera has no pixel: its pair is an outlier.
-        behind = ~_is_in_front(shown)
-        shown = torch.where(behind[..., None], torch.ones_like(shown), shown)
+        in_front = _is_in_front(shown)
+        shown = torch.where(in_front, shown, 1.0)
         img_points = self.focal * shown[..., :2] / shown[..., 2:]
-        img_points = torch.where((draw.sensing | behind)[..., None], anywhere, img_points)
-        noise_options["degrees"] = self.degrees
-        noise, img_sigma, img_cov = draw_noise(img_points.shape, self.img_sigma, generator, **noise_options)
+        img_points = torch.where(is_sensing | ~in_front, anywhere, img_points)
+        noise, img_sigma, img_cov = self._noise(img_points.shape, self.img_sigma, self.degrees, generator)
         img_points += noise
         length = noise.norm(dim=-1)
-        inliers = draw.inliers & ~behind
+        inliers = ((kind == OutlierKind.INLIER) & in_front)[..., 0]
         if self.degrees:
             inliers &= length <= _MOST_NOISE * img_sigma
         if mix.near_share:
-            offsets = near_offsets(img_sigma, self.n, generator, mix.near_pixels)
-            img_points += torch.where(draw.near[..., None], offsets, 0.0)
+            offsets = near_offsets(img_sigma, n, generator, mix.near_pixels)
+            img_points += torch.where(kind == OutlierKind.NEAR, offsets, 0.0)
         if mix.crowd_share:
-            leader = crowd_leaders(size, self.n, mix.max_crowds, generator)[..., None]
+            leader = crowd_leaders(size, n, mix.max_crowds, generator)[..., None]
             pixels, points = img_points.take_along_dim(leader, 1), world_points.take_along_dim(leader, 1)
-            img_points = torch.where((draw.crowd & ~draw.of_points)[..., None], pixels, img_points)
-            world_points = torch.where((draw.crowd & draw.of_points)[..., None], points, world_points)
+            img_points = torch.where(kind == OutlierKind.CROWD, pixels, img_points)
+            world_points = torch.where(kind == OutlierKind.POINT_CROWD, points, world_points)
 
-        intrinsics = torch.tensor((self.focal, self.focal, 1.0), dtype=torch.float64, device=generator.device).diag()
-        problems = Problems(world_points, img_points, intrinsics.expand(size, 3, 3), pose, inliers)
+        known: dict[str, Any] = {}
         if self.known_noise and img_cov is not None:
-            problems = problems._replace(img_cov=img_cov, world_cov=world_cov)
+            known = {"img_cov": img_cov, "world_cov": world_cov}
         elif self.known_noise:
-            sigmas = hide_sigmas(img_sigma, world_sigma, self.known_noise, generator)
-            of_img, of_world = sigmas if self.sigma_spread else (x[:, 0] for x in sigmas)
-            problems = problems._replace(img_sigma=of_img, world_sigma=of_world)
+            known = self._known_sigmas(img_sigma, world_sigma, generator)
         if self.confidence_share:
             errors = length / img_sigma.mean(1, keepdim=True).clamp(min=_TINY)
-            confidence = draw_confidence(inliers, errors, self.confidence_share, generator)
-            problems = problems._replace(confidence=confidence)
-        return problems
+            known["confidence"] = self._confidence(inliers, errors, generator)
+        intrinsics = torch.tensor((self.focal, self.focal, 1.0), dtype=torch.float64).diag()
+        return Problems(world_points, img_points, intrinsics.expand(size, 3, 3), pose, inliers, **known)
 
     def _anywhere(self, scene: Tensor, generator: torch.Generator) -> Tensor:
         """Pixels that are uniform in the image, (B, N, 2)."""
         shape = self.batch_size, self.n, 2
         if self.half_image is not None:
             return uniform(shape, -self.half_image, self.half_image, generator)
-        in_front = _is_in_front(scene)[..., None]
-        depth = torch.where(in_front, scene[..., 2:], 1.0)
-        tangent = torch.where(in_front, scene[..., :2] / depth, 0.0)
+        in_front = _is_in_front(scene)
+        tangent = torch.where(in_front, scene[..., :2], 0.0) / torch.where(in_front, scene[..., 2:], 1.0)
         half = self.focal * tangent.abs().amax((1, 2), keepdim=True).clamp(max=_WIDEST_TANGENT)
         return half * uniform(shape, -1.0, 1.0, generator)
 
+    def _bunched(self, scene: Tensor, displaced: Tensor, generator: torch.Generator) -> Tensor:
+        """The points of each scene, (B, 2N, 3), sorted so that pairs that are not ``displaced``, (B, N), lie together.
+
+        Points are ranked by their angle from one of them plus random numbers, whose random size makes bunches more or
+        less sharp. In a share of the problems the first points of the ranking go to the pairs that are not displaced.
+        """
+        shape, each = scene.shape[:2], (len(scene), 1)
+        direction = normalize(scene, dim=-1)
+        distance = (direction - direction[:, :1]).square().sum(-1).sqrt()
+        blur = uniform(each, 0.0, _MOST_BLUR, generator) * unit(shape, generator)
+        score = distance / distance.mean(1, keepdim=True).clamp(min=torch.finfo(distance.dtype).tiny) + blur
+        chosen = unit(each, generator) < self.bunched_share
+        score = torch.where(chosen, score, unit(shape, generator))
+        last = pad(displaced, (0, self.n), value=True)
+        # Pairs that are not displaced come first, in random order, so that the position of a pair in the batch says
+        # nothing about its place in the image.
+        rank = (last + unit(shape, generator)).argsort(1).argsort(1)
+        return scene.take_along_dim(score.argsort(1).gather(1, rank)[..., None], 1)
+
+    def _noise(
+        self, shape: Sequence[int], sigma: Amount, degrees: Amount, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        r"""Noise (B, N, D), its standard deviations (B, 1) or (B, N), and with axes its covariances (B, N, D, D).
+
+        With ``degrees`` the length :math:`r` of normal noise on a pair, in standard deviations, becomes
+        :math:`\sqrt{\nu(\exp(r^2/\nu) - 1)}`: noise of two coordinates then has the bivariate Student distribution
+        with :math:`\nu` degrees of freedom, and short noise hardly changes.
+        """
+        noise = normal(shape, generator)
+        sigmas = self._amounts(sigma, generator)
+        if self.sigma_spread:
+            exponents = normal((*shape[:2], 1), generator)
+            sigmas = sigmas * (exponents * self._amounts(self.sigma_spread, generator)).exp()
+        if degrees:
+            freedom = self._amounts(degrees, generator)
+            sq_length = noise.square().sum(-1, keepdim=True).clamp(min=_LEAST_SQ_LENGTH)
+            noise *= (freedom * (sq_length / freedom).expm1() / sq_length).sqrt()
+        noise *= sigmas
+        if self.axis_ratio == 1.0:
+            return noise, sigmas[..., 0], None
+        axes = self.axis_ratio ** torch.linspace(0.0, 1.0, shape[-1], dtype=noise.dtype)
+        axes = axes / axes.square().mean().sqrt()
+        turn = torch.linalg.qr(normal((*shape, shape[-1]), generator)).Q  # (B, N, D, D)
+        factor = (turn * axes) @ turn.mT
+        return (factor @ noise[..., None])[..., 0], sigmas[..., 0], factor @ factor * sigmas[..., None].square()
+
+    def _amounts(self, value: Amount, generator: torch.Generator) -> Tensor:
+        """A number for each problem, (B, 1, 1)."""
+        each = self.batch_size, 1, 1
+        if isinstance(value, Sequence):
+            return log_uniform(each, value[0], value[1], generator)
+        return torch.full(each, value, dtype=torch.float64)
+
+    def _known_sigmas(self, img_sigma: Tensor, world_sigma: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
+        """The sigmas, NaN where a solver does not know them."""
+        chance, side = unit((2, self.batch_size, 1), generator)
+        has_one = chance < self.known_noise + (1.0 - self.known_noise) / 3.0
+        known = {}
+        for name, sigma, is_side in (("img_sigma", img_sigma, side < 0.5), ("world_sigma", world_sigma, side >= 0.5)):
+            sigma = torch.where((chance < self.known_noise) | (has_one & is_side), sigma, torch.nan)
+            known[name] = sigma if self.sigma_spread else sigma[:, 0]
+        return known
+
+    def _confidence(self, inliers: Tensor, errors: Tensor, generator: torch.Generator) -> Tensor:
+        """The confidence of a matcher or a keypoint network in each pair, in (0, 1), NaN where there is none, (B, N).
+
+        Noisy inliers have lower confidences: ``errors``, (B, N), are the lengths of the noise of the pixels in
+        standard deviations.
+        """
+        each = self.batch_size, 1
+        separation, noisiness = (uniform(each, *bounds, generator) for bounds in (_SEPARATION, _NOISINESS))
+        score = normal(inliers.shape, generator) + torch.where(inliers, separation - noisiness * errors.log1p(), 0.0)
+        logit = log_uniform(each, *_GAIN, generator) * score + _OFFSET * normal(each, generator)
+        return torch.where(unit(each, generator) < self.confidence_share, torch.sigmoid(logit), torch.nan)
+
 
 def _is_in_front(cam_points: Tensor) -> Tensor:
-    """Whether a camera can see each point, (B, N)."""
-    return cam_points[..., 2] > _LEAST_COSINE * cam_points.norm(dim=-1)
-
-
-def _bunched(scene: Tensor, displaced: Tensor, share: float, generator: torch.Generator) -> Tensor:
-    """The points of each scene, (B, 2N, 3), sorted so that pairs that are not ``displaced``, (B, N), lie together.
-
-    Points are ranked by their angle from one of them, with random numbers of a random size added: bunches differ in how
-    sharp they are. In a share of the problems the first points of the ranking go to the pairs that are not displaced.
-    """
-    shape = scene.shape[:2]
-    each = shape[0], 1
-    direction = normalize(scene, dim=-1)
-    distance = (direction - direction[:, :1]).square().sum(-1).sqrt()
-    blur = uniform(each, 0.0, _MOST_BLUR, generator) * unit(shape, generator)
-    score = distance / distance.mean(1, keepdim=True).clamp(min=torch.finfo(distance.dtype).tiny) + blur
-    chosen = unit(each, generator) < share
-    score = torch.where(chosen, score, unit(shape, generator))
-    last = pad(displaced, (0, shape[1] - displaced.shape[1]), value=True)
-    # Kept pairs first, in random order: the number of a pair says nothing about its place in the image.
-    places = (last + unit(shape, generator)).argsort(1)
-    order = torch.empty_like(places).scatter_(1, places, score.argsort(1))
-    return scene.gather(1, order[..., None].expand(-1, -1, 3))
+    """Whether a camera can see each point, (B, N, 1)."""
+    return cam_points[..., 2:] > _LEAST_COSINE * cam_points.norm(dim=-1, keepdim=True)
