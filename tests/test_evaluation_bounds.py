@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from kornia.core.exceptions import BaseError
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from strategies import SOLVERS, batches, check, many, poses
+from torch.func import jacrev, vmap
 
 from kornia_pnpnet import pose_errors, success
 from kornia_pnpnet.data import CameraProblems, OutlierMix, SyntheticProblems
@@ -54,19 +55,17 @@ def test_the_pose_minimises_the_weighted_squares_of_the_inliers(make_problems, b
 def test_weights_are_inverse_variances_by_the_jacobian(make_problems):
     problems = make_problems(batch=3, outliers=1)
     camera = torch.tensor([[800.0, 0, 320], [0, 950, 240], [0, 0, 1]], dtype=torch.float64)
-    seen = pixels(problems.pose.rotation, problems.pose.translation[:, None], problems.world_points, camera)
-    problems = problems._replace(intrinsics=camera.expand(3, 3, 3), img_points=seen)
+    pose = problems.pose.rotation, problems.pose.translation[:, None]
+    img_points = pixels(*pose, problems.world_points, camera)
+    problems = problems._replace(intrinsics=camera.expand(3, 3, 3), img_points=img_points)
     weights = KnownInliersAndNoise(img_sigma=2.0, world_sigma=0.3).solve_with_truth(problems).weights
-    for i in range(3):
-        pose = problems.pose.rotation[i], problems.pose.translation[i]
-        for j in range(9):
 
-            def project(point, pose=pose):
-                return pixels(*pose, point[None], camera)[0]
+    def project(point, rotation, translation):
+        return pixels(rotation, translation, point[None], camera)[0]
 
-            jacobian = torch.autograd.functional.jacobian(project, problems.world_points[i, j])
-            expected = 1.0 / (2.0**2 + 0.3**2 * jacobian.square().sum() / 2.0)
-            assert weights[i, j].item() == pytest.approx(expected.item() if problems.inliers[i, j] else 0.0)
+    jacobian = vmap(vmap(jacrev(project), in_dims=(0, None, None)))(problems.world_points, *pose)  # (B, N, 2, 3)
+    variance = 2.0**2 + 0.3**2 * jacobian.square().sum((-2, -1)) / 2.0
+    torch.testing.assert_close(weights.detach(), torch.where(problems.inliers, 1.0 / variance, 0.0))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -289,7 +289,7 @@ def test_rows_of_another_evaluation_are_refused(sets, path, change, named):
 def test_rows_of_other_code_or_versions_are_refused(sets, path, monkeypatch):
     evaluate({"fixed": _Fixed()}, sets, path=path)
     env = environment()
-    env["versions"] = {**env["versions"], "torch": "0.1"}
+    env["versions"]["torch"] = "0.1"
     monkeypatch.setattr(kornia_pnpnet.evaluation.comparison, "environment", lambda: env)
     monkeypatch.setattr(kornia_pnpnet.evaluation.comparison, "source_digest", lambda: "other")
     with pytest.raises(ValueError, match=r"torch was .* and is '0\.1'; code was"):

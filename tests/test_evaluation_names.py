@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from data_helpers import make_view, same
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from kornia.core.exceptions import ValueCheckError
@@ -14,7 +15,7 @@ from kornia.core.exceptions import ValueCheckError
 import kornia_pnpnet.evaluation.problem_sets
 from kornia_pnpnet import PnPNet, list_solvers
 from kornia_pnpnet.core.trees import iter_tensors
-from kornia_pnpnet.data import OutlierMix, Scene, SceneProblems, SlabPoints, SyntheticProblems, View
+from kornia_pnpnet.data import OutlierMix, Scene, SceneProblems, SlabPoints, SyntheticProblems
 from kornia_pnpnet.evaluation.bounds import KnownInliersAndNoise
 from kornia_pnpnet.evaluation.comparison import SeesTruth
 from kornia_pnpnet.evaluation.named_solvers import BOUNDS, default_solvers, load_solver, missing_package
@@ -63,22 +64,8 @@ def test_missing_packages_are_named_and_left_out(monkeypatch):
 # -- sets of problems --------------------------------------------------------------------------------------------------
 
 
-def scene(name="room", points=60, metric=True):
-    """One image of points around it, all of them exact."""
-    generator = torch.Generator().manual_seed(0)
-    world_points = torch.rand(points, 3, dtype=torch.float64, generator=generator) + torch.tensor([-0.5, -0.5, 4.0])
-    view = View(
-        name="a.jpg",
-        world_points=world_points,
-        img_points=500 * world_points[:, :2] / world_points[:, 2:] + 320,
-        intrinsics=torch.tensor([[500.0, 0, 320], [0, 500, 320], [0, 0, 1]], dtype=torch.float64),
-        rotation=torch.eye(3, dtype=torch.float64),
-        translation=torch.zeros(3, dtype=torch.float64),
-        width=640,
-        height=640,
-        inliers=torch.ones(points, dtype=torch.bool),
-    )
-    return Scene(name, (view,), metric=metric)
+def scene(name="room", metric=True):
+    return Scene(name, (make_view(count=60),), (), metric)
 
 
 @pytest.fixture
@@ -91,10 +78,6 @@ def scenes(monkeypatch):
 
 def draw(*sources, outliers="none", n=9, count=20, **options):
     return evaluation_sets(sources, outliers, n=n, count=count, seed=3, **options)
-
-
-def same(a, b):
-    return all(torch.equal(x, y) for x, y in zip(iter_tensors(a), iter_tensors(b), strict=True))
 
 
 @pytest.mark.parametrize(

@@ -246,14 +246,13 @@ def test_sweep_picture_shows_success_and_time(tmp_path, drawn, against, places, 
     runs = runs.assign(**{"uniform/rate": rate, "uniform/low": rate - 0.01, "uniform/high": rate + 0.01})
     runs.to_csv(tmp_path / "a.csv", index=False)
     figures.plot_sweep(tmp_path / "a.png", tmp_path / "a.csv", against=against)
-    rates, times = drawn["a.png"].axes[:2], drawn["a.png"].axes[2:]
-    for axes, below, value in zip(rates, times, panels, strict=True):
+    for i, value in enumerate(panels):
         pairs = [(place, value) if against == "n" else (value, place) for place in places]
-        for bars, share in zip(axes.containers, (0, 33), strict=True):
-            x, y = bars.lines[0].get_data()
-            assert list(x) == places
-            assert list(y) == pytest.approx([n + m / 10 + share for n, m in pairs])
-        (time,) = below.containers
+        rates, times = drawn["a.png"].axes[i], drawn["a.png"].axes[2 + i]
+        expected = {share: [n + m / 10 + share for n, m in pairs] for share in (0, 33)}
+        for bars, values in zip(rates.containers, expected.values(), strict=True):
+            assert np.array(bars.lines[0].get_data()) == pytest.approx(np.array([places, values]))
+        (time,) = times.containers
         assert list(time.lines[0].get_ydata()) == pytest.approx([n * m for n, m in pairs])  # the least over the mixes
     runs.assign(**{"model.m": 2}).to_csv(tmp_path / "a.csv", index=False)
     with pytest.raises(ValueError, match="several runs"):

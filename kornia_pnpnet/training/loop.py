@@ -217,9 +217,7 @@ def fit(
             norm = nn.utils.clip_grad_norm_(model.parameters(), settings.clip)
             # All processes must take the same branch, whichever process saw the bad number or the signal.
             bad, stopped = _any_process(fabric, ~torch.isfinite(terms.total + norm), stop.is_set())
-            if not bad:
-                fabric_optimizer.step()
-            else:
+            if bad:
                 skipped += 1
                 if fabric.is_global_zero:
                     _log.warning("update %s: loss or gradient not finite, step skipped (%s so far)", update, skipped)
@@ -228,6 +226,8 @@ def fit(
                         f"{skipped} steps had a loss or a gradient that is not finite, more than max_skipped = "
                         f"{settings.max_skipped}, up to update {update}. Lower the learning rate or check the data."
                     )
+            else:
+                fabric_optimizer.step()
             clock.lap("optimizer")
             bar.update()
 
