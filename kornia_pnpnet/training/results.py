@@ -74,8 +74,8 @@ class FitReport:
 class ValidationResult:
     """Success (rotation error below 1°, translation error below 0.2) and errors on one validation set.
 
-    ``first_stage`` stands for the initial poses, the other fields for the refined poses. Translations are in the unit
-    of the world.
+    Fields with ``first_stage`` describe the initial poses, the other fields the refined poses. Translations are in the
+    unit of the world.
     """
 
     success: SuccessRate
@@ -113,7 +113,7 @@ class RunResults:
     Attributes:
         overrides: arguments of ``train.py``, ``key=value``.
         run: the report of the training.
-        us_per_problem: time of the solver per problem in microseconds, in calls of 1000 problems.
+        us_per_problem: time of the solver in microseconds per problem, measured with calls of 1000 problems.
         validation: success and errors on each validation set, at least one.
         learned: hyperparameters of the refinement.
         model: configuration of the solver.
@@ -138,7 +138,7 @@ class RunResults:
     origin: RunResults | None = None
 
     def __post_init__(self) -> None:
-        """Check what the types do not say."""
+        """Check the number of validation sets and of hyperparameters."""
         if not self.validation:
             raise ValueError("validation is empty, expected at least one validation set")
         iterations = max(1, self.model["refine"]["m"])
@@ -185,7 +185,7 @@ def run_results(
     overrides: list[str],
     origin: RunResults | None = None,
 ) -> RunResults:
-    """Measure a trained solver and gather the :class:`RunResults` of its run, whose arguments these are.
+    """Measure a trained solver and gather the :class:`RunResults` of its run.
 
     Raises:
         ValueError: when there is no validation set.
@@ -232,7 +232,7 @@ def find_results(weights: str | Path) -> RunResults | None:
         ValueError: see :func:`load_run`.
     """
     folder = find_weights(weights)
-    # `train.py` writes weights into the folder `weights` of a run. Above another folder the file is of something else.
+    # `train.py` writes weights into the folder `weights` of a run. A results file above another folder is not theirs.
     folders = [folder, folder.parent] if folder.name == "weights" else [folder]
     paths = (place / RESULTS_NAME for place in folders)
     return next((load_run(path) for path in paths if path.is_file()), None)
