@@ -19,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from kornia_pnpnet.core.files import write_json
 from kornia_pnpnet.core.schema import to_json
 from kornia_pnpnet.solver import PnPNet
-from kornia_pnpnet.training import TrainingError, describe_shares, fit
+from kornia_pnpnet.training import TrainingError, fit
 from kornia_pnpnet.training.card import write_model_card
 from kornia_pnpnet.training.results import RESULTS_NAME, find_results, load_run, run_results, summarize_runs
 
@@ -35,6 +35,7 @@ def main(config: DictConfig) -> float | None:
         maximise this rate.
     """
     runtime = HydraConfig.get()
+    sweeps = runtime.mode == RunMode.MULTIRUN
     folder = Path(runtime.runtime.output_dir)
     if config.threads is not None:
         torch.set_num_threads(config.threads)
@@ -55,7 +56,6 @@ def main(config: DictConfig) -> float | None:
     validation = {name: instantiate(source).batch(0) for name, source in config.data.validation.items()}
     if not validation:
         sys.exit("data.validation is empty: a run needs at least one validation set.")
-    settings = instantiate(config.train, _convert_="all")
     processes = int(os.environ.get("WORLD_SIZE", fabric.world_size))
     if processes != fabric.world_size:
         sys.exit(f"torchrun started {processes} processes: pass engine.devices=... engine.strategy=ddp to match.")
@@ -64,6 +64,7 @@ def main(config: DictConfig) -> float | None:
         shape = f"n = {config.model.n}, m = {config.model.m}"
         log.info("%s, %s parameters, %s processes", shape, parameters, fabric.world_size)
     resolved: Any = OmegaConf.to_container(config, resolve=True)
+    settings = instantiate(config.train, _convert_="all")
     try:
         report = fit(
             model,
@@ -79,20 +80,13 @@ def main(config: DictConfig) -> float | None:
             progress=config.progress,
         )
     except (TrainingError, OSError) as error:
-        if runtime.mode == RunMode.MULTIRUN:
+        if sweeps:
             raise  # the sweep goes on with its other runs
         log.error("%s", error)
         sys.exit(1)
     if not fabric.is_global_zero:
         return None
-    log.info(
-        "%s updates, %.1f per second (%s), peak memory %.0f MiB, %s skipped",
-        report.update,
-        report.updates_per_second,
-        describe_shares(report.time_shares),
-        report.peak_memory_mib,
-        report.skipped,
-    )
+    log.info("%s", report)
     if report.interrupted:
         log.warning("Stopped at update %s of %s; continue with resume=true.", report.update, settings.updates)
         sys.exit(130)
@@ -101,7 +95,7 @@ def main(config: DictConfig) -> float | None:
         try:
             results = load_run(folder / RESULTS_NAME)
         except ValueError as error:
-            if runtime.mode == RunMode.MULTIRUN:
+            if sweeps:
                 raise
             sys.exit(str(error))
     else:
@@ -112,7 +106,7 @@ def main(config: DictConfig) -> float | None:
     for name, entry in results.validation.items():
         log.info("%s: success %s", name, entry.success)
     log.info("Weights, model card and results are in %s", folder)
-    if runtime.mode == RunMode.MULTIRUN:
+    if sweeps:
         log.info("Sweep summary: %s", summarize_runs(runtime.sweep.dir))
     return results.validation.get("uniform", entry).success.rate
 
@@ -120,12 +114,11 @@ def main(config: DictConfig) -> float | None:
 def start_from(model: PnPNet, trained: PnPNet) -> None:
     """Copy the weights of another solver. A refinement of another kind keeps its initial hyperparameters."""
     state = trained.state_dict()
-    before, now = (
-        {key: refine.config[key] for key in ("m", "kernel", "shared", "by_residual")}
-        for refine in (trained.refine, model.refine)
+    kind, new = (
+        {key: x.refine.config[key] for key in ("m", "kernel", "shared", "by_residual")} for x in (trained, model)
     )
-    if before != now:
-        log.info("The weights are of a refinement with %s: only the network starts from the weights.", before)
+    if kind != new:
+        log.info("The weights are of a refinement with %s: only the network starts from the weights.", kind)
         state = {name: value for name, value in state.items() if not name.startswith("refine.")}
         state |= {f"refine.{name}": value for name, value in model.refine.state_dict().items()}
     model.load_state_dict(state)

@@ -9,11 +9,12 @@ from hypothesis import strategies as st
 from kornia.core.exceptions import BaseError
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from strategies import SOLVERS, batches, check, many, poses
+from torch.func import jacrev, vmap
 
-from kornia_pnpnet import create_solver, pose_errors, success
+from kornia_pnpnet import pose_errors, success
 from kornia_pnpnet.data import CameraProblems, OutlierMix, SyntheticProblems
 from kornia_pnpnet.evaluation.bounds import KnownInliers, KnownInliersAndNoise
-from kornia_pnpnet.evaluation.comparison import EvaluationData, SeesTruth, evaluate
+from kornia_pnpnet.evaluation.comparison import SeesTruth
 from kornia_pnpnet.result import Problems
 
 BOUNDS = (KnownInliers, KnownInliersAndNoise)
@@ -28,11 +29,8 @@ def pixels(rotation, translation, world_points, intrinsics):
 @pytest.mark.parametrize("bound", BOUNDS)
 def test_bounds_of_rigs(bound):
     problems = CameraProblems(n=12, batch_size=50, seed=3, outlier_share=0.25, cameras=3, dtype=torch.float64).batch(0)
-    bound = bound()
-    assert torch.equal(bound.pair_weights(problems) > 0, problems.inliers)
-    for solver in (bound, create_solver("pnpnet-set")):
-        results = evaluate({"solver": solver}, {"rigs": EvaluationData(problems)}, repeats=1)
-        assert results["rows"][0]["success"]["rate"] > 0.9
+    assert torch.equal(bound().solve_with_truth(problems).weights > 0, problems.inliers)
+    assert rate(bound(), problems) > 0.9
 
 
 def rate(bound, problems):
@@ -42,15 +40,13 @@ def rate(bound, problems):
 @pytest.mark.parametrize("bound", BOUNDS)
 def test_the_pose_minimises_the_weighted_squares_of_the_inliers(make_problems, bound):
     problems = make_problems(batch=5, outliers=2)
-    bound = bound()
-    weights = bound.pair_weights(problems)
-    assert torch.equal(weights > 0, problems.inliers)
-    result = bound.solve_with_truth(problems)
+    result = bound().solve_with_truth(problems)
+    assert torch.equal(result.weights > 0, problems.inliers)
     assert result.ok.all()
     turn, shift = torch.zeros(2, 5, 3, dtype=torch.float64).requires_grad_()
     rotation = axis_angle_to_rotation_matrix(turn) @ result.rotation
     where = pixels(rotation, (result.translation + shift)[:, None], problems.world_points, problems.intrinsics)
-    costs = (weights * (where - problems.img_points).square().sum(-1)).sum(-1)
+    costs = (result.weights.detach() * (where - problems.img_points).square().sum(-1)).sum(-1)
     # A radian moves pixels by thousands, so that a gradient of this size is rounding.
     for gradient in torch.autograd.grad(costs.sum(), (turn, shift)):
         assert gradient.abs().max() < 1e-6 * costs.max()
@@ -59,18 +55,17 @@ def test_the_pose_minimises_the_weighted_squares_of_the_inliers(make_problems, b
 def test_weights_are_inverse_variances_by_the_jacobian(make_problems):
     problems = make_problems(batch=3, outliers=1)
     camera = torch.tensor([[800.0, 0, 320], [0, 950, 240], [0, 0, 1]], dtype=torch.float64)
-    problems = problems._replace(intrinsics=camera.expand(3, 3, 3))
-    weights = KnownInliersAndNoise(img_sigma=2.0, world_sigma=0.3).pair_weights(problems)
-    for i in range(3):
-        pose = problems.pose.rotation[i], problems.pose.translation[i]
-        for j in range(9):
+    pose = problems.pose.rotation, problems.pose.translation[:, None]
+    img_points = pixels(*pose, problems.world_points, camera)
+    problems = problems._replace(intrinsics=camera.expand(3, 3, 3), img_points=img_points)
+    weights = KnownInliersAndNoise(img_sigma=2.0, world_sigma=0.3).solve_with_truth(problems).weights
 
-            def project(point, pose=pose):
-                return pixels(*pose, point[None], camera)[0]
+    def project(point, rotation, translation):
+        return pixels(rotation, translation, point[None], camera)[0]
 
-            jacobian = torch.autograd.functional.jacobian(project, problems.world_points[i, j])
-            expected = 1.0 / (2.0**2 + 0.3**2 * jacobian.square().sum() / 2.0)
-            assert weights[i, j].item() == pytest.approx(expected.item() if problems.inliers[i, j] else 0.0)
+    jacobian = vmap(vmap(jacrev(project), in_dims=(0, None, None)))(problems.world_points, *pose)  # (B, N, 2, 3)
+    variance = 2.0**2 + 0.3**2 * jacobian.square().sum((-2, -1)) / 2.0
+    torch.testing.assert_close(weights.detach(), torch.where(problems.inliers, 1.0 / variance, 0.0))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -89,9 +84,6 @@ def test_success_is_what_the_protocol_measured(mix, inliers, inliers_and_noise, 
 def test_sigmas_are_checked(sigmas):
     with pytest.raises(BaseError, match="img_sigma"):
         KnownInliersAndNoise(**sigmas)
-
-
-# -- spoiled problems --------------------------------------------------------------------------------------------------
 
 
 @many(60)

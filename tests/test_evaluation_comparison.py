@@ -1,9 +1,11 @@
-"""Comparing solvers: rows and their summaries, continuing an interrupted evaluation, inputs of solvers."""
+"""Comparing solvers: rows and their summaries, results files, continuing an evaluation, inputs of solvers."""
 
 from __future__ import annotations
 
-import json
 import math
+import re
+from functools import reduce
+from operator import getitem
 
 import pytest
 import torch
@@ -15,7 +17,7 @@ from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.evaluation.comparison import EvaluationData, SeesTruth, draw_problems, evaluate
-from kornia_pnpnet.evaluation.results import format_table, load_results, row_errors, save_results
+from kornia_pnpnet.evaluation.results import format_table, load_results, row_errors, save_results, source_digest
 from kornia_pnpnet.result import PnPResult, Pose
 
 
@@ -28,14 +30,14 @@ def _same_code(monkeypatch):
 class _Fixed(nn.Module):
     """Return the identity and remember the sizes of the calls; raise KeyboardInterrupt after some calls."""
 
-    def __init__(self, *, bad: float | None = None, calls: int | None = None) -> None:
+    def __init__(self, *, bad: float | None = None, calls: float = math.inf) -> None:
         super().__init__()
         self.bad = bad
         self.calls = calls
         self.sizes: list[int] = []
 
     def forward(self, world_points, img_points, intrinsics):
-        if self.calls is not None and len(self.sizes) >= self.calls:
+        if len(self.sizes) >= self.calls:
             raise KeyboardInterrupt
         assert not self.training
         assert not torch.is_grad_enabled()
@@ -59,6 +61,10 @@ def lm(m=3, seed=0):
     return PnPNet(MLPInit(n=9), RobustWeightedLM(m=m))
 
 
+def names(results):
+    return [(row["data"], row["solver"]) for row in results["rows"]]
+
+
 @pytest.fixture(scope="module")
 def sets():
     clean = SyntheticProblems(batch_size=100, seed=5)
@@ -75,29 +81,27 @@ def solver():
 
 
 @pytest.fixture(scope="module")
-def results(sets, solver):
+def evaluated(sets, solver):
     return evaluate({"lm": solver, "fixed": _Fixed()}, sets)
 
 
-def test_rows_hold_the_errors_of_the_solver(results, sets, solver):
-    assert [(row["data"], row["solver"]) for row in results["rows"]] == [
-        (data, name) for data in sets for name in ("lm", "fixed")
-    ]
-    row = results["rows"][2]
+def test_rows_hold_the_errors_of_the_solver(evaluated, sets, solver):
+    assert names(evaluated) == [(data, name) for data in sets for name in ("lm", "fixed")]
+    row = evaluated["rows"][2]
     problems = sets["spoilt"].problems
-    result = solver(problems.world_points, problems.img_points, problems.intrinsics)
+    result = solver(*problems[:3])
     errors, ok = row_errors(row)
     expected = pose_errors(as_double(result.pose), as_double(problems.pose))
     torch.testing.assert_close(tuple(errors), tuple(expected), rtol=1e-5, atol=1e-9)
     assert torch.equal(ok, result.ok)
     assert row["ok"] == pytest.approx(result.ok.double().mean().item(), rel=1e-5)
-    assert all(row["us_per_problem"] > 0 for row in results["rows"])
+    assert all(row["us_per_problem"] > 0 for row in evaluated["rows"])
 
 
-def test_summaries_and_table_are_those_of_the_stored_errors(results):
-    lines = format_table(results).splitlines()
-    for line, row in zip(lines[2:], results["rows"], strict=True):
-        entry = results["data"][row["data"]]
+def test_summaries_and_table_are_those_of_the_stored_errors(evaluated):
+    lines = format_table(evaluated).splitlines()
+    for line, row in zip(lines[2:], evaluated["rows"], strict=True):
+        entry = evaluated["data"][row["data"]]
         errors, _ = row_errors(row)
         rate = success_rate(success(errors, entry["max_rotation_deg"], entry["max_translation"]))
         assert row["success"] == pytest.approx(rate._asdict(), rel=1e-5)
@@ -108,6 +112,15 @@ def test_summaries_and_table_are_those_of_the_stored_errors(results):
         assert cells[:3] == [row["data"], row["solver"], str(rate)]
         assert float(cells[3].rstrip("°")) == pytest.approx(errors.rotation_error_deg.quantile(0.5).item(), rel=6e-3)
         assert cells[4].endswith(" m") == (entry["unit"] == "m")
+
+
+def test_data_and_solvers_are_described(evaluated, solver):
+    described = evaluated["solvers"]
+    assert (described["lm"]["class"], described["lm"]["config"]) == ("PnPNet", solver.config())
+    assert described["fixed"] == {"class": "_Fixed", "config": None, "weights": None}
+    spoilt = {"count": 60, "n": 9, "mean_outliers": 2.0, "dtype": "float32", "max_translation": 0.5, "unit": ""}
+    assert spoilt.items() <= evaluated["data"]["spoilt"].items()
+    assert set(evaluated["environment"]["versions"]) >= {"kornia_pnpnet", "torch", "kornia", "numpy", "opencv"}
 
 
 def test_big_sets_are_solved_in_chunks_with_one_untimed_call(sets):
@@ -127,20 +140,6 @@ def test_a_pose_that_is_not_finite_is_a_failure(sets, bad):
     assert broken["per_problem"]["translation_error"] == whole["per_problem"]["translation_error"]
 
 
-def test_data_and_solvers_are_described(results, solver):
-    described = results["solvers"]
-    assert (described["lm"]["class"], described["lm"]["config"]) == ("PnPNet", solver.config())
-    assert described["fixed"] == {"class": "_Fixed", "config": None, "weights": None}
-    spoilt = {"count": 60, "n": 9, "mean_outliers": 2.0, "dtype": "float32", "max_translation": 0.5, "unit": ""}
-    assert spoilt.items() <= results["data"]["spoilt"].items()
-
-
-def test_the_environment_is_plain_data():
-    env = environment()
-    assert set(env["versions"]) >= {"kornia_pnpnet", "torch", "kornia", "numpy", "opencv"}
-    json.dumps(env, allow_nan=False)
-
-
 def test_fewer_problems_are_the_first_of_more():
     source = SyntheticProblems(batch_size=8, seed=2, known_noise=1.0)
     few, many = draw_problems(source, 5), draw_problems(source, 20)
@@ -152,43 +151,99 @@ def test_fewer_problems_are_the_first_of_more():
         draw_problems(source, 0)
 
 
-# -- resuming --------------------------------------------------------------------------------------------------------
+# -- results files -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "new" / "results.json"
+
+
+def test_results_file_round_trips_and_a_failed_save_keeps_it(evaluated, path):
+    save_results(evaluated, path)
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        save_results({**evaluated, "rows": [math.nan]}, path)
+    assert load_results(path) == evaluated
+    assert [entry.name for entry in path.parent.iterdir()] == ["results.json"]
+    save_results({**evaluated, "rows": []}, path)
+    assert load_results(path)["rows"] == []
+
+
+@pytest.mark.parametrize("content", ["", "[]", '{"format": 99}', '{"format": 1, "rows": []}', "\x00"])
+def test_other_files_are_refused(tmp_path, content):
+    path = tmp_path / "other.json"
+    path.write_text(content)
+    with pytest.raises(ValueError, match=r"other\.json"):
+        load_results(path)
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        ("rows.0.success.rate", 1.5),
+        ("rows.0.solver", "t"),
+        ("rows.0.per_problem.ok", 1),
+        ("rows.0.per_problem", {"rotation_error_deg": [], "translation_error": [0.0], "ok": [1]}),
+        ("data.clean.n", None),
+        ("data", []),
+    ],
+)
+def test_the_wrong_entry_of_a_file_is_named(evaluated, place, value, path):
+    save_results(evaluated, path)
+    results = load_results(path)
+    *inner, last = (int(x) if x.isdecimal() else x for x in place.split("."))
+    reduce(getitem, inner, results)[last] = value
+    save_results(results, path)
+    with pytest.raises(ValueError, match=r"results\.json.*: " + re.escape(place.replace(".0", "[0]"))):
+        load_results(path)
+
+
+def test_the_digest_of_the_code_covers_python_files_and_their_places(tmp_path, monkeypatch):
+    monkeypatch.setattr(kornia_pnpnet.evaluation.results, "__file__", str(tmp_path / "evaluation" / "results.py"))
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "other.py").write_text("b = 2\n")
+    before = source_digest()
+    (tmp_path / "notes.txt").write_text("not code")
+    assert source_digest() == before
+    (tmp_path / "data" / "other.py").write_text("b = 3\n")
+    changed = source_digest()
+    (tmp_path / "data" / "other.py").rename(tmp_path / "other.py")
+    assert len({before, changed, source_digest()}) == 3
+
+
+# -- continuing --------------------------------------------------------------------------------------------------------
 
 
 def without_times(results):
     """The results without times and environment."""
     rows = [{key: value for key, value in row.items() if key != "us_per_problem"} for row in results["rows"]]
-    return json.loads(json.dumps({**results, "rows": rows, "environment": None}))
+    return {**results, "rows": rows, "environment": None}
 
 
-@pytest.mark.parametrize("calls", [1, 6])
-def test_interrupted_and_continued_equals_uninterrupted(sets, tmp_path, calls):
+@pytest.mark.parametrize(("calls", "finished"), [(1, 1), (6, 3)])
+def test_interrupted_and_continued_equals_uninterrupted(sets, path, calls, finished):
     """The second solver has four calls on each of the two sets."""
-    path = tmp_path / "results.json"
     whole = evaluate({"first": _Fixed(), "second": _Fixed()}, sets, repeats=3)
     with pytest.raises(KeyboardInterrupt):
         evaluate({"first": _Fixed(), "second": _Fixed(calls=calls)}, sets, path=path)
     kept = load_results(path)["rows"]
-    finished = [("clean", "first"), ("clean", "second"), ("spoilt", "first")][: 1 if calls < 4 else 3]
-    assert [(row["data"], row["solver"]) for row in kept] == finished
-
+    assert len(kept) == finished
     solvers = {"first": _Fixed(), "second": _Fixed()}
     continued = evaluate(solvers, sets, path=path)
-    assert continued["rows"][: len(kept)] == kept  # no finished row is measured again
+    assert continued["rows"][:finished] == kept  # no finished row is measured again
     assert without_times(continued) == without_times(whole)
     assert load_results(path) == continued
     assert len(solvers["first"].sizes) == (4 if calls < 4 else 0)
     assert evaluate({"first": _Fixed(), "second": _Fixed(calls=0)}, sets, path=path) == continued
 
 
-def test_solvers_and_sets_may_be_added(sets, solver, tmp_path):
-    path = tmp_path / "results.json"
+def test_solvers_and_sets_may_be_added(sets, solver, path):
     evaluate({"fixed": _Fixed()}, {"spoilt": sets["spoilt"]}, path=path)
     before = {**load_results(path), "note": "not ours"}
     save_results(before, path)
     counted = _Fixed()
     grown = evaluate({"lm": solver, "fixed": counted}, sets, path=path)
-    assert [(row["data"], row["solver"]) for row in grown["rows"]] == [(d, s) for d in sets for s in ("lm", "fixed")]
+    assert names(grown) == [(data, name) for data in sets for name in ("lm", "fixed")]
     assert grown["rows"][3] == before["rows"][0]
     assert counted.sizes == 4 * [100]
     assert list(grown["data"]) == list(sets)
@@ -209,17 +264,16 @@ def other_problems(function):
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        (lambda solvers, data: solvers.update(lm=lm(m=4)), "'lm'.* config, .* weights"),
-        (lambda solvers, data: solvers.update(lm=lm(seed=1)), "'lm'.* weights"),
-        (lambda solvers, data: solvers.pop("fixed"), "solvers: 'fixed'"),
-        (lambda solvers, data: data.pop("clean"), "data: 'clean'"),
-        (other(max_translation=0.1), "'clean'.* max_translation"),
-        (other_problems(lambda part: part.flip(0)), "'clean'.* digest"),
-        (other_problems(as_double), "'clean'.* dtype"),
+        (lambda solvers, data: solvers.update(lm=lm(m=4)), r"lm\.config\.refine\.m was 3 and is 4"),
+        (lambda solvers, data: solvers.update(lm=lm(seed=1)), r"lm\.weights was"),
+        (lambda solvers, data: solvers.pop("fixed"), r"solvers\.fixed\."),
+        (lambda solvers, data: data.pop("clean"), r"data\.clean\."),
+        (other(max_translation=0.1), r"clean\.max_translation was 0.2 and is 0.1"),
+        (other_problems(lambda part: part.flip(0)), r"clean\.digest was"),
+        (other_problems(as_double), r"clean\.dtype was"),
     ],
 )
-def test_rows_of_another_evaluation_are_refused(sets, tmp_path, change, named):
-    path = tmp_path / "results.json"
+def test_rows_of_another_evaluation_are_refused(sets, path, change, named):
     solvers, data = {"lm": lm(), "fixed": _Fixed()}, dict(sets)
     evaluate(solvers, data, path=path)
     before = path.read_bytes()
@@ -232,28 +286,17 @@ def test_rows_of_another_evaluation_are_refused(sets, tmp_path, change, named):
     assert without_times(anew) == without_times(evaluate(solvers, data))
 
 
-def test_rows_of_other_code_or_versions_are_refused(sets, tmp_path, monkeypatch):
-    path = tmp_path / "results.json"
+def test_rows_of_other_code_or_versions_are_refused(sets, path, monkeypatch):
     evaluate({"fixed": _Fixed()}, sets, path=path)
     env = environment()
-    env["versions"] = {**env["versions"], "torch": "0.1"}
+    env["versions"]["torch"] = "0.1"
     monkeypatch.setattr(kornia_pnpnet.evaluation.comparison, "environment", lambda: env)
     monkeypatch.setattr(kornia_pnpnet.evaluation.comparison, "source_digest", lambda: "other")
-    with pytest.raises(ValueError, match=r"torch was .* and is 0\.1; the package's code"):
+    with pytest.raises(ValueError, match=r"torch was .* and is '0\.1'; code was"):
         evaluate({"fixed": _Fixed()}, sets, path=path)
 
 
-def test_a_path_that_cannot_be_written_is_an_error_before_the_work(sets, tmp_path):
-    (tmp_path / "file").write_text("")
-    counted = _Fixed()
-    for path in (tmp_path, tmp_path / "file" / "results.json"):
-        with pytest.raises(OSError, match=r"directory|exists"):
-            evaluate({"fixed": counted}, sets, path=path)
-    assert counted.sizes == []
-
-
-def test_rows_of_another_machine_name_it(sets, tmp_path, monkeypatch):
-    path = tmp_path / "results.json"
+def test_rows_of_another_machine_name_it(sets, path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         evaluate({"first": _Fixed(), "second": _Fixed(calls=0)}, {"clean": sets["clean"]}, path=path)
     env = {**environment(), "cpu": "an abacus", "threads": 100, "date": "tomorrow"}
@@ -263,13 +306,19 @@ def test_rows_of_another_machine_name_it(sets, tmp_path, monkeypatch):
     assert second["environment"] == {"cpu": "an abacus", "threads": 100}
 
 
-# -- inputs of solvers -----------------------------------------------------------------------------------------------
+def test_a_path_that_cannot_be_written_is_an_error_before_the_work(sets, tmp_path):
+    (tmp_path / "file").write_text("")
+    for path in (tmp_path, tmp_path / "file" / "results.json"):
+        with pytest.raises(OSError, match=r"directory|exists"):
+            evaluate({"fixed": _Fixed(calls=0)}, sets, path=path)
+
+
+# -- inputs of solvers -------------------------------------------------------------------------------------------------
 
 
 class _Oracle(_Fixed):
     def solve_with_truth(self, problems):
-        result = self(problems.world_points, problems.img_points, problems.intrinsics)
-        return result._replace(rotation=problems.pose.rotation, translation=problems.pose.translation)
+        return self(*problems[:3])._replace(rotation=problems.pose.rotation, translation=problems.pose.translation)
 
 
 def test_only_bounds_get_the_truth(sets):
@@ -291,30 +340,29 @@ def test_only_our_solvers_get_the_noise_level(sets):
 
     for data in (known, sets["clean"]):
         evaluate({"ours": Listening(None, RobustWeightedLM(1)), "other": _Fixed()}, {"data": data}, chunk=60)
+        for noise in given:
+            assert noise.keys() == data.problems.sigmas.keys()
+            assert all(torch.equal(noise[name], sigma) for name, sigma in data.problems.sigmas.items())
         assert given
-        assert all(noise.keys() == data.problems.sigmas.keys() for noise in given)
-        assert all(torch.equal(noise[name], sigma) for noise in given for name, sigma in data.problems.sigmas.items())
         given.clear()
 
 
-def test_a_solver_for_another_n_is_left_out(tmp_path):
+def test_a_solver_for_another_n_is_left_out(path):
     data = {str(n): EvaluationData(draw_problems(SyntheticProblems(n=n, batch_size=10), 10)) for n in (6, 9)}
-    path = tmp_path / "results.json"
     for _ in range(2):  # the second time from the file
         results = evaluate({"nine": lm(), "any": _Fixed()}, data, path=path)
-        assert [(row["data"], row["solver"]) for row in results["rows"]] == [("6", "any"), ("9", "nine"), ("9", "any")]
+        assert names(results) == [("6", "any"), ("9", "nine"), ("9", "any")]
         (entry,) = results["left_out"]
         assert (entry["data"], entry["solver"]) == ("6", "nine")
         assert "n = 9" in entry["reason"]
         assert load_results(path) == results
 
 
-def test_an_error_says_where_it_was_and_keeps_the_rows(sets, tmp_path):
+def test_an_error_says_where_it_was_and_keeps_the_rows(sets, path):
     class Broken(_Fixed):
         def forward(self, *_):
             raise RuntimeError("no memory")
 
-    path = tmp_path / "results.json"
     with pytest.raises(RuntimeError, match="no memory") as caught:
         evaluate({"fixed": _Fixed(), "broken": Broken()}, sets, path=path)
     assert caught.value.__notes__ == ["broken on clean"]

@@ -1,6 +1,5 @@
 """Processes that die, disks that are full, files that are damaged: nothing that was saved is lost."""
 
-import csv
 import json
 import multiprocessing
 import random
@@ -17,12 +16,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ValueCheckError
 from strategies import damage, many
+from test_training_loop import LossWith, comparable, make_parts, read_history
 
-from kornia_pnpnet import MLPInit, PnPNet, PoseLoss, RobustWeightedLM
+from kornia_pnpnet import MLPInit, PnPNet, RobustWeightedLM
 from kornia_pnpnet.cli import main
 from kornia_pnpnet.data import SyntheticProblems
-from kornia_pnpnet.training import TrainSettings, fit
-from kornia_pnpnet.training.checkpoint import CHECKPOINT_NAME, HISTORY_NAME
+from kornia_pnpnet.training import fit
+from kornia_pnpnet.training.checkpoint import CHECKPOINT_NAME
 
 KILLS = 20
 # Python 3.12 warns of every fork of a process with threads, which pytest-xdist's are.
@@ -32,36 +32,17 @@ pytestmark = [
 ]
 
 
-class Then(PoseLoss):
-    """Calls a function at an update."""
-
-    def __init__(self, update=-1, what=None):
-        super().__init__()
-        self.left, self.what = update, what
-
-    def forward(self, *args, **kwargs):
-        self.left -= 1
-        if self.left == 0:
-            self.what()
-        return super().forward(*args, **kwargs)
+def train(folder, updates=40, resume=False, **changes):
+    parts = make_parts(updates, validate_every=50, checkpoint_every=5)
+    fit(folder=folder, resume=resume, **{**parts, **changes})
 
 
-def train(folder, updates=40, resume=False, loss=None):
-    torch.manual_seed(0)
-    model = PnPNet(MLPInit(6), RobustWeightedLM(2))
-    problems = SyntheticProblems(n=6, batch_size=16, seed=3)
-    ends = TrainSettings(updates, warmup=1, log_every=1, validate_every=50, checkpoint_every=5, ramp=(0.2, 0.5))
-    validation = {"none": SyntheticProblems(n=6, batch_size=32, seed=4).batch(0)}
-    fit(model, problems, validation, loss or Then(), ends, folder, resume=resume, progress=False)
-
-
-def state(folder):
-    saved = torch.load(folder / CHECKPOINT_NAME, weights_only=True)
-    with (folder / HISTORY_NAME).open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    timed = ("updates_per_second", "peak_memory_mib")
-    kept = [key for key in rows[0] if key not in timed and not key.endswith("_share")]
-    return saved["model"], [{key: row[key] for key in kept} for row in rows]
+def assert_same_runs(folder, other):
+    """The weights and the learning curves, except what depends on the clock."""
+    mine, theirs = (torch.load(x / CHECKPOINT_NAME, weights_only=True)["model"] for x in (folder, other))
+    assert mine.keys() == theirs.keys()
+    assert all(mine[key].equal(value) for key, value in theirs.items())
+    assert comparable(read_history(folder)) == comparable(read_history(other))
 
 
 def in_a_process(function, *arguments):
@@ -70,32 +51,36 @@ def in_a_process(function, *arguments):
     return process
 
 
+def with_kills(tmp_path, start, moments):
+    """Start processes until KILLS of them were killed at random moments, each folder until a process ends by itself.
+
+    Yields the folder after each process, and whether the process ended by itself.
+    """
+    chance, killed, run = random.Random(0), 0, 0
+    while killed < KILLS:
+        run, done = run + 1, False
+        while not done:
+            process = start(tmp_path / str(run))
+            process.join(chance.uniform(*moments) if killed < KILLS else None)
+            process.kill()  # nothing when it has ended
+            process.join()
+            done = process.exitcode == 0
+            assert done or process.exitcode == -signal.SIGKILL
+            killed += not done
+            yield tmp_path / str(run), done
+
+
 @pytest.mark.slow
 def test_kill_9_at_any_moment_loses_nothing(tmp_path):
     """After any number of kills the weights and curves are those of a run without kills."""
-    updates = 400
-    train(tmp_path / "whole", updates)
-    weights, history = state(tmp_path / "whole")
-    chance = random.Random(0)
-    killed, run = 0, 0
-    while killed < KILLS:
-        run += 1
-        folder, done = tmp_path / str(run), False
-        while not done:
-            process = in_a_process(train, folder, updates, (folder / CHECKPOINT_NAME).exists())
-            process.join(chance.uniform(0.05, 1.0) if killed < KILLS else None)
-            done = process.exitcode == 0
-            if process.exitcode is None:
-                process.kill()
-                process.join()
-                killed += 1
-            elif not done:
-                raise AssertionError(f"exit code {process.exitcode} after {killed} kills")
-        mine, rows = state(folder)
-        assert mine.keys() == weights.keys()
-        assert all(mine[key].equal(value) for key, value in weights.items())
-        assert rows == history
-    assert killed == KILLS
+    train(tmp_path / "whole", updates=400)
+
+    def start(folder):
+        return in_a_process(train, folder, 400, (folder / CHECKPOINT_NAME).exists())
+
+    for folder, done in with_kills(tmp_path, start, (0.05, 1.0)):
+        if done:
+            assert_same_runs(folder, tmp_path / "whole")
 
 
 def _with_a_full_disk(folder):
@@ -104,9 +89,10 @@ def _with_a_full_disk(folder):
     def full():
         shutil.copy(folder / CHECKPOINT_NAME, folder / "before")
         resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, 10_000))
+        return 1.0
 
     try:
-        train(folder, loss=Then(23, full))
+        train(folder, loss=LossWith(full, at=(23,)))
     except OSError:
         sys.exit(3)
 
@@ -119,9 +105,7 @@ def test_a_full_disk_loses_nothing(tmp_path):
     assert list((tmp_path / "run").glob("*.tmp")) == []
     train(tmp_path / "run", resume=True)
     train(tmp_path / "whole")
-    (mine, rows), (weights, history) = state(tmp_path / "run"), state(tmp_path / "whole")
-    assert all(mine[key].equal(value) for key, value in weights.items())
-    assert rows == history
+    assert_same_runs(tmp_path / "run", tmp_path / "whole")
 
 
 def arrays_of(source):
@@ -130,9 +114,13 @@ def arrays_of(source):
     return dict(zip(("world_points", "img_points", "intrinsics"), inputs, strict=True))
 
 
+def solve(source, out, *options):
+    return main(["solve", "--batch", "--solver", "epnp", *options, "--out", str(out), str(source)])
+
+
 def _shards_on_a_full_disk(source, out):
     resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
-    sys.exit(main(["solve", "--batch", "--solver", "epnp", "--out", str(out), str(source)]))
+    sys.exit(solve(source, out))
 
 
 def test_shards_on_a_full_disk_are_whole_or_missing(tmp_path, capsys):
@@ -145,12 +133,8 @@ def test_shards_on_a_full_disk_are_whole_or_missing(tmp_path, capsys):
     process.join()
     assert process.exitcode == 2
     assert {path.name for path in out.iterdir()} == {"a.parquet"}
-    assert main(["solve", "--batch", "--solver", "epnp", "--out", str(out), str(source)]) == 0
+    assert solve(source, out) == 0
     assert "in 2 shards solved; 1 shards had been solved before" in capsys.readouterr().out
-
-
-def _solve_batch(source, out):
-    sys.exit(main(["solve", "--batch", "--solver", "epnp", "--batch-size", "500", "--out", str(out), str(source)]))
 
 
 @pytest.mark.slow
@@ -167,33 +151,24 @@ def test_kill_9_at_any_moment_loses_no_results(tmp_path):
             parquet.write_table(pyarrow.table(lists), source / f"{i:02}.parquet")
         else:
             np.savez(source / f"{i:02}.npz", **arrays)
+    names = {f"{path.stem}.parquet" for path in source.iterdir()}
+
+    def start(out):
+        return in_a_process(lambda: sys.exit(solve(source, out, "--batch-size", "500")))
 
     began = time.monotonic()
-    process = in_a_process(_solve_batch, source, whole)
+    process = start(whole)
     process.join()
-    took = time.monotonic() - began
     assert process.exitcode == 0
-    names = {f"{path.stem}.parquet" for path in source.iterdir()}
-    chance = random.Random(0)
-    killed, amid, run = 0, 0, 0
-    while killed < KILLS:
-        run += 1
-        out, done, made = tmp_path / str(run), False, {}
-        while not done:
-            process = in_a_process(_solve_batch, source, out)
-            process.join(chance.uniform(0.0, took / 4) if killed < KILLS else None)
-            process.kill()  # nothing when it has ended
-            process.join()
-            done = process.exitcode == 0
-            found = {path.name: path.stat().st_mtime_ns for path in out.glob("*") if path.name in names}
-            assert made.items() <= found.items()
-            made = found
-            if not done:
-                assert process.exitcode == -signal.SIGKILL
-                killed += 1
-                amid += 0 < len(made) < len(names)
-        assert {path.name for path in out.iterdir() if path.suffix != ".tmp"} == names
-        assert all(parquet.read_table(out / name) == parquet.read_table(whole / name) for name in names)
+    amid, made = 0, {}
+    for out, done in with_kills(tmp_path, start, (0.0, (time.monotonic() - began) / 4)):
+        found = {path: path.stat().st_mtime_ns for path in out.glob("*") if path.name in names}
+        assert {path: time for path, time in made.items() if path.parent == out}.items() <= found.items()
+        made = found
+        amid += not done and 0 < len(made) < len(names)
+        if done:
+            assert {path.name for path in out.iterdir() if path.suffix != ".tmp"} == names
+            assert all(parquet.read_table(out / name) == parquet.read_table(whole / name) for name in names)
     assert amid >= 3  # else the moments say nothing
 
 

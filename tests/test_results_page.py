@@ -89,16 +89,3 @@ def test_runs_are_apart_only_when_all_their_intervals_are():
         found = short_runs.compared([row(rate) for rate in rates], [row(rate) for rate in others], "none")
         assert found.startswith(difference)
         assert verdict in found
-
-
-def test_ablations_stand_beside_the_recipe():
-    seeds = [row(rate, experiment="recipe", seed=f"{seed}") for seed, rate in enumerate((80.0, 81.5))]
-    kernels = [row(rate, experiment="kernels", **{short_runs.KERNEL: k}) for k, rate in (("huber", 70), ("cauchy", 81))]
-    facts = short_runs.ablation([*kernels, *seeds, row(90.0, experiment="shared", seed="", **{short_runs.KERNEL: ""})])
-    assert (facts["seeds"], facts["spread"]) == (2, pytest.approx(1.5))
-    assert "| `recipe seed=1` | 81.5 [80.5, 82.5] | 81.5 [80.5, 82.5] |" in facts["table"]
-    by_name = {finding["experiment"]: finding["found"] for finding in facts["findings"]}
-    assert by_name["kernels"]["huber"].startswith("none -10.8 points (below)")
-    assert by_name["kernels"]["cauchy"].startswith("none +0.2 points (intervals overlap)")
-    assert by_name["shared"][""].startswith("none +9.2 points (above)")
-    assert list(facts["verdicts"].values()) == [["`shared`"], ["`kernels huber`"], ["`kernels cauchy`"]]

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from copy import deepcopy
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,7 +22,6 @@ from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.training import TrainSettings, fit, train_briefly
 from kornia_pnpnet.training.checkpoint import CHECKPOINT_NAME, HISTORY_NAME, TrainingError
 
-REPO = Path(__file__).resolve().parents[1]
 SHARES = [f"{stage}_share" for stage in ("data", "forward", "backward", "optimizer", "rest")]
 
 # Python 3.12 warns of every fork of a process with threads, which pytest-xdist's are.
@@ -127,14 +127,13 @@ def test_history_after_the_checkpoint_is_written_again(tmp_path):
     assert comparable(read_history(tmp_path / "killed")) == comparable(read_history(tmp_path / "whole"))
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+@pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_steps_that_are_not_finite_are_skipped_and_counted(tmp_path, value):
     parts = make_parts(updates=1)
-    before = {name: p.clone() for name, p in parts["model"].state_dict().items()}
+    before = deepcopy(parts["model"])
     report = fit(folder=tmp_path / "one", **{**parts, "loss": LossWith(lambda: value, at=(1,))})
     assert report.skipped == 1
-    for name, p in parts["model"].state_dict().items():
-        assert torch.equal(p, before[name]), name
+    assert_same_weights(parts["model"], before)
 
     parts = make_parts(updates=5)
     report = fit(folder=tmp_path / "some", **{**parts, "loss": LossWith(lambda: value, at=(2, 4))})
@@ -218,10 +217,7 @@ from kornia_pnpnet.training import fit
 
 def train(fabric):
     torch.set_num_threads(1)
-    parts = make_double()
-    fit(folder={folder!r}, fabric=fabric, **parts)
-    if fabric.is_global_zero:
-        torch.save(parts["model"].state_dict(), {out!r})
+    fit(folder={folder!r}, fabric=fabric, **make_double())
 
 fabric = Fabric(accelerator="cpu", devices=2, strategy={strategy!r})
 if {strategy!r} == "ddp":
@@ -244,16 +240,14 @@ def make_double():
 def test_two_processes_equal_one(strategy, tmp_path):
     """Two CPU processes with gloo share the batch of one and arrive at the same weights."""
     one = make_double()
-    start = {name: value.clone() for name, value in one["model"].state_dict().items()}
+    start = deepcopy(one["model"].state_dict())
     fit(folder=tmp_path / "one", **one)
-
-    script, out = tmp_path / "run.py", tmp_path / "two.pt"
-    folder = str(tmp_path / "two")
-    script.write_text(DDP_SCRIPT.format(tests=str(REPO / "tests"), strategy=strategy, folder=folder, out=str(out)))
+    script = tmp_path / "run.py"
+    script.write_text(DDP_SCRIPT.format(tests=str(Path(__file__).parent), strategy=strategy, folder=str(tmp_path)))
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=240, check=False)
     assert done.returncode == 0, done.stderr
     assert "distributed_backend=gloo" in done.stderr
-    two = torch.load(out, weights_only=True)
+    two = torch.load(tmp_path / CHECKPOINT_NAME, weights_only=True)["model"]
     for name, value in one["model"].state_dict().items():
         torch.testing.assert_close(two[name], value, rtol=0, atol=1e-9)
     assert any(not torch.equal(two[name], start[name]) for name in start)

@@ -32,8 +32,8 @@ def _least_squares(problems: Problems, weights: Tensor, **noise: Any) -> PnPResu
 class KnownInliers(Configured):
     r"""Least squares of the reprojection errors of the true inliers, started from the true pose.
 
-    This is the best result of a method that finds all inliers and then minimises the reprojection error. Source: the
-    protocol's bound *known inliers*.
+    No method that finds the inliers and then minimises the reprojection error does better. Source: the protocol's bound
+    *known inliers*.
 
     Example:
         >>> from kornia_pnpnet.data import OutlierMix, SyntheticProblems
@@ -46,16 +46,12 @@ class KnownInliers(Configured):
     def __init__(self) -> None:
         super().__init__(locals())
 
-    def pair_weights(self, problems: Problems) -> Tensor:
-        """Return the weight of each pair, 1 for an inlier and 0 for an outlier, shape :math:`(B, N)`."""
-        return problems.inliers.to(problems.world_points.dtype)
-
     def solve_with_truth(self, problems: Problems) -> PnPResult:
         """Solve problems with the help of their true poses and inliers."""
-        return _least_squares(problems, self.pair_weights(problems))
+        return _least_squares(problems, problems.inliers.to(problems.world_points.dtype))
 
 
-class KnownInliersAndNoise(KnownInliers):
+class KnownInliersAndNoise(Configured):
     r"""Least squares as in :class:`KnownInliers`, with each inlier weighted by the inverse variance of its pixel.
 
     The noise of a world point moves the pixels of near points more than those of far points. With :math:`J_x` the
@@ -63,29 +59,35 @@ class KnownInliersAndNoise(KnownInliers):
     :math:`1 / (\sigma_\mathrm{img}^2 + \sigma_\mathrm{world}^2\,\mathrm{tr}(J_x J_x^\top) / 2)`. Source: the
     protocol's bound *known inliers and noise*.
 
-    Where problems have covariances, residuals are whitened by those of their pairs, and the sigmas below stand for a
-    covariance that is missing: the maximum likelihood estimate on the inliers.
+    Problems with covariances get the maximum likelihood estimate on the inliers: their covariances whiten the
+    residuals, and a sigma stands for a covariance that is missing.
 
     Args:
         img_sigma: standard deviation of each pixel coordinate, in pixels. The default is the protocol's.
         world_sigma: standard deviation of each world coordinate, in the unit of the world. The default is that of the
-            protocol's synthetic data; a scene has its own.
+            protocol's synthetic data.
 
     Raises:
         BaseError: for a standard deviation that is negative or not finite, or when both are 0.
     """
 
     def __init__(self, *, img_sigma: float = 1.0, world_sigma: float = 0.05) -> None:
-        Configured.__init__(self, locals())
+        super().__init__(locals())
         check_numbers(0.0, img_sigma=img_sigma, world_sigma=world_sigma)
         KORNIA_CHECK(img_sigma + world_sigma > 0, "img_sigma and world_sigma must not both be 0.")
 
-    @torch.no_grad()
-    def pair_weights(self, problems: Problems) -> Tensor:
-        """Return the weight of each pair, its inverse variance in 1/px² or 0 for an outlier, shape :math:`(B, N)`.
+    def solve_with_truth(self, problems: Problems) -> PnPResult:
+        """See :meth:`KnownInliers.solve_with_truth`."""
+        covs = {"img": problems.img_cov, "world": problems.world_cov}
+        if all(cov is None for cov in covs.values()):
+            return _least_squares(problems, self._inverse_variances(problems))
+        sigmas = {f"{kind}_sigma": self.config[f"{kind}_sigma"] for kind, cov in covs.items() if cov is None}
+        known = {f"{kind}_cov": cov for kind, cov in covs.items() if cov is not None}
+        return _least_squares(problems, problems.inliers.to(problems.world_points.dtype), **sigmas, **known)
 
-        The weights carry no gradient, because the gradient of a NaN point would reach all other points.
-        """
+    @torch.no_grad()  # the gradient of a NaN point would reach all other points
+    def _inverse_variances(self, problems: Problems) -> Tensor:
+        """The weight of each pair in 1/px², 0 for an outlier, (B, N)."""
         cam_points = problems.true_cam_points
         depth = cam_points[..., 2:]
         depth = torch.where(depth > 0, depth, 1.0)  # pairs behind the camera have no weight in the solver
@@ -94,12 +96,3 @@ class KnownInliersAndNoise(KnownInliers):
         trace = ((focal / depth).square() * (1.0 + (cam_points[..., :2] / depth).square())).sum(-1)  # (B, N)
         variance = self.config["img_sigma"] ** 2 + self.config["world_sigma"] ** 2 * trace / 2.0
         return torch.where(problems.inliers, variance.reciprocal(), 0.0)
-
-    def solve_with_truth(self, problems: Problems) -> PnPResult:
-        """See :meth:`KnownInliers.solve_with_truth`."""
-        noise: dict[str, Any] = {}
-        for kind, cov in (("img", problems.img_cov), ("world", problems.world_cov)):
-            noise |= {f"{kind}_sigma": self.config[f"{kind}_sigma"]} if cov is None else {f"{kind}_cov": cov}
-        if not {"img_cov", "world_cov"} & noise.keys():
-            return super().solve_with_truth(problems)
-        return _least_squares(problems, KnownInliers().pair_weights(problems), **noise)

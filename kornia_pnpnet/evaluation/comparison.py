@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import statistics
-import sys
 import time
 from collections.abc import Mapping
 from itertools import product
@@ -19,9 +18,9 @@ from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.core.files import digest
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors, take
 from kornia_pnpnet.data.stream import ProblemSource
-from kornia_pnpnet.evaluation.results import FORMAT, resume, save_results, source_digest
+from kornia_pnpnet.evaluation.results import FORMAT, resume, row_errors, save_results, source_digest
 from kornia_pnpnet.metrics import PoseErrors, pose_errors, success, success_rate
-from kornia_pnpnet.result import PnPResult, Pose, Problems, gate_pose
+from kornia_pnpnet.result import PnPResult, Problems, gate_pose
 from kornia_pnpnet.solver import PnPNet
 
 __all__ = ["EvaluationData", "SeesTruth", "draw_problems", "evaluate"]
@@ -63,14 +62,10 @@ def draw_problems(source: ProblemSource, count: int) -> Problems:
 
     Args:
         source: has ``batch(index)``, for example :class:`~kornia_pnpnet.data.SyntheticProblems`.
-        count: number of problems, at least 1.
+        count: number of problems, at least 1, else ``ValueError``.
 
     Returns:
-        The source's batches 0, 1, ... one after the other, cut to ``count`` problems. With the same batch size, a
-        smaller count gives the first problems of a larger count.
-
-    Raises:
-        ValueError: when ``count`` is below 1.
+        The source's batches 0, 1, ... one after the other, cut to ``count`` problems.
 
     Example:
         >>> from kornia_pnpnet.data import SyntheticProblems
@@ -96,17 +91,16 @@ def evaluate(
 ) -> dict[str, Any]:
     """Solve the same problems with every solver.
 
-    A pose that is not finite counts as the identity with ``ok=False``. All summaries are computed from the per-problem
-    errors as they are stored, rounded to six digits, so that a reader of the file can reproduce the summaries.
+    A pose that is not finite counts as the identity with ``ok=False``. Summaries are computed from the errors of the
+    problems as they are stored, rounded to six digits.
 
     With a ``path``, the file is written after every row, and a call with the same arguments, or with more solvers and
     data sets, continues it. A file with rows of other code, versions, weights, configurations or problems is refused.
 
     Args:
         solvers: by name, each called as ``solver(world_points, img_points, intrinsics)`` in evaluation mode, without
-            gradients. A bound (see :class:`SeesTruth`) gets the problems with their truth. A
-            :class:`~kornia_pnpnet.solver.PnPNet` gets the noise level where the problems have it
-            (:attr:`~kornia_pnpnet.result.Problems.known`).
+            gradients. A bound (see :class:`SeesTruth`) gets the problems with their truth, a
+            :class:`~kornia_pnpnet.solver.PnPNet` also what is :attr:`~kornia_pnpnet.result.Problems.known`.
         data: problems by name. Each set is solved on its own device and in its own dtype.
         path: the results file to write and to continue; none when ``None``.
         overwrite: start anew and replace the file at ``path``.
@@ -116,12 +110,12 @@ def evaluate(
 
     Returns:
         Plain data: ``format``, ``environment`` (see :func:`~kornia_pnpnet.core.environment.environment`), ``code`` (a
-        digest of the package), ``solvers`` with each one's configuration and a digest of its weights, ``data`` with
-        each set's description, limits and a digest of its problems, and ``rows``, one for each set and solver:
-        ``success`` (rate, low, high, total), quartiles of ``rotation_error_deg`` and ``translation_error``, the share
-        ``ok``, ``us_per_problem`` (median over the timed calls), the ``per_problem`` errors and ok, and the differences
-        from ``environment`` when another machine continued the file. A solver that refuses the shape of a set (a
-        network for another n) has an entry in ``left_out`` instead: ``data``, ``solver`` and ``reason``.
+        digest of the package), ``solvers`` (class, configuration, digest of the weights), ``data`` (description,
+        limits, digest of the problems) and ``rows``, one for each set and solver: ``success`` (rate, low, high, total),
+        quartiles of ``rotation_error_deg`` and ``translation_error``, the share ``ok``, ``us_per_problem`` (median over
+        the timed calls), the errors and ok ``per_problem``, and the differences from ``environment`` when another
+        machine continued the file. A solver that refuses the shape of a set (a network for another n) has an entry in
+        ``left_out`` instead: ``data``, ``solver`` and ``reason``.
 
     Raises:
         ValueError: when ``path`` is not a results file, or one that this evaluation cannot continue.
@@ -143,7 +137,7 @@ def evaluate(
         "environment": here,
         "code": source_digest(),
         "solvers": {name: _describe_solver(solver) for name, solver in solvers.items()},
-        "data": {name: {**_describe(entry), "chunk": chunk} for name, entry in data.items()},
+        "data": {name: {**_describe_data(entry), "chunk": chunk} for name, entry in data.items()},
         "rows": [],
     }
     if path is not None and not overwrite:
@@ -155,11 +149,11 @@ def evaluate(
 
     plan = list(product(data, solvers))
     done = {(row["data"], row["solver"]): row for row in results["rows"]}
-    hidden = not (sys.stderr.isatty() if progress is None else progress)
-    for names in tqdm([names for names in plan if names not in done], disable=hidden, unit="run"):
+    missing = [names for names in plan if names not in done]
+    for names in tqdm(missing, disable=None if progress is None else not progress, unit="run"):
         row: dict[str, Any] = dict(zip(("data", "solver"), names, strict=True))
         try:
-            row |= _row(solvers[row["solver"]], data[row["data"]], chunk, repeats)
+            row |= _measure(solvers[row["solver"]], data[row["data"]], chunk, repeats)
         except ShapeError as error:
             results["left_out"].append({**row, "reason": str(error).splitlines()[0]})
         except Exception as error:
@@ -184,7 +178,7 @@ def _describe_solver(solver: nn.Module) -> dict[str, Any]:
     }
 
 
-def _describe(entry: EvaluationData) -> dict[str, Any]:
+def _describe_data(entry: EvaluationData) -> dict[str, Any]:
     problems = entry.problems
     # In float32, because the last bits of float64 problems differ between machines.
     rounded = problems.map(lambda part: part.float() if part.is_floating_point() else part)
@@ -202,47 +196,44 @@ def _describe(entry: EvaluationData) -> dict[str, Any]:
     }
 
 
-def _row(solver: nn.Module, entry: EvaluationData, chunk: int, repeats: int) -> dict[str, Any]:
+def _measure(solver: nn.Module, entry: EvaluationData, chunk: int, repeats: int) -> dict[str, Any]:
+    """The entries of a row that depend on the solver's poses and times."""
     was_training = solver.training
     solver.eval()
     try:
         with torch.no_grad():
-            errors, ok, seconds = _run(solver, entry.problems, chunk, repeats)
+            errors, ok, seconds = _solve_all(solver, entry.problems, chunk, repeats)
     finally:
         solver.train(was_training)
-    lists = {name: [_rounded(value) for value in values.tolist()] for name, values in errors._asdict().items()}
-    stored = PoseErrors(*(torch.tensor(values, dtype=torch.float64) for values in lists.values()))
-    rate = success_rate(success(stored, entry.max_rotation_deg, entry.max_translation))._asdict()
-    return {
-        "success": {name: value if name == "total" else _rounded(value) for name, value in rate.items()},
-        **{
-            name: {key: _rounded(values.quantile(share).item()) for key, share in _QUARTILES.items()}
-            for name, values in stored._asdict().items()
-        },
-        "ok": _rounded(ok.double().mean().item()),
-        "us_per_problem": _rounded(1e6 * seconds),
-        "per_problem": {**lists, "ok": ok.int().tolist()},
+    lists = {name: values.tolist() for name, values in errors._asdict().items()}
+    per_problem = _rounded({**lists, "ok": ok.int().tolist()})
+    errors, ok = row_errors({"per_problem": per_problem})
+    row: dict[str, Any] = {
+        "success": success_rate(success(errors, entry.max_rotation_deg, entry.max_translation))._asdict()
     }
+    for name, values in errors._asdict().items():
+        row[name] = {key: values.quantile(share).item() for key, share in _QUARTILES.items()}
+    row |= {"ok": ok.double().mean().item(), "us_per_problem": 1e6 * seconds}
+    return {**_rounded(row), "per_problem": per_problem}
 
 
-def _run(solver: nn.Module, problems: Problems, chunk: int, repeats: int) -> tuple[PoseErrors, Tensor, float]:
-    """Errors and ok of all problems, and the median time per problem in seconds."""
+def _solve_all(solver: nn.Module, problems: Problems, chunk: int, repeats: int) -> tuple[PoseErrors, Tensor, float]:
+    """Errors (float64) and ok of all problems on the CPU, and the median time per problem in seconds."""
     chunks = [take(problems, slice(i, i + chunk)) for i in range(0, len(problems.world_points), chunk)]
+    _solve(solver, chunks[0])
+    calls = [_solve(solver, chunks[i % len(chunks)]) for i in range(max(repeats, len(chunks)))]
+    # A short last chunk is not timed: it would pay the fixed cost of a call for few problems.
     full = len(chunks[0].world_points)
-    _timed(solver, chunks[0])
-    compared, seconds = [], []
-    for i in range(max(repeats, len(chunks))):
-        part = chunks[i % len(chunks)]
-        result, elapsed = _timed(solver, part)
-        if i < len(chunks):
-            compared.append(_compare(result, part.pose))
-        if len(part.world_points) == full:  # a short last chunk pays the fixed cost of a call for few problems
-            seconds.append(elapsed / full)
-    errors, ok = map_tensors(lambda *parts: torch.cat(parts), *compared)
-    return errors, ok, statistics.median(seconds)
+    seconds = statistics.median(elapsed / full for result, elapsed in calls if len(result.ok) == full)
+    found = [(result.pose, result.ok) for result, _ in calls[: len(chunks)]]
+    pose, ok = map_tensors(lambda *parts: torch.cat(parts), *found)
+    pose, truth = map_tensors(lambda part: part.double().cpu(), (pose, problems.pose))
+    finite = pose.rotation.isfinite().flatten(1).all(-1) & pose.translation.isfinite().all(-1)
+    return pose_errors(gate_pose(pose, finite, finite), truth), ok.cpu() & finite, seconds
 
 
-def _timed(solver: nn.Module, problems: Problems) -> tuple[PnPResult, float]:
+def _solve(solver: nn.Module, problems: Problems) -> tuple[PnPResult, float]:
+    """The result and the time in seconds."""
     on_gpu = problems.world_points.is_cuda
     if on_gpu:
         torch.cuda.synchronize()
@@ -257,13 +248,10 @@ def _timed(solver: nn.Module, problems: Problems) -> tuple[PnPResult, float]:
     return result, time.perf_counter() - start
 
 
-def _compare(result: PnPResult, truth: Pose) -> tuple[PoseErrors, Tensor]:
-    """Errors in float64, and ok, on the CPU."""
-    pose, true = map_tensors(lambda part: part.double().cpu(), (result.pose, truth))
-    finite = pose.rotation.isfinite().flatten(1).all(-1) & pose.translation.isfinite().all(-1)
-    return pose_errors(gate_pose(pose, finite, finite), true), result.ok.cpu() & finite
-
-
-def _rounded(value: float) -> float:
-    """Round to six significant digits, which keeps a results file of 10 000 problems small."""
-    return float(f"{value:.6g}")
+def _rounded(value: Any) -> Any:
+    """Round to six significant digits, also in nested data, which keeps a results file of 10 000 problems small."""
+    if isinstance(value, dict):
+        return {key: _rounded(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_rounded(entry) for entry in value]
+    return float(f"{value:.6g}") if isinstance(value, float) else value

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,7 @@ from kornia_pnpnet.solver import PnPNet
 __all__ = ["BOUNDS", "default_solvers", "load_solver", "missing_package"]
 
 #: Bounds by name. They need the true pose and inliers, so they can be evaluated but cannot solve new problems.
-BOUNDS: dict[str, type[nn.Module]] = {
-    "known-inliers": KnownInliers,
-    "known-inliers-and-noise": KnownInliersAndNoise,
-}
+BOUNDS: dict[str, type[nn.Module]] = {"known-inliers": KnownInliers, "known-inliers-and-noise": KnownInliersAndNoise}
 
 # Every competitor of the protocol, in the order of its figures.
 _COMPETITORS = (
@@ -30,10 +28,9 @@ _COMPETITORS = (
     *("ransac-epnp-lm", "p3p-ransac", "opencv-sqpnp", "opencv-epnp", "opencv-ransac", "opencv-usac"),
     *("kornia-rs", "poselib", "pycolmap"),
 )
-# Thresholds of RANSAC in px and m, each the best of a grid on problems of another seed. Real scenes, whose points are
-# sharper than those of the protocol: from 3 to 60 px on five scenes with 0, 2 and 4 outliers in 9 pairs, where success
-# hardly changes between 6 and 20 px. Synthetic data, which the other solvers' defaults suit: three to five times the
-# noise, from 3 px and 0.15 m to 8 px and 0.4 m, within which success changes by one percentage point.
+# Options of RANSAC for real scenes and for the protocol's synthetic data. Each threshold, in px and m, is the best of a
+# grid on problems of another seed. Five scenes, with 0, 2 and 4 outliers in 9 pairs: 3 to 60 px; success hardly changes
+# from 6 to 20 px. Synthetic data: 3 px and 0.15 m to 8 px and 0.4 m; success changes by one percentage point.
 _SCENE_OPTIONS = dict.fromkeys(
     ("ransac-epnp-lm", "p3p-ransac", "opencv-ransac", "opencv-usac", "poselib", "pycolmap"), "threshold=12"
 )
@@ -64,22 +61,18 @@ def load_solver(spec: str) -> nn.Module:
     name, _, text = spec.partition(":")
     if name not in {*list_solvers(), *BOUNDS} and Path(spec).is_dir():
         return PnPNet.from_pretrained(spec)
-    pairs = (option.partition("=") for option in text.split(",") if option)
-    options = {key: _value(word) for key, _, word in pairs}
+    options: dict[str, Any] = {}
+    for option in filter(None, text.split(",")):
+        key, _, word = option.partition("=")
+        options[key] = word
+        with suppress(ValueError):  # any other word is a text
+            options[key] = json.loads(word)
     if name not in BOUNDS:
         return create_solver(name, **options)
     try:
         return BOUNDS[name](**options).eval()
     except TypeError as error:
         raise ValueCheckError(f"Bound {name!r} does not accept these options: {error}.") from error
-
-
-def _value(word: str) -> Any:
-    """A number, true, false or null as in JSON; any other word is a text."""
-    try:
-        return json.loads(word)
-    except ValueError:
-        return word
 
 
 def default_solvers(n: int | Iterable[int], sources: Iterable[str] = ("synthetic",)) -> list[str]:
@@ -95,11 +88,10 @@ def default_solvers(n: int | Iterable[int], sources: Iterable[str] = ("synthetic
     """
     sizes = [n] if isinstance(n, int) else list(n)
     names = dict.fromkeys(competitor.format(n=size) for competitor in _COMPETITORS for size in sizes)
-    known = list_solvers()
+    installed = [name for name in names if name in list_solvers() and not missing_package(name)]
     synthetic = any(source in PRIORS for source in sources)
     options = _PRIOR_OPTIONS if synthetic else _SCENE_OPTIONS
-    installed = (name for name in names if name in known and not missing_package(name))
-    specs = (f"{name}:{options[name]}" if name in options else name for name in installed)
+    specs = [f"{name}:{options[name]}" if name in options else name for name in installed]
     return [*specs, *(BOUNDS if synthetic else ["known-inliers"])]
 
 

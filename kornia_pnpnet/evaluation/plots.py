@@ -45,7 +45,7 @@ themed = rc_context(THEME)  #: Decorator of functions that draw.
 
 
 def make_figure(width: float, height: float, *heading: str) -> Figure:
-    """An opaque white figure with lines of a title, readable on a dark page too. Sizes are in inches."""
+    """Make a figure with lines of a title, white so that it is readable on a dark page too. Sizes are in inches."""
     figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
     if heading:
         figure.suptitle("\n".join(heading), x=0.01, ha="left")
@@ -69,19 +69,19 @@ def plot_pose(path: str | Path, img_points: Tensor, reprojections: Tensor, rejec
     if not there.any():
         raise ValueError("There is no pixel to draw.")
     pixels, projected, bad = (x[there].numpy() for x in (img_points, reprojections, rejected))
-    seen = np.isfinite(projected).all(1)
+    visible = np.isfinite(projected).all(1)
     margin = 0.3 * max(1.0, np.ptp(pixels, axis=0).max())
     low, high = pixels.min(0) - margin, pixels.max(0) + margin
     figure = make_figure(WIDTH, 1.0 + 6.2 * (high - low)[1] / (high - low)[0])
     axes = figure.subplots()
-    for rows, colour, dash in ((seen & ~bad, BLUE, "-"), (seen & bad, VERMILION, "--")):
+    for rows, colour, dash in ((visible & ~bad, BLUE, "-"), (visible & bad, VERMILION, "--")):
         lines = list(np.stack((pixels[rows], projected[rows]), axis=1))
         axes.add_collection(LineCollection(lines, colors=colour, linestyles=dash, alpha=0.8))
     axes.plot(*pixels[~bad].T, "o", color=BLUE, markersize=9.0, markerfacecolor="none", label="pixel, kept")
     axes.plot(*pixels[bad].T, "x", color=VERMILION, markersize=9.0, markeredgewidth=2.2, label="pixel, rejected")
-    axes.plot(*projected[seen].T, "+", color="black", markersize=9.0, label="reprojection")
+    axes.plot(*projected[visible].T, "+", color="black", markersize=9.0, label="reprojection")
     axes.set(xlim=(low[0], high[0]), ylim=(high[1], low[1]), xlabel="u (px)", ylabel="v (px)", aspect="equal")
-    behind = "" if seen.all() else f", {(~seen).sum()} behind the camera"
+    behind = "" if visible.all() else f", {(~visible).sum()} behind the camera"
     axes.set_title(f"{title}: n = {len(pixels)}, {bad.sum()} rejected{behind}")
     figure.legend(loc="outside lower center", ncols=3)
     return save(figure, path)
@@ -130,11 +130,12 @@ def plot_errors(path: str | Path, results: Mapping[str, Any]) -> Path:
 
 def _panels(results: Mapping[str, Any]) -> tuple[dict[str, list[Mapping[str, Any]]], dict[str, str]]:
     """The rows by data set, and a colour for each solver; ``ValueError`` when there are no rows."""
-    rows = results["rows"]
-    if not rows:
+    panels: dict[str, list[Mapping[str, Any]]] = {}
+    for row in results["rows"]:
+        panels.setdefault(row["data"], []).append(row)
+    if not panels:
         raise ValueError("The results hold no rows to draw.")
-    panels = {data: [row for row in rows if row["data"] == data] for data in dict.fromkeys(row["data"] for row in rows)}
-    return panels, dict(zip(dict.fromkeys(row["solver"] for row in rows), cycle(COLOURS), strict=False))
+    return panels, dict(zip(dict.fromkeys(row["solver"] for row in results["rows"]), cycle(COLOURS), strict=False))
 
 
 @themed

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import Any
 
@@ -29,19 +29,17 @@ PRIORS: dict[str, tuple[str, Callable[..., SyntheticProblems | MixedProblems]]] 
     "mixed": ("mixed", partial(MixedProblems, [SyntheticProblems, _slab])),
 }
 
-# Problems per drawn batch. It does not depend on the number of problems asked for, so that a request for 100 problems
-# gives the first 100 of a request for 1000.
+# Problems per drawn batch. The constant makes 100 problems the first 100 of 1000.
 _DRAW_BATCH = 1000
 
 
-def _outlier_mixes(text: str, n: int, mismatches_only: bool) -> list[tuple[str, OutlierMix, str | int]]:
+def _read_outliers(text: str, n: int, mismatches_only: bool) -> Iterator[tuple[str, OutlierMix, str | int]]:
     """Read ``--outliers``: labels, mixes and their numbers in results (``none``, ``uniform`` or an integer)."""
     one, many, share = ("mismatch", "mismatches", 1.0) if mismatches_only else ("outlier", "outliers", 0.5)
-    mixes: list[tuple[str, OutlierMix, str | int]] = []
-    for word in (part.strip() for part in text.split(",")):
+    for word in map(str.strip, text.split(",")):
         if word == "uniform":
             mix = OutlierMix(mismatch_share=share)
-            mixes.append((f"0-{mix.max_count(n)} {many}", mix, "uniform"))
+            yield f"0-{mix.max_count(n)} {many}", mix, "uniform"
             continue
         if word == "none" or word.isdecimal():
             count = 0 if word == "none" else int(word)
@@ -53,9 +51,8 @@ def _outlier_mixes(text: str, n: int, mismatches_only: bool) -> list[tuple[str, 
             )
         if count > n:
             raise ValueCheckError(f"--outliers: {count} outliers do not fit into n = {n} pairs")
-        label = f"{count} {one if count == 1 else many}"
-        mixes.append((label, OutlierMix(count=count, mismatch_share=share), count or "none"))
-    return mixes
+        mix = OutlierMix(count=count, mismatch_share=share)
+        yield f"{count} {one if count == 1 else many}", mix, count or "none"
 
 
 def evaluation_sets(
@@ -97,7 +94,8 @@ def evaluation_sets(
     sizes = [n] if isinstance(n, int) else list(n)
     if min(sizes) < 3:
         raise ValueCheckError(f"--n: a pose needs at least 3 pairs, got {min(sizes)}")
-    mixes = [(size, *mix) for size in sizes for mix in _outlier_mixes(outliers, size, mismatches_only)]
+    mixes = [(size, *mix) for size in sizes for mix in _read_outliers(outliers, size, mismatches_only)]
+    noise = {"known_noise": 1.0} if known_noise else {}
     sets: dict[str, EvaluationData] = {}
     for source in dict.fromkeys(sources):
         try:
@@ -107,27 +105,26 @@ def evaluation_sets(
                 name = source  # another scene of the same name
             # Raw matches already contain outliers; those of the mix come on top.
             added = "+" if scene is not None and source.endswith(".npz") else ""
-            noise = ", noise told" if known_noise and scene is None else ""
+            suffix = ", noise told" if known_noise and scene is None else ""
             for size, label, mix, number in mixes:
                 options: dict[str, Any] = {"n": size, "outliers": mix, "seed": seed, "dtype": dtype}
-                options["batch_size"] = _DRAW_BATCH
-                described = {"outliers": number, "mismatch_share": mix.mismatch_share, "seed": seed}
+                description = {"outliers": number, "mismatch_share": mix.mismatch_share, "seed": seed}
                 if scene is None:
                     prior, make = PRIORS[source]
-                    drawn = make(**options, known_noise=1.0) if known_noise else make(**options)
-                    entry = EvaluationData(draw_problems(drawn, count), description={"source": prior, **described})
+                    problems = draw_problems(make(**options, **noise, batch_size=_DRAW_BATCH), count)
+                    entry = EvaluationData(problems, description={"source": prior, **description})
                 else:
-                    # A mismatch takes the pixel of a spare point. With one spare, all mismatches would agree on a
-                    # wrong pose.
+                    # A mismatch takes the pixel of a spare point. With one spare, all mismatches would agree on one
+                    # pose.
                     spares = max(1, mix.max_count(size)) if mismatches_only else 1
-                    views = SceneProblems(scene, num_spares=spares, **options)
+                    views = SceneProblems(scene, num_spares=spares, **options, batch_size=_DRAW_BATCH)
+                    description = {"source": scene.name, "path": source, **description}
+                    unit = "m" if scene.metric else ""
+                    problems = draw_problems(views, count)
                     entry = EvaluationData(
-                        draw_problems(views, count),
-                        max_translation=views.max_translation,
-                        unit="m" if scene.metric else "",
-                        description={"source": scene.name, "path": source, **described},
+                        problems, max_translation=views.max_translation, unit=unit, description=description
                     )
-                sets[f"{name}, n = {size}, {added}{label}{noise}"] = entry
+                sets[f"{name}, n = {size}, {added}{label}{suffix}"] = entry
         except ValueError as error:
             raise ValueCheckError(f"{source}: {error}") from error
     return sets

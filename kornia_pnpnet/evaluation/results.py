@@ -1,9 +1,9 @@
-"""Results files: their form, continuing an interrupted evaluation, and the table of an evaluation."""
+"""Results files: reading, writing and continuing them, and the table of an evaluation."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,16 @@ from kornia_pnpnet.core.files import atomic_open, digest
 from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.metrics import PoseErrors, SuccessRate
 
-__all__ = ["FORMAT", "format_table", "load_results", "resume", "row_errors", "save_results", "source_digest"]
+__all__ = [
+    "FORMAT",
+    "differences",
+    "format_table",
+    "load_results",
+    "resume",
+    "row_errors",
+    "save_results",
+    "source_digest",
+]
 
 FORMAT = 1
 _SHOWN_DIFFERENCES = 3
@@ -52,10 +61,12 @@ def load_results(path: str | Path) -> dict[str, Any]:
         ValueError: when the file is not a results file of this format; the message names the first wrong entry.
     """
     try:
-        from kornia_pnpnet.evaluation.forms import read_results
+        from kornia_pnpnet.core.schema import read_json
+        from kornia_pnpnet.evaluation.forms import Evaluation
     except ImportError as error:
         raise ImportError("reading results files needs pydantic: pip install 'kornia_pnpnet[eval]'") from error
-    return read_results(path)
+    results: dict[str, Any] = read_json(path, Evaluation, "a results file of evaluation")
+    return results
 
 
 def source_digest() -> str:
@@ -64,46 +75,45 @@ def source_digest() -> str:
     return digest({path.relative_to(root).as_posix(): digest(path.read_bytes()) for path in root.rglob("*.py")})
 
 
+def differences(before: Any, now: Any, place: str = "") -> list[str]:
+    """Name the entries in which nested plain data differ, for example ``refine.m was 3 and is 4``."""
+    if isinstance(before, dict | None) and isinstance(now, dict | None):
+        before, now = before or {}, now or {}
+        pairs = [(key, before.get(key), now.get(key)) for key in {**before, **now}]
+    elif isinstance(before, list) and isinstance(now, list) and len(before) == len(now):
+        pairs = list(zip(range(len(now)), before, now, strict=True))
+    else:
+        return [] if before == now else [f"{place[1:]} was {before!r} and is {now!r}"]
+    return [line for key, old, new in pairs for line in differences(old, new, f"{place}.{key}")]
+
+
 def resume(plan: Mapping[str, Any], path: str | Path) -> dict[str, Any]:
     """Join the plan of an evaluation, its results without rows, with the rows of the results file at ``path``, if any.
 
-    A file can be continued by the same code and versions. The plan must have all solvers and data sets of the file,
-    unchanged, and may have more; or else a ``ValueError`` names the differences.
+    Raises:
+        ValueError: when code or versions have changed, or a solver or data set of the file is missing in the plan or
+            has changed. The message names the first differences.
     """
     fresh: dict[str, Any] = json.loads(json.dumps(plan))  # tuples become lists, as in a file
     there = load_results(path) if Path(path).exists() else fresh
     if not there["rows"]:
         return fresh
-    found = list(_differences(there, fresh))
+    before = {"versions": there["environment"].get("versions"), "code": there.get("code")}
+    now = {"versions": fresh["environment"]["versions"], "code": fresh["code"]}
+    for kind in ("solvers", "data"):
+        before[kind], now[kind] = there[kind], {name: fresh[kind].get(name) for name in there[kind]}
+    found = differences(before, now)
     if found:
         more = [f"and {len(found) - _SHOWN_DIFFERENCES} more"] if len(found) > _SHOWN_DIFFERENCES else []
         raise ValueError(
-            f"'{path}' holds another evaluation, which this one cannot continue: "
-            f"{'; '.join(found[:_SHOWN_DIFFERENCES] + more)}. Choose another file, or overwrite this one."
+            f"'{path}' holds another evaluation (commit {there['environment'].get('commit')}), which this one cannot "
+            f"continue: {'; '.join(found[:_SHOWN_DIFFERENCES] + more)}. Choose another file, or overwrite this one."
         )
     return {**there, "solvers": fresh["solvers"], "data": fresh["data"]}
 
 
-def _differences(there: Mapping[str, Any], plan: Mapping[str, Any]) -> Iterator[str]:
-    """Why the rows of a file do not belong to a plan."""
-    versions = there["environment"].get("versions", {})
-    for package, version in plan["environment"]["versions"].items():
-        if versions.get(package) != version:
-            yield f"{package} was {versions.get(package)} and is {version}"
-    if there.get("code") != plan["code"]:
-        yield f"the package's code has changed since (commit {there['environment'].get('commit')})"
-    for kind in ("solvers", "data"):
-        for name, entry in there[kind].items():
-            now = plan[kind].get(name)
-            if now is None:
-                yield f"{kind}: '{name}' is not part of this one"
-            elif now != entry:
-                keys = [key for key in {**entry, **now} if entry.get(key) != now.get(key)]
-                yield f"{kind}: '{name}' has another {', another '.join(keys)}"
-
-
 def format_table(results: Mapping[str, Any]) -> str:
-    """Format results as a Markdown table that also reads well as plain text.
+    """Format results as a Markdown table that is aligned as plain text, too.
 
     There is one line for each set and solver: success with its 95 % interval, median errors, time and share of ok.
     """

@@ -59,25 +59,21 @@ def write_model_card(folder: str | Path, results: RunResults, *, name: str | Non
     from huggingface_hub import EvalResult, ModelCardData
 
     name = name or results.name
-    rates = [
-        EvalResult("pose-estimation", "validation", key, "success-rate", round(x.success.rate, 4), dataset_config=key)
-        for key, x in results.validation.items()
-    ]
+    rates, rows = [], []
+    for key, x in results.validation.items():
+        rate = round(x.success.rate, 4)
+        rates.append(EvalResult("pose-estimation", "validation", key, "success-rate", rate, dataset_config=key))
+        errors = f"{x.median_rotation_error_deg:.3f}° | {x.median_translation_error:.3f}"
+        rows.append(f"| {key} | {x.success} | {x.first_stage_success} | {errors} |")
     metadata = ModelCardData(
         license="apache-2.0", library_name="kornia_pnpnet", tags=_TAGS, model_name=name, eval_results=rates
     )
-    rows = [
-        f"| {key} | {x.success} | {x.first_stage_success} | {x.median_rotation_error_deg:.3f}° "
-        f"| {x.median_translation_error:.3f} |"
-        for key, x in results.validation.items()
-    ]
-    runs = [f"{number}. {_described(run)}" for number, run in enumerate(results.lineage(), 1)]
-    card = _CARD.format(metadata=metadata.to_yaml(), name=name, runs="\n".join(runs), rows="\n".join(rows))
+    runs = [f"{number}. {_describe(run)}" for number, run in enumerate(results.lineage(), 1)]
     with atomic_open(Path(folder) / "README.md", encoding="utf-8") as file:
-        file.write(card)
+        file.write(_CARD.format(metadata=metadata.to_yaml(), name=name, runs="\n".join(runs), rows="\n".join(rows)))
 
 
-def _described(results: RunResults) -> str:
+def _describe(results: RunResults) -> str:
     """A run in one sentence; its command without folders of the machine that ran the command."""
     words = ["python train.py"]
     for override in results.overrides:

@@ -1,38 +1,126 @@
-"""The training loop, on one process or several.
+"""The training loop, on one process or several; Lightning Fabric handles devices and processes.
 
-Lightning Fabric carries devices and processes. The package adds the ramp of the loss, steps that are skipped when they
-are not finite, and a run that can be stopped at any moment and continued to the same numbers.
+The loop ramps the loss in and skips steps that are not finite. A run that is stopped and continued gives the same
+numbers as a run without a stop.
 """
 
 from __future__ import annotations
 
+import json
+import logging
+import math
+import resource
 import shutil
+import sys
 import timeit
 from collections.abc import Mapping
 from contextlib import closing
+from dataclasses import asdict, dataclass
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import torch
 from kornia.core.check import KORNIA_CHECK
 from lightning_fabric import Fabric
+from torch import Tensor, nn
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
-from kornia_pnpnet.core.checks import check_positive
+from kornia_pnpnet.core.checks import check_numbers, check_positive, check_whole
+from kornia_pnpnet.core.files import atomic_open
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.data.stream import ProblemSource, stream_batches
-from kornia_pnpnet.losses import PoseLoss, SetLoss
+from kornia_pnpnet.losses import LossTerms, PoseLoss, SetLoss
 from kornia_pnpnet.propose.mlp import MLPInit
 from kornia_pnpnet.refine.lm import RobustWeightedLM
 from kornia_pnpnet.result import Problems
 from kornia_pnpnet.solver import PnPNet
-from kornia_pnpnet.training.checkpoint import CHECKPOINT_NAME, HISTORY_NAME, stop_on_signal
-from kornia_pnpnet.training.results import FitReport
-from kornia_pnpnet.training.run import Run, TrainSettings
+from kornia_pnpnet.training.checkpoint import (
+    CHECKPOINT_NAME,
+    HISTORY_NAME,
+    History,
+    StageClock,
+    TrainingError,
+    load_checkpoint,
+    stop_on_signal,
+)
+from kornia_pnpnet.training.results import FitReport, validate
 
-__all__ = ["fit", "train_briefly"]
+__all__ = ["TrainSettings", "fit", "train_briefly"]
+
+_log = logging.getLogger(__name__)
+
+# Stages of an update. The rest is learning curves, validations and checkpoints.
+_STAGES = ("data", "forward", "backward", "optimizer", "rest")
+# Columns of the learning curves: those of every row, and those of a validation, which begin with ``val/<set>/``, with
+# the field of ValidationResult that each column shows.
+_COLUMNS = (
+    *("update", *LossTerms._fields, "ramp", "lr", "grad_norm", "skipped", "updates_per_second"),
+    *(*(f"{stage}_share" for stage in _STAGES), "peak_memory_mib"),
+)
+_CURVES = {
+    "success": "success.rate",
+    "rotation_error_deg": "median_rotation_error_deg",
+    "translation_error": "median_translation_error",
+    "init_rotation_error_deg": "first_stage_median_rotation_error_deg",
+    "init_translation_error": "first_stage_median_translation_error",
+}
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    """Numbers of a training run.
+
+    Attributes:
+        updates: number of updates of the whole run.
+        lr: Adam's learning rate for the network.
+        lr_refine: Adam's learning rate for the hyperparameters of the refinement.
+        warmup: number of updates over which the learning rates rise linearly.
+        final_lr: factor of the learning rates at the end of the cosine decay; 1 keeps the rates constant.
+        clip: largest norm of the gradient; infinity does not clip.
+        ramp: shares of the run at which the refined terms of the loss begin to count, and count in full.
+        max_skipped: largest number of skipped steps; one more ends the run.
+        log_every: updates between rows of the learning curves.
+        validate_every: updates between validations.
+        checkpoint_every: updates between checkpoints.
+
+    Raises:
+        BaseError: for a number that is out of range, or a ramp that falls.
+    """
+
+    updates: int
+    lr: float = 3e-3
+    lr_refine: float = 1e-2
+    warmup: int = 200
+    final_lr: float = 0.02
+    clip: float = 1.0
+    ramp: tuple[float, float] = (0.8, 0.81)
+    max_skipped: int = 100
+    log_every: int = 100
+    validate_every: int = 1000
+    checkpoint_every: int = 500
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        check_whole(1, **{name: getattr(self, name) for name in ("log_every", "validate_every", "checkpoint_every")})
+        check_whole(0, updates=self.updates, warmup=self.warmup, max_skipped=self.max_skipped)
+        check_numbers(0.0, lr=self.lr, lr_refine=self.lr_refine)
+        check_positive(clip=self.clip, or_infinite=True)
+        check_numbers(0.0, 1.0, final_lr=self.final_lr)
+        rises = len(self.ramp) == 2 and 0.0 <= self.ramp[0] <= self.ramp[1] < math.inf
+        KORNIA_CHECK(rises, f"ramp must be two shares, the second not smaller, got {self.ramp}.")
+
+    def lr_factor(self, update: int) -> float:
+        """Factor of the learning rates at an update: a linear warm-up times a cosine from 1 to ``final_lr``."""
+        cosine = 0.5 * (1.0 + math.cos(math.pi * min(1.0, update / max(1, self.updates))))
+        return min(1.0, (update + 1) / max(1, self.warmup)) * (self.final_lr + (1.0 - self.final_lr) * cosine)
+
+    def ramp_factor(self, update: int) -> float:
+        """Weight of the refined terms at an update, from 0 to 1."""
+        start, end = (share * self.updates for share in self.ramp)
+        return 0.0 if update < start else 1.0 if update >= end else (update - start) / (end - start)
 
 
 def fit(
@@ -76,31 +164,157 @@ def fit(
             other settings or options of the solver, or when more than ``settings.max_skipped`` steps were not finite.
         BaseError: when the batch cannot be divided equally among the processes.
     """
-    if fabric is None:
-        fabric = Fabric(accelerator="cpu", devices=1)
+    fabric = fabric or Fabric(accelerator="cpu", devices=1)
     KORNIA_CHECK(
         data.batch_size % fabric.world_size == 0,
         f"A batch of {data.batch_size} cannot be shared equally among {fabric.world_size} processes.",
     )
-    run = Run(model, loss, validation, settings, Path(folder), fabric, identity or {}, resume)
+    checkpoint = Path(folder) / CHECKPOINT_NAME
+    described = {"settings": asdict(settings), "model": model.config(), **(identity or {})}
+    described = json.loads(json.dumps(described))  # tuples become lists, as in a checkpoint
+    start, skipped, state = 0, 0, None
+    if checkpoint.exists():
+        if not resume:
+            raise TrainingError(f"{checkpoint} exists: pass resume=true to continue, or choose another folder.")
+        state = load_checkpoint(checkpoint, described)
+        start, skipped = state["update"], state["skipped"]
+        model.load_state_dict(state["model"])
+
+    groups = []
+    for module, lr in ((model.init, settings.lr), (model.refine, settings.lr_refine)):
+        if module is not None and (trained := [p for p in module.parameters() if p.requires_grad]):
+            groups.append({"params": trained, "lr": lr, "initial_lr": lr})
+    optimizer = torch.optim.Adam(groups, fused=True)
+    solver, fabric_optimizer = fabric.setup(model, optimizer)
+    solver.mark_forward_method("with_starts")
+    if state is not None:  # after the parameters are on their device, so that Adam's state follows them
+        optimizer.load_state_dict(state["optimizer"])
+    model.train()
+
+    validation = {name: problems.map(lambda x: x.to(fabric.device)) for name, problems in validation.items()}
+    columns = [*_COLUMNS, *(f"val/{name}/{column}" for name in validation for column in _CURVES)]
+    history = History(Path(folder), columns, start) if fabric.is_global_zero else None
     part = slice(fabric.global_rank, None, fabric.world_size)  # all processes together have the batch of one process
     hidden = not (progress and fabric.is_global_zero)
-    bar = tqdm(total=settings.updates, initial=run.start, disable=hidden, unit="update")
-    batches = stream_batches(data, run.start, settings.updates, data_workers)
+    bar = tqdm(total=settings.updates, initial=start, disable=hidden, unit="update")
+    batches = stream_batches(data, start, settings.updates, data_workers)
+    clock = StageClock(*_STAGES)
+    update, interrupted, logged = start, False, (start, dict(clock.seconds))
     with stop_on_signal() as stop, closing(batches), bar, logging_redirect_tqdm():
-        while not (run.finished or run.interrupted):
-            run.clock.lap("rest")
-            problems = next(batches).map(lambda x: x[part].to(fabric.device))
-            run.clock.lap("data")
-            step = run.step(problems, stop)
+        for update, batch in enumerate(batches, start + 1):
+            problems = batch.map(lambda x: x[part].to(fabric.device))
+            clock.lap("data")
+            factor, ramp = settings.lr_factor(update - 1), settings.ramp_factor(update - 1)
+            for group in optimizer.param_groups:
+                group["lr"] = group["initial_lr"] * factor
+            terms = _compare(solver, loss, problems, ramp)
+            # The zero keeps the refiner in the graph before the ramp: processes expect gradients of every parameter.
+            unused = sum(p.sum() for p in model.refine.parameters() if p.requires_grad) if ramp == 0.0 else 0.0
+            clock.lap("forward")
+            optimizer.zero_grad()
+            fabric.backward(terms.total + 0.0 * unused)
+            clock.lap("backward")
+            norm = nn.utils.clip_grad_norm_(model.parameters(), settings.clip)
+            # All processes must take the same branch, whichever process saw the bad number or the signal.
+            bad, stopped = _any_process(fabric, ~torch.isfinite(terms.total + norm), stop.is_set())
+            if bad:
+                skipped += 1
+                if fabric.is_global_zero:
+                    _log.warning("update %s: loss or gradient not finite, step skipped (%s so far)", update, skipped)
+                if skipped > settings.max_skipped:
+                    raise TrainingError(
+                        f"{skipped} steps had a loss or a gradient that is not finite, more than max_skipped = "
+                        f"{settings.max_skipped}, up to update {update}. Lower the learning rate or check the data."
+                    )
+            else:
+                fabric_optimizer.step()
+            clock.lap("optimizer")
             bar.update()
-            validates = run.finished or run.update % settings.validate_every == 0
-            if validates or run.update % settings.log_every == 0:
-                run.log(step, validates)
-                bar.set_postfix_str(run.rates)
-            if run.finished or run.interrupted or run.update % settings.checkpoint_every == 0:
-                run.save()
-    return run.report()
+
+            finished = update == settings.updates
+            interrupted = stopped and not finished
+            validates = finished or update % settings.validate_every == 0
+            if validates or update % settings.log_every == 0:
+                values = torch.as_tensor(fabric.all_reduce(torch.stack(terms).detach(), reduce_op="mean"))
+                if history is not None:
+                    report = _report(fabric, clock, *logged, update, skipped)
+                    row = {"update": update, **dict(zip(LossTerms._fields, values.tolist(), strict=True))}
+                    if ramp == 0.0:  # nothing was refined yet
+                        row = {name: value for name, value in row.items() if not name.startswith("refined")}
+                    row |= {"ramp": ramp, "lr": settings.lr * factor, "grad_norm": norm.item(), "skipped": skipped}
+                    row |= {name: getattr(report, name) for name in ("updates_per_second", "peak_memory_mib")}
+                    row |= {f"{stage}_share": share for stage, share in report.time_shares.items()}
+                    if validates:
+                        model.eval()
+                        results = validate(model, validation)
+                        model.train()
+                        for name, result in results.items():
+                            row |= {f"val/{name}/{key}": attrgetter(field)(result) for key, field in _CURVES.items()}
+                        rates = ", ".join(f"{name} {100 * x.success.rate:.1f} %" for name, x in results.items())
+                        bar.set_postfix_str(rates)
+                        _log.info("%s; success: %s", report, rates)
+                    history.write(row)
+                    clock.lap("rest")
+                    logged = update, dict(clock.seconds)
+            if finished or interrupted or update % settings.checkpoint_every == 0:
+                if fabric.is_global_zero:
+                    content = {"update": update, "skipped": skipped, "identity": described}
+                    content |= {"model": model.state_dict(), "optimizer": optimizer.state_dict()}
+                    with atomic_open(checkpoint, "wb") as file:
+                        torch.save(content, file)
+                fabric.barrier()
+            clock.lap("rest")
+            if interrupted:
+                break
+    if history is not None:
+        history.board.close()
+    model.eval()
+    return _report(fabric, clock, start, dict.fromkeys(_STAGES, 0.0), update, skipped, interrupted)
+
+
+def _compare(solver: Any, loss: PoseLoss | SetLoss, problems: Problems, ramp: float) -> LossTerms:
+    """Solve the problems and compare the results with the true poses."""
+    inputs = problems.world_points, problems.img_points, problems.intrinsics
+    options = {**problems.known, "first_stage_only": ramp == 0.0}
+    if isinstance(loss, SetLoss):
+        result, guess = solver.with_starts(*inputs, **options)
+        return loss(result, problems, ramp, guess)
+    return loss(solver(*inputs, **options), problems, ramp)
+
+
+def _any_process(fabric: Fabric, *flags: bool | Tensor) -> list[bool]:
+    """Whether each flag is set on at least one process."""
+    counts = torch.stack([torch.as_tensor(flag, dtype=torch.float32, device=fabric.device) for flag in flags])
+    return (torch.as_tensor(fabric.all_reduce(counts, reduce_op="sum")) > 0).tolist()
+
+
+def _report(
+    fabric: Fabric,
+    clock: StageClock,
+    start: int,
+    before: Mapping[str, float],
+    update: int,
+    skipped: int,
+    interrupted: bool = False,
+) -> FitReport:
+    """Sum up the work since the update ``start``, at which the clock had the seconds ``before``."""
+    clock.lap("rest")
+    spent = {stage: seconds - before[stage] for stage, seconds in clock.seconds.items()}
+    whole = max(sum(spent.values()), 1e-9)
+    if fabric.device.type == "cuda":
+        memory = torch.cuda.max_memory_allocated(fabric.device) / 2**20
+    else:  # bytes on macOS, KiB elsewhere
+        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2 ** (20 if sys.platform == "darwin" else 10)
+    return FitReport(
+        start=start,
+        update=update,
+        skipped=skipped,
+        interrupted=interrupted,
+        seconds=whole,
+        updates_per_second=(update - start) / whole,
+        time_shares={stage: seconds / whole for stage, seconds in spent.items()},
+        peak_memory_mib=memory,
+    )
 
 
 def train_briefly(seconds: float, folder: str | Path, *, progress: bool = True) -> Path:
@@ -126,10 +340,9 @@ def train_briefly(seconds: float, folder: str | Path, *, progress: bool = True) 
         torch.manual_seed(0)
         model = PnPNet(MLPInit(9), RobustWeightedLM(5))
     data = SyntheticProblems(n=9, batch_size=250, seed=0, outliers=OutlierMix())
-    sets = {"none": (900_001, None), "uniform": (900_002, OutlierMix())}
     validation = {
         name: SyntheticProblems(n=9, batch_size=500, seed=seed, outliers=mix).batch(0)
-        for name, (seed, mix) in sets.items()
+        for name, seed, mix in (("none", 900_001, None), ("uniform", 900_002, OutlierMix()))
     }
     loss = PoseLoss(saturation=0.02)
 
@@ -139,8 +352,7 @@ def train_briefly(seconds: float, folder: str | Path, *, progress: bool = True) 
 
     alone = TrainSettings(0).ramp[0]  # share of the run that trains the network without the refinement
     fast, slow = (timeit.timeit(partial(try_update, ramp), number=10) / 10 for ramp in (0.0, 1.0))
-    expected = alone * fast + (1.0 - alone) * slow
-    updates = max(100, round(seconds / expected) // 100 * 100)
+    updates = max(100, round(seconds / (alone * fast + (1.0 - alone) * slow)) // 100 * 100)
     rows = updates // 20
     settings = TrainSettings(updates, warmup=100, log_every=rows, validate_every=rows, checkpoint_every=updates)
     fit(model, data, validation, loss, settings, folder, progress=progress)

@@ -3,25 +3,24 @@
 # ruff: noqa: UP013  (one line for each small mapping)
 from __future__ import annotations
 
-import csv
 import timeit
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, NamedTuple, NotRequired, cast
+from typing import Annotated, Any, ClassVar, NamedTuple, NotRequired
 
 import torch
 from torch import nn
 from typing_extensions import TypedDict
 
 from kornia_pnpnet.core.environment import environment
-from kornia_pnpnet.core.files import atomic_open
 from kornia_pnpnet.core.schema import STRICT, Count, Kept, read_json
 from kornia_pnpnet.metrics import SuccessRate, pose_errors, success, success_rate
 from kornia_pnpnet.pretrained import find_weights
 from kornia_pnpnet.result import Problems
 from kornia_pnpnet.solver import PnPNet
+from kornia_pnpnet.training.checkpoint import write_csv
 
 __all__ = [
     "RESULTS_NAME",
@@ -65,13 +64,18 @@ class FitReport:
     time_shares: dict[str, float]
     peak_memory_mib: float
 
+    def __str__(self) -> str:
+        shares = ", ".join(f"{stage} {100 * share:.0f} %" for stage, share in self.time_shares.items())
+        speed = f"{self.updates_per_second:.1f} per second ({shares})"
+        return f"{self.update} updates, {speed}, peak memory {self.peak_memory_mib:.0f} MiB, {self.skipped} skipped"
+
 
 @dataclass(frozen=True)
 class ValidationResult:
     """Success (rotation error below 1°, translation error below 0.2) and errors on one validation set.
 
-    ``first_stage`` stands for the initial poses, the other fields for the refined poses. Translations are in the unit
-    of the world.
+    Fields with ``first_stage`` describe the initial poses, the other fields the refined poses. Translations are in the
+    unit of the world.
     """
 
     success: SuccessRate
@@ -97,12 +101,8 @@ _Size = TypedDict("_Size", {"n": Count})
 _ModelConfig = TypedDict("_ModelConfig", {"init": _Init | None, "refine": _Refine})
 _RunConfig = TypedDict("_RunConfig", {"name": NotRequired[Any], "model": _Size})
 _RunEnvironment = TypedDict("_RunEnvironment", {"commit": str | None})
-
-#: What :meth:`PnPNet.config` returned.
 ModelConfig = Annotated[_ModelConfig, Kept]
-#: The resolved configuration of ``train.py``.
 RunConfig = Annotated[_RunConfig, Kept]
-#: What :func:`~kornia_pnpnet.core.environment.environment` returned during the run.
 RunEnvironment = Annotated[_RunEnvironment, Kept]
 
 
@@ -113,7 +113,7 @@ class RunResults:
     Attributes:
         overrides: arguments of ``train.py``, ``key=value``.
         run: the report of the training.
-        us_per_problem: time of the solver per problem in microseconds, in calls of 1000 problems.
+        us_per_problem: time of the solver in microseconds per problem, measured with calls of 1000 problems.
         validation: success and errors on each validation set, at least one.
         learned: hyperparameters of the refinement.
         model: configuration of the solver.
@@ -138,7 +138,7 @@ class RunResults:
     origin: RunResults | None = None
 
     def __post_init__(self) -> None:
-        """Check what the types do not say."""
+        """Check the number of validation sets and of hyperparameters."""
         if not self.validation:
             raise ValueError("validation is empty, expected at least one validation set")
         iterations = max(1, self.model["refine"]["m"])
@@ -172,8 +172,7 @@ def validate(model: nn.Module, validation: Mapping[str, Problems]) -> dict[str, 
         result = model(problems.world_points, problems.img_points, problems.intrinsics, **problems.known)
         refined, first = (pose_errors(pose, problems.pose) for pose in (result.pose, result.init))
         rates = success_rate(success(refined)), success_rate(success(first))
-        medians = (part.median().item() for part in (*refined, *first))
-        results[name] = ValidationResult(*rates, *medians)
+        results[name] = ValidationResult(*rates, *(part.median().item() for part in (*refined, *first)))
     return results
 
 
@@ -182,30 +181,31 @@ def run_results(
     model: PnPNet,
     validation: Mapping[str, Problems],
     report: FitReport,
-    config: Mapping[str, Any],
+    config: Any,
     overrides: list[str],
     origin: RunResults | None = None,
 ) -> RunResults:
-    """Measure a trained solver and gather the :class:`RunResults` of its run, whose arguments these are.
+    """Measure a trained solver and gather the :class:`RunResults` of its run.
 
     Raises:
         ValueError: when there is no validation set.
     """
-    if not validation:
-        raise ValueError("The results of a run need at least one validation set, got none.")
-    part = [*validation.values()][-1].map(lambda x: x[:_TIMED_PROBLEMS])
+    *_, last = validation.values()
+    part = last.map(lambda x: x[:_TIMED_PROBLEMS])
     inputs = part.world_points, part.img_points, part.intrinsics
     seconds = timeit.repeat(lambda: model(*inputs, **part.known), number=1, repeat=_TIMED_CALLS)
     learned = model.refine.hyperparameters(torch.zeros((), dtype=torch.float64))
+    model_config: Any = model.config()
+    made_with: Any = environment()
     return RunResults(
         overrides=overrides,
         run=report,
         us_per_problem=1e6 * min(seconds) / len(part.world_points),
         validation=validate(model, validation),
         learned=Learned(*(values.tolist() for values in learned)),
-        model=cast(ModelConfig, model.config()),
-        config=cast(RunConfig, config),
-        environment=cast(RunEnvironment, environment()),
+        model=model_config,
+        config=config,
+        environment=made_with,
         origin=origin,
     )
 
@@ -232,7 +232,7 @@ def find_results(weights: str | Path) -> RunResults | None:
         ValueError: see :func:`load_run`.
     """
     folder = find_weights(weights)
-    # `train.py` writes weights into the folder `weights` of a run. Above another folder the file is of something else.
+    # `train.py` writes weights into the folder `weights` of a run. A results file above another folder is not theirs.
     folders = [folder, folder.parent] if folder.name == "weights" else [folder]
     paths = (place / RESULTS_NAME for place in folders)
     return next((load_run(path) for path in paths if path.is_file()), None)
@@ -258,8 +258,7 @@ def summarize_runs(folder: str | Path) -> Path | None:
             warnings.warn(f"Left out of the summary: {error}", stacklevel=2)
             continue
         row: dict[str, Any] = {"run": str(path.parent.relative_to(folder))}
-        overrides = (override.lstrip("+").partition("=") for override in results.overrides)
-        row |= {key: value for key, _, value in overrides}
+        row |= dict(override.lstrip("+").partition("=")[::2] for override in results.overrides)
         for key in ("update", "skipped", "updates_per_second", "peak_memory_mib"):
             row[key] = getattr(results.run, key)
         row["us_per_problem"] = f"{results.us_per_problem:.4g}"
@@ -268,9 +267,6 @@ def summarize_runs(folder: str | Path) -> Path | None:
         rows.append(row)
     if not rows:
         return None
-    path = folder / "summary.csv"
-    with atomic_open(path, newline="") as file:  # runs of a parallel launcher may end at the same time
-        writer = csv.DictWriter(file, list(dict.fromkeys(key for row in rows for key in row)), restval="")
-        writer.writeheader()
-        writer.writerows(rows)
-    return path
+    # In one piece, because runs of a parallel launcher may end at the same time.
+    write_csv(folder / "summary.csv", dict.fromkeys(key for row in rows for key in row), rows)
+    return folder / "summary.csv"

@@ -1,4 +1,4 @@
-"""Sets of problems by name: sources, words for outliers, and the description of each set."""
+"""Solvers, bounds and sets of problems by the names that a user types."""
 
 from __future__ import annotations
 
@@ -7,34 +7,65 @@ from pathlib import Path
 
 import pytest
 import torch
+from data_helpers import make_view, same
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from kornia.core.exceptions import ValueCheckError
 
 import kornia_pnpnet.evaluation.problem_sets
+from kornia_pnpnet import PnPNet, list_solvers
 from kornia_pnpnet.core.trees import iter_tensors
-from kornia_pnpnet.data import OutlierMix, Scene, SceneProblems, SlabPoints, SyntheticProblems, View
+from kornia_pnpnet.data import OutlierMix, Scene, SceneProblems, SlabPoints, SyntheticProblems
+from kornia_pnpnet.evaluation.bounds import KnownInliersAndNoise
+from kornia_pnpnet.evaluation.comparison import SeesTruth
+from kornia_pnpnet.evaluation.named_solvers import BOUNDS, default_solvers, load_solver, missing_package
 from kornia_pnpnet.evaluation.problem_sets import PRIORS, evaluation_sets
 
-CONF = Path(__file__).resolve().parents[1] / "conf" / "data"
+CONF = Path(__file__).resolve().parents[1] / "conf"
 
 
-def scene(name="room", points=60, metric=True):
-    """One image of points around it, all of them exact."""
-    generator = torch.Generator().manual_seed(0)
-    world_points = torch.rand(points, 3, dtype=torch.float64, generator=generator) + torch.tensor([-0.5, -0.5, 4.0])
-    view = View(
-        name="a.jpg",
-        world_points=world_points,
-        img_points=500 * world_points[:, :2] / world_points[:, 2:] + 320,
-        intrinsics=torch.tensor([[500.0, 0, 320], [0, 500, 320], [0, 0, 1]], dtype=torch.float64),
-        rotation=torch.eye(3, dtype=torch.float64),
-        translation=torch.zeros(3, dtype=torch.float64),
-        width=640,
-        height=640,
-        inliers=torch.ones(points, dtype=torch.bool),
-    )
-    return Scene(name, (view,), metric=metric)
+def test_bounds_take_options():
+    bound = load_solver("known-inliers-and-noise:world_sigma=0.01")
+    assert isinstance(bound, KnownInliersAndNoise)
+    assert bound.config == {"img_sigma": 1.0, "world_sigma": 0.01}
+    assert not bound.training
+    with pytest.raises(ValueCheckError, match="known-inliers"):
+        load_solver("known-inliers:world_sigma=0.01")
+
+
+def test_a_name_wins_over_a_folder_of_that_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("known-inliers", "identity-lm"):
+        (tmp_path / name).mkdir()
+    assert isinstance(load_solver("known-inliers"), SeesTruth)
+    assert isinstance(load_solver("identity-lm"), PnPNet)
+
+
+@pytest.mark.parametrize("sources", [["synthetic", "a/room"], ["a/room"]])
+def test_default_solvers_load_and_cover_every_n(sources):
+    specs = default_solvers([6, 9], sources)
+    assert len(set(specs)) == len(specs)
+    assert set(default_solvers(9, sources)) | set(default_solvers(6, sources)) == set(specs)
+    for spec in specs:
+        assert isinstance(load_solver(spec), SeesTruth) == (spec.partition(":")[0] in BOUNDS)
+    left = set(list_solvers()) - {spec.partition(":")[0] for spec in specs}
+    assert all(name.startswith(("pnpnet-", "net-")) and not name.endswith(("-n6", "-n9")) for name in left)
+
+
+def test_missing_packages_are_named_and_left_out(monkeypatch):
+    needed = {"opencv-usac": "OpenCV", "poselib": "PoseLib", "pycolmap": "pycolmap", "kornia-rs": "kornia-rs"}
+    needed["epnp"] = None
+    assert {name: missing_package(name) for name in needed} == dict.fromkeys(needed)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert {name: missing_package(name) for name in needed} == needed
+    assert not any(name.startswith(("opencv", "kornia-rs", "poselib", "pycolmap")) for name in default_solvers(9))
+
+
+# -- sets of problems --------------------------------------------------------------------------------------------------
+
+
+def scene(name="room", metric=True):
+    return Scene(name, (make_view(count=60),), (), metric)
 
 
 @pytest.fixture
@@ -47,10 +78,6 @@ def scenes(monkeypatch):
 
 def draw(*sources, outliers="none", n=9, count=20, **options):
     return evaluation_sets(sources, outliers, n=n, count=count, seed=3, **options)
-
-
-def same(a, b):
-    return all(torch.equal(x, y) for x, y in zip(iter_tensors(a), iter_tensors(b), strict=True))
 
 
 @pytest.mark.parametrize(
@@ -74,7 +101,7 @@ def test_priors_are_the_protocols(source, called, options):
 @pytest.mark.parametrize("source", ["synthetic", "gaussian_pose", "mixed"])
 def test_priors_are_those_of_the_training_configuration(source):
     name, make = PRIORS[source]
-    with initialize_config_dir(str(CONF.parent), version_base="1.3"):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("train", overrides=[f"data={name}", "batch_size=4", "seed=3"])
     trained = instantiate(config.data.train).batch(2)
     ours = make(n=9, batch_size=4, seed=3, outliers=OutlierMix()).batch(2)
@@ -82,13 +109,13 @@ def test_priors_are_those_of_the_training_configuration(source):
 
 
 def test_known_noise_is_added_to_the_same_problems():
-    ((name, told),) = draw("synthetic", outliers="2", count=300, known_noise=True).items()
+    ((name, known),) = draw("synthetic", outliers="2", count=300, known_noise=True).items()
     ((plain_name, plain),) = draw("synthetic", outliers="2", count=300).items()
     assert name == f"{plain_name}, noise told"
     assert plain.problems.sigmas == {}
-    assert torch.equal(told.problems.img_points, plain.problems.img_points)
-    assert told.problems.img_sigma.tolist() == [1.0] * 300
-    torch.testing.assert_close(told.problems.world_sigma, torch.full((300,), 0.05))
+    assert torch.equal(known.problems.img_points, plain.problems.img_points)
+    assert known.problems.img_sigma.tolist() == [1.0] * 300
+    torch.testing.assert_close(known.problems.world_sigma, torch.full((300,), 0.05))
 
 
 @pytest.mark.parametrize(
@@ -109,36 +136,31 @@ def test_words_for_outliers(word, n, counts, called, label):
 
 
 def test_mismatches_only_are_pixels_of_other_points(scenes):
-    ((name, entry),) = draw("room", outliers="4", count=200, mismatches_only=True, dtype=torch.float64).items()
-    assert name == "room, n = 9, 4 mismatches"
-    assert entry.description["mismatch_share"] == 1.0
     known = scene().views[0].img_points
-    distance = torch.cdist(entry.problems.img_points, known.expand(200, -1, -1)).amin(-1)
+
+    def distances(**options):
+        ((name, entry),) = draw("room", outliers="4", count=200, dtype=torch.float64, **options).items()
+        return name, torch.cdist(entry.problems.img_points, known.expand(200, -1, -1)).amin(-1)
+
+    name, distance = distances(mismatches_only=True)
+    assert name == "room, n = 9, 4 mismatches"
     assert distance.max() < 0.1
-    ((_, both),) = draw("room", outliers="4", count=200, dtype=torch.float64).items()
-    distance = torch.cdist(both.problems.img_points, known.expand(200, -1, -1)).amin(-1)
-    assert (distance > 1.0).sum(-1).double().mean() == pytest.approx(2.0, abs=0.3)
+    assert (distances()[1] > 1.0).sum(-1).double().mean() == pytest.approx(2.0, abs=0.3)
 
 
 def test_every_n_has_every_mix_and_a_set_is_the_same_beside_others(scenes):
     sets = draw("synthetic", "room", outliers="none,2", n=[6, 9])
-    assert list(sets) == [
-        f"{source}, n = {n}, {label}"
-        for source in ("synthetic", "room")
-        for n in (6, 9)
-        for label in ("0 outliers", "2 outliers")
-    ]
-    for name, entry in sets.items():
-        source, n, label = name.split(", ")
-        alone = draw(source, outliers="2" if label == "2 outliers" else "none", n=int(n.removeprefix("n = ")))
-        assert same(entry.problems, alone[name].problems)
-        assert entry.description == alone[name].description
+    mixes = [(source, n, count) for source in ("synthetic", "room") for n in (6, 9) for count in (0, 2)]
+    for (name, entry), (source, n, count) in zip(sets.items(), mixes, strict=True):
+        assert name == f"{source}, n = {n}, {count} outliers"
+        alone = draw(source, outliers=str(count), n=n)[name]
+        assert same(entry.problems, alone.problems)
+        assert entry.description == alone.description
 
 
 def test_scenes_are_the_protocols(scenes):
     """The world is moved so that the poses are those of the training prior; the limits depend on the unit."""
-    sets = draw("here/room", outliers="2", count=1000, dtype=torch.float64)
-    ((name, entry),) = sets.items()
+    ((name, entry),) = draw("here/room", outliers="2", count=1000, dtype=torch.float64).items()
     assert name == "room, n = 9, 2 outliers"
     described = {"source": "room", "path": "here/room", "outliers": 2, "mismatch_share": 0.5, "seed": 3}
     assert entry.description == described
