@@ -54,32 +54,28 @@ def main(argv: list[str] | None = None) -> int:
     """
     try:
         arguments = make_parser().parse_args(argv)
-    except OSError as error:
-        return _failed(_one_line(error))
-    from kornia.core.exceptions import BaseError
+        from kornia_pnpnet.core.performance import keep_freed_memory
 
-    from kornia_pnpnet.core.performance import keep_freed_memory
-
-    keep_freed_memory()
-    try:
+        keep_freed_memory()
         return COMMANDS[arguments.command].run(arguments)
-    except (BaseError, OSError, ImportError, ValueError) as error:
-        return _failed(_one_line(error))
-    except (MemoryError, RuntimeError) as error:
-        if not isinstance(error, MemoryError) and "allocate" not in str(error):
-            raise
-        return _failed(f"not enough memory for so much at once: {_one_line(error)}")
     except KeyboardInterrupt:
-        return _failed("interrupted", 130)
+        print("pnpnet: interrupted", file=sys.stderr)
+        return 130
+    except Exception as error:
+        print(f"pnpnet: {_reason(error)}", file=sys.stderr)
+        return 2
 
 
-def _failed(reason: str, code: int = 2) -> int:
-    print(f"pnpnet: {reason}", file=sys.stderr)
-    return code
-
-
-def _one_line(error: Exception) -> str:
+def _reason(error: Exception) -> str:
+    """One line about an error of the input or of the machine; any other error is raised again."""
     if isinstance(error, OSError) and error.filename and error.strerror:
         return " ".join(f"{error.filename}: {error.strerror}".splitlines())  # file names may contain line breaks
-    notes = (f"({note})" for note in getattr(error, "__notes__", ()))
-    return " ".join(" ".join([str(error) or type(error).__name__, *notes]).split())
+    from kornia.core.exceptions import BaseError
+
+    notes = [f"({note})" for note in getattr(error, "__notes__", ())]
+    reason = " ".join(" ".join([str(error) or type(error).__name__, *notes]).split())
+    if isinstance(error, (BaseError, OSError, ImportError, ValueError)):
+        return reason
+    if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "allocate" in str(error)):
+        return f"not enough memory for so much at once: {reason}"
+    raise error

@@ -17,8 +17,8 @@ from kornia.core.exceptions import BaseError
 from pyarrow import compute, parquet
 
 from kornia_pnpnet.arrow import INPUTS, Solve, list_column
-from kornia_pnpnet.cli.correspondence_files import InputError, read_arrays
-from kornia_pnpnet.core.files import atomic_open, digest
+from kornia_pnpnet.cli.correspondence_files import read_arrays
+from kornia_pnpnet.core.files import InputError, atomic_open, digest
 
 __all__ = ["SUFFIXES", "ShardReport", "solve_shards"]
 
@@ -56,10 +56,10 @@ def solve_shards(
 ) -> ShardReport:
     r"""Solve shards of problems one after the other, and write the results of ``part.*`` to ``part.parquet``.
 
-    A shard is a Parquet file with one problem per row and the columns of :class:`~kornia_pnpnet.arrow.Solve`, of which
-    ``batch`` rows are read at a time. Or it is an NPZ file, read as a whole, with ``world_points`` (B, N, 3),
-    ``img_points`` (B, N, 2) and optionally ``intrinsics`` (3, 3) or (B, 3, 3), ``weights`` (B, N), and ``img_sigma``
-    and ``world_sigma``, each a number, (B,) or (B, N).
+    A Parquet shard has one problem per row and the columns of :class:`~kornia_pnpnet.arrow.Solve`; ``batch`` rows are
+    read at a time. An NPZ shard is read as a whole. It has ``world_points`` (B, N, 3), ``img_points`` (B, N, 2) and
+    optionally ``intrinsics`` (3, 3) or (B, 3, 3), ``weights`` (B, N), and ``img_sigma`` and ``world_sigma``, each a
+    number, (B,) or (B, N).
 
     A results file gets its name when it is complete, so a run that was stopped can be repeated: shards with results
     are skipped. A shard that cannot be read is reported, and the other shards are solved.
@@ -78,12 +78,16 @@ def solve_shards(
             or a shard has results of another solver.
         OSError: when the results cannot be written.
     """
-    targets = {Path(out) / f"{shard.stem}.parquet": shard for shard in _find(sources, Path(out))}
     state = sorted(solve.solver.state_dict().items())
     mark = json.dumps({"name": name, "parameters": digest(*(part for item in state for part in item))}).encode()
-    waiting = {target: shard for target, shard in targets.items() if overwrite or not target.exists()}
-    for target in targets:
-        if target not in waiting and _solver_of(target) != mark:
+    waiting, kept = {}, 0
+    for stem, shard in _find(sources, Path(out)).items():
+        target = Path(out) / f"{stem}.parquet"
+        if overwrite or not target.exists():
+            waiting[target] = shard
+        elif _solver_of(target) == mark:
+            kept += 1
+        else:
             raise InputError(target, f"not of this {name}: choose another folder, or replace it with --overwrite")
     counts, failed = [], []
     with _bar(waiting.values(), progress) as bar:
@@ -92,12 +96,12 @@ def solve_shards(
                 counts.append(_solve_shard(solve, shard, target, mark, batch, bar))
             except InputError as error:
                 failed.append(str(error))
-    solved, problems = (sum(numbers) for numbers in zip((0, 0), *counts, strict=True))
-    return ShardReport(solved, problems, len(counts), len(targets) - len(waiting), failed)
+    solved, problems = np.sum(counts, axis=0, dtype=int).tolist() if counts else (0, 0)
+    return ShardReport(solved, problems, len(counts), kept, failed)
 
 
-def _find(sources: Sequence[str | Path], out: Path) -> list[Path]:
-    """All shards in the order of the sources, those of a folder by name."""
+def _find(sources: Sequence[str | Path], out: Path) -> dict[str, Path]:
+    """All shards by the stem of their names, in the order of the sources; those of a folder by name."""
     shards: dict[str, Path] = {}
     for source in map(Path, sources):
         found = sorted(x for x in source.iterdir() if x.suffix in SUFFIXES) if source.is_dir() else [source]
@@ -112,15 +116,14 @@ def _find(sources: Sequence[str | Path], out: Path) -> list[Path]:
                 raise InputError(shard, "the results would lie among the shards: choose another folder")
             if shards.setdefault(shard.stem, shard) != shard:
                 raise InputError(shard, f"its results would have the name of those of {shards[shard.stem]}")
-    return list(shards.values())
+    return shards
 
 
 def _solver_of(target: Path) -> bytes | None:
-    """What a results file says of its solver; ``None`` when it is no results file."""
-    try:
+    """The solver that a results file names; ``None`` when the file is no results file."""
+    with suppress(pa.ArrowException, OSError):
         return (parquet.read_schema(target).metadata or {}).get(_SOLVER)
-    except (pa.ArrowException, OSError):
-        return None
+    return None
 
 
 def _bar(shards: Iterable[Path], shown: bool) -> Any:
@@ -137,15 +140,7 @@ def _bar(shards: Iterable[Path], shown: bool) -> Any:
 
 def _solve_shard(solve: Solve, shard: Path, target: Path, mark: bytes, batch: int, bar: Any) -> tuple[int, int]:
     """Solve a shard; return the number of solved problems and of all problems."""
-
-    def solved_tables() -> Iterator[pa.Table]:
-        for table in _tables(shard, batch):
-            try:
-                yield solve(table)
-            except (BaseError, TypeError, pa.ArrowException) as error:  # a column is missing or not for this solver
-                raise InputError(shard, str(error)) from None
-
-    results = solved_tables()
+    results = _results(solve, shard, batch)
     first, solved, count = next(results), 0, 0
     with (
         atomic_open(target, "wb") as file,
@@ -159,11 +154,17 @@ def _solve_shard(solve: Solve, shard: Path, target: Path, mark: bytes, batch: in
     return solved, count
 
 
-def _tables(shard: Path, batch: int) -> Iterator[pa.Table]:
-    """Tables of at most ``batch`` problems of a shard, at least one table."""
-    if shard.suffix == ".npz":
-        yield from _tables_of_arrays(shard, batch)
-        return
+def _results(solve: Solve, shard: Path, batch: int) -> Iterator[pa.Table]:
+    """The tables of results of a shard, at least one."""
+    for table in _tables_of_arrays(shard, batch) if shard.suffix == ".npz" else _tables_of_parquet(shard, batch):
+        try:
+            yield solve(table)
+        except (BaseError, TypeError, pa.ArrowException) as error:  # a column is missing or not for this solver
+            raise InputError(shard, str(error)) from None
+
+
+def _tables_of_parquet(shard: Path, batch: int) -> Iterator[pa.Table]:
+    """Tables of at most ``batch`` rows of a Parquet file, at least one table."""
     try:
         # With pre_buffer Arrow reads ahead to the end of the file, and without buffer_size a row group at once.
         with parquet.ParquetFile(shard, pre_buffer=False, buffer_size=1 << 20) as file:
@@ -178,7 +179,7 @@ def _tables(shard: Path, batch: int) -> Iterator[pa.Table]:
 
 
 def _tables_of_arrays(shard: Path, batch: int) -> Iterator[pa.Table]:
-    """Tables of the problems of an NPZ file."""
+    """Tables of at most ``batch`` problems of an NPZ file, at least one table."""
     arrays = read_arrays(shard, INPUTS)
     for name, size in (("world_points", 3), ("img_points", 2)):
         if arrays[name].ndim != 3 or arrays[name].shape[2] != size:
