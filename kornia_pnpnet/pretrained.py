@@ -11,24 +11,16 @@ from typing import Any, Self
 from kornia.core.exceptions import BaseError, ValueCheckError
 from torch import Tensor, nn
 
-from kornia_pnpnet.core.files import atomic_open, digest
+from kornia_pnpnet.core.files import atomic_open, digest, write_json
 from kornia_pnpnet.frame import Normalize
 from kornia_pnpnet.propose.epnp import EPnP
+from kornia_pnpnet.propose.minimal import describe
 from kornia_pnpnet.propose.mlp import MLPInit
 from kornia_pnpnet.propose.reppnp import REPPnP
 from kornia_pnpnet.propose.set import SetInit
 from kornia_pnpnet.refine.lm import RobustWeightedLM
 
-__all__ = [
-    "CONFIG_NAME",
-    "WEIGHTS_FOLDER",
-    "WEIGHTS_NAME",
-    "PretrainedMixin",
-    "find_weights",
-    "read_weights",
-    "shipped_weights",
-    "write_weights",
-]
+__all__ = ["PretrainedMixin", "find_weights", "read_weights", "shipped_weights", "write_weights"]
 
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 CONFIG_NAME, WEIGHTS_NAME = "config.json", "model.safetensors"
@@ -55,8 +47,7 @@ def write_weights(folder: str | Path, config: Mapping[str, Any], state: Mapping[
     state = {name: value.detach().cpu().contiguous() for name, value in state.items()}
     with atomic_open(Path(folder) / WEIGHTS_NAME, "wb") as file:
         file.write(save(state, {"format": "pt", _FINGERPRINT: _fingerprint(config, state)}))
-    with atomic_open(Path(folder) / CONFIG_NAME) as file:
-        file.write(json.dumps(config, indent=2) + "\n")
+    write_json(Path(folder) / CONFIG_NAME, config)
 
 
 def read_weights(name_or_folder: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -70,11 +61,11 @@ def read_weights(name_or_folder: str | Path) -> tuple[dict[str, Any], dict[str, 
     from safetensors import SafetensorError, safe_open
 
     try:
-        for name, largest in ((CONFIG_NAME, _LARGEST_CONFIG), (WEIGHTS_NAME, None)):
-            path = folder / name
-            if not path.is_file() or (largest and path.stat().st_size > largest):  # a pipe would wait for ever
-                raise ValueError(f"{name} is no file" if not path.is_file() else f"{name} has over {largest} bytes")
-        config = json.loads((folder / CONFIG_NAME).read_text())
+        for name in (CONFIG_NAME, WEIGHTS_NAME):
+            if not (folder / name).is_file():  # a pipe would wait for ever
+                raise ValueError(f"{name} is no file")
+        with (folder / CONFIG_NAME).open("rb") as text:
+            config = json.loads(text.read(_LARGEST_CONFIG))
         with safe_open(folder / WEIGHTS_NAME, "pt") as file:
             metadata = file.metadata() or {}
             state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
@@ -93,13 +84,11 @@ def read_weights(name_or_folder: str | Path) -> tuple[dict[str, Any], dict[str, 
         if isinstance(entry, dict):
             entries += entry.items()
         elif isinstance(entry, int) and entry > (len(state) if name == "layers" else largest):
-            raise ValueCheckError(
-                f"{folder / CONFIG_NAME}: {name} is {entry}, too large for the tensors in {WEIGHTS_NAME}."
-            )
+            raise ValueCheckError(f"{folder / CONFIG_NAME}: {name} is {entry}, too large for its {WEIGHTS_NAME}.")
     return config, state
 
 
-def _fingerprint(config: Any, state: dict[str, Tensor]) -> str:
+def _fingerprint(config: Any, state: Mapping[str, Tensor]) -> str:
     """Digest of a configuration and its weights: it tells whether both were saved together."""
     return digest(config, *(part for item in sorted(state.items()) for part in item))
 
@@ -118,20 +107,18 @@ def find_weights(name_or_folder: str | Path) -> Path:
     for folder in (WEIGHTS_FOLDER / name, Path(name)):
         if (folder / CONFIG_NAME).is_file():
             return folder
-    message = (
-        f"No weights {name!r}: shipped weights are {shipped_weights()}; a folder needs {CONFIG_NAME} and {WEIGHTS_NAME}"
-    )
+    files = f"a folder needs {CONFIG_NAME} and {WEIGHTS_NAME}"
+    message = f"No weights {name!r}: shipped weights are {shipped_weights()}; {files}"
     if isinstance(name_or_folder, Path) or name.count("/") != 1 or Path(name).exists():
         raise FileNotFoundError(f"{message}.")
     from huggingface_hub import hf_hub_download
     from huggingface_hub.errors import HfHubHTTPError
 
     try:
-        config = hf_hub_download(name, CONFIG_NAME)
         hf_hub_download(name, WEIGHTS_NAME)
+        return Path(hf_hub_download(name, CONFIG_NAME)).parent
     except (HfHubHTTPError, OSError, ValueError) as error:
         raise FileNotFoundError(f"{message}; the Hub said: {error}") from error
-    return Path(config).parent
 
 
 _INITIALISERS: dict[str, type[nn.Module]] = {x.__name__: x for x in (EPnP, MLPInit, REPPnP, SetInit)}
@@ -165,8 +152,7 @@ class PretrainedMixin(nn.Module):
 
     def config(self) -> dict[str, Any]:
         """The constructor arguments of all parts and the options, as plain data."""
-        arguments = getattr(self.init, "config", {})
-        init = None if self.init is None else {"name": type(self.init).__name__, **arguments}
+        init = None if self.init is None else describe(self.init)
         return {"init": init, "refine": self.refine.config, "normalize": self.normalize.config, **self.options}
 
     @classmethod
@@ -180,8 +166,7 @@ class PretrainedMixin(nn.Module):
             options = dict(config)
             init, refine, normalize = (options.pop(part) for part in ("init", "refine", "normalize"))
             if init is not None:
-                arguments = dict(init)
-                init = _INITIALISERS[arguments.pop("name")](**arguments)
+                init = _INITIALISERS[init["name"]](**{key: x for key, x in init.items() if key != "name"})
             return cls(init, RobustWeightedLM(**refine), Normalize(**normalize), **options)
         except (BaseError, KeyError, TypeError, ValueError, AttributeError) as error:
             raise ValueCheckError(f"Not a configuration of PnPNet: {error!r}.") from error
