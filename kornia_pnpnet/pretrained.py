@@ -11,7 +11,7 @@ from typing import Any, Self
 from kornia.core.exceptions import BaseError, ValueCheckError
 from torch import Tensor, nn
 
-from kornia_pnpnet.core.files import atomic_open, digest, write_json
+from kornia_pnpnet.core.files import atomic_open, digest
 from kornia_pnpnet.frame import Normalize
 from kornia_pnpnet.propose.epnp import EPnP
 from kornia_pnpnet.propose.minimal import describe
@@ -47,7 +47,8 @@ def write_weights(folder: str | Path, config: Mapping[str, Any], state: Mapping[
     state = {name: value.detach().cpu().contiguous() for name, value in state.items()}
     with atomic_open(Path(folder) / WEIGHTS_NAME, "wb") as file:
         file.write(save(state, {"format": "pt", _FINGERPRINT: _fingerprint(config, state)}))
-    write_json(Path(folder) / CONFIG_NAME, config)
+    with atomic_open(Path(folder) / CONFIG_NAME) as text:
+        text.write(json.dumps(config, indent=2) + "\n")
 
 
 def read_weights(name_or_folder: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:

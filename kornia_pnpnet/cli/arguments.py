@@ -1,4 +1,4 @@
-"""The arguments of all commands as one table, the parser that reads them, and the checks of solvers and files."""
+"""The arguments of all commands as one table, the parser that reads them, and the choice of a solver."""
 
 from __future__ import annotations
 
@@ -13,14 +13,12 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 if TYPE_CHECKING:
     from torch import nn
 
-__all__ = ["ARGUMENTS", "SYNTHETIC", "OneLineParser", "check_new", "load_solver_without_truth"]
+__all__ = ["ARGUMENTS", "SYNTHETIC", "OneLineParser", "load_solver_without_truth"]
 
 _T = TypeVar("_T")
 
 #: Names of synthetic data for ``--data``.
 SYNTHETIC = ("synthetic", "gaussian_pose", "any_rotation", "slab", "mixed")
-
-_PICTURES = (".pdf", ".png", ".svg")
 
 
 class OneLineParser(argparse.ArgumentParser):
@@ -33,9 +31,6 @@ class OneLineParser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Print the message in one line and exit with the code 2."""
         self.exit(2, f"pnpnet: {' '.join(message.split())} (see {self.prog} --help)\n")
-
-
-# -- types of arguments ------------------------------------------------------------------------------------------------
 
 
 def _checked(read: Callable[[str], _T], fits: Callable[[_T], bool], expected: str) -> Callable[[str], _T]:
@@ -58,7 +53,7 @@ def _whole(low: int, high: int = 10**8) -> Callable[[str], int]:
 
 _positive = _checked(float, lambda value: 0 < value < math.inf, "a positive number")
 _seconds = _checked(float, lambda value: 0 <= value < math.inf, "a number of at least 0")
-_picture = _checked(Path, lambda path: path.suffix.lower() in _PICTURES, f"a file ending in {', '.join(_PICTURES)}")
+_picture = _checked(Path, lambda path: path.suffix.lower() in (".pdf", ".png", ".svg"), "a .pdf, .png or .svg file")
 
 
 def _counts(text: str) -> list[int]:
@@ -81,16 +76,9 @@ def _source(text: str) -> str:
     return text if text in SYNTHETIC else _path(text)
 
 
-# -- the table ---------------------------------------------------------------------------------------------------------
-
-
 def _arg(help_: str, metavar: str | None = None, **more: Any) -> dict[str, Any]:
     """What argparse takes about an argument. Its help ends with its default."""
     return {"help": f"{help_}; default: %(default)s" if "default" in more else help_, "metavar": metavar, **more}
-
-
-def _list(help_: str, metavar: str, **more: Any) -> dict[str, Any]:
-    return _arg(help_, metavar, nargs="+", action="extend", **more)
 
 
 def _flag(help_: str) -> dict[str, Any]:
@@ -130,8 +118,8 @@ ARGUMENTS: dict[str, dict[str, dict[str, Any]]] = {
         "--overwrite": _flag("replace the picture; with --batch also solve the shards that have results"),
     },
     "evaluate": {
-        "--solver": _list(_SOLVERS, "NAME"),
-        "--data": _list(_DATA, "DATA", type=_source),
+        "--solver": _arg(_SOLVERS, "NAME", nargs="+", action="extend"),
+        "--data": _arg(_DATA, "DATA", nargs="+", action="extend", type=_source),
         "--n": _arg("numbers of correspondences per problem, separated by commas", "LIST", type=_counts, default="9"),
         "--outliers": _arg(_OUTLIERS, "LIST", default="none,uniform"),
         "--mismatches-only": _flag(_MISMATCHES),
@@ -160,15 +148,6 @@ ARGUMENTS: dict[str, dict[str, dict[str, Any]]] = {
         "--train-seconds": _arg(_DURATION, "SECONDS", type=_seconds, default=60.0),
     },
 }
-
-
-# -- checks that several commands make ---------------------------------------------------------------------------------
-
-
-def check_new(path: Path, overwrite: bool) -> None:
-    """Raise a ``ValueError`` for a file that exists, unless it may be overwritten."""
-    if path.exists() and not overwrite:
-        raise ValueError(f"'{path}' exists: pass --overwrite to replace it")
 
 
 def load_solver_without_truth(name: str) -> nn.Module:

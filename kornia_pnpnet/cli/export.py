@@ -14,7 +14,7 @@ import argparse
 import warnings
 from pathlib import Path
 
-from kornia_pnpnet.cli.arguments import check_new, load_solver_without_truth
+from kornia_pnpnet.cli.arguments import load_solver_without_truth
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -31,7 +31,8 @@ def run(arguments: argparse.Namespace) -> int:
     target.parent.mkdir(parents=True, exist_ok=True)  # an error now, not after minutes
     if target.is_dir():
         raise ValueError(f"'{target}' is a folder")
-    check_new(target, arguments.overwrite)
+    if target.exists() and not arguments.overwrite:
+        raise ValueError(f"'{target}' exists: pass --overwrite to replace it")
     export, action = (export_onnx, "converting") if target.suffix == ".onnx" else (export_package, "compiling")
     print(f"Tracing and {action}; PyTorch takes a minute or more", flush=True)
     with warnings.catch_warnings():

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import ExitStack, nullcontext, suppress
 from importlib.util import find_spec
-from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -89,27 +87,28 @@ def solve_shards(
             kept += 1
         else:
             raise InputError(target, f"not of this {name}: choose another folder, or replace it with --overwrite")
-    counts, failed = [], []
+    counts, failed = [(0, 0)], []
     with _bar(waiting.values(), progress) as bar:
         for target, shard in waiting.items():
             try:
                 counts.append(_solve_shard(solve, shard, target, mark, batch, bar))
             except InputError as error:
                 failed.append(str(error))
-    solved, problems = np.sum(counts, axis=0, dtype=int).tolist() if counts else (0, 0)
-    return ShardReport(solved, problems, len(counts), kept, failed)
+    solved, problems = map(sum, zip(*counts, strict=True))
+    return ShardReport(solved, problems, len(waiting) - len(failed), kept, failed)
 
 
 def _find(sources: Sequence[str | Path], out: Path) -> dict[str, Path]:
     """All shards by the stem of their names, in the order of the sources; those of a folder by name."""
     shards: dict[str, Path] = {}
+    endings = " or ".join(SUFFIXES)
     for source in map(Path, sources):
         found = sorted(x for x in source.iterdir() if x.suffix in SUFFIXES) if source.is_dir() else [source]
         if not found:
-            raise InputError(source, f"no {' or '.join(SUFFIXES)} file in this folder")
+            raise InputError(source, f"no {endings} file in this folder")
         for shard in found:
             if shard.suffix not in SUFFIXES:
-                raise InputError(shard, f"the name of a shard must end in {' or '.join(SUFFIXES)}")
+                raise InputError(shard, f"the name of a shard must end in {endings}")
             if not shard.is_file():
                 raise InputError(shard, "no such file")
             if shard.resolve().parent == out.resolve():
@@ -128,39 +127,33 @@ def _solver_of(target: Path) -> bytes | None:
 
 def _bar(shards: Iterable[Path], shown: bool) -> Any:
     """A progress bar over the problems of shards, or a context without one."""
-    if not shown or not sys.stderr.isatty() or find_spec("tqdm") is None:
+    if not shown or find_spec("tqdm") is None:
         return nullcontext()
     from tqdm import tqdm
 
     total = None  # of NPZ files, and where a file cannot be read
     with suppress(OSError, pa.ArrowException):
         total = sum(parquet.read_metadata(shard).num_rows for shard in shards)
-    return tqdm(total=total, unit="problem", unit_scale=True)
+    return tqdm(total=total, unit="problem", unit_scale=True, disable=None)  # None: where stderr is no terminal
 
 
 def _solve_shard(solve: Solve, shard: Path, target: Path, mark: bytes, batch: int, bar: Any) -> tuple[int, int]:
     """Solve a shard; return the number of solved problems and of all problems."""
-    results = _results(solve, shard, batch)
-    first, solved, count = next(results), 0, 0
-    with (
-        atomic_open(target, "wb") as file,
-        parquet.ParquetWriter(file, first.schema.with_metadata({_SOLVER: mark})) as writer,
-    ):
-        for result in chain([first], results):
+    solved, count, writer = 0, 0, None
+    with atomic_open(target, "wb") as file, ExitStack() as stack:
+        for table in _tables_of_arrays(shard, batch) if shard.suffix == ".npz" else _tables_of_parquet(shard, batch):
+            try:
+                result = solve(table)
+            except (BaseError, TypeError, pa.ArrowException) as error:  # a column is missing or not for this solver
+                raise InputError(shard, str(error)) from None
+            if writer is None:
+                schema = result.schema.with_metadata({_SOLVER: mark})
+                writer = stack.enter_context(parquet.ParquetWriter(file, schema))
             writer.write_table(result)
             solved, count = solved + (compute.sum(result["ok"]).as_py() or 0), count + len(result)
             if bar is not None:
                 bar.update(len(result))
     return solved, count
-
-
-def _results(solve: Solve, shard: Path, batch: int) -> Iterator[pa.Table]:
-    """The tables of results of a shard, at least one."""
-    for table in _tables_of_arrays(shard, batch) if shard.suffix == ".npz" else _tables_of_parquet(shard, batch):
-        try:
-            yield solve(table)
-        except (BaseError, TypeError, pa.ArrowException) as error:  # a column is missing or not for this solver
-            raise InputError(shard, str(error)) from None
 
 
 def _tables_of_parquet(shard: Path, batch: int) -> Iterator[pa.Table]:

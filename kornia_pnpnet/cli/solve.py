@@ -26,7 +26,7 @@ import math
 import sys
 from typing import TYPE_CHECKING
 
-from kornia_pnpnet.cli.arguments import check_new, load_solver_without_truth
+from kornia_pnpnet.cli.arguments import load_solver_without_truth
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -100,8 +100,8 @@ def _solve_image(arguments: argparse.Namespace, camera: Tensor | None) -> int:
     camera = camera_of_file if camera is None else camera
     if camera is None:
         raise InputError(path, "the file has no intrinsics: pass --intrinsics fx,fy,cx,cy")
-    if plot:
-        check_new(plot, arguments.overwrite)
+    if plot and plot.exists() and not arguments.overwrite:
+        raise ValueError(f"'{plot}' exists: pass --overwrite to replace it")
     solver, weights = _load_solver(arguments), None if weights is None else weights[None]
     with torch.no_grad():
         result = solver(world_points[None], img_points[None], camera[None], weights)
