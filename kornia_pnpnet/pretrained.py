@@ -26,9 +26,9 @@ WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 CONFIG_NAME, WEIGHTS_NAME = "config.json", "model.safetensors"
 # Key of the digest in the metadata of the weights file.
 _FINGERPRINT = "sha256"
-# Bytes of a configuration, far more than any has.
+# Bytes that are read of a configuration. No configuration has as many.
 _LARGEST_CONFIG = 2**20
-# Sizes up to this one take little memory, whatever the tensors are.
+# Sizes up to this one take little memory.
 _SMALL = 1000
 
 
@@ -90,7 +90,7 @@ def read_weights(name_or_folder: str | Path) -> tuple[dict[str, Any], dict[str, 
 
 
 def _fingerprint(config: Any, state: Mapping[str, Tensor]) -> str:
-    """Digest of a configuration and its weights: it tells whether both were saved together."""
+    """Digest of a configuration and the weights that were saved with it."""
     return digest(config, *(part for item in sorted(state.items()) for part in item))
 
 
@@ -126,7 +126,7 @@ _INITIALISERS: dict[str, type[nn.Module]] = {x.__name__: x for x in (EPnP, MLPIn
 
 
 class PretrainedMixin(nn.Module):
-    """A solver as plain data and files, and back: a part of :class:`~kornia_pnpnet.PnPNet`."""
+    """A base of :class:`~kornia_pnpnet.PnPNet` that saves and loads solvers, and copies them with other options."""
 
     init: nn.Module | None
     refine: RobustWeightedLM
@@ -134,7 +134,7 @@ class PretrainedMixin(nn.Module):
 
     @classmethod
     def option_names(cls) -> list[str]:
-        """Names of a solver's options: the arguments of its constructor that can only be given by name."""
+        """Names of the options: the keyword-only arguments of the constructor."""
         parameters = inspect.signature(cls.__init__).parameters.values()
         return [x.name for x in parameters if x.kind is inspect.Parameter.KEYWORD_ONLY]
 
@@ -148,17 +148,17 @@ class PretrainedMixin(nn.Module):
         return ", ".join(f"{name}={value!r}" for name, value in self.options.items())
 
     def with_options(self, *, refine: RobustWeightedLM | None = None, **options: Any) -> Self:
-        """The same solver with another refinement and other options."""
+        """Copy the solver with another refinement and other options."""
         return type(self)(self.init, refine or self.refine, self.normalize, **{**self.options, **options})
 
     def config(self) -> dict[str, Any]:
-        """The constructor arguments of all parts and the options, as plain data."""
+        """Return the constructor arguments of all parts, and the options, as plain data."""
         init = None if self.init is None else describe(self.init)
         return {"init": init, "refine": self.refine.config, "normalize": self.normalize.config, **self.options}
 
     @classmethod
     def from_config(cls, config: dict[str, Any]) -> Self:
-        """Build an untrained solver from what :meth:`config` returned; options that are not in it have their defaults.
+        """Build an untrained solver from the result of :meth:`config`. Missing options have their defaults.
 
         Raises:
             ValueCheckError: when a part or an argument is unknown.

@@ -24,7 +24,7 @@ from kornia_pnpnet.solver import PnPNet
 
 __all__ = ["create_solver", "list_solvers", "solve_pnp"]
 
-# Iterations of the classical robust LM: from a pose that is nearly right, and from the identity.
+# Iterations of the classical robust LM, from the pose of a method and from the identity.
 _FEW, _MANY = 10, 30
 # Pairs in a sample of the paper's RANSAC.
 _PAPERS_SAMPLE = 7
@@ -37,9 +37,9 @@ def _trained(weights: str, m: int | None = None) -> PnPNet:
 
 
 def _alone(init: Callable[..., nn.Module], **options: Any) -> PnPNet:
-    """A method without refinement: its pose is judged, and its weights are the weights of the result."""
+    """A method without refinement: the result has its pose, which is judged, and its weights."""
     refine = RobustWeightedLM(0, damping=1e-6, robustness=0.0, learnable=False)
-    return PnPNet(init(**options), refine, Normalize(order=init is RANSAC))  # others do not see the order of the pairs
+    return PnPNet(init(**options), refine, Normalize(order=init is RANSAC))  # only samples depend on the order
 
 
 def _paper_lm(m: int) -> RobustWeightedLM:
@@ -48,7 +48,7 @@ def _paper_lm(m: int) -> RobustWeightedLM:
 
 
 def _refined(init: Callable[..., nn.Module], m: int = _FEW, **options: Any) -> PnPNet:
-    """The paper's "-LM": started from a method."""
+    """The paper's "-LM": a method, then LM from its pose."""
     return PnPNet(init(**options), _paper_lm(m), Normalize(order=False))
 
 

@@ -11,11 +11,10 @@ import math
 import numpy as np
 import pytest
 import torch
-from kornia.geometry import solve_pnp_dlt
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor, nn
 
-from kornia_pnpnet import PnPResult, Pose, Problems, Status, create_solver, pose_errors, solve_pnp, success
+from kornia_pnpnet import PnPResult, Pose, Problems, Status, create_solver, pose_errors, success
 from kornia_pnpnet.data import SyntheticProblems
 from kornia_pnpnet.peers import OpenCVPnP, OpenCVRansac, PoseLib, PyColmap
 
@@ -214,17 +213,6 @@ def test_pytorch3d_grid_of_noise_and_scale(n, noise, name, dtype, request):
         ours += right(solve(create_solver(name.split(",")[0]), p, dtype, **told), p, 2.0, 0.2 * scale)
         twin += right(solve(OpenCVPnP(method="EPNP"), p), p, 2.0, 0.2 * scale)
     assert ours >= twin - 2
-
-
-@pytest.mark.parametrize(("batch", "n"), [(1, 6), (4, 8), (3, 20)])
-@pytest.mark.parametrize("name", OURS)
-def test_kornia_dlt_shapes_and_exactness(name, batch, n, dtype):
-    """Kornia's tests of ``solve_pnp_dlt``: exact pairs give the true matrix, of the same shape and dtype."""
-    p = SyntheticProblems(n=n, batch_size=batch, seed=5, world_sigma=0.0, img_sigma=0.0, dtype=torch.float64).batch(0)
-    inputs = [x.to(dtype) for x in p[:3]]
-    expected, found = solve_pnp_dlt(*inputs), solve_pnp(*inputs, solver=name)
-    assert (found.shape, found.dtype) == (expected.shape, expected.dtype)
-    torch.testing.assert_close(found, p.pose.matrix[:, :3].to(dtype), rtol=1e-5, atol=LIMIT[dtype])
 
 
 #: Least magnitudes of wild points and pixels, as powers of ten.

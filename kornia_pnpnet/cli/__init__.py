@@ -1,17 +1,15 @@
 """The command ``pnpnet``: one module per command.
 
-To add a command, write a module whose docstring is the command's help (the first line its summary), with
-``run(arguments)``, which returns the exit code. Register the module in :data:`COMMANDS`, and its arguments in
-:data:`kornia_pnpnet.cli.arguments.ARGUMENTS`.
-PyTorch takes seconds to import: modules of commands import what needs PyTorch inside ``run``, so that wrong arguments
-and missing files are reported at once.
+A command is a module in :data:`COMMANDS`. Its docstring is the help, and ``run(arguments)`` returns the exit code. The
+arguments are in :data:`kornia_pnpnet.cli.arguments.ARGUMENTS`.
+Modules of commands import PyTorch inside ``run``, because the import takes seconds: wrong arguments and missing files
+are reported at once.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-from types import ModuleType
 
 from kornia_pnpnet import __version__
 from kornia_pnpnet.cli import demo, evaluate, export, listing, solve
@@ -20,13 +18,7 @@ from kornia_pnpnet.cli.arguments import ARGUMENTS, OneLineParser
 __all__ = ["COMMANDS", "main", "make_parser"]
 
 #: All commands by name, in the order of ``pnpnet --help``.
-COMMANDS: dict[str, ModuleType] = {
-    "solve": solve,
-    "evaluate": evaluate,
-    "export": export,
-    "list": listing,
-    "demo": demo,
-}
+COMMANDS = {"solve": solve, "evaluate": evaluate, "export": export, "list": listing, "demo": demo}
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -57,7 +49,8 @@ def main(argv: list[str] | None = None) -> int:
         from kornia_pnpnet.core.performance import keep_freed_memory
 
         keep_freed_memory()
-        return COMMANDS[arguments.command].run(arguments)
+        code: int = COMMANDS[arguments.command].run(arguments)
+        return code
     except KeyboardInterrupt:
         print("pnpnet: interrupted", file=sys.stderr)
         return 130

@@ -22,11 +22,11 @@ SYNTHETIC = ("synthetic", "gaussian_pose", "any_rotation", "slab", "mixed")
 
 
 class OneLineParser(argparse.ArgumentParser):
-    """A parser whose errors are one line, as all errors of ``pnpnet`` are, and that takes lists of negative numbers."""
+    """A parser that accepts lists of negative numbers and reports an error in one line."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self._negative_number_matcher = re.compile(r"-[\d.]")  # argparse takes "-1,2" for an option
+        self._negative_number_matcher = re.compile(r"-[\d.]")  # for argparse "-1,2" is an option
 
     def error(self, message: str) -> NoReturn:
         """Print the message in one line and exit with the code 2."""
@@ -34,7 +34,7 @@ class OneLineParser(argparse.ArgumentParser):
 
 
 def _checked(read: Callable[[str], _T], fits: Callable[[_T], bool], expected: str) -> Callable[[str], _T]:
-    """A parser of the texts that ``read`` can read and whose values fit."""
+    """A parser with ``read``, which refuses values that do not fit."""
 
     def parse(text: str) -> _T:
         with suppress(ValueError):
@@ -47,7 +47,7 @@ def _checked(read: Callable[[str], _T], fits: Callable[[_T], bool], expected: st
 
 
 def _whole(low: int, high: int = 10**8) -> Callable[[str], int]:
-    """A parser of integers from ``low`` to ``high``; more problems or pairs than the default fill no memory."""
+    """A parser of integers. The default of ``high`` keeps a number of problems or pairs from filling the memory."""
     return _checked(int, lambda value: low <= value <= high, f"an integer from {low} to {high}")
 
 
@@ -57,7 +57,7 @@ _picture = _checked(Path, lambda path: path.suffix.lower() in (".pdf", ".png", "
 
 
 def _counts(text: str) -> list[int]:
-    """Integers of at least 1 separated by commas, without duplicates."""
+    """Parse integers of at least 1, separated by commas, without duplicates."""
     return list(dict.fromkeys(map(_whole(1), text.split(","))))
 
 
@@ -67,7 +67,7 @@ def _focal(text: str) -> dict[str, Any]:
 
 
 def _path(text: str) -> str:
-    """A file or a folder; ``OSError`` where there is none."""
+    """Return the path of a file or a folder; ``OSError`` when there is none."""
     Path(text).stat()
     return text
 
@@ -77,7 +77,7 @@ def _source(text: str) -> str:
 
 
 def _arg(help_: str, metavar: str | None = None, **more: Any) -> dict[str, Any]:
-    """What argparse takes about an argument. Its help ends with its default."""
+    """Options of ``ArgumentParser.add_argument``. The help ends with the default."""
     return {"help": f"{help_}; default: %(default)s" if "default" in more else help_, "metavar": metavar, **more}
 
 

@@ -44,9 +44,9 @@ class ImageCorrespondences(NamedTuple):
     intrinsics: Tensor | None = None
 
     def undistorted(self, camera: str) -> ImageCorrespondences:
-        """With the pixels of the pinhole camera of COLMAP's ``MODEL,width,height,params...``.
+        """Replace the pixels of a camera of COLMAP, ``MODEL,width,height,params...``, by those of a pinhole camera.
 
-        A pixel that no ray of the camera has gets the weight 0.
+        A pixel without a ray gets the weight 0.
         """
         from kornia_pnpnet.data.colmap import undistort
 

@@ -26,7 +26,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Compare the solvers, draw, train; end with the :func:`verdict`."""
     import torch
 
-    from kornia_pnpnet.evaluation import evaluate, format_table, save_results
+    from kornia_pnpnet.evaluation import evaluate, format_table
     from kornia_pnpnet.evaluation.named_solvers import default_solvers, load_solver
     from kornia_pnpnet.evaluation.plots import plot_errors, plot_success, plot_training
     from kornia_pnpnet.evaluation.problem_sets import evaluation_sets
@@ -37,13 +37,11 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"pnpnet: the demo runs without {missing}, which is not installed", file=sys.stderr)
     sets = evaluation_sets(sources, "none,2" if arguments.data else "none,uniform", n=_N, count=count, metric=metric)
     solvers = {specs[name]: load_solver(specs[name]) for name in _SOLVERS if name in specs}
-    # The tensors are small: more threads gain nothing, and lose much when another process computes at the same time.
-    torch.set_num_threads(1)
+    torch.set_num_threads(1)  # more threads gain nothing with small tensors
     print(f"{count} problems of {_N} correspondences in each set, one thread:\n", flush=True)
-    results = evaluate(solvers, sets)
-    print(format_table(results), flush=True)
     folder = Path(arguments.out)
-    save_results(results, folder / "results.json")
+    results = evaluate(solvers, sets, path=folder / "results.json", overwrite=True)
+    print(format_table(results), flush=True)
     files = [plot_success(folder / "success.png", results), plot_errors(folder / "errors.png", results)]
     files.append(_draw_one(folder / "problem.png", *next(iter(solvers.items())), list(sets.values())[-1]))
     history = _train(arguments.train_seconds, folder / "training") if arguments.train_seconds > 0 else None

@@ -25,7 +25,7 @@ SUFFIXES = (".npz", ".parquet")
 
 # Metadata of a results file: the name of the solver and the digest of its parameters.
 _SOLVER = b"kornia_pnpnet.solver"
-# Numbers of a Parquet file that are read at once, 256 MB in float64: where problems are large, a batch has fewer.
+# Numbers that are read from a Parquet file at once, 256 MB in float64. A batch of large problems has fewer rows.
 _NUMBERS_AT_ONCE = 2**25
 
 
@@ -131,10 +131,10 @@ def _bar(shards: Iterable[Path], shown: bool) -> Any:
         return nullcontext()
     from tqdm import tqdm
 
-    total = None  # of NPZ files, and where a file cannot be read
+    total = None  # unknown with NPZ files, and with files that cannot be read
     with suppress(OSError, pa.ArrowException):
         total = sum(parquet.read_metadata(shard).num_rows for shard in shards)
-    return tqdm(total=total, unit="problem", unit_scale=True, disable=None)  # None: where stderr is no terminal
+    return tqdm(total=total, unit="problem", unit_scale=True, disable=None)  # None: disabled without a terminal
 
 
 def _solve_shard(solve: Solve, shard: Path, target: Path, mark: bytes, batch: int, bar: Any) -> tuple[int, int]:
@@ -179,7 +179,7 @@ def _tables_of_arrays(shard: Path, batch: int) -> Iterator[pa.Table]:
             raise InputError(shard, f"{name} must be of the shape (B, N, {size}), got {arrays[name].shape}")
     count = len(arrays["world_points"])
     for name, shape in (("intrinsics", (3, 3)), ("img_sigma", ()), ("world_sigma", ())):
-        if name in arrays and arrays[name].shape == shape:  # of all problems
+        if name in arrays and arrays[name].shape == shape:  # one for all problems
             arrays[name] = np.broadcast_to(arrays[name], (count, *shape))
     for start in range(0, max(count, 1), batch):
         try:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 __all__ = ["MOST_BYTES", "InputError", "atomic_open", "digest", "read_csv", "read_npz", "write_json"]
 
-#: Bytes of numbers that are read from a file at once. A few compressed megabytes can unpack to any size.
+#: Largest number of bytes read from a file at once. A few compressed megabytes can unpack to gigabytes.
 MOST_BYTES = 2**31
 
 
@@ -110,7 +110,8 @@ def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, np.n
 def digest(*parts: Any) -> str:
     """SHA-256, in hexadecimal, of contents one after the other.
 
-    A tensor counts by dtype, shape and values, on any device; plain data as JSON with sorted keys.
+    The digest of a tensor depends on dtype, shape and values, not on the device. Plain data are digested as JSON with
+    sorted keys.
     """
     sha = hashlib.sha256()
     for part in parts:

@@ -1,4 +1,4 @@
-"""Reading data that anyone may have written, with an error that names the file and the first wrong entry.
+"""Read data from any source. An error names the file and the first wrong entry.
 
 Needs pydantic, which only the extras install: the modules that ``import kornia_pnpnet`` loads must not import this one.
 """
@@ -23,7 +23,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 #: An integer of at least 0 that fits into 64 bits.
 Count = Annotated[int, Field(ge=0, lt=2**63)]
-#: The configuration of a type whose numbers must be finite; types inside it take it over.
+#: The configuration of a type whose numbers, and those of types inside it, must be finite.
 STRICT = ConfigDict(strict=True, allow_inf_nan=False)
 
 
@@ -41,8 +41,8 @@ def read_json(path: str | Path, kind: type[_T], what: str) -> _T:
 
     Raises:
         FileNotFoundError: when there is no such file.
-        ValueError: when the file is not of this type. The message says that it is not ``what`` (such as "a results
-            file") and names the first wrong entry, for example ``rows[0].success.rate``.
+        ValueError: when the file is not of this type. The message ends with the first wrong entry, for example:
+            "'a.json' is not a results file: rows[0].success.rate is missing", where ``what`` is "a results file".
     """
     try:
         return TypeAdapter(kind).validate_json(Path(path).read_bytes(), strict=True)
@@ -58,7 +58,7 @@ def read_json(path: str | Path, kind: type[_T], what: str) -> _T:
 
 
 def to_json(value: Any) -> Any:
-    """Plain data of dataclasses and named tuples, with their fields as keys."""
+    """Convert dataclasses and named tuples, also nested ones, to dictionaries."""
     if dataclasses.is_dataclass(value):
         value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
     elif hasattr(value, "_asdict"):

@@ -47,10 +47,9 @@ class PeerSolver(nn.Module):
     r"""A solver of another library, which takes one problem at a time, as a batched layer without gradients.
 
     A subclass implements :meth:`solve_one` and is a dataclass, whose fields are the arguments of its constructor.
-    The peer sees only the pairs that are present and have a weight above 0; the size of the weight has no effect. A
-    problem fails, with ``ok=False`` and the identity as its pose, when the peer finds no pose, and without asking the
-    peer when the problem is not finite, has a negative weight, fewer than three pairs, or a camera with skew or without
-    a positive focal length.
+    The peer gets the pairs that are present and have a weight above 0; the size of the weight has no effect. A problem
+    without a pose has ``ok=False``, and its pose is the identity. The peer does not get problems that are not finite,
+    have a negative weight or fewer than three pairs, or a camera with a skew or without a positive focal length.
 
     Convention: ``x_cam = R x_world + t``, +z forward, pixels ``u = fx x/z + cx``.
 

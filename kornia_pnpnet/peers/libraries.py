@@ -145,9 +145,9 @@ def _pinhole(intrinsics: np.ndarray) -> list[float]:
 class KorniaRs(RobustPeer):
     r"""``solve_pnp_ransac`` of kornia-rs, problem by problem: P3P, RANSAC, then least squares of the inliers.
 
-    The library computes in float32. Its local optimisation, off by default, finds nothing more on the protocol's data
-    and is not offered. The default threshold is tuned as that of :class:`OpenCVRansac`, where threshold, confidence and
-    seed are described.
+    The library computes in float32. Its local optimisation, which is off by default, solves no more of the protocol's
+    problems and is not offered. The default threshold is tuned as that of :class:`OpenCVRansac`, where threshold,
+    confidence and seed are described.
 
     Args:
         max_iterations: largest number of RANSAC iterations.
@@ -180,7 +180,7 @@ class PoseLib(RobustPeer):
     r"""PoseLib's ``estimate_absolute_pose``, problem by problem: P3P, LO-RANSAC and a robust refinement of the inliers.
 
     The default threshold is tuned as that of :class:`OpenCVRansac`, where threshold, confidence and seed are described.
-    PoseLib's own minimum of 1000 iterations, ten times the default here, finds nothing more with nine pairs.
+    PoseLib's own minimum of 1000 iterations, ten times the default here, solves no more problems of nine pairs.
 
     Args:
         min_iterations: smallest number of iterations.
