@@ -241,29 +241,35 @@ def test_export_takes_two_suffixes_and_overwrites_nothing(capsys, tmp_path, name
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"mine.onnx": "mine", "mine.pt2": "mine"}
 
 
-@pytest.mark.parametrize("camera", ["1,2,3", "1,2,3,x", "1,2,3,4,5", "0,800,320,240", "800,-1,320,240", "8,8,nan,2"])
-def test_bad_intrinsics(capsys, csv_file, camera):
-    assert refused(capsys, "solve", csv_file, f"--intrinsics={camera}").startswith("pnpnet: --intrinsics: ")
+BAD_CAMERAS = ("1,2,3", "1,2,3,x", "1,2,3,4,5", "0,800,320,240", "800,-1,320,240", "8,8,nan,2")
+PINHOLE = "PINHOLE,640,480,800,810,320,240"
 
 
-def test_wrong_n_and_wrong_solvers(capsys, csv_file, tmp_path, weights_folder):
+@pytest.mark.parametrize(
+    ("options", "culprit"),
+    [
+        *((f"--intrinsics={camera}", "pnpnet: --intrinsics: ") for camera in BAD_CAMERAS),
+        (f"--intrinsics {CAMERA} --camera {PINHOLE}", "--camera stands alone"),
+        ("--camera PINHOLE,640,480,800", "--camera: expected MODEL"),
+        (f"--intrinsics {CAMERA} --focal unknown --solver poselib", "does not estimate focal lengths"),
+        *((f"--solver {name}", name) for name in ("nobody", "tests")),
+        ("--solver opencv-ransac:speed=9", "speed"),
+        ("--solver opencv-ransac:refine=no", "refine"),
+        ("--solver known-inliers", "bound"),
+    ],
+)
+def test_bad_options_of_solve(capsys, csv_file, options, culprit):
+    known = [] if "--camera" in options or "--intrinsics" in options else ["--intrinsics", CAMERA]
+    assert culprit in refused(capsys, "solve", csv_file, *known, *options.split())
+
+
+def test_files_of_another_n_and_no_files(capsys, csv_file, tmp_path, weights_folder):
     for path in (tmp_path / "missing.csv", tmp_path):
         assert f"{path}: " in refused(capsys, "solve", path, "--intrinsics", CAMERA)
-    eight = tmp_path / "eight.csv"
-    eight.write_text("\n".join(csv_file.read_text().splitlines()[:-1]))
-    err = refused(capsys, "solve", eight, "--intrinsics", CAMERA, "--solver", weights_folder)
+    csv_file.write_text("\n".join(csv_file.read_text().splitlines()[:-1]))
+    err = refused(capsys, "solve", csv_file, "--intrinsics", CAMERA, "--solver", weights_folder)
     assert "n = 9" in err
     assert "N = 8" in err
-    (weights_folder / "config.json").write_text("{}")
-    for name, expected in {
-        "nobody": "nobody",
-        tmp_path: str(tmp_path),
-        weights_folder: "",
-        "opencv-ransac:speed=9": "speed",
-        "opencv-ransac:refine=no": "refine",
-        "known-inliers": "bound",
-    }.items():
-        assert expected in refused(capsys, "solve", csv_file, "--intrinsics", CAMERA, "--solver", name)
 
 
 @pytest.mark.parametrize(
@@ -334,18 +340,13 @@ def test_the_same_command_continues_and_another_is_refused(capsys, tmp_path):
     assert out_file.read_text() == '{"format": 1, "rows": [{"data"'
 
 
-@pytest.mark.parametrize(
-    ("name", "command"),
-    [
-        ("evaluation.comparison.evaluate", "evaluate --problems 5 --solver identity-lm --out x"),
-        ("list_solvers", "list"),
-    ],
-)
-def test_interruptions_are_one_line(capsys, monkeypatch, name, command):
+@pytest.mark.parametrize("name", ["evaluation.comparison.evaluate", "list_solvers"])
+def test_interruptions_are_one_line(capsys, monkeypatch, name):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(f"kornia_pnpnet.{name}", interrupt)
+    command = "list" if name == "list_solvers" else "evaluate --problems 5 --solver identity-lm --out x"
     code, out, err = run(capsys, *command.split())
     assert (code, out, err.count("\n")) == (130, "", 1)
 
@@ -473,20 +474,15 @@ def test_solve_estimates_the_focal_length(capsys, csv_file):
     assert got["ok"]
     assert got["intrinsics"][0][0] == pytest.approx(800, rel=0.02)
     assert got["intrinsics"][1][1] == pytest.approx(1.0125 * got["intrinsics"][0][0])
-    told = answer(capsys, csv_file, "--focal", "0.1", "--intrinsics", "780,790,320,240")
-    assert told["intrinsics"][0][0] == pytest.approx(800, rel=0.02)
+    prior = answer(capsys, csv_file, "--focal", "0.1", "--intrinsics", "780,790,320,240")
+    assert prior["intrinsics"][0][0] == pytest.approx(800, rel=0.02)
     assert answer(capsys, csv_file, "--focal", "known", "--intrinsics", CAMERA)["intrinsics"] == K.tolist()
-    err = refused(capsys, "solve", csv_file, "--intrinsics", CAMERA, "--focal", "unknown", "--solver", "poselib")
-    assert "does not estimate focal lengths" in err
 
 
 def test_solve_takes_cameras_of_colmap(capsys, csv_file):
     plain = answer(capsys, csv_file, "--intrinsics", CAMERA)
-    pinhole = answer(capsys, csv_file, "--camera", "PINHOLE,640,480,800,810,320,240")
+    pinhole = answer(capsys, csv_file, "--camera", PINHOLE)
     assert pinhole["translation"] == pytest.approx(plain["translation"], abs=1e-6)
     radial = answer(capsys, csv_file, "--camera", "RADIAL,640,480,800,320,240,-0.05,0.01")
     assert radial["intrinsics"][0][0] == 800
     assert radial["translation"] != plain["translation"]
-    assert "--camera: expected MODEL" in refused(capsys, "solve", csv_file, "--camera", "PINHOLE,640,480,800")
-    err = refused(capsys, "solve", csv_file, "--camera", "PINHOLE,640,480,800,810,320,240", "--intrinsics", CAMERA)
-    assert "--camera stands alone" in err

@@ -185,24 +185,24 @@ def test_poselib_and_colmap_random_images(focal, share, name, dtype):
     assert count(create_solver(name), p, 1e-2, dtype) >= best - 1
 
 
-@pytest.mark.parametrize("name", [*OURS, "pnpnet-set, told"])
+@pytest.mark.parametrize("name", [*OURS, "pnpnet-set, known noise"])
 @pytest.mark.parametrize("noise", [0.0, 1e-3, 1e-2])
 @pytest.mark.parametrize("n", [6, 20, 100])
 def test_pytorch3d_grid_of_noise_and_scale(n, noise, name, dtype, request):
     """PyTorch3D's test of ``efficient_pnp``: points x noise of plane points x scale; its twin here is OpenCV's EPNP."""
     open_ = name.startswith("pnpnet-set") and (n, noise) == (6, 1e-2)
-    lost(request, open_, "these pairs leave the rotation open to degrees, so that right poses are not `ok`")
+    lost(request, open_, "these pairs leave the rotation open to degrees: correct poses are not `ok`")
     generator = torch.Generator().manual_seed(n)
     cam, jitter, (axis, shift) = (torch.randn(k, 20, n, 3, generator=generator).double() for k in (1, 1, 2))
     rotation, translation = axis_angle_to_rotation_matrix(axis[:, 0]), shift[:, 0]
     cam = cam[0] + torch.tensor([0.0, 0, 6])
     img = cam[..., :2] / cam[..., 2:] + noise * jitter[0, ..., :2]
-    told = {"img_sigma": max(noise, 1e-4)} if "told" in name else {}
+    known = {"img_sigma": max(noise, 1e-4)} if "known" in name else {}
     ours = twin = 0
     for scale in (0.1, 10.0):
         world = scale * ((cam - translation[:, None]) @ rotation)
         p = problems_of(world, img, torch.eye(3).double(), rotation, scale * translation)
-        ours += right(solve(create_solver(name.split(",")[0]), p, dtype, **told), p, 2.0, 0.2 * scale)
+        ours += right(solve(create_solver(name.split(",")[0]), p, dtype, **known), p, 2.0, 0.2 * scale)
         twin += right(solve(OpenCVPnP(method="EPNP"), p), p, 2.0, 0.2 * scale)
     assert ours >= twin - 2
 
@@ -234,7 +234,7 @@ def test_wild_pairs_cost_at_most_three_of_fifty(name, wild, dtype):
 @pytest.mark.parametrize("name", WILD)
 def test_right_points_far_away(name, distance, dtype, request):
     """Five of twenty exact points far along their rays: every problem is ok, and no less exact."""
-    reason = "median 0.014 with img_sigma alone (0.013 without far points), 0.0076 told world_sigma=0, too"
+    reason = "median 0.014 with img_sigma alone (0.013 without far points), 0.0076 with world_sigma=0, too"
     lost(request, name == "pnpnet-set", reason)
     p = protocol(world_sigma=0.0)
     cam = p.world_points @ p.pose.rotation.mT + p.pose.translation[:, None]
