@@ -62,7 +62,7 @@ def _counts(text: str) -> list[int]:
 
 
 def _focal(text: str) -> dict[str, Any]:
-    """Options of :class:`~kornia_pnpnet.PnPNet`."""
+    """Options of :class:`~kornia_pnpnet.PnPNet` for a focal length."""
     return {"focal": text} if text in ("known", "unknown") else {"focal": "unknown", "focal_sigma": _positive(text)}
 
 

@@ -22,7 +22,7 @@ __all__ = ["ImageCorrespondences", "InputError", "camera_matrix", "read_arrays",
 
 _COLUMNS = ("X", "Y", "Z", "u", "v")
 _ZIP_MAGIC = b"PK\x03\x04"
-# Median absolute deviation to standard deviation of a normal distribution.
+# Ratio of the standard deviation of a normal distribution to its median absolute deviation.
 _MAD_TO_SIGMA = 1.4826
 # Lowest limit of a reprojection error in pixels: about three standard deviations of a corner detector's noise.
 _MIN_LIMIT_PX = 3.0

@@ -53,7 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def verdict(results: Mapping[str, Any]) -> str:
-    """One sentence on the solvers that solved the most problems of each set, and on the fastest one.
+    """Name the solvers that solved the most problems of each set, and the fastest solver, in one sentence.
 
     Solvers whose 95 % interval contains the highest success rate share the first place.
     """
@@ -73,7 +73,7 @@ def _result(row: Mapping[str, Any]) -> str:
 
 
 def _draw_one(path: Path, name: str, solver: nn.Module, entry: EvaluationData) -> Path:
-    """Draw the first one of the problems with the most outliers, so that the picture is not a selected success."""
+    """Draw the first problem with the most outliers: the choice does not depend on success."""
     import torch
 
     from kornia_pnpnet.cli.correspondence_files import reproject

@@ -30,7 +30,7 @@ _NUMBERS_AT_ONCE = 2**25
 
 
 class ShardReport(NamedTuple):
-    """Numbers of problems with a pose, of all problems, of shards that were solved and that had results before.
+    """Numbers of solved problems, of all problems, of shards that were solved, and of shards that had results before.
 
     ``failed`` has a line for each shard that cannot be read.
     """
