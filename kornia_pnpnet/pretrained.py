@@ -14,29 +14,21 @@ from torch import Tensor, nn
 from kornia_pnpnet.core.files import atomic_open, digest
 from kornia_pnpnet.frame import Normalize
 from kornia_pnpnet.propose.epnp import EPnP
+from kornia_pnpnet.propose.minimal import describe
 from kornia_pnpnet.propose.mlp import MLPInit
 from kornia_pnpnet.propose.reppnp import REPPnP
 from kornia_pnpnet.propose.set import SetInit
 from kornia_pnpnet.refine.lm import RobustWeightedLM
 
-__all__ = [
-    "CONFIG_NAME",
-    "WEIGHTS_FOLDER",
-    "WEIGHTS_NAME",
-    "PretrainedMixin",
-    "find_weights",
-    "read_weights",
-    "shipped_weights",
-    "write_weights",
-]
+__all__ = ["PretrainedMixin", "find_weights", "read_weights", "shipped_weights", "write_weights"]
 
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 CONFIG_NAME, WEIGHTS_NAME = "config.json", "model.safetensors"
 # Key of the digest in the metadata of the weights file.
 _FINGERPRINT = "sha256"
-# Bytes of a configuration, far more than any has.
+# Bytes that are read of a configuration. No configuration has as many.
 _LARGEST_CONFIG = 2**20
-# Sizes up to this one take little memory, whatever the tensors are.
+# Sizes up to this one take little memory.
 _SMALL = 1000
 
 
@@ -55,8 +47,8 @@ def write_weights(folder: str | Path, config: Mapping[str, Any], state: Mapping[
     state = {name: value.detach().cpu().contiguous() for name, value in state.items()}
     with atomic_open(Path(folder) / WEIGHTS_NAME, "wb") as file:
         file.write(save(state, {"format": "pt", _FINGERPRINT: _fingerprint(config, state)}))
-    with atomic_open(Path(folder) / CONFIG_NAME) as file:
-        file.write(json.dumps(config, indent=2) + "\n")
+    with atomic_open(Path(folder) / CONFIG_NAME) as text:
+        text.write(json.dumps(config, indent=2) + "\n")
 
 
 def read_weights(name_or_folder: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -70,11 +62,11 @@ def read_weights(name_or_folder: str | Path) -> tuple[dict[str, Any], dict[str, 
     from safetensors import SafetensorError, safe_open
 
     try:
-        for name, largest in ((CONFIG_NAME, _LARGEST_CONFIG), (WEIGHTS_NAME, None)):
-            path = folder / name
-            if not path.is_file() or (largest and path.stat().st_size > largest):  # a pipe would wait for ever
-                raise ValueError(f"{name} is no file" if not path.is_file() else f"{name} has over {largest} bytes")
-        config = json.loads((folder / CONFIG_NAME).read_text())
+        for name in (CONFIG_NAME, WEIGHTS_NAME):
+            if not (folder / name).is_file():  # a pipe would wait for ever
+                raise ValueError(f"{name} is no file")
+        with (folder / CONFIG_NAME).open("rb") as text:
+            config = json.loads(text.read(_LARGEST_CONFIG))
         with safe_open(folder / WEIGHTS_NAME, "pt") as file:
             metadata = file.metadata() or {}
             state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
@@ -93,14 +85,12 @@ def read_weights(name_or_folder: str | Path) -> tuple[dict[str, Any], dict[str, 
         if isinstance(entry, dict):
             entries += entry.items()
         elif isinstance(entry, int) and entry > (len(state) if name == "layers" else largest):
-            raise ValueCheckError(
-                f"{folder / CONFIG_NAME}: {name} is {entry}, too large for the tensors in {WEIGHTS_NAME}."
-            )
+            raise ValueCheckError(f"{folder / CONFIG_NAME}: {name} is {entry}, too large for its {WEIGHTS_NAME}.")
     return config, state
 
 
-def _fingerprint(config: Any, state: dict[str, Tensor]) -> str:
-    """Digest of a configuration and its weights: it tells whether both were saved together."""
+def _fingerprint(config: Any, state: Mapping[str, Tensor]) -> str:
+    """Digest of a configuration and the weights that were saved with it."""
     return digest(config, *(part for item in sorted(state.items()) for part in item))
 
 
@@ -118,27 +108,25 @@ def find_weights(name_or_folder: str | Path) -> Path:
     for folder in (WEIGHTS_FOLDER / name, Path(name)):
         if (folder / CONFIG_NAME).is_file():
             return folder
-    message = (
-        f"No weights {name!r}: shipped weights are {shipped_weights()}; a folder needs {CONFIG_NAME} and {WEIGHTS_NAME}"
-    )
+    files = f"a folder needs {CONFIG_NAME} and {WEIGHTS_NAME}"
+    message = f"No weights {name!r}: shipped weights are {shipped_weights()}; {files}"
     if isinstance(name_or_folder, Path) or name.count("/") != 1 or Path(name).exists():
         raise FileNotFoundError(f"{message}.")
     from huggingface_hub import hf_hub_download
     from huggingface_hub.errors import HfHubHTTPError
 
     try:
-        config = hf_hub_download(name, CONFIG_NAME)
         hf_hub_download(name, WEIGHTS_NAME)
+        return Path(hf_hub_download(name, CONFIG_NAME)).parent
     except (HfHubHTTPError, OSError, ValueError) as error:
         raise FileNotFoundError(f"{message}; the Hub said: {error}") from error
-    return Path(config).parent
 
 
 _INITIALISERS: dict[str, type[nn.Module]] = {x.__name__: x for x in (EPnP, MLPInit, REPPnP, SetInit)}
 
 
 class PretrainedMixin(nn.Module):
-    """A solver as plain data and files, and back: a part of :class:`~kornia_pnpnet.PnPNet`."""
+    """A base of :class:`~kornia_pnpnet.PnPNet` that saves and loads solvers, and copies them with other options."""
 
     init: nn.Module | None
     refine: RobustWeightedLM
@@ -146,7 +134,7 @@ class PretrainedMixin(nn.Module):
 
     @classmethod
     def option_names(cls) -> list[str]:
-        """Names of a solver's options: the arguments of its constructor that can only be given by name."""
+        """Names of the options: the keyword-only arguments of the constructor."""
         parameters = inspect.signature(cls.__init__).parameters.values()
         return [x.name for x in parameters if x.kind is inspect.Parameter.KEYWORD_ONLY]
 
@@ -160,18 +148,17 @@ class PretrainedMixin(nn.Module):
         return ", ".join(f"{name}={value!r}" for name, value in self.options.items())
 
     def with_options(self, *, refine: RobustWeightedLM | None = None, **options: Any) -> Self:
-        """The same solver with another refinement and other options."""
+        """Copy the solver with another refinement and other options."""
         return type(self)(self.init, refine or self.refine, self.normalize, **{**self.options, **options})
 
     def config(self) -> dict[str, Any]:
-        """The constructor arguments of all parts and the options, as plain data."""
-        arguments = getattr(self.init, "config", {})
-        init = None if self.init is None else {"name": type(self.init).__name__, **arguments}
+        """Return the constructor arguments of all parts, and the options, as plain data."""
+        init = None if self.init is None else describe(self.init)
         return {"init": init, "refine": self.refine.config, "normalize": self.normalize.config, **self.options}
 
     @classmethod
     def from_config(cls, config: dict[str, Any]) -> Self:
-        """Build an untrained solver from what :meth:`config` returned; options that are not in it have their defaults.
+        """Build an untrained solver from the result of :meth:`config`. Missing options have their defaults.
 
         Raises:
             ValueCheckError: when a part or an argument is unknown.
@@ -180,8 +167,7 @@ class PretrainedMixin(nn.Module):
             options = dict(config)
             init, refine, normalize = (options.pop(part) for part in ("init", "refine", "normalize"))
             if init is not None:
-                arguments = dict(init)
-                init = _INITIALISERS[arguments.pop("name")](**arguments)
+                init = _INITIALISERS[init["name"]](**{key: x for key, x in init.items() if key != "name"})
             return cls(init, RobustWeightedLM(**refine), Normalize(**normalize), **options)
         except (BaseError, KeyError, TypeError, ValueError, AttributeError) as error:
             raise ValueCheckError(f"Not a configuration of PnPNet: {error!r}.") from error

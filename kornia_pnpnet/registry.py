@@ -12,6 +12,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
 from kornia_pnpnet.frame import Normalize
+from kornia_pnpnet.peers import KorniaRs, OpenCVPnP, OpenCVRansac, OpenCVUsac, PoseLib, PyColmap
 from kornia_pnpnet.pretrained import shipped_weights
 from kornia_pnpnet.propose.epnp import EPnP
 from kornia_pnpnet.propose.minimal import SubsetSolver
@@ -23,20 +24,10 @@ from kornia_pnpnet.solver import PnPNet
 
 __all__ = ["create_solver", "list_solvers", "solve_pnp"]
 
-# Iterations of the classical robust LM: from a pose that is nearly right, and from the identity.
+# Iterations of the classical robust LM, from the pose of a method and from the identity.
 _FEW, _MANY = 10, 30
 # Pairs in a sample of the paper's RANSAC.
 _PAPERS_SAMPLE = 7
-#: Solvers of other libraries: class and arguments in :mod:`kornia_pnpnet.peers`, which need the extras.
-_PEERS: dict[str, tuple[str, dict[str, str]]] = {
-    "opencv-epnp": ("OpenCVPnP", {"method": "EPNP"}),
-    "opencv-sqpnp": ("OpenCVPnP", {"method": "SQPNP"}),
-    "opencv-ransac": ("OpenCVRansac", {}),
-    "opencv-usac": ("OpenCVUsac", {}),
-    "kornia-rs": ("KorniaRs", {}),
-    "poselib": ("PoseLib", {}),
-    "pycolmap": ("PyColmap", {}),
-}
 
 
 def _trained(weights: str, m: int | None = None) -> PnPNet:
@@ -46,9 +37,9 @@ def _trained(weights: str, m: int | None = None) -> PnPNet:
 
 
 def _alone(init: Callable[..., nn.Module], **options: Any) -> PnPNet:
-    """A method without refinement: its pose is judged, and its weights are the weights of the result."""
+    """A method without refinement: the result has its pose, which is judged, and its weights."""
     refine = RobustWeightedLM(0, damping=1e-6, robustness=0.0, learnable=False)
-    return PnPNet(init(**options), refine, Normalize(order=init is RANSAC))  # others do not see the order of the pairs
+    return PnPNet(init(**options), refine, Normalize(order=init is RANSAC))  # only samples depend on the order
 
 
 def _paper_lm(m: int) -> RobustWeightedLM:
@@ -57,20 +48,8 @@ def _paper_lm(m: int) -> RobustWeightedLM:
 
 
 def _refined(init: Callable[..., nn.Module], m: int = _FEW, **options: Any) -> PnPNet:
-    """The paper's "-LM": started from a method."""
+    """The paper's "-LM": a method, then LM from its pose."""
     return PnPNet(init(**options), _paper_lm(m), Normalize(order=False))
-
-
-def _ransac_epnp_lm(m: int = _FEW, **options: Any) -> PnPNet:
-    """The paper's RANSAC: EPnP-LM on samples."""
-    return _alone(RANSAC, minimal=SubsetSolver(EPnP(), _paper_lm(m), size=_PAPERS_SAMPLE), **options)
-
-
-def _peer(name: str, **options: Any) -> nn.Module:
-    from kornia_pnpnet import peers
-
-    solver: nn.Module = getattr(peers, name)(**options)
-    return solver
 
 
 def _builders() -> dict[str, Callable[..., nn.Module]]:
@@ -80,13 +59,22 @@ def _builders() -> dict[str, Callable[..., nn.Module]]:
         "reppnp": partial(_alone, REPPnP),
         "reppnp-lm": partial(_refined, REPPnP),
         "p3p-ransac": lambda **options: _alone(RANSAC, minimal=P3P(), **options),
-        "ransac-epnp-lm": _ransac_epnp_lm,
+        "ransac-epnp-lm": lambda m=_FEW, **options: _alone(
+            RANSAC, minimal=SubsetSolver(EPnP(), _paper_lm(m), size=_PAPERS_SAMPLE), **options
+        ),
         "identity-lm": lambda m=_MANY: PnPNet(None, _paper_lm(m)),
+        "opencv-epnp": partial(OpenCVPnP, method="EPNP"),
+        "opencv-sqpnp": partial(OpenCVPnP, method="SQPNP"),
+        "opencv-ransac": OpenCVRansac,
+        "opencv-usac": OpenCVUsac,
+        "kornia-rs": KorniaRs,
+        "poselib": PoseLib,
+        "pycolmap": PyColmap,
     }
     for name in shipped_weights():
         builders[name] = partial(_trained, name)
         builders[name.replace("pnpnet-", "net-")] = partial(_trained, name, m=0)
-    return builders | {name: partial(_peer, kind, **options) for name, (kind, options) in _PEERS.items()}
+    return builders
 
 
 def list_solvers() -> list[str]:
@@ -107,11 +95,11 @@ def create_solver(name: str, **options: Any) -> nn.Module:
 
     Args:
         name: one of :func:`list_solvers`.
-        options: options of that solver: ``m``, the number of iterations, of every ``-lm`` and of trained weights (see
-            :meth:`~kornia_pnpnet.refine.lm.RobustWeightedLM.with_iterations`); the arguments of
+        options: for every ``-lm`` and for trained weights ``m``, the number of iterations (see
+            :meth:`~kornia_pnpnet.refine.lm.RobustWeightedLM.with_iterations`); else the arguments of
             :class:`~kornia_pnpnet.propose.epnp.EPnP`, :class:`~kornia_pnpnet.propose.reppnp.REPPnP`,
-            :class:`~kornia_pnpnet.propose.ransac.RANSAC`, and of the classes in :mod:`kornia_pnpnet.peers`; and for all
-            but the peers the options of :class:`~kornia_pnpnet.solver.PnPNet`.
+            :class:`~kornia_pnpnet.propose.ransac.RANSAC` or the class in :mod:`kornia_pnpnet.peers`; and for all but
+            the peers the options of :class:`~kornia_pnpnet.solver.PnPNet`.
 
     Returns:
         The solver as a module in evaluation mode.
@@ -130,12 +118,12 @@ def create_solver(name: str, **options: Any) -> nn.Module:
         raise ValueCheckError(f"No solver {name!r}. There are: {', '.join(sorted(builders))}.")
     ours = {key: options.pop(key) for key in PnPNet.option_names() if key in options}
     try:
-        solver = builders[name](**options).eval()
-        if not ours:
-            return solver
-        if not isinstance(solver, PnPNet):
-            raise TypeError(f"{' and '.join(ours)}: for solvers of this package only")
-        return solver.with_options(**ours).eval()
+        solver = builders[name](**options)
+        if ours:
+            if not isinstance(solver, PnPNet):
+                raise TypeError(f"{' and '.join(ours)}: for solvers of this package only")
+            solver = solver.with_options(**ours)
+        return solver.eval()
     except TypeError as error:
         raise ValueCheckError(f"Solver {name!r} does not take these options: {error}.") from error
 

@@ -26,14 +26,21 @@ CAMERA = "800,810,320,240"
 K = torch.tensor([[800.0, 0, 320], [0, 810, 240], [0, 0, 1]], dtype=torch.float64)
 
 
+def points(n=9):
+    return np.random.default_rng(0).uniform((-2, -2, 4), (2, 2, 9), (n, 3))
+
+
+def seen(world):
+    """Pixels of a camera at the identity."""
+    return world[:, :2] / world[:, 2:] * (800, 810) + (320, 240)
+
+
 @pytest.fixture
 def problem():
-    """Nine world points and their pixels for a camera at the identity; the points 1 and 6 are outliers."""
-    generator = np.random.default_rng(0)
-    world = generator.uniform((-2, -2, 4), (2, 2, 9), (9, 3))
-    img = world[:, :2] / world[:, 2:] * (800, 810) + (320, 240) + generator.normal(0, 0.3, (9, 2))
+    """Nine world points and their pixels; the points 1 and 6 are outliers."""
+    img = seen(points()) + np.random.default_rng(1).normal(0, 0.3, (9, 2))
     img[[1, 6]] += ((180.0, -90.0), (-150.0, 200.0))
-    return world, img
+    return points(), img
 
 
 @pytest.fixture
@@ -76,11 +83,7 @@ def refused(capsys, *arguments) -> str:
 
 def answer(capsys, *arguments) -> dict:
     code, out, _ = run(capsys, "solve", *arguments)
-
-    def refuse(word):
-        raise AssertionError(f"{word} is not JSON")
-
-    parsed = json.loads(out, parse_constant=refuse)
+    parsed = json.loads(out, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
     assert code == (0 if parsed["ok"] else 1)
     return parsed
 
@@ -92,15 +95,13 @@ def answer(capsys, *arguments) -> dict:
 def test_solve_prints_what_the_library_returns(capsys, csv_file, problem, weights_folder, solver):
     name = solver if solver == "identity-lm" else str(weights_folder)
     got = answer(capsys, csv_file, "--intrinsics", CAMERA, "--solver", name)
-    module = load_solver(name)
     world, img = (torch.from_numpy(part)[None] for part in problem)
     with torch.no_grad():
-        result = module(world, img, K)
+        result = load_solver(name)(world, img, K)
     assert (got["solver"], got["n"], got["ok"], got["cost"]) == (name, 9, result.ok.item(), result.cost.item())
-    assert got["rotation"] == result.rotation[0].tolist()
-    assert got["translation"] == result.translation[0].tolist()
+    fields = got["rotation"], got["translation"], got["quaternion_wxyz"]
+    assert fields == tuple(x[0].tolist() for x in (*result.pose, result.pose.quaternion))
     assert [pair["weight"] for pair in got["pairs"]] == result.weights[0].tolist()
-    assert got["quaternion_wxyz"] == result.pose.quaternion[0].tolist()
     cam = world @ result.rotation.mT + result.translation[:, None]
     pixels = cam[0, :, :2] / cam[0, :, 2:] * K.diagonal()[:2] + K[:2, 2]
     for pair, point, error in zip(got["pairs"], cam[0], (pixels - img[0]).norm(dim=-1), strict=True):
@@ -111,23 +112,21 @@ def test_solve_prints_what_the_library_returns(capsys, csv_file, problem, weight
             assert pair == {"weight": 0.0, "reprojection_error_px": None, "rejected": True}
 
 
-def test_solve_rejects_the_outliers(capsys, csv_file):
-    got = answer(capsys, csv_file, "--intrinsics", CAMERA, "--solver", "identity-lm")
-    assert got["ok"]
+def test_solve_rejects_and_draws_outliers(capsys, csv_file, tmp_path):
+    pytest.importorskip("matplotlib")
+    common, picture = ("--intrinsics", CAMERA, "--solver", "identity-lm"), tmp_path / "sub" / "pose.png"
+    got = answer(capsys, csv_file, *common, "--plot", picture)
     assert [pair["rejected"] for pair in got["pairs"]] == [i in (1, 6) for i in range(9)]
     np.testing.assert_allclose(got["rotation"], np.eye(3), atol=5e-3)
     errors = sorted(pair["reprojection_error_px"] for pair in got["pairs"])
     assert got["rejected_above_px"] == max(3.0, 3 * 1.4826 * errors[4])
-
-
-def test_points_behind_the_camera_are_rejected(capsys, csv_file, tmp_path):
-    lines = csv_file.read_text().splitlines()
-    path = tmp_path / "behind.csv"
-    path.write_text("\n".join([*lines, "0.1,0.2,-5,300,200"]))
-    got = answer(capsys, path, "--intrinsics", CAMERA, "--solver", "identity-lm", "--threshold", "1e6")
-    assert got["ok"]
-    assert got["pairs"][-1] == {"weight": 0.0, "reprojection_error_px": None, "rejected": True}
-    assert not any(pair["rejected"] for pair in got["pairs"][:-1])
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert picture.stat().st_size > 10_000
+    with csv_file.open("a") as file:
+        file.write("0.1,0.2,-5,300,200")
+    *others, behind = answer(capsys, csv_file, *common, "--threshold", "1e6")["pairs"]
+    assert behind == {"weight": 0.0, "reprojection_error_px": None, "rejected": True}
+    assert not any(pair["rejected"] for pair in others)
 
 
 def test_csv_in_any_column_order_and_npz_give_the_same(capsys, tmp_path, problem, csv_file):
@@ -163,14 +162,6 @@ def test_no_pose_is_exit_code_one_with_the_reason(capsys, tmp_path):
         assert got["rotation"] == torch.eye(3).tolist()
     _, _, err = run(capsys, "solve", path, "--intrinsics", CAMERA)
     assert err.startswith("pnpnet: not solved (degenerate)")
-
-
-def test_plot_draws_a_picture(capsys, csv_file, tmp_path):
-    pytest.importorskip("matplotlib")
-    picture = tmp_path / "sub" / "pose.png"
-    answer(capsys, csv_file, "--intrinsics", CAMERA, "--solver", "identity-lm", "--plot", picture)
-    assert picture.read_bytes().startswith(b"\x89PNG")
-    assert picture.stat().st_size > 10_000
 
 
 # -- bad input -------------------------------------------------------------------------------------------------------
@@ -227,14 +218,11 @@ def test_bad_npz_files(capsys, tmp_path):
 
 def test_cameras_with_skew_and_scale(capsys, tmp_path):
     """Reprojections of the command use the whole matrix, as the solver does."""
-    world = np.random.default_rng(0).uniform((-2, -2, 4), (2, 2, 9), (12, 3))
     camera = 2.0 * np.array([[800.0, 150.0, 320.0], [0.0, 810.0, 240.0], [0.0, 0.0, 1.0]])
-    img = world @ camera.T
-    path = tmp_path / "skew.npz"
-    np.savez(path, world_points=world, img_points=img[:, :2] / img[:, 2:], intrinsics=camera)
-    assert main(["solve", str(path)]) == 0
-    answer = json.loads(capsys.readouterr().out)
-    assert max(pair["reprojection_error_px"] for pair in answer["pairs"]) < 1e-2
+    img = points(12) @ camera.T
+    np.savez(tmp_path / "skew.npz", world_points=points(12), img_points=img[:, :2] / img[:, 2:], intrinsics=camera)
+    got = answer(capsys, tmp_path / "skew.npz")
+    assert max(pair["reprojection_error_px"] for pair in got["pairs"]) < 1e-2
 
 
 def test_a_small_file_that_unpacks_to_gigabytes_is_refused(capsys, tmp_path, monkeypatch):
@@ -253,29 +241,35 @@ def test_export_takes_two_suffixes_and_overwrites_nothing(capsys, tmp_path, name
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"mine.onnx": "mine", "mine.pt2": "mine"}
 
 
-@pytest.mark.parametrize("camera", ["1,2,3", "1,2,3,x", "1,2,3,4,5", "0,800,320,240", "800,-1,320,240", "8,8,nan,2"])
-def test_bad_intrinsics(capsys, csv_file, camera):
-    assert refused(capsys, "solve", csv_file, f"--intrinsics={camera}").startswith("pnpnet: --intrinsics: ")
+BAD_CAMERAS = ("1,2,3", "1,2,3,x", "1,2,3,4,5", "0,800,320,240", "800,-1,320,240", "8,8,nan,2")
+PINHOLE = "PINHOLE,640,480,800,810,320,240"
 
 
-def test_wrong_n_and_wrong_solvers(capsys, csv_file, tmp_path, weights_folder):
+@pytest.mark.parametrize(
+    ("options", "culprit"),
+    [
+        *((f"--intrinsics={camera}", "pnpnet: --intrinsics: ") for camera in BAD_CAMERAS),
+        (f"--intrinsics {CAMERA} --camera {PINHOLE}", "--camera stands alone"),
+        ("--camera PINHOLE,640,480,800", "--camera: expected MODEL"),
+        (f"--intrinsics {CAMERA} --focal unknown --solver poselib", "does not estimate focal lengths"),
+        *((f"--solver {name}", name) for name in ("nobody", "tests")),
+        ("--solver opencv-ransac:speed=9", "speed"),
+        ("--solver opencv-ransac:refine=no", "refine"),
+        ("--solver known-inliers", "bound"),
+    ],
+)
+def test_bad_options_of_solve(capsys, csv_file, options, culprit):
+    known = [] if "--camera" in options or "--intrinsics" in options else ["--intrinsics", CAMERA]
+    assert culprit in refused(capsys, "solve", csv_file, *known, *options.split())
+
+
+def test_files_of_another_n_and_no_files(capsys, csv_file, tmp_path, weights_folder):
     for path in (tmp_path / "missing.csv", tmp_path):
         assert f"{path}: " in refused(capsys, "solve", path, "--intrinsics", CAMERA)
-    eight = tmp_path / "eight.csv"
-    eight.write_text("\n".join(csv_file.read_text().splitlines()[:-1]))
-    err = refused(capsys, "solve", eight, "--intrinsics", CAMERA, "--solver", weights_folder)
+    csv_file.write_text("\n".join(csv_file.read_text().splitlines()[:-1]))
+    err = refused(capsys, "solve", csv_file, "--intrinsics", CAMERA, "--solver", weights_folder)
     assert "n = 9" in err
     assert "N = 8" in err
-    (weights_folder / "config.json").write_text("{}")
-    for name, expected in {
-        "nobody": "nobody",
-        tmp_path: str(tmp_path),
-        weights_folder: "",
-        "opencv-ransac:speed=9": "speed",
-        "opencv-ransac:refine=no": "refine",
-        "known-inliers": "bound",
-    }.items():
-        assert expected in refused(capsys, "solve", csv_file, "--intrinsics", CAMERA, "--solver", name)
 
 
 @pytest.mark.parametrize(
@@ -325,39 +319,34 @@ def test_evaluate_writes_what_it_prints(capsys, tmp_path, shipped):
 def test_the_same_command_continues_and_another_is_refused(capsys, tmp_path):
     out_file = tmp_path / "results.json"
     common = ("evaluate", "--problems", 5, "--out", out_file, "--outliers", "none")
+    both = (*common, "--solver", "identity-lm", "known-inliers", "--n", "6,9")
     assert run(capsys, *common, "--solver", "identity-lm", "--n", "6")[0] == 0
-    before = load_results(out_file)["rows"]
-    code, out, err = run(capsys, *common, "--solver", "identity-lm", "known-inliers", "--n", "6,9")
+    (before,) = load_results(out_file)["rows"]
+    code, out, err = run(capsys, *both)
     assert (code, err) == (0, "")
     assert "1 of 4 rows" in out.splitlines()[-1]
     rows = load_results(out_file)["rows"]
-    assert rows[0] == before[0]
+    assert rows[0] == before
     assert [(row["data"], row["solver"]) for row in rows] == [
         (f"synthetic, n = {n}, 0 outliers", solver) for n in (6, 9) for solver in ("identity-lm", "known-inliers")
     ]
     content = out_file.read_bytes()
-    other = (*common, "--solver", "identity-lm", "known-inliers", "--n", "6,9", "--seed", 7)
-    assert str(out_file) in refused(capsys, *other)
+    assert str(out_file) in refused(capsys, *both, "--seed", 7)
     assert out_file.read_bytes() == content
-    assert run(capsys, *other, "--overwrite")[0] == 0
+    assert run(capsys, *both, "--seed", 7, "--overwrite")[0] == 0
     assert load_results(out_file)["data"]["synthetic, n = 6, 0 outliers"]["description"]["seed"] == 7
     out_file.write_text('{"format": 1, "rows": [{"data"')
     assert str(out_file) in refused(capsys, *common)
     assert out_file.read_text() == '{"format": 1, "rows": [{"data"'
 
 
-@pytest.mark.parametrize(
-    ("name", "command"),
-    [
-        ("evaluation.comparison.evaluate", "evaluate --problems 5 --solver identity-lm --out x"),
-        ("list_solvers", "list"),
-    ],
-)
-def test_interruptions_are_one_line(capsys, monkeypatch, name, command):
+@pytest.mark.parametrize("name", ["evaluation.comparison.evaluate", "list_solvers"])
+def test_interruptions_are_one_line(capsys, monkeypatch, name):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(f"kornia_pnpnet.{name}", interrupt)
+    command = "list" if name == "list_solvers" else "evaluate --problems 5 --solver identity-lm --out x"
     code, out, err = run(capsys, *command.split())
     assert (code, out, err.count("\n")) == (130, "", 1)
 
@@ -376,15 +365,10 @@ def test_solvers_for_another_n_are_skipped(capsys, tmp_path, weights_folder):
 
 
 def test_evaluate_accepts_scenes_options_and_folders(capsys, tmp_path, weights_folder):
-    world = np.random.default_rng(0).uniform((-2, -2, 4), (2, 2, 9), (30, 3))
-    img, view = (
-        world[:, :2] / world[:, 2:] * (800, 810) + (320, 240),
-        {"names": np.array(["a.jpg"]), "K": K.numpy()[None]},
-    )
-    view |= {"R": np.eye(3)[None], "t": np.zeros((1, 3)), "size": np.array([[640, 480]])}
-    pairs = {"000_world_points": world, "000_img_points": img, "000_error_px": np.zeros(30)}
-    matches = tmp_path / "scene.npz"
-    np.savez(matches, **view, **pairs)
+    world, matches = points(30), tmp_path / "scene.npz"
+    view = {"K": K.numpy()[None], "R": np.eye(3)[None], "t": np.zeros((1, 3)), "size": np.array([[640, 480]])}
+    pairs = {"000_world_points": world, "000_img_points": seen(world), "000_error_px": np.zeros(30)}
+    np.savez(matches, names=np.array(["a.jpg"]), **view, **pairs)
     out_file = tmp_path / "results.json"
     solvers = ("opencv-ransac:threshold=5,refine=false", str(weights_folder))
     common = ("evaluate", "--data", matches, "--outliers", "none,1", "--problems", 5, "--out", out_file)
@@ -432,26 +416,23 @@ def test_list_names_solvers_and_missing_packages(capsys, shipped, monkeypatch):
 
 def test_demo_compares_trains_and_draws(capsys, tmp_path, monkeypatch):
     pytest.importorskip("matplotlib")
-    asked = []
+    folder, durations = tmp_path / "demo", []
 
-    def train_briefly(seconds, folder):
-        asked.append((seconds, folder))
-        folder.mkdir(parents=True)
+    def train_briefly(seconds, history):
+        durations.append(seconds)
+        history.mkdir(parents=True)
         columns = "update,total,init_rotation,init_translation,refined_rotation,refined_translation,val/none/success"
-        (folder / "history.csv").write_text(f"{columns}\n1,1,1,1,1,1,0.25\n2,1,1,1,1,1,\n3,1,1,1,1,1,0.5\n")
-        return folder / "history.csv"
+        (history / "history.csv").write_text(f"{columns}\n1,1,1,1,1,1,0.25\n2,1,1,1,1,1,\n3,1,1,1,1,1,0.5\n")
+        return history / "history.csv"
 
     training = ModuleType("kornia_pnpnet.training.loop")
     training.train_briefly = train_briefly
     monkeypatch.setitem(sys.modules, "kornia_pnpnet.training.loop", training)
-    folder = tmp_path / "demo"
     code, out, err = run(capsys, "demo", "--out", folder, "--problems", 20, "--train-seconds", 3)
-    assert (code, err) == (0, "")
-    assert asked == [(3.0, folder / "training")]
+    assert (code, err, durations) == (0, "", [3.0])
     assert "25.0 % at update 1 -> 50.0 % at update 3" in out
     results = load_results(folder / "results.json")
     assert list(results["solvers"]) == ["pnpnet-set", "pnpnet-n9", "opencv-ransac", "poselib"]
-    assert {entry["dtype"] for entry in results["data"].values()} == {"float32"}
     assert out.count("| synthetic, n = 9, 0-3 outliers") == len(results["solvers"])
     for name in ("success", "errors", "problem", "training"):
         assert (folder / f"{name}.png").stat().st_size > 10_000
@@ -493,20 +474,15 @@ def test_solve_estimates_the_focal_length(capsys, csv_file):
     assert got["ok"]
     assert got["intrinsics"][0][0] == pytest.approx(800, rel=0.02)
     assert got["intrinsics"][1][1] == pytest.approx(1.0125 * got["intrinsics"][0][0])
-    told = answer(capsys, csv_file, "--focal", "0.1", "--intrinsics", "780,790,320,240")
-    assert told["intrinsics"][0][0] == pytest.approx(800, rel=0.02)
+    prior = answer(capsys, csv_file, "--focal", "0.1", "--intrinsics", "780,790,320,240")
+    assert prior["intrinsics"][0][0] == pytest.approx(800, rel=0.02)
     assert answer(capsys, csv_file, "--focal", "known", "--intrinsics", CAMERA)["intrinsics"] == K.tolist()
-    err = refused(capsys, "solve", csv_file, "--intrinsics", CAMERA, "--focal", "unknown", "--solver", "poselib")
-    assert "does not estimate focal lengths" in err
 
 
 def test_solve_takes_cameras_of_colmap(capsys, csv_file):
     plain = answer(capsys, csv_file, "--intrinsics", CAMERA)
-    pinhole = answer(capsys, csv_file, "--camera", "PINHOLE,640,480,800,810,320,240")
+    pinhole = answer(capsys, csv_file, "--camera", PINHOLE)
     assert pinhole["translation"] == pytest.approx(plain["translation"], abs=1e-6)
     radial = answer(capsys, csv_file, "--camera", "RADIAL,640,480,800,320,240,-0.05,0.01")
     assert radial["intrinsics"][0][0] == 800
     assert radial["translation"] != plain["translation"]
-    assert "--camera: expected MODEL" in refused(capsys, "solve", csv_file, "--camera", "PINHOLE,640,480,800")
-    err = refused(capsys, "solve", csv_file, "--camera", "PINHOLE,640,480,800,810,320,240", "--intrinsics", CAMERA)
-    assert "--camera stands alone" in err

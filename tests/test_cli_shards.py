@@ -20,17 +20,17 @@ from kornia_pnpnet.cli.shards import solve_shards  # noqa: E402
 NAMES = ("world_points", "img_points", "intrinsics")
 
 
-class Stopped(Solve):
-    """Stopped by the user after some tables."""
+class Watched(Solve):
+    """Notes the sizes of the tables; the user stops the solver after some tables."""
 
-    def __init__(self, name, after):
+    def __init__(self, name, after=100):
         super().__init__(name)
-        self.left = after
+        self.after, self.sizes = after, []
 
     def __call__(self, part):
-        if not self.left:
+        if len(self.sizes) == self.after:
             raise KeyboardInterrupt
-        self.left -= 1
+        self.sizes.append(len(part))
         return super().__call__(part)
 
 
@@ -71,16 +71,10 @@ def test_a_shard_is_read_in_batches_and_keeps_other_columns(shards, tmp_path, ma
     _, drawn = shards
     problems = pa.concat_tables([table(p) for p in drawn] + [table(make_problems(n=6, batch=2, dtype=torch.float32))])
     parquet.write_table(problems.append_column("id", pa.array(range(23))), tmp_path / "x.parquet")
-    batches = []
-
-    class Watched(Solve):
-        def __call__(self, part):
-            batches.append(len(part))
-            return super().__call__(part)
-
-    solve_shards(Watched("epnp-lm"), [tmp_path / "x.parquet"], tmp_path / "out", name="epnp-lm", batch=5)
+    solve = Watched("epnp-lm")
+    solve_shards(solve, [tmp_path / "x.parquet"], tmp_path / "out", name="epnp-lm", batch=5)
     found = parquet.read_table(tmp_path / "out" / "x.parquet")
-    assert batches == [5, 5, 5, 5, 3]
+    assert solve.sizes == [5, 5, 5, 5, 3]
     assert found.column_names == ["id", *OUTPUTS]
     assert found["id"].to_pylist() == [*range(23)]
 
@@ -89,7 +83,7 @@ def test_it_goes_on_with_the_first_shard_without_a_result(shards, solve, tmp_pat
     folder, _ = shards
     out = tmp_path / "out"
     with pytest.raises(KeyboardInterrupt):
-        solve_shards(Stopped("reppnp", after=2), [folder], out, name="reppnp")
+        solve_shards(Watched("reppnp", after=2), [folder], out, name="reppnp")
     assert sorted(x.name for x in out.iterdir()) == ["part0.parquet", "part1.parquet"]
     before = (out / "part0.parquet").stat().st_mtime_ns
     assert solve_shards(solve, [folder], out, name="reppnp")[2:] == (1, 2, [])
@@ -109,7 +103,7 @@ def test_results_of_another_solver_are_not_taken_for_its_own(shards, solve, tmp_
         solve_shards(other, [folder], out, name="reppnp")
 
     with pytest.raises(KeyboardInterrupt):
-        solve_shards(Stopped("pnpnet-n9", after=1), [folder], out, name="pnpnet-n9", overwrite=True)
+        solve_shards(Watched("pnpnet-n9", after=1), [folder], out, name="pnpnet-n9", overwrite=True)
     with pytest.raises(InputError, match="part1"):
         solve_shards(other, [folder], out, name="pnpnet-n9")
     assert solve_shards(other, [folder], out, name="pnpnet-n9", overwrite=True).shards == 3
@@ -121,13 +115,13 @@ def test_results_of_another_solver_are_not_taken_for_its_own(shards, solve, tmp_
 def test_a_shard_that_cannot_be_read_stops_no_other(shards, solve, tmp_path):
     folder, drawn = shards
     good = arrays(drawn[0])
-    points = {name: good[name] for name in NAMES[:2]}
+    world, img = good["world_points"], good["img_points"]
     bad = {
-        "b": {"world_points": good["world_points"]},
-        "c": good | {"img_points": good["img_points"][:5]},
-        "d": good | {"world_points": good["world_points"].astype(object)},
-        "e": points,
-        "f": good | {"world_points": good["world_points"].swapaxes(1, 2)},
+        "b": {"world_points": world},
+        "c": good | {"img_points": img[:5]},
+        "d": good | {"world_points": world.astype(object)},
+        "e": {"world_points": world, "img_points": img},
+        "f": good | {"world_points": world.swapaxes(1, 2)},
     }
     for name, content in bad.items():
         np.savez(folder / f"{name}.npz", **content)

@@ -86,7 +86,7 @@ def test_training_picture_reads_the_history(tmp_path, drawn):
     loss, success, *_ = drawn["a.png"].axes
     assert loss.lines[0].get_ydata() == pytest.approx([2 / i for i in range(1, 9)])
     assert pytest.approx(np.array([[i, 0.1 * i] for i in (2, 4, 6, 8)])) == np.array(success.lines[0].get_data()).T
-    for text, message in (("", "no rows"), (header, "no rows"), ("update\n1", "'total'")):
+    for text, message in (("", "header"), (header, "no rows"), ("update\n1", "total")):
         history.write_text(text)
         with pytest.raises(ValueError, match=message):
             plots.plot_training(tmp_path / "a.png", history)

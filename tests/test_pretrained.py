@@ -16,10 +16,13 @@ from kornia_pnpnet.training.card import write_model_card
 from kornia_pnpnet.training.results import load_run
 
 
-def rate(solver, problems):
+def solve(solver, problems):
     with torch.no_grad():
-        result = solver(problems.world_points, problems.img_points, problems.intrinsics)
-    return success_rate(success(pose_errors(result.pose, problems.pose))).rate
+        return solver(*problems[:3])
+
+
+def rate(solver, problems):
+    return success_rate(success(pose_errors(solve(solver, problems).pose, problems.pose))).rate
 
 
 # Success without outliers and with a random number of outliers: about two points below what the training run found.
@@ -83,12 +86,9 @@ def test_weights_of_the_set_network_are_inlier_probabilities():
 def test_sound_problems_are_ok_and_garbage_is_not(name, n):
     solver = create_solver(name)
     problems = SyntheticProblems(n=n, batch_size=500, seed=555_003).batch(0)
-    with torch.no_grad():
-        ok = solver(problems.world_points, problems.img_points, problems.intrinsics).ok
-        shuffled = problems.img_points.roll(1, 0)  # every pixel belongs to another problem
-        garbage = solver(problems.world_points, shuffled, problems.intrinsics).ok
-    assert ok.float().mean() > 0.99
-    assert garbage.float().mean() < 0.1
+    garbage = problems._replace(img_points=problems.img_points.roll(1, 0))  # every pixel belongs to another problem
+    assert solve(solver, problems).ok.float().mean() > 0.99
+    assert solve(solver, garbage).ok.float().mean() < 0.1
 
 
 @pytest.mark.parametrize("name", shipped_weights())

@@ -1,17 +1,15 @@
 """The command ``pnpnet``: one module per command.
 
-To add a command, write a module whose docstring is the command's help (the first line its summary), with
-``run(arguments)``, which returns the exit code. Register the module in :data:`COMMANDS`, and its arguments in
-:data:`kornia_pnpnet.cli.arguments.ARGUMENTS`.
-PyTorch takes seconds to import: modules of commands import what needs PyTorch inside ``run``, so that wrong arguments
-and missing files are reported at once.
+A command is a module in :data:`COMMANDS`. Its docstring is the help, and ``run(arguments)`` returns the exit code. The
+arguments are in :data:`kornia_pnpnet.cli.arguments.ARGUMENTS`.
+Modules of commands import PyTorch inside ``run``, because the import takes seconds: wrong arguments and missing files
+are reported at once.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-from types import ModuleType
 
 from kornia_pnpnet import __version__
 from kornia_pnpnet.cli import demo, evaluate, export, listing, solve
@@ -20,13 +18,7 @@ from kornia_pnpnet.cli.arguments import ARGUMENTS, OneLineParser
 __all__ = ["COMMANDS", "main", "make_parser"]
 
 #: All commands by name, in the order of ``pnpnet --help``.
-COMMANDS: dict[str, ModuleType] = {
-    "solve": solve,
-    "evaluate": evaluate,
-    "export": export,
-    "list": listing,
-    "demo": demo,
-}
+COMMANDS = {"solve": solve, "evaluate": evaluate, "export": export, "list": listing, "demo": demo}
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -54,32 +46,29 @@ def main(argv: list[str] | None = None) -> int:
     """
     try:
         arguments = make_parser().parse_args(argv)
-    except OSError as error:
-        return _failed(_one_line(error))
-    from kornia.core.exceptions import BaseError
+        from kornia_pnpnet.core.performance import keep_freed_memory
 
-    from kornia_pnpnet.core.performance import keep_freed_memory
-
-    keep_freed_memory()
-    try:
-        return COMMANDS[arguments.command].run(arguments)
-    except (BaseError, OSError, ImportError, ValueError) as error:
-        return _failed(_one_line(error))
-    except (MemoryError, RuntimeError) as error:
-        if not isinstance(error, MemoryError) and "allocate" not in str(error):
-            raise
-        return _failed(f"not enough memory for so much at once: {_one_line(error)}")
+        keep_freed_memory()
+        code: int = COMMANDS[arguments.command].run(arguments)
+        return code
     except KeyboardInterrupt:
-        return _failed("interrupted", 130)
+        print("pnpnet: interrupted", file=sys.stderr)
+        return 130
+    except Exception as error:
+        print(f"pnpnet: {_reason(error)}", file=sys.stderr)
+        return 2
 
 
-def _failed(reason: str, code: int = 2) -> int:
-    print(f"pnpnet: {reason}", file=sys.stderr)
-    return code
-
-
-def _one_line(error: Exception) -> str:
+def _reason(error: Exception) -> str:
+    """One line about an error of the input or of the machine; any other error is raised again."""
     if isinstance(error, OSError) and error.filename and error.strerror:
         return " ".join(f"{error.filename}: {error.strerror}".splitlines())  # file names may contain line breaks
-    notes = (f"({note})" for note in getattr(error, "__notes__", ()))
-    return " ".join(" ".join([str(error) or type(error).__name__, *notes]).split())
+    from kornia.core.exceptions import BaseError
+
+    notes = [f"({note})" for note in getattr(error, "__notes__", ())]
+    reason = " ".join(" ".join([str(error) or type(error).__name__, *notes]).split())
+    if isinstance(error, (BaseError, OSError, ImportError, ValueError)):
+        return reason
+    if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "allocate" in str(error)):
+        return f"not enough memory for so much at once: {reason}"
+    raise error

@@ -6,72 +6,68 @@ import argparse
 import math
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 if TYPE_CHECKING:
     from torch import nn
 
 __all__ = ["ARGUMENTS", "SYNTHETIC", "OneLineParser", "load_solver_without_truth"]
 
+_T = TypeVar("_T")
+
 #: Names of synthetic data for ``--data``.
 SYNTHETIC = ("synthetic", "gaussian_pose", "any_rotation", "slab", "mixed")
 
-_PICTURES = (".pdf", ".png", ".svg")
-
 
 class OneLineParser(argparse.ArgumentParser):
-    """A parser whose errors are one line, as all errors of ``pnpnet`` are, and that takes lists of negative numbers."""
+    """A parser that accepts lists of negative numbers and reports an error in one line."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self._negative_number_matcher = re.compile(r"-[\d.]")  # argparse takes "-1,2" for an option
+        self._negative_number_matcher = re.compile(r"-[\d.]")  # for argparse "-1,2" is an option
 
     def error(self, message: str) -> NoReturn:
         """Print the message in one line and exit with the code 2."""
         self.exit(2, f"pnpnet: {' '.join(message.split())} (see {self.prog} --help)\n")
 
 
-# -- types of arguments ------------------------------------------------------------------------------------------------
+def _checked(read: Callable[[str], _T], fits: Callable[[_T], bool], expected: str) -> Callable[[str], _T]:
+    """A parser with ``read``, which refuses values that do not fit."""
 
-
-def _whole(low: int, high: int = 10**8) -> Callable[[str], int]:
-    """A parser of integers from ``low`` to ``high``; more problems or pairs than the default fill no memory."""
-
-    def parse(text: str) -> int:
-        if not text.isdecimal() or not low <= int(text[:20]) <= high:
-            raise argparse.ArgumentTypeError(f"expected an integer from {low} to {high}, got {text!r}")
-        return int(text)
+    def parse(text: str) -> _T:
+        with suppress(ValueError):
+            value = read(text)
+            if fits(value):
+                return value
+        raise argparse.ArgumentTypeError(f"expected {expected}, got {text!r}")
 
     return parse
 
 
+def _whole(low: int, high: int = 10**8) -> Callable[[str], int]:
+    """A parser of integers. The default of ``high`` keeps a number of problems or pairs from filling the memory."""
+    return _checked(int, lambda value: low <= value <= high, f"an integer from {low} to {high}")
+
+
+_positive = _checked(float, lambda value: 0 < value < math.inf, "a positive number")
+_seconds = _checked(float, lambda value: 0 <= value < math.inf, "a number of at least 0")
+_picture = _checked(Path, lambda path: path.suffix.lower() in (".pdf", ".png", ".svg"), "a .pdf, .png or .svg file")
+
+
 def _counts(text: str) -> list[int]:
-    """Integers of at least 1 separated by commas, without duplicates."""
-    return list(dict.fromkeys(_whole(1)(part.strip()) for part in text.split(",")))
-
-
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"expected a positive number, got {text!r}")
-    return value
-
-
-def _seconds(text: str) -> float:
-    return 0.0 if text in ("0", "0.0") else _positive(text)
+    """Parse integers of at least 1, separated by commas, without duplicates."""
+    return list(dict.fromkeys(map(_whole(1), text.split(","))))
 
 
 def _focal(text: str) -> dict[str, Any]:
-    """Options of :class:`~kornia_pnpnet.PnPNet`."""
+    """Options of :class:`~kornia_pnpnet.PnPNet` for a focal length."""
     return {"focal": text} if text in ("known", "unknown") else {"focal": "unknown", "focal_sigma": _positive(text)}
 
 
 def _path(text: str) -> str:
-    """A file or a folder; ``OSError`` where there is none."""
+    """Return the path of a file or a folder; ``OSError`` when there is none."""
     Path(text).stat()
     return text
 
@@ -80,18 +76,8 @@ def _source(text: str) -> str:
     return text if text in SYNTHETIC else _path(text)
 
 
-def _picture(text: str) -> Path:
-    """A picture, whose ending gives the format."""
-    if Path(text).suffix.lower() not in _PICTURES:
-        raise argparse.ArgumentTypeError(f"expected a file ending in {', '.join(_PICTURES)}, got {text!r}")
-    return Path(text)
-
-
-# -- the table ---------------------------------------------------------------------------------------------------------
-
-
 def _arg(help_: str, metavar: str | None = None, **more: Any) -> dict[str, Any]:
-    """What argparse takes about an argument. Its help ends with its default."""
+    """Options of ``ArgumentParser.add_argument``. The help ends with the default."""
     return {"help": f"{help_}; default: %(default)s" if "default" in more else help_, "metavar": metavar, **more}
 
 
@@ -102,65 +88,41 @@ def _flag(help_: str) -> dict[str, Any]:
 _PROBLEMS = _arg("problems per set", "COUNT", type=_whole(1), default=1000)
 _UNIT = _flag("the scene is not in metres: success needs a translation error below 0.5 %% of the median depth")
 _SOLVER = _arg("a name of `pnpnet list`, or a folder of weights", "NAME", default="pnpnet-set")
+_MATCHES = """CSV with the header X,Y,Z,u,v and optionally weight, or NPZ with world_points (N, 3), img_points (N, 2)
+and optionally weights (N,) and intrinsics (3, 3)"""
+_CAMERA = """a distorted camera as in COLMAP's cameras.txt, in place of --intrinsics, for example
+SIMPLE_RADIAL,1920,1080,1500,960,540,-0.02; errors are those of undistorted pixels"""
+_FOCAL = "estimate the focal length; SIGMA: that of the intrinsics is right up to this fraction, such as 0.1"
+_THRESHOLD = """reject correspondences with a larger reprojection error; default: a robust estimate of three standard
+deviations, at least 3 px"""
+_SOLVERS = """names of `pnpnet list`, with options after a colon (opencv-ransac:threshold=12,iterations=100), or folders
+of weights; solvers for another n are skipped; default: all installed solvers for these n, and the bounds"""
+_DATA = f"{', '.join(SYNTHETIC)}, a folder with a COLMAP model, or an .npz file of matches; default: synthetic"
+_OUTLIERS = "none, uniform (0 to n/3 per problem), numbers or shares like 50%%, separated by commas"
+_MISMATCHES = "every outlier is the pixel of another point; default: half of the outliers, the others are random pixels"
+_DEMO_DATA = "a COLMAP model or an .npz file of matches instead of random problems"
+_DURATION = "approximate duration of the training; 0 skips the training"
 #: The arguments of each command.
 ARGUMENTS: dict[str, dict[str, dict[str, Any]]] = {
     "solve": {
-        "file": _arg(
-            "CSV with the header X,Y,Z,u,v and optionally weight, or NPZ with world_points (N, 3), img_points (N, 2) "
-            "and optionally weights (N,) and intrinsics (3, 3)",
-            "FILE",
-            nargs="+",
-            type=_path,
-        ),
+        "file": _arg(_MATCHES, "FILE", nargs="+", type=_path),
         "--intrinsics": _arg("the camera in pixels; replaces the intrinsics of an NPZ file", "fx,fy,cx,cy"),
-        "--camera": _arg(
-            "a distorted camera as in COLMAP's cameras.txt, in place of --intrinsics, for example "
-            "SIMPLE_RADIAL,1920,1080,1500,960,540,-0.02; errors are those of undistorted pixels",
-            "MODEL,w,h,PARAMS",
-        ),
-        "--focal": _arg(
-            "estimate the focal length; SIGMA: that of the intrinsics is right up to this fraction, such as 0.1",
-            "known|unknown|SIGMA",
-            type=_focal,
-        ),
+        "--camera": _arg(_CAMERA, "MODEL,w,h,PARAMS"),
+        "--focal": _arg(_FOCAL, "known|unknown|SIGMA", type=_focal),
         "--solver": _SOLVER,
         "--plot": _arg("draw pixels, reprojections and rejected correspondences", "PNG", type=_picture),
-        "--threshold": _arg(
-            "reject correspondences with a larger reprojection error; default: a robust estimate of three standard "
-            "deviations, at least 3 px",
-            "PX",
-            type=_positive,
-        ),
+        "--threshold": _arg(_THRESHOLD, "PX", type=_positive),
         "--batch": _flag("FILE are shards of many problems, or folders of shards"),
         "--out": _arg("where --batch writes poses; default: outputs/poses", "FOLDER"),
         "--batch-size": _arg("problems per call", "B", type=_whole(1), default=10_000),
         "--overwrite": _flag("replace the picture; with --batch also solve the shards that have results"),
     },
     "evaluate": {
-        "--solver": _arg(
-            "names of `pnpnet list`, with options after a colon (opencv-ransac:threshold=12,iterations=100), or "
-            "folders of weights; solvers for another n are skipped; default: all installed "
-            "solvers for these n, and the bounds",
-            "NAME",
-            nargs="+",
-            action="extend",
-        ),
-        "--data": _arg(
-            f"{', '.join(SYNTHETIC)}, a folder with a COLMAP model, or an .npz file of matches; default: synthetic",
-            "DATA",
-            nargs="+",
-            action="extend",
-            type=_source,
-        ),
+        "--solver": _arg(_SOLVERS, "NAME", nargs="+", action="extend"),
+        "--data": _arg(_DATA, "DATA", nargs="+", action="extend", type=_source),
         "--n": _arg("numbers of correspondences per problem, separated by commas", "LIST", type=_counts, default="9"),
-        "--outliers": _arg(
-            "none, uniform (0 to n/3 per problem), numbers or shares like 50%%, separated by commas",
-            "LIST",
-            default="none,uniform",
-        ),
-        "--mismatches-only": _flag(
-            "every outlier is the pixel of another point; default: half of the outliers, the others are random pixels"
-        ),
+        "--outliers": _arg(_OUTLIERS, "LIST", default="none,uniform"),
+        "--mismatches-only": _flag(_MISMATCHES),
         "--problems": _PROBLEMS,
         "--seed": _arg("of the problems; default: that of the published results", type=_whole(0, 2**63 - 1)),
         "--dtype": _arg("of the problems", choices=("float32", "float64"), default="float32"),
@@ -179,19 +141,17 @@ ARGUMENTS: dict[str, dict[str, dict[str, Any]]] = {
     },
     "list": {},
     "demo": {
-        "--data": _arg("a COLMAP model or an .npz file of matches instead of random problems", "FOLDER", type=_path),
+        "--data": _arg(_DEMO_DATA, "FOLDER", type=_path),
         "--arbitrary-unit": _UNIT,
         "--out": _arg("where results and pictures go", "FOLDER", default="outputs/demo"),
         "--problems": _PROBLEMS,
-        "--train-seconds": _arg(
-            "approximate duration of the training; 0 skips the training", "SECONDS", type=_seconds, default=60.0
-        ),
+        "--train-seconds": _arg(_DURATION, "SECONDS", type=_seconds, default=60.0),
     },
 }
 
 
 def load_solver_without_truth(name: str) -> nn.Module:
-    """Make the solver named by ``--solver``. Bounds need the true pose: the name of one raises a ``ValueError``."""
+    """Make the solver named by ``--solver``; ``ValueError`` for the name of a bound, which needs the true pose."""
     from kornia_pnpnet.evaluation.named_solvers import BOUNDS, load_solver
 
     if name.partition(":")[0] in BOUNDS:

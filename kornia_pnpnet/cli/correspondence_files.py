@@ -1,33 +1,31 @@
-"""Files of the correspondences of one image, CSV or NPZ, and the camera of the command line."""
+"""The correspondences of one image: files, cameras of the command line, and reprojection errors under a pose."""
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Collection
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from kornia.geometry.conversions import convert_points_from_homogeneous
+from kornia.geometry.linalg import transform_points
 from torch import Tensor
 
-from kornia_pnpnet.core.files import read_npz
+from kornia_pnpnet.core.files import InputError, read_csv, read_npz
+from kornia_pnpnet.problem import MIN_PAIRS
+from kornia_pnpnet.result import Pose
 
-__all__ = ["ImageCorrespondences", "InputError", "camera_matrix", "read_arrays", "read_correspondences"]
+__all__ = ["ImageCorrespondences", "InputError", "camera_matrix", "read_arrays", "read_correspondences", "reproject"]
 
 _COLUMNS = ("X", "Y", "Z", "u", "v")
-_MIN_COUNT = 3
 _ZIP_MAGIC = b"PK\x03\x04"
-
-
-class InputError(ValueError):
-    """A file or a camera cannot be used. The message is one line and names the file and, in text files, the line."""
-
-    def __init__(self, source: str | Path, message: str, line: int | None = None) -> None:
-        where = f"{source}:{line}" if line is not None else str(source)
-        super().__init__(f"{where}: {' '.join(message.split())}")
+# Ratio of the standard deviation of a normal distribution to its median absolute deviation.
+_MAD_TO_SIGMA = 1.4826
+# Lowest limit of a reprojection error in pixels: about three standard deviations of a corner detector's noise.
+_MIN_LIMIT_PX = 3.0
 
 
 class ImageCorrespondences(NamedTuple):
@@ -46,9 +44,9 @@ class ImageCorrespondences(NamedTuple):
     intrinsics: Tensor | None = None
 
     def undistorted(self, camera: str) -> ImageCorrespondences:
-        """With the pixels of the pinhole camera of COLMAP's ``MODEL,width,height,params...``.
+        """Replace the pixels of a camera of COLMAP, ``MODEL,width,height,params...``, by those of a pinhole camera.
 
-        A pixel that no ray of the camera has gets the weight 0.
+        A pixel without a ray gets the weight 0.
         """
         from kornia_pnpnet.data.colmap import undistort
 
@@ -72,7 +70,7 @@ def camera_matrix(text: str) -> Tensor:
 
 
 def _pinhole(matrix: Tensor, source: str | Path) -> Tensor:
-    """Return the matrix of a pinhole camera, scaled to end in 1; raise an :class:`InputError` for any other matrix."""
+    """Scale the matrix of a pinhole camera to end in 1; raise an :class:`InputError` for any other matrix."""
     if not matrix.isfinite().all():
         raise InputError(source, "the intrinsics are not finite")
     if matrix[1, 0] != 0 or matrix[2, :2].any() or matrix[2, 2] == 0:
@@ -92,52 +90,31 @@ def read_correspondences(path: str | Path) -> ImageCorrespondences:
             (N,) and ``intrinsics`` (3, 3).
     """
     path = Path(path)
-    content = path.read_bytes()
-    is_npz = path.suffix.lower() == ".npz" or content.startswith(_ZIP_MAGIC)
-    read = _read_npz(path) if is_npz else _read_csv(path, content)
-    if len(read.world_points) < _MIN_COUNT:
-        raise InputError(path, f"a pose needs at least {_MIN_COUNT} correspondences, got {len(read.world_points)}")
+    with path.open("rb") as file:
+        is_npz = path.suffix.lower() == ".npz" or file.read(len(_ZIP_MAGIC)) == _ZIP_MAGIC
+    read = _read_npz(path) if is_npz else _read_csv(path)
+    if len(read.world_points) < MIN_PAIRS:
+        raise InputError(path, f"a pose needs at least {MIN_PAIRS} correspondences, got {len(read.world_points)}")
     return read
 
 
-def _read_csv(path: Path, content: bytes) -> ImageCorrespondences:
-    try:
-        reader = csv.reader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True)
-    except UnicodeDecodeError as error:
-        raise InputError(path, "not a text file in UTF-8", content[: error.start].count(b"\n") + 1) from None
-    try:
-        lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
-    except csv.Error as error:
-        raise InputError(path, f"not a CSV file: {error}", reader.line_num) from None
-    (header_line, header), *rows = [(line, cells) for line, cells in lines if any(cells)] or [(1, [""])]
-    columns = [*_COLUMNS, *(["weight"] if "weight" in header else [])]
-    if any(header.count(column) != 1 for column in columns):
-        found = ",".join(header)[:60]
-        raise InputError(path, f"expected the header {','.join(_COLUMNS)}, each once, found {found!r}", header_line)
-    table = np.empty((len(rows), len(columns)))
-    for number, (line, cells) in enumerate(rows):
-        if len(cells) != len(header):
-            raise InputError(path, f"{len(cells)} values, but the header has {len(header)} columns", line)
-        named = dict(zip(header, cells, strict=True))
-        for index, column in enumerate(columns):
-            table[number, index] = value = _number(named[column])
-            least = 0.0 if column == "weight" else -math.inf
-            if not (math.isfinite(value) and value >= least):
-                wanted = "a number of at least 0" if column == "weight" else "a finite number"
-                raise InputError(path, f"{column} must be {wanted}, got {named[column][:40]!r}", line)
-    world_points, img_points, weights = torch.from_numpy(table).tensor_split((3, 5), 1)
-    return ImageCorrespondences(world_points, img_points, weights[:, 0] if "weight" in columns else None)
-
-
-def _number(cell: str) -> float:
-    try:
-        return float(cell)
-    except ValueError:
-        return math.nan
+def _read_csv(path: Path) -> ImageCorrespondences:
+    table: dict[str, list[float]] = {name: [] for name in (*_COLUMNS, "weight")}
+    for line, row in read_csv(path, _COLUMNS, optional=("weight",)).items():
+        for name in (name for name in table if name in row):
+            value = math.nan
+            with suppress(ValueError):
+                value = float(row[name])
+            if not math.isfinite(value) or (name == "weight" and value < 0):
+                wanted = "a number of at least 0" if name == "weight" else "a finite number"
+                raise InputError(path, f"{name} must be {wanted}, got {row[name][:40]!r}", line)
+            table[name].append(value)
+    x, y, z, u, v, weights = (torch.tensor(column, dtype=torch.float64) for column in table.values())
+    return ImageCorrespondences(torch.stack((x, y, z), 1), torch.stack((u, v), 1), weights if len(weights) else None)
 
 
 def _read_npz(path: Path) -> ImageCorrespondences:
-    arrays = read_arrays(path, ("world_points", "img_points", "weights", "intrinsics"))
+    arrays = read_arrays(path, ImageCorrespondences._fields)
     count = len(arrays["world_points"]) if arrays["world_points"].ndim else 0
     shapes = {"world_points": (count, 3), "img_points": (count, 2), "weights": (count,), "intrinsics": (3, 3)}
     tensors = {}
@@ -156,7 +133,7 @@ def _read_npz(path: Path) -> ImageCorrespondences:
 
 
 def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
-    """Read the arrays that the NPZ file ``path`` has, of which only the points must be there."""
+    """Read the arrays of these names that an NPZ file has. Both arrays of points must be there."""
     try:
         arrays = read_npz(path, names)
     except ValueError as error:
@@ -165,3 +142,25 @@ def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
         if name not in arrays:
             raise InputError(path, f"no array {name}")
     return arrays
+
+
+def reproject(
+    world_points: Tensor, img_points: Tensor, intrinsics: Tensor, pose: Pose, limit_px: float | None = None
+) -> tuple[Tensor, Tensor, float]:
+    """Compare the pixels (N, 2) of one image with the projections of its world points (N, 3) by a pose (1, ...).
+
+    Returns:
+        The projections (N, 2) and the reprojection errors (N,), both in pixels and NaN where a point is not in front
+        of the camera; and the largest error of a correspondence that is not rejected: ``limit_px``, or a robust
+        estimate of three standard deviations of the inliers, at least 3 px.
+    """
+    cam_points = transform_points(pose.matrix, world_points[None])[0]
+    in_front = cam_points[:, 2:] > 0
+    pixels = convert_points_from_homogeneous(torch.where(in_front, cam_points, 1.0) @ intrinsics.mT, eps=0.0)
+    pixels = torch.where(in_front, pixels, torch.nan)
+    errors = (pixels - img_points).norm(dim=-1)
+    if limit_px is None:
+        finite = errors[errors.isfinite()].double()
+        sigma = _MAD_TO_SIGMA * finite.quantile(0.5).item() if len(finite) else 0.0
+        limit_px = max(_MIN_LIMIT_PX, 3.0 * sigma)
+    return pixels, errors, limit_px

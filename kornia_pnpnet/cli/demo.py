@@ -8,7 +8,6 @@ The problems are random, without and with outliers. The demo prints a table, tra
 from __future__ import annotations
 
 import argparse
-import csv
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -27,7 +26,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Compare the solvers, draw, train; end with the :func:`verdict`."""
     import torch
 
-    from kornia_pnpnet.evaluation import evaluate, format_table, save_results
+    from kornia_pnpnet.evaluation import evaluate, format_table
     from kornia_pnpnet.evaluation.named_solvers import default_solvers, load_solver
     from kornia_pnpnet.evaluation.plots import plot_errors, plot_success, plot_training
     from kornia_pnpnet.evaluation.problem_sets import evaluation_sets
@@ -38,13 +37,11 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"pnpnet: the demo runs without {missing}, which is not installed", file=sys.stderr)
     sets = evaluation_sets(sources, "none,2" if arguments.data else "none,uniform", n=_N, count=count, metric=metric)
     solvers = {specs[name]: load_solver(specs[name]) for name in _SOLVERS if name in specs}
-    # The tensors are small: more threads gain nothing, and lose much when another process computes at the same time.
-    torch.set_num_threads(1)
+    torch.set_num_threads(1)  # more threads gain nothing with small tensors
     print(f"{count} problems of {_N} correspondences in each set, one thread:\n", flush=True)
-    results = evaluate(solvers, sets)
-    print(format_table(results), flush=True)
     folder = Path(arguments.out)
-    save_results(results, folder / "results.json")
+    results = evaluate(solvers, sets, path=folder / "results.json", overwrite=True)
+    print(format_table(results), flush=True)
     files = [plot_success(folder / "success.png", results), plot_errors(folder / "errors.png", results)]
     files.append(_draw_one(folder / "problem.png", *next(iter(solvers.items())), list(sets.values())[-1]))
     history = _train(arguments.train_seconds, folder / "training") if arguments.train_seconds > 0 else None
@@ -56,30 +53,30 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def verdict(results: Mapping[str, Any]) -> str:
-    """One sentence on the solvers that solved the most problems of each set, and on the fastest one.
+    """Name the solvers that solved the most problems of each set, and the fastest solver, in one sentence.
 
     Solvers whose 95 % interval contains the highest success rate share the first place.
     """
     sentences = []
     for data in results["data"]:
-        rows = {
-            f"{row['solver']} ({100 * row['success']['rate']:.1f} %, {row['us_per_problem']:.0f} µs per problem)": row
-            for row in results["rows"]
-            if row["data"] == data
-        }
-        best = max(row["success"]["rate"] for row in rows.values())
-        most = [text for text, row in rows.items() if row["success"]["high"] >= best]
-        fastest = min(rows, key=lambda text: rows[text]["us_per_problem"])
+        rows = [row for row in results["rows"] if row["data"] == data]
+        best = max(row["success"]["rate"] for row in rows)
+        most = [_result(row) for row in rows if row["success"]["high"] >= best]
+        fastest = _result(min(rows, key=lambda row: row["us_per_problem"]))
         second = "was" if most == [fastest] else f"{fastest} was"
         sentences.append(f'on "{data}", {" and ".join(most)} solved the most problems and {second} the fastest')
     return f"In short: {'; '.join(sentences)}."
 
 
+def _result(row: Mapping[str, Any]) -> str:
+    return f"{row['solver']} ({100 * row['success']['rate']:.1f} %, {row['us_per_problem']:.0f} µs per problem)"
+
+
 def _draw_one(path: Path, name: str, solver: nn.Module, entry: EvaluationData) -> Path:
-    """Draw the first one of the problems with the most outliers, so that the picture is not a selected success."""
+    """Draw the first problem with the most outliers: the choice does not depend on success."""
     import torch
 
-    from kornia_pnpnet.cli.reprojection import reproject
+    from kornia_pnpnet.cli.correspondence_files import reproject
     from kornia_pnpnet.evaluation.plots import plot_pose
 
     outliers = (~entry.problems.inliers).sum(-1)
@@ -87,12 +84,14 @@ def _draw_one(path: Path, name: str, solver: nn.Module, entry: EvaluationData) -
     world_points, img_points, intrinsics = (x[index] for x in entry.problems[:3])
     with torch.no_grad():
         pose = solver(world_points[None], img_points[None], intrinsics[None]).pose
-    found = reproject(world_points, img_points, intrinsics, pose)
-    return plot_pose(path, img_points, found.pixels, found.rejected, f"{name}, {int(outliers[index])} outliers")
+    pixels, errors, limit = reproject(world_points, img_points, intrinsics, pose)
+    return plot_pose(path, img_points, pixels, ~(errors <= limit), f"{name}, {int(outliers[index])} outliers")
 
 
 def _train(seconds: float, folder: Path) -> Path | None:
     """Train briefly and print the success rate before and after; ``None`` without the packages for training."""
+    from kornia_pnpnet.core.files import read_csv
+
     try:
         from kornia_pnpnet.training.loop import train_briefly
     except ImportError as error:
@@ -100,7 +99,7 @@ def _train(seconds: float, folder: Path) -> Path | None:
         return None
     print(f"\nTraining a new network for about {seconds:.0f} s:", flush=True)
     history = train_briefly(seconds, folder)
-    rows = list(csv.DictReader(history.read_text().splitlines()))
+    rows = list(read_csv(history, ["update"]).values())
     for column in rows[0]:
         filled = [row for row in rows if row[column]]
         if filled and column.startswith("val/") and column.endswith("/success"):

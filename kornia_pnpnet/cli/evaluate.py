@@ -45,9 +45,9 @@ def run(arguments: argparse.Namespace) -> int:
     if not results["rows"]:
         raise ValueError(f"no solver accepts these problems: {results['left_out'][0]['reason']}")
     for solver in solvers:
-        given = [entry["reason"] for entry in results["left_out"] if entry["solver"] == solver]
-        if given:
-            print(f"pnpnet: {solver} is skipped on {len(given)} of {len(sets)} sets: {given[0]}", file=sys.stderr)
+        reasons = [entry["reason"] for entry in results["left_out"] if entry["solver"] == solver]
+        if reasons:
+            print(f"pnpnet: {solver} is skipped on {len(reasons)} of {len(sets)} sets: {reasons[0]}", file=sys.stderr)
     print(format_table(results))
     print(f"\nResults: {out}" + (f" ({found} of {len(results['rows'])} rows were there)" if found else ""))
     if arguments.plot:

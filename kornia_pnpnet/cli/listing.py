@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 
-#: What each solver is, by the beginning of its name; the longest beginning counts.
+#: What each solver is, by the longest prefix of its name.
 _WHAT = {
     "pnpnet-set": "network over any number of pairs, then learned LM: the default",
     "pnpnet-n": "the paper's network for that number of pairs, then learned LM; camera near the world's axes",
@@ -37,7 +37,7 @@ def run(_: argparse.Namespace) -> int:
     for name in list_solvers():
         package = missing_package(name)
         missing = f" (needs {package}: pip install 'kornia_pnpnet[eval]')" if package else ""
-        states[name] = _WHAT[max((start for start in _WHAT if name.startswith(start)), key=len)] + missing
+        states[name] = _WHAT[max(filter(name.startswith, _WHAT), key=len)] + missing
     states |= dict.fromkeys(BOUNDS, "bound: needs the true pose, for `pnpnet evaluate` only")
     for name, state in states.items():
         print(f"{name:<{max(map(len, states))}}  {state}")

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import ExitStack, nullcontext, suppress
 from importlib.util import find_spec
-from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,8 +15,8 @@ from kornia.core.exceptions import BaseError
 from pyarrow import compute, parquet
 
 from kornia_pnpnet.arrow import INPUTS, Solve, list_column
-from kornia_pnpnet.cli.correspondence_files import InputError, read_arrays
-from kornia_pnpnet.core.files import atomic_open, digest
+from kornia_pnpnet.cli.correspondence_files import read_arrays
+from kornia_pnpnet.core.files import InputError, atomic_open, digest
 
 __all__ = ["SUFFIXES", "ShardReport", "solve_shards"]
 
@@ -27,12 +25,12 @@ SUFFIXES = (".npz", ".parquet")
 
 # Metadata of a results file: the name of the solver and the digest of its parameters.
 _SOLVER = b"kornia_pnpnet.solver"
-# Numbers of a Parquet file that are read at once, 256 MB in float64: where problems are large, a batch has fewer.
+# Numbers that are read from a Parquet file at once, 256 MB in float64. A batch of large problems has fewer rows.
 _NUMBERS_AT_ONCE = 2**25
 
 
 class ShardReport(NamedTuple):
-    """Numbers of problems with a pose, of all problems, of shards that were solved and that had results before.
+    """Numbers of solved problems, of all problems, of shards that were solved, and of shards that had results before.
 
     ``failed`` has a line for each shard that cannot be read.
     """
@@ -56,10 +54,10 @@ def solve_shards(
 ) -> ShardReport:
     r"""Solve shards of problems one after the other, and write the results of ``part.*`` to ``part.parquet``.
 
-    A shard is a Parquet file with one problem per row and the columns of :class:`~kornia_pnpnet.arrow.Solve`, of which
-    ``batch`` rows are read at a time. Or it is an NPZ file, read as a whole, with ``world_points`` (B, N, 3),
-    ``img_points`` (B, N, 2) and optionally ``intrinsics`` (3, 3) or (B, 3, 3), ``weights`` (B, N), and ``img_sigma``
-    and ``world_sigma``, each a number, (B,) or (B, N).
+    A Parquet shard has one problem per row and the columns of :class:`~kornia_pnpnet.arrow.Solve`; ``batch`` rows are
+    read at a time. An NPZ shard is read as a whole. It has ``world_points`` (B, N, 3), ``img_points`` (B, N, 2) and
+    optionally ``intrinsics`` (3, 3) or (B, 3, 3), ``weights`` (B, N), and ``img_sigma`` and ``world_sigma``, each a
+    number, (B,) or (B, N).
 
     A results file gets its name when it is complete, so a run that was stopped can be repeated: shards with results
     are skipped. A shard that cannot be read is reported, and the other shards are solved.
@@ -78,80 +76,79 @@ def solve_shards(
             or a shard has results of another solver.
         OSError: when the results cannot be written.
     """
-    targets = {Path(out) / f"{shard.stem}.parquet": shard for shard in _find(sources, Path(out))}
     state = sorted(solve.solver.state_dict().items())
     mark = json.dumps({"name": name, "parameters": digest(*(part for item in state for part in item))}).encode()
-    waiting = {target: shard for target, shard in targets.items() if overwrite or not target.exists()}
-    for target in targets:
-        if target not in waiting and _solver_of(target) != mark:
+    waiting, kept = {}, 0
+    for stem, shard in _find(sources, Path(out)).items():
+        target = Path(out) / f"{stem}.parquet"
+        if overwrite or not target.exists():
+            waiting[target] = shard
+        elif _solver_of(target) == mark:
+            kept += 1
+        else:
             raise InputError(target, f"not of this {name}: choose another folder, or replace it with --overwrite")
-    counts, failed = [], []
+    counts, failed = [(0, 0)], []
     with _bar(waiting.values(), progress) as bar:
         for target, shard in waiting.items():
             try:
                 counts.append(_solve_shard(solve, shard, target, mark, batch, bar))
             except InputError as error:
                 failed.append(str(error))
-    solved, problems = (sum(numbers) for numbers in zip((0, 0), *counts, strict=True))
-    return ShardReport(solved, problems, len(counts), len(targets) - len(waiting), failed)
+    solved, problems = map(sum, zip(*counts, strict=True))
+    return ShardReport(solved, problems, len(waiting) - len(failed), kept, failed)
 
 
-def _find(sources: Sequence[str | Path], out: Path) -> list[Path]:
-    """All shards in the order of the sources, those of a folder by name."""
+def _find(sources: Sequence[str | Path], out: Path) -> dict[str, Path]:
+    """All shards by the stem of their names, in the order of the sources; those of a folder by name."""
     shards: dict[str, Path] = {}
+    endings = " or ".join(SUFFIXES)
     for source in map(Path, sources):
         found = sorted(x for x in source.iterdir() if x.suffix in SUFFIXES) if source.is_dir() else [source]
         if not found:
-            raise InputError(source, f"no {' or '.join(SUFFIXES)} file in this folder")
+            raise InputError(source, f"no {endings} file in this folder")
         for shard in found:
             if shard.suffix not in SUFFIXES:
-                raise InputError(shard, f"the name of a shard must end in {' or '.join(SUFFIXES)}")
+                raise InputError(shard, f"the name of a shard must end in {endings}")
             if not shard.is_file():
                 raise InputError(shard, "no such file")
             if shard.resolve().parent == out.resolve():
                 raise InputError(shard, "the results would lie among the shards: choose another folder")
             if shards.setdefault(shard.stem, shard) != shard:
                 raise InputError(shard, f"its results would have the name of those of {shards[shard.stem]}")
-    return list(shards.values())
+    return shards
 
 
 def _solver_of(target: Path) -> bytes | None:
-    """What a results file says of its solver; ``None`` when it is no results file."""
-    try:
+    """The solver that a results file names; ``None`` when the file is no results file."""
+    with suppress(pa.ArrowException, OSError):
         return (parquet.read_schema(target).metadata or {}).get(_SOLVER)
-    except (pa.ArrowException, OSError):
-        return None
+    return None
 
 
 def _bar(shards: Iterable[Path], shown: bool) -> Any:
     """A progress bar over the problems of shards, or a context without one."""
-    if not shown or not sys.stderr.isatty() or find_spec("tqdm") is None:
+    if not shown or find_spec("tqdm") is None:
         return nullcontext()
     from tqdm import tqdm
 
-    total = None  # of NPZ files, and where a file cannot be read
+    total = None  # unknown with NPZ files, and with files that cannot be read
     with suppress(OSError, pa.ArrowException):
         total = sum(parquet.read_metadata(shard).num_rows for shard in shards)
-    return tqdm(total=total, unit="problem", unit_scale=True)
+    return tqdm(total=total, unit="problem", unit_scale=True, disable=None)  # None: disabled without a terminal
 
 
 def _solve_shard(solve: Solve, shard: Path, target: Path, mark: bytes, batch: int, bar: Any) -> tuple[int, int]:
     """Solve a shard; return the number of solved problems and of all problems."""
-
-    def solved_tables() -> Iterator[pa.Table]:
-        for table in _tables(shard, batch):
+    solved, count, writer = 0, 0, None
+    with atomic_open(target, "wb") as file, ExitStack() as stack:
+        for table in _tables_of_arrays(shard, batch) if shard.suffix == ".npz" else _tables_of_parquet(shard, batch):
             try:
-                yield solve(table)
+                result = solve(table)
             except (BaseError, TypeError, pa.ArrowException) as error:  # a column is missing or not for this solver
                 raise InputError(shard, str(error)) from None
-
-    results = solved_tables()
-    first, solved, count = next(results), 0, 0
-    with (
-        atomic_open(target, "wb") as file,
-        parquet.ParquetWriter(file, first.schema.with_metadata({_SOLVER: mark})) as writer,
-    ):
-        for result in chain([first], results):
+            if writer is None:
+                schema = result.schema.with_metadata({_SOLVER: mark})
+                writer = stack.enter_context(parquet.ParquetWriter(file, schema))
             writer.write_table(result)
             solved, count = solved + (compute.sum(result["ok"]).as_py() or 0), count + len(result)
             if bar is not None:
@@ -159,11 +156,8 @@ def _solve_shard(solve: Solve, shard: Path, target: Path, mark: bytes, batch: in
     return solved, count
 
 
-def _tables(shard: Path, batch: int) -> Iterator[pa.Table]:
-    """Tables of at most ``batch`` problems of a shard, at least one table."""
-    if shard.suffix == ".npz":
-        yield from _tables_of_arrays(shard, batch)
-        return
+def _tables_of_parquet(shard: Path, batch: int) -> Iterator[pa.Table]:
+    """Tables of at most ``batch`` rows of a Parquet file, at least one table."""
     try:
         # With pre_buffer Arrow reads ahead to the end of the file, and without buffer_size a row group at once.
         with parquet.ParquetFile(shard, pre_buffer=False, buffer_size=1 << 20) as file:
@@ -178,14 +172,14 @@ def _tables(shard: Path, batch: int) -> Iterator[pa.Table]:
 
 
 def _tables_of_arrays(shard: Path, batch: int) -> Iterator[pa.Table]:
-    """Tables of the problems of an NPZ file."""
+    """Tables of at most ``batch`` problems of an NPZ file, at least one table."""
     arrays = read_arrays(shard, INPUTS)
     for name, size in (("world_points", 3), ("img_points", 2)):
         if arrays[name].ndim != 3 or arrays[name].shape[2] != size:
             raise InputError(shard, f"{name} must be of the shape (B, N, {size}), got {arrays[name].shape}")
     count = len(arrays["world_points"])
     for name, shape in (("intrinsics", (3, 3)), ("img_sigma", ()), ("world_sigma", ())):
-        if name in arrays and arrays[name].shape == shape:  # of all problems
+        if name in arrays and arrays[name].shape == shape:  # one for all problems
             arrays[name] = np.broadcast_to(arrays[name], (count, *shape))
     for start in range(0, max(count, 1), batch):
         try:

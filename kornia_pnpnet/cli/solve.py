@@ -24,7 +24,6 @@ import argparse
 import json
 import math
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kornia_pnpnet.cli.arguments import load_solver_without_truth
@@ -43,17 +42,6 @@ _ADVICE = {
 }
 
 
-def _load_solver(arguments: argparse.Namespace) -> nn.Module:
-    from kornia_pnpnet.solver import PnPNet
-
-    solver = load_solver_without_truth(arguments.solver)
-    if not arguments.focal:
-        return solver
-    if not isinstance(solver, PnPNet):
-        raise ValueError(f"--focal: {arguments.solver} does not estimate focal lengths")
-    return solver.with_options(**arguments.focal).eval()
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Solve one image or, with ``--batch``, shards."""
     from kornia_pnpnet.cli.correspondence_files import camera_matrix
@@ -66,6 +54,17 @@ def run(arguments: argparse.Namespace) -> int:
         raise ValueError("several files and --out need --batch")
     camera = camera_matrix(arguments.intrinsics) if arguments.intrinsics else None
     return _solve_batch(arguments, camera) if arguments.batch else _solve_image(arguments, camera)
+
+
+def _load_solver(arguments: argparse.Namespace) -> nn.Module:
+    from kornia_pnpnet.solver import PnPNet
+
+    solver = load_solver_without_truth(arguments.solver)
+    if not arguments.focal:
+        return solver
+    if not isinstance(solver, PnPNet):
+        raise ValueError(f"--focal: {arguments.solver} does not estimate focal lengths")
+    return solver.with_options(**arguments.focal).eval()
 
 
 def _solve_batch(arguments: argparse.Namespace, camera: Tensor | None) -> int:
@@ -91,29 +90,28 @@ def _solve_image(arguments: argparse.Namespace, camera: Tensor | None) -> int:
     import torch
 
     from kornia_pnpnet import Status
-    from kornia_pnpnet.cli.correspondence_files import InputError, read_correspondences
-    from kornia_pnpnet.cli.reprojection import reproject
+    from kornia_pnpnet.cli.correspondence_files import InputError, read_correspondences, reproject
 
-    (path,) = arguments.file
+    (path,), name, plot = arguments.file, arguments.solver, arguments.plot
     matches = read_correspondences(path)
     if arguments.camera:
         matches = matches.undistorted(arguments.camera)
-    camera = matches.intrinsics if camera is None else camera
+    world_points, img_points, weights, camera_of_file = matches
+    camera = camera_of_file if camera is None else camera
     if camera is None:
         raise InputError(path, "the file has no intrinsics: pass --intrinsics fx,fy,cx,cy")
-    if arguments.plot and Path(arguments.plot).exists() and not arguments.overwrite:
-        raise ValueError(f"'{arguments.plot}' exists: pass --overwrite to replace it")
-    solver, name = _load_solver(arguments), arguments.solver
-    weights = None if matches.weights is None else matches.weights[None]
+    if plot and plot.exists() and not arguments.overwrite:
+        raise ValueError(f"'{plot}' exists: pass --overwrite to replace it")
+    solver, weights = _load_solver(arguments), None if weights is None else weights[None]
     with torch.no_grad():
-        result = solver(matches.world_points[None], matches.img_points[None], camera[None], weights)
+        result = solver(world_points[None], img_points[None], camera[None], weights)
     camera, ok, status = result.intrinsics[0], bool(result.ok), Status(int(result.status)).name.lower()
-    found = reproject(matches.world_points, matches.img_points, camera, result.pose, arguments.threshold)
-    rejected = found.rejected if ok else torch.ones_like(found.rejected)  # without a pose no pair is accepted
-    pairs = zip(*(x.tolist() for x in (result.weights[0], found.errors_px, rejected)), strict=True)
+    pixels, errors, limit = reproject(world_points, img_points, camera, result.pose, arguments.threshold)
+    rejected = ~(errors <= limit) | ~result.ok  # without a pose every correspondence is rejected
+    pairs = zip(result.weights[0].tolist(), errors.tolist(), rejected.tolist(), strict=True)
     answer = {
         "solver": name,
-        "n": len(matches.world_points),
+        "n": len(world_points),
         "ok": ok,
         "status": status,
         "rotation": result.rotation[0].tolist(),
@@ -121,18 +119,17 @@ def _solve_image(arguments: argparse.Namespace, camera: Tensor | None) -> int:
         "quaternion_wxyz": result.pose.quaternion[0].tolist(),
         "intrinsics": camera.tolist(),
         "cost": result.cost.item(),
-        "rejected_above_px": found.limit_px,
+        "rejected_above_px": limit,
         "pairs": [
             {"weight": weight, "reprojection_error_px": error if math.isfinite(error) else None, "rejected": bad}
             for weight, error, bad in pairs
         ],
     }
     print(json.dumps(answer, indent=2, allow_nan=False))
-    if arguments.plot:
+    if plot:
         from kornia_pnpnet.evaluation.plots import plot_pose
 
-        title = name if ok else f"{name}: NOT SOLVED"
-        plot_pose(arguments.plot, matches.img_points, found.pixels, rejected, title)
+        plot_pose(plot, img_points, pixels, rejected, name if ok else f"{name}: NOT SOLVED")
     if not ok:
         print(f"pnpnet: not solved ({status}): {_ADVICE[status]}", file=sys.stderr)
     return 0 if ok else 1

@@ -27,14 +27,12 @@ class Configured(nn.Module):
 
     def __init__(self, arguments: Mapping[str, Any]) -> None:
         super().__init__()
-        values = {name: value for name, value in arguments.items() if name not in ("self", "__class__")}
-        self.config = {name: _plain(value) for name, value in values.items() if not isinstance(value, nn.Module)}
+        self.config: dict[str, Any] = {}
+        for name, value in arguments.items():
+            if name not in ("self", "__class__") and not isinstance(value, nn.Module):
+                is_numpys = isinstance(value, Integral) and not isinstance(value, bool)  # JSON takes Python's integers
+                self.config[name] = int(value) if is_numpys else value
 
     def extra_repr(self) -> str:
         """Show the arguments of the constructor."""
         return ", ".join(f"{name}={value!r}" for name, value in self.config.items())
-
-
-def _plain(value: Any) -> Any:
-    """NumPy's integers as Python's, which JSON can hold."""
-    return int(value) if isinstance(value, Integral) and not isinstance(value, bool) else value

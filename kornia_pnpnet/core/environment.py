@@ -14,10 +14,9 @@ import torch
 
 __all__ = ["environment"]
 
-# Distributions that contain each package, the most common first.
-_OPENCV = tuple(f"opencv-{kind}" for kind in ("python-headless", "python", "contrib-python-headless", "contrib-python"))
-_PACKAGES: dict[str, tuple[str, ...]] = {name: (name,) for name in ("kornia_pnpnet", "torch", "kornia", "numpy")}
-_PACKAGES |= {"opencv": _OPENCV, **{name: (name,) for name in ("kornia_rs", "poselib", "pycolmap")}}
+_PACKAGES = ("kornia_pnpnet", "torch", "kornia", "numpy", "opencv", "kornia_rs", "poselib", "pycolmap")
+# Distributions of OpenCV, the most common first.
+_OPENCV = ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python")
 
 
 def environment() -> dict[str, Any]:
@@ -29,7 +28,7 @@ def environment() -> dict[str, Any]:
         ``None``: outside a checkout) and the ``date`` in UTC.
     """
     return {
-        "versions": {name: _version(*distributions) for name, distributions in _PACKAGES.items()},
+        "versions": {name: _version(name) for name in _PACKAGES},
         "python": platform.python_version(),
         "platform": platform.platform(),
         "cpu": _cpu_name(),
@@ -40,8 +39,8 @@ def environment() -> dict[str, Any]:
     }
 
 
-def _version(*distributions: str) -> str | None:
-    for name in distributions:
+def _version(package: str) -> str | None:
+    for name in _OPENCV if package == "opencv" else (package,):
         with suppress(metadata.PackageNotFoundError):
             return metadata.version(name)
     return None
@@ -57,13 +56,11 @@ def _cpu_name() -> str:
 def _commit() -> str | None:
     """The commit of the checkout that this file belongs to, not of a checkout with an installed copy."""
     root = Path(__file__).resolve().parents[2]
-
-    def git(*arguments: str) -> str:
-        command = ["git", "-C", str(root), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
-
-    with suppress(OSError, subprocess.SubprocessError):
-        if Path(git("rev-parse", "--show-toplevel")).resolve() == root:
-            changed = git("status", "--porcelain", "--untracked-files=no")
-            return git("rev-parse", "HEAD") + ("+" if changed else "")
+    git = ["git", "-C", str(root)]
+    with suppress(OSError, ValueError, subprocess.SubprocessError):
+        top, commit = subprocess.check_output(
+            [*git, "rev-parse", "--show-toplevel", "HEAD"], text=True, stderr=subprocess.DEVNULL, timeout=10
+        ).splitlines()
+        changed = subprocess.check_output([*git, "status", "--porcelain", "--untracked-files=no"], timeout=10)
+        return commit + "+" * bool(changed) if Path(top).resolve() == root else None
     return None

@@ -15,8 +15,8 @@ def markdown_table(
     Args:
         header: titles of the columns.
         rows: cells of each row, one for each column.
-        align: one letter for each column, ``l`` (left) or ``r`` (right); ``None``: only the first one to the left.
-        pad: fill the cells with spaces so that the columns also line up as plain text, for a terminal.
+        align: ``l`` (left) or ``r`` (right) for each column; ``None``: the first column to the left, others right.
+        pad: fill the cells with spaces, so that the columns line up in a terminal.
 
     Example:
         >>> print(markdown_table(["solver", "µs"], [["epnp", "7"], ["p3p-ransac", "120"]], pad=True))
@@ -25,14 +25,11 @@ def markdown_table(
         | epnp       |   7 |
         | p3p-ransac | 120 |
     """
-    align = align or "l" + "r" * (len(header) - 1)
     lines = [list(header), *map(list, rows)]
     widths = [max(2, *map(len, column)) if pad else 0 for column in zip(*lines, strict=True)]
-    sides = [str.rjust if side == "r" else str.ljust for side in align]
-    texts = [
-        f"| {' | '.join(side(cell, width) for cell, side, width in zip(line, sides, widths, strict=True))} |"
-        for line in lines
-    ]
-    ends = zip(("---:" if side == "r" else "---" for side in align), widths, strict=True)
-    rule = "|".join(end.rjust(width + 2, "-") for end, width in ends)
-    return "\n".join([texts[0], f"|{rule}|", *texts[1:]])
+    columns = list(zip(align or "l" + "r" * (len(header) - 1), widths, strict=True))
+    rule = ("---:".rjust(width + 2, "-") if side == "r" else "---".ljust(width + 2, "-") for side, width in columns)
+    for i, line in enumerate(lines):
+        cells = zip(line, columns, strict=True)
+        lines[i] = [f" {cell.rjust(width) if side == 'r' else cell.ljust(width)} " for cell, (side, width) in cells]
+    return "\n".join(f"|{'|'.join(line)}|" for line in [lines[0], rule, *lines[1:]])

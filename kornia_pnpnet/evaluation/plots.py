@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from kornia_pnpnet.core.schema import read_column, read_rows
+from kornia_pnpnet.core.files import read_csv
 from kornia_pnpnet.evaluation.results import row_errors
 
 try:
@@ -141,18 +141,24 @@ def _panels(results: Mapping[str, Any]) -> tuple[dict[str, list[Mapping[str, Any
 @themed
 def plot_training(path: str | Path, history_csv: str | Path) -> Path:
     """Draw loss, distances and success (columns ``val/<set>/success``) of a training against ``update``."""
-    rows = read_rows(history_csv)
+    distances = [[f"{stage}_{part}" for stage in ("init", "refined")] for part in ("rotation", "translation")]
+    rows = list(read_csv(history_csv, ["update", "total", *distances[0], *distances[1]]).values())
+    if not rows:
+        raise ValueError(f"'{history_csv}' has no rows.")
     success = [name for name in rows[0] if name.startswith("val/") and name.endswith("/success")]
     panels = (
         ("training loss (refined terms ramp in)", ["total"]),
         ("validation success", success),
-        ("rotation distance ‖R̂ − R‖", ["init_rotation", "refined_rotation"]),
-        ("translation distance ‖t̂ − t‖", ["init_translation", "refined_translation"]),
+        ("rotation distance ‖R̂ − R‖", distances[0]),
+        ("translation distance ‖t̂ − t‖", distances[1]),
     )
     figure = make_figure(WIDTH, 5.8)
     for axes, (title, columns) in zip(figure.subplots(2, 2, sharex=True).flat, panels, strict=True):
         for colour, column in zip(cycle(COLOURS), columns, strict=False):
-            curve = np.array([read_column(history_csv, rows, name, float, gaps=True) for name in ("update", column)])
+            try:
+                curve = np.array([[float(row[name] or "nan") for row in rows] for name in ("update", column)])
+            except ValueError as error:
+                raise ValueError(f"'{history_csv}': {error}") from error
             label = column.split("/")[1] if columns is success else column.split("_")[0]
             axes.plot(*curve[:, np.isfinite(curve).all(0)], label=label, color=colour)
         axes.set(title=title, xlabel="update")

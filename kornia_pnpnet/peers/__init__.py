@@ -4,7 +4,6 @@ A library is imported when one of its solvers is made.
 """
 
 from kornia_pnpnet.peers.base import PeerPose, PeerSolver
-from kornia_pnpnet.peers.opencv import OpenCVPnP, OpenCVRansac, OpenCVUsac
-from kornia_pnpnet.peers.samplers import KorniaRs, PoseLib, PyColmap
+from kornia_pnpnet.peers.libraries import KorniaRs, OpenCVPnP, OpenCVRansac, OpenCVUsac, PoseLib, PyColmap
 
 __all__ = ["KorniaRs", "OpenCVPnP", "OpenCVRansac", "OpenCVUsac", "PeerPose", "PeerSolver", "PoseLib", "PyColmap"]

@@ -17,11 +17,12 @@ from kornia.geometry.conversions import convert_points_from_homogeneous
 from torch import Tensor, nn
 
 from kornia_pnpnet.arguments import checked_inputs, restore_leading
+from kornia_pnpnet.cameras import pinholes
 from kornia_pnpnet.core.checks import check_positive, check_whole
 from kornia_pnpnet.problem import MIN_PAIRS
 from kornia_pnpnet.result import Alternatives, PnPResult, Pose, Status
 
-__all__ = ["PeerPose", "PeerSolver"]
+__all__ = ["PeerPose", "PeerSolver", "RobustPeer"]
 
 
 class PeerPose(NamedTuple):
@@ -31,8 +32,8 @@ class PeerPose(NamedTuple):
         rotation: world-to-camera rotation, shape :math:`(3, 3)`.
         translation: world-to-camera translation, shape :math:`(3,)`.
         inliers: the pairs that the peer kept, bool, shape :math:`(N,)`.
-        init: rotation and translation before the last refinement; ``None`` when the peer does not report them: the
-            result then repeats the final pose.
+        init: rotation and translation before the last refinement; ``None``: the peer does not report them, and the
+            result repeats the final pose.
     """
 
     rotation: np.ndarray
@@ -46,10 +47,9 @@ class PeerSolver(nn.Module):
     r"""A solver of another library, which takes one problem at a time, as a batched layer without gradients.
 
     A subclass implements :meth:`solve_one` and is a dataclass, whose fields are the arguments of its constructor.
-    The peer sees only the pairs that are present and have a weight above 0; the size of the weight has no effect. A
-    problem fails, with ``ok=False`` and the identity as its pose, when the peer finds no pose, and without asking the
-    peer when the problem is not finite, has a negative weight, fewer than three pairs, or a camera with skew or without
-    a positive focal length.
+    The peer gets the pairs that are present and have a weight above 0; the size of the weight has no effect. A problem
+    without a pose has ``ok=False``, and its pose is the identity. The peer does not get problems that are not finite,
+    have a negative weight or fewer than three pairs, or a camera with a skew or without a positive focal length.
 
     Convention: ``x_cam = R x_world + t``, +z forward, pixels ``u = fx x/z + cx``.
 
@@ -127,12 +127,17 @@ class PeerSolver(nn.Module):
                 actual_shape=tuple(img_points.shape),
                 expected_shape=["B", "N", "2"],
             )
-        like = inputs[0]
+        like, largest = inputs.world_points, torch.finfo(inputs.world_points.dtype).max
         world, img, cameras = (x.detach().cpu().double() for x in inputs[:3])
-        shares = torch.ones_like(world[..., 0]) if inputs[3] is None else inputs[3].detach().cpu().double()
-        present = torch.ones_like(shares, dtype=torch.bool) if inputs[4] is None else inputs[4].cpu()
-        cameras, used = cameras / cameras[:, 2:, 2:], present & (shares > 0)
-        status = _status(world, img, cameras, torch.where(present, shares, 0.0), present)
+        present = torch.ones(world.shape[:2], dtype=torch.bool) if inputs.mask is None else inputs.mask.cpu()
+        shares = present.double() if inputs.weights is None else inputs.weights.detach().cpu().double()
+        used = present & (shares > 0)
+        cameras, pinhole = pinholes(cameras)
+        pinhole &= (cameras[:, (0, 1, 2, 2), (1, 0, 0, 1)] == 0).all(-1)  # no peer takes a skew
+        sound = world.isfinite().all(-1) & img.isfinite().all(-1) & shares.isfinite() & (shares >= 0) | ~present
+        status = torch.where(used.sum(-1) >= MIN_PAIRS, Status.NOT_BELIEVED, Status.TOO_FEW_PAIRS)
+        status = torch.where(pinhole, status, Status.CAMERA)
+        status = torch.where(sound.all(-1), status, Status.NOT_FINITE)
 
         poses = torch.eye(3, 4, dtype=torch.float64).repeat(2, len(world), 1, 1)  # final, before the last refinement
         inliers, ok = torch.zeros_like(shares), torch.zeros(len(world), dtype=torch.bool)
@@ -144,7 +149,6 @@ class PeerSolver(nn.Module):
                     poses[:, i], ok[i] = torch.from_numpy(both), True
                     inliers[i, used[i]] = torch.from_numpy(np.asarray(found.inliers)).double()
 
-        largest = torch.finfo(like.dtype).max
         truncated = _squared_errors(poses[0], world, img, cameras).clamp(max=min(self.threshold, largest**0.25) ** 2)
         cost = torch.where(used, truncated, 0.0).sum(-1) / used.sum(-1).clamp(min=1)
 
@@ -161,7 +165,7 @@ class PeerSolver(nn.Module):
             status=torch.where(ok, Status.SOLVED, status).to(like.device, torch.int8),
             probability=back(ok.double()),
             alternatives=Alternatives.none(pose),
-            intrinsics=back(torch.where((status == Status.CAMERA)[:, None, None], torch.eye(3).double(), cameras)),
+            intrinsics=back(torch.where(pinhole[:, None, None], cameras, torch.eye(3).double())),
             dist=like.new_zeros(len(like), 4),
         )
         return restore_leading(size, result)
@@ -169,10 +173,10 @@ class PeerSolver(nn.Module):
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class RobustPeer(PeerSolver):
-    """Base of the peers that draw samples. It checks ``threshold``, ``confidence``, ``seed`` and numbers of iterations.
+    """A peer that draws samples.
 
     Raises:
-        BaseError: for an argument out of range.
+        BaseError: for a ``threshold``, ``confidence``, ``seed`` or number of iterations out of range.
     """
 
     confidence: float = 0.9999
@@ -187,17 +191,6 @@ class RobustPeer(PeerSolver):
         check_whole(1, **counts)
         for name, value in {**counts, "seed": self.seed}.items():
             setattr(self, name, int(value))
-
-
-def _status(world: Tensor, img: Tensor, cameras: Tensor, weights: Tensor, present: Tensor) -> Tensor:
-    """Why problems are not passed to the peer, by the rules of ``Normalize``; ``NOT_BELIEVED`` for the others, (B,)."""
-    sound = world.isfinite().all(-1) & img.isfinite().all(-1) & weights.isfinite() & (weights >= 0) | ~present  # (B, N)
-    enough = (present & (weights > 0)).sum(-1) >= MIN_PAIRS
-    focal, others = cameras[:, (0, 1), (0, 1)], cameras[:, (0, 1, 2, 2), (1, 0, 0, 1)]  # no peer takes a skew
-    pinhole = cameras.isfinite().flatten(1).all(-1) & (focal > 0).all(-1) & (others == 0).all(-1)
-    status = torch.where(enough, Status.NOT_BELIEVED, Status.TOO_FEW_PAIRS)
-    status = torch.where(pinhole, status, Status.CAMERA)
-    return torch.where(sound.all(-1), status, Status.NOT_FINITE)
 
 
 def _squared_errors(poses: Tensor, world: Tensor, img: Tensor, cameras: Tensor) -> Tensor:
