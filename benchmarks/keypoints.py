@@ -1,4 +1,4 @@
-"""What the confidences of a network's keypoints are worth: ``keypoints.py A.npz B.npz --sources S.json --out O.json``.
+"""Ways to use the confidences of a network's keypoints: ``keypoints.py A.npz B.npz --sources S.json --out O.json``.
 
 Each file holds the problems of one source: ``world`` (P, N, 3), ``img`` (P, N, 2) in undistorted pixels, ``mask``
 (P, N), ``confidence`` (P, N), ``K`` (P, 3, 3), the reference pose ``R`` (P, 3, 3) and ``t`` (P, 3), ``seen`` (P,) for
@@ -137,8 +137,7 @@ def main() -> None:
     """Measure, print the tables and write the results."""
     command = parser(__doc__)
     command.add_argument("problems", type=Path, nargs="+")
-    command.add_argument("--sources", type=Path, required=True, help="JSON: what each source is, by its file")
-    command.add_argument("--out", type=Path, required=True)
+    command.add_argument("--sources", type=Path, required=True, help="JSON: a description of each source, by its file")
     options = command.parse_args()
     sources = json.loads(options.sources.read_text())
     with threads():
