@@ -2,25 +2,7 @@
 
     python benchmarks/cameras.py --out benchmarks/cameras.json --data ../shared/data
 
-*Unknown focal length.* Fields of view of 18 to 100 degrees, depths within 10 to 50 % of their mean, 1 px of noise. A
-problem is solved within 1 degree, 5 % of the distance and 5 % of the focal length. pycolmap estimates the focal length
-(P4Pf in LO-RANSAC, then refinement; threshold 12 px, the best of 2, 4, 8 and 12 on seed 6); OpenCV's RANSAC runs at 21
-focal lengths, as DUSt3R does, and keeps the one with most inliers. The oracle is least squares on the true inliers,
-from the true pose and focal length.
-
-*COLMAP's cell.* Half of the pairs are outliers, 1 px of noise: recall, and medians of the errors.
-
-*Real matches.* The raw matches of an image and one other image (`raw/by_image.npz`) with at least 8 inliers, the focal
-length withheld; solved within 1 degree and 1 % of the median depth. Nothing was tuned on them with an unknown focal
-length; with a known one they have been looked at.
-
-*Scenes.* Problems of 20 pairs of five reconstructed scenes, without the focal length. The pixel of an outlier is
-that of another point, or anywhere in the image. No solver was tuned on the scenes without the focal length.
-
-*Rigs.* Three and six cameras that look in all directions; solved within 1 degree and 5 % of the distance. PoseLib's and
-pycolmap's generalised absolute pose with a threshold of 10 px, ours with their defaults.
-
-Times are of one thread, one call for all problems; of the other libraries one call for each problem.
+The page says what is measured.
 """
 
 from __future__ import annotations
@@ -354,44 +336,19 @@ def page(results: Row) -> str:
         **{"solved, 5 % (%)": percent("success_5"), "far but ok (%)": percent("far_but_ok")},
         **{"median focal error (%)": percent("median_focal", 2), "ms": lambda x: f"{x['us'] / 1000:,.1f}"},
     }
-    absent = "Not measured: the data were not at hand."
     scene_keys = {"scene": "{scene}", f"outliers of {SCENE_N}": "{outliers}"}
     rig_keys = {"cameras": "{cameras}", "baseline": "{baseline}", "n": "{n}", "outliers": "{share:.0%}"}
-    where = "{cpu}, {date}".format_map(results["environment"])
-    return f"""\
-# Cameras: unknown focal lengths and rigs
-
-Written by `benchmarks/cameras.py`, whose first lines say what is measured. {where}. Cells hold the share of solved
-problems in per cent, then µs per problem; `pnpnet-set` and `p3p-ransac` solve {results["settings"]["count"]} problems
-in a call, the other libraries one.
-
-{harness.targets_table(targets(results))}
-
-## Unknown focal length
-
-{pivot(results["focal"], {"n": "{n}", "outliers": "{share:.0%}"}, BY_FOCAL, _solved)}
-
-## COLMAP's cell
-
-{CELL} pairs, half of them outliers, 1 px.
-
-{harness.table(results["cell"], {**cell, "µs": "{us:,.0f}"})}
-
-## Real matches without the focal length
-
-*solved*: 1° and 1 % of the median depth; *solved, 5 %*: 1°, 5 % and 5 % of the focal length; *far but ok*: `ok`, but
-more than 10° or 30 % off. One problem a call.
-
-{harness.table(results["real"], real) if results["real"] else absent}
-
-## Scenes without the focal length
-
-{pivot(results["scenes"], scene_keys, BY_FOCAL, _solved) if results["scenes"] else absent}
-
-## Rigs
-
-{pivot(results["rigs"], rig_keys, ("pnpnet-set", "p3p-ransac:threshold=10", *RIG_PEERS), _solved)}
-"""
+    return harness.render(
+        "cameras.md.jinja",
+        results=results,
+        pairs=CELL,
+        targets=harness.targets_table(targets(results)),
+        focal=pivot(results["focal"], {"n": "{n}", "outliers": "{share:.0%}"}, BY_FOCAL, _solved),
+        cell=harness.table(results["cell"], {**cell, "µs": "{us:,.0f}"}),
+        real=harness.table(results["real"], real),
+        scenes=pivot(results["scenes"], scene_keys, BY_FOCAL, _solved),
+        rigs=pivot(results["rigs"], rig_keys, ("pnpnet-set", "p3p-ransac:threshold=10", *RIG_PEERS), _solved),
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -49,9 +49,6 @@ class CannotBeTimedError(Exception):
     """Why a contender cannot be timed."""
 
 
-# -- tasks -------------------------------------------------------------------------------------------------------------
-
-
 @dataclass
 class Task:
     """A call on given problems.
@@ -121,9 +118,6 @@ def gradient(pose: Pose, leaves: Sequence[Tensor]) -> tuple[Tensor, ...]:
 def float_inputs(problems: Problems, device: str = "cpu") -> list[Tensor]:
     """Points, pixels and intrinsics in float32 on a device."""
     return [x.to(device, torch.float32) for x in problems[:3]]
-
-
-# -- contenders --------------------------------------------------------------------------------------------------------
 
 
 class Contender:
@@ -392,9 +386,6 @@ def make_contenders(settings: Settings) -> tuple[dict[str, Contender], list[dict
                 skipped.append({"contender": name, "why": str(error)})
                 say(f"skipped: {name}: {error}")
     return made, skipped
-
-
-# -- how much, and on which problems -----------------------------------------------------------------------------------
 
 
 class Settings(NamedTuple):

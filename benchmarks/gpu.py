@@ -60,9 +60,6 @@ FULL = Amount()
 QUICK = Amount(4, ("pnpnet-n9",), ("eager",), (1, 4), ("pnpnet-n9", "epnp-lm"), (4, 8), (9, 12), 3, 10.0, 2**16, 64)
 
 
-# -- parity ------------------------------------------------------------------------------------------------------------
-
-
 def parity(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
     """Solve the same problems on the CPU and on the device, with gradients, by every solver of ours."""
     for name in list_solvers():
@@ -119,8 +116,6 @@ def rotation_difference(one: Tensor, other: Tensor) -> Tensor:
     """Angles between rotations, radians, shape (B,). Exact to the first order, also where the angle is tiny."""
     return (one - other).flatten(1).norm(dim=1) / math.sqrt(2.0)
 
-
-# -- CUDA graphs -------------------------------------------------------------------------------------------------------
 
 #: By mode the options of ``solver.compile``; ``None``: not compiled.
 MODES: dict[str, dict[str, str] | None] = {
@@ -199,9 +194,6 @@ def _modes(solvers: dict[str, PnPNet], batch: int, device: str, rounds: int) -> 
 
 def _microseconds(task: Task, times: int = 1) -> float:
     return 1e6 * task.seconds(times)
-
-
-# -- throughput and floors ---------------------------------------------------------------------------------------------
 
 
 class Work(TorchDispatchMode):
@@ -338,8 +330,6 @@ def peak_bytes(task: Task, device: str) -> int | None:
     task.seconds()
     return torch.cuda.max_memory_allocated(device) - before
 
-
-# -- the command -------------------------------------------------------------------------------------------------------
 
 Part = Callable[[str, Amount], Iterator[dict[str, Any]]]
 PARTS: dict[str, Part] = {"parity": parity, "graphs": graphs, "throughput": measure_throughput}

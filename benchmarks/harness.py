@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from torch import Tensor
 
 from kornia_pnpnet.core.environment import environment
@@ -28,9 +29,6 @@ HERE = Path(__file__).resolve().parent
 Row = Mapping[str, Any]
 #: A column of a table: a format string of the row's entries, or a function of the row.
 Column = str | Callable[[Row], str]
-
-
-# -- timing ------------------------------------------------------------------------------------------------------------
 
 
 @contextmanager
@@ -125,9 +123,6 @@ def target(what: str, measured: float, wanted: float, *, unit: str = "", at_most
     return {"what": what, "measured": measured, "target": wanted, "unit": unit, "at_most": at_most, "met": met}
 
 
-# -- the command and its results file ----------------------------------------------------------------------------------
-
-
 def parser(description: str | None, out: Path | None = None, *, required: bool = True) -> argparse.ArgumentParser:
     """A command line with ``--out``, whose help shows the description as it is written."""
     command = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -146,6 +141,13 @@ def recorded(measure: Callable[[], Row], **settings: Any) -> dict[str, Any]:
     return {"environment": environment(), "settings": settings, "load_average": load, **found}
 
 
+def render(template: str, folder: Path = HERE, **facts: Any) -> str:
+    """A page from its template; a fact that is missing is an error."""
+    options: dict[str, Any] = {"trim_blocks": True, "keep_trailing_newline": True, "undefined": StrictUndefined}
+    environment = Environment(loader=FileSystemLoader(folder), autoescape=False, **options)
+    return environment.get_template(template).render(**facts)
+
+
 def write(path: Path, results: Row, page: Callable[[Row], str]) -> None:
     """Write a results file, and its page beside it."""
     write_json(path, results)
@@ -155,9 +157,6 @@ def write(path: Path, results: Row, page: Callable[[Row], str]) -> None:
 def say(text: str) -> None:
     """Write a line of progress."""
     print(text, file=sys.stderr, flush=True)
-
-
-# -- tables ------------------------------------------------------------------------------------------------------------
 
 
 def fill(column: Column, row: Row) -> str:

@@ -8,11 +8,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import harness
 import numpy as np
 import pandas as pd
 from contenders import ANY, COARSE_ANGLE_DEG, COARSE_SHIFT, ITERATIONS, PLAIN, TRAINED, N
 from harness import HERE, Column, Row, digits, percent, pivot, table, targets_table, three_digits
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from timing import BACKWARD, FORWARD
 
 from kornia_pnpnet import PnPNet
@@ -137,9 +137,6 @@ class Summary:
                 times = rows[slow]["median_us"] / rows[fast]["median_us"]
                 found.append(f"{what}: `{fast}` is fastest, {times:.1f} times as fast as `{slow}`.")
         return found
-
-
-# -- tables of one part ------------------------------------------------------------------------------------------------
 
 
 def medians(rows: Iterable[Row], unit: float = 1.0, **wanted: Any) -> Column:
@@ -281,9 +278,8 @@ def page(results: Rows, gpu: Row | None = None) -> str:
     settings, shipped, summary = results["throughput"]["settings"], PnPNet.from_pretrained(TRAINED), Summary(results)
     targets = [entry for part in PARTS for entry in results[part]["targets"]]
     sizes = [entry["calls"][1:] for entry in results["startup"]["starts"] if len(entry["calls"]) > 1]
-    options: dict[str, Any] = {"trim_blocks": True, "keep_trailing_newline": True, "undefined": StrictUndefined}
-    environment = Environment(loader=FileSystemLoader(HERE), autoescape=False, **options)
-    return environment.get_template("performance.md.jinja").render(
+    return harness.render(
+        "performance.md.jinja",
         **{"trained": TRAINED, "plain": PLAIN, "any": ANY, "n": N, "m": ITERATIONS},
         **{"angle": COARSE_ANGLE_DEG, "shift": 100 * COARSE_SHIFT},
         shipped={"m": shipped.refine.m, "views": shipped.views},
@@ -306,8 +302,6 @@ def page(results: Rows, gpu: Row | None = None) -> str:
         skipped=skipped_reasons(results),
     )
 
-
-# -- pictures ----------------------------------------------------------------------------------------------------------
 
 # Lines by the end of a name, which says how the solver runs. Without such an end the line is dashed.
 _WAYS = {" compiled": "-", " compiled whole": ":", " ONNX": "-.", " packaged": ":"}

@@ -29,9 +29,6 @@ from kornia_pnpnet.evaluation.results import save_results
 COMPILED = f"{TRAINED} compiled"
 
 
-# -- throughput and latency --------------------------------------------------------------------------------------------
-
-
 def measure_threads(part: str, settings: Settings, count: int) -> dict[str, list[dict[str, Any]]]:
     """Throughput or latency on ``count`` threads, in this process."""
     with threads(count):
@@ -52,8 +49,6 @@ def measure_part(part: str, settings: Settings) -> dict[str, Any]:
     targets = timing.throughput_targets if part == "throughput" else timing.latency_targets
     return {**found, "targets": targets(found["rows"])}
 
-
-# -- cold start, the compiler's warm-up and peak memory, each in a process of its own ----------------------------------
 
 # The first batch size shows the compiler's warm-up, the others whether another size compiles again.
 _BATCHES = (1000, 999, 100, 10, 1)
@@ -112,9 +107,6 @@ def startup_targets(starts: Sequence[Row], imports: Sequence[float]) -> list[dic
         what, first = f"`{COMPILED}`, first call, {mode}, {entry['cache']}", entry["calls"][0]["first_s"]
         found.append(target(what, entry["make_s"] + first, most, unit="s"))
     return found
-
-
-# -- the command -------------------------------------------------------------------------------------------------------
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

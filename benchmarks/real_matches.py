@@ -139,9 +139,6 @@ class Solved(NamedTuple):
     probability: Tensor  # (P,) NaN where the solver has none
 
 
-# --- Problems of a scene ----------------------------------------------------------------------------------------------
-
-
 def read_views(folder: Path, features: int) -> list[View]:
     """Detect keypoints in all images of a COLMAP model that have a pose, sorted by name."""
     import cv2
@@ -301,9 +298,6 @@ def read(paths: Sequence[Path]) -> Matches:
     problems = Problems(one["world"], one["pixels"], one["K"], pose, inliers)
     scenes = tuple(path.stem for path, file in zip(paths, files, strict=True) for _ in file["kind"])
     return Matches(problems, one["mask"], one["ratio"], one["error_px"], one["kind"], scenes)
-
-
-# --- Solvers on problems ----------------------------------------------------------------------------------------------
 
 
 def batches(matches: Matches, size: int) -> list[Tensor]:

@@ -158,16 +158,7 @@ def format_tables(results: harness.Row) -> str:
 
 def page(results: harness.Row) -> str:
     """The tables as a page."""
-    load = results["load_average"]
-    where = "{cpu}, {date}".format_map(results["environment"])
-    return f"""\
-# Time, success and memory
-
-Written by `benchmarks/solvers.py`, see [README.md](README.md). Median and minimum in µs per problem, calls of
-{results["settings"]["count"]} problems, one thread, {where}, load average {load[0]:.1f} before and {load[1]:.1f} after.
-
-{format_tables(results)}
-"""
+    return harness.render("solvers.md.jinja", results=results, tables=format_tables(results))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -147,8 +147,6 @@ def throughput_targets(rows: Sequence[Row]) -> list[dict[str, Any]]:
     return found
 
 
-# -- one problem at a time ---------------------------------------------------------------------------------------------
-
 #: Number of quantiles of a distribution in the file, besides the smallest value.
 QUANTILE_STEPS = 200
 _TURN = 20  # calls of a contender in a row; one more call before them is not timed

@@ -2,22 +2,7 @@
 
     python benchmarks/uncertainty.py --out benchmarks/uncertainty.json
 
-*Errors.* The problems of uncertain PnP (Vakhitov et al., arXiv 2107.03890): points and pixels with noise of ten sizes
-and random axes. A solver gets the covariances, the standard deviations of isotropic noise of the same trace, or
-nothing; the solvers of other libraries take neither. Errors are medians, relative to those of maximum likelihood on the
-true inliers with the covariances, started from the truth; all solve the same problems.
-
-*Covariances of poses.* The squared error of a pose by its covariance (Mahalanobis) has the mean 6 and is below 12.59
-for 95 % when the covariance is right. Poses that are not ``ok`` or far off (10 degrees or 30 % of the distance) are
-left out.
-
-*Planar targets.* A square of four points, 0.2 units wide, 1 to 2 units away, tilted against the camera's axis, with
-known noise: how often the pose, or the pose or one of two alternatives, is right (5 degrees and 5 degrees for each
-pixel of noise, a tenth of the distance), beside the two poses of OpenCV's IPPE.
-
-*Priors.* Success (1 degree, 0.2 units) with a prior of the pose: the direction of gravity or the last pose, right or
-wrong by ten standard deviations more. The bound is least squares on the true inliers with the same prior, from the
-truth.
+The page says what is measured.
 """
 
 from __future__ import annotations
@@ -362,42 +347,17 @@ def page(results: harness.Row) -> str:
     size: dict[str, Column] = {"n": "{n}", "Outliers": "{outliers}"}
     credible = {"Noise": "{noise}", **size, "Mean": "{mean:.2f}", "Below the limit": percent("below", unit=" %")}
     planar: dict[str, Column] = {"Tilt": "{tilt:.0f}°", "Noise": "{sigma:.1f} px"}
-    return f"""# Uncertainty
-
-Written by `benchmarks/uncertainty.py`, whose first lines say what is measured; `{results["solver"]}`,
-{results["problems"]} problems in each row.
-
-{harness.targets_table(results["targets"])}
-
-## Noise that differs between pairs and directions
-
-Median rotation and translation error on the problems of uncertain PnP, relative to maximum likelihood on the true
-inliers. *Pixels*: whether their noise is round or has axes.
-
-{harness.table(results["rows"], errors)}
-
-Processor time of a problem in µs (float32, {BATCH} problems at once, one thread), and the median ratio of a round:
-
-{harness.table(results["times"], {**times, "Ratio": "{ratio:.2f}"}, align="rrrr")}
-
-## Is the covariance of the pose right
-
-Mean squared error by the covariance (right: 6), and how often it is below the 95 % limit. The covariance knows the
-noise; *unknown*: the solver did not.
-
-{harness.table(results["covariances"], {**credible, "Problems used": percent("used", unit=" %")})}
-
-## Priors of the pose
-
-Success. Gravity is known to {GRAVITY}°, the last pose to {TURN}° and {100 * SHIFT:.0f} % of the distance; *wrong*: off
-by {WRONG:.0f} standard deviations more.
-
-{shares(results["priors"], size, "n", "outliers")}
-
-## Planar targets
-
-{shares(results["squares"], planar, "tilt", "sigma")}
-"""
+    return harness.render(
+        "uncertainty.md.jinja",
+        results=results,
+        **{"batch": BATCH, "gravity": GRAVITY, "turn": TURN, "shift": SHIFT, "wrong": WRONG},
+        targets=harness.targets_table(results["targets"]),
+        errors=harness.table(results["rows"], errors),
+        times=harness.table(results["times"], {**times, "Ratio": "{ratio:.2f}"}, align="rrrr"),
+        covariances=harness.table(results["covariances"], {**credible, "Problems used": percent("used", unit=" %")}),
+        priors=shares(results["priors"], size, "n", "outliers"),
+        planar=shares(results["squares"], planar, "tilt", "sigma"),
+    )
 
 
 def main() -> None:

@@ -27,7 +27,7 @@ from typing import Any
 
 import torch
 from contenders import random_cameras, relative_errors
-from harness import HERE, Row, parser, pivot, recorded, say, table, threads
+from harness import HERE, Row, parser, pivot, recorded, render, say, table, threads
 from kornia.geometry import solve_pnp_dlt
 from torch import Tensor
 
@@ -158,21 +158,14 @@ def page(results: Row) -> str:
     def solved(row: Row) -> str:
         return f"{100 * row['success']:.1f} ({row['us']:,.0f})"
 
-    return f"""\
-Solved problems in per cent, and in parentheses µs per problem ({results["settings"]["count"]} problems in each row):
-
-{pivot(success, {"pairs": "{n}", **outliers}, [*title.values()], solved, by="title")}
-
-µs per problem by batch size, 30 pairs with 25 % outliers:
-
-{table(results["batches"], batches)}
-
-Median loss when {STEPS} steps of gradient descent move the pixels through a solver, 12 pairs with 5 px of noise:
-
-{table(results["descent"], descent, align="llrr")}
-
-{results["environment"]["cpu"]}, CPU time of one thread, {results["environment"]["date"][:10]}.
-"""
+    return render(
+        "upstream.md.jinja",
+        results=results,
+        steps=STEPS,
+        success=pivot(success, {"pairs": "{n}", **outliers}, [*title.values()], solved, by="title"),
+        batches=table(results["batches"], batches),
+        descent=table(results["descent"], descent, align="llrr"),
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -14,6 +14,7 @@ import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence, Sized
 from contextlib import suppress
 from fractions import Fraction
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,11 +31,7 @@ from kornia_pnpnet.evaluation.plots import COLOURS, WIDTH, log_scale, make_figur
 from kornia_pnpnet.evaluation.problem_sets import PRIORS
 from kornia_pnpnet.metrics import success_rate
 
-__all__ = ["draw_curves", "paper_figures", "plot_reliability", "plot_sweep", "solver_styles"]
-
 BLUE, ORANGE, GREEN, VERMILION, PINK, BROWN, _, GREY, _, SKY = COLOURS
-
-# -- the look of solvers -----------------------------------------------------------------------------------------------
 
 # Colour, marker and line of a solver, in the order of the rows. A solver has the look of the longest name that its name
 # begins with, up to a hyphen. A bound has no marker.
@@ -189,8 +186,6 @@ def draw_curves(
     return save(figure, path)
 
 
-# -- results files -----------------------------------------------------------------------------------------------------
-
 _KEYS = ["source", "outliers", "mismatches", "n", "solver"]
 _RATE = ["rate", "low", "high", "total"]
 _SOURCES = {"paper": "the paper's data", "gaussian_pose": "data with Gaussian positions"}
@@ -281,9 +276,6 @@ def _by_outliers(table: pd.DataFrame, n: int | str) -> list[Panel]:
     """A panel of rates for each outlier setting: none, uniform, other numbers, other texts."""
     settings = sorted(table.outliers.unique(), key=lambda x: (x != 0, x != "uniform", isinstance(x, str), x))
     return [(outliers_in_words(setting, n), table[table.outliers == setting], "rate") for setting in settings]
-
-
-# -- figures -----------------------------------------------------------------------------------------------------------
 
 
 def plot_operations(path: str | Path, complexity: Mapping[str, Any]) -> Path:
@@ -413,8 +405,6 @@ def paper_figures(results: Sequence[Mapping[str, Any]], folder: str | Path) -> l
     return made
 
 
-# -- trainings and probabilities ---------------------------------------------------------------------------------------
-
 _MIXES = ((GREEN, "o", "-"), (BLUE, "s", "--"), (VERMILION, "^", "-."), (PINK, "D", ":"))
 _TIME = "time, least over the mixes"
 
@@ -471,6 +461,54 @@ def plot_reliability(path: str | Path, curves: Mapping[str, Mapping[str, Sequenc
     chance.legend(loc="upper left")
     share.set(yscale="log", xlabel="weight: the predicted probability of an inlier", ylabel="pairs (%)")
     share.yaxis.set_major_formatter("{x:g}")
+    return save(figure, path)
+
+
+_RAW_LOOKS = {  # a solver with more inputs keeps its colour and has another marker and line
+    "+ratio": {"marker": "s", "linestyle": "--", "markerfacecolor": "white"},
+    ":adaptive": {"marker": "^"},
+}
+
+
+def find_rows(results: Mapping[str, Any], kind: str) -> dict[str, dict[str, Mapping[str, Any]]]:
+    """The rows of one kind by solver and group."""
+    table: dict[str, dict[str, Mapping[str, Any]]] = {}
+    for row in results["rows"]:
+        if row["kind"] == kind:
+            table.setdefault(row["solver"], {})[row["group"]] = row
+    return table
+
+
+@themed
+def plot_real_matches(path: str | Path, results: Mapping[str, Any], costs: Mapping[str, Any]) -> Path:
+    """Draw success and time against the share of outliers, and time against the number of pairs, of raw matches.
+
+    ``results`` and ``costs`` are what ``benchmarks/real_matches.py measure`` and ``cost`` wrote; the solvers of
+    ``costs`` are drawn.
+    """
+    table = find_rows(results, "no ratio test")
+    times = {(row["solver"], row["group"]): row["ms_per_problem"] for row in costs["rows"]}
+    solvers = costs["settings"]["solvers"]
+    shown = {name: re.sub(r",?\w+_iterations=\d+|:threshold=\d+|effort=", "", name) for name in solvers}
+    styles = solver_styles(shown.values())
+    for name, style in styles.items():
+        for part, look in _RAW_LOOKS.items():
+            style |= look if part in name else {}
+    shares, pairs = (list(pairwise(costs["settings"][key])) for key in ("shares", "pairs"))
+    by_share = {f"{100 * a:.0f}–{100 * b:.0f} %": f"{100 * a:.0f}–{100 * b:.0f}" for a, b in shares}
+    by_pairs = {f"{a}–{b - 1} pairs": f"{a}–{b - 1}" for a, b in pairs}
+    figure = make_figure(WIDTH, 3.6, "Nearest-neighbour matches without a ratio test")
+    plots = ("success", by_share, "outliers (%)"), ("ms", by_share, "outliers (%)"), ("ms", by_pairs, "pairs")
+    for axes, (value, groups, label) in zip(figure.subplots(1, 3), plots, strict=True):
+        there = [group for group in groups if (solvers[0], group) in times]
+        for name in solvers:
+            heights = [100 * table[name][g]["success"] if value == "success" else times[name, g] for g in there]
+            axes.plot(np.arange(len(there)), heights, **styles[shown[name]])
+        axes.set_xticks(range(len(there)), [groups[group] for group in there], rotation=40, ha="right")
+        axes.set(xlabel=label, title="right poses (%)" if value == "success" else "ms per problem")
+        if value == "ms":
+            log_scale(axes, "y")
+    draw_legend(figure, styles)
     return save(figure, path)
 
 

@@ -29,8 +29,6 @@ from kornia_pnpnet.training.card import write_model_card
 from kornia_pnpnet.training.checkpoint import HISTORY_NAME
 from kornia_pnpnet.training.results import RESULTS_NAME, load_run
 
-__all__ = ["ANY", "CHI_SQUARE_95", "HERE", "OURS", "PAPER", "PEERS", "RESULTS", "ROBUST", "compare", "measure", "ship"]
-
 HERE = Path(__file__).resolve().parent
 OUTPUTS = HERE.parents[1] / "outputs" / "results"
 
@@ -154,9 +152,6 @@ def run(name: str, solvers: Mapping[str, nn.Module], data: Mapping[str, Evaluati
     rows = [{key: value for key, value in row.items() if key != "per_problem"} for row in results["rows"]]
     save_results({**results, "rows": rows, **more}, HERE / f"{name}.json")
     print(f"\n{name}\n{format_table(results)}", flush=True)
-
-
-# -- the files, each by what it measures -------------------------------------------------------------------------------
 
 
 def measure_protocol(counts: Counts, wanted: set[str]) -> None:

@@ -26,8 +26,6 @@ from kornia_pnpnet.metrics import pose_errors, reliability, success_rate
 from kornia_pnpnet.refine.information import larger_sigma
 from kornia_pnpnet.result import PnPResult, Problems
 
-__all__ = ["measure_probability"]
-
 #: By law the solvers that it is fitted to.
 FITTED = {"sigmas": ("pnpnet-set:effort=fixed", "pnpnet-set:effort=adaptive"), "residuals": ("p3p-ransac",)}
 

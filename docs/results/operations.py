@@ -27,8 +27,6 @@ from kornia_pnpnet.propose.mlp import MLPInit
 from kornia_pnpnet.propose.ransac import RANSAC
 from kornia_pnpnet.solver import PnPNet
 
-__all__ = ["OPERATION_COSTS", "OperationCounter", "complexity_results", "count_per_problem", "operation_count"]
-
 #: The cost of one operation of each kind in "flops". Source: Lightspeed 2.8, ``flops.m`` and ``flops_div``, ``_sqrt``,
 #: ``_exp``, ``_log`` (timed on a Pentium 4). There a sine or another special function costs as much as a logarithm, and
 #: an absolute value (4) as much as two comparisons. The cost of logic, which Lightspeed does not list, is ours.

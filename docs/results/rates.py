@@ -10,8 +10,6 @@ from measure import BOUNDS
 
 from kornia_pnpnet.core.tables import markdown_table
 
-__all__ = ["Rates", "Standing", "compare_all", "interval", "shown"]
-
 
 def interval(rate: float, low: float, high: float) -> str:
     """A rate with its interval."""

@@ -14,8 +14,6 @@ from rates import interval
 
 from kornia_pnpnet.core.tables import markdown_table
 
-__all__ = ["KERNEL", "ablation", "capacity", "claim", "compared", "read_summary", "sweep"]
-
 EXPERIMENTS = HERE.parents[1] / "conf" / "experiment"
 KERNEL = "model.solver.refine.kernel"  # column of a summary
 
