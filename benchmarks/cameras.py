@@ -307,7 +307,8 @@ def targets(results: Row) -> list[dict[str, Any]]:
 
     solvable = [c for c in cells.values() if c["oracle"]["success"] > 0]
     slowest = max(c["pnpnet-set"]["us"] for c in twelve)
-    points, times = {"unit": "points"}, {"unit": "times as fast", "at_most": False}
+    points: dict[str, Any] = {"unit": "points"}
+    times: dict[str, Any] = {"unit": "times as fast", "at_most": False}
     worst, fewest = "in the worst cell", "`pnpnet-set`, n = 12, at most 50 % outliers"
     return [
         target(f"Unknown focal length: behind pycolmap {worst}", behind(cells.values(), "pycolmap"), 0.0, **points),

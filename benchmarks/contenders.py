@@ -81,8 +81,7 @@ class Task:
     def warm(self) -> float:
         """Call twice, first to compile and to fill caches, and return the seconds of the second call.
 
-        Raises:
-            CannotBeTimedError: when the call warns that it does not compile.
+        CannotBeTimedError when the call warns that it does not compile.
         """
         _compiled(self.seconds)
         return float(_compiled(self.seconds))
@@ -121,9 +120,7 @@ def float_inputs(problems: Problems, device: str = "cpu") -> list[Tensor]:
 
 
 class Contender:
-    """A solver to be timed.
-
-    A subclass defines ``call``, and what differs of ``inputs``, ``pose`` and ``poses``.
+    """A solver to be timed. A subclass defines ``call``, and the other methods where they differ.
 
     Attributes:
         loops: whether problems are solved one after the other. Then a part of a batch shows the time per problem.
@@ -419,7 +416,7 @@ def draw(n: int, count: int, outliers: OutlierMix | None = None) -> Problems:
 
 
 def random_cameras(n: int, count: int, seed: int, share: float, **options: Any) -> Problems:
-    """Problems of random cameras in float64, with this share of outliers."""
+    """Problems of random cameras in float64; ``share`` is the share of outliers."""
     options |= {"batch_size": count, "seed": seed, "outlier_share": share, "dtype": torch.float64}
     return CameraProblems(n=n, **options).batch(0)
 

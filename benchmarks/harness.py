@@ -99,11 +99,7 @@ def peak_bytes() -> int:
 
 
 def run_child(script: Path, *arguments: str, **environment: str) -> Any:
-    """Run a script in a process of its own and return the JSON that it prints. Its standard error is shown at once.
-
-    Raises:
-        RuntimeError: when the script fails.
-    """
+    """Run a script in a process of its own and return the JSON that it prints; RuntimeError when the script fails."""
     command = [sys.executable, str(script), *arguments]
     variables = {**os.environ, **environment}
     output = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False, env=variables)
@@ -141,10 +137,10 @@ def recorded(measure: Callable[[], Row], **settings: Any) -> dict[str, Any]:
     return {"environment": environment(), "settings": settings, "load_average": load, **found}
 
 
-def render(template: str, folder: Path = HERE, **facts: Any) -> str:
+def render(template: str, **facts: Any) -> str:
     """A page from its template; a fact that is missing is an error."""
     options: dict[str, Any] = {"trim_blocks": True, "keep_trailing_newline": True, "undefined": StrictUndefined}
-    environment = Environment(loader=FileSystemLoader(folder), autoescape=False, **options)
+    environment = Environment(loader=FileSystemLoader(HERE), autoescape=False, **options)
     return environment.get_template(template).render(**facts)
 
 

@@ -63,11 +63,7 @@ def is_whole(name: str) -> bool:
 
 
 class Summary:
-    """What the first tables and sentences of the page say.
-
-    Args:
-        results: the results files by their names in ``PARTS``.
-    """
+    """The first tables and sentences of the page, from the results files by their names in ``PARTS``."""
 
     def __init__(self, results: Rows) -> None:
         self.batch = results["throughput"]["settings"]["problems"]
@@ -374,6 +370,6 @@ def render(folder: Path, path: Path) -> None:
     title = f"B = {size}{fewer}, a third of the pairs mismatched, one thread"
     plot_times(pictures / "pairs.png", title, {FORWARD: pairs}, against="n", label="pairs n")
     alone = [row for row in results["latency"]["rows"] if is_drawn(row)]
-    plot_latency(pictures / "latency.png", "One problem at a time, n = 9, 0 to 3 wrong pairs, one thread", alone)
+    plot_latency(pictures / "latency.png", "One problem at a time, n = 9, 0 to 3 outliers, one thread", alone)
     with atomic_open(path, encoding="utf-8") as file:
         file.write(page(results, gpu))

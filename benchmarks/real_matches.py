@@ -55,8 +55,8 @@ from kornia_pnpnet.result import PnPResult, Pose, Problems
 Floats = NDArray[np.float64]
 Whole = NDArray[np.int64]
 
-# A pair is an inlier when its reprojection error under the reference pose is below this many pixels, in images of 1000
-# to 1600 pixels. A problem with fewer inliers than MIN_INLIERS does not count in rates.
+# Upper limit of the reprojection error of an inlier under the reference pose, in pixels; images have 1000 to 1600. A
+# problem with fewer inliers than MIN_INLIERS does not count in rates.
 INLIER_PX, MIN_INLIERS = 8.0, 8
 # Upper limits of the rotation error in degrees and of the distance of the camera centres by the median depth of the
 # inliers, for a pose to be right; a pose above one of the other two is far off.
@@ -180,15 +180,16 @@ def agree(first: View, second: View, pairs: Whole) -> NDArray[np.bool_]:
     one, two = (torch.from_numpy(view.intrinsics @ view.pose)[None] for view in (first, second))
     fundamental = fundamental_from_projections(one, two)
     points = [torch.from_numpy(view.pixels[at])[None] for view, at in zip((first, second), pairs.T, strict=True)]
-    sides = left_to_right_epipolar_distance, right_to_left_epipolar_distance
-    return torch.stack([side(*points, fundamental)[0] < EPIPOLAR_PX for side in sides]).all(0).numpy()
+    right = left_to_right_epipolar_distance(points[0], points[1], fundamental)[0]
+    left = right_to_left_epipolar_distance(points[0], points[1], fundamental)[0]
+    return ((right < EPIPOLAR_PX) & (left < EPIPOLAR_PX)).numpy()
 
 
 def tracks(views: Sequence[View]) -> list[Whole]:
-    """Keypoints of the same point, as rows of the number of a view and of a keypoint of this view.
+    """Keypoints of the same point, as rows of the number of a view and the number of a keypoint in this view.
 
-    Keypoints are joined that are each other's nearest neighbour, pass the ratio test and fit the epipolar geometry. A
-    track with two keypoints in one image is dropped.
+    A match joins two keypoints when each is the nearest neighbour of the other, the ratio test accepts it, and it fits
+    the epipolar geometry. A track with two keypoints in one image is dropped.
     """
     starts = np.cumsum([0, *(len(view.pixels) for view in views)])
     edges = [np.zeros((0, 2), dtype=np.int64)]
@@ -223,8 +224,9 @@ def triangulate(views: Sequence[View]) -> list[Floats]:
     found = [np.full((len(view.pixels), 3), np.nan) for view in views]
     for track in tracks(views):
         pixels = np.array([views[i].pixels[at] for i, at in track])
-        chosen = [[x[i] for i, _ in track] for x in (poses, cameras)]
-        made = pycolmap.estimate_triangulation(pixels, *chosen, options)
+        seen_by = [i for i, _ in track]
+        chosen = [poses[i] for i in seen_by], [cameras[i] for i in seen_by]
+        made = pycolmap.estimate_triangulation(pixels, chosen[0], chosen[1], options)
         if made is not None and all(made["inliers"]):
             for i, at in track:
                 found[i][at] = made["xyz"]
@@ -326,7 +328,7 @@ def batch(matches: Matches, at: Tensor) -> tuple[tuple[Problems, Tensor, Tensor]
     return (given, mask[:, :longest], matches.ratio[at].where(mask, 1.0)[:, :longest].float()), origin
 
 
-def call(solver: nn.Module, spec: str, given: Problems, mask: Tensor, ratio: Tensor) -> tuple[PnPResult, float]:
+def call(solver: Any, spec: str, given: Problems, mask: Tensor, ratio: Tensor) -> tuple[PnPResult, float]:
     """Solve a batch; the result, and milliseconds of the processor for a problem.
 
     A bound sees the reference poses. Other libraries with a ratio get the best pairs first.
@@ -339,8 +341,8 @@ def call(solver: nn.Module, spec: str, given: Problems, mask: Tensor, ratio: Ten
     elif CONFIDENCE in spec:
         known = {"confidence": 1 - ratio}
     start = time.process_time()
-    truth = isinstance(solver, SeesTruth)
-    result = solver.solve_with_truth(given) if truth else solver(*given[:3], mask=mask, **known)
+    bound = isinstance(solver, SeesTruth)
+    result = solver.solve_with_truth(given) if bound else solver(*given[:3], mask=mask, **known)
     return result, 1e3 * (time.process_time() - start) / len(mask)
 
 

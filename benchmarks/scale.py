@@ -61,8 +61,8 @@ def run(command: list[str], kill_at: tuple[Path, int, str] | None = None) -> dic
 
     Args:
         command: the command.
-        kill_at: kill processes once the folder has results of this number of problems: the first process with this text
-            in its title, or all processes of the command for an empty title.
+        kill_at: a folder, a number of problems and a title. Once the folder has results of that number of problems, the
+            first process whose title contains the text is killed; with an empty text all processes of the command.
 
     Returns:
         ``wall_s``; ``cpu_s`` and ``peak_bytes`` of all processes together; ``killed_at``, the number of problems with

@@ -144,8 +144,10 @@ def format_tables(results: harness.Row) -> str:
     targets = [
         harness.target(
             "`{solver}` beside `{peer}`, {set}".format_map(entry),
-            *(entry["ratio"], entry["target"]),
-            **{"unit": "times as fast", "at_most": False},
+            entry["ratio"],
+            entry["target"],
+            unit="times as fast",
+            at_most=False,
         )
         for entry in results["speedups"]
     ]

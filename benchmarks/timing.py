@@ -53,10 +53,8 @@ def ready(
     """A warm task, its number of problems, and the seconds of its call.
 
     A loop gets its first problems, enough for ``settings.loop_s`` seconds. ``known`` are seconds per problem of an
-    earlier measurement, or ``None``.
-
-    Raises:
-        CannotBeTimedError: when the call would take too long, or the contender cannot compile.
+    earlier measurement, or ``None``. CannotBeTimedError when the call would take too long, or the contender cannot
+    compile.
     """
     count = len(problems.world_points)
     if contender.loops:

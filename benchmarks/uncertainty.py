@@ -77,17 +77,16 @@ MOST_CLEAN, MOST_ROBUST, MOST_TIME = 1.05, 1.10, 1.6
 def uncertain_pnp(n: int, share: float, count: int, *, turned: bool, seed: int) -> Problems:
     """Problems of the protocol of uncertain PnP (Vakhitov et al., CVPR 2021, arXiv 2107.03890, section 4.1).
 
-    Points lie in a box in front of a camera of 800 px, their centre is the origin of the world. A tenth of the pairs
-    each has grade 1, 2, ..., 10: the standard deviation along the longest axis, in pixels and in hundredths
-    of a unit. Those of the other axes are uniform between 0 and that; the axes have a random direction.
-
-    Half of the outliers are mismatches, half have a random pixel. The noise of pixels has axes if ``turned``, and is
-    isotropic otherwise, as in most of the protocol.
+    Points lie in a box in front of a camera of 800 px; their centre is the origin of the world. Pairs have grades 1, 2,
+    ..., 10 in turn. The grade is the standard deviation along the longest axis, in pixels and in hundredths of a unit.
+    The standard deviations of the other axes are uniform between 0 and that of the longest; the axes have random
+    directions. Half of the outliers are mismatches, half have a random pixel. The noise of pixels has axes if
+    ``turned``, and is isotropic otherwise, as in most of the protocol.
     """
-    camera = {"focal": 800.0, "half_image": 400.0, "max_angle": math.pi}
+    options: dict[str, Any] = {"batch_size": count, "seed": seed, "dtype": torch.float64, "max_angle": math.pi}
     exact = SyntheticProblems(
         n=n,
-        **{"batch_size": count, "seed": seed, "dtype": torch.float64, "img_sigma": 0.0, "world_sigma": 0.0, **camera},
+        **{"focal": 800.0, "half_image": 400.0, "img_sigma": 0.0, "world_sigma": 0.0, **options},
         points=BoxPoints(half_width=2.0, z_near=4.0, depth=4.0),
         outliers=OutlierMix(count=round(share * n)),
     ).batch(0)

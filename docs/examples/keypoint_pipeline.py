@@ -148,10 +148,9 @@ def render(pose: Pose) -> tuple[Tensor, Tensor]:
 
 
 class Keypoints(nn.Module):
-    """Pixels (B, 14, 2) of the keypoints, and the noise of each.
+    """Pixels (B, 14, 2) of the keypoints, and their noise: a standard deviation (B, 14) of 0.1 to 30 pixels.
 
-    The noise is a standard deviation (B, 14), 0.1 to 30 pixels; after :meth:`predict` it may be a covariance
-    (B, 14, 2, 2).
+    After :meth:`predict` the noise may be a covariance (B, 14, 2, 2).
     """
 
     def __init__(self) -> None:
@@ -232,17 +231,10 @@ def train(
     likelihood: bool = False,
     motion: bool = False,
 ) -> dict[str, list[float]]:
-    """Train a network further, and return its curves.
+    """Train a network on the batches ``updates`` of a seed, and return its curves.
 
-    Args:
-        network: the network.
-        solver: makes poses of the keypoints.
-        seed: of the images.
-        updates: indices of the batches.
-        end_to_end: add the loss of the pose to that of the keypoints.
-        hidden: hidden keypoints have labels, too.
-        likelihood: learn the noise by its likelihood. Keypoints get no gradient from it.
-        motion: blur the images along one direction, see :func:`draw`.
+    The loss is that of the keypoints; with ``end_to_end`` also that of the pose, and with ``likelihood`` also that of
+    the noise, from which keypoints get no gradient. With ``hidden`` the hidden keypoints have labels, too.
     """
     log: list[list[float]] = []
     optimizer = torch.optim.AdamW(network.parameters(), lr=2e-3, weight_decay=1e-4)

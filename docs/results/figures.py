@@ -150,8 +150,8 @@ def draw_curves(
 ) -> Path:
     """Draw panels of curves against the column ``x``, with one legend below.
 
-    A panel is a title, a table with the column ``solver``, and the column of its vertical axis: ``rate`` in per cent
-    (with ``low`` and ``high``), ``us`` or ``operations``. Panels with the same vertical axis share its limits.
+    A panel is a title, a table with the column ``solver``, and the name of the column on its vertical axis: ``rate`` in
+    per cent (with ``low`` and ``high``), ``us`` or ``operations``. Panels with the same vertical axis share its limits.
     """
     found = {solver for _, table, _ in panels for solver in table.solver}
     styles = {name: look for name, look in (styles or solver_styles(found)).items() if name in found}
@@ -206,9 +206,9 @@ def require(found: Sized, what: str) -> None:
 def read_records(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
     """Read results files. Data sets without a source or outliers are left out.
 
-    One row for each source, outliers, kind of outliers, n and solver: the one with the most problems, then the last.
-    ``outliers`` is a number, ``"uniform"`` for 0 to a third of the pairs, or another text; ``mismatches`` says that
-    every outlier shows another point; ``base`` is the solver's name without the option m; an unknown ``m`` is -1.
+    A row has the largest number of problems with its source, outliers, kind of outliers, n and solver; of several the
+    last. ``outliers`` is a number, ``"uniform"`` for 0 to a third of the pairs, or another text. With ``mismatches``
+    every outlier shows another point. ``base`` is the solver's name without the option m; an unknown ``m`` is -1.
     """
     rows, synthetic = [], {name for name, _ in PRIORS.values()}
     for result in results:
@@ -315,10 +315,10 @@ def plot_scenes(path: str | Path, records: pd.DataFrame) -> Path:
 
 
 def plot_mismatches(path: str | Path, records: pd.DataFrame) -> Path:
-    """Draw success, pooled over the scenes with the most numbers of mismatches, against their number: figure 5.
+    """Draw success against the number of mismatches: figure 5.
 
-    A solver that solved all these scenes at three numbers or more has a curve. Without sets of mismatches only, the
-    outliers of the protocol are drawn.
+    Success is pooled over the scenes that have the most numbers of mismatches. A solver that solved all these scenes at
+    three numbers or more has a curve. Without sets of mismatches the outliers of the protocol are drawn.
     """
     table = records.query("scene and not swept")
     table = table[table.outliers.map(lambda outliers: isinstance(outliers, int)).astype(bool)]
@@ -381,16 +381,11 @@ _FIGURES: dict[str, Callable[..., Path]] = {
 
 
 def paper_figures(results: Sequence[Mapping[str, Any]], folder: str | Path) -> list[Path]:
-    """Draw the protocol's five figures, success against n and success against m. Figures without data are left out.
+    """Draw the protocol's five figures, success against n and success against m, into a folder.
 
-    Args:
-        results: results files of :func:`~kornia_pnpnet.evaluation.evaluate`, and at most one file of operation counts.
-            Of several results with the same source, outliers, n and solver, the one with the most problems is drawn,
-            and of these the last. A solver whose name sets m is in the figure against m only.
-        folder: folder of the pictures, made when missing.
-
-    Raises:
-        ValueError: when no figure has data, or there are several files of operation counts.
+    Figures without data are left out; ``ValueError`` when no figure has data. Of several results with the same source,
+    outliers, n and solver, the one with the most problems is drawn, and of these the last. A solver whose name sets m
+    is in the figure against m only. ``results`` may have one file of operation counts.
     """
     complexity = [entry for entry in results if entry.get("kind") == "complexity"]
     if len(complexity) > 1 or not results:
@@ -419,8 +414,8 @@ def mix_in_words(max_ratio: float) -> str:
 def plot_sweep(path: str | Path, summary_csv: str | Path, *, against: Literal["n", "m"]) -> Path:
     """Draw the success of trained networks against n or m: a panel for each value of the other, a line for each mix.
 
-    The panels below show the time: the least over the mixes, which do not change the time. ``summary_csv`` is the
-    summary of ``train.py -m experiment=sweep``. ``ValueError`` when two rows have the same n, m and mix.
+    The panels below show the time, which does not depend on the mix. ``summary_csv`` is the summary of ``train.py -m
+    experiment=sweep``; ``ValueError`` when two rows have the same n, m and mix.
     """
     named = {"model.n": "n", "model.m": "m", "data.outliers.max_ratio": "mix", "us_per_problem": "us"}
     named |= {f"uniform/{name}": name for name in ("rate", "low", "high")}
@@ -445,8 +440,7 @@ def plot_sweep(path: str | Path, summary_csv: str | Path, *, against: Literal["n
 def plot_reliability(path: str | Path, curves: Mapping[str, Mapping[str, Sequence[float]]]) -> Path:
     """Draw observed shares against predicted probabilities, and below the number of predictions in each range.
 
-    ``curves`` are by name the lists ``number``, ``predicted`` and ``observed`` of a
-    :class:`~kornia_pnpnet.metrics.Reliability`. Empty ranges are left out.
+    ``curves`` has the lists of a :class:`~kornia_pnpnet.metrics.Reliability` by name. Empty ranges are left out.
     """
     figure = make_figure(0.72 * WIDTH, 6.0)
     chance, share = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
@@ -481,10 +475,10 @@ def find_rows(results: Mapping[str, Any], kind: str) -> dict[str, dict[str, Mapp
 
 @themed
 def plot_real_matches(path: str | Path, results: Mapping[str, Any], costs: Mapping[str, Any]) -> Path:
-    """Draw success and time against the share of outliers, and time against the number of pairs, of raw matches.
+    """Draw success and time of raw matches against the share of outliers, and time against the number of pairs.
 
-    ``results`` and ``costs`` are what ``benchmarks/real_matches.py measure`` and ``cost`` wrote; the solvers of
-    ``costs`` are drawn.
+    ``results`` and ``costs`` are files of ``benchmarks/real_matches.py measure`` and ``cost``. Solvers of ``costs`` are
+    drawn.
     """
     table = find_rows(results, "no ratio test")
     times = {(row["solver"], row["group"]): row["ms_per_problem"] for row in costs["rows"]}

@@ -22,9 +22,9 @@ MATCHES = ("real_matches", "real_matches_again", "real_matches_third", "real_mat
 #: The file of ``benchmarks/real_matches.py measure --batch 1`` on some of these scenes: one image in each call.
 SINGLE = "real_matches_single"
 BATCH = 500  # problems in a call of ours in the files of MATCHES
-SCORES = "scores"  # what the title of a solver ends with that got a score for each pair
+SCORES = "scores"  # end of the title of a solver that got a score for each pair
 _TITLES = {"poselib": "PoseLib", "opencv-usac": "OpenCV USAC", "known-inliers": "inliers known"}
-_TOLD = {"": "", "ratio": SCORES, "sigma": "noise known"}
+_KNOWN = {"": "", "ratio": SCORES, "sigma": "noise known"}
 
 
 def title(solver: str, settings: Mapping[str, Any]) -> str:
@@ -32,7 +32,7 @@ def title(solver: str, settings: Mapping[str, Any]) -> str:
 
     The first file was measured when the fixed effort was the default of ``pnpnet-set``: it names the adaptive one.
     """
-    spec, _, told = solver.partition("+")
+    spec, _, known = solver.partition("+")
     name, _, options = spec.partition(":")
     parts = [_TITLES.get(name, name if name == "pycolmap" else f"`{name}`")]
     if name == ANY:
@@ -40,7 +40,7 @@ def title(solver: str, settings: Mapping[str, Any]) -> str:
         fixed = "effort=fixed" in options or (fixed_by_default and not options)
         parts += ["fixed effort"] if fixed else []
     parts += [f"{pixels} px" for pixels in re.findall(r"threshold=(\d+)", options)]
-    return ", ".join(filter(None, (*parts, _TOLD[told])))
+    return ", ".join(filter(None, (*parts, _KNOWN[known])))
 
 
 class Pooled(NamedTuple):
@@ -165,11 +165,7 @@ def group_table(results: Mapping[str, Any], kind: str) -> str:
 
 
 def facts(results: Mapping[str, Any]) -> dict[str, Any]:
-    """Tables of one file of ``benchmarks/real_matches.py measure``.
-
-    Returns:
-        ``tables`` by kind; ``scenes``, a table; ``total`` number of problems; ``results``, the file.
-    """
+    """Tables of one file of ``benchmarks/real_matches.py measure``, its number of problems, and the file."""
     kinds = list(dict.fromkeys(row["kind"] for row in results["rows"]))
     known = {row["scene"]: row for row in read_summary(HERE / "real_matches_scenes.csv")}
     lines = []
@@ -201,7 +197,7 @@ def pooled_table(files: Sequence[Mapping[str, Any]]) -> str:
 
 
 def measurements_table(files: Iterable[Mapping[str, Any]]) -> str:
-    """Each file by itself: how far ``pnpnet-set`` is ahead of the PoseLib that is best on its problems."""
+    """A line for each file: how far ``pnpnet-set`` is ahead of the PoseLib that is best on its problems."""
     lines = []
     for results in files:
         pooled = pool([results])
@@ -218,12 +214,9 @@ def measurements_table(files: Iterable[Mapping[str, Any]]) -> str:
 def page_facts(
     files: Sequence[Mapping[str, Any]], costs: Mapping[str, Any], keypoints: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """What the template of the page on real matches needs.
+    """Facts for the template of the page on real matches.
 
-    Args:
-        files: the files of :data:`MATCHES`.
-        costs: what ``benchmarks/real_matches.py cost`` wrote.
-        keypoints: what ``benchmarks/keypoints.py`` wrote.
+    ``files`` are the files of :data:`MATCHES`; ``benchmarks/real_matches.py cost`` wrote ``costs``.
     """
     first = files[0]
     solver = first["settings"]["solvers"][0]

@@ -369,9 +369,8 @@ def ship(runs: Sequence[Path]) -> None:
 def collect_weights(runs: Sequence[Path], folder: Path) -> None:
     """Gather weights, results, model card and learning curves of successive runs of ``train.py`` in one folder.
 
-    Each run but the first began with the weights of the run before. Of each run's learning curves at most 100 rows are
-    kept, all with a validation. The name of the folder becomes the name of the weights. After an error nothing is
-    written.
+    Each run after the first began with the weights of the run before. The folder gets at most 100 rows of each run's
+    learning curves, all with a validation, and gives the weights their name. After an error nothing is written.
     """
     curves = [_validated_rows(run / HISTORY_NAME) for run in runs]
     for before, rows in pairwise(curves):  # updates count from the first run on

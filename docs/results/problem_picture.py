@@ -57,11 +57,7 @@ def _frustum(pose: Pose) -> Tensor:
 
 @themed
 def plot_problem(path: str | Path) -> Path:
-    """Draw the pairs in the image, kept and rejected, and the points in space with the camera that was found.
-
-    Returns:
-        The path.
-    """
+    """Draw the pairs in the image, kept and rejected, and the points in space with the camera that was found."""
     outliers = OutlierMix(count=_OUTLIERS, mismatch_share=1.0)
     source = SyntheticProblems(n=_PAIRS, batch_size=1, seed=_SEED, points=_HousePoints(), outliers=outliers)
     problem = source.batch(0)

@@ -146,11 +146,7 @@ def real_matches() -> str:
 
 
 def with_block(text: str, block: str) -> str:
-    """The text with another block between the lines ``BEGIN`` and ``END``.
-
-    Raises:
-        ValueError: when the text has not exactly one of each line.
-    """
+    """The text with another block between the lines ``BEGIN`` and ``END``; ``ValueError`` without one of each line."""
     if text.count(BEGIN) != 1 or text.count(END) != 1:
         raise ValueError(f"A page with an overview needs one line '{BEGIN}' and one line '{END}' below it.")
     return f"{text.partition(BEGIN)[0]}{BEGIN}\n{block}\n{END}{text.partition(END)[2]}"
