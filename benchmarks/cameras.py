@@ -293,7 +293,7 @@ def by_cell(rows: Sequence[Row], *keys: str) -> dict[tuple[Any, ...], dict[str, 
 
 
 def targets(results: Row) -> list[dict[str, Any]]:
-    """The targets of the pages of this project, met or not."""
+    """The targets beside the measurements."""
     cells = by_cell(results["focal"], "n", "share")
     twelve = [cell for (n, outliers), cell in cells.items() if n == 12 and outliers <= 0.5]
     rigs = by_cell(results["rigs"], "cameras", "baseline", "n", "share").values()

@@ -205,7 +205,7 @@ def memory_table(results: Row) -> str:
 
 
 def gpu_section(results: Row | None) -> dict[str, Any] | None:
-    """What the page says of a GPU, from the file of ``gpu.py``."""
+    """Tables and facts of the section on a GPU, from the file of ``gpu.py``."""
     if results is None:
         return None
     parity, part = results["parity"], results["throughput"]
@@ -299,7 +299,7 @@ def page(results: Rows, gpu: Row | None = None) -> str:
     )
 
 
-# Lines by the end of a name, which says how the solver runs. Without such an end the line is dashed.
+# Line styles by the end of a contender's name. Other names have a dashed line.
 _WAYS = {" compiled": "-", " compiled whole": ":", " ONNX": "-.", " packaged": ":"}
 _LAST_SHARE = 0.99  # share of the calls drawn; other programs delayed the slowest
 

@@ -422,9 +422,9 @@ def measure(
 
 @torch.no_grad()
 def measure_cost(matches: Matches, specs: Sequence[str]) -> dict[str, Any]:
-    """Time solvers on the matches without a ratio test, apart for every share of outliers and number of pairs.
+    """Time solvers on matches without a ratio test, by share of outliers and by number of pairs.
 
-    A batch holds the problems of a group, repeated in turns.
+    A batch repeats the problems of a group until it is full.
     """
     solvers, chosen, rows = load_solvers(specs), groups(matches), []
     with threads():

@@ -179,7 +179,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     given = {"count": options.count, "repeats": options.repeats}
     try:
-        with harness.threads():  # the environment says how many
+        with harness.threads():  # so that the environment in the file has one thread
             results = harness.recorded(
                 partial(measure, options.solvers, **given, memory_count=options.memory_count),
                 **{"solvers": options.solvers, **given, "seed": SEED, "dtype": "float64"},

@@ -47,7 +47,7 @@ SEED = 20_270_925
 AXIS_RATIO = 5.0
 #: Of uncertain PnP: pairs of a problem, and shares of outliers.
 SIZES, SHARES = (10, 30, 50, 110), (0.0, 0.3, 0.5)
-# Pixels. The best of 8, 12, 16, 20, 25, 30 and 40 on problems of uncertain PnP of another seed.
+# Threshold of PoseLib in pixels, the best of 8, 12, 16, 20, 25, 30 and 40 on problems of another seed.
 THRESHOLD = 20.0
 #: Solvers of other libraries. The first two take no outliers.
 PEERS: dict[str, Callable[[], PeerSolver]] = {
@@ -211,7 +211,7 @@ def squared_errors(result: PnPResult, problems: Problems, covariance: Tensor) ->
 
 @torch.no_grad()
 def measure_credibility(solver: nn.Module, count: int) -> list[dict[str, Any]]:
-    """How the errors of poses compare with their covariances, of each kind of noise and size."""
+    """Compare the errors of poses with their covariances, for each kind of noise and number of pairs."""
     rows = []
     kinds = ("isotropic", 1.0, True), ("covariances", AXIS_RATIO, True), ("unknown", 1.0, False)
     for (noise, axis_ratio, is_known), (n, outliers) in itertools.product(kinds, CREDIBLE):

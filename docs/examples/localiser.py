@@ -98,7 +98,7 @@ class Sift:
 
 
 class DiskLightGlue:
-    """Kornia's DISK and LightGlue; their weights are downloaded unless they are at hand."""
+    """Kornia's DISK and LightGlue; Kornia downloads their weights unless they are in its cache."""
 
     def __init__(self, count: int) -> None:
         self.count = count

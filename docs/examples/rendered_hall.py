@@ -30,8 +30,8 @@ SIZE = np.array([12.0, 9.0, 4.0])  # of the hall, in metres
 TEXELS = 100  # of a texture on a metre
 SUPERSAMPLING = 2  # rays across a pixel
 MAX_DEPTH = 8.0  # metres, of the depth images
-# Points of the map: features of the images that make it, Lowe's ratio, smallest angle between rays, largest error of
-# a ray, both in degrees.
+# Points of the map: number of features of an image, Lowe's ratio, smallest angle between rays and largest error of a
+# ray in degrees.
 FEATURES, RATIO, MIN_ANGLE, MAX_ERROR = 1500, 0.8, 1.5, 0.25
 
 

@@ -341,7 +341,8 @@ def plot_mismatches(path: str | Path, records: pd.DataFrame) -> Path:
 def plot_against_n(path: str | Path, records: pd.DataFrame) -> Path:
     """Draw success on the protocol's data against the number of pairs, a panel for each outlier setting.
 
-    Solvers for one n each, such as ``pnpnet-n9`` and ``pnpnet-n20``, make one curve. Other solvers need two n.
+    Solvers for one n each, such as ``pnpnet-n9`` and ``pnpnet-n20``, make one curve.
+    Other solvers have a curve when they were measured at two n or more.
     """
     table = records.query("source == 'paper' and not swept and not mismatches")
     table = table[table.groupby("outliers").n.transform("nunique") > 1]

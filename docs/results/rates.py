@@ -77,7 +77,7 @@ class Rates:
         return max((name for name in solvers if (data, name) in self.rows), key=lambda name: self.rate(data, name))
 
     def reach(self, sets: Sequence[str] | None = None) -> float:
-        """The largest distance in points from a rate to an end of its interval."""
+        """The largest half-width of an interval, in points."""
         found = [row["success"] for (data, _), row in self.rows.items() if data in (sets or self.sets)]
         return 100 * max(max(one["rate"] - one["low"], one["high"] - one["rate"]) for one in found)
 
