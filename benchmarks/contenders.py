@@ -1,103 +1,237 @@
-"""The contenders by name: solvers of ours and of other libraries; how much is measured, and on which problems."""
+"""The contenders by name: solvers of this package and of other libraries; how much is measured, on which problems.
+
+A contender makes a task of a batch of problems. A task can be timed, forward or forward and backward, and counts how
+many problems its poses solve.
+"""
 
 from __future__ import annotations
 
-import functools
 import re
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from harness import HERE, say
+from harness import HERE, say, seconds
 from kornia.geometry import solve_pnp_dlt
-from tasks import (
-    ITERATIONS,
-    CannotBeTimedError,
-    Contender,
-    Task,
-    compile_or_raise,
-    float_inputs,
-    gradient,
-    leaves_of,
-    normalized,
-    waiting,
-    without_gradient,
-)
-from torch import nn
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+from torch import Tensor, nn
 
-from kornia_pnpnet import PnPNet, RobustWeightedLM
-from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet import Normalize, PnPNet, RobustWeightedLM, Starts, pose_errors, success, success_rate
+from kornia_pnpnet.data import CameraProblems, OutlierMix, SyntheticProblems
 from kornia_pnpnet.evaluation import draw_problems
 from kornia_pnpnet.evaluation.named_solvers import load_solver
+from kornia_pnpnet.metrics import SuccessRate
 from kornia_pnpnet.peers import PeerSolver
 from kornia_pnpnet.result import Pose, Problems
 
 #: The paper's solver as it is shipped, and the solver for any number of pairs.
 TRAINED, ANY = "pnpnet-n9", "pnpnet-set"
-#: The network of ``TRAINED``, one guess, and the number of iterations that the targets were set for, with classical
-#: hyperparameters: the trained hyperparameters belong to more iterations.
+#: The network of ``TRAINED`` with one guess, ``ITERATIONS`` and classical hyperparameters. The targets were set for
+#: this number of iterations; the trained hyperparameters belong to more.
 PLAIN = "net-n9+lm"
 WHOLE = f"{PLAIN} compiled whole"
+#: Iterations of every refinement with classical hyperparameters.
+ITERATIONS = 5
+# Errors of the pose that the refinement alone starts from, about those of the network's guess: the angle, and the
+# distance relative to the distance of the points.
+COARSE_ANGLE_DEG, COARSE_SHIFT = 5.0, 0.05
+#: Number of pairs unless a row says otherwise.
+N = 9
+# Seed of the problems. No training or tuning used it.
+_SEED = 20_270_400
+
+
+class CannotBeTimedError(Exception):
+    """Why a contender cannot be timed."""
+
+
+@dataclass
+class Task:
+    """A call on given problems.
+
+    Attributes:
+        call: solves all problems once, forward, or forward and backward.
+        poses: returns the poses in the frame of the problems; not timed.
+        problems: the problems.
+        device: the device that works; a call on a GPU is timed until the GPU has finished.
+    """
+
+    call: Callable[[], Any]
+    poses: Callable[[], Pose]
+    problems: Problems
+    device: str = "cpu"
+
+    def seconds(self, times: int = 1) -> float:
+        """Seconds of a call, the mean over ``times`` calls."""
+        if self.device == "cpu":
+            return seconds(self.call, times)
+
+        def everything() -> None:
+            for _ in range(times):
+                self.call()
+            torch.cuda.synchronize()
+
+        torch.cuda.synchronize()
+        return seconds(everything) / times
+
+    def warm(self) -> float:
+        """Call twice, first to compile and to fill caches, and return the seconds of the second call.
+
+        CannotBeTimedError when the call warns that it does not compile.
+        """
+        _compiled(self.seconds)
+        return float(_compiled(self.seconds))
+
+    def success(self) -> SuccessRate:
+        """Share of the problems that are solved."""
+        with torch.no_grad():
+            pose = Pose(*(x.double().cpu() for x in self.poses()))
+        return success_rate(success(pose_errors(pose, self.problems.pose)))
+
+
+def _compiled(call: Callable[[], Any]) -> Any:
+    """Call a function, and raise CannotBeTimedError when it warns that it does not compile."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = call()
+    for warning in caught:
+        if "compil" in str(warning.message) and not issubclass(warning.category, DeprecationWarning):
+            raise CannotBeTimedError(str(warning.message))
+    return found
+
+
+def compile_or_raise(module: nn.Module, **options: bool | str) -> None:
+    """Call the module's ``compile``; CannotBeTimedError when it warns that it does not compile."""
+    _compiled(partial(module.compile, **options))
+
+
+def gradient(pose: Pose, leaves: Sequence[Tensor]) -> tuple[Tensor, ...]:
+    """Gradients of the sum of all entries of the poses."""
+    return torch.autograd.grad(pose.rotation.sum() + pose.translation.sum(), leaves, allow_unused=True)
+
+
+def float_inputs(problems: Problems, device: str = "cpu") -> list[Tensor]:
+    """Points, pixels and intrinsics in float32 on a device."""
+    return [x.to(device, torch.float32) for x in problems[:3]]
+
+
+class Contender:
+    """A solver to be timed. A subclass defines ``call``, and the other methods where they differ.
+
+    Attributes:
+        loops: whether problems are solved one after the other. Then a part of a batch shows the time per problem.
+        differentiable: whether there are gradients.
+        n: the only number of pairs that the solver takes, if there is one.
+        device: the device that works.
+    """
+
+    loops = False
+    differentiable = True
+    n: int | None = None
+    device = "cpu"
+
+    def takes(self, n: int) -> bool:
+        """Whether the contender gets problems of ``n`` pairs."""
+        return self.n in (None, n)
+
+    def inputs(self, problems: Problems) -> Any:
+        """Prepare the arguments of ``call``; this is not timed. With gradients, points and pixels come first."""
+        return float_inputs(problems, self.device)
+
+    def call(self, inputs: Any) -> Any:
+        """Solve the problems; this is timed."""
+        raise NotImplementedError
+
+    def pose(self, result: Any) -> Pose:
+        """The pose of a result of ``call``."""
+        return Pose(*result.pose)
+
+    def poses(self, problems: Problems, inputs: Any) -> Pose:
+        """Solve the problems once more, for their poses in the frame of the problems."""
+        return self.pose(self.call(inputs))
+
+    def learned(self) -> list[Tensor]:
+        """Parameters that get gradients."""
+        return []
+
+    def task(self, problems: Problems, *, backward: bool = False) -> Task:
+        """Prepare a batch; this is not timed."""
+        inputs = self.inputs(problems)
+        call: Callable[[], Any] = torch.no_grad()(lambda: self.call(inputs))
+        if backward:
+            # A clone would change the layout in memory in which the solver hands pairs over.
+            leaves = [x.detach().requires_grad_() for x in inputs[:2]]
+            learned = self.learned()
+            call = lambda: gradient(self.pose(self.call([*leaves, *inputs[2:]])), [*leaves, *learned])  # noqa: E731
+        return Task(call, lambda: self.poses(problems, inputs), problems, self.device)
 
 
 class Ours(Contender):
     """A solver of this package: the whole call, in float32. Gradients go to points, pixels and parameters."""
 
     def __init__(
-        self,
-        spec: str,
-        *,
-        compiled: bool = False,
-        whole: bool = False,
-        classical: int | None = None,
-        device: str = "cpu",
+        self, spec: str, *, classical: bool = False, compiled: bool = False, device: str = "cpu", **options: bool
     ) -> None:
         solver: Any = load_solver(spec)
-        if classical is not None:
-            solver = PnPNet(solver.init, RobustWeightedLM(classical, reject_worse=False), solver.normalize).eval()
-        solver = solver.float().to(device)
-        self.solver: nn.Module = solver
+        if classical:
+            solver = PnPNet(solver.init, RobustWeightedLM(ITERATIONS, reject_worse=False), solver.normalize).eval()
+        self.solver: nn.Module = solver.float().to(device)
         self.device = device
         self.n = int(found[1]) if (found := re.match(r"pnpnet-n(\d+)", spec)) else None
         if compiled:
-            compile_or_raise(self.solver, **({"whole": True} if whole else {}))
+            compile_or_raise(self.solver, **options)
 
-    def task(self, problems: Problems, *, backward: bool = False) -> Task:
-        """The call with the whole batch."""
-        world, img, intrinsics = float_inputs(problems, self.device)
+    def call(self, inputs: Any) -> Any:
+        """Call the solver with the whole batch."""
+        return self.solver(*inputs)
 
-        def poses() -> Pose:
-            return Pose(*self.solver(world, img, intrinsics).pose)
-
-        call: Callable[[], object] = without_gradient(lambda: self.solver(world, img, intrinsics))
-        if backward:
-            leaves = leaves_of(world, img)
-            learned = [x for x in self.solver.parameters() if x.requires_grad]
-            call = lambda: gradient(self.solver(*leaves, intrinsics).pose, [*leaves, *learned])  # noqa: E731
-        return Task(call, poses, problems, waiting(self.device))
+    def learned(self) -> list[Tensor]:
+        """Parameters of the network and of the refinement."""
+        return [x for x in self.solver.parameters() if x.requires_grad]
 
 
-class Refinement(Contender):
+class Refinement(Ours):
     """A refinement alone, on normalised pairs and from the coarse pose."""
 
     def __init__(self, *, compiled: bool = False, device: str = "cpu") -> None:
-        self.refine: nn.Module = RobustWeightedLM(ITERATIONS, reject_worse=False).to(device)
+        self.solver = RobustWeightedLM(ITERATIONS, reject_worse=False).to(device)
         self.device = device
         if compiled:
-            compile_or_raise(self.refine)
+            compile_or_raise(self.solver)
 
-    def task(self, problems: Problems, *, backward: bool = False) -> Task:
-        """The call of the refinement."""
-        pairs, starts, undo = normalized(problems, self.device)
-        call: Callable[[], object] = without_gradient(lambda: self.refine(pairs, starts))
-        if backward:
-            # Not cloned: a clone would change the layout in memory in which the solver hands pairs over.
-            leaves = [x.detach().requires_grad_() for x in (pairs.world_points, pairs.img_points)]
-            wanted = pairs._replace(world_points=leaves[0], img_points=leaves[1])
-            learned = [x for x in self.refine.parameters() if x.requires_grad]
-            call = lambda: gradient(self.refine(wanted, starts).pose, [*leaves, *learned])  # noqa: E731
-        return Task(call, lambda: undo(self.refine(pairs, starts).pose), problems, waiting(self.device))
+    def inputs(self, problems: Problems) -> Any:
+        """Normalised points and pixels, the normalised problem, its start, and its frame."""
+        with torch.no_grad():
+            problem, frame = Normalize(order=False)(*float_inputs(problems, self.device))
+            start = frame.apply(Pose(*(x.to(problem.world_points) for x in coarse_pose(problems))))
+        starts = Starts(start, torch.ones_like(problem.weights))
+        return problem.world_points, problem.img_points, problem, starts, frame
+
+    def call(self, inputs: Any) -> Any:
+        """Call the refinement."""
+        world, img, problem, starts, _ = inputs
+        return self.solver(problem._replace(world_points=world, img_points=img), starts)
+
+    def poses(self, problems: Problems, inputs: Any) -> Pose:
+        """Refine once more and undo the normalisation."""
+        return Pose(*inputs[-1].undo(self.call(inputs).pose))
+
+
+def coarse_pose(problems: Problems, seed: int = 0) -> Pose:
+    """The true poses, turned about the centre of the points and moved."""
+    rotation, translation = problems.pose
+    generator = torch.Generator().manual_seed(seed)
+    turn, shift = torch.randn(2, len(rotation), 3, generator=generator, dtype=torch.float64)
+    turn, shift = (x / x.norm(dim=-1, keepdim=True) for x in (turn, shift))
+    centre = problems.world_points.mean(1)[..., None]  # (B, 3, 1)
+    cam_centre = rotation @ centre + translation[..., None]
+    turned = axis_angle_to_rotation_matrix(torch.deg2rad(torch.tensor(COARSE_ANGLE_DEG)) * turn).to(rotation) @ rotation
+    shift = COARSE_SHIFT * cam_centre.norm(dim=1) * shift.to(translation)
+    return Pose(turned, (cam_centre - turned @ centre)[..., 0] + shift)
 
 
 def exported(spec: str, suffix: str, export: Callable[[PnPNet, Path], object]) -> Path:
@@ -115,85 +249,87 @@ def exported(spec: str, suffix: str, export: Callable[[PnPNet, Path], object]) -
 class Packaged(Contender):
     """A solver of this package for nine pairs, compiled ahead of time for one problem per call, in float32."""
 
-    loops, differentiable = True, False
-    n: int = 9
+    loops, differentiable, n = True, False, 9
 
     def __init__(self, spec: str) -> None:
         from kornia_pnpnet.export import export_package, load_package
 
         self.solver = load_package(
-            exported(spec, ".pt2", lambda solver, path: export_package(solver, path, self.n, batch=1))
+            exported(spec, ".pt2", lambda solver, path: export_package(solver, path, 9, batch=1))
         )
 
-    def task(self, problems: Problems, *, backward: bool = False) -> Task:
-        """The calls one after the other."""
-        tensors = float_inputs(problems, "cpu")
-        single = list(zip(*(x.split(1) for x in tensors), strict=True))
+    def inputs(self, problems: Problems) -> Any:
+        """The inputs of each problem."""
+        return list(zip(*(x.split(1) for x in float_inputs(problems)), strict=True))
 
-        def poses() -> Pose:
-            results = [self.solver(*one) for one in single]
-            return Pose(*(torch.cat(x) for x in list(zip(*results, strict=True))[:2]))
+    def call(self, inputs: Any) -> Any:
+        """Call the package for each problem."""
+        return [self.solver(*one) for one in inputs]
 
-        return Task(lambda: [self.solver(*one) for one in single], poses, problems)
+    def pose(self, result: Any) -> Pose:
+        """The poses of all calls."""
+        return Pose(*(torch.cat(x) for x in list(zip(*result, strict=True))[:2]))
 
 
 class Onnx(Contender):
     """A solver of this package as an ONNX model for nine pairs, under ONNX Runtime, in float32."""
 
-    differentiable = False
-    n: int = 9
+    differentiable, n = False, 9
 
     def __init__(self, spec: str) -> None:
         import onnxruntime
 
-        from kornia_pnpnet.export import INPUTS, export_onnx
+        from kornia_pnpnet.export import export_onnx
 
-        self.names = INPUTS
-        path = exported(spec, ".onnx", lambda solver, path: export_onnx(solver, path, self.n))
+        path = exported(spec, ".onnx", lambda solver, path: export_onnx(solver, path, 9))
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = torch.get_num_threads()
         options.log_severity_level = 3
         self.session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
 
-    def task(self, problems: Problems, *, backward: bool = False) -> Task:
-        """The call of the session with the whole batch."""
-        tensors = *float_inputs(problems, "cpu"), torch.ones(problems.world_points.shape[:2])
-        inputs = {name: x.numpy() for name, x in zip(self.names, tensors, strict=True)}
+    def inputs(self, problems: Problems) -> Any:
+        """Arrays by the names of the model's inputs."""
+        from kornia_pnpnet.export import INPUTS
 
-        def poses() -> Pose:
-            rotation, translation, *_ = self.session.run(None, inputs)
-            return Pose(torch.from_numpy(rotation), torch.from_numpy(translation))
+        tensors = *float_inputs(problems), torch.ones(problems.world_points.shape[:2])
+        return {name: x.numpy() for name, x in zip(INPUTS, tensors, strict=True)}
 
-        return Task(lambda: self.session.run(None, inputs), poses, problems)
+    def call(self, inputs: Any) -> Any:
+        """Run the session with the whole batch."""
+        return self.session.run(None, inputs)
 
-
-# -- other libraries, called as fast as a user of the library can call them --------------------------------------------
+    def pose(self, result: Any) -> Pose:
+        """The first two outputs of the model."""
+        return Pose(*map(torch.from_numpy, result[:2]))
 
 
 def bare_call(solver: nn.Module, problems: Problems) -> Callable[[], object]:
     """One call with the whole batch for a solver of ours; the calls of the library alone for a peer."""
-    inputs = (problems.world_points, problems.img_points, problems.intrinsics)
     if isinstance(solver, PeerSolver):
-        single = list(zip(*(x.numpy() for x in inputs), strict=True))
+        single = list(zip(*(x.numpy() for x in problems[:3]), strict=True))
         return lambda: [solver.solve_one(*one) for one in single]
-    return lambda: solver(*inputs)
+    return lambda: solver(*problems[:3])
 
 
 class Peer(Contender):
-    """The call of a library for each problem, on arrays in float64 that are prepared."""
+    """The calls of another library, one after the other, on arrays in float64 that are prepared."""
 
     loops, differentiable = True, False
 
     def __init__(self, spec: str) -> None:
         self.solver = load_solver(spec)
 
-    def task(self, problems: Problems, *, backward: bool = False) -> Task:
-        """The calls one after the other."""
+    def inputs(self, problems: Problems) -> Any:
+        """The calls for all problems."""
+        return bare_call(self.solver, problems)
 
-        def poses() -> Pose:
-            return Pose(*self.solver(problems.world_points, problems.img_points, problems.intrinsics).pose)
+    def call(self, inputs: Any) -> Any:
+        """Call the library for each problem."""
+        return inputs()
 
-        return Task(bare_call(self.solver, problems), poses, problems)
+    def poses(self, problems: Problems, inputs: Any) -> Pose:
+        """Solve with the adapter of this package."""
+        return Pose(*self.solver(*problems[:3]).pose)
 
 
 class KorniaDLT(Contender):
@@ -203,55 +339,50 @@ class KorniaDLT(Contender):
         """At least six pairs. Above 200 the singular value decomposition of all pairs takes too long."""
         return 6 <= n <= 200
 
-    def task(self, problems: Problems, *, backward: bool = False) -> Task:
-        """One call with the whole batch."""
-        world, img, intrinsics = float_inputs(problems, "cpu")
-        leaves = leaves_of(world, img)
-        call: Callable[[], object] = without_gradient(lambda: solve_pnp_dlt(world, img, intrinsics))
-        if backward:
-            call = lambda: gradient(solve_pnp_dlt(leaves[0], leaves[1], intrinsics), leaves)  # noqa: E731
+    def call(self, inputs: Any) -> Any:
+        """Call the function with the whole batch."""
+        return solve_pnp_dlt(*inputs)
 
-        def poses() -> Pose:
-            matrix = solve_pnp_dlt(world, img, intrinsics)
-            return Pose(matrix[:, :, :3], matrix[:, :, 3])
-
-        return Task(call, poses, problems)
+    def pose(self, result: Any) -> Pose:
+        """The parts of the matrices (B, 3, 4)."""
+        return Pose(result[:, :, :3], result[:, :, 3])
 
 
 #: Our solvers. The threshold of the RANSAC is tuned for the protocol's data (docs/results).
 OURS: dict[str, Callable[..., Contender]] = {
-    TRAINED: functools.partial(Ours, TRAINED),
-    f"{TRAINED} compiled": functools.partial(Ours, TRAINED, compiled=True),
-    PLAIN: functools.partial(Ours, TRAINED, classical=ITERATIONS),
-    WHOLE: functools.partial(Ours, TRAINED, classical=ITERATIONS, compiled=True, whole=True),
-    ANY: functools.partial(Ours, ANY),
-    f"{ANY} compiled": functools.partial(Ours, ANY, compiled=True),
+    TRAINED: partial(Ours, TRAINED),
+    f"{TRAINED} compiled": partial(Ours, TRAINED, compiled=True),
+    PLAIN: partial(Ours, TRAINED, classical=True),
+    WHOLE: partial(Ours, TRAINED, classical=True, compiled=True, whole=True),
+    ANY: partial(Ours, ANY),
+    f"{ANY} compiled": partial(Ours, ANY, compiled=True),
     "refinement": Refinement,
-    "refinement compiled": functools.partial(Refinement, compiled=True),
-    "epnp-lm": functools.partial(Ours, "epnp-lm"),
-    "p3p-ransac": functools.partial(Ours, "p3p-ransac:threshold=50"),
+    "refinement compiled": partial(Refinement, compiled=True),
+    "epnp-lm": partial(Ours, "epnp-lm"),
+    "p3p-ransac": partial(Ours, "p3p-ransac:threshold=50"),
 }
 #: All contenders.
 CONTENDERS: dict[str, Callable[..., Contender]] = {
     **OURS,
-    f"{TRAINED} packaged": functools.partial(Packaged, TRAINED),
-    f"{ANY} packaged": functools.partial(Packaged, ANY),
-    f"{TRAINED} ONNX": functools.partial(Onnx, TRAINED),
-    f"{ANY} ONNX": functools.partial(Onnx, ANY),
-    "opencv-ransac": functools.partial(Peer, "opencv-ransac"),
-    "kornia-rs": functools.partial(Peer, "kornia-rs"),
-    "poselib": functools.partial(Peer, "poselib"),
-    "pycolmap": functools.partial(Peer, "pycolmap"),
+    **{f"{name} packaged": partial(Packaged, name) for name in (TRAINED, ANY)},
+    **{f"{name} ONNX": partial(Onnx, name) for name in (TRAINED, ANY)},
+    **{name: partial(Peer, name) for name in ("opencv-ransac", "kornia-rs", "poselib", "pycolmap")},
     "kornia-dlt": KorniaDLT,
 }
 
 
-# -- how much, and on which problems -----------------------------------------------------------------------------------
-
-#: Number of pairs unless a row says otherwise.
-N = 9
-# Seed of the problems. No training or tuning used it.
-_SEED = 20_270_400
+def make_contenders(settings: Settings) -> tuple[dict[str, Contender], list[dict[str, Any]]]:
+    """The contenders that are asked for by name, and for each that cannot be made its name and the reason."""
+    made: dict[str, Contender] = {}
+    skipped: list[dict[str, Any]] = []
+    for name, make in CONTENDERS.items():
+        if settings.contenders is None or name in settings.contenders:
+            try:
+                made[name] = make()
+            except (ImportError, CannotBeTimedError) as error:
+                skipped.append({"contender": name, "why": str(error)})
+                say(f"skipped: {name}: {error}")
+    return made, skipped
 
 
 class Settings(NamedTuple):
@@ -272,7 +403,7 @@ class Settings(NamedTuple):
 
 
 FULL = Settings()
-#: A few small problems: does everything run?
+#: A few small problems, which show that everything runs.
 QUICK = Settings(None, 20, (1, 20), (6, 9), 20, 3, 0.01, 600.0, 1.0, 20, 1.0, 100)
 
 
@@ -284,16 +415,20 @@ def draw(n: int, count: int, outliers: OutlierMix | None = None) -> Problems:
     return draw_problems(source, count)
 
 
-def make_contenders(settings: Settings) -> tuple[dict[str, Contender], list[dict[str, Any]]]:
-    """The contenders that are asked for by name, and for each that cannot be made its name and the reason."""
-    made: dict[str, Contender] = {}
-    skipped: list[dict[str, Any]] = []
-    for name, make in CONTENDERS.items():
-        if settings.contenders is not None and name not in settings.contenders:
-            continue
-        try:
-            made[name] = make()
-        except (ImportError, CannotBeTimedError) as error:
-            skipped.append({"contender": name, "why": str(error)})
-            say(f"skipped: {name}: {error}")
-    return made, skipped
+def random_cameras(n: int, count: int, seed: int, share: float, **options: Any) -> Problems:
+    """Problems of random cameras in float64; ``share`` is the share of outliers."""
+    options |= {"batch_size": count, "seed": seed, "outlier_share": share, "dtype": torch.float64}
+    return CameraProblems(n=n, **options).batch(0)
+
+
+def first(problems: Problems, count: int) -> Problems:
+    """The first ``count`` problems of a batch."""
+    return problems.map(lambda x: x[:count])
+
+
+def relative_errors(pose: Pose, problems: Problems) -> tuple[Tensor, Tensor]:
+    """Rotation errors in degrees, and distances of the camera centres by the median distance of the points, (B,)."""
+    centres = [(x.rotation.mT @ x.translation[..., None])[..., 0] for x in (pose, problems.pose)]
+    cam_points = problems.world_points @ problems.pose.rotation.mT + problems.pose.translation[:, None]
+    shift = (centres[0] - centres[1]).norm(dim=-1) / cam_points.norm(dim=-1).median(1).values
+    return pose_errors(pose, problems.pose).rotation_error_deg, shift

@@ -5,31 +5,20 @@ README.md beside this file describes the measurements.
 
 from __future__ import annotations
 
-import functools
 import itertools
 import json
 import math
+import os
 import re
 import time
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
+from functools import partial
 from typing import Any, NamedTuple
 
+import contenders
 import torch
-from contenders import CONTENDERS, OURS, N, draw
-from harness import HERE, in_turns, load, parser, say, share, summary
-from tasks import (
-    CannotBeTimedError,
-    Contender,
-    Task,
-    compile_or_raise,
-    first,
-    float_inputs,
-    gradient,
-    leaves_of,
-    waiting,
-    without_gradient,
-)
+from contenders import OURS, CannotBeTimedError, Contender, N, Task, draw, first
+from harness import HERE, in_turns, parser, say, share, summary
 from timing import BACKWARD, FORWARD
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -67,11 +56,8 @@ class Amount(NamedTuple):
 
 
 FULL = Amount()
-#: A few small problems without compiling: does everything run?
+#: A few small problems without compiling, which show that everything runs.
 QUICK = Amount(4, ("pnpnet-n9",), ("eager",), (1, 4), ("pnpnet-n9", "epnp-lm"), (4, 8), (9, 12), 3, 10.0, 2**16, 64)
-
-
-# -- parity ------------------------------------------------------------------------------------------------------------
 
 
 def parity(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
@@ -110,11 +96,10 @@ def parity(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
 
 def _solved(solver: PnPNet, problems: Problems, device: str, dtype: torch.dtype) -> tuple[PnPResult, Tensor, float]:
     """Result, gradient of the poses to points and pixels, (B, 5 N), both on the CPU, and the rate of success."""
-    inputs = problems.world_points, problems.img_points, problems.intrinsics
-    world, img, intrinsics = (x.to(device, dtype) for x in inputs)
-    leaves = leaves_of(world, img)
+    world, img, intrinsics = (x.to(device, dtype, copy=True) for x in problems[:3])
+    leaves = [world.requires_grad_(), img.requires_grad_()]
     result = solver.to(device, dtype)(*leaves, intrinsics)
-    parts = gradient(result.pose, leaves) if result.rotation.requires_grad else (None, None)
+    parts = contenders.gradient(result.pose, leaves) if result.rotation.requires_grad else (None, None)
     filled = [torch.zeros_like(leaf) if part is None else part for part, leaf in zip(parts, leaves, strict=True)]
     rotation, translation = (x.detach().cpu() for x in result.pose)
     solved = success(pose_errors(Pose(rotation.double(), translation.double()), problems.pose))
@@ -131,8 +116,6 @@ def rotation_difference(one: Tensor, other: Tensor) -> Tensor:
     """Angles between rotations, radians, shape (B,). Exact to the first order, also where the angle is tiny."""
     return (one - other).flatten(1).norm(dim=1) / math.sqrt(2.0)
 
-
-# -- CUDA graphs -------------------------------------------------------------------------------------------------------
 
 #: By mode the options of ``solver.compile``; ``None``: not compiled.
 MODES: dict[str, dict[str, str] | None] = {
@@ -170,7 +153,7 @@ def graphs(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
         solvers = {mode: create_solver(name, effort="fixed").to(device, torch.float32) for mode in amount.modes}
         for mode, solver in solvers.items():
             if (options := MODES[mode]) is not None:
-                compile_or_raise(solver, **options)
+                contenders.compile_or_raise(solver, **options)
         for batch in amount.calls:
             modes = _modes(solvers, batch, device, amount.rounds)  # type: ignore[arg-type]
             yield {"solver": name, "batch": batch, "modes": modes}
@@ -179,20 +162,20 @@ def graphs(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
 
 
 def _modes(solvers: dict[str, PnPNet], batch: int, device: str, rounds: int) -> dict[str, dict[str, Any]]:
+    """Time a call of each mode in turns, and compare its result with that of the first mode."""
     problems = draw(N, batch)
-    inputs = float_inputs(problems, device)
+    inputs = contenders.float_inputs(problems, device)
     tasks: dict[str, Task] = {}
     modes: dict[str, dict[str, Any]] = {}
     expected = None
     for mode, solver in solvers.items():
         say(f"graphs: B = {batch}, {mode}")
         try:
-            call = without_gradient(functools.partial(solver, *inputs))
-            call = captured(call) if mode == "captured" else call
-            task = _task(call, problems, device)
+            call: Callable[[], PnPResult] = torch.no_grad()(partial(solver, *inputs))
+            task = _task(captured(call) if mode == "captured" else call, problems, device)
             start = time.perf_counter()
             task.warm()
-            result = call()
+            result = task.call()
         except (CannotBeTimedError, RuntimeError) as error:
             modes[mode] = {"why": reason(error)}
             continue
@@ -203,17 +186,14 @@ def _modes(solvers: dict[str, PnPNet], batch: int, device: str, rounds: int) -> 
         difference = rotation_difference(found[0], expected[0])
         same_ok = share(found[1] == expected[1])
         modes[mode] = {"rotation_difference": float(difference.max()), "same_ok": same_ok, "warm_s": warm_s}
-    timers = {mode: functools.partial(_microseconds, task) for mode, task in tasks.items()}
+    timers = {mode: partial(_microseconds, task, 10) for mode, task in tasks.items()}
     for mode, rounds_us in in_turns(timers, rounds).items():
         modes[mode] |= summary(rounds_us)
     return modes
 
 
-def _microseconds(task: Task) -> float:
-    return 1e6 * task.seconds(10)
-
-
-# -- throughput and floors ---------------------------------------------------------------------------------------------
+def _microseconds(task: Task, times: int = 1) -> float:
+    return 1e6 * task.seconds(times)
 
 
 class Work(TorchDispatchMode):
@@ -260,7 +240,7 @@ def machine_rates(device: str, amount: Amount) -> dict[str, float]:
 
 def _task(call: Callable[[], object], problems: Problems, device: str) -> Task:
     """A task whose poses nobody asks for."""
-    return Task(call, lambda: problems.pose, problems, waiting(device))
+    return Task(call, lambda: problems.pose, problems, device)
 
 
 def work(contender: Contender, problems: Problems, *, backward: bool) -> dict[str, float]:
@@ -313,7 +293,7 @@ def measure_throughput(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
             place["warm_s"] = time.perf_counter() - start
             each = work(plain, first(problems, 1000), backward=mode == BACKWARD)
             peak = peak_bytes(task, device)
-            found = summary([1e6 * task.seconds() / batch for _ in range(amount.rounds)])
+            found = summary([_microseconds(task) / batch for _ in range(amount.rounds)])
             known[mode].append((batch, found["median_us"] * batch / 1e6))
             floor_s = max(each["least_bytes"] / rates["bytes_per_s"], each["flops"] / rates["flops_per_s"])
             traffic_s = each["bytes"] / rates["bytes_per_s"]
@@ -333,18 +313,17 @@ def _expected_s(known: list[tuple[int, float]], batch: int) -> float:
 
 
 def _looped(name: str, n: int, amount: Amount) -> dict[str, Any]:
-    problems = draw(n, amount.batches[0])
+    batch = amount.batches[0]
     say(f"throughput: {name}, n = {n}")
-    task = CONTENDERS[name]().task(problems)
+    task = contenders.CONTENDERS[name]().task(draw(n, batch))
     task.warm()
-    times = summary([1e6 * task.seconds() / amount.batches[0] for _ in range(amount.rounds)])
-    place = {"contender": name, "mode": FORWARD, "n": n, "batch": amount.batches[0]}
-    return {**place, "success": task.success().rate, **times}
+    times = summary([_microseconds(task) / batch for _ in range(amount.rounds)])
+    return {"contender": name, "mode": FORWARD, "n": n, "batch": batch, "success": task.success().rate, **times}
 
 
 def peak_bytes(task: Task, device: str) -> int | None:
     """Most bytes that PyTorch allocates on the GPU during a call, beyond those before it."""
-    if task.finish is None:
+    if device == "cpu":
         return None
     torch.cuda.reset_peak_memory_stats(device)
     before = torch.cuda.memory_allocated(device)
@@ -352,29 +331,27 @@ def peak_bytes(task: Task, device: str) -> int | None:
     return torch.cuda.max_memory_allocated(device) - before
 
 
-# -- the command -------------------------------------------------------------------------------------------------------
-
-
-PARTS: dict[str, Callable[[str, Amount], Iterator[dict[str, Any]]]] = {
-    "parity": parity,
-    "graphs": graphs,
-    "throughput": measure_throughput,
-}
+Part = Callable[[str, Amount], Iterator[dict[str, Any]]]
+PARTS: dict[str, Part] = {"parity": parity, "graphs": graphs, "throughput": measure_throughput}
 
 
 def main(arguments: Sequence[str] | None = None, amount: Amount | None = None) -> None:
     """Measure, and write each row into the file as soon as it is known."""
-    command = parser(__doc__)
+    command = parser(__doc__, HERE / "gpu.json")
     command.add_argument("--device", default="cuda", help="cuda, or cpu to try the script")
     command.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), help="the others stay in the file")
     command.add_argument("--quick", action="store_true", help="a few small problems: does everything run?")
-    command.add_argument("--out", type=Path, default=HERE / "gpu.json", help="the results file")
     options = command.parse_args(arguments)
     amount = amount or (QUICK if options.quick else FULL)
     results = json.loads(options.out.read_text()) if options.out.exists() else {}
     for part in options.parts:
         settings = {"device": options.device, **amount._asdict()}
-        results[part] = {"environment": environment(), "settings": settings, "load_average": load(), "rows": []}
+        results[part] = {
+            "environment": environment(),
+            "settings": settings,
+            "load_average": os.getloadavg()[0],
+            "rows": [],
+        }
         for row in PARTS[part](options.device, amount):
             if "rates" in row:
                 results[part] |= row

@@ -15,8 +15,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from torch import Tensor
 
 from kornia_pnpnet.core.environment import environment
@@ -38,17 +38,17 @@ def threads(count: int = 1) -> Iterator[None]:
     The allocator is set as the documentation advises for large batches.
     """
     keep_freed_memory()
-    cv2 = sys.modules.get("cv2")  # its solvers have imported it
-    before = torch.get_num_threads(), None if cv2 is None else cv2.getNumThreads()
-    torch.set_num_threads(count)
-    if cv2 is not None:
-        cv2.setNumThreads(count)
+    libraries: list[tuple[Callable[[], int], Callable[[int], None]]] = [(torch.get_num_threads, torch.set_num_threads)]
+    if cv2 := sys.modules.get("cv2"):  # its solvers have imported it
+        libraries.append((cv2.getNumThreads, cv2.setNumThreads))
+    before = [get() for get, _ in libraries]
+    for _, change in libraries:
+        change(count)
     try:
         yield
     finally:
-        torch.set_num_threads(before[0])
-        if cv2 is not None:
-            cv2.setNumThreads(before[1])
+        for (_, change), number in zip(libraries, before, strict=True):
+            change(number)
 
 
 @contextmanager
@@ -61,11 +61,6 @@ def without_garbage_collection() -> Iterator[None]:
     finally:
         if collecting:
             gc.enable()
-
-
-def load() -> float:
-    """Load average of the last minute. Well above the number of threads, times are not to be trusted."""
-    return os.getloadavg()[0]
 
 
 def seconds(call: Callable[[], object], times: int = 1) -> float:
@@ -91,20 +86,10 @@ def summary(rounds_us: Sequence[float]) -> dict[str, Any]:
     return {"median_us": statistics.median(rounds_us), "min_us": min(rounds_us), "rounds_us": list(rounds_us)}
 
 
-def ratio(mine: Mapping[str, Any], theirs: Mapping[str, Any]) -> float:
+def ratio(mine: Row, theirs: Row) -> float:
     """Time of theirs by time of mine: the median over the rounds of the ratio in the same round."""
     rounds = zip(theirs["rounds_us"], mine["rounds_us"], strict=True)
     return statistics.median(other / own for other, own in rounds)
-
-
-def quantiles(values: Sequence[float], steps: int) -> list[float]:
-    """Quantiles at 0, 1/steps, ..., 1. Each is one of the values."""
-    return list(np.quantile(values, np.linspace(0, 1, steps + 1), method="inverted_cdf"))
-
-
-def share(picked: Tensor) -> float | None:
-    """Share of the entries that are true, ``None`` without entries."""
-    return float(picked.double().mean()) if len(picked) else None
 
 
 def peak_bytes() -> int:
@@ -114,11 +99,7 @@ def peak_bytes() -> int:
 
 
 def run_child(script: Path, *arguments: str, **environment: str) -> Any:
-    """Run a script in a process of its own and return the JSON that it prints. Its standard error is shown at once.
-
-    Raises:
-        RuntimeError: when the script fails.
-    """
+    """Run a script in a process of its own and return the JSON that it prints; RuntimeError when the script fails."""
     command = [sys.executable, str(script), *arguments]
     variables = {**os.environ, **environment}
     output = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False, env=variables)
@@ -127,31 +108,51 @@ def run_child(script: Path, *arguments: str, **environment: str) -> Any:
     return json.loads(output.stdout)
 
 
-def target(what: str, measured: float, wanted: float, *, unit: str, at_most: bool) -> dict[str, Any]:
+def share(chosen: Tensor) -> float | None:
+    """Share of the entries that are true, ``None`` without entries."""
+    return float(chosen.double().mean()) if len(chosen) else None
+
+
+def target(what: str, measured: float, wanted: float, *, unit: str = "", at_most: bool = True) -> dict[str, Any]:
     """A target beside the measurement, and whether the target is met."""
     met = measured <= wanted if at_most else measured >= wanted
     return {"what": what, "measured": measured, "target": wanted, "unit": unit, "at_most": at_most, "met": met}
 
 
-# -- results files and tables ------------------------------------------------------------------------------------------
+def parser(description: str | None, out: Path | None = None, *, required: bool = True) -> argparse.ArgumentParser:
+    """A command line with ``--out``, whose help shows the description as it is written."""
+    command = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    command.add_argument("--out", type=Path, default=out, required=required and out is None, help="file of results")
+    return command
 
 
-def parser(description: str | None) -> argparse.ArgumentParser:
-    """A command line whose help shows the description as it is written."""
-    return argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+def recorded(measure: Callable[[], Row], **settings: Any) -> dict[str, Any]:
+    """What a measurement returns, with ``environment``, ``settings``, and ``load_average`` before and after.
 
-
-def recorded(measure: Callable[[], Mapping[str, Any]], **settings: Any) -> dict[str, Any]:
-    """What a measurement returns, with ``environment``, ``settings``, and ``load_average`` before and after."""
-    before = load()
+    Times are not to be trusted where the load average of the last minute is well above the number of threads.
+    """
+    before = os.getloadavg()[0]
     found = measure()
-    return {"environment": environment(), "settings": settings, "load_average": [before, load()], **found}
+    load = [before, os.getloadavg()[0]]
+    return {"environment": environment(), "settings": settings, "load_average": load, **found}
 
 
-def write(path: Path, results: Mapping[str, Any], page: Callable[[Mapping[str, Any]], str]) -> None:
+def render(template: str, **facts: Any) -> str:
+    """A page from its template; a fact that is missing is an error."""
+    options: dict[str, Any] = {"trim_blocks": True, "keep_trailing_newline": True, "undefined": StrictUndefined}
+    environment = Environment(loader=FileSystemLoader(HERE), autoescape=False, **options)
+    return environment.get_template(template).render(**facts)
+
+
+def write(path: Path, results: Row, page: Callable[[Row], str]) -> None:
     """Write a results file, and its page beside it."""
     write_json(path, results)
     path.with_suffix(".md").write_text(page(results), encoding="utf-8")
+
+
+def say(text: str) -> None:
+    """Write a line of progress."""
+    print(text, file=sys.stderr, flush=True)
 
 
 def fill(column: Column, row: Row) -> str:
@@ -184,12 +185,18 @@ def pivot(
     return markdown_table([*keys, *names], cells, **options)
 
 
-def by_solver(rows: Iterable[Row], *keys: str) -> dict[tuple[Any, ...], dict[str, Row]]:
-    """Rows by these entries, then by solver."""
-    found: dict[tuple[Any, ...], dict[str, Row]] = {}
-    for row in rows:
-        found.setdefault(tuple(row[key] for key in keys), {})[row["solver"]] = row
-    return found
+def targets_table(targets: Iterable[Row]) -> str:
+    """Every target beside the measurement."""
+
+    def wanted(row: Row) -> str:
+        return f"at {'most' if row['at_most'] else 'least'} {row['target']:g} {row['unit']}".rstrip()
+
+    columns: dict[str, Column] = {
+        **{"What": "{what}", "Wanted": wanted},
+        "Measured": lambda row: f"{three_digits(row['measured'])} {row['unit']}".rstrip(),
+        "Verdict": lambda row: "met" if row["met"] else "**missed**",
+    }
+    return table(targets, columns)
 
 
 def percent(key: str, digits: int = 1, unit: str = "") -> Column:
@@ -197,6 +204,11 @@ def percent(key: str, digits: int = 1, unit: str = "") -> Column:
     return lambda row: "–" if row[key] is None else f"{100 * row[key]:.{digits}f}{unit}"
 
 
-def say(text: str) -> None:
-    """Write a line of progress."""
-    print(text, file=sys.stderr, flush=True)
+def digits(key: str, unit: float = 1.0) -> Column:
+    """A column of numbers in a unit, with three digits."""
+    return lambda row: three_digits(row[key] / unit)
+
+
+def three_digits(value: float) -> str:
+    """Three significant digits, never an exponent."""
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:#.3g}".rstrip(".")

@@ -1,4 +1,4 @@
-"""What the confidences of a network's keypoints are worth: ``keypoints.py A.npz B.npz --sources S.json --out O.json``.
+"""Ways to use the confidences of a network's keypoints: ``keypoints.py A.npz B.npz --sources S.json --out O.json``.
 
 Each file holds the problems of one source: ``world`` (P, N, 3), ``img`` (P, N, 2) in undistorted pixels, ``mask``
 (P, N), ``confidence`` (P, N), ``K`` (P, 3, 3), the reference pose ``R`` (P, 3, 3) and ``t`` (P, 3), ``seen`` (P,) for
@@ -30,7 +30,8 @@ from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.result import Pose
 
 FIELDS = ("world", "img", "mask", "confidence", "K", "R", "t", "seen", "cluster")
-# A pose is right below this number of degrees and this relative translation error; errors are also averaged up to CAP.
+# Upper limits of the rotation error in degrees and of the relative translation error for a pose to be right. The mean
+# "capped" error has no term above CAP.
 RIGHT, CAP = (5.0, 0.05), 0.5
 FEWEST = 6  # pairs that PoseLib gets at least, the most confident ones
 # Median and mean logarithm of the length of a two-dimensional residual, relative to its standard deviation.
@@ -76,7 +77,7 @@ def solve(p: Problems, way: Way) -> dict[str, Tensor]:
 
 
 def ways(seen: Problems, inlier_px: float) -> tuple[dict[str, Way], dict[str, float]]:
-    """Ways to use the confidence, fitted on problems that were seen, and the fitted numbers."""
+    """Ways to use the confidence, and the numbers that were fitted on the seen problems."""
     error, used, c = reprojection(seen), seen["mask"], seen["confidence"]
     isotonic = IsotonicRegression(y_min=0.01, y_max=0.99, increasing="auto", out_of_bounds="clip")
     isotonic.fit(c[used].numpy(), (error < inlier_px)[used].numpy())
@@ -137,8 +138,7 @@ def main() -> None:
     """Measure, print the tables and write the results."""
     command = parser(__doc__)
     command.add_argument("problems", type=Path, nargs="+")
-    command.add_argument("--sources", type=Path, required=True, help="JSON: what each source is, by its file")
-    command.add_argument("--out", type=Path, required=True)
+    command.add_argument("--sources", type=Path, required=True, help="JSON: a description of each source, by its file")
     options = command.parse_args()
     sources = json.loads(options.sources.read_text())
     with threads():

@@ -8,7 +8,11 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Sequence
+import statistics
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
 from functools import partial
 from importlib.metadata import distributions
 from pathlib import Path
@@ -16,21 +20,23 @@ from typing import Any
 
 import page
 import timing
-from contenders import FULL, QUICK, Settings
-from harness import HERE, parser, recorded, run_child, say
-from startup import measure_startup
+from contenders import FULL, PLAIN, QUICK, TRAINED, WHOLE, Settings, make_contenders
+from harness import HERE, Row, recorded, run_child, say, target, threads
+from page import CACHED, COLD, EAGER
 
 from kornia_pnpnet.evaluation.results import save_results
+
+COMPILED = f"{TRAINED} compiled"
 
 
 def measure_threads(part: str, settings: Settings, count: int) -> dict[str, list[dict[str, Any]]]:
     """Throughput or latency on ``count`` threads, in this process."""
-    measure_here = timing.measure_throughput if part == "throughput" else timing.measure_latency
-    return measure_here(settings, count=count)
+    with threads(count):
+        return (timing.measure_throughput if part == "throughput" else timing.measure_latency)(settings, count)
 
 
 def measure_part(part: str, settings: Settings) -> dict[str, Any]:
-    """Measure throughput or latency; rows, skipped contenders and targets."""
+    """Measure throughput, latency or cold starts; rows, skipped contenders and targets."""
     if part == "startup":
         return measure_startup(settings)
     # One process for each number of threads: code is compiled for the threads of its process.
@@ -44,9 +50,68 @@ def measure_part(part: str, settings: Settings) -> dict[str, Any]:
     return {**found, "targets": targets(found["rows"])}
 
 
+# The first batch size shows the compiler's warm-up, the others whether another size compiles again.
+_BATCHES = (1000, 999, 100, 10, 1)
+_IMPORTS = 5  # processes; the median counts
+_IMPORT = (
+    "import time, torch, kornia; start = time.perf_counter(); import kornia_pnpnet; print(time.perf_counter() - start)"
+)
+
+
+def measure_startup(settings: Settings) -> dict[str, Any]:
+    """Start every contender alone, forward and with gradients, on one thread.
+
+    Compiled contenders start with an empty cache of the compiler, and again with the cache of that first start.
+    """
+    contenders, skipped = make_contenders(settings)
+    starts = []
+    for name, contender in contenders.items():
+        if name.startswith(PLAIN) and name != WHOLE:
+            continue  # as TRAINED
+        for backward in (False, True) if contender.differentiable and name != WHOLE else (False,):
+            say(f"cold start: {name}{', backward' if backward else ''}")
+            # A loop needs the memory of one problem.
+            batch = 0 if contender.loops else settings.memory_batch
+            starts += start({"contender": name, "backward": backward, "memory_batch": batch}, settings)
+    command = [sys.executable, "-c", _IMPORT]
+    imports = [
+        float(subprocess.run(command, capture_output=True, text=True, check=True).stdout) for _ in range(_IMPORTS)
+    ]
+    return {"starts": starts, "imports_s": imports, "skipped": skipped, "targets": startup_targets(starts, imports)}
+
+
+def start(request: Mapping[str, Any], settings: Settings) -> list[dict[str, Any]]:
+    """Run ``process.py`` in processes one after the other. Only the last process measures memory."""
+
+    def measured(cache: str, batches: Sequence[int], **environment: str) -> dict[str, Any]:
+        wanted = {**request, "batches": batches, "memory_batch": 0 if cache == COLD else request["memory_batch"]}
+        found = run_child(HERE / "process.py", json.dumps(wanted), OMP_NUM_THREADS="1", **environment)
+        return {**found, "cache": cache}
+
+    if "compiled" not in request["contender"]:
+        return [measured(EAGER, [1])]
+    batches = [min(size, settings.problems) for size in _BATCHES]
+    with tempfile.TemporaryDirectory(prefix="inductor-") as folder:
+        return [measured(cache, batches, TORCHINDUCTOR_CACHE_DIR=folder) for cache in (COLD, CACHED)]
+
+
+def startup_targets(starts: Sequence[Row], imports: Sequence[float]) -> list[dict[str, Any]]:
+    """Most seconds of the import, and of making a compiled solver with its first call."""
+    what = "`import kornia_pnpnet` after torch and kornia"
+    found = [target(what, statistics.median(imports), 0.5, unit="s")] if imports else []
+    compiled = [entry for entry in starts if entry["contender"] == COMPILED]
+    if any("compil" in text for entry in compiled for text in entry["warnings"]):
+        return found  # there is no compiler
+    for entry in sorted(compiled, key=lambda entry: (entry["backward"], entry["cache"] == CACHED)):
+        most, mode = 20.0 if entry["cache"] == COLD else 5.0, timing.BACKWARD if entry["backward"] else timing.FORWARD
+        what, first = f"`{COMPILED}`, first call, {mode}, {entry['cache']}", entry["calls"][0]["first_s"]
+        found.append(target(what, entry["make_s"] + first, most, unit="s"))
+    return found
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure and write the results files, or write the page."""
-    command = parser(__doc__)
+    command = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     command.add_argument("step", nargs="?", choices=("measure", "render"), default="measure")
     command.add_argument("--parts", nargs="+", choices=page.PARTS, default=page.PARTS, help="for measure: only these")
     command.add_argument("--contenders", nargs="+", help="for measure: only these")

@@ -29,14 +29,13 @@ def main(request: dict[str, Any]) -> dict[str, Any]:
         size ``first_s`` and ``second_s``; ``memory``: ``before_bytes`` and ``peak_bytes`` of the process around the
         call, or ``None``; ``warnings`` of the calls.
     """
-    start = time.perf_counter()
+    clock = [time.perf_counter()]
     import torch  # noqa: F401
 
-    torch_s = time.perf_counter() - start
-    start = time.perf_counter()
+    clock.append(time.perf_counter())
     import kornia_pnpnet  # noqa: F401
 
-    package_s = time.perf_counter() - start
+    clock.append(time.perf_counter())
     from contenders import CONTENDERS, N, draw
     from harness import peak_bytes, threads
 
@@ -65,11 +64,8 @@ def main(request: dict[str, Any]) -> dict[str, Any]:
     ignored = DeprecationWarning | FutureWarning
     return {
         **{key: request[key] for key in ("contender", "backward")},
-        "torch_s": torch_s,
-        "package_s": package_s,
-        "make_s": make_s,
-        "calls": calls,
-        "memory": memory,
+        **{"torch_s": clock[1] - clock[0], "package_s": clock[2] - clock[1], "make_s": make_s},
+        **{"calls": calls, "memory": memory},
         "warnings": [str(entry.message) for entry in caught if not issubclass(entry.category, ignored)],
     }
 

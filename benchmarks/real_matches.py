@@ -2,29 +2,32 @@
 
 ``make`` localises images in a map as a user would. FOLDER holds a COLMAP model with poses of all images (its points are
 not used) in ``sparse/0``, ``sparse`` or FOLDER itself, and the images in ``images``. Every fourth image is a query, the
-others are the map: SIFT keypoints (OpenCV) with points triangulated from the images of the map alone. A problem is one
-query against one image of the map: each keypoint of the query is matched to its nearest neighbour (kind 1), or only
-where Lowe's ratio test accepts it (kind 0). The reference pose is the model's.
+others are the map: SIFT keypoints (OpenCV), whose points pycolmap triangulates from the images of the map alone. A
+problem is one query against one image of the map: each keypoint of the query is matched to its nearest neighbour
+(kind 1), or only where Lowe's ratio test accepts it (kind 0). The reference pose is the model's.
 
 ``measure`` solves the problems of such files with solvers by name, all in turns in the same run on one thread. A name
 with ``+ratio`` at the end gets 1 - ratio as the confidence of each pair, one with ``+sigma`` gets sigmas of 1 px and 0.
 ``--pictures`` draws failures of the first solver: of each scene the far-off pose with the most inliers under the
-reference pose, and of these the three with the most.
+reference pose, and of these the three with the most. ``--batch`` gives the numbers of problems in a call.
 
-``--batch`` gives the numbers of problems in a call. ``cost`` times solvers by share of outliers and number of pairs.
+``cost`` times solvers by share of outliers and number of pairs.
 """
 
 from __future__ import annotations
 
+import argparse
 import itertools
+import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from harness import Row, parser, pivot, recorded, say, share, threads
+from harness import Row, pivot, recorded, say, share, threads
 from kornia.core.exceptions import BaseError
 from kornia.geometry.epipolar import (
     fundamental_from_projections,
@@ -35,9 +38,11 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor, nn
+from torch.nn.utils.rnn import pad_sequence
 
 from kornia_pnpnet import pose_errors
 from kornia_pnpnet.core.files import read_npz
+from kornia_pnpnet.core.trees import take
 from kornia_pnpnet.data.colmap import _find_model
 from kornia_pnpnet.evaluation import SeesTruth
 from kornia_pnpnet.evaluation.named_solvers import load_solver
@@ -50,8 +55,8 @@ from kornia_pnpnet.result import PnPResult, Pose, Problems
 Floats = NDArray[np.float64]
 Whole = NDArray[np.int64]
 
-# A pair is an inlier when its reprojection error under the reference pose is below this many pixels, in images of 1000
-# to 1600 pixels. A problem with fewer inliers than MIN_INLIERS does not count in rates.
+# Upper limit of the reprojection error of an inlier under the reference pose, in pixels; images have 1000 to 1600. A
+# problem with fewer inliers than MIN_INLIERS does not count in rates.
 INLIER_PX, MIN_INLIERS = 8.0, 8
 # Upper limits of the rotation error in degrees and of the distance of the camera centres by the median depth of the
 # inliers, for a pose to be right; a pose above one of the other two is far off.
@@ -67,9 +72,9 @@ EPIPOLAR_PX, TRIANGULATION_PX, MIN_ANGLE = 2.0, 2.0, 1.5
 # An image of the map can be matched to a query when this fraction of its points, and at least this number of them, lies
 # inside the query.
 MIN_OVERLAP, MIN_POINTS = 0.25, 30
-# What a solver is told whose name ends with this: 1 - ratio as the confidence of each pair, or sigmas.
+# Ends of the names of solvers that get 1 - ratio as the confidence of each pair, or KNOWN_SIGMAS.
 CONFIDENCE, SIGMAS = "+ratio", "+sigma"
-TOLD_SIGMAS = {"img_sigma": 1.0, "world_sigma": 0.0}
+KNOWN_SIGMAS = {"img_sigma": 1.0, "world_sigma": 0.0}
 # Limits of the numbers of pairs by which results are grouped.
 PAIRS = (0, 25, 50, 100, 200, 400, 501)
 PICTURES = 3
@@ -87,18 +92,17 @@ class View(NamedTuple):
     pixels: Floats  # (M, 2)
     descriptors: NDArray[np.float32]  # (M, 128)
     intrinsics: Floats  # (3, 3)
-    rotation: Floats  # (3, 3)
-    translation: Floats  # (3,)
+    pose: Floats  # (3, 4)
 
     @property
     def centre(self) -> Floats:
         """Camera centre in the world, shape (3,)."""
-        return -self.rotation.T @ self.translation
+        return -self.pose[:, :3].T @ self.pose[:, 3]
 
-    @property
-    def projection(self) -> Floats:
-        """Matrix from homogeneous world points to pixels, shape (3, 4)."""
-        return self.intrinsics @ np.column_stack([self.rotation, self.translation])
+    def project(self, points: Floats) -> Floats:
+        """Pixels (M, 2) of world points (M, 3), NaN behind the camera."""
+        image = (points @ self.pose[:, :3].T + self.pose[:, 3]) @ self.intrinsics.T
+        return image[:, :2] / np.where(image[:, 2:] > 0, image[:, 2:], np.nan)
 
 
 class Matches(NamedTuple):
@@ -135,9 +139,6 @@ class Solved(NamedTuple):
     probability: Tensor  # (P,) NaN where the solver has none
 
 
-# --- Problems of a scene ----------------------------------------------------------------------------------------------
-
-
 def read_views(folder: Path, features: int) -> list[View]:
     """Detect keypoints in all images of a COLMAP model that have a pose, sorted by name."""
     import cv2
@@ -162,37 +163,33 @@ def read_views(folder: Path, features: int) -> list[View]:
         intrinsics = camera.calibration_matrix()
         pixels = camera.cam_from_img(distorted) @ intrinsics[:2, :2].T + intrinsics[:2, 2]
         seen = np.isfinite(pixels).all(1)
-        pose = image.cam_from_world().matrix()
-        size = (camera.width, camera.height)
-        views.append(View(image.name, size, pixels[seen], descriptors[seen], intrinsics, pose[:, :3], pose[:, 3]))
+        size, pose = (camera.width, camera.height), image.cam_from_world().matrix()
+        views.append(View(image.name, size, pixels[seen], descriptors[seen], intrinsics, pose))
     return views
 
 
 def nearest(query: NDArray[np.float32], train: NDArray[np.float32]) -> tuple[Whole, Floats]:
     """Nearest neighbour of each descriptor, and the distance to it by the distance to the second nearest."""
-    squares = (query**2).sum(1)[:, None] - 2 * query @ train.T + (train**2).sum(1)
-    two = np.argpartition(squares, 1, axis=1)[:, :2]
-    distances = np.sqrt(np.maximum(np.take_along_axis(squares, two, axis=1), 0.0).astype(np.float64))
-    first = distances.argmin(1)
-    rows = np.arange(len(query))
-    return two[rows, first].astype(np.int64), distances[rows, first] / np.maximum(distances[rows, 1 - first], 1e-9)
+    two = torch.cdist(torch.from_numpy(query), torch.from_numpy(train)).topk(2, largest=False)
+    distances = two.values.double().numpy()
+    return two.indices[:, 0].numpy(), distances[:, 0] / np.maximum(distances[:, 1], 1e-9)
 
 
 def agree(first: View, second: View, pairs: Whole) -> NDArray[np.bool_]:
-    """Whether matched keypoints, shape (M, 2), lie near each other's epipolar line under the poses of the model."""
-    one, two = (torch.from_numpy(view.projection)[None] for view in (first, second))
+    """Whether matched keypoints (M, 2) lie close to each other's epipolar line under the poses of the model."""
+    one, two = (torch.from_numpy(view.intrinsics @ view.pose)[None] for view in (first, second))
     fundamental = fundamental_from_projections(one, two)
-    points = [torch.from_numpy(x.pixels[at])[None] for x, at in ((first, pairs[:, 0]), (second, pairs[:, 1]))]
+    points = [torch.from_numpy(view.pixels[at])[None] for view, at in zip((first, second), pairs.T, strict=True)]
     right = left_to_right_epipolar_distance(points[0], points[1], fundamental)[0]
     left = right_to_left_epipolar_distance(points[0], points[1], fundamental)[0]
     return ((right < EPIPOLAR_PX) & (left < EPIPOLAR_PX)).numpy()
 
 
 def tracks(views: Sequence[View]) -> list[Whole]:
-    """Label the keypoints of each image by track, -1 where there is none.
+    """Keypoints of the same point, as rows of the number of a view and the number of a keypoint in this view.
 
-    Keypoints are joined that are each other's nearest neighbour, pass the ratio test and fit the epipolar geometry. A
-    track with two keypoints in one image is dropped.
+    A match joins two keypoints when each is the nearest neighbour of the other, the ratio test accepts it, and it fits
+    the epipolar geometry. A track with two keypoints in one image is dropped.
     """
     starts = np.cumsum([0, *(len(view.pixels) for view in views)])
     edges = [np.zeros((0, 2), dtype=np.int64)]
@@ -205,64 +202,35 @@ def tracks(views: Sequence[View]) -> list[Whole]:
     ends = np.concatenate(edges).T
     graph = coo_array((np.ones(ends.shape[1]), (ends[0], ends[1])), shape=(starts[-1], starts[-1]))
     _, track = connected_components(graph, directed=False)
-    size = np.bincount(track)
-    image = np.repeat(np.arange(len(views)), np.diff(starts))
-    keys, times = np.unique(track * len(views) + image, return_counts=True)
-    size[keys[times > 1] // len(views)] = 0
-    labels = np.where(size[track] >= 2, track, -1)
-    return [labels[start:end] for start, end in itertools.pairwise(starts)]
+    order = track.argsort(kind="stable")
+    view = np.searchsorted(starts, order, side="right") - 1
+    members = np.column_stack([view, order - starts[view]])
+    groups = np.split(members, np.flatnonzero(np.diff(track[order])) + 1)
+    return [group for group in groups if 1 < len(group) == len(np.unique(group[:, 0]))]
 
 
-def triangulate(views: Sequence[View], labels: Sequence[Whole]) -> list[Floats]:
-    """World point of each keypoint, NaN where it has no track or the point of its track fails a check."""
-    kept = [np.flatnonzero(label >= 0) for label in labels]
-    names, track = np.unique(
-        np.concatenate([lab[at] for lab, at in zip(labels, kept, strict=True)]), return_inverse=True
-    )
-    view = np.repeat(np.arange(len(views)), [len(at) for at in kept])
-    pixels = np.concatenate([v.pixels[at] for v, at in zip(views, kept, strict=True)])
-    offset = np.mean([v.centre for v in views], axis=0)
-    shift = np.eye(4)
-    shift[:3, 3] = offset
-    matrices = np.stack([v.projection @ shift for v in views])[view]  # (M, 3, 4)
-    focal = np.array([v.intrinsics[0, 0] for v in views])[view]
-    rows = (pixels[:, :, None] * matrices[:, 2:] - matrices[:, :2]) / focal[:, None, None]  # (M, 2, 4)
-    weight = np.ones(len(track))
-    for _ in range(4):  # weights of 1 / depth turn algebraic errors into reprojection errors
-        scaled = rows * weight[:, None, None]
-        normal, right = np.zeros((len(names), 3, 3)), np.zeros((len(names), 3))
-        np.add.at(normal, track, scaled[..., :3].mT @ scaled[..., :3])
-        np.add.at(right, track, -(scaled[..., :3].mT @ scaled[..., 3:])[..., 0])
-        flat = np.linalg.cond(normal) > 1e12
-        normal[flat] = np.eye(3)
-        points = np.linalg.solve(normal, right[..., None])[..., 0]
-        depth = (matrices[:, 2, :3] * points[track]).sum(1) + matrices[:, 2, 3]
-        weight = 1 / np.maximum(np.abs(depth), 1e-6)
-    image = (matrices[:, :, :3] @ points[track][..., None])[..., 0] + matrices[:, :, 3]
-    error = np.linalg.norm(image[:, :2] / np.where(image[:, 2:] > 0, image[:, 2:], 1e-9) - pixels, axis=1)
-    rays = np.stack([v.centre - offset for v in views])[view] - points[track]
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    # The angle to the first ray of the track bounds the largest angle from below.
-    _, first = np.unique(track, return_index=True)
-    cosine = np.ones(len(names))
-    np.minimum.at(cosine, track, (rays * rays[first][track]).sum(1))
-    worst = np.zeros(len(names))
-    np.maximum.at(worst, track, np.where(depth > 0, error, np.inf))
-    good = ~flat & (worst < TRIANGULATION_PX) & (cosine < np.cos(np.radians(MIN_ANGLE)))
-    points = np.where(good[:, None], points + offset, np.nan)
-    found = [np.full((len(label), 3), np.nan) for label in labels]
-    for number, at in enumerate(kept):
-        found[number][at] = points[track[view == number]]
+def triangulate(views: Sequence[View]) -> list[Floats]:
+    """World point of each keypoint, NaN where it has no track or a keypoint of its track does not fit the point."""
+    import pycolmap
+
+    residual = pycolmap.TriangulationResidualType.REPROJECTION_ERROR
+    options = pycolmap.EstimateTriangulationOptions(residual_type=residual, min_tri_angle=math.radians(MIN_ANGLE))
+    options.ransac.max_error, options.ransac.random_seed = TRIANGULATION_PX, 0
+    poses, cameras = [pycolmap.Rigid3d(view.pose) for view in views], []
+    for view in views:
+        (fx, _, cx), (_, fy, cy), _ = view.intrinsics
+        size = {"width": view.size[0], "height": view.size[1]}
+        cameras.append(pycolmap.Camera(model="PINHOLE", **size, params=[fx, fy, cx, cy]))
+    found = [np.full((len(view.pixels), 3), np.nan) for view in views]
+    for track in tracks(views):
+        pixels = np.array([views[i].pixels[at] for i, at in track])
+        seen_by = [i for i, _ in track]
+        chosen = [poses[i] for i in seen_by], [cameras[i] for i in seen_by]
+        made = pycolmap.estimate_triangulation(pixels, chosen[0], chosen[1], options)
+        if made is not None and all(made["inliers"]):
+            for i, at in track:
+                found[i][at] = made["xyz"]
     return found
-
-
-def reprojection(view: View, points: Floats, pixels: Floats) -> Floats:
-    """Reprojection errors in pixels, infinite behind the camera."""
-    camera = points @ view.rotation.T + view.translation
-    ahead = camera[:, 2] > 0
-    image = camera @ view.intrinsics.T
-    error = np.linalg.norm(image[:, :2] / np.where(ahead, image[:, 2], 1.0)[:, None] - pixels, axis=1)
-    return np.where(ahead, error, np.inf)
 
 
 def choose_images(query: View, database: Sequence[View], points: Sequence[Floats], count: int) -> list[int]:
@@ -270,11 +238,7 @@ def choose_images(query: View, database: Sequence[View], points: Sequence[Floats
     distances = {}
     for number, (view, known) in enumerate(zip(database, points, strict=True)):
         world = known[np.isfinite(known[:, 0])]
-        if len(world) < MIN_POINTS:
-            continue
-        camera = world @ query.rotation.T + query.translation
-        image = camera @ query.intrinsics.T
-        pixels = image[:, :2] / np.where(camera[:, 2:] > 0, image[:, 2:], np.nan)
+        pixels = query.project(world)
         inside = ((pixels > 0) & (pixels < np.array(query.size))).all(1)  # False where NaN
         if inside.sum() < max(MIN_POINTS, MIN_OVERLAP * len(world)):
             continue
@@ -291,7 +255,7 @@ def make(folder: Path, out: Path, *, features: int, every: int, views: int, pair
     """Make the problems of one scene, with the options of the command, write them and read them again."""
     found = read_views(folder, features)
     queries, database = found[every // 2 :: every], [v for i, v in enumerate(found) if i % every != every // 2]
-    points = triangulate(database, tracks(database))
+    points = triangulate(database)
     known = sum(int(np.isfinite(p[:, 0]).sum()) for p in points)
     say(f"{folder.name}: {len(queries)} queries, {len(database)} images with {known} keypoints with a point")
     generator = np.random.default_rng(seed)
@@ -305,20 +269,19 @@ def make(folder: Path, out: Path, *, features: int, every: int, views: int, pair
                 if len(at) < MIN_INLIERS:
                     continue
                 at = generator.permutation(at)[:pairs]
-                error = reprojection(query, world[at], query.pixels[at])
+                error = np.linalg.norm(query.project(world[at]) - query.pixels[at], axis=1)
+                error[np.isnan(error)] = np.inf
                 values = (world[at], query.pixels[at], ratio[at], np.ones(len(at), dtype=bool), error)
-                pose = (query.intrinsics, query.rotation, query.translation, kind)
+                pose = (query.intrinsics, query.pose[:, :3], query.pose[:, 3], kind)
                 names = {"query": query.name, "database": database[number].name}
                 rows.append({**dict(zip((*OF_PAIRS, *OF_PROBLEMS), (*values, *pose), strict=True)), **names})
     if not rows:
         raise ValueError(f"{folder} has no problems.")
-    longest = max(len(row["ratio"]) for row in rows)
-    for row in rows:
-        for name in OF_PAIRS:
-            width = [(0, longest - len(row[name]))] + [(0, 0)] * (row[name].ndim - 1)
-            row[name] = np.pad(row[name], width, constant_values=np.inf if name == "error_px" else 0)
-    arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
-    arrays |= {name: arrays[name].astype(np.float32) for name in ("ratio", "error_px")}
+    arrays: dict[str, Any] = {name: np.stack([row[name] for row in rows]) for name in rows[0] if name not in OF_PAIRS}
+    for name in OF_PAIRS:
+        filling = np.inf if name == "error_px" else 0
+        padded = pad_sequence([torch.from_numpy(row[name]) for row in rows], True, filling).numpy()
+        arrays[name] = padded.astype(np.float32) if name in ("ratio", "error_px") else padded
     out.parent.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(out, allow_pickle=False, **arrays)
     return read([out])
@@ -329,21 +292,14 @@ def read(paths: Sequence[Path]) -> Matches:
     files = [
         {name: torch.from_numpy(x) for name, x in read_npz(path, OF_PAIRS + OF_PROBLEMS).items()} for path in paths
     ]
-    longest = max(file["ratio"].shape[1] for file in files)
-    for file in files:
-        for name in OF_PAIRS:
-            padded = file[name].new_zeros(len(file[name]), longest, *file[name].shape[2:])
-            padded[:, : file[name].shape[1]] = file[name]
-            file[name] = padded
-    one = {name: torch.cat([file[name] for file in files]) for name in (*OF_PAIRS, *OF_PROBLEMS)}
+    one = {name: torch.cat([file[name] for file in files]) for name in OF_PROBLEMS}
+    for name in OF_PAIRS:
+        one[name] = pad_sequence([row for file in files for row in file[name]], batch_first=True)
     one |= {name: x.double() for name, x in one.items() if name != "mask"}
     pose, inliers = Pose(one["R"], one["t"]), one["mask"] & (one["error_px"] < INLIER_PX)
     problems = Problems(one["world"], one["pixels"], one["K"], pose, inliers)
     scenes = tuple(path.stem for path, file in zip(paths, files, strict=True) for _ in file["kind"])
     return Matches(problems, one["mask"], one["ratio"], one["error_px"], one["kind"], scenes)
-
-
-# --- Solvers on problems ----------------------------------------------------------------------------------------------
 
 
 def batches(matches: Matches, size: int) -> list[Tensor]:
@@ -372,26 +328,22 @@ def batch(matches: Matches, at: Tensor) -> tuple[tuple[Problems, Tensor, Tensor]
     return (given, mask[:, :longest], matches.ratio[at].where(mask, 1.0)[:, :longest].float()), origin
 
 
-def call(solver: nn.Module, spec: str, given: Problems, mask: Tensor, ratio: Tensor) -> PnPResult:
-    """Solve a batch; a bound sees the reference poses, and other libraries with a ratio get the best pairs first."""
-    if isinstance(solver, SeesTruth):
-        return solver.solve_with_truth(given)
-    known: dict[str, Any] = {}
+def call(solver: Any, spec: str, given: Problems, mask: Tensor, ratio: Tensor) -> tuple[PnPResult, float]:
+    """Solve a batch; the result, and milliseconds of the processor for a problem.
+
+    A bound sees the reference poses. Other libraries with a ratio get the best pairs first.
+    """
+    known: dict[str, Any] = KNOWN_SIGMAS if SIGMAS in spec else {}
     if CONFIDENCE in spec and isinstance(solver, PeerSolver):
-        order, rows = ratio.argsort(dim=1, stable=True), torch.arange(len(ratio))[:, None]
-        given = given._replace(world_points=given.world_points[rows, order], img_points=given.img_points[rows, order])
-        mask = mask.gather(1, order)
+        order = ratio.argsort(dim=1, stable=True)
+        world, img = (x.take_along_dim(order[..., None], 1) for x in given[:2])
+        given, mask = given._replace(world_points=world, img_points=img), mask.gather(1, order)
     elif CONFIDENCE in spec:
-        known["confidence"] = 1 - ratio
-    known |= TOLD_SIGMAS if SIGMAS in spec else {}
-    return solver(*given[:3], mask=mask, **known)
-
-
-def timed(solver: nn.Module, spec: str, given: tuple[Problems, Tensor, Tensor]) -> tuple[PnPResult, float]:
-    """The result of :func:`call`, and milliseconds of the processor for a problem."""
+        known = {"confidence": 1 - ratio}
     start = time.process_time()
-    result = call(solver, spec, *given)
-    return result, 1e3 * (time.process_time() - start) / len(given[1])
+    bound = isinstance(solver, SeesTruth)
+    result = solver.solve_with_truth(given) if bound else solver(*given[:3], mask=mask, **known)
+    return result, 1e3 * (time.process_time() - start) / len(mask)
 
 
 @torch.no_grad()
@@ -406,9 +358,9 @@ def solve(solvers: Mapping[str, nn.Module], matches: Matches, size: int) -> dict
         given, origin = batch(matches, at)
         for spec, solver in solvers.items():
             say(f"batch {number + 1} of {len(parts)}: {spec}")
-            call(solver, spec, given[0].map(lambda x: x[:2]), given[1][:2], given[2][:2])  # not timed: slower
+            call(solver, spec, *take(given, slice(2)))  # not timed: slower
             one = found[spec]
-            result, one.milliseconds[at] = timed(solver, spec, given)
+            result, one.milliseconds[at] = call(solver, spec, *given)
             one.pose.rotation[at] = rotation = result.rotation.double()
             one.pose.translation[at] = result.translation.double() - (rotation @ origin[..., None])[..., 0]
             one.ok[at] = result.ok
@@ -417,14 +369,9 @@ def solve(solvers: Mapping[str, nn.Module], matches: Matches, size: int) -> dict
     return found
 
 
-def ranges(
-    limits: Sequence[float], title: str, upper: float = 0.0, scale: float = 1.0
-) -> dict[str, tuple[float, float]]:
-    """Ranges between limits by a title that holds both ends; the upper end is shown less ``upper``."""
-    return {title.format(scale * low, scale * (high - upper)): (low, high) for low, high in itertools.pairwise(limits)}
-
-
-BY_SHARE, BY_PAIRS = ranges(SHARES, "{:.0f}–{:.0f} %", scale=100), ranges(PAIRS, "{:.0f}–{:.0f} pairs", upper=1)
+#: Ranges of the share of outliers and of the number of pairs, by their titles.
+BY_SHARE = {f"{100 * low:.0f}–{100 * high:.0f} %": (low, high) for low, high in itertools.pairwise(SHARES)}
+BY_PAIRS = {f"{low}–{high - 1} pairs": (low, high) for low, high in itertools.pairwise(PAIRS)}
 
 
 def groups(matches: Matches) -> dict[tuple[str, str], Tensor]:
@@ -475,9 +422,9 @@ def measure(
 
 @torch.no_grad()
 def measure_cost(matches: Matches, specs: Sequence[str]) -> dict[str, Any]:
-    """Time solvers on the matches without a ratio test, apart for every share of outliers and number of pairs.
+    """Time solvers on matches without a ratio test, by share of outliers and by number of pairs.
 
-    A batch holds the problems of a group, repeated in turns.
+    A batch repeats the problems of a group until it is full.
     """
     solvers, chosen, rows = load_solvers(specs), groups(matches), []
     with threads():
@@ -488,7 +435,7 @@ def measure_cost(matches: Matches, specs: Sequence[str]) -> dict[str, Any]:
             given, _ = batch(matches, at[torch.arange(COST_BATCH) % len(at)])
             for spec, solver in solvers.items():
                 say(f"{group}: {spec}")
-                rows.append({"solver": spec, "group": group, "ms_per_problem": timed(solver, spec, given)[1]})
+                rows.append({"solver": spec, "group": group, "ms_per_problem": call(solver, spec, *given)[1]})
     return {"rows": rows}
 
 
@@ -580,7 +527,7 @@ def format_results(results: Mapping[str, Any]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Make or measure problems, and print what was found."""
-    command = parser(__doc__)
+    command = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = command.add_subparsers(dest="command", required=True)
     making = commands.add_parser("make", help="make the problems of one scene")
     making.add_argument("folder", type=Path, help="a COLMAP model with its images in images/")
@@ -609,19 +556,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     matches = read(options.problems)
     settings: dict[str, Any] = {"files": [path.name for path in options.problems], "solvers": options.solvers}
-    settings |= {"shares": SHARES, "pairs": PAIRS}
+    settings |= {"shares": SHARES, "pairs": PAIRS, "batch": COST_BATCH}
+    run: Callable[[], dict[str, Any]] = partial(measure_cost, matches, options.solvers)
+    if options.command == "measure":
+        settings |= {"split": options.split, "batch": options.batch, "dtype": "torch.float32", "told": KNOWN_SIGMAS}
+        settings |= {"inlier_px": INLIER_PX, "min_inliers": MIN_INLIERS, "right": RIGHT, "far": FAR}
+        run = partial(measure, matches, options.solvers, options.pictures, options.batch)
     try:
-        if options.command == "cost":
-            settings["batch"] = COST_BATCH
-            results = recorded(lambda: measure_cost(matches, options.solvers), **settings)
-        else:
-            settings |= {"split": options.split, "batch": options.batch, "dtype": "torch.float32", "told": TOLD_SIGMAS}
-            settings |= {"inlier_px": INLIER_PX, "min_inliers": MIN_INLIERS, "right": RIGHT, "far": FAR}
-            parts = options.solvers, options.pictures, options.batch
-            results = recorded(lambda: measure(matches, *parts), **settings)
-            print(format_results(results))
+        results = recorded(run, **settings)
     except BaseError as error:
         command.error(str(error))
+    if options.command == "measure":
+        print(format_results(results))
     save_results(results, options.out)
 
 

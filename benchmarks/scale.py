@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import psutil
 import pyarrow as pa
-from harness import HERE, load, parser, say
+from harness import HERE, parser, say
 from pyarrow import dataset, parquet
 
 from kornia_pnpnet.arrow import list_column
@@ -31,15 +31,12 @@ from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 EXAMPLE = HERE.parent / "docs" / "examples" / "ray_data.py"
 COMMAND = [sys.executable, "-c", "import sys; from kornia_pnpnet.cli import main; sys.exit(main())", "solve", "--batch"]
 PAIRS, OUTLIERS = 9, 2
-#: Largest number of problems in a file.
-FILE = 250_000
-#: Problems of a run that is little more than the start of Ray.
-FEW = 1000
-#: Seconds between two looks at the memory.
-PERIOD = 0.5
-#: The title of a worker's process.
-WORKER = "MapBatches(Solve)"
-#: The largest distances from a pose of the loop that count as rounding: entries of the rotation, and metres.
+FILE = 250_000  # largest number of problems in a file
+FEW = 1000  # problems of a run that is little more than the start of Ray
+PERIOD = 0.5  # seconds between two measurements of the memory
+WORKER = "MapBatches(Solve)"  # the title of a worker's process
+POSE = ("rotation", "translation")
+# The largest differences from a pose of the loop that count as rounding: entries of the rotation, and metres.
 ROUNDING = 1e-3
 
 
@@ -64,8 +61,8 @@ def run(command: list[str], kill_at: tuple[Path, int, str] | None = None) -> dic
 
     Args:
         command: the command.
-        kill_at: kill processes once the folder has results of this number of problems: the first process with this text
-            in its title, or all processes of the command for an empty title.
+        kill_at: a folder, a number of problems and a title. Once the folder has results of that number of problems, the
+            first process whose title contains the text is killed; with an empty text all processes of the command.
 
     Returns:
         ``wall_s``; ``cpu_s`` and ``peak_bytes`` of all processes together; ``killed_at``, the number of problems with
@@ -98,7 +95,13 @@ def run(command: list[str], kill_at: tuple[Path, int, str] | None = None) -> dic
         raise RuntimeError("the command ended before a process could be killed")
     if process.returncode and not (kill_at and not kill_at[2]):
         raise RuntimeError(f"{' '.join(command)} failed")
-    return {"wall_s": wall, "cpu_s": sum(cpu.values()), "peak_bytes": peak, "killed_at": killed, "load": load()}
+    return {
+        "wall_s": wall,
+        "cpu_s": sum(cpu.values()),
+        "peak_bytes": peak,
+        "killed_at": killed,
+        "load": os.getloadavg()[0],
+    }
 
 
 def rows(folder: Path) -> int:
@@ -118,9 +121,6 @@ def read(folder: Path) -> dict[str, np.ndarray]:
     order = ids.argsort(kind="stable")
     poses = {name: columns[name].flatten().to_numpy().reshape(len(ids), -1)[order] for name in columns if name in POSE}
     return {"id": ids[order], "ok": columns["ok"].to_numpy(zero_copy_only=False)[order], **poses}
-
-
-POSE = ("rotation", "translation")
 
 
 def compare(expected: dict[str, np.ndarray], folder: Path) -> dict[str, int]:
@@ -155,23 +155,21 @@ def measure(problems: int, solver: str, batch: int, folder: Path) -> dict[str, A
     def ray(name: str, workers: int, *more: str, source: str = source) -> list[str]:
         return [sys.executable, str(EXAMPLE), source, str(folder / name), *same, "--workers", str(workers), *more]
 
-    runs = {"start": run(ray("start", 2, source=str(folder / "few")))}
-    runs["loop"] = run([*COMMAND, source, "--out", str(folder / "loop"), *same])
-    runs["one"] = run(ray("one", 1))
-    runs["two"] = run(ray("two", 2))
-    runs["killed"] = run(ray("killed", 2), (folder / "killed", problems // 3, WORKER))
-    runs["stopped"] = run(ray("again", 2, "--id", "id"), (folder / "again", problems // 3, ""))
-    runs["again"] = run(ray("again", 2, "--id", "id"))
+    third = problems // 3
+    runs = {
+        "start": run(ray("start", 2, source=str(folder / "few"))),
+        "loop": run([*COMMAND, source, "--out", str(folder / "loop"), *same]),
+        "one": run(ray("one", 1)),
+        "two": run(ray("two", 2)),
+        "killed": run(ray("killed", 2), (folder / "killed", third, WORKER)),
+        "stopped": run(ray("again", 2, "--id", "id"), (folder / "again", third, "")),
+        "again": run(ray("again", 2, "--id", "id")),
+    }
     expected = read(folder / "loop")
     return {
-        "problems": problems,
-        "pairs": PAIRS,
-        "solver": solver,
-        "batch": batch,
-        "cores": os.cpu_count(),
+        **{"problems": problems, "pairs": PAIRS, "solver": solver, "batch": batch, "cores": os.cpu_count()},
         "ok": int(expected["ok"].sum()),
-        "problem_bytes": size(folder / "problems"),
-        "result_bytes": size(folder / "loop"),
+        **{f"{name}_bytes": size(folder / part) for name, part in (("problem", "problems"), ("result", "loop"))},
         "runs": runs,
         "differences": {name: compare(expected, folder / name) for name in ("one", "two", "killed", "again")},
     }
@@ -179,12 +177,11 @@ def measure(problems: int, solver: str, batch: int, folder: Path) -> dict[str, A
 
 def main() -> None:
     """Measure, and write the results."""
-    command = parser(__doc__)
+    command = parser(__doc__, HERE / "scale.json")
     command.add_argument("--problems", type=int, default=1_000_000)
     command.add_argument("--solver", default="pnpnet-n9")
     command.add_argument("--batch-size", type=int, default=10_000)
     command.add_argument("--folder", type=Path, default=Path("outputs/scale"), help="of the problems and the results")
-    command.add_argument("--out", type=Path, default=HERE / "scale.json")
     options = command.parse_args()
     found = measure(options.problems, options.solver, options.batch_size, options.folder)
     versions = {name: metadata.version(name) for name in ("ray", "pyarrow")}

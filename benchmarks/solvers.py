@@ -7,7 +7,6 @@ describes the measurements.
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -39,14 +38,8 @@ SETS = {
 # Thresholds were tuned by docs/results/make.py on its tuning seed, like the defaults of the peers. `p3p-ransac` runs
 # once with one threshold in pixels, like every peer, and once allowing for noise of the world points.
 OURS = (
-    "epnp",
-    "epnp-lm",
-    "reppnp",
-    "ransac-epnp-lm:threshold=50",
-    "p3p-ransac:threshold=50",
-    "p3p-ransac:threshold=10,world_threshold=0.3",
-    "pnpnet-n9",
-    "pnpnet-set",
+    *("epnp", "epnp-lm", "reppnp", "ransac-epnp-lm:threshold=50", "p3p-ransac:threshold=50"),
+    *("p3p-ransac:threshold=10,world_threshold=0.3", "pnpnet-n9", "pnpnet-set"),
 )
 PEERS = ("opencv-epnp", "opencv-sqpnp", "opencv-ransac", "opencv-usac", "kornia-rs", "poselib", "pycolmap")
 # Solvers of the large problems. The paper's RANSAC is not among them: few samples of 7 pairs are free of outliers, so
@@ -54,8 +47,6 @@ PEERS = ("opencv-epnp", "opencv-sqpnp", "opencv-ransac", "opencv-usac", "kornia-
 ROBUST = ("p3p-ransac", "pnpnet-set", "opencv-ransac", "opencv-usac", "kornia-rs", "poselib", "pycolmap")
 MEMORY_SET = "n = 100, 70 outliers"
 MEMORY_SOLVER, MEMORY_TARGET, MEMORY_RUNS = "p3p-ransac", 2 * 2**30, 5
-
-
 # Targets of the time of a peer by the time of a solver of ours, on the small problems.
 SPEEDUPS = {("epnp", "opencv-epnp"): 3.0, ("p3p-ransac", "poselib"): 1.0}
 
@@ -79,26 +70,25 @@ def measure_set(solvers: Mapping[str, nn.Module], name: str, count: int, repeats
     problems = draw(name, count)
     rates, timers = {}, {}
     for spec, solver in solvers.items():
-        result = solver(problems.world_points, problems.img_points, problems.intrinsics)  # not timed: slower
-        rates[spec] = success_rate(success(pose_errors(result.pose, problems.pose)))
+        pose = solver(*problems[:3]).pose  # not timed: slower
+        rates[spec] = success_rate(success(pose_errors(pose, problems.pose)))._asdict()
         timers[spec] = partial(harness.seconds, bare_call(solver, problems))
-    found = []
-    for spec, times in harness.in_turns(timers, repeats).items():
-        measured = {"success": rates[spec]._asdict(), **harness.summary([1e6 * s / count for s in times])}
-        found.append({"solver": spec, "set": name, **measured})
-    return found
+    return [
+        {"solver": spec, "set": name, "success": rates[spec], **harness.summary([1e6 * s / count for s in times])}
+        for spec, times in harness.in_turns(timers, repeats).items()
+    ]
 
 
-def speedups(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def speedups(rows: Sequence[harness.Row]) -> list[dict[str, Any]]:
     """Every target of speed on every small set on which both sides were measured."""
     found = []
-    for (solver, peer), target in SPEEDUPS.items():
-        for mine, theirs in itertools.product(rows, rows):
-            names = (base_name(mine["solver"]), base_name(theirs["solver"]))
-            if names == (solver, peer) and mine["set"] == theirs["set"] and SETS[mine["set"]][0] == SMALL:
+    for mine in rows:
+        for theirs in rows:
+            wanted = SPEEDUPS.get((base_name(mine["solver"]), base_name(theirs["solver"])))
+            if wanted and mine["set"] == theirs["set"] and SETS[mine["set"]][0] == SMALL:
                 times = harness.ratio(mine, theirs)
                 entry = {"solver": mine["solver"], "peer": theirs["solver"], "set": mine["set"], "ratio": times}
-                found.append({**entry, "target": target, "met": times >= target})
+                found.append({**entry, "target": wanted, "met": times >= wanted})
     return found
 
 
@@ -106,8 +96,7 @@ def memory_here(spec: str, count: int) -> dict[str, int]:
     """Solve one large batch in this process; the peak memory before and after."""
     before = harness.peak_bytes()
     with harness.threads(), torch.no_grad():
-        problems = draw(MEMORY_SET, count)
-        load_solver(spec)(problems.world_points, problems.img_points, problems.intrinsics)
+        load_solver(spec)(*draw(MEMORY_SET, count)[:3])
     return {"imports_bytes": before, "peak_bytes": harness.peak_bytes()}
 
 
@@ -145,46 +134,38 @@ def measure(specs: Sequence[str], *, count: int, repeats: int, memory_count: int
     return {"skipped": skipped, "rows": rows, "speedups": speedups(rows), "memory": memory}
 
 
-def format_tables(results: Mapping[str, Any]) -> str:
+def format_tables(results: harness.Row) -> str:
     """Times with success, and the targets, as two Markdown tables."""
 
     def cell(row: harness.Row) -> str:
         return f"{row['median_us']:.1f} µs (min {row['min_us']:.1f}), {100 * row['success']['rate']:.1f} %"
 
     times = harness.pivot(results["rows"], {"Solver": "`{solver}`"}, SETS, cell, by="set", align="l" * (1 + len(SETS)))
-    found = [
-        {**entry, "wanted": "`{solver}` at least {target:g} times as fast as `{peer}`".format_map(entry)}
-        | {"measured": f"{entry['ratio']:.2f} times"}
+    targets = [
+        harness.target(
+            "`{solver}` beside `{peer}`, {set}".format_map(entry),
+            entry["ratio"],
+            entry["target"],
+            unit="times as fast",
+            at_most=False,
+        )
         for entry in results["speedups"]
     ]
     for entry in results["memory"]:
-        peak, rise, target = (entry[f"{key}_bytes"] / 2**30 for key in ("peak", "rise", "target"))
-        wanted = f"`{entry['solver']}` on {entry['count']} problems below {target:g} GiB"
-        measured = f"{peak:.2f} GiB, {rise:.2f} GiB without the imports"
-        found.append({**entry, "wanted": wanted, "measured": measured})
-    verdict: dict[str, harness.Column] = {"Verdict": lambda entry: "met" if entry["met"] else "**missed**"}
-    columns: dict[str, harness.Column] = {"Target": "{wanted}", "Set": "{set}", "Measured": "{measured}", **verdict}
-    return f"{times}\n\n{harness.table(found, columns, align='llll')}"
+        peak, rise, wanted = (entry[f"{key}_bytes"] / 2**30 for key in ("peak", "rise", "target"))
+        what = "Memory of `{solver}`, {count} problems, {set}".format_map(entry)
+        targets.append(harness.target(f"{what} ({rise:.2f} GiB without the imports)", peak, wanted, unit="GiB"))
+    return f"{times}\n\n{harness.targets_table(targets)}"
 
 
-def page(results: Mapping[str, Any]) -> str:
+def page(results: harness.Row) -> str:
     """The tables as a page."""
-    load = results["load_average"]
-    where = f"{results['environment']['cpu']}, {results['environment']['date']}"
-    return f"""\
-# Time, success and memory
-
-Written by `benchmarks/solvers.py`, see [README.md](README.md). Median and minimum in µs per problem, calls of
-{results["settings"]["count"]} problems, one thread, {where}, load average {load[0]:.1f} before and {load[1]:.1f} after.
-
-{format_tables(results)}
-"""
+    return harness.render("solvers.md.jinja", results=results, tables=format_tables(results))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, write the files and print the tables."""
-    command = harness.parser(__doc__)
-    command.add_argument("--out", type=Path, help="the results file (.json); the tables go beside it (.md)")
+    command = harness.parser(__doc__, required=False)
     command.add_argument("--solvers", nargs="+", default=[*OURS, *PEERS], help="names, with options after a colon")
     command.add_argument("--count", type=int, default=1000, help="number of problems in a batch")
     command.add_argument("--repeats", type=int, default=7, help="number of rounds")
@@ -198,7 +179,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     given = {"count": options.count, "repeats": options.repeats}
     try:
-        with harness.threads():  # the environment says how many
+        with harness.threads():  # so that the environment in the file has one thread
             results = harness.recorded(
                 partial(measure, options.solvers, **given, memory_count=options.memory_count),
                 **{"solvers": options.solvers, **given, "seed": SEED, "dtype": "float64"},

@@ -1,23 +1,8 @@
-"""What is told of uncertainty, and what is said of it: ``uncertainty.json`` and ``uncertainty.md`` beside it.
+"""Solvers that know the noise, and the noise that solvers report: ``uncertainty.json`` and ``uncertainty.md``.
 
     python benchmarks/uncertainty.py --out benchmarks/uncertainty.json
 
-*Errors.* The problems of uncertain PnP (Vakhitov et al., arXiv 2107.03890): points and pixels with noise of ten sizes
-and random axes. A solver is told the covariances, the standard deviations of isotropic noise of the same trace, or
-nothing; the solvers of other libraries take neither. Errors are medians, relative to those of maximum likelihood on the
-true inliers with the covariances, started from the truth; all solve the same problems.
-
-*Covariances of poses.* The squared error of a pose by its covariance (Mahalanobis) has the mean 6 and is below 12.59
-for 95 % when the covariance is right. Poses that are not ``ok`` or far off (10 degrees or 30 % of the distance) are
-left out.
-
-*Planar targets.* A square of four points, 0.2 units wide, 1 to 2 units away, tilted against the camera's axis, noise
-told: how often the pose, or the pose or one of two alternatives, is right (5 degrees and 5 degrees for each pixel of
-noise, a tenth of the distance), beside the two poses of OpenCV's IPPE.
-
-*Priors.* Success (1 degree, 0.2 units) with what is known of the pose: the direction of gravity or the last pose, right
-or wrong by ten standard deviations more. The bound is least squares on the true inliers with the same prior, from the
-truth.
+The page says what is measured.
 """
 
 from __future__ import annotations
@@ -25,27 +10,15 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import harness
+import numpy as np
 import torch
-from harness import (
-    Column,
-    Row,
-    in_turns,
-    parser,
-    percent,
-    ratio,
-    recorded,
-    share,
-    summary,
-    table,
-    target,
-    threads,
-    write,
-)
+from harness import Column, percent, share
 from kornia.geometry.liegroup import So3
 from kornia.geometry.linalg import transform_points
 from torch import Tensor, nn
@@ -74,7 +47,7 @@ SEED = 20_270_925
 AXIS_RATIO = 5.0
 #: Of uncertain PnP: pairs of a problem, and shares of outliers.
 SIZES, SHARES = (10, 30, 50, 110), (0.0, 0.3, 0.5)
-# Pixels. The best of 8, 12, 16, 20, 25, 30 and 40 on problems of uncertain PnP of another seed.
+# Threshold of PoseLib in pixels, the best of 8, 12, 16, 20, 25, 30 and 40 on problems of another seed.
 THRESHOLD = 20.0
 #: Solvers of other libraries. The first two take no outliers.
 PEERS: dict[str, Callable[[], PeerSolver]] = {
@@ -82,50 +55,40 @@ PEERS: dict[str, Callable[[], PeerSolver]] = {
     "SQPnP": lambda: OpenCVPnP(method="SQPNP"),
     "PoseLib": lambda: PoseLib(threshold=THRESHOLD),
 }
-#: For covariances of poses and for priors: pairs of a problem, and how many of them are outliers.
+#: For covariances of poses and for priors: number of pairs, and number of outliers among them.
 CREDIBLE = ((9, 0), (9, 2), (9, 4), (20, 0), (20, 10), (50, 0), (50, 25), (200, 0), (200, 100))
 FEW = ((3, 0), (4, 0), (4, 1), (5, 1), (6, 0), (6, 2), (9, 3), (12, 4))
 #: Standard deviations in degrees of gravity and of the last rotation; of the last position, relative to the distance.
 GRAVITY, TURN, SHIFT = 0.5, 1.0, 0.02
 # Grades of noise in uncertain PnP; standard deviations of grade 1 in pixels and in the unit of the world.
 _GRADES, _PIXEL, _POINT = 10, 1.0, 0.01
-#: Below this the squared error of six Gaussian numbers is in 95 % of all cases.
+#: 95 % quantile of the chi-square distribution with 6 degrees of freedom.
 LIMIT = 12.592
 #: Degrees between the normal of a planar target and the camera's axis.
 TILTS = (0.0, 15.0, 30.0, 45.0, 60.0)
-#: Standard deviations by which a wrong prior is off.
+#: Additional error of a wrong prior, in standard deviations.
 WRONG = 10.0
 #: Of timed batches: pairs of a problem; problems; rounds.
 TIMED, BATCH, ROUNDS = (9, 50), 1000, 15
-#: Most that errors may be above those of maximum likelihood, without and with outliers; that covariances may cost.
+#: Upper limits of errors relative to maximum likelihood, without and with outliers, and of the time of covariances.
 MOST_CLEAN, MOST_ROBUST, MOST_TIME = 1.05, 1.10, 1.6
-
-
-# -- problems ----------------------------------------------------------------------------------------------------------
 
 
 def uncertain_pnp(n: int, share: float, count: int, *, turned: bool, seed: int) -> Problems:
     """Problems of the protocol of uncertain PnP (Vakhitov et al., CVPR 2021, arXiv 2107.03890, section 4.1).
 
-    Points lie in a box in front of a camera of 800 px, their centre is the origin of the world. A tenth of the pairs
-    each has grade 1, 2, ..., 10: the standard deviation along the longest axis, in pixels and in hundredths
-    of a unit. Those of the other axes are uniform between 0 and that; the axes have a random direction.
-
-    Half of the outliers are mismatches, half have a random pixel. The noise of pixels has axes if ``turned``, and is
-    isotropic otherwise, as in most of the protocol.
+    Points lie in a box in front of a camera of 800 px; their centre is the origin of the world. Pairs have grades 1, 2,
+    ..., 10 in turn. The grade is the standard deviation along the longest axis, in pixels and in hundredths of a unit.
+    The standard deviations of the other axes are uniform between 0 and that of the longest; the axes have random
+    directions. Half of the outliers are mismatches, half have a random pixel. The noise of pixels has axes if
+    ``turned``, and is isotropic otherwise, as in most of the protocol.
     """
+    options: dict[str, Any] = {"batch_size": count, "seed": seed, "dtype": torch.float64, "max_angle": math.pi}
     exact = SyntheticProblems(
         n=n,
-        batch_size=count,
-        seed=seed,
+        **{"focal": 800.0, "half_image": 400.0, "img_sigma": 0.0, "world_sigma": 0.0, **options},
         points=BoxPoints(half_width=2.0, z_near=4.0, depth=4.0),
         outliers=OutlierMix(count=round(share * n)),
-        max_angle=math.pi,
-        focal=800.0,
-        half_image=400.0,
-        img_sigma=0.0,
-        world_sigma=0.0,
-        dtype=torch.float64,
     ).batch(0)
     rotation, translation = exact.pose
     middle = exact.world_points.mean(1, keepdim=True)
@@ -162,7 +125,7 @@ def sigmas_of_same_trace(problems: Problems) -> dict[str, Tensor]:
 
 
 def last_pose(problems: Problems, generator: torch.Generator, wrong: float) -> PosePrior:
-    """The pose of the frame before."""
+    """The pose of the frame before, with ``wrong`` additional standard deviations of error."""
     distance = problems.pose.translation.norm(dim=-1, keepdim=True)
     sigma = torch.cat((torch.full_like(distance, math.radians(TURN)).repeat(1, 3), SHIFT * distance.repeat(1, 3)), -1)
     noise, direction = torch.randn(2, *sigma.shape, generator=generator, dtype=sigma.dtype)
@@ -171,7 +134,7 @@ def last_pose(problems: Problems, generator: torch.Generator, wrong: float) -> P
 
 
 def gravity(problems: Problems, generator: torch.Generator, wrong: float) -> PosePrior:
-    """The direction of gravity, which is any direction in the world."""
+    """The direction of gravity, which is any direction in the world. For ``wrong`` see :func:`last_pose`."""
     like, sigma = problems.pose.translation, math.radians(GRAVITY)
     down, noise, side = torch.randn(3, *like.shape, generator=generator, dtype=like.dtype)
     down = nn.functional.normalize(down, dim=-1)
@@ -207,7 +170,9 @@ def draw(n: int, outliers: int, count: int, seed: int, **options: Any) -> Proble
     return SyntheticProblems(n=n, **options).batch(0)
 
 
-# -- measurements ------------------------------------------------------------------------------------------------------
+def success_share(result: PnPResult, problems: Problems) -> float | None:
+    """Share of the problems that are solved."""
+    return share(success(pose_errors(result.pose, problems.pose)))
 
 
 def medians(result: PnPResult, problems: Problems) -> Tensor:
@@ -246,13 +211,13 @@ def squared_errors(result: PnPResult, problems: Problems, covariance: Tensor) ->
 
 @torch.no_grad()
 def measure_credibility(solver: nn.Module, count: int) -> list[dict[str, Any]]:
-    """How the errors of poses compare with their covariances, of each kind of noise and size."""
+    """Compare the errors of poses with their covariances, for each kind of noise and number of pairs."""
     rows = []
     kinds = ("isotropic", 1.0, True), ("covariances", AXIS_RATIO, True), ("unknown", 1.0, False)
-    for (noise, axis_ratio, is_told), (n, outliers) in itertools.product(kinds, CREDIBLE):
+    for (noise, axis_ratio, is_known), (n, outliers) in itertools.product(kinds, CREDIBLE):
         problems = draw(n, outliers, count, 1, axis_ratio=axis_ratio, known_noise=1.0)
         known: dict[str, Any] = dict(problems.known)
-        result = solver(*problems[:3], **(known if is_told else {}))
+        result = solver(*problems[:3], **(known if is_known else {}))
         covariance = pose_covariance(result.pose, *problems[:3], **known, weights=result.weights)
         errors, distance = pose_errors(result.pose, problems.pose), problems.pose.translation.norm(dim=-1)
         near = (errors.rotation_error_deg < 10.0) & (errors.translation_error < 0.3 * distance)
@@ -265,44 +230,47 @@ def measure_credibility(solver: nn.Module, count: int) -> list[dict[str, Any]]:
 
 @torch.no_grad()
 def measure_priors(solver: nn.Module, count: int) -> list[dict[str, Any]]:
-    """Success with and without priors, of each size, with the noise told."""
-    least_squares = PnPNet(None, RobustWeightedLM(30, kernel="huber", robustness=1e4, learnable=False))
+    """Success with and without priors, of each size, with known noise."""
+    bound = PnPNet(None, RobustWeightedLM(30, kernel="huber", robustness=1e4, learnable=False))
     sigmas = {"img_sigma": 1.0, "world_sigma": 0.05}
     rows = []
     for n, outliers in FEW:
         problems, generator = draw(n, outliers, count, 2), torch.Generator().manual_seed(SEED)
-        priors = {
-            "nothing": None,
-            "gravity": gravity(problems, generator, 0.0),
-            "gravity, wrong": gravity(problems, generator, WRONG),
-            "last pose": last_pose(problems, generator, 0.0),
-            "last pose, wrong": last_pose(problems, generator, WRONG),
-        }
+        priors: dict[str, PosePrior | None] = {"nothing": None}
+        for (name, make), wrong in itertools.product(
+            {"gravity": gravity, "last pose": last_pose}.items(), (0.0, WRONG)
+        ):
+            priors[f"{name}, wrong" if wrong else name] = make(problems, generator, wrong)
         row: dict[str, Any] = {"n": n, "outliers": outliers}
-        inliers = problems.inliers.double()
         for name, prior in priors.items():
-            answers = {name: solver(*problems[:3], **sigmas, prior=prior)}
+            row[name] = success_share(solver(*problems[:3], **sigmas, prior=prior), problems)
             if "wrong" not in name:
-                bound = least_squares(*problems[:3], inliers, init=problems.pose, **sigmas, prior=prior)
-                answers[f"{name}, bound"] = bound
-            for key, result in answers.items():
-                row[key] = share(success(pose_errors(result.pose, problems.pose)))
+                known: dict[str, Any] = {**sigmas, "prior": prior, "init": problems.pose}
+                row[f"{name}, bound"] = success_share(
+                    bound(*problems[:3], problems.inliers.double(), **known), problems
+                )
         rows.append(row)
     return rows
 
 
 def ippe(problems: Problems) -> Pose:
-    """OpenCV's two poses of each problem, (B, 2, 3, 3) and (B, 2, 3)."""
+    """OpenCV's two poses of each problem, (B, 2, 3, 3) and (B, 2, 3); the only pose twice where there is one."""
     import cv2
 
     found = []
     for world, img, camera in zip(*(x.numpy() for x in problems[:3]), strict=True):
         _, turns, shifts, _ = cv2.solvePnPGeneric(world, img[:, None], camera, None, flags=cv2.SOLVEPNP_IPPE)
-        both = [(torch.from_numpy(turns[i % len(turns)]), torch.from_numpy(shifts[i % len(turns)])) for i in (0, 1)]
-        found.append([torch.cat((turn, shift))[:, 0] for turn, shift in both])
-    rows = torch.stack([torch.stack(pair) for pair in found])
-    pose = Pose.from_rvec(rows[..., :3].flatten(0, 1), rows[..., 3:].flatten(0, 1))
-    return Pose(pose.rotation.unflatten(0, (-1, 2)), pose.translation.unflatten(0, (-1, 2)))
+        found.append([(turns[i][:, 0], shifts[i][:, 0]) for i in (0, -1)])
+    turn, shift = torch.from_numpy(np.array(found)).unbind(2)  # (B, 2, 3) each
+    pose = Pose.from_rvec(turn.flatten(0, 1), shift.flatten(0, 1))
+    return Pose(*(x.unflatten(0, (-1, 2)) for x in pose))
+
+
+def close(rotation: Tensor, translation: Tensor, problems: Problems, sigma: float) -> Tensor:
+    """Which of several poses of each planar target are right, (B, K)."""
+    most = 0.1 * problems.pose.translation.norm(dim=-1)
+    poses = (Pose(*x) for x in zip(rotation.unbind(1), translation.unbind(1), strict=True))
+    return torch.stack([success(pose_errors(pose, problems.pose), 5.0 + 5.0 * sigma, most) for pose in poses], 1)
 
 
 @torch.no_grad()
@@ -311,24 +279,17 @@ def measure_squares(solver: nn.Module, count: int) -> list[dict[str, Any]]:
     rows = []
     for tilt, sigma in itertools.product(TILTS, (0.5, 1.0, 3.0)):
         problems = squares(tilt, sigma, count, seed=SEED + 3)
-        distance = problems.pose.translation.norm(dim=-1)
         result = solver(*problems[:3], img_sigma=sigma, world_sigma=0.0, alternatives=2)
-        others, theirs = result.alternatives, ippe(problems)
-
-        def right(
-            pose: Pose, most: Tensor = 0.1 * distance, sigma: float = sigma, truth: Pose = problems.pose
-        ) -> Tensor:
-            return success(pose_errors(pose, truth), 5.0 + 5.0 * sigma, most)
-
-        first = right(result.pose)
-        either = [others.valid[:, i] & right(Pose(others.rotation[:, i], others.translation[:, i])) for i in (0, 1)]
-        of_theirs = [right(Pose(theirs.rotation[:, i], theirs.translation[:, i])) for i in (0, 1)]
+        found = result.alternatives
+        first = close(result.rotation[:, None], result.translation[:, None], problems, sigma)[:, 0]
+        others = found.valid & close(found.rotation, found.translation, problems, sigma)
+        theirs = close(*ippe(problems), problems, sigma)
         shares = {
             "pose": first,
-            "pose or alternatives": first | either[0] | either[1],
-            "IPPE's first": of_theirs[0],
-            "IPPE's two": of_theirs[0] | of_theirs[1],
-            "problems with alternatives": others.valid.any(1),
+            "pose or alternatives": first | others.any(1),
+            "IPPE's first": theirs[:, 0],
+            "IPPE's two": theirs.any(1),
+            "problems with alternatives": found.valid.any(1),
         }
         rows.append({"tilt": tilt, "sigma": sigma, **{name: share(x) for name, x in shares.items()}})
     return rows
@@ -340,99 +301,67 @@ def measure_times(solver: nn.Module) -> list[dict[str, Any]]:
     rows = []
     for n in TIMED:
         problems = SyntheticProblems(n=n, batch_size=BATCH, seed=SEED, axis_ratio=AXIS_RATIO, known_noise=1.0).batch(0)
-        told: dict[str, dict[str, Any]] = {
+        given: dict[str, Any] = {
             "sigmas": {"img_sigma": torch.full((BATCH,), 1.0), "world_sigma": torch.full((BATCH,), 0.05)},
             "covariances": problems.known,
         }
-
-        def us_per_problem(problems: Problems, known: dict[str, Any]) -> float:
-            start = time.process_time()
-            solver(*problems[:3], **known)
-            return 1e6 * (time.process_time() - start) / BATCH
-
-        timers = {name: partial(us_per_problem, problems, known) for name, known in told.items()}
-        in_turns(timers, 2)  # to warm up
-        times = {name: summary(rounds) for name, rounds in in_turns(timers, ROUNDS).items()}
-        rows.append({"n": n, **times, "ratio": ratio(times["sigmas"], times["covariances"])})
+        timers = {name: partial(us_per_problem, solver, problems, known) for name, known in given.items()}
+        harness.in_turns(timers, 2)  # to warm up
+        times = {name: harness.summary(rounds) for name, rounds in harness.in_turns(timers, ROUNDS).items()}
+        rows.append({"n": n, **times, "ratio": harness.ratio(times["sigmas"], times["covariances"])})
     return rows
 
 
-def targets(results: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The largest measurements beside what was wanted."""
+def us_per_problem(solver: nn.Module, problems: Problems, known: dict[str, Any]) -> float:
+    """Processor time of a call, in microseconds per problem."""
+    start = time.process_time()
+    solver(*problems[:3], **known)
+    return 1e6 * (time.process_time() - start) / BATCH
+
+
+def targets(results: harness.Row) -> list[dict[str, Any]]:
+    """The largest measurements beside their limits."""
     found = []
     for outliers in SHARES:
         worst = max(max(row["covariances"]) for row in results["rows"] if row["outliers"] == outliers)
         what = f"Largest relative error with {100 * outliers:.0f} % outliers"
-        found.append(target(what, worst, MOST_ROBUST if outliers else MOST_CLEAN, unit="", at_most=True))
+        found.append(harness.target(what, worst, MOST_ROBUST if outliers else MOST_CLEAN))
     slowest = max(row["ratio"] for row in results["times"])
-    return [*found, target("Time with covariances by time with sigmas", slowest, MOST_TIME, unit="", at_most=True)]
+    return [*found, harness.target("Time with covariances by time with sigmas", slowest, MOST_TIME)]
 
 
-def share_columns(rows: Sequence[Row], *keys: str) -> dict[str, Column]:
-    """Columns of all entries but the keys that identify a row."""
-    return {name: percent(name, unit=" %") for name in rows[0] if name not in keys}
-
-
-def page(results: Mapping[str, Any]) -> str:
+def page(results: harness.Row) -> str:
     """The page of the results."""
-    wanted: dict[str, Column] = {
-        **{"Target": "{what}", "Measured": "{measured:.3f}", "At most": "{target:.2f}"},
-        "Met": lambda x: "yes" if x["met"] else "no",
-    }
 
     def both(name: str) -> Column:
         return lambda row: " ".join(f"{x:.3g}" if x > 10 else f"{x:.3f}" for x in row[name])
 
-    errors = {"Pixels": "{pixels}", "n": "{n}", "Outliers": percent("outliers", 0, " %")}
+    def shares(rows: Sequence[harness.Row], columns: dict[str, Column], *keys: str) -> str:
+        """A table with the columns, and one for each entry that is not among the keys."""
+        return harness.table(rows, columns | {key: percent(key, unit=" %") for key in rows[0] if key not in keys})
+
+    errors: dict[str, Column] = {"Pixels": "{pixels}", "n": "{n}", "Outliers": percent("outliers", 0, " %")}
     errors |= {name: both(name) for name in ("covariances", "sigmas", "nothing", *PEERS)}
     times = {"n": "{n}", **{name: f"{{{name}[median_us]:.1f}}" for name in ("sigmas", "covariances")}}
-    size = {"n": "{n}", "Outliers": "{outliers}"}
-    shares = {"Below the limit": percent("below", unit=" %"), "Problems used": percent("used", unit=" %")}
-    credible = {"Noise": "{noise}", **size, "Mean": "{mean:.2f}", **shares}
-    priors = {**size, **share_columns(results["priors"], "n", "outliers")}
-    planar = {"Tilt": "{tilt:.0f}°", "Noise": "{sigma:.1f} px", **share_columns(results["squares"], "tilt", "sigma")}
-    return f"""# Uncertainty
-
-Written by `benchmarks/uncertainty.py`, whose first lines say what is measured; `{results["solver"]}`,
-{results["problems"]} problems in each row.
-
-{table(results["targets"], wanted)}
-
-## Noise that differs between pairs and directions
-
-Median rotation and translation error on the problems of uncertain PnP, relative to maximum likelihood on the true
-inliers. *Pixels*: whether their noise is round or has axes.
-
-{table(results["rows"], errors)}
-
-Processor time of a problem in µs (float32, {BATCH} problems at once, one thread), and the median ratio of a round:
-
-{table(results["times"], {**times, "Ratio": "{ratio:.2f}"}, align="rrrr")}
-
-## Is the covariance of the pose right
-
-Mean squared error by the covariance (right: 6), and how often it is below the 95 % limit. The covariance knows the
-noise; *unknown*: the solver did not.
-
-{table(results["covariances"], credible)}
-
-## What is known before
-
-Success. Gravity is known to {GRAVITY}°, the last pose to {TURN}° and {100 * SHIFT:.0f} % of the distance; *wrong*: off
-by {WRONG:.0f} standard deviations more.
-
-{table(results["priors"], priors)}
-
-## Planar targets
-
-{table(results["squares"], planar)}
-"""
+    size: dict[str, Column] = {"n": "{n}", "Outliers": "{outliers}"}
+    credible = {"Noise": "{noise}", **size, "Mean": "{mean:.2f}", "Below the limit": percent("below", unit=" %")}
+    planar: dict[str, Column] = {"Tilt": "{tilt:.0f}°", "Noise": "{sigma:.1f} px"}
+    return harness.render(
+        "uncertainty.md.jinja",
+        results=results,
+        **{"batch": BATCH, "gravity": GRAVITY, "turn": TURN, "shift": SHIFT, "wrong": WRONG},
+        targets=harness.targets_table(results["targets"]),
+        errors=harness.table(results["rows"], errors),
+        times=harness.table(results["times"], {**times, "Ratio": "{ratio:.2f}"}, align="rrrr"),
+        covariances=harness.table(results["covariances"], {**credible, "Problems used": percent("used", unit=" %")}),
+        priors=shares(results["priors"], size, "n", "outliers"),
+        planar=shares(results["squares"], planar, "tilt", "sigma"),
+    )
 
 
 def main() -> None:
     """Measure and write the file and its page."""
-    command = parser(__doc__)
-    command.add_argument("--out", type=Path, default=Path("outputs/bench/uncertainty.json"))
+    command = harness.parser(__doc__, Path("outputs/bench/uncertainty.json"))
     command.add_argument("--count", type=int, default=4000, help="problems of each noise and size (default: 4000)")
     options = command.parse_args()
     solver = create_solver(SOLVER).double()
@@ -446,10 +375,10 @@ def main() -> None:
             "squares": measure_squares(solver, options.count),
         }
 
-    with threads():
-        results = recorded(measure, seed=SEED, axis_ratio=AXIS_RATIO)
+    with harness.threads():
+        results = harness.recorded(measure, seed=SEED, axis_ratio=AXIS_RATIO)
     results |= {"solver": SOLVER, "problems": options.count, "targets": targets(results)}
-    write(options.out, results, page)
+    harness.write(options.out, results, page)
     print(page(results))
 
 

@@ -15,28 +15,27 @@ thread.
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import re
+import runpy
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
-from harness import Row, parser, pivot, recorded, say, table, threads
+from contenders import random_cameras, relative_errors
+from harness import HERE, Row, parser, pivot, recorded, render, say, table, threads
 from kornia.geometry import solve_pnp_dlt
-from tasks import relative_errors
 from torch import Tensor
 
 from kornia_pnpnet.core.files import write_json
-from kornia_pnpnet.data import CameraProblems
 from kornia_pnpnet.peers import OpenCVRansac
 from kornia_pnpnet.result import Pose, Problems
 
-DOCS = Path(__file__).resolve().parents[1] / "docs"
+DOCS = HERE.parent / "docs"
 PATCH = DOCS / "upstream" / "0001-Add-solve_pnp_robust.patch"
 _FILE = "kornia/geometry/calibration/pnp_robust.py"
 # Used for nothing else. The defaults of the patch come from the literature and round numbers; nothing was tuned.
@@ -46,20 +45,16 @@ THRESHOLD = 3.0
 CALL, BATCHES = 100, (1, 10, 100, 1000)
 STEPS, RATE = 40, 0.3
 
-Solve = Callable[[Tensor, Tensor, Tensor], Tensor]
+Solve = Callable[..., Tensor]
 
 
-def patched() -> Callable[..., tuple[Tensor, Tensor]]:
-    """``solve_pnp_robust`` of the patch, run with the installed Kornia."""
+def patched() -> Solve:
+    """The matrices (B, 3, 4) of ``solve_pnp_robust`` of the patch, run with the installed Kornia."""
     with tempfile.TemporaryDirectory() as folder:
         ceiling = {**os.environ, "GIT_CEILING_DIRECTORIES": str(Path(folder).parent)}
         subprocess.run(["git", "apply", f"--include={_FILE}", str(PATCH)], cwd=folder, env=ceiling, check=True)
-        spec = importlib.util.spec_from_file_location("pnp_robust", Path(folder) / _FILE)
-        assert spec is not None
-        assert spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-    return module.solve_pnp_robust
+        robust = runpy.run_path(str(Path(folder) / _FILE))["solve_pnp_robust"]
+    return lambda *inputs, **options: robust(*inputs, **options)[0]
 
 
 def _dlt(world_points: Tensor, img_points: Tensor, intrinsics: Tensor) -> Tensor:
@@ -80,12 +75,6 @@ def _errors(matrix: Tensor, problems: Problems) -> tuple[Tensor, Tensor]:
     return relative_errors(Pose(matrix[..., :3], matrix[..., 3]), problems)
 
 
-def _draw(n: int, count: int, seed: int, share: float, **options: Any) -> Problems:
-    """Problems of random cameras."""
-    options |= {"batch_size": count, "seed": SEED + seed, "outlier_share": share, "dtype": torch.float64}
-    return CameraProblems(n=n, **options).batch(0)
-
-
 def _timed(solve: Solve, problems: Problems, call: int) -> tuple[Tensor, float]:
     """Poses (B, 3, 4) and µs per problem, in calls of ``call`` problems after one that is not timed."""
     inputs = [x.float() for x in problems[:3]]
@@ -100,15 +89,15 @@ def measure_success(count: int, cells: Sequence[tuple[int, float]] = CELLS) -> l
     """Success, median rotation error and time by number of pairs and share of outliers."""
     robust = patched()
     solvers: dict[str, Solve] = {
-        "solve_pnp_robust": lambda *x: robust(*x)[0],
-        "solve_pnp_robust, n_samples=512": lambda *x: robust(*x, n_samples=512)[0],
+        "solve_pnp_robust": robust,
+        "solve_pnp_robust, n_samples=512": lambda *inputs: robust(*inputs, n_samples=512),
         "solve_pnp_dlt": _dlt,
         "OpenCV RANSAC": _opencv,
     }
     rows = []
     for k, (n, share) in enumerate(cells):
         say(f"success, n = {n}, {share:.0%} outliers")
-        problems = _draw(n, count, k, share)
+        problems = random_cameras(n, count, SEED + k, share)
         for name, solve in solvers.items():
             found, us = _timed(solve, problems, CALL)
             turn, shift = _errors(found, problems)
@@ -124,9 +113,8 @@ def measure_batches(batches: Sequence[int] = BATCHES) -> list[dict[str, Any]]:
     rows = []
     for batch in batches:
         say(f"batches of {batch}")
-        count = max(batch, min(20 * batch, CALL))
-        problems = _draw(30, count, 50, 0.25)
-        us = [_timed(solve, problems, batch)[1] for solve in (lambda *x: robust(*x)[0], _opencv)]
+        problems = random_cameras(30, max(batch, min(20 * batch, CALL)), SEED + 50, 0.25)
+        us = [_timed(solve, problems, batch)[1] for solve in (robust, _opencv)]
         rows.append({"batch": batch, "us": us[0], "opencv_us": us[1]})
     return rows
 
@@ -135,13 +123,13 @@ def measure_descent(count: int, shares: Sequence[float] = (0.0, 0.25)) -> list[d
     """Median loss before and after descending through a solver."""
     robust = patched()
     solvers: dict[str, Solve] = {
-        "solve_pnp_robust": lambda *x: robust(*x, inl_th=4 * THRESHOLD)[0],
+        "solve_pnp_robust": lambda *inputs: robust(*inputs, inl_th=4 * THRESHOLD),
         "solve_pnp_dlt": _dlt,
     }
     rows = []
     for k, share in enumerate(shares):
         say(f"descent, {share:.0%} outliers")
-        problems = _draw(12, count, 60 + k, share, img_sigma=5.0)
+        problems = random_cameras(12, count, SEED + 60 + k, share, img_sigma=5.0)
         for name, solve in solvers.items():
             pixels = problems.img_points.clone().requires_grad_()
             descent = torch.optim.Adam([pixels], lr=RATE)
@@ -158,7 +146,7 @@ def measure_descent(count: int, shares: Sequence[float] = (0.0, 0.25)) -> list[d
     return rows
 
 
-def page(results: Mapping[str, Any]) -> str:
+def page(results: Row) -> str:
     """The tables of ``docs/upstream.md``."""
     names = list(dict.fromkeys(x["solver"] for x in results["success"]))
     title = {name: name if " " in name and "=" not in name else f"`{name}`" for name in names}
@@ -170,27 +158,19 @@ def page(results: Mapping[str, Any]) -> str:
     def solved(row: Row) -> str:
         return f"{100 * row['success']:.1f} ({row['us']:,.0f})"
 
-    return f"""\
-Solved problems in per cent, and in parentheses µs per problem ({results["settings"]["count"]} problems in each row):
-
-{pivot(success, {"pairs": "{n}", **outliers}, [*title.values()], solved, by="title")}
-
-µs per problem by batch size, 30 pairs with 25 % outliers:
-
-{table(results["batches"], batches)}
-
-Median loss when {STEPS} steps of gradient descent move the pixels through a solver, 12 pairs with 5 px of noise:
-
-{table(results["descent"], descent, align="llrr")}
-
-{results["environment"]["cpu"]}, CPU time of one thread, {results["environment"]["date"][:10]}.
-"""
+    return render(
+        "upstream.md.jinja",
+        results=results,
+        steps=STEPS,
+        success=pivot(success, {"pairs": "{n}", **outliers}, [*title.values()], solved, by="title"),
+        batches=table(results["batches"], batches),
+        descent=table(results["descent"], descent, align="llrr"),
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure and write the file and the tables."""
     command = parser(__doc__)
-    command.add_argument("--out", type=Path, required=True, help="the results file (.json)")
     command.add_argument("--page", type=Path, default=DOCS / "upstream.md", help="the page that holds the tables")
     command.add_argument("--count", type=int, default=400, help="number of problems in a row")
     options = command.parse_args(arguments)

@@ -57,7 +57,7 @@ def _math(display):
 
 
 def _outside(app, name, source):
-    """What a page links to outside of the documentation is named by its path in the repository."""
+    """Replace links that leave the documentation by the path of their target in the repository."""
 
     def named(match):
         target = (Path(app.srcdir) / name).parent.joinpath(match[2]).resolve()
@@ -69,7 +69,7 @@ def _outside(app, name, source):
 
 
 def _without_types(app, what, name, obj, options, lines):
-    """Signatures have the types. Napoleon takes what is before a colon for one: it gets an empty one."""
+    """Give Napoleon an empty type before the colon where it expects a type: signatures have the types."""
     starts = [i + 1 for i, line in enumerate(lines) if line.strip() in ("Returns:", "Yields:")]
     if lines and what in ("attribute", "data", "property"):
         starts.append(0)
@@ -78,12 +78,12 @@ def _without_types(app, what, name, obj, options, lines):
 
 
 def _is_field(app, what, name, member, skip, options):
-    """Fields of named tuples are described with their class; of themselves they only know their number."""
+    """Leave out the fields of named tuples: the docstring of the class describes them."""
     return True if type(member).__name__ == "_tuplegetter" else None
 
 
 def setup(app):
-    """Register the way in which formulas are written, and what becomes of links that leave and of docstrings."""
+    """Register the handlers of formulas, links and docstrings."""
     app.connect("source-read", _outside)
     app.connect("autodoc-process-docstring", _without_types, priority=400)  # before napoleon
     app.connect("autodoc-skip-member", _is_field)

@@ -1,8 +1,8 @@
 """A ChArUco board, detected by OpenCV, with corners mislabelled: ``python docs/examples/fiducial_board.py``.
 
-A camera circles over a board, which is drawn in perspective, blurred and noisy. OpenCV finds the corners and says which
-is which; a share of them is then given the number of another one, as happens when markers are misread. The poses by
-`pnpnet-set` and by `cv2.solvePnPRansac` from the same corners, and the camera's path. Writes `fiducial_board.json` and
+A camera circles over a board, which is drawn in perspective, blurred and noisy. OpenCV finds the corners and their
+numbers; a share of the corners then gets the number of another corner, as happens when markers are misread.
+`pnpnet-set` and `cv2.solvePnPRansac` solve for the pose from the same corners. Writes `fiducial_board.json` and
 `fiducial_board.png` to `--out`.
 """
 

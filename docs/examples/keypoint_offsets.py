@@ -1,10 +1,9 @@
 """Learn where a detector is wrong, from poses alone: ``python docs/examples/keypoint_offsets.py``.
 
-A detector sees the 12 keypoints of an object, each with a bias of its own in pixels that it does not know of. What is
-learned is an offset for each keypoint; the only teacher is the pose of the camera, through a differentiable solver. In
-every image 30 % of the keypoints are anywhere, and how far the learned offsets are from the truth is written down after
-every step: with this package's `pnpnet-set`, its EPnP without weights, and Kornia's DLT. Writes `keypoint_offsets.json`
-and a picture of it to `--out`.
+A detector finds the 12 keypoints of an object. Each keypoint has an unknown bias in pixels, and in every image 30 % of
+the keypoints are at random pixels. The program learns an offset for each keypoint from the true camera pose alone,
+through a differentiable solver: this package's `pnpnet-set`, its EPnP without weights, or Kornia's DLT. It records the
+error of the offsets after every step. Writes `keypoint_offsets.json` and a picture of it to `--out`.
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ def kornias_dlt(*inputs: Tensor) -> tuple[Pose, Tensor]:
 
 
 SOLVERS: dict[str, Callable[[], Solve]] = {
-    # Pixels that are off by their bias are no mismatches: without this they would hardly count, and never learn.
+    # The noise includes the bias. Otherwise biased keypoints would be outliers with hardly any gradient.
     "pnpnet-set": lambda: ours("pnpnet-set", img_sigma=BIAS, world_sigma=0.0),
     "epnp": lambda: ours("epnp"),
     "kornia-dlt": lambda: kornias_dlt,
@@ -74,7 +73,7 @@ def draw(index: int, keypoints: Tensor, bias: Tensor) -> tuple[Tensor, Tensor, T
 
 
 def learn(solve: Solve, steps: int) -> dict[str, Any]:
-    """The offsets' errors after every step, and how many gradients were not finite."""
+    """The errors of the offsets after every step, and the number of gradients that were not finite."""
     generator = batch_generator(SEED, 0)
     keypoints = torch.randn(KEYPOINTS, 3, generator=generator) * 0.5
     bias = BIAS * torch.randn(KEYPOINTS, 2, generator=generator)
@@ -88,7 +87,7 @@ def learn(solve: Solve, steps: int) -> dict[str, Any]:
         world_points, img_points, intrinsics, truth = draw(step, keypoints, bias)
         pose, counts = solve(world_points, img_points + offsets, intrinsics)
         rotation, translation = pose_distances(pose, truth)
-        # A pose that is far off says nothing about pixels: no sample may weigh more than a small one.
+        # A pose that is far off contains no information about pixels, so the loss of a sample is bounded.
         loss = rotation + translation
         loss = torch.where(counts, loss / (1.0 + 5.0 * loss), 0.0).sum() / counts.sum().clamp(min=1)
         optimizer.zero_grad()

@@ -1,14 +1,14 @@
 """From images to poses, trained end to end: ``python docs/examples/keypoint_pipeline.py``.
 
 A textured box is rendered under random poses, before a random background, behind occluders, blurred and noisy. A small
-network finds its 14 keypoints (Kornia's spatial softmax and expectation) and says of each by how many pixels it may be
-off; `PnPNet` makes a pose of them. First the network learns where keypoints are, from labels like those that people
-make: of the keypoints that can be seen, more than half of them hidden. Then copies go on for as long: with the keypoint
-loss alone; with the likelihood of the labels, too, which teaches how far off a keypoint may be without a pose; and end
-to end, with the loss of the pose, whose gradient comes through the solver. Two more learn from labels of all keypoints,
-as only a known pose can make them. All are tested with the same solver on images that none saw; it is told how far off
-keypoints may be where a network has learned it, and once not told what the last one says. Writes
-`keypoint_pipeline.json` and pictures to `--out`.
+network finds its 14 keypoints (Kornia's spatial softmax and expectation) and predicts a standard deviation for each;
+`PnPNet` makes a pose of them. First the network learns from labels of the visible keypoints, as people make them; more
+than half of the keypoints are hidden. Then copies of it train as long again in the ways of :data:`WAYS`: with the
+keypoint loss alone; also with the likelihood of the labels, which teaches the standard deviations without a pose; or
+end to end, with the loss of the pose, whose gradient comes through the solver. Two more networks learn from labels of
+all keypoints, which only a known pose can give. All are tested with the same solver on new images. The solver gets the
+standard deviations where a network has learned them; the network that was trained end to end is also tested without.
+Writes `keypoint_pipeline.json` and pictures to `--out`.
 
 ``--covariances`` runs another, shorter experiment. Each image is also blurred along one direction, as by a camera in
 motion, so that a keypoint is less exact along the blur than across it; there are no occluders. Copies of one network
@@ -31,14 +31,13 @@ import torch
 from kornia.filters import gaussian_blur2d, motion_blur
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from kornia.geometry.subpix import spatial_softmax2d
-from shared import command, write
+from shared import command, pose_error, write
 from torch import Tensor, nn
 from torch.distributions import MultivariateNormal
 from torch.nn import functional
 
 from kornia_pnpnet import PnPResult, Pose, create_solver, heatmap_keypoints
 from kornia_pnpnet.evaluation.plots import BLUE, ORANGE, VERMILION, make_figure, save, themed
-from kornia_pnpnet.refine.residual import rotation_angle
 
 SIZE, FOCAL, BATCH = 64, 90.0, 32
 CAMERA = torch.tensor([[FOCAL, 0.0, (SIZE - 1) / 2], [0.0, FOCAL, (SIZE - 1) / 2], [0.0, 0.0, 1.0]])
@@ -48,19 +47,25 @@ CENTRES = torch.cat((torch.eye(3), -torch.eye(3)))
 KEYPOINTS = torch.cat((CORNERS, CENTRES)) * HALF  # (14, 3)
 EDGES = [(i, j) for i in range(8) for j in range(i) if (CORNERS[i] != CORNERS[j]).sum() == 1]
 TEXTURES = 8
-# A pose that is farther off than this counts as far off: keypoints a third of the box away.
-MOST = 0.3
-# The loss of the pose counts this much beside that of the keypoints, in pixels.
-POSE_WEIGHT = 50.0
+MOST = 0.3  # a mean distance of the keypoints from which on a pose is far off: a third of the box
+POSE_WEIGHT = 50.0  # weight of the loss of the pose beside that of the keypoints, in pixels
+MEAN_OF = 50  # updates in the mean that is a point of a curve
+MOTION = 9  # pixels; length of the blur of a camera in motion
+TEST_SEED = 999_983  # of images that no training uses
+
 ALONE, END, WITHOUT_SIGMA = "keypoint loss alone", "end to end", "end to end, not told how far off"
 FULL = "keypoint loss alone, hidden ones labelled"
 LIKELY, FULL_LIKELY = f"{ALONE}, how far off by likelihood", f"{FULL}, how far off by likelihood"
-# Points of a curve are means of so many updates.
-MEAN_OF = 50
-# The noise of a keypoint, as a network predicts it.
+#: Arguments of :func:`train` by the name of a network.
+WAYS: dict[str, dict[str, bool]] = {
+    ALONE: {},
+    END: {"end_to_end": True},
+    LIKELY: {"likelihood": True},
+    FULL: {"hidden": True},
+    FULL_LIKELY: {"hidden": True, "likelihood": True},
+}
+#: The noise of a keypoint, as a network predicts it.
 SIGMA, COVARIANCE, HEAT_MAP = "standard deviation", "covariance", "covariance of the heat map times a factor"
-# Pixels: length of the blur of a camera in motion.
-MOTION = 9
 
 
 class Images(NamedTuple):
@@ -94,9 +99,8 @@ def draw(seed: int, index: int, batch: int = BATCH, *, motion: bool = False) -> 
     row, column = torch.meshgrid(torch.arange(SIZE), torch.arange(SIZE), indexing="ij")
     for _ in range(0 if motion else 3):
         centre, half = uniform(batch, 2, low=8.0, high=SIZE - 8.0), uniform(batch, 2, low=2.0, high=12.0)
-        inside = ((row - centre[:, :1, None]).abs() < half[:, :1, None]) & (
-            (column - centre[:, 1:, None]).abs() < half[:, 1:, None]
-        )
+        inside = (row - centre[:, :1, None]).abs() < half[:, :1, None]
+        inside &= (column - centre[:, 1:, None]).abs() < half[:, 1:, None]
         images = torch.where(inside[:, None], uniform(batch, 3, 1, 1), images)
         visible &= ((pixels.flip(-1) - centre[:, None]).abs() > half[:, None]).any(-1)
     images = gaussian_blur2d(images, (5, 5), uniform(batch, 1, low=0.4, high=1.2).expand(-1, 2))
@@ -135,9 +139,7 @@ def render(pose: Pose) -> tuple[Tensor, Tensor]:
     hit = enter < far.amin(-1)
     point = (origin + enter[..., None] * direction) / HALF  # on the surface, one entry is -1 or 1
     face = side + 3 * (direction.gather(-1, side[..., None])[..., 0] > 0)
-    across = torch.stack(
-        (point.gather(-1, ((side + 1) % 3)[..., None]), point.gather(-1, ((side + 2) % 3)[..., None])), -1
-    )
+    across = torch.stack([point.gather(-1, ((side + k) % 3)[..., None]) for k in (1, 2)], -1)
     cell = (0.5 * (across[..., 0, :] + 1.0) * TEXTURES).long().clamp(0, TEXTURES - 1)
     colour = textures[face, :, cell[..., 0], cell[..., 1]]  # (B, P, 3)
     light = 0.6 + 0.4 * direction.gather(-1, side[..., None]).abs() / direction.norm(dim=-1, keepdim=True)
@@ -146,10 +148,9 @@ def render(pose: Pose) -> tuple[Tensor, Tensor]:
 
 
 class Keypoints(nn.Module):
-    """Pixels (B, 14, 2) of the keypoints, and the noise of each.
+    """Pixels (B, 14, 2) of the keypoints, and their noise: a standard deviation (B, 14) of 0.1 to 30 pixels.
 
-    The noise is a standard deviation (B, 14), 0.1 to 30 pixels; after :meth:`predict` it may be a covariance
-    (B, 14, 2, 2).
+    After :meth:`predict` the noise may be a covariance (B, 14, 2, 2).
     """
 
     def __init__(self) -> None:
@@ -157,7 +158,7 @@ class Keypoints(nn.Module):
         count = len(KEYPOINTS)
 
         def block(size_in: int, size_out: int, kernel: int | None = None) -> nn.Sequential:
-            """To half the size with a kernel that is given, at the same size without."""
+            """A layer that halves the size if ``kernel`` is given."""
             layer = nn.Conv2d(size_in, size_out, kernel or 3, 2 if kernel else 1, (kernel or 3) // 2, bias=False)
             return nn.Sequential(layer, nn.GroupNorm(8, size_out), nn.ReLU())
 
@@ -221,18 +222,19 @@ def surprise(off: Tensor, noise: Tensor) -> Tensor:
 
 def train(
     network: Keypoints,
-    solver: nn.Module | None,
+    solver: nn.Module,
     seed: int,
     updates: range,
     *,
+    end_to_end: bool = False,
     hidden: bool = False,
     likelihood: bool = False,
     motion: bool = False,
 ) -> dict[str, list[float]]:
-    """Go on with the keypoint loss, and with a solver that of the pose; returns curves.
+    """Train a network on the batches ``updates`` of a seed, and return its curves.
 
-    On request the hidden keypoints have labels, too; or the network learns how far off it is from its labels, by the
-    likelihood of normal noise, which moves keypoints only through what says how far off they are.
+    The loss is that of the keypoints; with ``end_to_end`` also that of the pose, and with ``likelihood`` also that of
+    the noise, from which keypoints get no gradient. With ``hidden`` the hidden keypoints have labels, too.
     """
     log: list[list[float]] = []
     optimizer = torch.optim.AdamW(network.parameters(), lr=2e-3, weight_decay=1e-4)
@@ -242,16 +244,15 @@ def train(
         pixels, noise = network(problem.images)
         off = functional.smooth_l1_loss(pixels, problem.pixels, reduction="none").mean(-1)
         labelled = torch.ones_like(problem.visible) if hidden else problem.visible
-        keypoint_loss = (off * labelled).sum() / labelled.sum()
-        loss, terms = keypoint_loss, [keypoint_loss.item()]
+        loss = (off * labelled).sum() / labelled.sum()
+        terms = [loss.item()]
         if likelihood:
-            likelihood_loss = surprise((pixels - problem.pixels).detach(), noise)
-            loss = loss + (likelihood_loss * labelled).sum() / labelled.sum()
-        if solver is not None:
+            loss = loss + (surprise((pixels - problem.pixels).detach(), noise) * labelled).sum() / labelled.sum()
+        if end_to_end:
             result = solve(solver, pixels, noise)
             error = distance(result.pose, problem.pose)
             counts = result.ok & (error.detach() < 10.0 * MOST)
-            # Saturated: a pose that is far off has little to say about pixels.
+            # Saturated, because a pose that is far off says little about pixels.
             loss = loss + POSE_WEIGHT * torch.where(counts, error / (1.0 + error / MOST), 0.0).mean()
             terms.append(error.detach().median().item())
         optimizer.zero_grad()
@@ -261,8 +262,8 @@ def train(
         schedule.step()
         log.append(terms)
     curves = torch.stack([x.mean(0) for x in torch.tensor(log).split(MEAN_OF)]).T.tolist()
-    names = "keypoint_loss", "median_distance"
-    return {name: [round(x, 5) for x in curve] for name, curve in zip(names, curves, strict=False)}
+    rounded = ([round(x, 5) for x in curve] for curve in curves)
+    return dict(zip(("keypoint_loss", "median_distance"), rounded, strict=False))
 
 
 @torch.no_grad()
@@ -270,33 +271,37 @@ def test(network: Keypoints, solver: nn.Module, *, with_sigma: bool, batches: in
     """Errors on images of a seed that no training uses."""
     rows = []
     for index in range(batches):
-        problem = draw(999_983, index, motion=motion)
+        problem = draw(TEST_SEED, index, motion=motion)
         pixels, sigma = network(problem.images)
-        result = solve(solver, pixels, sigma if with_sigma else None)
-        angle = torch.rad2deg(rotation_angle(result.rotation, problem.pose.rotation))
+        pose = solve(solver, pixels, sigma if with_sigma else None).pose
         off = (pixels - problem.pixels).norm(dim=-1).mean(-1)
-        rows.append(torch.stack((distance(result.pose, problem.pose), angle, off)))
+        rows.append(torch.stack((distance(pose, problem.pose), pose_error(pose, problem.pose)[1], off)))
     away, angle, pixel = torch.cat(rows, 1)
     means = {"mean_distance": away.clamp(max=1.0).mean(), "mean_rotation_deg": angle.mean()}
     medians = {"median_distance": away.median(), "median_rotation_deg": angle.median()}
     return {name: x.item() for name, x in {**means, **medians, "mean_keypoint_px": pixel.mean()}.items()}
 
 
-def run(seed: int, updates: int, batches: int) -> tuple[dict[str, Any], dict[str, Keypoints]]:
-    """Train both from one start."""
+def begin(seed: int, updates: int, *, motion: bool, **options: Any) -> tuple[nn.Module, Keypoints, Keypoints, Any]:
+    """The solver, an untrained network, the same after training with the keypoint loss, and the first results."""
     torch.set_num_threads(1)
     torch.manual_seed(seed)
-    solver = create_solver("pnpnet-set", effort="fixed").requires_grad_(False)
-    start = Keypoints()
-    untrained = copy.deepcopy(start)
-    found: dict[str, Any] = {"keypoints first": {"curves": train(start, None, seed, range(updates))}}
-    networks = {name: copy.deepcopy(start) for name in (ALONE, END, LIKELY)}
-    networks |= {name: copy.deepcopy(untrained) for name in (FULL, FULL_LIKELY)}
-    for name, network in networks.items():
-        labels = {"hidden": name in (FULL, FULL_LIKELY), "likelihood": name in (LIKELY, FULL_LIKELY)}
-        for first in (0, updates) if labels["hidden"] else (updates,):
-            curves = train(network, solver if name == END else None, seed, range(first, first + updates), **labels)
-        with_sigma = name in (END, LIKELY, FULL_LIKELY)
+    solver = create_solver("pnpnet-set", **options).requires_grad_(False)
+    untrained = Keypoints()
+    start = copy.deepcopy(untrained)
+    curves = train(start, solver, seed, range(updates), motion=motion)
+    return solver, untrained, start, {"keypoints first": {"curves": curves}}
+
+
+def run(seed: int, updates: int, batches: int) -> tuple[dict[str, Any], dict[str, Keypoints]]:
+    """Train networks in all :data:`WAYS`."""
+    solver, untrained, start, found = begin(seed, updates, motion=False, effort="fixed")
+    networks = {}
+    for name, way in WAYS.items():
+        networks[name] = network = copy.deepcopy(untrained if way.get("hidden") else start)
+        for first in (0, updates) if way.get("hidden") else (updates,):
+            curves = train(network, solver, seed, range(first, first + updates), **way)
+        with_sigma = name not in (ALONE, FULL)
         found[name] = {"curves": curves, **test(network, solver, with_sigma=with_sigma, batches=batches, motion=False)}
         distances = ", ".join(f"{key} {found[name][key]:.4f}" for key in ("mean_distance", "median_distance"))
         print(f"seed {seed}, {name}: {distances}", flush=True)
@@ -306,15 +311,11 @@ def run(seed: int, updates: int, batches: int) -> tuple[dict[str, Any], dict[str
 
 def run_covariances(seed: int, updates: int, batches: int) -> dict[str, Any]:
     """Train networks that predict each kind of noise from one start, on images with motion blur."""
-    torch.set_num_threads(1)
-    torch.manual_seed(seed)
-    solver = create_solver("pnpnet-set").requires_grad_(False)
-    start = Keypoints()
-    found: dict[str, Any] = {"keypoints first": {"curves": train(start, None, seed, range(updates), motion=True)}}
+    solver, _, start, found = begin(seed, updates, motion=True)
+    more = range(updates, updates + updates // 2)
     for noise in (SIGMA, COVARIANCE, HEAT_MAP):
         network = copy.deepcopy(start).predict(noise)
-        more = range(updates, updates + updates // 2)
-        curves = train(network, solver, seed, more, likelihood=True, motion=True)
+        curves = train(network, solver, seed, more, end_to_end=True, likelihood=True, motion=True)
         found[noise] = {"curves": curves, **test(network, solver, with_sigma=True, batches=batches, motion=True)}
         print(f"seed {seed}, {noise}: mean_distance {found[noise]['mean_distance']:.4f}", flush=True)
     return found
@@ -325,11 +326,11 @@ def plot_errors(results: dict[str, Any], path: Path) -> None:
     """The errors of each seed, and their means."""
     figure = make_figure(8.0, 3.4)
     looks = {
-        ALONE: ("labels of what is seen", ORANGE),
-        LIKELY: ("... and how far off, by likelihood", ORANGE),
+        ALONE: ("labels of visible keypoints", ORANGE),
+        LIKELY: ("... and sigmas, by likelihood", ORANGE),
         FULL: ("labels of hidden ones, too", VERMILION),
-        FULL_LIKELY: ("... and how far off, by likelihood", VERMILION),
-        WITHOUT_SIGMA: ("end to end, how far off not told", BLUE),
+        FULL_LIKELY: ("... and sigmas, by likelihood", VERMILION),
+        WITHOUT_SIGMA: ("end to end, without sigmas", BLUE),
         END: ("end to end", BLUE),
     }
     parts = (("mean_distance", "mean distance of keypoints"), ("mean_rotation_deg", "mean rotation error (°)"))
@@ -352,7 +353,7 @@ def plot_errors(results: dict[str, Any], path: Path) -> None:
 def plot_overlays(networks: dict[str, Keypoints], path: Path, count: int = 6) -> None:
     """The box as it is and as it is found, over test images."""
     solver = create_solver("pnpnet-set")
-    problem = draw(999_983, 0)
+    problem = draw(TEST_SEED, 0)
     figure = make_figure(9.0, 3.2)
     for row, (name, network) in zip(figure.subplots(2, count), networks.items(), strict=True):
         pixels, sigma = network(problem.images)
@@ -376,27 +377,26 @@ def main() -> None:
     parser = command(__doc__)
     parser.add_argument("--updates", type=int, default=2000, help="of each half of the training")
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--jobs", type=int, default=1, help="so many seeds at the same time")
+    parser.add_argument("--jobs", type=int, default=1, help="seeds at the same time")
     parser.add_argument("--batches", type=int, default=32, help="of test images")
     parser.add_argument("--covariances", action="store_true", help="compare kinds of noise; end to end half as long")
     options = parser.parse_args()
     arguments = range(options.seeds), repeat(options.updates), repeat(options.batches)
     made = {"updates": options.updates, "batches": options.batches}
     with ProcessPoolExecutor(options.jobs, multiprocessing.get_context("spawn")) as pool:
-        if options.covariances:
-            found = list(pool.map(run_covariances, *arguments))
-            seeds = {str(seed): row for seed, row in enumerate(found)}
-            write(options.out / "keypoint_covariances.json", **made, seeds=seeds)
-            return
-        runs = list(pool.map(run, *arguments))
+        runs = list(pool.map(run_covariances if options.covariances else run, *arguments))
+    if options.covariances:
+        seeds = {str(seed): found for seed, found in enumerate(runs)}
+        write(options.out / "keypoint_covariances.json", **made, seeds=seeds)
+        return
     seeds = {str(seed): found for seed, (found, _) in enumerate(runs)}
+    sums = {
+        name: {key: sum(x[name][key] for x in seeds.values()) for key in seeds["0"][WITHOUT_SIGMA]} for name in WAYS
+    }
     times_lower = {
-        name: {
-            key: sum(x[name][key] for x in seeds.values()) / sum(x[END][key] for x in seeds.values())
-            for key in seeds["0"][END]
-            if key != "curves"
-        }
-        for name in (ALONE, LIKELY, FULL, FULL_LIKELY)
+        name: {key: total / sums[END][key] for key, total in of_way.items()}
+        for name, of_way in sums.items()
+        if name != END
     }
     results = {**made, "times_lower": times_lower, "seeds": seeds}
     write(options.out / "keypoint_pipeline.json", **results)

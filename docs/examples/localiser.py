@@ -98,7 +98,7 @@ class Sift:
 
 
 class DiskLightGlue:
-    """Kornia's DISK and LightGlue; their weights are downloaded unless they are at hand."""
+    """Kornia's DISK and LightGlue; Kornia downloads their weights unless they are in its cache."""
 
     def __init__(self, count: int) -> None:
         self.count = count
@@ -211,13 +211,13 @@ def solve(
     return result
 
 
-def believed(result: PnPResult) -> list[Pose | None]:
+def found_poses(result: PnPResult) -> list[Pose | None]:
     """The pose of each problem, None where it is not ok."""
     return [Pose(*x) if ok else None for *x, ok in zip(*result.pose, result.ok, strict=True)]
 
 
 def solve_by_colmap(photo: Photo, matches: Matches) -> Pose | None:
-    """COLMAP's estimator as hloc calls it: a threshold of 12 px, all else as it comes."""
+    """COLMAP's estimator as hloc calls it: a threshold of 12 px and default options."""
     (fx, _, cx), (_, fy, cy), _ = photo.intrinsics.tolist()
     camera = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=[fx, fy, cx, cy])
     options = pycolmap.AbsolutePoseEstimationOptions()
@@ -286,7 +286,7 @@ def run(
     lap("preparation")
     results = [solve(solver, photos[x], kept[x], confidences[x]) for x in groups]
     lap(OURS)
-    poses: dict[str, list[Pose | None]] = {OURS: [pose for result in results for pose in believed(result)]}
+    poses: dict[str, list[Pose | None]] = {OURS: [pose for result in results for pose in found_poses(result)]}
     theirs = {"pycolmap, the same pairs": kept}
     if isinstance(detector, Sift):
         theirs["pycolmap, ratio test"] = [Matches(*(x[m.scores < RATIO_TEST] for x in m)) for m in matched]
@@ -315,7 +315,7 @@ def run(
 
 @themed
 def draw(drawn: Sequence[tuple[Matches, Tensor, dict[str, Any]]], images: Path, path: Path) -> None:
-    """Draw the pairs that the solver kept, on queries with few, some and many outliers."""
+    """Draw the kept and the rejected pairs on queries with few, some and many outliers."""
     ranked = sorted(drawn, key=lambda x: x[2]["outliers"])
     figure = make_figure(7.2, 2.3)
     places = (len(ranked) // 2, 9 * len(ranked) // 10, -1)

@@ -1,7 +1,7 @@
 """A pose network that has learned nothing, and three losses to train it: ``python docs/examples/pose_network.py``.
 
-The network is given a noisy description of an object's pose and says where the object's twelve keypoints are in the
-image. Its only teacher is the pose, through a solver. At first its keypoints fit no pose. The losses are the distance
+The network gets a noisy description of an object's pose and predicts the pixels of the object's twelve keypoints. Its
+only label is the pose, through a solver; before training its keypoints fit no pose. The losses are the distance
 of the pose of Kornia's DLT, the distance of the pose of `pnpnet-set` with `gradient="always"`, and this package's
 `monte_carlo_pose_loss`; they stand in :data:`LOSSES`. Writes `pose_network.json` to `--out`.
 """

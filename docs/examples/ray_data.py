@@ -2,7 +2,7 @@
 
 IN is a Parquet file or a folder of them with one problem per row, OUT a folder for the poses; either may be an address
 such as ``s3://bucket/poses``. The columns are those of :class:`kornia_pnpnet.arrow.Solve`; other columns are kept. On a
-node of a cluster, or with ``ray job submit``, Ray finds the cluster by itself; elsewhere it starts on this machine.
+node of a cluster, or with ``ray job submit``, Ray finds the cluster; elsewhere it starts on this machine.
 
 With ``--id NAME``, a column of unique numbers, Ray writes down which problems are done (in ``OUT.done``). The same
 command then goes on where it was stopped. Without ``--id``, OUT must not exist.

@@ -17,17 +17,21 @@ import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 Floats = NDArray[np.float64]
 WIDTH, HEIGHT, FOCAL = 640, 480, 500.0
+CAMERA = pycolmap.Camera(model="PINHOLE", width=WIDTH, height=HEIGHT, params=[FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2])
+CAMERA.camera_id = 1
 INTRINSICS = np.array([[FOCAL, 0.0, WIDTH / 2], [0.0, FOCAL, HEIGHT / 2], [0.0, 0.0, 1.0]])
 DOWN = np.array([0.0, 0.0, -1.0])  # gravity
 SIZE = np.array([12.0, 9.0, 4.0])  # of the hall, in metres
 TEXELS = 100  # of a texture on a metre
 SUPERSAMPLING = 2  # rays across a pixel
 MAX_DEPTH = 8.0  # metres, of the depth images
-# Points of the map: features of the images that make it, Lowe's ratio, smallest angle between rays, largest error of
-# a ray, both in degrees.
+# Points of the map: number of features of an image, Lowe's ratio, smallest angle between rays and largest error of a
+# ray in degrees.
 FEATURES, RATIO, MIN_ANGLE, MAX_ERROR = 1500, 0.8, 1.5, 0.25
 
 
@@ -178,12 +182,23 @@ def make_scene(folder: Path, references: int = 20, queries: int = 60, seed: int 
     """
     hall = make_hall(seed)
     views = {f"reference{i:02}.png": view for i, view in enumerate(reference_views(hall, references))}
-    keypoints, points, tracks = triangulate(list(views.values()))
+    keypoints, points = triangulate(list(views.values()))
     views |= {f"query{i:02}.png": view for i, view in enumerate(query_views(hall, queries))}
-    (folder / "images").mkdir(parents=True)
-    for name, view in views.items():
+    for name in ("images", "sparse"):
+        (folder / name).mkdir(parents=True)
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(CAMERA)
+    for i, (name, view) in enumerate(views.items()):
         cv2.imwrite(str(folder / "images" / name), view.image)
-    write_model(folder / "sparse", views, keypoints, points, tracks)
+        found = keypoints[i] if i < references else np.zeros((0, 2))
+        image = pycolmap.Image(name=name, keypoints=found, camera_id=1, image_id=i + 1)
+        model.add_image_with_trivial_frame(image, rigid(view.rotation, view.translation))
+    for point, fitting in points:
+        track = pycolmap.Track()
+        for i, keypoint in fitting:
+            track.add_element(i + 1, keypoint)
+        model.add_point3D(point, track)
+    model.write_text(folder / "sparse")
     return folder
 
 
@@ -217,69 +232,51 @@ def write_sequence(folder: Path, frames: int = 100, seed: int = 3) -> Path:
         for kind, image in (("rgb", view.image), ("depth", depth)):
             cv2.imwrite(str(folder / kind / f"{i:04}.png"), image)
             lines[kind].append(f"{time:.4f} {kind}/{i:04}.png")
-        place = pycolmap.Rigid3d(np.column_stack((view.rotation.T, centre)))
+        place = rigid(view.rotation.T, centre)
         lines["groundtruth"].append(" ".join(map(str, (f"{time:.4f}", *centre, *place.rotation.quat))))
     for kind, rows in lines.items():
         (folder / f"{kind}.txt").write_text("\n".join(rows) + "\n")
     return folder
 
 
-def triangulate(views: list[View]) -> tuple[list[Floats], list[Floats], list[dict[int, int]]]:
-    """Keypoints (K, 2) of views with known poses, points (3,) from their matches, and the keypoint of each by view."""
+def rigid(rotation: Floats, translation: Floats) -> pycolmap.Rigid3d:
+    """A pose of pycolmap."""
+    return pycolmap.Rigid3d(np.column_stack((rotation, translation)))
+
+
+def triangulate(views: list[View]) -> tuple[list[Floats], list[tuple[Floats, list[tuple[int, int]]]]]:
+    """Keypoints (K, 2) of views with known poses, and points from their matches.
+
+    Each point (3,) comes with its track: pairs of the number of a view and the number of a keypoint.
+    """
     sift = cv2.SIFT_create(nfeatures=FEATURES, enable_precise_upscale=True)
     found = [sift.detectAndCompute(view.image, None) for view in views]
     keypoints = [np.array([x.pt for x in points], dtype=np.float64) + 0.5 for points, _ in found]
     matcher = cv2.BFMatcher(cv2.NORM_L2)
-    parent: dict[tuple[int, int], tuple[int, int]] = {}
-
-    def root(node: tuple[int, int]) -> tuple[int, int]:
-        while parent.setdefault(node, node) != node:
-            node = parent[node]
-        return node
-
+    starts = np.cumsum([0, *map(len, keypoints)])  # number of the first keypoint of each view, over all views
+    ends = []
     for i, j in itertools.combinations(range(len(views)), 2):
         back = {x.queryIdx: x.trainIdx for x in matcher.match(found[j][1], found[i][1])}
         for first, second in matcher.knnMatch(found[i][1], found[j][1], k=2):
             if first.distance < RATIO * second.distance and back[first.trainIdx] == first.queryIdx:
-                parent[root((i, first.queryIdx))] = root((j, first.trainIdx))
-    groups: dict[tuple[int, int], list[tuple[int, int]]] = {}
-    for node in list(parent):
-        groups.setdefault(root(node), []).append(node)
-    camera = pycolmap.Camera(model="PINHOLE", width=WIDTH, height=HEIGHT, params=[FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2])
-    poses = [pycolmap.Rigid3d(np.column_stack((view.rotation, view.translation))) for view in views]
+                ends.append((starts[i] + first.queryIdx, starts[j] + first.trainIdx))
+    one, other = np.array(ends).T
+    matches = coo_array((np.ones(len(one)), (one, other)), shape=(starts[-1], starts[-1]))
+    _, labels = connected_components(matches, directed=False)
+    groups: dict[int, list[tuple[int, int]]] = {}
+    for i, (start, end) in enumerate(itertools.pairwise(starts)):
+        for keypoint, label in enumerate(labels[start:end].tolist()):
+            groups.setdefault(label, []).append((i, keypoint))
+    poses = [rigid(view.rotation, view.translation) for view in views]
     options = pycolmap.EstimateTriangulationOptions(min_tri_angle=math.radians(MIN_ANGLE))
     options.ransac.max_error = math.radians(MAX_ERROR)
     options.ransac.random_seed = 0
-    points, tracks = [], []
+    points = []
     for group in groups.values():
-        pixels = np.array([keypoints[view][feature] for view, feature in group])
-        seen_by = [view for view, _ in group]
-        made = pycolmap.estimate_triangulation(pixels, [poses[i] for i in seen_by], [camera] * len(group), options)
-        track = {} if made is None else dict(x for x, fits in zip(group, made["inliers"], strict=True) if fits)
-        if len(track) >= 2:
-            points.append(made["xyz"])
-            tracks.append(track)
-    return keypoints, points, tracks
-
-
-def write_model(
-    folder: Path, views: dict[str, View], keypoints: list[Floats], points: list[Floats], tracks: list[dict[int, int]]
-) -> None:
-    """Write a COLMAP model as text. The first views have keypoints, the others only poses."""
-    folder.mkdir(parents=True)
-    camera = f"1 PINHOLE {WIDTH} {HEIGHT} {FOCAL} {FOCAL} {WIDTH / 2} {HEIGHT / 2}\n"
-    (folder / "cameras.txt").write_text(camera)
-    point_of = {(view, feature): i + 1 for i, track in enumerate(tracks) for view, feature in track.items()}
-    lines = []
-    for i, (name, view) in enumerate(views.items()):
-        pose = pycolmap.Rigid3d(np.column_stack((view.rotation, view.translation)))
-        x, y, z, w = pose.rotation.quat
-        numbers = " ".join(map(str, (w, x, y, z, *pose.translation)))
-        seen = enumerate(keypoints[i] if i < len(keypoints) else [])
-        lines += [f"{i + 1} {numbers} 1 {name}", " ".join(f"{u} {v} {point_of.get((i, j), -1)}" for j, (u, v) in seen)]
-    (folder / "images.txt").write_text("\n".join(lines) + "\n")
-    rows = []
-    for i, (point, track) in enumerate(zip(points, tracks, strict=True)):
-        seen_by = " ".join(f"{view + 1} {feature}" for view, feature in track.items())
-        rows.append(f"{i + 1} {point[0]} {point[1]} {point[2]} 128 128 128 0 {seen_by}")
-    (folder / "points3D.txt").write_text("\n".join(rows) + "\n")
+        if len(group) > 1:
+            pixels = np.array([keypoints[i][keypoint] for i, keypoint in group])
+            made = pycolmap.estimate_triangulation(pixels, [poses[i] for i, _ in group], [CAMERA] * len(group), options)
+            track = made and [x for x, fits in zip(group, made["inliers"], strict=True) if fits]
+            if track and len(dict(track)) > 1:
+                points.append((made["xyz"], list(dict(track).items())))
+    return keypoints, points

@@ -24,7 +24,7 @@ def command(description: str | None) -> argparse.ArgumentParser:
 
 
 def write(path: Path, /, **results: Any) -> None:
-    """Write a results file, with the environment; a missing folder is made."""
+    """Write a results file with the environment, and make a missing folder."""
     save_results({"environment": environment(), **results}, path)
 
 
@@ -40,7 +40,7 @@ def pose_error(found: Pose, truth: Pose) -> tuple[Tensor, Tensor]:
 
 
 def opencv(threshold: float) -> nn.Module:
-    """``cv2.solvePnPRansac`` with a threshold in pixels and all else as it comes, called like a solver of ours."""
+    """``cv2.solvePnPRansac`` with a threshold in pixels and OpenCV's defaults, called like a solver of ours."""
     defaults = {"iterations": 100, "confidence": 0.99, "method": "ITERATIVE", "refine": False}
     return create_solver("opencv-ransac", threshold=threshold, **defaults)
 

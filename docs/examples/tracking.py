@@ -124,7 +124,7 @@ def depth_covariances(points: Tensor, camera: Pose) -> Tensor:
 
 
 def motion_prior(last: Pose, frames: int) -> PosePrior:
-    """The last pose as a prior: the camera has turned and moved since then, the more the more frames ago."""
+    """The last pose as a prior. Its uncertainty grows with the number of frames since then."""
     rotation, translation = last
     eye = torch.eye(3, dtype=rotation.dtype)
     # A turn w about the camera and a shift d of its centre change the translation by w x t - R d.
@@ -158,11 +158,10 @@ def moved(first: Pose, second: Pose) -> tuple[float, float]:
 def track(
     frames: Sequence[Frame], intrinsics: Tensor, solver: nn.Module, prior: Callable[..., PosePrior | None], pairs: int
 ) -> dict[str, Any]:
-    """Track all frames with the first matches of each frame.
+    """Track all frames with the first matches of each frame, from a known place.
 
-    A pose is taken when the solver believes it (``ok``), with a prior also when the camera can have moved there. Else
-    the frame keeps the last pose. The camera starts at a known place.
-    ``prior`` makes the prior of a frame from the last pose, the number of frames since then, and the frame.
+    A pose counts when it is ``ok``; with a prior also when the camera can have moved there. Otherwise the frame keeps
+    the last pose. ``prior`` makes a prior from the last pose, the number of frames since then, and the frame.
     """
     last, since, path, errors, seconds = frames[0].pose, 1, [], [], []
     for frame in frames:

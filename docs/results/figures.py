@@ -14,6 +14,7 @@ import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence, Sized
 from contextlib import suppress
 from fractions import Fraction
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,11 +31,7 @@ from kornia_pnpnet.evaluation.plots import COLOURS, WIDTH, log_scale, make_figur
 from kornia_pnpnet.evaluation.problem_sets import PRIORS
 from kornia_pnpnet.metrics import success_rate
 
-__all__ = ["draw_curves", "paper_figures", "plot_reliability", "plot_sweep", "solver_styles"]
-
 BLUE, ORANGE, GREEN, VERMILION, PINK, BROWN, _, GREY, _, SKY = COLOURS
-
-# -- the look of solvers -----------------------------------------------------------------------------------------------
 
 # Colour, marker and line of a solver, in the order of the rows. A solver has the look of the longest name that its name
 # begins with, up to a hyphen. A bound has no marker.
@@ -153,8 +150,8 @@ def draw_curves(
 ) -> Path:
     """Draw panels of curves against the column ``x``, with one legend below.
 
-    A panel is a title, a table with the column ``solver``, and the column of its vertical axis: ``rate`` in per cent
-    (with ``low`` and ``high``), ``us`` or ``operations``. Panels with the same vertical axis share its limits.
+    A panel is a title, a table with the column ``solver``, and the name of the column on its vertical axis: ``rate`` in
+    per cent (with ``low`` and ``high``), ``us`` or ``operations``. Panels with the same vertical axis share its limits.
     """
     found = {solver for _, table, _ in panels for solver in table.solver}
     styles = {name: look for name, look in (styles or solver_styles(found)).items() if name in found}
@@ -189,8 +186,6 @@ def draw_curves(
     return save(figure, path)
 
 
-# -- results files -----------------------------------------------------------------------------------------------------
-
 _KEYS = ["source", "outliers", "mismatches", "n", "solver"]
 _RATE = ["rate", "low", "high", "total"]
 _SOURCES = {"paper": "the paper's data", "gaussian_pose": "data with Gaussian positions"}
@@ -211,9 +206,9 @@ def require(found: Sized, what: str) -> None:
 def read_records(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
     """Read results files. Data sets without a source or outliers are left out.
 
-    One row for each source, outliers, kind of outliers, n and solver: the one with the most problems, then the last.
-    ``outliers`` is a number, ``"uniform"`` for 0 to a third of the pairs, or another text; ``mismatches`` says that
-    every outlier shows another point; ``base`` is the solver's name without the option m; an unknown ``m`` is -1.
+    A row has the largest number of problems with its source, outliers, kind of outliers, n and solver; of several the
+    last. ``outliers`` is a number, ``"uniform"`` for 0 to a third of the pairs, or another text. With ``mismatches``
+    every outlier shows another point. ``base`` is the solver's name without the option m; an unknown ``m`` is -1.
     """
     rows, synthetic = [], {name for name, _ in PRIORS.values()}
     for result in results:
@@ -283,9 +278,6 @@ def _by_outliers(table: pd.DataFrame, n: int | str) -> list[Panel]:
     return [(outliers_in_words(setting, n), table[table.outliers == setting], "rate") for setting in settings]
 
 
-# -- figures -----------------------------------------------------------------------------------------------------------
-
-
 def plot_operations(path: str | Path, complexity: Mapping[str, Any]) -> Path:
     """Draw operation counts without and with RANSAC, see ``operations.complexity_results``: figure 1."""
     counts = {"n": complexity["n"], **complexity["counts"]}
@@ -323,10 +315,10 @@ def plot_scenes(path: str | Path, records: pd.DataFrame) -> Path:
 
 
 def plot_mismatches(path: str | Path, records: pd.DataFrame) -> Path:
-    """Draw success, pooled over the scenes with the most numbers of mismatches, against their number: figure 5.
+    """Draw success against the number of mismatches: figure 5.
 
-    A solver that solved all these scenes at three numbers or more has a curve. Without sets of mismatches only, the
-    outliers of the protocol are drawn.
+    Success is pooled over the scenes that have the most numbers of mismatches. A solver that solved all these scenes at
+    three numbers or more has a curve. Without sets of mismatches the outliers of the protocol are drawn.
     """
     table = records.query("scene and not swept")
     table = table[table.outliers.map(lambda outliers: isinstance(outliers, int)).astype(bool)]
@@ -349,7 +341,8 @@ def plot_mismatches(path: str | Path, records: pd.DataFrame) -> Path:
 def plot_against_n(path: str | Path, records: pd.DataFrame) -> Path:
     """Draw success on the protocol's data against the number of pairs, a panel for each outlier setting.
 
-    Solvers for one n each, such as ``pnpnet-n9`` and ``pnpnet-n20``, make one curve. Other solvers need two n.
+    Solvers for one n each, such as ``pnpnet-n9`` and ``pnpnet-n20``, make one curve.
+    Other solvers have a curve when they were measured at two n or more.
     """
     table = records.query("source == 'paper' and not swept and not mismatches")
     table = table[table.groupby("outliers").n.transform("nunique") > 1]
@@ -389,16 +382,11 @@ _FIGURES: dict[str, Callable[..., Path]] = {
 
 
 def paper_figures(results: Sequence[Mapping[str, Any]], folder: str | Path) -> list[Path]:
-    """Draw the protocol's five figures, success against n and success against m. Figures without data are left out.
+    """Draw the protocol's five figures, success against n and success against m, into a folder.
 
-    Args:
-        results: results files of :func:`~kornia_pnpnet.evaluation.evaluate`, and at most one file of operation counts.
-            Of several results with the same source, outliers, n and solver, the one with the most problems is drawn,
-            and of these the last. A solver whose name sets m is in the figure against m only.
-        folder: folder of the pictures, made when missing.
-
-    Raises:
-        ValueError: when no figure has data, or there are several files of operation counts.
+    Figures without data are left out; ``ValueError`` when no figure has data. Of several results with the same source,
+    outliers, n and solver, the one with the most problems is drawn, and of these the last. A solver whose name sets m
+    is in the figure against m only. ``results`` may have one file of operation counts.
     """
     complexity = [entry for entry in results if entry.get("kind") == "complexity"]
     if len(complexity) > 1 or not results:
@@ -412,8 +400,6 @@ def paper_figures(results: Sequence[Mapping[str, Any]], folder: str | Path) -> l
         raise ValueError("The results hold no data for any figure: no data set has a source and outliers to compare.")
     return made
 
-
-# -- trainings and probabilities ---------------------------------------------------------------------------------------
 
 _MIXES = ((GREEN, "o", "-"), (BLUE, "s", "--"), (VERMILION, "^", "-."), (PINK, "D", ":"))
 _TIME = "time, least over the mixes"
@@ -429,8 +415,8 @@ def mix_in_words(max_ratio: float) -> str:
 def plot_sweep(path: str | Path, summary_csv: str | Path, *, against: Literal["n", "m"]) -> Path:
     """Draw the success of trained networks against n or m: a panel for each value of the other, a line for each mix.
 
-    The panels below show the time: the least over the mixes, which do not change the time. ``summary_csv`` is the
-    summary of ``train.py -m experiment=sweep``. ``ValueError`` when two rows have the same n, m and mix.
+    The panels below show the time, which does not depend on the mix. ``summary_csv`` is the summary of ``train.py -m
+    experiment=sweep``; ``ValueError`` when two rows have the same n, m and mix.
     """
     named = {"model.n": "n", "model.m": "m", "data.outliers.max_ratio": "mix", "us_per_problem": "us"}
     named |= {f"uniform/{name}": name for name in ("rate", "low", "high")}
@@ -455,8 +441,7 @@ def plot_sweep(path: str | Path, summary_csv: str | Path, *, against: Literal["n
 def plot_reliability(path: str | Path, curves: Mapping[str, Mapping[str, Sequence[float]]]) -> Path:
     """Draw observed shares against predicted probabilities, and below the number of predictions in each range.
 
-    ``curves`` are by name the lists ``number``, ``predicted`` and ``observed`` of a
-    :class:`~kornia_pnpnet.metrics.Reliability`. Empty ranges are left out.
+    ``curves`` has the lists of a :class:`~kornia_pnpnet.metrics.Reliability` by name. Empty ranges are left out.
     """
     figure = make_figure(0.72 * WIDTH, 6.0)
     chance, share = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
@@ -471,6 +456,54 @@ def plot_reliability(path: str | Path, curves: Mapping[str, Mapping[str, Sequenc
     chance.legend(loc="upper left")
     share.set(yscale="log", xlabel="weight: the predicted probability of an inlier", ylabel="pairs (%)")
     share.yaxis.set_major_formatter("{x:g}")
+    return save(figure, path)
+
+
+_RAW_LOOKS = {  # a solver with more inputs keeps its colour and has another marker and line
+    "+ratio": {"marker": "s", "linestyle": "--", "markerfacecolor": "white"},
+    ":adaptive": {"marker": "^"},
+}
+
+
+def find_rows(results: Mapping[str, Any], kind: str) -> dict[str, dict[str, Mapping[str, Any]]]:
+    """The rows of one kind by solver and group."""
+    table: dict[str, dict[str, Mapping[str, Any]]] = {}
+    for row in results["rows"]:
+        if row["kind"] == kind:
+            table.setdefault(row["solver"], {})[row["group"]] = row
+    return table
+
+
+@themed
+def plot_real_matches(path: str | Path, results: Mapping[str, Any], costs: Mapping[str, Any]) -> Path:
+    """Draw success and time of raw matches against the share of outliers, and time against the number of pairs.
+
+    ``results`` and ``costs`` are files of ``benchmarks/real_matches.py measure`` and ``cost``. Solvers of ``costs`` are
+    drawn.
+    """
+    table = find_rows(results, "no ratio test")
+    times = {(row["solver"], row["group"]): row["ms_per_problem"] for row in costs["rows"]}
+    solvers = costs["settings"]["solvers"]
+    shown = {name: re.sub(r",?\w+_iterations=\d+|:threshold=\d+|effort=", "", name) for name in solvers}
+    styles = solver_styles(shown.values())
+    for name, style in styles.items():
+        for part, look in _RAW_LOOKS.items():
+            style |= look if part in name else {}
+    shares, pairs = (list(pairwise(costs["settings"][key])) for key in ("shares", "pairs"))
+    by_share = {f"{100 * a:.0f}–{100 * b:.0f} %": f"{100 * a:.0f}–{100 * b:.0f}" for a, b in shares}
+    by_pairs = {f"{a}–{b - 1} pairs": f"{a}–{b - 1}" for a, b in pairs}
+    figure = make_figure(WIDTH, 3.6, "Nearest-neighbour matches without a ratio test")
+    plots = ("success", by_share, "outliers (%)"), ("ms", by_share, "outliers (%)"), ("ms", by_pairs, "pairs")
+    for axes, (value, groups, label) in zip(figure.subplots(1, 3), plots, strict=True):
+        there = [group for group in groups if (solvers[0], group) in times]
+        for name in solvers:
+            heights = [100 * table[name][g]["success"] if value == "success" else times[name, g] for g in there]
+            axes.plot(np.arange(len(there)), heights, **styles[shown[name]])
+        axes.set_xticks(range(len(there)), [groups[group] for group in there], rotation=40, ha="right")
+        axes.set(xlabel=label, title="right poses (%)" if value == "success" else "ms per problem")
+        if value == "ms":
+            log_scale(axes, "y")
+    draw_legend(figure, styles)
     return save(figure, path)
 
 

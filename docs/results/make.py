@@ -27,8 +27,6 @@ from pathlib import Path
 
 from measure import HERE, RESULTS, compare, measure, ship
 
-__all__ = ["main"]
-
 
 def main() -> None:
     """Run one of the steps."""

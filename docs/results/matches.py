@@ -10,23 +10,21 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 import torch
+from figures import find_rows
 from measure import ANY, HERE
-from real_matches_picture import find_rows
 from short_runs import read_summary
 
 from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.metrics import SuccessRate, success_rate
-
-__all__ = ["MATCHES", "Pooled", "facts", "overview", "pool", "title"]
 
 #: Files of ``benchmarks/real_matches.py measure``, each on scenes that no solver had seen, the latest last.
 MATCHES = ("real_matches", "real_matches_again", "real_matches_third", "real_matches_fourth")
 #: The file of ``benchmarks/real_matches.py measure --batch 1`` on some of these scenes: one image in each call.
 SINGLE = "real_matches_single"
 BATCH = 500  # problems in a call of ours in the files of MATCHES
-SCORES = "scores"  # what the title of a solver ends with that got a score for each pair
+SCORES = "scores"  # end of the title of a solver that got a score for each pair
 _TITLES = {"poselib": "PoseLib", "opencv-usac": "OpenCV USAC", "known-inliers": "inliers known"}
-_TOLD = {"": "", "ratio": SCORES, "sigma": "noise known"}
+_KNOWN = {"": "", "ratio": SCORES, "sigma": "noise known"}
 
 
 def title(solver: str, settings: Mapping[str, Any]) -> str:
@@ -34,7 +32,7 @@ def title(solver: str, settings: Mapping[str, Any]) -> str:
 
     The first file was measured when the fixed effort was the default of ``pnpnet-set``: it names the adaptive one.
     """
-    spec, _, told = solver.partition("+")
+    spec, _, known = solver.partition("+")
     name, _, options = spec.partition(":")
     parts = [_TITLES.get(name, name if name == "pycolmap" else f"`{name}`")]
     if name == ANY:
@@ -42,7 +40,7 @@ def title(solver: str, settings: Mapping[str, Any]) -> str:
         fixed = "effort=fixed" in options or (fixed_by_default and not options)
         parts += ["fixed effort"] if fixed else []
     parts += [f"{pixels} px" for pixels in re.findall(r"threshold=(\d+)", options)]
-    return ", ".join(filter(None, (*parts, _TOLD[told])))
+    return ", ".join(filter(None, (*parts, _KNOWN[known])))
 
 
 class Pooled(NamedTuple):
@@ -76,30 +74,24 @@ def best_peer(pooled: Mapping[str, Mapping[str, Pooled]], kind: str = "all") -> 
     return max(peers, key=lambda name: pooled[name][kind].success.rate)
 
 
-def overview(files: Sequence[Mapping[str, Any]], link: str) -> str:
-    """The table of the home page and of the README: the solvers on the real matches of all files.
-
-    Args:
-        files: the files of :data:`MATCHES`.
-        link: where the page on real matches is, from the page that shows the table.
-    """
+def overview(files: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Facts of the overview on the home page and in the README: the solvers on the real matches of all files."""
     pooled = pool(files)
     measured = json.loads((HERE / f"{SINGLE}.json").read_text(encoding="utf-8"))
     single, batched = (pool([of_batch(measured, size)]) for size in (1, BATCH))
     kinds = [kind for kind in pooled[f"`{ANY}`"] if kind != "all"]
     ours = [f"`{ANY}`", f"`{ANY}`, {SCORES}"]
     others = [name for name in pooled if name[0] != "`" and name != _TITLES["known-inliers"]]
-    plain = best_peer({name: kinds for name, kinds in pooled.items() if not name.endswith(SCORES)})
-    told = best_peer({name: kinds for name, kinds in pooled.items() if name.endswith(SCORES)})
-    shown = [name for name in others if not name.startswith("PoseLib") or name in (plain, told)]
+    best = [best_peer({x: pooled[x] for x in pooled if x.endswith(SCORES) == scores}) for scores in (False, True)]
+    shown = [name for name in others if not name.startswith("PoseLib") or name in best]
     rows = [*ours, *sorted(shown, key=lambda name: -pooled[name]["all"].success.rate)]
     lines = []
     for name in rows:
-        title_ = name.replace(f", {SCORES}", f" with {SCORES}")
+        title_, mark = name.replace(f", {SCORES}", f" with {SCORES}"), "**" if name in ours else ""
         cells = [title_, f"{BATCH}" if name in ours else "1"]
         for kind in kinds:
             cells += [f"{100 * pooled[name][kind].success.rate:.1f} %", microseconds(pooled[name][kind])]
-        lines.append([f"**{cell}**" if name in ours else cell for cell in cells])
+        lines.append([f"{mark}{cell}{mark}" for cell in cells])
         if name in ours:
             lines.append([title_, "1"])
             for kind in kinds:
@@ -108,37 +100,33 @@ def overview(files: Sequence[Mapping[str, Any]], link: str) -> str:
                 lines[-1] += ["same" if same else f"{100 * one.success.rate:.1f} %\\*", f"{microseconds(one)}\\*"]
     short = {"ratio test": "filtered", "no ratio test": "raw"}
     header = ["Solver", "images per call", *(x for kind in kinds for x in (f"{short[kind]}: right", "µs per image"))]
-    scenes = sum(len(results["counts"]) for results in files)
     rates = [pooled[name][kind].success for name in rows for kind in kinds]
-    reach = 100 * max(max(x.rate - x.low, x.high - x.rate) for x in rates)
-    right = files[0]["settings"]["right"]
-    base = pooled[ours[0]]
     ahead = []
     for kind in kinds:
+        base, alone = pooled[ours[0]][kind], single[ours[0]][kind]
         better = {
-            "more often right": [x for x in shown if pooled[x][kind].success.rate > base[kind].success.rate],
-            "faster": [x for x in shown if pooled[x][kind].ms < base[kind].ms],
-            "faster with one image per call": [x for x in shown if single[x][kind].ms < single[ours[0]][kind].ms],
+            "more often right": [x for x in shown if pooled[x][kind].success.rate > base.success.rate],
+            "faster": [x for x in shown if pooled[x][kind].ms < base.ms],
+            "faster with one image per call": [x for x in shown if single[x][kind].ms < alone.ms],
         }
         for what, found in better.items():
             names = dict.fromkeys(name.partition(",")[0] for name in found)
             ahead += [f"{' and '.join(names)} {what} on {short[kind]} matches"] if names else []
-    steps = [100 * points_ahead(pool([results])) for results in files]
-    there = [
-        f"{what} takes {' and '.join(microseconds(one[kind]) for kind in kinds)} µs"
-        for what, one in ((f"`{ANY}` in batches of {BATCH}", batched[ours[0]]), (plain, single[plain]))
-    ]
-    notes = (
-        f"{base['all'].success.total} problems of {scenes} public scenes that no solver had seen: SIFT matches after a "
-        f"ratio test (*filtered*) or without (*raw*). Right: within {right[0]:g}° and {100 * right[1]:g} % of the "
-        f"distance; 95 % intervals: at most ±{reach:.1f} points. One thread, {files[0]['environment']['cpu']}. "
-        f"\\* {single[ours[0]]['all'].success.total} of these problems on {measured['environment']['cpu']}, where "
-        f"{' and '.join(there)} (filtered and raw). "
-        f"**Where others are ahead** of `{ANY}`: {'; '.join(ahead) or 'nowhere'}. In the {len(files)} measurements "
-        f"`{ANY}` was {min(steps):+.1f} to {max(steps):+.1f} points ahead of the best PoseLib. "
-        f"[All measurements]({link})."
-    )
-    return f"{markdown_table(header, lines)}\n\n{notes}"
+    there = ((f"`{ANY}` in batches of {BATCH}", batched[ours[0]]), (best[0], single[best[0]]))
+    return {
+        "table": markdown_table(header, lines),
+        "total": pooled[ours[0]]["all"].success.total,
+        "scenes": sum(len(results["counts"]) for results in files),
+        "right": files[0]["settings"]["right"],
+        "reach": 100 * max(max(x.rate - x.low, x.high - x.rate) for x in rates),
+        "cpu": files[0]["environment"]["cpu"],
+        "few": single[ours[0]]["all"].success.total,
+        "there": {name: [microseconds(one[kind]) for kind in kinds] for name, one in there},
+        "there_cpu": measured["environment"]["cpu"],
+        "ahead": ahead,
+        "steps": [100 * points_ahead(pool([results])) for results in files],
+        "any": ANY,
+    }
 
 
 def microseconds(one: Pooled) -> str:
@@ -177,11 +165,7 @@ def group_table(results: Mapping[str, Any], kind: str) -> str:
 
 
 def facts(results: Mapping[str, Any]) -> dict[str, Any]:
-    """Tables of one file of ``benchmarks/real_matches.py measure``.
-
-    Returns:
-        ``tables`` by kind; ``scenes``, a table; ``total`` number of problems; ``results``, the file.
-    """
+    """Tables of one file of ``benchmarks/real_matches.py measure``, its number of problems, and the file."""
     kinds = list(dict.fromkeys(row["kind"] for row in results["rows"]))
     known = {row["scene"]: row for row in read_summary(HERE / "real_matches_scenes.csv")}
     lines = []
@@ -213,7 +197,7 @@ def pooled_table(files: Sequence[Mapping[str, Any]]) -> str:
 
 
 def measurements_table(files: Iterable[Mapping[str, Any]]) -> str:
-    """Each file by itself: how far ``pnpnet-set`` is ahead of the PoseLib that is best on its problems."""
+    """A line for each file: how far ``pnpnet-set`` is ahead of the PoseLib that is best on its problems."""
     lines = []
     for results in files:
         pooled = pool([results])
@@ -230,12 +214,9 @@ def measurements_table(files: Iterable[Mapping[str, Any]]) -> str:
 def page_facts(
     files: Sequence[Mapping[str, Any]], costs: Mapping[str, Any], keypoints: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """What the template of the page on real matches needs.
+    """Facts for the template of the page on real matches.
 
-    Args:
-        files: the files of :data:`MATCHES`.
-        costs: what ``benchmarks/real_matches.py cost`` wrote.
-        keypoints: what ``benchmarks/keypoints.py`` wrote.
+    ``files`` are the files of :data:`MATCHES`; ``benchmarks/real_matches.py cost`` wrote ``costs``.
     """
     first = files[0]
     solver = first["settings"]["solvers"][0]

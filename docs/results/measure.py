@@ -29,8 +29,6 @@ from kornia_pnpnet.training.card import write_model_card
 from kornia_pnpnet.training.checkpoint import HISTORY_NAME
 from kornia_pnpnet.training.results import RESULTS_NAME, load_run
 
-__all__ = ["ANY", "CHI_SQUARE_95", "HERE", "OURS", "PAPER", "PEERS", "RESULTS", "ROBUST", "compare", "measure", "ship"]
-
 HERE = Path(__file__).resolve().parent
 OUTPUTS = HERE.parents[1] / "outputs" / "results"
 
@@ -154,9 +152,6 @@ def run(name: str, solvers: Mapping[str, nn.Module], data: Mapping[str, Evaluati
     rows = [{key: value for key, value in row.items() if key != "per_problem"} for row in results["rows"]]
     save_results({**results, "rows": rows, **more}, HERE / f"{name}.json")
     print(f"\n{name}\n{format_table(results)}", flush=True)
-
-
-# -- the files, each by what it measures -------------------------------------------------------------------------------
 
 
 def measure_protocol(counts: Counts, wanted: set[str]) -> None:
@@ -374,9 +369,8 @@ def ship(runs: Sequence[Path]) -> None:
 def collect_weights(runs: Sequence[Path], folder: Path) -> None:
     """Gather weights, results, model card and learning curves of successive runs of ``train.py`` in one folder.
 
-    Each run but the first began with the weights of the run before. Of each run's learning curves at most 100 rows are
-    kept, all with a validation. The name of the folder becomes the name of the weights. After an error nothing is
-    written.
+    Each run after the first began with the weights of the run before. The folder gets at most 100 rows of each run's
+    learning curves, all with a validation, and gives the weights their name. After an error nothing is written.
     """
     curves = [_validated_rows(run / HISTORY_NAME) for run in runs]
     for before, rows in pairwise(curves):  # updates count from the first run on

@@ -26,8 +26,6 @@ from kornia_pnpnet.metrics import pose_errors, reliability, success_rate
 from kornia_pnpnet.refine.information import larger_sigma
 from kornia_pnpnet.result import PnPResult, Problems
 
-__all__ = ["measure_probability"]
-
 #: By law the solvers that it is fitted to.
 FITTED = {"sigmas": ("pnpnet-set:effort=fixed", "pnpnet-set:effort=adaptive"), "residuals": ("p3p-ransac",)}
 
@@ -37,9 +35,7 @@ def measure_probability(seed_fit: int, seed_report: int) -> dict[str, Any]:
     """Fit the law on problems of one seed, and measure it on those of another.
 
     Most problems are like real matches (``conf/data/matches.yaml``), of 5 to 250 pairs; others are the protocol's.
-
-    Returns:
-        ``environment``, ``laws``, and by solver how often right and far-off poses are ``ok``, and the reliability.
+    Returns the laws, and by solver the share of right and of far-off poses that are ``ok``, and the reliability.
     """
     conf = str(Path(__file__).resolve().parents[2] / "conf")
     with initialize_config_dir(conf, version_base=None):

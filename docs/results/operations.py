@@ -27,8 +27,6 @@ from kornia_pnpnet.propose.mlp import MLPInit
 from kornia_pnpnet.propose.ransac import RANSAC
 from kornia_pnpnet.solver import PnPNet
 
-__all__ = ["OPERATION_COSTS", "OperationCounter", "complexity_results", "count_per_problem", "operation_count"]
-
 #: The cost of one operation of each kind in "flops". Source: Lightspeed 2.8, ``flops.m`` and ``flops_div``, ``_sqrt``,
 #: ``_exp``, ``_log`` (timed on a Pentium 4). There a sine or another special function costs as much as a logarithm, and
 #: an absolute value (4) as much as two comparisons. The cost of logic, which Lightspeed does not list, is ours.
@@ -234,17 +232,11 @@ def count_per_problem(run: Callable[[int], object], batch: int = 2) -> float:
 
 
 def operation_count(solver: str | PnPNet, n: int, *, outliers: int = 0) -> float:
-    """Count the operations that a solver executes for one problem, by running it.
+    """Count the operations that a solver executes for one problem of ``n`` pairs, by running it.
 
-    Args:
-        solver: the solver, or its name as for :func:`~kornia_pnpnet.evaluation.named_solvers.load_solver`. The names
-            ``net``, ``pnpnet`` and ``pnpnet-paper`` stand for networks that are built for ``n`` pairs. A named solver
-            has the fixed effort, because the operations of a search depend on the data.
-        n: number of pairs, at least 3.
-        outliers: number of outliers among them. Only the counts of RANSAC depend on it.
-
-    Raises:
-        ValueCheckError: when the solver does not run in PyTorch.
+    The names ``net``, ``pnpnet`` and ``pnpnet-paper`` stand for networks that are built for ``n`` pairs. A named solver
+    has the fixed effort, because the operations of a search depend on the data. Only the counts of RANSAC depend on
+    ``outliers``. ``ValueCheckError`` when the solver does not run in PyTorch.
     """
     runnable = _solver(solver, n) if isinstance(solver, str) else solver
     mix = OutlierMix(count=outliers)
@@ -272,10 +264,7 @@ def _solver(spec: str, n: int) -> PnPNet:
 def complexity_results(solvers: Sequence[str] = SOLVERS, n: Iterable[int] = range(6, 51)) -> dict[str, Any]:
     """Count the operations of solvers for the results file behind figure 1, with a third of outliers.
 
-    Returns:
-        ``kind`` and ``format``; ``n``; ``counts``, for each solver one number for each n, ``None`` where a sample of
-        RANSAC has more than n pairs; ``ransac``, the solvers that draw samples; ``outliers`` for each n; ``costs``, the
-        table of costs; ``environment``.
+    ``counts`` has one number for each solver and n, ``None`` where a sample of RANSAC has more than n pairs.
     """
     sizes = list(n)
     inits = {name: _solver(name, n=9).init for name in solvers}

@@ -13,8 +13,6 @@ from kornia_pnpnet import Pose, create_solver, pose_errors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.evaluation.plots import BLUE, GREY, VERMILION, WIDTH, make_figure, save, themed
 
-__all__ = ["plot_problem"]
-
 _PAIRS, _OUTLIERS, _SEED = 48, 20, 3
 _KEPT = 0.5  # weights above this count as inliers, as on the page about OpenCV
 _HALF_VIEW = 0.31  # tangent of half the field of view that is drawn
@@ -59,11 +57,7 @@ def _frustum(pose: Pose) -> Tensor:
 
 @themed
 def plot_problem(path: str | Path) -> Path:
-    """Draw the pairs in the image, kept and rejected, and the points in space with the camera that was found.
-
-    Returns:
-        The path.
-    """
+    """Draw the pairs in the image, kept and rejected, and the points in space with the camera that was found."""
     outliers = OutlierMix(count=_OUTLIERS, mismatch_share=1.0)
     source = SyntheticProblems(n=_PAIRS, batch_size=1, seed=_SEED, points=_HousePoints(), outliers=outliers)
     problem = source.batch(0)

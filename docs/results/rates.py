@@ -10,8 +10,6 @@ from measure import BOUNDS
 
 from kornia_pnpnet.core.tables import markdown_table
 
-__all__ = ["Rates", "Standing", "compare_all", "interval", "shown"]
-
 
 def interval(rate: float, low: float, high: float) -> str:
     """A rate with its interval."""
@@ -26,12 +24,9 @@ def shown(data: str) -> str:
 
 
 class Standing(NamedTuple):
-    """Sets of problems on which the intervals of a solver and of the best other one are apart, or overlap.
+    """Sets by how a solver compares with the best other one: their intervals are apart, or overlap.
 
-    Attributes:
-        ahead: names of the sets.
-        behind: by set, the best other solver and the points that it is ahead.
-        overlapping: names of the sets.
+    ``behind`` has by set the best other solver, and its lead in points.
     """
 
     ahead: list[str]
@@ -47,11 +42,7 @@ class Standing(NamedTuple):
 
 
 class Rates:
-    """Success rates and times of a results file, by data set and solver.
-
-    Args:
-        results: the results file.
-    """
+    """Success rates and times of a results file, by data set and solver."""
 
     def __init__(self, results: Mapping[str, Any]) -> None:
         self.rows = {(row["data"], row["solver"]): row for row in results["rows"]}
@@ -86,30 +77,28 @@ class Rates:
         return max((name for name in solvers if (data, name) in self.rows), key=lambda name: self.rate(data, name))
 
     def reach(self, sets: Sequence[str] | None = None) -> float:
-        """The largest distance in points from a rate to an end of its interval."""
+        """The largest half-width of an interval, in points."""
         found = [row["success"] for (data, _), row in self.rows.items() if data in (sets or self.sets)]
         return 100 * max(max(one["rate"] - one["low"], one["high"] - one["rate"]) for one in found)
 
-    def by_set(self, told: Rates | None = None) -> str:
-        """A line for each set and a column for each solver, in per cent. The best one that is no bound is bold.
+    def cell(self, data: str, solver: str) -> str:
+        """Success in per cent for a table, a dash where the solver did not solve the set."""
+        return f"{self.rate(data, solver):.1f}" if (data, solver) in self.rows else "–"
 
-        Args:
-            told: rates of one more solver, which knew the noise; their sets have ``, noise told`` at the end.
+    def by_set(self, known: Rates | None = None) -> str:
+        """A line for each set and a column for each solver, in per cent. The best solver that is no bound is bold.
+
+        The last column is of ``known``, the rates of a solver that knew the noise of the same sets.
         """
         lines = []
         for data in self.sets:
-            known = [name for name in self.solvers if (data, name) in self.rows]
-            best = max(self.rate(data, name) for name in known if name not in BOUNDS)
-            line = [shown(data)]
-            for name in self.solvers:
-                cell = f"{self.rate(data, name):.1f}" if name in known else "–"
-                line.append(f"**{cell}**" if name in known and self.rate(data, name) == best else cell)
-            if told:
-                key = f"{data}, noise told"
-                line.append(f"{told.rate(key, told.solvers[0]):.1f}" if key in told.sets else "–")
-            lines.append(line)
+            best = self.best(data, [name for name in self.solvers if name not in BOUNDS])
+            first = [x for x in self.solvers if (data, x) in self.rows and self.rate(data, x) == self.rate(data, best)]
+            cells = (f"**{self.cell(data, x)}**" if x in first else self.cell(data, x) for x in self.solvers)
+            lines.append([shown(data), *cells])
+            lines[-1] += [known.cell(f"{data}, noise told", known.solvers[0])] if known else []
         header = ["Solved (%)", *(f"`{name}`" for name in self.solvers)]
-        return markdown_table([*header, f"`{told.solvers[0]}`, noise known"] if told else header, lines)
+        return markdown_table([*header, f"`{known.solvers[0]}`, noise known"] if known else header, lines)
 
     def by_solver(self, *, times: bool = False) -> str:
         """A line for each solver and a column for each set: success in per cent and, with ``times``, microseconds."""
@@ -119,10 +108,9 @@ class Rates:
         header = [f"Solved (%), {shown(start)}" if common else "Solved (%)", *titles]
         lines = []
         for name in self.solvers:
-            known = [data if (data, name) in self.rows else None for data in self.sets]
-            cells = [f"{self.rate(data, name):.1f}" if data else "–" for data in known]
-            cells += [f"{self.time(data, name):.0f}" if data else "–" for data in known if times]
-            lines.append([f"`{name}`", *cells])
+            cells = [self.cell(data, name) for data in self.sets]
+            us = (f"{self.time(x, name):.0f}" if (x, name) in self.rows else "–" for x in self.sets if times)
+            lines.append([f"`{name}`", *cells, *us])
         return markdown_table([*header, *(f"µs, {title}" for title in titles if times)], lines)
 
 

@@ -8,13 +8,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from figures import paper_figures, plot_reliability, plot_sweep
+from figures import paper_figures, plot_real_matches, plot_reliability, plot_sweep
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matches import MATCHES, overview, page_facts
 from measure import ANY, CHI_SQUARE_95, HERE, OURS, PAPER, PEERS, RESULTS, ROBUST
 from problem_picture import plot_problem
 from rates import Rates, compare_all
-from real_matches_picture import plot_real_matches
 from short_runs import ablation, capacity, read_summary, sweep
 
 from kornia_pnpnet import PnPNet
@@ -23,8 +22,6 @@ from kornia_pnpnet.evaluation.plots import plot_training
 from kornia_pnpnet.evaluation.results import format_table, load_results
 from kornia_pnpnet.metrics import SuccessRate
 from kornia_pnpnet.pretrained import WEIGHTS_FOLDER, shipped_weights
-
-__all__ = ["page", "pages", "real_matches", "render", "with_block"]
 
 REPOSITORY = HERE.parents[1]
 #: Files of short runs, see ``make.py``.
@@ -123,7 +120,7 @@ def page() -> str:
         commits={name: f"{entry['environment']['commit']:.9}" for name, entry in results.items()},
         results=results,
         operations={name: counts[at_nine] for name, counts in complexity["counts"].items()},
-        overview=overview(load_matches(), "real_matches.md"),
+        overview=written("overview.md.jinja", link="real_matches.md", **overview(load_matches())),
         summary=summary(benchmark),
         benchmark=benchmark,
         unknown_focal=unknown_focal(cameras),
@@ -149,11 +146,7 @@ def real_matches() -> str:
 
 
 def with_block(text: str, block: str) -> str:
-    """The text with another block between the lines ``BEGIN`` and ``END``.
-
-    Raises:
-        ValueError: when the text has not exactly one of each line.
-    """
+    """The text with another block between the lines ``BEGIN`` and ``END``; ``ValueError`` without one of each line."""
     if text.count(BEGIN) != 1 or text.count(END) != 1:
         raise ValueError(f"A page with an overview needs one line '{BEGIN}' and one line '{END}' below it.")
     return f"{text.partition(BEGIN)[0]}{BEGIN}\n{block}\n{END}{text.partition(END)[2]}"
@@ -162,7 +155,8 @@ def with_block(text: str, block: str) -> str:
 def with_overview(path: Path) -> str:
     """The page at ``path`` with the overview, whose link leads from there."""
     link = Path(os.path.relpath(HERE / "real_matches.md", path.parent)).as_posix()
-    return with_block(path.read_text(encoding="utf-8"), overview(load_matches(), link))
+    block = written("overview.md.jinja", link=link, **overview(load_matches()))
+    return with_block(path.read_text(encoding="utf-8"), block)
 
 
 def load(name: str, folder: Path = HERE) -> Any:

@@ -14,8 +14,6 @@ from rates import interval
 
 from kornia_pnpnet.core.tables import markdown_table
 
-__all__ = ["KERNEL", "ablation", "capacity", "claim", "compared", "read_summary", "sweep"]
-
 EXPERIMENTS = HERE.parents[1] / "conf" / "experiment"
 KERNEL = "model.solver.refine.kernel"  # column of a summary
 
@@ -59,12 +57,7 @@ def claim(experiment: str) -> str:
 
 
 def ablation(rows: Sequence[Row]) -> dict[str, Any]:
-    """Facts of the ablations.
-
-    Returns:
-        ``updates``; ``seeds`` and their ``spread``; ``table``; ``findings``, claim and comparison of each experiment;
-        ``verdicts``, the runs by how they compare with the recipe on all sets.
-    """
+    """Facts of the ablations: a table, and by experiment and as ``verdicts`` the comparison with the recipe."""
     sets = [key.removesuffix("/rate") for key in rows[0] if key.endswith("/rate")]
     recipe = [row for row in rows if row["experiment"] == "recipe"]
     others = [row for row in rows if row not in recipe]
