@@ -6,13 +6,18 @@ compares that call with a changed one. Everything speaks through the public cont
 
 from __future__ import annotations
 
+import copy
 import math
+import pickle
 import re
+import tempfile
 from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
 
+import pytest
 import torch
+from kornia.core.exceptions import ShapeError, TypeCheckError
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 from torch.nn.functional import pad
@@ -22,6 +27,7 @@ from kornia_pnpnet import PnPNet, PnPResult, Pose, PosePrior, RobustWeightedLM, 
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 
 CAMERAS, NOISES, FOCALS = ("pixels", "rig", "bearings"), ("none", "sigma", "covariance"), ("known", "unknown")
+PEERS = ("opencv-ransac", "kornia-rs", "poselib", "pycolmap")
 #: Sizes of the problems: of the batch, and of the pairs of each.
 BATCH, PAIRS = 5, 12
 #: Largest differences in entries of rotations and in translations relative to their length.
@@ -49,6 +55,10 @@ class Case(NamedTuple):
         return self.focal == "unknown" and self.camera != "pixels"
 
     @property
+    def is_peer(self) -> bool:
+        return self.solver in PEERS
+
+    @property
     def takes_any_n(self) -> bool:
         return "net-n" not in self.solver
 
@@ -63,7 +73,8 @@ def build(case: Case) -> PnPNet:
     """The solver of a case, without parameters that require a gradient."""
     options = {"max_samples": 30} if case.solver == "ransac-epnp-lm" else {}
     options |= {"radial": 1} if case.extra == "radial" else {}
-    return create_solver(case.solver, focal=case.focal, **options).to(case.dtype).requires_grad_(False)
+    options |= {} if case.is_peer else {"focal": case.focal}
+    return create_solver(case.solver, **options).to(case.dtype).requires_grad_(False)
 
 
 # --- problems ---------------------------------------------------------------------------------------------------------
@@ -78,8 +89,8 @@ def make(case: Case, batch: int = BATCH, seed: int = 0) -> tuple[Call, Pose]:
     n = PAIRS if case.takes_any_n else int(re.search(r"-n(\d+)", case.solver)[1])
     outliers = 0 if case.solver.startswith(("epnp", "reppnp", "identity", "net")) or case.focal == "unknown" else 1
     options = {"axis_ratio": 3.0, "known_noise": 1.0} if case.noise == "covariance" else {}
-    options |= {"n": n, "batch_size": batch, "seed": seed, "outliers": OutlierMix(count=outliers)}
-    p = SyntheticProblems(dtype=torch.float64, sigma_spread=0.5, **options).batch(0)
+    options |= {"batch_size": batch, "outliers": OutlierMix(count=outliers), "dtype": torch.float64}
+    p = SyntheticProblems(n=n, seed=seed, sigma_spread=0.5, **options).batch(0)
     generator = torch.Generator().manual_seed(seed)
     f = 700.0 + 50.0 * torch.arange(batch, dtype=torch.float64)
     size = (f / p.intrinsics[:, 0, 0])[:, None, None]
@@ -115,7 +126,7 @@ def make(case: Case, batch: int = BATCH, seed: int = 0) -> tuple[Call, Pose]:
     if case.extra == "confidence":
         call["confidence"] = 0.2 + 0.6 * torch.rand(batch, n, generator=generator, dtype=torch.float64)
     if case.focal == "unknown":
-        call["intrinsics"] = _with_focal(call["intrinsics"], 2.0)
+        call["intrinsics"][..., [0, 1], [0, 1]] *= 2.0
     return to(case.dtype, call), p.pose
 
 
@@ -126,10 +137,6 @@ def _apply(matrices: Tensor, vectors: Tensor) -> Tensor:
 def _near(pose: Pose, generator: torch.Generator) -> Pose:
     turn = axis_angle_to_rotation_matrix(0.02 * torch.randn(len(pose.rotation), 3, generator=generator).double())
     return Pose(turn @ pose.rotation, 1.01 * pose.translation)
-
-
-def _with_focal(intrinsics: Tensor, factor: float) -> Tensor:
-    return intrinsics * torch.tensor([[factor] * 2 + [1.0]] * 2 + [[1.0] * 3], dtype=intrinsics.dtype)
 
 
 def to(dtype: torch.dtype, tree: Any) -> Any:
@@ -205,15 +212,25 @@ def sound(case: Case) -> None:
         assert result.ok.double().mean() > 0.7
 
 
-def alone_is_in_batch(case: Case) -> None:
-    """A problem alone is that problem in a batch, and one problem needs no batch dimension."""
-    call, _ = make(case)
-    result = build(case)(**call)
+def batches_are_free(case: Case) -> None:
+    """A problem alone is that problem in a batch, and there may be any leading dimensions or none."""
+    call, truth = make(case)
+    solver = build(case)
+    result = solver(**call)
     at = int(result.ok.nonzero()[-1])
-    assert_near(build(case)(**take(slice(at, at + 1), call)), take(slice(at, at + 1), result))
-    single = build(case)(**take(at, call))
+    assert_near(solver(**take(slice(at, at + 1), call)), take(slice(at, at + 1), result))
+    single = solver(**take(at, call))
     assert single.matrix.shape == (4, 4)
     assert_near(take(None, single), take(slice(at, at + 1), result))
+    nested = pytree.tree_map(lambda x: x.unflatten(0, (1, BATCH, 1)), call)
+    cameras = (
+        nested
+        if case.camera != "pixels"
+        else {**nested, "intrinsics": to(case.dtype, truth).camera(call["intrinsics"])}
+    )
+    for same in (solver(**nested), solver(**cameras)):  # Kornia's cameras are one batch
+        assert same.matrix.shape == (1, BATCH, 1, 4, 4)
+        assert_equal(pytree.tree_map(lambda x: x.flatten(0, 2), same), result)
 
 
 def shuffled_is_ordered(case: Case) -> None:
@@ -365,6 +382,11 @@ def bad_problems_fail_alone(case: Case) -> None:
     for kind, ok in zip(kinds, result.ok[1::2].tolist(), strict=True):
         assert kind == "nan start" or not ok, kind
     assert all(x.isfinite().all() for x in _answers(case, result))
+    if not {"init", "prior"} & call.keys():
+        hopeless = build(case)(**{**call, "world_points": torch.full_like(call["world_points"], math.nan)})
+        assert torch.equal(hopeless.rotation, torch.eye(3, dtype=case.dtype).expand_as(hopeless.rotation))
+        assert not hopeless.ok.any()
+        assert not hopeless.weights.any()
 
 
 def bad_problems_have_no_gradient(case: Case) -> None:
@@ -397,9 +419,73 @@ def gradients_reach_the_inputs(case: Case) -> None:
         assert not there[~result.ok].any(), name
 
 
+def half_precision_is_converted(case: Case) -> None:
+    """Half precision is solved as full precision, also under autocast; each input has a gradient of its own dtype."""
+    cast = torch.bfloat16 if case.dtype == torch.float32 else torch.float16
+    call, _ = make(case)
+    halves = to(cast, call)
+    if case.dtype == torch.float64:  # one input of float64 is enough
+        halves["img_points"] = call["img_points"]
+    outcomes = []
+    for inputs, enabled in ((to(case.dtype, halves), False), (halves, True)):
+        leaves = pytree.tree_map(lambda x: x.detach().clone().requires_grad_(), inputs)
+        with torch.autocast("cpu", dtype=cast, enabled=enabled):
+            result = build(case)(**leaves)
+            loss = sum(x.sum() for x in floats(result) if x.requires_grad)
+        inputs, gradients = pytree.tree_leaves(leaves), []
+        if isinstance(loss, Tensor):
+            gradients = torch.autograd.grad(loss, inputs, materialize_grads=True)
+        outcomes.append((result, gradients))
+    (expected, full), (found, half) = outcomes
+    assert_equal(found, expected)
+    assert expected.rotation.dtype == case.dtype
+    for one, other, leaf in zip(half, full, inputs, strict=True) if full else ():
+        assert one.dtype == leaf.dtype
+        size = 4.0 * torch.finfo(cast).eps * other.abs().max().item()  # sums over the uses of an input
+        torch.testing.assert_close(one, other.to(leaf.dtype), rtol=0, atol=size)
+
+
+def copies_are_the_same(case: Case) -> None:
+    """Copied; pickled, and saved and loaded again, unless it is a sampler."""
+    call, _ = make(case)
+    solver = build(case)
+    copies = [copy.deepcopy(solver)]
+    if not case.is_ransac:
+        with tempfile.TemporaryDirectory() as folder:
+            solver.save_pretrained(folder)
+            copies += [pickle.loads(pickle.dumps(solver)), PnPNet.from_pretrained(folder).to(case.dtype)]
+    for copied in copies:
+        assert (copied.config(), copied.options) == (solver.config(), solver.options)
+        assert_equal(copied(**call), solver(**call))
+
+
+def wrong_arguments_are_refused(case: Case) -> None:
+    """With a typed error that names the argument."""
+    call, _ = make(case)
+    batch, n = call["world_points"].shape[:2]
+    call |= {"weights": torch.ones(batch, n), "mask": torch.ones(batch, n, dtype=torch.bool)}
+    leaves, spec = pytree.tree_flatten(call)
+    names = [name for name, value in call.items() for _ in pytree.tree_leaves(value)]
+    names[0] = "world_points|Shape mismatch"  # Kornia's check of a shape names no argument
+    wrong: list[tuple[Callable[[Tensor], Any], type[Exception]]] = [
+        (lambda x: x[:-1], ShapeError),
+        (lambda x: x[..., None], ShapeError),
+        (lambda x: x.cfloat(), TypeCheckError),
+        (lambda x: x.bool() if x.is_floating_point() else x.float(), TypeCheckError),
+        (lambda x: [1.0], TypeCheckError),
+    ]
+    for i, name in enumerate(names):
+        for spoil, error in wrong:
+            with pytest.raises(error, match=name):
+                build(case)(**pytree.tree_unflatten([*leaves[:i], spoil(leaves[i]), *leaves[i + 1 :]], spec))
+    two = of_pairs(lambda x: x[:, :2], call)
+    with pytest.raises(ShapeError, match=r"3 pairs.*2" if case.takes_any_n else "2"):
+        build(case)(**two)
+
+
 LAWS = (
     sound,
-    alone_is_in_batch,
+    batches_are_free,
     shuffled_is_ordered,
     padding_is_nothing,
     units_are_free,
@@ -407,6 +493,9 @@ LAWS = (
     bad_problems_fail_alone,
     bad_problems_have_no_gradient,
     gradients_reach_the_inputs,
+    half_precision_is_converted,
+    copies_are_the_same,
+    wrong_arguments_are_refused,
 )
 
 
@@ -416,6 +505,8 @@ def applies(law: Callable[[Case], None], case: Case) -> bool:
     Samplers see the places of the pairs. A first guess alone may come from a sample, which is a constant, and a network
     of a fixed number of pairs makes nothing of fewer without a refinement.
     """
+    if case.is_peer:
+        return law in (batches_are_free, half_precision_is_converted, wrong_arguments_are_refused)
     if case.solver.startswith("net-"):
         return law not in (gradients_reach_the_inputs, padding_is_nothing)
     samples = case.is_ransac or (case.focal == "unknown" and case.solver != "pnpnet-set")

@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from jacobians import verified_derivative
+from helpers import verified_derivative
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from kornia.geometry.linalg import transform_points
 
