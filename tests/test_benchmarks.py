@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import importlib
 import itertools
 import json
@@ -13,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers import reprojection_errors
 from torch import nn
 
 from kornia_pnpnet import create_solver, pose_covariance, pose_errors
@@ -23,13 +23,18 @@ from kornia_pnpnet.evaluation.bounds import KnownInliersAndNoise
 FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"
 SOLVERS = ("epnp", "p3p-ransac:max_samples=50", "opencv-epnp", "poselib")
 sys.path.insert(0, str(FOLDER))  # the benchmarks are scripts and import each other
-contenders, gpu, harness, page, performance, process, benchmark, startup, tasks, timing, uncertainty = map(
-    importlib.import_module,
-    (
-        *("contenders", "gpu", "harness", "page", "performance", "process", "solvers", "startup", "tasks"),
-        *("timing", "uncertainty"),
-    ),
+NAMES = ("contenders", "gpu", "harness", "page", "performance", "process", "solvers", "startup", "tasks", "timing")
+contenders, gpu, harness, page, performance, process, benchmark, startup, tasks, timing = (
+    importlib.import_module(name) for name in NAMES
 )
+
+
+@pytest.fixture
+def script(request):
+    """The script that the test's parameter ``name`` names, and the packages of its peers are there."""
+    for module in ("cv2", "poselib", "pycolmap"):
+        pytest.importorskip(module)
+    return importlib.import_module(request.param)
 
 
 # -- solvers.py --------------------------------------------------------------------------------------------------------
@@ -48,10 +53,6 @@ def written(tmp_path_factory):
     return json.loads(path.read_text())
 
 
-def solver_row(solver, rounds, name="n = 9, 3 outliers"):
-    return {"solver": solver, "set": name, **harness.summary(rounds)}
-
-
 def test_every_solver_has_a_row_for_every_set_it_solves(written):
     rows = {(row["solver"], row["set"]): row for row in written["rows"]}
     small = {name for name, (n, _) in benchmark.SETS.items() if n == benchmark.SMALL}
@@ -65,16 +66,10 @@ def test_every_solver_has_a_row_for_every_set_it_solves(written):
     assert pairs == {(*names, name) for name in small for names in (("epnp", "opencv-epnp"), (SOLVERS[1], "poselib"))}
 
 
-def test_memory_is_the_largest_peak_of_processes_of_their_own(written, monkeypatch):
+def test_memory_is_the_peak_of_a_process_of_its_own(written):
     (memory,) = written["memory"]
     (run,) = memory["runs"]
     assert memory["peak_bytes"] == run["peak_bytes"] > run["imports_bytes"] > 2**26  # PyTorch alone is more
-    runs = iter([{"imports_bytes": 2**20, "peak_bytes": peak} for peak in (2**21, 2**20)])
-    monkeypatch.setattr(benchmark, "MEMORY_RUNS", 2)
-    monkeypatch.setattr(benchmark, "MEMORY_TARGET", 2**20 + 1)
-    monkeypatch.setattr(harness, "run_child", lambda *_: next(runs))
-    memory = benchmark.measure_memory("p3p-ransac", 5)
-    assert (memory["peak_bytes"], memory["met"]) == (2**21, False)
 
 
 def test_a_child_that_fails_stops_the_measurement(tmp_path):
@@ -84,15 +79,14 @@ def test_a_child_that_fails_stops_the_measurement(tmp_path):
 
 
 def test_a_speedup_is_the_median_over_rounds_of_the_ratio_on_the_same_set():
-    rows = [solver_row("epnp:x=1", [10.0, 10.0, 20.0]), solver_row("opencv-epnp", [30.0, 90.0, 20.0])]
-    (entry,) = benchmark.speedups([*rows, solver_row("poselib", [1.0, 1.0, 1.0])])
-    assert entry["ratio"] == 3.0
-    assert entry["met"]
-    rows[0]["rounds_us"] = [10.1, 10.0, 20.0]
-    (entry,) = benchmark.speedups(rows)
-    assert not entry["met"]
-    elsewhere = solver_row("opencv-epnp", [9.0], "n = 9, no outliers")
-    assert benchmark.speedups([solver_row("epnp", [1.0]), elsewhere]) == []
+    def row(solver, *rounds, name="n = 9, 3 outliers"):
+        return {"solver": solver, "set": name, **harness.summary(rounds)}
+
+    theirs = [row("opencv-epnp", 30.0, 90.0, 20.0), row("poselib", 1.0, 1.0, 1.0)]
+    for first, ratio, met in ((10.0, 3.0, True), (10.1, pytest.approx(2.97, abs=0.01), False)):
+        (entry,) = benchmark.speedups([row("epnp:x=1", first, 10.0, 20.0), *theirs])
+        assert (entry["ratio"], entry["met"]) == (ratio, met)
+    assert benchmark.speedups([row("epnp", 1.0), row("opencv-epnp", 9.0, name="n = 9, no outliers")]) == []
 
 
 def test_peers_are_timed_without_our_adapter(make_problems):
@@ -128,23 +122,6 @@ def test_threads_are_set_and_restored_after_an_error():
     with pytest.raises(KeyError):
         interrupted()
     assert (torch.get_num_threads(), cv2.getNumThreads()) == before
-
-
-def test_timers_take_turns_and_no_garbage_is_collected_meanwhile():
-    order = []
-
-    def timer(name):
-        return lambda: order.append((name, gc.isenabled())) or float(len(order))
-
-    found = harness.in_turns({"a": timer("a"), "b": timer("b")}, 2)
-    assert order == [("a", False), ("b", False), ("a", False), ("b", False)]
-    assert found == {"a": [1.0, 3.0], "b": [2.0, 4.0]}
-    assert gc.isenabled()
-
-
-def test_a_target_is_met_at_its_limit():
-    for measured, at_most, met in ((2.0, True, True), (2.1, True, False), (2.1, False, True), (1.9, False, False)):
-        assert harness.target("x", measured, 2.0, unit="s", at_most=at_most)["met"] == met
 
 
 # -- contenders --------------------------------------------------------------------------------------------------------
@@ -244,37 +221,14 @@ def test_throughput_has_a_row_for_every_point(measured):
     assert results["skipped"] == []
 
 
-def test_loops_are_cut_and_long_calls_left_out():
-    problems = contenders.draw(9, 40)
-
-    def fake(loops, each):
-        class Fake(tasks.Contender):
-            def task(self, problems, *, backward=False):
-                task = tasks.Task(lambda: None, lambda: problems.pose, problems)
-                task.seconds = lambda times=1: each * len(problems.world_points)
-                return task
-
-        Fake.loops = loops
-        return Fake()
-
-    few = contenders.FULL._replace(loop_s=0.3, call_s=1.0)
-    task, count, once = timing.ready(fake(True, 0.01), problems, few, backward=False, known=None)
-    assert (count, len(task.problems.world_points)) == (30, 30)
-    assert once == pytest.approx(0.3)
-    assert timing.ready(fake(False, 0.01), problems, few, backward=False, known=None)[1] == 40
-    with pytest.raises(tasks.CannotBeTimedError, match="about 4 s"):
-        timing.ready(fake(False, 0.1), problems, few, backward=False, known=0.1)
-
-
-def a_time(contender, rounds, mode="forward", **more):
-    row = {"contender": contender, "threads": 1, "mode": mode, "n": 9, "batch": 1000}
-    return {**row, **harness.summary(rounds), **more}
-
-
 def test_targets_of_throughput():
-    rows = [a_time("refinement compiled", [2.0, 3.0, 4.0]), a_time("pnpnet-n9 compiled", [9.0, 8.5, 8.1])]
-    rows += [a_time("opencv-ransac", [180.0, 170.0, 162.0]), a_time("poselib", [60.0, 60.0, 60.0])]
-    rows += [a_time("poselib", [1.0], threads=2), a_time("opencv-ransac", [1.0], batch=10)]
+    def row(contender, *rounds, **more):
+        place = {"contender": contender, "threads": 1, "mode": "forward", "n": 9, "batch": 1000}
+        return {**place, **harness.summary(rounds), **more}
+
+    rows = [row("refinement compiled", 2.0, 3.0, 4.0), row("pnpnet-n9 compiled", 9.0, 8.5, 8.1)]
+    rows += [row("opencv-ransac", 180.0, 170.0, 162.0), row("poselib", 60.0, 60.0, 60.0)]
+    rows += [row("poselib", 1.0, threads=2), row("opencv-ransac", 1.0, batch=10)]
     found = [(entry["measured"], entry["target"], entry["met"]) for entry in timing.throughput_targets(rows)]
     assert found == [
         (3.0, 3.0, True),  # the refinement in µs
@@ -296,29 +250,6 @@ def test_latency_keeps_the_distribution(measured):
         assert row["success"]["total"] == row["calls"]
 
 
-def test_calls_come_in_turns_of_which_the_first_is_not_timed():
-    order = []
-
-    def task(name, index):
-        found = type("Fake", (), {})()
-        found.seconds = lambda: order.append((name, index)) or 1e-6
-        return found
-
-    fakes = {name: [task(name, index) for index in range(count)] for name, count in (("a", 100), ("b", 1))}
-    times = timing.latencies(fakes)
-    assert {name: len(values) for name, values in times.items()} == {"a": 100, "b": 1}
-    turn = order.index(("b", 0))
-    assert order[:3] == [("a", 0), ("a", 0), ("a", 1)]
-    assert order[turn : turn + 4] == [("b", 0), ("b", 0), ("a", turn - 1), ("a", turn - 1)]
-
-
-def test_targets_of_latency():
-    row = {"contender": "pnpnet-n9", "threads": 1, "median_us": 3000.0, "p99_us": 6001.0}
-    median, tail = timing.latency_targets([row, {**row, "threads": 2}, {**row, "contender": "epnp-lm"}])
-    assert (median["measured"], median["met"]) == (3.0, True)
-    assert not tail["met"]
-
-
 def test_a_large_call_shows_in_the_memory_of_its_process():
     request = {"contender": "refinement", "backward": True, "batches": [2], "memory_batch": 5000}
     found = harness.run_child(FOLDER / "process.py", json.dumps(request), OMP_NUM_THREADS="1")
@@ -334,18 +265,11 @@ def test_compiled_contenders_start_with_an_empty_and_with_a_filled_cache(monkeyp
         request, folder = json.loads(text), Path(environment["TORCHINDUCTOR_CACHE_DIR"])
         caches.append((request["memory_batch"], len(list(folder.iterdir()))))
         (folder / "code").touch()
-        calls = [{"batch": batch, "first_s": 4.0 if len(caches) == 1 else 1.0} for batch in request["batches"]]
-        return {**request, "make_s": 1.0, "calls": calls, "memory": None, "warnings": []}
+        return {**request, "warnings": []}
 
     monkeypatch.setattr(startup, "run_child", fake)
-    request = {"contender": startup.COMPILED, "backward": False, "memory_batch": 7}
-    starts = startup.start(request, contenders.FULL)
+    startup.start({"contender": startup.COMPILED, "backward": False, "memory_batch": 7}, contenders.FULL)
     assert caches == [(0, 0), (7, 1)]
-    imports, cold, cached = startup.targets(starts, [0.3, 0.2, 0.9])
-    assert (imports["measured"], imports["met"]) == (0.3, True)
-    assert (cold["measured"], cached["measured"]) == (5.0, 2.0)
-    starts[0]["warnings"] = ["There is no compiler"]
-    assert startup.targets(starts, []) == []
 
 
 # -- gpu.py ------------------------------------------------------------------------------------------------------------
@@ -380,44 +304,57 @@ def test_the_measurements_for_a_gpu_run_on_a_cpu(tmp_path, monkeypatch):
     assert json.loads(path.read_text())["throughput"]["rows"] == results["throughput"]
 
 
-# -- uncertainty.py ----------------------------------------------------------------------------------------------------
+# -- uncertainty.py and cameras.py -------------------------------------------------------------------------------------
+
+uncertain = pytest.mark.parametrize("script", ["uncertainty"], indirect=True)
 
 
-def test_covariances_bring_errors_close_to_the_bound(monkeypatch):
-    for module in ("cv2", "poselib"):
-        pytest.importorskip(module)
-    monkeypatch.setattr(uncertainty, "SIZES", (30,))
-    monkeypatch.setattr(uncertainty, "SHARES", (0.3,))
-    for row in uncertainty.measure_errors(create_solver(uncertainty.SOLVER).double(), 500):
+@uncertain
+def test_covariances_bring_errors_close_to_the_bound(script, monkeypatch):
+    monkeypatch.setattr(script, "SIZES", (30,))
+    monkeypatch.setattr(script, "SHARES", (0.3,))
+    for row in script.measure_errors(create_solver(script.SOLVER).double(), 500):
         assert all(0.9 < error < 1.1 for error in row["covariances"]), row
-        assert all(error > 1.3 for name in ("nothing", *uncertainty.PEERS) for error in row[name]), row
+        assert all(error > 1.3 for name in ("nothing", *script.PEERS) for error in row[name]), row
 
 
+@uncertain
 @pytest.mark.parametrize("turned", [False, True])
-def test_covariances_of_uncertain_pnp_are_those_of_its_noise(turned):
-    problems = uncertainty.uncertain_pnp(50, 0.3, 1500, turned=turned, seed=1)
+def test_covariances_of_uncertain_pnp_are_those_of_its_noise(script, turned):
+    problems = script.uncertain_pnp(50, 0.3, 1500, turned=turned, seed=1)
     assert ((~problems.inliers).sum(1) == 15).all()
     best = KnownInliersAndNoise().solve_with_truth(problems)
     covariance = pose_covariance(best.pose, *problems[:3], **problems.known, weights=problems.inliers.double())
-    assert uncertainty.squared_errors(best, problems, covariance).mean().item() == pytest.approx(6.0, rel=0.1)
+    assert script.squared_errors(best, problems, covariance).mean().item() == pytest.approx(6.0, rel=0.1)
 
 
-def test_covariances_of_poses_are_right(monkeypatch):
-    monkeypatch.setattr(uncertainty, "CREDIBLE", ((20, 0), (50, 25)))
-    for row in uncertainty.measure_credibility(create_solver(uncertainty.SOLVER).double(), 1500)[:4]:
+@uncertain
+def test_covariances_of_poses_are_right(script, monkeypatch):
+    monkeypatch.setattr(script, "CREDIBLE", ((20, 0), (50, 25)))
+    for row in script.measure_credibility(create_solver(script.SOLVER).double(), 1500)[:4]:
         assert 5.6 < row["mean"] < 6.4, row
         assert 0.935 < row["below"] < 0.97, row
+
+
+@pytest.mark.parametrize("script", ["cameras"], indirect=True)
+def test_cameras_are_measured_beside_the_peers(script, monkeypatch):
+    for name, value in (("RIGS", (3,)), ("BASELINES", (0.1,)), ("FEW", 8)):
+        monkeypatch.setattr(script, name, value)
+    found = {row["solver"]: row for row in script.measure_focal(32, (12,), (0.25,))}
+    assert set(found) == {*script.OURS, "pycolmap", "opencv, 21 focals", "oracle"}
+    rigs = script.measure_rigs(32, ((12, 0.25),))
+    assert len(rigs) == 4
+    assert all(row["success"] > 0.9 for row in (*rigs, *found.values()) if not row["solver"].startswith("opencv"))
+    assert all(row["median_focal"] < 0.01 for row in script.measure_cell(4, 100))
 
 
 # -- the pages ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["cameras", "solvers", "uncertainty"])
-def test_pages_are_written_from_their_files(name):
-    for module in ("cv2", "poselib", "pycolmap"):
-        pytest.importorskip(module)
-    results = json.loads((FOLDER / f"{name}.json").read_text())
-    assert importlib.import_module(name).page(results) == (FOLDER / f"{name}.md").read_text(encoding="utf-8")
+@pytest.mark.parametrize("script", ["cameras", "solvers", "uncertainty"], indirect=True)
+def test_pages_are_written_from_their_files(script):
+    results = json.loads((FOLDER / f"{script.__name__}.json").read_text())
+    assert script.page(results) == (FOLDER / f"{script.__name__}.md").read_text(encoding="utf-8")
 
 
 def test_the_page_of_performance_is_written_from_its_files():
@@ -434,16 +371,10 @@ def write_matches(path, seed):
     counts, each = (4, 32), 6
     options = {"n": 40, "batch_size": each, "seed": seed, "world_sigma": 0.0, "dtype": torch.float64}
     parts = [SyntheticProblems(outliers=OutlierMix(count=count), **options).batch(0) for count in counts]
-    world, pixels, intrinsics, pose, inliers = (
-        map_tensors(lambda *x: torch.cat(x), *column)
-        for column in zip(
-            *((p.world_points, p.img_points, p.intrinsics, p.pose, p.inliers) for p in parts), strict=True
-        )
-    )
-    camera = (world @ pose.rotation.mT + pose.translation[:, None]) @ intrinsics.mT
-    arrays = {"world": world, "pixels": pixels, "ratio": torch.where(inliers, 0.5, 0.9), "mask": inliers | True}
-    arrays |= {"K": intrinsics, "R": pose.rotation, "t": pose.translation}
-    arrays["error_px"] = (camera[..., :2] / camera[..., 2:] - pixels).norm(dim=-1)
+    p = map_tensors(lambda *x: torch.cat(x), *parts)
+    arrays = {"world": p.world_points, "pixels": p.img_points, "mask": p.inliers | True, "K": p.intrinsics}
+    arrays |= {"ratio": torch.where(p.inliers, 0.5, 0.9), "R": p.pose.rotation, "t": p.pose.translation}
+    arrays["error_px"] = reprojection_errors(p, p.pose).norm(dim=-1)
     arrays["kind"] = torch.arange(len(counts)).repeat_interleave(each)
     np.savez_compressed(path, **{name: value.numpy() for name, value in arrays.items()})
 
@@ -510,26 +441,3 @@ def test_keypoints_are_measured_where_they_were_not_seen(tmp_path, monkeypatch):
         for key, (mean, low, high) in rows["confidence=fitted"]["less"][base].items():
             assert low <= mean <= high
             assert mean == pytest.approx(rows["confidence=fitted"][key] - rows[base][key])
-
-
-# -- cameras.py --------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def cameras():
-    for module in ("cv2", "poselib", "pycolmap"):
-        pytest.importorskip(module)
-    return importlib.import_module("cameras")
-
-
-def test_cameras_are_measured_beside_the_peers(cameras, monkeypatch):
-    for name, value in (("RIGS", (3,)), ("BASELINES", (0.1,)), ("FEW", 8)):
-        monkeypatch.setattr(cameras, name, value)
-    found = {row["solver"]: row for row in cameras.measure_focal(32, (12,), (0.25,))}
-    assert set(found) == {*cameras.OURS, "pycolmap", "opencv, 21 focals", "oracle"}
-    assert all(row["success"] > 0.9 for name, row in found.items() if not name.startswith("opencv"))
-    rigs = cameras.measure_rigs(32, ((12, 0.25),))
-    assert all(row["success"] > 0.9 for row in rigs)
-    assert len(rigs) == 4
-    cell = cameras.measure_cell(4, 100)
-    assert all(row["median_focal"] < 0.01 for row in cell)
