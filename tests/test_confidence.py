@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
+from helpers import rate
 
-from kornia_pnpnet import create_solver, pose_errors, success
+from kornia_pnpnet import create_solver, pose_errors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 
 
@@ -29,32 +30,25 @@ def test_fitted_confidences_find_poses_among_many_outliers(generator):
     rates = {}
     for name, confidence in {"none": None, "raw": 1.0 - scores, "fitted": fitted}.items():
         with torch.no_grad():
-            errors = pose_errors(solver(*problems[:3], confidence=confidence).pose, problems.pose)
-        rates[name] = success(errors, max_translation=0.5).double().mean().item()
+            rates[name] = rate(solver(*problems[:3], confidence=confidence), problems, max_translation=0.5)
     assert rates["fitted"] > rates["none"] + 0.15, rates
     assert rates["fitted"] > rates["raw"] + 0.05, rates
 
 
-def keypoints(power, generator, batch=500, n=11):
-    """Keypoints as a network finds them: less accurate (``power``) and more often wrong where it is less confident."""
-    problems = SyntheticProblems(n=n, batch_size=batch, seed=31, img_sigma=0.0, world_sigma=0.0).batch(0)
-    confidence = torch.rand(batch, n, generator=generator) ** 0.4
-    sigma = confidence.clamp(min=0.05) ** -power
-    pixels = problems.img_points + sigma[..., None] * torch.randn(batch, n, 2, generator=generator)
-    elsewhere = pixels.roll(1, 1) + 50.0 * torch.randn(batch, n, 2, generator=generator)
-    inliers = torch.rand(batch, n, generator=generator) < 0.98 * confidence.sqrt()
-    return problems._replace(img_points=torch.where(inliers[..., None], pixels, elsewhere), inliers=inliers), confidence
-
-
 @pytest.mark.parametrize("power", [0.0, 1.5, 3.0])
 def test_confidence_is_at_least_as_good_as_weights_made_of_it(power, generator):
-    problems, confidence = keypoints(power, generator)
-    solver, given = create_solver("pnpnet-set"), problems[:3]
-    options = {"confidence": {"confidence": confidence}, "weights": {"weights": confidence**6}, "nothing": {}}
+    """Keypoints as a network finds them: less accurate (``power``) and more often wrong where it is less confident."""
+    problems = SyntheticProblems(n=11, batch_size=500, seed=31, img_sigma=0.0, world_sigma=0.0).batch(0)
+    confidence = torch.rand(500, 11, generator=generator) ** 0.4
+    noise = torch.randn(2, 500, 11, 2, generator=generator)
+    pixels = problems.img_points + confidence.clamp(min=0.05)[..., None] ** -power * noise[0]
+    elsewhere = problems.img_points.roll(1, 1) + 50.0 * noise[1]
+    inliers = torch.rand(500, 11, generator=generator) < 0.98 * confidence.sqrt()
+    pixels = torch.where(inliers[..., None], pixels, elsewhere)
     errors = {}
-    with torch.no_grad():
-        for name, option in options.items():
-            rotation, _ = pose_errors(solver(*given, **option).pose, problems.pose)
-            errors[name] = rotation.clamp(max=10.0).mean()
+    for name, values in {"confidence": confidence, "weights": confidence**6, "mask": inliers | True}.items():
+        with torch.no_grad():
+            found = create_solver("pnpnet-set")(problems[0], pixels, problems[2], **{name: values})
+        errors[name] = pose_errors(found.pose, problems.pose).rotation_error_deg.clamp(max=10.0).mean()
     assert errors["confidence"] < errors["weights"]
-    assert errors["confidence"] < (0.75 if power == 3.0 else 1.02) * errors["nothing"]
+    assert errors["confidence"] < (0.75 if power == 3.0 else 1.02) * errors["mask"]

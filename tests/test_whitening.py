@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+from helpers import assert_same
 from kornia.core.exceptions import ValueCheckError
 from kornia.geometry.conversions import convert_points_from_homogeneous
 from kornia.geometry.liegroup import So3
@@ -91,21 +92,20 @@ def test_poses_covariances_and_weights_are_those_of_a_dense_solver():
 
 @pytest.mark.parametrize("name", ["epnp-lm", "pnpnet-n9", "p3p-ransac"])
 def test_an_isotropic_covariance_is_a_sigma(name, make_problems):
+    """Results and gradients."""
     p = make_problems(batch=20, outliers=1)
-    solver = create_solver(name).double()
+    solver, found = create_solver(name).double(), []
     sigma = torch.linspace(10.0, 30.0, 180, dtype=DOUBLE).view(20, 9)
-    by_sigma, by_cov = p.img_points.clone().requires_grad_(), p.img_points.clone().requires_grad_()
-    given = solver(p.world_points, by_sigma, p.intrinsics, img_sigma=sigma, world_sigma=0.0)
-    same = solver(p.world_points, by_cov, p.intrinsics, img_cov=isotropic(sigma, 2), world_sigma=0.0)
+    for noise in ({"img_sigma": sigma}, {"img_cov": isotropic(sigma, 2)}):
+        leaf = p.img_points.clone().requires_grad_()
+        result = solver(p.world_points, leaf, p.intrinsics, world_sigma=0.0, **noise)
+        total = result.rotation[..., 0].sum() + result.weights.sum()
+        found.append((result, torch.autograd.grad(total, leaf)[0]))
+    (given, by_sigma), (same, by_cov) = found
     assert given.ok.double().mean() > 0.5
     assert torch.equal(given.ok, same.ok)
-    for ours, other in zip(given[:4], same[:4], strict=True):
-        torch.testing.assert_close(other[given.ok], ours[given.ok], rtol=1e-6, atol=1e-7)
-    for result in (given, same):
-        if result.rotation.requires_grad:
-            (result.rotation[..., 0].sum() + result.weights.sum()).backward()
-    if by_sigma.grad is not None:
-        torch.testing.assert_close(by_cov.grad, by_sigma.grad, rtol=1e-4, atol=1e-7)
+    assert_same([x[given.ok] for x in same[:4]], [x[given.ok] for x in given[:4]], 1e-6, 1e-7)
+    assert_same(by_cov, by_sigma, 1e-4, 1e-7)
 
 
 # -- bad covariances -----------------------------------------------------------------------------------------------
