@@ -15,10 +15,9 @@ import torch
 from helpers import reprojection_errors
 from torch import nn
 
-from kornia_pnpnet import create_solver, pose_covariance, pose_errors
+from kornia_pnpnet import create_solver
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
-from kornia_pnpnet.evaluation.bounds import KnownInliersAndNoise
 
 FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"
 SOLVERS = ("epnp", "p3p-ransac:max_samples=50", "opencv-epnp", "poselib")
@@ -46,10 +45,8 @@ def written(tmp_path_factory):
     for module in ("cv2", "poselib"):
         pytest.importorskip(module)
     path = tmp_path_factory.mktemp("benchmark") / "solvers.json"
-    sizes = ("--count", "20", "--repeats", "3", "--memory-count", "20")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(benchmark, "MEMORY_RUNS", 1)
-        benchmark.main(["--out", str(path), *sizes, "--solvers", *SOLVERS])
+    sizes = ("--count", "20", "--repeats", "3", "--memory-count", "0")
+    benchmark.main(["--out", str(path), *sizes, "--solvers", *SOLVERS])
     return json.loads(path.read_text())
 
 
@@ -64,12 +61,6 @@ def test_every_solver_has_a_row_for_every_set_it_solves(written):
     assert rows["opencv-epnp", "n = 9, 3 outliers"]["success"]["rate"] < 0.2
     pairs = {(entry["solver"], entry["peer"], entry["set"]) for entry in written["speedups"]}
     assert pairs == {(*names, name) for name in small for names in (("epnp", "opencv-epnp"), (SOLVERS[1], "poselib"))}
-
-
-def test_memory_is_the_peak_of_a_process_of_its_own(written):
-    (memory,) = written["memory"]
-    (run,) = memory["runs"]
-    assert memory["peak_bytes"] == run["peak_bytes"] > run["imports_bytes"] > 2**26  # PyTorch alone is more
 
 
 def test_a_child_that_fails_stops_the_measurement(tmp_path):
@@ -107,35 +98,7 @@ def test_missing_packages_are_skipped_with_a_reason(monkeypatch):
     assert results["speedups"] == results["memory"] == []
 
 
-# -- what the benchmarks share -----------------------------------------------------------------------------------------
-
-
-def test_threads_are_set_and_restored_after_an_error():
-    cv2 = pytest.importorskip("cv2")
-    before = torch.get_num_threads(), cv2.getNumThreads()
-
-    def interrupted():
-        with harness.threads():
-            assert (torch.get_num_threads(), cv2.getNumThreads()) == (1, 1)
-            raise KeyError
-
-    with pytest.raises(KeyError):
-        interrupted()
-    assert (torch.get_num_threads(), cv2.getNumThreads()) == before
-
-
 # -- contenders --------------------------------------------------------------------------------------------------------
-
-
-def test_the_coarse_pose_has_the_stated_error(make_problems):
-    problems = make_problems(n=9, batch=50)
-    coarse = tasks.coarse_pose(problems)
-    angles = pose_errors(coarse, problems.pose).rotation_error_deg
-    torch.testing.assert_close(angles, torch.full_like(angles, tasks.COARSE_ANGLE_DEG), atol=1e-4, rtol=0)
-    centre = problems.world_points.mean(1)[..., None]
-    true, moved = (pose.rotation @ centre + pose.translation[..., None] for pose in (problems.pose, coarse))
-    share = ((moved - true).norm(dim=1) / true.norm(dim=1))[:, 0]
-    torch.testing.assert_close(share, torch.full_like(share, tasks.COARSE_SHIFT))
 
 
 # Exporting takes minutes.
@@ -234,13 +197,9 @@ def test_targets_of_throughput():
     rows = [row("refinement compiled", 2.0, 3.0, 4.0), row("pnpnet-n9 compiled", 9.0, 8.5, 8.1)]
     rows += [row("opencv-ransac", 180.0, 170.0, 162.0), row("poselib", 60.0, 60.0, 60.0)]
     rows += [row("poselib", 1.0, threads=2), row("opencv-ransac", 1.0, batch=10)]
-    found = [(entry["measured"], entry["target"], entry["met"]) for entry in timing.throughput_targets(rows)]
-    assert found == [
-        (3.0, 3.0, True),  # the refinement in µs
-        (8.5, 8.0, False),  # the solver in µs
-        (20.0, 20.0, True),  # against OpenCV
-        (pytest.approx(60 / 8.5), 10.0, False),  # against PoseLib
-    ]
+    found = [(round(x["measured"], 2), x["target"], x["met"]) for x in timing.throughput_targets(rows)]
+    # The refinement and the solver in µs, and the solver against OpenCV and PoseLib.
+    assert found == [(3.0, 3.0, True), (8.5, 8.0, False), (20.0, 20.0, True), (7.06, 10.0, False)]
 
 
 def test_a_large_call_shows_in_the_memory_of_its_process():
@@ -249,20 +208,6 @@ def test_a_large_call_shows_in_the_memory_of_its_process():
     memory = found["memory"]
     assert memory["peak_bytes"] - memory["before_bytes"] > 5000 * 9 * 5 * 4  # the gradients alone
     assert min(found["torch_s"], found["package_s"], found["make_s"]) > 0
-
-
-def test_compiled_contenders_start_with_an_empty_and_with_a_filled_cache(monkeypatch):
-    caches = []
-
-    def fake(script, text, **environment):
-        request, folder = json.loads(text), Path(environment["TORCHINDUCTOR_CACHE_DIR"])
-        caches.append((request["memory_batch"], len(list(folder.iterdir()))))
-        (folder / "code").touch()
-        return {**request, "warnings": []}
-
-    monkeypatch.setattr(startup, "run_child", fake)
-    startup.start({"contender": startup.COMPILED, "backward": False, "memory_batch": 7}, contenders.FULL)
-    assert caches == [(0, 0), (7, 1)]
 
 
 # -- gpu.py ------------------------------------------------------------------------------------------------------------
@@ -282,8 +227,7 @@ def test_the_measurements_for_a_gpu_run_on_a_cpu(tmp_path, monkeypatch):
     assert {"pnpnet-n9", "pnpnet-set", "p3p-ransac", "epnp"} <= {row["solver"] for row in results["parity"]}
     for row in results["parity"]:  # the device is the CPU
         assert row["same_ok"] == 1.0
-        assert row["same_pose"] in (1.0, None)
-        assert row["same_gradient"] in (1.0, None)
+        assert {row["same_pose"], row["same_gradient"]} <= {1.0, None}
         assert row["success"][0] == row["success"][1]
     (row,) = results["graphs"]
     assert row["modes"]["compiled"]["rotation_difference"] < 1e-6
@@ -291,7 +235,6 @@ def test_the_measurements_for_a_gpu_run_on_a_cpu(tmp_path, monkeypatch):
     *ours, loop = results["throughput"]
     points = [(row["contender"], row["mode"], row["batch"]) for row in ours]
     assert points == list(itertools.product(gpu.QUICK.contenders, ("forward", "forward+backward"), few.batches))
-    assert all(0 < row["work"]["least_bytes"] < row["work"]["bytes"] for row in ours)
     assert (loop["contender"], loop["batch"]) == ("opencv-ransac", few.batches[0])
     gpu.main([*to_file, "--parts", "graphs"], few._replace(modes=("captured",)))  # the others stay
     assert json.loads(path.read_text())["throughput"]["rows"] == results["throughput"]
@@ -299,32 +242,16 @@ def test_the_measurements_for_a_gpu_run_on_a_cpu(tmp_path, monkeypatch):
 
 # -- uncertainty.py and cameras.py -------------------------------------------------------------------------------------
 
-uncertain = pytest.mark.parametrize("script", ["uncertainty"], indirect=True)
 
-
-@uncertain
-def test_covariances_bring_errors_close_to_the_bound(script, monkeypatch):
-    monkeypatch.setattr(script, "SIZES", (30,))
-    monkeypatch.setattr(script, "SHARES", (0.3,))
-    for row in script.measure_errors(create_solver(script.SOLVER).double(), 500):
+@pytest.mark.parametrize("script", ["uncertainty"], indirect=True)
+def test_covariances_are_right_and_bring_errors_close_to_the_bound(script, monkeypatch):
+    for name, value in (("SIZES", (30,)), ("SHARES", (0.3,)), ("CREDIBLE", ((20, 0), (50, 25)))):
+        monkeypatch.setattr(script, name, value)
+    solver = create_solver(script.SOLVER).double()
+    for row in script.measure_errors(solver, 500):
         assert all(0.9 < error < 1.1 for error in row["covariances"]), row
         assert all(error > 1.3 for name in ("nothing", *script.PEERS) for error in row[name]), row
-
-
-@uncertain
-@pytest.mark.parametrize("turned", [False, True])
-def test_covariances_of_uncertain_pnp_are_those_of_its_noise(script, turned):
-    problems = script.uncertain_pnp(50, 0.3, 1500, turned=turned, seed=1)
-    assert ((~problems.inliers).sum(1) == 15).all()
-    best = KnownInliersAndNoise().solve_with_truth(problems)
-    covariance = pose_covariance(best.pose, *problems[:3], **problems.known, weights=problems.inliers.double())
-    assert script.squared_errors(best, problems, covariance).mean().item() == pytest.approx(6.0, rel=0.1)
-
-
-@uncertain
-def test_covariances_of_poses_are_right(script, monkeypatch):
-    monkeypatch.setattr(script, "CREDIBLE", ((20, 0), (50, 25)))
-    for row in script.measure_credibility(create_solver(script.SOLVER).double(), 1500)[:4]:
+    for row in script.measure_credibility(solver, 1500)[:4]:
         assert 5.6 < row["mean"] < 6.4, row
         assert 0.935 < row["below"] < 0.97, row
 
@@ -376,17 +303,16 @@ def test_real_matches_are_measured_and_failures_drawn(tmp_path):
     pytest.importorskip("pandas")
     pytest.importorskip("poselib")
     real_matches = importlib.import_module("real_matches")
-    for seed, name in enumerate(("yard", "room")):
-        write_matches(tmp_path / f"{name}.npz", seed)
-    files = [str(tmp_path / f"{name}.npz") for name in ("yard", "room")]
+    files = [tmp_path / f"{name}.npz" for name in ("yard", "room")]
+    for seed, file in enumerate(files):
+        write_matches(file, seed)
     specs = ["p3p-ransac:max_samples=3", "p3p-ransac:threshold=8", "p3p-ransac:threshold=8+ratio", "known-inliers"]
     specs += ["poselib:threshold=8+ratio", "pnpnet-set+sigma"]
     out = tmp_path / "out.json"
-    more = ["--split", "made up", "--pictures", str(tmp_path), "--batch", "500", "1", "--solvers", *specs]
-    real_matches.main(["measure", *files, "--out", str(out), *more])
+    more = ["--split", "made up", "--pictures", tmp_path, "--batch", 500, 1, "--solvers", *specs]
+    real_matches.main([str(x) for x in ("measure", *files, "--out", out, *more)])
     results = json.loads(out.read_text())
     rows = {(row["solver"], row["kind"], row["group"], row["batch"]): row for row in results["rows"]}
-    assert results["settings"]["split"] == "made up"
     for kind, spec in itertools.product(real_matches.KINDS, specs):
         every = rows[spec, kind, "all", 500]
         assert every["count"] == 12
@@ -395,11 +321,8 @@ def test_real_matches_are_measured_and_failures_drawn(tmp_path):
         scenes = [rows[spec, kind, scene, 500]["success"] for scene in ("yard", "room")]
         assert sum(scenes) / 2 == pytest.approx(every["success"])  # the scenes are all problems
     assert rows[specs[0], real_matches.KINDS[1], "all", 500]["far"] > 0
-    assert {failure["scene"] for failure in results["failures"]} <= {"yard", "room"}
-    for failure in results["failures"]:
-        assert failure["right"] == 8
-        assert (tmp_path / failure["picture"]).stat().st_size > 0
-    assert sum(results["reliability"][specs[1]]["number"]) == 24
+    assert results["failures"]
+    assert all((tmp_path / failure["picture"]).stat().st_size > 0 for failure in results["failures"])
 
 
 # -- keypoints.py ------------------------------------------------------------------------------------------------------

@@ -21,9 +21,13 @@ def run(tmp_path, name, *arguments, results=None):
     return json.loads((tmp_path / f"{results or name}.json").read_text())
 
 
-@pytest.fixture
-def hall(monkeypatch):
+@pytest.fixture(autouse=True)
+def _examples(monkeypatch):
     monkeypatch.syspath_prepend(EXAMPLES)
+
+
+@pytest.fixture
+def hall():
     return pytest.importorskip("rendered_hall")
 
 
@@ -60,7 +64,6 @@ def test_queries_of_a_folder_and_a_model_are_localised(tmp_path, hall, reference
 def test_disk_and_lightglue_fit_the_localiser(monkeypatch):
     """An untrained network and a matcher of nearest neighbours, because the weights would be downloaded."""
     pytest.importorskip("sklearn")
-    monkeypatch.syspath_prepend(EXAMPLES)
     import localiser
     from kornia.feature import match_mnn
 
@@ -91,23 +94,16 @@ def test_priors_help_to_track_with_few_pairs(tmp_path, hall):
 
 
 @pytest.mark.slow
-def test_images_become_poses_end_to_end(tmp_path):
+def test_images_become_poses_end_to_end_and_networks_predict_each_kind_of_noise(tmp_path):
     """A few updates of it."""
-    arguments = ("--updates", 60, "--seeds", 1, "--batches", 1)
-    found = run(tmp_path, "keypoint_pipeline", *arguments)["seeds"]["0"]
+    few = ("--seeds", 1, "--batches", 1, "--updates", 60)
+    found = run(tmp_path, "keypoint_pipeline", *few)["seeds"]["0"]
     losses = found["keypoints first"]["curves"]["keypoint_loss"]
     assert losses[-1] < 0.9 * losses[0]
-    assert 0.0 < found["end to end"]["mean_distance"] <= 1.0
-
-
-@pytest.mark.slow
-def test_networks_predict_each_kind_of_noise(tmp_path):
-    """A few updates of it."""
-    arguments = ("--covariances", "--updates", 40, "--seeds", 1, "--batches", 1)
-    results = run(tmp_path, "keypoint_pipeline", *arguments, results="keypoint_covariances")
+    results = run(tmp_path, "keypoint_pipeline", *few, "--covariances", results="keypoint_covariances")
     _, *kinds = results["seeds"]["0"].values()
     assert len(kinds) == 3
-    assert all(0.0 < found["mean_distance"] <= 1.0 for found in kinds)
+    assert all(0.0 < x["mean_distance"] <= 1.0 for x in (found["end to end"], *kinds))
 
 
 @pytest.mark.slow
@@ -139,15 +135,13 @@ def test_the_tables_of_the_page_are_of_the_results():
         assert made["page"](name) == (EXAMPLES / name).read_text()
 
 
-def test_keypoints_are_visible_where_nothing_is_before_them(monkeypatch):
+def test_keypoints_are_visible_where_nothing_is_before_them():
     """The box alone: what shows is as near as the ray's hit with the box."""
-    monkeypatch.syspath_prepend(EXAMPLES)
     import keypoint_pipeline as pipeline
 
     pose = pipeline.draw(3, 0).pose
     eye = -(pose.translation[:, None] @ pose.rotation)
     rays = pipeline.KEYPOINTS - eye  # (B, 14, 3), hit the box first where they meet its slabs
-    near = ((-pipeline.HALF * rays.sign() - eye) / rays).amax(-1)
-    first = near > 1.0 - 1e-4
+    first = ((-pipeline.HALF * rays.sign() - eye) / rays).amax(-1) > 1.0 - 1e-4
     assert (first == pipeline.outside(pose)).all()
     assert 0 < first.sum() < first.numel()
