@@ -252,9 +252,9 @@ def padding_is_nothing(case: Case) -> None:
 
 
 def units_are_free(case: Case) -> None:
-    """World and pixels may count in any unit, together with all that is measured in it."""
+    """World, pixels and weights may count in any unit, together with all that is measured in it."""
     call, _ = make(case)
-    length, pixel = 1024.0, 0.25
+    length, pixel, weight = 1024.0, 0.25, 1e30 if case.dtype == torch.float64 else 1e6
     result = build(case)(**call)
     scale = torch.tensor([pixel, pixel, 1.0], dtype=case.dtype)[:, None]
     factors = {"world_points": length, "world_sigma": length, "world_cov": length**2}
@@ -270,9 +270,9 @@ def units_are_free(case: Case) -> None:
     if case.is_ransac:  # whose threshold is in pixels
         changed |= {name: x for name, x in call.items() if name.startswith("img") or name == "intrinsics"}
         scale = torch.ones_like(scale)
-    found = build(case)(**changed)
-    back = found._replace(translation=found.translation / length, intrinsics=found.intrinsics / scale)
-    assert_near(back, result)
+    found = build(case)(**changed, weights=torch.full_like(call["world_points"][..., 0], weight))
+    back = {"translation": found.translation / length, "intrinsics": found.intrinsics / scale}
+    assert_near(found._replace(**back, weights=found.weights / weight), result)
 
 
 def frames_are_free(case: Case) -> None:

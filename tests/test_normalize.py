@@ -84,19 +84,16 @@ def test_pairs_are_ordered_by_u_then_v_and_padding_is_last():
 @pytest.mark.parametrize("n", [3, 9, 50])
 def test_points_on_a_line_are_invalid(n, offset, dtype, generator):
     """Also where only two of the pairs are there; lines up to the rounding of the dtype."""
-    direction = torch.randn(20, 1, 3, generator=generator, dtype=DOUBLE)
+    direction, start = torch.randn(2, 20, 1, 3, generator=generator, dtype=DOUBLE)
     direction[:3, 0] = torch.eye(3, dtype=DOUBLE)
-    direction = direction / direction.norm(dim=-1, keepdim=True)
-    start = offset * torch.randn(20, 1, 3, generator=generator, dtype=DOUBLE)
     along = torch.rand(20, n, 1, generator=generator, dtype=DOUBLE)
+    line = along * torch.nn.functional.normalize(direction, dim=-1)
     pixels = torch.randn(20, n, 2, generator=generator, dtype=DOUBLE).to(dtype)
     K, two = torch.eye(3, dtype=dtype).expand(20, 3, 3), (torch.arange(n) < 2).expand(20, n)
+    anywhere = offset + torch.randn(20, n, 3, generator=generator, dtype=DOUBLE)
     for length in (1e-3, 1.0, 100.0):
-        _, frame = Normalize()((start + length * along * direction).to(dtype), pixels, K)
-        assert not frame.valid.any(), length
-        world = length * (offset + torch.randn(20, n, 3, generator=generator, dtype=DOUBLE))
-        _, frame = Normalize()(world.to(dtype), pixels, K, None, two)
-        assert not frame.valid.any(), length
+        for world, mask in ((offset * start + length * line, None), (length * anywhere, two)):
+            assert not Normalize()(world.to(dtype), pixels, K, None, mask)[1].valid.any(), length
 
 
 @both_dtypes
@@ -107,8 +104,7 @@ def test_points_off_a_line_are_valid(n, dtype, random_rotations, generator):
     pixels = torch.randn(20, n, 2, generator=generator, dtype=DOUBLE).to(dtype)
     K, turn = torch.eye(3, dtype=dtype).expand(20, 3, 3), random_rotations(20)
     shapes = [(1, 1, 1), (1, 1, 0), (1, 0.1, 0), (1, 1e-2, 0), (1, 1e-2, 1e-2)]
-    if dtype == DOUBLE:
-        shapes += [(1, 1e-3, 0), (1, 1e-6, 0)]
+    shapes += [(1, 1e-3, 0), (1, 1e-6, 0)] * (dtype == DOUBLE)
     for shape, offset, unit in itertools.product(shapes, (0.0, 10.0), (1e-3, 1.0, 1e3)):
         points = unit * ((world * torch.tensor(shape, dtype=DOUBLE)) @ turn.mT + offset)
         assert Normalize()(points.to(dtype), pixels, K)[1].valid.all(), (shape, offset, unit)

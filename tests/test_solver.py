@@ -168,41 +168,25 @@ def test_saving_and_loading_keeps_every_option_and_every_bit(solver, tmp_path, m
     assert_same(again(*p[:3]), solver(*p[:3]))
 
 
-DAMAGES = {
-    "truncated": lambda config, weights: weights.write_bytes(weights.read_bytes()[:-100]),
-    "empty": lambda config, weights: weights.write_bytes(b""),
-    "pickle": lambda config, weights: torch.save({"a": torch.zeros(1)}, weights),
-    "missing": lambda config, weights: weights.unlink(),
-    "foreign": lambda config, weights: save_file({"linear.weight": torch.zeros(2, 2)}, weights),
-    "not JSON": lambda config, weights: config.write_text("{n: 9"),
-    "no dictionary": lambda config, weights: config.write_text("[1, 2]"),
-    "not text": lambda config, weights: config.write_bytes(b"\xff\xfe\x00"),
-    "another configuration": lambda config, weights: config.write_text(config.read_text().replace("cauchy", "huber")),
-}
+DAMAGES = [
+    lambda config, weights: weights.write_bytes(weights.read_bytes()[:-100]),
+    lambda config, weights: weights.write_bytes(b""),
+    lambda config, weights: torch.save({"a": torch.zeros(1)}, weights),
+    lambda config, weights: weights.unlink(),
+    lambda config, weights: save_file({"linear.weight": torch.zeros(2, 2)}, weights),
+    lambda config, weights: config.write_text("{n: 9"),
+    lambda config, weights: config.write_text("[1, 2]"),
+    lambda config, weights: config.write_bytes(b"\xff\xfe\x00"),
+    lambda config, weights: config.write_text(config.read_text().replace("cauchy", "huber")),  # of other weights
+]
 
 
-@pytest.mark.parametrize("how", DAMAGES)
-def test_damaged_weights_raise_a_typed_error(how, tmp_path):
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damaged_weights_raise_a_typed_error(damage, tmp_path):
     saved_net().save_pretrained(tmp_path)
-    DAMAGES[how](tmp_path / "config.json", tmp_path / "model.safetensors")
+    damage(tmp_path / "config.json", tmp_path / "model.safetensors")
     with pytest.raises(ValueCheckError, match=r"\S"):
         PnPNet.from_pretrained(tmp_path)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"init": {"name": "MLPInit", "n": "six"}},
-        {"init": {"name": "Oracle"}},
-        {"refine": None},
-        {"refine": [1]},
-        {"refine": {"kernel": "tukey"}},
-        {"colour": "red"},
-    ],
-)
-def test_impossible_configurations_raise_a_typed_error(change):
-    with pytest.raises(BaseError):
-        PnPNet.from_config({**saved_net().config(), **change})
 
 
 def test_an_initialiser_of_ones_own(make_problems, tmp_path):
@@ -213,26 +197,30 @@ def test_an_initialiser_of_ones_own(make_problems, tmp_path):
 
     solver = PnPNet(Identity(), RobustWeightedLM(m=2))
     assert solver(*make_problems()[:3]).matrix.shape == (7, 4, 4)
-    assert solver.config()["init"] == {"name": "Identity"}
     with pytest.raises(ValueCheckError, match="Identity cannot be saved"):
         solver.save_pretrained(tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
-    ("name", "options", "message"),
+    ("make", "message"),
     [
-        ("pnpnet-nine", {}, r"pnpnet-nine.*identity-lm"),
-        (["epnp"], {}, r"\S"),
-        (None, {}, r"\S"),
-        ("identity-lm", {"iterations": 3}, "iterations"),
-        ("pnpnet-n9", {"m": -1}, "m must"),
-        ("epnp-lm", {"effort": "adaptive"}, "effort"),
+        (lambda: create_solver("pnpnet-nine"), r"pnpnet-nine.*identity-lm"),
+        (lambda: create_solver(["epnp"]), "epnp"),
+        (lambda: create_solver(None), "None"),
+        (lambda: create_solver("identity-lm", iterations=3), "iterations"),
+        (lambda: create_solver("pnpnet-n9", m=-1), "m must"),
+        (lambda: create_solver("epnp-lm", effort="adaptive"), "effort"),
+        (lambda: PnPNet.from_config({**saved_net().config(), "init": {"name": "MLPInit", "n": "six"}}), "six"),
+        (lambda: PnPNet.from_config({**saved_net().config(), "init": {"name": "Oracle"}}), "Oracle"),
+        (lambda: PnPNet.from_config({**saved_net().config(), "refine": None}), "refine"),
+        (lambda: PnPNet.from_config({**saved_net().config(), "refine": {"kernel": "tukey"}}), "tukey"),
+        (lambda: PnPNet.from_config({**saved_net().config(), "colour": "red"}), "colour"),
     ],
 )
-def test_names_and_options_of_no_solver_are_refused(name, options, message):
+def test_solvers_that_there_are_not_raise_an_error_that_names_what_is_wrong(make, message):
     with pytest.raises(BaseError, match=message):
-        create_solver(name, **options)
+        make()
 
 
 def test_solvers_have_sorted_names_and_are_in_evaluation_mode():
