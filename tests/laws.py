@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import pytest
 import torch
 from helpers import assert_same
-from kornia.core.exceptions import ShapeError, TypeCheckError
+from kornia.core.exceptions import ShapeError, TypeCheckError, ValueCheckError
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from kornia.geometry.linalg import transform_points
 from torch import Tensor
@@ -388,6 +388,25 @@ def gradients_reach_the_inputs(case: Case) -> None:
         assert not there[~result.ok].any(), name
 
 
+def isotropic_covariances_are_sigmas(case: Case) -> None:
+    call, _ = make(case)
+    sigma = call.pop("img_sigma")
+    call["world_sigma"] = 0.0  # what its projection adds to a pixel is not isotropic
+    covariance = sigma.square()[..., None, None] * torch.eye(2, dtype=case.dtype)
+    results = []
+    for noise in ({"img_sigma": sigma}, {"img_cov": covariance}):
+        leaf = call["img_points"].clone().requires_grad_()
+        result = build(case)(**{**call, "img_points": leaf}, **noise)
+        (gradient,) = torch.autograd.grad(result.rotation[..., 0].sum() + result.weights.sum(), leaf)
+        results.append((result, gradient))
+    (expected, by_sigma), (found, by_covariance) = results
+    assert_near(found, expected)
+    if case.dtype == torch.float64:
+        assert_same(by_covariance, by_sigma, 1e-4, 1e-6 * by_sigma.abs().max().item())
+    with pytest.raises(ValueCheckError, match="img_sigma or img_cov"):
+        build(case)(**call, img_sigma=sigma, img_cov=covariance)
+
+
 def half_precision_is_converted(case: Case) -> None:
     """Half precision is solved as full precision, also under autocast; each input has a gradient of its own dtype."""
     cast = torch.bfloat16 if case.dtype == torch.float32 else torch.float16
@@ -456,6 +475,7 @@ LAWS = (
     frames_are_free,
     bad_problems_fail_alone,
     gradients_reach_the_inputs,
+    isotropic_covariances_are_sigmas,
     half_precision_is_converted,
     copies_are_the_same,
     wrong_arguments_are_refused,
@@ -468,6 +488,8 @@ def applies(law: Callable[[Case], None], case: Case) -> bool:
     Samplers see the places of the pairs. A first guess alone may come from a sample, which is a constant, and a network
     of a fixed number of pairs makes nothing of fewer without a refinement.
     """
+    if law is isotropic_covariances_are_sigmas:
+        return case.noise == "sigma"
     if case.solver in PEERS:
         return law in (batches_are_free, half_precision_is_converted, wrong_arguments_are_refused)
     if case.solver.startswith("net-"):

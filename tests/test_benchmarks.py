@@ -180,19 +180,6 @@ def test_throughput_and_latency_have_a_row_for_every_point(measured):
         assert row["success"]["total"] == row["calls"]
 
 
-def test_targets_of_throughput():
-    def row(contender, *rounds, **more):
-        place = {"contender": contender, "threads": 1, "mode": "forward", "n": 9, "batch": 1000}
-        return {**place, **harness.summary(rounds), **more}
-
-    rows = [row("refinement compiled", 2.0, 3.0, 4.0), row("pnpnet-n9 compiled", 9.0, 8.5, 8.1)]
-    rows += [row("opencv-ransac", 180.0, 170.0, 162.0), row("poselib", 60.0, 60.0, 60.0)]
-    rows += [row("poselib", 1.0, threads=2), row("opencv-ransac", 1.0, batch=10)]
-    found = [(round(x["measured"], 2), x["target"], x["met"]) for x in timing.throughput_targets(rows)]
-    # The refinement and the solver in µs, and the solver against OpenCV and PoseLib.
-    assert found == [(3.0, 3.0, True), (8.5, 8.0, False), (20.0, 20.0, True), (7.06, 10.0, False)]
-
-
 def test_a_large_call_shows_in_the_memory_of_its_process():
     request = {"contender": "refinement", "backward": True, "batches": [2], "memory_batch": 5000}
     found = harness.run_child(FOLDER / "process.py", json.dumps(request), OMP_NUM_THREADS="1")
@@ -223,10 +210,8 @@ def test_the_measurements_for_a_gpu_run_on_a_cpu(tmp_path, monkeypatch):
     (row,) = results["graphs"]
     assert row["modes"]["compiled"]["rotation_difference"] < 1e-6
     assert "why" in row["modes"]["captured"]
-    *ours, loop = results["throughput"]
-    points = [(row["contender"], row["mode"], row["batch"]) for row in ours]
-    assert points == list(itertools.product(gpu.QUICK.contenders, ("forward", "forward+backward"), few.batches))
-    assert (loop["contender"], loop["batch"]) == ("opencv-ransac", few.batches[0])
+    rows = {(row["contender"], row["mode"], row["batch"]) for row in results["throughput"]}
+    assert rows >= set(itertools.product(gpu.QUICK.contenders, ("forward", "forward+backward"), few.batches))
     gpu.main([*to_file, "--parts", "graphs"], few._replace(modes=("captured",)))  # the others stay
     assert json.loads(path.read_text())["throughput"]["rows"] == results["throughput"]
 

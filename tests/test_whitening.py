@@ -47,10 +47,6 @@ def least_squares(m=30, **options):
     return PnPNet(None, RobustWeightedLM(m, **options))
 
 
-def isotropic(sigma, size):
-    return sigma[..., None, None].square() * torch.eye(size, dtype=sigma.dtype)
-
-
 def whitened(p, i, pose):
     """Of one problem: the Jacobian (2N, 6) by the tangent and the residual (2N), all derivatives by autograd."""
 
@@ -90,24 +86,6 @@ def test_poses_covariances_and_weights_are_those_of_a_dense_solver():
         torch.testing.assert_close(robust.weights[i], 1.0 / (1.0 + distance / 9.0), rtol=1e-6, atol=0)
 
 
-@pytest.mark.parametrize("name", ["epnp-lm", "pnpnet-n9", "p3p-ransac"])
-def test_an_isotropic_covariance_is_a_sigma(name, make_problems):
-    """Results and gradients."""
-    p = make_problems(batch=20, outliers=1)
-    solver, found = create_solver(name).double(), []
-    sigma = torch.linspace(10.0, 30.0, 180, dtype=DOUBLE).view(20, 9)
-    for noise in ({"img_sigma": sigma}, {"img_cov": isotropic(sigma, 2)}):
-        leaf = p.img_points.clone().requires_grad_()
-        result = solver(p.world_points, leaf, p.intrinsics, world_sigma=0.0, **noise)
-        total = result.rotation[..., 0].sum() + result.weights.sum()
-        found.append((result, torch.autograd.grad(total, leaf)[0]))
-    (given, by_sigma), (same, by_cov) = found
-    assert given.ok.double().mean() > 0.5
-    assert torch.equal(given.ok, same.ok)
-    assert_same([x[given.ok] for x in same[:4]], [x[given.ok] for x in given[:4]], 1e-6, 1e-7)
-    assert_same(by_cov, by_sigma, 1e-4, 1e-7)
-
-
 # -- bad covariances -----------------------------------------------------------------------------------------------
 
 
@@ -125,19 +103,16 @@ def test_exact_points_and_exact_pixels_are_sound():
     assert result.ok.double().mean() > 0.9
 
 
-@pytest.mark.parametrize("call", ["solver", "pose_covariance", "likelihood"])
+@pytest.mark.parametrize(
+    "call", [pose_covariance, lambda pose, *p, **noise: monte_carlo_pose_loss(pose, pose, *p, **noise)]
+)
 def test_a_sigma_beside_a_covariance_is_an_error(call):
     p = problems()
-    run = {
-        "solver": lambda **noise: create_solver("epnp-lm")(*p[:3], **noise),
-        "pose_covariance": lambda **noise: pose_covariance(p.pose, *p[:3], **noise),
-        "likelihood": lambda **noise: monte_carlo_pose_loss(p.pose, p.pose, *p[:3], **noise),
-    }[call]
     pixels = {"img_sigma": 1.0, "img_cov": p.img_cov}
     points = {"img_sigma": 1.0, "world_sigma": 0.1, "world_cov": p.world_cov}
-    for name, noise in (("img", pixels), ("world", points), *([("img", {})] * (call != "solver"))):
+    for name, noise in (("img", pixels), ("world", points), ("img", {})):
         with pytest.raises(ValueCheckError, match=f"{name}_sigma or {name}_cov"):
-            run(**noise)
+            call(p.pose, *p[:3], **noise)
 
 
 def test_undetermined_where_a_covariance_is_bad():
