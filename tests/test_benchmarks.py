@@ -146,16 +146,16 @@ def measured(tmp_path_factory):
     pytest.importorskip("cv2")
     folder = tmp_path_factory.mktemp("performance")
 
-    def threaded(script, flag, text, **environment):
-        request = json.loads(text)
-        found = performance.measure_threads(
-            request["part"], contenders.Settings(**request["settings"]), request["count"]
-        )
-        return json.loads(json.dumps(found))
+    def here(script, *arguments, **environment):
+        request = json.loads(arguments[-1])
+        if script.name == "process.py":
+            return process.main(request)
+        settings = contenders.Settings(**request["settings"])
+        return json.loads(json.dumps(performance.measure_threads(request["part"], settings, request["count"])))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(performance, "run_child", threaded)
-        patch.setattr(startup, "run_child", lambda _, text, **__: process.main(json.loads(text)))
+        for module in (performance, startup):
+            patch.setattr(module, "run_child", here)
         performance.main(["measure", "--quick", "--contenders", *SMALL, "--results", str(folder)])
     return folder, page.load_parts(folder)[0]
 

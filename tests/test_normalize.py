@@ -57,25 +57,6 @@ def test_poses_go_to_the_frame_of_the_points_and_back_for_any_camera(fx, fy, cx,
         assert torch.equal(frame.scale, torch.ones(7).double())
 
 
-# --- order ----------------------------------------------------------------------------------------------------------
-
-
-def test_pairs_are_ordered_by_u_then_v_and_padding_is_last():
-    pixels = torch.tensor([[[3.0, 0], [1, 5], [-9, -9], [1, 4], [2, 7], [1, 4], [-8, -8]]], dtype=DOUBLE)
-    world = torch.randn(1, 7, 3, generator=torch.Generator().manual_seed(0), dtype=DOUBLE)
-    mask = torch.tensor([[True, True, False, True, True, True, True]])
-    weights = torch.tensor([[1.0, 2, 3, 4, 5, 6, 0]], dtype=DOUBLE)
-    normalize = Normalize(f_const=1.0, center=False, scale=False)
-    problem, frame = normalize(world, pixels, torch.eye(3, dtype=DOUBLE)[None], weights, mask)
-    # 3 and 5 tie in both: they keep the order they came in.
-    assert frame.order[0, :5].tolist() == [3, 5, 1, 4, 0]
-    assert problem.img_points[0, :5].tolist() == [[1, 4], [1, 4], [1, 5], [2, 7], [3, 0]]
-    assert problem.weights.tolist() == [[4, 6, 2, 5, 1, 0, 0]]
-    assert torch.equal(problem.world_points[0, :5], world[0, [3, 5, 1, 4, 0]])
-    assert not problem.world_points[0, 5:].any()
-    assert not problem.img_points[0, 5:].any()
-
-
 # --- validity ---------------------------------------------------------------------------------------------------------
 
 
