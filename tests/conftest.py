@@ -48,9 +48,8 @@ def make_problems() -> Callable[..., Problems]:
         seed: int = 0,
         dtype: torch.dtype = torch.float64,
     ) -> Problems:
-        sigmas = {"img_sigma": 1.0 if noise else 0.0, "world_sigma": 0.05 if noise else 0.0}
-        mix = OutlierMix(count=outliers)
-        return SyntheticProblems(n=n, batch_size=batch, seed=seed, outliers=mix, dtype=dtype, **sigmas).batch(0)
+        options = {"img_sigma": 1.0 * noise, "world_sigma": 0.05 * noise, "outliers": OutlierMix(count=outliers)}
+        return SyntheticProblems(n=n, batch_size=batch, seed=seed, dtype=dtype, **options).batch(0)
 
     return make
 

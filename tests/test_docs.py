@@ -1,4 +1,4 @@
-"""The documentation: its Python prints what pages show, the site builds without warnings, its links lead to places."""
+"""The documentation: its Python runs and prints what pages show, links lead to places, and the site fits its window."""
 
 import html
 import json
@@ -60,6 +60,22 @@ def test_python_prints_what_the_page_shows(page, tmp_path, monkeypatch):
     assert [float(number) for number in NUMBER.findall(printed)] == pytest.approx(numbers, rel=0.05, abs=0.05)
 
 
+def test_python_of_the_readme_runs():
+    names = {}
+    for block in re.findall(r"```python\n(.*?)```", (REPO / "README.md").read_text(), flags=re.S):
+        exec(block, names)
+    assert names["result"].ok.float().mean() > 0.9
+    assert names["robust"].ok.float().mean() > 0.9
+    for value in (names["img_points"].grad, names["refined"].matrix, names["covariance"][names["result"].ok]):
+        assert value.isfinite().all()
+
+
+@pytest.mark.parametrize("page", [REPO / "README.md", *sorted(DOCS.rglob("*.md"))], ids=lambda page: page.stem)
+def test_links_between_files_are_there(page):
+    links = re.findall(r"\]\(([^)#]+)\)", page.read_text())
+    assert [x for x in links if "://" not in x and not (page.parent / x).exists()] == []
+
+
 class Targets(HTMLParser):
     """The targets of a page's links and pictures, and the ids in the page that links can name."""
 
@@ -85,17 +101,16 @@ def site(tmp_path_factory):
 @pytest.mark.slow
 def test_links_and_pictures_of_the_site_are_there(site):
     parsed = {page: Targets() for page in site.rglob("*.html")}
+    assert len(parsed) > 20
     for page, found in parsed.items():
         found.feed(page.read_text())
-    assert len(parsed) > 20
     broken = []
     for page, found in parsed.items():
-        for target in found.targets:
-            url = urlparse(target)
-            file = (page.parent / unquote(url.path)).resolve() if url.path else page
-            missing = not file.exists() or (file in parsed and url.fragment not in {"", *parsed[file].places})
-            if missing and not (url.scheme or url.netloc):
-                broken.append((page.name, target))
+        for url in map(urlparse, found.targets):
+            if not (url.scheme or url.netloc):
+                file = (page.parent / unquote(url.path)).resolve() if url.path else page
+                lost = url.fragment and file in parsed and url.fragment not in parsed[file].places
+                broken += [(page.name, url.geturl())] * bool(lost or not file.exists())
     assert not broken
 
 

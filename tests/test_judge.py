@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from kornia.geometry.linalg import transform_points
 
 from kornia_pnpnet import Pose, create_solver, pose_errors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
@@ -17,7 +18,7 @@ from kornia_pnpnet.problem import Problem, State
 from kornia_pnpnet.refine.residual import project
 
 
-def alarms(pixels, errors, tested=1, radius=10.0, weights=None):
+def alarms(pixels, errors, tested, weights=None):
     """log_false_alarms of pairs whose points are seen at the origin; with an error of at most 1 a pair is an inlier."""
     count = len(pixels)
     world = torch.tensor([[[0.0, 0.0, 4.0]]]).expand(1, count, 3)
@@ -25,52 +26,44 @@ def alarms(pixels, errors, tested=1, radius=10.0, weights=None):
     problem = Problem.of(world, torch.tensor([pixels]), 100.0, weights=weights)
     errors = torch.tensor([errors])
     judged = Judged(((errors < 1.0) & (weights > 0)).float(), errors)
-    thresholds = Thresholds(torch.full((1, 1), radius), torch.zeros(1, 1))
+    thresholds = Thresholds(torch.full((1, 1), 10.0), torch.zeros(1, 1))
     projection = project(State.of(Pose(torch.eye(3)[None], torch.zeros(1, 3))), problem)
     return log_false_alarms(torch.tensor([tested]), projection, problem, thresholds, judged).item()
 
 
 BOX = [[-400.0, -200.0], [400.0, -200.0], [-400.0, 200.0], [400.0, 200.0]]
+SIX = [*BOX, [-390.0, 190.0], [390.0, -190.0]]
 DISC = math.pi * 0.25 * 10.0**2 / (800.0 * 400.0)
-
-
-@pytest.mark.parametrize(
-    ("pixels", "errors", "chance"),
-    [
-        (BOX, [0.1, 0.25, 0.0, 0.0], DISC),
-        ([[-200.0, 50.0], [200.0, 50.0], [100.0, 50.0], [90.0, 50.0]], [0.999999, 0.0, 0.0, 0.0], 20.0 / 400.0),
-        ([[60.0, 50.0], [61.0, 50.0], [60.0, 51.0], [61.0, 51.0]], [0.999999, 0.5, 0.0, 0.0], 1.0),
-    ],
-    ids=["a disc in a box", "a strip of a thin box", "at most 1"],
-)
-def test_chance_is_the_share_of_the_box(pixels, errors, chance):
-    assert alarms(pixels, errors) == pytest.approx(math.log(chance), abs=1e-4)
-    far = [*pixels, [1e4, 1e4]]  # padding is not in the box
-    assert alarms(far, [*errors, 0.0], weights=torch.tensor([[1.0] * 4 + [0.0]])) == pytest.approx(
-        math.log(chance), abs=1e-4
-    )
-
-
-def test_false_alarms_by_counting():
-    """Each tested pose is a chance, and so is each choice of the inliers besides three."""
-    for tested, inliers, count in ((10, 4, 4), (1, 5, 5), (500, 5, 5), (7, 4, 5)):
-        pixels = [*BOX, [-390.0, 190.0]][:count]
-        errors = [0.25] * inliers + [1e9] * (count - inliers)
-        expected = tested * math.comb(count - 3, inliers - 3) * DISC ** (inliers - 3)
-        assert alarms(pixels, errors, tested) == pytest.approx(math.log(expected), abs=1e-4)
-    for inliers, count in ((0, 2), (2, 2), (3, 3)):
-        assert alarms(BOX[:count], [0.25] * inliers + [1e9] * (count - inliers), 7) == pytest.approx(math.log(7.0))
-
-
-def test_close_outliers_and_pixels_near_other_points_raise_the_chance():
-    """Of six pairs three decide, and each of the other three may be the fourth inlier."""
-    far = [*BOX, [-390.0, 190.0], [390.0, -190.0]]
-    assert alarms(far, [0.25] * 4 + [1e9] * 2) == pytest.approx(math.log(3 * DISC), abs=1e-4)
+#: Pixels, squared errors, number of tested poses, and the expected number of false alarms.
+ALARMS = {
+    "a disc in a box": (BOX, [0.1, 0.25, 0.0, 0.0], 1, DISC),
+    "a strip of a thin box": (
+        [[-200.0, 50.0], [200.0, 50.0], [100.0, 50.0], [90.0, 50.0]],
+        [0.999999, 0.0, 0.0, 0.0],
+        1,
+        20.0 / 400.0,
+    ),
+    "at most 1": ([[60.0, 50.0], [61.0, 50.0], [60.0, 51.0], [61.0, 51.0]], [0.999999, 0.5, 0.0, 0.0], 1, 1.0),
+    "each tested pose is a chance": (BOX, [0.25] * 4, 10, 10 * DISC),
+    "five inliers": (SIX[:5], [0.25] * 5, 500, 500 * DISC**2),
+    "each choice of the inliers besides three is a chance": (SIX[:5], [0.25] * 4 + [1e9], 7, 7 * 2 * DISC),
+    "three of six pairs decide": (SIX, [0.25] * 4 + [1e9] * 2, 1, 3 * DISC),
+    "no inlier": (BOX[:2], [1e9] * 2, 7, 7.0),
+    "three inliers": (BOX[:3], [0.25] * 3, 7, 7.0),
     # Two outliers, of three pairs, are in a disc whose area is 600 times as large.
-    assert alarms(far, [0.25] * 4 + [150.0] * 2) == pytest.approx(math.log(3 * 2 / 3 / 600), abs=1e-4)
+    "close outliers": (SIX, [0.25] * 4 + [150.0] * 2, 1, 3 * 2 / 3 / 600),
     # All points are seen at the origin: ten pixels are near another point, and four are ignored, of thirty.
-    near = [*BOX, [0.0, 0.0], [0.0, 0.5]]
-    assert alarms(near, [0.25] * 4 + [1e9] * 2) == pytest.approx(math.log(3 * 6 / 30), abs=1e-4)
+    "pixels near other points": ([*BOX, [0.0, 0.0], [0.0, 0.5]], [0.25] * 4 + [1e9] * 2, 1, 3 * 6 / 30),
+}
+
+
+@pytest.mark.parametrize("name", ALARMS)
+def test_false_alarms_by_counting(name):
+    pixels, errors, tested, expected = ALARMS[name]
+    assert alarms(pixels, errors, tested) == pytest.approx(math.log(expected), abs=1e-4)
+    weights = torch.tensor([[1.0] * len(pixels) + [0.0]])  # padding is not in the box
+    padded = alarms([*pixels, [1e4, 1e4]], [*errors, 0.0], tested, weights)
+    assert padded == pytest.approx(math.log(expected), abs=1e-4)
 
 
 def test_an_inlier_is_within_the_thresholds_of_pixel_and_point():
@@ -90,8 +83,8 @@ def test_an_inlier_is_within_the_thresholds_of_pixel_and_point():
 # --- the probability that a pose is not far off ---------------------------------------------------------------------
 
 
-def of_solver(problems, effort=None, **sigmas):
-    return create_solver("pnpnet-set", effort=effort)(*problems[:3], **sigmas)
+def solve(problems, **options):
+    return create_solver("pnpnet-set", effort=options.pop("effort", None))(*problems[:3], **options)
 
 
 @pytest.mark.parametrize("sigmas", [{}, {"img_sigma": 1.0, "world_sigma": 0.05}], ids=["unknown", "given"])
@@ -99,39 +92,24 @@ def of_solver(problems, effort=None, **sigmas):
 def test_probability_tells_sound_problems_from_random_pixels(effort, most, sigmas):
     """Who searches longer finds better poses by chance, none of which is ``ok``."""
     sound = SyntheticProblems(n=20, batch_size=200, seed=3).batch(0)
-    result = of_solver(sound, effort, **sigmas)
-    assert result.probability.median() > 0.99
-    noise = sound._replace(img_points=sound.img_points.roll(1, 0))  # the pixels of another problem
-    wrong = of_solver(noise, effort, **sigmas)
-    # The law is that of problems most of which have a pose.
-    assert wrong.probability.median() < most
+    random = sound._replace(img_points=sound.img_points.roll(1, 0))  # the pixels of another problem
+    found, wrong = (solve(x, effort=effort, **sigmas) for x in (sound, random))
+    assert found.probability.median() > 0.99
+    assert wrong.probability.median() < most  # the law is that of problems most of which have a pose
     assert not wrong.ok.double().mean() > 0.05
-    for found in (result, wrong):
-        assert ((found.probability >= 0) & (found.probability <= 1)).all()
-        assert not found.probability.requires_grad
-
-
-def test_probability_falls_with_the_noise_of_few_pairs():
-    """Of six pairs: the more noise, the wider the poses that fit."""
-    means = []
-    for sigma in (0.3, 10.0, 60.0):
-        problems = SyntheticProblems(n=6, batch_size=300, seed=4, img_sigma=sigma, world_sigma=0.0).batch(0)
-        means.append(of_solver(problems, img_sigma=sigma, world_sigma=0.0).probability.mean().item())
-    assert means[0] > 0.97
-    assert means == sorted(means, reverse=True)
-    assert means[2] < means[0] - 0.1
+    for probability in (found.probability, wrong.probability):
+        assert ((probability >= 0) & (probability <= 1)).all()
+        assert not probability.requires_grad
 
 
 def test_probability_is_observed_as_often():
     """Problems with many outliers, by the law's own definition of far off."""
-    problems = SyntheticProblems(n=12, batch_size=1500, seed=5, outliers=OutlierMix(max_ratio=0.8)).batch(0)
-    result = of_solver(problems)
-    errors = pose_errors(result.pose, problems.pose)
-    depth = (problems.world_points @ problems.pose.rotation.mT + problems.pose.translation[:, None])[..., 2].median(1)[
-        0
-    ]
-    centres = [-(pose.rotation.mT @ pose.translation[..., None])[..., 0] for pose in (result.pose, problems.pose)]
-    near = (errors.rotation_error_deg <= 10) & ((centres[0] - centres[1]).norm(dim=-1) <= 0.3 * depth)
+    p = SyntheticProblems(n=12, batch_size=1500, seed=5, outliers=OutlierMix(max_ratio=0.8)).batch(0)
+    result = solve(p)
+    depth = transform_points(p.pose.matrix, p.world_points)[..., 2].median(1).values
+    found, true = (-(x.rotation.mT @ x.translation[..., None])[..., 0] for x in (result.pose, p.pose))  # centres
+    near = pose_errors(result.pose, p.pose).rotation_error_deg <= 10
+    near &= (found - true).norm(dim=-1) <= 0.3 * depth
     sure = result.probability > 0.9
     assert near[sure].double().mean() > 0.9
     assert near[~sure].double().mean() < near[sure].double().mean() - 0.2

@@ -4,65 +4,88 @@ from itertools import product
 
 import pytest
 import torch
+from data_helpers import make_scene, same
+from helpers import assert_same
+from hypothesis import given
+from hypothesis import strategies as st
 from kornia.core.exceptions import ValueCheckError
-from laws import CAMERAS, FOCALS, LAWS, NOISES, Case, applies, build, gradcheck, make
+from laws import CAMERAS, FOCALS, LAWS, NOISES, PEERS, Case, applies, build, copies_are_the_same, gradcheck, make
+from strategies import many
+
+from kornia_pnpnet import heatmap_keypoints
+from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.data import BoxPoints, DrivePoints, OutlierMix, SceneProblems, SlabPoints, SyntheticProblems
 
 SOLVERS = ("pnpnet-set", "pnpnet-n9", "epnp-lm", "reppnp-lm", "p3p-ransac", "identity-lm")
-DTYPES = torch.float64, torch.float32
-#: Each solver, camera, noise, focal length and dtype in some combination.
+ALL = [Case(*x) for x in product(SOLVERS, CAMERAS, NOISES, FOCALS, (torch.float64, torch.float32))]
+#: Each solver, camera, noise, focal length and dtype in some combination, and what else there is.
 QUICK = [
-    Case("pnpnet-set"),
-    Case("pnpnet-set", "rig", "covariance"),
+    *ALL[::11],
+    *(Case(name) for name in ("epnp", "reppnp", "net-n9", "net-set", "pnpnet-n6", "ransac-epnp-lm", *PEERS)),
     Case("pnpnet-set", "pixels", "sigma", "unknown"),
-    Case("pnpnet-set", "bearings", dtype=torch.float32),
-    Case("pnpnet-n9", "pixels", "covariance"),
-    Case("pnpnet-n9", dtype=torch.float32),
-    Case("epnp-lm", "pixels", "sigma"),
-    Case("epnp-lm", "pixels", "covariance", dtype=torch.float32),
-    Case("reppnp-lm", "rig"),
-    Case("p3p-ransac", "pixels", "sigma"),
-    Case("p3p-ransac", "bearings", "covariance"),
-    Case("p3p-ransac", focal="unknown"),
     Case("p3p-ransac", focal="unknown", extra="radial"),
-    Case("identity-lm", "pixels", "sigma", dtype=torch.float32),
-    Case("identity-lm", "bearings"),
-    Case("identity-lm", "rig", "covariance"),
     Case("pnpnet-set", extra="prior"),
     Case("epnp-lm", "pixels", "covariance", extra="prior"),
     Case("p3p-ransac", extra="confidence"),
-    *(Case(name) for name in ("epnp", "reppnp", "net-n9", "net-set", "pnpnet-n6", "ransac-epnp-lm")),
 ]
-ALL = [Case(*x) for x in product(SOLVERS, CAMERAS, NOISES, FOCALS, DTYPES)]
+FEW_GRADIENTS = [Case("identity-lm", *x) for x in ([], ["rig", "covariance"], ["pixels", "sigma", "unknown"])]
+GRADIENTS = [Case("identity-lm", *x) for x in product(CAMERAS, NOISES, FOCALS)]
+REFUSED = [Case(name, camera, focal="unknown") for name, camera in product(SOLVERS, ("rig", "bearings"))]
 
 
-def params(cases, marks=()):
-    pairs = ((law, case) for case in cases if not case.is_refused for law in LAWS if applies(law, case))
-    return [pytest.param(law, case, id=f"{law.__name__}-{case}", marks=marks) for law, case in pairs]
+def params(laws, cases, *marks):
+    pairs = ((law, case) for case in cases if not case.is_refused for law in laws if applies(law, case))
+    for law, case in pairs:
+        unsaved = law is copies_are_the_same and case.solver in ("epnp", "reppnp")
+        defect = [pytest.mark.xfail(reason="saved hyperparameters at their bounds cannot be loaded")] * unsaved
+        yield pytest.param(law, case, id=f"{law.__name__}-{case}", marks=(*marks, *defect))
 
 
 @pytest.mark.parametrize(
-    ("law", "case"), params(QUICK) + params([x for x in ALL if x not in QUICK], marks=[pytest.mark.slow])
+    ("law", "case"),
+    [
+        *params(LAWS, QUICK),
+        *params(LAWS, [x for x in ALL if x not in QUICK], pytest.mark.slow),
+        *params([gradcheck], FEW_GRADIENTS),
+        *params([gradcheck], [x for x in GRADIENTS if x not in FEW_GRADIENTS], pytest.mark.slow),
+    ],
 )
 def test_law(law, case):
+    try:
+        build(case)
+    except ImportError as error:
+        pytest.skip(str(error))
     law(case)
 
 
-@pytest.mark.parametrize("camera", ["rig", "bearings"])
-@pytest.mark.parametrize("name", SOLVERS)
-def test_what_the_contract_excludes_is_refused(name, camera):
-    case = Case(name, camera, focal="unknown")
-    assert case.is_refused
+@pytest.mark.parametrize("case", REFUSED, ids=str)
+def test_what_the_contract_excludes_is_refused(case):
     with pytest.raises(ValueCheckError):
         build(case)(**make(case)[0])
 
 
-CHECKED = [Case("identity-lm", *x) for x in product(CAMERAS, NOISES, FOCALS)]
-IN_TIME = [CHECKED[0], Case("identity-lm", "rig", "covariance"), Case("identity-lm", "pixels", "sigma", "unknown")]
+# --- laws of precision beside those of solvers ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "case",
-    [pytest.param(x, id=str(x), marks=[] if x in IN_TIME else [pytest.mark.slow]) for x in CHECKED if not x.is_refused],
+@many(60)
+@given(
+    st.sampled_from([None, BoxPoints(), SlabPoints(), DrivePoints()]),
+    st.integers(4, 15),
+    st.integers(0, 1000),
+    st.sampled_from([{}, {"count": 2}, {"max_ratio": 0.5, "mismatch_share": 0.5}]),
 )
-def test_gradcheck(case):
-    gradcheck(case)
+def test_both_precisions_see_the_same_problems(points, n, seed, outliers):
+    options = {"n": n, "batch_size": 3, "seed": seed, "outliers": OutlierMix(**outliers)}
+    if points is None:
+        source, options = SceneProblems, {"scene": make_scene(20, 25), **options}
+    else:
+        source, options = SyntheticProblems, {"points": points, "axis_ratio": 3.0, "known_noise": 1.0, **options}
+    single, double = (source(**options, dtype=dtype).batch(seed) for dtype in (torch.float32, torch.float64))
+    assert double.world_points.dtype == torch.float64
+    assert same(single, map_tensors(lambda x: x.float() if x.is_floating_point() else x, double))
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_heat_maps_of_half_precision_are_those_of_float32(dtype, generator):
+    heatmaps = torch.randn(1, 2, 4, 5, generator=generator).to(dtype)
+    assert_same(heatmap_keypoints(heatmaps), heatmap_keypoints(heatmaps.float()))

@@ -6,7 +6,7 @@ import itertools
 
 import pytest
 import torch
-from kornia.geometry.conversions import normalize_points_with_intrinsics
+from kornia.geometry.conversions import denormalize_points_with_intrinsics
 from kornia.geometry.linalg import transform_points
 
 from kornia_pnpnet import Normalize, Pose
@@ -15,24 +15,9 @@ from kornia_pnpnet.problem import Starts, State
 from kornia_pnpnet.propose.views import VIEWS, from_views
 from kornia_pnpnet.refine.residual import project
 
-DTYPES = (torch.float32, torch.float64)
-OPTIONS = [
-    {"order": order, "center": center, "scale": scale}
-    for order in (True, False)
-    for center in (True, False)
-    for scale in (True, False)
-]
-
-
-def camera(fx, fy, cx, cy, batch=None):
-    K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
-    return K if batch is None else K.expand(batch, 3, 3)
-
-
-def see(problems, K):
-    """The problems as another camera sees them: the same rays and the same noise relative to the focal length."""
-    rays = problems.img_points / problems.intrinsics[:, 0, 0, None, None]
-    return rays * K.diagonal(dim1=-2, dim2=-1)[:, None, :2] + K[:, None, :2, 2]
+DOUBLE = torch.float64
+both_dtypes = pytest.mark.parametrize("dtype", [torch.float32, DOUBLE])
+OPTIONS = [dict(zip(("order", "center", "scale"), x, strict=True)) for x in itertools.product((True, False), repeat=3)]
 
 
 def residuals(pose, problem):
@@ -43,24 +28,27 @@ def residuals(pose, problem):
 
 
 @pytest.mark.parametrize("options", OPTIONS, ids=str)
-def test_poses_go_to_the_frame_of_the_points_and_back(options, make_problems):
-    """Residuals scale with the focal length."""
+@pytest.mark.parametrize("f_const", [1.0, F_CONST])
+@pytest.mark.parametrize(("fx", "fy", "cx", "cy"), [(800, 1200, 0, 0), (3000, 2000, 2016.5, -7.25), (1, 1, 0.5, 0.5)])
+def test_poses_go_to_the_frame_of_the_points_and_back_for_any_camera(fx, fy, cx, cy, f_const, options, make_problems):
+    """Pixels are Kornia's times the focal length, and residuals scale with it."""
     p = make_problems(outliers=2)
-    for f in (500.0, 12345.6):
-        K = camera(f, f, 320.0, 240.0, 7)
-        pixels = see(p, K)
-        cam_points = transform_points(p.pose.matrix, p.world_points)
-        expected = (f * cam_points[..., :2] / cam_points[..., 2:] + K[:, None, :2, 2]) - pixels
-        normalize = Normalize(**options)
-        problem, frame = normalize(p.world_points, pixels, K)
-        pose = frame.apply(p.pose)
-        if frame.order is not None:
-            expected = expected.gather(1, frame.order[..., None].expand(-1, -1, 2))
-        torch.testing.assert_close(residuals(pose, problem), expected * (F_CONST / f), rtol=1e-9, atol=1e-7)
-        assert problem.focal == F_CONST
-        torch.testing.assert_close(frame.undo(pose).matrix, p.pose.matrix, rtol=0, atol=1e-10)
-        forth = frame.apply(frame.undo(p.pose))
-        torch.testing.assert_close(forth.matrix, p.pose.matrix, rtol=0, atol=1e-10)
+    K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=DOUBLE).expand(7, 3, 3)
+    rays = p.img_points / p.intrinsics[:, 0, 0, None, None]
+    problem, frame = Normalize(f_const=f_const, **options)(
+        p.world_points, denormalize_points_with_intrinsics(rays, K), K
+    )
+    cam = transform_points(p.pose.matrix, p.world_points)
+    pixels, expected = f_const * rays, f_const * (cam[..., :2] / cam[..., 2:] - rays)
+    if frame.order is not None:
+        pixels, expected = (x.gather(1, frame.order[..., None].expand(-1, -1, 2)) for x in (pixels, expected))
+    pose = frame.apply(p.pose)
+    torch.testing.assert_close(problem.img_points, pixels)
+    torch.testing.assert_close(residuals(pose, problem), expected, rtol=1e-9, atol=1e-10 * f_const)
+    for back in (frame.undo(pose), frame.apply(frame.undo(p.pose))):
+        torch.testing.assert_close(back.matrix, p.pose.matrix, rtol=0, atol=1e-10)
+    assert problem.focal == f_const
+    assert frame.valid.all()
     if options["center"]:
         assert problem.world_points.mean(1).abs().max() < 1e-10
     if options["center"] and options["scale"]:
@@ -69,73 +57,37 @@ def test_poses_go_to_the_frame_of_the_points_and_back(options, make_problems):
         assert torch.equal(frame.scale, torch.ones(7).double())
 
 
-@pytest.mark.parametrize("f_const", [1.0, F_CONST])
-@pytest.mark.parametrize(("fx", "fy", "cx", "cy"), [(800, 1200, 0, 0), (3000, 2000, 2016.5, -7.25), (1, 1, 0.5, 0.5)])
-def test_pixels_are_kornias_times_the_focal_length_for_any_camera(fx, fy, cx, cy, f_const, make_problems):
-    p = make_problems(noise=False)
-    K = camera(fx, fy, cx, cy, 7)
-    normalize = Normalize(f_const=f_const, order=False)
-    problem, frame = normalize(p.world_points, see(p, K), K)
-    torch.testing.assert_close(problem.img_points, f_const * normalize_points_with_intrinsics(see(p, K), K))
-    assert residuals(frame.apply(p.pose), problem).abs().max() < 1e-8  # the true pose
-    assert problem.focal == f_const
-    assert frame.valid.all()
-
-
-# --- order ----------------------------------------------------------------------------------------------------------
-
-
-def test_pairs_are_ordered_by_u_then_v_and_padding_is_last():
-    pixels = torch.tensor([[[3.0, 0], [1, 5], [-9, -9], [1, 4], [2, 7], [1, 4], [-8, -8]]], dtype=torch.float64)
-    world = torch.randn(1, 7, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    mask = torch.tensor([[True, True, False, True, True, True, True]])
-    weights = torch.tensor([[1.0, 2, 3, 4, 5, 6, 0]], dtype=torch.float64)
-    normalize = Normalize(f_const=1.0, center=False, scale=False)
-    problem, frame = normalize(world, pixels, camera(1, 1, 0, 0, 1), weights, mask)
-    # 3 and 5 tie in both: they keep the order they came in.
-    assert frame.order[0, :5].tolist() == [3, 5, 1, 4, 0]
-    assert problem.img_points[0, :5].tolist() == [[1, 4], [1, 4], [1, 5], [2, 7], [3, 0]]
-    assert problem.weights.tolist() == [[4, 6, 2, 5, 1, 0, 0]]
-    assert torch.equal(problem.world_points[0, :5], world[0, [3, 5, 1, 4, 0]])
-    assert not problem.world_points[0, 5:].any()
-    assert not problem.img_points[0, 5:].any()
-
-
 # --- validity ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@both_dtypes
 @pytest.mark.parametrize("offset", [0.0, 1.0, 1e4])
 @pytest.mark.parametrize("n", [3, 9, 50])
 def test_points_on_a_line_are_invalid(n, offset, dtype, generator):
     """Also where only two of the pairs are there; lines up to the rounding of the dtype."""
-    direction = torch.randn(20, 1, 3, generator=generator, dtype=torch.float64)
-    direction[:3, 0] = torch.eye(3, dtype=torch.float64)
-    direction = direction / direction.norm(dim=-1, keepdim=True)
-    start = offset * torch.randn(20, 1, 3, generator=generator, dtype=torch.float64)
-    along = torch.rand(20, n, 1, generator=generator, dtype=torch.float64)
-    pixels = torch.randn(20, n, 2, generator=generator, dtype=torch.float64).to(dtype)
+    direction, start = torch.randn(2, 20, 1, 3, generator=generator, dtype=DOUBLE)
+    direction[:3, 0] = torch.eye(3, dtype=DOUBLE)
+    along = torch.rand(20, n, 1, generator=generator, dtype=DOUBLE)
+    line = along * torch.nn.functional.normalize(direction, dim=-1)
+    pixels = torch.randn(20, n, 2, generator=generator, dtype=DOUBLE).to(dtype)
     K, two = torch.eye(3, dtype=dtype).expand(20, 3, 3), (torch.arange(n) < 2).expand(20, n)
+    anywhere = offset + torch.randn(20, n, 3, generator=generator, dtype=DOUBLE)
     for length in (1e-3, 1.0, 100.0):
-        _, frame = Normalize()((start + length * along * direction).to(dtype), pixels, K)
-        assert not frame.valid.any(), length
-        world = length * (offset + torch.randn(20, n, 3, generator=generator, dtype=torch.float64))
-        _, frame = Normalize()(world.to(dtype), pixels, K, None, two)
-        assert not frame.valid.any(), length
+        for world, mask in ((offset * start + length * line, None), (length * anywhere, two)):
+            assert not Normalize()(world.to(dtype), pixels, K, None, mask)[1].valid.any(), length
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@both_dtypes
 @pytest.mark.parametrize("n", [3, 9, 50])
 def test_points_off_a_line_are_valid(n, dtype, random_rotations, generator):
-    world = torch.rand(20, n, 3, generator=generator, dtype=torch.float64)
-    world[:, :3] = torch.tensor([[0.0, 0, 0], [1, 0, 1], [0.5, 1, 0]], dtype=torch.float64)  # never thin by chance
-    pixels = torch.randn(20, n, 2, generator=generator, dtype=torch.float64).to(dtype)
+    world = torch.rand(20, n, 3, generator=generator, dtype=DOUBLE)
+    world[:, :3] = torch.tensor([[0.0, 0, 0], [1, 0, 1], [0.5, 1, 0]], dtype=DOUBLE)  # never thin by chance
+    pixels = torch.randn(20, n, 2, generator=generator, dtype=DOUBLE).to(dtype)
     K, turn = torch.eye(3, dtype=dtype).expand(20, 3, 3), random_rotations(20)
     shapes = [(1, 1, 1), (1, 1, 0), (1, 0.1, 0), (1, 1e-2, 0), (1, 1e-2, 1e-2)]
-    if dtype == torch.float64:
-        shapes += [(1, 1e-3, 0), (1, 1e-6, 0)]
+    shapes += [(1, 1e-3, 0), (1, 1e-6, 0)] * (dtype == DOUBLE)
     for shape, offset, unit in itertools.product(shapes, (0.0, 10.0), (1e-3, 1.0, 1e3)):
-        points = unit * ((world * torch.tensor(shape, dtype=torch.float64)) @ turn.mT + offset)
+        points = unit * ((world * torch.tensor(shape, dtype=DOUBLE)) @ turn.mT + offset)
         assert Normalize()(points.to(dtype), pixels, K)[1].valid.all(), (shape, offset, unit)
 
 
@@ -150,7 +102,7 @@ def test_mirrors_show_the_same_problems_and_are_undone(order, make_problems):
     true, count = frame.apply(p.pose), len(VIEWS)
     poses = []
     for swap, reverse_x, reverse_y in VIEWS:
-        mirror = torch.diag(torch.tensor([1.0 - 2 * reverse_x, 1.0 - 2 * reverse_y, 1.0], dtype=torch.float64))
+        mirror = torch.diag(torch.tensor([1.0 - 2 * reverse_x, 1.0 - 2 * reverse_y, 1.0], dtype=DOUBLE))
         mirror = mirror[:, [1, 0, 2]] if swap else mirror
         poses.append((mirror @ true.rotation @ mirror.mT, true.translation @ mirror.mT))
     stacked = Pose(*(torch.cat(entries) for entries in zip(*poses, strict=True)))

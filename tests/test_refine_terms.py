@@ -1,22 +1,14 @@
 """What is known besides the pairs: Jacobians, exact least squares, no harm by a wrong prior, any unit and heading."""
 
 import math
+from itertools import product
 
 import pytest
 import torch
-from jacobians import derivative, verified_derivative, verify_jacobian
+from helpers import derivative, rate, verified_derivative, verify_jacobian
 from torch import nn
 
-from kornia_pnpnet import (
-    PnPNet,
-    Pose,
-    PosePrior,
-    RobustWeightedLM,
-    create_solver,
-    gravity_prior,
-    pose_errors,
-    success,
-)
+from kornia_pnpnet import PnPNet, Pose, PosePrior, RobustWeightedLM, create_solver, gravity_prior
 from kornia_pnpnet.problem import Problem, State
 from kornia_pnpnet.refine.residual import project, retract
 from kornia_pnpnet.refine.terms import CameraTerm, PoseTerm
@@ -25,39 +17,32 @@ SIGMA = math.radians(1.0)
 SIGMAS = {"img_sigma": 1.0, "world_sigma": 0.05}
 
 
-def drawn(problems, generator, wrong=0.0, sigma=SIGMA):
+def drawn(problems, generator, wrong=0.0):
     """The pose of the frame before: 1 degree and 2 % of the distance off, and ``wrong`` sigmas more."""
-    like = problems.world_points
-    batch, distance = len(like), problems.pose.translation.norm(dim=-1, keepdim=True)
-    sigmas = torch.cat((torch.full_like(distance, sigma).expand(batch, 3), 0.02 * distance.expand(batch, 3)), -1)
-    noise, direction = torch.randn(2, batch, 6, generator=generator, dtype=like.dtype)
+    distance = problems.pose.translation.norm(dim=-1, keepdim=True).expand(-1, 3)
+    sigmas = torch.cat((torch.full_like(distance, SIGMA), 0.02 * distance), -1)
+    noise, direction = torch.randn(2, *sigmas.shape, generator=generator, dtype=sigmas.dtype)
     error = sigmas * (noise + wrong * nn.functional.normalize(direction, dim=-1))
     return PosePrior(retract(problems.pose, error), torch.diag_embed(sigmas**-2))
 
 
-def gravity(problems, generator, wrong=0.0, sigma=0.5 * SIGMA):
-    like = problems.world_points
-    down, noise, side = torch.randn(3, len(like), 3, generator=generator, dtype=like.dtype)
-    down = nn.functional.normalize(down, dim=-1)
-    truth = (problems.pose.rotation @ down[..., None])[..., 0]
+def gravity(problems, generator, wrong=0.0):
+    """Of an accelerometer that is half a degree off, and ``wrong`` sigmas more."""
+    down, noise, side = torch.randn(3, *problems.pose.translation.shape, generator=generator, dtype=torch.float64)
+    truth = nn.functional.normalize((problems.pose.rotation @ down[..., None])[..., 0], dim=-1)
     across = nn.functional.normalize(torch.linalg.cross(truth, side), dim=-1)
-    turn = sigma * (noise + wrong * across)
-    return gravity_prior(down, truth + torch.linalg.cross(turn, truth), sigma)
+    turn = 0.5 * SIGMA * (noise + wrong * across)
+    return gravity_prior(down, truth + torch.linalg.cross(turn, truth), 0.5 * SIGMA)
 
 
 def informative(problems, generator):
     """An information with correlations between turns and shifts."""
     root = torch.randn(len(problems.world_points), 6, 6, generator=generator, dtype=torch.float64)
-    expected = retract(problems.pose, 0.01 * root[:, 0])
-    return PosePrior(expected, 400.0 * root @ root.mT, torch.full_like(root[:, 0, 0], torch.inf))
+    return PosePrior(retract(problems.pose, 0.01 * root[:, 0]), 400.0 * root @ root.mT)
 
 
-def refiner(m=40, kernel="huber", robustness=1e4):
-    return PnPNet(None, RobustWeightedLM(m, kernel=kernel, robustness=robustness, learnable=False))
-
-
-def rate(result, problems):
-    return success(pose_errors(result.pose, problems.pose)).double().mean()
+def refiner(m):
+    return PnPNet(None, RobustWeightedLM(m, kernel="huber", robustness=1e4, learnable=False))
 
 
 # --- the terms --------------------------------------------------------------------------------------------------------
@@ -71,19 +56,14 @@ def state(request, random_rotations, generator):
     return State(pose, 0.1 * torch.randn(5, unknown, generator=generator, dtype=torch.float64))
 
 
-@pytest.fixture
-def known(generator):
-    """Makes a term of an information (5, 6, 6) and an expected pose, in a frame off the caller's."""
-
-    def make(expected, information, scale=None):
-        centroid, size = torch.randn(5, 3, generator=generator).double(), torch.linspace(0.5, 2.0, 5).double()
-        term, usable = PoseTerm.of(PosePrior(expected, information, scale), centroid, size)
-        assert usable.all()
-        turned = (expected.rotation * term.offset[:, None]).sum(-1)
-        torch.testing.assert_close(term.pose.translation, expected.translation * size[:, None] + turned)
-        return term
-
-    return make
+def pose_term(expected, information, generator, scale=None):
+    """A term of an information (5, 6, 6) and an expected pose, in a frame off the caller's."""
+    centroid, size = torch.randn(5, 3, generator=generator).double(), torch.linspace(0.5, 2.0, 5).double()
+    term, usable = PoseTerm.of(PosePrior(expected, information, scale), centroid, size)
+    assert usable.all()
+    turned = (expected.rotation * term.offset[:, None]).sum(-1)
+    torch.testing.assert_close(term.pose.translation, expected.translation * size[:, None] + turned)
+    return term
 
 
 def assert_gradient(term, state):
@@ -97,30 +77,33 @@ def assert_gradient(term, state):
 
 @pytest.mark.parametrize("unknown", range(4))
 @pytest.mark.parametrize("scale", [3.0, math.inf])
-def test_a_pose_term_is_linearised(unknown, scale, state, known, generator):
+def test_a_pose_term_is_linearised(unknown, scale, state, generator):
     root = torch.randn(5, 6, 6, generator=generator, dtype=torch.float64)
     expected = retract(state.pose, 0.5 * torch.randn(5, 6, generator=generator, dtype=torch.float64))
-    term = known(expected, root @ root.mT, torch.full((5,), scale, dtype=torch.float64))
+    term = pose_term(expected, root @ root.mT, generator, torch.full((5,), scale, dtype=torch.float64))
     verify_jacobian(lambda x: term.errors(x.pose)[0], state, term.linearise(state).jacobian)
     assert_gradient(term, state)
 
 
+WRONG = pytest.mark.xfail(reason="the Jacobian leaves out that the nearest pose about the open axis moves, too")
+
+
 @pytest.mark.parametrize("unknown", range(4))
-def test_a_term_with_an_open_axis_is_linearised(unknown, state, known, generator):
+@pytest.mark.parametrize("isotropic", [True, pytest.param(False, marks=WRONG)])
+def test_a_term_with_an_open_axis_is_linearised(isotropic, unknown, state, generator):
     """Turns about the axis change nothing; there the error is that of the nearest pose that the term allows."""
     axis = nn.functional.normalize(torch.randn(5, 3, generator=generator, dtype=torch.float64), dim=-1)
-    turns = torch.eye(3).double() - axis[:, :, None] * axis[:, None]
-    information = torch.block_diag(torch.zeros(3, 3), torch.eye(3)).double() + nn.functional.pad(turns, (0, 3, 0, 3))
+    known = torch.block_diag(torch.eye(3), torch.eye(3)).double().repeat(5, 1, 1)
+    known[:, :3, :3] -= axis[:, :, None] * axis[:, None]
+    root = torch.randn(5, 6, 6, generator=generator, dtype=torch.float64)
+    information = known if isotropic else known @ root @ root.mT @ known
     about, off = torch.zeros(5, 6, dtype=torch.float64), torch.randn(5, 6, generator=generator, dtype=torch.float64)
     about[:, :3] = 1.5 * axis
-    term = known(retract(state.pose, about), information)
-    assert term.linearise(state).residual[:, :3].abs().max() < 1e-12
-    verify_jacobian(
-        lambda x: (information @ term.errors(x.pose)[0][..., None])[..., 0],
-        state,
-        information @ term.linearise(state).jacobian,
-    )
-    assert_gradient(known(retract(retract(state.pose, about), 0.3 * off), information), state)
+    term = pose_term(retract(state.pose, about), information, generator)
+    linear = term.linearise(state)
+    assert linear.residual[:, :3].abs().max() < 1e-12
+    verify_jacobian(lambda x: (known @ term.errors(x.pose)[0][..., None])[..., 0], state, known @ linear.jacobian)
+    assert_gradient(pose_term(retract(retract(state.pose, about), 0.3 * off), information, generator), state)
 
 
 @pytest.mark.parametrize("unknown", [1, 2, 3])
@@ -138,57 +121,57 @@ def test_a_camera_term_is_linearised(unknown, state):
 
 @pytest.mark.parametrize("kind", [informative, gravity, drawn])
 def test_pose_is_a_minimum_of_the_whole_cost(kind, make_problems, generator):
-    problems = make_problems(n=8, batch=20, outliers=0)
-    prior = kind(problems, generator)._replace(scale=torch.full((20,), torch.inf, dtype=torch.float64))
+    p = make_problems(n=8, batch=20)
+    prior = kind(p, generator)._replace(scale=torch.full((20,), torch.inf, dtype=torch.float64))
     with torch.no_grad():
-        result = refiner()(*problems[:3], prior=prior, init=problems.pose, img_sigma=2.0)
-    centre, focal = problems.intrinsics[:, None, :2, 2], problems.intrinsics[0, 0, 0]
-    problem = Problem.of(problems.world_points, problems.img_points - centre, focal)
+        state = State.of(refiner(40)(*p[:3], prior=prior, init=p.pose, img_sigma=2.0).pose)
+    problem = Problem.of(p.world_points, p.img_points, p.intrinsics[0, 0, 0])
     term, _ = PoseTerm.of(prior, torch.zeros(20, 3).double(), torch.ones(20).double())
 
     def of_pairs(state):
         return project(state, problem).sq_residual.sum(1, keepdim=True) / 4.0
 
-    state = State.of(result.pose)
     alone = derivative(of_pairs, state)[:, 0]
     whole = derivative(lambda x: of_pairs(x) + term.errors(x.pose)[1][:, None], state)[:, 0]
     assert (whole.norm(dim=-1) < 1e-5 * alone.norm(dim=-1)).all()
 
 
-def test_a_prior_without_information_is_a_start_alone(make_problems):
+@pytest.mark.parametrize("name", ["pnpnet-set", "epnp-lm", "p3p-ransac"])
+def test_a_prior_without_information_is_a_start_alone(name, make_problems):
     problems = make_problems(n=9, batch=10, outliers=2)
     nothing = PosePrior(problems.pose, torch.zeros(10, 6, 6, dtype=torch.float64))
-    for name in ("pnpnet-set", "epnp-lm", "p3p-ransac"):
-        solver = create_solver(name)
-        with torch.no_grad():
-            expected = solver(*problems[:3], init=problems.pose)
-            found = solver(*problems[:3], prior=nothing)
-        torch.testing.assert_close(found.matrix, expected.matrix)
+    solver = create_solver(name)
+    found, expected = solver(*problems[:3], prior=nothing), solver(*problems[:3], init=problems.pose)
+    torch.testing.assert_close(found.matrix, expected.matrix)
 
 
 def test_what_is_known_helps_and_what_is_wrong_hardly_harms(make_problems, generator):
     solver = create_solver("pnpnet-set")
     three = make_problems(n=3, batch=500, outliers=0)
     nine = make_problems(n=9, batch=500, outliers=3)
-    with torch.no_grad():
-        assert rate(solver(*three[:3], prior=drawn(three, generator), **SIGMAS), three) > (
-            rate(solver(*three[:3], **SIGMAS), three) + 0.15
-        )
-        alone = rate(solver(*nine[:3], **SIGMAS), nine)
-        assert rate(solver(*nine[:3], prior=drawn(nine, generator), **SIGMAS), nine) > alone + 0.04
-        for kind in (drawn, gravity):
-            for wrong in (10.0, 100.0):
-                assert rate(solver(*nine[:3], prior=kind(nine, generator, wrong), **SIGMAS), nine) > alone - 0.03
+
+    def found(problems, prior=None):
+        with torch.no_grad():
+            return rate(solver(*problems[:3], prior=prior, **SIGMAS), problems)
+
+    assert found(three, drawn(three, generator)) > found(three) + 0.15
+    alone = found(nine)
+    assert found(nine, drawn(nine, generator)) > alone + 0.04
+    for kind, wrong in product((drawn, gravity), (10.0, 100.0)):
+        assert found(nine, kind(nine, generator, wrong)) > alone - 0.03
 
 
-@pytest.mark.parametrize("effort", ["fixed", "adaptive"])
-def test_gravity_chooses_among_poses(effort, make_problems, generator):
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [("pnpnet-set", {"effort": "fixed"}), ("pnpnet-set", {"effort": "adaptive"}), ("p3p-ransac", {"threshold": 10.0})],
+)
+def test_gravity_chooses_among_poses(name, options, make_problems, generator):
     """Of four pairs with one outlier, three decide: gravity tells their poses apart."""
     problems = make_problems(n=4, batch=500, outliers=1)
-    for solver in (create_solver("pnpnet-set", effort=effort), create_solver("p3p-ransac", threshold=10.0)):
-        with torch.no_grad():
-            alone = rate(solver(*problems[:3], **SIGMAS), problems)
-            assert rate(solver(*problems[:3], prior=gravity(problems, generator), **SIGMAS), problems) > alone + 0.02
+    solver = create_solver(name, **options)
+    with torch.no_grad():
+        found = [solver(*problems[:3], prior=x, **SIGMAS) for x in (None, gravity(problems, generator))]
+    assert rate(found[1], problems) > rate(found[0], problems) + 0.02
 
 
 def test_opposite_directions(generator):
@@ -199,25 +182,24 @@ def test_opposite_directions(generator):
 
 
 def test_gradients(make_problems, generator):
+    """To the pose, information and scale of a prior, and through the function that makes one of gravity."""
     problems = make_problems(n=5, batch=1, outliers=0)
-    prior, (world, img, camera) = drawn(problems, generator), problems[:3]
-    solver = refiner(10)
-    zero, root = torch.zeros(1, 6, dtype=torch.float64), prior.information.diagonal(dim1=1, dim2=2).sqrt()
-
-    def answer(delta, root, scale):
-        known = PosePrior(retract(prior.pose, delta), torch.diag_embed(root**2), scale)
-        return solver(world, img, camera, prior=known, gradient="always", img_sigma=1.0).matrix[:, :3]
-
-    inputs = zero, root, torch.full((1,), 2.0, dtype=torch.float64)
-    assert torch.autograd.gradcheck(answer, [x.requires_grad_() for x in inputs], eps=1e-6, atol=1e-4, rtol=1e-3)
-
+    prior, truth = drawn(problems, generator), problems.pose
+    root = prior.information.diagonal(dim1=1, dim2=2).sqrt()
     down = torch.randn(1, 3, generator=generator, dtype=torch.float64)
-    cam = (problems.pose.rotation @ down[..., None])[..., 0] + 0.01
-    sigma = torch.full((1,), 0.02, dtype=torch.float64)
+    cam = (truth.rotation @ down[..., None])[..., 0] + 0.01
 
-    def level(down, cam, sigma):
-        known = gravity_prior(down, cam, sigma)
-        return solver(world, img, camera, prior=known, init=problems.pose, gradient="always", img_sigma=1.0).matrix
+    def given(delta, root, scale):
+        return PosePrior(retract(prior.pose, delta), torch.diag_embed(root**2), scale)
 
-    inputs = [x.requires_grad_() for x in (down, cam, sigma)]
-    assert torch.autograd.gradcheck(level, inputs, eps=1e-6, atol=1e-4, rtol=1e-3, fast_mode=True)
+    for make, inputs in (
+        (given, (torch.zeros(1, 6).double(), root, torch.full((1,), 2.0, dtype=torch.float64))),
+        (gravity_prior, (down, cam, torch.full((1,), 0.02, dtype=torch.float64))),
+    ):
+
+        def answer(*values, make=make):
+            options = {"init": truth, "gradient": "always", "img_sigma": 1.0}
+            return refiner(10)(*problems[:3], prior=make(*values), **options).matrix[:, :3]
+
+        leaves = [x.requires_grad_() for x in inputs]
+        assert torch.autograd.gradcheck(answer, leaves, eps=1e-6, atol=1e-4, rtol=1e-3, fast_mode=True)

@@ -1,14 +1,34 @@
-"""Derivatives of functions of a state, by automatic differentiation and by central differences."""
+"""Helpers that several tests share: comparisons, the share of problems that are solved, and derivatives."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
+from kornia_pnpnet import Pose, Problems, pose_errors, success
 from kornia_pnpnet.problem import State
 from kornia_pnpnet.refine.residual import moved
+
+
+def assert_same(one: Any, two: Any, rtol: float = 0.0, atol: float = 0.0) -> None:
+    """The same tensors in two trees, to the bit unless a tolerance is given."""
+    for a, b in zip(pytree.tree_leaves(one), pytree.tree_leaves(two), strict=True):
+        torch.testing.assert_close(a, b, rtol=rtol, atol=atol)
+
+
+def rate(result: Any, problems: Problems, **limits: float) -> float:
+    """The share of problems whose pose is right."""
+    return success(pose_errors(result.pose, problems.pose), **limits).double().mean().item()
+
+
+def reprojection_errors(problems: Problems, pose: Pose) -> Tensor:
+    """Pixels of the points under poses minus those of the problems, (B, N, 2)."""
+    seen = (problems.world_points @ pose.rotation.mT + pose.translation[:, None]) @ problems.intrinsics.mT
+    return seen[..., :2] / seen[..., 2:] - problems.img_points
 
 
 def derivative(function: Callable[[State], Tensor], state: State) -> Tensor:
