@@ -9,7 +9,7 @@ from helpers import assert_same
 from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ValueCheckError
-from laws import CAMERAS, FOCALS, LAWS, NOISES, PEERS, Case, applies, build, copies_are_the_same, gradcheck, make
+from laws import CAMERAS, FOCALS, LAWS, NOISES, PEERS, Case, applies, build, gradcheck, make
 from strategies import many
 
 from kornia_pnpnet import heatmap_keypoints
@@ -36,9 +36,7 @@ REFUSED = [Case(name, camera, focal="unknown") for name, camera in product(SOLVE
 def params(laws, cases, *marks):
     pairs = ((law, case) for case in cases if not case.is_refused for law in laws if applies(law, case))
     for law, case in pairs:
-        unsaved = law is copies_are_the_same and case.solver in ("epnp", "reppnp")
-        defect = [pytest.mark.xfail(reason="saved hyperparameters at their bounds cannot be loaded")] * unsaved
-        yield pytest.param(law, case, id=f"{law.__name__}-{case}", marks=(*marks, *defect))
+        yield pytest.param(law, case, id=f"{law.__name__}-{case}", marks=marks)
 
 
 @pytest.mark.parametrize(

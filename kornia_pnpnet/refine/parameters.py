@@ -12,6 +12,9 @@ from kornia_pnpnet.core.checks import check_numbers, check_whole
 
 __all__ = ["BoundedParameter"]
 
+# Parameter of a value at its bound: the sigmoid of 1000 rounds to 1 in float64.
+_BOUND = 1e3
+
 
 class BoundedParameter(nn.Module):
     r"""Values that are learned without bounds and used within bounds.
@@ -43,7 +46,8 @@ class BoundedParameter(nn.Module):
         self._logarithmic = logarithmic
         self._lower, self._upper = (math.log(lower), math.log(upper)) if logarithmic else (lower, upper)
         share = ((math.log(initial) if logarithmic else initial) - self._lower) / (self._upper - self._lower)
-        self.raw = nn.Parameter(torch.full((size,), share).logit())
+        # At a bound the parameter is finite, so that it can be saved, and its sigmoid is exactly 0 or 1.
+        self.raw = nn.Parameter(torch.full((size,), share).logit().clamp(-_BOUND, _BOUND))
 
     def forward(self) -> Tensor:
         """Return the bounded values, shape ``(size,)``."""

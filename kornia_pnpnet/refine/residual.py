@@ -21,7 +21,7 @@ from kornia.geometry.liegroup import So3
 from torch import Tensor
 
 from kornia_pnpnet.core.linalg import dot, solve_positive
-from kornia_pnpnet.core.performance import are_few
+from kornia_pnpnet.core.performance import are_few, compiling
 from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.problem import Noise, Problem, State
@@ -340,6 +340,11 @@ def _columns(projection: Projection, problem: Problem) -> list[_Column]:
     return [*turns, *shifts, (p * y3, q * y3)] if projection.state.camera.shape[1] else [*turns, *shifts]
 
 
+def _cross(a: list[Tensor], b: list[Tensor]) -> list[Tensor]:
+    """Cross product of two vectors given by their entries."""
+    return [torch.addcmul(a[i] * b[j], a[j], b[i], value=-1) for i, j in ((1, 2), (2, 0), (0, 1))]
+
+
 def _times(a: Any, b: Any) -> Any:
     """A product in which a factor that is known to be 0 or 1 costs nothing."""
     if type(a) is float:
@@ -407,12 +412,17 @@ def moved(state: State, delta: Tensor) -> State:
     world, keeps its pixel and its scale. A change of the focal length and a shift along the axis look alike from far
     away; they are then well separated parameters.
     """
-    half = (0.5 * delta[:3])[:, None]  # (3, 1, B)
-    rotation = state.pose.rotation.permute(1, 2, 0)
-    once = torch.linalg.cross(half, rotation, dim=0)
-    twice = once + torch.linalg.cross(half, once, dim=0)
+    half, rotation = 0.5 * delta[:3], state.pose.rotation.permute(1, 2, 0)
     factor = 2.0 / (1.0 + half.square().sum(0))
-    rotation = torch.addcmul(rotation, factor, twice).permute(2, 0, 1)
+    if not compiling():
+        once = torch.linalg.cross(half[:, None], rotation, dim=0)
+        rotation = torch.addcmul(rotation, factor, once + torch.linalg.cross(half[:, None], once, dim=0))
+    else:  # entry by entry: the code of `linalg.cross` computes the vector and the factor anew for each entry
+        once = [_cross([*half], [*column]) for column in rotation.unbind(1)]
+        twice = [_cross([*half], column) for column in once]
+        turned = [[x + y for x, y in zip(*both, strict=True)] for both in zip(once, twice, strict=True)]
+        rotation = torch.addcmul(rotation, factor, torch.stack([torch.stack(x) for x in turned], 1))
+    rotation = rotation.permute(2, 0, 1)
     translation = state.pose.translation + delta[3:6].mT
     if not state.camera.shape[1]:
         return State(Pose(rotation, translation), state.camera)

@@ -195,11 +195,10 @@ class PoseTerm(NamedTuple):
             :math:`(B, 6)`; the squared length, :math:`(B,)`.
         """
         turn = self.pose.rotation @ pose.rotation.mT
-        # Turn the prior's pose about its free axis to the angle nearest to the pose. The error has no derivative by
-        # this angle.
-        free, fixed = self.free, turn.detach()
-        along = fixed.diagonal(dim1=-2, dim2=-1).sum(-1) - (free * (fixed @ free[..., None])[..., 0]).sum(-1)
-        around = -(free * So3.vee(fixed - fixed.mT)).sum(-1)
+        # Turn the prior's pose about its free axis to the angle nearest to the pose.
+        free = self.free
+        along = turn.diagonal(dim1=-2, dim2=-1).sum(-1) - (free * (turn @ free[..., None])[..., 0]).sum(-1)
+        around = -(free * So3.vee(turn - turn.mT)).sum(-1)
         length = torch.hypot(along, around)
         sound = length > torch.finfo(length.dtype).eps
         length = torch.where(sound, length, 1.0)
@@ -220,6 +219,9 @@ class PoseTerm(NamedTuple):
         eye = torch.eye(3, dtype=error.dtype, device=error.device)
         turned = (state.pose.rotation * self.offset[:, None]).sum(-1)
         rows = eye + So3.hat(half) + half[:, :, None] * half[:, None]
+        # The nearest pose that the term allows turns about the free axis, too.
+        follows = self.free - torch.linalg.cross(half, self.free)
+        rows = rows - follows[:, :, None] * (self.free[:, None] @ rows)
         by_turn = torch.cat((-rows, -So3.hat(turned)), 1)
         by_shift = torch.cat((torch.zeros_like(rows), -eye.expand_as(rows)), 1)
         columns = [by_turn, by_shift]
