@@ -122,16 +122,14 @@ def _frame(affine: Tensor, squares: Tensor) -> Tensor:
     p, q = affine.unbind(1)
     product = (p * q).sum(-1, keepdim=True)  # (B, 1)
     # The inverse square root of the Gram matrix S of the rows, up to a factor: (S + sqrt(det S) I)^-1.
-    ridge = 1e-3 * squares.sum(-1, keepdim=True) + 1e-6
-    raised = squares + ridge
-    root = (raised[:, :1] * raised[:, 1:] - product.square()).clamp(min=1e-12).sqrt()
+    raised = squares + (1e-3 * squares.sum(-1, keepdim=True) + 1e-6)
+    root = (raised.prod(-1, keepdim=True) - product.square()).clamp(min=1e-12).sqrt()
     diagonal = raised.flip(-1) + root
     u, v = (diagonal[..., None] * affine - product[..., None] * affine.flip(1)).unbind(1)
     eye = torch.eye(3, dtype=u.dtype, device=u.device)
     u = functional.normalize(u + 1e-6 * eye[0], dim=-1)
     # A vector that is orthogonal to u: the reflection that maps u to an axis ±z takes x to it.
-    sign = 1.0 - 2.0 * (u[:, 2:] < 0).to(u.dtype)
+    sign = torch.where(u[:, 2:] < 0, -1.0, 1.0)
     orthogonal = eye[0] - (u[:, :1] / (1.0 + sign * u[:, 2:])) * (u + sign * eye[2])
-    v = v - (u * v).sum(-1, keepdim=True) * u + 1e-6 * orthogonal
-    v = functional.normalize(v, dim=-1)
+    v = functional.normalize(v - (u * v).sum(-1, keepdim=True) * u + 1e-6 * orthogonal, dim=-1)
     return torch.stack((u, v, torch.linalg.cross(u, v)), 1)
