@@ -122,9 +122,16 @@ def monte_carlo_pose_loss(
     if img_sigma is None and img_cov is None:
         raise ValueCheckError("monte_carlo_pose_loss needs the noise of the pixels: img_sigma or img_cov.")
     noisy_points = world_sigma is not None or world_cov is not None
-    sigmas = {"img_sigma": img_sigma, "world_sigma": world_sigma if noisy_points else 0.0}
-    arguments = world_points, img_points, intrinsics, weights, mask
-    checked = [checked_inputs(*arguments, x, **sigmas, img_cov=img_cov, world_cov=world_cov) for x in (truth, *others)]
+    checked = [
+        checked_inputs(
+            *(world_points, img_points, intrinsics, weights, mask, pose),
+            img_sigma=img_sigma,
+            world_sigma=world_sigma if noisy_points else 0.0,
+            img_cov=img_cov,
+            world_cov=world_cov,
+        )
+        for pose in (truth, *others)
+    ]
     size, inputs = checked[0]
     noise = inputs.noise
     assert noise is not None
