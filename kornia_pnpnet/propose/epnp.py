@@ -102,15 +102,14 @@ class EPnP(Initialiser):
     weighted reprojection error is aligned with the world (orthogonal Procrustes).
 
     Source: V. Lepetit, F. Moreno-Noguer and P. Fua, "EPnP: An Accurate O(n) Solution to the PnP Problem", IJCV 2009.
-    Ours are the elimination of two thirds of the unknowns (see the module), the order of the null vectors (by their
-    algebraic error at equal depth of the centroid, not at equal length), a norm of the distances that does not depend
-    on the choice of the control points, and the algebraic error as a part of the objective: with a dozen noisy pairs
-    the null vectors are not equally free. Planar points use the same equations, with 0 as the fourth control point.
+    Our changes are the elimination of two thirds of the unknowns (see the module), an order of the null vectors by
+    their algebraic error at equal depth of the centroid, a norm of the distances that does not depend on the choice of
+    the control points, and the algebraic error as a part of the objective: with a dozen noisy pairs the null vectors
+    are not equally free. Planar points use the same equations, with 0 as the fourth control point.
 
     Four or five pairs leave up to four solutions, and the solution with the least reprojection error may be incorrect.
     A problem is not ``ok`` with fewer than four pairs, with points on a line, and when fewer than three pairs are in
-    front of the camera. Gradients to points, pixels and weights are those of the minimum, by the implicit function
-    theorem.
+    front of the camera. Gradients are those of the minimum, by the implicit function theorem.
 
     Args:
         iterations: number of Gauss-Newton steps, at least 2: two steps in every case, the other steps in the best case.

@@ -50,14 +50,14 @@ class REPPnP(Initialiser):
     Source: L. Ferraz, X. Binefa and F. Moreno-Noguer, "Very Fast Solution to the PnP Problem with Algebraic Outlier
     Rejection", CVPR 2014. Our changes are for success on the protocol's problems and for batches:
 
-    - The null vector has the least error with the centroid at depth 1, instead of length 1: a linear system that does
-      not depend on the control points, the frame or the unit. A small ridge keeps the other depths close to the
-      centroid's, so that the fit bends less to outliers and a narrow view is weak perspective.
+    - The null vector has the centroid at depth 1, instead of length 1: a linear system that does not depend on the
+      control points, the frame or the unit. A small ridge keeps the other depths close to the centroid's, so that the
+      fit bends less to outliers and a narrow view is weak perspective.
     - Pairs are compared by their leave-one-out error. The quantile is the median instead of 25 %, and at least 7 pairs
       are kept.
-    - The same loop continues with a rigid motion and one Gauss-Newton step of its algebraic error per iteration, and
-      the pose minimises this error. The paper alternates between the span of four null vectors and rigid points.
-    - Both loops have a fixed length; the paper's loop stops when the quantile no longer falls.
+    - The loop continues with a rigid motion and one Gauss-Newton step of its algebraic error per iteration, and the
+      pose minimises this error. The paper alternates between the span of four null vectors and rigid points.
+    - Both loops have a fixed length. The paper's loop stops when the quantile no longer falls.
 
     Gradients: the selection is piecewise constant, and the last Gauss-Newton steps start from a detached pose, so that
     their gradient is that of the minimum.

@@ -121,7 +121,7 @@ def _support(rotation: Tensor, translation: Tensor, judges: Tensor) -> Tensor:
 
 
 class _Block(nn.Module):
-    """A residual layer on each pair, with a context that attention pools over all pairs."""
+    """A residual layer on each pair and on a context: attention pools the context over all pairs."""
 
     def __init__(self, width: int, heads: int, hidden: int) -> None:
         super().__init__()
@@ -174,9 +174,9 @@ class SetInit(Initialiser):
     also form minimal samples of three (see :func:`~kornia_pnpnet.propose.p3p`). The best of their poses, scored by the
     32 likeliest pairs, is one more hypothesis, without gradient.
 
-    The weight of a pair is the estimated probability that it is an inlier. The noise is that of the problem where
-    known, else the network's estimate; of a covariance the network sees the isotropic noise of the same trace. The
-    network runs in the dtype of its weights, everything around it in the dtype of the correspondences.
+    The weight of a pair is the estimated probability that it is an inlier. Where the noise of the problem is unknown,
+    the network estimates it; of a covariance the network sees the isotropic noise of the same trace. The network runs
+    in the dtype of its weights, everything around it in the dtype of the correspondences.
 
     The design is ours. Distances along rays before a closed-form alignment: J. Hesch and S. Roumeliotis, "A direct
     least-squares method for PnP", ICCV 2011; attention pooled over correspondences: W. Sun et al., "ACNe: Attentive

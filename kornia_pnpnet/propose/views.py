@@ -1,4 +1,4 @@
-"""Views: a network answers the mirror images of a problem differently, and each answer is a pose to start from."""
+"""Views: a network answers each mirror image of a problem differently, and each answer is a pose to start from."""
 
 from __future__ import annotations
 
