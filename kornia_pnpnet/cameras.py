@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from kornia.core.exceptions import ShapeError, ValueCheckError
 from kornia.geometry.calibration import distort_points
-from kornia.geometry.conversions import convert_points_to_homogeneous
+from kornia.geometry.conversions import convert_points_to_homogeneous, normalize_points_with_intrinsics
 from kornia.geometry.linalg import transform_points
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -171,8 +171,9 @@ def _through(
         coefficients, sound = torch.where(finite[:, None], coefficients, 0.0), sound & finite
     lens = _lens(coefficients, is_fisheye=dist is None)
     there = img_points.detach().isfinite().all(-1) & sound[:, None]
-    to_plane = torch.linalg.inv_ex(camera).inverse  # Kornia's conversions with intrinsics ignore a skew
-    point, found = _invert(lens, transform_points(to_plane, torch.where(there[..., None], img_points, 0.0)))
+    x, y = normalize_points_with_intrinsics(torch.where(there[..., None], img_points, 0.0), camera).unbind(-1)
+    skew = camera[:, None, 0, 1] / camera[:, None, 0, 0]  # Kornia ignores it
+    point, found = _invert(lens, torch.stack((x - skew * y, y), -1))
     return point, found & there, lens
 
 
