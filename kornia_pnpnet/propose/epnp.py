@@ -167,8 +167,7 @@ class EPnP(Initialiser):
 
     def _depths(self, system: _DepthSystem) -> tuple[Tensor, Tensor]:
         """The depths (4, 1, B) of the best case, and whether they were found (B,); where not, equal depths."""
-        basis = _null_space(system)
-        cases = _four_cases(system, basis).detach()  # forward mode starts here: roots of 0 have no derivative
+        cases = _four_cases(system).detach()  # forward mode starts here: the square roots of 0 have no derivative
         # A shape and its mirror image along the optical axis have the same distances, and Gauss-Newton does not change
         # the one into the other: symmetric points need both.
         mirrored = torch.cat((cases[:1, -1:], -cases[1:, -1:]))
@@ -177,7 +176,7 @@ class EPnP(Initialiser):
         depths = _minimize(system, best, self.iterations - _CASE_ITERATIONS)
         # Depths beyond the precision of the dtype are a failure; NaN compares false.
         solved = (depths.abs() < 1.0 / torch.finfo(depths.dtype).eps).all(0)
-        return torch.where(solved, depths, basis.new_tensor((1.0, 0.0, 0.0, 0.0))[:, None, None]), solved[0]
+        return torch.where(solved, depths, system.maps[2, 0]), solved[0]
 
 
 class _DepthSystem(NamedTuple):
@@ -243,13 +242,14 @@ def _null_space(system: _DepthSystem) -> Tensor:
     return torch.cat((eye[:1].expand(1, 4, len(spread)), torch.cat((usual, directions), 1)))
 
 
-def _four_cases(system: _DepthSystem, basis: Tensor) -> Tensor:
+def _four_cases(system: _DepthSystem) -> Tensor:
     r"""The depths of the paper's four cases, which differ in the number of null vectors, (4, 4 cases, B).
 
     For :math:`N = 1, 2, 3` the products of the betas are found by least squares; for N = 3 without :math:`\beta_3^2`,
     the smallest product. N = 4 adds :math:`\beta_1 \beta_4`, so that there are as many unknowns as equations (the paper
     linearises the four remaining products again). The systems of all cases are leading blocks of one system.
     """
+    basis = _null_space(system)
     vectors = _in_camera(system, basis)[:, 1:]  # (3 axes, 3 vectors, 4 null vectors, B)
     left, right = (vectors[:, :, index] for index in map(list, zip(*_PRODUCTS, strict=True)))
     half = (left[:, :, None] * right[:, None]).sum(0)

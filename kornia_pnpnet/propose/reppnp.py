@@ -199,7 +199,7 @@ def _inverse(normal: Tensor, ridge: Tensor | float = 0.0) -> Tensor:
 def _null_vector(rows: Tensor, weights: Tensor, depth_prior: float) -> tuple[Tensor, Tensor]:
     """The inverse normal matrix, and the control points of least error, (B, 12, 1): x and y, the depths, and 1."""
     normal = _normal_matrix(rows, weights)
-    inverse = _inverse(normal, normal.new_tensor([0.0] * 8 + [depth_prior] * 3))
+    inverse = _inverse(normal, depth_prior * (torch.arange(11, device=normal.device) >= 8))
     return inverse, torch.cat((-(inverse @ normal[..., -1:]), torch.ones_like(normal[:, :1, :1])), 1)
 
 
