@@ -44,10 +44,10 @@ def undistort(
         noise: noise of the pixels that were given.
 
     Returns:
-        The pixels, the principal point where there is none; which pairs have one, bool :math:`(B, N)`; the noise of the
-        new pixels. There is none beyond what the coefficients were calibrated for, for points more than 85 degrees off
-        the axis, and for pixels, coefficients or cameras that are not finite. A standard deviation stays isotropic: it
-        is multiplied by the root mean square of the map's singular values.
+        The pixels; which pairs have one, bool :math:`(B, N)`; the noise of the new pixels. A pair has no pixel beyond
+        the turning point of the polynomial, more than 85 degrees off the axis, and where pixel, coefficients or camera
+        are not finite: the principal point then stands in. A standard deviation stays isotropic: it is multiplied by
+        the root mean square of the map's singular values.
     """
     camera, _ = pinholes(intrinsics)
     point, found, lens = _through(dist, fisheye, img_points, intrinsics)
@@ -77,13 +77,12 @@ def bearings(
     Args:
         img_points: shape :math:`(B, N, 2)`.
         intrinsics: shape :math:`(B, 3, 3)` or :math:`(3, 3)`.
-        dist: coefficients of :func:`kornia.geometry.calibration.distort_points`, 4, 5, 8, 12 or 14 numbers, shape
-            :math:`(B, D)` or :math:`(D,)`.
-        fisheye: coefficients of ``cv2.fisheye``, shape :math:`(B, 4)` or :math:`(4,)`, in place of ``dist``.
+        dist: see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`.
+        fisheye: see ``PnPNet.forward``.
 
     Returns:
-        Unit vectors in the camera's frame, shape :math:`(B, N, 3)`, to use in place of pixels; NaN, without gradient,
-        where a pixel has no direction.
+        Unit vectors in the camera's frame, shape :math:`(B, N, 3)`, which a solver takes in place of pixels; NaN,
+        without gradient, where a pixel has no direction.
 
     Raises:
         ShapeError: for another number of coefficients.
@@ -110,7 +109,7 @@ def bearings(
 
 
 def check_coefficients(dist: Tensor | None, fisheye: Tensor | None) -> None:
-    """Raise unless there is one kind of coefficients at most, and as many of them as the model has."""
+    """Raise for both kinds of coefficients, and for a number of coefficients that no model has."""
     if dist is not None and fisheye is not None:
         raise ValueCheckError("Give dist or fisheye, not both.")
     for name, given, sizes in (("dist", dist, _COEFFICIENTS), ("fisheye", fisheye, (4,))):
@@ -129,8 +128,8 @@ def bearing_cameras(rays: Tensor) -> tuple[Tensor, Tensor]:
         rays: directions of any length but 0, shape :math:`(B, N, 3)`.
 
     Returns:
-        Rotations :math:`(B, N, 3, 3)`, half turns with or without a half turn about the x axis, and whether the
-        direction is finite and not 0, bool :math:`(B, N)`; the rotation is a constant where it is not.
+        Rotations :math:`(B, N, 3, 3)`, and whether the direction is finite and not 0, bool :math:`(B, N)`. Where it is
+        not, the rotation is constant.
 
     Example:
         >>> rotation, _ = bearing_cameras(torch.tensor([[[3.0, 0.0, -4.0]]]))
@@ -150,9 +149,9 @@ def bearing_cameras(rays: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def pinholes(intrinsics: Tensor) -> tuple[Tensor, Tensor]:
-    """Camera matrices (*, 3, 3) scaled to a last entry of 1, and which are those of pinhole cameras, bool (*).
+    """Camera matrices (*, 3, 3) scaled to a last entry of 1, and whether they are sound, bool (*).
 
-    A matrix becomes the identity, without gradient, where an entry is not finite or a focal length is not positive.
+    Where an entry is not finite or a focal length is not positive, the identity without gradient is returned.
     """
     scaled = intrinsics.detach() / intrinsics.detach()[..., 2:, 2:]
     sound = scaled.isfinite().all(-1).all(-1) & (scaled.diagonal(dim1=-2, dim2=-1) > 0).all(-1)
@@ -164,7 +163,7 @@ def pinholes(intrinsics: Tensor) -> tuple[Tensor, Tensor]:
 def _through(
     dist: Tensor | None, fisheye: Tensor | None, img_points: Tensor, intrinsics: Tensor
 ) -> tuple[Tensor, Tensor, Callable[[Tensor], Tensor]]:
-    """Points that a lens shows at the pixels, see :func:`_lens`, which pixels have one, bool (B, N), and the lens."""
+    """The points that a lens maps to the pixels, which pixels have such a point, bool (B, N), and the lens."""
     camera, sound = pinholes(intrinsics)
     coefficients = fisheye if dist is None else dist
     if coefficients is not None:
@@ -173,7 +172,7 @@ def _through(
     lens = _lens(coefficients, is_fisheye=dist is None)
     there = img_points.detach().isfinite().all(-1) & sound[:, None]
     x, y = normalize_points_with_intrinsics(torch.where(there[..., None], img_points, 0.0), camera).unbind(-1)
-    skew = camera[:, None, 0, 1] / camera[:, None, 0, 0]  # which Kornia leaves out
+    skew = camera[:, None, 0, 1] / camera[:, None, 0, 0]  # Kornia ignores it
     point, found = _invert(lens, torch.stack((x - skew * y, y), -1))
     return point, found & there, lens
 
@@ -181,8 +180,8 @@ def _through(
 def _lens(coefficients: Tensor | None, *, is_fisheye: bool) -> Callable[[Tensor], Tensor]:
     """A lens as a map of points (B, N, 2) to the plane z = 1.
 
-    The points are those of the ideal plane, of a fisheye directions: unit vectors in the plane times the angle from the
-    axis, which stay finite at 90 degrees.
+    For ``dist`` the points are on the undistorted plane z = 1. For a fisheye they are directions: unit vectors in the
+    plane times the angle from the axis, which stay finite at 90 degrees.
     """
     if coefficients is None:
         return lambda point: point
@@ -201,7 +200,7 @@ def _lens(coefficients: Tensor | None, *, is_fisheye: bool) -> Callable[[Tensor]
 
 
 def _angle(point: Tensor) -> tuple[Tensor, Tensor]:
-    """Lengths (B, N, 1) with finite gradients, 1 where a point is at the centre, and where it is, bool (B, N, 1)."""
+    """Lengths (B, N, 1) with finite gradients, 1 for points at the centre, and which points are, bool (B, N, 1)."""
     square = point.square().sum(-1, keepdim=True)
     is_central = square.detach() < torch.finfo(point.dtype).eps ** 2
     return torch.where(is_central, 1.0, square).sqrt(), is_central
@@ -214,10 +213,10 @@ def _flatten(point: Tensor) -> Tensor:
 
 
 def _invert(lens: Callable[[Tensor], Tensor], target: Tensor) -> tuple[Tensor, Tensor]:
-    """Points (B, N, 2) that a lens takes to the target, 0 where there is no solution, and where there is one.
+    """Points (B, N, 2) that a lens maps to the target, 0 where there is no solution, and whether there is one.
 
-    A step of Newton's is as long as half of the target's distance at most. The last two steps carry the gradient, to
-    the target and to the coefficients of the lens; the second of them makes second derivatives exact.
+    A Newton step is at most half as long as the target's distance from the centre. The last two steps carry the
+    gradient to the target and to the coefficients; the second of them makes second derivatives exact.
     """
     with torch.no_grad():
         point = target
@@ -242,7 +241,7 @@ def _invert(lens: Callable[[Tensor], Tensor], target: Tensor) -> tuple[Tensor, T
 def _jacobian(function: Callable[[Tensor], Tensor], point: Tensor) -> Tensor:
     """Jacobians (B, N, 2, 2) of a map of each point by itself, by central differences.
 
-    They only steer Newton's method and the noise: what Newton's method converges to does not depend on them.
+    The solution of Newton's method does not depend on their accuracy.
     """
     size = torch.finfo(point.dtype).eps ** (1 / 3)
     step = size * torch.eye(2, dtype=point.dtype, device=point.device)

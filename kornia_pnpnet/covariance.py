@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from kornia.core.exceptions import ValueCheckError
 from kornia.geometry.camera import PinholeCamera
-from kornia.geometry.conversions import normalize_points_with_intrinsics
 from kornia.geometry.liegroup import So3
 from torch import Tensor
 
-from kornia_pnpnet.arguments import checked_noise
-from kornia_pnpnet.core.checks import Shapes, check_devices, check_positive, check_shapes, common_dtype
-from kornia_pnpnet.core.symmetric import are_semi_definite
+from kornia_pnpnet.arguments import checked_inputs, restore_leading
+from kornia_pnpnet.core.checks import check_positive
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.problem import LEAST_NOISE, Noise, Problem, State
+from kornia_pnpnet.frame import Normalize
+from kornia_pnpnet.problem import State
 from kornia_pnpnet.refine.information import pixel_precision
 from kornia_pnpnet.refine.residual import normal_equations, project
 from kornia_pnpnet.refine.terms import CameraTerm, PoseTerm, add_term
-from kornia_pnpnet.result import Pose, PosePrior, camera_matrices
+from kornia_pnpnet.result import Pose, PosePrior
 
 __all__ = ["pose_covariance"]
 
@@ -56,7 +54,7 @@ def pose_covariance(
 
     Args:
         pose: the estimated world-to-camera pose, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
-        world_points: see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`.
+        world_points: see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`, also for dimensions and dtypes.
         img_points: pixels; see ``PnPNet.forward``.
         intrinsics: see ``PnPNet.forward``.
         img_sigma: see ``PnPNet.forward``; required without ``img_cov``.
@@ -73,15 +71,12 @@ def pose_covariance(
 
     Returns:
         Shape :math:`(B, 6, 6)`, with an unknown focal length :math:`(B, 7, 7)`, whose last row and column are of the
-        logarithm of the focal length; in radians and the unit of the world, float64 when the points, the camera, the
-        weights or the pose are, else float32. Where the pairs do not determine the pose, or a covariance is not
-        positive semi-definite, the diagonal is infinite and all other entries are 0.
+        logarithm of the focal length; in radians and the unit of the world, in the dtype of a solver's result. Where
+        the pairs do not determine the pose, or a solver would refuse the problem, the diagonal is infinite and all
+        other entries are 0.
 
     Raises:
-        ShapeError: when shapes do not match.
-        TypeCheckError: when a sigma is neither a number nor a tensor, or a tensor holds booleans or complex numbers.
-        DeviceError: when tensors are on different devices.
-        ValueCheckError: without the noise of the pixels, with both a sigma and a covariance, or for another ``focal``.
+        BaseError: see ``PnPNet.forward``; without the noise of the pixels, or for another ``focal``.
 
     Example:
         >>> from kornia_pnpnet.data import SyntheticProblems
@@ -90,91 +85,60 @@ def pose_covariance(
         >>> pose_covariance(p.pose, p.world_points, p.img_points, p.intrinsics, **noise).shape
         torch.Size([2, 6, 6])
     """
-    KORNIA_CHECK_SHAPE(world_points, ["B", "N", "3"])
-    batch, count = world_points.shape[:2]
-    camera = camera_matrices(intrinsics)
-    shapes: Shapes = {
-        "img_points": (img_points, (batch, count, 2)),
-        "intrinsics": (camera, (3, 3) if camera.ndim == 2 else (batch, 3, 3)),
-        "rotation of the pose": (pose.rotation, (batch, 3, 3)),
-        "translation of the pose": (pose.translation, (batch, 3)),
-        "weights": (weights, (batch, count)),
-        "img_cov": (img_cov, (batch, count, 2, 2)),
-        "world_cov": (world_cov, (batch, count, 3, 3)),
-    }
-    check_shapes(shapes, world_points)
-    tensors = {name: tensor for name, (tensor, _) in shapes.items()}
-    check_devices(tensors, world_points)
-    dtype = common_dtype({"world_points": world_points, **tensors})
     if focal not in ("known", "unknown") or (focal == "known" and focal_sigma is not None):
         raise ValueCheckError(f"focal must be 'known', or 'unknown' with or without focal_sigma, got {focal!r}.")
     if img_sigma is None and img_cov is None:
         raise ValueCheckError("pose_covariance needs the noise of the pixels: img_sigma or img_cov.")
-    world_sigma = 0.0 if world_sigma is None and world_cov is None else world_sigma
-    noise = checked_noise(world_points.double(), img_sigma, world_sigma, img_cov, world_cov)
-    assert noise is not None
-    points, rotation, camera = world_points.double(), pose.rotation.double(), camera.double()
-    inlier = torch.ones_like(noise.img) if weights is None else _inlier_probability(weights.double())
-
-    # Coordinates in which the matrix is well conditioned: centroid 0, spread 1, focal length 1.
-    centroid = points.mean(1, keepdim=True)  # (B, 1, 3)
-    offsets = points - centroid
-    mean_square = offsets.square().sum(-1).mean(1, keepdim=True)  # (B, 1)
-    spread = torch.where(mean_square > 0, mean_square, 1.0).sqrt()
-    rotated_centroid = (rotation @ centroid.mT)[..., 0]  # (B, 3)
-    centred_pose = Pose(rotation, (pose.translation.double() + rotated_centroid) / spread)
-    rays = normalize_points_with_intrinsics(img_points.double(), camera.expand(batch, 3, 3))
-    mean_focal = camera.diagonal(dim1=-2, dim2=-1)[..., :2].log().mean(-1).exp().reshape(-1, 1)  # (B or 1, 1)
-    one = torch.ones_like(spread[:, 0])
-    problem = Problem.of(offsets / spread[..., None], rays, weights=inlier)
-    state = State(centred_pose, one.new_zeros(batch, 0 if focal == "known" else 1))
-
-    projection = project(state, problem)
-    sound = [(are_semi_definite(x) | (inlier == 0)).all(1) for x in noise.covariances]
-    noise = _in_unit_frame(noise, camera, mean_focal, spread, inlier != 0)
-    pair_weights = map_tensors(lambda x: inlier * x, pixel_precision(projection, problem, noise))
-    equations = normal_equations(projection, problem, pair_weights)
+    size, inputs = checked_inputs(
+        *(world_points, img_points, intrinsics, weights, None, pose),
+        img_sigma=img_sigma,
+        world_sigma=0.0 if world_sigma is None and world_cov is None else world_sigma,
+        img_cov=img_cov,
+        world_cov=world_cov,
+        prior=prior,
+    )
+    dtype, inputs = inputs.world_points.dtype, map_tensors(torch.Tensor.double, inputs)
+    # Coordinates in which the matrix is well conditioned: centroid 0 and spread 1.
+    problem, frame = Normalize(order=False)(*inputs[:5], inputs.noise)
+    assert inputs.init is not None
+    assert problem.noise is not None
+    pose = Pose(*inputs.init)
+    size_of_camera = 0 if focal == "known" else 1
+    state = State(frame.apply(pose), problem.weights.new_zeros(len(problem.weights), size_of_camera))
+    projection, inlier = project(state, problem), _inlier_probability(problem.weights)
+    precision = map_tensors(lambda x: inlier * x, pixel_precision(projection, problem, problem.noise))
+    equations, determined = normal_equations(projection, problem, precision), frame.valid
     if focal_sigma is not None:
         check_positive(focal_sigma=focal_sigma)
+        one = torch.ones_like(frame.scale)
         term = CameraTerm(one, one * focal_sigma**-2, one, one)
         equations = add_term(equations, term.linearise(state), problem.focal)
-    if prior is not None:
-        framed, usable = PoseTerm.of(map_tensors(torch.Tensor.double, prior), centroid[:, 0], spread[:, 0].reciprocal())
-        sound.append(usable)
-        equations = add_term(equations, framed.linearise(state), problem.focal)
-    information = equations.matrix.permute(2, 0, 1)
-    size = information.shape[-1]
-    eye = torch.eye(size, dtype=information.dtype, device=information.device)
+    if inputs.prior is not None:
+        framed, usable = PoseTerm.of(inputs.prior, frame.centroid, frame.scale)
+        equations, determined = add_term(equations, framed.linearise(state), problem.focal), determined & usable
+    information = equations.matrix.permute(2, 0, 1) * problem.focal.square()
+    eye = torch.eye(information.shape[-1], dtype=information.dtype, device=information.device)
     with torch.no_grad():
         unit = information.diagonal(dim1=1, dim2=2).rsqrt()
         correlation = unit[:, :, None] * information * unit[:, None]
         is_definite = torch.linalg.cholesky_ex(correlation - _LEAST_EIGENVALUE * eye).info == 0
-        determined = torch.stack((is_definite, correlation.isfinite().all((1, 2)), *sound)).all(0)[:, None, None]
+        determined = (determined & is_definite & correlation.isfinite().all((1, 2)))[:, None, None]
     inverse = torch.linalg.inv_ex(torch.where(determined, information, eye)).inverse
 
-    # Back to the given coordinates: omega stays, v = spread * v_centred + (R centroid) x omega.
-    back = eye.repeat(batch, 1, 1)
+    # Back to the given coordinates: omega stays, v = v_framed / scale + (R centroid) x omega.
+    rotated_centroid = (pose.rotation @ frame.centroid[..., None])[..., 0]
+    back = eye.repeat(len(information), 1, 1)
     back[:, 3:6, :3] = So3.hat(rotated_centroid)
-    back[:, 3:6, 3:6] *= spread[..., None]
-    if size == 7:  # the depth of the centroid grows with the focal length, see `moved`
-        back[:, 5, 6] = pose.translation[:, 2].double() + rotated_centroid[:, 2]
+    back[:, 3:6, 3:6] /= frame.scale[:, None, None]
+    if size_of_camera:  # the depth of the centroid grows with the focal length, see `moved`
+        back[:, 5, 6] = pose.translation[:, 2] + rotated_centroid[:, 2]
     covariance = back @ torch.where(determined, inverse, 0.0) @ back.mT
-    return torch.where(determined, covariance, torch.where(eye > 0, torch.inf, 0.0)).to(dtype)
+    covariance = torch.where(determined, covariance, torch.where(eye > 0, torch.inf, 0.0))
+    return restore_leading(size, covariance.to(dtype))
 
 
 def _inlier_probability(weights: Tensor) -> Tensor:
-    """Robust weights of inliers vary around their mean: this mean, as the inliers weigh it, and more count as 1."""
+    """Weights over the mean weight of an inlier, at most 1, see :func:`pose_covariance`."""
     total = weights.sum(-1, keepdim=True)
     mean = weights.square().sum(-1, keepdim=True) / torch.where(total > 0, total, 1.0)
     return (weights / torch.where(mean > 0, mean, 1.0)).clamp(max=1.0)
-
-
-def _in_unit_frame(noise: Noise, camera: Tensor, mean_focal: Tensor, spread: Tensor, used: Tensor) -> Noise:
-    """Noise in units of focal length and spread; covariances of pairs that are not ``used``, bool (B, N), are 0."""
-    img_cov, world_cov = map_tensors(lambda x: torch.where(used, x, 0.0), (noise.img_cov, noise.world_cov))
-    if img_cov is not None:
-        fx, fy, skew = (camera[..., i, j].reshape(-1, 1) for i, j in ((0, 0), (1, 1), (0, 1)))
-        img_cov = img_cov.mapped(1.0 / fx, -skew / (fx * fy), 1.0 / fy).at_least(LEAST_NOISE**2)
-    if world_cov is not None:
-        world_cov = world_cov.scaled(spread.square().reciprocal())
-    return Noise(noise.img / mean_focal, noise.world / spread, img_cov, world_cov)

@@ -36,16 +36,9 @@ _PRIOR_TRANSLATION = 0.5
 _WIDEST_ROTATION = 1.0
 # Iterations from the likeliest sample to the mode beside it, and their damping.
 _MODE_ITERATIONS, _MODE_DAMPING = 4, 1e-3
-# Share of the distance between camera and points. Nearer points, and points behind the camera, project as if they were
-# this far away, and their depth counts as a residual.
+# Share of the distance between camera and points. Points at a smaller depth, and points behind the camera, project from
+# this depth, and what is missing of it counts as a residual.
 _LEAST_DEPTH = 0.02
-
-
-class _Component(NamedTuple):
-    """A t distribution around a pose: its precision matrix is the square of the factor, lower triangular (B, 6, 6)."""
-
-    pose: Pose
-    factor: Tensor
 
 
 def monte_carlo_pose_loss(
@@ -77,8 +70,8 @@ def monte_carlo_pose_loss(
     Samples come in equal numbers from the prior, from a t distribution around the true pose and around each hypothesis,
     with the precision of the normal equations there, and from ``rounds`` more, each around the mode next to the
     likeliest sample so far. The prior :math:`p_0` has uniform rotations, and translations of a t distribution around
-    the true one as wide as half the distance between camera and points. It only matters while the correspondences say
-    little.
+    the true one as wide as half the distance between camera and points. The prior only matters while the
+    correspondences say little.
 
     Gradients flow to points, pixels, cameras, weights, sigmas and covariances, not to the poses. A problem that a
     solver would refuse (NaN, points on a line, no pinhole camera) has the loss 0 without gradient.
@@ -140,110 +133,121 @@ def monte_carlo_pose_loss(
         for pose in (truth, *others)
     ]
     size, inputs = checked[0]
-    given = [Pose(*x.init) for _, x in checked if x.init is not None]
     noise = inputs.noise
     assert noise is not None
-    known = noise.img.isfinite().all(1) & (noise.img > 0).all(1) & noise.world.isfinite().all(1)
+    known = (noise.img.isfinite() & (noise.img > 0) & noise.world.isfinite()).all(1)
     img, world = (torch.where(known[:, None], x, 1.0) for x in noise[:2])
-    noise = noise._replace(img=img, world=world)
+    with torch.no_grad():  # the frame is a constant: its gradient would only add noise to that of the integral
+        _, frame = Normalize(order=False)(*inputs[:5], noise._replace(img=img, world=world))
+    unit = frame.scale[:, None]
+    world_noise = None if noise.world_cov is None else noise.world_cov.scaled(unit.square())
+    noise = noise._replace(img=img, world=world * unit, world_cov=world_noise)
+    points = (inputs.world_points - frame.centroid[:, None]) * unit[..., None]
+    problem, _ = Normalize(center=False, scale=False, order=False)(points, *inputs[1:5], noise)
 
-    with torch.no_grad():
-        _, frame = Normalize(order=False)(*inputs[:5], noise)
-    problem, _ = Normalize(center=False, scale=False, order=False)(*inputs[:5], noise)
-    # The frame is a constant: its gradient would only add noise to that of the integral.
-    there = frame.valid[:, None, None] & (problem.weights > 0)[..., None]
-    world = torch.where(there, (problem.world_points - frame.centroid[:, None]) * frame.scale[:, None, None], 0.0)
-    assert problem.noise is not None
-    noise = problem.noise._replace(world=problem.noise.world * frame.scale[:, None])
-    if noise.world_cov is not None:
-        noise = noise._replace(world_cov=noise.world_cov.scaled(frame.scale.square()[:, None]))
-    problem = problem._replace(world_points=world, noise=noise)
-
-    live = frame.valid & known
+    live, eye, poses = frame.valid & known, torch.eye(3).to(points), []
+    given = [x.init for _, x in checked if x.init is not None]
     for pose in given:
-        live = live & pose.matrix.isfinite().all(-1).all(-1)
-    eye = torch.eye(3).to(world)
-    poses = []
+        live = live & torch.cat((pose.rotation.flatten(1), pose.translation), 1).isfinite().all(1)
     for pose in given:  # a problem that is refused has a constant pose
         rotation = torch.where(live[:, None, None], pose.rotation.detach(), eye)
         poses.append(frame.apply(Pose(rotation, torch.where(live[:, None], pose.translation.detach(), eye[2]))))
     refine = RobustWeightedLM(
         _MODE_ITERATIONS, kernel=kernel, robustness=scale, damping=_MODE_DAMPING, reject_worse=False, learnable=False
-    ).to(world)
-    model = _Posterior(problem, poses[0].translation, refine, world.new_tensor(scale), noisy_points)
-    fixed = model._replace(problem=problem.map(torch.Tensor.detach))
+    ).to(points)
+    model = _Posterior(problem, _Prior(poses[0].translation), refine, points.new_tensor(scale), noisy_points)
     with torch.no_grad():
-        drawn, log_proposal = _draw(fixed, poses, samples // count, rounds)
+        drawn, log_proposal = _draw(model._replace(problem=problem.map(Tensor.detach)), poses, samples // count, rounds)
     log_weights = model.log_density(drawn) - log_proposal
     log_total = torch.logsumexp(log_weights, 0) - math.log(len(log_weights))
     log_density = model.log_density(Pose(*(x[None] for x in poses[0])))[0] - log_total
     return torch.where(live, -log_density - 3.0 * frame.scale.log(), 0.0).reshape(size)
 
 
-class _Posterior(NamedTuple):
-    """The density of poses, up to a factor, in the frame of a problem.
+class _Prior(NamedTuple):
+    """Uniform rotations, and translations of a t distribution around the true one, (B, 3)."""
 
-    Attributes:
-        problem: the problem with known noise.
-        translation: translation of the true pose, (B, 3).
-        refine: finds modes, by the robust kernel of the posterior.
-        shape: shape of the kernel, a scalar.
-        noisy_points: whether world points have noise, so that the variance of a pixel depends on the pose.
-    """
-
-    problem: Problem
     translation: Tensor
-    refine: RobustWeightedLM
-    shape: Tensor
-    noisy_points: bool
 
     @property
     def distance(self) -> Tensor:
         """Distance between the true camera and the points, (B, 1)."""
         return self.translation.norm(dim=-1, keepdim=True)
 
-    def log_density(self, poses: Pose) -> Tensor:
-        """Logarithm of likelihood times prior, (S, B), of rotations (S, B, 3, 3) and translations (S, B, 3)."""
-        return self.log_prior(poses.translation) - self._cost(poses)
-
-    def log_prior(self, translation: Tensor) -> Tensor:
-        """Logarithm of the prior's density, (S, B); it does not depend on the rotation."""
-        width = _PRIOR_TRANSLATION * self.distance
-        sq_distance = ((translation - self.translation) / width).square().sum(-1)
-        return _log_t(sq_distance, 3) - 3.0 * width.log().mT - math.log(8.0 * math.pi**2)
-
-    def sample_prior(self, count: int) -> Pose:
-        """Uniform rotations, and translations around the true one."""
-        batch = self.translation.shape[0]
+    def sample(self, count: int) -> Pose:
+        """Draw poses, (S, B, ...)."""
+        batch = len(self.translation)
         rotation = quaternion_to_rotation_matrix(torch.randn(count, batch, 4).to(self.translation))
         shift = _PRIOR_TRANSLATION * self.distance * _sample_t(count, self.translation)
         return Pose(rotation, self.translation + shift)
 
-    def _cost(self, poses: Pose) -> Tensor:
-        """Half the weighted sum of robust losses, (S, B)."""
-        problem = self.problem
+    def log_density(self, poses: Pose) -> Tensor:
+        """Logarithm of the density per radian³ and unit³, (S, B); it does not depend on the rotation."""
+        width = _PRIOR_TRANSLATION * self.distance
+        sq_distance = ((poses.translation - self.translation) / width).square().sum(-1)
+        return _log_t(sq_distance, 3) - 3.0 * width.log().mT - math.log(8.0 * math.pi**2)
+
+
+class _Component(NamedTuple):
+    """A t distribution around a pose: its precision matrix is the square of the factor, lower triangular (B, 6, 6)."""
+
+    pose: Pose
+    factor: Tensor
+
+    def sample(self, count: int) -> Pose:
+        """Draw poses, (S, B, ...)."""
+        vectors = _sample_t(count, self.factor[..., 0])  # (S, B, 6)
+        tangents = torch.linalg.solve_triangular(self.factor.mT, vectors.permute(1, 2, 0), upper=True).permute(2, 0, 1)
+        origin = map_tensors(lambda x: x.expand(count, *x.shape).flatten(0, 1), self.pose)
+        return map_tensors(lambda x: x.unflatten(0, (count, -1)), retract(origin, tangents.flatten(0, 1)))
+
+    def log_density(self, poses: Pose) -> Tensor:
+        """Logarithm of the density per radian³ and unit³, (S, B)."""
+        turn = poses.rotation @ self.pose.rotation.mT
+        # The inverse of Cayley's map; half a turn would be infinitely far away.
+        cosine = 1.0 + turn.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True)
+        omega = 2.0 * So3.vee(turn - turn.mT) / cosine.clamp(min=1e-4)
+        tangent = torch.cat((omega, poses.translation - self.pose.translation), -1)
+        sq_distance = (tangent[..., None, :] @ self.factor)[..., 0, :].square().sum(-1)
+        log_determinant = self.factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        # Volume of rotations by volume of Cayley's vectors: 1 / (1 + |omega|² / 4)².
+        return _log_t(sq_distance, 6) + log_determinant + 2.0 * torch.log1p(0.25 * omega.square().sum(-1))
+
+
+class _Posterior(NamedTuple):
+    """The density of poses, up to a factor, in the frame of a problem."""
+
+    problem: Problem  # with known noise
+    prior: _Prior
+    refine: RobustWeightedLM  # finds modes, by the robust kernel of the posterior
+    shape: Tensor  # of the kernel, a scalar
+    noisy_points: bool  # whether world points have noise, so that the variance of a pixel depends on the pose
+
+    def log_density(self, poses: Pose) -> Tensor:
+        """Logarithm of likelihood times prior, (S, B), of rotations (S, B, 3, 3) and translations (S, B, 3)."""
+        problem, noise, distance = self.problem, self.problem.noise, self.prior.distance
+        assert noise is not None
         cam = problem.world_points @ poses.rotation.mT + poses.translation[..., None, :]  # (S, B, N, 3)
-        least = _LEAST_DEPTH * self.distance
+        least = _LEAST_DEPTH * distance
         depth = cam[..., 2].maximum(least)
         plane = cam[..., :2] / depth[..., None]
-        behind = (depth - cam[..., 2]) / least
-        residual, sq_behind = problem.focal * plane - problem.img_points, (problem.focal * behind).square()
-        assert problem.noise is not None
-        if problem.noise.covariances:
+        sq_behind = (problem.focal * (depth - cam[..., 2]) / least).square()
+        residual = problem.focal * plane - problem.img_points
+        if noise.covariances:
             p, q = plane.unbind(-1)
-            covariance = covariance_at(poses.rotation[..., None, :, :], p, q, problem.focal / depth, problem.noise)
+            covariance = covariance_at(poses.rotation[..., None, :, :], p, q, problem.focal / depth, noise)
             determinant, precision = covariance.determinant, covariance.inverse()
             sq_residual = precision.form(*residual.unbind(-1)) + 0.5 * sq_behind * (precision.uu + precision.vv)
         else:
-            variance = problem.noise.img.square()
+            variance = noise.img.square()
             if self.noisy_points:
                 sides = 1.0 + 0.5 * plane.square().sum(-1)
-                variance = variance + (problem.focal * problem.noise.world / depth).square() * sides
+                variance = variance + (problem.focal * noise.world / depth).square() * sides
             sq_residual, determinant = (residual.square().sum(-1) + sq_behind) / variance, variance.square()
         loss = self.refine.kernel.loss(sq_residual, self.shape)
         if self.noisy_points:
             loss = loss + determinant.log()
-        return 0.5 * (problem.weights * loss).sum(-1)
+        return self.prior.log_density(poses) - 0.5 * (problem.weights * loss).sum(-1)
 
     def component(self, pose: Pose) -> _Component:
         """The t distribution whose precision is that of the normal equations at a pose, with a bounded width."""
@@ -252,9 +256,11 @@ class _Posterior(NamedTuple):
         factor = problem.focal.square() * problem.weights * self.refine.kernel.weight(sq_residual, self.shape)
         weights = map_tensors(lambda x: factor * x, precision)
         matrix = normal_equations(projection, problem, weights).matrix.permute(2, 0, 1)
-        widest = torch.full_like(pose.translation, _WIDEST_ROTATION), _PRIOR_TRANSLATION * self.distance.expand(-1, 3)
-        least = torch.cat(widest, -1).square().reciprocal()
-        matrix = matrix + torch.diag_embed(least)
+        widest = (
+            torch.full_like(pose.translation, _WIDEST_ROTATION),
+            (_PRIOR_TRANSLATION * self.prior.distance).expand(-1, 3),
+        )
+        matrix = matrix + torch.diag_embed(torch.cat(widest, -1).square().reciprocal())
         # Scaled to a diagonal of one, so that rounding does not depend on units.
         scale = matrix.diagonal(dim1=-2, dim2=-1).rsqrt()
         eye = torch.eye(6, dtype=scale.dtype, device=scale.device)
@@ -264,31 +270,28 @@ class _Posterior(NamedTuple):
     def mode(self, poses: Pose, log_weights: Tensor) -> Pose:
         """The mode next to the pose of the largest weight."""
         best = log_weights.argmax(0)
-        rows = torch.arange(len(best), device=best.device)
-        pose = Pose(poses.rotation[best, rows], poses.translation[best, rows])
+        pose = map_tensors(lambda x: x[best, torch.arange(len(best), device=best.device)], poses)
         starts = Starts(pose, torch.ones_like(self.problem.weights))
         return self.refine.iterate(self.refine.begin(self.problem, starts))[0].pose
 
 
 def _draw(model: _Posterior, poses: Sequence[Pose], each: int, rounds: int) -> tuple[Pose, Tensor]:
-    """Draw from the prior and from a component around every pose and every mode that is found.
+    """Draw from the prior and from a component around every pose and around every mode that is found.
 
     Returns:
         The samples, and the logarithm of the density of the mixture that they come from, (S, B).
     """
-    components = [model.component(pose) for pose in poses]
-    parts = [model.sample_prior(each), *(_sample(component, each) for component in components)]
+    mixture: list[_Prior | _Component] = [model.prior, *map(model.component, poses)]
+    drawn = map_tensors(lambda *x: torch.cat(x), *[part.sample(each) for part in mixture])
 
-    def log_mixture(drawn: Pose) -> Tensor:
-        every = [model.log_prior(drawn.translation), *(_log_density(component, drawn) for component in components)]
-        return torch.logsumexp(torch.stack(every), 0) - math.log(len(every))
+    def log_mixture() -> Tensor:
+        densities = torch.stack([part.log_density(drawn) for part in mixture])
+        return torch.logsumexp(densities, 0) - math.log(len(mixture))
 
     for _ in range(rounds):
-        drawn = Pose(*map(torch.cat, zip(*parts, strict=True)))
-        components.append(model.component(model.mode(drawn, model.log_density(drawn) - log_mixture(drawn))))
-        parts.append(_sample(components[-1], each))
-    drawn = Pose(*map(torch.cat, zip(*parts, strict=True)))
-    return drawn, log_mixture(drawn)
+        mixture.append(model.component(model.mode(drawn, model.log_density(drawn) - log_mixture())))
+        drawn = map_tensors(lambda *x: torch.cat(x), drawn, mixture[-1].sample(each))
+    return drawn, log_mixture()
 
 
 def _sample_t(count: int, like: Tensor) -> Tensor:
@@ -303,31 +306,3 @@ def _log_t(sq_distance: Tensor, size: int) -> Tensor:
     both = 0.5 * (_FREEDOM + size)
     constant = math.lgamma(both) - math.lgamma(0.5 * _FREEDOM) - 0.5 * size * math.log(_FREEDOM * math.pi)
     return constant - both * torch.log1p(sq_distance / _FREEDOM)
-
-
-def _sample(component: _Component, count: int) -> Pose:
-    """Poses of a component."""
-    pose, factor = component
-    vectors = _sample_t(count, factor[..., 0])  # (S, B, 6)
-    tangents = torch.linalg.solve_triangular(factor.mT, vectors.permute(1, 2, 0), upper=True).permute(2, 0, 1)
-    moved = retract(map_tensors(lambda x: x.repeat(count, *(1,) * (x.ndim - 1)), pose), tangents.flatten(0, 1))
-    return Pose(*map_tensors(lambda x: x.unflatten(0, (count, -1)), moved))
-
-
-def _log_density(component: _Component, poses: Pose) -> Tensor:
-    """Logarithm of the density of a component per radian³ and unit³, (S, B)."""
-    pose, factor = component
-    tangent = _tangent(poses, pose)
-    sq_distance = (tangent[..., None, :] @ factor)[..., 0, :].square().sum(-1)
-    log_determinant = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    # Volume of rotations by volume of Cayley's vectors: 1 / (1 + |omega|² / 4)².
-    return _log_t(sq_distance, 6) + log_determinant + 2.0 * torch.log1p(0.25 * tangent[..., :3].square().sum(-1))
-
-
-def _tangent(pose: Pose, origin: Pose) -> Tensor:
-    """The inverse of ``retract``: the tangent vectors that move ``origin`` to ``pose``, (..., B, 6)."""
-    turn = pose.rotation @ origin.rotation.mT
-    # The inverse of Cayley's map; half a turn would be infinitely far away.
-    cosine = 1.0 + turn.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True)
-    omega = 2.0 * So3.vee(turn - turn.mT) / cosine.clamp(min=1e-4)
-    return torch.cat((omega, pose.translation - origin.translation), -1)

@@ -89,9 +89,8 @@ class PoseLoss(nn.Module):
     compared at the centroid of the world points: at an origin far from the points it would mostly repeat the rotation
     error.
 
-    A failed refinement may be off by any amount. So that such problems do not dominate the batch, the refined distance
-    :math:`d` of a problem is saturated to :math:`d / (1 + d / c)`. With :math:`c` near the limit of success the loss
-    follows the success rate.
+    A failed refinement may be off by any amount. The refined distance :math:`d` of a problem is therefore saturated to
+    :math:`d / (1 + d / c)`. With :math:`c` at the limit of success the loss follows the success rate.
 
     Args:
         rotation: weight of the chordal rotation distances.
@@ -121,15 +120,12 @@ class PoseLoss(nn.Module):
         saturation: float | None = None,
     ) -> None:
         super().__init__()
-        weights = {"rotation": rotation, "translation": translation, "init_translation": init_translation}
-        check_numbers(0.0, **weights, refined=refined)
-        saturation = math.inf if saturation is None else saturation
-        check_positive(saturation=saturation, or_infinite=True)
-        self.rotation = rotation
-        self.translation = translation
-        self.init_translation = init_translation
-        self.refined = refined
-        self.saturation = saturation
+        self.saturation = math.inf if saturation is None else saturation
+        check_positive(saturation=self.saturation, or_infinite=True)
+        check_numbers(0.0, rotation=rotation, translation=translation)
+        check_numbers(0.0, init_translation=init_translation, refined=refined)
+        self.rotation, self.translation = rotation, translation
+        self.init_translation, self.refined = init_translation, refined
 
     def forward(self, result: PnPResult, problems: Problems, ramp: float = 1.0) -> LossTerms:
         r"""Compare a solver's result with the truth.
@@ -158,7 +154,7 @@ class SetLoss(nn.Module):
     The loss has no unit: translations are compared at the centroid of the points, relative to its distance from the
     camera. The terms are:
 
-    - First guess: the distance of the best hypothesis, plus a small share of the mean over all hypotheses, so that the
+    - First guess: the distance of the best hypothesis, plus a small share of the mean over all hypotheses, so that
       hypotheses may differ.
     - Refined pose: both distances in units of the limit of success, saturated as in :class:`PoseLoss`.
     - Binary cross entropy of the network's weights.
@@ -196,12 +192,9 @@ class SetLoss(nn.Module):
         check_numbers(0.0, refined=refined, weights=weights, noise=noise)
         check_positive(saturation=saturation, or_infinite=True)
         check_positive(rotation_unit=rotation_unit, translation_unit=translation_unit)
-        self.starts = starts
-        self.every = every
-        self.refined = refined
-        self.saturation = saturation
-        self.weights = weights
-        self.noise = noise
+        self.starts, self.every = starts, every
+        self.refined, self.saturation = refined, saturation
+        self.weights, self.noise = weights, noise
         self.rotation_unit = 2.0**0.5 * math.radians(rotation_unit)  # as a chordal distance
         self.translation_unit = translation_unit
 

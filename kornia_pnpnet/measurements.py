@@ -26,8 +26,8 @@ def heatmap_keypoints(
 
     The softmax of a map is a density that is constant in each cell. Its mean is Kornia's soft-argmax. Its covariance
     is that of the cells' centres plus the variance of a cell, 1/12 per axis (Sheppard's correction), so that a map
-    with a single peak has a positive definite covariance. This is the error of the keypoint only when a loss such as
-    :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss` has taught the network so.
+    with a single peak has a positive definite covariance. A network that was trained with a loss such as
+    :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss` makes it the covariance of the keypoint's error.
 
     Convention:
         Pixels are (u, v) with the centre of the top-left pixel at (0, 0), as in Kornia. Add 0.5 where the principal
@@ -36,7 +36,7 @@ def heatmap_keypoints(
     Source: A. Nibali et al., "Numerical Coordinate Regression with Convolutional Neural Networks", 2018 (DSNT).
 
     Args:
-        heatmaps: logits, shape :math:`(B, N, H, W)`. Pass the logarithm of maps that are probabilities already.
+        heatmaps: logits, shape :math:`(B, N, H, W)`; of a map of probabilities the logarithm.
         temperature: the logits are divided by it, positive: a number or a tensor that broadcasts to ``heatmaps``.
         stride: image pixels per cell of the map. Cell 0 covers the first ``stride`` pixels.
 
@@ -138,9 +138,8 @@ def depth_points(
     tensors = {name: tensor for name, (tensor, _) in shapes.items()}
     check_devices(tensors, img_points, "img_points")
     dtype = common_dtype({"img_points": img_points, **tensors})
-    pixels, depth, camera, rotation, translation = (
-        x.to(dtype) for x in (img_points, depth, camera, pose.rotation, pose.translation)
-    )
+    pixels, depth, camera = (x.to(dtype) for x in (img_points, depth, camera))
+    rotation, translation = (x.to(dtype) for x in pose)
     sigma_depth = expand_sigma("depth_sigma", depth_sigma, pixels)
     sigma_img = expand_sigma("img_sigma", 0.0 if img_sigma is None else img_sigma, pixels)
 

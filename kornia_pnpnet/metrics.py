@@ -145,7 +145,7 @@ def success(errors: PoseErrors, max_rotation_deg: float = 1.0, max_translation: 
 def success_rate(successes: Tensor) -> SuccessRate:
     r"""Success rate with its 95 % Wilson score interval (E. B. Wilson, 1927).
 
-    Unlike the interval of the normal approximation it stays inside [0, 1] and keeps a positive width at 0 and 1.
+    Unlike the normal approximation, the interval stays inside [0, 1] and has a positive width at 0 and 1.
 
     Args:
         successes: bool, any shape with at least one element, else ``ValueError``.

@@ -179,12 +179,12 @@ def test_bearing_cameras_look_along(uniform):
     assert not sound.any()
 
 
-def everywhere(uniform, batch, n, wrong=0):
-    """Points all around, bearings and poses; the first bearings are wrong."""
+def everywhere(uniform, batch, n, outliers=0):
+    """Points all around, bearings and poses; the first bearings are outliers."""
     cam_points = functional.normalize(uniform(batch, n, 3), dim=-1) * uniform(batch, n, 1, low=3.0, high=7.0)
     pose = poses(uniform, batch)
     rays = functional.normalize(cam_points, dim=-1)
-    rays[:, :wrong] = functional.normalize(uniform(batch, wrong, 3), dim=-1)
+    rays[:, :outliers] = functional.normalize(uniform(batch, outliers, 3), dim=-1)
     return to_world(cam_points, pose), rays, pose
 
 
@@ -201,7 +201,7 @@ def test_bearings_in_every_direction(name, uniform):
     assert right(in_pixels, pose, 0.05, 0.01).double().mean() > 0.9
 
 
-def rig(uniform, batch, n, cameras, base, wrong=0):
+def rig(uniform, batch, n, cameras, base, outliers=0):
     """Points, pixels, intrinsics of pairs, places in the rig, and poses of the rig."""
     yaw = torch.arange(cameras, dtype=torch.float64) * (2 * math.pi / cameras)
     rotation = axis_angle_to_rotation_matrix(torch.stack((0 * yaw, yaw, 0 * yaw), -1))
@@ -217,13 +217,13 @@ def rig(uniform, batch, n, cameras, base, wrong=0):
     cam_points = convert_points_to_homogeneous((pixels - 320.0) / focal[:, None]) * depth
     rig_points = (places.rotation.mT @ (cam_points - places.translation)[..., None])[..., 0]
     pose = poses(uniform, batch)
-    pixels[:, :wrong] = uniform(batch, wrong, 2, low=0.0, high=640.0)
+    pixels[:, :outliers] = uniform(batch, outliers, 2, low=0.0, high=640.0)
     return to_world(rig_points, pose), pixels, intrinsics, places, pose
 
 
 @pytest.mark.parametrize("base", [0.02, 0.5])
 @pytest.mark.parametrize(
-    ("name", "cameras", "wrong", "options"),
+    ("name", "cameras", "outliers", "options"),
     [
         ("pnpnet-set", 3, 6, {}),
         ("pnpnet-set", 6, 6, {"effort": "fixed"}),
@@ -231,8 +231,8 @@ def rig(uniform, batch, n, cameras, base, wrong=0):
         ("reppnp-lm", 3, 0, {}),
     ],
 )
-def test_rigs(name, cameras, wrong, options, base, uniform):
-    points, pixels, intrinsics, places, pose = rig(uniform, 32, 24, cameras, base, wrong)
+def test_rigs(name, cameras, outliers, options, base, uniform):
+    points, pixels, intrinsics, places, pose = rig(uniform, 32, 24, cameras, base, outliers)
     result = create_solver(name, **options)(points, pixels, intrinsics, cam_from_rig=places)
     assert right(result, pose, 0.05, 0.01).double().mean() > 0.95
     torch.testing.assert_close(result.intrinsics, intrinsics)

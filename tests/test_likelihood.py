@@ -16,13 +16,9 @@ def problems(n=30, batch=4, seed=5, **noise):
     return SyntheticProblems(n=n, batch_size=batch, seed=seed, dtype=DOUBLE, **noise).batch(0)
 
 
-def inputs(p):
-    return p.world_points, p.img_points, p.intrinsics
-
-
 def loss_of(p, hypothesis=None, **options):
     torch.manual_seed(0)
-    return monte_carlo_pose_loss(p.pose, hypothesis or p.pose, *inputs(p), **options)
+    return monte_carlo_pose_loss(p.pose, hypothesis or p.pose, *p[:3], **options)
 
 
 @pytest.mark.parametrize("world_sigma", [None, 0.05])
@@ -31,9 +27,9 @@ def test_is_gaussian_where_the_noise_is_small(world_sigma):
     p = problems(n=60, world_sigma=0.0, img_sigma=0.0)
     solver = create_solver("epnp-lm")
     noise = {"img_sigma": 1.0, "world_sigma": world_sigma}
-    mode = solver(*inputs(p), img_sigma=1.0).pose
+    mode = solver(*p[:3], img_sigma=1.0).pose
     known = {"img_sigma": 1.0, "world_sigma": world_sigma or 0.0}
-    covariance = pose_covariance(mode, *inputs(p), **known)
+    covariance = pose_covariance(mode, *p[:3], **known)
     expected = 0.5 * torch.logdet(2.0 * math.pi * covariance)
     loss = loss_of(p, mode, **noise, samples=2000, kernel="truncated", scale=1e3)
     torch.testing.assert_close(loss, expected, rtol=0.0, atol=0.1)
@@ -186,7 +182,7 @@ def test_covariances_are_learned_through_poses():
         one, corner, two = entries
         factor = torch.stack((one.exp(), torch.zeros_like(one), 10.0 * corner, two.exp())).reshape(2, 2)
         covariance = (factor @ factor.mT).expand(128, 12, 2, 2)
-        loss = monte_carlo_pose_loss(p.pose, p.pose, *inputs(p), img_cov=covariance, samples=64, rounds=0).mean()
+        loss = monte_carlo_pose_loss(p.pose, p.pose, *p[:3], img_cov=covariance, samples=64, rounds=0).mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

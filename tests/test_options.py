@@ -175,7 +175,7 @@ REFUSED = [
     (SetInit, {"width": 0, "starts": 0, "layers": 1.5, "samples": 9}),
     (partial(SetInit, width=30), {"heads": 4}),
     (EPnP, {"iterations": 1, "algebraic_weight": -0.1}),
-    (REPPnP, {"quantile": 1.1, "max_error": -1.0, "null_iterations": -1, "refine_iterations": 0}),
+    (REPPnP, {"quantile": 1.1, "max_error": -1.0, "refine_iterations": 0}),
     (partial(RANSAC, P3P()), {"threshold": math.nan, "world_threshold": -1.0, "scorer": "best", "max_samples": 0}),
     (partial(RANSAC, P3P()), {"min_samples": 1.5, "confidence": 1.0, "final_steps": -1}),
     (partial(SubsetSolver, EPnP()), {"size": 2}),

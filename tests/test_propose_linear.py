@@ -74,7 +74,7 @@ def test_gross_outliers_are_found_and_do_not_move_the_pose(n, outliers, make_pro
     p = make_problems(n, 200, outliers=outliers, noise=False)
     cam = p.world_points @ p.pose.rotation.mT + p.pose.translation[:, None]
     off = (cam[..., :2] - p.img_points / p.intrinsics[:, :1, :1] * cam[..., 2:]).norm(dim=-1)
-    gross = (p.inliers | (off > 3.0)).all(-1)  # some mismatches happen to be close to the right pixel
+    gross = (p.inliers | (off > 3.0)).all(-1)  # some mismatches happen to be close to the true pixel
     assert gross.sum() > 100
     result = SOLVERS["REPPnP"]()(*p[:3])
     found = ((result.weights > 0) == p.inliers).all(-1)

@@ -69,7 +69,7 @@ def test_known_noise_is_used_as_it_is_and_unknown_noise_is_estimated(make_proble
 
 
 def test_it_learns():
-    """In a hundred small steps: any rotation, with a third of the pairs wrong."""
+    """In a hundred small steps: any rotation, up to a third of the pairs are outliers."""
     torch.manual_seed(0)
     refine = RobustWeightedLM(6, kernel="geman_mcclure", robustness=20.0)
     net = PnPNet(SetInit(width=16, layers=2, hidden=32, samples=0), refine, Normalize(order=False))

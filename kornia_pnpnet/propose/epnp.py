@@ -1,11 +1,15 @@
 r"""EPnP: a pose from four or more pairs, in closed form and by a few Gauss-Newton steps in four unknowns.
 
-With orthonormal coordinates (see ``kornia_pnpnet.propose.control_points``) the equations
-:math:`\sum_j a_{ij} (x_j - u_i z_j) = 0`, and the same with :math:`y` and :math:`v`, are solved for x and y in closed
-form: :math:`x = P z` with :math:`P = \sum_i w_i u_i a_i a_i^\top`, and :math:`y = Q z` with :math:`v_i`. The remaining
-algebraic error :math:`z^\top K z` has 4 unknowns where the paper's :math:`M^\top M` has 12. The control vectors in the
-camera frame are the columns of a 3 by 3 matrix :math:`D(z)`. They are the rotated control vectors :math:`L` of the
-world when :math:`D^\top D = L^\top L`. Arrays have the problems in the last dimension.
+A world point is :math:`p_i = \sum_j a_{ij} c_j`, and in the camera frame it has the same coordinates :math:`a_{ij}`.
+Lepetit et al. use four control points :math:`c_j` and barycentric coordinates. Here :math:`c_0` is the centroid and the
+others are *vectors* from it, so that the coordinates are orthonormal, :math:`\sum_i w_i a_i a_i^\top = I`, and results
+do not depend on the axes of the world.
+
+The equations :math:`\sum_j a_{ij} (x_j - u_i z_j) = 0`, and the same with :math:`y` and :math:`v`, are solved for x
+and y in closed form: :math:`x = P z` with :math:`P = \sum_i w_i u_i a_i a_i^\top`, and :math:`y = Q z` with
+:math:`v_i`. The remaining algebraic error :math:`z^\top K z` has 4 unknowns where the paper's :math:`M^\top M` has 12.
+The control vectors in the camera frame are the columns of a 3 by 3 matrix :math:`D(z)`. They are the rotated control
+vectors :math:`L` of the world when :math:`D^\top D = L^\top L`. Arrays (4, C, B) hold depths of C candidates.
 """
 
 from __future__ import annotations
@@ -16,21 +20,15 @@ import torch
 from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_numbers, check_whole
-from kornia_pnpnet.core.linalg import (
-    dot,
-    eigenvectors,
-    nearest_rotation,
-    small_product,
-    solve_leading,
-    solve_positive,
-)
+from kornia_pnpnet.core.linalg import eigenvectors, nearest_rotation, small_product, solve_leading, solve_positive
 from kornia_pnpnet.problem import Problem, Starts
-from kornia_pnpnet.propose.control_points import ControlPoints, control_points
 from kornia_pnpnet.propose.initialiser import Initialiser
 from kornia_pnpnet.result import Pose
 
-__all__ = ["EPnP"]
+__all__ = ["ControlPoints", "EPnP", "control_points"]
 
+# Points are planar when their extent across the plane is below this fraction of their extent along the plane.
+_PLANAR_RATIO = 1e-3
 # Number of pairs below which a problem is not `ok`: EPnP is defined from four pairs on.
 _MIN_PAIRS = 4
 # Number of pairs that must be in front of the camera: fewer do not determine a pose.
@@ -42,8 +40,58 @@ _MAX_SQ_RESIDUAL = 4.0
 # Share of the squared spread of the pixels. A ridge of this size breaks ties between null vectors: equal depths come
 # first, then tilts along the world's longest extents. It affects where the iterations start, not where they end.
 _TIE = 1e-4
-# Upper entries of the Gram matrix of the three control vectors; an entry is the equation of an "edge".
-_EDGES = [(i, j) for i in range(1, 4) for j in range(i, 4)]
+# Pairs (m, n) of null vectors whose coefficients' products βₘβₙ are unknowns of the four cases, in the order of use.
+_PRODUCTS = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (0, 3))
+
+
+class ControlPoints(NamedTuple):
+    """Control points, coordinates and weights of the pairs. In memory the problems are the last dimension."""
+
+    points: Tensor  # the centroid and three vectors, a square root of the covariance; planar: c_3 is 0, (B, 4, 3)
+    coordinates: Tensor  # a: `coordinates @ points` are the world points; planar: the last ones are 0, (B, N, 4)
+    weights: Tensor  # with the sum 1, (B, N)
+    planar: Tensor  # whether the points lie in one plane (or on a line), bool, (B,)
+    ok: Tensor  # whether the points span more than a line, bool, (B,)
+
+
+def control_points(problem: Problem) -> ControlPoints:
+    r"""Choose the control points by weighted Gram-Schmidt on the coordinates of the world points.
+
+    The axis along which the points spread most is projected out of the other axes, and so on. The principal directions
+    of the paper cost an eigendecomposition and have no gradient where two extents are equal.
+
+    Args:
+        problem: the problem. Pairs with the weight 0 are ignored.
+
+    Example:
+        >>> world = torch.tensor([[[4.0, 0, 0], [-4, 0, 0], [0, 2, 0], [0, -2, 0]]])
+        >>> control = control_points(Problem.of(world, torch.zeros(1, 4, 2)))
+        >>> control.planar, torch.allclose(control.coordinates @ control.points, world)
+        (tensor([True]), True)
+    """
+    weights = problem.weights.mT.contiguous()  # (N, B)
+    total = weights.sum(0)
+    weights = weights / torch.where(total > 0, total, 1.0)
+    world = problem.world_points.permute(2, 1, 0).contiguous()  # (3, N, B)
+    centroid = (world * weights).sum(1)  # (3, B)
+    rest = world - centroid[:, None]
+    # An axis below its limit is rounding. The first limit is absolute, the others are relative to the previous extent.
+    limit = torch.full_like(total, torch.finfo(rest.dtype).tiny ** 0.5)
+    line_ratio = torch.finfo(rest.dtype).eps ** 0.5
+    vectors, axes, found = [centroid], [torch.ones_like(weights)], []
+    for ratio in (line_ratio, _PLANAR_RATIO, 1.0):
+        largest, position = (rest.square() * weights).sum(1).max(0)  # (B,): the largest variance of an axis
+        there = largest > limit
+        inverse = torch.where(there, largest, torch.inf).rsqrt()
+        axis = rest.gather(0, position.expand(1, *weights.shape))[0] * inverse  # (N, B)
+        vector = (rest * (weights * axis)).sum(1)  # (3, B)
+        rest = torch.addcmul(rest, vector[:, None], axis, value=-1)
+        vectors.append(vector)
+        axes.append(axis)
+        found.append(there)
+        limit = torch.where(there, (largest.detach() * ratio**2).maximum(limit), torch.inf)
+    points, coordinates = torch.stack(vectors, 1).permute(2, 1, 0), torch.stack(axes).permute(2, 1, 0)
+    return ControlPoints(points, coordinates, weights.mT, ~found[2], found[1])
 
 
 class EPnP(Initialiser):
@@ -54,15 +102,14 @@ class EPnP(Initialiser):
     weighted reprojection error is aligned with the world (orthogonal Procrustes).
 
     Source: V. Lepetit, F. Moreno-Noguer and P. Fua, "EPnP: An Accurate O(n) Solution to the PnP Problem", IJCV 2009.
-    Ours are the elimination of two thirds of the unknowns (see the module), the order of the null vectors (by their
-    algebraic error at equal depth of the centroid, not at equal length), a norm of the distances that does not depend
-    on the choice of the control points, and the algebraic error as a part of the objective: with a dozen noisy pairs
-    the null vectors are not equally free. Planar points use the same equations, with 0 as the fourth control point.
+    Our changes are the elimination of two thirds of the unknowns (see the module), an order of the null vectors by
+    their algebraic error at equal depth of the centroid, a norm of the distances that does not depend on the choice of
+    the control points, and the algebraic error as a part of the objective: with a dozen noisy pairs the null vectors
+    are not equally free. Planar points use the same equations, with 0 as the fourth control point.
 
     Four or five pairs leave up to four solutions, and the solution with the least reprojection error may be incorrect.
     A problem is not ``ok`` with fewer than four pairs, with points on a line, and when fewer than three pairs are in
-    front of the camera. Gradients to points, pixels and weights are those of the minimum, by the implicit function
-    theorem.
+    front of the camera. Gradients are those of the minimum, by the implicit function theorem.
 
     Args:
         iterations: number of Gauss-Newton steps, at least 2: two steps in every case, the other steps in the best case.
@@ -92,39 +139,31 @@ class EPnP(Initialiser):
         self.algebraic_weight = algebraic_weight
 
     def forward(self, problem: Problem) -> Starts:
-        r"""Find the pose.
-
-        Args:
-            problem: the problem in the solver's frame.
-
-        Returns:
-            The pose, weights of 1, and ``ok``. Where ``ok`` is false the pose is finite.
-        """
+        """Find the pose of a problem in the solver's frame: finite, with weights of 1, also where it is not ``ok``."""
         problem = problem._replace(weights=problem.usual_weights)
         control = control_points(problem)
-        plane_points = (problem.img_points.permute(2, 1, 0) / problem.focal).contiguous()  # (2, N, B)
-        system = _depth_system(control, plane_points, self.algebraic_weight)
+        system = _depth_system(control, problem, self.algebraic_weight)
         with torch.no_grad():
             depths, solved = self._depths(system)
-        if system.error.requires_grad:
-            depths = _attach_gradient(system, depths)
+        if system.prior.requires_grad:
+            depths = _attach_gradient(system, depths, control.planar)
 
-        vectors = system.vectors
-        camera = torch.stack(_in_camera(system, depths))[:, :, 0]  # (3, 4, B)
+        camera = _in_camera(system, depths)[:, :, 0]  # (3, 4, B)
         affine = camera[:, 1:]
-        rotation, unique = nearest_rotation(small_product(affine, vectors.transpose(0, 1)))
+        moment = small_product(affine, system.vectors.transpose(0, 1))
+        turn, unique = nearest_rotation(moment)
         # The control points miss their distances a little. The scale restores the known size of the world.
         size = affine.square().sum((0, 1))
-        scale = (small_product(rotation, vectors) * affine).sum((0, 1)) / torch.where(size > 0, size, 1.0)
-        offset = dot(rotation.unbind(1), control.points[:, 0].mT.unbind(0))
-        translation = camera[:, 0] * (scale * system.unit) - offset  # (3, B)
+        scale = (turn * moment).sum((0, 1)) / torch.where(size > 0, size, 1.0)
+        rotation = turn.permute(2, 0, 1).contiguous()
+        offset = (rotation @ control.points[:, 0, :, None])[..., 0]
+        translation = (camera[:, 0] * (scale * system.unit)).mT - offset
 
-        there = problem.weights.mT > 0
-        depth = dot(rotation[2].unbind(0), problem.world_points.permute(2, 1, 0).unbind(0)) + translation[2]  # (N, B)
-        ok = solved & unique & (there.sum(0) >= _MIN_PAIRS)
-        ok = ok & ((there & (depth > 0)).sum(0) >= _MIN_IN_FRONT)
-        pose = Pose(rotation.permute(2, 0, 1).contiguous(), translation.mT.contiguous())
-        return Starts(pose, torch.ones_like(problem.weights), ok)
+        there = problem.weights > 0
+        depth = (problem.world_points @ rotation[:, 2, :, None])[..., 0] + translation[:, 2:]  # (B, N)
+        in_front = (there & (depth > 0)).sum(1) >= _MIN_IN_FRONT
+        ok = solved & unique & (there.sum(1) >= _MIN_PAIRS) & in_front
+        return Starts(Pose(rotation, translation), torch.ones_like(problem.weights), ok)
 
     def _depths(self, system: _DepthSystem) -> tuple[Tensor, Tensor]:
         """The depths (4, 1, B) of the best case, and whether they were found (B,); where not, equal depths."""
@@ -137,50 +176,55 @@ class EPnP(Initialiser):
         depths = _minimize(system, best, self.iterations - _CASE_ITERATIONS)
         # Depths beyond the precision of the dtype are a failure; NaN compares false.
         solved = (depths.abs() < 1.0 / torch.finfo(depths.dtype).eps).all(0)
-        return torch.where(solved, depths, system.maps[2][0]), solved[0]
+        return torch.where(solved, depths, system.maps[2, 0]), solved[0]
 
 
 class _DepthSystem(NamedTuple):
-    """The equations of depths (4, C, B): C candidates for each problem."""
+    """The equations of depths (4, C, B)."""
 
-    control: ControlPoints
+    coordinates: Tensor  # a, (4, N, B)
+    weights: Tensor  # with the sum 1, (N, B)
     plane_points: Tensor  # (u, v), (2, N, B)
     unit: Tensor  # unit of the depths: the root mean square distance of the points from their centroid, (B,)
     vectors: Tensor  # the control vectors of the world in this unit, (3 axes, 3 vectors, B)
-    maps: tuple[tuple[Tensor, ...], ...]  # rows (4, 1, B) of P, Q and the identity: x = P z, y = Q z, z
-    error: Tensor  # K, (4, 4, 1, B)
-    prior: Tensor  # half the weighted algebraic error, (4, 4, 1, B)
-    gram: Tensor  # the Gram matrix of the vectors, whose trace is 1, (3, 3, B)
-    target: dict[tuple[int, int], Tensor]  # minus its entry of each edge, (B,)
+    gram: Tensor  # the Gram matrix of the vectors, whose trace is 1, (3, 3, 1, B)
+    maps: Tensor  # P, Q and the identity: x = P z, y = Q z, z, (3, 4, 4, 1, B)
+    error: Tensor  # K, (4, 4, B)
+    prior: Tensor  # the weighted K, (4, 4, 1, B)
 
 
-def _depth_system(control: ControlPoints, plane_points: Tensor, weight: float) -> _DepthSystem:
+def _depth_system(control: ControlPoints, problem: Problem, weight: float) -> _DepthSystem:
     """Eliminate the x and y coordinates of the control points."""
-    coordinates, weights = control.coordinates.permute(2, 1, 0), control.weights.mT
-    scaled = plane_points[:, None] * coordinates  # (2, 4, N, B)
-    moments = [((weights * a) * scaled).sum(2, keepdim=True) for a in coordinates]  # (2, 4, 1, B) each
+    coordinates, weights = control.coordinates.mT.contiguous(), control.weights[:, None]  # (B, 4, N), (B, 1, N)
+    plane_points = (problem.img_points / problem.focal).mT  # (B, 2, N)
+    scaled = (plane_points[:, :, None] * coordinates[:, None]).flatten(1, 2)  # (B, 8, N)
+    moments = torch.bmm(scaled, (weights * coordinates).mT)  # P and Q, (B, 8, 4)
     # K is a sum of squared residuals of the elimination. As a difference of moments float32 would lose it.
-    errors = scaled
-    for a, moment in zip(coordinates, moments, strict=True):
-        errors = torch.addcmul(errors, a, moment, value=-1)
-    weighted = weights * errors
-    quadratic = torch.stack([(weighted[:, j, None] * errors).sum((0, 2)) for j in range(4)])[:, :, None]
-    first, second = torch.stack(moments).unbind(1)  # (4, 4, 1, B) each
-    eye = torch.eye(4, dtype=weights.dtype, device=weights.device)[..., None, None]
+    errors = (scaled - torch.bmm(moments, coordinates)).unflatten(1, (2, 4)).transpose(1, 2)  # (B, 4, 2, N)
+    error = torch.bmm((weights[:, None] * errors).flatten(2), errors.flatten(2).mT).permute(1, 2, 0)
+    eye = torch.eye(4, dtype=weights.dtype, device=weights.device)
+    maps = torch.cat((moments, eye.expand(len(moments), 4, 4)), 1).permute(1, 2, 0).unflatten(0, (3, 4)).contiguous()
     mean_square = control.points[:, 1:].square().sum((1, 2))
     unit = torch.where(control.ok, mean_square, 1.0).sqrt()
     vectors = control.points[:, 1:].permute(2, 1, 0) / unit
-    gram = small_product(vectors.transpose(0, 1), vectors)
-    target = {(k, j): -gram[k - 1, j - 1] for k, j in _EDGES}
-    maps = first.unbind(), second.unbind(), eye.unbind()
-    prior = 0.5 * weight * quadratic
-    return _DepthSystem(control, plane_points, unit, vectors, maps, quadratic, prior, gram, target)
+    gram = small_product(vectors.transpose(0, 1), vectors)[:, :, None]
+    last = (x.permute(1, 2, 0).contiguous() for x in (coordinates, plane_points))
+    return _DepthSystem(
+        next(last),
+        control.weights.mT,
+        next(last),
+        unit,
+        vectors,
+        gram,
+        maps[..., None, :],
+        error,
+        weight * error[:, :, None],
+    )
 
 
-def _in_camera(system: _DepthSystem, depths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """x, y and z of the centroid and the vectors in units of ``system.unit``, (4, C, B) each."""
-    z = depths.unbind(0)
-    return dot(system.maps[0], z), dot(system.maps[1], z), depths  # P is symmetric: its rows are its columns
+def _in_camera(system: _DepthSystem, depths: Tensor) -> Tensor:
+    """x, y and z of the centroid and of the vectors in units of ``system.unit``, (3, 4, C, B)."""
+    return small_product(system.maps.flatten(0, 1), depths[:, None])[:, 0].unflatten(0, (3, 4))
 
 
 def _null_space(system: _DepthSystem) -> Tensor:
@@ -189,18 +233,13 @@ def _null_space(system: _DepthSystem) -> Tensor:
     The first vector has the least error with the centroid at depth 1. The other vectors have the centroid at depth 0;
     they are the eigenvectors of the rest of K, so that K is diagonal in this basis.
     """
-    error = system.error[:, :, 0]
-    first, second = (rows[0][1:, 0] for rows in system.maps[:2])  # (3, B) each
-    spread = error[0, 0] + (first.square() + second.square()).sum(0)
-    eye = torch.eye(3, dtype=error.dtype, device=error.device)[..., None]
-    usual = torch.zeros_like(first)
-    directions = []
-    for value, direction in eigenvectors(torch.addcmul(error[1:, 1:], _TIE * spread, 1.1 * eye - system.gram)):
-        along = dot(error[0, 1:].unbind(0), direction.unbind(0)) / value
-        usual = torch.addcmul(usual, along, direction, value=-1)
-        directions.append(direction)
-    top = system.maps[2][0][:, 0].expand(1, 4, *spread.shape)
-    return torch.cat((top, torch.stack((usual, *directions), 1)))
+    error, eye = system.error, torch.eye(4, dtype=system.error.dtype, device=system.error.device)[..., None]
+    spread = error[0, 0] + system.maps[:2, 0, 1:, 0].square().sum((0, 1))
+    ridge = _TIE * spread * (1.1 * eye[1:, 1:] - system.gram[:, :, 0])
+    values, directions = (torch.stack(x, -2) for x in zip(*eigenvectors(error[1:, 1:] + ridge), strict=True))
+    along = (error[0, 1:, None] * directions).sum(0) / values  # (3 vectors, B)
+    usual = -(along * directions).sum(1, keepdim=True)
+    return torch.cat((eye[:1].expand(1, 4, len(spread)), torch.cat((usual, directions), 1)))
 
 
 def _four_cases(system: _DepthSystem) -> Tensor:
@@ -211,52 +250,33 @@ def _four_cases(system: _DepthSystem) -> Tensor:
     linearises the four remaining products again). The systems of all cases are leading blocks of one system.
     """
     basis = _null_space(system)
-    camera = [axis.unbind(0) for axis in _in_camera(system, basis)]  # (4 vectors, B) for each axis and control point
-    single = [[control.unbind(0) for control in axis] for axis in camera]
-    normal, rhs = basis.new_zeros(6, 6, basis.shape[-1]), basis.new_zeros(6, basis.shape[-1])
-    for k, j in _EDGES:
-        sides = [(k, j), (j, k)] if k != j else [(k, j)]
-        terms = [(axis, *side) for axis in range(3) for side in sides]
-        # The unknowns are ½β₁², β₁β₂, β₁β₃, β₁β₄, ½β₂², β₂β₃; the equation of an edge with itself is halved.
-        parts = [
-            dot((single[c][a][m] for c, a, _ in terms), (camera[c][b][others] for c, _, b in terms))
-            for m, others in ((0, slice(0, 4)), (1, slice(1, 3)))
-        ]
-        row = torch.cat(parts)  # (6, B)
-        weight, half = (2.0, 1.0) if k != j else (4.0, 0.5)
-        normal.addcmul_(row[:, None], row, value=weight)
-        rhs.addcmul_(system.target[k, j], row, value=-half * weight)
-    nested = (0, 1, 4, 2, 5, 3)
-    rows, right = [row.unbind(0) for row in normal.unbind(0)], rhs.unbind(0)
-    solutions = solve_leading([[rows[i][j] for j in nested] for i in nested], [right[i] for i in nested], (1, 3, 5, 6))
-    zero = torch.zeros_like(right[0])
+    vectors = _in_camera(system, basis)[:, 1:]  # (3 axes, 3 vectors, 4 null vectors, B)
+    left, right = (vectors[:, :, index] for index in map(list, zip(*_PRODUCTS, strict=True)))
+    half = (left[:, :, None] * right[:, None]).sum(0)
+    rows = (half + half.transpose(0, 1)).flatten(0, 1)  # (9 entries of the Gram matrix, 6 products, B)
+    normal = small_product(rows.transpose(0, 1), rows)
+    rhs = small_product(rows.transpose(0, 1), system.gram.flatten(0, 1))[:, 0]
+    solutions = solve_leading([row.unbind(0) for row in normal.unbind(0)], rhs.unbind(0), (1, 3, 5, 6))
+    zero = torch.zeros_like(rhs[0])
     padded = [torch.stack([*x, *[zero] * (6 - len(x))]) for x in solutions]
-    square, mixed, other, third, _, fourth = torch.stack(padded, 1).unbind(0)  # (4 cases, B) each
+    square, mixed, other, third, _, fourth = torch.stack(padded, 1).unbind(0)  # (4 cases, B), of ½β₁², β₁β₂, ½β₂², …
     sign = square.sign()
     first = (2.0 * square.abs()).sqrt()
     second = (2.0 * sign * other).clamp(min=0.0).sqrt().copysign(sign * mixed)
     inverse = sign / first
-    return dot(basis[:, :, None].unbind(1), (first, second, third * inverse, fourth * inverse))
+    return small_product(basis, torch.stack((first, second, third * inverse, fourth * inverse)))
 
 
-def _normal_equations(system: _DepthSystem, depths: Tensor) -> tuple[Tensor, Tensor, dict[tuple[int, int], Tensor]]:
-    r"""Half of :math:`J^\top J` (4, 4, C, B) and of :math:`J^\top r` (4, C, B), and the misfits of the edges (C, B)."""
-    p, q, axes = system.maps
-    normal, misfits = system.prior.expand(4, *depths.shape).clone(), {}
-    gradient = dot(system.prior.unbind(0), depths.unbind(0))
-    x, y, z = (axis.unbind(0) for axis in _in_camera(system, depths))
-    for k, j in _EDGES:
-        misfits[k, j] = misfit = (
-            torch.addcmul(system.target[k, j], x[k], x[j]).addcmul_(y[k], y[j]).addcmul_(z[k], z[j])
-        )
-        slope = (x[k] * p[j]).addcmul_(y[k], q[j]).addcmul_(z[k], axes[j])
-        if k != j:
-            slope.addcmul_(x[j], p[k]).addcmul_(y[j], q[k]).addcmul_(z[j], axes[k])
-        # A diagonal entry of the Gram matrix appears once in the Frobenius norm, and its slope is halved; the other
-        # entries appear twice.
-        normal.addcmul_(slope[:, None], slope, value=1.0 if k != j else 2.0)
-        gradient.addcmul_(slope, misfit)
-    return normal, gradient, misfits
+def _normal_equations(system: _DepthSystem, depths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    r"""Half of the Gauss-Newton matrix (4, 4, C, B) and of the gradient (4, C, B), and the misfits (3, 3, C, B)."""
+    vectors = _in_camera(system, depths)[:, 1:]
+    columns = vectors.transpose(0, 1)
+    misfit = small_product(columns, vectors) - system.gram
+    half = small_product(columns, system.maps[:, 1:].flatten(1, 2)).unflatten(1, (3, 4))
+    slope = (half + half.transpose(0, 1)).flatten(0, 1)  # (9, 4, C, B)
+    normal = small_product(slope.transpose(0, 1), slope) + system.prior
+    gradient = small_product(slope.transpose(0, 1), misfit.flatten(0, 1)[:, None])
+    return normal, (gradient + small_product(system.prior, depths[:, None]))[:, 0], misfit
 
 
 def _minimize(system: _DepthSystem, depths: Tensor, iterations: int) -> Tensor:
@@ -266,45 +286,38 @@ def _minimize(system: _DepthSystem, depths: Tensor, iterations: int) -> Tensor:
     """
     for _ in range(iterations):
         normal, gradient, _ = _normal_equations(system, depths)
-        (step,) = solve_leading((row.unbind(0) for row in normal.unbind(0)), gradient.unbind(0), (4,))
+        (step,) = solve_leading([row.unbind(0) for row in normal.unbind(0)], gradient.unbind(0), (4,))
         depths = depths - torch.stack(step)
     return depths
 
 
-def _attach_gradient(system: _DepthSystem, depths: Tensor) -> Tensor:
+def _attach_gradient(system: _DepthSystem, depths: Tensor, planar: Tensor) -> Tensor:
     r"""Give a minimum (4, 1, B) its gradient by the implicit function theorem; 0 where the minimum is not isolated.
 
     The result has the value of ``depths`` and the derivatives of two Newton steps with a constant matrix: the first
     step makes first derivatives exact, the second step second derivatives.
     """
-    depths = depths.detach()
-    normal, gradient, misfits = _normal_equations(system, depths)
     with torch.no_grad():
-        entries = [misfits[min(i, j), max(i, j)] for i in range(1, 4) for j in range(1, 4)]
-        misfit = torch.stack(entries).unflatten(0, (3, 3))
-        for rows in system.maps:
-            matrix = torch.stack(rows[1:])
-            normal = normal + small_product(matrix.transpose(0, 1), small_product(misfit, matrix))
+        normal, _, misfit = _normal_equations(system, depths)
+        for rows in system.maps[:, 1:].unbind(0):
+            normal = normal + 2.0 * small_product(rows.transpose(0, 1), small_product(misfit, rows))
         # The depth of the third vector of planar points is always 0: an identity row keeps the system regular.
-        normal[3, 3] += system.control.planar
+        normal[3, 3] += planar
         # The four columns of the inverse, one system each.
         eye = torch.eye(4, dtype=depths.dtype, device=depths.device)[..., None].expand_as(normal[:, :, 0])
-        repeated = normal.expand(-1, -1, 4, -1).flatten(2)
-        columns, solved = solve_positive(repeated, eye.flatten(1), depths.new_zeros(()))
+        columns, solved = solve_positive(normal.expand(-1, -1, 4, -1).flatten(2), eye.flatten(1), depths.new_zeros(()))
         inverse = torch.where(solved, columns, 0.0).unflatten(1, (4, 1, -1))  # (4, 4, 1, B)
-    for again in (True, False):
-        step = small_product(inverse, gradient[:, None])[:, 0]
+    for _ in range(2):
+        step = small_product(inverse, _normal_equations(system, depths)[1][:, None])[:, 0]
         depths = depths - step + step.detach()
-        if again:
-            gradient = _normal_equations(system, depths)[1]
     return depths
 
 
-def _frame(one: Tensor, two: Tensor) -> Tensor:
+def _frames(one: Tensor, two: Tensor) -> Tensor:
     """Orthonormal axes (3, 3 axes, *) from two vectors (3, *) by Gram-Schmidt."""
-    first = one * dot(one.unbind(), one.unbind()).rsqrt()
-    second = torch.addcmul(two, dot(first.unbind(), two.unbind()), first, value=-1)
-    second = second * dot(second.unbind(), second.unbind()).rsqrt()
+    first = one * one.square().sum(0).rsqrt()
+    second = torch.addcmul(two, (first * two).sum(0), first, value=-1)
+    second = second * second.square().sum(0).rsqrt()
     return torch.stack((first, second, torch.linalg.cross(first, second, dim=0)), 1)
 
 
@@ -314,11 +327,11 @@ def _best_case(system: _DepthSystem, cases: Tensor) -> Tensor:
     The control vectors of a case are nearly the rotated control vectors of the world. The rotation between frames of
     two of these vectors, which is faster, replaces Procrustes.
     """
-    camera, world = torch.stack(_in_camera(system, cases)), system.vectors[:, :, None]  # (3, 4, C, B), (3, 3, 1, B)
-    world_frame = _frame(world[:, 0], world[:, 1]).transpose(0, 1)
-    turned = small_product(small_product(_frame(camera[:, 1], camera[:, 2]), world_frame), world)  # (3, 3, C, B)
+    camera, world = _in_camera(system, cases), system.vectors[:, :, None]  # (3, 4, C, B), (3, 3, 1, B)
+    camera_frames, world_frame = _frames(camera[:, 1], camera[:, 2]), _frames(world[:, 0], world[:, 1])
+    turned = small_product(camera_frames, small_product(world_frame.transpose(0, 1), world))  # (3, 3, C, B)
     points = camera[:, 0, :, None]
-    for vector, coordinate in zip(turned.unbind(1), system.control.coordinates.permute(2, 1, 0)[1:], strict=True):
+    for vector, coordinate in zip(turned.unbind(1), system.coordinates[1:], strict=True):
         points = torch.addcmul(points, vector[:, :, None], coordinate)  # (3, C, N, B)
     x, y, z = points.unbind()
     inverse = z.reciprocal()
@@ -326,4 +339,4 @@ def _best_case(system: _DepthSystem, cases: Tensor) -> Tensor:
     x, y = torch.addcmul(-u, x, inverse), torch.addcmul(-v, y, inverse)
     error = (x * x).addcmul_(y, y).clamp_(max=_MAX_SQ_RESIDUAL)
     error = torch.where(z > 0, error, _MAX_SQ_RESIDUAL)  # failed cases, too: NaN compares false
-    return (error * system.control.weights.mT).sum(1).argmin(0)
+    return (error * system.weights).sum(1).argmin(0)

@@ -18,15 +18,15 @@ class Initialiser(Configured):
     Any module with such a ``forward`` is an initialiser. An attribute below that it lacks has the value of this class.
 
     Attributes:
-        pairs_at_once: pairs per core whose temporaries stay in its caches. A solver splits larger batches where
+        pairs_at_once: number of pairs per core whose temporaries fit its caches. A solver splits larger batches where
             gradients allow it. ``None``: the whole batch.
-        fixed_pairs: whether it takes a fixed number of pairs, ``config["n"]``.
-        takes_given: whether it lets a given pose compete itself: ``forward(problem, given)``.
-        takes_rigs: whether it solves rigs.
-        finds_focal: whether it estimates an unknown focal length.
-        estimates_noise: whether it returns several poses and the noise, so that a search may follow:
+        fixed_pairs: whether the number of pairs is fixed, ``config["n"]``.
+        takes_given: whether a given pose is an argument, ``forward(problem, given)``.
+        takes_rigs: whether rigs are solved.
+        finds_focal: whether an unknown focal length is estimated.
+        estimates_noise: whether the result has several poses and the noise, so that a search may follow:
             ``forward(problem, search_follows=True)``.
-        weighs_unusual: whether its weights say which of the pairs that are not of normal scale are inliers.
+        weighs_unusual: whether the weights of pairs that are not of normal scale are valid.
     """
 
     pairs_at_once: int | None = None

@@ -28,11 +28,11 @@ def _relu_layers(sizes: list[int]) -> list[nn.Module]:
 
 
 def _run(layers: nn.Sequential, hidden: Tensor) -> Tensor:
-    """Apply layers to columns, (units, B), in the wider of the dtypes of the input and the weights."""
+    """Apply layers to columns, (units, B), in the dtype of the columns."""
     for layer in layers:
         if isinstance(layer, nn.Linear):
-            wider = torch.promote_types(layer.weight.dtype, hidden.dtype)
-            hidden = torch.addmm(layer.bias.to(wider)[:, None], layer.weight.to(wider), hidden.to(wider))
+            weight, bias = layer.weight.to(hidden.dtype), layer.bias.to(hidden.dtype)
+            hidden = torch.addmm(bias.unsqueeze(1), weight, hidden)
         else:
             hidden = hidden.relu_()  # in place: nothing else reads the sum
     return hidden
@@ -114,13 +114,13 @@ class MLPInit(Initialiser):
                 actual_shape=tuple(problem.world_points.shape),
                 expected_shape=["B", str(self.n), "3"],
             )
-        check_devices({"world_points": problem.world_points}, next(self.parameters()), "the network")
+        weight = next(self.parameters())
+        check_devices({"world_points": problem.world_points}, weight, "the network")
         # One column per problem: x, y, z, u, v of the first pair, then of the next, which is their order in memory.
         coordinates = problem.world_points / self.world_scale, problem.img_points / self.img_scale
         usual = problem.usual[..., None]
         features = torch.cat([(x * usual).permute(1, 2, 0) for x in coordinates], 1).flatten(0, 1)  # (5n, B)
-        hidden = _run(self.shared, features)  # (3n, B)
+        hidden = _run(self.shared, features.to(torch.promote_types(features.dtype, weight.dtype)))  # (3n, B)
         axis, angle = _run(self.rotation, hidden).split((3, 1))
-        parts = rotation_about(axis, angle[0]), _run(self.translation, hidden).mT
-        pose = Pose(*(x.to(features.dtype) for x in parts))
-        return Starts(pose, problem.usual)
+        rotation, translation = rotation_about(axis, angle[0]), _run(self.translation, hidden).mT
+        return Starts(Pose(rotation.to(features.dtype), translation.to(features.dtype)), problem.usual)

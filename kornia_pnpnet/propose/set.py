@@ -24,20 +24,22 @@ __all__ = ["SetInit"]
 
 _T = TypeVar("_T")
 
-# Numbers per pair: 3 of the world, 2 of the image, 2 of the residual, 3 of the problem, 2 of the noise, 2 flags. Also 2
-# with confidences (logit and flag), and 2 with repeats (pairs with the same pixel, and with the same point).
+# Numbers per pair: 3 of the world, 2 of the image, 2 of the residual, 3 of the problem, 2 of the noise, 2 flags.
+# Confidences add 2 numbers (logit and flag), and repeats 2 (pairs with the same pixel, and with the same point).
 _FEATURES = 14
-# Pairs. The softmax of PyTorch 2.13 takes its slow way through rows of fewer numbers.
+# Pairs. PyTorch 2.13 computes the softmax of shorter rows slowly.
 _SHORT = 16
 # Added to the score of padding.
 _ABSENT = -1e9
 # Minimal samples, as ranks of pairs by likelihood. The first six are a Turán system: whichever two of the six likeliest
 # pairs are outliers, one of the six samples has only inliers. No five samples have this property.
 _SAMPLES = ((0, 1, 2), (0, 1, 3), (2, 3, 4), (2, 3, 5), (0, 4, 5), (1, 4, 5), (0, 2, 3), (1, 2, 3))
-# From 18, 24 and 30 pairs on, the same samples are drawn again with their ranks multiplied by 3, 4 and 5.
-_SPREADS = {18: 3, 24: 4, 30: 5}
+# From 18, 24 and 30 pairs on, the same samples are drawn again with their ranks multiplied by 3, 4 and 5: they help
+# where the likeliest pairs are outliers that agree.
+_SPREADS = ((18, 3), (24, 4), (30, 5))
 # From 36 pairs on, 25 further samples: each of the 25 likeliest pairs is in three of them, no two pairs meet twice.
-_RING = {36: [(a, b, c) for i in range(25) for a, b, c in [sorted((i, (i + 1) % 25, (i + 6) % 25))]]}
+_RING_FROM = 36
+_RING = [(a, b, c) for i in range(25) for a, b, c in [sorted((i, (i + 1) % 25, (i + 6) % 25))]]
 # Number of top-ranked pairs that score each hypothesis.
 _MOST_JUDGES = 32
 # Slots for poses of minimal samples. With more slots than this, empty slots are removed before scoring (CPU only).
@@ -56,7 +58,7 @@ _GOLDEN = 0.6180339887
 
 
 def _taken(tree: _T, index: Tensor) -> _T:
-    """The pairs at the positions (B, K) in all tensors (B, N, ...) of pairs; other tensors as they are."""
+    """Take the pairs at positions (B, K) from every tensor (B, N, ...) of pairs, and leave other tensors."""
 
     def take(x: Tensor) -> Tensor:
         if x.ndim < 2 or x.shape[1] <= index.shape[1]:
@@ -68,9 +70,9 @@ def _taken(tree: _T, index: Tensor) -> _T:
 
 @torch.no_grad()
 def _some_of(present: Tensor, count: int) -> Tensor:
-    """Positions (B, count) of pairs that are present, evenly spread; all of them where a problem has fewer.
+    """Positions (B, count) of present pairs, evenly spread; of all present pairs where a problem has fewer.
 
-    Multiples of the golden ratio shift the positions, so that a pattern in the order of the pairs is not repeated; the
+    Multiples of the golden ratio shift the positions, so that a pattern in the order of the pairs is not repeated. The
     shifts are small enough that no position occurs twice.
     """
     steps = torch.arange(count, dtype=torch.float64, device=present.device)
@@ -84,14 +86,25 @@ def _some_of(present: Tensor, count: int) -> Tensor:
 def _agreement(problem: Problem, noise: Noise, pose: Pose) -> Tensor:
     """How well each pair agrees with a pose, in [0, 1], (B, N)."""
     projection = project(State.of(pose), problems_last(problem))
-    variance = _variance(noise.img, noise.world, problem.focal, pose.translation[:, 2:])
+    variance = _variance(noise, problem.focal, pose)
     agreement = 1.0 / (1.0 + projection.sq_residual / (_JUDGED * variance))
     return torch.where(projection.in_front, agreement, 0.0).contiguous()
 
 
-def _variance(img: Tensor, world: Tensor, focal: Tensor, depth: Tensor) -> Tensor:
-    """Variance of pixels whose points are all at the depth of the centre of the world."""
-    return img.square() + (focal * world / depth.clamp(min=_LEAST_DEPTH)).square()
+def _variance(noise: Noise, focal: Tensor, pose: Pose) -> Tensor:
+    """Variance of each pixel (B, N) when every point is as deep as the centre of the world."""
+    depth = pose.translation[:, 2:].clamp(min=_LEAST_DEPTH)
+    return noise.img.square() + (focal * noise.world / depth).square()
+
+
+def _samples(count: int, number: int, search_follows: bool) -> list[tuple[int, tuple[int, int, int]]]:
+    """Minimal samples, each as three ranks of pairs, after the least number of pairs of a problem that uses it."""
+    likeliest = [(0, sample) for sample in _SAMPLES[:number] if max(sample) < count]
+    if search_follows:  # the search draws the others
+        return likeliest
+    spread = [(least, (f * i, f * j, f * k)) for least, f in _SPREADS for _, (i, j, k) in likeliest]
+    ring = [(_RING_FROM, sample) for sample in _RING]
+    return [(least, sample) for least, sample in (*likeliest, *spread, *ring) if least <= count]
 
 
 def _support(rotation: Tensor, translation: Tensor, judges: Tensor) -> Tensor:
@@ -108,7 +121,7 @@ def _support(rotation: Tensor, translation: Tensor, judges: Tensor) -> Tensor:
 
 
 class _Block(nn.Module):
-    """A residual layer on each pair, with a context that attention pools over all pairs."""
+    """A residual layer on each pair and on a context: attention pools the context over all pairs."""
 
     def __init__(self, width: int, heads: int, hidden: int) -> None:
         super().__init__()
@@ -124,16 +137,17 @@ class _Block(nn.Module):
 
     def forward(self, x: Tensor, absent: Tensor) -> Tensor:
         """Map (B * N, width) to the same shape; ``absent`` (B, N) is a large negative number for padding, else 0."""
-        width, heads = x.shape[1], self.heads
+        (batch, count), width, heads = absent.shape, x.shape[1], self.heads
         y = self.norm(x)
+        values, scores = self.look.weight.split((width, heads))
         # The scores need no bias: the softmax over pairs cancels it.
-        attention = _attention(y, self.look.weight[width:], absent)  # (heads, B, N)
+        attention = _attention(y, scores, absent).movedim(0, 1)  # (B, heads, N)
         # The values are linear in y, so the mean of the values is the value of the mean: one product per problem and
         # head is enough, instead of one per pair.
-        means = torch.bmm(attention.movedim(0, 1), y.view(*absent.shape, width))  # (B, heads, width)
-        values = self.look.weight[:width].view(heads, width // heads, width)
-        context = torch.bmm(means.movedim(1, 0), values.mT).movedim(0, 1).flatten(1) + self.look.bias[:width]
-        hidden = torch.mm(y, self.pair.weight.mT).view(*absent.shape, self.pair.out_features)
+        means = torch.bmm(attention, y.view(batch, count, width)).movedim(1, 0)  # (heads, B, width)
+        bias = self.look.bias[:width].view(heads, 1, -1)
+        context = torch.baddbmm(bias, means, values.view(heads, -1, width).mT).movedim(0, 1).flatten(1)
+        hidden = functional.linear(y, self.pair.weight).view(batch, count, -1)
         hidden = hidden.add_(functional.linear(context, self.all.weight, self.pair.bias)[:, None]).relu_()
         return torch.addmm(x + self.out.bias, hidden.flatten(0, 1), self.out.weight.mT)
 
@@ -141,8 +155,8 @@ class _Block(nn.Module):
 def _attention(x: Tensor, weight: Tensor, absent: Tensor) -> Tensor:
     """Softmax over the pairs, (C, B, N), of scores that are linear in x (B * N, width).
 
-    The scores of a channel are contiguous in memory. Of rows shorter than a processor's vectors, a softmax over columns
-    takes a tenth of the time.
+    The scores of a channel are contiguous in memory. Where rows are shorter than a processor's vectors, a softmax over
+    columns takes a tenth of the time.
     """
     scores = torch.addmm(absent.view(1, -1), weight, x.mT).view(weight.shape[0], *absent.shape)
     if compiling() or scores.shape[-1] >= _SHORT or are_few(scores):
@@ -160,9 +174,9 @@ class SetInit(Initialiser):
     also form minimal samples of three (see :func:`~kornia_pnpnet.propose.p3p`). The best of their poses, scored by the
     32 likeliest pairs, is one more hypothesis, without gradient.
 
-    The weight of a pair is the estimated probability that it is an inlier. The noise is that of the problem where
-    known, else the network's estimate; of a covariance the network sees the isotropic noise of the same trace. The
-    network runs in the dtype of its weights, everything around it in the dtype of the correspondences.
+    The weight of a pair is the estimated probability that it is an inlier. Where the noise of the problem is unknown,
+    the network estimates it; of a covariance the network sees the isotropic noise of the same trace. The network runs
+    in the dtype of its weights, everything around it in the dtype of the correspondences.
 
     The design is ours. Distances along rays before a closed-form alignment: J. Hesch and S. Roumeliotis, "A direct
     least-squares method for PnP", ICCV 2011; attention pooled over correspondences: W. Sun et al., "ACNe: Attentive
@@ -231,8 +245,9 @@ class SetInit(Initialiser):
 
         Args:
             problem: pairs in any order, of a centred and scaled world.
-            search_follows: look at 48 pairs at most, evenly spread over all, and draw fewer samples, because a search
-                among all pairs follows. The weights of the other pairs say how well they agree with the best sample.
+            search_follows: whether a search among all pairs follows. The network then sees 48 pairs at most, evenly
+                spread over all, and draws fewer samples. The weight of every other pair is its agreement with the best
+                sample.
 
         Returns:
             The first hypothesis as the pose and the other hypotheses as others, the best sample last; probabilities of
@@ -242,21 +257,21 @@ class SetInit(Initialiser):
             DeviceError: when the problem and the network are on different devices.
         """
         check_devices({"world_points": problem.world_points}, self.pair.bias, "the network")
-        given, index = problem, None
+        given, index, starts = problem, None, self.starts
         same = repeats(problem) if self.repeats else None
         if search_follows and problem.weights.shape[1] > _ENOUGH:
             index = _some_of(problem.usual_weights > 0, _ENOUGH)
             problem, same = _taken((problem, same), index)
-        view, starts = View(problem, self.confidence, same), self.starts
+        view = View(problem, self.confidence, same)
         of_pairs, of_problem = (x.to(view.there.dtype) for x in self._run(view))
-        right = torch.sigmoid(of_pairs[0])
+        probability = torch.sigmoid(of_pairs[0])
         counts, along = of_pairs[1:].split(starts)  # (S, B, N) each
         away, noise = of_problem.split((starts, 2), -1)
         # A point's distance is the distance of the world's centre plus an offset, so that far worlds keep their relief.
         distance = (away.clamp(-6.0, 6.0) - view.log_spread).exp().mT[..., None]  # (S, B, 1)
         relief = torch.add(view.height, along, alpha=3.0) / distance
         ranges = distance * relief.clamp(-3.0, 3.0).exp()
-        chances = right * view.there
+        chances = probability * view.there
         counts = torch.addcmul(view.there * 1e-6, chances, (3.0 * counts.tanh()).exp())
         points = (ranges[..., None] * view.rays).flatten(0, 1)
         source = problem.world_points.expand(starts, -1, -1, -1).flatten(0, 1)
@@ -264,28 +279,11 @@ class SetInit(Initialiser):
         poses = [*map(Pose, rotation.chunk(starts), translation.chunk(starts))]
         noises = self._noise(given, view, noise)
         if self.samples:
-            seen = noises if index is None else _taken(noises, index)
-            poses.append(self._sampled(problem, chances, seen, poses[0], search_follows))
+            visible = noises if index is None else _taken(noises, index)
+            poses.append(self._sampled(problem, chances, visible, poses[0], search_follows))
         if index is not None:
-            right = _agreement(given, noises, poses[-1]).scatter(1, index, right)
-        return Starts(poses[0], right, noise=noises).with_others(*poses[1:])
-
-    def triples(self, count: int, *, search_follows: bool = False) -> dict[int, list[tuple[int, int, int]]]:
-        """Minimal samples of a problem.
-
-        Args:
-            count: number of pairs.
-            search_follows: only samples of the likeliest pairs, because a search draws the others.
-
-        Returns:
-            Groups of samples, as ranks of pairs by likelihood, by the least number of pairs of a problem that uses the
-            group. Groups that spread over more pairs help where the likeliest pairs are outliers that agree.
-        """
-        likeliest = [x for x in _SAMPLES[: self.samples] if max(x) < count]
-        if search_follows:
-            return {0: likeliest}
-        spread = {least: [(f * i, f * j, f * k) for i, j, k in likeliest] for least, f in _SPREADS.items()}
-        return {0: likeliest, **{least: group for least, group in (spread | _RING).items() if least <= count}}
+            probability = _agreement(given, noises, poses[-1]).scatter(1, index, probability)
+        return Starts(poses[0], probability, noise=noises).with_others(*poses[1:])
 
     @torch.no_grad()
     def _sampled(self, problem: Problem, chances: Tensor, noise: Noise, fallback: Pose, search_follows: bool) -> Pose:
@@ -295,31 +293,31 @@ class SetInit(Initialiser):
         # An unlikely pair that agrees may be an inlier after all; padding does not score.
         vote = torch.add(_LEAST_VOTE * there, chances, alpha=1.0 - _LEAST_VOTE)
         # At the depth of the network's pose: by its own depths, a pose close to the points would explain most pixels.
-        variance = _variance(noise.img, noise.world, problem.focal, fallback.translation[:, 2:])
-        rest = torch.stack((vote, problem.focal.square() / (_JUDGED * variance)), -1)
-        of_pairs = torch.cat((problem.world_points, problem.img_points / problem.focal, rest), -1)  # (B, N, 7)
+        precision = problem.focal.square() / (_JUDGED * _variance(noise, problem.focal, fallback))
+        plane_points = problem.img_points / problem.focal
+        of_pairs = torch.cat(
+            (problem.world_points, plane_points, vote[..., None], precision[..., None]), -1
+        )  # (B, N, 7)
         if not isinstance(count, int):  # exported for any number of pairs: pad to the number of judges
             more = of_pairs[:, :1] * torch.tensor((1, 1, 1, 1, 1, 0, 1), dtype=vote.dtype, device=vote.device)
             of_pairs = torch.cat((of_pairs, more.expand(-1, _MOST_JUDGES, -1)), 1)
             chances, count = functional.pad(chances, (0, _MOST_JUDGES)), count + _MOST_JUDGES
         likely = chances.topk(min(_MOST_JUDGES, count)).indices
         pairs = take_pairs(of_pairs, likely)  # (7, K, B)
-        samples = self.triples(count, search_follows=search_follows)
-        drawn = [sample for group in samples.values() for sample in group]
+        least, samples = zip(*_samples(count, self.samples, search_follows), strict=True)
         if compiling():  # stacked, so that a compiler copies whole rows
-            three = torch.stack([pairs[:6, k] for column in zip(*drawn, strict=True) for k in column], 1)
+            three = torch.stack([pairs[:6, k] for column in zip(*samples, strict=True) for k in column], 1)
         else:
-            three = pairs[:6].index_select(1, torch.tensor(drawn, device=pairs.device).mT.flatten())
-        three = three.unflatten(1, (3, len(drawn))).flatten(2)  # (6, 3, S B)
+            three = pairs[:6].index_select(1, torch.tensor(samples, device=pairs.device).mT.flatten())
+        three = three.unflatten(1, (3, len(samples))).flatten(2)  # (6, 3, S B)
         pose, valid = p3p(three[:3].permute(2, 1, 0), three[3:5].permute(2, 1, 0))[:2]
         # Problems last, as p3p lays them out, after the four solutions and the samples.
-        each = len(drawn), batch
+        each = len(samples), batch
         rotation, translation = (x.movedim((0, 1), (-1, -2)).unflatten(-1, each).flatten(-3, -2) for x in pose)
         rotation = rotation.flatten(0, 1)  # (9, H, B)
         valid = (valid.mT & (three[5] > 0).all(0)).unflatten(-1, each)  # (4, S, B)
-        if len(samples) > 1:  # by the number of pairs without padding, so that padding changes nothing
-            enough = [(there.sum(1) >= least).expand(len(group), -1) for least, group in samples.items()]
-            valid = valid & torch.cat(enough)
+        if least[-1]:  # by the number of pairs without padding, so that padding changes nothing
+            valid = valid & (there.sum(1) >= torch.tensor(least, device=there.device)[:, None])
         valid = valid.flatten(0, 1)  # (H, B)
         if batch and len(valid) > _MANY_SLOTS and valid.device.type == "cpu" and sees_values(valid):
             slots = present_first(valid.mT)[:, : max(int(valid.sum(0).max()), 1)].mT
@@ -331,9 +329,9 @@ class SetInit(Initialiser):
         if problem.prior is not None:
             poses = Pose(matrices.permute(2, 3, 0, 1), translation.permute(1, 2, 0))  # (H, B, ...)
             support = support - problem.prior.disagreement(poses)
-        best = torch.where(valid, support, -torch.inf).max(0)
-        every = torch.cat((rotation, translation)).gather(1, best.indices.expand(12, 1, -1))[:, 0].mT  # (B, 12)
-        found = (best.values > -torch.inf)[:, None]
+        score, best = torch.where(valid, support, -torch.inf).max(0)
+        every = torch.cat((rotation, translation)).gather(1, best.expand(12, 1, -1))[:, 0].mT  # (B, 12)
+        found = (score > -torch.inf)[:, None]
         every = torch.where(found, every, torch.cat((fallback.rotation.flatten(1), fallback.translation), 1))
         return Pose(every[:, :9].unflatten(1, (3, 3)), every[:, 9:])
 

@@ -1,4 +1,4 @@
-"""What the set network sees of a problem: features that do not depend on where world and camera are, nor on units."""
+"""The input of the set network: features that depend neither on the places of world and camera nor on units."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["LEAST_NOISE", "LOG_NOISE", "View", "repeats"]
 
 # Ridge of the affine camera, relative to the mean square of the world points: the fit is then unique for planar points.
 _RIDGE = 0.02
-# Spreads. Features are clipped to this size, so that a pair with wild coordinates does not dominate the network.
+# Spreads. Features are clipped to this size, so that no pair dominates the network.
 _MOST = 8.0
 #: Centre of the logarithm of the estimated noise, relative to the spread of the pixels and of the world.
 LOG_NOISE = -5.0
@@ -21,17 +21,16 @@ LOG_NOISE = -5.0
 LEAST_NOISE = 1e-6
 # Confidences are clipped to this distance from 0 and from 1.
 _LEAST_CONFIDENCE = 1e-3
-# Points are sorted by their first coordinate plus the others times these factors, so that equal points are neighbours.
-# The factors are irrational, so that the points of a grid have different keys.
-_KEY = 0.7548776662, 0.5698402910
+# Points are sorted by this combination of their coordinates, so that equal points are neighbours. The factors are
+# irrational, so that the points of a grid have different keys.
+_KEY = 1.0, 0.7548776662, 0.5698402910
 
 
 class View:
     r"""The network's input: invariant to rotations of world and camera and to their units.
 
     The camera is rotated so that the mean of the rays is its axis, and zoomed until the spread of the rays is 1. The
-    world, already centred and scaled, is rotated to the axes of the affine camera that fits the pairs best (by ridge
-    regression).
+    centred and scaled world is rotated to the axes of the affine camera that fits the pairs best, by ridge regression.
 
     Attributes:
         there: 1 for pairs with a weight and of normal scale, 0 for others, shape :math:`(B, N)`.
@@ -92,26 +91,17 @@ class View:
 
 @torch.no_grad()
 def repeats(problem: Problem) -> Tensor:
-    """Logarithms of the numbers of pairs with the same pixel and with the same point, (B, N, 2)."""
-    there = (problem.usual_weights > 0).to(problem.weights)
-    pixels = functional.pad(problem.img_points, (0, 1))
-    same = _same(torch.cat((pixels, problem.world_points)), there.repeat(2, 1))
-    return same.log().unflatten(0, (2, -1)).movedim(0, -1)
-
-
-@torch.no_grad()
-def _same(points: Tensor, there: Tensor) -> Tensor:
-    """Number of pairs of the problem whose point is exactly the same, at least 1; ``points`` (B, N, K), (B, N)."""
-    key, *others = points.unbind(-1)
-    for x, factor in zip(others, _KEY, strict=False):
-        key = torch.add(key, x, alpha=factor)
-    order = key.argsort(1)  # equal points are neighbours
+    """Logarithms of the numbers of pairs with exactly the same pixel and with exactly the same point, (B, N, 2)."""
+    there = (problem.usual_weights > 0).to(problem.weights).repeat(2, 1)
+    points = torch.cat((functional.pad(problem.img_points, (0, 1)), problem.world_points))  # (2 B, N, 3)
+    order = (points * points.new_tensor(_KEY)).sum(-1).argsort(1)  # equal points are neighbours
     ordered = points.gather(1, order[..., None].expand_as(points))
-    # Numbers, not booleans, of which PyTorch 2.13 makes code that does not compile.
+    # Numbers, not booleans: of booleans PyTorch 2.13 makes code that does not compile.
     new = (ordered[:, 1:] != ordered[:, :-1]).long().amax(-1)
     run = functional.pad(new.cumsum(1), (1, 0))
     sizes = torch.zeros_like(there).scatter_add(1, run, there.gather(1, order))
-    return torch.empty_like(there).scatter(1, order, sizes.gather(1, run)).clamp(min=1.0)
+    same = torch.empty_like(there).scatter(1, order, sizes.gather(1, run)).clamp(min=1.0)
+    return same.log().unflatten(0, (2, -1)).movedim(0, -1)
 
 
 def _frame(affine: Tensor, squares: Tensor) -> Tensor:
@@ -122,16 +112,14 @@ def _frame(affine: Tensor, squares: Tensor) -> Tensor:
     p, q = affine.unbind(1)
     product = (p * q).sum(-1, keepdim=True)  # (B, 1)
     # The inverse square root of the Gram matrix S of the rows, up to a factor: (S + sqrt(det S) I)^-1.
-    ridge = 1e-3 * squares.sum(-1, keepdim=True) + 1e-6
-    raised = squares + ridge
-    root = (raised[:, :1] * raised[:, 1:] - product.square()).clamp(min=1e-12).sqrt()
+    raised = squares + (1e-3 * squares.sum(-1, keepdim=True) + 1e-6)
+    root = (raised.prod(-1, keepdim=True) - product.square()).clamp(min=1e-12).sqrt()
     diagonal = raised.flip(-1) + root
     u, v = (diagonal[..., None] * affine - product[..., None] * affine.flip(1)).unbind(1)
     eye = torch.eye(3, dtype=u.dtype, device=u.device)
     u = functional.normalize(u + 1e-6 * eye[0], dim=-1)
     # A vector that is orthogonal to u: the reflection that maps u to an axis ±z takes x to it.
-    sign = 1.0 - 2.0 * (u[:, 2:] < 0).to(u.dtype)
+    sign = torch.where(u[:, 2:] < 0, -1.0, 1.0)
     orthogonal = eye[0] - (u[:, :1] / (1.0 + sign * u[:, 2:])) * (u + sign * eye[2])
-    v = v - (u * v).sum(-1, keepdim=True) * u + 1e-6 * orthogonal
-    v = functional.normalize(v, dim=-1)
+    v = functional.normalize(v - (u * v).sum(-1, keepdim=True) * u + 1e-6 * orthogonal, dim=-1)
     return torch.stack((u, v, torch.linalg.cross(u, v)), 1)

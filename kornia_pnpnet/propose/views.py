@@ -1,4 +1,4 @@
-"""Views: a network answers the mirror images of a problem differently, and each answer is a pose to start from."""
+"""Views: a network answers each mirror image of a problem differently, and each answer is a pose to start from."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ VIEWS = (
 def from_views(init: Callable[[Problem], Starts], problem: Problem, count: int, order: bool) -> Starts:
     """The starts of an initialiser for a problem, with its poses for mirror images of the problem.
 
-    The axes of image and world are exchanged or reversed, both in the same way: the distribution of random problems
-    does not change.
+    A mirror image exchanges or reverses the axes of image and world in the same way, so that the distribution of random
+    problems does not change.
 
     Args:
         init: the initialiser.
@@ -41,10 +41,9 @@ def from_views(init: Callable[[Problem], Starts], problem: Problem, count: int, 
     """
     batch = problem.weights.shape[0]
     starts = init(_views(problem, count, order))
-    _, *others = [x for pose in starts.poses for x in _undone(pose, count)]
-    # Weights, ok and noise of the first view, whose pairs have the order of the problem.
-    first: Starts = map_tensors(lambda x: x[:batch], starts._replace(others=None))
-    return first.with_others(*others)
+    # The first view is the problem itself, in the order of its pairs.
+    first: Starts = map_tensors(lambda x: x[:batch], starts)
+    return first.with_others(*(x for pose in starts.poses for x in _undone(pose, count)))
 
 
 def _views(problem: Problem, count: int, order: bool) -> Problem:
@@ -68,10 +67,10 @@ def _views(problem: Problem, count: int, order: bool) -> Problem:
 
 
 def _undone(pose: Pose, count: int) -> list[Pose]:
-    """Poses of the problems themselves from the poses of their views, the first view first."""
+    """Poses of the problems themselves from the poses of all their views but the first."""
     poses = []
-    matrices, vectors = (x.movedim(0, -1).unflatten(-1, (count, -1)).unbind(-2) for x in pose)
-    for view, matrix, vector in zip(VIEWS, matrices, vectors, strict=False):  # (3, 3, B), (3, B)
+    matrices, vectors = (x.movedim(0, -1).unflatten(-1, (count, -1)).unbind(-2)[1:] for x in pose)
+    for view, matrix, vector in zip(VIEWS[1:count], matrices, vectors, strict=True):  # (3, 3, B), (3, B)
         for axis in (0, 1):
             matrix = _axes_back(matrix, axis, view)
         poses.append(Pose(matrix.movedim(-1, 0), _axes_back(vector, 0, view).movedim(-1, 0)))
