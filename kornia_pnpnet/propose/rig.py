@@ -6,17 +6,14 @@ import torch
 from torch import Tensor
 
 from kornia_pnpnet.core.linalg import relative
-from kornia_pnpnet.core.performance import present_first, problems_last, repeat_problems, sees_values, take_pairs
-from kornia_pnpnet.core.trees import map_tensors, take
+from kornia_pnpnet.core.performance import present_first, problems_last, sees_values
+from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.judge.belief import residual_noise
 from kornia_pnpnet.judge.inliers import Thresholds, judge
 from kornia_pnpnet.problem import Problem, Starts, State
 from kornia_pnpnet.propose.p3p import P3P
-from kornia_pnpnet.propose.p3p_rig import P3PRig
 from kornia_pnpnet.propose.ransac import RANSAC
-from kornia_pnpnet.propose.sampling import draw_subsets
-from kornia_pnpnet.propose.scoring import SCORERS, Scene
-from kornia_pnpnet.propose.search import least_squares, pack_pairs, unpack_pairs
+from kornia_pnpnet.propose.search import Search
 from kornia_pnpnet.refine.residual import project
 from kornia_pnpnet.result import Pose
 
@@ -30,9 +27,6 @@ _FINDER = RANSAC(P3P(), threshold=_THRESHOLD, final_steps=0)
 _SAMPLES, _DRAWS = 128, 4
 # Number of pairs on which each pose is scored when the effort is fixed.
 _JUDGES = 32
-# Number of best poses that a fixed effort improves, by one step of least squares on the pairs up to each limit in
-# thresholds.
-_IMPROVED, _LIMITS = 3, (3.0, 1.0)
 # The root of x^4 = x + 1. Multiples of its negative powers, modulo 1, fill the unit cube evenly (M. Roberts, "The
 # unreasonable effectiveness of quasirandom sequences", 2018).
 _ROOT = 1.2207440846057596
@@ -50,7 +44,7 @@ def starts_of_rig(problem: Problem, given: Pose | None, *, with_noise: bool, fix
     """
     problem = problem.map(torch.Tensor.detach)
     if fixed or not sees_values(problem.weights):
-        starts = _best_of_samples(problem)
+        starts = _of_fixed_effort(problem._replace(weights=relative(problem.weights, problem.weights), noise=None))
     else:
         starts = _FINDER(problem._replace(img_scale=problem.focal.expand(len(problem.weights))), given)
     noise = None
@@ -63,49 +57,32 @@ def starts_of_rig(problem: Problem, given: Pose | None, *, with_noise: bool, fix
     return starts._replace(ok=None, noise=noise, weights=(starts.weights > 0).to(starts.weights))
 
 
-def _best_of_samples(problem: Problem) -> Starts:
-    """The best pose of a fixed number of minimal samples, improved on its inliers, and weights of the inliers."""
-    batch, count = problem.weights.shape
-    problem = problem._replace(weights=relative(problem.weights, problem.weights), noise=None)
-    counts, order = (problem.weights > 0).sum(1), present_first(problem.weights > 0)
+def _of_fixed_effort(problem: Problem) -> Starts:
+    """The best pose of a fixed number of minimal samples, and weights of its inliers."""
+    there = problem.weights > 0
+    counts, order = there.sum(1, keepdim=True), present_first(there)
     # Judges are spread evenly over the pairs that have a weight; fewer pairs judge once each.
     turn = torch.arange(_JUDGES, device=order.device)
-    judges = turn.maximum(turn * counts[:, None] // _JUDGES).clamp(max=count - 1)
-    at = torch.cat((_draw(problem, order, counts), order.gather(1, judges)), 1)
-    owners = torch.arange(batch, device=order.device)
-    samples, judging = take_pairs(pack_pairs(problem), at).split((3 * _SAMPLES, _JUDGES), 1)  # (18, 3 S + J, B)
-    samples = samples.unflatten(1, (3, _SAMPLES)).flatten(2)
-    pose, valid = P3PRig().hypotheses(unpack_pairs(samples, problem, owners.repeat(_SAMPLES)))
-
-    jury = unpack_pairs(judging, problem, owners)._replace(prior=problem.prior)
-    jury = jury._replace(weights=torch.where(turn < counts[:, None], jury.weights, 0.0))
-    limit = (_THRESHOLD * problem.focal).expand(batch, 1)
-    thresholds = Thresholds(limit, torch.zeros_like(limit))
-    scene = Scene.of(jury, thresholds, limit.dtype)
-    packed = torch.cat((pose.rotation.mT, pose.translation[..., None, :]), -2)  # (S B, 4, 4, 3)
-    packed = packed.unflatten(0, (_SAMPLES, batch)).permute(1, 3, 4, 0, 2).flatten(3)  # (B, 4, 3, S 4)
-    valid = valid.unflatten(0, (_SAMPLES, batch)).movedim(0, 1).flatten(1)
-    losses = scene.losses(packed, SCORERS["msac"]).masked_fill(~valid, torch.inf)
-    best = losses.topk(_IMPROVED, largest=False).indices[:, None, None].expand(-1, 4, 3, -1)
-    matrix = packed.gather(3, best).permute(3, 0, 2, 1).flatten(0, 1)  # (K B, 3, 4)
-    repeated, limits = repeat_problems((problem._replace(prior=None), thresholds), _IMPROVED)
-    projection = project(State.of(Pose(matrix[..., :3], matrix[..., 3])), repeated)
-    for factor in _LIMITS:
-        inliers = judge(projection, repeated, limits._replace(img=factor * limits.img)).weights
-        projection = project(least_squares(repeated, projection, inliers), repeated)
-    judged = judge(projection, repeated, limits)
-    loss = (repeated.weights * SCORERS["msac"](judged.errors)).sum(1)
-    at = loss.unflatten(0, (_IMPROVED, batch)).argmin(0) * batch + owners
-    return Starts(take(projection.state.pose, at), judged.weights[at])
+    judges = order.gather(1, turn.maximum(turn * counts // _JUDGES).clamp(max=order.shape[1] - 1))
+    img = (_THRESHOLD * problem.focal).expand(len(there), 1)
+    thresholds = Thresholds(img, torch.zeros_like(img))
+    search = Search(_FINDER, problem, thresholds)
+    search.run_once(_drawn(problem, order, counts), torch.where(turn < counts, judges, -1))
+    pose = search.state.pose
+    return Starts(pose, judge(project(State.of(pose), problems_last(problem)), problem, thresholds).weights)
 
 
-def _draw(problem: Problem, order: Tensor, counts: Tensor) -> Tensor:
-    """Positions of the pairs of the samples, (B, 3 S), in ``order`` (B, N) of which the first ``counts`` are drawn."""
+def _drawn(problem: Problem, order: Tensor, counts: Tensor) -> Tensor:
+    """Positions (B, S, 3) of the pairs of the samples, of the first ``counts`` (B, 1) in ``order`` (B, N)."""
     numbers = torch.arange(1, _DRAWS * _SAMPLES + 1, dtype=torch.float64, device=order.device)
-    numbers = torch.stack([numbers * _ROOT**-k for k in (1, 2, 3)], -1)
-    drawn = draw_subsets(numbers - numbers.floor(), counts).mT  # (B, 3, D S)
-    drawn = order.gather(1, drawn.flatten(1))
-    rays = take_pairs(problem.places, drawn).unflatten(1, (3, _DRAWS, _SAMPLES))  # (3, 3, D, S, B)
-    ahead = (rays * rays.sum(1, keepdim=True)).sum(0).amin(0) > 0  # what P3PRig can solve, (D, S, B)
-    first = ahead.long().argmax(0).mT[:, None, None].expand(-1, 3, -1, -1)
-    return drawn.unflatten(1, (3, _DRAWS, _SAMPLES)).gather(2, first).flatten(1)
+    numbers = torch.stack([numbers * _ROOT**-k for k in (1, 2, 3)], -1)  # (D S, 3)
+    ranks = ((numbers - numbers.floor()).flatten() * counts).long()
+    drawn = order.gather(1, ranks.minimum((counts - 1).clamp(min=0)))  # (B, D S 3)
+    places = problem.places
+    rays = places.gather(1, drawn[..., None].expand(-1, -1, 3)).unflatten(1, (_DRAWS, _SAMPLES, 3))
+    drawn = drawn.unflatten(1, (_DRAWS, _SAMPLES, 3))
+    # What P3PRig can solve: three pairs whose rays are less than 90 degrees from their mean.
+    ahead = (rays * rays.sum(-2, keepdim=True)).sum(-1).amin(-1) > 0
+    apart = (drawn != drawn.roll(1, -1)).all(-1)
+    first = (ahead & apart).long().argmax(1)[:, None, :, None].expand(-1, 1, -1, 3)
+    return drawn.gather(1, first)[:, 0]
