@@ -11,7 +11,7 @@ from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.problem import Hypotheses, Problem
 from kornia_pnpnet.refine.lm import RobustWeightedLM
-from kornia_pnpnet.result import Pose, gate_pose
+from kornia_pnpnet.result import gate_pose
 
 __all__ = ["MinimalSolver", "SubsetSolver", "describe"]
 

@@ -19,15 +19,14 @@ from kornia_pnpnet.propose.initialiser import Initialiser
 from kornia_pnpnet.propose.minimal import MinimalSolver, describe
 from kornia_pnpnet.propose.p3p import P3P
 from kornia_pnpnet.propose.scoring import SCORERS, Scorer
-from kornia_pnpnet.propose.search import Search, least_squares
+from kornia_pnpnet.propose.search import Search, cauchy_scale, least_squares
 from kornia_pnpnet.refine.residual import Projection, project
 from kornia_pnpnet.result import Pose
 
 __all__ = ["RANSAC", "search_on"]
 
-# Scale of the Cauchy kernel of the last least squares, in standard deviations of the inliers' residuals; the median of
-# the squared residuals of Gaussian noise, in variances of a pixel coordinate; number of pairs that any pose fits.
-_KERNEL_SCALE, _MEDIAN, _FITTED = 3.4, 2.0 * math.log(2.0), 5
+# Number of pairs that any pose fits.
+_FITTED = 5
 # Standard deviations. :func:`search_on` counts nearer pairs as inliers. The limit of estimated noise is wide because
 # networks estimate too little noise where most pairs are outliers: an inlier that does not count costs more than an
 # outlier that does. That of known noise was tuned on problems of uncertain PnP (`benchmarks/uncertain_problems.py`,
@@ -205,7 +204,7 @@ class RANSAC(Initialiser):
             judged = judge(projection, problem, thresholds)
             inliers = judged.weights.detach()
             for _ in range(self.final_steps):
-                state = least_squares(problem, projection, inliers * _robust(judged, inliers))
+                state = least_squares(problem, projection, inliers * _robust(judged.errors, inliers))
                 projection = project(state, problem)
                 judged = judge(projection, problem, thresholds)
         return projection, map_tensors(torch.Tensor.detach, judged)
@@ -222,18 +221,15 @@ def _on_grid(problem: Problem) -> Tensor:
     return (_GRID_RESIDUAL * problem.free_focal.width * away.nanmedian(1).values.nan_to_num(0.0))[:, None]
 
 
-def _robust(judged: Judged, inliers: Tensor) -> Tensor:
+def _robust(errors: Tensor, inliers: Tensor) -> Tensor:
     """Weights of a Cauchy kernel, (B, N): its scale follows the median residual of the inliers, wherever they end.
 
     Thresholds are wide, and noise has tails: with equal weights, pairs near the threshold would decide the pose.
     """
-    count = (inliers > 0).sum(-1, keepdim=True)
-    middle = ((count + MIN_PAIRS) // 2).minimum(count - 1).clamp(min=0)
-    median = torch.where(inliers > 0, judged.errors, torch.inf).sort(-1).values.gather(1, middle)
+    sq_scale, count = cauchy_scale(errors, inliers > 0)
     # Few inliers lie close to the pose that was fitted to them: their residuals say less than they seem to.
     free = (count - _FITTED).clamp(min=0) / count.clamp(min=1)
-    sq_scale = _KERNEL_SCALE**2 / _MEDIAN * median.clamp(min=torch.finfo(median.dtype).eps)
-    return 1.0 / (1.0 + free * judged.errors / sq_scale)
+    return 1.0 / (1.0 + free * errors / sq_scale.clamp(min=torch.finfo(errors.dtype).eps))
 
 
 # How :func:`search_on` searches.

@@ -64,7 +64,7 @@ def _of_fixed_effort(problem: Problem) -> Starts:
     # Judges are spread evenly over the pairs that have a weight; fewer pairs judge once each.
     turn = torch.arange(_JUDGES, device=order.device)
     judges = order.gather(1, turn.maximum(turn * counts // _JUDGES).clamp(max=order.shape[1] - 1))
-    img = (_THRESHOLD * problem.focal).expand(len(there), 1)
+    img = (_THRESHOLD * problem.focal).expand(there.shape[0], 1)
     thresholds = Thresholds(img, torch.zeros_like(img))
     search = Search(_FINDER, problem, thresholds)
     search.run_once(_drawn(problem, order, counts), torch.where(turn < counts, judges, -1))

@@ -87,7 +87,7 @@ class Scene(NamedTuple):
         return self._replace(rows=rows, weights=self.weights.gather(2, positions[:, None]))
 
     def losses(self, poses: Tensor, scorer: Scorer) -> Tensor:
-        """Weighted sums (P, H) of the losses of pairs and prior at poses, the entries of :func:`as_pose`, (P, 12, H)."""
+        """Weighted sums (P, H) of the losses of pairs and prior at poses (P, 12, H), see :func:`as_pose`."""
         losses = (self.weights @ scorer(self.errors(poses)))[:, 0]
         if self.prior is None:
             return losses
@@ -100,7 +100,7 @@ class Scene(NamedTuple):
         There is no mask: comparing and selecting would take longer than all the arithmetic, which is in place.
         """
         rows = self.rows.flatten(1, 2)
-        x, y, z = torch.baddbmm(rows[..., 12:], rows[..., :12], poses).chunk(3, 1)
+        x, y, z = torch.baddbmm(rows[..., 12:], rows[..., :12], poses).unflatten(1, self.rows.shape[1:3]).unbind(1)
         sq_limit = torch.addcmul(self.sq_world, z, z)
         sq_distance = x.mul_(x).addcmul_(y, y).add_(z.clamp_(max=0.0), alpha=-_BEHIND)
         return sq_distance.div_(sq_limit).clamp_(max=MAX_ERROR)

@@ -3,26 +3,32 @@ r"""The one search of all samplers: solve minimal samples, score their poses, im
 from __future__ import annotations
 
 import math
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
+from kornia_pnpnet.core.linalg import solve_positive
 from kornia_pnpnet.core.performance import compiling, present_first, sees_values
 from kornia_pnpnet.core.trees import map_tensors, take
 from kornia_pnpnet.judge.belief import residual_noise, rotation_sigma
 from kornia_pnpnet.judge.inliers import Thresholds, judge
-from kornia_pnpnet.problem import Noise, Problem, State
-from kornia_pnpnet.propose.minimal import MinimalSolver
+from kornia_pnpnet.problem import MIN_PAIRS, Problem, State
 from kornia_pnpnet.propose.p3p_rig import P3PRig
 from kornia_pnpnet.propose.sampling import Samples, agreement_of_neighbours, kept_at_once
-from kornia_pnpnet.propose.scoring import Scene, Scorer, as_pose
-from kornia_pnpnet.refine.residual import Projection, lm_step, normal_equations, project
+from kornia_pnpnet.propose.scoring import Scene, as_pose
+from kornia_pnpnet.refine.residual import Projection, moved, normal_equations, project
 from kornia_pnpnet.refine.terms import add_term
 from kornia_pnpnet.result import Pose
 
-__all__ = ["Plan", "Search", "least_squares"]
+if TYPE_CHECKING:
+    from kornia_pnpnet.propose.ransac import RANSAC
+
+__all__ = ["CAUCHY", "Search", "cauchy_scale", "least_squares"]
+
+#: Scale of the Cauchy kernel in standard deviations.
+CAUCHY = 3.4
 
 # Poses are compared and improved in this precision, which resolves 1e-4 px at the protocol's focal length of 3400 px.
 _DTYPE = torch.float32
@@ -58,25 +64,14 @@ _PLAIN_SAMPLES = 256
 _LEAST_AGREEMENT, _AGREEMENT_POWER = 0.3, 1.5
 
 
-class Plan(Protocol):
-    """How to search: the arguments of :class:`~kornia_pnpnet.propose.ransac.RANSAC`."""
-
-    minimal: MinimalSolver
-    score: Scorer
-    max_samples: int
-    min_samples: int
-    confidence: float
-    seed: int
-
-
 class Search:
     r"""One search for the best poses of a batch, without gradients.
 
-    A pose is the twelve entries of :math:`[R | t]` by rows, see :func:`~kornia_pnpnet.propose.scoring.as_pose`. The last
+    A pose is twelve entries of :math:`[R | t]` by rows, see :func:`~kornia_pnpnet.propose.scoring.as_pose`. Its last
     row is divided by the zoom of an unknown focal length.
 
     Args:
-        plan: how to search.
+        plan: how to search: see the arguments of RANSAC.
         problem: the problems; their world is centred, since the search runs in float32.
         thresholds: thresholds of an inlier.
         chances: how likely a pair is an inlier, up to a factor, shape :math:`(B, N)`; all the same when ``None``.
@@ -103,7 +98,7 @@ class Search:
 
     def __init__(
         self,
-        plan: Plan,
+        plan: RANSAC,
         problem: Problem,
         thresholds: Thresholds,
         chances: Tensor | None = None,
@@ -121,12 +116,11 @@ class Search:
         rig = [] if problem.rig is None else [problem.rig.rotation.flatten(2), problem.rig.translation]
         self.pairs = torch.cat((problem.world_points, problem.img_points, problem.weights[..., None], *rig), -1)
         self.low = self.pairs.to(_DTYPE)
-        batch = len(self.low)
+        batch = self.low.shape[0]
         self.poses = torch.eye(3, 4, dtype=_DTYPE, device=self.low.device).flatten().repeat(batch, 1)
         self.loss = self.low.new_full((batch,), torch.inf)
-        self.least = self.loss.new_zeros(batch, dtype=torch.float64)
-        self.needed = self.least + torch.inf
-        self.scored, self.drawn = self.least.long(), self.least.long()
+        self.needed = self.loss.double()
+        self.scored, self.drawn = torch.zeros(2, batch, dtype=torch.int64, device=self.low.device)
 
     @property
     def state(self) -> State:
@@ -151,7 +145,8 @@ class Search:
             poses = _entries(given)[active].to(_DTYPE).mT
             losses = take(self.scene, active).losses(poses, self.plan.score)
             self.scored[active] += losses.shape[1]
-            self.loss[active], self.poses[active] = _best(losses, poses)
+            self.loss[active], best = losses.min(1)
+            self.poses[active] = poses.mT[torch.arange(len(best), device=best.device), best]
             self._expect(active)
             hard = self.needed[active] > enough
             self._improve(active[hard], losses[hard], poses[hard])
@@ -179,12 +174,13 @@ class Search:
             positions: positions of the pairs of the samples, shape :math:`(B, H, s)`.
             judges: positions of the pairs that score all poses, shape :math:`(B, J)`; a negative one does not count.
         """
-        poses, valid = self._solved(torch.arange(len(positions), device=positions.device), positions)
+        problems = torch.arange(positions.shape[0], device=positions.device)
+        poses, valid = self._solved(problems, positions)
         jury = self.scene.pairs(judges.clamp(min=0))
         jury = jury._replace(weights=torch.where(judges[:, None] >= 0, jury.weights, 0.0))
         _, poses, _ = self._best_of(jury, poses, valid, _IMPROVED)
         losses = self.scene.losses(poses, self.plan.score)
-        self.loss, self.poses = self._improved(torch.arange(len(poses), device=poses.device), losses, poses)
+        self.loss, self.poses = self._improved(problems, losses, poses)
 
     def _state(self, poses: Tensor) -> State:
         """Poses (R, 12) and their zoom."""
@@ -204,15 +200,10 @@ class Search:
         usual = torch.ones_like(weights)
         return Problem(values[..., :3], values[..., 3:5], weights, focal, *scales, usual, rig=rig, free_focal=free)
 
-    def _projected(self, problems: Tensor, poses: Tensor) -> tuple[Problem, Thresholds, Projection, Tensor]:
-        """Some problems, their thresholds, and the points at poses (R, 12), in the precision of the search.
-
-        The last result are the rows, which are repeated to fill a processor's vectors.
-        """
-        count = self.low.shape[1]
-        rows = full_vectors(problems, count)
+    def _projected(self, rows: Tensor, poses: Tensor) -> tuple[Problem, Thresholds, Projection]:
+        """Some problems, their thresholds, and their points at poses (R, 12), in the precision of the search."""
         problem = self._unpacked(self.low[rows].permute(2, 1, 0).contiguous(), rows)
-        return problem, take(self.thresholds, rows), project(self._state(full_vectors(poses, count)), problem), rows
+        return problem, take(self.thresholds, rows), project(self._state(poses), problem)
 
     def _samples(self, chances: Tensor | None) -> Samples:
         plan, there = self.plan, self.problem.weights > 0
@@ -234,20 +225,19 @@ class Search:
         """
         if not len(at):
             return
-        problem, thresholds, projection, rows = self._projected(at, self.poses[at])
+        rows = full_vectors(at, self.low.shape[1])
+        problem, thresholds, projection = self._projected(rows, self.poses[rows])
         judged = judge(projection, problem, thresholds)
-        if self.problem.free_focal is None:
-            if self.sigma is None:
-                noise = residual_noise(projection, problem, judged.weights)
-            else:
-                noise = Noise(self.sigma[rows], torch.zeros_like(problem.weights))
-            is_open = rotation_sigma(projection, problem, noise, judged) > _OPEN
-            self.least[at] = self.least[at].where(~is_open[: len(at)], _OPEN_SAMPLES)
         inliers = judged.weights[: len(at)] > 0
         needed = self.samples.needed(at, inliers, self.plan.confidence)
         if self.samples is not self.plain:
             needed = (needed * self.plain.needed(at, inliers, self.plan.confidence)).sqrt()
-        self.needed[at] = needed.maximum(self.least[at])
+        if self.problem.free_focal is None:
+            noise = residual_noise(projection, problem, judged.weights)
+            noise = noise if self.sigma is None else noise._replace(img=self.sigma[rows])
+            is_open = rotation_sigma(projection, problem, noise, judged)[: len(at)] > _OPEN
+            needed = torch.where(is_open, needed.clamp(min=_OPEN_SAMPLES), needed)
+        self.needed[at] = needed
 
     def _end_of_round(self, done: int, total: int) -> int:
         """Number of samples after the next round; few that would be left go with it."""
@@ -309,22 +299,24 @@ class Search:
         Each of the two steps counts only where it lowers the loss; an invalid pose stays invalid. Returns losses (P,)
         and poses (P, 12).
         """
+        number, pairs = problems.shape[0], self.low.shape[1]
+        problems, losses, poses = (full_vectors(x, pairs) for x in (problems, losses, poses))
         scene = take(self.scene, problems)
         for limit in _LIMITS:
             owners = problems.repeat_interleave(poses.shape[2])
-            problem, thresholds, projection, _ = self._projected(owners, poses.mT.flatten(0, 1))
+            problem, thresholds, projection = self._projected(owners, poses.mT.flatten(0, 1))
             wide = Thresholds(limit * thresholds.img, limit * thresholds.world)
             pose, camera = least_squares(problem, projection, judge(projection, problem, wide).weights)
             entries = _entries(pose)
             if camera.shape[1]:
                 entries = torch.cat((entries[:, :8], entries[:, 8:] * (-camera).exp()), 1)
-            new = entries[: len(owners)].view_as(poses.mT).mT
+            new = entries.view_as(poses.mT).mT
             new_losses = scene.losses(new, self.plan.score)
             better = (new_losses < losses) & losses.isfinite()
             losses, poses = torch.where(better, new_losses, losses), torch.where(better[:, None], new, poses)
-            best_losses, best = _best(losses, poses)
-            losses, poses = best_losses[:, None], best[..., None]
-        return best_losses, best
+            losses, best = losses.min(1, keepdim=True)
+            poses = poses.gather(2, best[:, None].expand(-1, 12, -1))
+        return losses[:number, 0], poses[:number, :, 0]
 
     def _improve(self, problems: Tensor, losses: Tensor, poses: Tensor) -> None:
         """Improve poses; the best becomes the pose of its problem."""
@@ -332,15 +324,31 @@ class Search:
             self.loss[problems], self.poses[problems] = self._improved(problems, losses, poses)
 
 
-def least_squares(problem: Problem, projection: Projection, weights: Tensor) -> State:
-    """Take one step of least squares with the weights (B, N) times the weights of the pairs."""
+def least_squares(problem: Problem, projection: Projection, weights: Tensor, variance: Tensor | None = None) -> State:
+    """Take one step of least squares with the weights (B, N) times the weights of the pairs.
+
+    What is known of the camera counts as the residual of a pixel counts whose variance is given, (B, 1): a pixel of the
+    caller by default.
+    """
     weights = problem.weights * weights
     equations = normal_equations(projection, problem, weights)
-    for term in problem._replace(prior=None).terms:  # a residual of a pixel of the caller is a standard deviation
-        equations = equations._replace(unit=problem.img_scale.square().reciprocal()[:, None])
+    for term in problem._replace(prior=None).terms:
+        variance = problem.img_scale.square()[:, None] if variance is None else variance
+        equations = equations._replace(unit=variance.reciprocal())
         equations = add_term(equations, term.linearise(projection.state), projection.focal)
-    one, damping = weights.new_ones(()), weights.new_full((), _DAMPING)
-    return lm_step(equations, projection.state, projection.focal, one, damping)[0]
+    delta, _ = solve_positive(equations.matrix, equations.gradient, weights.new_full((), _DAMPING))
+    return moved(projection.state, delta / -projection.focal)
+
+
+def cauchy_scale(sq_residuals: Tensor, there: Tensor, fitted: int = MIN_PAIRS) -> tuple[Tensor, Tensor]:
+    """Squared scale of a Cauchy kernel, by the median squared residual of some pairs (B, N), and their number, (B, 1).
+
+    Any state fits as many pairs as are given. Without any pair the scale is infinite.
+    """
+    count = there.sum(-1, keepdim=True)
+    middle = ((count + fitted) // 2).minimum(count - 1).clamp(min=0)
+    median = torch.where(there, sq_residuals, torch.inf).sort(-1).values.gather(1, middle)
+    return CAUCHY**2 / (2.0 * math.log(2.0)) * median, count  # the median is in variances of a pixel coordinate
 
 
 def full_vectors(rows: Tensor, pairs: int = 1) -> Tensor:
@@ -358,9 +366,3 @@ def full_vectors(rows: Tensor, pairs: int = 1) -> Tensor:
 def _entries(pose: Pose) -> Tensor:
     """The inverse of :func:`~kornia_pnpnet.propose.scoring.as_pose`, (*, 12)."""
     return torch.cat((pose.rotation, pose.translation[..., None]), -1).flatten(-2)
-
-
-def _best(losses: Tensor, poses: Tensor) -> tuple[Tensor, Tensor]:
-    """The smallest losses (P,) of (P, K), and their poses (P, 12) of (P, 12, K)."""
-    losses, best = losses.min(1, keepdim=True)
-    return losses[:, 0], poses.gather(2, best[:, None].expand(-1, 12, -1))[..., 0]
