@@ -5,14 +5,18 @@ from __future__ import annotations
 import torch
 from torch import nn
 
-from kornia_pnpnet.problem import Problem, Starts
-from kornia_pnpnet.propose.alternatives import is_seen
+from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.problem import Problem, Starts, State
 from kornia_pnpnet.propose.initialiser import trait
 from kornia_pnpnet.propose.rig import starts_of_rig
 from kornia_pnpnet.propose.views import from_views
+from kornia_pnpnet.refine.residual import project
 from kornia_pnpnet.result import Pose
 
 __all__ = ["propose"]
+
+# Focal lengths. A pair that is not of normal scale is refined only when some first pose projects it this close.
+_SEEN = 0.25
 
 
 def propose(
@@ -51,5 +55,10 @@ def propose(
         starts = starts.with_others(given)._replace(ok=None)
     if trait(init, "weighs_unusual"):
         return starts
-    # Pairs that are not of normal scale have a weight where a start sees them.
-    return starts._replace(weights=starts.weights * torch.where(is_seen(starts, problem), 1.0, problem.usual))
+    # A pair that is not of normal scale has a weight where some pose projects its point close to its pixel.
+    known, limit = problem.map(torch.Tensor.detach), (_SEEN * problem.focal) ** 2
+    seen = torch.zeros_like(problem.weights, dtype=torch.bool)
+    for pose in map_tensors(torch.Tensor.detach, starts.poses):
+        projection = project(State.of(pose), known)
+        seen = seen | (projection.in_front & (projection.sq_residual < limit))
+    return starts._replace(weights=starts.weights * torch.where(seen, 1.0, problem.usual))

@@ -22,7 +22,7 @@ from kornia_pnpnet.problem import Problem
 from kornia_pnpnet.refine.terms import PoseTerm
 from kornia_pnpnet.result import Pose
 
-__all__ = ["SCORERS", "Scene", "Scorer", "as_pose"]
+__all__ = ["SCORERS", "Scene", "Scorer", "as_entries", "as_pose"]
 
 #: Maps standardised squared residuals of any shape to losses of the pairs.
 Scorer: TypeAlias = Callable[[Tensor], Tensor]
@@ -42,6 +42,11 @@ def as_pose(entries: Tensor) -> Pose:
     """Poses from the entries of the matrices [R | t] by rows, shape (*, 12)."""
     matrix = entries.unflatten(-1, (3, 4))
     return Pose(matrix[..., :3], matrix[..., 3])
+
+
+def as_entries(pose: Pose) -> Tensor:
+    """The inverse of :func:`as_pose`, (*, 12)."""
+    return torch.cat((pose.rotation, pose.translation[..., None]), -1).flatten(-2)
 
 
 class Scene(NamedTuple):

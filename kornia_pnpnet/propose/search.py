@@ -17,7 +17,7 @@ from kornia_pnpnet.judge.inliers import Thresholds, judge
 from kornia_pnpnet.problem import MIN_PAIRS, Problem, State
 from kornia_pnpnet.propose.p3p_rig import P3PRig
 from kornia_pnpnet.propose.sampling import Samples, agreement_of_neighbours, kept_at_once
-from kornia_pnpnet.propose.scoring import Scene, as_pose
+from kornia_pnpnet.propose.scoring import Scene, as_entries, as_pose
 from kornia_pnpnet.refine.residual import Projection, moved, normal_equations, project
 from kornia_pnpnet.refine.terms import add_term
 from kornia_pnpnet.result import Pose
@@ -142,7 +142,7 @@ class Search:
         totals = self.samples.totals
         active = (self.samples.counts >= self.samples.size).nonzero()[:, 0]
         if given is not None and len(active):
-            poses = _entries(given)[active].to(_DTYPE).mT
+            poses = as_entries(given)[active].to(_DTYPE).mT
             losses = take(self.scene, active).losses(poses, self.plan.score)
             self.scored[active] += losses.shape[1]
             self.loss[active], best = losses.min(1)
@@ -307,7 +307,7 @@ class Search:
             problem, thresholds, projection = self._projected(owners, poses.mT.flatten(0, 1))
             wide = Thresholds(limit * thresholds.img, limit * thresholds.world)
             pose, camera = least_squares(problem, projection, judge(projection, problem, wide).weights)
-            entries = _entries(pose)
+            entries = as_entries(pose)
             if camera.shape[1]:
                 entries = torch.cat((entries[:, :8], entries[:, 8:] * (-camera).exp()), 1)
             new = entries.view_as(poses.mT).mT
@@ -361,8 +361,3 @@ def full_vectors(rows: Tensor, pairs: int = 1) -> Tensor:
         return rows
     left_over = -len(rows) % _VECTOR
     return torch.cat((rows, rows[:1].expand(left_over, *rows.shape[1:]))) if left_over else rows
-
-
-def _entries(pose: Pose) -> Tensor:
-    """The inverse of :func:`~kornia_pnpnet.propose.scoring.as_pose`, (*, 12)."""
-    return torch.cat((pose.rotation, pose.translation[..., None]), -1).flatten(-2)
