@@ -60,8 +60,8 @@ def with_nominal_focal(inputs: Inputs, sigma: float | None) -> Inputs:
             principal_point = camera[:, None, :2, 2]
             away = (inputs.img_points - principal_point).abs().amax(-1)  # (B, N)
             there = away < torch.inf  # NaN compares false
-            there = there if inputs.mask is None else there & inputs.mask
-            there = there if inputs.weights is None else there & (inputs.weights > 0)
+            for given_pairs in (inputs.mask, inputs.weights):
+                there = there if given_pairs is None else there & (given_pairs > 0)
             median = ranked(torch.where(there, away, torch.inf).mT[None], (there.sum(1) - 1) // 2)[0]
             half = (_HALF_WIDTH * median).maximum(principal_point[:, 0].abs().amax(-1))
             half = torch.where(half.isfinite() & (half > 0), half, 1.0)
@@ -78,9 +78,7 @@ def with_nominal_focal(inputs: Inputs, sigma: float | None) -> Inputs:
 
 def scale_focal(intrinsics: Tensor, factor: Tensor) -> Tensor:
     """Multiply the focal lengths and the skew of camera matrices (B, 3, 3) by a factor (B,)."""
-    first, rest = intrinsics.split((2, 1), 1)
-    linear, principal_point = first.split((2, 1), 2)
-    return torch.cat((torch.cat((linear * factor[:, None, None], principal_point), 2), rest), 1)
+    return intrinsics * functional.pad(factor[:, None, None].expand(-1, 2, 2), (0, 1, 0, 1), value=1.0)
 
 
 def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:

@@ -182,7 +182,7 @@ class RANSAC(Initialiser):
         with torch.no_grad():
             if fixed.free_focal is not None:
                 stages = [thresholds._replace(img=thresholds.img.maximum(_on_grid(fixed))), thresholds]
-            search = Search(self, fixed, stages[0], _trusted(fixed.confidence))
+            search = Search(self, fixed, stages[0], _trusted(fixed))
             search.run(given)
         projection, judged = self._refined(problems_last(problem), search.state, stages)
         pose, camera = map_tensors(torch.Tensor.contiguous, projection.state)
@@ -236,9 +236,11 @@ def _robust(errors: Tensor, inliers: Tensor) -> Tensor:
 _FURTHER = RANSAC(P3P(), min_samples=64)
 
 
-def _trusted(confidence: Tensor | None) -> Tensor | None:
+def _trusted(problem: Problem) -> Tensor:
     """How often pairs are drawn, by the caller's confidence, (B, N)."""
-    return None if confidence is None else _LEAST_TRUST + (1.0 - _LEAST_TRUST) * confidence.nan_to_num(0.5)
+    if problem.confidence is None:
+        return torch.ones_like(problem.weights)
+    return _LEAST_TRUST + (1.0 - _LEAST_TRUST) * problem.confidence.nan_to_num(0.5)
 
 
 @torch.no_grad()
@@ -283,9 +285,7 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
     else:
         limit = torch.where(known.img.isfinite() & known.world.isfinite(), _KNOWN_INLIER, _INLIER) * sigma
     thresholds = Thresholds(limit, torch.zeros_like(depth))
-    chances = _DOUBT + (1.0 - _DOUBT) * constant.weights
-    trusted = _trusted(problem.confidence)
-    chances = chances if trusted is None else chances * trusted
+    chances = (_DOUBT + (1.0 - _DOUBT) * constant.weights) * _trusted(problem)
     given = map_tensors(lambda *x: torch.stack(x, 1), *constant.poses)
     search = Search(_FURTHER, problem, thresholds, chances, sigma)
     search.run(given, enough=_FURTHER.min_samples)

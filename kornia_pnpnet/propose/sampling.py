@@ -12,6 +12,7 @@ from functools import lru_cache
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from kornia_pnpnet.core.performance import present_first
 
@@ -95,7 +96,10 @@ def agreement_of_neighbours(world_points: Tensor, img_points: Tensor, there: Ten
     rows = torch.arange(there.shape[1], device=there.device).split(max(1, block // width))
     problems = torch.arange(len(there), device=there.device).split(max(1, block // (width * there.shape[1])))
     for some, here in itertools.product(problems, rows):
-        both = [_sq_distances(x[some][:, here], x[some[:, None], at[some]]) for x in (world_points, img_points)]
+        both = [
+            torch.cdist(x[some][:, here], x[some[:, None], at[some]], compute_mode="donot_use_mm_for_euclid_dist")
+            for x in (world_points, img_points)
+        ]  # exactly 0 between equal points
         no = (both[0] == 0).logical_or_(both[1] == 0).logical_or_(absent[some])
         # Distances as integers with the number of the pair in the last digits: they ascend alike, and differ.
         keys = [x.masked_fill_(no, torch.inf).view(torch.int32).bitwise_and_(-_CANDIDATES) for x in both]
@@ -104,15 +108,6 @@ def agreement_of_neighbours(world_points: Tensor, img_points: Tensor, there: Ten
         common &= (near < _INFINITE)[..., :, None]
         out[some[:, None], here] = common.flatten(2).float() @ score
     return out
-
-
-def _sq_distances(points: Tensor, others: Tensor) -> Tensor:
-    """Squared distances, (P, N, K) and (P, M, K) to (P, N, M); exactly 0 between equal points."""
-    total = points.new_zeros(points.shape[0], points.shape[1], others.shape[1])
-    for x, y in zip(points.unbind(-1), others.unbind(-1), strict=True):
-        difference = x[:, :, None] - y[:, None]
-        total.addcmul_(difference, difference)
-    return total
 
 
 class Samples:
@@ -149,9 +144,7 @@ class Samples:
         self._enumerated = of_problem <= most
         kinds, self._kinds = self.counts.where(self._enumerated, size).unique(return_inverse=True)
         tables = [_subsets(n, size, seed) for n in kinds.tolist()] or [_subsets(size, size, seed)]
-        self._table = torch.cat(tables).to(device)
-        self._lengths = torch.tensor([len(table) for table in tables], device=device)
-        self._firsts = self._lengths.cumsum(0) - self._lengths
+        self._tables = pad_sequence(tables, batch_first=True).to(device)  # (K, L, s)
         self._numbers = None if bool(self._enumerated.all()) else _random_numbers(size, most, seed).to(device)
         share = there.double()
         if chances is not None:
@@ -164,8 +157,8 @@ class Samples:
 
         Samples after the last one of a problem repeat others.
         """
-        kind = self._kinds[problems, None]
-        ranks = self._table[self._firsts[kind] + torch.arange(start, stop, device=kind.device) % self._lengths[kind]]
+        listed = torch.arange(start, stop, device=problems.device) % self.totals[problems, None]
+        ranks = self._tables[self._kinds[problems, None], listed.clamp(max=self._tables.shape[1] - 1)]
         if self._numbers is not None:
             drawn = draw(self._numbers[start:stop], self._upper[problems])
             ranks = torch.where(self._enumerated[problems, None, None], ranks, drawn)

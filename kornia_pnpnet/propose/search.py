@@ -104,7 +104,8 @@ class Search:
         chances: Tensor | None = None,
         sigma: Tensor | None = None,
     ) -> None:
-        self.plan, self.problem, self.chances = plan, problem, chances
+        self.plan, self.problem = plan, problem
+        self.chances = torch.ones_like(problem.weights) if chances is None else chances
         self.minimal = plan.minimal
         if problem.rig is not None:  # the rays of bearings meet in one centre
             central = sees_values(problem.weights) and not bool(problem.rig.translation.any())
@@ -205,15 +206,15 @@ class Search:
         problem = self._unpacked(self.low[rows].permute(2, 1, 0).contiguous(), rows)
         return problem, take(self.thresholds, rows), project(self._state(poses), problem)
 
-    def _samples(self, chances: Tensor | None) -> Samples:
+    def _samples(self, chances: Tensor) -> Samples:
         plan, there = self.plan, self.problem.weights > 0
         return Samples(there, size=self.minimal.sample_size, most=plan.max_samples, seed=plan.seed, chances=chances)
 
     def _prefer_agreement(self, problems: Tensor) -> None:
         """From now on draw the pairs of some problems in proportion to the agreement of their neighbours, too."""
         world, img, weights = take(self.problem[:3], problems)
-        chances = torch.ones_like(self.problem.weights) if self.chances is None else self.chances.clone()
         agreement = agreement_of_neighbours(world, img, weights > 0)
+        chances = self.chances.clone()
         chances[problems] *= (_LEAST_AGREEMENT + agreement) ** _AGREEMENT_POWER
         self.samples = self._samples(chances)
 
