@@ -35,7 +35,7 @@ _INLIER, _KNOWN_INLIER = 10.0, 5.0
 # Residuals at the best focal length on a grid, relative to the median distance of the pixels from the principal point
 # and the range of the grid in logarithms. Tuned on random problems with fields of view of 18 to 100 degrees (seed 6).
 _GRID_RESIDUAL = 0.04
-# Normalised units. A start that has the centre of the world nearer than this counts as this near.
+# Normalised units. Least depth of the centre of the world in the limit of an inlier.
 _NEAREST = 0.5
 # A pair whose weight or confidence is 0 is drawn this often, relative to a pair where it is 1. Networks mislead more
 # often than callers: where repeated structure or crowds agree, for example.

@@ -167,8 +167,8 @@ class Samples:
     def needed(self, problems: Tensor, inliers: Tensor, confidence: float) -> Tensor:
         """:func:`samples_needed` of some problems (P,) with the inliers (P, N) of their best poses so far.
 
-        Unequally likely pairs count as so many equally likely pairs as have the mean share of an inlier each. The mean
-        is weighted by the share.
+        Where pairs are unequally likely, the formula reads an effective number of pairs: one over the mean share of an
+        inlier. The mean is weighted by the share.
         """
         share = torch.where(inliers, self._share[problems], 0.0)
         mass = share.sum(-1)

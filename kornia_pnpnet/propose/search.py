@@ -328,8 +328,8 @@ class Search:
 def least_squares(problem: Problem, projection: Projection, weights: Tensor, variance: Tensor | None = None) -> State:
     """Take one step of least squares with the weights (B, N) times the weights of the pairs.
 
-    What is known of the camera counts as the residual of a pixel counts whose variance is given, (B, 1): a pixel of the
-    caller by default.
+    What is known of the camera is weighed against residuals with the variance (B, 1) of a pixel coordinate. By default
+    the standard deviation is one pixel of the caller.
     """
     weights = problem.weights * weights
     equations = normal_equations(projection, problem, weights)
@@ -344,7 +344,7 @@ def least_squares(problem: Problem, projection: Projection, weights: Tensor, var
 def cauchy_scale(sq_residuals: Tensor, there: Tensor, fitted: int = MIN_PAIRS) -> tuple[Tensor, Tensor]:
     """Squared scale of a Cauchy kernel, by the median squared residual of some pairs (B, N), and their number, (B, 1).
 
-    Any state fits as many pairs as are given. Without any pair the scale is infinite.
+    The argument ``fitted`` is the number of pairs that any state fits. Without any pair the scale is infinite.
     """
     count = there.sum(-1, keepdim=True)
     middle = ((count + fitted) // 2).minimum(count - 1).clamp(min=0)
