@@ -19,8 +19,7 @@ from kornia_pnpnet.propose.ransac import RANSAC
 from kornia_pnpnet.propose.sampling import (
     Samples,
     agreement_of_neighbours,
-    draw_likely,
-    draw_subsets,
+    draw,
     samples_needed,
 )
 from kornia_pnpnet.propose.scoring import Scene
@@ -36,8 +35,9 @@ def uniform_numbers(count, size):
 @pytest.mark.parametrize(("count", "size"), [(6, 3), (9, 7), (5, 1)])
 def test_every_subset_is_equally_likely(count, size):
     draws = 20000
-    subsets = draw_subsets(uniform_numbers(draws, size), torch.tensor([count, 40]))[0]
-    assert (subsets.diff(dim=-1) > 0).all()  # ascending: no item twice
+    upper = torch.tensor([1.0 / count] * count + [0.0], dtype=torch.float64).cumsum(0)
+    subsets = draw(uniform_numbers(draws, size), upper[None])[0].sort(-1).values
+    assert (subsets.diff(dim=-1) > 0).all()  # no item twice
     _, seen = subsets.unique(dim=0, return_counts=True)
     expected = draws / math.comb(count, size)
     assert len(seen) == math.comb(count, size)
@@ -49,7 +49,7 @@ def test_every_subset_is_equally_likely(count, size):
 def test_likely_items_are_drawn_more_often_and_none_twice():
     """Items one after the other in proportion to their probabilities among those that are left."""
     draws, chances = 40000, torch.tensor([0.5, 0.2, 0.0, 0.2, 0.1], dtype=torch.float64)
-    subsets = draw_likely(uniform_numbers(draws, 3), chances.cumsum(-1)[None])[0]
+    subsets = draw(uniform_numbers(draws, 3), chances.cumsum(-1)[None])[0]
     for order in itertools.permutations((0, 1, 3, 4), 3):
         a, b, c = (chances[i].item() for i in order)
         expected = a * b / (1 - a) * c / (1 - a - b)
@@ -126,8 +126,8 @@ def test_errors_without_division_are_the_textbooks(of_pairs, in_world, dtype, ma
     tau = tau * torch.linspace(0.2, 3.0, 9, dtype=torch.float64) if of_pairs else tau
     thresholds = Thresholds(tau, omega)
     scene = Scene.of(problem, thresholds, dtype)
-    rotation, translation = (torch.stack(x, -1).movedim(0, -2) for x in zip(*poses, strict=True))  # (3, 3, P, H)
-    errors = scene.errors(scene.pack(rotation, translation)).double()  # (P, N, H)
+    entries = [torch.cat((pose.rotation, pose.translation[..., None]), -1).flatten(1) for pose in poses]
+    errors = scene.errors(torch.stack(entries, -1).to(dtype)).double()  # (P, N, H)
     behind = 0
     for h, pose in enumerate(poses):
         cam = problem.world_points @ pose.rotation.mT + pose.translation[:, None]

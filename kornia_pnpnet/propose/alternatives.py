@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -11,17 +10,16 @@ from torch.nn import functional
 
 from kornia_pnpnet.core.linalg import eigenvectors
 from kornia_pnpnet.core.performance import repeat_problems
-from kornia_pnpnet.core.trees import iter_tensors, map_tensors, take
+from kornia_pnpnet.core.trees import map_tensors, take
 from kornia_pnpnet.judge.belief import has_enough, residual_noise
 from kornia_pnpnet.problem import Problem, Starts, State
 from kornia_pnpnet.propose.p3p import p3p
+from kornia_pnpnet.propose.scoring import as_entries, as_pose
 from kornia_pnpnet.refine.lm import Refinement, RobustWeightedLM
 from kornia_pnpnet.refine.residual import project, rotation_angle
 from kornia_pnpnet.result import Alternatives, Pose
 
-__all__ = ["find_alternatives", "is_seen", "mirror_probability"]
-
-_T = TypeVar("_T")
+__all__ = ["find_alternatives", "mirror_probability"]
 
 # A pose explains the pairs nearly as well when its likelihood is at least this fraction of the best one's.
 _LIKELY = 1e-3
@@ -30,8 +28,6 @@ _LIKELIER = 30.0
 # Two poses are the same minimum when their rotations differ by less than `_SAME_TURN` radians, and the mean of the
 # points, in camera coordinates, differs by less than the fraction `_SAME_SHIFT` of its distance from the camera.
 _SAME_TURN, _SAME_SHIFT = 0.035, 0.035
-# Focal lengths. A pair that is not of normal scale is refined only when some first pose projects it this close.
-_SEEN = 0.25
 # Shares of the spread of the pixels. A mirror image that leaves a larger median residual has no minimum nearby that
 # explains as much; of fewer likely inliers than this, any mirror image may have one.
 _NEAR_MIRROR, _FEW_INLIERS = 0.2, 10
@@ -69,41 +65,41 @@ def find_alternatives(
     weights = problem.weights * starts.weights
     middle = _mean(problem.world_points, weights)
     mirrored = _mirrored(pose, problem, weights)
-    every = [pose, mirrored, *_of_three(problem, weights, pose), *starts.poses]
+    every = [*map(as_entries, (pose, mirrored)), *_of_three(problem, weights, pose), *map(as_entries, starts.poses)]
     count, batch = len(every), weights.shape[0]
     many, factors, noise = repeat_problems((problem, starts.weights, starts.noise), count)
-    tried = Starts(map_tensors(lambda *x: torch.cat(x), *every), factors, noise=noise)
+    tried = Starts(as_pose(torch.cat(every)), factors, noise=noise)
     refine = refine if refine.m else RobustWeightedLM(_ITERATIONS, kernel="cauchy", learnable=False)
     for _ in range(2):
         refined = refine(many, tried)
         tried = tried._replace(pose=refined.pose)
-    unrefined = _ends(refine(problem, starts._replace(pose=mirrored, others=None, camera=None), m=0))
-    ends, cost, usable = map_tensors(lambda x: x.unflatten(0, (count, batch)), _ends(refined))  # (S, B, ...)
-    lost = _are_same(take(ends, slice(1, 2)), pose, middle)[0].nonzero()[:, 0]
-    for x, image in zip(iter_tensors((ends, cost, usable)), iter_tensors(unrefined), strict=True):
+    unrefined = refine(problem, starts._replace(pose=mirrored, others=None, camera=None), m=0)
+    ends, cost, usable = (x.unflatten(0, (count, batch)) for x in _ends(refined))  # (S, B, ...)
+    lost = _are_same(ends[1], every[0], middle)
+    for x, image in zip((ends, cost, usable), _ends(unrefined), strict=True):
         x[1, lost] = image[lost]
 
     # From costs, which are means over the pairs, to log-likelihoods.
-    unit = (problem.weights > 0).sum(-1) / _unit(problem, starts, Pose(ends.rotation[0], ends.translation[0]))
+    unit = (problem.weights > 0).sum(-1) / _unit(problem, starts, as_pose(ends[0]))
     log_ratio = (-0.5 * unit * (cost - cost[0])).clamp(max=_LIKELIER)
     log_ratio = torch.where(usable & (log_ratio > math.log(_LIKELY)), log_ratio, -torch.inf)
     log_ratio, order = log_ratio.sort(dim=0, descending=True, stable=True)
-    ends, cost = _pick((ends, cost), order)
-    valid = valid & log_ratio.isfinite() & ~_are_same(ends, pose, middle)
+    ends, cost = ends.take_along_dim(order[..., None], 0), cost.take_along_dim(order, 0)
+    valid = valid & log_ratio.isfinite() & ~_are_same(ends, every[0], middle)
     for i in range(1, count):
-        same = _are_same(ends, Pose(ends.rotation[i], ends.translation[i]), middle)
+        same = _are_same(ends, ends[i], middle)
         valid[i] &= ~(same[:i] & valid[:i]).any(0)
     share = torch.where(valid, log_ratio, -torch.inf).exp()
     probability = share / (1.0 + share.sum(0))
 
     position = (~valid).to(torch.int8).sort(dim=0, stable=True).indices[:most]
-    eye = torch.eye(3, dtype=cost.dtype, device=cost.device)
-    *picked, chosen = _pick((*ends, cost, probability, valid), position)
-    rotation, translation, cost, probability = (
-        torch.where(chosen.view(*chosen.shape, *(1,) * (x.ndim - 2)), x, fill).movedim(0, 1)
-        for x, fill in zip(picked, (eye, 0.0, torch.finfo(cost.dtype).max ** 0.5, 0.0), strict=True)
+    chosen = valid.take_along_dim(position, 0)
+    identity = torch.eye(3, 4, dtype=cost.dtype, device=cost.device).flatten()
+    rotation, translation = as_pose(
+        torch.where(chosen[..., None], ends.take_along_dim(position[..., None], 0), identity).movedim(0, 1)
     )
-    return Alternatives(rotation, translation, cost, probability, chosen.mT)
+    cost = torch.where(chosen, cost.take_along_dim(position, 0), torch.finfo(cost.dtype).max ** 0.5)
+    return Alternatives(rotation, translation, cost.mT, probability.take_along_dim(position, 0).mT, chosen.mT)
 
 
 @torch.no_grad()
@@ -148,15 +144,9 @@ def mirror_probability(
     return probability
 
 
-def _ends(refined: Refinement) -> tuple[Pose, Tensor, Tensor]:
-    """Poses, their costs, and whether they can be answers, all with the batch first."""
-    return refined.pose, refined.cost, refined.in_front & refined.cost.isfinite()
-
-
-def _pick(tree: _T, index: Tensor) -> _T:
-    """Of tensors (S, B, ...) the entries of each problem at an index (K, B)."""
-    problems = torch.arange(index.shape[1], device=index.device)
-    return map_tensors(lambda x: x[index, problems], tree)
+def _ends(refined: Refinement) -> tuple[Tensor, Tensor, Tensor]:
+    """Entries of the poses, their costs, and whether they can be answers, all with the batch first."""
+    return as_entries(refined.pose), refined.cost, refined.in_front & refined.cost.isfinite()
 
 
 def _mean(points: Tensor, weights: Tensor) -> Tensor:
@@ -189,8 +179,8 @@ def _half_turn(axis: Tensor) -> Tensor:
     return 2.0 * axis[:, :, None] * axis[:, None] - torch.eye(3, dtype=axis.dtype, device=axis.device)
 
 
-def _of_three(problem: Problem, weights: Tensor, fallback: Pose) -> list[Pose]:
-    """The four poses of three likely pairs that lie far apart; the fallback where there are fewer."""
+def _of_three(problem: Problem, weights: Tensor, fallback: Pose) -> tuple[Tensor, ...]:
+    """Entries of the four poses of three likely pairs that lie far apart; the fallback where there are fewer."""
     likely = weights * (weights > 0.5 * weights.amax(1, keepdim=True))
     points, rows = problem.world_points, torch.arange(len(weights), device=weights.device)[:, None]
 
@@ -203,13 +193,8 @@ def _of_three(problem: Problem, weights: Tensor, fallback: Pose) -> list[Pose]:
     third = farthest(torch.linalg.cross(from_first, from_first[rows, second].expand_as(points)))
     index = torch.cat((first, second, third), 1)
     solved = p3p(points[rows, index], problem.img_points[rows, index] / problem.focal)
-    return [
-        Pose(
-            torch.where(valid[:, None, None], rotation, fallback.rotation),
-            torch.where(valid[:, None], translation, fallback.translation),
-        )
-        for rotation, translation, valid in zip(*(x.unbind(1) for x in (*solved.pose, solved.valid)), strict=True)
-    ]
+    entries = torch.where(solved.valid[..., None], as_entries(solved.pose), as_entries(fallback)[:, None])
+    return entries.unbind(1)
 
 
 def _unit(problem: Problem, starts: Starts, pose: Pose) -> Tensor:
@@ -220,16 +205,9 @@ def _unit(problem: Problem, starts: Starts, pose: Pose) -> Tensor:
     return noise.img[:, 0].square()
 
 
-def _are_same(poses: Pose, other: Pose, middle: Tensor) -> Tensor:
-    """Which of the poses (S, B, ...) are the other pose (B, ...), by what they do to points (B, 3); bool (S, B)."""
-    there = _moved(middle, other)
-    shift = (_moved(middle, poses) - there).norm(dim=-1) < _SAME_SHIFT * there.norm(dim=-1)
-    return shift & (rotation_angle(poses.rotation, other.rotation.expand_as(poses.rotation)) < _SAME_TURN)
-
-
-def is_seen(starts: Starts, problem: Problem) -> Tensor:
-    """Whether any of the poses projects a point close to its pixel, bool (B, N)."""
-    starts, problem = map_tensors(torch.Tensor.detach, (starts, problem))
-    limit = (_SEEN * problem.focal) ** 2
-    projections = [project(State.of(pose), problem) for pose in starts.poses]
-    return torch.stack([x.in_front & (x.sq_residual < limit) for x in projections]).any(0)
+def _are_same(poses: Tensor, other: Tensor, middle: Tensor) -> Tensor:
+    """Which of the poses (*, B, 12) are the other pose (B, 12), by what they do to points (B, 3); bool (*, B)."""
+    pose, other_pose = as_pose(poses), as_pose(other.expand_as(poses))
+    there = _moved(middle, other_pose)
+    shift = (_moved(middle, pose) - there).norm(dim=-1) < _SAME_SHIFT * there.norm(dim=-1)
+    return shift & (rotation_angle(pose.rotation, other_pose.rotation) < _SAME_TURN)

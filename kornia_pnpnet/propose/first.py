@@ -1,18 +1,42 @@
-"""The first proposals for a problem: from an initialiser of any kind, the caller's pose, and mirror images."""
+"""The first proposals for a problem: from an initialiser of any kind, the caller's pose, and mirror images.
+
+Networks and EPnP know one pinhole camera: rigs start from minimal samples on the exact cameras.
+"""
 
 from __future__ import annotations
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
-from kornia_pnpnet.problem import Problem, Starts
-from kornia_pnpnet.propose.alternatives import is_seen
+from kornia_pnpnet.core.linalg import relative
+from kornia_pnpnet.core.performance import present_first, problems_last, sees_values
+from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.judge.belief import residual_noise
+from kornia_pnpnet.judge.inliers import Thresholds, judge
+from kornia_pnpnet.problem import Problem, Starts, State
 from kornia_pnpnet.propose.initialiser import trait
-from kornia_pnpnet.propose.rig import starts_of_rig
+from kornia_pnpnet.propose.p3p import P3P
+from kornia_pnpnet.propose.ransac import RANSAC
+from kornia_pnpnet.propose.search import Search
 from kornia_pnpnet.propose.views import from_views
+from kornia_pnpnet.refine.residual import project
 from kornia_pnpnet.result import Pose
 
 __all__ = ["propose"]
+
+# Focal lengths. A pair that is not of normal scale is refined only when some first pose projects it this close.
+_SEEN = 0.25
+# Focal lengths. Threshold of an inlier in a rig: ten times the noise of a pixel at a focal length of 1000 pixels.
+_THRESHOLD = 0.01
+_FINDER = RANSAC(P3P(), threshold=_THRESHOLD, final_steps=0)
+# Number of samples of a fixed effort, and of draws for each, of which the first that P3PRig can solve is the sample: of
+# three cameras that look in all directions it can solve every second draw. Chosen on `CameraProblems` with seed 77002.
+_SAMPLES, _DRAWS = 128, 4
+# Number of pairs on which each pose is scored when the effort is fixed.
+_JUDGES = 32
+# The root of x^4 = x + 1. Multiples of its negative powers, modulo 1, fill the unit cube evenly (M. Roberts, "The
+# unreasonable effectiveness of quasirandom sequences", 2018).
+_ROOT = 1.2207440846057596
 
 
 def propose(
@@ -40,7 +64,7 @@ def propose(
         assert given is not None
         return Starts(given, torch.ones_like(problem.weights))
     if problem.rig is not None and not trait(init, "takes_rigs"):
-        starts = starts_of_rig(problem, given, with_noise=trait(init, "estimates_noise"), fixed=fixed)
+        starts = _starts_of_rig(problem, given, with_noise=trait(init, "estimates_noise"), fixed=fixed)
     elif trait(init, "takes_given"):
         starts, given = init(problem, given), None
     elif views > 1:
@@ -51,5 +75,66 @@ def propose(
         starts = starts.with_others(given)._replace(ok=None)
     if trait(init, "weighs_unusual"):
         return starts
-    # Pairs that are not of normal scale have a weight where a start sees them.
-    return starts._replace(weights=starts.weights * torch.where(is_seen(starts, problem), 1.0, problem.usual))
+    # A pair that is not of normal scale has a weight where some pose projects its point close to its pixel.
+    known, limit = problem.map(torch.Tensor.detach), (_SEEN * problem.focal) ** 2
+    seen = torch.zeros_like(problem.weights, dtype=torch.bool)
+    for pose in map_tensors(torch.Tensor.detach, starts.poses):
+        projection = project(State.of(pose), known)
+        seen = seen | (projection.in_front & (projection.sq_residual < limit))
+    return starts._replace(weights=starts.weights * torch.where(seen, 1.0, problem.usual))
+
+
+@torch.no_grad()
+def _starts_of_rig(problem: Problem, given: Pose | None, *, with_noise: bool, fixed: bool = False) -> Starts:
+    """Find the pose of a rig, its inliers and their noise, as constants.
+
+    Args:
+        problem: normalised problems of a rig.
+        given: see :meth:`~kornia_pnpnet.propose.ransac.RANSAC.forward`.
+        with_noise: estimate the noise of the pixels from the residuals, for a refinement that expects it.
+        fixed: try a fixed number of samples, as in graphs, in place of RANSAC.
+    """
+    problem = problem.map(torch.Tensor.detach)
+    if fixed or not sees_values(problem.weights):
+        starts = _of_fixed_effort(problem._replace(weights=relative(problem.weights, problem.weights), noise=None))
+    else:
+        starts = _FINDER(problem._replace(img_scale=problem.focal.expand(len(problem.weights))), given)
+    noise = None
+    if with_noise:
+        pairs = problems_last(problem)
+        noise = residual_noise(project(State.of(starts.pose), pairs), pairs, starts.weights)
+        if problem.noise is not None:
+            noise = map_tensors(lambda x, y: torch.where(y.isnan(), x, y), noise, problem.noise.sigmas)
+        noise = map_tensors(torch.Tensor.contiguous, noise)
+    return starts._replace(ok=None, noise=noise, weights=(starts.weights > 0).to(starts.weights))
+
+
+def _of_fixed_effort(problem: Problem) -> Starts:
+    """The best pose of a fixed number of minimal samples, and weights of its inliers."""
+    there = problem.weights > 0
+    counts, order = there.sum(1, keepdim=True), present_first(there)
+    # Judges are spread evenly over the pairs that have a weight; fewer pairs judge once each.
+    turn = torch.arange(_JUDGES, device=order.device)
+    judges = order.gather(1, turn.maximum(turn * counts // _JUDGES).clamp(max=order.shape[1] - 1))
+    img = (_THRESHOLD * problem.focal).expand(there.shape[0], 1)
+    thresholds = Thresholds(img, torch.zeros_like(img))
+    search = Search(_FINDER, problem, thresholds)
+    search.run_once(_drawn(problem, order, counts), torch.where(turn < counts, judges, -1))
+    pose = search.state.pose
+    return Starts(pose, judge(project(State.of(pose), problems_last(problem)), problem, thresholds).weights)
+
+
+def _drawn(problem: Problem, order: Tensor, counts: Tensor) -> Tensor:
+    """Positions (B, S, 3) of the pairs of the samples, of the first ``counts`` (B, 1) in ``order`` (B, N)."""
+    numbers = torch.arange(1, _DRAWS * _SAMPLES + 1, dtype=torch.float64, device=order.device)
+    numbers = torch.stack([numbers * _ROOT**-k for k in (1, 2, 3)], -1)  # (D S, 3)
+    ranks = ((numbers - numbers.floor()).flatten() * counts).long()
+    drawn = order.gather(1, ranks.minimum((counts - 1).clamp(min=0)))  # (B, D S 3)
+    places = problem.places
+    rays = places.gather(1, drawn[..., None].expand(-1, -1, 3)).unflatten(1, (_DRAWS, _SAMPLES, 3))
+    drawn = drawn.unflatten(1, (_DRAWS, _SAMPLES, 3))
+    # What P3PRig can solve: three pairs whose rays are less than 90 degrees from their mean.
+    ahead = (rays * rays.sum(-2, keepdim=True)).sum(-1).amin(-1) > 0
+    apart = (drawn != drawn.roll(1, -1)).all(-1)
+    first = (ahead & apart).long().argmax(1)[:, None, :, None].expand(-1, 1, -1, 3)
+    return drawn.gather(1, first)[:, 0]

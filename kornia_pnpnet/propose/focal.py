@@ -10,15 +10,15 @@ from torch.nn import functional
 
 from kornia_pnpnet.arguments import Inputs, with_undistorted
 from kornia_pnpnet.cameras import pinholes
-from kornia_pnpnet.core.linalg import solve_positive
 from kornia_pnpnet.core.performance import ranked
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.frame import Normalize
 from kornia_pnpnet.problem import MIN_PAIRS, Problem, State
 from kornia_pnpnet.propose.p3p import P3P
 from kornia_pnpnet.propose.ransac import RANSAC
-from kornia_pnpnet.refine.residual import moved, normal_equations, project
-from kornia_pnpnet.refine.terms import CameraTerm, add_term
+from kornia_pnpnet.propose.search import CAUCHY, cauchy_scale, least_squares
+from kornia_pnpnet.refine.residual import project
+from kornia_pnpnet.refine.terms import CameraTerm
 from kornia_pnpnet.result import Pose
 
 __all__ = ["as_dist", "distorted", "scale_focal", "with_found_focal", "with_nominal_focal"]
@@ -39,10 +39,8 @@ _FINDER = RANSAC(P3P(), threshold=_THRESHOLD, confidence=0.99, final_steps=3)
 # Focal lengths. Pairs with a smaller residual count in the first steps, before distortion is known: 0.2 times the cube
 # of a tangent of 0.7 is 0.07. From step to step the limit shrinks by a factor, down to the scale of the residuals.
 _WIDE, _SHRINK = 0.07, 0.6
-# Steps of the first estimate of distortion, and their damping.
-_STEPS, _DAMPING = 14, 1e-6
-# Scale of Cauchy's kernel in standard deviations, and the median of squared residuals in variances of a coordinate.
-_KERNEL_SCALE, _MEDIAN = 3.4, 2.0 * math.log(2.0)
+# Steps of the first estimate of distortion.
+_STEPS = 14
 # Focal lengths. The scale of the residuals is at least this.
 _LEAST = 1e-5
 
@@ -62,8 +60,8 @@ def with_nominal_focal(inputs: Inputs, sigma: float | None) -> Inputs:
             principal_point = camera[:, None, :2, 2]
             away = (inputs.img_points - principal_point).abs().amax(-1)  # (B, N)
             there = away < torch.inf  # NaN compares false
-            there = there if inputs.mask is None else there & inputs.mask
-            there = there if inputs.weights is None else there & (inputs.weights > 0)
+            for given_pairs in (inputs.mask, inputs.weights):
+                there = there if given_pairs is None else there & (given_pairs > 0)
             median = ranked(torch.where(there, away, torch.inf).mT[None], (there.sum(1) - 1) // 2)[0]
             half = (_HALF_WIDTH * median).maximum(principal_point[:, 0].abs().amax(-1))
             half = torch.where(half.isfinite() & (half > 0), half, 1.0)
@@ -80,9 +78,7 @@ def with_nominal_focal(inputs: Inputs, sigma: float | None) -> Inputs:
 
 def scale_focal(intrinsics: Tensor, factor: Tensor) -> Tensor:
     """Multiply the focal lengths and the skew of camera matrices (B, 3, 3) by a factor (B,)."""
-    first, rest = intrinsics.split((2, 1), 1)
-    linear, principal_point = first.split((2, 1), 2)
-    return torch.cat((torch.cat((linear * factor[:, None, None], principal_point), 2), rest), 1)
+    return intrinsics * functional.pad(factor[:, None, None].expand(-1, 2, 2), (0, 1, 0, 1), value=1.0)
 
 
 def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
@@ -158,34 +154,20 @@ def as_dist(coefficients: Tensor) -> Tensor:
 def _with_distortion(problem: Problem, pose: Pose, radial: int) -> State:
     """Estimate radial distortion with the pose and the focal length, by Gauss-Newton steps with Cauchy's kernel.
 
-    Its scale first is that of what distortion does at the edge of an image, and shrinks to the median residual.
+    The scale of the kernel first is what distortion does at the edge of an image, and shrinks to the median residual.
     """
     state = State(pose, problem.weights.new_zeros(len(problem.weights), 1 + radial))
-    there, limit = problem.weights > 0, _WIDE
+    # The distortion is small; what is known of the focal length is left to the refinement.
+    information = torch.zeros_like(problem.img_scale)
+    problem = problem._replace(free_focal=problem.free_focal._replace(information=information))
+    limit = _WIDE
     for _ in range(_STEPS):
         projection = project(state, problem)
-        seen = projection.in_front & there
-        sq_residual = torch.where(seen, projection.sq_residual, torch.inf)
-        scale = _scale(sq_residual, projection.focal[:, None], limit)
-        weights = torch.where(seen, problem.weights / (1.0 + sq_residual / scale.square()), 0.0)
-        equations = normal_equations(projection, problem, weights)
-        # The distortion is small; what is known of the focal length is left to the refinement.
-        known = problem.free_focal._replace(information=torch.zeros_like(problem.img_scale))
-        equations = equations._replace(unit=(_KERNEL_SCALE / scale).square())
-        equations = add_term(equations, known.linearise(state), projection.focal)
-        delta, solved = solve_positive(
-            equations.matrix, equations.gradient, torch.full_like(projection.focal, _DAMPING)
-        )
-        state = moved(state, (-solved.to(delta) / projection.focal * delta).clamp(-1.0, 1.0))
-        limit *= _SHRINK
+        seen, sq_residual = projection.in_front & (problem.weights > 0), projection.sq_residual
+        sq_limit = (limit * projection.focal).square()[:, None]
+        sq_scale, _ = cauchy_scale(sq_residual, seen & (sq_residual <= CAUCHY**2 * sq_limit), MIN_PAIRS + 1)
+        sq_scale = sq_scale.nan_to_num(posinf=0.0).maximum(sq_limit)
+        weights = torch.where(seen, 1.0 / (1.0 + sq_residual / sq_scale), 0.0)
+        state = least_squares(problem, projection, weights, sq_scale / CAUCHY**2)
+        limit = max(_SHRINK * limit, _LEAST)
     return state
-
-
-def _scale(sq_residual: Tensor, focal: Tensor, limit: float) -> Tensor:
-    """Scale of the kernel in pixels, (B, 1): the limit, or what the residuals around it show where this is more."""
-    wide = limit * focal
-    ascending = torch.where(sq_residual <= (_KERNEL_SCALE * wide).square(), sq_residual, torch.inf).sort(1).values
-    count = ascending.isfinite().sum(1, keepdim=True)
-    middle = ((count + MIN_PAIRS + 1) // 2).minimum(count - 1).clamp(min=0)
-    sigma = (ascending.gather(1, middle) / _MEDIAN).sqrt().nan_to_num(posinf=0.0)
-    return (_KERNEL_SCALE * sigma).maximum(wide).maximum(_LEAST * focal)

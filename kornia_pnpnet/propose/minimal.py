@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
-from torch import Tensor, nn
+from torch import nn
 
 from kornia_pnpnet.core.checks import check_whole
 from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.problem import Hypotheses, Problem
 from kornia_pnpnet.refine.lm import RobustWeightedLM
-from kornia_pnpnet.result import Pose, gate_pose
+from kornia_pnpnet.result import gate_pose
 
-__all__ = ["FocalHypotheses", "MinimalSolver", "SubsetSolver", "describe"]
-
-
-class FocalHypotheses(NamedTuple):
-    """:class:`~kornia_pnpnet.problem.Hypotheses` with the logarithm of the focal length over that of the problem."""
-
-    pose: Pose
-    valid: Tensor
-    zoom: Tensor
+__all__ = ["MinimalSolver", "SubsetSolver", "describe"]
 
 
 class MinimalSolver(Protocol):
@@ -31,8 +23,12 @@ class MinimalSolver(Protocol):
     def sample_size(self) -> int:
         """Number of pairs in a sample."""
 
-    def hypotheses(self, problem: Problem) -> Hypotheses | FocalHypotheses:
-        """The poses of a batch of samples: normalised, with :math:`N` = ``sample_size``. Their weights do not count."""
+    def hypotheses(self, problem: Problem) -> Hypotheses:
+        """The poses of a batch of samples: normalised, with :math:`N` = ``sample_size``. Their weights do not count.
+
+        Where the focal length is unknown, the last rows of rotation and translation are divided by its ratio to the
+        focal length of the problem.
+        """
 
 
 class SubsetSolver(Configured):

@@ -39,7 +39,6 @@ from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.performance import compiling, exporting, fold_vmap, unfold_vmap
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.problem import Hypotheses, Problem
-from kornia_pnpnet.propose.minimal import FocalHypotheses
 from kornia_pnpnet.propose.sampling import kept_at_once
 from kornia_pnpnet.refine.residual import MIN_DEPTH_RATIO
 from kornia_pnpnet.result import Pose
@@ -426,18 +425,20 @@ class P3P(Configured):
     def __init__(self) -> None:
         super().__init__(locals())
 
-    def hypotheses(self, problem: Problem) -> Hypotheses | FocalHypotheses:
-        """Four slots per sample and focal length, without gradients."""
+    def hypotheses(self, problem: Problem) -> Hypotheses:
+        """Four slots per sample and focal length, without gradients; see MinimalSolver.hypotheses."""
         plane = problem.img_points / problem.focal
         if problem.free_focal is None:
             return p3p(problem.world_points, plane)
         at = (torch.arange(_FOCALS, device=plane.device) + 0.5) * (2.0 / _FOCALS) - 1.0
-        zoom = at[:, None].to(plane) * problem.free_focal.width  # (F, B)
+        focal = (at[:, None].to(plane) * problem.free_focal.width).exp()[..., None, None]  # (F, B, 1, 1)
         world = problem.world_points.expand(_FOCALS, -1, -1, -1)
-        solved = p3p(world, plane * (-zoom).exp()[..., None, None])
+        (rotation, translation), valid = p3p(world, plane / focal)
+        one = torch.ones_like(focal)
+        rows = torch.cat((one, one, one / focal), -1)
+        pose = Pose(rotation * rows[..., None], translation * rows)
         # From (F, B, 4, ...) to (B, 4 F, ...): the slots of a sample side by side, the batch last in memory.
-        pose, valid = map_tensors(
+        return map_tensors(
             lambda x: x.movedim((0, 1, 2), (-2, -1, -3)).flatten(-3, -2).movedim((-1, -2), (0, 1)),
-            (solved.pose, solved.valid),
+            Hypotheses(pose, valid),
         )
-        return FocalHypotheses(pose, valid, zoom.repeat(4, 1).mT)

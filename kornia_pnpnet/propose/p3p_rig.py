@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from kornia_pnpnet.cameras import bearing_cameras
-from kornia_pnpnet.core.checks import check_whole
 from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.linalg import small_product
 from kornia_pnpnet.core.performance import problems_last, sees_values
@@ -15,7 +14,7 @@ from kornia_pnpnet.problem import Hypotheses, Problem
 from kornia_pnpnet.propose.p3p import p3p
 from kornia_pnpnet.result import Pose
 
-__all__ = ["P3PRig", "is_central"]
+__all__ = ["P3PRig"]
 
 # Relative error of the squared sides of a triangle up to which a pose is a solution.
 _EXACT = 1e-3
@@ -38,7 +37,6 @@ class P3PRig(Configured):
 
     def __init__(self, steps: int = 8) -> None:
         super().__init__(locals())
-        check_whole(0, steps=steps)
         self.steps = steps
 
     def hypotheses(self, problem: Problem) -> Hypotheses:
@@ -59,44 +57,27 @@ class P3PRig(Configured):
         solved = p3p(problem.world_points, plane.permute(2, 0, 1))
         away = ((centres.mean(0) - centres) * rays).sum(1)
         # The slots of all samples side by side: (3, 3, 4 B), (3, 4 B) and (4 B,).
-        last = map_tensors(lambda x: x.movedim((0, 1), (-1, -2)).flatten(-2), solved)
-        valid, slots = last.valid, torch.arange(4 * batch, device=rays.device)
+        (rotation, translation), valid = map_tensors(lambda x: x.movedim((0, 1), (-1, -2)).flatten(-2), solved)
+        slots = torch.arange(4 * batch, device=rays.device)
         if sees_values(rays):  # a graph tries slots without a solution, too
             slots = valid.nonzero()[:, 0]
-        rotation, translation = (x.index_select(-1, slots) for x in last.pose)
-        of_sample = (x.contiguous().index_select(-1, slots % batch) for x in (world, rays, centres, turn, seen, away))
-        rotation, translation, exact = self._exact(rotation, translation, *of_sample)
+        rotation, translation = (x.index_select(-1, slots) for x in (rotation, translation))
+        world, rays, centres, seen, away = (
+            x.contiguous().index_select(-1, slots % batch) for x in (world, rays, centres, seen, away)
+        )
+        # From the points of the central approximation to those nearest on the rays.
+        cam = small_product(world, rotation.transpose(0, 1)) + translation
+        rotation, translation, exact = _newton(world, rays, centres, (cam * seen).sum(1) + away, self.steps)
         exact = exact & valid[slots]
         eye = torch.eye(3, dtype=rays.dtype, device=rays.device)[..., None]
-        rotation, translation = torch.where(exact, rotation, eye), torch.where(exact, translation, 0.0)
         found = Hypotheses(
             Pose(
-                eye.repeat(1, 1, 4 * batch).index_copy(-1, slots, rotation),
-                rays.new_zeros(3, 4 * batch).index_copy(-1, slots, translation),
+                eye.repeat(1, 1, 4 * batch).index_copy(-1, slots, torch.where(exact, rotation, eye)),
+                rays.new_zeros(3, 4 * batch).index_copy(-1, slots, torch.where(exact, translation, 0.0)),
             ),
             torch.zeros_like(valid).index_copy(0, slots, exact),
         )
         return map_tensors(lambda x: x.unflatten(-1, (4, batch)).movedim((-1, -2), (0, 1)), found)
-
-    def _exact(
-        self,
-        rotation: Tensor,
-        translation: Tensor,
-        world: Tensor,
-        rays: Tensor,
-        centres: Tensor,
-        turn: Tensor,
-        seen: Tensor,
-        away: Tensor,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """From M poses of the central approximation, problems last, to exact ones, and whether they are exact."""
-        if not self.steps:
-            back = turn.transpose(0, 1)
-            rotation, translation = small_product(back, rotation), small_product(back, translation[:, None])[:, 0]
-            return rotation, translation, torch.ones_like(translation[0], dtype=torch.bool)
-        # From the points of the central approximation to those nearest on the rays.
-        cam = small_product(world, rotation.transpose(0, 1)) + translation
-        return _newton(world, rays, centres, (cam * seen).sum(1) + away, self.steps)
 
 
 def _newton(
@@ -130,8 +111,3 @@ def _newton(
     rotation = (torch.stack(cam)[:, :, None] * (torch.stack(dual) / normal.square().sum(0))[:, None]).sum(0)
     translation = points[0] - (rotation * world_points[0]).sum(1)
     return rotation, translation, exact & translation.isfinite().all(0)
-
-
-def is_central(rig: Pose) -> bool:
-    """Whether all centres are the rig's origin, as those of bearings."""
-    return not bool(rig.translation.any())

@@ -12,24 +12,21 @@ from torch import Tensor
 from kornia_pnpnet.core.checks import check_numbers, check_positive, check_whole
 from kornia_pnpnet.core.linalg import relative
 from kornia_pnpnet.core.performance import compiling, problems_last, sees_values
-from kornia_pnpnet.core.trees import map_tensors, take
+from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.judge.inliers import MAX_FALSE_ALARMS, Judged, Thresholds, judge, log_false_alarms
 from kornia_pnpnet.problem import LEAST_NOISE, MIN_PAIRS, Problem, Starts, State
 from kornia_pnpnet.propose.initialiser import Initialiser
 from kornia_pnpnet.propose.minimal import MinimalSolver, describe
 from kornia_pnpnet.propose.p3p import P3P
-from kornia_pnpnet.propose.p3p_rig import P3PRig, is_central
-from kornia_pnpnet.propose.sampling import kept_at_once
 from kornia_pnpnet.propose.scoring import SCORERS, Scorer
-from kornia_pnpnet.propose.search import PAIRS_AT_ONCE, Plan, Search, full_vectors, least_squares
-from kornia_pnpnet.refine.residual import project
+from kornia_pnpnet.propose.search import Search, cauchy_scale, least_squares
+from kornia_pnpnet.refine.residual import Projection, project
 from kornia_pnpnet.result import Pose
 
 __all__ = ["RANSAC", "search_on"]
 
-# Scale of the Cauchy kernel of the last least squares, in standard deviations of the inliers' residuals; the median of
-# the squared residuals of Gaussian noise, in variances of a pixel coordinate; number of pairs that any pose fits.
-_KERNEL_SCALE, _MEDIAN, _FITTED = 3.4, 2.0 * math.log(2.0), 5
+# Number of pairs that any pose fits.
+_FITTED = 5
 # Standard deviations. :func:`search_on` counts nearer pairs as inliers. The limit of estimated noise is wide because
 # networks estimate too little noise where most pairs are outliers: an inlier that does not count costs more than an
 # outlier that does. That of known noise was tuned on problems of uncertain PnP (`benchmarks/uncertain_problems.py`,
@@ -38,7 +35,7 @@ _INLIER, _KNOWN_INLIER = 10.0, 5.0
 # Residuals at the best focal length on a grid, relative to the median distance of the pixels from the principal point
 # and the range of the grid in logarithms. Tuned on random problems with fields of view of 18 to 100 degrees (seed 6).
 _GRID_RESIDUAL = 0.04
-# Normalised units. A start that has the centre of the world nearer than this counts as this near.
+# Normalised units. Least depth of the centre of the world in the limit of an inlier.
 _NEAREST = 0.5
 # A pair whose weight or confidence is 0 is drawn this often, relative to a pair where it is 1. Networks mislead more
 # often than callers: where repeated structure or crowds agree, for example.
@@ -134,10 +131,10 @@ class RANSAC(Initialiser):
         self.minimal = minimal
         self.threshold = threshold
         self.world_threshold = world_threshold
-        self.final_steps = final_steps
+        self.score = scorer if callable(scorer) else SCORERS[scorer]
+        self.max_samples, self.min_samples = max_samples, min_samples
+        self.confidence, self.final_steps, self.seed = confidence, final_steps, seed
         self.finds_focal = isinstance(minimal, P3P)
-        score = scorer if callable(scorer) else SCORERS[scorer]
-        self.plan = Plan(minimal, score, max_samples, min_samples, confidence, self.config["seed"])
 
     def forward(self, problem: Problem, given: Pose | None = None) -> Starts:
         r"""Find the poses.
@@ -177,53 +174,45 @@ class RANSAC(Initialiser):
         if problem.prior is not None:
             problem = problem._replace(prior=problem.prior.recentred(centre))
         if given is not None:
-            shift = (given.rotation @ centre[..., None])[..., 0]
-            given = map_tensors(lambda x: x.detach()[:, None], Pose(given.rotation, given.translation + shift))
+            given = map_tensors(lambda x: x.detach()[:, None], _recentred(given, centre))
         fixed = problem.map(torch.Tensor.detach)
         img, world = self.threshold * fixed.img_scale, self.world_threshold * fixed.world_scale
         thresholds = Thresholds(img[:, None], world[:, None])
-        plan, stages = self.plan, [thresholds]
+        stages = [thresholds]
         with torch.no_grad():
             if fixed.free_focal is not None:
                 stages = [thresholds._replace(img=thresholds.img.maximum(_on_grid(fixed))), thresholds]
-            if fixed.rig is not None:
-                plan = plan._replace(minimal=P3PRig(0 if is_central(fixed.rig) else 8))
-            found = Search(plan, fixed, stages[0], _trusted(fixed.confidence)).run(given)
-        state, judged = self._refine(problem, found.state, stages)
-        pose, camera = map_tensors(torch.Tensor.contiguous, state)
+            search = Search(self, fixed, stages[0], _trusted(fixed))
+            search.run(given)
+        projection, judged = self._refined(problems_last(problem), search.state, stages)
+        pose, camera = map_tensors(torch.Tensor.contiguous, projection.state)
         with torch.no_grad():
-            fixed, counts = problems_last(fixed), (fixed.weights > 0).sum(-1)
+            projection, counts = map_tensors(torch.Tensor.detach, projection), (fixed.weights > 0).sum(-1)
             # Every number of inliers from 4 to all pairs is another test of the same pose.
-            tests = found.poses * (counts - MIN_PAIRS).clamp(min=1)
-            projection = project(map_tensors(torch.Tensor.detach, state), fixed)
-            ok = log_false_alarms(tests, projection, fixed, thresholds, judged) < math.log(MAX_FALSE_ALARMS)
+            tests = search.scored * (counts - MIN_PAIRS).clamp(min=1)
+            alarms = log_false_alarms(tests, projection, problems_last(fixed), thresholds, judged)
+            ok = alarms < math.log(MAX_FALSE_ALARMS)
             if fixed.free_focal is None:
                 ok |= (judged.inliers == MIN_PAIRS) & (counts == MIN_PAIRS)
-            ok &= found.loss.isfinite()
-        offset = (pose.rotation @ centre[..., None])[..., 0]
-        return Starts(Pose(pose.rotation, pose.translation - offset), judged.weights, ok, camera=camera)
+            ok &= search.loss.isfinite()
+        return Starts(_recentred(pose, -centre), judged.weights.contiguous(), ok, camera=camera)
 
-    def _refine(self, problem: Problem, state: State, stages: list[Thresholds]) -> tuple[State, Judged]:
-        """Improve poses on their inliers, in chunks whose tensors a cache holds; return the inliers afterwards, too.
+    def _refined(self, problem: Problem, state: State, stages: list[Thresholds]) -> tuple[Projection, Judged]:
+        """Improve poses on their inliers, which are chosen anew for each of the stages."""
+        projection = project(state, problem)
+        for thresholds in stages:
+            judged = judge(projection, problem, thresholds)
+            inliers = judged.weights.detach()
+            for _ in range(self.final_steps):
+                state = least_squares(problem, projection, inliers * _robust(judged.errors, inliers))
+                projection = project(state, problem)
+                judged = judge(projection, problem, thresholds)
+        return projection, map_tensors(torch.Tensor.detach, judged)
 
-        The inliers are chosen anew for each entry of ``stages``.
-        """
-        batch, count = problem.weights.shape
-        size = max(1, kept_at_once(PAIRS_AT_ONCE, problem.weights) // count)
-        results = []
-        for rows in torch.arange(batch, device=problem.weights.device).split(size):
-            at = full_vectors(rows, count)
-            part, now, limits_of_part = take((problem, state, stages), at)
-            part = problems_last(part)
-            projection = project(now, part)
-            for limits in limits_of_part:
-                inliers = judge(projection, part, limits).weights.detach()
-                for _ in range(self.final_steps):
-                    weights = inliers * _robust(judge(projection, part, limits), inliers)
-                    projection = project(least_squares(part, projection, weights), part)
-            judged = map_tensors(torch.Tensor.detach, judge(projection, part, limits))
-            results.append(take((projection.state, judged), slice(len(rows))))
-        return map_tensors(lambda *parts: torch.cat(parts), *results)
+
+def _recentred(pose: Pose, centre: Tensor) -> Pose:
+    """Poses where a world point (B, 3) becomes the origin."""
+    return Pose(pose.rotation, pose.translation + (pose.rotation @ centre[..., None])[..., 0])
 
 
 def _on_grid(problem: Problem) -> Tensor:
@@ -232,27 +221,26 @@ def _on_grid(problem: Problem) -> Tensor:
     return (_GRID_RESIDUAL * problem.free_focal.width * away.nanmedian(1).values.nan_to_num(0.0))[:, None]
 
 
-def _robust(judged: Judged, inliers: Tensor) -> Tensor:
+def _robust(errors: Tensor, inliers: Tensor) -> Tensor:
     """Weights of a Cauchy kernel, (B, N): its scale follows the median residual of the inliers, wherever they end.
 
     Thresholds are wide, and noise has tails: with equal weights, pairs near the threshold would decide the pose.
     """
-    count = (inliers > 0).sum(-1, keepdim=True)
-    middle = ((count + MIN_PAIRS) // 2).minimum(count - 1).clamp(min=0)
-    median = torch.where(inliers > 0, judged.errors, torch.inf).sort(-1).values.gather(1, middle)
+    sq_scale, count = cauchy_scale(errors, inliers > 0)
     # Few inliers lie close to the pose that was fitted to them: their residuals say less than they seem to.
     free = (count - _FITTED).clamp(min=0) / count.clamp(min=1)
-    sq_scale = _KERNEL_SCALE**2 / _MEDIAN * median.clamp(min=torch.finfo(median.dtype).eps)
-    return 1.0 / (1.0 + free * judged.errors / sq_scale)
+    return 1.0 / (1.0 + free * errors / sq_scale.clamp(min=torch.finfo(errors.dtype).eps))
 
 
 # How :func:`search_on` searches.
-_FURTHER = RANSAC(P3P(), min_samples=64).plan
+_FURTHER = RANSAC(P3P(), min_samples=64)
 
 
-def _trusted(confidence: Tensor | None) -> Tensor | None:
+def _trusted(problem: Problem) -> Tensor:
     """How often pairs are drawn, by the caller's confidence, (B, N)."""
-    return None if confidence is None else _LEAST_TRUST + (1.0 - _LEAST_TRUST) * confidence.nan_to_num(0.5)
+    if problem.confidence is None:
+        return torch.ones_like(problem.weights)
+    return _LEAST_TRUST + (1.0 - _LEAST_TRUST) * problem.confidence.nan_to_num(0.5)
 
 
 @torch.no_grad()
@@ -297,12 +285,12 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
     else:
         limit = torch.where(known.img.isfinite() & known.world.isfinite(), _KNOWN_INLIER, _INLIER) * sigma
     thresholds = Thresholds(limit, torch.zeros_like(depth))
-    chances = _DOUBT + (1.0 - _DOUBT) * constant.weights
-    trusted = _trusted(problem.confidence)
-    chances = chances if trusted is None else chances * trusted
+    chances = (_DOUBT + (1.0 - _DOUBT) * constant.weights) * _trusted(problem)
     given = map_tensors(lambda *x: torch.stack(x, 1), *constant.poses)
-    found = Search(_FURTHER, problem, thresholds, chances, sigma).run(given, enough=_FURTHER.min_samples)
-    judged = judge(project(found.state, problems_last(problem)), problem, thresholds)
-    weights = torch.where((found.samples > 0)[:, None], 1.0 / (1.0 + judged.errors), constant.weights)
+    search = Search(_FURTHER, problem, thresholds, chances, sigma)
+    search.run(given, enough=_FURTHER.min_samples)
+    state = search.state
+    judged = judge(project(state, problems_last(problem)), problem, thresholds)
+    weights = torch.where((search.drawn > 0)[:, None], 1.0 / (1.0 + judged.errors), constant.weights)
     others = starts.others if keep_others else None
-    return starts._replace(pose=found.state.pose, others=others, weights=weights, camera=found.state.camera)
+    return starts._replace(pose=state.pose, others=others, weights=weights, camera=state.camera)

@@ -12,10 +12,11 @@ from functools import lru_cache
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from kornia_pnpnet.core.performance import present_first
 
-__all__ = ["Samples", "agreement_of_neighbours", "draw_likely", "draw_subsets", "kept_at_once", "samples_needed"]
+__all__ = ["Samples", "agreement_of_neighbours", "draw", "kept_at_once", "samples_needed"]
 
 # Nearest neighbours of a pair that are compared.
 _NEIGHBOURS = 16
@@ -35,39 +36,30 @@ def kept_at_once(count: int, like: Tensor) -> int:
     return count if like.device.type == "cpu" else 64 * count
 
 
-def draw_subsets(numbers: Tensor, counts: Tensor) -> Tensor:
-    """Subsets (P, H, s), ascending, of the ``counts`` (P,) items of problems, from uniform numbers (H, s) in [0, 1).
-
-    Items are drawn one by one without replacement; of too few items, subsets hold positions past the last one.
-    """
-    chosen: list[Tensor] = []
-    for j in range(numbers.shape[1]):
-        left = (counts - j).clamp(min=1)[:, None]
-        item = (numbers[:, j] * left).long().minimum(left - 1)  # (P, H); rounding may carry a product up to `left`
-        for earlier in chosen:  # ascending: the position among those left becomes the position among all
-            item = item + (item >= earlier)
-        for i, earlier in enumerate(chosen):
-            chosen[i], item = torch.minimum(earlier, item), torch.maximum(earlier, item)
-        chosen.append(item)
-    return torch.stack(chosen, -1)
-
-
-def draw_likely(numbers: Tensor, upper: Tensor) -> Tensor:
-    """:func:`draw_subsets`, not ascending, of unequally likely items, by their cumulative probabilities (P, N).
+def draw(numbers: Tensor, upper: Tensor) -> Tensor:
+    """Draw subsets of items one by one without replacement.
 
     Items of probability 0 are drawn only where there are too few others.
+
+    Args:
+        numbers: uniform in [0, 1), float64, shape (H, s).
+        upper: cumulative probabilities of the items of each problem, float64, shape (P, N).
+
+    Returns:
+        Positions of the items, shape (P, H, s).
     """
     lower = torch.cat((torch.zeros_like(upper[:, :1]), upper[:, :-1]), 1)
     chosen: list[tuple[Tensor, Tensor]] = []  # where the interval of an item begins, and its length, ascending
     items = []
-    for j in range(numbers.shape[1]):
-        left = 1.0 - sum(length for _, length in chosen) if chosen else torch.ones_like(upper[:, :1])
-        at = numbers[:, j] * left  # (P, H), among the intervals that are left
+    left = torch.ones_like(upper[:, :1])
+    for number in numbers.unbind(-1):
+        at = number * left  # (P, H), among the intervals that are left
         for begin, length in chosen:
             at = at + torch.where(at >= begin, length, 0.0)
-        item = torch.searchsorted(upper, at.contiguous(), right=True).clamp(max=upper.shape[1] - 1)
+        item = torch.searchsorted(upper, at, right=True).clamp(max=upper.shape[1] - 1)
         items.append(item)
         begin, length = lower.gather(1, item), (upper - lower).gather(1, item)
+        left = left - length
         for i, (other, size) in enumerate(chosen):
             swap = other > begin
             chosen[i] = torch.where(swap, begin, other), torch.where(swap, length, size)
@@ -104,7 +96,10 @@ def agreement_of_neighbours(world_points: Tensor, img_points: Tensor, there: Ten
     rows = torch.arange(there.shape[1], device=there.device).split(max(1, block // width))
     problems = torch.arange(len(there), device=there.device).split(max(1, block // (width * there.shape[1])))
     for some, here in itertools.product(problems, rows):
-        both = [_sq_distances(x[some][:, here], x[some[:, None], at[some]]) for x in (world_points, img_points)]
+        both = [
+            torch.cdist(x[some][:, here], x[some[:, None], at[some]], compute_mode="donot_use_mm_for_euclid_dist")
+            for x in (world_points, img_points)
+        ]  # exactly 0 between equal points
         no = (both[0] == 0).logical_or_(both[1] == 0).logical_or_(absent[some])
         # Distances as integers with the number of the pair in the last digits: they ascend alike, and differ.
         keys = [x.masked_fill_(no, torch.inf).view(torch.int32).bitwise_and_(-_CANDIDATES) for x in both]
@@ -115,27 +110,18 @@ def agreement_of_neighbours(world_points: Tensor, img_points: Tensor, there: Ten
     return out
 
 
-def _sq_distances(points: Tensor, others: Tensor) -> Tensor:
-    """Squared distances, (P, N, K) and (P, M, K) to (P, N, M); exactly 0 between equal points."""
-    total = points.new_zeros(points.shape[0], points.shape[1], others.shape[1])
-    for x, y in zip(points.unbind(-1), others.unbind(-1), strict=True):
-        difference = x[:, :, None] - y[:, None]
-        total.addcmul_(difference, difference)
-    return total
-
-
 class Samples:
     """The samples that RANSAC tries, for every problem of a batch.
 
     When a problem has at most ``most`` subsets of its pairs, each subset is a sample once, in random order. Otherwise
-    ``most`` samples are drawn, all pairs equally likely or with probabilities in proportion to ``chances``.
+    ``most`` samples are drawn.
 
     Args:
         there: which pairs have a weight, bool (B, N).
         size: number of pairs in a sample.
         most: largest number of samples.
         seed: seed of the random numbers, which are the same for every problem.
-        chances: at least 0, (B, N).
+        chances: pairs are drawn in proportion to these numbers, at least 0, (B, N); ``None``: all equally likely.
 
     Attributes:
         counts: number of pairs that have a weight, (B,).
@@ -148,53 +134,46 @@ class Samples:
     """
 
     def __init__(self, there: Tensor, *, size: int, most: int, seed: int, chances: Tensor | None = None) -> None:
-        pairs, device = there.shape[1], there.device
+        device = there.device
         self.size = size
         self.counts = there.sum(-1)
-        self._present_first = present_first(there)
-        subsets = [math.comb(n, size) for n in range(pairs + 1)]
-        self.totals = torch.tensor([min(n, most) for n in subsets], device=device)[self.counts]
-        self._enumerated = self.counts <= max(n for n in range(pairs + 1) if subsets[n] <= most)
+        self._order = present_first(there)
+        subsets = [math.comb(n, size) for n in range(there.shape[1] + 1)]
+        of_problem = torch.tensor(subsets, dtype=torch.float64, device=device)[self.counts]
+        self.totals = of_problem.clamp(max=most).long()
+        self._enumerated = of_problem <= most
         kinds, self._kinds = self.counts.where(self._enumerated, size).unique(return_inverse=True)
         tables = [_subsets(n, size, seed) for n in kinds.tolist()] or [_subsets(size, size, seed)]
-        self._table = torch.cat(tables).to(device)
-        self._lengths = torch.tensor([len(table) for table in tables], device=device)
-        self._firsts = self._lengths.cumsum(0) - self._lengths
+        self._tables = pad_sequence(tables, batch_first=True).to(device)  # (K, L, s)
         self._numbers = None if bool(self._enumerated.all()) else _random_numbers(size, most, seed).to(device)
-        self.share: Tensor | None = None
-        if chances is not None and self._numbers is not None:
-            share = torch.where(there, chances, 0.0).double()
-            self.share = share / share.sum(-1, keepdim=True).clamp(min=torch.finfo(share.dtype).tiny)
-            self._upper = self.share.gather(1, self._present_first).cumsum(-1)
+        share = there.double()
+        if chances is not None:
+            share = share * torch.where(self._enumerated[:, None], 1.0, chances)
+        self._share = share / share.sum(-1, keepdim=True).clamp(min=torch.finfo(share.dtype).tiny)
+        self._upper = self._share.gather(1, self._order).cumsum(-1)
 
     def positions(self, problems: Tensor, start: int, stop: int) -> Tensor:
         """Positions of the pairs of the samples ``start`` to ``stop - 1`` of some problems (P,), (P, H, s).
 
         Samples after the last one of a problem repeat others.
         """
-        kind = self._kinds[problems]
-        listed = torch.arange(start, stop, device=problems.device) % self._lengths[kind, None]
-        ranks = self._table[self._firsts[kind, None] + listed]
+        listed = torch.arange(start, stop, device=problems.device) % self.totals[problems, None]
+        ranks = self._tables[self._kinds[problems, None], listed.clamp(max=self._tables.shape[1] - 1)]
         if self._numbers is not None:
-            numbers = self._numbers[start:stop]
-            if self.share is None:
-                drawn = draw_subsets(numbers, self.counts[problems])
-            else:
-                drawn = draw_likely(numbers, self._upper[problems])
+            drawn = draw(self._numbers[start:stop], self._upper[problems])
             ranks = torch.where(self._enumerated[problems, None, None], ranks, drawn)
         return self._present(problems, ranks)
 
     def needed(self, problems: Tensor, inliers: Tensor, confidence: float) -> Tensor:
-        """:func:`samples_needed` of some problems (P,) with the inliers (P, N) of their best poses so far."""
-        plain = samples_needed(inliers.sum(-1), self.counts[problems], self.size, confidence)
-        if self.share is None:
-            return plain
-        # As for equally likely pairs, each with the mean share of an inlier. The mean is weighted by the share.
-        share = torch.where(inliers, self.share[problems], 0.0)
+        """:func:`samples_needed` of some problems (P,) with the inliers (P, N) of their best poses so far.
+
+        Where pairs are unequally likely, the formula reads an effective number of pairs: one over the mean share of an
+        inlier. The mean is weighted by the share.
+        """
+        share = torch.where(inliers, self._share[problems], 0.0)
         mass = share.sum(-1)
         count = mass / share.square().sum(-1).clamp(min=torch.finfo(share.dtype).tiny)
-        likely = samples_needed(mass * count, count, self.size, confidence)
-        return torch.where(self._enumerated[problems], plain, likely)
+        return samples_needed(mass * count, count, self.size, confidence)
 
     def spread(self, problems: Tensor, count: int) -> Tensor:
         """Positions of ``count`` pairs spread evenly over the pairs that have a weight, (P, count).
@@ -202,16 +181,13 @@ class Samples:
         :class:`~kornia_pnpnet.frame.Normalize` orders pairs by their pixels: these are spread over the image. Where
         pairs are unequally likely, likely ones come more often.
         """
-        middle = 2 * torch.arange(count, device=problems.device) + 1
-        if self.share is None:
-            return self._present(problems, middle * self.counts[problems, None] // (2 * count))
-        at = (middle / (2 * count)).to(self._upper).expand(len(problems), -1).contiguous()
-        ranks = torch.searchsorted(self._upper[problems], at, right=True)
+        at = (torch.arange(count, dtype=torch.float64, device=problems.device) + 0.5) / count
+        ranks = torch.searchsorted(self._upper[problems], at.expand(len(problems), -1).contiguous(), right=True)
         return self._present(problems, ranks.clamp(max=self._upper.shape[1] - 1))
 
     def _present(self, problems: Tensor, ranks: Tensor) -> Tensor:
         """Positions of pairs from their ranks (P, ...) among the pairs that have a weight."""
-        return self._present_first[problems].gather(1, ranks.flatten(1)).view_as(ranks)
+        return self._order[problems].gather(1, ranks.flatten(1)).view_as(ranks)
 
 
 @lru_cache(maxsize=64)

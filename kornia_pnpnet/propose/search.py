@@ -1,32 +1,39 @@
-r"""The rounds of RANSAC: solve samples, keep the best poses, improve these on their inliers, stop solved problems."""
+r"""The one search of all samplers: solve minimal samples, score their poses, improve the best ones on their inliers."""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
+from kornia_pnpnet.core.linalg import solve_positive
+from kornia_pnpnet.core.performance import compiling, present_first, sees_values
 from kornia_pnpnet.core.trees import map_tensors, take
 from kornia_pnpnet.judge.belief import residual_noise, rotation_sigma
 from kornia_pnpnet.judge.inliers import Thresholds, judge
-from kornia_pnpnet.problem import Noise, Problem, State
-from kornia_pnpnet.propose.minimal import FocalHypotheses, MinimalSolver
+from kornia_pnpnet.problem import MIN_PAIRS, Problem, State
+from kornia_pnpnet.propose.p3p_rig import P3PRig
 from kornia_pnpnet.propose.sampling import Samples, agreement_of_neighbours, kept_at_once
-from kornia_pnpnet.propose.scoring import Scene, Scorer
-from kornia_pnpnet.refine.residual import Projection, lm_step, normal_equations, project
+from kornia_pnpnet.propose.scoring import Scene, as_entries, as_pose
+from kornia_pnpnet.refine.residual import Projection, moved, normal_equations, project
 from kornia_pnpnet.refine.terms import add_term
 from kornia_pnpnet.result import Pose
 
-__all__ = ["PAIRS_AT_ONCE", "Found", "Plan", "Search", "full_vectors", "least_squares", "pack_pairs", "unpack_pairs"]
+if TYPE_CHECKING:
+    from kornia_pnpnet.propose.ransac import RANSAC
+
+__all__ = ["CAUCHY", "Search", "cauchy_scale", "least_squares"]
+
+#: Scale of the Cauchy kernel in standard deviations.
+CAUCHY = 3.4
 
 # Poses are compared and improved in this precision, which resolves 1e-4 px at the protocol's focal length of 3400 px.
 _DTYPE = torch.float32
-# Number of samples that are solved and scored together, and of pairs that are improved together: a core's caches hold
-# their tensors.
+# Number of samples that are solved and scored together: a core's caches hold their tensors.
 _SAMPLES_AT_ONCE = 4096
-PAIRS_AT_ONCE = 8 * _SAMPLES_AT_ONCE
 # Number of pairs that score all poses of a round first, see `_rank`: at least the first, and the second times the cube
 # root of the number of samples before. After k samples in vain at a confidence of 0.999 the share of the inliers is
 # below (7 / k)^(1/3); of 3 over that share, one is an inlier with a probability of 95 %.
@@ -44,8 +51,9 @@ _FEW_LEFT = 2.0
 _VECTOR = 64
 # Relative damping of least squares: next to none, since the start is close to the minimum.
 _DAMPING = 1e-6
-# Thresholds. The first least squares use the pairs up to this limit: the pose of a noisy sample misses some inliers.
-_WIDE = 3.0
+# Thresholds. The first least squares use the pairs up to the first limit: the pose of a noisy sample misses some
+# inliers.
+_LIMITS = 3.0, 1.0
 # Where the inliers leave the rotation open by more than the first (standard deviation in radians), as those of a flat
 # scene in a narrow field of view do, another pose may have as many: at least the second number of samples is drawn.
 # Chosen on a scene with a field of view of 13 degrees; half of the angle takes twice the time at 9 pairs.
@@ -56,82 +64,74 @@ _PLAIN_SAMPLES = 256
 _LEAST_AGREEMENT, _AGREEMENT_POWER = 0.3, 1.5
 
 
-class Plan(NamedTuple):
-    """How to search, see the arguments of :class:`~kornia_pnpnet.propose.ransac.RANSAC`."""
-
-    minimal: MinimalSolver
-    scorer: Scorer
-    max_samples: int
-    min_samples: int
-    confidence: float
-    seed: int
-
-
-class Found(NamedTuple):
-    r"""The best state of each problem.
-
-    Attributes:
-        state: pose in the frame of the problem and zoom, in the dtype of the problem.
-        loss: its loss, infinite where there is no pose, shape :math:`(B,)`.
-        poses: number of poses that were scored, int64, shape :math:`(B,)`.
-        samples: number of samples that were drawn, int64, shape :math:`(B,)`.
-    """
-
-    state: State
-    loss: Tensor
-    poses: Tensor
-    samples: Tensor
-
-
 class Search:
     r"""One search for the best poses of a batch, without gradients.
 
-    Poses are 3x4 matrices :math:`[R | t]`, whose last row is divided by the zoom of an unknown focal length.
+    A pose is twelve entries of :math:`[R | t]` by rows, see :func:`~kornia_pnpnet.propose.scoring.as_pose`. Its last
+    row is divided by the zoom of an unknown focal length.
 
     Args:
-        plan: how to search.
+        plan: how to search: see the arguments of RANSAC.
         problem: the problems; their world is centred, since the search runs in float32.
         thresholds: thresholds of an inlier.
         chances: how likely a pair is an inlier, up to a factor, shape :math:`(B, N)`; all the same when ``None``.
         sigma: standard deviation of the pixels, shape :math:`(B, 1)` or :math:`(B, N)`; as the residuals of the inliers
             show it when ``None``.
 
+    Attributes:
+        poses: the best pose of each problem, shape :math:`(B, 12)`.
+        loss: its loss, infinite where there is no pose, shape :math:`(B,)`.
+        scored: number of poses that were scored, int64, shape :math:`(B,)`.
+        drawn: number of samples that were drawn, int64, shape :math:`(B,)`.
+
     Example:
         >>> from kornia_pnpnet.propose.p3p import P3P
-        >>> from kornia_pnpnet.propose.scoring import SCORERS
+        >>> from kornia_pnpnet.propose.ransac import RANSAC
         >>> points = torch.rand(1, 6, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
         >>> cam_points = points + torch.tensor([0.0, 0.0, 5.0], dtype=torch.float64)
         >>> problem = Problem.of(points, 100.0 * cam_points[..., :2] / cam_points[..., 2:], 100.0)
-        >>> plan = Plan(P3P(), SCORERS["msac"], max_samples=100, min_samples=32, confidence=0.999, seed=0)
-        >>> found = Search(plan, problem, Thresholds(points.new_ones(1, 1), points.new_zeros(1, 1))).run()
-        >>> round(found.state.pose.translation[0, 2].item(), 3), found.samples
+        >>> search = Search(RANSAC(P3P()), problem, Thresholds(points.new_ones(1, 1), points.new_zeros(1, 1)))
+        >>> search.run()
+        >>> round(search.state.pose.translation[0, 2].item(), 3), search.drawn
         (5.0, tensor([20]))
     """
 
     def __init__(
         self,
-        plan: Plan,
+        plan: RANSAC,
         problem: Problem,
         thresholds: Thresholds,
         chances: Tensor | None = None,
         sigma: Tensor | None = None,
     ) -> None:
-        self.plan = plan
-        self.problem = problem
-        batch, device = len(problem.weights), problem.weights.device
-        thresholds, sigma = map_tensors(lambda x: x.to(_DTYPE), (thresholds, sigma))
-        self.limits = thresholds, None if sigma is None else sigma.expand_as(problem.weights)
-        self.scene = Scene.of(problem, thresholds, _DTYPE)
-        self.pairs = pack_pairs(problem)
+        self.plan, self.problem = plan, problem
+        self.chances = torch.ones_like(problem.weights) if chances is None else chances
+        self.minimal = plan.minimal
+        if problem.rig is not None:  # the rays of bearings meet in one centre
+            central = sees_values(problem.weights) and not bool(problem.rig.translation.any())
+            self.minimal = P3PRig(0 if central else 8)
+        self.thresholds, sigma = map_tensors(lambda x: x.to(_DTYPE), (thresholds, sigma))
+        self.sigma = None if sigma is None else sigma.expand_as(problem.weights)
+        self.scene = Scene.of(problem, self.thresholds, _DTYPE)
+        # The numbers of each pair side by side, so that pairs are selected at once: (B, N, 6), in a rig (B, N, 18).
+        rig = [] if problem.rig is None else [problem.rig.rotation.flatten(2), problem.rig.translation]
+        self.pairs = torch.cat((problem.world_points, problem.img_points, problem.weights[..., None], *rig), -1)
         self.low = self.pairs.to(_DTYPE)
-        self.chances = chances
-        self.samples = self.plain = self._samples(chances)
-        self.matrix = torch.eye(3, 4, dtype=_DTYPE, device=device).repeat(batch, 1, 1)
-        self.loss = self.matrix.new_full((batch,), torch.inf)
+        batch = self.low.shape[0]
+        self.poses = torch.eye(3, 4, dtype=_DTYPE, device=self.low.device).flatten().repeat(batch, 1)
+        self.loss = self.low.new_full((batch,), torch.inf)
         self.needed = self.loss.double()
-        self.least = torch.zeros_like(self.needed)
+        self.scored, self.drawn = torch.zeros(2, batch, dtype=torch.int64, device=self.low.device)
 
-    def run(self, given: Pose | None = None, enough: int = 0) -> Found:
+    @property
+    def state(self) -> State:
+        """The best poses as rotations without rounding errors, and zooms, in the dtype of the problem."""
+        pose, camera = self._state(self.poses.to(self.problem.weights))
+        # Newton's step for the polar factor doubles the number of correct digits.
+        rotation = 1.5 * pose.rotation - 0.5 * pose.rotation @ (pose.rotation.mT @ pose.rotation)
+        return State(Pose(rotation, pose.translation), camera)
+
+    def run(self, given: Pose | None = None, enough: int = 0) -> None:
         """Search until every problem has a sample without an outlier at the confidence, or all its samples.
 
         Args:
@@ -139,21 +139,20 @@ class Search:
                 :math:`(B, S, 3)`, in the frame of the problem.
             enough: a problem whose given poses show that it needs no more samples than this is not searched.
         """
+        self.samples = self.plain = self._samples(self.chances)
         totals = self.samples.totals
-        poses, drawn = torch.zeros_like(totals), torch.zeros_like(totals)
         active = (self.samples.counts >= self.samples.size).nonzero()[:, 0]
         if given is not None and len(active):
-            rotation, translation = (x.to(_DTYPE) for x in given)
-            packed = self.scene.pack(rotation.permute(2, 3, 0, 1), translation.permute(2, 0, 1))
-            losses, matrices = self.scene.losses(packed, self.plan.scorer)[active], self.scene.unpack(packed)[active]
-            poses[active] += losses.shape[1]
+            poses = as_entries(given)[active].to(_DTYPE).mT
+            losses = take(self.scene, active).losses(poses, self.plan.score)
+            self.scored[active] += losses.shape[1]
             self.loss[active], best = losses.min(1)
-            self.matrix[active] = matrices[torch.arange(len(best), device=best.device), best]
+            self.poses[active] = poses.mT[torch.arange(len(best), device=best.device), best]
             self._expect(active)
             hard = self.needed[active] > enough
-            self._improve(active[hard], losses[hard], matrices[hard])
-            if enough:
-                active = active[self.needed[active] > enough]
+            self._improve(active[hard], losses[hard], poses[hard])
+            self._expect(active[hard])
+            active = active[self.needed[active] > enough] if enough else active
         start = stop = 0
         while len(active):
             if start < _PLAIN_SAMPLES <= stop and self.problem.rig is None:
@@ -161,38 +160,61 @@ class Search:
                 self._expect(active)
             start, stop = stop, self._end_of_round(stop, int(totals[active].max()))
             parts = active.split(max(1, kept_at_once(_SAMPLES_AT_ONCE, active) // (stop - start)))
-            best_of_parts = [self._best_of_samples(part, start, stop) for part in parts]
-            losses, matrices, scored = map_tensors(lambda *x: torch.cat(x), *best_of_parts)
-            poses[active] += scored
-            drawn[active] = totals[active].clamp(max=stop)
-            better = (losses[:, 0] < self.loss[active]).nonzero()[:, 0]
-            self._improve(active[better], losses[better], matrices[better])
-            enough_samples = self.needed[active].clamp(min=self.plan.min_samples).minimum(totals[active])
-            active = active[enough_samples > stop]
-        pose, camera = self._state(self.matrix.to(self.problem.weights))
-        return Found(State(_orthonormal(pose), camera), self.loss, poses, drawn)
+            losses, poses = map_tensors(lambda *x: torch.cat(x), *(self._round(x, start, stop) for x in parts))
+            self.drawn[active] = totals[active].clamp(max=stop)
+            better = losses[:, 0] < self.loss[active]
+            self._improve(active[better], losses[better], poses[better])
+            self._expect(active[better & (totals[active] > stop)])
+            active = active[totals[active] > stop]
+            active = active[self.needed[active].clamp(min=self.plan.min_samples) > stop]
 
-    def _state(self, matrix: Tensor) -> State:
-        """Pose and zoom of matrices."""
+    def run_once(self, positions: Tensor, judges: Tensor) -> None:
+        """Search in one round of given samples, in which no size depends on values: as in a graph.
+
+        Args:
+            positions: positions of the pairs of the samples, shape :math:`(B, H, s)`.
+            judges: positions of the pairs that score all poses, shape :math:`(B, J)`; a negative one does not count.
+        """
+        problems = torch.arange(positions.shape[0], device=positions.device)
+        poses, valid = self._solved(problems, positions)
+        jury = self.scene.pairs(judges.clamp(min=0))
+        jury = jury._replace(weights=torch.where(judges[:, None] >= 0, jury.weights, 0.0))
+        _, poses, _ = self._best_of(jury, poses, valid, _IMPROVED)
+        losses = self.scene.losses(poses, self.plan.score)
+        self.loss, self.poses = self._improved(problems, losses, poses)
+
+    def _state(self, poses: Tensor) -> State:
+        """Poses (R, 12) and their zoom."""
         if self.problem.free_focal is None:
-            return State.of(Pose(matrix[..., :3], matrix[..., 3]))
-        scale = matrix[:, 2, :3].norm(dim=-1, keepdim=True).clamp(min=torch.finfo(matrix.dtype).eps)
-        matrix = torch.cat((matrix[:, :2], matrix[:, 2:] / scale[..., None]), 1)
-        return State(Pose(matrix[..., :3], matrix[..., 3]), -scale.log())
+            return State.of(as_pose(poses))
+        first, last = poses.split((8, 4), 1)
+        scale = last[:, :3].norm(dim=-1, keepdim=True).clamp(min=torch.finfo(poses.dtype).eps)
+        return State(as_pose(torch.cat((first, last / scale), 1)), -scale.log())
 
-    def _some(self, rows: Tensor) -> Problem:
-        """Some of the problems, in the precision of the search."""
-        return unpack_pairs(self.low[rows].permute(2, 1, 0).contiguous(), self.problem, rows)
+    def _unpacked(self, values: Tensor, owners: Tensor) -> Problem:
+        """Pairs of :math:`P` problems, whose numbers are side by side, (C, n, P), of some of the problems (P,)."""
+        scales, free = take(((self.problem.img_scale, self.problem.world_scale), self.problem.free_focal), owners)
+        scales, free, focal = map_tensors(lambda x: x.to(values), (scales, free, self.problem.focal))
+        values = values.permute(2, 1, 0)
+        rig = None if self.problem.rig is None else Pose(values[..., 6:15].unflatten(-1, (3, 3)), values[..., 15:])
+        weights = values[..., 5]
+        usual = torch.ones_like(weights)
+        return Problem(values[..., :3], values[..., 3:5], weights, focal, *scales, usual, rig=rig, free_focal=free)
 
-    def _samples(self, chances: Tensor | None) -> Samples:
+    def _projected(self, rows: Tensor, poses: Tensor) -> tuple[Problem, Thresholds, Projection]:
+        """Some problems, their thresholds, and their points at poses (R, 12), in the precision of the search."""
+        problem = self._unpacked(self.low[rows].permute(2, 1, 0).contiguous(), rows)
+        return problem, take(self.thresholds, rows), project(self._state(poses), problem)
+
+    def _samples(self, chances: Tensor) -> Samples:
         plan, there = self.plan, self.problem.weights > 0
-        return Samples(there, size=plan.minimal.sample_size, most=plan.max_samples, seed=plan.seed, chances=chances)
+        return Samples(there, size=self.minimal.sample_size, most=plan.max_samples, seed=plan.seed, chances=chances)
 
     def _prefer_agreement(self, problems: Tensor) -> None:
         """From now on draw the pairs of some problems in proportion to the agreement of their neighbours, too."""
-        world, img, weights = (x[problems] for x in self.problem[:3])
-        chances = torch.ones_like(self.problem.weights) if self.chances is None else self.chances.clone()
+        world, img, weights = take(self.problem[:3], problems)
         agreement = agreement_of_neighbours(world, img, weights > 0)
+        chances = self.chances.clone()
         chances[problems] *= (_LEAST_AGREEMENT + agreement) ** _AGREEMENT_POWER
         self.samples = self._samples(chances)
 
@@ -202,140 +224,132 @@ class Search:
         Once agreement was counted, it is the geometric mean of the numbers with and without agreement. Neighbours also
         agree where structure repeats: such a wrong pose must not end the search too early.
         """
-        rows = full_vectors(at, self.problem.weights.shape[1])
-        thresholds, sigma = take(self.limits, rows)
-        problem = self._some(rows)
-        projection = project(self._state(self.matrix[rows]), problem)
+        if not len(at):
+            return
+        rows = full_vectors(at, self.low.shape[1])
+        problem, thresholds, projection = self._projected(rows, self.poses[rows])
         judged = judge(projection, problem, thresholds)
-        if self.problem.free_focal is None:
-            known = None if sigma is None else Noise(sigma, torch.zeros_like(sigma))
-            noise = known or residual_noise(projection, problem, judged.weights)
-            is_open = rotation_sigma(projection, problem, noise, judged) > _OPEN
-            self.least[at] = self.least[at].where(~is_open[: len(at)], _OPEN_SAMPLES)
         inliers = judged.weights[: len(at)] > 0
         needed = self.samples.needed(at, inliers, self.plan.confidence)
         if self.samples is not self.plain:
             needed = (needed * self.plain.needed(at, inliers, self.plan.confidence)).sqrt()
-        self.needed[at] = needed.maximum(self.least[at])
+        if self.problem.free_focal is None:
+            noise = residual_noise(projection, problem, judged.weights)
+            noise = noise if self.sigma is None else noise._replace(img=self.sigma[rows])
+            is_open = rotation_sigma(projection, problem, noise, judged)[: len(at)] > _OPEN
+            needed = torch.where(is_open, needed.clamp(min=_OPEN_SAMPLES), needed)
+        self.needed[at] = needed
 
     def _end_of_round(self, done: int, total: int) -> int:
         """Number of samples after the next round; few that would be left go with it."""
         size = min(max(self.plan.min_samples, int(_GROWTH * done)), _SAMPLES_AT_ONCE)
         return total if done + size * _FEW_LEFT >= total and total - done <= _SAMPLES_AT_ONCE else done + size
 
-    def _best_of_samples(self, problems: Tensor, start: int, stop: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Losses (P, K), ascending, and matrices (P, K, 3, 4) of the best poses; number of poses of the samples."""
-        positions = self.samples.positions(problems, start, stop)  # (P, H, s)
-        batch, count, size = positions.shape
-        rows = (positions + problems[:, None, None] * self.problem.weights.shape[1]).flatten(0, 1)  # (P H, s)
-        rows = full_vectors(rows)
-        values = self.pairs.flatten(0, 1).index_select(0, rows.flatten()).view(-1, size, self.pairs.shape[2])
-        owners = full_vectors(problems.repeat_interleave(count))
-        solved = self.plan.minimal.hypotheses(unpack_pairs(values.permute(2, 1, 0), self.problem, owners))
-        fresh = torch.arange(start, stop, device=problems.device) < self.samples.totals[problems, None]  # (P, H)
-        valid = solved.valid[: batch * count].unflatten(0, (batch, count)) & fresh[..., None]
-        valid = valid.mT.flatten(1)  # (P, S H)
-        number = valid.sum(1)
-        at, valid = _present_first(valid, number)
-        row = at % count + count * torch.arange(batch, device=at.device)[:, None]
-        at = (at // count * len(rows) + row).flatten()
-        # The components of a pose are the first dimensions, as in p3p's results, so that selecting poses reads each
-        # component from contiguous memory.
-        (rotation, translation), zoom = map_tensors(
-            lambda x: x.movedim((0, 1), (-1, -2)).flatten(-2).index_select(-1, at).unflatten(-1, valid.shape),
-            (solved.pose, solved.zoom if isinstance(solved, FocalHypotheses) else None),
-        )
-        if zoom is not None:
-            rotation[2] *= (scale := (-zoom).exp())
-            translation[2] *= scale
-        scene = take(self.scene, problems)
-        losses, packed = self._rank(problems, scene, scene.pack(rotation, translation), valid, start)
-        return losses, scene.unpack(packed), number
+    def _round(self, problems: Tensor, start: int, stop: int) -> tuple[Tensor, Tensor]:
+        """Losses (P, K), ascending, and poses (P, 12, K) of the best of some samples.
 
-    def _rank(self, problems: Tensor, scene: Scene, packed: Tensor, valid: Tensor, done: int) -> tuple[Tensor, Tensor]:
-        """Losses and poses of the best; of many pairs, a few score all poses first, then more pairs the best poses.
-
-        After many samples in vain the share of the inliers is small, and more pairs are needed to see one of them.
+        Of many pairs, a few score all poses first, then more pairs the best poses. After many samples in vain the share
+        of the inliers is small, and more pairs are needed to see one of them.
         """
-
-        def keep(judges: Scene, width: int, last: bool) -> tuple[Tensor, Tensor, Tensor]:
-            """The poses with the smallest losses: losses (P, K), packed (P, 4, 3, K), valid (P, K)."""
-            losses = judges.losses(packed, self.plan.scorer).masked_fill(~valid, torch.inf)
-            losses, order = losses.topk(min(width, losses.shape[1]), largest=False, sorted=last)
-            return losses, packed.gather(3, order[:, None, None].expand(-1, 4, 3, -1)), valid.gather(1, order)
-
-        pairs, width = max(_FIRST_PAIRS, math.ceil(_PAIRS_BY_SAMPLES * done ** (1 / 3))), packed.shape[-1]
-        while 2 * pairs <= scene.points.shape[1]:
+        poses, valid = self._solved(problems, self.samples.positions(problems, start, stop), start)
+        scene, width = take(self.scene, problems), poses.shape[-1]
+        pairs = max(_FIRST_PAIRS, math.ceil(_PAIRS_BY_SAMPLES * start ** (1 / 3)))
+        while 2 * pairs <= self.low.shape[1]:
             width = max(width // _KEPT_ONE_IN, _IMPROVED)
-            _, packed, valid = keep(scene.pairs(self.samples.spread(problems, pairs)), width, last=False)
+            _, poses, valid = self._best_of(scene.pairs(self.samples.spread(problems, pairs)), poses, valid, width)
             pairs *= _MORE
-        losses, packed, _ = keep(scene, _IMPROVED, last=True)
-        return losses, packed
+        return self._best_of(scene, poses, valid, _IMPROVED)[:2]
 
-    def _improve(self, problems: Tensor, losses: Tensor, matrices: Tensor) -> None:
-        """Improve all the poses (P, K) once, then the best of each problem further; it becomes the problem's pose."""
-        if not len(problems):
-            return
-        size = max(1, kept_at_once(PAIRS_AT_ONCE, problems) // (self.problem.weights.shape[1] * losses.shape[1]))
-        for at, some, part in zip(*(x.split(size) for x in (problems, losses, matrices)), strict=True):
-            owners = at.repeat_interleave(some.shape[1])
-            loss, matrix = self._descend(owners, some.flatten(), part.flatten(0, 1), limit=_WIDE)
-            loss, best = loss.view_as(some).min(-1)
-            matrix = matrix.view_as(part)[torch.arange(len(best), device=best.device), best]
-            self.loss[at], self.matrix[at] = self._descend(at, loss, matrix, limit=1.0)
-            self._expect(at)
+    def _solved(self, problems: Tensor, positions: Tensor, start: int | None = None) -> tuple[Tensor, Tensor]:
+        """Poses (P, 12, W) of some problems' samples (P, H, s), and which of them are solutions, (P, W).
 
-    def _descend(self, problems: Tensor, loss: Tensor, matrix: Tensor, limit: float) -> tuple[Tensor, Tensor]:
-        """Take one step of least squares on the pairs within ``limit`` thresholds, where it lowers the loss."""
-        count = self.problem.weights.shape[1]
-        rows = full_vectors(problems, count)
-        some, scene = self._some(rows), take(self.scene, problems)
-        wide = map_tensors(lambda x: limit * x[rows], self.limits[0])
-        projection = project(self._state(full_vectors(matrix, count)), some)
-        pose, camera = least_squares(some, projection, judge(projection, some, wide).weights)
-        new_matrix = torch.cat((pose.rotation, pose.translation[..., None]), -1)[: len(problems)]
-        if camera.shape[1]:
-            zoomed = new_matrix[:, 2:] * (-camera[: len(problems), None]).exp()
-            new_matrix = torch.cat((new_matrix[:, :2], zoomed), 1)
-        components = new_matrix.permute(1, 2, 0)[..., None]
-        new_loss = scene.losses(scene.pack(components[:, :3], components[:, 3]), self.plan.scorer)[:, 0]
-        better = (new_loss < loss) & loss.isfinite()  # an invalid pose stays invalid
-        return torch.where(better, new_loss, loss), torch.where(better[:, None, None], new_matrix, matrix)
+        With ``start``, the number of the first sample, only solutions of samples that count are returned, and counted.
+        """
+        batch, count, size = positions.shape
+        rows = full_vectors((positions + problems[:, None, None] * self.pairs.shape[1]).flatten(0, 1))  # (R, s)
+        values = self.pairs.flatten(0, 1).index_select(0, rows.flatten()).unflatten(0, (-1, size))
+        owners = full_vectors(problems.repeat_interleave(count))
+        pose, valid = self.minimal.hypotheses(self._unpacked(values.permute(2, 1, 0), owners))
+        valid = valid[: batch * count].unflatten(0, (batch, count)).mT  # (P, S, H)
+        # The components of a pose come first, as in p3p's results: each is selected from contiguous memory.
+        pose = map_tensors(lambda x: x.movedim((0, 1), (-1, -2)), pose)
+        poses = torch.cat((pose.rotation, pose.translation[:, None]), 1).flatten(0, 1).to(_DTYPE)  # (12, S, R)
+        if start is None:
+            return poses.unflatten(-1, (batch, count)).movedim(2, 0).flatten(2), valid.flatten(1)
+        numbers = torch.arange(start, start + count, device=problems.device)
+        valid = (valid & (numbers < self.samples.totals[problems, None])[:, None]).flatten(1)
+        found = valid.sum(1)
+        self.scored[problems] += found
+        # The width is as small as the largest number of a problem allows, and fills a processor's vectors.
+        width = max(1, -(-int(found.max()) // _VECTOR)) * _VECTOR
+        at = present_first(functional.pad(valid, (0, width)))[:, :width]
+        valid = torch.arange(width, device=at.device) < found[:, None]
+        at = torch.where(valid, at, 0)
+        at = at // count * len(rows) + at % count + count * torch.arange(batch, device=at.device)[:, None]
+        return poses.flatten(1).index_select(1, at.flatten()).unflatten(1, at.shape).movedim(1, 0), valid
+
+    def _best_of(self, judges: Scene, poses: Tensor, valid: Tensor, width: int) -> tuple[Tensor, Tensor, Tensor]:
+        """The poses with the smallest losses, ascending: losses (P, K), poses (P, 12, K), valid (P, K)."""
+        losses = judges.losses(poses, self.plan.score).masked_fill(~valid, torch.inf)
+        losses, order = losses.topk(min(width, losses.shape[1]), largest=False)
+        return losses, poses.gather(2, order[:, None].expand(-1, 12, -1)), valid.gather(1, order)
+
+    def _improved(self, problems: Tensor, losses: Tensor, poses: Tensor) -> tuple[Tensor, Tensor]:
+        """Improve the poses (P, 12, K) of some problems by least squares on their inliers, then the best again.
+
+        Each of the two steps counts only where it lowers the loss; an invalid pose stays invalid. Returns losses (P,)
+        and poses (P, 12).
+        """
+        number, pairs = problems.shape[0], self.low.shape[1]
+        problems, losses, poses = (full_vectors(x, pairs) for x in (problems, losses, poses))
+        scene = take(self.scene, problems)
+        for limit in _LIMITS:
+            owners = problems.repeat_interleave(poses.shape[2])
+            problem, thresholds, projection = self._projected(owners, poses.mT.flatten(0, 1))
+            wide = Thresholds(limit * thresholds.img, limit * thresholds.world)
+            pose, camera = least_squares(problem, projection, judge(projection, problem, wide).weights)
+            entries = as_entries(pose)
+            if camera.shape[1]:
+                entries = torch.cat((entries[:, :8], entries[:, 8:] * (-camera).exp()), 1)
+            new = entries.view_as(poses.mT).mT
+            new_losses = scene.losses(new, self.plan.score)
+            better = (new_losses < losses) & losses.isfinite()
+            losses, poses = torch.where(better, new_losses, losses), torch.where(better[:, None], new, poses)
+            losses, best = losses.min(1, keepdim=True)
+            poses = poses.gather(2, best[:, None].expand(-1, 12, -1))
+        return losses[:number, 0], poses[:number, :, 0]
+
+    def _improve(self, problems: Tensor, losses: Tensor, poses: Tensor) -> None:
+        """Improve poses; the best becomes the pose of its problem."""
+        if len(problems):
+            self.loss[problems], self.poses[problems] = self._improved(problems, losses, poses)
 
 
-def least_squares(problem: Problem, projection: Projection, weights: Tensor) -> State:
-    """Take one step of least squares with the weights (B, N) times the weights of the pairs."""
+def least_squares(problem: Problem, projection: Projection, weights: Tensor, variance: Tensor | None = None) -> State:
+    """Take one step of least squares with the weights (B, N) times the weights of the pairs.
+
+    What is known of the camera is weighed against residuals with the variance (B, 1) of a pixel coordinate. By default
+    the standard deviation is one pixel of the caller.
+    """
     weights = problem.weights * weights
     equations = normal_equations(projection, problem, weights)
-    for term in problem._replace(prior=None).terms:  # a residual of a pixel of the caller is a standard deviation
-        equations = equations._replace(unit=problem.img_scale.square().reciprocal()[:, None])
+    for term in problem._replace(prior=None).terms:
+        variance = problem.img_scale.square()[:, None] if variance is None else variance
+        equations = equations._replace(unit=variance.reciprocal())
         equations = add_term(equations, term.linearise(projection.state), projection.focal)
-    one, damping = weights.new_ones(()), weights.new_full((), _DAMPING)
-    return lm_step(equations, projection.state, projection.focal, one, damping)[0]
+    delta, _ = solve_positive(equations.matrix, equations.gradient, weights.new_full((), _DAMPING))
+    return moved(projection.state, delta / -projection.focal)
 
 
-def pack_pairs(problem: Problem) -> Tensor:
-    """The numbers of each pair side by side, (B, N, 6), in a rig (B, N, 18): pairs are selected at once."""
-    rig = [] if problem.rig is None else [problem.rig.rotation.flatten(2), problem.rig.translation]
-    return torch.cat((problem.world_points, problem.img_points, problem.weights[..., None], *rig), -1)
+def cauchy_scale(sq_residuals: Tensor, there: Tensor, fitted: int = MIN_PAIRS) -> tuple[Tensor, Tensor]:
+    """Squared scale of a Cauchy kernel, by the median squared residual of some pairs (B, N), and their number, (B, 1).
 
-
-def unpack_pairs(values: Tensor, problem: Problem, owners: Tensor) -> Problem:
-    """Undo :func:`pack_pairs`.
-
-    Args:
-        values: pairs of :math:`P` problems, shape :math:`(C, n, P)`.
-        problem: the problems they are from.
-        owners: which of these, shape :math:`(P,)`.
+    The argument ``fitted`` is the number of pairs that any state fits. Without any pair the scale is infinite.
     """
-    dtype = values.dtype
-    scales, free = take(((problem.img_scale, problem.world_scale), problem.free_focal), owners)
-    scales, free, focal = map_tensors(lambda x: x.to(dtype), (scales, free, problem.focal))
-    values = values.permute(2, 1, 0)
-    rig = Pose(values[..., 6:15].unflatten(-1, (3, 3)), values[..., 15:]) if values.shape[2] > 6 else None
-    weights = values[..., 5]
-    usual = torch.ones_like(weights)
-    return Problem(values[..., :3], values[..., 3:5], weights, focal, *scales, usual, rig=rig, free_focal=free)
+    count = there.sum(-1, keepdim=True)
+    middle = ((count + fitted) // 2).minimum(count - 1).clamp(min=0)
+    median = torch.where(there, sq_residuals, torch.inf).sort(-1).values.gather(1, middle)
+    return CAUCHY**2 / (2.0 * math.log(2.0)) * median, count  # the median is in variances of a pixel coordinate
 
 
 def full_vectors(rows: Tensor, pairs: int = 1) -> Tensor:
@@ -344,26 +358,7 @@ def full_vectors(rows: Tensor, pairs: int = 1) -> Tensor:
     Some arithmetic rounds differently in the remainder of the vectors. With full vectors a sample has the same poses at
     any place in the batch. Sums over many pairs may round differently: there, more rows would take more time.
     """
-    left_over = -len(rows) % _VECTOR if pairs <= _VECTOR else 0
+    if compiling() or pairs > _VECTOR:
+        return rows
+    left_over = -len(rows) % _VECTOR
     return torch.cat((rows, rows[:1].expand(left_over, *rows.shape[1:]))) if left_over else rows
-
-
-def _present_first(present: Tensor, number: Tensor) -> tuple[Tensor, Tensor]:
-    """Positions of what is present, (P, K) to (P, W), and which of them are no padding.
-
-    The width is as small as the largest number of a problem allows, and fills a processor's vectors.
-    """
-    width = max(1, -(-int(number.max()) // _VECTOR)) * _VECTOR
-    problem, at = present.nonzero(as_tuple=True)
-    rank = torch.arange(len(at), device=at.device) - (number.cumsum(0) - number)[problem]
-    positions = at.new_zeros(len(present), width)
-    positions[problem, rank] = at
-    return positions, torch.arange(width, device=at.device) < number[:, None]
-
-
-def _orthonormal(pose: Pose) -> Pose:
-    """The nearest rotation to a rotation with rounding errors, by two Newton steps for the polar factor."""
-    rotation = pose.rotation
-    for _ in range(2):
-        rotation = 1.5 * rotation - 0.5 * rotation @ (rotation.mT @ rotation)
-    return Pose(rotation, pose.translation)
