@@ -173,7 +173,7 @@ def _rotation_in_closed_form(matrix: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(unique, rotation, eye), unique
 
 
-def _turned(matrix: Tensor, rotation: Tensor, unique: Tensor, change: Tensor) -> Tensor:
+def _turned(change: Tensor, matrix: Tensor, rotation: Tensor, unique: Tensor) -> Tensor:
     """The change of the nearest rotation by a change of the matrix."""
     # With M = R S, a change dM turns the rotation by dR = R [w], where (tr S - S) w is the vector of Rᵀ dM - dMᵀ R.
     transposed = rotation.transpose(0, 1)
@@ -208,7 +208,7 @@ class _NearestRotation(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> Tensor:
         # The map from dM to dR is symmetric: it takes a gradient by R to the gradient by M.
-        return _turned(*ctx.saved_tensors, gradients[0])
+        return _turned(gradients[0], *ctx.saved_tensors)
 
 
 class _NearestRotationForward(_NearestRotation):
@@ -224,7 +224,7 @@ class _NearestRotationForward(_NearestRotation):
     @staticmethod
     def jvp(ctx: Any, change: Tensor) -> tuple[Tensor, None]:
         # A tangent must have the memory layout of its value.
-        return torch.zeros_like(ctx.saved_tensors[1]) + _turned(*ctx.saved_tensors, change), None
+        return torch.zeros_like(ctx.saved_tensors[1]) + _turned(change, *ctx.saved_tensors), None
 
 
 def nearest_rotation(matrix: Tensor) -> tuple[Tensor, Tensor]:
@@ -290,7 +290,7 @@ def span_a_plane(centred: Tensor, share: Tensor, size: Tensor) -> Tensor:
     Args:
         centred: the points minus their mean, 0 for padding, (3, N, B).
         share: one over the number of points, (B,).
-        size: the largest coordinate before the points were centred, (B,). Where it is 0 or NaN the result is false.
+        size: the largest coordinate of the points before they were centred, (B,). With 0 or NaN the result is false.
     """
     # The second largest variance is about the sum of the principal minors of the covariance, (trace² - sum of squares)
     # / 2, over the trace. For points on a line only rounding remains.
@@ -305,8 +305,8 @@ def solve_leading(
 ) -> list[list[Tensor]]:
     """Solve the leading blocks of symmetric systems by one LDLᵀ factorisation, entry by entry.
 
-    A small multiple of the diagonal is added to each pivot. A singular system whose right side lies in the range of
-    the matrix therefore has a finite solution.
+    Each pivot grows by a small multiple of the diagonal. A singular system whose right side lies in the range of the
+    matrix therefore has a finite solution.
 
     Args:
         matrix: rows of the positive semi-definite matrices; entries above the diagonal are not read.
@@ -380,8 +380,8 @@ def solve_positive(matrix: Tensor, right: Tensor, damping: Tensor) -> tuple[Tens
         damping: :math:`\lambda \ge 0`, a scalar or :math:`(B,)`.
 
     Returns:
-        The solutions, shape :math:`(K, B)`, and whether there is a solution, bool :math:`(B,)`: whether all pivots are
-        above rounding, in any units. Without a solution it is 0, and gradients are finite.
+        The solutions, shape :math:`(K, B)`, and whether all pivots are above rounding, in any units, bool :math:`(B,)`.
+        Where they are not the solution is 0, with finite gradients.
 
     Example:
         >>> matrix, right = torch.tensor([[4.0, 0.0], [0.0, 4.0]])[..., None], torch.tensor([[8.0], [4.0]])

