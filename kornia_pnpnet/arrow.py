@@ -91,12 +91,7 @@ class Solve:
         self.intrinsics = intrinsics
 
     def __call__(self, table: pa.Table) -> pa.Table:
-        """Solve the problems of a table, see the class.
-
-        Raises:
-            ValueCheckError: when a column is missing.
-            TypeCheckError: when a column holds no numbers.
-        """
+        """Solve the problems of a table. ``ValueCheckError``: a column is missing; ``TypeCheckError``: no numbers."""
         for name in INPUTS[: 3 if self.intrinsics is None else 2]:
             if name not in table.column_names:
                 raise ValueCheckError(f"no {name}")
@@ -173,8 +168,8 @@ class _Cells:
 def _groups(counts: np.ndarray, fits: np.ndarray, most: int) -> Iterator[tuple[np.ndarray, int]]:
     """Rows that are solved in one call, and the number of pairs to which they are padded.
 
-    This number depends on the row alone, so that the result does, too: below 16 pairs there is no padding, with more
-    the number is the next of 16, 20, 24, 28, 32, 40, 48, ..., at most a quarter more.
+    The padding depends on the row alone, so that the result does, too: none below 16 pairs; otherwise to the next of
+    16, 20, 24, 28, 32, 40, 48, ..., at most a quarter more.
     """
     step = 2 ** (np.log2(counts.clip(_PADDED_FROM)).astype(int) - 2)
     widths = np.where(counts < _PADDED_FROM, counts, -(-counts // step) * step)

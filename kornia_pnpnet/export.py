@@ -13,10 +13,9 @@ from kornia.core.exceptions import ValueCheckError
 from torch import Tensor, nn
 
 from kornia_pnpnet.core.checks import check_shapes, check_whole
-from kornia_pnpnet.core.compilation import package_options
 from kornia_pnpnet.core.files import atomic_open
-from kornia_pnpnet.core.inlining import INLINE
-from kornia_pnpnet.data import CameraProblems, SyntheticProblems
+from kornia_pnpnet.core.performance import INLINE, package_options
+from kornia_pnpnet.data import CameraProblems
 from kornia_pnpnet.propose.initialiser import trait
 from kornia_pnpnet.result import Pose
 from kornia_pnpnet.solver import PnPNet
@@ -54,16 +53,7 @@ class ExportedResult(NamedTuple):
 
 
 class ExportedCamera(NamedTuple):
-    """An :class:`ExportedResult` of a solver that estimates the focal length.
-
-    Attributes:
-        rotation: see ExportedResult.
-        translation: see ExportedResult.
-        pair_weights: see ExportedResult.
-        cost: see ExportedResult.
-        ok: see ExportedResult.
-        camera: the result's ``intrinsics``, shape :math:`(B, 3, 3)`.
-    """
+    """An :class:`ExportedResult` and ``camera``: the result's ``intrinsics``, shape :math:`(B, 3, 3)`."""
 
     rotation: Tensor
     translation: Tensor
@@ -141,18 +131,13 @@ def export_program(
         )
     if rig and (solver.focal == "unknown" or solver.init is None):
         raise ValueCheckError("For rigs a solver needs an initialiser and known focal lengths.")
-    if n is not None:
-        check_whole(3, n=n)
-    if batch is not None:
-        check_whole(1, _MAX_BATCH, batch=batch)
+    check_whole(3, n=3 if n is None else n)
+    check_whole(1, _MAX_BATCH, batch=1 if batch is None else batch)
     fixed = _fixed_n(solver, n)
     if n not in (None, fixed):
         raise ValueCheckError(f"The solver's network was built for n = {fixed}, got n = {n!r}.")
     pairs, count = fixed or 12, int(batch or 3)
-    if rig:
-        problems = CameraProblems(n=pairs, batch_size=count, cameras=3).batch(0)
-    else:
-        problems = SyntheticProblems(n=pairs, batch_size=count).batch(0)
+    problems = CameraProblems(n=pairs, batch_size=count, cameras=3 if rig else 1).batch(0)
     inputs = (*problems[:3], torch.ones_like(problems.world_points[..., 0]), *(problems.cam_from_rig or ()))
     sizes: dict[int, Any] = {} if batch is not None else {0: torch.export.Dim("batch", min=1, max=_MAX_BATCH)}
     points = sizes if fixed is not None else {**sizes, 1: torch.export.Dim("pairs", min=4, max=_MAX_N)}
@@ -162,16 +147,17 @@ def export_program(
             warnings.simplefilter("ignore", FutureWarning)  # the exporter warns about its own code
             return torch.export.export(_Graph(copy.deepcopy(solver).float().eval()), inputs, dynamic_shapes=shapes)
     except Exception as error:
-        reason = " ".join(str(error).split())[:300]
-        raise ValueCheckError(f"{type(solver.init).__name__} cannot be exported: {reason}") from error
+        raise ValueCheckError(f"{type(solver.init).__name__} cannot be exported: {_reason(error)}") from error
 
 
 def _fixed_n(solver: PnPNet, n: int | None) -> int | None:
     """The number of pairs of a program; ``None``: any."""
-    if solver.init is None or not trait(solver.init, "fixed_pairs"):
-        return n
-    config: Any = solver.init.config
-    return int(config["n"])
+    config: Any = getattr(solver.init, "config", {})
+    return int(config["n"]) if trait(solver.init, "fixed_pairs") else n
+
+
+def _reason(error: Exception) -> str:
+    return " ".join(str(error).split())[:300]
 
 
 def export_package(
@@ -184,19 +170,19 @@ def export_package(
     of PyTorch that made it. Compiling takes minutes and needs a C++ compiler and PyTorch 2.6 or later.
 
     Args:
-        solver: see :func:`export_program`.
+        solver: See export_program.
         path: the file to write, ``.pt2``. An existing file is replaced when the package is complete.
-        n: see :func:`export_program`.
-        batch: see :func:`export_program`. With 1 and a fixed number of correspondences, a problem takes a fraction of
-            the time. Load such a package with :func:`load_package`: with PyTorch's own loader, each call overwrites the
+        n: See export_program.
+        batch: See export_program. With 1 and a fixed number of correspondences, a problem takes a fraction of the
+            time. Load such a package with :func:`load_package`: with PyTorch's own loader, each call overwrites the
             result of the previous call on the same thread.
-        rig: see :func:`export_program`.
+        rig: See export_program.
 
     Returns:
         The path.
 
     Raises:
-        BaseError: see :func:`export_program`; or when the name does not end in ``.pt2``.
+        BaseError: See export_program; or when the name does not end in ``.pt2``.
         ImportError: without a C++ compiler.
     """
     path = Path(path)
@@ -219,9 +205,8 @@ def export_package(
     options = {**package_options(pairs, on_stack=inline), "aot_inductor.metadata": metadata}
     content = io.BytesIO()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of the compiler about itself
-        if inline:
-            program = program.run_decompositions(INLINE)
+        warnings.simplefilter("ignore")  # warnings of the compiler about itself
+        program = program.run_decompositions(INLINE) if inline else program
         torch._inductor.aoti_compile_and_package(program, package_path=content, inductor_configs=options)
     with atomic_open(path, "wb") as file:
         file.write(content.getbuffer())
@@ -229,9 +214,9 @@ def export_package(
 
 
 class PackagedSolver:
-    r"""A solver that :func:`export_package` compiled. Results have no gradients.
+    """A solver that :func:`export_package` compiled. Results have no gradients.
 
-    Calls compute in float32 on the CPU. Inputs of any dtype, device and memory layout are converted.
+    Calls compute in float32 on the CPU and convert inputs of any dtype, device and memory layout.
 
     Attributes:
         batch: number of problems of each call; ``None``: any number.
@@ -254,10 +239,7 @@ class PackagedSolver:
         *,
         cam_from_rig: Pose | None = None,
     ) -> ExportedResult | ExportedCamera:
-        """Solve a batch of problems.
-
-        For the arguments see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`. A package for rigs needs
-        ``cam_from_rig`` and a camera for each pair or for all; others do not take it.
+        """Solve a batch of problems. See PnPNet.forward; only a package for rigs takes, and needs, ``cam_from_rig``.
 
         Raises:
             ShapeError: for other shapes; compiled code would read beyond the end of a tensor.
@@ -267,11 +249,9 @@ class PackagedSolver:
             raise ValueCheckError(f"This package {'needs' if self.rig else 'does not take'} cam_from_rig.")
         batch, n = (*world_points.shape, 0, 0)[:2]
         batch, n = self.batch or batch, self.n or max(n, 4)
-        if weights is None:
-            weights = torch.ones(batch, n)
+        weights = torch.ones(batch, n) if weights is None else weights
         cameras = (batch, n, 3, 3) if self.rig else (batch, 3, 3)
-        if intrinsics.ndim == 2:
-            intrinsics = intrinsics.expand(cameras)
+        intrinsics = intrinsics.expand(cameras) if intrinsics.ndim == 2 else intrinsics
         shapes = (batch, n, 3), (batch, n, 2), cameras, (batch, n), (batch, n, 3, 3), (batch, n, 3)
         inputs = world_points, img_points, intrinsics, weights, *(cam_from_rig or ())
         check_shapes(dict(zip(RIG_INPUTS, zip(inputs, shapes, strict=False), strict=False)))
@@ -295,8 +275,8 @@ def load_package(path: str | Path) -> PackagedSolver:
         # parses the signature in each call.
         return PackagedSolver(torch._C._aoti.AOTIModelPackageLoader(str(path), "model", False, 1, -1))
     except (RuntimeError, KeyError, ValueError) as error:
-        reason = " ".join(str(error).split())[:300]
-        raise ValueCheckError(f"'{path}' is not a solver of export_package for this machine: {reason}") from error
+        message = f"'{path}' is not a solver of export_package for this machine: {_reason(error)}"
+        raise ValueCheckError(message) from error
 
 
 def export_onnx(
@@ -320,11 +300,10 @@ def export_onnx(
     path = Path(path)
     program = export_program(solver, n, batch=batch, rig=rig)
     inputs, outputs = RIG_INPUTS if rig else INPUTS, OUTPUTS if solver.focal == "known" else ExportedCamera._fields
+    names: dict[str, Any] = {"input_names": [*inputs], "output_names": [*outputs]}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # the exporter warns about its own code
-        model = torch.onnx.export(
-            program, dynamo=True, verbose=False, optimize=False, input_names=[*inputs], output_names=[*outputs]
-        )
+        model = torch.onnx.export(program, dynamo=True, verbose=False, optimize=False, **names)
     assert model is not None
     _simplify(model.model)
     graph = model.model_proto
@@ -340,8 +319,7 @@ def export_onnx(
 def _simplify(model: Any) -> None:
     """Simplify as ``torch.onnx.export(optimize=True)`` does, but without its rewrite rules.
 
-    The time of the rules grows with the square of the size. For the thousands of nodes of a solver they take nine
-    tenths of all time, and take a twentieth of the nodes away.
+    For the thousands of nodes of a solver the rules take nine tenths of the time and remove a twentieth of the nodes.
     """
     from onnx_ir.passes import Sequential, common
     from onnxscript import optimizer

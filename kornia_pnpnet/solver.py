@@ -12,9 +12,8 @@ from torch import Tensor, nn
 
 from kornia_pnpnet.arguments import Inputs, checked_inputs, given_cameras, joined, restore_leading, split_batch
 from kornia_pnpnet.core.checks import check_positive, check_whole
-from kornia_pnpnet.core.compilation import Runner
 from kornia_pnpnet.core.linalg import bound_gradient, gate
-from kornia_pnpnet.core.performance import in_full_precision, sees_values
+from kornia_pnpnet.core.performance import Runner, in_full_precision, sees_values
 from kornia_pnpnet.core.trees import map_tensors, put, take
 from kornia_pnpnet.frame import Frame, Normalize
 from kornia_pnpnet.judge.belief import LEAST_PROBABILITY

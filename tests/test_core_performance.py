@@ -8,12 +8,12 @@ import warnings
 
 import pytest
 import torch
+from torch import nn
 from torch._dynamo.testing import CompileCounter
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from kornia_pnpnet import MLPInit, PnPNet, Pose, RobustWeightedLM, create_solver
-from kornia_pnpnet.core.compilation import Compiled
-from kornia_pnpnet.core.performance import ascending_order, in_order, ranked
+from kornia_pnpnet.core.performance import INLINE, Compiled, ascending_order, in_order, ranked
 from kornia_pnpnet.core.trees import iter_tensors
 from kornia_pnpnet.data import CameraProblems, OutlierMix, SyntheticProblems
 from kornia_pnpnet.result import PnPResult
@@ -127,31 +127,21 @@ def test_rigs_are_graphs(whole, backend):
     assert not whole or backend.frame_count == 1
 
 
-def fails_in_the_backend(function):
-    def broken(graph, inputs):
-        raise RuntimeError("no compiler here")
+def raises(error):
+    def function(*args, **options):
+        raise error
 
-    return torch_compile(function, fullgraph=True, backend=broken)
-
-
-def fails_in_dynamo(function):
-    """As Dynamo 2.11 does with our code."""
-
-    def compiled(*args):
-        raise AssertionError("no compiler here")
-
-    return compiled
+    return function
 
 
-torch_compile = torch.compile
+OLD = raises(TypeError("compile() got an unexpected keyword argument"))  # PyTorch before 2.13
 
 
-@pytest.mark.parametrize("broken", [fails_in_the_backend, fails_in_dynamo])
-def test_without_a_compiler_it_runs_as_it_is(broken, monkeypatch):
-    torch.compiler.reset()
-    monkeypatch.setattr(torch, "compile", lambda function, **options: broken(function))
+@pytest.mark.parametrize("compile_", [OLD, lambda function, **options: raises(RuntimeError("no compiler got here"))])
+def test_without_a_compiler_it_runs_as_it_is(compile_, monkeypatch):
+    monkeypatch.setattr(torch, "compile", compile_)
     twice = Compiled(lambda x: 2 * x)
-    with pytest.warns(RuntimeWarning, match="no compiler here") as caught:
+    with pytest.warns(RuntimeWarning, match="Not compiled, running uncompiled.* got ") as caught:
         assert torch.equal(twice(torch.ones(3)), 2 * torch.ones(3))
     assert len(caught) == 1
     with warnings.catch_warnings():
@@ -160,10 +150,7 @@ def test_without_a_compiler_it_runs_as_it_is(broken, monkeypatch):
 
 
 def test_too_little_memory_is_no_failure_of_the_compiler(monkeypatch):
-    def full(*args):
-        raise torch.cuda.OutOfMemoryError("too large")
-
-    monkeypatch.setattr(torch, "compile", lambda function, **options: full)
+    monkeypatch.setattr(torch, "compile", lambda function, **options: raises(torch.cuda.OutOfMemoryError("too large")))
     twice = Compiled(lambda x: 2 * x)
     with pytest.raises(torch.cuda.OutOfMemoryError):
         twice(torch.ones(3))
@@ -187,12 +174,12 @@ def test_errors_of_the_caller_are_the_callers(backend):
     assert not twice.failed
 
 
-class Scaled(torch.nn.Module):
+class Scaled(nn.Module):
     """Compiled as a solver is: a method of its own, which reads its own weights."""
 
     def __init__(self):
         super().__init__()
-        self.scale = torch.nn.Parameter(torch.ones(1))
+        self.scale = nn.Parameter(torch.ones(1))
         self.run = Compiled(self.forward)
 
     def forward(self, x):
@@ -300,3 +287,54 @@ def test_ties_of_the_first_key_are_ordered_by_the_second_and_equal_pairs_stay(co
     expected = [sorted(range(count), key=lambda i, pairs=pairs: pairs[i]) for pairs in keys.permute(2, 1, 0).tolist()]
     for order in (ascending_order, Compiled(ascending_order)):
         assert order(keys).tolist() == expected
+
+
+# --- operations as elementwise operations, in packages of one problem -------------------------------------------------
+
+of_the_exporter = pytest.mark.filterwarnings("ignore::FutureWarning")  # about its own code
+
+
+def kernels(program):
+    return {node.target for node in program.graph.nodes if node.op == "call_function"} & set(INLINE)
+
+
+def export(function, *inputs):
+    module = nn.Module()
+    module.forward = lambda *x: function(*x)  # noqa: PLW0108 - built-in functions have no signature
+    return torch.export.export(module, inputs)
+
+
+A, B = torch.linspace(-1.0, 2.0, 24).sin().view(2, 3, 4), torch.linspace(-3.0, 1.0, 40).cos().view(2, 4, 5)
+TIES = torch.tensor([[3.0, 1.0, 1.0, -2.0, 3.0, 0.0], [0.0, -0.0, torch.inf, -torch.inf, 5.0, 5.0]])
+
+
+@of_the_exporter
+@pytest.mark.parametrize(
+    ("function", "inputs"),
+    [
+        (torch.matmul, (A, B[0])),
+        (torch.mm, (A[0], B[0])),
+        (torch.bmm, (A, B)),
+        (lambda bias, a, b: torch.addmm(bias, a, b, beta=0.5, alpha=2.0), (B[0, :1], A[0], B[0])),
+        (nn.functional.linear, (A, B[0].T, B[0, 0])),
+        (nn.functional.linear, (A, B[0].T)),
+        (lambda x: (x > 0).cumsum(-1), (A,)),
+        (lambda x: x.cumsum(0, dtype=torch.float64), (A,)),
+        (lambda x: x.sort(stable=True), (TIES,)),
+        (lambda x: x.sort(dim=0, descending=True, stable=True), (TIES,)),
+        (lambda x: x.topk(3, 1), (A.mT,)),
+        (lambda x: x.topk(2, 1, largest=False), (A,)),
+    ],
+)
+def test_operations_that_are_inlined_give_the_same_results(function, inputs):
+    program = export(function, *inputs)
+    inlined = program.run_decompositions(INLINE)
+    assert not kernels(inlined)
+    expected, found = program.module()(*inputs), inlined.module()(*inputs)
+    torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-6)
+
+
+@of_the_exporter
+def test_long_sorts_stay_calls():
+    program = export(lambda x: x.sort(stable=True).indices, torch.randn(2, 1000))
+    assert kernels(program.run_decompositions(INLINE)) == kernels(program) != set()

@@ -73,14 +73,6 @@ def test_programs(name, n, counts, make_problems):
             near(program.module()(*inputs), solver, inputs)
 
 
-@pytest.mark.slow
-def test_programs_of_rigs():
-    solver = create_solver("pnpnet-set")
-    program = export_program(solver, rig=True)
-    for n, batch in ((4, 3), (12, 1), (12, 50), (70, 10)):
-        near(program.module()(*rigs(n, batch)), solver, rigs(n, batch))
-
-
 def run_onnx(path, inputs):
     runtime = pytest.importorskip("onnxruntime")
     session = runtime.InferenceSession(path, providers=["CPUExecutionProvider"])
@@ -111,14 +103,6 @@ def test_onnx(name, fixed, sizes, make_problems, tmp_path):
         near(found, solver, inputs)
         assert all(np.isfinite(x).all() for x in found[:4])
         assert not found[4][3:4].any()
-
-
-@pytest.mark.slow
-def test_onnx_of_rigs(tmp_path):
-    solver = PnPNet(SetInit(), RobustWeightedLM(2))
-    path = export_onnx(solver, tmp_path / "model.onnx", rig=True)
-    for n, batch in ((5, 3), (12, 1), (12, 50), (70, 10)):
-        near(run_onnx(path, rigs(n, batch)), solver, rigs(n, batch))
 
 
 @pytest.mark.slow
@@ -199,12 +183,20 @@ def test_packages(n, batch, sizes, make_problems, tmp_path):
 
 
 @pytest.mark.slow
-def test_packages_of_rigs(tmp_path):
-    solver = PnPNet(SetInit(), RobustWeightedLM(1))
-    package = load_package(packaged(tmp_path, solver, 12, rig=True))
-    for batch in (1, 50):
-        inputs = rigs(12, batch)
-        near(package(*inputs[:4], cam_from_rig=Pose(*inputs[4:])), solver, inputs)
+@pytest.mark.parametrize("kind", ["program", "onnx", "package"])
+def test_rigs(kind, tmp_path):
+    solver = PnPNet(SetInit(), RobustWeightedLM(2))
+    sizes = ((5, 3), (12, 1), (12, 50), (70, 10))
+    if kind == "program":
+        run = export_program(solver, rig=True).module()
+    elif kind == "onnx":
+        path = export_onnx(solver, tmp_path / "model.onnx", rig=True)
+        run = lambda *inputs: run_onnx(path, inputs)  # noqa: E731
+    else:
+        package, sizes = load_package(packaged(tmp_path, solver, 12, rig=True)), ((12, 1), (12, 50))
+        run = lambda *inputs: package(*inputs[:4], cam_from_rig=Pose(*inputs[4:]))  # noqa: E731
+    for size in sizes:
+        near(run(*rigs(*size)), solver, rigs(*size))
 
 
 @pytest.mark.slow

@@ -29,21 +29,12 @@ def vectors(angle, dtype=torch.float64):
     return (angle * axis / axis.norm(dim=-1, keepdim=True)).to(dtype)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("angle", ANGLES)
-def test_axis_angle_gives_rotations(angle, dtype):
-    rotation = axis_angle_to_rotation_matrix(vectors(angle, dtype))
-    eye = torch.eye(3, dtype=dtype).expand(50, 3, 3)
-    torch.testing.assert_close(rotation @ rotation.mT, eye, rtol=0, atol=20 * torch.finfo(dtype).eps)
-    torch.testing.assert_close(torch.linalg.det(rotation), torch.ones(50, dtype=dtype))
-    cosine = 0.5 * (rotation.diagonal(dim1=-2, dim2=-1).sum(-1) - 1)
-    torch.testing.assert_close(cosine, torch.full((50,), math.cos(angle), dtype=dtype))
-
-
 def test_axis_angle_is_the_matrix_exponential_and_its_derivative_at_the_identity():
     for angle in ANGLES:
         exponential = torch.linalg.matrix_exp(So3.hat(vectors(angle)))
         torch.testing.assert_close(axis_angle_to_rotation_matrix(vectors(angle)), exponential, rtol=0, atol=1e-13)
+        rotation = axis_angle_to_rotation_matrix(vectors(angle, torch.float32))
+        torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3).expand(50, 3, 3), rtol=0, atol=2e-6)
     jacobian = torch.func.jacrev(axis_angle_to_rotation_matrix)(torch.zeros(3, dtype=torch.float64))
     generators = So3.hat(torch.eye(3, dtype=torch.float64))
     torch.testing.assert_close(So3.vee(generators), torch.eye(3, dtype=torch.float64))

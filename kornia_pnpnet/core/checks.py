@@ -73,11 +73,9 @@ def check_shapes(shapes: Shapes, like: Tensor | None = None) -> None:
     for name, (tensor, expected) in shapes.items():
         if tensor is not None and tensor.shape != expected:
             beside = "" if like is None else f" to go with world_points of {tuple(like.shape)}"
-            raise ShapeError(
-                f"{name} must have the shape {expected}{beside}, got {tuple(tensor.shape)}.",
-                actual_shape=tuple(tensor.shape),
-                expected_shape=expected,
-            )
+            got = tuple(tensor.shape)
+            message = f"{name} must have the shape {expected}{beside}, got {got}."
+            raise ShapeError(message, actual_shape=got, expected_shape=expected)
 
 
 def check_like(tensors: Mapping[str, Tensor | None], like: Tensor, like_name: str = "world_points") -> None:
@@ -123,10 +121,7 @@ def expand_sigma(name: str, sigma: Tensor | float | None, world_points: Tensor) 
         raise TypeCheckError(f"{name} must be a number or a tensor, got {type(sigma).__name__}.")
     check_devices({name: sigma}, world_points)
     if sigma.shape not in ((), pairs[:-1], pairs):
-        raise ShapeError(
-            f"{name} must be a number or have the shape {tuple(pairs[:-1])} or {tuple(pairs)}, "
-            f"got {tuple(sigma.shape)}.",
-            actual_shape=tuple(sigma.shape),
-            expected_shape=["*", "N"],
-        )
+        expected = f"be a number or have the shape {tuple(pairs[:-1])} or {tuple(pairs)}"
+        got = tuple(sigma.shape)
+        raise ShapeError(f"{name} must {expected}, got {got}.", actual_shape=got, expected_shape=["*", "N"])
     return (sigma if sigma.shape == pairs else sigma[..., None]).expand(pairs).to(world_points.dtype)

@@ -10,10 +10,9 @@ from kornia.core.exceptions import ValueCheckError
 from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_whole
-from kornia_pnpnet.core.compilation import EAGER, Runner, per_problem
 from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.linalg import relative, solve_positive
-from kornia_pnpnet.core.performance import problems_last, repeat_problems, sees_values
+from kornia_pnpnet.core.performance import EAGER, Runner, per_problem, problems_last, repeat_problems, sees_values
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.judge.belief import believe, explains, has_enough, has_focal, residual_noise
 from kornia_pnpnet.problem import Noise, Problem, Starts, State
