@@ -56,7 +56,7 @@ _ENTRIES: dict[str, tuple[bool, tuple[int, ...]]] = {
 
 
 class Inputs(NamedTuple):
-    """The arguments of a call as one batch in one dtype. ``noise`` has sigmas for every pair, NaN where unknown.
+    """The arguments of a call as one batch in one dtype. ``noise`` is ``None``, or has sigmas for every pair.
 
     In a rig, ``intrinsics`` has a camera matrix for each pair, (B, N, 3, 3), and ``rig`` has the transform from the rig
     to the camera of each pair. When a solver estimates the focal length, ``free_focal`` is the range and the prior of
@@ -226,7 +226,7 @@ def with_undistorted(inputs: Inputs, dist: Tensor | None, fisheye: Tensor | None
     refuses its problem.
     """
     broken = ~inputs.img_points.isfinite().all(-1)
-    # Invalid cameras are replaced by the identity here, for finite gradients; `Normalize` refuses their problems later.
+    # The identity replaces invalid cameras here, for finite gradients. `Normalize` refuses their problems later.
     diagonal = inputs.intrinsics.diagonal(dim1=-2, dim2=-1)
     usable = inputs.intrinsics.isfinite().flatten(-2).all(-1) & (diagonal / diagonal[..., 2:] > 0).all(-1)
     camera = torch.where(usable[..., None, None], inputs.intrinsics, torch.eye(3).to(diagonal))
@@ -240,7 +240,7 @@ def _looking_along(inputs: Inputs) -> Inputs:
     """Convert bearings to a rig: each pair gets a camera whose optical axis is the bearing of the pair."""
     rotation, sound = bearing_cameras(inputs.img_points)
     axis = torch.where(sound[..., None], torch.zeros_like(inputs.img_points[..., :2]), torch.nan)
-    # Sigmas in pixels become radians by the geometric mean of fx and fy. Skew and principal point are ignored.
+    # The geometric mean of fx and fy converts sigmas from pixels to radians. Skew and principal point are ignored.
     cameras, has_focal = pinholes(inputs.intrinsics.diagonal(dim1=-2, dim2=-1).diag_embed())
     focal = torch.where(has_focal, (cameras[..., 0, 0] * cameras[..., 1, 1]).sqrt(), 0.0)
     cameras = torch.stack((focal, focal, torch.ones_like(focal)), -1).diag_embed()
@@ -251,7 +251,7 @@ def _looking_along(inputs: Inputs) -> Inputs:
 
 
 def one_batch(x: Tensor, size: torch.Size, dtype: torch.dtype) -> Tensor:
-    """Reshape the leading dimensions ``size`` of a tensor to one, and convert any but bool tensors to ``dtype``."""
+    """Reshape the leading dimensions ``size`` to one batch dimension, and convert all but bool tensors to ``dtype``."""
     x = x if x.dtype in (dtype, torch.bool) else x.to(dtype)
     return x if len(size) == 1 else x.reshape((size.numel(), *x.shape[len(size) :]))
 

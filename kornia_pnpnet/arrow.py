@@ -78,7 +78,7 @@ class Solve:
         ([7, 8], [True, True])
     """
 
-    #: Approximate largest number of pairs, padding included, in one call of the solver. It bounds the memory of a call.
+    #: Approximate largest number of pairs, padding included, in one call of the solver, a limit of its memory.
     pairs_at_once = 2**17
 
     def __init__(
@@ -140,7 +140,7 @@ def list_column(values: np.ndarray) -> pa.Array:
 
 
 class _Cells:
-    """The numbers of a column of lists, those of all rows in ``values``: row i has ``sizes[i]`` from ``starts[i]`` on.
+    """The numbers of a column of lists. Row i has ``sizes[i]`` numbers in ``values``, from ``starts[i]`` on.
 
     A missing number is NaN. A missing list has the size 0.
     """
@@ -174,7 +174,7 @@ def _groups(counts: np.ndarray, fits: np.ndarray, most: int) -> Iterator[tuple[n
     """Yield the rows of each call of the solver, and the number of pairs to which the rows are padded.
 
     Rows with fewer than 16 pairs are not padded. Other rows are padded to the next of 16, 20, 24, 28, 32, 40, 48, ...,
-    at most a quarter more pairs. The padding of a row does not depend on other rows; otherwise its result would.
+    at most a quarter more pairs. The padding of a row, and so its result, does not depend on other rows.
     """
     step = 2 ** (np.log2(counts.clip(_PADDED_FROM)).astype(int) - 2)
     widths = np.where(counts < _PADDED_FROM, counts, -(-counts // step) * step)

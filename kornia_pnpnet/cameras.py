@@ -32,9 +32,9 @@ def undistort(
     r"""Replace pixels of a camera with distortion by pixels of the pinhole camera with the same intrinsics.
 
     Newton's method inverts the distortion, and the implicit function theorem gives the gradient of the inverse.
-    :func:`kornia.geometry.calibration.undistort_points` is not used, because it is a fixed-point iteration without a
-    test of convergence. For ``k1 = -0.2`` its result after 5 steps is 1.4 px off at 45 degrees from the axis (focal
-    length 320 px). Beyond the turning point of the distortion polynomial it returns pixels that do not exist.
+    :func:`kornia.geometry.calibration.undistort_points` is not used: its fixed-point iteration has no test of
+    convergence. For ``k1 = -0.2`` the result of its 5 steps is 1.4 px off at 45 degrees from the axis (focal length
+    320 px). Kornia also returns pixels beyond the turning point of the distortion polynomial, where no pixels exist.
 
     Args:
         img_points: shape :math:`(B, N, 2)`.
@@ -73,7 +73,9 @@ def undistort(
 def bearings(
     img_points: Tensor, intrinsics: Tensor, dist: Tensor | None = None, fisheye: Tensor | None = None
 ) -> Tensor:
-    r"""Convert pixels to bearings, which may be more than 90 degrees off the axis of a fisheye.
+    r"""Convert pixels to bearings, the directions of their rays in the camera's frame.
+
+    Bearings of a fisheye may be more than 90 degrees off the optical axis.
 
     Args:
         img_points: shape :math:`(B, N, 2)`.

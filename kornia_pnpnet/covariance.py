@@ -66,10 +66,10 @@ def pose_covariance(
         weights: weight of each pair, 0 for outliers, shape :math:`(B, N)`, such as the ``weights`` of a result. The
             weights of ``p3p-ransac`` with a ``world_threshold`` also depend on the depth; pass
             ``(result.weights > 0).double()`` instead. ``None``: 1 for every pair.
-        prior: the prior of the solver's call. Its information is added to that of the pairs.
+        prior: the prior of the solver's call. Its information is added to the information of the pairs.
         focal: ``"known"``; or ``"unknown"`` if the solver estimated the focal length. ``intrinsics`` must then be the
             ``intrinsics`` of the result.
-        focal_sigma: ``focal_sigma`` of the solver. Its information is added to that of the pairs.
+        focal_sigma: ``focal_sigma`` of the solver. Its information is added to the information of the pairs.
 
     Returns:
         Shape :math:`(B, 6, 6)` in radians and the unit of the world, in the dtype of a solver's result. With an unknown

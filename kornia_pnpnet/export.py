@@ -105,7 +105,7 @@ def export_program(
         rig: whether to export the solver for rigs (several cameras with one pose).
 
     Returns:
-        A program that maps :data:`INPUTS` to the fields of :class:`ExportedResult`, or to those of
+        A program that maps :data:`INPUTS` to the fields of :class:`ExportedResult`, or of
         :class:`ExportedCamera` if the focal length is unknown. The inputs are world points :math:`(B, N, 3)`, pixels
         :math:`(B, N, 2)`, camera matrices :math:`(B, 3, 3)` and weights :math:`(B, N)`, 0 for padding. A program for
         rigs takes :data:`RIG_INPUTS`: camera matrices have the shape :math:`(B, N, 3, 3)`, and the last two inputs are
@@ -168,9 +168,9 @@ def export_package(
     """Compile a solver ahead of time with AOTInductor.
 
     :func:`load_package` loads the package without tracing or compiling. C++ programs load the package with libtorch
-    alone. A package runs on one thread. It needs a CPU with the instruction sets (AVX2, AVX-512) of the CPU that
-    compiled the package, and the same version of PyTorch. Compiling takes minutes and needs a C++ compiler and PyTorch
-    2.6 or later.
+    alone. A package runs on one thread. The CPU must have the instruction sets (AVX2, AVX-512) of the CPU that
+    compiled the package, and the version of PyTorch must be the same. Compiling takes minutes and needs a C++ compiler
+    and PyTorch 2.6 or later.
 
     Args:
         solver: See export_program.
@@ -243,7 +243,7 @@ class PackagedSolver:
         *,
         cam_from_rig: Pose | None = None,
     ) -> ExportedResult | ExportedCamera:
-        """Solve a batch of problems. See PnPNet.forward; ``cam_from_rig`` is for packages for rigs, which require it.
+        """Solve a batch of problems. See PnPNet.forward. A package for rigs requires ``cam_from_rig``.
 
         Raises:
             ShapeError: when a shape is not that of the package: compiled code would read beyond the end of a tensor.

@@ -48,7 +48,7 @@ class Frame(NamedTuple):
         order: position in the input of each normalised pair, int64, shape :math:`(B, N)`; ``None``: unchanged.
         status: ``Status.SOLVED`` for a valid problem, else why the problem is invalid, int64, shape :math:`(B,)`.
         intrinsics: the camera matrices with a last entry of 1, shape :math:`(B, 3, 3)`, in a rig
-            :math:`(B, N, 3, 3)`. A matrix that is not that of a pinhole camera becomes the identity.
+            :math:`(B, N, 3, 3)`. The identity replaces matrices that are no pinhole cameras.
     """
 
     centroid: Tensor
@@ -82,7 +82,7 @@ class Frame(NamedTuple):
         return values if self.order is None else torch.zeros_like(values).scatter(1, self.order, values)
 
     def undo_starts(self, starts: Starts) -> Starts:
-        """Express starts in the caller's frame, order and units. Their ``ok`` becomes :attr:`valid`."""
+        """Express starts in the caller's frame, order and units. The new ``ok`` is :attr:`valid`."""
         noise = starts.noise
         if noise is not None:
             noise = Noise(noise.img / self.img_scale[:, None], noise.world / self.scale[:, None])
@@ -227,7 +227,7 @@ class Normalize(Configured):
         number = there.sum(0)
         far = torch.where(number < _MANY, _FAR_OF_FEW**2, _FAR**2) * typical
         seen = there & (tangent <= _FAR_ANGLE)
-        usual = (seen | (there & (seen.sum(0) <= MIN_PAIRS))) & (sq_distance <= far)  # few pairs: wide angles count
+        usual = (seen | (there & (seen.sum(0) <= MIN_PAIRS))) & (sq_distance <= far)  # of few pairs, wide angles count
         is_usual, is_there = usual.to(rows.dtype), there.to(rows.dtype)
 
         # Centre and scale by the usual pairs.

@@ -69,11 +69,11 @@ def monte_carlo_pose_loss(
     true pose with all other poses.
 
     Equal numbers of samples are drawn from each component of a mixture: the prior, t distributions around the true pose
-    and around each hypothesis, and ``rounds`` further t distributions. A further t distribution is centred at a mode,
-    which is refined from the sample with the largest importance weight so far. The precision of a t distribution is the
-    matrix of the normal equations at its centre. In the prior :math:`p_0`, rotations are uniform, and translations have
-    a t distribution around the true translation with a scale of half the distance between camera and points. The prior
-    has little effect once the correspondences determine the pose.
+    and around each hypothesis, and ``rounds`` further t distributions. Each further t distribution is centred at a mode
+    of the density. To find the mode, the sample with the largest importance weight so far is refined. The precision of
+    a t distribution is the matrix of the normal equations at its centre. In the prior :math:`p_0`, rotations are
+    uniform, and translations have a t distribution around the true translation with a scale of half the distance
+    between camera and points. The prior has little effect once the correspondences determine the pose.
 
     Gradients flow to points, pixels, cameras, weights, sigmas and covariances, but not to poses. A problem that a
     solver would refuse (NaN, points on a line, no pinhole camera) has the loss 0 without gradient.

@@ -43,7 +43,10 @@ class State(NamedTuple):
 
     @property
     def zoom(self) -> Tensor:
-        """Logarithm of the ratio of the focal length to ``Problem.focal``, :math:`(B, 1)`; known: :math:`(B, 0)`."""
+        """Logarithm of the ratio of the focal length to ``Problem.focal``, shape :math:`(B, 1)`.
+
+        For a known focal length the shape is :math:`(B, 0)`.
+        """
         return self.camera[:, :1]
 
     @property
@@ -57,7 +60,7 @@ class Noise(NamedTuple):
 
     Attributes:
         img: standard deviation of each pixel coordinate, NaN where unknown, shape :math:`(B, N)`. With ``img_cov``:
-            standard deviation of the isotropic noise whose covariance has the same trace. Networks use only ``img``.
+            standard deviation of the isotropic noise whose covariance has the same trace. Networks ignore ``img_cov``.
         world: standard deviation of each world coordinate; see ``img``.
         img_cov: covariance of the pixel, entries of shape :math:`(B, N)`; ``None``: the noise is isotropic.
         world_cov: covariance of the world point; see ``img_cov``.
@@ -149,7 +152,7 @@ class Problem(NamedTuple):
 
     @classmethod
     def of(cls, world_points: Tensor, img_points: Tensor, focal: Tensor | float = 1.0, **more: Any) -> Problem:
-        """A problem in the caller's own frame. Weights and scales are 1 unless given in ``more``."""
+        """A problem without normalisation. Weights and scales are 1 unless given in ``more``."""
         one = torch.ones_like(world_points[..., 0])
         scale = one.new_ones(len(one))
         given = {"weights": one, "usual": one, "img_scale": scale, "world_scale": scale, **more}
@@ -205,7 +208,7 @@ class Starts(NamedTuple):
     Attributes:
         pose: a coarse pose in the frame of the :class:`Problem`.
         weights: a factor for the weight of each pair, at least 0, shape :math:`(B, N)`.
-        ok: whether a pose was found (degenerate pairs may have no pose), bool, shape :math:`(B,)`; ``None``: always.
+        ok: whether a pose was found (degenerate pairs may have no pose), bool, shape :math:`(B,)`; ``None``: all true.
         others: more poses, rotations :math:`(B, S, 3, 3)` and translations :math:`(B, S, 3)`; ``None``: no others.
         noise: noise of each pair in the units of the problem, without covariances: the caller's noise, or the
             initialiser's estimate where the caller's noise is unknown. With ``noise``, residuals are measured in

@@ -177,7 +177,7 @@ class Status(IntEnum):
 
     #: The problem is ``ok``.
     SOLVED = 0
-    #: Fewer than 3 pairs have a weight and are not at an impossible angle or distance.
+    #: Fewer than 3 pairs remain without padding and without pairs at impossible angles or distances.
     TOO_FEW_PAIRS = 1
     #: The points lie on a line or coincide, or the pairs do not determine a pose.
     DEGENERATE = 2
@@ -240,7 +240,7 @@ class PnPResult(NamedTuple):
             return 1 where ``ok``.
         alternatives: other poses that explain the pairs nearly as well; no slots unless the call requested them.
         intrinsics: camera matrices with a last entry of 1, shape :math:`(B, 3, 3)`, in a rig as given. An unknown focal
-            length is replaced by its estimate. A matrix that is not that of a pinhole camera becomes the identity.
+            length is replaced by its estimate. The identity replaces matrices that are no pinhole cameras.
         dist: estimated distortion (k1, k2, 0, 0), shape :math:`(B, 4)`; 0 if no distortion was estimated.
     """
 
@@ -276,14 +276,14 @@ class Problems(NamedTuple):
         intrinsics: camera matrices, shape :math:`(B, 3, 3)`, in a rig :math:`(B, N, 3, 3)`.
         pose: the true world-to-camera pose.
         inliers: whether a pair is an inlier, bool, shape :math:`(B, N)`.
-        img_sigma: standard deviation of the noise on each pixel coordinate that a solver is given, shape :math:`(B,)`
-            or :math:`(B, N)`; NaN where unknown; ``None``: unknown for all problems.
+        img_sigma: standard deviation, given to a solver, of the noise on each pixel coordinate, shape :math:`(B,)` or
+            :math:`(B, N)`; NaN where unknown; ``None``: unknown for all problems.
         world_sigma: standard deviation of the noise on each world coordinate; see ``img_sigma``.
         confidence: belief that a pair is an inlier, in [0, 1], shape :math:`(B, N)`; NaN and ``None`` as for
             ``img_sigma``.
-        img_cov: covariance of the noise of each pixel that a solver is given in place of ``img_sigma``, shape
+        img_cov: covariance of the noise of each pixel, given to a solver in place of ``img_sigma``, shape
             :math:`(B, N, 2, 2)`; ``None``: unknown.
-        world_cov: covariance of the noise of each world point that a solver is given in place of ``world_sigma``, shape
+        world_cov: covariance of the noise of each world point, given to a solver in place of ``world_sigma``, shape
             :math:`(B, N, 3, 3)`; ``None``: unknown.
         cam_from_rig: the transform from a rig to the camera of each pair, :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`.
             ``pose`` is then the pose of the rig. ``None``: one camera.

@@ -37,7 +37,7 @@ __all__ = ["PnPNet"]
 _LONGEST_GRADIENT = 10.0
 # Further iterations from the nominal focal length: the least number that converges with 1000 pairs. With 2, 4 and 8
 # further iterations the median error of the focal length is 0.037, 0.029 and 0.030 % (CameraProblems, seeds 4321, 4322,
-# half outliers). Radial distortion gets its gradient from these iterations, because its search has no gradient.
+# half outliers). The gradient of radial distortion comes from these iterations, because the search has no gradient.
 _MORE_ITERATIONS = 4
 # Least probability with which a pose that started with the nominal focal length is accepted. Of problems with 50 %
 # outliers (n = 12, seeds 7700 to 7709 of CameraProblems), 0.4 to 0.6 % exceed it and are far off, as are 0.6 % of the
@@ -101,7 +101,7 @@ class PnPNet(PretrainedMixin):
             refined in the first seven tenths of the iterations, and only the best pose in the last three tenths.
         focal: ``"unknown"``: the focal length is estimated with the pose and returned in the result's ``intrinsics``.
             The intrinsics of the call then give the principal point, the aspect ratio, and the skew relative to the
-            focal length. With ``SetInit`` the refinement starts from a nominal focal length. If that fails, and with
+            focal length. With ``SetInit`` the refinement starts from a nominal focal length. If this fails, and with
             other initialisers, the refinement starts from a focal length that a search with P3P finds. A problem is not
             ``ok`` when the standard deviation of log f exceeds 0.15. ``"known"``: the intrinsics give the focal length.
         focal_sigma: standard deviation of the logarithm of the focal length in the intrinsics of a call, for example
@@ -205,7 +205,7 @@ class PnPNet(PretrainedMixin):
                 :math:`(B, N)`; NaN where unknown. Pairs of high confidence are drawn more often for minimal samples.
                 Networks that were trained with confidences use them as an input. Confidences need not be calibrated.
             prior: a prior of the pose, such as :func:`~kornia_pnpnet.refine.terms.gravity_prior`. The prior is a term
-                of the refinement and of the choice among poses. Its pose is one of the starts unless ``init`` is given.
+                of the refinement and of the choice among poses. The prior's pose is a start unless ``init`` is given.
                 ``ok`` and ``probability`` depend on the pairs alone. If the noise is unknown, the prior is weighed
                 against pixels with a standard deviation of one pixel.
             dist: distortion coefficients of Kornia and OpenCV, 4, 5, 8, 12 or 14 numbers, shape :math:`(B, D)` or
@@ -271,7 +271,7 @@ class PnPNet(PretrainedMixin):
     def with_starts(
         self, *args: Any, first_stage_only: bool = False, gradient: str | None = None, **options: Any
     ) -> tuple[PnPResult, Starts]:
-        """Solve a batch, and also return the starts (proposed poses, weights and noise), for losses of a training.
+        """Solve a batch, and also return the starts (proposed poses, weights and noise) for training losses.
 
         For the arguments, except ``alternatives``, see :meth:`forward`. The starts are in the frame, order and units of
         the inputs. The ``ok`` of the starts says whether the problem is valid.
