@@ -116,12 +116,10 @@ def checked_inputs(
 
     For the arguments and errors see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`. Distorted pixels
     become pixels of pinhole cameras. Bearings become a rig in which each pair has a camera that looks along its
-    bearing. Shapes, dtypes and devices are checked. Values are not checked, because reading values would stall a GPU,
-    and one problem could fail the whole batch.
+    bearing. Values are not checked: reading values would stall a GPU, and one problem could fail the whole batch.
 
     Returns:
-        The leading dimensions of ``world_points`` (empty for a single problem), and the inputs with one batch
-        dimension.
+        The leading dimensions of ``world_points``, and the inputs with one batch dimension.
     """
     is_bearing = isinstance(img_points, Tensor) and img_points.ndim > 1 and img_points.shape[-1] == 3
     if intrinsics is None and is_bearing:
@@ -222,8 +220,7 @@ def checked_noise(
 def with_undistorted(inputs: Inputs, dist: Tensor | None, fisheye: Tensor | None) -> Inputs:
     """Replace distorted pixels by pixels of pinhole cameras, see :func:`~kornia_pnpnet.cameras.undistort`.
 
-    Pairs whose pixel cannot be undistorted are masked out. A pixel that is not finite is kept, so that the solver
-    refuses its problem.
+    Pairs whose pixel cannot be undistorted are masked out, but non-finite pixels are kept: a solver refuses them.
     """
     broken = ~inputs.img_points.isfinite().all(-1)
     # The identity replaces invalid cameras here, for finite gradients. `Normalize` refuses their problems later.

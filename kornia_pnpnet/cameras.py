@@ -217,11 +217,9 @@ def _flatten(point: Tensor) -> Tensor:
 
 
 def _invert(lens: Callable[[Tensor], Tensor], target: Tensor) -> tuple[Tensor, Tensor]:
-    """Find points (B, N, 2) that a lens maps to ``target`` (0 without a solution), and which targets have a solution.
-
-    A Newton step is at most about half as long as the target's distance from the centre. Two final steps carry the
-    gradient to the target and to the coefficients. The second final step makes second derivatives exact.
-    """
+    """Find points (B, N, 2) that a lens maps to ``target`` (no solution: 0), and which targets have a solution."""
+    # A Newton step is at most about half as long as the target's distance from the centre. Two final steps carry the
+    # gradient to the target and to the coefficients. The second final step makes second derivatives exact.
     with torch.no_grad():
         point = target
         longest = 0.5 * (target.norm(dim=-1, keepdim=True) + 1e-3)

@@ -203,8 +203,8 @@ def export_package(
     program = export_program(solver, n, batch=batch, rig=rig)
     pairs = _fixed_n(solver, n)
     metadata = {_BATCH: str(batch or _ANY), _N: str(pairs or _ANY), _RIG: str(rig)}
-    # Calls of operators and allocations take most of the time of one problem; inlined operators avoid both. For more
-    # problems, calls of operators take less time than inlined operators.
+    # Calls and allocations take most of the time of one problem, and inlined operators avoid both. For more problems,
+    # calls are faster than inlined operators.
     inline = batch == 1 and pairs is not None
     options = {**package_options(pairs, on_stack=inline), "aot_inductor.metadata": metadata}
     content = io.BytesIO()

@@ -295,11 +295,8 @@ class Normalize(Configured):
         return Problem(world_points, img_points, weights[..., 0], focal, *scales, noise, confidence, rig), frame
 
     def _scaled_covariances(self, noise: Noise, sound: Tensor, pixel_map: Sequence[Tensor], scale: Tensor) -> Noise:
-        """Covariances in the units of the problem, raised above rounding; 0 for pairs that are not ``sound``.
-
-        ``pixel_map`` holds the entries a, b, d, (B, 1) or (B, N) each, of the matrix [[a, b], [0, d]] that pixels are
-        multiplied by.
-        """
+        """Covariances in the units of the problem, raised above rounding; 0 for pairs that are not ``sound``."""
+        # `pixel_map` holds the entries a, b, d of the matrix [[a, b], [0, d]] that multiplies pixels.
         img_cov, world_cov = map_tensors(lambda x: torch.where(sound, x, 0.0), (noise.img_cov, noise.world_cov))
         if img_cov is not None:
             img_cov = img_cov.mapped(*pixel_map).at_least((LEAST_NOISE * self.f_const) ** 2)
@@ -309,21 +306,13 @@ class Normalize(Configured):
 
 
 def _is_usable(noise: Noise, there: Tensor) -> Tensor:
-    """Whether the noise of a problem is possible, bool (B,).
-
-    A possible standard deviation is NaN (unknown), or finite and not negative. The covariance of a pair with a weight
-    (``there``, bool (N, B)) must be finite and positive semi-definite.
-    """
+    """Whether all sigmas (NaN: unknown), and the covariances of pairs that are ``there``, are possible, bool (B,)."""
     usable = [((x >= 0) | x.isnan()).all(-1) & ~x.isinf().any(-1) for x in (noise.img, noise.world)]
     return torch.stack([*usable, *((are_semi_definite(x) | ~there.mT).all(-1) for x in noise.covariances)]).all(0)
 
 
 def _pinhole(camera: Tensor) -> tuple[Tensor, Tensor]:
-    """Scale camera matrices (9, B) to a last entry of 1, and tell which matrices are pinhole cameras, bool (B,).
-
-    A pinhole camera is a multiple of [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with positive fx and fy. All entries of
-    other matrices become 1.
-    """
+    """Scale camera matrices (9, B) to a last entry of 1, and tell which are pinhole cameras; others become all ones."""
     limit = torch.finfo(camera.dtype).max ** 0.25
     entries = camera.detach()
     scaled = entries / entries[8:]
@@ -336,14 +325,11 @@ def _pinhole(camera: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _distances(points: Tensor, there: Tensor, padded: bool) -> tuple[Tensor, Tensor]:
-    """Squared distances (N, B) of points (3, N, B) from their median, and the squared typical distance (B,).
-
-    Two thirds of the points are within the typical distance. When two thirds of the points coincide, the typical
-    distance is infinite.
-    """
+    """Squared distances (N, B) of points (3, N, B) from their median, and the squared typical distance (B,)."""
     counts = there.sum(0) if padded else points.shape[1]
     points = torch.where(there, points, torch.inf)
     middle = ranked(points, (counts - 1) // 2).nan_to_num(posinf=0.0)
     sq_distance = (points - middle[:, None]).square().sum(0)
     typical = ranked(sq_distance[None], 2 * counts // 3)[0]
+    # When two thirds of the points coincide, no distance is typical.
     return sq_distance, typical.masked_fill(typical == 0, torch.inf)

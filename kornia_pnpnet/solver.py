@@ -69,7 +69,7 @@ class PnPNet(PretrainedMixin):
     The layer normalises the correspondences, lets ``init`` propose poses, refines and judges the poses, and expresses
     the best pose in the frame of the inputs. All steps are batched and differentiable. An unsolvable problem
     (non-finite input, fewer than three pairs, points on a line, a pose that does not explain the pixels) gets
-    ``ok=False``, a ``status`` that says why, and a finite pose without gradient. Other problems are not affected.
+    ``ok=False``, a ``status`` that says why, and a finite pose without gradient. Other problems do not change.
 
     Convention: ``x_cam = R x_world + t``, +z forward, pixels ``u = fx x/z + s y/z + cx`` with the skew ``s``. All
     multiples of a camera matrix are the same camera.
@@ -221,10 +221,9 @@ class PnPNet(PretrainedMixin):
                 poses takes as long as several calls without ``alternatives``.
 
         Returns:
-            The :class:`~kornia_pnpnet.result.PnPResult`, in float64 if any input is float64, else in float32. Gradients
-            flow through pose, intrinsics, dist, weights and cost of problems that are ``ok``, and through the first
-            guess of every valid problem. A problem without a finite pose gets the identity as its pose, and the square
-            root of the dtype's largest number as its cost.
+            The :class:`~kornia_pnpnet.result.PnPResult`. Gradients flow through pose, intrinsics, dist, weights and
+            cost of problems that are ``ok``, and through the first guess of every valid problem. A problem without a
+            finite pose gets the identity as its pose, and the square root of the dtype's largest number as its cost.
 
         Raises:
             ShapeError: for shapes that do not fit each other, fewer than 3 pairs, or a number of pairs that the
@@ -383,8 +382,8 @@ class PnPNet(PretrainedMixin):
     def _result(self, frame: Frame, starts: Starts, refined: Refinement, call: _Call) -> PnPResult:
         """Everything after the refinement: express the refined state in the caller's world."""
         pose, first = frame.undo(refined.pose), frame.undo(starts.pose)
-        # A sum is finite only if all its terms are finite. The rotation needs no test: its entries were multiplied by
-        # the centroid and added to the translation, so that the translation is finite only if the rotation is.
+        # A sum is finite only if all its terms are finite. The rotation needs no test, because its products with the
+        # centroid are terms of the translation.
         finite = frame.valid & (pose.translation.sum(-1) + refined.weights.sum(-1) + refined.cost).isfinite()
         ok = finite & refined.ok if starts.ok is None else finite & refined.ok & starts.ok
         state, intrinsics = refined.state, frame.intrinsics
