@@ -1,4 +1,4 @@
-"""The arguments of a solver's call: one table of what they may be, and what they become."""
+"""Checks of the arguments of a solver's call, and their conversion to one batch of one dtype."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ __all__ = [
 
 _T = TypeVar("_T")
 
-# Parts without padding keep at least this number of pairs.
+# Pairs. Least size of the pair dimension of a part, see `_without_padding`.
 _LEAST_PAIRS = 16
-#: The tensors of a call, by their names in error messages: whether they have an entry for each pair (N) or for each
-#: problem, and the shape of an entry. Those of cameras and lenses depend on more.
+#: Shapes of tensors of a call by their names in error messages: whether the tensor has one entry for each pair (N) or
+#: one for each problem, and the shape of an entry. The shapes of cameras and lenses are in :func:`checked_inputs`.
 _ENTRIES: dict[str, tuple[bool, tuple[int, ...]]] = {
     "weights": (True, ()),
     "mask": (True, ()),
@@ -56,11 +56,12 @@ _ENTRIES: dict[str, tuple[bool, tuple[int, ...]]] = {
 
 
 class Inputs(NamedTuple):
-    """Arguments of a call as one batch in one dtype, with sigmas for every pair where any is known.
+    """The arguments of a call as one batch in one dtype. ``noise`` is ``None``, or has sigmas for every pair.
 
-    In a rig each pair has a camera, (B, N, 3, 3), and a pose of this camera in ``rig``. Where a solver estimates the
-    focal length, ``free_focal`` says in pixels of the caller what is known of it, and ``radial`` holds the coefficients
-    of distortion by which the pixels were undistorted.
+    In a rig, ``intrinsics`` has a camera matrix for each pair, (B, N, 3, 3), and ``rig`` has the transform from the rig
+    to the camera of each pair. When a solver estimates the focal length, ``free_focal`` is the range and the prior of
+    the focal length in the caller's pixels. ``radial`` holds the estimated distortion coefficients by which the pixels
+    were undistorted.
     """
 
     world_points: Tensor
@@ -78,13 +79,13 @@ class Inputs(NamedTuple):
 
 
 class Part(NamedTuple):
-    """Some problems of a batch, and their positions in it.
+    """Some problems of a batch, and their positions in the batch.
 
     Attributes:
         inputs: the problems.
-        problems: positions among the problems, (P,); ``None``: they follow those of the part before.
-        pairs: positions of their pairs among the pairs of the batch, (P, n); ``None``: all pairs in order.
-        most_pairs: number of pairs of the batch.
+        problems: positions of the problems in the batch, (P,); ``None``: the parts are consecutive slices of the batch.
+        pairs: positions of the part's pairs among the N pairs of each problem, (P, n); ``None``: all pairs in order.
+        most_pairs: number N of pairs of the batch; 0 without ``pairs``.
     """
 
     inputs: Inputs
@@ -111,14 +112,14 @@ def checked_inputs(
     fisheye: Tensor | None = None,
     cam_from_rig: Pose | None = None,
 ) -> tuple[torch.Size, Inputs]:
-    """Check the arguments of a call, and make them one batch of one dtype (:func:`common_dtype`).
+    """Check the arguments of a call, and convert them to one batch of one dtype (``core.checks.common_dtype``).
 
     For the arguments and errors see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`. Distorted pixels
-    become pixels of pinhole cameras; bearings become a rig of cameras that each look at their own point. Shapes, dtypes
-    and devices are checked. Values are not: this would stall a GPU and let one problem fail a batch.
+    become pixels of pinhole cameras. Bearings become a rig in which each pair has a camera that looks along its
+    bearing. Values are not checked: reading values would stall a GPU, and one problem could fail the whole batch.
 
     Returns:
-        The leading dimensions of ``world_points``, none for a single problem, and the inputs with one batch dimension.
+        The leading dimensions of ``world_points``, and the inputs with one batch dimension.
     """
     is_bearing = isinstance(img_points, Tensor) and img_points.ndim > 1 and img_points.shape[-1] == 3
     if intrinsics is None and is_bearing:
@@ -142,7 +143,7 @@ def checked_inputs(
             raise TypeCheckError(f"{name} must be a tensor, got {type(value).__name__}.")
     KORNIA_CHECK_SHAPE(world_points, ["*", "N", "3"])
     size, count = world_points.shape[:-2], world_points.shape[-2]
-    if isinstance(intrinsics, PinholeCamera) and len(matrices) == size.numel():  # Kornia's cameras are one batch
+    if isinstance(intrinsics, PinholeCamera) and len(matrices) == size.numel():  # one batch dimension
         tensors["intrinsics"] = matrices = matrices.reshape(*size, 3, 3)
     if weights is not None and weights.shape == (*size, count, 2):
         raise ShapeError(
@@ -196,7 +197,7 @@ def checked_noise(
     img_cov: Tensor | None,
     world_cov: Tensor | None,
 ) -> Noise | None:
-    """The noise of every pair in the dtype of the points; ``None`` where nothing is known of any pair.
+    """The noise of every pair in the dtype of the points; ``None`` if neither sigmas nor covariances are given.
 
     For the arguments and errors see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`.
     """
@@ -217,12 +218,12 @@ def checked_noise(
 
 
 def with_undistorted(inputs: Inputs, dist: Tensor | None, fisheye: Tensor | None) -> Inputs:
-    """Inputs with the pixels of pinhole cameras, see :func:`~kornia_pnpnet.cameras.undistort`.
+    """Replace distorted pixels by pixels of pinhole cameras, see :func:`~kornia_pnpnet.cameras.undistort`.
 
-    Pairs without such a pixel are left out; one that is not finite still fails its problem.
+    Pairs whose pixel cannot be undistorted are masked out, but non-finite pixels are kept: a solver refuses them.
     """
     broken = ~inputs.img_points.isfinite().all(-1)
-    # Safe inputs give finite gradients; problems with other cameras fail later.
+    # The identity replaces invalid cameras here, for finite gradients. `Normalize` refuses their problems later.
     diagonal = inputs.intrinsics.diagonal(dim1=-2, dim2=-1)
     usable = inputs.intrinsics.isfinite().flatten(-2).all(-1) & (diagonal / diagonal[..., 2:] > 0).all(-1)
     camera = torch.where(usable[..., None, None], inputs.intrinsics, torch.eye(3).to(diagonal))
@@ -233,13 +234,10 @@ def with_undistorted(inputs: Inputs, dist: Tensor | None, fisheye: Tensor | None
 
 
 def _looking_along(inputs: Inputs) -> Inputs:
-    """Bearings as a rig of cameras without skew whose axes are the bearings.
-
-    The focal length of a camera, by which a sigma in pixels is one in radians, is the geometric mean of those given.
-    """
+    """Convert bearings to a rig: each pair gets a camera whose optical axis is the bearing of the pair."""
     rotation, sound = bearing_cameras(inputs.img_points)
     axis = torch.where(sound[..., None], torch.zeros_like(inputs.img_points[..., :2]), torch.nan)
-    # Of the camera only the diagonal counts.
+    # The geometric mean of fx and fy converts sigmas from pixels to radians. Skew and principal point are ignored.
     cameras, has_focal = pinholes(inputs.intrinsics.diagonal(dim1=-2, dim2=-1).diag_embed())
     focal = torch.where(has_focal, (cameras[..., 0, 0] * cameras[..., 1, 1]).sqrt(), 0.0)
     cameras = torch.stack((focal, focal, torch.ones_like(focal)), -1).diag_embed()
@@ -250,18 +248,18 @@ def _looking_along(inputs: Inputs) -> Inputs:
 
 
 def one_batch(x: Tensor, size: torch.Size, dtype: torch.dtype) -> Tensor:
-    """Reshape a tensor with the leading dimensions ``size`` to one batch, and convert it unless it is a mask."""
+    """Reshape the leading dimensions ``size`` to one batch dimension, and convert all but bool tensors to ``dtype``."""
     x = x if x.dtype in (dtype, torch.bool) else x.to(dtype)
     return x if len(size) == 1 else x.reshape((size.numel(), *x.shape[len(size) :]))
 
 
 def restore_leading(size: torch.Size, result: _T) -> _T:
-    """Give a result of one batch the leading dimensions that :func:`checked_inputs` returned."""
+    """Reshape the batch dimension of a result to the leading dimensions that :func:`checked_inputs` returned."""
     return result if len(size) == 1 else map_tensors(lambda x: x.reshape((*size, *x.shape[1:])), result)
 
 
 def given_cameras(intrinsics: Tensor | PinholeCamera | None, world_points: Tensor, like: Tensor) -> Tensor:
-    """The cameras of a rig as they were given, expanded to a problem each, or to a pair each."""
+    """The camera matrices that the caller gave for a rig, one for each problem or pair, with a last entry of 1."""
     if intrinsics is None:
         return torch.eye(3, dtype=like.dtype, device=like.device).expand(*world_points.shape[:-2], 3, 3)
     matrices = camera_matrices(intrinsics).to(like.dtype)
@@ -270,13 +268,13 @@ def given_cameras(intrinsics: Tensor | PinholeCamera | None, world_points: Tenso
 
 
 def split_batch(inputs: Inputs, most: int | None, any_number: bool) -> list[Part]:
-    """Split a batch into parts that are solved one after the other, on a CPU, whose caches hold a small part.
+    """Split a batch on a CPU into small parts that fit the CPU's caches and are solved one after the other.
 
     Args:
         inputs: the batch.
-        most: largest number of pairs of a part for each thread, without gradients; ``None``: the whole batch.
-        any_number: whether parts may have fewer pairs than the batch, so that they have little padding. Problems of
-            few among problems of many pairs then take a half to two thirds of the time.
+        most: largest number of pairs of a part per thread. ``None``, or a call that records gradients: no limit.
+        any_number: whether problems may be grouped by their number of pairs, so that parts have little padding. A batch
+            of problems with few and with many pairs then takes a half to two thirds of the time.
     """
     batch, count = inputs.world_points.shape[:2]
     if inputs.world_points.device.type != "cpu" or not sees_values(inputs.world_points) or not batch:
@@ -291,7 +289,7 @@ def split_batch(inputs: Inputs, most: int | None, any_number: bool) -> list[Part
 
 
 def _without_padding(inputs: Inputs, most: int) -> list[Part]:
-    """Parts of problems of about the same number of pairs, with at least two problems where the batch has two."""
+    """Split a batch into parts of problems with similar numbers of pairs, at least two problems in each if possible."""
     assert inputs.mask is not None
     batch, count = inputs.mask.shape
     counts = inputs.mask.sum(1)
@@ -319,7 +317,7 @@ def _without_padding(inputs: Inputs, most: int) -> list[Part]:
 
 
 def joined(parts: list[Part], results: list[PnPResult]) -> PnPResult:
-    """The result of a batch from the results of its parts."""
+    """Join the results of the parts of a batch."""
     padded = []
     for part, result in zip(parts, results, strict=True):
         if part.pairs is not None:

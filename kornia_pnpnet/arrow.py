@@ -1,4 +1,4 @@
-"""Tables of problems in the format of Apache Arrow: a batch in, a batch out, for Ray Data and other engines."""
+"""Solve tables of problems in the format of Apache Arrow, for Ray Data and other engines."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ except ImportError as error:
 
 __all__ = ["INPUTS", "OUTPUTS", "Solve", "list_column"]
 
-_PAIRS = -1  # the number of pairs, in a shape
+_PAIRS = -1  # stands for the number of pairs in a shape
 # Shapes of the columns that Solve reads.
 _SHAPES: dict[str, tuple[int, ...]] = {"world_points": (_PAIRS, 3), "img_points": (_PAIRS, 2), "intrinsics": (3, 3)}
 _SHAPES |= dict.fromkeys(("weights", "img_sigma", "world_sigma"), (_PAIRS,))
@@ -33,32 +33,32 @@ INPUTS = tuple(_SHAPES)
 #: Columns that :class:`Solve` writes.
 OUTPUTS = ("rotation", "translation", "weights", "cost", "ok", "status")
 
-# Types of the cells and of what they hold.
+# Type tests: whether a cell is a list, and whether a value is a number.
 _LISTS = pa.types.is_list, pa.types.is_large_list, pa.types.is_fixed_size_list
 _NUMBERS = pa.types.is_integer, pa.types.is_floating, pa.types.is_null
-# Names of the values of Status, and of rows that no solver saw.
+# Names of the values of Status, then the status of rows that were not solved.
 _STATUS_NAMES = pa.array([*(status.name.lower() for status in Status), "malformed"])
-# Pairs. Problems with this number or more are padded, so that those with similar numbers are solved together.
+# Pairs. Problems with at least this number of pairs are padded, so that one call solves problems of similar size.
 _PADDED_FROM = 16
 
 
 class Solve:
-    r"""Map a table of problems to a table of poses: a function of batches for Ray Data and other engines.
+    r"""Map a table of problems to a table of poses, for example in ``map_batches`` of Ray Data.
 
-    A row is a problem. Each cell holds the numbers of its problem as one list in row-major order. The number of pairs N
-    may differ between rows. The columns are
+    Each row is a problem. Each cell is one list of numbers in row-major order. The number of pairs N may differ between
+    rows. The columns are
 
     - ``world_points`` (3N numbers) and ``img_points`` (2N numbers, pixels),
     - optionally ``intrinsics`` (9 numbers), ``weights`` (N numbers), and the standard deviations ``img_sigma`` in
       pixels and ``world_sigma`` in the unit of the world (N numbers or one number; NaN: unknown).
 
     The result has the columns ``rotation`` (9 numbers), ``translation`` (3), ``weights`` (N), ``cost``, ``ok`` and
-    ``status``, the name of a :class:`~kornia_pnpnet.result.Status` in lower case. It also has the columns of the table
-    with other names, for example an ``id``. Rows keep their order, and numbers are float32.
+    ``status``, the name of a :class:`~kornia_pnpnet.result.Status` in lower case. Columns of the table with other
+    names, for example ``id``, are kept. Rows keep their order. Numbers are float32.
 
-    A bad row raises nothing: its ``ok`` is false and its pose is the identity. Its status is ``malformed`` when a list
-    is missing or has the wrong length, or when the solver is for another number of pairs. Rows change each other's
-    results by rounding only.
+    A row that cannot be solved raises no error: its ``ok`` is false and its pose is the identity. Its status is
+    ``malformed`` when a list is missing or has an incorrect length, when the row has fewer than 3 pairs, or when the
+    solver was built for another number of pairs. The result of a row depends on the other rows only by rounding.
 
     Args:
         solver: a name of :func:`~kornia_pnpnet.registry.list_solvers`, or a solver.
@@ -66,7 +66,7 @@ class Solve:
         options: options of the named solver, see :func:`~kornia_pnpnet.registry.create_solver`.
 
     Raises:
-        BaseError: for an unknown solver or option, or another shape of ``intrinsics``.
+        BaseError: for an unknown solver or option, or when ``intrinsics`` does not have the shape :math:`(3, 3)`.
 
     Example:
         >>> from kornia_pnpnet.data import SyntheticProblems
@@ -78,7 +78,7 @@ class Solve:
         ([7, 8], [True, True])
     """
 
-    #: Number of pairs, with padding, in one call of the solver. It bounds the memory beside that of the tables.
+    #: Approximate largest number of pairs, padding included, in one call of the solver, a limit of its memory.
     pairs_at_once = 2**17
 
     def __init__(
@@ -91,7 +91,12 @@ class Solve:
         self.intrinsics = intrinsics
 
     def __call__(self, table: pa.Table) -> pa.Table:
-        """Solve the problems of a table. ``ValueCheckError``: a column is missing; ``TypeCheckError``: no numbers."""
+        """Solve the problems of a table.
+
+        Raises:
+            ValueCheckError: when a required column is missing.
+            TypeCheckError: when a column does not hold numbers.
+        """
         for name in INPUTS[: 3 if self.intrinsics is None else 2]:
             if name not in table.column_names:
                 raise ValueCheckError(f"no {name}")
@@ -101,7 +106,7 @@ class Solve:
         values: dict[str, np.ndarray] = {
             "rotation": np.tile(np.eye(3, dtype=np.float32), (len(counts), 1, 1)),
             "translation": np.zeros((len(counts), 3), dtype=np.float32),
-            "cost": np.full(len(counts), np.finfo(np.float32).max ** 0.5, dtype=np.float32),  # as without a pose
+            "cost": np.full(len(counts), np.finfo(np.float32).max ** 0.5, dtype=np.float32),  # the cost without a pose
             "ok": np.zeros(len(counts), dtype=bool),
             "status": np.full(len(counts), len(_STATUS_NAMES) - 1, dtype=np.int8),
         }
@@ -111,7 +116,7 @@ class Solve:
             there = np.arange(width) < counts[rows, None]  # (R, width), false for padding
             taken = {name: torch.from_numpy(x.take(rows, width)) for name, x in cells.items()}
             inputs: dict[str, Any] = {"intrinsics": self.intrinsics, **taken}
-            with torch.no_grad(), suppress(ShapeError):  # the solver is for another number of pairs
+            with torch.no_grad(), suppress(ShapeError):  # raised for another number of pairs
                 result = self.solver(**inputs, mask=None if there.all() else torch.from_numpy(there))
                 for name, array in values.items():
                     array[rows] = getattr(result, name).numpy()
@@ -124,7 +129,7 @@ class Solve:
 
 
 def list_column(values: np.ndarray) -> pa.Array:
-    r"""Make a column of lists, one for each problem, of their numbers, shape :math:`(B, …)`.
+    r"""Make a column of lists from an array :math:`(B, …)`: one list of numbers in row-major order for each problem.
 
     Example:
         >>> list_column(np.eye(2)).to_pylist()
@@ -135,15 +140,15 @@ def list_column(values: np.ndarray) -> pa.Array:
 
 
 class _Cells:
-    """The numbers of a column of lists: ``values`` of all rows one after the other, NaN where one is missing.
+    """The numbers of a column of lists. Row i has ``sizes[i]`` numbers in ``values``, from ``starts[i]`` on.
 
-    A row begins at ``starts`` and has ``sizes`` numbers, 0 where its list is missing.
+    A missing number is NaN. A missing list has the size 0.
     """
 
     def __init__(self, name: str, column: pa.ChunkedArray) -> None:
         array = column.combine_chunks()
         ends = np.arange(len(array) + 1)
-        while any(is_list(array.type) for is_list in _LISTS):  # a list may be nested, as `.tolist()` makes it
+        while any(is_list(array.type) for is_list in _LISTS):  # lists from `.tolist()` are nested
             sizes = compute.list_value_length(array).fill_null(0).to_numpy(zero_copy_only=False)
             ends = np.append(0, sizes.cumsum())[ends]
             array = compute.list_flatten(array)
@@ -154,22 +159,22 @@ class _Cells:
         self.shape, self.one_for_all = _SHAPES[name], name.endswith("_sigma")
 
     def fit(self, counts: np.ndarray) -> np.ndarray:
-        """Whether each cell has as many numbers as its problem needs."""
+        """Whether each cell has the number of entries that its problem needs, bool (rows,)."""
         needed = math.prod(counts if size == _PAIRS else size for size in self.shape)
         return (self.sizes == needed) | (self.one_for_all & (self.sizes == 1))
 
     def take(self, rows: np.ndarray, width: int) -> np.ndarray:
-        """The cells of some rows, padded to ``width`` pairs: the last number of a cell is repeated."""
+        """The cells of some rows, padded to ``width`` pairs by repeating the last number of each cell."""
         shape = [width if size == _PAIRS else size for size in self.shape]
         within = np.minimum(np.arange(math.prod(shape)), self.sizes[rows, None] - 1)
         return self.values[self.starts[rows, None] + within].reshape(len(rows), *shape)
 
 
 def _groups(counts: np.ndarray, fits: np.ndarray, most: int) -> Iterator[tuple[np.ndarray, int]]:
-    """Rows that are solved in one call, and the number of pairs to which they are padded.
+    """Yield the rows of each call of the solver, and the number of pairs to which the rows are padded.
 
-    The padding depends on the row alone, so that the result does, too: none below 16 pairs; otherwise to the next of
-    16, 20, 24, 28, 32, 40, 48, ..., at most a quarter more.
+    Rows with fewer than 16 pairs are not padded. Other rows are padded to the next of 16, 20, 24, 28, 32, 40, 48, ...,
+    at most a quarter more pairs. The padding of a row, and so its result, does not depend on other rows.
     """
     step = 2 ** (np.log2(counts.clip(_PADDED_FROM)).astype(int) - 2)
     widths = np.where(counts < _PADDED_FROM, counts, -(-counts // step) * step)

@@ -1,4 +1,4 @@
-"""Cameras that are no pinholes: distorted pixels become pixels of a pinhole camera, bearings become small cameras."""
+"""Cameras other than pinholes: distorted pixels become pixels of a pinhole camera, each bearing gets its own camera."""
 
 from __future__ import annotations
 
@@ -16,38 +16,39 @@ from kornia_pnpnet.problem import Noise
 
 __all__ = ["bearing_cameras", "bearings", "check_coefficients", "pinholes", "undistort"]
 
-# Numbers of coefficients of Kornia and OpenCV.
+# Numbers of distortion coefficients that Kornia and OpenCV accept.
 _COEFFICIENTS = (4, 5, 8, 12, 14)
 # Newton steps from the distorted to the undistorted point.
 _STEPS = 12
-# The largest residual of a solution, in focal lengths and roots of the machine epsilon.
+# Largest residual of a Newton solution on the plane z = 1, as a multiple of the square root of the machine epsilon.
 _LARGEST_RESIDUAL = 0.1
-# The largest angle from the axis that has a pixel in a pinhole camera, in radians: 85 degrees.
+# Radians (85 degrees). Fisheye pixels at a larger angle from the axis get no pixel of a pinhole camera.
 _WIDEST = 1.4835
 
 
 def undistort(
     img_points: Tensor, intrinsics: Tensor, dist: Tensor | None, fisheye: Tensor | None, noise: Noise | None
 ) -> tuple[Tensor, Tensor, Noise | None]:
-    r"""Replace pixels of a distorted camera by those of the pinhole camera with the same intrinsics.
+    r"""Replace pixels of a camera with distortion by pixels of the pinhole camera with the same intrinsics.
 
-    Newton's method finds the inverse, and the implicit function theorem its gradient, because
-    :func:`kornia.geometry.calibration.undistort_points` is a fixed-point iteration without a test of convergence: for
-    ``k1 = -0.2`` its 5 steps are 1.4 px off at 45 degrees from the axis (focal length 320 px), and beyond the turning
-    point of the polynomial it returns pixels that do not exist.
+    Newton's method inverts the distortion, and the implicit function theorem gives the gradient of the inverse.
+    :func:`kornia.geometry.calibration.undistort_points` is not used: its fixed-point iteration has no test of
+    convergence. For ``k1 = -0.2`` the result of its 5 steps is 1.4 px off at 45 degrees from the axis (focal length
+    320 px). Kornia also returns pixels beyond the turning point of the distortion polynomial, where no pixels exist.
 
     Args:
         img_points: shape :math:`(B, N, 2)`.
         intrinsics: shape :math:`(B, 3, 3)`.
         dist: coefficients of :func:`kornia.geometry.calibration.distort_points`, shape :math:`(B, D)`.
         fisheye: coefficients of ``cv2.fisheye``, shape :math:`(B, 4)`, in place of ``dist``.
-        noise: noise of the pixels that were given.
+        noise: noise of the distorted pixels.
 
     Returns:
-        The pixels; which pairs have one, bool :math:`(B, N)`; the noise of the new pixels. A pair has no pixel beyond
-        the turning point of the polynomial, more than 85 degrees off the axis, and where pixel, coefficients or camera
-        are not finite: the principal point then stands in. A standard deviation stays isotropic: it is multiplied by
-        the root mean square of the map's singular values.
+        The undistorted pixels; which pairs have an undistorted pixel, bool :math:`(B, N)`; the noise of the undistorted
+        pixels. A pixel cannot be undistorted beyond the turning point of the polynomial, more than 85 degrees off the
+        axis of a fisheye, or when pixel, coefficients or camera are not finite. The principal point then replaces the
+        pixel. Isotropic noise stays isotropic: its standard deviation is multiplied by the root mean square of the
+        singular values of the undistortion's Jacobian.
     """
     camera, _ = pinholes(intrinsics)
     point, found, lens = _through(dist, fisheye, img_points, intrinsics)
@@ -57,7 +58,7 @@ def undistort(
         point = torch.where(found[..., None], point, 0.0)
     pixels = transform_points(camera, flatten(point))
     if noise is not None:
-        with torch.no_grad():  # of the undistorted by the distorted point
+        with torch.no_grad():  # derivative of the undistorted point by the distorted point
             jacobian = _jacobian(flatten, point) @ _inverse(_jacobian(lens, point))
             jacobian = torch.where(found[..., None, None], jacobian, torch.eye(2).to(jacobian))
         to_pixels = camera[:, None, :2, :2]
@@ -72,7 +73,9 @@ def undistort(
 def bearings(
     img_points: Tensor, intrinsics: Tensor, dist: Tensor | None = None, fisheye: Tensor | None = None
 ) -> Tensor:
-    r"""Directions in which a camera sees its pixels; those of a fisheye may be more than 90 degrees off the axis.
+    r"""Convert pixels to bearings, the directions of their rays in the camera's frame.
+
+    Bearings of a fisheye may be more than 90 degrees off the optical axis.
 
     Args:
         img_points: shape :math:`(B, N, 2)`.
@@ -81,12 +84,12 @@ def bearings(
         fisheye: see ``PnPNet.forward``.
 
     Returns:
-        Unit vectors in the camera's frame, shape :math:`(B, N, 3)`, which a solver takes in place of pixels; NaN,
-        without gradient, where a pixel has no direction.
+        Unit vectors in the camera's frame, shape :math:`(B, N, 3)`. A solver accepts bearings in place of pixels. The
+        bearing of a pixel that cannot be undistorted is NaN and has no gradient.
 
     Raises:
-        ShapeError: for another number of coefficients.
-        ValueCheckError: for both kinds of coefficients.
+        ShapeError: for a number of coefficients that no lens model has.
+        ValueCheckError: when both ``dist`` and ``fisheye`` are given.
 
     Example:
         >>> camera = torch.tensor([[100.0, 0.0, 320.0], [0.0, 100.0, 240.0], [0.0, 0.0, 1.0]])
@@ -109,7 +112,7 @@ def bearings(
 
 
 def check_coefficients(dist: Tensor | None, fisheye: Tensor | None) -> None:
-    """Raise for both kinds of coefficients, and for a number of coefficients that no model has."""
+    """Raise when both ``dist`` and ``fisheye`` are given, or for a number of coefficients that no lens model has."""
     if dist is not None and fisheye is not None:
         raise ValueCheckError("Give dist or fisheye, not both.")
     for name, given, sizes in (("dist", dist, _COEFFICIENTS), ("fisheye", fisheye, (4,))):
@@ -122,14 +125,14 @@ def check_coefficients(dist: Tensor | None, fisheye: Tensor | None) -> None:
 
 
 def bearing_cameras(rays: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Rotations that turn directions to the axis of a camera of their own.
+    r"""Find rotations that turn each direction to the z axis, the optical axis of a camera.
 
     Args:
         rays: directions of any length but 0, shape :math:`(B, N, 3)`.
 
     Returns:
-        Rotations :math:`(B, N, 3, 3)`, and whether the direction is finite and not 0, bool :math:`(B, N)`. Where it is
-        not, the rotation is constant.
+        Rotations :math:`(B, N, 3, 3)`, and which directions are valid (finite and not 0), bool :math:`(B, N)`. An
+        invalid direction has a constant rotation.
 
     Example:
         >>> rotation, _ = bearing_cameras(torch.tensor([[[3.0, 0.0, -4.0]]]))
@@ -140,7 +143,7 @@ def bearing_cameras(rays: Tensor) -> tuple[Tensor, Tensor]:
     sound = (length > 0) & length.isfinite()
     axis = torch.tensor([0.0, 0.0, 1.0], dtype=rays.dtype, device=rays.device)
     rays = normalize(torch.where(sound, rays, axis), dim=-1)
-    behind = torch.tensor([1.0, -1.0, -1.0], dtype=rays.dtype, device=rays.device)  # half a turn about x
+    behind = torch.tensor([1.0, -1.0, -1.0], dtype=rays.dtype, device=rays.device)  # a half turn about x
     turn = torch.where(rays.detach()[..., 2:] < 0, behind, 1.0)
     middle = turn * rays + axis
     half_turn = 2.0 * middle[..., :, None] * middle[..., None, :] / middle.square().sum(-1)[..., None, None]
@@ -149,9 +152,10 @@ def bearing_cameras(rays: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def pinholes(intrinsics: Tensor) -> tuple[Tensor, Tensor]:
-    """Camera matrices (*, 3, 3) scaled to a last entry of 1, and whether they are sound, bool (*).
+    """Scale camera matrices (*, 3, 3) to a last entry of 1, and tell which matrices are valid, bool (*).
 
-    Where an entry is not finite or a focal length is not positive, the identity without gradient is returned.
+    A valid matrix has finite entries and positive focal lengths. An invalid matrix becomes the identity, without
+    gradient.
     """
     scaled = intrinsics.detach() / intrinsics.detach()[..., 2:, 2:]
     sound = scaled.isfinite().all(-1).all(-1) & (scaled.diagonal(dim1=-2, dim2=-1) > 0).all(-1)
@@ -163,7 +167,7 @@ def pinholes(intrinsics: Tensor) -> tuple[Tensor, Tensor]:
 def _through(
     dist: Tensor | None, fisheye: Tensor | None, img_points: Tensor, intrinsics: Tensor
 ) -> tuple[Tensor, Tensor, Callable[[Tensor], Tensor]]:
-    """The points that a lens maps to the pixels, which pixels have such a point, bool (B, N), and the lens."""
+    """Undistorted points (B, N, 2) of pixels, which pixels have such a point, bool (B, N), and the :func:`_lens`."""
     camera, sound = pinholes(intrinsics)
     coefficients = fisheye if dist is None else dist
     if coefficients is not None:
@@ -172,16 +176,16 @@ def _through(
     lens = _lens(coefficients, is_fisheye=dist is None)
     there = img_points.detach().isfinite().all(-1) & sound[:, None]
     x, y = normalize_points_with_intrinsics(torch.where(there[..., None], img_points, 0.0), camera).unbind(-1)
-    skew = camera[:, None, 0, 1] / camera[:, None, 0, 0]  # Kornia ignores it
+    skew = camera[:, None, 0, 1] / camera[:, None, 0, 0]  # Kornia ignores the skew
     point, found = _invert(lens, torch.stack((x - skew * y, y), -1))
     return point, found & there, lens
 
 
 def _lens(coefficients: Tensor | None, *, is_fisheye: bool) -> Callable[[Tensor], Tensor]:
-    """A lens as a map of points (B, N, 2) to the plane z = 1.
+    """A lens: a function from undistorted points (B, N, 2) to distorted points on the plane z = 1.
 
-    For ``dist`` the points are on the undistorted plane z = 1. For a fisheye they are directions: unit vectors in the
-    plane times the angle from the axis, which stay finite at 90 degrees.
+    For ``dist``, undistorted points lie on the plane z = 1. For a fisheye, the length of an undistorted point is the
+    angle from the axis, which is finite at 90 degrees.
     """
     if coefficients is None:
         return lambda point: point
@@ -200,24 +204,22 @@ def _lens(coefficients: Tensor | None, *, is_fisheye: bool) -> Callable[[Tensor]
 
 
 def _angle(point: Tensor) -> tuple[Tensor, Tensor]:
-    """Lengths (B, N, 1) with finite gradients, 1 for points at the centre, and which points are, bool (B, N, 1)."""
+    """Lengths (B, N, 1) of points with finite gradients (1 at the centre), and which points are at the centre, bool."""
     square = point.square().sum(-1, keepdim=True)
     is_central = square.detach() < torch.finfo(point.dtype).eps ** 2
     return torch.where(is_central, 1.0, square).sqrt(), is_central
 
 
 def _flatten(point: Tensor) -> Tensor:
-    """Directions of a fisheye, see :func:`_lens`, on the plane z = 1."""
+    """Project undistorted points of a fisheye (see :func:`_lens`) onto the plane z = 1."""
     angle, is_central = _angle(point)
     return torch.where(is_central, 1.0, angle.tan() / angle) * point
 
 
 def _invert(lens: Callable[[Tensor], Tensor], target: Tensor) -> tuple[Tensor, Tensor]:
-    """Points (B, N, 2) that a lens maps to the target, 0 where there is no solution, and whether there is one.
-
-    A Newton step is at most half as long as the target's distance from the centre. The last two steps carry the
-    gradient to the target and to the coefficients; the second of them makes second derivatives exact.
-    """
+    """Find points (B, N, 2) that a lens maps to ``target`` (no solution: 0), and which targets have a solution."""
+    # A Newton step is at most about half as long as the target's distance from the centre. Two final steps carry the
+    # gradient to the target and to the coefficients. The second final step makes second derivatives exact.
     with torch.no_grad():
         point = target
         longest = 0.5 * (target.norm(dim=-1, keepdim=True) + 1e-3)
@@ -226,7 +228,7 @@ def _invert(lens: Callable[[Tensor], Tensor], target: Tensor) -> tuple[Tensor, T
             point = point + (step * (longest / step.norm(dim=-1, keepdim=True).clamp(min=longest))).nan_to_num(0.0)
         jacobian = _jacobian(lens, point)
         limit = _LARGEST_RESIDUAL * torch.finfo(point.dtype).eps ** 0.5 * (1.0 + target.norm(dim=-1))
-        # Beyond a turning point a polynomial has more solutions, where it mirrors or turns the image.
+        # Beyond its turning point the polynomial has further solutions, at which it mirrors or rotates the image.
         ahead = (torch.linalg.det(jacobian) > 0) & (jacobian.diagonal(dim1=-2, dim2=-1).sum(-1) > 0)
         found = ((target - lens(point)).norm(dim=-1) < limit) & ahead
         point = torch.where(found[..., None], point, 0.0)
@@ -239,17 +241,15 @@ def _invert(lens: Callable[[Tensor], Tensor], target: Tensor) -> tuple[Tensor, T
 
 
 def _jacobian(function: Callable[[Tensor], Tensor], point: Tensor) -> Tensor:
-    """Jacobians (B, N, 2, 2) of a map of each point by itself, by central differences.
-
-    The solution of Newton's method does not depend on their accuracy.
-    """
+    """Jacobians (B, N, 2, 2), by central differences, of a function that maps each point independently."""
+    # Newton's method converges to the same solution with approximate Jacobians.
     size = torch.finfo(point.dtype).eps ** (1 / 3)
     step = size * torch.eye(2, dtype=point.dtype, device=point.device)
     return torch.stack([(function(point + x) - function(point - x)) / (2.0 * size) for x in step], -1)
 
 
 def _inverse(matrices: Tensor) -> Tensor:
-    """Inverses of 2×2 matrices, 0 where there is none."""
+    """Inverses of 2 by 2 matrices; 0 for a singular matrix."""
     (a, b), (c, d) = (row.unbind(-1) for row in matrices.unbind(-2))
     determinant = a * d - b * c
     determinant = torch.where(determinant.abs() > torch.finfo(matrices.dtype).eps, determinant, torch.inf)

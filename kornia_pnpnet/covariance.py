@@ -20,7 +20,8 @@ from kornia_pnpnet.result import Pose, PosePrior
 
 __all__ = ["pose_covariance"]
 
-# An information matrix with a diagonal of 1 and a smaller eigenvalue is singular up to rounding in float64.
+# Least eigenvalue of an information matrix scaled to a unit diagonal. A matrix with a smaller eigenvalue is singular up
+# to rounding in float64.
 _LEAST_EIGENVALUE = 1e-13
 
 
@@ -42,15 +43,16 @@ def pose_covariance(
     r"""First-order covariance of a pose found by weighted least squares.
 
     The covariance is :math:`(\sum_i w_i J_i^\top \Sigma_i^{-1} J_i)^{-1}`. :math:`J_i` is the Jacobian of pixel
-    :math:`i` by the tangent :math:`(\omega, v)` of :func:`~kornia_pnpnet.refine.residual.retract`: when
-    :math:`(R, t)` is the true pose, the estimate is about :math:`(\mathrm{cay}(\omega) R,\; t + v)`.
-    :math:`\Sigma_i` is the :func:`~kornia_pnpnet.refine.residual.pixel_covariance`, of isotropic noise the
-    :func:`~kornia_pnpnet.refine.residual.pixel_variance`. The computation runs in float64. Gradients flow to the pose,
-    the points, the camera, the noise and the weights.
+    :math:`i` by the tangent vector :math:`(\omega, v)` of :func:`~kornia_pnpnet.refine.residual.retract`: if
+    :math:`(R, t)` is the true pose, the estimated pose is about :math:`(\mathrm{cay}(\omega) R,\; t + v)`.
+    :math:`\Sigma_i` is the covariance of the pixel, :func:`~kornia_pnpnet.refine.residual.pixel_covariance` (for
+    isotropic noise :func:`~kornia_pnpnet.refine.residual.pixel_variance`). The computation runs in float64. Gradients
+    flow to the pose, the points, the camera, the noise and the weights.
 
-    A robust kernel gives most inliers a weight below 1, but an M-estimate is hardly less accurate for it (P. Huber,
-    "Robust Statistics", 1981). So :math:`w_i` is the weight over the mean weight of an inlier,
-    :math:`\bar w = \sum_i w_i^2 / \sum_i w_i`, at most 1: a common factor of the weights does not matter.
+    A robust kernel gives most inliers a weight below 1, but an M-estimate is hardly less accurate than least squares on
+    the inliers (P. Huber, "Robust Statistics", 1981). Therefore :math:`w_i` is the ratio of the pair's weight to the
+    mean weight of an inlier, :math:`\bar w = \sum_i w_i^2 / \sum_i w_i`, clipped to at most 1. A common factor of the
+    weights has no effect.
 
     Args:
         pose: the estimated world-to-camera pose, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
@@ -61,22 +63,23 @@ def pose_covariance(
         world_sigma: see ``PnPNet.forward``. World points are exact without this and ``world_cov``.
         img_cov: see ``PnPNet.forward``.
         world_cov: see ``PnPNet.forward``.
-        weights: weight of each pair, 0 for outliers, shape :math:`(B, N)`: the ``weights`` of a result. Those of
-            `p3p-ransac` with a ``world_threshold`` also depend on the depth: pass ``(result.weights > 0).double()``.
-            ``None``: 1 for every pair.
-        prior: the prior that the pose was found with; its information adds to that of the pairs.
-        focal: ``"known"``, or ``"unknown"``: the pose was found together with the focal length of the ``intrinsics``,
-            which are then the ``intrinsics`` of the result.
-        focal_sigma: the option of the solver with an unknown focal length; its information adds to that of the pairs.
+        weights: weight of each pair, 0 for outliers, shape :math:`(B, N)`, such as the ``weights`` of a result. The
+            weights of ``p3p-ransac`` with a ``world_threshold`` also depend on the depth; pass
+            ``(result.weights > 0).double()`` instead. ``None``: 1 for every pair.
+        prior: the prior of the solver's call. Its information is added to the information of the pairs.
+        focal: ``"known"``; or ``"unknown"`` if the solver estimated the focal length. ``intrinsics`` must then be the
+            ``intrinsics`` of the result.
+        focal_sigma: ``focal_sigma`` of the solver. Its information is added to the information of the pairs.
 
     Returns:
-        Shape :math:`(B, 6, 6)`, with an unknown focal length :math:`(B, 7, 7)`, whose last row and column are of the
-        logarithm of the focal length; in radians and the unit of the world, in the dtype of a solver's result. Where
-        the pairs do not determine the pose, or a solver would refuse the problem, the diagonal is infinite and all
-        other entries are 0.
+        Shape :math:`(B, 6, 6)` in radians and the unit of the world, in the dtype of a solver's result. With an unknown
+        focal length the shape is :math:`(B, 7, 7)`, and the last row and column belong to the logarithm of the focal
+        length. If the pairs do not determine the pose, or a solver would refuse the problem, the diagonal is infinite
+        and all other entries are 0.
 
     Raises:
-        BaseError: see ``PnPNet.forward``; without the noise of the pixels, or for another ``focal``.
+        BaseError: see ``PnPNet.forward``; also without the noise of the pixels, for another value of ``focal``, or for
+            ``focal_sigma`` with a known focal length.
 
     Example:
         >>> from kornia_pnpnet.data import SyntheticProblems
@@ -98,7 +101,7 @@ def pose_covariance(
         prior=prior,
     )
     dtype, inputs = inputs.world_points.dtype, map_tensors(torch.Tensor.double, inputs)
-    # Coordinates in which the matrix is well conditioned: centroid 0 and spread 1.
+    # The information matrix is well conditioned in the frame with the centroid 0 and the spread 1.
     problem, frame = Normalize(order=False)(*inputs[:5], inputs.noise)
     assert inputs.init is not None
     assert problem.noise is not None
@@ -125,12 +128,12 @@ def pose_covariance(
         determined = (determined & is_definite & correlation.isfinite().all((1, 2)))[:, None, None]
     inverse = torch.linalg.inv_ex(torch.where(determined, information, eye)).inverse
 
-    # Back to the given coordinates: omega stays, v = v_framed / scale + (R centroid) x omega.
+    # Back to the caller's world: omega does not change, v = v_framed / scale + (R centroid) x omega.
     rotated_centroid = (pose.rotation @ frame.centroid[..., None])[..., 0]
     back = eye.repeat(len(information), 1, 1)
     back[:, 3:6, :3] = So3.hat(rotated_centroid)
     back[:, 3:6, 3:6] /= frame.scale[:, None, None]
-    if size_of_camera:  # the depth of the centroid grows with the focal length, see `moved`
+    if size_of_camera:  # the depth of the centroid grows with the focal length, see `refine.residual.moved`
         back[:, 5, 6] = pose.translation[:, 2] + rotated_centroid[:, 2]
     covariance = back @ torch.where(determined, inverse, 0.0) @ back.mT
     covariance = torch.where(determined, covariance, torch.where(eye > 0, torch.inf, 0.0))
@@ -138,7 +141,7 @@ def pose_covariance(
 
 
 def _inlier_probability(weights: Tensor) -> Tensor:
-    """Weights over the mean weight of an inlier, at most 1, see :func:`pose_covariance`."""
+    """Ratios of the weights to the mean weight of an inlier, clipped to at most 1, see :func:`pose_covariance`."""
     total = weights.sum(-1, keepdim=True)
     mean = weights.square().sum(-1, keepdim=True) / torch.where(total > 0, total, 1.0)
     return (weights / torch.where(mean > 0, mean, 1.0)).clamp(max=1.0)

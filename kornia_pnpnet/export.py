@@ -35,12 +35,12 @@ __all__ = [
 
 
 class ExportedResult(NamedTuple):
-    """What an exported solver returns: fields of :class:`~kornia_pnpnet.result.PnPResult`.
+    """The outputs of an exported solver: some fields of :class:`~kornia_pnpnet.result.PnPResult`.
 
     Attributes:
         rotation: shape :math:`(B, 3, 3)`.
         translation: shape :math:`(B, 3)`.
-        pair_weights: the result's ``weights``, shape :math:`(B, N)`. ONNX requires another name than that of the input.
+        pair_weights: the result's ``weights``, shape :math:`(B, N)`. ONNX forbids an output with the name of an input.
         cost: shape :math:`(B,)`.
         ok: bool, shape :math:`(B,)`.
     """
@@ -53,7 +53,7 @@ class ExportedResult(NamedTuple):
 
 
 class ExportedCamera(NamedTuple):
-    """An :class:`ExportedResult` and ``camera``: the result's ``intrinsics``, shape :math:`(B, 3, 3)`."""
+    """The fields of :class:`ExportedResult`, and ``camera``: the result's ``intrinsics``, shape :math:`(B, 3, 3)`."""
 
     rotation: Tensor
     translation: Tensor
@@ -63,16 +63,16 @@ class ExportedCamera(NamedTuple):
     camera: Tensor
 
 
-#: Names of the inputs of an exported solver in their order, all float32.
+#: Names of the inputs of an exported solver, in order. All inputs are float32.
 INPUTS = ("world_points", "img_points", "intrinsics", "weights")
 #: Names of the inputs of a solver that was exported for rigs.
 RIG_INPUTS = (*INPUTS, "rig_rotation", "rig_translation")
 #: Names of the outputs with known focal lengths: the fields of :class:`ExportedResult`.
 OUTPUTS = ExportedResult._fields
-#: Upper bounds of the dynamic dimensions: torch.export simplifies its guards with finite ranges.
+# Upper bounds of the dynamic dimensions. With finite ranges torch.export can simplify its guards.
 _MAX_BATCH = 2**20
 _MAX_N = 2**16
-# Metadata of a package: the sizes that it was compiled for, and whether it solves rigs.
+# Keys of the metadata of a package, and the value of a size that is not fixed.
 _BATCH, _N, _ANY, _RIG = "pnpnet_batch", "pnpnet_n", "any", "pnpnet_rig"
 
 
@@ -95,25 +95,27 @@ class _Graph(nn.Module):
 def export_program(
     solver: PnPNet, n: int | None = None, *, batch: int | None = None, rig: bool = False
 ) -> torch.export.ExportedProgram:
-    r"""Trace a solver for batches of any size or of one size.
+    r"""Trace a solver with ``torch.export``.
 
     Args:
-        solver: any solver but RANSAC. The program always has the fixed effort.
-        n: number of correspondences per problem. With ``None`` the n of the network, or any n of at least 4 when the
-            network accepts any n.
-        batch: number of problems of each call, which a compiler can specialise for; ``None``: any number.
-        rig: export for rigs: several cameras with one pose.
+        solver: a solver whose initialiser is not RANSAC. The program always uses ``effort="fixed"``.
+        n: number of pairs per problem. ``None``: the number that the network was built for, or any number of at least 4
+            if the network accepts any number.
+        batch: number of problems in each call. A compiler can optimise for a fixed number. ``None``: any number.
+        rig: whether to export the solver for rigs (several cameras with one pose).
 
     Returns:
-        A program that maps :data:`INPUTS` to the fields of :class:`ExportedResult`, with an unknown focal length to
-        those of :class:`ExportedCamera`. The inputs are world points :math:`(B, N, 3)`, pixels :math:`(B, N, 2)`,
-        camera matrices :math:`(B, 3, 3)` and weights :math:`(B, N)`, 0 for padding. For rigs they are
-        :data:`RIG_INPUTS`: camera matrices :math:`(B, N, 3, 3)`, and ``cam_from_rig`` of ``PnPNet.forward``.
+        A program that maps :data:`INPUTS` to the fields of :class:`ExportedResult`, or of
+        :class:`ExportedCamera` if the focal length is unknown. The inputs are world points :math:`(B, N, 3)`, pixels
+        :math:`(B, N, 2)`, camera matrices :math:`(B, 3, 3)` and weights :math:`(B, N)`, 0 for padding. A program for
+        rigs takes :data:`RIG_INPUTS`: camera matrices have the shape :math:`(B, N, 3, 3)`, and the last two inputs are
+        ``cam_from_rig`` of ``PnPNet.forward``.
 
     Raises:
-        BaseError: when ``n`` is less than 3 or not the n of the network, or ``batch`` less than 1.
-        ValueCheckError: when the solver cannot be traced, or ``rig`` is given with an unknown focal length or without
-            an initialiser.
+        BaseError: when ``n`` is less than 3 or not the number that the network was built for, or when ``batch`` is less
+            than 1.
+        ValueCheckError: when the solver cannot be traced, or when ``rig`` is true and the focal length is unknown or
+            the solver has no initialiser.
 
     Example:
         >>> from kornia_pnpnet import MLPInit, RobustWeightedLM
@@ -151,7 +153,7 @@ def export_program(
 
 
 def _fixed_n(solver: PnPNet, n: int | None) -> int | None:
-    """The number of pairs of a program; ``None``: any."""
+    """The fixed number of pairs of a program; ``None``: any number."""
     config: Any = getattr(solver.init, "config", {})
     return int(config["n"]) if trait(solver.init, "fixed_pairs") else n
 
@@ -165,25 +167,26 @@ def export_package(
 ) -> Path:
     """Compile a solver ahead of time with AOTInductor.
 
-    :func:`load_package` loads the package without tracing or compiling, and C++ loads it with libtorch alone. A package
-    runs on CPUs that have the instructions of the one that compiled it (AVX2, AVX-512), on one thread, with the version
-    of PyTorch that made it. Compiling takes minutes and needs a C++ compiler and PyTorch 2.6 or later.
+    :func:`load_package` loads the package without tracing or compiling. C++ programs load the package with libtorch
+    alone. A package runs on one thread. The CPU must have the instruction sets (AVX2, AVX-512) of the CPU that
+    compiled the package, and the version of PyTorch must be the same. Compiling takes minutes and needs a C++ compiler
+    and PyTorch 2.6 or later.
 
     Args:
         solver: See export_program.
         path: the file to write, ``.pt2``. An existing file is replaced when the package is complete.
         n: See export_program.
-        batch: See export_program. With 1 and a fixed number of correspondences, a problem takes a fraction of the
-            time. Load such a package with :func:`load_package`: with PyTorch's own loader, each call overwrites the
-            result of the previous call on the same thread.
+        batch: See export_program. A package for ``batch=1`` and a fixed number of pairs solves one problem in a
+            fraction of the time of other packages. Load such a package with :func:`load_package`: with PyTorch's own
+            loader, each call overwrites the result of the previous call on the same thread.
         rig: See export_program.
 
     Returns:
         The path.
 
     Raises:
-        BaseError: See export_program; or when the name does not end in ``.pt2``.
-        ImportError: without a C++ compiler.
+        BaseError: See export_program; also when the name does not end in ``.pt2``.
+        ImportError: when no C++ compiler is installed.
     """
     path = Path(path)
     if path.suffix != ".pt2":
@@ -200,7 +203,8 @@ def export_package(
     program = export_program(solver, n, batch=batch, rig=rig)
     pairs = _fixed_n(solver, n)
     metadata = {_BATCH: str(batch or _ANY), _N: str(pairs or _ANY), _RIG: str(rig)}
-    # One problem mostly waits for calls and allocations. For more problems calls take less time.
+    # Calls and allocations take most of the time of one problem, and inlined operators avoid both. For more problems,
+    # calls are faster than inlined operators.
     inline = batch == 1 and pairs is not None
     options = {**package_options(pairs, on_stack=inline), "aot_inductor.metadata": metadata}
     content = io.BytesIO()
@@ -216,12 +220,12 @@ def export_package(
 class PackagedSolver:
     """A solver that :func:`export_package` compiled. Results have no gradients.
 
-    Calls compute in float32 on the CPU and convert inputs of any dtype, device and memory layout.
+    Calls compute in float32 on the CPU. Inputs of any dtype, device and memory layout are converted.
 
     Attributes:
-        batch: number of problems of each call; ``None``: any number.
-        n: number of correspondences per problem; ``None``: any number of at least 4.
-        rig: whether problems are those of rigs.
+        batch: number of problems in each call; ``None``: any number.
+        n: number of pairs per problem; ``None``: any number of at least 4.
+        rig: whether the package solves problems of rigs.
     """
 
     def __init__(self, loader: torch._C._aoti.AOTIModelPackageLoader) -> None:
@@ -239,11 +243,11 @@ class PackagedSolver:
         *,
         cam_from_rig: Pose | None = None,
     ) -> ExportedResult | ExportedCamera:
-        """Solve a batch of problems. See PnPNet.forward; only a package for rigs takes, and needs, ``cam_from_rig``.
+        """Solve a batch of problems. See PnPNet.forward. A package for rigs requires ``cam_from_rig``.
 
         Raises:
-            ShapeError: for other shapes; compiled code would read beyond the end of a tensor.
-            ValueCheckError: for a rig without a package for rigs, or the other way round.
+            ShapeError: when a shape is not that of the package: compiled code would read beyond the end of a tensor.
+            ValueCheckError: when ``cam_from_rig`` is missing for a package for rigs, or given to any other package.
         """
         if self.rig != (cam_from_rig is not None):
             raise ValueCheckError(f"This package {'needs' if self.rig else 'does not take'} cam_from_rig.")
@@ -255,7 +259,7 @@ class PackagedSolver:
         shapes = (batch, n, 3), (batch, n, 2), cameras, (batch, n), (batch, n, 3, 3), (batch, n, 3)
         inputs = world_points, img_points, intrinsics, weights, *(cam_from_rig or ())
         check_shapes(dict(zip(RIG_INPUTS, zip(inputs, shapes, strict=False), strict=False)))
-        # Compiled code does not look at dtypes and strides, and may write the next result over this one.
+        # Compiled code does not check dtypes and strides. Results are copied, because the next call may overwrite them.
         results = self._run([x.to("cpu", torch.float32).contiguous() for x in inputs])
         return (ExportedResult if len(results) == len(OUTPUTS) else ExportedCamera)(*[x.clone() for x in results])
 
@@ -267,12 +271,12 @@ def load_package(path: str | Path) -> PackagedSolver:
 
     Raises:
         OSError: when the file cannot be read.
-        ValueCheckError: when the file is not a package of :func:`export_package`, or of another platform.
+        ValueCheckError: when the file is not a package of :func:`export_package` for this platform.
     """
     Path(path).open("rb").close()
     try:
-        # `torch._inductor.aoti_load_package` is the same, but imports the compiler first, which takes seconds, and
-        # parses the signature in each call.
+        # `torch._inductor.aoti_load_package` is not used: it imports the compiler, which takes seconds, and parses the
+        # signature in each call.
         return PackagedSolver(torch._C._aoti.AOTIModelPackageLoader(str(path), "model", False, 1, -1))
     except (RuntimeError, KeyError, ValueError) as error:
         message = f"'{path}' is not a solver of export_package for this machine: {_reason(error)}"
@@ -284,14 +288,14 @@ def export_onnx(
 ) -> Path:
     """Write a solver as an ONNX model in one file. ONNX Runtime runs the model without PyTorch.
 
-    See :func:`export_program` for the arguments and their errors, and for the inputs and outputs of the model. The file
-    ``path`` is replaced when the model is complete.
+    See :func:`export_program` for the arguments and their errors, and for the inputs and outputs of the model. An
+    existing file ``path`` is replaced when the model is complete.
 
     Returns:
         The path.
 
     Raises:
-        ImportError: without the extra ``onnx``.
+        ImportError: when the extra ``onnx`` is not installed.
     """
     try:
         import onnxscript  # noqa: F401
@@ -309,7 +313,7 @@ def export_onnx(
     graph = model.model_proto
     batches = {value.type.tensor_type.shape.dim[0].dim_param for value in graph.graph.input}
     if batch is None and not batches.isdisjoint({"", *map(str, range(10))}):
-        # The exporter replaced the batch size by that of the example inputs.
+        # The exporter fixed the batch size to that of the example inputs.
         raise ValueCheckError(f"{type(solver.init).__name__} cannot be exported to ONNX for batches of any size.")
     with atomic_open(path, "wb") as file:
         file.write(graph.SerializeToString())
@@ -317,10 +321,9 @@ def export_onnx(
 
 
 def _simplify(model: Any) -> None:
-    """Simplify as ``torch.onnx.export(optimize=True)`` does, but without its rewrite rules.
-
-    For the thousands of nodes of a solver the rules take nine tenths of the time and remove a twentieth of the nodes.
-    """
+    """Simplify a model by the passes of ``torch.onnx.export(optimize=True)``, without its rewrite rules."""
+    # A solver has thousands of nodes. The rewrite rules would take nine tenths of the time of all passes, and remove a
+    # twentieth of the nodes.
     from onnx_ir.passes import Sequential, common
     from onnxscript import optimizer
 

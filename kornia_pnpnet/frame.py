@@ -1,8 +1,8 @@
-r"""Into the solver's frame and back.
+r"""Normalisation of problems: the transform from the caller's frame to the solver's frame, and its inverse.
 
-Pixels become those of a camera with the focal length ``f_const`` and the principal point 0. The pairs may be ordered
-by their pixels, as in the paper. The world may be centred and scaled, which makes the solved pose equivariant to
-similarity transforms of the world. Every step has an exact inverse on the pose.
+Pixels become pixels of a camera with the focal length ``f_const`` and the principal point 0. Pairs can be sorted by
+their pixels, as in the paper. The world can be centred and scaled, so that the solved pose is equivariant to
+translations and scalings of the world. Every step has an exact inverse on the pose.
 """
 
 from __future__ import annotations
@@ -25,28 +25,30 @@ from kornia_pnpnet.result import Pose, Status, gate_pose
 
 __all__ = ["F_CONST", "Frame", "Normalize"]
 
-#: Focal length of the normalised camera in pixels (the cameras of ETH3D have 3400 to 3430).
+#: Pixels. Focal length of the normalised camera (cameras of ETH3D have focal lengths of 3400 to 3430).
 F_CONST = 3400.0
-# A point further from the median of the points than this number of typical distances does not count for centre and
-# scale. With fewer than 12 pairs the larger number holds, because few pairs say little about a typical distance.
+# Typical distances (see `Normalize`). Points further than 5 typical distances from the median of the points do not
+# count for centre and scale. With fewer than 12 pairs the limit is 25, because few points give an inaccurate typical
+# distance.
 _FAR, _MANY, _FAR_OF_FEW = 5.0, 12, 25.0
-# Typical distances from the median. A float32 has too few digits for points further away.
+# Typical distances from the median. Points further away lose their weight: float32 has too few digits for them.
 _LARGEST_DISTANCE = 1e6
-# Tangent of 85 degrees, a larger angle than a lens without distortion can show.
+# Tangent of 85 degrees. A lens without distortion cannot show larger angles from the axis.
 _FAR_ANGLE = 11.4
 
 
 class Frame(NamedTuple):
-    r"""How :class:`Normalize` moved and ordered problems.
+    r"""The changes of frame and order that :class:`Normalize` applied to problems.
 
     Attributes:
         centroid: the world point that became the origin, shape :math:`(B, 3)`.
         scale: factor of world lengths, shape :math:`(B,)`.
-        img_scale: factor of pixels, the geometric mean of both axes, shape :math:`(B,)`.
+        img_scale: factor of pixels, the geometric mean over both axes (in a rig its mean over the pairs), shape
+            :math:`(B,)`.
         order: position in the input of each normalised pair, int64, shape :math:`(B, N)`; ``None``: unchanged.
-        status: ``Status.SOLVED`` where the problem is valid, else the reason, int64, shape :math:`(B,)`.
-        intrinsics: the camera matrices with a last entry of 1, the identity where they are impossible, shape
-            :math:`(B, 3, 3)`, of a rig :math:`(B, N, 3, 3)`.
+        status: ``Status.SOLVED`` for a valid problem, else why the problem is invalid, int64, shape :math:`(B,)`.
+        intrinsics: the camera matrices with a last entry of 1, shape :math:`(B, 3, 3)`, in a rig
+            :math:`(B, N, 3, 3)`. The identity replaces matrices that are no pinhole cameras.
     """
 
     centroid: Tensor
@@ -69,18 +71,18 @@ class Frame(NamedTuple):
     def undo(self, pose: Pose) -> Pose:
         r"""Express a pose in the caller's world, the inverse of :meth:`apply`: :math:`(R,\; t / s - R c)`.
 
-        There may be several poses of each problem, :math:`(B, S, 3, 3)` and :math:`(B, S, 3)`.
+        Each problem may have several poses, :math:`(B, S, 3, 3)` and :math:`(B, S, 3)`.
         """
         more = (1,) * (pose.translation.ndim - 2)
         offset = (pose.rotation * self.centroid.view(-1, *more, 1, 3)).sum(-1)
         return Pose(pose.rotation, pose.translation / self.scale.view(-1, *more, 1) - offset)
 
     def undo_pairs(self, values: Tensor) -> Tensor:
-        """Bring values of pairs, :math:`(B, N)`, back to the order in which the pairs came."""
+        """Reorder values of pairs, :math:`(B, N)`, from the normalised order to the caller's order."""
         return values if self.order is None else torch.zeros_like(values).scatter(1, self.order, values)
 
     def undo_starts(self, starts: Starts) -> Starts:
-        """Express starts in the frame, order and units of the inputs; ``ok``: whether the problem is valid."""
+        """Express starts in the caller's frame, order and units. The new ``ok`` is :attr:`valid`."""
         noise = starts.noise
         if noise is not None:
             noise = Noise(noise.img / self.img_scale[:, None], noise.world / self.scale[:, None])
@@ -89,33 +91,34 @@ class Frame(NamedTuple):
         return Starts(self.undo(starts.pose), self.undo_pairs(starts.weights), self.valid, others, noise)
 
     def start(self, init: Pose | None) -> Pose:
-        """A caller's pose in the frame of the problem; the identity for ``None`` and where it is not finite."""
+        """Express the caller's pose in the frame of the problem. ``None`` and non-finite poses become the identity."""
         eye = torch.eye(3, dtype=self.scale.dtype, device=self.scale.device).expand(self.scale.shape[0], 3, 3)
         init = Pose(eye, torch.zeros_like(self.centroid)) if init is None else init
-        limit = torch.finfo(eye.dtype).max ** 0.25  # as for points: below it, squares of squares are finite
+        limit = torch.finfo(eye.dtype).max ** 0.25  # fourth powers of numbers below this limit are finite
         usable = self.valid & (torch.cat((init.rotation.flatten(1), init.translation), 1).abs().amax(-1) < limit)
         return self.apply(gate_pose(init, usable, usable))
 
 
 class Normalize(Configured):
-    r"""Normalise cameras, order and world frame.
+    r"""Normalise the cameras, the order of the pairs, and the world frame of problems.
 
     A problem is *valid* when its numbers are finite, its weights are not negative, at least three pairs have a weight,
-    its camera is a pinhole (any multiple of its matrix, with or without skew), and its points do not lie on one line or
-    coincide. The inputs of invalid problems are replaced by zeros, which keeps all later values and gradients finite. A
-    pair without weight is padding: its numbers do not matter.
+    its camera is a pinhole camera (any multiple of a camera matrix, with or without skew), and its points do not
+    coincide or lie on one line. The inputs of invalid problems are replaced by zeros, so that all later values and
+    gradients are finite. A pair of weight 0 is padding, and its other numbers are ignored.
 
-    Centroid and scale are those of the *usual* pairs, so that bad triangulations and bad detections do not spoil the
-    frame. A usual pair is less than 85° off the camera's axis, and its point is at most five typical distances from the
-    median of the points; two thirds of the pairs are within one typical distance. Pairs beyond a million typical
-    distances, or too close to 90° to be seen, lose their weight.
+    Centroid and scale are computed from the *usual* pairs, so that bad triangulations and bad detections do not spoil
+    the frame. The pixel of a usual pair is less than 85° off the camera's axis. The point of a usual pair is at most
+    five typical distances from the median of the points (25 with fewer than 12 pairs). Two thirds of the points are
+    within one typical distance of the median. A pair loses its weight when its point is more than a million typical
+    distances from the median, or when its pixel is almost 90° off the axis.
 
     Args:
         f_const: focal length of the normalised camera in pixels.
-        order: sort the pairs by their horizontal pixel coordinate, ties by the vertical one (the paper's input
-            order). Pairs without weight come last.
+        order: sort the pairs by their horizontal pixel coordinate, and ties by their vertical pixel coordinate (the
+            paper's input order). Pairs that are not usual, and padding, come last.
         center: move the centroid of the world points to the origin.
-        scale: scale the world to a root mean square distance of 1 from the origin.
+        scale: scale the world so that the root mean square distance of the usual points from the origin is 1.
 
     Raises:
         BaseError: when ``f_const`` is not a positive number.
@@ -156,17 +159,18 @@ class Normalize(Configured):
         Args:
             world_points: shape :math:`(B, N, 3)`.
             img_points: pixels, shape :math:`(B, N, 2)`.
-            intrinsics: shape :math:`(B, 3, 3)`, or of each pair in a rig, :math:`(B, N, 3, 3)`.
+            intrinsics: shape :math:`(B, 3, 3)`; in a rig one matrix for each pair, :math:`(B, N, 3, 3)`.
             weights: at least 0, shape :math:`(B, N)`; 1 when ``None``.
             mask: False where a pair is padding, bool, shape :math:`(B, N)`.
-            noise: standard deviations in pixels and in the unit of the world, NaN where unknown, or covariances in
-                their squares.
+            noise: standard deviations in pixels and in the unit of the world, NaN where unknown; covariances in the
+                squares of these units.
             confidence: the caller's belief that a pair is an inlier, in [0, 1], shape :math:`(B, N)`; NaN where
                 unknown.
-            rig: the camera of each pair in the frame of a rig, :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`.
+            rig: the transform from a rig to the camera of each pair, :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`.
 
         Returns:
-            The problem in its frame, with the problems last in memory, and the :class:`Frame` that undoes it.
+            The normalised problem, with the batch as the last dimension in memory, and the :class:`Frame` that undoes
+            the normalisation.
         """
         batch, count = world_points.shape[:2]
         padded = weights is not None or mask is not None
@@ -174,24 +178,24 @@ class Normalize(Configured):
             weights = world_points.new_ones(batch, count) if mask is None else mask.to(world_points.dtype)
         else:
             weights = weights if mask is None else torch.where(mask, weights, 0.0)
-        # From here on problems are the last dimension: coordinates and weight of each pair, (6, N, B), and the entries
-        # of each camera, (9, B), of which fx, fy = [:5:4] and cx, cy = [2:6:3].
+        # From here on the batch is the last dimension. `rows` (6, N, B) holds the coordinates and the weight of each
+        # pair. `camera` (9, B) holds the entries of each matrix: fx, fy = camera[:5:4] and cx, cy = camera[2:6:3].
         rows = torch.cat((world_points.permute(2, 1, 0), img_points.permute(2, 1, 0), weights.mT[None]))
         zero, one = rows.new_zeros(1, batch), rows.new_ones(1, batch)
-        # Of a rig the entries of each pair's camera, (9, N, B).
+        # In a rig `cameras` holds the entries of each pair's matrix, (9, N, B).
         cameras = intrinsics.flatten(-2)
         cameras, is_camera = _pinhole((cameras.mT if intrinsics.ndim == 3 else cameras.permute(2, 1, 0)).contiguous())
         camera = cameras[:, None] if intrinsics.ndim == 3 else cameras  # (9, 1 or N, B)
 
-        # Make inputs safe before computing with them: between this limit and its inverse, squares of squares neither
-        # overflow nor vanish. NaN compares false.
+        # Make inputs safe before computing with them: fourth powers of numbers between this limit and its inverse
+        # neither overflow nor underflow. NaN compares false.
         limit = torch.finfo(rows.dtype).max ** 0.25
         there = rows[5] != 0
         sizes = rows.detach().abs()
         if padded:
             sizes = torch.where(there, sizes, zero)
-        size = sizes[:5].amax(0)  # of each pair
-        # Sums, because the maximum of ONNX Runtime leaves NaN out.
+        size = sizes[:5].amax(0)  # largest coordinate of each pair
+        # A sum, because a maximum in ONNX Runtime ignores NaN.
         is_finite = sizes.sum((0, 1)) < torch.inf
         if padded:
             is_finite = is_finite & ((rows[5] >= 0) & (rows[5] < limit)).all(0)
@@ -211,11 +215,11 @@ class Normalize(Configured):
             is_finite = is_finite & (is_probability | ~there.mT).all(-1)
             confidence = torch.where(is_probability & there.mT, confidence, torch.nan)
         there = there & (is_camera & is_finite) & (size < limit)
-        rows = torch.where(there, rows, zero)  # finite, so that products with 0 are 0 from here on
+        rows = torch.where(there, rows, zero)  # all numbers are finite now, so that products with 0 are 0
         focal = rows.new_full((), self.f_const)  # made on the device, so that a GPU need not wait for the CPU
         img_scales = focal / camera[:5:4]  # (2, 1 or N, B)
 
-        # A pair far off is no reason to refuse the problem: beyond any angle or distance it is an outlier.
+        # A pair at an impossible angle or distance is an outlier: it loses its weight, but the problem stays valid.
         pixels = (rows[3:5] - camera[2:6:3]) * img_scales
         tangent = pixels.detach().abs().amax(0) / self.f_const
         sq_distance, typical = _distances(rows[:3].detach(), there, padded)
@@ -223,10 +227,10 @@ class Normalize(Configured):
         number = there.sum(0)
         far = torch.where(number < _MANY, _FAR_OF_FEW**2, _FAR**2) * typical
         seen = there & (tangent <= _FAR_ANGLE)
-        usual = (seen | (there & (seen.sum(0) <= MIN_PAIRS))) & (sq_distance <= far)  # a wide angle may be right
+        usual = (seen | (there & (seen.sum(0) <= MIN_PAIRS))) & (sq_distance <= far)  # of few pairs, wide angles count
         is_usual, is_there = usual.to(rows.dtype), there.to(rows.dtype)
 
-        # Centre and scale by the pairs of normal scale.
+        # Centre and scale by the usual pairs.
         share = is_usual.sum(0).clamp(min=1.0).reciprocal()
         usual_points = rows[:3] * is_usual
         mean = usual_points.sum(1) * share
@@ -245,7 +249,7 @@ class Normalize(Configured):
         ):
             status = torch.where(fine, status, otherwise.value)
         valid = status == Status.SOLVED.value
-        # The skew is 0 for pairs that are left out, whose pixels may be so large that products overflow.
+        # Pairs that lost their weight get the skew 0: their pixels can be so large that the product would overflow.
         without_skew = torch.addcmul(pixels[:1], camera[1] / camera[0] * is_there, pixels[1:], value=-1)
         world = (rows[:3] - centroid[:, None]) * scale
         # An invalid problem becomes zeros, without gradient.
@@ -263,13 +267,13 @@ class Normalize(Configured):
         matrices = torch.where(is_camera, cameras, eye)
         matrices = (matrices.mT if intrinsics.ndim == 3 else matrices.permute(2, 1, 0)).unflatten(-1, (3, 3))
         mean_scale = img_scale[0]
-        if rig is not None:  # 1 where no pair is there
+        if rig is not None:  # a problem without pairs gets the scale 1
             share = is_there / is_there.sum(0).clamp(min=1.0)
             mean_scale = torch.where(there.any(0), (img_scale * share).sum(0), 1.0)
         frame = Frame(centroid.mT, scale, mean_scale, order, status, matrices)
         if noise is not None:
-            # Unknown sigmas, NaN, and those of invalid problems are replaced before they are scaled: the gradient of
-            # the scale would be NaN.
+            # Sigmas that are unknown (NaN) or impossible are replaced before the multiplication: otherwise the gradient
+            # of the scale would be NaN.
             known = [has_noise[:, None] & ~sigma.isnan() for sigma in noise[:2]]
             scaled = [
                 torch.where(is_known, torch.where(is_known, sigma, 0.0) * unit, torch.nan)
@@ -291,10 +295,8 @@ class Normalize(Configured):
         return Problem(world_points, img_points, weights[..., 0], focal, *scales, noise, confidence, rig), frame
 
     def _scaled_covariances(self, noise: Noise, sound: Tensor, pixel_map: Sequence[Tensor], scale: Tensor) -> Noise:
-        """Covariances in the units of the problem, raised above rounding; 0 where not ``sound``.
-
-        Pixels are multiplied by the matrix [[a, b], [0, d]] with the entries of ``pixel_map``, (B, 1) or (B, N) each.
-        """
+        """Covariances in the units of the problem, raised above rounding; 0 for pairs that are not ``sound``."""
+        # `pixel_map` holds the entries a, b, d of the matrix [[a, b], [0, d]] that multiplies pixels.
         img_cov, world_cov = map_tensors(lambda x: torch.where(sound, x, 0.0), (noise.img_cov, noise.world_cov))
         if img_cov is not None:
             img_cov = img_cov.mapped(*pixel_map).at_least((LEAST_NOISE * self.f_const) ** 2)
@@ -304,25 +306,17 @@ class Normalize(Configured):
 
 
 def _is_usable(noise: Noise, there: Tensor) -> Tensor:
-    """Whether the noise of all pairs is possible, bool (B,).
-
-    Standard deviations are finite and not negative, or unknown; covariances of pairs that are there, bool (N, B), are
-    finite and positive semi-definite.
-    """
+    """Whether all sigmas (NaN: unknown), and the covariances of pairs that are ``there``, are possible, bool (B,)."""
     usable = [((x >= 0) | x.isnan()).all(-1) & ~x.isinf().any(-1) for x in (noise.img, noise.world)]
     return torch.stack([*usable, *((are_semi_definite(x) | ~there.mT).all(-1) for x in noise.covariances)]).all(0)
 
 
 def _pinhole(camera: Tensor) -> tuple[Tensor, Tensor]:
-    """Cameras (9, B) scaled to a last entry of 1, and whether they are pinhole cameras, bool (B,).
-
-    A pinhole camera has positive focal lengths and any skew; the entries below the diagonal are 0. Any multiple of its
-    matrix is the same camera. Other matrices become ones.
-    """
+    """Scale camera matrices (9, B) to a last entry of 1, and tell which are pinhole cameras; others become all ones."""
     limit = torch.finfo(camera.dtype).max ** 0.25
     entries = camera.detach()
     scaled = entries / entries[8:]
-    # A sum below the limit bounds each term; NaN compares false.
+    # A sum of absolute values below the limit bounds each term. NaN compares false.
     largest = torch.cat((entries, entries[8:].reciprocal(), scaled, scaled[:5:4].rsqrt())).abs().sum(0)
     below_diagonal = torch.cat((entries[3:4], entries[6:8])).any(0)
     fine = (largest < limit) & ~below_diagonal
@@ -331,13 +325,11 @@ def _pinhole(camera: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _distances(points: Tensor, there: Tensor, padded: bool) -> tuple[Tensor, Tensor]:
-    """Squared distances (N, B) from the median of the points (3, N, B), and the distance that two thirds stay below.
-
-    The typical distance (B,) is squared, too, and infinite where two thirds of the points coincide.
-    """
+    """Squared distances (N, B) of points (3, N, B) from their median, and the squared typical distance (B,)."""
     counts = there.sum(0) if padded else points.shape[1]
     points = torch.where(there, points, torch.inf)
     middle = ranked(points, (counts - 1) // 2).nan_to_num(posinf=0.0)
     sq_distance = (points - middle[:, None]).square().sum(0)
     typical = ranked(sq_distance[None], 2 * counts // 3)[0]
+    # When two thirds of the points coincide, no distance is typical.
     return sq_distance, typical.masked_fill(typical == 0, torch.inf)

@@ -27,17 +27,17 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["monte_carlo_pose_loss"]
 
-# Degrees of freedom of the t distributions: their tails are heavier than those of a likelihood, so that no sample has a
-# very large weight.
+# Degrees of freedom of the t distributions. Their tails are heavier than the tails of the likelihood, so that no sample
+# has a very large importance weight.
 _FREEDOM = 3.0
 # Scale of the prior of the translation, as a share of the distance between camera and points.
 _PRIOR_TRANSLATION = 0.5
-# Radians. Upper limit of the scale of a component's rotation: a tangent vector describes larger rotations badly.
+# Radians. Upper limit of the scale of a component's rotations: tangent vectors approximate larger rotations badly.
 _WIDEST_ROTATION = 1.0
-# Iterations from the likeliest sample to the mode beside it, and their damping.
+# Iterations, and their damping, of the refinement from the sample with the largest importance weight to a mode.
 _MODE_ITERATIONS, _MODE_DAMPING = 4, 1e-3
-# Share of the distance between camera and points. Points at a smaller depth, and points behind the camera, project from
-# this depth, and what is missing of it counts as a residual.
+# Least depth, as a share of the distance between camera and points. A point with a smaller depth is projected from the
+# least depth, and the difference between both depths counts as a residual.
 _LEAST_DEPTH = 0.02
 
 
@@ -61,53 +61,56 @@ def monte_carlo_pose_loss(
 ) -> Tensor:
     r"""Negative log-likelihood of the true pose under the distribution of poses that the correspondences define.
 
-    The density of a pose :math:`y` is :math:`p(y) = \exp(-c(y))\,p_0(y) / Z`. The cost :math:`c` is half the sum over
-    the pairs of the weight times the robust loss of the squared residual in variances. :math:`Z` is an integral over
-    all poses, estimated by importance sampling. A distance between poses has no useful gradient while the
-    correspondences fit no pose; this loss has one from the first step, because it compares the true pose with all
-    others.
+    The density of a pose :math:`y` is :math:`p(y) = \exp(-c(y))\,p_0(y) / Z`. The cost :math:`c` is half the weighted
+    sum of the robust losses of the pairs; residuals are measured in standard deviations. If the world points have
+    noise, the cost includes the logarithm of the variance, which then depends on the pose. :math:`Z` is an integral
+    over all poses, estimated by importance sampling. While the correspondences do not fit any pose, a distance between
+    poses has no useful gradient. This loss has a useful gradient from the first training step, because it compares the
+    true pose with all other poses.
 
-    Samples come in equal numbers from the prior, from a t distribution around the true pose and around each hypothesis,
-    with the precision of the normal equations there, and from ``rounds`` more, each around the mode next to the
-    likeliest sample so far. The prior :math:`p_0` has uniform rotations, and translations of a t distribution around
-    the true one as wide as half the distance between camera and points. The prior only matters while the
-    correspondences say little.
+    Equal numbers of samples are drawn from each component of a mixture: the prior, t distributions around the true pose
+    and around each hypothesis, and ``rounds`` further t distributions. Each further t distribution is centred at a mode
+    of the density. To find the mode, the sample with the largest importance weight so far is refined. The precision of
+    a t distribution is the matrix of the normal equations at its centre. In the prior :math:`p_0`, rotations are
+    uniform, and translations have a t distribution around the true translation with a scale of half the distance
+    between camera and points. The prior has little effect once the correspondences determine the pose.
 
-    Gradients flow to points, pixels, cameras, weights, sigmas and covariances, not to the poses. A problem that a
+    Gradients flow to points, pixels, cameras, weights, sigmas and covariances, but not to poses. A problem that a
     solver would refuse (NaN, points on a line, no pinhole camera) has the loss 0 without gradient.
 
     Source: H. Chen et al., "EPro-PnP: Generalized End-to-End Probabilistic Perspective-n-Points", CVPR 2022, equations
-    4 to 7. Differences: several hypotheses, a prior, modes found by refinement in place of fitted proposals.
+    4 to 7. Differences from the paper: several hypotheses, a prior, and modes found by refinement in place of fitted
+    proposals.
 
     Args:
         truth: true world-to-camera poses, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
-        hypotheses: poses around which to look as well, such as the ``pose`` of a result.
+        hypotheses: further poses around which samples are drawn, such as the ``pose`` of a result.
         world_points: see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`, also for dimensions and dtypes.
         img_points: see ``PnPNet.forward``.
         intrinsics: see ``PnPNet.forward``.
         weights: see ``PnPNet.forward``.
         mask: see ``PnPNet.forward``.
-        img_sigma: see ``PnPNet.forward``; required without ``img_cov``. A network that predicts it learns from this
-            loss how sure it is.
-        world_sigma: see ``PnPNet.forward``; ``None`` without ``world_cov``: exact points.
+        img_sigma: see ``PnPNet.forward``; required without ``img_cov``. A network that predicts ``img_sigma`` can be
+            trained with this loss.
+        world_sigma: see ``PnPNet.forward``. World points are exact without this and ``world_cov``.
         img_cov: see ``PnPNet.forward``.
         world_cov: see ``PnPNet.forward``.
-        samples: number of poses drawn per problem.
-        rounds: number of components that are added one after the other.
+        samples: number of poses drawn per problem, rounded down to a multiple of the number of components.
+        rounds: number of t distributions that are added one after the other.
         kernel: name of the robust kernel, a key of :data:`~kornia_pnpnet.refine.kernels.KERNELS`.
-        scale: shape of the kernel, in standard deviations.
+        scale: scale of the kernel in standard deviations; the exponent of ``"power"``.
 
     Returns:
         The loss of each problem, shape :math:`(B,)`, in nats, for a density per radian³ and world unit³.
 
     Raises:
-        BaseError: see ``PnPNet.forward``; for an unknown kernel, a scale that is not positive, fewer samples than
-            components, no noise of the pixels, or both a sigma and a covariance.
+        BaseError: see ``PnPNet.forward``; also for an unknown kernel, a scale that is not positive, fewer samples than
+            components, or without the noise of the pixels.
 
     Example:
         >>> from kornia_pnpnet.data import SyntheticProblems
         >>> p = SyntheticProblems(n=20, batch_size=2, seed=0).batch(0)
-        >>> pixels = torch.randn_like(p.img_points).requires_grad_()  # of a network that has learned nothing
+        >>> pixels = torch.randn_like(p.img_points).requires_grad_()  # of an untrained network
         >>> loss = monte_carlo_pose_loss(p.pose, p.pose, p.world_points, pixels, p.intrinsics, img_sigma=100.0)
         >>> loss.mean().backward()
         >>> loss.shape, bool(pixels.grad.isfinite().all()), bool((pixels.grad != 0).any())
@@ -137,7 +140,7 @@ def monte_carlo_pose_loss(
     assert noise is not None
     known = (noise.img.isfinite() & (noise.img > 0) & noise.world.isfinite()).all(1)
     img, world = (torch.where(known[:, None], x, 1.0) for x in noise[:2])
-    with torch.no_grad():  # the frame is a constant: its gradient would only add noise to that of the integral
+    with torch.no_grad():  # the frame is a constant: its gradient would only add noise to the integral's gradient
         _, frame = Normalize(order=False)(*inputs[:5], noise._replace(img=img, world=world))
     unit = frame.scale[:, None]
     world_noise = None if noise.world_cov is None else noise.world_cov.scaled(unit.square())
@@ -149,7 +152,7 @@ def monte_carlo_pose_loss(
     given = [x.init for _, x in checked if x.init is not None]
     for pose in given:
         live = live & torch.cat((pose.rotation.flatten(1), pose.translation), 1).isfinite().all(1)
-    for pose in given:  # a problem that is refused has a constant pose
+    for pose in given:  # a refused problem gets a constant pose
         rotation = torch.where(live[:, None, None], pose.rotation.detach(), eye)
         poses.append(frame.apply(Pose(rotation, torch.where(live[:, None], pose.translation.detach(), eye[2]))))
     refine = RobustWeightedLM(
@@ -165,7 +168,7 @@ def monte_carlo_pose_loss(
 
 
 class _Prior(NamedTuple):
-    """Uniform rotations, and translations of a t distribution around the true one, (B, 3)."""
+    """The prior of poses: uniform rotations, and a t distribution around the true ``translation``, (B, 3)."""
 
     translation: Tensor
 
@@ -182,14 +185,14 @@ class _Prior(NamedTuple):
         return Pose(rotation, self.translation + shift)
 
     def log_density(self, poses: Pose) -> Tensor:
-        """Logarithm of the density per radian³ and unit³, (S, B); it does not depend on the rotation."""
+        """Logarithm of the density per radian³ and unit³, (S, B). The density does not depend on the rotation."""
         width = _PRIOR_TRANSLATION * self.distance
         sq_distance = ((poses.translation - self.translation) / width).square().sum(-1)
         return _log_t(sq_distance, 3) - 3.0 * width.log().mT - math.log(8.0 * math.pi**2)
 
 
 class _Component(NamedTuple):
-    """A t distribution around a pose: its precision matrix is the square of the factor, lower triangular (B, 6, 6)."""
+    """A t distribution around a pose. ``factor`` is the Cholesky factor of its precision matrix, (B, 6, 6)."""
 
     pose: Pose
     factor: Tensor
@@ -204,23 +207,23 @@ class _Component(NamedTuple):
     def log_density(self, poses: Pose) -> Tensor:
         """Logarithm of the density per radian³ and unit³, (S, B)."""
         turn = poses.rotation @ self.pose.rotation.mT
-        # The inverse of Cayley's map; half a turn would be infinitely far away.
+        # The inverse of Cayley's map. The denominator is clamped, because it is 0 for a half turn.
         cosine = 1.0 + turn.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True)
         omega = 2.0 * So3.vee(turn - turn.mT) / cosine.clamp(min=1e-4)
         tangent = torch.cat((omega, poses.translation - self.pose.translation), -1)
         sq_distance = (tangent[..., None, :] @ self.factor)[..., 0, :].square().sum(-1)
         log_determinant = self.factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        # Volume of rotations by volume of Cayley's vectors: 1 / (1 + |omega|² / 4)².
+        # Cayley's map from tangent vectors to rotations multiplies volumes by 1 / (1 + |omega|² / 4)².
         return _log_t(sq_distance, 6) + log_determinant + 2.0 * torch.log1p(0.25 * omega.square().sum(-1))
 
 
 class _Posterior(NamedTuple):
-    """The density of poses, up to a factor, in the frame of a problem."""
+    """The density of poses up to a constant factor, in the frame of a problem."""
 
     problem: Problem  # with known noise
     prior: _Prior
-    refine: RobustWeightedLM  # finds modes, by the robust kernel of the posterior
-    shape: Tensor  # of the kernel, a scalar
+    refine: RobustWeightedLM  # finds modes with the same robust kernel
+    shape: Tensor  # shape parameter of the kernel, a scalar
     noisy_points: bool  # whether world points have noise, so that the variance of a pixel depends on the pose
 
     def log_density(self, poses: Pose) -> Tensor:
@@ -250,7 +253,7 @@ class _Posterior(NamedTuple):
         return self.prior.log_density(poses) - 0.5 * (problem.weights * loss).sum(-1)
 
     def component(self, pose: Pose) -> _Component:
-        """The t distribution whose precision is that of the normal equations at a pose, with a bounded width."""
+        """The t distribution around a pose with the precision of the normal equations, and with a bounded width."""
         problem, projection = self.problem, project(State.of(pose), self.problem)
         sq_residual, precision = information(projection, problem)
         factor = problem.focal.square() * problem.weights * self.refine.kernel.weight(sq_residual, self.shape)
@@ -261,14 +264,14 @@ class _Posterior(NamedTuple):
             (_PRIOR_TRANSLATION * self.prior.distance).expand(-1, 3),
         )
         matrix = matrix + torch.diag_embed(torch.cat(widest, -1).square().reciprocal())
-        # Scaled to a diagonal of one, so that rounding does not depend on units.
+        # The matrix is scaled to a unit diagonal, so that rounding does not depend on units.
         scale = matrix.diagonal(dim1=-2, dim2=-1).rsqrt()
         eye = torch.eye(6, dtype=scale.dtype, device=scale.device)
         scaled = matrix * scale[..., None] * scale[..., None, :] + 10.0 * torch.finfo(scale.dtype).eps * eye
         return _Component(pose, torch.linalg.cholesky_ex(scaled)[0] / scale[..., None])
 
     def mode(self, poses: Pose, log_weights: Tensor) -> Pose:
-        """The mode next to the pose of the largest weight."""
+        """The mode to which the pose with the largest importance weight is refined."""
         best = log_weights.argmax(0)
         pose = map_tensors(lambda x: x[best, torch.arange(len(best), device=best.device)], poses)
         starts = Starts(pose, torch.ones_like(self.problem.weights))
@@ -276,10 +279,10 @@ class _Posterior(NamedTuple):
 
 
 def _draw(model: _Posterior, poses: Sequence[Pose], each: int, rounds: int) -> tuple[Pose, Tensor]:
-    """Draw from the prior and from a component around every pose and around every mode that is found.
+    """Draw samples from the prior, from a component around each pose, and from components around ``rounds`` modes.
 
     Returns:
-        The samples, and the logarithm of the density of the mixture that they come from, (S, B).
+        The samples, and the logarithm of the mixture's density at each sample, (S, B).
     """
     mixture: list[_Prior | _Component] = [model.prior, *map(model.component, poses)]
     drawn = map_tensors(lambda *x: torch.cat(x), *[part.sample(each) for part in mixture])
@@ -302,7 +305,7 @@ def _sample_t(count: int, like: Tensor) -> Tensor:
 
 
 def _log_t(sq_distance: Tensor, size: int) -> Tensor:
-    """Logarithm of the density of the standard t distribution of ``size`` dimensions, by squared length."""
+    """Logarithm of the density of the ``size``-dimensional standard t distribution at vectors of a squared length."""
     both = 0.5 * (_FREEDOM + size)
     constant = math.lgamma(both) - math.lgamma(0.5 * _FREEDOM) - 0.5 * size * math.log(_FREEDOM * math.pi)
     return constant - both * torch.log1p(sq_distance / _FREEDOM)

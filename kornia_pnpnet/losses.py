@@ -1,4 +1,4 @@
-"""Distances between poses that can be trained with, and the losses over both stages of a solver."""
+"""Differentiable distances between poses, and training losses for both stages of a solver."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from kornia_pnpnet.result import PnPResult, Pose, Problems, check_poses
 
 __all__ = ["LossTerms", "PoseLoss", "SetLoss", "pose_distances"]
 
-# Probability. The cross entropy treats smaller probabilities as this one, which bounds the loss of a single pair.
+# Least probability in the cross entropy. It bounds the loss of a single pair.
 _LEAST_PROBABILITY = 1e-3
-# Variances. Squared residuals are clipped here: larger residuals are not noise.
+# Variances. Larger squared residuals are clipped to this value, because they are not noise.
 _MOST_VARIANCES = 20.0
 
 
@@ -27,13 +27,13 @@ class LossTerms(NamedTuple):
     """The loss and its terms, each a scalar and a mean over the batch.
 
     Attributes:
-        total: weighted sum of the terms, saturated per problem.
+        total: weighted sum of the terms. The refined distance of each problem is saturated.
         init_rotation: chordal rotation distance of the first guess.
         init_translation: translation distance of the first guess at the centroid of the points.
         refined_rotation: chordal rotation distance after refinement.
         refined_translation: translation distance after refinement.
-        weights: cross entropy of the weights as probabilities of being an inlier, of :class:`SetLoss`.
-        noise: negative log-likelihood of the inliers under the estimated noise, of :class:`SetLoss`.
+        weights: cross entropy of the weights as probabilities of being an inlier; 0 in :class:`PoseLoss`.
+        noise: negative log-likelihood of the inliers under the estimated noise; 0 in :class:`PoseLoss`.
     """
 
     total: Tensor
@@ -46,18 +46,19 @@ class LossTerms(NamedTuple):
 
 
 def pose_distances(estimate: Pose, truth: Pose, origin: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    r"""Distances between poses whose gradients are bounded everywhere, also at 0.
+    r"""Rotation and translation distances between poses. Their gradients are bounded, even at a distance of 0.
 
     Args:
         estimate: rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
         truth: rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
-        origin: world points at which the translations are compared, :math:`(B, 3)`; the world's origin when ``None``.
+        origin: world point of each problem at which the translations are compared, :math:`(B, 3)`; ``None``: the
+            world's origin.
 
     Returns:
         :math:`\|\hat R - R\|_F = 2\sqrt2 \sin(\theta / 2)` and :math:`\|\hat t - t\|`, each :math:`(B,)`.
 
     Raises:
-        BaseError: when shapes, dtypes or devices are wrong or differ.
+        BaseError: when shapes are not as above, or shapes, dtypes or devices of the poses differ.
 
     Example:
         >>> eye = Pose(torch.eye(3)[None], torch.zeros(1, 3))
@@ -77,27 +78,28 @@ def pose_distances(estimate: Pose, truth: Pose, origin: Tensor | None = None) ->
 def _refined_distances(
     result: PnPResult, problems: Problems, ramp: float, origin: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Distances of the refined poses, without a gradient at the ramp 0."""
+    """Distances of the refined poses from the true poses, without gradient if ``ramp`` is 0."""
     with torch.set_grad_enabled(torch.is_grad_enabled() and ramp > 0.0):
         return pose_distances(result.pose, problems.pose, origin)
 
 
 class PoseLoss(nn.Module):
-    r"""Weighted sum of four distances: rotation and translation, of the first guess and after the refinement.
+    r"""Weighted sum of the rotation and translation distances of the first guess and of the refined pose.
 
-    The refined translation is compared at the world's origin, as it is scored. The first guess's translation is
-    compared at the centroid of the world points: at an origin far from the points it would mostly repeat the rotation
-    error.
+    The refined translation is compared at the world's origin, as in :func:`~kornia_pnpnet.metrics.pose_errors`. The
+    translation of the first guess is compared at the centroid of the world points, because the translation error at an
+    origin far from the points mostly repeats the rotation error.
 
-    A failed refinement may be off by any amount. The refined distance :math:`d` of a problem is therefore saturated to
-    :math:`d / (1 + d / c)`. With :math:`c` at the limit of success the loss follows the success rate.
+    The error of a failed refinement has no upper bound. The weighted refined distance :math:`d` of a problem is
+    therefore saturated to :math:`d / (1 + d / c)`. If :math:`c` is the largest distance of a successful pose, the loss
+    mainly counts failures.
 
     Args:
         rotation: weight of the chordal rotation distances.
         translation: weight of the refined translation distance, per unit of length.
         init_translation: weight of the first guess's translation distance, per unit of length.
-        refined: weight of the refined terms relative to the first guess's terms, at the ramp 1.
-        saturation: :math:`c`; ``None`` does not saturate.
+        refined: weight of the refined terms relative to the terms of the first guess, for ``ramp=1``.
+        saturation: :math:`c`; ``None``: no saturation.
 
     Raises:
         BaseError: for a negative weight, or a saturation that is not positive.
@@ -133,7 +135,7 @@ class PoseLoss(nn.Module):
         Args:
             result: the result for :math:`B` problems.
             problems: the problems with their true poses.
-            ramp: factor of the refined terms. At 0, the start of a training, no gradient passes through them.
+            ramp: factor of the refined terms, 0 at the start of a training. At 0 the refined terms have no gradient.
 
         Raises:
             BaseError: when result and truth differ in shape, dtype or device.
@@ -151,24 +153,24 @@ class PoseLoss(nn.Module):
 class SetLoss(nn.Module):
     r"""The loss of a set network: poses before and after the refinement, inlier probabilities, and noise.
 
-    The loss has no unit: translations are compared at the centroid of the points, relative to its distance from the
-    camera. The terms are:
+    The loss has no unit: translation distances at the centroid of the points are divided by the distance of the
+    centroid from the camera. The terms are:
 
-    - First guess: the distance of the best hypothesis, plus a small share of the mean over all hypotheses, so that
-      hypotheses may differ.
-    - Refined pose: both distances in units of the limit of success, saturated as in :class:`PoseLoss`.
+    - First guess: a weighted mean of the distance of the best hypothesis and of the mean distance of all hypotheses.
+      The best hypothesis has most of the weight, so that the network can propose different hypotheses.
+    - Refined pose: both distances in units of their limits of success, saturated as in :class:`PoseLoss`.
     - Binary cross entropy of the network's weights.
     - Negative log-likelihood of the inliers' residuals at the true pose under the estimated noise.
 
     Args:
-        starts: number of the network's hypotheses, which come first among all hypotheses.
-        every: weight of the mean over the hypotheses; the best hypothesis has one minus this weight.
-        refined: weight of the refined term, at the ramp 1.
-        saturation: saturation of the refined term, in units of success.
+        starts: number of the network's hypotheses. They are the first poses of the starts.
+        every: weight of the mean over the hypotheses. The best hypothesis has the weight ``1 - every``.
+        refined: weight of the refined term, for ``ramp=1``.
+        saturation: :math:`c` of :class:`PoseLoss`, in limits of success.
         weights: weight of the cross entropy.
         noise: weight of the negative log-likelihood.
         rotation_unit: limit of success of the rotation, in degrees.
-        translation_unit: limit of success of the translation, as a share of the distance.
+        translation_unit: limit of success of the translation, as a share of the centroid's distance from the camera.
 
     Raises:
         BaseError: for a negative weight, or a saturation or unit that is not positive.
@@ -199,7 +201,7 @@ class SetLoss(nn.Module):
         self.translation_unit = translation_unit
 
     def forward(self, result: PnPResult, problems: Problems, ramp: float, guess: Starts) -> LossTerms:
-        """See :meth:`PoseLoss.forward`; ``guess``: see :meth:`~kornia_pnpnet.solver.PnPNet.with_starts`."""
+        """See :meth:`PoseLoss.forward`. ``guess``: starts of :meth:`~kornia_pnpnet.solver.PnPNet.with_starts`."""
         centre = problems.world_points.mean(1)
         distance = transform_points(problems.pose.matrix, centre[:, None])[:, 0].norm(dim=-1)
 
@@ -224,7 +226,7 @@ class SetLoss(nn.Module):
 
 
 def _negative_log_likelihood(noise: Noise, problems: Problems) -> Tensor:
-    """Negative log-likelihood of the residuals at the true pose up to a constant, mean over the inliers, (B,)."""
+    """Mean negative log-likelihood of the inliers' residuals at the true pose, up to a constant, (B,)."""
     cam = problems.true_cam_points
     cam = torch.where(problems.inliers[..., None], cam, torch.eye(3).to(cam)[2])
     cameras = problems.pair_intrinsics

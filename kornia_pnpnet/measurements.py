@@ -1,4 +1,4 @@
-"""Pixels and world points with their covariances, from heat maps and from depth: the inputs of a solver."""
+"""Inputs of a solver with covariances: pixels from heat maps, and world points from depth."""
 
 from __future__ import annotations
 
@@ -22,31 +22,32 @@ _CELL_VARIANCE = 1.0 / 12.0
 def heatmap_keypoints(
     heatmaps: Tensor, temperature: Tensor | float = 1.0, *, stride: float = 1.0
 ) -> tuple[Tensor, Tensor]:
-    r"""Mean and covariance of heat maps: the keypoints of a soft-argmax, and how far each map spreads.
+    r"""Keypoints and their covariances from heat maps: the mean and the covariance of the softmax of each map.
 
-    The softmax of a map is a density that is constant in each cell. Its mean is Kornia's soft-argmax. Its covariance
-    is that of the cells' centres plus the variance of a cell, 1/12 per axis (Sheppard's correction), so that a map
-    with a single peak has a positive definite covariance. A network that was trained with a loss such as
-    :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss` makes it the covariance of the keypoint's error.
+    The softmax of a map is a density that is constant in each cell. The mean of the density is Kornia's soft-argmax.
+    The covariance of the density is the covariance of the cells' centres plus the variance of a cell, 1/12 per axis
+    (Sheppard's correction). The covariance is therefore positive definite even if all probability is in one cell. A
+    network can learn maps whose covariance is that of the keypoint's error, by a loss such as
+    :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss`.
 
     Convention:
-        Pixels are (u, v) with the centre of the top-left pixel at (0, 0), as in Kornia. Add 0.5 where the principal
-        point counts from the corner.
+        Pixels are (u, v) with the centre of the top-left pixel at (0, 0), as in Kornia. Add 0.5 to the pixels if the
+        camera's principal point is measured from the corner of the image.
 
     Source: A. Nibali et al., "Numerical Coordinate Regression with Convolutional Neural Networks", 2018 (DSNT).
 
     Args:
-        heatmaps: logits, shape :math:`(B, N, H, W)`; of a map of probabilities the logarithm.
-        temperature: the logits are divided by it, positive: a number or a tensor that broadcasts to ``heatmaps``.
+        heatmaps: logits, shape :math:`(B, N, H, W)`. For maps of probabilities pass their logarithms.
+        temperature: positive divisor of the logits, a number or a tensor that broadcasts to ``heatmaps``.
         stride: image pixels per cell of the map. Cell 0 covers the first ``stride`` pixels.
 
     Returns:
         The pixels, shape :math:`(B, N, 2)`, and their covariances in px², shape :math:`(B, N, 2, 2)`: ``img_points``
-        and ``img_cov`` of a solver. Both are NaN for a map with NaN, so that its problem is not ``ok``.
+        and ``img_cov`` of a solver. A map with NaN gives NaN, and its problem is then not ``ok``.
 
     Raises:
-        BaseError: for maps without four dimensions, of booleans or of complex numbers, or for a temperature that is a
-            number but not positive, or a stride that is not positive.
+        BaseError: when ``heatmaps`` does not have four dimensions or holds booleans or complex numbers, when
+            ``temperature`` is a number that is not positive, or when ``stride`` is not positive.
 
     Example:
         >>> heatmaps = torch.full((1, 1, 5, 5), -100.0)
@@ -84,17 +85,17 @@ def depth_points(
     img_sigma: Tensor | float | None = None,
     img_cov: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    r"""World points with covariances from pixels with depth, such as the keypoints of an RGB-D image.
+    r"""World points and their covariances from pixels with depth, for example from keypoints of an RGB-D image.
 
-    A pixel of depth :math:`d` is the point :math:`x = R^\top (d\,r - t)` with :math:`r = K^{-1} (u, v, 1)^\top`. For
-    independent errors of the pixel and of the depth its covariance is exactly
-    :math:`R^\top ((d^2 + \sigma_d^2)\, A \Sigma A^\top + \sigma_d^2\, r r^\top) R`, where :math:`A` is the derivative
-    of :math:`r` by the pixel and :math:`\Sigma` the covariance of the pixel. First-order transport leaves out the
-    :math:`\sigma_d^2` beside :math:`d^2`.
+    A pixel :math:`(u, v)` with the depth :math:`d` shows the point :math:`x = R^\top (d\,r - t)` with
+    :math:`r = K^{-1} (u, v, 1)^\top`. If the errors of pixel and depth are independent, the covariance of :math:`x` is
+    exactly :math:`R^\top ((d^2 + \sigma_d^2)\, A \Sigma A^\top + \sigma_d^2\, r r^\top) R`, where :math:`A` is the
+    derivative of :math:`r` by the pixel and :math:`\Sigma` is the covariance of the pixel. First-order propagation of
+    errors would omit the :math:`\sigma_d^2` next to :math:`d^2`.
 
     Args:
         img_points: pixels of the camera that measured the depth, shape :math:`(B, N, 2)`.
-        depth: along the camera's z axis, in the unit of the world, shape :math:`(B, N)`.
+        depth: depth along the camera's z axis, in the unit of the world, shape :math:`(B, N)`.
         intrinsics: see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`.
         pose: world-to-camera pose of this camera, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
         depth_sigma: standard deviation of the depth in its unit: a number, :math:`(B,)` or :math:`(B, N)`.
@@ -104,12 +105,12 @@ def depth_points(
     Returns:
         The points, shape :math:`(B, N, 3)`, and their covariances in squared units of the world, shape
         :math:`(B, N, 3, 3)`: ``world_points`` and ``world_cov`` of a solver. Both are NaN, without gradient, where the
-        depth is not positive, a pixel or a depth is not finite, or a sigma is negative. Such a problem is not ``ok``
-        unless the solver's ``mask`` leaves the pair out.
+        depth is not positive, a pixel or a depth is not finite, or a sigma is negative. The problem of such a pair is
+        not ``ok`` unless the solver's ``mask`` excludes the pair.
 
     Raises:
         BaseError: for tensors whose shapes or devices do not match, tensors of booleans or complex numbers, a sigma
-            that is no number, or both ``img_sigma`` and ``img_cov``.
+            that is neither a number nor a tensor, or both ``img_sigma`` and ``img_cov``.
 
     Example:
         >>> camera = torch.tensor([[100.0, 0.0, 50.0], [0.0, 100.0, 50.0], [0.0, 0.0, 1.0]])
@@ -149,7 +150,7 @@ def depth_points(
     eye = torch.eye(2, dtype=dtype, device=pixels.device)
     noise = sigma_img.square()[..., None, None] * eye if img_cov is None else img_cov.to(dtype)
 
-    # Rays along the world's axes: Kornia's unprojection ignores a skew.
+    # Rays in the axes of the world. Kornia's unprojection is not used, because it ignores the skew.
     back = rotation.mT @ torch.linalg.inv_ex(camera).inverse  # (B, 3, 3)
     rays = convert_points_to_homogeneous(pixels) @ back.mT  # (B, N, 3)
     points = depth[..., None] * rays - translation[:, None] @ rotation

@@ -14,7 +14,7 @@ from kornia_pnpnet.result import Pose, check_poses
 
 __all__ = ["PoseErrors", "Reliability", "SuccessRate", "pose_errors", "reliability", "success", "success_rate"]
 
-# The 97.5 % point of the standard normal distribution: a two-sided 95 % interval.
+# The 97.5 % point of the standard normal distribution, for a two-sided 95 % interval.
 _Z_95 = 1.959963984540054
 
 
@@ -50,7 +50,7 @@ class SuccessRate(NamedTuple):
 
 
 class Reliability(NamedTuple):
-    r"""Predicted probabilities against observed frequencies, in :math:`K` equally wide bins from 0 to 1.
+    r"""Predicted probabilities and observed frequencies in :math:`K` equally wide bins of probability.
 
     Attributes:
         number: number of predictions, shape :math:`(K,)`.
@@ -64,7 +64,7 @@ class Reliability(NamedTuple):
 
     @property
     def expected_error(self) -> float:
-        """The expected calibration error: the mean gap between predicted and observed, weighted by ``number``."""
+        """The expected calibration error: mean of ``|predicted - observed|`` over the bins, weighted by ``number``."""
         gap = (self.predicted - self.observed).abs().nan_to_num(0.0)
         return float((self.number * gap).sum() / self.number.sum())
 
@@ -72,7 +72,7 @@ class Reliability(NamedTuple):
 def reliability(chances: Tensor, outcomes: Tensor, ranges: int = 10) -> Reliability:
     r"""Compare predicted probabilities with outcomes, for a reliability diagram.
 
-    Source: C. Guo et al., "On calibration of modern neural networks", ICML 2017, for the probability of one outcome.
+    Source: C. Guo et al., "On calibration of modern neural networks", ICML 2017, here for binary outcomes.
 
     Args:
         chances: predicted probabilities between 0 and 1, any shape with at least one element.
@@ -105,7 +105,7 @@ def pose_errors(estimate: Pose, truth: Pose) -> PoseErrors:
     r"""Errors of estimated poses, rotations :math:`(B, 3, 3)` and translations :math:`(B, 3)`.
 
     Raises:
-        BaseError: when shapes, dtypes or devices of the poses differ, or a shape is not as above.
+        BaseError: when shapes are not as above, or shapes, dtypes or devices of the poses differ.
 
     Example:
         >>> truth = Pose(torch.eye(3)[None], torch.zeros(1, 3))
@@ -127,7 +127,7 @@ def success(errors: PoseErrors, max_rotation_deg: float = 1.0, max_translation: 
         max_translation: limit of the translation error in the unit of the world, a number or :math:`(B,)`.
 
     Returns:
-        bool of shape :math:`(B,)`; False where an error is NaN.
+        bool, shape :math:`(B,)`. False where an error is NaN.
 
     Raises:
         DeviceError: when tensors are on different devices.
@@ -148,7 +148,10 @@ def success_rate(successes: Tensor) -> SuccessRate:
     Unlike the normal approximation, the interval stays inside [0, 1] and has a positive width at 0 and 1.
 
     Args:
-        successes: bool, any shape with at least one element, else ``ValueError``.
+        successes: bool, any shape with at least one element.
+
+    Raises:
+        ValueError: when ``successes`` is empty.
 
     Example:
         >>> print(success_rate(torch.tensor([True] * 8 + [False] * 2)))
@@ -161,5 +164,5 @@ def success_rate(successes: Tensor) -> SuccessRate:
     z = _Z_95
     centre = (rate + z * z / (2 * count)) / (1 + z * z / count)
     half = z / (1 + z * z / count) * math.sqrt(rate * (1 - rate) / count + z * z / (4 * count * count))
-    # The interval contains the rate. At rates of 0 and 1 rounding could put a bound on the wrong side.
+    # The interval must contain the rate. At rates of 0 and 1, rounding could exclude the rate.
     return SuccessRate(rate, max(0.0, min(rate, centre - half)), min(1.0, max(rate, centre + half)), count)

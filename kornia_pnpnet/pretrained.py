@@ -1,4 +1,4 @@
-"""Weights on disk: the shipped ones by name, local folders and Hub repositories, as safetensors."""
+"""Saving and loading of weights as safetensors: shipped weights, local folders, and repositories of the Hub."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 CONFIG_NAME, WEIGHTS_NAME = "config.json", "model.safetensors"
 # Key of the digest in the metadata of the weights file.
 _FINGERPRINT = "sha256"
-# Bytes that are read of a configuration. No configuration has as many.
+# Bytes. At most this much of a configuration file is read. Every configuration is smaller.
 _LARGEST_CONFIG = 2**20
-# Sizes up to this one take little memory.
+# Integers up to this value are always accepted in a configuration: tensors of such sizes take little memory.
 _SMALL = 1000
 
 
@@ -38,9 +38,12 @@ def shipped_weights() -> list[str]:
 
 
 def write_weights(folder: str | Path, config: Mapping[str, Any], state: Mapping[str, Tensor]) -> None:
-    """Write constructor arguments and tensors by name as ``config.json`` and ``model.safetensors``.
+    """Write constructor arguments to ``config.json``, and named tensors to ``model.safetensors``.
 
-    A missing folder is made. ``OSError`` when a file cannot be written.
+    A missing folder is created.
+
+    Raises:
+        OSError: when a file cannot be written.
     """
     from safetensors.torch import save
 
@@ -52,7 +55,7 @@ def write_weights(folder: str | Path, config: Mapping[str, Any], state: Mapping[
 
 
 def read_weights(name_or_folder: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Read the arguments and tensors that :func:`write_weights` wrote. Nothing is unpickled.
+    """Read the arguments and tensors that :func:`write_weights` wrote. No code in the files is run.
 
     Raises:
         FileNotFoundError: see :func:`find_weights`.
@@ -63,7 +66,7 @@ def read_weights(name_or_folder: str | Path) -> tuple[dict[str, Any], dict[str, 
 
     try:
         for name in (CONFIG_NAME, WEIGHTS_NAME):
-            if not (folder / name).is_file():  # a pipe would wait for ever
+            if not (folder / name).is_file():  # opening a pipe would block forever
                 raise ValueError(f"{name} is no file")
         with (folder / CONFIG_NAME).open("rb") as text:
             config = json.loads(text.read(_LARGEST_CONFIG))
@@ -77,7 +80,7 @@ def read_weights(name_or_folder: str | Path) -> tuple[dict[str, Any], dict[str, 
     for name, tensor in state.items():
         if not tensor.isfinite().all():
             raise ValueCheckError(f"The weights in {folder} are not finite: {name}.")
-    # Refuse numbers that cannot be sizes of these tensors, before anything of such a size is built.
+    # Refuse integers that are too large for sizes of these tensors, before a module of such a size is built.
     largest = max([_SMALL, *(size for tensor in state.values() for size in tensor.shape)])
     entries = [("", config)]
     while entries:
@@ -98,11 +101,11 @@ def find_weights(name_or_folder: str | Path) -> Path:
     """Find the folder of weights.
 
     Args:
-        name_or_folder: the name of shipped weights (see :func:`shipped_weights`), which needs no network; a local
-            folder; or a repository id of the Hugging Face Hub. The first that exists is used.
+        name_or_folder: one of :func:`shipped_weights`, a local folder, or a repository id of the Hugging Face Hub. They
+            are searched in this order. Only the Hub needs a network connection.
 
     Raises:
-        FileNotFoundError: when there is no such name, folder or repository.
+        FileNotFoundError: when no shipped weights, folder or repository has this name.
     """
     name = str(name_or_folder)
     for folder in (WEIGHTS_FOLDER / name, Path(name)):
@@ -126,7 +129,7 @@ _INITIALISERS: dict[str, type[nn.Module]] = {x.__name__: x for x in (EPnP, MLPIn
 
 
 class PretrainedMixin(nn.Module):
-    """A base of :class:`~kornia_pnpnet.PnPNet` that saves and loads solvers, and copies them with other options."""
+    """The base class of :class:`~kornia_pnpnet.PnPNet` for saving, loading and copying solvers."""
 
     init: nn.Module | None
     refine: RobustWeightedLM
@@ -148,17 +151,17 @@ class PretrainedMixin(nn.Module):
         return ", ".join(f"{name}={value!r}" for name, value in self.options.items())
 
     def with_options(self, *, refine: RobustWeightedLM | None = None, **options: Any) -> Self:
-        """Copy the solver with another refinement and other options."""
+        """Make a solver with another refinement and other options. Both solvers share all unchanged modules."""
         return type(self)(self.init, refine or self.refine, self.normalize, **{**self.options, **options})
 
     def config(self) -> dict[str, Any]:
-        """Return the constructor arguments of all parts, and the options, as plain data."""
+        """Return the constructor arguments of all parts and the options as plain data."""
         init = None if self.init is None else describe(self.init)
         return {"init": init, "refine": self.refine.config, "normalize": self.normalize.config, **self.options}
 
     @classmethod
     def from_config(cls, config: dict[str, Any]) -> Self:
-        """Build an untrained solver from the result of :meth:`config`. Missing options have their defaults.
+        """Build an untrained solver from the result of :meth:`config`. Missing options get their default values.
 
         Raises:
             ValueCheckError: when a part or an argument is unknown.
@@ -173,10 +176,10 @@ class PretrainedMixin(nn.Module):
             raise ValueCheckError(f"Not a configuration of PnPNet: {error!r}.") from error
 
     def save_pretrained(self, folder: str | Path) -> None:
-        """Write ``config.json`` and ``model.safetensors`` to a folder, which is made when missing.
+        """Write ``config.json`` and ``model.safetensors`` to a folder. A missing folder is created.
 
         Raises:
-            ValueCheckError: when the initialiser is not one of the package's.
+            ValueCheckError: when the initialiser is not one that :meth:`from_pretrained` can build.
         """
         config = self.config()
         if self.init is not None and config["init"]["name"] not in _INITIALISERS:
@@ -188,14 +191,14 @@ class PretrainedMixin(nn.Module):
         """Load a trained solver, in evaluation mode.
 
         Args:
-            name_or_folder: see :func:`~kornia_pnpnet.pretrained.find_weights`. Nothing is unpickled.
+            name_or_folder: see :func:`~kornia_pnpnet.pretrained.find_weights`. No code in the files is run.
 
         Returns:
             The solver in float32 on the CPU.
 
         Raises:
-            FileNotFoundError: when there is no such name, folder or repository.
-            ValueCheckError: when the files are damaged or of another model.
+            FileNotFoundError: when no shipped weights, folder or repository has this name.
+            ValueCheckError: when the files are damaged or belong to another model.
         """
         config, state = read_weights(name_or_folder)
         model = cls.from_config(config)

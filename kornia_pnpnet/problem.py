@@ -1,6 +1,6 @@
-"""What a solver works on: the pairs of a batch in its own frame, their noise, and the poses from which it starts.
+"""The data of a solver in its own frame: problems, noise, states, prior terms, and the poses to start from.
 
-Tensors of pairs have the shapes ``(B, N)`` and ``(B, N, C)``; in memory the problems come last, see
+Tensors of pairs have the shapes ``(B, N)`` and ``(B, N, C)``. In memory the batch is the last dimension, see
 ``kornia_pnpnet.core.performance.problems_last``.
 """
 
@@ -18,20 +18,19 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["LEAST_NOISE", "MIN_PAIRS", "Hypotheses", "Linear", "Noise", "Problem", "Starts", "State", "Term"]
 
-#: Focal lengths. Pixels are never known better than this, so that weights stay finite.
+#: Focal lengths. Least standard deviation of a pixel, so that weights are finite.
 LEAST_NOISE = 1e-6
-#: Pairs that determine a pose up to a few solutions.
+#: Pairs. Least number of pairs that determine a pose up to a few solutions.
 MIN_PAIRS = 3
 
 
 class State(NamedTuple):
-    r"""What a refinement estimates.
+    r"""The unknowns that a refinement estimates.
 
     Attributes:
         pose: world-to-camera poses.
-        camera: unknown parameters of the camera, shape :math:`(B, K)`. A known camera has none. The first parameter is
-            the logarithm of the ratio of the focal length to the focal length of the problem; the coefficients
-            :math:`k_1, k_2` of radial distortion follow.
+        camera: unknown parameters of the camera, shape :math:`(B, K)`; :math:`K = 0` for a known camera. The first
+            parameter is :attr:`zoom`. The other parameters are the coefficients :math:`k_1, k_2` of radial distortion.
     """
 
     pose: Pose
@@ -39,12 +38,15 @@ class State(NamedTuple):
 
     @classmethod
     def of(cls, pose: Pose) -> State:
-        """Poses of known cameras."""
+        """The state of poses with known cameras."""
         return cls(pose, pose.translation[:, :0])
 
     @property
     def zoom(self) -> Tensor:
-        """Logarithm of the focal length over that of the problem, shape :math:`(B, 1)`, or 0 wide when it is known."""
+        """Logarithm of the ratio of the focal length to ``Problem.focal``, shape :math:`(B, 1)`.
+
+        For a known focal length the shape is :math:`(B, 0)`.
+        """
         return self.camera[:, :1]
 
     @property
@@ -54,14 +56,14 @@ class State(NamedTuple):
 
 
 class Noise(NamedTuple):
-    r"""The noise of each pair: standard deviations, the same on each coordinate, and covariances where there are any.
+    r"""The noise of each pair: isotropic standard deviations, and covariances if the caller gave them.
 
     Attributes:
-        img: standard deviation of the pixel, NaN where unknown, shape :math:`(B, N)`. Beside a covariance: of isotropic
-            noise of the same trace, which is what a network sees.
-        world: standard deviation of the world point, as ``img``.
+        img: standard deviation of each pixel coordinate, NaN where unknown, shape :math:`(B, N)`. With ``img_cov``:
+            standard deviation of the isotropic noise whose covariance has the same trace. Networks ignore ``img_cov``.
+        world: standard deviation of each world coordinate; see ``img``.
         img_cov: covariance of the pixel, entries of shape :math:`(B, N)`; ``None``: the noise is isotropic.
-        world_cov: covariance of the world point, as ``img_cov``.
+        world_cov: covariance of the world point; see ``img_cov``.
     """
 
     img: Tensor
@@ -71,21 +73,22 @@ class Noise(NamedTuple):
 
     @property
     def sigmas(self) -> Noise:
-        """The standard deviations alone."""
+        """The noise without covariances."""
         return self._replace(img_cov=None, world_cov=None)
 
     @property
     def covariances(self) -> list[Symmetric2 | Symmetric3]:
-        """The covariances that there are."""
+        """The covariances that are not ``None``."""
         return [x for x in (self.img_cov, self.world_cov) if x is not None]
 
 
 class Linear(NamedTuple):
-    r"""A term near a state: its loss is about :math:`w (r + J \delta)^\top \Omega (r + J \delta)`.
+    r"""A term linearised at a state: its loss is about :math:`w (r + J \delta)^\top \Omega (r + J \delta)`.
 
     Attributes:
         residual: :math:`r`, shape :math:`(B, D)`.
-        jacobian: :math:`J` by the tangent of :meth:`~kornia_pnpnet.refine.residual.moved`, shape :math:`(B, D, 6 + K)`.
+        jacobian: :math:`J`, the derivative by the tangent vector :math:`\delta` of
+            :meth:`~kornia_pnpnet.refine.residual.moved`, shape :math:`(B, D, 6 + K)`.
         information: :math:`\Omega`, shape :math:`(B, D, D)`.
         weight: robust weight :math:`w`, shape :math:`(B,)`.
     """
@@ -97,16 +100,16 @@ class Linear(NamedTuple):
 
 
 class Term(Protocol):
-    """What is known besides the pairs: a tuple of tensors whose first dimension is the batch."""
+    """A prior of the pose or of the camera: a tuple of tensors whose first dimension is the batch."""
 
     def linearise(self, state: State) -> Linear:
-        """The term near a state."""
+        """Linearise the term at a state."""
 
     def loss(self, state: State) -> Tensor:
         """Robust loss in squared standard deviations, shape (B,)."""
 
     def disagreement(self, pose: Pose) -> Tensor:
-        """Penalty of poses :math:`(B, …)` in the choice among starts, in units of the penalty of one outlier."""
+        """Penalty of poses :math:`(B, …)` when the best start is chosen. An outlier has the penalty 1."""
 
 
 class Problem(NamedTuple):
@@ -120,17 +123,18 @@ class Problem(NamedTuple):
         focal: the focal length in pixels that all pairs share, a scalar.
         img_scale: pixels of ``img_points`` per pixel of the caller, shape :math:`(B,)`.
         world_scale: lengths of ``world_points`` per unit of the caller's world, shape :math:`(B,)`.
-        usual: 1 for usual pairs, 0 for points far from the others and pixels at extreme angles (see
+        usual: 1 for usual pairs, 0 for points far from the other points and pixels at extreme angles (see
             :class:`~kornia_pnpnet.frame.Normalize`), shape :math:`(B, N)`. Initialisers that are not robust use
             :attr:`usual_weights`.
-        noise: noise of each pair in the units of ``img_points`` and ``world_points``, NaN where unknown; ``None``: all
-            unknown.
+        noise: noise of each pair in the units of ``img_points`` and ``world_points``, NaN where unknown; ``None``:
+            unknown for all pairs.
         confidence: the caller's belief that a pair is an inlier, in [0, 1], NaN where unknown, shape :math:`(B, N)`;
-            ``None``: all unknown.
-        rig: the camera of each pair, from the frame of the pose to the camera's, :math:`(B, N, 3, 3)` and
-            :math:`(B, N, 3)`; ``None``: one camera, whose frame is that of the pose.
-        prior: what is known of the pose besides the pairs; ``None``: nothing.
-        free_focal: what is known of the focal length besides the pairs; ``None``: the focal length is ``focal``.
+            ``None``: unknown for all pairs.
+        rig: the transform from the rig to the camera of each pair, :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`. The pose
+            of the problem is that of the rig. ``None``: one camera.
+        prior: prior of the pose, a :class:`~kornia_pnpnet.refine.terms.PoseTerm`; ``None``: no prior.
+        free_focal: range and prior of an unknown focal length, a :class:`~kornia_pnpnet.refine.terms.CameraTerm`;
+            ``None``: the focal length is ``focal``.
     """
 
     world_points: Tensor
@@ -148,7 +152,7 @@ class Problem(NamedTuple):
 
     @classmethod
     def of(cls, world_points: Tensor, img_points: Tensor, focal: Tensor | float = 1.0, **more: Any) -> Problem:
-        """A problem of its own frame: all weights are 1 and all scales are 1 unless given."""
+        """A problem without normalisation. Weights and scales are 1 unless given in ``more``."""
         one = torch.ones_like(world_points[..., 0])
         scale = one.new_ones(len(one))
         given = {"weights": one, "usual": one, "img_scale": scale, "world_scale": scale, **more}
@@ -156,7 +160,7 @@ class Problem(NamedTuple):
 
     @property
     def terms(self) -> Iterator[Term]:
-        """What is known besides the pairs. An unknown focal length without ``focal_sigma`` is no term."""
+        """The prior terms. An unknown focal length without information (no ``focal_sigma``) adds no term."""
         free = self.free_focal is not None and self.free_focal.information is not None
         known = self.prior, self.free_focal if free else None
         return (term for term in known if term is not None)
@@ -168,20 +172,20 @@ class Problem(NamedTuple):
 
     @property
     def places(self) -> Tensor:
-        """Where each pair is seen: its pixel, :math:`(B, N, 2)`; in a rig its ray (:meth:`rays`), :math:`(B, N, 3)`."""
+        """The pixel of each pair, :math:`(B, N, 2)`; in a rig its ray (see :meth:`rays`), :math:`(B, N, 3)`."""
         return self.img_points if self.rig is None else self.rays(self.img_points / self.focal)
 
     def rays(self, plane_points: Tensor) -> Tensor:
-        """Rays in the frame of a rig, as long as the focal length, of points on the planes z = 1, (B, N, 3)."""
+        """Rays (B, N, 3) of the length ``focal`` in the frame of a rig, through points on the cameras' planes z = 1."""
         assert self.rig is not None
         rays = torch.cat((plane_points, torch.ones_like(plane_points[..., :1])), -1)
         rays = self.focal * torch.nn.functional.normalize(rays, dim=-1)
         return (self.rig.rotation * rays[..., None]).sum(-2)
 
     def seen_with(self, zoom: Tensor) -> Problem:
-        """The same pairs with a known focal length, multiplied by the exponential of ``zoom``, (B, 1) or (B, 0).
+        """The same pairs with a known focal length: ``focal`` times the exponential of ``zoom``, (B, 1) or (B, 0).
 
-        Dividing the pixels and their noise by this factor has the same effect.
+        The pixels and their noise are divided by this factor, which has the same effect as another ``focal``.
         """
         if not zoom.shape[1]:
             return self
@@ -199,17 +203,17 @@ class Problem(NamedTuple):
 
 
 class Starts(NamedTuple):
-    r"""What an initialiser returns: poses to refine, and weights and noise of the pairs.
+    r"""The result of an initialiser: poses to refine, and weights and noise of the pairs.
 
     Attributes:
         pose: a coarse pose in the frame of the :class:`Problem`.
         weights: a factor for the weight of each pair, at least 0, shape :math:`(B, N)`.
-        ok: whether a pose was found (degenerate pairs may have none), bool, shape :math:`(B,)`; ``None``: always.
+        ok: whether a pose was found (degenerate pairs may have no pose), bool, shape :math:`(B,)`; ``None``: all true.
         others: more poses, rotations :math:`(B, S, 3, 3)` and translations :math:`(B, S, 3)`; ``None``: no others.
-        noise: noise of each pair in the units of the problem, without covariances: the caller's, and the initialiser's
-            estimate where it is unknown. Residuals then count in standard deviations. ``None``: the initialiser does
-            not estimate noise.
-        camera: first parameters of the camera for every pose, see :class:`State`; ``None``: zeros.
+        noise: noise of each pair in the units of the problem, without covariances: the caller's noise, or the
+            initialiser's estimate where the caller's noise is unknown. With ``noise``, residuals are measured in
+            standard deviations. ``None``: the initialiser does not estimate noise.
+        camera: initial camera parameters for all poses, see :class:`State`; ``None``: zeros.
     """
 
     pose: Pose
@@ -221,22 +225,22 @@ class Starts(NamedTuple):
 
     @property
     def poses(self) -> list[Pose]:
-        """The pose and the others, each of rotations :math:`(B, 3, 3)` and translations :math:`(B, 3)`."""
+        """A list of ``pose`` and ``others``: rotations :math:`(B, 3, 3)` and translations :math:`(B, 3)` each."""
         others = () if self.others is None else map(Pose, *(x.unbind(1) for x in self.others))
         return [self.pose, *others]
 
     def with_others(self, *more: Pose) -> Starts:
-        """With more poses."""
+        """Add more poses to ``others``."""
         every = [*self.poses[1:], *more]
         return self._replace(others=map_tensors(lambda *x: torch.stack(x, 1), *every)) if every else self
 
 
 class Hypotheses(NamedTuple):
-    r"""Up to :math:`S` poses for each sample: what a minimal solver returns.
+    r"""The result of a minimal solver: up to :math:`S` poses for each sample.
 
     Attributes:
         pose: rotations :math:`(B, S, 3, 3)` and translations :math:`(B, S, 3)` in the frame of the sample.
-        valid: which slots hold a solution, bool, shape :math:`(B, S)`. The other slots are finite.
+        valid: which slots hold a solution, bool, shape :math:`(B, S)`. Values in the other slots are finite.
     """
 
     pose: Pose

@@ -1,4 +1,4 @@
-"""Every solver by name."""
+"""All solvers by name."""
 
 from __future__ import annotations
 
@@ -24,31 +24,31 @@ from kornia_pnpnet.solver import PnPNet
 
 __all__ = ["create_solver", "list_solvers", "solve_pnp"]
 
-# Iterations of the classical robust LM, from the pose of a method and from the identity.
+# Iterations of the classical robust LM: few from the pose of another method, many from the identity.
 _FEW, _MANY = 10, 30
 # Pairs in a sample of the paper's RANSAC.
 _PAPERS_SAMPLE = 7
 
 
 def _trained(weights: str, m: int | None = None) -> PnPNet:
-    """Shipped weights with ``m`` iterations (0: the network alone, the paper's "Net")."""
+    """A solver with shipped weights and ``m`` iterations (0: the network alone, the paper's "Net")."""
     solver = PnPNet.from_pretrained(weights)
     return solver if m is None else solver.with_options(refine=solver.refine.with_iterations(m))
 
 
 def _alone(init: Callable[..., nn.Module], **options: Any) -> PnPNet:
-    """A method without refinement: the result has its pose, which is judged, and its weights."""
+    """A solver that judges the pose of a method without refining the pose."""
     refine = RobustWeightedLM(0, damping=1e-6, robustness=0.0, learnable=False)
-    return PnPNet(init(**options), refine, Normalize(order=init is RANSAC))  # only samples depend on the order
+    return PnPNet(init(**options), refine, Normalize(order=init is RANSAC))  # only RANSAC depends on the order
 
 
 def _paper_lm(m: int) -> RobustWeightedLM:
-    """The classical robust LM of the paper's comparisons: alpha = 1, and every step is taken."""
+    """The classical robust LM of the paper's comparisons: alpha = 1, and every step is accepted."""
     return RobustWeightedLM(m, learnable=False, reject_worse=False)
 
 
 def _refined(init: Callable[..., nn.Module], m: int = _FEW, **options: Any) -> PnPNet:
-    """The paper's "-LM": a method, then LM from its pose."""
+    """The paper's "-LM": a method, and the classical robust LM from the pose of the method."""
     return PnPNet(init(**options), _paper_lm(m), Normalize(order=False))
 
 
@@ -78,7 +78,7 @@ def _builders() -> dict[str, Callable[..., nn.Module]]:
 
 
 def list_solvers() -> list[str]:
-    """Names that :func:`create_solver` takes.
+    """List the names that :func:`create_solver` accepts.
 
     Example:
         >>> "p3p-ransac" in list_solvers()
@@ -88,25 +88,26 @@ def list_solvers() -> list[str]:
 
 
 def create_solver(name: str, **options: Any) -> nn.Module:
-    """Build a solver.
+    """Build a solver by its name.
 
     Every solver is called as ``solver(world_points, img_points, intrinsics, weights=None, mask=None)`` and returns a
     :class:`~kornia_pnpnet.result.PnPResult`.
 
     Args:
         name: one of :func:`list_solvers`.
-        options: for every ``-lm`` and for trained weights ``m``, the number of iterations (see
-            :meth:`~kornia_pnpnet.refine.lm.RobustWeightedLM.with_iterations`); else the arguments of
-            :class:`~kornia_pnpnet.propose.epnp.EPnP`, :class:`~kornia_pnpnet.propose.reppnp.REPPnP`,
-            :class:`~kornia_pnpnet.propose.ransac.RANSAC` or the class in :mod:`kornia_pnpnet.peers`; and for all but
-            the peers the options of :class:`~kornia_pnpnet.solver.PnPNet`.
+        options: depend on the solver. Names with ``-lm`` and trained weights take ``m``, the number of iterations (see
+            :meth:`~kornia_pnpnet.refine.lm.RobustWeightedLM.with_iterations`). The solvers with EPnP, REPPnP and RANSAC
+            take the arguments of :class:`~kornia_pnpnet.propose.epnp.EPnP`,
+            :class:`~kornia_pnpnet.propose.reppnp.REPPnP` and :class:`~kornia_pnpnet.propose.ransac.RANSAC`. Solvers of
+            other libraries take the arguments of their class in :mod:`kornia_pnpnet.peers`. Solvers of this package
+            also take the options of :class:`~kornia_pnpnet.solver.PnPNet`.
 
     Returns:
         The solver as a module in evaluation mode.
 
     Raises:
         ValueCheckError: for an unknown name or option.
-        BaseError: for an option out of its range.
+        BaseError: for an option outside its range.
         ImportError: when the solver needs a package that is not installed.
 
     Example:
@@ -130,7 +131,7 @@ def create_solver(name: str, **options: Any) -> nn.Module:
 
 @lru_cache(maxsize=8)
 def _frozen(name: str, device: torch.device) -> nn.Module:
-    """A solver that is built once, without gradients of its parameters."""
+    """Build a solver whose parameters have no gradients, once for each name and device."""
     return create_solver(name).to(device).requires_grad_(False)
 
 
@@ -144,27 +145,27 @@ def solve_pnp(
     dist: Tensor | None = None,
     fisheye: Tensor | None = None,
 ) -> Tensor:
-    r"""Find world-to-camera matrices, with the signature of :func:`kornia.geometry.solve_pnp_dlt`, despite outliers.
+    r"""Find world-to-camera matrices despite outliers, with the signature of :func:`kornia.geometry.solve_pnp_dlt`.
 
-    A solver of :func:`create_solver` also takes masks and noise, and returns weights and a probability.
+    Solvers of :func:`create_solver` also take masks and noise, and also return weights and a probability.
 
     Args:
         world_points: see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`.
         img_points: see ``PnPNet.forward``.
         intrinsics: see ``PnPNet.forward``.
         weights: see ``PnPNet.forward``.
-        solver: one of :func:`list_solvers`, or a module with the same signature. A named solver is built once.
-        dist: see ``PnPNet.forward``; solvers of other libraries take none.
-        fisheye: see ``PnPNet.forward``; solvers of other libraries take none.
+        solver: one of :func:`list_solvers`, or a module with the signature of a solver. Named solvers are cached.
+        dist: see ``PnPNet.forward``. Not for solvers of other libraries.
+        fisheye: see ``PnPNet.forward``. Not for solvers of other libraries.
 
     Returns:
-        :math:`[R\,|\,t]` with ``x_cam = R x_world + t``, shape :math:`(B, 3, 4)`, float64 when any input is, else
-        float32, with gradients to points, pixels, intrinsics and weights. A problem without a pose (``ok`` of the
-        result is false) is NaN without gradient; nothing is raised, and no other problem of the batch changes.
+        :math:`[R\,|\,t]` with ``x_cam = R x_world + t``, shape :math:`(B, 3, 4)`, float64 if any input is float64, else
+        float32. Gradients flow to points, pixels, intrinsics and weights. The matrix of a problem whose ``ok`` is false
+        is NaN without gradient. Such a problem raises no error and does not change other problems.
 
     Raises:
         ValueCheckError: for an unknown name.
-        BaseError: for shapes, dtypes and devices that the solver does not take.
+        BaseError: for shapes, dtypes and devices that the solver does not accept.
 
     Example:
         >>> from kornia_pnpnet.data import SyntheticProblems

@@ -1,7 +1,8 @@
 """Poses, results and problems with known poses: the tensors that the public functions take and return.
 
-Each is a ``NamedTuple`` and thus a pytree: ``torch.compile``, ``torch.export``, ``torch.func`` and data loaders take it
-as it is. The letters are the same everywhere: ``B`` problems in the batch, ``N`` pairs in each.
+Each class of tensors is a ``NamedTuple`` and therefore a pytree, which ``torch.compile``, ``torch.export``,
+``torch.func`` and data loaders accept. In all shapes of the package, ``B`` is the number of problems in the batch, and
+``N`` is the number of pairs of each problem.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ class Pose(NamedTuple):
 
     @classmethod
     def from_rvec(cls, rvec: Tensor, translation: Tensor) -> Pose:
-        r"""A pose from a rotation vector, as OpenCV's ``rvec`` and ``tvec``.
+        r"""A pose from a rotation vector and a translation, which are OpenCV's ``rvec`` and ``tvec``.
 
         Args:
             rvec: axis times angle in radians, shape :math:`(B, 3)`.
@@ -74,10 +75,10 @@ class Pose(NamedTuple):
 
     @classmethod
     def from_quaternion(cls, quaternion: Tensor, translation: Tensor) -> Pose:
-        r"""A pose from a quaternion :math:`(w, x, y, z)`, as COLMAP's and Kornia's, of any length but 0.
+        r"""A pose from a quaternion :math:`(w, x, y, z)`, the order of COLMAP and Kornia.
 
         Args:
-            quaternion: shape :math:`(B, 4)`.
+            quaternion: any length but 0, shape :math:`(B, 4)`.
             translation: shape :math:`(B, 3)`.
         """
         return cls(quaternion_to_rotation_matrix(quaternion), translation)
@@ -94,17 +95,17 @@ class Pose(NamedTuple):
 
     @property
     def se3(self) -> Se3:
-        """As Kornia's group element, with the gradient of the pose; its tangent vectors are (translation, rotation)."""
+        """The pose as Kornia's group element, with gradients. Kornia's tangent vectors are (translation, rotation)."""
         return Se3.from_matrix(self.matrix)
 
     def camera(self, intrinsics: Tensor | PinholeCamera, height: int = 1, width: int = 1) -> PinholeCamera:
-        r"""Kornia's camera with these extrinsics.
+        r"""Kornia's camera with the pose as its extrinsics.
 
         Args:
-            intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or a camera, whose image size is
-                kept.
-            height: height of the image in pixels; projection does not need it.
-            width: width of the image in pixels; projection does not need it.
+            intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`; or Kornia's camera, whose image size
+                replaces ``height`` and ``width``.
+            height: height of the image in pixels. Projection ignores the height.
+            width: width of the image in pixels. Projection ignores the width.
 
         Example:
             >>> pose = Pose(torch.eye(3)[None], torch.tensor([[0.0, 0.0, 2.0]]))
@@ -122,7 +123,7 @@ class Pose(NamedTuple):
 
 
 def camera_matrices(intrinsics: Tensor | PinholeCamera) -> Tensor:
-    """Camera matrices (B, 3, 3) or (3, 3) from matrices or from Kornia's camera without its extrinsics."""
+    """Camera matrices (B, 3, 3) or (3, 3) from matrices, or from Kornia's camera, whose extrinsics are ignored."""
     if not isinstance(intrinsics, PinholeCamera):
         return intrinsics
     matrices = intrinsics.camera_matrix
@@ -130,7 +131,7 @@ def camera_matrices(intrinsics: Tensor | PinholeCamera) -> Tensor:
 
 
 def check_poses(estimate: Pose, truth: Pose) -> None:
-    """Check that two batches of poses have equal shapes. Broadcasting would compare poses of different problems."""
+    """Check that two batches of poses agree in shape, dtype and device. Broadcasting would mix up problems."""
     batch = tuple(estimate.translation.shape[:-1])
     shapes: Shapes = {
         "The rotation of the estimate": (estimate.rotation, (*batch, 3, 3)),
@@ -144,25 +145,26 @@ def check_poses(estimate: Pose, truth: Pose) -> None:
 
 
 def gate_pose(pose: Pose, live: Tensor, finite: Tensor) -> Pose:
-    """``core.linalg.gate`` for a pose; the identity fills."""
+    """Apply ``core.linalg.gate`` to a pose. The identity replaces poses that are not ``finite``."""
     eye = torch.eye(3, dtype=pose.rotation.dtype, device=pose.rotation.device)
     return Pose(gate(pose.rotation, live, finite, eye), gate(pose.translation, live, finite, 0.0))
 
 
 class PosePrior(NamedTuple):
-    r"""What is known of a pose besides the pairs: from the frame before, from gravity, from an odometer.
+    r"""A prior of a pose, for example from the previous frame, from gravity, or from an odometer.
 
-    With the true pose :math:`(R, t)`, the prior's pose is :math:`(\mathrm{cay}(\omega) R,\; t + v)`, where
-    :math:`(\omega, v)` is Gaussian with the inverse of the information as its covariance: the tangent of
-    :func:`~kornia_pnpnet.covariance.pose_covariance`.
+    If :math:`(R, t)` is the true pose, the prior's pose is :math:`(\mathrm{cay}(\omega) R,\; t + v)` with Gaussian
+    noise :math:`(\omega, v)`. The covariance of the noise is the inverse of ``information``. The function
+    :func:`~kornia_pnpnet.covariance.pose_covariance` returns covariances of the same vector :math:`(\omega, v)`.
 
     Attributes:
         pose: the expected world-to-camera pose.
-        information: inverse of the covariance in radians and the unit of the world, positive semi-definite; rows and
-            columns of zeros where nothing is known, shape :math:`(B, 6, 6)`.
-        scale: :math:`c`, shape :math:`(B,)`; ``None``: 3. A squared error of :math:`s` standard deviations has the
-            weight :math:`\exp(-2 s / (k c^2))` with :math:`k` known directions (Welsch's kernel), so that a wrong prior
-            does not spoil a pose that the pairs determine. Infinite: least squares.
+        information: inverse of the covariance in radians and the unit of the world, positive semi-definite, shape
+            :math:`(B, 6, 6)`. An unknown component of :math:`(\omega, v)` has zeros in its row and column.
+        scale: scale :math:`c` of Welsch's kernel, shape :math:`(B,)`; ``None``: 3. A prior with :math:`k` known
+            directions and a squared Mahalanobis distance of :math:`s` from the pose has the weight
+            :math:`\exp(-2 s / (k c^2))`. An incorrect prior therefore does not spoil a pose that the pairs determine.
+            An infinite scale means least squares.
     """
 
     pose: Pose
@@ -171,11 +173,11 @@ class PosePrior(NamedTuple):
 
 
 class Status(IntEnum):
-    """Why a problem is not ``ok``: the values of ``PnPResult.status``."""
+    """The values of ``PnPResult.status``: why a problem is not ``ok``."""
 
-    #: ``ok``.
+    #: The problem is ``ok``.
     SOLVED = 0
-    #: Fewer than 3 pairs have a weight and are at an angle that a camera can see.
+    #: Fewer than 3 pairs remain without padding and without pairs at impossible angles or distances.
     TOO_FEW_PAIRS = 1
     #: The points lie on a line or coincide, or the pairs do not determine a pose.
     DEGENERATE = 2
@@ -184,22 +186,24 @@ class Status(IntEnum):
     NOT_FINITE = 3
     #: The intrinsics are not a multiple of ``[[fx, s, cx], [0, fy, cy], [0, 0, 1]]`` with positive ``fx`` and ``fy``.
     CAMERA = 4
-    #: No pose was found with which enough pairs agree. Most solvers answer this for three pairs, whose poses
-    #: :func:`~kornia_pnpnet.propose.p3p.p3p` finds.
+    #: Too few pairs agree with the best pose. Most solvers return this status for problems of three pairs; use
+    #: :func:`~kornia_pnpnet.propose.p3p.p3p` for such problems.
     NOT_BELIEVED = 5
-    #: The pose that was found has fewer than 3 pairs in front of the camera.
+    #: Fewer than 3 pairs are in front of the camera at the best pose.
     BEHIND = 6
 
 
 class Alternatives(NamedTuple):
-    r"""Other poses that explain the pairs nearly as well, without gradient.
+    r"""Other poses that explain the pairs nearly as well as the pose of the result, without gradient.
 
     Attributes:
-        rotation: world-to-camera rotations in the order of their costs, shape :math:`(B, S, 3, 3)`.
+        rotation: world-to-camera rotations by ascending cost, shape :math:`(B, S, 3, 3)`.
         translation: world-to-camera translations, shape :math:`(B, S, 3)`.
-        cost: cost of the refinement that compares the poses, see :class:`PnPResult`, shape :math:`(B, S)`.
-        probability: probability of each pose if one of them or the result's pose is the true one, shape :math:`(B, S)`.
-        valid: which slots hold a pose, the first ones of a problem, bool, shape :math:`(B, S)`.
+        cost: cost of each pose (see :class:`PnPResult`) in the refinement that compared the poses, shape
+            :math:`(B, S)`.
+        probability: probability of each pose, provided that an alternative or the pose of the result is the true pose,
+            shape :math:`(B, S)`.
+        valid: which slots hold a pose, bool, shape :math:`(B, S)`. Empty slots come last.
     """
 
     rotation: Tensor
@@ -210,7 +214,7 @@ class Alternatives(NamedTuple):
 
     @classmethod
     def none(cls, pose: Pose) -> Alternatives:
-        """No slots, :math:`S = 0`, for the problems of a pose."""
+        """Alternatives without slots (:math:`S = 0`) for a batch of poses."""
         empty = pose.translation.detach()[:, :0]  # (B, 0)
         vectors = empty[..., None].expand(-1, -1, 3)
         return cls(vectors[..., None].expand(-1, -1, -1, 3), vectors, empty, empty, empty > 0)
@@ -222,21 +226,22 @@ class PnPResult(NamedTuple):
     Attributes:
         rotation: world-to-camera rotation, shape :math:`(B, 3, 3)`.
         translation: world-to-camera translation in the unit of the world points, shape :math:`(B, 3)`.
-        weights: final weight of each pair, in the order in which the pairs were given, shape :math:`(B, N)`.
-        cost: mean robust loss of the pairs and of a prior in the kernel's unit (see
+        weights: final weight of each pair, in the caller's order, shape :math:`(B, N)`.
+        cost: robust loss of the pairs and of a prior, divided by the number of pairs, in the unit of the kernel (see
             :mod:`kornia_pnpnet.refine.kernels`), shape :math:`(B,)`. Costs of the same solver are comparable.
-        ok: whether the pose is to be believed, bool, shape :math:`(B,)`. Where ``ok`` is false the fields above, the
-            ``intrinsics`` and ``dist`` are finite and carry no gradient.
-        init: the first guess. It carries a gradient for every valid problem, also where refinement failed, so that an
-            initialiser can learn from its failures.
+        ok: whether the pose can be trusted, bool, shape :math:`(B,)`. Where ``ok`` is false, the fields above, the
+            ``intrinsics`` and ``dist`` are finite, and have no gradient unless the solver has ``gradient="always"``.
+        init: the first guess. The first guess of every valid problem has a gradient, even if the refinement failed, so
+            that an initialiser can learn from failures.
         status: why a problem is not ``ok``: the value of a :class:`Status`, int8, shape :math:`(B,)`.
-        probability: estimated probability that the pose is within 10 degrees and 30 % of the distance of the points,
-            shape :math:`(B,)`, without gradient. A solver that neither knows nor estimates the noise takes it from the
-            residuals. Peers do not estimate the probability and return 1 where ``ok``.
-        alternatives: other poses that explain the pairs nearly as well; no slots where the call did not ask for them.
-        intrinsics: camera matrices of the poses with a last entry of 1, shape :math:`(B, 3, 3)`. With an unknown focal
-            length they hold its estimate. The identity for a problem whose camera is impossible.
-        dist: estimated distortion (k1, k2, 0, 0), shape :math:`(B, 4)`; 0 where it was not estimated.
+        probability: estimated probability that the rotation error is at most 10 degrees, and the translation error at
+            most 30 % of the distance of the points, shape :math:`(B,)`, without gradient. If the noise is neither given
+            nor estimated by the solver, the probability is computed from the residuals. Solvers of other libraries
+            return 1 where ``ok``.
+        alternatives: other poses that explain the pairs nearly as well; no slots unless the call requested them.
+        intrinsics: camera matrices with a last entry of 1, shape :math:`(B, 3, 3)`, in a rig as given. An unknown focal
+            length is replaced by its estimate. The identity replaces matrices that are no pinhole cameras.
+        dist: estimated distortion (k1, k2, 0, 0), shape :math:`(B, 4)`; 0 if no distortion was estimated.
     """
 
     rotation: Tensor
@@ -271,17 +276,17 @@ class Problems(NamedTuple):
         intrinsics: camera matrices, shape :math:`(B, 3, 3)`, in a rig :math:`(B, N, 3, 3)`.
         pose: the true world-to-camera pose.
         inliers: whether a pair is an inlier, bool, shape :math:`(B, N)`.
-        img_sigma: standard deviation of the noise on each pixel coordinate, as a solver may know it: NaN where it is
-            unknown, ``None`` where it is unknown for all problems, shape :math:`(B,)` or :math:`(B, N)`.
+        img_sigma: standard deviation, given to a solver, of the noise on each pixel coordinate, shape :math:`(B,)` or
+            :math:`(B, N)`; NaN where unknown; ``None``: unknown for all problems.
         world_sigma: standard deviation of the noise on each world coordinate; see ``img_sigma``.
-        confidence: belief that a pair is an inlier, in [0, 1], NaN and ``None`` as for ``img_sigma``, shape
-            :math:`(B, N)`.
-        img_cov: covariance of the noise of each pixel, as a solver may know it in place of ``img_sigma``, shape
+        confidence: belief that a pair is an inlier, in [0, 1], shape :math:`(B, N)`; NaN and ``None`` as for
+            ``img_sigma``.
+        img_cov: covariance of the noise of each pixel, given to a solver in place of ``img_sigma``, shape
             :math:`(B, N, 2, 2)`; ``None``: unknown.
-        world_cov: covariance of the noise of each world point in place of ``world_sigma``, shape
+        world_cov: covariance of the noise of each world point, given to a solver in place of ``world_sigma``, shape
             :math:`(B, N, 3, 3)`; ``None``: unknown.
-        cam_from_rig: the camera of each pair in a rig, :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`, with intrinsics of
-            the shape :math:`(B, N, 3, 3)`; the pose is that of the rig. ``None``: one camera.
+        cam_from_rig: the transform from a rig to the camera of each pair, :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`.
+            ``pose`` is then the pose of the rig. ``None``: one camera.
     """
 
     world_points: Tensor
@@ -311,7 +316,7 @@ class Problems(NamedTuple):
 
     @property
     def true_cam_points(self) -> Tensor:
-        """The points in the frame of the camera that sees them, by the true poses, shape :math:`(B, N, 3)`."""
+        """The points in the frame of their camera at the true pose, shape :math:`(B, N, 3)`."""
         points = self.world_points @ self.pose.rotation.mT + self.pose.translation[:, None]
         if self.cam_from_rig is None:
             return points
@@ -319,7 +324,7 @@ class Problems(NamedTuple):
 
     @property
     def pair_intrinsics(self) -> Tensor:
-        """The camera matrix of each pair, shape :math:`(B, N, 3, 3)`, without a rig :math:`(B, 1, 3, 3)`."""
+        """The camera matrix of each pair, shape :math:`(B, N, 3, 3)` in a rig, else :math:`(B, 1, 3, 3)`."""
         return self.intrinsics[:, None] if self.cam_from_rig is None else self.intrinsics
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Problems:

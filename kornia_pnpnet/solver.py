@@ -1,4 +1,4 @@
-"""The solver as one layer: problem, propose, refine, judge."""
+"""The solver as one layer: normalise a problem, propose poses, refine them, and judge the best pose."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ from kornia_pnpnet.result import Alternatives, PnPResult, Pose, PosePrior, Statu
 
 __all__ = ["PnPNet"]
 
-# Bound of a problem's gradient by normalised coordinates, in which those of a problem that is ok are about 1.
+# Largest norm of a problem's gradient by normalised coordinates. The gradient of a problem that is ok is about 1 long.
 _LONGEST_GRADIENT = 10.0
-# Further iterations from the nominal focal length: the least that converge with 1000 pairs. With 2, 4 and 8 of them the
-# median error of the focal length is 0.037, 0.029 and 0.030 % (CameraProblems, seeds 4321, 4322, half outliers).
-# Radial distortion needs them for its gradient: the search before them works on undistorted pixels, without gradient.
+# Further iterations from the nominal focal length: the least number that converges with 1000 pairs. With 2, 4 and 8
+# further iterations the median error of the focal length is 0.037, 0.029 and 0.030 % (CameraProblems, seeds 4321, 4322,
+# half outliers). The gradient of radial distortion comes from these iterations, because the search has no gradient.
 _MORE_ITERATIONS = 4
 
 
 class _Call(NamedTuple):
-    """How a batch is solved: options of :meth:`PnPNet.forward`; ``always``: every valid problem has a gradient."""
+    """Options of :meth:`PnPNet.forward`. ``always``: whether every valid problem has a gradient."""
 
     first_stage_only: bool
     always: bool
@@ -50,7 +50,7 @@ class _Call(NamedTuple):
 
 
 class _Attempt(NamedTuple):
-    """One pass from a problem to a result: what was proposed, and how the refinement ended."""
+    """One pass from a problem to a result, with the proposed starts and the refined pose."""
 
     problem: Problem
     frame: Frame
@@ -62,50 +62,53 @@ class _Attempt(NamedTuple):
 class PnPNet(PretrainedMixin):
     r"""Find the pose of a calibrated camera from 2D-3D correspondences with outliers.
 
-    The layer normalises the correspondences, lets ``init`` propose poses, refines and judges them, and expresses the
-    best pose in the frame of the inputs. All of it is batched and differentiable. A bad problem (non-finite input,
-    fewer than three pairs, points on a line, a pose that does not explain the pixels) has ``ok=False``, a ``status``
-    that says why, a finite pose without gradient, and changes no other problem.
+    The layer normalises the correspondences, lets ``init`` propose poses, refines and judges the poses, and expresses
+    the best pose in the frame of the inputs. All steps are batched and differentiable. An unsolvable problem
+    (non-finite input, fewer than three pairs, points on a line, a pose that does not explain the pixels) gets
+    ``ok=False``, a ``status`` that says why, and a finite pose without gradient. Other problems do not change.
 
-    Convention: ``x_cam = R x_world + t``, +z forward, pixels ``u = fx x/z + s y/z + cx`` with the skew ``s``; any
-    multiple of a camera matrix is the same camera.
+    Convention: ``x_cam = R x_world + t``, +z forward, pixels ``u = fx x/z + s y/z + cx`` with the skew ``s``. All
+    multiples of a camera matrix are the same camera.
 
-    Precision: the layer computes in float64 when any input tensor is float64, else in float32; results have that dtype.
-    Inputs of float16, bfloat16 and integers are converted, because half precision has too few digits for a pixel; each
-    input gets its gradient in its own dtype. :class:`torch.autocast` does not change the results.
+    Precision: the layer computes in float64 if any input tensor is float64, else in float32. Results have the dtype of
+    the computation. Inputs of float16, bfloat16 and integers are converted, because half precision has too few digits
+    for a pixel. The gradient of each input has the dtype of the input. :class:`torch.autocast` does not change the
+    results.
 
     Args:
-        init: maps a :class:`~kornia_pnpnet.problem.Problem` to :class:`~kornia_pnpnet.problem.Starts`, see
-            ``kornia_pnpnet.propose``; ``None``: the refinement starts from the pose given with the call, else from the
-            identity.
+        init: the initialiser, which maps a :class:`~kornia_pnpnet.problem.Problem` to
+            :class:`~kornia_pnpnet.problem.Starts`, see ``kornia_pnpnet.propose``. ``None``: the refinement starts from
+            ``init`` or ``prior`` of the call, else from the identity.
         refine: the refiner; classical :class:`~kornia_pnpnet.refine.lm.RobustWeightedLM` when ``None``.
-        normalize: the normalisation; the default centres and scales the world and orders the pairs.
+        normalize: the normalisation; the default centres and scales the world and sorts the pairs.
         effort: ``"adaptive"``: a problem whose first poses do not suffice gets further minimal samples
-            (:func:`~kornia_pnpnet.propose.ransac.search_on`), and a pose whose mirror image fits as well is not
-            ``ok``; needs an initialiser that estimates the noise, :class:`~kornia_pnpnet.propose.set.SetInit`.
-            ``"fixed"``: every problem gets the same work. ``None``: adaptive with such an initialiser and a refinement
-            in evaluation mode, else fixed. Always fixed: exported graphs, ``compile(whole=True)``,
-            ``torch.func.vmap`` and the device ``meta``. Rigs and bearings get further samples unless the effort is
-            ``"fixed"`` or the solver is compiled.
-        gradient: which problems have a gradient. ``"ok"``: those whose result is ``ok``. ``"always"``: every valid
-            problem, to train a network whose poses are still far off; the gradient of each problem by its normalised
-            points, pixels and weights is then finite and at most 10 long.
-        views: number of poses for each problem, 1 to 8: one of the problem itself and others of its mirror images (see
-            :mod:`kornia_pnpnet.propose.views`), which a network answers differently. All poses are refined; after seven
-            tenths of the iterations the best one goes on alone.
+            (:func:`~kornia_pnpnet.propose.ransac.search_on`), and a pose whose mirror image fits equally well is not
+            ``ok``. This effort needs an initialiser that estimates the noise,
+            :class:`~kornia_pnpnet.propose.set.SetInit`. ``"fixed"``: every problem gets the same work. ``None``:
+            adaptive in evaluation mode if the initialiser estimates the noise and the refinement has iterations, else
+            fixed. The effort is always fixed in exported graphs, with ``compile(whole=True)``, in ``torch.func.vmap``
+            and on the device ``meta``. For rigs and bearings the number of minimal samples is adaptive unless the
+            effort is ``"fixed"`` or the solver is compiled.
+        gradient: which problems have a gradient. ``"ok"``: problems whose result is ``ok``. ``"always"``: all valid
+            problems, to train a network whose poses are still far off. The gradient of each problem by its normalised
+            points, pixels and weights is then finite, and its norm is at most 10.
+        views: number of views of each problem, 1 to 8: the problem itself and mirror images of the problem (see
+            :mod:`kornia_pnpnet.propose.views`). A network proposes different poses for different views. All poses are
+            refined in the first seven tenths of the iterations, and only the best pose in the last three tenths.
         focal: ``"unknown"``: the focal length is estimated with the pose and returned in the result's ``intrinsics``.
-            The intrinsics of the call then give the principal point, the aspect ratio and the skew relative to the
-            focal length. The refinement starts from a nominal focal length with ``SetInit``; where that does not
-            suffice, and with other initialisers, from one that P3P finds. A problem is not ``ok`` when the standard
-            deviation of log f exceeds 0.15. ``"known"``: the focal length is that of the intrinsics.
+            The intrinsics of the call then give the principal point, the aspect ratio, and the skew relative to the
+            focal length. With ``SetInit`` the refinement starts from a nominal focal length. If this fails, and with
+            other initialisers, the refinement starts from a focal length that a search with P3P finds. A problem is not
+            ``ok`` when the standard deviation of log f exceeds 0.15. ``"known"``: the intrinsics give the focal length.
         focal_sigma: standard deviation of the logarithm of the focal length in the intrinsics of a call, for example
-            0.1 for one that is known to about 10 %; ``None``: the focal length in the intrinsics is ignored.
-        radial: number of coefficients of radial distortion, 0 to 2, estimated with an unknown focal length and returned
-            as ``dist``.
+            0.1 for a focal length that is known to about 10 %; ``None``: the given focal length is ignored.
+        radial: number of coefficients of radial distortion, 0 to 2, that are estimated with an unknown focal length and
+            returned as ``dist``.
 
     Raises:
-        BaseError: when ``views`` is not an integer from 1 to 8, or ``gradient``, ``effort`` or ``focal`` neither of its
-            values, or ``focal_sigma`` not positive, or given with a known focal length.
+        BaseError: when an option is not one of its values or outside its range, when ``effort="adaptive"`` is given
+            without an initialiser that estimates the noise, or when ``focal_sigma`` or ``radial`` is given with a known
+            focal length.
 
     Example:
         >>> from kornia_pnpnet import MLPInit
@@ -173,58 +176,59 @@ class PnPNet(PretrainedMixin):
         r"""Solve a batch of problems.
 
         Args:
-            world_points: shape :math:`(B, N, 3)`, any unit, floats or integers. Any leading dimensions may stand in
-                place of :math:`B`, in all arguments and in the result; a single problem has none.
-            img_points: pixels, shape :math:`(B, N, 2)`; or bearings, directions of any length in the camera's frame
-                (:func:`~kornia_pnpnet.cameras.bearings`), shape :math:`(B, N, 3)`.
+            world_points: shape :math:`(B, N, 3)`, any unit, floats or integers. In all arguments and in the result,
+                :math:`B` may be any number of leading dimensions; a single problem has no leading dimension.
+            img_points: pixels, shape :math:`(B, N, 2)`; or bearings, which are directions of any length in the camera's
+                frame (see :func:`~kornia_pnpnet.cameras.bearings`), shape :math:`(B, N, 3)`.
             intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or Kornia's cameras, whose
-                extrinsics are ignored; in a rig also one for each pair, :math:`(B, N, 3, 3)`. Bearings may omit them.
-                Sigmas and thresholds of bearings are then in radians, else in pixels of the focal length.
+                extrinsics are ignored; in a rig also one matrix for each pair, :math:`(B, N, 3, 3)`. ``None`` is
+                allowed with bearings. Sigmas and thresholds of bearings are in radians without intrinsics, and in
+                pixels at the given focal length with intrinsics.
             weights: weight of each pair, the same for u and v, at least 0, shape :math:`(B, N)`; 1 when ``None``.
-            mask: False where a pair is padding, bool, shape :math:`(B, N)`. The numbers of padding do not matter.
-            init: a world-to-camera pose, :math:`(B, 3, 3)` and :math:`(B, 3)`. It is refined beside the poses of the
-                initialiser; without an initialiser the refinement starts from it.
+            mask: False where a pair is padding, bool, shape :math:`(B, N)`. The numbers of padding are ignored.
+            init: a world-to-camera pose, :math:`(B, 3, 3)` and :math:`(B, 3)`, that is refined in addition to the poses
+                of the initialiser. Without an initialiser the refinement starts from ``init`` alone.
             img_sigma: standard deviation of the noise on each pixel coordinate, a number, :math:`(B,)` or
-                :math:`(B, N)`, at least 0; NaN where unknown. With this or ``world_sigma``, residuals and the scales of
-                the refinement's kernel count in standard deviations.
+                :math:`(B, N)`, at least 0; NaN where unknown. With ``img_sigma`` or ``world_sigma``, residuals and the
+                scales of the refinement's kernel are in standard deviations.
             world_sigma: standard deviation of the noise on each world coordinate, in the unit of ``world_points``;
                 shapes and NaN as for ``img_sigma``.
             img_cov: covariance of the noise of each pixel in px², in place of ``img_sigma``, shape
-                :math:`(B, N, 2, 2)`, symmetric and positive semi-definite. Residuals are whitened by it.
+                :math:`(B, N, 2, 2)`, symmetric and positive semi-definite. The refinement whitens the residuals.
             world_cov: covariance of the noise of each world point, in place of ``world_sigma``, shape
                 :math:`(B, N, 3, 3)`.
             confidence: the caller's belief that a pair is an inlier, in [0, 1], for example a matcher's score, shape
-                :math:`(B, N)`; NaN where unknown. Minimal samples are drawn from likely pairs more often, and a
-                network that was trained with confidences sees them. They need not be calibrated.
-            prior: what is known of the pose besides the pairs, such as
-                :func:`~kornia_pnpnet.refine.terms.gravity_prior`: a term of the refinement and of the choice among
-                poses. Its pose is one of the starts unless ``init`` is given. ``ok`` and ``probability`` are judged by
-                the pairs alone. Unknown noise counts as one pixel.
-            dist: distortion of the camera as Kornia and OpenCV have it, 4, 5, 8, 12 or 14 coefficients, shape
-                :math:`(B, D)` or :math:`(D,)`. Pixels and their noise are undistorted once. Pairs beyond what the
-                coefficients can show are left out.
+                :math:`(B, N)`; NaN where unknown. Pairs of high confidence are drawn more often for minimal samples.
+                Networks that were trained with confidences use them as an input. Confidences need not be calibrated.
+            prior: a prior of the pose, such as :func:`~kornia_pnpnet.refine.terms.gravity_prior`. The prior is a term
+                of the refinement and of the choice among poses. The prior's pose is a start unless ``init`` is given.
+                ``ok`` and ``probability`` depend on the pairs alone. If the noise is unknown, the prior is weighed
+                against pixels with a standard deviation of one pixel.
+            dist: distortion coefficients of Kornia and OpenCV, 4, 5, 8, 12 or 14 numbers, shape :math:`(B, D)` or
+                :math:`(D,)`. Pixels and their noise are undistorted once before solving. Pairs whose pixel cannot be
+                undistorted are left out.
             fisheye: the four coefficients of ``cv2.fisheye``, in place of ``dist``, shape :math:`(B, 4)` or
-                :math:`(4,)`. Pixels more than 85 degrees off the axis are left out; bearings keep them.
-            cam_from_rig: for several cameras with one pose, that of their rig: the transform from the rig to the camera
-                that sees each pair, :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`.
-            first_stage_only: return the first guess unrefined, the paper's "Net", at the cost of ``m=0``.
-            gradient: ``"ok"`` or ``"always"``; the solver's own when ``None``.
-            alternatives: largest number of other poses to return that explain the pairs nearly as well; they cost as
-                much as several solutions.
+                :math:`(4,)`. Pixels more than 85 degrees off the axis are left out. To keep such pixels, pass bearings.
+            cam_from_rig: the transform from a rig of several cameras to the camera of each pair,
+                :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`. The pose is then that of the rig.
+            first_stage_only: return the first guess without refinement (the paper's "Net"), as with ``m=0``.
+            gradient: ``"ok"`` or ``"always"``, see :class:`PnPNet`; the option of the solver when ``None``.
+            alternatives: largest number of other poses to return that explain the pairs nearly as well. Finding other
+                poses takes as long as several calls without ``alternatives``.
 
         Returns:
-            The :class:`~kornia_pnpnet.result.PnPResult`, in float64 when any input is, else in float32. Gradients flow
-            through pose, intrinsics, dist, weights and cost of problems that are ``ok``, and through the first guess
-            of every valid problem. A problem that cannot be solved has the identity as its pose and a cost of the
-            square root of the dtype's largest number.
+            The :class:`~kornia_pnpnet.result.PnPResult`. Gradients flow through pose, intrinsics, dist, weights and
+            cost of problems that are ``ok``, and through the first guess of every valid problem. A problem without a
+            finite pose gets the identity as its pose, and the square root of the dtype's largest number as its cost.
 
         Raises:
-            ShapeError: for shapes that do not fit each other, fewer than 3 pairs, or another N than the initialiser
-                was built for.
-            TypeCheckError: for arguments that are no tensors, or hold booleans or complex numbers.
+            ShapeError: for shapes that do not fit each other, fewer than 3 pairs, or a number of pairs that the
+                initialiser was not built for.
+            TypeCheckError: for arguments that are not tensors, or hold booleans or complex numbers.
             DeviceError: for tensors on different devices, or on another device than a network of the solver.
-            ValueCheckError: for both a sigma and a covariance of the pixels, or of the points; for arguments that
-                cannot be combined (an unknown focal length with distortion or a rig, a rig with alternatives).
+            ValueCheckError: when both a sigma and a covariance are given for the pixels or for the points, or for
+                arguments that cannot be combined (an unknown focal length with distortion or a rig, a rig with
+                alternatives).
         """
         size, inputs = checked_inputs(
             world_points,
@@ -249,7 +253,7 @@ class PnPNet(PretrainedMixin):
         with in_full_precision(inputs.world_points.device.type):
             compiled = self._run.compiled or self._whole.compiled
             single = compiled and len(inputs.world_points) == 1 and not (self._run.failed or self._whole.failed)
-            if compiled:  # a batch of one, and every layout in memory, would be compiled for by itself
+            if compiled:  # a batch of one, or another memory layout, would need a new compilation
                 inputs = map_tensors(lambda x: torch.cat((x, x)) if single else x.contiguous(), inputs)
             any_number = not (compiled or trait(self.init, "fixed_pairs"))
             parts = split_batch(inputs, trait(self.init, "pairs_at_once"), any_number)
@@ -262,10 +266,10 @@ class PnPNet(PretrainedMixin):
     def with_starts(
         self, *args: Any, first_stage_only: bool = False, gradient: str | None = None, **options: Any
     ) -> tuple[PnPResult, Starts]:
-        """Solve a batch and return the whole first proposal as well (poses, weights and noise), to train it.
+        """Solve a batch, and also return the starts (proposed poses, weights and noise) for training losses.
 
-        For the arguments see :meth:`forward`; ``alternatives`` is not among them. The starts are in the frame, order
-        and units of the inputs, and their ``ok`` says whether the problem is valid.
+        For the arguments, except ``alternatives``, see :meth:`forward`. The starts are in the frame, order and units of
+        the inputs. The ``ok`` of the starts says whether the problem is valid.
         """
         size, inputs = checked_inputs(*args, **options)
         with in_full_precision(inputs.world_points.device.type):
@@ -274,23 +278,24 @@ class PnPNet(PretrainedMixin):
             return restore_leading(size, (attempt.result, attempt.frame.undo_starts(attempt.starts)))
 
     def compile(self, mode: str | None = None, *, whole: bool = False) -> None:
-        """Compile with ``torch.compile``, in place: what is before, in, and after an iteration, each once.
+        """Compile the solver in place with ``torch.compile``: the first stage, an iteration, and the final stage.
 
-        The first call then takes some seconds, less where a cache of ``torch.compile`` is on disk; further calls take a
-        fraction of the uncompiled time. The batch may change its size; another number of pairs, another dtype and calls
-        that record gradients are compiled for when they first come. What cannot be compiled, without a C++ compiler or
-        because it is a RANSAC, runs uncompiled after one warning. Copies compile for themselves.
+        The first call then takes some seconds, or less with a disk cache of ``torch.compile``. Further calls take a
+        fraction of the uncompiled time. The size of the batch may change without a new compilation. The first call with
+        another number of pairs, with another dtype, or with gradients compiles again. Parts that cannot be compiled
+        (RANSAC, or all parts without a C++ compiler) run uncompiled after one warning. A copy of the solver compiles
+        again.
 
         Args:
             mode: mode of ``torch.compile``; ``"reduce-overhead"`` captures CUDA graphs.
-            whole: compile the solver as one graph, with its iterations one after the other. The first call takes
-                longer; calls of a few problems, which mostly wait for Python, take half the time. A search is no
-                graph: the effort is fixed.
+            whole: compile the solver with all iterations as one graph. The first call takes longer. Calls with few
+                problems take half the time, because they run less Python code. The effort is fixed, because a search
+                cannot be part of a graph.
         """
         self._run, self._whole = Runner(not whole, mode), Runner(whole, mode)
 
     def _solve(self, inputs: Inputs, call: _Call) -> PnPResult:
-        """Problem, attempts, judge: a first attempt for all problems, further ones for those that ask for them."""
+        """Solve all problems once, then solve some of them again with a better focal length or better noise."""
         inputs, nominal = self._with_camera(inputs)
         more = _MORE_ITERATIONS if nominal or self.radial else 0
         attempt = self._attempt(inputs, call, more)
@@ -311,11 +316,12 @@ class PnPNet(PretrainedMixin):
         return self._with_alternatives(attempt, result, call.alternatives) if call.alternatives else result
 
     def _with_camera(self, inputs: Inputs) -> tuple[Inputs, bool]:
-        """Give the problems a first focal length if theirs is unknown, and tell whether it is only a nominal one."""
+        """Set an initial focal length if the focal length is unknown, and tell whether the initial one is nominal."""
         if self.focal == "known":
             return inputs, False
         inputs = with_nominal_focal(inputs, self.focal_sigma)
-        # From a nominal focal length the refinement of a network's poses converges; a caller's pose does not fit it.
+        # Refinement from a network's poses converges from the nominal focal length. A caller's pose does not fit the
+        # nominal focal length.
         free = trait(self.init, "estimates_noise") and inputs.init is None and inputs.prior is None
         if free and not self.radial:
             return inputs, True
@@ -323,7 +329,7 @@ class PnPNet(PretrainedMixin):
         return (with_found_focal(inputs, self.radial) if searched else inputs), False
 
     def _attempt(self, inputs: Inputs, call: _Call, more: int = 0) -> _Attempt:
-        """Propose poses, refine them, and judge the best."""
+        """Propose poses, refine them, and judge the best pose."""
         adapts = self._adapts(inputs, call)
         searches = adapts and self.focal == "known"  # an unknown focal length has a search of its own
         problem, frame, starts = self._run(self._propose, inputs, call, searches and inputs.confidence is None)
@@ -343,7 +349,7 @@ class PnPNet(PretrainedMixin):
         return _Attempt(problem, frame, starts, refined, self._run(self._result, frame, starts, refined, call))
 
     def _propose(self, inputs: Inputs, call: _Call, search_follows: bool) -> tuple[Problem, Frame, Starts]:
-        """Normalise and propose: everything before the refinement."""
+        """Everything before the refinement: normalise the inputs and propose poses."""
         problem, frame = self.normalize(*inputs[:5], inputs.noise, inputs.confidence, inputs.rig)
         init = inputs.init
         if call.always:
@@ -369,10 +375,10 @@ class PnPNet(PretrainedMixin):
         return problem, frame, starts
 
     def _result(self, frame: Frame, starts: Starts, refined: Refinement, call: _Call) -> PnPResult:
-        """A refined state in the caller's world: everything after the refinement."""
+        """Everything after the refinement: express the refined state in the caller's world."""
         pose, first = frame.undo(refined.pose), frame.undo(starts.pose)
-        # A sum is finite when all its terms are finite. A rotation that is not finite makes its translation not finite,
-        # since every entry was multiplied by a coordinate of the centroid.
+        # A sum is finite only if all its terms are finite. The rotation needs no test, because its products with the
+        # centroid are terms of the translation.
         finite = frame.valid & (pose.translation.sum(-1) + refined.weights.sum(-1) + refined.cost).isfinite()
         ok = finite & refined.ok if starts.ok is None else finite & refined.ok & starts.ok
         state, intrinsics = refined.state, frame.intrinsics
@@ -381,7 +387,7 @@ class PnPNet(PretrainedMixin):
         first_ok = frame.valid & first.translation.sum(-1).isfinite()
         status = torch.where(refined.in_front, Status.NOT_BELIEVED.value, Status.BEHIND.value)
         status = torch.where(ok, Status.SOLVED.value, torch.where(finite, status, Status.DEGENERATE.value))
-        # ONNX Runtime chooses among int64, not among int8.
+        # int64 until here, because `where` of ONNX Runtime does not support int8.
         status = torch.where(frame.valid, status, frame.status).to(torch.int8)
         live = finite if call.always else ok
         pose = gate_pose(pose, live, finite)
@@ -399,7 +405,7 @@ class PnPNet(PretrainedMixin):
         )
 
     def _adapts(self, inputs: Inputs, call: _Call) -> bool:
-        """Whether the effort is adaptive."""
+        """Whether the effort of a call is adaptive, see :class:`PnPNet`."""
         if call.first_stage_only or self.effort == "fixed" or inputs.rig is not None:
             return False
         if not sees_values(inputs.world_points):
@@ -408,7 +414,7 @@ class PnPNet(PretrainedMixin):
         return self.effort == "adaptive" or (can and not self.training)
 
     def _shown_sigma(self, attempt: _Attempt, result: PnPResult) -> Tensor:
-        """Sigma of pixels that a result shows, in pixels of the caller, where it is far above the estimate, else 0."""
+        """Sigma of the inliers' residuals in the caller's pixels if far above the estimated noise, else 0, (B, N)."""
         problem, frame, starts = attempt.problem, attempt.frame, attempt.starts
         assert starts.noise is not None
         assert result.intrinsics is not None
@@ -422,7 +428,7 @@ class PnPNet(PretrainedMixin):
         return frame.undo_pairs(sigma / frame.img_scale[:, None])
 
     def _with_alternatives(self, attempt: _Attempt, result: PnPResult, most: int) -> PnPResult:
-        """The result with other poses that explain the pairs nearly as well."""
+        """Add to a result the other poses that explain the pairs nearly as well."""
         frame = attempt.frame
         problem, starts = _as_known(attempt.problem, attempt.starts, attempt.refined)
         found = find_alternatives(self.refine, problem, starts, frame.apply(result.pose), frame.valid, most)
@@ -440,7 +446,7 @@ class PnPNet(PretrainedMixin):
 
 
 def _as_known(problem: Problem, starts: Starts, refined: Refinement) -> tuple[Problem, Starts]:
-    """The problem with the noise that it was refined with, and with the camera that was found, both as known."""
+    """Make the noise of the refinement and the estimated focal length known parts of the problem."""
     known = problem._replace(noise=complete_noise(problem, starts))
     return known.seen_with(refined.state.zoom), starts._replace(camera=None)
 
