@@ -39,10 +39,6 @@ _LONGEST_GRADIENT = 10.0
 # median error of the focal length is 0.037, 0.029 and 0.030 % (CameraProblems, seeds 4321, 4322, half outliers).
 # Radial distortion needs them for its gradient: the search before them works on undistorted pixels, without gradient.
 _MORE_ITERATIONS = 4
-# Least probability with which a pose that started with the nominal focal length is accepted. Of problems with 50 %
-# outliers (n = 12, seeds 7700 to 7709 of CameraProblems), 0.4 to 0.6 % exceed it and are far off, as are 0.6 % of the
-# poses of least squares on the inliers.
-_CONVINCING = 0.97
 
 
 class _Call(NamedTuple):
@@ -301,11 +297,10 @@ class PnPNet(PretrainedMixin):
         result = attempt.result
         if self._adapts(inputs, call):
             if nominal:
-                rows = (~result.ok | (result.probability < _CONVINCING)).nonzero()[:, 0]  # type: ignore[operator]
+                rows = (~result.ok).nonzero()[:, 0]
                 if len(rows):
                     again = self._attempt(with_found_focal(take(inputs, rows)), call).result
-                    better = again.ok | ~result.ok[rows]
-                    result = put(result, rows[better], take(again, better))
+                    result = put(result, rows, again)
             if inputs.noise is None:
                 sigma = self._shown_sigma(attempt, result)
                 rows = (sigma[:, 0] > 0).nonzero()[:, 0]

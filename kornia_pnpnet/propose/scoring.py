@@ -30,12 +30,19 @@ Scorer: TypeAlias = Callable[[Tensor], Tensor]
 # Added to the squared distance per unit of negative depth: points behind the camera then exceed MAX_ERROR.
 _BEHIND = 1e15
 
-#: Losses of a pair, 1 from the threshold on: the truncated squares of MSAC (P. Torr and A. Zisserman, "MLESAC",
-#: CVIU 78(1), 2000, section 3), and RANSAC's count of outliers.
-SCORERS: dict[str, Scorer] = {
-    "msac": lambda error: error.clamp(max=1.0),
-    "inliers": lambda error: (error >= 1.0).to(error.dtype),
-}
+
+def _truncated(error: Tensor) -> Tensor:
+    """Truncated squares (P. Torr and A. Zisserman, "MLESAC", CVIU 78(1), 2000, section 3)."""
+    return error.clamp(max=1.0)
+
+
+def _outliers(error: Tensor) -> Tensor:
+    """RANSAC's count of outliers."""
+    return (error >= 1.0).to(error.dtype)
+
+
+#: Losses of a pair by name, 1 from the threshold on. Functions, not lambdas: a solver can then be pickled.
+SCORERS: dict[str, Scorer] = {"msac": _truncated, "inliers": _outliers}
 
 
 def as_pose(entries: Tensor) -> Pose:
