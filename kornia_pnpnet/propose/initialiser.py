@@ -19,8 +19,8 @@ class Initialiser(Configured):
     this class.
 
     Attributes:
-        pairs_at_once: number of pairs whose temporaries fit the caches of one core. A solver splits larger batches
-            where gradients allow a split. ``None``: batches are never split.
+        pairs_at_once: number of pairs whose temporaries fit the caches of one core. Without gradients, a solver splits
+            batches with more pairs per thread (CPU only). ``None``: batches are not split.
         fixed_pairs: whether the number of pairs is fixed, ``config["n"]``.
         takes_given: whether ``forward(problem, given)`` accepts a given pose.
         takes_rigs: whether the initialiser solves rigs.
