@@ -23,16 +23,16 @@ __all__ = ["find_alternatives", "mirror_probability"]
 
 # Another pose is kept when its likelihood is at least this fraction of the likelihood of the refinement's pose.
 _LIKELY = 1e-3
-# Largest logarithm of the ratio of both likelihoods: the exponential of larger numbers could overflow.
+# Upper bound of the logarithm of this likelihood ratio, without which the exponential could overflow.
 _LIKELIER = 30.0
 # Two poses are the same minimum when their rotations differ by less than `_SAME_TURN` radians, and the two positions of
-# the mean point in the camera frame differ by less than `_SAME_SHIFT` times its distance from the camera.
+# the mean point in the camera frame differ by less than `_SAME_SHIFT` times the distance of this point from the camera.
 _SAME_TURN, _SAME_SHIFT = 0.035, 0.035
 # A mirror image is refined only when its median residual is less than this share of the spread of the pixels, or when
 # the problem has fewer likely inliers than the second number.
 _NEAR_MIRROR, _FEW_INLIERS = 0.2, 10
-# After this number of iterations a mirror image is dropped when its log-likelihood minus that of the pose is below the
-# second number.
+# A mirror image is dropped after the first number of iterations if the logarithm of its likelihood ratio to the pose is
+# below the second number.
 _FIRST_LOOK, _HOPELESS = 2, -30.0
 # Radians. A mirror image whose rotation differs by less does not lower the probability of the pose (see
 # :attr:`~kornia_pnpnet.result.PnPResult.probability`).
@@ -81,7 +81,7 @@ def find_alternatives(
     for x, image in zip((ends, cost, usable), _ends(unrefined), strict=True):
         x[1, lost] = image[lost]
 
-    # A cost is a mean over the pairs. Multiplied by their number, the cost gives the log-likelihood.
+    # Costs are means over the pairs. Log-likelihoods are sums over the pairs.
     unit = (problem.weights > 0).sum(-1) / _unit(problem, starts, as_pose(ends[0]))
     log_ratio = (-0.5 * unit * (cost - cost[0])).clamp(max=_LIKELIER)
     log_ratio = torch.where(usable & (log_ratio > math.log(_LIKELY)), log_ratio, -torch.inf)
@@ -147,7 +147,7 @@ def mirror_probability(
 
 
 def _ends(refined: Refinement) -> tuple[Tensor, Tensor, Tensor]:
-    """Entries of the refined poses, their costs, and which are usable: finite with enough points in front."""
+    """Entries of the refined poses, their costs, and which poses have a finite cost and enough points in front."""
     return as_entries(refined.pose), refined.cost, refined.in_front & refined.cost.isfinite()
 
 
@@ -163,7 +163,7 @@ def _moved(points: Tensor, pose: Pose) -> Tensor:
 
 
 def _mirrored(pose: Pose, problem: Problem, weights: Tensor) -> Pose:
-    """The pose between two half turns: of the world about the plane's normal, of the camera about the line of sight."""
+    """Mirror image: a half turn about the normal of the plane, the pose, and a half turn about the line of sight."""
     middle = _mean(problem.world_points, weights)
     centred = problem.world_points - middle[:, None]
     covariance = centred.mT @ (weights[..., None] * centred)

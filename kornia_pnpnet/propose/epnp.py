@@ -102,9 +102,10 @@ def control_points(problem: Problem) -> ControlPoints:
 class EPnP(Initialiser):
     r"""EPnP with weights, planar points and gradients, for batches.
 
-    The control points in the camera frame are that combination of the null vectors of the projection equations that
-    preserves the distances of the world. Gauss-Newton starts from four cases with 1 to 4 null vectors. The case with
-    the least weighted reprojection error is aligned with the world (orthogonal Procrustes).
+    The control points in the camera frame are a combination of the null vectors of the projection equations. The
+    combination has to preserve the distances between the control points. Gauss-Newton starts from four cases with 1 to
+    4 null vectors. The case with the least weighted reprojection error is aligned with the world (orthogonal
+    Procrustes).
 
     Source: V. Lepetit, F. Moreno-Noguer and P. Fua, "EPnP: An Accurate O(n) Solution to the PnP Problem", IJCV 2009.
     Four things differ from the paper. Two thirds of the unknowns are eliminated (see the module). The null vectors are
@@ -119,8 +120,8 @@ class EPnP(Initialiser):
     Args:
         iterations: number of Gauss-Newton steps, at least 2. Every case takes two steps; the best case takes the rest.
         algebraic_weight: :math:`\mu \ge 0`, weight of the algebraic error relative to the squared error of the
-            distances. The world then has a root mean square radius of 1, and pixels are divided by the focal length.
-            The paper has no such term (0).
+            distances. Both errors are measured in a world with a root mean square radius of 1, for pixels over the
+            focal length. In the paper the weight is 0.
 
     Raises:
         BaseError: when an argument is out of its range.
@@ -173,7 +174,7 @@ class EPnP(Initialiser):
 
     def _depths(self, system: _DepthSystem) -> tuple[Tensor, Tensor]:
         """Depths (4, 1, B) of the best case, and whether the case succeeded, bool (B,); equal depths if it failed."""
-        cases = _four_cases(system).detach()  # forward mode starts here: the square roots of 0 have no derivative
+        cases = _four_cases(system).detach()  # also in forward mode: sqrt has no derivative at 0
         # A shape and its mirror image along the optical axis have the same distances, and Gauss-Newton does not turn
         # the shape into the mirror image. Symmetric points therefore need both starts.
         mirrored = torch.cat((cases[:1, -1:], -cases[1:, -1:]))

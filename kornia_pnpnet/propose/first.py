@@ -1,4 +1,4 @@
-"""The first poses of a problem: of any initialiser, of the caller, and of the mirror images of the problem.
+"""The poses from which refinement starts: from any initialiser, from mirror images, and from the caller.
 
 Networks and EPnP accept only one pinhole camera. For a rig with such an initialiser, RANSAC finds the pose instead.
 """

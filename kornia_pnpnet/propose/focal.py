@@ -39,7 +39,7 @@ _FINDER = RANSAC(P3P(), threshold=_THRESHOLD, confidence=0.99, final_steps=3)
 # Focal lengths. Least scale of the kernel in the first step, when distortion is unknown: k1 = 0.2 shifts a pixel at the
 # tangent 0.7 by 0.2 times 0.7 cubed, which is 0.07. Each step multiplies the least scale by the second number.
 _WIDE, _SHRINK = 0.07, 0.6
-# Steps of the first estimate of distortion.
+# Number of Gauss-Newton steps in the first estimate of distortion.
 _STEPS = 14
 # Focal lengths. Lower bound of the scale of the kernel.
 _LEAST = 1e-5

@@ -13,8 +13,8 @@ distances. The conic is a pair of lines when
 .. math:: (u_1 u_2 + u_2 u_3 + u_3 u_1)\,(s \cdot u) = g\, u_1 u_2 u_3,
 
 with the squared sine :math:`s_k` of the angle between the rays :math:`i` and :math:`j`, and the squared determinant
-:math:`g` of all three rays. One root of this cubic gives two lines. Each line meets another conic of the family in two
-points. A Newton step then refines the ratios.
+:math:`g` of all three rays. One root of this cubic gives two lines. Other weights give a second conic, which each line
+meets in two points. A Newton step then refines the ratios.
 
 Sources: M. Persson and K. Nordberg, "Lambda Twist", ECCV 2018, for the use of one degenerate conic; Y. Ding, J. Yang,
 V. Larsson, C. Olsson and K. Åström, "Revisiting the P3P Problem", CVPR 2023, for the solutions by the roots of the
@@ -52,7 +52,7 @@ _CHUNK_BYTES = 2**16
 _ERROR_POWER = 2 / 3
 # Share of the longest edge. Largest difference of the two triangles at any distance of the camera.
 _LARGEST_ERROR = 0.01
-# Machine epsilons, relative to the coordinates and to the longest edge. A triangle with a smaller height is a line.
+# Machine epsilons, relative to the coordinates and to the longest edge. A triangle of less height counts as a line.
 _LINE = 32.0
 # Number of focal lengths on the grid when the focal length is unknown.
 _FOCALS = 12
@@ -181,7 +181,7 @@ def _candidates(p: Tensor, q: Tensor, r: Tensor, b: Tensor, g: Tensor) -> Tensor
     """Solutions of the equations of :func:`_distances` up to rounding."""
     h = 0.5 * b
     s1, s2, s3 = torch.addcmul(b, h, h, value=-1.0)
-    # With u_1 = -(p u_3 + q u_2) the cubic is one in u_3 : u_2, and s · u = t_3 u_3 + t_2 u_2.
+    # With u_1 = -(p u_3 + q u_2) the unknown of the cubic is u_3 : u_2, and s · u = t_3 u_3 + t_2 u_2.
     t3, t2 = s3.addcmul_(p, s1, value=-1.0), s2.addcmul_(q, s1, value=-1.0)
     k2, k1 = (r * t3).addcmul_(p, g - t2), (r * t2).addcmul_(q, g - t3)
     u3, u2 = _isolated_root(torch.stack(((p * t3).neg_(), k2, k1, (q * t2).neg_())))
@@ -246,7 +246,7 @@ def _dot(v: Tensor, w: Tensor) -> Tensor:
 
 
 def _cross(v: Tensor, w: Tensor) -> Tensor:
-    """Cross products of vectors (3, *, C); ``torch.linalg.cross`` takes a CPU several times as long."""
+    """Cross products of vectors (3, *, C); ``torch.linalg.cross`` is several times slower on a CPU."""
     return (v.roll(-1, 0) * w.roll(1, 0)).addcmul_(v.roll(1, 0), w.roll(-1, 0), value=-1.0)
 
 
@@ -273,8 +273,8 @@ def _edges(points: Tensor) -> Tensor:
 def _solve_chunk(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Rotations (3, 3, 2, 2, C), translations (3, 2, 2, C), and which poses are solutions (2, 2, C)."""
     finfo = torch.finfo(world_points.dtype)
-    # Components of world points and image points. Unsound problems become 0. Each triple of points is then turned so
-    # that the longest edge is opposite to the first point.
+    # Components of world points and image points, 0 for unsound problems. Each triple of points is then turned so that
+    # the longest edge is opposite to the first point.
     points = torch.cat((world_points.permute(1, 2, 0), plane_points.permute(1, 2, 0)), 1)  # (3, 5, C)
     sound = points.abs().sum((0, 1)) <= finfo.max**0.2  # larger numbers could overflow
     points = torch.where(sound, points, 0.0)
@@ -296,7 +296,7 @@ def _solve_chunk(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Te
     det = _dot(_cross(gaps[1], gaps[2]), rays[0])
     dist = _distances(p, q, r, gaps.square_().sum(1), det.mul_(det))
 
-    # The longest edge has the length 1 above this line. Below, lengths are in the unit of the world.
+    # Above, the longest edge has the length 1. From here on lengths are in the unit of the world.
     base_length = inv_base.reciprocal()
     y1, y2, y3 = (dist * base_length)[:, None] * rays[:, :, None, None]
     cam1, cam2, cam_inv_base, cam_along, cam_sq_height = _axes(y3 - y2, y1 - y2)

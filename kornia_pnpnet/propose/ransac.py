@@ -248,23 +248,24 @@ def _trusted(problem: Problem) -> Tensor:
 def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) -> Starts:
     r"""Run RANSAC on the problems for which the poses of an initialiser do not suffice.
 
-    A pair is drawn in proportion to 0.8 plus 0.2 times its weight in the starts, times a factor by the caller's
-    confidence. Misleading weights then cost some samples, but the search still succeeds. An inlier has a residual of
-    less than five standard deviations if the caller gave the noise of the pair, else of less than ten standard
-    deviations. The standard deviation is the mean over the pairs if the caller gave no noise at all. A covariance
-    counts as isotropic noise of the same trace. Noise of a point is converted to pixels at the depth of the centre of
-    the world in the first pose, for all poses. With the depths of each pose, a pose close to the points would have
-    the most inliers.
+    The chance of a pair to be drawn is proportional to 0.8 plus 0.2 times its weight in the starts, times a factor by
+    the caller's confidence. Misleading weights then cost some samples, but the search still succeeds.
 
-    A problem is searched only when it needs more than 64 samples for a confidence of 0.999, both by the inliers of the
-    best pose of the starts and by those after the poses of the starts were improved on their inliers. Problems that are
-    done leave the batch. The result of a problem does not depend on the other problems.
+    An inlier has a residual of less than five standard deviations if the caller gave the noise of the pair, else of
+    less than ten standard deviations. If the caller gave no noise, the standard deviation is the mean over the pairs. A
+    covariance counts as isotropic noise of the same trace. For all poses the noise of points is converted to pixels at
+    one depth: the depth of the centre of the world in the first pose. If the depths of each pose were used, a pose
+    close to the points would have the most inliers.
+
+    A problem is searched only when it needs more than 64 samples for a confidence of 0.999. The inliers of the best
+    pose of the starts determine this number, first before and then after least squares improve the pose. Problems that
+    are done leave the batch. The result of a problem does not depend on the other problems.
 
     Args:
         problem: normalised problems of a centred and scaled world.
         starts: several poses, probabilities of being an inlier as weights, and the noise of the pairs.
-        keep_others: whether the result keeps the other poses of the starts. With a pose or a prior of the caller they
-            are kept, because a search on few pairs can lead away from the correct pose.
+        keep_others: whether the result keeps the other poses of the starts. A solver keeps them if the caller gave a
+            pose or a prior, because a search on few pairs can lead away from the correct pose.
 
     Returns:
         The starts with the best pose, without gradient. The weights of a searched problem are replaced, because the

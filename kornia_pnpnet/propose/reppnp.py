@@ -33,7 +33,7 @@ _MIN_PAIRS = 4
 # Weight of the squared depths of the control vectors during outlier rejection. Values from 1e-3 to 3e-2 work equally
 # well on the protocol's problems.
 _DEPTH_PRIOR = 5e-3
-# Weight of these squared depths for the last null vector: small enough to keep the small depths of a narrow view.
+# Weight of the squared depths for the last null vector, small enough to keep the small depths of a narrow view.
 _FINAL_DEPTH_PRIOR = 1e-5
 # Number of iterations of rejection with the null vector, and with the rigid motion.
 _NULL_ITERATIONS, _RIGID_ITERATIONS = 3, 4

@@ -21,7 +21,7 @@ __all__ = ["Samples", "agreement_of_neighbours", "draw", "kept_at_once", "sample
 # Number of nearest neighbours of a pair that are compared.
 _NEIGHBOURS = 16
 # Largest number of pairs, spread evenly over all pairs, among which neighbours are searched. The bound makes the cost
-# linear in the number of pairs. It must be a power of two.
+# linear in the number of pairs. The number must be a power of two.
 _CANDIDATES = 512
 # The bits of an infinite float32.
 _INFINITE = 0x7F800000
@@ -155,7 +155,7 @@ class Samples:
     def positions(self, problems: Tensor, start: int, stop: int) -> Tensor:
         """Positions (P, H, s) of the pairs in the samples ``start`` to ``stop - 1`` of some problems (P,).
 
-        After the last sample of an enumerated problem, its first samples are repeated.
+        If all subsets of a problem are listed, the first samples are repeated after the last sample.
         """
         listed = torch.arange(start, stop, device=problems.device) % self.totals[problems, None]
         ranks = self._tables[self._kinds[problems, None], listed.clamp(max=self._tables.shape[1] - 1)]
@@ -167,8 +167,8 @@ class Samples:
     def needed(self, problems: Tensor, inliers: Tensor, confidence: float) -> Tensor:
         """:func:`samples_needed` of some problems (P,) with the inliers (P, N) of their best poses so far.
 
-        If pairs have unequal chances, an effective number of pairs replaces the number of pairs. It is the inverse of
-        the mean chance of the inliers, weighted by the chances. (The chances of a problem sum to 1.)
+        The chances of a problem are scaled to the sum 1. If pairs have unequal chances, an effective number replaces
+        the number of pairs: the inverse of the mean chance of the inliers, with the chances themselves as weights.
         """
         share = torch.where(inliers, self._share[problems], 0.0)
         mass = share.sum(-1)

@@ -57,8 +57,9 @@ _DAMPING = 1e-6
 # limit is larger, because inliers have larger residuals at the pose of a noisy sample.
 _LIMITS = 3.0, 1.0
 # At least the second number of samples is drawn when the standard deviation of the rotation exceeds the first number
-# (radians), as for a flat scene in a narrow field of view. Another pose may then have as many inliers. Chosen on a
-# scene with a field of view of 13 degrees. With half of the first number, problems of 9 pairs take twice the time.
+# (radians), as for a flat scene in a narrow field of view. Another pose may then have as many inliers as the correct
+# pose. Chosen on a scene with a field of view of 13 degrees. With half of the first number, problems of 9 pairs take
+# twice the time.
 _OPEN, _OPEN_SAMPLES = 0.008, 256.0
 # After this number of samples, pairs whose neighbours agree are drawn more often (see `agreement_of_neighbours`). To
 # compute the agreement takes about as long as these samples.
@@ -197,7 +198,7 @@ class Search:
         return State(as_pose(torch.cat((first, last / scale), 1)), -scale.log())
 
     def _unpacked(self, values: Tensor, owners: Tensor) -> Problem:
-        """A problem from the C numbers of each pair, (C, n, P), that belong to the problems ``owners`` (P,)."""
+        """Problems of n pairs, from numbers of the pairs (C, n, P) and indices ``owners`` (P,) in the batch."""
         scales, free = take(((self.problem.img_scale, self.problem.world_scale), self.problem.free_focal), owners)
         scales, free, focal = map_tensors(lambda x: x.to(values), (scales, free, self.problem.focal))
         values = values.permute(2, 1, 0)
@@ -207,7 +208,7 @@ class Search:
         return Problem(values[..., :3], values[..., 3:5], weights, focal, *scales, usual, rig=rig, free_focal=free)
 
     def _projected(self, rows: Tensor, poses: Tensor) -> tuple[Problem, Thresholds, Projection]:
-        """Problems ``rows`` (R,), their thresholds, and their projections at poses (R, 12), all in float32."""
+        """The problems at ``rows`` (R,), their thresholds, and their projections at poses (R, 12), in float32."""
         problem = self._unpacked(self.low[rows].permute(2, 1, 0).contiguous(), rows)
         return problem, take(self.thresholds, rows), project(self._state(poses), problem)
 
@@ -226,8 +227,8 @@ class Search:
     def _expect(self, at: Tensor) -> None:
         """Estimate the number of samples that some problems need, by the inliers of their best poses.
 
-        After `_prefer_agreement` the estimate is the geometric mean of the numbers with and without agreement.
-        Otherwise an incorrect pose on repeated structure, where neighbours also agree, could end the search too early.
+        After `_prefer_agreement` the result is the geometric mean of two estimates, with and without agreement. With
+        agreement alone, an incorrect pose on repeated structure, where neighbours agree, could end the search early.
         """
         if not len(at):
             return

@@ -27,7 +27,7 @@ _T = TypeVar("_T")
 # Number of features per pair: 3 of the world, 2 of the image, 2 of the residual, 3 of the problem, 2 of the noise, and
 # 2 flags. Confidences add 2 features (logit and flag). Repeats add 2 features, see `repeats`.
 _FEATURES = 14
-# Number of pairs. PyTorch 2.13 is slow at the softmax of shorter rows.
+# Least number of pairs for a softmax over rows: PyTorch 2.13 is slow at shorter rows.
 _SHORT = 16
 # Number that is added to the attention score of padding.
 _ABSENT = -1e9
@@ -102,7 +102,7 @@ def _variance(noise: Noise, focal: Tensor, pose: Pose) -> Tensor:
 def _samples(count: int, number: int, search_follows: bool) -> list[tuple[int, tuple[int, int, int]]]:
     """Minimal samples of up to ``count`` pairs: the least number of pairs of a problem with the sample, and 3 ranks."""
     likeliest = [(0, sample) for sample in _SAMPLES[:number] if max(sample) < count]
-    if search_follows:  # the search draws the others
+    if search_follows:  # the search draws further samples
         return likeliest
     spread = [(least, (f * i, f * j, f * k)) for least, f in _SPREADS for _, (i, j, k) in likeliest]
     ring = [(_RING_FROM, sample) for sample in _RING]
@@ -270,7 +270,7 @@ class SetInit(Initialiser):
         counts, along = of_pairs[1:].split(starts)  # (S, B, N) each
         away, noise = of_problem.split((starts, 2), -1)
         # The distance of a point is about the distance of the world's centre plus an offset. With an offset instead of
-        # a factor, worlds that are far away keep their relief.
+        # a factor, the differences of distances do not grow with the distance.
         distance = (away.clamp(-6.0, 6.0) - view.log_spread).exp().mT[..., None]  # (S, B, 1)
         relief = torch.add(view.height, along, alpha=3.0) / distance
         ranges = distance * relief.clamp(-3.0, 3.0).exp()

@@ -11,7 +11,7 @@ from kornia_pnpnet.problem import Problem
 
 __all__ = ["LEAST_NOISE", "LOG_NOISE", "View", "repeats"]
 
-# Ridge of the affine camera, relative to the mean square of the world points. It makes the fit of planar points unique.
+# Ridge of the affine camera, relative to the mean square of the world points: the fit of planar points is then unique.
 _RIDGE = 0.02
 # Spreads. Features are clipped to this absolute value, so that no pair dominates the network.
 _MOST = 8.0
@@ -27,8 +27,9 @@ _KEY = 1.0, 0.7548776662, 0.5698402910
 
 
 class View:
-    r"""The network's input, which is invariant to rotations of world and camera (except the roll) and to their units.
+    r"""The network's input.
 
+    The features are invariant to rotations of the world, to rotations of the camera except the roll, and to units.
     The camera is rotated so that its axis is the mean of the rays, and zoomed so that the spread of the rays is 1.
     Ridge regression fits an affine camera to the pairs. The centred and scaled world is rotated to the axes of this
     affine camera.
@@ -36,7 +37,8 @@ class View:
     Attributes:
         there: 1 for pairs with a weight and of normal scale, 0 for others, shape :math:`(B, N)`.
         rays: unit rays in the frame of the original camera, shape :math:`(B, N, 3)`.
-        log_spread: logarithm of the root mean square distance of the rays from their mean, shape :math:`(B, 1)`.
+        log_spread: logarithm of the spread of the rays, the root mean square sine of the angles between the rays and
+            the mean ray, shape :math:`(B, 1)`.
         unit: spread of the pixels and of the world, shape :math:`(B, 2)`.
         height: the last coordinate of the rotated world points, shape :math:`(B, N)`.
         features: the network's input, shape :math:`(B, N, C)`.

@@ -1,4 +1,4 @@
-"""Views: mirror images of a problem, for which a network finds different poses from which refinement can start."""
+"""Views: mirror images of a problem. A network finds a different pose for each, and refinement can start from all."""
 
 from __future__ import annotations
 
