@@ -76,7 +76,7 @@ class Search:
     of the problem.
 
     Args:
-        plan: the RANSAC with the arguments of the search.
+        plan: the RANSAC whose arguments control the search.
         problem: problems in a centred world, because the search computes in float32.
         thresholds: thresholds of an inlier.
         chances: relative probabilities of the pairs to be inliers, shape :math:`(B, N)`; ``None``: equal probabilities.
