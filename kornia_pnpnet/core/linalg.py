@@ -98,8 +98,6 @@ def relative(values: Tensor, size: Tensor) -> Tensor:
 
 def small_product(a: Tensor, b: Tensor) -> Tensor:
     """Product (R, C, *) of small matrices (R, K, *) and (K, C, *): several times faster than a batched ``matmul``."""
-    if are_few(a):  # fewer calls, more memory
-        return (a[:, :, None] * b).sum(1)
     (column, row), *others = zip(a.unsqueeze(2).unbind(1), b.unbind(0), strict=True)  # (R, 1, *) and (C, *)
     total = column * row
     for column, row in others:

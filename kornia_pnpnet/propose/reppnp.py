@@ -195,7 +195,7 @@ def _normal_matrix(rows: Tensor, weights: Tensor) -> Tensor:
 
 def _inverse(normal: Tensor, ridge: Tensor | float = 0.0) -> Tensor:
     """Inverse of normal matrices plus a ridge; the ridge makes singular matrices invertible."""
-    ridge = torch.diag_embed(torch.zeros_like(normal[0, :, 0]) + ridge + 32.0 * torch.finfo(normal.dtype).eps)
+    ridge = torch.diag_embed(normal.new_zeros(normal.shape[1]) + ridge + 32.0 * torch.finfo(normal.dtype).eps)
     return torch.linalg.inv_ex(normal[..., :-1] + ridge).inverse
 
 

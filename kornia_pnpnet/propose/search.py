@@ -3,7 +3,7 @@ r"""The search of RANSAC: solve minimal samples, score their poses, and improve 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -15,17 +15,15 @@ from kornia_pnpnet.core.trees import map_tensors, take
 from kornia_pnpnet.judge.belief import residual_noise, rotation_sigma
 from kornia_pnpnet.judge.inliers import Thresholds, judge
 from kornia_pnpnet.problem import MIN_PAIRS, Problem, State
+from kornia_pnpnet.propose.minimal import MinimalSolver
 from kornia_pnpnet.propose.p3p_rig import P3PRig
 from kornia_pnpnet.propose.sampling import Samples, agreement_of_neighbours, kept_at_once
-from kornia_pnpnet.propose.scoring import Scene, as_entries, as_pose
+from kornia_pnpnet.propose.scoring import Scene, Scorer, as_entries, as_pose
 from kornia_pnpnet.refine.residual import Projection, moved, normal_equations, project
 from kornia_pnpnet.refine.terms import add_term
 from kornia_pnpnet.result import Pose
 
-if TYPE_CHECKING:
-    from kornia_pnpnet.propose.ransac import RANSAC
-
-__all__ = ["CAUCHY", "Search", "cauchy_scale", "least_squares"]
+__all__ = ["CAUCHY", "Plan", "Search", "cauchy_scale", "least_squares"]
 
 #: Scale of the Cauchy kernel in standard deviations.
 CAUCHY = 3.4
@@ -68,6 +66,17 @@ _PLAIN_SAMPLES = 256
 _LEAST_AGREEMENT, _AGREEMENT_POWER = 0.3, 1.5
 
 
+class Plan(Protocol):
+    """Options of a search. The arguments of :class:`~kornia_pnpnet.propose.ransac.RANSAC` describe them."""
+
+    minimal: MinimalSolver
+    score: Scorer
+    max_samples: int
+    min_samples: int
+    confidence: float
+    seed: int
+
+
 class Search:
     r"""One search for the best poses of a batch, without gradients.
 
@@ -76,7 +85,7 @@ class Search:
     of the problem.
 
     Args:
-        plan: the RANSAC whose arguments control the search.
+        plan: options of the search.
         problem: problems in a centred world, because the search computes in float32.
         thresholds: thresholds of an inlier.
         chances: relative probabilities of the pairs to be inliers, shape :math:`(B, N)`; ``None``: equal probabilities.
@@ -103,7 +112,7 @@ class Search:
 
     def __init__(
         self,
-        plan: RANSAC,
+        plan: Plan,
         problem: Problem,
         thresholds: Thresholds,
         chances: Tensor | None = None,

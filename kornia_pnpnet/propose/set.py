@@ -148,8 +148,8 @@ class _Block(nn.Module):
         # product per problem and head instead of one product per pair.
         means = torch.bmm(attention, y.view(batch, count, width)).movedim(1, 0)  # (heads, B, width)
         bias = self.look.bias[:width].view(heads, 1, -1)
-        context = torch.baddbmm(bias, means, values.view(heads, -1, width).mT).movedim(0, 1).flatten(1)
-        hidden = functional.linear(y, self.pair.weight).view(batch, count, -1)
+        context = torch.baddbmm(bias, means, values.view(heads, -1, width).mT).movedim(0, 1).reshape(batch, width)
+        hidden = functional.linear(y, self.pair.weight).view(batch, count, self.pair.out_features)
         hidden = hidden.add_(functional.linear(context, self.all.weight, self.pair.bias)[:, None]).relu_()
         return torch.addmm(x + self.out.bias, hidden.flatten(0, 1), self.out.weight.mT)
 

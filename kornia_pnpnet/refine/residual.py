@@ -248,7 +248,7 @@ def normal_equations(
 
 
 def _jacobian(projection: Projection, problem: Problem) -> Tensor:
-    r"""The rows of u and v of :math:`z J / f`, shape :math:`(2, 6 + K, N, B)`.
+    r"""The rows of u and v of :math:`z J / f`, shape :math:`(6 + K, 2, N, B)`.
 
     With :math:`y = R x`, and the rows :math:`e` of :math:`z` times the derivative of :math:`(p, q)` by a point in the
     frame of the pose, a row is :math:`y \times e` for a turn and :math:`e` for a shift. For one camera
@@ -257,11 +257,11 @@ def _jacobian(projection: Projection, problem: Problem) -> Tensor:
     plane, y3 = projection.plane, projection.rotated[2]
     if problem.rig is None:
         ones = torch.eye(2, dtype=plane.dtype, device=plane.device)[..., None, None].expand(2, *plane.shape)
-        shifts = torch.cat((ones, -plane[:, None]), 1)
+        shifts = torch.cat((ones, -plane[None]))
     else:
-        axes = problem.rig.rotation.permute(2, 3, 1, 0)
-        shifts = torch.addcmul(axes[:2], plane[:, None], axes[2], value=-1)
-    jacobian = torch.cat((torch.linalg.cross(projection.rotated[None], shifts, dim=1), shifts), 1)
+        axes = problem.rig.rotation.permute(3, 2, 1, 0)
+        shifts = torch.addcmul(axes[:, :2], plane, axes[:, 2:], value=-1)
+    jacobian = torch.cat((torch.linalg.cross(projection.rotated[:, None], shifts, dim=0), shifts))
     unknown = projection.state.camera.shape[1]
     if not unknown:
         return jacobian
@@ -269,13 +269,13 @@ def _jacobian(projection: Projection, problem: Problem) -> Tensor:
         zoomed, powers = y3, []  # the focal length grows, and the depth of the origin with it
     else:
         # The derivative of the distorted by the undistorted point is d I + 2 d' (p, q) (p, q)^T.
-        along = projection.slope * (plane[:, None] * jacobian).sum(0)
-        jacobian = projection.stretch * jacobian + along * plane[:, None]
+        along = projection.slope * (plane * jacobian).sum(1, keepdim=True)
+        jacobian = projection.stretch * jacobian + along * plane
         depth = torch.where(projection.front, projection.inv_depth, 1.0).reciprocal()
         square = plane.square().sum(0)
         zoomed = projection.stretch * y3 - projection.slope * square * (depth - y3)
         powers = [depth * square ** (power + 1) for power in range(unknown - 1)]
-    return torch.cat((jacobian, plane[:, None] * torch.stack((zoomed, *powers))), 1)
+    return torch.cat((jacobian, plane * torch.stack((zoomed, *powers))[:, None]))
 
 
 def _stacked_equations(projection: Projection, problem: Problem, weights: Tensor | Symmetric2) -> tuple[Tensor, Tensor]:
@@ -284,10 +284,10 @@ def _stacked_equations(projection: Projection, problem: Problem, weights: Tensor
     if isinstance(weights, Tensor):
         weighted = jacobian * weights
     else:
-        (u, v), (uu, uv, vv) = jacobian, weights
-        weighted = torch.stack((uu * u + uv * v, uv * u + vv * v))
-    right = torch.cat((jacobian, projection.scaled[:, None]), 1)
-    products = (weighted[:, :, None] * right[:, None]).sum((0, 3))  # (K, K + 1, B)
+        (u, v), (uu, uv, vv) = jacobian.unbind(1), weights
+        weighted = torch.stack((uu * u + uv * v, uv * u + vv * v), 1)
+    right = torch.cat((jacobian, projection.scaled[None]))
+    products = (weighted.flatten(1, 2)[:, None] * right.flatten(1, 2)).sum(2)  # (K, K + 1, B)
     return products[:, :-1], products[:, -1]
 
 
@@ -326,8 +326,7 @@ def _entrywise_equations(
 def _columns(projection: Projection, problem: Problem) -> list[_Column]:
     """The columns of :func:`_jacobian`. Of a camera without a rig two columns are constant, which saves a quarter."""
     if problem.rig is not None or projection.stretch is not None:
-        u, v = _jacobian(projection, problem)
-        return list(zip(u, v, strict=True))
+        return [(u, v) for u, v in _jacobian(projection, problem)]
     y1, y2, y3 = projection.rotated.unbind()
     p, q = projection.plane.unbind()
     minus_p, minus_q = (-projection.plane).unbind()
