@@ -35,7 +35,7 @@ _FINDER = RANSAC(P3P(), threshold=_THRESHOLD, final_steps=0)
 _SAMPLES, _DRAWS = 128, 4
 # Number of pairs that score each pose when the effort is fixed.
 _JUDGES = 32
-# The root of x^4 = x + 1. Multiples of its negative powers, modulo 1, fill the unit cube evenly (M. Roberts, "The
+# The root r of x^4 = x + 1. Multiples of (1/r, 1/r^2, 1/r^3), modulo 1, fill the unit cube evenly (M. Roberts, "The
 # unreasonable effectiveness of quasirandom sequences", 2018).
 _ROOT = 1.2207440846057596
 

@@ -54,7 +54,8 @@ class RANSAC(Initialiser):
 
     A pair is an inlier when :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`. The ``threshold`` :math:`\tau` covers errors
     of the pixels. The ``world_threshold`` :math:`\omega` covers errors of the points; an error of a point moves the
-    projection by :math:`f/z` times the error. Least squares weigh an inlier by the inverse of the right hand side.
+    projection by :math:`f/z` times the error. Least squares weigh an inlier by the inverse of the right hand side; the
+    last steps multiply this weight by the weight of a Cauchy kernel.
 
     A pose is ``ok`` when fewer than 0.01 poses with as many inliers are expected by chance, for random pairs (see
     :func:`~kornia_pnpnet.judge.inliers.log_false_alarms`). Three pairs cannot show whether a pose is correct: a problem
