@@ -1,5 +1,6 @@
 """Initialisers propose the poses from which refinement starts.
 
-A new one is a new file here: a subclass of :class:`~kornia_pnpnet.propose.initialiser.Initialiser`, which documents
-what a solver must know of it.
+A new initialiser is a new file in this package with a subclass of
+:class:`~kornia_pnpnet.propose.initialiser.Initialiser`. The attributes of this class tell a solver what the initialiser
+can do.
 """

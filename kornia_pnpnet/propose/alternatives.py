@@ -1,4 +1,4 @@
-"""Other poses that explain the pairs nearly as well: mirror images of planes, other solutions of three pairs."""
+"""Other poses that explain the pairs nearly as well as the pose: mirror images of planes, and solutions of P3P."""
 
 from __future__ import annotations
 
@@ -21,21 +21,23 @@ from kornia_pnpnet.result import Alternatives, Pose
 
 __all__ = ["find_alternatives", "mirror_probability"]
 
-# A pose explains the pairs nearly as well when its likelihood is at least this fraction of the best one's.
+# Another pose is kept when its likelihood is at least this fraction of the likelihood of the refinement's pose.
 _LIKELY = 1e-3
-# Logarithm. Poses that are this much likelier than the best one are not compared further.
+# Upper bound of the logarithm of this likelihood ratio, without which the exponential could overflow.
 _LIKELIER = 30.0
-# Two poses are the same minimum when their rotations differ by less than `_SAME_TURN` radians, and the mean of the
-# points, in camera coordinates, differs by less than the fraction `_SAME_SHIFT` of its distance from the camera.
+# Two poses are the same minimum when their rotations differ by less than `_SAME_TURN` radians, and the two positions of
+# the mean point in the camera frame differ by less than `_SAME_SHIFT` times the distance of this point from the camera.
 _SAME_TURN, _SAME_SHIFT = 0.035, 0.035
-# Shares of the spread of the pixels. A mirror image that leaves a larger median residual has no minimum nearby that
-# explains as much; of fewer likely inliers than this, any mirror image may have one.
+# A mirror image is refined only when its median residual is less than this share of the spread of the pixels, or when
+# the problem has fewer likely inliers than the second number.
 _NEAR_MIRROR, _FEW_INLIERS = 0.2, 10
-# Iterations after which mirror images are given up whose log-likelihood is this far below that of the pose.
+# A mirror image is dropped after the first number of iterations if the logarithm of its likelihood ratio to the pose is
+# below the second number.
 _FIRST_LOOK, _HOPELESS = 2, -30.0
-# Radians. A pose that is turned further is far off, see :attr:`~kornia_pnpnet.result.PnPResult.probability`.
+# Radians. A mirror image whose rotation differs by less does not lower the probability of the pose (see
+# :attr:`~kornia_pnpnet.result.PnPResult.probability`).
 _FAR_TURN = math.radians(10.0)
-# For solvers that do not refine: iterations with a classical kernel.
+# Number of iterations, with the kernel of Cauchy, for a solver that does not refine (``m=0``).
 _ITERATIONS = 20
 
 
@@ -43,19 +45,19 @@ _ITERATIONS = 20
 def find_alternatives(
     refine: RobustWeightedLM, problem: Problem, starts: Starts, pose: Pose, valid: Tensor, most: int
 ) -> Alternatives:
-    """Refine other starts and keep the minima that differ from the pose, and from each other, and are nearly as likely.
+    """Find other minima that are nearly as likely as the pose. They differ from the pose and from each other.
 
-    The starts are the mirror image of the pose about the line of sight to the plane through the points, all poses of
-    three pairs that lie far apart, and the poses of the starts. If the refinement of the mirror image ends at the pose,
-    the unrefined mirror image is used instead: when the camera sees a plane almost from the front, the mirror image can
-    be nearly as likely as the pose without being a minimum.
+    The refinement starts from the mirror image of the pose about the line of sight to the plane through the points,
+    from the P3P solutions of three pairs that lie far apart, and from the poses of ``starts``. When the camera sees a
+    plane almost from the front, the mirror image can be nearly as likely as the pose without being a minimum.
+    Therefore the unrefined mirror image is used where its refinement ends at the pose.
 
     Args:
         refine: the refinement that found the pose.
         problem: the problem.
-        starts: what the refinement started from.
+        starts: the starts from which the refinement found the pose.
         pose: the pose that was found, in the frame of the problem.
-        valid: problems that have a pose at all, bool (B,).
+        valid: which problems are valid (see :class:`~kornia_pnpnet.frame.Frame`), bool (B,).
         most: largest number of other poses.
 
     Returns:
@@ -79,7 +81,7 @@ def find_alternatives(
     for x, image in zip((ends, cost, usable), _ends(unrefined), strict=True):
         x[1, lost] = image[lost]
 
-    # From costs, which are means over the pairs, to log-likelihoods.
+    # Costs are means over the pairs. Log-likelihoods are sums over the pairs.
     unit = (problem.weights > 0).sum(-1) / _unit(problem, starts, as_pose(ends[0]))
     log_ratio = (-0.5 * unit * (cost - cost[0])).clamp(max=_LIKELIER)
     log_ratio = torch.where(usable & (log_ratio > math.log(_LIKELY)), log_ratio, -torch.inf)
@@ -106,16 +108,16 @@ def find_alternatives(
 def mirror_probability(
     refine: RobustWeightedLM, problem: Problem, starts: Starts, pose: Pose, ok: Tensor, cost: Tensor
 ) -> Tensor:
-    """Probability that the mirror image of a pose, refined, is right instead of the pose, (B,); 0 where not ``ok``.
+    """Probability (B,) that the refined mirror image is the correct pose instead of the given pose; 0 where not ``ok``.
 
-    Only a mirror image that is far off and explains the pairs nearly as well makes a pose doubtful.
+    The probability is also 0 when the refined mirror image is within 10 degrees of the given pose.
 
     Args:
         refine: See find_alternatives.
         problem: See find_alternatives.
         starts: See find_alternatives.
         pose: See find_alternatives.
-        ok: which poses are to be believed otherwise, bool (B,).
+        ok: which poses pass all other tests, bool (B,).
         cost: the cost of the pose, (B,).
     """
     weights = problem.weights * starts.weights
@@ -145,7 +147,7 @@ def mirror_probability(
 
 
 def _ends(refined: Refinement) -> tuple[Tensor, Tensor, Tensor]:
-    """Entries of the poses, their costs, and whether they can be answers, all with the batch first."""
+    """Entries of the refined poses, their costs, and which poses have a finite cost and enough points in front."""
     return as_entries(refined.pose), refined.cost, refined.in_front & refined.cost.isfinite()
 
 
@@ -161,13 +163,13 @@ def _moved(points: Tensor, pose: Pose) -> Tensor:
 
 
 def _mirrored(pose: Pose, problem: Problem, weights: Tensor) -> Pose:
-    """Half a turn about the normal of the plane through the points, then about the line of sight to its middle."""
+    """Mirror image: a half turn about the normal of the plane, the pose, and a half turn about the line of sight."""
     middle = _mean(problem.world_points, weights)
     centred = problem.world_points - middle[:, None]
     covariance = centred.mT @ (weights[..., None] * centred)
     if covariance.device.type == "cpu":
         normal = torch.linalg.eigh(covariance).eigenvectors[..., 0]
-    else:  # cuSOLVER takes 250 KiB for each, and fails for a hundred thousand
+    else:  # cuSOLVER takes 250 KiB for each matrix, and fails for 100,000 matrices
         normal = eigenvectors(covariance.permute(1, 2, 0))[0][1].mT
     seen = _moved(middle, pose)
     rotation = _half_turn(seen) @ pose.rotation @ _half_turn(normal)
@@ -180,7 +182,7 @@ def _half_turn(axis: Tensor) -> Tensor:
 
 
 def _of_three(problem: Problem, weights: Tensor, fallback: Pose) -> tuple[Tensor, ...]:
-    """Entries of the four poses of three likely pairs that lie far apart; the fallback where there are fewer."""
+    """Entries of the four P3P solutions of three likely pairs that lie far apart; the fallback fills invalid slots."""
     likely = weights * (weights > 0.5 * weights.amax(1, keepdim=True))
     points, rows = problem.world_points, torch.arange(len(weights), device=weights.device)[:, None]
 
@@ -198,7 +200,7 @@ def _of_three(problem: Problem, weights: Tensor, fallback: Pose) -> tuple[Tensor
 
 
 def _unit(problem: Problem, starts: Starts, pose: Pose) -> Tensor:
-    """What a squared residual of one standard deviation costs, (B,)."""
+    """Cost (B,) of a residual of one standard deviation."""
     if problem.noise is not None or starts.noise is not None:
         return torch.ones_like(problem.weights[:, 0])
     noise = residual_noise(project(State.of(pose), problem), problem, problem.weights * starts.weights)
@@ -206,7 +208,7 @@ def _unit(problem: Problem, starts: Starts, pose: Pose) -> Tensor:
 
 
 def _are_same(poses: Tensor, other: Tensor, middle: Tensor) -> Tensor:
-    """Which of the poses (*, B, 12) are the other pose (B, 12), by what they do to points (B, 3); bool (*, B)."""
+    """Which poses (*, B, 12) are the same minimum as another pose (B, 12) of a world with mean (B, 3); bool (*, B)."""
     pose, other_pose = as_pose(poses), as_pose(other.expand_as(poses))
     there = _moved(middle, other_pose)
     shift = (_moved(middle, pose) - there).norm(dim=-1) < _SAME_SHIFT * there.norm(dim=-1)

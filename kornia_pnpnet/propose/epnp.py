@@ -1,15 +1,18 @@
 r"""EPnP: a pose from four or more pairs, in closed form and by a few Gauss-Newton steps in four unknowns.
 
-A world point is :math:`p_i = \sum_j a_{ij} c_j`, and in the camera frame it has the same coordinates :math:`a_{ij}`.
-Lepetit et al. use four control points :math:`c_j` and barycentric coordinates. Here :math:`c_0` is the centroid and the
-others are *vectors* from it, so that the coordinates are orthonormal, :math:`\sum_i w_i a_i a_i^\top = I`, and results
-do not depend on the axes of the world.
+A world point is a combination of control points, :math:`p_i = \sum_j a_{ij} c_j`. The coordinates :math:`a_{ij}` of the
+point are the same in the world frame and in the camera frame. Lepetit et al. use four control points :math:`c_j` and
+barycentric coordinates. Here :math:`c_0` is the centroid, and :math:`c_1, c_2, c_3` are *vectors* from the centroid.
+The coordinates are then orthonormal, :math:`\sum_i w_i a_i a_i^\top = I`, and the results do not depend on the axes of
+the world.
 
-The equations :math:`\sum_j a_{ij} (x_j - u_i z_j) = 0`, and the same with :math:`y` and :math:`v`, are solved for x
-and y in closed form: :math:`x = P z` with :math:`P = \sum_i w_i u_i a_i a_i^\top`, and :math:`y = Q z` with
-:math:`v_i`. The remaining algebraic error :math:`z^\top K z` has 4 unknowns where the paper's :math:`M^\top M` has 12.
-The control vectors in the camera frame are the columns of a 3 by 3 matrix :math:`D(z)`. They are the rotated control
-vectors :math:`L` of the world when :math:`D^\top D = L^\top L`. Arrays (4, C, B) hold depths of C candidates.
+The projection equations are :math:`\sum_j a_{ij} (x_j - u_i z_j) = 0` and :math:`\sum_j a_{ij} (y_j - v_i z_j) = 0`.
+Their least-squares solutions for given depths are :math:`x = P z` and :math:`y = Q z`, with
+:math:`P = \sum_i w_i u_i a_i a_i^\top` and :math:`Q = \sum_i w_i v_i a_i a_i^\top`. The remaining algebraic error
+:math:`z^\top K z` has 4 unknowns, whereas the paper's :math:`M^\top M` has 12. The control vectors in the camera frame
+are the columns of a 3 by 3 matrix :math:`D(z)`, and the control vectors in the world are the columns of :math:`L`. The
+two sets differ by a rotation or reflection when :math:`D^\top D = L^\top L`. Arrays (4, C, B) hold the depths of C
+candidates.
 """
 
 from __future__ import annotations
@@ -29,26 +32,26 @@ __all__ = ["ControlPoints", "EPnP", "control_points"]
 
 # Points are planar when their extent across the plane is below this fraction of their extent along the plane.
 _PLANAR_RATIO = 1e-3
-# Number of pairs below which a problem is not `ok`: EPnP is defined from four pairs on.
+# Least number of pairs of a problem that is `ok`: EPnP needs four pairs.
 _MIN_PAIRS = 4
-# Number of pairs that must be in front of the camera: fewer do not determine a pose.
+# Least number of pairs in front of the camera: fewer pairs do not determine a pose.
 _MIN_IN_FRONT = 3
-# Number of Gauss-Newton steps of every case before the best case is chosen.
+# Number of Gauss-Newton steps in each case before the best case is chosen.
 _CASE_ITERATIONS = 2
-# Squared focal lengths. Larger squared reprojection errors, and points behind the camera, count as this error.
+# Squared focal lengths. Upper bound of a squared reprojection error; a point behind the camera has this error.
 _MAX_SQ_RESIDUAL = 4.0
-# Share of the squared spread of the pixels. A ridge of this size breaks ties between null vectors: equal depths come
-# first, then tilts along the world's longest extents. It affects where the iterations start, not where they end.
+# Share of the squared spread of the pixels. A ridge of this size orders null vectors of equal error: equal depths come
+# first, then tilts along the longest extents of the world. The ridge affects only the start of the iterations.
 _TIE = 1e-4
-# Pairs (m, n) of null vectors whose coefficients' products βₘβₙ are unknowns of the four cases, in the order of use.
+# Indices (m, n) of the products βₘβₙ of null-vector coefficients that are unknowns of the four cases, in order of use.
 _PRODUCTS = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (0, 3))
 
 
 class ControlPoints(NamedTuple):
-    """Control points, coordinates and weights of the pairs. In memory the problems are the last dimension."""
+    """Control points, coordinates and weights of the pairs; the batch is the last dimension in memory."""
 
-    points: Tensor  # the centroid and three vectors, a square root of the covariance; planar: c_3 is 0, (B, 4, 3)
-    coordinates: Tensor  # a: `coordinates @ points` are the world points; planar: the last ones are 0, (B, N, 4)
+    points: Tensor  # the centroid and three vectors, a square root of the covariance; c_3 is 0 if planar, (B, 4, 3)
+    coordinates: Tensor  # `coordinates @ points` are the world points; the last column is 0 if planar, (B, N, 4)
     weights: Tensor  # with the sum 1, (B, N)
     planar: Tensor  # whether the points lie in one plane (or on a line), bool, (B,)
     ok: Tensor  # whether the points span more than a line, bool, (B,)
@@ -57,8 +60,9 @@ class ControlPoints(NamedTuple):
 def control_points(problem: Problem) -> ControlPoints:
     r"""Choose the control points by weighted Gram-Schmidt on the coordinates of the world points.
 
-    The axis along which the points spread most is projected out of the other axes, and so on. The principal directions
-    of the paper cost an eigendecomposition and have no gradient where two extents are equal.
+    Each of three steps selects the axis along which the points spread most, and projects this axis out of the others.
+    The paper uses principal directions instead: they cost an eigendecomposition and have no gradient where two extents
+    are equal.
 
     Args:
         problem: the problem. Pairs with the weight 0 are ignored.
@@ -75,7 +79,8 @@ def control_points(problem: Problem) -> ControlPoints:
     world = problem.world_points.permute(2, 1, 0).contiguous()  # (3, N, B)
     centroid = (world * weights).sum(1)  # (3, B)
     rest = world - centroid[:, None]
-    # An axis below its limit is rounding. The first limit is absolute, the others are relative to the previous extent.
+    # A variance below the limit is rounding. The first limit is absolute; later limits are relative to the previous
+    # variance.
     limit = torch.full_like(total, torch.finfo(rest.dtype).tiny ** 0.5)
     line_ratio = torch.finfo(rest.dtype).eps ** 0.5
     vectors, axes, found = [centroid], [torch.ones_like(weights)], []
@@ -97,24 +102,26 @@ def control_points(problem: Problem) -> ControlPoints:
 class EPnP(Initialiser):
     r"""EPnP with weights, planar points and gradients, for batches.
 
-    The control points in the camera frame are a combination of the null vectors of the projection equations that keeps
-    the distances of the world. Gauss-Newton starts from four cases, N = 1 … 4 null vectors; the case with the least
-    weighted reprojection error is aligned with the world (orthogonal Procrustes).
+    The control points in the camera frame are a combination of the null vectors of the projection equations. The
+    combination has to preserve the distances between the control points. Gauss-Newton starts from four cases with 1 to
+    4 null vectors. The case with the least weighted reprojection error is aligned with the world (orthogonal
+    Procrustes).
 
     Source: V. Lepetit, F. Moreno-Noguer and P. Fua, "EPnP: An Accurate O(n) Solution to the PnP Problem", IJCV 2009.
-    Our changes are the elimination of two thirds of the unknowns (see the module), an order of the null vectors by
-    their algebraic error at equal depth of the centroid, a norm of the distances that does not depend on the choice of
-    the control points, and the algebraic error as a part of the objective: with a dozen noisy pairs the null vectors
-    are not equally free. Planar points use the same equations, with 0 as the fourth control point.
+    Four things differ from the paper. Two thirds of the unknowns are eliminated (see the module). The null vectors are
+    ordered by their algebraic error at equal depth of the centroid. The norm of the distances does not depend on the
+    choice of the control points. The objective includes the algebraic error, because the null vectors of about twelve
+    noisy pairs have different errors. Planar points use the same equations, with 0 as the fourth control point.
 
-    Four or five pairs leave up to four solutions, and the solution with the least reprojection error may be incorrect.
-    A problem is not ``ok`` with fewer than four pairs, with points on a line, and when fewer than three pairs are in
-    front of the camera. Gradients are those of the minimum, by the implicit function theorem.
+    Four or five pairs can have up to four solutions, and the solution with the least reprojection error may be
+    incorrect. A problem is not ``ok`` with fewer than four pairs, with points on a line, and when fewer than three
+    pairs are in front of the camera. The implicit function theorem gives the gradient of the minimum.
 
     Args:
-        iterations: number of Gauss-Newton steps, at least 2: two steps in every case, the other steps in the best case.
+        iterations: number of Gauss-Newton steps, at least 2. Every case takes two steps; the best case takes the rest.
         algebraic_weight: :math:`\mu \ge 0`, weight of the algebraic error relative to the squared error of the
-            distances, for a world of unit root mean square radius and pixels over the focal length; 0 in the paper.
+            distances. Both errors are measured in a world with a root mean square radius of 1, for pixels over the
+            focal length. In the paper the weight is 0.
 
     Raises:
         BaseError: when an argument is out of its range.
@@ -139,7 +146,7 @@ class EPnP(Initialiser):
         self.algebraic_weight = algebraic_weight
 
     def forward(self, problem: Problem) -> Starts:
-        """Find the pose of a problem in the solver's frame: finite, with weights of 1, also where it is not ``ok``."""
+        """Find the pose in the solver's frame. All weights are 1, and a pose that is not ``ok`` is finite, too."""
         problem = problem._replace(weights=problem.usual_weights)
         control = control_points(problem)
         system = _depth_system(control, problem, self.algebraic_weight)
@@ -152,7 +159,7 @@ class EPnP(Initialiser):
         affine = camera[:, 1:]
         moment = small_product(affine, system.vectors.transpose(0, 1))
         turn, unique = nearest_rotation(moment)
-        # The control points miss their distances a little. The scale restores the known size of the world.
+        # The distances of the control points are slightly incorrect. The scale restores the known size of the world.
         size = affine.square().sum((0, 1))
         scale = (turn * moment).sum((0, 1)) / torch.where(size > 0, size, 1.0)
         rotation = turn.permute(2, 0, 1).contiguous()
@@ -166,10 +173,10 @@ class EPnP(Initialiser):
         return Starts(Pose(rotation, translation), torch.ones_like(problem.weights), ok)
 
     def _depths(self, system: _DepthSystem) -> tuple[Tensor, Tensor]:
-        """The depths (4, 1, B) of the best case, and whether they were found (B,); where not, equal depths."""
-        cases = _four_cases(system).detach()  # forward mode starts here: the square roots of 0 have no derivative
-        # A shape and its mirror image along the optical axis have the same distances, and Gauss-Newton does not change
-        # the one into the other: symmetric points need both.
+        """Depths (4, 1, B) of the best case, and whether the case succeeded, bool (B,); equal depths if it failed."""
+        cases = _four_cases(system).detach()  # also in forward mode: sqrt has no derivative at 0
+        # A shape and its mirror image along the optical axis have the same distances, and Gauss-Newton does not turn
+        # the shape into the mirror image. Symmetric points therefore need both starts.
         mirrored = torch.cat((cases[:1, -1:], -cases[1:, -1:]))
         cases = _minimize(system, torch.cat((cases, mirrored), 1), _CASE_ITERATIONS)
         best = cases.gather(1, _best_case(system, cases).expand(4, 1, -1))
@@ -186,11 +193,11 @@ class _DepthSystem(NamedTuple):
     weights: Tensor  # with the sum 1, (N, B)
     plane_points: Tensor  # (u, v), (2, N, B)
     unit: Tensor  # unit of the depths: the root mean square distance of the points from their centroid, (B,)
-    vectors: Tensor  # the control vectors of the world in this unit, (3 axes, 3 vectors, B)
-    gram: Tensor  # the Gram matrix of the vectors, whose trace is 1, (3, 3, 1, B)
-    maps: Tensor  # P, Q and the identity: x = P z, y = Q z, z, (3, 4, 4, 1, B)
+    vectors: Tensor  # the control vectors of the world, divided by `unit`, (3 axes, 3 vectors, B)
+    gram: Tensor  # the Gram matrix of the vectors, with the trace 1, (3, 3, 1, B)
+    maps: Tensor  # P, Q and the identity, the maps from z to x, y and z, (3, 4, 4, 1, B)
     error: Tensor  # K, (4, 4, B)
-    prior: Tensor  # the weighted K, (4, 4, 1, B)
+    prior: Tensor  # K times the weight of the algebraic error, (4, 4, 1, B)
 
 
 def _depth_system(control: ControlPoints, problem: Problem, weight: float) -> _DepthSystem:
@@ -199,7 +206,7 @@ def _depth_system(control: ControlPoints, problem: Problem, weight: float) -> _D
     plane_points = (problem.img_points / problem.focal).mT  # (B, 2, N)
     scaled = (plane_points[:, :, None] * coordinates[:, None]).flatten(1, 2)  # (B, 8, N)
     moments = torch.bmm(scaled, (weights * coordinates).mT)  # P and Q, (B, 8, 4)
-    # K is a sum of squared residuals of the elimination. As a difference of moments float32 would lose it.
+    # K is computed as a sum of squared residuals. A difference of moments would lose all digits in float32.
     errors = (scaled - torch.bmm(moments, coordinates)).unflatten(1, (2, 4)).transpose(1, 2)  # (B, 4, 2, N)
     error = torch.bmm((weights[:, None] * errors).flatten(2), errors.flatten(2).mT).permute(1, 2, 0)
     eye = torch.eye(4, dtype=weights.dtype, device=weights.device)
@@ -223,15 +230,15 @@ def _depth_system(control: ControlPoints, problem: Problem, weight: float) -> _D
 
 
 def _in_camera(system: _DepthSystem, depths: Tensor) -> Tensor:
-    """x, y and z of the centroid and of the vectors in units of ``system.unit``, (3, 4, C, B)."""
+    """Camera coordinates of the centroid and of the control vectors, divided by ``system.unit``, (3, 4, C, B)."""
     return small_product(system.maps.flatten(0, 1), depths[:, None])[:, 0].unflatten(0, (3, 4))
 
 
 def _null_space(system: _DepthSystem) -> Tensor:
     """A basis of depths in the order of their algebraic error, (4, 4 vectors, B): z = β₁v₁ + β₂v₂ + β₃v₃ + β₄v₄.
 
-    The first vector has the least error with the centroid at depth 1. The other vectors have the centroid at depth 0;
-    they are the eigenvectors of the rest of K, so that K is diagonal in this basis.
+    The first vector has the least error of all depths with the centroid at depth 1. The other vectors have the centroid
+    at depth 0. They are the eigenvectors of the lower right 3 by 3 block of K, so that K is diagonal in this basis.
     """
     error, eye = system.error, torch.eye(4, dtype=system.error.dtype, device=system.error.device)[..., None]
     spread = error[0, 0] + system.maps[:2, 0, 1:, 0].square().sum((0, 1))
@@ -243,11 +250,11 @@ def _null_space(system: _DepthSystem) -> Tensor:
 
 
 def _four_cases(system: _DepthSystem) -> Tensor:
-    r"""The depths of the paper's four cases, which differ in the number of null vectors, (4, 4 cases, B).
+    r"""The depths of the paper's four cases, which use N = 1, 2, 3 and 4 null vectors, (4, 4 cases, B).
 
-    For :math:`N = 1, 2, 3` the products of the betas are found by least squares; for N = 3 without :math:`\beta_3^2`,
-    the smallest product. N = 4 adds :math:`\beta_1 \beta_4`, so that there are as many unknowns as equations (the paper
-    linearises the four remaining products again). The systems of all cases are leading blocks of one system.
+    Least squares find the products of the betas. The case N = 3 omits the smallest product :math:`\beta_3^2`. The case
+    N = 4 adds :math:`\beta_1 \beta_4`, so that the six equations have six unknowns. (The paper linearises the four
+    remaining products again.) The systems of all cases are leading blocks of one system.
     """
     basis = _null_space(system)
     vectors = _in_camera(system, basis)[:, 1:]  # (3 axes, 3 vectors, 4 null vectors, B)
@@ -268,7 +275,7 @@ def _four_cases(system: _DepthSystem) -> Tensor:
 
 
 def _normal_equations(system: _DepthSystem, depths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    r"""Half of the Gauss-Newton matrix (4, 4, C, B) and of the gradient (4, C, B), and the misfits (3, 3, C, B)."""
+    r"""Half of the Gauss-Newton matrix (4, 4, C, B), half of the gradient (4, C, B), and the misfits (3, 3, C, B)."""
     vectors = _in_camera(system, depths)[:, 1:]
     columns = vectors.transpose(0, 1)
     misfit = small_product(columns, vectors) - system.gram
@@ -294,16 +301,15 @@ def _minimize(system: _DepthSystem, depths: Tensor, iterations: int) -> Tensor:
 def _attach_gradient(system: _DepthSystem, depths: Tensor, planar: Tensor) -> Tensor:
     r"""Give a minimum (4, 1, B) its gradient by the implicit function theorem; 0 where the minimum is not isolated.
 
-    The result has the value of ``depths`` and the derivatives of two Newton steps with a constant matrix: the first
-    step makes first derivatives exact, the second step second derivatives.
+    The result has the value of ``depths`` and the derivatives of two Newton steps with a constant matrix. One step
+    makes first derivatives exact; two steps make second derivatives exact.
     """
     with torch.no_grad():
         normal, _, misfit = _normal_equations(system, depths)
         for rows in system.maps[:, 1:].unbind(0):
             normal = normal + 2.0 * small_product(rows.transpose(0, 1), small_product(misfit, rows))
-        # The depth of the third vector of planar points is always 0: an identity row keeps the system regular.
+        # The third vector of planar points always has depth 0. A 1 on the diagonal keeps the system regular.
         normal[3, 3] += planar
-        # The four columns of the inverse, one system each.
         eye = torch.eye(4, dtype=depths.dtype, device=depths.device)[..., None].expand_as(normal[:, :, 0])
         columns, solved = solve_positive(normal.expand(-1, -1, 4, -1).flatten(2), eye.flatten(1), depths.new_zeros(()))
         inverse = torch.where(solved, columns, 0.0).unflatten(1, (4, 1, -1))  # (4, 4, 1, B)
@@ -322,10 +328,10 @@ def _frames(one: Tensor, two: Tensor) -> Tensor:
 
 
 def _best_case(system: _DepthSystem, cases: Tensor) -> Tensor:
-    """Number (B,) of the case with the least weighted sum of squared reprojection errors, of depths (4, C, B).
+    """Index (B,) of the case with the least weighted sum of squared reprojection errors, of depths (4, C, B).
 
-    The control vectors of a case are nearly the rotated control vectors of the world. The rotation between frames of
-    two of these vectors, which is faster, replaces Procrustes.
+    The control vectors of a case are nearly the rotated control vectors of the world. The rotation is computed from
+    frames of two of these vectors, which is faster than Procrustes.
     """
     camera, world = _in_camera(system, cases), system.vectors[:, :, None]  # (3, 4, C, B), (3, 3, 1, B)
     camera_frames, world_frame = _frames(camera[:, 1], camera[:, 2]), _frames(world[:, 0], world[:, 1])
@@ -338,5 +344,5 @@ def _best_case(system: _DepthSystem, cases: Tensor) -> Tensor:
     u, v = system.plane_points
     x, y = torch.addcmul(-u, x, inverse), torch.addcmul(-v, y, inverse)
     error = (x * x).addcmul_(y, y).clamp_(max=_MAX_SQ_RESIDUAL)
-    error = torch.where(z > 0, error, _MAX_SQ_RESIDUAL)  # failed cases, too: NaN compares false
+    error = torch.where(z > 0, error, _MAX_SQ_RESIDUAL)  # also in failed cases: NaN compares false
     return (error * system.weights).sum(1).argmin(0)

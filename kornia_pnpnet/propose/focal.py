@@ -1,4 +1,4 @@
-r"""An unknown focal length: the range in which it is searched, and a first estimate of it together with a pose."""
+r"""An unknown focal length: the range of the search, and a first estimate of focal length and pose."""
 
 from __future__ import annotations
 
@@ -23,35 +23,34 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["as_dist", "distorted", "scale_focal", "with_found_focal", "with_nominal_focal"]
 
-# Half widths of the image: the focal lengths of fields of view from 118 to 14 degrees, which are searched.
+# Half widths of the image. The search covers these focal lengths: fields of view from 118 to 14 degrees.
 _SHORTEST, _LONGEST = 0.6, 8.0
-# Half of this range in logarithms.
+# Half of the range of log f.
 _WIDTH = 0.5 * math.log(_LONGEST / _SHORTEST)
-# Half the width of a square over the median distance, in the maximum norm, of a point in it from its middle.
+# In a square with uniform points: half the width over the median distance (maximum norm) of the points from the middle.
 _HALF_WIDTH = math.sqrt(2.0)
-# Standard deviations of an expected focal length that are searched on either side.
+# The search covers this number of standard deviations of log f on either side of an expected focal length.
 _SEARCHED = 2.0
-# Pixels of a camera whose focal length is in the middle of the range: 0.65 % of half the width of the image. The least
-# threshold of an inlier; near the right focal length on the grid of the search, inliers have larger residuals.
+# Pixels of the normalised camera. Threshold of an inlier: 0.65 % of half the width of the image, for a focal length in
+# the middle of the range. RANSAC first uses a larger threshold, because the focal lengths of its grid are inexact.
 _THRESHOLD = 10.0
 _FINDER = RANSAC(P3P(), threshold=_THRESHOLD, confidence=0.99, final_steps=3)
 
-# Focal lengths. Pairs with a smaller residual count in the first steps, before distortion is known: 0.2 times the cube
-# of a tangent of 0.7 is 0.07. From step to step the limit shrinks by a factor, down to the scale of the residuals.
+# Focal lengths. Least scale of the kernel in the first step, when distortion is unknown: k1 = 0.2 shifts a pixel at the
+# tangent 0.7 by 0.2 times 0.7 cubed, which is 0.07. Each step multiplies the least scale by the second number.
 _WIDE, _SHRINK = 0.07, 0.6
-# Steps of the first estimate of distortion.
+# Number of Gauss-Newton steps in the first estimate of distortion.
 _STEPS = 14
-# Focal lengths. The scale of the residuals is at least this.
+# Focal lengths. Lower bound of the scale of the kernel.
 _LEAST = 1e-5
 
 
 def with_nominal_focal(inputs: Inputs, sigma: float | None) -> Inputs:
-    """Give the cameras the focal length in the middle of the range in which theirs is searched, and ``free_focal``.
+    """Replace each focal length by the middle of the range of the search, and set ``free_focal``.
 
-    The range is that of the caller's focal length and ``sigma``, the standard deviation of its logarithm. For ``None``
-    it follows from the size of the image, which is twice the principal point, or what the pixels cover where this is
-    more. The aspect ratio of the pixels is kept.
-    Matrices that are no pinhole cameras become NaN, without gradient.
+    Given ``sigma``, the standard deviation of log f, the range lies around the caller's focal length. Without ``sigma``
+    the range follows from the size of the image: twice the principal point, or the extent of the pixels if larger. The
+    aspect ratio of the pixels is kept. Matrices that are no pinhole cameras become NaN, without gradient.
     """
     camera, is_pinhole = pinholes(inputs.intrinsics)
     given = (camera[:, 0, 0] * camera[:, 1, 1]).sqrt()  # (B,)
@@ -82,13 +81,14 @@ def scale_focal(intrinsics: Tensor, factor: Tensor) -> Tensor:
 
 
 def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
-    """Give the cameras an estimate of their focal length, and the problems a pose to start from unless they have one.
+    """Estimate the focal lengths, and a pose for the problems without a given pose.
 
-    P3P at focal lengths on a grid, and least squares of the inliers, find both.
+    RANSAC with P3P at focal lengths on a grid estimates both, followed by least squares on the inliers.
 
     Args:
         inputs: what :func:`with_nominal_focal` returned.
-        radial: number of coefficients of radial distortion to estimate; the pixels are then undistorted.
+        radial: number of coefficients of radial distortion to estimate. The estimated distortion is removed from the
+            pixels.
     """
     assert inputs.free_focal is not None
     normalize = Normalize(order=False)
@@ -103,7 +103,7 @@ def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
     if radial:
         known = inputs.free_focal
         assert known is not None
-        if known.information is None:  # coefficients are small also where nothing is known of f
+        if known.information is None:  # CameraTerm also holds the prior of small distortion, which is always known
             known = known._replace(information=torch.zeros_like(zoom))
             inputs = inputs._replace(free_focal=known)
         with torch.no_grad():
@@ -121,14 +121,14 @@ def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
 
 
 def _zoomed(inputs: Inputs, zoom: Tensor) -> Inputs:
-    """Inputs whose cameras have a longer focal length, by the exponential of ``zoom`` (B,)."""
+    """Inputs with the focal lengths multiplied by the exponential of ``zoom`` (B,)."""
     assert inputs.free_focal is not None
     known = inputs.free_focal._replace(focal=inputs.free_focal.focal * zoom.exp())
     return inputs._replace(intrinsics=scale_focal(inputs.intrinsics, zoom.exp()), free_focal=known)
 
 
 def distorted(problem: Problem, coefficients: Tensor) -> Problem:
-    """A problem whose pixels, and their noise, are those before distortion (B, K) was taken away."""
+    """Put radial distortion (B, K) back into undistorted pixels and their noise."""
     p, q = (problem.img_points / problem.focal).unbind(-1)
     square = torch.addcmul(p * p, q, q)
     stretch, slope = torch.ones_like(square), torch.zeros_like(square)
@@ -139,7 +139,7 @@ def distorted(problem: Problem, coefficients: Tensor) -> Problem:
     if noise is not None:
         with torch.no_grad():
             along = stretch + slope * square
-            growth = (0.5 * (stretch**-2 + along**-2)).sqrt()  # of a standard deviation, see `cameras.undistort`
+            growth = (0.5 * (stretch**-2 + along**-2)).sqrt()  # factor of a sigma in `cameras.undistort`
             turned = stretch + slope * p * p, slope * p * q, stretch + slope * q * q, slope * p * q
         cov = None if noise.img_cov is None else noise.img_cov.mapped(*turned)
         noise = noise._replace(img=noise.img / growth, img_cov=cov)
@@ -152,12 +152,13 @@ def as_dist(coefficients: Tensor) -> Tensor:
 
 
 def _with_distortion(problem: Problem, pose: Pose, radial: int) -> State:
-    """Estimate radial distortion with the pose and the focal length, by Gauss-Newton steps with Cauchy's kernel.
+    """Estimate pose, focal length and radial distortion by Gauss-Newton steps with a Cauchy kernel.
 
-    The scale of the kernel first is what distortion does at the edge of an image, and shrinks to the median residual.
+    At first the scale of the kernel is at least `_WIDE`, the shift by distortion at the edge of an image. This lower
+    bound shrinks from step to step, and the scale follows the median residual.
     """
     state = State(pose, problem.weights.new_zeros(len(problem.weights), 1 + radial))
-    # The distortion is small; what is known of the focal length is left to the refinement.
+    # Only the prior of small distortion is used here. The refinement uses the prior of the focal length.
     information = torch.zeros_like(problem.img_scale)
     problem = problem._replace(free_focal=problem.free_focal._replace(information=information))
     limit = _WIDE

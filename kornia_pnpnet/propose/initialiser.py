@@ -1,4 +1,4 @@
-"""The base of all initialisers, and what distinguishes them."""
+"""The base class of all initialisers."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ __all__ = ["Initialiser", "trait"]
 class Initialiser(Configured):
     """A module that maps a :class:`~kornia_pnpnet.problem.Problem` to :class:`~kornia_pnpnet.problem.Starts`.
 
-    Any module with such a ``forward`` is an initialiser. An attribute below that it lacks has the value of this class.
+    Any module with such a ``forward`` is an initialiser. If a module lacks an attribute below, solvers use the value of
+    this class.
 
     Attributes:
-        pairs_at_once: number of pairs per core whose temporaries fit its caches. A solver splits larger batches where
-            gradients allow it. ``None``: the whole batch.
+        pairs_at_once: number of pairs whose temporaries fit the caches of one core. Without gradients, a solver splits
+            batches with more pairs per thread (CPU only). ``None``: batches are not split.
         fixed_pairs: whether the number of pairs is fixed, ``config["n"]``.
-        takes_given: whether a given pose is an argument, ``forward(problem, given)``.
-        takes_rigs: whether rigs are solved.
-        finds_focal: whether an unknown focal length is estimated.
-        estimates_noise: whether the result has several poses and the noise, so that a search may follow:
-            ``forward(problem, search_follows=True)``.
-        weighs_unusual: whether the weights of pairs that are not of normal scale are valid.
+        takes_given: whether ``forward(problem, given)`` accepts a given pose.
+        takes_rigs: whether the initialiser solves rigs.
+        finds_focal: whether the initialiser estimates an unknown focal length.
+        estimates_noise: whether the result contains several poses and the noise. A search may then follow, and the
+            initialiser accepts ``forward(problem, search_follows=True)``.
+        weighs_unusual: whether the weights are also valid for pairs that are not of normal scale.
     """
 
     pairs_at_once: int | None = None
@@ -43,5 +44,5 @@ class Initialiser(Configured):
 
 
 def trait(init: nn.Module | None, name: str) -> Any:
-    """A trait of any initialiser, see :class:`Initialiser`."""
+    """The value of an attribute of :class:`Initialiser` for any initialiser."""
     return getattr(init, name, getattr(Initialiser, name))

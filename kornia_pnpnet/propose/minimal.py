@@ -1,4 +1,4 @@
-"""Minimal solvers: the contract of RANSAC's samples, and a solver of samples made of any initialiser."""
+"""Minimal solvers: the interface that RANSAC expects, and a minimal solver that is made of any initialiser."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ class MinimalSolver(Protocol):
         """Number of pairs in a sample."""
 
     def hypotheses(self, problem: Problem) -> Hypotheses:
-        """The poses of a batch of samples: normalised, with :math:`N` = ``sample_size``. Their weights do not count.
+        """Find the poses of a batch of normalised samples, :math:`N` = ``sample_size``. Weights of pairs are ignored.
 
-        Where the focal length is unknown, the last rows of rotation and translation are divided by its ratio to the
-        focal length of the problem.
+        If the focal length f is unknown, the last row of each rotation and of each translation is divided by the ratio
+        of f to the focal length of the problem.
         """
 
 
 class SubsetSolver(Configured):
-    r"""A solver of samples made of an initialiser, for example the paper's "EPnP-LM on subsets of 7".
+    r"""A minimal solver that is made of an initialiser, for example the paper's "EPnP-LM on subsets of 7".
 
     Args:
         init: maps :class:`~kornia_pnpnet.problem.Problem` to :class:`~kornia_pnpnet.problem.Starts`.
-        refine: refines the poses; ``None``: the first poses are the solutions.
+        refine: refines the poses of the initialiser; ``None``: the poses are not refined.
         size: number of pairs in a sample.
 
     Raises:
@@ -57,7 +57,7 @@ class SubsetSolver(Configured):
         self.init, self.refine, self.sample_size = init, refine, size
 
     def hypotheses(self, problem: Problem) -> Hypotheses:
-        """One pose per sample, valid where the initialiser has one and the pose is finite."""
+        """One pose per sample. A pose is valid where the start is ``ok`` and the pose is finite."""
         starts = self.init(problem)
         pose = starts.pose if self.refine is None else self.refine(problem, starts).pose
         valid = pose.rotation.isfinite().flatten(1).all(-1) & pose.translation.isfinite().all(-1)
@@ -67,5 +67,5 @@ class SubsetSolver(Configured):
 
 
 def describe(part: object) -> dict[str, object]:
-    """The class name and the constructor's arguments of a part, as plain data."""
+    """The class name and the constructor arguments of a module, as plain data."""
     return {"name": type(part).__name__, **getattr(part, "config", {})}

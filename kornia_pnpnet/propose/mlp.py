@@ -17,7 +17,7 @@ __all__ = ["MLPInit", "rotation_about"]
 
 
 def _relu_layers(sizes: list[int]) -> list[nn.Module]:
-    """Fully connected ReLU layers with He initialisation: with PyTorch's default, ten narrow layers lose the signal."""
+    """Fully connected ReLU layers with He initialisation: PyTorch's default loses the signal in ten narrow layers."""
     layers: list[nn.Module] = []
     for size_in, size_out in pairwise(sizes):
         linear = nn.Linear(size_in, size_out)
@@ -28,7 +28,7 @@ def _relu_layers(sizes: list[int]) -> list[nn.Module]:
 
 
 def _run(layers: nn.Sequential, hidden: Tensor) -> Tensor:
-    """Apply layers to columns, (units, B), in the dtype of the columns."""
+    """Apply layers to columns (units, B), in the dtype of the columns."""
     for layer in layers:
         if isinstance(layer, nn.Linear):
             weight, bias = layer.weight.to(hidden.dtype), layer.bias.to(hidden.dtype)
@@ -39,12 +39,12 @@ def _run(layers: nn.Sequential, hidden: Tensor) -> Tensor:
 
 
 def rotation_about(axis: Tensor, angle: Tensor) -> Tensor:
-    """Rotations about axes (3, B) of any length other than 0 by angles (B,) in radians, (B, 3, 3)."""
+    """Rotations (B, 3, 3) about axes (3, B) by angles (B,) in radians. Axes may have any length other than 0."""
     limits = torch.finfo(axis.dtype)
-    # The floor under the root keeps the gradient finite where the network returns zeros.
+    # The added epsilon keeps the gradient finite where the network returns the axis 0.
     vector = axis * (angle * ((axis * axis).sum(0) + limits.eps).rsqrt())
     length = (vector * vector).sum(0).clamp(min=limits.tiny).sqrt()
-    # The unit quaternion times the square root of 2.
+    # Unit quaternion times the square root of 2.
     half, root = 0.5 * length, 2.0**0.5
     w, xyz = root * half.cos(), vector * (root * half.sin() / length)
     (x, y, z), (wx, wy, wz) = xyz.unbind(), (w * xyz).unbind()
@@ -59,15 +59,15 @@ class MLPInit(Initialiser):
     r"""Stage 1 of PnP-Net: a small multilayer perceptron for exactly ``n`` ordered pairs.
 
     The 5n coordinates pass through shared ReLU layers of 20n, 5n and 3n units. A rotation branch and a translation
-    branch follow, each of five ReLU layers of 2n units and a linear last layer. The rotation branch returns an axis and
-    an angle, :math:`R = \exp(\theta [s / \|s\|]_\times)`.
+    branch follow. Each branch has five ReLU layers of 2n units and a linear last layer. The rotation branch returns an
+    axis :math:`s` and an angle :math:`\theta`, :math:`R = \exp(\theta [s / \|s\|]_\times)`.
 
-    Source: Sheffer and Wiesel 2020, figure 2; the scales of the input are ours. The network computes in the wider of
-    its own dtype and the dtype of the problem.
+    Source: Sheffer and Wiesel 2020, figure 2; the scales of the input are ours. The network computes in its own dtype
+    or in the dtype of the problem, whichever is wider.
 
     Args:
         n: number of pairs.
-        world_scale: length by which world coordinates are divided; 1 suits a centred and scaled world.
+        world_scale: length by which world coordinates are divided. The value 1 suits a centred and scaled world.
         img_scale: pixels by which image coordinates are divided.
 
     Raises:
@@ -80,7 +80,7 @@ class MLPInit(Initialiser):
     """
 
     fixed_pairs = True
-    weighs_unusual = True  # they have a weight of 0
+    weighs_unusual = True  # pairs that are not of normal scale have a weight of 0
 
     def __init__(self, n: int, *, world_scale: float = 1.0, img_scale: float = 1000.0) -> None:
         super().__init__(locals())
@@ -101,7 +101,7 @@ class MLPInit(Initialiser):
             problem: ``n`` pairs, ordered by their pixels. Pairs that are not of normal scale enter as zeros.
 
         Returns:
-            The coarse pose, and weights of 1, or 0 for pairs that are not of normal scale.
+            The coarse pose, and weights: 0 for pairs that are not of normal scale, 1 for all others.
 
         Raises:
             ShapeError: when the number of pairs is not ``n``.
@@ -116,7 +116,7 @@ class MLPInit(Initialiser):
             )
         weight = next(self.parameters())
         check_devices({"world_points": problem.world_points}, weight, "the network")
-        # One column per problem: x, y, z, u, v of the first pair, then of the next, which is their order in memory.
+        # One column per problem: x, y, z, u, v of the first pair, then of the second pair, and so on.
         coordinates = problem.world_points / self.world_scale, problem.img_points / self.img_scale
         usual = problem.usual[..., None]
         features = torch.cat([(x * usual).permute(1, 2, 0) for x in coordinates], 1).flatten(0, 1)  # (5n, B)

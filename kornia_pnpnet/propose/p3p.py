@@ -1,29 +1,29 @@
-r"""P3P: the up to four poses that project three world points exactly onto three pixels, for whole batches.
+r"""P3P: all poses (up to four) that project three world points exactly onto three pixels, for batches.
 
-The unknowns are the distances :math:`\lambda_k` of the points along their unit rays. The law of cosines for the edge
-:math:`k`, the one opposite to point :math:`k` with the ends :math:`i` and :math:`j`, is
+The unknowns are the distances :math:`\lambda_k` of the points along their unit rays. Edge :math:`k` of the triangle is
+opposite to point :math:`k` and connects the points :math:`i` and :math:`j`. The law of cosines for edge :math:`k` is
 
 .. math:: (\lambda_i - \lambda_j)^2 + b_k \lambda_i \lambda_j = a_k,
 
-with the squared length :math:`a_k` of the edge and the squared length :math:`b_k` of the difference of the two rays.
-(:math:`b_k` keeps the digits that :math:`2 - 2\cos` loses between rays close to each other.) A sum of the three
-equations with weights :math:`u` such that :math:`a \cdot u = 0` is a conic in the ratios of the distances. The conic
-is a pair of lines when
+with the squared length :math:`a_k` of the edge and the squared length :math:`b_k` of the difference of the rays
+:math:`i` and :math:`j`. (For rays close to each other :math:`b_k` has more correct digits than :math:`2 - 2\cos`.) If
+weights :math:`u` satisfy :math:`a \cdot u = 0`, the weighted sum of the three equations is a conic in the ratios of the
+distances. The conic is a pair of lines when
 
 .. math:: (u_1 u_2 + u_2 u_3 + u_3 u_1)\,(s \cdot u) = g\, u_1 u_2 u_3,
 
-with the squared sine :math:`s_k` of the angle of two rays and the squared determinant :math:`g` of all three rays. One
-root of this cubic gives two lines, and each line meets the other conics in two points. A Newton step then refines the
-ratios.
+with the squared sine :math:`s_k` of the angle between the rays :math:`i` and :math:`j`, and the squared determinant
+:math:`g` of all three rays. One root of this cubic gives two lines. Other weights give a second conic, which each line
+meets in two points. A Newton step then refines the ratios.
 
-Sources: M. Persson and K. Nordberg, "Lambda Twist", ECCV 2018, for the route by one degenerate conic; Y. Ding, J. Yang,
-V. Larsson, C. Olsson and K. Åström, "Revisiting the P3P Problem", CVPR 2023, for how the roots of the cubic determine
-the solutions and for the lines from the adjugate matrix. Three things are new here: the short form of the cubic, the
-choice of its root, and equations of the two lines that are written in differences of distances.
+Sources: M. Persson and K. Nordberg, "Lambda Twist", ECCV 2018, for the use of one degenerate conic; Y. Ding, J. Yang,
+V. Larsson, C. Olsson and K. Åström, "Revisiting the P3P Problem", CVPR 2023, for the solutions by the roots of the
+cubic, and for the lines from the adjugate matrix. Three things are new here: the short form of the cubic, the choice of
+its root, and equations of the two lines that are written in differences of distances.
 
-The problems of a chunk are the last dimension of every tensor, ``(*, C)``. A choice between two finite values is a
-``lerp`` with a weight of exactly 0 or 1, which returns exactly one of the values: with an unpredictable mask, ``where``
-takes a CPU ten times as long.
+The problems of a chunk are the last dimension of every tensor, ``(*, C)``. Finite values are selected by ``lerp``
+with a weight of 0 or 1, which returns exactly one of two values. On a CPU, ``where`` takes ten times as long for an
+unpredictable mask.
 """
 
 from __future__ import annotations
@@ -45,24 +45,25 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["P3P", "p3p"]
 
-# Bytes that one number per problem of a chunk takes: a few dozen of these vectors fit into a core's caches.
+# Bytes of a vector with one number per problem of a chunk. A few dozen of these vectors fit into a core's caches.
 _CHUNK_BYTES = 2**16
-# Power of the machine epsilon. The triangle of a solution differs from the given triangle, whose longest edge is 1, by
-# less than this power times the distance.
+# Power of the machine epsilon. The triangle of a solution differs from the given triangle by less than this power times
+# the distance of the camera. (The longest edge is 1.)
 _ERROR_POWER = 2 / 3
-# Share of the longest edge. The two triangles differ by less than this fraction at any distance.
+# Share of the longest edge. Largest difference of the two triangles at any distance of the camera.
 _LARGEST_ERROR = 0.01
-# Machine epsilons of the coordinates and the longest edge. A triangle less high than this is a line.
+# Machine epsilons, relative to the coordinates and to the longest edge. A triangle of less height counts as a line.
 _LINE = 32.0
-# Number of focal lengths on the grid for an unknown one.
+# Number of focal lengths on the grid when the focal length is unknown.
 _FOCALS = 12
-# Least distance of the camera from a point, approximately. The unit is the longest edge times the machine epsilon to
-# the power `_ERROR_POWER`. Closer cameras are rejected: rounding would decide in which direction they see the point.
+# Approximate least distance of the camera from a point. The unit is the longest edge times the machine epsilon to the
+# power `_ERROR_POWER`. Closer cameras are rejected, because rounding would determine the direction of the point.
 _CLOSE = 64.0
-# Number of Newton steps for the root of the cubic: from an error of a tenth at the start to rounding in float64.
+# Number of Newton steps for the root of the cubic. They reduce the error at the start, at most 37 %, to rounding in
+# float64.
 _CUBIC_STEPS = 4
-# Power of the machine epsilon. The last Newton step fades out where its squared determinant is less than this power, in
-# squared edges: there two solutions meet, and the step would be noise.
+# Power of the machine epsilon. The Newton step for the ratios is damped where its squared determinant, over the product
+# of two squared edges, is less than this power. Two solutions then nearly coincide, and the full step would be noise.
 _DAMPING_POWER = 1.25
 
 
@@ -72,13 +73,13 @@ def _greater(first: Tensor, second: Tensor) -> Tensor:
 
 
 def _turn_to_largest(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Weights (C,) of the turn by one and by two places that brings the largest of three values (3, C) to the front."""
+    """Weights (C,), 0 or 1, of a turn by one and by two places that moves the largest of three values (3, C) first."""
     first, second, third = values
     return _greater(second, first), _greater(third, torch.maximum(first, second))
 
 
 def _turned(triple: Tensor, turn: tuple[Tensor, Tensor], step: int = 1) -> Tensor:
-    """Turn the triple (3, *, C) of each problem; with the step -1, turn it back."""
+    """Turn the triple (3, *, C) of each problem; the step -1 undoes the turn."""
     return triple.lerp(triple.roll(-step, 0), turn[0]).lerp_(triple.roll(step, 0), turn[1])
 
 
@@ -88,17 +89,17 @@ def _sqrt(square: Tensor) -> Tensor:
 
 
 def _signed(size: Tensor, sign: Tensor) -> Tensor:
-    """Give a positive number, which is overwritten, the sign of another number."""
+    """Give a positive number the sign of another number, in place."""
     if exporting():  # ONNX has no `copysign`
         return torch.where(sign < 0, -size, size)
     return size.copysign_(sign)
 
 
 def _isolated_root(k: Tensor) -> tuple[Tensor, Tensor]:
-    """The real root, as a ratio ``u : v``, of a cubic form (4, C) that is farthest from the other two roots.
+    """The real root of a cubic form (4, C) that is farthest from the other two roots, as a ratio ``u : v``.
 
-    Where two solutions of the P3P problem are close, two roots are close, too. The third root, which is returned, then
-    has both solutions on one of its lines.
+    When two solutions of the P3P problem are close, two roots are also close. Both solutions then lie on one line of
+    the third root, which this function returns.
     """
     tiny = torch.finfo(k.dtype).tiny
     sizes = k.abs()
@@ -106,15 +107,15 @@ def _isolated_root(k: Tensor) -> tuple[Tensor, Tensor]:
     # Swap u and v where two roots could be at infinity.
     swap = _greater(sizes[2], sizes[1])
     k3, k2, k1, k0 = k.lerp_(k.flip(0), swap)
-    # x = k3 u / v + k2 / 3 solves x³ = 3 p x + 2 q. The root is the outermost one, of the sign of q.
+    # x = k3 u / v + k2 / 3 solves x³ = 3 p x + 2 q. The root of largest size has the sign of q.
     third = k2 * (1 / 3)
     k31, sq_third = k3 * k1, third * third
     p = torch.add(sq_third, k31, alpha=-1 / 3)
     q = torch.sub(k31, sq_third, alpha=2).mul_(third).addcmul_(k3 * k3, k0, value=-1.0).mul_(0.5)
     size = q.abs()
-    pure = (2.0 * size).pow_(2 / 3).clamp_(min=tiny)  # x² if p were 0
+    pure = (2.0 * size).pow_(2 / 3).clamp_(min=tiny)  # x² for p = 0
     up = p.clamp(min=0.0)
-    x = _sqrt(torch.add(pure, up, alpha=3)).mul_(pure).div_(pure.add_(up.sub_(p), alpha=2.2))  # within a tenth
+    x = _sqrt(torch.add(pure, up, alpha=3)).mul_(pure).div_(pure.add_(up.sub_(p), alpha=2.2))  # error < 37 %
     for _ in range(_CUBIC_STEPS):
         sq_x = x * x
         x = torch.addcmul(size, sq_x, x).mul_(2 / 3).div_(sq_x.sub_(p).clamp_(min=tiny))
@@ -125,14 +126,16 @@ def _isolated_root(k: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _lines(u: Tensor, h: Tensor, pairs: Tensor) -> tuple[Tensor, Tensor]:
-    r"""The two lines (2, C) that form the conic with the weights ``u`` (3, C), of which ``u[1] + u[2]`` is not small.
+    r"""Slopes and offsets (2, C) of the two lines of the conic with the weights ``u`` (3, C).
 
+    The sum ``u[1] + u[2]`` must not be small.
     The lines are :math:`\lambda_1 - \lambda_3 = \text{slope}\,(\lambda_2 - \lambda_3) + \text{offset}\,\lambda_3`.
-    ``h`` (3, C) is 1 minus the cosines of the angles between rays, ``pairs`` (C,) the first factor of the cubic.
+    ``h`` (3, C) is 1 minus the cosines of the angles between rays. ``pairs`` (C,) is the first factor of the cubic, the
+    sum of the products of two weights.
     """
     tiny = torch.finfo(pairs.dtype).tiny
-    # The matrix D of the conic has u_2 + u_3, u_3 + u_1, u_1 + u_2 on its diagonal and -u_k cos_k beside it. The lines
-    # cross in m with m mᵀ = -adj D. The matrices D + [m]ₓ and D - [m]ₓ have rank one; their first rows are the lines.
+    # The matrix D of the conic has u_2 + u_3, u_3 + u_1, u_1 + u_2 on its diagonal and -u_k cos_k off the diagonal. The
+    # lines cross in m with m mᵀ = -adj D. D + [m]ₓ and D - [m]ₓ have rank one, and their first rows are the two lines.
     e1, e2, e3 = torch.addcmul(u, u, h, value=-1.0)
     u, h = u[1:], h[1:]
     d11 = u.sum(0)
@@ -140,12 +143,11 @@ def _lines(u: Tensor, h: Tensor, pairs: Tensor) -> tuple[Tensor, Tensor]:
     us = (u * u).mul_(torch.addcmul(2.0 * h, h, h, value=-1.0))
     sq_m2, sq_m3 = (us + pairs).neg_().clamp_(min=tiny)
     large = _sqrt(torch.maximum(sq_m2, sq_m3))
-    # The bound matters where the lines are not real.
-    least = -large
+    least = -large  # the bounds have an effect only where the lines are not real
     small = (e1 * d11).addcmul_(e2, e3).neg_().div_(large).clamp_(least, large)
     third = _greater(sq_m3, sq_m2)
     m2, m3 = large.lerp(small, third), small.lerp(large, third)
-    # m_3 - m_2 from the difference of the squares, which keeps more digits, unless the signs differ.
+    # If the signs agree, m_3 - m_2 is computed from the difference of the squares, which is more accurate.
     same_sign = _greater(small, torch.zeros_like(small))
     apart = (us[0] - us[1]).div_((m2 + m3).abs_().clamp_(min=tiny**0.5)).clamp_(least, large)
     apart = (m3 - m2).lerp_(apart, same_sign)
@@ -155,9 +157,9 @@ def _lines(u: Tensor, h: Tensor, pairs: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _meet(slope: Tensor, offset: Tensor, v: Tensor, h: Tensor) -> Tensor:
-    """The points where lines (2, C) meet the conic with the weights ``v`` (3, C): distances (3, 2, 2, C) up to scale.
+    """Points where lines (2, C) meet the conic with the weights ``v`` (3, C), as distances (3, 2, 2, C) up to scale.
 
-    A line that misses the conic counts as touching it. Where a line touches the conic, the second point is 0.
+    A line that misses the conic is treated like a tangent. The second point of a tangent is 0.
     """
     v1, v2, v3 = v
     vh1, vh2, vh3 = v * h
@@ -179,7 +181,7 @@ def _candidates(p: Tensor, q: Tensor, r: Tensor, b: Tensor, g: Tensor) -> Tensor
     """Solutions of the equations of :func:`_distances` up to rounding."""
     h = 0.5 * b
     s1, s2, s3 = torch.addcmul(b, h, h, value=-1.0)
-    # With u_1 = -(p u_3 + q u_2) the cubic is one in u_3 : u_2, and s · u = t_3 u_3 + t_2 u_2.
+    # With u_1 = -(p u_3 + q u_2) the unknown of the cubic is u_3 : u_2, and s · u = t_3 u_3 + t_2 u_2.
     t3, t2 = s3.addcmul_(p, s1, value=-1.0), s2.addcmul_(q, s1, value=-1.0)
     k2, k1 = (r * t3).addcmul_(p, g - t2), (r * t2).addcmul_(q, g - t3)
     u3, u2 = _isolated_root(torch.stack(((p * t3).neg_(), k2, k1, (q * t2).neg_())))
@@ -203,8 +205,8 @@ def _refined(candidates: Tensor, p: Tensor, q: Tensor, b: Tensor) -> Tensor:
     e1, e2, e3 = (d * d).addcmul_(b[:, None, None], after.mul_(before))
     d1, d2, d3 = d
     r2, r3 = torch.addcmul(e2, q, e1, value=-1.0), torch.addcmul(e3, p, e1, value=-1.0)
-    # Half the derivatives: of e1 by dist2, of -e1 by dist3, of e2 by dist3, of -e3 by dist2; from these, of -r2 and -r3
-    # by dist2 (r22, r32), and of r2 and r3 by dist3 (r23, r33).
+    # Half the derivatives: e12 of e1 by dist2, e13 of -e1 by dist3, e23 of e2 by dist3, e32 of -e3 by dist2. They give
+    # half the derivatives r22 and r32 of -r2 and -r3 by dist2, and r23 and r33 of r2 and r3 by dist3.
     e12, e13 = torch.addcmul(d1, h1, dist3), d1.addcmul_(h1, dist2, value=-1.0)
     e23, e32 = d2.addcmul_(h2, dist1), d3.addcmul_(h3, dist1, value=-1.0)
     r22, r23 = q * e12, e23.addcmul_(q, e13)
@@ -223,12 +225,13 @@ def _distances(p: Tensor, q: Tensor, r: Tensor, b: Tensor, g: Tensor) -> Tensor:
     Args:
         p: squared edge 3, (C,).
         q: squared edge 2, (C,).
-        r: ``1 - p - q``, which the caller may know with more digits, (C,).
+        r: ``1 - p - q``, (C,). The caller can compute this number more accurately.
         b: see the module, (3, C).
         g: see the module, (C,).
 
     Returns:
-        Four candidates for the distances of the points, (3, 2, 2, C): finite, the first distance not negative.
+        Four candidates for the distances of the points, (3, 2, 2, C). All are finite, and the first distance is not
+        negative.
     """
     dist = _refined(_candidates(p, q, r, b, g), p, q, b)
     dist1, dist2, dist3 = dist
@@ -238,19 +241,20 @@ def _distances(p: Tensor, q: Tensor, r: Tensor, b: Tensor, g: Tensor) -> Tensor:
 
 
 def _dot(v: Tensor, w: Tensor) -> Tensor:
-    """Products of the vectors (3, *, C)."""
+    """Dot products of vectors (3, *, C)."""
     return (v * w).sum(0)
 
 
 def _cross(v: Tensor, w: Tensor) -> Tensor:
-    """Cross products of vectors (3, *, C); ``torch.linalg.cross`` takes a CPU several times as long."""
+    """Cross products of vectors (3, *, C); ``torch.linalg.cross`` is several times slower on a CPU."""
     return (v.roll(-1, 0) * w.roll(1, 0)).addcmul_(v.roll(1, 0), w.roll(-1, 0), value=-1.0)
 
 
 def _axes(base: Tensor, side: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Of a triangle with two given sides: unit vectors along its base and its height, and three numbers.
+    """Axes and sizes of a triangle with two given sides.
 
-    These are one over the length of the base, the other side along the base, and the squared height.
+    Returns unit vectors along the base and along the height, the inverse length of the base, the component of the other
+    side along the base, and the squared height.
     """
     tiny = torch.finfo(base.dtype).tiny
     inv_base = _dot(base, base).clamp_(min=tiny).rsqrt_()
@@ -269,7 +273,8 @@ def _edges(points: Tensor) -> Tensor:
 def _solve_chunk(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Rotations (3, 3, 2, 2, C), translations (3, 2, 2, C), and which poses are solutions (2, 2, C)."""
     finfo = torch.finfo(world_points.dtype)
-    # Points by components, ordered so that the longest edge is opposite to the first point; 0 where not sound.
+    # Components of world points and image points, 0 for unsound problems. Each triple of points is then turned so that
+    # the longest edge is opposite to the first point.
     points = torch.cat((world_points.permute(1, 2, 0), plane_points.permute(1, 2, 0)), 1)  # (3, 5, C)
     sound = points.abs().sum((0, 1)) <= finfo.max**0.2  # larger numbers could overflow
     points = torch.where(sound, points, 0.0)
@@ -291,17 +296,18 @@ def _solve_chunk(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Te
     det = _dot(_cross(gaps[1], gaps[2]), rays[0])
     dist = _distances(p, q, r, gaps.square_().sum(1), det.mul_(det))
 
-    # So far the longest edge had the length 1; from here on lengths are in the unit of the world.
+    # Above, the longest edge has the length 1. From here on lengths are in the unit of the world.
     base_length = inv_base.reciprocal()
     y1, y2, y3 = (dist * base_length)[:, None] * rays[:, :, None, None]
     cam1, cam2, cam_inv_base, cam_along, cam_sq_height = _axes(y3 - y2, y1 - y2)
-    # The two triangles differ in the base, the side along it and the squared height, relative to the base.
+    # Differences of the two triangles relative to the base: of the base, of the other side's component along the base,
+    # and of the squared height.
     base_error = (cam_inv_base * base_length).sub_(1.0)
     along_error = torch.addcmul(-along, cam_along, inv_base)
     height_error = torch.addcmul(-sq_height, cam_sq_height, inv_sq_base)
     sq_error = base_error.mul_(base_error).addcmul_(along_error, along_error).addcmul_(height_error, height_error)
     least = dist.amin(0)
-    # No distance is more than dist[0] + 1, in longest edges.
+    # No distance is larger than dist[0] + 1 (the longest edge is 1).
     room = torch.addcmul(least, least, dist[0]).sub_(_CLOSE * finfo.eps**_ERROR_POWER)
     room.mul_(sound * finfo.eps ** (2 * _ERROR_POWER)).clamp_(max=_LARGEST_ERROR**2)
 
@@ -314,7 +320,7 @@ def _solve_chunk(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Te
 
 
 def _solve(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Tensor]:
-    """Components of rotations and translations, (12, 4, B), and which poses are solutions, (4, B)."""
+    """Components of rotations and translations (12, 4, B), and which poses are solutions (4, B)."""
     batch = world_points.shape[0]
     if compiling():
         rotation, translation, found = _solve_chunk(world_points, plane_points)
@@ -322,7 +328,7 @@ def _solve(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Tensor]:
     out = world_points.new_empty(12, 2, 2, batch)
     valid = torch.empty(2, 2, batch, dtype=torch.bool, device=world_points.device)
     chunk = kept_at_once(_CHUNK_BYTES, world_points) // world_points.element_size()
-    with torch.inference_mode():  # an eighth faster than `no_grad`; the results were made outside
+    with torch.inference_mode():  # an eighth faster than `no_grad`; `out` and `valid` remain ordinary tensors
         for start in range(0, batch, chunk):
             part = slice(start, start + chunk)
             rotation, translation, valid[..., part] = _solve_chunk(world_points[part], plane_points[part])
@@ -356,27 +362,27 @@ class _Solve(torch.autograd.Function):
 def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
     r"""Find all poses that project three world points exactly onto three image points, for a batch of problems.
 
-    Use this function when there are exactly three pairs: most solvers do not believe a pose that no fourth pair
-    confirms (:attr:`~kornia_pnpnet.result.Status.NOT_BELIEVED`).
+    Use this function for problems of exactly three pairs: most solvers reject a pose that no fourth pair confirms
+    (:attr:`~kornia_pnpnet.result.Status.NOT_BELIEVED`).
 
     Convention: ``x_cam = R x_world + t``, the camera looks along +z.
 
-    The poses carry no gradient. In memory the batch is the last dimension, which suits arithmetic over many poses.
+    The poses carry no gradient. The batch is the last dimension in memory, which makes arithmetic on many poses faster.
 
     Source: M. Persson and K. Nordberg, "Lambda Twist", ECCV 2018; Y. Ding et al., "Revisiting the P3P Problem", CVPR
     2023; details in :mod:`kornia_pnpnet.propose.p3p`.
 
     Args:
-        world_points: points in any unit, shape :math:`(B, 3, 3)`. Any leading dimensions may stand in place of
-            :math:`B`, in both arguments and in the result; a single problem has none.
+        world_points: points in any unit, shape :math:`(B, 3, 3)`. Any leading dimensions may replace :math:`B`, in both
+            arguments and in the result; a single problem needs none.
         plane_points: :math:`(x/z, y/z)` of the points in the camera frame, shape :math:`(B, 3, 2)`. Kornia's
             ``normalize_points_with_intrinsics`` computes them from pixels.
 
     Returns:
-        Four slots per problem, in float64 when an argument is, else in float32. A slot is valid when its pose is a
-        solution with all three points in front of the camera. A double solution fills one slot. Invalid slots are
-        finite. No slot is valid for points on a line, which have no pose or infinitely many, for NaN and infinity, and
-        where a point is further off the axis than ``MIN_DEPTH_RATIO`` of :mod:`kornia_pnpnet.refine.residual` allows.
+        Four slots per problem, in float64 if an argument is float64, else in float32. A slot is valid when its pose is
+        a solution with all three points in front of the camera. A double solution fills one slot. Invalid slots are
+        finite. A problem has no valid slot when the points lie on a line, when a coordinate is NaN or infinite, or when
+        a ray is nearly orthogonal to the optical axis (``MIN_DEPTH_RATIO`` of :mod:`kornia_pnpnet.refine.residual`).
 
     Raises:
         ShapeError: when a tensor has another shape, or the batches differ.
@@ -409,9 +415,9 @@ def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
 class P3P(Configured):
     r"""Minimal solver of three pairs for :class:`~kornia_pnpnet.propose.ransac.RANSAC`: :func:`p3p` as a module.
 
-    With an unknown focal length :func:`p3p` solves each sample at focal lengths on a grid, spread evenly in logarithms
-    over the range of :class:`~kornia_pnpnet.refine.terms.CameraTerm`. Least squares of all inliers, with the focal
-    length as a parameter, then find what lies between the points of the grid.
+    With an unknown focal length :func:`p3p` solves each sample at focal lengths on a grid. The grid divides the range
+    of :class:`~kornia_pnpnet.refine.terms.CameraTerm` evenly in logarithms. Least squares on all inliers, with the
+    focal length as a parameter, then find focal lengths between the points of the grid.
 
     Example:
         >>> problem = Problem.of(torch.randn(7, 3, 3), torch.randn(7, 3, 2))
@@ -426,7 +432,7 @@ class P3P(Configured):
         super().__init__(locals())
 
     def hypotheses(self, problem: Problem) -> Hypotheses:
-        """Four slots per sample and focal length, without gradients; see MinimalSolver.hypotheses."""
+        """Four slots per sample and focal length of the grid, without gradients; see MinimalSolver.hypotheses."""
         plane = problem.img_points / problem.focal
         if problem.free_focal is None:
             return p3p(problem.world_points, plane)
@@ -437,7 +443,7 @@ class P3P(Configured):
         one = torch.ones_like(focal)
         rows = torch.cat((one, one, one / focal), -1)
         pose = Pose(rotation * rows[..., None], translation * rows)
-        # From (F, B, 4, ...) to (B, 4 F, ...): the slots of a sample side by side, the batch last in memory.
+        # From (F, B, 4, ...) to (B, 4 F, ...), with the batch last in memory.
         return map_tensors(
             lambda x: x.movedim((0, 1, 2), (-2, -1, -3)).flatten(-3, -2).movedim((-1, -2), (0, 1)),
             Hypotheses(pose, valid),

@@ -1,4 +1,4 @@
-r"""RANSAC: the pose with the most inliers among the poses of many small samples, for whole batches at once."""
+r"""RANSAC: the pose with the best score among the poses of many small samples, for batches."""
 
 from __future__ import annotations
 
@@ -25,20 +25,21 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["RANSAC", "search_on"]
 
-# Number of pairs that any pose fits.
+# Number of inliers whose residuals carry no information on the noise, because the pose is fitted to them.
 _FITTED = 5
-# Standard deviations. :func:`search_on` counts nearer pairs as inliers. The limit of estimated noise is wide because
-# networks estimate too little noise where most pairs are outliers: an inlier that does not count costs more than an
-# outlier that does. That of known noise was tuned on problems of uncertain PnP (`benchmarks/uncertain_problems.py`,
-# seeds 777 and 778, 10 pairs with 5 outliers): 4 and 8 lead to larger errors.
+# Standard deviations. Largest residuals of an inlier in :func:`search_on`, for estimated noise and for known noise. The
+# first limit is wide, because networks estimate too little noise when most pairs are outliers, and because a missed
+# inlier costs more than an accepted outlier. The second limit was tuned on problems of uncertain PnP
+# (`benchmarks/uncertain_problems.py`, seeds 777 and 778, 10 pairs with 5 outliers): limits of 4 and 8 lead to larger
+# errors.
 _INLIER, _KNOWN_INLIER = 10.0, 5.0
-# Residuals at the best focal length on a grid, relative to the median distance of the pixels from the principal point
-# and the range of the grid in logarithms. Tuned on random problems with fields of view of 18 to 100 degrees (seed 6).
+# Residuals at the best focal length of a grid, relative to the median distance of the pixels from the principal point
+# times half the range of log f. Tuned on random problems with fields of view of 18 to 100 degrees (seed 6).
 _GRID_RESIDUAL = 0.04
-# Normalised units. Least depth of the centre of the world in the limit of an inlier.
+# Normalised units. Lower bound of the depth by which :func:`search_on` converts noise of the points to pixels.
 _NEAREST = 0.5
-# A pair whose weight or confidence is 0 is drawn this often, relative to a pair where it is 1. Networks mislead more
-# often than callers: where repeated structure or crowds agree, for example.
+# Chance that a pair of weight 0 is drawn relative to a pair of weight 1, and the same ratio for confidences of 0 and 1.
+# The first ratio is larger because networks mislead more often than callers, for example with repeated structure.
 _DOUBT, _LEAST_TRUST = 0.8, 0.05
 
 
@@ -47,42 +48,43 @@ class RANSAC(Initialiser):
 
     The samples of all problems are solved as one batch, in rounds. After each round the best pose of a problem is
     improved by least squares on its inliers (LO-RANSAC). A problem is done when a sample without an outlier has been
-    drawn with the probability ``confidence``. When the pairs have at most ``max_samples`` subsets, each subset is tried
-    once instead. Problems share only the random numbers, which are the same in every call: a problem has the same
-    result alone, in any batch and at any place in the batch, up to rounding.
+    drawn with the probability ``confidence``. If the pairs have at most ``max_samples`` subsets, no subset is drawn
+    twice. Problems share only the random numbers, which are the same in every call. The result of a problem therefore
+    does not depend on the batch or on the position in the batch, up to rounding.
 
-    A pair is an inlier when :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`. The ``threshold`` :math:`\tau` is for errors
-    of the pixels; the ``world_threshold`` :math:`\omega` is for errors of the points, which move the pixel by
-    :math:`f/z` times as much. Least squares weigh an inlier by the inverse of the right hand side.
+    A pair is an inlier when :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`. The ``threshold`` :math:`\tau` covers errors
+    of the pixels. The ``world_threshold`` :math:`\omega` covers errors of the points; an error of a point moves the
+    projection by :math:`f/z` times the error. Least squares weigh an inlier by the inverse of the right hand side; the
+    last steps multiply this weight by the weight of a Cauchy kernel.
 
-    The guess is ``ok`` when fewer than 0.01 poses with as many inliers are expected by chance, from pairs without any
-    pose behind them (see :func:`~kornia_pnpnet.judge.inliers.log_false_alarms`). A problem of only three pairs is
-    ``ok`` when it has a pose: three pairs hold no evidence.
+    A pose is ``ok`` when fewer than 0.01 poses with as many inliers are expected by chance, for random pairs (see
+    :func:`~kornia_pnpnet.judge.inliers.log_false_alarms`). Three pairs cannot show whether a pose is correct: a problem
+    of three pairs is ``ok`` when it has a pose.
 
-    Where the caller gave a confidence for each pair, samples hold pairs in proportion to it, and fewer samples suffice
-    when the inliers are those with much confidence.
+    If the caller gave confidences, pairs are drawn more often the larger their confidence is. Fewer samples then
+    suffice when the inliers have large confidences.
 
-    Gradients: the inliers, and their weights by depth, are selected without a gradient. The last refinement, unrolled
-    least squares on the inliers from a constant start near the minimum, has a gradient to points, pixels and weights.
+    Gradients: the inliers, and their weights by depth, are constants. The last step, unrolled least squares on the
+    inliers from a constant start close to the minimum, has a gradient to points, pixels and weights.
 
     Source: M. Fischler and R. Bolles, Communications of the ACM 24(6), 1981; O. Chum, J. Matas and J. Kittler,
-    "Locally optimized RANSAC", DAGM 2003; P. Torr and A. Zisserman, CVIU 78(1), 2000 (MSAC); scoring few pairs first as
-    in D. Nistér, "Preemptive RANSAC for live structure and motion estimation", ICCV 2003.
+    "Locally optimized RANSAC", DAGM 2003; P. Torr and A. Zisserman, CVIU 78(1), 2000 (MSAC); D. Nistér, "Preemptive
+    RANSAC for live structure and motion estimation", ICCV 2003 (few pairs score all poses first).
 
     Args:
-        minimal: solver of samples, for example :class:`~kornia_pnpnet.propose.p3p.P3P` or
+        minimal: minimal solver, for example :class:`~kornia_pnpnet.propose.p3p.P3P` or
             :class:`~kornia_pnpnet.propose.minimal.SubsetSolver`.
         threshold: :math:`\tau` in pixels of the user's camera.
         world_threshold: :math:`\omega` in the unit of the user's world.
-        scorer: ``"msac"``, the truncated squares; ``"inliers"``, the number of outliers; or any function from squared
-            residuals over squared thresholds, of any shape, to losses. The loss of a pose is the sum over the pairs,
-            weighted by the weights of the pairs.
+        scorer: ``"msac"`` (truncated squares), ``"inliers"`` (number of outliers), or a function that maps ratios of
+            squared residual and squared threshold, of any shape, to losses. The loss of a pose is the weighted sum of
+            the losses of the pairs.
         max_samples: largest number of samples of a problem.
-        min_samples: smallest number of samples of a problem. Noise makes the poses of many outlier-free samples bad,
-            so the first of them may not suffice.
+        min_samples: smallest number of samples of a problem. The first sample without an outlier may not suffice,
+            because noise makes many poses of such samples inaccurate.
         confidence: probability of having drawn a sample without an outlier, in (0, 1).
-        final_steps: number of least-squares steps from the best pose, which is near the minimum already. They carry the
-            gradient; with 0 the pose is a constant, which is enough where a refinement follows.
+        final_steps: number of least-squares steps from the best pose. These steps carry the gradient; with 0 steps the
+            pose is a constant, which is sufficient before a refinement.
         seed: seed of the random numbers.
 
     Raises:
@@ -99,7 +101,7 @@ class RANSAC(Initialiser):
         (True, [True, True, True, True])
     """
 
-    #: Pairs per core of a part of a batch. Parts have problems of about the same number of pairs.
+    #: See Initialiser.
     pairs_at_once = 24_000
     takes_given = True
     takes_rigs = True
@@ -141,14 +143,13 @@ class RANSAC(Initialiser):
 
         Args:
             problem: normalised problems.
-            given: a pose of each problem that competes with those of the samples, in the frame of the problem.
+            given: one pose per problem, in the frame of the problem. This pose competes with the poses of the samples.
 
         Returns:
-            The poses; as weights :math:`\tau^2 / (\tau^2 + (f \omega / z)^2)` for the inliers, 0 for the outliers; and
-            ``ok``.
+            The poses, ``ok``, and weights: :math:`\tau^2 / (\tau^2 + (f \omega / z)^2)` for inliers, 0 for outliers.
 
         Raises:
-            ShapeError: when there are fewer pairs than in a sample.
+            ShapeError: when a problem has fewer pairs than a sample.
             NotImplementedError: inside of ``torch.func.vmap``.
         """
         size = self.minimal.sample_size
@@ -163,12 +164,12 @@ class RANSAC(Initialiser):
                 "torch.func.vmap cannot map RANSAC, whose search ends when its problems are solved. "
                 "Give the solver a larger batch: it takes any leading dimensions."
             )
-        # Contiguous, so that a sum over pairs rounds alike at every place in the batch; the noise is not used.
+        # Contiguous, so that rounding of a sum over pairs does not depend on the position in the batch.
         problem = problem._replace(noise=None).map(torch.Tensor.contiguous)
         share = (problem.usual_weights.detach() > 0).to(problem.weights)
         share = share / share.sum(-1, keepdim=True).clamp(min=1.0)
         centre = (share[..., None] * problem.world_points.detach()).sum(1)  # (B, 3)
-        # Weights relative to the largest weight, so that their unit does not matter.
+        # Weights are divided by the largest weight of the problem, so that their unit has no effect.
         weights = relative(problem.weights, problem.weights)
         problem = problem._replace(world_points=problem.world_points - centre[:, None], weights=weights)
         if problem.prior is not None:
@@ -188,7 +189,7 @@ class RANSAC(Initialiser):
         pose, camera = map_tensors(torch.Tensor.contiguous, projection.state)
         with torch.no_grad():
             projection, counts = map_tensors(torch.Tensor.detach, projection), (fixed.weights > 0).sum(-1)
-            # Every number of inliers from 4 to all pairs is another test of the same pose.
+            # Each possible number of inliers, from 4 to the number of pairs, is one more test of the same pose.
             tests = search.scored * (counts - MIN_PAIRS).clamp(min=1)
             alarms = log_false_alarms(tests, projection, problems_last(fixed), thresholds, judged)
             ok = alarms < math.log(MAX_FALSE_ALARMS)
@@ -198,7 +199,7 @@ class RANSAC(Initialiser):
         return Starts(_recentred(pose, -centre), judged.weights.contiguous(), ok, camera=camera)
 
     def _refined(self, problem: Problem, state: State, stages: list[Thresholds]) -> tuple[Projection, Judged]:
-        """Improve poses on their inliers, which are chosen anew for each of the stages."""
+        """Improve poses on their inliers. After each step the inliers are selected by the thresholds of the stage."""
         projection = project(state, problem)
         for thresholds in stages:
             judged = judge(projection, problem, thresholds)
@@ -211,33 +212,34 @@ class RANSAC(Initialiser):
 
 
 def _recentred(pose: Pose, centre: Tensor) -> Pose:
-    """Poses where a world point (B, 3) becomes the origin."""
+    """Poses in a world whose origin is moved to a world point (B, 3)."""
     return Pose(pose.rotation, pose.translation + (pose.rotation @ centre[..., None])[..., 0])
 
 
 def _on_grid(problem: Problem) -> Tensor:
-    """Threshold of residuals between the focal lengths of a grid, in pixels of the problem, (B, 1)."""
+    """Threshold of an inlier for focal lengths that lie between those of the grid, in pixels of the problem, (B, 1)."""
     away = torch.where(problem.weights > 0, problem.img_points.abs().amax(-1), torch.nan)
     return (_GRID_RESIDUAL * problem.free_focal.width * away.nanmedian(1).values.nan_to_num(0.0))[:, None]
 
 
 def _robust(errors: Tensor, inliers: Tensor) -> Tensor:
-    """Weights of a Cauchy kernel, (B, N): its scale follows the median residual of the inliers, wherever they end.
+    """Weights (B, N) of a Cauchy kernel. The scale of the kernel follows the median residual of the inliers.
 
-    Thresholds are wide, and noise has tails: with equal weights, pairs near the threshold would decide the pose.
+    Thresholds are wide, and noise has heavy tails. With equal weights, the pairs with the largest residuals would
+    dominate the pose.
     """
     sq_scale, count = cauchy_scale(errors, inliers > 0)
-    # Few inliers lie close to the pose that was fitted to them: their residuals say less than they seem to.
+    # A pose fits few inliers closely even if they are noisy. Their residuals are therefore weighted less.
     free = (count - _FITTED).clamp(min=0) / count.clamp(min=1)
     return 1.0 / (1.0 + free * errors / sq_scale.clamp(min=torch.finfo(errors.dtype).eps))
 
 
-# How :func:`search_on` searches.
+# Plan of :func:`search_on`.
 _FURTHER = RANSAC(P3P(), min_samples=64)
 
 
 def _trusted(problem: Problem) -> Tensor:
-    """How often pairs are drawn, by the caller's confidence, (B, N)."""
+    """Relative chances of the pairs to be drawn, by the caller's confidence, (B, N)."""
     if problem.confidence is None:
         return torch.ones_like(problem.weights)
     return _LEAST_TRUST + (1.0 - _LEAST_TRUST) * problem.confidence.nan_to_num(0.5)
@@ -245,28 +247,31 @@ def _trusted(problem: Problem) -> Tensor:
 
 @torch.no_grad()
 def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) -> Starts:
-    r"""Go on searching where the poses of an initialiser do not suffice, with samples of likely inliers.
+    r"""Run RANSAC on the problems for which the poses of an initialiser do not suffice.
 
-    Samples hold pairs in proportion to 0.8 plus 0.2 times the weight of the starts, times the caller's confidence:
-    weights that mislead then cost some samples, but no pose. An inlier is within ten standard deviations of the noise
-    that the starts estimate (its mean over the pairs), or within five of the noise of its pair that the caller gave; of
-    noise with covariances the standard deviation of isotropic noise of the same trace. The limit is that of a point as
-    far away as the centre of the world in the first pose, for all poses: with a limit by each pose's own depths, a pose
-    close to the points would have most inliers.
+    The chance of a pair to be drawn is proportional to 0.8 plus 0.2 times its weight in the starts, times a factor by
+    the caller's confidence. Misleading weights then cost some samples, but the search still succeeds.
 
-    A problem is searched only when, by the number of inliers of the best pose of the starts, it needs more than 64
-    samples to reach a confidence of 0.999, and still does after its poses were improved on their inliers. Problems that
-    are done leave the batch, and no problem's result depends on the others.
+    An inlier has a residual of less than five standard deviations if the caller gave the noise of the pair, else of
+    less than ten standard deviations. If the caller gave no noise, the standard deviation is the mean over the pairs. A
+    covariance counts as isotropic noise of the same trace. For all poses the noise of points is converted to pixels at
+    one depth: the depth of the centre of the world in the first pose. If the depths of each pose were used, a pose
+    close to the points would have the most inliers.
+
+    A problem is searched only when it needs more than 64 samples for a confidence of 0.999. The inliers of the best
+    pose of the starts determine this number, first before and then after least squares improve the pose. Problems that
+    are done leave the batch. The result of a problem does not depend on the other problems.
 
     Args:
         problem: normalised problems of a centred and scaled world.
         starts: several poses, probabilities of being an inlier as weights, and the noise of the pairs.
-        keep_others: whether the starts keep their other poses. The caller's pose is one of them, and few pairs alone
-            may lead away from it.
+        keep_others: whether the result keeps the other poses of the starts. A solver keeps them if the caller gave a
+            pose or a prior, because a search on few pairs can lead away from the correct pose.
 
     Returns:
-        The starts with the best pose, a constant. Where a problem was searched, the weights are those of a Cauchy
-        kernel at this pose, whose scale is the limit of an inlier: the network's likelihoods misled there.
+        The starts with the best pose, without gradient. The weights of a searched problem are replaced, because the
+        network's weights misled: the new weights are those of a Cauchy kernel at the best pose, with the limit of an
+        inlier as its scale.
 
     Raises:
         ValueCheckError: when the initialiser does not estimate the noise.

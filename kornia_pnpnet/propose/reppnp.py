@@ -1,9 +1,10 @@
-r"""EPPnP and REPPnP: the null space of the projection equations, with outliers rejected by their algebraic error.
+r"""EPPnP and REPPnP: the null space of the projection equations; REPPnP rejects outliers by their algebraic error.
 
-In the camera frame the four control points of :mod:`kornia_pnpnet.propose.epnp` are twelve unknowns, and a pair gives
-two equations, :math:`X_i - u_i Z_i = 0` and :math:`Y_i - v_i Z_i = 0`. Their residual is the algebraic error: the pixel
-error times the depth over the focal length, a length. Rows (B, K + 1, 2 N) hold the derivatives of the errors of all u,
-then of all v, by K unknowns, and at last the errors.
+In the camera frame the four control points of :mod:`kornia_pnpnet.propose.epnp` are twelve unknowns. A pair gives two
+equations, :math:`X_i - u_i Z_i = 0` and :math:`Y_i - v_i Z_i = 0`. The algebraic error is the residual of these
+equations. It is the pixel error times the depth over the focal length, a length. In an array ``rows`` (B, K + 1, 2 N)
+the first K rows are the derivatives of the errors by K unknowns, and the last row is the errors. The columns are the
+errors of all u, then the errors of all v.
 """
 
 from __future__ import annotations
@@ -24,48 +25,50 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["REPPnP"]
 
-# Number of pairs that are kept at any error: 11 unknowns of the null vector need 6 pairs, 6 unknowns of a rigid motion
-# 3 pairs, and one or two more so that errors show.
+# Least number of pairs that are kept. The 11 unknowns of the null vector need 6 pairs, and the 6 unknowns of a rigid
+# motion need 3 pairs. One or two more pairs are necessary for errors to show.
 _NULL_FLOOR, _RIGID_FLOOR = 7, 5
-# Number of pairs below which a problem is not `ok`.
+# Least number of pairs of a problem that is `ok`.
 _MIN_PAIRS = 4
-# Weight of the squared depths of the control points relative to the centroid, during outlier rejection. Values from
-# 1e-3 to 3e-2 work equally well on the protocol's problems.
+# Weight of the squared depths of the control vectors during outlier rejection. Values from 1e-3 to 3e-2 work equally
+# well on the protocol's problems.
 _DEPTH_PRIOR = 5e-3
-# The same weight for the last null vector: small enough to keep the little depth that a narrow view shows.
+# Weight of the squared depths for the last null vector, small enough to keep the small depths of a narrow view.
 _FINAL_DEPTH_PRIOR = 1e-5
-# Numbers of rejections by the null vector and by the rigid motion.
+# Number of iterations of rejection with the null vector, and with the rigid motion.
 _NULL_ITERATIONS, _RIGID_ITERATIONS = 3, 4
-# Added to 1 minus the leverage: a pair that alone determines an unknown has the leverage 1 and the error 0.
+# Added to 1 minus the leverage, which is 0 when a pair alone determines an unknown.
 _LEVERAGE_RIDGE = 1e-6
 
 
 class REPPnP(Initialiser):
     r"""Null space of the projection equations, algebraic outlier rejection, and the pose of the remaining pairs.
 
-    Each iteration finds the null vector of the kept pairs, at first of all pairs, and then keeps the pairs whose
-    algebraic error is at most :math:`\max(Q, \delta_{\max})`, with a quantile :math:`Q` of the errors. The last null
-    vector is aligned with the world (orthogonal Procrustes). Without rejection the method is EPPnP.
+    Each iteration finds the null vector of the kept pairs, and then keeps the pairs whose algebraic error is at most
+    :math:`\max(Q, \delta_{\max})`, with a quantile :math:`Q` of the errors. The first iteration uses all pairs. The
+    last null vector is aligned with the world (orthogonal Procrustes). Without rejection the method is EPPnP.
 
     Source: L. Ferraz, X. Binefa and F. Moreno-Noguer, "Very Fast Solution to the PnP Problem with Algebraic Outlier
-    Rejection", CVPR 2014. Our changes are for success on the protocol's problems and for batches:
+    Rejection", CVPR 2014. Our changes improve success on the protocol's problems or allow batches:
 
-    - The null vector has the centroid at depth 1, instead of length 1: a linear system that does not depend on the
-      control points, the frame or the unit. A small ridge keeps the other depths close to the centroid's, so that the
-      fit bends less to outliers and a narrow view is weak perspective.
+    - The null vector is scaled so that the centroid has depth 1; the paper scales its length to 1. Our null vector
+      solves a linear system, and does not depend on the control points, the frame or the unit. A small ridge keeps the
+      other depths close to the depth of the centroid. With the ridge, outliers change the fit less, and a narrow view
+      is treated as weak perspective.
     - Pairs are compared by their leave-one-out error. The quantile is the median instead of 25 %, and at least 7 pairs
       are kept.
-    - The loop continues with a rigid motion and one Gauss-Newton step of its algebraic error per iteration, and the
-      pose minimises this error. The paper alternates between the span of four null vectors and rigid points.
-    - Both loops have a fixed length. The paper's loop stops when the quantile no longer falls.
+    - A second loop has a rigid motion and one Gauss-Newton step on its algebraic error per iteration; it keeps at least
+      5 pairs. The final pose minimises this error. The paper instead alternates between the span of four null vectors
+      and rigid points.
+    - Both loops have a fixed length. The paper's loop stops when the quantile no longer decreases.
 
-    Gradients: the selection is piecewise constant, and the last Gauss-Newton steps start from a detached pose, so that
-    their gradient is that of the minimum.
+    Gradients: the selection is piecewise constant. The last Gauss-Newton steps start from a detached pose, and their
+    gradient is the gradient of the minimum.
 
     Args:
-        reject_outliers: reject outliers; otherwise all pairs are kept.
+        reject_outliers: whether outliers are rejected; otherwise all pairs are kept.
         max_error: :math:`\delta_{\max}` as a share of the root mean square radius of the world.
-        quantile: share of the pairs that is always kept, in (0, 1].
+        quantile: least share of the pairs that is kept, in (0, 1].
         refine_iterations: number of Gauss-Newton steps after the last rejection, at least 1.
 
     Raises:
@@ -103,9 +106,9 @@ class REPPnP(Initialiser):
         """Find the pose and the inliers of a problem in the solver's frame.
 
         Returns:
-            The pose; as weights 1 for the kept pairs and 0 for the outliers; and ``ok``, false for fewer than 4 pairs,
-            for points on a line, for equations that do not determine a pose, and for a pose with the centroid of the
-            points behind the camera.
+            The pose, weights of 1 for kept pairs and 0 for outliers, and ``ok``. A problem is not ``ok`` with fewer
+            than 4 pairs, with points on a line, when the equations do not determine a pose, or when the centroid of the
+            points is behind the camera.
         """
         problem = problem._replace(weights=problem.usual_weights)
         with torch.no_grad():
@@ -113,7 +116,7 @@ class REPPnP(Initialiser):
         centroid = control.points[:, 0, :, None]
         mean_square = control.points[:, 1:].square().sum((1, 2))
         radius = torch.where(control.ok, mean_square, 1.0).sqrt()
-        # No gradient through the sum of the weights: the pose does not depend on it.
+        # The sum of the weights has no gradient, because the pose does not depend on the sum.
         total = problem.weights.detach().sum(-1, keepdim=True)
         pairs = _Pairs(
             (problem.world_points.mT - centroid) / radius[:, None, None],
@@ -136,10 +139,10 @@ class REPPnP(Initialiser):
         return Starts(pose, kept.to(problem.weights.dtype), ok)
 
     def _select(self, pairs: _Pairs, control: ControlPoints) -> tuple[Tensor, Pose]:
-        """The weights, 0 for outliers, and a pose that fits the kept pairs, in the frame of :class:`_Pairs`."""
+        """Weights, which are 0 for outliers, and a pose that fits the kept pairs, in the frame of :class:`_Pairs`."""
         coordinates = control.coordinates.mT.contiguous()  # (B, 4, N)
-        # The pixels are relative to their mean: a shear of the camera frame that changes no error but keeps the digits
-        # of a narrow view.
+        # The mean is subtracted from the pixels. This shear of the camera frame changes no error, but reduces rounding
+        # in a narrow view.
         mean = (control.weights[:, None] * pairs.plane).sum(-1, keepdim=True)  # (B, 2, 1)
         zero = torch.zeros_like(coordinates)
         by_x, by_y = torch.cat((coordinates, zero), -1), torch.cat((zero, coordinates), -1)
@@ -151,7 +154,7 @@ class REPPnP(Initialiser):
             errors = _leave_one_out(torch.cat((rows[:, :-1], null.mT @ rows), 1), inverse, pairs, weights)
             sq_size = null[:, 2:-1].square().sum(1).clamp(min=torch.finfo(null.dtype).eps ** 2)
             weights = self._keep(pairs, errors / sq_size, _NULL_FLOOR)
-        # The rigid motion that fits the null vector best.
+        # Find the rigid motion that fits the null vector best.
         _, null = _null_vector(rows, weights, _FINAL_DEPTH_PRIOR)
         centroid, vectors = torch.cat((null[:, :2], null[:, -1:]), 1), null[:, 2:-1].view(-1, 3, 3)
         camera = torch.cat((centroid, vectors), 2)  # (B, 3, 4)
@@ -168,7 +171,7 @@ class REPPnP(Initialiser):
         return weights, pose
 
     def _keep(self, pairs: _Pairs, sq_error: Tensor, floor: int) -> Tensor:
-        """The weights (B, N), 0 where the error exceeds quantile and limit; at least ``floor`` pairs are kept."""
+        """Weights (B, N), 0 where the error exceeds both quantile and limit; at least ``floor`` pairs are kept."""
         rank = (self.quantile * pairs.there.sum(-1, keepdim=True)).ceil().long().clamp(min=floor)  # (B, 1)
         rank = rank.clamp(max=sq_error.shape[-1]) - 1
         ascending = torch.where(pairs.there, sq_error, torch.inf).sort(-1).values
@@ -177,41 +180,41 @@ class REPPnP(Initialiser):
 
 
 class _Pairs(NamedTuple):
-    """The pairs in a world whose centroid is 0 and whose root mean square radius is 1."""
+    """Pairs in a world with the centroid 0 and a root mean square radius of 1."""
 
     world: Tensor  # (B, 3, N)
     plane: Tensor  # u and v: pixel over focal length, (B, 2, N)
     weights: Tensor  # with the sum 1, (B, N)
-    there: Tensor  # bool, (B, N)
+    there: Tensor  # whether the weight is not 0, bool, (B, N)
 
 
 def _normal_matrix(rows: Tensor, weights: Tensor) -> Tensor:
-    """Normal matrix of rows; the last column holds the gradient, (B, K, K + 1)."""
+    """Normal matrix of ``rows`` (see the module), with the gradient as the last column, (B, K, K + 1)."""
     return (rows[:, :-1] * weights.repeat(1, 2)[:, None]) @ rows.mT
 
 
 def _inverse(normal: Tensor, ridge: Tensor | float = 0.0) -> Tensor:
-    """Inverse of normal matrices plus a ridge, which keeps singular matrices finite."""
+    """Inverse of normal matrices plus a ridge; the ridge makes singular matrices invertible."""
     ridge = torch.diag_embed(normal.new_zeros(normal.shape[1]) + ridge + 32.0 * torch.finfo(normal.dtype).eps)
     return torch.linalg.inv_ex(normal[..., :-1] + ridge).inverse
 
 
 def _null_vector(rows: Tensor, weights: Tensor, depth_prior: float) -> tuple[Tensor, Tensor]:
-    """The inverse normal matrix, and the control points of least error, (B, 12, 1): x and y, the depths, and 1."""
+    """Inverse normal matrix, and the null vector (B, 12, 1): x and y, the depths, and the depth 1 of the centroid."""
     normal = _normal_matrix(rows, weights)
     inverse = _inverse(normal, depth_prior * (torch.arange(11, device=normal.device) >= 8))
     return inverse, torch.cat((-(inverse @ normal[..., -1:]), torch.ones_like(normal[:, :1, :1])), 1)
 
 
 def _linearize(pairs: _Pairs, pose: Pose) -> Tensor:
-    """Jacobian of the algebraic errors by the tangent of ``retract``; the last row holds the errors, (B, 7, 2N)."""
+    """Rows (see the module) of the algebraic errors and their derivatives by the tangent of ``retract``, (B, 7, 2N)."""
     u, v = pairs.plane.unbind(1)
     x, y, z = (pose.rotation @ pairs.world).unbind(1)  # (B, N) each
     tx, ty, tz = pose.translation[..., None].unbind(1)
     depth = z + tz
     one, zero = torch.ones_like(u), torch.zeros_like(u)
     rows = (
-        *(-u * y, -z - v * y, z + u * x, v * x, -y, x),  # by the rotation: the errors of u and of v in turn
+        *(-u * y, -z - v * y, z + u * x, v * x, -y, x),  # by the rotation: for each axis the errors of u, then of v
         *(one, zero, zero, one, -u, -v),  # by the translation
         *(x + tx - u * depth, y + ty - v * depth),
     )
@@ -224,10 +227,10 @@ def _step(pose: Pose, normal: Tensor) -> Pose:
 
 
 def _leave_one_out(rows: Tensor, inverse: Tensor, pairs: _Pairs, weights: Tensor) -> Tensor:
-    r"""Decrease of the cost when a pair leaves the fit, or increase when it enters, over its weight, (B, N).
+    r"""Change of the cost when a kept pair is removed or a rejected pair is added, divided by its weight, (B, N).
 
-    The value is :math:`e^\top (1 \mp w H)^{-1} e`, minus for the kept pairs, with the two errors of a pair and the
-    leverage :math:`H`, which follows from the rows and the inverse normal matrix.
+    The value is :math:`e^\top (1 \mp w H)^{-1} e` with the two errors :math:`e` of a pair and the leverage :math:`H`,
+    which follows from ``rows`` and the inverse normal matrix. The sign is minus for kept pairs, else plus.
     """
     jacobian, count = rows[:, :-1], weights.shape[-1]
     solved = inverse @ jacobian

@@ -1,6 +1,6 @@
 r"""Samples of RANSAC: which subsets of the pairs are drawn, and how many samples suffice.
 
-Problems share only the random numbers: a problem has the same samples alone and at any place in any batch.
+Problems share only the random numbers. The samples of a problem do not depend on the rest of the batch.
 """
 
 from __future__ import annotations
@@ -18,42 +18,40 @@ from kornia_pnpnet.core.performance import present_first
 
 __all__ = ["Samples", "agreement_of_neighbours", "draw", "kept_at_once", "samples_needed"]
 
-# Nearest neighbours of a pair that are compared.
+# Number of nearest neighbours of a pair that are compared.
 _NEIGHBOURS = 16
-# Of more pairs than this, as many spread over all pairs are compared, so that the cost is linear. A power of two.
+# Largest number of pairs, spread evenly over all pairs, among which neighbours are searched. The bound makes the cost
+# linear in the number of pairs. The number must be a power of two.
 _CANDIDATES = 512
 # The bits of an infinite float32.
 _INFINITE = 0x7F800000
-# Numbers of a block of distances, so that a processor's cache holds it.
+# Number of distances in a block that a core's cache holds.
 _BLOCK = 2**18
 
 
 def kept_at_once(count: int, like: Tensor) -> int:
-    """How much is computed at once: ``count``, what the caches of a CPU's core hold, or 64 times as much elsewhere.
-
-    A graphics processor is slow at many small operations, and its memory holds more.
-    """
+    """Size of a block that is computed at once: ``count`` on a CPU, to fit a core's caches; 64 times more elsewhere."""
     return count if like.device.type == "cpu" else 64 * count
 
 
 def draw(numbers: Tensor, upper: Tensor) -> Tensor:
-    """Draw subsets of items one by one without replacement.
+    """Draw subsets of items without replacement.
 
-    Items of probability 0 are drawn only where there are too few others.
+    Items of probability 0 are drawn only when a subset needs more items than have a positive probability.
 
     Args:
-        numbers: uniform in [0, 1), float64, shape (H, s).
+        numbers: random numbers, uniform in [0, 1), float64, shape (H, s).
         upper: cumulative probabilities of the items of each problem, float64, shape (P, N).
 
     Returns:
         Positions of the items, shape (P, H, s).
     """
     lower = torch.cat((torch.zeros_like(upper[:, :1]), upper[:, :-1]), 1)
-    chosen: list[tuple[Tensor, Tensor]] = []  # where the interval of an item begins, and its length, ascending
+    chosen: list[tuple[Tensor, Tensor]] = []  # starts and lengths of the intervals of drawn items, ascending
     items = []
     left = torch.ones_like(upper[:, :1])
     for number in numbers.unbind(-1):
-        at = number * left  # (P, H), among the intervals that are left
+        at = number * left  # (P, H), position in the concatenation of the remaining intervals
         for begin, length in chosen:
             at = at + torch.where(at >= begin, length, 0.0)
         item = torch.searchsorted(upper, at, right=True).clamp(max=upper.shape[1] - 1)
@@ -69,15 +67,16 @@ def draw(numbers: Tensor, upper: Tensor) -> Tensor:
 
 
 def agreement_of_neighbours(world_points: Tensor, img_points: Tensor, there: Tensor) -> Tensor:
-    r"""How well the neighbours of each pair in the image agree with those in the world, (B, N), at least 0.
+    r"""Agreement of each pair's nearest neighbours in the image with its nearest neighbours in the world, (B, N).
 
-    What is seen side by side mostly lies side by side, so that inliers share neighbours; outliers share them by chance.
-    A pair that is the :math:`a`-th nearest in the image and the :math:`b`-th nearest in the world, counted from 0 and
-    both among 16, counts :math:`1 / (1 + \max(a, b))`. Pairs with the same pixel or the same point do not count: one
-    wrong match that is made many times looks like this.
+    Points that are neighbours in the image are mostly neighbours in the world. Inliers therefore have common neighbours
+    in both, whereas outliers have common neighbours only by chance. A neighbour that is the :math:`a`-th nearest in the
+    image and the :math:`b`-th nearest in the world, counted from 0, adds :math:`1 / (1 + \max(a, b))` to the agreement.
+    Only the 16 nearest neighbours are compared. Pairs with the same pixel or the same point are ignored, because they
+    often repeat one incorrect match.
 
-    Source: the idea is that of J. Bian et al., "GMS: Grid-based motion statistics for fast, ultra-robust feature
-    correspondence", CVPR 2017, for matches between two images.
+    Source: J. Bian et al., "GMS: Grid-based motion statistics for fast, ultra-robust feature correspondence", CVPR 2017
+    (the idea, for matches between two images).
 
     Args:
         world_points: shape :math:`(B, N, 3)`.
@@ -101,7 +100,8 @@ def agreement_of_neighbours(world_points: Tensor, img_points: Tensor, there: Ten
             for x in (world_points, img_points)
         ]  # exactly 0 between equal points
         no = (both[0] == 0).logical_or_(both[1] == 0).logical_or_(absent[some])
-        # Distances as integers with the number of the pair in the last digits: they ascend alike, and differ.
+        # Bits of positive floats, read as integers, have the order of the floats. The index of the neighbour replaces
+        # the last bits, so that no two keys are equal.
         keys = [x.masked_fill_(no, torch.inf).view(torch.int32).bitwise_and_(-_CANDIDATES) for x in both]
         near, seen = (x.bitwise_or_(order).topk(len(rank), largest=False).values for x in keys)
         common = (near[..., :, None] & (_CANDIDATES - 1)) == (seen[..., None, :] & (_CANDIDATES - 1))
@@ -113,7 +113,7 @@ def agreement_of_neighbours(world_points: Tensor, img_points: Tensor, there: Ten
 class Samples:
     """The samples that RANSAC tries, for every problem of a batch.
 
-    When a problem has at most ``most`` subsets of its pairs, each subset is a sample once, in random order. Otherwise
+    If the pairs of a problem have at most ``most`` subsets, each subset is one sample, in random order. Otherwise
     ``most`` samples are drawn.
 
     Args:
@@ -121,7 +121,7 @@ class Samples:
         size: number of pairs in a sample.
         most: largest number of samples.
         seed: seed of the random numbers, which are the same for every problem.
-        chances: pairs are drawn in proportion to these numbers, at least 0, (B, N); ``None``: all equally likely.
+        chances: relative chances of the pairs to be drawn, at least 0, (B, N); ``None``: equal chances.
 
     Attributes:
         counts: number of pairs that have a weight, (B,).
@@ -153,9 +153,9 @@ class Samples:
         self._upper = self._share.gather(1, self._order).cumsum(-1)
 
     def positions(self, problems: Tensor, start: int, stop: int) -> Tensor:
-        """Positions of the pairs of the samples ``start`` to ``stop - 1`` of some problems (P,), (P, H, s).
+        """Positions (P, H, s) of the pairs in the samples ``start`` to ``stop - 1`` of some problems (P,).
 
-        Samples after the last one of a problem repeat others.
+        If all subsets of a problem are listed, the first samples are repeated after the last sample.
         """
         listed = torch.arange(start, stop, device=problems.device) % self.totals[problems, None]
         ranks = self._tables[self._kinds[problems, None], listed.clamp(max=self._tables.shape[1] - 1)]
@@ -167,8 +167,8 @@ class Samples:
     def needed(self, problems: Tensor, inliers: Tensor, confidence: float) -> Tensor:
         """:func:`samples_needed` of some problems (P,) with the inliers (P, N) of their best poses so far.
 
-        Where pairs are unequally likely, the formula reads an effective number of pairs: one over the mean share of an
-        inlier. The mean is weighted by the share.
+        The chances of a problem are scaled to the sum 1. If pairs have unequal chances, an effective number replaces
+        the number of pairs: the inverse of the mean chance of the inliers, with the chances themselves as weights.
         """
         share = torch.where(inliers, self._share[problems], 0.0)
         mass = share.sum(-1)
@@ -178,8 +178,8 @@ class Samples:
     def spread(self, problems: Tensor, count: int) -> Tensor:
         """Positions of ``count`` pairs spread evenly over the pairs that have a weight, (P, count).
 
-        :class:`~kornia_pnpnet.frame.Normalize` orders pairs by their pixels: these are spread over the image. Where
-        pairs are unequally likely, likely ones come more often.
+        The selected pairs are spread over the image, because :class:`~kornia_pnpnet.frame.Normalize` orders pairs by
+        their pixels. Pairs with larger chances are selected more often.
         """
         at = (torch.arange(count, dtype=torch.float64, device=problems.device) + 0.5) / count
         ranks = torch.searchsorted(self._upper[problems], at.expand(len(problems), -1).contiguous(), right=True)
@@ -192,7 +192,7 @@ class Samples:
 
 @lru_cache(maxsize=64)
 def _random_numbers(size: int, most: int, seed: int) -> Tensor:
-    """Uniform numbers in [0, 1), (most, size), on the CPU. NumPy's: ``torch.func.jacfwd`` refuses those of PyTorch."""
+    """Uniform numbers (most, size) on the CPU, from NumPy: ``torch.func.jacfwd`` rejects PyTorch's random functions."""
     return torch.from_numpy(np.random.default_rng(seed).random((most, size)))
 
 
@@ -204,10 +204,16 @@ def _subsets(count: int, size: int, seed: int) -> Tensor:
 
 
 def samples_needed(inliers: Tensor, counts: Tensor, size: int, confidence: float) -> Tensor:
-    r"""Number of samples of which at least one has no outlier with the confidence :math:`p`, float64 (B,).
+    r"""Number of samples for which at least one sample has no outlier with the probability :math:`p`, float64 (B,).
 
-    It is :math:`\log(1-p) / \log(1-w)` with the share :math:`w = \binom{k}{s} / \binom{c}{s}` of samples of :math:`s`
-    pairs without an outlier, of :math:`k` inliers (B,), whole or not, of :math:`c` pairs (B,).
+    The number is :math:`\log(1-p) / \log(1-w)`, where :math:`w = \binom{k}{s} / \binom{c}{s}` is the share of samples
+    without an outlier.
+
+    Args:
+        inliers: number :math:`k` of inliers, not necessarily an integer, shape (B,).
+        counts: number :math:`c` of pairs, not necessarily an integer, shape (B,).
+        size: number :math:`s` of pairs in a sample.
+        confidence: the probability :math:`p`.
 
     Source: M. Fischler and R. Bolles, "Random sample consensus", Communications of the ACM 24(6), 1981, section II.B.
 

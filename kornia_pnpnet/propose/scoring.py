@@ -1,8 +1,9 @@
-r"""Scores of thousands of poses per problem at once, and the rules that turn residuals into losses.
+r"""Losses of thousands of poses per problem at once, and the functions that map residuals to losses.
 
-A new scoring rule is one entry of :data:`SCORERS`. The *standardised* squared residual :math:`e` of a pair is its
-squared residual over the squared threshold, see :mod:`kornia_pnpnet.judge.inliers`. With both multiplied by
-:math:`(z/f)^2` there is no division by the depth, and one matrix product projects all points at all poses:
+A new loss function is one entry of :data:`SCORERS`. The *standardised* squared residual :math:`e` of a pair is the
+ratio of its squared residual and the squared threshold, see :mod:`kornia_pnpnet.judge.inliers`. Here numerator and
+denominator are multiplied by :math:`(z/f)^2`, so that there is no division by the depth. One matrix product then
+projects all points at all poses:
 
 .. math:: e = \frac{(x - z\,b_u/f)^2 + (y - z\,b_v/f)^2}{(z \tau / f)^2 + \omega^2}
 """
@@ -27,7 +28,7 @@ __all__ = ["SCORERS", "Scene", "Scorer", "as_entries", "as_pose"]
 #: Maps standardised squared residuals of any shape to losses of the pairs.
 Scorer: TypeAlias = Callable[[Tensor], Tensor]
 
-# Added to the squared distance per unit of negative depth: points behind the camera then exceed MAX_ERROR.
+# Increase of the squared distance per unit of negative depth, by which points behind the camera exceed MAX_ERROR.
 _BEHIND = 1e15
 
 
@@ -41,12 +42,12 @@ def _outliers(error: Tensor) -> Tensor:
     return (error >= 1.0).to(error.dtype)
 
 
-#: Losses of a pair by name, 1 from the threshold on. Functions, not lambdas: a solver can then be pickled.
+#: Loss functions of a pair by name. A residual at or above the threshold has the loss 1. Lambdas could not be pickled.
 SCORERS: dict[str, Scorer] = {"msac": _truncated, "inliers": _outliers}
 
 
 def as_pose(entries: Tensor) -> Pose:
-    """Poses from the entries of the matrices [R | t] by rows, shape (*, 12)."""
+    """Poses from the entries (*, 12) of the matrices [R | t], in row-major order."""
     matrix = entries.unflatten(-1, (3, 4))
     return Pose(matrix[..., :3], matrix[..., 3])
 
@@ -57,14 +58,14 @@ def as_entries(pose: Pose) -> Tensor:
 
 
 class Scene(NamedTuple):
-    r"""The pairs of some problems in the form that scoring reads.
+    r"""The pairs of some problems in the form that scoring requires.
 
     Attributes:
-        rows: coefficients of :math:`x - z\,b_u/f`, :math:`y - z\,b_v/f` and :math:`z \tau / f` in the twelve entries of
-            a pose, and a constant, shape :math:`(P, 3, N, 13)`.
+        rows: :math:`x - z\,b_u/f`, :math:`y - z\,b_v/f` and :math:`z \tau / f` as linear functions of a pose: twelve
+            coefficients of its entries (see :func:`as_pose`) and a constant, shape :math:`(P, 3, N, 13)`.
         weights: weights of the pairs, shape :math:`(P, 1, N)`.
-        sq_world: :math:`\omega^2`, shape :math:`(P, 1, 1)`.
-        prior: what is known of the poses besides the pairs.
+        sq_world: :math:`\omega^2`, shape :math:`(P, 1, 1)` or :math:`(P, N, 1)`.
+        prior: prior of the poses; ``None``: no prior.
     """
 
     rows: Tensor
@@ -74,7 +75,7 @@ class Scene(NamedTuple):
 
     @classmethod
     def of(cls, problem: Problem, thresholds: Thresholds, dtype: torch.dtype) -> Scene:
-        """Bring problems to this form, in a dtype that suffices to compare poses."""
+        """Convert problems to a scene, in a dtype that is precise enough to compare poses."""
         if problem.rig is None:
             eye = torch.eye(3, 4, dtype=problem.weights.dtype, device=problem.weights.device)
             first, second, third = eye.expand(1, 1, 3, 4).unbind(2)
@@ -88,28 +89,29 @@ class Scene(NamedTuple):
         scene = cls(
             torch.cat((products.flatten(-2), camera[..., 3:]), -1),
             problem.weights[:, None],
-            thresholds.world.square()[..., None] + torch.finfo(dtype).tiny,  # avoids 0/0 in the camera's centre
+            thresholds.world.square()[..., None] + torch.finfo(dtype).tiny,  # avoids 0/0 at the camera centre
             problem.prior,
         )
         return map_tensors(lambda x: x.to(dtype), scene)
 
     def pairs(self, positions: Tensor) -> Scene:
-        """Select pairs of each problem, :math:`(P, n)`."""
+        """Select pairs by their positions in each problem, :math:`(P, n)`."""
         rows = self.rows.gather(2, positions[:, None, :, None].expand(-1, 3, -1, 13))
         return self._replace(rows=rows, weights=self.weights.gather(2, positions[:, None]))
 
     def losses(self, poses: Tensor, scorer: Scorer) -> Tensor:
-        """Weighted sums (P, H) of the losses of pairs and prior at poses (P, 12, H), see :func:`as_pose`."""
+        """Losses (P, H) of poses (P, 12, H): the weighted sum of the losses of the pairs, plus that of the prior."""
         losses = (self.weights @ scorer(self.errors(poses)))[:, 0]
         if self.prior is None:
             return losses
-        prior = map_tensors(lambda x: x[:, None], self.prior)  # for each of H poses
+        prior = map_tensors(lambda x: x[:, None], self.prior)  # broadcasts over H poses
         return losses + prior.disagreement(as_pose(poses.mT))
 
     def errors(self, poses: Tensor) -> Tensor:
-        """The standardised squared residual of every pair at every pose (P, 12, H): (P, N, H), at most MAX_ERROR.
+        """Standardised squared residuals (P, N, H), at most MAX_ERROR, of every pair at every pose (P, 12, H).
 
-        There is no mask: comparing and selecting would take longer than all the arithmetic, which is in place.
+        Points behind the camera are not masked but get a large residual, because a mask would take longer than the
+        arithmetic.
         """
         rows = self.rows.flatten(1, 2)
         x, y, z = torch.baddbmm(rows[..., 12:], rows[..., :12], poses).unflatten(1, self.rows.shape[1:3]).unbind(1)

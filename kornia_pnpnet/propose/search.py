@@ -1,4 +1,4 @@
-r"""The one search of all samplers: solve minimal samples, score their poses, improve the best ones on their inliers."""
+r"""The search of RANSAC: solve minimal samples, score their poses, and improve the best poses on their inliers."""
 
 from __future__ import annotations
 
@@ -28,42 +28,46 @@ __all__ = ["CAUCHY", "Plan", "Search", "cauchy_scale", "least_squares"]
 #: Scale of the Cauchy kernel in standard deviations.
 CAUCHY = 3.4
 
-# Poses are compared and improved in this precision, which resolves 1e-4 px at the protocol's focal length of 3400 px.
+# Precision in which poses are compared and improved. It resolves 1e-4 px at the protocol's focal length of 3400 px.
 _DTYPE = torch.float32
-# Number of samples that are solved and scored together: a core's caches hold their tensors.
+# Largest number of samples that are solved and scored together, so that a core's caches hold the tensors.
 _SAMPLES_AT_ONCE = 4096
-# Number of pairs that score all poses of a round first, see `_rank`: at least the first, and the second times the cube
-# root of the number of samples before. After k samples in vain at a confidence of 0.999 the share of the inliers is
-# below (7 / k)^(1/3); of 3 over that share, one is an inlier with a probability of 95 %.
+# Number of pairs that score all poses of a round first, see `Search._round`: the maximum of the first number and of the
+# second number times the cube root of the number k of samples drawn before. If k samples did not suffice for a
+# confidence of 0.999, the share w of inliers is below (7 / k)^(1/3). Among 3 / w pairs at least one is an inlier with a
+# probability of 95 %.
 _FIRST_PAIRS, _PAIRS_BY_SAMPLES = 24, 3.0 / 7.0 ** (1 / 3)
-# Between two rankings the number of poses is divided by the first, the number of pairs that score multiplied by the
-# second. With more than 90 % outliers the few pairs that score first have hardly an inlier: more must be kept.
+# After each scoring of a round the number of poses is divided by the first number, and the number of pairs that score
+# is multiplied by the second. Half of the poses are kept, because with 90 % outliers the first pairs have few inliers.
 _KEPT_ONE_IN, _MORE = 2, 4
-# Number of best poses of a round that are improved once; the best of them is then improved again.
+# Number of best poses of a round that are improved. The best improved pose is then improved again.
 _IMPROVED = 3
-# Each round draws at least this fraction of the samples before it. More: fewer rounds, but more needless samples.
+# Number of samples in a round relative to the number of samples drawn before. A larger ratio reduces the number of
+# rounds, but draws more samples than necessary.
 _GROWTH = 0.5
-# Where no more rounds than these are left, one round draws them all.
+# If the remaining samples would take at most this number of rounds, one round draws all of them.
 _FEW_LEFT = 2.0
-# Number of samples that are solved at once, up to multiples: twice the numbers in the longest vector of a processor.
+# The number of samples that are solved at once is a multiple of this number, so that they fill a processor's vectors.
 _VECTOR = 64
-# Relative damping of least squares: next to none, since the start is close to the minimum.
+# Relative damping of least squares, nearly 0 because the start is close to the minimum.
 _DAMPING = 1e-6
-# Thresholds. The first least squares use the pairs up to the first limit: the pose of a noisy sample misses some
-# inliers.
+# Thresholds of an inlier. Largest residuals of the pairs in the first and in the second least-squares step. The first
+# limit is larger, because inliers have larger residuals at the pose of a noisy sample.
 _LIMITS = 3.0, 1.0
-# Where the inliers leave the rotation open by more than the first (standard deviation in radians), as those of a flat
-# scene in a narrow field of view do, another pose may have as many: at least the second number of samples is drawn.
-# Chosen on a scene with a field of view of 13 degrees; half of the angle takes twice the time at 9 pairs.
+# At least the second number of samples is drawn when the standard deviation of the rotation exceeds the first number
+# (radians), as for a flat scene in a narrow field of view. Another pose may then have as many inliers as the correct
+# pose. Chosen on a scene with a field of view of 13 degrees. With half of the first number, problems of 9 pairs take
+# twice the time.
 _OPEN, _OPEN_SAMPLES = 0.008, 256.0
-# After this number of samples, pairs whose neighbours agree are drawn more often. Finding these takes about as long.
+# After this number of samples, pairs whose neighbours agree are drawn more often (see `agreement_of_neighbours`). To
+# compute the agreement takes about as long as these samples.
 _PLAIN_SAMPLES = 256
-# A pair without any agreement is drawn this often, relative to one unit of agreement; the exponent is empirical.
+# The chance of a pair is multiplied by (first number + agreement) to the power of the second number. Empirical values.
 _LEAST_AGREEMENT, _AGREEMENT_POWER = 0.3, 1.5
 
 
 class Plan(Protocol):
-    """Options of a search, see the arguments of :class:`~kornia_pnpnet.propose.ransac.RANSAC`."""
+    """Options of a search. The arguments of :class:`~kornia_pnpnet.propose.ransac.RANSAC` describe them."""
 
     minimal: MinimalSolver
     score: Scorer
@@ -76,22 +80,23 @@ class Plan(Protocol):
 class Search:
     r"""One search for the best poses of a batch, without gradients.
 
-    A pose is twelve entries of :math:`[R | t]` by rows, see :func:`~kornia_pnpnet.propose.scoring.as_pose`. Its last
-    row is divided by the zoom of an unknown focal length.
+    A pose is stored as the twelve entries of :math:`[R | t]`, see :func:`~kornia_pnpnet.propose.scoring.as_pose`. If
+    the focal length is unknown, the last row of the matrix is divided by the ratio of its estimate to the focal length
+    of the problem.
 
     Args:
         plan: options of the search.
-        problem: the problems; their world is centred, since the search runs in float32.
+        problem: problems in a centred world, because the search computes in float32.
         thresholds: thresholds of an inlier.
-        chances: how likely a pair is an inlier, up to a factor, shape :math:`(B, N)`; all the same when ``None``.
-        sigma: standard deviation of the pixels, shape :math:`(B, 1)` or :math:`(B, N)`; as the residuals of the inliers
-            show it when ``None``.
+        chances: relative probabilities of the pairs to be inliers, shape :math:`(B, N)`; ``None``: equal probabilities.
+        sigma: standard deviation of the pixels, shape :math:`(B, 1)` or :math:`(B, N)`; ``None``: estimated from the
+            residuals of the inliers.
 
     Attributes:
         poses: the best pose of each problem, shape :math:`(B, 12)`.
-        loss: its loss, infinite where there is no pose, shape :math:`(B,)`.
-        scored: number of poses that were scored, int64, shape :math:`(B,)`.
-        drawn: number of samples that were drawn, int64, shape :math:`(B,)`.
+        loss: loss of the best pose, infinite for a problem without a pose, shape :math:`(B,)`.
+        scored: number of scored poses, int64, shape :math:`(B,)`.
+        drawn: number of drawn samples, int64, shape :math:`(B,)`.
 
     Example:
         >>> from kornia_pnpnet.propose.p3p import P3P
@@ -116,13 +121,13 @@ class Search:
         self.plan, self.problem = plan, problem
         self.chances = torch.ones_like(problem.weights) if chances is None else chances
         self.minimal = plan.minimal
-        if problem.rig is not None:  # the rays of bearings meet in one centre
+        if problem.rig is not None:  # all rays of bearings start at one centre
             central = sees_values(problem.weights) and not bool(problem.rig.translation.any())
             self.minimal = P3PRig(0 if central else 8)
         self.thresholds, sigma = map_tensors(lambda x: x.to(_DTYPE), (thresholds, sigma))
         self.sigma = None if sigma is None else sigma.expand_as(problem.weights)
         self.scene = Scene.of(problem, self.thresholds, _DTYPE)
-        # The numbers of each pair side by side, so that pairs are selected at once: (B, N, 6), in a rig (B, N, 18).
+        # All numbers of a pair are adjacent, so that one operation selects pairs: (B, N, 6), of a rig (B, N, 18).
         rig = [] if problem.rig is None else [problem.rig.rotation.flatten(2), problem.rig.translation]
         self.pairs = torch.cat((problem.world_points, problem.img_points, problem.weights[..., None], *rig), -1)
         self.low = self.pairs.to(_DTYPE)
@@ -134,19 +139,20 @@ class Search:
 
     @property
     def state(self) -> State:
-        """The best poses as rotations without rounding errors, and zooms, in the dtype of the problem."""
+        """The best poses and zooms in the dtype of the problem. Rotations are orthogonal up to rounding."""
         pose, camera = self._state(self.poses.to(self.problem.weights))
-        # Newton's step for the polar factor doubles the number of correct digits.
+        # A Newton step for the polar factor doubles the number of correct digits.
         rotation = 1.5 * pose.rotation - 0.5 * pose.rotation @ (pose.rotation.mT @ pose.rotation)
         return State(Pose(rotation, pose.translation), camera)
 
     def run(self, given: Pose | None = None, enough: int = 0) -> None:
-        """Search until every problem has a sample without an outlier at the confidence, or all its samples.
+        """Search until the drawn samples of each problem reach the confidence of the plan, or all samples are drawn.
 
         Args:
-            given: :math:`S` poses of each problem that compete with those of the samples, :math:`(B, S, 3, 3)` and
+            given: :math:`S` poses of each problem that compete with the poses of the samples, :math:`(B, S, 3, 3)` and
                 :math:`(B, S, 3)`, in the frame of the problem.
-            enough: a problem whose given poses show that it needs no more samples than this is not searched.
+            enough: number of samples. A problem is not searched if it needs at most this number of samples by the
+                inliers of its given poses.
         """
         self.samples = self.plain = self._samples(self.chances)
         totals = self.samples.totals
@@ -178,11 +184,11 @@ class Search:
             active = active[self.needed[active].clamp(min=self.plan.min_samples) > stop]
 
     def run_once(self, positions: Tensor, judges: Tensor) -> None:
-        """Search in one round of given samples, in which no size depends on values: as in a graph.
+        """Search in one round of given samples. No size depends on values, so that graphs can contain this method.
 
         Args:
-            positions: positions of the pairs of the samples, shape :math:`(B, H, s)`.
-            judges: positions of the pairs that score all poses, shape :math:`(B, J)`; a negative one does not count.
+            positions: positions of the pairs in the samples, shape :math:`(B, H, s)`.
+            judges: positions of the pairs that score all poses, shape :math:`(B, J)`; negative positions are ignored.
         """
         problems = torch.arange(positions.shape[0], device=positions.device)
         poses, valid = self._solved(problems, positions)
@@ -193,7 +199,7 @@ class Search:
         self.loss, self.poses = self._improved(problems, losses, poses)
 
     def _state(self, poses: Tensor) -> State:
-        """Poses (R, 12) and their zoom."""
+        """Separate poses and zooms from the entries (R, 12)."""
         if self.problem.free_focal is None:
             return State.of(as_pose(poses))
         first, last = poses.split((8, 4), 1)
@@ -201,7 +207,7 @@ class Search:
         return State(as_pose(torch.cat((first, last / scale), 1)), -scale.log())
 
     def _unpacked(self, values: Tensor, owners: Tensor) -> Problem:
-        """Pairs of :math:`P` problems, whose numbers are side by side, (C, n, P), of some of the problems (P,)."""
+        """Problems of n pairs, from numbers of the pairs (C, n, P) and indices ``owners`` (P,) in the batch."""
         scales, free = take(((self.problem.img_scale, self.problem.world_scale), self.problem.free_focal), owners)
         scales, free, focal = map_tensors(lambda x: x.to(values), (scales, free, self.problem.focal))
         values = values.permute(2, 1, 0)
@@ -211,7 +217,7 @@ class Search:
         return Problem(values[..., :3], values[..., 3:5], weights, focal, *scales, usual, rig=rig, free_focal=free)
 
     def _projected(self, rows: Tensor, poses: Tensor) -> tuple[Problem, Thresholds, Projection]:
-        """Some problems, their thresholds, and their points at poses (R, 12), in the precision of the search."""
+        """The problems at ``rows`` (R,), their thresholds, and their projections at poses (R, 12), in float32."""
         problem = self._unpacked(self.low[rows].permute(2, 1, 0).contiguous(), rows)
         return problem, take(self.thresholds, rows), project(self._state(poses), problem)
 
@@ -220,7 +226,7 @@ class Search:
         return Samples(there, size=self.minimal.sample_size, most=plan.max_samples, seed=plan.seed, chances=chances)
 
     def _prefer_agreement(self, problems: Tensor) -> None:
-        """From now on draw the pairs of some problems in proportion to the agreement of their neighbours, too."""
+        """Multiply the chances of the pairs of some problems by the agreement of their neighbours."""
         world, img, weights = take(self.problem[:3], problems)
         agreement = agreement_of_neighbours(world, img, weights > 0)
         chances = self.chances.clone()
@@ -228,10 +234,10 @@ class Search:
         self.samples = self._samples(chances)
 
     def _expect(self, at: Tensor) -> None:
-        """Find how many samples some problems need, by the inliers of their best poses.
+        """Estimate the number of samples that some problems need, by the inliers of their best poses.
 
-        Once agreement was counted, it is the geometric mean of the numbers with and without agreement. Neighbours also
-        agree where structure repeats: such a wrong pose must not end the search too early.
+        After `_prefer_agreement` the result is the geometric mean of two estimates, with and without agreement. With
+        agreement alone, an incorrect pose on repeated structure, where neighbours agree, could end the search early.
         """
         if not len(at):
             return
@@ -250,15 +256,15 @@ class Search:
         self.needed[at] = needed
 
     def _end_of_round(self, done: int, total: int) -> int:
-        """Number of samples after the next round; few that would be left go with it."""
+        """Number of samples after the next round; the round includes the remaining samples if there are few."""
         size = min(max(self.plan.min_samples, int(_GROWTH * done)), _SAMPLES_AT_ONCE)
         return total if done + size * _FEW_LEFT >= total and total - done <= _SAMPLES_AT_ONCE else done + size
 
     def _round(self, problems: Tensor, start: int, stop: int) -> tuple[Tensor, Tensor]:
-        """Losses (P, K), ascending, and poses (P, 12, K) of the best of some samples.
+        """Losses (P, K), ascending, and poses (P, 12, K): the best poses of the samples ``start`` to ``stop - 1``.
 
-        Of many pairs, a few score all poses first, then more pairs the best poses. After many samples in vain the share
-        of the inliers is small, and more pairs are needed to see one of them.
+        If a problem has many pairs, a few pairs score all poses first, and more pairs then score the best poses. The
+        number of pairs increases with ``start``: after many samples without success the share of inliers is small.
         """
         poses, valid = self._solved(problems, self.samples.positions(problems, start, stop), start)
         scene, width = take(self.scene, problems), poses.shape[-1]
@@ -270,9 +276,10 @@ class Search:
         return self._best_of(scene, poses, valid, _IMPROVED)[:2]
 
     def _solved(self, problems: Tensor, positions: Tensor, start: int | None = None) -> tuple[Tensor, Tensor]:
-        """Poses (P, 12, W) of some problems' samples (P, H, s), and which of them are solutions, (P, W).
+        """Poses (P, 12, W) of the samples (P, H, s) of some problems, and which poses are solutions, (P, W).
 
-        With ``start``, the number of the first sample, only solutions of samples that count are returned, and counted.
+        Given ``start``, the index of the first sample, samples after the last sample of a problem are ignored. Only
+        solutions are then returned, and ``scored`` is increased by their number.
         """
         batch, count, size = positions.shape
         rows = full_vectors((positions + problems[:, None, None] * self.pairs.shape[1]).flatten(0, 1))  # (R, s)
@@ -280,7 +287,8 @@ class Search:
         owners = full_vectors(problems.repeat_interleave(count))
         pose, valid = self.minimal.hypotheses(self._unpacked(values.permute(2, 1, 0), owners))
         valid = valid[: batch * count].unflatten(0, (batch, count)).mT  # (P, S, H)
-        # The components of a pose come first, as in p3p's results: each is selected from contiguous memory.
+        # The components of a pose are the first dimension, as in the memory of p3p's result, so that each component is
+        # selected from contiguous memory.
         pose = map_tensors(lambda x: x.movedim((0, 1), (-1, -2)), pose)
         poses = torch.cat((pose.rotation, pose.translation[:, None]), 1).flatten(0, 1).to(_DTYPE)  # (12, S, R)
         if start is None:
@@ -289,7 +297,7 @@ class Search:
         valid = (valid & (numbers < self.samples.totals[problems, None])[:, None]).flatten(1)
         found = valid.sum(1)
         self.scored[problems] += found
-        # The width is as small as the largest number of a problem allows, and fills a processor's vectors.
+        # The width is the largest number of solutions of a problem, rounded up to full vectors of a processor.
         width = max(1, -(-int(found.max()) // _VECTOR)) * _VECTOR
         at = present_first(functional.pad(valid, (0, width)))[:, :width]
         valid = torch.arange(width, device=at.device) < found[:, None]
@@ -298,15 +306,15 @@ class Search:
         return poses.flatten(1).index_select(1, at.flatten()).unflatten(1, at.shape).movedim(1, 0), valid
 
     def _best_of(self, judges: Scene, poses: Tensor, valid: Tensor, width: int) -> tuple[Tensor, Tensor, Tensor]:
-        """The poses with the smallest losses, ascending: losses (P, K), poses (P, 12, K), valid (P, K)."""
+        """Losses (P, K), ascending, poses (P, 12, K) and validity (P, K) of the poses with the smallest losses."""
         losses = judges.losses(poses, self.plan.score).masked_fill(~valid, torch.inf)
         losses, order = losses.topk(min(width, losses.shape[1]), largest=False)
         return losses, poses.gather(2, order[:, None].expand(-1, 12, -1)), valid.gather(1, order)
 
     def _improved(self, problems: Tensor, losses: Tensor, poses: Tensor) -> tuple[Tensor, Tensor]:
-        """Improve the poses (P, 12, K) of some problems by least squares on their inliers, then the best again.
+        """Improve the poses (P, 12, K) of some problems by least squares on their inliers, then improve the best again.
 
-        Each of the two steps counts only where it lowers the loss; an invalid pose stays invalid. Returns losses (P,)
+        A step that does not lower the loss of a pose is undone. An invalid pose remains invalid. Returns losses (P,)
         and poses (P, 12).
         """
         number, pairs = problems.shape[0], self.low.shape[1]
@@ -329,16 +337,16 @@ class Search:
         return losses[:number, 0], poses[:number, :, 0]
 
     def _improve(self, problems: Tensor, losses: Tensor, poses: Tensor) -> None:
-        """Improve poses; the best becomes the pose of its problem."""
+        """Improve poses (P, 12, K), and store the best pose of each problem."""
         if len(problems):
             self.loss[problems], self.poses[problems] = self._improved(problems, losses, poses)
 
 
 def least_squares(problem: Problem, projection: Projection, weights: Tensor, variance: Tensor | None = None) -> State:
-    """Take one step of least squares with the weights (B, N) times the weights of the pairs.
+    """Take one least-squares step. The weight of a pair is ``weights`` (B, N) times its weight in the problem.
 
-    What is known of the camera is weighed against residuals with the variance (B, 1) of a pixel coordinate. By default
-    the standard deviation is one pixel of the caller.
+    A prior of the camera is weighed against the residuals by the ``variance`` (B, 1) of a pixel coordinate. By default
+    the standard deviation is one pixel of the caller's image.
     """
     weights = problem.weights * weights
     equations = normal_equations(projection, problem, weights)
@@ -351,21 +359,24 @@ def least_squares(problem: Problem, projection: Projection, weights: Tensor, var
 
 
 def cauchy_scale(sq_residuals: Tensor, there: Tensor, fitted: int = MIN_PAIRS) -> tuple[Tensor, Tensor]:
-    """Squared scale of a Cauchy kernel, by the median squared residual of some pairs (B, N), and their number, (B, 1).
+    """Squared scale of a Cauchy kernel, by the median squared residual, and the number of pairs, both (B, 1).
 
-    The argument ``fitted`` is the number of pairs that any state fits. Without any pair the scale is infinite.
+    Args:
+        sq_residuals: squared residuals, shape (B, N).
+        there: which pairs are used, bool, shape (B, N). For a problem without such pairs the scale is infinite.
+        fitted: number of pairs that every state fits exactly.
     """
     count = there.sum(-1, keepdim=True)
     middle = ((count + fitted) // 2).minimum(count - 1).clamp(min=0)
     median = torch.where(there, sq_residuals, torch.inf).sort(-1).values.gather(1, middle)
-    return CAUCHY**2 / (2.0 * math.log(2.0)) * median, count  # the median is in variances of a pixel coordinate
+    return CAUCHY**2 / (2.0 * math.log(2.0)) * median, count  # median / (2 log 2) is the variance of a coordinate
 
 
 def full_vectors(rows: Tensor, pairs: int = 1) -> Tensor:
-    """Repeat the first row at the end until the rows fill a processor's vectors; not where each has many pairs.
+    """Repeat the first row until the rows fill a processor's vectors, unless each row has many pairs.
 
-    Some arithmetic rounds differently in the remainder of the vectors. With full vectors a sample has the same poses at
-    any place in the batch. Sums over many pairs may round differently: there, more rows would take more time.
+    Some arithmetic rounds differently in a vector that is not full. With full vectors the poses of a sample do not
+    depend on its position in the batch. Rows with many pairs are not repeated, because this would take too much time.
     """
     if compiling() or pairs > _VECTOR:
         return rows

@@ -1,4 +1,4 @@
-"""A network over the set of pairs, for any number, order, world and camera: poses, weights and noise."""
+"""A network on a set of pairs, in any number and order, that estimates poses, weights and noise."""
 
 from __future__ import annotations
 
@@ -24,36 +24,38 @@ __all__ = ["SetInit"]
 
 _T = TypeVar("_T")
 
-# Numbers per pair: 3 of the world, 2 of the image, 2 of the residual, 3 of the problem, 2 of the noise, 2 flags.
-# Confidences add 2 numbers (logit and flag), and repeats 2 (pairs with the same pixel, and with the same point).
+# Number of features per pair: 3 of the world, 2 of the image, 2 of the residual, 3 of the problem, 2 of the noise, and
+# 2 flags. Confidences add 2 features (logit and flag). Repeats add 2 features, see `repeats`.
 _FEATURES = 14
-# Pairs. PyTorch 2.13 computes the softmax of shorter rows slowly.
+# Least number of pairs for a softmax over rows: PyTorch 2.13 is slow at shorter rows.
 _SHORT = 16
-# Added to the score of padding.
+# Number that is added to the attention score of padding.
 _ABSENT = -1e9
-# Minimal samples, as ranks of pairs by likelihood. The first six are a Turán system: whichever two of the six likeliest
-# pairs are outliers, one of the six samples has only inliers. No five samples have this property.
+# Minimal samples, as ranks of pairs by likelihood. The first six are a Turán system: if any two of the six likeliest
+# pairs are outliers, at least one of the six samples has only inliers. No five samples have this property.
 _SAMPLES = ((0, 1, 2), (0, 1, 3), (2, 3, 4), (2, 3, 5), (0, 4, 5), (1, 4, 5), (0, 2, 3), (1, 2, 3))
-# From 18, 24 and 30 pairs on, the same samples are drawn again with their ranks multiplied by 3, 4 and 5: they help
-# where the likeliest pairs are outliers that agree.
+# Problems of at least 18, 24 and 30 pairs have further samples: the same samples with their ranks multiplied by 3, 4
+# and 5. They help when the likeliest pairs are outliers that agree with each other.
 _SPREADS = ((18, 3), (24, 4), (30, 5))
-# From 36 pairs on, 25 further samples: each of the 25 likeliest pairs is in three of them, no two pairs meet twice.
+# Problems of at least 36 pairs have 25 further samples. Each of the 25 likeliest pairs is in three of these samples,
+# and no two pairs are together in two samples.
 _RING_FROM = 36
 _RING = [(a, b, c) for i in range(25) for a, b, c in [sorted((i, (i + 1) % 25, (i + 6) % 25))]]
 # Number of top-ranked pairs that score each hypothesis.
 _MOST_JUDGES = 32
 # Slots for poses of minimal samples. With more slots than this, empty slots are removed before scoring (CPU only).
 _MANY_SLOTS = 64
-# Variances. Squared residuals of this size halve the score of a pair.
+# Variances. A squared residual of this size halves the score of a pair.
 _JUDGED = 50.0
-# Normalised units: the least depth of the centre of the world in the variance of a pair.
+# Normalised units. Lower bound of the depth by which noise of the points is converted to pixels.
 _LEAST_DEPTH = 0.5
-# Score of a pair whose likelihood is 0, relative to a pair whose likelihood is 1.
+# Score of a pair with the likelihood 0, relative to a pair with the likelihood 1.
 _LEAST_VOTE = 0.5
-# Pairs. Before a search the network sees at most 48 pairs; the search uses all pairs. On real matches (the file
-# `raw/by_image.npz` that docs/results describe) and random ones of up to 1000 pairs, 32 to 96 succeed as often as all.
+# Number of pairs. Before a search the network sees at most 48 pairs; the search uses all pairs. On real matches
+# (`raw/by_image.npz`, see docs/results) and on random problems of up to 1000 pairs, a network that sees 32 to 96 pairs
+# succeeds as often as a network that sees all pairs.
 _ENOUGH = 48
-# Fractional parts of its multiples are spread evenly over the unit interval.
+# Golden ratio. The fractional parts of its multiples are spread evenly over the unit interval.
 _GOLDEN = 0.6180339887
 
 
@@ -70,10 +72,10 @@ def _taken(tree: _T, index: Tensor) -> _T:
 
 @torch.no_grad()
 def _some_of(present: Tensor, count: int) -> Tensor:
-    """Positions (B, count) of present pairs, evenly spread; of all present pairs where a problem has fewer.
+    """Positions (B, count) of evenly spread present pairs. Absent pairs follow if a problem has fewer present pairs.
 
-    Multiples of the golden ratio shift the positions, so that a pattern in the order of the pairs is not repeated. The
-    shifts are small enough that no position occurs twice.
+    Multiples of the golden ratio shift the positions, so that the selection does not follow a periodic pattern in the
+    order of the pairs. The shifts are small enough that no position occurs twice.
     """
     steps = torch.arange(count, dtype=torch.float64, device=present.device)
     total = present.sum(1, keepdim=True).clamp(min=count)
@@ -84,7 +86,7 @@ def _some_of(present: Tensor, count: int) -> Tensor:
 
 @torch.no_grad()
 def _agreement(problem: Problem, noise: Noise, pose: Pose) -> Tensor:
-    """How well each pair agrees with a pose, in [0, 1], (B, N)."""
+    """Agreement (B, N) of each pair with a pose, in [0, 1]; 0 behind the camera."""
     projection = project(State.of(pose), problems_last(problem))
     variance = _variance(noise, problem.focal, pose)
     agreement = 1.0 / (1.0 + projection.sq_residual / (_JUDGED * variance))
@@ -92,15 +94,15 @@ def _agreement(problem: Problem, noise: Noise, pose: Pose) -> Tensor:
 
 
 def _variance(noise: Noise, focal: Tensor, pose: Pose) -> Tensor:
-    """Variance of each pixel (B, N) when every point is as deep as the centre of the world."""
+    """Variance of each pixel (B, N), for all points at the depth of the centre of the world."""
     depth = pose.translation[:, 2:].clamp(min=_LEAST_DEPTH)
     return noise.img.square() + (focal * noise.world / depth).square()
 
 
 def _samples(count: int, number: int, search_follows: bool) -> list[tuple[int, tuple[int, int, int]]]:
-    """Minimal samples, each as three ranks of pairs, after the least number of pairs of a problem that uses it."""
+    """Minimal samples of up to ``count`` pairs: the least number of pairs of a problem with the sample, and 3 ranks."""
     likeliest = [(0, sample) for sample in _SAMPLES[:number] if max(sample) < count]
-    if search_follows:  # the search draws the others
+    if search_follows:  # the search draws further samples
         return likeliest
     spread = [(least, (f * i, f * j, f * k)) for least, f in _SPREADS for _, (i, j, k) in likeliest]
     ring = [(_RING_FROM, sample) for sample in _RING]
@@ -108,7 +110,7 @@ def _samples(count: int, number: int, search_follows: bool) -> list[tuple[int, t
 
 
 def _support(rotation: Tensor, translation: Tensor, judges: Tensor) -> Tensor:
-    """Scores (H, B) of poses (3, 3, H, B), (3, H, B) by pairs (7, K, B): points, plane points, votes, 1 / variances."""
+    """Scores (H, B) of rotations (3, 3, H, B) and translations (3, H, B) by the pairs (7, K, B)."""
     a, b, c, u, v, vote, precision = judges.unbind()  # (K, B) each
     points = torch.addcmul(translation[:, :, None], rotation[:, 0, :, None], a)  # (3, H, K, B)
     x, y, z = points.addcmul_(rotation[:, 1, :, None], b).addcmul_(rotation[:, 2, :, None], c).unbind()
@@ -121,7 +123,7 @@ def _support(rotation: Tensor, translation: Tensor, judges: Tensor) -> Tensor:
 
 
 class _Block(nn.Module):
-    """A residual layer on each pair and on a context: attention pools the context over all pairs."""
+    """A residual layer that maps each pair and a context. Attention pools the context over all pairs."""
 
     def __init__(self, width: int, heads: int, hidden: int) -> None:
         super().__init__()
@@ -140,10 +142,10 @@ class _Block(nn.Module):
         (batch, count), width, heads = absent.shape, x.shape[1], self.heads
         y = self.norm(x)
         values, scores = self.look.weight.split((width, heads))
-        # The scores need no bias: the softmax over pairs cancels it.
+        # The scores need no bias, because the softmax over pairs cancels a bias.
         attention = _attention(y, scores, absent).movedim(0, 1)  # (B, heads, N)
-        # The values are linear in y, so the mean of the values is the value of the mean: one product per problem and
-        # head is enough, instead of one per pair.
+        # The values are linear in y. The mean of the values is therefore the value of the mean of y, which needs one
+        # product per problem and head instead of one product per pair.
         means = torch.bmm(attention, y.view(batch, count, width)).movedim(1, 0)  # (heads, B, width)
         bias = self.look.bias[:width].view(heads, 1, -1)
         context = torch.baddbmm(bias, means, values.view(heads, -1, width).mT).movedim(0, 1).reshape(batch, width)
@@ -153,35 +155,35 @@ class _Block(nn.Module):
 
 
 def _attention(x: Tensor, weight: Tensor, absent: Tensor) -> Tensor:
-    """Softmax over the pairs, (C, B, N), of scores that are linear in x (B * N, width).
+    """Softmax (C, B, N) over the pairs, of scores that are linear in x (B * N, width).
 
-    The scores of a channel are contiguous in memory. Where rows are shorter than a processor's vectors, a softmax over
-    columns takes a tenth of the time.
+    If rows of pairs are shorter than a processor's vectors, the softmax is computed over columns, in a tenth of the
+    time.
     """
     scores = torch.addmm(absent.view(1, -1), weight, x.mT).view(weight.shape[0], *absent.shape)
     if compiling() or scores.shape[-1] >= _SHORT or are_few(scores):
         return scores.softmax(-1)
-    return scores.mT.contiguous().softmax(1).mT.contiguous()  # `bmm` takes other layouts row by row
+    return scores.mT.contiguous().softmax(1).mT.contiguous()  # `bmm` is slow with other layouts
 
 
 class SetInit(Initialiser):
-    r"""A small network over the set of pairs: several coarse poses, a weight for each pair, and the noise.
+    r"""A small network on a set of pairs that estimates several coarse poses, a weight for each pair, and the noise.
 
-    Residual layers see all pairs through pooled attention: the cost is linear in the number of pairs, and their order
-    does not matter. For each hypothesis the network predicts the distance of each point along its ray and a weight; the
-    pose is the rigid motion that moves the world points there. Poses are equivariant to similarity transforms of the
-    world and to rotations of the camera except its roll; intrinsics enter through the rays alone. The likeliest pairs
-    also form minimal samples of three (see :func:`~kornia_pnpnet.propose.p3p`). The best of their poses, scored by the
-    32 likeliest pairs, is one more hypothesis, without gradient.
+    In every residual layer, attention pools a context over all pairs. The cost is therefore linear in the number of
+    pairs, and the order of the pairs has no effect. For each hypothesis the network predicts a weight and a distance
+    along the ray for each point. The pose is the rigid motion that moves the world points to these distances. Poses are
+    equivariant to similarity transforms of the world, and to rotations of the camera except the roll. Intrinsics affect
+    only the rays. The likeliest pairs also form minimal samples of three (see :func:`~kornia_pnpnet.propose.p3p.p3p`).
+    The best pose of these samples, scored by the 32 likeliest pairs, is one more hypothesis, without gradient.
 
-    The weight of a pair is the estimated probability that it is an inlier. Where the noise of the problem is unknown,
-    the network estimates it; of a covariance the network sees the isotropic noise of the same trace. The network runs
-    in the dtype of its weights, everything around it in the dtype of the correspondences.
+    The weight of a pair is the estimated probability that the pair is an inlier. The network also estimates unknown
+    noise. In place of a covariance the network sees isotropic noise of the same trace. The layers compute in the dtype
+    of the network's weights, and all other operations use the dtype of the correspondences.
 
-    The design is ours. Distances along rays before a closed-form alignment: J. Hesch and S. Roumeliotis, "A direct
-    least-squares method for PnP", ICCV 2011; attention pooled over correspondences: W. Sun et al., "ACNe: Attentive
-    context normalization for robust permutation-equivariant learning", CVPR 2020; samples: P. Turán's problem for
-    (6, 4, 3), 1941.
+    The design is ours, with three ideas from the literature. Distances along rays before a closed-form alignment: J.
+    Hesch and S. Roumeliotis, "A direct least-squares method for PnP", ICCV 2011. Attention pooled over correspondences:
+    W. Sun et al., "ACNe: Attentive context normalization for robust permutation-equivariant learning", CVPR 2020.
+    Samples: P. Turán's problem for (6, 4, 3), 1941.
 
     Args:
         width: number of channels of each pair.
@@ -189,7 +191,7 @@ class SetInit(Initialiser):
         heads: number of attention heads of each layer.
         hidden: number of channels inside a layer.
         starts: number of hypotheses of the network, at least 1.
-        samples: number of minimal samples of the six likeliest pairs, 0 to 8; more pairs have more samples.
+        samples: number of minimal samples of the six likeliest pairs, 0 to 8. Problems of at least 18 pairs have more.
         confidence: whether the network sees the ``confidence`` of the correspondences.
         repeats: whether the network sees how many pairs have the same pixel and how many have the same point.
 
@@ -230,9 +232,9 @@ class SetInit(Initialiser):
         self.first = nn.Linear(_FEATURES + 2 * confidence + 2 * repeats, width)
         self.blocks = nn.ModuleList(_Block(width, heads, hidden) for _ in range(layers))
         self.norm = nn.LayerNorm(width)
-        # Per pair: the logit of being an inlier; per hypothesis a weight and a distance along the ray.
+        # Per pair: the logit of being an inlier, and for each hypothesis a weight and a distance along the ray.
         self.pair = nn.Linear(width, 1 + 2 * starts)
-        # Per problem: the distance of the world in each hypothesis; the noise of pixels and of points.
+        # Per problem: the distance of the world's centre in each hypothesis, and the noise of pixels and of points.
         self.problem = nn.Linear(width, starts + 2)
         with torch.no_grad():
             for layer, scale in ((self.pair, 0.3), (self.problem, 0.1)):
@@ -245,13 +247,13 @@ class SetInit(Initialiser):
 
         Args:
             problem: pairs in any order, of a centred and scaled world.
-            search_follows: whether a search among all pairs follows. The network then sees 48 pairs at most, evenly
-                spread over all, and draws fewer samples. The weight of every other pair is its agreement with the best
-                sample.
+            search_follows: whether :func:`~kornia_pnpnet.propose.ransac.search_on` follows. The network then sees at
+                most 48 pairs, evenly spread over all pairs, and solves fewer samples. The weight of every other pair is
+                its agreement with the best pose of the samples.
 
         Returns:
-            The first hypothesis as the pose and the other hypotheses as others, the best sample last; probabilities of
-            being an inlier as weights; the noise of each pair.
+            The pose of the first hypothesis; the poses of the other hypotheses, with the best pose of the samples as
+            the last one; probabilities of being an inlier as weights; the noise of each pair.
 
         Raises:
             DeviceError: when the problem and the network are on different devices.
@@ -267,7 +269,8 @@ class SetInit(Initialiser):
         probability = torch.sigmoid(of_pairs[0])
         counts, along = of_pairs[1:].split(starts)  # (S, B, N) each
         away, noise = of_problem.split((starts, 2), -1)
-        # A point's distance is the distance of the world's centre plus an offset, so that far worlds keep their relief.
+        # The distance of a point is about the distance of the world's centre plus an offset. With an offset instead of
+        # a factor, the differences of distances do not grow with the distance.
         distance = (away.clamp(-6.0, 6.0) - view.log_spread).exp().mT[..., None]  # (S, B, 1)
         relief = torch.add(view.height, along, alpha=3.0) / distance
         ranges = distance * relief.clamp(-3.0, 3.0).exp()
@@ -287,12 +290,13 @@ class SetInit(Initialiser):
 
     @torch.no_grad()
     def _sampled(self, problem: Problem, chances: Tensor, noise: Noise, fallback: Pose, search_follows: bool) -> Pose:
-        """The best poses of minimal samples by the score of the likeliest pairs; the fallback where there are none."""
+        """The best poses of minimal samples, scored by the likeliest pairs; the fallback if no sample has a pose."""
         batch, count = chances.shape
         there = problem.usual_weights > 0
-        # An unlikely pair that agrees may be an inlier after all; padding does not score.
+        # Unlikely pairs also score, because they can be inliers. Padding does not score.
         vote = torch.add(_LEAST_VOTE * there, chances, alpha=1.0 - _LEAST_VOTE)
-        # At the depth of the network's pose: by its own depths, a pose close to the points would explain most pixels.
+        # The variance is computed at the depth of the network's pose. With the depths of each pose, a pose close to the
+        # points would explain most pixels.
         precision = problem.focal.square() / (_JUDGED * _variance(noise, problem.focal, fallback))
         plane_points = problem.img_points / problem.focal
         of_pairs = torch.cat(
@@ -305,18 +309,18 @@ class SetInit(Initialiser):
         likely = chances.topk(min(_MOST_JUDGES, count)).indices
         pairs = take_pairs(of_pairs, likely)  # (7, K, B)
         least, samples = zip(*_samples(count, self.samples, search_follows), strict=True)
-        if compiling():  # stacked, so that a compiler copies whole rows
+        if compiling():  # with `stack` a compiler copies whole rows
             three = torch.stack([pairs[:6, k] for column in zip(*samples, strict=True) for k in column], 1)
         else:
             three = pairs[:6].index_select(1, torch.tensor(samples, device=pairs.device).mT.flatten())
         three = three.unflatten(1, (3, len(samples))).flatten(2)  # (6, 3, S B)
         pose, valid = p3p(three[:3].permute(2, 1, 0), three[3:5].permute(2, 1, 0))[:2]
-        # Problems last, as p3p lays them out, after the four solutions and the samples.
+        # Dimensions: four solutions, samples, problems, as in the memory of p3p's result.
         each = len(samples), batch
         rotation, translation = (x.movedim((0, 1), (-1, -2)).unflatten(-1, each).flatten(-3, -2) for x in pose)
         rotation = rotation.flatten(0, 1)  # (9, H, B)
         valid = (valid.mT & (three[5] > 0).all(0)).unflatten(-1, each)  # (4, S, B)
-        if least[-1]:  # by the number of pairs without padding, so that padding changes nothing
+        if least[-1]:  # padding does not count, so that it has no effect
             valid = valid & (there.sum(1) >= torch.tensor(least, device=there.device)[:, None])
         valid = valid.flatten(0, 1)  # (H, B)
         if batch and len(valid) > _MANY_SLOTS and valid.device.type == "cpu" and sees_values(valid):
@@ -336,18 +340,18 @@ class SetInit(Initialiser):
         return Pose(every[:, :9].unflatten(1, (3, 3)), every[:, 9:])
 
     def _run(self, view: View) -> tuple[Tensor, Tensor]:
-        """The network: outputs for each pair, (1 + 2 S, B, N), and for each problem, (B, S + 2)."""
+        """Outputs of the network for each pair, (1 + 2 S, B, N), and for each problem, (B, S + 2)."""
         x = self.first(view.features.flatten(0, 1).to(self.first.weight.dtype))
         absent = torch.where(view.there > 0, 0.0, _ABSENT).to(x.dtype).contiguous()
         for block in self.blocks:
             x = block(x, absent)
         x = self.norm(x)
         pair = torch.addmm(self.pair.bias[:, None], self.pair.weight, x.mT).view(self.pair.out_features, *absent.shape)
-        share = _attention(x, self.pair.weight[:1], absent)[0]  # the softmax cancels the bias
+        share = _attention(x, self.pair.weight[:1], absent)[0]  # the softmax cancels a bias
         return pair, self.problem(torch.bmm(share[:, None], x.view(*absent.shape, x.shape[-1]))[:, 0])
 
     def _noise(self, problem: Problem, view: View, estimate: Tensor) -> Noise:
-        """The known noise, and the network's estimate where it is unknown."""
+        """The noise of each pair: the caller's where known, else the network's estimate."""
         guessed = ((LOG_NOISE + 3.0 * estimate.tanh()).exp() * view.unit)[:, None].expand(*problem.weights.shape, 2)
         if problem.noise is not None:
             known = torch.stack((problem.noise.img, problem.noise.world), -1)

@@ -1,4 +1,4 @@
-"""The input of the set network: features that depend neither on the places of world and camera nor on units."""
+"""The input of the set network: features that depend neither on the frames of world and camera nor on units."""
 
 from __future__ import annotations
 
@@ -11,31 +11,34 @@ from kornia_pnpnet.problem import Problem
 
 __all__ = ["LEAST_NOISE", "LOG_NOISE", "View", "repeats"]
 
-# Ridge of the affine camera, relative to the mean square of the world points: the fit is then unique for planar points.
+# Ridge of the affine camera, relative to the mean square of the world points: the fit of planar points is then unique.
 _RIDGE = 0.02
-# Spreads. Features are clipped to this size, so that no pair dominates the network.
+# Spreads. Features are clipped to this absolute value, so that no pair dominates the network.
 _MOST = 8.0
-#: Centre of the logarithm of the estimated noise, relative to the spread of the pixels and of the world.
+#: Centre of the range of the logarithm of noise, relative to the spread of the pixels and of the world.
 LOG_NOISE = -5.0
-#: Least noise, as a share of the spread: scores divide by the variance.
+#: Least noise as a share of the spread, because scores divide by the variance.
 LEAST_NOISE = 1e-6
 # Confidences are clipped to this distance from 0 and from 1.
 _LEAST_CONFIDENCE = 1e-3
-# Points are sorted by this combination of their coordinates, so that equal points are neighbours. The factors are
-# irrational, so that the points of a grid have different keys.
+# Coefficients of the key by which points are sorted, so that equal points are adjacent. The ratios of the coefficients
+# are irrational, so that different points of a grid have different keys.
 _KEY = 1.0, 0.7548776662, 0.5698402910
 
 
 class View:
-    r"""The network's input: invariant to rotations of world and camera and to their units.
+    r"""The network's input.
 
-    The camera is rotated so that the mean of the rays is its axis, and zoomed until the spread of the rays is 1. The
-    centred and scaled world is rotated to the axes of the affine camera that fits the pairs best, by ridge regression.
+    The features are invariant to rotations of the world, to rotations of the camera except the roll, and to units.
+    The camera is rotated so that its axis is the mean of the rays, and zoomed so that the spread of the rays is 1.
+    Ridge regression fits an affine camera to the pairs. The centred and scaled world is rotated to the axes of this
+    affine camera.
 
     Attributes:
         there: 1 for pairs with a weight and of normal scale, 0 for others, shape :math:`(B, N)`.
-        rays: unit rays in the frame of the camera, shape :math:`(B, N, 3)`.
-        log_spread: logarithm of the root mean square distance of the rays from their mean, shape :math:`(B, 1)`.
+        rays: unit rays in the frame of the original camera, shape :math:`(B, N, 3)`.
+        log_spread: logarithm of the spread of the rays, the root mean square sine of the angles between the rays and
+            the mean ray, shape :math:`(B, 1)`.
         unit: spread of the pixels and of the world, shape :math:`(B, 2)`.
         height: the last coordinate of the rotated world points, shape :math:`(B, N)`.
         features: the network's input, shape :math:`(B, N, C)`.
@@ -49,8 +52,8 @@ class View:
         plane = functional.pad(problem.img_points / problem.focal, (0, 1), value=1.0)
         self.rays = functional.normalize(plane, dim=-1)
         mean = functional.normalize((share * self.rays).sum(1), dim=-1)
-        # The smallest rotation of the mean to the axis: a reflection that maps it to the negative axis, and the
-        # negative third row.
+        # The smallest rotation of the mean ray to the axis: a reflection maps the mean ray to the negative axis, then
+        # the third coordinate is negated.
         half = mean + eye[2]
         mirror = 1.0 - 2.0 * eye[2]
         turn = (half * mirror)[..., None] * (half / half[:, 2:])[:, None]
@@ -83,7 +86,7 @@ class View:
             return torch.zeros_like(problem.weights)[..., None].expand(-1, -1, 4)
         sigmas = torch.stack((problem.noise.img, problem.noise.world), -1)  # (B, N, 2)
         known = sigmas.isfinite()
-        # Unknown sigmas are NaN. Replace them before dividing, or the gradient of the unit becomes NaN.
+        # Unknown sigmas are NaN. They are replaced before the division, because the gradient of the unit would be NaN.
         relative = torch.where(known, sigmas, 1.0) / torch.where(known, self.unit[:, None], 1.0)
         logs = torch.where(known, relative.clamp(min=LEAST_NOISE).log() - LOG_NOISE, 0.0)
         return torch.cat((logs, known.to(logs.dtype)), -1)
@@ -91,12 +94,12 @@ class View:
 
 @torch.no_grad()
 def repeats(problem: Problem) -> Tensor:
-    """Logarithms of the numbers of pairs with exactly the same pixel and with exactly the same point, (B, N, 2)."""
+    """Logarithms (B, N, 2) of the number of pairs with the same pixel, and of the number with the same point."""
     there = (problem.usual_weights > 0).to(problem.weights).repeat(2, 1)
     points = torch.cat((functional.pad(problem.img_points, (0, 1)), problem.world_points))  # (2 B, N, 3)
     order = (points * points.new_tensor(_KEY)).sum(-1).argsort(1)  # equal points are neighbours
     ordered = points.gather(1, order[..., None].expand_as(points))
-    # Numbers, not booleans: of booleans PyTorch 2.13 makes code that does not compile.
+    # Integers, because the code that PyTorch 2.13 generates for the maximum of booleans does not compile.
     new = (ordered[:, 1:] != ordered[:, :-1]).long().amax(-1)
     run = functional.pad(new.cumsum(1), (1, 0))
     sizes = torch.zeros_like(there).scatter_add(1, run, there.gather(1, order))
@@ -105,20 +108,21 @@ def repeats(problem: Problem) -> Tensor:
 
 
 def _frame(affine: Tensor, squares: Tensor) -> Tensor:
-    """The rotation whose first two rows are nearest the rows of an affine camera (B, 2, 3); any rotation if it is 0.
+    """The rotation with the first two rows closest to the rows of an affine camera (B, 2, 3).
 
-    ``squares`` are the squared lengths of the rows, (B, 2).
+    ``squares`` (B, 2) are the squared lengths of the rows. For a camera of zeros the result is some rotation.
     """
     p, q = affine.unbind(1)
     product = (p * q).sum(-1, keepdim=True)  # (B, 1)
-    # The inverse square root of the Gram matrix S of the rows, up to a factor: (S + sqrt(det S) I)^-1.
+    # With the Gram matrix S of the rows, the closest orthonormal rows are S^-1/2 times the rows. Up to a factor, S^-1/2
+    # is the adjugate of S + sqrt(det S) I.
     raised = squares + (1e-3 * squares.sum(-1, keepdim=True) + 1e-6)
     root = (raised.prod(-1, keepdim=True) - product.square()).clamp(min=1e-12).sqrt()
     diagonal = raised.flip(-1) + root
     u, v = (diagonal[..., None] * affine - product[..., None] * affine.flip(1)).unbind(1)
     eye = torch.eye(3, dtype=u.dtype, device=u.device)
     u = functional.normalize(u + 1e-6 * eye[0], dim=-1)
-    # A vector that is orthogonal to u: the reflection that maps u to an axis ±z takes x to it.
+    # A vector orthogonal to u: the image of the x axis under the reflection that maps the z axis to u or to -u.
     sign = torch.where(u[:, 2:] < 0, -1.0, 1.0)
     orthogonal = eye[0] - (u[:, :1] / (1.0 + sign * u[:, 2:])) * (u + sign * eye[2])
     v = functional.normalize(v - (u * v).sum(-1, keepdim=True) * u + 1e-6 * orthogonal, dim=-1)

@@ -1,4 +1,4 @@
-"""Views: a network answers each mirror image of a problem differently, and each answer is a pose to start from."""
+"""Views: mirror images of a problem. A network finds a different pose for each, and refinement can start from all."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["VIEWS", "from_views"]
 
-#: The symmetries of a square image, as three flags: exchange x and y, then reverse x, then reverse y.
+#: The symmetries of a square image, as three flags: whether to exchange x and y, then to negate x, then to negate y.
 VIEWS = (
     (False, False, False),
     (True, False, False),
@@ -28,26 +28,25 @@ VIEWS = (
 
 
 def from_views(init: Callable[[Problem], Starts], problem: Problem, count: int, order: bool) -> Starts:
-    """The starts of an initialiser for a problem, with its poses for mirror images of the problem.
+    """Find the starts of an initialiser for a problem, including its poses for mirror images of the problem.
 
-    A mirror image exchanges or reverses the axes of image and world in the same way, so that the distribution of random
+    A mirror image exchanges or negates the x and y axes of image and world in the same way. The distribution of random
     problems does not change.
 
     Args:
         init: the initialiser.
         problem: :math:`B` problems.
-        count: number of views of each problem, 2 to 8; the first view is the problem itself.
+        count: number of views of each problem, 2 to 8. The first view is the problem itself.
         order: whether the initialiser needs the pairs in the order of their pixels.
     """
     batch = problem.weights.shape[0]
     starts = init(_views(problem, count, order))
-    # The first view is the problem itself, in the order of its pairs.
     first: Starts = map_tensors(lambda x: x[:batch], starts)
     return first.with_others(*(x for pose in starts.poses for x in _undone(pose, count)))
 
 
 def _views(problem: Problem, count: int, order: bool) -> Problem:
-    """All problems in the first view, then in the second view, and so on; without covariances and terms."""
+    """All problems in the first view, then all in the second view, and so on, without covariances and terms."""
     noise = None if problem.noise is None else problem.noise.sigmas
     of_pairs = problem.weights, problem.usual, noise, problem.confidence
     others = [values.mT for values in iter_tensors(of_pairs)]  # (N, B) each
@@ -67,7 +66,7 @@ def _views(problem: Problem, count: int, order: bool) -> Problem:
 
 
 def _undone(pose: Pose, count: int) -> list[Pose]:
-    """Poses of the problems themselves from the poses of all their views but the first."""
+    """Poses for the problems from the poses of all their views except the first."""
     poses = []
     matrices, vectors = (x.movedim(0, -1).unflatten(-1, (count, -1)).unbind(-2)[1:] for x in pose)
     for view, matrix, vector in zip(VIEWS[1:count], matrices, vectors, strict=True):  # (3, 3, B), (3, B)
@@ -78,13 +77,13 @@ def _undone(pose: Pose, count: int) -> list[Pose]:
 
 
 def _exchanged(x: Tensor, y: Tensor, swap: bool, reverse_x: bool, reverse_y: bool) -> tuple[Tensor, Tensor]:
-    """Two coordinates of a mirrored view."""
+    """Coordinates x and y in a mirrored view."""
     x, y = (y, x) if swap else (x, y)
     return -x if reverse_x else x, -y if reverse_y else y
 
 
 def _axes_back(entries: Tensor, axis: int, view: tuple[bool, bool, bool]) -> Tensor:
-    """Undo a mirrored view along one axis of three coordinates."""
+    """Undo a mirrored view along one dimension of three coordinates."""
     x, y, z = entries.unbind(axis)
     x, y = _exchanged(x, y, False, *view[1:])
     return torch.stack((y, x, z) if view[0] else (x, y, z), axis)
