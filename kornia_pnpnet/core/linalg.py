@@ -162,9 +162,9 @@ def _rotation_in_closed_form(matrix: Tensor) -> tuple[Tensor, Tensor]:
     # Because of the stack a compiler computes these values once per matrix, not once per entry.
     largest, determinant = torch.stack((largest, determinant))
     # Let s₁ ≥ s₂ ≥ |s₃| be the singular values, where s₃ has the sign of the determinant. The matrix plus its cofactors
-    # over s₁ has the same singular vectors. Its singular values are first = s₁ + s₂s₃/s₁ (once) and second = s₂ + s₃
-    # (twice). Its Gram matrix has only two distinct eigenvalues, so that the inverse square root is a polynomial of
-    # degree 1 in the Gram matrix.
+    # over s₁ is `upright`. The singular vectors of both matrices are equal, and the singular values of `upright` are
+    # first = s₁ + s₂s₃/s₁ (once) and second = s₂ + s₃ (twice). The Gram matrix of `upright` therefore has two distinct
+    # eigenvalues. The inverse square root of such a Gram matrix is a polynomial of degree 1 in the Gram matrix.
     upright = scaled + cofactors / largest
     first = largest + determinant / (largest * largest)
     square = first * first
@@ -391,7 +391,7 @@ def solve_positive(matrix: Tensor, right: Tensor, damping: Tensor) -> tuple[Tens
 
     Uncompiled code on a CPU solves few systems by LAPACK, in a fifth of the time of LDLᵀ for one system. All other
     systems are solved by an LDLᵀ factorisation, entry by entry. For 1000 systems LDLᵀ takes two thirds of the time of
-    LAPACK, and it compiles to one loop.
+    LAPACK. LDLᵀ compiles to one loop.
 
     Args:
         matrix: :math:`H`, shape :math:`(K, K, B)`.

@@ -63,7 +63,7 @@ def exporting() -> bool:
 def sees_values(x: Tensor) -> bool:
     """Whether Python code may depend on the values of a tensor.
 
-    It may not while a graph is traced, in ``torch.func.vmap``, and on the device ``meta``.
+    Values must not be read in a traced graph, in ``torch.func.vmap``, and on the device ``meta``.
     """
     if compiling():
         return False
@@ -334,9 +334,9 @@ def take_pairs(values: Tensor, index: Tensor) -> Tensor:
 
 # --- compilation ------------------------------------------------------------------------------------------------------
 
-# Pairs. From this number on, the CPU compiler of PyTorch 2.13 must keep the given order of loops. Its own order
-# transposes vectors of 16 numbers, and can give incorrect results if a problem has more pairs than the batch has
-# problems. The given order takes up to 50 % longer.
+# Pairs. From this number on, the CPU compiler of PyTorch 2.13 must not choose the order of loops. An order with
+# transposes of vectors of 16 numbers can give incorrect results if a problem has more pairs than the batch has
+# problems. The given order of loops takes up to 50 % longer than a chosen order.
 _MANY_PAIRS = 16
 
 
@@ -388,7 +388,7 @@ class Compiled:
         def copied(run: Callable[..., Any]) -> Callable[..., Any]:
             return lambda *args: map_tensors(torch.clone, run(*args))
 
-        # Results are copied because the next replay of a CUDA graph overwrites them.
+        # The next replay of a CUDA graph overwrites the results, so that they are copied.
         return (copied(few), copied(many)) if options.get("triton.cudagraphs") else (few, many)
 
     def __call__(self, *args: Any) -> Any:
@@ -462,7 +462,7 @@ EAGER = Runner()
 
 
 def _needs_check(guards: Sequence[Any]) -> list[bool]:
-    """Skip checks of functions and constants of modules: they do not change, and checks take time at each call."""
+    """Skip guards of functions and constants of modules, which do not change: guards take time at each call."""
     return [guard.guard_type == "DUPLICATE_INPUT" or not guard.is_global for guard in guards]
 
 
