@@ -192,14 +192,15 @@ def corrected_noise(
 
 @torch.no_grad()
 def larger_sigma(projection: Projection, problem: Problem, estimate: Noise, inlier_weights: Tensor) -> Tensor:
-    """Estimate the standard deviation of pixels from the residuals of inliers, if it is much larger than given, else 0.
+    """Estimate the standard deviation of the pixels from the residuals of the inliers.
 
-    With confidences, pairs of low confidence get larger sigmas than pairs of high confidence.
+    The result is 0 unless the residuals show much larger noise than ``estimate``. With confidences, pairs of low
+    confidence get larger sigmas than pairs of high confidence.
 
     Args:
         projection: the points at the final pose.
         problem: the problem.
-        estimate: the estimated noise.
+        estimate: the noise that was estimated before the refinement.
         inlier_weights: final weight of each pair relative to its weight before the refinement, :math:`(B, N)`.
 
     Returns:
