@@ -95,10 +95,7 @@ def check_like(tensors: Mapping[str, Tensor | None], like: Tensor, like_name: st
 
 
 def check_devices(tensors: Mapping[str, Tensor | None], like: Tensor, like_name: str = "world_points") -> None:
-    """Raise ``DeviceError`` when the device of a tensor differs from ``like``. ``None`` is not checked.
-
-    Tensors without dimensions are checked, too.
-    """
+    """Raise ``DeviceError`` when the device of a tensor differs from ``like``. ``None`` is not checked."""
     for name, tensor in tensors.items():
         if tensor is not None and tensor.device != like.device:
             raise DeviceError(f"{name} is on {tensor.device} but {like_name} is on {like.device}.")

@@ -27,7 +27,7 @@ MOST_BYTES = 2**31
 class InputError(ValueError):
     """An input file or a command-line option cannot be used.
 
-    The message is a single line. It starts with the name of the file or option and, for text files, the line number.
+    The message is a single line with the name of the file or option and, for text files, the line number.
     """
 
     def __init__(self, source: str | Path, message: str, line: int | None = None) -> None:
@@ -37,10 +37,10 @@ class InputError(ValueError):
 
 @contextmanager
 def atomic_open(path: str | Path, mode: str = "w", **options: Any) -> Iterator[IO[Any]]:
-    """Open a temporary file for writing, and rename it to ``path`` once it is complete and on disk.
+    """Open a temporary file for writing, and rename the complete file to ``path``.
 
     If the process is killed or the disk is full, an existing file at ``path`` does not change. Missing folders are
-    created.
+    made.
     """
     path = Path(path)
     if path.is_dir():

@@ -95,10 +95,7 @@ def gate(value: Tensor, live: Tensor, finite: Tensor, fill: float | Tensor) -> T
 
 
 def relative(values: Tensor, size: Tensor) -> Tensor:
-    """Divide the values (B, N) of each problem by the problem's largest ``size`` (B, N).
-
-    The divisor has no gradient. A divisor of 0 is replaced by 1.
-    """
+    """Divide the values (B, N) of each problem by its largest ``size``, a constant, unless that size is 0."""
     largest = size.detach().amax(1, keepdim=True)
     return values / torch.where(largest > 0, largest, 1.0)
 
@@ -305,9 +302,8 @@ def span_a_plane(centred: Tensor, share: Tensor, size: Tensor) -> Tensor:
         size: the largest absolute coordinate of the points before centring, (B,). With a size of 0 or NaN the result is
             false.
     """
-    # The sum of the principal 2×2 minors of the covariance is (trace² - sum of squares) / 2. This sum over the trace
-    # approximates the second largest variance. For points on a line the second largest variance is only a rounding
-    # error.
+    # The sum of the principal 2×2 minors of the covariance is (trace² - sum of squares) / 2. The sum divided by the
+    # trace approximates the second largest variance. For points on a line this variance is only a rounding error.
     eps = torch.finfo(centred.dtype).eps
     covariance = (centred[:, None] * centred).sum(2) * (share / (size * size))  # (3, 3, B), in units of the size
     trace = covariance.diagonal().sum(-1)
@@ -375,10 +371,7 @@ def factorise(
 
 
 def substitute(lower: Mapping[tuple[int, int], Tensor], scaled: Iterable[Tensor]) -> list[Tensor]:
-    """Solve Lᵀ x = b with the entries of L of :func:`factorise`.
-
-    If b is shorter than L, the leading block of L of the size of b is used.
-    """
+    """Solve Lᵀ x = b with L of :func:`factorise` or, if b is shorter, with the leading block of L of the size of b."""
     solution = list(scaled)
     for i in range(len(solution) - 1, 0, -1):
         for k in range(i):
@@ -477,10 +470,7 @@ def eigenvectors(matrix: Tensor) -> list[tuple[Tensor, Tensor]]:
 
 
 def solve_symmetric(matrix: Tensor, right: Tensor) -> Tensor:
-    """Solve systems with positive definite matrices (B, 3, 3).
-
-    Few systems are solved by LAPACK, which takes half the time of cofactors. All other systems are solved by cofactors.
-    """
+    """Solve positive definite systems (B, 3, 3). LAPACK solves few systems in half of the time of cofactors."""
     if are_few(matrix):
         return torch.linalg.solve_ex(matrix, right).result
     a, b, c = matrix.unbind(1)

@@ -53,18 +53,12 @@ def compiling() -> bool:
 
 
 def exporting() -> bool:
-    """Whether ``torch.export`` is tracing the code.
-
-    ONNX has no stable sort, no ``copysign`` and none of the custom operations of this package.
-    """
+    """Whether ``torch.export`` is tracing the code. ONNX lacks a stable sort, ``copysign`` and custom operations."""
     return torch.compiler.is_exporting()
 
 
 def sees_values(x: Tensor) -> bool:
-    """Whether Python code may depend on the values of a tensor.
-
-    Values must not be read in a traced graph, in ``torch.func.vmap``, and on the device ``meta``.
-    """
+    """Whether Python code may read values: not in a traced graph, in ``torch.func.vmap`` or on the device ``meta``."""
     if compiling():
         return False
     functorch = torch._C._functorch
@@ -76,10 +70,7 @@ def sees_values(x: Tensor) -> bool:
 
 
 def in_full_precision(device: str) -> AbstractContextManager[Any]:
-    """Return a context that disables autocast.
-
-    The context does nothing in an exported graph, or on a device without autocast such as ``meta``.
-    """
+    """Return a context that disables autocast, except in an exported graph or on a device without autocast."""
     if exporting() or not torch.amp.is_autocast_available(device):
         return nullcontext()
     return torch.autocast(device, enabled=False)
@@ -111,10 +102,7 @@ def problems_last(tree: _T) -> _T:
 
 
 def repeat_problems(tree: _T, count: int) -> _T:
-    """Repeat the batch of every tensor of a tree ``count`` times, in the memory layout of :func:`problems_last`.
-
-    Scalars are not repeated.
-    """
+    """Repeat the batch of every tensor but scalars ``count`` times, in the memory layout of :func:`problems_last`."""
 
     def repeat(x: Tensor) -> Tensor:  # `Tensor.repeat` compiles to one division per entry
         last = _reversed(x)[..., None, :]
@@ -199,7 +187,7 @@ def _in_network(values: Tensor) -> bool:
 
 
 def _through_network(values: Tensor, rank: int | None) -> list[Tensor]:
-    """Sort values (C, N, B) into rows (C, B). With a rank, only the row of this rank is at its place."""
+    """Sort values (C, N, B) into rows (C, B). With a rank, only the row of this rank is correct."""
     rows = list(values.unbind(1))
     for i, j, smaller, larger in _network(len(rows), rank):
         a, b = rows[i], rows[j]
@@ -297,10 +285,7 @@ def fold_vmap(size: int, in_dims: Sequence[int | None], *tensors: Tensor) -> lis
 
 
 def unfold_vmap(size: int, result: Tensor) -> Tensor:
-    """Undo :func:`fold_vmap` for a result whose last dimension is the batch.
-
-    The mapped dimension of the result precedes the batch.
-    """
+    """Undo :func:`fold_vmap` in a result whose last dimension is the batch: split the batch into two dimensions."""
     return result.unflatten(-1, (size, -1))
 
 
@@ -308,9 +293,9 @@ def _take_pairs(values: Tensor, index: Tensor) -> Tensor:
     return values.permute(2, 1, 0).gather(1, index.mT.expand(values.shape[-1], -1, -1))
 
 
-# A custom operation, so that a compiler does not fuse the gather into each operation that reads its result. With
-# fusion, the compiled hypotheses of the set network take a third longer. `torch.library.Library` is used because the
-# first call of `torch.library.custom_op` imports 800 modules in 2 to 3 s.
+# A custom operation keeps a compiler from fusing the gather into each operation that reads its result. With fusion, the
+# compiled hypotheses of the set network take a third longer. `torch.library.Library` is used because the first call of
+# `torch.library.custom_op` imports 800 modules in 2 to 3 s.
 _LIBRARY = torch.library.Library("kornia_pnpnet", "DEF")
 _LIBRARY.define("take_pairs(Tensor values, Tensor index) -> Tensor")
 _LIBRARY.impl("take_pairs", _take_pairs, "CompositeExplicitAutograd")
@@ -388,7 +373,7 @@ class Compiled:
         def copied(run: Callable[..., Any]) -> Callable[..., Any]:
             return lambda *args: map_tensors(torch.clone, run(*args))
 
-        # The next replay of a CUDA graph overwrites the results, so that they are copied.
+        # The results are copied because the next replay of a CUDA graph overwrites its results.
         return (copied(few), copied(many)) if options.get("triton.cudagraphs") else (few, many)
 
     def __call__(self, *args: Any) -> Any:

@@ -24,7 +24,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 #: An integer of at least 0 that fits into 64 bits.
 Count = Annotated[int, Field(ge=0, lt=2**63)]
-#: Configuration of a pydantic type: values are not converted, and all numbers, also in nested types, must be finite.
+#: Configuration of a pydantic type: types are checked strictly. Numbers, also in nested types, must be finite.
 STRICT = ConfigDict(strict=True, allow_inf_nan=False)
 
 

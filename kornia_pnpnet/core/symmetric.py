@@ -54,7 +54,7 @@ class Symmetric2(NamedTuple):
         return Symmetric2(self.vv * scale, -self.uv * scale, self.uu * scale)
 
     def mapped(self, a: Tensor, b: Tensor, d: Tensor, c: Tensor | None = None) -> Symmetric2:
-        """The covariance A S Aᵀ of this covariance S and the matrix A = [[a, b], [c, d]]. ``None``: c is 0."""
+        """The covariance A S Aᵀ, where S is this covariance and A is [[a, b], [c, d]]. ``None`` for c means 0."""
         u, v = a * self.uu + b * self.uv, a * self.uv + b * self.vv
         if c is None:
             return Symmetric2(a * u + b * v, d * v, d * d * self.vv)

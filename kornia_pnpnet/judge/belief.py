@@ -40,15 +40,15 @@ __all__ = [
 #: A pose is believed when its :func:`probability` is at least this value. On synthetic problems to which the law was
 #: not fitted, 98 % of the correct poses pass, and 5 to 7 % of the incorrect poses.
 LEAST_PROBABILITY = 0.93
-#: The coefficients of :func:`probability`: the log-odds at 0, and the slopes of the log-odds by the logarithms of false
-#: alarms and of the rotation's sigma. The law ``sigmas`` is for noise that the caller gave or a network estimated. The
-#: law ``residuals`` is for :func:`residual_noise`. Fitted by
+#: The coefficients of :func:`probability`: the log-odds if both numbers are 0, and the slopes of the log-odds by the
+#: logarithms of false alarms and of the rotation's sigma. The law ``sigmas`` is for noise that the caller gave or a
+#: network estimated. The law ``residuals`` is for :func:`residual_noise`. Fitted by
 #: ``python docs/results/make.py measure --only probability``.
 LAWS = {"sigmas": (-3.2501, -0.16608, -1.0784), "residuals": (0.89795, -0.27745, 0.070018)}
 _ALARMS, _LOG_SIGMA = (-20.0, 10.0), (-12.0, 2.0)
 # Standard deviations. A pair with a larger residual is an outlier of the pose.
 _EVIDENT = 3.5
-# Standard deviation of the logarithm of a focal length. With a larger one, the focal length is not determined.
+# Largest standard deviation of the logarithm of a focal length that is determined by the pairs.
 _OPEN_FOCAL = 0.15
 # A pose explains the pixels when at least this fraction of the pairs (by weight) has small residuals. The fraction is
 # just below 0.6, so that a sum of shares that is 0.6 up to rounding suffices.
@@ -67,10 +67,10 @@ def explains(projection: Projection, problem: Problem, weights: Tensor) -> Tenso
     """Tell whether a pose explains the pixels, when the noise is unknown.
 
     The 60 % quantile of the residuals must be at most a fifth of the 60 % quantile of the distances of pixels from
-    their mean. Both quantiles are weighted by ``weights``. A pose that hardly fits better than a projection of all
-    points to one pixel therefore fails. Both quantiles scale with the image, so that no threshold is in pixels. At
-    least four pairs (three if there are only three) must have such small residuals, and their points must span more
-    than a line. The weights are the weights without the robust weight.
+    their mean. Both quantiles are weighted by ``weights``, the weights without the robust weight. A pose that hardly
+    fits better than a projection of all points to one pixel therefore fails. Both quantiles scale with the image, so
+    that no threshold is in pixels. At least four pairs (three if there are only three) must have such small residuals,
+    and the points of these pairs must span more than a line.
     """
     weights = weights.detach()
     there = weights > 0
@@ -123,8 +123,8 @@ def probability(log_alarms: Tensor, sigma: Tensor, law: str = "sigmas") -> Tenso
     """Probability that a pose is correct: within 10 degrees, and within 30 % of the distance of the points.
 
     The probability is a logistic function of two numbers. The false alarms tell how unlikely the inliers are by chance.
-    The sigma tells how well the inliers determine the rotation, because few inliers in a small part of the image agree
-    with many poses.
+    The sigma tells how well the inliers determine the rotation. Few inliers in a small part of the space and of the
+    image agree with many poses.
 
     Args:
         log_alarms: :func:`~kornia_pnpnet.judge.inliers.log_false_alarms`, shape :math:`(B,)`.

@@ -1,8 +1,8 @@
-r"""The inliers of a pose, and how likely a pose has so many inliers by chance.
+r"""The inliers of a pose, and the number of poses that are expected to have as many inliers by chance.
 
 A pair is an inlier of a pose when :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`. The threshold :math:`\tau` is in pixels.
-The threshold :math:`\omega` is a shift of the world point, which moves its projection at the depth :math:`z` by
-:math:`f \omega / z` pixels. The left side over the right side is the *standardised* squared residual.
+The threshold :math:`\omega` is a shift of the world point. At the depth :math:`z` such a shift moves the projection by
+:math:`f \omega / z` pixels. The left side divided by the right side is the *standardised* squared residual.
 """
 
 from __future__ import annotations
@@ -24,8 +24,7 @@ __all__ = ["MAX_ERROR", "MAX_FALSE_ALARMS", "Judged", "Thresholds", "judge", "lo
 
 #: The standardised squared residual of points behind the camera.
 MAX_ERROR = 1e6
-#: Upper bound of the number of poses that are expected to have as many inliers by chance. A pose with a larger number
-#: is not believed.
+#: Largest number of false alarms (see :func:`log_false_alarms`) of a pose that is believed.
 MAX_FALSE_ALARMS = 0.01
 # Largest number of pairs that `_chance_by_others` compares. These pairs are spaced evenly over all pairs.
 _MOST_OTHERS = 64
@@ -44,9 +43,9 @@ class Thresholds(NamedTuple):
     Attributes:
         img: :math:`\tau` in pixels of the problem, shape :math:`(B, 1)` or :math:`(B, N)`.
         world: :math:`\omega` in units of the problem's world, shape :math:`(B, 1)` or :math:`(B, N)`.
-        precision: the matrix :math:`P` of each pair whose standardised squared residual is :math:`r^\top P r`, entries
-            :math:`(B, N)`. The chance of an inlier is then estimated by a disc with the area of the ellipse
-            :math:`r^\top P r < 1`. ``None``: only :math:`\tau` and :math:`\omega` count.
+        precision: the matrix :math:`P` in the standardised squared residual :math:`r^\top P r` of each pair, entries
+            :math:`(B, N)`; ``None``: :math:`\tau` and :math:`\omega` define the standardised squared residual. The
+            chance of an inlier is estimated by a disc with the area of the ellipse :math:`r^\top P r < 1`.
     """
 
     img: Tensor
@@ -54,7 +53,7 @@ class Thresholds(NamedTuple):
     precision: Symmetric2 | None = None
 
     def sq_limits(self, projection: Projection) -> Tensor:
-        """Squared radius in square pixels of the inliers' disc, or of a disc with the area of their ellipse, (B, N)."""
+        """Squared radius (px²) of the inlier disc or, with ``precision``, of a disc of equal area: (B, N)."""
         if self.precision is not None:
             return self.precision.determinant.rsqrt()
         return self.img.square() + ((projection.focal * projection.inv_depth).mT * self.world).square()
@@ -104,7 +103,7 @@ def judge(projection: Projection, problem: Problem, thresholds: Thresholds) -> J
 def log_false_alarms(
     tested: Tensor, projection: Projection, problem: Problem, thresholds: Thresholds, judged: Judged
 ) -> Tensor:
-    r"""Natural logarithm of the number of poses that are expected to have as many inliers by chance.
+    r"""Natural logarithm of the number of poses that are expected to have as many inliers as a pose, by chance.
 
     Three of the :math:`c` pairs determine a pose. There are :math:`\binom{c - 3}{k - 3}` ways to choose the other
     inliers of a pose with :math:`k` inliers. Each of the other inliers is an inlier by chance with the probability

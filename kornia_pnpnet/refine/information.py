@@ -29,8 +29,8 @@ __all__ = [
 # Logarithm of a likelihood ratio. An estimated variance factor replaces 1 if the residuals are more than e³ times as
 # likely with the estimated factor as with 1.
 _BELIEVED = 3.0
-# Exponents of 4. Candidate variance factors for noise above its estimate, which the weights of a too narrow kernel
-# hide.
+# Exponents of 4. Candidate variance factors for noise above the estimate. The weights of a too narrow kernel hide such
+# noise.
 _FACTORS = range(8)
 # Candidate exponents p: the standard deviation of the noise is proportional to confidence**p.
 _POWERS = (0.0, -1.0, -2.0, -3.0)
@@ -68,8 +68,8 @@ KernelWeight: TypeAlias = Callable[[Tensor, Tensor], Tensor]
 def complete_noise(problem: Problem, starts: Starts) -> Noise | None:
     """Combine the noise of the caller and the initialiser to noise of every pair, ``None`` if neither gave noise.
 
-    Sigmas are the initialiser's. If the initialiser gave none, sigmas are the caller's, with 0 in place of unknown
-    sigmas. Covariances are always the caller's.
+    The sigmas are from the initialiser or, if the initialiser gave no noise, from the caller, with 0 for unknown
+    sigmas. The covariances are from the caller.
     """
     noise = starts.noise
     if noise is None and problem.noise is not None:
@@ -102,8 +102,8 @@ def sq_standardised(projection: Projection, problem: Problem, most: Tensor) -> T
     Args:
         projection: the points at a state.
         problem: the problem, with known noise of every pair or without noise.
-        most: upper bound of a squared residual in square pixels, a scalar or (B, 1). Points behind the camera have this
-            value. With covariances the bound is multiplied by the mean precision of both coordinates.
+        most: upper bound of a squared residual in square pixels, a scalar or (B, 1). Points behind the camera have the
+            upper bound. With covariances the bound is multiplied by the mean precision of both coordinates.
 
     Returns:
         Shape :math:`(B, N)`.
@@ -126,7 +126,7 @@ def information(projection: Projection, problem: Problem) -> tuple[Tensor, Tenso
 
     Returns:
         Squared residuals, (B, N), and the inverse variance of each pixel, (B, N) or (B, 1), or its inverse covariance.
-        Squared residuals are divided by the variance of their pixel or, without noise, in square pixels.
+        Squared residuals are in variances of their pixel or, without noise, in square pixels.
     """
     if problem.noise is None:  # without noise, sigma is one pixel of the caller
         return projection.sq_residual, problem.img_scale.square().reciprocal()[:, None]
@@ -143,13 +143,12 @@ def corrected_noise(
 
     *Noise above the estimate.* The residuals of inliers are Gaussian with the estimated variance times a factor. The
     pixels of outliers are uniform in an area. The candidate factors are powers of 4, and the share of inliers is
-    estimated for each factor. The factor of the largest likelihood replaces 1 if its likelihood is more than
-    :math:`e^3` times the likelihood of 1. Three inliers do not count in the likelihood, because a pose can fit any
-    three pairs.
+    estimated for each factor. The most likely factor is used if its likelihood is more than :math:`e^3` times the
+    likelihood of the factor 1. Three inliers do not count in the likelihood, because a pose can fit any three pairs.
 
     *Noise below the estimate.* The factor is the a posteriori variance factor of an adjustment: the weighted sum of
-    squared residuals over the degrees of freedom. The weights are small for all pairs but those deep within the kernel.
-    The factor replaces 1 if it is below 1 and its likelihood is more than :math:`e^3` times the likelihood of 1.
+    squared residuals over the degrees of freedom. Only pairs deep within the kernel have large weights. The factor is
+    used if it is below 1 and its likelihood is more than :math:`e^3` times the likelihood of the factor 1.
 
     With confidences, the noise is first made to depend on the confidence if the residuals show such a dependence.
 
@@ -269,10 +268,9 @@ def _information_factor(
     """Factor of each pair's precision, (B, N), if the residuals show that the noise depends on the confidence, else 1.
 
     Keypoints of a network are often less accurate at low confidence, but the confidence of a matcher says nothing about
-    the noise. The standard deviation is therefore proportional to a power of the confidence, or independent of the
-    confidence. The power replaces 0 if its likelihood (see :func:`_log_likelihoods`) is more than :math:`e^3` times the
-    likelihood of 0, and if most pairs are inliers. With many outliers, outliers with small residuals would pass for
-    noisy inliers.
+    the noise. The standard deviation is therefore proportional to a power of the confidence, or constant. A power is
+    used if its likelihood (see :func:`_log_likelihoods`) is more than :math:`e^3` times the likelihood of constant
+    noise, and if most pairs are inliers. Otherwise, outliers with small residuals could pass for noisy inliers.
     """
     assert problem.confidence is not None
     there = problem.weights > 0

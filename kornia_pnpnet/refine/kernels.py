@@ -3,11 +3,11 @@ r"""Robust kernels: the weight of a pair as a function of its squared residual.
 A new kernel is a new entry of :data:`KERNELS`.
 
 A kernel consists of a loss :math:`\rho(s)` of the squared residual :math:`s = \|r\|^2` and of its derivative
-:math:`w(s) = \rho'(s)`. Both have one *shape* parameter. Iteratively reweighted least squares with the weight :math:`w`
-minimises :math:`\sum \rho`. The residual is in pixels of the normalised camera or, if the noise is known, in standard
-deviations. The shape of ``huber``, ``cauchy``, ``geman_mcclure`` and ``truncated`` is a scale in the unit of the
-residual. The shape of ``power`` is the exponent :math:`\alpha` of the weight :math:`w = 1/\|r\|^\alpha` of PnP-Net (see
-:func:`~kornia_pnpnet.refine.residual.lm_step` for the source).
+:math:`w(s) = \rho'(s)`. Loss and derivative have one *shape* parameter. Iteratively reweighted least squares with the
+weight :math:`w` minimises :math:`\sum \rho`. The residual is in pixels of the normalised camera or, if the noise is
+known, in standard deviations. The shape of ``huber``, ``cauchy``, ``geman_mcclure`` and ``truncated`` is a scale in the
+unit of the residual. The shape of ``power`` is the exponent :math:`\alpha` of the weight :math:`w = 1/\|r\|^\alpha` of
+PnP-Net (see :func:`~kornia_pnpnet.refine.residual.lm_step` for the source).
 """
 
 from __future__ import annotations
@@ -20,8 +20,7 @@ from torch import Tensor
 
 __all__ = ["KERNELS", "POWER_FLOOR", "RobustKernel"]
 
-#: Pixels. The square of this value is added to squared residuals in ``power``, because the weight at 0 would be
-#: infinite.
+#: Pixels. ``power`` adds the square to squared residuals, because its weight at 0 would be infinite otherwise.
 POWER_FLOOR = 0.1
 
 

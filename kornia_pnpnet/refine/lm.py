@@ -60,8 +60,8 @@ class Plan(NamedTuple):
             every problem, and so on.
         area: :func:`~kornia_pnpnet.refine.information.outlier_area` of problems whose noise is corrected by residuals,
             0 for all other problems, :math:`(B, 1)`; ``None``: no noise is corrected.
-        noiseless: problems without noise from the caller, in a batch with noise from the caller only, bool
-            :math:`(B,)`; ``None``: the batch has no noise, or the initialiser estimated noise.
+        noiseless: problems without noise in a batch with noise from the caller, bool :math:`(B,)`; ``None``: the caller
+            gave no noise, or the initialiser returned noise.
         hyperparameters: step :math:`\gamma`, damping :math:`\lambda` and the kernel's shape of each iteration, scalars.
         starts: number :math:`S` of initial states of each problem.
     """
@@ -91,7 +91,7 @@ class Refinement(NamedTuple):
     Attributes:
         state: the refined pose in the frame of the problem, and the refined camera.
         weights: the weight of each pair at the refined pose, shape :math:`(B, N)`.
-        cost: robust loss of pairs and terms at the refined pose, per pair, shape :math:`(B,)`.
+        cost: robust loss of pairs and terms, divided by the number of pairs, shape :math:`(B,)`.
         ok: whether the pose is to be believed, see :meth:`RobustWeightedLM.forward`, bool, shape :math:`(B,)`.
         in_front: whether at least three pairs with a weight are in front of the camera, bool, shape :math:`(B,)`.
         probability: probability that the pose is correct, see :func:`~kornia_pnpnet.judge.belief.probability`, shape
@@ -369,8 +369,8 @@ class RobustWeightedLM(Configured):
             return Progress(state, solved, now.factor)
         new = self._cost(project(state, problem), problem, problem.weights, shape)
         old = self._cost(projection, problem, problem.weights, shape)
-        # At a minimum, rounding errors decide which cost is lower. Steps there are accepted, because a rejected step
-        # has no gradient.
+        # At a minimum, rounding errors decide which cost is lower. Such steps are accepted, because a rejected step has
+        # no gradient.
         rounding = _ROUNDING * torch.finfo(new.dtype).eps
         better = new <= old * (1.0 + rounding) + (rounding * projection.focal).square()
         factor = torch.where(better, now.factor * _DAMPING_DOWN, now.factor * _DAMPING_UP)
@@ -388,7 +388,7 @@ class RobustWeightedLM(Configured):
         return equations
 
     def _best(self, rivals: Problem, prior: Tensor, shape: Tensor, now: Progress) -> Progress:
-        """Keep the state of the lowest cost of each problem. Only ``prior`` has one entry per problem."""
+        """Keep the state of the lowest cost of each problem, out of all states of the problem in ``now``."""
         batch = prior.shape[0]
         projection = project(map_tensors(torch.Tensor.detach, now.state), rivals)
         cost = self._cost(projection, rivals, rivals.weights, shape.detach())
@@ -410,8 +410,8 @@ class RobustWeightedLM(Configured):
         r"""Give a converged state the gradient of a minimum, by the implicit function theorem.
 
         Let :math:`g(\delta) = J^\top W r` at the state moved by :math:`\delta`. At the minimum :math:`g = 0`, so that
-        :math:`d\delta = -(\partial g / \partial \delta)^{-1} dg`. This is the gradient of a Newton step, whose value is
-        discarded. If the Newton matrix is not positive definite, the state is not a minimum yet, and the Gauss-Newton
+        :math:`d\delta = -(\partial g / \partial \delta)^{-1} dg`. The code takes a Newton step with this gradient and
+        the value 0. If the Newton matrix is not positive definite, the state is not a minimum yet, and the Gauss-Newton
         matrix is used. A second step with the same matrix makes second derivatives exact. With covariances, which
         rotate with the pose, the matrix is not exactly symmetric. A third step then removes most of the error.
         """

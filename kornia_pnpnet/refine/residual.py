@@ -4,10 +4,10 @@ Convention: ``x_cam = R x_world + t``; the camera looks along +z; pixels belong 
 and the principal point 0. A point is *in front* when its depth exceeds ``MIN_DEPTH_RATIO`` times its distance. The test
 does not depend on the unit of the world.
 
-The dimensions of arrays in this module are coordinates, pairs, problems. An operation then runs over long rows of
-memory even if each problem has few pairs. Kornia's ``transform_points`` and ``project_points`` compute the same
-projection (``tests/test_kornia_contract.py``), but neither residual nor Jacobian. For 1000 problems of 9 pairs, these
-batch-first functions take three times as long as this module.
+The dimensions of arrays in this module are coordinates, pairs and problems, in this order. An operation then runs over
+long rows of memory even if each problem has few pairs. Kornia's ``transform_points`` and ``project_points`` compute the
+same projection (``tests/test_kornia_contract.py``), but neither residual nor Jacobian. For 1000 problems of 9 pairs,
+these batch-first functions take three times as long as this module.
 """
 
 from __future__ import annotations
@@ -42,10 +42,9 @@ __all__ = [
     "rotation_angle",
 ]
 
-#: A point ``x`` with depth ``z <= MIN_DEPTH_RATIO * |x|`` counts as behind the camera. The ratio bounds ``|x / z|`` by
-#: 1000.
+#: A point ``x`` of depth ``z <= MIN_DEPTH_RATIO * |x|`` is behind the camera. In front, ``|x / z|`` is below 1000.
 MIN_DEPTH_RATIO = 1e-3
-# Largest change in one step: of the logarithm of the focal length, whose exponential could overflow otherwise, and of a
+# Largest changes in one step, of the logarithm of the focal length (its exponential must not overflow) and of a
 # coefficient of radial distortion.
 _LARGEST_ZOOM, _LARGEST_RADIAL = 1.0, 0.3
 
@@ -185,10 +184,7 @@ def pixel_variance(projection: Projection, noise: Noise) -> Tensor:
 
 
 def pixel_covariance(projection: Projection, problem: Problem, noise: Noise) -> Symmetric2:
-    """:func:`covariance_at` for the points of a :class:`Projection`, entries :math:`(B, N)`.
-
-    Behind the camera only the noise of the pixel counts.
-    """
+    """:func:`covariance_at` of a projection, entries (B, N). Behind the camera only the noise of the pixel counts."""
     rotation = projection.state.pose.rotation[:, None]
     rotation = rotation if problem.rig is None else problem.rig.rotation @ rotation
     p, q = (x.mT for x in projection.plane.unbind())
@@ -229,7 +225,7 @@ def normal_equations(
 
     Args:
         projection: the result of :func:`project`.
-        problem: the projected problem.
+        problem: the problem that was projected.
         weights: weight of each pair, :math:`(B, N)`, or 2x2 weight matrix of each pair with entries :math:`(B, N)`.
             Points behind the camera do not count.
         relative: divide the weights of each problem by the largest weight, so that products of tiny weights do not
@@ -326,7 +322,7 @@ def _entrywise_equations(
 
 
 def _columns(projection: Projection, problem: Problem) -> list[_Column]:
-    """The columns of :func:`_jacobian`. Constant columns save a quarter of the time, without a rig or distortion."""
+    """The columns of :func:`_jacobian`. Without rig and distortion two are constant, which saves a quarter of time."""
     if problem.rig is not None or projection.stretch is not None:
         u, v = _jacobian(projection, problem)
         return list(zip(u, v, strict=True))
@@ -461,7 +457,7 @@ def rotation_angle(rotation_a: Tensor, rotation_b: Tensor) -> Tensor:
     r"""Angle between two rotations.
 
     With :math:`D = A B^\top`, the angle is
-    :math:`\mathrm{atan2}(\|\tfrac12 \mathrm{vee}(D - D^\top)\|, \tfrac12(\mathrm{tr} D - 1))`. The equal formula
+    :math:`\mathrm{atan2}(\|\tfrac12 \mathrm{vee}(D - D^\top)\|, \tfrac12(\mathrm{tr} D - 1))`. The equivalent formula
     :math:`\arccos((\mathrm{tr} D - 1)/2)` loses half of its digits for small angles. The angle is not differentiable at
     0. Use the losses of :mod:`kornia_pnpnet.losses` for training.
 

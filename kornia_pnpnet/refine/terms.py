@@ -21,8 +21,8 @@ from kornia_pnpnet.result import Pose, PosePrior
 
 __all__ = ["CameraTerm", "PoseTerm", "add_term", "gravity_prior"]
 
-# Fraction of the largest eigenvalue or, in `_correlations`, of the unit diagonal. A smaller eigenvalue of an
-# information matrix counts as 0: nothing is known in the direction of its eigenvector.
+# Smallest eigenvalue of an information matrix in a known direction, relative to the largest eigenvalue or to a unit
+# diagonal. Smaller eigenvalues count as 0.
 _KNOWN = 1e-5
 # Standard deviations. Scale of the robust kernel if the caller gave no scale.
 _SCALE = 3.0
@@ -31,7 +31,8 @@ _LEAST_DENOMINATOR = 1e-4
 # Prior standard deviation of a coefficient of radial distortion. The prior keeps a coefficient close to 0 if the pairs
 # do not determine the coefficient.
 _RADIAL = 0.15
-# Largest number of matrices in one call of cuSOLVER's eigenvalues, which fails for a hundred thousand matrices.
+# Largest number of matrices whose eigenvalues are computed in one call of cuSOLVER. A call with a hundred thousand
+# matrices fails.
 _MOST_MATRICES = 10_000
 
 
@@ -48,7 +49,7 @@ def gravity_prior(world_down: Tensor, cam_down: Tensor, sigma: Tensor | float) -
             a number or :math:`(B,)`.
 
     Returns:
-        The prior. The rotation of its pose turns ``world_down`` to ``cam_down``; the heading of this rotation is
+        The prior. The rotation of its pose turns ``world_down`` to ``cam_down``. The heading of this rotation is
         arbitrary. Gradients flow to the directions and to sigma.
 
     Raises:
@@ -115,11 +116,7 @@ class CameraTerm(NamedTuple):
         return self._replace(expected=self.expected * pixels, focal=self.focal * pixels)
 
     def linearise(self, state: State) -> Linear:
-        """See :class:`~kornia_pnpnet.problem.Term`.
-
-        The residual is the difference of log f from its expected value, followed by the coefficients of radial
-        distortion, whose expected value is 0.
-        """
+        """Linearise the difference of log f from its expected value, and the coefficients of distortion."""
         assert self.information is not None
         batch, count = state.camera.shape
         offset = (self.focal / self.expected).log()
@@ -144,8 +141,8 @@ class PoseTerm(NamedTuple):
     Attributes:
         pose: the expected pose.
         information: inverse covariance of the pose, shape :math:`(B, 6, 6)`.
-        offset: the centroid of the caller's world in lengths of the problem, shape :math:`(B, 3)`. The offset is needed
-            because the shifts of the prior are shifts of the caller's world origin.
+        offset: the centroid of the caller's world in lengths of the problem, shape :math:`(B, 3)`. Shifts of the prior
+            refer to the origin of the caller's world.
         free: the only axis in the camera about which the rotation is unknown, 0 if there is no such axis, shape
             :math:`(B, 3)`.
         sq_scale: squared scale of the robust kernel, in squared standard deviations, shape :math:`(B,)`.
@@ -205,7 +202,7 @@ class PoseTerm(NamedTuple):
             about ``free``, :math:`(B, 6)`, and its squared Mahalanobis length, :math:`(B,)`.
         """
         turn = self.pose.rotation @ pose.rotation.mT
-        # Rotate the prior's pose about its free axis, so that it is as close as possible to the given pose.
+        # Rotate the prior's pose about the free axis, as close as possible to the given pose.
         free = self.free
         along = turn.diagonal(dim1=-2, dim2=-1).sum(-1) - (free * (turn @ free[..., None])[..., 0]).sum(-1)
         around = -(free * So3.vee(turn - turn.mT)).sum(-1)
@@ -247,7 +244,7 @@ class PoseTerm(NamedTuple):
         return torch.where(self.sq_scale.isinf(), square, -scale * torch.expm1(-square / scale))
 
     def disagreement(self, pose: Pose) -> Tensor:
-        """See :class:`~kornia_pnpnet.problem.Term`. A prior of two known directions counts as one pair."""
+        """See :class:`~kornia_pnpnet.problem.Term`. A prior of two known directions counts at most as one outlier."""
         scale = torch.where(self.sq_scale.isinf(), _SCALE**2 * self.rank.clamp(min=1.0), self.sq_scale)
         return -0.5 * self.rank * torch.expm1(-self.errors(pose)[1] / scale)
 
@@ -279,7 +276,7 @@ def _open_axis(information: Tensor) -> Tensor:
 
 
 def _correlations(information: Tensor) -> tuple[Tensor, Tensor]:
-    """Ascending eigenvalues (B, 6) of an information scaled to a unit diagonal, and whether it is symmetric, (B,)."""
+    """Ascending eigenvalues (B, 6) of matrices scaled to a unit diagonal; whether each matrix is symmetric, (B,)."""
     diagonal = information.detach().double().diagonal(dim1=1, dim2=2)
     size = torch.where(diagonal > 0, diagonal, 1.0).rsqrt()
     scaled = information.detach().double() * size[:, :, None] * size[:, None]
