@@ -48,7 +48,7 @@ class Plan(NamedTuple):
     r"""The inputs of all iterations of a refinement, prepared before the first iteration.
 
     Attributes:
-        problem: the problem in the memory layout of :func:`~kornia_pnpnet.core.performance.problems_last`, with the
+        problem: the problem in the memory layout of ``kornia_pnpnet.core.performance.problems_last``, with the
             weights of the caller, and with known noise of every pair or without noise.
         prior: weight of each pair without the robust weight, for the cost and :meth:`RobustWeightedLM.judge`,
             :math:`(B, N)`. With iterations by residual, ``prior`` is the weight of the caller. Otherwise ``prior`` is

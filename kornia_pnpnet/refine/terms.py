@@ -166,7 +166,7 @@ class PoseTerm(NamedTuple):
             scale: lengths of the problem per unit of the caller's world, (B,).
 
         Returns:
-            The term, and whether the prior is usable (see :func:`_is_usable`), bool (B,). The information of an
+            The term, and whether the prior is usable (see ``_is_usable``), bool (B,). The information of an
             unusable prior becomes 0.
         """
         usable = _is_usable(prior)
