@@ -1,1 +1,1 @@
-"""What the rest of the package stands on and no user sees: checks, linear algebra, compilation, files, schemas."""
+"""Internal foundations of the package: checks, linear algebra, compilation, files, schemas."""

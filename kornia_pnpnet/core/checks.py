@@ -1,4 +1,4 @@
-"""Checks of arguments. Every error names the argument, what it must be and what it was."""
+"""Checks of arguments. Every error message names the argument, the expected value and the received value."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ __all__ = [
     "expand_sigma",
 ]
 
-#: Maps the name of each argument to its tensor (``None``: not given, not checked) and the shape it must have.
+#: Maps the name of each argument to its tensor and its expected shape. A tensor that is ``None`` is not checked.
 Shapes: TypeAlias = dict[str, tuple[Tensor | None, tuple[int, ...]]]
 
 
@@ -35,9 +35,9 @@ def _is_number(value: Any) -> bool:
 
 
 def check_whole(least: int, most: int | None = None, /, **values: Any) -> None:
-    """Raise ``BaseError`` unless each value is an integer from ``least`` to ``most`` (``None``: without upper bound).
+    """Raise ``BaseError`` unless each value is an integer from ``least`` to ``most``.
 
-    NumPy integers pass, booleans do not.
+    ``most=None`` means that there is no upper bound. NumPy integers pass, booleans do not.
     """
     bounds = f"of at least {least}" if most is None else f"from {least} to {most}"
     for name, value in values.items():
@@ -61,7 +61,7 @@ def check_positive(*, or_infinite: bool = False, **values: Any) -> None:
 
 
 def check_ranges(**values: Any) -> None:
-    """Raise ``BaseError`` unless each value is a pair of positive numbers, the second not smaller than the first."""
+    """Raise ``BaseError`` unless each value is two finite numbers ``(low, high)`` with ``0 < low <= high``."""
     for name, value in values.items():
         two_numbers = hasattr(value, "__len__") and len(value) == 2 and all(map(_is_number, value))
         in_order = two_numbers and 0 < value[0] <= value[1]
@@ -69,7 +69,10 @@ def check_ranges(**values: Any) -> None:
 
 
 def check_shapes(shapes: Shapes, like: Tensor | None = None) -> None:
-    """Raise ``ShapeError`` for a tensor of another shape. ``like``: the world points that the error message names."""
+    """Raise ``ShapeError`` when a tensor does not have its expected shape.
+
+    The error message also names the shape of ``like``, the world points.
+    """
     for name, (tensor, expected) in shapes.items():
         if tensor is not None and tensor.shape != expected:
             beside = "" if like is None else f" to go with world_points of {tuple(like.shape)}"
@@ -79,7 +82,12 @@ def check_shapes(shapes: Shapes, like: Tensor | None = None) -> None:
 
 
 def check_like(tensors: Mapping[str, Tensor | None], like: Tensor, like_name: str = "world_points") -> None:
-    """Raise ``TypeCheckError`` or ``DeviceError`` for a tensor of another dtype or device. ``None`` is not checked."""
+    """Raise an error when the dtype or the device of a tensor differs from ``like``. ``None`` is not checked.
+
+    Raises:
+        TypeCheckError: when the dtypes differ.
+        DeviceError: when the devices differ.
+    """
     for name, tensor in tensors.items():
         if tensor is not None and tensor.dtype != like.dtype:
             raise TypeCheckError(f"{name} is {tensor.dtype} but {like_name} is {like.dtype}.")
@@ -87,17 +95,19 @@ def check_like(tensors: Mapping[str, Tensor | None], like: Tensor, like_name: st
 
 
 def check_devices(tensors: Mapping[str, Tensor | None], like: Tensor, like_name: str = "world_points") -> None:
-    """Raise ``DeviceError`` for a tensor on another device, even one without dimensions. ``None`` is not checked."""
+    """Raise ``DeviceError`` when the device of a tensor differs from ``like``. ``None`` is not checked."""
     for name, tensor in tensors.items():
         if tensor is not None and tensor.device != like.device:
             raise DeviceError(f"{name} is on {tensor.device} but {like_name} is on {like.device}.")
 
 
 def common_dtype(tensors: Mapping[str, Tensor | None]) -> torch.dtype:
-    """The dtype to compute in: float64 when any tensor is float64, else float32. ``None`` does not count.
+    """Find the dtype for computation: float64 when any tensor is float64, else float32. ``None`` does not count.
 
-    Half precision has too few digits for a pixel, and integers have no gradient. ``TypeCheckError`` for a tensor of
-    booleans or complex numbers.
+    Half precision is too coarse for pixel coordinates, and integers have no gradient.
+
+    Raises:
+        TypeCheckError: when a tensor holds booleans or complex numbers.
     """
     given = {name: tensor.dtype for name, tensor in tensors.items() if tensor is not None}
     for name, dtype in given.items():
@@ -107,12 +117,15 @@ def common_dtype(tensors: Mapping[str, Tensor | None]) -> torch.dtype:
 
 
 def expand_sigma(name: str, sigma: Tensor | float | None, world_points: Tensor) -> Tensor:
-    """Check a standard deviation that a user gave, and expand it to every pair: shape (*, N).
+    """Check the type, device and shape of a standard deviation, and expand it to every pair.
 
     Args:
         name: name of the argument in error messages.
-        sigma: a number, a tensor of shape (), (*) or (*, N), or ``None`` for unknown: NaN.
+        sigma: a number, a tensor of shape (), (*) or (*, N), or ``None`` if unknown.
         world_points: shape (*, N, 3).
+
+    Returns:
+        Shape (*, N), in the dtype of the world points; NaN if ``sigma`` is ``None``.
     """
     pairs = world_points.shape[:-1]
     if sigma is None or isinstance(sigma, int | float):

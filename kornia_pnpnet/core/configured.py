@@ -1,4 +1,4 @@
-"""Modules that remember the arguments of their constructor, for their configuration file and their text."""
+"""Modules that remember the arguments of their constructor, for configuration files and for ``repr``."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ __all__ = ["Configured"]
 
 
 class Configured(nn.Module):
-    """A module whose ``config`` holds the arguments of its constructor, except those that are modules.
+    """A module whose ``config`` holds the arguments of its constructor, except arguments that are modules.
 
     Args:
-        arguments: ``locals()`` of the constructor that calls this one, before any other variable is assigned.
+        arguments: ``locals()`` of the subclass's constructor, called before that constructor assigns any variable.
 
     Example:
         >>> class Scale(Configured):
@@ -30,7 +30,7 @@ class Configured(nn.Module):
         self.config: dict[str, Any] = {}
         for name, value in arguments.items():
             if name not in ("self", "__class__") and not isinstance(value, nn.Module):
-                is_numpys = isinstance(value, Integral) and not isinstance(value, bool)  # JSON takes Python's integers
+                is_numpys = isinstance(value, Integral) and not isinstance(value, bool)  # JSON has no NumPy integers
                 self.config[name] = int(value) if is_numpys else value
 
     def extra_repr(self) -> str:

@@ -1,4 +1,4 @@
-"""Versions and machine, for files that hold measured numbers."""
+"""Software versions and a description of the machine, for files of measured results."""
 
 from __future__ import annotations
 
@@ -15,17 +15,18 @@ import torch
 __all__ = ["environment"]
 
 _PACKAGES = ("kornia_pnpnet", "torch", "kornia", "numpy", "opencv", "kornia_rs", "poselib", "pycolmap")
-# Distributions of OpenCV, the most common first.
+# Distributions of OpenCV on PyPI, the most common distribution first.
 _OPENCV = ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python")
 
 
 def environment() -> dict[str, Any]:
-    """Describe the versions and the machine that numbers are measured with.
+    """Describe the software and the machine of a measurement.
 
     Returns:
-        ``versions`` of the packages (``None``: not installed), ``python``, ``platform``, ``cpu``, ``threads`` of
-        PyTorch, ``gpu``, ``commit`` of the checkout that the package runs from (``+`` at the end: with changed files;
-        ``None``: outside a checkout) and the ``date`` in UTC.
+        A dictionary with ``versions`` of the packages (``None`` for a package that is not installed), ``python``,
+        ``platform``, ``cpu``, ``threads`` (number of threads of PyTorch), ``gpu`` (``None`` without a GPU), ``commit``
+        and ``date`` (in UTC). ``commit`` is the commit of the git checkout that contains the package, with a trailing
+        ``+`` if tracked files have changes. Outside of a checkout ``commit`` is ``None``.
     """
     return {
         "versions": {name: _version(name) for name in _PACKAGES},
@@ -54,7 +55,7 @@ def _cpu_name() -> str:
 
 
 def _commit() -> str | None:
-    """The commit of the checkout that this file belongs to, not of a checkout with an installed copy."""
+    """The commit of the git checkout whose source tree contains this file, ``None`` for an installed copy."""
     root = Path(__file__).resolve().parents[2]
     git = ["git", "-C", str(root)]
     with suppress(OSError, ValueError, subprocess.SubprocessError):

@@ -1,4 +1,4 @@
-"""Write files in one piece, read CSV and NPZ files, digest contents."""
+"""Atomic writing of files, reading of CSV and NPZ files, and digests of contents."""
 
 from __future__ import annotations
 
@@ -19,12 +19,16 @@ from torch import Tensor
 
 __all__ = ["MOST_BYTES", "InputError", "atomic_open", "digest", "read_csv", "read_npz", "write_json"]
 
-#: Largest number of bytes read from a file at once. A few compressed megabytes can unpack to gigabytes.
+#: Bytes. Largest total size of the arrays that :func:`read_npz` unpacks, because a few compressed megabytes can unpack
+#: to gigabytes.
 MOST_BYTES = 2**31
 
 
 class InputError(ValueError):
-    """A file or an option cannot be used. The message is one line that names it and, in text files, the line."""
+    """An input file or a command-line option cannot be used.
+
+    The message is a single line with the name of the file or option and, for text files, the line number.
+    """
 
     def __init__(self, source: str | Path, message: str, line: int | None = None) -> None:
         place = source if line is None else f"{source}:{line}"
@@ -33,9 +37,10 @@ class InputError(ValueError):
 
 @contextmanager
 def atomic_open(path: str | Path, mode: str = "w", **options: Any) -> Iterator[IO[Any]]:
-    """Open a file for writing that takes its name only when it is complete and on disk.
+    """Open a temporary file for writing, and rename the complete file to ``path``.
 
-    A process that is killed or finds the disk full leaves the old file as it was. Missing folders are made.
+    If the process is killed or the disk is full, an existing file at ``path`` does not change. Missing folders are
+    made.
     """
     path = Path(path)
     if path.is_dir():
@@ -53,19 +58,23 @@ def atomic_open(path: str | Path, mode: str = "w", **options: Any) -> Iterator[I
 
 
 def write_json(path: str | Path, content: Any) -> None:
-    """Write an indented JSON file in one piece. ``ValueError`` for numbers that are not finite."""
+    """Write an indented JSON file by :func:`atomic_open`.
+
+    Raises:
+        ValueError: when a number is not finite.
+    """
     with atomic_open(path, encoding="utf-8") as file:
         file.write(json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
 def read_csv(path: str | Path, columns: Sequence[str], optional: Sequence[str] = ()) -> dict[int, dict[str, str]]:
-    """Read the rows of a CSV file with a header: maps the number of the line to the cells by column.
+    """Read a CSV file with a header, and map the line number of each row to its cells by column name.
 
-    Blank lines and spaces around cells are dropped; further columns are kept.
+    Blank lines and spaces around cells are dropped. Columns beyond ``columns`` and ``optional`` are kept.
 
     Raises:
-        InputError: when the file is not CSV in UTF-8, lacks one of the ``columns``, has one of them or an ``optional``
-            one twice, or a row has more or fewer cells than the header.
+        InputError: when the file is not CSV in UTF-8, when one of the ``columns`` is missing, when one of the
+            ``columns`` or ``optional`` columns occurs twice, or when a row has more or fewer cells than the header.
     """
     content = Path(path).read_bytes()
     try:
@@ -87,11 +96,15 @@ def read_csv(path: str | Path, columns: Sequence[str], optional: Sequence[str] =
 
 
 def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
-    """Read the arrays of an NPZ file, or those of these names that it has, without unpickling.
+    """Read arrays of an NPZ file, without unpickling.
+
+    Args:
+        path: the NPZ file.
+        names: names of the arrays to read; ``None``: all arrays. Names that the file lacks are ignored.
 
     Raises:
-        ValueError: when the file is not an NPZ file of numbers, or has more than :data:`MOST_BYTES` of them. The
-            message does not name the file.
+        ValueError: when the file is not an NPZ file of numbers, or when the arrays take more than :data:`MOST_BYTES`.
+            The message does not name the file.
     """
     with path.open("rb") as file:
         try:
@@ -102,22 +115,22 @@ def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, np.n
                 size = sum(wanted.values())
                 if size <= MOST_BYTES:
                     return {name: np.asarray(content[name]) for name in wanted}
-        except Exception as error:  # numpy, zipfile and zlib raise a dozen types of errors for broken files
+        except Exception as error:  # numpy, zipfile and zlib raise many types of errors for broken files
             raise ValueError(f"not an NPZ file of numbers: {error}") from error
     raise ValueError(f"the numbers take {size / 1e9:.1f} GB, more than {MOST_BYTES / 1e9:.1f} GB: split the file")
 
 
 def digest(*parts: Any) -> str:
-    """SHA-256, in hexadecimal, of contents one after the other.
+    """Compute one hexadecimal SHA-256 digest of the concatenated parts.
 
-    The digest of a tensor depends on dtype, shape and values, not on the device. Plain data are digested as JSON with
-    sorted keys.
+    The digest of a tensor depends on dtype, shape and values, not on the device. Strings and bytes are digested
+    directly, all other data as JSON with sorted keys.
     """
     sha = hashlib.sha256()
     for part in parts:
         if isinstance(part, Tensor):
             values = part.detach().cpu().contiguous()
-            content = values.reshape(-1).view(torch.uint8).numpy().tobytes()  # NumPy does not have every dtype
+            content = values.reshape(-1).view(torch.uint8).numpy().tobytes()  # NumPy lacks some dtypes
             sha.update(f" {values.dtype} {tuple(values.shape)}".encode() + content)
         elif isinstance(part, bytes):
             sha.update(part)

@@ -1,7 +1,7 @@
-"""Linear algebra of small matrices, written out in elementwise operations. The batch is the last dimension.
+"""Linear algebra of small matrices, by elementwise operations. The batch is usually the last dimension.
 
-A thousand 3 by 3 matrices are 9 vectors of a thousand numbers: an operation on such vectors takes about a microsecond,
-a thousand calls of LAPACK about a millisecond.
+For 1000 matrices of size 3×3, an elementwise operation on one entry of all matrices takes about a microsecond. One call
+of LAPACK for each matrix takes about a millisecond in total.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ __all__ = [
     "substitute",
 ]
 
-# Sweeps of Jacobi's rotations in `eigenvectors`. After two, the median error of an eigenvalue of a random matrix is
-# below 1e-9 of the matrix's norm (tests/test_core_linalg.py).
+# Sweeps of Jacobi's rotations in `eigenvectors`. After two sweeps, the median error of an eigenvalue of a random matrix
+# is below 1e-9 of the matrix's norm (tests/test_core_linalg.py).
 _SWEEPS = 2
-# Units in the last place of the diagonal. A pivot below this is rounding.
+# Units in the last place of the diagonal entry. A smaller pivot counts as a rounding error.
 _PIVOT = 10.0
-# Matrices. Up to this number LAPACK decomposes in the time of the calls of the closed form (429 and 435 µs).
+# Matrices. Up to this number LAPACK's singular value decomposition is as fast as the closed form (429 and 435 µs).
 _MOST_BY_LAPACK = 128
 
 
@@ -71,7 +71,7 @@ class _BoundedGradient(torch.autograd.Function):
 
 
 def bound_gradient(values: Tensor, limit: float) -> Tensor:
-    """Return the values (B, *); their gradient is shortened, per problem, to a norm of at most ``limit``.
+    """Return values (B, *) unchanged, but shorten the gradient of each problem to a norm of at most ``limit``.
 
     A gradient that is not finite becomes 0.
     """
@@ -80,24 +80,28 @@ def bound_gradient(values: Tensor, limit: float) -> Tensor:
 
 
 def gate(value: Tensor, live: Tensor, finite: Tensor, fill: float | Tensor) -> Tensor:
-    """Keep the gradient of values (B, *) that are live (B,), the value of those that are finite (B,), fill the others.
+    """Replace values that are not finite, and stop the gradient of values that are not live.
 
-    The fill is a number or has the shape of one problem.
+    Args:
+        value: shape (B, *).
+        live: problems that keep their gradient, bool, shape (B,).
+        finite: problems that keep their value, bool, shape (B,).
+        fill: the value of all other problems, a number or a tensor with the shape of one problem.
     """
     shape = (-1,) + (1,) * (value.ndim - 1)
-    if torch.is_grad_enabled():  # a tensor that forward mode differentiates does not require a gradient
+    if torch.is_grad_enabled():  # not `value.requires_grad`, which is false in forward mode
         value = torch.where(live.view(shape), value, value.detach())
     return torch.where(finite.view(shape), value, fill).contiguous()
 
 
 def relative(values: Tensor, size: Tensor) -> Tensor:
-    """Divide the values (B, N) of each problem by its largest ``size`` (B, N), a constant, unless that is 0."""
+    """Divide the values (B, N) of each problem by its largest ``size``, a constant, unless that size is 0."""
     largest = size.detach().amax(1, keepdim=True)
     return values / torch.where(largest > 0, largest, 1.0)
 
 
 def small_product(a: Tensor, b: Tensor) -> Tensor:
-    """Product (R, C, *) of small matrices (R, K, *) and (K, C, *): several times faster than a batched ``matmul``."""
+    """Multiply small matrices (R, K, *) and (K, C, *), several times faster than a batched ``matmul``."""
     (column, row), *others = zip(a.unsqueeze(2).unbind(1), b.unbind(0), strict=True)  # (R, 1, *) and (C, *)
     total = column * row
     for column, row in others:
@@ -106,7 +110,7 @@ def small_product(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _cofactors(matrix: Tensor) -> Tensor:
-    """Cofactors of matrices (3, 3, *): the rows are the cross products of the rows of the matrix."""
+    """Cofactors of matrices (3, 3, *): each row is the cross product of the other two rows of the matrix."""
     m = [row.unbind(0) for row in matrix.unbind(0)]
     turns = ((1, 2), (2, 0), (0, 1))
     entries = [torch.addcmul(m[i][k] * m[j][n], m[i][n], m[j][k], value=-1) for i, j in turns for k, n in turns]
@@ -114,7 +118,7 @@ def _cofactors(matrix: Tensor) -> Tensor:
 
 
 def _eye(like: Tensor) -> Tensor:
-    """The identity, shape (3, 3, 1, …), for matrices (3, 3, *)."""
+    """The identity with the shape (3, 3, 1, …), for matrices (3, 3, *)."""
     return torch.eye(3, dtype=like.dtype, device=like.device).view(3, 3, *(1,) * (like.ndim - 2))
 
 
@@ -123,7 +127,7 @@ def _rotation_by_svd(matrix: Tensor) -> tuple[Tensor, Tensor]:
     limits = torch.finfo(matrix.dtype)
     flat = matrix.reshape(3, 3, -1).permute(2, 0, 1)
     size = torch.linalg.vector_norm(flat, torch.inf, (1, 2), keepdim=True)  # (B, 1, 1)
-    sound = size.clamp(limits.tiny**0.5, limits.max) == size  # LAPACK raises for NaN
+    sound = size.clamp(limits.tiny**0.5, limits.max) == size  # LAPACK raises an error for NaN
     left, values, right = torch.linalg.svd(torch.where(sound, flat, 0.0))
     rotation = torch.bmm(left, right)
     proper = torch.linalg.det(rotation)[:, None, None]  # 1 or -1
@@ -139,9 +143,10 @@ def _rotation_in_closed_form(matrix: Tensor) -> tuple[Tensor, Tensor]:
     """:func:`nearest_rotation` entry by entry, without gradient."""
     eps = torch.finfo(matrix.dtype).eps
     size = matrix.abs().amax((0, 1))
-    nonzero = size > torch.finfo(matrix.dtype).tiny ** 0.5  # below, the gradient would overflow
+    nonzero = size > torch.finfo(matrix.dtype).tiny ** 0.5  # the gradient of smaller matrices would overflow
     scaled = torch.where(nonzero, matrix, 0.0) / torch.where(nonzero, size, 1.0)
-    # The largest singular value: the squares of all three are the roots of x³ - 3 mean x² + minors x - det².
+    # The squares of the singular values are the roots of x³ - 3 mean x² + minors x - det². Viète's formula gives the
+    # largest root.
     cofactors = _cofactors(scaled)
     determinant = (scaled[0] * cofactors[0]).sum(0)
     mean = scaled.square().sum((0, 1)) / 3.0
@@ -149,17 +154,18 @@ def _rotation_in_closed_form(matrix: Tensor) -> tuple[Tensor, Tensor]:
     radius = (mean * mean - minors / 3.0).clamp(min=eps * eps).sqrt()
     cosine = (mean * (mean * mean - 0.5 * minors) + 0.5 * determinant * determinant) / radius**3
     largest = (mean + 2.0 * radius * (cosine.clamp(-1.0, 1.0).acos() / 3.0).cos()).sqrt()
-    # The stack makes a compiler compute these values once, not for each of the nine entries.
+    # Because of the stack a compiler computes these values once per matrix, not once per entry.
     largest, determinant = torch.stack((largest, determinant))
-    # With singular values s₁ ≥ s₂ ≥ |s₃|, the last with the sign of the determinant, the matrix plus its cofactors
-    # over s₁ has the same singular vectors and the values first = s₁ + s₂s₃/s₁ and, twice, second = s₂ + s₃, all
-    # positive. Of two distinct values the inverse square root is a polynomial of degree 1.
+    # Let s₁ ≥ s₂ ≥ |s₃| be the singular values, where s₃ has the sign of the determinant. The matrix plus its cofactors
+    # over s₁ is `upright`. The singular vectors of both matrices are equal, and the singular values of `upright` are
+    # first = s₁ + s₂s₃/s₁ (once) and second = s₂ + s₃ (twice). The Gram matrix of `upright` therefore has two distinct
+    # eigenvalues. The inverse square root of such a Gram matrix is a polynomial of degree 1 in the Gram matrix.
     upright = scaled + cofactors / largest
     first = largest + determinant / (largest * largest)
     square = first * first
-    minors = _cofactors(upright).square().sum((0, 1))  # 2 first² second² + second⁴
+    minors = _cofactors(upright).square().sum((0, 1))  # equals 2 first² second² + second⁴
     second = (minors / (square + torch.addcmul(minors, square, square).sqrt())).sqrt()
-    unique = second > eps**0.75 * first  # Newton-Schulz below converges from here
+    unique = second > eps**0.75 * first  # otherwise the Newton-Schulz iteration does not converge
     second = torch.where(unique, second, 1.0)
     constant = second.reciprocal() + second / (first * (first + second))
     linear = -(first * second * (first + second)).reciprocal()
@@ -167,15 +173,16 @@ def _rotation_in_closed_form(matrix: Tensor) -> tuple[Tensor, Tensor]:
     eye = _eye(matrix)
     gram = small_product(upright.transpose(0, 1), upright)
     rotation = small_product(upright, torch.addcmul(constant * eye, linear, gram))
-    for _ in range(2):  # Newton-Schulz removes the deviation from orthogonality that rounding left
+    for _ in range(2):  # the Newton-Schulz iteration removes rounding errors of the orthogonality
         gram = small_product(rotation.transpose(0, 1), rotation)
         rotation = small_product(rotation, 1.5 * eye - 0.5 * gram)
     return torch.where(unique, rotation, eye), unique
 
 
 def _turned(change: Tensor, matrix: Tensor, rotation: Tensor, unique: Tensor) -> Tensor:
-    """The change of the nearest rotation by a change of the matrix."""
-    # With M = R S, a change dM turns the rotation by dR = R [w], where (tr S - S) w is the vector of Rᵀ dM - dMᵀ R.
+    """The derivative of the nearest rotation in the direction ``change`` of the matrix."""
+    # With M = R S, a change dM of the matrix changes the rotation by dR = R hat(w), where (tr(S) I - S) w = vee(Rᵀ dM -
+    # dMᵀ R).
     transposed = rotation.transpose(0, 1)
     inner = small_product(transposed, matrix)
     size = inner.abs().amax((0, 1))
@@ -207,12 +214,12 @@ class _NearestRotation(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> Tensor:
-        # The map from dM to dR is symmetric: it takes a gradient by R to the gradient by M.
+        # The linear map from dM to dR is symmetric. The same map therefore takes a gradient by R to the gradient by M.
         return _turned(gradients[0], *ctx.saved_tensors)
 
 
 class _NearestRotationForward(_NearestRotation):
-    """With a rule for forward mode, which ``torch.compile`` refuses to trace."""
+    """``_NearestRotation`` with forward-mode differentiation, which ``torch.compile`` cannot trace."""
 
     generate_vmap_rule = True
 
@@ -223,23 +230,23 @@ class _NearestRotationForward(_NearestRotation):
 
     @staticmethod
     def jvp(ctx: Any, change: Tensor) -> tuple[Tensor, None]:
-        # A tangent must have the memory layout of its value.
+        # PyTorch requires that a tangent has the memory layout of its value.
         return torch.zeros_like(ctx.saved_tensors[1]) + _turned(change, *ctx.saved_tensors), None
 
 
 def nearest_rotation(matrix: Tensor) -> tuple[Tensor, Tensor]:
     r"""Find the rotation :math:`R` that maximises :math:`\mathrm{tr}(R^\top M)` (orthogonal Procrustes).
 
-    The closed form takes a fifth of the time of LAPACK's singular value decomposition for 1000 matrices. LAPACK
-    decomposes few matrices.
+    Uncompiled code on a CPU decomposes up to 128 matrices by LAPACK. Otherwise a closed form is used, which takes a
+    fifth of the time of LAPACK for 1000 matrices.
 
     Args:
         matrix: :math:`M` with the batch last, shape :math:`(3, 3, *)`.
 
     Returns:
-        The rotations, shape :math:`(3, 3, *)`, and whether each is unique, bool, shape :math:`(*)`: whether
-        :math:`s_2 + s_3 > 0` for singular values :math:`s_1 \ge s_2 \ge |s_3|`, the last with the sign of the
-        determinant. Where it is not unique, the identity without gradient is returned.
+        The rotations, shape :math:`(3, 3, *)`, and whether each rotation is unique, bool, shape :math:`(*)`. A rotation
+        is unique when :math:`s_2 + s_3 > 0`. The singular values are :math:`s_1 \ge s_2 \ge |s_3|`, where :math:`s_3`
+        has the sign of the determinant. If the rotation is not unique, the identity without gradient is returned.
 
     Example:
         >>> rotation, unique = nearest_rotation(torch.diag(torch.tensor([3.0, 2.0, 0.0])))
@@ -252,19 +259,19 @@ def nearest_rotation(matrix: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def align(source: Tensor, target: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    r"""Find the rigid motion and the scale that move points onto other points, by weighted least squares.
+    """Find the rigid motion and the similarity that best map source points to target points (weighted least squares).
 
     Source: S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991.
 
     Args:
         source: points :math:`x`, shape :math:`(B, K, 3)`.
         target: points :math:`y`, shape :math:`(B, K, 3)`.
-        weights: at least 0, shape :math:`(B, K)`.
+        weights: weight of each point, at least 0, shape :math:`(B, K)`.
 
     Returns:
         The rotation :math:`R`, shape :math:`(B, 3, 3)`, the translation :math:`t`, shape :math:`(B, 3)`, and the scale
-        :math:`s`, shape :math:`(B,)`: the best rigid motion is :math:`R x + t`, and the best similarity has the same
-        rotation.
+        :math:`s`, shape :math:`(B,)`. The best rigid motion is :math:`R x + t`. The best similarity has the rotation
+        :math:`R`, the scale :math:`s` and another translation.
 
     Example:
         >>> points = torch.tensor([[[0.0, 0, 0], [2, 0, 0], [0, 2, 0], [0, 0, 2]]])
@@ -285,17 +292,18 @@ def align(source: Tensor, target: Tensor, weights: Tensor) -> tuple[Tensor, Tens
 
 
 def span_a_plane(centred: Tensor, share: Tensor, size: Tensor) -> Tensor:
-    """Whether points span more than a line, bool (B,).
+    """Tell whether points span more than a line, bool (B,).
 
     Args:
         centred: the points minus their mean, 0 for padding, (3, N, B).
-        share: one over the number of points, (B,).
-        size: the largest coordinate of the points before they were centred, (B,). With 0 or NaN the result is false.
+        share: the inverse of the number of points, (B,).
+        size: the largest absolute coordinate of the points before centring, (B,). With a size of 0 or NaN the result is
+            false.
     """
-    # The second largest variance is about the sum of the principal minors of the covariance, (trace² - sum of squares)
-    # / 2, over the trace. For points on a line only rounding remains.
+    # The sum of the principal 2×2 minors of the covariance is (trace² - sum of squares) / 2. The sum divided by the
+    # trace approximates the second largest variance. For points on a line this variance is only a rounding error.
     eps = torch.finfo(centred.dtype).eps
-    covariance = (centred[:, None] * centred).sum(2) * (share / (size * size))  # (3, 3, B) in the unit of the size
+    covariance = (centred[:, None] * centred).sum(2) * (share / (size * size))  # (3, 3, B), in units of the size
     trace = covariance.diagonal().sum(-1)
     return ((1.0 - 16.0 * eps) * trace - 2.0 * (64.0 * eps) ** 2) * trace > covariance.square().sum((0, 1))
 
@@ -305,8 +313,8 @@ def solve_leading(
 ) -> list[list[Tensor]]:
     """Solve the leading blocks of symmetric systems by one LDLᵀ factorisation, entry by entry.
 
-    Each pivot grows by a small multiple of the diagonal. A singular system whose right side lies in the range of the
-    matrix therefore has a finite solution.
+    A small multiple of the diagonal entry is added to each pivot. The solution of a singular system is therefore finite
+    if the right side lies in the range of the matrix.
 
     Args:
         matrix: rows of the positive semi-definite matrices; entries above the diagonal are not read.
@@ -314,7 +322,7 @@ def solve_leading(
         sizes: sizes of the leading blocks to solve.
 
     Returns:
-        The entries of the solution of each block.
+        For each size, the entries of the solution.
 
     Example:
         >>> two, four, six = torch.tensor([[2.0], [4.0], [6.0]])
@@ -336,16 +344,17 @@ def solve_leading(
 def factorise(
     rows: list[list[Tensor]], rest: list[Tensor], inverse: Callable[[int, Tensor], Tensor]
 ) -> tuple[dict[tuple[int, int], Tensor], list[Tensor]]:
-    r"""Factorise symmetric matrices into LDLᵀ, entry by entry, and apply the factors to a right side.
+    """Factorise symmetric matrices into LDLᵀ, entry by entry, and apply the inverses of L and D to a right side.
 
     Args:
         rows: rows of the lower triangle with the diagonal; overwritten.
-        rest: entries of the right side; overwritten.
-        inverse: maps the index of a pivot and the pivot to the inverse of the pivot, also for a pivot of 0.
+        rest: entries of the right side :math:`b`; overwritten.
+        inverse: maps the index of a pivot and the pivot to the inverse of the pivot. The inverse of a pivot of 0 must
+            be finite, too.
 
     Returns:
-        The entries of :math:`L` below its unit diagonal by (row, column), and :math:`D^{-1} L^{-1}` times the right
-        side.
+        The entries of :math:`L` below its unit diagonal, keyed by (row, column), and the entries of
+        :math:`D^{-1} L^{-1} b`.
     """
     count = len(rest)
     lower, inverses = {}, []
@@ -360,7 +369,7 @@ def factorise(
 
 
 def substitute(lower: Mapping[tuple[int, int], Tensor], scaled: Iterable[Tensor]) -> list[Tensor]:
-    """Solve Lᵀ x = b, or the leading block of the size of b, with the entries of L of :func:`factorise`."""
+    """Solve Lᵀ x = b with L of :func:`factorise` or, if b is shorter, with the leading block of L of the size of b."""
     solution = list(scaled)
     for i in range(len(solution) - 1, 0, -1):
         for k in range(i):
@@ -371,8 +380,9 @@ def substitute(lower: Mapping[tuple[int, int], Tensor], scaled: Iterable[Tensor]
 def solve_positive(matrix: Tensor, right: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
     r"""Solve :math:`(H + \lambda\,\mathrm{diag}(H))\,x = g` for positive semi-definite matrices.
 
-    LAPACK solves few systems: a fifth of the time for one system. An LDLᵀ factorisation written out entry by entry
-    solves many systems and those of a graph: two thirds of the time for 1000 systems, and it compiles to one loop.
+    Uncompiled code on a CPU solves few systems by LAPACK, in a fifth of the time of LDLᵀ for one system. All other
+    systems are solved by an LDLᵀ factorisation, entry by entry. For 1000 systems LDLᵀ takes two thirds of the time of
+    LAPACK. LDLᵀ compiles to one loop.
 
     Args:
         matrix: :math:`H`, shape :math:`(K, K, B)`.
@@ -380,8 +390,9 @@ def solve_positive(matrix: Tensor, right: Tensor, damping: Tensor) -> tuple[Tens
         damping: :math:`\lambda \ge 0`, a scalar or :math:`(B,)`.
 
     Returns:
-        The solutions, shape :math:`(K, B)`, and whether all pivots are above rounding, in any units, bool :math:`(B,)`.
-        Where they are not the solution is 0, with finite gradients.
+        The solutions, shape :math:`(K, B)`, and whether each system could be solved, bool :math:`(B,)`. A system can be
+        solved when each pivot exceeds a multiple of the rounding error of its diagonal entry, a test that does not
+        depend on units. The solution of any other system is 0, with finite gradients.
 
     Example:
         >>> matrix, right = torch.tensor([[4.0, 0.0], [0.0, 4.0]])[..., None], torch.tensor([[8.0], [4.0]])
@@ -409,7 +420,8 @@ def solve_positive(matrix: Tensor, right: Tensor, damping: Tensor) -> tuple[Tens
     factor, info = torch.linalg.cholesky_ex(batched.detach())
     pivots = factor.diagonal(dim1=1, dim2=2).square().add(damped.detach().diagonal(), alpha=-_PIVOT * limits.eps)
     solved = (pivots > limits.tiny).all(1) & (info == 0)  # NaN compares false
-    # With a gradient, in either mode: a factorisation that failed would have gradients of NaN.
+    # For gradients (backward or forward mode), factorise again with the identity in place of systems that could not be
+    # solved: gradients of a failed factorisation are NaN.
     if batched.requires_grad or right.requires_grad or unpack_dual(batched).tangent is not None:
         factor = torch.linalg.cholesky_ex(torch.where(solved[:, None, None], batched, eye)).L
     solution = torch.cholesky_solve(right.mT[..., None], factor)[..., 0].mT
@@ -419,13 +431,14 @@ def solve_positive(matrix: Tensor, right: Tensor, damping: Tensor) -> tuple[Tens
 def eigenvectors(matrix: Tensor) -> list[tuple[Tensor, Tensor]]:
     """Approximate eigenvectors of symmetric 3 by 3 matrices by two sweeps of Jacobi's rotations.
 
-    The vectors are orthonormal up to rounding. They diagonalise the matrix only approximately.
+    The eigenvectors are orthonormal up to rounding, but diagonalise the matrix only approximately.
 
     Args:
         matrix: shape :math:`(3, 3, B)`.
 
     Returns:
-        Three pairs of an eigenvalue :math:`(B)` and its eigenvector :math:`(3, B)`, by ascending eigenvalue.
+        Three pairs of an eigenvalue :math:`(B,)` and its eigenvector :math:`(3, B)`, in ascending order of the
+        eigenvalues.
     """
     a = [list(row.unbind(0)) for row in matrix.unbind(0)]
     one, zero = torch.ones_like(a[0][0]), torch.zeros_like(a[0][0])
@@ -455,7 +468,7 @@ def eigenvectors(matrix: Tensor) -> list[tuple[Tensor, Tensor]]:
 
 
 def solve_symmetric(matrix: Tensor, right: Tensor) -> Tensor:
-    """Solve systems with positive definite matrices (B, 3, 3): few by LAPACK in half the time, others by cofactors."""
+    """Solve positive definite systems (B, 3, 3). LAPACK solves few systems in half of the time of cofactors."""
     if are_few(matrix):
         return torch.linalg.solve_ex(matrix, right).result
     a, b, c = matrix.unbind(1)

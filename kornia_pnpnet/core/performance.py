@@ -1,6 +1,7 @@
-"""What exists only to be fast: switches, memory layouts, order, compilation, one operation, the allocator's setting.
+"""Code for speed: switches, memory layouts, sorting, a custom operation, compilation, and memory of the process.
 
-Nothing here changes a result. Each part says what it buys; times are of PyTorch 2.13 on one thread of an AMD EPYC.
+The choices of this module change the speed of a result, not its value. All times are of PyTorch 2.13 on one thread of
+an AMD EPYC.
 """
 
 from __future__ import annotations
@@ -43,21 +44,21 @@ __all__ = [
 _T = TypeVar("_T")
 
 
-# --- switches: what may be done here ----------------------------------------------------------------------------------
+# --- switches: which code may run -------------------------------------------------------------------------------------
 
 
 def compiling() -> bool:
-    """Whether ``torch.compile`` or ``torch.export`` traces: loops over chunks would break the graph."""
+    """Whether ``torch.compile`` or ``torch.export`` is tracing the code. Loops over chunks would break the graph."""
     return torch.compiler.is_compiling()
 
 
 def exporting() -> bool:
-    """Whether ``torch.export`` traces: ONNX has no stable sort, no ``copysign`` and none of our custom operations."""
+    """Whether ``torch.export`` is tracing the code. ONNX lacks a stable sort, ``copysign`` and custom operations."""
     return torch.compiler.is_exporting()
 
 
 def sees_values(x: Tensor) -> bool:
-    """Whether code may depend on values: not in graphs, in ``torch.func.vmap`` and on the device meta."""
+    """Whether Python code may read values: not in a traced graph, in ``torch.func.vmap`` or on the device ``meta``."""
     if compiling():
         return False
     functorch = torch._C._functorch
@@ -69,21 +70,21 @@ def sees_values(x: Tensor) -> bool:
 
 
 def in_full_precision(device: str) -> AbstractContextManager[Any]:
-    """Disable autocast on devices that have it; ``meta`` does not. In a graph for other programs it has no meaning."""
+    """Return a context that disables autocast, except in an exported graph or on a device without autocast."""
     if exporting() or not torch.amp.is_autocast_available(device):
         return nullcontext()
     return torch.autocast(device, enabled=False)
 
 
-# Numbers. Up to here an operation on a processor takes about as long as its call.
+# Numbers. Up to this size, the call of an operation on a CPU takes at least as long as the arithmetic.
 _FEW_NUMBERS = 4096
 
 
 def are_few(x: Tensor) -> bool:
-    """Whether calls, not arithmetic, take the time of operations on a tensor: uncompiled, on a CPU, and small.
+    """Whether calls take more time than arithmetic: the tensor is small and on a CPU, and the code is not compiled.
 
-    LAPACK then replaces loops over entries: 55 instead of 293 µs for one 6 by 6 system, 104 instead of 400 µs for one
-    nearest rotation.
+    LAPACK then replaces loops over entries. The time falls from 293 to 55 µs for one 6 by 6 system, and from 400 to 104
+    µs for one nearest rotation.
     """
     return not compiling() and x.device.type == "cpu" and x.numel() <= _FEW_NUMBERS
 
@@ -92,18 +93,18 @@ def are_few(x: Tensor) -> bool:
 
 
 def problems_last(tree: _T) -> _T:
-    """Lay out tensors (B, N, C) as (C, N, B) in memory; shapes and values stay.
+    """Lay out tensors (B, N, C) as (C, N, B) in memory. Shapes and values do not change.
 
-    Elementwise operations then run at full width however few pairs a problem has, and a compiler can keep a problem in
-    registers: half the time of an iteration at n = 9.
+    Elementwise operations then use full vectors of the CPU even if each problem has few pairs, and a compiler can keep
+    a problem in registers. With 9 pairs this layout halves the time of an iteration.
     """
     return map_tensors(lambda x: _reversed(_reversed(x).contiguous()) if x.ndim > 1 else x, tree)
 
 
 def repeat_problems(tree: _T, count: int) -> _T:
-    """Repeat the batch of every tensor that has one, problems last in memory."""
+    """Repeat the batch of every tensor but scalars ``count`` times, in the memory layout of :func:`problems_last`."""
 
-    def repeat(x: Tensor) -> Tensor:  # `Tensor.repeat` compiles to a division for the index of each entry
+    def repeat(x: Tensor) -> Tensor:  # `Tensor.repeat` compiles to one division per entry
         last = _reversed(x)[..., None, :]
         return _reversed(last.expand(*last.shape[:-2], count, -1).flatten(-2))
 
@@ -114,35 +115,38 @@ def _reversed(x: Tensor) -> Tensor:
     return x.permute(tuple(reversed(range(x.ndim))))
 
 
-# Bytes. glibc raises its threshold up to 32 MiB (mallopt(3), M_MMAP_THRESHOLD); 64 KiB are left for its header.
+# Bytes. glibc raises its mmap threshold up to 32 MiB (mallopt(3), M_MMAP_THRESHOLD). 64 KiB are left for the header of
+# the allocation.
 _LARGEST_KEPT = 2**25 - 2**16
 
 
 def keep_freed_memory() -> None:
-    """Let glibc keep the memory of large temporaries for the next call, for the whole process.
+    """Let glibc keep freed memory of large tensors for reuse, in the whole process.
 
-    Otherwise every call asks the system anew for each tensor of more than 128 KiB: batches of 1000 and more problems on
-    a CPU take 20 to 45 % longer with ``pnpnet-set``. The process then holds up to 64 MiB of freed memory. Other
-    allocators, and a glibc whose thresholds were set, stay as they are. Only the command ``pnpnet`` and the benchmarks
-    call this function: a library must not decide for its process.
+    By default glibc requests memory from the system for each tensor of more than 128 KiB. Batches of 1000 or more
+    problems on a CPU then take 20 to 45 % longer with ``pnpnet-set``. After this call the process holds up to 64 MiB of
+    freed memory. The call has no effect on other allocators, or if the thresholds of glibc were set explicitly. Only
+    the command ``pnpnet`` and the benchmarks call this function: a library must not change the allocator of its
+    process.
 
     Example:
         >>> keep_freed_memory()
     """
-    torch.empty(_LARGEST_KEPT, dtype=torch.uint8, device="cpu")  # freed at once, and never touched
+    torch.empty(_LARGEST_KEPT, dtype=torch.uint8, device="cpu")  # freed at once, its pages never touched
 
 
 # --- order ------------------------------------------------------------------------------------------------------------
 
-# Pairs. Up to this number a compiled function sorts by minima and maxima, which become one loop: 31 µs for 9 values of
-# 1000 problems, where the call of a sort takes 65 µs. Uncompiled, the calls of the minima take longer than a sort.
+# Pairs. Up to this number compiled code sorts by a network of minima and maxima, which compiles to one loop. For 9
+# values of 1000 problems the network takes 31 µs, and a call of a sort takes 65 µs. Uncompiled code calls a sort,
+# because a call for each minimum and maximum takes longer.
 _FEW_PAIRS = 12
 # Problems. From this number on, one sort of integers takes two thirds of the time of two sorts of floats.
 _MANY_PROBLEMS = 256
 
 
 def in_order(values: Tensor) -> Tensor:
-    """Sort values without NaN, (C, N, B), along the second dimension.
+    """Sort values (C, N, B) without NaN in ascending order along the second dimension.
 
     Example:
         >>> in_order(torch.tensor([[[3.0], [1.0], [2.0]]])).flatten()
@@ -150,16 +154,17 @@ def in_order(values: Tensor) -> Tensor:
     """
     if _in_network(values):
         return torch.stack(_through_network(values, None), 1)
-    # ONNX sorts by a top-k.
+    # A sort for ONNX is a top-k of all values.
     return values.topk(values.shape[1], 1, largest=False).values if exporting() else values.sort(1).values
 
 
 def ranked(values: Tensor, rank: Tensor | int) -> Tensor:
-    """Find the value of a rank, along the second dimension.
+    """Find the value of a rank along the second dimension.
 
     Args:
         values: no NaN, shape :math:`(C, N, B)`.
-        rank: 0 for the smallest value, shape :math:`(B,)`. A negative rank means 0.
+        rank: an integer, or a tensor of shape :math:`(B,)` in which a negative rank counts as 0. Rank 0 is the smallest
+            value.
 
     Returns:
         Shape :math:`(C, B)`.
@@ -170,19 +175,19 @@ def ranked(values: Tensor, rank: Tensor | int) -> Tensor:
     """
     if isinstance(rank, int) and _in_network(values):
         return _through_network(values, rank)[rank]
-    if isinstance(rank, int) and not exporting():  # ONNX has no k-th value
+    if isinstance(rank, int) and not exporting():  # ONNX has no `kthvalue`
         return values.kthvalue(rank + 1, 1).values
     rank = torch.as_tensor(rank, device=values.device).clamp(min=0).expand(values.shape[0], 1, values.shape[-1])
     return in_order(values).gather(1, rank)[:, 0]
 
 
 def _in_network(values: Tensor) -> bool:
-    """Whether a network of minima and maxima sorts values (C, N, B): a compiler calls PyTorch for any other sort."""
+    """Whether :func:`_network` sorts values (C, N, B): only in compiled code, and only for few pairs."""
     return compiling() and isinstance(values.shape[1], int) and values.shape[1] <= _FEW_PAIRS
 
 
 def _through_network(values: Tensor, rank: int | None) -> list[Tensor]:
-    """The rows (C, B) of values (C, N, B) in ascending order, or with the one of a rank at its place."""
+    """Sort values (C, N, B) into rows (C, B). With a rank, only the row of this rank is correct."""
     rows = list(values.unbind(1))
     for i, j, smaller, larger in _network(len(rows), rank):
         a, b = rows[i], rows[j]
@@ -192,9 +197,10 @@ def _through_network(values: Tensor, rank: int | None) -> list[Tensor]:
 
 @cache
 def _network(count: int, rank: int | None) -> list[tuple[int, int, bool, bool]]:
-    """Comparisons that sort numbers, or find one: two positions, and whether their minimum and maximum are needed.
+    """Comparators that sort numbers: two positions, and whether their minimum and their maximum are needed.
 
-    Source: D. Knuth, "The Art of Computer Programming", volume 3, algorithm 5.2.2M (Batcher's merge exchange).
+    With a rank, only comparators that determine the number of this rank are returned. Source: D. Knuth, "The Art of
+    Computer Programming", volume 3, algorithm 5.2.2M (Batcher's merge exchange).
     """
     pairs = []
     step = largest = 1 << max(count - 1, 1).bit_length() - 1
@@ -214,18 +220,18 @@ def _network(count: int, rank: int | None) -> list[tuple[int, int, bool, bool]]:
 
 
 def present_first(present: Tensor) -> Tensor:
-    """Positions of the pairs that are present (B, N), then of the others, each in order.
+    """Find positions (B, N) that move the present pairs of each problem before the absent pairs, both in their order.
 
     Example:
         >>> present_first(torch.tensor([[False, True, True]]))
         tensor([[1, 2, 0]])
     """
     places = torch.arange(present.shape[1], device=present.device)
-    return _ascending(torch.where(present, places, places + len(places)))  # no ties: PyTorch's top-k is not stable
+    return _ascending(torch.where(present, places, places + len(places)))  # unique keys: PyTorch's top-k is not stable
 
 
 def ascending_order(keys: Tensor) -> Tensor:
-    """Find the stable ascending order by the first of two keys, ties by the second key.
+    """Find the stable ascending order by the first of two keys. The second key orders equal first keys.
 
     Args:
         keys: no NaN, shape :math:`(2, N, B)`.
@@ -240,29 +246,29 @@ def ascending_order(keys: Tensor) -> Tensor:
     if compiling() and not exporting() and keys.shape[1] <= _FEW_PAIRS:
         return _order_by_counting(*keys)
     if keys.dtype == torch.float32 and not compiling() and keys.shape[2] >= _MANY_PROBLEMS:
-        # Both keys as one integer. Adding 0 turns -0 into 0.
+        # Combine both keys into one integer. Adding 0 turns -0 into 0.
         bits = (keys + 0.0).mT.contiguous().view(torch.int32)
-        first, second = (bits ^ (bits >> 31 & 0x7FFFFFFF)).long()  # integers in the order of the floats
+        first, second = (bits ^ (bits >> 31 & 0x7FFFFFFF)).long()  # integers that sort as the floats do
         return _ascending((first << 32) + second)
-    first, second = keys.mT.contiguous()  # sorting along the last dimension is twice as fast
+    first, second = keys.mT.contiguous()  # a sort is twice as fast along the last dimension
     by_second = _ascending(second)
     return by_second.gather(1, _ascending(first.gather(1, by_second)))
 
 
 def _ascending(keys: Tensor) -> Tensor:
-    """Stable ascending order along the last dimension."""
+    """The stable ascending order along the last dimension."""
     if exporting():  # ONNX has no stable sort, but its top-k is stable
         return keys.topk(keys.shape[-1], largest=False).indices
     return keys.argsort(stable=True, dim=-1)
 
 
 def _order_by_counting(first: Tensor, second: Tensor) -> Tensor:
-    """:func:`ascending_order` by the number of pairs that come before each pair: for a compiler one loop, no call.
+    """:func:`ascending_order` by counting the pairs that precede each pair, which compiles to one loop.
 
-    For 9 pairs of 1000 problems it takes 60 µs; the sorts take 200 µs.
+    For 9 pairs of 1000 problems counting takes 60 µs, and sorting takes 200 µs.
     """
     position = torch.arange(len(first), device=first.device)
-    before = (position < position[:, None])[..., None]  # (N, N, 1): is the second before the first?
+    before = (position < position[:, None])[..., None]  # (N, N, 1), at (i, j): whether pair j precedes pair i
     for key in (second, first):
         before = (key < key[:, None]) | ((key == key[:, None]) & before)
     rank = before.sum(1)  # (N, B)
@@ -273,13 +279,13 @@ def _order_by_counting(first: Tensor, second: Tensor) -> Tensor:
 
 
 def fold_vmap(size: int, in_dims: Sequence[int | None], *tensors: Tensor) -> list[Tensor]:
-    """Make the dimension that ``torch.func.vmap`` maps a part of the batch, which is the first dimension."""
+    """Merge the dimension that ``torch.func.vmap`` maps into the batch, the first dimension of each tensor."""
     pairs = zip(tensors, in_dims, strict=True)
     return [(x.expand(size, *x.shape) if dim is None else x.movedim(dim, 0)).flatten(0, 1) for x, dim in pairs]
 
 
 def unfold_vmap(size: int, result: Tensor) -> Tensor:
-    """Undo :func:`fold_vmap` for a result whose batch is the last dimension: the mapped dimension comes before it."""
+    """Undo :func:`fold_vmap` in a result whose last dimension is the batch: split the batch into two dimensions."""
     return result.unflatten(-1, (size, -1))
 
 
@@ -287,8 +293,9 @@ def _take_pairs(values: Tensor, index: Tensor) -> Tensor:
     return values.permute(2, 1, 0).gather(1, index.mT.expand(values.shape[-1], -1, -1))
 
 
-# Compilers do not look inside: fused into its readers, each would gather anew, and the compiled hypotheses of the set
-# network take a third longer. The first call of `torch.library.custom_op` would import 800 modules, for 2 to 3 s.
+# A custom operation keeps a compiler from fusing the gather into each operation that reads its result. With fusion, the
+# compiled hypotheses of the set network take a third longer. `torch.library.Library` is used because the first call of
+# `torch.library.custom_op` imports 800 modules in 2 to 3 s.
 _LIBRARY = torch.library.Library("kornia_pnpnet", "DEF")
 _LIBRARY.define("take_pairs(Tensor values, Tensor index) -> Tensor")
 _LIBRARY.impl("take_pairs", _take_pairs, "CompositeExplicitAutograd")
@@ -306,27 +313,27 @@ def _(info: Any, in_dims: tuple[int | None, int | None], *tensors: Tensor) -> tu
 
 
 def take_pairs(values: Tensor, index: Tensor) -> Tensor:
-    """Take the pairs at positions (B, K) from values (B, N, C): shape (C, K, B)."""
+    """Take the pairs at positions (B, K) from values (B, N, C). The result has the shape (C, K, B)."""
     return (_take_pairs if exporting() else torch.ops.kornia_pnpnet.take_pairs)(values, index)
 
 
 # --- compilation ------------------------------------------------------------------------------------------------------
 
-# Pairs. From this number on, the loop order that the CPU compiler of PyTorch 2.13 chooses can give incorrect results
-# where a problem has more pairs than the batch has problems (it transposes vectors of 16 numbers). The given order is
-# then kept, which takes up to half as long again.
+# Pairs. From this number on, the CPU compiler of PyTorch 2.13 must not choose the order of loops. An order with
+# transposes of vectors of 16 numbers can give incorrect results if a problem has more pairs than the batch has
+# problems. The given order of loops takes up to 50 % longer than a chosen order.
 _MANY_PAIRS = 16
 
 
 class Compiled:
-    """A function of batches that is compiled when it is first called.
+    """A function of batches that is compiled at its first call.
 
-    The first dimension of its tensors, the batch, may change without a new compilation, except to or from a batch of
-    one. Other sizes, dtypes, and whether gradients are recorded are compiled for anew. When compilation fails, for
-    example without a C++ compiler or before PyTorch 2.13, the function runs uncompiled after one warning.
+    The batch size may change without a new compilation, except to or from 1. A change of any other size, of a dtype, or
+    of whether gradients are recorded needs a new compilation. If compilation fails, for example without a C++ compiler
+    or before PyTorch 2.13, the function warns once and then runs uncompiled.
 
     Args:
-        function: takes tensors and nested tuples of tensors. The first dimension of each tensor that has one is the
+        function: takes tensors and nested tuples of tensors. The first dimension of every tensor but scalars is the
             batch.
         mode: mode of ``torch.compile``.
 
@@ -345,17 +352,18 @@ class Compiled:
         self._seen: set[tuple[torch.Size, torch.dtype, int, bool]] = set()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Copies and other processes compile for themselves."""
+        """Copy or pickle without compiled code. Copies and other processes compile again."""
         return type(self), (self.function, self.mode)
 
     @cached_property
     def _compiled(self) -> tuple[Callable[..., Any], Callable[..., Any]]:
-        """The compiled function for few and for many pairs."""
-        # `vec_isa_ok` skips asking the C++ compiler for each instruction set: half of the first compilation. Loops end
-        # with single numbers, not with a second vector loop: a third less to compile, and calls take the same time.
+        """The compiled function for few pairs, and for at least ``_MANY_PAIRS`` pairs."""
+        # `vec_isa_ok` skips tests of the C++ compiler for each instruction set, which take half of the first
+        # compilation. Without `enable_loop_tail_vec` a loop ends with scalar code instead of a second vector loop.
+        # Compilation then takes a third less time, and calls take the same time.
         options = {**torch._inductor.list_mode_options(self.mode or "default"), "cpp.vec_isa_ok": True}
         options.update({"cpp.enable_loop_tail_vec": False, "guard_filter_fn": _needs_check})
-        # Each solver counts its own compilations: numbers of pairs, dtypes, with and without gradients.
+        # The limit is per solver. Each number of pairs and each dtype needs a compilation, with and without gradients.
         limits: dict[str, Any] = {"recompile_limit": 64, "isolate_recompiles": True}
         few, many = (
             torch.compile(self.function, fullgraph=True, options={**options, **order}, **limits)
@@ -365,7 +373,7 @@ class Compiled:
         def copied(run: Callable[..., Any]) -> Callable[..., Any]:
             return lambda *args: map_tensors(torch.clone, run(*args))
 
-        # The next replay of a CUDA graph overwrites the results of the last one.
+        # The results are copied because the next replay of a CUDA graph overwrites its results.
         return (copied(few), copied(many)) if options.get("triton.cudagraphs") else (few, many)
 
     def __call__(self, *args: Any) -> Any:
@@ -377,21 +385,21 @@ class Compiled:
         kind = first.shape, first.dtype, len(tensors), torch.is_grad_enabled()
         many = first.ndim > 1 and first.shape[1] >= _MANY_PAIRS
         if kind in self._seen:
-            with suppress(Exception):  # recompiling may warn, and warnings may be errors here: try again without them
+            with suppress(Exception):  # an error may be a compiler's warning: try again without warnings
                 return self._compiled[many](*args)
         try:
             for tensor in tensors:
                 if tensor.ndim and tensor.shape[0] > 1:
                     torch._dynamo.maybe_mark_dynamic(tensor, 0)
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # warnings of the compiler about itself
+                warnings.simplefilter("ignore")  # the compiler warns about its own code
                 result = self._compiled[many](*args)
             self._seen.add(kind)
             return result
         except torch.cuda.OutOfMemoryError:
             raise
-        except Exception as error:  # the compiler's are of many types
-            result = self.function(*args)  # a mistake of the caller raises here as it would anywhere
+        except Exception as error:  # the compiler raises many types of errors
+            result = self.function(*args)  # an invalid call raises its own error here
             self.failed = True
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             warnings.warn(f"Not compiled, running uncompiled. {reason[:300]}", RuntimeWarning, stacklevel=3)
@@ -399,10 +407,10 @@ class Compiled:
 
 
 class Runner:
-    """Calls functions as they are, or compiled: what may be compiled is visible where it is called.
+    """Calls functions, compiled or uncompiled. Calls through a runner mark the code that may be compiled.
 
     Args:
-        compiled: whether functions are compiled when they are first called.
+        compiled: whether to compile each function at its first call.
         mode: mode of ``torch.compile``.
 
     Example:
@@ -415,7 +423,7 @@ class Runner:
         self._functions: dict[str, Compiled] = {}
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Copies and other processes compile for themselves."""
+        """Copy or pickle without compiled code. Copies and other processes compile again."""
         return type(self), (self.compiled, self.mode)
 
     def __call__(self, function: Callable[..., _T], *args: Any) -> _T:
@@ -430,24 +438,24 @@ class Runner:
 
     @property
     def failed(self) -> bool:
-        """Whether some function could not be compiled."""
+        """Whether the compilation of any function has failed."""
         return any(x.failed for x in self._functions.values())
 
 
-#: Runs everything uncompiled.
+#: The runner that calls all functions uncompiled.
 EAGER = Runner()
 
 
 def _needs_check(guards: Sequence[Any]) -> list[bool]:
-    """Skip checks of functions and constants of modules, which do not change: they take time at each call."""
+    """Skip guards of functions and constants of modules, which do not change: guards take time at each call."""
     return [guard.guard_type == "DUPLICATE_INPUT" or not guard.is_global for guard in guards]
 
 
 def per_problem(scalar: Tensor, like: Tensor) -> Tensor:
-    """Expand a scalar to the shape of ``like`` in compiled code, so that its gradient is summed in float64.
+    """Expand a scalar to the shape of ``like``, in compiled code on a CPU, so that its gradient is summed in float64.
 
-    A sum in float32 is compiled anew when the number of addends, which grows with the batch, crosses a limit of the CPU
-    compiler of PyTorch 2.13.
+    The number of addends of the gradient grows with the batch. For a sum in float32, the CPU compiler of PyTorch 2.13
+    compiles again when the number of addends crosses a limit.
     """
     if scalar.ndim or not compiling() or exporting() or like.device.type != "cpu":
         return scalar
@@ -455,27 +463,28 @@ def per_problem(scalar: Tensor, like: Tensor) -> Tensor:
 
 
 def package_options(pairs: int | None, *, on_stack: bool) -> dict[str, Any]:
-    """Options of AOTInductor.
+    """Make the options of AOTInductor.
 
     Args:
         pairs: number of pairs of a problem; ``None``: any number.
-        on_stack: keep tensors on the stack where the graph calls no operator of PyTorch. Compiled functions then return
-            the same tensors from each call in a thread.
+        on_stack: keep tensors on the stack if the graph calls no operator of PyTorch. Every call of the compiled
+            function in a thread then returns the same tensors.
     """
     return {
         "aot_inductor.allow_stack_allocation": on_stack,
-        "cpp.vec_isa_ok": True,  # see Compiled
-        "cpp.threads": 1,  # else the number of threads of the process that compiles
+        "cpp.vec_isa_ok": True,  # see `Compiled`
+        "cpp.threads": 1,  # the default is the number of threads of the compiling process
         "pick_loop_orders": pairs is not None and pairs < _MANY_PAIRS,
     }
 
 
 # --- packages of one problem: sorts, running sums and products as elementwise operations ------------------------------
-# A compiler fuses elementwise operations and calls PyTorch for all others. AOTInductor keeps the tensors of a graph
-# without calls on the stack; otherwise most of the time of one problem goes into allocating small tensors. A package of
-# `pnpnet-n9` for one problem takes 42 µs with INLINE and 297 µs without.
+# A compiler fuses elementwise operations, and calls PyTorch for all other operations. AOTInductor keeps the tensors of
+# a graph on the stack if the graph has no such calls. Otherwise the allocation of small tensors takes most of the time
+# of one problem. A package of `pnpnet-n9` for one problem takes 42 µs with INLINE and 297 µs without INLINE.
 
-# Numbers. The comparisons of a sort grow with the square of their number.
+# Numbers. Longer sorts and cumulative sums remain calls of PyTorch, because the number of comparisons of an inline sort
+# grows with the square of its length.
 _FEW_INLINE = 32
 
 
@@ -505,7 +514,7 @@ def _cumsum(x: Tensor, dim: int, *, dtype: torch.dtype | None = None) -> Any:
 
 
 def _topk(x: Tensor, k: int, dim: int = -1, largest: bool = True, ordered: bool = True) -> Any:
-    """Sort by the number of entries that come before each entry: stable, for values that are not NaN."""
+    """Stable top-k by counting the entries that precede each entry, for values without NaN."""
     if x.shape[dim] > _FEW_INLINE:
         return NotImplemented
     values = x.movedim(dim, -1)
@@ -522,7 +531,7 @@ def _sort(x: Tensor, dim: int = -1, descending: bool = False, *, stable: bool | 
 
 
 _aten = torch.ops.aten
-#: Decompositions for ``ExportedProgram.run_decompositions``. Sizes that are not static or too large stay as they are.
+#: Decompositions for ``ExportedProgram.run_decompositions`` of a graph with static sizes.
 INLINE: dict[Any, Callable[..., Any]] = {
     _aten.addmm.default: _addmm,
     _aten.cumsum.default: _cumsum,

@@ -1,6 +1,7 @@
-"""Read data from any source. An error names the file and the first wrong entry.
+"""Reading and checking of JSON files. An error names the file and the first invalid entry.
 
-Needs pydantic, which only the extras install: the modules that ``import kornia_pnpnet`` loads must not import this one.
+This module needs pydantic, which only the extras install. Modules that ``import kornia_pnpnet`` loads must therefore
+not import this module.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 #: An integer of at least 0 that fits into 64 bits.
 Count = Annotated[int, Field(ge=0, lt=2**63)]
-#: The configuration of a type whose numbers, and those of types inside it, must be finite.
+#: Configuration of a pydantic type: types are checked strictly. Numbers, also in nested types, must be finite.
 STRICT = ConfigDict(strict=True, allow_inf_nan=False)
 
 
@@ -32,17 +33,22 @@ def _keep(data: Any, check: ValidatorFunctionWrapHandler) -> Any:
     return data
 
 
-#: Check the keys that a ``TypedDict`` names, and keep the mapping as it is, with its other keys.
+#: Checks the keys that a ``TypedDict`` declares, and returns the mapping unchanged, including all other keys.
 Kept = WrapValidator(_keep)
 
 
 def read_json(path: str | Path, kind: type[_T], what: str) -> _T:
-    """Read a JSON file of a type that pydantic knows.
+    """Read a JSON file, and check its content against a type that pydantic supports.
+
+    Args:
+        path: the JSON file.
+        kind: the expected type of the content.
+        what: description of the expected file in error messages, for example "a results file".
 
     Raises:
-        FileNotFoundError: when there is no such file.
-        ValueError: when the file is not of this type. The message ends with the first wrong entry, for example:
-            "'a.json' is not a results file: rows[0].success.rate is missing", where ``what`` is "a results file".
+        FileNotFoundError: when the file does not exist.
+        ValueError: when the content does not have the expected type. The message ends with the first invalid entry, for
+            example: "'a.json' is not a results file: rows[0].success.rate is missing".
     """
     try:
         return TypeAdapter(kind).validate_json(Path(path).read_bytes(), strict=True)
@@ -58,7 +64,7 @@ def read_json(path: str | Path, kind: type[_T], what: str) -> _T:
 
 
 def to_json(value: Any) -> Any:
-    """Convert dataclasses and named tuples, also nested ones, to dictionaries."""
+    """Convert nested dataclasses and named tuples to dictionaries, and other tuples to lists."""
     if dataclasses.is_dataclass(value):
         value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
     elif hasattr(value, "_asdict"):

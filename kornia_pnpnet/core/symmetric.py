@@ -1,4 +1,4 @@
-"""Symmetric 2×2 and 3×3 matrices, one for each pair, entry by entry: covariances of pixels and of world points."""
+"""Symmetric 2×2 and 3×3 matrices, stored by entries: covariances of the pixel and the world point of each pair."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ from kornia_pnpnet.core.linalg import factorise
 
 __all__ = ["Symmetric2", "Symmetric3", "are_semi_definite", "equivalent_sigma"]
 
-# Units in the last place of the trace. A matrix whose smallest eigenvalue is further below 0 is not semi-definite.
+# Units in the last place of the trace. A matrix is not semi-definite when an eigenvalue is below minus this bound.
 _ROUNDING = 16.0
-# Units in the last place of the trace. Smaller eigenvalues are raised to this: a determinant keeps no digits of them.
+# Units in the last place of the trace. Smaller eigenvalues are raised to this bound, because the rounding error of a
+# determinant hides smaller eigenvalues.
 _LEAST = 64.0
 
 
 class Symmetric2(NamedTuple):
-    """Entries of a symmetric 2×2 matrix for each pair, tensors of one shape."""
+    """Entries of symmetric 2×2 matrices, one matrix for each pair, as tensors of the same shape."""
 
     uu: Tensor
     uv: Tensor
@@ -32,7 +33,7 @@ class Symmetric2(NamedTuple):
 
     @property
     def determinant(self) -> Tensor:
-        """The determinant of a positive definite matrix, not less than what rounding leaves of it."""
+        """The determinant of a positive definite matrix, raised to a lower bound of the size of its rounding error."""
         product = self.uu * self.vv
         least = _LEAST * torch.finfo(product.dtype).eps * product.detach()
         return torch.addcmul(product, self.uv, self.uv, value=-1).maximum(least)
@@ -43,7 +44,7 @@ class Symmetric2(NamedTuple):
         return torch.addcmul(cross * u, self.vv * v, v)
 
     def inverse(self) -> Symmetric2:
-        """The inverse of a positive definite matrix. Eigenvalues at the level of rounding count as larger.
+        """The inverse of a positive definite matrix, computed with the bounded :attr:`determinant`.
 
         Example:
             >>> Symmetric2(*torch.tensor([2.0, 1.0, 1.0])).inverse()
@@ -53,14 +54,14 @@ class Symmetric2(NamedTuple):
         return Symmetric2(self.vv * scale, -self.uv * scale, self.uu * scale)
 
     def mapped(self, a: Tensor, b: Tensor, d: Tensor, c: Tensor | None = None) -> Symmetric2:
-        """The covariance of a vector after its product with the matrix [[a, b], [c, d]]; ``None``: c is 0."""
+        """The covariance A S Aᵀ, where S is this covariance and A is [[a, b], [c, d]]. ``None`` for c means 0."""
         u, v = a * self.uu + b * self.uv, a * self.uv + b * self.vv
         if c is None:
             return Symmetric2(a * u + b * v, d * v, d * d * self.vv)
         return Symmetric2(a * u + b * v, c * u + d * v, c * (c * self.uu + 2.0 * d * self.uv) + d * d * self.vv)
 
     def at_least(self, least: float) -> Symmetric2:
-        """Add a multiple of the identity where the smallest eigenvalue is below ``least``, so that it is not."""
+        """Raise the smallest eigenvalue to at least ``least`` by adding a multiple of the identity."""
         uu, uv, vv = (x.detach() for x in self)
         smallest = 0.5 * (uu + vv) - torch.hypot(0.5 * (uu - vv), uv)
         more = ((_LEAST * torch.finfo(uu.dtype).eps * (uu + vv)).clamp(min=least) - smallest).clamp(min=0.0)
@@ -68,7 +69,7 @@ class Symmetric2(NamedTuple):
 
 
 class Symmetric3(NamedTuple):
-    """Entries of a symmetric 3×3 matrix for each pair, tensors of one shape."""
+    """Entries of symmetric 3×3 matrices, one matrix for each pair, as tensors of the same shape."""
 
     xx: Tensor
     xy: Tensor
@@ -83,20 +84,20 @@ class Symmetric3(NamedTuple):
         return cls(*_upper(matrix))
 
     def scaled(self, factor: Tensor) -> Symmetric3:
-        """The product with a number, plus a multiple of the identity that is above the rounding of the entries."""
+        """Scale the matrix, and add a multiple of the identity that exceeds the rounding error of the entries."""
         xx, xy, xz, yy, yz, zz = (factor * x for x in self)
         more = 2.0 * _ROUNDING * torch.finfo(xx.dtype).eps * (xx + yy + zz).detach()
         return Symmetric3(xx + more, xy, xz, yy + more, yz, zz + more)
 
     def times(self, vector: Sequence[Tensor]) -> list[Tensor]:
-        """The product with a vector of three entries."""
+        """The product of the matrix and a vector of three entries."""
         a, b, c = vector
         rows = (self.xx, self.xy, self.xz), (self.xy, self.yy, self.yz), (self.xz, self.yz, self.zz)
         return [torch.addcmul(torch.addcmul(i * a, j, b), k, c) for i, j, k in rows]
 
 
 def _upper(matrix: Tensor) -> list[Tensor]:
-    """The entries of the symmetric parts of matrices (..., K, K), row by row."""
+    """The upper triangles of the symmetric parts of matrices (..., K, K), row by row."""
     size = range(matrix.shape[-1])
     half = 0.5 * (matrix + matrix.mT)
     return [half[..., i, j] for i in size for j in size[i:]]
@@ -109,7 +110,7 @@ def _lower_rows(matrix: Symmetric2 | Symmetric3) -> list[list[Tensor]]:
 
 
 def are_semi_definite(matrix: Symmetric2 | Symmetric3) -> Tensor:
-    """Whether matrices are finite and positive semi-definite up to rounding, bool of the entries' shape.
+    """Tell whether matrices are finite and positive semi-definite up to rounding, bool, in the shape of the entries.
 
     Example:
         >>> are_semi_definite(Symmetric2(torch.tensor([1.0, 1.0, 0.0]), torch.tensor([1.0, 2.0, 0.0]), torch.ones(3)))
@@ -122,7 +123,7 @@ def are_semi_definite(matrix: Symmetric2 | Symmetric3) -> Tensor:
     rows = [[x * scale for x in row] for row in rows]
     for row in rows:
         row[-1] = row[-1] + _ROUNDING * limits.eps
-    good = trace < limits.max**0.25  # products stay finite
+    good = trace < limits.max**0.25  # products of larger entries could overflow
 
     def inverse(k: int, pivot: Tensor) -> Tensor:
         nonlocal good
@@ -134,8 +135,8 @@ def are_semi_definite(matrix: Symmetric2 | Symmetric3) -> Tensor:
 
 
 def equivalent_sigma(matrix: Symmetric2 | Symmetric3) -> Tensor:
-    """The standard deviation of isotropic noise of the same trace; NaN where the trace is not a sound number."""
+    """The standard deviation of isotropic noise with the same trace; NaN if the trace is negative, infinite or NaN."""
     variance = torch.stack([row[-1] for row in _lower_rows(matrix)]).mean(0)
-    positive = (variance > 0) & (variance < torch.inf)  # at 0 the root has an infinite gradient
+    positive = (variance > 0) & (variance < torch.inf)  # the square root has an infinite gradient at 0
     sigma = torch.where(positive, variance, 1.0).sqrt()
     return torch.where(positive, sigma, torch.where(variance == 0, 0.0, torch.nan))

@@ -14,9 +14,9 @@ def markdown_table(
 
     Args:
         header: titles of the columns.
-        rows: cells of each row, one for each column.
-        align: ``l`` (left) or ``r`` (right) for each column; ``None``: the first column to the left, others right.
-        pad: fill the cells with spaces, so that the columns line up in a terminal.
+        rows: rows of cells, one cell for each column.
+        align: ``l`` (left) or ``r`` (right) for each column; ``None``: the first column left, all others right.
+        pad: pad the cells with spaces, so that the columns line up in a terminal.
 
     Example:
         >>> print(markdown_table(["solver", "µs"], [["epnp", "7"], ["p3p-ransac", "120"]], pad=True))

@@ -1,4 +1,4 @@
-"""Nested tuples of tensors, visited as a whole: no code lists their fields by position."""
+"""Functions that visit every tensor of nested tuples."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ def map_tensors(function: Callable[..., Any], tree: _T, *others: _T) -> _T:
     """Apply a function to every tensor of nested tuples.
 
     Args:
-        function: receives the tensors at the same place of all trees.
-        tree: a tensor, or a (named) tuple or list of trees. Everything else, such as ``None``, stays as it is.
+        function: receives one tensor from each tree, all from the same position.
+        tree: a tensor, or a tuple, named tuple or list of trees. Any other value, such as ``None``, is returned
+            unchanged.
         others: more trees of the same structure.
 
     Returns:
-        A tree of the same types that holds what the function returned.
+        A tree of the same structure with the results of the function.
 
     Example:
         >>> import torch
@@ -37,17 +38,17 @@ def map_tensors(function: Callable[..., Any], tree: _T, *others: _T) -> _T:
 
 
 def take(tree: _T, at: Tensor | slice) -> _T:
-    """Select problems from every tensor of a tree that has a batch."""
+    """Select problems from every tensor of a tree, except from scalars."""
     return map_tensors(lambda x: x[at] if x.ndim else x, tree)
 
 
 def put(tree: _T, at: Tensor, rows: _T) -> _T:
-    """Replace the problems at some indices in every tensor of a tree."""
+    """Return a copy of a tree in which the problems at the indices ``at`` are replaced by ``rows``."""
     return map_tensors(lambda x, new: x.index_copy(0, at, new), tree, rows)
 
 
 def iter_tensors(tree: Any) -> Iterator[Tensor]:
-    """Yield every tensor of nested tuples and lists, in order; anything else is passed over."""
+    """Yield every tensor of nested tuples and lists in order, and skip all other values."""
     if isinstance(tree, Tensor):
         yield tree
     elif isinstance(tree, (tuple, list)):

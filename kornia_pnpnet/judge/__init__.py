@@ -1,1 +1,1 @@
-"""Whether a pose is to be believed: ``inliers`` says which pairs support it, ``belief`` what they say of it."""
+"""Judgement of a pose: ``inliers`` finds its inliers, and ``belief`` tells whether the pose is to be believed."""

@@ -1,8 +1,10 @@
-r"""Whether a pose is to be believed: whether it explains the pixels, and whether its inliers could be chance.
+"""Whether a pose is to be believed.
+
+If the noise is unknown, a pose must explain the pixels (:func:`explains`). If the noise is known, a pose must have more
+inliers than expected by chance (:func:`believe`).
 
 The functions take the :class:`~kornia_pnpnet.refine.residual.Projection` of one pose per problem, the problem, the
-noise of every pair, and weights of the pairs, :math:`(B, N)`. Their answers have no gradient and the shape
-:math:`(B,)`.
+noise of every pair, and weights of the pairs, :math:`(B, N)`. The results have no gradient.
 """
 
 from __future__ import annotations
@@ -35,23 +37,24 @@ __all__ = [
     "rotation_sigma",
 ]
 
-#: A pose is believed when its :func:`probability` is at least this. On synthetic problems to which the law was not
-#: fitted, 98 % of the poses within the limits pass, and 5 to 7 % of the poses that are far off.
+#: A pose is believed when its :func:`probability` is at least this value. On synthetic problems to which the law was
+#: not fitted, 98 % of the correct poses pass, and 5 to 7 % of the incorrect poses.
 LEAST_PROBABILITY = 0.93
-#: The laws of :func:`probability`: the log-odds when both numbers are 0, and the slopes by the logarithms of the false
-#: alarms and of the rotation's sigma. The first law is for noise that was given or estimated by a network, the second
-#: for :func:`residual_noise`. Fitted by ``python docs/results/make.py measure --only probability``.
+#: The coefficients of :func:`probability`: the log-odds if both numbers are 0, and the slopes of the log-odds by the
+#: logarithms of false alarms and of the rotation's sigma. The law ``sigmas`` is for noise that the caller gave or a
+#: network estimated. The law ``residuals`` is for :func:`residual_noise`. Fitted by
+#: ``python docs/results/make.py measure --only probability``.
 LAWS = {"sigmas": (-3.2501, -0.16608, -1.0784), "residuals": (0.89795, -0.27745, 0.070018)}
 _ALARMS, _LOG_SIGMA = (-20.0, 10.0), (-12.0, 2.0)
-# Standard deviations. A pair with a larger residual is no evidence for a pose.
+# Standard deviations. A pair with a larger residual is an outlier of the pose.
 _EVIDENT = 3.5
-# Standard deviation of the logarithm of a focal length beyond which it is open.
+# Largest standard deviation of the logarithm of a focal length that is determined by the pairs.
 _OPEN_FOCAL = 0.15
 # A pose explains the pixels when at least this fraction of the pairs (by weight) has small residuals. The fraction is
 # just below 0.6, so that a sum of shares that is 0.6 up to rounding suffices.
 _EXPLAINED_SHARE = 0.6 - 1e-5
-# A residual is small when it is below this fraction of the pixels' spread. Poses with points behind the camera nearly
-# always have larger residuals; small objects with noise of a tenth of their size have smaller ones.
+# A residual is small when it is below this fraction of the spread of the pixels. Poses with points behind the camera
+# nearly always have larger residuals. Small objects whose noise is a tenth of their size have smaller residuals.
 _EXPLAINED_RESIDUAL = 0.2
 
 
@@ -61,13 +64,13 @@ def has_enough(projection: Projection, weights: Tensor) -> Tensor:
 
 
 def explains(projection: Projection, problem: Problem, weights: Tensor) -> Tensor:
-    r"""Tell whether a pose explains the pixels, when the noise is unknown.
+    """Tell whether a pose explains the pixels, when the noise is unknown.
 
-    A pose explains the pixels when the residual that 60 % of the pairs (by weight) stay below is less than a fifth of
-    the distance from their mean that 60 % of the pixels stay below: a pose hardly better than "everything is at one
-    point" is no answer. Both sides scale with the image, so that no threshold is in pixels. At least four pairs have to
-    agree (of three pairs all three), and their points must span more than a line. The weights are those before
-    residuals were looked at.
+    The 60 % quantile of the residuals must be at most a fifth of the 60 % quantile of the distances of pixels from
+    their mean. Both quantiles are weighted by ``weights``, the weights without the robust weight. A pose that hardly
+    fits better than a projection of all points to one pixel therefore fails. Both quantiles scale with the image, so
+    that no threshold is in pixels. At least four pairs (three if there are only three) must have such small residuals,
+    and the points of these pairs must span more than a line.
     """
     weights = weights.detach()
     there = weights > 0
@@ -79,24 +82,25 @@ def explains(projection: Projection, problem: Problem, weights: Tensor) -> Tenso
     limit = _EXPLAINED_RESIDUAL**2 * ascending.gather(-1, position.clamp(max=ascending.shape[-1] - 1))
     explained = projection.in_front & (projection.sq_residual.detach() <= limit)
     enough = (share * explained).sum(-1) >= _EXPLAINED_SHARE
-    # Any three pairs have a pose that explains them: of more pairs, a fourth has to agree.
+    # Any three pairs have a pose that explains them. With more than three pairs, a fourth pair must agree.
     agree = explained & there
     enough = enough & (agree.sum(-1) >= there.sum(-1).clamp(MIN_PAIRS, MIN_PAIRS + 1))
     return enough & _span_a_plane(problem.world_points.detach(), agree)
 
 
 class Belief(NamedTuple):
-    """The :func:`probability` of a pose, and whether it is to be believed, bool."""
+    """The :func:`probability` of a pose, and whether the pose is to be believed (bool)."""
 
     probability: Tensor
     ok: Tensor
 
 
 def believe(projection: Projection, problem: Problem, noise: Noise, law: str = "sigmas") -> Belief:
-    """Tell whether a pose is to be believed, when the noise is known for every pair, by one of the :data:`LAWS`.
+    """Tell whether a pose is to be believed, when the noise is known for every pair.
 
-    The pose must have more inliers than chance would give it, the inliers must span more than a line, and the
-    probability must be at least :data:`LEAST_PROBABILITY`.
+    The pose must have more inliers than expected by chance (:data:`~kornia_pnpnet.judge.inliers.MAX_FALSE_ALARMS`), and
+    the inliers must span more than a line. The probability by the given law of :data:`LAWS` must be at least
+    :data:`LEAST_PROBABILITY`.
     """
     projection, problem, noise = map_tensors(torch.Tensor.detach, (projection, problem, noise))
     precision = pixel_precision(projection, problem, noise) if noise.covariances else None
@@ -105,7 +109,7 @@ def believe(projection: Projection, problem: Problem, noise: Noise, law: str = "
     thresholds = Thresholds(_EVIDENT * noise.img, _EVIDENT * noise.world, precision)
     judged = judge(projection, problem, thresholds)
     counts = (problem.weights > 0).sum(-1)
-    samples = counts * (counts - 1) * (counts - 2) // 6  # any three pairs could have given the pose
+    samples = counts * (counts - 1) * (counts - 2) // 6  # any three pairs can be the minimal sample of the pose
     if problem.free_focal is not None:
         samples = samples * (counts - 3).clamp(min=1) // 4
     alarms = log_false_alarms(samples, projection, problem, thresholds, judged)
@@ -116,15 +120,16 @@ def believe(projection: Projection, problem: Problem, noise: Noise, law: str = "
 
 
 def probability(log_alarms: Tensor, sigma: Tensor, law: str = "sigmas") -> Tensor:
-    r"""Probability that a pose is within 10 degrees and 30 % of the distance of the points.
+    """Probability that a pose is correct: within 10 degrees, and within 30 % of the distance of the points.
 
-    A logistic law of two numbers: how unlikely the inliers are by chance, and how well they determine the rotation.
-    Few inliers in a small part of the space and of the image agree with many poses.
+    The probability is a logistic function of two numbers. The false alarms tell how unlikely the inliers are by chance.
+    The sigma tells how well the inliers determine the rotation. Few inliers in a small part of the space and of the
+    image agree with many poses.
 
     Args:
         log_alarms: :func:`~kornia_pnpnet.judge.inliers.log_false_alarms`, shape :math:`(B,)`.
         sigma: :func:`rotation_sigma`, shape :math:`(B,)`.
-        law: one of :data:`LAWS`.
+        law: a key of :data:`LAWS`.
 
     Returns:
         In (0, 1), shape :math:`(B,)`.
@@ -139,16 +144,16 @@ def probability(log_alarms: Tensor, sigma: Tensor, law: str = "sigmas") -> Tenso
 
 
 def clipped(log_alarms: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
-    """Logarithms of the false alarms and of sigma, clipped to the ranges in which :data:`LAWS` depend on them."""
+    """Clip the logarithms of the false alarms and of sigma to the ranges in which :data:`LAWS` depend on them."""
     return log_alarms.clamp(*_ALARMS), sigma.log().clamp(*_LOG_SIGMA)
 
 
 def residual_noise(projection: Projection, problem: Problem, weights: Tensor) -> Noise:
-    """The noise of the pixels by the median residual, the same sigma for all pairs of a problem."""
+    """Estimate the noise of the pixels from the median residual of each problem, the same sigma for all pairs."""
     there = (weights > 0) & projection.in_front
     count = there.sum(-1, keepdim=True)
     ascending = in_order(torch.where(there, projection.sq_residual, torch.inf).detach().mT[None])[0].mT
-    middle = ((count + MIN_PAIRS) // 2).minimum(count - 1).clamp(min=0)  # any pose fits three pairs
+    middle = ((count + MIN_PAIRS) // 2).minimum(count - 1).clamp(min=0)  # a pose can fit any three pairs
     variance = ascending.gather(-1, middle) / (2.0 * math.log(2.0))
     focal = projection.focal.detach().reshape(-1, 1)
     sigma = variance.minimum(focal.square()).sqrt().maximum(LEAST_NOISE * focal)
@@ -156,25 +161,26 @@ def residual_noise(projection: Projection, problem: Problem, weights: Tensor) ->
 
 
 def rotation_sigma(projection: Projection, problem: Problem, noise: Noise, judged: Judged) -> Tensor:
-    """Square root of the trace of the rotation's covariance in radians, by the noise of the inliers, float64 (B,).
+    """Standard deviation of the rotation in radians, from the noise of the inliers, float64 (B,).
 
-    Infinite where the inliers do not determine the rotation.
+    The standard deviation is the square root of the trace of the rotation's covariance, and infinite if the inliers do
+    not determine the rotation.
     """
     inlier = problem.focal.square() * (judged.weights > 0)
     weights = map_tensors(lambda x: inlier * x, pixel_precision(projection, problem, noise))
     matrix = normal_equations(projection, problem, weights).matrix[:6, :6].permute(2, 0, 1).double()
     turn, cross, shift = matrix[:, :3, :3], matrix[:, 3:, :3], matrix[:, 3:, 3:]
-    left = turn - cross.mT @ solve_symmetric(shift, cross)  # the shift eliminated
+    left = turn - cross.mT @ solve_symmetric(shift, cross)  # the translation is eliminated (Schur complement)
     eye = torch.eye(3, dtype=left.dtype, device=left.device)
     variance = solve_symmetric(left, eye.expand_as(left)).diagonal(dim1=1, dim2=2).sum(-1)
-    return torch.where(variance > 0, variance, torch.inf).sqrt()  # NaN, too, is open
+    return torch.where(variance > 0, variance, torch.inf).sqrt()  # NaN becomes infinite, too
 
 
 def has_focal(projection: Projection, problem: Problem, noise: Noise, weights: Tensor) -> Tensor:
-    """Whether the pairs determine an unknown focal length to a standard deviation of 15 %, bool (B,).
+    """Tell whether the pairs determine an unknown focal length up to a standard deviation of 15 %, bool (B,).
 
-    Two standard deviations are then the 30 % of the distance beyond which a pose is far off. ``weights`` are the final
-    weights of the pairs.
+    The distance of a correct pose may be off by 30 % (see :func:`probability`), which is two such standard deviations.
+    ``weights`` are the final weights of the pairs.
     """
     projection, problem, noise = map_tensors(torch.Tensor.detach, (projection, problem, noise))
     weights = weights.detach()
@@ -184,7 +190,7 @@ def has_focal(projection: Projection, problem: Problem, noise: Noise, weights: T
     matrix = normal_equations(projection, problem, precision).matrix.permute(2, 0, 1).double()
     camera, cross, pose = matrix[:, 6:7, 6:7], matrix[:, :6, 6:7], matrix[:, :6, :6]
     solved, info = torch.linalg.solve_ex(pose, cross)
-    # The information of the focal length when the pose is unknown.
+    # Information of the focal length after elimination of the pose (Schur complement).
     information = (camera - cross.mT @ solved)[:, 0, 0]
     known = problem.free_focal.information
     information = information if known is None else information + known
@@ -192,7 +198,7 @@ def has_focal(projection: Projection, problem: Problem, noise: Noise, weights: T
 
 
 def _span_a_plane(world_points: Tensor, inliers: Tensor) -> Tensor:
-    """Whether the points (B, N, 3) of the inliers (B, N) span more than a line: a line leaves the pose open."""
+    """Whether the points (B, N, 3) of the inliers (B, N) span more than a line. A line does not determine the pose."""
     inlier = inliers.mT.to(world_points.dtype)
     share = inlier.sum(0).clamp(min=1.0).reciprocal()
     points = world_points.permute(2, 1, 0) * inlier

@@ -1,8 +1,8 @@
-r"""Which pairs are inliers of a pose, and whether the pose could have them by chance.
+r"""The inliers of a pose, and the number of poses that are expected to have as many inliers by chance.
 
-A pair is an inlier of a pose when :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`, with the threshold :math:`\tau` in
-pixels and the pixels by which a shift of the world point by the threshold :math:`\omega` moves its projection at the
-depth :math:`z`. The ratio of the two sides is the *standardised* squared residual.
+A pair is an inlier of a pose when :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`. The threshold :math:`\tau` is in pixels.
+The threshold :math:`\omega` is a shift of the world point. At the depth :math:`z` such a shift moves the projection by
+:math:`f \omega / z` pixels. The left side divided by the right side is the *standardised* squared residual.
 """
 
 from __future__ import annotations
@@ -22,30 +22,30 @@ from kornia_pnpnet.refine.residual import Projection
 
 __all__ = ["MAX_ERROR", "MAX_FALSE_ALARMS", "Judged", "Thresholds", "judge", "log_false_alarms"]
 
-#: Largest standardised squared residual; points behind the camera have it.
+#: The standardised squared residual of points behind the camera.
 MAX_ERROR = 1e6
-#: A pose is evident when fewer poses than this are expected to have as many inliers by chance.
+#: Largest number of false alarms (see :func:`log_false_alarms`) of a pose that is believed.
 MAX_FALSE_ALARMS = 0.01
-# Largest number of pairs, spread evenly over all, that `_chance_by_others` compares.
+# Largest number of pairs that `_chance_by_others` compares. These pairs are spaced evenly over all pairs.
 _MOST_OTHERS = 64
-# Hits that are ignored, because pixels of inliers can coincide.
+# Number of hits that `_chance_by_others` ignores, because pixels of inliers can coincide.
 _FEW_HITS = 4
-# Ratio of the residual of an outlier to that of the worst inlier. Outliers of smaller ratios say nothing about chance:
-# they are near misses, or inliers where the caller's sigmas are too small. Tuned on synthetic problems (`pnpnet-set`,
-# seed 9101) with sigmas that are half of the noise: 10 refuses many more poses within the limits, 30 accepts more poses
-# that are far off.
+# Smallest ratio of the radius of the larger disc to the radius of the disc in `_chance_by_place`. Closer outliers say
+# nothing about chance: if the caller's sigmas are too small, these outliers can be inliers. Tuned on synthetic problems
+# (`pnpnet-set`, seed 9101) with sigmas that are half of the noise. A ratio of 10 rejects many more correct poses, and a
+# ratio of 30 accepts more incorrect poses.
 _REACH = 20.0
 
 
 class Thresholds(NamedTuple):
-    r"""The thresholds of an inlier in each problem.
+    r"""The inlier thresholds of each problem or pair.
 
     Attributes:
         img: :math:`\tau` in pixels of the problem, shape :math:`(B, 1)` or :math:`(B, N)`.
         world: :math:`\omega` in units of the problem's world, shape :math:`(B, 1)` or :math:`(B, N)`.
-        precision: the matrix by which the squared length of a residual is 1 at the threshold, entries :math:`(B, N)`;
-            ``None``: the matrix follows from :math:`\tau` and :math:`\omega`. The chance of an inlier is estimated by
-            a disc of the same area as its ellipse.
+        precision: the matrix :math:`P` in the standardised squared residual :math:`r^\top P r` of each pair, entries
+            :math:`(B, N)`; ``None``: :math:`\tau` and :math:`\omega` define the standardised squared residual. The
+            chance of an inlier is estimated by a disc with the area of the ellipse :math:`r^\top P r < 1`.
     """
 
     img: Tensor
@@ -53,7 +53,7 @@ class Thresholds(NamedTuple):
     precision: Symmetric2 | None = None
 
     def sq_limits(self, projection: Projection) -> Tensor:
-        """Largest squared residual of an inlier in square pixels, (B, N)."""
+        """Squared radius (px²) of the inlier disc or, with ``precision``, of a disc of equal area: (B, N)."""
         if self.precision is not None:
             return self.precision.determinant.rsqrt()
         return self.img.square() + ((projection.focal * projection.inv_depth).mT * self.world).square()
@@ -63,8 +63,8 @@ class Judged(NamedTuple):
     r"""Inliers and residuals of one pose per problem.
 
     Attributes:
-        weights: :math:`\tau^2 / (\tau^2 + (f \omega / z)^2)` for inliers, which is 1 without a threshold in the world,
-            and 0 for all others, shape :math:`(B, N)`.
+        weights: :math:`\tau^2 / (\tau^2 + (f \omega / z)^2)` for inliers, 0 for all other pairs, shape :math:`(B, N)`.
+            Without a threshold in the world the weight of an inlier is 1.
         errors: standardised squared residuals, below 1 for inliers, :data:`MAX_ERROR` behind the camera, shape
             :math:`(B, N)`.
     """
@@ -79,7 +79,7 @@ class Judged(NamedTuple):
 
 
 def judge(projection: Projection, problem: Problem, thresholds: Thresholds) -> Judged:
-    """Find the inliers of a pose, and their precision. Pairs without weight are no inliers.
+    """Find the inliers of a pose. Pairs without weight are not inliers.
 
     Example:
         >>> from kornia_pnpnet.problem import State
@@ -103,25 +103,26 @@ def judge(projection: Projection, problem: Problem, thresholds: Thresholds) -> J
 def log_false_alarms(
     tested: Tensor, projection: Projection, problem: Problem, thresholds: Thresholds, judged: Judged
 ) -> Tensor:
-    r"""Natural logarithm of the number of poses that are expected to have as many inliers by chance.
+    r"""Natural logarithm of the number of poses that are expected to have as many inliers as a pose, by chance.
 
-    Three pairs give a pose, which leaves :math:`\binom{c - 3}{k - 3}` ways to choose the other inliers. Each of them is
-    an inlier by chance with the probability :math:`p`, and every tested pose is another chance. So the expected number
-    of such poses is at most :math:`T \binom{c-3}{k-3} p^{k-3}`. With an unknown focal length four pairs give a pose.
+    Three of the :math:`c` pairs determine a pose. There are :math:`\binom{c - 3}{k - 3}` ways to choose the other
+    inliers of a pose with :math:`k` inliers. Each of the other inliers is an inlier by chance with the probability
+    :math:`p`. Of :math:`T` tested poses, at most :math:`T \binom{c-3}{k-3} p^{k-3}` are therefore expected to have
+    :math:`k` inliers by chance. With an unknown focal length four pairs determine a pose, and 4 replaces 3.
 
     The probability :math:`p` is the largest of three estimates: from the image, from the outliers and from other pairs.
 
     Source: L. Moisan and B. Stival, "A probabilistic criterion to detect rigid point matches between two images and
     estimate the fundamental matrix", IJCV 57(3), 2004; P. Moulon, P. Monasse and R. Marlet, "Adaptive structure from
-    motion with a contrario model estimation", ACCV 2012. These count the poses that could be tested; here the poses
-    that were tested count.
+    motion with a contrario model estimation", ACCV 2012. The sources count all poses that could be tested; this
+    function counts the poses that were tested.
 
     Args:
         tested: number of poses :math:`T` that were tested, shape :math:`(B,)`.
         projection: the points at the pose.
-        problem: the problem, :math:`c` pairs that have a weight.
-        thresholds: what counts as an inlier.
-        judged: what :func:`judge` returned, :math:`k` inliers.
+        problem: the problem, with :math:`c` pairs that have a weight.
+        thresholds: the thresholds of an inlier.
+        judged: the result of :func:`judge`, with :math:`k` inliers.
 
     Returns:
         float64 of shape :math:`(B,)`.
@@ -138,24 +139,24 @@ def log_false_alarms(
 
 
 def _chance_by_place(problem: Problem, thresholds: Thresholds, judged: Judged) -> Tensor:
-    r"""Probability that an outlier fits by chance as well as the worst inlier does, at most 1, (B,).
+    """Probability that an outlier fits by chance at least as well as the worst inlier, at most 1, (B,).
 
-    *The image.* The pixel of an outlier is uniform in the smallest axis-parallel box around the pixels. The pixel fits
-    when it falls into a disc around the projection, whose standardised radius is the residual of the worst inlier. The
-    chance is the ratio of the areas of disc and box, or the ratio of the disc's diameter to the shorter side of the box
-    if this is smaller; then its mean over the inliers.
+    *The image.* The pixel of an outlier is uniform in the smallest axis-parallel box around all pixels. The outlier
+    fits if its pixel lies in a disc around its projection. The standardised radius of the disc is the residual of the
+    worst inlier. The chance is the area of the disc over the area of the box or, if smaller, the diameter of the disc
+    over the longer side of the box. The estimate is the mean chance of the inliers.
 
-    *The outliers.* A pose that is far off but brings all points near their pixels has more inliers than independent
-    pixels would give it. Points behind the camera, for example, have such poses. The outliers then lie close to their
-    projections. The chance is the share of the pairs (without the three that give the pose) that are outliers within a
-    larger disc, times the ratio of the areas of both discs. The larger disc is at least twenty times as wide and holds
-    at least two outliers; of all such discs the one with the largest chance is taken.
+    *The outliers.* An incorrect pose can bring all points close to their pixels, for example if the points are behind
+    the camera. Such a pose has more inliers than a pose with independent pixels, and its outliers lie close to their
+    projections. Consider larger discs that are at least twenty times as wide and hold at least two outliers. The chance
+    is the number of outliers in the larger disc over the number of all pairs but three, times the area of the disc over
+    the area of the larger disc. The estimate is the largest chance of all larger discs.
     """
     there, inlier = problem.weights > 0, judged.weights > 0
     high = torch.where(there[..., None], problem.places, -torch.inf).amax(1)
     low = torch.where(there[..., None], problem.places, torch.inf).amin(1)
-    eps = torch.finfo(high.dtype).eps  # a perfect fit of pixels that all coincide is no evidence
-    sides = (high - low).clamp(min=eps)  # (B, 2), of the rays in a rig (B, 3)
+    eps = torch.finfo(high.dtype).eps  # if all pixels coincide, a perfect fit is no evidence
+    sides = (high - low).clamp(min=eps)  # (B, 2), or (B, 3) for the rays of a rig
     if problem.rig is not None:
         sides = sides.sort(-1).values[:, 1:]
     worst = torch.where(inlier, judged.errors, 0.0).amax(-1, keepdim=True).clamp(min=eps)
@@ -164,7 +165,7 @@ def _chance_by_place(problem: Problem, thresholds: Thresholds, judged: Judged) -
     chance = (0.25 * math.pi * strips.prod(-1)).minimum(strips.amin(-1)).clamp(max=1.0)
     anywhere = torch.where(inlier, chance, 0.0).sum(-1) / inlier.sum(-1).clamp(min=1)
     outlier = there & ~inlier
-    sq_distance = in_order(torch.where(outlier, judged.errors, torch.inf).mT[None])[0, 1:].mT  # from the second on
+    sq_distance = in_order(torch.where(outlier, judged.errors, torch.inf).mT[None])[0, 1:].mT  # without the first
     within = torch.arange(2, there.shape[1] + 1, device=outlier.device)
     others = (there.sum(-1, keepdim=True) - MIN_PAIRS).clamp(min=1)
     by_outliers = within / others * worst / sq_distance.maximum(_REACH**2 * worst)
@@ -172,10 +173,10 @@ def _chance_by_place(problem: Problem, thresholds: Thresholds, judged: Judged) -
 
 
 def _chance_by_others(projection: Projection, problem: Problem, thresholds: Thresholds, judged: Judged) -> Tensor:
-    """Probability that the pixel of another pair is as close to a projection as the pixel of the worst inlier is, (B,).
+    """Probability that the pixel of another pair is at least as close to a projection as the worst inlier is, (B,).
 
-    Pixels are not uniform: many outliers may have the same pixel, and a pose that projects all points into a small part
-    of the image finds many pixels there.
+    Pixels are not uniform. Many outliers may have the same pixel. A pose that projects all points into a small part of
+    the image finds many pixels in this part.
     """
     there = problem.weights > 0
     worst = torch.where(judged.weights > 0, judged.errors, 0.0).amax(-1, keepdim=True)
@@ -185,7 +186,7 @@ def _chance_by_others(projection: Projection, problem: Problem, thresholds: Thre
     seen = projection.focal.reshape(-1, 1, 1) * seen if problem.rig is None else problem.rays(seen)
     values = torch.cat((seen, pixels, limit[..., None]), -1)
     counts = there.sum(-1)
-    if not exporting() and values.shape[1] > _MOST_OTHERS:  # spread evenly over those that are no padding
+    if not exporting() and values.shape[1] > _MOST_OTHERS:  # spaced evenly over the pairs that are no padding
         first = torch.arange(_MOST_OTHERS, device=there.device)
         some = present_first(there).gather(1, first.maximum(first * counts[:, None] // _MOST_OTHERS))
         values = values.gather(1, some[..., None].expand(-1, -1, values.shape[-1]))
@@ -205,7 +206,7 @@ def _log_factorial(x: Tensor) -> Tensor:
     r"""Logarithm of :math:`x!` for integers :math:`x \ge 0`, in float64."""
     if not exporting():
         return torch.lgamma(x + 1)
-    # ONNX has no log-gamma. Stirling's series of Γ(x + 9), which is Γ(x + 1) times eight factors: 12 digits.
+    # ONNX has no log-gamma. Stirling's series gives Γ(x + 9), which is Γ(x + 1) times eight factors, to 12 digits.
     y = x + 9.0
     inv, sq = y.reciprocal(), y.reciprocal().square()
     series = inv * (1 / 12 - sq * (1 / 360 - sq * (1 / 1260 - sq / 1680)))

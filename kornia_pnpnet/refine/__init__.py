@@ -1,5 +1,6 @@
 """Refinement: robust weighted Levenberg-Marquardt.
 
-``lm`` has the module and its stages, ``residual`` the one residual and its normal equations, ``information`` what noise
-makes of residuals, ``terms`` priors, ``kernels`` the robust kernels, ``parameters`` values that are learned in bounds.
+``lm`` holds the module and its stages. ``residual`` holds the reprojection residual and its normal equations.
+``information`` computes the precision of pixels from noise. ``terms`` holds priors of pose and camera, ``kernels`` the
+robust kernels, and ``parameters`` the learned hyperparameters.
 """

@@ -1,4 +1,4 @@
-r"""The one place where noise becomes information: the precision of each pixel, and its correction by the residuals."""
+"""Noise of the pairs: the precision of each pixel, and corrections of the noise by residuals."""
 
 from __future__ import annotations
 
@@ -26,46 +26,50 @@ __all__ = [
     "sq_standardised",
 ]
 
-# Logarithm of a likelihood ratio. A variance factor that the residuals show replaces 1 where it is e³ times as likely.
+# Logarithm of a likelihood ratio. An estimated variance factor replaces 1 if the residuals are more than e³ times as
+# likely with the estimated factor as with 1.
 _BELIEVED = 3.0
-# Exponents of 4: the variance factors of noise above the estimate. A kernel that is too narrow hides such noise.
+# Exponents of 4. Candidate variance factors for noise above the estimate. The weights of a too narrow kernel hide such
+# noise.
 _FACTORS = range(8)
-# The standard deviation of the noise may be proportional to one of these powers of the confidence. The powers are
-# compared at variance factors of these exponents of 4.
+# Candidate exponents p: the standard deviation of the noise is proportional to confidence**p.
 _POWERS = (0.0, -1.0, -2.0, -3.0)
+# Exponents of 4. Variance factors at which the likelihoods of `_POWERS` are computed.
 _POWER_FACTORS = range(-5, 8)
-# Lower confidences are raised to this, so that the pair keeps some weight.
+# Lower confidences are raised to this value, so that their pairs keep some weight.
 _LEAST_CONFIDENCE = 0.05
-# The noise may depend on the confidence only where a larger share of the pairs are inliers.
+# Share of inliers among the pairs. With a smaller share, `_information_factor` and `larger_sigma` change nothing.
 _MOST = 0.5
-# Rounds of expectation and maximisation for the share of the inliers at each factor; lower bound of this share.
+# Rounds of expectation-maximisation for the share of inliers at each variance factor, and lower bound of this share.
 _ROUNDS, _LEAST_SHARE = 2, 0.02
-# The smallest variance factor: residuals of exact data would give 0.
+# Lower bound of a variance factor, because residuals of exact data would give 0.
 _LEAST_FACTOR = 1e-4
-# Ratio of the standard deviation that the residuals show to its estimate. Iterations by residual correct smaller
-# ratios; with larger ones they start too far from the minimum.
+# Ratio of the standard deviation of the residuals to the estimated standard deviation. The iterations by residual
+# correct smaller ratios. With larger ratios these iterations start too far from the minimum.
 _LARGER = 4.0
 # A pair is an inlier if its final weight is at least this fraction of its initial weight.
 _INLIER = 0.25
-# The residuals of fewer inliers than this say little of a pose that was fitted to them: with 6 to 9 pairs a second
-# solution by their noise succeeds as often as the first (seeds 3117 and 3120 of SyntheticProblems).
+# Inliers. With fewer inliers `larger_sigma` is 0, because residuals of a pose that was fitted to few inliers say little
+# about the noise. With 6 to 9 pairs, a second solution by `larger_sigma` succeeds as often as the first solution (seeds
+# 3117 and 3120 of SyntheticProblems).
 _FEWEST = 7
-# Ratio of the residuals at the true pose to the residuals at the pose that was fitted to them.
+# Ratio of the residuals at the true pose to the residuals at the fitted pose.
 _FITTED = 1.1
-# Sigmas are proportional to the inverse of this power of the confidences. On keypoints of networks the power is near 1;
-# a larger one is better where pairs of low confidence are outliers.
+# `larger_sigma` makes sigmas proportional to confidence**-_POWER. For keypoints of networks an exponent of about 1 fits
+# the noise. A larger exponent is better when pairs of low confidence are outliers.
 _POWER = 1.5
-# Median of the length of a residual of unit variance in both coordinates.
+# Median length of a residual with unit variance in each coordinate.
 _MEDIAN = math.sqrt(2.0 * math.log(2.0))
 
-#: Robust weight by squared residual and shape, see :class:`~kornia_pnpnet.refine.kernels.RobustKernel`.
+#: Robust weight as a function of squared residual and shape, see :class:`~kornia_pnpnet.refine.kernels.RobustKernel`.
 KernelWeight: TypeAlias = Callable[[Tensor, Tensor], Tensor]
 
 
 def complete_noise(problem: Problem, starts: Starts) -> Noise | None:
-    """Noise of every pair: sigmas of the initialiser, or the caller's with 0 where unknown; covariances of the caller.
+    """Combine the noise of the caller and the initialiser to noise of every pair, ``None`` if neither gave noise.
 
-    ``None`` where neither knows any noise.
+    The sigmas are from the initialiser or, if the initialiser gave no noise, from the caller, with 0 for unknown
+    sigmas. The covariances are from the caller.
     """
     noise = starts.noise
     if noise is None and problem.noise is not None:
@@ -78,7 +82,7 @@ def complete_noise(problem: Problem, starts: Starts) -> Noise | None:
 
 
 def is_unknown(problem: Problem) -> Tensor:
-    """Problems for which the caller gave no sigma, neither of a pixel nor of a point, bool (B, 1)."""
+    """Find problems for which the caller gave no sigma of any pixel or world point, bool (B, 1)."""
     known = torch.zeros_like(problem.weights[:, :1], dtype=torch.bool)
     for sigma in () if problem.noise is None else problem.noise.sigmas[:2]:
         known = known | sigma.isfinite().any(1, keepdim=True)
@@ -86,20 +90,20 @@ def is_unknown(problem: Problem) -> Tensor:
 
 
 def pixel_precision(projection: Projection, problem: Problem, noise: Noise) -> Tensor | Symmetric2:
-    """Inverse of the variance of each pixel, (B, N), or of the covariance where there is any."""
+    """Inverse variance of each pixel, (B, N), or inverse covariance if the noise has covariances."""
     if not noise.covariances:
         return pixel_variance(projection, noise).reciprocal()
     return pixel_covariance(projection, problem, noise).inverse()
 
 
 def sq_standardised(projection: Projection, problem: Problem, most: Tensor) -> Tensor:
-    """Squared residuals in variances of their pixel where the noise is known, else in square pixels, bounded.
+    """Bounded squared residuals: divided by the variance of their pixel if the noise is known, else in square pixels.
 
     Args:
         projection: the points at a state.
-        problem: the problem; its noise is known for every pair or for none.
-        most: upper bound of a squared residual and its value behind the camera, in square pixels, a scalar or (B, 1).
-            With covariances these square pixels have the mean precision of both coordinates.
+        problem: the problem, with known noise of every pair or without noise.
+        most: upper bound of a squared residual in square pixels, a scalar or (B, 1). Points behind the camera have the
+            upper bound. With covariances the bound is multiplied by the mean precision of both coordinates.
 
     Returns:
         Shape :math:`(B, N)`.
@@ -114,17 +118,17 @@ def sq_standardised(projection: Projection, problem: Problem, most: Tensor) -> T
 
 
 def information(projection: Projection, problem: Problem) -> tuple[Tensor, Tensor | Symmetric2]:
-    """Squared residuals in the unit of the robust kernel, and the information of the pixels.
+    """Compute squared residuals in the unit of the robust kernel, and the information of the pixels.
 
     Args:
         projection: the points at a state.
-        problem: the problem; its noise is known for every pair or for none.
+        problem: the problem, with known noise of every pair or without noise.
 
     Returns:
-        Squared residuals in variances, in square pixels where no noise is known, (B, N); the inverse variance of a
-        pixel, (B, N) or (B, 1), or the inverse of its covariance.
+        Squared residuals, (B, N), and the inverse variance of each pixel, (B, N) or (B, 1), or its inverse covariance.
+        Squared residuals are in variances of their pixel or, without noise, in square pixels.
     """
-    if problem.noise is None:  # unknown noise counts as one pixel of the caller
+    if problem.noise is None:  # without noise, sigma is one pixel of the caller
         return projection.sq_residual, problem.img_scale.square().reciprocal()[:, None]
     precision = pixel_precision(projection, problem, problem.noise)
     if isinstance(precision, Tensor):
@@ -135,26 +139,29 @@ def information(projection: Projection, problem: Problem) -> tuple[Tensor, Tenso
 def corrected_noise(
     projection: Projection, problem: Problem, kernel_weight: KernelWeight, shape: Tensor, outlier_area: Tensor
 ) -> tuple[Noise, Tensor]:
-    r"""The noise that the residuals show, where an initialiser estimated it.
+    """Correct the noise that an initialiser estimated, by residuals.
 
-    Noise above the estimate: inliers have Gaussian residuals with the variance times a factor, outliers have pixels
-    anywhere in an area. The power of 4 with the largest likelihood replaces 1 where it is :math:`e^3` times as likely.
-    The share of inliers is estimated for each factor, and the three pairs that any pose fits do not count.
+    *Noise above the estimate.* The residuals of inliers are Gaussian with the estimated variance times a factor. The
+    pixels of outliers are uniform in an area. The candidate factors are powers of 4, and the share of inliers is
+    estimated for each factor. The most likely factor is used if its likelihood is more than :math:`e^3` times the
+    likelihood of the factor 1. Three inliers do not count in the likelihood, because a pose can fit any three pairs.
 
-    Noise below the estimate: the a posteriori variance factor of an adjustment, which is the weighted sum of squared
-    residuals over the degrees of freedom, of the pairs deep within the kernel. It replaces 1 where its likelihood ratio
-    is beyond chance.
+    *Noise below the estimate.* The factor is the a posteriori variance factor of an adjustment: the weighted sum of
+    squared residuals over the degrees of freedom. Only pairs deep within the kernel have large weights. The factor is
+    used if it is below 1 and its likelihood is more than :math:`e^3` times the likelihood of the factor 1.
+
+    With confidences, the noise is first made to depend on the confidence if the residuals show such a dependence.
 
     Args:
         projection: the points at a state.
-        problem: the problem; its noise is known for every pair, its weights are at most about 1.
-        kernel_weight: the robust kernel's weight, at most 1.
+        problem: the problem, with known noise of every pair and weights of at most about 1.
+        kernel_weight: the robust weight, at most 1.
         shape: shape of the kernel, a scale.
-        outlier_area: See :func:`outlier_area`, 0 where the caller gave the noise, (B, 1).
+        outlier_area: see :func:`outlier_area`; 0 for problems whose noise the caller gave, (B, 1).
 
     Returns:
-        The noise, with sigmas at least as large as estimated, and a factor of the kernel's shape, at most 1, (B, 1).
-        Noise below the estimate makes only the kernel narrower.
+        The corrected noise, and a factor of the kernel's shape, at most 1, (B, 1). Noise below the estimate makes the
+        kernel narrower, but does not change the sigmas.
     """
     noise, weights, area = problem.noise, problem.weights, outlier_area
     assert noise is not None
@@ -184,14 +191,15 @@ def corrected_noise(
 
 @torch.no_grad()
 def larger_sigma(projection: Projection, problem: Problem, estimate: Noise, inlier_weights: Tensor) -> Tensor:
-    """Standard deviation of the pixels that the inliers show, where it is much larger than estimated, else 0.
+    """Estimate the standard deviation of the pixels from the residuals of the inliers.
 
-    With confidences, pairs of low confidence get larger sigmas than others.
+    The result is 0 unless the residuals show much larger noise than ``estimate``. With confidences, pairs of low
+    confidence get larger sigmas than pairs of high confidence.
 
     Args:
-        projection: the points at the pose that was found.
+        projection: the points at the final pose.
         problem: the problem.
-        estimate: the estimated noise.
+        estimate: the noise that was estimated before the refinement.
         inlier_weights: final weight of each pair relative to its weight before the refinement, :math:`(B, N)`.
 
     Returns:
@@ -215,7 +223,10 @@ def larger_sigma(projection: Projection, problem: Problem, estimate: Noise, inli
 
 
 def outlier_area(problem: Problem) -> Tensor:
-    """Area in which pixels of outliers lie: a square with the variance of the usual pixels, in px², (B, 1)."""
+    """Area of the square in which pixels of outliers are uniformly distributed, in px², (B, 1).
+
+    The distribution has the variance of the pixels of usual pairs (see :class:`~kornia_pnpnet.problem.Problem`).
+    """
     there = (problem.usual_weights > 0).to(problem.weights)[..., None]
     share = there / there.sum(1, keepdim=True).clamp(min=1.0)
     places = problem.places.detach()
@@ -224,7 +235,7 @@ def outlier_area(problem: Problem) -> Tensor:
 
 
 def _powers_of_4(exponents: range, like: Tensor) -> Tensor:
-    """Powers of 4, (F,), made on the device: a CUDA graph cannot capture a copy from the CPU."""
+    """Powers of 4, (F,), computed on the device: a CUDA graph cannot capture a copy from the CPU."""
     return 4.0 ** torch.arange(exponents.start, exponents.stop, dtype=like.dtype, device=like.device)
 
 
@@ -238,7 +249,7 @@ def _log_likelihoods(
 ) -> tuple[Tensor, Tensor]:
     """Log-likelihood of the residuals at each variance factor, and the number of inliers, (F, B) each."""
     grid = _powers_of_4(exponents, sq_residual)
-    # Densities of a pixel, relative to that of an inlier without a residual whose factor is 1.
+    # Densities of a pixel, divided by the density of an inlier with residual 0 and variance factor 1.
     inlier = torch.exp(sq_residual * (-0.5 / grid)[:, None, None]) * in_front / grid[:, None, None]
     outlier = (2.0 * math.pi / (precision * outlier_area)).clamp(max=1.0)  # (B, N)
     count = there.sum(-1, keepdim=True).clamp(min=1)
@@ -254,24 +265,24 @@ def _log_likelihoods(
 def _information_factor(
     sq_residual: Tensor, precision: Tensor, projection: Projection, problem: Problem, outlier_area: Tensor
 ) -> Tensor:
-    r"""Factor of each pair's precision where the residuals show that noise grows as the confidence falls, (B, N).
+    """Factor of each pair's precision, (B, N), if the residuals show that the noise depends on the confidence, else 1.
 
-    The keypoints of a network are often less accurate where their confidence is low, but a matcher's ratio says nothing
-    of the noise. So the standard deviation is proportional to a power of the confidence, or independent of it. A power
-    replaces 0 where it is :math:`e^3` times as likely by the mixture of :func:`_log_likelihoods`, and most pairs are
-    inliers. Among many outliers, near misses would pass for noisy inliers.
+    Keypoints of a network are often less accurate at low confidence, but the confidence of a matcher says nothing about
+    the noise. The standard deviation is therefore proportional to a power of the confidence, or constant. A power is
+    used if its likelihood (see :func:`_log_likelihoods`) is more than :math:`e^3` times the likelihood of constant
+    noise, and if most pairs are inliers. Otherwise, outliers with small residuals could pass for noisy inliers.
     """
     assert problem.confidence is not None
     there = problem.weights > 0
     known = there & problem.confidence.isfinite()
     log = torch.where(known, problem.confidence.clamp(min=_LEAST_CONFIDENCE).log(), 0.0)
     log = torch.where(known, log - log.sum(-1, keepdim=True) / known.sum(-1, keepdim=True).clamp(min=1), 0.0)
-    factors = torch.stack([torch.exp(-2.0 * power * log) for power in _POWERS])  # their geometric mean is 1
+    factors = torch.stack([torch.exp(-2.0 * power * log) for power in _POWERS])  # the geometric mean over pairs is 1
     seen = projection.in_front & there, there, outlier_area, _POWER_FACTORS
     found = [_log_likelihoods(sq_residual * x, precision * x, *seen) for x in factors]
     likelihoods, inliers = (torch.stack(x) for x in zip(*found, strict=True))  # (K, F, B)
     variance = likelihoods.max(1)
-    best = variance.values.max(0)  # of the powers, (B,)
+    best = variance.values.max(0)  # over the powers, (B,)
     inliers = inliers.gather(1, variance.indices[:, None])[:, 0].gather(0, best.indices[None])[0]
     believed = (best.values > variance.values[0] + _BELIEVED) & (inliers > _MOST * there.sum(-1))
     believed = believed & (outlier_area[:, 0] > 0)

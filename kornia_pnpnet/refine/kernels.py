@@ -1,12 +1,13 @@
 r"""Robust kernels: the weight of a pair as a function of its squared residual.
 
-A new kernel is one more entry of :data:`KERNELS`.
+A new kernel is a new entry of :data:`KERNELS`.
 
-A kernel is a loss :math:`\rho(s)` of the squared residual :math:`s = \|r\|^2` in square pixels with one *shape*
-parameter, and its derivative :math:`w(s) = \rho'(s)`: iterating weighted least squares with the weight :math:`w`
-minimises :math:`\sum \rho`. The scale of ``huber``, ``cauchy``, ``geman_mcclure`` and ``truncated`` is in pixels of the
-normalised camera, or in standard deviations where the noise is known; the shape of ``power`` is the exponent
-:math:`\alpha` of the paper's :math:`w = 1/\|r\|^\alpha`.
+A kernel consists of a loss :math:`\rho(s)` of the squared residual :math:`s = \|r\|^2` and of its derivative
+:math:`w(s) = \rho'(s)`. Loss and derivative have one *shape* parameter. Iteratively reweighted least squares with the
+weight :math:`w` minimises :math:`\sum \rho`. The residual is in pixels of the normalised camera or, if the noise is
+known, in standard deviations. The shape of ``huber``, ``cauchy``, ``geman_mcclure`` and ``truncated`` is a scale in the
+unit of the residual. The shape of ``power`` is the exponent :math:`\alpha` of the weight :math:`w = 1/\|r\|^\alpha` of
+PnP-Net (see :func:`~kornia_pnpnet.refine.residual.lm_step` for the source).
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from torch import Tensor
 
 __all__ = ["KERNELS", "POWER_FLOOR", "RobustKernel"]
 
-#: Pixels. Added to residuals (in squares) in ``power``, whose weight would be infinite at 0.
+#: Pixels. ``power`` adds the square to squared residuals, because its weight at 0 would be infinite otherwise.
 POWER_FLOOR = 0.1
 
 
@@ -27,7 +28,7 @@ class RobustKernel(NamedTuple):
     """A robust loss of the squared residual, its derivative, and the range of its one shape parameter.
 
     Attributes:
-        loss: ``loss(sq_residual, shape)``, 0 at 0 and never decreasing.
+        loss: ``loss(sq_residual, shape)``, non-decreasing, and 0 for a residual of 0.
         weight: ``weight(sq_residual, shape)``, the derivative of ``loss`` by ``sq_residual``.
         default: the classical value of the shape.
         lower: the smallest shape that may be learned.
@@ -53,8 +54,9 @@ def _power_weight(sq_residual: Tensor, alpha: Tensor) -> Tensor:
 
 
 def _power_loss(sq_residual: Tensor, alpha: Tensor) -> Tensor:
-    # The integral of (s + c)^(-alpha/2) from 0. With e = 1 - alpha/2 and L = log(1 + s/c) it is
-    # c^e L (exp(e L) - 1) / (e L), which stays smooth through alpha = 2 when the last factor does.
+    # The loss is the integral of (s + c)^(-alpha/2) from 0, where c is `floor`. With e = 1 - alpha/2 and L = log(1 +
+    # s/c), the integral is c^e L (exp(e L) - 1) / (e L). A series replaces the last factor close to e L = 0, so that
+    # the loss is smooth at alpha = 2.
     floor = POWER_FLOOR**2
     exponent = 1.0 - 0.5 * alpha
     log_ratio = torch.log1p(sq_residual / floor)
@@ -95,7 +97,7 @@ def _geman_mcclure_loss(sq_residual: Tensor, scale: Tensor) -> Tensor:
 
 
 def _truncated_weight(sq_residual: Tensor, scale: Tensor) -> Tensor:
-    # The zero term keeps the scale in the graph, as training on several processes expects of every parameter.
+    # The zero term keeps the scale in the autograd graph: distributed training expects a gradient of every parameter.
     return (sq_residual < scale * scale).to(sq_residual.dtype) + 0.0 * scale
 
 
@@ -103,9 +105,9 @@ def _truncated_loss(sq_residual: Tensor, scale: Tensor) -> Tensor:
     return torch.minimum(sq_residual, scale * scale)
 
 
-#: The kernels by name. ``power`` is the paper's; the others are the usual M-estimators (Z. Zhang, "Parameter
-#: estimation techniques", Image and Vision Computing 15(1), 1997, table 1), with ``truncated`` the least squares
-#: behind MSAC.
+#: The kernels by name. ``power`` is the kernel of PnP-Net. The other kernels are common M-estimators (Z. Zhang,
+#: "Parameter estimation techniques", Image and Vision Computing 15(1), 1997, table 1). ``truncated`` is the truncated
+#: least squares of MSAC.
 KERNELS: dict[str, RobustKernel] = {
     "power": RobustKernel(_power_loss, _power_weight, 1.0, 0.0, 3.0, logarithmic=False),
     "huber": RobustKernel(_huber_loss, _huber_weight, 5.0, 0.1, 1e4, logarithmic=True),

@@ -35,33 +35,35 @@ __all__ = ["BACKWARDS", "Plan", "Refinement", "RobustWeightedLM"]
 #: How gradients pass through a refinement, see :class:`RobustWeightedLM`.
 BACKWARDS = ("unroll", "implicit")
 
-# Focal lengths. Residuals count up to this size in the cost, and a point behind the camera counts as much, so that it
-# is never cheaper than a point in front of the camera.
+# Focal lengths. Upper bound of a residual in the cost. The residual of a point behind the camera counts as this bound,
+# so that the point never costs less than a point in front of the camera.
 _MAX_RESIDUAL = 2.0
-# Units in the last place. With `reject_worse`, costs and residuals that differ by less count as equal.
+# Units in the last place, of costs and of residuals. With `reject_worse`, smaller increases of the cost are ignored.
 _ROUNDING = 100.0
-# Factors of the damping after a refused and after an accepted step (Marquardt 1963; only with `reject_worse`).
+# Factors of the damping after a rejected and after an accepted step (Marquardt 1963; only with `reject_worse`).
 _DAMPING_UP, _DAMPING_DOWN = 10.0, 0.3
 
 
 class Plan(NamedTuple):
-    r"""Everything that the iterations of a refinement need, made before the first of them.
+    r"""The inputs of all iterations of a refinement, prepared before the first iteration.
 
     Attributes:
-        problem: the problem, problems last in memory, with the weights of the caller; its noise is known for every
-            pair, or ``None``.
-        prior: weight of each pair without the robust factor, for cost and judgement: the caller's times the
-            initialiser's, or the caller's alone when there are iterations by residual, :math:`(B, N)`.
-        guided: weights of caller and initialiser, relative to the largest, :math:`(B, N)`.
-        by_residual: weights of the last iterations: those of the caller alone, relative to their mean, or ``guided``
-            without such iterations, :math:`(B, N)`.
-        state: the first states of :math:`S B` refinements: one of every problem, then the next of every problem.
-        area: :func:`~kornia_pnpnet.refine.information.outlier_area` of problems whose noise the last iterations
-            correct, 0 of others, :math:`(B, 1)`; ``None``: the noise is not corrected.
-        noiseless: problems without any noise beside others whose noise the caller gave, bool :math:`(B,)`; ``None``:
-            there are no such problems.
+        problem: the problem in the memory layout of ``kornia_pnpnet.core.performance.problems_last``, with the
+            weights of the caller, and with known noise of every pair or without noise.
+        prior: weight of each pair without the robust weight, for the cost and :meth:`RobustWeightedLM.judge`,
+            :math:`(B, N)`. With iterations by residual, ``prior`` is the weight of the caller. Otherwise ``prior`` is
+            the product of the weights of caller and initialiser.
+        guided: product of the weights of caller and initialiser, divided by the largest product, :math:`(B, N)`.
+        by_residual: weights in the iterations by residual: the weights of the caller, divided by their mean,
+            :math:`(B, N)`. Without iterations by residual, ``by_residual`` equals ``guided``.
+        state: the initial states, a batch of :math:`S B`: the first state of every problem, then the second state of
+            every problem, and so on.
+        area: :func:`~kornia_pnpnet.refine.information.outlier_area` of problems whose noise is corrected by residuals,
+            0 for all other problems, :math:`(B, 1)`; ``None``: no noise is corrected.
+        noiseless: problems without noise in a batch with noise from the caller, bool :math:`(B,)`; ``None``: the caller
+            gave no noise, or the initialiser returned noise.
         hyperparameters: step :math:`\gamma`, damping :math:`\lambda` and the kernel's shape of each iteration, scalars.
-        starts: number :math:`S` of states of each problem.
+        starts: number :math:`S` of initial states of each problem.
     """
 
     problem: Problem
@@ -76,7 +78,7 @@ class Plan(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """States between two iterations, whether the last equations were solved (bool), and a factor of the damping."""
+    """States between two iterations, whether the last equations could be solved (bool), and a factor of the damping."""
 
     state: State
     solved: Tensor
@@ -84,15 +86,16 @@ class Progress(NamedTuple):
 
 
 class Refinement(NamedTuple):
-    r"""A refined pose: what a refiner returns.
+    """A refined pose: the result of a refiner.
 
     Attributes:
-        state: the refined pose in the frame of the problem, and the camera that goes with it.
-        weights: the weight of each pair at that pose, shape :math:`(B, N)`.
-        cost: mean robust loss of the pairs at that pose, shape :math:`(B,)`.
-        ok: whether the pose is to be believed, bool, shape :math:`(B,)`.
+        state: the refined pose in the frame of the problem, and the refined camera.
+        weights: the weight of each pair at the refined pose, shape :math:`(B, N)`.
+        cost: robust loss of pairs and terms, divided by the number of pairs, shape :math:`(B,)`.
+        ok: whether the pose is to be believed, see :meth:`RobustWeightedLM.forward`, bool, shape :math:`(B,)`.
         in_front: whether at least three pairs with a weight are in front of the camera, bool, shape :math:`(B,)`.
-        probability: probability that the pose is not far off, shape :math:`(B,)`.
+        probability: probability that the pose is correct, see :func:`~kornia_pnpnet.judge.belief.probability`, shape
+            :math:`(B,)`.
     """
 
     state: State
@@ -111,45 +114,51 @@ class Refinement(NamedTuple):
 class RobustWeightedLM(Configured):
     r"""Refine poses by ``m`` unrolled iterations of robust weighted Levenberg-Marquardt.
 
-    Each iteration weighs a pair by the product of the caller's weight, the initialiser's weight, and the robust weight
-    of the pair's residual at the previous estimate, and takes one :func:`~kornia_pnpnet.refine.residual.lm_step`. Step
-    :math:`\gamma`, damping :math:`\lambda` and robustness (the shape of the kernel, :math:`\alpha` for ``power``) are
-    learned, by default one set per iteration. Their initial values give the classical method.
+    Each iteration takes one :func:`~kornia_pnpnet.refine.residual.lm_step`. The weight of a pair is the product of the
+    caller's weight, the initialiser's weight, and the robust weight of the pair's residual at the previous estimate.
+    Step :math:`\gamma`, damping :math:`\lambda` and robustness (the shape of the kernel, :math:`\alpha` for ``power``)
+    are learned, by default one set per iteration. The initial hyperparameters give the classical method.
 
-    *Noise.* Where the noise of each pair is known or estimated, residuals are divided by the standard deviation of
-    their pixel (:func:`~kornia_pnpnet.refine.residual.pixel_variance` at the previous estimate), or whitened by its
-    covariance where the caller gave covariances. Scales of kernels and the cost then count in standard deviations.
+    *Noise.* If the noise of each pair is known or estimated, residuals are divided by the standard deviation of their
+    pixel (:func:`~kornia_pnpnet.refine.residual.pixel_variance` at the previous estimate). If the caller gave
+    covariances, residuals are whitened by the covariance of their pixel. The scale of a kernel is then in standard
+    deviations, and the cost is in squared standard deviations.
 
-    *Several poses.* Where an initialiser returns several poses, the first seven tenths of the iterations (rounded down)
-    refine all of them. Then the pose of the lowest cost by the kernel of the last of these iterations goes on alone.
+    *Several poses.* If an initialiser returns several poses, the first 70 % of the iterations (rounded down) refine all
+    poses. The remaining iterations refine only the pose of the lowest cost. This cost is computed with the kernel of
+    the last iteration on all poses.
 
     *By residual.* The last ``by_residual`` iterations and the choice among several poses ignore the initialiser's
-    weights, because residuals then separate inliers from outliers better. If the initialiser estimated the noise, they
-    correct it (:func:`~kornia_pnpnet.refine.information.corrected_noise`). Noise that the caller gave stays as it is.
+    weights, because residuals then separate inliers from outliers better than the initialiser's weights. If the
+    initialiser estimated the noise, :func:`~kornia_pnpnet.refine.information.corrected_noise` corrects the estimate
+    before these iterations. Noise that the caller gave is not corrected.
 
-    All operations are per problem: a problem that cannot be solved keeps its pose, reports ``ok=False`` and changes
-    no other.
+    Problems are independent. A problem that cannot be solved keeps its pose, reports ``ok=False``, and does not change
+    other problems.
 
     Args:
-        m: number of iterations; 0 leaves the poses as they are and only judges the first.
+        m: number of iterations. With 0, the pose of the lowest cost is judged without refinement.
         kernel: name of the robust kernel, a key of :data:`~kornia_pnpnet.refine.kernels.KERNELS`.
         step: initial :math:`\gamma`, in [0, 2].
         damping: initial :math:`\lambda`, in [1e-8, 100].
-        robustness: initial shape of the kernel, its classical value when ``None``. With 0, ``power`` is least squares.
-        shared: learn one set for all iterations instead of one each.
-        update: ``"retraction"`` on the rotation group, or the paper's ``"additive"`` on the rotation vector.
-        reject_worse: refuse, per problem, a step that raises the cost, and raise the damping tenfold after it. From a
-            start far away the iterations diverge otherwise; from a good start they take the same steps, and are faster
-            without.
-        by_residual: number of final iterations that ignore the initialiser's weights, at most those after the choice
-            among several poses. Needs a kernel whose weights are at most 1, which those of ``power`` are not.
+        robustness: initial shape of the kernel; ``None``: the classical value of the kernel. With 0, ``power`` is least
+            squares.
+        shared: learn one set of hyperparameters for all iterations instead of one set per iteration.
+        update: ``"retraction"`` on the rotation group, or the paper's ``"additive"`` update of the rotation vector.
+        reject_worse: reject a step that raises the cost of its problem, and then multiply the damping by 10. Without
+            rejection, iterations from a distant start can diverge. From a good start, both variants take nearly the
+            same steps, and iterations without rejection are faster.
+        by_residual: number of final iterations that ignore the initialiser's weights, at most the iterations after the
+            choice among several poses. Needs a kernel whose weights are at most 1, which excludes ``power``.
         learnable: whether the hyperparameters are trained.
-        backward: how gradients pass. ``"unroll"``: through all iterations. ``"implicit"``: by the implicit function
-            theorem, as through a minimum, at a memory that does not grow with ``m``; exact once the iterations have
-            converged. Step, damping and the first poses then have no gradient.
+        backward: how gradients are computed. ``"unroll"`` differentiates all iterations. ``"implicit"`` applies the
+            implicit function theorem to the last state, with memory that does not grow with ``m``. The implicit
+            gradient is exact if the iterations have converged. Step, damping and initial poses have no implicit
+            gradient.
 
     Raises:
-        BaseError: for an unknown kernel or update, a negative ``m``, or an initial value out of its bounds.
+        BaseError: for an unknown kernel, update or backward, a negative ``m`` or ``by_residual``, or an initial value
+            out of its bounds.
         ValueCheckError: for ``by_residual`` with a kernel whose weights exceed 1.
 
     Example:
@@ -201,21 +210,24 @@ class RobustWeightedLM(Configured):
         self.requires_grad_(learnable and m > 0)
 
     def hyperparameters(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        r"""Step :math:`\gamma`, damping :math:`\lambda` and shape of the kernel, :math:`(\max(m, 1),)` each.
+        r"""Step :math:`\gamma`, damping :math:`\lambda` and shape of the kernel of each iteration.
 
         Args:
-            like: a tensor of the dtype and device to return them in.
+            like: a tensor of the dtype and the device of the results.
+
+        Returns:
+            Three tensors of shape :math:`(\max(m, 1),)`.
         """
         count = max(self.m, 1)
         step, damping, shape = (p().to(like).expand(count) for p in (self.step, self.damping, self.robustness))
         return step, damping, shape
 
     def with_iterations(self, m: int) -> RobustWeightedLM:
-        """A copy with another number of iterations, its hyperparameters included.
+        """Copy the module, including its hyperparameters, with another number of iterations.
 
         Args:
-            m: number of iterations. Fewer: the first of them. More: the last iteration is repeated, so that poses
-                converge further.
+            m: number of iterations. A smaller number keeps the hyperparameters of the first iterations. A larger number
+                repeats the hyperparameters of the last iteration, so that poses converge further.
 
         Example:
             >>> refine = RobustWeightedLM(m=5).with_iterations(20)
@@ -233,27 +245,29 @@ class RobustWeightedLM(Configured):
     def forward(
         self, problem: Problem, starts: Starts, *, m: int | None = None, more: int = 0, run: Runner = EAGER
     ) -> Refinement:
-        r"""Refine poses.
+        """Refine poses.
 
         Args:
             problem: :math:`B` problems with :math:`N` pairs each.
-            starts: poses in the frame of the problem and a factor for the weight of each pair.
-            m: stop after this number of iterations; run all of them when ``None``.
-            more: number of further iterations like the last one.
-            run: runs each part, compiled or not.
+            starts: initial poses in the frame of the problem, and a factor of the weight of each pair.
+            m: number of iterations to run; ``None``: all iterations.
+            more: number of additional iterations with the hyperparameters of the last iteration.
+            run: calls each part of the refinement, compiled or uncompiled.
 
         Returns:
             The refined poses, the weights and the cost at these poses with the kernel of the last iteration, and
-            ``ok``: whether the last equations could be solved and the pose is to be believed. With unknown noise it
-            has to explain the pixels better than a single point would; with known noise it has to have more inliers
-            than chance would give it (see :mod:`kornia_pnpnet.judge.belief`).
+            ``ok``. A pose is ``ok`` only if the equations of the last iteration could be solved and three pairs are in
+            front of the camera. With unknown noise, the pose must explain the pixels better than a single point
+            (:func:`~kornia_pnpnet.judge.belief.explains`). With known noise, the pose must have more inliers than
+            expected by chance (:func:`~kornia_pnpnet.judge.belief.believe`). The pairs must determine an unknown focal
+            length (:func:`~kornia_pnpnet.judge.belief.has_focal`).
         """
         plan = run(self.begin, problem, starts)
         state, solved = self.iterate(plan, m, more=more, run=run)
         return run(self.judge, plan, state, solved)
 
     def begin(self, problem: Problem, starts: Starts) -> Plan:
-        """Prepare a refinement: everything before the first iteration. For the arguments see :meth:`forward`."""
+        """Run everything before the first iteration. See :meth:`forward` for the arguments."""
         each = zip(*(x.unbind() for x in self.hyperparameters(problem.world_points)), strict=True)
         unknown = is_unknown(problem) if self.by_residual or problem.noise is not None else None
         noiseless = None if unknown is None or problem.noise is None or starts.noise is not None else unknown[:, 0]
@@ -263,12 +277,13 @@ class RobustWeightedLM(Configured):
         if self.by_residual and unknown is not None and problem.noise is not None and not problem.noise.covariances:
             all_known = sees_values(unknown) and unknown.device.type == "cpu" and not bool(unknown.any())
             area = None if all_known else torch.where(unknown, outlier_area(problem), 0.0)
-        # Steps do not depend on a common factor of the weights; tiny weights must not vanish when multiplied.
+        # A common factor of the weights does not change a step. The division keeps products of tiny weights from
+        # vanishing.
         guided = by_residual = relative(prior, prior)
         if self.by_residual:
             by_residual, prior = _relative_to_mean(problem.weights), problem.weights
         poses = starts.poses
-        # Problems last in memory, too: (3, 3, S B) and (3, S B).
+        # In the memory layout of `problems_last`: (3, 3, S B) and (3, S B).
         pose = map_tensors(lambda *x: torch.cat([y.movedim(0, -1) for y in x], -1).movedim(-1, 0), *poses)
         camera = pose.translation[:, : 0 if problem.free_focal is None else 1] * 0.0
         if starts.camera is not None:
@@ -277,9 +292,9 @@ class RobustWeightedLM(Configured):
         return Plan(problem, *weights, state, area, noiseless, tuple(each), len(poses))
 
     def iterate(self, plan: Plan, m: int | None = None, *, more: int = 0, run: Runner = EAGER) -> tuple[State, Tensor]:
-        """Run the iterations: on all poses of a problem, then on the best pose of each, the last by residual.
+        """Run the iterations: first on all poses of a problem, then on the best pose, and finally by residual.
 
-        For the arguments see :meth:`forward`. Returns the last state, and whether the last equations could be solved.
+        See :meth:`forward` for the arguments. Returns the last state, and whether the last equations could be solved.
         """
         m = self.m if m is None else min(m, self.m)
         each = plan.hyperparameters[:m] + plan.hyperparameters[max(m - 1, 0) :][:1] * more
@@ -311,7 +326,7 @@ class RobustWeightedLM(Configured):
         return now.state, now.solved
 
     def judge(self, plan: Plan, state: State, solved: Tensor) -> Refinement:
-        """Judge what :meth:`iterate` returned: everything after the last iteration."""
+        """Run everything after the last iteration: compute weights, cost and ``ok`` of a state of :meth:`iterate`."""
         projection, shape = project(state, plan.problem), per_problem(plan.hyperparameters[-1][2], plan.prior[:, :1])
         cost = self._cost(projection, plan.problem, plan.prior, shape)
         seen, noise = plan.problem._replace(weights=plan.by_residual), plan.problem.noise
@@ -326,7 +341,7 @@ class RobustWeightedLM(Configured):
             unknown = torch.ones_like(solved)
         probability, ok = believe(projection, judged, noise, law)
         if unknown is not None:
-            # Not `where`: ONNX Runtime has none for booleans.
+            # ONNX Runtime has no `where` for booleans.
             ok = (unknown & explains(projection, plan.problem, plan.prior)) | (~unknown & ok)
         in_front = has_enough(projection, plan.prior)
         if state.camera.shape[1]:
@@ -338,7 +353,7 @@ class RobustWeightedLM(Configured):
         return self._cost(project(state, plan.problem), plan.problem, plan.prior, plan.hyperparameters[-1][2])
 
     def _correct(self, problem: Problem, state: State, shape: Tensor, area: Tensor) -> tuple[Noise, Tensor]:
-        """The noise of a stage, from the residuals before it, and a factor of the kernel's shape."""
+        """Correct the noise by the residuals at a state, see :func:`corrected_noise` for the result."""
         shape = per_problem(shape, problem.weights[:, :1])
         return corrected_noise(project(state, problem), problem, self.kernel.weight, shape, area)
 
@@ -354,7 +369,8 @@ class RobustWeightedLM(Configured):
             return Progress(state, solved, now.factor)
         new = self._cost(project(state, problem), problem, problem.weights, shape)
         old = self._cost(projection, problem, problem.weights, shape)
-        # At a minimum, rounding decides which cost is lower. A refused step has no gradient there: take the step.
+        # At a minimum, rounding errors decide which cost is lower. Such steps are accepted, because a rejected step has
+        # no gradient.
         rounding = _ROUNDING * torch.finfo(new.dtype).eps
         better = new <= old * (1.0 + rounding) + (rounding * projection.focal).square()
         factor = torch.where(better, now.factor * _DAMPING_DOWN, now.factor * _DAMPING_UP)
@@ -362,7 +378,7 @@ class RobustWeightedLM(Configured):
         return Progress(kept, solved, factor)
 
     def _equations(self, projection: Projection, problem: Problem, shape: Tensor) -> NormalEquations:
-        """Normal equations of the pairs, weighted and whitened, and of the terms."""
+        """The sum of the normal equations of the pairs, weighted and whitened, and of the terms."""
         sq_residual, precision = information(projection, problem)
         robust = problem.weights * self.kernel.weight(sq_residual, shape)
         weights = map_tensors(lambda x: x * robust, precision)
@@ -372,20 +388,20 @@ class RobustWeightedLM(Configured):
         return equations
 
     def _best(self, rivals: Problem, prior: Tensor, shape: Tensor, now: Progress) -> Progress:
-        """Keep the state of the lowest cost of each problem; ``prior`` has as many problems as there are."""
+        """Keep the state of the lowest cost of each problem, out of all states of the problem in ``now``."""
         batch = prior.shape[0]
         projection = project(map_tensors(torch.Tensor.detach, now.state), rivals)
         cost = self._cost(projection, rivals, rivals.weights, shape.detach())
-        best = (cost.view(-1, batch) if batch else cost[None]).argmin(0)  # (B,), the first of equals
+        best = (cost.view(-1, batch) if batch else cost[None]).argmin(0)  # (B,), the first state of equal costs
         index = torch.add(torch.arange(batch, device=best.device), best, alpha=batch)
         return map_tensors(lambda x: x.movedim(0, -1).index_select(-1, index).movedim(-1, 0), now)
 
     def _cost(self, projection: Projection, problem: Problem, prior: Tensor, shape: Tensor) -> Tensor:
-        """Mean robust loss over the pairs that have a weight, with that of the terms, shape (B,)."""
+        """Robust loss of pairs and terms, divided by the number of pairs that have a weight, shape (B,)."""
         most = (_MAX_RESIDUAL * projection.focal).square().reshape(-1, 1)
         count = (problem.weights > 0).sum(-1).clamp(min=1)
         total = (prior * self.kernel.loss(sq_standardised(projection, problem, most), shape)).sum(-1)
-        unit = problem.img_scale.square() if problem.noise is None else 1.0  # unknown noise counts as a pixel
+        unit = problem.img_scale.square() if problem.noise is None else 1.0  # without noise, sigma is one pixel
         for term in problem.terms:
             total = total + unit * term.loss(projection.state)
         return total / count
@@ -393,11 +409,11 @@ class RobustWeightedLM(Configured):
     def _with_gradient(self, problem: Problem, state: State, shape: Tensor) -> State:
         r"""Give a converged state the gradient of a minimum, by the implicit function theorem.
 
-        With :math:`g(\delta) = J^\top W r` at the state moved by :math:`\delta`, which is 0 at the minimum,
-        :math:`d\delta = -(\partial g / \partial \delta)^{-1} dg`: one Newton step whose value is left out. Where the
-        matrix is not positive definite the state is no minimum yet, and the Gauss-Newton matrix replaces it. A second
-        step with the same matrix makes second derivatives exact. Covariances turn with the pose, so that the matrix is
-        not quite symmetric: a third step takes most of the difference away.
+        Let :math:`g(\delta) = J^\top W r` at the state moved by :math:`\delta`. At the minimum :math:`g = 0`, so that
+        :math:`d\delta = -(\partial g / \partial \delta)^{-1} dg`. The code takes a Newton step with this gradient and
+        the value 0. If the Newton matrix is not positive definite, the state is not a minimum yet, and the Gauss-Newton
+        matrix is used. A second step with the same matrix makes second derivatives exact. With covariances, which
+        rotate with the pose, the matrix is not exactly symmetric. A third step then removes most of the error.
         """
 
         def equations(problem: Problem, at: State, shape: Tensor) -> NormalEquations:
@@ -420,9 +436,6 @@ class RobustWeightedLM(Configured):
 
 
 def _relative_to_mean(weights: Tensor) -> Tensor:
-    """Divide the weights of a problem by the mean of its positive weights.
-
-    The largest weight would be another divisor, but it has no derivative where two weights are equally large.
-    """
+    """Divide weights by the mean positive weight. The largest weight has no derivative if two weights are equal."""
     mean = weights.sum(-1, keepdim=True) / (weights > 0).sum(-1, keepdim=True).clamp(min=1)
     return weights / torch.where(mean > 0, mean, 1.0)

@@ -12,24 +12,24 @@ from kornia_pnpnet.core.checks import check_numbers, check_whole
 
 __all__ = ["BoundedParameter"]
 
-# Parameter of a value at its bound: the sigmoid of 1000 rounds to 1 in float64.
+# Raw parameter of a value at its bound. The sigmoid of 1000 rounds to 1 in float64.
 _BOUND = 1e3
 
 
 class BoundedParameter(nn.Module):
-    r"""Values that are learned without bounds and used within bounds.
+    """Values that are learned without bounds and used within bounds.
 
-    The free parameter passes a sigmoid onto ``[lower, upper]``, in log space when ``logarithmic``.
+    A sigmoid maps the raw parameter to ``[lower, upper]``, in log space if ``logarithmic``.
 
     Args:
-        initial: first value of each entry, between the bounds. A value at a bound never changes.
+        initial: initial value of each entry, within the bounds. Training never changes a value at a bound.
         size: number of entries.
         lower: lower bound.
         upper: upper bound.
-        logarithmic: interpolate the logarithm; the bounds must be positive.
+        logarithmic: interpolate between the logarithms of the bounds, which must be positive.
 
     Raises:
-        BaseError: when the bounds do not rise, or ``initial`` is not between the bounds.
+        BaseError: when ``lower`` is not less than ``upper``, or ``initial`` is not within the bounds.
 
     Example:
         >>> BoundedParameter(1e-3, size=2, lower=1e-6, upper=1.0, logarithmic=True)()
@@ -46,7 +46,8 @@ class BoundedParameter(nn.Module):
         self._logarithmic = logarithmic
         self._lower, self._upper = (math.log(lower), math.log(upper)) if logarithmic else (lower, upper)
         share = ((math.log(initial) if logarithmic else initial) - self._lower) / (self._upper - self._lower)
-        # At a bound the parameter is finite, so that it can be saved, and its sigmoid is exactly 0 or 1.
+        # Clamping keeps the raw parameter finite at a bound, so that it can be saved. The sigmoid is still exactly 0 or
+        # 1.
         self.raw = nn.Parameter(torch.full((size,), share).logit().clamp(-_BOUND, _BOUND))
 
     def forward(self) -> Tensor:

@@ -1,13 +1,13 @@
-r"""The one residual: projection, its Jacobian, normal equations, and how a state moves.
+"""The reprojection residual: projection, Jacobian, normal equations, and the motion of a state along a tangent vector.
 
-Convention: ``x_cam = R x_world + t``; the camera looks along +z; pixels are those of a camera with one focal length and
-the principal point 0. A point is *in front* when its depth is more than ``MIN_DEPTH_RATIO`` of its distance, a test
-that does not depend on the unit of the world.
+Convention: ``x_cam = R x_world + t``; the camera looks along +z; pixels belong to a camera with a single focal length
+and the principal point 0. A point is *in front* when its depth exceeds ``MIN_DEPTH_RATIO`` times its distance. The test
+does not depend on the unit of the world.
 
-Arrays of this module have the problems in the last dimension: coordinates, pairs, problems. An operation on all pairs
-then runs over long rows of memory however few pairs a problem has. Kornia's ``transform_points`` and ``project_points``
-compute the same projection (``tests/test_kornia_contract.py``) but neither residual nor Jacobian, and they take three
-times as long for 1000 problems of 9 pairs (batch first).
+The dimensions of arrays in this module are coordinates, pairs and problems, in this order. An operation then runs over
+long rows of memory even if each problem has few pairs. Kornia's ``transform_points`` and ``project_points`` compute the
+same projection (``tests/test_kornia_contract.py``), but neither residual nor Jacobian. For 1000 problems of 9 pairs,
+these batch-first functions take three times as long as this module.
 """
 
 from __future__ import annotations
@@ -42,21 +42,21 @@ __all__ = [
     "rotation_angle",
 ]
 
-#: A point with ``z <= MIN_DEPTH_RATIO * |x|`` counts as behind the camera. It bounds ``|x / z|`` by 1000.
+#: A point ``x`` of depth ``z <= MIN_DEPTH_RATIO * |x|`` is behind the camera. In front, ``|x / z|`` is below 1000.
 MIN_DEPTH_RATIO = 1e-3
-# Largest change of the logarithm of the focal length in one step, so that its exponential cannot overflow, and of a
-# coefficient of distortion.
+# Largest changes in one step, of the logarithm of the focal length (its exponential must not overflow) and of a
+# coefficient of radial distortion.
 _LARGEST_ZOOM, _LARGEST_RADIAL = 1.0, 0.3
 
-# Two rows of a column of the Jacobian; an entry that is the same for all pairs is a plain number.
+# The entries of u and v in one column of the Jacobian. An entry that is the same for all pairs is a Python number.
 _Column: TypeAlias = tuple[Any, Any]
 
 
 class Projection(NamedTuple):
-    r"""Points projected at a state and compared with their pixels. The problems are the last dimension.
+    r"""Points projected at a state, and their residuals. The problems are the last dimension.
 
     Attributes:
-        residual: projection minus measurement in pixels, shape :math:`(2, N, B)`. Where ``front`` is false the residual
+        residual: projection minus measurement in pixels, shape :math:`(2, N, B)`. If ``front`` is false, the residual
             is finite but meaningless.
         front: whether the point is in front of the camera, bool, shape :math:`(N, B)`.
         rotated: the points in the axes of the pose before translation, :math:`y = R x`, shape :math:`(3, N, B)`.
@@ -67,7 +67,8 @@ class Projection(NamedTuple):
         state: the state.
         stretch: :math:`d = 1 + k_1 \rho^2 + k_2 \rho^4` with :math:`\rho^2 = p^2 + q^2`, shape :math:`(N, B)`;
             ``None``: there is no distortion.
-        slope: twice the derivative of :math:`d` by :math:`\rho^2`, as ``stretch``.
+        slope: twice the derivative of :math:`d` by :math:`\rho^2`, shape :math:`(N, B)`; ``None``: there is no
+            distortion.
     """
 
     residual: Tensor
@@ -98,7 +99,7 @@ class NormalEquations(NamedTuple):
     Attributes:
         matrix: :math:`J^\top W J`, shape :math:`(6 + K, 6 + K, B)`.
         gradient: :math:`J^\top W r`, shape :math:`(6 + K, B)`.
-        unit: the weights were divided by this, shape :math:`(B, 1)`; ``None``: 1.
+        unit: number by which the weights of a problem were divided, shape :math:`(B, 1)`; ``None``: 1.
     """
 
     matrix: Tensor
@@ -107,17 +108,17 @@ class NormalEquations(NamedTuple):
 
 
 def project(state: State, problem: Problem) -> Projection:
-    r"""Project the points of a problem and compare them with their pixels.
+    """Project the points of a problem, and subtract their pixels.
 
     The depth of points behind the camera is replaced *before* the division, so that neither values nor gradients can
     overflow.
 
     Args:
-        state: poses in the frame of the problem, and what is unknown of the cameras.
+        state: poses in the frame of the problem, and the unknown parameters of the cameras.
         problem: the problem.
 
     Returns:
-        The :class:`Projection`; its residual is :math:`f d (p, q) - b` in pixels.
+        The :class:`Projection`. The residual is :math:`f d (p, q) - b` with the pixel :math:`b`.
 
     Example:
         >>> problem = Problem.of(torch.tensor([[[1.0, 2.0, 4.0]]]), torch.zeros(1, 1, 2), 100.0)
@@ -135,7 +136,7 @@ def project(state: State, problem: Problem) -> Projection:
         points = torch.addcmul(torch.addcmul(torch.addcmul(shift, i, x), j, y), k, z)
     x, y, z = points.unbind()
     least_slope = MIN_DEPTH_RATIO / math.sqrt(1.0 - MIN_DEPTH_RATIO**2)
-    smallest = torch.finfo(z.dtype).tiny ** 0.5  # the square of the inverse depth is finite
+    smallest = torch.finfo(z.dtype).tiny ** 0.5  # keeps the square of the inverse depth finite
     front = z > (least_slope * torch.addcmul(x * x, y, y).sqrt()).clamp(min=smallest)  # ONNX has no hypot
     inv_depth = torch.where(front, z, torch.inf).reciprocal()
     img = problem.img_points.permute(2, 1, 0)
@@ -158,17 +159,17 @@ def project(state: State, problem: Problem) -> Projection:
 def pixel_variance(projection: Projection, noise: Noise) -> Tensor:
     r"""Variance of a pixel coordinate, from the noise of the pixel and of the world point.
 
-    A shift of the point by :math:`d` moves its pixel by :math:`J d` with :math:`J = \tfrac fz [I_2 \mid -(p, q)^\top]`.
-    The mean over both coordinates is returned:
-    :math:`\sigma_\mathrm{img}^2 + \sigma_\mathrm{world}^2 \, \mathrm{tr}(J J^\top) / 2`, where the trace is
-    :math:`(f/z)^2 (2 + p^2 + q^2)`.
+    A shift of the point by :math:`d` in the camera's axes moves its pixel by :math:`J d` with
+    :math:`J = \tfrac fz [I_2 \mid -(p, q)^\top]`. The mean of the variances of both coordinates is
+    :math:`\sigma_\mathrm{img}^2 + \sigma_\mathrm{world}^2 \, \mathrm{tr}(J J^\top) / 2` with
+    :math:`\mathrm{tr}(J J^\top) = (f/z)^2 (2 + p^2 + q^2)`.
 
     Args:
-        projection: what :func:`project` returned.
+        projection: the result of :func:`project`.
         noise: standard deviations.
 
     Returns:
-        Shape :math:`(B, N)`. Behind the camera it is the variance of the pixel alone.
+        The mean variance, shape :math:`(B, N)`. Behind the camera only the noise of the pixel counts.
 
     Example:
         >>> problem = Problem.of(torch.tensor([[[0.0, 0.0, 4.0]]]), torch.zeros(1, 1, 2), 100.0)
@@ -183,10 +184,7 @@ def pixel_variance(projection: Projection, noise: Noise) -> Tensor:
 
 
 def pixel_covariance(projection: Projection, problem: Problem, noise: Noise) -> Symmetric2:
-    """:func:`covariance_at` of the points of a :class:`Projection`, entries :math:`(B, N)`.
-
-    Behind the camera it is the covariance of the pixel alone.
-    """
+    """:func:`covariance_at` of a projection, entries (B, N). Behind the camera only the noise of the pixel counts."""
     rotation = projection.state.pose.rotation[:, None]
     rotation = rotation if problem.rig is None else problem.rig.rotation @ rotation
     p, q = (x.mT for x in projection.plane.unbind())
@@ -196,8 +194,8 @@ def pixel_covariance(projection: Projection, problem: Problem, noise: Noise) -> 
 def covariance_at(rotation: Tensor, p: Tensor, q: Tensor, scale: Tensor, noise: Noise) -> Symmetric2:
     r"""Covariance of a pixel, from the noise of the pixel and of the world point.
 
-    It is :math:`\Sigma_\mathrm{img} + J R\,\Sigma_\mathrm{world} R^\top J^\top` with :math:`J` of
-    :func:`pixel_variance`. A standard deviation stands for a multiple of the identity.
+    The covariance is :math:`\Sigma_\mathrm{img} + J R\,\Sigma_\mathrm{world} R^\top J^\top` with :math:`J` of
+    :func:`pixel_variance`. If only a standard deviation :math:`\sigma` is known, :math:`\Sigma = \sigma^2 I`.
 
     Args:
         rotation: rotation from the world to the camera, :math:`(*, 1, 3, 3)` or :math:`(*, N, 3, 3)`.
@@ -223,18 +221,18 @@ def covariance_at(rotation: Tensor, p: Tensor, q: Tensor, scale: Tensor, noise: 
 def normal_equations(
     projection: Projection, problem: Problem, weights: Tensor | Symmetric2, *, relative: bool = False
 ) -> NormalEquations:
-    r"""Build the normal equations of the residuals for the pose and the unknown parameters of the camera.
+    """Build the normal equations of the residuals for the pose and the unknown parameters of the camera.
 
     Args:
-        projection: what :func:`project` returned.
-        problem: its problem.
-        weights: weight of each pair, :math:`(B, N)`, or 2x2 matrices with entries of that shape. Points behind the
-            camera do not count.
-        relative: divide the weights of each problem by the largest, a constant, so that products of tiny weights do
-            not vanish.
+        projection: the result of :func:`project`.
+        problem: the problem that was projected.
+        weights: weight of each pair, :math:`(B, N)`, or 2x2 weight matrix of each pair with entries :math:`(B, N)`.
+            Points behind the camera do not count.
+        relative: divide the weights of each problem by the largest weight, so that products of tiny weights do not
+            vanish. The divisor has no gradient.
 
     Returns:
-        The equations for a tangent vector of :func:`moved`, with :math:`J` divided by the focal length and :math:`r` in
+        The equations of a tangent vector of :func:`moved`, with :math:`J` divided by the focal length and :math:`r` in
         pixels.
     """
     unit, sq_inverse = None, projection.inv_depth * projection.inv_depth
@@ -250,9 +248,9 @@ def normal_equations(
 def _jacobian(projection: Projection, problem: Problem) -> Tensor:
     r"""The rows of u and v of :math:`z J / f`, shape :math:`(6 + K, 2, N, B)`.
 
-    With :math:`y = R x`, and the rows :math:`e` of :math:`z` times the derivative of :math:`(p, q)` by a point in the
-    frame of the pose, a row is :math:`y \times e` for a turn and :math:`e` for a shift. For one camera
-    :math:`e = (1, 0, -p), (0, 1, -q)`.
+    Let :math:`y = R x`, and let :math:`e` be a row of :math:`z` times the derivative of :math:`(p, q)` by a point in
+    the frame of the pose. The entries of a row of the Jacobian are :math:`y \times e` for the rotation and :math:`e`
+    for the translation. For one camera the rows :math:`e` are :math:`(1, 0, -p)` and :math:`(0, 1, -q)`.
     """
     plane, y3 = projection.plane, projection.rotated[2]
     if problem.rig is None:
@@ -266,9 +264,9 @@ def _jacobian(projection: Projection, problem: Problem) -> Tensor:
     if not unknown:
         return jacobian
     if projection.stretch is None or projection.slope is None:
-        zoomed, powers = y3, []  # the focal length grows, and the depth of the origin with it
+        zoomed, powers = y3, []  # the depth of the origin grows with f, see `moved`
     else:
-        # The derivative of the distorted by the undistorted point is d I + 2 d' (p, q) (p, q)^T.
+        # The derivative of the distorted by the undistorted point is d I + 2 d' (p, q) (p, q)^T, with 2 d' in `slope`.
         along = projection.slope * (plane * jacobian).sum(1, keepdim=True)
         jacobian = projection.stretch * jacobian + along * plane
         depth = torch.where(projection.front, projection.inv_depth, 1.0).reciprocal()
@@ -279,7 +277,7 @@ def _jacobian(projection: Projection, problem: Problem) -> Tensor:
 
 
 def _stacked_equations(projection: Projection, problem: Problem, weights: Tensor | Symmetric2) -> tuple[Tensor, Tensor]:
-    """All products at once: few calls, for few pairs."""
+    """Build the normal equations by one product of all columns. Few calls suffice, which is faster for few pairs."""
     jacobian = _jacobian(projection, problem)
     if isinstance(weights, Tensor):
         weighted = jacobian * weights
@@ -294,7 +292,7 @@ def _stacked_equations(projection: Projection, problem: Problem, weights: Tensor
 def _entrywise_equations(
     projection: Projection, problem: Problem, weights: Tensor | Symmetric2
 ) -> tuple[Tensor, Tensor]:
-    """Entry by entry: temporaries of (N, B) stay in a processor's cache, and a compiler keeps them in registers."""
+    """Build the normal equations entry by entry. Temporaries (N, B) fit into the cache or, compiled, into registers."""
     columns = _columns(projection, problem)
     uu, uv, vv = (weights, 0.0, weights) if isinstance(weights, Tensor) else weights
     total = uu.sum(0)
@@ -311,7 +309,7 @@ def _entrywise_equations(
             return zero
         return total if products[0] is uu else products[0].sum(0)
 
-    # The products of a column with the two constant ones are its weighted entries.
+    # Columns 3 and 4 are constant, (1, 0) and (0, 1). Their products with a weighted column are entries of that column.
     size = range(len(columns))
     lower = {
         (i, j): inner(weighted[j], columns[i]) if i < 5 else inner(weighted[i], columns[j])
@@ -324,7 +322,7 @@ def _entrywise_equations(
 
 
 def _columns(projection: Projection, problem: Problem) -> list[_Column]:
-    """The columns of :func:`_jacobian`. Of a camera without a rig two columns are constant, which saves a quarter."""
+    """The columns of :func:`_jacobian`. Without rig and distortion two are constant, which saves a quarter of time."""
     if problem.rig is not None or projection.stretch is not None:
         return [(u, v) for u, v in _jacobian(projection, problem)]
     y1, y2, y3 = projection.rotated.unbind()
@@ -345,7 +343,7 @@ def _cross(a: list[Tensor], b: list[Tensor]) -> list[Tensor]:
 
 
 def _times(a: Any, b: Any) -> Any:
-    """A product in which a factor that is known to be 0 or 1 costs nothing."""
+    """The product of two factors, without multiplication if one factor is the Python number 0 or 1."""
     if type(a) is float:
         return b if a == 1.0 else 0.0
     if type(b) is float:
@@ -354,7 +352,7 @@ def _times(a: Any, b: Any) -> Any:
 
 
 def _plus(a: Any, b: Any) -> Any:
-    """A sum in which a term that is known to be 0 costs nothing."""
+    """The sum of two terms, without addition if one term is the Python number 0."""
     return b if type(a) is float else a if type(b) is float else a + b
 
 
@@ -365,14 +363,14 @@ def lm_step(
 
     .. math:: \beta \leftarrow \beta - \gamma\,(J^\top W J + \lambda\,\mathrm{diag}(J^\top W J))^{-1} J^\top W r
 
-    with :math:`r` projection minus measurement, so that the step that reduces the residual is the negative one. The
-    step does not depend on a common factor of the weights.
+    The residual :math:`r` of the state :math:`\beta` is projection minus measurement, hence the minus sign. A common
+    factor of the weights does not change the step.
 
-    Source: R. Sheffer and A. Wiesel, "PnP-Net: A hybrid Perspective-n-Point Network", 2020, section 3; the damping by
+    Source: R. Sheffer and A. Wiesel, "PnP-Net: A hybrid Perspective-n-Point Network", 2020, section 3. The damping by
     the diagonal is D. Marquardt's (1963).
 
     Args:
-        equations: at the state.
+        equations: the normal equations at the state.
         state: the state to improve.
         focal: the focal length in pixels, a scalar or of shape :math:`(B,)`.
         step: :math:`\gamma`, a scalar.
@@ -380,12 +378,14 @@ def lm_step(
         additive: update the rotation vector additively as in the paper, instead of by the retraction.
 
     Returns:
-        The moved state, and whether the equations could be solved (if not, the state stays), bool, shape :math:`(B,)`.
+        The moved state, and whether the equations could be solved, bool, shape :math:`(B,)`. A state whose equations
+        could not be solved does not change.
     """
     if not additive:
         delta, solved = solve_positive(equations.matrix, equations.gradient, damping)
         return moved(state, delta * (-step / focal)), solved
-    # The equations by the rotation vector, whose derivative is the left Jacobian of SO(3).
+    # Write the equations in terms of the rotation vector. The derivative of the tangent vector by the rotation vector
+    # is the left Jacobian of SO(3).
     rvec = rotation_matrix_to_axis_angle(state.pose.rotation)
     size, matrix = len(equations.gradient), equations.matrix.permute(2, 0, 1)
     tangent = torch.eye(size, dtype=rvec.dtype, device=rvec.device).repeat(len(rvec), 1, 1)
@@ -401,22 +401,24 @@ def moved(state: State, delta: Tensor) -> State:
     r"""Move a state along a tangent vector :math:`(\omega, v, c)`, shape :math:`(6 + K, B)`.
 
     The pose becomes :math:`(\mathrm{cay}(\omega) R,\; t + v)`. Rotation and translation move independently. With a
-    centred world a rotation then leaves the centroid in place, so that both stay well separated in the normal equations
-    at any distance of the points. The rotation is Cayley's,
-    :math:`\mathrm{cay}(\omega) = (I - \tfrac12[\omega]_\times)^{-1}(I + \tfrac12[\omega]_\times)`. It agrees with
-    the exponential to second order, rotates by :math:`2 \arctan(|\omega|/2)`, at most half a turn, and needs neither
-    trigonometry nor a branch at 0.
+    centred world, a rotation therefore leaves the centroid in place. Rotation and translation then stay well separated
+    in the normal equations at any distance of the points.
 
-    A larger focal length moves the camera away as in a dolly zoom: the origin, which is the centroid of a centred
-    world, keeps its pixel and its scale. A change of the focal length and a shift along the axis look alike from far
-    away; they are then well separated parameters.
+    The Cayley transform is
+    :math:`\mathrm{cay}(\omega) = (I - \tfrac12[\omega]_\times)^{-1}(I + \tfrac12[\omega]_\times)`. The transform agrees
+    with the exponential to second order. The angle of rotation is :math:`2 \arctan(|\omega|/2)`, at most half a turn.
+    The transform needs neither trigonometry nor a branch at 0.
+
+    The parameters of the camera change by :math:`c`. A larger focal length also moves the camera away, as in a dolly
+    zoom. The origin, which is the centroid of a centred world, then keeps its pixel and its scale. Without this motion,
+    a change of the focal length and a shift along the optical axis would be nearly the same for distant points.
     """
     half, rotation = 0.5 * delta[:3], state.pose.rotation.permute(1, 2, 0)
     factor = 2.0 / (1.0 + half.square().sum(0))
     if not compiling():
         once = torch.linalg.cross(half[:, None], rotation, dim=0)
         rotation = torch.addcmul(rotation, factor, once + torch.linalg.cross(half[:, None], once, dim=0))
-    else:  # entry by entry: the code of `linalg.cross` computes the vector and the factor anew for each entry
+    else:  # entry by entry: compiled `linalg.cross` computes the vector and the factor again for each entry
         once = [_cross([*half], [*column]) for column in rotation.unbind(1)]
         twice = [_cross([*half], column) for column in once]
         turned = [[x + y for x, y in zip(*both, strict=True)] for both in zip(once, twice, strict=True)]
@@ -433,7 +435,7 @@ def moved(state: State, delta: Tensor) -> State:
 
 
 def retract(pose: Pose, delta: Tensor) -> Pose:
-    r"""Move a pose by :func:`moved`.
+    r"""Move a pose of a known camera by :func:`moved`.
 
     Args:
         pose: rotation :math:`(B, 3, 3)`, translation :math:`(B, 3)`.
@@ -453,13 +455,14 @@ def retract(pose: Pose, delta: Tensor) -> Pose:
 def rotation_angle(rotation_a: Tensor, rotation_b: Tensor) -> Tensor:
     r"""Angle between two rotations.
 
-    :math:`\mathrm{atan2}(\|\tfrac12 \mathrm{vee}(D - D^\top)\|, \tfrac12(\mathrm{tr} D - 1))` of
-    :math:`D = A B^\top`, which equals :math:`\arccos((\mathrm{tr} D - 1)/2)` but keeps its digits near 0, where the
-    arc cosine loses half of them. Not differentiable at exactly 0; use :mod:`kornia_pnpnet.losses` to train.
+    With :math:`D = A B^\top`, the angle is
+    :math:`\mathrm{atan2}(\|\tfrac12 \mathrm{vee}(D - D^\top)\|, \tfrac12(\mathrm{tr} D - 1))`. The equivalent formula
+    :math:`\arccos((\mathrm{tr} D - 1)/2)` loses half of its digits for small angles. The angle is not differentiable at
+    0. Use the losses of :mod:`kornia_pnpnet.losses` for training.
 
     Args:
-        rotation_a: shape :math:`(*, 3, 3)`.
-        rotation_b: shape :math:`(*, 3, 3)`.
+        rotation_a: :math:`A`, shape :math:`(*, 3, 3)`.
+        rotation_b: :math:`B`, shape :math:`(*, 3, 3)`.
 
     Returns:
         The angle in radians, in [0, π], shape :math:`(*)`.

@@ -1,6 +1,6 @@
-r"""What is known besides the pairs: priors of the pose and of the camera, each a :class:`~kornia_pnpnet.problem.Term`.
+"""Priors of the pose and of the camera. Each prior is a :class:`~kornia_pnpnet.problem.Term`.
 
-A new prior is a class with the methods of :class:`~kornia_pnpnet.problem.Term`, and a place in ``Problem.terms``.
+A new prior is a class with the methods of :class:`~kornia_pnpnet.problem.Term`, and an entry of ``Problem.terms``.
 """
 
 from __future__ import annotations
@@ -21,30 +21,36 @@ from kornia_pnpnet.result import Pose, PosePrior
 
 __all__ = ["CameraTerm", "PoseTerm", "add_term", "gravity_prior"]
 
-# An eigenvalue of an information below this fraction counts as 0: nothing is known in its direction.
+# Smallest eigenvalue of an information matrix in a known direction, relative to the largest eigenvalue or to a unit
+# diagonal. Smaller eigenvalues count as 0.
 _KNOWN = 1e-5
-# Standard deviations: scale of the robust kernel unless the caller gave one.
+# Standard deviations. Scale of the robust kernel if the caller gave no scale.
 _SCALE = 3.0
-# Least value of 1 plus the cosine of the angle to the prior's rotation, by which the tangent vector is divided.
+# Lower bound of 1 plus the trace of the rotation to the prior, by which the tangent vector is divided.
 _LEAST_DENOMINATOR = 1e-4
-# Prior standard deviation of a coefficient of radial distortion; it keeps a coefficient near 0 that no pair determines.
+# Prior standard deviation of a coefficient of radial distortion. The prior keeps a coefficient close to 0 if the pairs
+# do not determine the coefficient.
 _RADIAL = 0.15
-# Largest number of matrices whose eigenvalues cuSOLVER finds in one call; it fails for a hundred thousand.
+# Largest number of matrices whose eigenvalues are computed in one call of cuSOLVER. A call with a hundred thousand
+# matrices fails.
 _MOST_MATRICES = 10_000
 
 
 def gravity_prior(world_down: Tensor, cam_down: Tensor, sigma: Tensor | float) -> PosePrior:
-    r"""A prior of the direction of gravity, as an accelerometer measures it; heading and position stay open.
+    """Make a prior from a measured direction of gravity, for example of an accelerometer.
+
+    The prior says nothing about heading and position.
 
     Args:
-        world_down: direction of gravity in the world, of any length but 0, shape :math:`(B, 3)`.
-        cam_down: the same direction in the camera's axes (+z forward), as measured, shape :math:`(B, 3)`.
-        sigma: standard deviation of the measured direction about each axis across it, in radians, a number or
-            :math:`(B,)`.
+        world_down: direction of gravity in the world, of any non-zero length, shape :math:`(B, 3)`.
+        cam_down: measured direction of gravity in the camera's axes (+z forward), of any non-zero length, shape
+            :math:`(B, 3)`.
+        sigma: standard deviation of the measured direction about each axis perpendicular to this direction, in radians,
+            a number or :math:`(B,)`.
 
     Returns:
-        The prior. The rotation of its pose is one of those that turn ``world_down`` to ``cam_down``. Gradients flow to
-        the directions and to sigma.
+        The prior. The rotation of its pose turns ``world_down`` to ``cam_down``. The heading of this rotation is
+        arbitrary. Gradients flow to the directions and to sigma.
 
     Raises:
         ShapeError: when the directions are not :math:`(B, 3)`.
@@ -61,7 +67,8 @@ def gravity_prior(world_down: Tensor, cam_down: Tensor, sigma: Tensor | float) -
     KORNIA_CHECK(isinstance(sigma, Tensor) or sigma > 0, f"sigma must be positive, got {sigma}.")
     a, b = (functional.normalize(x, dim=-1) for x in (world_down, cam_down))
     eye = torch.eye(3, dtype=b.dtype, device=b.device)
-    # Half a turn about the middle of both directions; about any axis across them where they are opposite.
+    # Half a turn about the bisector of both directions. Opposite directions have no bisector; any perpendicular axis is
+    # used instead.
     across = torch.linalg.cross(a, eye[a.detach().abs().argmin(-1)])
     opposite = ((a + b).detach().square().sum(-1, keepdim=True)) < torch.finfo(b.dtype).eps
     middle = functional.normalize(torch.where(opposite, across, a + b), dim=-1)
@@ -76,7 +83,7 @@ def add_term(equations: NormalEquations, linear: Linear, focal: Tensor) -> Norma
     r"""Add a term to the normal equations of the pairs.
 
     Args:
-        equations: of the pairs at a state, with weights in inverse square pixels.
+        equations: the normal equations of the pairs at a state, with weights in inverse square pixels.
         linear: the term at the same state.
         focal: the focal length in pixels, a scalar or (B,).
     """
@@ -88,14 +95,14 @@ def add_term(equations: NormalEquations, linear: Linear, focal: Tensor) -> Norma
 
 
 class CameraTerm(NamedTuple):
-    """What is known of an unknown focal length and of radial distortion, in the unit of a problem.
+    """A prior of an unknown focal length and of radial distortion, in pixels of a problem.
 
     Attributes:
         expected: the focal length that the caller expects, in pixels, shape :math:`(B,)`.
-        information: inverse variance of the logarithm of the expected focal length, shape :math:`(B,)`; ``None``:
-            nothing is known of the camera.
-        width: the focal length is searched within this distance of that of the problem, in logarithms, shape
-            :math:`(B,)`.
+        information: inverse variance of the logarithm of the focal length, shape :math:`(B,)`; ``None``: there is no
+            prior of the camera.
+        width: half the width of the interval in which the logarithm of the focal length is searched, shape
+            :math:`(B,)`. The centre of the interval is the logarithm of ``focal``.
         focal: the focal length of the problem in pixels, shape :math:`(B,)`.
     """
 
@@ -105,11 +112,11 @@ class CameraTerm(NamedTuple):
     focal: Tensor
 
     def scaled(self, pixels: Tensor) -> CameraTerm:
-        """In other pixels, (B,): of the problem in place of the caller's."""
+        """Convert the focal lengths to other pixels. ``pixels`` is the number of new pixels per old pixel, (B,)."""
         return self._replace(expected=self.expected * pixels, focal=self.focal * pixels)
 
     def linearise(self, state: State) -> Linear:
-        """Distance of log f from its expectation, and the coefficients of distortion, which are small."""
+        """Linearise the difference of log f from its expected value, and the coefficients of distortion."""
         assert self.information is not None
         batch, count = state.camera.shape
         offset = (self.focal / self.expected).log()
@@ -119,12 +126,12 @@ class CameraTerm(NamedTuple):
         return Linear(residual, functional.pad(eye, (6, 0)), eye * known[:, None], torch.ones_like(offset))
 
     def loss(self, state: State) -> Tensor:
-        """Squared standard deviations, (B,)."""
+        """Squared Mahalanobis length of the residual, (B,)."""
         linear = self.linearise(state)
         return (linear.information.diagonal(dim1=1, dim2=2) * linear.residual.square()).sum(1)
 
     def disagreement(self, pose: Pose) -> Tensor:
-        """See Term. A focal length says nothing of a pose."""
+        """See :class:`~kornia_pnpnet.problem.Term`. A prior of the camera says nothing about a pose."""
         return torch.zeros_like(pose.translation[..., 0])
 
 
@@ -133,13 +140,13 @@ class PoseTerm(NamedTuple):
 
     Attributes:
         pose: the expected pose.
-        information: its inverse covariance, shape :math:`(B, 6, 6)`.
-        offset: the centroid of the world in lengths of the problem, shape :math:`(B, 3)`, because the prior's shifts
-            are those of the caller's world.
-        free: the one axis in the camera about which turns are unknown; 0 where there is no such axis, shape
+        information: inverse covariance of the pose, shape :math:`(B, 6, 6)`.
+        offset: the centroid of the caller's world in lengths of the problem, shape :math:`(B, 3)`. Shifts of the prior
+            refer to the origin of the caller's world.
+        free: the only axis in the camera about which the rotation is unknown, 0 if there is no such axis, shape
             :math:`(B, 3)`.
         sq_scale: squared scale of the robust kernel, in squared standard deviations, shape :math:`(B,)`.
-        rank: number of known directions, shape :math:`(B,)`.
+        rank: number of directions in which the prior has information, shape :math:`(B,)`.
     """
 
     pose: Pose
@@ -154,13 +161,13 @@ class PoseTerm(NamedTuple):
         """Express a prior in the frame of a problem.
 
         Args:
-            prior: in the world of the caller.
+            prior: the prior in the world of the caller.
             centroid: the world point that became the origin, (B, 3).
-            scale: factor of world lengths, (B,).
+            scale: lengths of the problem per unit of the caller's world, (B,).
 
         Returns:
-            The term, and whether the prior is possible, bool (B,): its numbers are finite and its information is
-            symmetric and positive semi-definite. The information of an impossible prior becomes 0.
+            The term, and whether the prior is usable (see ``_is_usable``), bool (B,). The information of an
+            unusable prior becomes 0.
         """
         usable = _is_usable(prior)
         eye = torch.eye(3, dtype=centroid.dtype, device=centroid.device)
@@ -179,7 +186,7 @@ class PoseTerm(NamedTuple):
         ), usable
 
     def recentred(self, centre: Tensor) -> PoseTerm:
-        """The prior where a world point (B, 3) becomes the origin."""
+        """The term in a world whose origin is the world point ``centre``, (B, 3)."""
         rotation, translation = self.pose
         pose = Pose(rotation, translation + (rotation @ centre[..., None])[..., 0])
         return self._replace(pose=pose, offset=self.offset + centre)
@@ -191,11 +198,11 @@ class PoseTerm(NamedTuple):
             pose: poses, :math:`(B, 3, 3)` and :math:`(B, 3)`.
 
         Returns:
-            :math:`(\omega, v)` of :func:`~kornia_pnpnet.refine.residual.retract` without turns about ``free``,
-            :math:`(B, 6)`; the squared length, :math:`(B,)`.
+            The tangent vector :math:`(\omega, v)` of :func:`~kornia_pnpnet.refine.residual.retract` without rotation
+            about ``free``, :math:`(B, 6)`, and its squared Mahalanobis length, :math:`(B,)`.
         """
         turn = self.pose.rotation @ pose.rotation.mT
-        # Turn the prior's pose about its free axis to the angle nearest to the pose.
+        # Rotate the prior's pose about the free axis, as close as possible to the given pose.
         free = self.free
         along = turn.diagonal(dim1=-2, dim2=-1).sum(-1) - (free * (turn @ free[..., None])[..., 0]).sum(-1)
         around = -(free * So3.vee(turn - turn.mT)).sum(-1)
@@ -213,37 +220,37 @@ class PoseTerm(NamedTuple):
         return error, ((self.information * error[..., None, :]).sum(-1) * error).sum(-1)
 
     def linearise(self, state: State) -> Linear:
-        """The tangent vector to the expected pose, and its Jacobian."""
+        """See :class:`~kornia_pnpnet.problem.Term`. The residual is the tangent vector to the expected pose."""
         error, square = self.errors(state.pose)
         half = 0.5 * error[:, :3]
         eye = torch.eye(3, dtype=error.dtype, device=error.device)
         turned = (state.pose.rotation * self.offset[:, None]).sum(-1)
         rows = eye + So3.hat(half) + half[:, :, None] * half[:, None]
-        # The nearest pose that the term allows turns about the free axis, too.
+        # If the state moves, the closest pose that the prior allows rotates about the free axis, too.
         follows = self.free - torch.linalg.cross(half, self.free)
         rows = rows - follows[:, :, None] * (self.free[:, None] @ rows)
         by_turn = torch.cat((-rows, -So3.hat(turned)), 1)
         by_shift = torch.cat((torch.zeros_like(rows), -eye.expand_as(rows)), 1)
         columns = [by_turn, by_shift]
-        if state.camera.shape[1]:  # a zoom moves the camera along its axis
+        if state.camera.shape[1]:  # a zoom moves the camera along its axis, see `moved`
             columns += [state.pose.translation[:, 2:, None] * by_shift[..., 2:]]
             columns += [torch.zeros_like(state.radial)[:, None].expand(-1, 6, -1)]
         return Linear(error, torch.cat(columns, 2), self.information, torch.exp(-square / self.sq_scale))
 
     def loss(self, state: State) -> Tensor:
-        """Robust loss (Welsch) in squared standard deviations, (B,): at most the squared scale of the kernel."""
+        """Robust loss (Welsch) in squared standard deviations, at most the squared scale of the kernel, (B,)."""
         square = self.errors(state.pose)[1]
         scale = torch.where(self.sq_scale.isinf(), 1.0, self.sq_scale)
         return torch.where(self.sq_scale.isinf(), square, -scale * torch.expm1(-square / scale))
 
     def disagreement(self, pose: Pose) -> Tensor:
-        """See Term. A prior of two known directions counts as one pair."""
+        """See :class:`~kornia_pnpnet.problem.Term`. A prior of two known directions counts at most as one outlier."""
         scale = torch.where(self.sq_scale.isinf(), _SCALE**2 * self.rank.clamp(min=1.0), self.sq_scale)
         return -0.5 * self.rank * torch.expm1(-self.errors(pose)[1] / scale)
 
 
 def _is_usable(prior: PosePrior) -> Tensor:
-    """Whether the numbers are finite and the information is symmetric and positive semi-definite, bool (B,)."""
+    """Whether numbers are bounded, the scale positive, and the information symmetric positive semi-definite, (B,)."""
     numbers = [prior.pose.rotation, prior.pose.translation, prior.information]
     limit = torch.finfo(prior.information.dtype).max ** 0.25
     fine = torch.stack([(x.detach().flatten(1).abs() < limit).all(1) for x in numbers]).all(0)
@@ -254,11 +261,11 @@ def _is_usable(prior: PosePrior) -> Tensor:
 
 
 def _open_axis(information: Tensor) -> Tensor:
-    """The axis (B, 3) about which turns are unknown while turns about both other axes are known, else 0."""
+    """The axis (B, 3) about which rotation is unknown while rotation about the other axes is known, or 0."""
     eigenvalues = _eigenvalues(information.detach().double())
     least, middle, largest = eigenvalues.unbind(-1)
     is_open = (least < _KNOWN * largest) & (middle > _KNOWN * largest)
-    # The columns of the adjugate are multiples of the axis; eigenvectors of equal eigenvalues have no derivative.
+    # The columns of the adjugate are multiples of the axis. Eigenvectors would have no derivative at equal eigenvalues.
     scaled = information / torch.where(largest > 0, largest, 1.0).to(information)[:, None, None]
     first, second, third = scaled.unbind(1)
     pairs = ((second, third), (third, first), (first, second))
@@ -269,7 +276,7 @@ def _open_axis(information: Tensor) -> Tensor:
 
 
 def _correlations(information: Tensor) -> tuple[Tensor, Tensor]:
-    """Eigenvalues (B, 6), ascending, of an information scaled to a unit diagonal; whether it is symmetric, (B,)."""
+    """Ascending eigenvalues (B, 6) of matrices scaled to a unit diagonal; whether each matrix is symmetric, (B,)."""
     diagonal = information.detach().double().diagonal(dim1=1, dim2=2)
     size = torch.where(diagonal > 0, diagonal, 1.0).rsqrt()
     scaled = information.detach().double() * size[:, :, None] * size[:, None]
@@ -280,6 +287,6 @@ def _correlations(information: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _eigenvalues(matrix: Tensor) -> Tensor:
-    """Eigenvalues of symmetric matrices, ascending."""
+    """Ascending eigenvalues of symmetric matrices."""
     whole = matrix.device.type == "cpu" or compiling()
     return torch.cat([torch.linalg.eigvalsh(part) for part in ([matrix] if whole else matrix.split(_MOST_MATRICES))])
