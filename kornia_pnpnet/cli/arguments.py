@@ -67,7 +67,7 @@ def _focal(text: str) -> dict[str, Any]:
 
 
 def _path(text: str) -> str:
-    """Return the path of a file or a folder; ``OSError`` when it does not exist."""
+    """Return the path of a file or a folder; ``OSError`` when the path does not exist."""
     Path(text).stat()
     return text
 
@@ -77,7 +77,7 @@ def _source(text: str) -> str:
 
 
 def _arg(help_: str, metavar: str | None = None, **more: Any) -> dict[str, Any]:
-    """Options of ``ArgumentParser.add_argument``. The help ends with the default."""
+    """Make options of ``ArgumentParser.add_argument``. The help text ends with the default."""
     return {"help": f"{help_}; default: %(default)s" if "default" in more else help_, "metavar": metavar, **more}
 
 

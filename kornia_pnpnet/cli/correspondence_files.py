@@ -71,7 +71,7 @@ def camera_matrix(text: str) -> Tensor:
 
 
 def _pinhole(matrix: Tensor, source: str | Path) -> Tensor:
-    """Scale a camera matrix so that its last element is 1; ``InputError`` if it is not that of a pinhole camera."""
+    """Scale a pinhole camera matrix so that its last element is 1; ``InputError`` for any other matrix."""
     if not matrix.isfinite().all():
         raise InputError(source, "the intrinsics are not finite")
     if matrix[1, 0] != 0 or matrix[2, :2].any() or matrix[2, 2] == 0:
@@ -91,7 +91,7 @@ def read_correspondences(path: str | Path) -> ImageCorrespondences:
             and optionally ``weights`` (N,) and ``intrinsics`` (3, 3).
 
     Raises:
-        InputError: for less than three correspondences, or numbers that are missing or not finite.
+        InputError: for fewer than three correspondences, a missing column or array, or an invalid number.
     """
     path = Path(path)
     with path.open("rb") as file:

@@ -23,7 +23,7 @@ __all__ = ["SUFFIXES", "ShardReport", "solve_shards"]
 #: Formats of shards.
 SUFFIXES = (".npz", ".parquet")
 
-# Key in the metadata of a results file. Its value has the name of the solver and the digest of the solver's parameters.
+# Key in the metadata of a results file. The value has the name of the solver and the digest of its parameters.
 _SOLVER = b"kornia_pnpnet.solver"
 # Largest number of values that are read from a Parquet file at once: 256 MB in float64. For large problems this limit
 # reduces the rows of a batch.
@@ -163,7 +163,7 @@ def _solve_shard(solve: Solve, shard: Path, target: Path, mark: bytes, batch: in
 
 
 def _tables_of_parquet(shard: Path, batch: int) -> Iterator[pa.Table]:
-    """Tables of at most ``batch`` rows of a Parquet file, at least one table."""
+    """Yield tables of at most ``batch`` rows from a Parquet file, at least one table."""
     try:
         # With pre_buffer Arrow would read ahead to the end of the file. Without buffer_size it would read a whole row
         # group at once.
@@ -179,7 +179,7 @@ def _tables_of_parquet(shard: Path, batch: int) -> Iterator[pa.Table]:
 
 
 def _tables_of_arrays(shard: Path, batch: int) -> Iterator[pa.Table]:
-    """Tables of at most ``batch`` problems of an NPZ file, at least one table."""
+    """Yield tables of at most ``batch`` problems from an NPZ file, at least one table."""
     arrays = read_arrays(shard, INPUTS)
     for name, size in (("world_points", 3), ("img_points", 2)):
         if arrays[name].ndim != 3 or arrays[name].shape[2] != size:

@@ -36,10 +36,10 @@ class CameraProblems(RandomProblems):
     Args:
         n: number of pairs per problem. For ``batch_size``, ``seed``, ``dtype`` and ``device`` see
             :class:`~kornia_pnpnet.data.SyntheticProblems`.
-        field_of_view: range of the horizontal field of view in degrees. Each camera draws a number, uniform.
-        depth_spread: range of the largest distance of a depth from the mean depth, relative to the mean depth. Each
-            problem draws a number, uniform.
-        outlier_share: share of the pairs that are outliers, rounded to the nearest number of pairs.
+        field_of_view: range of the horizontal field of view in degrees, uniform for each camera.
+        depth_spread: range of the largest distance of a depth from the mean depth, relative to the mean depth; uniform
+            for each problem.
+        outlier_share: share of the pairs that are outliers. The number of outliers is rounded to an integer.
         img_sigma: standard deviation of the noise on each pixel coordinate, in pixels.
         cameras: number of cameras of the rig. With 1 there is no rig; with more, batches have ``cam_from_rig``.
         baseline: distance of the camera centres from the origin of the rig, relative to the mean depth.

@@ -59,7 +59,7 @@ def load_scene(path: str | Path, *, metric: bool = True, min_points: int = 10, m
         most = max(len(view.world_points) for view in views)
         raise ValueError(f"no image of '{path}' has {min_points} points: the best of {len(views)} images has {most}")
     skipped = tuple(view.name for view in views if len(view.world_points) < min_points)
-    # A scene has the name of the first folder above that is not part of a model's layout.
+    # A scene has the name of the innermost folder that is not part of a model's layout.
     above = (place.name for place in (path.resolve(), *path.resolve().parents))
     name = path.stem if is_file else next(x for x in above if x not in ("0", "sparse", "dslr_calibration_undistorted"))
     return Scene(name, kept, skipped, metric)
@@ -133,7 +133,7 @@ def _colmap_views(folder: Path) -> Iterator[View]:
     xyz_of = {number: point.xyz for number, point in model.points3D.items()}
     for image in model.images.values():
         observed = image.get_observation_points2D()
-        pixel_of = {point.point3D_id: point.xy for point in reversed(observed)}  # the first pixel of a point is kept
+        pixel_of = {point.point3D_id: point.xy for point in reversed(observed)}  # reversed: the first pixel wins
         numbers = sorted(pixel_of)
         if missing := pixel_of.keys() - xyz_of.keys():
             raise ValueError(f"image '{image.name}' observes the point {min(missing)}, which the model lacks")

@@ -21,7 +21,7 @@ __all__ = ["RandomProblems", "batch_generator", "log_uniform", "normal", "random
 
 @dataclass(kw_only=True, eq=False)
 class RandomProblems:
-    """Base of endless, reproducible random sources. Options: see :class:`~kornia_pnpnet.data.SyntheticProblems`."""
+    """Base class of endless, reproducible sources. Fields: see :class:`~kornia_pnpnet.data.SyntheticProblems`."""
 
     n: int = 9
     batch_size: int = 1000
@@ -87,7 +87,7 @@ def random_poses(
 
     The axis of the rotation has a uniform direction, and the angle is uniform from 0 to ``max_angle`` radians. The
     translation is uniform in a cube of side ``translation_box`` about 0 if ``translation_sigma`` is ``None``. Otherwise
-    it is normal with this standard deviation on each axis.
+    the translation is normal with the standard deviation ``translation_sigma`` on each axis.
     """
     axis = normalize(normal((batch_size, 3), generator), dim=-1)
     angle = uniform((batch_size, 1), 0.0, max_angle, generator)

@@ -21,7 +21,8 @@ from kornia_pnpnet.result import Problems
 
 __all__ = ["MixedPoints", "MixedProblems", "VaryingSize"]
 
-# Added to a stream's seed to draw the numbers of pairs. Large, because the sources use the seeds that follow it.
+# Added to the stream's seed to get the seed that draws the numbers of pairs. The offset is large, because the sources
+# use the stream's seed and the seeds directly after the stream's seed.
 _SIZES = 1_000_003
 
 
@@ -29,16 +30,16 @@ class MixedProblems:
     """Batches that mix the problems of several sources.
 
     Args:
-        sources: constructors of :class:`SyntheticProblems` with the arguments ``batch_size``, ``seed`` and ``options``:
-            the class itself or a :func:`functools.partial` of the class.
-        shares: positive number for each source, in proportion to its problems in a batch; equal when ``None``.
+        sources: constructors of the sources, called with ``batch_size``, ``seed`` and ``options``. A constructor is
+            :class:`SyntheticProblems` or a :func:`functools.partial` of this class.
+        shares: positive number for each source, proportional to the source's problems in a batch; equal when ``None``.
         batch_size: number of problems per batch.
         seed: seed of the stream.
-        options: options of all sources.
+        options: further arguments of all constructors.
 
     Raises:
-        BaseError: when the number of shares is not that of the sources, or a share is not positive. ``batch`` raises
-            it when some sources know covariances and others do not.
+        BaseError: when there are more or fewer shares than sources, or a share is not positive. ``batch`` raises the
+            same error when some sources know covariances and others do not.
 
     Example:
         >>> from functools import partial
@@ -112,10 +113,10 @@ class MixedPoints:
 
     Args:
         priors: the priors.
-        shares: positive number for each prior, in proportion to its problems; equal when ``None``.
+        shares: positive number for each prior, proportional to the prior's problems; equal when ``None``.
 
     Raises:
-        BaseError: when the number of shares is not that of the priors, or a share is not positive.
+        BaseError: when there are more or fewer shares than priors, or a share is not positive.
 
     Example:
         >>> from kornia_pnpnet.data import BoxPoints, SlabPoints, SyntheticProblems

@@ -46,20 +46,20 @@ class OutlierMix:
     Args:
         max_ratio: largest number of outliers as a share of the pairs, rounded down. 0.33 gives n // 3 for n up to 15.
         count: exact number of outliers. ``max_ratio``, ``min_count`` and ``min_inliers`` then have no effect.
-        min_count: smallest number of outliers, cut to the maximum.
-        min_inliers: smallest number of inliers. The maximum is at most n minus this number.
+        min_count: smallest number of outliers; the largest number replaces a ``min_count`` above it.
+        min_inliers: smallest number of inliers. The largest number of outliers is at most n - ``min_inliers``.
         mismatch_share: probability that an outlier of no other kind is a *mismatch* (its pixel shows another point).
             Otherwise it is a *sensing* outlier (its pixel is uniform in the image).
         near_share: probability that an outlier is *near*: its pixel is close to the pixel of its point.
-        near_pixels: smallest and largest distance of a near outlier from the pixel of its point in pixels, log-uniform.
-            The two ends are raised to 5 and 10 standard deviations of the pixel noise. ``None``: the distance is 5 to
-            50 standard deviations.
+        near_pixels: range, in pixels, of the distance between a near outlier and the pixel of its point, log-uniform.
+            The ends of the range are raised to at least 5 and 10 standard deviations of the pixel noise. ``None``: the
+            range is 5 to 50 standard deviations.
         structured_share: probability that a problem has *structured* outliers. The structured outliers of a problem
             agree on one incorrect pose, as in scenes with repeated structure.
-        structured_ratio: smallest and largest number of structured outliers relative to the number of inliers, uniform.
+        structured_ratio: range of the number of structured outliers relative to the number of inliers, uniform.
         structured_angle: largest rotation in radians of the points that structured outliers show. These points are also
             shifted.
-        mirrored_share: probability that the points that the structured outliers of a problem show are mirrored.
+        mirrored_share: probability that a problem mirrors the points that structured outliers show.
         crowd_share: probability that a problem has *crowds*: outliers with the pixels of a few pairs, the leaders. The
             probability that an outlier joins a crowd is uniform from 0 to 1 and differs between problems.
         max_crowds: largest number of leaders; the number is a uniform integer from 1.

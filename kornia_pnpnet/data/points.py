@@ -32,8 +32,8 @@ _OBJECT_DISTANCE, _OBJECT_TANGENT, _THINNEST, _PLANAR = (1.5, 40.0), 0.8, 0.05, 
 # Façades: distance; largest angle between normal and optical axis in degrees; relief relative to the depth; share of
 # problems with two façades.
 _FACADE_DISTANCE, _SLANT, _RELIEF, _CORNER = (4.0, 60.0), 70.0, (0.001, 0.1), 0.3
-# Smallest ratio of a façade's distance along the optical axis to the depth of a point. Rays that meet the façade at a
-# larger depth, or miss the façade, get a point at this depth.
+# Smallest ratio of a façade's distance along the optical axis to the depth of a point. The
+# depth is thus at most 20 times the distance, also on rays that miss the façade.
 _LEAST_FACING = 0.05
 # Rooms: sides; height; number of pieces of furniture; smallest depth of furniture relative to the depth of the wall
 # behind. Closer furniture is left out, because nobody photographs the door of a cupboard.
@@ -224,7 +224,7 @@ class DrivePoints(_View):
 
 
 def _hits(rays: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """The multiples of rays, (..., 3), that enter and leave a box, (...). A ray misses the box if enter >= leave."""
+    """The factors at which rays, (..., 3), enter and leave a box, (...). A ray misses the box if enter >= leave."""
     rays = torch.where(rays.abs() < _PARALLEL, _PARALLEL, rays)
     one, two = low / rays, high / rays
     return torch.minimum(one, two).amax(-1), torch.maximum(one, two).amin(-1)

@@ -104,11 +104,11 @@ class SceneProblems(RandomProblems):
     pose is the true pose: :math:`x' = R^{*\top}(R x + t - t^*)`.
 
     Args:
-        scene: the scene. Images with less than ``n + num_spares`` points are not used.
+        scene: the scene. Images with fewer than ``n + num_spares`` points are not used.
         n: number of pairs per problem. For ``batch_size``, ``seed``, ``dtype`` and ``device`` see
             :class:`SyntheticProblems`.
         outliers: number of outliers and share of mismatches; no outliers are added when ``None``. Scenes of raw matches
-            have other outliers, too.
+            already contain outliers.
         num_spares: number of spare points per problem. Mismatches get the pixels of the spare points in turn. With the
             protocol's one spare point, all mismatches of a problem share a pixel.
 
@@ -158,7 +158,7 @@ class SceneProblems(RandomProblems):
         cam_points, img_points, inliers = self._pairs
         world_points = (cam_points[rows] - pose.translation[:, None]) @ pose.rotation  # (B, N, 3)
         mismatch = kind == OutlierKind.MISMATCH
-        turn = (mismatch.cumsum(1) - 1) % self.num_spares  # (B, N), used at mismatches only
+        turn = (mismatch.cumsum(1) - 1) % self.num_spares  # (B, N), only mismatches use `turn`
         pixels = img_points[torch.where(mismatch, spare_rows.gather(1, turn), rows)]
         pixels = torch.where((kind == OutlierKind.SENSING)[..., None], anywhere, pixels)
         inliers = inliers[rows] & (kind == OutlierKind.INLIER)
@@ -170,7 +170,7 @@ def _choose(counts: Tensor, k: int, generator: torch.Generator) -> Tensor:
     draws = unit((len(counts), k), generator)
     chosen = torch.empty((len(counts), k), dtype=torch.int64)
     for i in range(k):
-        last = counts - k + i  # larger in each iteration, so that it was not chosen before
+        last = counts - k + i  # `last` grows in each iteration, so that `last` was not chosen before
         candidate = (draws[:, i] * (last + 1)).long().minimum(last)
         chosen_before = (chosen[:, :i] == candidate[:, None]).any(1)
         chosen[:, i] = torch.where(chosen_before, last, candidate)

@@ -21,7 +21,7 @@ _AHEAD = 4
 
 
 class ProblemSource(Protocol):
-    """A source of problems. Batch ``i`` always has the same numbers; for workers all batches must have one shape."""
+    """A source of problems. Batch ``i`` always has the same numbers. Workers need batches of one shape."""
 
     batch_size: int
 
@@ -70,7 +70,7 @@ def stream_batches(source: ProblemSource, start: int, stop: int, workers: int = 
         yield from map(slots.read, indices)
     finally:
         atexit.unregister(indices._shutdown_workers)
-        indices._shutdown_workers()  # else the workers live as long as a traceback that refers to them
+        indices._shutdown_workers()  # else a traceback that refers to `indices` keeps the workers alive
 
 
 class _SharedSlots(Dataset[int]):

@@ -34,8 +34,8 @@ _AMOUNTS = {
 _MOST_RATIO = 100.0
 # Largest pixel noise of an inlier with Student noise, in standard deviations. A choice.
 _MOST_NOISE = 10.0
-# Smallest squared length of noise, in squared standard deviations. It avoids 0 / 0 in Student noise; float64 resolves
-# that quotient at this length.
+# Smallest squared length of noise, in squared standard deviations. The bound avoids 0 / 0 in Student noise; float64
+# resolves the quotient at the bound.
 _LEAST_SQ_LENGTH = 1e-12
 # Pixels: replaces a standard deviation of 0 as a divisor.
 _TINY = 1e-9
@@ -83,8 +83,8 @@ class SyntheticProblems(RandomProblems):
             ``10 * img_sigma`` is then an outlier.
         sigma_spread: standard deviation of the logarithm of the sigmas of pairs within a problem, at most 3, or a
             range. Above 0, known sigmas have the shape ``(batch_size, n)``.
-        axis_ratio: ratio of the largest to the smallest standard deviation of a pixel's or a point's noise along its
-            axes, at most 100. The axes are random and differ between pairs; the standard deviations are a geometric
+        axis_ratio: ratio of the largest to the smallest standard deviation along the axes of the noise of a pixel or a
+            point, at most 100. The axes are random and differ between pairs; the standard deviations are a geometric
             series. Above 1, ``img_sigma`` and ``world_sigma`` are the root mean square over the axes, and known noise
             is given as covariances.
         known_noise: share of the problems that come with both sigmas; 0 omits the sigmas of all problems. Above 0, a
@@ -144,7 +144,7 @@ class SyntheticProblems(RandomProblems):
     def _draw(self, generator: torch.Generator) -> Problems:
         size, n, mix = self.batch_size, self.n, self.outliers or OutlierMix(count=0)
         pose = random_poses(size, generator, translation_sigma=self.translation_sigma, max_angle=self.max_angle)
-        # Pixels of mismatches show other points of the same scene: N points for the pairs, N points for mismatches.
+        # The scene has the N points of the pairs and N other points, which the pixels of mismatches show.
         scene = (self.points or BoxPoints())(size, 2 * n, generator)
         kind = mix.draw(size, n, generator)[..., None]  # (B, N, 1), as all masks below
         in_crowd = (kind == OutlierKind.CROWD) | (kind == OutlierKind.POINT_CROWD)

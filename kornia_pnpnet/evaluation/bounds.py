@@ -61,7 +61,7 @@ class KnownInliersAndNoise(Configured):
     and noise*.
 
     For problems with covariances the result is the maximum likelihood estimate from the inliers: the covariances whiten
-    the residuals. If only one of the two covariances is known, the sigma replaces the other covariance.
+    the residuals. If only one of the two covariances is known, ``img_sigma`` or ``world_sigma`` replaces the other.
 
     Args:
         img_sigma: standard deviation of the noise on each pixel coordinate, in pixels. The default is the value of the

@@ -126,7 +126,7 @@ def evaluate(
 
         A row has ``success`` (rate, low, high, total), quartiles of ``rotation_error_deg`` and ``translation_error``,
         the share ``ok``, ``us_per_problem`` (median of the timed calls), and errors and ok ``per_problem``. A row that
-        was measured on another machine than ``environment`` also has an ``environment`` with the entries that differ.
+        was measured on another machine also has ``environment``: the entries that differ from those of the file.
 
     Raises:
         ValueError: when ``path`` is not a results file, or this evaluation cannot continue it.

@@ -36,7 +36,7 @@ _SCENE_OPTIONS = dict.fromkeys(
 # Options of RANSAC for synthetic data: the best thresholds of a grid from 3 px and 0.15 m to 8 px and 0.4 m, on
 # problems of another seed. Success changes by one percentage point over the grid.
 _PRIOR_OPTIONS = dict.fromkeys(("ransac-epnp-lm", "p3p-ransac"), "threshold=5,world_threshold=0.25")
-# Optional packages by the prefix of the solvers that need the package: name of the module and name of the package.
+# Module and name of each optional package, by the prefix of the solvers that need the package.
 _PACKAGES = {
     "opencv-": ("cv2", "OpenCV"),
     "kornia-rs": ("kornia_rs", "kornia-rs"),
@@ -82,8 +82,8 @@ def default_solvers(n: int | Iterable[int], sources: Iterable[str] = ("synthetic
     Args:
         n: number of pairs per problem, or several such numbers.
         sources: sources of the problems, see :func:`~kornia_pnpnet.evaluation.problem_sets.evaluation_sets`. If any
-            source is synthetic, RANSAC gets thresholds for synthetic data. Otherwise it gets thresholds for scenes, and
-            the bound that needs the noise is left out.
+            source is synthetic, RANSAC gets thresholds for synthetic data. Otherwise RANSAC gets thresholds for scenes,
+            and the bound that needs the noise is left out.
 
     Returns:
         Names with options for :func:`load_solver`.
@@ -98,6 +98,6 @@ def default_solvers(n: int | Iterable[int], sources: Iterable[str] = ("synthetic
 
 
 def missing_package(solver: str) -> str | None:
-    """Return the name of the package that a solver needs, or ``None`` if the package is installed or not needed."""
+    """Return the name of the missing package that a solver needs, or ``None`` if no package is missing."""
     needed = (package for prefix, package in _PACKAGES.items() if solver.startswith(prefix))
     return next((name for module, name in needed if importlib.util.find_spec(module) is None), None)

@@ -33,7 +33,7 @@ def row_errors(row: Mapping[str, Any]) -> tuple[PoseErrors, Tensor]:
     """Read the errors (float64) and ok (bool) of all problems from a row of ``results["rows"]``, each :math:`(B,)`.
 
     Raises:
-        ValueError: when the row has no per-problem errors. The results files in the repository have none.
+        ValueError: when the row has no per-problem errors. The results files in the repository have no such errors.
     """
     if "per_problem" not in row:
         raise ValueError(f"The row of '{row['solver']}' on '{row['data']}' has no per-problem errors.")

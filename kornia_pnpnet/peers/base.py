@@ -31,9 +31,9 @@ class PeerPose(NamedTuple):
     Attributes:
         rotation: world-to-camera rotation, shape :math:`(3, 3)`.
         translation: world-to-camera translation, shape :math:`(3,)`.
-        inliers: whether the peer calls a pair an inlier, bool, shape :math:`(N,)`.
-        init: rotation and translation before the last refinement. ``None`` if the peer does not report them; the final
-            pose then replaces them.
+        inliers: whether the library reports a pair as an inlier, bool, shape :math:`(N,)`.
+        init: rotation and translation before the last refinement. ``None`` if the library does not report this pose;
+            the ``init`` of the result is then the final pose.
     """
 
     rotation: np.ndarray

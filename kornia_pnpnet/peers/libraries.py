@@ -30,7 +30,7 @@ class _OpenCV(PeerSolver):
     def flag(self) -> int:
         """Return OpenCV's constant for the method."""
         cv2, name = self.library(), self.kind + f"{self.method}".removeprefix(self.kind)
-        # OpenCV lists its USAC variant for fundamental matrices among the others.
+        # The constant USAC_FM_8PTS is for fundamental matrices.
         usable = hasattr(cv2, name) and name != "USAC_FM_8PTS"
         KORNIA_CHECK(usable, f"OpenCV {cv2.__version__} has no method {self.method} for poses.")
         flag: int = getattr(cv2, name)
@@ -55,7 +55,7 @@ class OpenCVPnP(_OpenCV):
         cv2 = self.library()
         try:
             found, turn, shift = cv2.solvePnP(world_points, img_points, intrinsics, None, flags=self.flag())
-        except cv2.error:  # OpenCV asserts on degenerate pairs and on too few pairs
+        except cv2.error:  # OpenCV raises on degenerate pairs and on too few pairs
             return None
         if not found:
             return None
@@ -113,7 +113,7 @@ class OpenCVRansac(_OpenCV, RobustPeer):
             if self.refine and len(kept) > 3:
                 turn, shift = cv2.solvePnPRefineLM(world_points[kept], img_points[kept], intrinsics, None, turn, shift)
             rotation = cv2.Rodrigues(turn)[0]
-        except cv2.error:  # OpenCV asserts on degenerate pairs and on too few pairs
+        except cv2.error:  # OpenCV raises on degenerate pairs and on too few pairs
             return None
         return PeerPose(rotation, shift.ravel(), np.isin(np.arange(len(world_points)), kept), first)
 

@@ -74,7 +74,7 @@ def write_model_card(folder: str | Path, results: RunResults, *, name: str | Non
 
 
 def _describe(results: RunResults) -> str:
-    """Describe a run in one line. In its command, absolute paths of the machine are replaced."""
+    """Describe a run in one line. In the command of the run, ``PATH`` replaces absolute paths."""
     words = ["python train.py"]
     for override in results.overrides:
         key, _, value = override.partition("=")

@@ -108,7 +108,11 @@ class History:
 
 
 def load_checkpoint(path: Path, identity: dict[str, Any]) -> dict[str, Any]:
-    """Read a checkpoint; ``TrainingError`` when the file is damaged or belongs to a run with another identity."""
+    """Read a checkpoint.
+
+    Raises:
+        TrainingError: when the file is damaged, or when ``identity`` differs from the identity that the file holds.
+    """
     try:
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
         found = differences(state["identity"], identity)

@@ -54,7 +54,7 @@ _log = logging.getLogger(__name__)
 
 # Stages of an update. "rest" consists of learning curves, validations and checkpoints.
 _STAGES = ("data", "forward", "backward", "optimizer", "rest")
-# Columns of the learning curves that every row has.
+# Columns that every row of the learning curves has.
 _COLUMNS = (
     *("update", *LossTerms._fields, "ramp", "lr", "grad_norm", "skipped", "updates_per_second"),
     *(*(f"{stage}_share" for stage in _STAGES), "peak_memory_mib"),
@@ -82,9 +82,9 @@ class TrainSettings:
         clip: norm to which longer gradients are scaled; infinity means no clipping.
         ramp: two shares of the run, between which the weight of the refined loss terms rises linearly from 0 to 1.
         max_skipped: largest number of skipped steps. A larger number ends the run with an error.
-        log_every: updates between rows of the learning curves.
-        validate_every: updates between validations.
-        checkpoint_every: updates between checkpoints.
+        log_every: number of updates between rows of the learning curves.
+        validate_every: number of updates between validations.
+        checkpoint_every: number of updates between checkpoints.
 
     Raises:
         BaseError: for a number out of range, or a ramp whose second share is smaller.
@@ -150,8 +150,8 @@ def fit(
         settings: numerical settings of the run.
         folder: folder of the run.
         fabric: a launched Fabric; one process on the CPU when ``None``.
-        identity: plain data that the checkpoint of a continued run must agree with, for example the configuration of
-            the data.
+        identity: plain data that describe the run, for example the configuration of the data. A run can only be
+            continued with equal data.
         data_workers: number of processes that draw batches for each training process, see
             :func:`~kornia_pnpnet.data.stream.stream_batches`.
         resume: continue from the checkpoint in ``folder`` if it exists.
@@ -173,7 +173,7 @@ def fit(
     )
     checkpoint = Path(folder) / CHECKPOINT_NAME
     described = {"settings": asdict(settings), "model": model.config(), **(identity or {})}
-    described = json.loads(json.dumps(described))  # tuples become lists, as in a checkpoint
+    described = json.loads(json.dumps(described))  # JSON turns tuples into lists, as in a checkpoint
     start, skipped, state = 0, 0, None
     if checkpoint.exists():
         if not resume:
@@ -210,7 +210,8 @@ def fit(
             for group in optimizer.param_groups:
                 group["lr"] = group["initial_lr"] * factor
             terms = _compare(solver, loss, problems, ramp)
-            # Before the ramp, a zero term keeps the refiner in the graph, because Fabric expects gradients everywhere.
+            # Before the ramp, a zero term keeps the refiner in the graph, because several processes need a gradient of
+            # every parameter.
             unused = sum(p.sum() for p in model.refine.parameters() if p.requires_grad) if ramp == 0.0 else 0.0
             clock.lap("forward")
             optimizer.zero_grad()

@@ -75,8 +75,8 @@ class FitReport:
 class ValidationResult:
     """Success (rotation error below 1°, translation error below 0.2) and errors on one validation set.
 
-    Fields with ``first_stage`` describe the initial poses, the other fields the refined poses. Translations are in the
-    unit of the world.
+    Fields with ``first_stage`` describe the initial poses, the other fields the refined poses. Translation errors are
+    in the unit of the world.
     """
 
     success: SuccessRate
@@ -236,7 +236,8 @@ def find_results(weights: str | Path) -> RunResults | None:
         ValueError: see :func:`load_run`.
     """
     folder = find_weights(weights)
-    # `train.py` writes weights into the folder `weights` of a run. Above other folders may be results of another run.
+    # `train.py` writes weights into the folder `weights` of a run. A results file above any other folder may belong to
+    # other weights.
     folders = [folder, folder.parent] if folder.name == "weights" else [folder]
     paths = (place / RESULTS_NAME for place in folders)
     return next((load_run(path) for path in paths if path.is_file()), None)
