@@ -142,6 +142,8 @@ class MixedPoints:
 class VaryingSize:
     """Batches with different numbers of pairs per problem and about the same total number of pairs.
 
+    Batches differ in shape, so worker processes cannot draw them (``data_workers=0`` in a training).
+
     Args:
         source: constructor of a source, with the arguments ``n``, ``batch_size`` and ``seed``.
         n: numbers of pairs per problem. Each batch draws one of these numbers.

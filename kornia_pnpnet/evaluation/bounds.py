@@ -64,10 +64,9 @@ class KnownInliersAndNoise(Configured):
     the residuals. If only one of the two covariances is known, ``img_sigma`` or ``world_sigma`` replaces the other.
 
     Args:
-        img_sigma: standard deviation of the noise on each pixel coordinate, in pixels. The default is the value of the
-            protocol.
-        world_sigma: standard deviation of the noise on each world coordinate, in the unit of the world. The default is
-            the value of the protocol's synthetic data.
+        img_sigma: standard deviation of the noise on each pixel coordinate, in pixels.
+        world_sigma: standard deviation of the noise on each world coordinate, in the unit of the world. Both defaults
+            are the values of the protocol's synthetic data.
 
     Raises:
         BaseError: for a standard deviation that is negative or not finite, or when both are 0.

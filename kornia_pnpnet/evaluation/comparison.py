@@ -62,13 +62,10 @@ def draw_problems(source: ProblemSource, count: int) -> Problems:
 
     Args:
         source: a source of problems, for example :class:`~kornia_pnpnet.data.SyntheticProblems`.
-        count: number of problems, at least 1.
+        count: number of problems; ``ValueError`` for a number below 1.
 
     Returns:
         The first ``count`` problems of the concatenated batches 0, 1, ...
-
-    Raises:
-        ValueError: for a ``count`` below 1.
 
     Example:
         >>> from kornia_pnpnet.data import SyntheticProblems
@@ -115,14 +112,13 @@ def evaluate(
     Returns:
         Plain data with the keys
 
-        - ``format``: version of the format,
-        - ``environment``: see :func:`~kornia_pnpnet.core.environment.environment`,
-        - ``code``: digest of the package,
+        - ``format`` (version of the format), ``code`` (digest of the package) and ``environment`` (see
+          :func:`~kornia_pnpnet.core.environment.environment`),
         - ``solvers``: class, configuration and digest of the weights of each solver,
         - ``data``: description, limits and digest of each set,
         - ``rows``: one row for each set and solver,
-        - ``left_out``: ``data``, ``solver`` and ``reason`` for each solver that refused the shape of a set (a network
-          for another n). The solver has no row for this set.
+        - ``left_out``: ``data``, ``solver`` and ``reason`` in place of a row, when a solver refuses the shape of a set
+          (a network for another n).
 
         A row has ``success`` (rate, low, high, total), quartiles of ``rotation_error_deg`` and ``translation_error``,
         the share ``ok``, ``us_per_problem`` (median of the timed calls), and errors and ok ``per_problem``. A row that

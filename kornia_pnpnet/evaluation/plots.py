@@ -65,13 +65,10 @@ def plot_pose(path: str | Path, img_points: Tensor, reprojections: Tensor, rejec
 
     Args:
         path: the file to write.
-        img_points: pixels, shape (N, 2). Pixels that are not finite are left out.
-        reprojections: reprojections in pixels, shape (N, 2), not finite for points behind the camera.
+        img_points: pixels, shape (N, 2). Pixels that are not finite are left out; ``ValueError`` if no pixel is finite.
+        reprojections: shape (N, 2), in pixels, not finite for points behind the camera.
         rejected: whether a pair is rejected, bool, shape (N,).
         title: first part of the title.
-
-    Raises:
-        ValueError: when no pixel is finite.
     """
     there = img_points.isfinite().all(-1)
     if not there.any():

@@ -236,8 +236,7 @@ def find_results(weights: str | Path) -> RunResults | None:
         ValueError: see :func:`load_run`.
     """
     folder = find_weights(weights)
-    # `train.py` writes weights into the folder `weights` of a run. A results file above any other folder may belong to
-    # other weights.
+    # `train.py` writes weights into the folder `weights` of a run. Other folders may lie in the folder of another run.
     folders = [folder, folder.parent] if folder.name == "weights" else [folder]
     paths = (place / RESULTS_NAME for place in folders)
     return next((load_run(path) for path in paths if path.is_file()), None)
