@@ -1,9 +1,8 @@
 """The command ``pnpnet``: one module per command.
 
-A command is a module in :data:`COMMANDS`. Its docstring is the help, and ``run(arguments)`` returns the exit code. The
-arguments are in :data:`kornia_pnpnet.cli.arguments.ARGUMENTS`.
-Modules of commands import PyTorch inside ``run``, because the import takes seconds: wrong arguments and missing files
-are reported at once.
+A command is a module in :data:`COMMANDS`. The docstring of the module is the command's help, and ``run(arguments)``
+returns the exit code. :data:`kornia_pnpnet.cli.arguments.ARGUMENTS` has the arguments of each command. The modules
+import PyTorch inside ``run``, because the import takes seconds and bad arguments are to be reported at once.
 """
 
 from __future__ import annotations
@@ -39,10 +38,10 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command line.
 
     Args:
-        argv: arguments after ``pnpnet``. With ``None`` those of the process.
+        argv: arguments after ``pnpnet``; ``None`` means the arguments of the process.
 
     Returns:
-        The exit code: 0; 1 when ``solve`` found no pose; 2 for bad input; 130 when interrupted.
+        The exit code: 0 for success, 1 when ``solve`` found no pose, 2 for bad input, 130 after an interruption.
     """
     try:
         arguments = make_parser().parse_args(argv)
@@ -60,7 +59,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _reason(error: Exception) -> str:
-    """One line about an error of the input or of the machine; any other error is raised again."""
+    """Describe an error of the input or the machine in one line; any other error is raised again."""
     if isinstance(error, OSError) and error.filename and error.strerror:
         return " ".join(f"{error.filename}: {error.strerror}".splitlines())  # file names may contain line breaks
     from kornia.core.exceptions import BaseError

@@ -1,4 +1,4 @@
-"""The arguments of all commands as one table, the parser that reads them, and the choice of a solver."""
+"""The arguments of all commands as one table, the parser of these arguments, and the solver named by an argument."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ SYNTHETIC = ("synthetic", "gaussian_pose", "any_rotation", "slab", "mixed")
 
 
 class OneLineParser(argparse.ArgumentParser):
-    """A parser that accepts lists of negative numbers and reports an error in one line."""
+    """A parser that accepts lists of negative numbers as values and reports errors in one line."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self._negative_number_matcher = re.compile(r"-[\d.]")  # for argparse "-1,2" is an option
+        self._negative_number_matcher = re.compile(r"-[\d.]")  # argparse would read "-1,2" as an option
 
     def error(self, message: str) -> NoReturn:
         """Print the message in one line and exit with the code 2."""
@@ -34,7 +34,7 @@ class OneLineParser(argparse.ArgumentParser):
 
 
 def _checked(read: Callable[[str], _T], fits: Callable[[_T], bool], expected: str) -> Callable[[str], _T]:
-    """A parser with ``read``, which refuses values that do not fit."""
+    """Make a parser that applies ``read`` and refuses values for which ``fits`` is false."""
 
     def parse(text: str) -> _T:
         with suppress(ValueError):
@@ -47,7 +47,7 @@ def _checked(read: Callable[[str], _T], fits: Callable[[_T], bool], expected: st
 
 
 def _whole(low: int, high: int = 10**8) -> Callable[[str], int]:
-    """A parser of integers. The default of ``high`` keeps a number of problems or pairs from filling the memory."""
+    """Make a parser of integers. The default of ``high`` keeps huge numbers of problems from filling the memory."""
     return _checked(int, lambda value: low <= value <= high, f"an integer from {low} to {high}")
 
 
@@ -62,12 +62,12 @@ def _counts(text: str) -> list[int]:
 
 
 def _focal(text: str) -> dict[str, Any]:
-    """Options of :class:`~kornia_pnpnet.PnPNet` for a focal length."""
+    """Parse ``--focal`` into options of :class:`~kornia_pnpnet.PnPNet`."""
     return {"focal": text} if text in ("known", "unknown") else {"focal": "unknown", "focal_sigma": _positive(text)}
 
 
 def _path(text: str) -> str:
-    """Return the path of a file or a folder; ``OSError`` when there is none."""
+    """Return the path of a file or a folder; ``OSError`` when the path does not exist."""
     Path(text).stat()
     return text
 
@@ -77,7 +77,7 @@ def _source(text: str) -> str:
 
 
 def _arg(help_: str, metavar: str | None = None, **more: Any) -> dict[str, Any]:
-    """Options of ``ArgumentParser.add_argument``. The help ends with the default."""
+    """Make options of ``ArgumentParser.add_argument``. The help text ends with the default."""
     return {"help": f"{help_}; default: %(default)s" if "default" in more else help_, "metavar": metavar, **more}
 
 
@@ -151,7 +151,7 @@ ARGUMENTS: dict[str, dict[str, dict[str, Any]]] = {
 
 
 def load_solver_without_truth(name: str) -> nn.Module:
-    """Make the solver named by ``--solver``; ``ValueError`` for the name of a bound, which needs the true pose."""
+    """Make the solver named by ``--solver``; ``ValueError`` for a bound, because bounds need the true pose."""
     from kornia_pnpnet.evaluation.named_solvers import BOUNDS, load_solver
 
     if name.partition(":")[0] in BOUNDS:

@@ -1,4 +1,4 @@
-"""The correspondences of one image: files, cameras of the command line, and reprojection errors under a pose."""
+"""The correspondences of one image: reading files and cameras of the command line, and reprojection errors."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _COLUMNS = ("X", "Y", "Z", "u", "v")
 _ZIP_MAGIC = b"PK\x03\x04"
 # Ratio of the standard deviation of a normal distribution to its median absolute deviation.
 _MAD_TO_SIGMA = 1.4826
-# Lowest limit of a reprojection error in pixels: about three standard deviations of a corner detector's noise.
+# Smallest automatic limit of a reprojection error, in pixels: three standard deviations of a corner detector's noise.
 _MIN_LIMIT_PX = 3.0
 
 
@@ -44,9 +44,10 @@ class ImageCorrespondences(NamedTuple):
     intrinsics: Tensor | None = None
 
     def undistorted(self, camera: str) -> ImageCorrespondences:
-        """Replace the pixels of a camera of COLMAP, ``MODEL,width,height,params...``, by those of a pinhole camera.
+        """Undistort the pixels, and set the intrinsics to those of the pinhole camera.
 
-        A pixel without a ray gets the weight 0.
+        A pixel that cannot be undistorted gets the weight 0. For ``camera`` see
+        ``kornia_pnpnet.data.colmap.undistort``.
         """
         from kornia_pnpnet.data.colmap import undistort
 
@@ -70,7 +71,7 @@ def camera_matrix(text: str) -> Tensor:
 
 
 def _pinhole(matrix: Tensor, source: str | Path) -> Tensor:
-    """Scale the matrix of a pinhole camera to end in 1; raise an :class:`InputError` for any other matrix."""
+    """Scale a pinhole camera matrix so that its last element is 1; ``InputError`` for any other matrix."""
     if not matrix.isfinite().all():
         raise InputError(source, "the intrinsics are not finite")
     if matrix[1, 0] != 0 or matrix[2, :2].any() or matrix[2, 2] == 0:
@@ -82,12 +83,15 @@ def _pinhole(matrix: Tensor, source: str | Path) -> Tensor:
 
 
 def read_correspondences(path: str | Path) -> ImageCorrespondences:
-    """Read the correspondences of one image: at least three, all finite, in the order of the file.
+    """Read the correspondences of one image in the order of the file.
 
     Args:
-        path: a CSV file with the header ``X,Y,Z,u,v`` in any order, an optional column ``weight`` and any others; or
-            an NPZ file with the arrays ``world_points`` (N, 3), ``img_points`` (N, 2) and optionally ``weights``
-            (N,) and ``intrinsics`` (3, 3).
+        path: a CSV file or an NPZ file. A CSV file has the columns ``X,Y,Z,u,v`` and optionally ``weight``, in any
+            order; other columns are ignored. An NPZ file has the arrays ``world_points`` (N, 3), ``img_points`` (N, 2)
+            and optionally ``weights`` (N,) and ``intrinsics`` (3, 3).
+
+    Raises:
+        InputError: for fewer than three correspondences, a missing column or array, or an invalid number.
     """
     path = Path(path)
     with path.open("rb") as file:
@@ -133,7 +137,7 @@ def _read_npz(path: Path) -> ImageCorrespondences:
 
 
 def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
-    """Read the arrays of these names that an NPZ file has. Both arrays of points must be there."""
+    """Read the arrays with one of ``names`` from an NPZ file; ``InputError`` without both arrays of points."""
     try:
         arrays = read_npz(path, names)
     except ValueError as error:
@@ -147,12 +151,12 @@ def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
 def reproject(
     world_points: Tensor, img_points: Tensor, intrinsics: Tensor, pose: Pose, limit_px: float | None = None
 ) -> tuple[Tensor, Tensor, float]:
-    """Compare the pixels (N, 2) of one image with the projections of its world points (N, 3) by a pose (1, ...).
+    """Reproject the world points (N, 3) of one image by a pose (a batch of one) and compare with the pixels (N, 2).
 
     Returns:
-        The projections (N, 2) and the reprojection errors (N,), both in pixels and NaN where a point is not in front
-        of the camera; and the largest error of a correspondence that is not rejected: ``limit_px``, or a robust
-        estimate of three standard deviations of the inliers, at least 3 px.
+        The reprojections (N, 2), the reprojection errors (N,), and the largest error of a correspondence that is not
+        rejected, all in pixels. Reprojections and errors are NaN for points that are not in front of the camera. The
+        limit is ``limit_px``; when ``None``, it is 3 times 1.4826 times the median error, at least 3 px.
     """
     cam_points = transform_points(pose.matrix, world_points[None])[0]
     in_front = cam_points[:, 2:] > 0

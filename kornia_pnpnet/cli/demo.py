@@ -23,7 +23,7 @@ _SOLVERS = ("pnpnet-set", f"pnpnet-n{_N}", "opencv-ransac", "poselib")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Compare the solvers, draw, train; end with the :func:`verdict`."""
+    """Compare the solvers, draw pictures, train a network and print the :func:`verdict`."""
     import torch
 
     from kornia_pnpnet.evaluation import evaluate, format_table
@@ -73,7 +73,7 @@ def _result(row: Mapping[str, Any]) -> str:
 
 
 def _draw_one(path: Path, name: str, solver: nn.Module, entry: EvaluationData) -> Path:
-    """Draw the first problem with the most outliers: the choice does not depend on success."""
+    """Draw the first problem with the most outliers, so that the choice does not depend on success."""
     import torch
 
     from kornia_pnpnet.cli.correspondence_files import reproject
@@ -89,7 +89,7 @@ def _draw_one(path: Path, name: str, solver: nn.Module, entry: EvaluationData) -
 
 
 def _train(seconds: float, folder: Path) -> Path | None:
-    """Train briefly and print the success rate before and after; ``None`` without the packages for training."""
+    """Train briefly and print the first and last success rates; ``None`` without the packages for training."""
     from kornia_pnpnet.core.files import read_csv
 
     try:

@@ -28,7 +28,7 @@ def run(arguments: argparse.Namespace) -> int:
     solver = load_solver_without_truth(arguments.solver)
     if not isinstance(solver, PnPNet):
         raise ValueError(f"--solver: {arguments.solver} belongs to another library and cannot be exported")
-    target.parent.mkdir(parents=True, exist_ok=True)  # fails now, not after minutes of tracing
+    target.parent.mkdir(parents=True, exist_ok=True)  # an error comes now, not after minutes of tracing
     if target.is_dir():
         raise ValueError(f"'{target}' is a folder")
     if target.exists() and not arguments.overwrite:
@@ -36,7 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
     export, action = (export_onnx, "converting") if target.suffix == ".onnx" else (export_package, "compiling")
     print(f"Tracing and {action}; PyTorch takes a minute or more", flush=True)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the exporter warns about itself
+        warnings.simplefilter("ignore")  # PyTorch's exporter warns about its own code
         path = export(solver, target, arguments.n, batch=arguments.batch, rig=arguments.rig)
     outputs = OUTPUTS if solver.focal == "known" else ExportedCamera._fields
     inputs = RIG_INPUTS if arguments.rig else INPUTS

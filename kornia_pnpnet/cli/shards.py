@@ -23,16 +23,22 @@ __all__ = ["SUFFIXES", "ShardReport", "solve_shards"]
 #: Formats of shards.
 SUFFIXES = (".npz", ".parquet")
 
-# Metadata of a results file: the name of the solver and the digest of its parameters.
+# Key in the metadata of a results file. The value has the name of the solver and the digest of its parameters.
 _SOLVER = b"kornia_pnpnet.solver"
-# Numbers that are read from a Parquet file at once, 256 MB in float64. A batch of large problems has fewer rows.
+# Largest number of values that are read from a Parquet file at once: 256 MB in float64. For large problems this limit
+# reduces the rows of a batch.
 _NUMBERS_AT_ONCE = 2**25
 
 
 class ShardReport(NamedTuple):
-    """Numbers of solved problems, of all problems, of shards that were solved, and of shards that had results before.
+    """Result of :func:`solve_shards`.
 
-    ``failed`` has a line for each shard that cannot be read.
+    Attributes:
+        solved: number of problems with a pose, in the shards of this call.
+        problems: number of all problems in the shards of this call.
+        shards: number of shards that this call solved.
+        kept: number of shards that were skipped because they have results.
+        failed: one error message for each shard that cannot be read.
     """
 
     solved: int
@@ -54,26 +60,26 @@ def solve_shards(
 ) -> ShardReport:
     r"""Solve shards of problems one after the other, and write the results of ``part.*`` to ``part.parquet``.
 
-    A Parquet shard has one problem per row and the columns of :class:`~kornia_pnpnet.arrow.Solve`; ``batch`` rows are
-    read at a time. An NPZ shard is read as a whole. It has ``world_points`` (B, N, 3), ``img_points`` (B, N, 2) and
-    optionally ``intrinsics`` (3, 3) or (B, 3, 3), ``weights`` (B, N), and ``img_sigma`` and ``world_sigma``, each a
-    number, (B,) or (B, N).
+    A Parquet shard has one problem per row and the columns of :class:`~kornia_pnpnet.arrow.Solve`; at most ``batch``
+    rows are read at a time. An NPZ shard is read as a whole. It has the arrays ``world_points`` (B, N, 3) and
+    ``img_points`` (B, N, 2). Optional arrays are ``intrinsics`` (3, 3) or (B, 3, 3), ``weights`` (B, N), and the
+    standard deviations ``img_sigma`` and ``world_sigma``, each of the shape (), (B,) or (B, N).
 
-    A results file gets its name when it is complete, so a run that was stopped can be repeated: shards with results
+    A results file gets its name when it is complete. A stopped call can therefore be repeated, and shards with results
     are skipped. A shard that cannot be read is reported, and the other shards are solved.
 
     Args:
         solve: the solver.
         sources: shards, or folders of shards.
-        out: folder of the results, another one than those of the shards.
-        name: name of the solver. Results files store it with the digest of the solver's parameters.
-        batch: number of problems solved at once.
+        out: folder of the results, without shards.
+        name: name of the solver. Results files store this name and the digest of the solver's parameters.
+        batch: largest number of problems that are solved at once.
         overwrite: also solve the shards that have results.
-        progress: show a progress bar on stderr, where stderr is a terminal and tqdm is installed.
+        progress: show a progress bar if stderr is a terminal and tqdm is installed.
 
     Raises:
-        InputError: when there is no shard, two results would have the same name, ``out`` holds the shards themselves,
-            or a shard has results of another solver.
+        InputError: when there is no shard, two results would have the same name, ``out`` is the folder of a shard, or a
+            shard has results of another solver.
         OSError: when the results cannot be written.
     """
     state = sorted(solve.solver.state_dict().items())
@@ -99,7 +105,7 @@ def solve_shards(
 
 
 def _find(sources: Sequence[str | Path], out: Path) -> dict[str, Path]:
-    """All shards by the stem of their names, in the order of the sources; those of a folder by name."""
+    """Find all shards, by the stem of their names. Shards of a folder are sorted by name."""
     shards: dict[str, Path] = {}
     endings = " or ".join(SUFFIXES)
     for source in map(Path, sources):
@@ -119,32 +125,32 @@ def _find(sources: Sequence[str | Path], out: Path) -> dict[str, Path]:
 
 
 def _solver_of(target: Path) -> bytes | None:
-    """The solver that a results file names; ``None`` when the file is no results file."""
+    """Read the metadata entry ``_SOLVER`` of a file; ``None`` when the file is not a results file."""
     with suppress(pa.ArrowException, OSError):
         return (parquet.read_schema(target).metadata or {}).get(_SOLVER)
     return None
 
 
 def _bar(shards: Iterable[Path], shown: bool) -> Any:
-    """A progress bar over the problems of shards, or a context without one."""
+    """Make a progress bar over the problems of shards, or an empty context."""
     if not shown or find_spec("tqdm") is None:
         return nullcontext()
     from tqdm import tqdm
 
-    total = None  # unknown with NPZ files, and with files that cannot be read
+    total = None  # the total is unknown with NPZ files and with files that cannot be read
     with suppress(OSError, pa.ArrowException):
         total = sum(parquet.read_metadata(shard).num_rows for shard in shards)
-    return tqdm(total=total, unit="problem", unit_scale=True, disable=None)  # None: disabled without a terminal
+    return tqdm(total=total, unit="problem", unit_scale=True, disable=None)  # None: no bar without a terminal
 
 
 def _solve_shard(solve: Solve, shard: Path, target: Path, mark: bytes, batch: int, bar: Any) -> tuple[int, int]:
-    """Solve a shard; return the number of solved problems and of all problems."""
+    """Solve a shard; return the number of solved problems and the number of all problems."""
     solved, count, writer = 0, 0, None
     with atomic_open(target, "wb") as file, ExitStack() as stack:
         for table in _tables_of_arrays(shard, batch) if shard.suffix == ".npz" else _tables_of_parquet(shard, batch):
             try:
                 result = solve(table)
-            except (BaseError, TypeError, pa.ArrowException) as error:  # a column is missing or not for this solver
+            except (BaseError, TypeError, pa.ArrowException) as error:  # a column is missing or does not fit the solver
                 raise InputError(shard, str(error)) from None
             if writer is None:
                 schema = result.schema.with_metadata({_SOLVER: mark})
@@ -157,9 +163,10 @@ def _solve_shard(solve: Solve, shard: Path, target: Path, mark: bytes, batch: in
 
 
 def _tables_of_parquet(shard: Path, batch: int) -> Iterator[pa.Table]:
-    """Tables of at most ``batch`` rows of a Parquet file, at least one table."""
+    """Yield tables of at most ``batch`` rows from a Parquet file, at least one table."""
     try:
-        # With pre_buffer Arrow reads ahead to the end of the file, and without buffer_size a row group at once.
+        # With pre_buffer Arrow would read ahead to the end of the file. Without buffer_size it would read a whole row
+        # group at once.
         with parquet.ParquetFile(shard, pre_buffer=False, buffer_size=1 << 20) as file:
             groups = [file.metadata.row_group(i) for i in range(file.metadata.num_row_groups)]
             numbers = [sum(x.column(i).num_values for i in range(x.num_columns)) // max(x.num_rows, 1) for x in groups]
@@ -167,19 +174,19 @@ def _tables_of_parquet(shard: Path, batch: int) -> Iterator[pa.Table]:
             if not file.metadata.num_rows:
                 yield file.schema_arrow.empty_table()
             yield from (pa.Table.from_batches([part]) for part in file.iter_batches(rows))
-    except Exception as error:  # Arrow raises half a dozen types of errors for broken files
+    except Exception as error:  # Arrow raises many types of errors for broken files
         raise InputError(shard, f"not a Parquet file of problems: {error}") from None
 
 
 def _tables_of_arrays(shard: Path, batch: int) -> Iterator[pa.Table]:
-    """Tables of at most ``batch`` problems of an NPZ file, at least one table."""
+    """Yield tables of at most ``batch`` problems from an NPZ file, at least one table."""
     arrays = read_arrays(shard, INPUTS)
     for name, size in (("world_points", 3), ("img_points", 2)):
         if arrays[name].ndim != 3 or arrays[name].shape[2] != size:
             raise InputError(shard, f"{name} must be of the shape (B, N, {size}), got {arrays[name].shape}")
     count = len(arrays["world_points"])
     for name, shape in (("intrinsics", (3, 3)), ("img_sigma", ()), ("world_sigma", ())):
-        if name in arrays and arrays[name].shape == shape:  # one for all problems
+        if name in arrays and arrays[name].shape == shape:  # one value for all problems
             arrays[name] = np.broadcast_to(arrays[name], (count, *shape))
     for start in range(0, max(count, 1), batch):
         try:

@@ -107,7 +107,7 @@ def _solve_image(arguments: argparse.Namespace, camera: Tensor | None) -> int:
         result = solver(world_points[None], img_points[None], camera[None], weights)
     camera, ok, status = result.intrinsics[0], bool(result.ok), Status(int(result.status)).name.lower()
     pixels, errors, limit = reproject(world_points, img_points, camera, result.pose, arguments.threshold)
-    rejected = ~(errors <= limit) | ~result.ok  # without a pose every correspondence is rejected
+    rejected = ~(errors <= limit) | ~result.ok  # without a pose all correspondences are rejected
     pairs = zip(result.weights[0].tolist(), errors.tolist(), rejected.tolist(), strict=True)
     answer = {
         "solver": name,

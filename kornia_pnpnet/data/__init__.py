@@ -1,9 +1,9 @@
 """Sources of problems: synthetic problems and real scenes.
 
-``synthetic`` makes problems from ``points`` (priors of points), ``outliers`` (their number and kinds) and ``draws``
-(random poses and numbers); ``cameras`` makes problems of many cameras; ``mixtures`` combines several sources;
-``scenes`` draws problems from real scenes, which ``colmap`` reads from files; ``stream`` draws batches in other
-processes. A new source is a class with ``batch_size`` and ``batch(index)``.
+``synthetic`` makes problems from ``points`` (priors of points), ``outliers`` (the number and kinds of outliers) and
+``draws`` (random poses and numbers). ``cameras`` makes problems of many cameras. ``mixtures`` combines several sources.
+``scenes`` draws problems from real scenes, and ``colmap`` reads such scenes from files. ``stream`` draws batches in
+worker processes. A new source is a class with ``batch_size`` and ``batch(index)``.
 """
 
 from kornia_pnpnet.data.cameras import CameraProblems

@@ -16,33 +16,34 @@ from kornia_pnpnet.data.scenes import Scene, View
 
 __all__ = ["load_scene", "undistort"]
 
-# Folders of a model below the user's folder: the folder itself, ETH3D's layout, COLMAP's layout.
+# Where a model is looked for, relative to the user's folder: the folder itself, ETH3D's layout, COLMAP's layout.
 _MODEL_FOLDERS = (".", "dslr_calibration_undistorted", "sparse/0", "sparse")
 
 
 def load_scene(path: str | Path, *, metric: bool = True, min_points: int = 10, max_error_px: float = 10.0) -> Scene:
-    """Load a scene from a COLMAP model or from a file of raw, unfiltered 2D-3D matches with the true poses.
+    """Load a scene from a COLMAP model, or from a file of unfiltered 2D-3D matches with the true poses.
 
-    A folder holds a model, text or binary, that ``pycolmap`` reads. The model is in the folder or below it: ETH3D has
-    it in ``dslr_calibration_undistorted``, COLMAP in ``sparse/0`` or ``sparse``. Pixels of distorted cameras are
-    undistorted to the pinhole camera with the same focal length and principal point. A point that an image observes
-    twice is used once, and points behind the camera, which only a fisheye lens can see, are dropped. All pairs count
-    as inliers.
+    ``pycolmap`` reads a model in text or binary format. The model is in the folder ``path`` or in its sub-folder
+    ``dslr_calibration_undistorted`` (ETH3D), ``sparse/0`` or ``sparse`` (COLMAP). Pixels of distorted cameras are
+    undistorted to the pinhole camera with the same focal length and principal point. If an image observes a point
+    twice, the first pixel is used. Points behind the camera, which a fisheye lens can see, are dropped. All pairs of a
+    model count as inliers.
 
-    An ``.npz`` file holds ``names`` (V,), ``K`` (V, 3, 3), ``R`` (V, 3, 3), ``t`` (V, 3) and ``size`` (V, 2) as width
-    and height; for image ``iii`` (three digits) ``iii_img_points`` (M, 2), ``iii_world_points`` (M, 3) and
-    ``iii_error_px`` (M,), the reprojection error under the true pose. Nothing in it is unpickled.
+    A file of matches is an ``.npz`` file with the arrays ``names`` (V,), ``K`` (V, 3, 3), ``R`` (V, 3, 3), ``t`` (V, 3)
+    and ``size`` (V, 2) as width and height. The matches of the image with the index ``iii`` (three digits) are
+    ``iii_img_points`` (M, 2), ``iii_world_points`` (M, 3) and ``iii_error_px`` (M,), the reprojection error under the
+    true pose. The file is read without unpickling.
 
     Args:
         path: the folder or the file.
         metric: whether the unit of the scene is the metre.
         min_points: images with fewer points are skipped.
-        max_error_px: matches of a file with a larger reprojection error are outliers.
+        max_error_px: largest reprojection error of an inlier in a file of matches, in pixels.
 
     Raises:
-        FileNotFoundError: if there is nothing at ``path`` or no model in the folder.
-        ImportError: if a COLMAP model is to be read without ``pycolmap``.
-        ValueError: if the file or the model cannot be used, or all images are skipped; the message says why.
+        FileNotFoundError: if ``path`` does not exist or the folder has no model.
+        ImportError: if ``pycolmap`` is missing and ``path`` is a COLMAP model.
+        ValueError: if the file or the model cannot be used, or if all images are skipped. The message says why.
     """
     path = Path(path)
     is_file = path.suffix == ".npz" and not path.is_dir()
@@ -58,26 +59,26 @@ def load_scene(path: str | Path, *, metric: bool = True, min_points: int = 10, m
         most = max(len(view.world_points) for view in views)
         raise ValueError(f"no image of '{path}' has {min_points} points: the best of {len(views)} images has {most}")
     skipped = tuple(view.name for view in views if len(view.world_points) < min_points)
-    # The folder of a scene is above the folders of its model.
+    # A scene has the name of the innermost folder that is not part of a model's layout.
     above = (place.name for place in (path.resolve(), *path.resolve().parents))
     name = path.stem if is_file else next(x for x in above if x not in ("0", "sparse", "dslr_calibration_undistorted"))
     return Scene(name, kept, skipped, metric)
 
 
 def undistort(camera: str, img_points: Tensor) -> tuple[Tensor, Tensor]:
-    """Undistort pixels by any camera model that ``pycolmap`` knows.
+    """Undistort pixels of any camera model that ``pycolmap`` knows.
 
     Args:
-        camera: ``MODEL,width,height,params...``, a line of COLMAP's ``cameras.txt`` without its number.
-        img_points: pixels in the convention of the camera, shape (N, 2).
+        camera: ``MODEL,width,height,params...``, a line of COLMAP's ``cameras.txt`` without the camera's number.
+        img_points: distorted pixels, shape (N, 2).
 
     Returns:
-        The pinhole camera of the same focal length and principal point, (3, 3), and its pixels, float64; NaN where a
-        pixel has none.
+        The matrix of the pinhole camera with the same focal length and principal point, shape (3, 3), and the
+        undistorted pixels, shape (N, 2), both float64. A pixel that the camera model cannot undistort becomes NaN.
 
     Raises:
         ImportError: if ``pycolmap`` is missing.
-        ValueError: for an unknown model or other numbers than the model has.
+        ValueError: for an unknown model, or for parameters that do not fit the model.
     """
     pycolmap = _pycolmap()
     try:
@@ -105,15 +106,15 @@ def _line(error: Exception) -> str:
 
 
 def _pinhole(camera: Any, distorted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The pinhole camera (3, 3) like a ``pycolmap.Camera``, and its pixels (M, 2); NaN where there are none."""
+    """The pinhole matrix (3, 3) of a ``pycolmap.Camera`` and the undistorted pixels (M, 2); see :func:`undistort`."""
     intrinsics = camera.calibration_matrix()
-    plane = camera.cam_from_img(distorted)  # (M, 2), nan where the lens model has no inverse
-    with np.errstate(invalid="ignore"):  # infinite where a focal length is 0
+    plane = camera.cam_from_img(distorted)  # (M, 2), NaN where the camera model has no inverse
+    with np.errstate(invalid="ignore"):  # a focal length of 0 makes `plane` infinite
         return intrinsics, plane @ intrinsics[:2, :2].T + intrinsics[:2, 2]
 
 
 def _find_model(folder: Path) -> Path:
-    """The folder at or below ``folder`` that has the three files of a model, all binary or all text."""
+    """The folder at or below ``folder`` with the three files of a model, all of them binary or all of them text."""
     for below, ending in product(_MODEL_FOLDERS, (".bin", ".txt")):
         if all((folder / below / f"{stem}{ending}").is_file() for stem in ("cameras", "images", "points3D")):
             return folder / below
@@ -122,17 +123,17 @@ def _find_model(folder: Path) -> Path:
 
 
 def _colmap_views(folder: Path) -> Iterator[View]:
-    """The images of a model with what they observe."""
+    """Yield the images of a model with their observations."""
     place = _find_model(folder)
     pycolmap = _pycolmap()
     try:
         model = pycolmap.Reconstruction(str(place))
-    except Exception as error:  # its C++ code throws many types on bad files, std::bad_alloc included
+    except Exception as error:  # pycolmap raises many types on bad files, MemoryError included
         raise ValueError(f"pycolmap cannot read the model: {_line(error)}") from error
     xyz_of = {number: point.xyz for number, point in model.points3D.items()}
     for image in model.images.values():
         observed = image.get_observation_points2D()
-        pixel_of = {point.point3D_id: point.xy for point in reversed(observed)}  # of two pixels of a point the first
+        pixel_of = {point.point3D_id: point.xy for point in reversed(observed)}  # reversed: the first pixel wins
         numbers = sorted(pixel_of)
         if missing := pixel_of.keys() - xyz_of.keys():
             raise ValueError(f"image '{image.name}' observes the point {min(missing)}, which the model lacks")
@@ -141,7 +142,7 @@ def _colmap_views(folder: Path) -> Iterator[View]:
         intrinsics, pixels = _pinhole(image.camera, distorted)
         world_to_cam = image.cam_from_world().matrix()  # (3, 4)
         depth = points @ world_to_cam[2, :3] + world_to_cam[2, 3]
-        # `~(depth <= 0)`, so that a pose that is not finite reaches the check in View.
+        # `~(depth <= 0)` keeps NaN depths, so that View refuses a pose that is not finite.
         seen = np.isfinite(pixels).all(axis=1) & ~(depth <= 0)
         arrays = (points[seen], pixels[seen], intrinsics, world_to_cam[:, :3], world_to_cam[:, 3])
         world, img, camera, rotation, translation = map(torch.tensor, arrays)
@@ -150,7 +151,7 @@ def _colmap_views(folder: Path) -> Iterator[View]:
 
 
 def _match_views(path: Path, max_error_px: float) -> Iterator[View]:
-    """The images of a file of matches."""
+    """Yield the images of a file of matches."""
     arrays = read_npz(path)
     if "names" not in arrays:
         raise ValueError("there is no array 'names'")
@@ -167,7 +168,7 @@ def _match_views(path: Path, max_error_px: float) -> Iterator[View]:
 
 
 def _numbers(arrays: Mapping[str, np.ndarray], key: str, *shape: int | None) -> Tensor:
-    """An array of numbers, float64; ``None`` in its shape is any number."""
+    """Read an array of numbers as float64 and check its shape, in which ``None`` stands for any size."""
     if key not in arrays:
         raise ValueError(f"there is no array '{key}'")
     array = arrays[key]

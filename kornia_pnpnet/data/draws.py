@@ -1,4 +1,4 @@
-"""The base class of random sources, a generator for each batch, random numbers in float64, and random poses."""
+"""The base class of random sources, the random generator of a batch, random numbers in float64, and random poses."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["RandomProblems", "batch_generator", "log_uniform", "normal", "random
 
 @dataclass(kw_only=True, eq=False)
 class RandomProblems:
-    """Random problems, endless and reproducible. Options: see :class:`~kornia_pnpnet.data.SyntheticProblems`."""
+    """Base class of endless, reproducible sources. Fields: see :class:`~kornia_pnpnet.data.SyntheticProblems`."""
 
     n: int = 9
     batch_size: int = 1000
@@ -47,9 +47,9 @@ class RandomProblems:
 
 
 def batch_generator(seed: int, index: int) -> torch.Generator:
-    """A generator for batch ``index`` of the stream ``seed``, the same on every call.
+    """Make the random generator of a batch; equal arguments give equal random numbers.
 
-    The two numbers are hashed because CPU generators use only 32 bits of their seed.
+    ``seed`` and ``index`` are hashed into one seed, because CPU generators use only 32 bits of a seed.
     """
     state = int(np.random.SeedSequence(seed, spawn_key=(index,)).generate_state(1, np.uint64)[0])
     return torch.Generator().manual_seed(state >> 1)
@@ -71,7 +71,7 @@ def normal(shape: Sequence[int], generator: torch.Generator) -> Tensor:
 
 
 def log_uniform(shape: Sequence[int], low: float, high: float, generator: torch.Generator) -> Tensor:
-    """Numbers whose logarithm is uniform between the logarithms of ``low`` and ``high``."""
+    """Numbers in ``[low, high)`` with uniform logarithms."""
     return uniform(shape, math.log(low), math.log(high), generator).exp_()
 
 
@@ -85,8 +85,9 @@ def random_poses(
 ) -> Pose:
     """Draw world-to-camera poses of the protocol.
 
-    The axis of the rotation is uniform in direction, its angle uniform from 0 to ``max_angle`` radians. The translation
-    is uniform in a box of side ``translation_box`` about 0, or normal with ``translation_sigma`` on each axis.
+    The axis of the rotation has a uniform direction, and the angle is uniform from 0 to ``max_angle`` radians. The
+    translation is uniform in a cube of side ``translation_box`` about 0 if ``translation_sigma`` is ``None``. Otherwise
+    the translation is normal with the standard deviation ``translation_sigma`` on each axis.
     """
     axis = normalize(normal((batch_size, 3), generator), dim=-1)
     angle = uniform((batch_size, 1), 0.0, max_angle, generator)

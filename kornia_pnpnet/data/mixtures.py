@@ -21,24 +21,25 @@ from kornia_pnpnet.result import Problems
 
 __all__ = ["MixedPoints", "MixedProblems", "VaryingSize"]
 
-# Added to the seed of the numbers of pairs. Large, because the sources have the seeds next to that of the stream.
+# Added to the stream's seed to get the seed that draws the numbers of pairs. The offset is large, because the sources
+# use the stream's seed and the seeds directly after the stream's seed.
 _SIZES = 1_000_003
 
 
 class MixedProblems:
-    """Batches of problems that alternate between several sources.
+    """Batches that mix the problems of several sources.
 
     Args:
-        sources: each makes a :class:`SyntheticProblems` from ``batch_size``, ``seed`` and ``options``: the class itself
-            or a :func:`functools.partial` of it.
-        shares: share of the batch of each source, up to a common factor; equal shares when ``None``.
+        sources: constructors of the sources, called with ``batch_size``, ``seed`` and ``options``. A constructor is
+            :class:`SyntheticProblems` or a :func:`functools.partial` of this class.
+        shares: positive number for each source, proportional to the source's problems in a batch; equal when ``None``.
         batch_size: number of problems per batch.
         seed: seed of the stream.
-        options: options of all sources.
+        options: further arguments of all constructors.
 
     Raises:
-        BaseError: when the shares do not fit the sources or are not positive; from ``batch``, when only some sources
-            know covariances.
+        BaseError: when there are more or fewer shares than sources, or a share is not positive. ``batch`` raises the
+            same error when some sources know covariances and others do not.
 
     Example:
         >>> from functools import partial
@@ -63,13 +64,13 @@ class MixedProblems:
         sizes = _split(batch_size, shares, round)
         parts = zip(sources, sizes, strict=True)
         self.sources = [source(batch_size=size, seed=seed, **options) for source, size in parts if size]
-        # Sources take turns in proportion to their shares, so that every part of a batch is mixed in the same way.
+        # Sources take turns in proportion to their shares, so that every slice of a batch has about these shares.
         turns = [(turn + 0.5) / size for size in sizes for turn in range(size)]
         self._order = torch.tensor(sorted(range(batch_size), key=turns.__getitem__))
 
     def batch(self, index: int) -> Problems:
         """Draw batch ``index``, at least 0."""
-        count = len(self.sources)  # no two sources see the same random numbers
+        count = len(self.sources)  # distinct indices, so that no two sources draw the same random numbers
         parts = [source.batch(count * index + i) for i, source in enumerate(self.sources)]
         with_covariances = sum(part.img_cov is not None for part in parts)
         KORNIA_CHECK(with_covariances in (0, count), "All sources of a mixture must know covariances, or none of them.")
@@ -90,13 +91,13 @@ def _checked_shares(what: str, count: int, shares: Sequence[float] | None) -> li
 
 
 def _split(batch_size: int, shares: Sequence[float], rounded: Callable[[float], int]) -> list[int]:
-    """The number of problems of each share; ``rounded`` makes the bounds between the shares whole."""
+    """Split a batch in proportion to the shares; ``rounded`` rounds the bounds between the parts to integers."""
     bounds = [rounded(batch_size * sum(shares[:i]) / sum(shares)) for i in range(len(shares))]
     return [end - start for start, end in pairwise([*bounds, batch_size])]
 
 
 def _joined(parts: list[Problems], name: str) -> Tensor | None:
-    """The sigmas or confidences of all parts, (B,) or (B, N); NaN for the parts that know none."""
+    """Concatenate sigmas or confidences, (B,) or (B, N), NaN for parts without them; ``None`` if no part has them."""
     known = [getattr(part, name) for part in parts]
     dimensions = max((value.ndim for value in known if value is not None), default=0)
     if not dimensions:
@@ -112,10 +113,10 @@ class MixedPoints:
 
     Args:
         priors: the priors.
-        shares: share of the problems of each prior, up to a common factor; equal shares when ``None``.
+        shares: positive number for each prior, proportional to the prior's problems; equal when ``None``.
 
     Raises:
-        BaseError: when the shares do not fit the priors or are not positive.
+        BaseError: when there are more or fewer shares than priors, or a share is not positive.
 
     Example:
         >>> from kornia_pnpnet.data import BoxPoints, SlabPoints, SyntheticProblems
@@ -130,7 +131,7 @@ class MixedPoints:
 
     def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
         """See :class:`PointPrior`."""
-        # A random offset gives each prior its share on average, however small the batch.
+        # A random offset gives each prior its share on average, also in small batches.
         offset = unit((), generator).item()
         sizes = _split(batch_size, self.shares, lambda bound: math.floor(bound + offset))
         drawn = [prior(size, n, generator) for prior, size in zip(self.priors, sizes, strict=True) if size]
@@ -139,16 +140,18 @@ class MixedPoints:
 
 @dataclass(eq=False)
 class VaryingSize:
-    """Batches that differ in the number of pairs per problem and agree in the total number of pairs.
+    """Batches with different numbers of pairs per problem and about the same total number of pairs.
+
+    Batches differ in shape, so worker processes cannot draw them (``data_workers=0`` in a training).
 
     Args:
-        source: makes a source from ``n``, ``batch_size`` and ``seed``.
-        n: numbers of pairs; each batch draws one.
-        batch_size: number of problems in a batch of the smallest number of pairs; other batches have fewer problems.
+        source: constructor of a source, with the arguments ``n``, ``batch_size`` and ``seed``.
+        n: numbers of pairs per problem. Each batch draws one of these numbers.
+        batch_size: number of problems in a batch with the smallest ``n``. Other batches have fewer problems.
         seed: seed of the stream.
 
     Raises:
-        BaseError: when there is no number of pairs, or one below 1.
+        BaseError: when ``n`` is empty or has a number below 1.
 
     Example:
         >>> source = VaryingSize(SyntheticProblems, n=(4, 8), batch_size=6)

@@ -16,15 +16,16 @@ from kornia_pnpnet.data.draws import log_uniform, normal, random_poses, uniform,
 
 __all__ = ["OutlierKind", "OutlierMix", "crowd_leaders", "near_offsets", "structured_points"]
 
-# Standard deviations of the pixel noise: the range of a near outlier's distance from its pixel, from just outside the
-# noise to ten times that. With ``near_pixels``, the smallest values of the two ends of its range.
+# Distance of a near outlier's pixel from the pixel of its point, in standard deviations of the pixel noise. `_NEAR` is
+# the range without `near_pixels`. `_LEAST_NEAR` is the smallest value of each end of the range `near_pixels`. A choice:
+# the noise itself hardly exceeds 5 standard deviations.
 _NEAR, _LEAST_NEAR = (5.0, 50.0), (5.0, 10.0)
-# Pairs. Added to n * max_ratio before rounding down: 0.33 gives floor(n / 3) for n up to 15, although 0.33 < 1/3.
+# Pairs: added to n * max_ratio before rounding down, so that 0.33 in place of 1/3 gives floor(n / 3) for n up to 15.
 _SLACK = 0.05
 
 
 class OutlierKind(IntEnum):
-    """The kinds of pairs, see :class:`OutlierMix`. A crowd shares a pixel, a point crowd shares a point."""
+    """Kinds of pairs, see :class:`OutlierMix`. Pairs of a crowd share a pixel; pairs of a point crowd share a point."""
 
     INLIER = 0
     MISMATCH = 1
@@ -37,29 +38,32 @@ class OutlierKind(IntEnum):
 
 @dataclass(kw_only=True, eq=False)
 class OutlierMix:
-    r"""Outliers at random positions, their number uniform over the integers from a minimum to a maximum.
+    r"""Number and kinds of the outliers of random problems.
 
-    The shares apply in the order structured, near, crowd, mismatch, each to the outliers without a kind so far.
+    The number of outliers is a uniform integer from a minimum to a maximum, and outliers have random indices. Kinds are
+    assigned in the order structured, near, crowd, mismatch. Each share applies to the outliers that have no kind yet.
 
     Args:
-        max_ratio: the maximum as a share of the pairs, rounded down; 0.33 gives n // 3 for every n up to 15.
-        count: exact number of outliers, which replaces the range.
-        min_count: smallest number of outliers, up to the maximum.
-        min_inliers: smallest number of inliers, which limits the maximum.
-        mismatch_share: probability that an outlier is a *mismatch* (the projection of another point) rather than
-            *sensing* (a uniform pixel of the image).
-        near_share: probability that an outlier is *near* the pixel of its point.
-        near_pixels: smallest and largest distance of near outliers in pixels, log-uniform, but at least 5 and 10
-            standard deviations of the noise. ``None``: 5 to 50 standard deviations.
-        structured_share: probability that a problem has *structured* outliers. They agree on another pose, as with
-            repeated structure.
-        structured_ratio: smallest and largest number of structured outliers relative to the number of inliers, uniform.
-        structured_angle: largest rotation in radians of the structured part of a scene, which is always shifted.
-        mirrored_share: probability that the structured part of a problem is mirrored as well.
-        crowd_share: probability that a problem has *crowds*. A share of its outliers, uniform from 0 to 1, then has the
-            pixels of a few other pairs.
-        max_crowds: largest number of these other pairs; their number is uniform from 1.
-        point_crowd_share: probability that the crowds of a problem share points, each with many pixels, not pixels.
+        max_ratio: largest number of outliers as a share of the pairs, rounded down. 0.33 gives n // 3 for n up to 15.
+        count: exact number of outliers. ``max_ratio``, ``min_count`` and ``min_inliers`` then have no effect.
+        min_count: smallest number of outliers; the largest number replaces a ``min_count`` above it.
+        min_inliers: smallest number of inliers. The largest number of outliers is at most n - ``min_inliers``.
+        mismatch_share: probability that an outlier of no other kind is a *mismatch* (its pixel shows another point).
+            Otherwise it is a *sensing* outlier (its pixel is uniform in the image).
+        near_share: probability that an outlier is *near*: its pixel is close to the pixel of its point.
+        near_pixels: range, in pixels, of the distance between a near outlier and the pixel of its point, log-uniform.
+            The ends of the range are raised to at least 5 and 10 standard deviations of the pixel noise. ``None``: the
+            range is 5 to 50 standard deviations.
+        structured_share: probability that a problem has *structured* outliers. The structured outliers of a problem
+            agree on one incorrect pose, as in scenes with repeated structure.
+        structured_ratio: range of the number of structured outliers relative to the number of inliers, uniform.
+        structured_angle: largest rotation in radians of the points that structured outliers show. These points are also
+            shifted.
+        mirrored_share: probability that a problem mirrors the points that structured outliers show.
+        crowd_share: probability that a problem has *crowds*: outliers with the pixels of a few pairs, the leaders. The
+            probability that an outlier joins a crowd is uniform from 0 to 1 and differs between problems.
+        max_crowds: largest number of leaders; the number is a uniform integer from 1.
+        point_crowd_share: probability that the crowds of a problem share world points of the leaders instead of pixels.
 
     Raises:
         BaseError: for a number or a range out of its bounds.
@@ -106,7 +110,7 @@ class OutlierMix:
         """Draw a value of :class:`OutlierKind` for each pair, int64, shape ``(batch_size, n)``.
 
         Raises:
-            BaseError: when there are to be more outliers than pairs.
+            BaseError: when ``n`` is smaller than the number of outliers.
         """
         most = self.max_count(n)
         least = min(self.min_count, most) if self.count is None else most
@@ -117,7 +121,7 @@ class OutlierMix:
 
         count = torch.randint(least, most + 1, (batch_size, 1), generator=generator)
         rank = chance(n).argsort(-1).argsort(-1)
-        is_open = rank < count  # outliers without a special kind so far
+        is_open = rank < count  # outliers that are not structured or near
         kind = is_open * torch.where(chance(n) < self.mismatch_share, OutlierKind.MISMATCH, OutlierKind.SENSING)
         if self.structured_share:
             chosen = chance(1) < self.structured_share
@@ -137,7 +141,7 @@ class OutlierMix:
 
 
 def near_offsets(img_sigma: Tensor, n: int, generator: torch.Generator, pixels: tuple[float, float] | None) -> Tensor:
-    """The offsets in pixels of near outliers, (B, n, 2), with noise ``img_sigma``, (B, 1) or (B, n)."""
+    """Draw offsets of near outliers in pixels, (B, n, 2); ``img_sigma`` is the pixel noise, (B, 1) or (B, n)."""
     direction = normalize(normal((len(img_sigma), n, 2), generator), dim=-1)
     each, img_sigma = (len(img_sigma), n, 1), img_sigma[..., None]
     if pixels is None:
@@ -147,7 +151,7 @@ def near_offsets(img_sigma: Tensor, n: int, generator: torch.Generator, pixels: 
 
 
 def structured_points(cam_points: Tensor, mix: OutlierMix, generator: torch.Generator) -> Tensor:
-    """The points that structured outliers show: all points, (B, N, 3), rotated about their centre and shifted."""
+    """Rotate all points about their centre, shift and mirror them (see :class:`OutlierMix`), (B, N, 3)."""
     batch_size = len(cam_points)
     centre = cam_points.mean(1, keepdim=True)
     size = (cam_points - centre).square().sum(-1).mean(1).sqrt()[:, None, None]
@@ -155,7 +159,7 @@ def structured_points(cam_points: Tensor, mix: OutlierMix, generator: torch.Gene
     if mix.structured_angle:
         turn = random_poses(batch_size, generator, max_angle=mix.structured_angle).rotation
     shift = 0.5 * size * normal((batch_size, 1, 3), generator)
-    if mix.mirrored_share:  # at a plane of random direction
+    if mix.mirrored_share:  # at a plane with a random normal
         axis = normalize(normal((batch_size, 3, 1), generator), dim=1)
         mirrored = unit((batch_size, 1, 1), generator) < mix.mirrored_share
         turn = torch.where(mirrored, turn - 2.0 * (turn @ axis) @ axis.mT, turn)
@@ -163,7 +167,7 @@ def structured_points(cam_points: Tensor, mix: OutlierMix, generator: torch.Gene
 
 
 def crowd_leaders(batch_size: int, n: int, max_crowds: int, generator: torch.Generator) -> Tensor:
-    """For each pair the index of the pair whose pixel or point its crowd shares, (B, N)."""
+    """Draw the index of the leader of each pair, (B, N). Only pairs of a crowd use their leader."""
     leader = (n * unit((batch_size, max_crowds), generator)).long().clamp(max=n - 1)  # (B, max_crowds)
     crowds = 1 + (max_crowds * unit((batch_size, 1), generator)).long()  # (B, 1)
     crowd = (crowds * unit((batch_size, n), generator)).long().clamp(max=max_crowds - 1)

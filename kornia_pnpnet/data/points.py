@@ -1,7 +1,7 @@
 """Priors of points in the camera's frame: the protocol's box, slabs, objects, façades, rooms, drives.
 
-A new prior is one more class with the ``__call__`` of :class:`PointPrior`. Options are keywords; two numbers are the
-ends of a range. A number out of its bounds or a falling range raises ``BaseError``.
+A new prior is a class with the ``__call__`` of :class:`PointPrior`. Constructors take keyword arguments. An argument of
+two numbers is a range. Constructors raise ``BaseError`` for a number out of its bounds or a range that falls.
 """
 
 from __future__ import annotations
@@ -21,29 +21,30 @@ __all__ = ["BoxPoints", "DrivePoints", "FacadePoints", "ObjectPoints", "PointPri
 
 Range: TypeAlias = tuple[float, float]
 
-# The shapes of scenes are choices: from a flat picture on a wall to a street, at distances in metres.
-# Slabs: half-size of the window and largest coordinate of a direction as tangents, distance, standard deviation of the
-# slopes; thickness and smallest depth of the surface relative to the distance.
+# The numbers below are choices. They cover scenes from a flat picture on a wall to a street. Lengths are in metres.
+# Slabs: half-size of the window as a tangent; largest tangent of a direction; distance; standard deviation of the
+# slopes; thickness relative to the distance; smallest depth of the surface relative to the distance.
 _SLAB_WINDOW, _SLAB_TANGENT, _SLAB_DISTANCE = (0.15, 0.8), 0.9, (10.0, 40.0)
 _TILT, _THICKNESS, _LEAST_SURFACE = 0.5, (0.02, 4.0), 0.3
-# Objects: distance in half-sizes, largest tangent of the direction of the centre, smallest factor of an axis, share of
-# planar objects.
+# Objects: distance relative to the object's half-size; largest tangent of the direction of the centre; smallest factor
+# of an axis; share of planar objects.
 _OBJECT_DISTANCE, _OBJECT_TANGENT, _THINNEST, _PLANAR = (1.5, 40.0), 0.8, 0.05, 0.15
-# Façades: distance; largest turn in degrees; relief relative to the distance; share of problems with two façades.
+# Façades: distance; largest angle between normal and optical axis in degrees; relief relative to the depth; share of
+# problems with two façades.
 _FACADE_DISTANCE, _SLANT, _RELIEF, _CORNER = (4.0, 60.0), 70.0, (0.001, 0.1), 0.3
-# Smallest cosine between a ray and a façade's normal, relative to that of the middle ray: rays that meet a façade
-# further away than 20 times its distance see something else at that depth.
+# Smallest ratio of a façade's distance along the optical axis to the depth of a point. The
+# depth is thus at most 20 times the distance, also on rays that miss the façade.
 _LEAST_FACING = 0.05
-# Rooms: sides, height, pieces of furniture, and depth of the nearest furniture relative to the wall behind it, since
-# nobody photographs a cupboard's door.
+# Rooms: sides; height; number of pieces of furniture; smallest depth of furniture relative to the depth of the wall
+# behind. Closer furniture is left out, because nobody photographs the door of a cupboard.
 _ROOM_SIDE, _ROOM_HEIGHT, _FURNITURE, _NEAREST = (2.0, 15.0), (2.2, 5.0), 4, 0.15
-# Drives: height of the camera, distances of the fronts and of the end of the street; standard deviation of the yaw in
-# degrees; share of points in front of the fronts; distance of the ceiling, which a street does not have.
+# Drives: height of the camera; distance of the house fronts; distance of the end of the street; standard deviation of
+# the yaw in degrees; share of points on cars and trees; height of the street's ceiling, so large that no ray shows it.
 _CAMERA_HEIGHT, _STREET_SIDE, _STREET_END = (1.0, 3.0), (2.5, 20.0), (30.0, 200.0)
 _YAW, _NEARER, _NOWHERE = 15.0, 0.3, 1e6
-# Smallest components of rays that are divided by: rays along a wall meet it far away instead of at infinity.
+# Replaces smaller components of rays as divisors, so that a ray along a wall meets the wall far away, not at infinity.
 _PARALLEL = 1e-9
-# Degrees. A camera's projection needs less than 180.
+# Largest field of view in degrees. A pinhole camera needs less than 180.
 _WIDEST = 170.0
 
 
@@ -84,10 +85,10 @@ class BoxPoints:
 class SlabPoints:
     r"""Points as in photographs: a tilted slab of any thickness, seen through a window of the image.
 
-    A façade fills part of the image and is thin, a courtyard is deep; a box along the optical axis is neither.
-    A window, a distance :math:`d`, slopes :math:`g` and a thickness :math:`e` are drawn for each problem. Each point
-    has a uniform direction in the window and a depth in the slab,
-    :math:`z = d (1 + g_x x/z + g_y y/z)(1 + e\,u)` with :math:`u` uniform.
+    Thin slabs model façades and thick slabs model courtyards. Each problem draws a window with a centre :math:`c`, a
+    distance :math:`d`, slopes :math:`g` and a thickness :math:`e`. Each point has a uniform direction
+    :math:`p = (x/z, y/z)` in the window and the depth :math:`z = d\,(1 + g \cdot (p - c))(1 + e\,u)` with :math:`u`
+    uniform in [0, 1).
     """
 
     def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
@@ -104,10 +105,10 @@ class SlabPoints:
 
 
 class ObjectPoints:
-    """Points of an object of any proportions somewhere in the image, near or far.
+    """Points of an object with random proportions, rotation, direction and distance.
 
-    The object is an ellipsoid or a box of half-size about 1, made thinner by random factors along two axes, in some
-    problems down to a plane, and rotated at random. Its direction is random.
+    The object is a box of half-size 1 or a Gaussian cloud with a standard deviation of 0.5. Random factors make the
+    object thinner along two axes; some objects are planar.
     """
 
     def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
@@ -126,7 +127,7 @@ class ObjectPoints:
 
 
 class _View:
-    """Points on surfaces, seen through a random window of an image. Options: see :class:`FacadePoints`."""
+    """Points on surfaces, seen through a random window of an image. Arguments: see :class:`FacadePoints`."""
 
     def __init__(self, *, field_of_view: Range = (15.0, 120.0), window: Range = (0.1, 1.0)) -> None:
         check_ranges(field_of_view=field_of_view, window=window)
@@ -137,7 +138,7 @@ class _View:
     def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
         angle = uniform((batch_size, 1, 1), *self.field_of_view, generator).deg2rad_()
         area = log_uniform((batch_size, 1, 1), *self.window, generator)
-        split = uniform((batch_size, 1, 1), 0.25, 0.75, generator)  # the window's shape: wide, square or high
+        split = uniform((batch_size, 1, 1), 0.25, 0.75, generator)  # shape of the window: wide, square or high
         size = torch.cat((area**split, area ** (1.0 - split)), -1)  # (B, 1, 2)
         centre = (1.0 - size) * uniform((batch_size, 1, 2), -1.0, 1.0, generator)
         tangents = (angle / 2).tan() * (centre + size * uniform((batch_size, n, 2), -1.0, 1.0, generator))
@@ -145,19 +146,20 @@ class _View:
         return rays * self._depth(rays, generator)[..., None]
 
     def _depth(self, rays: Tensor, generator: torch.Generator) -> Tensor:
-        """The depths, (B, n), of points on rays with a third coordinate of 1, (B, n, 3)."""
+        """Draw the depths of points on rays, (B, n). Rays have a third coordinate of 1, (B, n, 3)."""
         raise NotImplementedError
 
 
 class FacadePoints(_View):
-    """Points of a façade or of two that meet at a corner, with relief.
+    """Points of one façade, or of two façades that meet at a corner, with relief.
 
-    Each façade is a plane that is turned away from the camera by a random angle. Recesses and balconies are steps: a
-    random half of the points lies deeper by the relief, and all points vary by a tenth of the relief.
+    Each façade is a plane that is turned away from the camera by a random angle. Recesses and balconies are steps: each
+    point lies deeper by the relief with probability 1/2. The standard deviation of all depths about these two levels is
+    a tenth of the relief.
 
     Args:
-        field_of_view: angle in degrees between opposite sides of the square image, uniform.
-        window: share of the image's area in which the points lie, log-uniform.
+        field_of_view: range of the angle between opposite sides of the square image in degrees, uniform.
+        window: range of the share of the image's area in which the points lie, log-uniform.
     """
 
     def _depth(self, rays: Tensor, generator: torch.Generator) -> Tensor:
@@ -176,10 +178,10 @@ class FacadePoints(_View):
 
 
 class RoomPoints(_View):
-    """Points of a room as seen from inside: floor, ceiling, walls and pieces of furniture.
+    """Points of a room seen from inside: floor, ceiling, walls and pieces of furniture.
 
-    The room is a box. The camera is anywhere in it except close to a wall, with any rotation. Pieces of furniture are
-    boxes that hide what is behind them. Options: see :class:`FacadePoints`.
+    The room is a box. The camera has a random rotation and a random position that is not close to a wall. Pieces of
+    furniture are boxes that hide the walls behind them. Arguments: see :class:`FacadePoints`.
     """
 
     def _depth(self, rays: Tensor, generator: torch.Generator) -> Tensor:
@@ -190,7 +192,7 @@ class RoomPoints(_View):
         low = -size * uniform((batch_size, 1, 3), 0.15, 0.85, generator)  # from the camera, in the room's axes
         in_room = rays @ turn.mT
         z = _hits(in_room, low, low + size)[1]
-        # Furniture stands on the floor and not where the camera is.
+        # Furniture stands on the floor. A piece around the camera has a negative `near` and is left out below.
         shape = batch_size, _FURNITURE, 3
         extent = size * uniform(shape, 0.08, 0.4, generator)
         start = low + (size - extent) * unit(shape, generator)
@@ -202,10 +204,10 @@ class RoomPoints(_View):
 
 
 class DrivePoints(_View):
-    """Points as seen from a car: the road, the fronts on both sides, the end of the street, with a large depth range.
+    """Points seen from a car: the road, the house fronts on both sides and the end of the street.
 
-    The camera looks along the street. Cars and trees are points that are nearer than the fronts. Options: see
-    :class:`FacadePoints`.
+    The camera looks approximately along the street. Points on cars and trees are closer than the surface behind them.
+    Arguments: see :class:`FacadePoints`.
     """
 
     def _depth(self, rays: Tensor, generator: torch.Generator) -> Tensor:
@@ -222,10 +224,7 @@ class DrivePoints(_View):
 
 
 def _hits(rays: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """Where rays, (..., 3), enter and leave an axis-aligned box, as multiples of the rays, (...).
-
-    A ray misses the box when the first number is not smaller than the second.
-    """
+    """The factors at which rays, (..., 3), enter and leave a box, (...). A ray misses the box if enter >= leave."""
     rays = torch.where(rays.abs() < _PARALLEL, _PARALLEL, rays)
     one, two = low / rays, high / rays
     return torch.minimum(one, two).amax(-1), torch.maximum(one, two).amin(-1)

@@ -1,7 +1,7 @@
 """Real scenes: the images of one scene with their poses, and random problems drawn from them.
 
-Convention: ``x_cam = R x_world + t``. Pixels and camera matrices are COLMAP's: the centre of the top-left pixel is
-(0.5, 0.5). A scene is in float64 on the CPU.
+Convention: ``x_cam = R x_world + t``. Pixels and camera matrices follow COLMAP: the centre of the top-left pixel is
+(0.5, 0.5). The tensors of a scene are in float64 on the CPU.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ class View:
     r"""One image of a scene: its observations and its pose.
 
     Attributes:
-        name: the image's name, with its sub-folders if it has any.
+        name: the image's name, including sub-folders.
         world_points: the observed points in the unit of the scene, shape :math:`(M, 3)`, float64.
-        img_points: pixels of the points, with lens distortion removed, shape :math:`(M, 2)`, float64.
+        img_points: undistorted pixels of the points, shape :math:`(M, 2)`, float64.
         intrinsics: pinhole camera matrix in pixels, shape :math:`(3, 3)`.
         rotation: world-to-camera rotation, shape :math:`(3, 3)`.
         translation: world-to-camera translation, shape :math:`(3,)`.
         width: image width in pixels.
         height: image height in pixels.
-        inliers: whether the pixel shows the point, bool, shape :math:`(M,)`.
+        inliers: whether a pair is an inlier, bool, shape :math:`(M,)`.
 
     Raises:
-        ValueError: if a shape is wrong, a value is not finite, or ``rotation`` is not a rotation.
+        ValueError: if a shape is wrong, a value is not finite, or ``rotation`` is not a rotation matrix.
     """
 
     name: str
@@ -75,8 +75,8 @@ class Scene:
     Attributes:
         name: the scene's name.
         views: the images that observe enough points, sorted by name.
-        skipped: names of the images left out because they observe too few points.
-        metric: whether the unit is the metre; otherwise it is arbitrary.
+        skipped: names of the images that were left out because they observe too few points.
+        metric: whether the unit of the scene is the metre and not arbitrary.
     """
 
     name: str
@@ -86,7 +86,7 @@ class Scene:
 
     @property
     def median_depth(self) -> float:
-        """Median depth of all observations in the unit of the scene."""
+        """Median depth of the observed points of all images in the unit of the scene."""
         return torch.cat([view.cam_points[:, 2] for view in self.views]).median().item()
 
 
@@ -94,23 +94,23 @@ class Scene:
 class SceneProblems(RandomProblems):
     r"""Random problems of a scene, endless and reproducible.
 
-    Each problem is a random image with ``n`` random points that it observes and their pixels. A *mismatch* gets the
-    pixel of a spare point of the same image, a *sensing* outlier a uniform pixel of the image. A pair is an inlier when
-    it is an inlier of the scene and did not become an outlier. ``outliers=OutlierMix(count=2)`` is the protocol's real
-    data with outliers. Points and poses do not depend on ``outliers``, so that different numbers of outliers are
-    compared on the same problems.
+    Each problem consists of ``n`` random points of a random image and their pixels. A *mismatch* gets the pixel of a
+    spare point of the same image, and a *sensing* outlier gets a uniform pixel of the image. All other pairs that are
+    inliers of the scene are inliers of the problem. ``outliers=OutlierMix(count=2)`` is the protocol's real data with
+    outliers. Points and poses do not depend on ``outliers``, so that different numbers of outliers can be compared on
+    the same problems.
 
-    As in the paper the world is centred on a coarse pose: a pose :math:`(R^*, t^*)` is drawn from the protocol's prior
-    and the world is moved so that this pose is the true one, :math:`x' = R^{*\top}(R x + t - t^*)`.
+    As in the paper, a pose :math:`(R^*, t^*)` is drawn from the protocol's prior, and the world is moved so that this
+    pose is the true pose: :math:`x' = R^{*\top}(R x + t - t^*)`.
 
     Args:
-        scene: the scene. Only its images with at least ``n + num_spares`` points are used.
+        scene: the scene. Images with fewer than ``n + num_spares`` points are not used.
         n: number of pairs per problem. For ``batch_size``, ``seed``, ``dtype`` and ``device`` see
             :class:`SyntheticProblems`.
-        outliers: number of outliers, and the share of mismatches among them; no outliers when ``None``. Raw matches
-            have mismatches of their own.
-        num_spares: number of spare points per problem, whose pixels the mismatches get in turn. With the protocol's one
-            spare point all mismatches of a problem share a pixel.
+        outliers: number of outliers and share of mismatches; no outliers are added when ``None``. Scenes of raw matches
+            already contain outliers.
+        num_spares: number of spare points per problem. Mismatches get the pixels of the spare points in turn. With the
+            protocol's one spare point, all mismatches of a problem share a pixel.
 
     Raises:
         BaseError: for an argument out of range, or ``outliers`` with *near* or *structured* outliers or crowds.
@@ -133,7 +133,7 @@ class SceneProblems(RandomProblems):
         if not views:
             wanted = f"n = {self.n} and num_spares = {self.num_spares}"
             raise ValueError(f"no image of '{self.scene.name}' has the {need} points for {wanted}")
-        # The pairs of all views, one view after the other, so that a batch is one gather.
+        # The pairs of all views are joined, so that one index operation gathers the pairs of a batch.
         pairs = zip(*((view.cam_points, view.img_points, view.inliers) for view in views), strict=True)
         self._pairs = [torch.cat(parts) for parts in pairs]
         self._intrinsics = torch.stack([view.intrinsics for view in views])
@@ -142,11 +142,11 @@ class SceneProblems(RandomProblems):
 
     @property
     def max_translation(self) -> float:
-        """Translation error below which a pose is a success: 0.2 in metres, else 0.5 % of the median depth."""
+        """Limit of the translation error of a success: 0.2 m, or 0.5 % of the median depth if the unit is arbitrary."""
         return 0.2 if self.scene.metric else 0.005 * self.scene.median_depth
 
     def _draw(self, generator: torch.Generator) -> Problems:
-        # Draws that depend on the outlier options come last.
+        # Draws that depend on `outliers` come last, so that points and poses do not depend on `outliers`.
         view = torch.randint(len(self.views), (self.batch_size,), generator=generator)
         rows = _choose(self._counts[view], self.n + self.num_spares, generator)
         rows += (self._counts.cumsum(0) - self._counts)[view, None]
@@ -158,7 +158,7 @@ class SceneProblems(RandomProblems):
         cam_points, img_points, inliers = self._pairs
         world_points = (cam_points[rows] - pose.translation[:, None]) @ pose.rotation  # (B, N, 3)
         mismatch = kind == OutlierKind.MISMATCH
-        turn = (mismatch.cumsum(1) - 1) % self.num_spares  # (B, N), used at mismatches only
+        turn = (mismatch.cumsum(1) - 1) % self.num_spares  # (B, N), only mismatches use `turn`
         pixels = img_points[torch.where(mismatch, spare_rows.gather(1, turn), rows)]
         pixels = torch.where((kind == OutlierKind.SENSING)[..., None], anywhere, pixels)
         inliers = inliers[rows] & (kind == OutlierKind.INLIER)
@@ -166,16 +166,13 @@ class SceneProblems(RandomProblems):
 
 
 def _choose(counts: Tensor, k: int, generator: torch.Generator) -> Tensor:
-    """For each count c of (B,), k different integers of 0 ... c - 1, every ordered choice equally likely, (B, k).
-
-    Floyd's algorithm for the whole batch. Its cost does not grow with the number of points in an image.
-    """
+    """Draw k different integers below each of ``counts``, (B,), in random order, (B, k), by Floyd's algorithm."""
     draws = unit((len(counts), k), generator)
     chosen = torch.empty((len(counts), k), dtype=torch.int64)
     for i in range(k):
-        last = counts - k + i  # the range grows by one each time, so that its last element was not chosen before
+        last = counts - k + i  # `last` grows in each iteration, so that `last` was not chosen before
         candidate = (draws[:, i] * (last + 1)).long().minimum(last)
         chosen_before = (chosen[:, :i] == candidate[:, None]).any(1)
         chosen[:, i] = torch.where(chosen_before, last, candidate)
-    # The set is uniform, its order is not: shuffle each row.
+    # Floyd's algorithm draws a uniform set in an order that is not uniform, so each row is shuffled.
     return chosen.gather(1, unit((len(counts), k), generator).argsort(1))

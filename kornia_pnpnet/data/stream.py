@@ -1,4 +1,4 @@
-"""Streams of batches: other processes draw the next batches while the caller works on the current batch."""
+"""Streams of batches: worker processes draw the next batches while the caller works on the current batch."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from kornia_pnpnet.result import Problems
 
 __all__ = ["ProblemSource", "stream_batches"]
 
-# Batches that each worker draws in advance: enough to keep drawing during a validation.
+# Batches that each worker draws in advance: enough work for the time of a validation.
 _AHEAD = 4
 
 
 class ProblemSource(Protocol):
-    """A source of problems: batch ``i`` always has the same numbers, and all batches have one shape."""
+    """A source of problems. Batch ``i`` always has the same numbers. Workers need batches of one shape."""
 
     batch_size: int
 
@@ -33,16 +33,18 @@ class ProblemSource(Protocol):
 def stream_batches(source: ProblemSource, start: int, stop: int, workers: int = 0) -> Generator[Problems, None, None]:
     """Yield the batches from ``start`` to ``stop``, excluding ``stop``.
 
-    The workers end when the iterator is exhausted, closed or deleted, at the latest with the process. SIGTERM and
-    Ctrl-C, which often reach a whole group of processes, do not end the workers: the caller decides what to do.
+    The workers end when the iterator is exhausted, closed or deleted, and at the latest when the process ends. Workers
+    ignore Ctrl-C and the first SIGTERM, because these signals often reach a whole group of processes and the caller
+    decides when to stop.
 
     Args:
-        source: the source of the problems. Where processes are spawned rather than forked, the source must be
-            picklable and the main module safe to import.
-        start: number of the first batch.
-        stop: number after the last batch.
-        workers: number of processes that draw ahead; 0 draws each batch when it is requested. The numbers drawn do not
-            depend on the number of workers. With workers the memory of a batch is reused for the next batch.
+        source: the source of the problems. On platforms that spawn processes instead of forking them, the source must
+            be picklable and the main module must be safe to import.
+        start: index of the first batch.
+        stop: index after the last batch.
+        workers: number of processes that draw ahead; 0 draws each batch when it is requested. The problems do not
+            depend on the number of workers. With workers, a batch is valid until the next batch is requested; then its
+            memory is reused.
     """
     if workers == 0 or start >= stop:
         yield from map(source.batch, range(start, stop))
@@ -56,26 +58,26 @@ def stream_batches(source: ProblemSource, start: int, stop: int, workers: int = 
         num_workers=workers,
         prefetch_factor=_AHEAD,
         worker_init_fn=_ignore_signals,
-        generator=torch.Generator(),  # not the global generator, whose state is the caller's
-        # In joblib's processes the default start method is joblib's own, which a loader cannot use.
+        generator=torch.Generator(),  # keeps the loader from drawing from the caller's global generator
+        # In processes of joblib, the default start method is joblib's own. A loader cannot use this method.
         multiprocessing_context=None if multiprocessing.get_start_method() in methods else methods[0],
     )
     indices: Any = iter(loader)
-    # A stream may be left open until the interpreter ends. The workers must end before multiprocessing's own exit waits
-    # for them: it sends one SIGTERM, which they ignore.
+    # A stream may be open until the interpreter exits. The workers must then end before the exit handler of
+    # multiprocessing runs: the handler sends one SIGTERM, which workers ignore, and waits for the workers.
     atexit.register(indices._shutdown_workers)
     try:
         yield from map(slots.read, indices)
     finally:
         atexit.unregister(indices._shutdown_workers)
-        indices._shutdown_workers()  # else they live as long as the traceback of an error that refers to them
+        indices._shutdown_workers()  # else a traceback that refers to `indices` keeps the workers alive
 
 
 class _SharedSlots(Dataset[int]):
     """Draws batch ``i`` into a slot of memory that all processes share, so that processes exchange only ``i``.
 
-    Tensors that are sent become new shared memory each time, which takes about as long as drawing them. There is one
-    slot more than batches drawn in advance, so that the caller's batch is not overwritten.
+    Sending the tensors instead would allocate shared memory for every batch, which takes about as long as drawing the
+    batch. There is one slot more than batches drawn in advance, so that the caller's batch is not overwritten.
     """
 
     def __init__(self, source: ProblemSource, example: Problems, slots: int) -> None:
@@ -87,7 +89,7 @@ class _SharedSlots(Dataset[int]):
         return index
 
     def read(self, index: int) -> Problems:
-        """The slot of batch ``index``."""
+        """Return batch ``index`` as views of its slot."""
         return self._memory.map(lambda x: x[index % self._slots])
 
 

@@ -1,4 +1,4 @@
-"""Synthetic problems: an endless, seeded source of batches, made of points, noise and outliers."""
+"""Synthetic problems: an endless, seeded source of batches of random points with noise and outliers."""
 
 from __future__ import annotations
 
@@ -20,31 +20,36 @@ from kornia_pnpnet.result import Problems
 
 __all__ = ["SyntheticProblems"]
 
-#: A number, or the two ends of a range from which each problem draws a number, log-uniform.
+#: A number, or a range (two numbers) from which each problem draws a number, log-uniform.
 Amount: TypeAlias = float | Sequence[float]
 
-# Bounds that keep noise finite in float32, and the digits of a covariance's shortest axis. An amount may also be 0.
+# Smallest and largest value of each amount; every amount may also be 0. The bounds keep noise finite in float32.
 _AMOUNTS = {
     "img_sigma": (0.0, math.inf),
     "world_sigma": (0.0, math.inf),
     "degrees": (1.0, math.inf),
     "sigma_spread": (0.0, 3.0),
 }
+# Largest axis ratio: the shortest axis of a covariance stays above the rounding error of float32.
 _MOST_RATIO = 100.0
-# Standard deviations. A choice: a pair whose pixel has more noise is called an outlier.
+# Largest pixel noise of an inlier with Student noise, in standard deviations. A choice.
 _MOST_NOISE = 10.0
-# Squared standard deviations. Keeps the quotient of the tails from 0 / 0; float64 resolves the quotient here.
+# Smallest squared length of noise, in squared standard deviations. The bound avoids 0 / 0 in Student noise; float64
+# resolves the quotient at the bound.
 _LEAST_SQ_LENGTH = 1e-12
-# Pixels. Noise of no size divides by this.
+# Pixels: replaces a standard deviation of 0 as a divisor.
 _TINY = 1e-9
-# A camera sees a point when the cosine between its direction and the optical axis is larger. A choice: 87 degrees.
+# Smallest cosine of the angle between the optical axis and a visible point's direction. A choice: 87 degrees.
 _LEAST_COSINE = 0.05
-# Half the side of the widest image at a focal length of 1, so that objects next to the camera fit into an image.
+# Half the side of the largest image without ``half_image``, at a focal length of 1: points beside the camera would
+# otherwise make the image huge.
 _WIDEST_TANGENT = math.tan(math.radians(60.0))
-# Mean distances between points in the image. A choice: bunches are sharp to hardly visible.
+# Largest random term of a point's score in `_bunched`, in mean distances of points from the first point. A choice: the
+# bunches of problems range from sharp to hardly visible.
 _MOST_BLUR = 2.0
-# Ranges of the quality of a confidence: standard deviations between inliers and outliers, influence of the noise, and
-# scale of the logits; standard deviation of the offset of the logits.
+# Choices for confidences. Ranges: distance between the mean scores of inliers and outliers in standard deviations,
+# decrease of an inlier's score with log(1 + noise), scale of the logits. Last, the standard deviation of the logits'
+# offset.
 _SEPARATION, _NOISINESS, _GAIN, _OFFSET = (0.0, 4.0), (0.0, 1.0), (0.3, 3.0), 1.5
 
 
@@ -52,41 +57,44 @@ _SEPARATION, _NOISINESS, _GAIN, _OFFSET = (0.0, 4.0), (0.0, 1.0), (0.3, 3.0), 1.
 class SyntheticProblems(RandomProblems):
     r"""Random problems of the protocol, endless and reproducible: batch ``i`` depends on ``seed`` and ``i`` alone.
 
-    Points are drawn in the camera's frame, and the inverse of a random pose moves them to the world. World coordinates
-    and pixels get Gaussian noise, and some pairs become outliers. The defaults are the protocol's ``paper``
-    distribution; ``gaussian_pose`` is ``translation_sigma=25`` and ``fixed_mismatches`` is
-    ``outliers=OutlierMix(count=k, mismatch_share=1.0)``. A range is two numbers from which each problem draws one,
-    log-uniform.
+    Points are drawn in the camera's frame, and the inverse of a random pose transforms them to the world frame. World
+    coordinates and pixels get noise, and some pairs become outliers. The defaults are the protocol's ``paper``
+    distribution without outliers. ``gaussian_pose`` is ``translation_sigma=25``, and ``fixed_mismatches`` is
+    ``outliers=OutlierMix(count=k, mismatch_share=1.0)``. A range is two numbers. Each problem draws a number from the
+    range, log-uniform.
 
     Args:
         n: number of pairs per problem.
         batch_size: number of problems per batch.
         seed: seed of the stream.
-        points: prior of the points in the camera's frame; the protocol's box when ``None``.
+        points: prior of the points in the camera's frame; ``BoxPoints()`` when ``None``.
         outliers: number and kinds of outliers; no outliers when ``None``.
-        translation_sigma: standard deviation of normally distributed translations. ``None``: translations are uniform
-            in a box of side 25.
+        translation_sigma: standard deviation of each coordinate of normally distributed translations. ``None``:
+            translations are uniform in a cube of side 25 about 0.
         max_angle: largest rotation angle in radians.
         focal: focal length in pixels; the principal point is 0.
-        half_image: pixels of *sensing* outliers are uniform in ``[-half_image, half_image]`` on both axes. ``None``:
-            in the smallest such square that holds the pixels of all points of the problem, up to a field of view of
-            120°.
-        img_sigma: standard deviation of the noise on each pixel coordinate, or a range.
+        half_image: pixels of *sensing* outliers are uniform in ``[-half_image, half_image]`` on both axes, in pixels.
+            ``None``: the square is the smallest one that contains the pixels of all points of the problem, with a field
+            of view of at most 120°.
+        img_sigma: standard deviation of the noise on each pixel coordinate in pixels, or a range.
         world_sigma: standard deviation of the noise on each world coordinate, or a range.
-        degrees: degrees of freedom of the pixel noise's Student distribution, at least 1, or a range. 0: Gaussian
-            noise. ``img_sigma`` is the standard deviation of the bulk; a pair with noise above 10 of it is an outlier.
-        sigma_spread: standard deviation, at most 3, or a range, of the logarithm of the sigmas of a problem's pairs
-            about the sigmas of the problem. Known sigmas then have the shape ``(batch_size, n)``.
-        axis_ratio: largest over smallest standard deviation of the noise of each pixel and of each point, at most 100;
-            the standard deviations are a geometric series along random axes that differ between pairs. Above 1,
-            ``img_sigma`` and ``world_sigma`` are the root mean square over the axes, and known noise is covariances, of
-            all problems or of none.
-        known_noise: share of the problems that come with both sigmas. A third of the other problems come with one of
-            them; unknown sigmas are NaN.
-        confidence_share: share of the problems that come with confidences; the other problems have NaN. The
-            separation of inliers from outliers and the scale of the logits differ between problems.
-        bunched_share: share of the problems whose inliers are bunched in a part of the image; the points and pixels of
-            outliers, except *near* and *structured* ones, come from the rest of the scene.
+        degrees: degrees of freedom of Student noise on the pixels, at least 1, or a range; 0 means Gaussian noise. With
+            Student noise, ``img_sigma`` is the scale of the distribution. A pair with pixel noise above
+            ``10 * img_sigma`` is then an outlier.
+        sigma_spread: standard deviation of the logarithm of the sigmas of pairs within a problem, at most 3, or a
+            range. Above 0, known sigmas have the shape ``(batch_size, n)``.
+        axis_ratio: ratio of the largest to the smallest standard deviation along the axes of the noise of a pixel or a
+            point, at most 100. The axes are random and differ between pairs; the standard deviations are a geometric
+            series. Above 1, ``img_sigma`` and ``world_sigma`` are the root mean square over the axes, and known noise
+            is given as covariances.
+        known_noise: share of the problems that come with both sigmas; 0 omits the sigmas of all problems. Above 0, a
+            third of the other problems come with one of the two sigmas, and unknown sigmas are NaN. With an
+            ``axis_ratio`` above 1, the share must be 0 or 1.
+        confidence_share: share of the problems that come with confidences, which are NaN in the other problems; 0 omits
+            the confidences of all problems. The separation of inliers from outliers and the scale of the logits differ
+            between problems.
+        bunched_share: share of the problems whose inliers are bunched in a part of the image, together with *near* and
+            *structured* outliers. The points of other outliers come from the rest of the scene.
         dtype: dtype of the batches; numbers are drawn in float64.
         device: device of the batches; numbers are drawn on the CPU.
 
@@ -136,7 +144,7 @@ class SyntheticProblems(RandomProblems):
     def _draw(self, generator: torch.Generator) -> Problems:
         size, n, mix = self.batch_size, self.n, self.outliers or OutlierMix(count=0)
         pose = random_poses(size, generator, translation_sigma=self.translation_sigma, max_angle=self.max_angle)
-        # Mismatches show other points of the same scene, so both are drawn at once.
+        # The scene has the N points of the pairs and N other points, which the pixels of mismatches show.
         scene = (self.points or BoxPoints())(size, 2 * n, generator)
         kind = mix.draw(size, n, generator)[..., None]  # (B, N, 1), as all masks below
         in_crowd = (kind == OutlierKind.CROWD) | (kind == OutlierKind.POINT_CROWD)
@@ -154,7 +162,7 @@ class SyntheticProblems(RandomProblems):
         if mix.structured_share:
             moved = structured_points(cam_points, mix, generator)
             shown = torch.where(kind == OutlierKind.STRUCTURED, moved, shown)
-        # A point that is not in front of the camera has no pixel: its pair is an outlier.
+        # A pair whose point the camera cannot see gets a uniform pixel and is an outlier.
         in_front = _is_in_front(shown)
         shown = torch.where(in_front, shown, 1.0)
         img_points = self.focal * shown[..., :2] / shown[..., 2:]
@@ -186,7 +194,7 @@ class SyntheticProblems(RandomProblems):
         return Problems(world_points, img_points, intrinsics.expand(size, 3, 3), pose, inliers, **known)
 
     def _anywhere(self, scene: Tensor, generator: torch.Generator) -> Tensor:
-        """Pixels that are uniform in the image, (B, N, 2)."""
+        """Draw uniform pixels of the image, (B, N, 2)."""
         shape = self.batch_size, self.n, 2
         if self.half_image is not None:
             return uniform(shape, -self.half_image, self.half_image, generator)
@@ -196,32 +204,29 @@ class SyntheticProblems(RandomProblems):
         return half * uniform(shape, -1.0, 1.0, generator)
 
     def _bunched(self, scene: Tensor, displaced: Tensor, generator: torch.Generator) -> Tensor:
-        """The points of each scene, (B, 2N, 3), sorted so that pairs that are not ``displaced``, (B, N), lie together.
-
-        Points are ranked by their angle from one of them plus random numbers, whose random size makes bunches more or
-        less sharp. In a share of the problems the first points of the ranking go to the pairs that are not displaced.
-        """
+        """Reorder points, (B, 2N, 3), so that pairs that are not ``displaced``, (B, N), form a bunch in the image."""
         shape, each = scene.shape[:2], (len(scene), 1)
         direction = normalize(scene, dim=-1)
+        # The score of a point is the distance of its direction from the direction of the first point, plus blur.
         distance = (direction - direction[:, :1]).square().sum(-1).sqrt()
         blur = uniform(each, 0.0, _MOST_BLUR, generator) * unit(shape, generator)
         score = distance / distance.mean(1, keepdim=True).clamp(min=torch.finfo(distance.dtype).tiny) + blur
         chosen = unit(each, generator) < self.bunched_share
         score = torch.where(chosen, score, unit(shape, generator))
         last = pad(displaced, (0, self.n), value=True)
-        # Pairs that are not displaced come first, in random order, so that the position of a pair in the batch says
-        # nothing about its place in the image.
+        # Pairs that are not displaced get the points of the lowest scores, in random order, so that the index of a pair
+        # is independent of its position in the image.
         rank = (last + unit(shape, generator)).argsort(1).argsort(1)
         return scene.take_along_dim(score.argsort(1).gather(1, rank)[..., None], 1)
 
     def _noise(
         self, shape: Sequence[int], sigma: Amount, degrees: Amount, generator: torch.Generator
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        r"""Noise (B, N, D), its standard deviations (B, 1) or (B, N), and with axes its covariances (B, N, D, D).
+        r"""Draw noise (B, N, D); also return its standard deviations, (B, 1) or (B, N), and its covariances.
 
-        With ``degrees`` the length :math:`r` of normal noise on a pair, in standard deviations, becomes
-        :math:`\sqrt{\nu(\exp(r^2/\nu) - 1)}`: noise of two coordinates then has the bivariate Student distribution
-        with :math:`\nu` degrees of freedom, and short noise hardly changes.
+        Covariances (B, N, D, D) are ``None`` when ``axis_ratio`` is 1. With :math:`\nu` degrees of freedom, the length
+        :math:`r` of normal noise, in standard deviations, is replaced by :math:`\sqrt{\nu(\exp(r^2/\nu) - 1)}`. Noise
+        of two coordinates then has the bivariate Student distribution.
         """
         noise = normal(shape, generator)
         sigmas = self._amounts(sigma, generator)
@@ -242,14 +247,14 @@ class SyntheticProblems(RandomProblems):
         return (factor @ noise[..., None])[..., 0], sigmas[..., 0], factor @ factor * sigmas[..., None].square()
 
     def _amounts(self, value: Amount, generator: torch.Generator) -> Tensor:
-        """A number for each problem, (B, 1, 1)."""
+        """Draw the amount of each problem, (B, 1, 1)."""
         each = self.batch_size, 1, 1
         if isinstance(value, Sequence):
             return log_uniform(each, value[0], value[1], generator)
         return torch.full(each, value, dtype=torch.float64)
 
     def _known_sigmas(self, img_sigma: Tensor, world_sigma: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
-        """The sigmas, NaN where a solver does not know them."""
+        """The sigmas that solvers get, NaN if unknown; see ``known_noise``."""
         chance, side = unit((2, self.batch_size, 1), generator)
         has_one = chance < self.known_noise + (1.0 - self.known_noise) / 3.0
         known = {}
@@ -259,10 +264,10 @@ class SyntheticProblems(RandomProblems):
         return known
 
     def _confidence(self, inliers: Tensor, errors: Tensor, generator: torch.Generator) -> Tensor:
-        """The confidence of a matcher or a keypoint network in each pair, in (0, 1), NaN where there is none, (B, N).
+        """Draw confidences of a matcher, in (0, 1), NaN in problems without confidences, (B, N).
 
-        Noisy inliers have lower confidences: ``errors``, (B, N), are the lengths of the noise of the pixels in
-        standard deviations.
+        Inliers with more pixel noise have lower confidences. ``errors`` is the length of the pixel noise in standard
+        deviations, (B, N).
         """
         each = self.batch_size, 1
         separation, noisiness = (uniform(each, *bounds, generator) for bounds in (_SEPARATION, _NOISINESS))

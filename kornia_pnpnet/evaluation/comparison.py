@@ -1,4 +1,4 @@
-"""Comparing solvers: every solver solves the same problems, and one results file holds the errors and times."""
+"""Comparison of solvers: all solvers solve the same problems, and a results file holds their errors and times."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from kornia_pnpnet.solver import PnPNet
 __all__ = ["EvaluationData", "SeesTruth", "draw_problems", "evaluate"]
 
 _QUARTILES = {"q25": 0.25, "median": 0.5, "q75": 0.75}
-# Entries of the environment that may differ between the rows of a file. Versions may not.
+# Entries of the environment that may differ between the rows of a results file. Versions of packages must be equal.
 _MACHINE = ("python", "platform", "cpu", "threads", "gpu", "commit")
 
 
@@ -34,11 +34,11 @@ class EvaluationData(NamedTuple):
     """A set of problems and the limits of a success.
 
     Attributes:
-        problems: a batch of any size.
-        max_rotation_deg: the rotation error of a success is below this limit, in degrees.
-        max_translation: the translation error of a success is below this limit, in the unit of the world.
-        unit: the unit of the world, for axis labels.
-        description: the origin of the problems, as plain data for the results file.
+        problems: all problems of the set in one batch.
+        max_rotation_deg: limit of the rotation error of a success, in degrees.
+        max_translation: limit of the translation error of a success, in the unit of the world.
+        unit: name of the unit of the world, for tables and axis labels.
+        description: source of the problems as plain data for the results file.
     """
 
     problems: Problems
@@ -61,11 +61,11 @@ def draw_problems(source: ProblemSource, count: int) -> Problems:
     """Take the first problems of a source.
 
     Args:
-        source: has ``batch(index)``, for example :class:`~kornia_pnpnet.data.SyntheticProblems`.
-        count: number of problems, at least 1, else ``ValueError``.
+        source: a source of problems, for example :class:`~kornia_pnpnet.data.SyntheticProblems`.
+        count: number of problems; ``ValueError`` for a number below 1.
 
     Returns:
-        The source's batches 0, 1, ... one after the other, cut to ``count`` problems.
+        The first ``count`` problems of the concatenated batches 0, 1, ...
 
     Example:
         >>> from kornia_pnpnet.data import SyntheticProblems
@@ -91,34 +91,41 @@ def evaluate(
 ) -> dict[str, Any]:
     """Solve the same problems with every solver.
 
-    A pose that is not finite counts as the identity with ``ok=False``. Summaries are computed from the errors of the
-    problems as they are stored, rounded to six digits.
+    A pose that is not finite is replaced by the identity, and its ``ok`` by false. Errors are rounded to six
+    significant digits, and summaries are computed from the rounded errors.
 
-    With a ``path``, the file is written after every row, and a call with the same arguments, or with more solvers and
-    data sets, continues it. A file with rows of other code, versions, weights, configurations or problems is refused.
+    With a ``path``, the results file is written after every row. A call with the same arguments, or with further
+    solvers and data sets, continues the file. A file with rows of other code, versions, weights, configurations or
+    problems is refused.
 
     Args:
-        solvers: by name, each called as ``solver(world_points, img_points, intrinsics)`` in evaluation mode, without
-            gradients. A bound (see :class:`SeesTruth`) gets the problems with their truth, a
-            :class:`~kornia_pnpnet.solver.PnPNet` also what is :attr:`~kornia_pnpnet.result.Problems.known`.
-        data: problems by name. Each set is solved on its own device and in its own dtype.
-        path: the results file to write and to continue; none when ``None``.
-        overwrite: start anew and replace the file at ``path``.
-        chunk: problems per call, which bounds the memory.
-        repeats: number of timed calls, at least. One untimed call on the first chunk comes before.
-        progress: show a progress bar; when ``None``, only if standard error is a terminal.
+        solvers: solvers by name. Each is called as ``solver(world_points, img_points, intrinsics)`` in evaluation mode
+            without gradients. A :class:`~kornia_pnpnet.solver.PnPNet` also gets
+            :attr:`~kornia_pnpnet.result.Problems.known`. For bounds see :class:`SeesTruth`.
+        data: sets of problems by name. Each set is solved on its own device and in its own dtype.
+        path: the results file; ``None`` writes no file.
+        overwrite: replace the file at ``path`` instead of continuing it.
+        chunk: number of problems per call of a solver. A smaller number takes less memory.
+        repeats: smallest number of timed calls. One call on the first chunk precedes them and is not timed.
+        progress: show a progress bar; ``None`` shows it if standard error is a terminal.
 
     Returns:
-        Plain data: ``format``, ``environment`` (see :func:`~kornia_pnpnet.core.environment.environment`), ``code`` (a
-        digest of the package), ``solvers`` (class, configuration, digest of the weights), ``data`` (description,
-        limits, digest of the problems) and ``rows``, one for each set and solver: ``success`` (rate, low, high, total),
-        quartiles of ``rotation_error_deg`` and ``translation_error``, the share ``ok``, ``us_per_problem`` (median over
-        the timed calls), the errors and ok ``per_problem``, and the differences from ``environment`` when another
-        machine continued the file. A solver that refuses the shape of a set (a network for another n) has an entry in
-        ``left_out`` instead: ``data``, ``solver`` and ``reason``.
+        Plain data with the keys
+
+        - ``format`` (version of the format), ``code`` (digest of the package) and ``environment`` (see
+          :func:`~kornia_pnpnet.core.environment.environment`),
+        - ``solvers``: class, configuration and digest of the weights of each solver,
+        - ``data``: description, limits and digest of each set,
+        - ``rows``: one row for each set and solver,
+        - ``left_out``: ``data``, ``solver`` and ``reason`` in place of a row, when a solver refuses the shape of a set
+          (a network for another n).
+
+        A row has ``success`` (rate, low, high, total), quartiles of ``rotation_error_deg`` and ``translation_error``,
+        the share ``ok``, ``us_per_problem`` (median of the timed calls), and errors and ok ``per_problem``. A row that
+        was measured on another machine also has ``environment``: the entries that differ from those of the file.
 
     Raises:
-        ValueError: when ``path`` is not a results file, or one that this evaluation cannot continue.
+        ValueError: when ``path`` is not a results file, or this evaluation cannot continue it.
         OSError: when ``path`` cannot be written.
 
     Example:
@@ -145,7 +152,7 @@ def evaluate(
     results["left_out"] = []
     elsewhere = {key: here[key] for key in _MACHINE if results["environment"].get(key) != here[key]}
     if path is not None:
-        save_results(results, path)  # fails before the work when the file cannot be written
+        save_results(results, path)  # a path that cannot be written fails here, before the work
 
     plan = list(product(data, solvers))
     done = {(row["data"], row["solver"]): row for row in results["rows"]}
@@ -180,7 +187,7 @@ def _describe_solver(solver: nn.Module) -> dict[str, Any]:
 
 def _describe_data(entry: EvaluationData) -> dict[str, Any]:
     problems = entry.problems
-    # In float32, because the last bits of float64 problems differ between machines.
+    # The digest is of float32 numbers, because the last bits of float64 numbers differ between machines.
     rounded = problems.map(lambda part: part.float() if part.is_floating_point() else part)
     return {
         "description": dict(entry.description),
@@ -197,7 +204,7 @@ def _describe_data(entry: EvaluationData) -> dict[str, Any]:
 
 
 def _measure(solver: nn.Module, entry: EvaluationData, chunk: int, repeats: int) -> dict[str, Any]:
-    """The entries of a row that depend on the solver's poses and times."""
+    """Solve a set and return the entries of its row, except the names of the set and the solver."""
     was_training = solver.training
     solver.eval()
     try:
@@ -222,7 +229,7 @@ def _solve_all(solver: nn.Module, problems: Problems, chunk: int, repeats: int) 
     chunks = [take(problems, slice(i, i + chunk)) for i in range(0, len(problems.world_points), chunk)]
     _solve(solver, chunks[0])
     calls = [_solve(solver, chunks[i % len(chunks)]) for i in range(max(repeats, len(chunks)))]
-    # A short last chunk is not timed: it would pay the fixed cost of a call for few problems.
+    # A smaller last chunk is not timed, because the fixed cost of a call raises its time per problem.
     full = len(chunks[0].world_points)
     seconds = statistics.median(elapsed / full for result, elapsed in calls if len(result.ok) == full)
     found = [(result.pose, result.ok) for result, _ in calls[: len(chunks)]]
@@ -233,7 +240,7 @@ def _solve_all(solver: nn.Module, problems: Problems, chunk: int, repeats: int) 
 
 
 def _solve(solver: nn.Module, problems: Problems) -> tuple[PnPResult, float]:
-    """The result and the time in seconds."""
+    """Return the result and the time in seconds."""
     on_gpu = problems.world_points.is_cuda
     if on_gpu:
         torch.cuda.synchronize()
@@ -249,7 +256,7 @@ def _solve(solver: nn.Module, problems: Problems) -> tuple[PnPResult, float]:
 
 
 def _rounded(value: Any) -> Any:
-    """Round to six significant digits, also in nested data, which keeps a results file of 10 000 problems small."""
+    """Round the floats of nested data to six significant digits, so that results files stay small."""
     if isinstance(value, dict):
         return {key: _rounded(entry) for key, entry in value.items()}
     if isinstance(value, list):

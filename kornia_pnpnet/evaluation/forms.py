@@ -1,4 +1,4 @@
-"""The form of results files, as far as their readers rely on it. Needs pydantic."""
+"""The schema of results files, limited to the entries that readers use. The module needs pydantic."""
 
 # ruff: noqa: UP013  (one line for each small mapping)
 from __future__ import annotations
@@ -47,7 +47,7 @@ class _Results(TypedDict):
 
 
 def _consistent(results: Any) -> Any:
-    """Refuse names in rows that have no entry, and lists of different lengths."""
+    """Refuse rows whose set or solver has no entry, and lists of one row with different lengths."""
     for i, row in enumerate(results["rows"]):
         if len({len(values) for values in row.get("per_problem", {}).values()}) > 1:
             raise ValueError(f"rows[{i}].per_problem has lists of different lengths")

@@ -19,23 +19,24 @@ from kornia_pnpnet.solver import PnPNet
 
 __all__ = ["BOUNDS", "default_solvers", "load_solver", "missing_package"]
 
-#: Bounds by name. They need the true pose and inliers, so they can be evaluated but cannot solve new problems.
+#: Bounds by name. A bound needs the true poses and inliers, so it cannot solve new problems.
 BOUNDS: dict[str, type[nn.Module]] = {"known-inliers": KnownInliers, "known-inliers-and-noise": KnownInliersAndNoise}
 
-# Every competitor of the protocol, in the order of its figures.
+# Competitors of the protocol, in the order of the protocol's figures.
 _COMPETITORS = (
     *("pnpnet-set", "pnpnet-n{n}", "net-n{n}", "identity-lm", "epnp", "epnp-lm", "reppnp", "reppnp-lm"),
     *("ransac-epnp-lm", "p3p-ransac", "opencv-sqpnp", "opencv-epnp", "opencv-ransac", "opencv-usac"),
     *("kornia-rs", "poselib", "pycolmap"),
 )
-# Options of RANSAC for real scenes and for the protocol's synthetic data. Each threshold, in px and m, is the best of a
-# grid on problems of another seed. Five scenes, with 0, 2 and 4 outliers in 9 pairs: 3 to 60 px; success hardly changes
-# from 6 to 20 px. Synthetic data: 3 px and 0.15 m to 8 px and 0.4 m; success changes by one percentage point.
+# Options of RANSAC for real scenes: the best threshold of a grid from 3 to 60 px, on problems of another seed from five
+# scenes with 0, 2 and 4 outliers in 9 pairs. Success hardly changes from 6 to 20 px.
 _SCENE_OPTIONS = dict.fromkeys(
     ("ransac-epnp-lm", "p3p-ransac", "opencv-ransac", "opencv-usac", "poselib", "pycolmap"), "threshold=12"
 )
+# Options of RANSAC for synthetic data: the best thresholds of a grid from 3 px and 0.15 m to 8 px and 0.4 m, on
+# problems of another seed. Success changes by one percentage point over the grid.
 _PRIOR_OPTIONS = dict.fromkeys(("ransac-epnp-lm", "p3p-ransac"), "threshold=5,world_threshold=0.25")
-# Optional packages, by the prefix of the solvers that need them: the module and the package's name.
+# Module and name of each optional package, by the prefix of the solvers that need the package.
 _PACKAGES = {
     "opencv-": ("cv2", "OpenCV"),
     "kornia-rs": ("kornia_rs", "kornia-rs"),
@@ -65,7 +66,7 @@ def load_solver(spec: str) -> nn.Module:
     for option in filter(None, text.split(",")):
         key, _, word = option.partition("=")
         options[key] = word
-        with suppress(ValueError):  # any other word is a text
+        with suppress(ValueError):  # a word that is not JSON stays a string
             options[key] = json.loads(word)
     if name not in BOUNDS:
         return create_solver(name, **options)
@@ -76,12 +77,13 @@ def load_solver(spec: str) -> nn.Module:
 
 
 def default_solvers(n: int | Iterable[int], sources: Iterable[str] = ("synthetic",)) -> list[str]:
-    """List the protocol's competitors and bounds for problems of ``n`` pairs, as far as they are installed.
+    """List the installed competitors and the bounds of the protocol for problems of ``n`` pairs.
 
     Args:
-        n: pairs per problem, one number or several.
-        sources: sources of the problems, see :func:`~kornia_pnpnet.evaluation.problem_sets.evaluation_sets`. RANSAC
-            gets thresholds that suit them. When all sources are scenes, the bound that needs the noise is left out.
+        n: number of pairs per problem, or several such numbers.
+        sources: sources of the problems, see :func:`~kornia_pnpnet.evaluation.problem_sets.evaluation_sets`. If any
+            source is synthetic, RANSAC gets thresholds for synthetic data. Otherwise RANSAC gets thresholds for scenes,
+            and the bound that needs the noise is left out.
 
     Returns:
         Names with options for :func:`load_solver`.
@@ -96,6 +98,6 @@ def default_solvers(n: int | Iterable[int], sources: Iterable[str] = ("synthetic
 
 
 def missing_package(solver: str) -> str | None:
-    """Return the name of the package that a solver needs and that is not installed, or ``None``."""
+    """Return the name of the missing package that a solver needs, or ``None`` if no package is missing."""
     needed = (package for prefix, package in _PACKAGES.items() if solver.startswith(prefix))
     return next((name for module, name in needed if importlib.util.find_spec(module) is None), None)

@@ -1,7 +1,7 @@
 """Pictures of a pose, an evaluation and a training.
 
-Each function writes the picture ``path``, whose ending gives the format, and returns the path. matplotlib's settings
-change only while a picture is drawn.
+Each ``plot_`` function writes a picture to ``path`` in the format of the file's suffix, and returns the path. The
+settings of matplotlib change only while a picture is drawn.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ __all__ = ["plot_errors", "plot_pose", "plot_success", "plot_training"]
 #: Colours that colour-blind readers can tell apart: the palette ``colorblind`` of seaborn.
 COLOURS = ("#0173b2", "#de8f05", "#029e73", "#d55e00", "#cc78bc", "#ca9161", "#fbafe4", "#949494", "#ece133", "#56b4e9")
 BLUE, ORANGE, GREEN, VERMILION, PINK, BROWN, _, GREY, _, SKY = COLOURS
-WIDTH = 7.2  #: inches; the width of a page with two columns, so that letters are printed at their size
-#: Settings of matplotlib while a picture is drawn. Names of solvers are not read as formulas.
+WIDTH = 7.2  #: inches; text width of a page with two columns, so that font sizes are those of the printed page
+#: Settings of matplotlib while a picture is drawn. ``text.parse_math`` is off: names of solvers are not formulas.
 THEME: Any = {
     **dict.fromkeys(("font.size", "axes.titlesize", "axes.labelsize", "figure.titlesize"), 9.0),
     **dict.fromkeys(("xtick.labelsize", "ytick.labelsize", "legend.fontsize"), 8.4),
@@ -45,7 +45,7 @@ themed = rc_context(THEME)  #: Decorator of functions that draw.
 
 
 def make_figure(width: float, height: float, *heading: str) -> Figure:
-    """Make a figure with lines of a title, white so that it is readable on a dark page too. Sizes are in inches."""
+    """Make a figure of a size in inches, with the lines of a title. The background is white, also for dark pages."""
     figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
     if heading:
         figure.suptitle("\n".join(heading), x=0.01, ha="left")
@@ -53,7 +53,7 @@ def make_figure(width: float, height: float, *heading: str) -> Figure:
 
 
 def save(figure: Figure, path: str | Path) -> Path:
-    """Write the figure and make missing folders."""
+    """Write the figure; missing folders are made."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=200)
     return Path(path)
@@ -61,9 +61,14 @@ def save(figure: Figure, path: str | Path) -> Path:
 
 @themed
 def plot_pose(path: str | Path, img_points: Tensor, reprojections: Tensor, rejected: Tensor, title: str) -> Path:
-    """Draw each pixel of an image (N, 2), joined to the projection (N, 2) of its point; ``rejected`` is bool, (N,).
+    """Draw the pixels of an image, each joined to the reprojection of its point.
 
-    Pixels that are not finite are left out; projections that are not finite belong to points behind the camera.
+    Args:
+        path: the file to write.
+        img_points: pixels, shape (N, 2). Pixels that are not finite are left out; ``ValueError`` if no pixel is finite.
+        reprojections: shape (N, 2), in pixels, not finite for points behind the camera.
+        rejected: whether a pair is rejected, bool, shape (N,).
+        title: first part of the title.
     """
     there = img_points.isfinite().all(-1)
     if not there.any():
@@ -89,7 +94,7 @@ def plot_pose(path: str | Path, img_points: Tensor, reprojections: Tensor, rejec
 
 @themed
 def plot_success(path: str | Path, results: Mapping[str, Any]) -> Path:
-    """Draw the success of a results file with 95 % intervals: a panel for each data set, a row for each solver."""
+    """Draw success rates with 95 % intervals: one panel for each data set and one line for each solver."""
     panels, colours = _panels(results)
     names, lines = list(colours), math.ceil(len(panels) / 3)
     figure = make_figure(WIDTH, 0.5 + (0.7 + 0.17 * len(names)) * lines, "Success with 95 % intervals")
@@ -97,7 +102,7 @@ def plot_success(path: str | Path, results: Mapping[str, Any]) -> Path:
     for axes, (title, rows) in zip(grid, panels.items(), strict=False):
         for row in rows:
             name, (rate, low, high) = row["solver"], (100 * row["success"][key] for key in ("rate", "low", "high"))
-            reach = [[max(rate - low, 0.0)], [max(high - rate, 0.0)]]  # rounding can put the rate outside
+            reach = [[max(rate - low, 0.0)], [max(high - rate, 0.0)]]  # rounding can put the rate outside the interval
             axes.errorbar([rate], [names.index(name)], xerr=reach, fmt="o", color=colours[name], label=name)
         axes.set(title=title, xlabel="solved (%)", xlim=(-3, 103), ylim=(len(names) - 0.4, -0.6))
         axes.set_yticks(range(len(names)), names)
@@ -108,7 +113,7 @@ def plot_success(path: str | Path, results: Mapping[str, Any]) -> Path:
 
 @themed
 def plot_errors(path: str | Path, results: Mapping[str, Any]) -> Path:
-    """Draw the share of problems with an error of at most x, of a results file with the errors of all problems."""
+    """Draw the share of problems with an error of at most x; ``ValueError`` for results without per-problem errors."""
     panels, colours = _panels(results)
     heading = "Problems with an error of at most x; the vertical line is the limit of a success"
     figure = make_figure(WIDTH, 1.2 + 2.2 * len(panels) + 0.05 * len(colours), heading)
@@ -129,7 +134,7 @@ def plot_errors(path: str | Path, results: Mapping[str, Any]) -> Path:
 
 
 def _panels(results: Mapping[str, Any]) -> tuple[dict[str, list[Mapping[str, Any]]], dict[str, str]]:
-    """The rows by data set, and a colour for each solver; ``ValueError`` when there are no rows."""
+    """The rows of each data set, and the colour of each solver; ``ValueError`` when there are no rows."""
     panels: dict[str, list[Mapping[str, Any]]] = {}
     for row in results["rows"]:
         panels.setdefault(row["data"], []).append(row)
@@ -140,7 +145,7 @@ def _panels(results: Mapping[str, Any]) -> tuple[dict[str, list[Mapping[str, Any
 
 @themed
 def plot_training(path: str | Path, history_csv: str | Path) -> Path:
-    """Draw loss, distances and success (columns ``val/<set>/success``) of a training against ``update``."""
+    """Draw the learning curves of a training: loss, pose distances and validation success at each update."""
     distances = [[f"{stage}_{part}" for stage in ("init", "refined")] for part in ("rotation", "translation")]
     rows = list(read_csv(history_csv, ["update", "total", *distances[0], *distances[1]]).values())
     if not rows:
@@ -170,7 +175,7 @@ def plot_training(path: str | Path, history_csv: str | Path) -> Path:
 
 
 def log_scale(axes: Axes, name: str, formatter: Formatter | str = "{x:g}") -> None:
-    """Make the axis x or y logarithmic, with a number at every power of 10, and at more places of a short axis."""
+    """Make the axis ``"x"`` or ``"y"`` logarithmic, with labels at powers of 10; short axes have more labels."""
     axes.set(**{f"{name}scale": "log"})
     axis, (low, high) = getattr(axes, f"{name}axis"), getattr(axes, f"get_{name}lim")()
     axis.set_major_locator(LogLocator(subs=(1, 2, 3, 5) if high < 100 * low else (1,)))

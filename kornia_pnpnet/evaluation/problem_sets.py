@@ -1,4 +1,4 @@
-"""Sets of problems by the names that a user types: sources (synthetic data and scenes) and numbers of outliers."""
+"""Sets of problems from the arguments that a user types: sources (synthetic data, scenes) and numbers of outliers."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from kornia_pnpnet.evaluation.comparison import EvaluationData, draw_problems
 
 __all__ = ["DEFAULT_SEED", "PRIORS", "evaluation_sets"]
 
-#: Seed of the problems that solvers are compared on. Nothing is trained or tuned on this seed.
+#: Seed of the problems on which solvers are compared. Nothing is trained or tuned on this seed.
 DEFAULT_SEED = 12345
 
 _slab = partial(SyntheticProblems, points=SlabPoints())
-#: Synthetic data by the name of a source: the name in results files (the names of conf/data), and the constructor.
+#: Synthetic sources by name: their name in results files (a name of ``conf/data``), and their constructor.
 PRIORS: dict[str, tuple[str, Callable[..., SyntheticProblems | MixedProblems]]] = {
     "synthetic": ("paper", SyntheticProblems),
     "gaussian_pose": ("gaussian_pose", partial(SyntheticProblems, translation_sigma=25.0)),
@@ -29,12 +29,12 @@ PRIORS: dict[str, tuple[str, Callable[..., SyntheticProblems | MixedProblems]]] 
     "mixed": ("mixed", partial(MixedProblems, [SyntheticProblems, _slab])),
 }
 
-# Problems per drawn batch. The constant makes 100 problems the first 100 of 1000.
+# Problems per drawn batch. Because of this fixed size, a set of 100 problems is the start of a set of 1000 problems.
 _DRAW_BATCH = 1000
 
 
 def _read_outliers(text: str, n: int, mismatches_only: bool) -> Iterator[tuple[str, OutlierMix, str | int]]:
-    """Read ``--outliers``: labels, mixes and their numbers in results (``none``, ``uniform`` or an integer)."""
+    """Parse ``--outliers``; yield label, mix, and the number for results (``none``, ``uniform`` or an integer)."""
     one, many, share = ("mismatch", "mismatches", 1.0) if mismatches_only else ("outlier", "outliers", 0.5)
     for word in map(str.strip, text.split(",")):
         if word == "uniform":
@@ -72,19 +72,19 @@ def evaluation_sets(
     Args:
         sources: names of :data:`PRIORS`, folders with COLMAP models, or ``.npz`` files of raw matches.
         outliers: ``none``, ``uniform``, numbers or shares like ``50%``, separated by commas.
-        n: pairs per problem, one number or several.
-        count: problems per set.
+        n: number of pairs per problem, or several such numbers.
+        count: number of problems per set.
         seed: seed of the problems.
         metric: whether the scenes are in metres.
-        mismatches_only: an outlier is the pixel of another point, a different one for each outlier, and never a random
-            pixel.
-        known_noise: pass the noise level of synthetic problems to the solvers. The problems are the same.
-        dtype: dtype of the problems. They are drawn in float64 and then converted.
+        mismatches_only: make every outlier a mismatch; no two mismatches of a problem share a pixel. When false, about
+            half of the outliers are mismatches, and the others have random pixels.
+        known_noise: add the standard deviations of the noise to synthetic problems. Points and pixels do not change.
+        dtype: dtype of the problems, which are drawn in float64 and then converted.
 
     Returns:
-        One set for each source, n and mix of outliers, by name. Each description has the keys ``source`` (the prior or
-        the scene's name), ``outliers`` (``"none"``, ``"uniform"`` or their number), ``mismatch_share``, ``seed`` and,
-        for scenes, ``path``.
+        A set for each source, n and mix of outliers, by name. The description of a set has the keys ``source`` (name of
+        the prior or the scene), ``outliers`` (``"none"``, ``"uniform"`` or an integer), ``mismatch_share``, ``seed``
+        and, for a scene, ``path``.
 
     Raises:
         BaseError: when a source or a mix cannot be used.
@@ -102,8 +102,8 @@ def evaluation_sets(
             scene = None if source in PRIORS else load_scene(source, metric=metric)
             name = source if scene is None else scene.name
             if any(key.startswith(f"{name}, ") for key in sets):
-                name = source  # another scene of the same name
-            # Raw matches already contain outliers; those of the mix come on top.
+                name = source  # an earlier scene has the same name
+            # Raw matches already contain outliers, and the mix adds further outliers.
             added = "+" if scene is not None and source.endswith(".npz") else ""
             suffix = ", noise told" if known_noise and scene is None else ""
             for size, label, mix, number in mixes:
@@ -114,8 +114,8 @@ def evaluation_sets(
                     problems = draw_problems(make(**options, **noise, batch_size=_DRAW_BATCH), count)
                     entry = EvaluationData(problems, description={"source": prior, **description})
                 else:
-                    # A mismatch takes the pixel of a spare point. With one spare, all mismatches would agree on one
-                    # pose.
+                    # A mismatch gets the pixel of a spare point. With one spare point, all mismatches would share a
+                    # pixel.
                     spares = max(1, mix.max_count(size)) if mismatches_only else 1
                     views = SceneProblems(scene, num_spares=spares, **options, batch_size=_DRAW_BATCH)
                     description = {"source": scene.name, "path": source, **description}

@@ -1,4 +1,4 @@
-"""Results files: reading, writing and continuing them, and the table of an evaluation."""
+"""Results files of evaluations: reading, writing, continuation and formatting as a table."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ _SHOWN_DIFFERENCES = 3
 
 
 def row_errors(row: Mapping[str, Any]) -> tuple[PoseErrors, Tensor]:
-    """Read the errors (float64) and ok (bool) of the problems of one of ``results["rows"]``, each :math:`(B,)`.
+    """Read the errors (float64) and ok (bool) of all problems from a row of ``results["rows"]``, each :math:`(B,)`.
 
     Raises:
-        ValueError: when the row has no per-problem errors, like the rows of the files in the repository.
+        ValueError: when the row has no per-problem errors. The results files in the repository have no such errors.
     """
     if "per_problem" not in row:
         raise ValueError(f"The row of '{row['solver']}' on '{row['data']}' has no per-problem errors.")
@@ -43,10 +43,10 @@ def row_errors(row: Mapping[str, Any]) -> tuple[PoseErrors, Tensor]:
 
 
 def save_results(results: Mapping[str, Any], path: str | Path) -> None:
-    """Write results as one JSON file, in one piece: a reader finds the old file or the new one.
+    """Write results atomically as a JSON file: a reader finds the old file or the new file.
 
     Raises:
-        ValueError: when a number is not finite, which JSON cannot express.
+        ValueError: when a number is not finite, because JSON has no such numbers.
         OSError: when the file cannot be written.
     """
     with atomic_open(path, encoding="utf-8") as file:
@@ -54,11 +54,12 @@ def save_results(results: Mapping[str, Any], path: str | Path) -> None:
 
 
 def load_results(path: str | Path) -> dict[str, Any]:
-    """Read a file of :func:`save_results`.
+    """Read a file that :func:`save_results` wrote.
 
     Raises:
-        FileNotFoundError: when there is no such file.
-        ValueError: when the file is not a results file of this format; the message names the first wrong entry.
+        FileNotFoundError: when the file does not exist.
+        ImportError: when pydantic is not installed.
+        ValueError: when the file is not a results file of this format. The message names the first invalid entry.
     """
     try:
         from kornia_pnpnet.core.schema import read_json
@@ -70,13 +71,13 @@ def load_results(path: str | Path) -> dict[str, Any]:
 
 
 def source_digest() -> str:
-    """Compute a digest of the package's Python files: rows with the same digest come from the same code."""
+    """Compute a digest of the package's Python files, which identifies the code that produced a row."""
     root = Path(__file__).resolve().parents[1]
     return digest({path.relative_to(root).as_posix(): digest(path.read_bytes()) for path in root.rglob("*.py")})
 
 
 def differences(before: Any, now: Any, place: str = "") -> list[str]:
-    """Name the entries in which nested plain data differ, for example ``refine.m was 3 and is 4``."""
+    """List the entries that differ between nested plain data, for example ``refine.m was 3 and is 4``."""
     if isinstance(before, dict | None) and isinstance(now, dict | None):
         before, now = before or {}, now or {}
         pairs = [(key, before.get(key), now.get(key)) for key in {**before, **now}]
@@ -88,11 +89,11 @@ def differences(before: Any, now: Any, place: str = "") -> list[str]:
 
 
 def resume(plan: Mapping[str, Any], path: str | Path) -> dict[str, Any]:
-    """Join the plan of an evaluation, its results without rows, with the rows of the results file at ``path``, if any.
+    """Add the rows of the results file at ``path``, if the file exists, to a plan (results without rows).
 
     Raises:
-        ValueError: when code or versions have changed, or a solver or data set of the file is missing in the plan or
-            has changed. The message names the first differences.
+        ValueError: when code or versions have changed, or a solver or data set of the file has changed or is missing in
+            the plan. The message names the first differences.
     """
     fresh: dict[str, Any] = json.loads(json.dumps(plan))  # tuples become lists, as in a file
     there = load_results(path) if Path(path).exists() else fresh
@@ -113,13 +114,13 @@ def resume(plan: Mapping[str, Any], path: str | Path) -> dict[str, Any]:
 
 
 def format_table(results: Mapping[str, Any]) -> str:
-    """Format results as a Markdown table that is aligned as plain text, too.
+    """Format results as a Markdown table with aligned columns.
 
-    There is one line for each set and solver: success with its 95 % interval, median errors, time and share of ok.
+    Each set and solver has one line: success with its 95 % interval, median errors, time and share of ok.
     """
     lines = []
     for row in results["rows"]:
-        # The alternate form keeps zeros at the end: 0.160.
+        # The flag # keeps trailing zeros, as in 0.160.
         rotation, translation = (f"{row[name]['median']:#.3g}".rstrip(".") for name in PoseErrors._fields)
         unit = results["data"][row["data"]]["unit"]
         success = str(SuccessRate(**{key: row["success"][key] for key in SuccessRate._fields}))

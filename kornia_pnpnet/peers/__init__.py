@@ -1,6 +1,6 @@
-"""Solvers of other libraries behind the signature of our solvers, to compare both on the same problems.
+"""Peers: solvers of other libraries with the call signature of PnPNet, for comparisons on the same problems.
 
-A library is imported when one of its solvers is made.
+A library is imported when one of its solvers is constructed.
 """
 
 from kornia_pnpnet.peers.base import PeerPose, PeerSolver

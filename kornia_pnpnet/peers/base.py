@@ -1,4 +1,4 @@
-"""The base of every peer: the loop over problems, the checks before each problem, and the conversion of its results."""
+"""The base classes of peers: checks of the input, the loop over problems, and the conversion of the results."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ __all__ = ["PeerPose", "PeerSolver", "RobustPeer"]
 
 
 class PeerPose(NamedTuple):
-    r"""The solution of one problem, in float64.
+    r"""A peer's solution of one problem, in float64.
 
     Attributes:
         rotation: world-to-camera rotation, shape :math:`(3, 3)`.
         translation: world-to-camera translation, shape :math:`(3,)`.
-        inliers: the pairs that the peer kept, bool, shape :math:`(N,)`.
-        init: rotation and translation before the last refinement; ``None``: the peer does not report them, and the
-            result repeats the final pose.
+        inliers: whether the library reports a pair as an inlier, bool, shape :math:`(N,)`.
+        init: rotation and translation before the last refinement. ``None`` if the library does not report this pose;
+            the ``init`` of the result is then the final pose.
     """
 
     rotation: np.ndarray
@@ -44,18 +44,18 @@ class PeerPose(NamedTuple):
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class PeerSolver(nn.Module):
-    r"""A solver of another library, which takes one problem at a time, as a batched layer without gradients.
+    r"""A batched layer without gradients around a solver of another library, which solves one problem at a time.
 
-    A subclass implements :meth:`solve_one` and is a dataclass, whose fields are the arguments of its constructor.
-    The peer gets the pairs that are present and have a weight above 0; the size of the weight has no effect. A problem
-    without a pose has ``ok=False``, and its pose is the identity. The peer does not get problems that are not finite,
-    have a negative weight or fewer than three pairs, or a camera with a skew or without a positive focal length.
+    A subclass implements :meth:`solve_one` and is a dataclass. Its fields are the arguments of its constructor. The
+    library gets the pairs that are present and have a weight above 0; the size of the weight has no effect. A problem
+    without a pose has ``ok=False``, and its pose is the identity. The library does not get problems with values that
+    are not finite, a negative weight, fewer than three pairs, a camera with skew, or a focal length that is not
+    positive.
 
     Convention: ``x_cam = R x_world + t``, +z forward, pixels ``u = fx x/z + cx``.
 
     Args:
-        threshold: largest reprojection error of an inlier, in pixels of the input. Infinite for a peer that keeps all
-            pairs.
+        threshold: largest reprojection error of an inlier in pixels; infinite if every pair is an inlier.
 
     Raises:
         ImportError: when the library is not installed.
@@ -63,7 +63,7 @@ class PeerSolver(nn.Module):
     """
 
     threshold: float
-    #: The module that the peer imports, and the name of its library.
+    #: Name of the module to import, and name of the library for error messages.
     source: ClassVar[tuple[str, str] | None] = None
 
     def __post_init__(self) -> None:
@@ -73,7 +73,7 @@ class PeerSolver(nn.Module):
             self.library()
 
     def library(self) -> ModuleType:
-        """Import the library, or raise an ImportError that names the extra which installs it."""
+        """Import the library; the ``ImportError`` of a missing library names the extra to install."""
         assert self.source is not None
         module, name = self.source
         try:
@@ -90,7 +90,7 @@ class PeerSolver(nn.Module):
         return ", ".join(f"{key}={value!r}" for key, value in self.config().items())
 
     def solve_one(self, world_points: np.ndarray, img_points: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:
-        r"""Solve one problem.
+        r"""Solve one problem with the library.
 
         Args:
             world_points: shape :math:`(N, 3)`, float64, finite.
@@ -98,7 +98,7 @@ class PeerSolver(nn.Module):
             intrinsics: shape :math:`(3, 3)`.
 
         Returns:
-            The pose, or ``None`` when the peer finds none.
+            The solution, or ``None`` when the library finds no pose.
         """
         raise NotImplementedError
 
@@ -113,12 +113,14 @@ class PeerSolver(nn.Module):
     ) -> PnPResult:
         r"""Solve a batch of problems, one after the other, on the CPU in float64.
 
-        Args and errors are those of :meth:`~kornia_pnpnet.solver.PnPNet.forward`, for pixels only.
+        For arguments and errors see :meth:`~kornia_pnpnet.solver.PnPNet.forward`. Bearings and rigs raise
+        ``ShapeError``.
 
         Returns:
-            The :class:`~kornia_pnpnet.result.PnPResult` on the device of the input, without gradients; float64 when any
-            input is, else float32. Its weights are 1 for the inliers that the peer reports, else 0; its cost is the
-            mean over the pairs of the squared reprojection error in px², truncated at the squared threshold.
+            The :class:`~kornia_pnpnet.result.PnPResult` on the device of the input, without gradients. Its dtype is
+            float64 when an input is float64, else float32. Weights are 1 for the inliers that the library reports, else
+            0. The cost is the mean squared reprojection error in px² of the pairs that the library gets; each squared
+            error is truncated at the squared threshold.
         """
         size, inputs = checked_inputs(world_points, img_points, intrinsics, weights, mask)
         if inputs.rig is not None:
@@ -133,13 +135,13 @@ class PeerSolver(nn.Module):
         shares = present.double() if inputs.weights is None else inputs.weights.detach().cpu().double()
         used = present & (shares > 0)
         cameras, pinhole = pinholes(cameras)
-        pinhole &= (cameras[:, (0, 1, 2, 2), (1, 0, 0, 1)] == 0).all(-1)  # no peer takes a skew
+        pinhole &= (cameras[:, (0, 1, 2, 2), (1, 0, 0, 1)] == 0).all(-1)  # no peer supports skew
         sound = world.isfinite().all(-1) & img.isfinite().all(-1) & shares.isfinite() & (shares >= 0) | ~present
         status = torch.where(used.sum(-1) >= MIN_PAIRS, Status.NOT_BELIEVED, Status.TOO_FEW_PAIRS)
         status = torch.where(pinhole, status, Status.CAMERA)
         status = torch.where(sound.all(-1), status, Status.NOT_FINITE)
 
-        poses = torch.eye(3, 4, dtype=torch.float64).repeat(2, len(world), 1, 1)  # final, before the last refinement
+        poses = torch.eye(3, 4, dtype=torch.float64).repeat(2, len(world), 1, 1)  # final and initial poses
         inliers, ok = torch.zeros_like(shares), torch.zeros(len(world), dtype=torch.bool)
         for i in (status == Status.NOT_BELIEVED).nonzero()[:, 0].tolist():
             found = self.solve_one(world[i, used[i]].numpy(), img[i, used[i]].numpy(), cameras[i].numpy())
@@ -173,7 +175,7 @@ class PeerSolver(nn.Module):
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class RobustPeer(PeerSolver):
-    """A peer that draws samples.
+    """A peer that draws random samples. For its arguments see ``OpenCVRansac``.
 
     Raises:
         BaseError: for a ``threshold``, ``confidence``, ``seed`` or number of iterations out of range.
@@ -194,7 +196,7 @@ class RobustPeer(PeerSolver):
 
 
 def _squared_errors(poses: Tensor, world: Tensor, img: Tensor, cameras: Tensor) -> Tensor:
-    """The squared reprojection errors in px², infinite behind the camera, (B, N)."""
+    """The squared reprojection errors in px², infinite for points behind the camera, (B, N)."""
     cam_points = world @ poses[..., :3].mT + poses[:, None, :, 3]
     in_front = cam_points[..., 2:] > 0
     pixels = convert_points_from_homogeneous(torch.where(in_front, cam_points, 1.0) @ cameras.mT, eps=0.0)

@@ -17,7 +17,7 @@ __all__ = ["KorniaRs", "OpenCVPnP", "OpenCVRansac", "OpenCVUsac", "PoseLib", "Py
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class _OpenCV(PeerSolver):
-    """A solver of OpenCV, whose name there is ``kind`` and ``method``."""
+    """A solver of OpenCV, whose constant has the name ``kind`` followed by ``method``."""
 
     method: str
     kind: ClassVar[str] = "SOLVEPNP_"
@@ -28,9 +28,9 @@ class _OpenCV(PeerSolver):
         self.flag()
 
     def flag(self) -> int:
-        """OpenCV's constant of the method."""
+        """Return OpenCV's constant for the method."""
         cv2, name = self.library(), self.kind + f"{self.method}".removeprefix(self.kind)
-        # The list of USAC's variants has one for fundamental matrices.
+        # The constant USAC_FM_8PTS is for fundamental matrices.
         usable = hasattr(cv2, name) and name != "USAC_FM_8PTS"
         KORNIA_CHECK(usable, f"OpenCV {cv2.__version__} has no method {self.method} for poses.")
         flag: int = getattr(cv2, name)
@@ -41,7 +41,7 @@ class _OpenCV(PeerSolver):
 class OpenCVPnP(_OpenCV):
     r"""OpenCV's ``solvePnP`` on all pairs, problem by problem. The solver is not robust to outliers.
 
-    Every pair is reported as an inlier; the cost is not truncated.
+    Every pair is reported as an inlier, and the cost is not truncated.
 
     Args:
         method: OpenCV's name of the solver, for example ``"EPNP"`` for ``SOLVEPNP_EPNP``.
@@ -55,7 +55,7 @@ class OpenCVPnP(_OpenCV):
         cv2 = self.library()
         try:
             found, turn, shift = cv2.solvePnP(world_points, img_points, intrinsics, None, flags=self.flag())
-        except cv2.error:  # an assertion of OpenCV's, on degenerate or too few pairs
+        except cv2.error:  # OpenCV raises on degenerate pairs and on too few pairs
             return None
         if not found:
             return None
@@ -66,19 +66,20 @@ class OpenCVPnP(_OpenCV):
 class OpenCVRansac(_OpenCV, RobustPeer):
     r"""OpenCV's ``solvePnPRansac``, then ``solvePnPRefineLM`` on its inliers, problem by problem.
 
-    The defaults are the best of a grid on the protocol's data (3000 problems of another seed without and with outliers,
-    focal length 3400 px, thresholds from 30 to 120 px), where the noise of a close world point alone moves its pixel by
-    17 px. Sharper world points need a lower threshold. With noise in the world points, ``method="SQPNP", refine=False``
-    solves more problems, because SQPnP minimises an error in space and not in the image, but it takes several times as
-    long.
+    The defaults are the best of a grid on the protocol's data: 3000 problems of another seed without and with outliers,
+    a focal length of 3400 px, and thresholds from 30 to 120 px. In these data the noise of a close world point alone
+    moves its pixel by 17 px. World points with less noise need a lower threshold. With noisy world points,
+    ``method="SQPNP", refine=False`` solves more problems than the defaults, because SQPnP minimises an error in space
+    and not in the image. This choice takes several times as long as the defaults.
 
     Args:
-        threshold: largest reprojection error of an inlier, in pixels of the input.
+        threshold: largest reprojection error of an inlier in pixels.
         iterations: largest number of RANSAC iterations.
-        confidence: RANSAC stops when it has drawn an outlier-free sample with this probability, in (0, 1).
+        confidence: RANSAC stops when the probability of having drawn a sample without outliers reaches this number in
+            (0, 1).
         method: OpenCV's name of the solver of minimal samples, for example ``"AP3P"`` for ``SOLVEPNP_AP3P``.
-        refine: minimise the squared reprojection error of the inliers, started from RANSAC's pose. The result keeps
-            that pose as ``init``.
+        refine: minimise the squared reprojection error of the inliers, started from the pose of RANSAC. The ``init`` of
+            the result is the pose of RANSAC.
         seed: seed of OpenCV's global random numbers, set before each problem.
 
     Example:
@@ -112,7 +113,7 @@ class OpenCVRansac(_OpenCV, RobustPeer):
             if self.refine and len(kept) > 3:
                 turn, shift = cv2.solvePnPRefineLM(world_points[kept], img_points[kept], intrinsics, None, turn, shift)
             rotation = cv2.Rodrigues(turn)[0]
-        except cv2.error:  # an assertion of OpenCV's, on degenerate or too few pairs
+        except cv2.error:  # OpenCV raises on degenerate pairs and on too few pairs
             return None
         return PeerPose(rotation, shift.ravel(), np.isin(np.arange(len(world_points)), kept), first)
 
@@ -121,13 +122,13 @@ class OpenCVRansac(_OpenCV, RobustPeer):
 class OpenCVUsac(OpenCVRansac):
     r"""OpenCV's ``solvePnPRansac`` in one of its USAC variants, problem by problem.
 
-    USAC has its own sampling, local optimisation and final refinement; nothing is refined afterwards. The other
-    arguments are those of :class:`OpenCVRansac`.
+    USAC has its own sampling, local optimisation and final refinement, so the pose is not refined again. For the other
+    arguments see :class:`OpenCVRansac`.
 
     Args:
         method: OpenCV's name of the variant, for example ``"USAC_ACCURATE"`` or ``"USAC_MAGSAC"``. ``USAC_PROSAC``
             expects the pairs sorted from the best to the worst.
-        seed: used by the local optimisation. The samples come from a generator that OpenCV starts anew for every
+        seed: seed of the local optimisation only. OpenCV draws the samples with a generator that it restarts for every
             problem.
     """
 
@@ -137,7 +138,7 @@ class OpenCVUsac(OpenCVRansac):
 
 
 def _pinhole(intrinsics: np.ndarray) -> list[float]:
-    """Focal lengths and principal point in the order of COLMAP's camera model ``PINHOLE``."""
+    """Focal lengths and principal point in the order of the camera model ``PINHOLE`` of COLMAP and PoseLib."""
     return [intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]]
 
 
@@ -145,13 +146,13 @@ def _pinhole(intrinsics: np.ndarray) -> list[float]:
 class KorniaRs(RobustPeer):
     r"""``solve_pnp_ransac`` of kornia-rs, problem by problem: P3P, RANSAC, then least squares of the inliers.
 
-    The library computes in float32. Its local optimisation, which is off by default, solves no more of the protocol's
-    problems and is not offered. The default threshold is tuned as that of :class:`OpenCVRansac`, where threshold,
-    confidence and seed are described.
+    kornia-rs computes in float32. The class has no option for the local optimisation of kornia-rs, because it does not
+    increase the number of solved problems on the protocol's data. For ``threshold``, its tuning, ``confidence`` and
+    ``seed`` see :class:`OpenCVRansac`.
 
     Args:
         max_iterations: largest number of RANSAC iterations.
-        method: the library's name of the solver of minimal samples, ``"AP3P"`` or ``"EPnP"``.
+        method: kornia-rs's name of the solver of minimal samples, ``"AP3P"`` or ``"EPnP"``.
     """
 
     threshold: float = 40.0
@@ -179,13 +180,14 @@ class KorniaRs(RobustPeer):
 class PoseLib(RobustPeer):
     r"""PoseLib's ``estimate_absolute_pose``, problem by problem: P3P, LO-RANSAC and a robust refinement of the inliers.
 
-    The default threshold is tuned as that of :class:`OpenCVRansac`, where threshold, confidence and seed are described.
-    PoseLib's own minimum of 1000 iterations, ten times the default here, solves no more problems of nine pairs.
+    For ``threshold``, its tuning, ``confidence`` and ``seed`` see :class:`OpenCVRansac`. PoseLib's own default for
+    ``min_iterations`` is 1000; on problems of nine pairs it solves no more problems than the default of 100 here.
 
     Args:
-        min_iterations: smallest number of iterations.
-        max_iterations: largest number of iterations. A problem without a pose takes all of them.
-        progressive_sampling: PROSAC: samples of the first pairs come first, so put the best pairs first.
+        min_iterations: smallest number of RANSAC iterations.
+        max_iterations: largest number of RANSAC iterations. A problem without a pose takes this number of iterations.
+        progressive_sampling: whether to use PROSAC, which samples from the first pairs first. The pairs must then be
+            sorted from the best to the worst.
     """
 
     threshold: float = 40.0
@@ -218,12 +220,12 @@ class PoseLib(RobustPeer):
 class PyColmap(RobustPeer):
     r"""COLMAP's absolute pose estimation, problem by problem: LO-RANSAC, then robust least squares of the inliers.
 
-    The default threshold and loss scale are tuned as the threshold of :class:`OpenCVRansac`, where threshold,
-    confidence and seed are described. COLMAP's own loss scale of 1 px suits sharp points; with the noise of the
-    protocol it solves several per cent fewer problems.
+    For ``threshold``, ``confidence`` and ``seed`` see :class:`OpenCVRansac`; ``threshold`` and ``loss_scale`` are tuned
+    on the grid described there. COLMAP's own default for ``loss_scale`` is 1 px, which suits world points with little
+    noise. With the noise of the protocol, 1 px solves several per cent fewer problems than the default here.
 
     Args:
-        loss_scale: scale of the Cauchy loss of the refinement, in pixels of the input.
+        loss_scale: scale of the Cauchy loss of the refinement in pixels.
         min_iterations: smallest number of RANSAC iterations.
         max_iterations: largest number of RANSAC iterations.
     """

@@ -1,4 +1,4 @@
-"""The model card of trained weights: a short template filled with the results of their run."""
+"""The model card of trained weights: a short template, filled with the results of the run that trained the weights."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from kornia_pnpnet.training.results import RunResults
 __all__ = ["write_model_card"]
 
 _TAGS = ["camera-pose-estimation", "kornia", "perspective-n-point", "pnp"]
-# Overrides that change how a run is carried out and not what the run finds.
+# Overrides that change how a run is carried out but not its results.
 _HOW_IT_RAN = ("resume", "progress", "threads", "data_workers", "compile")
-# Absolute paths, not the slashes of a URL or of a relative path.
+# Matches absolute paths, but not the slashes of a URL or of a relative path.
 _PATH = re.compile(r"(?:file://|(?<![\w./\\])(?:~|[A-Za-z]:)?)(?:/(?!/)|\\)[^\s,;'\"\]})]*")
 _CARD = """---
 {metadata}
@@ -51,7 +51,7 @@ def write_model_card(folder: str | Path, results: RunResults, *, name: str | Non
     Args:
         folder: folder of the weights.
         results: results of the run that trained the weights.
-        name: name of the weights; that of the run when ``None``.
+        name: name of the weights; the name of the run when ``None``.
 
     Raises:
         OSError: when the file cannot be written.
@@ -74,12 +74,12 @@ def write_model_card(folder: str | Path, results: RunResults, *, name: str | Non
 
 
 def _describe(results: RunResults) -> str:
-    """A run in one sentence; its command without folders of the machine that ran the command."""
+    """Describe a run in one line. In the command of the run, ``PATH`` replaces absolute paths."""
     words = ["python train.py"]
     for override in results.overrides:
         key, _, value = override.partition("=")
         if key == "weights" and results.origin is not None and _PATH.fullmatch(value):
-            words.append(f"weights=outputs/{results.origin.name}/weights")  # where `train.py` writes them
+            words.append(f"weights=outputs/{results.origin.name}/weights")  # where `train.py` writes weights
         elif key not in _HOW_IT_RAN:
             words.append(_PATH.sub("PATH", override))
     start = f", from the weights of {results.origin.name}" if results.origin else ""

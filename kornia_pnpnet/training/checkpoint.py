@@ -1,4 +1,4 @@
-"""Parts of a run that can be stopped, continued and watched: signals, checkpoints, learning curves, times."""
+"""Means to stop, continue and watch a run: signals, checkpoints, learning curves and times of stages."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ CHECKPOINT_NAME, HISTORY_NAME = "last.ckpt", "history.csv"
 
 
 class TrainingError(RuntimeError):
-    """The training cannot go on or cannot be continued. The message names the reason and a remedy."""
+    """A training cannot go on, or a stopped training cannot be continued. The message names the reason."""
 
 
 @contextmanager
 def stop_on_signal() -> Iterator[threading.Event]:
-    """Turn the first SIGTERM or Ctrl-C into an event, so that the loop can save before it ends.
+    """Turn the first SIGTERM or Ctrl-C into an event, so that the loop can save a checkpoint before it ends.
 
-    Only the main thread can catch signals. In another thread the event is never set.
+    Only the main thread can catch signals. In other threads the event is never set.
     """
     event = threading.Event()
     before: dict[int, Any] = {}
@@ -75,7 +75,7 @@ class StageClock:
 
 
 def write_csv(path: Path, columns: Iterable[str], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Write a CSV file in one piece. Missing values become empty cells."""
+    """Write a CSV file atomically. Missing values become empty cells."""
     with atomic_open(path, newline="") as file:
         writer = csv.DictWriter(file, list(columns), restval="", extrasaction="ignore")
         writer.writeheader()
@@ -83,7 +83,7 @@ def write_csv(path: Path, columns: Iterable[str], rows: Iterable[Mapping[str, An
 
 
 class History:
-    """Learning curves in a CSV file and TensorBoard. Rows of an earlier run are kept up to the update ``start``."""
+    """Learning curves in a CSV file and TensorBoard. Rows of an earlier call are kept up to the update ``start``."""
 
     def __init__(self, folder: Path, columns: list[str], start: int) -> None:
         self._path = folder / HISTORY_NAME
@@ -108,7 +108,11 @@ class History:
 
 
 def load_checkpoint(path: Path, identity: dict[str, Any]) -> dict[str, Any]:
-    """Read a checkpoint; ``TrainingError`` when the file is damaged or of a run with another identity."""
+    """Read a checkpoint.
+
+    Raises:
+        TrainingError: when the file is damaged, or when ``identity`` differs from the identity that the file holds.
+    """
     try:
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
         found = differences(state["identity"], identity)

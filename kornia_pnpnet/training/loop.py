@@ -1,7 +1,7 @@
-"""The training loop, on one process or several; Lightning Fabric handles devices and processes.
+"""The training loop on one process or several. Lightning Fabric handles devices and processes.
 
-The loop ramps the loss in and skips steps that are not finite. A run that is stopped and continued gives the same
-numbers as a run without a stop.
+The loop ramps in the refined terms of the loss, and skips steps whose loss or gradient is not finite. A run that is
+stopped and continued gives the same numbers as a run without a stop.
 """
 
 from __future__ import annotations
@@ -52,14 +52,14 @@ __all__ = ["TrainSettings", "fit", "train_briefly"]
 
 _log = logging.getLogger(__name__)
 
-# Stages of an update. The rest is learning curves, validations and checkpoints.
+# Stages of an update. "rest" consists of learning curves, validations and checkpoints.
 _STAGES = ("data", "forward", "backward", "optimizer", "rest")
-# Columns of the learning curves: those of every row, and those of a validation, which begin with ``val/<set>/``, with
-# the field of ValidationResult that each column shows.
+# Columns that every row of the learning curves has.
 _COLUMNS = (
     *("update", *LossTerms._fields, "ramp", "lr", "grad_norm", "skipped", "updates_per_second"),
     *(*(f"{stage}_share" for stage in _STAGES), "peak_memory_mib"),
 )
+# Columns of a validation without their prefix ``val/<set>/``, and the field of ValidationResult that each column shows.
 _CURVES = {
     "success": "success.rate",
     "rotation_error_deg": "median_rotation_error_deg",
@@ -71,23 +71,23 @@ _CURVES = {
 
 @dataclass(frozen=True)
 class TrainSettings:
-    """Numbers of a training run.
+    """Numerical settings of a training run.
 
     Attributes:
         updates: number of updates of the whole run.
         lr: Adam's learning rate for the network.
         lr_refine: Adam's learning rate for the hyperparameters of the refinement.
         warmup: number of updates over which the learning rates rise linearly.
-        final_lr: factor of the learning rates at the end of the cosine decay; 1 keeps the rates constant.
-        clip: largest norm of the gradient; infinity does not clip.
-        ramp: shares of the run at which the refined terms of the loss begin to count, and count in full.
-        max_skipped: largest number of skipped steps; one more ends the run.
-        log_every: updates between rows of the learning curves.
-        validate_every: updates between validations.
-        checkpoint_every: updates between checkpoints.
+        final_lr: factor of the learning rates at the end of the cosine decay; 1 means no decay.
+        clip: norm to which longer gradients are scaled; infinity means no clipping.
+        ramp: two shares of the run, between which the weight of the refined loss terms rises linearly from 0 to 1.
+        max_skipped: largest number of skipped steps. A larger number ends the run with an error.
+        log_every: number of updates between rows of the learning curves.
+        validate_every: number of updates between validations.
+        checkpoint_every: number of updates between checkpoints.
 
     Raises:
-        BaseError: for a number that is out of range, or a ramp that falls.
+        BaseError: for a number out of range, or a ramp whose second share is smaller.
     """
 
     updates: int
@@ -139,30 +139,32 @@ def fit(
 ) -> FitReport:
     r"""Train a solver.
 
-    Writes ``last.ckpt``, ``history.csv`` and ``tensorboard/`` into ``folder``. SIGTERM and Ctrl-C save a checkpoint and
-    return. A step whose loss or gradient is not finite is skipped and counted.
+    The call writes ``last.ckpt``, ``history.csv`` and ``tensorboard/`` into ``folder``. After SIGTERM or Ctrl-C a
+    checkpoint is saved and the call returns. A step whose loss or gradient is not finite is skipped and counted.
 
     Args:
         model: the solver, trained in place.
-        data: source of the problems; batch ``i`` is used for update ``i``.
-        validation: fixed problems by the name of their set.
-        loss: compares results with true poses.
-        settings: numbers of the run.
+        data: source of the problems. Batch ``i`` is the batch of update ``i + 1``.
+        validation: problems of the validation sets, by the name of the set.
+        loss: loss of results against true poses.
+        settings: numerical settings of the run.
         folder: folder of the run.
-        fabric: the launched engine; one process on the CPU when ``None``.
-        identity: plain data that must be equal when the run is continued, for example the configuration of the data.
-        data_workers: processes that draw the next batches, for each process that trains, see
+        fabric: a launched Fabric; one process on the CPU when ``None``.
+        identity: plain data that describe the run, for example the configuration of the data. A run can only be
+            continued with equal data.
+        data_workers: number of processes that draw batches for each training process, see
             :func:`~kornia_pnpnet.data.stream.stream_batches`.
-        resume: continue from the checkpoint in ``folder`` if there is one.
+        resume: continue from the checkpoint in ``folder`` if it exists.
         progress: show a progress bar.
 
     Returns:
         The report of this call.
 
     Raises:
-        TrainingError: when ``folder`` holds a checkpoint and ``resume`` is false, when the checkpoint is damaged or of
-            other settings or options of the solver, or when more than ``settings.max_skipped`` steps were not finite.
-        BaseError: when the batch cannot be divided equally among the processes.
+        TrainingError: when ``folder`` holds a checkpoint and ``resume`` is false; when the checkpoint is damaged or has
+            other settings, options of the solver or ``identity``; or when more than ``settings.max_skipped`` steps were
+            skipped.
+        BaseError: when the batch size is not a multiple of the number of processes.
     """
     fabric = fabric or Fabric(accelerator="cpu", devices=1)
     KORNIA_CHECK(
@@ -171,7 +173,7 @@ def fit(
     )
     checkpoint = Path(folder) / CHECKPOINT_NAME
     described = {"settings": asdict(settings), "model": model.config(), **(identity or {})}
-    described = json.loads(json.dumps(described))  # tuples become lists, as in a checkpoint
+    described = json.loads(json.dumps(described))  # JSON turns tuples into lists, as in a checkpoint
     start, skipped, state = 0, 0, None
     if checkpoint.exists():
         if not resume:
@@ -194,7 +196,7 @@ def fit(
     validation = {name: problems.map(lambda x: x.to(fabric.device)) for name, problems in validation.items()}
     columns = [*_COLUMNS, *(f"val/{name}/{column}" for name in validation for column in _CURVES)]
     history = History(Path(folder), columns, start) if fabric.is_global_zero else None
-    part = slice(fabric.global_rank, None, fabric.world_size)  # all processes together have the batch of one process
+    part = slice(fabric.global_rank, None, fabric.world_size)  # the processes share one batch
     hidden = not (progress and fabric.is_global_zero)
     bar = tqdm(total=settings.updates, initial=start, disable=hidden, unit="update")
     batches = stream_batches(data, start, settings.updates, data_workers)
@@ -208,14 +210,15 @@ def fit(
             for group in optimizer.param_groups:
                 group["lr"] = group["initial_lr"] * factor
             terms = _compare(solver, loss, problems, ramp)
-            # The zero keeps the refiner in the graph before the ramp: processes expect gradients of every parameter.
+            # Before the ramp, a zero term keeps the refiner in the graph, because several processes need a gradient of
+            # every parameter.
             unused = sum(p.sum() for p in model.refine.parameters() if p.requires_grad) if ramp == 0.0 else 0.0
             clock.lap("forward")
             optimizer.zero_grad()
             fabric.backward(terms.total + 0.0 * unused)
             clock.lap("backward")
             norm = nn.utils.clip_grad_norm_(model.parameters(), settings.clip)
-            # All processes must take the same branch, whichever process saw the bad number or the signal.
+            # All processes must take the same branch, even if only one process has a bad number or got the signal.
             bad, stopped = _any_process(fabric, ~torch.isfinite(terms.total + norm), stop.is_set())
             if bad:
                 skipped += 1
@@ -239,7 +242,7 @@ def fit(
                 if history is not None:
                     report = _report(fabric, clock, *logged, update, skipped)
                     row = {"update": update, **dict(zip(LossTerms._fields, values.tolist(), strict=True))}
-                    if ramp == 0.0:  # nothing was refined yet
+                    if ramp == 0.0:  # results are not refined before the ramp
                         row = {name: value for name, value in row.items() if not name.startswith("refined")}
                     row |= {"ramp": ramp, "lr": settings.lr * factor, "grad_norm": norm.item(), "skipped": skipped}
                     row |= {name: getattr(report, name) for name in ("updates_per_second", "peak_memory_mib")}
@@ -273,7 +276,7 @@ def fit(
 
 
 def _compare(solver: Any, loss: PoseLoss | SetLoss, problems: Problems, ramp: float) -> LossTerms:
-    """Solve the problems and compare the results with the true poses."""
+    """Solve the problems and compute the loss of the results."""
     inputs = problems.world_points, problems.img_points, problems.intrinsics
     options = {**problems.known, "first_stage_only": ramp == 0.0}
     if isinstance(loss, SetLoss):
@@ -297,13 +300,13 @@ def _report(
     skipped: int,
     interrupted: bool = False,
 ) -> FitReport:
-    """Sum up the work since the update ``start``, at which the clock had the seconds ``before``."""
+    """Report the work since the update ``start``; ``before`` are the clock's seconds at that update."""
     clock.lap("rest")
     spent = {stage: seconds - before[stage] for stage, seconds in clock.seconds.items()}
     whole = max(sum(spent.values()), 1e-9)
     if fabric.device.type == "cuda":
         memory = torch.cuda.max_memory_allocated(fabric.device) / 2**20
-    else:  # bytes on macOS, KiB elsewhere
+    else:  # ru_maxrss is in bytes on macOS and in KiB elsewhere
         memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2 ** (20 if sys.platform == "darwin" else 10)
     return FitReport(
         start=start,
@@ -321,8 +324,8 @@ def train_briefly(seconds: float, folder: str | Path, *, progress: bool = True) 
     """Train a new PnP-Net for n = 9 for a short time, to show that training works on this machine.
 
     Args:
-        seconds: approximate duration. The speed of the machine is measured first.
-        folder: folder of the run. A run in this folder is replaced.
+        seconds: approximate duration. The number of updates follows from a short measurement of the machine's speed.
+        folder: folder of the run. An earlier run in this folder is replaced.
         progress: show a progress bar.
 
     Returns:
@@ -350,7 +353,7 @@ def train_briefly(seconds: float, folder: str | Path, *, progress: bool = True) 
         problems = data.batch(0)
         loss(model(*problems[:3], first_stage_only=ramp == 0.0), problems, ramp).total.backward()
 
-    alone = TrainSettings(0).ramp[0]  # share of the run that trains the network without the refinement
+    alone = TrainSettings(0).ramp[0]  # share of the run before the refinement starts
     fast, slow = (timeit.timeit(partial(try_update, ramp), number=10) / 10 for ramp in (0.0, 1.0))
     updates = max(100, round(seconds / (alone * fast + (1.0 - alone) * slow)) // 100 * 100)
     rows = updates // 20

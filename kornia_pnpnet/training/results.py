@@ -1,4 +1,4 @@
-"""What a training run finds: its report, its validation, its results file, and the summary of a sweep."""
+"""Results of training runs: report, validation, results file, and the summary of a sweep of runs."""
 
 # ruff: noqa: UP013  (one line for each small mapping)
 from __future__ import annotations
@@ -36,7 +36,8 @@ __all__ = [
 ]
 
 RESULTS_NAME = "results.json"
-# Problems of a timed call, and timed calls. The shortest call counts, since other work on the machine only adds time.
+# Problems per timed call, and number of timed calls. The result is the shortest time, because other work on the machine
+# only adds time.
 _TIMED_PROBLEMS, _TIMED_CALLS = 1000, 20
 
 
@@ -45,14 +46,14 @@ class FitReport:
     """Report of one call of :func:`~kornia_pnpnet.training.fit`.
 
     Attributes:
-        start: updates done by earlier calls.
-        update: updates done in all.
-        skipped: steps skipped in all, because the loss or the gradient was not finite.
-        interrupted: whether a signal ended the call early. The checkpoint is saved.
+        start: number of updates in earlier calls.
+        update: number of updates in earlier calls and this call.
+        skipped: number of steps skipped in earlier calls and this call, because the loss or gradient was not finite.
+        interrupted: whether a signal ended the call early. A checkpoint is then saved.
         seconds: wall-clock time of this call.
-        updates_per_second: updates per second of this call.
-        time_shares: shares of ``seconds`` spent waiting for data, on forward, backward, optimizer, and the rest.
-        peak_memory_mib: largest resident memory of this process, or largest allocation on the GPU that is used.
+        updates_per_second: average speed of this call.
+        time_shares: share of ``seconds`` by stage: data (waiting), forward, backward, optimizer and rest.
+        peak_memory_mib: peak resident memory of this process; on a GPU, peak memory that PyTorch allocated.
     """
 
     start: Count
@@ -74,8 +75,8 @@ class FitReport:
 class ValidationResult:
     """Success (rotation error below 1°, translation error below 0.2) and errors on one validation set.
 
-    Fields with ``first_stage`` describe the initial poses, the other fields the refined poses. Translations are in the
-    unit of the world.
+    Fields with ``first_stage`` describe the initial poses, the other fields the refined poses. Translation errors are
+    in the unit of the world.
     """
 
     success: SuccessRate
@@ -94,7 +95,7 @@ class Learned(NamedTuple):
     robustness: list[float]
 
 
-# The keys that model cards and summaries read; the mappings have more.
+# The keys that model cards and summaries read. The mappings have further keys.
 _Init = TypedDict("_Init", {"name": str})
 _Refine = TypedDict("_Refine", {"m": Count})
 _Size = TypedDict("_Size", {"n": Count})
@@ -113,16 +114,16 @@ class RunResults:
     Attributes:
         overrides: arguments of ``train.py``, ``key=value``.
         run: the report of the training.
-        us_per_problem: time of the solver in microseconds per problem, measured with calls of 1000 problems.
-        validation: success and errors on each validation set, at least one.
-        learned: hyperparameters of the refinement.
+        us_per_problem: time of the solver in microseconds per problem, in calls of at most 1000 problems.
+        validation: success and errors by the name of the validation set; at least one set.
+        learned: learned hyperparameters of the refinement.
         model: configuration of the solver.
         config: resolved configuration of ``train.py``.
-        environment: versions and machine.
-        origin: results of the run whose weights this run began with; ``None`` for a run from scratch.
+        environment: versions and machine, see :func:`~kornia_pnpnet.core.environment.environment`.
+        origin: results of the run that trained the initial weights of this run; ``None`` for a run from scratch.
 
     Raises:
-        ValueError: when there is no validation set, or the hyperparameters do not fit the model.
+        ValueError: when ``validation`` is empty, or when the number of hyperparameters does not fit the model.
     """
 
     __pydantic_config__: ClassVar = STRICT
@@ -147,7 +148,7 @@ class RunResults:
 
     @property
     def initializer(self) -> str | None:
-        """Class of the initialiser; ``None`` for a start from the identity."""
+        """Class name of the initialiser; ``None`` if the refinement starts from the identity."""
         return self.model["init"]["name"] if self.model["init"] else None
 
     @property
@@ -162,7 +163,7 @@ class RunResults:
 
 @torch.no_grad()
 def validate(model: nn.Module, validation: Mapping[str, Problems]) -> dict[str, ValidationResult]:
-    """Solve fixed problems, given by the name of their set, and summarise the errors on each set.
+    """Solve the problems of each validation set and summarise the errors; sets are given and returned by name.
 
     Raises:
         ValueError: when a set has no problems.
@@ -214,34 +215,37 @@ def load_run(path: str | Path) -> RunResults:
     """Read the results file of a run.
 
     Raises:
-        FileNotFoundError: when there is no such file.
-        ValueError: when the file does not hold the results of a run; the message names the wrong entry.
+        FileNotFoundError: when the file does not exist.
+        ValueError: when the file does not hold the results of a run. The message names the invalid entry.
     """
     return read_json(path, RunResults, "a results file of a run")
 
 
 def find_results(weights: str | Path) -> RunResults | None:
-    """Find the results of the run that trained some weights; ``weights`` is what ``PnPNet.from_pretrained`` takes.
+    """Find the results of the run that trained some weights.
+
+    Args:
+        weights: name or folder of the weights, see :func:`~kornia_pnpnet.pretrained.find_weights`.
 
     Returns:
-        The results, or ``None`` when there is no results file beside the weights or, for a folder named ``weights``,
-        in the folder above.
+        The results, or ``None`` without a results file. The file is looked for in the folder of the weights and, if the
+        name of this folder is ``weights``, in its parent folder.
 
     Raises:
-        FileNotFoundError: when there are no such weights.
+        FileNotFoundError: when the weights do not exist.
         ValueError: see :func:`load_run`.
     """
     folder = find_weights(weights)
-    # `train.py` writes weights into the folder `weights` of a run. A results file above another folder is not theirs.
+    # `train.py` writes weights into the folder `weights` of a run. Other folders may lie in the folder of another run.
     folders = [folder, folder.parent] if folder.name == "weights" else [folder]
     paths = (place / RESULTS_NAME for place in folders)
     return next((load_run(path) for path in paths if path.is_file()), None)
 
 
 def summarize_runs(folder: str | Path) -> Path | None:
-    """Write ``summary.csv``: one row for each run of a sweep, with its overrides, speed and success.
+    """Write ``summary.csv`` with one row for each run of a sweep: overrides, speed and success.
 
-    The runs are in sub-folders of the sweep. A results file that cannot be read is left out with a warning.
+    The runs are in sub-folders of ``folder``. A results file that cannot be read is left out with a warning.
 
     Returns:
         Path of the summary, or ``None`` when no run has results.
@@ -267,6 +271,6 @@ def summarize_runs(folder: str | Path) -> Path | None:
         rows.append(row)
     if not rows:
         return None
-    # In one piece, because runs of a parallel launcher may end at the same time.
+    # Written atomically, because runs of a parallel launcher may write the summary at the same time.
     write_csv(folder / "summary.csv", dict.fromkeys(key for row in rows for key in row), rows)
     return folder / "summary.csv"
