@@ -260,11 +260,14 @@ def restore_leading(size: torch.Size, result: _T) -> _T:
 
 def given_cameras(intrinsics: Tensor | PinholeCamera | None, world_points: Tensor, like: Tensor) -> Tensor:
     """The camera matrices that the caller gave for a rig, one for each problem or pair, with a last entry of 1."""
+    size = world_points.shape[:-2]
     if intrinsics is None:
-        return torch.eye(3, dtype=like.dtype, device=like.device).expand(*world_points.shape[:-2], 3, 3)
+        return torch.eye(3, dtype=like.dtype, device=like.device).expand(*size, 3, 3)
     matrices = camera_matrices(intrinsics).to(like.dtype)
     matrices = matrices / matrices[..., 2:, 2:]
-    return matrices.expand(*world_points.shape[:-2], 3, 3) if matrices.ndim == 2 else matrices
+    if isinstance(intrinsics, PinholeCamera) and matrices.ndim == 3:  # Kornia's cameras are one batch
+        return matrices.reshape(*size, 3, 3)
+    return matrices.expand(*size, 3, 3) if matrices.ndim == 2 else matrices
 
 
 def split_batch(inputs: Inputs, most: int | None, any_number: bool) -> list[Part]:

@@ -7,6 +7,7 @@ from kornia.geometry import solve_pnp_dlt
 from kornia.geometry.camera import PinholeCamera
 
 from kornia_pnpnet import PnPNet, create_solver, pose_covariance, solve_pnp
+from kornia_pnpnet.cameras import bearings
 
 
 def cameras(intrinsics, size=None):
@@ -100,3 +101,12 @@ def test_solve_pnp_makes_a_solver_once_and_takes_one(make_problems):
     assert not solve_pnp(*p[:3]).requires_grad
     with pytest.raises(ValueCheckError, match="No solver"):
         solve_pnp(*p[:3], solver="magic")
+
+
+def test_cameras_of_bearings_keep_the_leading_dimensions(make_problems):
+    p = make_problems(n=9, batch=6)
+    rays = bearings(p.img_points, p.intrinsics)
+    world, rays, matrices = (x.unflatten(0, (2, 3)) for x in (p.world_points, rays, p.intrinsics))
+    result = create_solver("epnp-lm")(world, rays, cameras(p.intrinsics))
+    torch.testing.assert_close(result.intrinsics, matrices)
+    assert result.matrix.equal(create_solver("epnp-lm")(world, rays, matrices).matrix)

@@ -7,6 +7,7 @@ import torch
 from kornia.core.exceptions import BaseError
 
 from kornia_pnpnet import Pose, create_solver, p3p, pose_errors
+from kornia_pnpnet.data import SyntheticProblems
 
 NAMES = ["pnpnet-set", "epnp-lm", "reppnp-lm", "p3p-ransac"]
 
@@ -141,3 +142,13 @@ def test_shapes_padding_bad_problems_and_gradients(generator):
         gradients.append(torch.autograd.grad(result.translation.sum(), pixels)[0])
     assert torch.equal(*gradients)
     assert not result.alternatives.rotation.requires_grad
+
+
+def test_problems_whose_noise_was_underestimated_have_alternatives():
+    """Their second solution takes the place of the first one, and the other poses are found for every problem."""
+    p = SyntheticProblems(n=30, batch_size=20, seed=5, img_sigma=40.0, world_sigma=0.0).batch(0)
+    with torch.no_grad():
+        solver = create_solver("pnpnet-set")
+        expected, result = solver(*p[:3]), solver(*p[:3], alternatives=2)
+    assert result.matrix.equal(expected.matrix)
+    assert result.alternatives.valid.shape == (20, 2)
