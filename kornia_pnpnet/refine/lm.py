@@ -17,6 +17,7 @@ from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.judge.belief import believe, explains, has_enough, has_focal, residual_noise
 from kornia_pnpnet.problem import Noise, Problem, Starts, State
 from kornia_pnpnet.refine.information import (
+    NARROWER,
     complete_noise,
     corrected_noise,
     information,
@@ -313,7 +314,7 @@ class RobustWeightedLM(Configured):
             for one in each[explored:switch]:
                 now = run(self._iteration, guided, now, *one)
             if each[switch:] and plan.area is not None:
-                noise, narrower = run(self._correct, by_residual, now.state, each[switch][2], plan.area)
+                noise, narrower = run(self._correct, by_residual, now.state, each[switch][2], plan.area, NARROWER)
                 by_residual = by_residual._replace(noise=noise)
             for step, damping, shape in each[switch:]:
                 shape = shape if narrower is None else shape * narrower
@@ -352,10 +353,12 @@ class RobustWeightedLM(Configured):
         """The ``cost`` of :meth:`judge` at any state, shape :math:`(B,)`."""
         return self._cost(project(state, plan.problem), plan.problem, plan.prior, plan.hyperparameters[-1][2])
 
-    def _correct(self, problem: Problem, state: State, shape: Tensor, area: Tensor) -> tuple[Noise, Tensor]:
+    def _correct(
+        self, problem: Problem, state: State, shape: Tensor, area: Tensor, narrower: float
+    ) -> tuple[Noise, Tensor]:
         """Correct the noise by the residuals at a state, see :func:`corrected_noise` for the result."""
         shape = per_problem(shape, problem.weights[:, :1])
-        return corrected_noise(project(state, problem), problem, self.kernel.weight, shape, area)
+        return corrected_noise(project(state, problem), problem, self.kernel.weight, shape, area, narrower)
 
     def _iteration(self, problem: Problem, now: Progress, step: Tensor, damping: Tensor, shape: Tensor) -> Progress:
         """One iteration. With ``reject_worse``, a problem whose cost would rise keeps its state."""
