@@ -1,18 +1,18 @@
-r"""EPnP: a pose from four or more pairs, in closed form and by a few Gauss-Newton steps in four unknowns.
+r"""EPnP: a pose from four or more pairs. A closed-form solution is refined by Gauss-Newton steps in four unknowns.
 
 A world point is a combination of control points, :math:`p_i = \sum_j a_{ij} c_j`. The coordinates :math:`a_{ij}` of the
 point are the same in the world frame and in the camera frame. Lepetit et al. use four control points :math:`c_j` and
 barycentric coordinates. Here :math:`c_0` is the centroid, and :math:`c_1, c_2, c_3` are *vectors* from the centroid.
-The coordinates are then orthonormal, :math:`\sum_i w_i a_i a_i^\top = I`, and the results do not depend on the axes of
-the world.
+These coordinates are orthonormal, :math:`\sum_i w_i a_i a_i^\top = I`. The pose does not depend on the axes of the
+world.
 
 The projection equations are :math:`\sum_j a_{ij} (x_j - u_i z_j) = 0` and :math:`\sum_j a_{ij} (y_j - v_i z_j) = 0`.
-Their least-squares solutions for given depths are :math:`x = P z` and :math:`y = Q z`, with
-:math:`P = \sum_i w_i u_i a_i a_i^\top` and :math:`Q = \sum_i w_i v_i a_i a_i^\top`. The remaining algebraic error
-:math:`z^\top K z` has 4 unknowns, whereas the paper's :math:`M^\top M` has 12. The control vectors in the camera frame
-are the columns of a 3 by 3 matrix :math:`D(z)`, and the control vectors in the world are the columns of :math:`L`. The
-two sets differ by a rotation or reflection when :math:`D^\top D = L^\top L`. Arrays (4, C, B) hold the depths of C
-candidates.
+For given depths :math:`z` of the control points, the least-squares solutions are :math:`x = P z` and :math:`y = Q z`,
+with :math:`P = \sum_i w_i u_i a_i a_i^\top` and :math:`Q = \sum_i w_i v_i a_i a_i^\top`. The remaining unknowns are the
+four depths, with the algebraic error :math:`z^\top K z`. (The paper has 12 unknowns.) The columns of :math:`D(z)` are
+the control vectors in the camera frame, and the columns of :math:`L` are the control vectors in the world frame. If
+:math:`D^\top D = L^\top L`, a rotation or a reflection maps :math:`L` to :math:`D`. An array (4, C, B) contains the
+four depths of C candidates.
 """
 
 from __future__ import annotations
@@ -30,39 +30,39 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["ControlPoints", "EPnP", "control_points"]
 
-# Points are planar when their extent across the plane is below this fraction of their extent along the plane.
+# Points are planar when their smallest extent is below this fraction of their middle extent.
 _PLANAR_RATIO = 1e-3
-# Least number of pairs of a problem that is `ok`: EPnP needs four pairs.
+# A problem needs at least this number of pairs to be `ok`.
 _MIN_PAIRS = 4
-# Least number of pairs in front of the camera: fewer pairs do not determine a pose.
+# A problem needs at least this number of pairs in front of the camera to be `ok`.
 _MIN_IN_FRONT = 3
-# Number of Gauss-Newton steps in each case before the best case is chosen.
+# Each of the four cases takes this number of Gauss-Newton steps. The best case is chosen afterwards.
 _CASE_ITERATIONS = 2
-# Squared focal lengths. Upper bound of a squared reprojection error; a point behind the camera has this error.
+# Upper bound of a squared reprojection error, in squared focal lengths. A point behind the camera has this error.
 _MAX_SQ_RESIDUAL = 4.0
-# Share of the squared spread of the pixels. A ridge of this size orders null vectors of equal error: equal depths come
-# first, then tilts along the longest extents of the world. The ridge affects only the start of the iterations.
+# Size of a ridge, as a share of the squared spread of the pixels. The ridge orders null vectors of equal algebraic
+# error: null vectors along the longest extents of the world come first. The ridge affects only the start values.
 _TIE = 1e-4
-# Indices (m, n) of the products βₘβₙ of null-vector coefficients that are unknowns of the four cases, in order of use.
+# Indices (m, n) of the products βₘβₙ, which are the unknowns of `_four_cases`.
 _PRODUCTS = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (0, 3))
 
 
 class ControlPoints(NamedTuple):
-    """Control points, coordinates and weights of the pairs; the batch is the last dimension in memory."""
+    """Control points, and coordinates and weights of the pairs. The batch is the last dimension in memory."""
 
-    points: Tensor  # the centroid and three vectors, a square root of the covariance; c_3 is 0 if planar, (B, 4, 3)
-    coordinates: Tensor  # `coordinates @ points` are the world points; the last column is 0 if planar, (B, N, 4)
-    weights: Tensor  # with the sum 1, (B, N)
-    planar: Tensor  # whether the points lie in one plane (or on a line), bool, (B,)
-    ok: Tensor  # whether the points span more than a line, bool, (B,)
+    points: Tensor  # the centroid and three vectors; the last vector of planar points is 0, (B, 4, 3)
+    coordinates: Tensor  # the world points are `coordinates @ points`; the last column of planar points is 0, (B, N, 4)
+    weights: Tensor  # normalised to the sum 1, (B, N)
+    planar: Tensor  # whether the points lie in a plane or on a line, bool, (B,)
+    ok: Tensor  # whether the points do not lie on a line, bool, (B,)
 
 
 def control_points(problem: Problem) -> ControlPoints:
     r"""Choose the control points by weighted Gram-Schmidt on the coordinates of the world points.
 
-    Each of three steps selects the axis along which the points spread most, and projects this axis out of the others.
-    The paper uses principal directions instead: they cost an eigendecomposition and have no gradient where two extents
-    are equal.
+    Each of three steps selects the coordinate with the largest variance, and makes the other coordinates orthogonal to
+    the selected coordinate. The paper uses principal directions. Principal directions need an eigendecomposition, and
+    have no gradient if two extents are equal.
 
     Args:
         problem: the problem. Pairs with the weight 0 are ignored.
@@ -79,8 +79,7 @@ def control_points(problem: Problem) -> ControlPoints:
     world = problem.world_points.permute(2, 1, 0).contiguous()  # (3, N, B)
     centroid = (world * weights).sum(1)  # (3, B)
     rest = world - centroid[:, None]
-    # A variance below the limit is rounding. The first limit is absolute; later limits are relative to the previous
-    # variance.
+    # A variance below the limit counts as 0. After the first step, the limit is relative to the previous variance.
     limit = torch.full_like(total, torch.finfo(rest.dtype).tiny ** 0.5)
     line_ratio = torch.finfo(rest.dtype).eps ** 0.5
     vectors, axes, found = [centroid], [torch.ones_like(weights)], []
@@ -103,25 +102,26 @@ class EPnP(Initialiser):
     r"""EPnP with weights, planar points and gradients, for batches.
 
     The control points in the camera frame are a combination of the null vectors of the projection equations. The
-    combination has to preserve the distances between the control points. Gauss-Newton starts from four cases with 1 to
-    4 null vectors. The case with the least weighted reprojection error is aligned with the world (orthogonal
-    Procrustes).
+    coefficients have to preserve the distances between the control points. Gauss-Newton starts from four cases, with
+    one to four null vectors. The best case has the least weighted reprojection error. Orthogonal Procrustes aligns the
+    world with the best case.
 
     Source: V. Lepetit, F. Moreno-Noguer and P. Fua, "EPnP: An Accurate O(n) Solution to the PnP Problem", IJCV 2009.
-    Four things differ from the paper. Two thirds of the unknowns are eliminated (see the module). The null vectors are
-    ordered by their algebraic error at equal depth of the centroid. The norm of the distances does not depend on the
-    choice of the control points. The objective includes the algebraic error, because the null vectors of about twelve
-    noisy pairs have different errors. Planar points use the same equations, with 0 as the fourth control point.
+    Four things differ from the paper. Two thirds of the unknowns are eliminated (see the module). Only the first null
+    vector moves the centroid in depth. The objective does not depend on the choice of the control points. The objective
+    includes the algebraic error, because the null vectors of noisy pairs have different algebraic errors. Planar points
+    use the same equations, with 0 as the last control vector.
 
-    Four or five pairs can have up to four solutions, and the solution with the least reprojection error may be
-    incorrect. A problem is not ``ok`` with fewer than four pairs, with points on a line, and when fewer than three
-    pairs are in front of the camera. The implicit function theorem gives the gradient of the minimum.
+    Four or five pairs can have up to four solutions. The solution with the least reprojection error may then be
+    incorrect. A problem is not ``ok`` with fewer than four pairs, with points on a line, or with fewer than three pairs
+    in front of the camera. The gradient of the pose follows from the implicit function theorem.
 
     Args:
-        iterations: number of Gauss-Newton steps, at least 2. Every case takes two steps; the best case takes the rest.
+        iterations: number of Gauss-Newton steps, at least 2. Each case takes two steps, and the best case takes the
+            remaining steps.
         algebraic_weight: :math:`\mu \ge 0`, weight of the algebraic error relative to the squared error of the
-            distances. Both errors are measured in a world with a root mean square radius of 1, for pixels over the
-            focal length. In the paper the weight is 0.
+            distances. The world has a root mean square radius of 1, and pixels are divided by the focal length. The
+            paper's weight is 0.
 
     Raises:
         BaseError: when an argument is out of its range.
@@ -146,7 +146,7 @@ class EPnP(Initialiser):
         self.algebraic_weight = algebraic_weight
 
     def forward(self, problem: Problem) -> Starts:
-        """Find the pose in the solver's frame. All weights are 1, and a pose that is not ``ok`` is finite, too."""
+        """Find the pose in the solver's frame. All returned weights are 1. A pose that is not ``ok`` is also finite."""
         problem = problem._replace(weights=problem.usual_weights)
         control = control_points(problem)
         system = _depth_system(control, problem, self.algebraic_weight)
@@ -159,7 +159,7 @@ class EPnP(Initialiser):
         affine = camera[:, 1:]
         moment = small_product(affine, system.vectors.transpose(0, 1))
         turn, unique = nearest_rotation(moment)
-        # The distances of the control points are slightly incorrect. The scale restores the known size of the world.
+        # The control vectors have approximate lengths. The scale restores the known size of the world.
         size = affine.square().sum((0, 1))
         scale = (turn * moment).sum((0, 1)) / torch.where(size > 0, size, 1.0)
         rotation = turn.permute(2, 0, 1).contiguous()
@@ -173,40 +173,40 @@ class EPnP(Initialiser):
         return Starts(Pose(rotation, translation), torch.ones_like(problem.weights), ok)
 
     def _depths(self, system: _DepthSystem) -> tuple[Tensor, Tensor]:
-        """Depths (4, 1, B) of the best case, and whether the case succeeded, bool (B,); equal depths if it failed."""
-        cases = _four_cases(system).detach()  # also in forward mode: sqrt has no derivative at 0
-        # A shape and its mirror image along the optical axis have the same distances, and Gauss-Newton does not turn
-        # the shape into the mirror image. Symmetric points therefore need both starts.
+        """Depths (4, 1, B) of the best case, and whether this case is valid (B,). An invalid case gets equal depths."""
+        cases = _four_cases(system).detach()  # `no_grad` does not stop forward-mode derivatives
+        # A shape and its mirror image along the optical axis have the same distances. Gauss-Newton cannot move
+        # from one shape to the other shape, and therefore starts from both shapes.
         mirrored = torch.cat((cases[:1, -1:], -cases[1:, -1:]))
         cases = _minimize(system, torch.cat((cases, mirrored), 1), _CASE_ITERATIONS)
         best = cases.gather(1, _best_case(system, cases).expand(4, 1, -1))
         depths = _minimize(system, best, self.iterations - _CASE_ITERATIONS)
-        # Depths beyond the precision of the dtype are a failure; NaN compares false.
+        # The comparison is false for NaN.
         solved = (depths.abs() < 1.0 / torch.finfo(depths.dtype).eps).all(0)
         return torch.where(solved, depths, system.maps[2, 0]), solved[0]
 
 
 class _DepthSystem(NamedTuple):
-    """The equations of depths (4, C, B)."""
+    """The equations of the four depths. For the symbols see the module."""
 
     coordinates: Tensor  # a, (4, N, B)
-    weights: Tensor  # with the sum 1, (N, B)
-    plane_points: Tensor  # (u, v), (2, N, B)
-    unit: Tensor  # unit of the depths: the root mean square distance of the points from their centroid, (B,)
-    vectors: Tensor  # the control vectors of the world, divided by `unit`, (3 axes, 3 vectors, B)
-    gram: Tensor  # the Gram matrix of the vectors, with the trace 1, (3, 3, 1, B)
-    maps: Tensor  # P, Q and the identity, the maps from z to x, y and z, (3, 4, 4, 1, B)
+    weights: Tensor  # w, normalised to the sum 1, (N, B)
+    plane_points: Tensor  # u and v, (2, N, B)
+    unit: Tensor  # unit of the depths, the root mean square distance of the points from their centroid, (B,)
+    vectors: Tensor  # L, the control vectors of the world divided by `unit`, (3 axes, 3 vectors, B)
+    gram: Tensor  # LᵀL, (3, 3, 1, B)
+    maps: Tensor  # P, Q and the identity, (3, 4, 4, 1, B)
     error: Tensor  # K, (4, 4, B)
-    prior: Tensor  # K times the weight of the algebraic error, (4, 4, 1, B)
+    prior: Tensor  # K times `algebraic_weight`, (4, 4, 1, B)
 
 
 def _depth_system(control: ControlPoints, problem: Problem, weight: float) -> _DepthSystem:
-    """Eliminate the x and y coordinates of the control points."""
+    """Eliminate the x and y coordinates of the control points; ``weight`` is the ``algebraic_weight``."""
     coordinates, weights = control.coordinates.mT.contiguous(), control.weights[:, None]  # (B, 4, N), (B, 1, N)
     plane_points = (problem.img_points / problem.focal).mT  # (B, 2, N)
     scaled = (plane_points[:, :, None] * coordinates[:, None]).flatten(1, 2)  # (B, 8, N)
     moments = torch.bmm(scaled, (weights * coordinates).mT)  # P and Q, (B, 8, 4)
-    # K is computed as a sum of squared residuals. A difference of moments would lose all digits in float32.
+    # K is a sum of squared residuals, because a difference of moments would lose all digits in float32.
     errors = (scaled - torch.bmm(moments, coordinates)).unflatten(1, (2, 4)).transpose(1, 2)  # (B, 4, 2, N)
     error = torch.bmm((weights[:, None] * errors).flatten(2), errors.flatten(2).mT).permute(1, 2, 0)
     eye = torch.eye(4, dtype=weights.dtype, device=weights.device)
@@ -230,15 +230,15 @@ def _depth_system(control: ControlPoints, problem: Problem, weight: float) -> _D
 
 
 def _in_camera(system: _DepthSystem, depths: Tensor) -> Tensor:
-    """Camera coordinates of the centroid and of the control vectors, divided by ``system.unit``, (3, 4, C, B)."""
+    """Camera coordinates (3, 4, C, B) of the centroid and of the control vectors, divided by ``system.unit``."""
     return small_product(system.maps.flatten(0, 1), depths[:, None])[:, 0].unflatten(0, (3, 4))
 
 
 def _null_space(system: _DepthSystem) -> Tensor:
-    """A basis of depths in the order of their algebraic error, (4, 4 vectors, B): z = β₁v₁ + β₂v₂ + β₃v₃ + β₄v₄.
+    """A basis v of the depths, z = β₁v₁ + β₂v₂ + β₃v₃ + β₄v₄, (4, 4 vectors, B). In this basis K is nearly diagonal.
 
-    The first vector has the least error of all depths with the centroid at depth 1. The other vectors have the centroid
-    at depth 0. They are the eigenvectors of the lower right 3 by 3 block of K, so that K is diagonal in this basis.
+    The vector v₁ has the least algebraic error of all depths with the centroid at depth 1. The vectors v₂, v₃ and v₄
+    have the centroid at depth 0, in ascending order of their algebraic errors.
     """
     error, eye = system.error, torch.eye(4, dtype=system.error.dtype, device=system.error.device)[..., None]
     spread = error[0, 0] + system.maps[:2, 0, 1:, 0].square().sum((0, 1))
@@ -250,11 +250,11 @@ def _null_space(system: _DepthSystem) -> Tensor:
 
 
 def _four_cases(system: _DepthSystem) -> Tensor:
-    r"""The depths of the paper's four cases, which use N = 1, 2, 3 and 4 null vectors, (4, 4 cases, B).
+    r"""The depths (4, 4 cases, B) of the paper's four cases, with 1, 2, 3 and 4 null vectors.
 
-    Least squares find the products of the betas. The case N = 3 omits the smallest product :math:`\beta_3^2`. The case
-    N = 4 adds :math:`\beta_1 \beta_4`, so that the six equations have six unknowns. (The paper linearises the four
-    remaining products again.) The systems of all cases are leading blocks of one system.
+    Linear least squares find products of the coefficients :math:`\beta`. The third case omits the smallest product
+    :math:`\beta_3^2`. The fourth case adds only :math:`\beta_1 \beta_4`, so that six equations have six unknowns. The
+    linear systems of all cases are leading blocks of one system.
     """
     basis = _null_space(system)
     vectors = _in_camera(system, basis)[:, 1:]  # (3 axes, 3 vectors, 4 null vectors, B)
@@ -266,7 +266,7 @@ def _four_cases(system: _DepthSystem) -> Tensor:
     solutions = solve_leading([row.unbind(0) for row in normal.unbind(0)], rhs.unbind(0), (1, 3, 5, 6))
     zero = torch.zeros_like(rhs[0])
     padded = [torch.stack([*x, *[zero] * (6 - len(x))]) for x in solutions]
-    square, mixed, other, third, _, fourth = torch.stack(padded, 1).unbind(0)  # (4 cases, B), of ½β₁², β₁β₂, ½β₂², …
+    square, mixed, other, third, _, fourth = torch.stack(padded, 1).unbind(0)  # ½β₁², β₁β₂, ½β₂², …, (4 cases, B)
     sign = square.sign()
     first = (2.0 * square.abs()).sqrt()
     second = (2.0 * sign * other).clamp(min=0.0).sqrt().copysign(sign * mixed)
@@ -275,7 +275,7 @@ def _four_cases(system: _DepthSystem) -> Tensor:
 
 
 def _normal_equations(system: _DepthSystem, depths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    r"""Half of the Gauss-Newton matrix (4, 4, C, B), half of the gradient (4, C, B), and the misfits (3, 3, C, B)."""
+    r"""Half of the Gauss-Newton matrix (4, 4, C, B), half of the gradient (4, C, B), and DᵀD - LᵀL (3, 3, C, B)."""
     vectors = _in_camera(system, depths)[:, 1:]
     columns = vectors.transpose(0, 1)
     misfit = small_product(columns, vectors) - system.gram
@@ -289,7 +289,7 @@ def _normal_equations(system: _DepthSystem, depths: Tensor) -> tuple[Tensor, Ten
 def _minimize(system: _DepthSystem, depths: Tensor, iterations: int) -> Tensor:
     r"""Gauss-Newton on :math:`\|D^\top D - L^\top L\|_F^2 + \mu\, z^\top K z`.
 
-    The six entries of the Gram matrix are equivalent to the paper's six distances between control points.
+    The six different entries of the Gram matrix :math:`D^\top D` replace the paper's six distances.
     """
     for _ in range(iterations):
         normal, gradient, _ = _normal_equations(system, depths)
@@ -299,16 +299,16 @@ def _minimize(system: _DepthSystem, depths: Tensor, iterations: int) -> Tensor:
 
 
 def _attach_gradient(system: _DepthSystem, depths: Tensor, planar: Tensor) -> Tensor:
-    r"""Give a minimum (4, 1, B) its gradient by the implicit function theorem; 0 where the minimum is not isolated.
+    r"""Attach gradients to minima (4, 1, B) by the implicit function theorem; 0 if a minimum is not isolated.
 
-    The result has the value of ``depths`` and the derivatives of two Newton steps with a constant matrix. One step
-    makes first derivatives exact; two steps make second derivatives exact.
+    The values of ``depths`` do not change. The gradient is the gradient of two Newton steps with a constant matrix.
+    The first step makes first derivatives exact, and the second step makes second derivatives exact.
     """
     with torch.no_grad():
         normal, _, misfit = _normal_equations(system, depths)
         for rows in system.maps[:, 1:].unbind(0):
             normal = normal + 2.0 * small_product(rows.transpose(0, 1), small_product(misfit, rows))
-        # The third vector of planar points always has depth 0. A 1 on the diagonal keeps the system regular.
+        # The last control vector of planar points is 0. A 1 on the diagonal makes the system regular.
         normal[3, 3] += planar
         eye = torch.eye(4, dtype=depths.dtype, device=depths.device)[..., None].expand_as(normal[:, :, 0])
         columns, solved = solve_positive(normal.expand(-1, -1, 4, -1).flatten(2), eye.flatten(1), depths.new_zeros(()))
@@ -320,7 +320,7 @@ def _attach_gradient(system: _DepthSystem, depths: Tensor, planar: Tensor) -> Te
 
 
 def _frames(one: Tensor, two: Tensor) -> Tensor:
-    """Orthonormal axes (3, 3 axes, *) from two vectors (3, *) by Gram-Schmidt."""
+    """Orthonormal axes (3, 3 axes, *) of two vectors (3, *) by Gram-Schmidt."""
     first = one * one.square().sum(0).rsqrt()
     second = torch.addcmul(two, (first * two).sum(0), first, value=-1)
     second = second * second.square().sum(0).rsqrt()
@@ -328,10 +328,10 @@ def _frames(one: Tensor, two: Tensor) -> Tensor:
 
 
 def _best_case(system: _DepthSystem, cases: Tensor) -> Tensor:
-    """Index (B,) of the case with the least weighted sum of squared reprojection errors, of depths (4, C, B).
+    """Index (B,) of the best case. The best case has the least weighted sum of squared reprojection errors.
 
-    The control vectors of a case are nearly the rotated control vectors of the world. The rotation is computed from
-    frames of two of these vectors, which is faster than Procrustes.
+    The rotation from the world to the camera is approximated by the frames of the first two control vectors. This
+    approximation is faster than Procrustes.
     """
     camera, world = _in_camera(system, cases), system.vectors[:, :, None]  # (3, 4, C, B), (3, 3, 1, B)
     camera_frames, world_frame = _frames(camera[:, 1], camera[:, 2]), _frames(world[:, 0], world[:, 1])
@@ -344,5 +344,5 @@ def _best_case(system: _DepthSystem, cases: Tensor) -> Tensor:
     u, v = system.plane_points
     x, y = torch.addcmul(-u, x, inverse), torch.addcmul(-v, y, inverse)
     error = (x * x).addcmul_(y, y).clamp_(max=_MAX_SQ_RESIDUAL)
-    error = torch.where(z > 0, error, _MAX_SQ_RESIDUAL)  # also in failed cases: NaN compares false
+    error = torch.where(z > 0, error, _MAX_SQ_RESIDUAL)  # z > 0 is false for the NaN of a failed case
     return (error * system.weights).sum(1).argmin(0)

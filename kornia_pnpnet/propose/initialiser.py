@@ -15,19 +15,19 @@ __all__ = ["Initialiser", "trait"]
 class Initialiser(Configured):
     """A module that maps a :class:`~kornia_pnpnet.problem.Problem` to :class:`~kornia_pnpnet.problem.Starts`.
 
-    Any module with such a ``forward`` is an initialiser. If a module lacks an attribute below, solvers use the value of
-    this class.
+    Any module with the same ``forward`` is an initialiser. If the module does not have an attribute of this class,
+    solvers use the default of this class.
 
     Attributes:
-        pairs_at_once: number of pairs whose temporaries fit the caches of one core. Without gradients, a solver splits
-            batches with more pairs per thread (CPU only). ``None``: batches are not split.
-        fixed_pairs: whether the number of pairs is fixed, ``config["n"]``.
+        pairs_at_once: largest number of pairs per thread in a part of a batch. On a CPU and without gradients, solvers
+            split a batch into parts that fit the CPU's caches. ``None`` if batches are not split.
+        fixed_pairs: whether the number of pairs has to be ``config["n"]``.
         takes_given: whether ``forward(problem, given)`` accepts a given pose.
         takes_rigs: whether the initialiser solves rigs.
         finds_focal: whether the initialiser estimates an unknown focal length.
-        estimates_noise: whether the result contains several poses and the noise. A search may then follow, and the
-            initialiser accepts ``forward(problem, search_follows=True)``.
-        weighs_unusual: whether the weights are also valid for pairs that are not of normal scale.
+        estimates_noise: whether the result contains several poses and the noise. The initialiser then accepts
+            ``forward(problem, search_follows=True)``.
+        weighs_unusual: whether the weights of pairs that are not of normal scale are also valid.
     """
 
     pairs_at_once: int | None = None
@@ -39,10 +39,10 @@ class Initialiser(Configured):
     weighs_unusual: bool = False
 
     def forward(self, problem: Problem) -> Starts:
-        """Propose poses for a problem in the solver's frame."""
+        """Estimate poses of a problem in the solver's frame."""
         raise NotImplementedError
 
 
 def trait(init: nn.Module | None, name: str) -> Any:
-    """The value of an attribute of :class:`Initialiser` for any initialiser."""
+    """An attribute of an initialiser, or the default of :class:`Initialiser` if the module lacks the attribute."""
     return getattr(init, name, getattr(Initialiser, name))

@@ -1,4 +1,4 @@
-"""The paper's fully connected network: maps n ordered pairs to a coarse pose."""
+"""The paper's fully connected network, which maps n ordered pairs to a coarse pose."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["MLPInit", "rotation_about"]
 
 
 def _relu_layers(sizes: list[int]) -> list[nn.Module]:
-    """Fully connected ReLU layers with He initialisation: PyTorch's default loses the signal in ten narrow layers."""
+    """Linear layers with ReLU and He initialisation. PyTorch's default loses the signal in ten narrow layers."""
     layers: list[nn.Module] = []
     for size_in, size_out in pairwise(sizes):
         linear = nn.Linear(size_in, size_out)
@@ -28,23 +28,23 @@ def _relu_layers(sizes: list[int]) -> list[nn.Module]:
 
 
 def _run(layers: nn.Sequential, hidden: Tensor) -> Tensor:
-    """Apply layers to columns (units, B), in the dtype of the columns."""
+    """Apply the layers to ``hidden`` (units, B), in the dtype of ``hidden``."""
     for layer in layers:
         if isinstance(layer, nn.Linear):
             weight, bias = layer.weight.to(hidden.dtype), layer.bias.to(hidden.dtype)
             hidden = torch.addmm(bias.unsqueeze(1), weight, hidden)
         else:
-            hidden = hidden.relu_()  # in place: nothing else reads the sum
+            hidden = hidden.relu_()
     return hidden
 
 
 def rotation_about(axis: Tensor, angle: Tensor) -> Tensor:
-    """Rotations (B, 3, 3) about axes (3, B) by angles (B,) in radians. Axes may have any length other than 0."""
+    """Rotations (B, 3, 3) about axes (3, B) by angles (B,) in radians. The axes need not have length 1."""
     limits = torch.finfo(axis.dtype)
-    # The added epsilon keeps the gradient finite where the network returns the axis 0.
+    # The added epsilon keeps the gradient finite if the network returns the axis 0.
     vector = axis * (angle * ((axis * axis).sum(0) + limits.eps).rsqrt())
     length = (vector * vector).sum(0).clamp(min=limits.tiny).sqrt()
-    # Unit quaternion times the square root of 2.
+    # The quaternion (w, xyz) has the length √2.
     half, root = 0.5 * length, 2.0**0.5
     w, xyz = root * half.cos(), vector * (root * half.sin() / length)
     (x, y, z), (wx, wy, wz) = xyz.unbind(), (w * xyz).unbind()
@@ -58,17 +58,17 @@ def rotation_about(axis: Tensor, angle: Tensor) -> Tensor:
 class MLPInit(Initialiser):
     r"""Stage 1 of PnP-Net: a small multilayer perceptron for exactly ``n`` ordered pairs.
 
-    The 5n coordinates pass through shared ReLU layers of 20n, 5n and 3n units. A rotation branch and a translation
+    The input is 5n coordinates. Shared ReLU layers have 20n, 5n and 3n units. A rotation branch and a translation
     branch follow. Each branch has five ReLU layers of 2n units and a linear last layer. The rotation branch returns an
-    axis :math:`s` and an angle :math:`\theta`, :math:`R = \exp(\theta [s / \|s\|]_\times)`.
+    axis :math:`s` and an angle :math:`\theta`. The rotation is :math:`R = \exp(\theta [s / \|s\|]_\times)`.
 
-    Source: Sheffer and Wiesel 2020, figure 2; the scales of the input are ours. The network computes in its own dtype
-    or in the dtype of the problem, whichever is wider.
+    Source: Sheffer and Wiesel 2020, figure 2. The scales of the input are ours. The network computes in the wider of
+    its own dtype and the dtype of the problem.
 
     Args:
         n: number of pairs.
-        world_scale: length by which world coordinates are divided. The value 1 suits a centred and scaled world.
-        img_scale: pixels by which image coordinates are divided.
+        world_scale: divisor of the world coordinates. The value 1 is for a centred and scaled world.
+        img_scale: divisor of the image coordinates, in pixels.
 
     Raises:
         BaseError: when ``n`` is less than 3, or a scale is not a positive number.
@@ -98,10 +98,11 @@ class MLPInit(Initialiser):
         """Find a coarse pose.
 
         Args:
-            problem: ``n`` pairs, ordered by their pixels. Pairs that are not of normal scale enter as zeros.
+            problem: ``n`` pairs, sorted by their pixels. The coordinates of pairs that are not of normal scale are
+                replaced by 0.
 
         Returns:
-            The coarse pose, and weights: 0 for pairs that are not of normal scale, 1 for all others.
+            The coarse pose and the weights. The weight is 1 for pairs of normal scale, and 0 for other pairs.
 
         Raises:
             ShapeError: when the number of pairs is not ``n``.
@@ -116,7 +117,7 @@ class MLPInit(Initialiser):
             )
         weight = next(self.parameters())
         check_devices({"world_points": problem.world_points}, weight, "the network")
-        # One column per problem: x, y, z, u, v of the first pair, then of the second pair, and so on.
+        # A column has x, y, z, u, v of the first pair, then x, y, z, u, v of the second pair, and so on.
         coordinates = problem.world_points / self.world_scale, problem.img_points / self.img_scale
         usual = problem.usual[..., None]
         features = torch.cat([(x * usual).permute(1, 2, 0) for x in coordinates], 1).flatten(0, 1)  # (5n, B)

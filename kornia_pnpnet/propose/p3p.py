@@ -1,29 +1,27 @@
 r"""P3P: all poses (up to four) that project three world points exactly onto three pixels, for batches.
 
-The unknowns are the distances :math:`\lambda_k` of the points along their unit rays. Edge :math:`k` of the triangle is
+The unknowns are the distances :math:`\lambda_k` from the camera to the points. Edge :math:`k` of the triangle is
 opposite to point :math:`k` and connects the points :math:`i` and :math:`j`. The law of cosines for edge :math:`k` is
 
 .. math:: (\lambda_i - \lambda_j)^2 + b_k \lambda_i \lambda_j = a_k,
 
-with the squared length :math:`a_k` of the edge and the squared length :math:`b_k` of the difference of the rays
-:math:`i` and :math:`j`. (For rays close to each other :math:`b_k` has more correct digits than :math:`2 - 2\cos`.) If
-weights :math:`u` satisfy :math:`a \cdot u = 0`, the weighted sum of the three equations is a conic in the ratios of the
-distances. The conic is a pair of lines when
+where :math:`a_k` is the squared length of the edge, and :math:`b_k` is the squared length of the difference of the unit
+rays :math:`i` and :math:`j`. If weights :math:`u` satisfy :math:`a \cdot u = 0`, the weighted sum of the three
+equations is a conic in the ratios of the distances. The conic is a pair of lines when
 
 .. math:: (u_1 u_2 + u_2 u_3 + u_3 u_1)\,(s \cdot u) = g\, u_1 u_2 u_3,
 
-with the squared sine :math:`s_k` of the angle between the rays :math:`i` and :math:`j`, and the squared determinant
-:math:`g` of all three rays. One root of this cubic gives two lines. Other weights give a second conic, which each line
-meets in two points. A Newton step then refines the ratios.
+where :math:`s_k` is the squared sine of the angle between the rays :math:`i` and :math:`j`, and :math:`g` is the
+squared determinant of the three rays. One root of this cubic gives two lines. Other weights give a second conic. Each
+line intersects the second conic in two points. A Newton step then refines the ratios.
 
 Sources: M. Persson and K. Nordberg, "Lambda Twist", ECCV 2018, for the use of one degenerate conic; Y. Ding, J. Yang,
-V. Larsson, C. Olsson and K. Åström, "Revisiting the P3P Problem", CVPR 2023, for the solutions by the roots of the
-cubic, and for the lines from the adjugate matrix. Three things are new here: the short form of the cubic, the choice of
-its root, and equations of the two lines that are written in differences of distances.
+V. Larsson, C. Olsson and K. Åström, "Revisiting the P3P Problem", CVPR 2023, for the use of the cubic, and for the
+lines from the adjugate matrix. We add the short form of the cubic, the choice of its root, and the equations of the
+lines in differences of distances.
 
-The problems of a chunk are the last dimension of every tensor, ``(*, C)``. Finite values are selected by ``lerp``
-with a weight of 0 or 1, which returns exactly one of two values. On a CPU, ``where`` takes ten times as long for an
-unpredictable mask.
+The last dimension of every tensor is a chunk of C problems. Finite values are selected by ``lerp`` with a weight of 0
+or 1, because ``torch.where`` with an unpredictable mask is ten times slower on a CPU.
 """
 
 from __future__ import annotations
@@ -45,25 +43,26 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["P3P", "p3p"]
 
-# Bytes of a vector with one number per problem of a chunk. A few dozen of these vectors fit into a core's caches.
+# Bytes of a vector that has one number per problem of a chunk. A core's caches hold a few dozen of these vectors.
 _CHUNK_BYTES = 2**16
-# Power of the machine epsilon. The triangle of a solution differs from the given triangle by less than this power times
-# the distance of the camera. (The longest edge is 1.)
+# Power of the machine epsilon. A candidate is a solution if its triangle differs from the world triangle by less than
+# this power times the distance of the camera. (The longest edge is 1.)
 _ERROR_POWER = 2 / 3
-# Share of the longest edge. Largest difference of the two triangles at any distance of the camera.
+# The triangle of a solution must also differ from the world triangle by less than this share of the longest edge.
 _LARGEST_ERROR = 0.01
-# Machine epsilons, relative to the coordinates and to the longest edge. A triangle of less height counts as a line.
+# A triangle counts as a line when its height over its size is below this number of machine epsilons. The size includes
+# the distance from the origin.
 _LINE = 32.0
-# Number of focal lengths on the grid when the focal length is unknown.
+# If the focal length is unknown, the grid has this number of focal lengths.
 _FOCALS = 12
 # Approximate least distance of the camera from a point. The unit is the longest edge times the machine epsilon to the
-# power `_ERROR_POWER`. Closer cameras are rejected, because rounding would determine the direction of the point.
+# power `_ERROR_POWER`. A closer camera is rejected, because rounding would determine the ray of the point.
 _CLOSE = 64.0
-# Number of Newton steps for the root of the cubic. They reduce the error at the start, at most 37 %, to rounding in
-# float64.
+# Number of Newton steps for the root of the cubic. The start has a relative error of at most 37 %. Four steps
+# reduce the error to rounding in float64.
 _CUBIC_STEPS = 4
-# Power of the machine epsilon. The Newton step for the ratios is damped where its squared determinant, over the product
-# of two squared edges, is less than this power. Two solutions then nearly coincide, and the full step would be noise.
+# Power of the machine epsilon. When two solutions nearly coincide, the full Newton step for the ratios would be noise.
+# The step is damped if its squared determinant is below this power times the product of two squared edges.
 _DAMPING_POWER = 1.25
 
 
@@ -73,13 +72,13 @@ def _greater(first: Tensor, second: Tensor) -> Tensor:
 
 
 def _turn_to_largest(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Weights (C,), 0 or 1, of a turn by one and by two places that moves the largest of three values (3, C) first."""
+    """Flags (C,): whether one cyclic shift, or two shifts, bring the largest of three values (3, C) to the front."""
     first, second, third = values
     return _greater(second, first), _greater(third, torch.maximum(first, second))
 
 
 def _turned(triple: Tensor, turn: tuple[Tensor, Tensor], step: int = 1) -> Tensor:
-    """Turn the triple (3, *, C) of each problem; the step -1 undoes the turn."""
+    """Shift triples (3, *, C) cyclically by the flags ``turn``. With ``step=-1``, undo the shift."""
     return triple.lerp(triple.roll(-step, 0), turn[0]).lerp_(triple.roll(step, 0), turn[1])
 
 
@@ -96,26 +95,26 @@ def _signed(size: Tensor, sign: Tensor) -> Tensor:
 
 
 def _isolated_root(k: Tensor) -> tuple[Tensor, Tensor]:
-    """The real root of a cubic form (4, C) that is farthest from the other two roots, as a ratio ``u : v``.
+    """The real root ``u : v`` of a cubic form (4, C) that is farthest from the other two roots.
 
-    When two solutions of the P3P problem are close, two roots are also close. Both solutions then lie on one line of
-    the third root, which this function returns.
+    When two solutions of a P3P problem are close to each other, two roots of the cubic are also close to each other.
+    Both solutions then lie on one line, which belongs to the third root.
     """
     tiny = torch.finfo(k.dtype).tiny
     sizes = k.abs()
     k = k * sizes.amax(0).clamp_(min=tiny).reciprocal_()
-    # Swap u and v where two roots could be at infinity.
+    # Swap u and v if two roots could be infinite.
     swap = _greater(sizes[2], sizes[1])
     k3, k2, k1, k0 = k.lerp_(k.flip(0), swap)
-    # x = k3 u / v + k2 / 3 solves x³ = 3 p x + 2 q. The root of largest size has the sign of q.
+    # x = k3 u / v + k2 / 3 solves x³ = 3 p x + 2 q. The root with the largest absolute value has the sign of q.
     third = k2 * (1 / 3)
     k31, sq_third = k3 * k1, third * third
     p = torch.add(sq_third, k31, alpha=-1 / 3)
     q = torch.sub(k31, sq_third, alpha=2).mul_(third).addcmul_(k3 * k3, k0, value=-1.0).mul_(0.5)
     size = q.abs()
-    pure = (2.0 * size).pow_(2 / 3).clamp_(min=tiny)  # x² for p = 0
+    pure = (2.0 * size).pow_(2 / 3).clamp_(min=tiny)  # x² if p = 0
     up = p.clamp(min=0.0)
-    x = _sqrt(torch.add(pure, up, alpha=3)).mul_(pure).div_(pure.add_(up.sub_(p), alpha=2.2))  # error < 37 %
+    x = _sqrt(torch.add(pure, up, alpha=3)).mul_(pure).div_(pure.add_(up.sub_(p), alpha=2.2))  # relative error < 37 %
     for _ in range(_CUBIC_STEPS):
         sq_x = x * x
         x = torch.addcmul(size, sq_x, x).mul_(2 / 3).div_(sq_x.sub_(p).clamp_(min=tiny))
@@ -126,16 +125,15 @@ def _isolated_root(k: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _lines(u: Tensor, h: Tensor, pairs: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Slopes and offsets (2, C) of the two lines of the conic with the weights ``u`` (3, C).
+    r"""Slopes (2, C) and offsets (2, C) of the two lines of the degenerate conic with the weights ``u`` (3, C).
 
-    The sum ``u[1] + u[2]`` must not be small.
     The lines are :math:`\lambda_1 - \lambda_3 = \text{slope}\,(\lambda_2 - \lambda_3) + \text{offset}\,\lambda_3`.
-    ``h`` (3, C) is 1 minus the cosines of the angles between rays. ``pairs`` (C,) is the first factor of the cubic, the
-    sum of the products of two weights.
+    The sum ``u[1] + u[2]`` must not be small. ``h`` (3, C) is 1 minus the cosines of the angles between rays. ``pairs``
+    (C,) is :math:`u_1 u_2 + u_2 u_3 + u_3 u_1`.
     """
     tiny = torch.finfo(pairs.dtype).tiny
     # The matrix D of the conic has u_2 + u_3, u_3 + u_1, u_1 + u_2 on its diagonal and -u_k cos_k off the diagonal. The
-    # lines cross in m with m mᵀ = -adj D. D + [m]ₓ and D - [m]ₓ have rank one, and their first rows are the two lines.
+    # lines intersect at m, and m mᵀ = -adj D. The first rows of D + [m]ₓ and of D - [m]ₓ are the two lines.
     e1, e2, e3 = torch.addcmul(u, u, h, value=-1.0)
     u, h = u[1:], h[1:]
     d11 = u.sum(0)
@@ -143,11 +141,11 @@ def _lines(u: Tensor, h: Tensor, pairs: Tensor) -> tuple[Tensor, Tensor]:
     us = (u * u).mul_(torch.addcmul(2.0 * h, h, h, value=-1.0))
     sq_m2, sq_m3 = (us + pairs).neg_().clamp_(min=tiny)
     large = _sqrt(torch.maximum(sq_m2, sq_m3))
-    least = -large  # the bounds have an effect only where the lines are not real
+    least = -large  # these bounds have an effect only if the lines are not real
     small = (e1 * d11).addcmul_(e2, e3).neg_().div_(large).clamp_(least, large)
     third = _greater(sq_m3, sq_m2)
     m2, m3 = large.lerp(small, third), small.lerp(large, third)
-    # If the signs agree, m_3 - m_2 is computed from the difference of the squares, which is more accurate.
+    # If m_2 and m_3 have the same sign, the difference of their squares gives m_3 - m_2 with less rounding.
     same_sign = _greater(small, torch.zeros_like(small))
     apart = (us[0] - us[1]).div_((m2 + m3).abs_().clamp_(min=tiny**0.5)).clamp_(least, large)
     apart = (m3 - m2).lerp_(apart, same_sign)
@@ -157,13 +155,13 @@ def _lines(u: Tensor, h: Tensor, pairs: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _meet(slope: Tensor, offset: Tensor, v: Tensor, h: Tensor) -> Tensor:
-    """Points where lines (2, C) meet the conic with the weights ``v`` (3, C), as distances (3, 2, 2, C) up to scale.
+    """Distances (3, 2, 2, C), up to scale, where two lines intersect the conic with the weights ``v`` (3, C).
 
-    A line that misses the conic is treated like a tangent. The second point of a tangent is 0.
+    A line that misses the conic is treated like a tangent. For a tangent, the second intersection is 0.
     """
     v1, v2, v3 = v
     vh1, vh2, vh3 = v * h
-    # Coefficients of y², 2 y and 1 in y = (λ_2 - λ_3) / λ_3.
+    # The quadratic equation is c2 y² + 2 c1 y + c0 = 0 for y = (λ_2 - λ_3) / λ_3.
     v2_slope, less = slope * v2, slope - 1.0
     c2 = (less * less).mul_(v3).addcmul_(slope, vh3, value=2.0).addcmul_(v2_slope, slope).add_(v1)
     c1 = (slope + offset).add_(1.0).mul_(vh3).addcmul_(less * v3, offset).addcmul_(v2_slope, offset).add_(vh1)
@@ -178,17 +176,17 @@ def _meet(slope: Tensor, offset: Tensor, v: Tensor, h: Tensor) -> Tensor:
 
 
 def _candidates(p: Tensor, q: Tensor, r: Tensor, b: Tensor, g: Tensor) -> Tensor:
-    """Solutions of the equations of :func:`_distances` up to rounding."""
+    """The candidates of :func:`_distances`, up to scale, before the Newton step."""
     h = 0.5 * b
     s1, s2, s3 = torch.addcmul(b, h, h, value=-1.0)
-    # With u_1 = -(p u_3 + q u_2) the unknown of the cubic is u_3 : u_2, and s · u = t_3 u_3 + t_2 u_2.
+    # u_1 = -(p u_3 + q u_2). The unknown of the cubic is u_3 : u_2, and s · u = t_3 u_3 + t_2 u_2.
     t3, t2 = s3.addcmul_(p, s1, value=-1.0), s2.addcmul_(q, s1, value=-1.0)
     k2, k1 = (r * t3).addcmul_(p, g - t2), (r * t2).addcmul_(q, g - t3)
     u3, u2 = _isolated_root(torch.stack(((p * t3).neg_(), k2, k1, (q * t2).neg_())))
     u = torch.stack(((p * u3).addcmul_(q, u2).neg_(), u2, u3))
     pairs = (u2 * u3).addcmul_(u[0], u2 + u3)
     turn = _turn_to_largest((u.roll(-1, 0) + u.roll(1, 0)).abs_())
-    # Intersect the lines with the conic whose weights are orthogonal to u: (p u_2 - q u_3, u_3, -u_2).
+    # The weights of the second conic, (p u_2 - q u_3, u_3, -u_2), are orthogonal to u.
     v = torch.stack(((p * u2).addcmul_(q, u3, value=-1.0), u3, -u2))
     u, v, h = _turned(torch.stack((u, v, h), 1), turn).unbind(1)
     slope, offset = _lines(u, h, pairs)
@@ -201,12 +199,12 @@ def _refined(candidates: Tensor, p: Tensor, q: Tensor, b: Tensor) -> Tensor:
     h1, h2, h3 = 0.5 * b
     after, before = candidates.roll(-1, 0), candidates.roll(1, 0)
     d = after - before
-    # The squared edges e; the equations are e2 = q e1 and e3 = p e1.
+    # The squared edges have to satisfy e2 = q e1 and e3 = p e1.
     e1, e2, e3 = (d * d).addcmul_(b[:, None, None], after.mul_(before))
     d1, d2, d3 = d
     r2, r3 = torch.addcmul(e2, q, e1, value=-1.0), torch.addcmul(e3, p, e1, value=-1.0)
-    # Half the derivatives: e12 of e1 by dist2, e13 of -e1 by dist3, e23 of e2 by dist3, e32 of -e3 by dist2. They give
-    # half the derivatives r22 and r32 of -r2 and -r3 by dist2, and r23 and r33 of r2 and r3 by dist3.
+    # e12 = ½ ∂e1/∂dist2, e13 = -½ ∂e1/∂dist3, e23 = ½ ∂e2/∂dist3, e32 = -½ ∂e3/∂dist2,
+    # r22 = -½ ∂r2/∂dist2, r32 = -½ ∂r3/∂dist2, r23 = ½ ∂r2/∂dist3, r33 = ½ ∂r3/∂dist3.
     e12, e13 = torch.addcmul(d1, h1, dist3), d1.addcmul_(h1, dist2, value=-1.0)
     e23, e32 = d2.addcmul_(h2, dist1), d3.addcmul_(h3, dist1, value=-1.0)
     r22, r23 = q * e12, e23.addcmul_(q, e13)
@@ -223,15 +221,14 @@ def _distances(p: Tensor, q: Tensor, r: Tensor, b: Tensor, g: Tensor) -> Tensor:
     """Solve the law of cosines for a triangle whose edge 1 is the longest edge and has the length 1.
 
     Args:
-        p: squared edge 3, (C,).
-        q: squared edge 2, (C,).
-        r: ``1 - p - q``, (C,). The caller can compute this number more accurately.
-        b: see the module, (3, C).
-        g: see the module, (C,).
+        p: squared length of edge 3, (C,).
+        q: squared length of edge 2, (C,).
+        r: ``1 - p - q``, (C,), without the rounding of these subtractions.
+        b: squared lengths of the differences of the rays, see the module, (3, C).
+        g: squared determinant of the rays, (C,).
 
     Returns:
-        Four candidates for the distances of the points, (3, 2, 2, C). All are finite, and the first distance is not
-        negative.
+        Four candidates for the three distances, (3, 2, 2, C). All distances are finite. The first is not negative.
     """
     dist = _refined(_candidates(p, q, r, b, g), p, q, b)
     dist1, dist2, dist3 = dist
@@ -251,10 +248,10 @@ def _cross(v: Tensor, w: Tensor) -> Tensor:
 
 
 def _axes(base: Tensor, side: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Axes and sizes of a triangle with two given sides.
+    """Axes and sizes of a triangle from its base and another side.
 
-    Returns unit vectors along the base and along the height, the inverse length of the base, the component of the other
-    side along the base, and the squared height.
+    Returns the unit vectors along the base and along the height, the inverse length of the base, the component of the
+    other side along the base, and the squared height.
     """
     tiny = torch.finfo(base.dtype).tiny
     inv_base = _dot(base, base).clamp_(min=tiny).rsqrt_()
@@ -266,15 +263,14 @@ def _axes(base: Tensor, side: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, T
 
 
 def _edges(points: Tensor) -> Tensor:
-    """The edges opposite to each of three points (3, *, C)."""
+    """The three edges of a triangle (3, *, C). Edge k is opposite to point k."""
     return points.roll(1, 0) - points.roll(-1, 0)
 
 
 def _solve_chunk(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Rotations (3, 3, 2, 2, C), translations (3, 2, 2, C), and which poses are solutions (2, 2, C)."""
+    """Rotations (3, 3, 2, 2, C), translations (3, 2, 2, C), and whether each pose is a solution (2, 2, C)."""
     finfo = torch.finfo(world_points.dtype)
-    # Components of world points and image points, 0 for unsound problems. Each triple of points is then turned so that
-    # the longest edge is opposite to the first point.
+    # Shift the three points cyclically, so that the longest edge is opposite to the first point.
     points = torch.cat((world_points.permute(1, 2, 0), plane_points.permute(1, 2, 0)), 1)  # (3, 5, C)
     sound = points.abs().sum((0, 1)) <= finfo.max**0.2  # larger numbers could overflow
     points = torch.where(sound, points, 0.0)
@@ -288,7 +284,6 @@ def _solve_chunk(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Te
     rest = 1.0 - along
     p, q = (along * along).add_(sq_height), (rest * rest).add_(sq_height)
     r = rest.mul_(along).sub_(sq_height).mul_(2.0)
-    # The rays, their differences, and their determinant.
     depths = plane.square().sum(1, keepdim=True).add_(1.0).rsqrt_()
     rays = torch.cat((plane * depths, depths), 1)  # (3, 3, C)
     sound.bitwise_and_(depths.amin((0, 1)) > MIN_DEPTH_RATIO)
@@ -296,18 +291,17 @@ def _solve_chunk(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Te
     det = _dot(_cross(gaps[1], gaps[2]), rays[0])
     dist = _distances(p, q, r, gaps.square_().sum(1), det.mul_(det))
 
-    # Above, the longest edge has the length 1. From here on lengths are in the unit of the world.
+    # Up to here the longest edge has the length 1. From here on lengths have the unit of the world points.
     base_length = inv_base.reciprocal()
     y1, y2, y3 = (dist * base_length)[:, None] * rays[:, :, None, None]
     cam1, cam2, cam_inv_base, cam_along, cam_sq_height = _axes(y3 - y2, y1 - y2)
-    # Differences of the two triangles relative to the base: of the base, of the other side's component along the base,
-    # and of the squared height.
+    # The camera triangle is compared with the world triangle, relative to the base of the world triangle.
     base_error = (cam_inv_base * base_length).sub_(1.0)
     along_error = torch.addcmul(-along, cam_along, inv_base)
     height_error = torch.addcmul(-sq_height, cam_sq_height, inv_sq_base)
     sq_error = base_error.mul_(base_error).addcmul_(along_error, along_error).addcmul_(height_error, height_error)
     least = dist.amin(0)
-    # No distance is larger than dist[0] + 1 (the longest edge is 1).
+    # No distance exceeds dist[0] + 1, because the longest edge is 1.
     room = torch.addcmul(least, least, dist[0]).sub_(_CLOSE * finfo.eps**_ERROR_POWER)
     room.mul_(sound * finfo.eps ** (2 * _ERROR_POWER)).clamp_(max=_LARGEST_ERROR**2)
 
@@ -320,7 +314,7 @@ def _solve_chunk(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Te
 
 
 def _solve(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Tensor]:
-    """Components of rotations and translations (12, 4, B), and which poses are solutions (4, B)."""
+    """Components of rotations and translations (12, 4, B), and whether each pose is a solution (4, B)."""
     batch = world_points.shape[0]
     if compiling():
         rotation, translation, found = _solve_chunk(world_points, plane_points)
@@ -328,7 +322,7 @@ def _solve(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Tensor]:
     out = world_points.new_empty(12, 2, 2, batch)
     valid = torch.empty(2, 2, batch, dtype=torch.bool, device=world_points.device)
     chunk = kept_at_once(_CHUNK_BYTES, world_points) // world_points.element_size()
-    with torch.inference_mode():  # an eighth faster than `no_grad`; `out` and `valid` remain ordinary tensors
+    with torch.inference_mode():  # faster than `no_grad` by an eighth
         for start in range(0, batch, chunk):
             part = slice(start, start + chunk)
             rotation, translation, valid[..., part] = _solve_chunk(world_points[part], plane_points[part])
@@ -337,7 +331,7 @@ def _solve(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class _Solve(torch.autograd.Function):
-    """:func:`_solve` with a rule for ``torch.func.vmap``, which cannot map operations that write in place."""
+    """:func:`_solve` with a rule for ``torch.func.vmap``, because ``vmap`` cannot map in-place operations."""
 
     @staticmethod
     def forward(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Tensor]:
@@ -362,27 +356,28 @@ class _Solve(torch.autograd.Function):
 def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
     r"""Find all poses that project three world points exactly onto three image points, for a batch of problems.
 
-    Use this function for problems of exactly three pairs: most solvers reject a pose that no fourth pair confirms
-    (:attr:`~kornia_pnpnet.result.Status.NOT_BELIEVED`).
+    Use this function for problems of exactly three pairs. Most solvers reject the pose of three pairs, because
+    no fourth pair confirms the pose (:attr:`~kornia_pnpnet.result.Status.NOT_BELIEVED`).
 
     Convention: ``x_cam = R x_world + t``, the camera looks along +z.
 
-    The poses carry no gradient. The batch is the last dimension in memory, which makes arithmetic on many poses faster.
+    The poses have no gradient. The batch is the last dimension in memory.
 
     Source: M. Persson and K. Nordberg, "Lambda Twist", ECCV 2018; Y. Ding et al., "Revisiting the P3P Problem", CVPR
-    2023; details in :mod:`kornia_pnpnet.propose.p3p`.
+    2023. See :mod:`kornia_pnpnet.propose.p3p`.
 
     Args:
-        world_points: points in any unit, shape :math:`(B, 3, 3)`. Any leading dimensions may replace :math:`B`, in both
-            arguments and in the result; a single problem needs none.
-        plane_points: :math:`(x/z, y/z)` of the points in the camera frame, shape :math:`(B, 3, 2)`. Kornia's
-            ``normalize_points_with_intrinsics`` computes them from pixels.
+        world_points: points in any unit, shape :math:`(B, 3, 3)`. Any number of leading dimensions may replace
+            :math:`B` in both arguments. The result has the same leading dimensions.
+        plane_points: normalised image coordinates :math:`(x/z, y/z)`, shape :math:`(B, 3, 2)`. Kornia's
+            ``normalize_points_with_intrinsics`` computes these coordinates from pixels.
 
     Returns:
-        Four slots per problem, in float64 if an argument is float64, else in float32. A slot is valid when its pose is
-        a solution with all three points in front of the camera. A double solution fills one slot. Invalid slots are
-        finite. A problem has no valid slot when the points lie on a line, when a coordinate is NaN or infinite, or when
-        a ray is nearly orthogonal to the optical axis (``MIN_DEPTH_RATIO`` of :mod:`kornia_pnpnet.refine.residual`).
+        Four slots per problem. The dtype is float64 if an argument is float64, else float32. A slot is valid when its
+        pose is a solution with all three points in front of the camera. Invalid slots contain finite numbers. A double
+        solution fills one slot. A problem has no valid slot when the points lie on a line, when a coordinate is not
+        finite, or when a ray is nearly orthogonal to the optical axis. (See ``MIN_DEPTH_RATIO`` in
+        :mod:`kornia_pnpnet.refine.residual`.)
 
     Raises:
         ShapeError: when a tensor has another shape, or the batches differ.
@@ -415,9 +410,9 @@ def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
 class P3P(Configured):
     r"""Minimal solver of three pairs for :class:`~kornia_pnpnet.propose.ransac.RANSAC`: :func:`p3p` as a module.
 
-    With an unknown focal length :func:`p3p` solves each sample at focal lengths on a grid. The grid divides the range
-    of :class:`~kornia_pnpnet.refine.terms.CameraTerm` evenly in logarithms. Least squares on all inliers, with the
-    focal length as a parameter, then find focal lengths between the points of the grid.
+    If the focal length is unknown, :func:`p3p` solves each sample at every focal length of a grid. The grid covers the
+    range of :class:`~kornia_pnpnet.refine.terms.CameraTerm` with a constant ratio between neighbours.
+    Refinement on all inliers then finds a focal length between the points of the grid.
 
     Example:
         >>> problem = Problem.of(torch.randn(7, 3, 3), torch.randn(7, 3, 2))
@@ -432,7 +427,7 @@ class P3P(Configured):
         super().__init__(locals())
 
     def hypotheses(self, problem: Problem) -> Hypotheses:
-        """Four slots per sample and focal length of the grid, without gradients; see MinimalSolver.hypotheses."""
+        """Four slots per sample, or per sample and focal length of the grid. See MinimalSolver.hypotheses."""
         plane = problem.img_points / problem.focal
         if problem.free_focal is None:
             return p3p(problem.world_points, plane)

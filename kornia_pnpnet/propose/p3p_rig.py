@@ -16,7 +16,7 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["P3PRig"]
 
-# Largest relative error of a side of the triangle in a solution.
+# A pose is a solution when the relative error of each side of the triangle is below this number.
 _EXACT = 1e-3
 
 
@@ -24,12 +24,12 @@ class P3PRig(Configured):
     r"""Minimal solver of three pairs of a rig: the central approximation, then Newton's method on the exact equations.
 
     In the central approximation all rays start at the mean of the camera centres, and :func:`p3p` finds up to four
-    poses. From each pose Newton's method finds the distances along the exact rays: at the solution the three points are
-    as far from each other as in the world. The exact problem has up to eight poses (D. Nistér, "A minimal solution to
-    the generalised 3-point pose problem", CVPR 2004); this solver finds at most four of them.
+    poses. From each pose, Newton's method finds distances along the exact rays. At a solution, the sides of the camera
+    triangle are as long as the sides of the world triangle. The exact problem has up to eight solutions (D. Nistér, "A
+    minimal solution to the generalised 3-point pose problem", CVPR 2004). This solver finds at most four solutions.
 
     Args:
-        steps: number of Newton steps; 0 is enough when all camera centres coincide.
+        steps: number of Newton steps. If all camera centres coincide, 0 steps suffice.
     """
 
     #: Number of pairs in a sample.
@@ -40,11 +40,11 @@ class P3PRig(Configured):
         self.steps = steps
 
     def hypotheses(self, problem: Problem) -> Hypotheses:
-        """Four slots per sample, without gradients. All are invalid if a ray is over 90 degrees from the mean ray."""
+        """Four slots per sample; none is valid if the angle between a ray and the mean ray is 90 degrees or more."""
         problem = problems_last(problem)
         assert problem.rig is not None
         batch = problem.weights.shape[0]
-        # Dimensions: pairs, coordinates, problems, (3, 3, B).
+        # The dimensions are pairs, coordinates and problems, (3, 3, B).
         world, rays, back = (
             x.permute(1, 2, 0) for x in (problem.world_points, problem.places, problem.rig.translation)
         )
@@ -56,16 +56,16 @@ class P3PRig(Configured):
         plane = torch.where(ahead > 0, seen[:, :2] / ahead, torch.inf)
         solved = p3p(problem.world_points, plane.permute(2, 0, 1))
         away = ((centres.mean(0) - centres) * rays).sum(1)
-        # The slots of all samples are the last dimension: (3, 3, 4 B), (3, 4 B) and (4 B,).
+        # Rotations (3, 3, 4 B), translations (3, 4 B) and flags (4 B,); the last dimension contains all slots.
         (rotation, translation), valid = map_tensors(lambda x: x.movedim((0, 1), (-1, -2)).flatten(-2), solved)
         slots = torch.arange(4 * batch, device=rays.device)
-        if sees_values(rays):  # a graph also processes slots without a solution
+        if sees_values(rays):  # keep only the slots with a solution
             slots = valid.nonzero()[:, 0]
         rotation, translation = (x.index_select(-1, slots) for x in (rotation, translation))
         world, rays, centres, seen, away = (
             x.contiguous().index_select(-1, slots % batch) for x in (world, rays, centres, seen, away)
         )
-        # Newton's method starts at the points on the exact rays closest to the points of the central approximation.
+        # Newton's method starts with the points of the central approximation, projected onto the exact rays.
         cam = small_product(world, rotation.transpose(0, 1)) + translation
         rotation, translation, exact = _newton(world, rays, centres, (cam * seen).sum(1) + away, self.steps)
         exact = exact & valid[slots]
@@ -83,11 +83,11 @@ class P3PRig(Configured):
 def _newton(
     world_points: Tensor, rays: Tensor, centres: Tensor, ranges: Tensor, steps: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    r"""Find the distances along three rays at which the points are as far from each other as in the world.
+    r"""Find distances along three rays such that the camera triangle is congruent to the world triangle.
 
-    The distances :math:`d`, ``ranges`` (3, M), solve :math:`\|c_i + d_i r_i - c_j - d_j r_j\|^2 = \|x_i - x_j\|^2` for
-    the world points :math:`x`, the rays :math:`r` of length 1 and their centres :math:`c`, (3, 3, M) each. Returns
-    rotations, translations, and whether the equations hold with all distances positive.
+    The equations are :math:`\|c_i + d_i r_i - c_j - d_j r_j\|^2 = \|x_i - x_j\|^2`, with world points :math:`x`, unit
+    rays :math:`r` and centres :math:`c` (3, 3, M). The distances :math:`d` start at ``ranges`` (3, M). Returns the
+    rotations, the translations, and whether the equations hold and all distances are positive.
     """
     first, second = [0, 0, 1], [1, 2, 2]
     sides = (world_points[first] - world_points[second]).square().sum(1)  # (3, M)
@@ -103,7 +103,7 @@ def _newton(
         steps_by_det = torch.stack((g * d * e + b * both, a * both + g * c * f, b * c * k + e * (g * c - a * h)))
         ranges = ranges + steps_by_det / (a * d * e - b * c * f)
     exact = (gap.abs() < _EXACT * sides).all(0) & (ranges > 0).all(0)
-    # The rotation maps two sides and the normal of the world triangle to those of the camera triangle.
+    # The rotation maps two sides and the normal of the world triangle to their counterparts of the camera triangle.
     cam = [-edge[0], -edge[1], torch.linalg.cross(edge[0], edge[1], dim=0)]
     world = [world_points[1] - world_points[0], world_points[2] - world_points[0]]
     normal = torch.linalg.cross(*world, dim=0)

@@ -1,10 +1,10 @@
-r"""EPPnP and REPPnP: the null space of the projection equations; REPPnP rejects outliers by their algebraic error.
+r"""EPPnP and REPPnP: a pose from the null space of the projection equations. REPPnP also rejects outliers.
 
-In the camera frame the four control points of :mod:`kornia_pnpnet.propose.epnp` are twelve unknowns. A pair gives two
-equations, :math:`X_i - u_i Z_i = 0` and :math:`Y_i - v_i Z_i = 0`. The algebraic error is the residual of these
-equations. It is the pixel error times the depth over the focal length, a length. In an array ``rows`` (B, K + 1, 2 N)
-the first K rows are the derivatives of the errors by K unknowns, and the last row is the errors. The columns are the
-errors of all u, then the errors of all v.
+The twelve unknowns are the camera coordinates of four control points (see :mod:`kornia_pnpnet.propose.epnp`). A pair
+gives two equations, :math:`X_i - u_i Z_i = 0` and :math:`Y_i - v_i Z_i = 0`. The algebraic errors of the pair are the
+residuals of the two equations, in the unit of the world points. In an array ``rows`` (B, K + 1, 2 N), the first K rows
+are the derivatives of the algebraic errors with respect to K unknowns. The last row is the algebraic errors. The first
+N columns are the errors in u, and the last N columns are the errors in v.
 """
 
 from __future__ import annotations
@@ -25,50 +25,49 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["REPPnP"]
 
-# Least number of pairs that are kept. The 11 unknowns of the null vector need 6 pairs, and the 6 unknowns of a rigid
-# motion need 3 pairs. One or two more pairs are necessary for errors to show.
+# Outlier rejection keeps at least this number of pairs. A null vector has 11 unknowns and needs 6 pairs. A rigid motion
+# has 6 unknowns and needs 3 pairs. One or two further pairs give outliers a residual.
 _NULL_FLOOR, _RIGID_FLOOR = 7, 5
-# Least number of pairs of a problem that is `ok`.
+# A problem needs at least this number of pairs to be `ok`.
 _MIN_PAIRS = 4
-# Weight of the squared depths of the control vectors during outlier rejection. Values from 1e-3 to 3e-2 work equally
-# well on the protocol's problems.
+# Ridge on the depths of the control vectors during outlier rejection. On the protocol's problems, all values from
+# 1e-3 to 3e-2 give the same success.
 _DEPTH_PRIOR = 5e-3
-# Weight of the squared depths for the last null vector, small enough to keep the small depths of a narrow view.
+# Ridge on the same depths after outlier rejection. A larger ridge would suppress the small depths of a narrow view.
 _FINAL_DEPTH_PRIOR = 1e-5
-# Number of iterations of rejection with the null vector, and with the rigid motion.
+# Number of iterations of outlier rejection, first with the null vector, then with the rigid motion.
 _NULL_ITERATIONS, _RIGID_ITERATIONS = 3, 4
-# Added to 1 minus the leverage, which is 0 when a pair alone determines an unknown.
+# This number is added to 1 minus the leverage of a pair, because the leverage can be 1.
 _LEVERAGE_RIDGE = 1e-6
 
 
 class REPPnP(Initialiser):
-    r"""Null space of the projection equations, algebraic outlier rejection, and the pose of the remaining pairs.
+    r"""A pose from the null space of the projection equations, with outlier rejection by the algebraic error.
 
-    Each iteration finds the null vector of the kept pairs, and then keeps the pairs whose algebraic error is at most
-    :math:`\max(Q, \delta_{\max})`, with a quantile :math:`Q` of the errors. The first iteration uses all pairs. The
-    last null vector is aligned with the world (orthogonal Procrustes). Without rejection the method is EPPnP.
+    Each iteration finds the null vector of the kept pairs. Then a pair is kept if its algebraic error is at most
+    :math:`\max(Q, \delta_{\max})`, where :math:`Q` is a quantile of the errors. The first iteration uses all pairs. The
+    last null vector is aligned with the world by orthogonal Procrustes. Without rejection the method is EPPnP.
 
     Source: L. Ferraz, X. Binefa and F. Moreno-Noguer, "Very Fast Solution to the PnP Problem with Algebraic Outlier
     Rejection", CVPR 2014. Our changes improve success on the protocol's problems or allow batches:
 
-    - The null vector is scaled so that the centroid has depth 1; the paper scales its length to 1. Our null vector
-      solves a linear system, and does not depend on the control points, the frame or the unit. A small ridge keeps the
-      other depths close to the depth of the centroid. With the ridge, outliers change the fit less, and a narrow view
-      is treated as weak perspective.
-    - Pairs are compared by their leave-one-out error. The quantile is the median instead of 25 %, and at least 7 pairs
-      are kept.
-    - A second loop has a rigid motion and one Gauss-Newton step on its algebraic error per iteration; it keeps at least
-      5 pairs. The final pose minimises this error. The paper instead alternates between the span of four null vectors
-      and rigid points.
+    - We scale the null vector so that the centroid has depth 1. The paper scales the null vector to length 1. Our null
+      vector solves a linear system, and does not depend on the control points, the frame or the unit. A small ridge
+      pulls all points toward the depth of the centroid. The ridge reduces the effect of outliers.
+    - Outliers are rejected by their leave-one-out error. Our quantile is 50 %, and the paper's quantile is 25 %. At
+      least 7 pairs are kept.
+    - A second loop rejects outliers with a rigid motion. Each iteration takes one Gauss-Newton step on the algebraic
+      error, and keeps at least 5 pairs. The final pose minimises the algebraic error of the kept pairs. The paper
+      alternates between a combination of four null vectors and a rigid motion.
     - Both loops have a fixed length. The paper's loop stops when the quantile no longer decreases.
 
-    Gradients: the selection is piecewise constant. The last Gauss-Newton steps start from a detached pose, and their
-    gradient is the gradient of the minimum.
+    The selection of pairs has no gradient. The last Gauss-Newton steps start from a detached pose, and their gradient
+    is the gradient of the minimum.
 
     Args:
-        reject_outliers: whether outliers are rejected; otherwise all pairs are kept.
+        reject_outliers: whether outliers are rejected. If ``False``, all pairs are kept.
         max_error: :math:`\delta_{\max}` as a share of the root mean square radius of the world.
-        quantile: least share of the pairs that is kept, in (0, 1].
+        quantile: share of the pairs, in (0, 1]. At least this share is kept.
         refine_iterations: number of Gauss-Newton steps after the last rejection, at least 1.
 
     Raises:
@@ -106,9 +105,9 @@ class REPPnP(Initialiser):
         """Find the pose and the inliers of a problem in the solver's frame.
 
         Returns:
-            The pose, weights of 1 for kept pairs and 0 for outliers, and ``ok``. A problem is not ``ok`` with fewer
-            than 4 pairs, with points on a line, when the equations do not determine a pose, or when the centroid of the
-            points is behind the camera.
+            The pose, weights, and ``ok``. The weight is 1 for kept pairs and pairs not of normal scale, else 0. A
+            problem is not ``ok`` with fewer than 4 pairs, with points on a line, if the equations do not determine a
+            pose, or if the centroid of the points is behind the camera.
         """
         problem = problem._replace(weights=problem.usual_weights)
         with torch.no_grad():
@@ -116,7 +115,7 @@ class REPPnP(Initialiser):
         centroid = control.points[:, 0, :, None]
         mean_square = control.points[:, 1:].square().sum((1, 2))
         radius = torch.where(control.ok, mean_square, 1.0).sqrt()
-        # The sum of the weights has no gradient, because the pose does not depend on the sum.
+        # The sum of the weights needs no gradient, because the pose does not depend on this sum.
         total = problem.weights.detach().sum(-1, keepdim=True)
         pairs = _Pairs(
             (problem.world_points.mT - centroid) / radius[:, None, None],
@@ -126,7 +125,7 @@ class REPPnP(Initialiser):
         )
         with torch.no_grad():
             weights, pose = self._select(pairs, control)
-        weights = torch.where(weights > 0, pairs.weights, 0.0)  # with gradient
+        weights = torch.where(weights > 0, pairs.weights, 0.0)  # these weights have a gradient
         ok = control.ok & (pairs.there.sum(-1) >= _MIN_PAIRS)
         for i in range(self.refine_iterations):
             normal = _normal_matrix(_linearize(pairs, pose), weights)
@@ -135,26 +134,26 @@ class REPPnP(Initialiser):
         ok = ok & (pose.translation[:, 2] > 0)
         offset = (pose.rotation @ centroid)[..., 0]
         pose = Pose(pose.rotation, pose.translation * radius[:, None] - offset)
-        kept = (weights > 0) | (problem.usual == 0)  # the solver decides about pairs that are not of normal scale
+        kept = (weights > 0) | (problem.usual == 0)  # pairs not of normal scale are left to the solver
         return Starts(pose, kept.to(problem.weights.dtype), ok)
 
     def _select(self, pairs: _Pairs, control: ControlPoints) -> tuple[Tensor, Pose]:
-        """Weights, which are 0 for outliers, and a pose that fits the kept pairs, in the frame of :class:`_Pairs`."""
+        """Weights (0 for outliers), and a pose of the kept pairs in the frame of :class:`_Pairs`."""
         coordinates = control.coordinates.mT.contiguous()  # (B, 4, N)
-        # The mean is subtracted from the pixels. This shear of the camera frame changes no error, but reduces rounding
-        # in a narrow view.
+        # The mean is subtracted from the pixels. This shear of the camera frame does not change the algebraic errors.
+        # In a narrow view the shear reduces rounding.
         mean = (control.weights[:, None] * pairs.plane).sum(-1, keepdim=True)  # (B, 2, 1)
         zero = torch.zeros_like(coordinates)
         by_x, by_y = torch.cat((coordinates, zero), -1), torch.cat((zero, coordinates), -1)
         by_z = -(pairs.plane - mean).flatten(1)[:, None] * coordinates.repeat(1, 1, 2)
         parts = by_x[:, :1], by_y[:, :1], by_x[:, 1:], by_y[:, 1:], by_z[:, 1:], by_z[:, :1]
-        rows, weights = torch.cat(parts, 1), pairs.weights  # the depth of the centroid is 1
+        rows, weights = torch.cat(parts, 1), pairs.weights  # the last row is for the centroid's depth, 1
         for _ in range(_NULL_ITERATIONS if self.reject_outliers else 0):
             inverse, null = _null_vector(rows, weights, _DEPTH_PRIOR)
             errors = _leave_one_out(torch.cat((rows[:, :-1], null.mT @ rows), 1), inverse, pairs, weights)
             sq_size = null[:, 2:-1].square().sum(1).clamp(min=torch.finfo(null.dtype).eps ** 2)
             weights = self._keep(pairs, errors / sq_size, _NULL_FLOOR)
-        # Find the rigid motion that fits the null vector best.
+        # Align the last null vector with the world.
         _, null = _null_vector(rows, weights, _FINAL_DEPTH_PRIOR)
         centroid, vectors = torch.cat((null[:, :2], null[:, -1:]), 1), null[:, 2:-1].view(-1, 3, 3)
         camera = torch.cat((centroid, vectors), 2)  # (B, 3, 4)
@@ -171,7 +170,7 @@ class REPPnP(Initialiser):
         return weights, pose
 
     def _keep(self, pairs: _Pairs, sq_error: Tensor, floor: int) -> Tensor:
-        """Weights (B, N), 0 where the error exceeds both quantile and limit; at least ``floor`` pairs are kept."""
+        """Weights (B, N), 0 if the error exceeds the quantile and the limit. At least ``floor`` pairs are kept."""
         rank = (self.quantile * pairs.there.sum(-1, keepdim=True)).ceil().long().clamp(min=floor)  # (B, 1)
         rank = rank.clamp(max=sq_error.shape[-1]) - 1
         ascending = torch.where(pairs.there, sq_error, torch.inf).sort(-1).values
@@ -180,42 +179,42 @@ class REPPnP(Initialiser):
 
 
 class _Pairs(NamedTuple):
-    """Pairs in a world with the centroid 0 and a root mean square radius of 1."""
+    """Pairs. The world points have the centroid 0 and the root mean square radius 1."""
 
     world: Tensor  # (B, 3, N)
-    plane: Tensor  # u and v: pixel over focal length, (B, 2, N)
-    weights: Tensor  # with the sum 1, (B, N)
+    plane: Tensor  # u and v, pixels over the focal length, (B, 2, N)
+    weights: Tensor  # normalised to the sum 1, (B, N)
     there: Tensor  # whether the weight is not 0, bool, (B, N)
 
 
 def _normal_matrix(rows: Tensor, weights: Tensor) -> Tensor:
-    """Normal matrix of ``rows`` (see the module), with the gradient as the last column, (B, K, K + 1)."""
+    """Normal equations (B, K, K + 1) of ``rows`` (see the module). The last column is the gradient."""
     return (rows[:, :-1] * weights.repeat(1, 2)[:, None]) @ rows.mT
 
 
 def _inverse(normal: Tensor, ridge: Tensor | float = 0.0) -> Tensor:
-    """Inverse of normal matrices plus a ridge; the ridge makes singular matrices invertible."""
+    """Inverse of the normal matrix plus a ridge. A tiny ridge is always added, so that the inverse exists."""
     ridge = torch.diag_embed(normal.new_zeros(normal.shape[1]) + ridge + 32.0 * torch.finfo(normal.dtype).eps)
     return torch.linalg.inv_ex(normal[..., :-1] + ridge).inverse
 
 
 def _null_vector(rows: Tensor, weights: Tensor, depth_prior: float) -> tuple[Tensor, Tensor]:
-    """Inverse normal matrix, and the null vector (B, 12, 1): x and y, the depths, and the depth 1 of the centroid."""
+    """Inverse normal matrix (B, 11, 11), and the null vector (B, 12, 1). The last entry is the centroid's depth 1."""
     normal = _normal_matrix(rows, weights)
     inverse = _inverse(normal, depth_prior * (torch.arange(11, device=normal.device) >= 8))
     return inverse, torch.cat((-(inverse @ normal[..., -1:]), torch.ones_like(normal[:, :1, :1])), 1)
 
 
 def _linearize(pairs: _Pairs, pose: Pose) -> Tensor:
-    """Rows (see the module) of the algebraic errors and their derivatives by the tangent of ``retract``, (B, 7, 2N)."""
+    """The algebraic errors and their derivatives with respect to the tangent vector of ``retract``, (B, 7, 2 N)."""
     u, v = pairs.plane.unbind(1)
     x, y, z = (pose.rotation @ pairs.world).unbind(1)  # (B, N) each
     tx, ty, tz = pose.translation[..., None].unbind(1)
     depth = z + tz
     one, zero = torch.ones_like(u), torch.zeros_like(u)
     rows = (
-        *(-u * y, -z - v * y, z + u * x, v * x, -y, x),  # by the rotation: for each axis the errors of u, then of v
-        *(one, zero, zero, one, -u, -v),  # by the translation
+        *(-u * y, -z - v * y, z + u * x, v * x, -y, x),  # rotation: errors in u and in v for each axis
+        *(one, zero, zero, one, -u, -v),  # translation
         *(x + tx - u * depth, y + ty - v * depth),
     )
     return torch.stack(rows, 1).view(u.shape[0], 7, 2 * u.shape[1])
@@ -227,10 +226,10 @@ def _step(pose: Pose, normal: Tensor) -> Pose:
 
 
 def _leave_one_out(rows: Tensor, inverse: Tensor, pairs: _Pairs, weights: Tensor) -> Tensor:
-    r"""Change of the cost when a kept pair is removed or a rejected pair is added, divided by its weight, (B, N).
+    r"""Squared leave-one-out errors (B, N): change of the cost if a kept pair is removed or a rejected pair is added.
 
-    The value is :math:`e^\top (1 \mp w H)^{-1} e` with the two errors :math:`e` of a pair and the leverage :math:`H`,
-    which follows from ``rows`` and the inverse normal matrix. The sign is minus for kept pairs, else plus.
+    The change is divided by the weight :math:`w` of the pair. The result is :math:`e^\top (1 \mp w H)^{-1} e`, where
+    :math:`e` are the two errors and :math:`H` is the leverage. The sign is minus for kept pairs, else plus.
     """
     jacobian, count = rows[:, :-1], weights.shape[-1]
     solved = inverse @ jacobian
@@ -242,7 +241,7 @@ def _leave_one_out(rows: Tensor, inverse: Tensor, pairs: _Pairs, weights: Tensor
 
 
 def _determined(normal: Tensor) -> Tensor:
-    """Whether the normal matrices have full rank, bool (B,)."""
+    """Whether each normal matrix has full rank, bool (B,)."""
     matrix = normal.detach()[..., :6]
     factor, info = torch.linalg.cholesky_ex(matrix)
     pivots = factor.diagonal(dim1=-2, dim2=-1).square()

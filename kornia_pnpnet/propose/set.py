@@ -1,4 +1,4 @@
-"""A network on a set of pairs, in any number and order, that estimates poses, weights and noise."""
+"""A network on a set of pairs that estimates poses, weights and noise. Pairs have any number and any order."""
 
 from __future__ import annotations
 
@@ -24,43 +24,44 @@ __all__ = ["SetInit"]
 
 _T = TypeVar("_T")
 
-# Number of features per pair: 3 of the world, 2 of the image, 2 of the residual, 3 of the problem, 2 of the noise, and
-# 2 flags. Confidences add 2 features (logit and flag). Repeats add 2 features, see `repeats`.
+# Number of features of a pair: 3 coordinates of the point, 2 of the pixel, 2 residuals, 3 features of the problem, 2
+# logarithms of noise and 2 flags. Confidences and repeats add 2 features each, see `View`.
 _FEATURES = 14
-# Least number of pairs for a softmax over rows: PyTorch 2.13 is slow at shorter rows.
+# The softmax is computed over rows of at least this number of pairs. PyTorch 2.13 is slow for shorter rows.
 _SHORT = 16
-# Number that is added to the attention score of padding.
+# This number is added to the attention score of padding.
 _ABSENT = -1e9
-# Minimal samples, as ranks of pairs by likelihood. The first six are a Turán system: if any two of the six likeliest
-# pairs are outliers, at least one of the six samples has only inliers. No five samples have this property.
+# Minimal samples. A number is the rank of a pair in descending order of likelihood. The first six samples are a Turán
+# system: if two of the six likeliest pairs are outliers, at least one of the six samples has only inliers.
 _SAMPLES = ((0, 1, 2), (0, 1, 3), (2, 3, 4), (2, 3, 5), (0, 4, 5), (1, 4, 5), (0, 2, 3), (1, 2, 3))
-# Problems of at least 18, 24 and 30 pairs have further samples: the same samples with their ranks multiplied by 3, 4
-# and 5. They help when the likeliest pairs are outliers that agree with each other.
+# Each entry is a number of pairs and a factor. Problems with at least this number of pairs have the samples above
+# again, with all ranks multiplied by the factor. These samples help if the likeliest pairs are outliers of one pose.
 _SPREADS = ((18, 3), (24, 4), (30, 5))
-# Problems of at least 36 pairs have 25 further samples. Each of the 25 likeliest pairs is in three of these samples,
-# and no two pairs are together in two samples.
+# Problems with at least 36 pairs have 25 further samples. Each of the 25 likeliest pairs is in three of these samples.
+# No two of these samples have two pairs in common.
 _RING_FROM = 36
 _RING = [(a, b, c) for i in range(25) for a, b, c in [sorted((i, (i + 1) % 25, (i + 6) % 25))]]
-# Number of top-ranked pairs that score each hypothesis.
+# The 32 likeliest pairs score each hypothesis.
 _MOST_JUDGES = 32
-# Slots for poses of minimal samples. With more slots than this, empty slots are removed before scoring (CPU only).
+# If the minimal samples have more slots than this number, empty slots are removed before scoring (CPU only).
 _MANY_SLOTS = 64
-# Variances. A squared residual of this size halves the score of a pair.
+# A squared residual of this number of variances halves the score of a pair.
 _JUDGED = 50.0
-# Normalised units. Lower bound of the depth by which noise of the points is converted to pixels.
+# The noise of points is converted to pixels at the depth of the world's centre, or at this depth
+# (normalised units) if the centre is closer.
 _LEAST_DEPTH = 0.5
-# Score of a pair with the likelihood 0, relative to a pair with the likelihood 1.
+# Score of a pair with the likelihood 0, relative to the score of a pair with the likelihood 1.
 _LEAST_VOTE = 0.5
-# Number of pairs. Before a search the network sees at most 48 pairs; the search uses all pairs. On real matches
-# (`raw/by_image.npz`, see docs/results) and on random problems of up to 1000 pairs, a network that sees 32 to 96 pairs
-# succeeds as often as a network that sees all pairs.
+# Before a search the network sees at most 48 pairs; the search uses all pairs. We measured success on real matches
+# (`raw/by_image.npz`, see docs/results) and on random problems of up to 1000 pairs. With 32 to 96 pairs the network has
+# the same success as with all pairs.
 _ENOUGH = 48
-# Golden ratio. The fractional parts of its multiples are spread evenly over the unit interval.
+# Fractional parts of the multiples of the golden ratio are spread evenly over the unit interval.
 _GOLDEN = 0.6180339887
 
 
 def _taken(tree: _T, index: Tensor) -> _T:
-    """Take the pairs at positions (B, K) from every tensor (B, N, ...) of pairs, and leave other tensors."""
+    """Select the pairs at positions (B, K) in each tensor (B, N, ...) of pairs. Other tensors do not change."""
 
     def take(x: Tensor) -> Tensor:
         if x.ndim < 2 or x.shape[1] <= index.shape[1]:
@@ -72,10 +73,10 @@ def _taken(tree: _T, index: Tensor) -> _T:
 
 @torch.no_grad()
 def _some_of(present: Tensor, count: int) -> Tensor:
-    """Positions (B, count) of evenly spread present pairs. Absent pairs follow if a problem has fewer present pairs.
+    """Positions (B, count) of present pairs, evenly spread. If these pairs are too few, absent pairs are added.
 
-    Multiples of the golden ratio shift the positions, so that the selection does not follow a periodic pattern in the
-    order of the pairs. The shifts are small enough that no position occurs twice.
+    Multiples of the golden ratio shift the positions. Otherwise the selection could follow a periodic pattern in the
+    order of the pairs. The shifts are small, so that no position occurs twice.
     """
     steps = torch.arange(count, dtype=torch.float64, device=present.device)
     total = present.sum(1, keepdim=True).clamp(min=count)
@@ -86,7 +87,7 @@ def _some_of(present: Tensor, count: int) -> Tensor:
 
 @torch.no_grad()
 def _agreement(problem: Problem, noise: Noise, pose: Pose) -> Tensor:
-    """Agreement (B, N) of each pair with a pose, in [0, 1]; 0 behind the camera."""
+    """Agreement (B, N) of each pair with a pose, in [0, 1]. Points behind the camera have the agreement 0."""
     projection = project(State.of(pose), problems_last(problem))
     variance = _variance(noise, problem.focal, pose)
     agreement = 1.0 / (1.0 + projection.sq_residual / (_JUDGED * variance))
@@ -94,13 +95,13 @@ def _agreement(problem: Problem, noise: Noise, pose: Pose) -> Tensor:
 
 
 def _variance(noise: Noise, focal: Tensor, pose: Pose) -> Tensor:
-    """Variance of each pixel (B, N), for all points at the depth of the centre of the world."""
+    """Variance of the pixels (B, N) from both noises, as if all points had the depth of the world's centre."""
     depth = pose.translation[:, 2:].clamp(min=_LEAST_DEPTH)
     return noise.img.square() + (focal * noise.world / depth).square()
 
 
 def _samples(count: int, number: int, search_follows: bool) -> list[tuple[int, tuple[int, int, int]]]:
-    """Minimal samples of up to ``count`` pairs: the least number of pairs of a problem with the sample, and 3 ranks."""
+    """Numbers and minimal samples (three ranks). Problems with fewer pairs than the number skip the sample."""
     likeliest = [(0, sample) for sample in _SAMPLES[:number] if max(sample) < count]
     if search_follows:  # the search draws further samples
         return likeliest
@@ -110,7 +111,7 @@ def _samples(count: int, number: int, search_follows: bool) -> list[tuple[int, t
 
 
 def _support(rotation: Tensor, translation: Tensor, judges: Tensor) -> Tensor:
-    """Scores (H, B) of rotations (3, 3, H, B) and translations (3, H, B) by the pairs (7, K, B)."""
+    """Scores (H, B) of rotations (3, 3, H, B) and translations (3, H, B). The pairs ``judges`` (7, K, B) score."""
     a, b, c, u, v, vote, precision = judges.unbind()  # (K, B) each
     points = torch.addcmul(translation[:, :, None], rotation[:, 0, :, None], a)  # (3, H, K, B)
     x, y, z = points.addcmul_(rotation[:, 1, :, None], b).addcmul_(rotation[:, 2, :, None], c).unbind()
@@ -123,7 +124,7 @@ def _support(rotation: Tensor, translation: Tensor, judges: Tensor) -> Tensor:
 
 
 class _Block(nn.Module):
-    """A residual layer that maps each pair and a context. Attention pools the context over all pairs."""
+    """A residual layer. Its inputs are the features of a pair, and a context that attention pools over all pairs."""
 
     def __init__(self, width: int, heads: int, hidden: int) -> None:
         super().__init__()
@@ -138,14 +139,14 @@ class _Block(nn.Module):
             self.out.bias.zero_()
 
     def forward(self, x: Tensor, absent: Tensor) -> Tensor:
-        """Map (B * N, width) to the same shape; ``absent`` (B, N) is a large negative number for padding, else 0."""
+        """Map ``x`` (B * N, width) to the same shape. ``absent`` (B, N) is ``_ABSENT`` for padding, else 0."""
         (batch, count), width, heads = absent.shape, x.shape[1], self.heads
         y = self.norm(x)
         values, scores = self.look.weight.split((width, heads))
-        # The scores need no bias, because the softmax over pairs cancels a bias.
+        # The scores have no bias, because the softmax over pairs cancels a bias.
         attention = _attention(y, scores, absent).movedim(0, 1)  # (B, heads, N)
-        # The values are linear in y. The mean of the values is therefore the value of the mean of y, which needs one
-        # product per problem and head instead of one product per pair.
+        # The values are linear in y. The mean of the values is therefore computed from the mean of y, with one product
+        # per problem and head instead of one product per pair.
         means = torch.bmm(attention, y.view(batch, count, width)).movedim(1, 0)  # (heads, B, width)
         bias = self.look.bias[:width].view(heads, 1, -1)
         context = torch.baddbmm(bias, means, values.view(heads, -1, width).mT).movedim(0, 1).reshape(batch, width)
@@ -155,10 +156,9 @@ class _Block(nn.Module):
 
 
 def _attention(x: Tensor, weight: Tensor, absent: Tensor) -> Tensor:
-    """Softmax (C, B, N) over the pairs, of scores that are linear in x (B * N, width).
+    """Softmax (C, B, N), over the pairs, of C scores that are linear in ``x`` (B * N, width).
 
-    If rows of pairs are shorter than a processor's vectors, the softmax is computed over columns, in a tenth of the
-    time.
+    For few pairs, the softmax is computed over columns. Columns take a tenth of the time of short rows.
     """
     scores = torch.addmm(absent.view(1, -1), weight, x.mT).view(weight.shape[0], *absent.shape)
     if compiling() or scores.shape[-1] >= _SHORT or are_few(scores):
@@ -169,21 +169,26 @@ def _attention(x: Tensor, weight: Tensor, absent: Tensor) -> Tensor:
 class SetInit(Initialiser):
     r"""A small network on a set of pairs that estimates several coarse poses, a weight for each pair, and the noise.
 
-    In every residual layer, attention pools a context over all pairs. The cost is therefore linear in the number of
-    pairs, and the order of the pairs has no effect. For each hypothesis the network predicts a weight and a distance
-    along the ray for each point. The pose is the rigid motion that moves the world points to these distances. Poses are
-    equivariant to similarity transforms of the world, and to rotations of the camera except the roll. Intrinsics affect
-    only the rays. The likeliest pairs also form minimal samples of three (see :func:`~kornia_pnpnet.propose.p3p.p3p`).
-    The best pose of these samples, scored by the 32 likeliest pairs, is one more hypothesis, without gradient.
+    In every residual layer, attention pools a context over all pairs. The cost is linear in the number of pairs, and
+    the order of the pairs has no effect. For each hypothesis, the network predicts a weight and a distance of each
+    point from the camera. The pose is the rigid motion that aligns the world points with the points at these distances.
+    Poses are equivariant to similarity transforms of the world, and to rotations of the camera except the roll. The
+    intrinsics affect only the rays.
+
+    The likeliest pairs also form minimal samples of three (see :func:`~kornia_pnpnet.propose.p3p.p3p`). The 32
+    likeliest pairs score the poses of the samples. The best pose is a further hypothesis, and has no gradient.
 
     The weight of a pair is the estimated probability that the pair is an inlier. The network also estimates unknown
-    noise. In place of a covariance the network sees isotropic noise of the same trace. The layers compute in the dtype
-    of the network's weights, and all other operations use the dtype of the correspondences.
+    noise. A covariance is replaced by isotropic noise with the same trace. The layers compute in the dtype of the
+    network's weights, and all other operations use the dtype of the correspondences.
 
-    The design is ours, with three ideas from the literature. Distances along rays before a closed-form alignment: J.
-    Hesch and S. Roumeliotis, "A direct least-squares method for PnP", ICCV 2011. Attention pooled over correspondences:
-    W. Sun et al., "ACNe: Attentive context normalization for robust permutation-equivariant learning", CVPR 2020.
-    Samples: P. Turán's problem for (6, 4, 3), 1941.
+    The design is ours. Three ideas are from the literature:
+
+    - distances along rays, followed by alignment: J. Hesch and S. Roumeliotis, "A direct least-squares method for PnP",
+      ICCV 2011;
+    - attention pooled over correspondences: W. Sun et al., "ACNe: Attentive context normalization for robust
+      permutation-equivariant learning", CVPR 2020;
+    - the samples: P. Turán's problem for (6, 4, 3), 1941.
 
     Args:
         width: number of channels of each pair.
@@ -191,9 +196,10 @@ class SetInit(Initialiser):
         heads: number of attention heads of each layer.
         hidden: number of channels inside a layer.
         starts: number of hypotheses of the network, at least 1.
-        samples: number of minimal samples of the six likeliest pairs, 0 to 8. Problems of at least 18 pairs have more.
+        samples: number of minimal samples of the six likeliest pairs, 0 to 8. Problems of at least 18 pairs have
+            further samples.
         confidence: whether the network sees the ``confidence`` of the correspondences.
-        repeats: whether the network sees how many pairs have the same pixel and how many have the same point.
+        repeats: whether the network sees how many pairs share a pixel and how many pairs share a world point.
 
     Raises:
         BaseError: for numbers out of range, or when ``heads`` does not divide ``width``.
@@ -232,9 +238,9 @@ class SetInit(Initialiser):
         self.first = nn.Linear(_FEATURES + 2 * confidence + 2 * repeats, width)
         self.blocks = nn.ModuleList(_Block(width, heads, hidden) for _ in range(layers))
         self.norm = nn.LayerNorm(width)
-        # Per pair: the logit of being an inlier, and for each hypothesis a weight and a distance along the ray.
+        # Outputs of a pair: the logit of being an inlier, a weight per hypothesis, and a distance per hypothesis.
         self.pair = nn.Linear(width, 1 + 2 * starts)
-        # Per problem: the distance of the world's centre in each hypothesis, and the noise of pixels and of points.
+        # Outputs of a problem: the distance of the world's centre per hypothesis, the noise of pixels and of points.
         self.problem = nn.Linear(width, starts + 2)
         with torch.no_grad():
             for layer, scale in ((self.pair, 0.3), (self.problem, 0.1)):
@@ -246,14 +252,14 @@ class SetInit(Initialiser):
         """Find poses, weights and noise.
 
         Args:
-            problem: pairs in any order, of a centred and scaled world.
+            problem: pairs in any order. The world is centred and scaled.
             search_follows: whether :func:`~kornia_pnpnet.propose.ransac.search_on` follows. The network then sees at
-                most 48 pairs, evenly spread over all pairs, and solves fewer samples. The weight of every other pair is
-                its agreement with the best pose of the samples.
+                most 48 pairs, and solves fewer samples. The weight of a pair that the network does not see is the
+                agreement of the pair with the last hypothesis.
 
         Returns:
-            The pose of the first hypothesis; the poses of the other hypotheses, with the best pose of the samples as
-            the last one; probabilities of being an inlier as weights; the noise of each pair.
+            The poses of all hypotheses, the weights, and the noise of each pair. If ``samples`` is not 0, the
+            last hypothesis is the best pose of the samples.
 
         Raises:
             DeviceError: when the problem and the network are on different devices.
@@ -269,8 +275,8 @@ class SetInit(Initialiser):
         probability = torch.sigmoid(of_pairs[0])
         counts, along = of_pairs[1:].split(starts)  # (S, B, N) each
         away, noise = of_problem.split((starts, 2), -1)
-        # The distance of a point is about the distance of the world's centre plus an offset. With an offset instead of
-        # a factor, the differences of distances do not grow with the distance.
+        # The distance of a point is approximately the distance of the world's centre plus an offset. With a factor
+        # instead of the offset, the relief of the points would grow with the distance.
         distance = (away.clamp(-6.0, 6.0) - view.log_spread).exp().mT[..., None]  # (S, B, 1)
         relief = torch.add(view.height, along, alpha=3.0) / distance
         ranges = distance * relief.clamp(-3.0, 3.0).exp()
@@ -290,37 +296,37 @@ class SetInit(Initialiser):
 
     @torch.no_grad()
     def _sampled(self, problem: Problem, chances: Tensor, noise: Noise, fallback: Pose, search_follows: bool) -> Pose:
-        """The best poses of minimal samples, scored by the likeliest pairs; the fallback if no sample has a pose."""
+        """The pose with the best score of all minimal samples, or ``fallback`` if no sample has a valid pose."""
         batch, count = chances.shape
         there = problem.usual_weights > 0
-        # Unlikely pairs also score, because they can be inliers. Padding does not score.
+        # Unlikely pairs also contribute to scores, because they can be inliers. Padding does not contribute.
         vote = torch.add(_LEAST_VOTE * there, chances, alpha=1.0 - _LEAST_VOTE)
-        # The variance is computed at the depth of the network's pose. With the depths of each pose, a pose close to the
-        # points would explain most pixels.
+        # The variance is computed at the depth of the network's pose. At the depth of a hypothesis close to the points,
+        # the variance would be large, and most pairs would agree with the hypothesis.
         precision = problem.focal.square() / (_JUDGED * _variance(noise, problem.focal, fallback))
         plane_points = problem.img_points / problem.focal
         of_pairs = torch.cat(
             (problem.world_points, plane_points, vote[..., None], precision[..., None]), -1
         )  # (B, N, 7)
-        if not isinstance(count, int):  # exported for any number of pairs: pad to the number of judges
+        if not isinstance(count, int):  # exported for any number of pairs: append padding
             more = of_pairs[:, :1] * torch.tensor((1, 1, 1, 1, 1, 0, 1), dtype=vote.dtype, device=vote.device)
             of_pairs = torch.cat((of_pairs, more.expand(-1, _MOST_JUDGES, -1)), 1)
             chances, count = functional.pad(chances, (0, _MOST_JUDGES)), count + _MOST_JUDGES
         likely = chances.topk(min(_MOST_JUDGES, count)).indices
         pairs = take_pairs(of_pairs, likely)  # (7, K, B)
         least, samples = zip(*_samples(count, self.samples, search_follows), strict=True)
-        if compiling():  # with `stack` a compiler copies whole rows
+        if compiling():  # compiled code is faster with `stack`
             three = torch.stack([pairs[:6, k] for column in zip(*samples, strict=True) for k in column], 1)
         else:
             three = pairs[:6].index_select(1, torch.tensor(samples, device=pairs.device).mT.flatten())
         three = three.unflatten(1, (3, len(samples))).flatten(2)  # (6, 3, S B)
         pose, valid = p3p(three[:3].permute(2, 1, 0), three[3:5].permute(2, 1, 0))[:2]
-        # Dimensions: four solutions, samples, problems, as in the memory of p3p's result.
+        # In memory, the result of p3p has the dimensions: components, solutions, samples, problems.
         each = len(samples), batch
         rotation, translation = (x.movedim((0, 1), (-1, -2)).unflatten(-1, each).flatten(-3, -2) for x in pose)
         rotation = rotation.flatten(0, 1)  # (9, H, B)
         valid = (valid.mT & (three[5] > 0).all(0)).unflatten(-1, each)  # (4, S, B)
-        if least[-1]:  # padding does not count, so that it has no effect
+        if least[-1]:  # padding does not count as pairs
             valid = valid & (there.sum(1) >= torch.tensor(least, device=there.device)[:, None])
         valid = valid.flatten(0, 1)  # (H, B)
         if batch and len(valid) > _MANY_SLOTS and valid.device.type == "cpu" and sees_values(valid):
@@ -340,7 +346,7 @@ class SetInit(Initialiser):
         return Pose(every[:, :9].unflatten(1, (3, 3)), every[:, 9:])
 
     def _run(self, view: View) -> tuple[Tensor, Tensor]:
-        """Outputs of the network for each pair, (1 + 2 S, B, N), and for each problem, (B, S + 2)."""
+        """The outputs of the network for pairs (1 + 2 S, B, N), and for problems (B, S + 2)."""
         x = self.first(view.features.flatten(0, 1).to(self.first.weight.dtype))
         absent = torch.where(view.there > 0, 0.0, _ABSENT).to(x.dtype).contiguous()
         for block in self.blocks:
@@ -351,7 +357,7 @@ class SetInit(Initialiser):
         return pair, self.problem(torch.bmm(share[:, None], x.view(*absent.shape, x.shape[-1]))[:, 0])
 
     def _noise(self, problem: Problem, view: View, estimate: Tensor) -> Noise:
-        """The noise of each pair: the caller's where known, else the network's estimate."""
+        """The noise of each pair: the known noise of the problem, else the network's estimate."""
         guessed = ((LOG_NOISE + 3.0 * estimate.tanh()).exp() * view.unit)[:, None].expand(*problem.weights.shape, 2)
         if problem.noise is not None:
             known = torch.stack((problem.noise.img, problem.noise.world), -1)

@@ -1,4 +1,4 @@
-"""The input of the set network: features that depend neither on the frames of world and camera nor on units."""
+"""The input features of the set network. They are invariant to units and to most rotations of world and camera."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ from kornia_pnpnet.problem import Problem
 
 __all__ = ["LEAST_NOISE", "LOG_NOISE", "View", "repeats"]
 
-# Ridge of the affine camera, relative to the mean square of the world points: the fit of planar points is then unique.
+# Ridge of the affine camera, relative to the mean square of the world points. With the ridge, planar points have a
+# unique affine camera.
 _RIDGE = 0.02
-# Spreads. Features are clipped to this absolute value, so that no pair dominates the network.
+# Features are clipped to this absolute value, so that no pair dominates the network.
 _MOST = 8.0
-#: Centre of the range of the logarithm of noise, relative to the spread of the pixels and of the world.
+#: Logarithm of the noise at the centre of its range. The unit of noise is the spread of the pixels or world points.
 LOG_NOISE = -5.0
-#: Least noise as a share of the spread, because scores divide by the variance.
+#: Least noise, as a share of the spread. Scores divide by the variance, which must not be 0.
 LEAST_NOISE = 1e-6
-# Confidences are clipped to this distance from 0 and from 1.
+# Confidences are clipped to at least this number and to at most 1 minus this number.
 _LEAST_CONFIDENCE = 1e-3
-# Coefficients of the key by which points are sorted, so that equal points are adjacent. The ratios of the coefficients
+# Points are sorted by a key with these coefficients, so that equal points are adjacent. The ratios of the coefficients
 # are irrational, so that different points of a grid have different keys.
 _KEY = 1.0, 0.7548776662, 0.5698402910
 
@@ -29,18 +30,17 @@ _KEY = 1.0, 0.7548776662, 0.5698402910
 class View:
     r"""The network's input.
 
-    The features are invariant to rotations of the world, to rotations of the camera except the roll, and to units.
-    The camera is rotated so that its axis is the mean of the rays, and zoomed so that the spread of the rays is 1.
-    Ridge regression fits an affine camera to the pairs. The centred and scaled world is rotated to the axes of this
-    affine camera.
+    The features are invariant to units, to rotations of the world, and to rotations of the camera except the roll.
+    First, the camera is rotated to the mean of the rays, and zoomed so that the spread of the rays is 1. Then an affine
+    camera is fitted to the pairs by ridge regression. The world is rotated to the axes of the affine camera.
 
     Attributes:
-        there: 1 for pairs with a weight and of normal scale, 0 for others, shape :math:`(B, N)`.
+        there: 1 for pairs of normal scale with a weight above 0, and 0 for other pairs, shape :math:`(B, N)`.
         rays: unit rays in the frame of the original camera, shape :math:`(B, N, 3)`.
-        log_spread: logarithm of the spread of the rays, the root mean square sine of the angles between the rays and
-            the mean ray, shape :math:`(B, 1)`.
-        unit: spread of the pixels and of the world, shape :math:`(B, 2)`.
-        height: the last coordinate of the rotated world points, shape :math:`(B, N)`.
+        log_spread: logarithm of the spread of the rays, shape :math:`(B, 1)`. The spread is the root mean square sine
+            of the angles between the rays and the mean ray.
+        unit: spread of the pixels, and spread of the world points, shape :math:`(B, 2)`.
+        height: third coordinates of the rotated world points, shape :math:`(B, N)`.
         features: the network's input, shape :math:`(B, N, C)`.
     """
 
@@ -52,8 +52,8 @@ class View:
         plane = functional.pad(problem.img_points / problem.focal, (0, 1), value=1.0)
         self.rays = functional.normalize(plane, dim=-1)
         mean = functional.normalize((share * self.rays).sum(1), dim=-1)
-        # The smallest rotation of the mean ray to the axis: a reflection maps the mean ray to the negative axis, then
-        # the third coordinate is negated.
+        # Two reflections rotate the mean ray to the z axis. The first reflection maps the mean ray to the negative z
+        # axis. The second reflection negates z.
         half = mean + eye[2]
         mirror = 1.0 - 2.0 * eye[2]
         turn = (half * mirror)[..., None] * (half / half[:, 2:])[:, None]
@@ -81,12 +81,12 @@ class View:
         self.features = torch.cat(parts, -1).clamp(-_MOST, _MOST)
 
     def _noise(self, problem: Problem) -> Tensor:
-        """Logarithms of the noise of pixels and of points relative to their spread, and whether each is known."""
+        """Logarithms of the noise of pixels and points over their spread, and whether the noise is known, (B, N, 4)."""
         if problem.noise is None:
             return torch.zeros_like(problem.weights)[..., None].expand(-1, -1, 4)
         sigmas = torch.stack((problem.noise.img, problem.noise.world), -1)  # (B, N, 2)
         known = sigmas.isfinite()
-        # Unknown sigmas are NaN. They are replaced before the division, because the gradient of the unit would be NaN.
+        # Unknown sigmas are NaN. They are replaced before the division, because `unit` would have the gradient NaN.
         relative = torch.where(known, sigmas, 1.0) / torch.where(known, self.unit[:, None], 1.0)
         logs = torch.where(known, relative.clamp(min=LEAST_NOISE).log() - LOG_NOISE, 0.0)
         return torch.cat((logs, known.to(logs.dtype)), -1)
@@ -94,12 +94,12 @@ class View:
 
 @torch.no_grad()
 def repeats(problem: Problem) -> Tensor:
-    """Logarithms (B, N, 2) of the number of pairs with the same pixel, and of the number with the same point."""
+    """Logarithms (B, N, 2) of the number of pairs with the same pixel, and the number of pairs with the same point."""
     there = (problem.usual_weights > 0).to(problem.weights).repeat(2, 1)
     points = torch.cat((functional.pad(problem.img_points, (0, 1)), problem.world_points))  # (2 B, N, 3)
     order = (points * points.new_tensor(_KEY)).sum(-1).argsort(1)  # equal points are neighbours
     ordered = points.gather(1, order[..., None].expand_as(points))
-    # Integers, because the code that PyTorch 2.13 generates for the maximum of booleans does not compile.
+    # `long`, because PyTorch 2.13 cannot compile the maximum of booleans.
     new = (ordered[:, 1:] != ordered[:, :-1]).long().amax(-1)
     run = functional.pad(new.cumsum(1), (1, 0))
     sizes = torch.zeros_like(there).scatter_add(1, run, there.gather(1, order))
@@ -108,21 +108,21 @@ def repeats(problem: Problem) -> Tensor:
 
 
 def _frame(affine: Tensor, squares: Tensor) -> Tensor:
-    """The rotation with the first two rows closest to the rows of an affine camera (B, 2, 3).
+    """The rotation (B, 3, 3) whose first two rows are closest to the two rows of an affine camera (B, 2, 3).
 
-    ``squares`` (B, 2) are the squared lengths of the rows. For a camera of zeros the result is some rotation.
+    ``squares`` (B, 2) are the squared lengths of the two rows. If the rows are 0, the rotation is arbitrary.
     """
     p, q = affine.unbind(1)
     product = (p * q).sum(-1, keepdim=True)  # (B, 1)
-    # With the Gram matrix S of the rows, the closest orthonormal rows are S^-1/2 times the rows. Up to a factor, S^-1/2
-    # is the adjugate of S + sqrt(det S) I.
+    # The closest orthonormal rows are S^-1/2 times the rows, where S is the Gram matrix of the rows. S^-1/2 is
+    # proportional to the adjugate of S + sqrt(det S) I.
     raised = squares + (1e-3 * squares.sum(-1, keepdim=True) + 1e-6)
     root = (raised.prod(-1, keepdim=True) - product.square()).clamp(min=1e-12).sqrt()
     diagonal = raised.flip(-1) + root
     u, v = (diagonal[..., None] * affine - product[..., None] * affine.flip(1)).unbind(1)
     eye = torch.eye(3, dtype=u.dtype, device=u.device)
     u = functional.normalize(u + 1e-6 * eye[0], dim=-1)
-    # A vector orthogonal to u: the image of the x axis under the reflection that maps the z axis to u or to -u.
+    # A reflection maps the z axis to u or to -u. The same reflection maps the x axis to a vector orthogonal to u.
     sign = torch.where(u[:, 2:] < 0, -1.0, 1.0)
     orthogonal = eye[0] - (u[:, :1] / (1.0 + sign * u[:, 2:])) * (u + sign * eye[2])
     v = functional.normalize(v - (u * v).sum(-1, keepdim=True) * u + 1e-6 * orthogonal, dim=-1)

@@ -1,4 +1,4 @@
-"""Views: mirror images of a problem. A network finds a different pose for each, and refinement can start from all."""
+"""Views are mirror images of a problem. A network finds a different pose for each view."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["VIEWS", "from_views"]
 
-#: The symmetries of a square image, as three flags: whether to exchange x and y, then to negate x, then to negate y.
+#: The eight symmetries of a square image. The three flags are: exchange x and y, then negate x, then negate y.
 VIEWS = (
     (False, False, False),
     (True, False, False),
@@ -28,16 +28,15 @@ VIEWS = (
 
 
 def from_views(init: Callable[[Problem], Starts], problem: Problem, count: int, order: bool) -> Starts:
-    """Find the starts of an initialiser for a problem, including its poses for mirror images of the problem.
+    """Apply an initialiser to the views of a problem. The result has the poses of all views.
 
-    A mirror image exchanges or negates the x and y axes of image and world in the same way. The distribution of random
-    problems does not change.
+    A view exchanges or negates the coordinates x and y of pixels and of world points in the same way.
 
     Args:
         init: the initialiser.
         problem: :math:`B` problems.
-        count: number of views of each problem, 2 to 8. The first view is the problem itself.
-        order: whether the initialiser needs the pairs in the order of their pixels.
+        count: number of views, 2 to 8. The first view is the problem itself.
+        order: whether the initialiser needs pairs that are sorted by their pixels.
     """
     batch = problem.weights.shape[0]
     starts = init(_views(problem, count, order))
@@ -46,7 +45,7 @@ def from_views(init: Callable[[Problem], Starts], problem: Problem, count: int, 
 
 
 def _views(problem: Problem, count: int, order: bool) -> Problem:
-    """All problems in the first view, then all in the second view, and so on, without covariances and terms."""
+    """The first views of all problems, then the second views, and so on. Covariances and terms are left out."""
     noise = None if problem.noise is None else problem.noise.sigmas
     of_pairs = problem.weights, problem.usual, noise, problem.confidence
     others = [values.mT for values in iter_tensors(of_pairs)]  # (N, B) each
@@ -66,7 +65,7 @@ def _views(problem: Problem, count: int, order: bool) -> Problem:
 
 
 def _undone(pose: Pose, count: int) -> list[Pose]:
-    """Poses for the problems from the poses of all their views except the first."""
+    """Transform the poses of the views, except the first view, into poses of the problems."""
     poses = []
     matrices, vectors = (x.movedim(0, -1).unflatten(-1, (count, -1)).unbind(-2)[1:] for x in pose)
     for view, matrix, vector in zip(VIEWS[1:count], matrices, vectors, strict=True):  # (3, 3, B), (3, B)
@@ -77,13 +76,13 @@ def _undone(pose: Pose, count: int) -> list[Pose]:
 
 
 def _exchanged(x: Tensor, y: Tensor, swap: bool, reverse_x: bool, reverse_y: bool) -> tuple[Tensor, Tensor]:
-    """Coordinates x and y in a mirrored view."""
+    """The coordinates x and y in a view, from the coordinates in the problem."""
     x, y = (y, x) if swap else (x, y)
     return -x if reverse_x else x, -y if reverse_y else y
 
 
 def _axes_back(entries: Tensor, axis: int, view: tuple[bool, bool, bool]) -> Tensor:
-    """Undo a mirrored view along one dimension of three coordinates."""
+    """Transform the coordinates along one dimension from a view back to the problem."""
     x, y, z = entries.unbind(axis)
     x, y = _exchanged(x, y, False, *view[1:])
     return torch.stack((y, x, z) if view[0] else (x, y, z), axis)
