@@ -30,11 +30,11 @@ _SEEN = 0.25
 # Inlier threshold for rigs, in focal lengths: 10 px at a focal length of 1000 px.
 _THRESHOLD = 0.01
 _FINDER = RANSAC(P3P(), threshold=_THRESHOLD, final_steps=0)
-# Number of samples if the effort is fixed, and number of draws for each sample. The sample is the first draw that
-# P3PRig can solve. If three cameras look in all directions, P3PRig can solve every second draw. Chosen on
-# `CameraProblems` with seed 77002.
+# With a fixed effort, RANSAC solves `_SAMPLES` samples. Each sample is the first of `_DRAWS` draws that P3PRig can
+# solve. If three cameras look in all directions, P3PRig can solve every second draw. Chosen on `CameraProblems` with
+# seed 77002.
 _SAMPLES, _DRAWS = 128, 4
-# Number of pairs that score each pose if the effort is fixed.
+# With a fixed effort, this number of pairs scores each pose.
 _JUDGES = 32
 # The root r of x^4 = x + 1. Multiples of (1/r, 1/r^2, 1/r^3), modulo 1, fill the unit cube evenly (M. Roberts, "The
 # unreasonable effectiveness of quasirandom sequences", 2018).

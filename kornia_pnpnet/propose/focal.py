@@ -23,8 +23,7 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["as_dist", "distorted", "scale_focal", "with_found_focal", "with_nominal_focal"]
 
-# The search covers the focal lengths between these numbers, in half widths of the image. The fields of view are 118 and
-# 14 degrees.
+# The search covers focal lengths between these numbers of half image widths: fields of view from 118 to 14 degrees.
 _SHORTEST, _LONGEST = 0.6, 8.0
 # Half of the range of log f.
 _WIDTH = 0.5 * math.log(_LONGEST / _SHORTEST)
@@ -43,7 +42,7 @@ _FINDER = RANSAC(P3P(), threshold=_THRESHOLD, confidence=0.99, final_steps=3)
 _WIDE, _SHRINK = 0.07, 0.6
 # Number of Gauss-Newton steps in the first estimate of distortion.
 _STEPS = 14
-# Smallest value of this bound, in focal lengths.
+# The lower bound of the kernel's scale does not shrink below this number of focal lengths.
 _LEAST = 1e-5
 
 
@@ -51,8 +50,9 @@ def with_nominal_focal(inputs: Inputs, sigma: float | None) -> Inputs:
     """Replace each focal length by the middle of the range of the search, and set ``free_focal``.
 
     ``sigma`` is the standard deviation of log f. With ``sigma``, the range lies around the caller's focal length.
-    Without ``sigma``, the range is proportional to the size of the image. The size is twice the principal point, or the
-    extent of the pixels if larger. The aspect ratio of the pixels is kept. Other cameras than pinholes become NaN.
+    Without ``sigma``, the range is proportional to the size of the image. The size is twice the principal point or, if
+    larger, the extent of the pixels. The aspect ratio of the pixels is kept. Matrices that are no pinhole cameras
+    become NaN.
     """
     camera, is_pinhole = pinholes(inputs.intrinsics)
     given = (camera[:, 0, 0] * camera[:, 1, 1]).sqrt()  # (B,)
@@ -156,8 +156,8 @@ def as_dist(coefficients: Tensor) -> Tensor:
 def _with_distortion(problem: Problem, pose: Pose, radial: int) -> State:
     """Estimate pose, focal length and radial distortion by Gauss-Newton steps with a Cauchy kernel.
 
-    The scale of the kernel is proportional to the median residual, but has a lower bound. The bound starts at `_WIDE`,
-    the shift by distortion at the edge of an image. It shrinks from step to step.
+    The scale of the kernel is proportional to the median residual, but has a lower bound. At first the bound is
+    `_WIDE`, the shift by distortion at the edge of an image. The bound shrinks from step to step.
     """
     state = State(pose, problem.weights.new_zeros(len(problem.weights), 1 + radial))
     # These steps use only the prior of distortion. The refinement also uses the prior of the focal length.

@@ -27,19 +27,19 @@ __all__ = ["RANSAC", "search_on"]
 
 # Number of inliers that a pose fits closely even if they are noisy.
 _FITTED = 5
-# Largest residuals of an inlier in :func:`search_on`, in standard deviations. The first limit is for estimated noise.
-# Networks underestimate the noise when most pairs are outliers. Moreover, a missed inlier costs more than an accepted
-# outlier. The second limit is for noise that the caller gave. On problems of uncertain PnP
-# (`benchmarks/uncertain_problems.py`, seeds 777 and 778, 10 pairs with 5 outliers) the limits 4 and 8 lead to larger
-# errors than 5.
+# Largest residuals of an inlier in :func:`search_on`, in standard deviations. The first limit is for the noise that a
+# network estimates, which is too small when most pairs are outliers. The limit is wide, because a missed inlier costs
+# more than an accepted outlier. The second limit is for the noise that the caller gave. On problems of uncertain PnP
+# (`benchmarks/uncertain_problems.py`, seeds 777 and 778, 10 pairs with 5 outliers), limits of 4 and 8 lead to larger
+# errors than a limit of 5.
 _INLIER, _KNOWN_INLIER = 10.0, 5.0
 # Inlier threshold of `_on_grid`, divided by two factors: the median distance of the pixels from the principal point,
 # and half the range of log f. Tuned on random problems with fields of view of 18 to 100 degrees (seed 6).
 _GRID_RESIDUAL = 0.04
 # Lower bound of the depth at which :func:`search_on` converts noise of points to pixels, in normalised units.
 _NEAREST = 0.5
-# First number: chance that a pair of weight 0 is drawn, relative to a pair of weight 1. Second number: the same ratio
-# for confidences. Networks mislead more often than callers, for example on repeated structure.
+# Chance that a pair of weight 0 is drawn, relative to a pair of weight 1. The second number is the same ratio for
+# confidences 0 and 1. The first number is larger, because networks mislead more often than callers.
 _DOUBT, _LEAST_TRUST = 0.8, 0.05
 
 
@@ -248,8 +248,8 @@ def _trusted(problem: Problem) -> Tensor:
 def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) -> Starts:
     r"""Run RANSAC on the problems for which the poses of an initialiser do not suffice.
 
-    The chance that a pair is drawn is proportional to :math:`0.8 + 0.2 w`, where :math:`w` is its weight in the starts.
-    A large confidence of the caller increases the chance. Misleading weights cost samples, but do not prevent success.
+    The chance that a pair of weight :math:`w` in the starts is drawn is proportional to :math:`0.8 + 0.2 w`. A large
+    confidence of the caller increases the chance. Misleading weights cost samples, but do not prevent success.
 
     A pair is an inlier if its residual is below ten standard deviations. If the caller gave the noise of the pair, the
     limit is five standard deviations. If the caller gave no noise, all pairs have the mean of the estimated standard
@@ -258,8 +258,8 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
     would have the most inliers.
 
     A problem is searched only when it needs more than 64 samples for a confidence of 0.999. This number is computed
-    from the inliers of the best pose of the starts. If it exceeds 64, least squares improve this pose, and the number
-    is computed again. The result of a problem does not depend on the other problems.
+    from the inliers of the best pose of the starts. If the number exceeds 64, least squares improve this pose, and the
+    number is computed again. The result of a problem does not depend on the other problems.
 
     Args:
         problem: normalised problems of a centred and scaled world.

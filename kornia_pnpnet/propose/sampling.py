@@ -30,7 +30,7 @@ _BLOCK = 2**18
 
 
 def kept_at_once(count: int, like: Tensor) -> int:
-    """Size of a block that is computed at once: ``count`` on a CPU, to fit a core's caches, and else 64 ``count``."""
+    """Size of a block that is computed at once: ``count`` on a CPU (limited by a core's caches), else 64 ``count``."""
     return count if like.device.type == "cpu" else 64 * count
 
 
@@ -67,13 +67,13 @@ def draw(numbers: Tensor, upper: Tensor) -> Tensor:
 
 
 def agreement_of_neighbours(world_points: Tensor, img_points: Tensor, there: Tensor) -> Tensor:
-    r"""Measure how well each pair's nearest neighbours in the image agree with those in the world, (B, N).
+    r"""Agreement (B, N) between each pair's nearest neighbours in the image and its nearest neighbours in the world.
 
     Points that are close in the image are mostly close in the world. An inlier therefore has common neighbours in both
-    spaces. An outlier has common neighbours only by chance. Of each pair, the 16 nearest neighbours are compared. Let a
+    spaces. An outlier has common neighbours only by chance. The 16 nearest neighbours of each pair are compared. Let a
     common neighbour have the rank :math:`a` in the image and the rank :math:`b` in the world, counted from 0. This
-    neighbour adds :math:`1 / (1 + \max(a, b))` to the agreement. A pair with the same pixel or the same point is no
-    neighbour, because such pairs often repeat one incorrect match.
+    neighbour adds :math:`1 / (1 + \max(a, b))` to the agreement. Pairs with equal pixels or equal points do not count
+    as neighbours, because such pairs often repeat one incorrect match.
 
     Source: J. Bian et al., "GMS: Grid-based motion statistics for fast, ultra-robust feature correspondence", CVPR 2017
     (the idea, for matches between two images).
@@ -176,7 +176,7 @@ class Samples:
         return samples_needed(mass * count, count, self.size, confidence)
 
     def spread(self, problems: Tensor, count: int) -> Tensor:
-        """Select ``count`` pairs that are spread evenly over the pairs of positive weight. Positions: (P, count).
+        """Select ``count`` pairs that are spread evenly over the pairs of positive weight, (P, count).
 
         The selected pairs are spread over the image, because :class:`~kornia_pnpnet.frame.Normalize` orders pairs by
         their pixels. Pairs are selected in proportion to their chances.
@@ -204,7 +204,7 @@ def _subsets(count: int, size: int, seed: int) -> Tensor:
 
 
 def samples_needed(inliers: Tensor, counts: Tensor, size: int, confidence: float) -> Tensor:
-    r"""Number of samples that contain a sample without an outlier with the probability :math:`p`, float64 (B,).
+    r"""Number of samples needed for a probability :math:`p` that at least one sample has no outlier, float64 (B,).
 
     The number is :math:`\log(1-p) / \log(1-w)`, where :math:`w = \binom{k}{s} / \binom{c}{s}` is the share of samples
     without an outlier.

@@ -43,7 +43,7 @@ def _outliers(error: Tensor) -> Tensor:
     return (error >= 1.0).to(error.dtype)
 
 
-#: Loss functions by name. The loss of a residual at or above the threshold is 1. Lambdas could not be pickled.
+#: Loss functions by name. The loss of a residual at or above the threshold is 1. Lambdas cannot be pickled.
 SCORERS: dict[str, Scorer] = {"msac": _truncated, "inliers": _outliers}
 
 
@@ -111,7 +111,7 @@ class Scene(NamedTuple):
     def errors(self, poses: Tensor) -> Tensor:
         """Standardised squared residuals (P, N, H) of every pair at every pose (P, 12, H), at most MAX_ERROR.
 
-        Points behind the camera get a large residual by arithmetic, because a mask would take longer.
+        The residual of a point behind the camera is MAX_ERROR. A sum replaces a mask, which would take longer.
         """
         rows = self.rows.flatten(1, 2)
         x, y, z = torch.baddbmm(rows[..., 12:], rows[..., :12], poses).unflatten(1, self.rows.shape[1:3]).unbind(1)

@@ -36,8 +36,8 @@ _SAMPLES_AT_ONCE = 4096
 # samples did not suffice for a confidence of 0.999, the share w of inliers is below the bound (7 / k)^(1/3). At this
 # bound, 3 / w pairs contain at least one inlier with a probability of 95 %.
 _FIRST_PAIRS, _PAIRS_BY_SAMPLES = 24, 3.0 / 7.0 ** (1 / 3)
-# After each scoring of a round, the best half of the poses is scored again on four times as many pairs. A smaller share
-# could miss the best pose: if 90 % of the pairs are outliers, the first pairs contain few inliers.
+# After each scoring of a round, the best half of the poses is scored again on four times as many pairs. To keep fewer
+# poses could lose the best pose: if 90 % of the pairs are outliers, the first pairs contain few inliers.
 _KEPT_ONE_IN, _MORE = 2, 4
 # This number of best poses of each round is improved. The best of the improved poses is then improved again.
 _IMPROVED = 3
@@ -145,7 +145,7 @@ class Search:
         return State(Pose(rotation, pose.translation), camera)
 
     def run(self, given: Pose | None = None, enough: int = 0) -> None:
-        """Search each problem until its samples suffice for the confidence of the plan, or until all are drawn.
+        """Search each problem until its samples suffice for the plan's confidence, or until all samples are drawn.
 
         Args:
             given: :math:`S` poses per problem, in the frame of the problem. These poses compete with the poses of the
@@ -206,7 +206,7 @@ class Search:
         return State(as_pose(torch.cat((first, last / scale), 1)), -scale.log())
 
     def _unpacked(self, values: Tensor, owners: Tensor) -> Problem:
-        """Build P problems of n pairs from the pairs' numbers (C, n, P). ``owners`` (P,) are indices in the batch."""
+        """Build P problems of n pairs from C numbers per pair, (C, n, P). ``owners`` (P,) are indices in the batch."""
         scales, free = take(((self.problem.img_scale, self.problem.world_scale), self.problem.free_focal), owners)
         scales, free, focal = map_tensors(lambda x: x.to(values), (scales, free, self.problem.focal))
         values = values.permute(2, 1, 0)
@@ -310,7 +310,7 @@ class Search:
         return losses, poses.gather(2, order[:, None].expand(-1, 12, -1)), valid.gather(1, order)
 
     def _improved(self, problems: Tensor, losses: Tensor, poses: Tensor) -> tuple[Tensor, Tensor]:
-        """Improve poses (P, 12, K) by a least-squares step on their inliers, then the best of them by a second step.
+        """Improve poses (P, 12, K) by a least-squares step on their inliers, and the best new pose by a second step.
 
         A step that does not lower the loss of a pose is undone. The loss of an invalid pose remains infinite. Returns
         the losses (P,) and the entries (P, 12) of the best poses.
@@ -374,7 +374,7 @@ def full_vectors(rows: Tensor, pairs: int = 1) -> Tensor:
     """Repeat the first row until the number of rows is a multiple of `_VECTOR`, unless each row has many pairs.
 
     Processors round differently in partly filled vectors. With full vectors, the poses of a sample do not depend on the
-    position in the batch. To repeat rows with many pairs would take too long.
+    position in the batch. Repeating rows with many pairs would take too long.
     """
     if compiling() or pairs > _VECTOR:
         return rows
