@@ -54,7 +54,7 @@ _OPEN_FOCAL = 0.15
 # fraction is 0.6 minus a tolerance for rounding.
 _EXPLAINED_SHARE = 0.6 - 1e-5
 # A residual is small if it is below this fraction of the spread of the pixels. Poses with points behind the camera
-# nearly always have larger residuals. Correct poses have smaller residuals even if the noise is a tenth of the spread.
+# nearly always have larger residuals. Correct poses have small residuals even if the noise is a tenth of the spread.
 _EXPLAINED_RESIDUAL = 0.2
 
 
@@ -178,9 +178,8 @@ def rotation_sigma(projection: Projection, problem: Problem, noise: Noise, judge
 def has_focal(projection: Projection, problem: Problem, noise: Noise, weights: Tensor) -> Tensor:
     """Tell whether the pairs determine an unknown focal length up to a standard deviation of 15 %, bool (B,).
 
-    Two such standard deviations are 30 %, which is the largest error of a correct translation (see
-    :func:`probability`).
-    ``weights`` are the final weights of the pairs.
+    Two such standard deviations are 30 %, which is the largest error of a correct translation. ``weights`` are the
+    final weights of the pairs.
     """
     projection, problem, noise = map_tensors(torch.Tensor.detach, (projection, problem, noise))
     weights = weights.detach()

@@ -31,8 +31,8 @@ MAX_FALSE_ALARMS = 0.01
 _MOST_OTHERS = 64
 # `_chance_by_others` ignores this number of hits, because pixels of inliers can coincide.
 _FEW_HITS = 4
-# Smallest ratio R / r in `_chance_by_place`. If the caller's sigmas are too small, pairs that look like outliers within
-# a smaller R can be inliers. Tuned on synthetic problems (`pnpnet-set`, seed 9101) with sigmas that are half of the
+# Smallest ratio R / r in `_chance_by_place`. If the caller's sigmas are too small, correct matches lie outside of the
+# inlier disc, but close to it. Tuned on synthetic problems (`pnpnet-set`, seed 9101) with sigmas that are half of the
 # noise. A ratio of 10 rejects many more correct poses than 20. A ratio of 30 accepts more incorrect poses than 20.
 _REACH = 20.0
 
@@ -164,7 +164,7 @@ def _chance_by_place(problem: Problem, thresholds: Thresholds, judged: Judged) -
     chance = (0.25 * math.pi * strips.prod(-1)).minimum(strips.amin(-1)).clamp(max=1.0)
     anywhere = torch.where(inlier, chance, 0.0).sum(-1) / inlier.sum(-1).clamp(min=1)
     outlier = there & ~inlier
-    sq_distance = in_order(torch.where(outlier, judged.errors, torch.inf).mT[None])[0, 1:].mT  # without the first
+    sq_distance = in_order(torch.where(outlier, judged.errors, torch.inf).mT[None])[0, 1:].mT  # n >= 2
     within = torch.arange(2, there.shape[1] + 1, device=outlier.device)
     others = (there.sum(-1, keepdim=True) - MIN_PAIRS).clamp(min=1)
     by_outliers = within / others * worst / sq_distance.maximum(_REACH**2 * worst)

@@ -47,10 +47,10 @@ def find_alternatives(
 ) -> Alternatives:
     """Find other minima that are nearly as likely as the pose. All minima differ from the pose and from each other.
 
-    First, the refinement starts from the mirror image of the pose, see `_mirrored`. Second, it starts from the P3P
-    solutions of three pairs that lie far apart. Third, it starts from the poses of ``starts``. When the camera sees a
-    plane almost from the front, the mirror image can be nearly as likely as the pose without being a minimum. If the
-    refinement of the mirror image ends at the pose, the unrefined mirror image is therefore used.
+    One start of the refinement is the mirror image of the pose, see `_mirrored`. Four starts are the P3P solutions of
+    three pairs that lie far apart. The other starts are the poses of ``starts``. When the camera sees a plane almost
+    from the front, the mirror image can be nearly as likely as the pose without being a minimum. If the refinement of
+    the mirror image ends at the pose, the unrefined mirror image is therefore used.
 
     Args:
         refine: the refinement that found the pose.

@@ -23,11 +23,11 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["as_dist", "distorted", "scale_focal", "with_found_focal", "with_nominal_focal"]
 
-# The search covers focal lengths between these numbers of half image widths: fields of view from 118 to 14 degrees.
+# Shortest and longest focal length of the search, in half widths of the image: fields of view of 118 and 14 degrees.
 _SHORTEST, _LONGEST = 0.6, 8.0
 # Half of the range of log f.
 _WIDTH = 0.5 * math.log(_LONGEST / _SHORTEST)
-# Half the width of a square, divided by the median distance (maximum norm) of uniform points from its centre.
+# Half the width of a square, divided by the median distance (maximum norm) of uniform points from the centre.
 _HALF_WIDTH = math.sqrt(2.0)
 # If the caller expects a focal length, the search covers this number of standard deviations of log f on either side.
 _SEARCHED = 2.0
@@ -85,7 +85,7 @@ def scale_focal(intrinsics: Tensor, factor: Tensor) -> Tensor:
 def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
     """Estimate the focal lengths, and a pose for the problems without a given pose.
 
-    RANSAC with P3P estimates both on a grid of focal lengths. Least squares on the inliers then improve both.
+    RANSAC tries P3P at the focal lengths of a grid. Least squares on the inliers improve pose and focal length.
 
     Args:
         inputs: the result of :func:`with_nominal_focal`.
@@ -123,7 +123,7 @@ def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
 
 
 def _zoomed(inputs: Inputs, zoom: Tensor) -> Inputs:
-    """Inputs with the focal lengths multiplied by the exponential of ``zoom`` (B,)."""
+    """Multiply the focal lengths of the inputs by the exponential of ``zoom`` (B,)."""
     assert inputs.free_focal is not None
     known = inputs.free_focal._replace(focal=inputs.free_focal.focal * zoom.exp())
     return inputs._replace(intrinsics=scale_focal(inputs.intrinsics, zoom.exp()), free_focal=known)
@@ -141,7 +141,7 @@ def distorted(problem: Problem, coefficients: Tensor) -> Problem:
     if noise is not None:
         with torch.no_grad():
             along = stretch + slope * square
-            growth = (0.5 * (stretch**-2 + along**-2)).sqrt()  # factor of a sigma in `cameras.undistort`
+            growth = (0.5 * (stretch**-2 + along**-2)).sqrt()  # `cameras.undistort` multiplies sigma by this factor
             turned = stretch + slope * p * p, slope * p * q, stretch + slope * q * q, slope * p * q
         cov = None if noise.img_cov is None else noise.img_cov.mapped(*turned)
         noise = noise._replace(img=noise.img / growth, img_cov=cov)
@@ -149,7 +149,7 @@ def distorted(problem: Problem, coefficients: Tensor) -> Problem:
 
 
 def as_dist(coefficients: Tensor) -> Tensor:
-    """Coefficients (B, K) of radial distortion as (k1, k2, 0, 0), (B, 4)."""
+    """Pad the coefficients (B, K) of radial distortion to (k1, k2, 0, 0), shape (B, 4)."""
     return functional.pad(coefficients, (0, 4 - coefficients.shape[1]))
 
 

@@ -25,7 +25,7 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["RANSAC", "search_on"]
 
-# Number of inliers that a pose fits closely even if they are noisy.
+# A pose can fit this number of inliers closely even if their pixels are noisy.
 _FITTED = 5
 # Largest residuals of an inlier in :func:`search_on`, in standard deviations. The first limit is for the noise that a
 # network estimates, which is too small when most pairs are outliers. The limit is wide, because a missed inlier costs
@@ -54,8 +54,8 @@ class RANSAC(Initialiser):
 
     A pair is an inlier when :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`. The ``threshold`` :math:`\tau` covers errors
     of the pixels. The ``world_threshold`` :math:`\omega` covers errors of the points. An error of a point moves the
-    projection by :math:`f/z` times the error. Least squares weight an inlier by the inverse of the right-hand side. The
-    final steps multiply this weight by the weight of a Cauchy kernel.
+    projection by :math:`f/z` times the error. In least squares, the weight of an inlier is the inverse of the
+    right-hand side. The final steps multiply this weight by the weight of a Cauchy kernel.
 
     A pose is ``ok`` when fewer than 0.01 poses are expected to have as many inliers by chance (see
     :func:`~kornia_pnpnet.judge.inliers.log_false_alarms`). Three pairs cannot show whether a pose is correct. A problem
@@ -248,8 +248,8 @@ def _trusted(problem: Problem) -> Tensor:
 def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) -> Starts:
     r"""Run RANSAC on the problems for which the poses of an initialiser do not suffice.
 
-    The chance that a pair of weight :math:`w` in the starts is drawn is proportional to :math:`0.8 + 0.2 w`. A large
-    confidence of the caller increases the chance. Misleading weights cost samples, but do not prevent success.
+    If a pair has the weight :math:`w` in the starts, its chance to be drawn is proportional to :math:`0.8 + 0.2 w`. A
+    large confidence of the caller increases the chance. Misleading weights cost samples, but do not prevent success.
 
     A pair is an inlier if its residual is below ten standard deviations. If the caller gave the noise of the pair, the
     limit is five standard deviations. If the caller gave no noise, all pairs have the mean of the estimated standard

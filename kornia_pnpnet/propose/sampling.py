@@ -176,7 +176,7 @@ class Samples:
         return samples_needed(mass * count, count, self.size, confidence)
 
     def spread(self, problems: Tensor, count: int) -> Tensor:
-        """Select ``count`` pairs that are spread evenly over the pairs of positive weight, (P, count).
+        """Select ``count`` pairs, spread evenly over the pairs of positive weight. Returns positions (P, count).
 
         The selected pairs are spread over the image, because :class:`~kornia_pnpnet.frame.Normalize` orders pairs by
         their pixels. Pairs are selected in proportion to their chances.

@@ -3,7 +3,7 @@ r"""Compute the losses of thousands of poses per problem at once.
 To add a loss function, add an entry to :data:`SCORERS`. The *standardised* squared residual :math:`e` of a pair is its
 squared residual divided by the squared threshold, see :mod:`kornia_pnpnet.judge.inliers`. To avoid the division by the
 depth :math:`z`, this module multiplies numerator and denominator by :math:`(z/f)^2`. One matrix product then projects
-all points at all poses. For a pixel :math:`b` and a point :math:`(x, y, z)` in the camera frame:
+all points at all poses. A pixel :math:`b` and a point :math:`(x, y, z)` in the camera frame have the residual
 
 .. math:: e = \frac{(x - z\,b_u/f)^2 + (y - z\,b_v/f)^2}{(z \tau / f)^2 + \omega^2}
 """
@@ -111,7 +111,7 @@ class Scene(NamedTuple):
     def errors(self, poses: Tensor) -> Tensor:
         """Standardised squared residuals (P, N, H) of every pair at every pose (P, 12, H), at most MAX_ERROR.
 
-        The residual of a point behind the camera is MAX_ERROR. A sum replaces a mask, which would take longer.
+        The residual of a point behind the camera is MAX_ERROR. No mask is used, because masking would take longer.
         """
         rows = self.rows.flatten(1, 2)
         x, y, z = torch.baddbmm(rows[..., 12:], rows[..., :12], poses).unflatten(1, self.rows.shape[1:3]).unbind(1)

@@ -32,14 +32,14 @@ CAUCHY = 3.4
 _DTYPE = torch.float32
 # On a CPU, at most this number of samples is solved and scored at once, so that the tensors fit into a core's caches.
 _SAMPLES_AT_ONCE = 4096
-# After k samples, the first scoring of a round (see `Search._round`) uses max(first, second * k^(1/3)) pairs. If k
-# samples did not suffice for a confidence of 0.999, the share w of inliers is below the bound (7 / k)^(1/3). At this
-# bound, 3 / w pairs contain at least one inlier with a probability of 95 %.
+# Let a and b be these numbers. After k samples, the first scoring of a round (see `Search._round`) uses the maximum of
+# a and b * k^(1/3) pairs. If k samples did not suffice for a confidence of 0.999, the share w of inliers is below the
+# bound (7 / k)^(1/3). At this bound, 3 / w pairs contain at least one inlier with a probability of 95 %.
 _FIRST_PAIRS, _PAIRS_BY_SAMPLES = 24, 3.0 / 7.0 ** (1 / 3)
-# After each scoring of a round, the best half of the poses is scored again on four times as many pairs. To keep fewer
-# poses could lose the best pose: if 90 % of the pairs are outliers, the first pairs contain few inliers.
+# After each scoring of a round, the best half of the poses is scored again on four times as many pairs. If fewer poses
+# were kept, the best pose could be lost: with 90 % outliers, the first pairs contain few inliers.
 _KEPT_ONE_IN, _MORE = 2, 4
-# This number of best poses of each round is improved. The best of the improved poses is then improved again.
+# In each round, this number of poses with the smallest losses is improved. The best of them is then improved again.
 _IMPROVED = 3
 # Number of samples in a round, divided by the number of samples before the round. A larger ratio would reduce the
 # number of rounds, but would draw more samples than necessary.
@@ -61,7 +61,7 @@ _OPEN, _OPEN_SAMPLES = 0.008, 256.0
 # After this number of samples, pairs with a large `agreement_of_neighbours` are drawn more often. Computing the
 # agreement takes about as long as solving this number of samples.
 _PLAIN_SAMPLES = 256
-# The chance that a pair is drawn is multiplied by (first + agreement) ** second. Both numbers were chosen empirically.
+# The chance that a pair is drawn is multiplied by (a + agreement)^b. These numbers a and b were chosen empirically.
 _LEAST_AGREEMENT, _AGREEMENT_POWER = 0.3, 1.5
 
 
@@ -277,8 +277,8 @@ class Search:
     def _solved(self, problems: Tensor, positions: Tensor, start: int | None = None) -> tuple[Tensor, Tensor]:
         """Solve samples (P, H, s) of some problems. Returns poses (P, 12, W), and which poses are solutions, (P, W).
 
-        If ``start``, the index of the first sample, is given, the number of solutions is added to ``scored``. The
-        solutions then precede invalid poses, and samples after the last sample of a problem are ignored.
+        ``start`` is the index of the first sample. If given, solutions precede invalid poses, and ``scored`` counts the
+        solutions. Samples after the last sample of a problem are then ignored.
         """
         batch, count, size = positions.shape
         rows = full_vectors((positions + problems[:, None, None] * self.pairs.shape[1]).flatten(0, 1))  # (R, s)
