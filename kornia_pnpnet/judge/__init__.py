@@ -1,1 +1,1 @@
-"""Judgement of a pose: ``inliers`` finds its inliers, and ``belief`` tells whether the pose is to be believed."""
+"""Judge a pose: ``inliers`` finds the inliers of the pose, and ``belief`` tells whether the pose is to be believed."""

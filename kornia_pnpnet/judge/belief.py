@@ -1,10 +1,10 @@
-"""Whether a pose is to be believed.
+"""Decide whether a pose is to be believed.
 
 If the noise is unknown, a pose must explain the pixels (:func:`explains`). If the noise is known, a pose must have more
 inliers than expected by chance (:func:`believe`).
 
-The functions take the :class:`~kornia_pnpnet.refine.residual.Projection` of one pose per problem, the problem, the
-noise of every pair, and weights of the pairs, :math:`(B, N)`. The results have no gradient.
+Each problem has one pose, given by its :class:`~kornia_pnpnet.refine.residual.Projection`. Weights and noise of the
+pairs have the shape :math:`(B, N)`. The results have no gradient.
 """
 
 from __future__ import annotations
@@ -37,24 +37,24 @@ __all__ = [
     "rotation_sigma",
 ]
 
-#: A pose is believed when its :func:`probability` is at least this value. On synthetic problems to which the law was
-#: not fitted, 98 % of the correct poses pass, and 5 to 7 % of the incorrect poses.
+#: A pose is believed when its :func:`probability` is at least this value. On held-out synthetic problems, 98 % of the
+#: correct poses and 5 to 7 % of the incorrect poses reach this value.
 LEAST_PROBABILITY = 0.93
-#: The coefficients of :func:`probability`: the log-odds if both numbers are 0, and the slopes of the log-odds by the
-#: logarithms of false alarms and of the rotation's sigma. The law ``sigmas`` is for noise that the caller gave or a
-#: network estimated. The law ``residuals`` is for :func:`residual_noise`. Fitted by
+#: Coefficients of the log-odds in :func:`probability`: the constant, the factor of ``log_alarms``, and the factor of
+#: the logarithm of ``sigma``. The law ``sigmas`` is for noise that the caller gave or a network estimated. The law
+#: ``residuals`` is for noise from :func:`residual_noise`. Both laws were fitted by
 #: ``python docs/results/make.py measure --only probability``.
 LAWS = {"sigmas": (-3.2501, -0.16608, -1.0784), "residuals": (0.89795, -0.27745, 0.070018)}
 _ALARMS, _LOG_SIGMA = (-20.0, 10.0), (-12.0, 2.0)
-# Standard deviations. A pair with a larger residual is an outlier of the pose.
+# A pair is an outlier of a pose if its residual exceeds this number of standard deviations.
 _EVIDENT = 3.5
-# Largest standard deviation of the logarithm of a focal length that is determined by the pairs.
+# The pairs determine the focal length if the standard deviation of log f is below this number.
 _OPEN_FOCAL = 0.15
-# A pose explains the pixels when at least this fraction of the pairs (by weight) has small residuals. The fraction is
-# just below 0.6, so that a sum of shares that is 0.6 up to rounding suffices.
+# A pose explains the pixels when the pairs with small residuals have at least this fraction of the total weight. The
+# fraction is 0.6 minus a tolerance for rounding.
 _EXPLAINED_SHARE = 0.6 - 1e-5
-# A residual is small when it is below this fraction of the spread of the pixels. Poses with points behind the camera
-# nearly always have larger residuals. Small objects whose noise is a tenth of their size have smaller residuals.
+# A residual is small if it is below this fraction of the spread of the pixels. Poses with points behind the camera
+# nearly always have larger residuals. Correct poses have small residuals even if the noise is a tenth of the spread.
 _EXPLAINED_RESIDUAL = 0.2
 
 
@@ -64,13 +64,13 @@ def has_enough(projection: Projection, weights: Tensor) -> Tensor:
 
 
 def explains(projection: Projection, problem: Problem, weights: Tensor) -> Tensor:
-    """Tell whether a pose explains the pixels, when the noise is unknown.
+    """Tell whether a pose explains the pixels, for problems of unknown noise.
 
-    The 60 % quantile of the residuals must be at most a fifth of the 60 % quantile of the distances of pixels from
-    their mean. Both quantiles are weighted by ``weights``, the weights without the robust weight. A pose that hardly
-    fits better than a projection of all points to one pixel therefore fails. Both quantiles scale with the image, so
-    that no threshold is in pixels. At least four pairs (three if there are only three) must have such small residuals,
-    and the points of these pairs must span more than a line.
+    The spread of the pixels is the 60 % quantile of their distances from their mean. A residual is small if it is at
+    most a fifth of the spread. Pairs with small residuals must have 60 % of the total weight. The ``weights`` do not
+    include the weights of a robust kernel. A pose fails if it fits hardly better than a pose that projects all points
+    to one pixel. At least four pairs must have small residuals (three pairs if the problem has only three). The points
+    of these pairs must span more than a line.
     """
     weights = weights.detach()
     there = weights > 0
@@ -82,7 +82,7 @@ def explains(projection: Projection, problem: Problem, weights: Tensor) -> Tenso
     limit = _EXPLAINED_RESIDUAL**2 * ascending.gather(-1, position.clamp(max=ascending.shape[-1] - 1))
     explained = projection.in_front & (projection.sq_residual.detach() <= limit)
     enough = (share * explained).sum(-1) >= _EXPLAINED_SHARE
-    # Any three pairs have a pose that explains them. With more than three pairs, a fourth pair must agree.
+    # Some pose explains any three pairs. If the problem has more than three pairs, a fourth pair must agree.
     agree = explained & there
     enough = enough & (agree.sum(-1) >= there.sum(-1).clamp(MIN_PAIRS, MIN_PAIRS + 1))
     return enough & _span_a_plane(problem.world_points.detach(), agree)
@@ -96,11 +96,10 @@ class Belief(NamedTuple):
 
 
 def believe(projection: Projection, problem: Problem, noise: Noise, law: str = "sigmas") -> Belief:
-    """Tell whether a pose is to be believed, when the noise is known for every pair.
+    """Tell whether a pose is to be believed, for problems of known noise.
 
-    The pose must have more inliers than expected by chance (:data:`~kornia_pnpnet.judge.inliers.MAX_FALSE_ALARMS`), and
-    the inliers must span more than a line. The probability by the given law of :data:`LAWS` must be at least
-    :data:`LEAST_PROBABILITY`.
+    The pose must have more inliers than expected by chance (:data:`~kornia_pnpnet.judge.inliers.MAX_FALSE_ALARMS`). The
+    points of the inliers must span more than a line. The :func:`probability` must be at least `LEAST_PROBABILITY`.
     """
     projection, problem, noise = map_tensors(torch.Tensor.detach, (projection, problem, noise))
     precision = pixel_precision(projection, problem, noise) if noise.covariances else None
@@ -120,11 +119,11 @@ def believe(projection: Projection, problem: Problem, noise: Noise, law: str = "
 
 
 def probability(log_alarms: Tensor, sigma: Tensor, law: str = "sigmas") -> Tensor:
-    """Probability that a pose is correct: within 10 degrees, and within 30 % of the distance of the points.
+    """Probability that a pose is correct.
 
-    The probability is a logistic function of two numbers. The false alarms tell how unlikely the inliers are by chance.
-    The sigma tells how well the inliers determine the rotation. Few inliers in a small part of the space and of the
-    image agree with many poses.
+    The rotation of a correct pose has an error of at most 10 degrees. The error of its translation is at most 30 % of
+    the distance of the points. The probability is a logistic function of the logarithms of two numbers. The number of
+    false alarms tells how unlikely the inliers are by chance. Sigma tells how well the inliers determine the rotation.
 
     Args:
         log_alarms: :func:`~kornia_pnpnet.judge.inliers.log_false_alarms`, shape :math:`(B,)`.
@@ -144,12 +143,12 @@ def probability(log_alarms: Tensor, sigma: Tensor, law: str = "sigmas") -> Tenso
 
 
 def clipped(log_alarms: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
-    """Clip the logarithms of the false alarms and of sigma to the ranges in which :data:`LAWS` depend on them."""
+    """Clip the two variables of :data:`LAWS`, the logarithms of false alarms and of sigma, to their ranges."""
     return log_alarms.clamp(*_ALARMS), sigma.log().clamp(*_LOG_SIGMA)
 
 
 def residual_noise(projection: Projection, problem: Problem, weights: Tensor) -> Noise:
-    """Estimate the noise of the pixels from the median residual of each problem, the same sigma for all pairs."""
+    """Estimate the noise of the pixels from the median residual. All pairs of a problem have the same sigma."""
     there = (weights > 0) & projection.in_front
     count = there.sum(-1, keepdim=True)
     ascending = in_order(torch.where(there, projection.sq_residual, torch.inf).detach().mT[None])[0].mT
@@ -163,8 +162,8 @@ def residual_noise(projection: Projection, problem: Problem, weights: Tensor) ->
 def rotation_sigma(projection: Projection, problem: Problem, noise: Noise, judged: Judged) -> Tensor:
     """Standard deviation of the rotation in radians, from the noise of the inliers, float64 (B,).
 
-    The standard deviation is the square root of the trace of the rotation's covariance, and infinite if the inliers do
-    not determine the rotation.
+    The standard deviation is the square root of the trace of the rotation's covariance. If the inliers do not determine
+    the rotation, the standard deviation is infinite.
     """
     inlier = problem.focal.square() * (judged.weights > 0)
     weights = map_tensors(lambda x: inlier * x, pixel_precision(projection, problem, noise))
@@ -179,8 +178,8 @@ def rotation_sigma(projection: Projection, problem: Problem, noise: Noise, judge
 def has_focal(projection: Projection, problem: Problem, noise: Noise, weights: Tensor) -> Tensor:
     """Tell whether the pairs determine an unknown focal length up to a standard deviation of 15 %, bool (B,).
 
-    The distance of a correct pose may be off by 30 % (see :func:`probability`), which is two such standard deviations.
-    ``weights`` are the final weights of the pairs.
+    Two such standard deviations are 30 %, which is the largest error of a correct translation. ``weights`` are the
+    final weights of the pairs.
     """
     projection, problem, noise = map_tensors(torch.Tensor.detach, (projection, problem, noise))
     weights = weights.detach()
@@ -190,7 +189,7 @@ def has_focal(projection: Projection, problem: Problem, noise: Noise, weights: T
     matrix = normal_equations(projection, problem, precision).matrix.permute(2, 0, 1).double()
     camera, cross, pose = matrix[:, 6:7, 6:7], matrix[:, :6, 6:7], matrix[:, :6, :6]
     solved, info = torch.linalg.solve_ex(pose, cross)
-    # Information of the focal length after elimination of the pose (Schur complement).
+    # Eliminating the pose gives the information of the focal length (Schur complement).
     information = (camera - cross.mT @ solved)[:, 0, 0]
     known = problem.free_focal.information
     information = information if known is None else information + known

@@ -1,8 +1,9 @@
-r"""The inliers of a pose, and the number of poses that are expected to have as many inliers by chance.
+r"""Find the inliers of a pose, and estimate whether a pose could have as many inliers by chance.
 
-A pair is an inlier of a pose when :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`. The threshold :math:`\tau` is in pixels.
-The threshold :math:`\omega` is a shift of the world point. At the depth :math:`z` such a shift moves the projection by
-:math:`f \omega / z` pixels. The left side divided by the right side is the *standardised* squared residual.
+A pair is an inlier if its residual :math:`r` satisfies :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`. The threshold
+:math:`\tau` is in pixels. The threshold :math:`\omega` is a shift of the world point. At the depth :math:`z`, this
+shift moves the projection by :math:`f \omega / z` pixels. The left-hand side divided by the right-hand side is the
+*standardised* squared residual.
 """
 
 from __future__ import annotations
@@ -24,16 +25,15 @@ __all__ = ["MAX_ERROR", "MAX_FALSE_ALARMS", "Judged", "Thresholds", "judge", "lo
 
 #: The standardised squared residual of points behind the camera.
 MAX_ERROR = 1e6
-#: Largest number of false alarms (see :func:`log_false_alarms`) of a pose that is believed.
+#: A pose is believed only if its number of false alarms (see :func:`log_false_alarms`) is below this number.
 MAX_FALSE_ALARMS = 0.01
-# Largest number of pairs that `_chance_by_others` compares. These pairs are spaced evenly over all pairs.
+# `_chance_by_others` compares at most this number of pairs, which are spaced evenly over all pairs.
 _MOST_OTHERS = 64
-# Number of hits that `_chance_by_others` ignores, because pixels of inliers can coincide.
+# `_chance_by_others` ignores this number of hits, because pixels of inliers can coincide.
 _FEW_HITS = 4
-# Smallest ratio of the radius of the larger disc to the radius of the disc in `_chance_by_place`. Closer outliers say
-# nothing about chance: if the caller's sigmas are too small, these outliers can be inliers. Tuned on synthetic problems
-# (`pnpnet-set`, seed 9101) with sigmas that are half of the noise. A ratio of 10 rejects many more correct poses, and a
-# ratio of 30 accepts more incorrect poses.
+# Smallest ratio R / r in `_chance_by_place`. If the caller's sigmas are too small, correct matches lie outside of the
+# inlier disc, but close to it. Tuned on synthetic problems (`pnpnet-set`, seed 9101) with sigmas that are half of the
+# noise. A ratio of 10 rejects many more correct poses than 20. A ratio of 30 accepts more incorrect poses than 20.
 _REACH = 20.0
 
 
@@ -43,9 +43,9 @@ class Thresholds(NamedTuple):
     Attributes:
         img: :math:`\tau` in pixels of the problem, shape :math:`(B, 1)` or :math:`(B, N)`.
         world: :math:`\omega` in units of the problem's world, shape :math:`(B, 1)` or :math:`(B, N)`.
-        precision: the matrix :math:`P` in the standardised squared residual :math:`r^\top P r` of each pair, entries
-            :math:`(B, N)`; ``None``: :math:`\tau` and :math:`\omega` define the standardised squared residual. The
-            chance of an inlier is estimated by a disc with the area of the ellipse :math:`r^\top P r < 1`.
+        precision: if given, the standardised squared residual of a pair is :math:`r^\top P r` with this matrix
+            :math:`P`. Its entries have the shape :math:`(B, N)`. False alarms are then estimated for a disc that has
+            the area of the ellipse :math:`r^\top P r < 1`.
     """
 
     img: Tensor
@@ -53,7 +53,7 @@ class Thresholds(NamedTuple):
     precision: Symmetric2 | None = None
 
     def sq_limits(self, projection: Projection) -> Tensor:
-        """Squared radius (px²) of the inlier disc or, with ``precision``, of a disc of equal area: (B, N)."""
+        """Squared radius (px²) of the inlier disc, (B, N). With ``precision``, disc and ellipse have the same area."""
         if self.precision is not None:
             return self.precision.determinant.rsqrt()
         return self.img.square() + ((projection.focal * projection.inv_depth).mT * self.world).square()
@@ -64,9 +64,9 @@ class Judged(NamedTuple):
 
     Attributes:
         weights: :math:`\tau^2 / (\tau^2 + (f \omega / z)^2)` for inliers, 0 for all other pairs, shape :math:`(B, N)`.
-            Without a threshold in the world the weight of an inlier is 1.
-        errors: standardised squared residuals, below 1 for inliers, :data:`MAX_ERROR` behind the camera, shape
-            :math:`(B, N)`.
+            If :math:`\omega` is 0, the weight of an inlier is 1.
+        errors: standardised squared residuals, shape :math:`(B, N)`. Inliers have values below 1. Points behind the
+            camera have the value :data:`MAX_ERROR`.
     """
 
     weights: Tensor
@@ -79,7 +79,7 @@ class Judged(NamedTuple):
 
 
 def judge(projection: Projection, problem: Problem, thresholds: Thresholds) -> Judged:
-    """Find the inliers of a pose. Pairs without weight are not inliers.
+    """Find the inliers of a pose. Pairs of weight 0 are not inliers.
 
     Example:
         >>> from kornia_pnpnet.problem import State
@@ -103,23 +103,23 @@ def judge(projection: Projection, problem: Problem, thresholds: Thresholds) -> J
 def log_false_alarms(
     tested: Tensor, projection: Projection, problem: Problem, thresholds: Thresholds, judged: Judged
 ) -> Tensor:
-    r"""Natural logarithm of the number of poses that are expected to have as many inliers as a pose, by chance.
+    r"""Natural logarithm of the expected number of poses that have as many inliers as this pose by chance.
 
-    Three of the :math:`c` pairs determine a pose. There are :math:`\binom{c - 3}{k - 3}` ways to choose the other
-    inliers of a pose with :math:`k` inliers. Each of the other inliers is an inlier by chance with the probability
+    Three of the :math:`c` pairs determine a pose. If the pose has :math:`k` inliers, there are
+    :math:`\binom{c - 3}{k - 3}` ways to choose the other inliers. A pair is an inlier by chance with the probability
     :math:`p`. Of :math:`T` tested poses, at most :math:`T \binom{c-3}{k-3} p^{k-3}` are therefore expected to have
-    :math:`k` inliers by chance. With an unknown focal length four pairs determine a pose, and 4 replaces 3.
+    :math:`k` inliers by chance. With an unknown focal length, four pairs determine a pose, and 4 replaces 3.
 
-    The probability :math:`p` is the largest of three estimates: from the image, from the outliers and from other pairs.
+    The probability :math:`p` is the largest of three estimates, see `_chance_by_place` and `_chance_by_others`.
 
     Source: L. Moisan and B. Stival, "A probabilistic criterion to detect rigid point matches between two images and
     estimate the fundamental matrix", IJCV 57(3), 2004; P. Moulon, P. Monasse and R. Marlet, "Adaptive structure from
-    motion with a contrario model estimation", ACCV 2012. The sources count all poses that could be tested; this
-    function counts the poses that were tested.
+    motion with a contrario model estimation", ACCV 2012. The sources count all poses that could be tested. This
+    function counts only the poses that were tested.
 
     Args:
         tested: number of poses :math:`T` that were tested, shape :math:`(B,)`.
-        projection: the points at the pose.
+        projection: the points projected at the pose.
         problem: the problem, with :math:`c` pairs that have a weight.
         thresholds: the thresholds of an inlier.
         judged: the result of :func:`judge`, with :math:`k` inliers.
@@ -139,18 +139,17 @@ def log_false_alarms(
 
 
 def _chance_by_place(problem: Problem, thresholds: Thresholds, judged: Judged) -> Tensor:
-    """Probability that an outlier fits by chance at least as well as the worst inlier, at most 1, (B,).
+    """Probability that an outlier fits by chance at least as well as the worst inlier, (B,).
 
-    *The image.* The pixel of an outlier is uniform in the smallest axis-parallel box around all pixels. The outlier
-    fits if its pixel lies in a disc around its projection. The standardised radius of the disc is the residual of the
-    worst inlier. The chance is the area of the disc over the area of the box or, if smaller, the diameter of the disc
-    over the longer side of the box. The estimate is the mean chance of the inliers.
+    *From the image.* The pixel of an outlier is assumed to be uniform in the bounding box of all pixels. The outlier
+    fits if its pixel lies in a disc around the projection of its point. The radius r of the disc is the residual of the
+    worst inlier. The chance is the area of the disc divided by the area of the box. If the box is thin, the chance is
+    at most the diameter of the disc divided by the longer side. The estimate is the mean chance of the inliers.
 
-    *The outliers.* An incorrect pose can bring all points close to their pixels, for example if the points are behind
-    the camera. Such a pose has more inliers than a pose with independent pixels, and its outliers lie close to their
-    projections. Consider larger discs that are at least twenty times as wide and hold at least two outliers. The chance
-    is the number of outliers in the larger disc over the number of all pairs but three, times the area of the disc over
-    the area of the larger disc. The estimate is the largest chance of all larger discs.
+    *From the outliers.* An incorrect pose can project all points close to their pixels, for example if the points are
+    behind the camera. The outliers then lie close to their projections, and many pairs are inliers by chance. Suppose
+    that n >= 2 outliers have pixels within a radius R >= 20 r of their projections. Three of the c pairs determine the
+    pose. The chance is then n / (c - 3) * (r / R)^2. The estimate is the largest of these chances over all R.
     """
     there, inlier = problem.weights > 0, judged.weights > 0
     high = torch.where(there[..., None], problem.places, -torch.inf).amax(1)
@@ -165,7 +164,7 @@ def _chance_by_place(problem: Problem, thresholds: Thresholds, judged: Judged) -
     chance = (0.25 * math.pi * strips.prod(-1)).minimum(strips.amin(-1)).clamp(max=1.0)
     anywhere = torch.where(inlier, chance, 0.0).sum(-1) / inlier.sum(-1).clamp(min=1)
     outlier = there & ~inlier
-    sq_distance = in_order(torch.where(outlier, judged.errors, torch.inf).mT[None])[0, 1:].mT  # without the first
+    sq_distance = in_order(torch.where(outlier, judged.errors, torch.inf).mT[None])[0, 1:].mT  # n >= 2
     within = torch.arange(2, there.shape[1] + 1, device=outlier.device)
     others = (there.sum(-1, keepdim=True) - MIN_PAIRS).clamp(min=1)
     by_outliers = within / others * worst / sq_distance.maximum(_REACH**2 * worst)
@@ -173,10 +172,10 @@ def _chance_by_place(problem: Problem, thresholds: Thresholds, judged: Judged) -
 
 
 def _chance_by_others(projection: Projection, problem: Problem, thresholds: Thresholds, judged: Judged) -> Tensor:
-    """Probability that the pixel of another pair is at least as close to a projection as the worst inlier is, (B,).
+    """Probability (B,) that the pixel of another pair lies in the disc around a projection, see `_chance_by_place`.
 
     Pixels are not uniform. Many outliers may have the same pixel. A pose that projects all points into a small part of
-    the image finds many pixels in this part.
+    the image can therefore have many inliers by chance.
     """
     there = problem.weights > 0
     worst = torch.where(judged.weights > 0, judged.errors, 0.0).amax(-1, keepdim=True)
@@ -186,7 +185,7 @@ def _chance_by_others(projection: Projection, problem: Problem, thresholds: Thre
     seen = projection.focal.reshape(-1, 1, 1) * seen if problem.rig is None else problem.rays(seen)
     values = torch.cat((seen, pixels, limit[..., None]), -1)
     counts = there.sum(-1)
-    if not exporting() and values.shape[1] > _MOST_OTHERS:  # spaced evenly over the pairs that are no padding
+    if not exporting() and values.shape[1] > _MOST_OTHERS:  # spaced evenly over the pairs of positive weight
         first = torch.arange(_MOST_OTHERS, device=there.device)
         some = present_first(there).gather(1, first.maximum(first * counts[:, None] // _MOST_OTHERS))
         values = values.gather(1, some[..., None].expand(-1, -1, values.shape[-1]))
@@ -206,7 +205,7 @@ def _log_factorial(x: Tensor) -> Tensor:
     r"""Logarithm of :math:`x!` for integers :math:`x \ge 0`, in float64."""
     if not exporting():
         return torch.lgamma(x + 1)
-    # ONNX has no log-gamma. Stirling's series gives Γ(x + 9), which is Γ(x + 1) times eight factors, to 12 digits.
+    # ONNX has no log-gamma. Stirling's series gives Γ(x + 9) to 12 digits. Γ(x + 9) is Γ(x + 1) times eight factors.
     y = x + 9.0
     inv, sq = y.reciprocal(), y.reciprocal().square()
     series = inv * (1 / 12 - sq * (1 / 360 - sq * (1 / 1260 - sq / 1680)))

@@ -1,4 +1,4 @@
-"""Other poses that explain the pairs nearly as well as the pose: mirror images of planes, and solutions of P3P."""
+"""Find other poses that explain the pairs nearly as well as the refined pose."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ __all__ = ["find_alternatives", "mirror_probability"]
 
 # Another pose is kept when its likelihood is at least this fraction of the likelihood of the refinement's pose.
 _LIKELY = 1e-3
-# Upper bound of the logarithm of this likelihood ratio, without which the exponential could overflow.
+# Upper bound of the logarithm of this likelihood ratio, so that the exponential does not overflow.
 _LIKELIER = 30.0
-# Two poses are the same minimum when their rotations differ by less than `_SAME_TURN` radians, and the two positions of
-# the mean point in the camera frame differ by less than `_SAME_SHIFT` times the distance of this point from the camera.
+# Two poses are the same minimum if their rotations differ by less than `_SAME_TURN` radians and their positions by less
+# than `_SAME_SHIFT`. A position is the mean point in the camera frame, in units of its distance from the camera.
 _SAME_TURN, _SAME_SHIFT = 0.035, 0.035
-# A mirror image is refined only when its median residual is less than this share of the spread of the pixels, or when
-# the problem has fewer likely inliers than the second number.
+# A mirror image is refined if its median residual is below the first number times the spread of the pixels. With fewer
+# likely inliers than the second number, the mirror image is always refined.
 _NEAR_MIRROR, _FEW_INLIERS = 0.2, 10
-# A mirror image is dropped after the first number of iterations if the logarithm of its likelihood ratio to the pose is
-# below the second number.
+# After the first number of iterations, a mirror image is dropped if its log-likelihood minus the log-likelihood of the
+# pose is below the second number.
 _FIRST_LOOK, _HOPELESS = 2, -30.0
-# Radians. A mirror image whose rotation differs by less does not lower the probability of the pose (see
-# :attr:`~kornia_pnpnet.result.PnPResult.probability`).
+# A mirror image within this angle (radians) of the pose does not lower the pose's
+# :attr:`~kornia_pnpnet.result.PnPResult.probability`.
 _FAR_TURN = math.radians(10.0)
-# Number of iterations, with the kernel of Cauchy, for a solver that does not refine (``m=0``).
+# If the solver does not refine (``m=0``), other poses are refined by this number of iterations with a Cauchy kernel.
 _ITERATIONS = 20
 
 
@@ -45,18 +45,18 @@ _ITERATIONS = 20
 def find_alternatives(
     refine: RobustWeightedLM, problem: Problem, starts: Starts, pose: Pose, valid: Tensor, most: int
 ) -> Alternatives:
-    """Find other minima that are nearly as likely as the pose. They differ from the pose and from each other.
+    """Find other minima that are nearly as likely as the pose. All minima differ from the pose and from each other.
 
-    The refinement starts from the mirror image of the pose about the line of sight to the plane through the points,
-    from the P3P solutions of three pairs that lie far apart, and from the poses of ``starts``. When the camera sees a
-    plane almost from the front, the mirror image can be nearly as likely as the pose without being a minimum.
-    Therefore the unrefined mirror image is used where its refinement ends at the pose.
+    One start of the refinement is the mirror image of the pose, see `_mirrored`. Four starts are the P3P solutions of
+    three pairs that lie far apart. The other starts are the poses of ``starts``. When the camera sees a plane almost
+    from the front, the mirror image can be nearly as likely as the pose without being a minimum. If the refinement of
+    the mirror image ends at the pose, the unrefined mirror image is therefore used.
 
     Args:
         refine: the refinement that found the pose.
         problem: the problem.
         starts: the starts from which the refinement found the pose.
-        pose: the pose that was found, in the frame of the problem.
+        pose: the pose that the refinement found, in the frame of the problem.
         valid: which problems are valid (see :class:`~kornia_pnpnet.frame.Frame`), bool (B,).
         most: largest number of other poses.
 
@@ -108,9 +108,9 @@ def find_alternatives(
 def mirror_probability(
     refine: RobustWeightedLM, problem: Problem, starts: Starts, pose: Pose, ok: Tensor, cost: Tensor
 ) -> Tensor:
-    """Probability (B,) that the refined mirror image is the correct pose instead of the given pose; 0 where not ``ok``.
+    """Compute the probability (B,) that the refined mirror image is the correct pose instead of the given pose.
 
-    The probability is also 0 when the refined mirror image is within 10 degrees of the given pose.
+    The probability is 0 if the pose is not ``ok``, or if the refined mirror image is within 10 degrees of the pose.
 
     Args:
         refine: See find_alternatives.
@@ -118,7 +118,7 @@ def mirror_probability(
         starts: See find_alternatives.
         pose: See find_alternatives.
         ok: which poses pass all other tests, bool (B,).
-        cost: the cost of the pose, (B,).
+        cost: the costs of the poses, (B,).
     """
     weights = problem.weights * starts.weights
     away = (problem.img_points - _mean(problem.img_points, weights)[:, None]).square().sum(-1)
@@ -147,7 +147,7 @@ def mirror_probability(
 
 
 def _ends(refined: Refinement) -> tuple[Tensor, Tensor, Tensor]:
-    """Entries of the refined poses, their costs, and which poses have a finite cost and enough points in front."""
+    """Entries and costs of the refined poses. A pose is usable if its cost is finite and enough points are in front."""
     return as_entries(refined.pose), refined.cost, refined.in_front & refined.cost.isfinite()
 
 
@@ -158,12 +158,12 @@ def _mean(points: Tensor, weights: Tensor) -> Tensor:
 
 
 def _moved(points: Tensor, pose: Pose) -> Tensor:
-    """Points (B, 3) in the frame of a camera."""
+    """Transform points (B, 3) to the camera frame."""
     return (pose.rotation @ points[..., None])[..., 0] + pose.translation
 
 
 def _mirrored(pose: Pose, problem: Problem, weights: Tensor) -> Pose:
-    """Mirror image: a half turn about the normal of the plane, the pose, and a half turn about the line of sight."""
+    """Apply a half turn about the plane's normal, then the pose, then a half turn about the line of sight."""
     middle = _mean(problem.world_points, weights)
     centred = problem.world_points - middle[:, None]
     covariance = centred.mT @ (weights[..., None] * centred)
@@ -182,7 +182,7 @@ def _half_turn(axis: Tensor) -> Tensor:
 
 
 def _of_three(problem: Problem, weights: Tensor, fallback: Pose) -> tuple[Tensor, ...]:
-    """Entries of the four P3P solutions of three likely pairs that lie far apart; the fallback fills invalid slots."""
+    """Solve P3P for three likely pairs that lie far apart. ``fallback`` replaces invalid solutions among the four."""
     likely = weights * (weights > 0.5 * weights.amax(1, keepdim=True))
     points, rows = problem.world_points, torch.arange(len(weights), device=weights.device)[:, None]
 
@@ -200,7 +200,7 @@ def _of_three(problem: Problem, weights: Tensor, fallback: Pose) -> tuple[Tensor
 
 
 def _unit(problem: Problem, starts: Starts, pose: Pose) -> Tensor:
-    """Cost (B,) of a residual of one standard deviation."""
+    """Squared standard deviation (B,) in the unit of the refinement's cost."""
     if problem.noise is not None or starts.noise is not None:
         return torch.ones_like(problem.weights[:, 0])
     noise = residual_noise(project(State.of(pose), problem), problem, problem.weights * starts.weights)
@@ -208,7 +208,7 @@ def _unit(problem: Problem, starts: Starts, pose: Pose) -> Tensor:
 
 
 def _are_same(poses: Tensor, other: Tensor, middle: Tensor) -> Tensor:
-    """Which poses (*, B, 12) are the same minimum as another pose (B, 12) of a world with mean (B, 3); bool (*, B)."""
+    """Whether poses (*, B, 12) are the same minimum as ``other`` (B, 12). ``middle`` (B, 3) is the mean point."""
     pose, other_pose = as_pose(poses), as_pose(other.expand_as(poses))
     there = _moved(middle, other_pose)
     shift = (_moved(middle, pose) - there).norm(dim=-1) < _SAME_SHIFT * there.norm(dim=-1)

@@ -1,6 +1,6 @@
-"""The poses from which refinement starts: from any initialiser, from mirror images, and from the caller.
+"""Propose the poses from which refinement starts.
 
-Networks and EPnP accept only one pinhole camera. For a rig with such an initialiser, RANSAC finds the pose instead.
+Networks and EPnP accept only one pinhole camera. For a rig, RANSAC therefore replaces these initialisers.
 """
 
 from __future__ import annotations
@@ -24,16 +24,17 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["propose"]
 
-# Focal lengths. A pair that is not of normal scale is used only when some first pose leaves it a smaller residual.
+# A pair that is not of normal scale is used only if its residual at some first pose is below this number of focal
+# lengths.
 _SEEN = 0.25
-# Focal lengths. Threshold of an inlier in a rig: ten pixels at a focal length of 1000 pixels.
+# Inlier threshold for rigs, in focal lengths: 10 px at a focal length of 1000 px.
 _THRESHOLD = 0.01
 _FINDER = RANSAC(P3P(), threshold=_THRESHOLD, final_steps=0)
-# Number of samples of a fixed effort, and number of draws for each sample. The sample is the first draw that P3PRig can
-# solve. With three cameras that look in all directions, P3PRig can solve every second draw. Chosen on `CameraProblems`
-# with seed 77002.
+# With a fixed effort, RANSAC solves `_SAMPLES` samples. Each sample is the first of `_DRAWS` draws that P3PRig can
+# solve. If three cameras look in all directions, P3PRig can solve every second draw. Chosen on `CameraProblems` with
+# seed 77002.
 _SAMPLES, _DRAWS = 128, 4
-# Number of pairs that score each pose when the effort is fixed.
+# With a fixed effort, this number of pairs scores each pose.
 _JUDGES = 32
 # The root r of x^4 = x + 1. Multiples of (1/r, 1/r^2, 1/r^3), modulo 1, fill the unit cube evenly (M. Roberts, "The
 # unreasonable effectiveness of quasirandom sequences", 2018).
@@ -56,10 +57,10 @@ def propose(
         init: the initialiser; ``None``: the refinement starts from the given pose.
         problem: the problem.
         given: the caller's pose in the frame of the problem. This pose competes with the initialiser's poses.
-        views: number of views, see :func:`~kornia_pnpnet.propose.views.from_views`. Rigs and initialisers that accept a
-            given pose have one view.
-        order: whether the pairs are in the order of their pixels.
-        fixed: whether the number of samples for a rig is fixed, as graphs require.
+        views: number of views, see :func:`~kornia_pnpnet.propose.views.from_views`. For rigs, and for initialisers that
+            accept a given pose, this argument has no effect.
+        order: see :func:`~kornia_pnpnet.propose.views.from_views`.
+        fixed: whether the number of samples for a rig is fixed, as compiled and exported graphs require.
         search_follows: see :meth:`~kornia_pnpnet.propose.set.SetInit.forward`.
     """
     if init is None:
@@ -77,7 +78,7 @@ def propose(
         starts = starts.with_others(given)._replace(ok=None)
     if trait(init, "weighs_unusual"):
         return starts
-    # A pair that is not of normal scale keeps its weight only when some pose projects its point close to its pixel.
+    # A pair that is not of normal scale keeps its weight only if some pose projects the point close to the pixel.
     known, limit = problem.map(torch.Tensor.detach), (_SEEN * problem.focal) ** 2
     seen = torch.zeros_like(problem.weights, dtype=torch.bool)
     for pose in map_tensors(torch.Tensor.detach, starts.poses):
@@ -93,8 +94,8 @@ def _starts_of_rig(problem: Problem, given: Pose | None, *, with_noise: bool, fi
     Args:
         problem: normalised problems of a rig.
         given: see :meth:`~kornia_pnpnet.propose.ransac.RANSAC.forward`.
-        with_noise: whether to estimate unknown noise of the pixels from the residuals.
-        fixed: whether to try a fixed number of samples, as graphs require, instead of running RANSAC.
+        with_noise: whether the result has noise. Unknown noise is estimated from the residuals.
+        fixed: see :func:`propose`.
     """
     problem = problem.map(torch.Tensor.detach)
     if fixed or not sees_values(problem.weights):
@@ -112,10 +113,10 @@ def _starts_of_rig(problem: Problem, given: Pose | None, *, with_noise: bool, fi
 
 
 def _of_fixed_effort(problem: Problem) -> Starts:
-    """The best pose of a fixed number of minimal samples, and weights of its inliers."""
+    """Find the best pose of a fixed number of minimal samples. Only the inliers have positive weights."""
     there = problem.weights > 0
     counts, order = there.sum(1, keepdim=True), present_first(there)
-    # Judges are spread evenly over the pairs that have a weight. With fewer pairs than judges each pair judges once.
+    # Judges are the pairs that score all poses. They are spread evenly over the pairs of positive weight.
     turn = torch.arange(_JUDGES, device=order.device)
     judges = order.gather(1, turn.maximum(turn * counts // _JUDGES).clamp(max=order.shape[1] - 1))
     img = (_THRESHOLD * problem.focal).expand(there.shape[0], 1)
@@ -127,7 +128,7 @@ def _of_fixed_effort(problem: Problem) -> Starts:
 
 
 def _drawn(problem: Problem, order: Tensor, counts: Tensor) -> Tensor:
-    """Draw samples from the first ``counts`` (B, 1) positions in ``order`` (B, N); positions of pairs, (B, S, 3)."""
+    """Draw samples (B, S, 3) from the first ``counts`` (B, 1) positions in ``order`` (B, N)."""
     numbers = torch.arange(1, _DRAWS * _SAMPLES + 1, dtype=torch.float64, device=order.device)
     numbers = torch.stack([numbers * _ROOT**-k for k in (1, 2, 3)], -1)  # (D S, 3)
     ranks = ((numbers - numbers.floor()).flatten() * counts).long()
@@ -135,7 +136,7 @@ def _drawn(problem: Problem, order: Tensor, counts: Tensor) -> Tensor:
     places = problem.places
     rays = places.gather(1, drawn[..., None].expand(-1, -1, 3)).unflatten(1, (_DRAWS, _SAMPLES, 3))
     drawn = drawn.unflatten(1, (_DRAWS, _SAMPLES, 3))
-    # P3PRig can solve three different pairs whose rays are less than 90 degrees from the mean ray.
+    # P3PRig can solve three different pairs if each ray is less than 90 degrees from the mean ray.
     ahead = (rays * rays.sum(-2, keepdim=True)).sum(-1).amin(-1) > 0
     apart = (drawn != drawn.roll(1, -1)).all(-1)
     first = (ahead & apart).long().argmax(1)[:, None, :, None].expand(-1, 1, -1, 3)

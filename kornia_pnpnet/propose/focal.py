@@ -1,4 +1,4 @@
-r"""An unknown focal length: the range of the search, and a first estimate of focal length and pose."""
+r"""Find the range of an unknown focal length, and a first estimate of focal length and pose."""
 
 from __future__ import annotations
 
@@ -23,34 +23,36 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["as_dist", "distorted", "scale_focal", "with_found_focal", "with_nominal_focal"]
 
-# Half widths of the image. The search covers these focal lengths: fields of view from 118 to 14 degrees.
+# Shortest and longest focal length of the search, in half widths of the image: fields of view of 118 and 14 degrees.
 _SHORTEST, _LONGEST = 0.6, 8.0
 # Half of the range of log f.
 _WIDTH = 0.5 * math.log(_LONGEST / _SHORTEST)
-# In a square with uniform points: half the width over the median distance (maximum norm) of the points from the middle.
+# Half the width of a square, divided by the median distance (maximum norm) of uniform points from the centre.
 _HALF_WIDTH = math.sqrt(2.0)
-# The search covers this number of standard deviations of log f on either side of an expected focal length.
+# If the caller expects a focal length, the search covers this number of standard deviations of log f on either side.
 _SEARCHED = 2.0
-# Pixels of the normalised camera. Threshold of an inlier: 0.65 % of half the width of the image, for a focal length in
-# the middle of the range. RANSAC first uses a larger threshold, because the focal lengths of its grid are inexact.
+# Inlier threshold in pixels of the normalised camera. For a focal length in the middle of the range, the threshold is
+# 0.65 % of half the width of the image. RANSAC first uses a larger threshold, because P3P tries only a grid of focal
+# lengths.
 _THRESHOLD = 10.0
 _FINDER = RANSAC(P3P(), threshold=_THRESHOLD, confidence=0.99, final_steps=3)
 
-# Focal lengths. Least scale of the kernel in the first step, when distortion is unknown: k1 = 0.2 shifts a pixel at the
-# tangent 0.7 by 0.2 times 0.7 cubed, which is 0.07. Each step multiplies the least scale by the second number.
+# Lower bound of the kernel's scale in the first step of `_with_distortion`, in focal lengths. At a radius of 0.7 focal
+# lengths, k1 = 0.2 shifts a pixel by 0.2 * 0.7^3 = 0.07. Each step multiplies the bound by the second number.
 _WIDE, _SHRINK = 0.07, 0.6
 # Number of Gauss-Newton steps in the first estimate of distortion.
 _STEPS = 14
-# Focal lengths. Lower bound of the scale of the kernel.
+# The lower bound of the kernel's scale does not shrink below this number of focal lengths.
 _LEAST = 1e-5
 
 
 def with_nominal_focal(inputs: Inputs, sigma: float | None) -> Inputs:
     """Replace each focal length by the middle of the range of the search, and set ``free_focal``.
 
-    Given ``sigma``, the standard deviation of log f, the range lies around the caller's focal length. Without ``sigma``
-    the range follows from the size of the image: twice the principal point, or the extent of the pixels if larger. The
-    aspect ratio of the pixels is kept. Matrices that are no pinhole cameras become NaN, without gradient.
+    ``sigma`` is the standard deviation of log f. With ``sigma``, the range lies around the caller's focal length.
+    Without ``sigma``, the range is proportional to the size of the image. The size is twice the principal point or, if
+    larger, the extent of the pixels. The aspect ratio of the pixels is kept. Matrices that are no pinhole cameras
+    become NaN.
     """
     camera, is_pinhole = pinholes(inputs.intrinsics)
     given = (camera[:, 0, 0] * camera[:, 1, 1]).sqrt()  # (B,)
@@ -83,10 +85,10 @@ def scale_focal(intrinsics: Tensor, factor: Tensor) -> Tensor:
 def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
     """Estimate the focal lengths, and a pose for the problems without a given pose.
 
-    RANSAC with P3P at focal lengths on a grid estimates both, followed by least squares on the inliers.
+    RANSAC tries P3P at the focal lengths of a grid. Least squares on the inliers improve pose and focal length.
 
     Args:
-        inputs: what :func:`with_nominal_focal` returned.
+        inputs: the result of :func:`with_nominal_focal`.
         radial: number of coefficients of radial distortion to estimate. The estimated distortion is removed from the
             pixels.
     """
@@ -103,7 +105,7 @@ def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
     if radial:
         known = inputs.free_focal
         assert known is not None
-        if known.information is None:  # CameraTerm also holds the prior of small distortion, which is always known
+        if known.information is None:  # CameraTerm has the prior of distortion only if the information is a number
             known = known._replace(information=torch.zeros_like(zoom))
             inputs = inputs._replace(free_focal=known)
         with torch.no_grad():
@@ -121,14 +123,14 @@ def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
 
 
 def _zoomed(inputs: Inputs, zoom: Tensor) -> Inputs:
-    """Inputs with the focal lengths multiplied by the exponential of ``zoom`` (B,)."""
+    """Multiply the focal lengths of the inputs by the exponential of ``zoom`` (B,)."""
     assert inputs.free_focal is not None
     known = inputs.free_focal._replace(focal=inputs.free_focal.focal * zoom.exp())
     return inputs._replace(intrinsics=scale_focal(inputs.intrinsics, zoom.exp()), free_focal=known)
 
 
 def distorted(problem: Problem, coefficients: Tensor) -> Problem:
-    """Put radial distortion (B, K) back into undistorted pixels and their noise."""
+    """Apply radial distortion (B, K) to undistorted pixels and their noise."""
     p, q = (problem.img_points / problem.focal).unbind(-1)
     square = torch.addcmul(p * p, q, q)
     stretch, slope = torch.ones_like(square), torch.zeros_like(square)
@@ -139,7 +141,7 @@ def distorted(problem: Problem, coefficients: Tensor) -> Problem:
     if noise is not None:
         with torch.no_grad():
             along = stretch + slope * square
-            growth = (0.5 * (stretch**-2 + along**-2)).sqrt()  # factor of a sigma in `cameras.undistort`
+            growth = (0.5 * (stretch**-2 + along**-2)).sqrt()  # `cameras.undistort` multiplies sigma by this factor
             turned = stretch + slope * p * p, slope * p * q, stretch + slope * q * q, slope * p * q
         cov = None if noise.img_cov is None else noise.img_cov.mapped(*turned)
         noise = noise._replace(img=noise.img / growth, img_cov=cov)
@@ -147,18 +149,18 @@ def distorted(problem: Problem, coefficients: Tensor) -> Problem:
 
 
 def as_dist(coefficients: Tensor) -> Tensor:
-    """Coefficients (B, K) of radial distortion as (k1, k2, 0, 0), (B, 4)."""
+    """Pad the coefficients (B, K) of radial distortion to (k1, k2, 0, 0), shape (B, 4)."""
     return functional.pad(coefficients, (0, 4 - coefficients.shape[1]))
 
 
 def _with_distortion(problem: Problem, pose: Pose, radial: int) -> State:
     """Estimate pose, focal length and radial distortion by Gauss-Newton steps with a Cauchy kernel.
 
-    At first the scale of the kernel is at least `_WIDE`, the shift by distortion at the edge of an image. This lower
-    bound shrinks from step to step, and the scale follows the median residual.
+    The scale of the kernel is proportional to the median residual, but has a lower bound. At first the bound is
+    `_WIDE`, the shift by distortion at the edge of an image. The bound shrinks from step to step.
     """
     state = State(pose, problem.weights.new_zeros(len(problem.weights), 1 + radial))
-    # Only the prior of small distortion is used here. The refinement uses the prior of the focal length.
+    # These steps use only the prior of distortion. The refinement also uses the prior of the focal length.
     information = torch.zeros_like(problem.img_scale)
     problem = problem._replace(free_focal=problem.free_focal._replace(information=information))
     limit = _WIDE

@@ -1,4 +1,4 @@
-"""Minimal solvers: the interface that RANSAC expects, and a minimal solver that is made of any initialiser."""
+"""The interface of RANSAC's minimal solvers, and a minimal solver that runs any initialiser."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ class MinimalSolver(Protocol):
         """Number of pairs in a sample."""
 
     def hypotheses(self, problem: Problem) -> Hypotheses:
-        """Find the poses of a batch of normalised samples, :math:`N` = ``sample_size``. Weights of pairs are ignored.
+        """Find the poses of normalised samples, which are problems of ``sample_size`` pairs. Weights are ignored.
 
-        If the focal length f is unknown, the last row of each rotation and of each translation is divided by the ratio
-        of f to the focal length of the problem.
+        If the focal length is unknown, the last row of each rotation and of each translation is multiplied by
+        ``problem.focal`` and divided by the estimated focal length.
         """
 
 
 class SubsetSolver(Configured):
-    r"""A minimal solver that is made of an initialiser, for example the paper's "EPnP-LM on subsets of 7".
+    r"""A minimal solver that runs an initialiser on each sample, for example the paper's "EPnP-LM on subsets of 7".
 
     Args:
-        init: maps :class:`~kornia_pnpnet.problem.Problem` to :class:`~kornia_pnpnet.problem.Starts`.
+        init: initialiser, which maps :class:`~kornia_pnpnet.problem.Problem` to :class:`~kornia_pnpnet.problem.Starts`.
         refine: refines the poses of the initialiser; ``None``: the poses are not refined.
         size: number of pairs in a sample.
 
@@ -57,7 +57,7 @@ class SubsetSolver(Configured):
         self.init, self.refine, self.sample_size = init, refine, size
 
     def hypotheses(self, problem: Problem) -> Hypotheses:
-        """One pose per sample. A pose is valid where the start is ``ok`` and the pose is finite."""
+        """Find one pose per sample. A pose is valid if the pose is finite and the start is ``ok``."""
         starts = self.init(problem)
         pose = starts.pose if self.refine is None else self.refine(problem, starts).pose
         valid = pose.rotation.isfinite().flatten(1).all(-1) & pose.translation.isfinite().all(-1)

@@ -25,21 +25,21 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["RANSAC", "search_on"]
 
-# Number of inliers whose residuals carry no information on the noise, because the pose is fitted to them.
+# A pose can fit this number of inliers closely even if their pixels are noisy.
 _FITTED = 5
-# Standard deviations. Largest residuals of an inlier in :func:`search_on`, for estimated noise and for known noise. The
-# first limit is wide, because networks estimate too little noise when most pairs are outliers, and because a missed
-# inlier costs more than an accepted outlier. The second limit was tuned on problems of uncertain PnP
-# (`benchmarks/uncertain_problems.py`, seeds 777 and 778, 10 pairs with 5 outliers): limits of 4 and 8 lead to larger
-# errors.
+# Largest residuals of an inlier in :func:`search_on`, in standard deviations. The first limit is for the noise that a
+# network estimates, which is too small when most pairs are outliers. The limit is wide, because a missed inlier costs
+# more than an accepted outlier. The second limit is for the noise that the caller gave. On problems of uncertain PnP
+# (`benchmarks/uncertain_problems.py`, seeds 777 and 778, 10 pairs with 5 outliers), limits of 4 and 8 lead to larger
+# errors than a limit of 5.
 _INLIER, _KNOWN_INLIER = 10.0, 5.0
-# Residuals at the best focal length of a grid, relative to the median distance of the pixels from the principal point
-# times half the range of log f. Tuned on random problems with fields of view of 18 to 100 degrees (seed 6).
+# Inlier threshold of `_on_grid`, divided by two factors: the median distance of the pixels from the principal point,
+# and half the range of log f. Tuned on random problems with fields of view of 18 to 100 degrees (seed 6).
 _GRID_RESIDUAL = 0.04
-# Normalised units. Lower bound of the depth by which :func:`search_on` converts noise of the points to pixels.
+# Lower bound of the depth at which :func:`search_on` converts noise of points to pixels, in normalised units.
 _NEAREST = 0.5
-# Chance that a pair of weight 0 is drawn relative to a pair of weight 1, and the same ratio for confidences of 0 and 1.
-# The first ratio is larger because networks mislead more often than callers, for example with repeated structure.
+# Chance that a pair of weight 0 is drawn, relative to a pair of weight 1. The second number is the same ratio for
+# confidences 0 and 1. The first number is larger, because networks mislead more often than callers.
 _DOUBT, _LEAST_TRUST = 0.8, 0.05
 
 
@@ -48,24 +48,23 @@ class RANSAC(Initialiser):
 
     The samples of all problems are solved as one batch, in rounds. After each round the best pose of a problem is
     improved by least squares on its inliers (LO-RANSAC). A problem is done when a sample without an outlier has been
-    drawn with the probability ``confidence``. If the pairs have at most ``max_samples`` subsets, no subset is drawn
-    twice. Problems share only the random numbers, which are the same in every call. The result of a problem therefore
-    does not depend on the batch or on the position in the batch, up to rounding.
+    drawn with the probability ``confidence``. If a problem has at most ``max_samples`` possible samples, no sample is
+    drawn twice. Problems share only the random numbers, which are the same in every call. The result of a problem
+    therefore does not depend on the batch or on the position in the batch, up to rounding.
 
     A pair is an inlier when :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`. The ``threshold`` :math:`\tau` covers errors
-    of the pixels. The ``world_threshold`` :math:`\omega` covers errors of the points; an error of a point moves the
-    projection by :math:`f/z` times the error. Least squares weigh an inlier by the inverse of the right hand side; the
-    last steps multiply this weight by the weight of a Cauchy kernel.
+    of the pixels. The ``world_threshold`` :math:`\omega` covers errors of the points. An error of a point moves the
+    projection by :math:`f/z` times the error. In least squares, the weight of an inlier is the inverse of the
+    right-hand side. The final steps multiply this weight by the weight of a Cauchy kernel.
 
-    A pose is ``ok`` when fewer than 0.01 poses with as many inliers are expected by chance, for random pairs (see
-    :func:`~kornia_pnpnet.judge.inliers.log_false_alarms`). Three pairs cannot show whether a pose is correct: a problem
-    of three pairs is ``ok`` when it has a pose.
+    A pose is ``ok`` when fewer than 0.01 poses are expected to have as many inliers by chance (see
+    :func:`~kornia_pnpnet.judge.inliers.log_false_alarms`). Three pairs cannot show whether a pose is correct. A problem
+    of three pairs is therefore ``ok`` when it has a pose.
 
-    If the caller gave confidences, pairs are drawn more often the larger their confidence is. Fewer samples then
-    suffice when the inliers have large confidences.
+    Pairs to which the caller gave a large confidence are drawn more often than other pairs.
 
-    Gradients: the inliers, and their weights by depth, are constants. The last step, unrolled least squares on the
-    inliers from a constant start close to the minimum, has a gradient to points, pixels and weights.
+    Gradients: the final least-squares steps have gradients with respect to points, pixels and weights. These steps
+    start from a constant pose close to the minimum. The inliers, and their weights by depth, are constants.
 
     Source: M. Fischler and R. Bolles, Communications of the ACM 24(6), 1981; O. Chum, J. Matas and J. Kittler,
     "Locally optimized RANSAC", DAGM 2003; P. Torr and A. Zisserman, CVIU 78(1), 2000 (MSAC); D. Nistér, "Preemptive
@@ -76,15 +75,15 @@ class RANSAC(Initialiser):
             :class:`~kornia_pnpnet.propose.minimal.SubsetSolver`.
         threshold: :math:`\tau` in pixels of the user's camera.
         world_threshold: :math:`\omega` in the unit of the user's world.
-        scorer: ``"msac"`` (truncated squares), ``"inliers"`` (number of outliers), or a function that maps ratios of
-            squared residual and squared threshold, of any shape, to losses. The loss of a pose is the weighted sum of
-            the losses of the pairs.
+        scorer: ``"msac"`` (truncated squares), ``"inliers"`` (number of outliers), or a function (see
+            :data:`~kornia_pnpnet.propose.scoring.Scorer`). The loss of a pose is the weighted sum of the losses of the
+            pairs.
         max_samples: largest number of samples of a problem.
-        min_samples: smallest number of samples of a problem. The first sample without an outlier may not suffice,
-            because noise makes many poses of such samples inaccurate.
-        confidence: probability of having drawn a sample without an outlier, in (0, 1).
-        final_steps: number of least-squares steps from the best pose. These steps carry the gradient; with 0 steps the
-            pose is a constant, which is sufficient before a refinement.
+        min_samples: smallest number of samples of a problem. One sample without an outlier may not suffice, because
+            noise can make its pose inaccurate.
+        confidence: required probability that at least one sample has no outlier, in (0, 1).
+        final_steps: number of least-squares steps from the best pose. These steps carry the gradient. With 0 steps the
+            pose has no gradient, which is sufficient before a refinement.
         seed: seed of the random numbers.
 
     Raises:
@@ -164,7 +163,7 @@ class RANSAC(Initialiser):
                 "torch.func.vmap cannot map RANSAC, whose search ends when its problems are solved. "
                 "Give the solver a larger batch: it takes any leading dimensions."
             )
-        # Contiguous, so that rounding of a sum over pairs does not depend on the position in the batch.
+        # If tensors are contiguous, the rounding of sums over pairs does not depend on the position in the batch.
         problem = problem._replace(noise=None).map(torch.Tensor.contiguous)
         share = (problem.usual_weights.detach() > 0).to(problem.weights)
         share = share / share.sum(-1, keepdim=True).clamp(min=1.0)
@@ -189,7 +188,7 @@ class RANSAC(Initialiser):
         pose, camera = map_tensors(torch.Tensor.contiguous, projection.state)
         with torch.no_grad():
             projection, counts = map_tensors(torch.Tensor.detach, projection), (fixed.weights > 0).sum(-1)
-            # Each possible number of inliers, from 4 to the number of pairs, is one more test of the same pose.
+            # Each pose is tested once for each possible number of inliers, from 4 to the number of pairs.
             tests = search.scored * (counts - MIN_PAIRS).clamp(min=1)
             alarms = log_false_alarms(tests, projection, problems_last(fixed), thresholds, judged)
             ok = alarms < math.log(MAX_FALSE_ALARMS)
@@ -199,7 +198,7 @@ class RANSAC(Initialiser):
         return Starts(_recentred(pose, -centre), judged.weights.contiguous(), ok, camera=camera)
 
     def _refined(self, problem: Problem, state: State, stages: list[Thresholds]) -> tuple[Projection, Judged]:
-        """Improve poses on their inliers. After each step the inliers are selected by the thresholds of the stage."""
+        """Improve poses on their inliers. Each stage selects the inliers once, by its own thresholds."""
         projection = project(state, problem)
         for thresholds in stages:
             judged = judge(projection, problem, thresholds)
@@ -212,24 +211,24 @@ class RANSAC(Initialiser):
 
 
 def _recentred(pose: Pose, centre: Tensor) -> Pose:
-    """Poses in a world whose origin is moved to a world point (B, 3)."""
+    """Express poses in a world whose origin is moved to the point ``centre`` (B, 3)."""
     return Pose(pose.rotation, pose.translation + (pose.rotation @ centre[..., None])[..., 0])
 
 
 def _on_grid(problem: Problem) -> Tensor:
-    """Threshold of an inlier for focal lengths that lie between those of the grid, in pixels of the problem, (B, 1)."""
+    """Inlier threshold (B, 1) in pixels of the problem, for focal lengths between two values of P3P's grid."""
     away = torch.where(problem.weights > 0, problem.img_points.abs().amax(-1), torch.nan)
     return (_GRID_RESIDUAL * problem.free_focal.width * away.nanmedian(1).values.nan_to_num(0.0))[:, None]
 
 
 def _robust(errors: Tensor, inliers: Tensor) -> Tensor:
-    """Weights (B, N) of a Cauchy kernel. The scale of the kernel follows the median residual of the inliers.
+    """Weights (B, N) of a Cauchy kernel. The scale of the kernel is proportional to the inliers' median residual.
 
     Thresholds are wide, and noise has heavy tails. With equal weights, the pairs with the largest residuals would
     dominate the pose.
     """
     sq_scale, count = cauchy_scale(errors, inliers > 0)
-    # A pose fits few inliers closely even if they are noisy. Their residuals are therefore weighted less.
+    # With few inliers, the median residual underestimates the noise. All weights are then closer to 1.
     free = (count - _FITTED).clamp(min=0) / count.clamp(min=1)
     return 1.0 / (1.0 + free * errors / sq_scale.clamp(min=torch.finfo(errors.dtype).eps))
 
@@ -239,7 +238,7 @@ _FURTHER = RANSAC(P3P(), min_samples=64)
 
 
 def _trusted(problem: Problem) -> Tensor:
-    """Relative chances of the pairs to be drawn, by the caller's confidence, (B, N)."""
+    """Relative chances (B, N) that pairs are drawn, from the caller's confidences."""
     if problem.confidence is None:
         return torch.ones_like(problem.weights)
     return _LEAST_TRUST + (1.0 - _LEAST_TRUST) * problem.confidence.nan_to_num(0.5)
@@ -249,32 +248,32 @@ def _trusted(problem: Problem) -> Tensor:
 def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) -> Starts:
     r"""Run RANSAC on the problems for which the poses of an initialiser do not suffice.
 
-    The chance of a pair to be drawn is proportional to 0.8 plus 0.2 times its weight in the starts, times a factor by
-    the caller's confidence. Misleading weights then cost some samples, but the search still succeeds.
+    If a pair has the weight :math:`w` in the starts, its chance to be drawn is proportional to :math:`0.8 + 0.2 w`. A
+    large confidence of the caller increases the chance. Misleading weights cost samples, but do not prevent success.
 
-    An inlier has a residual of less than five standard deviations if the caller gave the noise of the pair, else of
-    less than ten standard deviations. If the caller gave no noise, the standard deviation is the mean over the pairs. A
-    covariance counts as isotropic noise of the same trace. For all poses the noise of points is converted to pixels at
-    one depth: the depth of the centre of the world in the first pose. If the depths of each pose were used, a pose
-    close to the points would have the most inliers.
+    A pair is an inlier if its residual is below ten standard deviations. If the caller gave the noise of the pair, the
+    limit is five standard deviations. If the caller gave no noise, all pairs have the mean of the estimated standard
+    deviations. A covariance is replaced by isotropic noise of the same trace. Noise of points is converted to pixels at
+    the depth of the world's origin in the first pose. If each pose used its own depths, a pose close to the points
+    would have the most inliers.
 
-    A problem is searched only when it needs more than 64 samples for a confidence of 0.999. The inliers of the best
-    pose of the starts determine this number, first before and then after least squares improve the pose. Problems that
-    are done leave the batch. The result of a problem does not depend on the other problems.
+    A problem is searched only when it needs more than 64 samples for a confidence of 0.999. This number is computed
+    from the inliers of the best pose of the starts. If the number exceeds 64, least squares improve this pose, and the
+    number is computed again. The result of a problem does not depend on the other problems.
 
     Args:
         problem: normalised problems of a centred and scaled world.
-        starts: several poses, probabilities of being an inlier as weights, and the noise of the pairs.
-        keep_others: whether the result keeps the other poses of the starts. A solver keeps them if the caller gave a
-            pose or a prior, because a search on few pairs can lead away from the correct pose.
+        starts: several poses per problem, and the noise of the pairs. Weights are probabilities that pairs are inliers.
+        keep_others: whether the result keeps the other poses of the starts. The solver keeps these poses if the caller
+            gave a pose or a prior, because a search on few pairs can lead away from the correct pose.
 
     Returns:
-        The starts with the best pose, without gradient. The weights of a searched problem are replaced, because the
-        network's weights misled: the new weights are those of a Cauchy kernel at the best pose, with the limit of an
-        inlier as its scale.
+        The starts with the best pose, without gradient. A searched problem has new weights, because the network's
+        weights misled the first pose. The new weights are those of a Cauchy kernel at the best pose. The scale of the
+        kernel is the inlier threshold.
 
     Raises:
-        ValueCheckError: when the initialiser does not estimate the noise.
+        ValueCheckError: when the starts have only one pose, or no noise.
     """
     if starts.noise is None or starts.others is None:
         raise ValueCheckError('effort="adaptive" needs an initialiser with several poses and the noise, as SetInit.')

@@ -1,4 +1,4 @@
-r"""Samples of RANSAC: which subsets of the pairs are drawn, and how many samples suffice.
+r"""Draw the samples of RANSAC, and compute how many samples suffice.
 
 Problems share only the random numbers. The samples of a problem do not depend on the rest of the batch.
 """
@@ -20,24 +20,24 @@ __all__ = ["Samples", "agreement_of_neighbours", "draw", "kept_at_once", "sample
 
 # Number of nearest neighbours of a pair that are compared.
 _NEIGHBOURS = 16
-# Largest number of pairs, spread evenly over all pairs, among which neighbours are searched. The bound makes the cost
-# linear in the number of pairs. The number must be a power of two.
+# Neighbours are searched among at most this number of pairs, which are a subsample spread evenly over all pairs. The
+# cost is therefore linear in the number of pairs. The number must be a power of two.
 _CANDIDATES = 512
 # The bits of an infinite float32.
 _INFINITE = 0x7F800000
-# Number of distances in a block that a core's cache holds.
+# Number of distances that are computed at once on a CPU, so that they fit into a core's cache.
 _BLOCK = 2**18
 
 
 def kept_at_once(count: int, like: Tensor) -> int:
-    """Size of a block that is computed at once: ``count`` on a CPU, to fit a core's caches; 64 times more elsewhere."""
+    """Size of a block that is computed at once: ``count`` on a CPU (limited by a core's caches), else 64 ``count``."""
     return count if like.device.type == "cpu" else 64 * count
 
 
 def draw(numbers: Tensor, upper: Tensor) -> Tensor:
     """Draw subsets of items without replacement.
 
-    Items of probability 0 are drawn only when a subset needs more items than have a positive probability.
+    Items of probability 0 are drawn only when too few items have a positive probability.
 
     Args:
         numbers: random numbers, uniform in [0, 1), float64, shape (H, s).
@@ -67,13 +67,13 @@ def draw(numbers: Tensor, upper: Tensor) -> Tensor:
 
 
 def agreement_of_neighbours(world_points: Tensor, img_points: Tensor, there: Tensor) -> Tensor:
-    r"""Agreement of each pair's nearest neighbours in the image with its nearest neighbours in the world, (B, N).
+    r"""Agreement (B, N) between each pair's nearest neighbours in the image and its nearest neighbours in the world.
 
-    Points that are neighbours in the image are mostly neighbours in the world. Inliers therefore have common neighbours
-    in both, whereas outliers have common neighbours only by chance. A neighbour that is the :math:`a`-th nearest in the
-    image and the :math:`b`-th nearest in the world, counted from 0, adds :math:`1 / (1 + \max(a, b))` to the agreement.
-    Only the 16 nearest neighbours are compared. Pairs with the same pixel or the same point are ignored, because they
-    often repeat one incorrect match.
+    Points that are close in the image are mostly close in the world. An inlier therefore has common neighbours in both
+    spaces. An outlier has common neighbours only by chance. The 16 nearest neighbours of each pair are compared. Let a
+    common neighbour have the rank :math:`a` in the image and the rank :math:`b` in the world, counted from 0. This
+    neighbour adds :math:`1 / (1 + \max(a, b))` to the agreement. Pairs with equal pixels or equal points do not count
+    as neighbours, because such pairs often repeat one incorrect match.
 
     Source: J. Bian et al., "GMS: Grid-based motion statistics for fast, ultra-robust feature correspondence", CVPR 2017
     (the idea, for matches between two images).
@@ -81,7 +81,7 @@ def agreement_of_neighbours(world_points: Tensor, img_points: Tensor, there: Ten
     Args:
         world_points: shape :math:`(B, N, 3)`.
         img_points: shape :math:`(B, N, 2)`.
-        there: which pairs have a weight, bool, shape :math:`(B, N)`.
+        there: which pairs have a positive weight, bool, shape :math:`(B, N)`.
     """
     counts, width = there.sum(-1, keepdim=True), min(there.shape[1], _CANDIDATES)
     order = torch.arange(width, dtype=torch.int32, device=there.device)
@@ -98,10 +98,10 @@ def agreement_of_neighbours(world_points: Tensor, img_points: Tensor, there: Ten
         both = [
             torch.cdist(x[some][:, here], x[some[:, None], at[some]], compute_mode="donot_use_mm_for_euclid_dist")
             for x in (world_points, img_points)
-        ]  # exactly 0 between equal points
+        ]  # the distance between equal points is exactly 0
         no = (both[0] == 0).logical_or_(both[1] == 0).logical_or_(absent[some])
-        # Bits of positive floats, read as integers, have the order of the floats. The index of the neighbour replaces
-        # the last bits, so that no two keys are equal.
+        # The bits of positive floats, read as integers, sort like the floats. The index of the neighbour replaces the
+        # last bits, so that no two keys are equal.
         keys = [x.masked_fill_(no, torch.inf).view(torch.int32).bitwise_and_(-_CANDIDATES) for x in both]
         near, seen = (x.bitwise_or_(order).topk(len(rank), largest=False).values for x in keys)
         common = (near[..., :, None] & (_CANDIDATES - 1)) == (seen[..., None, :] & (_CANDIDATES - 1))
@@ -113,18 +113,18 @@ def agreement_of_neighbours(world_points: Tensor, img_points: Tensor, there: Ten
 class Samples:
     """The samples that RANSAC tries, for every problem of a batch.
 
-    If the pairs of a problem have at most ``most`` subsets, each subset is one sample, in random order. Otherwise
-    ``most`` samples are drawn.
+    If a problem has at most ``most`` subsets of ``size`` pairs, each subset is one sample. The order of these samples
+    is random. Otherwise ``most`` samples are drawn at random.
 
     Args:
-        there: which pairs have a weight, bool (B, N).
+        there: which pairs have a positive weight, bool (B, N).
         size: number of pairs in a sample.
         most: largest number of samples.
         seed: seed of the random numbers, which are the same for every problem.
-        chances: relative chances of the pairs to be drawn, at least 0, (B, N); ``None``: equal chances.
+        chances: relative chances, at least 0, that pairs are drawn, (B, N); ``None``: equal chances.
 
     Attributes:
-        counts: number of pairs that have a weight, (B,).
+        counts: number of pairs that have a positive weight, (B,).
         totals: number of samples of each problem, (B,).
 
     Example:
@@ -155,7 +155,7 @@ class Samples:
     def positions(self, problems: Tensor, start: int, stop: int) -> Tensor:
         """Positions (P, H, s) of the pairs in the samples ``start`` to ``stop - 1`` of some problems (P,).
 
-        If all subsets of a problem are listed, the first samples are repeated after the last sample.
+        If a problem has fewer than ``stop`` samples, its first samples are repeated.
         """
         listed = torch.arange(start, stop, device=problems.device) % self.totals[problems, None]
         ranks = self._tables[self._kinds[problems, None], listed.clamp(max=self._tables.shape[1] - 1)]
@@ -165,10 +165,10 @@ class Samples:
         return self._present(problems, ranks)
 
     def needed(self, problems: Tensor, inliers: Tensor, confidence: float) -> Tensor:
-        """:func:`samples_needed` of some problems (P,) with the inliers (P, N) of their best poses so far.
+        """Apply :func:`samples_needed` to some problems (P,), given the inliers (P, N) of their best poses.
 
-        The chances of a problem are scaled to the sum 1. If pairs have unequal chances, an effective number replaces
-        the number of pairs: the inverse of the mean chance of the inliers, with the chances themselves as weights.
+        With unequal chances, the inverse of the inliers' mean chance replaces the number of pairs. The chances of a
+        problem have the sum 1. The mean is weighted by the chances themselves.
         """
         share = torch.where(inliers, self._share[problems], 0.0)
         mass = share.sum(-1)
@@ -176,35 +176,35 @@ class Samples:
         return samples_needed(mass * count, count, self.size, confidence)
 
     def spread(self, problems: Tensor, count: int) -> Tensor:
-        """Positions of ``count`` pairs spread evenly over the pairs that have a weight, (P, count).
+        """Select ``count`` pairs, spread evenly over the pairs of positive weight. Returns positions (P, count).
 
         The selected pairs are spread over the image, because :class:`~kornia_pnpnet.frame.Normalize` orders pairs by
-        their pixels. Pairs with larger chances are selected more often.
+        their pixels. Pairs are selected in proportion to their chances.
         """
         at = (torch.arange(count, dtype=torch.float64, device=problems.device) + 0.5) / count
         ranks = torch.searchsorted(self._upper[problems], at.expand(len(problems), -1).contiguous(), right=True)
         return self._present(problems, ranks.clamp(max=self._upper.shape[1] - 1))
 
     def _present(self, problems: Tensor, ranks: Tensor) -> Tensor:
-        """Positions of pairs from their ranks (P, ...) among the pairs that have a weight."""
+        """Convert ranks (P, ...) among the pairs of positive weight to positions in the problems."""
         return self._order[problems].gather(1, ranks.flatten(1)).view_as(ranks)
 
 
 @lru_cache(maxsize=64)
 def _random_numbers(size: int, most: int, seed: int) -> Tensor:
-    """Uniform numbers (most, size) on the CPU, from NumPy: ``torch.func.jacfwd`` rejects PyTorch's random functions."""
+    """Random numbers (most, size) from NumPy, because ``torch.func.jacfwd`` rejects PyTorch's random functions."""
     return torch.from_numpy(np.random.default_rng(seed).random((most, size)))
 
 
 @lru_cache(maxsize=256)
 def _subsets(count: int, size: int, seed: int) -> Tensor:
-    """All subsets of ``count`` items in an order that the seed fixes, (C, size), on the CPU."""
+    """List all subsets of ``size`` among ``count`` items, (C, size). The seed determines their random order."""
     table = torch.combinations(torch.arange(max(count, size), device="cpu"), size)
     return table[torch.from_numpy(np.random.default_rng(seed).permutation(len(table)))]
 
 
 def samples_needed(inliers: Tensor, counts: Tensor, size: int, confidence: float) -> Tensor:
-    r"""Number of samples for which at least one sample has no outlier with the probability :math:`p`, float64 (B,).
+    r"""Number of samples needed for a probability :math:`p` that at least one sample has no outlier, float64 (B,).
 
     The number is :math:`\log(1-p) / \log(1-w)`, where :math:`w = \binom{k}{s} / \binom{c}{s}` is the share of samples
     without an outlier.

@@ -1,9 +1,9 @@
-r"""Losses of thousands of poses per problem at once, and the functions that map residuals to losses.
+r"""Compute the losses of thousands of poses per problem at once.
 
-A new loss function is one entry of :data:`SCORERS`. The *standardised* squared residual :math:`e` of a pair is the
-ratio of its squared residual and the squared threshold, see :mod:`kornia_pnpnet.judge.inliers`. Here numerator and
-denominator are multiplied by :math:`(z/f)^2`, so that there is no division by the depth. One matrix product then
-projects all points at all poses:
+To add a loss function, add an entry to :data:`SCORERS`. The *standardised* squared residual :math:`e` of a pair is its
+squared residual divided by the squared threshold, see :mod:`kornia_pnpnet.judge.inliers`. To avoid the division by the
+depth :math:`z`, this module multiplies numerator and denominator by :math:`(z/f)^2`. One matrix product then projects
+all points at all poses. A pixel :math:`b` and a point :math:`(x, y, z)` in the camera frame have the residual
 
 .. math:: e = \frac{(x - z\,b_u/f)^2 + (y - z\,b_v/f)^2}{(z \tau / f)^2 + \omega^2}
 """
@@ -28,7 +28,8 @@ __all__ = ["SCORERS", "Scene", "Scorer", "as_entries", "as_pose"]
 #: Maps standardised squared residuals of any shape to losses of the pairs.
 Scorer: TypeAlias = Callable[[Tensor], Tensor]
 
-# Increase of the squared distance per unit of negative depth, by which points behind the camera exceed MAX_ERROR.
+# The squared distance of a point behind the camera is increased by this number times the distance behind the camera.
+# The residual of the point then exceeds MAX_ERROR.
 _BEHIND = 1e15
 
 
@@ -38,16 +39,16 @@ def _truncated(error: Tensor) -> Tensor:
 
 
 def _outliers(error: Tensor) -> Tensor:
-    """RANSAC's count of outliers."""
+    """The loss of the original RANSAC: 1 for an outlier, 0 for an inlier."""
     return (error >= 1.0).to(error.dtype)
 
 
-#: Loss functions of a pair by name. A residual at or above the threshold has the loss 1. Lambdas could not be pickled.
+#: Loss functions by name. The loss of a residual at or above the threshold is 1. Lambdas cannot be pickled.
 SCORERS: dict[str, Scorer] = {"msac": _truncated, "inliers": _outliers}
 
 
 def as_pose(entries: Tensor) -> Pose:
-    """Poses from the entries (*, 12) of the matrices [R | t], in row-major order."""
+    """Convert the entries (*, 12) of matrices [R | t], in row-major order, to poses."""
     matrix = entries.unflatten(-1, (3, 4))
     return Pose(matrix[..., :3], matrix[..., 3])
 
@@ -61,8 +62,8 @@ class Scene(NamedTuple):
     r"""The pairs of some problems in the form that scoring requires.
 
     Attributes:
-        rows: :math:`x - z\,b_u/f`, :math:`y - z\,b_v/f` and :math:`z \tau / f` as linear functions of a pose: twelve
-            coefficients of its entries (see :func:`as_pose`) and a constant, shape :math:`(P, 3, N, 13)`.
+        rows: :math:`x - z\,b_u/f`, :math:`y - z\,b_v/f` and :math:`z \tau / f` as linear functions of a pose. Each has
+            twelve coefficients for the entries of :func:`as_pose`, and a constant. Shape :math:`(P, 3, N, 13)`.
         weights: weights of the pairs, shape :math:`(P, 1, N)`.
         sq_world: :math:`\omega^2`, shape :math:`(P, 1, 1)` or :math:`(P, N, 1)`.
         prior: prior of the poses; ``None``: no prior.
@@ -75,7 +76,7 @@ class Scene(NamedTuple):
 
     @classmethod
     def of(cls, problem: Problem, thresholds: Thresholds, dtype: torch.dtype) -> Scene:
-        """Convert problems to a scene, in a dtype that is precise enough to compare poses."""
+        """Convert problems to a scene of the given dtype."""
         if problem.rig is None:
             eye = torch.eye(3, 4, dtype=problem.weights.dtype, device=problem.weights.device)
             first, second, third = eye.expand(1, 1, 3, 4).unbind(2)
@@ -100,7 +101,7 @@ class Scene(NamedTuple):
         return self._replace(rows=rows, weights=self.weights.gather(2, positions[:, None]))
 
     def losses(self, poses: Tensor, scorer: Scorer) -> Tensor:
-        """Losses (P, H) of poses (P, 12, H): the weighted sum of the losses of the pairs, plus that of the prior."""
+        """Losses (P, H) of poses (P, 12, H): the weighted sum of the pairs' losses, plus the loss of the prior."""
         losses = (self.weights @ scorer(self.errors(poses)))[:, 0]
         if self.prior is None:
             return losses
@@ -108,10 +109,9 @@ class Scene(NamedTuple):
         return losses + prior.disagreement(as_pose(poses.mT))
 
     def errors(self, poses: Tensor) -> Tensor:
-        """Standardised squared residuals (P, N, H), at most MAX_ERROR, of every pair at every pose (P, 12, H).
+        """Standardised squared residuals (P, N, H) of every pair at every pose (P, 12, H), at most MAX_ERROR.
 
-        Points behind the camera are not masked but get a large residual, because a mask would take longer than the
-        arithmetic.
+        The residual of a point behind the camera is MAX_ERROR. No mask is used, because masking would take longer.
         """
         rows = self.rows.flatten(1, 2)
         x, y, z = torch.baddbmm(rows[..., 12:], rows[..., :12], poses).unflatten(1, self.rows.shape[1:3]).unbind(1)

@@ -28,41 +28,40 @@ __all__ = ["CAUCHY", "Plan", "Search", "cauchy_scale", "least_squares"]
 #: Scale of the Cauchy kernel in standard deviations.
 CAUCHY = 3.4
 
-# Precision in which poses are compared and improved. It resolves 1e-4 px at the protocol's focal length of 3400 px.
+# Poses are compared and improved in this dtype. At a focal length of 3400 px, rounding errors are about 1e-4 px.
 _DTYPE = torch.float32
-# Largest number of samples that are solved and scored together, so that a core's caches hold the tensors.
+# On a CPU, at most this number of samples is solved and scored at once, so that the tensors fit into a core's caches.
 _SAMPLES_AT_ONCE = 4096
-# Number of pairs that score all poses of a round first, see `Search._round`: the maximum of the first number and of the
-# second number times the cube root of the number k of samples drawn before. If k samples did not suffice for a
-# confidence of 0.999, the share w of inliers is below (7 / k)^(1/3). Among 3 / w pairs at least one is an inlier with a
-# probability of 95 %.
+# Let a and b be these numbers. After k samples, the first scoring of a round (see `Search._round`) uses the maximum of
+# a and b * k^(1/3) pairs. If k samples did not suffice for a confidence of 0.999, the share w of inliers is below the
+# bound (7 / k)^(1/3). At this bound, 3 / w pairs contain at least one inlier with a probability of 95 %.
 _FIRST_PAIRS, _PAIRS_BY_SAMPLES = 24, 3.0 / 7.0 ** (1 / 3)
-# After each scoring of a round the number of poses is divided by the first number, and the number of pairs that score
-# is multiplied by the second. Half of the poses are kept, because with 90 % outliers the first pairs have few inliers.
+# After each scoring of a round, the best half of the poses is scored again on four times as many pairs. If fewer poses
+# were kept, the best pose could be lost: with 90 % outliers, the first pairs contain few inliers.
 _KEPT_ONE_IN, _MORE = 2, 4
-# Number of best poses of a round that are improved. The best improved pose is then improved again.
+# In each round, this number of poses with the smallest losses is improved. The best of them is then improved again.
 _IMPROVED = 3
-# Number of samples in a round relative to the number of samples drawn before. A larger ratio reduces the number of
-# rounds, but draws more samples than necessary.
+# Number of samples in a round, divided by the number of samples before the round. A larger ratio would reduce the
+# number of rounds, but would draw more samples than necessary.
 _GROWTH = 0.5
 # If the remaining samples would take at most this number of rounds, one round draws all of them.
 _FEW_LEFT = 2.0
-# The number of samples that are solved at once is a multiple of this number, so that they fill a processor's vectors.
+# Samples are solved in multiples of this number, so that they fill the vector registers of a processor.
 _VECTOR = 64
-# Relative damping of least squares, nearly 0 because the start is close to the minimum.
+# Relative damping of a least-squares step. Almost no damping is needed, because the start is close to the minimum.
 _DAMPING = 1e-6
-# Thresholds of an inlier. Largest residuals of the pairs in the first and in the second least-squares step. The first
-# limit is larger, because inliers have larger residuals at the pose of a noisy sample.
+# Factors of the inlier threshold in the first and in the second least-squares step. The first factor is larger, because
+# inliers have larger residuals at the pose of a minimal sample than at an improved pose.
 _LIMITS = 3.0, 1.0
-# At least the second number of samples is drawn when the standard deviation of the rotation exceeds the first number
-# (radians), as for a flat scene in a narrow field of view. Another pose may then have as many inliers as the correct
-# pose. Chosen on a scene with a field of view of 13 degrees. With half of the first number, problems of 9 pairs take
-# twice the time.
+# If the standard deviation of the rotation exceeds the first number (radians), at least the second number of samples is
+# drawn. An incorrect pose may then have as many inliers as the correct pose, for example in a flat scene and a narrow
+# field of view. Chosen on a scene with a field of view of 13 degrees. Half of the first number would double the time
+# for problems of 9 pairs.
 _OPEN, _OPEN_SAMPLES = 0.008, 256.0
-# After this number of samples, pairs whose neighbours agree are drawn more often (see `agreement_of_neighbours`). To
-# compute the agreement takes about as long as these samples.
+# After this number of samples, pairs with a large `agreement_of_neighbours` are drawn more often. Computing the
+# agreement takes about as long as solving this number of samples.
 _PLAIN_SAMPLES = 256
-# The chance of a pair is multiplied by (first number + agreement) to the power of the second number. Empirical values.
+# The chance that a pair is drawn is multiplied by (a + agreement)^b. These numbers a and b were chosen empirically.
 _LEAST_AGREEMENT, _AGREEMENT_POWER = 0.3, 1.5
 
 
@@ -81,20 +80,20 @@ class Search:
     r"""One search for the best poses of a batch, without gradients.
 
     A pose is stored as the twelve entries of :math:`[R | t]`, see :func:`~kornia_pnpnet.propose.scoring.as_pose`. If
-    the focal length is unknown, the last row of the matrix is divided by the ratio of its estimate to the focal length
-    of the problem.
+    the focal length is unknown, the last row of this matrix is multiplied by ``problem.focal`` and divided by the
+    estimated focal length.
 
     Args:
         plan: options of the search.
-        problem: problems in a centred world, because the search computes in float32.
+        problem: problems whose points are centred at the origin, because the search computes in float32.
         thresholds: thresholds of an inlier.
-        chances: relative probabilities of the pairs to be inliers, shape :math:`(B, N)`; ``None``: equal probabilities.
+        chances: relative probabilities that pairs are inliers, shape :math:`(B, N)`; ``None``: equal probabilities.
         sigma: standard deviation of the pixels, shape :math:`(B, 1)` or :math:`(B, N)`; ``None``: estimated from the
             residuals of the inliers.
 
     Attributes:
         poses: the best pose of each problem, shape :math:`(B, 12)`.
-        loss: loss of the best pose, infinite for a problem without a pose, shape :math:`(B,)`.
+        loss: loss of the best pose, shape :math:`(B,)`. The loss of a problem without a pose is infinite.
         scored: number of scored poses, int64, shape :math:`(B,)`.
         drawn: number of drawn samples, int64, shape :math:`(B,)`.
 
@@ -121,13 +120,13 @@ class Search:
         self.plan, self.problem = plan, problem
         self.chances = torch.ones_like(problem.weights) if chances is None else chances
         self.minimal = plan.minimal
-        if problem.rig is not None:  # all rays of bearings start at one centre
+        if problem.rig is not None:  # without translations, all rays start at one point
             central = sees_values(problem.weights) and not bool(problem.rig.translation.any())
             self.minimal = P3PRig(0 if central else 8)
         self.thresholds, sigma = map_tensors(lambda x: x.to(_DTYPE), (thresholds, sigma))
         self.sigma = None if sigma is None else sigma.expand_as(problem.weights)
         self.scene = Scene.of(problem, self.thresholds, _DTYPE)
-        # All numbers of a pair are adjacent, so that one operation selects pairs: (B, N, 6), of a rig (B, N, 18).
+        # The numbers of a pair are adjacent, so that one operation selects pairs. Shape (B, N, 6), (B, N, 18) for rigs.
         rig = [] if problem.rig is None else [problem.rig.rotation.flatten(2), problem.rig.translation]
         self.pairs = torch.cat((problem.world_points, problem.img_points, problem.weights[..., None], *rig), -1)
         self.low = self.pairs.to(_DTYPE)
@@ -139,20 +138,20 @@ class Search:
 
     @property
     def state(self) -> State:
-        """The best poses and zooms in the dtype of the problem. Rotations are orthogonal up to rounding."""
+        """The best poses and cameras in the dtype of the problem. Rotations are orthogonal up to rounding."""
         pose, camera = self._state(self.poses.to(self.problem.weights))
-        # A Newton step for the polar factor doubles the number of correct digits.
+        # One Newton step towards the closest orthogonal matrix doubles the number of correct digits.
         rotation = 1.5 * pose.rotation - 0.5 * pose.rotation @ (pose.rotation.mT @ pose.rotation)
         return State(Pose(rotation, pose.translation), camera)
 
     def run(self, given: Pose | None = None, enough: int = 0) -> None:
-        """Search until the drawn samples of each problem reach the confidence of the plan, or all samples are drawn.
+        """Search each problem until its samples suffice for the plan's confidence, or until all samples are drawn.
 
         Args:
-            given: :math:`S` poses of each problem that compete with the poses of the samples, :math:`(B, S, 3, 3)` and
-                :math:`(B, S, 3)`, in the frame of the problem.
-            enough: number of samples. A problem is not searched if it needs at most this number of samples by the
-                inliers of its given poses.
+            given: :math:`S` poses per problem, in the frame of the problem. These poses compete with the poses of the
+                samples. Shapes :math:`(B, S, 3, 3)` and :math:`(B, S, 3)`.
+            enough: a problem with given poses is searched only if it needs more than this number of samples. The
+                inliers of its best pose determine how many samples it needs.
         """
         self.samples = self.plain = self._samples(self.chances)
         totals = self.samples.totals
@@ -184,7 +183,7 @@ class Search:
             active = active[self.needed[active].clamp(min=self.plan.min_samples) > stop]
 
     def run_once(self, positions: Tensor, judges: Tensor) -> None:
-        """Search in one round of given samples. No size depends on values, so that graphs can contain this method.
+        """Search in one round of given samples. No shape depends on values, as compiled and exported graphs require.
 
         Args:
             positions: positions of the pairs in the samples, shape :math:`(B, H, s)`.
@@ -199,7 +198,7 @@ class Search:
         self.loss, self.poses = self._improved(problems, losses, poses)
 
     def _state(self, poses: Tensor) -> State:
-        """Separate poses and zooms from the entries (R, 12)."""
+        """Convert stored poses (R, 12), see :class:`Search`, to states."""
         if self.problem.free_focal is None:
             return State.of(as_pose(poses))
         first, last = poses.split((8, 4), 1)
@@ -207,7 +206,7 @@ class Search:
         return State(as_pose(torch.cat((first, last / scale), 1)), -scale.log())
 
     def _unpacked(self, values: Tensor, owners: Tensor) -> Problem:
-        """Problems of n pairs, from numbers of the pairs (C, n, P) and indices ``owners`` (P,) in the batch."""
+        """Build P problems of n pairs from C numbers per pair, (C, n, P). ``owners`` (P,) are indices in the batch."""
         scales, free = take(((self.problem.img_scale, self.problem.world_scale), self.problem.free_focal), owners)
         scales, free, focal = map_tensors(lambda x: x.to(values), (scales, free, self.problem.focal))
         values = values.permute(2, 1, 0)
@@ -217,7 +216,7 @@ class Search:
         return Problem(values[..., :3], values[..., 3:5], weights, focal, *scales, usual, rig=rig, free_focal=free)
 
     def _projected(self, rows: Tensor, poses: Tensor) -> tuple[Problem, Thresholds, Projection]:
-        """The problems at ``rows`` (R,), their thresholds, and their projections at poses (R, 12), in float32."""
+        """Select the problems and thresholds at ``rows`` (R,), and project the points at poses (R, 12), in float32."""
         problem = self._unpacked(self.low[rows].permute(2, 1, 0).contiguous(), rows)
         return problem, take(self.thresholds, rows), project(self._state(poses), problem)
 
@@ -234,10 +233,10 @@ class Search:
         self.samples = self._samples(chances)
 
     def _expect(self, at: Tensor) -> None:
-        """Estimate the number of samples that some problems need, by the inliers of their best poses.
+        """Estimate how many samples some problems need, from the inliers of their best poses.
 
-        After `_prefer_agreement` the result is the geometric mean of two estimates, with and without agreement. With
-        agreement alone, an incorrect pose on repeated structure, where neighbours agree, could end the search early.
+        After `_prefer_agreement`, the result is the geometric mean of the estimates with and without agreement. On
+        repeated structure, neighbours of outliers agree. The estimate with agreement could then end the search early.
         """
         if not len(at):
             return
@@ -256,15 +255,15 @@ class Search:
         self.needed[at] = needed
 
     def _end_of_round(self, done: int, total: int) -> int:
-        """Number of samples after the next round; the round includes the remaining samples if there are few."""
+        """Number of samples at the end of the next round. If few samples remain, the round draws all of them."""
         size = min(max(self.plan.min_samples, int(_GROWTH * done)), _SAMPLES_AT_ONCE)
         return total if done + size * _FEW_LEFT >= total and total - done <= _SAMPLES_AT_ONCE else done + size
 
     def _round(self, problems: Tensor, start: int, stop: int) -> tuple[Tensor, Tensor]:
-        """Losses (P, K), ascending, and poses (P, 12, K): the best poses of the samples ``start`` to ``stop - 1``.
+        """Find the best poses (P, 12, K) of the samples ``start`` to ``stop - 1``, and their ascending losses (P, K).
 
-        If a problem has many pairs, a few pairs score all poses first, and more pairs then score the best poses. The
-        number of pairs increases with ``start``: after many samples without success the share of inliers is small.
+        If a problem has many pairs, a few pairs score all poses first. More pairs then score the best poses. The number
+        of first pairs increases with ``start``, because after many samples without success inliers are rare.
         """
         poses, valid = self._solved(problems, self.samples.positions(problems, start, stop), start)
         scene, width = take(self.scene, problems), poses.shape[-1]
@@ -276,10 +275,10 @@ class Search:
         return self._best_of(scene, poses, valid, _IMPROVED)[:2]
 
     def _solved(self, problems: Tensor, positions: Tensor, start: int | None = None) -> tuple[Tensor, Tensor]:
-        """Poses (P, 12, W) of the samples (P, H, s) of some problems, and which poses are solutions, (P, W).
+        """Solve samples (P, H, s) of some problems. Returns poses (P, 12, W), and which poses are solutions, (P, W).
 
-        Given ``start``, the index of the first sample, samples after the last sample of a problem are ignored. Only
-        solutions are then returned, and ``scored`` is increased by their number.
+        ``start`` is the index of the first sample. If given, solutions precede invalid poses, and ``scored`` counts the
+        solutions. Samples after the last sample of a problem are then ignored.
         """
         batch, count, size = positions.shape
         rows = full_vectors((positions + problems[:, None, None] * self.pairs.shape[1]).flatten(0, 1))  # (R, s)
@@ -287,8 +286,7 @@ class Search:
         owners = full_vectors(problems.repeat_interleave(count))
         pose, valid = self.minimal.hypotheses(self._unpacked(values.permute(2, 1, 0), owners))
         valid = valid[: batch * count].unflatten(0, (batch, count)).mT  # (P, S, H)
-        # The components of a pose are the first dimension, as in the memory of p3p's result, so that each component is
-        # selected from contiguous memory.
+        # The components of a pose come first, as in the memory of p3p's result, so that each component is contiguous.
         pose = map_tensors(lambda x: x.movedim((0, 1), (-1, -2)), pose)
         poses = torch.cat((pose.rotation, pose.translation[:, None]), 1).flatten(0, 1).to(_DTYPE)  # (12, S, R)
         if start is None:
@@ -297,7 +295,7 @@ class Search:
         valid = (valid & (numbers < self.samples.totals[problems, None])[:, None]).flatten(1)
         found = valid.sum(1)
         self.scored[problems] += found
-        # The width is the largest number of solutions of a problem, rounded up to full vectors of a processor.
+        # The width is the largest number of solutions of a problem, rounded up to a multiple of `_VECTOR`.
         width = max(1, -(-int(found.max()) // _VECTOR)) * _VECTOR
         at = present_first(functional.pad(valid, (0, width)))[:, :width]
         valid = torch.arange(width, device=at.device) < found[:, None]
@@ -306,16 +304,16 @@ class Search:
         return poses.flatten(1).index_select(1, at.flatten()).unflatten(1, at.shape).movedim(1, 0), valid
 
     def _best_of(self, judges: Scene, poses: Tensor, valid: Tensor, width: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Losses (P, K), ascending, poses (P, 12, K) and validity (P, K) of the poses with the smallest losses."""
+        """Select the K poses with the smallest losses: ascending losses (P, K), poses (P, 12, K), validity (P, K)."""
         losses = judges.losses(poses, self.plan.score).masked_fill(~valid, torch.inf)
         losses, order = losses.topk(min(width, losses.shape[1]), largest=False)
         return losses, poses.gather(2, order[:, None].expand(-1, 12, -1)), valid.gather(1, order)
 
     def _improved(self, problems: Tensor, losses: Tensor, poses: Tensor) -> tuple[Tensor, Tensor]:
-        """Improve the poses (P, 12, K) of some problems by least squares on their inliers, then improve the best again.
+        """Improve poses (P, 12, K) by a least-squares step on their inliers, and the best new pose by a second step.
 
-        A step that does not lower the loss of a pose is undone. An invalid pose remains invalid. Returns losses (P,)
-        and poses (P, 12).
+        A step that does not lower the loss of a pose is undone. The loss of an invalid pose remains infinite. Returns
+        the losses (P,) and the entries (P, 12) of the best poses.
         """
         number, pairs = problems.shape[0], self.low.shape[1]
         problems, losses, poses = (full_vectors(x, pairs) for x in (problems, losses, poses))
@@ -343,10 +341,10 @@ class Search:
 
 
 def least_squares(problem: Problem, projection: Projection, weights: Tensor, variance: Tensor | None = None) -> State:
-    """Take one least-squares step. The weight of a pair is ``weights`` (B, N) times its weight in the problem.
+    """Take one least-squares step. Pairs are weighted by the products of ``weights`` (B, N) and ``problem.weights``.
 
-    A prior of the camera is weighed against the residuals by the ``variance`` (B, 1) of a pixel coordinate. By default
-    the standard deviation is one pixel of the caller's image.
+    If the camera has a prior, ``variance`` (B, 1) is the variance of a pixel coordinate, which determines the relative
+    weight of the prior. The default is one squared pixel of the caller's image.
     """
     weights = problem.weights * weights
     equations = normal_equations(projection, problem, weights)
@@ -359,12 +357,12 @@ def least_squares(problem: Problem, projection: Projection, weights: Tensor, var
 
 
 def cauchy_scale(sq_residuals: Tensor, there: Tensor, fitted: int = MIN_PAIRS) -> tuple[Tensor, Tensor]:
-    """Squared scale of a Cauchy kernel, by the median squared residual, and the number of pairs, both (B, 1).
+    """Compute the squared scale of a Cauchy kernel from the median residual, and count the used pairs, both (B, 1).
 
     Args:
         sq_residuals: squared residuals, shape (B, N).
-        there: which pairs are used, bool, shape (B, N). For a problem without such pairs the scale is infinite.
-        fitted: number of pairs that every state fits exactly.
+        there: which pairs are used, bool, shape (B, N). If a problem uses no pair, its scale is infinite.
+        fitted: number of pairs that a state can fit exactly. The median ignores this number of smallest residuals.
     """
     count = there.sum(-1, keepdim=True)
     middle = ((count + fitted) // 2).minimum(count - 1).clamp(min=0)
@@ -373,10 +371,10 @@ def cauchy_scale(sq_residuals: Tensor, there: Tensor, fitted: int = MIN_PAIRS) -
 
 
 def full_vectors(rows: Tensor, pairs: int = 1) -> Tensor:
-    """Repeat the first row until the rows fill a processor's vectors, unless each row has many pairs.
+    """Repeat the first row until the number of rows is a multiple of `_VECTOR`, unless each row has many pairs.
 
-    Some arithmetic rounds differently in a vector that is not full. With full vectors the poses of a sample do not
-    depend on its position in the batch. Rows with many pairs are not repeated, because this would take too much time.
+    Processors round differently in partly filled vectors. With full vectors, the poses of a sample do not depend on the
+    position in the batch. Repeating rows with many pairs would take too long.
     """
     if compiling() or pairs > _VECTOR:
         return rows
