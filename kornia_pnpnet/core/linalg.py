@@ -95,7 +95,7 @@ def gate(value: Tensor, live: Tensor, finite: Tensor, fill: float | Tensor) -> T
 
 
 def relative(values: Tensor, size: Tensor) -> Tensor:
-    """Divide values (B, N) by the largest ``size`` of their problem, if that is not 0. The divisor has no gradient."""
+    """Divide values (B, N) by the largest positive ``size`` of their problem. The divisor has no gradient."""
     largest = size.detach().amax(1, keepdim=True)
     return values / torch.where(largest > 0, largest, 1.0)
 
@@ -313,8 +313,8 @@ def solve_leading(
 ) -> list[list[Tensor]]:
     """Solve systems with leading blocks of symmetric matrices. All blocks share one LDLᵀ factorisation, entry by entry.
 
-    A small multiple of the diagonal entry is added to each pivot. The solution of a singular system is therefore finite
-    if the right side lies in the range of the matrix.
+    A small multiple of the diagonal entry of its row is added to each pivot. The solution of a singular system is
+    therefore finite if the right side lies in the range of the matrix.
 
     Args:
         matrix: rows of the positive semi-definite matrices; entries above the diagonal are not read.

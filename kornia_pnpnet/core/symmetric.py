@@ -12,7 +12,7 @@ from kornia_pnpnet.core.linalg import factorise
 
 __all__ = ["Symmetric2", "Symmetric3", "are_semi_definite", "equivalent_sigma"]
 
-# Units in the last place of the trace. A matrix is not semi-definite when an eigenvalue is below minus this bound.
+# Units in the last place of the trace. An eigenvalue counts as negative only if it is below minus this bound.
 _ROUNDING = 16.0
 # Units in the last place of the trace. Smaller eigenvalues are raised to this bound, because the determinant would
 # otherwise be smaller than its rounding error.
@@ -33,7 +33,7 @@ class Symmetric2(NamedTuple):
 
     @property
     def determinant(self) -> Tensor:
-        """The determinant of a positive definite matrix, at least about as large as its rounding error."""
+        """The determinant of a positive definite matrix, raised to at least its rounding error."""
         product = self.uu * self.vv
         least = _LEAST * torch.finfo(product.dtype).eps * product.detach()
         return torch.addcmul(product, self.uv, self.uv, value=-1).maximum(least)

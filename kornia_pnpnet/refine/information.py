@@ -225,7 +225,7 @@ def larger_sigma(projection: Projection, problem: Problem, estimate: Noise, inli
 def outlier_area(problem: Problem) -> Tensor:
     """Area of the square in which pixels of outliers are assumed to be uniformly distributed, in px², (B, 1).
 
-    The pixels of usual pairs have the same variance (see :class:`~kornia_pnpnet.problem.Problem`).
+    The square has the size that gives the variance of the pixels of usual pairs (see ``Problem.usual``).
     """
     there = (problem.usual_weights > 0).to(problem.weights)[..., None]
     share = there / there.sum(1, keepdim=True).clamp(min=1.0)

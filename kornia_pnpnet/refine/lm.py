@@ -146,8 +146,8 @@ class RobustWeightedLM(Configured):
         shared: learn one set of hyperparameters for all iterations instead of one set per iteration.
         update: ``"retraction"`` on the rotation group, or the paper's ``"additive"`` update of the rotation vector.
         reject_worse: reject a step that raises the cost of its problem, and then multiply the damping by 10. Without
-            rejection, iterations from a distant start can diverge. From a good start, both variants take nearly the
-            same steps, and iterations without rejection are faster.
+            rejection, iterations from a distant start can diverge. From a good start, rejection takes time but hardly
+            changes the steps.
         by_residual: number of final iterations that ignore the initialiser's weights. This number is limited to the
             iterations after the choice among several poses. The weights of the kernel must be at most 1, which excludes
             ``power``.
@@ -292,7 +292,7 @@ class RobustWeightedLM(Configured):
         return Plan(problem, *weights, state, area, noiseless, tuple(each), len(poses))
 
     def iterate(self, plan: Plan, m: int | None = None, *, more: int = 0, run: Runner = EAGER) -> tuple[State, Tensor]:
-        """Run the iterations: first on all poses of a problem, then on the best pose, at last by residual.
+        """Run the iterations: first on all poses of a problem, then on the best pose, and finally by residual.
 
         See :meth:`forward` for the arguments. Returns the last state, and whether the last equations could be solved.
         """

@@ -246,7 +246,7 @@ def normal_equations(
 
 
 def _jacobian(projection: Projection, problem: Problem) -> Tensor:
-    r"""The rows of u and v of :math:`z J / f`, shape :math:`(6 + K, 2, N, B)`.
+    r"""The rows of the Jacobian for u and v, times :math:`z / f`, shape :math:`(6 + K, 2, N, B)`.
 
     Let :math:`y = R x`. Let :math:`e` be a row of :math:`z` times the derivative of :math:`(p, q)` with respect to a
     point in the frame of the pose. The entries of a row of the Jacobian are :math:`y \times e` for the rotation and
@@ -309,7 +309,7 @@ def _entrywise_equations(
             return zero
         return total if products[0] is uu else products[0].sum(0)
 
-    # Columns 3 and 4 are (1, 0) and (0, 1) for every pair. Their product with a weighted column is its u or v entry.
+    # Columns 3 and 4 are (1, 0) and (0, 1). Their products with a weighted column are its u and v entries.
     size = range(len(columns))
     lower = {
         (i, j): inner(weighted[j], columns[i]) if i < 5 else inner(weighted[i], columns[j])
@@ -406,8 +406,8 @@ def moved(state: State, delta: Tensor) -> State:
 
     The Cayley transform is
     :math:`\mathrm{cay}(\omega) = (I - \tfrac12[\omega]_\times)^{-1}(I + \tfrac12[\omega]_\times)`. The transform agrees
-    with the exponential to second order. The angle of rotation is :math:`2 \arctan(|\omega|/2)`, at most half a turn.
-    The transform needs neither trigonometry nor a branch at 0.
+    with the exponential map to second order. The angle of rotation is :math:`2 \arctan(|\omega|/2)`, at most half a
+    turn. The transform needs neither trigonometry nor a branch at 0.
 
     The parameters of the camera change by :math:`c`. A larger focal length also moves the camera away, as in a dolly
     zoom. The origin, which is the centroid of a centred world, then keeps its pixel and its scale. Without this motion,

@@ -21,8 +21,7 @@ from kornia_pnpnet.result import Pose, PosePrior
 
 __all__ = ["CameraTerm", "PoseTerm", "add_term", "gravity_prior"]
 
-# An eigenvector of an information matrix is a known direction if its eigenvalue exceeds this share of the largest
-# eigenvalue or, after scaling to a unit diagonal, this number.
+# Share of the largest eigenvalue of an information matrix, or of its unit diagonal. Smaller eigenvalues count as 0.
 _KNOWN = 1e-5
 # Standard deviations. Default scale of the robust kernel.
 _SCALE = 3.0
@@ -141,7 +140,7 @@ class PoseTerm(NamedTuple):
         pose: the expected pose.
         information: inverse covariance of the pose, shape :math:`(B, 6, 6)`.
         offset: the point of the caller's world that is the origin of the problem, in lengths of the problem, shape
-            :math:`(B, 3)`. The prior refers translations to the origin of the caller's world.
+            :math:`(B, 3)`. Errors of the translation are measured at the origin of the caller's world.
         free: axis in the camera about which the rotation is unknown, 0 unless exactly one such axis exists, shape
             :math:`(B, 3)`.
         sq_scale: squared scale of the robust kernel, in squared standard deviations, shape :math:`(B,)`.
@@ -244,7 +243,7 @@ class PoseTerm(NamedTuple):
         return torch.where(self.sq_scale.isinf(), square, -scale * torch.expm1(-square / scale))
 
     def disagreement(self, pose: Pose) -> Tensor:
-        """See :class:`~kornia_pnpnet.problem.Term`. The penalty is at most half the rank."""
+        """See :class:`~kornia_pnpnet.problem.Term`. The penalty is at most half of ``rank``."""
         scale = torch.where(self.sq_scale.isinf(), _SCALE**2 * self.rank.clamp(min=1.0), self.sq_scale)
         return -0.5 * self.rank * torch.expm1(-self.errors(pose)[1] / scale)
 
